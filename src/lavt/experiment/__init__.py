@@ -1,1 +1,1 @@
-"""Runs, sweeps, what is computed from their records, and the report."""
+"""Runs, sweeps, the analysis of their records, and the report."""

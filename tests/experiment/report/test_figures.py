@@ -7,7 +7,7 @@ from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
 from matplotlib.text import Annotation
 
-from lavt.experiment.report.figure_style import condition_colours, near_each_other
+from lavt.experiment.report.figure_style import clusters_of, condition_colours
 from lavt.experiment.report.latency_figures import degradation_figure, presets_figure
 from lavt.experiment.report.run_figures import cross_track_figure
 from lavt.experiment.statistics.paper_results import paper
@@ -17,55 +17,59 @@ COLOURS = condition_colours(["L2", "L3", "L4"])
 
 def entry(loop_ms: float, rate: float, p95_m: float) -> dict[str, Any]:
     return {
-        "loop_ms": {"p50": loop_ms}, "completion_rate": rate, "completion_interval": [rate - 0.1, rate + 0.1],
-        "p95_m": p95_m, "p95_interval": [p95_m - 0.5, p95_m + 0.5], "p95_common_m": 1.0,
+        "loop_ms": {"p50": loop_ms},
+        "completion_rate": rate,
+        "completion_interval": [rate - 0.1, rate + 0.1],
+        "p95_m": p95_m,
+        "p95_interval": [p95_m - 0.5, p95_m + 0.5],
+        "p95_common_m": 1.0,
         "p95_common_interval": [0.75, 1.5],
-    }  # fmt: skip
+    }
 
 
 CONDITIONS = {"L2": entry(222.4, 0.9, 2.5), "L3": entry(297.6, 0.467, 6.0), "L4": entry(297.4, 0.533, 6.3)}
 
 
-def names_in(axes: Axes) -> list[str]:
+def point_names(axes: Axes) -> list[str]:
     return [text.get_text() for text in axes.texts if isinstance(text, Annotation)]
 
 
-def bars_in(axes: Axes) -> list[list[float]]:
-    """Give the low and the high end of each error bar."""
+def error_bars(axes: Axes) -> list[list[float]]:
+    """Return the low and the high end of each error bar."""
     bars = [each.lines[2][0] for each in axes.containers if isinstance(each, ErrorbarContainer) and each.has_yerr]
     return [[round(float(y), 9) for _, y in bar.get_segments()[0]] for bar in bars]
 
 
-def test_names_of_near_points_stand_together() -> None:
-    """Points nearer than a name is high and wide are together, upper first, wherever they lie; others are alone."""
+def test_points_with_overlapping_names_form_a_cluster() -> None:
+    """Points nearer than the size of a name form a cluster, the upper first; other points are alone."""
     axes = Figure().subplots()
     axes.set(xlim=(0, 420), ylim=(0, 112))
     points = [("a", 100.0, 50.0, None), ("b", 104.1, 53.4, None), ("c", 100.0, 90.0, None), ("d", 350.0, 50.0, None)]
     for shift in range(12):
         moved = [(name, x + shift, y + shift / 4, None) for name, x, y, _ in points]
-        assert [[point[0] for point in place] for place in near_each_other(moved, axes)] == [["c"], ["b", "a"], ["d"]]
-    assert near_each_other([], axes) == []
+        assert [[point[0] for point in cluster] for cluster in clusters_of(moved, axes)] == [["c"], ["b", "a"], ["d"]]
+    assert clusters_of([], axes) == []
 
 
-def test_degradation_has_every_interval_and_every_name() -> None:
-    """Circles, diamonds and the paper's completion have their intervals, and the paper's points have names."""
+def test_the_degradation_figure_has_all_intervals_and_names() -> None:
+    """Circles, diamonds and the paper's completion have intervals, and all points have names."""
     its = {name: each for name, each in paper()["conditions"].items() if name in CONDITIONS}
     completion, error = degradation_figure({"virtual": CONDITIONS}, its, COLOURS).axes
     theirs = [[round(100 * end, 9) for end in each["completion_interval"]] for each in its.values()]
-    assert bars_in(completion) == [*theirs, [80.0, 100.0], [36.7, 56.7], [43.3, 63.3]]
-    assert bars_in(error) == [[2.0, 3.0], [5.5, 6.5], [5.8, 6.8], *[[0.75, 1.5]] * 3]
-    assert names_in(completion) == ["L2", "L3\nL4", "L2", "L4\nL3"]
-    assert names_in(error) == ["L3", "L4", "L2", "L4\nL3", "L2"]
+    assert error_bars(completion) == [*theirs, [80.0, 100.0], [36.7, 56.7], [43.3, 63.3]]
+    assert error_bars(error) == [[2.0, 3.0], [5.5, 6.5], [5.8, 6.8], *[[0.75, 1.5]] * 3]
+    assert point_names(completion) == ["L2", "L3\nL4", "L2", "L4\nL3"]
+    assert point_names(error) == ["L3", "L4", "L2", "L4\nL3", "L2"]
 
 
-def test_a_condition_that_hides_another_is_named() -> None:
-    """Of groups compared, conditions at one place are named there, since one marker hides the other."""
+def test_conditions_with_overlapping_points_are_named() -> None:
+    """The comparison of groups names conditions whose markers overlap."""
     completion, error = presets_figure({"one": CONDITIONS, "other": {"L2": CONDITIONS["L2"]}}, COLOURS).axes
-    assert names_in(completion) == names_in(error) == ["L4\nL3"]
+    assert point_names(completion) == point_names(error) == ["L4\nL3"]
 
 
-def test_the_lowest_panel_of_each_column_says_what_its_axis_is() -> None:
-    """With three routes in two columns the right column's only panel has a label, too, and the upper left has none."""
+def test_the_lowest_panel_of_each_column_has_an_x_label() -> None:
+    """With three routes in two columns, the lower left and the right panel have an x label, the upper left has none."""
     panels = cross_track_figure({"a": [], "b": [], "c": []}, COLOURS).axes[:3]
     label = "distance along the route (m)"
     assert [axes.get_xlabel() for axes in panels] == ["", label, label]

@@ -4,11 +4,13 @@ import csv
 import json
 import re
 from collections.abc import Callable
+from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from markupsafe import escape
 
 from lavt.domain import NS_PER_S, Now
 from lavt.errors import WorkError
@@ -24,6 +26,12 @@ from lavt.recording.record import RecordWriter, read_record
 
 MakeRun = Callable[..., Path]
 
+ROUTE = "A <script>alert('1')</script> & \"key\" $^$"
+"""A route name with special characters of HTML and of mathematical text in figures."""
+
+FAILED = [{"run": "<b>5</b>", "reason": '<img src=x onerror="alert(1)"> & more'}]
+"""A failed run whose name and reason have special characters of HTML."""
+
 
 def add_run(make_run: MakeRun, sweep: Path, name: str, *, time: str = "virtual", **settings: Any) -> None:
     condition, video_ms = settings.pop("condition", "L0"), settings.pop("video_ms", 0.0)
@@ -33,7 +41,7 @@ def add_run(make_run: MakeRun, sweep: Path, name: str, *, time: str = "virtual",
         "time": time,
         "injection": "model" if time == "virtual" else "relay",
         "inherent": "paper_wifi5",
-        "route": "A <key> $^$",
+        "route": ROUTE,
         "condition": condition,
         "controller": "lane",
         "preset": "designed",
@@ -46,7 +54,7 @@ def add_run(make_run: MakeRun, sweep: Path, name: str, *, time: str = "virtual",
 
 @pytest.fixture(scope="module")
 def sweep(make_run: MakeRun, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Give a sweep and its report: three virtual runs, of which one ends early, three in real time, one unfinished."""
+    """Return a sweep with its report: three virtual runs (one ends early), three in real time, and one unfinished."""
     directory = tmp_path_factory.mktemp("sweep")
     add_run(make_run, directory, "0", seconds=3.0)
     add_run(make_run, directory, "1", seconds=3.0, condition="L1", video_ms=75.0)
@@ -55,9 +63,9 @@ def sweep(make_run: MakeRun, tmp_path_factory: pytest.TempPathFactory) -> Path:
     add_run(make_run, directory, "5", seconds=3.0, time="real", client_clock=lambda _second: {"correction_s": None})
     add_run(
         make_run, directory, "6", seconds=3.0, time="real", server_host="a", client_host="a", offset_s=0.0, drift=0.0
-    )  # fmt: skip
+    )
     (directory / "runs" / "4").mkdir()
-    write_report(directory, speed={"simulated_s": 30.0, "wall_s": 10.0, "jobs": 2})
+    write_report(directory, speed={"simulated_s": 30.0, "wall_s": 10.0, "jobs": 2}, failed=FAILED)
     return directory
 
 
@@ -65,15 +73,26 @@ def page_of(sweep: Path) -> str:
     return (sweep / "report" / "index.html").read_text()
 
 
-def test_the_report_is_whole(sweep: Path) -> None:
-    """The page, every file it names in each of its formats, and the summary are there; nothing is from a network."""
+def test_the_report_is_complete(sweep: Path) -> None:
+    """The report has the page, all files it links to, and the summary; the page loads nothing from a network."""
     html = page_of(sweep)
     figures = {name.rpartition(".")[0] for name in re.findall(r'src="([^"]+)"', html)}
     assert figures == {
-        "degradation", "injected", "stages_virtual", "stages_real", "time_virtual", "time_real", "survival_virtual",
-        "survival_real", "incidence_virtual", "incidence_real", "trajectories_whole_virtual", "trajectories_whole_real",
-        "cross_track_virtual", "cross_track_real",
-    }  # fmt: skip
+        "degradation",
+        "injected",
+        "stages_virtual",
+        "stages_real",
+        "time_virtual",
+        "time_real",
+        "survival_virtual",
+        "survival_real",
+        "incidence_virtual",
+        "incidence_real",
+        "trajectories_whole_virtual",
+        "trajectories_whole_real",
+        "cross_track_virtual",
+        "cross_track_real",
+    }
     for figure in figures:
         assert (sweep / "report" / f"{figure}.png").read_bytes().startswith(b"\x89PNG")
         assert "<text" in (sweep / "report" / f"{figure}.svg").read_text()
@@ -89,25 +108,34 @@ def test_the_report_is_whole(sweep: Path) -> None:
     assert summary["speed"]["jobs"] == 2
 
 
-def test_every_section_has_a_link_and_is_in_order(sweep: Path) -> None:
-    """The page links to each of its sections, in the order in which they come."""
+def test_the_page_links_to_its_sections_in_order(sweep: Path) -> None:
+    """The page links to each of its sections, in their order."""
     html = page_of(sweep)
     names = re.findall(r'<h2 id="([^"]+)"', html)
     assert re.findall(r'<a href="#([^"]+)"', html) == names
     assert names == [
-        "conditions", "planned_contrasts", "trajectories", "injected_and_measured_latency", "driving_against_latency",
-        "how_far_the_runs_came", "where_the_latency_comes_from", "route_by_route", "single_runs", "every_run",
-        "clocks_of_two_machines", "versions_and_machine",
-    ]  # fmt: skip
+        "conditions",
+        "planned_contrasts",
+        "trajectories",
+        "injected_and_measured_latency",
+        "driving_performance_over_latency",
+        "distance_driven_and_endings",
+        "latency_of_each_stage",
+        "results_by_route",
+        "single_runs",
+        "all_runs",
+        "clock_offset_between_two_machines",
+        "versions_and_machines",
+    ]
 
 
-def test_the_same_runs_give_the_same_bytes(sweep: Path) -> None:
-    """A report made again, of drives that were read before, is the same file by file, figures and page included."""
+def test_a_report_is_byte_for_byte_reproducible(sweep: Path) -> None:
+    """A second report of the same runs, with drives that are already read, has the same bytes in each file."""
     before = files_of(sweep)
     assert len(before) > 40
     directories = [sweep / "runs" / name for name in "012356"]
     drives = {directory: read_drive(directory, read_json(directory / "result.json")) for directory in directories}
-    write_report(sweep, drives=drives)
+    write_report(sweep, drives=drives, failed=FAILED)
     assert files_of(sweep) == before
 
 
@@ -115,8 +143,8 @@ def files_of(sweep: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted((sweep / "report").rglob("*.*"))}
 
 
-def test_numbers_come_back_from_the_csv(sweep: Path) -> None:
-    """The CSV of a table has each number to its last digit, an interval in two columns, and what is unknown empty."""
+def test_csv_files_have_exact_numbers(sweep: Path) -> None:
+    """The CSV of a table has each number with all digits, an interval in two columns, and an unknown value empty."""
     summary = json.loads((sweep / "summary.json").read_text())
     with (sweep / "report" / "tables" / "conditions_virtual_driving.csv").open(newline="") as file:
         rows = {row["condition"]: row for row in csv.DictReader(file)}
@@ -133,17 +161,19 @@ def test_numbers_come_back_from_the_csv(sweep: Path) -> None:
     assert errors["L1"]["p95 m, all runs ranked p75"] == ""
 
 
-def test_real_and_virtual_runs_have_tables_of_their_own(sweep: Path) -> None:
-    """The page says of each table whether time was real and who injected; an invalid run is named with its reason."""
+def test_real_and_virtual_runs_have_separate_tables(sweep: Path) -> None:
+    """The tables name the kind of time and the source of the injected delay, and an invalid run has its reason."""
     html = page_of(sweep)
-    assert "Virtual time, fidelity video: network and clocks are modelled" in html
+    assert "Virtual time, fidelity video: modelled network and clocks" in html
     assert "Real time, injected by relay" in html
-    assert "not valid: the offset between the clocks is only known to 6.00 ms" in html
+    assert "invalid: the offset between the clocks is only known to 6.00 ms" in html
 
 
-def test_two_clocks_are_told_with_source_bound_and_drift(sweep: Path) -> None:
-    """Of runs on two machines the page has Delta, its source, bound and drift, and the probe's Delta; of others not."""
-    clocks = page_of(sweep).partition('id="clocks_of_two_machines"')[2].partition('id="versions_and_machine"')[0]
+def test_the_page_has_the_clock_offset_of_two_machines(sweep: Path) -> None:
+    """Runs on two machines have the clock offset with source, bound and drift, and the probe's offset."""
+    clocks = (
+        page_of(sweep).partition('id="clock_offset_between_two_machines"')[2].partition('id="versions_and_machines"')[0]
+    )
     rows = re.findall(r"<tr><td.*?</tr>", clocks.replace("\n", ""))
     cells = [[re.sub("<[^>]*>|\xa0", "", cell) for cell in re.findall(r"<td[^>]*>(.*?)</td>", row)] for row in rows]
     assert [row[:2] for row in cells] == [["3", "chrony"], ["5", "probe"]]
@@ -151,33 +181,56 @@ def test_two_clocks_are_told_with_source_bound_and_drift(sweep: Path) -> None:
     assert [cell.partition("±")[0] for cell in (cells[0][4], cells[1][2], cells[1][4])] == ["250.030"] * 3
     assert "half the round trip" in clocks
     first, *_ = (sweep / "report" / "tables" / "clocks.csv").read_text().splitlines()
-    assert first.split(",")[2:4] == ["Delta ms", "Delta ms bound"]
+    assert first.split(",")[2:4] == ["clock offset ms", "clock offset ms bound"]
 
 
-def test_names_cannot_become_html(sweep: Path) -> None:
-    """Whatever a route or a run is called, the page and the figures show it as text."""
+def test_texts_of_users_are_escaped(sweep: Path) -> None:
+    """The page shows names and reasons with special characters of HTML as text, never as markup."""
     html = page_of(sweep)
-    assert "A &lt;key&gt;" in html
-    assert "<key>" not in html
+    assert not re.search("<script|<b>|<img src=x", html)
+    assert str(escape(ROUTE)) in html
+    assert "<li>&lt;b&gt;5&lt;/b&gt;: &lt;img src=x" in html
+    page = PageTexts()
+    page.feed(html)
+    assert any(ROUTE in text for text in page.texts)
+    assert f"{FAILED[0]['run']}: {FAILED[0]['reason']}" in page.texts
+    assert any(ROUTE in text for text in page.alternatives)
 
 
-def test_a_report_made_again_keeps_the_speed(sweep: Path) -> None:
-    """A second report of the same runs gives the same summary, the speed of the sweep included."""
+class PageTexts(HTMLParser):
+    """The texts and the alternative texts of a page, as a browser reads them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.texts: list[str] = []
+        self.alternatives: list[str] = []
+
+    def handle_data(self, data: str) -> None:
+        """Collect a text."""
+        self.texts.append(data)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Collect the alternative text of an image."""
+        self.alternatives += [value or "" for name, value in attrs if tag == "img" and name == "alt"]
+
+
+def test_a_second_report_keeps_the_speed(sweep: Path) -> None:
+    """A second report of the same runs has the same summary, including the speed of the sweep."""
     first = (sweep / "summary.json").read_bytes()
-    write_report(sweep)
+    write_report(sweep, failed=FAILED)
     assert (sweep / "summary.json").read_bytes() == first
 
 
 def test_unfinished_runs_are_left_out_and_named(sweep: Path) -> None:
-    """A run without a result is named as left out; a directory without any finished run is an error."""
-    assert "1 of the runs asked for failed and are in no number of this page" in page_of(sweep)
-    assert "4: it has no result" in page_of(sweep)
+    """A run without a result is listed as left out; a directory without a finished run is an error."""
+    assert "2 runs failed and are left out" in page_of(sweep)
+    assert "4: no result" in page_of(sweep)
     with pytest.raises(WorkError, match=r"no finished run"):
         write_report(sweep / "report")
 
 
-def test_what_is_before_the_stamp_is_in_the_table_only(make_run: MakeRun, tmp_path: Path, sweep: Path) -> None:
-    """From capture to stamp is the first row of the table of hops; a dash where no camera told."""
+def test_the_table_of_stages_begins_with_capture_to_stamp(make_run: MakeRun, tmp_path: Path, sweep: Path) -> None:
+    """The first row of the table of stages is the time from capture to stamp, or a dash if it is unknown."""
     make_run(tmp_path, seconds=3.0, capture_ms=7.5)
     assert capture_to_stamp_ms(tmp_path / "server.mcap") == 7.5
     assert capture_to_stamp_ms(sweep / "runs" / "0" / "server.mcap") is None
@@ -187,7 +240,7 @@ def test_what_is_before_the_stamp_is_in_the_table_only(make_run: MakeRun, tmp_pa
 
 
 def test_received_pictures_are_decoded(tmp_path: Path) -> None:
-    """Four pictures, evenly spread, come out of the recorded video; a record without video has none."""
+    """Four evenly spaced pictures are decoded from the recorded video; a record without video gives none."""
     h264 = pytest.importorskip("lavt.transport.video.h264")
     writer = RecordWriter(tmp_path / "client.mcap", "client")
     writer.close()
@@ -204,16 +257,16 @@ def test_received_pictures_are_decoded(tmp_path: Path) -> None:
     assert [round(float(picture.mean()) / 20) for _, picture in pictures] == [3, 5, 7, 9]
 
 
-def test_every_condition_has_a_colour_of_its_own() -> None:
-    """However many conditions there are, no two share a colour, and the order they come in does not matter."""
+def test_each_condition_has_a_distinct_colour() -> None:
+    """No two conditions share a colour, and the colours do not depend on the order of the conditions."""
     names = [f"L{index}" for index in range(20)]
     colours = condition_colours(names)
     assert len({str(colour) for colour in colours.values()}) == 20
     assert condition_colours(["L5", "L0"]) == condition_colours(["L0", "L5"])
 
 
-def test_what_is_undefined_is_a_dash() -> None:
-    """A number, a share, an interval or a latency that is not known is shown as a dash, and a bound as unknown."""
+def test_an_unknown_value_is_a_dash() -> None:
+    """An unknown number, share, interval or latency is shown as a dash, and an unknown bound as "unknown"."""
     nothing = {"p5": None, "p50": None, "p95": None, "bound": None, "n": 0}
     dashes = [
         table_format.number(None),
@@ -226,8 +279,8 @@ def test_what_is_undefined_is_a_dash() -> None:
     assert unbounded.replace(table_format.UNBROKEN, " ") == "2.0 ± unknown (1.0 to 3.0)"
 
 
-def test_a_run_of_which_nothing_is_known_is_reported(tmp_path: Path) -> None:
-    """Records without any message give a report all the same: nothing measured, and the reasons why it is not valid."""
+def test_a_run_with_empty_records_is_reported(tmp_path: Path) -> None:
+    """A run whose records have no messages is in the report, as invalid with the reasons."""
     directory = tmp_path / "runs" / "0"
     directory.mkdir(parents=True)
     RecordWriter(directory / "server.mcap", "server").close()

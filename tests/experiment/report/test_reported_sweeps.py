@@ -17,17 +17,26 @@ MakeRun = Callable[..., Path]
 def add_run(make_run: MakeRun, sweep: Path, name: str, *, preset: str, condition: str = "L0") -> None:
     directory = make_run(sweep / "runs" / name, seconds=2.0)
     identity = {
-        **dict.fromkeys(IDENTITY), "run": name, "time": "virtual", "fidelity": "geometry", "injection": "model",
-        "route": "a", "condition": condition, "preset": preset, "seed": 1, "repetition": 0,
-        "injected_ms": {"video": 0.0, "control": 0.0}, "digest": None,
-    }  # fmt: skip
+        **dict.fromkeys(IDENTITY),
+        "run": name,
+        "time": "virtual",
+        "fidelity": "geometry",
+        "injection": "model",
+        "route": "a",
+        "condition": condition,
+        "preset": preset,
+        "seed": 1,
+        "repetition": 0,
+        "injected_ms": {"video": 0.0, "control": 0.0},
+        "digest": None,
+    }
     server, client = (read_record(directory / f"{side}.mcap") for side in ("server", "client"))
     write_json(directory / "result.json", run_result(identity, server, client))
 
 
 @pytest.fixture
 def sweeps(make_run: MakeRun, tmp_path: Path) -> tuple[Path, Path]:
-    """Give two sweeps whose directories and runs have equal names; the first has an unequal one, too."""
+    """Return two sweeps whose directories and runs have equal names; the first sweep has one more run."""
     first, second = tmp_path / "old" / "sweep", tmp_path / "new" / "sweep"
     add_run(make_run, first, "a_L0_00", preset="paper_calibrated")
     add_run(make_run, first, "a_L1_00", preset="paper_calibrated", condition="L1")
@@ -35,8 +44,8 @@ def sweeps(make_run: MakeRun, tmp_path: Path) -> tuple[Path, Path]:
     return first, second
 
 
-def test_two_sweeps_in_one_report_stay_apart(sweeps: tuple[Path, Path], tmp_path: Path) -> None:
-    """Each run says which sweep it is of, each sweep is a group, and `conditions` are of the first alone."""
+def test_two_sweeps_in_one_report_are_separate_groups(sweeps: tuple[Path, Path], tmp_path: Path) -> None:
+    """Each run has the name of its sweep, each sweep is a group, and `conditions` has the runs of the first only."""
     report(list(sweeps), tmp_path / "both")
     summary = json.loads((tmp_path / "both" / "summary.json").read_text())
     assert [(run["run"], run["sweep"], run["preset"]) for run in summary["runs"]] == [
@@ -53,12 +62,13 @@ def test_two_sweeps_in_one_report_stay_apart(sweeps: tuple[Path, Path], tmp_path
         assert [row["sweep"] for row in csv.DictReader(file)] == ["old/sweep", "old/sweep", "new/sweep"]
     figures = {path.stem for path in (tmp_path / "both" / "report").glob("trajectories*.svg")}
     assert figures == {
-        "trajectories_whole_virtual_preset_paper_calibrated", "trajectories_whole_virtual_preset_designed",
-    }  # fmt: skip
+        "trajectories_whole_virtual_preset_paper_calibrated",
+        "trajectories_whole_virtual_preset_designed",
+    }
 
 
-def test_a_sweep_alone_has_no_name(sweeps: tuple[Path, Path], tmp_path: Path) -> None:
-    """A single directory, and single runs, are reported as ever: no run and no group is of a sweep."""
+def test_a_single_sweep_has_no_name(sweeps: tuple[Path, Path], tmp_path: Path) -> None:
+    """In a report of one directory or of single runs, no run and no group has the name of a sweep."""
     first, second = sweeps
     runs = [first / "runs" / "a_L0_00", second / "runs" / "a_L0_00"]
     for directories in ([first], runs):

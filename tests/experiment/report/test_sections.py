@@ -5,6 +5,7 @@ import csv
 import json
 import re
 from collections.abc import Callable
+from html import unescape
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +25,11 @@ from lavt.experiment.report.sections import (
     degradation_parts,
     difference_parts,
     group_parts,
-    head,
     injected_parts,
     route_parts,
     run_parts,
     stage_parts,
+    summary_parts,
     survival_parts,
 )
 from lavt.experiment.report.sweep_figures import axis_figure
@@ -40,33 +41,72 @@ MakeRun = Callable[..., Path]
 INJECTED = {"L0": (0, 0), "L1": (75, 0), "L2": (150, 0), "L3": (225, 0), "L4": (150, 75), "L5": (225, 100)}
 
 NEW_OF_CONDITION = (
-    "completion_such_roads", "endings", "routes", "p95_common_m", "p95_common_interval", "p95_worst_rank_m",
-    "collisions_per_km", "lane_invasions_per_km", "heading_rms_rad", "steering_reversals_per_s", "oscillation_hz",
-    "mae_m", "rms_m", "max_m", "picture_age_ms", "age_at_actuation_ms", "stages_ms", "survival",
-)  # fmt: skip
+    "completion_such_roads",
+    "endings",
+    "routes",
+    "p95_common_m",
+    "p95_common_interval",
+    "p95_worst_rank_m",
+    "collisions_per_km",
+    "lane_invasions_per_km",
+    "heading_rms_rad",
+    "steering_reversals_per_s",
+    "oscillation_hz",
+    "mae_m",
+    "rms_m",
+    "max_m",
+    "picture_age_ms",
+    "age_at_actuation_ms",
+    "stages_ms",
+    "survival",
+)
 """Keys that a summary of an older version lacks."""
 
 
 def run_of(condition: str, route: str = "a", repetition: int = 0, **changes: Any) -> dict[str, Any]:
-    """Make the entry of a run by hand: L0 to L2 are completed, the others collide halfway."""
+    """Return a hand-made entry of a run: L0 to L2 are completed, the others collide halfway."""
     video, control = INJECTED[condition]
     completed = video + control < 200
     percentiles = {"p5": 1.0, "p50": 62.0 + video, "p95": 90.0 + video, "bound": 0.2, "n": 100}
     run = {
-        "run": f"{route}_{condition}_{repetition}", "time": "virtual", "fidelity": "geometry", "injection": "model",
-        "inherent": "paper_wifi5", "route": route, "condition": condition, "controller": "lane_keeper",
-        "preset": "paper_calibrated", "driver": "lane_keeper", "repetition": repetition, "seed": 7 + repetition,
-        "injected_ms": {"video": float(video), "control": float(control)}, "valid": True, "invalid_reasons": [],
-        "ending": "completed" if completed else "collision", "distance_m": 100.0 if completed else 50.0,
-        "route_length_m": 100.0, "duration_s": 12.0, "p95_m": 0.1, "p95_by_10m": [0.1] * (10 if completed else 5),
-        "mae_m": 0.1, "rms_m": 0.1, "max_m": 0.2, "heading_rms_rad": 0.01, "steering_reversals_per_s": 0.2,
-        "oscillation_hz": None, "collisions": 0 if completed else 1, "lane_invasions": 0,
-        "collisions_per_km": 0.0, "lane_invasions_per_km": 0.0,
+        "run": f"{route}_{condition}_{repetition}",
+        "time": "virtual",
+        "fidelity": "geometry",
+        "injection": "model",
+        "inherent": "paper_wifi5",
+        "route": route,
+        "condition": condition,
+        "controller": "lane_keeper",
+        "preset": "paper_calibrated",
+        "driver": "lane_keeper",
+        "repetition": repetition,
+        "seed": 7 + repetition,
+        "injected_ms": {"video": float(video), "control": float(control)},
+        "valid": True,
+        "invalid_reasons": [],
+        "ending": "completed" if completed else "collision",
+        "distance_m": 100.0 if completed else 50.0,
+        "route_length_m": 100.0,
+        "duration_s": 12.0,
+        "p95_m": 0.1,
+        "p95_by_10m": [0.1] * (10 if completed else 5),
+        "mae_m": 0.1,
+        "rms_m": 0.1,
+        "max_m": 0.2,
+        "heading_rms_rad": 0.01,
+        "steering_reversals_per_s": 0.2,
+        "oscillation_hz": None,
+        "collisions": 0 if completed else 1,
+        "lane_invasions": 0,
+        "collisions_per_km": 0.0,
+        "lane_invasions_per_km": 0.0,
         "loop_ms": {**percentiles, "p5": 60.0, "p50": 72.0 + video + control},
-        "tau_v_ms": percentiles, "tau_c_ms": {**percentiles, "p50": 9.0 + control},
-        "picture_age_ms": {"mean": 90.0 + video + control, "p95": 120.0}, "age_at_actuation_ms": {**percentiles},
+        "tau_v_ms": percentiles,
+        "tau_c_ms": {**percentiles, "p50": 9.0 + control},
+        "picture_age_ms": {"mean": 90.0 + video + control, "p95": 120.0},
+        "age_at_actuation_ms": {**percentiles},
         "stages_ms": [{"node": "camera", "stage": "encode", "p50": 2.0, "p95": 3.0, "n": 9}],
-    }  # fmt: skip
+    }
     return {**run, **changes}
 
 
@@ -86,28 +126,35 @@ def report_of(summary: dict[str, Any], directory: Path) -> ReportContext:
 
 def all_parts(report: ReportContext) -> dict[str, str]:
     parts = {
-        "head": head(report), "conditions": conditions_parts(report), "contrasts": contrast_parts(report),
-        "differences": difference_parts(report), "injected": injected_parts(report),
-        "degradation": degradation_parts(report), "survival": survival_parts(report), "stages": stage_parts(report, {}),
-        "groups": group_parts(report), "axes": axis_parts(report), "routes": route_parts(report),
+        "summary": summary_parts(report),
+        "conditions": conditions_parts(report),
+        "contrasts": contrast_parts(report),
+        "differences": difference_parts(report),
+        "injected": injected_parts(report),
+        "degradation": degradation_parts(report),
+        "survival": survival_parts(report),
+        "stages": stage_parts(report, {}),
+        "groups": group_parts(report),
+        "axes": axis_parts(report),
+        "routes": route_parts(report),
         "runs": run_parts(report),
-    }  # fmt: skip
+    }
     return {name: "\n".join(every) for name, every in parts.items()}
 
 
 def text_of(html: str) -> str:
-    return re.sub(r"\s+", " ", re.sub("<[^>]*>", " ", html).replace("&#x27;", "'"))
+    return re.sub(r"\s+", " ", unescape(re.sub("<[^>]*>", " ", html)))
 
 
-def test_the_papers_figures_stand_beside_ours(tmp_path: Path) -> None:
-    """Conditions of the paper have its completion, latency and error beside ours, contrasts its Fisher p."""
+def test_results_are_compared_with_the_paper(tmp_path: Path) -> None:
+    """The tables have the paper's completion, latency and error, and Fisher's p for its contrasts."""
     parts = all_parts(report_of(summarize(campaign(), None), tmp_path))
-    assert "the paper's completed" in parts["conditions"].replace("&#x27;", "'")
     assert "13.15" in parts["conditions"]
-    titles = re.findall("<th[^>]*>(.*?)</th>", parts["conditions"].replace("&#x27;", "'"))
-    assert {"the paper's τ video ms", "the paper's τ control ms", "its 95 % interval m"} < set(titles)
-    assert "range over such roads" in titles
-    assert "and no interval of 95 %" in text_of(parts["conditions"])
+    titles = re.findall("<th[^>]*>(.*?)</th>", unescape(parts["conditions"]))
+    assert {"the paper's completed", "the paper's τ video ms", "the paper's τ control ms", "range over roads"} < set(
+        titles
+    )
+    assert "not a 95 % interval" in text_of(parts["conditions"])
     assert "13.15" in parts["degradation"] + parts["differences"]
     row = re.search(r"<tr><td class=\"text\">L3 – L4</td>(.*?)</tr>", parts["contrasts"])
     assert row is not None
@@ -115,8 +162,8 @@ def test_the_papers_figures_stand_beside_ours(tmp_path: Path) -> None:
     assert "L3 (225 + 0 ms) and L4 (150 + 75 ms) inject the same total" in parts["contrasts"]
 
 
-def test_survival_curves_are_there_as_numbers(tmp_path: Path) -> None:
-    """Below the figures of survival are files of every step with its 95 % interval, for what draws it otherwise."""
+def test_survival_curves_have_data_files(tmp_path: Path) -> None:
+    """The survival figures come with files of all steps and their 95 % intervals."""
     report = report_of(summarize(campaign(), None), tmp_path)
     assert 'href="tables/survival_virtual.csv"' in "".join(survival_parts(report))
     first, *rows = (tmp_path / "tables" / "survival_virtual.csv").read_text().splitlines()
@@ -126,50 +173,51 @@ def test_survival_curves_are_there_as_numbers(tmp_path: Path) -> None:
     assert len(rows) == sum(len(curve["distance_m"]) for curve in curves) > 0
 
 
-def test_figures_and_tables_say_of_which_group_they_are(tmp_path: Path) -> None:
-    """With two groups the first contrasts, both figures of survival and the sentence on equal totals name theirs."""
+def test_figures_and_tables_name_their_group(tmp_path: Path) -> None:
+    """With two groups, contrasts, survival figures and the sentence on equal totals name their group."""
     runs = [*campaign(sweep="x"), *campaign(sweep="y", preset="designed")]
     parts = all_parts(report_of(summarize(runs, None, base={"sweep": "x"}), tmp_path))
     assert re.findall("<h3>(.*?)</h3>", parts["contrasts"]) == ["preset paper_calibrated", "preset designed"]
     assert "<p>preset paper_calibrated: L3 (225 + 0 ms) and L4" in parts["contrasts"]
     assert parts["survival"].count("Virtual time (preset paper_calibrated).") == 2
-    assert "Virtual runs are of one group (preset paper_calibrated)." in text_of(parts["degradation"])
+    assert "Runs in virtual time are from one group (preset paper_calibrated)." in text_of(parts["degradation"])
     alone = all_parts(report_of(summarize(campaign(), None), tmp_path))
     assert "<h3>" not in alone["contrasts"]
     assert "<p>L3 (225 + 0 ms) and L4" in alone["contrasts"]
 
 
 def test_the_bar_of_stages_is_the_loop(tmp_path: Path) -> None:
-    """What the actuator reports once the command is applied is in the table and in no bar; a rest fills the loop."""
+    """Stages after the loop are in the table but in no bar, and a rest completes the bar to the loop latency."""
     stages = [
-        {"node": "camera", "stage": "encode", "p50": 50.0}, {"node": "actuator", "stage": "apply", "p50": 10.0},
+        {"node": "camera", "stage": "encode", "p50": 50.0},
+        {"node": "actuator", "stage": "apply", "p50": 10.0},
         {"node": "actuator", "stage": "report", "p50": 8.0},
-    ]  # fmt: skip
+    ]
     report = report_of(summarize([run_of("L0", stages_ms=stages)], None), tmp_path)
-    said = text_of("".join(stage_parts(report, {"virtual": {"L0": 5.0}})))
+    text = text_of("".join(stage_parts(report, {"virtual": {"L0": 5.0}})))
     assert ">72 ms</text>" in (tmp_path / "stages_virtual.svg").read_text()
     with (tmp_path / "tables" / "stages_virtual.csv").open(newline="") as file:
         assert list(csv.reader(file))[1:] == [
             ["camera: capture to stamp, before the loop", "5.0"],
             ["camera: encode", "50.0"],
             ["actuator: apply", "10.0"],
-            ["rest: waiting, and what medians do not add up to", "12.0"],
+            ["rest: waiting (median loop minus the sum of stages)", "12.0"],
             ["actuator: report, after the loop", "8.0"],
         ]
-    assert "the sum of these medians, which need not be the median loop exactly" in said
-    assert "is of one run of each condition" in said
+    assert "the sum of these medians" in text
+    assert "from one run of each condition" in text
 
 
-def test_runs_that_failed_are_told_at_the_top(tmp_path: Path) -> None:
-    """The summary of a report names the runs that failed and why, and how many they are."""
+def test_failed_runs_are_in_the_summary(tmp_path: Path) -> None:
+    """The summary section has the number of failed runs, their names and the reasons."""
     failed = [{"run": "a_L0_00", "reason": "the disk is full"}]
-    said = text_of("".join(head(report_of(summarize(campaign(), None, failed=failed), tmp_path))))
-    assert "1 of the runs asked for failed and are in no number of this page: a_L0_00: the disk is full" in said
-    assert "failed" not in text_of("".join(head(report_of(summarize(campaign(), None), tmp_path))))
+    text = text_of("".join(summary_parts(report_of(summarize(campaign(), None, failed=failed), tmp_path))))
+    assert "1 run failed and is left out: a_L0_00: the disk is full" in text
+    assert "failed" not in text_of("".join(summary_parts(report_of(summarize(campaign(), None), tmp_path))))
 
 
-def test_conditions_of_ones_own_have_no_paper_beside_them(tmp_path: Path) -> None:
-    """Conditions of other names, or that inject something else, are reported without the paper and its differences."""
+def test_other_conditions_are_not_compared_with_the_paper(tmp_path: Path) -> None:
+    """Conditions with other names or other injected delays are reported without the paper."""
     runs = [{**run_of("L0"), "condition": "mine"}, {**run_of("L1"), "condition": "L0"}]
     parts = all_parts(report_of(summarize(runs, None), tmp_path))
     assert "the paper" not in text_of("".join(parts.values())).lower()
@@ -177,8 +225,8 @@ def test_conditions_of_ones_own_have_no_paper_beside_them(tmp_path: Path) -> Non
     assert "mine" in parts["degradation"] + parts["conditions"]
 
 
-def test_an_old_summary_has_the_parts_it_can_have(tmp_path: Path) -> None:
-    """Without the keys of this version the parts made of them are left out, and the others are there."""
+def test_a_summary_of_an_older_version_is_reported(tmp_path: Path) -> None:
+    """Parts that need keys of a newer version are left out; the others are shown."""
     summary = copy.deepcopy(summarize(campaign(), None))
     for key in ("contrasts", "paper"):
         del summary[key]
@@ -189,8 +237,14 @@ def test_an_old_summary_has_the_parts_it_can_have(tmp_path: Path) -> None:
                 del condition[key]
     parts = all_parts(report_of(summary, tmp_path))
     assert [name for name, html in parts.items() if not html] == [
-        "contrasts", "differences", "survival", "stages", "groups", "axes", "routes",
-    ]  # fmt: skip
+        "contrasts",
+        "differences",
+        "survival",
+        "stages",
+        "groups",
+        "axes",
+        "routes",
+    ]
     rows = re.findall(r'<tr><td class="text">(L\d)</td>(.*?)</tr>', parts["conditions"])
     assert [name for name, _ in rows] == [*INJECTED] * 3
     shown = {name: text_of(cells).split() for name, cells in rows[: len(INJECTED)]}
@@ -199,8 +253,8 @@ def test_an_old_summary_has_the_parts_it_can_have(tmp_path: Path) -> None:
     assert {cells[1] for cells in shown.values()} == {"0", "100"}
 
 
-def test_two_presets_are_told_apart_everywhere(tmp_path: Path) -> None:
-    """Runs of equal names of two sweeps make two groups, and `conditions` are of the first; tables say which."""
+def test_two_presets_are_separate_groups(tmp_path: Path) -> None:
+    """Two sweeps with equal run names are two groups, `conditions` has the first, and tables name their group."""
     runs = [
         *campaign(sweep="calibrated"),
         *campaign(sweep="other", preset="designed", ending="completed", collisions=0),
@@ -210,44 +264,46 @@ def test_two_presets_are_told_apart_everywhere(tmp_path: Path) -> None:
     report = report_of(summary, tmp_path)
     parts = all_parts(report)
     assert [title_of(group, differing(report.groups)) for group in report.groups] == [
-        "preset paper_calibrated", "preset designed",
-    ]  # fmt: skip
-    assert "Virtual time, preset designed: Completed" in parts["head"]
+        "preset paper_calibrated",
+        "preset designed",
+    ]
+    assert "Virtual time, preset designed. Completed" in parts["summary"]
     assert "(preset paper_calibrated)" in parts["conditions"]
     assert {path.name for path in (tmp_path / "tables").glob("contrasts*.csv")} == {
-        "contrasts.csv", "contrasts_preset_designed.csv",
-    }  # fmt: skip
+        "contrasts.csv",
+        "contrasts_preset_designed.csv",
+    }
     assert parts["runs"].count('<td class="text">other</td>') == 36
     assert "designed" in parts["groups"]
 
 
-def test_sweeps_that_differ_in_nothing_else_are_told_by_their_names() -> None:
-    """Two sweeps of the same settings stay two groups."""
+def test_sweeps_with_equal_settings_are_separate_groups() -> None:
+    """Two sweeps with the same settings are two groups, distinguished by their names."""
     groups = summarize([*campaign(sweep="x"), *campaign(sweep="y")], None)["groups"]
     assert [title_of(group, differing(groups)) for group in groups] == ["sweep x", "sweep y"]
     assert "sweep" not in summarize(campaign(), None)["groups"][0]
 
 
-@pytest.mark.parametrize("many", [1, 2, 3])
-def test_axes_of_a_sweep_are_drawn(many: int, tmp_path: Path) -> None:
-    """One axis gives one column of panels, two a column for each value of the second; three are left to the table."""
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_axes_of_a_sweep_are_drawn(count: int, tmp_path: Path) -> None:
+    """One axis gives one column of panels, two give a column for each value of the second; three give no figure."""
     axes = {"controller.speed_mps": (10.0, 6.0, 8.0), "network.video.loss": (0.0, 0.1), "camera.rate_hz": (30.0, 15.0)}
     runs = campaign()
-    for name in list(axes)[:many]:
+    for name in list(axes)[:count]:
         runs = [{**run, "axes": {**run.get("axes", {}), name: value}} for value in axes[name] for run in runs]
     report = report_of(summarize(runs, None), tmp_path)
     html = "\n".join(axis_parts(report))
-    assert ("axes.png" in html) == (many < 3)
-    if many < 3:
-        figure = axis_figure(report.groups, axes_of(report.groups)[:many], report.colours)
-        assert len(figure.axes) == 3 * (1 if many == 1 else 2)
+    assert ("axes.png" in html) == (count < 3)
+    if count < 3:
+        figure = axis_figure(report.groups, axes_of(report.groups)[:count], report.colours)
+        assert len(figure.axes) == 3 * (1 if count == 1 else 2)
         line = figure.axes[0].get_lines()[0]
         assert list(np.asarray(line.get_xdata())) == [6.0, 8.0, 10.0]
         assert len(figure.axes[0].get_lines()) == 6
 
 
-def test_groups_are_told_apart_by_as_little_as_possible() -> None:
-    """What an axis tells already is not told again by the change it makes; axes are in the order of their values."""
+def test_group_titles_are_as_short_as_possible() -> None:
+    """A setting that an axis implies is not in the title of a group, and groups are sorted by their axis values."""
     runs = [run_of("L0", axes={"loss": loss}, changes=f"loss {loss}") for loss in (10.0, 2.0)]
     groups = in_order(summarize(runs, None)["groups"])
     assert differing(groups) == ["loss"]
@@ -255,8 +311,8 @@ def test_groups_are_told_apart_by_as_little_as_possible() -> None:
     assert [is_of(runs[1], group) for group in groups] == [True, False]
 
 
-def test_a_sweep_without_its_base_has_groups_all_the_same(tmp_path: Path) -> None:
-    """Where no run has the values of the sweep's own config the page says so and shows the groups."""
+def test_a_sweep_without_runs_of_its_base_config_shows_groups(tmp_path: Path) -> None:
+    """If no run has the values of the base config, the page says so and shows the groups."""
     runs = [{**run, "axes": {"speed": speed}} for run in campaign() for speed in (1.0, 2.0)]
     summary = summarize(runs, None, base={"speed": None})
     assert summary["conditions"] == {}
@@ -267,7 +323,7 @@ def test_a_sweep_without_its_base_has_groups_all_the_same(tmp_path: Path) -> Non
 
 
 def test_sweeps_without_a_common_condition_are_reported(tmp_path: Path) -> None:
-    """Two sweeps of which the one drove L0 and the other L3 share no condition, and are shown beside each other."""
+    """Two sweeps without a common condition are compared as groups."""
     runs = [run_of("L0", sweep="x"), run_of("L3", sweep="y", preset="designed")]
     parts = all_parts(report_of(summarize(runs, None, base={"sweep": "x"}), tmp_path))
     assert parts["contrasts"] == ""
@@ -275,15 +331,15 @@ def test_sweeps_without_a_common_condition_are_reported(tmp_path: Path) -> None:
 
 
 def test_a_drive_is_drawn_every_half_metre() -> None:
-    """Of a drive the first row, the last, and one for each half metre of its way are drawn; nothing of none."""
+    """The drawn rows of a drive are the first, the last, and one for each half metre of progress."""
     progress_m = np.linspace(0.0, 10.0, 1001)
     rows = drawn_points(progress_m)
     assert (rows[0], rows[-1], len(rows)) == (0, 1000, 21)
     assert drawn_points(np.zeros(0)) == []
 
 
-def test_boundaries_stand_in_the_report(make_run: MakeRun, tmp_path: Path) -> None:
-    """What `lavt boundary` found is a section of the page, with a figure and a table in every format."""
+def test_the_report_has_the_maximum_tolerable_latency(make_run: MakeRun, tmp_path: Path) -> None:
+    """The result of `lavt boundary` is a section of the page with a figure and a table in each format."""
     directory = make_run(tmp_path / "runs" / "0", seconds=2.0)
     server, client = (read_record(directory / f"{side}.mcap") for side in ("server", "client"))
     identity = {"run": "0", "time": "virtual", "injection": "model", "route": "A", "condition": "L0"}
@@ -291,16 +347,20 @@ def test_boundaries_stand_in_the_report(make_run: MakeRun, tmp_path: Path) -> No
     found = {"p25": 200.0, "p50": 210.0, "p75": 220.0, "interval": [195.0, 230.0], "n": 1}
     criteria = {f"{name}_ms": found for name in ("onset", "departure", "completion")}
     group = {
-        "route": "a", "preset": "designed", "n": 1, "theory_ms": 204.0, **criteria,
+        "route": "a",
+        "preset": "designed",
+        "n": 1,
+        "theory_ms": 204.0,
+        **criteria,
         "not_monotone": {"onset": 0, "departure": 0, "completion": 0},
-    }  # fmt: skip
+    }
     searched = {"searched_ms": [50.0, 600.0], "below": [], "onset_ms": 210.0, "departure_ms": 210.0}
     run = {"route": "a", "preset": "designed", "completion_ms": None, **searched}
     boundary = {"schema": 1, "config": {}, "runs": [run], "groups": [group]}
     html = write_report(tmp_path, boundaries=[boundary]).read_text()
-    assert '<h2 id="boundaries">' in html
+    assert '<h2 id="maximum_tolerable_latency">' in html
     assert 'href="boundary.svg"' in html
-    assert "designed, route a: by theory a swing grows from 204 ms of total delay" in html
+    assert "designed, route a: theory predicts growing oscillation from a total delay of 204 ms" in html
     assert "210" in (tmp_path / "report" / "tables" / "boundary.csv").read_text()
-    assert '<h2 id="boundaries">' not in write_report(tmp_path).read_text()
+    assert '<h2 id="maximum_tolerable_latency">' not in write_report(tmp_path).read_text()
     assert json.loads((tmp_path / "summary.json").read_text())["schema"] == 1

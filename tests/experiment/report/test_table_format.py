@@ -17,13 +17,13 @@ from lavt.experiment.report.table_format import (
     share_intervals,
     shares,
     tex_of,
-    words,
+    texts,
 )
 
 NASTY = 'a_b & 50 % of $x^2 #1 {~} \\ "<b>"\nτ'
 
 TABLE = TableData(
-    [words("name"), numbers("error m", 2), shares("completed"), share_intervals("interval"), latencies("loop ms")],
+    [texts("name"), numbers("error m", 2), shares("completed"), share_intervals("interval"), latencies("loop ms")],
     [
         [NASTY, 1 / 3, 0.5, (0.123456789, 1.0), {"p5": 1.0, "p50": 2.25, "p95": 3.0, "n": 4}],
         ["nothing", None, None, None, None],
@@ -31,20 +31,25 @@ TABLE = TableData(
 )
 
 
-def test_csv_has_every_value_whole() -> None:
-    """Texts and numbers come back from the CSV as they were, each in a column; what is not known is empty."""
+def test_csv_keeps_all_values_exactly() -> None:
+    """The CSV has each text and number unchanged in its own column; an unknown value is empty."""
     head, first, second = csv.reader(io.StringIO(csv_of(TABLE)))
     parts = ["loop ms p50", "loop ms p5", "loop ms p95"]
     assert head == [
-        "name", "error m", "completed (share)", "interval low (share)", "interval high (share)", *parts,
-    ]  # fmt: skip
+        "name",
+        "error m",
+        "completed (share)",
+        "interval low (share)",
+        "interval high (share)",
+        *parts,
+    ]
     assert first[0] == NASTY
     assert [float(cell) for cell in first[1:]] == [1 / 3, 0.5, 0.123456789, 1.0, 2.25, 1.0, 3.0]
     assert second == ["nothing", "", "", "", "", "", "", ""]
 
 
-def test_latex_escapes_what_would_be_a_command() -> None:
-    """Each of LaTeX's special characters is escaped, a row stays on a line, and a share's sign is one of text."""
+def test_latex_escapes_special_characters() -> None:
+    """LaTeX's special characters are escaped, each row is one line, and a per cent sign is text."""
     lines = tex_of(TABLE).splitlines()
     row = next(line for line in lines if "a\\_b" in line)
     assert row.startswith(
@@ -55,33 +60,36 @@ def test_latex_escapes_what_would_be_a_command() -> None:
     assert lines[2] == r"\resizebox{\textwidth}{!}{\begin{tabular}{lrrrr}"
     assert lines[-3:] == [r"nothing & -- & -- & -- & -- \\", r"\bottomrule", r"\end{tabular}}"]
     assert [line for line in lines if line.startswith("\\") and "rule" in line] == [
-        r"\toprule", r"\midrule", r"\bottomrule",
-    ]  # fmt: skip
+        r"\toprule",
+        r"\midrule",
+        r"\bottomrule",
+    ]
 
 
 def test_latex_reads_no_cell_as_an_option() -> None:
-    """A row that begins with a bracket or a star is no argument of the line break before it."""
-    lines = tex_of(TableData([words("name")], [["[1 m]"], ["*"]])).splitlines()
+    """A row that begins with a bracket or a star is not an option of the line break before it."""
+    lines = tex_of(TableData([texts("name")], [["[1 m]"], ["*"]])).splitlines()
     assert lines[5:7] == [r"{[}1 m] \\", r"{*} \\"]
 
 
-def test_a_wide_table_is_fitted_to_the_page_in_latex() -> None:
-    """A long title is broken into lines, and a table that is wide all the same is scaled; a narrow one is not."""
+def test_a_wide_latex_table_is_scaled_to_the_line() -> None:
+    """A long column title is broken into lines, and a table that remains too wide is scaled."""
     column = numbers("collisions of the paper / run", 2)
     narrow, wide = (tex_of(TableData([column] * many, [[1.0] * many])).splitlines() for many in (2, 12))
     title = r"\shortstack[r]{collisions of\\the paper /\\run}"
     assert narrow[3] == rf"{title} & {title} \\"
     assert not any("graphicx" in line or "resizebox" in line for line in narrow)
     assert wide[1:3] == [
-        r"% needs \usepackage{graphicx}", rf"\resizebox{{\textwidth}}{{!}}{{\begin{{tabular}}{{{'r' * 12}}}",
-    ]  # fmt: skip
+        r"% needs \usepackage{graphicx}",
+        rf"\resizebox{{\textwidth}}{{!}}{{\begin{{tabular}}{{{'r' * 12}}}",
+    ]
     assert wide[-1] == r"\end{tabular}}"
 
 
-def test_long_texts_can_be_broken_in_latex() -> None:
-    """A text too long for a line stands in a column that breaks it, within JSON, too."""
+def test_latex_breaks_long_texts() -> None:
+    """A column with a long text has line breaks, also inside JSON."""
     text = 'said: {"of_one":"word","of_two":"words, or more"}'
-    for column in (words("endings"), words("endings", is_long=True)):
+    for column in (texts("endings"), texts("endings", is_long=True)):
         lines = tex_of(TableData([column], [[text]])).splitlines()
         assert lines[1] == r"\begin{tabular}{p{6cm}}"
         assert lines[5] == (
@@ -90,21 +98,21 @@ def test_long_texts_can_be_broken_in_latex() -> None:
 
 
 def test_html_escapes_texts() -> None:
-    """No text of a table becomes HTML, and every row has a cell for each column."""
+    """Texts of a table are escaped in HTML, and each row has a cell for each column."""
     html = html_of(TABLE)
     assert "&lt;b&gt;" in html
     assert "<b>" not in html
     assert [len(re.findall("<t[dh]", row)) for row in html.split("<tr>")[1:]] == [5, 5, 5]
 
 
-def test_columns_without_any_value_are_left_out() -> None:
-    """A column of which no row knows a value is not shown; one with a single value is."""
-    columns = [words("name"), numbers("known"), share_intervals("unknown"), probabilities("p")]
+def test_columns_without_values_are_left_out() -> None:
+    """A column without a known value is left out; a column with one value remains."""
+    columns = [texts("name"), numbers("known"), share_intervals("unknown"), probabilities("p")]
     table = TableData(columns, [["a", None, None, None], ["b", 1.0, None, None]]).without_empty()
     assert [column.title for column in table.columns] == ["name", "known"]
     assert table.rows == [["a", None], ["b", 1.0]]
 
 
-def test_a_small_probability_is_never_nothing() -> None:
-    """A p value has two significant digits, and one too small for them is less than, not zero."""
+def test_a_small_p_value_is_not_zero() -> None:
+    """A p value has two significant digits, and a very small one is shown as less than 0.0001."""
     assert [probability(p) for p in (None, 1.0, 0.0371, 0.00002)] == [NOTHING, "1", "0.037", f"<{UNBROKEN}0.0001"]

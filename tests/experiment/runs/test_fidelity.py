@@ -14,7 +14,7 @@ from lavt.config import RunConfig
 from lavt.config_file import load_config, shipped
 from lavt.domain import NS_PER_S
 from lavt.errors import UserError
-from lavt.experiment.report.tables import FIDELITY_SAYS
+from lavt.experiment.report.tables import FIDELITY_DESCRIPTIONS
 from lavt.experiment.runs.plan import PlannedRun, plan_run
 from lavt.experiment.runs.run import run_once
 from lavt.experiment.runs.virtual_run import build_loop, drive
@@ -108,7 +108,7 @@ def test_lost_packets_are_lost_frames_at_geometry(tmp_path: Path) -> None:
 
 def test_the_report_describes_every_fidelity() -> None:
     """The report has a description of every fidelity."""
-    assert set(FIDELITY_SAYS) == set(FIDELITIES)
+    assert set(FIDELITY_DESCRIPTIONS) == set(FIDELITIES)
 
 
 def test_geometry_needs_a_known_road(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,1 +1,1 @@
-"""The report of a run, a sweep or a boundary: pages, tables, sentences and figures."""
+"""The report of a run, a sweep or a boundary search: page, tables, sentences and figures."""

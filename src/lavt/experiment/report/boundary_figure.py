@@ -1,4 +1,4 @@
-"""Boundaries as a figure and as a table, of what is in `boundary.json`."""
+"""The maximum tolerable latency as a figure and as a table, from the contents of `boundary.json`."""
 
 from __future__ import annotations
 
@@ -9,26 +9,26 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from lavt.experiment.report.table_format import LOW_HIGH, NOTHING, UNBROKEN, Column, TableData, number, numbers, words
+from lavt.experiment.report.table_format import LOW_HIGH, NOTHING, UNBROKEN, Column, TableData, number, numbers, texts
 from lavt.experiment.statistics.boundary_summary import CRITERIA
 
-LOOKS = {"onset": ("#0072b2", "o"), "departure": ("#e69f00", "s"), "completion": ("#d55e00", "D")}
-"""Colour (Okabe and Ito) and marker of each criterion: told apart without colour, too."""
-LABELS = {"onset": "swing begins to grow", "departure": "first leaves its lane", "completion": "not completed"}
-APART = {"onset": 0.26, "departure": 0.0, "completion": -0.26}
-"""So far from the middle of its route's row each criterion is, upwards."""
+STYLES = {"onset": ("#0072b2", "o"), "departure": ("#e69f00", "s"), "completion": ("#d55e00", "D")}
+"""Colour (Okabe and Ito) and marker of each criterion; the markers differ, too."""
+LABELS = {"onset": "oscillation begins to grow", "departure": "first leaves its lane", "completion": "not completed"}
+ROW_OFFSETS = {"onset": 0.26, "departure": 0.0, "completion": -0.26}
+"""Upward offset of each criterion from the middle of its route's row."""
 ALL_ROUTES = "all routes"
 
 Boundary = Mapping[str, Any]
-"""What `boundary.json` holds."""
+"""The contents of `boundary.json`."""
 
 
 def boundary_figure(boundary: Boundary) -> Figure:
-    """Total delays at which each criterion is first met: a panel a preset, a row a route, a small point a seed.
+    """Return the figure of total delays at which each criterion is first met: a panel for each preset, a row a route.
 
-    The large point is the median, the bar its 95 % interval, the dashed line what theory says of the onset. What was
-    not met within the searched range is counted at the right edge, what was met already at its beginning at the left;
-    an interval that ends out of range is drawn to its edge.
+    A tick is a seed, the large point the median, the bar its 95 % interval, and the dashed line the onset by theory.
+    Seeds that do not meet a criterion in the searched range are counted at the right edge, seeds that meet it from the
+    beginning at the left edge. An interval that ends out of range is drawn to its edge.
     """
     presets = list(dict.fromkeys(group["preset"] for group in boundary["groups"]))
     rows = {preset: [each for each in boundary["groups"] if each["preset"] == preset] for preset in presets}
@@ -40,10 +40,10 @@ def boundary_figure(boundary: Boundary) -> Figure:
     for axes, preset in zip(panels[:, 0], presets, strict=True):
         _panel(axes, boundary["runs"], rows[preset])
         axes.set_title(preset, loc="left", fontsize=10)
-    panels[-1, 0].set_xlabel("total delay, middle of exposure to the wheel's command (ms)")
+    panels[-1, 0].set_xlabel("total delay, from the middle of the exposure to the wheel's command (ms)")
     handles = [
         Line2D([], [], linestyle="none", marker=marker, color=colour, label=LABELS[name])
-        for name, (colour, marker) in LOOKS.items()
+        for name, (colour, marker) in STYLES.items()
     ]
     handles.append(Line2D([], [], linestyle="--", color="black", label="onset by theory"))
     figure.legend(handles=handles, fontsize=8, ncols=4, loc="outside lower center", frameon=False)
@@ -54,7 +54,7 @@ def _panel(axes: Axes, runs: Sequence[Mapping[str, Any]], groups: Sequence[Mappi
     for row, group in enumerate(reversed(groups)):
         chosen = [run for run in runs if run["preset"] == group["preset"] and group["route"] in (None, run["route"])]
         for name in CRITERIA:
-            _criterion(axes, row + APART[name], name, chosen, group)
+            _criterion(axes, row + ROW_OFFSETS[name], name, chosen, group)
     if groups[0]["theory_ms"] is not None:
         axes.axvline(groups[0]["theory_ms"], color="black", linestyle="--", linewidth=1, zorder=1)
     axes.set_yticks(range(len(groups)), [group["route"] or ALL_ROUTES for group in reversed(groups)])
@@ -67,8 +67,8 @@ def _panel(axes: Axes, runs: Sequence[Mapping[str, Any]], groups: Sequence[Mappi
 def _criterion(
     axes: Axes, height: float, name: str, runs: Sequence[Mapping[str, Any]], group: Mapping[str, Any]
 ) -> None:
-    """Draw one criterion of one row: a point for each seed, the median with its interval, and who is out of range."""
-    colour, marker = LOOKS[name]
+    """Draw one criterion of one row: a tick for each seed, the median with its interval, and seeds out of range."""
+    colour, marker = STYLES[name]
     found_ms = [run[f"{name}_ms"] for run in runs if run[f"{name}_ms"] is not None]
     axes.plot(found_ms, [height] * len(found_ms), "|", color=colour, markersize=7, alpha=0.55)
     summary = group[f"{name}_ms"]
@@ -87,14 +87,20 @@ def _criterion(
     ):
         if count:
             axes.annotate(
-                f"{sign}{count}", (place_ms, height), xytext=(aside, 0), textcoords="offset points", color=colour,
-                fontsize=8, ha=side, va="center",
-            )  # fmt: skip
+                f"{sign}{count}",
+                (place_ms, height),
+                xytext=(aside, 0),
+                textcoords="offset points",
+                color=colour,
+                fontsize=8,
+                ha=side,
+                va="center",
+            )
 
 
 def boundary_table(boundary: Boundary) -> TableData:
-    """Make the table of all groups: median, its interval, and quartiles of each criterion, in ms."""
-    columns = [words("route"), words("preset"), numbers("seeds", 0), numbers("onset by theory (ms)", 0)]
+    """Return the table of all groups: median, its interval, and quartiles of each criterion, in ms."""
+    columns = [texts("route"), texts("preset"), numbers("seeds", 0), numbers("onset by theory (ms)", 0)]
     for name in CRITERIA:
         columns += [
             numbers(f"{LABELS[name]}: median (ms)", 0),
@@ -116,7 +122,7 @@ def _row(group: Mapping[str, Any]) -> list[Any]:
 
 
 def span(ends: Sequence[float | None] | None) -> str:
-    """Write two ends in whole milliseconds; one that is out of range is a dash, and so are both."""
+    """Return two ends in whole milliseconds; an end out of range is a dash."""
     if ends is None or ends[0] is ends[1] is None:
         return NOTHING
     return " to ".join(number(end, 0) for end in ends).replace(" ", UNBROKEN)

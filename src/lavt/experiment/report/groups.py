@@ -1,4 +1,4 @@
-"""Groups of a summary: what the runs of one have in common, and in what the groups differ."""
+"""Groups of a summary: the settings of each group, and the settings in which groups differ."""
 
 from __future__ import annotations
 
@@ -12,38 +12,38 @@ STATISTICS = ("conditions", "contrasts")
 """The keys of a group that are not settings."""
 
 USUAL = ("fidelity", "inherent", "controller", "preset", "driver", "changes", "sweep")
-"""Settings that every run has; any other is an axis of the sweep."""
+"""Settings of every run; any other setting is an axis of the sweep."""
 
 
 def settings_of(group: Group) -> dict[str, Any]:
-    """Give what the runs of a group have in common."""
+    """Return the settings that the runs of a group share."""
     return {name: value for name, value in group.items() if name not in STATISTICS}
 
 
 def axes_of(groups: Sequence[Group]) -> list[str]:
-    """Name the further axes of a sweep that were driven at more than one value, in their order."""
+    """Return the names of the sweep's axes that have more than one value, in their order."""
     names = dict.fromkeys(name for group in groups for name in settings_of(group) if name not in USUAL)
     return [name for name in names if len({str(group.get(name)) for group in groups}) > 1]
 
 
 def in_order(groups: Sequence[Group]) -> list[Group]:
-    """Put groups into the order of their axes' values; what axes do not tell apart keeps its order."""
+    """Return the groups sorted by the values of their axes; groups with equal values keep their order."""
     axes = axes_of(groups)
-    return sorted(groups, key=lambda group: [_place(group.get(name)) for name in axes])
+    return sorted(groups, key=lambda group: [_sort_key(group.get(name)) for name in axes])
 
 
-def _place(value: Any) -> tuple[bool, float, str]:
+def _sort_key(value: Any) -> tuple[bool, float, str]:
     is_number = isinstance(value, int | float)
     return not is_number, float(value) if is_number else 0.0, str(value)
 
 
 def differing(groups: Sequence[Group]) -> list[str]:
-    """Name the fewest settings that tell the groups apart: further axes first, then what those do not tell."""
-    told: list[str] = []
+    """Return the names of the fewest settings that distinguish the groups; axes come first."""
+    names: list[str] = []
     for name in (*axes_of(groups), *USUAL):
-        if len(_values(groups, [*told, name])) > len(_values(groups, told)):
-            told.append(name)
-    return told
+        if len(_values(groups, [*names, name])) > len(_values(groups, names)):
+            names.append(name)
+    return names
 
 
 def _values(groups: Sequence[Group], names: Sequence[str]) -> set[tuple[str, ...]]:
@@ -51,17 +51,17 @@ def _values(groups: Sequence[Group], names: Sequence[str]) -> set[tuple[str, ...
 
 
 def title_of(group: Group, names: Sequence[str]) -> str:
-    """Say which group it is by the settings `names`."""
+    """Return a title of the group from the settings `names`."""
     return ", ".join(f"{short(name)} {'none' if group.get(name) is None else group[name]}" for name in names)
 
 
 def short(name: str) -> str:
-    """Give the last two words of a dotted name: which flow, and what of it."""
+    """Return the last two parts of a dotted name, such as the flow and its property."""
     return " ".join(name.split(".")[-2:]).replace("_", " ")
 
 
 def is_of(run: Mapping[str, Any], group: Group) -> bool:
-    """Tell whether a run is one of a group."""
+    """Return whether a run belongs to a group."""
     axes = run.get("axes") or {}
     return all(
         str(axes[name] if name in axes else run.get(name)) == str(value) for name, value in settings_of(group).items()

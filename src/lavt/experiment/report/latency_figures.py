@@ -1,4 +1,4 @@
-"""Figures of latency: injected against measured, what it does to driving, where the loop goes. Nothing reads a file."""
+"""Figures of latency: measured over injected, its effect on driving, and stages. None reads a file."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from lavt.experiment.report.figure_style import (
     Colours,
     Conditions,
     Point,
-    beside,
+    clusters_of,
     kind_handles,
     legend_below,
     marker,
-    near_each_other,
+    name_style,
     new_figure,
     tidy,
 )
@@ -31,73 +31,73 @@ OTHER_COLOURS = "Reds"
 PAPER_MARKER: dict[str, Any] = {"marker": "^", "color": "0.55", "label": "the paper", "zorder": 1}
 
 DIAMOND: dict[str, Any] = {"marker": "D", "markersize": 4, "markerfacecolor": "white"}
-"""The error up to the common distance."""
+"""Marker of the error up to the common distance."""
 
 ERROR_LABEL = "P95 of cross-track error,\nmean of runs (m)"
 
-Place = tuple[str, str]
-"""Where a condition has a latency: key, and key in that."""
+LatencyKey = tuple[str, str]
+"""Path of a latency in a condition: a key, and a key in its value."""
 
-LOOP: Place = ("loop_ms", "p50")
+LOOP: LatencyKey = ("loop_ms", "p50")
 
-SCALES: Mapping[str, Place] = {
+SCALES: Mapping[str, LatencyKey] = {
     "loop latency, median (ms)": LOOP,
-    "picture age, mean (ms)": ("picture_age_ms", "mean"),
+    "frame age, mean (ms)": ("picture_age_ms", "mean"),
 }
-"""What degradation is drawn over."""
+"""The latencies on the x axes of the degradation figure, by label."""
 
 
 def degradation_figure(kinds: Mapping[str, Conditions], paper: Conditions, colours: Colours) -> Figure:
-    """Completion and cross-track error over loop latency and, where it is known, picture age: one point a condition.
+    """Return the figure of completion and cross-track error over loop latency and, if known, frame age.
 
-    `paper` has the paper's conditions, drawn over its tau_v + tau_c beside our loop latency. Diamonds are the error up
-    to the common distance, of all runs.
+    Each condition is a point. The conditions in `paper` are drawn at the paper's tau_v + tau_c. Diamonds are the error
+    of all runs up to the common distance.
     """
-    scales = {label: place for label, place in SCALES.items() if any(_known(kinds, place))}
+    scales = {label: latency for label, latency in SCALES.items() if any(_known(kinds, latency))}
     named: list[tuple[Axes, str, list[Point]]] = []
     figure = new_figure(5.6)
     panels = figure.subplots(2, len(scales), sharex="col", sharey="row", squeeze=False)
-    for column, (label, place) in enumerate(scales.items()):
+    for column, (label, latency) in enumerate(scales.items()):
         completion, error = panels[:, column]
         for kind, conditions in {"paper": _with_totals(paper), **kinds}.items():
             shown = {
-                completion: _over(conditions, place, "completion_rate", "completion_interval", 100.0),
-                error: _over(conditions, place, "p95_m", "p95_interval"),
+                completion: _over(conditions, latency, "completion_rate", "completion_interval", 100.0),
+                error: _over(conditions, latency, "p95_m", "p95_interval"),
             }
             for axes, points in shown.items():
                 for point in points:
                     _draw(axes, point, PAPER_MARKER if kind == "paper" else marker(kind, colours[point[0]]))
                 named.append((axes, kind, points))
-            for point in _over(conditions, place, "p95_common_m", "p95_common_interval"):
+            for point in _over(conditions, latency, "p95_common_m", "p95_common_interval"):
                 _draw(error, point, {**DIAMOND, "color": colours[point[0]], "zorder": 4})
         completion.margins(x=0.16)
         error.margins(x=0.16)
         tidy(completion, "", "runs completed (%)" if column == 0 else "")
         tidy(error, label, ERROR_LABEL if column == 0 else "")
-    panels[0, 0].set_ylim(-9, 112)  # names of points stand below them, or above
+    panels[0, 0].set_ylim(-9, 112)  # room for the names below and above the points
     panels[1, 0].set_ylim(bottom=-0.09 * panels[1, 0].get_ylim()[1])
     for axes, kind, points in named:
-        _name(axes, near_each_other(points, axes), kind)
+        _write_names(axes, clusters_of(points, axes), kind)
     handles: list[Any] = kind_handles(kinds)
     if any("p95_common_m" in entry for conditions in kinds.values() for entry in conditions.values()):
-        said = "error up to the common distance"
-        handles.append(Line2D([], [], label=said, color="0.4", linestyle="none", **DIAMOND))
+        label = "error up to the common distance"
+        handles.append(Line2D([], [], label=label, color="0.4", linestyle="none", **DIAMOND))
     if paper:
         handles.append(Line2D([], [], linestyle="none", **PAPER_MARKER))
     legend_below(figure, handles)
     return figure
 
 
-def _known(kinds: Mapping[str, Conditions], place: Place) -> list[bool]:
-    key, part = place
+def _known(kinds: Mapping[str, Conditions], latency: LatencyKey) -> list[bool]:
+    key, part = latency
     return [
         (entry.get(key) or {}).get(part) is not None for conditions in kinds.values() for entry in conditions.values()
     ]
 
 
-def _over(conditions: Conditions, place: Place, value: str, bounds: str, unit: float = 1.0) -> list[Point]:
-    """Points of the conditions that know both."""
-    key, part = place
+def _over(conditions: Conditions, latency: LatencyKey, value: str, bounds: str, unit: float = 1.0) -> list[Point]:
+    """Return the points of the conditions that have both values."""
+    key, part = latency
     points: list[Point] = []
     for name, entry in conditions.items():
         x, y, interval = (entry.get(key) or {}).get(part), entry.get(value), entry.get(bounds)
@@ -107,28 +107,28 @@ def _over(conditions: Conditions, place: Place, value: str, bounds: str, unit: f
 
 
 def _with_totals(paper: Conditions) -> Conditions:
-    """Put the paper's points where its two latencies sum to."""
+    """Return the paper's conditions with the sum of both one-way latencies as loop latency."""
     return {name: {**entry, "loop_ms": {"p50": entry["tau_v_ms"] + entry["tau_c_ms"]}} for name, entry in paper.items()}
 
 
 def _draw(axes: Axes, point: Point, style: Mapping[str, Any]) -> None:
-    """Draw a point with its interval, where it has one."""
+    """Draw a point, with its interval if it has one."""
     _, x, y, interval = point
     reach = None if interval is None else [[max(y - interval[0], 0)], [max(interval[1] - y, 0)]]
     axes.errorbar(x, y, yerr=reach, capsize=3, linestyle="none", elinewidth=1, **style)
 
 
-def _name(axes: Axes, places: Sequence[Sequence[Point]], kind: str) -> None:
-    """Write the names of points that are near each other together, the upper point's above."""
-    for place in places:
-        middle = (sum(x for _, x, _, _ in place) / len(place), sum(y for _, _, y, _ in place) / len(place))
-        axes.annotate("\n".join(name for name, _, _, _ in place), middle, **beside(kind))
+def _write_names(axes: Axes, clusters: Sequence[Sequence[Point]], kind: str) -> None:
+    """Write the names of each cluster of points in the vertical order of the points."""
+    for cluster in clusters:
+        middle = (sum(x for _, x, _, _ in cluster) / len(cluster), sum(y for _, _, y, _ in cluster) / len(cluster))
+        axes.annotate("\n".join(name for name, _, _, _ in cluster), middle, **name_style(kind))
 
 
 def presets_figure(groups: Mapping[str, Conditions], colours: Colours) -> Figure:
-    """Completion and cross-track error over loop latency: one line a group, one colour a condition.
+    """Return the figure of completion and error over loop latency: a line for each group, a colour for each condition.
 
-    Conditions at one place, of which one hides another, are named.
+    Conditions whose points overlap are named.
     """
     figure = new_figure(3.8)
     completion, error = figure.subplots(1, 2)
@@ -147,7 +147,7 @@ def presets_figure(groups: Mapping[str, Conditions], colours: Colours) -> Figure
     tidy(error, "loop latency, median (ms)", ERROR_LABEL, "Error of completed runs")
     error.set_ylim(0, 1.1 * error.get_ylim()[1])
     for axes, points in lines:
-        _name(axes, [place for place in near_each_other(points, axes) if len(place) > 1], "group")
+        _write_names(axes, [cluster for cluster in clusters_of(points, axes) if len(cluster) > 1], "group")
     groups_shown = [
         Line2D([], [], color="0.4", marker=symbols[title], label=title, linestyle="none") for title in groups
     ]
@@ -157,10 +157,10 @@ def presets_figure(groups: Mapping[str, Conditions], colours: Colours) -> Figure
 
 
 def injected_figure(kinds: Mapping[str, Conditions], colours: Colours) -> Figure:
-    """Injected against measured delay of video and of control.
+    """Return the figure of measured one-way latency over injected delay, for video and control.
 
-    Above: medians, bars from p5 to p95, and lines for the injected delay on top of the latency without any. Below: how
-    far the medians are from those lines; bars are the bound of the clocks.
+    The upper panels show medians with bars from p5 to p95, and the line of the least latency plus the injected delay.
+    The lower panels show the deviation of the medians from this line; bars are the bound of the clock error.
     """
     figure = new_figure(5.2)
     panels = figure.subplots(2, 2, sharex="col", height_ratios=[3, 2])
@@ -172,7 +172,7 @@ def injected_figure(kinds: Mapping[str, Conditions], colours: Colours) -> Figure
         symbol = "τ video" if direction == "video" else "τ control"
         tidy(above, "", f"{symbol}, measured (ms)", direction.capitalize())
         above.set_ylim(bottom=min(0.0, above.get_ylim()[0]))
-        tidy(below, f"injected {direction} delay (ms)", "off the line (ms)")
+        tidy(below, f"injected {direction} delay (ms)", "deviation (ms)")
         low, high = below.get_ylim()
         below.set_ylim(min(low, -1.2), max(high, 1.2))
         below.axhline(0, color="0.6", linewidth=0.8, zorder=0)
@@ -181,7 +181,7 @@ def injected_figure(kinds: Mapping[str, Conditions], colours: Colours) -> Figure
 
 
 def _injected_points(conditions: Conditions, direction: str, key: str) -> list[tuple[str, float, Mapping[str, Any]]]:
-    """Conditions of which both are known, least injected first."""
+    """Return the conditions with known injected delay and latency, sorted by injected delay."""
     points = [
         (name, float(condition["injected_ms"][direction]), condition[key])
         for name, condition in conditions.items()
@@ -211,12 +211,12 @@ def _draw_injected(
         below.errorbar(injected_ms, latency["p50"] - injected_ms - base_ms, yerr=latency["bound"] or 0.0, **style)
     medians_ms = {injected_ms: latency["p50"] for _, injected_ms, latency in points}
     for injected_ms, names in together.items():
-        above.annotate(", ".join(names), (injected_ms, medians_ms[injected_ms]), **beside(kind))
+        above.annotate(", ".join(names), (injected_ms, medians_ms[injected_ms]), **name_style(kind))
     above.margins(x=0.15)
 
 
 def stages_figure(stages: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
-    """Where the time of the median loop goes: a bar a condition, a colour a node, a shade a hop of `stages_ms`."""
+    """Return the figure of stage latencies: a bar for each condition, with a shade for each stage."""
     figure = new_figure(0.42 * len(stages) + 1.6)
     axes = figure.subplots()
     colours = _stage_colours(stages)
@@ -231,7 +231,7 @@ def stages_figure(stages: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
     axes.set_yticks(range(len(stages)), list(stages))
     axes.invert_yaxis()
     axes.margins(x=0.1)
-    tidy(axes, "median of each hop, one after the other (ms)", "")
+    tidy(axes, "median latency of the stages, in order (ms)", "")
     axes.grid(visible=False, axis="y")
     legend = {stage if node == "network" else node: colour for (node, stage), colour in colours.items()}
     legend_below(figure, [Patch(color=colour, label=name) for name, colour in legend.items()])
@@ -239,7 +239,7 @@ def stages_figure(stages: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
 
 
 def _stage_colours(every_condition: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[tuple[str, str], Any]:
-    """Give each hop a shade of its node's colour."""
+    """Return a shade of its node's colour for each stage."""
     names = list(
         dict.fromkeys((stage["node"], stage["stage"]) for stages in every_condition.values() for stage in stages)
     )

@@ -1,4 +1,4 @@
-"""The report of runs: `summary.json`, and `report/index.html` with its figures and tables beside it."""
+"""The report of runs: `summary.json`, and `report/` with the page `index.html`, its figures and its tables."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ from lavt.experiment.report.sections import (
     degradation_parts,
     difference_parts,
     group_parts,
-    head,
     injected_parts,
     route_parts,
     run_parts,
     stage_parts,
+    summary_parts,
     survival_parts,
 )
 from lavt.experiment.statistics.summary import summarize
 
-TITLE = "LAVT: latency and driving"
+TITLE = "LAVT: driving performance over network latency"
 
 
 def write_report(
@@ -57,18 +57,17 @@ def write_report(
 ) -> Path:
     """Write `summary.json` and `report/` into `sweep_dir`, and return the page's path.
 
-    `run_dirs` are the runs to report, by default those under `sweep_dir/runs`. `base` is that of
-    `summary.summarize`; `speed`, where it is not given, is kept from the summary that is already there. `drives` are
-    those that were read already, by run directory. `sweeps` names, by run directory, the sweep a run is of, where runs
-    of several are reported together. `boundaries` are contents of `boundary.json`. `failed` are runs that
-    failed, as in `FAILED`; they and those whose result cannot be read are left out, and the page says so. Raises
-    `WorkError` where no run is left.
+    `run_dirs` are the directories of the runs, by default those under `sweep_dir/runs`. `base` is passed to
+    `summary.summarize`. `speed` defaults to the value in the existing summary. `drives` has drives that are already
+    read, by run directory. `sweeps` has the sweep of each run directory if the runs are from several sweeps.
+    `boundaries` are the contents of `boundary.json` files. `failed` are the failed runs, as in `FAILED`; the page lists
+    them, and the runs without a readable result, as left out. Raises `WorkError` if no run is left.
     """
     if run_dirs is None:
         run_dirs = sorted(path for path in (sweep_dir / "runs").glob("*") if path.is_dir())
     results, unfinished = _read_results(run_dirs, sweeps or {})
-    known = {each["run"] for each in failed}
-    left_out = [*failed, *({"run": name, "reason": "it has no result"} for name in unfinished if name not in known)]
+    reported = {each["run"] for each in failed}
+    left_out = [*failed, *({"run": name, "reason": "no result"} for name in unfinished if name not in reported)]
     if not results:
         raise WorkError(f"there is no finished run in {sweep_dir}: a run leaves a result.json in its directory")
     summary_path = sweep_dir / "summary.json"
@@ -80,7 +79,7 @@ def write_report(
     report_dir.mkdir(parents=True, exist_ok=True)
     report = ReportContext(summary, report_dir, condition_colours(str(run["condition"]) for run in summary["runs"]))
     sets = read_drives(drawn_runs(report, results), drives or {})
-    with mpl.rc_context({"text.parse_math": False}):  # a name with a dollar is no formula
+    with mpl.rc_context({"text.parse_math": False}):  # a dollar sign in a name does not begin a formula
         sections = _sections(report, sets, boundaries)
     index = report_dir / "index.html"
     index.write_text(html_page.page(TITLE, sections), encoding="utf-8")
@@ -90,30 +89,30 @@ def write_report(
 def _sections(
     report: ReportContext, sets: DriveSets, boundaries: Sequence[Mapping[str, Any]]
 ) -> list[html_page.Section]:
-    """Make the page's sections in their order."""
+    """Return the page's sections in their order."""
     return [
-        ("Summary", head(report)),
+        ("Summary", summary_parts(report)),
         ("Conditions", conditions_parts(report)),
         ("Planned contrasts", contrast_parts(report)),
-        ("Where this differs from the paper, and why", difference_parts(report)),
+        ("Differences from the paper", difference_parts(report)),
         ("Trajectories", trajectory_parts(report, sets)),
         ("Injected and measured latency", injected_parts(report)),
-        ("Driving against latency", degradation_parts(report)),
-        ("How far the runs came", survival_parts(report)),
-        ("Boundaries", boundary_parts(boundaries, report.directory)),
-        ("Where the latency comes from", stage_parts(report, captured_ms(sets))),
-        ("Presets and settings compared", group_parts(report)),
+        ("Driving performance over latency", degradation_parts(report)),
+        ("Distance driven and endings", survival_parts(report)),
+        ("Maximum tolerable latency", boundary_parts(boundaries, report.directory)),
+        ("Latency of each stage", stage_parts(report, captured_ms(sets))),
+        ("Comparison of presets and settings", group_parts(report)),
         ("Axes of the sweep", axis_parts(report)),
-        ("Route by route", route_parts(report)),
+        ("Results by route", route_parts(report)),
         ("Single runs", single_run_parts(report, sets)),
-        ("Every run", run_parts(report)),
-        ("Clocks of two machines", clock_parts(report)),
-        ("Versions and machine", machine_parts(report, sets)),
+        ("All runs", run_parts(report)),
+        ("Clock offset between two machines", clock_parts(report)),
+        ("Versions and machines", machine_parts(report, sets)),
     ]
 
 
 def read_failed(sweep_dir: Path) -> list[dict[str, str]]:
-    """Read which runs of a sweep failed, and why."""
+    """Return the failed runs of a sweep with the reasons."""
     return list(read_json(sweep_dir / FAILED)) if (sweep_dir / FAILED).is_file() else []
 
 
@@ -121,11 +120,11 @@ def _read_results(
     run_dirs: Sequence[Path], sweeps: Mapping[Path, str]
 ) -> tuple[list[tuple[Path, dict[str, Any]]], list[str]]:
     results: list[tuple[Path, dict[str, Any]]] = []
-    left_out: list[str] = []
+    unfinished: list[str] = []
     for directory in run_dirs:
-        named = {"sweep": sweeps[directory]} if directory in sweeps else {}
+        sweep = {"sweep": sweeps[directory]} if directory in sweeps else {}
         try:
-            results.append((directory, {**read_json(directory / "result.json"), **named}))
+            results.append((directory, {**read_json(directory / "result.json"), **sweep}))
         except WorkError:
-            left_out.append(directory.name)
-    return results, left_out
+            unfinished.append(directory.name)
+    return results, unfinished

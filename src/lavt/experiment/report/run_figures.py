@@ -1,4 +1,4 @@
-"""Figures of single drives: where they went, how they steered, what was seen. Nothing here reads a file."""
+"""Figures of single drives: trajectories, steering and received frames. None reads a file."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lavt.experiment.analysis.drive_data import DriveData
 from lavt.experiment.report.figure_style import Colours, condition_handles, legend_below, new_figure, tidy
 
 DRAWN_EVERY_M = 0.5
-"""Nearer points of a drive cannot be told apart on paper, and would make the figure of 90 drives too large."""
+"""Distance between drawn points; denser points are indistinguishable and make a figure of 90 drives too large."""
 
 CROSS: dict[str, Any] = {
     "color": "red",
@@ -27,7 +27,7 @@ CROSS: dict[str, Any] = {
 
 
 def drawn_points(progress_m: FloatArray) -> list[int]:
-    """Choose the rows of a drive that are drawn: one every `DRAWN_EVERY_M` of its way, and the last."""
+    """Return the rows of a drive that are drawn: one every `DRAWN_EVERY_M` of progress, and the last."""
     if not len(progress_m):
         return []
     bins = np.floor(progress_m / DRAWN_EVERY_M)
@@ -36,27 +36,27 @@ def drawn_points(progress_m: FloatArray) -> list[int]:
 
 
 def trajectories_figure(routes: Mapping[str, Sequence[DriveData]], colours: Colours) -> Figure:
-    """Draw all drives of each route from above, one panel a route.
+    """Return the figure of all trajectories from above, one panel for each route.
 
-    The reference is thick and black, each drive a thin line in the colour of its condition, and a red cross is where
-    one ended before its goal.
+    The lane centre is a thick black line, each drive a thin line in the colour of its condition. A red cross marks the
+    end of a drive that ended early.
     """
     references = {route: max((drive.reference_m for drive in drives), key=len) for route, drives in routes.items()}
-    turned = {route: _turned(reference_m) for route, reference_m in references.items()}
-    extents = {route: _extent(turned[route](reference_m)) for route, reference_m in references.items()}
+    rotated = {route: _rotation_to_x(reference_m) for route, reference_m in references.items()}
+    extents = {route: _extent(rotated[route](reference_m)) for route, reference_m in references.items()}
     heights = [min(max(high / width, 0.12), 0.7) for width, high in extents.values()]
     figure = new_figure(7.2 * sum(heights) + 0.75 * len(heights) + 0.4)
     panels = figure.subplots(len(routes), 1, squeeze=False, height_ratios=heights)[:, 0]
     for axes, (route, drives) in zip(panels, routes.items(), strict=True):
-        turn, reference_m = turned[route], turned[route](references[route])
+        rotate, reference_m = rotated[route], rotated[route](references[route])
         axes.plot(reference_m[:, 0], reference_m[:, 1], color="black", linewidth=3.5, solid_capstyle="butt")
         ends = []
         for drive in drives:
             rows = drawn_points(drive.truth.floats("progress_m"))
-            way_m = turn(np.column_stack([drive.truth.floats("x_m")[rows], drive.truth.floats("y_m")[rows]]))
-            axes.plot(way_m[:, 0], way_m[:, 1], color=colours[drive.condition], linewidth=0.7)
+            path_m = rotate(np.column_stack([drive.truth.floats("x_m")[rows], drive.truth.floats("y_m")[rows]]))
+            axes.plot(path_m[:, 0], path_m[:, 1], color=colours[drive.condition], linewidth=0.7)
             if drive.result["ending"] != "completed":
-                ends.append(way_m[-1])
+                ends.append(path_m[-1])
         if ends:
             axes.plot(*np.transpose(ends), **CROSS)
         tidy(axes, "", "m", f"Route {route}, {len(drives)} runs")
@@ -66,8 +66,8 @@ def trajectories_figure(routes: Mapping[str, Sequence[DriveData]], colours: Colo
     return figure
 
 
-def _turned(reference_m: FloatArray) -> Any:
-    """Give what moves and turns points (n, 2) so that the reference lies along x: a narrow panel shows more of it."""
+def _rotation_to_x(reference_m: FloatArray) -> Any:
+    """Return a function that moves and rotates points (n, 2) so that the reference lies along x."""
     if len(reference_m) < 2:
         return lambda points_m: points_m
     middle_m = reference_m.mean(axis=0)
@@ -86,7 +86,7 @@ def _extent(points_m: FloatArray) -> tuple[float, float]:
 
 
 def cross_track_figure(routes: Mapping[str, Sequence[DriveData]], colours: Colours) -> Figure:
-    """Draw how far each drive was from the lane's centre over the distance along its route, one panel a route."""
+    """Return the figure of cross-track error over distance along the route, one panel for each route."""
     columns = min(2, len(routes))
     rows = -(-len(routes) // columns)
     figure = new_figure(1.9 * rows + 0.6)
@@ -119,7 +119,7 @@ def _legend(figure: Figure, routes: Mapping[str, Sequence[DriveData]], colours: 
 
 
 def time_figure(drives: Sequence[DriveData], colours: Colours) -> Figure:
-    """Steering and cross-track error over time, one row a drive."""
+    """Return the figure of steering and cross-track error over time, one row for each drive."""
     figure = new_figure(1.35 * len(drives) + 0.6)
     rows = figure.subplots(len(drives), 2, sharex=True, sharey="col", squeeze=False)
     for row, drive in zip(rows, drives, strict=True):
@@ -135,7 +135,7 @@ def time_figure(drives: Sequence[DriveData], colours: Colours) -> Figure:
 
 
 def frames_figure(pictures: Sequence[tuple[str, Picture]]) -> Figure:
-    """Received pictures side by side, each with a line of text."""
+    """Return the figure of received pictures, each with a line of text."""
     columns = min(2, len(pictures))
     rows = -(-len(pictures) // columns)
     figure = new_figure(3.1 * rows)

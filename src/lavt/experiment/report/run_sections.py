@@ -1,4 +1,4 @@
-"""The sections of a report that are made of single runs: where they went, what was seen, on what machine."""
+"""The sections of a report that need single runs: trajectories, received frames, versions and machines."""
 
 from __future__ import annotations
 
@@ -20,20 +20,19 @@ from lavt.recording.record import read_record
 SHOWN_FRAMES = 4
 
 DRAWN_GROUPS = 4
-"""Of more groups than these only the runs of the base config are drawn, or of the first group where there are none."""
+"""With more groups than this, the figures show only the runs of the base config, or else of the first group."""
 
 PANELS = 3
-"""Routes in one figure of trajectories: the paper's three key parts, and its three whole routes."""
-
+"""Routes in one figure of trajectories: the paper has three key parts and three whole routes."""
 
 DriveSets = Mapping[tuple[str, str], Sequence[DriveData]]
-"""Drives by kind of time and title of their group: what may be drawn into one figure."""
+"""Drives by kind of time and title of their group; each entry is drawn in figures of its own."""
 
 Runs = Sequence[tuple[Path, Mapping[str, object]]]
 
 
 def drawn_runs(report: ReportContext, runs: Runs) -> dict[tuple[str, str], list[tuple[Path, Mapping[str, object]]]]:
-    """Choose the runs whose drives are drawn, by kind of time and title of their group.
+    """Return the runs whose drives are drawn, by kind of time and title of their group.
 
     `runs` has directories, and entries of the summary's `runs`.
     """
@@ -51,7 +50,7 @@ def drawn_runs(report: ReportContext, runs: Runs) -> dict[tuple[str, str], list[
 def read_drives(
     sets: Mapping[tuple[str, str], Runs], known: Mapping[Path, DriveData]
 ) -> dict[tuple[str, str], list[DriveData]]:
-    """Read the drives that are not `known` yet."""
+    """Return the drives of `sets`, reading those that are not in `known`."""
     return {
         key: [known.get(directory) or read_drive(directory, run) for directory, run in members]
         for key, members in sets.items()
@@ -59,29 +58,29 @@ def read_drives(
 
 
 def trajectory_parts(report: ReportContext, sets: DriveSets) -> Parts:
-    """Draw all drives: key parts of routes in one figure, whole routes in another, and their error over the way."""
+    """Return the figures of all trajectories, key parts and whole routes apart, and of their cross-track error."""
     parts = []
     for (kind, title), drives in sets.items():
         routes: dict[str, list[DriveData]] = {}
         for drive in sorted(drives, key=lambda drive: str(drive.result["route"])):
             if len(drive.truth):
                 routes.setdefault(str(drive.result["route"]), []).append(drive)
-        which = f"{kind} time{f', {title}' if title else ''}"
+        runs = f"{kind} time{f', {title}' if title else ''}"
         suffix = "_".join(word for word in (kind, html_page.slug(title)) if word)
         for name, shown in _figures_of(list(routes)):
             figure = trajectories_figure({route: routes[route] for route in shown}, report.colours)
-            caption = f"Every run from above, turned to fit; {which}. A red cross is where one ended before its goal."
-            alternative = f"trajectories on the routes {', '.join(shown)}"
+            caption = f"All trajectories, {runs}; each route is rotated to fit. A red cross marks an early end."
+            alternative = f"trajectories on routes {', '.join(shown)}"
             parts.append(save_figure(report.directory, f"trajectories_{name}_{suffix}", figure, alternative, caption))
         if routes:
-            caption = f"Distance from the lane's centre over the way, {which}."
+            caption = f"Distance from the lane centre over distance along the route, {runs}."
             figure = cross_track_figure(routes, report.colours)
             parts.append(save_figure(report.directory, f"cross_track_{suffix}", figure, "cross-track error", caption))
     return parts
 
 
 def _figures_of(routes: Sequence[str]) -> list[tuple[str, Sequence[str]]]:
-    """Say which routes share a figure: key parts first, `PANELS` in each."""
+    """Return the name and the routes of each figure: key parts first, at most `PANELS` routes in each."""
     kinds = {
         "key": [route for route in routes if road_of(route) != stem_of(route)],
         "whole": [route for route in routes if road_of(route) == stem_of(route)],
@@ -94,7 +93,7 @@ def _figures_of(routes: Sequence[str]) -> list[tuple[str, Sequence[str]]]:
 
 
 def single_run_parts(report: ReportContext, sets: DriveSets) -> Parts:
-    """Show one run of each condition over time, and the pictures that the client received; a kind of time each."""
+    """Return one run of each condition over time, and frames that the client received, for each kind of time."""
     parts = []
     for kind, drives in _first_sets(sets).items():
         chosen = one_of_each_condition(drives)
@@ -102,23 +101,23 @@ def single_run_parts(report: ReportContext, sets: DriveSets) -> Parts:
         if driven:
             names = ", ".join(str(drive.result["run"]) for drive in driven)
             caption = (
-                f"Road wheel angle and distance from the lane's centre over time, left positive; {kind} time, one run "
-                f"of each condition: {names}."
+                f"Road wheel angle and distance from the lane centre over time; left is positive. {kind.capitalize()} "
+                f"time, one run of each condition: {names}."
             )
             figure = time_figure(driven, report.colours)
             parts.append(save_figure(report.directory, f"time_{kind}", figure, "steering over time", caption))
         pictures = received_pictures(chosen[0].directory / "client.mcap")
         if pictures:
             caption = (
-                f"Pictures as the client received them, run {chosen[0].result['run']}; the stamp is at the top left."
+                f"Frames as the client received them, run {chosen[0].result['run']}. The stamp is at the top left."
             )
             figure = frames_figure(pictures)
-            parts.append(save_figure(report.directory, f"frames_{kind}", figure, "received pictures", caption))
+            parts.append(save_figure(report.directory, f"frames_{kind}", figure, "received frames", caption))
     return parts
 
 
 def _first_sets(sets: DriveSets) -> dict[str, Sequence[DriveData]]:
-    """Give the first set of either kind of time."""
+    """Return the first set of each kind of time."""
     first: dict[str, Sequence[DriveData]] = {}
     for (kind, _), drives in sets.items():
         first.setdefault(kind, drives)
@@ -126,7 +125,7 @@ def _first_sets(sets: DriveSets) -> dict[str, Sequence[DriveData]]:
 
 
 def captured_ms(sets: DriveSets) -> dict[str, dict[str, float | None]]:
-    """Tell by kind of time and condition how long a frame's stamp came after its exposure, of one run each."""
+    """Return the time from capture to stamp, from one run, by kind of time and condition."""
     return {
         kind: {
             drive.condition: capture_to_stamp_ms(drive.directory / "server.mcap")
@@ -137,11 +136,11 @@ def captured_ms(sets: DriveSets) -> dict[str, dict[str, float | None]]:
 
 
 def received_pictures(client_record: Path) -> list[tuple[str, Picture]]:
-    """Decode the video as the client received it, and choose `SHOWN_FRAMES` pictures, evenly spread; [] without one."""
+    """Return `SHOWN_FRAMES` evenly spaced pictures from the received video, each with its time; [] without video."""
     units = read_record(client_record, channels=()).video() if client_record.is_file() else []
     if not units:
         return []
-    from lavt.transport.video.h264 import Decoder  # noqa: PLC0415 (a report without pictures needs no codec)
+    from lavt.transport.video.h264 import Decoder  # noqa: PLC0415 (a report without video needs no codec)
 
     shown = {len(units) * (2 * index + 1) // (2 * SHOWN_FRAMES) for index in range(SHOWN_FRAMES)}
     decoder = Decoder()
@@ -154,16 +153,16 @@ def received_pictures(client_record: Path) -> list[tuple[str, Picture]]:
 
 
 def machine_parts(report: ReportContext, sets: DriveSets) -> Parts:
-    """Show versions and machine as the drawn runs recorded them; runs that agree share a table."""
+    """Return versions and machines as the drawn runs recorded them; runs with equal values share a table."""
     drives = [drive for members in sets.values() for drive in members]
-    by_text: dict[str, tuple[DriveData, int]] = {}
+    by_html: dict[str, tuple[DriveData, int]] = {}
     for drive in drives:
         html = html_of(machine_table(drive.annotations))
-        first, many = by_text.get(html, (drive, 0))
-        by_text[html] = (first, many + 1)
+        first, count = by_html.get(html, (drive, 0))
+        by_html[html] = (first, count + 1)
     parts = []
-    for number, (first, many) in enumerate(by_text.values(), start=1):
-        text = f"{many} of the {len(report.summary['runs'])} runs, the first of them {first.result['run']}:"
+    for number, (first, count) in enumerate(by_html.values(), start=1):
+        text = f"Recorded by {count} of {len(report.summary['runs'])} runs, the first is {first.result['run']}:"
         table = machine_table(first.annotations)
-        parts += [html_page.paragraph(text, note=True), save_table(report.directory, f"machine_{number}", table)]
+        parts += [html_page.paragraph(text, is_note=True), save_table(report.directory, f"machine_{number}", table)]
     return parts

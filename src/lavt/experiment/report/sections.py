@@ -1,4 +1,4 @@
-"""The sections of a report that are made of a summary alone."""
+"""The sections of a report that need only the summary."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from markupsafe import Markup
+
 from lavt.experiment.analysis.clocks import PROBE, SAME_KERNEL
 from lavt.experiment.analysis.stage_latency import AFTER_LOOP
 from lavt.experiment.report import html_page
@@ -14,7 +16,12 @@ from lavt.experiment.report.figure_style import Colours, Conditions
 from lavt.experiment.report.files import link_table, save_figure, save_table
 from lavt.experiment.report.groups import Group, axes_of, differing, in_order, short, title_of
 from lavt.experiment.report.latency_figures import degradation_figure, injected_figure, presets_figure, stages_figure
-from lavt.experiment.report.sentences import differences, equal_totals, headline, what_was_driven
+from lavt.experiment.report.sentences import (
+    difference_sentences,
+    equal_total_sentences,
+    results_sentences,
+    runs_overview,
+)
 from lavt.experiment.report.sweep_figures import axis_figure, incidence_figure, routes_with_survival, survival_figure
 from lavt.experiment.report.tables import (
     clock_table,
@@ -22,56 +29,56 @@ from lavt.experiment.report.tables import (
     driving_table,
     error_table,
     group_table,
-    how_it_was_driven,
     latency_table,
-    paper_beside,
+    matching_paper,
     route_overview,
     route_table,
+    run_setup,
     run_table,
     stage_table,
     survival_table,
 )
 
-Parts = list[str]
+Parts = list[Markup]
 
 ONE_CLOCK = (None, SAME_KERNEL)
-"""Sources of Delta that have no figure: unknown, as the run's own row says, or the same clock."""
+"""Sources of the clock offset without a value to show: none is known, or both sides share a clock."""
 
 LATENCIES_NOTE = (
-    "Latencies in ms: median (p5 to p95) ± how wrong the offset between the clocks can make them. The loop latency, "
-    "frame stamped to its command applied on the server's own clock, needs no offset."
+    "Latencies are in ms: median ± bound of the clock error (p5 to p95). The loop latency, from a frame's stamp to the "
+    "application of its command, is measured on the server's clock alone and needs no clock offset."
 )
-PAPER_NOTE = " The paper measured no loop: the sum of its two medians stands beside ours."
+PAPER_NOTE = " The paper did not measure the loop latency; the table shows the sum of its median τ video and τ control."
 PAPER_POINTS = (
-    " The paper's points stand at the sum of its two one-way medians; the bar of its completion is that of its counts, "
-    "and of its error it gives none."
+    " The paper's points are drawn at the sum of its two median one-way latencies. Their completion intervals are "
+    "computed from its counts; it gives no interval of the error."
 )
-ROUTES_NOTE = " Of the completion: these routes, the exact interval of what repeating just these routes would give."
+ROUTES_NOTE = " “95 %, these routes” is the exact confidence interval of completion for repeated runs of these routes."
 ROADS_NOTE = (
-    " Of the completion: such roads, how far the rates of the roads lie apart, a route and its key part being one "
-    "road, and no interval of 95 %."
+    " “Range over roads” is the spread of completion between roads, where a route and its key part are one road; it is "
+    "not a 95 % interval."
 )
 ERRORS_NOTE = (
-    " Each error is the mean over runs of what each run has by itself, its P95 and its maximum, too. P95 of the "
-    "cross-track error three ways: over completed runs, so read it beside the completion; of all runs up "
-    "to the farthest place that all runs of a route and repetition reached; and of all runs in order, one that ended "
-    "early being last: median (quartiles). docs/metrics.md defines every number."
+    " Each error is computed for each run and then averaged over the runs. P95 of the cross-track error is given in "
+    "three ways: over the completed runs, to be read together with the completion; over all runs, up to the common "
+    "distance, which all runs of a route and repetition reached; and as median (quartiles) of all runs, where a run "
+    "that ended early ranks last. docs/metrics.md defines each number."
 )
 STAGES_NOTE = (
-    "The first row, from capture to stamp, is of one run of each condition, the others of all its runs; it is before "
-    "the loop, and what the actuator reports is after it: both are in no bar."
+    "The first row, from capture to stamp, is from one run of each condition, the other rows from all its runs. The "
+    "bars leave out this row, which is before the loop, and the stages after the loop."
 )
 
 LEAST_REST_MS = 0.5
-"""Less than this is not told as a hop of its own."""
+"""A smaller rest of the loop is not shown as a stage."""
 
 COMPARED_GROUPS = 6
-"""More groups than these are not drawn as lines of one figure; their table and the figure of their axes are there."""
+"""More groups than this are shown only in their table and in the figures of their axes."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReportContext:
-    """What all sections are made of: a summary, where files go, and what is the same in all of them."""
+    """The input of all sections: the summary, the directory for files, and the colour of each condition."""
 
     summary: Mapping[str, Any]
     directory: Path
@@ -79,82 +86,82 @@ class ReportContext:
 
     @property
     def groups(self) -> Sequence[Group]:
-        """Give the groups of the runs in virtual time."""
+        """Return the groups of the runs in virtual time."""
         return in_order(self.summary.get("groups") or [])
 
     @property
     def kinds(self) -> dict[str, Conditions]:
-        """Give the conditions of both kinds of time, as far as there are any."""
+        """Return the conditions of each kind of time, without a kind that has none."""
         kinds = {"virtual": self.summary["conditions"], "real": self.summary["real"]}
         return {kind: conditions for kind, conditions in kinds.items() if conditions}
 
     @property
     def base(self) -> list[Group]:
-        """Give the groups whose conditions are those of the base config: none where these are of several groups."""
+        """Return the groups that have the conditions of the base config; none if these span several groups."""
         return [group for group in self.groups if group["conditions"] == self.summary["conditions"]]
 
     def paper(self, conditions: Conditions) -> Conditions:
-        """Give the paper's conditions that are among these."""
-        return paper_beside(conditions, (self.summary.get("paper") or {}).get("conditions") or {})
+        """Return the paper's conditions that match these."""
+        return matching_paper(conditions, (self.summary.get("paper") or {}).get("conditions") or {})
 
-    def how(self, kind: str) -> str:
-        """Say how the runs of a kind of time were driven, and which of several groups its conditions are of."""
-        driven = how_it_was_driven([run for run in self.summary["runs"] if run["time"] == kind])
-        return f"{driven[0].upper()}{driven[1:]}{self.which(kind)}"
+    def setup(self, kind: str) -> str:
+        """Return how the runs of a kind of time were made, and the group of its conditions if there are several."""
+        setup = run_setup([run for run in self.summary["runs"] if run["time"] == kind])
+        return f"{setup[0].upper()}{setup[1:]}{self.base_title(kind)}"
 
-    def which(self, kind: str = "virtual") -> str:
-        """Say in brackets which group the conditions in virtual time are of."""
+    def base_title(self, kind: str = "virtual") -> str:
+        """Return the group of the conditions in virtual time, in brackets."""
         names = differing(self.groups) or ["preset"]
         return f" ({title_of(self.base[0], names)})" if kind == "virtual" and self.base else ""
 
 
-def head(report: ReportContext) -> Parts:
-    """Say in plain words what was driven and what came out."""
+def summary_parts(report: ReportContext) -> Parts:
+    """Return the summary: the runs, their results, the speed of the simulation, and the failed runs."""
     runs, speed, failed = report.summary["runs"], report.summary["speed"], report.summary.get("failed")
-    parts = [html_page.paragraph(what_was_driven(runs))]
+    parts = [html_page.paragraph(runs_overview(runs))]
     names = differing(report.groups)
     compared = report.groups if 1 < len(report.groups) <= COMPARED_GROUPS else []
-    said = {f"Virtual time, {title_of(group, names)}": group["conditions"] for group in compared}
-    if "virtual" in report.kinds and not said:
-        said = {f"Virtual time{report.which()}": report.kinds["virtual"]}
+    named = {f"Virtual time, {title_of(group, names)}": group["conditions"] for group in compared}
+    if "virtual" in report.kinds and not named:
+        named = {f"Virtual time{report.base_title()}": report.kinds["virtual"]}
     if "real" in report.kinds:
-        said["Real time"] = report.kinds["real"]
-    sentences = [headline(name, conditions) for name, conditions in said.items()]
+        named["Real time"] = report.kinds["real"]
+    sentences = [results_sentences(name, conditions) for name, conditions in named.items()]
     parts.append(html_page.bullets([sentence for sentence in sentences if sentence]))
     if speed["wall_s"]:
         factor = speed["simulated_s"] / speed["wall_s"]
-        text = f"{speed['simulated_s']:.0f} s were simulated in {speed['wall_s']:.0f} s with {speed['jobs']} jobs: "
-        parts.append(html_page.paragraph(f"{text}{factor:.1f} times as fast as real time.", note=True))
+        jobs = f"{speed['jobs']} parallel job{'s' if speed['jobs'] != 1 else ''}"
+        text = f"{speed['simulated_s']:.0f} s of driving were simulated in {speed['wall_s']:.0f} s with {jobs}: "
+        parts.append(html_page.paragraph(f"{text}{factor:.1f} times as fast as real time.", is_note=True))
     if failed:
-        parts.append(
-            html_page.paragraph(f"{len(failed)} of the runs asked for failed and are in no number of this page:")
-        )
+        runs_failed = "1 run" if len(failed) == 1 else f"{len(failed)} runs"
+        parts.append(html_page.paragraph(f"{runs_failed} failed and {'is' if len(failed) == 1 else 'are'} left out:"))
         parts.append(html_page.bullets([f"{each['run']}: {each['reason']}" for each in failed]))
     return parts
 
 
 def conditions_parts(report: ReportContext) -> Parts:
-    """Show the paper's table, with the paper's own figures where the conditions are the same; a kind of time each."""
+    """Return the tables of the conditions for each kind of time, compared with the paper where it has them."""
     if not report.kinds:
-        return [html_page.paragraph("No run has the values of the sweep's own config: see the groups.", note=True)]
+        return [html_page.paragraph("No run has the values of the base config; see the table of groups.", is_note=True)]
     parts = []
     for kind, conditions in report.kinds.items():
         paper = report.paper(conditions)
-        parts.append(html_page.heading(report.how(kind)))
+        parts.append(html_page.heading(report.setup(kind)))
         for name, make in (("driving", driving_table), ("latency", latency_table), ("error", error_table)):
             parts.append(save_table(report.directory, f"conditions_{kind}_{name}", make(conditions, paper)))
     roads = any(entry.get("completion_such_roads") for of in report.kinds.values() for entry in of.values())
-    beside = any(report.paper(conditions) for conditions in report.kinds.values())
+    compared = any(report.paper(conditions) for conditions in report.kinds.values())
     return [
         *parts,
         html_page.paragraph(
-            "".join((LATENCIES_NOTE, PAPER_NOTE * beside, ROUTES_NOTE, ROADS_NOTE * roads, ERRORS_NOTE)), note=True
+            "".join((LATENCIES_NOTE, PAPER_NOTE * compared, ROUTES_NOTE, ROADS_NOTE * roads, ERRORS_NOTE)), is_note=True
         ),
     ]
 
 
 def contrast_parts(report: ReportContext) -> Parts:
-    """Show the planned contrasts, and why conditions of equal total delay are not told apart."""
+    """Return the planned contrasts, with a comparison of conditions that inject the same total delay."""
     summary, paper = report.summary, (report.summary.get("paper") or {}).get("contrasts") or []
     contrasts = summary.get("contrasts") or []
     if not contrasts:
@@ -171,73 +178,79 @@ def contrast_parts(report: ReportContext) -> Parts:
             parts.append(html_page.heading(title))
             name = f"contrasts_{html_page.slug(title)}"
             parts.append(save_table(report.directory, name, contrast_table(group["contrasts"], shown)))
+    fisher = " The paper's p values are from Fisher's exact test on its counts." if shown else ""
     note = (
-        "Completion under two conditions. Ours: McNemar's exact test on pairs with the same route, repetition and "
-        "seed; Holm's correction over the contrasts, which were planned before any run was driven."
+        "Each contrast compares completion under two conditions, with McNemar's exact test on pairs of runs with the "
+        "same route, repetition and seed. Holm's correction is applied over all contrasts, which were planned before "
+        f"the first run.{fisher}"
     )
-    parts.append(
-        html_page.paragraph(note + (" The paper's: Fisher's exact test on its counts." if shown else ""), note=True)
-    )
+    parts.append(html_page.paragraph(note, is_note=True))
     changed = any(run.get("changes") for run in summary["runs"])
-    said = [] if changed else equal_totals(contrasts, summary["conditions"], shown)
-    return [*parts, *(html_page.paragraph(f"{base}: {each}" if base else each) for each in said)]
+    sentences = [] if changed else equal_total_sentences(contrasts, summary["conditions"], shown)
+    return [*parts, *(html_page.paragraph(f"{base}: {each}" if base else each) for each in sentences)]
 
 
 def difference_parts(report: ReportContext) -> Parts:
-    """Say where the results differ from the paper's, where all its conditions were driven."""
+    """Return the differences from the paper if all its conditions were run."""
     conditions = report.summary["conditions"]
     paper = (report.summary.get("paper") or {}).get("conditions") or {}
-    said = differences(conditions, paper) if len(report.paper(conditions)) == len(paper) else []
-    return [html_page.bullets(said)] if said else []
+    sentences = difference_sentences(conditions, paper) if len(report.paper(conditions)) == len(paper) else []
+    return [html_page.bullets(sentences)] if sentences else []
 
 
-def of_base(report: ReportContext) -> str:
-    """Say below a figure of both kinds of time which group the virtual runs in it are of, where there are several."""
-    return f" Virtual runs are of one group{report.which()}." if len(report.groups) > 1 and report.base else ""
+def _base_note(report: ReportContext) -> str:
+    """Return the caption's sentence on the group of the virtual runs if there are several groups."""
+    if len(report.groups) < 2 or not report.base:
+        return ""
+    return f" Runs in virtual time are from one group{report.base_title()}."
 
 
 def injected_parts(report: ReportContext) -> Parts:
-    """Show injected against measured latency."""
+    """Return the figure of measured latency over injected delay."""
     if not report.kinds:
         return []
     caption = (
-        "Injected against measured one-way latency: median, p5 to p95. The grey line is the latency of the least "
-        "delayed condition, plus the injected delay; below, how far each median is from it, with the bound."
-        f"{of_base(report)}"
+        "Measured one-way latency over injected delay: median, p5 to p95. The grey line is the latency of the "
+        "condition with the least delay, plus the injected delay. The lower panels show the deviation of each median "
+        "from this line; bars are the bound of the clock error."
+        f"{_base_note(report)}"
     )
     figure = injected_figure(report.kinds, report.colours)
-    return [save_figure(report.directory, "injected", figure, "injected against measured latency", caption)]
+    return [save_figure(report.directory, "injected", figure, "measured latency over injected delay", caption)]
 
 
 def degradation_parts(report: ReportContext) -> Parts:
-    """Show what latency does to driving."""
+    """Return the figure of completion and error over latency."""
     if not any(entry["loop_ms"]["p50"] is not None for of in report.kinds.values() for entry in of.values()):
         return []
     paper = report.paper(report.summary["conditions"])
     caption = (
-        "Completion and error over the median loop latency (frame stamped to its command applied) and over the mean "
-        "age of the picture that the vehicle acts on. Bars are 95 % intervals; where names stand together, the upper "
-        "is the upper point's." + (PAPER_POINTS if paper else "") + of_base(report)
+        "Completion and error over the median loop latency (from a frame's stamp to the application of its command) "
+        "and over the mean age of the frame behind the command in force. Bars are 95 % intervals. Stacked names are in "
+        "the vertical order of their points." + (PAPER_POINTS if paper else "") + _base_note(report)
     )
     figure = degradation_figure(report.kinds, paper, report.colours)
     return [save_figure(report.directory, "degradation", figure, "completion and error over latency", caption)]
 
 
 def survival_parts(report: ReportContext) -> Parts:
-    """Show how far the runs came and how they ended, a kind of time each."""
+    """Return the figures of distance driven and of endings for each kind of time."""
     parts = []
     for kind, conditions in report.kinds.items():
         if not routes_with_survival(conditions):
             continue
-        many = {
+        figures = {
             "survival": (
                 survival_figure,
-                "Runs that are still driving after each distance (Kaplan-Meier): any ending but completed "
-                "counts, and a completed run leaves at the route's end. The files have the 95 % intervals.",
+                "Share of runs still driving at each distance (Kaplan-Meier). Each ending except completion is an "
+                "event; a completed run is censored at the end of its route. The files contain the 95 % intervals.",
             ),
-            "incidence": (incidence_figure, "Cumulative incidence: the share of the runs that has ended in each way."),
+            "incidence": (
+                incidence_figure,
+                "Cumulative incidence: share of runs that ended in each way by each distance.",
+            ),
         }
-        for name, (make, caption) in many.items():
+        for name, (make, caption) in figures.items():
             figure = make(conditions, report.colours)
             alternative = f"{name} by distance, {kind} time"
             parts.append(
@@ -246,7 +259,7 @@ def survival_parts(report: ReportContext) -> Parts:
                     f"{name}_{kind}",
                     figure,
                     alternative,
-                    f"{caption} {kind.capitalize()} time{report.which(kind)}.",
+                    f"{caption} {kind.capitalize()} time{report.base_title(kind)}.",
                 )
             )
         parts.append(link_table(report.directory, f"survival_{kind}", survival_table(conditions)))
@@ -254,7 +267,7 @@ def survival_parts(report: ReportContext) -> Parts:
 
 
 def stage_parts(report: ReportContext, captured_ms: Mapping[str, Mapping[str, float | None]]) -> Parts:
-    """Show where the loop's time goes; `captured_ms` is by kind of time and condition."""
+    """Return the latency of each stage; `captured_ms` is by kind of time and condition."""
     parts = []
     for kind, conditions in report.kinds.items():
         known = {name: entry for name, entry in conditions.items() if entry.get("stages_ms")}
@@ -263,15 +276,15 @@ def stage_parts(report: ReportContext, captured_ms: Mapping[str, Mapping[str, fl
         loops = {name: _loop_of(entry) for name, entry in known.items()}
         stages = {name: [*loops[name], *filter(_is_after_loop, entry["stages_ms"])] for name, entry in known.items()}
         caption = (
-            "Where the median loop goes, in the order of a frame's life: of each hop the median over all runs. The "
-            "number is the sum of these medians, which need not be the median loop exactly. "
-            f"{kind.capitalize()} time{report.which(kind)}."
+            "Median latency of each stage over all runs, in the order in which a frame passes the stages. The number "
+            "at each bar is the sum of these medians, which can differ slightly from the median loop latency. "
+            f"{kind.capitalize()} time{report.base_title(kind)}."
         )
         parts.append(
-            save_figure(report.directory, f"hops_{kind}", stages_figure(loops), "latency of each hop", caption)
+            save_figure(report.directory, f"stages_{kind}", stages_figure(loops), "latency of each stage", caption)
         )
-        parts.append(save_table(report.directory, f"hops_{kind}", stage_table(stages, captured_ms.get(kind))))
-        parts.append(html_page.paragraph(STAGES_NOTE, note=True))
+        parts.append(save_table(report.directory, f"stages_{kind}", stage_table(stages, captured_ms.get(kind))))
+        parts.append(html_page.paragraph(STAGES_NOTE, is_note=True))
     return parts
 
 
@@ -280,15 +293,15 @@ def _is_after_loop(stage: Mapping[str, Any]) -> bool:
 
 
 def _loop_of(entry: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """Give the hops that make a condition's loop, and what is left of its median: every wait for a next tick."""
+    """Return the stages of a condition's loop, and the rest of its median: waiting for the next tick."""
     stages, loop_ms = [stage for stage in entry["stages_ms"] if not _is_after_loop(stage)], entry["loop_ms"]["p50"]
     rest_ms = 0.0 if loop_ms is None else loop_ms - sum(stage["p50"] or 0.0 for stage in stages)
-    rest = {"node": "rest", "stage": "waiting, and what medians do not add up to", "p50": rest_ms}
+    rest = {"node": "rest", "stage": "waiting (median loop minus the sum of stages)", "p50": rest_ms}
     return [*stages, rest] if rest_ms > LEAST_REST_MS else stages
 
 
 def group_parts(report: ReportContext) -> Parts:
-    """Compare the groups: presets, sweeps, fidelities, further axes."""
+    """Return the comparison of the groups: presets, sweeps, fidelities, further axes."""
     groups, names = report.groups, differing(report.groups)
     if len(groups) < 2:
         return []
@@ -296,20 +309,20 @@ def group_parts(report: ReportContext) -> Parts:
     if len(groups) <= COMPARED_GROUPS:
         figure = presets_figure({title_of(group, names): group["conditions"] for group in groups}, report.colours)
         caption = (
-            "The groups beside each other, virtual time; what makes them differ is in the legend. "
-            "Conditions that hide one another are named, the upper above."
+            "Comparison of the groups, virtual time. The legend names the settings that differ. Conditions whose "
+            "points overlap are named, in the vertical order of their points."
         )
         parts.append(save_figure(report.directory, "groups", figure, "groups compared", caption))
     return [*parts, save_table(report.directory, "groups", group_table(groups, names))]
 
 
 def axis_parts(report: ReportContext) -> Parts:
-    """Show what the further axes of a sweep do, one figure for each set of runs that else are alike."""
+    """Return a figure of the sweep's further axes for each set of groups that differ in these axes only."""
     axes = axes_of(report.groups)
     if not axes:
         return []
     if len(axes) > 2:
-        return [html_page.paragraph(f"{len(axes)} axes are too many for a figure: see the table of groups.", note=True)]
+        return [html_page.paragraph(f"No figure can show {len(axes)} axes; see the table of groups.", is_note=True)]
     along = sorted(axes, key=lambda axis: -_numeric_values(report.groups, axis))
     others = [name for name in differing(report.groups) if name not in axes]
     alike: dict[str, list[Group]] = {}
@@ -318,10 +331,10 @@ def axis_parts(report: ReportContext) -> Parts:
     parts = []
     for title, groups in alike.items():
         figure = axis_figure(groups, along, report.colours)
-        what = " and ".join(short(axis) for axis in along)
-        caption = f"Driving over {what}, virtual time{f', {title}' if title else ''}."
+        names = " and ".join(short(axis) for axis in along)
+        caption = f"Driving results over {names}, virtual time{f', {title}' if title else ''}."
         name = "_".join(["axes", *(html_page.slug(title),)]) if title else "axes"
-        parts.append(save_figure(report.directory, name, figure, f"driving over {short(along[0])}", caption))
+        parts.append(save_figure(report.directory, name, figure, f"driving results over {short(along[0])}", caption))
     return parts
 
 
@@ -331,23 +344,23 @@ def _numeric_values(groups: Sequence[Group], axis: str) -> int:
 
 
 def route_parts(report: ReportContext) -> Parts:
-    """Show the headline route by route."""
+    """Return the tables of completion by route."""
     parts = []
     for kind, conditions in report.kinds.items():
         if any(entry.get("routes") for entry in conditions.values()):
-            parts.append(html_page.heading(f"{kind.capitalize()} time{report.which(kind)}"))
+            parts.append(html_page.heading(f"{kind.capitalize()} time{report.base_title(kind)}"))
             parts.append(save_table(report.directory, f"routes_{kind}_overview", route_overview(conditions)))
             parts.append(save_table(report.directory, f"routes_{kind}", route_table(conditions)))
     return parts
 
 
 def run_parts(report: ReportContext) -> Parts:
-    """Show every run with its validity."""
+    """Return the table of all runs with their validity."""
     return [save_table(report.directory, "runs", run_table(report.summary["runs"]))]
 
 
 def clock_parts(report: ReportContext) -> Parts:
-    """Say how far the clocks of two machines were apart; in virtual time they are modelled."""
+    """Return the clock offset of the runs in real time whose sides have separate clocks."""
     runs = report.summary["runs"]
     apart = [run for run in runs if run["time"] == "real" and (run.get("delta") or {}).get("source") not in ONE_CLOCK]
     if not apart:
@@ -355,18 +368,19 @@ def clock_parts(report: ReportContext) -> Parts:
     parts = [
         save_table(report.directory, "clocks", clock_table(apart)),
         html_page.paragraph(
-            "Delta is the server's clock less the client's in the middle of the drive; ± is the largest bound during "
-            "it, that of every one-way latency of the run. The hosts' sources of time and the probe are two opinions: "
-            "a run in which they contradict each other does not count.",
-            note=True,
+            "The clock offset is the server's clock minus the client's in the middle of the run. The value after ± is "
+            "the largest bound during the run; it applies to each one-way latency. The hosts' time sources and the "
+            "probe are independent estimates; a run in which they contradict each other is invalid.",
+            is_note=True,
         ),
     ]
     if any(run["delta"]["source"] == PROBE for run in apart):
         parts.append(
             html_page.paragraph(
-                "By the probe: no other source of time said how the clocks were. Its bound is half the round trip "
-                "and the drift since; if one way is slower than the other, that is hidden inside it.",
-                note=True,
+                "Source “probe”: no other time source reported the clock error. The probe's bound is half the round "
+                "trip plus the drift since then. It covers a difference between the two directions, which the probe "
+                "cannot see.",
+                is_note=True,
             )
         )
     return parts

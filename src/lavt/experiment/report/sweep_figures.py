@@ -1,4 +1,4 @@
-"""Figures of many runs: how far they came, how they ended, and what an axis of the sweep does. Nothing reads a file."""
+"""Figures of many runs: distance driven, endings, and results over an axis of the sweep. None reads a file."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ MOST_TICKS = 8
 AXIS_ROWS = (
     ("runs completed (%)", "completion_rate", 100.0),
     ("error, mean P95 (m)", "p95_m", 1.0),
-    ("picture age (ms)", "picture_age_ms", 1.0),
+    ("frame age (ms)", "picture_age_ms", 1.0),
 )
-"""What is drawn over an axis of a sweep: label, key of a condition, unit."""
+"""The rows of panels over an axis of a sweep: label, key of a condition, factor."""
 
 
 def routes_with_survival(conditions: Conditions) -> list[str]:
-    """Name the routes of which any condition knows how far its runs came."""
+    """Return the routes with a survival curve under any condition."""
     return sorted({route for entry in conditions.values() for route in entry.get("survival") or {}})
 
 
 def survival_figure(conditions: Conditions, colours: Colours) -> Figure:
-    """How many runs are still driving after each distance: a panel a route, a line a condition.
+    """Return the figure of runs still driving at each distance: a panel for each route, a line for each condition.
 
-    Of a few conditions the 95 % intervals are drawn, too; those of more would hide each other.
+    The 95 % intervals are drawn for at most `MOST_BANDS` conditions, because more would overlap.
     """
     routes = routes_with_survival(conditions)
     figure, panels = _panels(len(routes))
@@ -62,7 +62,7 @@ def survival_figure(conditions: Conditions, colours: Colours) -> Figure:
 
 
 def incidence_figure(conditions: Conditions, colours: Colours) -> Figure:
-    """What share of the runs has ended in each way by each distance: a panel a route, a dash an ending."""
+    """Return the figure of endings by distance: a panel for each route, a line style for each ending."""
     routes = routes_with_survival(conditions)
     figure, panels = _panels(len(routes))
     shown: dict[str, Any] = {}
@@ -77,15 +77,15 @@ def incidence_figure(conditions: Conditions, colours: Colours) -> Figure:
         tidy(axes, "", "", f"Route {route}")
         axes.set_ylim(-4, 104)
     _label_lowest(panels, "distance driven (m)")
-    figure.supylabel("runs that ended so (%)", fontsize=10)
+    figure.supylabel("runs ended in this way (%)", fontsize=10)
     endings = [Line2D([], [], color="0.3", linestyle=dash, label=ending) for ending, dash in shown.items()]
     legend_below(figure, [*condition_handles(conditions, colours), *endings])
     return figure
 
 
-def _widths(many: int) -> list[float]:
-    """Give the width of each line: those drawn first are wider, so that one under another can be seen."""
-    return [float(width) for width in np.linspace(4.0 if many > 1 else 1.2, 1.2, many)]
+def _widths(count: int) -> list[float]:
+    """Return the width of each line; the first are wider, so that they remain visible under the later ones."""
+    return [float(width) for width in np.linspace(4.0 if count > 1 else 1.2, 1.2, count)]
 
 
 def _label_lowest(panels: Sequence[Axes], label: str) -> None:
@@ -93,24 +93,24 @@ def _label_lowest(panels: Sequence[Axes], label: str) -> None:
         axes.set_xlabel(label)
 
 
-def _panels(many: int) -> tuple[Figure, list[Axes]]:
-    """Begin a figure of small panels of one scale, three beside each other."""
-    columns = min(3, many)
-    rows = -(-many // columns)
+def _panels(count: int) -> tuple[Figure, list[Axes]]:
+    """Return a new figure with small panels of one scale, three in a row."""
+    columns = min(3, count)
+    rows = -(-count // columns)
     figure = new_figure(2.0 * rows + 0.7)
-    every = list(figure.subplots(rows, columns, squeeze=False, sharey=True).flat)
-    for axes in every[many:]:
+    panels = list(figure.subplots(rows, columns, squeeze=False, sharey=True).flat)
+    for axes in panels[count:]:
         axes.axis("off")
-    return figure, every[:many]
+    return figure, panels[:count]
 
 
 def axis_figure(groups: Sequence[Group], axes_names: Sequence[str], colours: Colours) -> Figure:
-    """What one or two axes of a sweep do: the first on x, a column of panels for each value of the second.
+    """Return the figure of one or two axes of a sweep: the first on x, a column of panels for each value of the second.
 
-    Lines are conditions; the rows are completion, error and picture age, as far as they are known.
+    Lines are conditions; the rows are completion, error and frame age, if they are known.
     """
     along, *second = axes_names
-    places, labels = _places([group.get(along) for group in groups])
+    positions, labels = _positions([group.get(along) for group in groups])
     columns = list(dict.fromkeys(str(group.get(second[0])) for group in groups)) if second else [""]
     names = sorted({name for group in groups for name in group["conditions"]})
     rows = [
@@ -127,7 +127,7 @@ def axis_figure(groups: Sequence[Group], axes_names: Sequence[str], colours: Col
             axes = panels[row, column]
             for name, width in zip(names, _widths(len(names)), strict=True):
                 points = sorted(
-                    (places[str(group.get(along))], _value(group["conditions"][name], key) * unit)
+                    (positions[str(group.get(along))], _value(group["conditions"][name], key) * unit)
                     for group in members
                     if name in group["conditions"] and _has(group["conditions"][name], key)
                 )
@@ -135,8 +135,8 @@ def axis_figure(groups: Sequence[Group], axes_names: Sequence[str], colours: Col
                     x, y = zip(*points, strict=True)
                     axes.plot(x, y, marker="o", markersize=width + 2.5, linewidth=width, color=colours[name])
             tidy(axes, "", label if column == 0 else "", title if row == 0 else "")
-            if labels or len(places) <= MOST_TICKS:
-                axes.set_xticks(list(places.values()), labels or list(places))
+            if labels or len(positions) <= MOST_TICKS:
+                axes.set_xticks(list(positions.values()), labels or list(positions))
     for axes in panels[:, 0]:
         axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
     panels[0, 0].set_ylim(-5, 105)
@@ -156,8 +156,8 @@ def _value(entry: Mapping[str, Any], key: str) -> float:
     return float(value["mean"] if isinstance(value, Mapping) else value)
 
 
-def _places(values: Sequence[Any]) -> tuple[dict[str, float], list[str]]:
-    """Say where each value stands on x: numbers at themselves, others side by side, with these labels."""
+def _positions(values: Sequence[Any]) -> tuple[dict[str, float], list[str]]:
+    """Return the position of each value on x, and tick labels if the values are not numbers."""
     if all(isinstance(value, int | float) and not isinstance(value, bool) for value in values):
         return {str(value): float(value) for value in values}, []
     labels = list(dict.fromkeys(str(value) for value in values))

@@ -1,4 +1,4 @@
-"""A table as data, and what can be made of it: HTML to read, CSV to compute with, LaTeX to paste."""
+"""Tables as data, with conversion to HTML for the page, CSV for computing, and LaTeX for papers."""
 
 from __future__ import annotations
 
@@ -8,35 +8,38 @@ import re
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 from typing import Any
+
+from markupsafe import Markup
+
+from lavt.experiment.report import html_page
 
 NOTHING = "–"
 UNBROKEN = "\N{NO-BREAK SPACE}"
 
 SHARE = "share"
-"""In CSV a share is a part of 1."""
+"""Unit of a share in CSV, where 1 is the whole; the page shows per cent."""
 
 LOW_HIGH = ("low", "high")
 PERCENTILES = ("p50", "p5", "p95")
 
 TITLE_CHARACTERS = 14
-"""A longer title of a column is broken into lines in LaTeX, where a page has an end."""
+"""A column title longer than this is broken into lines in LaTeX."""
 
 LINE_CHARACTERS = 66
-"""A wider table is made as narrow as the text in LaTeX: so many are in a line of its article."""
+"""A table wider than a line of text in LaTeX's article class is scaled to the line's width."""
 
 LONG_CHARACTERS, LONG_CM = 35, 6
-"""A column of texts of which one is longer is broken into lines of so many centimetres in LaTeX."""
+"""In LaTeX, a text column with more than `LONG_CHARACTERS` characters is `LONG_CM` cm wide, with line breaks."""
 
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """One column: its title, and how a cell's value is shown as text.
+    """A column: its title, and a function that formats the value of a cell.
 
-    `parts` names the values that a cell consists of, where it has several (a sequence, or a mapping with these keys):
-    CSV has a column for each of them. `in_csv` is the unit of its values in CSV, where they are shown in another one.
-    `is_text` is for words, which begin at the left; `is_long` for sentences.
+    `parts` names the values of a cell that has several (a sequence, or a mapping with these keys); CSV has a column
+    for each part. `in_csv` is the unit of the values in CSV if it differs from the unit shown. `is_text` marks a column
+    of words, which is aligned left, and `is_long` a column of sentences.
     """
 
     title: str
@@ -49,13 +52,13 @@ class Column:
 
 @dataclass(frozen=True, slots=True)
 class TableData:
-    """Columns, and rows of values, as many as there are columns; None is what is not known."""
+    """A table: columns, and rows with a value for each column; None is an unknown value."""
 
     columns: Sequence[Column]
     rows: Sequence[Sequence[Any]]
 
     def without_empty(self) -> TableData:
-        """Leave out the columns of which no row knows a value."""
+        """Return the table without the columns that have no known value."""
         known = [
             index
             for index, column in enumerate(self.columns)
@@ -65,23 +68,23 @@ class TableData:
         return TableData(columns, [[row[index] for index in known] for row in self.rows])
 
 
-def words(title: str, *, is_long: bool = False) -> Column:
-    """Make a column of texts."""
+def texts(title: str, *, is_long: bool = False) -> Column:
+    """Return a column of texts."""
     return Column(title, lambda cell: NOTHING if cell is None else str(cell), is_text=True, is_long=is_long)
 
 
 def numbers(title: str, digits: int = 1) -> Column:
-    """Make a column of numbers, shown with `digits` after the point."""
+    """Return a column of numbers, shown with `digits` decimals."""
     return Column(title, lambda cell: number(cell, digits))
 
 
 def shares(title: str) -> Column:
-    """Make a column of shares of 1, shown as whole per cent."""
+    """Return a column of shares, shown as whole per cent."""
     return Column(title, percent, in_csv=SHARE)
 
 
 def share_intervals(title: str) -> Column:
-    """Make a column of intervals of shares of 1."""
+    """Return a column of intervals of shares."""
     return Column(
         title,
         lambda cell: NOTHING if cell is None else f"{interval(cell, unit=100.0)}{UNBROKEN}%",
@@ -91,46 +94,46 @@ def share_intervals(title: str) -> Column:
 
 
 def intervals(title: str, digits: int = 2) -> Column:
-    """Make a column of intervals, each a low and a high bound."""
+    """Return a column of intervals, each with a low and a high bound."""
     return Column(title, lambda cell: interval(cell, digits=digits), LOW_HIGH)
 
 
 def probabilities(title: str) -> Column:
-    """Make a column of p values."""
+    """Return a column of p values."""
     return Column(title, probability)
 
 
 def latencies(title: str, *, bounded: bool = False) -> Column:
-    """Make a column of latencies in ms: `p5`, `p50`, `p95`, and `bound` where the offset between clocks matters."""
+    """Return a column of latencies in ms: `p5`, `p50`, `p95`, and `bound` if the clock offset enters them."""
     return Column(title, latency, (*PERCENTILES, "bound") if bounded else PERCENTILES)
 
 
 def number(value: float | None, digits: int = 1) -> str:
-    """Write a number with `digits` after the point; a dash where there is none."""
+    """Return a number with `digits` decimals, or a dash for None."""
     return NOTHING if value is None else f"{value:.{digits}f}"
 
 
 def percent(value: float | None) -> str:
-    """Write a share as whole per cent."""
+    """Return a share in whole per cent, or a dash for None."""
     return NOTHING if value is None else f"{value * 100:.0f}{UNBROKEN}%"
 
 
 def probability(value: float | None) -> str:
-    """Write a p value with two significant digits, never as 0."""
+    """Return a p value with two significant digits, never as 0."""
     if value is None:
         return NOTHING
     return f"<{UNBROKEN}0.0001" if value < 0.0001 else f"{value:.2g}"
 
 
 def interval(bounds: Sequence[float] | None, *, unit: float = 1.0, digits: int = 0) -> str:
-    """Write an interval as "low to high", not to be broken."""
+    """Return an interval as "low to high", without a line break."""
     if bounds is None:
         return NOTHING
     return f"{bounds[0] * unit:.{digits}f} to {bounds[1] * unit:.{digits}f}".replace(" ", UNBROKEN)
 
 
 def latency(summary: Mapping[str, Any] | None) -> str:
-    """Write a latency: median, the bound of what the clocks can make of it (not of a loop), and p5 to p95."""
+    """Return the median, the bound of its clock error (if there is one), and p5 to p95."""
     if summary is None or summary["p50"] is None:
         return NOTHING
     median, spread = f"{summary['p50']:.1f}", f"({summary['p5']:.1f} to {summary['p95']:.1f})"
@@ -140,28 +143,20 @@ def latency(summary: Mapping[str, Any] | None) -> str:
 
 
 def with_bound(value: float | None, bound: float | None, *, digits: int = 1) -> str:
-    """Write a number with how wrong it can be (one digit more, at most three), not to be broken."""
+    """Return a number ± its bound, without a line break; the bound has one decimal more, at most three."""
     if value is None:
         return NOTHING
-    wrong = "unknown" if bound is None else f"{bound:.{min(digits + 1, 3)}f}"
-    return f"{value:.{digits}f} ± {wrong}".replace(" ", UNBROKEN)
+    error = "unknown" if bound is None else f"{bound:.{min(digits + 1, 3)}f}"
+    return f"{value:.{digits}f} ± {error}".replace(" ", UNBROKEN)
 
 
-def html_of(table: TableData) -> str:
-    """Make HTML of a table, which scrolls sideways on a narrow screen."""
-    kinds = [
-        ' class="long"' if column.is_long else ' class="text"' if column.is_text else "" for column in table.columns
-    ]
-    head = "".join(f"<th{kind}>{escape(column.title)}</th>" for kind, column in zip(kinds, table.columns, strict=True))
-    body = "\n".join(
-        "<tr>" + "".join(f"<td{kind}>{escape(text)}</td>" for kind, text in zip(kinds, texts, strict=True)) + "</tr>"
-        for texts in _texts(table)
-    )
-    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>\n{body}\n</tbody></table></div>'
+def html_of(table: TableData) -> Markup:
+    """Return a table as HTML."""
+    return html_page.table(table.columns, _texts(table))
 
 
 def csv_of(table: TableData) -> str:
-    """Make CSV of a table: every value in a column of its own, to its last digit; nothing where it is not known."""
+    """Return a table as CSV: each value in its own column with all its digits, an unknown value empty."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow([name for column in table.columns for name in _names(column)])
@@ -172,12 +167,12 @@ def csv_of(table: TableData) -> str:
 
 
 def tex_of(table: TableData) -> str:
-    r"""Make a LaTeX `tabular` of a table, as it is shown; needs `booktabs`, and `graphicx` where it is wide."""
-    texts = _texts(table)
-    columns = [_tex_column(column, [row[index] for row in texts]) for index, column in enumerate(table.columns)]
+    r"""Return a table as a LaTeX `tabular`; it needs `booktabs`, and `graphicx` if it is wide."""
+    shown = _texts(table)
+    columns = [_tex_column(column, [row[index] for row in shown]) for index, column in enumerate(table.columns)]
     head, *rows = [" & ".join(cells) + r" \\" for cells in zip(*(cells for _, _, cells in columns), strict=True)]
     packages = [r"% needs \usepackage{booktabs}"]
-    begin, end = rf"\begin{{tabular}}{{{''.join(place for place, _, _ in columns)}}}", r"\end{tabular}"
+    begin, end = rf"\begin{{tabular}}{{{''.join(align for align, _, _ in columns)}}}", r"\end{tabular}"
     if sum(width + 2 for _, width, _ in columns) > LINE_CHARACTERS:
         packages.append(r"% needs \usepackage{graphicx}")
         begin, end = r"\resizebox{\textwidth}{!}{" + begin, end + "}"
@@ -185,16 +180,16 @@ def tex_of(table: TableData) -> str:
 
 
 def _tex_column(column: Column, texts: Sequence[str]) -> tuple[str, int, list[str]]:
-    """Give a column's place in LaTeX, about how many characters wide it is, and its cells, the title first."""
+    """Return a column's LaTeX alignment, its approximate width in characters, and its cells, the title first."""
     longest = max(map(len, texts), default=0)
     if column.is_text and longest > LONG_CHARACTERS:
         return f"p{{{LONG_CM}cm}}", LONG_CHARACTERS, [_tex(column.title), *map(_tex_long, texts)]
-    place = "l" if column.is_text else "r"
+    align = "l" if column.is_text else "r"
     title = column.title.replace(" %", f"{UNBROKEN}%")
     lines = textwrap.wrap(title, TITLE_CHARACTERS, break_long_words=False) or [""]
     stack = r"\\".join(map(_tex, lines))
-    title = stack if len(lines) == 1 else rf"\shortstack[{place}]{{{stack}}}"
-    return place, max(longest, *map(len, lines)), [title, *map(_tex, texts)]
+    title = stack if len(lines) == 1 else rf"\shortstack[{align}]{{{stack}}}"
+    return align, max(longest, *map(len, lines)), [title, *map(_tex, texts)]
 
 
 def _texts(table: TableData) -> list[list[str]]:
@@ -226,7 +221,7 @@ _TEX = {
     "<": r"$<$",
     ">": r"$>$",
     "|": r"$|$",
-    "[": "{[}",  # after a row, these would be read as the height of a space, and as a star
+    "[": "{[}",  # at the beginning of a row, LaTeX reads these as options of the line break before it
     "*": "{*}",
     "τ": r"$\tau$",
     "±": r"$\pm$",
@@ -237,10 +232,10 @@ _TEX = {
 
 
 def _tex(text: str) -> str:
-    """Escape what LaTeX would read as a command; a line break ends a table's row there, so it becomes a space."""
+    """Escape LaTeX's special characters; a line break becomes a space, so that each row is one line."""
     return "".join(_TEX.get(character, character) for character in text.replace("\n", " "))
 
 
 def _tex_long(text: str) -> str:
-    """Escape a text that may be broken where JSON has no spaces, too."""
+    """Escape a text, and permit line breaks after each comma and colon, as JSON has no spaces."""
     return re.sub(r"([,:])(?=[^\s~])", r"\1\\allowbreak{}", _tex(text))

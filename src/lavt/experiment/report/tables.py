@@ -21,40 +21,40 @@ from lavt.experiment.report.table_format import (
     probabilities,
     share_intervals,
     shares,
+    texts,
     with_bound,
-    words,
 )
 
 FLOWS = ("video", "control")
 
 COMPLETED_P95 = "p95 m, completed runs"
-COMMON_P95 = "p95 m, to the common distance"
+COMMON_P95 = "p95 m, up to common distance"
 
 AFTERWARDS = ", after the loop"
 
 ENDED_EARLY = "ended early"
-"""What a quantile is over all runs where it lies among those that were not completed."""
+"""The text of a quantile over all runs that falls among the runs that were not completed."""
 
-FIDELITY_SAYS = {
-    "video": "network and clocks are modelled, pictures, codec and packets are real",
-    "pixels": "network, clocks and codec are modelled, pictures are real",
-    "geometry": "network, clocks, codec, camera and perception are modelled, the lane is seen without fault",
+FIDELITY_DESCRIPTIONS = {
+    "video": "modelled network and clocks, real images, codec and packets",
+    "pixels": "modelled network, clocks and codec, real images",
+    "geometry": "modelled network, clocks, codec, camera and perception, lane detection without errors",
 }
 
 
-def how_it_was_driven(runs: Sequence[Mapping[str, Any]]) -> str:
-    """Say in words whether time was real, what was modelled, and who injected the delay."""
-    ways = {(run["time"], run.get("fidelity") or "video", run["injection"]) for run in runs}
+def run_setup(runs: Sequence[Mapping[str, Any]]) -> str:
+    """Return whether time was real, which parts were modelled, and what injected the delay."""
+    setups = {(run["time"], run.get("fidelity") or "video", run["injection"]) for run in runs}
     return "; ".join(
-        f"virtual time, fidelity {fidelity}: {FIDELITY_SAYS[fidelity]}"
+        f"virtual time, fidelity {fidelity}: {FIDELITY_DESCRIPTIONS[fidelity]}"
         if time == "virtual"
         else f"real time, {'nothing injected' if injection == 'none' else f'injected by {injection}'}"
-        for time, fidelity, injection in sorted(ways, key=str)
+        for time, fidelity, injection in sorted(setups, key=str)
     )
 
 
-def paper_beside(conditions: Conditions, paper: Conditions) -> Conditions:
-    """Choose the paper's conditions that are ours, too: same name, and the same delay injected."""
+def matching_paper(conditions: Conditions, paper: Conditions) -> Conditions:
+    """Return the paper's conditions with the same name and the same injected delay as one of `conditions`."""
     return {
         name: paper[name]
         for name, entry in conditions.items()
@@ -63,25 +63,25 @@ def paper_beside(conditions: Conditions, paper: Conditions) -> Conditions:
 
 
 def latency_table(conditions: Conditions, paper: Conditions) -> TableData:
-    """What was injected and what was measured, ours and the paper's: one row a condition."""
+    """Return the table of injected and measured latency with the paper's values: one row for each condition."""
     columns = [
-        words("condition"),
-        numbers("injected into video ms", 0),
-        numbers("into control ms", 0),
+        texts("condition"),
+        numbers("injected video delay ms", 0),
+        numbers("injected control delay ms", 0),
         latencies("τ video ms", bounded=True),
         numbers("the paper's τ video ms", 0),
         latencies("τ control ms", bounded=True),
         numbers("the paper's τ control ms", 0),
-        latencies("loop ms"),
+        latencies("loop latency ms"),
         numbers("the paper's τ video + τ control ms", 0),
-        numbers("picture age, mean ms", 0),
-        numbers("picture age, p95 ms", 0),
-        latencies("age when a command is applied ms"),
+        numbers("frame age, mean ms", 0),
+        numbers("frame age, p95 ms", 0),
+        latencies("frame age at actuation ms"),
     ]
     rows = []
     for name, entry in conditions.items():
-        its = paper.get(name, {})
-        total_ms = its["tau_v_ms"] + its["tau_c_ms"] if its else None
+        published = paper.get(name, {})
+        total_ms = published["tau_v_ms"] + published["tau_c_ms"] if published else None
         age_ms = entry.get("picture_age_ms") or {}
         rows.append(
             [
@@ -89,9 +89,9 @@ def latency_table(conditions: Conditions, paper: Conditions) -> TableData:
                 entry["injected_ms"]["video"],
                 entry["injected_ms"]["control"],
                 entry["tau_v_ms"],
-                its.get("tau_v_ms"),
+                published.get("tau_v_ms"),
                 entry["tau_c_ms"],
-                its.get("tau_c_ms"),
+                published.get("tau_c_ms"),
                 entry["loop_ms"],
                 total_ms,
                 age_ms.get("mean"),
@@ -103,13 +103,13 @@ def latency_table(conditions: Conditions, paper: Conditions) -> TableData:
 
 
 def driving_table(conditions: Conditions, paper: Conditions) -> TableData:
-    """How the runs ended, ours and the paper's: one row a condition."""
+    """Return the table of completion and endings with the paper's values: one row for each condition."""
     columns = [
-        words("condition"),
+        texts("condition"),
         numbers("runs", 0),
         shares("completed"),
         share_intervals("95 %, these routes"),
-        share_intervals("range over such roads"),
+        share_intervals("range over roads"),
         shares("the paper's completed"),
         share_intervals("the paper's 95 %"),
         numbers("collisions / run", 2),
@@ -118,12 +118,12 @@ def driving_table(conditions: Conditions, paper: Conditions) -> TableData:
         numbers("lane invasions / run", 2),
         numbers("the paper's lane invasions / run", 2),
         numbers("lane invasions / km", 1),
-        words("endings"),
+        texts("endings"),
     ]
     rows = []
     for name, entry in conditions.items():
-        its = paper.get(name, {})
-        endings = ", ".join(f"{many} {ending}" for ending, many in (entry.get("endings") or {}).items())
+        published = paper.get(name, {})
+        endings = ", ".join(f"{count} {ending}" for ending, count in (entry.get("endings") or {}).items())
         rows.append(
             [
                 name,
@@ -131,13 +131,13 @@ def driving_table(conditions: Conditions, paper: Conditions) -> TableData:
                 entry["completion_rate"],
                 entry["completion_interval"],
                 entry.get("completion_such_roads"),
-                its.get("completion_rate"),
-                its.get("completion_interval"),
+                published.get("completion_rate"),
+                published.get("completion_interval"),
                 entry["collisions_per_run"],
-                its.get("collisions_per_run"),
+                published.get("collisions_per_run"),
                 entry.get("collisions_per_km"),
                 entry["lane_invasions_per_run"],
-                its.get("lane_invasions_per_run"),
+                published.get("lane_invasions_per_run"),
                 entry.get("lane_invasions_per_km"),
                 endings or None,
             ]
@@ -146,14 +146,14 @@ def driving_table(conditions: Conditions, paper: Conditions) -> TableData:
 
 
 def error_table(conditions: Conditions, paper: Conditions) -> TableData:
-    """How well the lane was kept, P95 three ways, ours and the paper's: one row a condition."""
+    """Return the table of lane-keeping errors with the paper's values: one row for each condition."""
     columns = [
-        words("condition"),
+        texts("condition"),
         numbers(f"{COMPLETED_P95}, mean of runs", 2),
-        intervals("its 95 % interval m"),
+        intervals("95 % interval, completed runs m"),
         numbers("the paper's p95 m", 2),
         numbers(f"{COMMON_P95}, mean of runs", 2),
-        intervals("95 % interval of that m"),
+        intervals("95 % interval, up to common distance m"),
         Column("p95 m, all runs ranked", _quartiles, ("p25", "p50", "p75")),
         numbers("mean error m", 2),
         numbers("rms m, mean of runs", 2),
@@ -180,7 +180,7 @@ def error_table(conditions: Conditions, paper: Conditions) -> TableData:
 
 
 def _quartiles(quartiles: Mapping[str, float | None] | None) -> str:
-    """Write the median and both quartiles."""
+    """Return the median and both quartiles."""
     if quartiles is None:
         return NOTHING
     low, middle, high = (
@@ -190,31 +190,31 @@ def _quartiles(quartiles: Mapping[str, float | None] | None) -> str:
 
 
 def contrast_table(contrasts: Sequence[Mapping[str, Any]], paper: Sequence[Mapping[str, Any]]) -> TableData:
-    """The planned contrasts, ours by McNemar's test on pairs and the paper's by Fisher's on counts."""
+    """Return the table of planned contrasts with the paper's p values, from Fisher's test on its counts."""
     columns = [
-        words("contrast"),
+        texts("contrast"),
         numbers("pairs", 0),
-        numbers("completed under the first only", 0),
-        numbers("under the second only", 0),
+        numbers("completed under first only", 0),
+        numbers("completed under second only", 0),
         probabilities("p"),
         probabilities("p, Holm"),
         probabilities("the paper's p"),
         probabilities("the paper's p, Holm"),
     ]
-    its = {(contrast["a"], contrast["b"]): contrast for contrast in paper}
+    published = {(contrast["a"], contrast["b"]): contrast for contrast in paper}
     rows = []
     for contrast in contrasts:
-        theirs = its.get((contrast["a"], contrast["b"]), {})
-        ours = [contrast[key] for key in ("pairs", "only_a", "only_b", "p", "p_holm")]
-        rows.append([f"{contrast['a']} – {contrast['b']}", *ours, theirs.get("p"), theirs.get("p_holm")])
+        its = published.get((contrast["a"], contrast["b"]), {})
+        values = [contrast[key] for key in ("pairs", "only_a", "only_b", "p", "p_holm")]
+        rows.append([f"{contrast['a']} – {contrast['b']}", *values, its.get("p"), its.get("p_holm")])
     return TableData(columns, rows).without_empty()
 
 
 def group_table(groups: Sequence[Group], names: Sequence[str]) -> TableData:
-    """One row for each condition of each group, which the settings `names` tell apart."""
+    """Return the table of groups, which the settings `names` distinguish: one row for each condition of a group."""
     columns = [
-        *(words(short(name)) for name in names),
-        words("condition"),
+        *(texts(short(name)) for name in names),
+        texts("condition"),
         numbers("runs", 0),
         shares("completed"),
         share_intervals("95 % interval"),
@@ -222,8 +222,8 @@ def group_table(groups: Sequence[Group], names: Sequence[str]) -> TableData:
         numbers("lane invasions / run", 2),
         numbers(f"{COMPLETED_P95}, mean of runs", 2),
         numbers(f"{COMMON_P95}, mean of runs", 2),
-        numbers("loop ms, median"),
-        numbers("picture age, mean ms", 0),
+        numbers("loop latency ms, median"),
+        numbers("frame age, mean ms", 0),
     ]
     rows = [
         [
@@ -246,10 +246,10 @@ def group_table(groups: Sequence[Group], names: Sequence[str]) -> TableData:
 
 
 def route_table(conditions: Conditions) -> TableData:
-    """One row for each condition on each route."""
+    """Return the table of routes: one row for each condition on each route."""
     columns = [
-        words("route"),
-        words("condition"),
+        texts("route"),
+        texts("condition"),
         numbers("runs", 0),
         numbers("completed", 0),
         shares("share"),
@@ -269,9 +269,9 @@ def route_table(conditions: Conditions) -> TableData:
 
 
 def route_overview(conditions: Conditions) -> TableData:
-    """How many of the runs were completed: one row a route, one column a condition."""
+    """Return the table of completed runs: one row for each route, one column for each condition."""
     routes = sorted({route for entry in conditions.values() for route in entry.get("routes") or {}})
-    columns = [words("completed"), *(Column(name, lambda cell: cell or NOTHING) for name in conditions)]
+    columns = [texts("completed"), *(Column(name, lambda cell: cell or NOTHING) for name in conditions)]
     rows = [
         [route, *(_completed((entry.get("routes") or {}).get(route)) for entry in conditions.values())]
         for route in routes
@@ -284,14 +284,14 @@ def _completed(entry: Mapping[str, Any] | None) -> str | None:
 
 
 def survival_table(conditions: Conditions) -> TableData:
-    """Where each step of each survival curve is: long, for computing and drawing with something else."""
+    """Return the table of all steps of the survival curves, for use in other programs."""
     columns = [
-        words("route"),
-        words("condition"),
+        texts("route"),
+        texts("condition"),
         numbers("distance m", 1),
         shares("still driving"),
         share_intervals("95 % interval"),
-        words("ended so far"),
+        texts("ended so far"),
     ]
     rows = []
     for name, entry in conditions.items():
@@ -304,20 +304,20 @@ def survival_table(conditions: Conditions) -> TableData:
 
 
 def run_table(runs: Sequence[Mapping[str, Any]]) -> TableData:
-    """One row a run: what it was, how it ended, and whether it may count."""
+    """Return the table of runs: identity, ending, main results and validity."""
     columns = [
-        words("run"),
-        words("sweep"),
-        words("time"),
-        words("route"),
-        words("condition"),
-        words("preset"),
-        words("ending"),
+        texts("run"),
+        texts("sweep"),
+        texts("time, fidelity, injection"),
+        texts("route"),
+        texts("condition"),
+        texts("preset"),
+        texts("ending"),
         numbers("distance m", 0),
-        numbers("loop ms"),
+        numbers("loop latency ms, median"),
         numbers("p95 error m", 2),
-        numbers("picture age, mean ms", 0),
-        words("validity", is_long=True),
+        numbers("frame age, mean ms", 0),
+        texts("validity", is_long=True),
     ]
     rows = [
         [
@@ -332,7 +332,7 @@ def run_table(runs: Sequence[Mapping[str, Any]]) -> TableData:
             run["loop_ms"]["p50"],
             run["p95_m"],
             (run.get("picture_age_ms") or {}).get("mean"),
-            "valid" if run["valid"] else "not valid: " + "; ".join(run["invalid_reasons"]),
+            "valid" if run["valid"] else "invalid: " + "; ".join(run["invalid_reasons"]),
         ]
         for run in runs
     ]
@@ -340,14 +340,14 @@ def run_table(runs: Sequence[Mapping[str, Any]]) -> TableData:
 
 
 def clock_table(runs: Sequence[Mapping[str, Any]]) -> TableData:
-    """One row for each run whose two sides had clocks of their own: Delta, who says it, and what the probe says."""
+    """Return the table of clock offsets, by their source and by the probe: one row for each run."""
     parts = ("", "bound")
     columns = [
-        words("run"),
-        words("Delta by"),
-        Column("Delta ms", lambda cell: with_bound(*cell, digits=3), parts),
+        texts("run"),
+        texts("source"),
+        Column("clock offset ms", lambda cell: with_bound(*cell, digits=3), parts),
         numbers("drift ppm", 2),
-        Column("by the probe ms", lambda cell: with_bound(*cell, digits=3), parts),
+        Column("clock offset by probe ms", lambda cell: with_bound(*cell, digits=3), parts),
     ]
     rows = [
         [
@@ -365,16 +365,15 @@ def clock_table(runs: Sequence[Mapping[str, Any]]) -> TableData:
 def stage_table(
     stages: Mapping[str, Sequence[Mapping[str, Any]]], captured_ms: Mapping[str, float | None] | None = None
 ) -> TableData:
-    """One row a hop in the order of a frame's life, one column a condition: medians in ms.
+    """Return the median latency of each stage in ms: one row for each stage, one column for each condition.
 
-    `captured_ms` is how long a frame's stamp came after its exposure: the first row, though the loop begins after it.
+    `captured_ms` is the time from capture to stamp by condition; it is the first row, before the loop begins.
     """
     names = list(dict.fromkeys((stage["node"], stage["stage"]) for every in stages.values() for stage in every))
     durations = [{(stage["node"], stage["stage"]): stage["p50"] for stage in every} for every in stages.values()]
-    known = captured_ms or {}
-    before: list[Any] = [known.get(name) for name in stages]
+    before: list[Any] = [(captured_ms or {}).get(name) for name in stages]
     show = numbers("", 2).show
-    columns = [words("hop, median ms"), *(Column(name, show) for name in stages)]
+    columns = [texts("stage, median ms"), *(Column(name, show) for name in stages)]
     rows = [
         [
             f"{node}: {stage}{AFTERWARDS if (node, stage) in AFTER_LOOP else ''}",
@@ -386,12 +385,12 @@ def stage_table(
 
 
 def machine_table(annotations: Mapping[str, Mapping[str, str]]) -> TableData:
-    """Show what a run's record says of versions and machine."""
-    columns = [words("of"), words("what", is_long=True), words("value", is_long=True)]
+    """Return the table of versions and machines from a run's records."""
+    columns = [texts("category"), texts("property", is_long=True), texts("value", is_long=True)]
     rows = [
         [name, key, value]
         for name in sorted(annotations)
         for key, value in annotations[name].items()
-        if key != "condition"  # which is told of each run, and no matter of the machine
+        if key != "condition"  # no property of the machine; other tables show it
     ]
     return TableData(columns, rows or [["not recorded", None, None]])
