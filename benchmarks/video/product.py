@@ -82,7 +82,7 @@ class SideRuntime:
         self.clock = MachineClock()
         self.runtime: RealRuntime | None = None
         self._recorder = recorder
-        self._link = UdpLink(self.clock, channel, self._deliver, bind=(LOOPBACK, 0), remote=remote)
+        self._link = UdpLink(self.clock, channel, bind=(LOOPBACK, 0), remote=remote)
 
     @property
     def port(self) -> int:
@@ -93,7 +93,7 @@ class SideRuntime:
         """Start the nodes, then receive messages."""
         self.runtime = RealRuntime(self.clock, nodes, self._recorder, lambda: None)
         self.runtime.start({"video": self._link, "zenoh": NullLink()})
-        self._link.start()
+        self._link.start(self._deliver)
         return self.runtime
 
     def close(self) -> None:

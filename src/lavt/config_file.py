@@ -26,6 +26,11 @@ def shipped(name: str) -> Path:
 Config = TypeVar("Config", bound=Section)
 
 
+def find_file(file: Path) -> Path:
+    """Return the file itself if it exists, otherwise the shipped file of that name."""
+    return file if file.exists() else shipped(str(file))
+
+
 def load_config(kind: type[Config], path: Path, changes: Iterable[str] = ()) -> Config:
     """Read a YAML file and `--set` changes (`a.b=value`, the value in YAML) into a config of class `kind`.
 

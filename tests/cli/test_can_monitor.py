@@ -12,7 +12,7 @@ import can
 import pytest
 from tests.support.command_line import Run
 
-from lavt.assembly.dbw_bus import find_dbw
+from lavt.assembly.dbw import find_dbw
 from lavt.config.dbw import DbwConfig
 from lavt.errors import UserError
 

@@ -33,9 +33,9 @@ def port() -> Iterator[int]:
         ):
             link.send(send)
 
-    link = UdpLink(clock, "probe_request", answer, bind=("127.0.0.1", 0), name="probe")
+    link = UdpLink(clock, "probe_request", bind=("127.0.0.1", 0), name="probe")
     with closing(link):
-        link.start()
+        link.start(answer)
         yield link.port
 
 

@@ -32,7 +32,7 @@ from lavt.transport.clock_sync import chrony
 from lavt.transport.clock_sync.clock_report import ClockReport, unknown_clock
 from lavt.transport.messages import encode
 from lavt.transport.udp_link import RECEIVE_BUFFER_BYTES, UdpLink
-from lavt.transport.zenoh_link import Router, Routers, ZenohLink, quiet_logs
+from lavt.transport.zenoh_link import Deliver, Router, Routers, ZenohLink, quiet_logs
 
 STATE = State(
     1, 1, 0.0, 0.0, "park", "disarmed", "nobody has armed the vehicle yet", -1, "", active_operator="operator-1"
@@ -307,14 +307,14 @@ def probe_port() -> Iterator[int]:
         ):
             link.send(send)
 
-    link = UdpLink(clock, "probe_request", answer, bind=("127.0.0.1", 0), name="probe")
+    link = UdpLink(clock, "probe_request", bind=("127.0.0.1", 0), name="probe")
     with closing(link):
-        link.start()
+        link.start(answer)
         yield link.port
 
 
 @contextmanager
-def sending(server: ZenohLink, send: Callable[[], None]) -> Iterator[None]:
+def sending(server: ZenohLink, send: Callable[[], None], deliver: Deliver = lambda *_: None) -> Iterator[None]:
     """Start a server's link and call `send` 50 times a second."""
     is_over = threading.Event()
 
@@ -324,7 +324,7 @@ def sending(server: ZenohLink, send: Callable[[], None]) -> Iterator[None]:
 
     sender = threading.Thread(target=send_periodically)
     with closing(server):
-        server.start()
+        server.start(deliver)
         sender.start()
         try:
             yield
@@ -337,7 +337,6 @@ def check_client(run: Run, router: str, probe_port: int, vehicle: str, payload: 
     """Run the doctor with a client's config while a server sends `payload` as its state; return the checks by name."""
     server = ZenohLink(
         MachineClock(),
-        lambda *_: None,
         side="server",
         path=shipped("zenoh-configs/session.json5"),
         router=router,
@@ -397,19 +396,18 @@ def test_a_pair_with_keys(router: str, keys: Path, operator: str, vehicle: str, 
     authenticator = vehicle_authenticator(
         parse_config(ServerConfig, {"vehicle_id": "vehicle-3", "security": security}, "test")
     )
-    gateway = ServerGateway(lambda *_: None, lambda *sends: server.send(*sends), lambda: (0, -1), authenticator)
     server = ZenohLink(
         MachineClock(),
-        gateway.receive,
         side="server",
         path=shipped("zenoh-configs/session.json5"),
         router=router,
         vehicle="vehicle-3",
         who="server",
     )
+    gateway = ServerGateway(lambda *_: None, server.send, lambda: (0, -1), authenticator)
     changes = [f"security.key={keys / operator}.key", f"security.vehicle={keys / vehicle}.pub"]
     network = [f"zenoh.router={router}", "vehicle_id=vehicle-3", "clock.probe_port=1"]
-    with sending(server, lambda: gateway.send(Send("state", encode(STATE)))):
+    with sending(server, lambda: gateway.send(Send("state", encode(STATE))), gateway.receive):
         found = check_config(shipped("configs/client.yaml"), *changes, *network)
     verdict, part = expected
     assert (found["vehicle"].verdict, part in found["vehicle"].found) == (verdict, True), found["vehicle"]

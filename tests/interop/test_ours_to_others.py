@@ -77,7 +77,7 @@ def our_server(port: int) -> Iterator[StampRecorder]:
     """Run the server's nodes in real time with a real socket; no client has control, so the vehicle is stationary."""
     config = load_config(ServerConfig, SERVER, config_changes(port))
     clock, stamps = MachineClock(), StampRecorder()
-    link = UdpLink(clock, "feedback", lambda *_: None, bind=("127.0.0.1", 0))
+    link = UdpLink(clock, "feedback", bind=("127.0.0.1", 0))
     nodes = build_server(config, clock.now, MachineEntropy(), host="here", video_port=link.port).all
     runtime = RealRuntime(clock, nodes, stamps, lambda: None)
     with closing(link):

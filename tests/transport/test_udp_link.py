@@ -36,8 +36,8 @@ class Received:
         return self.messages.get(timeout=ARRIVES_S)
 
 
-def open_link(received: Received, clock: Clock | None = None, remote: tuple[str, int] | None = None) -> UdpLink:
-    return UdpLink(clock or MachineClock(), "rtp", received, bind=ANY, remote=remote)
+def open_link(clock: Clock | None = None, remote: tuple[str, int] | None = None) -> UdpLink:
+    return UdpLink(clock or MachineClock(), "rtp", bind=ANY, remote=remote)
 
 
 @pytest.fixture
@@ -52,8 +52,8 @@ def sender() -> Iterator[socket.socket]:
 def test_delivers(sender: socket.socket) -> None:
     """A datagram is delivered on the link's channel, with the address it came from."""
     received = Received()
-    with closing(open_link(received)) as link:
-        link.start()
+    with closing(open_link()) as link:
+        link.start(received)
         sender.sendto(b"packet", ("127.0.0.1", link.port))
         channel, payload, _, peer = received.next()
     assert (channel, payload, peer) == ("rtp", b"packet", sender.getsockname())
@@ -62,11 +62,11 @@ def test_delivers(sender: socket.socket) -> None:
 def test_time_of_arrival(sender: socket.socket) -> None:
     """The time of arrival is when the kernel received the datagram, however late the link reads it."""
     received = Received()
-    with closing(open_link(received)) as link:
+    with closing(open_link()) as link:
         before = MachineClock().now()
         sender.sendto(b"early", ("127.0.0.1", link.port))
         sent = MachineClock().now()
-        link.start()
+        link.start(received)
         arrived = received.next()[2]
     assert before.wall_ns <= arrived.wall_ns <= sent.wall_ns + NS_PER_S // 100
     assert before.mono_ns - NS_PER_S // 1000 <= arrived.mono_ns <= MachineClock().now().mono_ns
@@ -75,9 +75,9 @@ def test_time_of_arrival(sender: socket.socket) -> None:
 def test_arrival_on_both_clocks(sender: socket.socket) -> None:
     """A kernel timestamp of 5 s ago puts the arrival 5 s back on the wall clock and on the monotonic clock."""
     received, clock = Received(), ShiftedClock(mono_ns=10**15, wall_ns=5 * NS_PER_S)
-    with closing(open_link(received, clock)) as link:
+    with closing(open_link(clock)) as link:
         before = MachineClock().now()
-        link.start()
+        link.start(received)
         sender.sendto(b"packet", ("127.0.0.1", link.port))
         arrived = received.next()[2]
         after = MachineClock().now()
@@ -90,9 +90,9 @@ def test_arrival_on_both_clocks(sender: socket.socket) -> None:
 def test_stepped_clock(sender: socket.socket, wall_s: float) -> None:
     """A kernel timestamp in the future or an hour old is ignored, and the time of reading is used."""
     received, clock = Received(), ShiftedClock(mono_ns=10**15, wall_ns=round(wall_s * NS_PER_S))
-    with closing(open_link(received, clock)) as link:
+    with closing(open_link(clock)) as link:
         before = clock.now()
-        link.start()
+        link.start(received)
         sender.sendto(b"packet", ("127.0.0.1", link.port))
         arrived = received.next()[2]
         after = clock.now()
@@ -105,8 +105,8 @@ def test_garbage(sender: socket.socket) -> None:
     received = Received()
     generator = stream(1, "garbage")
     datagrams = [b"", bytes(65_000), *(generator.bytes(int(generator.integers(1, 1500))) for _ in range(100))]
-    with closing(open_link(received)) as link:
-        link.start()
+    with closing(open_link()) as link:
+        link.start(received)
         for datagram in datagrams:
             sender.sendto(datagram, ("127.0.0.1", link.port))
             assert received.next()[1] == datagram
@@ -114,7 +114,7 @@ def test_garbage(sender: socket.socket) -> None:
 
 def test_send_to_a_peer(sender: socket.socket) -> None:
     """A link without a remote sends to the peer that a message names."""
-    with closing(open_link(Received())) as link:
+    with closing(open_link()) as link:
         link.send(Send("rtp", b"to you", sender.getsockname()))
         assert sender.recvfrom(100) == (b"to you", ("127.0.0.1", link.port))
 
@@ -123,14 +123,14 @@ def test_send_to_a_peer(sender: socket.socket) -> None:
 def test_send_to_the_remote(sender: socket.socket, known: bool) -> None:
     """A client's link sends to its server, at the configured port or else at the port of the session's reply."""
     port = sender.getsockname()[1]
-    with closing(open_link(Received(), remote=("localhost", port if known else 0))) as link:
+    with closing(open_link(remote=("localhost", port if known else 0))) as link:
         link.send(Send("feedback", b"hello", 9 if known else port))
         assert sender.recv(100) == b"hello"
 
 
 def test_unsendable_datagrams_are_counted() -> None:
     """A datagram that the system rejects is counted and raises nothing."""
-    with closing(open_link(Received())) as link:
+    with closing(open_link()) as link:
         for payload, address in ((bytes(70_000), ANY), (b"x", ("255.255.255.255", 9)), (b"x", ANY)):
             link.send(Send("rtp", payload, address))
         assert link.counts == {"datagrams_not_sent": 3}
@@ -140,30 +140,30 @@ def test_port_in_use(sender: socket.socket) -> None:
     """A port in use raises a UserError that names the port and a remedy."""
     port = sender.getsockname()[1]
     with pytest.raises(UserError, match=rf"port 127\.0\.0\.1:{port} .*in use.*: choose another, or 0"):
-        UdpLink(MachineClock(), "rtp", Received(), bind=("127.0.0.1", port))
+        UdpLink(MachineClock(), "rtp", bind=("127.0.0.1", port))
 
 
 @pytest.mark.parametrize("host", ["a" * 64, "192.0.2.1"])
 def test_address_of_another_machine(host: str) -> None:
     """An address of another machine, or an invalid one, raises a UserError."""
     with pytest.raises(UserError, match="cannot be opened"):
-        UdpLink(MachineClock(), "rtp", Received(), bind=(host, 0))
+        UdpLink(MachineClock(), "rtp", bind=(host, 0))
 
 
 def test_unknown_remote() -> None:
     """A server whose name cannot be resolved raises a UserError."""
     with pytest.raises(UserError, match="is not known"):
-        open_link(Received(), remote=("a" * 64, 5600))
+        open_link(remote=("a" * 64, 5600))
 
 
 @pytest.mark.parametrize("started", [True, False])
 def test_close(started: bool) -> None:
     """Closing a link ends its thread and frees its port."""
     before = set(threading.enumerate())
-    link = open_link(Received())
+    link = open_link()
     port = link.port
     if started:
-        link.start()
+        link.start(received)
     link.close()
     assert set(threading.enumerate()) <= before
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as again:
@@ -174,11 +174,11 @@ def test_only_from_one_host(sender: socket.socket) -> None:
     """A link with `only_from` receives from any port of that host; datagrams of other hosts are counted."""
     received = Received()
     with (
-        closing(UdpLink(MachineClock(), "rtp", received, bind=ANY, only_from="127.0.0.2")) as link,
+        closing(UdpLink(MachineClock(), "rtp", bind=ANY, only_from="127.0.0.2")) as link,
         closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as known,
     ):
         known.bind(("127.0.0.2", 0))
-        link.start()
+        link.start(received)
         sender.sendto(b"stranger", ("127.0.0.1", link.port))
         known.sendto(b"known", ("127.0.0.1", link.port))
         assert received.next()[1] == b"known"

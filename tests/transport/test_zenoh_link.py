@@ -79,7 +79,6 @@ def routers() -> Iterator[tuple[str, str]]:
 
 def link(
     side: Literal["server", "client"],
-    received: Received,
     router: str,
     *,
     vehicle: str = "vehicle-1",
@@ -88,7 +87,6 @@ def link(
 ) -> ZenohLink:
     return ZenohLink(
         MachineClock(),
-        received,
         side=side,
         path=path,
         router=router,
@@ -102,10 +100,10 @@ class Pair:
 
     def __init__(self, routers: tuple[str, str], vehicle: str) -> None:
         self.server_received, self.client_received = Received(), Received()
-        self.server = link("server", self.server_received, routers[0], vehicle=vehicle)
-        self.client = link("client", self.client_received, routers[1], vehicle=vehicle)
-        self.server.start()
-        self.client.start()
+        self.server = link("server", routers[0], vehicle=vehicle)
+        self.client = link("client", routers[1], vehicle=vehicle)
+        self.server.start(self.server_received)
+        self.client.start(self.client_received)
 
     def close(self) -> None:
         """Close both links."""
@@ -214,8 +212,8 @@ def test_liveliness(routers: tuple[str, str]) -> None:
         )
         known = {changes.get(timeout=ARRIVES_S) for _ in range(2)}
         assert known == {(f"lavt/vehicle-1/alive/{who}", True) for who in ("server-1", "client-1")}
-        visitor = link("client", Received(), routers[1], who="visitor")
-        visitor.start()
+        visitor = link("client", routers[1], who="visitor")
+        visitor.start(Received())
         assert changes.get(timeout=ARRIVES_S) == ("lavt/vehicle-1/alive/visitor", True)
         visitor.close()
         assert changes.get(timeout=ARRIVES_S) == ("lavt/vehicle-1/alive/visitor", False)
@@ -225,8 +223,8 @@ def test_liveliness(routers: tuple[str, str]) -> None:
 def test_query_without_a_server(routers: tuple[str, str]) -> None:
     """A query without a reply is not an error, and the link can be closed."""
     received = Received()
-    with closing(link("client", received, routers[1], vehicle="nobody")) as alone:
-        alone.start()
+    with closing(link("client", routers[1], vehicle="nobody")) as alone:
+        alone.start(received)
         alone.send(Send("session", b"query"))
         alone.send(Send("control", b"command"))
     assert received.messages.empty()
@@ -234,8 +232,8 @@ def test_query_without_a_server(routers: tuple[str, str]) -> None:
 
 def test_send_after_close(routers: tuple[str, str]) -> None:
     """A message that is sent after the session was closed is counted and raises nothing."""
-    closed = link("client", Received(), routers[1], vehicle="closed")
-    closed.start()
+    closed = link("client", routers[1], vehicle="closed")
+    closed.start(Received())
     closed.close()
     for channel in ("session", "control"):
         closed.send(Send(channel, b"x"))
@@ -252,7 +250,6 @@ def test_names(name: str) -> None:
         with pytest.raises(UserError, match="1 to 32 letters"):
             ZenohLink(
                 MachineClock(),
-                Received(),
                 side="client",
                 path=SESSION,
                 router="tcp/127.0.0.1:1",
@@ -275,7 +272,7 @@ def test_no_router() -> None:
     """Without a router, the error names the endpoint and the command that starts a router."""
     endpoint = unanswered()
     with pytest.raises(UserError, match=rf"{endpoint}.*lavt router") as error:
-        link("server", Received(), endpoint)
+        link("server", endpoint)
     assert is_one_plain_line(error)
 
 
@@ -285,7 +282,6 @@ def test_waiting_for_a_router() -> None:
     with ExitStack() as stack:
         waiting = ZenohLink(
             MachineClock(),
-            Received(),
             side="client",
             path=SESSION,
             router=endpoint,
@@ -295,13 +291,13 @@ def test_waiting_for_a_router() -> None:
         )
         stack.callback(waiting.close)
         assert reasons == []
-        waiting.start()
+        waiting.start(Received())
         waiting.send(Send("control", b"too early"), Send("session", b"too early"))
         assert waiting.counts["control_not_sent"] == waiting.counts["session_not_sent"] == 1
         stack.callback(Router(CONFIGS / "router-server.json5", {"listen/endpoints": [endpoint]}).close)
-        server = link("server", received, endpoint, vehicle="late")
+        server = link("server", endpoint, vehicle="late")
         stack.callback(server.close)
-        server.start()
+        server.start(received)
         received.next(("control", b"now"), lambda: waiting.send(Send("control", b"now")))
     assert len(reasons) == 1
     assert endpoint in reasons[0]
@@ -312,7 +308,6 @@ def test_closing_while_waiting_for_a_router() -> None:
     with closing(
         ZenohLink(
             MachineClock(),
-            Received(),
             side="server",
             path=SESSION,
             router=unanswered(),
@@ -321,14 +316,14 @@ def test_closing_while_waiting_for_a_router() -> None:
             waiting=lambda _: None,
         )
     ) as waiting:
-        waiting.start()
+        waiting.start(Received())
 
 
 @pytest.mark.parametrize("endpoint", ["nonsense", "foo/127.0.0.1:1", "tcp/127.0.0.1", "tcp/127.0.0.1:99999"])
 def test_bad_endpoint(endpoint: str) -> None:
     """An invalid endpoint raises a UserError that names it."""
     with pytest.raises(UserError, match=endpoint) as error:
-        link("server", Received(), endpoint)
+        link("server", endpoint)
     assert is_one_plain_line(error)
 
 
@@ -448,7 +443,7 @@ def test_shipped_configs(
         endpoint = endpoints.format(tmp_path)
         with closing(Router(CONFIGS / "router-server.json5", {"listen/endpoints": [endpoint]})) as router:
             connect = local(router) if endpoint == LOCAL else endpoint
-            link("server", Received(), connect, vehicle="shipped", path=CONFIGS / name).close()
+            link("server", connect, vehicle="shipped", path=CONFIGS / name).close()
         return
     if "-tls" in name:
         monkeypatch.chdir(request.getfixturevalue("keys").parent)

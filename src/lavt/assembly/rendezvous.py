@@ -11,7 +11,7 @@ from lavt.transport.messages import NAME
 from lavt.transport.rendezvous.forwarder import Address, FlowName, Forwarder, encode_registration
 from lavt.transport.rendezvous.link import RendezvousLink, RendezvousPort
 from lavt.transport.security.keys import load_private, load_public
-from lavt.transport.udp_link import Deliver, UdpLink, resolve_host
+from lavt.transport.udp_link import UdpLink, resolve_host
 
 
 def open_flow(
@@ -19,7 +19,6 @@ def open_flow(
     clock: Clock,
     flow: FlowName,
     channel: str,
-    deliver: Deliver,
     *,
     bind: Address,
     remote: Address | None,
@@ -29,14 +28,13 @@ def open_flow(
     Raises `UserError` for a port that cannot be opened, an unknown host, and a key that cannot be read.
     """
     if not isinstance(config, ServerConfig) or not config.rendezvous.host:
-        return UdpLink(clock, channel, deliver, bind=bind, remote=remote, name=flow)
+        return UdpLink(clock, channel, bind=bind, remote=remote, name=flow)
     rendezvous = config.rendezvous
     key = load_private(Path(config.security.key)) if config.security.key else None
     host = resolve_host("rendezvous.host", rendezvous.host)
     return RendezvousLink(
         clock,
         channel,
-        deliver,
         bind=bind,
         name=flow,
         rendezvous=(host, {"video": rendezvous.video_port, "probe": rendezvous.probe_port}[flow]),

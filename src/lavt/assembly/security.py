@@ -12,6 +12,8 @@ from lavt.transport.security.gateway import Carry, ClientGateway, Deliver, OpenC
 from lavt.transport.security.keys import load_private, load_public
 from lavt.transport.video.cipher import End, NewCipher, SrtpCipher, plain_cipher
 
+Authenticator = NullVehicleAuthenticator | OperatorAuthenticator | None
+
 
 def cipher_of(config: ServerConfig | ClientConfig) -> NewCipher:
     """Return the cipher of the video, which is encrypted if the config has a key."""
@@ -22,17 +24,20 @@ def cipher_of(config: ServerConfig | ClientConfig) -> NewCipher:
     return lambda token, challenge: SrtpCipher(end, token, challenge)
 
 
-def gateway_of(
-    config: ServerConfig | ClientConfig,
-    deliver: Deliver,
-    carry: Carry,
-    in_force: Callable[[], tuple[int, int]] = lambda: (0, -1),
+def build_authenticator(config: ServerConfig | ClientConfig) -> Authenticator:
+    """Build a side's authenticator, None for a client without a key; raise `UserError` for an unreadable key."""
+    return vehicle_authenticator(config) if isinstance(config, ServerConfig) else operator_authenticator(config)
+
+
+def build_gateway(
+    authenticator: Authenticator, deliver: Deliver, carry: Carry, in_force: Callable[[], tuple[int, int]]
 ) -> ServerGateway | ClientGateway | OpenClientGateway:
-    """Build a side's gateway; raise `UserError` for an unreadable key. Only the server's gateway calls `in_force`."""
-    if isinstance(config, ServerConfig):
-        return ServerGateway(deliver, carry, in_force, vehicle_authenticator(config))
-    authenticator = operator_authenticator(config)
-    return OpenClientGateway(deliver, carry) if authenticator is None else ClientGateway(deliver, carry, authenticator)
+    """Build the gateway of a side with this authenticator; only a server's gateway calls `in_force`."""
+    if authenticator is None:
+        return OpenClientGateway(deliver, carry)
+    if isinstance(authenticator, OperatorAuthenticator):
+        return ClientGateway(deliver, carry, authenticator)
+    return ServerGateway(deliver, carry, in_force, authenticator)
 
 
 def vehicle_authenticator(config: ServerConfig) -> NullVehicleAuthenticator:

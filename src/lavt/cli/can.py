@@ -11,8 +11,7 @@ from typing import Annotated
 
 import typer
 
-from lavt.assembly.dbw import load_profile, read_profile
-from lavt.assembly.dbw_bus import expected_traffic, find_dbw
+from lavt.assembly.dbw import expected_traffic, find_dbw, load_profile, read_profile
 from lavt.assembly.dbw_check import find_mismatches, real_bus_inhibit_reasons
 from lavt.cli import console
 from lavt.cli.can_test_watchdog import run_watchdog_test

@@ -8,10 +8,9 @@ from typing import Annotated
 
 import typer
 
-from lavt.assembly.entropy import MachineEntropy
-from lavt.assembly.nodes import build_client
+from lavt.assembly.side import open_client
 from lavt.cli import console
-from lavt.cli.side import Side, run_side
+from lavt.cli.side import run_side
 from lavt.clock import MachineClock
 from lavt.config import ClientConfig
 from lavt.config_file import load_config
@@ -42,11 +41,7 @@ def client(
     console.reserve_stdout()
     process_priority.raise_priority()
     settings = load_config(ClientConfig, config, [*(changes or []), *(["take_over=true"] if take_over else [])])
-    clock = MachineClock()
-    with Side(settings, out, clock) as side:
-        side.open_video("rtp", bind=("", 0), remote=(settings.video.server, settings.video.port))
-        side.open_probe("probe_reply", bind=("", 0), remote=(settings.video.server, settings.clock.probe_port))
-        nodes = build_client(settings, clock.now, MachineEntropy())
+    with open_client(settings, out, MachineClock(), console.print_message) as side:
         signal.signal(signal.SIGUSR1, lambda *_: side.send("operator", "emergency_stop"))
         signal.signal(signal.SIGUSR2, lambda *_: side.send("operator", "release"))
-        run_side(side, nodes.all, once=False, as_json=as_json, ready={}, session=nodes.driver.session)
+        run_side(side, settings.who, once=False, as_json=as_json, ready={})

@@ -97,9 +97,9 @@ def probe(
         replies.put((payload, arrived))
 
     sent: dict[int, int] = {}
-    link = UdpLink(machine, "probe_reply", deliver, bind=("", 0), remote=(address, port), name="probe")
+    link = UdpLink(machine, "probe_reply", bind=("", 0), remote=(address, port), name="probe")
     with closing(link):
-        link.start()
+        link.start(deliver)
         end_ns = machine.now().mono_ns + duration_ns
         while machine.now().mono_ns < end_ns:
             sent[len(sent)] = machine.now().wall_ns

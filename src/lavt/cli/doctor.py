@@ -20,10 +20,9 @@ from lavt.assembly.by_wire import listen
 from lavt.assembly.cameras import client_camera
 from lavt.cli import console
 from lavt.cli.clock import probe
-from lavt.cli.router import find_file
 from lavt.clock import MachineClock
 from lavt.config import ClientConfig, ServerCameraConfig, ServerConfig
-from lavt.config_file import load_config, read_yaml, split_change
+from lavt.config_file import find_file, load_config, read_yaml, split_change
 from lavt.doctor import checks, probes
 from lavt.doctor.checks import Check
 from lavt.doctor.clock_checks import compare
@@ -200,7 +199,6 @@ def _zenoh(settings: Settings, clock: MachineClock) -> Iterator[Check]:
     try:
         link = ZenohLink(
             clock,
-            listener.receive,
             side="client",
             path=find_file(Path(settings.zenoh.session)),
             router=settings.zenoh.router,

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from lavt.cli import console
-from lavt.config_file import shipped, split_change
+from lavt.config_file import find_file, split_change
 from lavt.runtime import process_priority
 
 POLL_PERIOD_S = 0.5
@@ -46,11 +46,6 @@ def router(
                 pass
     finally:
         running.close()  # an open router would keep the process alive
-
-
-def find_file(file: Path) -> Path:
-    """Return the file itself if it exists, otherwise the shipped file of that name."""
-    return file if file.exists() else shipped(str(file))
 
 
 def parse_overrides(changes: list[str]) -> dict[str, Any]:

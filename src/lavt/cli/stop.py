@@ -10,12 +10,11 @@ from typing import Annotated, Any
 import typer
 
 from lavt.assembly.entropy import MachineEntropy
-from lavt.assembly.security import gateway_of
+from lavt.assembly.security import build_authenticator, build_gateway
 from lavt.cli import console
-from lavt.cli.router import find_file
 from lavt.clock import MachineClock
 from lavt.config import ClientConfig
-from lavt.config_file import load_config
+from lavt.config_file import find_file, load_config
 from lavt.domain import Now, SessionReply, SessionRequest
 from lavt.errors import BadMessage, WorkError
 from lavt.node import Send
@@ -47,6 +46,7 @@ def stop(
     """
     console.reserve_stdout()
     settings = load_config(ClientConfig, config, changes or [])
+    authenticator = build_authenticator(settings)
     quiet_logs()
     clock, replies = MachineClock(), queue.Queue[bytes]()
 
@@ -54,16 +54,16 @@ def stop(
         if channel == "session_reply":
             replies.put(payload)
 
-    gateway = gateway_of(settings, deliver, lambda *sends: link.send(*sends))
     link = ZenohLink(
         clock,
-        gateway.receive,
         side="client",
         path=find_file(Path(settings.zenoh.session)),
         router=settings.zenoh.router,
         vehicle=settings.vehicle_id,
         who=settings.who,
     )
+    gateway = build_gateway(authenticator, deliver, link.send, lambda: (0, -1))
+    link.start(gateway.receive, queries_only=True)
     try:
         instance, number = MachineEntropy().number(64), clock.now().wall_ns
         reply = _query(gateway.send, replies, SessionRequest("emergency_stop", settings.who, instance, number))

@@ -66,11 +66,11 @@ def watch(
     only_from = None if sent_from is None else resolve_host("--from", sent_from)
     clock, nodes = MachineClock(), WatchNodes(sender, reorder_hold_ms)
     runtime = RealRuntime(clock, nodes.nodes, nodes, lambda: None)
-    link = UdpLink(clock, "rtp", runtime.deliver, bind=(bind, port), only_from=only_from)
+    link = UdpLink(clock, "rtp", bind=(bind, port), only_from=only_from)
     with closing(link), console.stop_on_signals() as stop:
         _print_header(link.port, as_json)
         runtime.start({})  # without a link to send on
-        link.start()
+        link.start(runtime.deliver)
         totals = nodes.totals()
         for second in _seconds(clock, stop, seconds):
             if runtime.stopped.is_set():

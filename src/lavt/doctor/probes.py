@@ -20,7 +20,7 @@ import numpy as np
 from lavt.assembly.cameras import build_device
 from lavt.assembly.clock_source import clock_source, interpreter
 from lavt.assembly.fidelity import VIDEO
-from lavt.assembly.security import cipher_of, gateway_of
+from lavt.assembly.security import build_authenticator, build_gateway, cipher_of
 from lavt.clock import MachineClock, pause
 from lavt.config import ClientCameraConfig, ClientConfig, ClockConfig, ServerConfig
 from lavt.doctor.checks import KEY_PACKAGES, CameraSample, CodecTimes, StateSample
@@ -31,7 +31,6 @@ from lavt.transport.arrival import ANCILLARY_BYTES, SO_TIMESTAMPNS, enable_arriv
 from lavt.transport.clock_sync.clock_report import ClockReport
 from lavt.transport.messages import decode
 from lavt.transport.netem.netem import NetemInterface, run_tc
-from lavt.transport.security.gateway import Carry
 from lavt.transport.udp_link import RECEIVE_BUFFER_BYTES
 from lavt.transport.zenoh_link import ZenohLink
 
@@ -197,13 +196,7 @@ class StateListener:
     def __init__(self, settings: ServerConfig | ClientConfig) -> None:
         self._accepted: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self._received = 0
-        self._send: Carry = lambda *_: None
-        self._gateway = gateway_of(settings, self._keep, lambda *sends: self._send(*sends))
-
-    def receive(self, channel: str, payload: Any, arrived: Now, peer: Any) -> None:
-        """Count a message of the link if it is a state, and pass it to the gateway."""
-        self._received += channel == "state"
-        self._gateway.receive(channel, payload, arrived, peer)
+        self._authenticator = build_authenticator(settings)
 
     def _keep(self, channel: str, payload: Any, _arrived: Now, _peer: Any) -> None:
         if channel == "state":
@@ -211,8 +204,13 @@ class StateListener:
 
     def listen(self, link: ZenohLink, clock: MachineClock) -> StateSample:
         """Wait some seconds for the vehicle's first state, then collect states for one second."""
-        self._send = link.send
-        link.start()
+        gateway = build_gateway(self._authenticator, self._keep, link.send, lambda: (0, -1))
+
+        def receive(channel: str, payload: Any, arrived: Now, peer: Any) -> None:
+            self._received += channel == "state"
+            gateway.receive(channel, payload, arrived, peer)
+
+        link.start(receive)
         states: list[State] = []
         unreadable: Counter[str] = Counter()
         has_first, end_ns = False, clock.now().mono_ns + FIRST_STATE_NS
@@ -228,7 +226,7 @@ class StateListener:
             except BadMessage as error:
                 unreadable[str(error)] += 1
         if self._received and not states and not unreadable:
-            unreadable.update(self._gateway.counts or {"rejected by the gateway": self._received})
+            unreadable.update(gateway.counts or {"rejected by the gateway": self._received})
         return StateSample(states, dict(unreadable), STATES_NS / NS_PER_S)
 
 
@@ -277,7 +275,7 @@ def keys_rejection(settings: ServerConfig | ClientConfig) -> str:
     """Return why the keys that a config names cannot be used; empty if they can."""
     try:
         cipher_of(settings)
-        gateway_of(settings, lambda *_: None, lambda *_: None)
+        build_authenticator(settings)
     except (UserError, ImportError) as error:
         return str(error)
     return ""

@@ -36,7 +36,6 @@ class UdpLink:
         self,
         clock: Clock,
         channel: str,
-        deliver: Deliver,
         *,
         bind: tuple[str, int],
         remote: tuple[str, int] | None = None,
@@ -46,7 +45,6 @@ class UdpLink:
         self.counts: Counter[str] = Counter()
         self._clock = clock
         self._channel = channel
-        self._deliver = deliver
         self._remote = None if remote is None else (resolve_host("video.server", remote[0]), remote[1])
         self._server: tuple[str, int] | None = None
         self._only_from = only_from
@@ -62,15 +60,16 @@ class UdpLink:
             ) from error
         self._buffer = memoryview(bytearray(MAX_DATAGRAM_BYTES))
         self._closing = False
-        self._thread = threading.Thread(target=self._receive, name="udp", daemon=True)
+        self._thread: threading.Thread | None = None
 
     @property
     def port(self) -> int:
         """The UDP port of the socket."""
         return int(self._socket.getsockname()[1])
 
-    def start(self) -> None:
-        """Start to receive."""
+    def start(self, deliver: Deliver) -> None:
+        """Start to receive; the receiving thread calls `deliver`."""
+        self._thread = threading.Thread(target=self._receive, args=(deliver,), name="udp", daemon=True)
         self._thread.start()
 
     def send(self, *sends: Send) -> None:
@@ -89,11 +88,11 @@ class UdpLink:
         self._closing = True
         with suppress(OSError):  # it raises "not connected", but still ends the wait in recvmsg
             self._socket.shutdown(socket.SHUT_RD)
-        if self._thread.is_alive():
+        if self._thread is not None:
             self._thread.join()
         self._socket.close()
 
-    def _receive(self) -> None:
+    def _receive(self, deliver: Deliver) -> None:
         """Deliver datagrams, with one blocking system call each."""
         buffer = self._buffer
         while True:
@@ -109,7 +108,7 @@ class UdpLink:
             if self._is_stranger(address):
                 self.counts["datagrams_from_strangers"] += 1
                 continue
-            self._deliver(self._channel, bytes(buffer[:length]), arrival(ancillary, self._clock.now()), address)
+            deliver(self._channel, bytes(buffer[:length]), arrival(ancillary, self._clock.now()), address)
 
     def _is_stranger(self, address: tuple[str, int]) -> bool:
         if self._only_from is not None and address[0] != self._only_from:

@@ -159,6 +159,10 @@ class Routers(NamedTuple):
     """Zenoh's version in every router that reports it, the session's router first."""
 
 
+def _discard(_channel: str, _payload: bytes, _arrived: Now, _peer: object) -> None:
+    """Ignore a message that arrives before the link is started."""
+
+
 class ZenohLink:
     """A Zenoh session of one side, which publishes, subscribes, and sends or answers queries.
 
@@ -170,7 +174,6 @@ class ZenohLink:
     def __init__(
         self,
         clock: Clock,
-        deliver: Deliver,
         *,
         side: Literal["server", "client"],
         path: Path,
@@ -181,7 +184,7 @@ class ZenohLink:
     ) -> None:
         self.counts: Counter[str] = Counter()
         self._clock = clock
-        self._deliver = deliver
+        self._deliver: Deliver = _discard
         self._side = side
         self._base = f"lavt/{check_name('the vehicle', vehicle)}"
         self._who = check_name("the client", who)
@@ -208,8 +211,14 @@ class ZenohLink:
             if waiting is None:
                 raise UserError(self._waiting_reason) from error
 
-    def start(self) -> None:
-        """Start to send and to deliver received messages."""
+    def start(self, deliver: Deliver, *, queries_only: bool = False) -> None:
+        """Start to send and to receive; threads of the link call `deliver`.
+
+        With `queries_only` it sends queries and receives their replies, and publishes and subscribes nothing.
+        """
+        self._deliver = deliver
+        if queries_only:
+            return
         if self._session is not None:
             self._declare(self._session)
         elif self._waiting is not None:

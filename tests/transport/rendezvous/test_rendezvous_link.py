@@ -32,12 +32,15 @@ class Setup:
         self.vehicle = RendezvousLink(
             MachineClock(),
             "feedback",
-            lambda *message: self.received.put(message),
             bind=ANY,
             rendezvous=("127.0.0.1", self.rendezvous.port),
             registration=lambda wall_ns: encode_registration("vehicle-1", "video", wall_ns, None),
         )
         stack.callback(self.vehicle.close)
+
+    def start(self) -> None:
+        """Start the vehicle's link."""
+        self.vehicle.start(lambda *message: self.received.put(message))
 
     def receive(self) -> tuple[str, Any, Now, Any]:
         """Wait for the vehicle's next message."""
@@ -63,7 +66,7 @@ def client() -> Iterator[socket.socket]:
 def connect(setup: Setup, client: socket.socket) -> Any:
     """Start both ends and send hellos until one arrives; return the peer that the vehicle's link gave it."""
     setup.rendezvous.start()
-    setup.vehicle.start()
+    setup.start()
     while True:
         client.sendto(HELLO, ("127.0.0.1", setup.rendezvous.port))
         try:
@@ -84,7 +87,7 @@ def test_through_the_rendezvous_and_back(setup: Setup, client: socket.socket) ->
 
 def test_direct_clients(setup: Setup, client: socket.socket) -> None:
     """A client can reach the vehicle directly, and only datagrams from the rendezvous are unwrapped."""
-    setup.vehicle.start()
+    setup.start()
     wrapped = wrap(("192.0.2.9", 5004), HELLO)
     for datagram in (HELLO, wrapped):
         client.sendto(datagram, ("127.0.0.1", setup.vehicle.port))
@@ -100,12 +103,11 @@ def test_malformed_datagrams_from_the_rendezvous(client: socket.socket) -> None:
     link = RendezvousLink(
         MachineClock(),
         "feedback",
-        lambda *message: received.put(message),
         bind=ANY,
         rendezvous=client.getsockname(),
         registration=lambda wall_ns: encode_registration("vehicle-1", "video", wall_ns, None),
     )
-    link.start()
+    link.start(lambda *message: received.put(message))
     for datagram in (HELLO, b"", b"LAVR\x01\x02short", wrap(("192.0.2.9", 5004), b"last")):
         client.sendto(datagram, ("127.0.0.1", link.port))
     assert received.get(timeout=ARRIVES_S)[1:4:2] == (b"last", ("rendezvous:192.0.2.9", 5004))
@@ -120,12 +122,11 @@ def test_each_registration_is_newer(client: socket.socket) -> None:
     link = RendezvousLink(
         backward,
         "feedback",
-        lambda *_: None,
         bind=ANY,
         rendezvous=client.getsockname(),
         registration=lambda wall_ns: wall_ns.to_bytes(8, "big"),
     )
-    link.start()
+    link.start(lambda *_: None)
     times_ns = [int.from_bytes(client.recv(100), "big") for _ in range(3)]
     link.close()
     assert times_ns == [times_ns[0], times_ns[0] + 1, times_ns[0] + 2]

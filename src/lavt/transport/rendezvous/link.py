@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Final
 
 from lavt.clock import Clock
@@ -29,16 +30,14 @@ class RendezvousLink:
         self,
         clock: Clock,
         channel: str,
-        deliver: Deliver,
         *,
         bind: Address,
         rendezvous: Address,
         registration: Callable[[int], bytes],
         name: str = "video",
     ) -> None:
-        self._link = UdpLink(clock, channel, self._on_datagram, bind=bind, name=name)
+        self._link = UdpLink(clock, channel, bind=bind, name=name)
         self._clock = clock
-        self._deliver = deliver
         self._rendezvous = rendezvous
         self._registration = registration
         self._registered_ns = 0
@@ -55,9 +54,9 @@ class RendezvousLink:
         """The numbers of lost and rejected datagrams, by reason."""
         return self._link.counts
 
-    def start(self) -> None:
-        """Start to receive and to register."""
-        self._link.start()
+    def start(self, deliver: Deliver) -> None:
+        """Start to receive and to register; the receiving thread calls `deliver`."""
+        self._link.start(partial(self._on_datagram, deliver))
         self._thread.start()
 
     def send(self, *sends: Send) -> None:
@@ -71,16 +70,16 @@ class RendezvousLink:
             self._thread.join()
         self._link.close()
 
-    def _on_datagram(self, channel: str, payload: Any, arrived: Now, peer: Any) -> None:
+    def _on_datagram(self, deliver: Deliver, channel: str, payload: Any, arrived: Now, peer: Any) -> None:
         if peer != self._rendezvous:
-            self._deliver(channel, payload, arrived, peer)
+            deliver(channel, payload, arrived, peer)
             return
         unwrapped = unwrap(payload)
         if unwrapped is None:
             self.counts["datagrams_not_wrapped"] += 1
             return
         (host, port), datagram = unwrapped
-        self._deliver(channel, datagram, arrived, (_VIA + host, port))
+        deliver(channel, datagram, arrived, (_VIA + host, port))
 
     def _route(self, send: Send) -> Send:
         host, port = send.peer
@@ -106,7 +105,7 @@ class RendezvousPort:
     def __init__(self, clock: Clock, forwarder: Forwarder, *, bind: Address, name: str) -> None:
         self._clock = clock
         self._forwarder = forwarder
-        self._link = UdpLink(clock, name, self._forward, bind=bind, name=name)
+        self._link = UdpLink(clock, name, bind=bind, name=name)
 
     @property
     def port(self) -> int:
@@ -124,7 +123,7 @@ class RendezvousPort:
 
     def start(self) -> None:
         """Start to forward."""
-        self._link.start()
+        self._link.start(self._forward)
 
     def close(self) -> None:
         """Stop forwarding and close the socket."""

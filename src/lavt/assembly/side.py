@@ -1,0 +1,262 @@
+"""The composition root: a server or a client is put together here, in order, each part from those before it.
+
+1. Check the output directory and the interface for injected delay; read the keys.
+2. Open the sockets and the Zenoh session; they deliver nothing yet.
+3. Build the nodes. A vehicle by wire gets its actuator node in a process of its own.
+4. Open the record, and build the runtime of the nodes.
+5. Build the gateway between the Zenoh session and the runtime, and the injector.
+
+`Side.start` then starts to deliver messages.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from lavt.assembly.actuator_process import ActuatorProcess, start_actuator
+from lavt.assembly.clock_source import clock_source, interpreter
+from lavt.assembly.entropy import MachineEntropy
+from lavt.assembly.nodes import build_client, build_server
+from lavt.assembly.rendezvous import open_flow
+from lavt.assembly.security import Authenticator, build_authenticator, build_gateway
+from lavt.clock import Clock
+from lavt.config import ClientConfig, ServerConfig
+from lavt.config_file import find_file
+from lavt.domain import Now
+from lavt.node import Node, Peer
+from lavt.nodes.client_session import ClientSession
+from lavt.recording.live_status import LiveTap
+from lavt.recording.output_directory import check_directory, prepare_directory
+from lavt.recording.provenance import provenance
+from lavt.recording.record import RecordWriter
+from lavt.runtime.realtime import RealRuntime
+from lavt.runtime.recorder import QueuedRecorder
+from lavt.transport.clock_sync.clock_report import kernel_identity
+from lavt.transport.clock_sync.persistent_process import PersistentProcess
+from lavt.transport.emulation.impairment import ExemptPort
+from lavt.transport.netem.injector import Injector
+from lavt.transport.netem.netem import NetemInterface
+from lavt.transport.rendezvous.link import RendezvousLink
+from lavt.transport.udp_link import UdpLink
+from lavt.transport.zenoh_link import ZenohLink, quiet_logs
+
+PrintMessage = Callable[[str], None]
+
+
+class NoRecorder:
+    """A recorder that discards every entry."""
+
+    def write(self, topic: str, payload: Any, now: Now) -> None:
+        """Discard one entry."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """The parts of a side that are checked before anything is opened."""
+
+    authenticator: Authenticator
+    queues: NetemInterface | None
+    """The queues of the interface for injected delay, if the config names one."""
+    time_source: PersistentProcess
+
+
+@dataclass(frozen=True)
+class Links:
+    """The connections of one side, opened before its nodes are built."""
+
+    video: UdpLink | RendezvousLink
+    probe: UdpLink | RendezvousLink
+    zenoh: ZenohLink
+
+    def close(self) -> None:
+        """Close all connections."""
+        for link in (self.video, self.probe, self.zenoh):
+            link.close()
+
+
+class Side:
+    """One side with all its parts; `start` runs it and `close` ends it and completes the record."""
+
+    def __init__(
+        self,
+        config: ServerConfig | ClientConfig,
+        clock: Clock,
+        links: Links,
+        nodes: Sequence[Node],
+        *,
+        out: Path | None,
+        prepared: Prepared,
+        in_force: Callable[[], tuple[int, int]],
+        actuator: ActuatorProcess | None = None,
+        session: ClientSession | None = None,
+    ) -> None:
+        self.clock = clock
+        self.session = session
+        """The client's session; None on a server."""
+        self.actuator = actuator
+        """The server's actuator if it runs in a process of its own."""
+        self._links = links
+        self._time_source = prepared.time_source
+        self._writer = None if out is None else _open_record(config, out)
+        self.live = LiveTap(NoRecorder() if self._writer is None else self._writer)
+        self._record = QueuedRecorder(self.live)
+        self.runtime = RealRuntime(
+            clock,
+            nodes,
+            self._record,
+            clock_source(config.clock, clock, prepared.time_source.run),
+            {} if actuator is None else {actuator.name: actuator},
+        )
+        self._gateway = build_gateway(prepared.authenticator, self._deliver, links.zenoh.send, in_force)
+        self._injector = Injector(clock, self._deliver, prepared.queues, _exempt_ports(config))
+
+    def start(self) -> None:
+        """Start the runtime, then deliver received messages to it."""
+        links, gateway = self._links, self._gateway
+        links.zenoh.start(gateway.receive)
+        self.runtime.start({"video": links.video, "probe": links.probe, "zenoh": gateway, "netem": self._injector})
+        if self.actuator is not None:
+            self.actuator.start(self.runtime)
+        links.video.start(self._deliver)
+        links.probe.start(self._deliver)
+
+    def send(self, channel: str, payload: Any) -> None:
+        """Deliver a message to a node of this side."""
+        self._deliver(channel, payload, self.clock.now(), None)
+
+    def close(self) -> None:
+        """Stop the runtime, close everything, and complete the record."""
+        if self.actuator is not None:
+            self.actuator.end()
+        self.runtime.stop()
+        self._injector.close()
+        self._time_source.close()
+        self._links.close()
+        for name, counts in self._link_counts().items():
+            self._record.write("counts", {"link": name, **counts}, self.clock.now())
+        self._record.close(self.clock.now())
+        if self._writer is not None and not self._record.failed:
+            self._writer.close()
+
+    def _link_counts(self) -> dict[str, Mapping[str, int]]:
+        links = self._links
+        return {
+            "video": links.video.counts,
+            "probe": links.probe.counts,
+            "zenoh": {**links.zenoh.counts, **self._gateway.counts},
+        }
+
+    def _deliver(self, channel: str, payload: Any, arrived: Now, peer: Peer) -> None:
+        """Deliver a message, unless the runtime has stopped."""
+        if not self.runtime.stopped.is_set():
+            self.runtime.deliver(channel, payload, arrived, peer)
+
+
+@contextmanager
+def open_server(
+    config: ServerConfig, out: Path | None, clock: Clock, print_message: PrintMessage
+) -> Iterator[tuple[Side, dict[str, int]]]:
+    """Put a server together; yield it with its ports, and close it afterwards.
+
+    Raises `UserError` for a wrong config, before the output directory is touched.
+    """
+    with ExitStack() as opened:
+        prepared = _prepare(config, out, opened, print_message)
+        bind = config.video.bind
+        video = open_flow(config, clock, "video", "feedback", bind=(bind, config.video.port), remote=None)
+        opened.callback(video.close)
+        probe = open_flow(config, clock, "probe", "probe_request", bind=(bind, config.clock.probe_port), remote=None)
+        opened.callback(probe.close)
+        links = Links(video, probe, opened.enter_context(closing(_open_zenoh(config, clock, print_message))))
+        host = kernel_identity()
+        nodes = build_server(config, clock.now, MachineEntropy(), host=host, video_port=video.port)
+        ready = {"video_port": video.port, "probe_port": probe.port}
+        if nodes.actuator is not None:
+            gate, actuator = nodes.actuator.gate, None
+            in_force = lambda: gate.in_force  # noqa: E731
+        else:
+            process = actuator = start_actuator(config, host=host, video_port=video.port)
+            opened.callback(process.end)
+            in_force = lambda: process.in_force  # noqa: E731
+            ready["actuator_pid"] = process.pid
+        side = Side(config, clock, links, nodes.all, out=out, prepared=prepared, in_force=in_force, actuator=actuator)
+        opened.pop_all()  # from here on the side closes them
+    with closing(side):
+        yield side, ready
+
+
+@contextmanager
+def open_client(config: ClientConfig, out: Path | None, clock: Clock, print_message: PrintMessage) -> Iterator[Side]:
+    """Put a client together, yield it, and close it afterwards.
+
+    Raises `UserError` for a wrong config, before the output directory is touched.
+    """
+    with ExitStack() as opened:
+        prepared = _prepare(config, out, opened, print_message)
+        server = config.video.server
+        video = open_flow(config, clock, "video", "rtp", bind=("", 0), remote=(server, config.video.port))
+        opened.callback(video.close)
+        probe = open_flow(config, clock, "probe", "probe_reply", bind=("", 0), remote=(server, config.clock.probe_port))
+        opened.callback(probe.close)
+        links = Links(video, probe, opened.enter_context(closing(_open_zenoh(config, clock, print_message))))
+        nodes = build_client(config, clock.now, MachineEntropy())
+        side = Side(
+            config,
+            clock,
+            links,
+            nodes.all,
+            out=out,
+            prepared=prepared,
+            in_force=lambda: (0, -1),
+            session=nodes.driver.session,
+        )
+        opened.pop_all()
+    with closing(side):
+        yield side
+
+
+def _prepare(
+    config: ServerConfig | ClientConfig, out: Path | None, opened: ExitStack, print_message: PrintMessage
+) -> Prepared:
+    if out is not None:
+        check_directory(out)
+    authenticator = build_authenticator(config)
+    queues = NetemInterface(config.injection.interface) if config.injection.interface else None
+    for message in () if queues is None else queues.check():
+        print_message(message)
+    return Prepared(authenticator, queues, opened.enter_context(closing(interpreter(config.clock))))
+
+
+def _open_zenoh(config: ServerConfig | ClientConfig, clock: Clock, print_message: PrintMessage) -> ZenohLink:
+    quiet_logs()
+    return ZenohLink(
+        clock,
+        side="server" if isinstance(config, ServerConfig) else "client",
+        path=find_file(Path(config.zenoh.session)),
+        router=config.zenoh.router,
+        vehicle=config.vehicle_id,
+        who="server" if isinstance(config, ServerConfig) else config.who,
+        waiting=lambda reason: print_message(f"lavt: {reason}; waiting for one"),
+    )
+
+
+def _exempt_ports(config: ServerConfig | ClientConfig) -> list[ExemptPort]:
+    port = config.clock.probe_port
+    return [ExemptPort("udp", port, "the clock probe")] if port else []
+
+
+def _open_record(config: ServerConfig | ClientConfig, out: Path) -> RecordWriter:
+    """Create the output directory and the record."""
+    name = "server" if isinstance(config, ServerConfig) else "client"
+    prepare_directory(out)
+    (out / "config.yaml").write_text(yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
+    writer = RecordWriter(out / f"{name}.mcap", name, left_out=config.record.left_out)
+    for topic, entries in provenance().items():
+        writer.annotate(topic, entries)
+    return writer
