@@ -163,7 +163,7 @@ def test_close(started: bool) -> None:
     link = open_link()
     port = link.port
     if started:
-        link.start(received)
+        link.start(Received())
     link.close()
     assert set(threading.enumerate()) <= before
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as again:

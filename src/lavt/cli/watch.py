@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from lavt.cli import console
-from lavt.cli.watch_nodes import Sender, WatchNodes
+from lavt.assembly.watcher import Sender, WatchNodes
 from lavt.clock import MachineClock
 from lavt.domain import NS_PER_S
 from lavt.errors import WorkError
