@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import yaml
 
@@ -253,7 +253,7 @@ def _exempt_ports(config: ServerConfig | ClientConfig) -> list[ExemptPort]:
 
 def _open_record(config: ServerConfig | ClientConfig, out: Path) -> RecordWriter:
     """Create the output directory and the record."""
-    name = "server" if isinstance(config, ServerConfig) else "client"
+    name: Literal["server", "client"] = "server" if isinstance(config, ServerConfig) else "client"
     prepare_directory(out)
     (out / "config.yaml").write_text(yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
     writer = RecordWriter(out / f"{name}.mcap", name, left_out=config.record.left_out)

@@ -10,8 +10,8 @@ from typing import Annotated, Any
 
 import typer
 
-from lavt.cli import console
 from lavt.assembly.watcher import Sender, WatchNodes
+from lavt.cli import console
 from lavt.clock import MachineClock
 from lavt.domain import NS_PER_S
 from lavt.errors import WorkError
