@@ -37,7 +37,7 @@ def armed_gate(car: Simulator) -> tuple[SafetyGate, int]:
     )
     numbers = count(1)
     gate = SafetyGate(LIMITS, limiter, new_epoch=lambda: next(numbers), new_token=lambda: bytes(16))
-    epoch = gate.session.answer(SessionRequest("hold", "newcomer", 1, 0), car.state(), START_NS).epoch
+    epoch = gate.session.answer(SessionRequest("acquire", "newcomer", 1, 0), car.state(), START_NS).epoch
     for number in range(51):
         at_ns = START_NS - (51 - number) * 20 * NS_PER_MS
         gate.issued_stamps.add(WALL_NS + at_ns, number, at_ns, pixel_crc=number)

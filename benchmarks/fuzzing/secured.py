@@ -38,7 +38,7 @@ GATEWAY_STEP_NS = 4 * NS_PER_MS
 """Time between two inputs; at a higher rate the rate limiters would reject them unread."""
 EPOCH = 2**63 + 7
 EVERYWHERE = tuple((at, 1) for at in range(0, 400, 3))
-HOLD = encode(SessionRequest("hold", "alice", 5, 0))
+ACQUIRE = encode(SessionRequest("acquire", "alice", 5, 0))
 GRANTED = encode(SessionReply(True, "", EPOCH, TOKEN, 5600, "kernel", 0))
 
 
@@ -88,7 +88,7 @@ def gateway_of_vehicle(seed: int) -> Target:
         return operator.sign_command(signed_bodies[-1])
 
     corpora = {
-        "session": Corpus([exchange(HOLD, GRANTED), exchange(HOLD, GRANTED)], fields=EVERYWHERE),
+        "session": Corpus([exchange(ACQUIRE, GRANTED), exchange(ACQUIRE, GRANTED)], fields=EVERYWHERE),
         "control": Corpus([command() for _ in range(4)], fields=EVERYWHERE),
     }
     corpus_bodies = frozenset(signed_bodies)  # the newest of the later commands are replayed
@@ -142,7 +142,7 @@ def gateway_of_operator(seed: int) -> Target:
         body = encode(State(number, number, 8.0, 0.0, "drive", "driving", "", number, ""))
         return body, car.sign_state(body)
 
-    gateway.send(Send("session", HOLD))
+    gateway.send(Send("session", ACQUIRE))
     replies = [answer(GRANTED), answer(GRANTED)]
     old = [state(number)[1] for number in range(8)]
     for each in old:

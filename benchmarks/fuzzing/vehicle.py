@@ -127,7 +127,7 @@ class VehicleSide:
         """Send the operator's next command, which others may replay."""
         self.picture()
         if self.gate.state not in ("arming", "driving", "degraded"):
-            reply = self.ask("hold")
+            reply = self.ask("acquire")
             if self.gate.state == "emergency_stop":
                 self.ask("clear_emergency_stop", reply.emergency_stop)
         self._sequence += 1
@@ -177,8 +177,8 @@ def requests() -> list[bytes]:
     return [
         encode(each)
         for each in (
-            SessionRequest("hold", "stranger", 77, 0),
-            SessionRequest("ask", "stranger", 77, 0),
+            SessionRequest("acquire", "stranger", 77, 0),
+            SessionRequest("request_handover", "stranger", 77, 0),
             SessionRequest("release", "stranger", 77, 0),
             SessionRequest("emergency_stop", "stranger", 77, start_ns),
             SessionRequest("clear_emergency_stop", "stranger", 77, start_ns),
@@ -241,7 +241,7 @@ def vehicle_driven(seed: int) -> Target:
     clear the stop; the operator then takes control again and arms it. Most emergency-stop numbers are old ones here.
     """
     side = VehicleSide(seed)
-    side.ask("hold")
+    side.ask("acquire")
     side.ask("emergency_stop", LARGEST_STORED_NUMBER)
     side.arm()
     inputs = driven = 0

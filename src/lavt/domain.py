@@ -175,7 +175,7 @@ class Decision:
 
 
 Mode = Literal["arm", "drive", "stop"]
-Operation = Literal["hold", "ask", "release", "emergency_stop", "clear_emergency_stop"]
+Operation = Literal["acquire", "request_handover", "release", "emergency_stop", "clear_emergency_stop"]
 """hold: acquire control. ask: request a handover from the active operator."""
 SafetyState = Literal["disarmed", "arming", "driving", "degraded", "safe_stop", "emergency_stop"]
 

@@ -94,7 +94,7 @@ class Bench:
         return self.gate.state
 
     def armed(self) -> Bench:
-        self.request("hold")
+        self.request("acquire")
         for _ in range(51):
             self.go(TICK_NS)
             self.command()
@@ -255,8 +255,8 @@ def test_an_event_before_the_drive_ends_no_drive() -> None:
 def test_the_token_goes_to_the_camera_when_it_changes() -> None:
     """The camera gets a new token once when control is acquired, and none when it is released."""
     bench = Bench()
-    bench.request("hold")
-    bench.request("hold")
+    bench.request("acquire")
+    bench.request("acquire")
     assert of(bench.sends, "video_token") == [bytes(16)]
     bench.request("release")
     assert of(bench.sends, "video_token") == [bytes(16), None]
@@ -271,7 +271,7 @@ def test_transitions_and_requests_are_events() -> None:
         "arming -> driving",
         "driving -> emergency_stop",
     ]
-    assert bench.events("session") == ["hold by alice granted", "emergency_stop by alice granted"]
+    assert bench.events("session") == ["acquire by alice granted", "emergency_stop by alice granted"]
 
 
 def test_frozen_pictures_stop_the_vehicle_though_they_change_again() -> None:
@@ -310,7 +310,7 @@ def states(sends: list[Send]) -> list[State]:
 def test_the_state_names_operator_and_requester() -> None:
     """The state names the active operator and the client that requests control, until that request expires."""
     bench = Bench().armed()
-    bench.take("session", encode(SessionRequest("ask", "bob", 7, 0)), peer="query")
+    bench.take("session", encode(SessionRequest("request_handover", "bob", 7, 0)), peer="query")
     reported = states(bench.go(2 * NS_PER_S))
     assert {(state.active_operator, state.requested_by) for state in reported} == {("alice", "bob")}
     assert {state.requested_by for state in states(bench.go(NS_PER_S + TICK_NS))[-1:]} == {""}

@@ -48,7 +48,7 @@ def test_control_is_requested_every_second_until_driving() -> None:
     assert session.take_request(99) is None
     request = session.take_request(100)
     assert request is not None
-    assert (request.operation, request.who, request.instance) == ("hold", "alice", 7)
+    assert (request.operation, request.who, request.instance) == ("acquire", "alice", 7)
     assert session.take_request(100 + NS_PER_S - 1) is None
     session.handle_reply(REJECTED, 200)
     assert (session.phase, session.reason, session.may_command) == ("seeking", REJECTED.reason, False)
@@ -152,7 +152,7 @@ def test_an_emergency_stop_is_repeated_until_answered(released: bool) -> None:
         session.release(300)
     first = session.raise_emergency_stop(Now(400, 60))
     others = {due(session, 400), due(session, 400 + NS_PER_S - 1)}
-    assert others <= {"hold", "release", ""}
+    assert others <= {"acquire", "release", ""}
     assert session.next_wake_ns() == 400 + NS_PER_S
     assert session.take_request(400 + NS_PER_S) == first
     assert session.take_request(400 + 2 * NS_PER_S) == first
@@ -189,7 +189,7 @@ def test_without_take_over_no_handover_is_requested() -> None:
     """Without `take_over`, a rejected client only repeats its request for control."""
     session = new_session()
     for second in range(3):
-        assert due(session, 100 + second * NS_PER_S) == "hold"
+        assert due(session, 100 + second * NS_PER_S) == "acquire"
         session.handle_reply(REJECTED, 200 + second * NS_PER_S)
         assert due(session, 300 + second * NS_PER_S) == ""
         assert (session.phase, session.reason) == ("seeking", REJECTED.reason)
@@ -200,27 +200,27 @@ def test_take_over_requests_a_handover() -> None:
     session = ClientSession("alice", 7, rearm=False, start_ns=0, take_over=True)
     for second in range(3):
         begin_ns = second * NS_PER_S
-        assert due(session, begin_ns) == "hold"
+        assert due(session, begin_ns) == "acquire"
         session.handle_reply(REJECTED, begin_ns)
-        assert due(session, begin_ns) == "ask"
+        assert due(session, begin_ns) == "request_handover"
         session.handle_reply(NOTED, begin_ns)
         assert (session.phase, session.reason) == ("seeking", f"{REJECTED.reason}; handover requested")
         assert due(session, begin_ns + NS_PER_S - 1) == ""
-    assert due(session, 3 * NS_PER_S) == "hold"
+    assert due(session, 3 * NS_PER_S) == "acquire"
     session.handle_reply(GRANTED, 3 * NS_PER_S)
     assert (session.phase, session.reason) == ("arming", "")
-    assert due(session, 4 * NS_PER_S) == "hold"
+    assert due(session, 4 * NS_PER_S) == "acquire"
 
 
 def test_both_rejection_reasons_are_shown() -> None:
     """The reasons of a rejected acquisition and a rejected handover request are both shown."""
     session = ClientSession("alice", 7, rearm=False, start_ns=0, take_over=True)
-    assert due(session, 0) == "hold"
+    assert due(session, 0) == "acquire"
     session.handle_reply(REJECTED, 0)
-    assert due(session, 0) == "ask"
+    assert due(session, 0) == "request_handover"
     session.handle_reply(replace(REJECTED, reason="carol asks"), 0)
     assert session.reason == f"{REJECTED.reason}; carol asks"
-    assert due(session, NS_PER_S) == "hold"
+    assert due(session, NS_PER_S) == "acquire"
     session.handle_reply(REJECTED, NS_PER_S)
     assert session.reason == f"{REJECTED.reason}; carol asks"
 

@@ -193,7 +193,7 @@ def test_the_active_operator_hands_over_on_request(session: Session, server: Rec
     assert (first["phase"], first["session"]) == ("watching", "released")
     released_ns = event_ns(server, "release", "operator-1", "granted")
     assert event_ns(server, "driving -> safe_stop") >= released_ns
-    acquired_ns = event_ns(server, "hold", "operator-2", "granted")
+    acquired_ns = event_ns(server, "acquire", "operator-2", "granted")
     assert acquired_ns >= released_ns
     with stalls.judging(released_ns, acquired_ns, stall_ms=LONG_STALL_MS):
         assert acquired_ns - released_ns < 2 * NS_PER_S

@@ -91,7 +91,7 @@ class Rig:
         return self.send(**{"mode": "drive", "throttle": 0.5, "brake": 0.0, **changes})
 
     def acquire(self) -> Rig:
-        assert self.request("hold").granted
+        assert self.request("acquire").granted
         return self
 
     def arm_for(self, duration_ns: int) -> None:
@@ -119,7 +119,7 @@ class Rig:
 
     def clear(self, who: str = "alice", instance: int = 1, number: int | None = None) -> SessionReply:
         """Request to clear the last emergency stop that the vehicle reported, or the given one."""
-        last = self.request("hold", who, instance).emergency_stop
+        last = self.request("acquire", who, instance).emergency_stop
         return self.request("clear_emergency_stop", who, instance, last if number is None else number)
 
     def actuation(self) -> Actuation:

@@ -158,7 +158,7 @@ def test_arming_again_drops_the_last_command() -> None:
     rig = Rig().driving(steering_rad=0.05)
     rig.go(LIMITS.stop_after_ns)
     assert rig.state == "safe_stop"
-    rig.request("hold")
+    rig.request("acquire")
     rig.arm_for(NS_PER_S)
     assert rig.state == "driving"
     actuation = rig.actuation()
@@ -226,7 +226,7 @@ def test_an_old_emergency_stop_is_rejected() -> None:
     rig = Rig().armed()
     assert rig.request("emergency_stop", number=40).granted
     assert rig.clear().granted
-    rig.request("hold")
+    rig.request("acquire")
     rig.arm_for(NS_PER_S)
     assert rig.state == "driving"
     for number in (40, 39, 1, 0):
@@ -260,7 +260,7 @@ def test_a_command_with_an_emergency_stop_never_moves_the_vehicle() -> None:
     rig = Rig().acquire()
     rig.request("emergency_stop", number=3)
     rig.clear()
-    rig.request("hold")
+    rig.request("acquire")
     for _ in range(100):
         rig.go(TICK_NS)
         rig.picture()
@@ -297,7 +297,7 @@ def test_an_emergency_stop_must_be_cleared_before_arming() -> None:
     """An emergency stop must be cleared before arming, and arming takes its second afterwards."""
     rig = Rig().driving()
     rig.request("emergency_stop", number=8)
-    rig.request("hold")
+    rig.request("acquire")
     rig.picture()
     assert rig.send().reason == RejectionReason.EMERGENCY_STOP_LATCHED
     assert rig.clear().granted

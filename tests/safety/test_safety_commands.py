@@ -210,7 +210,7 @@ def test_safe_stop_is_latched_under_a_new_epoch() -> None:
     rig.picture()
     assert rig.drive().reason == RejectionReason.WRONG_EPOCH
     old_epoch = rig.epoch
-    assert rig.request("hold").epoch != old_epoch
+    assert rig.request("acquire").epoch != old_epoch
     assert rig.drive().reason == RejectionReason.NOT_ARMED
     assert rig.send().reason == RejectionReason.NOT_STATIONARY
     for _ in range(50):

@@ -72,7 +72,7 @@ class GateMachine(RuleBasedStateMachine):
 
     @rule(seconds=st.sampled_from([0.4, 0.8, 1.0]))
     def arm_well_for_a_while(self, seconds: float) -> None:
-        self.rig.request("hold")
+        self.rig.request("acquire")
         self.rig.vehicle = vehicle_at(0.0, self.rig.vehicle.steering_rad)
         for _ in range(round(seconds * 50)):
             self.pass_time(TICK_NS)
@@ -115,7 +115,7 @@ class GateMachine(RuleBasedStateMachine):
             self.met_since_ns = None
 
     @rule(
-        operation=st.sampled_from(["hold", "ask", "release", "emergency_stop", "clear_emergency_stop"]),
+        operation=st.sampled_from(["acquire", "request_handover", "release", "emergency_stop", "clear_emergency_stop"]),
         who=st.sampled_from(["alice", "alice", "bob"]),
         number=st.integers(0, 5),
     )

@@ -112,7 +112,7 @@ def test_a_new_drive_never_uses_an_old_path() -> None:
     """After arming again, a command timeout does not follow the path of the previous drive."""
     rig = Moving().on(LEFT)
     rig.roll(STOP_NS)
-    rig.request("hold")
+    rig.request("acquire")
     rig.vehicle = replace(vehicle_at(0.0, 0.0), mono_ns=rig.now_ns)
     rig.arm_for(NS_PER_S)
     assert rig.state == "driving"

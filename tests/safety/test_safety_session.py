@@ -38,7 +38,7 @@ def test_epoch_and_sequence_are_always_known() -> None:
 
 def test_the_active_operator_gets_an_epoch_and_a_token() -> None:
     """A client that acquires control gets an epoch for commands and a token for the video path."""
-    reply = Rig().request("hold")
+    reply = Rig().request("acquire")
     assert (reply.granted, reply.reason) == (True, "")
     assert reply.epoch != 0
     assert len(reply.token) == 16
@@ -48,10 +48,10 @@ def test_the_active_operator_gets_an_epoch_and_a_token() -> None:
 def test_acquiring_control_again_changes_nothing() -> None:
     """An instance that acquires control again, also while driving, gets the same epoch and token."""
     rig = Rig()
-    first = rig.request("hold")
-    assert rig.request("hold") == first
+    first = rig.request("acquire")
+    assert rig.request("acquire") == first
     rig.arm_for(NS_PER_S)
-    assert rig.request("hold") == first
+    assert rig.request("acquire") == first
     assert rig.state == "driving"
     rig.picture()
     assert rig.drive().accepted
@@ -63,7 +63,7 @@ def test_a_second_client_is_rejected_while_the_vehicle_is_armed_or_moves(other: 
     rig = Rig().acquire()
 
     def rejected() -> bool:
-        reply = rig.gate.session.answer(SessionRequest("hold", *other, 0), rig.vehicle, rig.now_ns)
+        reply = rig.gate.session.answer(SessionRequest("acquire", *other, 0), rig.vehicle, rig.now_ns)
         return (reply.granted, reply.epoch, reply.token) == (False, 0, b"")
 
     rig.arm_for(NS_PER_S // 2)
@@ -86,8 +86,8 @@ def test_a_second_client_is_rejected_while_the_vehicle_is_armed_or_moves(other: 
 def test_a_takeover_at_standstill_renews_the_epoch() -> None:
     """At standstill and disarmed, another client acquires control under a new epoch and token."""
     rig = Rig()
-    first = rig.request("hold")
-    second = rig.request("hold", "bob", 7)
+    first = rig.request("acquire")
+    second = rig.request("acquire", "bob", 7)
     assert second.granted
     assert second.epoch != first.epoch
     assert second.token != first.token
@@ -105,7 +105,7 @@ def test_a_release_stops_and_frees_the_vehicle() -> None:
     assert rig.state == "safe_stop"
     rig.picture()
     assert rig.drive().reason == RejectionReason.WRONG_EPOCH
-    assert rig.request("hold", "bob", 1).granted
+    assert rig.request("acquire", "bob", 1).granted
 
 
 def test_the_reply_to_a_release_has_no_epoch() -> None:
@@ -142,9 +142,9 @@ def test_an_emergency_stop_grants_no_control() -> None:
 def test_session_requests_are_counted() -> None:
     """Each operation is counted, granted and rejected separately."""
     rig = Rig().armed()
-    rig.request("hold", "bob", 1)
+    rig.request("acquire", "bob", 1)
     counts = rig.gate.counts
-    assert (counts["session hold granted"], counts["session hold rejected"]) == (1, 1)
+    assert (counts["session acquire granted"], counts["session acquire rejected"]) == (1, 1)
 
 
 def requested_by(rig: Rig) -> str:
@@ -154,7 +154,7 @@ def requested_by(rig: Rig) -> str:
 def test_a_handover_request_is_reported_and_changes_nothing_else() -> None:
     """A handover request is granted without epoch or token, is reported, and leaves the drive unchanged."""
     rig = Rig().driving()
-    reply = rig.request("ask", "bob", 7)
+    reply = rig.request("request_handover", "bob", 7)
     assert (reply.granted, reply.epoch, reply.token) == (True, 0, b"")
     assert requested_by(rig) == "bob"
     rig.picture()
@@ -166,8 +166,8 @@ def test_without_consent_a_driven_vehicle_is_not_handed_over() -> None:
     """Handover requests alone never transfer control of a driven vehicle."""
     rig = Rig().driving()
     for _ in range(5):
-        rig.request("ask", "bob", 7)
-        reply = rig.request("hold", "bob", 7)
+        rig.request("request_handover", "bob", 7)
+        reply = rig.request("acquire", "bob", 7)
         assert not reply.granted
         assert "alice has control" in reply.reason
         for _ in range(50):
@@ -180,25 +180,25 @@ def test_with_consent_the_vehicle_stops_and_is_reserved_for_the_requester() -> N
     """A release during a handover request stops the vehicle and reserves it for the requester."""
     rig = Rig().driving()
     rig.vehicle = vehicle_at(5.0)
-    rig.request("ask", "bob", 7)
+    rig.request("request_handover", "bob", 7)
     assert rig.request("release").granted
     assert (rig.state, rig.gate.session.active_operator, requested_by(rig)) == ("safe_stop", None, "")
     for who, instance in (("carol", 1), ("alice", 1), ("bob", 8)):
-        reply = rig.request("hold", who, instance)
+        reply = rig.request("acquire", who, instance)
         assert not reply.granted
         assert "reserved for bob" in reply.reason
-    assert rig.request("hold", "bob", 7).epoch != 0
+    assert rig.request("acquire", "bob", 7).epoch != 0
     rig.vehicle = vehicle_at(0.0)
-    assert rig.request("hold", "carol").granted
+    assert rig.request("acquire", "carol").granted
 
 
 def test_a_new_active_operator_arms_at_standstill() -> None:
     """A client that took over a moving vehicle arms it only at standstill, in 1 s."""
     rig = Rig().driving()
     rig.vehicle = vehicle_at(5.0)
-    rig.request("ask", "bob", 7)
+    rig.request("request_handover", "bob", 7)
     rig.request("release")
-    rig.epoch = rig.request("hold", "bob", 7).epoch
+    rig.epoch = rig.request("acquire", "bob", 7).epoch
     rig.picture()
     assert rig.send().reason == RejectionReason.NOT_STATIONARY
     rig.vehicle = vehicle_at(0.0)
@@ -211,51 +211,51 @@ def test_a_new_active_operator_arms_at_standstill() -> None:
 def test_a_reservation_expires() -> None:
     """The reservation for a requester ends after 5 s."""
     rig = Rig().driving()
-    rig.request("ask", "bob", 7)
+    rig.request("request_handover", "bob", 7)
     rig.request("release")
     rig.go(LIMITS.reservation_ns - 1)
-    assert not rig.request("hold", "carol").granted
+    assert not rig.request("acquire", "carol").granted
     rig.go(1)
-    assert rig.request("hold", "carol").granted
+    assert rig.request("acquire", "carol").granted
     assert LIMITS.reservation_ns == 5 * NS_PER_S
 
 
 def test_a_handover_request_expires() -> None:
     """A handover request that is not renewed expires after 3 s, and a release then reserves nothing."""
     rig = Rig().driving()
-    rig.request("ask", "bob", 7)
+    rig.request("request_handover", "bob", 7)
     rig.go(LIMITS.handover_request_timeout_ns - 1)
     assert requested_by(rig) == "bob"
-    rig.request("ask", "bob", 7)
+    rig.request("request_handover", "bob", 7)
     rig.go(LIMITS.handover_request_timeout_ns - 1)
     assert requested_by(rig) == "bob"
     rig.go(1)
     assert requested_by(rig) == ""
     rig.request("release")
-    assert rig.request("hold", "carol").granted
+    assert rig.request("acquire", "carol").granted
     assert LIMITS.handover_request_timeout_ns == 3 * NS_PER_S
 
 
 def test_the_first_handover_request_has_priority() -> None:
     """A second handover request is rejected until the first has expired."""
     rig = Rig().driving()
-    rig.request("ask", "bob", 7)
+    rig.request("request_handover", "bob", 7)
     for who, instance in (("carol", 1), ("bob", 8)):
-        reply = rig.request("ask", who, instance)
+        reply = rig.request("request_handover", who, instance)
         assert not reply.granted
         assert "bob" in reply.reason
     rig.go(LIMITS.handover_request_timeout_ns)
-    assert rig.request("ask", "carol").granted
+    assert rig.request("request_handover", "carol").granted
     assert requested_by(rig) == "carol"
 
 
 def test_a_handover_request_needs_another_active_operator() -> None:
     """A handover request is rejected from the active operator and while no client has control."""
     rig = Rig()
-    without_operator = rig.request("ask")
+    without_operator = rig.request("request_handover")
     assert not without_operator.granted
     rig.acquire()
-    rejected = rig.request("ask")
+    rejected = rig.request("request_handover")
     assert rejected.reason not in ("", without_operator.reason)
     assert (rejected.granted, rejected.epoch, rejected.token) == (False, 0, b"")
     assert requested_by(rig) == ""
@@ -264,15 +264,15 @@ def test_a_handover_request_needs_another_active_operator() -> None:
 def test_at_rest_no_consent_is_needed() -> None:
     """At standstill and disarmed, a third client acquires control in spite of a pending handover request."""
     rig = Rig().acquire()
-    rig.request("ask", "bob", 7)
-    assert rig.request("hold", "carol").granted
+    rig.request("request_handover", "bob", 7)
+    assert rig.request("acquire", "carol").granted
     assert requested_by(rig) == ""
 
 
 def test_an_emergency_stop_by_another_client_keeps_the_session() -> None:
     """Another client's emergency stop is reported with its name and leaves the session unchanged."""
     rig = Rig().driving()
-    rig.request("ask", "bob", 7)
+    rig.request("request_handover", "bob", 7)
     assert rig.request("emergency_stop", "bob", 7, number=5).granted
     assert (rig.state, rig.gate.machine.reason) == ("emergency_stop", "emergency stop by bob")
     assert (rig.gate.session.active_operator, requested_by(rig)) == (("alice", 1), "bob")
@@ -290,4 +290,4 @@ def test_a_server_shutdown_stops_the_vehicle() -> None:
     rig.picture()
     assert rig.drive().reason == RejectionReason.WRONG_EPOCH
     rig.vehicle = vehicle_at(0.0)
-    assert "shutting down" in rig.request("hold", "bob").reason
+    assert "shutting down" in rig.request("acquire", "bob").reason

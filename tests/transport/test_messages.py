@@ -40,7 +40,7 @@ STATE = State(
     applied_sequence=-1,
     rejected="",
 )
-REQUEST = SessionRequest(operation="hold", who="operator-1", instance=2**64 - 1, number=0)
+REQUEST = SessionRequest(operation="acquire", who="operator-1", instance=2**64 - 1, number=0)
 REPLY = SessionReply(granted=True, reason="", epoch=3, token=bytes(16), video_port=5600, host="a-b-c", emergency_stop=0)
 NETEM = NetemRequest(
     who="operator-1",
@@ -104,7 +104,7 @@ STATES = st.builds(
 )
 REQUESTS = st.builds(
     SessionRequest,
-    operation=st.sampled_from(["hold", "ask", "release", "emergency_stop", "clear_emergency_stop"]),
+    operation=st.sampled_from(["acquire", "request_handover", "release", "emergency_stop", "clear_emergency_stop"]),
     who=NAMES,
     instance=U64,
     number=TIME,
@@ -269,7 +269,7 @@ def test_every_field_is_checked(kind: type[Any], name: str) -> None:
 
 
 @pytest.mark.parametrize("kind", MESSAGES)
-@pytest.mark.parametrize("version", [0, 1, 3, -1, True, 1.0, "1", None, [1]])
+@pytest.mark.parametrize("version", [0, 2, 4, -1, True, 3.0, "3", None, [3]])
 def test_other_versions(kind: type[Any], version: Any) -> None:
     """A message whose version is not exactly the expected integer is rejected."""
     _, *values = msgpack.unpackb(encode(MESSAGES[kind]))

@@ -47,9 +47,9 @@ class ClientSession:
         self._clear_stop = clear_stop
         self._waits_reason = "the network condition is not in force yet" if waits else ""
         self._take_over = take_over
-        self._next_operation: Operation = "hold"
-        """The next request while seeking; with `take_over`, "hold" and "ask" alternate."""
-        self._last_operation: Operation = "hold"
+        self._next_operation: Operation = "acquire"
+        """The next request while seeking; with `take_over`, "acquire" and "request_handover" alternate."""
+        self._last_operation: Operation = "acquire"
         self._rejections: dict[Operation, str] = {}
         """The last reply to each of the two operations."""
         self._was_active_operator = False
@@ -92,7 +92,7 @@ class ClientSession:
             return SessionRequest("release", self._who, self._instance, 0)
         if self._clear_stop and self.phase == "arming" and self.safety == "emergency_stop":
             return SessionRequest("clear_emergency_stop", self._who, self._instance, self._highest_emergency_stop)
-        self._last_operation, self._next_operation = self._next_operation, "hold"
+        self._last_operation, self._next_operation = self._next_operation, "acquire"
         return SessionRequest(self._last_operation, self._who, self._instance, 0)
 
     def release(self, now_ns: int) -> None:
@@ -120,8 +120,8 @@ class ClientSession:
             self.epoch = reply.epoch
             if self.phase == "seeking":
                 self.phase, self._was_active_operator = "arming", False
-        elif self.phase == "seeking" and self._take_over and self._last_operation == "hold":
-            self._next_operation, self._request_ns = "ask", now_ns
+        elif self.phase == "seeking" and self._take_over and self._last_operation == "acquire":
+            self._next_operation, self._request_ns = "request_handover", now_ns
 
     def _update_reason(self, reply: SessionReply) -> None:
         if self.phase == "watching":
@@ -130,7 +130,7 @@ class ClientSession:
         if reply.token:
             self._rejections.clear()
         else:
-            is_handover_requested = reply.granted and self._last_operation == "ask"
+            is_handover_requested = reply.granted and self._last_operation == "request_handover"
             self._rejections[self._last_operation] = "handover requested" if is_handover_requested else reply.reason
         self.reason = "; ".join(each for each in self._rejections.values() if each) or self._waits_reason
 

@@ -152,8 +152,8 @@ class VehicleSession:
         return ""
 
     _OPERATIONS: ClassVar[dict[Operation, Callable[..., str]]] = {
-        "hold": _acquire,
-        "ask": _request_handover,
+        "acquire": _acquire,
+        "request_handover": _request_handover,
         "release": _release,
         "emergency_stop": _emergency_stop,
         "clear_emergency_stop": _clear_emergency_stop,

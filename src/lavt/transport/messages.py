@@ -19,7 +19,7 @@ import msgpack
 from lavt.domain import PATH_POINTS, Command, NetemReply, NetemRequest, SessionReply, SessionRequest, State
 from lavt.errors import BadMessage
 
-VERSION = 2
+VERSION = 3
 MAX_MESSAGE_BYTES = 1024
 NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_-]{0,31}\Z")
 """A valid name of a vehicle or client: it contains nothing that has a meaning in a Zenoh key."""
@@ -110,7 +110,7 @@ CHECKS: dict[type, dict[str, Check]] = {
         "instance": U64,
     },
     SessionRequest: {
-        "operation": _one_of("hold", "ask", "release", "emergency_stop", "clear_emergency_stop"),
+        "operation": _one_of("acquire", "request_handover", "release", "emergency_stop", "clear_emergency_stop"),
         "who": _name,
         "instance": U64,
         "number": TIME,

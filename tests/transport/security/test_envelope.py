@@ -52,7 +52,7 @@ class Pair:
         self.vehicle = vehicle or VehicleAuthenticator("car", VEHICLE, OPERATORS)
         self.operator = OperatorAuthenticator("car", who, key, VEHICLE.public)
 
-    def signed_request(self, operation: str = "hold", number: int = 0) -> bytes:
+    def signed_request(self, operation: str = "acquire", number: int = 0) -> bytes:
         request = SessionRequest(operation, self.who, 5, number)  # type: ignore[arg-type]
         return self.operator.sign_request("session", encode(request))
 
@@ -176,7 +176,7 @@ def test_a_replayed_request_is_stale(pair: Pair) -> None:
 def test_a_request_to_an_earlier_process_of_the_server_is_stale(pair: Pair) -> None:
     """A request that was signed for the server before its restart is stale afterwards."""
     pair.acquire_control()
-    data = pair.signed_request("hold")
+    data = pair.signed_request("acquire")
     request = VehicleAuthenticator("car", VEHICLE, OPERATORS).verify_request("session", data)
     assert request is not None
     assert request.is_stale
@@ -218,7 +218,7 @@ def test_a_request_in_another_name_is_rejected(pair: Pair) -> None:
     """A request in the name of another or an unknown operator is rejected."""
     for name, key in (("alice", BOB), ("alice", MALLORY), ("mallory", MALLORY)):
         assert pair.vehicle.verify_request("session", Pair(name, key).signed_request()) is None
-    forged = pair.operator.sign_request("session", encode(SessionRequest("hold", "bob", 5, 0)))
+    forged = pair.operator.sign_request("session", encode(SessionRequest("acquire", "bob", 5, 0)))
     assert pair.vehicle.verify_request("session", forged) is None
     assert pair.vehicle.counts["session_requests_forged"] == 4
 
@@ -279,7 +279,7 @@ def test_a_reply_to_an_earlier_request_is_rejected(pair: Pair) -> None:
     pair.acquire_control()
     replies = []
     for number in range(2):
-        request = pair.vehicle.verify_request("session", pair.signed_request("hold", number))
+        request = pair.vehicle.verify_request("session", pair.signed_request("acquire", number))
         assert request is not None
         replies.append(pair.vehicle.sign_reply(request, b"" if request.is_stale else encode(GRANTED)))
     assert pair.operator.verify_reply("session", replies[1]).retry is not None
@@ -349,7 +349,7 @@ def test_pending_requests_are_bounded(pair: Pair) -> None:
     pair.acquire_control()
     requests = [pair.vehicle.verify_request("netem", pair.operator.sign_request("netem", b""))]
     requests += [
-        pair.vehicle.verify_request("session", pair.signed_request("hold", number)) for number in range(3 * KEPT)
+        pair.vehicle.verify_request("session", pair.signed_request("acquire", number)) for number in range(3 * KEPT)
     ]
     assert len(pair.operator._pending) == KEPT
     replies = [pair.vehicle.sign_reply(request, encode(GRANTED)) for request in requests if request is not None]

@@ -19,7 +19,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from lavt.transport.security.keys import KeyAgreement, PrivateKey, decrypt
 
 TOKEN = bytes(range(16))
-HOLD = encode(SessionRequest("hold", "alice", 5, 0))
+ACQUIRE = encode(SessionRequest("acquire", "alice", 5, 0))
 GRANTED = encode(SessionReply(True, "", 77, TOKEN, 5600, "kernel", 0))
 VEHICLE, ALICE = (PrivateKey(Ed25519PrivateKey.generate()) for _ in range(2))
 
@@ -30,7 +30,7 @@ class Session:
     def __init__(self) -> None:
         self.vehicle = VehicleAuthenticator("car", VEHICLE, {"alice": ALICE.public})
         self.operator = OperatorAuthenticator("car", "alice", ALICE, VEHICLE.public)
-        data = self.operator.sign_request("session", HOLD)
+        data = self.operator.sign_request("session", ACQUIRE)
         for body in (b"", GRANTED):
             request = self.vehicle.verify_request("session", data)
             assert request is not None
@@ -76,7 +76,7 @@ def test_bytes_of_commands_states_and_requests(session: Session) -> None:
 def test_bytes_of_a_reply(session: Session, *, stale: bool) -> None:
     """A reply carries a signature and no MAC, as `docs/wire.md` describes."""
     client = session.operator._agreement = KeyAgreement()
-    data = session.operator.sign_request("session", HOLD)
+    data = session.operator.sign_request("session", ACQUIRE)
     request = session.vehicle.verify_request("session", data)
     assert request is not None
     reply = session.vehicle.sign_reply(replace(request, is_stale=stale), GRANTED)

@@ -21,7 +21,7 @@ from lavt.transport.security.keys import PrivateKey
 
 OTHER_COMMANDS_PER_S, QUERIES_PER_S, STATES_PER_S, MAX_PENDING_QUERIES = 200, 100, 500, 64
 """The design's limits, repeated here so that a change in the code fails a test."""
-HOLD = encode(SessionRequest("hold", "alice", 5, 0))
+ACQUIRE = encode(SessionRequest("acquire", "alice", 5, 0))
 GRANTED = encode(SessionReply(True, "", 7, bytes(range(16)), 5600, "kernel", 0))
 COMMAND = encode(Command(7, 3, 1, 2, 3, 0.1, 0.2, 0.0, (0.0,) * PATH_POINTS, "drive", 0))
 NEXT_COMMAND = encode(Command(7, 4, 1, 2, 3, 0.1, 0.2, 0.0, (0.0,) * PATH_POINTS, "drive", 0))
@@ -57,7 +57,7 @@ class GatewayPair:
 
     def acquire_control(self) -> None:
         """Make the client the active operator."""
-        self.client.send(Send("session", HOLD))
+        self.client.send(Send("session", ACQUIRE))
         self.deliver_all()
         self.server.send(Send("session_reply", GRANTED, "query"))
         self.deliver_all()
@@ -75,14 +75,14 @@ def test_gateways_deliver_each_message_once_and_unchanged(pair: GatewayPair) -> 
     pair.client.send(Send("control", COMMAND))
     pair.server.send(Send("state", b"state"))
     pair.deliver_all()
-    assert pair.server_received == [("session", HOLD, "query"), ("control", COMMAND, "query")]
+    assert pair.server_received == [("session", ACQUIRE, "query"), ("control", COMMAND, "query")]
     assert pair.client_received == [("session_reply", GRANTED), ("state", b"state")]
 
 
 def test_replayed_requests_replies_and_states_are_rejected(pair: GatewayPair) -> None:
     """Replayed requests, replies and states are rejected and counted; a replayed command is left to the safety gate."""
     recorded = []
-    for channel, payload in (("session", HOLD), ("control", COMMAND)):
+    for channel, payload in (("session", ACQUIRE), ("control", COMMAND)):
         pair.client.send(Send(channel, payload))
         recorded += pair.in_flight
         pair.deliver_all()
@@ -203,7 +203,7 @@ def test_a_retry_is_sent_in_another_thread() -> None:
     """The retry of a request is sent from a daemon thread, because Zenoh sends nothing in the thread that delivers."""
     pair = GatewayPair()
     del pair.client._send_in_thread
-    pair.client.send(Send("session", HOLD))
+    pair.client.send(Send("session", ACQUIRE))
     pair.server.receive("session", pair.in_flight.pop().payload, Now(0, 0), "query")
     sent: queue.SimpleQueue[tuple[threading.Thread, tuple[Send, ...]]] = queue.SimpleQueue()
     pair.client._carry = lambda *sends: sent.put((threading.current_thread(), sends))
@@ -227,7 +227,7 @@ def test_a_flood_does_not_displace_authentic_messages(pair: GatewayPair) -> None
     """During a flood of forged and replayed states and queries, the next authentic state and query are delivered."""
     now = Now(2 * NS_PER_S, 0)
     pair.server.send(Send("state", b"old"))
-    pair.client.send(Send("session", HOLD))
+    pair.client.send(Send("session", ACQUIRE))
     state, query = pair.in_flight
     pair.deliver_all()
     pair.server.send(Send("session_reply", GRANTED, "query"))
@@ -238,12 +238,12 @@ def test_a_flood_does_not_displace_authentic_messages(pair: GatewayPair) -> None
             flooded.receive(channel, true if number % 2 else true[:-80] + bytes(80), now, number)
     pair.in_flight.clear()
     pair.server.send(Send("state", b"new"))
-    pair.client.send(Send("session", HOLD))
+    pair.client.send(Send("session", ACQUIRE))
     before = len(pair.server_received)
     for send in pair.in_flight:
         (pair.client if send.channel == "state" else pair.server).receive(send.channel, send.payload, now, "next")
     assert pair.client_received[-1] == ("state", b"new")
-    assert pair.server_received[before:] == [("session", HOLD, "next")]
+    assert pair.server_received[before:] == [("session", ACQUIRE, "next")]
     assert pair.server.counts["session_requests_screened_out"] > 1_000
     assert pair.client.counts["states_screened_out"] > 1_000
 
