@@ -176,6 +176,21 @@ def test_shared_value_is_made_again_after_a_stall() -> None:
     assert shared.get() == 2
 
 
+def test_failure_to_make_a_shared_value_fails_every_test() -> None:
+    """If a shared value cannot be made and no stall explains it, each request raises that failure."""
+    attempts = []
+
+    def broken() -> None:
+        attempts.append(1)
+        raise AssertionError("it does not stop")
+
+    shared = Shared(stalls_of(), broken)
+    for _ in range(4):
+        with pytest.raises(AssertionError, match="does not stop"):
+            shared.get()
+    assert len(attempts) == 1
+
+
 def test_shared_value_is_given_up_after_three_stalls() -> None:
     """If the host stalls each of three attempts, later requests raise without another attempt."""
     attempts = []

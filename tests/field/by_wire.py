@@ -42,6 +42,8 @@ STOP_BEFORE_MS, STOP_STALL_MS = 1500, 100
 """The same for a safe stop, which begins after 500 ms and is reported within 200 ms; shorter stalls do not cause it."""
 SLOW_MS = 3000
 """Many short stalls in this time before a stop may be its cause."""
+LATE = ("reports are missing", "did not stay enabled", "did not brake within")
+"""The failures of `lavt can test-watchdog` that depend on timing."""
 GENERATIONS = ("dataspeed_gen1", "dataspeed_gen2")
 
 
@@ -53,8 +55,15 @@ def pass_watchdog_test(profile: str, work: Path, stalls: Stalls) -> RunConfig:
         command = [sys.executable, "-m", "lavt", "can", "test-watchdog", str(config), "--yes"]
         since_ns = CLOCK.now().mono_ns
         done = subprocess.run(command, capture_output=True, text=True, check=False)
-        stalls.require(done.returncode == 0, f"{done.stderr}, {car.events}", since_ns, CLOCK.now().mono_ns)
+        message = f"{done.stderr}, {car.events}"
+        assert done.returncode == 0 or is_late(done.stderr), message
+        stalls.require(done.returncode == 0, message, since_ns, CLOCK.now().mono_ns)
     return run
+
+
+def is_late(message: str) -> bool:
+    """Return whether the watchdog test failed in a way that a stalled host can cause."""
+    return any(part in message for part in LATE)
 
 
 def write_config(run: RunConfig, path: Path) -> Path:

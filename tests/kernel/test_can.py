@@ -23,6 +23,7 @@ from tests.field.by_wire import (
     KIT_MS,
     ROOM_MS,
     SoftwareCarProcess,
+    is_late,
     ms_since,
     software_car,
 )
@@ -103,6 +104,7 @@ def run_watchdog_test(machine: Machine, changes: tuple[str, ...], stalls: Stalls
             machine.run([machine.python, "-B", "-m", "lavt", "can", "test-watchdog", BY_WIRE, *sets(changes), "--yes"])
         except MachineError as failed:
             message = f"{failed}, {car.events}"
+            assert is_late(message), message
             raise stalls.verdict(message, since_ns, CLOCK.now().mono_ns, stall_ms=KIT_STALL_MS) from None
 
 

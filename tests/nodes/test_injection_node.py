@@ -147,7 +147,7 @@ def test_a_deviating_measurement_is_recorded() -> None:
 
 
 def test_failed_queues_are_cleared_and_end_the_lease() -> None:
-    """If the queues fail, the client is told why, the queues are cleared, and the lease ends."""
+    """If the queues fail, the client receives the reason, the queues are cleared, and the lease ends."""
     node = server()
     request(node, L4)
     sends = done(node, 1, reason="there is no tc")
@@ -238,7 +238,7 @@ def test_the_client_delays_its_control_first() -> None:
 
 
 def test_a_failed_order_of_the_client_is_repeated() -> None:
-    """If the own queue fails, the driver is told why, and the order is repeated after a second."""
+    """If the client's own queue fails, the driver receives the reason, and the order is repeated after a second."""
     client = new_client()
     give(client, WAKE, None, at(0))
     sends = give(client, "injected", InjectionResult(1, "no tc", "", ()), at(0))
@@ -248,7 +248,7 @@ def test_a_failed_order_of_the_client_is_repeated() -> None:
 
 
 def test_a_rejection_is_reported_to_the_driver() -> None:
-    """The driver is told the server's rejection reason."""
+    """The driver receives the server's reason for a rejection."""
     client = new_client()
     give(client, WAKE, None, at(0))
     give(client, "injected", InjectionResult(1, "", "", ()), at(0))

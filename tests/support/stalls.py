@@ -299,14 +299,26 @@ class Shared(Generic[Result]):
     def __init__(self, stalls: Stalls, make: Callable[[], Result]) -> None:
         self._stalls, self._make = stalls, make
         self._made: list[Result] = []
+        self._failure: Exception | None = None
         self._left, self._excused = TRIES, 0
 
     def get(self) -> Result:
-        """Return the last value; make it again if the record has excused a failure since."""
-        if self._left and not (self._made and self._excused == self._stalls.excused):
+        """Return the last value; make it again if the record has excused a failure since.
+
+        A failure to make it that no stall explains is raised for every test.
+        """
+        if self._failure is None and self._left and not (self._made and self._excused == self._stalls.excused):
             self._left -= 1
-            self._made[:] = [self._make()]
+            self._made.clear()
+            try:
+                self._made.append(self._make())
+            except HostStalled:
+                raise
+            except Exception as failure:
+                self._failure = failure
             self._excused = self._stalls.excused
+        if self._failure is not None:
+            raise self._failure
         if not self._made:
             raise HostStalledEachTime("the host stalled each attempt to make what this test judges")
         return self._made[0]
