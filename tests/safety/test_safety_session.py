@@ -23,17 +23,17 @@ def test_without_an_operator_every_command_is_rejected() -> None:
 def test_epoch_and_sequence_are_always_known() -> None:
     """Epoch and last accepted sequence number are known at any time; a new epoch has no sequence yet."""
     rig = Rig()
-    before, sequence = rig.gate.in_force
+    before, sequence = rig.gate.in_force()
     assert sequence == -1
     rig.acquire()
-    assert rig.gate.in_force == (rig.epoch, -1)
+    assert rig.gate.in_force() == (rig.epoch, -1)
     assert rig.epoch != before
     rig.picture()
     assert rig.send().accepted
-    assert rig.gate.in_force == (rig.epoch, rig.sequence)
+    assert rig.gate.in_force() == (rig.epoch, rig.sequence)
     rig.request("release")
-    assert rig.gate.in_force[0] not in (before, rig.epoch)
-    assert rig.gate.in_force[1] == -1
+    assert rig.gate.in_force()[0] not in (before, rig.epoch)
+    assert rig.gate.in_force()[1] == -1
 
 
 def test_the_active_operator_gets_an_epoch_and_a_token() -> None:

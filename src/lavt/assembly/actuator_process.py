@@ -47,7 +47,6 @@ class ActuatorProcess(RemoteNodeProxy):
         """The process id."""
         return self._process.pid or 0
 
-    @property
     def in_force(self) -> tuple[int, int]:
         """The epoch in force and the sequence of its last accepted command, as last reported."""
         return self.status or (0, -1)
@@ -98,9 +97,7 @@ def serve_actuator(connection: Connection, config: ServerConfig, host: str, vide
         return
     connection.send(None)
     disconnected = threading.Event()
-    host_of_node = NodeHost(
-        connection, clock, node, get_status=lambda: node.gate.in_force, on_disconnect=disconnected.set
-    )
+    host_of_node = NodeHost(connection, clock, node, get_status=node.gate.in_force, on_disconnect=disconnected.set)
     host_of_node.start()
     try:
         while not disconnected.wait(POLL_PERIOD_S) and not host_of_node.runtime.stopped.is_set():

@@ -178,12 +178,11 @@ def open_server(
         nodes = build_server(config, clock.now, MachineEntropy(), host=host, video_port=video.port)
         ready = {"video_port": video.port, "probe_port": probe.port}
         if nodes.actuator is not None:
-            gate, actuator = nodes.actuator.gate, None
-            in_force = lambda: gate.in_force  # noqa: E731
+            actuator, in_force = None, nodes.actuator.gate.in_force
         else:
             process = actuator = start_actuator(config, host=host, video_port=video.port)
             opened.callback(process.end)
-            in_force = lambda: process.in_force  # noqa: E731
+            in_force = process.in_force
             ready["actuator_pid"] = process.pid
         side = Side(config, clock, links, nodes.all, out=out, prepared=prepared, in_force=in_force, actuator=actuator)
         opened.pop_all()  # from here on the side closes them

@@ -98,7 +98,6 @@ class SafetyGate:
         """Return the safety state."""
         return self.machine.state
 
-    @property
     def in_force(self) -> tuple[int, int]:
         """Return the present epoch and the sequence number last accepted in it; safe to call from any thread."""
         return self.epoch.number, self.epoch.sequence
