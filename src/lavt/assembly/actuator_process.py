@@ -48,7 +48,7 @@ class ActuatorProcess(RemoteNodeProxy):
         return self._process.pid or 0
 
     def in_force(self) -> tuple[int, int]:
-        """The epoch in force and the sequence of its last accepted command, as last reported."""
+        """Return the epoch in force and the sequence of its last accepted command, as last reported."""
         return self.status or (0, -1)
 
     def end(self) -> None:
