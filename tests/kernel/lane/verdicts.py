@@ -20,7 +20,8 @@ from lavt.experiment.analysis.metrics import driving_interval
 
 MARGIN_MS = 60
 """One period of the commands to the kit or of its reports, and two for a slow machine, which a stall may lack."""
-KIT_STALL_MS = KIT_MS - MARGIN_MS
+KIT_STALL_MS = KIT_MS - 30
+"""Commands are 20 ms apart. Longer than the stalls of a machine that uses its processor fully: those excuse no kit."""
 UNSAMPLED_STALL_MS = 1500
 """Clocks are sampled once a second, and a gap of up to 2.5 s is valid."""
 STALL_MS = {"the clock of the ": UNSAMPLED_STALL_MS, "the clock samples of the ": UNSAMPLED_STALL_MS}
