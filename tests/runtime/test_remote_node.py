@@ -162,7 +162,7 @@ def test_threads_that_forward_requests_do_not_disturb_each_other() -> None:
         thread.start()
     for thread in threads:
         thread.join()
-    threading.setprofile(None)  # type: ignore[arg-type] (None ends it)
+    threading.setprofile(None)
     proxy.close(0)
     theirs.close()
     assert errors == []
