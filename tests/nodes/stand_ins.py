@@ -84,6 +84,7 @@ class FakeVehicle:
     applied: list[Actuation] = field(default_factory=list)
     is_engage_requested: bool = False
     reached: list[ReachedCommand] = field(default_factory=list)
+    inhibit_reason: str = ""
 
     @property
     def capabilities(self) -> Capabilities:
@@ -105,7 +106,7 @@ class FakeVehicle:
         return reached
 
     def state(self) -> VehicleState:
-        return VehicleState(self.now_ns, self.speed_mps, 0.0, "drive")
+        return VehicleState(self.now_ns, self.speed_mps, 0.0, "drive", self.inhibit_reason)
 
     def ground_truth(self) -> GroundTruth | None:
         return None

@@ -324,6 +324,19 @@ def test_a_rejection_is_reported_for_1_s() -> None:
     assert {state.rejected for state in states(bench.go(3 * TICK_NS))[-1:]} == {""}
 
 
+@pytest.mark.parametrize("letter", ["a", "ä"])
+def test_a_state_with_a_long_inhibit_reason_is_readable(letter: str) -> None:
+    """However long the inhibit reason is, clients can read the state, which contains the reason's beginning."""
+    bench = Bench().armed()
+    bench.vehicle.inhibit_reason = 300 * letter
+    bench.go(TICK_NS)
+    bench.request("acquire")
+    bench.command()
+    for state in states(bench.go(2 * TICK_NS)):
+        assert (state.safety, state.reason[-20:]) == ("safe_stop", 20 * letter)
+        assert state.rejected[-20:] == 20 * letter
+
+
 def test_a_server_shutdown_stops_the_vehicle_and_ends_the_drive() -> None:
     """A server shutdown stops the vehicle, ends control, closes the video path and ends the drive."""
     bench = Bench().armed()

@@ -195,6 +195,14 @@ def test_the_result_of_a_replaced_order_is_ignored() -> None:
     assert rejections(done(node, 2)) == ["", ""]
 
 
+def test_a_long_reason_is_shortened() -> None:
+    """A reply with a long reason, of letters of any size in UTF-8, can be decoded."""
+    node = server()
+    request(node, L4)
+    (reason,) = rejections(done(node, 1, 300 * "ä"))
+    assert reason == 200 * "ä"
+
+
 def test_pending_requests_are_bounded() -> None:
     """Of the requests that wait for the queues, the last 64 are answered."""
     node = server()

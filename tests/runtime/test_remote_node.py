@@ -141,6 +141,33 @@ def test_a_remote_node_receives_and_sends() -> None:
         wait_until(lambda: both.outputs.of("event") == ["received"])
 
 
+def test_threads_that_forward_requests_do_not_disturb_each_other() -> None:
+    """Threads that forward requests at the same time, none of which is answered, cause no error.
+
+    Each built-in function that a thread calls lets the other threads run.
+    """
+    ours, theirs = multiprocessing.Pipe()
+    proxy, errors = RemoteNodeProxy("actuator", ours), list[Exception]()
+
+    def forward() -> None:
+        try:
+            for _ in range(100):
+                proxy.put(Message("session", b"", Now(0, 0), object()))
+        except RuntimeError as error:
+            errors.append(error)
+
+    threading.setprofile(lambda _frame, event, _function: pause(1) if event == "c_return" else None)
+    threads = [threading.Thread(target=forward) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    threading.setprofile(None)
+    proxy.close(0)
+    theirs.close()
+    assert errors == []
+
+
 def test_a_reply_goes_to_its_peer() -> None:
     """A reply of the remote node goes to the peer of its request."""
     with rig() as both:

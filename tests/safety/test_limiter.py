@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+import sys
 
 import pytest
 from hypothesis import given
@@ -98,6 +99,24 @@ def test_a_speed_that_is_not_finite_lifts_no_limit(speed_mps: float) -> None:
     assert actuation.steering_rad == pytest.approx(top_rad)
     assert "lateral acceleration" in changed
     assert limited(Actuation(0.0, 1.0, 0.0), speed_mps)[0].throttle == 0.0
+
+
+def test_the_highest_speed_leaves_no_steering() -> None:
+    """The highest finite speed, whose square is not finite, limits the wheel to the middle and removes the throttle."""
+    actuation, _ = limited(Actuation(0.5, 1.0, 0.0), sys.float_info.max)
+    assert actuation == Actuation(0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("steering_rad", [math.nan, math.inf, -math.inf])
+def test_a_wheel_angle_that_is_not_finite_changes_no_target(steering_rad: float) -> None:
+    """A reported wheel angle that is not finite neither becomes a target nor lifts the limit of the steering rate."""
+    limiter, vehicle, requested = new_limiter(), vehicle_at(0.0, steering_rad), Actuation(0.4, 0.0, 1.0)
+    assert limiter.target_rad(vehicle) == 0.0
+    assert limiter.limit(requested, vehicle, 0).steering_rad == 0.0
+    limiter.reset(0.1, 0)
+    limiter.reset(steering_rad, 10 * NS_PER_MS)
+    assert limiter.target_rad(vehicle) == 0.1
+    assert limiter.limit(requested, vehicle, 10 * NS_PER_MS).steering_rad == pytest.approx(0.108)
 
 
 def test_before_the_first_target_the_wheel_keeps_its_angle() -> None:

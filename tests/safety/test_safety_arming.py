@@ -58,6 +58,12 @@ def no_new_pictures(rig: Rig) -> None:
         rig.send()
 
 
+def rolls_between_commands(rig: Rig) -> None:
+    rig.vehicle = vehicle_at(0.05)
+    rig.actuation()
+    rig.vehicle = vehicle_at()
+
+
 BREAKS: dict[str, Callable[[Rig], object]] = {
     "throttle": lambda rig: rig.send(throttle=0.01),
     "brake eased": lambda rig: rig.send(brake=0.29),
@@ -67,6 +73,7 @@ BREAKS: dict[str, Callable[[Rig], object]] = {
     "a stop command": lambda rig: rig.send(mode="stop"),
     "rolling": rolls,
     "rolling back": rolls_back,
+    "rolling between two commands": rolls_between_commands,
     "frozen pictures": freezes,
     "no newer pictures": no_new_pictures,
     "no commands": lambda rig: rig.go(300 * NS_PER_MS),

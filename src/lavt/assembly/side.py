@@ -74,11 +74,6 @@ class Links:
     probe: UdpLink | RendezvousLink
     zenoh: ZenohLink
 
-    def close(self) -> None:
-        """Close all connections."""
-        for link in (self.video, self.probe, self.zenoh):
-            link.close()
-
 
 class Side:
     """One side with all its parts; `start` runs it and `close` ends it and completes the record."""
@@ -131,13 +126,20 @@ class Side:
         self._deliver(channel, payload, self.clock.now(), None)
 
     def close(self) -> None:
-        """Stop the runtime, close everything, and complete the record."""
-        if self.actuator is not None:
-            self.actuator.end()
-        self.runtime.stop()
-        self._injector.close()
-        self._time_source.close()
-        self._links.close()
+        """Stop the runtime, close everything, and complete the record; a part that fails keeps no other one open."""
+        links = self._links
+        with ExitStack() as parts:  # closes the last part first
+            parts.callback(self._close_record)
+            for link in (links.zenoh, links.probe, links.video):
+                parts.callback(link.close)
+            parts.callback(self._time_source.close)
+            parts.callback(self._injector.close)
+            parts.callback(self.runtime.stop)
+            if self.actuator is not None:
+                parts.callback(self.actuator.end)
+
+    def _close_record(self) -> None:
+        """Record the counts of the links, and complete the record."""
         for name, counts in self._link_counts().items():
             self._record.write("counts", {"link": name, **counts}, self.clock.now())
         self._record.close(self.clock.now())

@@ -6,6 +6,7 @@ nodes. Both use the same clocks, since they run on one machine.
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Callable
 from multiprocessing.connection import Connection
@@ -22,6 +23,7 @@ from lavt.runtime.realtime import MessageLink, RealRuntime
 LATE_NS: Final = 60 * NS_PER_MS
 """A command that took longer between the processes is dropped, because one of them did not run meanwhile."""
 MAX_PENDING_PEERS: Final = 64
+"""The last peers to which replies can be sent."""
 CLOSE_S: Final = 1.0
 END: Final = ("end",)
 
@@ -40,7 +42,8 @@ class RemoteNodeProxy:
         self._pipe = Pipe(connection, self._receive, self._on_closed)
         self._runtime: RealRuntime | None = None
         self._peers: dict[int, Peer] = {}
-        self._number = 0
+        """The peers by number, set and taken by different threads."""
+        self._numbers = itertools.count(1)
         self._is_closing = False
 
     def start(self, runtime: RealRuntime) -> None:
@@ -52,10 +55,9 @@ class RemoteNodeProxy:
         """Forward a message to the node's process."""
         number = 0
         if message.peer is not None:
-            self._number = number = self._number + 1
+            number = next(self._numbers)
             self._peers[number] = message.peer
-            if len(self._peers) > MAX_PENDING_PEERS:
-                self._peers.pop(next(iter(self._peers)))
+            self._peers.pop(number - MAX_PENDING_PEERS, None)
         self._pipe.send((message.channel, message.payload, message.arrived, number))
 
     def close(self, wait_s: float) -> None:

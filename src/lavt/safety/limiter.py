@@ -29,12 +29,15 @@ class Limiter:
         self._at_ns = 0
 
     def reset(self, steering_rad: float, now_ns: int) -> None:
-        """Take the wheel's present angle as the last steering target."""
-        self._steering_rad, self._at_ns = steering_rad, now_ns
+        """Take the wheel's present angle as the last steering target; ignore an angle that is not finite."""
+        if math.isfinite(steering_rad):
+            self._steering_rad, self._at_ns = steering_rad, now_ns
 
     def target_rad(self, vehicle: VehicleState) -> float:
-        """Return the last steering target; before the first one, the wheel's present angle."""
-        return vehicle.steering_rad if self._steering_rad is None else self._steering_rad
+        """Return the last steering target; before the first one, the wheel's angle, or 0 if it is not finite."""
+        if self._steering_rad is not None:
+            return self._steering_rad
+        return vehicle.steering_rad if math.isfinite(vehicle.steering_rad) else 0.0
 
     def limit(
         self, requested: Actuation, vehicle: VehicleState, now_ns: int, picture_age_ns: int | None = None
@@ -92,7 +95,7 @@ class Limiter:
             speed_mps = self.limits.speed_limit_mps
         if abs(speed_mps) < 0.1:
             return math.pi / 2
-        return math.atan(self.wheelbase_m * self.limits.lateral_acceleration_mps2 / speed_mps**2)
+        return math.atan(self.wheelbase_m * self.limits.lateral_acceleration_mps2 / (speed_mps * speed_mps))
 
 
 def stopping_speed_limit_mps(picture_age_s: float, limits: Limits) -> float:

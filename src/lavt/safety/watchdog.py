@@ -63,13 +63,15 @@ class Watchdog:
         return self._fresh_command_ns + (self._limits.stop_after_ns if is_degraded else self._limits.degraded_after_ns)
 
     def check_vehicle(self, vehicle: VehicleState) -> None:
-        """Trigger the transitions of a driver override and of a vehicle fault."""
+        """Trigger the transitions of a driver override, a vehicle fault, and of motion while arming."""
         if vehicle.is_overridden:
             self._machine.trigger("driver override")
         elif vehicle.inhibit_reason:
             self._machine.trigger("vehicle fault", vehicle.inhibit_reason)
         elif not vehicle.is_engaged and self._machine.state in ("driving", "degraded"):
             self._machine.trigger("vehicle fault")
+        elif not self._limits.is_stationary(vehicle):
+            self._machine.trigger("arming interrupted")
 
     def should_engage(self, vehicle: VehicleState) -> bool:
         """Return whether the vehicle must be engaged: it is driven or about to be, or it has not stopped yet.

@@ -26,6 +26,9 @@ NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_-]{0,31}\Z")
 MAX_DELAY_MS = 10_000.0
 """Limits what a client can request of a server, which needs as long to clear the delay."""
 
+MAX_REASON_BYTES = 200
+MAX_NETEM_REASON_BYTES = 400
+
 Check = Callable[[Any], bool]
 _NUMBERS = frozenset((int, float))
 
@@ -100,9 +103,9 @@ CHECKS: dict[type, dict[str, Check]] = {
         "steering_rad": ROAD_WHEEL,
         "gear": _one_of("park", "reverse", "neutral", "drive"),
         "safety": _one_of("disarmed", "arming", "driving", "degraded", "safe_stop", "emergency_stop"),
-        "reason": _text(200),
+        "reason": _text(MAX_REASON_BYTES),
         "applied_sequence": _integer(-1, 2**63 - 1),
-        "rejected": _text(200),
+        "rejected": _text(MAX_REASON_BYTES),
         "limited": _text(100),
         "active_operator": _name_or_empty,
         "active_operator_instance": U64,
@@ -117,7 +120,7 @@ CHECKS: dict[type, dict[str, Check]] = {
     },
     SessionReply: {
         "granted": lambda value: type(value) is bool,
-        "reason": _text(200),
+        "reason": _text(MAX_REASON_BYTES),
         "epoch": U64,
         "token": _bytes(0, 16),
         "video_port": _integer(0, 65535),
@@ -139,7 +142,7 @@ CHECKS: dict[type, dict[str, Check]] = {
         "reorder": UNIT,
         "state_delay_ms": _number(0.0, MAX_DELAY_MS),
     },
-    NetemReply: {"granted": lambda value: type(value) is bool, "reason": _text(400)},
+    NetemReply: {"granted": lambda value: type(value) is bool, "reason": _text(MAX_NETEM_REASON_BYTES)},
 }
 
 _FIELD_NAMES: dict[type, tuple[str, ...]] = {kind: tuple(checks) for kind, checks in CHECKS.items()}
@@ -149,6 +152,11 @@ _FIELD_VALUES: dict[type, Callable[[Any], tuple[Any, ...]]] = {
 }
 
 Kind = TypeVar("Kind", Command, State, SessionRequest, SessionReply, NetemRequest, NetemReply)
+
+
+def shorten(text: str, max_bytes: int = MAX_REASON_BYTES) -> str:
+    """Return the beginning of a text that fits into a field of at most `max_bytes` in UTF-8."""
+    return text.encode(errors="replace")[:max_bytes].decode(errors="ignore")
 
 
 def encode(message: Command | State | SessionRequest | SessionReply | NetemRequest | NetemReply) -> bytes:

@@ -28,6 +28,17 @@ def test_one_shell_runs_all_programs(shell: Shell) -> None:
     assert parents != {Completed(0, f"{os.getpid()}\n")}
 
 
+def test_a_closed_shell_starts_no_process() -> None:
+    """After `close`, a late command has no result and starts no process, which nobody would end."""
+    shell = Shell()
+    with closing(shell):
+        assert shell.run(["echo", "one"], 10) == Completed(0, "one\n")
+    try:
+        assert shell.run(["echo", "late"], 10) is None
+    finally:
+        shell.close()
+
+
 def test_missing_program_has_exit_code_127(shell: Shell) -> None:
     """A program that is not installed has exit code 127, as in any shell."""
     assert shell.run(["no-such-program-of-ours"], 10) == Completed(NOT_FOUND, "")

@@ -37,7 +37,7 @@ Run = Callable[[Sequence[str], float], Completed | None]
 
 
 class PersistentProcess(ABC):
-    """A process that executes one command after the other. The first command starts it; `close` ends it."""
+    """A process that executes one command after the other. The first command starts it; `close` ends it for good."""
 
     program: tuple[str, ...]
     niceness = 0
@@ -45,6 +45,7 @@ class PersistentProcess(ABC):
     def __init__(self, clock: Clock | None = None) -> None:
         self._clock = clock or MachineClock()
         self._process: subprocess.Popen[bytes] | None = None
+        self._is_closed = False
         self._lock = threading.Lock()
 
     @abstractmethod
@@ -56,8 +57,10 @@ class PersistentProcess(ABC):
         """Return the parsed answer, or None if it is not complete yet."""
 
     def run(self, command: Sequence[str], timeout_s: float) -> Completed | None:
-        """Run a command to completion. Return None if it takes too long or the process has died."""
+        """Run a command to completion. Return None if it takes too long, or the process has died or was closed."""
         with self._lock:
+            if self._is_closed:  # a query of another thread may come later than `close`
+                return None
             try:
                 return self._query(self.encode(command), timeout_s)
             except FileNotFoundError:
@@ -67,8 +70,9 @@ class PersistentProcess(ABC):
                 return None
 
     def close(self) -> None:
-        """End the process."""
+        """End the process; no command starts another."""
         with self._lock:
+            self._is_closed = True
             self._kill()
 
     def _query(self, encode: str, timeout_s: float) -> Completed | None:

@@ -1,0 +1,34 @@
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import pytest
+
+from lavt.assembly.side import open_client
+from lavt.clock import MachineClock
+from lavt.config import ClientClockConfig, ClientConfig, ZenohConfig
+from lavt.recording.record import read_record
+from lavt.transport.netem.injector import Injector
+
+
+class PartFailed(Exception):
+    """A part of a side cannot be closed."""
+
+
+@pytest.mark.usefixtures("own_switch_interval")
+def test_a_part_that_cannot_be_closed_keeps_no_other_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """If closing one part fails, all other parts are closed, the record is complete, and the error is raised."""
+    close = Injector.close
+
+    def fail(injector: Injector) -> None:
+        close(injector)
+        raise PartFailed
+
+    monkeypatch.setattr(Injector, "close", fail)
+    config = ClientConfig(zenoh=ZenohConfig(router="tcp/127.0.0.1:1"), clock=ClientClockConfig(source="probe"))
+    before, out = set(threading.enumerate()), tmp_path / "out"
+    with pytest.raises(PartFailed), open_client(config, out, MachineClock(), lambda _: None) as side:
+        side.start()
+    assert set(threading.enumerate()) == before
+    assert read_record(out / "client.mcap").complete
