@@ -9,7 +9,9 @@ from pydantic import Field
 from lavt.config.section import Section
 
 CommandSet = Literal["remote", "user"]
-Word = Literal["enabled", "angle", "command", "speed", "gear"]
+Word = Literal[
+    "enabled", "angle", "command", "gear", "speed", "second_speed", "wheel_1", "wheel_2", "wheel_3", "wheel_4"
+]
 
 
 class CommandConfig(Section):
@@ -79,6 +81,8 @@ class ReportConfig(Section):
     """The values that a signal must have; any other value inhibits driving."""
     reasons: list[str] = Field(default_factory=list)
     """Signals whose value, by its name in the DBC, explains why something is inhibited."""
+    count: str = ""
+    """The frame counter; a report that repeats the last one's counter is dropped."""
     checksum: str = ""
     """As in a command; a report with a wrong checksum is dropped."""
 
@@ -91,6 +95,7 @@ class ReportsConfig(Section):
     throttle: ReportConfig
     gear: ReportConfig
     speed: ReportConfig = ReportConfig()
+    wheels: ReportConfig = ReportConfig()
     system: ReportConfig = ReportConfig()
     remote: ReportConfig = ReportConfig()
 
@@ -111,6 +116,8 @@ class ByWireCarConfig(Section):
     """The angle of the steering wheel divided by the angle of the road wheels."""
     steering_sign: Literal[1, -1] | None = None
     """1: left is positive on the bus; null: unknown."""
+    wheel_radius_m: float = Field(0.33, gt=0.1, lt=1)
+    """Converts the reported wheel speeds."""
     max_acceleration_mps2: float = Field(gt=0, le=20)
     max_braking_mps2: float = Field(gt=0, le=20)
 

@@ -21,7 +21,8 @@ from lavt.vehicle.dbw.profile import (
 )
 from lavt.vehicle.dbw.reports import NewestReports
 from lavt.vehicle.dbw.sending import DriveCommand, FrameSender, KitCommands
-from lavt.vehicle.dbw.states import ENABLING_LIMIT_NS, STATIONARY_BELOW_MPS, Situation, State, next_state
+from lavt.vehicle.dbw.speed_monitor import Pedals, SpeedMonitor
+from lavt.vehicle.dbw.states import ENABLING_LIMIT_NS, Situation, State, next_state
 from lavt.vehicle.vehicle import ReachedCommand
 
 SHIFT_REPORT_LIMIT_NS: Final = NS_PER_S
@@ -47,6 +48,9 @@ class ByWireAdapter:
     def __init__(self, profile: Profile, *, start_ns: int, inhibit_reason: str = "") -> None:
         self._profile = profile
         self._reports, self._sender = NewestReports(profile, start_ns), FrameSender(profile, start_ns)
+        self._speed = SpeedMonitor(
+            max_acceleration_mps2=profile.car.max_acceleration_mps2, max_braking_mps2=profile.car.max_braking_mps2
+        )
         unknown_sign = "the steering's sign is not known: set vehicle.dbw.steering_sign"
         self._installation = _join([inhibit_reason, unknown_sign if profile.car.steering_sign is None else ""])
         self._state: State = "idle"
@@ -119,7 +123,9 @@ class ByWireAdapter:
         still_enabled = NO_AXES if has_timed_out else self._reports.enabled  # reports may have waited for us
         self._still_enabled &= still_enabled
         self._is_shifting &= self._reports.gear != "drive"
-        if not self._is_stationary():
+        if (fault := self._speed.update(self._reports.speeds, self._pedals(has_timed_out), now_ns)) is not None:
+            self._counts[fault.code] += 1
+        if not self._speed.is_stationary:
             self._moved_ns = now_ns
         self._record_new_problems(now_ns)
         while True:
@@ -135,16 +141,22 @@ class ByWireAdapter:
                 self._still_enabled = still_enabled
             self._state, self._entered_ns = state, now_ns
 
-    def _is_stationary(self) -> bool:
-        return abs(self._reports.speed_mps) < STATIONARY_BELOW_MPS
+    def _pedals(self, has_timed_out: bool) -> Pedals:
+        """Return the pedals that the kit applies: the last ones sent, on the axes that it reports as enabled."""
+        sent, enabled = self._sender.sent, NO_AXES if has_timed_out else self._reports.enabled
+        return Pedals(sent.throttle if "throttle" in enabled else 0.0, sent.brake if "brake" in enabled else 0.0)
+
+    @property
+    def _speed_fault(self) -> str:
+        return self._speed.fault or ""
 
     def _current_situation(self, now_ns: int) -> Situation:
         reports = self._reports
         missing_reports = _join([self._bus_error, *reports.missing(now_ns)])
-        faults = _join([reports.other_commander(now_ns), *reports.texts("fault")])
+        faults = _join([reports.other_commander(now_ns), self._speed_fault, *reports.texts("fault")])
         return Situation(
             wanted=self._wanted,
-            is_stationary=self._is_stationary(),
+            is_stationary=self._speed.is_stationary and self._speed.fault is None,
             inhibit_reason=_join([self._installation, missing_reports, faults]),
             missing_reports=missing_reports,
             since_sent_ns=now_ns - self._sender.sent_ns,
@@ -162,6 +174,7 @@ class ByWireAdapter:
         """Emit an event for each newly reported problem."""
         reports = self._reports
         problems = [*reports.texts("override"), *reports.texts("trip"), *reports.texts("fault")]
+        problems += [self._speed_fault] if self._speed_fault else []
         self._events += [VehicleEvent(now_ns, "fault", text) for text in problems if text not in self._known_problems]
         self._known_problems = frozenset(problems)
 
@@ -221,7 +234,7 @@ class ByWireAdapter:
         is_shifting = self._is_shifting and self._now_ns - self._entered_ns < SHIFT_REPORT_LIMIT_NS
         if self._reports.gear == "park" and not is_shifting:
             return KitCommands(NO_AXES, system="disable")
-        may_park = self._now_ns - self._moved_ns >= STATIONARY_BEFORE_PARK_NS
+        may_park = self._speed.fault is None and self._now_ns - self._moved_ns >= STATIONARY_BEFORE_PARK_NS
         return KitCommands(
             self._still_enabled,
             gear="park" if may_park and self._still_enabled else None,
@@ -232,6 +245,8 @@ class ByWireAdapter:
         """Return the drive command of the current state, before the limits."""
         requested, limits = self._requested, self._profile.limits
         wheel_deg = self._profile.wheel_deg(requested.steering_rad)
+        if self._speed.fault is not None:
+            return DriveCommand(wheel_deg, 0.0, 1.0)
         if self._state == "engaged":
             return DriveCommand(wheel_deg, requested.throttle, requested.brake)
         needs_brake = self._state in {"enabling", "parking"}
@@ -268,13 +283,14 @@ class ByWireAdapter:
         """Return the newest state; its time is that of the newest speed."""
         reports = self._reports
         return VehicleState(
-            mono_ns=reports.speed_ns,
-            speed_mps=reports.speed_mps,
+            mono_ns=reports.speeds["speed"].mono_ns,
+            speed_mps=self._speed.speed_mps,
             steering_rad=self._profile.road_rad(reports.wheel_deg),
             gear=reports.gear or "neutral",
             inhibit_reason=self._inhibit_reason(),
             is_engaged=self._state == "engaged",
             is_overridden=self._state == "overridden",
+            is_speed_plausible=self._speed.fault is None,
         )
 
     def _inhibit_reason(self) -> str:
