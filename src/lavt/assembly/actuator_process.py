@@ -89,7 +89,7 @@ def serve_actuator(connection: Connection, config: ServerConfig, host: str, vide
     process_priority.raise_priority(process_priority.VEHICLE_NICENESS)
     clock = MachineClock()
     try:
-        vehicle, start = open_by_wire(config.vehicle, clock), clock.now()
+        vehicle, start = open_by_wire(config, clock), clock.now()
         node = build_actuator(
             config, vehicle, MachineEntropy(), start, host=host, video_port=video_port, route=driven_route(config)
         )

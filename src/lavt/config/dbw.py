@@ -170,6 +170,10 @@ class DbwConfig(Section):
     """The UDP address, as `host:port`, at which a software car's ground truth is received; empty: a real car."""
     watchdog_proof: str = ""
     """The file that `lavt can test-watchdog` wrote."""
+    watchdog_proof_days: int = Field(30, ge=1, le=365)
+    """A proof is accepted for this many days."""
+    car: str = Field("", max_length=64)
+    """The car's serial number or VIN, which a proof of a real bus names: kits do not report it as far as is known."""
     steering_sign: Literal[1, -1] | None = None
     """1: left is positive on the bus; for a profile without a sign."""
 
@@ -184,9 +188,10 @@ class DbwConfig(Section):
 
 
 class WatchdogProof(Section):
-    """The file of a passed `lavt can test-watchdog`: the kit's watchdog braked, on this bus, with this profile."""
+    """The file of a passed `lavt can test-watchdog`: this car's watchdog braked, on this bus, with this profile."""
 
-    version: Literal[1] = 1
+    version: Literal[2] = 2
+    car: str
     at: str
     """The date and time (UTC)."""
     profile: str
