@@ -33,13 +33,12 @@ class Limiter:
         self._at_ns = 0
 
     def reset(self, steering_rad: float, now_ns: int) -> None:
-        """Take the wheel's present angle as the last steering target, unless it is not a finite number."""
-        self._at_ns = now_ns
+        """Take the wheel's present angle as the last steering target; ignore an angle that is not finite."""
         if math.isfinite(steering_rad):
-            self._steering_rad = steering_rad
+            self._steering_rad, self._at_ns = steering_rad, now_ns
 
     def target_rad(self, vehicle: VehicleState) -> float:
-        """Return the last steering target; before the first one, the wheel's angle, or 0 if that is not finite."""
+        """Return the last steering target; before the first one, the wheel's angle, or 0 if it is not finite."""
         if self._steering_rad is not None:
             return self._steering_rad
         return vehicle.steering_rad if math.isfinite(vehicle.steering_rad) else 0.0

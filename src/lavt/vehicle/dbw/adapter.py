@@ -119,13 +119,12 @@ class ByWireAdapter:
     def _update_state(self, now_ns: int) -> None:
         """Apply transitions until none matches."""
         self._now_ns = now_ns
+        self._check_speed(now_ns)
         has_timed_out = now_ns - self._sender.sent_ns >= COMMAND_TIMEOUT_NS
         still_enabled = NO_AXES if has_timed_out else self._reports.enabled  # reports may have waited for us
         self._still_enabled &= still_enabled
         self._is_shifting &= self._reports.gear != "drive"
-        if (fault := self._speed.update(self._reports.speeds, self._pedals(has_timed_out), now_ns)) is not None:
-            self._counts[fault.code] += 1
-        if not self._speed.is_stationary:
+        if not self._is_stationary():
             self._moved_ns = now_ns
         self._record_new_problems(now_ns)
         while True:
@@ -141,10 +140,16 @@ class ByWireAdapter:
                 self._still_enabled = still_enabled
             self._state, self._entered_ns = state, now_ns
 
-    def _pedals(self, has_timed_out: bool) -> Pedals:
-        """Return the pedals that the kit applies: the last ones sent, on the axes that it reports as enabled."""
+    def _is_stationary(self) -> bool:
+        return self._speed.is_stationary and self._speed.fault is None
+
+    def _check_speed(self, now_ns: int) -> None:
+        """Compare the reported speeds with the pedals that the kit applies: the last ones sent, on enabled axes."""
+        has_timed_out = now_ns - self._sender.sent_ns >= COMMAND_TIMEOUT_NS
         sent, enabled = self._sender.sent, NO_AXES if has_timed_out else self._reports.enabled
-        return Pedals(sent.throttle if "throttle" in enabled else 0.0, sent.brake if "brake" in enabled else 0.0)
+        pedals = Pedals(sent.throttle if "throttle" in enabled else 0.0, sent.brake if "brake" in enabled else 0.0)
+        if (fault := self._speed.update(self._reports.speeds, pedals, now_ns)) is not None:
+            self._counts[fault.code] += 1
 
     @property
     def _speed_fault(self) -> str:
@@ -156,7 +161,7 @@ class ByWireAdapter:
         faults = _join([reports.other_commander(now_ns), self._speed_fault, *reports.texts("fault")])
         return Situation(
             wanted=self._wanted,
-            is_stationary=self._speed.is_stationary and self._speed.fault is None,
+            is_stationary=self._is_stationary(),
             inhibit_reason=_join([self._installation, missing_reports, faults]),
             missing_reports=missing_reports,
             since_sent_ns=now_ns - self._sender.sent_ns,
@@ -234,7 +239,7 @@ class ByWireAdapter:
         is_shifting = self._is_shifting and self._now_ns - self._entered_ns < SHIFT_REPORT_LIMIT_NS
         if self._reports.gear == "park" and not is_shifting:
             return KitCommands(NO_AXES, system="disable")
-        may_park = self._speed.fault is None and self._now_ns - self._moved_ns >= STATIONARY_BEFORE_PARK_NS
+        may_park = self._now_ns - self._moved_ns >= STATIONARY_BEFORE_PARK_NS
         return KitCommands(
             self._still_enabled,
             gear="park" if may_park and self._still_enabled else None,

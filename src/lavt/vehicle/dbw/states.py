@@ -25,10 +25,9 @@ SENT_IN_STATE: Final[dict[State, str]] = {
     "enabling": "all axes enabled, throttle 0, the holding brake; DRIVE once all axes are reported enabled",
     "engaged": "the requested actuation",
     "parking": "requested steering and brake, at least the holding brake, throttle 0; PARK once the car was stationary "
-    "for 300 ms; then no axis enabled; full brake and no PARK while the speed is implausible",
+    "for 300 ms; then no axis enabled",
     "overridden": "no axis enabled",
-    "lost": "requested steering and brake, throttle 0, on the axes that are still enabled; full brake while the speed "
-    "is implausible",
+    "lost": "requested steering and brake, throttle 0, on the axes that are still enabled",
 }
 """Frames sent in each state."""
 
@@ -121,7 +120,7 @@ TABLE: Final[tuple[TransitionRow, ...]] = (
     ),
     TransitionRow(
         ("clearing", "enabling", "engaged"),
-        "the kit reports a fault, the speed is implausible, or another sender commands it",
+        "the kit reports a fault, or another sender commands it",
         lambda now: now.faults,
         "lost",
     ),
