@@ -7,7 +7,14 @@ import struct
 
 import pytest
 
-from lavt.vehicle.dbw.can_gateway import AF_CAN, NLMSG_DONE, NLMSG_ERROR, RTM_NEWROUTE, gateway_interfaces, parse_rules
+from lavt.vehicle.dbw.can_gateway import (
+    CAN_FAMILY,
+    NLMSG_DONE,
+    NLMSG_ERROR,
+    RTM_NEWROUTE,
+    gateway_interfaces,
+    parse_rules,
+)
 
 
 def message(kind: int, body: bytes) -> bytes:
@@ -18,7 +25,7 @@ def attribute(kind: int, value: bytes) -> bytes:
     return struct.pack("=HH", 4 + len(value), kind) + value + bytes(-len(value) % 4)
 
 
-def rule(source: int, destination: int, family: int = AF_CAN) -> bytes:
+def rule(source: int, destination: int, family: int = CAN_FAMILY) -> bytes:
     """Return a rule as the kernel writes it, with a counter, a modification of odd length and the interfaces."""
     attributes = [
         attribute(7, struct.pack("=I", 12)),

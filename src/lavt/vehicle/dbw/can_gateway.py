@@ -17,7 +17,8 @@ RTM_NEWROUTE, RTM_GETROUTE = 24, 26
 NLMSG_ERROR, NLMSG_DONE = 2, 3
 DUMP_REQUEST: Final = 0x301
 """NLM_F_REQUEST and NLM_F_DUMP."""
-AF_CAN, GATEWAY_CAN_TO_CAN = 29, 1
+CAN_FAMILY, GATEWAY_CAN_TO_CAN = 29, 1
+"""The family of the rules; no CAN socket is opened here."""
 SOURCE, DESTINATION = 9, 10
 """CGW_SRC_IF and CGW_DST_IF."""
 HEADER, RULE, ATTRIBUTE = struct.Struct("=IHHII"), struct.Struct("=BBH"), struct.Struct("=HH")
@@ -31,7 +32,7 @@ def gateway_interfaces() -> frozenset[int]:
     with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, socket.NETLINK_ROUTE) as link:
         link.settimeout(TIMEOUT_S)
         link.bind((0, 0))
-        request = RULE.pack(AF_CAN, GATEWAY_CAN_TO_CAN, 0)
+        request = RULE.pack(CAN_FAMILY, GATEWAY_CAN_TO_CAN, 0)
         link.sendto(HEADER.pack(HEADER.size + len(request), RTM_GETROUTE, DUMP_REQUEST, 1, 0) + request, (0, 0))
         while True:
             data = link.recv(MAX_BYTES)
@@ -52,7 +53,7 @@ def parse_rules(data: bytes) -> tuple[set[int], bool]:
         if kind == NLMSG_ERROR:
             (number,) = struct.unpack_from("=i", body)
             raise OSError(-number, os.strerror(-number))
-        if kind == RTM_NEWROUTE and body[:1] == bytes([AF_CAN]):
+        if kind == RTM_NEWROUTE and body[:1] == bytes([CAN_FAMILY]):
             attributes = dict(_pieces(body[RULE.size :], ATTRIBUTE))
             found |= {
                 int.from_bytes(attributes[side][:4], sys.byteorder)
