@@ -49,6 +49,14 @@ def pause(duration_ns: int) -> None:
         time.sleep(duration_ns / NS_PER_S)
 
 
+def wall_time_ns(calendar_time: str) -> int:
+    """Return the wall clock time of a date and time with an offset, as `calendar_time` writes it; else `ValueError`."""
+    time = datetime.fromisoformat(calendar_time)
+    if time.tzinfo is None:
+        raise ValueError("no offset from UTC")
+    return round(time.timestamp()) * NS_PER_S
+
+
 def calendar_time(wall_ns: int) -> datetime:
     """Return a wall clock time as a date and time in UTC, in whole seconds."""
     return datetime.fromtimestamp(wall_ns // NS_PER_S, UTC)

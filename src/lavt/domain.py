@@ -76,6 +76,8 @@ class VehicleState:
     """The vehicle executes commands; engaging may take time after `Vehicle.engage`."""
     is_overridden: bool = False
     """A driver in the car has taken over: no command reaches the wheels."""
+    is_speed_plausible: bool = True
+    """False: `speed_mps` may be wrong, and the car may move even if it is 0."""
 
 
 @value

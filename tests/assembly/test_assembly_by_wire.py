@@ -8,7 +8,8 @@ import pytest
 
 from lavt.assembly.by_wire import inhibit_reason_of
 from lavt.assembly.dbw import load_profile
-from lavt.config.dbw import DbwConfig
+from lavt.config import DbwConfig, ServerConfig, ServerSecurityConfig, VehicleConfig
+from lavt.domain import NS_PER_S
 from lavt.vehicle.dbw.profile import Profile
 
 
@@ -17,24 +18,51 @@ def known() -> Profile:
     return load_profile("dataspeed_gen1", steering_sign=1)
 
 
+WALL_NS = 1_790_000_000 * NS_PER_S
+REAL = DbwConfig(interface="socketcan", channel="no_such_bus", car="VIN 1")
+KEYS = ServerSecurityConfig(key="vehicle.sign.key", operators={"alice": "alice.sign.pub"})
+
+
+def reason_for(
+    config: DbwConfig, profile: Profile, security: ServerSecurityConfig = KEYS, wall_ns: int = WALL_NS
+) -> str:
+    server = ServerConfig(vehicle=VehicleConfig(kind="dbw", dbw=config), security=security)
+    return inhibit_reason_of(server, profile, wall_ns)
+
+
+def test_a_real_bus_without_keys_inhibits_arming(known: Profile) -> None:
+    """A bus that may have a real car is not driven without signing keys; a virtual bus is."""
+    assert "security.key" in reason_for(REAL, known, ServerSecurityConfig())
+    assert "security.key" not in reason_for(REAL, known)
+    virtual = DbwConfig(interface="udp_multicast", channel="239.74.163.2")
+    assert "security.key" not in reason_for(virtual, known, ServerSecurityConfig())
+    routed = virtual.model_copy(update={"options": {"hop_limit": 1}})
+    assert "security.key" in reason_for(routed, known, ServerSecurityConfig())
+
+
+def test_a_real_bus_without_a_car_inhibits_arming(known: Profile) -> None:
+    """A bus that may have a real car needs the car's name, which its watchdog proof must have."""
+    assert "vehicle.dbw.car" in reason_for(REAL.model_copy(update={"car": ""}), known)
+    assert "vehicle.dbw.watchdog_proof" in reason_for(REAL, known)
+
+
 def test_unverified_signals_inhibit_arming_on_a_real_bus() -> None:
     """Unverified signals inhibit arming on any bus that is not known to be virtual."""
     unverified = load_profile("dataspeed_gen2")
-    real = DbwConfig(interface="socketcan", channel="no_such_bus")
-    assert "unverified" in inhibit_reason_of(real, unverified)
+    assert "unverified" in reason_for(REAL, unverified)
     virtual = DbwConfig(interface="udp_multicast", channel="239.74.163.2")
-    assert "unverified" not in inhibit_reason_of(virtual, unverified)
+    assert "unverified" not in reason_for(virtual, unverified)
 
 
 def test_a_missing_sign_or_proof_inhibits_arming(known: Profile) -> None:
     """An unknown steering sign or a missing watchdog proof inhibits arming, even on a virtual bus."""
     config = DbwConfig(interface="virtual", channel="test")
-    assert "vehicle.dbw.steering_sign" in inhibit_reason_of(config, load_profile("dataspeed_gen1"))
-    assert "vehicle.dbw.watchdog_proof" in inhibit_reason_of(config, known)
+    assert "vehicle.dbw.steering_sign" in reason_for(config, load_profile("dataspeed_gen1"))
+    assert "vehicle.dbw.watchdog_proof" in reason_for(config, known)
 
 
 @pytest.mark.parametrize(("limit", "is_enough"), [(0.66, False), (0.67, True)])
 def test_a_brake_too_weak_for_a_safe_stop_inhibits_arming(known: Profile, limit: float, is_enough: bool) -> None:
     """A brake limit below the 4 m/s2 of a safe stop, on which all speed limits depend, inhibits arming."""
-    reason = inhibit_reason_of(DbwConfig(), replace(known, limits=replace(known.limits, brake=limit)))
+    reason = reason_for(REAL, replace(known, limits=replace(known.limits, brake=limit)))
     assert ("limits.brake" in reason) is not is_enough

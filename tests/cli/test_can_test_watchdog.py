@@ -21,7 +21,7 @@ from lavt.assembly.watchdog_proof import new_proof, proof_rejection
 from lavt.clock import MachineClock
 from lavt.config.dbw import DbwConfig
 from lavt.config_file import shipped
-from lavt.domain import NS_PER_MS
+from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.vehicle.dbw.watchdog_test import WatchdogObservation
 
 SERVER = str(shipped("configs/server.yaml"))
@@ -93,7 +93,7 @@ def test_passed(run: Run, tmp_path: Path, port: int, profile: str) -> None:
     assert 100 <= written["release_ms"] <= written["braked_ms"] <= 500
     assert written["gear"] == "park"
     config = DbwConfig(profile=profile, interface="udp_multicast", channel=GROUP, options={"port": port})
-    assert proof_rejection("proof.json", load_profile(profile), config) == ""
+    assert proof_rejection("proof.json", load_profile(profile), config, MachineClock().now().wall_ns) == ""
 
 
 @pytest.mark.realtime
@@ -168,6 +168,7 @@ def test_rejected(run: Run, monkeypatch: pytest.MonkeyPatch, arguments: list[str
 
 CONFIG = DbwConfig(profile="dataspeed_gen2", interface="udp_multicast", channel=GROUP)
 PROFILE = load_profile("dataspeed_gen2")
+WALL_NS = 1_790_000_000 * NS_PER_S
 
 
 def proof(tmp_path: Path, **others: Any) -> str:
@@ -175,7 +176,7 @@ def proof(tmp_path: Path, **others: Any) -> str:
     observation = WatchdogObservation(
         released_ns=100 * NS_PER_MS, braked_ns=120 * NS_PER_MS, reports=49, kit_messages=""
     )
-    fields = new_proof(observation, "park", PROFILE, CONFIG, 0).model_dump() | others
+    fields = new_proof(observation, "park", PROFILE, CONFIG, WALL_NS).model_dump() | others
     path = tmp_path / "proof.json"
     path.write_text(json.dumps(fields))
     return str(path)
@@ -188,7 +189,13 @@ INVALID: list[tuple[dict[str, Any], str]] = [
     ({"options": {"port": 4}}, "another bus"),
     ({"is_virtual": False}, "another bus"),
     ({"braked_ms": 501.0}, "501 ms"),
-    ({"version": 2}, "version"),
+    ({"car": "another"}, "another car"),
+    ({"at": "2001-01-01T00:00:00+00:00"}, "vehicle.dbw.watchdog_proof_days"),
+    ({"at": "2201-01-01T00:00:00+00:00"}, "future"),
+    ({"at": "2026-09-21T14:13:20"}, "no date"),
+    ({"at": "yesterday"}, "no date"),
+    ({"reports": 1}, "1 reports"),
+    ({"version": 1}, "version"),
     ({"release_ms": -1}, "release_ms"),
     ({"surprise": 1}, "surprise"),
 ]
@@ -197,18 +204,27 @@ INVALID: list[tuple[dict[str, Any], str]] = [
 @pytest.mark.parametrize(("others", "reason"), INVALID, ids=[next(iter(each[0])) for each in INVALID])
 def test_invalid_proof(tmp_path: Path, others: dict[str, Any], reason: str) -> None:
     """A proof for another setup, of braking that was too slow, or with invalid fields is rejected with the reason."""
-    assert proof_rejection(proof(tmp_path), PROFILE, CONFIG) == ""
-    assert reason in proof_rejection(proof(tmp_path, **others), PROFILE, CONFIG)
+    assert proof_rejection(proof(tmp_path), PROFILE, CONFIG, WALL_NS) == ""
+    assert reason in proof_rejection(proof(tmp_path, **others), PROFILE, CONFIG, WALL_NS)
+
+
+def test_a_proof_expires(tmp_path: Path) -> None:
+    """A proof applies for the configured number of days."""
+    path, day_ns = proof(tmp_path), 86_400 * NS_PER_S
+    assert proof_rejection(path, PROFILE, CONFIG, WALL_NS + 30 * day_ns) == ""
+    assert "30" in proof_rejection(path, PROFILE, CONFIG, WALL_NS + 31 * day_ns)
+    longer = CONFIG.model_copy(update={"watchdog_proof_days": 60})
+    assert proof_rejection(path, PROFILE, longer, WALL_NS + 31 * day_ns) == ""
 
 
 def test_no_proof(tmp_path: Path) -> None:
     """Without a readable proof, the rejection names the command that writes one."""
-    assert proof_rejection("", PROFILE, CONFIG).endswith("vehicle.dbw.watchdog_proof")
+    assert proof_rejection("", PROFILE, CONFIG, WALL_NS).endswith("vehicle.dbw.watchdog_proof")
     path = tmp_path / "proof.json"
     for text in (None, "", "[]", "[" * 100_000, "\xff", '{"version": 1}'):
         if text is not None:
             path.write_text(text, "latin-1")
-        assert proof_rejection(str(path), PROFILE, CONFIG).endswith("`lavt can test-watchdog`")
+        assert proof_rejection(str(path), PROFILE, CONFIG, WALL_NS).endswith("`lavt can test-watchdog`")
 
 
 def test_changed_profile_or_dbc(tmp_path: Path) -> None:
@@ -219,6 +235,6 @@ def test_changed_profile_or_dbc(tmp_path: Path) -> None:
     dbc.write_text(source.with_suffix(".dbc").read_text())
     config = CONFIG.model_copy(update={"profile": str(mine)})
     path = proof(tmp_path)  # of the shipped profile, whose bytes are equal
-    assert proof_rejection(path, PROFILE, config) == ""
+    assert proof_rejection(path, PROFILE, config, WALL_NS) == ""
     dbc.write_text(dbc.read_text() + "\n")
-    assert "another profile or DBC" in proof_rejection(path, PROFILE, config)
+    assert "another profile or DBC" in proof_rejection(path, PROFILE, config, WALL_NS)

@@ -524,11 +524,11 @@ def test_a_kit_on_its_bus(tmp_path: Path) -> None:
     run = by_wire.run_config("dataspeed_gen2", tmp_path / "none.json")
     path, clock = by_wire.write_config(run, tmp_path / "server.yaml"), MachineClock()
     config = load_config(ServerConfig, path)
-    frames, reason = listen(config.vehicle, clock, NS_PER_S)
+    frames, reason = listen(config, clock, NS_PER_S)
     assert frames == 0
     assert "SteerReport1" in reason
     with by_wire.software_car(path) as car:
-        frames, reason = listen(config.vehicle, clock, 2 * NS_PER_S)
+        frames, reason = listen(config, clock, 2 * NS_PER_S)
         assert frames > 100
         assert "none.json" in reason
         assert "SteerReport1" not in reason

@@ -127,9 +127,9 @@ def test_lost_interface_is_reported_and_recovers(
 
 def test_virtual_channels_are_recognised(channel: str) -> None:
     """A vcan channel is virtual; a missing channel, or an interface of another kind, is not."""
-    assert is_virtual("socketcan", channel)
-    assert not is_virtual("socketcan", "lo")
-    assert not is_virtual("socketcan", "can7")
+    assert is_virtual("socketcan", channel, {})
+    assert not is_virtual("socketcan", "lo", {})
+    assert not is_virtual("socketcan", "can7", {})
 
 
 def test_missing_channel_is_rejected() -> None:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 import sys
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -9,7 +10,8 @@ from hypothesis import strategies as st
 from tests.safety.rig import MAX_STEERING_RAD, WHEELBASE_M, new_limiter, vehicle_at
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation
-from lavt.safety.limiter import COMMAND_PERIOD_S, stopping_speed_limit_mps
+from lavt.errors import UserError
+from lavt.safety.limiter import COMMAND_PERIOD_S, Limiter, stopping_speed_limit_mps
 from lavt.safety.limits import LIMITS
 
 LONG_NS = 3600 * NS_PER_S
@@ -206,3 +208,56 @@ def test_the_limits_hold_for_any_request(requested: list[tuple[float, float, flo
         assert actuation.throttle in (0.0, throttle)
         assert actuation.brake == brake
         before_rad = actuation.steering_rad
+
+
+NUMBERS = st.floats(allow_nan=True, allow_infinity=True)
+
+
+@given(
+    st.tuples(NUMBERS, NUMBERS, NUMBERS),
+    st.lists(st.tuples(NUMBERS, NUMBERS, st.booleans(), st.booleans()), min_size=1, max_size=5),
+)
+def test_whatever_a_vehicle_reports_the_output_is_finite(
+    requested: tuple[float, float, float], reports: list[tuple[float, float, bool, bool]]
+) -> None:
+    """No speed, angle or request, finite or not, raises or reaches the output as a number that is not finite."""
+    limiter = new_limiter()
+    for index, (speed_mps, steering_rad, is_plausible, is_reset) in enumerate(reports):
+        vehicle = replace(vehicle_at(speed_mps, steering_rad), is_speed_plausible=is_plausible)
+        if is_reset:
+            limiter.reset(steering_rad, index * LONG_NS)
+        actuation = limiter.limit(Actuation(*requested), vehicle, index * LONG_NS, index * NS_PER_MS)
+        assert all(map(math.isfinite, (actuation.steering_rad, actuation.throttle, actuation.brake)))
+
+
+def test_a_request_that_is_not_finite_brakes() -> None:
+    """A request with a value that is not finite becomes the last steering target and a full brake."""
+    actuation, changed = limited(Actuation(math.nan, 1.0, 0.0), SPEED_MPS)
+    assert (actuation.throttle, actuation.brake) == (0.0, 1.0)
+    assert changed == ("not finite",)
+
+
+@pytest.mark.parametrize("speed_mps", [1e155, -1e300])
+def test_a_huge_speed_does_not_overflow(speed_mps: float) -> None:
+    """A finite speed whose square is not finite limits the wheel to 0."""
+    assert limited(Actuation(0.5, 0.0, 0.0), speed_mps)[0].steering_rad == 0.0
+
+
+def test_an_implausible_speed_gives_no_throttle_and_the_least_steering() -> None:
+    """An implausible speed of 0 limits the wheel as at the speed limit, and removes the throttle."""
+    limiter = new_limiter()
+    limiter.reset(0.0, 0)
+    vehicle = replace(vehicle_at(0.0), is_speed_plausible=False)
+    actuation = limiter.limit(Actuation(0.5, 1.0, 0.0), vehicle, LONG_NS)
+    top_rad = math.atan(WHEELBASE_M * LIMITS.lateral_acceleration_mps2 / LIMITS.speed_limit_mps**2)
+    assert actuation.steering_rad == pytest.approx(top_rad)
+    assert actuation.throttle == 0.0
+
+
+@pytest.mark.parametrize("name", ["wheelbase_m", "max_steering_rad", "max_braking_mps2"])
+@pytest.mark.parametrize("number", [math.nan, math.inf, 0.0, -1.0])
+def test_properties_of_the_vehicle_are_positive_numbers(name: str, number: float) -> None:
+    """A vehicle whose wheelbase, steering or braking is no positive number is rejected."""
+    properties = {"wheelbase_m": 2.8, "max_steering_rad": 0.5, "max_braking_mps2": 6.0, name: number}
+    with pytest.raises(UserError):
+        Limiter(LIMITS, **properties)

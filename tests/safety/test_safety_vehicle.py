@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -146,3 +147,14 @@ def test_an_emergency_stop_does_not_engage_a_disarmed_vehicle() -> None:
     assert not rig.gate.watchdog.should_engage(rig.vehicle)
     assert rig.request("emergency_stop", number=7).granted
     assert not rig.gate.watchdog.should_engage(rig.vehicle)
+
+
+@pytest.mark.parametrize("changes", [{"speed_mps": math.nan}, {"steering_rad": math.inf}])
+def test_a_state_that_is_not_finite_is_a_vehicle_fault(changes: dict[str, Any]) -> None:
+    """A speed or an angle that is not finite stops the vehicle."""
+    rig = Rig().driving()
+    rig.vehicle = replace(vehicle_at(5.0), **changes)
+    actuation = rig.actuation()
+    assert rig.state == "safe_stop"
+    assert actuation.throttle == 0.0
+    assert math.isfinite(actuation.steering_rad)

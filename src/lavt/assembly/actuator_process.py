@@ -27,8 +27,9 @@ from lavt.vehicle.dbw.vehicle import DbwVehicle
 
 NAME = "actuator"
 READY_TIMEOUT_S = 30.0
-STOP_TIMEOUT_S = 10.0
-"""How long the vehicle may take to stop and disengage when the server ends."""
+STOP_TIMEOUT_S = 12.0
+"""How long the vehicle may take to stop and disengage when the server ends; after an implausible speed it brakes for at
+least 8 s."""
 POLL_PERIOD_S = 0.05
 IGNORED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Signals that all processes of a terminal or service receive; the server's process handles them, and its end is
@@ -88,7 +89,7 @@ def serve_actuator(connection: Connection, config: ServerConfig, host: str, vide
     process_priority.raise_priority(process_priority.VEHICLE_NICENESS)
     clock = MachineClock()
     try:
-        vehicle, start = open_by_wire(config.vehicle, clock), clock.now()
+        vehicle, start = open_by_wire(config, clock), clock.now()
         node = build_actuator(
             config, vehicle, MachineEntropy(), start, host=host, video_port=video_port, route=driven_route(config)
         )

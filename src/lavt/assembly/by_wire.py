@@ -36,9 +36,9 @@ def inside(config: ServerConfig, road: Road, start: Now) -> DbwVehicle:
     return _build_vehicle(profile, port, car.simulator.capabilities, start, truth=port.truth)
 
 
-def open_by_wire(config: VehicleConfig, clock: Clock) -> DbwVehicle:
+def open_by_wire(config: ServerConfig, clock: Clock) -> DbwVehicle:
     """Open the bus of the configured kit and build its vehicle; raise `UserError` on failure."""
-    dbw = config.dbw
+    dbw = config.vehicle.dbw
     profile = profile_of(dbw)
     truth = TruthSocket(resolved_address("vehicle.dbw.truth", dbw.truth)) if dbw.truth else None
     port = CanPort(dbw.interface, dbw.channel, dbw.options, clock=clock)
@@ -48,20 +48,22 @@ def open_by_wire(config: VehicleConfig, clock: Clock) -> DbwVehicle:
         capabilities_of(profile, simulated=is_simulated(dbw), truth=truth is not None),
         clock.now(),
         truth=None if truth is None else truth.take,
-        inhibit_reason=inhibit_reason_of(dbw, profile),
+        inhibit_reason=inhibit_reason_of(config, profile, clock.now().wall_ns),
     )
 
 
-def listen(config: VehicleConfig, clock: Clock, duration_ns: int) -> tuple[int, str]:
+def listen(config: ServerConfig, clock: Clock, duration_ns: int) -> tuple[int, str]:
     """Listen to the configured bus without sending; return the number of frames, and why driving is inhibited.
 
     Raises `UserError` for an invalid profile and for a bus that cannot be opened.
     """
-    dbw = config.dbw
+    dbw = config.vehicle.dbw
     profile = profile_of(dbw)
     port = CanPort(dbw.interface, dbw.channel, dbw.options, clock=clock)
-    adapter = ByWireAdapter(profile, start_ns=clock.now().mono_ns, inhibit_reason=inhibit_reason_of(dbw, profile))
-    frames, end_ns = 0, clock.now().mono_ns + duration_ns
+    now = clock.now()
+    reason = inhibit_reason_of(config, profile, now.wall_ns)
+    adapter = ByWireAdapter(profile, start_ns=now.mono_ns, inhibit_reason=reason)
+    frames, end_ns = 0, now.mono_ns + duration_ns
     try:
         while (now_ns := clock.now().mono_ns) < end_ns:
             for each in port.take(now_ns):
@@ -78,7 +80,7 @@ def listen(config: VehicleConfig, clock: Clock, duration_ns: int) -> tuple[int, 
 
 def is_simulated(config: DbwConfig) -> bool:
     """Return whether the car must be a software car: it sends ground truth, and its bus stays on this machine."""
-    return bool(config.truth) and is_virtual(config.interface, config.channel)
+    return bool(config.truth) and is_virtual(config.interface, config.channel, config.options)
 
 
 def capabilities_of(profile: Profile, *, simulated: bool, truth: bool) -> Capabilities:
@@ -97,11 +99,20 @@ def capabilities_of(profile: Profile, *, simulated: bool, truth: bool) -> Capabi
     )
 
 
-def inhibit_reason_of(config: DbwConfig, profile: Profile) -> str:
-    """Return why the vehicle must not be armed with this config; empty if it may."""
+def inhibit_reason_of(server: ServerConfig, profile: Profile, wall_ns: int) -> str:
+    """Return why the vehicle must not be armed with this config at `wall_ns`; empty if it may."""
+    config = server.vehicle.dbw
+    is_real = not is_virtual(config.interface, config.channel, config.options)
     if profile.car.steering_sign is None:
         return "the sign of steering to the left is unknown: test it with the wheels up, set vehicle.dbw.steering_sign"
-    if profile.unverified and not is_virtual(config.interface, config.channel):
+    if is_real and not server.security.key:
+        return (
+            f"{config.interface} {config.channel} may have a real car, which anyone who reaches the router could drive"
+            ": make keys with `lavt keys` and set security.key and security.operators"
+        )
+    if is_real and not config.car:
+        return "it is not known which car this is: set vehicle.dbw.car to its serial number or VIN"
+    if is_real and profile.unverified:
         return (
             f"{profile.name} has {len(profile.unverified)} unverified signals, such as {profile.unverified[0]}: "
             "name the vendor's DBC in vehicle.dbw.dbc"
@@ -112,7 +123,7 @@ def inhibit_reason_of(config: DbwConfig, profile: Profile) -> str:
             f"{profile.name} brakes with at most {braking_mps2:g} m/s2, but a safe stop needs "
             f"{LIMITS.stop_deceleration_mps2:g}: raise limits.brake if vehicle.max_braking_mps2 is correct"
         )
-    return proof_rejection(config.watchdog_proof, profile, config)
+    return proof_rejection(config.watchdog_proof, profile, config, wall_ns)
 
 
 def _build_vehicle(

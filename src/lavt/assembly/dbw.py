@@ -29,6 +29,9 @@ from lavt.vehicle.dbw.profile import (
     IN_DEGREES_PER_SECOND,
     IN_FRACTIONS,
     IN_METRES_PER_SECOND,
+    IN_RADIANS_PER_SECOND,
+    SPEEDS,
+    WHEEL_SPEEDS,
     AxisCommand,
     ByWireCar,
     ByWireLimits,
@@ -143,7 +146,7 @@ class _ProfileBuilder:
             clearing_bytes=config.sent.clearing_bytes,
             reports=reports,
             watchdog=self._watchdog(),
-            speed_per_mps=self._unit_of(reports, "speed", IN_METRES_PER_SECOND),
+            speeds_per_mps=self._speed_units(reports),
             angle_per_deg=self._unit_of(reports, "angle", IN_DEGREES),
             unverified=tuple(name for name, is_unverified in self.used.items() if is_unverified),
             codec=self.codec,
@@ -248,6 +251,7 @@ class _ProfileBuilder:
                 for signal, numbers in report.needs.items()
             },
             reasons=tuple(self._signal(message, signal).name for signal in report.reasons),
+            count=self._optional_signal(message, report.count),
             checksum=self._checksum(message, report.checksum),
         )
 
@@ -333,6 +337,18 @@ class _ProfileBuilder:
         name, report = next((name, report) for name, report in reports.items() if word in report.values)
         message = self.codec.messages[name]
         return self._unit(message.signals[report.values[word]], message, units)
+
+    def _speed_units(self, reports: Mapping[str, ReportSpec]) -> dict[str, float]:
+        """Return the unit of each reported speed; a wheel's is converted by its radius."""
+        words = {word for report in reports.values() for word in report.values}
+        radius_m = self.config.vehicle.wheel_radius_m
+        return {
+            word: self._unit_of(reports, word, IN_RADIANS_PER_SECOND) / radius_m
+            if word in WHEEL_SPEEDS
+            else self._unit_of(reports, word, IN_METRES_PER_SECOND)
+            for word in SPEEDS
+            if word in words
+        }
 
     def _check_range(self, message: MessageFacts, signal: SignalFacts, value: float) -> None:
         tolerance = abs(signal.scale) / 2

@@ -103,6 +103,8 @@ def _report_signals(report: ReportConfig) -> Iterator[tuple[str, str]]:
         yield f"needs.{signal}", signal
     for signal in report.reasons:
         yield "reasons", signal
+    if report.count:
+        yield "count", report.count
     if report.checksum:
         yield "checksum", report.checksum
 

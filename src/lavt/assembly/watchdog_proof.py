@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Final
 
 from lavt.assembly.dbw import profile_digest
-from lavt.clock import calendar_time
+from lavt.clock import calendar_time, wall_time_ns
 from lavt.config.dbw import DbwConfig, WatchdogProof
 from lavt.config_file import parse_config
-from lavt.domain import NS_PER_MS
+from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
 from lavt.vehicle.dbw.bus import is_virtual
 from lavt.vehicle.dbw.profile import Profile
-from lavt.vehicle.dbw.watchdog_test import BRAKE, BRAKE_WITHIN_NS, WatchdogObservation
+from lavt.vehicle.dbw.watchdog_test import BRAKE, BRAKE_WITHIN_NS, LEAST_REPORTS, WatchdogObservation
 
+NS_PER_DAY: Final = 86_400 * NS_PER_S
+CLOCK_TOLERANCE_DAYS: Final = 1
+"""The clock of the machine that made the proof may have been this far ahead."""
 RUN_TEST = "run `lavt can test-watchdog`"
 
 
@@ -23,6 +27,7 @@ def new_proof(
 ) -> WatchdogProof:
     """Return the proof of a watchdog test that passed on the config's bus."""
     return WatchdogProof(
+        car=config.car,
         at=calendar_time(wall_ns).isoformat(),
         profile=config.profile,
         commands=profile.commands,
@@ -30,7 +35,7 @@ def new_proof(
         interface=config.interface,
         channel=config.channel,
         options=config.options,
-        is_virtual=is_virtual(config.interface, config.channel),
+        is_virtual=is_virtual(config.interface, config.channel, config.options),
         gear=gear,
         brake=BRAKE,
         release_ms=round(observation.released_ns / NS_PER_MS, 1),
@@ -40,25 +45,49 @@ def new_proof(
     )
 
 
-def proof_rejection(path: str, profile: Profile, config: DbwConfig) -> str:
-    """Return why the proof at `path` does not apply to this profile and the config's bus; empty if it applies."""
+def proof_rejection(path: str, profile: Profile, config: DbwConfig, wall_ns: int) -> str:
+    """Return why the proof at `path` does not apply at `wall_ns` to this profile and the config's car and bus.
+
+    The result is empty if it applies.
+    """
     if not path:
         return f"the kit's watchdog has not been tested: {RUN_TEST} and name its file in vehicle.dbw.watchdog_proof"
     try:
         proof = parse_config(WatchdogProof, _read(path), path)
     except UserError as error:
         return f"the kit's watchdog has no valid test ({error}): {RUN_TEST}"
-    bus = (config.interface, config.channel, config.options, is_virtual(config.interface, config.channel))
+    bus = (
+        config.interface,
+        config.channel,
+        config.options,
+        is_virtual(config.interface, config.channel, config.options),
+    )
     for subject, tested, configured in (
         ("profile or DBC", proof.digest, profile_digest(config.profile, config.dbc)),
         ("set of commands", proof.commands, profile.commands),
+        ("car", proof.car, config.car),
         ("bus", (proof.interface, proof.channel, proof.options, proof.is_virtual), bus),
     ):
         if tested != configured:
             return f"{path} is the watchdog test of another {subject}: {RUN_TEST} again"
+    if (age := _age_rejection(proof.at, config.watchdog_proof_days, wall_ns)) != "":
+        return f"{path} {age}: {RUN_TEST} again"
+    if proof.reports < LEAST_REPORTS:
+        return f"{path} is from {proof.reports} reports of the brake, fewer than {LEAST_REPORTS}: {RUN_TEST} again"
     if proof.braked_ms * NS_PER_MS > BRAKE_WITHIN_NS:
         return f"in {path} the kit took {proof.braked_ms:g} ms to brake, which is too long: {RUN_TEST} again"
     return ""
+
+
+def _age_rejection(at: str, days: int, wall_ns: int) -> str:
+    """Return why a proof of the date `at` is not accepted now; empty if it is."""
+    try:
+        age_days = (wall_ns - wall_time_ns(at)) / NS_PER_DAY
+    except (ValueError, OverflowError):
+        return f"has no date ({at[:40]!r})"
+    if age_days > days:
+        return f"is {age_days:.0f} days old, more than {days} (vehicle.dbw.watchdog_proof_days)"
+    return "is from the future, by this machine's clock" if age_days < -CLOCK_TOLERANCE_DAYS else ""
 
 
 def _read(path: str) -> dict[str, object]:

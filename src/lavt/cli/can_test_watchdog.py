@@ -88,7 +88,11 @@ def _load_testable(dbw: DbwConfig) -> tuple[Profile, OwnBrake]:
         raise UserError(f"{dbw.profile} has no sign of the kit's own braking: set watchdog.signal in the profile")
     if profile.car.steering_sign is None:  # the test keeps the wheel where it is, so its sign does not matter
         profile = dataclasses.replace(profile, car=dataclasses.replace(profile.car, steering_sign=1))
-    reasons = [] if is_virtual(dbw.interface, dbw.channel) else real_bus_inhibit_reasons(profile)
+    reasons = []
+    if not is_virtual(dbw.interface, dbw.channel, dbw.options):
+        reasons = real_bus_inhibit_reasons(profile)
+        if not dbw.car:
+            reasons.append("the proof must name the car: set vehicle.dbw.car to its serial number or VIN")
     if reasons:
         raise UserError(f"{dbw.profile} may not be used on {dbw.interface} {dbw.channel}: {'; '.join(reasons)}")
     return profile, watchdog

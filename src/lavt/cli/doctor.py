@@ -151,7 +151,7 @@ def _camera(settings: ServerConfig, clock: MachineClock) -> Check:
 def _by_wire(settings: ServerConfig, clock: MachineClock) -> Check:
     bus = f"{settings.vehicle.dbw.interface} {settings.vehicle.dbw.channel}"
     try:
-        frames, inhibit_reason = listen(settings.vehicle, clock, LISTEN_NS)
+        frames, inhibit_reason = listen(settings, clock, LISTEN_NS)
     except UserError as error:
         frames, inhibit_reason = 0, str(error)
     return checks.check_by_wire(frames, inhibit_reason, name=bus)

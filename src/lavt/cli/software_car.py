@@ -66,7 +66,7 @@ def software_car(
     build_software_car(settings, profile, road, start_ns=0)  # raises errors before the bus is opened
     port = CanPort(dbw.interface, dbw.channel, dbw.options, clock=clock)
     try:
-        if not is_virtual(dbw.interface, dbw.channel):
+        if not is_virtual(dbw.interface, dbw.channel, dbw.options):
             console.print_message(f"lavt: {dbw.channel} is not a virtual bus: make sure that no real kit is on it")
         start_ns = clock.now().mono_ns
         runner = SoftwareCarRunner(build_software_car(settings, profile, road, start_ns), port, start_ns=start_ns)

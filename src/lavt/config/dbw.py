@@ -9,7 +9,9 @@ from pydantic import Field
 from lavt.config.section import Section
 
 CommandSet = Literal["remote", "user"]
-Word = Literal["enabled", "angle", "command", "speed", "gear"]
+Word = Literal[
+    "enabled", "angle", "command", "gear", "speed", "second_speed", "wheel_1", "wheel_2", "wheel_3", "wheel_4"
+]
 
 
 class CommandConfig(Section):
@@ -79,6 +81,8 @@ class ReportConfig(Section):
     """The values that a signal must have; any other value inhibits driving."""
     reasons: list[str] = Field(default_factory=list)
     """Signals whose value, by its name in the DBC, explains why something is inhibited."""
+    count: str = ""
+    """The frame counter; a report that repeats the last one's counter is dropped."""
     checksum: str = ""
     """As in a command; a report with a wrong checksum is dropped."""
 
@@ -91,6 +95,7 @@ class ReportsConfig(Section):
     throttle: ReportConfig
     gear: ReportConfig
     speed: ReportConfig = ReportConfig()
+    wheels: ReportConfig = ReportConfig()
     system: ReportConfig = ReportConfig()
     remote: ReportConfig = ReportConfig()
 
@@ -111,6 +116,8 @@ class ByWireCarConfig(Section):
     """The angle of the steering wheel divided by the angle of the road wheels."""
     steering_sign: Literal[1, -1] | None = None
     """1: left is positive on the bus; null: unknown."""
+    wheel_radius_m: float = Field(0.33, gt=0.1, lt=1)
+    """Converts the reported wheel speeds."""
     max_acceleration_mps2: float = Field(gt=0, le=20)
     max_braking_mps2: float = Field(gt=0, le=20)
 
@@ -163,6 +170,10 @@ class DbwConfig(Section):
     """The UDP address, as `host:port`, at which a software car's ground truth is received; empty: a real car."""
     watchdog_proof: str = ""
     """The file that `lavt can test-watchdog` wrote."""
+    watchdog_proof_days: int = Field(30, ge=1, le=365)
+    """A proof is accepted for this many days."""
+    car: str = Field("", max_length=64)
+    """The car's serial number or VIN, which a proof of a real bus names: kits do not report it as far as is known."""
     steering_sign: Literal[1, -1] | None = None
     """1: left is positive on the bus; for a profile without a sign."""
 
@@ -177,9 +188,10 @@ class DbwConfig(Section):
 
 
 class WatchdogProof(Section):
-    """The file of a passed `lavt can test-watchdog`: the kit's watchdog braked, on this bus, with this profile."""
+    """The file of a passed `lavt can test-watchdog`: this car's watchdog braked, on this bus, with this profile."""
 
-    version: Literal[1] = 1
+    version: Literal[2] = 2
+    car: str
     at: str
     """The date and time (UTC)."""
     profile: str

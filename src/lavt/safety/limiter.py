@@ -6,6 +6,7 @@ import math
 
 from lavt.control.driver_limits import CLIENT_LIMITS
 from lavt.domain import NS_PER_S, Actuation, VehicleState
+from lavt.errors import UserError
 from lavt.safety.limits import Limits
 
 COMMAND_PERIOD_S = CLIENT_LIMITS.command_period_ns / NS_PER_S
@@ -15,10 +16,13 @@ COMMAND_PERIOD_S = CLIENT_LIMITS.command_period_ns / NS_PER_S
 class Limiter:
     """A limiter that keeps each requested actuation within the limits and names the limits that changed it.
 
-    `wheelbase_m`, `max_steering_rad` and `max_braking_mps2` are properties of the vehicle.
+    `wheelbase_m`, `max_steering_rad` and `max_braking_mps2` are properties of the vehicle. Raises `UserError` unless
+    they are positive and finite.
     """
 
     def __init__(self, limits: Limits, *, wheelbase_m: float, max_steering_rad: float, max_braking_mps2: float) -> None:
+        if not all(0 < number < math.inf for number in (wheelbase_m, max_steering_rad, max_braking_mps2)):
+            raise UserError("wheelbase, largest steering angle and deceleration of a vehicle must be positive numbers")
         self.limits = limits
         self.max_braking_mps2 = max_braking_mps2
         self.applied_limits: tuple[str, ...] = ()
@@ -42,7 +46,7 @@ class Limiter:
     def limit(
         self, requested: Actuation, vehicle: VehicleState, now_ns: int, picture_age_ns: int | None = None
     ) -> Actuation:
-        """Return `requested` within the limits at the vehicle's present speed.
+        """Return `requested` within the limits at the vehicle's present speed; all values are finite.
 
         `picture_age_ns` is the age of the picture that `requested` was made from; None: it was made from none.
         """
@@ -51,12 +55,16 @@ class Limiter:
         if self._steering_rad is None:
             step_rad = 0.0
         changed = []
+        if not all(map(math.isfinite, (requested.steering_rad, requested.throttle, requested.brake))):
+            changed.append("not finite")
+            requested = Actuation(before_rad, 0.0, 1.0)
         steering_rad = requested.steering_rad
         bound_rad = self._max_steering_rad
         if not -bound_rad <= steering_rad <= bound_rad:
             changed.append("steering angle")
             steering_rad = min(max(steering_rad, -bound_rad), bound_rad)
-        bound_rad = self._lateral_limit_rad(vehicle.speed_mps)
+        is_speed_known = vehicle.is_speed_plausible and math.isfinite(vehicle.speed_mps)
+        bound_rad = self._lateral_limit_rad(vehicle.speed_mps, is_speed_known)
         if not -bound_rad <= steering_rad <= bound_rad:
             changed.append("lateral acceleration")
             steering_rad = min(max(steering_rad, -bound_rad), bound_rad)
@@ -66,7 +74,6 @@ class Limiter:
             if abs(steering_rad - before_rad) > self.limits.steering_rate_radps * COMMAND_PERIOD_S:
                 changed.append("steering rate")
         throttle = requested.throttle
-        is_speed_known = math.isfinite(vehicle.speed_mps)
         if throttle > 0 and not (is_speed_known and vehicle.speed_mps <= self.limits.speed_limit_mps):
             throttle = 0.0
             changed.append("speed")
@@ -86,13 +93,14 @@ class Limiter:
         deceleration_mps2 = min(excess_mps / self.limits.stopping_brake_settling_s, self.limits.stop_deceleration_mps2)
         return min(1.0, deceleration_mps2 / self.max_braking_mps2)
 
-    def _lateral_limit_rad(self, speed_mps: float) -> float:
+    def _lateral_limit_rad(self, speed_mps: float, is_known: bool) -> float:
         """Return the road wheel angle at which the lateral acceleration v^2 tan(angle) / wheelbase is at its limit.
 
-        A speed that is not finite counts as the speed limit.
+        A speed that is not known counts as the speed limit at least.
         """
-        if not math.isfinite(speed_mps):
-            speed_mps = self.limits.speed_limit_mps
+        if not is_known:
+            reported_mps = abs(speed_mps) if math.isfinite(speed_mps) else 0.0
+            speed_mps = max(reported_mps, self.limits.speed_limit_mps)
         if abs(speed_mps) < 0.1:
             return math.pi / 2
         return math.atan(self.wheelbase_m * self.limits.lateral_acceleration_mps2 / (speed_mps * speed_mps))

@@ -19,6 +19,11 @@ class Limits:
     """Gentle: most command timeouts end by themselves."""
     stop_deceleration_mps2: float = 4.0
     """From 30 km/h to standstill in 2.1 s and 9 m; it leaves grip for steering."""
+    stop_settling_ns: int = 500 * NS_PER_MS
+    """From the begin of a safe stop until the speed must fall: the brake's lag is 0.2 s, and reports are up to 0.1 s
+    old."""
+    stop_excess_mps: float = 0.5
+    """From this speed above that of the wanted safe stop, the brake is full; half of it adds half of the difference."""
     stopping_distance_limit_m: float = PATH_STEP_M * PATH_POINTS
     """The stopping distance must lie on the path in the command (`stopping_speed_limit_mps`). Only a simulated vehicle
     may be configured beyond it, to study higher speeds and delays."""
@@ -51,8 +56,8 @@ class Limits:
     """This many equal pictures in a row are a camera fault."""
 
     def is_stationary(self, vehicle: VehicleState) -> bool:
-        """Return whether the vehicle is at standstill."""
-        return abs(vehicle.speed_mps) < self.standstill_mps
+        """Return whether the vehicle is at standstill; False if its speed is implausible."""
+        return vehicle.is_speed_plausible and abs(vehicle.speed_mps) < self.standstill_mps
 
 
 LIMITS = Limits()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from lavt.domain import Actuation, Command, VehicleState
 from lavt.safety.issued_stamps import IssuedStamps
 from lavt.safety.limiter import Limiter
@@ -9,6 +11,7 @@ from lavt.safety.limits import Limits
 from lavt.safety.path_follower import PathFollower
 from lavt.safety.session import CommandEpoch
 from lavt.safety.state_machine import UNCOMMANDED, SafetyStateMachine
+from lavt.safety.stop_brake import StopBrake
 
 
 class Watchdog:
@@ -31,6 +34,7 @@ class Watchdog:
         self._epoch = epoch
         self._issued_stamps = issued_stamps
         self._path = PathFollower(limiter.wheelbase_m, limits.stamp_memory_ns)
+        self._stop_brake = StopBrake(limits, limiter.max_braking_mps2)
         self._fresh_command_ns = 0
         self._picture_ns = 0
         """When the stamp of the picture of `CommandEpoch.command` was issued."""
@@ -68,6 +72,8 @@ class Watchdog:
             self._machine.trigger("driver override")
         elif vehicle.inhibit_reason:
             self._machine.trigger("vehicle fault", vehicle.inhibit_reason)
+        elif not (math.isfinite(vehicle.speed_mps) and math.isfinite(vehicle.steering_rad)):
+            self._machine.trigger("vehicle fault", "its speed or steering angle is not a finite number")
         elif not vehicle.is_engaged and self._machine.state in ("driving", "degraded"):
             self._machine.trigger("vehicle fault")
         elif not self._limits.is_stationary(vehicle):
@@ -110,9 +116,11 @@ class Watchdog:
         if state == "degraded":  # never releases a brake
             throttle, brake = 0.0, max(brake, self._pedal(self._limits.degraded_deceleration_mps2))
         elif state == "safe_stop":
-            throttle, brake = 0.0, self._pedal(self._limits.stop_deceleration_mps2)
+            throttle, brake = 0.0, self._stop_brake.pedal(vehicle, now_ns)
         elif state != "driving":
             throttle, brake = 0.0, 1.0
+        if state != "safe_stop":
+            self._stop_brake.reset()
         picture_age_ns = now_ns - self._picture_ns if command else None
         target = Actuation(self._steering_target_rad(vehicle, now_ns), throttle, brake)
         return self._limiter.limit(target, vehicle, now_ns, picture_age_ns)

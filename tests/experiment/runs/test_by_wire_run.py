@@ -11,15 +11,31 @@ from lavt.config import RunConfig
 from lavt.config_file import parse_config
 from lavt.experiment.runs.plan import plan_run
 from lavt.experiment.runs.run import run_once
+from lavt.vehicle.dbw.speed_monitor import SpeedFault, SpeedMonitor
 
 GENERATIONS = ("dataspeed_gen1", "dataspeed_gen2")
 
 
-def result_of(out: Path, kind: str, profile: str = GENERATIONS[0]) -> dict[str, Any]:
+@pytest.fixture
+def speed_faults(monkeypatch: pytest.MonkeyPatch) -> list[SpeedFault]:
+    """Return a list that collects the implausible speeds of all runs."""
+    faults: list[SpeedFault] = []
+    update = SpeedMonitor.update
+
+    def collect(*arguments: Any) -> SpeedFault | None:
+        fault = update(*arguments)
+        faults.extend([] if fault is None else [fault])
+        return fault
+
+    monkeypatch.setattr(SpeedMonitor, "update", collect)
+    return faults
+
+
+def result_of(out: Path, kind: str, profile: str = GENERATIONS[0], route: str = "a_key") -> dict[str, Any]:
     settings = {
         "vehicle": {
             "kind": kind,
-            "route": "a_key",
+            "route": route,
             "dbw": {"profile": profile, "interface": "inside", "steering_sign": 1},
         },
         "fidelity": "geometry",
@@ -28,7 +44,7 @@ def result_of(out: Path, kind: str, profile: str = GENERATIONS[0]) -> dict[str, 
 
 
 @pytest.mark.parametrize("profile", [pytest.param(GENERATIONS[0], marks=pytest.mark.full), GENERATIONS[1]])
-def test_a_route_is_driven_through_the_kit(profile: str, tmp_path: Path) -> None:
+def test_a_route_is_driven_through_the_kit(profile: str, tmp_path: Path, speed_faults: list[SpeedFault]) -> None:
     """A route is driven through the by-wire kit about as well as without, and the latency to the wheel is measured."""
     result, without = result_of(tmp_path / "by-wire", "dbw", profile), result_of(tmp_path / "without", "simulator")
     assert (result["ending"], result["valid"]) == ("completed", True)
@@ -38,7 +54,19 @@ def test_a_route_is_driven_through_the_kit(profile: str, tmp_path: Path) -> None
         stage for stage in result["stages_ms"] if (stage["node"], stage["stage"]) == ("vehicle", "command to wheel")
     ]
     assert wheel["n"] > 100
+    assert speed_faults == []
     assert 0 < wheel["p50"] < wheel["p95"] < 20, "a frame's time on the bus, the kit's report, and half its period"
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("profile", GENERATIONS)
+@pytest.mark.parametrize("route", ["b_key", "c_key"])
+def test_no_drive_has_an_implausible_speed(
+    profile: str, route: str, tmp_path: Path, speed_faults: list[SpeedFault]
+) -> None:
+    """The other routes are driven without a false alarm on the speed."""
+    assert result_of(tmp_path, "dbw", profile, route)["ending"] == "completed"
+    assert speed_faults == []
 
 
 @pytest.mark.full

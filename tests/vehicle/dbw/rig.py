@@ -21,6 +21,8 @@ from lavt.vehicle.software_car.car import SoftwareCar
 from lavt.vehicle.software_car.kit import Kit
 
 START_NS = 77_000_000_123
+SPEED_SOURCES = {1: ("speed", "wheel_speed"), 2: ("speed", "second_speed", "wheel_speed")}
+"""Sources of speed by generation."""
 COARSE_MS = 5
 """Time step in ms where nothing is measured; elsewhere it is 1 ms, the resolution of all measurements."""
 
@@ -172,6 +174,13 @@ def with_limits(generation: int, **limits: float) -> Profile:
     """Return a profile with other limits."""
     found = profile(f"dataspeed_gen{generation}")
     return replace(found, limits=replace(found.limits, **limits))
+
+
+def with_one_speed(generation: int) -> Profile:
+    """Return a profile of a kit that reports no wheel speeds and no second speed."""
+    found = profile(f"dataspeed_gen{generation}")
+    reports = {name: report for name, report in found.reports.items() if name != "WheelSpeed"}
+    return replace(found, reports=reports, speeds_per_mps={"speed": found.speeds_per_mps["speed"]})
 
 
 both = pytest.mark.parametrize("generation", [1, 2])

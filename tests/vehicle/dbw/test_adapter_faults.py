@@ -6,12 +6,13 @@ the rig, exact to its step of 1 ms.
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import pytest
-from tests.vehicle.dbw.rig import COARSE_MS, AdapterRig, both, driving, profile, started
+from tests.vehicle.dbw.rig import COARSE_MS, SPEED_SOURCES, AdapterRig, both, driving, profile, started
 
 from lavt.domain import NS_PER_MS, Actuation
 from lavt.vehicle.can_frame import CanFrame
@@ -492,12 +493,13 @@ def test_wrong_checksum_of_a_report() -> None:
     """A report of generation 2 with a wrong checksum is dropped and counted."""
     rig = driving(2)
     before = rig.adapter.state()
-    frame = with_crc(0x107, bytes(8))
+    count = (rig.kit.state.sent[0x107] + 5) % 16
+    frame = with_crc(0x107, struct.pack("<hhBBBB", 1700, 1700, 0, 0, count << 4, 0))
     rig.adapter.receive(CanFrame(0x107, frame.data[:-1] + bytes([frame.data[-1] ^ 1])), rig.now_ns)
     assert rig.adapter.state() == before
     assert rig.adapter.counts["wrong_checksum"] == 1
     rig.adapter.receive(frame, rig.now_ns)
-    assert rig.adapter.state().speed_mps == 0.0
+    assert rig.adapter.state().speed_mps == pytest.approx(17.0 / 3.6)
 
 
 # Additional conditions of generation 2.
@@ -617,12 +619,9 @@ def test_a_moving_car_need_not_park() -> None:
     """A car that still moves 3 s after driving ended has no inhibit reason and is not shifted to PARK."""
     rig = without_park()
 
-    def move(frame: CanFrame) -> bool:
-        if frame.identifier == 0x065:
-            rig.adapter.receive(CanFrame(0x065, frame.data[:4] + b"\0\4" + frame.data[6:]), rig.now_ns)
-        return frame.identifier == 0x065
-
-    rig.lose_report = move
+    for source in SPEED_SOURCES[1]:
+        rig.kit.stick_speed(source, 2.8)
+    rig.actuation = Actuation(0.0, 0.0, 0.0)
     rig.run_ms(20)
     rig.adapter.engage(False, rig.now_ns)
     rig.run_ms(4000, step_ms=COARSE_MS)

@@ -403,34 +403,51 @@ def test_without_python_can(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("bus", "output", "expected"),
     [
-        (("virtual", "x"), "", True),
-        (("udp_multicast", GROUP), "", True),
-        (("inside", ""), "", True),
-        (("pcan", "PCAN_USBBUS1"), "", False),
-        (("socketcan", "vcan0"), '[{"ifname": "vcan0", "linkinfo": {"info_kind": "vcan"}}]', True),
-        (("socketcan", "can0"), '[{"ifname": "can0", "linkinfo": {"info_kind": "can"}}]', False),
-        (("socketcan", "slcan0"), '[{"ifname": "slcan0"}]', False),
-        (("socketcan", "vcan0"), "[]", False),
-        (("socketcan", "vcan0"), "nonsense", False),
+        (("virtual", "x", {}), "", True),
+        (("udp_multicast", GROUP, {}), "", True),
+        (("inside", "", {}), "", True),
+        (("udp_multicast", GROUP, {"hop_limit": 0}), "", True),
+        (("udp_multicast", GROUP, {"hop_limit": 1}), "", False),
+        (("pcan", "PCAN_USBBUS1", {}), "", False),
+        (("socketcan", "vcan0", {}), '[{"ifname": "vcan0", "linkinfo": {"info_kind": "vcan"}}]', True),
+        (("socketcan", "can0", {}), '[{"ifname": "can0", "linkinfo": {"info_kind": "can"}}]', False),
+        (("socketcan", "slcan0", {}), '[{"ifname": "slcan0"}]', False),
+        (("socketcan", "vcan0", {}), "[]", False),
+        (("socketcan", "vcan0", {}), "nonsense", False),
     ],
 )
 def test_is_virtual(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, bus: tuple[str, str], output: str, expected: bool
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, bus: tuple[str, str, dict[str, Any]], output: str, expected: bool
 ) -> None:
     """A bus is virtual if python-can or the kernel says so, and not otherwise."""
     program = tmp_path / "ip"
     program.write_text(f"#!/bin/sh\nprintf '%s' '{output}'\n")
     program.chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr("lavt.vehicle.dbw.bus.socket.if_nametoindex", lambda _: 3)
+    monkeypatch.setattr("lavt.vehicle.dbw.bus.gateway_interfaces", frozenset)
     assert is_virtual(*bus) is expected
+
+
+def test_a_forwarded_bus_is_not_virtual(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A vcan that a gateway rule names is not virtual, nor is one whose rules cannot be read."""
+
+    def unreadable() -> frozenset[int]:
+        raise OSError
+
+    monkeypatch.setattr("lavt.vehicle.dbw.bus._link_kind", lambda _: "vcan")
+    monkeypatch.setattr("lavt.vehicle.dbw.bus.socket.if_nametoindex", lambda _: 3)
+    for read, expected in ((lambda: frozenset({4, 5}), True), (lambda: frozenset({3, 5}), False), (unreadable, False)):
+        monkeypatch.setattr("lavt.vehicle.dbw.bus.gateway_interfaces", read)
+        assert is_virtual("socketcan", "vcan0", {}) is expected
 
 
 def test_is_virtual_unknown(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A bus is not virtual if the interface does not exist or `ip` is missing."""
-    assert not is_virtual("socketcan", "lo")
-    assert not is_virtual("socketcan", "nosuch0")
+    assert not is_virtual("socketcan", "lo", {})
+    assert not is_virtual("socketcan", "nosuch0", {})
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert not is_virtual("socketcan", "vcan0")
+    assert not is_virtual("socketcan", "vcan0", {})
 
 
 def test_log(tmp_path: Path) -> None:

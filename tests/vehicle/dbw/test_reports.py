@@ -23,12 +23,12 @@ ANGLE_AND_SPEED = CanFrame(STEERING, bytes.fromhex("64 00 00 00 E8 03 00 00"))
 def test_units(angle_unit: str, wheel_deg: float, speed_unit: str, speed_mps: float) -> None:
     """A wheel angle in degrees or radians and a speed in m/s or km/h are converted to degrees and m/s."""
     angle_per_deg, speed_per_mps = IN_DEGREES[angle_unit], IN_METRES_PER_SECOND[speed_unit]
-    in_units = replace(profile("dataspeed_gen1"), angle_per_deg=angle_per_deg, speed_per_mps=speed_per_mps)
+    in_units = replace(profile("dataspeed_gen1"), angle_per_deg=angle_per_deg, speeds_per_mps={"speed": speed_per_mps})
     reports = NewestReports(in_units, START_NS)
     reports.receive(ANGLE_AND_SPEED, START_NS + 1)
     assert reports.wheel_deg == pytest.approx(wheel_deg)
     assert reports.speed_mps == pytest.approx(speed_mps)
-    assert reports.speed_ns == START_NS + 1
+    assert reports.speeds["speed"].mono_ns == START_NS + 1
 
 
 def test_deadline() -> None:

@@ -91,7 +91,7 @@ def test_a_gap_longer_than_the_timeout_is_an_error(gap_ms: int, is_wrong: bool) 
 def test_a_missing_report_is_an_error() -> None:
     """Expected reports are listed in the order of their identifiers, with an error if they were never received."""
     messages = new_traffic().take_period(0)
-    assert [each.facts.identifier for each in messages] == [0x100, 0x101, 0x102, 0x103, 0x106, 0x107, 0x2D8]
+    assert [each.facts.identifier for each in messages] == [0x100, 0x101, 0x102, 0x103, 0x106, 0x107, 0x2A4, 0x2D8]
     assert {len(each.wrong) for each in messages} == {1}
     assert all("never" in each.wrong[0] for each in messages)
 

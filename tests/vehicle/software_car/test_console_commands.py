@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
+from copy import deepcopy
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from lavt.domain import NS_PER_S
 from lavt.errors import UserError
 from lavt.vehicle.software_car.console_commands import COMMANDS, execute, help_lines
 from lavt.vehicle.software_car.kit import Kit
+from lavt.vehicle.software_car.sensor_faults import MAX_REPORTED_MPS
 from lavt.vehicle.software_car.state import Gear, ReleaseReason
 
 INTERNAL_METHODS = {"receive", "frames_due", "actuation", "next_wake_ns", "sense"}
@@ -32,6 +34,12 @@ INTERNAL_METHODS = {"receive", "frames_due", "actuation", "next_wake_ns", "sense
         ("  fault   steering.fault  ", lambda kit: kit.state.actuators["steering"].faults == {"fault"}),
         ("fault gear.fault", lambda kit: kit.state.gear_faults == {"fault"}),
         ("unknown speed", lambda kit: kit.state.invalid == {"speed"}),
+        ("stick_speed speed", lambda kit: kit.state.sensor_faults.stuck_mps == {"speed": kit.state.speed_mps}),
+        ("stick_speed wheel_speed=3.5", lambda kit: kit.state.reported_mps("wheel_speed") == 3.5),
+        ("stick_speed speed = 1e9", lambda kit: kit.state.reported_mps("speed") == MAX_REPORTED_MPS),
+        ("scale_speed second_speed=0.5", lambda kit: kit.state.sensor_faults.factors == {"second_speed": 0.5}),
+        ("drop_speed speed", lambda kit: kit.state.sensor_faults.dropped == {"speed"}),
+        ("weaken_brake 0.25", lambda kit: kit.state.brake_share == 0.25),
         ("inhibit seat belt", lambda kit: kit.state.not_ready == ReleaseReason.SEAT_BELT),
         ("switch_remote emergency_stop", lambda kit: kit.state.remote_state == 0),
         ("switch_remote pause", lambda kit: kit.state.remote_state == 1),
@@ -52,6 +60,10 @@ def test_a_command_has_its_effect(line: str, has_effect: Callable[[Kit], bool]) 
     [
         ("fault steering.fault", "clear_fault steering.fault"),
         ("unknown angle", "known angle"),
+        ("stick_speed speed=1", "restore_speed speed"),
+        ("scale_speed wheel_speed=2", "restore_speed wheel_speed"),
+        ("drop_speed wheel_speed", "restore_speed wheel_speed"),
+        ("weaken_brake 0.5", "weaken_brake 1"),
         ("inhibit door", "clear_inhibit"),
         ("bus_off", "bus_on"),
         ("switch_remote pause", "switch_remote remote"),
@@ -72,7 +84,8 @@ def condition_of(rig: KitRig) -> tuple[object, ...]:
     rig.now_ns += NS_PER_S
     state, frame_count = rig.kit.state, len(rig.kit.frames_due(rig.now_ns))
     faults = [sorted(actuator.faults) for actuator in state.actuators.values()]
-    return faults, sorted(state.invalid), state.not_ready, state.remote_state, frame_count
+    reports = faults, sorted(state.invalid), deepcopy(state.sensor_faults), state.brake_share
+    return *reports, state.not_ready, state.remote_state, frame_count
 
 
 @pytest.mark.parametrize(("lines", "brake"), [([], 0.5), (["no_watchdog"], 0.0), (["no_watchdog", "watchdog"], 0.5)])
@@ -97,6 +110,9 @@ def test_the_watchdog_can_be_disabled(lines: list[str], brake: float) -> None:
         ("driver_shifts reverse", ["'REVERSE'", "DRIVE, NEUTRAL, PARK"]),
         ("fault wheel", ["'wheel'", "brake.fault, gear.fault, steering.fault, throttle.fault"]),
         ("clear_fault wheel", ["'wheel'", "brake.fault, gear.fault, steering.fault, throttle.fault"]),
+        ("stick_speed weather", ["'weather'", "second_speed, speed, wheel_speed"]),
+        ("stick_speed speed=fast", ["'fast'"]),
+        ("scale_speed speed", ["scale_speed"]),
         ("unknown weather", ["'weather'", "angle, speed, wheel_speed"]),
         ("inhibit me", ["'me'", "acceleration, door, reverse, seat belt, speed"]),
         ("switch_remote 2", ["'2'", "control_allowed, emergency_stop, pause, remote"]),

@@ -21,7 +21,8 @@ from lavt.vehicle.dbw.profile import (
 )
 from lavt.vehicle.dbw.reports import NewestReports
 from lavt.vehicle.dbw.sending import DriveCommand, FrameSender, KitCommands
-from lavt.vehicle.dbw.states import ENABLING_LIMIT_NS, STATIONARY_BELOW_MPS, Situation, State, next_state
+from lavt.vehicle.dbw.speed_monitor import Pedals, SpeedMonitor
+from lavt.vehicle.dbw.states import ENABLING_LIMIT_NS, Situation, State, next_state
 from lavt.vehicle.vehicle import ReachedCommand
 
 SHIFT_REPORT_LIMIT_NS: Final = NS_PER_S
@@ -47,6 +48,9 @@ class ByWireAdapter:
     def __init__(self, profile: Profile, *, start_ns: int, inhibit_reason: str = "") -> None:
         self._profile = profile
         self._reports, self._sender = NewestReports(profile, start_ns), FrameSender(profile, start_ns)
+        self._speed = SpeedMonitor(
+            max_acceleration_mps2=profile.car.max_acceleration_mps2, max_braking_mps2=profile.car.max_braking_mps2
+        )
         unknown_sign = "the steering's sign is not known: set vehicle.dbw.steering_sign"
         self._installation = _join([inhibit_reason, unknown_sign if profile.car.steering_sign is None else ""])
         self._state: State = "idle"
@@ -115,6 +119,7 @@ class ByWireAdapter:
     def _update_state(self, now_ns: int) -> None:
         """Apply transitions until none matches."""
         self._now_ns = now_ns
+        self._check_speed(now_ns)
         has_timed_out = now_ns - self._sender.sent_ns >= COMMAND_TIMEOUT_NS
         still_enabled = NO_AXES if has_timed_out else self._reports.enabled  # reports may have waited for us
         self._still_enabled &= still_enabled
@@ -136,12 +141,24 @@ class ByWireAdapter:
             self._state, self._entered_ns = state, now_ns
 
     def _is_stationary(self) -> bool:
-        return abs(self._reports.speed_mps) < STATIONARY_BELOW_MPS
+        return self._speed.is_stationary and self._speed.fault is None
+
+    def _check_speed(self, now_ns: int) -> None:
+        """Compare the reported speeds with the pedals that the kit applies: the last ones sent, on enabled axes."""
+        has_timed_out = now_ns - self._sender.sent_ns >= COMMAND_TIMEOUT_NS
+        sent, enabled = self._sender.sent, NO_AXES if has_timed_out else self._reports.enabled
+        pedals = Pedals(sent.throttle if "throttle" in enabled else 0.0, sent.brake if "brake" in enabled else 0.0)
+        if (fault := self._speed.update(self._reports.speeds, pedals, now_ns)) is not None:
+            self._counts[fault.code] += 1
+
+    @property
+    def _speed_fault(self) -> str:
+        return self._speed.fault or ""
 
     def _current_situation(self, now_ns: int) -> Situation:
         reports = self._reports
         missing_reports = _join([self._bus_error, *reports.missing(now_ns)])
-        faults = _join([reports.other_commander(now_ns), *reports.texts("fault")])
+        faults = _join([reports.other_commander(now_ns), self._speed_fault, *reports.texts("fault")])
         return Situation(
             wanted=self._wanted,
             is_stationary=self._is_stationary(),
@@ -162,6 +179,7 @@ class ByWireAdapter:
         """Emit an event for each newly reported problem."""
         reports = self._reports
         problems = [*reports.texts("override"), *reports.texts("trip"), *reports.texts("fault")]
+        problems += [self._speed_fault] if self._speed_fault else []
         self._events += [VehicleEvent(now_ns, "fault", text) for text in problems if text not in self._known_problems]
         self._known_problems = frozenset(problems)
 
@@ -232,6 +250,8 @@ class ByWireAdapter:
         """Return the drive command of the current state, before the limits."""
         requested, limits = self._requested, self._profile.limits
         wheel_deg = self._profile.wheel_deg(requested.steering_rad)
+        if self._speed.fault is not None:
+            return DriveCommand(wheel_deg, 0.0, 1.0)
         if self._state == "engaged":
             return DriveCommand(wheel_deg, requested.throttle, requested.brake)
         needs_brake = self._state in {"enabling", "parking"}
@@ -268,13 +288,14 @@ class ByWireAdapter:
         """Return the newest state; its time is that of the newest speed."""
         reports = self._reports
         return VehicleState(
-            mono_ns=reports.speed_ns,
-            speed_mps=reports.speed_mps,
+            mono_ns=reports.speeds["speed"].mono_ns,
+            speed_mps=self._speed.speed_mps,
             steering_rad=self._profile.road_rad(reports.wheel_deg),
             gear=reports.gear or "neutral",
             inhibit_reason=self._inhibit_reason(),
             is_engaged=self._state == "engaged",
             is_overridden=self._state == "overridden",
+            is_speed_plausible=self._speed.fault is None,
         )
 
     def _inhibit_reason(self) -> str:

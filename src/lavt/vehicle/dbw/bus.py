@@ -25,6 +25,7 @@ from lavt.clock import Clock
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.errors import UserError
 from lavt.vehicle.can_frame import BusGone, CanFrame, ReceivedCanFrame
+from lavt.vehicle.dbw.can_gateway import gateway_interfaces
 
 if TYPE_CHECKING:
     from can import BusABC, Message
@@ -186,13 +187,16 @@ class CanPort:
         return message
 
 
-def is_virtual(interface: str, channel: str) -> bool:
-    """Return whether a bus exists in software only, so that no real kit can be on it; False if that is not known."""
+def is_virtual(interface: str, channel: str, options: Mapping[str, Any]) -> bool:
+    """Return whether a bus exists in software only, so that no real kit can be on it; False if that is not known.
+
+    A vcan that a gateway rule of the kernel names is not virtual, nor is a multicast that leaves this machine.
+    """
+    if interface == RECEIVES_OWN_FRAMES:
+        return bool(options.get("hop_limit", 0) == 0)
     if interface in VIRTUAL_INTERFACES:
         return True
-    if interface != "socketcan":
-        return False
-    return _link_kind(channel) == "vcan"
+    return interface == "socketcan" and _link_kind(channel) == "vcan" and not _is_forwarded(channel)
 
 
 def read_log(path: Path) -> Iterator[ReceivedCanFrame]:
@@ -242,7 +246,7 @@ def _open_bus(interface: str, channel: str, options: Mapping[str, Any]) -> BusAB
     if interface == "socketcan" and channel not in (name for _, name in socket.if_nameindex()):
         # python-can would report this as well, but leave a socket open
         raise UserError(f"socketcan {channel} cannot be opened (no such device): {REMEDIES[errno.ENODEV]}")
-    # The bus counts as virtual, so no gateway on another machine may receive it.
+    # The bus counts as virtual by default, so no gateway on another machine may receive it.
     defaults = {"hop_limit": 0} if interface == RECEIVES_OWN_FRAMES else {}
     try:
         bus: BusABC = library.Bus(channel=channel, interface=interface, ignore_config=True, **{**defaults, **options})
@@ -290,6 +294,14 @@ def _error_text(error: Exception) -> str:
     """Return the first lines of an error's and its cause's messages."""
     lines = [str(candidate).partition("\n")[0] for candidate in (error, error.__cause__) if candidate is not None]
     return ": ".join(dict.fromkeys(line for line in lines if line)) or type(error).__name__
+
+
+def _is_forwarded(channel: str) -> bool:
+    """Return whether a gateway rule names an interface; True if the rules cannot be read."""
+    try:
+        return socket.if_nametoindex(channel) in gateway_interfaces()
+    except OSError:
+        return True
 
 
 def _link_kind(channel: str) -> str:

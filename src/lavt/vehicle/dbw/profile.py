@@ -18,6 +18,11 @@ Axis = Literal["steering", "brake", "throttle"]
 AXES: tuple[Axis, ...] = ("steering", "brake", "throttle")
 Gear = Literal["park", "reverse", "neutral", "drive"]
 
+VEHICLE_SPEEDS = ("speed", "second_speed")
+WHEEL_SPEEDS = ("wheel_1", "wheel_2", "wheel_3", "wheel_4")
+SPEEDS = (*VEHICLE_SPEEDS, *WHEEL_SPEEDS)
+"""Names of the reported speeds. Only `speed` is used to drive; the others are compared with it."""
+
 LEAST_GAP_NS = 5 * NS_PER_MS
 """Shortest time between sets of commands when the commands change."""
 PERIOD_NS = 20 * NS_PER_MS
@@ -32,6 +37,7 @@ TICK_LIMIT_NS = 60 * NS_PER_MS
 IN_DEGREES = {"deg": 1.0, "rad": math.radians(1.0)}
 IN_FRACTIONS = {"": 1.0, "%": 100.0}
 IN_METRES_PER_SECOND = {"m/s": 1.0, "km/h": 3.6}
+IN_RADIANS_PER_SECOND = {"rad/s": 1.0, "deg/s": math.degrees(1.0)}
 IN_DEGREES_PER_SECOND = {"": 1.0, "deg/s": 1.0, "rad/s": math.radians(1.0)}
 """One unit of LAVT in the unit of a DBC; other units are rejected."""
 
@@ -106,6 +112,7 @@ class ReportSpec:
     needs: Mapping[str, frozenset[int]]
     reasons: tuple[str, ...]
     """Signals with the reason for a rejection; 0 means no reason."""
+    count: str
     checksum: str
 
 
@@ -126,6 +133,7 @@ class ByWireCar:
     steering_ratio: float
     steering_sign: Literal[1, -1] | None
     """1: left is positive on the bus; None: unknown."""
+    wheel_radius_m: float
     max_acceleration_mps2: float
     max_braking_mps2: float
 
@@ -162,8 +170,8 @@ class Profile:
     """By message name."""
     watchdog: OwnBrake | None
     """How to detect that the kit's watchdog brakes; None if that is not possible."""
-    speed_per_mps: float
-    """Converts m/s into the unit of the reported speed."""
+    speeds_per_mps: Mapping[str, float]
+    """By value name, one of `SPEEDS`: converts m/s into the unit of a reported speed. A kit has at least `speed`."""
     angle_per_deg: float
     unverified: tuple[str, ...]
     """Names, as `message.signal`, of the signals in use whose position is an assumption."""

@@ -10,6 +10,7 @@ from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.dbw.crc8 import has_valid_checksum
 from lavt.vehicle.dbw.profile import AXES, Axis, Gear, Profile, ReportSpec, SignalCondition
+from lavt.vehicle.dbw.speed_monitor import SpeedReport
 
 Values = Mapping[str, float | None]
 Kind = Literal["override", "trip", "command_error", "fault", "reason"]
@@ -22,8 +23,8 @@ OTHER_COMMANDER_NS: Final = NS_PER_S
 class NewestReports:
     """The newest report of each message in a profile.
 
-    `counts` has the reports that could not be used: `wrong_checksum`, `value_unknown` (the codec counts the others),
-    and `foreign_commands`, commands that another sender sent to the kit.
+    `counts` has the reports that could not be used: `wrong_checksum`, `repeated_counter`, `value_unknown` (the codec
+    counts the others), and `foreign_commands`, commands that another sender sent to the kit.
     """
 
     def __init__(self, profile: Profile, start_ns: int) -> None:
@@ -39,7 +40,10 @@ class NewestReports:
         """Name and arrival time of the last command from another sender."""
         self._gears = {number: gear for gear, number in profile.gear.numbers.items()}
         self.counts: Counter[str] = Counter()
-        self.speed_mps, self.speed_ns = 0.0, start_ns
+        self.speeds: dict[str, SpeedReport] = {"speed": SpeedReport(0.0, start_ns)}
+        """The newest speed by name (`profile.SPEEDS`); before its first report, `speed` is 0 and the others missing."""
+        self._report_counts: dict[str, float | None] = {}
+        """Counter of the newest report of each message that has one."""
         self.wheel_deg = 0.0
         """The steering wheel's angle, with the bus's sign."""
         self.command: int | None = None
@@ -47,6 +51,11 @@ class NewestReports:
         self.gear: Gear | None = None
         """None: unknown."""
         self.enabled: frozenset[Axis] = frozenset()
+
+    @property
+    def speed_mps(self) -> float:
+        """The car's speed, as the kit reports it."""
+        return self.speeds["speed"].mps
 
     def receive(self, frame: CanFrame, now_ns: int) -> None:
         """Process any frame from the bus."""
@@ -61,6 +70,11 @@ class NewestReports:
         if report.checksum and not has_valid_checksum(frame):
             self.counts["wrong_checksum"] += 1
             return
+        if report.count:
+            before, self._report_counts[message] = self._report_counts.get(message), values[report.count]
+            if before is not None and before == values[report.count]:
+                self.counts["repeated_counter"] += 1
+                return
         self._update_texts(message, self._texts_of(message, report, values))
         known = {
             name: number
@@ -82,8 +96,9 @@ class NewestReports:
             }
 
     def _update_values(self, report: ReportSpec, known: Mapping[str, float], now_ns: int) -> None:
-        if "speed" in known:
-            self.speed_mps, self.speed_ns = known["speed"] / self._profile.speed_per_mps, now_ns
+        for name, per_mps in self._profile.speeds_per_mps.items():
+            if name in known:
+                self.speeds[name] = SpeedReport(known[name] / per_mps, now_ns)
         if "angle" in known:
             self.wheel_deg = known["angle"] / self._profile.angle_per_deg
         if "command" in known:

@@ -31,6 +31,8 @@ ENABLED_NS: Final = 500 * NS_PER_MS
 BRAKE_WITHIN_NS: Final = 500 * NS_PER_MS
 MONITOR_NS: Final = NS_PER_S
 """The kit is monitored for this long after the last frame."""
+LEAST_REPORTS: Final = 10
+"""The kit must report the brake at least this often in that time; generation 2 does so 50 times."""
 OBSERVED_KINDS: Final[tuple[Kind, ...]] = ("trip", "command_error", "fault", "reason")
 """The kinds of texts that are part of the observation."""
 
@@ -169,6 +171,8 @@ class WatchdogTest:
                 f"the kit did not brake within {BRAKE_WITHIN_NS // NS_PER_MS} ms of the last frame{late}, in gear "
                 f"{self.gear}: switch on its watchdog with brake action"
             )
+        elif self._monitored_reports < LEAST_REPORTS:
+            self._fail(f"the kit reported its brake only {self._monitored_reports} times, not {LEAST_REPORTS}")
         elif overrides:
             self._fail(f"override by the driver: {', '.join(overrides)}")
         else:

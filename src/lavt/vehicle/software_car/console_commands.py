@@ -50,6 +50,20 @@ def parse_remote_state(text: str) -> int:
     return REMOTE_STATES[check_known(text, set(REMOTE_STATES), "state of the remote's switch")]
 
 
+def parse_source(text: str) -> tuple[str, float | None]:
+    """Parse `SOURCE` or `SOURCE=NUMBER`. Raises `UserError` for an invalid number; the kit checks the source."""
+    source, equals, number = text.partition("=")
+    return source.strip(), parse_number(number) if equals else None
+
+
+def scale_speed(kit: Kit, text: str, _: int) -> None:
+    """Scale the source in `SOURCE=FACTOR`. Raises `UserError`."""
+    source, factor = parse_source(text)
+    if factor is None:
+        raise UserError(f"scale_speed needs a factor: write {source[:MAX_QUOTED]}=0.5")
+    kit.scale_speed(source, factor)
+
+
 COMMANDS: Final[dict[str, ConsoleCommand]] = {
     "driver_steers": ConsoleCommand(
         "NM",
@@ -90,6 +104,27 @@ COMMANDS: Final[dict[str, ConsoleCommand]] = {
         "VALUE",
         "report the value again",
         lambda kit, text, _: kit.set_unknown(text, is_unknown=False),
+    ),
+    "stick_speed": ConsoleCommand(
+        "SOURCE[=M/S]",
+        "report a fixed speed, else the present one: speed, second_speed (generation 2) or wheel_speed",
+        lambda kit, text, _: kit.stick_speed(*parse_source(text)),
+    ),
+    "scale_speed": ConsoleCommand("SOURCE=FACTOR", "report a multiple of the speed", scale_speed),
+    "drop_speed": ConsoleCommand(
+        "SOURCE",
+        "do not send the message of the source",
+        lambda kit, text, _: kit.drop_speed(text),
+    ),
+    "restore_speed": ConsoleCommand(
+        "SOURCE",
+        "remove the faults of the source",
+        lambda kit, text, _: kit.restore_speed(text),
+    ),
+    "weaken_brake": ConsoleCommand(
+        "SHARE",
+        "let only a share of the brake's force reach the wheels; 1: all of it",
+        lambda kit, text, _: kit.weaken_brake(parse_number(text)),
     ),
     "inhibit": ConsoleCommand(
         "REASON",

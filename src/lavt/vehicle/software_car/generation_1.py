@@ -205,7 +205,7 @@ def steering_report(state: KitState, _: Mechanics) -> bytes:
     values = {
         "angle": UNKNOWN if "angle" in state.invalid else tenths_of_degree(state.wheel_rad),
         "command": tenths_of_degree(order.target) if order else 0,
-        "speed": UNKNOWN if "speed" in state.invalid else hundredths_of_kmh(state.speed_mps),
+        "speed": UNKNOWN if "speed" in state.invalid else hundredths_of_kmh(state.reported_mps("speed")),
         "torque": round(within(state.driver_torque_nm / 0.0625, -127, 127)),
         **flag_fields(state, "steering"),
     }
@@ -227,9 +227,16 @@ def gear_report(state: KitState, _: Mechanics) -> bytes:
 
 def wheel_speeds(state: KitState, mechanics: Mechanics) -> bytes:
     """Return the wheel speeds, which are all equal."""
-    speed = UNKNOWN if "wheel_speed" in state.invalid else round(mechanics.tyre_radps(state.speed_mps) * 100)
+    speed = (
+        UNKNOWN
+        if "wheel_speed" in state.invalid
+        else round(mechanics.tyre_radps(state.reported_mps("wheel_speed")) * 100)
+    )
     return pack(WHEEL_SPEEDS, dict.fromkeys((f"wheel_{index}" for index in range(4)), speed))
 
+
+SPEED_MESSAGES: Final = {"speed": 0x065, "wheel_speed": 0x06A}
+"""The message of each source of speed."""
 
 REPORTS: dict[int, tuple[int, Callable[[KitState, Mechanics], bytes]]] = {
     0x061: (20, brake_report),

@@ -154,13 +154,21 @@ def system_report(state: KitState, _: Mechanics) -> dict[str, int]:
 
 def velocity_report(state: KitState, _: Mechanics) -> dict[str, int]:
     """Return the fields of the velocity report."""
-    speed = UNKNOWN if "speed" in state.invalid else hundredths_of_kmh(state.speed_mps)
-    return {"by_brakes": speed, "by_propulsion": speed}
+    if "speed" in state.invalid:
+        return {"by_brakes": UNKNOWN, "by_propulsion": UNKNOWN}
+    return {
+        "by_brakes": hundredths_of_kmh(state.reported_mps("speed")),
+        "by_propulsion": hundredths_of_kmh(state.reported_mps("second_speed")),
+    }
 
 
 def wheel_speeds(state: KitState, mechanics: Mechanics) -> dict[str, int]:
     """Return the wheel speeds, which are all equal."""
-    speed = UNKNOWN if "wheel_speed" in state.invalid else round(mechanics.tyre_radps(state.speed_mps) * 100)
+    speed = (
+        UNKNOWN
+        if "wheel_speed" in state.invalid
+        else round(mechanics.tyre_radps(state.reported_mps("wheel_speed")) * 100)
+    )
     return dict.fromkeys((f"wheel_{index}" for index in range(4)), speed)
 
 
@@ -183,6 +191,9 @@ def report_encoder(
 
     return report
 
+
+SPEED_MESSAGES: Final = {"speed": 0x107, "second_speed": 0x107, "wheel_speed": 0x2A4}
+"""The message of each source of speed."""
 
 REPORTS: dict[int, tuple[int, Callable[[KitState, Mechanics], bytes]]] = {
     identifier: (period_ms, report_encoder(identifier, values))

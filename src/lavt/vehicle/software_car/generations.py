@@ -20,6 +20,8 @@ class Generation:
     reports: dict[int, tuple[int, Callable[[KitState, Mechanics], bytes]]]
     """By identifier: the period in milliseconds, and the report."""
     faults: dict[str, tuple[str, ...]]
+    speed_messages: dict[str, int]
+    """The identifier of the message of each source of speed."""
     follows: Callable[[int, int], bool]
     """Whether a counter is a valid successor of another."""
     is_one_system: bool
@@ -31,6 +33,7 @@ GENERATIONS: Final = {
         generation_1.parse_order,
         generation_1.REPORTS,
         generation_1.FAULTS,
+        generation_1.SPEED_MESSAGES,
         lambda before, count: count == (before + 1) % 256,
         is_one_system=False,
     ),
@@ -38,6 +41,7 @@ GENERATIONS: Final = {
         generation_2.parse_order,
         generation_2.REPORTS,
         generation_2.FAULTS,
+        generation_2.SPEED_MESSAGES,
         lambda before, count: count != before,
         is_one_system=True,
     ),

@@ -155,11 +155,14 @@ class Kit:
         if now_ns < self._next_due_ns:
             return []
         frames = []
+        dropped = {self._generation.speed_messages[source] for source in self.state.sensor_faults.dropped}
         for identifier, (period_ms, make) in self._generation.reports.items():
             late_ns = now_ns - self._due_ns[identifier]
             if late_ns >= 0:
                 period_ns = period_ms * NS_PER_MS
                 self._due_ns[identifier] += (late_ns // period_ns + 1) * period_ns
+                if identifier in dropped:
+                    continue
                 frames.append(CanFrame(identifier, make(self.state, self._mechanics)))
                 self.state.sent[identifier] = self.state.sent.get(identifier, 0) + 1
         self._next_due_ns = min(self._due_ns.values())
@@ -168,7 +171,7 @@ class Kit:
     def actuation(self, now_ns: int) -> Actuation:
         """Return the actuation of the wheels. While steering is not enabled, the wheel keeps its angle (our choice)."""
         self._advance(now_ns)
-        brake = 1.0 if self.state.gear == Gear.PARK else self.state.brake
+        brake = 1.0 if self.state.gear == Gear.PARK else self.state.brake * self.state.brake_share
         return Actuation(self.state.setpoint_rad / self._mechanics.steering_ratio, self.state.throttle, brake)
 
     # The car, the driver, and faults.
@@ -234,6 +237,34 @@ class Kit:
         """Report `angle`, `speed` or `wheel_speed` as unknown, or as known again."""
         check_known(name, REPORTED_VALUES, "value that can be unknown")
         (self.state.invalid.add if is_unknown else self.state.invalid.discard)(name)
+
+    def stick_speed(self, source: str, speed_mps: float | None = None) -> None:
+        """Report a fixed speed, or the present one. Raises `UserError` with the known sources."""
+        faults = self.state.sensor_faults
+        self._check_source(source)
+        faults.stuck_mps[source] = self.state.reported_mps(source) if speed_mps is None else speed_mps
+
+    def scale_speed(self, source: str, factor: float) -> None:
+        """Report a multiple of the speed. Raises `UserError` with the known sources."""
+        self._check_source(source)
+        self.state.sensor_faults.factors[source] = factor
+
+    def drop_speed(self, source: str) -> None:
+        """Stop sending the message of a source. Raises `UserError` with the known sources."""
+        self._check_source(source)
+        self.state.sensor_faults.dropped.add(source)
+
+    def restore_speed(self, source: str) -> None:
+        """Remove the faults of a source. Raises `UserError` with the known sources."""
+        self._check_source(source)
+        self.state.sensor_faults.clear(source)
+
+    def weaken_brake(self, share: float) -> None:
+        """Let only a share of the brake's force reach the wheels; 1 removes the fault."""
+        self.state.brake_share = within(share, 0.0, 1.0)
+
+    def _check_source(self, source: str) -> None:
+        check_known(source, set(self._generation.speed_messages), "source of speed of this kit")
 
     def inhibit(self, name: str | None, now_ns: int) -> None:
         """Make generation 2 not ready for a reason of `INHIBIT_REASONS`; None removes the reason."""

@@ -10,6 +10,7 @@ from enum import IntEnum
 from typing import Final, Literal
 
 from lavt.value import value
+from lavt.vehicle.software_car.sensor_faults import SensorFaults
 
 Axis = Literal["steering", "brake", "throttle"]
 AXES: Final[tuple[Axis, ...]] = ("steering", "brake", "throttle")
@@ -150,6 +151,9 @@ class KitState:
     """Angle of the steering wheel."""
     invalid: set[str] = field(default_factory=set)
     """Values reported as unknown: `angle`, `speed`, `wheel_speed`."""
+    sensor_faults: SensorFaults = field(default_factory=SensorFaults)
+    brake_share: float = 1.0
+    """Share of the brake's force that reaches the wheels; no report shows it."""
     # The driver.
     driver_torque_nm: float = 0.0
     driver_brake: float = 0.0
@@ -181,6 +185,10 @@ class KitState:
     def is_stationary(self) -> bool:
         """Whether the car is stationary."""
         return abs(self.speed_mps) < STATIONARY_BELOW_MPS
+
+    def reported_mps(self, source: str) -> float:
+        """Return the speed that a source reports, one of `SPEED_SOURCES`."""
+        return self.sensor_faults.reported_mps(source, self.speed_mps)
 
     @property
     def is_in_gear(self) -> bool:

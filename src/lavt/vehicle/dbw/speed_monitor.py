@@ -1,0 +1,229 @@
+"""The plausibility of the reported speeds: against each other, the pedals, and what a car can do.
+
+A kit reports `speed`, which is used to drive, and possibly others to compare it with: a second speed and those of the
+wheels. They may come from one control unit, so that all of them can be wrong together: the checks against the pedals
+detect that. An implausible speed is a fault until the car has been braked fully for `HOLD_NS` and every reported speed
+is that of a stationary car.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from enum import StrEnum
+from typing import Final
+
+from lavt.domain import NS_PER_MS, NS_PER_S
+from lavt.value import value
+from lavt.vehicle.dbw.states import STATIONARY_BELOW_MPS
+
+MAX_FALL_MPS2: Final = 12.0
+"""No car brakes harder than 1.2 g: road tyres on dry asphalt reach 1.0 to 1.1 g."""
+MAX_DROP_MPS: Final = 2.5
+"""A speed may be this much below what `MAX_FALL_MPS2` allows: below about 2 m/s anti-lock brakes let wheels lock, and
+wheels that spun regain grip within a report."""
+LOCKED_BELOW_MPS: Final = 0.5
+"""A speed this much below what `MAX_FALL_MPS2` allows is that of locked wheels, or wrong."""
+LOCKED_NS: Final = 2 * NS_PER_S
+"""For this long after it, no speed means standstill: the holding brake of 1.8 m/s2 stops a car from `MAX_DROP_MPS`."""
+DISAGREEMENT_MPS: Final = 1.0
+DISAGREEMENT_SHARE: Final = 0.2
+"""Two speeds may differ by 1 m/s and a fifth of the larger: brakes with anti-lock control slip by 10 to 20 %, and the
+radius of a tyre is known to a few per cent."""
+DISAGREEMENT_NS: Final = 500 * NS_PER_MS
+"""And by more for this long: anti-lock control cycles at 3 Hz or faster, and traction control is no slower."""
+SOURCE_LIMIT_NS: Final = 200 * NS_PER_MS
+"""An older report is not compared. Where it must not be missing, that inhibits driving by itself."""
+LEAST_BRAKING_MPS2: Final = 3.0
+"""A brake that should decelerate by this must slow the car even on a descent of 20 % (2 m/s2)."""
+BRAKE_SETTLING_NS: Final = 500 * NS_PER_MS
+"""Dead time and lag of a brake, and of the throttle before it."""
+BRAKE_CHECK_NS: Final = NS_PER_S
+LEAST_BRAKED_MPS: Final = 0.2
+"""Within `BRAKE_CHECK_NS`; on ice, braking at 1 m/s2, it is 1 m/s."""
+BRAKE_CHECKED_ABOVE_MPS: Final = 1.0
+CONSTANT_WITHIN_MPS: Final = 0.005
+"""A speed that changes by less is constant: kits report steps of 0.01 km/h, 0.003 m/s."""
+MOVING_ABOVE_MPS: Final = 0.5
+"""Below this, a constant speed is checked as that of a car that does not start."""
+FROZEN_ACCELERATION_MPS2: Final = 0.4
+"""On the level, a throttle for this much is more than drag balances below 40 km/h (0.12 m/s2 in the simulator)."""
+FROZEN_NS: Final = 2 * NS_PER_S
+"""On a slope the throttle may balance weight and drag, but a real car's speed is never this constant for so long."""
+STARTING_THROTTLE: Final = 0.5
+STARTING_NS: Final = 3 * NS_PER_S
+"""A car that does not move for this long at half throttle does not start: the slope is too steep, a wheel is blocked,
+or it moves and its speed is wrong. All of them end the drive."""
+HOLD_NS: Final = 8 * NS_PER_S
+"""After an implausible speed, the car is braked fully for at least this long: 1.4 m/s2, a quarter of what the brakes
+should reach, stop a car from 40 km/h in this time."""
+STANDSTILL_NS: Final = NS_PER_S
+"""All speeds must be those of a stationary car for this long."""
+
+
+class SpeedFault(StrEnum):
+    """Why the reported speed is implausible; the values are the texts shown."""
+
+    FALL = "speed_fall: the speed fell faster than brakes can slow a car"
+    DISAGREEMENT = "speed_disagreement: the reported speeds differ"
+    NO_BRAKING = "speed_unbraked: the speed does not answer the brake"
+    FROZEN = "speed_frozen: the speed does not change under throttle"
+    NO_START = "speed_no_start: the car does not start under throttle"
+
+    @property
+    def code(self) -> str:
+        """A word for counters and logs."""
+        return self.value.partition(":")[0]
+
+
+@value
+class SpeedReport:
+    """A reported speed and when it arrived."""
+
+    mps: float
+    mono_ns: int
+
+
+@value
+class Pedals:
+    """The pedals that the kit is applying, as fractions."""
+
+    throttle: float
+    brake: float
+
+
+class SpeedMonitor:
+    """A monitor of the reported speeds. Call `update` after each report and regularly; times must not decrease.
+
+    The accelerations are the car's at full pedals.
+    """
+
+    def __init__(self, *, max_acceleration_mps2: float, max_braking_mps2: float) -> None:
+        self._max_acceleration_mps2, self._max_braking_mps2 = max_acceleration_mps2, max_braking_mps2
+        self.fault: SpeedFault | None = None
+        self._fault_ns = 0
+        self._speeds: Mapping[str, SpeedReport] = {"speed": SpeedReport(0.0, 0)}
+        self._checked = SpeedReport(0.0, 0)
+        """The newest `speed` that was checked for a fall."""
+        self._least_mps = 0.0
+        """The least speed that the car can have now, after those before."""
+        self._now_ns = 0
+        self._moved_ns = self._locked_ns = -LOCKED_NS
+        """Time of the last update at which the car may have moved, or at which its wheels had locked."""
+        self._agreed_ns: int | None = None
+        self._brake_reference: SpeedReport | None = None
+        """The speed at the start of the present check of the brake; its time is that of the pedal before settling."""
+        self._frozen_reference: SpeedReport | None = None
+        self._starting_reference: SpeedReport | None = None
+
+    @property
+    def is_stationary(self) -> bool:
+        """Whether every reported speed is that of a stationary car, and its wheels have not locked just now."""
+        return self._moved_ns < self._now_ns
+
+    @property
+    def speed_mps(self) -> float:
+        """The speed to drive by: the largest if the speed is implausible or says, alone, that the car is stationary."""
+        speed_mps = self._speeds["speed"].mps
+        if self.fault is None and abs(speed_mps) >= STATIONARY_BELOW_MPS:
+            return speed_mps
+        return max((each.mps for each in self._speeds.values()), key=abs)
+
+    def update(self, speeds: Mapping[str, SpeedReport], pedals: Pedals, now_ns: int) -> SpeedFault | None:
+        """Process the newest speeds by name and the pedals; return a fault that begins now."""
+        self._speeds, self._now_ns = speeds, now_ns
+        has_fallen = self._has_fallen(speeds["speed"])
+        is_locked = now_ns - self._locked_ns < LOCKED_NS
+        if is_locked or any(abs(each.mps) >= STATIONARY_BELOW_MPS for each in speeds.values()):
+            self._moved_ns = now_ns
+        checks = (
+            (SpeedFault.FALL, has_fallen),
+            (SpeedFault.DISAGREEMENT, self._disagrees(now_ns)),
+            (SpeedFault.NO_BRAKING, self._is_unbraked(pedals.brake, now_ns)),
+            (SpeedFault.FROZEN, self._is_frozen(pedals, now_ns)),
+            (SpeedFault.NO_START, self._does_not_start(pedals, now_ns)),
+        )
+        found = next((fault for fault, is_present in checks if is_present), None)
+        if self.fault is not None:
+            if now_ns - self._fault_ns >= HOLD_NS and now_ns - self._moved_ns >= STANDSTILL_NS:
+                self.fault = None
+            return None
+        if found is not None:
+            self.fault, self._fault_ns = found, now_ns
+        return found
+
+    def _has_fallen(self, speed: SpeedReport) -> bool:
+        """Return whether the speed is below the least that it can be after the speeds before."""
+        before, self._checked = self._checked, speed
+        passed_s = (speed.mono_ns - before.mono_ns) / NS_PER_S
+        if passed_s <= 0:
+            return False
+        least_mps = self._least_mps - MAX_FALL_MPS2 * passed_s
+        self._least_mps = max(abs(speed.mps), least_mps)
+        if abs(speed.mps) < least_mps - LOCKED_BELOW_MPS:
+            self._locked_ns = speed.mono_ns
+        return abs(speed.mps) < least_mps - MAX_DROP_MPS
+
+    def _disagrees(self, now_ns: int) -> bool:
+        if self._agreed_ns is None or not self._differs(now_ns):
+            self._agreed_ns = now_ns
+        return now_ns - self._agreed_ns >= DISAGREEMENT_NS
+
+    def _differs(self, now_ns: int) -> bool:
+        """Return whether `speed` is neither near the second speed, nor near or between those of the wheels."""
+        fresh_mps = {
+            name: abs(each.mps) for name, each in self._speeds.items() if now_ns - each.mono_ns <= SOURCE_LIMIT_NS
+        }
+        speed_mps = fresh_mps.pop("speed", None)
+        if speed_mps is None:
+            return False
+        second_mps = [mps for name, mps in fresh_mps.items() if name == "second_speed"]
+        wheels_mps = [mps for name, mps in fresh_mps.items() if name != "second_speed"]
+        return _is_outside(speed_mps, second_mps) or _is_outside(speed_mps, wheels_mps)
+
+    def _is_unbraked(self, brake: float, now_ns: int) -> bool:
+        speed_mps = abs(self._speeds["speed"].mps)
+        if brake * self._max_braking_mps2 < LEAST_BRAKING_MPS2 or speed_mps < BRAKE_CHECKED_ABOVE_MPS:
+            self._brake_reference = None
+            return False
+        reference = self._brake_reference
+        if reference is None:
+            self._brake_reference = SpeedReport(speed_mps, now_ns)
+            return False
+        passed_ns = now_ns - reference.mono_ns
+        if passed_ns < BRAKE_SETTLING_NS:
+            self._brake_reference = SpeedReport(speed_mps, reference.mono_ns)
+            return False
+        if passed_ns < BRAKE_SETTLING_NS + BRAKE_CHECK_NS:
+            return False
+        self._brake_reference = SpeedReport(speed_mps, now_ns - BRAKE_SETTLING_NS)
+        return speed_mps > reference.mps - LEAST_BRAKED_MPS
+
+    def _is_frozen(self, pedals: Pedals, now_ns: int) -> bool:
+        is_pressed = pedals.brake == 0 and pedals.throttle * self._max_acceleration_mps2 >= FROZEN_ACCELERATION_MPS2
+        reference = self._constant_since(self._frozen_reference, is_pressed, now_ns)
+        self._frozen_reference = reference
+        return reference is not None and reference.mps > MOVING_ABOVE_MPS and now_ns - reference.mono_ns >= FROZEN_NS
+
+    def _does_not_start(self, pedals: Pedals, now_ns: int) -> bool:
+        is_pressed = pedals.brake == 0 and pedals.throttle >= STARTING_THROTTLE
+        reference = self._constant_since(self._starting_reference, is_pressed, now_ns)
+        self._starting_reference = reference
+        return reference is not None and reference.mps <= MOVING_ABOVE_MPS and now_ns - reference.mono_ns >= STARTING_NS
+
+    def _constant_since(self, reference: SpeedReport | None, is_pressed: bool, now_ns: int) -> SpeedReport | None:
+        """Return `reference` while the throttle is pressed and the speed constant, else a new one, or None."""
+        if not is_pressed:
+            return None
+        speed_mps = abs(self._speeds["speed"].mps)
+        if reference is None or abs(speed_mps - reference.mps) > CONSTANT_WITHIN_MPS:
+            return SpeedReport(speed_mps, now_ns)
+        return reference
+
+
+def _is_outside(speed_mps: float, others_mps: Iterable[float]) -> bool:
+    """Return whether a speed is below all others or above all others by more than the tolerance."""
+    others = [*others_mps]
+    if not others:
+        return False
+    nearest_mps = min(max(speed_mps, min(others)), max(others))
+    return abs(speed_mps - nearest_mps) > DISAGREEMENT_MPS + DISAGREEMENT_SHARE * max(speed_mps, nearest_mps)

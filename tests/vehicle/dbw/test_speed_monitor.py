@@ -1,0 +1,210 @@
+"""The plausibility of reported speeds: faults are found in time, and normal driving raises none."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+
+from lavt.domain import NS_PER_MS, NS_PER_S
+from lavt.vehicle.dbw.speed_monitor import (
+    HOLD_NS,
+    STANDSTILL_NS,
+    Pedals,
+    SpeedFault,
+    SpeedMonitor,
+    SpeedReport,
+)
+
+START_NS = 5 * NS_PER_S
+PERIOD_NS = 10 * NS_PER_MS
+SPEED_STEP_MPS = 0.01 / 3.6
+"""Step of the kits' reports."""
+NONE, FULL_BRAKE, HALF_BRAKE, THROTTLE = Pedals(0.0, 0.0), Pedals(0.0, 1.0), Pedals(0.0, 0.5), Pedals(0.5, 0.0)
+Course = Callable[[float], float]
+"""A speed in m/s as a function of time in s."""
+
+
+class MonitorRig:
+    """A monitor that gets reports every 10 ms."""
+
+    def __init__(self) -> None:
+        self.monitor = SpeedMonitor(max_acceleration_mps2=2.0, max_braking_mps2=6.0)
+        self.now_ns = START_NS
+        self.found: list[SpeedFault] = []
+
+    def run(
+        self, duration_s: float, pedals: Pedals, speed: Course, *wheels: Course, second: Course | None = None
+    ) -> MonitorRig:
+        """Report courses for a time, each from its own 0 s."""
+        began_ns = self.now_ns
+        while self.now_ns < began_ns + round(duration_s * NS_PER_S):
+            self.now_ns += PERIOD_NS
+            passed_s = (self.now_ns - began_ns) / NS_PER_S
+            courses = {"speed": speed} | {f"wheel_{index}": each for index, each in enumerate(wheels, 1)}
+            courses |= {} if second is None else {"second_speed": second}
+            reports = {name: SpeedReport(quantised(course(passed_s)), self.now_ns) for name, course in courses.items()}
+            found = self.monitor.update(reports, pedals, self.now_ns)
+            self.found += [] if found is None else [found]
+        return self
+
+
+def quantised(speed_mps: float) -> float:
+    return round(speed_mps / SPEED_STEP_MPS) * SPEED_STEP_MPS
+
+
+def constant(speed_mps: float) -> Course:
+    return lambda _: speed_mps
+
+
+def ramp(from_mps: float, acceleration_mps2: float) -> Course:
+    return lambda s: max(0.0, from_mps + acceleration_mps2 * s)
+
+
+def noisy(course: Course, amplitude_mps: float = 0.05) -> Course:
+    """Add the oscillation of a real car's speed."""
+    return lambda s: max(0.0, course(s) + amplitude_mps * math.sin(7.0 * s))
+
+
+# Faults.
+
+
+def test_a_speed_that_drops_to_zero_is_a_fall() -> None:
+    """A speed that becomes 0 at 8.3 m/s is implausible with its first report, and the car is not stationary."""
+    rig = MonitorRig().run(1.0, NONE, noisy(constant(8.3)))
+    rig.run(0.01, NONE, constant(0.0))
+    assert rig.found == [SpeedFault.FALL]
+
+
+def test_the_fault_lasts_until_all_speeds_agree_on_standstill() -> None:
+    """The fault ends after the car was braked for long enough, and every speed was 0 for a second."""
+    rig = MonitorRig().run(1.0, NONE, *[noisy(constant(8.3))] * 5)
+    rig.run(HOLD_NS / NS_PER_S + 5.0, FULL_BRAKE, constant(0.0), *[constant(8.3)] * 4)
+    assert rig.monitor.fault is SpeedFault.FALL
+    assert rig.monitor.speed_mps == pytest.approx(8.3, abs=0.01)
+    rig.run(STANDSTILL_NS / NS_PER_S - 0.02, FULL_BRAKE, *[constant(0.0)] * 5)
+    assert rig.monitor.fault is SpeedFault.FALL
+    rig.run(0.1, FULL_BRAKE, *[constant(0.0)] * 5)
+    assert rig.monitor.fault is None
+
+
+def test_a_fault_of_the_only_source_lasts_as_long_as_the_car_may_need() -> None:
+    """Without another speed, the fault lasts until any speed within the limits is braked away."""
+    rig = MonitorRig().run(1.0, NONE, noisy(constant(8.3)))
+    rig.run(HOLD_NS / NS_PER_S - 0.02, FULL_BRAKE, constant(0.0))
+    assert rig.monitor.fault is SpeedFault.FALL
+    rig.run(0.1, FULL_BRAKE, constant(0.0))
+    assert rig.monitor.fault is None
+
+
+@pytest.mark.parametrize("other", ["wheels", "second"])
+@pytest.mark.parametrize("stuck_mps", [0.0, 3.0])
+def test_a_stuck_speed_disagrees(other: str, stuck_mps: float) -> None:
+    """A speed that is stuck while the car accelerates at 2 m/s2 is implausible before the car is 3 m/s faster."""
+    course = ramp(stuck_mps, 2.0)
+    others = {"second": course} if other == "second" else {}
+    rig = MonitorRig().run(1.5, THROTTLE, constant(stuck_mps), *[course] * (0 if others else 4), **others)
+    assert rig.found == [SpeedFault.DISAGREEMENT]
+
+
+def test_a_scaled_speed_disagrees() -> None:
+    """A speed of half that of the wheels is implausible."""
+    rig = MonitorRig().run(4.0, THROTTLE, ramp(0.0, 1.0), *[ramp(0.0, 2.0)] * 4)
+    assert rig.found == [SpeedFault.DISAGREEMENT]
+
+
+@pytest.mark.parametrize("sources", [1, 5])
+def test_a_frozen_speed_under_throttle(sources: int) -> None:
+    """A moving car's speed that does not change under throttle is implausible, even if all sources agree."""
+    rig = MonitorRig().run(2.1, THROTTLE, *[constant(3.0)] * sources)
+    assert rig.found == [SpeedFault.FROZEN]
+
+
+@pytest.mark.parametrize("sources", [1, 5])
+def test_a_speed_that_stays_zero_under_throttle(sources: int) -> None:
+    """A car that does not start at half throttle for 3 s may have a wrong speed."""
+    rig = MonitorRig().run(3.1, THROTTLE, *[constant(0.0)] * sources)
+    assert rig.found == [SpeedFault.NO_START]
+
+
+@pytest.mark.parametrize("sources", [1, 5])
+def test_a_speed_that_does_not_answer_the_brake(sources: int) -> None:
+    """A speed that does not fall while the brake is pressed is implausible."""
+    rig = MonitorRig().run(1.6, HALF_BRAKE, *[noisy(constant(5.0))] * sources)
+    assert rig.found == [SpeedFault.NO_BRAKING]
+
+
+# No false alarms.
+
+
+def stop_and_go(s: float) -> float:
+    return 2.5 * (1 - math.cos(s))
+
+
+NORMAL: dict[str, Callable[[MonitorRig], object]] = {
+    "an emergency stop on dry asphalt": lambda rig: rig.run(2.0, FULL_BRAKE, *[ramp(11.1, -10.5)] * 5),
+    "anti-lock brakes on gravel: wheels slip by a fifth, and each locks for 0.1 s": lambda rig: rig.run(
+        3.0,
+        FULL_BRAKE,
+        ramp(11.1, -4.0),
+        *[lambda s, wheel=wheel: 0.0 if (10 * s + wheel) % 4 < 1 else 0.8 * ramp(11.1, -4.0)(s) for wheel in range(4)],
+    ),
+    "all wheels lock on gravel at 2 m/s": lambda rig: (
+        rig.run(1.0, NONE, *[noisy(constant(2.0))] * 5),
+        rig.run(1.0, FULL_BRAKE, *[constant(0.0)] * 5),
+    ),
+    "ice: full brakes, 1 m/s2": lambda rig: rig.run(11.0, FULL_BRAKE, *[ramp(11.1, -1.0)] * 5),
+    "front wheels spin at the start": lambda rig: rig.run(
+        3.0, THROTTLE, ramp(0.0, 0.8), *[ramp(0.0, 3.0)] * 2, *[ramp(0.0, 0.8)] * 2
+    ),
+    "spinning wheels regain grip": lambda rig: (
+        rig.run(1.0, THROTTLE, *[ramp(1.0, 4.0)] * 5),
+        rig.run(1.0, THROTTLE, *[ramp(3.0, 1.0)] * 5),
+    ),
+    "a tight curve: wheels differ by a fifth": lambda rig: rig.run(
+        5.0, THROTTLE, noisy(constant(5.0)), *[noisy(constant(4.5))] * 2, *[noisy(constant(5.5))] * 2
+    ),
+    "stop and go": lambda rig: [
+        rig.run(2 * math.pi, pedals, *[stop_and_go] * 5) for pedals in (NONE, Pedals(0.2, 0.0), NONE)
+    ],
+    "waiting with the brake": lambda rig: rig.run(20.0, FULL_BRAKE, *[constant(0.0)] * 5),
+    "holding on a hill by throttle": lambda rig: rig.run(10.0, Pedals(0.3, 0.0), *[constant(0.0)] * 5),
+    "rolling back on a hill under throttle": lambda rig: rig.run(4.0, THROTTLE, *[lambda s: -0.2 * s] * 5),
+    "climbing at a constant speed": lambda rig: rig.run(10.0, Pedals(0.9, 0.0), *[noisy(constant(5.0), 0.02)] * 5),
+    "cruising at an exactly constant speed on the level": lambda rig: rig.run(
+        20.0, Pedals(0.1, 0.0), *[constant(8.3)] * 5
+    ),
+    "braking down a hill of 20 % with half the pedal": lambda rig: rig.run(
+        4.0, HALF_BRAKE, *[lambda s: 5.0 + 2.0 * min(s, 0.3) - max(0.0, s - 0.3)] * 5
+    ),
+    "standstill reported with noise": lambda rig: rig.run(10.0, NONE, *[lambda s: 0.04 * math.sin(50 * s)] * 5),
+}
+
+
+@pytest.mark.parametrize("situation", NORMAL)
+def test_normal_driving_raises_no_fault(situation: str) -> None:
+    """Slip, locked wheels, hills, quantisation and stop-and-go are plausible."""
+    rig = MonitorRig()
+    NORMAL[situation](rig)
+    assert rig.found == []
+
+
+def test_any_moving_source_means_not_stationary() -> None:
+    """A car is stationary only if every source says so; until then, the largest speed counts."""
+    rig = MonitorRig().run(0.1, NONE, constant(0.0), *[constant(0.0)] * 3, constant(0.4))
+    assert not rig.monitor.is_stationary
+    assert rig.monitor.speed_mps == pytest.approx(0.4, abs=0.01)
+    rig.run(0.01, NONE, *[constant(0.0)] * 5)
+    assert rig.monitor.is_stationary
+    assert rig.found == []
+
+
+def test_an_old_report_is_not_compared() -> None:
+    """A source whose reports are missing does not disagree; that they are missing is a fault by itself."""
+    monitor = SpeedMonitor(max_acceleration_mps2=2.0, max_braking_mps2=6.0)
+    wheel = SpeedReport(8.0, START_NS)
+    for index in range(300):
+        now_ns = START_NS + index * PERIOD_NS
+        speeds = {"speed": SpeedReport(ramp(8.0, -4.0)(index / 100), now_ns), "wheel_1": wheel}
+        assert monitor.update(speeds, FULL_BRAKE, now_ns) is None
