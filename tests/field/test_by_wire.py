@@ -16,7 +16,7 @@ from tests.support.stalls import Stalls
 
 from lavt.clock import pause
 from lavt.config import RunConfig
-from lavt.domain import NS_PER_S
+from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.experiment.runs.processes import LAVT
 from lavt.runtime import process_priority
 
@@ -30,6 +30,9 @@ Drive = Callable[..., AbstractContextManager[RunningDrive]]
 HOGGING = (str(Path(__file__).with_name("hogging.py")),)
 COMMAND_TIMEOUT_MS = 500
 """The server stops the car this long after the last command."""
+STATIONARY_MPS = 0.05
+BUSY_S = 0.8
+"""An actuator that spins uses more of a second; one that waits uses a fifth of it."""
 PARKED_MS = 6000
 """Standstill from 5 m/s or more, and park, are reached within this time."""
 
@@ -107,12 +110,48 @@ def test_a_stalled_actuator_leaves_a_braking_car(
         tell(f"actuator {how}, {profile}: the kit brakes {took_ms:.0f} ms after")
         if how == "frozen":
             os.kill(driven.actuator_pid, signal.SIGCONT)
-        if how == "killed":
+        if how != "frozen":
             assert driven.loop.server.popen.wait(30) == 1
-            assert "the process of the actuator has ended" in driven.loop.server.said()
+            reason = {"killed": "has ended", "busy": "does not respond"}[how]
+            assert f"the process of the actuator {reason}" in driven.loop.server.said()
         else:
             driven.wait(lambda status: status.get("safety") == "safe_stop", "the server does not report its stop")
         assert driven.car.event_ns("enabled", "enabled: ", since_ns=since_ns) is None, "no old command is accepted"
+
+
+@pytest.mark.parametrize("duration_ms", [120, 135, 150])
+def test_a_stall_while_parking_ends(duration_ms: int, tell: Tell, drive: Drive) -> None:
+    """An actuator that is stopped for a moment while parking reports again, does not spin, and ends with its server.
+
+    The gearbox has a fault, so that parking lasts.
+    """
+    with drive("dataspeed_gen1") as driven:
+        driven.car.execute("fault gear.FLTBUS")
+        driven.wait(lambda status: status.get("safety") == "safe_stop", "the server does not report its stop")
+        driven.wait(lambda status: abs(status["speed_mps"]) < STATIONARY_MPS, "the car does not stop")
+        pause(NS_PER_S)
+        if driven.car.braked_ns() is not None:
+            raise driven.unexpected_stop()
+        since_ns, server = CLOCK.now().mono_ns, driven.loop.server.popen
+        os.kill(driven.actuator_pid, signal.SIGSTOP)
+        pause(duration_ms * NS_PER_MS)
+        os.kill(driven.actuator_pid, signal.SIGCONT)
+        driven.car.wait_for_watchdog_ms(since_ns)
+        before_s = used_cpu_s(driven.actuator_pid)
+        pause(NS_PER_S)
+        used_s = used_cpu_s(driven.actuator_pid) - before_s
+        tell(f"stopped for {duration_ms} ms while parking: the actuator uses {used_s:.2f} s of the next second")
+        assert used_s < BUSY_S
+        assert server.poll() is None, "the actuator reports its state"
+        server.send_signal(signal.SIGINT)
+        assert server.wait(20) == 0
+        assert not Path(f"/proc/{driven.actuator_pid}").exists()
+
+
+def used_cpu_s(pid: int) -> float:
+    """Return the processor time of a process so far."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 @pytest.mark.parametrize("how", [signal.SIGSTOP, signal.SIGKILL])

@@ -285,8 +285,7 @@ def test_frozen_actuator_sends_no_frames(lab: CanLab, report_figure: ReportFigur
             last_ns = last_command_ns(port)
         finally:
             os.kill(active_drive.actuator_pid, signal.SIGCONT)
-        active_drive.wait_until_stopped()
-        pause(NS_PER_S)
+        pause(2 * NS_PER_S)  # the server has ended by itself, since it got no state for 0.5 s
         report_figure(f"last command {ms_since(last_ns, since_ns):.0f} ms, the kit brakes {took_ms:.0f} ms after")
         assert last_ns < frozen_ns + LATE_FRAME_MS * NS_PER_MS
         assert active_drive.car.event_ns("enabled", "enabled: ", since_ns=since_ns) is None

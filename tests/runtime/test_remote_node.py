@@ -21,7 +21,7 @@ from lavt.node import WAKE, Message, Send, Stage
 from lavt.nodes.payloads import StationaryStatus
 from lavt.runtime.pipe import CAPACITY, Pipe
 from lavt.runtime.realtime import RealRuntime
-from lavt.runtime.remote_node import LATE_NS, NodeHost, RemoteNodeProxy
+from lavt.runtime.remote_node import FAILED_CHECKS, LATE_NS, START_CHECKS, NodeHost, RemoteNodeProxy
 
 pytestmark = pytest.mark.usefixtures("own_switch_interval")
 
@@ -106,19 +106,21 @@ class Rig:
     host: NodeHost
     disconnected: threading.Event
     number: list[int]
+    silences: list[RealRuntime]
 
 
 @contextmanager
 def rig() -> Iterator[Rig]:
     ours, theirs = multiprocessing.Pipe()
     node, neighbour, outputs, disconnected, number = Echo(), Neighbour(), FakeOutputs(), threading.Event(), [0]
-    proxy = RemoteNodeProxy("actuator", ours)
+    silences: list[RealRuntime] = []
+    proxy = RemoteNodeProxy("actuator", ours, heartbeat="state", on_silent=silences.append)
     main = RealRuntime(CLOCK, [neighbour], outputs, lambda: None, {"actuator": proxy})
     host = NodeHost(theirs, CLOCK, node, get_status=lambda: number[0], on_disconnect=disconnected.set)
     main.start({"zenoh": outputs})
     proxy.start(main)
     host.start()
-    both = Rig(node, neighbour, outputs, proxy, main, host, disconnected, number)
+    both = Rig(node, neighbour, outputs, proxy, main, host, disconnected, number, silences)
     try:
         yield both
     finally:
@@ -228,6 +230,54 @@ def test_the_end_of_the_nodes_process_ends_the_run() -> None:
         assert "ended" in str(both.main.failed)
 
 
+@pytest.fixture
+def no_checker(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only the test checks heartbeats."""
+    monkeypatch.setattr(RemoteNodeProxy, "_check_heartbeats", lambda _: None)
+
+
+def beat(both: Rig) -> None:
+    """Let the remote node record a state, and wait until the proxy has received it."""
+    count = len(both.outputs.of("state"))
+    both.host.runtime.record("state", b"", CLOCK.now())
+    wait_until(lambda: len(both.outputs.of("state")) > count)
+
+
+@pytest.mark.usefixtures("no_checker")
+def test_a_remote_node_without_a_heartbeat_fails_the_run() -> None:
+    """Without a heartbeat a silence is reported once, and then the run fails; a heartbeat in between prevents that."""
+    with rig() as both:
+        for _ in range(3):
+            beat(both)
+            for _ in range(FAILED_CHECKS - 1):
+                both.proxy.check_heartbeat()
+        assert both.silences == [both.main] * 3
+        assert both.main.failed is None
+        both.host.runtime.record("event", "alive, but without a state", CLOCK.now())
+        wait_until(lambda: bool(both.outputs.of("event")))
+        both.proxy.check_heartbeat()
+        assert isinstance(both.main.failed, WorkError)
+
+
+@pytest.mark.usefixtures("no_checker")
+def test_the_first_heartbeat_may_take_longer() -> None:
+    """Before the first heartbeat a node has 30 s; then the run fails."""
+    with rig() as both:
+        for _ in range(START_CHECKS - 1):
+            both.proxy.check_heartbeat()
+        assert (both.silences, both.main.failed) == ([], None)
+        both.proxy.check_heartbeat()
+        assert isinstance(both.main.failed, WorkError)
+
+
+def test_heartbeats_are_checked() -> None:
+    """A proxy checks heartbeats by itself from its start on."""
+    with rig() as both:
+        beat(both)
+        wait_until(lambda: both.main.failed is not None)
+        assert both.silences == [both.main]
+
+
 @pytest.mark.parametrize("where", ["sent", "read", "received"])
 def test_an_error_in_one_direction_closes_the_pipe(where: str) -> None:
     """An entry that cannot be sent, read or received closes the pipe at both ends."""
@@ -254,7 +304,7 @@ def test_a_server_that_never_started_ends_the_nodes_process() -> None:
     """A server that fails before its start ends the node's process."""
     ours, theirs = multiprocessing.Pipe()
     disconnected = threading.Event()
-    proxy = RemoteNodeProxy("actuator", ours)
+    proxy = RemoteNodeProxy("actuator", ours, heartbeat="state", on_silent=lambda _: None)
     host = NodeHost(theirs, CLOCK, Echo(), get_status=lambda: 0, on_disconnect=disconnected.set)
     host.start()
     proxy.close(5)
@@ -276,7 +326,7 @@ def test_sending_without_a_reader_does_not_block() -> None:
 def test_a_pipe_that_was_never_started_closes() -> None:
     """A pipe that was never started can be closed, which the other end notices."""
     ours, theirs = multiprocessing.Pipe()
-    proxy = RemoteNodeProxy("actuator", ours)
+    proxy = RemoteNodeProxy("actuator", ours, heartbeat="state", on_silent=lambda _: None)
     proxy.close(1)
     with pytest.raises(EOFError):
         theirs.recv_bytes()

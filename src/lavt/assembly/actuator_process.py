@@ -7,6 +7,7 @@ vehicle's own watchdog brakes.
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import signal
 import threading
@@ -21,7 +22,9 @@ from lavt.clock import Clock, MachineClock
 from lavt.config import ServerConfig
 from lavt.domain import NS_PER_S
 from lavt.errors import UserError, WorkError
+from lavt.nodes.payloads import Event
 from lavt.runtime import process_priority
+from lavt.runtime.realtime import RealRuntime
 from lavt.runtime.remote_node import NodeHost, RemoteNodeProxy
 from lavt.vehicle.dbw.vehicle import DbwVehicle
 
@@ -31,16 +34,20 @@ STOP_TIMEOUT_S = 12.0
 """How long the vehicle may take to stop and disengage when the server ends; after an implausible speed it brakes for at
 least 8 s."""
 POLL_PERIOD_S = 0.05
+LONGEST_END_S = 11
+"""The process is killed by its own alarm this long after the server's end, even if its node is stuck by then."""
 IGNORED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Signals that all processes of a terminal or service receive; the server's process handles them, and its end is
 detected."""
+
+log = logging.getLogger(__name__)
 
 
 class ActuatorProcess(RemoteNodeProxy):
     """The server's handle of the actuator's process."""
 
     def __init__(self, process: BaseProcess, connection: Connection) -> None:
-        super().__init__(NAME, connection)
+        super().__init__(NAME, connection, heartbeat="state", on_silent=_record_silence)
         self._process = process
 
     @property
@@ -58,6 +65,13 @@ class ActuatorProcess(RemoteNodeProxy):
         self._process.join(1)
         if self._process.is_alive():  # it is frozen: it sends no frame, and the vehicle brakes by itself
             self._process.kill()
+
+
+def _record_silence(runtime: RealRuntime) -> None:
+    """Record that the actuator's process reports no state any more."""
+    now = runtime.now()
+    log.warning("the process of the %s reports no state", NAME)
+    runtime.record("event", Event(now.mono_ns, "silent", f"the process of the {NAME} reports no state"), now)
 
 
 def start_actuator(config: ServerConfig, *, host: str, video_port: int) -> ActuatorProcess:
@@ -103,6 +117,7 @@ def serve_actuator(connection: Connection, config: ServerConfig, host: str, vide
     try:
         while not disconnected.wait(POLL_PERIOD_S) and not host_of_node.runtime.stopped.is_set():
             pass
+        signal.alarm(LONGEST_END_S)
         host_of_node.deliver("server_ends", None)
         _wait_until_disengaged(host_of_node, vehicle, clock)
     finally:

@@ -7,6 +7,7 @@ nodes. Both use the same clocks, since they run on one machine.
 from __future__ import annotations
 
 import itertools
+import threading
 from collections import Counter
 from collections.abc import Callable
 from multiprocessing.connection import Connection
@@ -25,6 +26,15 @@ LATE_NS: Final = 60 * NS_PER_MS
 MAX_PENDING_PEERS: Final = 64
 """The last peers to which replies can be sent."""
 CLOSE_S: Final = 1.0
+CHECK_S: Final = 0.05
+"""Period at which the node's heartbeat is checked. Only checks are counted: a process that was frozen itself counts
+one."""
+START_CHECKS: Final = 600
+"""Checks that may pass until the first heartbeat: 30 s."""
+SILENT_CHECKS: Final = 2
+"""Checks without a heartbeat after which the node is silent: 0.1 s."""
+FAILED_CHECKS: Final = 10
+"""Checks without a heartbeat after which the node has failed: 0.5 s."""
 END: Final = ("end",)
 
 Report = tuple[Any, ...]
@@ -33,10 +43,21 @@ topic, payload, when), ("status", the result of `get_status`), ("failed", reason
 
 
 class RemoteNodeProxy:
-    """The proxy of a node in another process: it forwards messages to that process and executes its reports."""
+    """The proxy of a node in another process: it forwards messages to that process and executes its reports.
 
-    def __init__(self, name: str, connection: Connection) -> None:
+    `heartbeat` is a topic that the node records all the time. `on_silent` is called when it has not done so for 0.1 s;
+    after 0.5 s the node has failed, which ends the run.
+    """
+
+    def __init__(
+        self, name: str, connection: Connection, *, heartbeat: str, on_silent: Callable[[RealRuntime], None]
+    ) -> None:
         self.name = name
+        self._heartbeat, self._on_silent = heartbeat, on_silent
+        self._missed = -START_CHECKS
+        """Checks without a heartbeat; negative before the first one."""
+        self._closing = threading.Event()
+        self._checker = threading.Thread(target=self._check_heartbeats, name=f"{name}'s heartbeat", daemon=True)
         self.status: Any = None
         """The last status that the node's process reported."""
         self._pipe = Pipe(connection, self._receive, self._on_closed)
@@ -44,12 +65,12 @@ class RemoteNodeProxy:
         self._peers: dict[int, Peer] = {}
         """The peers by number, set and taken by different threads."""
         self._numbers = itertools.count(1)
-        self._is_closing = False
 
     def start(self, runtime: RealRuntime) -> None:
         """Start to forward messages."""
         self._runtime = runtime
         self._pipe.start()
+        self._checker.start()
 
     def put(self, message: Message) -> None:
         """Forward a message to the node's process."""
@@ -62,7 +83,7 @@ class RemoteNodeProxy:
 
     def close(self, wait_s: float) -> None:
         """End the node's process, and process its remaining reports for at most `wait_s`."""
-        self._is_closing = True
+        self._closing.set()
         self._pipe.send(END)
         self._pipe.wait_closed(wait_s)
         self._pipe.close(CLOSE_S)
@@ -76,6 +97,8 @@ class RemoteNodeProxy:
             return
         kind, *rest = report
         if kind == "record":
+            if rest[0] == self._heartbeat:
+                self._missed = 0
             runtime.record(*rest)
         elif kind == "send":
             carrier, sends, when = rest
@@ -89,11 +112,26 @@ class RemoteNodeProxy:
         elif kind == "failed":
             runtime.fail(WorkError(rest[0]))
 
+    def _check_heartbeats(self) -> None:
+        while not self._closing.wait(CHECK_S):
+            self.check_heartbeat()
+
+    def check_heartbeat(self) -> None:
+        """Count a check without a heartbeat; the next heartbeat resets the count."""
+        runtime = self._runtime
+        if runtime is None:
+            return
+        self._missed += 1
+        if self._missed == SILENT_CHECKS:
+            self._on_silent(runtime)
+        if self._missed in {0, FAILED_CHECKS}:
+            runtime.fail(WorkError(f"the process of the {self.name} does not respond"))
+
     def _with_peer(self, send: Send) -> Send:
         return send if send.peer is None else Send(send.channel, send.payload, self._peers.pop(send.peer, None))
 
     def _on_closed(self) -> None:
-        if not self._is_closing and self._runtime is not None:
+        if not self._closing.is_set() and self._runtime is not None:
             self._runtime.fail(WorkError(f"the process of the {self.name} has ended"))
 
 

@@ -26,7 +26,14 @@ class ReceivedCanFrame:
 
 
 class BusGone(Exception):
-    """Raised when the bus cannot be written to or read from; the message gives the reason."""
+    """Raised when the bus cannot be written to or read from; the message gives the reason.
+
+    `written` is the number of frames that were written before.
+    """
+
+    def __init__(self, reason: str, written: int = 0) -> None:
+        super().__init__(reason)
+        self.written = written
 
 
 class BusPort(Protocol):
@@ -37,8 +44,11 @@ class BusPort(Protocol):
         """Event counters by name."""
         ...
 
-    def send(self, frames: Sequence[CanFrame], made_ns: int) -> None:
-        """Send frames made at `made_ns`, in order and without blocking. Raises `BusGone`."""
+    def send(self, frames: Sequence[CanFrame], made_ns: int) -> int:
+        """Send frames made at `made_ns`, in order and without blocking; return how many. Raises `BusGone`.
+
+        If a frame cannot be sent, the ones after it are not sent either.
+        """
         ...
 
     def take(self, now_ns: int) -> list[ReceivedCanFrame]:

@@ -69,6 +69,8 @@ class AdapterRig:
         self.is_ticking, self.is_cut = True, False
         self.spoil: Callable[[CanFrame], CanFrame | None] = lambda frame: frame
         self.lose_report: Callable[[CanFrame], bool] = lambda _: False
+        self.dropped_frames = 0
+        """Number of frames at the end of each set that the port does not write."""
         self.sent: list[tuple[int, CanFrame]] = []
         self.moments: list[Moment] = []
         self.events: list[VehicleEvent] = []
@@ -96,6 +98,16 @@ class AdapterRig:
             self.run_ms(step_ms, step_ms=step_ms)
         raise AssertionError(f"not in {limit_ms} ms: {self.adapter.state()}")
 
+    def stall_ms(self, duration_ms: int) -> None:
+        """Let the car run for a time in which the adapter does not; then it gets the reports, with their times."""
+        waiting = []
+        for _ in range(duration_ms):
+            self.now_ns += NS_PER_MS
+            waiting += [(frame, self.now_ns) for frame in self.car.advance(self.now_ns)]
+        for frame, arrived_ns in waiting:
+            self.adapter.receive(frame, arrived_ns)
+        self._step()
+
     def _step(self) -> None:
         for frame in self.car.advance(self.now_ns):
             if not self.is_cut and not self.lose_report(frame):
@@ -103,7 +115,10 @@ class AdapterRig:
         if self.is_ticking and self.now_ns >= self._next_tick_ns:
             self._next_tick_ns = self.now_ns + self.tick_ns
             self.adapter.set_actuation(self.actuation, self.now_ns)
-        for frame in self.adapter.frames_due(self.now_ns):
+        frames = self.adapter.frames_due(self.now_ns)
+        written = len(frames) - min(self.dropped_frames, len(frames))
+        self.adapter.on_dropped(frames[written:])
+        for frame in frames[:written]:
             self.sent.append((self.now_ns, frame))
             if not self.is_cut and (spoiled := self.spoil(frame)) is not None:
                 self.car.receive(spoiled, self.now_ns)

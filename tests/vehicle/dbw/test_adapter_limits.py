@@ -12,6 +12,8 @@ from hypothesis import strategies as st
 from tests.vehicle.dbw.rig import COARSE_MS, AdapterRig, both, driving, profile, started, with_limits
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation
+from lavt.vehicle.can_frame import CanFrame
+from lavt.vehicle.dbw.crc8 import frame_crc8
 from lavt.vehicle.dbw.profile import LEAST_GAP_NS, PERIOD_NS, TICK_LIMIT_NS, ByWireLimits
 from lavt.vehicle.dbw.sending import DriveCommand, apply_limits
 from lavt.vehicle.sim.rendering.cars import LINCOLN_MKZ
@@ -82,6 +84,8 @@ def test_nothing_is_sent_before_the_first_tick(generation: int) -> None:
     assert (rig.sent, rig.adapter.tick_ns) == ([], None)
     assert rig.adapter.counts["ticks_missed"] == 1
     rig.is_ticking = True
+    rig.adapter.engage(False, rig.now_ns)
+    rig.adapter.engage(True, rig.now_ns)
     rig.run_ms(COARSE_MS, step_ms=COARSE_MS)
     assert rig.sent
 
@@ -141,15 +145,17 @@ def test_steering_starts_at_the_reported_angle(generation: int) -> None:
 any_number = st.floats(allow_nan=False, allow_infinity=False)
 requested = st.builds(DriveCommand, any_number, any_number, any_number)
 allowed = st.builds(DriveCommand, st.floats(-400, 400), st.floats(0, 0.6), st.floats(0, 0.8))
+any_wheel = st.builds(DriveCommand, st.floats(-3276, 3276), st.floats(0, 0.6), st.floats(0, 0.8))
 
 
-@given(requested, allowed, st.integers(0, 10 * NS_PER_S))
+@given(requested, any_wheel, st.integers(0, 10 * NS_PER_S))
 def test_limits_hold_for_any_request(wanted: DriveCommand, before: DriveCommand, passed_ns: int) -> None:
-    """For any request the limited command is in range and no faster than the rates over at most 60 ms."""
+    """For any request and any wheel the limited command is in range, and from there no faster than the rates."""
     found = apply_limits(LIMITS, wanted, before, passed_ns)
     passed_s = min(passed_ns, TICK_LIMIT_NS) / NS_PER_S
     assert abs(found.wheel_deg) <= 400.0
-    assert abs(found.wheel_deg - before.wheel_deg) <= 300.0 * passed_s + 1e-9
+    nearest_deg = min(max(before.wheel_deg, -400.0), 400.0)
+    assert abs(found.wheel_deg - nearest_deg) <= 300.0 * passed_s + 1e-9
     assert 0.0 <= found.throttle <= min(0.6, before.throttle + 2.0 * passed_s)
     assert 0.0 <= found.brake <= min(0.8, before.brake + 5.0 * passed_s)
 
@@ -182,3 +188,52 @@ def test_limits_are_the_simulators(name: str) -> None:
     assert known.road_rad(known.limits.steering_wheel_deg) == pytest.approx(LINCOLN_MKZ.max_steering_rad, abs=1e-3)
     rate_radps = known.road_rad(known.limits.steering_wheel_rate_degps)
     assert rate_radps == pytest.approx(LINCOLN_MKZ.max_steering_rate_radps, abs=2e-3)
+
+
+@both
+@pytest.mark.parametrize("wheel_deg", [435.5, -540.0, 600.0])
+def test_a_wheel_beyond_the_limit_inhibits(generation: int, wheel_deg: float) -> None:
+    """A stationary car whose wheel is beyond the limit is not engaged; turned back, it is."""
+    rig = started(generation)
+    turn_wheel(rig, wheel_deg)
+    rig.adapter.engage(True, rig.now_ns)
+    rig.run_ms(300, step_ms=COARSE_MS)
+    assert (rig.state, rig.sent) == ("idle", [])
+    assert "beyond the limit" in rig.adapter.state().inhibit_reason
+    rig.lose_report = lambda _: False
+    rig.run_until(lambda rig: rig.state == "engaged")
+    assert rig.adapter.state().inhibit_reason == ""
+
+
+@both
+@pytest.mark.parametrize("wheel_deg", [-540.0, 600.0])
+def test_a_wheel_beyond_the_limit_is_never_commanded(generation: int, wheel_deg: float) -> None:
+    """A wheel that is turned too far while the kit is engaged is commanded to no angle beyond the limit."""
+    rig = started(generation)
+    rig.adapter.engage(True, rig.now_ns)
+    rig.run_until(lambda rig: rig.state == "clearing")
+    turn_wheel(rig, wheel_deg)
+    rig.run_until(lambda rig: rig.state == "engaged")
+    rig.run_ms(100)
+    angles = [abs(angle_deg) for _, angle_deg in angles_deg(rig)]
+    assert 400.0 < max(angles) <= 435.0
+
+
+def turn_wheel(rig: AdapterRig, wheel_deg: float) -> None:
+    """Forge the steering reports: they have another angle."""
+    tenths = round(wheel_deg * 10)
+
+    def forge(frame: CanFrame) -> bool:
+        if frame.identifier == 0x065:
+            data = tenths.to_bytes(2, "little", signed=True) + frame.data[2:]
+        elif frame.identifier == 0x100:
+            data = (tenths & 0x3FFF | int.from_bytes(frame.data[:2], "little") & 0xC000).to_bytes(2, "little")
+            data += frame.data[2:-1]
+            data += bytes([frame_crc8(0x100, data)])
+        else:
+            return False
+        rig.adapter.receive(CanFrame(frame.identifier, data), rig.now_ns)
+        return True
+
+    rig.lose_report = forge
+    rig.run_ms(20)

@@ -194,7 +194,7 @@ def test_too_old_while_writing(opened: Callable[..., CanPort], raw: can.BusABC) 
     clock = ManualClock(0)
     port = opened(clock=clock)
     clock.step_ns = 25 * NS_PER_MS
-    port.send([STEERING, BRAKE, STEERING, BRAKE], 0)
+    assert port.send([STEERING, BRAKE, STEERING, BRAKE], 0) == 2
     assert [getattr(raw.recv(0), "arbitration_id", None) for _ in range(3)] == [0x064, 0x060, None]
     assert port.counts["frames_too_old"] == 2
 
@@ -324,11 +324,12 @@ def test_not_written(opened: Callable[..., CanPort], device: Device, error: Exce
     """A failed write raises an error at once; after a full buffer the same bus is used, otherwise it is reopened."""
     port = opened("breakable", "stick", clock=ManualClock(0))
     device.send_error = error
-    with pytest.raises(BusGone, match=r"breakable stick cannot be written to"):
+    with pytest.raises(BusGone, match=r"breakable stick cannot be written to") as raised:
         port.send([STEERING], 0)
+    assert raised.value.written == 0
     device.send_error = None
     if is_temporary:
-        port.send([STEERING], 0)
+        assert port.send([STEERING], 0) == 1
     else:
         with pytest.raises(BusGone):
             port.send([STEERING], 0)

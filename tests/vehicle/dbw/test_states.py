@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
+from collections.abc import Iterator
+from dataclasses import fields, replace
+from itertools import chain, combinations, product
+from typing import Any, get_args
 
 import pytest
 
 from lavt.domain import NS_PER_MS
+from lavt.vehicle.dbw import states
 from lavt.vehicle.dbw.adapter import SEPARATOR
 from lavt.vehicle.dbw.profile import AXES, Axis
-from lavt.vehicle.dbw.states import TABLE, Situation, State, next_state
+from lavt.vehicle.dbw.states import TABLE, Situation, State, TransitionRow, next_state, states_after
 
 ALL: frozenset[Axis] = frozenset(AXES)
 NONE: frozenset[Axis] = frozenset()
@@ -119,7 +122,13 @@ ROWS: list[tuple[State, dict[str, Any], State]] = [
     *(("parking", {"enabled": frozenset({axis}), "in_state_ns": LIMIT_NS}, "parking") for axis in AXES),
     ("lost", {"enabled": NONE, "in_state_ns": LIMIT_NS}, "lost"),
     ("lost", NOT_WANTED, "parking"),
-    *(("lost", {"wanted": False, "enabled": frozenset({axis})}, "parking") for axis in AXES),
+    ("lost", {**NOT_WANTED, "enabled": frozenset({"brake"})}, "parking"),
+    ("lost", {**NOT_WANTED, "enabled": ALL - {"brake"}}, "lost"),
+    ("lost", {**NOT_WANTED, "since_sent_ns": TIMEOUT_NS - 1}, "parking"),
+    ("lost", {**NOT_WANTED, "since_sent_ns": TIMEOUT_NS}, "lost"),
+    ("lost", {**RELEASED, "since_sent_ns": TIMEOUT_NS}, "idle"),
+    ("parking", {**RELEASED, "since_sent_ns": TIMEOUT_NS}, "parking"),
+    *(("parking", {"enabled": frozenset({axis}), "since_sent_ns": TIMEOUT_NS}, "lost") for axis in AXES),
     ("lost", {**NOT_WANTED, "missing_reports": "u"}, "lost"),
     ("lost", RELEASED, "idle"),
     ("lost", {**RELEASED, "is_stationary": False}, "idle"),
@@ -206,3 +215,62 @@ def test_a_gear_that_was_not_reached_is_named() -> None:
     assert "park" in reason("enabling", enabled=ALL, in_state_ns=LIMIT_NS)
     assert "gear" not in reason("enabling", gear="drive", in_state_ns=LIMIT_NS)
     assert "gear" not in reason("clearing", in_state_ns=LIMIT_NS, trips="TRIP")
+
+
+AXIS_SETS = [frozenset(axes) for axes in chain.from_iterable(combinations(AXES, size) for size in range(4))]
+CHOICES: dict[str, tuple[Any, ...]] = {
+    "wanted": (False, True),
+    "is_stationary": (False, True),
+    "inhibit_reason": ("", "i"),
+    "missing_reports": ("", "m"),
+    "since_sent_ns": (TIMEOUT_NS - 1, TIMEOUT_NS),
+    "faults": ("", "f"),
+    "overrides": ("", "o"),
+    "trips": ("", "t"),
+    "command_errors": ("", "c"),
+    "reasons": ("",),
+    "enabled": tuple(AXIS_SETS),
+    "gear": ("drive", "park"),
+    "in_state_ns": (0, PAUSE_NS, LIMIT_NS),
+}
+"""Inputs on either side of every condition in the table."""
+
+
+def situations() -> Iterator[Situation]:
+    return (Situation(*values) for values in product(*CHOICES.values()))
+
+
+def test_no_states_follow_each_other_in_a_cycle_at_one_instant() -> None:
+    """With any inputs, the transitions of one instant end, and no state is reached twice by them."""
+    assert list(CHOICES) == [field.name for field in fields(Situation)]
+    for now in situations():
+        at_once = replace(now, in_state_ns=0)
+        following = {state: next_state(state, at_once)[0] for state in get_args(State)}
+        for state in get_args(State):
+            path = [state, next_state(state, now)[0]]
+            while path[-1] != following[path[-1]]:
+                path.append(following[path[-1]])
+                assert len(path) <= len(following), (path, now)
+            assert len(set(path[1:])) == len(path[1:]), (path, now)
+            assert state not in path[2:], (path, now)
+
+
+def test_transitions_of_one_instant_follow_the_table() -> None:
+    """The states of one instant are those that the table gives one after another, with its reasons."""
+    stalled = replace(STAYS["parking"], since_sent_ns=TIMEOUT_NS)
+    (lost,) = states_after("parking", stalled)
+    assert lost == next_state("parking", stalled)
+    missed = replace(GOOD, wanted=False, enabled=NONE, in_state_ns=LIMIT_NS)
+    assert [state for state, _ in states_after("engaged", missed)] == ["lost", "idle"]
+    assert states_after("idle", STAYS["idle"]) == []
+
+
+def test_a_cycle_in_the_table_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Even with a table that has a cycle, no state is reached twice at one instant."""
+    cycle = (
+        TransitionRow(("engaged",), "", lambda _: True, "lost"),
+        TransitionRow(("lost",), "", lambda _: True, "parking"),
+        TransitionRow(("parking",), "", lambda _: True, "lost"),
+    )
+    monkeypatch.setattr(states, "TABLE", cycle)
+    assert [state for state, _ in states_after("engaged", GOOD)] == ["lost", "parking"]

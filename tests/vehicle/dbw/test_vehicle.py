@@ -30,10 +30,11 @@ class StandInPort:
         self.taken_ns = 0
         self.is_gone = self.is_closed = False
 
-    def send(self, frames: Sequence[CanFrame], made_ns: int) -> None:
+    def send(self, frames: Sequence[CanFrame], made_ns: int) -> int:
         """Record frames with the time at which they were made."""
         self._check()
         self.sent += [(frame, made_ns) for frame in frames]
+        return len(frames)
 
     def take(self, now_ns: int) -> list[ReceivedCanFrame]:
         """Return the waiting frames once, and record the time."""
@@ -168,6 +169,29 @@ def test_write_fails(port: StandInPort, monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(port, "send", fail)
     vehicle.apply(Actuation(0.0, 0.0, 0.0), START_NS + 2)
     assert "no more room" in vehicle.state().inhibit_reason
+
+
+@pytest.mark.parametrize("is_gone", [False, True])
+@pytest.mark.parametrize("written", [0, 1, 2])
+def test_frames_that_were_not_written(
+    port: StandInPort, monkeypatch: pytest.MonkeyPatch, written: int, is_gone: bool
+) -> None:
+    """The adapter gets the frames back that the port did not write, also if the bus is gone meanwhile."""
+    vehicle = made(port)
+    frames = [CanFrame(number, bytes(8)) for number in range(3)]
+    dropped: list[CanFrame] = []
+
+    def send(*_: object) -> int:
+        if is_gone:
+            raise BusGone("no more room", written)
+        return written
+
+    monkeypatch.setattr(port, "send", send)
+    monkeypatch.setattr(vehicle._adapter, "frames_due", lambda _: frames)
+    monkeypatch.setattr(vehicle._adapter, "on_dropped", dropped.extend)
+    vehicle.apply(Actuation(0.0, 0.0, 0.0), START_NS + 2)
+    assert dropped == frames[written:]
+    assert ("no more room" in vehicle.state().inhibit_reason) is is_gone
 
 
 def test_delegation(port: StandInPort) -> None:

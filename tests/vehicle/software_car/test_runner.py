@@ -27,11 +27,12 @@ class Bus:
         self.gone_reason = ""
         self.counts: dict[str, int] = {}
 
-    def send(self, frames: Sequence[CanFrame], made_ns: int) -> None:
+    def send(self, frames: Sequence[CanFrame], made_ns: int) -> int:
         """Record frames."""
         if self.gone_reason:
             raise BusGone(self.gone_reason)
         self.sent += [(frame, made_ns) for frame in frames]
+        return len(frames)
 
     def take(self, _now_ns: int) -> list[ReceivedCanFrame]:
         """Return the incoming frames."""

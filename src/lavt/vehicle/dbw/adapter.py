@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Final
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation, VehicleEvent, VehicleState
@@ -17,12 +18,13 @@ from lavt.vehicle.dbw.profile import (
     PERIOD_NS,
     TICK_LIMIT_NS,
     Axis,
+    Gear,
     Profile,
 )
 from lavt.vehicle.dbw.reports import NewestReports
 from lavt.vehicle.dbw.sending import DriveCommand, FrameSender, KitCommands
 from lavt.vehicle.dbw.speed_monitor import Pedals, SpeedMonitor
-from lavt.vehicle.dbw.states import ENABLING_LIMIT_NS, Situation, State, next_state
+from lavt.vehicle.dbw.states import ENABLING_LIMIT_NS, Situation, State, states_after
 from lavt.vehicle.vehicle import ReachedCommand
 
 SHIFT_REPORT_LIMIT_NS: Final = NS_PER_S
@@ -60,6 +62,9 @@ class ByWireAdapter:
         self._wanted, self._bus_error = False, ""
         self._still_enabled: frozenset[Axis] = NO_AXES
         """Axes that were enabled when driving ended and still are."""
+        self._needed_axes = frozenset({"brake"}) if profile.system is None else frozenset(AXES)
+        """Without these axes no command is sent any more: a kit that is enabled as a whole releases the brake as well,
+        without braking by itself, when another axis is commanded to be disabled."""
         self._moved_ns = start_ns
         """Time of the last report that the car moves."""
         self._is_shifting = False
@@ -117,28 +122,24 @@ class ByWireAdapter:
     # State machine.
 
     def _update_state(self, now_ns: int) -> None:
-        """Apply transitions until none matches."""
+        """Apply the transitions of this instant."""
         self._now_ns = now_ns
         self._check_speed(now_ns)
         has_timed_out = now_ns - self._sender.sent_ns >= COMMAND_TIMEOUT_NS
-        still_enabled = NO_AXES if has_timed_out else self._reports.enabled  # reports may have waited for us
-        self._still_enabled &= still_enabled
+        enabled = NO_AXES if has_timed_out else self._reports.enabled  # reports may have waited for us
+        self._still_enabled = enabled & self._still_enabled if self._state in {"lost", "parking"} else enabled
         self._is_shifting &= self._reports.gear != "drive"
         if not self._is_stationary():
             self._moved_ns = now_ns
         self._record_new_problems(now_ns)
-        while True:
-            self._situation = self._current_situation(now_ns)
-            state, reason = next_state(self._state, self._situation)
-            if state == self._state:
-                return
+        self._situation = self._current_situation(now_ns)
+        for state, reason in states_after(self._state, self._situation):
             if state in {"lost", "overridden"}:
                 self._stop_reason = reason
                 if not self._known_problems.issuperset(reason.split(SEPARATOR)):
                     self._events.append(VehicleEvent(now_ns, "fault", reason))
-            if state in {"lost", "parking"}:
-                self._still_enabled = still_enabled
             self._state, self._entered_ns = state, now_ns
+            self._situation = replace(self._situation, in_state_ns=0)
 
     def _is_stationary(self) -> bool:
         return self._speed.is_stationary and self._speed.fault is None
@@ -162,7 +163,7 @@ class ByWireAdapter:
         return Situation(
             wanted=self._wanted,
             is_stationary=self._is_stationary(),
-            inhibit_reason=_join([self._installation, missing_reports, faults]),
+            inhibit_reason=_join([self._installation, missing_reports, faults, self._turned_too_far()]),
             missing_reports=missing_reports,
             since_sent_ns=now_ns - self._sender.sent_ns,
             faults=faults,
@@ -174,6 +175,13 @@ class ByWireAdapter:
             gear=reports.gear,
             in_state_ns=now_ns - self._entered_ns,
         )
+
+    def _turned_too_far(self) -> str:
+        """Return a text if the wheel is beyond its limit before driving; while driving, the kit turns it back."""
+        limit_deg, wheel_deg = self._profile.limits.steering_wheel_deg, self._reports.wheel_deg
+        if self._state == "engaged" or abs(wheel_deg) <= limit_deg:
+            return ""
+        return f"the steering wheel is at {wheel_deg:.1f} deg, beyond the limit of {limit_deg:g} deg"
 
     def _record_new_problems(self, now_ns: int) -> None:
         """Emit an event for each newly reported problem."""
@@ -207,6 +215,11 @@ class ByWireAdapter:
         self._expect_echo(commands)
         return frames
 
+    def on_dropped(self, frames: Sequence[CanFrame]) -> None:
+        """Note that these last ones of the frames that were due were not written."""
+        if frames:
+            self._sender.take_back(frames)
+
     def _is_fresh(self, now_ns: int) -> bool:
         return self._requested_ns is not None and now_ns - self._requested_ns <= TICK_LIMIT_NS
 
@@ -229,22 +242,27 @@ class ByWireAdapter:
         if self._state == "engaged":
             return KitCommands(everything, system="enable")
         if self._state == "lost":
-            return KitCommands(self._still_enabled, system="enable" if self._still_enabled else "")
+            return self._remaining_commands()
         if self._state == "parking":
             return self._parking_commands()
         return KitCommands(NO_AXES) if self._state == "overridden" else None
 
-    def _parking_commands(self) -> KitCommands:
+    def _parking_commands(self) -> KitCommands | None:
         """Return the commands to brake, then shift to PARK, then disengage: a kit disengaged in gear trips."""
         is_shifting = self._is_shifting and self._now_ns - self._entered_ns < SHIFT_REPORT_LIMIT_NS
         if self._reports.gear == "park" and not is_shifting:
             return KitCommands(NO_AXES, system="disable")
         may_park = self._now_ns - self._moved_ns >= STATIONARY_BEFORE_PARK_NS
-        return KitCommands(
-            self._still_enabled,
-            gear="park" if may_park and self._still_enabled else None,
-            system="enable" if self._still_enabled else "",
-        )
+        return self._remaining_commands("park" if may_park else None)
+
+    def _remaining_commands(self, gear: Gear | None = None) -> KitCommands | None:
+        """Return the commands to the axes that are still enabled.
+
+        Return None without the axes needed to brake: without commands, the kit's watchdog brakes.
+        """
+        if not self._needed_axes <= self._still_enabled:
+            return None
+        return KitCommands(self._still_enabled, gear=gear, system="enable")
 
     def _drive_command(self) -> DriveCommand:
         """Return the drive command of the current state, before the limits."""

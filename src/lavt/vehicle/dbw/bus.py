@@ -74,25 +74,27 @@ class CanPort:
         self.counts: Counter[str] = Counter()
         self._open()
 
-    def send(self, frames: Sequence[CanFrame], made_ns: int) -> None:
+    def send(self, frames: Sequence[CanFrame], made_ns: int) -> int:
         """Write frames made at `made_ns`, in order and without blocking, but none older than `TICK_LIMIT_NS`.
 
-        The age is checked right before each write. Raises `BusGone` without writing the remaining frames.
+        Return how many were written. The age is checked right before each write. Raises `BusGone` without writing the
+        remaining frames.
         """
-        for frame in frames:
+        for written, frame in enumerate(frames):
             if self._bus is None:
-                raise BusGone(self._gone_reason)
+                raise BusGone(self._gone_reason, written)
             message = self._message(frame)
             if self._clock.now().mono_ns - made_ns > TICK_LIMIT_NS:
-                self.counts["frames_too_old"] += 1
-                continue
+                self.counts["frames_too_old"] += len(frames) - written
+                return written
             try:
                 self._bus.send(message, timeout=0)
             except Exception as error:  # of any driver
                 reason = f"{self._interface} {self._channel} cannot be written to ({_error_text(error)})"
                 if _error_number(error) not in TEMPORARY_ERRORS:
                     self._lose(reason)
-                raise BusGone(reason) from error
+                raise BusGone(reason, written) from error
+        return len(frames)
 
     def take(self, now_ns: int) -> list[ReceivedCanFrame]:
         """Return the frames received since the last call, in order, without own frames.

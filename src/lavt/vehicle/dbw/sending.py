@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from typing import Literal
 
 from lavt.domain import NS_PER_MS, NS_PER_S
@@ -38,15 +39,27 @@ class DriveCommand:
 
 
 def apply_limits(limits: ByWireLimits, requested: DriveCommand, before: DriveCommand, passed_ns: int) -> DriveCommand:
-    """Limit `requested`, `passed_ns` after `before` was sent; a brake request zeroes the throttle."""
+    """Limit `requested`, `passed_ns` after `before` was sent; a brake request zeroes the throttle.
+
+    The limit of the angle counts more than that of its rate: a wheel that was turned beyond it is not commanded there.
+    """
     passed_s = min(passed_ns, TICK_LIMIT_NS) / NS_PER_S
     turn_deg = limits.steering_wheel_rate_degps * passed_s
-    wheel_deg = _within(requested.wheel_deg, -limits.steering_wheel_deg, limits.steering_wheel_deg)
+    wheel_deg = _within(requested.wheel_deg, before.wheel_deg - turn_deg, before.wheel_deg + turn_deg)
     throttle = 0.0 if requested.brake > 0 else requested.throttle
     return DriveCommand(
-        _within(wheel_deg, before.wheel_deg - turn_deg, before.wheel_deg + turn_deg),
+        _within(wheel_deg, -limits.steering_wheel_deg, limits.steering_wheel_deg),
         _within(throttle, 0.0, min(limits.throttle, before.throttle + limits.throttle_rate_per_s * passed_s)),
         _within(requested.brake, 0.0, min(limits.brake, before.brake + limits.brake_rate_per_s * passed_s)),
+    )
+
+
+def _choose(axes: AbstractSet[Axis], chosen: DriveCommand, other: DriveCommand) -> DriveCommand:
+    """Return a command with the values of `chosen` for `axes`, and of `other` for the remaining ones."""
+    return DriveCommand(
+        (chosen if "steering" in axes else other).wheel_deg,
+        (chosen if "throttle" in axes else other).throttle,
+        (chosen if "brake" in axes else other).brake,
     )
 
 
@@ -67,10 +80,14 @@ class FrameSender:
         self._frame_counts: Counter[str] = Counter()
         """Number of frames per message, for its counter."""
         self._gear_ns: int | None = None
+        self._before: tuple[DriveCommand, int, int | None] = self.sent, start_ns, None
+        """`sent`, `sent_ns` and `_gear_ns` before the last set."""
+        self._messages = {(facts.identifier, facts.is_extended): facts for facts in profile.codec.messages.values()}
 
     def frames(self, commands: KitCommands, requested: DriveCommand, wheel_deg: float, now_ns: int) -> list[CanFrame]:
         """Return a set of frames. Steering starts from the reported angle `wheel_deg` once it is enabled."""
         profile, passed_ns = self._profile, now_ns - self.sent_ns
+        self._before = self.sent, self.sent_ns, self._gear_ns
         self.sent_ns = now_ns
         self.counts["sets"] += 1
         if commands.is_clearing:
@@ -78,11 +95,7 @@ class FrameSender:
             return self._clearing_frames()
         allowed = apply_limits(profile.limits, requested, self.sent, passed_ns)
         self._count_limits(requested, allowed, commands.enabled)
-        self.sent = DriveCommand(
-            allowed.wheel_deg if "steering" in commands.enabled else wheel_deg,
-            allowed.throttle if "throttle" in commands.enabled else 0.0,
-            allowed.brake if "brake" in commands.enabled else 0.0,
-        )
+        self.sent = _choose(commands.enabled, allowed, DriveCommand(wheel_deg, 0.0, 0.0))
         values = {"steering": allowed.wheel_deg, "brake": allowed.brake, "throttle": allowed.throttle}
         frames = [self.axis_frame(axis, values[axis], is_enabled=axis in commands.enabled) for axis in AXES]
         if commands.system and profile.system is not None:
@@ -93,6 +106,19 @@ class FrameSender:
             self._gear_ns = now_ns
             frames.append(self.gear_frame(commands.gear))
         return frames
+
+    def take_back(self, dropped: Sequence[CanFrame]) -> None:
+        """Take back these last frames of the last set, which were not written: a counter's gap disengages a kit."""
+        sent, sent_ns, self._gear_ns = self._before
+        axes = set(AXES)
+        for frame in dropped:
+            facts = self._messages[frame.identifier, frame.is_extended]
+            axes -= {axis for axis in AXES if self._profile.axes[axis].message == facts.name}
+            if len(frame.data) == facts.length:  # shorter ones have no counter
+                self._frame_counts[facts.name] -= 1
+        self.sent = _choose(axes, self.sent, sent)
+        if not axes:
+            self.sent_ns = sent_ns
 
     def axis_frame(self, axis: Axis, number: float, *, is_enabled: bool) -> CanFrame:
         """Return an axis's command: degrees of the steering wheel, or the fraction of a pedal."""

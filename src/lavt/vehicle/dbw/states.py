@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Final, Literal
 
 from lavt.domain import NS_PER_MS, NS_PER_S
@@ -25,9 +26,10 @@ SENT_IN_STATE: Final[dict[State, str]] = {
     "enabling": "all axes enabled, throttle 0, the holding brake; DRIVE once all axes are reported enabled",
     "engaged": "the requested actuation",
     "parking": "requested steering and brake, at least the holding brake, throttle 0; PARK once the car was stationary "
-    "for 300 ms; then no axis enabled",
+    "for 300 ms; then no axis enabled. Before PARK, nothing once the brake, or any axis of generation 2, is released",
     "overridden": "no axis enabled",
-    "lost": "requested steering and brake, throttle 0, on the axes that are still enabled",
+    "lost": "requested steering and brake, throttle 0, on the axes that are still enabled; nothing once the brake, or "
+    "any axis of generation 2, is released",
 }
 """Frames sent in each state."""
 
@@ -113,9 +115,15 @@ TABLE: Final[tuple[TransitionRow, ...]] = (
         "lost",
     ),
     TransitionRow(
-        ("enabling", "engaged", "parking"),
+        ("enabling", "engaged"),
         "no command was sent for 100 ms",
         lambda now: now.since_sent_ns >= COMMAND_TIMEOUT_NS,
+        "lost",
+    ),
+    TransitionRow(
+        ("parking",),
+        "no command was sent for 100 ms, and an axis is reported enabled",
+        lambda now: now.since_sent_ns >= COMMAND_TIMEOUT_NS and bool(now.enabled),
         "lost",
     ),
     TransitionRow(
@@ -164,14 +172,20 @@ TABLE: Final[tuple[TransitionRow, ...]] = (
     ),
     TransitionRow(
         ("lost",),
-        "driving is no longer wanted, no report is missing, and an axis is still enabled",
-        lambda now: not now.wanted and not now.missing_reports and bool(now.enabled),
+        "driving is no longer wanted, no report is missing, the brake is still enabled, and a command was sent within "
+        "100 ms",
+        lambda now: (
+            not now.wanted
+            and not now.missing_reports
+            and "brake" in now.enabled
+            and now.since_sent_ns < COMMAND_TIMEOUT_NS
+        ),
         "parking",
     ),
     TransitionRow(
         ("lost",),
         "driving is no longer wanted, no report is missing, and no axis is enabled",
-        lambda now: not now.wanted and not now.missing_reports,
+        lambda now: not now.wanted and not now.missing_reports and not now.enabled,
         "idle",
     ),
     TransitionRow(
@@ -190,3 +204,16 @@ def next_state(state: State, now: Situation) -> tuple[State, str]:
         if state in row.sources and (reason := row.condition(now)):
             return row.target, reason if isinstance(reason, str) else row.description
     return state, ""
+
+
+def states_after(state: State, now: Situation) -> list[tuple[State, str]]:
+    """Return the states that follow from `state` at one instant, in order, with their reasons: no state twice."""
+    found: list[tuple[State, str]] = []
+    visited = {state}
+    while True:
+        state, reason = next_state(state, now)
+        if state in visited:
+            return found
+        visited.add(state)
+        found.append((state, reason))
+        now = replace(now, in_state_ns=0)

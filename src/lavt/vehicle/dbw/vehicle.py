@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 from lavt.domain import NS_PER_MS, Actuation, GroundTruth, VehicleEvent, VehicleState
@@ -44,6 +44,10 @@ class KitAdapter(Protocol):
 
     def frames_due(self, now_ns: int) -> list[CanFrame]:
         """Return the frames to send now for the newest tick."""
+        ...
+
+    def on_dropped(self, frames: Sequence[CanFrame]) -> None:
+        """Note that these last ones of the frames that were due were not written."""
         ...
 
     def next_wake_ns(self) -> int:
@@ -113,9 +117,11 @@ class DbwVehicle:
         """Process received frames, then request `actuation` and send the frames that are due."""
         self._poll_bus(now_ns)
         self._adapter.set_actuation(actuation, now_ns)
+        frames = self._adapter.frames_due(now_ns)
         try:
-            self._port.send(self._adapter.frames_due(now_ns), now_ns)
+            self._adapter.on_dropped(frames[self._port.send(frames, now_ns) :])
         except BusGone as gone:
+            self._adapter.on_dropped(frames[gone.written :])
             self._adapter.on_bus_gone(str(gone), now_ns)
 
     def _poll_bus(self, now_ns: int) -> None:

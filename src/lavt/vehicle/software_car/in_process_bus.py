@@ -68,11 +68,12 @@ class InProcessPort:
         """Empty: no frame gets lost."""
         return {}
 
-    def send(self, frames: Sequence[CanFrame], made_ns: int) -> None:
-        """Send frames made at `made_ns`. Raises `BusGone` while the bus is cut."""
+    def send(self, frames: Sequence[CanFrame], made_ns: int) -> int:
+        """Send frames made at `made_ns` and return their number. Raises `BusGone` while the bus is cut."""
         if self._cut_reason:
             raise BusGone(self._cut_reason)
         self._to_car.put(frames, max(made_ns, self._now_ns))
+        return len(frames)
 
     def take(self, now_ns: int) -> list[ReceivedCanFrame]:
         """Advance the car and return the frames received from it. Raises `BusGone` while the bus is cut."""

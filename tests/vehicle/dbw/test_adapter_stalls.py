@@ -1,0 +1,129 @@
+"""Stalls of the adapter's process, frames that were not written, and axes that the kit has released."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+from tests.vehicle.dbw.rig import COARSE_MS, AdapterRig, both, driving
+
+from lavt.domain import Actuation
+from lavt.vehicle.can_frame import CanFrame
+from lavt.vehicle.dbw.crc8 import frame_crc8
+from lavt.vehicle.dbw.profile import AXES, Axis
+from lavt.vehicle.software_car.authority import WATCHDOG_BRAKE
+
+
+@both
+@pytest.mark.timeout(30)
+def test_a_stall_while_parking_ends(generation: int) -> None:
+    """A stall while parking ends it, at whatever moment, if the kit has disengaged meanwhile: the watchdog brakes."""
+    begun = driving(generation)
+    begun.adapter.engage(False, begun.now_ns)
+    begun.run_ms(50)
+    for moment_ms in range(9):
+        for duration_ms in (80, 98, 100, 102, 150, 1000):
+            rig = begun.copy()
+            rig.run_ms(moment_ms)
+            rig.stall_ms(duration_ms)
+            rig.run_ms(250)
+            assert rig.speed_mps > 1.0
+            if duration_ms == 80:
+                assert (rig.state, rig.enabled(), rig.kit.state.watchdog) == ("parking", set(AXES), 0), moment_ms
+            if duration_ms > 100:
+                assert (rig.state, rig.kit.state.brake) == ("idle", WATCHDOG_BRAKE), (moment_ms, duration_ms)
+            assert len(rig.events) == len({event.detail for event in rig.events})
+
+
+def forge_enabled(rig: AdapterRig, axis: Axis, *, is_enabled: bool) -> None:
+    """Forge the axis's reports: they say whether it is enabled."""
+    codec = rig.profile.codec
+    message, spec = next((name, spec) for name, spec in rig.profile.reports.items() if spec.part == axis)
+    facts = codec.messages[message]
+
+    def forge(frame: CanFrame) -> bool:
+        decoded = codec.decode(frame) if frame.identifier == facts.identifier else None
+        if decoded is None:
+            return False
+        values = {name: value or 0.0 for name, value in decoded[1].items()}
+        data = codec.encode(message, values | {spec.values["enabled"]: int(is_enabled)})
+        if spec.checksum:
+            data = data[:-1] + bytes([frame_crc8(facts.identifier, data[:-1])])
+        rig.adapter.receive(CanFrame(facts.identifier, data), rig.now_ns)
+        return True
+
+    rig.lose_report = forge
+
+
+@both
+@pytest.mark.parametrize("axis", AXES)
+@pytest.mark.parametrize("is_wanted", [True, False])
+def test_the_car_brakes_without_an_axis(generation: int, axis: Axis, is_wanted: bool) -> None:
+    """If one axis is reported as released, driving or parking, the kit's watchdog brakes the car to a standstill."""
+    rig = driving(generation)
+    rig.actuation = Actuation(0.01, 0.0, 0.4)
+    rig.adapter.engage(is_wanted, rig.now_ns)
+    rig.run_ms(30)
+    forge_enabled(rig, axis, is_enabled=False)
+    rig.run_until(lambda rig: axis not in rig.adapter._reports.enabled, 21)
+    rig.sent.clear()
+    rig.run_ms(110)
+    assert (rig.kit.state.brake, rig.enabled()) == (WATCHDOG_BRAKE, set())
+    if axis == "brake" or generation == 2:
+        assert rig.sent == []
+    rig.run_ms(2000, step_ms=COARSE_MS)
+    assert rig.speed_mps == 0.0
+
+
+def test_a_released_axis_is_not_enabled_again() -> None:
+    """An axis that was released once is not enabled again while parking, even if it is reported as enabled again."""
+    rig = driving(1, has_watchdog=False)
+    rig.actuation = Actuation(0.01, 0.0, 0.4)
+    forge_enabled(rig, "steering", is_enabled=False)
+    rig.run_until(lambda rig: rig.state == "lost")
+    forge_enabled(rig, "steering", is_enabled=True)
+    rig.run_ms(100)
+    assert "steering" in rig.adapter._reports.enabled
+    rig.adapter.engage(False, rig.now_ns)
+    rig.run_ms(100)
+    assert (rig.state, rig.enabled()) == ("parking", {"brake", "throttle"})
+    assert round(rig.kit.state.brake, 2) == 0.4
+
+
+@both
+@pytest.mark.parametrize("dropped", [1, 2, 3, 4])
+def test_dropped_frames_leave_no_gap_in_the_counters(generation: int, dropped: int) -> None:
+    """If the last frames of a set, or all, are not written the next ones have their numbers, and driving goes on."""
+    rig = driving(generation)
+    rig.run_until(lambda rig: bool(rig.sent) and rig.sent[-1][0] == rig.now_ns)
+    for _ in range(5):
+        sets = rig.adapter.counts["sets"]
+        rig.dropped_frames = dropped
+        rig.run_until(lambda rig: rig.adapter.counts["sets"] > sets)  # noqa: B023 (called in the loop)
+        rig.dropped_frames = 0
+        rig.run_ms(40)
+    assert (rig.state, rig.enabled(), rig.kit.state.watchdog) == ("engaged", set(AXES), 0)
+    codec = rig.profile.codec
+    counts: dict[str, list[float]] = {}
+    for _, frame in rig.sent:
+        decoded = codec.decode(frame)
+        assert decoded is not None
+        name, values = decoded
+        counts.setdefault(name, []).append(values["COUNT" if generation == 1 else "RC"] or 0.0)
+    modulus = 256 if generation == 1 else 16
+    for found in counts.values():
+        assert len(found) > 10
+        assert {(after - before) % modulus for before, after in pairwise(found)} == {1}
+
+
+@both
+def test_sets_that_are_never_written_are_no_commands(generation: int) -> None:
+    """If no frame is written for 100 ms this ends driving, as if none had been due."""
+    rig = driving(generation)
+    rig.run_until(lambda rig: bool(rig.sent) and rig.sent[-1][0] == rig.now_ns)
+    rig.dropped_frames = 9
+    rig.run_ms(99)
+    assert rig.state == "engaged"
+    rig.run_ms(1)
+    assert rig.state == "lost"
+    assert any("no command was sent" in event.detail for event in rig.events)
