@@ -109,7 +109,7 @@ def test_a_stalled_actuator_leaves_a_braking_car(
             os.kill(driven.actuator_pid, signal.SIGCONT)
         if how == "killed":
             assert driven.loop.server.popen.wait(30) == 1
-            assert "the process of the actuator has ended" in driven.loop.server.said()
+            assert "the process of the actuator has ended" in driven.loop.server.last_message()
         else:
             driven.wait(lambda status: status.get("safety") == "safe_stop", "the server does not report its stop")
         assert driven.car.event_ns("enabled", "enabled: ", since_ns=since_ns) is None, "no old command is accepted"
