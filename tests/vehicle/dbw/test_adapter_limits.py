@@ -14,7 +14,7 @@ from tests.vehicle.dbw.rig import COARSE_MS, AdapterRig, both, driving, profile,
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation
 from lavt.vehicle.dbw.profile import LEAST_GAP_NS, PERIOD_NS, TICK_LIMIT_NS, ByWireLimits
 from lavt.vehicle.dbw.sending import DriveCommand, apply_limits
-from lavt.vehicle.sim.rendering.cars import LINCOLN_MKZ
+from lavt.vehicle.sim.dynamics import LINCOLN_MKZ
 
 LIMITS = ByWireLimits(400.0, 300.0, 0.6, 0.8, 2.0, 5.0, 0.3)
 STEERING = {1: 0x064, 2: 0x200}

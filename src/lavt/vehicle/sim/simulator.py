@@ -7,8 +7,7 @@ from collections import deque
 
 from lavt.domain import NS_PER_S, Actuation, GroundTruth, Pose, VehicleEvent, VehicleState
 from lavt.streams import stream
-from lavt.vehicle.sim.dynamics import CarDynamics, CarMotion, CarParameters
-from lavt.vehicle.sim.rendering.cars import LINCOLN_MKZ
+from lavt.vehicle.sim.dynamics import LINCOLN_MKZ, CarDynamics, CarMotion, CarParameters
 from lavt.vehicle.sim.road.road import Road
 from lavt.vehicle.sim.route_monitor import RouteMonitor
 from lavt.vehicle.vehicle import Capabilities, ReachedCommand
