@@ -97,25 +97,3 @@ def _fall_sentences(levels: Sequence[Sequence[ConditionPoint]]) -> list[str]:
         begin_ms = min(loop_ms for _, loop_ms, _ in levels[last + 1])
         parts.append(f"At {begin_ms:.0f} ms and above, fewer than half of the runs are completed.")
     return parts
-
-
-def boundary_sentences(groups: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return a sentence on each preset: the onset by theory and the delays found, over all routes if possible."""
-    over_all = [group for group in groups if group["route"] is None] or groups
-    return [_boundary_sentence(group) for group in over_all]
-
-
-def _boundary_sentence(group: Mapping[str, Any]) -> str:
-    onset, departure, completion = (
-        "not in the searched range" if delay_ms is None else f"{delay_ms:.0f} ms"
-        for delay_ms in (group[f"{name}_ms"]["p50"] for name in ("onset", "departure", "completion"))
-    )
-    route = "all routes" if group["route"] is None else f"route {group['route']}"
-    theory = "theory gives no onset of oscillation"
-    if group["theory_ms"] is not None:
-        theory = f"theory predicts growing oscillation from a total delay of {group['theory_ms']:.0f} ms"
-    return (
-        f"{group['preset']}, {route}: {theory}. Medians over {group['n']} seed{'s' if group['n'] > 1 else ''}: "
-        f"oscillation begins to grow: {onset}; the vehicle first leaves its lane: {departure}; "
-        f"the route is no longer completed: {completion}."
-    )
