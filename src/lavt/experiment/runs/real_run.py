@@ -18,7 +18,7 @@ import yaml
 from pydantic import BaseModel
 
 from lavt.assembly.links import trace_digests, trace_path
-from lavt.clock import Clock, MachineClock, pause
+from lavt.clock import MachineClock, pause
 from lavt.config import DelayConfig, ImpairmentConfig, LinkConfig, RelayConfig
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import WorkError
@@ -112,12 +112,11 @@ def start_client_router(processes: Processes, dialled: str, listen: str = LOCAL_
     return router, local
 
 
-def drive_real(planned: PlannedRun, out: Path, *, progress: Progress | None = None, clock: Clock | None = None) -> None:
+def drive_real(planned: PlannedRun, out: Path, *, progress: Progress | None = None) -> None:
     """Drive once, and write the two records into `out`, with the requests and measurements of the relay or netem.
 
     Raises `WorkError` where a process ends early or the drive does not begin; the records up to then stay in `out`.
     """
-    clock = clock or MachineClock()
     with TemporaryDirectory(prefix="lavt-") as folder:
         work = Path(folder)
         try:
@@ -125,7 +124,7 @@ def drive_real(planned: PlannedRun, out: Path, *, progress: Progress | None = No
                 netem = stack.enter_context(NetemRun(planned)) if uses_netem(planned) else None
                 processes = stack.enter_context(Processes(work))
                 loop = start_loop(processes, planned, work, work, netem=netem)
-                _wait_for_ending(processes, loop, clock, progress)
+                _wait_for_ending(processes, loop, progress)
                 for process in reversed(processes.started):
                     process.end()
                 if loop.relay is not None:
@@ -138,7 +137,8 @@ def drive_real(planned: PlannedRun, out: Path, *, progress: Progress | None = No
                 shutil.move(record, out / record.name)
 
 
-def _wait_for_ending(processes: Processes, loop: LoopProcesses, clock: Clock, progress: Progress | None) -> None:
+def _wait_for_ending(processes: Processes, loop: LoopProcesses, progress: Progress | None) -> None:
+    clock = MachineClock()
     start_ns = clock.now().mono_ns
     while loop.server.running and loop.server.latest.get("ending") is None:
         elapsed_s = (clock.now().mono_ns - start_ns) / NS_PER_S
