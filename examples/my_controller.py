@@ -28,10 +28,7 @@ class Stanley:
 
     gain_per_s = 1.2
 
-    def __init__(
-        self, preset: Preset, *, wheelbase_m: float, max_acceleration_mps2: float, max_braking_mps2: float
-    ) -> None:
-        del max_acceleration_mps2, max_braking_mps2
+    def __init__(self, preset: Preset, *, wheelbase_m: float) -> None:
         self._preset, self._wheelbase_m = preset, wheelbase_m
 
     def decide(self, lane: Lane, speed_mps: float, now_ns: int) -> Decision:

@@ -41,7 +41,7 @@ from lavt.errors import UserError
 from lavt.node import WAKE, Message
 from lavt.runtime.pipeline import run_stages
 from lavt.transport.clock_sync.persistent_process import Shell
-from lavt.vehicle.sim.rendering.cars import LINCOLN_MKZ
+from lavt.vehicle.sim.dynamics import LINCOLN_MKZ
 from lavt.vehicle.video_device import VideoDevice
 
 

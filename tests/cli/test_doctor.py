@@ -389,11 +389,11 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.usefixtures("quick")
 def test_a_pair_with_keys(router: str, keys: Path, operator: str, vehicle: str, expected: tuple[str, str]) -> None:
     """Signed states are verified with the configured keys, without a session; keys that do not match are a problem."""
-    from lavt.assembly.security import vehicle_authenticator
+    from lavt.assembly.security import build_vehicle_authenticator
     from lavt.transport.security.gateway import ServerGateway
 
     security = {"key": str(keys / "vehicle-3.key"), "operators": {"operator-1": str(keys / "operator-1.pub")}}
-    authenticator = vehicle_authenticator(
+    authenticator = build_vehicle_authenticator(
         parse_config(ServerConfig, {"vehicle_id": "vehicle-3", "security": security}, "test")
     )
     server = ZenohLink(

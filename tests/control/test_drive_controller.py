@@ -4,7 +4,18 @@ from importlib.metadata import EntryPoint
 import pytest
 
 from lavt.control import drive_controller
-from lavt.control.drive_controller import DESIGNED, PRESETS, LaneKeeper, Preset, find_preset, make_controller
+from lavt.control.drive_controller import (
+    DESIGNED,
+    GENTLE_BRAKING_MPS2,
+    PRESETS,
+    LaneKeeper,
+    Preset,
+    SpeedPi,
+    confident_speed_mps,
+    find_preset,
+    make_controller,
+    pedals,
+)
 from lavt.control.lane_watch import BRAKE_AFTER_NS, STOP_AFTER_NS
 from lavt.control.pure_pursuit import curvature_per_m
 from lavt.domain import NS_PER_S, PATH_POINTS, Decision, Lane
@@ -20,7 +31,7 @@ def lane(c0: float = 0.0, c1: float = 0.0, c2: float = 0.0, confidence: float = 
 
 
 def keeper(preset: Preset = DESIGNED) -> LaneKeeper:
-    return LaneKeeper(preset, wheelbase_m=WHEELBASE_M, max_acceleration_mps2=2.0, max_braking_mps2=6.0)
+    return LaneKeeper(preset, wheelbase_m=WHEELBASE_M)
 
 
 @pytest.mark.parametrize("name", sorted(PRESETS))
@@ -106,10 +117,8 @@ def test_unknown_names_are_user_errors() -> None:
 class ExternalController:
     """A controller from another package."""
 
-    def __init__(
-        self, preset: Preset, *, wheelbase_m: float, max_acceleration_mps2: float, max_braking_mps2: float
-    ) -> None:
-        self.arguments = (preset.name, wheelbase_m, max_acceleration_mps2, max_braking_mps2)
+    def __init__(self, preset: Preset, *, wheelbase_m: float) -> None:
+        self.arguments = (preset.name, wheelbase_m)
 
     def decide(self, lane: Lane, speed_mps: float, now_ns: int) -> Decision:
         """Return full brake."""
@@ -118,8 +127,66 @@ class ExternalController:
 
 
 def test_a_package_adds_a_controller_by_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A controller registered in the group `lavt.controllers` is found by name and gets the car's properties."""
+    """A controller registered in the group `lavt.controllers` is found by name and gets the wheelbase."""
     entry = EntryPoint("external", f"{__name__}:ExternalController", drive_controller.ENTRY_POINTS)
     monkeypatch.setattr(drive_controller, "entry_points", lambda group: [entry] if group == "lavt.controllers" else [])
-    controller = make_controller("external", PRESETS["designed"], WHEELBASE_M, max_braking_mps2=8.0)
-    assert getattr(controller, "arguments", None) == ("designed", WHEELBASE_M, 2.0, 8.0)
+    controller = make_controller("external", PRESETS["designed"], WHEELBASE_M)
+    assert getattr(controller, "arguments", None) == ("designed", WHEELBASE_M)
+
+
+def drive(pi: SpeedPi, seconds: float, speed_mps: float, slope_mps2: float = 0.0) -> list[float]:
+    """Return the speeds of a car with a lag of 0.2 s and a constant deceleration `slope_mps2`."""
+    speeds, acceleration = [speed_mps], 0.0
+    for _ in range(round(seconds * 30)):
+        wanted = pi.acceleration_mps2(SPEED_MPS, speeds[-1], 1 / 30)
+        acceleration += (wanted - acceleration) / 6
+        speeds.append(speeds[-1] + (acceleration - slope_mps2) / 30)
+    return speeds
+
+
+def test_the_target_speed_is_reached_without_overshoot() -> None:
+    """From standstill, the target speed is overshot by less than 0.1 m/s and held."""
+    speeds = drive(SpeedPi(), 30, 0.0)
+    assert max(speeds) < SPEED_MPS + 0.1
+    assert speeds[-1] == pytest.approx(SPEED_MPS, abs=0.02)
+
+
+def test_anti_windup() -> None:
+    """After a minute of saturated throttle the overshoot is less than 0.1 m/s (anti-windup)."""
+    pi = SpeedPi()
+    for _ in range(1800):
+        assert pi.acceleration_mps2(SPEED_MPS, 1.0, 1 / 30) == 2.0
+    assert max(drive(pi, 30, 1.0)) < SPEED_MPS + 0.1
+
+
+def test_a_slope_is_compensated() -> None:
+    """The integral term compensates a constant slope."""
+    assert drive(SpeedPi(), 60, SPEED_MPS, slope_mps2=0.3)[-1] == pytest.approx(SPEED_MPS, abs=0.03)
+
+
+def test_a_pause_is_not_integrated() -> None:
+    """After a long pause one call integrates over at most 0.1 s."""
+    rested, fresh = SpeedPi(), SpeedPi()
+    rested.acceleration_mps2(SPEED_MPS, SPEED_MPS - 0.4, 100.0)
+    fresh.acceleration_mps2(SPEED_MPS, SPEED_MPS - 0.4, 0.1)
+    assert rested.acceleration_mps2(1.0, 1.0, 0.0) == fresh.acceleration_mps2(1.0, 1.0, 0.0)
+
+
+def test_slowing_down_is_gentle() -> None:
+    """Speed control brakes gently, for any excess speed."""
+    assert SpeedPi().acceleration_mps2(0.0, 10.0, 1 / 30) == -GENTLE_BRAKING_MPS2
+
+
+@pytest.mark.parametrize(
+    ("acceleration_mps2", "expected"),
+    [(1.0, (0.5, 0.0)), (5.0, (1.0, 0.0)), (-3.0, (0.0, 0.5)), (-9.0, (0.0, 1.0)), (0, (0, 0))],
+)
+def test_pedals(acceleration_mps2: float, expected: tuple[float, float]) -> None:
+    """Throttle is a share of the full acceleration, brake of the full braking, and one of them is 0."""
+    assert pedals(acceleration_mps2) == expected
+
+
+@pytest.mark.parametrize(("confidence", "share"), [(1.0, 1.0), (0.5, 1.0), (0.3, 0.6), (0.0, 0.4)])
+def test_lower_confidence_lowers_the_speed(confidence: float, share: float) -> None:
+    """Full speed down to confidence 0.5, in proportion below that, never less than 0.4 of it."""
+    assert confident_speed_mps(10.0, confidence) == pytest.approx(10 * share)

@@ -113,7 +113,7 @@ def test_a_stalled_actuator_leaves_a_braking_car(
         if how != "frozen":
             assert driven.loop.server.popen.wait(30) == 1
             reason = {"killed": "has ended", "busy": "does not respond"}[how]
-            assert f"the process of the actuator {reason}" in driven.loop.server.said()
+            assert f"the process of the actuator {reason}" in driven.loop.server.last_message()
         else:
             driven.wait(lambda status: status.get("safety") == "safe_stop", "the server does not report its stop")
         assert driven.car.event_ns("enabled", "enabled: ", since_ns=since_ns) is None, "no old command is accepted"

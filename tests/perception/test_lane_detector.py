@@ -6,10 +6,16 @@ import pytest
 from tests.perception.conftest import BROKEN_LANE, FOUR_LANES, LANE, Line, Scene, centre_y_m, on_road
 from tests.perception.lens import ground_points
 
-from lavt.domain import CameraModel, Lane, Picture
+from lavt.domain import CameraModel, Lane, Picture, SeenLane
 from lavt.perception.bird_eye import STAMP_SIDE_PX
 from lavt.perception.calibration import CalibratedCamera, calibrated
-from lavt.perception.lane_detector import FORGET_AFTER, SMOOTHING, TRACK_CONFIDENCE, LaneDetector
+from lavt.perception.lane_detector import (
+    FORGET_AFTER,
+    SMOOTHING,
+    TRACK_CONFIDENCE,
+    GroundTruthLaneDetector,
+    LaneDetector,
+)
 
 MODEL = CameraModel()
 GREY = np.full((480, 640, 3), 128, dtype=np.uint8)
@@ -214,3 +220,25 @@ def test_forget_makes_the_detector_take_the_nearest_lane(scene: Scene) -> None:
     assert lane.centre[0] == pytest.approx(-3.5, abs=0.3)
     detector.forget()
     assert detector.detect(scene.picture(FOUR_LANES, offset_m=3.5)).centre[0] == pytest.approx(0.0, abs=0.1)
+
+
+def true_lane(offset_m: float, confidence: float = 1.0) -> SeenLane:
+    return SeenLane(1, 2, Lane((offset_m, 0.0, 0.0), 3.5, 3.6, 20.0, confidence))
+
+
+def test_true_lanes_are_averaged_as_by_the_lane_detector() -> None:
+    """The average starts with the first lane, and each newer lane has the weight `SMOOTHING`."""
+    detector = GroundTruthLaneDetector()
+    assert detector.detect(true_lane(1.0)).centre[0] == 1.0
+    assert detector.detect(true_lane(2.0)).centre[0] == pytest.approx(1.0 + SMOOTHING)
+
+
+def test_the_last_lane_is_kept_with_low_confidence() -> None:
+    """A lane of low confidence changes only the confidence; after several, or `forget`, the average restarts."""
+    detector = GroundTruthLaneDetector()
+    detector.detect(true_lane(1.0))
+    lost = [detector.detect(true_lane(5.0, confidence=0.1)) for _ in range(FORGET_AFTER)]
+    assert [(lane.centre[0], lane.confidence) for lane in lost] == [(1.0, 0.1)] * FORGET_AFTER
+    assert detector.detect(true_lane(3.0)).centre[0] == 3.0
+    detector.forget()
+    assert detector.detect(true_lane(7.0)).centre[0] == 7.0

@@ -81,7 +81,7 @@ class Drive:
             phase = self.client.latest.get("status", {}).get("phase")
             return (status.get("safety"), phase) == ("driving", "driving") and bool(status["speed_mps"] >= speed_mps)
 
-        assert self.loop.server.running, self.loop.server.said()
+        assert self.loop.server.running, self.loop.server.last_message()
         self.wait_until(f"the vehicle is driven with {speed_mps} m/s", reached, DRIVING_WITHIN_S)
 
     def note_outage(self, name: str) -> None:

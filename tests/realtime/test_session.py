@@ -118,7 +118,7 @@ def sessions(
         with Processes(work) as processes:
             drive = Session(processes, work, wait_until, planned("vehicle.scenery=none", "controller.preset=designed"))
             first = drive.client("first", "operator-1")
-            drive.seen["first without a router"] = first.said()
+            drive.seen["first without a router"] = first.last_message()
             server = drive.server()
             drive.routers()
             drive.reach(server, first, 2.0)

@@ -149,7 +149,7 @@ def test_threads_that_forward_requests_do_not_disturb_each_other() -> None:
     Each built-in function that a thread calls lets the other threads run.
     """
     ours, theirs = multiprocessing.Pipe()
-    proxy, errors = RemoteNodeProxy("actuator", ours), list[Exception]()
+    proxy, errors = RemoteNodeProxy("actuator", ours, heartbeat="state", on_silent=lambda _: None), list[Exception]()
 
     def forward() -> None:
         try:

@@ -52,7 +52,7 @@ class NullRecorder:
 
 
 def new_runtime(
-    law: DelayModel, *, costs_ns: Mapping[tuple[str, str], int] | None = None, period_ns: int = 20 * MS
+    delay: DelayModel, *, costs_ns: Mapping[tuple[str, str], int] | None = None, period_ns: int = 20 * MS
 ) -> tuple[VirtualRuntime, PeriodicSender]:
     """Return a runtime in which a driver sends `control` to an actuator."""
     clock = HostClock(0, 0)
@@ -62,7 +62,7 @@ def new_runtime(
         VirtualHost(side, clock, [node], NullRecorder(), costs_ns or {}, modelled_clock_source(clock, side, 0, 0))
         for side, node in (("client", driver), ("server", actuator))
     ]
-    link = VirtualLink(DelayLine(law), lambda _payload, count: count)
+    link = VirtualLink(DelayLine(delay), lambda _payload, count: count)
     return VirtualRuntime(hosts, {"control": link}), actuator
 
 

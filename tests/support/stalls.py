@@ -93,12 +93,12 @@ def stalled_share(stalls: Iterable[Stall], since_ns: int, until_ns: int) -> floa
 def described(stalls: Sequence[Stall], since_ns: int) -> str:
     """Return a description of the longest stalls; their times count from `since_ns`."""
     longest = sorted(sorted(stalls, key=lambda each: -each.length_ms)[:LISTED_STALLS], key=lambda each: each.begin_ns)
-    said = [
+    shown = [
         f"{each.length_ms:.0f} ms on processor {each.processor} at {(each.begin_ns - since_ns) / NS_PER_MS:+.0f} ms"
         for each in longest
     ]
     more = len(stalls) - len(longest)
-    return ", ".join(said) + (f" and {more} more" if more else "")
+    return ", ".join(shown) + (f" and {more} more" if more else "")
 
 
 def inconclusive_too_often(inconclusive: int, tests: int, idle_share: float) -> bool:
@@ -220,23 +220,23 @@ class Stalls:
                 self.recorded += stalls
             self._reported_ns = max(self._reported_ns, reported_ns)
 
-    def require(self, ok: object, said: str, since_ns: int, until_ns: int, *, stall_ms: float = STALL_MS) -> None:
+    def require(self, ok: object, message: str, since_ns: int, until_ns: int, *, stall_ms: float = STALL_MS) -> None:
         """Raise AssertionError unless `ok`, or `HostStalled` if a stall of `stall_ms` overlaps the interval.
 
         The interval ends with the limit at the latest: something late or missing was due before.
         """
         if not ok:
-            raise self.verdict(said, since_ns, until_ns, stall_ms=stall_ms)
+            raise self.verdict(message, since_ns, until_ns, stall_ms=stall_ms)
 
-    def verdict(self, said: str, since_ns: int, until_ns: int, *, stall_ms: float = STALL_MS) -> Exception:
+    def verdict(self, message: str, since_ns: int, until_ns: int, *, stall_ms: float = STALL_MS) -> Exception:
         """Return the exception for a failure in an interval."""
         stalls = self.during(since_ns, until_ns, at_least_ms=stall_ms)
         if not stalls:
-            return AssertionError(said)
+            return AssertionError(message)
         self.excused += 1
-        return HostStalled(f"{described(stalls, since_ns)}; {said}")
+        return HostStalled(f"{described(stalls, since_ns)}; {message}")
 
-    def share_verdict(self, said: str, since_ns: int, until_ns: int, *, share: float) -> Exception:
+    def share_verdict(self, message: str, since_ns: int, until_ns: int, *, share: float) -> Exception:
         """Return the exception for a rate or a median, which a stalled share of the time explains, but no single stall.
 
         The share is that of the processor with most stalls.
@@ -244,9 +244,9 @@ class Stalls:
         stalls = self.during(since_ns, until_ns)
         stalled = stalled_share(stalls, since_ns, until_ns)
         if stalled < share:
-            return AssertionError(said)
+            return AssertionError(message)
         self.excused += 1
-        return HostStalled(f"{stalled:.1%} of the time, {described(stalls, since_ns)}; {said}")
+        return HostStalled(f"{stalled:.1%} of the time, {described(stalls, since_ns)}; {message}")
 
     @contextmanager
     def judging(
@@ -275,17 +275,19 @@ class Stalls:
     def summary(self) -> str:
         """Return a summary of the record until the last report, by processor."""
         gone_ns = max(self._reported_ns - self._began_ns, 1)
-        said = []
+        by_processor = []
         for processor in sorted({each.processor for each in self.recorded}):
             own = [each for each in self.recorded if each.processor == processor]
             listed = [each for each in own if each.length_ms >= LISTED_MS]
             share = stalled_share(own, self._began_ns, self._reported_ns)
             longest_ms = max(each.length_ms for each in own)
-            said.append(f"processor {processor} {len(listed)}, longest {longest_ms:.0f} ms, {share:.2%} of the time")
-        told = f"stalls over {LISTED_MS:.0f} ms in {gone_ns / NS_PER_S:.0f} s: {'; '.join(said) or 'none'}"
+            by_processor.append(
+                f"processor {processor} {len(listed)}, longest {longest_ms:.0f} ms, {share:.2%} of the time"
+            )
+        text = f"stalls over {LISTED_MS:.0f} ms in {gone_ns / NS_PER_S:.0f} s: {'; '.join(by_processor) or 'none'}"
         if not all(probe.above for probe in self.probes):
-            told += " (no right to real-time priority: programs of the tests may have caused them)"
-        return told
+            text += " (no right to real-time priority: programs of the tests may have caused them)"
+        return text
 
     def end(self) -> None:
         """End all probes."""

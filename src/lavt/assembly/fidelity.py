@@ -9,8 +9,7 @@ from lavt.assembly.cameras import client_camera
 from lavt.assembly.vehicles import VehicleSetup, build_geometry_setup, build_vehicle_setup
 from lavt.config import ClientConfig, ServerConfig
 from lavt.nodes.driver import LaneDetection
-from lavt.perception.lane_detector import LaneDetector
-from lavt.perception.lane_given import GivenLane
+from lavt.perception.lane_detector import GroundTruthLaneDetector, LaneDetector
 from lavt.transport.video.frame_codec import (
     InMemoryFrameCodec,
     LaneReceiver,
@@ -67,7 +66,9 @@ def _pixels() -> FidelityModel:
 
 
 def _geometry() -> FidelityModel:
-    return FidelityModel(build_geometry_setup, lambda _: LaneSender(), lambda _: LaneReceiver(), lambda _: GivenLane())
+    return FidelityModel(
+        build_geometry_setup, lambda _: LaneSender(), lambda _: LaneReceiver(), lambda _: GroundTruthLaneDetector()
+    )
 
 
 FIDELITIES: dict[str, Callable[[], FidelityModel]] = {

@@ -41,15 +41,21 @@ def netem_flows(
     without an impairment are included, so that another condition can be applied later without packet loss.
     """
     flows = [
-        ImpairedFlow("video", "udp", video_port, "source", law(requested.video_ms, requested.video)),
-        ImpairedFlow("control", protocol, control_port, "destination", law(requested.control_ms, requested.control)),
+        ImpairedFlow("video", "udp", video_port, "source", build_netem_impairment(requested.video_ms, requested.video)),
+        ImpairedFlow(
+            "control",
+            protocol,
+            control_port,
+            "destination",
+            build_netem_impairment(requested.control_ms, requested.control),
+        ),
     ]
     if state_delay == "with_video":
         flows.append(ImpairedFlow("state", protocol, control_port, "source", Impairment(delay_ms=requested.video_ms)))
     return [flow for flow in flows if flow.name in SENT_BY[role]]
 
 
-def law(delay_ms: float, impairment: ImpairmentConfig) -> Impairment:
+def build_netem_impairment(delay_ms: float, impairment: ImpairmentConfig) -> Impairment:
     """Return the netem impairment of one flow; raise `UserError` for an impairment that netem does not support."""
     if impairment.trace:
         raise UserError(
@@ -61,10 +67,10 @@ def law(delay_ms: float, impairment: ImpairmentConfig) -> Impairment:
             f"netem's queue has {QUEUE_PACKETS} packets, not queue_packets {impairment.queue_packets}: choose "
             "network.injection relay or time virtual, or leave queue_packets out"
         )
-    return plain_law(delay_ms, impairment)
+    return build_impairment(delay_ms, impairment)
 
 
-def plain_law(delay_ms: float, impairment: ImpairmentConfig) -> Impairment:
+def build_impairment(delay_ms: float, impairment: ImpairmentConfig) -> Impairment:
     """Return the impairment of one flow without its trace and queue."""
     names = {each.name for each in fields(Impairment)}
     return Impairment(delay_ms=delay_ms, **impairment.model_dump(include=names - {"delay_ms"}))
@@ -96,7 +102,7 @@ def injection_client(config: ClientInjectionConfig, who: str, instance: int, sta
         instance,
         condition=config.condition,
         control=control,
-        video=law(requested.video_ms, requested.video),
+        video=build_netem_impairment(requested.video_ms, requested.video),
         state_delay_ms=requested.video_ms if config.state_delay == "with_video" else 0.0,
         start_ns=start_ns,
     )

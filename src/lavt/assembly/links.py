@@ -6,7 +6,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Final
 
-from lavt.assembly.injection import plain_law
+from lavt.assembly.injection import build_impairment
 from lavt.config import Condition, ImpairmentConfig
 from lavt.config_file import shipped
 from lavt.errors import UserError
@@ -25,7 +25,7 @@ def injected(name: str, delay_ms: float, impairment: ImpairmentConfig, seed: int
     if impairment == ImpairmentConfig():
         return None
     trace = read_trace(impairment.trace) if impairment.trace else None
-    requested = LinkInjection(plain_law(delay_ms, impairment), seed, name, trace, impairment.queue_packets)
+    requested = LinkInjection(build_impairment(delay_ms, impairment), seed, name, trace, impairment.queue_packets)
     check_injection(requested)
     return requested
 

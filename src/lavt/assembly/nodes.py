@@ -10,7 +10,7 @@ from lavt.assembly.addresses import resolved_address
 from lavt.assembly.entropy import Entropy
 from lavt.assembly.fidelity import VIDEO, FidelityModel
 from lavt.assembly.injection import injection_client, injection_node
-from lavt.assembly.security import cipher_of
+from lavt.assembly.security import build_cipher
 from lavt.assembly.vehicles import check_vehicle, physics_sample_times
 from lavt.config import ClientConfig, ControllerConfig, SafetyConfig, ServerConfig, VehicleConfig
 from lavt.control.drive_controller import DriveController, find_preset, make_controller
@@ -145,7 +145,7 @@ def build_server(
                 RepairSender(entropy.number(32), entropy.number(16)),
                 None if config.video.repair_packets == "auto" else config.video.repair_packets,
             ),
-            PathServer(lambda: entropy.token(32), cipher_of(config)),
+            PathServer(lambda: entropy.token(32), build_cipher(config)),
             start_ns=start.mono_ns,
             send_to=[resolved_address("video.send_to", each) for each in config.video.send_to],
         ),
@@ -218,7 +218,7 @@ def build_client(
             JitterBuffer(None if hold_ms == "auto" else round(hold_ms * NS_PER_MS)),
             Depacketizer(),
             config.video.max_bit_rate_bps,
-            cipher_of(config),
+            build_cipher(config),
         ),
         DriverNode(
             PictureReader(pictures),

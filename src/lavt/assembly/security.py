@@ -15,7 +15,7 @@ from lavt.transport.video.cipher import End, NewCipher, SrtpCipher, plain_cipher
 Authenticator = NullVehicleAuthenticator | OperatorAuthenticator | None
 
 
-def cipher_of(config: ServerConfig | ClientConfig) -> NewCipher:
+def build_cipher(config: ServerConfig | ClientConfig) -> NewCipher:
     """Return the cipher of the video, which is encrypted if the config has a key."""
     if not config.security.key:
         return plain_cipher
@@ -26,7 +26,11 @@ def cipher_of(config: ServerConfig | ClientConfig) -> NewCipher:
 
 def build_authenticator(config: ServerConfig | ClientConfig) -> Authenticator:
     """Build a side's authenticator, None for a client without a key; raise `UserError` for an unreadable key."""
-    return vehicle_authenticator(config) if isinstance(config, ServerConfig) else operator_authenticator(config)
+    return (
+        build_vehicle_authenticator(config)
+        if isinstance(config, ServerConfig)
+        else build_operator_authenticator(config)
+    )
 
 
 def build_gateway(
@@ -40,7 +44,7 @@ def build_gateway(
     return ServerGateway(deliver, carry, in_force, authenticator)
 
 
-def vehicle_authenticator(config: ServerConfig) -> NullVehicleAuthenticator:
+def build_vehicle_authenticator(config: ServerConfig) -> NullVehicleAuthenticator:
     """Build the vehicle's authenticator; raise `UserError` for an unreadable key."""
     security = config.security
     if not security.key:
@@ -49,7 +53,7 @@ def vehicle_authenticator(config: ServerConfig) -> NullVehicleAuthenticator:
     return VehicleAuthenticator(config.vehicle_id, load_private(Path(security.key)), operators)
 
 
-def operator_authenticator(config: ClientConfig) -> OperatorAuthenticator | None:
+def build_operator_authenticator(config: ClientConfig) -> OperatorAuthenticator | None:
     """Build the operator's authenticator, None without a key; raise `UserError` for an unreadable key."""
     security = config.security
     if not security.key:

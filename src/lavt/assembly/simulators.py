@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from lavt.config import ServerConfig, VehicleConfig
-from lavt.vehicle.sim.dynamics import CarParameters
-from lavt.vehicle.sim.rendering.cars import named_car
+from lavt.vehicle.sim.dynamics import CarParameters, named_car
 from lavt.vehicle.sim.road.road import Road
 from lavt.vehicle.sim.simulator import Simulator
 

@@ -58,7 +58,7 @@ def boundary(
 
 def boundary_table(found: dict[str, Any]) -> list[str]:
     """Return the lines of a table with the medians and intervals for each route and preset."""
-    from lavt.experiment.report.boundary_figure import ALL_ROUTES, span  # noqa: PLC0415 (slow: matplotlib)
+    from lavt.experiment.report.boundary_section import ALL_ROUTES, span  # noqa: PLC0415 (slow: matplotlib)
     from lavt.experiment.report.table_format import number  # noqa: PLC0415 (with them)
     from lavt.experiment.statistics.boundary_summary import CRITERIA  # noqa: PLC0415 (slow: scipy)
 

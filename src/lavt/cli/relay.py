@@ -63,7 +63,7 @@ def flows(config: RelayConfig) -> list[RelayedFlow]:
         _resolve("video_listen", config.video_listen),
         _resolve("video_server", config.video_server),
         upstream=NONE,
-        downstream=_delay_law(config.video, seed, "video inherent"),
+        downstream=_delay_model(config.video, seed, "video inherent"),
         delays_downstream=is_delayed_video,
         index_downstream=video_index,
         downstream_injected=_link_injection("video", config.video, seed),
@@ -72,15 +72,15 @@ def flows(config: RelayConfig) -> list[RelayedFlow]:
         "control",
         _resolve("control_listen", config.control_listen),
         _resolve("control_server", config.control_server),
-        upstream=_delay_law(config.control, seed, "control inherent"),
-        downstream=_delay_law(config.state, seed, "state inherent"),
+        upstream=_delay_model(config.control, seed, "control inherent"),
+        downstream=_delay_model(config.state, seed, "state inherent"),
         upstream_injected=_link_injection("control", config.control, seed),
         downstream_injected=_link_injection("state", config.state, seed),
     )
     return [video, control]
 
 
-def _delay_law(config: DelayConfig, seed: int, name: str) -> DelayModel:
+def _delay_model(config: DelayConfig, seed: int, name: str) -> DelayModel:
     jitter = Lognormal(config.jitter_median_ms, config.jitter_sigma) if config.jitter_median_ms > 0 else None
     return DelayModel(config.constant_ms, jitter, seed, name)
 

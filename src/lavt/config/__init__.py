@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from lavt.config.calibration import CalibrationConfig as CalibrationConfig
+from lavt.config.camera import CalibrationConfig as CalibrationConfig
 from lavt.config.camera import CameraConfig as CameraConfig
 from lavt.config.camera import ClientCameraConfig as ClientCameraConfig
 from lavt.config.camera import ServerCameraConfig as ServerCameraConfig

@@ -1,10 +1,10 @@
-"""The schema of a camera, on the vehicle's machine and on the client."""
+"""The schema of a camera, on the vehicle's machine and on the client, and of its calibration file."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from lavt.config.section import Section
 
@@ -55,3 +55,46 @@ class ClientCameraConfig(CameraConfig):
 
     calibration: str = ""
     """A calibration file, which replaces all keys above except the rate; empty: the keys above apply."""
+
+
+class CalibrationConfig(Section):
+    """A calibrated camera: picture size, lens parameters as in OpenCV, and pose in the vehicle's frame."""
+
+    width_px: int = Field(ge=64, le=8192)
+    height_px: int = Field(ge=64, le=8192)
+    field_of_view_deg: float | None = Field(None, gt=10, lt=150)
+    """The horizontal field of view, for square pixels and a centred axis; an alternative to the four keys below."""
+    fx_px: float | None = Field(None, gt=0)
+    fy_px: float | None = Field(None, gt=0)
+    cx_px: float | None = None
+    cy_px: float | None = None
+    lens: Literal["pinhole", "fisheye"] = "pinhole"
+    distortion: tuple[float, ...] = ()
+    """k1, k2, p1, p2 (and k3, or k3 to k6) of a pinhole lens, k1 to k4 of a fisheye lens; empty: no distortion."""
+    x_m: float
+    y_m: float = 0.0
+    z_m: float = Field(gt=0)
+    yaw_deg: float = Field(0.0, ge=-90, le=90)
+    pitch_deg: float = Field(0.0, ge=-60, le=80)
+    roll_deg: float = Field(0.0, ge=-60, le=60)
+
+    @field_validator("distortion")
+    @classmethod
+    def _check_length(cls, distortion: tuple[float, ...], info: Any) -> tuple[float, ...]:
+        lengths = (4,) if info.data.get("lens") == "fisheye" else (0, 4, 5, 8)
+        if len(distortion) not in lengths:
+            raise ValueError(f"must have {' or '.join(str(each) for each in lengths)} coefficients for this lens")
+        return distortion
+
+    @model_validator(mode="after")
+    def _check_focal_length(self) -> CalibrationConfig:
+        matrix = (self.fx_px, self.fy_px, self.cx_px, self.cy_px)
+        is_complete = None not in matrix
+        if is_complete == (self.field_of_view_deg is not None) or (not is_complete and matrix != (None,) * 4):
+            raise ValueError("give either field_of_view_deg, or all of fx_px, fy_px, cx_px and cy_px")
+        if self.lens == "fisheye" and not (is_complete and self.distortion):
+            # Without them the lens would be treated as a pinhole lens.
+            raise ValueError(
+                "a fisheye needs fx_px, fy_px, cx_px, cy_px and distortion ([0, 0, 0, 0] for no distortion)"
+            )
+        return self

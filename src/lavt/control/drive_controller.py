@@ -18,12 +18,32 @@ from lavt.control.pure_pursuit import (
     pursuit_path_per_m,
     steering_rad,
 )
-from lavt.control.speed_pi import SpeedPi, confident_speed_mps
 from lavt.domain import NS_PER_S, Decision, Lane
 from lavt.errors import UserError
 
 WHEEL_LIMIT_RAD = 0.5
 """Largest road wheel angle of a car."""
+MAX_ACCELERATION_MPS2 = 2.0
+"""Acceleration at full throttle, of the simulator's car."""
+MAX_BRAKING_MPS2 = 6.0
+"""Deceleration at full brake, of the simulator's car."""
+
+PROPORTIONAL_PER_S = 0.8
+"""m/s2 for each m/s of error: a time constant of 1.3 s, slow compared with pedal lag plus network delay."""
+INTEGRAL_PER_S2 = 0.1
+"""m/s2 for each m/s of error and second: compensates drag and slope within some 8 s."""
+GENTLE_BRAKING_MPS2 = 1.5
+"""Largest deceleration of speed control, so that a few badly seen pictures cause no jolt."""
+INTEGRATE_WITHIN_MPS = 0.5
+"""Nothing is integrated farther from the target: the error there is a transient, not an offset."""
+INTEGRAL_WITHIN_MPS2 = 0.5
+"""Largest integral term; drag and a slope of 5 % need no more."""
+FULL_SPEED_CONFIDENCE = 0.5
+"""From this confidence on, the full speed is driven: one line over the whole length, or both over half of it."""
+SLOWEST_SHARE = 0.4
+"""Share of the full speed at low confidence: 12 of 30 km/h, fast enough to reach the next marks."""
+LONGEST_STEP_S = 0.1
+"""Longest time that one call integrates over."""
 
 
 class DriveController(Protocol):
@@ -65,6 +85,37 @@ default car.
 PRESETS = {preset.name: preset for preset in (DESIGNED, PAPER_CALIBRATED)}
 
 
+class SpeedPi:
+    """A PI speed controller; its only state is the integral term."""
+
+    def __init__(self) -> None:
+        self._integral_mps2 = 0.0
+
+    def acceleration_mps2(self, target_mps: float, speed_mps: float, step_s: float) -> float:
+        """Return the acceleration to command now, `step_s` after the last call.
+
+        It is limited to `MAX_ACCELERATION_MPS2`, and to `GENTLE_BRAKING_MPS2` of braking.
+        """
+        error_mps = target_mps - speed_mps
+        if abs(error_mps) < INTEGRATE_WITHIN_MPS:
+            integral_mps2 = self._integral_mps2 + INTEGRAL_PER_S2 * error_mps * min(step_s, LONGEST_STEP_S)
+            self._integral_mps2 = min(max(integral_mps2, -INTEGRAL_WITHIN_MPS2), INTEGRAL_WITHIN_MPS2)
+        wanted_mps2 = PROPORTIONAL_PER_S * error_mps + self._integral_mps2
+        return min(max(wanted_mps2, -GENTLE_BRAKING_MPS2), MAX_ACCELERATION_MPS2)
+
+
+def pedals(acceleration_mps2: float) -> tuple[float, float]:
+    """Return throttle and brake for an acceleration, each in [0, 1] and one of them 0."""
+    if acceleration_mps2 >= 0:
+        return min(acceleration_mps2 / MAX_ACCELERATION_MPS2, 1.0), 0.0
+    return 0.0, min(-acceleration_mps2 / MAX_BRAKING_MPS2, 1.0)
+
+
+def confident_speed_mps(speed_mps: float, confidence: float) -> float:
+    """Return the speed to drive at: `speed_mps` at high confidence, proportionally less below that."""
+    return speed_mps * min(max(confidence / FULL_SPEED_CONFIDENCE, SLOWEST_SHARE), 1.0)
+
+
 class LaneKeeper:
     """A lane keeper: pure pursuit steering and PI speed control. Without a lane it follows the last one, unpowered.
 
@@ -73,12 +124,10 @@ class LaneKeeper:
     As in the paper there is no delay compensation: the lane in the picture is taken as the present one.
     """
 
-    def __init__(
-        self, preset: Preset, *, wheelbase_m: float, max_acceleration_mps2: float, max_braking_mps2: float
-    ) -> None:
+    def __init__(self, preset: Preset, *, wheelbase_m: float) -> None:
         self._preset = preset
         self._wheelbase_m = wheelbase_m
-        self._speed_pi = SpeedPi(max_acceleration_mps2, max_braking_mps2)
+        self._speed_pi = SpeedPi()
         self._lane = Lane((0.0, 0.0, 0.0), 0.0, 0.0, 0.0, 0.0)
         self._pose = ORIGIN
         self._curvature_per_m = 0.0
@@ -96,7 +145,7 @@ class LaneKeeper:
         limit_per_m = self._curvature_limit_per_m(speed_mps)
         distance_m = lookahead_m(self._preset.lookahead_s, speed_mps)
         self._curvature_per_m = clamp(pursuit_curvature_per_m(self._lane, distance_m, self._pose), limit_per_m)
-        throttle, brake = self._speed_pi.pedals(self._acceleration_mps2(lane.confidence, speed_mps, step_s))
+        throttle, brake = pedals(self._acceleration_mps2(lane.confidence, speed_mps, step_s))
         return Decision(
             steering_rad=steering_rad(self._curvature_per_m, self._wheelbase_m),
             throttle=throttle,
@@ -117,12 +166,10 @@ class LaneKeeper:
 
 
 class ControllerFactory(Protocol):
-    """A function that makes a controller from a preset and properties of the car."""
+    """A function that makes a controller from a preset and the wheelbase of the car."""
 
-    def __call__(
-        self, preset: Preset, *, wheelbase_m: float, max_acceleration_mps2: float, max_braking_mps2: float
-    ) -> DriveController:
-        """Return a controller; the accelerations are those of full throttle and of full brake, both positive."""
+    def __call__(self, preset: Preset, *, wheelbase_m: float) -> DriveController:
+        """Return a controller."""
         ...
 
 
@@ -132,19 +179,9 @@ ENTRY_POINTS = "lavt.controllers"
 """Entry point group under which a package registers a `ControllerFactory`."""
 
 
-def make_controller(
-    kind: str, preset: Preset, wheelbase_m: float, max_acceleration_mps2: float = 2.0, max_braking_mps2: float = 6.0
-) -> DriveController:
-    """Return the controller named `kind` with the settings `preset`; raise `UserError` for an unknown name.
-
-    The accelerations are the car's at full throttle and full brake, both positive; the defaults are the simulator's.
-    """
-    return _factory(kind)(
-        preset,
-        wheelbase_m=wheelbase_m,
-        max_acceleration_mps2=max_acceleration_mps2,
-        max_braking_mps2=max_braking_mps2,
-    )
+def make_controller(kind: str, preset: Preset, wheelbase_m: float) -> DriveController:
+    """Return the controller named `kind` with the settings `preset`; raise `UserError` for an unknown name."""
+    return _factory(kind)(preset, wheelbase_m=wheelbase_m)
 
 
 def find_preset(name: str) -> Preset:

@@ -20,7 +20,7 @@ import numpy as np
 from lavt.assembly.cameras import build_device
 from lavt.assembly.clock_source import clock_source, interpreter
 from lavt.assembly.fidelity import VIDEO
-from lavt.assembly.security import build_authenticator, build_gateway, cipher_of
+from lavt.assembly.security import build_authenticator, build_cipher, build_gateway
 from lavt.clock import MachineClock, pause
 from lavt.config import ClientCameraConfig, ClientConfig, ClockConfig, ServerConfig
 from lavt.doctor.checks import KEY_PACKAGES, CameraSample, CodecTimes, StateSample
@@ -274,7 +274,7 @@ def certificates(folder: Path, now_wall_ns: int) -> list[tuple[Path, float]]:
 def keys_rejection(settings: ServerConfig | ClientConfig) -> str:
     """Return why the keys that a config names cannot be used; empty if they can."""
     try:
-        cipher_of(settings)
+        build_cipher(settings)
         build_authenticator(settings)
     except (UserError, ImportError) as error:
         return str(error)

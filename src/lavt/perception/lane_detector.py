@@ -1,4 +1,4 @@
-"""The lane detector: finds the car's lane in a sequence of pictures."""
+"""The lane detectors: from a sequence of pictures, and from lanes without pixels."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lavt.domain import NS_PER_MS, CameraModel, Lane, Picture
+from lavt.domain import NS_PER_MS, CameraModel, Lane, Picture, SeenLane
 from lavt.perception.bird_eye import GroundGrid, bird_eye
 from lavt.perception.calibration import CalibratedCamera, calibrated
 from lavt.perception.lane_fit import (
@@ -142,6 +142,32 @@ class LaneDetector:
             if fit is not None:
                 fit = self._fit_near(points, fit.centre, fit.width_m)
         return fit
+
+
+class GroundTruthLaneDetector:
+    """A detector for fidelity `geometry`: it averages the true lanes as `LaneDetector` does, for equal loop dynamics.
+
+    When little of the lane is visible, the confidence is low and the lane is the last one detected.
+    """
+
+    def __init__(self) -> None:
+        self._lane = Lane((0.0, 0.0, 0.0), LANE_WIDTH_M, GRID.near_m, GRID.far_m, 0.0)
+        self._misses = FORGET_AFTER
+
+    def forget(self) -> None:
+        """Restart the average with the next lane."""
+        self._misses = FORGET_AFTER
+
+    def detect(self, picture: SeenLane) -> Lane:
+        """Return the average of the lanes in this picture and those before."""
+        seen = picture.lane
+        if seen.confidence < TRACK_CONFIDENCE:
+            self._misses += 1
+            self._lane = replace(self._lane, confidence=seen.confidence)
+        else:
+            self._lane = average_lane(self._lane if self._misses < FORGET_AFTER else None, seen)
+            self._misses = 0
+        return self._lane
 
 
 def contains_car(lane: LaneFit) -> bool:

@@ -20,7 +20,7 @@ def planned(condition: str, **network: Any) -> PlannedRun:
 
 @pytest.mark.parametrize("name", sorted(conditions()))
 def test_the_relay_receives_the_whole_condition(name: str) -> None:
-    """The relay's flows have the delay law, impairment, trace and seed of the run's condition."""
+    """The relay's flows have the delay, impairment, trace and seed of the run's condition."""
     run = planned(name, inherent="paper_wifi5")
     video, control = flows(_relay_config(run, 5600, 7448))
     requested = run.requested

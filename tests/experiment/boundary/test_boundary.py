@@ -30,7 +30,7 @@ from lavt.experiment.boundary.boundary import (
     with_video_delay,
 )
 from lavt.experiment.boundary.oscillation_growth import growth_per_s
-from lavt.experiment.report.boundary_figure import boundary_figure, boundary_table
+from lavt.experiment.report.boundary_section import boundary_figure, boundary_table
 from lavt.experiment.report.table_format import html_of
 from lavt.experiment.runs.monitored_run import MonitoredRun, summarize_drive
 from lavt.experiment.runs.plan import PlannedRun

@@ -17,7 +17,7 @@ from lavt.experiment.boundary.delay_margin import (
     smallest_lookahead_s,
     spectral_radius,
 )
-from lavt.vehicle.sim.rendering.cars import LINCOLN_MKZ
+from lavt.vehicle.sim.dynamics import LINCOLN_MKZ
 
 INDEPENDENT_RESULTS = [  # lookahead s, steering lag s, delay margin ms: an independent computation of the same model
     (0.60, 0.15, 114),

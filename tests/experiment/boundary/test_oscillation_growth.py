@@ -19,7 +19,7 @@ from lavt.experiment.boundary.oscillation_growth import (
     straight_growth,
 )
 from lavt.experiment.runs.monitored_run import MonitoredRun
-from lavt.vehicle.sim.simulator import start_of
+from lavt.vehicle.sim.simulator import start_offset
 
 LOOPBACK_MS = 11.8
 """The delay from exposure to the wheel's command without injected delay; an approximate value is sufficient."""
@@ -81,7 +81,7 @@ def test_the_seed_of_a_straight_drive_has_a_calm_start() -> None:
     seeds = [calm_seed(seed) for seed in range(5)]
     assert len(set(seeds)) == 5
     for seed in seeds:
-        _, offset_m, heading_rad = start_of(seed)
+        _, offset_m, heading_rad = start_offset(seed)
         assert abs(offset_m) <= CALM_START[0]
         assert abs(heading_rad) <= CALM_START[1]
 

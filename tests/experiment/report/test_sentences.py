@@ -2,17 +2,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from lavt.experiment.report import sentences
-from lavt.experiment.report.sentences import (
-    difference_sentences,
-    equal_total_sentences,
-    results_sentences,
-    runs_overview,
-)
-from lavt.experiment.statistics.paper_results import paper
+from lavt.experiment.report.sentences import results_sentences, runs_overview
 
 INJECTED = {"L0": (0, 0), "L1": (75, 0), "L2": (150, 0), "L3": (225, 0), "L4": (150, 75), "L5": (225, 100)}
-PAPER = paper()
 
 
 def entry(name: str, rate: float, loop_ms: float | None, p95_m: float | None = 0.1) -> dict[str, Any]:
@@ -30,10 +22,6 @@ def entry(name: str, rate: float, loop_ms: float | None, p95_m: float | None = 0
 
 def conditions(*rates: float) -> dict[str, dict[str, Any]]:
     return {name: entry(name, rate, 72.0 + sum(INJECTED[name])) for name, rate in zip(INJECTED, rates, strict=False)}
-
-
-def contrast(only_a: int, only_b: int, p: float) -> dict[str, Any]:
-    return {"a": "L3", "b": "L4", "pairs": 30, "only_a": only_a, "only_b": only_b, "p": p, "p_holm": p}
 
 
 def test_the_results_name_the_largest_fall_of_completion() -> None:
@@ -60,60 +48,6 @@ def test_many_routes_and_conditions_are_counted() -> None:
     assert "All runs are valid" in runs_overview(runs[1:])
 
 
-def test_equal_total_delay_means_equal_loop_latency() -> None:
-    """The report explains why conditions with equal total delay and loop latency do not differ."""
-    (text,) = equal_total_sentences([contrast(1, 0, 1.0)], conditions(1, 1, 1, 0.3, 0.3, 0), PAPER["contrasts"])
-    for part in (
-        "L3 (225 + 0 ms)",
-        "L4 (150 + 75 ms)",
-        "total delay, 225 ms",
-        "same loop latency",
-        "29 of 30 pairs",
-        "p 0.78",
-    ):
-        assert part in text
-
-
-def test_sentences_do_not_contradict_the_data() -> None:
-    """If conditions with equal total delay differ in completion or loop latency, no equal loop is claimed."""
-    of = conditions(1, 1, 1, 0.9, 0.3, 0)
-    (unequal_completion,) = equal_total_sentences([contrast(18, 0, 0.001)], of, [])
-    assert "completion differs significantly" in unequal_completion
-    assert "same loop" not in unequal_completion
-    (unequal_loops,) = equal_total_sentences([contrast(1, 0, 1.0)], {**of, "L4": entry("L4", 0.3, 350.0)}, [])
-    assert "same loop" not in unequal_loops
-    unequal_totals = [{**contrast(0, 0, 1.0), "a": "L2"}]
-    assert equal_total_sentences(unequal_totals, of, []) == []
-    assert equal_total_sentences([{**contrast(0, 0, 1.0), "p_holm": None}], of, []) == []
-
-
-def test_differences_from_the_paper_match_the_data() -> None:
-    """Each difference is reported only if the data show it, and none if a condition of the paper is missing."""
-    sharp = difference_sentences(conditions(1.0, 1.0, 1.0, 0.3, 0.3, 0.0), PAPER["conditions"])
-    for parts in (
-        ("sharply", "(100, 100, 100, 30, 30, 0 %)", "(100, 93,"),
-        ("P95 at L0", "0.10 m here", "2.30 m in the paper"),
-        ("0.10 m here", "13.15 m in the paper", "rails"),
-        ("All runs are completed at L1 here", "28 of 30"),
-    ):
-        assert any(all(part in each for part in parts) for each in sharp), parts
-    like = {
-        name: entry(name, theirs["completion_rate"], 100.0, theirs["p95_m"])
-        for name, theirs in PAPER["conditions"].items()
-    }
-    text = " ".join(difference_sentences(like, PAPER["conditions"]))
-    assert "sharply" not in text
-    assert "rails" not in text
-    assert "All runs are completed" not in text
-    assert "gains" in text
-    assert difference_sentences(conditions(1.0, 1.0), PAPER["conditions"]) == []
-    steady = " ".join(difference_sentences(conditions(1.0, 1.0, 1.0, 1.0, 1.0, 1.0), PAPER["conditions"]))
-    assert "sharply" not in steady
-    assert "rails" not in steady
-    few = {name: {**each, "runs": 5} for name, each in conditions(1.0, 1.0, 1.0, 0.3, 0.3, 0.0).items()}
-    assert difference_sentences(few, PAPER["conditions"]) == []
-
-
 def test_conditions_with_equal_loop_latency_are_sorted_by_name() -> None:
     """Loop latencies that differ by half a millisecond count as equal, also for the latency at which half fail."""
     rates = {"L2": (222.5, 0.9), "L3": (297.6, 0.53), "L4": (297.4, 0.47), "L5": (397.3, 0.1)}
@@ -137,13 +71,3 @@ def test_a_fall_is_between_two_latencies() -> None:
         for name, (loop_ms, rate) in rates.items()
     }
     assert "fall" not in results_sentences("Virtual time", conditions)
-
-
-def test_significant_differences_from_the_paper_are_named() -> None:
-    """A condition whose interval does not overlap with the paper's is named, with both shares."""
-    theirs = {"L2": {"completion_interval": [0.31, 0.69], "completion_rate": 0.5}}
-    ours: Any = {"L2": {"completion_interval": [0.73, 0.98], "completion_rate": 0.9}}
-    assert "higher at L2 (90 %, paper 50 %)" in sentences._unequal_completion(ours, theirs)
-    ours["L2"]["completion_interval"] = [0.6, 0.9]
-    assert "overlap" in sentences._unequal_completion(ours, theirs)
-    assert "L2" not in sentences._unequal_completion(ours, theirs)

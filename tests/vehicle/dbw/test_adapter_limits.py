@@ -16,7 +16,7 @@ from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.dbw.crc8 import frame_crc8
 from lavt.vehicle.dbw.profile import LEAST_GAP_NS, PERIOD_NS, TICK_LIMIT_NS, ByWireLimits
 from lavt.vehicle.dbw.sending import DriveCommand, apply_limits
-from lavt.vehicle.sim.rendering.cars import LINCOLN_MKZ
+from lavt.vehicle.sim.dynamics import LINCOLN_MKZ
 
 LIMITS = ByWireLimits(400.0, 300.0, 0.6, 0.8, 2.0, 5.0, 0.3)
 STEERING = {1: 0x064, 2: 0x200}

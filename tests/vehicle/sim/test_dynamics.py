@@ -6,8 +6,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lavt.domain import Actuation
-from lavt.vehicle.sim.dynamics import GRAVITY_MPS2, RAIL_FRICTION, CarDynamics, CarMotion, CarParameters, Contact
-from lavt.vehicle.sim.rendering.cars import LINCOLN_MKZ
+from lavt.vehicle.sim.dynamics import (
+    GRAVITY_MPS2,
+    LINCOLN_MKZ,
+    RAIL_FRICTION,
+    CarDynamics,
+    CarMotion,
+    CarParameters,
+    Contact,
+)
 
 STEP_S = 1 / 240
 CAR = LINCOLN_MKZ

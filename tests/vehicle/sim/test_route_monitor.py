@@ -6,8 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lavt.domain import NS_PER_S, EventKind, VehicleEvent
-from lavt.vehicle.sim.dynamics import CarMotion
-from lavt.vehicle.sim.rendering.cars import LINCOLN_MKZ
+from lavt.vehicle.sim.dynamics import LINCOLN_MKZ, CarMotion
 from lavt.vehicle.sim.road.road import Road, load_road, parse_road
 from lavt.vehicle.sim.route_monitor import RouteMonitor
 

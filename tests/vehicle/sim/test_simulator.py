@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation, VehicleEvent
-from lavt.vehicle.sim.rendering.cars import LINCOLN_MKZ
+from lavt.vehicle.sim.dynamics import LINCOLN_MKZ
 from lavt.vehicle.sim.road.road import Road, load_road, parse_road
 from lavt.vehicle.sim.simulator import Simulator, grid_ns
 from lavt.vehicle.vehicle import Vehicle

@@ -23,7 +23,7 @@ from lavt.experiment.analysis.results import write_json
 from lavt.experiment.boundary.bisection import Bracket, first_bracket, zero_bracket
 from lavt.experiment.boundary.delay_margin import configured_loop, critical_delay_s
 from lavt.experiment.boundary.oscillation_growth import straight_growth
-from lavt.experiment.report.boundary_figure import boundary_figure
+from lavt.experiment.report.boundary_section import boundary_figure
 from lavt.experiment.report.files import save_figure
 from lavt.experiment.runs.monitored_run import MonitoredRun, drive_monitored
 from lavt.experiment.runs.plan import PlannedRun, plan_run

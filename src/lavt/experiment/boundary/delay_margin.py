@@ -31,8 +31,7 @@ from lavt.control.drive_controller import find_preset
 from lavt.control.pure_pursuit import lookahead_m
 from lavt.domain import FloatArray
 from lavt.perception.lane_detector import SMOOTHING
-from lavt.vehicle.sim.dynamics import CarParameters
-from lavt.vehicle.sim.rendering.cars import LINCOLN_MKZ
+from lavt.vehicle.sim.dynamics import LINCOLN_MKZ, CarParameters
 
 ComplexArray = NDArray[np.complex128]
 

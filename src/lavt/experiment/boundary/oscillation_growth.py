@@ -13,7 +13,7 @@ from lavt.config import RunConfig
 from lavt.domain import FloatArray
 from lavt.experiment.runs.monitored_run import MonitoredRun, drive_monitored
 from lavt.experiment.runs.plan import PlannedRun, plan_run
-from lavt.vehicle.sim.simulator import start_of
+from lavt.vehicle.sim.simulator import start_offset
 
 ROAD = "straight"
 DRIVE_LIMIT_S = 45.0
@@ -80,7 +80,7 @@ def calm_seed(seed: int) -> int:
     return next(
         each
         for each in seeds
-        for _, offset_m, heading_rad in [start_of(each)]
+        for _, offset_m, heading_rad in [start_offset(each)]
         if abs(offset_m) <= limit_m and abs(heading_rad) <= limit_rad
     )
 

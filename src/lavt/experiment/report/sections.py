@@ -16,12 +16,7 @@ from lavt.experiment.report.figure_style import Colours, Conditions
 from lavt.experiment.report.files import link_table, save_figure, save_table
 from lavt.experiment.report.groups import Group, axes_of, differing, in_order, short, title_of
 from lavt.experiment.report.latency_figures import degradation_figure, injected_figure, presets_figure, stages_figure
-from lavt.experiment.report.sentences import (
-    difference_sentences,
-    equal_total_sentences,
-    results_sentences,
-    runs_overview,
-)
+from lavt.experiment.report.sentences import results_sentences, runs_overview
 from lavt.experiment.report.sweep_figures import axis_figure, incidence_figure, routes_with_survival, survival_figure
 from lavt.experiment.report.tables import (
     clock_table,
@@ -161,7 +156,7 @@ def conditions_parts(report: ReportContext) -> Parts:
 
 
 def contrast_parts(report: ReportContext) -> Parts:
-    """Return the planned contrasts, with a comparison of conditions that inject the same total delay."""
+    """Return the planned contrasts of completion between conditions."""
     summary, paper = report.summary, (report.summary.get("paper") or {}).get("contrasts") or []
     contrasts = summary.get("contrasts") or []
     if not contrasts:
@@ -185,17 +180,7 @@ def contrast_parts(report: ReportContext) -> Parts:
         f"the first run.{fisher}"
     )
     parts.append(html_page.paragraph(note, is_note=True))
-    changed = any(run.get("changes") for run in summary["runs"])
-    sentences = [] if changed else equal_total_sentences(contrasts, summary["conditions"], shown)
-    return [*parts, *(html_page.paragraph(f"{base}: {each}" if base else each) for each in sentences)]
-
-
-def difference_parts(report: ReportContext) -> Parts:
-    """Return the differences from the paper if all its conditions were run."""
-    conditions = report.summary["conditions"]
-    paper = (report.summary.get("paper") or {}).get("conditions") or {}
-    sentences = difference_sentences(conditions, paper) if len(report.paper(conditions)) == len(paper) else []
-    return [html_page.bullets(sentences)] if sentences else []
+    return parts
 
 
 def _base_note(report: ReportContext) -> str:

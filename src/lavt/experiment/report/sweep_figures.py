@@ -55,7 +55,7 @@ def survival_figure(conditions: Conditions, colours: Colours) -> Figure:
             axes.step(distance_m, surviving, where="post", color=colours[name], linewidth=width)
         tidy(axes, "", "", f"Route {route}")
         axes.set_ylim(-4, 104)
-    _label_lowest(panels, "distance driven (m)")
+    _label_distance(panels)
     figure.supylabel("runs still driving (%)", fontsize=10)
     legend_below(figure, list(condition_handles(conditions, colours)))
     return figure
@@ -76,7 +76,7 @@ def incidence_figure(conditions: Conditions, colours: Colours) -> Figure:
                     axes.step(curve["distance_m"], np.array(incidence, np.float64) * 100, where="post", **style)
         tidy(axes, "", "", f"Route {route}")
         axes.set_ylim(-4, 104)
-    _label_lowest(panels, "distance driven (m)")
+    _label_distance(panels)
     figure.supylabel("runs ended in this way (%)", fontsize=10)
     endings = [Line2D([], [], color="0.3", linestyle=dash, label=ending) for ending, dash in shown.items()]
     legend_below(figure, [*condition_handles(conditions, colours), *endings])
@@ -88,9 +88,9 @@ def _widths(count: int) -> list[float]:
     return [float(width) for width in np.linspace(4.0 if count > 1 else 1.2, 1.2, count)]
 
 
-def _label_lowest(panels: Sequence[Axes], label: str) -> None:
+def _label_distance(panels: Sequence[Axes]) -> None:
     for axes in panels[-3:]:
-        axes.set_xlabel(label)
+        axes.set_xlabel("distance driven (m)")
 
 
 def _panels(count: int) -> tuple[Figure, list[Axes]]:

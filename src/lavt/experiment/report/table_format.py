@@ -93,9 +93,9 @@ def share_intervals(title: str) -> Column:
     )
 
 
-def intervals(title: str, digits: int = 2) -> Column:
+def intervals(title: str) -> Column:
     """Return a column of intervals, each with a low and a high bound."""
-    return Column(title, lambda cell: interval(cell, digits=digits), LOW_HIGH)
+    return Column(title, lambda cell: interval(cell, digits=2), LOW_HIGH)
 
 
 def probabilities(title: str) -> Column:

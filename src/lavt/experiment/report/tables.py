@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from lavt.experiment.analysis.stage_latency import AFTER_LOOP
@@ -62,121 +62,93 @@ def matching_paper(conditions: Conditions, paper: Conditions) -> Conditions:
     }
 
 
+def _table(entries: Iterable[Mapping[str, Any]], columns: Sequence[tuple[Column, str]]) -> TableData:
+    """Return the table with a row for each entry, without empty columns; a dotted key leads into nested entries."""
+    rows = [[_value(entry, key) for _, key in columns] for entry in entries]
+    return TableData([column for column, _ in columns], rows).without_empty()
+
+
+def _value(entry: Mapping[str, Any], key: str) -> Any:
+    value: Any = entry
+    for name in key.split("."):
+        value = (value or {}).get(name)
+    return value
+
+
+def _with_paper(conditions: Conditions, paper: Conditions) -> list[Mapping[str, Any]]:
+    """Return an entry for each condition, with its name and the paper's entry."""
+    return [{**entry, "condition": name, "paper": paper.get(name, {})} for name, entry in conditions.items()]
+
+
 def latency_table(conditions: Conditions, paper: Conditions) -> TableData:
     """Return the table of injected and measured latency with the paper's values: one row for each condition."""
-    columns = [
-        texts("condition"),
-        numbers("injected video delay ms", 0),
-        numbers("injected control delay ms", 0),
-        latencies("τ video ms", bounded=True),
-        numbers("the paper's τ video ms", 0),
-        latencies("τ control ms", bounded=True),
-        numbers("the paper's τ control ms", 0),
-        latencies("loop latency ms"),
-        numbers("the paper's τ video + τ control ms", 0),
-        numbers("frame age, mean ms", 0),
-        numbers("frame age, p95 ms", 0),
-        latencies("frame age at actuation ms"),
-    ]
-    rows = []
-    for name, entry in conditions.items():
-        published = paper.get(name, {})
-        total_ms = published["tau_v_ms"] + published["tau_c_ms"] if published else None
-        age_ms = entry.get("picture_age_ms") or {}
-        rows.append(
-            [
-                name,
-                entry["injected_ms"]["video"],
-                entry["injected_ms"]["control"],
-                entry["tau_v_ms"],
-                published.get("tau_v_ms"),
-                entry["tau_c_ms"],
-                published.get("tau_c_ms"),
-                entry["loop_ms"],
-                total_ms,
-                age_ms.get("mean"),
-                age_ms.get("p95"),
-                entry.get("age_at_actuation_ms"),
-            ]
-        )
-    return TableData(columns, rows).without_empty()
+    totals = {name: {**its, "total_ms": its["tau_v_ms"] + its["tau_c_ms"]} for name, its in paper.items()}
+    return _table(
+        _with_paper(conditions, totals),
+        [
+            (texts("condition"), "condition"),
+            (numbers("injected video delay ms", 0), "injected_ms.video"),
+            (numbers("injected control delay ms", 0), "injected_ms.control"),
+            (latencies("τ video ms", bounded=True), "tau_v_ms"),
+            (numbers("the paper's τ video ms", 0), "paper.tau_v_ms"),
+            (latencies("τ control ms", bounded=True), "tau_c_ms"),
+            (numbers("the paper's τ control ms", 0), "paper.tau_c_ms"),
+            (latencies("loop latency ms"), "loop_ms"),
+            (numbers("the paper's τ video + τ control ms", 0), "paper.total_ms"),
+            (numbers("frame age, mean ms", 0), "picture_age_ms.mean"),
+            (numbers("frame age, p95 ms", 0), "picture_age_ms.p95"),
+            (latencies("frame age at actuation ms"), "age_at_actuation_ms"),
+        ],
+    )
 
 
 def driving_table(conditions: Conditions, paper: Conditions) -> TableData:
     """Return the table of completion and endings with the paper's values: one row for each condition."""
-    columns = [
-        texts("condition"),
-        numbers("runs", 0),
-        shares("completed"),
-        share_intervals("95 %, these routes"),
-        share_intervals("range over roads"),
-        shares("the paper's completed"),
-        share_intervals("the paper's 95 %"),
-        numbers("collisions / run", 2),
-        numbers("the paper's collisions / run", 2),
-        numbers("collisions / km", 2),
-        numbers("lane invasions / run", 2),
-        numbers("the paper's lane invasions / run", 2),
-        numbers("lane invasions / km", 1),
-        texts("endings"),
-    ]
-    rows = []
-    for name, entry in conditions.items():
-        published = paper.get(name, {})
-        endings = ", ".join(f"{count} {ending}" for ending, count in (entry.get("endings") or {}).items())
-        rows.append(
-            [
-                name,
-                entry["runs"],
-                entry["completion_rate"],
-                entry["completion_interval"],
-                entry.get("completion_such_roads"),
-                published.get("completion_rate"),
-                published.get("completion_interval"),
-                entry["collisions_per_run"],
-                published.get("collisions_per_run"),
-                entry.get("collisions_per_km"),
-                entry["lane_invasions_per_run"],
-                published.get("lane_invasions_per_run"),
-                entry.get("lane_invasions_per_km"),
-                endings or None,
-            ]
-        )
-    return TableData(columns, rows).without_empty()
+    return _table(
+        [{**entry, "endings": _endings(entry)} for entry in _with_paper(conditions, paper)],
+        [
+            (texts("condition"), "condition"),
+            (numbers("runs", 0), "runs"),
+            (shares("completed"), "completion_rate"),
+            (share_intervals("95 %, these routes"), "completion_interval"),
+            (share_intervals("range over roads"), "completion_such_roads"),
+            (shares("the paper's completed"), "paper.completion_rate"),
+            (share_intervals("the paper's 95 %"), "paper.completion_interval"),
+            (numbers("collisions / run", 2), "collisions_per_run"),
+            (numbers("the paper's collisions / run", 2), "paper.collisions_per_run"),
+            (numbers("collisions / km", 2), "collisions_per_km"),
+            (numbers("lane invasions / run", 2), "lane_invasions_per_run"),
+            (numbers("the paper's lane invasions / run", 2), "paper.lane_invasions_per_run"),
+            (numbers("lane invasions / km", 1), "lane_invasions_per_km"),
+            (texts("endings"), "endings"),
+        ],
+    )
+
+
+def _endings(entry: Mapping[str, Any]) -> str | None:
+    return ", ".join(f"{count} {ending}" for ending, count in (entry.get("endings") or {}).items()) or None
 
 
 def error_table(conditions: Conditions, paper: Conditions) -> TableData:
     """Return the table of lane-keeping errors with the paper's values: one row for each condition."""
-    columns = [
-        texts("condition"),
-        numbers(f"{COMPLETED_P95}, mean of runs", 2),
-        intervals("95 % interval, completed runs m"),
-        numbers("the paper's p95 m", 2),
-        numbers(f"{COMMON_P95}, mean of runs", 2),
-        intervals("95 % interval, up to common distance m"),
-        Column("p95 m, all runs ranked", _quartiles, ("p25", "p50", "p75")),
-        numbers("mean error m", 2),
-        numbers("rms m, mean of runs", 2),
-        numbers("maximum m, mean of runs", 2),
-        numbers("heading rms rad", 3),
-        numbers("steering reversals / s", 2),
-        numbers("oscillation Hz", 2),
-    ]
-    measured = ("mae_m", "rms_m", "max_m", "heading_rms_rad", "steering_reversals_per_s", "oscillation_hz")
-    rows = [
+    return _table(
+        _with_paper(conditions, paper),
         [
-            name,
-            entry["p95_m"],
-            entry["p95_interval"],
-            paper.get(name, {}).get("p95_m"),
-            entry.get("p95_common_m"),
-            entry.get("p95_common_interval"),
-            entry.get("p95_worst_rank_m"),
-            *(entry.get(key) for key in measured),
-        ]
-        for name, entry in conditions.items()
-    ]
-    return TableData(columns, rows).without_empty()
+            (texts("condition"), "condition"),
+            (numbers(f"{COMPLETED_P95}, mean of runs", 2), "p95_m"),
+            (intervals("95 % interval, completed runs m"), "p95_interval"),
+            (numbers("the paper's p95 m", 2), "paper.p95_m"),
+            (numbers(f"{COMMON_P95}, mean of runs", 2), "p95_common_m"),
+            (intervals("95 % interval, up to common distance m"), "p95_common_interval"),
+            (Column("p95 m, all runs ranked", _quartiles, ("p25", "p50", "p75")), "p95_worst_rank_m"),
+            (numbers("mean error m", 2), "mae_m"),
+            (numbers("rms m, mean of runs", 2), "rms_m"),
+            (numbers("maximum m, mean of runs", 2), "max_m"),
+            (numbers("heading rms rad", 3), "heading_rms_rad"),
+            (numbers("steering reversals / s", 2), "steering_reversals_per_s"),
+            (numbers("oscillation Hz", 2), "oscillation_hz"),
+        ],
+    )
 
 
 def _quartiles(quartiles: Mapping[str, float | None] | None) -> str:
@@ -191,58 +163,49 @@ def _quartiles(quartiles: Mapping[str, float | None] | None) -> str:
 
 def contrast_table(contrasts: Sequence[Mapping[str, Any]], paper: Sequence[Mapping[str, Any]]) -> TableData:
     """Return the table of planned contrasts with the paper's p values, from Fisher's test on its counts."""
-    columns = [
-        texts("contrast"),
-        numbers("pairs", 0),
-        numbers("completed under first only", 0),
-        numbers("completed under second only", 0),
-        probabilities("p"),
-        probabilities("p, Holm"),
-        probabilities("the paper's p"),
-        probabilities("the paper's p, Holm"),
-    ]
     published = {(contrast["a"], contrast["b"]): contrast for contrast in paper}
-    rows = []
-    for contrast in contrasts:
-        its = published.get((contrast["a"], contrast["b"]), {})
-        values = [contrast[key] for key in ("pairs", "only_a", "only_b", "p", "p_holm")]
-        rows.append([f"{contrast['a']} – {contrast['b']}", *values, its.get("p"), its.get("p_holm")])
-    return TableData(columns, rows).without_empty()
+    entries = [
+        {**each, "contrast": f"{each['a']} – {each['b']}", "paper": published.get((each["a"], each["b"]))}
+        for each in contrasts
+    ]
+    return _table(
+        entries,
+        [
+            (texts("contrast"), "contrast"),
+            (numbers("pairs", 0), "pairs"),
+            (numbers("completed under first only", 0), "only_a"),
+            (numbers("completed under second only", 0), "only_b"),
+            (probabilities("p"), "p"),
+            (probabilities("p, Holm"), "p_holm"),
+            (probabilities("the paper's p"), "paper.p"),
+            (probabilities("the paper's p, Holm"), "paper.p_holm"),
+        ],
+    )
 
 
 def group_table(groups: Sequence[Group], names: Sequence[str]) -> TableData:
     """Return the table of groups, which the settings `names` distinguish: one row for each condition of a group."""
-    columns = [
-        *(texts(short(name)) for name in names),
-        texts("condition"),
-        numbers("runs", 0),
-        shares("completed"),
-        share_intervals("95 % interval"),
-        numbers("collisions / run", 2),
-        numbers("lane invasions / run", 2),
-        numbers(f"{COMPLETED_P95}, mean of runs", 2),
-        numbers(f"{COMMON_P95}, mean of runs", 2),
-        numbers("loop latency ms, median"),
-        numbers("frame age, mean ms", 0),
-    ]
-    rows = [
-        [
-            *(group.get(key) for key in names),
-            name,
-            entry["runs"],
-            entry["completion_rate"],
-            entry["completion_interval"],
-            entry["collisions_per_run"],
-            entry["lane_invasions_per_run"],
-            entry["p95_m"],
-            entry.get("p95_common_m"),
-            entry["loop_ms"]["p50"],
-            (entry.get("picture_age_ms") or {}).get("mean"),
-        ]
+    entries = [  # numbers as keys of the settings, whose names may have dots
+        {**entry, "condition": name, **{str(index): group.get(key) for index, key in enumerate(names)}}
         for group in groups
         for name, entry in group["conditions"].items()
     ]
-    return TableData(columns, rows).without_empty()
+    return _table(
+        entries,
+        [
+            *((texts(short(name)), str(index)) for index, name in enumerate(names)),
+            (texts("condition"), "condition"),
+            (numbers("runs", 0), "runs"),
+            (shares("completed"), "completion_rate"),
+            (share_intervals("95 % interval"), "completion_interval"),
+            (numbers("collisions / run", 2), "collisions_per_run"),
+            (numbers("lane invasions / run", 2), "lane_invasions_per_run"),
+            (numbers(f"{COMPLETED_P95}, mean of runs", 2), "p95_m"),
+            (numbers(f"{COMMON_P95}, mean of runs", 2), "p95_common_m"),
+            (numbers("loop latency ms, median"), "loop_ms.p50"),
+            (numbers("frame age, mean ms", 0), "picture_age_ms.mean"),
+        ],
+    )
 
 
 def route_table(conditions: Conditions) -> TableData:
@@ -305,38 +268,31 @@ def survival_table(conditions: Conditions) -> TableData:
 
 def run_table(runs: Sequence[Mapping[str, Any]]) -> TableData:
     """Return the table of runs: identity, ending, main results and validity."""
-    columns = [
-        texts("run"),
-        texts("sweep"),
-        texts("time, fidelity, injection"),
-        texts("route"),
-        texts("condition"),
-        texts("preset"),
-        texts("ending"),
-        numbers("distance m", 0),
-        numbers("loop latency ms, median"),
-        numbers("p95 error m", 2),
-        numbers("frame age, mean ms", 0),
-        texts("validity", is_long=True),
-    ]
-    rows = [
-        [
-            run["run"],
-            run.get("sweep"),
-            f"{run['time']}, {run.get('fidelity') or 'video'}, {run['injection']}",
-            run["route"],
-            run["condition"],
-            run.get("preset"),
-            run["ending"],
-            run["distance_m"],
-            run["loop_ms"]["p50"],
-            run["p95_m"],
-            (run.get("picture_age_ms") or {}).get("mean"),
-            "valid" if run["valid"] else "invalid: " + "; ".join(run["invalid_reasons"]),
-        ]
+    entries = [
+        {
+            **run,
+            "setup": f"{run['time']}, {run.get('fidelity') or 'video'}, {run['injection']}",
+            "validity": "valid" if run["valid"] else "invalid: " + "; ".join(run["invalid_reasons"]),
+        }
         for run in runs
     ]
-    return TableData(columns, rows).without_empty()
+    return _table(
+        entries,
+        [
+            (texts("run"), "run"),
+            (texts("sweep"), "sweep"),
+            (texts("time, fidelity, injection"), "setup"),
+            (texts("route"), "route"),
+            (texts("condition"), "condition"),
+            (texts("preset"), "preset"),
+            (texts("ending"), "ending"),
+            (numbers("distance m", 0), "distance_m"),
+            (numbers("loop latency ms, median"), "loop_ms.p50"),
+            (numbers("p95 error m", 2), "p95_m"),
+            (numbers("frame age, mean ms", 0), "picture_age_ms.mean"),
+            (texts("validity", is_long=True), "validity"),
+        ],
+    )
 
 
 def clock_table(runs: Sequence[Mapping[str, Any]]) -> TableData:

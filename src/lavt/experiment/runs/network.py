@@ -91,8 +91,8 @@ def virtual_network(requested: NetworkDelays, costs: Costs) -> NetworkDelays:
     )
 
 
-def _add_delay(law: DelayModel, delay_us: float) -> DelayModel:
-    return DelayModel(law.constant_ms + delay_us / US_PER_MS, law.jitter, law.seed, law.name)
+def _add_delay(delay: DelayModel, delay_us: float) -> DelayModel:
+    return DelayModel(delay.constant_ms + delay_us / US_PER_MS, delay.jitter, delay.seed, delay.name)
 
 
 def _stages_ms(costs: Costs, stages: tuple[tuple[str, str], ...]) -> float:

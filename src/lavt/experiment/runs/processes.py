@@ -61,8 +61,8 @@ class Process:
             raise WorkError(f"{self.name} did not get ready within {READY_S:.0f} s") from None
         if line is None:
             if self.popen.wait() == USER_ERROR:
-                raise UserError(self.said().removeprefix("lavt: "))
-            raise WorkError(f"{self.name} did not start: {self.said()}")
+                raise UserError(self.last_message().removeprefix("lavt: "))
+            raise WorkError(f"{self.name} did not start: {self.last_message()}")
         return line
 
     @property
@@ -70,7 +70,7 @@ class Process:
         """True while the process has not ended."""
         return self.popen.poll() is None
 
-    def said(self) -> str:
+    def last_message(self) -> str:
         """Return the last line on standard error."""
         lines = self._log.read_text(errors="replace").strip().splitlines()
         return lines[-1] if lines else "no message"

@@ -18,7 +18,7 @@ import yaml
 from pydantic import BaseModel
 
 from lavt.assembly.links import trace_digests, trace_path
-from lavt.clock import Clock, MachineClock, pause
+from lavt.clock import MachineClock, pause
 from lavt.config import DelayConfig, ImpairmentConfig, LinkConfig, RelayConfig
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import WorkError
@@ -112,12 +112,11 @@ def start_client_router(processes: Processes, dialled: str, listen: str = LOCAL_
     return router, local
 
 
-def drive_real(planned: PlannedRun, out: Path, *, progress: Progress | None = None, clock: Clock | None = None) -> None:
+def drive_real(planned: PlannedRun, out: Path, *, progress: Progress | None = None) -> None:
     """Drive once, and write the two records into `out`, with the requests and measurements of the relay or netem.
 
     Raises `WorkError` where a process ends early or the drive does not begin; the records up to then stay in `out`.
     """
-    clock = clock or MachineClock()
     with TemporaryDirectory(prefix="lavt-") as folder:
         work = Path(folder)
         try:
@@ -125,7 +124,7 @@ def drive_real(planned: PlannedRun, out: Path, *, progress: Progress | None = No
                 netem = stack.enter_context(NetemRun(planned)) if uses_netem(planned) else None
                 processes = stack.enter_context(Processes(work))
                 loop = start_loop(processes, planned, work, work, netem=netem)
-                _wait_for_ending(processes, loop, clock, progress)
+                _wait_for_ending(processes, loop, progress)
                 for process in reversed(processes.started):
                     process.end()
                 if loop.relay is not None:
@@ -138,7 +137,8 @@ def drive_real(planned: PlannedRun, out: Path, *, progress: Progress | None = No
                 shutil.move(record, out / record.name)
 
 
-def _wait_for_ending(processes: Processes, loop: LoopProcesses, clock: Clock, progress: Progress | None) -> None:
+def _wait_for_ending(processes: Processes, loop: LoopProcesses, progress: Progress | None) -> None:
+    clock = MachineClock()
     start_ns = clock.now().mono_ns
     while loop.server.running and loop.server.latest.get("ending") is None:
         elapsed_s = (clock.now().mono_ns - start_ns) / NS_PER_S
@@ -146,7 +146,7 @@ def _wait_for_ending(processes: Processes, loop: LoopProcesses, clock: Clock, pr
         ended = next((each for each in processes.started if not each.running and each is not loop.server), None)
         if ended is not None:
             code = ended.popen.returncode  # negative: the signal that ended it
-            raise WorkError(f"{ended.name} ended during the run with {code}: {ended.said()}")
+            raise WorkError(f"{ended.name} ended during the run with {code}: {ended.last_message()}")
         not_begun = status.get("safety") in (None, "disarmed", "arming")
         if elapsed_s > RUN_LIMIT_S or (elapsed_s > BEGIN_LIMIT_S and not_begun):
             raise WorkError(f"the drive did not begin or end within {elapsed_s:.0f} s: {loop.client.latest} {status}")
@@ -154,7 +154,7 @@ def _wait_for_ending(processes: Processes, loop: LoopProcesses, clock: Clock, pr
             progress(status, loop.client.latest.get("status", {}))
         pause(STATUS_PERIOD_NS)
     if loop.server.popen.poll() not in (None, 0):
-        raise WorkError(f"the server failed: {loop.server.said()}")
+        raise WorkError(f"the server failed: {loop.server.last_message()}")
 
 
 def _requested_ms(planned: PlannedRun) -> dict[str, float | None]:
@@ -162,10 +162,10 @@ def _requested_ms(planned: PlannedRun) -> dict[str, float | None]:
 
     None for a flow with more than a constant delay: its median depends on the other traffic.
     """
-    laws = _injected(planned)
+    delays = _injected(planned)
     return {
-        "video": laws.video.median_ms() if laws.video_injected is None else None,
-        "control": laws.control.median_ms() if laws.control_injected is None else None,
+        "video": delays.video.median_ms() if delays.video_injected is None else None,
+        "control": delays.control.median_ms() if delays.control_injected is None else None,
     }
 
 
@@ -207,23 +207,26 @@ def _relay_config(planned: PlannedRun, video_port: int, control_port: int) -> Re
     return RelayConfig(
         video_server=f"127.0.0.1:{video_port}",
         control_server=f"127.0.0.1:{control_port}",
-        video=_delay(injected.video, requested.video_ms, requested.video),
-        control=_delay(injected.control, requested.control_ms, requested.control),
-        state=_delay(injected.state),
+        video=_delay_config(injected.video, requested.video_ms, requested.video),
+        control=_delay_config(injected.control, requested.control_ms, requested.control),
+        state=_delay_config(injected.state),
         seed=planned.seed,
     )
 
 
-def _delay(law: DelayModel, delay_ms: float = 0.0, impairment: ImpairmentConfig = UNIMPAIRED) -> DelayConfig:
+def _delay_config(delay: DelayModel, delay_ms: float = 0.0, impairment: ImpairmentConfig = UNIMPAIRED) -> DelayConfig:
     link = LinkConfig()
     if impairment != UNIMPAIRED:
         requested = impairment.model_dump()
         requested["trace"] = str(trace_path(impairment.trace).absolute()) if impairment.trace else ""
         link = LinkConfig(delay_ms=delay_ms, **requested)
-    if law.jitter is None:
-        return DelayConfig(constant_ms=law.constant_ms, link=link)
+    if delay.jitter is None:
+        return DelayConfig(constant_ms=delay.constant_ms, link=link)
     return DelayConfig(
-        constant_ms=law.constant_ms, jitter_median_ms=law.jitter.median_ms, jitter_sigma=law.jitter.sigma, link=link
+        constant_ms=delay.constant_ms,
+        jitter_median_ms=delay.jitter.median_ms,
+        jitter_sigma=delay.jitter.sigma,
+        link=link,
     )
 
 

@@ -184,9 +184,9 @@ def virtual_links(network: NetworkDelays) -> dict[str, VirtualLink]:
         return count
 
     def link(
-        law: DelayModel, injected: LinkInjection | None = None, index: Callable[[bytes, int], int] = packet_count
+        delay: DelayModel, injected: LinkInjection | None = None, index: Callable[[bytes, int], int] = packet_count
     ) -> VirtualLink:
-        return VirtualLink(DelayLine(law, None if injected is None else EmulatedLink(injected)), index)
+        return VirtualLink(DelayLine(delay, None if injected is None else EmulatedLink(injected)), index)
 
     session = None if network.control_injected is None else replace(network.control_injected, name="session")
     return {

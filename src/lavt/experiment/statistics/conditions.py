@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 
 from lavt.experiment.statistics.intervals import bootstrap_interval, exact_interval
-from lavt.experiment.statistics.paired_error import common_distances, common_p95_m, worst_rank_m
 from lavt.experiment.statistics.survival import survival
 
 Run = Mapping[str, Any]
 """An entry of `runs`, as `results.run_result` returns it. Entries of older versions lack some keys."""
 
 CommonDistances = Mapping[tuple[Any, ...], int]
-"""The distances at which runs are compared, from `paired_error.common_distances`."""
+"""The distances (in 10 m) at which runs are compared, by route, repetition and seed."""
 
 KEY_PART = "_key"
 """The suffix of a route that is the key part of another: the two are the same road."""
@@ -30,6 +29,8 @@ MEANS = (
     "oscillation_hz",
 )
 """The measures whose mean over the valid runs that have them is in a condition's summary."""
+
+QUARTILES = {"p25": 25, "p50": 50, "p75": 75}
 
 
 def summarize_conditions(runs: Iterable[Run]) -> dict[str, dict[str, Any]]:
@@ -106,6 +107,40 @@ def group_by(runs: Iterable[Run], key: str) -> dict[str, list[Run]]:
     for run in runs:
         members.setdefault(str(run[key]), []).append(run)
     return members
+
+
+def common_distances(runs: Sequence[Run]) -> CommonDistances:
+    """Return for each route, repetition and seed the distance (in 10 m) that its valid runs of all conditions drove."""
+    distances: dict[tuple[Any, ...], int] = {}
+    for run in runs:
+        if run["valid"] and run.get("p95_by_10m") is not None:
+            distances[_start(run)] = min(distances.get(_start(run), len(run["p95_by_10m"])), len(run["p95_by_10m"]))
+    return distances
+
+
+def common_p95_m(runs: Sequence[Run], distances: CommonDistances) -> list[float]:
+    """Return each run's P95 up to its common distance; runs with a common distance of 0 are left out."""
+    with_distance = [(run, distances.get(_start(run), 0)) for run in runs if run.get("p95_by_10m")]
+    return [float(run["p95_by_10m"][distance - 1]) for run, distance in with_distance if distance]
+
+
+def worst_rank_m(runs: Sequence[Run]) -> dict[str, float | None]:
+    """Return the quartiles of P95 over all runs, where a run that was not completed is worse than all completed ones.
+
+    Each is the smallest value that the share of runs does not exceed; None where that is a run that was not completed.
+    A completed run with an unknown error is left out.
+    """
+    ranked = [run["p95_m"] if run["ending"] == "completed" else np.inf for run in runs]
+    known = [value for value in ranked if value is not None]
+    quartiles = {
+        name: float(np.percentile(known, share, method="inverted_cdf")) if known else np.inf
+        for name, share in QUARTILES.items()
+    }
+    return {name: value if np.isfinite(value) else None for name, value in quartiles.items()}
+
+
+def _start(run: Run) -> tuple[Any, ...]:
+    return run["route"], run.get("repetition"), run.get("seed")
 
 
 def _summarize_route(runs: Sequence[Run], distances: CommonDistances) -> dict[str, Any]:

@@ -5,7 +5,6 @@ One persistent chronyc answers each query within 0.3 ms, without starting a proc
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Final
 
@@ -14,6 +13,7 @@ from lavt.domain import NS_PER_S, Now
 from lavt.transport.clock_sync.clock_report import (
     ClockReport,
     host_addresses,
+    parse_number,
     plain_address,
     query_clock,
     unknown_clock,
@@ -74,7 +74,7 @@ def parse_chrony(host: str, answer: str, before: Now, after: Now) -> ClockReport
     if tracking is None:
         return unknown_clock(middle, host, SOURCE, NOT_RUNNING)
     reference_s, correction_s, skew_ppm, delay_s, dispersion_s = (
-        _parse_number(tracking[at]) for at in (3, 4, 9, 10, 11)
+        parse_number(tracking[at]) for at in (3, 4, 9, 10, 11)
     )
     if (
         tracking[13] not in SYNCHRONISED
@@ -87,7 +87,7 @@ def parse_chrony(host: str, answer: str, before: Now, after: Now) -> ClockReport
     follows = plain_address(tracking[1])
     peer = next((row for row in rows if len(row) == NTPDATA_FIELDS and plain_address(row[0]) == follows != ""), None)
     peer_delay_s, peer_dispersion_s = _parse_numbers(peer, (19, 20))
-    poll_log2 = None if peer is None else _parse_number(peer[9])
+    poll_log2 = None if peer is None else parse_number(peer[9])
     return ClockReport(
         middle.mono_ns,
         middle.wall_ns,
@@ -111,16 +111,8 @@ def parse_chrony(host: str, answer: str, before: Now, after: Now) -> ClockReport
 
 def _parse_numbers(row: Sequence[str] | None, columns: Sequence[int]) -> list[float | None]:
     """Return columns that cannot be negative, with None for invalid values and for all if there is no row."""
-    found = [None if row is None else _parse_number(row[at]) for at in columns]
+    found = [None if row is None else parse_number(row[at]) for at in columns]
     return [each if _not_negative(each) else None for each in found]
-
-
-def _parse_number(text: str) -> float | None:
-    try:
-        number = float(text)
-    except ValueError:
-        return None
-    return number if math.isfinite(number) else None
 
 
 def _not_negative(*numbers: float | None) -> bool:

@@ -6,11 +6,9 @@ software time stamping; where phc2sys copies a network card's clock, configure t
 
 from __future__ import annotations
 
-import math
-
 from lavt.clock import Clock
 from lavt.domain import NS_PER_S, Now
-from lavt.transport.clock_sync.clock_report import ClockReport, host_addresses, query_clock, unknown_clock
+from lavt.transport.clock_sync.clock_report import ClockReport, host_addresses, parse_number, query_clock, unknown_clock
 from lavt.transport.clock_sync.persistent_process import Run
 
 SOURCE = "ptp"
@@ -44,7 +42,7 @@ def parse_ptp(host: str, answer: str, before: Now, after: Now) -> ClockReport:
     if "gmIdentity" not in fields:
         return unknown_clock(middle, host, SOURCE, NOT_RUNNING)
     offset_ns, path_ns, steps = (
-        _parse_number(fields.get(key)) for key in ("offsetFromMaster", "meanPathDelay", "stepsRemoved")
+        parse_number(fields.get(key, "")) for key in ("offsetFromMaster", "meanPathDelay", "stepsRemoved")
     )
     if fields.get("gmPresent") == "false" and "MASTER" in states:
         offset_ns, path_ns, steps = 0.0, 0.0, 0.0
@@ -61,11 +59,3 @@ def parse_ptp(host: str, answer: str, before: Now, after: Now) -> ClockReport:
         follows=fields["gmIdentity"],
         addresses=host_addresses(),
     )
-
-
-def _parse_number(text: str | None) -> float | None:
-    try:
-        number = float(text or "")
-    except ValueError:
-        return None
-    return number if math.isfinite(number) else None

@@ -17,7 +17,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final
 
-from lavt.clock import Clock, MachineClock, pause
+from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import LavtError, UserError, WorkError
 from lavt.transport.emulation.impairment import ExemptPort, ImpairedFlow, Impairment, check_flows
@@ -140,7 +140,6 @@ class NetemInterface:
         persistent: bool = False,
         directory: Path = DIRECTORY,
         run: RunCommand = run_tc,
-        clock: Clock | None = None,
         seed: int = 1,
     ) -> None:
         if not re.fullmatch(r"(?!-)[^\s/]{1,15}", interface) or interface in {".", ".."}:
@@ -150,7 +149,7 @@ class NetemInterface:
         self._tables = str(directory)
         self._owner = NO_OWNER if persistent else current_process()
         self._run = run
-        self._clock = clock or MachineClock()
+        self._clock = MachineClock()
         self._seed = seed
         self._jitter: CorrelatedJitter | None = None
 
@@ -262,7 +261,7 @@ class NetemInterface:
         self, flows: Sequence[ImpairedFlow], *, exempt: Sequence[ExemptPort] = (), count: int = 50
     ) -> dict[str, ProbeResult]:
         """Measure packets of each flow, and packets that must not be delayed, on their way through the queue."""
-        return measure(self.interface, probes(flows, exempt), count=count, clock=self._clock)
+        return measure(self.interface, probes(flows, exempt), count=count)
 
     def verify(
         self, flows: Sequence[ImpairedFlow], *, exempt: Sequence[ExemptPort] = (), count: int = 50

@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from statistics import median, quantiles
 from typing import Any, Final, Literal
 
-from lavt.clock import Clock, MachineClock, pause
+from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
 from lavt.transport.arrival import ANCILLARY_BYTES, SO_TIMESTAMPNS
@@ -108,29 +108,21 @@ def probes(flows: Sequence[ImpairedFlow], exempt: Sequence[ExemptPort] = ()) -> 
     return impaired + unimpaired
 
 
-def measure(
-    interface: str,
-    requested: Sequence[ProbeSpec],
-    *,
-    count: int = 50,
-    period_ns: int = PERIOD_NS,
-    clock: Clock | None = None,
-) -> dict[str, ProbeResult]:
-    """Send `count` frames for each probe, `period_ns` apart, and return the results by probe name.
+def measure(interface: str, requested: Sequence[ProbeSpec], *, count: int = 50) -> dict[str, ProbeResult]:
+    """Send `count` frames for each probe, `PERIOD_NS` apart, and return the results by probe name.
 
     Raise `UserError` without root, and for an interface that does not exist or is down.
     """
     try:
-        return _measure(interface, requested, count, period_ns, clock or MachineClock())
+        return _measure(interface, requested, count)
     except OSError as error:
         raise UserError(
             f"cannot measure {interface} ({error.strerror}): name an interface that is up (`ip link`)"
         ) from error
 
 
-def _measure(
-    interface: str, requested: Sequence[ProbeSpec], count: int, period_ns: int, clock: Clock
-) -> dict[str, ProbeResult]:
+def _measure(interface: str, requested: Sequence[ProbeSpec], count: int) -> dict[str, ProbeResult]:
+    clock = MachineClock()
     with _open(interface) as receiver, _open_sender() as sender:
         captured = _CapturedFrames(receiver, requested, clock.now().mono_ns)
         link = (interface, _IPV4, 0, 0, _hardware_address(interface))
@@ -138,7 +130,7 @@ def _measure(
         for number in range(count):
             for index, probe in enumerate(requested):
                 _send(sender, _frame(probe, captured.mark(number, index, clock.now().wall_ns)), link)
-            pause(begin_ns + (number + 1) * period_ns - clock.now().mono_ns)
+            pause(begin_ns + (number + 1) * PERIOD_NS - clock.now().mono_ns)
             captured.receive()  # the kernel takes the times, so this need not be prompt
         longest_ns = round(max(probe.impairment.longest_ms for probe in requested) * NS_PER_MS)
         limit_ns = clock.now().mono_ns + longest_ns + DRAIN_MARGIN_NS

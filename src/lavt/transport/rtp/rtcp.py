@@ -58,7 +58,6 @@ _BEFORE_BLOCKS: Final = {_SENDER_REPORT: _SENDER_INFORMATION.size, _RECEIVER_REP
 _MAX_LOST: Final = 2**23 - 1
 _MAX_WORD: Final = 2**32 - 1
 _MAX_BIT_RATE_BPS: Final = (2**17 - 1) << 63
-_RTP_HEADER_BYTES: Final = 12
 _RTCP_HEADER_BYTES: Final = 8
 
 
@@ -238,11 +237,6 @@ def parse_announcement(datagram: bytes) -> Announcement:
 def is_rtcp(datagram: bytes) -> bool:
     """Return whether a datagram on a port of RTP and RTCP is RTCP (RFC 5761, section 4)."""
     return len(datagram) >= _RTCP_HEADER_BYTES and datagram[0] >> 6 == 2 and 192 <= datagram[1] <= 223
-
-
-def is_rtp(datagram: bytes) -> bool:
-    """Return whether a datagram on a port of RTP and RTCP is RTP, whose payload type is never 64 to 95 (RFC 5761)."""
-    return len(datagram) >= _RTP_HEADER_BYTES and datagram[0] >> 6 == 2 and not 64 <= datagram[1] & 0x7F <= 95
 
 
 def _packet(kind: int, count: int, body: bytes) -> bytes:

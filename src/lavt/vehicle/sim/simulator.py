@@ -7,8 +7,7 @@ from collections import deque
 
 from lavt.domain import NS_PER_S, Actuation, GroundTruth, Pose, VehicleEvent, VehicleState
 from lavt.streams import stream
-from lavt.vehicle.sim.dynamics import CarDynamics, CarMotion, CarParameters
-from lavt.vehicle.sim.rendering.cars import LINCOLN_MKZ
+from lavt.vehicle.sim.dynamics import LINCOLN_MKZ, CarDynamics, CarMotion, CarParameters
 from lavt.vehicle.sim.road.road import Road
 from lavt.vehicle.sim.route_monitor import RouteMonitor
 from lavt.vehicle.vehicle import Capabilities, ReachedCommand
@@ -28,7 +27,7 @@ def grid_ns(index: int) -> int:
     return index * NS_PER_S // STEPS_PER_S
 
 
-def start_of(seed: int) -> tuple[float, float, float]:
+def start_offset(seed: int) -> tuple[float, float, float]:
     """Return a run's start relative to the route's start: metres ahead, metres to the left, heading in rad."""
     return (
         float(stream(seed, "start position").uniform(0.0, START_AHEAD_M)),
@@ -59,7 +58,7 @@ class Simulator:
         self._steering_dead_ns = round(parameters.steering_dead_time_s * NS_PER_S)
         self._pedal_dead_ns = round(parameters.pedal_dead_time_s * NS_PER_S)
         self._index = -(-start_mono_ns * STEPS_PER_S // NS_PER_S)
-        ahead_m, lateral_m, turned_rad = start_of(seed)
+        ahead_m, lateral_m, turned_rad = start_offset(seed)
         x_m, y_m = road.across(ahead_m, lateral_m).tolist()
         motion = CarMotion(x_m, y_m, float(road.point(ahead_m)[2]) + turned_rad)
         self._car = CarDynamics(parameters, motion, 1.0 / STEPS_PER_S)

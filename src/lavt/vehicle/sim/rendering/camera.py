@@ -35,34 +35,12 @@ class SimCamera:
         exposure_ns: int = 0,
         sensor_delay_ns: int = 0,
     ) -> None:
-        self._model, self._rate_hz, self._phase_ns = model, rate_hz, phase_ns
-        self._exposure_ns, self._sensor_delay_ns = exposure_ns, sensor_delay_ns
+        self.model = model
+        self.rate_hz = rate_hz
+        self.phase_ns = phase_ns
+        self.exposure_ns = exposure_ns
+        self.sensor_delay_ns = sensor_delay_ns
         self._renderer = Renderer(road, model, seed=seed, scenery=scenery, light=light)
-
-    @property
-    def model(self) -> CameraModel:
-        """The geometry of the pictures."""
-        return self._model
-
-    @property
-    def rate_hz(self) -> float:
-        """Frames per second."""
-        return self._rate_hz
-
-    @property
-    def phase_ns(self) -> int:
-        """The time from the start until the shutter opens for frame 0."""
-        return self._phase_ns
-
-    @property
-    def exposure_ns(self) -> int:
-        """The exposure time."""
-        return self._exposure_ns
-
-    @property
-    def sensor_delay_ns(self) -> int:
-        """The time from the end of the exposure until the picture is available, without the time of rendering it."""
-        return self._sensor_delay_ns
 
     def prepare(self) -> None:
         """Fill the caches whose first use would delay a frame in real time."""
@@ -76,13 +54,13 @@ class SimCamera:
 
     def expose(self, number: int, begin_ns: int, poses: Sequence[Pose]) -> CapturedFrame | None:
         """Render frame `number` with motion blur; None when no pose is as old as the opening of the shutter."""
-        if self._exposure_ns == 0:
+        if self.exposure_ns == 0:
             return self.capture(number, begin_ns, newest_pose(poses, begin_ns))
-        begin, end = interpolate_pose(poses, begin_ns), interpolate_pose(poses, begin_ns + self._exposure_ns)
+        begin, end = interpolate_pose(poses, begin_ns), interpolate_pose(poses, begin_ns + self.exposure_ns)
         if begin is None or end is None:
             return None
         picture = self._renderer.render_exposed(begin, end, number)
-        return CapturedFrame(number, begin_ns + self._exposure_ns // 2, picture)
+        return CapturedFrame(number, begin_ns + self.exposure_ns // 2, picture)
 
 
 def interpolate_pose(poses: Sequence[Pose], at_ns: int) -> Pose | None:

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from lavt.experiment.statistics.paired_error import common_distances, common_p95_m, worst_rank_m
+from lavt.experiment.statistics.conditions import common_distances, common_p95_m, worst_rank_m
 
 
 def run(by_10m: list[float] | None = None, **changes: Any) -> dict[str, Any]:
