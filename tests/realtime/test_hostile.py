@@ -32,7 +32,7 @@ GARBAGE_PER_ROUND = 5
 ENDED_WITHIN_S = 5.0
 
 COMMAND = Command(1, 2**40, 0, 0, 0, 0.1, 1.0, 0.0, (0.0,) * PATH_POINTS, "drive", 0)
-PREFIXES = (b"", b"\x80\x60", b"\x80\xc9\x00\x01", b"\x81\xce\x00\x02", b"LAVT\x01\x01")
+PREFIXES = (b"", b"\x80\x60", b"\x80\xc9\x00\x01", b"\x81\xce\x00\x02", b"LAVT\x01\x03")
 """Nothing, and the first bytes of RTP, a receiver report, a picture-loss indication and a hello."""
 REQUEST = SessionRequest("acquire", "stranger", 7, 0)
 

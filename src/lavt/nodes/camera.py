@@ -108,6 +108,7 @@ class CameraNode:
             "path_wrong_token": path.wrong_token,
             "path_wrong_address": path.wrong_address,
             "path_stale": path.stale,
+            "path_unneeded": path.unneeded,
             "path_foreign_reports": path.foreign_reports,
         }
 
