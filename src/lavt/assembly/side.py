@@ -39,11 +39,13 @@ from lavt.runtime.realtime import RealRuntime
 from lavt.runtime.recorder import QueuedRecorder
 from lavt.transport.clock_sync.clock_report import kernel_identity
 from lavt.transport.clock_sync.persistent_process import PersistentProcess
+from lavt.transport.datagram_filter import ProbePortFilter, VideoPortFilter, filtered
 from lavt.transport.emulation.impairment import ExemptPort
 from lavt.transport.netem.injector import Injector
 from lavt.transport.netem.netem import NetemInterface
 from lavt.transport.rendezvous.link import RendezvousLink
 from lavt.transport.udp_link import UdpLink
+from lavt.transport.video.path_validation import PathServer
 from lavt.transport.zenoh_link import ZenohLink, quiet_logs
 
 PrintMessage = Callable[[str], None]
@@ -95,6 +97,7 @@ class Side:
         in_force: Callable[[], tuple[int, int]],
         actuator: ActuatorProcess | None = None,
         session: ClientSession | None = None,
+        path: PathServer | None = None,
     ) -> None:
         self.clock = clock
         self.session = session
@@ -102,6 +105,8 @@ class Side:
         self.actuator = actuator
         """The server's actuator if it runs in a process of its own."""
         self._links = links
+        self._path = path
+        """The server's end of the video path, by which strangers' datagrams are dropped; None on a client."""
         self._time_source = prepared.time_source
         self._writer = None if out is None else _open_record(config, out)
         self.live = LiveTap(NoRecorder() if self._writer is None else self._writer)
@@ -123,8 +128,12 @@ class Side:
         self.runtime.start({"video": links.video, "probe": links.probe, "zenoh": gateway, "netem": self._injector})
         if self.actuator is not None:
             self.actuator.start(self.runtime)
-        links.video.start(self._deliver)
-        links.probe.start(self._deliver)
+        if self._path is None:
+            links.video.start(self._deliver)
+            links.probe.start(self._deliver)
+        else:
+            links.video.start(filtered(self._deliver, VideoPortFilter(self._path), links.video.counts))
+            links.probe.start(filtered(self._deliver, ProbePortFilter(self._path), links.probe.counts))
 
     def send(self, channel: str, payload: Any) -> None:
         """Deliver a message to a node of this side."""
@@ -184,7 +193,17 @@ def open_server(
             opened.callback(process.end)
             in_force = process.in_force
             ready["actuator_pid"] = process.pid
-        side = Side(config, clock, links, nodes.all, out=out, prepared=prepared, in_force=in_force, actuator=actuator)
+        side = Side(
+            config,
+            clock,
+            links,
+            nodes.all,
+            out=out,
+            prepared=prepared,
+            in_force=in_force,
+            actuator=actuator,
+            path=nodes.camera.path,
+        )
         opened.pop_all()  # from here on the side closes them
     with closing(side):
         yield side, ready

@@ -191,6 +191,9 @@ class PathServer:
         self._new_cipher = new_cipher
         self.set_token(None)
 
+    token: bytes | None
+    """The token of the session; None: there is no session."""
+
     def set_token(self, token: bytes | None) -> None:
         """Close the path and set the token of a new session, or None for no session.
 
@@ -198,7 +201,7 @@ class PathServer:
         """
         if token is not None:
             _check_token(token)
-        self._token = token
+        self.token = token
         self.cipher: Cipher = NoCipher()
         self._secret = self._new_secret()
         self._address: Address | None = None
@@ -212,7 +215,7 @@ class PathServer:
         number = client_datagram_number(datagram)
         if number is None:
             self.malformed += 1
-        elif not self._verify_mac(datagram):
+        elif not self.is_authentic(datagram):
             self.wrong_token += 1
         elif datagram.startswith(_ANSWER):
             self._open(datagram, address, now_ns)
@@ -237,19 +240,27 @@ class PathServer:
             self.foreign_reports += 1
 
     def accepts_rtcp_from(self, address: Address) -> bool:
-        """Return whether RTCP from `address` is accepted: the path was open to it at the last check."""
+        """Return whether RTCP from `address` is accepted: the path was open to it at the last check.
+
+        It is safe to call this from any thread.
+        """
         return self._address == address
 
-    def _verify_mac(self, datagram: bytes) -> bool:
-        """Return whether a datagram ends with a valid MAC under the token."""
-        body, mac = datagram[:-_MAC_BYTES], datagram[-_MAC_BYTES:]
-        return self._token is not None and hmac.compare_digest(mac, _mac(self._token, body))
+    def is_open_to_host(self, host: str) -> bool:
+        """Return whether the path was open to any port of `host` at the last check; safe to call from any thread."""
+        address = self._address
+        return address is not None and address[0] == host
+
+    def is_authentic(self, datagram: bytes) -> bool:
+        """Return whether a datagram ends with a valid MAC under the token; safe to call from any thread."""
+        body, mac, token = datagram[:-_MAC_BYTES], datagram[-_MAC_BYTES:], self.token
+        return token is not None and hmac.compare_digest(mac, _mac(token, body))
 
     def _challenge(self, number: int, address: Address, now_ns: int) -> bytes:
         """Return the challenge for `address`."""
         challenged = number.to_bytes(8, "big") + now_ns.to_bytes(8, "big", signed=True)
         body = _CHALLENGE + challenged + self._cookie(challenged, address)
-        return body + _mac(self._token or b"", body)[:_CHALLENGE_MAC_BYTES]
+        return body + _mac(self.token or b"", body)[:_CHALLENGE_MAC_BYTES]
 
     def _open(self, answer: bytes, address: Address, now_ns: int) -> None:
         """Open the path to `address` if `answer`, whose MAC is valid, answers a recent challenge sent to it."""
@@ -266,7 +277,7 @@ class PathServer:
             self.unneeded += 1
             return
         self._address = address
-        self.cipher = self._new_cipher(self._token or b"", answer[_CHALLENGED])
+        self.cipher = self._new_cipher(self.token or b"", answer[_CHALLENGED])
         self._opened_by_ns = issued_ns
         self._last_report_ns = now_ns
 
