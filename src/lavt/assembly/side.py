@@ -176,7 +176,7 @@ def open_server(
     Raises `UserError` for a wrong config, before the output directory is touched.
     """
     with ExitStack() as opened:
-        prepared = _prepare(config, out, opened, print_message)
+        prepared = _prepare(config, out, clock, opened, print_message)
         bind = config.video.bind
         video = open_flow(config, clock, "video", "feedback", bind=(bind, config.video.port), remote=None)
         opened.callback(video.close)
@@ -216,7 +216,7 @@ def open_client(config: ClientConfig, out: Path | None, clock: Clock, print_mess
     Raises `UserError` for a wrong config, before the output directory is touched.
     """
     with ExitStack() as opened:
-        prepared = _prepare(config, out, opened, print_message)
+        prepared = _prepare(config, out, clock, opened, print_message)
         server = config.video.server
         video = open_flow(config, clock, "video", "rtp", bind=("", 0), remote=(server, config.video.port))
         opened.callback(video.close)
@@ -240,11 +240,15 @@ def open_client(config: ClientConfig, out: Path | None, clock: Clock, print_mess
 
 
 def _prepare(
-    config: ServerConfig | ClientConfig, out: Path | None, opened: ExitStack, print_message: PrintMessage
+    config: ServerConfig | ClientConfig,
+    out: Path | None,
+    clock: Clock,
+    opened: ExitStack,
+    print_message: PrintMessage,
 ) -> Prepared:
     if out is not None:
         check_directory(out)
-    authenticator = build_authenticator(config)
+    authenticator = build_authenticator(config, clock.now().wall_ns)
     queues = NetemInterface(config.injection.interface) if config.injection.interface else None
     for message in () if queues is None else queues.check():
         print_message(message)
