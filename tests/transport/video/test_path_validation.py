@@ -263,6 +263,15 @@ def test_replayed_hello() -> None:
     assert rejections(server) == {"stale": 3}
 
 
+def test_few_copies_of_a_hello_get_a_challenge() -> None:
+    """Copies of the newest hello from many addresses get four challenges, and the next hello gets its own."""
+    server, client = new_server(), PathClient(TOKEN)
+    hello = client.hello(T0)
+    challenges = [server.receive(hello, ("198.51.100.7", port), T0) for port in range(100)]
+    assert sum(each is not None for each in challenges) == 4
+    assert server.receive(client.hello(T0), HOME, T0) is not None
+
+
 def test_an_open_path_keeps_its_cipher() -> None:
     """A second answer from the address of the path changes no key while the path is open, and opens it afterwards."""
     server, client = new_server(), PathClient(TOKEN)

@@ -10,15 +10,16 @@ The number counts the client's hellos; challenge and answer repeat it. MAC is HM
 before it. The cookie is an address-validation cookie (compare RFC 9000, section 8.1): HMAC-SHA256, cut to 16 bytes,
 over number, time and the address *from which the server received the hello*, under a secret that never leaves the
 server and changes with each token. Behind a NAT or a relay the client cannot know that address, so it returns the
-cookie, and the server accepts the cookie only from that address. The server keeps the highest number only, however
-many hellos arrive.
+cookie, and the server accepts the cookie only from that address. The server keeps only the highest number and
+up to four addresses of it, however many hellos arrive.
 
 * Aiming the video at a third party: its address must answer a challenge that was sent only there, even if the attacker
   has the token.
 * Redirecting the video by a forged hello or answer: needs the token. A hello opens or moves no path, and one without a
   valid MAC gets no reply. No reply is longer than the datagram it replies to.
 * Replaying a hello: a number below the highest gets no challenge, and the client answers one challenge to each of its
-  hellos. A copy of the newest hello that arrives first from elsewhere does not prevent the challenge to the client.
+  hellos. The newest hello gets up to four, to different addresses: a copy that arrives first from elsewhere does not
+  prevent the challenge to the client.
 * Replaying an answer: it is valid only from the address in its cookie, within 2 s, and if its challenge is newer than
   the one that opened the path. A restart or a new token invalidates all older cookies.
 * Making either end change its keys: the server keeps the key of a path that is open to the answer's address, and the
@@ -69,6 +70,8 @@ _CHALLENGE_MAC_BYTES: Final = 8
 _CHALLENGE_BYTES: Final = _COOKIE.stop + _CHALLENGE_MAC_BYTES
 _CLIENT_SIZES: Final = {_HELLO: _NUMBER.stop + _MAC_BYTES, _ANSWER: _COOKIE.stop + _MAC_BYTES}
 """Sizes in bytes of the datagrams that a client sends, by their head."""
+_MAX_CHALLENGES: Final = 4
+"""Challenges to copies of one hello from different addresses: few, because each copy may have a false address."""
 _MAX_CIPHERS: Final = 16
 """Two seconds of hellos: after that the server accepts no answer to them."""
 
@@ -205,8 +208,10 @@ class PathServer:
         self.cipher: Cipher = NoCipher()
         self._secret = self._new_secret()
         self._address: Address | None = None
-        self._last_hello: tuple[int, Address | None] = (0, None)
-        """The highest number of a hello, and the address to which its last challenge was sent."""
+        self._hello_number = 0
+        """The highest number of a hello."""
+        self._challenged: set[Address] = set()
+        """The addresses from which that hello came."""
         self._opened_by_ns: int | None = None
         self._last_report_ns = 0
 
@@ -219,10 +224,9 @@ class PathServer:
             self.wrong_token += 1
         elif datagram.startswith(_ANSWER):
             self._open(datagram, address, now_ns)
-        elif number < self._last_hello[0] or (number, address) == self._last_hello:
+        elif not self._is_new_hello(number, address):
             self.stale += 1
         else:
-            self._last_hello = number, address
             return self._challenge(number, address, now_ns)
         return None
 
@@ -245,6 +249,15 @@ class PathServer:
         It is safe to call this from any thread.
         """
         return self._address == address
+
+    def _is_new_hello(self, number: int, address: Address) -> bool:
+        """Return whether an authentic hello gets a challenge."""
+        if number > self._hello_number:
+            self._hello_number, self._challenged = number, set()
+        if number < self._hello_number or address in self._challenged or len(self._challenged) == _MAX_CHALLENGES:
+            return False
+        self._challenged.add(address)
+        return True
 
     def is_open_to_host(self, host: str) -> bool:
         """Return whether the path was open to any port of `host` at the last check; safe to call from any thread."""
