@@ -108,8 +108,9 @@ def feedback(seed: int) -> Target:
     bench.deliver("video_token", token)
     inputs = 0
 
+    client = PathClient(token)
+
     def validate_path() -> None:
-        client = PathClient(token)
         hello = client.hello(0)
         [challenged] = bench.deliver("feedback", hello, HOME)
         answer = client.answer(challenged.payload) or b""
