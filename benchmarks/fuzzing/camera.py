@@ -102,14 +102,15 @@ def feedback(seed: int) -> Target:
 
     bench = NodeBench(node, on_send)
     token, reports = entropy.token(16), rtcp_reports()
-    path = Corpus(old_path(), fields=((4, 1), (5, 1), (6, 8), (14, 16)))
+    path = Corpus(old_path(), fields=((4, 1), (5, 1), (6, 8), (14, 8), (22, 16)))
     words = tuple((at, 4) for at in range(4, 64, 4))
     rtcp = Corpus(reports, fields=((0, 1), (1, 1), (2, 2), *words))
     bench.deliver("video_token", token)
     inputs = 0
 
+    client = PathClient(token)
+
     def validate_path() -> None:
-        client = PathClient(token)
         hello = client.hello(0)
         [challenged] = bench.deliver("feedback", hello, HOME)
         answer = client.answer(challenged.payload) or b""

@@ -243,6 +243,8 @@ def encrypted_feedback(seed: int) -> Target:
     bench.deliver("video_token", TOKEN)
     [challenge] = bench.deliver("feedback", client.hello(0), HOME)
     bench.deliver("feedback", client.answer(challenge.payload), HOME)
+    [packet] = Packetizer(77, 0).packetize(b"\0\0\1\x65", 0)
+    client.unprotect(path.cipher.protect(packet))  # from now on it uses the server's key
     report, loss = rtcp_reports()[0], picture_loss(1, 2)
     corpus = Corpus(
         [client.protect_rtcp(each) for each in (report, loss, report)], fields=tuple((at, 1) for at in range(96))

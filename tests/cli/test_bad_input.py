@@ -322,6 +322,32 @@ SIDES = {
 }
 
 
+@pytest.mark.parametrize("way", ["listen", "connect"])
+def test_a_router_whose_private_key_others_may_read(way: str, run: Run, tmp_path: Path) -> None:
+    """A router does not start if other users may read the private key of its certificate."""
+    key = tmp_path / "vehicle-1.key"
+    key.touch(0o644)
+    key.chmod(0o644)
+    change = f"transport.link.tls.{way}_private_key={key}"
+    assert str(key) in run("router", ROUTER, "--set", change, "--set", "listen.endpoints=[tcp/127.0.0.1:0]").rejected()
+
+
+@pytest.mark.parametrize(("side", "config"), [("server", SERVER), ("client", CLIENT)])
+def test_an_expired_signing_key(side: str, config: str, run: Run, tmp_path: Path) -> None:
+    """A server or client with an expired signing key does not start."""
+    certificates = pytest.importorskip("lavt.transport.security.certificates")
+    pair = certificates.new_signing_pair(0, 1)
+    private, public = tmp_path / "mine.sign.key", tmp_path / "other.sign.pub"
+    private.write_bytes(pair.private)
+    private.chmod(0o600)
+    public.write_bytes(pair.public)
+    other = f"security.operators={{a: {public}}}" if side == "server" else f"security.vehicle={public}"
+    sentence = run(side, config, "--set", f"security.key={private}", "--set", other, "--out", "mine").rejected()
+    assert str(private) in sentence or str(public) in sentence
+    assert "1970-01-02" in sentence
+    assert not (tmp_path / "mine").exists()
+
+
 @pytest.mark.parametrize("case", SIDES)
 def test_bad_sides(case: str, run: Run, tmp_path: Path) -> None:
     """An invalid config of a server, client, router or relay is rejected in one sentence, and nothing is created."""

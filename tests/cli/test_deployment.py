@@ -30,6 +30,12 @@ def lines(path: Path) -> list[str]:
     return [line for line in path.read_text().splitlines() if line and not line.startswith("#")]
 
 
+def test_the_servers_unit_allows_can() -> None:
+    """The server may open a CAN socket, for a vehicle by wire; no other unit may."""
+    allowed = {path.name: unit(path)["Service"]["RestrictAddressFamilies"].split() for path in UNITS}
+    assert [name for name, families in allowed.items() if "AF_CAN" in families] == ["lavt-server.service"]
+
+
 @pytest.mark.parametrize("path", UNITS, ids=lambda path: path.name)
 def test_units_start_existing_commands(path: Path) -> None:
     """Each unit starts an existing command of lavt with existing options and a file in /etc/lavt."""

@@ -162,6 +162,10 @@ VERDICTS: list[tuple[Callable[[], Check], str, str]] = [
     (lambda: checks.check_certificate(Path("a.pem"), 100.0), "ok", "valid for 100 days"),
     (lambda: checks.check_certificate(Path("a.pem"), 13.0), "warning", "valid for 13 days"),
     (lambda: checks.check_certificate(Path("a.pem"), -1.0), "problem", "expired 1 days ago"),
+    (lambda: checks.check_signing_key(Path("a.sign.key"), 100.0), "ok", "valid for 100 days"),
+    (lambda: checks.check_signing_key(Path("a.sign.key"), 13.0), "warning", "valid for 13 days"),
+    (lambda: checks.check_signing_key(Path("a.sign.key"), -1.0), "problem", "expired 1 days ago"),
+    (lambda: checks.check_signing_key(Path("a.sign.key"), None), "warning", "never expires"),
 ]
 """A check, its verdict, and a part of its text."""
 
@@ -371,7 +375,7 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
     certificates = pytest.importorskip("lavt.transport.security.certificates")
     folder = tmp_path_factory.mktemp("keys")
     for name in ("vehicle-3", "operator-1", "operator-2"):
-        pair = certificates.new_signing_pair()
+        pair = certificates.new_signing_pair(MachineClock().now().wall_ns, 10)
         (folder / f"{name}.key").write_bytes(pair.private)
         (folder / f"{name}.key").chmod(0o600)
         (folder / f"{name}.pub").write_bytes(pair.public)

@@ -4,6 +4,7 @@ import re
 import shutil
 import stat
 import sys
+from datetime import timedelta  # noqa: TID251 (no clock is read)
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,9 @@ from cryptography import x509
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ec, ed25519
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from lavt.clock import calendar_time
+from lavt.transport.security.keys import key_expiry_ns
 
 ENDINGS = (".key", ".pem", ".sign.key", ".sign.pub")
 
@@ -113,6 +117,18 @@ def test_instructions(run: Run) -> None:
         "bob": own["bob"] | {"bob.sign.key", "car.sign.pub"},
         "sky": own["sky"],
     }
+
+
+def test_signing_keys_expire(run: Run, directory: Path) -> None:
+    """Signing keys expire together with the certificate, and the output has the day."""
+    code, out, _ = run("keys", "--operator", "ann", "--days", "30")
+    assert code == 0
+    for ending in (".sign.key", ".sign.pub"):
+        path = directory / f"ann{ending}"
+        expires_ns = key_expiry_ns(path.read_bytes(), path)
+        assert expires_ns is not None
+        assert abs(calendar_time(expires_ns) - certificate(directory, "ann").not_valid_after_utc) < timedelta(minutes=2)
+        assert f"signing key until {calendar_time(expires_ns):%Y-%m-%d}" in out
 
 
 def test_adding_names(run: Run, directory: Path) -> None:

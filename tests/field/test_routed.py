@@ -31,7 +31,7 @@ pytestmark = [pytest.mark.usefixtures("namespaces")]
 
 VIDEO_PORT, PROBE_PORT = 5600, 5602
 """As in configs/server.yaml."""
-HELLO_BYTES, CHALLENGE_BYTES, ANSWER_BYTES = 38, 38, 62
+HELLO_BYTES, CHALLENGE_BYTES, ANSWER_BYTES = 46, 46, 70
 """Sizes of the datagrams that validate the video's path; RTCP datagrams have multiples of 4 bytes."""
 UNSOLICITED_S = 1.0
 """Within one kernel a datagram that passes arrives at once."""

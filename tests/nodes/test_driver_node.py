@@ -102,8 +102,11 @@ class Bench:
         self.mono_ns = end_ns
         return made
 
-    def state(self, safety: str, speed_mps: float = 0.0) -> None:
-        self.take("state", encode(State(1, 1, speed_mps, 0.0, "drive", safety, "", -1, "")))  # type: ignore[arg-type]
+    def state(self, safety: str, speed_mps: float = 0.0, *, vehicle_ns: int | None = None, instance: int = 0) -> None:
+        """Deliver a state, at the time of the vehicle that is now or `vehicle_ns`."""
+        mono_ns = at(self.mono_ns).mono_ns if vehicle_ns is None else vehicle_ns
+        state = State(1, mono_ns, speed_mps, 0.0, "drive", safety, "", -1, "", instance=instance)  # type: ignore[arg-type]
+        self.take("state", encode(state))
 
     def driving(self) -> Bench:
         self.take("session_reply", encode(GRANTED))
@@ -240,6 +243,39 @@ def test_without_states_it_brakes_and_stops(lost_ns: int, mode: str, *, brakes: 
     assert command.mode == mode
     assert (command.brake >= CLIENT_LIMITS.brake) == brakes
     assert (command.throttle == 0.0) == brakes
+
+
+@pytest.mark.parametrize(
+    ("lost_ms", "mode", "brakes"), [(280, "drive", False), (300, "drive", True), (2500, "stop", True)]
+)
+@pytest.mark.parametrize("going_back_ns", [0, NS_PER_MS])
+def test_a_repeated_state_is_no_newer_state(lost_ms: int, mode: str, going_back_ns: int, *, brakes: bool) -> None:
+    """States whose vehicle time does not grow are as if no state arrived: brake after 300 ms, stop after 2.5 s."""
+    bench = Bench().driving()
+    for number in range(lost_ms // 20):
+        bench.mono_ns += 20 * NS_PER_MS
+        bench.state("driving", vehicle_ns=MONO_NS - number * going_back_ns)
+        (command,) = bench.view()
+    assert command.mode == mode
+    assert (command.brake >= CLIENT_LIMITS.brake) == brakes
+    assert bench.node.counts["states_not_newer"] == lost_ms // 20
+
+
+def test_a_repeated_state_still_reports_the_safety_state() -> None:
+    """A stop in a state whose vehicle time does not grow ends the drive at the client."""
+    bench = Bench().driving()
+    bench.state("safe_stop", vehicle_ns=MONO_NS)
+    assert bench.session.phase == "stopped"
+
+
+def test_the_time_of_a_restarted_server_begins_anew() -> None:
+    """The first state of another server process is new, whatever its vehicle time."""
+    bench = Bench().driving()
+    bench.mono_ns += 280 * NS_PER_MS
+    bench.state("driving", vehicle_ns=1, instance=2)
+    bench.mono_ns += 280 * NS_PER_MS
+    (command,) = bench.view()
+    assert command.brake < CLIENT_LIMITS.brake
 
 
 @pytest.mark.parametrize(

@@ -62,11 +62,12 @@ class Rig:
         self.now_ns = end_ns
         self.gate.watchdog.check_timeouts(end_ns)
 
-    def picture(self, crc: int | None = None) -> int:
-        """Issue the stamp of a new picture and return it."""
+    def picture(self, crc: int | None = None, *, captured_ns: int | None = None) -> int:
+        """Issue the stamp of a new picture and return it; the camera reports `captured_ns`."""
         self.frame += 1
         self.stamp_ns = WALL_NS + self.now_ns + self.wall_step_ns
-        self.gate.issued_stamps.add(self.stamp_ns, self.frame, self.now_ns, self.frame if crc is None else crc)
+        crc = self.frame if crc is None else crc
+        self.gate.issued_stamps.add(self.stamp_ns, self.frame, self.now_ns, crc, captured_ns)
         self.gate.watchdog.check_timeouts(self.now_ns)
         return self.stamp_ns
 

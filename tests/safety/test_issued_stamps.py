@@ -41,11 +41,12 @@ def test_a_stamp_issued_twice_counts_as_the_newer_frame() -> None:
 
 
 def test_capture_time() -> None:
-    """The capture time is the camera's, else the time of issue; equal pictures keep that of the first."""
+    """The capture time is the camera's, else or if it is later the time of issue; equal pictures keep the first's."""
     stamps = IssuedStamps(MEMORY_NS, 5)
-    for stamp_ns, mono_ns, crc, captured_ns in ((1, 100, 7, 90), (2, 200, 8, None), (3, 300, 8, 290), (4, 400, 9, 390)):
+    added = ((1, 100, 7, 90), (2, 200, 8, None), (3, 300, 8, 290), (4, 400, 9, 390), (5, 500, 10, 501))
+    for stamp_ns, mono_ns, crc, captured_ns in added:
         stamps.add(stamp_ns, stamp_ns, mono_ns, crc, captured_ns)
-    assert [stamps.captured_ns(stamp_ns) for stamp_ns in (1, 2, 3, 4)] == [90, 200, 200, 390]
+    assert [stamps.captured_ns(stamp_ns) for stamp_ns in (1, 2, 3, 4, 5)] == [90, 200, 200, 390, 500]
 
 
 @given(st.lists(st.tuples(st.integers(0, 20), st.integers(0, NS_PER_S)), max_size=60))

@@ -70,6 +70,32 @@ def test_a_command_from_a_picture_older_than_500_ms_is_rejected(late_ns: int, *,
     assert accepted or verdict.reason == RejectionReason.PICTURE_TOO_OLD
 
 
+@pytest.mark.parametrize(("late_ns", "accepted"), [(0, True), (1, False)])
+def test_the_age_of_a_picture_counts_from_its_capture(late_ns: int, *, accepted: bool) -> None:
+    """A picture that was stamped 200 ms after its capture is too old 300 ms after its stamp."""
+    rig = Rig().acquire()
+    captured_ns = rig.now_ns
+    rig.go(200 * NS_PER_MS)
+    stamp_ns = rig.picture(captured_ns=captured_ns)
+    rig.go(LIMITS.picture_age_limit_ns - 200 * NS_PER_MS + late_ns)
+    verdict = rig.send(stamp_ns=stamp_ns)
+    assert verdict.accepted is accepted
+    assert accepted or verdict.reason == RejectionReason.PICTURE_TOO_OLD
+
+
+def test_the_stopping_speed_limit_counts_from_the_capture() -> None:
+    """The later a camera delivers its picture, the lower is the speed above which the vehicle brakes."""
+    pedals = []
+    for sensor_delay_ns in (0, 400 * NS_PER_MS):
+        rig = Rig().armed()
+        rig.vehicle = vehicle_at(speed_mps=11.0)
+        rig.go(TICK_NS)
+        rig.picture(captured_ns=rig.now_ns - sensor_delay_ns)
+        assert rig.drive().accepted
+        pedals.append(rig.actuation().brake)
+    assert pedals[0] < pedals[1]
+
+
 @pytest.mark.parametrize(
     ("late_ns", "reason"),
     [(0, RejectionReason.PICTURE_TOO_OLD), (1, RejectionReason.UNKNOWN_STAMP)],

@@ -30,7 +30,7 @@ def open_flow(
     if not isinstance(config, ServerConfig) or not config.rendezvous.host:
         return UdpLink(clock, channel, bind=bind, remote=remote, name=flow)
     rendezvous = config.rendezvous
-    key = load_private(Path(config.security.key)) if config.security.key else None
+    key = load_private(Path(config.security.key), clock.now().wall_ns) if config.security.key else None
     host = resolve_host("rendezvous.host", rendezvous.host)
     return RendezvousLink(
         clock,
@@ -47,7 +47,7 @@ def open_rendezvous(config: RendezvousConfig, clock: Clock) -> dict[FlowName, Re
     vehicle = config.vehicle_id
     if not NAME.match(vehicle):
         raise UserError(f"the vehicle {vehicle!r} has an invalid name: use up to 32 of A-Z, a-z, 0-9, - and _")
-    key = load_public(Path(config.vehicle_key)) if config.vehicle_key else None
+    key = load_public(Path(config.vehicle_key), clock.now().wall_ns) if config.vehicle_key else None
     ports: dict[FlowName, int] = {"video": config.video_port, "probe": config.probe_port}
     opened: dict[FlowName, RendezvousPort] = {}
     try:

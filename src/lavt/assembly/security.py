@@ -24,13 +24,14 @@ def build_cipher(config: ServerConfig | ClientConfig) -> NewCipher:
     return lambda token, challenge: SrtpCipher(end, token, challenge)
 
 
-def build_authenticator(config: ServerConfig | ClientConfig) -> Authenticator:
-    """Build a side's authenticator, None for a client without a key; raise `UserError` for an unreadable key."""
-    return (
-        build_vehicle_authenticator(config)
-        if isinstance(config, ServerConfig)
-        else build_operator_authenticator(config)
-    )
+def build_authenticator(config: ServerConfig | ClientConfig, now_wall_ns: int | None = None) -> Authenticator:
+    """Build a side's authenticator, None for a client without a key.
+
+    Raise `UserError` for a key that is unreadable, or has expired by `now_wall_ns`; None: any time is accepted.
+    """
+    if isinstance(config, ServerConfig):
+        return build_vehicle_authenticator(config, now_wall_ns)
+    return build_operator_authenticator(config, now_wall_ns)
 
 
 def build_gateway(
@@ -44,19 +45,19 @@ def build_gateway(
     return ServerGateway(deliver, carry, in_force, authenticator)
 
 
-def build_vehicle_authenticator(config: ServerConfig) -> NullVehicleAuthenticator:
-    """Build the vehicle's authenticator; raise `UserError` for an unreadable key."""
+def build_vehicle_authenticator(config: ServerConfig, now_wall_ns: int | None = None) -> NullVehicleAuthenticator:
+    """Build the vehicle's authenticator; raise `UserError` for a key that is unreadable or has expired."""
     security = config.security
     if not security.key:
         return NullVehicleAuthenticator()
-    operators = {name: load_public(Path(file)) for name, file in security.operators.items()}
-    return VehicleAuthenticator(config.vehicle_id, load_private(Path(security.key)), operators)
+    operators = {name: load_public(Path(file), now_wall_ns) for name, file in security.operators.items()}
+    return VehicleAuthenticator(config.vehicle_id, load_private(Path(security.key), now_wall_ns), operators)
 
 
-def build_operator_authenticator(config: ClientConfig) -> OperatorAuthenticator | None:
-    """Build the operator's authenticator, None without a key; raise `UserError` for an unreadable key."""
+def build_operator_authenticator(config: ClientConfig, now_wall_ns: int | None = None) -> OperatorAuthenticator | None:
+    """Build the operator's authenticator, None without a key; raise `UserError` for one unreadable or expired."""
     security = config.security
     if not security.key:
         return None
-    key = load_private(Path(security.key))
-    return OperatorAuthenticator(config.vehicle_id, config.who, key, load_public(Path(security.vehicle)))
+    key, vehicle = load_private(Path(security.key), now_wall_ns), load_public(Path(security.vehicle), now_wall_ns)
+    return OperatorAuthenticator(config.vehicle_id, config.who, key, vehicle)

@@ -39,11 +39,13 @@ from lavt.runtime.realtime import RealRuntime
 from lavt.runtime.recorder import QueuedRecorder
 from lavt.transport.clock_sync.clock_report import kernel_identity
 from lavt.transport.clock_sync.persistent_process import PersistentProcess
+from lavt.transport.datagram_filter import ProbePortFilter, VideoPortFilter, filtered
 from lavt.transport.emulation.impairment import ExemptPort
 from lavt.transport.netem.injector import Injector
 from lavt.transport.netem.netem import NetemInterface
 from lavt.transport.rendezvous.link import RendezvousLink
 from lavt.transport.udp_link import UdpLink
+from lavt.transport.video.path_validation import PathServer
 from lavt.transport.zenoh_link import ZenohLink, quiet_logs
 
 PrintMessage = Callable[[str], None]
@@ -90,6 +92,7 @@ class Side:
         in_force: Callable[[], tuple[int, int]],
         actuator: ActuatorProcess | None = None,
         session: ClientSession | None = None,
+        path: PathServer | None = None,
     ) -> None:
         self.clock = clock
         self.session = session
@@ -97,6 +100,8 @@ class Side:
         self.actuator = actuator
         """The server's actuator if it runs in a process of its own."""
         self._links = links
+        self._path = path
+        """The server's end of the video path, by which strangers' datagrams are dropped; None on a client."""
         self._time_source = prepared.time_source
         self._writer = None if out is None else _open_record(config, out)
         self.live = LiveTap(NoRecorder() if self._writer is None else self._writer)
@@ -118,8 +123,12 @@ class Side:
         self.runtime.start({"video": links.video, "probe": links.probe, "zenoh": gateway, "netem": self._injector})
         if self.actuator is not None:
             self.actuator.start(self.runtime)
-        links.video.start(self._deliver)
-        links.probe.start(self._deliver)
+        if self._path is None:
+            links.video.start(self._deliver)
+            links.probe.start(self._deliver)
+        else:
+            links.video.start(filtered(self._deliver, VideoPortFilter(self._path), links.video.counts))
+            links.probe.start(filtered(self._deliver, ProbePortFilter(self._path), links.probe.counts))
 
     def send(self, channel: str, payload: Any) -> None:
         """Deliver a message to a node of this side."""
@@ -169,7 +178,7 @@ def open_server(
     Raises `UserError` for a wrong config, before the output directory is touched.
     """
     with ExitStack() as opened:
-        prepared = _prepare(config, out, opened, print_message)
+        prepared = _prepare(config, out, clock, opened, print_message)
         bind = config.video.bind
         video = open_flow(config, clock, "video", "feedback", bind=(bind, config.video.port), remote=None)
         opened.callback(video.close)
@@ -186,7 +195,17 @@ def open_server(
             opened.callback(process.end)
             in_force = process.in_force
             ready["actuator_pid"] = process.pid
-        side = Side(config, clock, links, nodes.all, out=out, prepared=prepared, in_force=in_force, actuator=actuator)
+        side = Side(
+            config,
+            clock,
+            links,
+            nodes.all,
+            out=out,
+            prepared=prepared,
+            in_force=in_force,
+            actuator=actuator,
+            path=nodes.camera.path,
+        )
         opened.pop_all()  # from here on the side closes them
     with closing(side):
         yield side, ready
@@ -199,7 +218,7 @@ def open_client(config: ClientConfig, out: Path | None, clock: Clock, print_mess
     Raises `UserError` for a wrong config, before the output directory is touched.
     """
     with ExitStack() as opened:
-        prepared = _prepare(config, out, opened, print_message)
+        prepared = _prepare(config, out, clock, opened, print_message)
         server = config.video.server
         video = open_flow(config, clock, "video", "rtp", bind=("", 0), remote=(server, config.video.port))
         opened.callback(video.close)
@@ -223,11 +242,15 @@ def open_client(config: ClientConfig, out: Path | None, clock: Clock, print_mess
 
 
 def _prepare(
-    config: ServerConfig | ClientConfig, out: Path | None, opened: ExitStack, print_message: PrintMessage
+    config: ServerConfig | ClientConfig,
+    out: Path | None,
+    clock: Clock,
+    opened: ExitStack,
+    print_message: PrintMessage,
 ) -> Prepared:
     if out is not None:
         check_directory(out)
-    authenticator = build_authenticator(config)
+    authenticator = build_authenticator(config, clock.now().wall_ns)
     queues = NetemInterface(config.injection.interface) if config.injection.interface else None
     for message in () if queues is None else queues.check():
         print_message(message)

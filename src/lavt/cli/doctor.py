@@ -171,6 +171,8 @@ def _security(settings: Settings, clock: MachineClock) -> Iterator[Check]:
     for key, path, private in files:
         rejection, mode = probes.file_state(path)
         yield checks.check_key_file(key, path, rejection=rejection, mode=mode, private=private)
+        if not rejection:
+            yield checks.check_signing_key(path, probes.signing_key_days_left(path, clock.now().wall_ns))
     rejection = probes.keys_rejection(settings)
     if rejection:
         yield Check("keys", "problem", rejection, "copy this machine's files from `lavt keys` (docs/deployment.md)")

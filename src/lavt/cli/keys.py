@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from lavt.cli import console
-from lavt.clock import MachineClock
+from lavt.clock import MachineClock, calendar_time
 from lavt.errors import UserError
 from lavt.transport.messages import NAME
+from lavt.transport.security.keys import key_expiry_ns
 
 if TYPE_CHECKING:
     from lavt.transport.security.certificates import CertificateSummary, KeyPair
@@ -50,7 +51,7 @@ def keys(
         Names,
         typer.Option(help="An address or host name of these vehicles and clouds; repeatable."),
     ] = None,
-    days: Annotated[int, typer.Option(help="Validity of the certificates in days.")] = DEFAULT_DAYS,
+    days: Annotated[int, typer.Option(help="Validity of the certificates and signing keys in days.")] = DEFAULT_DAYS,
 ) -> None:
     """Create certificates and signing keys with a test authority.
 
@@ -73,7 +74,7 @@ def keys(
                 authority, name, role, server_hosts=server_hosts, now_wall_ns=now_wall_ns, days=days
             )
             _write_pair(directory, name, (".key", ".pem"), pair)
-            _write_pair(directory, name, (".sign.key", ".sign.pub"), certificates.new_signing_pair())
+            _write_pair(directory, name, (".sign.key", ".sign.pub"), certificates.new_signing_pair(now_wall_ns, days))
     summary = certificates.summarize(authority.public, AUTHORITY)
     console.print_result("\n".join(_instructions(directory, summary, _list_certificates(certificates, directory))))
 
@@ -167,9 +168,12 @@ def _instructions(directory: Path, authority: CertificateSummary, summaries: lis
     for one in summaries:
         own = f"{AUTHORITY}.pem {one.name}.pem {one.name}.key"
         signing = f" {one.name}.sign.key" if PINNED_ROLES[one.role] else ""
+        public = directory / f"{one.name}.sign.pub"
+        expires_ns = key_expiry_ns(public.read_bytes(), public) if signing and public.exists() else None
+        expires = "" if expires_ns is None else f", signing key until {calendar_time(expires_ns):%Y-%m-%d}"
         pinned = "".join(f" {other.name}.sign.pub" for other in summaries if other.role in PINNED_ROLES[one.role])
         hosts = f", reachable at {', '.join(one.hosts)}" if one.hosts else ""
-        lines.append(f"{one.role} {one.name}, valid until {one.expires}{hosts}")
+        lines.append(f"{one.role} {one.name}, valid until {one.expires}{expires}{hosts}")
         lines.append(f"  copy to its machine: {own}{signing}{pinned}")
     lines.append("Copy each .key to that one machine only, and make it readable by LAVT's user only (mode 0600).")
     return lines

@@ -46,7 +46,7 @@ def stop(
     """
     console.reserve_stdout()
     settings = load_config(ClientConfig, config, changes or [])
-    authenticator = build_authenticator(settings)
+    authenticator = build_authenticator(settings)  # an expired key is accepted: this stops the vehicle
     quiet_logs()
     clock, replies = MachineClock(), queue.Queue[bytes]()
 

@@ -16,7 +16,8 @@ class ClientLimits:
     no_picture_stop_ns: int = 2500 * NS_PER_MS
     """Without a new picture: request a safe stop."""
     no_state_brake_ns: int = 300 * NS_PER_MS
-    """Without a newer state of the vehicle: brake. The controller's speed input is as old; 15 states are missing."""
+    """Without a newer state of the vehicle: brake. The controller's speed input is as old; 15 states are missing. A
+    state is newer if the time in it is later, on the vehicle's clock."""
     no_state_stop_ns: int = 2500 * NS_PER_MS
     """Without a newer state of the vehicle: request a safe stop."""
     no_lane_brake_ns: int = 500 * NS_PER_MS

@@ -346,13 +346,20 @@ def check_key_file(key: str, path: Path, *, rejection: str, mode: int, private: 
     return Check(key, "ok", f"{path} is readable")
 
 
-def check_certificate(path: Path, days_left: float) -> Check:
-    """Check that a certificate is valid for some time."""
+def check_signing_key(path: Path, days_left: float | None) -> Check:
+    """Check that a signing key is valid for some time; None: it has no expiry."""
+    if days_left is None:
+        return Check(path.name, "warning", f"the key {path} never expires", "create new ones with `lavt keys`")
+    return check_certificate(path, days_left, kind="key")
+
+
+def check_certificate(path: Path, days_left: float, *, kind: str = "certificate") -> Check:
+    """Check that a certificate, or a key, is valid for some time."""
     name, measured = path.name, {"days_left": round(days_left, 2)}
     do = "create new ones with `lavt keys`, and copy them to all machines"
     if days_left < 0:
-        return Check(name, "problem", f"the certificate {path} expired {-days_left:.0f} days ago", do, measured)
-    found = f"the certificate {path} is valid for {days_left:.0f} days"
+        return Check(name, "problem", f"the {kind} {path} expired {-days_left:.0f} days ago", do, measured)
+    found = f"the {kind} {path} is valid for {days_left:.0f} days"
     if days_left < CERTIFICATE_DAYS:
         return Check(name, "warning", found, do, measured)
     return Check(name, "ok", found, measured=measured)

@@ -72,7 +72,8 @@ class CameraNode:
         if isinstance(camera, TimedCamera):
             self._ready_after_ns, self._expose = camera.exposure_ns + camera.sensor_delay_ns, camera.expose
         self._stream = stream
-        self._path = path
+        self.path = path
+        """The server's end of the video path."""
         self._shutter_times = FrameTimes(start_ns + camera.phase_ns, camera.rate_hz)
         self._send_to = tuple(send_to)
         self._next_frame = 0
@@ -99,7 +100,7 @@ class CameraNode:
     @property
     def counts(self) -> Mapping[str, int]:
         """Return the counts of the node, the camera and path validation."""
-        path = self._path
+        path = self.path
         counted = {} if self._counting is None else self._counting.counts
         return {
             **self._counts,
@@ -108,6 +109,7 @@ class CameraNode:
             "path_wrong_token": path.wrong_token,
             "path_wrong_address": path.wrong_address,
             "path_stale": path.stale,
+            "path_unneeded": path.unneeded,
             "path_foreign_reports": path.foreign_reports,
         }
 
@@ -162,7 +164,7 @@ class CameraNode:
     def _packetize(self, encoded: EncodedFrame, now: Now) -> list[Send]:
         stamped, unit = encoded.stamped, encoded.access_unit
         packets = self._stream.packets(unit, encoded.stamp_ns, now)
-        validated = self._path.open_address(now.mono_ns)
+        validated = self.path.open_address(now.mono_ns)
         self._counts["frames_sent"] += 1
         self._counts["frames_without_receiver"] += validated is None and not self._send_to
         self._counts["packets_of_repair"] += 0 if validated is None else len(packets.repair)
@@ -177,7 +179,7 @@ class CameraNode:
         # First of all sends: a command from this frame may arrive 5 ms later, and the gate must know its stamp.
         sends = [Send("frame", frame)]
         if validated is not None:
-            cipher = self._path.cipher
+            cipher = self.path.cipher
             sends += [Send("rtp", cipher.protect(each), validated) for each in (*packets.media, *packets.repair)]
             sends += [Send("rtp", cipher.protect_rtcp(each), validated) for each in packets.report]
         plain = [*packets.media, *packets.report]
@@ -188,18 +190,18 @@ class CameraNode:
         self._poses.append(message.payload)
 
     def _note_token(self, message: Message, _now: Now) -> None:
-        self._path.set_token(message.payload)
+        self.path.set_token(message.payload)
         self._stream.forget_receiver()
 
     def _receive_feedback(self, message: Message, now: Now) -> list[Send] | None:
         """Process a datagram: path validation, or RTCP, which is accepted from the validated address only."""
         if not is_rtcp(message.payload):
-            answer = self._path.receive(message.payload, message.peer, now.mono_ns)
+            answer = self.path.receive(message.payload, message.peer, now.mono_ns)
             return None if answer is None else [Send("rtp", answer, message.peer)]
-        if not self._path.accepts_rtcp_from(message.peer):
+        if not self.path.accepts_rtcp_from(message.peer):
             self._counts["feedback_from_strangers"] += 1
             return None
-        packet = self._path.cipher.unprotect_rtcp(message.payload)
+        packet = self.path.cipher.unprotect_rtcp(message.payload)
         if packet is None:
             self._counts["feedback_forged"] += 1
             return None
@@ -208,7 +210,7 @@ class CameraNode:
         except BadPacket:
             self._counts["feedback_unreadable"] += 1
             return None
-        self._path.report(message.peer, now.mono_ns)
+        self.path.report(message.peer, now.mono_ns)
         self._stream.receive_feedback(feedback, now.mono_ns)
         self._keyframe_wanted |= feedback.picture_loss
         return None

@@ -74,8 +74,13 @@ class DriverNode:
         self._detected_stamp_ns = 0
         self._decision: Decision | None = None
         self._lane_state: LaneState = "ok"
+        self._server: int | None = None
+        """Instance of the server process that sent the newest state."""
+        self._vehicle_ns = 0
+        """Time of the newest state on the vehicle's clock."""
         self._speed_mps = 0.0
         self._state_ns = 0
+        """When the newest state arrived."""
         self._command_ns: int | None = None
         self.pipelines: Mapping[str, Sequence[Stage]] = {
             "access_unit": reader.stages,
@@ -204,7 +209,11 @@ class DriverNode:
         except BadMessage:
             self._counts["states_unreadable"] += 1
             return
-        self._speed_mps, self._state_ns = state.speed_mps, now.mono_ns
+        if state.instance != self._server or state.state_mono_ns > self._vehicle_ns:
+            self._server, self._vehicle_ns = state.instance, state.state_mono_ns
+            self._speed_mps, self._state_ns = state.speed_mps, now.mono_ns
+        else:
+            self._counts["states_not_newer"] += 1
         self.session.handle_state(state, now.mono_ns)
 
     def _note_condition(self, message: Message, _now: Now) -> None:

@@ -73,7 +73,8 @@ class LiveTap:
             self._updates.append((state, now))
 
     def _update_admission(self, admission: Any, now: Now) -> None:
-        self._status["raw_tau_c_ms"] = (admission.received_wall_ns - admission.sent_wall_ns) / NS_PER_MS
+        if admission.verdict == "accepted":  # the send time of any other may be a stranger's
+            self._status["raw_tau_c_ms"] = (admission.received_wall_ns - admission.sent_wall_ns) / NS_PER_MS
         if admission.reason:
             self._status["rejected"] = admission.reason
             self._updates.append((admission.reason, now))

@@ -121,7 +121,7 @@ class SafetyGate:
         elif command.mode == "stop":
             self.machine.trigger("stop requested")
         else:
-            self.watchdog.set_command(command, vehicle, now_ns)
+            self.watchdog.set_command(command, vehicle)
             if is_fresh:
                 self.machine.trigger("fresh command")
         return ACCEPTED
@@ -135,10 +135,9 @@ class SafetyGate:
             return RejectionReason.OLD_SEQUENCE
         if command.emergency_stop:
             return RejectionReason.EMERGENCY_STOP
-        issued_ns = self.issued_stamps.issued_ns(command.stamp_ns, now_ns)
-        if issued_ns is None:
+        if self.issued_stamps.issued_ns(command.stamp_ns, now_ns) is None:
             return RejectionReason.UNKNOWN_STAMP
-        if now_ns - issued_ns > self._limits.picture_age_limit_ns:
+        if now_ns - self.issued_stamps.captured_ns(command.stamp_ns) > self._limits.picture_age_limit_ns:
             return RejectionReason.PICTURE_TOO_OLD
         if command.mode == "drive" and state not in ("driving", "degraded"):
             return RejectionReason.NOT_ARMED

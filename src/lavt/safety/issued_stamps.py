@@ -25,13 +25,14 @@ class IssuedStamps:
         """Store the stamp of a frame that was stamped at `mono_ns`; forget stamps older than the memory.
 
         `pixel_crc` is a checksum of the pixels without the stamp. `captured_ns` is the camera's capture time; None: the
-        camera reports none, and `mono_ns` is used. A frame equal to the one before it keeps that one's capture time.
+        camera reports none. Then, and if it is later than `mono_ns`, `mono_ns` is used. A frame equal to the one before
+        it keeps that one's capture time.
         """
         if pixel_crc == self._last_crc:
             self._equal_frames += 1
         else:
             self._equal_frames = 1
-            self._last_captured_ns = mono_ns if captured_ns is None else captured_ns
+            self._last_captured_ns = mono_ns if captured_ns is None else min(captured_ns, mono_ns)
         self._last_crc = pixel_crc
         self._issued[stamp_ns] = (number, mono_ns, self._last_captured_ns)
         self._order.append((mono_ns, stamp_ns))

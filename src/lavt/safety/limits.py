@@ -31,7 +31,8 @@ class Limits:
     """Time to brake away speed above `stopping_speed_limit_mps`. The brake's lag is 0.2 s: a shorter time would
     oscillate. 1 m/s of excess already brakes like a safe stop, which is the maximum."""
     picture_age_limit_ns: int = 500 * NS_PER_MS
-    """A command from an older picture is rejected. Only a simulated vehicle may be configured up to 2 s."""
+    """A command from an older picture is rejected. The age counts from the capture, or from the stamp if the camera
+    reports no capture time. Only a simulated vehicle may be configured up to 2 s."""
     stamp_memory_ns: int = 5 * NS_PER_S
     """The server remembers the stamps that it issued for this long."""
     lateral_acceleration_mps2: float = 3.0

@@ -36,8 +36,8 @@ class Watchdog:
         self._path = PathFollower(limiter.wheelbase_m, limits.stamp_memory_ns)
         self._stop_brake = StopBrake(limits, limiter.max_braking_mps2)
         self._fresh_command_ns = 0
-        self._picture_ns = 0
-        """When the stamp of the picture of `CommandEpoch.command` was issued."""
+        self._captured_ns = 0
+        """Capture time of the picture of `CommandEpoch.command`."""
         self._engages = False
 
     def reset_timeout(self, now_ns: int) -> None:
@@ -95,13 +95,12 @@ class Watchdog:
         self._path.clear_path()
         self._limiter.reset(vehicle.steering_rad, now_ns)
 
-    def set_command(self, command: Command, vehicle: VehicleState, now_ns: int) -> None:
+    def set_command(self, command: Command, vehicle: VehicleState) -> None:
         """Store an accepted drive command and its path; its stamp must be known."""
         self._epoch.command = command
-        self._picture_ns = self._issued_stamps.issued_ns(command.stamp_ns, now_ns) or now_ns
+        self._captured_ns = self._issued_stamps.captured_ns(command.stamp_ns)
         self._path.update_odometry(vehicle)
-        captured_ns = self._issued_stamps.captured_ns(command.stamp_ns)
-        self._path.set_path(command.steering_rad, command.path_curvature_per_m, captured_ns)
+        self._path.set_path(command.steering_rad, command.path_curvature_per_m, self._captured_ns)
 
     def actuation(self, vehicle: VehicleState, now_ns: int) -> Actuation:
         """Return the actuation for now, within all limits: the last command, or the stop of the present state.
@@ -121,7 +120,7 @@ class Watchdog:
             throttle, brake = 0.0, 1.0
         if state != "safe_stop":
             self._stop_brake.reset()
-        picture_age_ns = now_ns - self._picture_ns if command else None
+        picture_age_ns = now_ns - self._captured_ns if command else None
         target = Actuation(self._steering_target_rad(vehicle, now_ns), throttle, brake)
         return self._limiter.limit(target, vehicle, now_ns, picture_age_ns)
 

@@ -28,6 +28,8 @@ Deliver = Callable[[str, Any, Now, Any], None]
 """Takes (channel, payload, arrived, peer) of each received message."""
 
 REPLY_TIMEOUT_S = 2.0
+PRIVATE_KEYS = ("transport/link/tls/listen_private_key", "transport/link/tls/connect_private_key")
+"""Config keys of private key files; Zenoh does not check their permissions."""
 ROUTER_READY_S = 5.0
 RETRY_S = 1.0
 PROTOCOLS = ("tcp", "tls", "quic", "udp", "ws")
@@ -84,6 +86,16 @@ def _load(path: Path, overrides: Mapping[str, Any]) -> zenoh.Config:
     return config
 
 
+def _check_private_keys(config: zenoh.Config) -> None:
+    """Raise `UserError` if other users have any permission on a private key of a config."""
+    for key in PRIVATE_KEYS:
+        file = json.loads(config.get_json(key))
+        if file is not None and Path(file).is_file() and Path(file).stat().st_mode & 0o077:
+            raise UserError(
+                f"other users may read the private key {file}: chmod 600 it, and make new keys if somebody has read it"
+            )
+
+
 def _error_text(error: Exception) -> str:
     """Return an error text of Zenoh in one line, without source locations and type names of Zenoh."""
     text = " ".join(re.sub(r" at /\S+\.rs:\d+\.?", "", str(error)).split())
@@ -129,6 +141,7 @@ class Router:
             raise UserError(
                 f"set adminspace: {{ enabled: true }} in {path}, or the router cannot report where it listens"
             )
+        _check_private_keys(config)
         try:
             self._session = zenoh.open(config)
         except zenoh.ZError as error:

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lavt.experiment.analysis.latency import picture_age, rtp_timestamp
+from lavt.experiment.analysis.clock_offset import NO_OFFSET
+from lavt.experiment.analysis.latency import control_latency_ns, picture_age, rtp_timestamp
 from lavt.experiment.analysis.metrics import RunMeasurement, driving_interval, last_count, measure
 from lavt.experiment.analysis.steering import steering_reversals
 from lavt.experiment.analysis.tracking import (
@@ -222,6 +223,22 @@ def test_picture_age_of_three_commands() -> None:
     age = picture_age(frames, admissions, 10 * millisecond, 50 * millisecond)
     assert age.mean_ms == pytest.approx((10 * 15 + 20 * 20 + 10 * 10) / 40)
     assert age.p95_ms == pytest.approx(28.0)
+
+
+def test_rejected_commands_do_not_change_the_control_latency() -> None:
+    """Only accepted commands have a control latency: a stranger's rejected command may have any send time."""
+    millisecond = 1_000_000
+    rows = [
+        {
+            "verdict": verdict,
+            "sent_wall_ns": sent,
+            "received_wall_ns": 10 * millisecond,
+            "received_mono_ns": 10 * millisecond,
+            "applied_mono_ns": 11 * millisecond if verdict == "accepted" else None,
+        }
+        for verdict, sent in (("accepted", millisecond), ("rejected", -(10**18)), ("rejected", 2 * millisecond))
+    ]
+    assert control_latency_ns(table(rows), NO_OFFSET, 0, 50 * millisecond).tolist() == [9 * millisecond]
 
 
 def test_missing_data_are_null_not_zero(make_run: MakeRun, tmp_path: Path) -> None:

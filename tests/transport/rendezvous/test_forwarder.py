@@ -23,7 +23,7 @@ from lavt.transport.rendezvous.forwarder import (
 )
 from lavt.transport.rtp.rtp import Packetizer
 from lavt.transport.security.keys import PrivateKey
-from lavt.transport.video.path_validation import PathClient
+from lavt.transport.video.path_validation import PathClient, PathServer
 
 VEHICLE, OTHER = ("203.0.113.2", 40_000), ("203.0.113.66", 40_000)
 CLIENT, SECOND = ("198.51.100.2", 50_000), ("198.51.100.7", 50_001)
@@ -224,6 +224,37 @@ def test_datagrams_to_the_vehicle_are_rate_limited() -> None:
     answered = [hello(forwarder, SECOND) is not None for _ in range(2 * UPSTREAM_PER_S)]
     assert sum(answered) == UPSTREAM_PER_S
     assert hello(forwarder, now_ns=T + NS_PER_S) is not None
+
+
+def test_replayed_hellos_do_not_crowd_out_reports() -> None:
+    """Replays of a client's hello, with its own address, do not use up the limit of its reports."""
+    forwarder = registered()
+    hello(forwarder)
+    answer(forwarder)
+    for _ in range(10 * UPSTREAM_PER_S):
+        hello(forwarder)
+    assert forwarder.counts["too_many"] > 0
+    assert forwarder.receive(REPORT, CLIENT, T) is not None
+
+
+def test_replayed_hellos_from_many_addresses_do_not_displace_the_client() -> None:
+    """The vehicle challenges few copies of a hello, so the rendezvous still forwards its video to the client."""
+    forwarder, path, client = registered(), PathServer(lambda: bytes(16)), PathClient(b"t" * 16)
+    path.set_token(b"t" * 16)
+
+    def through(datagram: bytes, sender: Address) -> bytes:
+        """Return what the sender gets back from the vehicle."""
+        forwarded = forwarder.receive(datagram, sender, T)
+        reply = None if forwarded is None else path.receive(datagram, sender, T)
+        back = None if reply is None else forwarder.receive(wrap(sender, reply), VEHICLE, T)
+        return b"" if back is None else back[0]
+
+    newest = client.hello(0)
+    through(client.answer(through(newest, CLIENT)) or b"", CLIENT)
+    assert path.open_address(T) == CLIENT
+    for port in range(UPSTREAM_PER_S):
+        through(newest, ("198.51.100.99", port + 1))
+    assert forwarder.receive(wrap(CLIENT, b"video"), VEHICLE, T) is not None
 
 
 def test_forged_registrations_are_rate_limited(key: PrivateKey) -> None:

@@ -6,8 +6,17 @@ from pathlib import Path
 
 import pytest
 
+from lavt.domain import NS_PER_S
 from lavt.errors import UserError
-from lavt.transport.security.keys import KeyAgreement, decrypt, encrypt, load_private, load_public
+from lavt.transport.security.keys import (
+    NS_PER_DAY,
+    KeyAgreement,
+    decrypt,
+    encrypt,
+    key_expiry_ns,
+    load_private,
+    load_public,
+)
 
 pytest.importorskip("cryptography", reason="an extra: pip install 'lavt[secure]'")
 
@@ -15,6 +24,10 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
 
+from lavt.transport.security.certificates import new_signing_pair
+
+NOW_NS = 1_795_520_000 * NS_PER_S
+"""24 November 2026."""
 ED25519 = bytes.fromhex("06032b6570")
 UNKNOWN_ALGORITHM = bytes.fromhex("06032b6577")
 """Object identifier 1.3.101.119, which no library knows."""
@@ -39,6 +52,37 @@ def test_a_public_key_verifies_the_signatures_of_its_private_key(tmp_path: Path)
     assert not key.verify(signature, b"other")
     assert not key.verify(bytes(64), b"data")
     assert not key.verify(b"", b"data")
+
+
+def test_a_signing_key_expires(tmp_path: Path) -> None:
+    """A pair is valid until the given number of days has passed, and `load` without a time accepts it afterwards."""
+    pair = new_signing_pair(NOW_NS, 30)
+    for data, load in ((pair.private, load_private), (pair.public, load_public)):
+        path = tmp_path / "key"
+        path.write_bytes(data)
+        path.chmod(0o600)
+        assert key_expiry_ns(data, path) == NOW_NS + 30 * NS_PER_DAY
+        load(path, NOW_NS + 30 * NS_PER_DAY - 1)
+        load(path)
+        with pytest.raises(UserError, match="expired on 2026-12-24"):
+            load(path, NOW_NS + 30 * NS_PER_DAY)
+
+
+def test_a_key_without_expiry_is_valid_at_any_time(tmp_path: Path) -> None:
+    """A key that another program has made has no expiry."""
+    private, public = write_pair(tmp_path, Ed25519PrivateKey.generate())
+    load_private(private, 2**62)
+    load_public(public, 2**62)
+    assert key_expiry_ns(public.read_bytes(), public) is None
+
+
+@pytest.mark.parametrize("damage", [(b"key 1", b"key 2"), (b"expires ", b"expires"), (b"1798", b"x798")])
+def test_an_unreadable_expiry_is_rejected(tmp_path: Path, damage: tuple[bytes, bytes]) -> None:
+    """A damaged expiry, or one of another version, does not make a key valid for ever."""
+    path = tmp_path / "key"
+    path.write_bytes(new_signing_pair(NOW_NS, 30).public.replace(*damage, 1))
+    with pytest.raises(UserError, match="expiry"):
+        load_public(path, NOW_NS)
 
 
 def test_a_key_of_another_kind_is_rejected(tmp_path: Path) -> None:

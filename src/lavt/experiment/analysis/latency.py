@@ -60,10 +60,14 @@ def video_latency_ns(pictures: Table, offset: ClockOffset) -> IntArray:
 
 
 def control_latency_ns(admissions: Table, offset: ClockOffset, began_ns: int, ended_ns: int) -> IntArray:
-    """Return tau_c of every received command, accepted or rejected: from sent to received, on the server's clock."""
-    received_ns = admissions.ints("received_mono_ns")
-    known = (admissions.ints("sent_wall_ns") != MISSING) & (admissions.ints("received_wall_ns") != MISSING)
-    within = admissions.where(known & (received_ns >= began_ns) & (received_ns <= ended_ns))
+    """Return tau_c of every accepted command: from sent to received, on the server's clock.
+
+    Only accepted commands are certain to be those of the client in control: others may have any send time.
+    """
+    commands = accepted_commands(admissions)
+    received_ns = commands.ints("received_mono_ns")
+    known = (commands.ints("sent_wall_ns") != MISSING) & (commands.ints("received_wall_ns") != MISSING)
+    within = commands.where(known & (received_ns >= began_ns) & (received_ns <= ended_ns))
     return within.ints("received_wall_ns") - offset.on_server_ns(within.ints("sent_wall_ns"))
 
 

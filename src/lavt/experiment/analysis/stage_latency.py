@@ -29,7 +29,7 @@ def stage_percentiles(
 ) -> list[dict[str, Any]]:
     """Return for each stage of the pipeline of `frames`, in order, its latency (p50 and p95 in ms) and the count `n`.
 
-    The control link is tau_c of every command. Without an `offset` the two network links are left out.
+    The control link is tau_c of every accepted command. Without an `offset` the two network links are left out.
     """
     pictures = pictures_of(client.table("picture"), frames)
     video_ns = video_link_ns(server.table("timeline"), pictures, frames, offset) if offset else np.zeros(0, np.int64)

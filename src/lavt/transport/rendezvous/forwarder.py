@@ -19,7 +19,8 @@ path. Threats:
   something in the last 30 s. Each datagram causes at most one, which differs in length by the wrapping. A registration
   gets no reply.
 * Flooding the vehicle: only datagrams that look like the flow's pass, at a limited rate. Clients that the vehicle has
-  answered have a rate limit of their own, so that others cannot crowd them out.
+  answered have a rate limit of their own, so that others cannot crowd them out, and so have hellos and answers, so that
+  replays with a client's address do not crowd out its reports.
 * Not covered: an attacker on the path to the rendezvous can forward a registration from another address before the
   original arrives, and so divert the flow for a second. It could as well drop the datagrams themselves.
 
@@ -56,8 +57,8 @@ MAX_CLIENTS: Final = 64
 REGISTRATIONS_PER_S: Final = 50
 """Limits the signatures verified from the vehicle's address, and separately those from other addresses."""
 UPSTREAM_PER_S: Final = 200
-"""Limits the datagrams of clients that the vehicle has answered, and separately those of others. A client sends 2.5
-reports a second, as measured."""
+"""Limits the datagrams of clients that the vehicle has answered, and separately those of others; separately also those
+of path validation. A client sends 2.5 reports a second, as measured."""
 MAX_UPSTREAM_BYTES: Final = 1400
 
 _MAGIC: Final = b"LAVR"
@@ -127,8 +128,12 @@ class Forwarder:
         self._clients = _Clients()
         self._signature_limiters = {True: RateLimiter(REGISTRATIONS_PER_S), False: RateLimiter(REGISTRATIONS_PER_S)}
         """By whether the registration comes from the vehicle's address."""
-        self._upstream_limiters = {True: RateLimiter(UPSTREAM_PER_S), False: RateLimiter(UPSTREAM_PER_S)}
-        """By whether the vehicle has answered the client."""
+        self._upstream_limiters = {
+            (is_answered, is_validation): RateLimiter(UPSTREAM_PER_S)
+            for is_answered in (True, False)
+            for is_validation in (True, False)
+        }
+        """By whether the vehicle has answered the client, and whether the datagram belongs to the path validation."""
 
     def vehicle_address(self, now_ns: int) -> Address | None:
         """Return the address from which the vehicle registered; None if there is none or the registration expired."""
@@ -181,12 +186,17 @@ class Forwarder:
             self.counts["malformed"] += 1
         elif address is None:
             self.counts["without_vehicle"] += 1
-        elif not self._upstream_limiters[self._clients.note_datagram(sender, now_ns)].take(now_ns):
+        elif not self._takes(datagram, sender, now_ns):
             self.counts["too_many"] += 1
         else:
             self.counts["to_vehicle"] += 1
             return wrap(sender, datagram), address
         return None
+
+    def _takes(self, datagram: bytes, sender: Address, now_ns: int) -> bool:
+        """Return whether a client's datagram is within the limit of its kind."""
+        is_answered = self._clients.note_datagram(sender, now_ns)
+        return self._upstream_limiters[is_answered, is_path_datagram(datagram)].take(now_ns)
 
 
 class _Clients:

@@ -22,9 +22,9 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from lavt.clock import calendar_time
 from lavt.domain import NS_PER_S
 from lavt.errors import UserError
+from lavt.transport.security.keys import NS_PER_DAY, expiry_line
 from lavt.value import value
 
-NS_PER_DAY: Final = 86_400 * NS_PER_S
 CLOCK_SKEW_NS: Final = NS_PER_DAY
 """Certificates are valid from this long before now: the clock of a vehicle that has just started may be behind."""
 AUTHORITY: Final = "lavt test authority"
@@ -100,11 +100,12 @@ def new_certificate(
     return KeyPair(_private(key), _certificate(builder.sign(issuer_key, hashes.SHA256())))
 
 
-def new_signing_pair() -> KeyPair:
-    """Create an Ed25519 key pair for signatures."""
+def new_signing_pair(now_wall_ns: int, days: int) -> KeyPair:
+    """Create an Ed25519 key pair for signatures, valid for `days`; the expiry is in the line before either key."""
     key = Ed25519PrivateKey.generate()
     public = key.public_key().public_bytes(serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo)
-    return KeyPair(_private(key), public)
+    line = expiry_line(now_wall_ns + days * NS_PER_DAY)
+    return KeyPair(line + _private(key), line + public)
 
 
 def summarize(certificate: bytes, where: str) -> CertificateSummary:

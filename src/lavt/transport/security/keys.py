@@ -5,10 +5,13 @@ Only this module and `certificates.py` import `cryptography`. It is an extra, so
 
 from __future__ import annotations
 
+import re
 import secrets
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from lavt.clock import calendar_time
+from lavt.domain import NS_PER_S
 from lavt.errors import UserError
 
 if TYPE_CHECKING:
@@ -18,7 +21,11 @@ SIGNATURE_BYTES: Final = 64
 PUBLIC_KEY_BYTES: Final = 32
 NONCE_BYTES: Final = 12
 SECRET_BYTES: Final = 32
+NS_PER_DAY: Final = 86_400 * NS_PER_S
 
+_EXPIRY: Final = b"LAVT signing key 1, expires "
+"""The beginning of the line before a PEM key, where a PEM file may have any text (RFC 7468); 1 is its version."""
+_EXPIRY_LINE: Final = re.compile(rb"^%s(\d{1,11}) \(\d{4}-\d\d-\d\d\)$" % _EXPIRY, re.MULTILINE)
 _INSTALL: Final = "signing needs the package cryptography: pip install 'lavt[secure]'"
 
 
@@ -55,8 +62,37 @@ class PublicKey:
         return True
 
 
-def load_private(path: Path) -> PrivateKey:
-    """Read an Ed25519 private key (PEM, PKCS 8); raise `UserError` if it is invalid or if other users may read it."""
+def expiry_line(expires_wall_ns: int) -> bytes:
+    """Return the line before a PEM key that says when the key expires: in seconds of Unix time, and the day in UTC."""
+    return _EXPIRY + f"{expires_wall_ns // NS_PER_S} ({calendar_time(expires_wall_ns):%Y-%m-%d})\n".encode()
+
+
+def key_expiry_ns(data: bytes, path: Path) -> int | None:
+    """Return the wall clock time at which a key expires; None for a key without an expiry.
+
+    `data` is the content of the file `path`. Raise `UserError` for an expiry that cannot be read.
+    """
+    found = _EXPIRY_LINE.search(data)
+    if found is not None:
+        return int(found[1]) * NS_PER_S
+    if b"LAVT signing key" in data:
+        raise UserError(f"the expiry of the key {path} cannot be read: copy the file again, or make new keys")
+    return None
+
+
+def _check_expiry(data: bytes, path: Path, now_wall_ns: int | None) -> None:
+    """Raise `UserError` for a key that has expired by `now_wall_ns`; None: any time is accepted."""
+    expires_ns = key_expiry_ns(data, path)
+    if expires_ns is not None and now_wall_ns is not None and now_wall_ns >= expires_ns:
+        day = calendar_time(expires_ns).strftime("%Y-%m-%d")
+        raise UserError(f"the key {path} expired on {day}: make new keys with `lavt keys DIR`")
+
+
+def load_private(path: Path, now_wall_ns: int | None = None) -> PrivateKey:
+    """Read an Ed25519 private key (PEM, PKCS 8).
+
+    Raise `UserError` if it is invalid, if other users may read it, or if it has expired by `now_wall_ns`.
+    """
     data = _read(path)
     if path.stat().st_mode & 0o077:
         raise UserError(
@@ -74,11 +110,12 @@ def load_private(path: Path) -> PrivateKey:
         raise UserError(f"{path} is not a private key: give a NAME.sign.key that `lavt keys` has made") from error
     if not isinstance(key, ed25519.Ed25519PrivateKey):
         raise UserError(f"{path} is a key of another kind than Ed25519: give a NAME.sign.key that `lavt keys` has made")
+    _check_expiry(data, path, now_wall_ns)
     return PrivateKey(key)
 
 
-def load_public(path: Path) -> PublicKey:
-    """Read an Ed25519 public key (PEM); raise `UserError` if it is invalid."""
+def load_public(path: Path, now_wall_ns: int | None = None) -> PublicKey:
+    """Read an Ed25519 public key (PEM); raise `UserError` if it is invalid or has expired by `now_wall_ns`."""
     data = _read(path)
     try:
         from cryptography.exceptions import UnsupportedAlgorithm  # noqa: PLC0415 (an extra)
@@ -92,6 +129,7 @@ def load_public(path: Path) -> PublicKey:
         raise UserError(f"{path} is not a public key: give a NAME.sign.pub that `lavt keys` has made") from error
     if not isinstance(key, ed25519.Ed25519PublicKey):
         raise UserError(f"{path} is a key of another kind than Ed25519: give a NAME.sign.pub that `lavt keys` has made")
+    _check_expiry(data, path, now_wall_ns)
     return PublicKey(key)
 
 

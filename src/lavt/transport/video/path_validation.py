@@ -2,24 +2,30 @@
 
 The session reply, over Zenoh, gives the client a token. Then, between the client's video socket and the server's:
 
-    client -> server   hello      MAC(token, "hello")
-    server -> client   challenge  issued_ns, cookie, MAC(token, "challenge", issued_ns, cookie) cut to 8 bytes
-    client -> server   answer     issued_ns, cookie, MAC(token, "answer", issued_ns, cookie)
+    client -> server   hello      number, MAC
+    server -> client   challenge  number, issued_ns, cookie, MAC cut to 8 bytes
+    client -> server   answer     number, issued_ns, cookie, MAC
 
-MAC is HMAC-SHA256 under the token. The cookie is an address-validation cookie (compare RFC 9000, section 8.1):
-HMAC-SHA256, cut to 16 bytes, over the time and the address *from which the server received the hello*, under a secret
-that never leaves the server and changes with each token. Behind a NAT or a relay the client cannot know that address,
-so it returns the cookie, and the server accepts the cookie only from that address. The server keeps no state for a
-hello, however many arrive.
+The number counts the client's hellos; challenge and answer repeat it. MAC is HMAC-SHA256 under the token over all
+before it. The cookie is an address-validation cookie (compare RFC 9000, section 8.1): HMAC-SHA256, cut to 16 bytes,
+over number, time and the address *from which the server received the hello*, under a secret that never leaves the
+server and changes with each token. Behind a NAT or a relay the client cannot know that address, so it returns the
+cookie, and the server accepts the cookie only from that address. The server keeps only the highest number and
+up to four addresses of it, however many hellos arrive.
 
 * Aiming the video at a third party: its address must answer a challenge that was sent only there, even if the attacker
   has the token.
 * Redirecting the video by a forged hello or answer: needs the token. A hello opens or moves no path, and one without a
   valid MAC gets no reply. No reply is longer than the datagram it replies to.
-* Redirecting it by replay: an answer is valid only from the address in its cookie, within 2 s, and if its challenge is
-  newer than the one that opened the path. A restart or a new token invalidates all older cookies.
-* Making the client accept another path: a challenge is valid only with its MAC, and if it is newer than all before.
-* Not covered without encryption: an attacker who reads, sends and drops datagrams on the path can do so with the video.
+* Replaying a hello: a number below the highest gets no challenge, and the client answers one challenge to each of its
+  hellos. The newest hello gets up to four, to different addresses: a copy that arrives first from elsewhere does not
+  prevent the challenge to the client.
+* Replaying an answer: it is valid only from the address in its cookie, within 2 s, and if its challenge is newer than
+  the one that opened the path. A restart or a new token invalidates all older cookies.
+* Making either end change its keys: the server keeps the key of a path that is open to the answer's address, and the
+  client never drops the key in use.
+* Not covered: an attacker who reads each hello and whose copy overtakes it can delay the opening of a path, and have a
+  path opened by way of the attacker's address; one who drops datagrams can do so with the video.
 
 If the video is encrypted, its keys are derived from the token and the challenge that opened the path, so each opening
 has its own. The client cannot know whether its answer arrives, so it keeps the keys of its last few answers.
@@ -49,14 +55,23 @@ CHALLENGE_LIFETIME_NS: Final = 2 * NS_PER_S
 REPORT_TIMEOUT_NS: Final = 2 * NS_PER_S
 
 _MAGIC: Final = b"LAVT"
-_VERSION: Final = 2
+_VERSION: Final = 3
 _HELLO: Final = _MAGIC + bytes([1, _VERSION])
 _CHALLENGE: Final = _MAGIC + bytes([2, _VERSION])
 _ANSWER: Final = _MAGIC + bytes([3, _VERSION])
-_TIME_BYTES: Final = 8
-_COOKIE_BYTES: Final = 16
+_HEAD_BYTES: Final = len(_HELLO)
+_NUMBER: Final = slice(_HEAD_BYTES, _HEAD_BYTES + 8)
+_ISSUED: Final = slice(_NUMBER.stop, _NUMBER.stop + 8)
+_COOKIE: Final = slice(_ISSUED.stop, _ISSUED.stop + 16)
+_CHALLENGED: Final = slice(_NUMBER.start, _COOKIE.stop)
+"""The parts of a challenge that its answer repeats."""
 _MAC_BYTES: Final = 32
 _CHALLENGE_MAC_BYTES: Final = 8
+_CHALLENGE_BYTES: Final = _COOKIE.stop + _CHALLENGE_MAC_BYTES
+_CLIENT_SIZES: Final = {_HELLO: _NUMBER.stop + _MAC_BYTES, _ANSWER: _COOKIE.stop + _MAC_BYTES}
+"""Sizes in bytes of the datagrams that a client sends, by their head."""
+_MAX_CHALLENGES: Final = 4
+"""Challenges to copies of one hello from different addresses: few, because each copy may have a false address."""
 _MAX_CIPHERS: Final = 16
 """Two seconds of hellos: after that the server accepts no answer to them."""
 
@@ -64,6 +79,13 @@ _MAX_CIPHERS: Final = 16
 def is_path_datagram(datagram: bytes) -> bool:
     """Return whether a datagram on the video's port belongs to the path validation."""
     return datagram.startswith(_MAGIC)
+
+
+def client_datagram_number(datagram: bytes) -> int | None:
+    """Return the number of a hello or an answer, whose MAC is not checked; None for any other datagram."""
+    if _CLIENT_SIZES.get(datagram[:_HEAD_BYTES]) != len(datagram):
+        return None
+    return int.from_bytes(datagram[_NUMBER], "big")
 
 
 class PathClient:
@@ -76,31 +98,38 @@ class PathClient:
         _check_token(token)
         self._token = token
         self._new_cipher = new_cipher
-        self._ciphers = [new_cipher(token, b"")]
-        """The current cipher first, then those that the server may use instead."""
-        self._answered_ns: int | None = None
+        self._cipher = new_cipher(token, b"")
+        """The cipher in use: the newest under which a packet has arrived."""
+        self._ciphers = [self._cipher]
+        """The ciphers of the last answers, newest first, and the cipher in use."""
+        self._number = 0
+        """Number of the last hello."""
+        self._answered_number = 0
         self._interval_ns = HELLO_INTERVAL_NS
         self._next_hello_ns = 0
 
     def hello(self, now_ns: int) -> bytes:
         """Return the datagram that requests a challenge, to be sent to the server at `now_ns`."""
         self._next_hello_ns = now_ns + self._interval_ns
-        return _HELLO + _mac(self._token, _HELLO)
+        self._number += 1
+        hello = _HELLO + self._number.to_bytes(8, "big")
+        return hello + _mac(self._token, hello)
 
-    def answer(self, challenge_datagram: bytes) -> bytes | None:
-        """Return the answer to a challenge, or None if the challenge is not from the server or is old."""
-        body, mac = challenge_datagram[:-_CHALLENGE_MAC_BYTES], challenge_datagram[-_CHALLENGE_MAC_BYTES:]
-        if len(body) != len(_CHALLENGE) + _TIME_BYTES + _COOKIE_BYTES or not body.startswith(_CHALLENGE):
+    def answer(self, challenge: bytes) -> bytes | None:
+        """Return the answer to a challenge; None if it is not the server's first to a hello of this client."""
+        body, mac = challenge[:-_CHALLENGE_MAC_BYTES], challenge[-_CHALLENGE_MAC_BYTES:]
+        if len(challenge) != _CHALLENGE_BYTES or not challenge.startswith(_CHALLENGE):
+            return None
+        number = int.from_bytes(challenge[_NUMBER], "big")
+        if not self._answered_number < number <= self._number:
             return None
         if not hmac.compare_digest(mac, _mac(self._token, body)[:_CHALLENGE_MAC_BYTES]):
             return None
-        challenge = body[len(_CHALLENGE) :]
-        issued_ns = int.from_bytes(challenge[:_TIME_BYTES], "big", signed=True)
-        if self._answered_ns is not None and issued_ns <= self._answered_ns:
-            return None
-        self._answered_ns = issued_ns
-        self._ciphers = [self._new_cipher(self._token, challenge), *self._ciphers[: _MAX_CIPHERS - 1]]
-        answer = _ANSWER + challenge
+        self._answered_number = number
+        self._ciphers.insert(0, self._new_cipher(self._token, challenge[_CHALLENGED]))
+        if len(self._ciphers) > _MAX_CIPHERS:
+            self._ciphers.remove(next(each for each in reversed(self._ciphers) if each is not self._cipher))
+        answer = _ANSWER + challenge[_CHALLENGED]
         return answer + _mac(self._token, answer)
 
     def unprotect(self, packet: bytes) -> bytes | None:
@@ -112,17 +141,24 @@ class PathClient:
         return self._try_ciphers(lambda cipher: cipher.unprotect_rtcp(packet))
 
     def _try_ciphers(self, unprotect: Callable[[Cipher], bytes | None]) -> bytes | None:
+        packet = unprotect(self._cipher)
+        if packet is not None:
+            return packet
+        is_newer = True
         for cipher in self._ciphers:
+            if cipher is self._cipher:
+                is_newer = False
+                continue
             packet = unprotect(cipher)
             if packet is not None:
-                if cipher is not self._ciphers[0]:
-                    self._ciphers = [cipher, *(each for each in self._ciphers if each is not cipher)]
+                if is_newer:
+                    self._cipher = cipher
                 return packet
         return None
 
     def protect_rtcp(self, packet: bytes) -> bytes:
         """Return the datagram to send for an RTCP packet."""
-        return self._ciphers[0].protect_rtcp(packet)
+        return self._cipher.protect_rtcp(packet)
 
     def video_arrived(self, now_ns: int) -> None:
         """Postpone the next hello, since video arrived over the path."""
@@ -143,7 +179,8 @@ class PathServer:
     `new_secret` returns 16 or more unpredictable bytes at each call. All times are of the server's monotonic clock.
     Public counters, in datagrams: `malformed` have another format, `wrong_token` have no valid MAC, `wrong_address`
     answer a challenge that this server did not send to that address, `stale` arrive too late or a second time,
-    `foreign_reports` are reports from an address to which no path is open.
+    `unneeded` answer from the address to which the path is open, `foreign_reports` are reports from an address to which
+    no path is open.
     """
 
     def __init__(self, new_secret: Callable[[], bytes], new_cipher: NewCipher = plain_cipher) -> None:
@@ -151,10 +188,14 @@ class PathServer:
         self.wrong_token = 0
         self.wrong_address = 0
         self.stale = 0
+        self.unneeded = 0
         self.foreign_reports = 0
         self._new_secret = new_secret
         self._new_cipher = new_cipher
         self.set_token(None)
+
+    token: bytes | None
+    """The token of the session; None: there is no session."""
 
     def set_token(self, token: bytes | None) -> None:
         """Close the path and set the token of a new session, or None for no session.
@@ -163,22 +204,30 @@ class PathServer:
         """
         if token is not None:
             _check_token(token)
-        self._token = token
+        self.token = token
         self.cipher: Cipher = NoCipher()
         self._secret = self._new_secret()
         self._address: Address | None = None
+        self._hello_number = 0
+        """The highest number of a hello."""
+        self._challenged: set[Address] = set()
+        """The addresses from which that hello came."""
         self._opened_by_ns: int | None = None
         self._last_report_ns = 0
 
     def receive(self, datagram: bytes, address: Address, now_ns: int) -> bytes | None:
-        """Handle a datagram from `address`; return the challenge to send there if it is a valid hello."""
-        if datagram.startswith(_HELLO) and len(datagram) == len(_HELLO) + _MAC_BYTES:
-            return self._challenge(address, now_ns) if self._verify_mac(datagram) else None
-        if datagram.startswith(_ANSWER) and len(datagram) == len(_ANSWER) + _TIME_BYTES + _COOKIE_BYTES + _MAC_BYTES:
-            if self._verify_mac(datagram):
-                self._open(datagram, address, now_ns)
-        else:
+        """Handle a datagram from `address`; return the challenge to send there if it is a valid and new hello."""
+        number = client_datagram_number(datagram)
+        if number is None:
             self.malformed += 1
+        elif not self.is_authentic(datagram):
+            self.wrong_token += 1
+        elif datagram.startswith(_ANSWER):
+            self._open(datagram, address, now_ns)
+        elif not self._is_new_hello(number, address):
+            self.stale += 1
+        else:
+            return self._challenge(number, address, now_ns)
         return None
 
     def open_address(self, now_ns: int) -> Address | None:
@@ -195,45 +244,61 @@ class PathServer:
             self.foreign_reports += 1
 
     def accepts_rtcp_from(self, address: Address) -> bool:
-        """Return whether RTCP from `address` is accepted: the path was open to it at the last check."""
+        """Return whether RTCP from `address` is accepted: the path was open to it at the last check.
+
+        It is safe to call this from any thread.
+        """
         return self._address == address
 
-    def _verify_mac(self, datagram: bytes) -> bool:
-        """Return whether a datagram ends with a valid MAC under the token; count it if not."""
-        body, mac = datagram[:-_MAC_BYTES], datagram[-_MAC_BYTES:]
-        if self._token is not None and hmac.compare_digest(mac, _mac(self._token, body)):
-            return True
-        self.wrong_token += 1
-        return False
+    def _is_new_hello(self, number: int, address: Address) -> bool:
+        """Return whether an authentic hello gets a challenge."""
+        if number > self._hello_number:
+            self._hello_number, self._challenged = number, set()
+        if number < self._hello_number or address in self._challenged or len(self._challenged) == _MAX_CHALLENGES:
+            return False
+        self._challenged.add(address)
+        return True
 
-    def _challenge(self, address: Address, now_ns: int) -> bytes:
+    def is_open_to_host(self, host: str) -> bool:
+        """Return whether the path was open to any port of `host` at the last check; safe to call from any thread."""
+        address = self._address
+        return address is not None and address[0] == host
+
+    def is_authentic(self, datagram: bytes) -> bool:
+        """Return whether a datagram ends with a valid MAC under the token; safe to call from any thread."""
+        body, mac, token = datagram[:-_MAC_BYTES], datagram[-_MAC_BYTES:], self.token
+        return token is not None and hmac.compare_digest(mac, _mac(token, body))
+
+    def _challenge(self, number: int, address: Address, now_ns: int) -> bytes:
         """Return the challenge for `address`."""
-        issued = now_ns.to_bytes(_TIME_BYTES, "big", signed=True)
-        body = _CHALLENGE + issued + self._cookie(issued, address)
-        return body + _mac(self._token or b"", body)[:_CHALLENGE_MAC_BYTES]
+        challenged = number.to_bytes(8, "big") + now_ns.to_bytes(8, "big", signed=True)
+        body = _CHALLENGE + challenged + self._cookie(challenged, address)
+        return body + _mac(self.token or b"", body)[:_CHALLENGE_MAC_BYTES]
 
     def _open(self, answer: bytes, address: Address, now_ns: int) -> None:
         """Open the path to `address` if `answer`, whose MAC is valid, answers a recent challenge sent to it."""
-        issued = answer[len(_ANSWER) : len(_ANSWER) + _TIME_BYTES]
-        cookie = answer[len(_ANSWER) + _TIME_BYTES : -_MAC_BYTES]
-        if not hmac.compare_digest(cookie, self._cookie(issued, address)):
+        challenged = answer[_NUMBER.start : _ISSUED.stop]
+        if not hmac.compare_digest(answer[_COOKIE], self._cookie(challenged, address)):
             self.wrong_address += 1
             return
-        issued_ns = int.from_bytes(issued, "big", signed=True)
+        issued_ns = int.from_bytes(answer[_ISSUED], "big", signed=True)
         used = self._opened_by_ns is not None and issued_ns <= self._opened_by_ns
         if used or now_ns - issued_ns > CHALLENGE_LIFETIME_NS:
             self.stale += 1
             return
+        if self.open_address(now_ns) == address:
+            self.unneeded += 1
+            return
         self._address = address
-        self.cipher = self._new_cipher(self._token or b"", answer[len(_ANSWER) : -_MAC_BYTES])
+        self.cipher = self._new_cipher(self.token or b"", answer[_CHALLENGED])
         self._opened_by_ns = issued_ns
         self._last_report_ns = now_ns
 
-    def _cookie(self, issued: bytes, address: Address) -> bytes:
-        """Return the cookie that binds a challenge to its time and to the address it is sent to."""
+    def _cookie(self, challenged: bytes, address: Address) -> bytes:
+        """Return the cookie that binds a challenge's number and time to the address it is sent to."""
         host, port = address
-        signed = issued + port.to_bytes(2, "big") + host.encode()
-        return hmac.digest(self._secret, signed, "sha256")[:_COOKIE_BYTES]
+        signed = challenged + port.to_bytes(2, "big") + host.encode()
+        return hmac.digest(self._secret, signed, "sha256")[: _COOKIE.stop - _COOKIE.start]
 
 
 def _mac(token: bytes, body: bytes) -> bytes:

@@ -1,0 +1,100 @@
+"""Measure what a stranger's datagram at the vehicle's video port costs, with and without the filter before the record.
+
+    python benchmarks/stranger_datagrams.py [--datagrams 20000] [--rounds 7]
+
+Both ways deliver the same datagrams, in turns, to the same camera node in the real-time runtime, with a record on disk.
+The cost is the CPU time of the whole process, including the threads of node and record, for each datagram. The filter
+passes 200 a second, which is included. Prints the median of each kind in microseconds and the ratio.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time  # noqa: TID251 (CPU time is what is measured)
+from collections import Counter
+from pathlib import Path
+from statistics import median
+
+from lavt.clock import MachineClock, pause
+from lavt.domain import NS_PER_MS, NS_PER_US
+from lavt.nodes.camera import CameraNode
+from lavt.recording.record import RecordWriter
+from lavt.runtime.realtime import RealRuntime
+from lavt.runtime.recorder import QueuedRecorder
+from lavt.transport.datagram_filter import VideoPortFilter, filtered
+from lavt.transport.rtp.fec import RepairSender
+from lavt.transport.rtp.rtp import Packetizer
+from lavt.transport.udp_link import Deliver
+from lavt.transport.video.path_validation import PathClient, PathServer
+from lavt.transport.video.stream_sender import StreamSender
+
+sys.path.insert(0, str(Path(__file__).parents[1]))  # for the package `benchmarks`
+
+from benchmarks.fuzzing.camera import FakeCamera
+
+TOKEN = bytes(range(16))
+STRANGER = ("198.51.100.7", 5004)
+BATCH = 1000
+"""Less than the node's queue."""
+
+
+def kinds() -> dict[str, bytes]:
+    """Return a datagram of each kind."""
+    return {
+        "random bytes": b"\x00" * 46,
+        "report": bytes.fromhex("80c900010000000b"),
+        "replayed hello": PathClient(TOKEN).hello(0),
+        "forged hello": PathClient(bytes(16)).hello(0),
+    }
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--datagrams", type=int, default=20_000, help="in each round, of each kind and way")
+    parser.add_argument("--rounds", type=int, default=7)
+    arguments = parser.parse_args()
+    clock, camera = MachineClock(), FakeCamera()
+    path = PathServer(lambda: bytes(32))
+    path.set_token(TOKEN)
+    stream = StreamSender(Packetizer(2, 0), RepairSender(3, 0))
+    node = CameraNode(camera, camera, stream, path, start_ns=clock.now().mono_ns + 10**15)
+    with tempfile.TemporaryDirectory() as directory:
+        recorder = QueuedRecorder(RecordWriter(Path(directory) / "server.mcap", "server"))
+        runtime = RealRuntime(clock, [node], recorder, lambda: None)
+        runtime.start({"video": DiscardingLink()})
+        ways = {"all": runtime.deliver, "filtered": filtered(runtime.deliver, VideoPortFilter(path), Counter())}
+        for kind, datagram in kinds().items():
+            ways["all"]("feedback", datagram, clock.now(), STRANGER)
+            costs: dict[str, list[float]] = {way: [] for way in ways}
+            for _ in range(arguments.rounds):
+                for way, deliver in ways.items():
+                    costs[way].append(cost_us(clock, deliver, datagram, arguments.datagrams))
+            before, after = (median(costs[way]) for way in ways)
+            sys.stdout.write(f"{kind}: {before:.1f} us, filtered {after:.2f} us, ratio {before / after:.1f}\n")
+        runtime.stop()
+        recorder.close(clock.now())
+
+
+class DiscardingLink:
+    """A link that sends nothing."""
+
+    def send(self, *sends: object) -> None:
+        """Discard everything."""
+
+
+def cost_us(clock: MachineClock, deliver: Deliver, datagram: bytes, number: int) -> float:
+    """Return the CPU time for each of `number` datagrams, until node and record have processed them."""
+    begin_ns = time.process_time_ns()
+    for at in range(number):
+        deliver("feedback", datagram, clock.now(), STRANGER)
+        if at % BATCH == 0:
+            pause(20 * NS_PER_MS)
+    pause(100 * NS_PER_MS)
+    return (time.process_time_ns() - begin_ns) / NS_PER_US / number
+
+
+if __name__ == "__main__":
+    main()

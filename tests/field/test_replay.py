@@ -1,0 +1,110 @@
+"""An attacker at a router between vehicle and operator, who overhears one hello and sends with any source address."""
+
+from __future__ import annotations
+
+import socket
+import struct
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.field.driving import MIXED, driven, wait_until
+from tests.field.namespaces import OPERATOR, VEHICLE, VEHICLE_UPLINK_ROUTER, plain_field
+from tests.field.secured import make_keys
+
+from lavt.clock import MachineClock, pause
+from lavt.domain import NS_PER_S
+from lavt.recording.record import Record
+from lavt.recording.table import MISSING
+
+pytestmark = [pytest.mark.usefixtures("namespaces")]
+
+VIDEO_PORT = 5600
+"""As in configs/server.yaml."""
+ATTACK_NS = 4 * NS_PER_S
+RATE_HZ = 1000
+"""Twice the 480 a second that made all video unreadable before hellos were numbered."""
+ETH_P_IP = 0x0800
+HEADERS_BYTES = 28
+HELLO = b"LAVT\x01"
+
+
+def spoofed(source: tuple[str, int], target: tuple[str, int], payload: bytes) -> bytes:
+    """Return an IPv4 packet with a UDP datagram; the kernel fills in the length and checksum of the IP header."""
+    udp = struct.pack(">HHHH", source[1], target[1], 8 + len(payload), 0)
+    addresses = (socket.inet_aton(each[0]) for each in (source, target))
+    return struct.pack(">BBHHHBBH4s4s", 0x45, 0, 0, 0, 0, 64, socket.IPPROTO_UDP, 0, *addresses) + udp + payload
+
+
+def overhear(listener: socket.socket) -> tuple[tuple[str, int], bytes]:
+    """Return source and payload of the next hello."""
+    while True:
+        packet = listener.recv(2048)
+        if packet[9] == socket.IPPROTO_UDP and packet[HEADERS_BYTES:].startswith(HELLO):
+            (port,) = struct.unpack_from(">H", packet, 20)
+            return (socket.inet_ntoa(packet[12:16]), port), packet[HEADERS_BYTES:]
+
+
+def counted(record: Record, name: str) -> int:
+    values = record.table("counts").ints(name)
+    return int(np.sum(values[values != MISSING]))
+
+
+def test_a_replayed_hello_leaves_encrypted_video_readable(tmp_path: Path, tell: Callable[[str], None]) -> None:
+    """A hello that is replayed with the client's address and the attacker's makes no packet of the video unreadable.
+
+    The attacker also forwards the challenges that it gets to the client, with the vehicle's address.
+    """
+    keys = tmp_path / "keys"
+    make_keys(keys, "--vehicle", "vehicle-1", "--operator", "operator-1", "--host", VEHICLE)
+    links = replace(
+        MIXED,
+        server=(
+            f"security.key={keys}/vehicle-1.sign.key",
+            f"security.operators={{operator-1: {keys}/operator-1.sign.pub}}",
+        ),
+        client=(f"security.key={keys}/operator-1.sign.key", f"security.vehicle={keys}/vehicle-1.sign.pub"),
+    )
+    clock = MachineClock()
+    with plain_field() as field:
+        listener = field.inside(
+            "internet", lambda: socket.socket(socket.AF_PACKET, socket.SOCK_DGRAM, socket.htons(ETH_P_IP))
+        )
+        listener.bind(("operator", ETH_P_IP))
+        raw = field.inside("internet", lambda: socket.socket(socket.AF_INET, socket.SOCK_RAW, socket.IPPROTO_RAW))
+        own = field.inside("internet", lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        with listener, raw, own, driven(field, tmp_path, links) as drive:
+            client, hello = overhear(listener)
+            wait_until("video arrives", lambda: "raw_tau_v_ms" in drive.running["client"].latest.get("status", {}))
+            own.bind((VEHICLE_UPLINK_ROUTER.address, 0))
+            own.setblocking(False)
+            begin_ns, sent, forwarded = clock.now().mono_ns, 0, 0
+            while (elapsed_ns := clock.now().mono_ns - begin_ns) < ATTACK_NS:
+                while sent < elapsed_ns * RATE_HZ // NS_PER_S:
+                    sent += 1
+                    raw.sendto(spoofed(client, (VEHICLE, VIDEO_PORT), hello), (VEHICLE, 0))
+                    own.sendto(hello, (VEHICLE, VIDEO_PORT))
+                    try:
+                        challenge = own.recv(2048)
+                    except BlockingIOError:
+                        continue
+                    forwarded += 1
+                    raw.sendto(spoofed((VEHICLE, VIDEO_PORT), client, challenge), (OPERATOR, 0))
+                pause(NS_PER_S // RATE_HZ)
+            end_ns = clock.now().mono_ns
+            pause(NS_PER_S)
+        (server_record,), (client_record,) = drive.records("server"), drive.records("client")
+    packets, unreadable = counted(client_record, "packets"), counted(client_record, "packets_forged")
+    at_server = counted(server_record, "path_stale"), counted(server_record, "datagrams_screened_out")
+    pictures_ns = client_record.table("picture").mono_ns
+    during = int(((pictures_ns > begin_ns) & (pictures_ns < end_ns)).sum())
+    tell(
+        f"{2 * sent} replays, {forwarded} challenges to the attacker: {unreadable} packets unreadable, {packets} "
+        f"readable, {during} pictures in {(end_ns - begin_ns) / NS_PER_S:.1f} s; at the server {at_server}"
+    )
+
+    assert sent > 0.5 * RATE_HZ * ATTACK_NS / NS_PER_S
+    assert unreadable == 0
+    assert during > 0
