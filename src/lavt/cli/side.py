@@ -36,7 +36,7 @@ def run_side(side: Side, who: str, *, once: bool, as_json: bool, ready: Mapping[
             console.print_json({"ready": dict(ready)})
         while not stop.wait(STATUS_PERIOD_S) and not runtime.stopped.is_set():
             _print_status(side, log, as_json=as_json)
-            if once and side.live.ending is not None:
+            if once and side.live.ending() is not None:
                 break
         if not runtime.stopped.is_set():
             stop.clear()
@@ -54,7 +54,7 @@ def _print_status(side: Side, log: SessionLog, *, as_json: bool, last_line: str 
             log.add_state(heard, at.mono_ns, has_control=session is not None and session.has_control)
         else:
             log.add_rejection(heard)
-    log.set_ending(side.live.ending)
+    log.set_ending(side.live.ending())
     status = side.live.status()
     if session is not None:
         if not last_line:
@@ -62,7 +62,7 @@ def _print_status(side: Side, log: SessionLog, *, as_json: bool, last_line: str 
         status |= {"phase": session.phase, "session": session.reason}
     lines = log.take_lines(side.clock.now().mono_ns) + [last_line] * bool(last_line)
     if as_json:
-        console.print_json({"status": status, "ending": side.live.ending, "said": lines})
+        console.print_json({"status": status, "ending": side.live.ending(), "said": lines})
         return
     for line in lines:
         console.print_result(line)

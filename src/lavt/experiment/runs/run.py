@@ -39,9 +39,9 @@ def drive_once(planned: PlannedRun, out: Path, *, progress: Progress | None = No
     if planned.config.time == "virtual":
         loop = build_loop(planned, out)
         _write_config(planned, out)
-        drive(loop, progress=None if progress is None else lambda _: progress(loop.tap.status(), {}))
+        drive(loop, progress=None if progress is None else lambda _: progress(loop.observer.status(), {}))
         digest = loop.digest.hexdigest()
-        if not loop.tap.began:
+        if not loop.observer.began:
             raise WorkError(f"{planned.name}: the vehicle was never armed: {loop.client.driver.session.reason}")
     else:
         prepare_directory(out)
