@@ -22,6 +22,7 @@ from lavt.config import ServerConfig
 from lavt.domain import NS_PER_S
 from lavt.errors import UserError, WorkError
 from lavt.runtime import process_priority
+from lavt.runtime.output import finish_output, queue_output
 from lavt.runtime.remote_node import NodeHost, RemoteNodeProxy
 from lavt.vehicle.dbw.vehicle import DbwVehicle
 
@@ -85,6 +86,7 @@ def serve_actuator(connection: Connection, config: ServerConfig, host: str, vide
     """Run the actuator's process: drive until the server's process ends or requests the end, then stop the vehicle."""
     for number in IGNORED:
         signal.signal(number, signal.SIG_IGN)
+    queue_output("stdout", "stderr")
     process_priority.raise_priority(process_priority.VEHICLE_NICENESS)
     clock = MachineClock()
     try:
@@ -107,6 +109,7 @@ def serve_actuator(connection: Connection, config: ServerConfig, host: str, vide
     finally:
         host_of_node.close()
         vehicle.close()
+        finish_output()
 
 
 def _wait_until_disengaged(host: NodeHost, vehicle: DbwVehicle, clock: Clock) -> None:
