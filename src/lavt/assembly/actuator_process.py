@@ -24,6 +24,7 @@ from lavt.errors import UserError, WorkError
 from lavt.runtime import process_priority
 from lavt.runtime.output import finish_output, queue_output
 from lavt.runtime.remote_node import NodeHost, RemoteNodeProxy
+from lavt.runtime.thread_failures import fail_on_thread_errors
 from lavt.vehicle.dbw.vehicle import DbwVehicle
 
 NAME = "actuator"
@@ -102,10 +103,11 @@ def serve_actuator(connection: Connection, config: ServerConfig, host: str, vide
     host_of_node = NodeHost(connection, clock, node, get_status=node.gate.in_force, on_disconnect=disconnected.set)
     host_of_node.start()
     try:
-        while not disconnected.wait(POLL_PERIOD_S) and not host_of_node.runtime.stopped.is_set():
-            pass
-        host_of_node.deliver("server_ends", None)
-        _wait_until_disengaged(host_of_node, vehicle, clock)
+        with fail_on_thread_errors(host_of_node.runtime.fail):
+            while not disconnected.wait(POLL_PERIOD_S) and not host_of_node.runtime.stopped.is_set():
+                pass
+            host_of_node.deliver("server_ends", None)
+            _wait_until_disengaged(host_of_node, vehicle, clock)
     finally:
         host_of_node.close()
         vehicle.close()
