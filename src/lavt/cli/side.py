@@ -25,7 +25,7 @@ STOP_TIMEOUT_S = 6.0
 
 
 def run_side(side: Side, who: str, *, once: bool, as_json: bool, ready: Mapping[str, Any]) -> None:
-    """Run until Ctrl-C, until a node or thread fails or, with `once`, until the drive has ended; print the session's log.
+    """Run until Ctrl-C, until a part fails or, with `once`, until the drive has ended; print the session's log.
 
     `who` is the name of a client, empty for a server. Before it ends, a client releases the vehicle and a server stops
     it. A second Ctrl-C ends the process immediately.
