@@ -40,6 +40,6 @@ class VehicleError(LavtError):
     """The vehicle or its camera failed."""
 
 
-def describe_error(error: Exception) -> str:
+def describe_error(error: BaseException) -> str:
     """Return an error as one sentence; an unexpected error is preceded by its type."""
     return str(error) if isinstance(error, LavtError) else f"{type(error).__name__}: {error}"

@@ -22,6 +22,7 @@ def run(
 ) -> Run:
     """Return a function that runs `lavt` in this process, from an empty working directory."""
     monkeypatch.setattr(console, "reserve_stdout", lambda: None)  # it would redirect pytest's output
+    monkeypatch.setattr(console, "queue_output", lambda *_: None)
     monkeypatch.setattr(process_priority, "raise_priority", lambda *_: None)  # affects all tests
     monkeypatch.chdir(tmp_path)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from itertools import count, repeat
@@ -10,14 +11,17 @@ from typing import Any
 import pytest
 
 from lavt.channels import CHANNELS
-from lavt.domain import Now, SessionReply
+from lavt.domain import Now, SessionReply, State
 from lavt.node import Message, Send
+from lavt.nodes.payloads import Event
+from lavt.recording.live_status import LiveStatus
 from lavt.runtime.inbox import Inbox
 from lavt.runtime.pipeline import run_stages
-from lavt.runtime.recorder import UNRECORDED, WIRE_DECODERS, QueuedRecorder, record
+from lavt.runtime.recorder import UNRECORDED, WIRE_DECODERS, QueuedRecorder, Recorders, record
 from lavt.transport.messages import encode
 
 NOW = Now(1000, 5000)
+STATE = State(1, 2, 8.3, 0.0, "drive", "driving", "armed", -1, "")
 
 
 def message(channel: str, payload: object = None) -> Message:
@@ -29,10 +33,15 @@ class ListRecorder:
 
     def __init__(self) -> None:
         self.entries: list[tuple[str, Any, Now]] = []
+        self.is_closed = False
 
     def write(self, topic: str, payload: Any, now: Now) -> None:
         """Store one entry."""
         self.entries.append((topic, payload, now))
+
+    def close(self) -> None:
+        """Note that the record is complete."""
+        self.is_closed = True
 
 
 def test_queued_messages_come_first() -> None:
@@ -150,12 +159,45 @@ def test_a_full_disk_ends_the_record_only() -> None:
     recorder.close(NOW)
     assert [payload for _, payload, _ in disk.entries] == [0, 1]
     assert recorder.overflow == 3
+    assert not disk.is_closed
+
+
+def test_a_record_is_complete_after_close() -> None:
+    """Closing writes the queued entries and the number of lost ones, and completes the record."""
+    disk = ListRecorder()
+    recorder = QueuedRecorder(disk)
+    recorder.write("event", 1, NOW)
+    recorder.close(NOW)
+    assert disk.entries == [("event", 1, NOW), ("counts", {"record_overflow": 0}, NOW)]
+    assert disk.is_closed
+
+
+@pytest.mark.parametrize("is_blocked", [False, True])
+def test_the_live_status_does_not_depend_on_the_record(is_blocked: bool) -> None:
+    """While the disk is full or does not answer, the ending and the figures are shown, and the record can be closed."""
+    go = threading.Event()
+
+    class Disk(ListRecorder):
+        def write(self, *_: Any) -> None:
+            if is_blocked:
+                go.wait()
+            raise OSError("no space left on device")
+
+    live, queued = LiveStatus(), QueuedRecorder(Disk(), close_timeout_s=0.02)
+    recorder = Recorders(live, queued)
+    recorder.write("event", Event(1, "drive_began", ""), NOW)
+    assert live.ending() is None
+    recorder.write("state", encode(STATE), NOW)
+    recorder.write("event", Event(2, "ending", "completed"), NOW)
+    assert live.ending() == "completed"
+    assert live.status()["reason"] == STATE.reason
+    assert live.take_updates() == [(STATE, NOW)]
+    queued.close(NOW)
+    go.set()
 
 
 def test_a_full_record_queue_counts_lost_entries() -> None:
     """A full record queue loses and counts entries without blocking."""
-    import threading
-
     recorded, go = ListRecorder(), threading.Event()
 
     class Slow(ListRecorder):

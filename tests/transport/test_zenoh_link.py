@@ -5,7 +5,7 @@ import queue
 import socket
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,6 +18,7 @@ from lavt.config_file import shipped
 from lavt.domain import NS_PER_S, Now
 from lavt.errors import UserError
 from lavt.node import Send
+from lavt.runtime.thread_failures import fail_on_thread_errors
 from lavt.transport.messages import MAX_MESSAGE_BYTES
 from lavt.transport.zenoh_link import RECEIVE_RING_LENGTH, Router, ZenohLink, quiet_logs
 
@@ -196,6 +197,36 @@ def test_vehicles_do_not_mix(pair: Pair, routers: tuple[str, str]) -> None:
         pair.server_received.next(("control", b"for one"), lambda: pair.client.send(Send("control", b"for one")))
         assert b"for two" not in pair.server_received.payloads
         assert b"for one" not in other.server_received.payloads
+
+
+@pytest.mark.parametrize("channel", ["control", "session", "session_reply"])
+def test_an_error_in_a_receiving_thread_is_not_lost(routers: tuple[str, str], channel: str) -> None:
+    """An error in the delivery of a command, a query or a reply is that of a thread, which fails the process."""
+    failed: queue.Queue[BaseException] = queue.Queue()
+
+    def deliver(received: str, _payload: Any, _arrived: Now, peer: Any) -> None:
+        if received == channel:
+            raise BrokenPipeError
+        if received == "session":
+            links.server.send(Send("session_reply", b"x", peer))
+
+    with fail_on_thread_errors(failed.put), closing(Pair(routers, f"broken-{channel}")) as links:
+        links.server._deliver = links.client._deliver = deliver
+        for _ in range(100):
+            links.client.send(Send(channel.removesuffix("_reply"), b"x"))
+            with suppress(queue.Empty):
+                assert isinstance(failed.get(timeout=ARRIVES_S / 100), BrokenPipeError)
+                return
+    pytest.fail("the error was lost")
+
+
+def test_the_end_of_a_subscription_is_not_lost(routers: tuple[str, str]) -> None:
+    """A subscription that ends while the link is open is the error of a thread; closing the link still works."""
+    failed: queue.Queue[BaseException] = queue.Queue()
+    with fail_on_thread_errors(failed.put), closing(Pair(routers, "ended")) as pair:
+        pair.server._declared[0].undeclare()
+        assert isinstance(failed.get(timeout=ARRIVES_S), zenoh.ZError)
+    assert failed.empty()
 
 
 @pytest.mark.usefixtures("pair")

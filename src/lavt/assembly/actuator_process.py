@@ -24,8 +24,10 @@ from lavt.domain import NS_PER_S
 from lavt.errors import UserError, WorkError
 from lavt.nodes.payloads import Event
 from lavt.runtime import process_priority
+from lavt.runtime.output import finish_output, queue_output
 from lavt.runtime.realtime import RealRuntime
 from lavt.runtime.remote_node import NodeHost, RemoteNodeProxy
+from lavt.runtime.thread_failures import fail_on_thread_errors
 from lavt.vehicle.dbw.vehicle import DbwVehicle
 
 NAME = "actuator"
@@ -100,6 +102,7 @@ def serve_actuator(connection: Connection, config: ServerConfig, host: str, vide
     """Run the actuator's process: drive until the server's process ends or requests the end, then stop the vehicle."""
     for number in IGNORED:
         signal.signal(number, signal.SIG_IGN)
+    queue_output("stdout", "stderr")
     process_priority.raise_priority(process_priority.VEHICLE_NICENESS)
     clock = MachineClock()
     try:
@@ -115,14 +118,16 @@ def serve_actuator(connection: Connection, config: ServerConfig, host: str, vide
     host_of_node = NodeHost(connection, clock, node, get_status=node.gate.in_force, on_disconnect=disconnected.set)
     host_of_node.start()
     try:
-        while not disconnected.wait(POLL_PERIOD_S) and not host_of_node.runtime.stopped.is_set():
-            pass
-        signal.alarm(LONGEST_END_S)
-        host_of_node.deliver("server_ends", None)
-        _wait_until_disengaged(host_of_node, vehicle, clock)
+        with fail_on_thread_errors(host_of_node.runtime.fail):
+            while not disconnected.wait(POLL_PERIOD_S) and not host_of_node.runtime.stopped.is_set():
+                pass
+            signal.alarm(LONGEST_END_S)
+            host_of_node.deliver("server_ends", None)
+            _wait_until_disengaged(host_of_node, vehicle, clock)
     finally:
         host_of_node.close()
         vehicle.close()
+        finish_output()
 
 
 def _wait_until_disengaged(host: NodeHost, vehicle: DbwVehicle, clock: Clock) -> None:

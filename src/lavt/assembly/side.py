@@ -31,12 +31,12 @@ from lavt.config_file import find_file
 from lavt.domain import Now
 from lavt.node import Node, Peer
 from lavt.nodes.client_session import ClientSession
-from lavt.recording.live_status import LiveTap
+from lavt.recording.live_status import LiveStatus
 from lavt.recording.output_directory import check_directory, prepare_directory
 from lavt.recording.provenance import provenance
 from lavt.recording.record import RecordWriter
 from lavt.runtime.realtime import RealRuntime
-from lavt.runtime.recorder import QueuedRecorder
+from lavt.runtime.recorder import QueuedRecorder, Recorders
 from lavt.transport.clock_sync.clock_report import kernel_identity
 from lavt.transport.clock_sync.persistent_process import PersistentProcess
 from lavt.transport.datagram_filter import ProbePortFilter, VideoPortFilter, filtered
@@ -49,13 +49,6 @@ from lavt.transport.video.path_validation import PathServer
 from lavt.transport.zenoh_link import ZenohLink, quiet_logs
 
 PrintMessage = Callable[[str], None]
-
-
-class NoRecorder:
-    """A recorder that discards every entry."""
-
-    def write(self, topic: str, payload: Any, now: Now) -> None:
-        """Discard one entry."""
 
 
 @dataclass(frozen=True)
@@ -103,13 +96,13 @@ class Side:
         self._path = path
         """The server's end of the video path, by which strangers' datagrams are dropped; None on a client."""
         self._time_source = prepared.time_source
-        self._writer = None if out is None else _open_record(config, out)
-        self.live = LiveTap(NoRecorder() if self._writer is None else self._writer)
-        self._record = QueuedRecorder(self.live)
+        self.live = LiveStatus()
+        self._record = None if out is None else QueuedRecorder(_open_record(config, out))
+        recorder = Recorders(self.live) if self._record is None else Recorders(self.live, self._record)
         self.runtime = RealRuntime(
             clock,
             nodes,
-            self._record,
+            recorder,
             clock_source(config.clock, clock, prepared.time_source.run),
             {} if actuator is None else {actuator.name: actuator},
         )
@@ -150,10 +143,9 @@ class Side:
     def _close_record(self) -> None:
         """Record the counts of the links, and complete the record."""
         for name, counts in self._link_counts().items():
-            self._record.write("counts", {"link": name, **counts}, self.clock.now())
-        self._record.close(self.clock.now())
-        if self._writer is not None and not self._record.failed:
-            self._writer.close()
+            self.runtime.record("counts", {"link": name, **counts}, self.clock.now())
+        if self._record is not None:
+            self._record.close(self.clock.now())
 
     def _link_counts(self) -> dict[str, Mapping[str, int]]:
         links = self._links

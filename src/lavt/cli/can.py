@@ -78,8 +78,9 @@ def monitor(
     else:
         profile = load_profile(config.profile, dbc or config.dbc)
         codec, expected = profile.codec, expected_traffic(profile)
-    with ExitStack() as stack, console.stop_on_signals() as stop:
+    with ExitStack() as stack:
         if log is None:
+            stop = stack.enter_context(console.stop_on_signals())
             port = stack.enter_context(closing(_open_port(config)))
             batches, dropped, to_wall_ns = _read_bus(port, stop, seconds), port.counts, _mono_to_wall_ns()
         else:

@@ -15,6 +15,7 @@ from typing import Annotated, Any
 import typer
 
 from lavt.errors import LavtError, UserError, WorkError
+from lavt.runtime.output import finish_output, queue_output
 
 Out = Annotated[Path | None, typer.Option(help="Output directory.")]
 Set = Annotated[list[str] | None, typer.Option("--set", help="Override a config value, as a.b=value; repeatable.")]
@@ -23,12 +24,12 @@ Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text."
 
 def print_message(text: str) -> None:
     """Print a message for the user to standard error."""
-    print(text, file=sys.stderr, flush=True)
+    print(f"{text}\n", end="", file=sys.stderr, flush=True)
 
 
 def print_result(text: str) -> None:
     """Print a result to standard output."""
-    print(text, flush=True)
+    print(f"{text}\n", end="", flush=True)
 
 
 def print_json(value: Any) -> None:
@@ -37,10 +38,21 @@ def print_json(value: Any) -> None:
 
 
 def reserve_stdout() -> None:
-    """Redirect the output of libraries (Zenoh's log) to standard error; `print_result` keeps standard output."""
+    """Redirect the output of libraries (Zenoh's log) to `sys.stderr`; `print_result` keeps standard output.
+
+    The libraries write to a pipe that is always read, so that they do not block either.
+    """
     results = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    read_end, write_end = os.pipe()
+    os.dup2(write_end, sys.stdout.fileno())
+    os.close(write_end)
     sys.stdout = results
+    threading.Thread(target=_copy_to_stderr, args=(read_end,), name="library output", daemon=True).start()
+
+
+def _copy_to_stderr(descriptor: int) -> None:
+    while data := os.read(descriptor, 65_536):
+        print(data.decode(errors="replace"), end="", file=sys.stderr, flush=True)
 
 
 def run_command(command: Callable[[], None]) -> None:
@@ -56,15 +68,21 @@ def run_command(command: Callable[[], None]) -> None:
     except OSError as error:  # such as a full disk or a missing permission that no check anticipated
         print_message(f"lavt: {error}")
         raise SystemExit(1) from None
+    finally:
+        finish_output()
 
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Raise `WorkError` when Ctrl-C, SIGTERM or a closed terminal interrupts long work."""
+    """Raise `WorkError` when Ctrl-C, SIGTERM or a closed terminal interrupts long work.
+
+    From here on, no message to standard error blocks the program.
+    """
 
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
+    queue_output("stderr")
     try:
         with _signal_handlers(interrupt, signal.SIGTERM):
             yield
@@ -108,7 +126,11 @@ class StopEvent:
 
 @contextmanager
 def stop_on_signals() -> Iterator[StopEvent]:
-    """Yield an event that Ctrl-C, SIGTERM or a closed terminal sets, for programs that run until they are stopped."""
+    """Yield an event that Ctrl-C, SIGTERM or a closed terminal sets, for programs that run until they are stopped.
+
+    From here on, no output blocks the program.
+    """
+    queue_output("stdout", "stderr")
     stop = StopEvent()
     with _signal_handlers(lambda *_: stop.set(), signal.SIGINT, signal.SIGTERM):
         yield stop

@@ -12,7 +12,9 @@ from lavt.cli import console
 from lavt.clock import MachineClock
 from lavt.config import RendezvousConfig
 from lavt.config_file import load_config
+from lavt.errors import WorkError, describe_error
 from lavt.runtime import process_priority
+from lavt.runtime.thread_failures import fail_on_thread_errors
 from lavt.transport.rendezvous.forwarder import Address, FlowName
 
 POLL_PERIOD_S = 0.2
@@ -39,7 +41,13 @@ def rendezvous(
     forwarders = open_rendezvous(settings, MachineClock())
     ports = {f"{flow}_port": each.port for flow, each in forwarders.items()}
     known: dict[FlowName, Address | None] = dict.fromkeys(forwarders)
-    with console.stop_on_signals() as stop:
+    failures: list[BaseException] = []
+
+    def fail(error: BaseException) -> None:
+        failures.append(error)
+        stop.set()
+
+    with console.stop_on_signals() as stop, fail_on_thread_errors(fail):
         for each in forwarders.values():
             each.start()
         if as_json:
@@ -56,6 +64,8 @@ def rendezvous(
             known.update(addresses)
     for each in forwarders.values():
         each.close()
+    if failures:
+        raise WorkError(f"stopped because a part failed: {describe_error(failures[0])}")
     if as_json:
         console.print_json({"counts": {flow: each.counts for flow, each in forwarders.items()}})
 

@@ -9,8 +9,9 @@ from lavt.assembly.side import Side
 from lavt.cli import console
 from lavt.cli.session_log import SessionLog, client_end_line, server_end_line
 from lavt.domain import NS_PER_S, State
-from lavt.errors import WorkError
+from lavt.errors import WorkError, describe_error
 from lavt.nodes.client_session import ClientSession
+from lavt.runtime.thread_failures import fail_on_thread_errors
 from lavt.safety.limits import LIMITS
 from lavt.safety.state_machine import ACTIVE
 
@@ -24,26 +25,26 @@ STOP_TIMEOUT_S = 6.0
 
 
 def run_side(side: Side, who: str, *, once: bool, as_json: bool, ready: Mapping[str, Any]) -> None:
-    """Run until Ctrl-C, until a node fails or, with `once`, until the drive has ended; print the session's log.
+    """Run until Ctrl-C, until a part fails or, with `once`, until the drive has ended; print the session's log.
 
     `who` is the name of a client, empty for a server. Before it ends, a client releases the vehicle and a server stops
     it. A second Ctrl-C ends the process immediately.
     """
     log, session, runtime = SessionLog(who), side.session, side.runtime
-    with console.stop_on_signals() as stop:
+    with console.stop_on_signals() as stop, fail_on_thread_errors(runtime.fail):
         side.start()
         if as_json:
             console.print_json({"ready": dict(ready)})
         while not stop.wait(STATUS_PERIOD_S) and not runtime.stopped.is_set():
             _print_status(side, log, as_json=as_json)
-            if once and side.live.ending is not None:
+            if once and side.live.ending() is not None:
                 break
         if not runtime.stopped.is_set():
             stop.clear()
             last_line = _stop_vehicle(side, stop) if session is None else _release(side, stop, session)
             _print_status(side, log, as_json=as_json, last_line=last_line)
     if runtime.failed is not None:
-        raise WorkError(f"stopped because a node failed: {runtime.failed}")
+        raise WorkError(f"stopped because a part failed: {describe_error(runtime.failed)}")
 
 
 def _print_status(side: Side, log: SessionLog, *, as_json: bool, last_line: str = "") -> None:
@@ -54,7 +55,7 @@ def _print_status(side: Side, log: SessionLog, *, as_json: bool, last_line: str 
             log.add_state(heard, at.mono_ns, has_control=session is not None and session.has_control)
         else:
             log.add_rejection(heard)
-    log.set_ending(side.live.ending)
+    log.set_ending(side.live.ending())
     status = side.live.status()
     if session is not None:
         if not last_line:
@@ -62,7 +63,7 @@ def _print_status(side: Side, log: SessionLog, *, as_json: bool, last_line: str 
         status |= {"phase": session.phase, "session": session.reason}
     lines = log.take_lines(side.clock.now().mono_ns) + [last_line] * bool(last_line)
     if as_json:
-        console.print_json({"status": status, "ending": side.live.ending, "said": lines})
+        console.print_json({"status": status, "ending": side.live.ending(), "said": lines})
         return
     for line in lines:
         console.print_result(line)

@@ -14,9 +14,10 @@ from lavt.assembly.watcher import Sender, WatchNodes
 from lavt.cli import console
 from lavt.clock import MachineClock
 from lavt.domain import NS_PER_S
-from lavt.errors import WorkError
+from lavt.errors import WorkError, describe_error
 from lavt.runtime import process_priority
 from lavt.runtime.realtime import RealRuntime
+from lavt.runtime.thread_failures import fail_on_thread_errors
 from lavt.transport.udp_link import UdpLink, resolve_host
 
 HINT_AFTER_S = 5
@@ -67,7 +68,7 @@ def watch(
     clock, nodes = MachineClock(), WatchNodes(sender, reorder_hold_ms)
     runtime = RealRuntime(clock, nodes.nodes, nodes, lambda: None)
     link = UdpLink(clock, "rtp", bind=(bind, port), only_from=only_from)
-    with closing(link), console.stop_on_signals() as stop:
+    with closing(link), console.stop_on_signals() as stop, fail_on_thread_errors(runtime.fail):
         _print_header(link.port, as_json)
         runtime.start({})  # without a link to send on
         link.start(runtime.deliver)
@@ -81,7 +82,7 @@ def watch(
                 console.print_message(_no_packet_hint(link, totals))
         runtime.stop()
     if runtime.failed is not None:
-        raise WorkError(f"stopped because a node failed: {runtime.failed}")
+        raise WorkError(f"stopped because a part failed: {describe_error(runtime.failed)}")
     summary = nodes.between(Counter(), nodes.totals())
     strangers = link.counts["datagrams_from_strangers"]
     _print_statistics("summary", {**summary, "datagrams_from_strangers": strangers, "check": CHECKS[sender]}, as_json)

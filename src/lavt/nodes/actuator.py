@@ -11,7 +11,7 @@ from lavt.errors import BadMessage
 from lavt.node import WAKE, Message, Send, Stage
 from lavt.nodes.payloads import Admission, AtWheel, Event, FrameWritten, Route, StationaryStatus
 from lavt.safety.gate import CommandVerdict, SafetyGate
-from lavt.transport.messages import decode, encode, shorten
+from lavt.transport.messages import decode, encode
 from lavt.value import value
 from lavt.vehicle.camera import FrameTimes
 from lavt.vehicle.vehicle import CountingVehicle, Vehicle
@@ -261,9 +261,9 @@ class ActuatorNode:
             steering_rad=vehicle.steering_rad,
             gear=vehicle.gear,
             safety=self.gate.state,
-            reason=shorten(self.gate.machine.reason),
+            reason=self.gate.machine.reason,
             applied_sequence=self.gate.epoch.sequence,
-            rejected=shorten(self.gate.rejected) if now.mono_ns - self._rejected_ns < REJECTION_SHOWN_NS else "",
+            rejected=self.gate.rejected if now.mono_ns - self._rejected_ns < REJECTION_SHOWN_NS else "",
             limited=", ".join(self._limited),
             active_operator=active_operator,
             active_operator_instance=active_operator_instance,

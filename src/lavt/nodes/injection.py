@@ -16,7 +16,7 @@ from lavt.errors import BadMessage, UserError
 from lavt.node import WAKE, Message, Peer, Send, Stage
 from lavt.nodes.payloads import InjectionSample, StationaryStatus
 from lavt.transport.emulation.impairment import ImpairedFlow, Impairment, check_flows
-from lavt.transport.messages import MAX_NETEM_REASON_BYTES, decode, encode, shorten
+from lavt.transport.messages import decode, encode
 from lavt.transport.netem.injector import InjectionOrder, InjectionResult
 from lavt.value import value
 
@@ -277,4 +277,4 @@ def _earliest(*times_ns: int | None) -> int | None:
 
 
 def _reply(reason: str, peer: Peer) -> Send:
-    return Send("netem_reply", encode(NetemReply(reason == "", shorten(reason, MAX_NETEM_REASON_BYTES))), peer)
+    return Send("netem_reply", encode(NetemReply(reason == "", reason)), peer)

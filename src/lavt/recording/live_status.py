@@ -1,59 +1,68 @@
-"""The live status of a running side, taken from its record: the newest figures, and the ending of a drive."""
+"""The live status of a running side: the newest figures, and the ending of a drive, from what its record gets."""
 
 from __future__ import annotations
 
-import threading
 from collections import deque
 from typing import Any
 
 from lavt.domain import NS_PER_MS, Now, State
-from lavt.runtime.recorder import Recorder
+from lavt.runtime.recorder import decode_for_record
 
 MAX_PENDING = 4096
-"""Updates that are kept until they are taken: the newest, more than ten seconds of states and commands."""
+"""Entries and updates that are kept until they are taken: the newest, of more than ten seconds."""
 
 StatusUpdate = tuple[State | str, Now]
 """A state of the vehicle or the reason for which a command was rejected, and its time."""
 
 
-class LiveTap:
-    """A recorder that passes everything on and keeps the newest figures for display.
+class LiveStatus:
+    """A recorder that keeps the newest figures for display, whatever happens to the record.
+
+    `write` is called by the threads of the runtime and only stores the entry; the other methods process the stored
+    entries, and are for one thread.
 
     The one-way latencies are raw: receiver's wall clock minus sender's, without a correction for the clock offset.
     """
 
-    def __init__(self, recorder: Recorder) -> None:
-        self.ending: str | None = None
-        self._recorder = recorder
-        self._lock = threading.Lock()
+    def __init__(self) -> None:
+        self._ending: str | None = None
         self._status: dict[str, Any] = {}
         self._updates: deque[StatusUpdate] = deque(maxlen=MAX_PENDING)
-
-    def write(self, topic: str, payload: Any, now: Now) -> None:
-        """Write one entry, and update the status with it."""
-        self._recorder.write(topic, payload, now)
-        update = {
+        self._entries: deque[tuple[str, Any, Now]] = deque(maxlen=MAX_PENDING)
+        self._processors = {
             "truth": self._update_truth,
             "admission": self._update_admission,
             "event": self._update_ending,
             "picture": self._update_picture,
             "state": self._update_state,
-        }.get(topic)
-        if update is not None:
-            with self._lock:
-                update(payload, now)
+        }
+
+    def write(self, topic: str, payload: Any, now: Now) -> None:
+        """Store one entry, if it is shown."""
+        if topic in self._processors:
+            self._entries.append((topic, payload, now))
+
+    def ending(self) -> str | None:
+        """Return how the last drive ended; None before its end, or after the start of another."""
+        self._process_entries()
+        return self._ending
 
     def take_updates(self) -> list[StatusUpdate]:
         """Return the states and rejections since the last call, in order."""
-        with self._lock:
-            updates = list(self._updates)
-            self._updates.clear()
+        self._process_entries()
+        updates = list(self._updates)
+        self._updates.clear()
         return updates
 
     def status(self) -> dict[str, Any]:
         """Return a copy of the newest figures."""
-        with self._lock:
-            return dict(self._status)
+        self._process_entries()
+        return dict(self._status)
+
+    def _process_entries(self) -> None:
+        while self._entries:
+            topic, payload, now = self._entries.popleft()
+            self._processors[topic](decode_for_record(topic, payload), now)
 
     def _update_truth(self, truth: Any, _now: Now) -> None:
         self._status.update(cross_track_m=truth.cross_track_m, progress_m=truth.progress_m)
@@ -85,6 +94,6 @@ class LiveTap:
 
     def _update_ending(self, event: Any, _now: Now) -> None:
         if event.kind == "ending":
-            self.ending = event.detail
+            self._ending = event.detail
         elif event.kind == "drive_began":
-            self.ending = None
+            self._ending = None

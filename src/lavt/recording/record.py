@@ -11,6 +11,7 @@ import base64
 import json
 from collections import defaultdict
 from collections.abc import Callable, Container, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -18,7 +19,7 @@ from typing import Any, Literal, Protocol
 from pydantic_core import from_json
 
 from lavt.domain import NS_PER_S, Now
-from lavt.errors import UserError, WorkError
+from lavt.errors import UserError, WorkError, describe_error
 from lavt.recording.json_payload import json_schema, serializer_of
 from lavt.recording.mcap_reader import McapContent, Messages, read_mcap
 from lavt.recording.mcap_writer import McapFile
@@ -162,6 +163,8 @@ class _Tables(Mapping[str, Table]):
         if channel not in self._parsed:
             messages = self._messages[channel]
             rows = from_json(b"[" + b",".join(messages.data) + b"]")
+            if len(rows) != len(messages.data) or not all(type(row) is dict for row in rows):
+                raise ValueError(f"a message of the channel {channel} is not a JSON object")
             self._parsed[channel] = table_of(rows, messages.publish_ns, messages.log_ns)
         return self._parsed[channel]
 
@@ -193,11 +196,29 @@ class Record:
     def video(self) -> list[tuple[int, bytes]]:
         """Read the stamp (ns) and the data of each access unit from the file; they are too large to keep in memory."""
         units = []
-        for data in read_mcap(self.path, lambda topic: topic == "/" + VIDEO).topics.get("/" + VIDEO, Messages()).data:
-            fields = from_json(data)
-            stamp_ns = fields["timestamp"]["sec"] * NS_PER_S + fields["timestamp"]["nsec"]
-            units.append((stamp_ns, base64.b64decode(fields["data"])))
+        content = read_mcap(self.path, lambda topic: topic == "/" + VIDEO)
+        with evaluating(self.path):
+            for data in content.topics.get("/" + VIDEO, Messages()).data:
+                fields = from_json(data)
+                stamp_ns = int(fields["timestamp"]["sec"]) * NS_PER_S + int(fields["timestamp"]["nsec"])
+                units.append((stamp_ns, base64.b64decode(fields["data"])))
         return units
+
+
+@contextmanager
+def evaluating(path: Path) -> Iterator[None]:
+    """Raise `UserError` if the records at `path`, which others may have written, have unexpected content.
+
+    The checksums of a record show damage. Content of another type or range than LAVT writes may cause any error in what
+    is computed from it.
+    """
+    try:
+        yield
+    except (ArithmeticError, AttributeError, LookupError, MemoryError, RecursionError, TypeError, ValueError) as error:
+        what = " ".join(describe_error(error).split())
+        raise UserError(
+            f"{path} has records that LAVT cannot evaluate ({what}): name a run that it recorded"
+        ) from error
 
 
 def read_record(path: Path, channels: Container[str] | None = None) -> Record:

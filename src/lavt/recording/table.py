@@ -36,7 +36,7 @@ class Table:
         return len(self.mono_ns)
 
     def ints(self, name: str) -> IntArray:
-        """Return a column of integers: `MISSING` for null and for a missing column."""
+        """Return a column of integers: `MISSING` for null, more than 64 bits, and a missing column."""
         column = self.columns.get(name)
         if column is None or column.dtype != np.int64:
             return _ints_of(column, len(self))
@@ -95,7 +95,7 @@ def _ints_of(column: NDArray[Any] | None, length: int) -> IntArray:
     ints = np.full(length, MISSING, np.int64)
     if column is not None and column.dtype == object:
         for index, value in enumerate(column):
-            if isinstance(value, int) and not isinstance(value, bool):
+            if isinstance(value, int) and not isinstance(value, bool) and MISSING <= value <= -(MISSING + 1):
                 ints[index] = value
     elif column is not None:
         known = np.isfinite(column.astype(np.float64))

@@ -110,9 +110,9 @@ class RealRuntime:
 
     def fail(self, error: BaseException) -> None:
         """End the run because of an error; the first error counts."""
-        log.critical("%s: %s", type(error).__name__, error, exc_info=error)
         self.failed = self.failed or error  # later errors follow from the first
         self.stopped.set()
+        log.critical("%s: %s", type(error).__name__, error, exc_info=error)
 
     def run_pipeline(self, node: Node, message: Message) -> None:
         """Run a message through its pipeline and send the result."""

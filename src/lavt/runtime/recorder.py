@@ -1,4 +1,4 @@
-"""Recording of messages: the recorded form of each, and a queue in front of the recorder."""
+"""Recording of messages: the recorded form of each, several recorders as one, and a queue in front of a disk."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ from lavt.value import value
 log = logging.getLogger(__name__)
 
 POLL_PERIOD_S = 0.02
+CLOSE_TIMEOUT_S = 10.0
+"""How long the end of a record may take; a full queue takes a second on an ordinary disk."""
 
 
 class Recorder(Protocol):
@@ -25,6 +27,26 @@ class Recorder(Protocol):
     def write(self, topic: str, payload: Any, now: Now) -> None:
         """Write one entry."""
         ...
+
+
+class RecordFile(Recorder, Protocol):
+    """A recorder that must be closed."""
+
+    def close(self) -> None:
+        """Complete the record."""
+        ...
+
+
+class Recorders:
+    """A recorder that passes each entry to several recorders, none of which may block or raise."""
+
+    def __init__(self, *recorders: Recorder) -> None:
+        self._writes = tuple(recorder.write for recorder in recorders)
+
+    def write(self, topic: str, payload: Any, now: Now) -> None:
+        """Write one entry to each recorder, in order."""
+        for write in self._writes:
+            write(topic, payload, now)
 
 
 def _decoded(kind: type[Any]) -> Callable[[bytes], object]:
@@ -109,7 +131,7 @@ def decode_for_record(channel: str, payload: Any) -> Any:
 
 
 class QueuedRecorder:
-    """A recorder with a bounded queue and its own thread, so that no node waits for a disk.
+    """A recorder with a bounded queue and its own thread, so that nothing else waits for a disk.
 
     The thread also decodes network bytes, which relieves the receiving threads. It polls the queue: waking it a
     thousand times a second would cost more than the writing.
@@ -117,15 +139,15 @@ class QueuedRecorder:
     Entries that do not fit or cannot be written are counted in `overflow`; a run with an overflow is invalid.
     """
 
-    def __init__(self, recorder: Recorder, capacity: int = 8192) -> None:
+    def __init__(self, file: RecordFile, capacity: int = 8192, close_timeout_s: float = CLOSE_TIMEOUT_S) -> None:
         self.overflow = 0
-        self.failed = False
-        """The record has ended, because it could not be written."""
-        self._recorder = recorder
+        self._file = file
         self._capacity = capacity
+        self._close_timeout_s = close_timeout_s
         self._queue: deque[tuple[str, Any, Now]] = deque()
         self._closed = threading.Event()
-        self._thread = threading.Thread(target=self._drain, name="recorder", daemon=True)
+        self._closed_at = Now(0, 0)
+        self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
 
     def write(self, topic: str, payload: Any, now: Now) -> None:
@@ -138,26 +160,29 @@ class QueuedRecorder:
             self.overflow += 1
 
     def close(self, now: Now) -> None:
-        """Write the queued entries and the number of lost ones."""
+        """Write the queued entries and the number of lost ones, and complete the record, unless that takes too long."""
+        self._closed_at = now
         self._closed.set()
-        self._thread.join()
-        if not self.failed:
-            self._recorder.write("counts", Counter(record_overflow=self.overflow), now)
+        self._thread.join(self._close_timeout_s)
+        if self._thread.is_alive():
+            log.error("the record is incomplete: it could not be written within %g s", self._close_timeout_s)
 
-    def _drain(self) -> None:
+    def _run(self) -> None:
+        """Write until closed; a full disk or any other error ends the record, not the drive."""
+        try:
+            self._write_until_closed()
+            self._file.write("counts", Counter(record_overflow=self.overflow), self._closed_at)
+            self._file.close()
+        except Exception as error:
+            log.error("the record ends here, because it cannot be written: %s", error)
+            self._capacity = 0
+            self.overflow += 1 + len(self._queue)
+            self._queue.clear()
+
+    def _write_until_closed(self) -> None:
         is_last = False
         while not is_last:
             is_last = self._closed.wait(POLL_PERIOD_S)
             while self._queue:
-                self._write(*self._queue.popleft())
-
-    def _write(self, topic: str, payload: Any, now: Now) -> None:
-        if self.failed:
-            self.overflow += 1
-            return
-        try:
-            self._recorder.write(topic, decode_for_record(topic, payload), now)
-        except Exception as error:  # a full disk or any other error ends the record, not the drive
-            log.error("the record ends here, because it cannot be written: %s", error)
-            self.failed = True
-            self.overflow += 1
+                topic, payload, now = self._queue.popleft()
+                self._file.write(topic, decode_for_record(topic, payload), now)

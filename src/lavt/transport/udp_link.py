@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import socket
 import threading
 from collections import Counter
@@ -98,9 +99,11 @@ class UdpLink:
         while True:
             try:
                 length, ancillary, _flags, address = self._socket.recvmsg_into((buffer,), ANCILLARY_BYTES)
-            except OSError:  # an ICMP error for a datagram sent before
+            except OSError as error:  # an ICMP error for a datagram sent before
                 if self._closing:
                     return
+                if error.errno == errno.EBADF:
+                    raise
                 self.counts["datagrams_rejected"] += 1
                 continue
             if self._closing:

@@ -6,13 +6,13 @@ not depend on Zenoh: after an outage it may deliver seconds of old commands, and
 
 from __future__ import annotations
 
-import functools
 import itertools
 import json
 import re
 import threading
 from collections import Counter
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -172,6 +172,19 @@ class Routers(NamedTuple):
     """Zenoh's version in every router that reports it, the session's router first."""
 
 
+def _as_thread(handle: Callable[[str, Any], None], channel: str) -> Callable[[Any], None]:
+    """Return a callback for Zenoh's threads; an error in it counts as one that ends a thread of Python's."""
+
+    def call(received: Any) -> None:
+        try:
+            handle(channel, received)
+        except BaseException as error:
+            details = (type(error), error, error.__traceback__, threading.current_thread())
+            threading.excepthook(threading.ExceptHookArgs(details))
+
+    return call
+
+
 def _discard(_channel: str, _payload: bytes, _arrived: Now, _peer: object) -> None:
     """Ignore a message that arrives before the link is started."""
 
@@ -262,7 +275,7 @@ class ZenohLink:
         )
         self._listener.start()
         for channel in REPLY_CHANNELS if self._side == "server" else ():
-            on_query: Any = zenoh.handlers.Callback(functools.partial(self._on_query, channel), indirect=False)
+            on_query: Any = zenoh.handlers.Callback(_as_thread(self._on_query, channel), indirect=False)
             self._declared.append(session.declare_queryable(f"{self._base}/{channel}", on_query))
         self._declared.append(session.liveliness().declare_token(f"{self._base}/alive/{self._who}"))
 
@@ -306,7 +319,8 @@ class ZenohLink:
         if self._session is None:
             return
         for declared in self._declared:
-            declared.undeclare()
+            with suppress(zenoh.ZError):  # the session has been closed already
+                declared.undeclare()
         if self._listener is not None:
             self._listener.join()
         self._session.close()
@@ -317,11 +331,13 @@ class ZenohLink:
             try:
                 sample = ring.recv()
             except zenoh.ZError:
-                return
+                if self._closing.is_set():
+                    return
+                raise
             self._deliver(channel, sample.payload.to_bytes(), self._clock.now(), None)
 
     def _query(self, channel: str, payload: bytes) -> None:
-        on_reply: Any = zenoh.handlers.Callback(functools.partial(self._on_reply, channel), indirect=False)
+        on_reply: Any = zenoh.handlers.Callback(_as_thread(self._on_reply, channel), indirect=False)
         self._session.get(
             f"{self._base}/{channel}",
             on_reply,

@@ -203,6 +203,19 @@ def test_no_dbc(tmp_path: Path) -> None:
         assert "\n" not in str(rejected.value)
 
 
+def test_a_message_that_takes_too_long_to_load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A DBC with a longer message than any of J1939 is rejected before it is loaded; the longest one is loaded."""
+    for length in (1785, 1786, 99_999, 10**30):
+        text = AWKWARD.replace("Unlimited: 8", f"Unlimited: {length}")
+        (tmp_path / "long.dbc").write_text(text)
+        if length == 1785:
+            assert Codec(tmp_path / "long.dbc").messages["Unlimited"].length == length
+            monkeypatch.setattr("cantools.database.load_file", lambda *_, **__: pytest.fail("loaded"))
+        else:
+            with pytest.raises(UserError, match="1785"):
+                Codec(tmp_path / "long.dbc")
+
+
 def test_without_cantools(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Without cantools the error says how to install it."""
 

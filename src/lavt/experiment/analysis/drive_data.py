@@ -12,7 +12,7 @@ import numpy as np
 from lavt.domain import NS_PER_MS, FloatArray
 from lavt.experiment.analysis.latency import frames_within
 from lavt.experiment.analysis.metrics import driving_interval
-from lavt.recording.record import Record, read_record
+from lavt.recording.record import Record, evaluating, read_record
 from lavt.recording.table import MISSING, Table
 
 DRAWN = ("mono_ns", "x_m", "y_m", "progress_m", "cross_track_m", "steering_rad")
@@ -42,9 +42,9 @@ class DriveData:
 
 def read_drive(directory: Path, result: Mapping[str, Any]) -> DriveData:
     """Read the data of the run in `directory` that figures need."""
-    return extract_drive(
-        read_record(directory / "server.mcap", channels=("truth", "event", "route")), directory, result
-    )
+    record = read_record(directory / "server.mcap", channels=("truth", "event", "route"))
+    with evaluating(record.path):
+        return extract_drive(record, directory, result)
 
 
 def extract_drive(record: Record, directory: Path, result: Mapping[str, Any]) -> DriveData:
@@ -74,8 +74,9 @@ def capture_to_stamp_ms(server_record: Path) -> float | None:
     None where the camera does not report the time of exposure.
     """
     server = read_record(server_record, channels=("frame", "event"))
-    began_ns, ended_ns, _ = driving_interval(server)
-    frames = frames_within(server.table("frame"), began_ns, ended_ns)
-    capture_ns = frames.ints("capture_ns")
-    times_ns = (frames.ints("stamped_mono_ns") - capture_ns)[capture_ns != MISSING]
+    with evaluating(server_record):
+        began_ns, ended_ns, _ = driving_interval(server)
+        frames = frames_within(server.table("frame"), began_ns, ended_ns)
+        capture_ns = frames.ints("capture_ns")
+        times_ns = (frames.ints("stamped_mono_ns") - capture_ns)[capture_ns != MISSING]
     return float(np.median(times_ns)) / NS_PER_MS if len(times_ns) else None

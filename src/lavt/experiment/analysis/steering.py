@@ -13,6 +13,9 @@ from lavt.recording.table import Table
 REVERSAL_DEADBAND_RAD = 0.01
 """The smallest turn back of the road wheels that counts as a steering reversal (0.57 degrees)."""
 
+MAX_DURATION_S = 24 * 3600
+"""A longer time is no drive, and its samples would fill the memory."""
+
 SAMPLE_RATE_HZ = 20.0
 """The steering is resampled at this rate for its spectrum: no wheel oscillates at half of it."""
 LOWEST_HZ, HIGHEST_HZ = 0.1, 5.0
@@ -53,6 +56,8 @@ def oscillation_hz(times_s: FloatArray, steering_rad: FloatArray) -> float | Non
     with at least `FEWEST_PERIODS` in the drive; None where its peak-to-peak value is at most `REVERSAL_DEADBAND_RAD`.
     """
     duration_s = float(times_s[-1] - times_s[0]) if len(times_s) else 0.0
+    if duration_s > MAX_DURATION_S:
+        raise ValueError(f"a drive of more than {MAX_DURATION_S // 3600} hours")
     even_s = np.arange(0.0, duration_s, 1 / SAMPLE_RATE_HZ)
     if duration_s < FEWEST_PERIODS / HIGHEST_HZ:
         return None

@@ -10,6 +10,9 @@ from lavt.recording.table import Table
 STEP_M = 0.25
 """Errors are sampled by distance, so that slow or waiting phases do not count more than fast ones."""
 
+MAX_DISTANCE_M = 50_000
+"""A longer progress is no drive, and would take minutes to evaluate."""
+
 PARTIAL_STEP_M = 10
 """The error from the start is kept at multiples of this distance, to compare runs that ended early."""
 
@@ -27,6 +30,8 @@ def sampled_by_distance(truth: Table, name: str) -> FloatArray:
         return np.zeros(0)
     farthest_m = np.maximum.accumulate(progress_m)
     new = np.concatenate([[True], progress_m[1:] > farthest_m[:-1]])
+    if farthest_m[-1] - progress_m[0] > MAX_DISTANCE_M:
+        raise ValueError(f"a drive of more than {MAX_DISTANCE_M / 1000:g} km")
     positions_m = np.arange(progress_m[0], farthest_m[-1] + 1e-9, STEP_M)
     return np.asarray(np.interp(positions_m, progress_m[new], values[new]), np.float64)
 

@@ -17,7 +17,7 @@ from lavt.experiment.analysis.metrics import driving_interval
 from lavt.experiment.runs.plan import injected_entry
 from lavt.experiment.runs.run import CONFIG, NETWORK, compute_result
 from lavt.recording.output_directory import check_directory, make_directory
-from lavt.recording.record import read_record
+from lavt.recording.record import evaluating, read_record
 from lavt.recording.table import MISSING
 
 SIDES = ("server", "client")
@@ -89,9 +89,11 @@ def _identity(name: str, run: RunConfig, client: ClientConfig) -> dict[str, Any]
 def _check_same_drive(server: Path, client: Path) -> None:
     """Raise `UserError` where the client has read no stamp that the server wrote during the drive."""
     server_record = read_record(server, channels=("event", "frame"))
-    began_ns, ended_ns, _ = driving_interval(server_record)
-    written = frames_within(server_record.table("frame"), began_ns, ended_ns).ints("stamp_ns")
-    read = read_record(client, channels=("picture",)).table("picture").ints("stamp_ns")
+    with evaluating(server):
+        began_ns, ended_ns, _ = driving_interval(server_record)
+        written = frames_within(server_record.table("frame"), began_ns, ended_ns).ints("stamp_ns")
+    with evaluating(client):
+        read = read_record(client, channels=("picture",)).table("picture").ints("stamp_ns")
     if not np.isin(read[read != MISSING], written).any():
         raise UserError(
             f"{client} has no picture of {server}: name two directories of the same drive; of a server with several "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -13,8 +13,9 @@ import numpy as np
 
 from lavt.domain import NS_PER_MS, NS_PER_S, FloatArray, Now
 from lavt.experiment.runs.plan import PlannedRun
-from lavt.experiment.runs.virtual_run import EndingTap, build_loop, drive
+from lavt.experiment.runs.virtual_run import build_loop, drive
 from lavt.nodes.payloads import Admission, FrameWritten
+from lavt.runtime.recorder import Recorders
 
 CHANNELS = frozenset({"truth", "event", "frame", "admission"})
 """The channels that are kept in memory."""
@@ -60,10 +61,9 @@ def drive_monitored(planned: PlannedRun, *, limit_s: float = 3600.0) -> Monitore
     recorder = InMemoryRecorder()
     with TemporaryDirectory() as directory:
         loop = build_loop(planned, Path(directory) / "run")
-        tap = EndingTap(recorder)
-        loop.runtime.hosts["server"].recorder = tap
+        loop.runtime.hosts["server"].recorder = Recorders(loop.observer, recorder)
         loop.runtime.hosts["client"].recorder = InMemoryRecorder()
-        drive(replace(loop, tap=tap), limit_ns=round(limit_s * NS_PER_S))
+        drive(loop, limit_ns=round(limit_s * NS_PER_S))
     return summarize_drive(recorder.payloads)
 
 

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -95,15 +96,18 @@ class Process:
         return self.latest
 
     def _read(self) -> None:
+        """Read lines until the process ends, and end it if that fails: its run would wait for lines in vain."""
         assert self.popen.stdout is not None  # noqa: S101 (it is a pipe)
-        for text in self.popen.stdout:
-            try:
-                line = json.loads(text)
-            except ValueError:
-                continue
-            self.latest = line
-            self._first.put(line)
-        self._first.put(None)
+        try:
+            for text in self.popen.stdout:
+                with suppress(ValueError):
+                    self.latest = json.loads(text)
+                    self._first.put(self.latest)
+        except BaseException:
+            self.popen.kill()
+            raise
+        finally:
+            self._first.put(None)
 
 
 class Processes:

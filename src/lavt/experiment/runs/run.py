@@ -18,7 +18,7 @@ from lavt.experiment.runs.plan import PlannedRun
 from lavt.experiment.runs.real_run import RELAY, Progress, drive_real, relay_reasons
 from lavt.experiment.runs.virtual_run import build_loop, drive
 from lavt.recording.output_directory import check_directory, prepare_directory
-from lavt.recording.record import read_record
+from lavt.recording.record import evaluating, read_record
 
 CONFIG = "config.yaml"
 RESULT = "result.json"
@@ -39,9 +39,9 @@ def drive_once(planned: PlannedRun, out: Path, *, progress: Progress | None = No
     if planned.config.time == "virtual":
         loop = build_loop(planned, out)
         _write_config(planned, out)
-        drive(loop, progress=None if progress is None else lambda _: progress(loop.tap.status(), {}))
+        drive(loop, progress=None if progress is None else lambda _: progress(loop.observer.status(), {}))
         digest = loop.digest.hexdigest()
-        if not loop.tap.began:
+        if not loop.observer.began:
             raise WorkError(f"{planned.name}: the vehicle was never armed: {loop.client.driver.session.reason}")
     else:
         prepare_directory(out)
@@ -60,8 +60,12 @@ def _write_config(planned: PlannedRun, out: Path) -> None:
 
 
 def compute_result(out: Path, identity: Mapping[str, Any], digest: str | None) -> dict[str, Any]:
-    """Compute and write `result.json` from the files in `out`: records, and `relay.json` or `netem.json`."""
-    return dict(_compute(out, identity, digest).result)
+    """Compute and write `result.json` from the files in `out`: records, and `relay.json` or `netem.json`.
+
+    Raises `UserError` for records with other content than LAVT writes.
+    """
+    with evaluating(out):
+        return dict(_compute(out, identity, digest).result)
 
 
 def _compute(out: Path, identity: Mapping[str, Any], digest: str | None) -> DriveData:

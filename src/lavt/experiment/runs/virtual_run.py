@@ -24,7 +24,7 @@ from lavt.experiment.runs.side_configs import client_config, server_config
 from lavt.recording.output_directory import make_directory
 from lavt.recording.provenance import provenance
 from lavt.recording.record import RecordWriter
-from lavt.runtime.recorder import Recorder
+from lavt.runtime.recorder import Recorders
 from lavt.runtime.virtual import HostClock, VirtualHost, VirtualLink, VirtualRuntime, modelled_clock_source
 from lavt.transport.emulation.delay_line import DelayLine, DelayModel
 from lavt.transport.emulation.link import EmulatedLink, LinkInjection
@@ -44,29 +44,27 @@ AFTER_ENDING_NS = NS_PER_S // 5
 """The time that is still recorded after the ending."""
 
 
-class EndingTap:
-    """A recorder that passes everything on and observes the start and the ending of the drive."""
+class DriveObserver:
+    """A recorder that observes the start and the ending of the drive, and keeps nothing else."""
 
-    def __init__(self, writer: Recorder) -> None:
+    def __init__(self) -> None:
         self.began = False
         self.ending: str | None = None
         self._truth: GroundTruth | None = None
-        self._write = writer.write
 
     def status(self) -> dict[str, Any]:
         """Return the newest figures of the drive for display."""
         truth = self._truth
         return {} if truth is None else {"speed_mps": truth.speed_mps, "cross_track_m": truth.cross_track_m}
 
-    def write(self, topic: str, payload: Any, now: Now) -> None:
-        """Write one entry, and observe it."""
+    def write(self, topic: str, payload: Any, now: Now) -> None:  # noqa: ARG002 (part of the protocol)
+        """Observe one entry."""
         if topic == "truth":
             self._truth = payload
         elif topic == "event":
             self.began |= payload.kind == "drive_began"
             if payload.kind == "ending":
                 self.ending = payload.detail
-        self._write(topic, payload, now)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +74,7 @@ class VirtualLoop:
     runtime: VirtualRuntime
     server: ServerNodes
     client: ClientNodes
-    tap: EndingTap
+    observer: DriveObserver
     writers: tuple[RecordWriter, RecordWriter]
     digest: Any
 
@@ -134,7 +132,7 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
                 "traces": json.dumps(trace_digests(requested)),
             },
         )
-    tap = EndingTap(writers[0])
+    observer = DriveObserver()
     costs_ns = {
         (node, stage): round(cost_us * NS_PER_US)
         for node, stages in costs.stages_us.items()
@@ -146,7 +144,7 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
             "server",
             server_clock,
             server.all,
-            tap,
+            Recorders(observer, writers[0]),
             costs_ns,
             modelled_clock_source(server_clock, "virtual-server", error_s, bound_s),
             left_out=left_out,
@@ -170,7 +168,7 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
         state_delay=config.network.state_delay,
     )
     runtime = VirtualRuntime(hosts, virtual_links(virtual_network(injected, costs)))
-    return VirtualLoop(runtime, server, client, tap, writers, digest)
+    return VirtualLoop(runtime, server, client, observer, writers, digest)
 
 
 def virtual_links(network: NetworkDelays) -> dict[str, VirtualLink]:
@@ -206,13 +204,13 @@ def drive(loop: VirtualLoop, *, limit_ns: int = RUN_LIMIT_NS, progress: Callable
 
     `progress` is called with the virtual time in ns, once per second of virtual time.
     """
-    runtime, tap = loop.runtime, loop.tap
+    runtime, observer = loop.runtime, loop.observer
     if progress is not None:
         _report_every_second(runtime, progress)
     gc.freeze()  # these objects exist until the end: garbage collections that visit them took over 3 % of the time
     try:
-        armed = runtime.run(min(ARMING_LIMIT_NS, limit_ns), lambda: tap.began)
-        if armed and runtime.run(limit_ns, lambda: tap.ending is not None):
+        armed = runtime.run(min(ARMING_LIMIT_NS, limit_ns), lambda: observer.began)
+        if armed and runtime.run(limit_ns, lambda: observer.ending is not None):
             runtime.run(runtime.true_ns + AFTER_ENDING_NS, lambda: False)
         runtime.close()
     finally:

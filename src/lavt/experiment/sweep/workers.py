@@ -96,8 +96,10 @@ def _end_with_parent() -> None:
     """Exit when the parent has ended, so that no old process writes into a resumed sweep."""
     parent = multiprocessing.parent_process()
     if parent is not None:
-        parent.join()
-        os._exit(1)
+        try:
+            parent.join()
+        finally:
+            os._exit(1)
 
 
 def drive_remotely(planned: PlannedRun) -> tuple[DriveData, dict[str, bytes]]:

@@ -10,6 +10,7 @@ Python 3.11, cantools 45.1, one core of a virtual machine).
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
 
 NO_VALUE: Final = frozenset({"INVALID", "UNKNOWN"})
 """Names that a DBC gives to numbers that mean "no value"."""
+MAX_MESSAGE_BYTES: Final = 1785
+"""The longest message of J1939, in several frames. cantools takes 0.1 s to load it, and 38 s one of 20 000 bytes."""
+MESSAGE_LENGTH: Final = re.compile(rb"\bBO_\s+\d+\s+\w+\s*:\s*(\d{1,20})")
 RANGE_SLACK_STEPS: Final = 1e-6
 """Tolerance of the range check: the step of a signal is rarely representable as a float."""
 
@@ -176,6 +180,7 @@ def _load(dbc: Path) -> Database:
     except ImportError as error:
         raise UserError(f"drive-by-wire needs cantools ({error}): pip install 'lavt[can]'") from error
     try:
+        _check_lengths(dbc.read_bytes())
         loaded: Database = cantools.database.load_file(dbc, database_format="dbc")
     except OSError as error:
         raise UserError(f"{dbc} cannot be read ({error.strerror}): name a DBC file") from error
@@ -185,6 +190,13 @@ def _load(dbc: Path) -> Database:
     if not loaded.messages:
         raise UserError(f"{dbc} has no message: name a DBC file")
     return loaded
+
+
+def _check_lengths(text: bytes) -> None:
+    """Raise `ValueError` for a message that is too long to load."""
+    longest = max(map(int, MESSAGE_LENGTH.findall(text)), default=0)
+    if longest > MAX_MESSAGE_BYTES:
+        raise ValueError(f"a message has {longest} bytes, and on a CAN bus at most {MAX_MESSAGE_BYTES}")
 
 
 def _message_facts(message: Message) -> MessageFacts:

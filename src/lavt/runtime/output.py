@@ -1,0 +1,86 @@
+"""Output that never blocks: a program that drives goes on, and ends, while nobody reads what it prints."""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+import threading
+from contextlib import suppress
+from queue import Empty, SimpleQueue
+from typing import Final, Literal
+
+CAPACITY: Final = 1000
+"""Texts that may wait: the JSON lines of three minutes of a drive."""
+FINISH_TIMEOUT_S: Final = 1.0
+"""How long a program that ends waits for the reader of each stream."""
+
+StreamName = Literal["stdout", "stderr"]
+
+
+class QueuedOutput(io.TextIOBase):
+    """A text stream whose texts a thread writes to a file descriptor.
+
+    A write to a pipe or terminal that nobody reads blocks; signal handlers run, and then the write blocks again. Here
+    only the thread blocks. If the queue is full, the oldest text is dropped and counted, as are texts that cannot be
+    written. Any thread and signal handler may write.
+    """
+
+    encoding = "utf-8"
+
+    def __init__(self, descriptor: int, capacity: int = CAPACITY) -> None:
+        self.dropped = 0
+        self._descriptor = descriptor
+        self._capacity = capacity
+        self._texts: SimpleQueue[str | None] = SimpleQueue()
+        self._thread = threading.Thread(target=self._run, name="output", daemon=True)
+        self._thread.start()
+
+    def write(self, text: str) -> int:
+        """Queue a text."""
+        if self._texts.qsize() >= self._capacity:
+            with suppress(Empty):
+                self._texts.get_nowait()
+                self.dropped += 1
+        self._texts.put(text)
+        return len(text)
+
+    def fileno(self) -> int:
+        """Return the file descriptor."""
+        return self._descriptor
+
+    def isatty(self) -> bool:
+        """Return whether the output goes to a terminal."""
+        return os.isatty(self._descriptor)
+
+    def finish(self, timeout_s: float = FINISH_TIMEOUT_S) -> None:
+        """Wait until all queued texts are written, for at most `timeout_s`; nothing is written after that."""
+        self._texts.put(None)
+        self._thread.join(timeout_s)
+
+    def _run(self) -> None:
+        while (text := self._texts.get()) is not None:
+            data = text.encode(errors="backslashreplace")
+            try:
+                while data:
+                    data = data[os.write(self._descriptor, data) :]
+            except OSError:  # its reader has ended, or its terminal is closed
+                self.dropped += 1
+
+
+def queue_output(*names: StreamName) -> None:
+    """Replace these standard streams by queued ones for the rest of the program."""
+    for name in names:
+        stream = getattr(sys, name)
+        if not isinstance(stream, QueuedOutput):
+            stream.flush()
+            setattr(sys, name, QueuedOutput(os.dup(stream.fileno())))  # the stream closes its own
+
+
+def finish_output() -> None:
+    """Write what the queued standard streams still have, within `FINISH_TIMEOUT_S` each; print what was dropped."""
+    streams = [stream for stream in (sys.stdout, sys.stderr) if isinstance(stream, QueuedOutput)]
+    for stream in streams:
+        if stream is sys.stderr and (dropped := sum(each.dropped for each in streams)):
+            stream.write(f"lavt: {dropped} texts were not printed, because they were not read in time\n")
+        stream.finish()

@@ -1,0 +1,66 @@
+"""Commands of which a thread fails."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+from tests.support.command_line import Run
+from tests.support.ports import free_port
+
+from lavt.config_file import shipped
+from lavt.transport import udp_link
+
+HERE = "127.0.0.1"
+NO_ROUTER = "tcp/127.0.0.1:1"
+PERIOD_S = 0.05
+
+
+def broken(*_: Any) -> Any:
+    raise RuntimeError("a receiving thread is broken")
+
+
+@contextmanager
+def datagrams(port: int) -> Iterator[None]:
+    """Send datagrams to a port of this machine."""
+    done = threading.Event()
+
+    def send() -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            while not done.wait(PERIOD_S):
+                sender.sendto(b"x", (HERE, port))
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
+
+
+@pytest.mark.parametrize("command", ["watch", "rendezvous", "server"])
+def test_a_command_fails_with_its_receiving_thread(command: str, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A command whose receiving thread fails ends with exit code 1, where it would go on deaf."""
+    port = free_port()
+    arguments = {
+        "watch": ["--bind", HERE, "--port", str(port)],
+        "rendezvous": [
+            str(shipped("configs/rendezvous.yaml")),
+            *(word for key in (f"bind={HERE}", f"video_port={port}", "probe_port=0") for word in ("--set", key)),
+        ],
+        "server": [
+            str(shipped("configs/server.yaml")),
+            *("--set", f"video.bind={HERE}", "--set", f"video.port={port}", "--set", "clock.probe_port=0"),
+            *("--set", f"zenoh.router={NO_ROUTER}", "--set", "vehicle.scenery=none"),
+        ],
+    }
+    monkeypatch.setattr(udp_link, "arrival", broken)
+    with datagrams(port):
+        result = run(command, *arguments[command])
+    assert result.code == 1, result
+    assert "RuntimeError" in result.err.splitlines()[-1]
