@@ -70,13 +70,14 @@ def check_case(case: DegradedCase) -> tuple[LaneVerdict, LaneVerdict]:
 
 
 def kinds_table(verdicts: Iterable[tuple[LaneVerdict, LaneVerdict]]) -> str:
-    """Return the table by kind: confidence, error, and how often a lane is wrong and believed, or right and not."""
+    """Return the table by kind: confidence, error, and how often a lane is wrong and accepted, or right and not."""
     by_kind = defaultdict(list)
     for pair in verdicts:
         by_kind[pair[0].kind].append(pair)
     lines = [
-        "| picture | searching: confidence p5, median | error at 10 m, p95 of believed | wrong and believed "
-        "| right and not believed | following: confidence p5, median | error | wrong and believed |",
+        "| picture | searching: confidence p5, median | searching: error at 10 m, p95 of accepted "
+        "| searching: wrong and accepted | searching: right and not accepted | tracking: confidence p5, median "
+        "| tracking: error at 10 m, p95 of accepted | tracking: wrong and accepted |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for kind, pairs in by_kind.items():
@@ -154,16 +155,14 @@ def main() -> None:
         if case.kind in {"as it is", "solid lines"}:
             undamaged.append(case.picture)
     print(kinds_table(verdicts))
-    for name, number in (("searching", 0), ("following", 1)):
+    for name, number in (("searching", 0), ("tracking", 1)):
         each = [pair[number] for pair in verdicts]
         decided_verdicts = [verdict for verdict in each if verdict.kind != UNDECIDED]
         harmful = sum(verdict.wrong and verdict.believed for verdict in decided_verdicts)
-        print(f"\n{name}: {harmful} of {len(decided_verdicts)} pictures are wrong and believed")
+        print(f"\n{name}: {harmful} of {len(decided_verdicts)} pictures are wrong and accepted")
         print(f"\n{reliability_table(each)}")
     following_ms, searching_ms = cost_ms(undamaged)
-    print(
-        f"\ncost of a picture: following {following_ms:.2f} ms, searching {searching_ms:.2f} ms of CPU time (medians)"
-    )
+    print(f"\ncost of a picture: tracking {following_ms:.2f} ms, searching {searching_ms:.2f} ms of CPU time (medians)")
     if arguments.picture is not None:
         arguments.picture.parent.mkdir(parents=True, exist_ok=True)
         drawn = draw_sheet(first[kind] for kind in PICTURED_KINDS)
