@@ -1,4 +1,4 @@
-"""The first test to read: one frame through the thirteen steps of its life, without nodes and runtime."""
+"""The first test to read: one frame from its capture to the command made from it, without nodes and runtime."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ VIDEO_DELAY_MS, CONTROL_DELAY_MS = 75.0, 20.0
 
 def armed_gate(car: Simulator) -> tuple[SafetyGate, int]:
     """Acquire control of the car and arm it, which takes a second; return the gate and the epoch."""
-    able = car.capabilities
+    capabilities = car.capabilities
     limiter = Limiter(
         LIMITS,
-        wheelbase_m=able.wheelbase_m,
-        max_steering_rad=able.max_steering_rad,
-        max_braking_mps2=able.max_braking_mps2,
+        wheelbase_m=capabilities.wheelbase_m,
+        max_steering_rad=capabilities.max_steering_rad,
+        max_braking_mps2=capabilities.max_braking_mps2,
     )
     numbers = count(1)
     gate = SafetyGate(LIMITS, limiter, new_epoch=lambda: next(numbers), new_token=lambda: bytes(16))
@@ -41,7 +41,7 @@ def armed_gate(car: Simulator) -> tuple[SafetyGate, int]:
     for number in range(51):
         at_ns = START_NS - (51 - number) * 20 * NS_PER_MS
         gate.issued_stamps.add(WALL_NS + at_ns, number, at_ns, pixel_crc=number)
-        arm = Command(
+        arming_command = Command(
             epoch=epoch,
             sequence=number,
             sent_wall_ns=0,
@@ -54,7 +54,7 @@ def armed_gate(car: Simulator) -> tuple[SafetyGate, int]:
             mode="arm",
             emergency_stop=0,
         )
-        assert gate.admit(arm, car.state(), at_ns).accepted
+        assert gate.admit(arming_command, car.state(), at_ns).accepted
     assert gate.state == "driving"
     return gate, epoch
 
@@ -101,7 +101,9 @@ def test_life_of_a_frame() -> None:  # noqa: PLR0915 (one frame, from end to end
     # 6. The packets arrive, are put in order (here the last two are swapped), and become an access unit.
     arrived[-1], arrived[-2] = arrived[-2], arrived[-1]
     jitter_buffer, depacketizer = JitterBuffer(), Depacketizer()
-    ordered = [each for packet in arrived for each in jitter_buffer.push(parse_packet(packet), now_ns)]
+    ordered = [
+        ordered_packet for packet in arrived for ordered_packet in jitter_buffer.push(parse_packet(packet), now_ns)
+    ]
     now_ns += MIN_HOLD_NS  # the first packets of a stream wait for any that were sent before them
     ordered += jitter_buffer.expire(now_ns)
     units = [unit for packet, lost_before in ordered for unit in depacketizer.push(packet, lost_before)]
@@ -114,7 +116,7 @@ def test_life_of_a_frame() -> None:  # noqa: PLR0915 (one frame, from end to end
     assert decoded.picture.shape == frame.picture.shape
     assert not decoded.corrupt
 
-    # 8. The stamp is read from the pixels, and is valid because it agrees with the RTP timestamp.
+    # 8. The stamp is read from the pixels. It is valid if it agrees with the RTP timestamp.
     read_ns = read_stamp(decoded.luma)
     assert read_ns == stamp_ns
     assert stamp_agrees(read_ns, units[0].timestamp)
@@ -122,9 +124,9 @@ def test_life_of_a_frame() -> None:  # noqa: PLR0915 (one frame, from end to end
     # 9. The lane is detected in the picture: 8 m ahead its centre agrees with the ground truth.
     lane = LaneDetector(model).detect(decoded.picture)
     truth = car.ground_truth()
-    seen_y_m = lane.centre[0] + 8 * lane.centre[1] + 64 * lane.centre[2]
+    detected_y_m = lane.centre[0] + 8 * lane.centre[1] + 64 * lane.centre[2]
     assert lane.confidence > 0.5
-    assert abs(seen_y_m - (-truth.cross_track_m - 8 * truth.heading_error_rad)) < 0.1
+    assert abs(detected_y_m - (-truth.cross_track_m - 8 * truth.heading_error_rad)) < 0.1
 
     # 10. The controller makes a command from the lane: throttle, and steering towards the centre.
     controller = make_controller("lane_keeper", PRESETS["designed"], car.capabilities.wheelbase_m)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.interop.tools import read_frames, running
-from tests.support.ports import free_pair
+from tests.support.ports import free_port_pair
 
 from lavt.assembly.entropy import MachineEntropy
 from lavt.assembly.nodes import build_server
@@ -109,14 +109,14 @@ def check_each_in_order(sent: list[int], read: list[int]) -> None:
 
 def test_gstreamer_receives_each_frame(tmp_path: Path) -> None:
     """GStreamer receives and decodes our stream, and each picture has the stamp of the sent frame."""
-    port = free_pair()
+    port = free_port_pair()
     check_each_in_order(*receive_with(GSTREAMER.format(port=port), port, tmp_path / "log"))
 
 
 @pytest.mark.parametrize("flags", ["", "-fflags nobuffer -flags low_delay"])
 def test_ffmpeg_receives_each_frame_by_our_sdp(flags: str, tmp_path: Path) -> None:
     """With the output of `lavt sdp` ffmpeg receives and decodes our stream, and each picture has its stamp."""
-    port, sdp = free_pair(), tmp_path / "lavt.sdp"
+    port, sdp = free_port_pair(), tmp_path / "lavt.sdp"
     settings = [part for change in config_changes(port) for part in ("--set", change)]
     with sdp.open("wb") as file:
         subprocess.run([sys.executable, "-m", "lavt", "sdp", str(SERVER), *settings], stdout=file, check=True)

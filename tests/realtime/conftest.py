@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tests.support.stalls import Shared, Stalls
+from tests.support.stalls import SharedResult, Stalls
 
 from lavt.clock import MachineClock, pause
 from lavt.config import RunConfig
@@ -122,7 +122,7 @@ def run_at_a_terminal(arguments: list[str]) -> tuple[int, str]:
 
 
 @pytest.fixture(scope="session")
-def demos(tmp_path_factory: pytest.TempPathFactory, stalls: Stalls) -> Shared[Demo]:
+def demos(tmp_path_factory: pytest.TempPathFactory, stalls: Stalls) -> SharedResult[Demo]:
     clock = MachineClock()
 
     def run() -> Demo:
@@ -131,10 +131,10 @@ def demos(tmp_path_factory: pytest.TempPathFactory, stalls: Stalls) -> Shared[De
         assert code == 0, output
         return Demo(out, code, output, since_ns, clock.now().mono_ns)
 
-    return Shared(stalls, run)
+    return SharedResult(stalls, run)
 
 
 @pytest.fixture
-def demo(demos: Shared[Demo]) -> Demo:
+def demo(demos: SharedResult[Demo]) -> Demo:
     """Return the demo, run once per session unless the host stalled it."""
     return demos.get()

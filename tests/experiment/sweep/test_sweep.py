@@ -160,7 +160,7 @@ def test_the_base_config_is_the_sweeps_own(changes: tuple[str, ...], base: dict[
 @pytest.mark.parametrize(
     ("number", "options"), [(signal.SIGINT, ()), (signal.SIGHUP, ()), (signal.SIGINT, ("--cluster", "local"))]
 )
-@pytest.mark.usefixtures("hangup_ends")
+@pytest.mark.usefixtures("sighup_ends_programs")
 def test_a_stopped_sweep_keeps_what_is_finished(number: int, options: tuple[str, ...], tmp_path: Path) -> None:
     """Ctrl-C or a closed terminal ends a sweep with a message, exit code 1 and no traceback.
 
@@ -264,7 +264,7 @@ def geometry(*changes: str) -> tuple[SweepConfig, list[PlannedRun]]:
 
 
 @pytest.mark.full
-@pytest.mark.usefixtures("own_environment")  # distributed sets variables for its workers
+@pytest.mark.usefixtures("restored_environment")  # distributed sets variables for its workers
 def test_digests_are_the_same_on_any_workers(tmp_path: Path) -> None:
     """Runs have the same digests when repeated, with one process, with two, and with Dask workers."""
     pytest.importorskip("distributed")
