@@ -9,20 +9,20 @@ def drive(pi: SpeedPi, seconds: float, speed_mps: float, slope_mps2: float = 0.0
     """Return the speeds of a car with a lag of 0.2 s and a constant deceleration `slope_mps2`."""
     speeds, acceleration = [speed_mps], 0.0
     for _ in range(round(seconds * 30)):
-        wanted = pi.acceleration_mps2(TARGET_MPS, speeds[-1], 1 / 30)
-        acceleration += (wanted - acceleration) / 6
+        requested = pi.acceleration_mps2(TARGET_MPS, speeds[-1], 1 / 30)
+        acceleration += (requested - acceleration) / 6
         speeds.append(speeds[-1] + (acceleration - slope_mps2) / 30)
     return speeds
 
 
 def test_the_target_speed_is_reached_without_overshoot() -> None:
-    """From standstill, the target speed is overshot by less than 0.1 m/s and held."""
+    """From standstill, the car overshoots the target speed by less than 0.1 m/s and then keeps it."""
     speeds = drive(SpeedPi(2.0, 6.0), 30, 0.0)
     assert max(speeds) < TARGET_MPS + 0.1
     assert speeds[-1] == pytest.approx(TARGET_MPS, abs=0.02)
 
 
-def test_anti_windup() -> None:
+def test_saturation_causes_no_overshoot() -> None:
     """After a minute of saturated throttle the overshoot is less than 0.1 m/s (anti-windup)."""
     pi = SpeedPi(2.0, 6.0)
     for _ in range(1800):
@@ -37,10 +37,10 @@ def test_a_slope_is_compensated() -> None:
 
 def test_a_pause_is_not_integrated() -> None:
     """After a long pause one call integrates over at most 0.1 s."""
-    rested, fresh = SpeedPi(2.0, 6.0), SpeedPi(2.0, 6.0)
-    rested.acceleration_mps2(TARGET_MPS, TARGET_MPS - 0.4, 100.0)
-    fresh.acceleration_mps2(TARGET_MPS, TARGET_MPS - 0.4, 0.1)
-    assert rested.acceleration_mps2(1.0, 1.0, 0.0) == fresh.acceleration_mps2(1.0, 1.0, 0.0)
+    after_long_pause, after_short_pause = SpeedPi(2.0, 6.0), SpeedPi(2.0, 6.0)
+    after_long_pause.acceleration_mps2(TARGET_MPS, TARGET_MPS - 0.4, 100.0)
+    after_short_pause.acceleration_mps2(TARGET_MPS, TARGET_MPS - 0.4, 0.1)
+    assert after_long_pause.acceleration_mps2(1.0, 1.0, 0.0) == after_short_pause.acceleration_mps2(1.0, 1.0, 0.0)
 
 
 def test_slowing_down_is_gentle() -> None:
@@ -59,5 +59,5 @@ def test_pedals(acceleration_mps2: float, expected: tuple[float, float]) -> None
 
 @pytest.mark.parametrize(("confidence", "share"), [(1.0, 1.0), (0.5, 1.0), (0.3, 0.6), (0.0, 0.4)])
 def test_lower_confidence_lowers_the_speed(confidence: float, share: float) -> None:
-    """Full speed down to confidence 0.5, in proportion below that, never less than 0.4 of it."""
+    """The speed is full down to confidence 0.5, proportional to lower confidence, and at least 0.4 of full speed."""
     assert confident_speed_mps(10.0, confidence) == pytest.approx(10 * share)

@@ -45,7 +45,7 @@ def test_the_results_name_the_largest_fall_of_completion() -> None:
 
 
 def test_no_fall_is_reported_if_there_is_none() -> None:
-    """Constant completion is reported as such, one condition without a fall, and no condition with no text."""
+    """Constant completion is reported as such; one condition has no fall; no condition gives no text."""
     assert "Completion does not fall" in results_sentences("It", conditions(1.0, 1.0, 1.0))
     assert "fall" not in results_sentences("It", conditions(1.0))
     assert results_sentences("It", {}) == ""
@@ -76,32 +76,32 @@ def test_equal_total_delay_means_equal_loop_latency() -> None:
 
 def test_sentences_do_not_contradict_the_data() -> None:
     """If conditions with equal total delay differ in completion or loop latency, no equal loop is claimed."""
-    of = conditions(1, 1, 1, 0.9, 0.3, 0)
-    (unequal_completion,) = equal_total_sentences([contrast(18, 0, 0.001)], of, [])
+    entries = conditions(1, 1, 1, 0.9, 0.3, 0)
+    (unequal_completion,) = equal_total_sentences([contrast(18, 0, 0.001)], entries, [])
     assert "completion differs significantly" in unequal_completion
     assert "same loop" not in unequal_completion
-    (unequal_loops,) = equal_total_sentences([contrast(1, 0, 1.0)], {**of, "L4": entry("L4", 0.3, 350.0)}, [])
+    (unequal_loops,) = equal_total_sentences([contrast(1, 0, 1.0)], {**entries, "L4": entry("L4", 0.3, 350.0)}, [])
     assert "same loop" not in unequal_loops
     unequal_totals = [{**contrast(0, 0, 1.0), "a": "L2"}]
-    assert equal_total_sentences(unequal_totals, of, []) == []
-    assert equal_total_sentences([{**contrast(0, 0, 1.0), "p_holm": None}], of, []) == []
+    assert equal_total_sentences(unequal_totals, entries, []) == []
+    assert equal_total_sentences([{**contrast(0, 0, 1.0), "p_holm": None}], entries, []) == []
 
 
 def test_differences_from_the_paper_match_the_data() -> None:
     """Each difference is reported only if the data show it, and none if a condition of the paper is missing."""
-    sharp = difference_sentences(conditions(1.0, 1.0, 1.0, 0.3, 0.3, 0.0), PAPER["conditions"])
+    with_sharp_fall = difference_sentences(conditions(1.0, 1.0, 1.0, 0.3, 0.3, 0.0), PAPER["conditions"])
     for parts in (
         ("sharply", "(100, 100, 100, 30, 30, 0 %)", "(100, 93,"),
         ("P95 at L0", "0.10 m here", "2.30 m in the paper"),
         ("0.10 m here", "13.15 m in the paper", "rails"),
         ("All runs are completed at L1 here", "28 of 30"),
     ):
-        assert any(all(part in each for part in parts) for each in sharp), parts
-    like = {
-        name: entry(name, theirs["completion_rate"], 100.0, theirs["p95_m"])
-        for name, theirs in PAPER["conditions"].items()
+        assert any(all(part in sentence for part in parts) for sentence in with_sharp_fall), parts
+    like_the_paper = {
+        name: entry(name, paper_condition["completion_rate"], 100.0, paper_condition["p95_m"])
+        for name, paper_condition in PAPER["conditions"].items()
     }
-    text = " ".join(difference_sentences(like, PAPER["conditions"]))
+    text = " ".join(difference_sentences(like_the_paper, PAPER["conditions"]))
     assert "sharply" not in text
     assert "rails" not in text
     assert "All runs are completed" not in text
@@ -110,8 +110,8 @@ def test_differences_from_the_paper_match_the_data() -> None:
     steady = " ".join(difference_sentences(conditions(1.0, 1.0, 1.0, 1.0, 1.0, 1.0), PAPER["conditions"]))
     assert "sharply" not in steady
     assert "rails" not in steady
-    few = {name: {**each, "runs": 5} for name, each in conditions(1.0, 1.0, 1.0, 0.3, 0.3, 0.0).items()}
-    assert difference_sentences(few, PAPER["conditions"]) == []
+    few_runs = {name: {**condition, "runs": 5} for name, condition in conditions(1.0, 1.0, 1.0, 0.3, 0.3, 0.0).items()}
+    assert difference_sentences(few_runs, PAPER["conditions"]) == []
 
 
 def test_conditions_with_equal_loop_latency_are_sorted_by_name() -> None:
