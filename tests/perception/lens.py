@@ -12,9 +12,9 @@ def ground_points(camera: CalibratedCamera, pixels: FloatArray) -> FloatArray:
     """Return the ground points (n, 2) in metres of pixels (n, 2) of the distorted picture; NaN above the horizon."""
     rays = np.column_stack([undistort(camera, pixels), np.ones(len(pixels))])
     ground = rays @ np.linalg.inv(ground_to_camera(camera)).T
-    # The third component of the inverse is 1 / depth: positive wdistorted the ray meets the ground ahead of the camera.
-    return np.wdistorted(
-        ground[:, 2:] > 1e-9, ground[:, :2] / np.wdistorted(ground[:, 2:] > 1e-9, ground[:, 2:], 1.0), np.nan
+    # The third component of the inverse is 1 / depth: positive where the ray meets the ground ahead of the camera.
+    return np.where(
+        ground[:, 2:] > 1e-9, ground[:, :2] / np.where(ground[:, 2:] > 1e-9, ground[:, 2:], 1.0), np.nan
     )
 
 

@@ -36,10 +36,10 @@ def cameras(draw: st.DrawFn) -> CalibratedCamera:
     )
 
 
-GROUND_POINTS = np.array([[x, y] for x in (4.0, 6.0, 9.0, 13.0, 19.0) for y in (-5.0, -1.75, 0.0, 1.75, 5.0)])
+GROUND = np.array([[x, y] for x in (4.0, 6.0, 9.0, 13.0, 19.0) for y in (-5.0, -1.75, 0.0, 1.75, 5.0)])
 
 
-def is_inside_picture(camera: CalibratedCamera, pixels: np.ndarray) -> np.ndarray:
+def inside(camera: CalibratedCamera, pixels: np.ndarray) -> np.ndarray:
     with np.errstate(invalid="ignore"):
         ahead = (pixels > 17) & (pixels < (camera.width_px - 18, camera.height_px - 18))
     return np.asarray(ahead.all(axis=1))
@@ -48,10 +48,10 @@ def is_inside_picture(camera: CalibratedCamera, pixels: np.ndarray) -> np.ndarra
 @settings(max_examples=60, derandomize=True)
 @given(cameras())
 def test_projection_and_inverse_projection_agree(camera: CalibratedCamera) -> None:
-    """For any lens, a ground point that is projected to its pixel and back moves by less than 1 cm."""
-    pixels = picture_points(camera, GROUND_POINTS)
-    visible = is_inside_picture(camera, pixels)
-    assert np.abs(ground_points(camera, pixels[visible]) - GROUND_POINTS[visible]).max(initial=0.0) < 0.01
+    """The inverse projection of a ground point's pixel is the point within 1 cm, through any lens."""
+    pixels = picture_points(camera, GROUND)
+    seen = inside(camera, pixels)
+    assert np.abs(ground_points(camera, pixels[seen]) - GROUND[seen]).max(initial=0.0) < 0.01
 
 
 @settings(max_examples=20, derandomize=True)
@@ -60,39 +60,35 @@ def test_a_ground_point_maps_to_its_cell_through_any_lens(camera: CalibratedCame
     """A spot in the distorted picture at a ground point's projection appears in that point's cell."""
     grid = GroundGrid()
     mapping = bird_eye(camera, grid, stamped=False)
-    pixels = picture_points(camera, GROUND_POINTS)
-    for (x_m, y_m), (u, v) in zip(
-        GROUND_POINTS[is_inside_picture(camera, pixels)], pixels[is_inside_picture(camera, pixels)], strict=True
-    ):
+    pixels = picture_points(camera, GROUND)
+    for (x_m, y_m), (u, v) in zip(GROUND[inside(camera, pixels)], pixels[inside(camera, pixels)], strict=True):
         picture = np.zeros((camera.height_px, camera.width_px), dtype=np.uint8)
-        half_width_px = round(60 / x_m)  # about 0.2 m on the ground, more than a cell
-        picture[round(v) - 1 : round(v) + 2, round(u) - half_width_px : round(u) + half_width_px + 1] = 255
+        beside = round(60 / x_m)  # some 0.2 m: more than a cell
+        picture[round(v) - 1 : round(v) + 2, round(u) - beside : round(u) + beside + 1] = 255
         # The size of the spot on the ground limits the accuracy of its position.
-        near, left = ground_points(camera, np.array([[u, v + 2], [u - half_width_px, v]]))
+        near, left = ground_points(camera, np.array([[u, v + 2], [u - beside, v]]))
         rows, columns = np.nonzero(mapping.from_above(mapping.region(picture)))
         if len(rows) == 0:
-            assert (
-                abs(x_m - near[0]) < 0.2 or x_m > 12
-            )  # farther away, three rows of pixels may lie between two rows of cells
+            assert abs(x_m - near[0]) < 0.2 or x_m > 12  # three rows of pixels between two rows of cells
             continue
-        error_x_m, error_y_m = grid.row_x_m()[rows].mean() - x_m, grid.column_y_m()[columns].mean() - y_m
-        assert abs(error_x_m) < 0.1 + abs(x_m - near[0]) + abs(x_m - left[0])
-        assert abs(error_y_m) < 0.05 + abs(y_m - left[1]) + abs(y_m - near[1])
+        off_x_m, off_y_m = grid.row_x_m()[rows].mean() - x_m, grid.column_y_m()[columns].mean() - y_m
+        assert abs(off_x_m) < 0.1 + abs(x_m - near[0]) + abs(x_m - left[0])
+        assert abs(off_y_m) < 0.05 + abs(y_m - left[1]) + abs(y_m - near[1])
 
 
 def test_yaw_pitch_and_roll_have_their_signs() -> None:
     """Positive yaw turns left, positive pitch turns down, and positive roll lowers the right side."""
     level = CalibratedCamera(640, 480, (320.0, 320.0), (319.5, 239.5), 0.0, 0.0, 1.4, 0.0, 0.0, 0.0)
 
-    def rotated_axes(yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> np.ndarray:
+    def turned(yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> np.ndarray:
         return axes(CalibratedCamera(640, 480, (320.0, 320.0), (319.5, 239.5), 0.0, 0.0, 1.4, yaw, pitch, roll))
 
-    right, down, forward = axes(level)
-    assert (right.tolist(), down.tolist(), forward.tolist()) == ([0, -1, 0], [0, 0, -1], [1, 0, 0])
-    assert rotated_axes(yaw=0.1)[2, 1] == pytest.approx(math.sin(0.1))
-    assert rotated_axes(pitch=0.1)[2, 2] == pytest.approx(-math.sin(0.1))
-    assert rotated_axes(roll=0.1)[0, 2] == pytest.approx(-math.sin(0.1))
-    assert np.linalg.det(rotated_axes(0.3, -0.2, 0.4)) == pytest.approx(1.0)
+    right, down, deep = axes(level)
+    assert (right.tolist(), down.tolist(), deep.tolist()) == ([0, -1, 0], [0, 0, -1], [1, 0, 0])
+    assert turned(yaw=0.1)[2, 1] == pytest.approx(math.sin(0.1))
+    assert turned(pitch=0.1)[2, 2] == pytest.approx(-math.sin(0.1))
+    assert turned(roll=0.1)[0, 2] == pytest.approx(-math.sin(0.1))
+    assert np.linalg.det(turned(0.3, -0.2, 0.4)) == pytest.approx(1.0)
 
 
 def test_points_beyond_the_lens_models_field_are_invisible() -> None:
