@@ -13,9 +13,7 @@ def ground_points(camera: CalibratedCamera, pixels: FloatArray) -> FloatArray:
     rays = np.column_stack([undistort(camera, pixels), np.ones(len(pixels))])
     ground = rays @ np.linalg.inv(ground_to_camera(camera)).T
     # The third component of the inverse is 1 / depth: positive where the ray meets the ground ahead of the camera.
-    return np.where(
-        ground[:, 2:] > 1e-9, ground[:, :2] / np.where(ground[:, 2:] > 1e-9, ground[:, 2:], 1.0), np.nan
-    )
+    return np.where(ground[:, 2:] > 1e-9, ground[:, :2] / np.where(ground[:, 2:] > 1e-9, ground[:, 2:], 1.0), np.nan)
 
 
 def undistort(camera: CalibratedCamera, pixels: FloatArray) -> FloatArray:
