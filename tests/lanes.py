@@ -16,13 +16,13 @@ from pathlib import Path
 TESTS = Path(__file__).resolve().parent
 REPOSITORY = TESTS.parent
 
-FOLDERS = ("field", "interop", "kernel", "realtime")
-"""Their tests run sequentially and alone, because they judge times or own a network."""
+SEQUENTIAL_FOLDERS = ("field", "interop", "kernel", "realtime")
+"""Tests in these folders run sequentially and alone, because they judge times or need a network of their own."""
 QUICK = "not full and not realtime"
 """The marker expression of `python -m pytest`."""
 PARALLEL = (QUICK, "full")
 """Marker expressions with which tests use all processors."""
-SLOWEST = ("--durations=12", "--durations-min=5")
+SHOW_SLOWEST = ("--durations=12", "--durations-min=5")
 
 
 @dataclass(frozen=True)
@@ -34,12 +34,12 @@ class LaneSpec:
     limit_min: float
     """A lane that takes longer is killed and has failed."""
     meanwhile: LaneSpec | None = None
-    """A lane that runs at the same time, at the lowest priority."""
+    """Another lane that runs at the same time, at the lowest priority."""
 
 
 def pytest(*arguments: str) -> tuple[str, ...]:
     """Return the pytest command for these arguments; it lists the slowest tests at the end."""
-    return (sys.executable, "-m", "pytest", *arguments, *SLOWEST)
+    return (sys.executable, "-m", "pytest", *arguments, *SHOW_SLOWEST)
 
 
 def program(name: str, *arguments: str) -> tuple[str, ...]:
@@ -55,17 +55,17 @@ LANES = (
     LaneSpec("interop", (pytest("tests/interop"),), 5),
     LaneSpec("realtime", (pytest("-m", "realtime"),), 35),
     LaneSpec("field", (pytest("tests/field"),), 35),
-    LaneSpec("kernel", ((sys.executable, "tests/kernel/run", *SLOWEST),), 25, meanwhile=FULL),
+    LaneSpec("kernel", ((sys.executable, "tests/kernel/run", *SHOW_SLOWEST),), 25, meanwhile=FULL),
 )
 
 
-def runs_in_parallel(markers: str, arguments: Iterable[Path]) -> bool:
-    """Return whether pytest may run tests in parallel for these markers and paths.
+def runs_in_parallel(marker_expression: str, arguments: Iterable[Path]) -> bool:
+    """Return whether pytest may run tests in parallel for this marker expression and these paths.
 
-    Single files and the folders of lanes run sequentially.
+    Single files and `SEQUENTIAL_FOLDERS` run sequentially.
     """
-    lane_folders = {TESTS / folder for folder in FOLDERS}
-    return markers in PARALLEL and all(
+    lane_folders = {TESTS / folder for folder in SEQUENTIAL_FOLDERS}
+    return marker_expression in PARALLEL and all(
         path.is_dir() and not lane_folders & {path, *path.parents} for path in map(Path.resolve, arguments)
     )
 

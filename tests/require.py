@@ -8,9 +8,9 @@ from typing import NoReturn
 import pytest
 
 
-def need(part: str, reason: str) -> NoReturn:
-    """Skip the calling test; fail it if LAVT_REQUIRE, a comma-separated list, names the part."""
+def need(requirement: str, reason: str) -> NoReturn:
+    """Skip the calling test; fail it if LAVT_REQUIRE, a comma-separated list, names the requirement."""
     required = os.environ.get("LAVT_REQUIRE", "").replace(" ", "").split(",")
-    if part in required:
-        pytest.fail(f"LAVT_REQUIRE names {part}: {reason}", pytrace=False)
+    if requirement in required:
+        pytest.fail(f"LAVT_REQUIRE names {requirement}: {reason}", pytrace=False)
     pytest.skip(reason)

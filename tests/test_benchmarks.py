@@ -15,7 +15,7 @@ BENCHMARK = BENCHMARKS / "virtual_loop.py"
 
 
 def test_rest_completes_the_stages() -> None:
-    """The rest is the whole less the stages; a stage without time, or stages above the whole, are an error."""
+    """The rest is the total time minus the stages; a stage of 0 ms, or stages longer than the total, are an error."""
     assert with_rest({"render": 2.0, "encode": 3.0}, 6.0) == {"render": 2.0, "encode": 3.0, "rest": 1.0}
     with pytest.raises(WorkError, match="encode"):
         with_rest({"render": 2.0, "encode": 0.0}, 6.0)
@@ -25,7 +25,7 @@ def test_rest_completes_the_stages() -> None:
 
 @pytest.mark.full
 def test_virtual_loop_benchmark_runs() -> None:
-    """`benchmarks/virtual_loop.py` prints the speed relative to real time and the stages, and JSON in the last line."""
+    """`benchmarks/virtual_loop.py` prints the speed relative to real time, the stages and, last, JSON."""
     completed = subprocess.run(
         [sys.executable, BENCHMARK, "--settings", "geometry", "--repetitions", "1", "--limit-s", "2"],
         capture_output=True,
@@ -33,9 +33,9 @@ def test_virtual_loop_benchmark_runs() -> None:
         check=True,
         timeout=120,
     )
-    last = json.loads(completed.stdout.splitlines()[-1])
-    assert list(last) == ["full_x", "bare_x", "geometry_x", "perception_ms", "render_ms"]
-    assert last["geometry_x"] > 0
+    result = json.loads(completed.stdout.splitlines()[-1])
+    assert list(result) == ["full_x", "bare_x", "geometry_x", "perception_ms", "render_ms"]
+    assert result["geometry_x"] > 0
     for stage in ("render", "perception", "control", "rest"):
         assert f"{stage} " in completed.stdout
 
@@ -72,17 +72,17 @@ def test_stamp_reading_study_runs() -> None:
     )
     lines = completed.stdout.splitlines()
     assert lines[4].startswith("| 460 | ")
-    last = json.loads(lines[-1])
-    cells = [(cell["loss"], cell["repair"]) for cell in last["cells"]]
+    result = json.loads(lines[-1])
+    cells = [(cell["loss"], cell["repair"]) for cell in result["cells"]]
     assert cells == [(0.0, 0), (0.01, 0), (0.01, 1), (0.05, 0), (0.05, 1), (0.05, 2)]
-    whole = last["cells"][0]
-    assert whole["accepted"] == whole["frames"] == whole["intact"] == whole["intact_good"] == 40
-    assert (whole["unread_share"], whole["good_of_intact"]) == (0.0, 1.0)
+    loss_free = result["cells"][0]
+    assert loss_free["accepted"] == loss_free["frames"] == loss_free["intact"] == loss_free["intact_good"] == 40
+    assert (loss_free["unread_share"], loss_free["good_of_intact"]) == (0.0, 1.0)
 
 
 @pytest.mark.full
 def test_rendezvous_benchmark_runs() -> None:
-    """`benchmarks/rendezvous.py` prints the delays of packets with and without the forwarder, last as JSON."""
+    """`benchmarks/rendezvous.py` prints the delays of packets with and without the forwarder; the last line is JSON."""
     completed = subprocess.run(
         [sys.executable, BENCHMARKS / "rendezvous.py", "--seconds", "0.5"],
         capture_output=True,

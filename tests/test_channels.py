@@ -37,12 +37,12 @@ def nodes() -> Sequence[Node]:
     return [*server.all, *client.all]
 
 
-PART_OF = {"picture_reader": "driver"}
-"""Modules that belong to a node of another name."""
+NODE_OF_MODULE = {"picture_reader": "driver"}
+"""The node of each module that has another name than its node."""
 
 
 def sent_channels() -> set[tuple[str, str]]:
-    """Return (module, channel) of each `Send` in the source of the nodes."""
+    """Return (node, channel) of each `Send` in the source of the nodes."""
     found = set()
     for path in Path(str(lavt.nodes.__file__)).parent.glob("*.py"):
         for call in ast.walk(ast.parse(path.read_text())):
@@ -51,7 +51,7 @@ def sent_channels() -> set[tuple[str, str]]:
                 assert isinstance(channel, ast.Constant), (
                     f"{path.name}:{call.lineno} sends on a channel that is not a constant"
                 )
-                found.add((PART_OF.get(path.stem, path.stem), str(channel.value)))
+                found.add((NODE_OF_MODULE.get(path.stem, path.stem), str(channel.value)))
     return found
 
 
@@ -74,9 +74,9 @@ def test_nodes_send_on_the_channels_of_the_table(nodes: Sequence[Node]) -> None:
     """Nodes send on channels of the table only, and the table names them as senders."""
     sent = sent_channels()
     assert {channel for _, channel in sent} <= CHANNELS.keys()
-    received = {(module, channel) for module, channel in sent if CHANNELS[channel].carrier != "record"}
+    not_recorded = {(node, channel) for node, channel in sent if CHANNELS[channel].carrier != "record"}
     names = {node.name for node in nodes}
-    assert received == {
+    assert not_recorded == {
         (row.sender, name) for name, row in CHANNELS.items() if row.sender in names and row.carrier != "record"
     }
 
@@ -88,7 +88,7 @@ def test_senders_and_receivers_exist(nodes: Sequence[Node]) -> None:
     assert set(chain.from_iterable(row.receivers for row in CHANNELS.values())) == names
 
 
-def test_every_channel_but_records_has_a_receiver() -> None:
+def test_only_records_queries_and_orders_have_no_receiver() -> None:
     """Every channel has a receiver, except for records, clock queries and injection orders."""
     without_receivers = {name for name, row in CHANNELS.items() if not row.receivers}
     assert without_receivers == {name for name, row in CHANNELS.items() if row.carrier == "record"} | {
@@ -103,7 +103,7 @@ def test_ground_truth_stays_on_the_server() -> None:
     assert CHANNELS["truth"].receivers == ()
 
 
-def test_commands_queue() -> None:
-    """Commands queue, because each one is judged, and the queue is bounded."""
+def test_commands_wait_in_a_bounded_queue() -> None:
+    """Commands wait in a queue of bounded length, because the gate judges each one."""
     assert CHANNELS["control"].waiting == "queue"
     assert 0 < QUEUE_LENGTH < 100_000

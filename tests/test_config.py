@@ -68,14 +68,14 @@ def test_a_written_config_is_read_back_unchanged(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["configs/demo.yaml", "netem/conditions.yaml", "zenoh-configs/session.json5"])
-def test_shipped(name: str) -> None:
-    """Shipped files have absolute paths, independent of the working directory."""
+def test_shipped_files_have_absolute_paths(name: str) -> None:
+    """The path of a shipped file is absolute, so it does not depend on the working directory."""
     assert shipped(name).is_file()
     assert shipped(name).is_absolute()
 
 
 def test_the_demo_config() -> None:
-    """The demo drives the key part of route A with the gains fitted to the paper and the limits that these need."""
+    """The demo drives route A key with the gains fitted to the paper and the safety limits that these need."""
     demo = load_config(RunConfig, shipped("configs/demo.yaml"))
     assert (demo.vehicle.route, demo.controller.preset, demo.network.condition) == ("a_key", "paper_calibrated", "L0")
     assert (demo.safety.lateral_acceleration_mps2, demo.safety.picture_age_limit_ms) == (6.0, 2000.0)
@@ -86,7 +86,7 @@ def test_the_paper_config() -> None:
     paper = load_config(SweepConfig, shipped("configs/paper.yaml"))
     assert (paper.controller.preset, paper.network.inherent, paper.axes) == ("paper_calibrated", "paper_wifi5", {})
     assert (paper.safety.lateral_acceleration_mps2, paper.safety.picture_age_limit_ms) == (6.0, 2000.0)
-    assert (paper.routes, paper.conditions) == (("a", "a_key", "b", "b_key", "c", "c_key"), tuple(PAPER))
+    assert (paper.routes, paper.conditions) == (("a", "a_key", "b", "b_key", "c", "c_key"), tuple(PAPER_DELAYS_MS))
     assert len(plan_sweep(paper)) == 180
 
 
@@ -111,13 +111,13 @@ def test_every_condition_is_supported(name: str) -> None:
         assert plan_run(RunConfig(time=time, network=NetworkConfig(condition=name))).requested == condition(name)
 
 
-PAPER = {"L0": (0, 0), "L1": (75, 0), "L2": (150, 0), "L3": (225, 0), "L4": (150, 75), "L5": (225, 100)}
+PAPER_DELAYS_MS = {"L0": (0, 0), "L1": (75, 0), "L2": (150, 0), "L3": (225, 0), "L4": (150, 75), "L5": (225, 100)}
 
 
-def test_conditions() -> None:
+def test_conditions_have_the_papers_delays() -> None:
     """The conditions L0 to L5 have the paper's delays, in milliseconds of video and control."""
     known = conditions()
-    assert {name: (known[name].video_ms, known[name].control_ms) for name in PAPER} == PAPER
+    assert {name: (known[name].video_ms, known[name].control_ms) for name in PAPER_DELAYS_MS} == PAPER_DELAYS_MS
     assert condition("L5") == known["L5"]
 
 
@@ -139,7 +139,7 @@ def rejection(text: str, tmp_path: Path, kind: type[Section] = RunConfig, change
 
 
 @pytest.mark.parametrize(
-    ("text", "key", "near"),
+    ("text", "key", "suggestion"),
     [
         ("sed: 3", "sed", "seed"),
         ("vehicle: {rute: a_key}", "vehicle.rute", "route"),
@@ -148,11 +148,11 @@ def rejection(text: str, tmp_path: Path, kind: type[Section] = RunConfig, change
         ("safety: {lateral_acceleration: 3.0}", "safety.lateral_acceleration", "lateral_acceleration_mps2"),
     ],
 )
-def test_unknown_key(text: str, key: str, near: str, tmp_path: Path) -> None:
-    """An unknown key, also in a section, is rejected with its path and the nearest known key."""
+def test_unknown_key(text: str, key: str, suggestion: str, tmp_path: Path) -> None:
+    """An unknown key, at the top or in a section, is rejected with its path and the nearest known key."""
     sentence = rejection(text, tmp_path)
     assert repr(key) in sentence
-    assert repr(near) in sentence
+    assert repr(suggestion) in sentence
 
 
 @pytest.mark.parametrize(
@@ -167,13 +167,13 @@ def test_unknown_key(text: str, key: str, near: str, tmp_path: Path) -> None:
     ],
 )
 @pytest.mark.parametrize("kind", [ServerConfig, ClientConfig])
-def test_time_sources(text: str, reason: str, kind: type[Section], tmp_path: Path) -> None:
+def test_invalid_time_sources_are_rejected(text: str, reason: str, kind: type[Section], tmp_path: Path) -> None:
     """An unknown time source, a missing value, and a value of another time source are rejected."""
     assert reason in rejection(text, tmp_path, kind)
 
 
 def test_a_client_must_know_the_port_of_the_probe(tmp_path: Path) -> None:
-    """Port 0, any free port, is valid for the server only, because a client could not know the port."""
+    """Port 0 (any free port) is valid only for the server, because a client could not know the port."""
     assert "clock.probe_port" in rejection("clock: {probe_port: 0}", tmp_path, ClientConfig)
     assert ServerConfig(clock=ClockConfig(probe_port=0)).clock.probe_port == 0
 
@@ -204,12 +204,12 @@ def test_unknown_key_without_a_near_one(tmp_path: Path) -> None:
         ("camera=3", "'camera'"),
     ],
 )
-def test_bad_set(change: str, reason: str, tmp_path: Path) -> None:
+def test_invalid_changes_are_rejected(change: str, reason: str, tmp_path: Path) -> None:
     """A change by --set is validated like the file, and a malformed change is named."""
     assert reason in rejection("seed: 1", tmp_path, changes=(change,))
 
 
-def test_set(tmp_path: Path) -> None:
+def test_changes_reach_nested_keys(tmp_path: Path) -> None:
     """Changes reach nested keys and create missing sections; of several changes of a key, the last one is used."""
     path = tmp_path / "my.yaml"
     path.write_text("camera: {width_px: 320}")
@@ -219,7 +219,7 @@ def test_set(tmp_path: Path) -> None:
     assert (config.camera.width_px, config.camera.rate_hz) == (320, 20.0)
 
 
-def test_set_lists(tmp_path: Path) -> None:
+def test_changes_may_be_lists_and_mappings(tmp_path: Path) -> None:
     """A change may have a list or mapping in YAML, and a value with an equals sign."""
     path = tmp_path / "my.yaml"
     path.write_text("")
@@ -274,7 +274,7 @@ BAD_VALUES: list[tuple[type[Section], str, str]] = [
 
 
 @pytest.mark.parametrize(("kind", "text", "reason"), BAD_VALUES, ids=[text for _, text, _ in BAD_VALUES])
-def test_bad_values(kind: type[Section], text: str, reason: str, tmp_path: Path) -> None:
+def test_bad_values_are_rejected(kind: type[Section], text: str, reason: str, tmp_path: Path) -> None:
     """A value of a wrong type, out of range or not finite is rejected with its key, and never converted silently."""
     sentence = rejection(text, tmp_path, kind)
     assert reason in sentence
@@ -300,7 +300,7 @@ def test_all_errors_are_reported_together(tmp_path: Path) -> None:
         ("[" * 5000, "is not YAML"),
     ],
 )
-def test_bad_files(text: str, reason: str, tmp_path: Path) -> None:
+def test_bad_files_are_rejected(text: str, reason: str, tmp_path: Path) -> None:
     """A file that is not YAML, or not a mapping, is rejected in one sentence that names it."""
     sentence = rejection(text, tmp_path)
     assert reason in sentence
@@ -329,7 +329,7 @@ def test_empty_file(tmp_path: Path) -> None:
 
 
 @given(st.text(max_size=60))
-def test_any_text(text: str) -> None:
+def test_any_text_raises_only_user_errors(text: str) -> None:
     """Parsing any text as YAML raises only UserError."""
     with suppress(UserError):
         parse_yaml(text, "here")
@@ -340,7 +340,7 @@ TREES = st.recursive(LEAVES, lambda inner: st.lists(inner, max_size=3) | st.dict
 
 
 @given(st.sampled_from([RunConfig, SweepConfig, ServerConfig, ClientConfig, RelayConfig, RendezvousConfig]), st.data())
-def test_any_values(kind: type[Section], data: Any) -> None:
+def test_any_values_raise_only_user_errors(kind: type[Section], data: Any) -> None:
     """Validating any values as a config raises only UserError."""
     keys = st.sampled_from([*kind.model_fields, "other"])
     with suppress(UserError):
@@ -373,7 +373,7 @@ def test_wide_limits_are_for_simulators(safety: SafetyConfig) -> None:
 
 
 @pytest.mark.parametrize("simulated", [True, False])
-def test_limits(simulated: bool) -> None:
+def test_tighter_limits_are_valid_for_every_vehicle(simulated: bool) -> None:
     """The default and tighter limits are valid for every vehicle, and change no other limit."""
     assert limits_of(SafetyConfig(), simulated=simulated) == LIMITS
     requested = SafetyConfig(lateral_acceleration_mps2=2.0, picture_age_limit_ms=300.0, stopping_distance_limit_m=10.0)
@@ -396,6 +396,6 @@ def test_nothing_is_delayed_by_default() -> None:
 def test_every_impairment_can_be_changed_by_a_run() -> None:
     """A run can replace every impairment of its condition within the same bounds, so that a sweep can vary it."""
     changes = FlowChanges.model_json_schema()["properties"]
-    for name, described in ImpairmentConfig.model_json_schema()["properties"].items():
-        bounds = {key: each for key, each in described.items() if key not in ("title", "default", "description")}
+    for name, schema in ImpairmentConfig.model_json_schema()["properties"].items():
+        bounds = {key: value for key, value in schema.items() if key not in ("title", "default", "description")}
         assert bounds in changes[name]["anyOf"], name

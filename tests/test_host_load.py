@@ -32,7 +32,7 @@ def test_load_stops_all_processors_together() -> None:
     """The command runs while all processors stop together and the load takes a share; its exit code is returned."""
     measured = Stalls.measured()
     try:
-        if not all(probe.above for probe in measured.probes):
+        if not all(probe.has_realtime_priority for probe in measured.probes):
             pytest.skip("needs the right to real-time priority")
         options = ["--share", "0.3", "--stop-ms", "120", "--stops-every-s", "0.5", "--seed", "1"]
         command = [sys.executable, "-c", "import time; time.sleep(3); raise SystemExit(3)"]
@@ -41,13 +41,14 @@ def test_load_stops_all_processors_together() -> None:
     finally:
         measured.end()
     stops = [
-        [each for each in measured.recorded if each.processor == probe.processor and each.length_ms > 90]  # type: ignore[attr-defined]
+        [stall for stall in measured.recorded if stall.processor == probe.processor and stall.length_ms > 90]  # type: ignore[attr-defined]
         for probe in measured.probes
     ]
     assert completed.returncode == 3
-    assert len({len(each) for each in stops}) == 1
+    assert len({len(processor_stops) for processor_stops in stops}) == 1
     assert stops[0]
-    for ends in zip(*stops, strict=True):
-        assert max(each.end_ns for each in ends) - min(each.end_ns for each in ends) < 20_000_000
+    for simultaneous_stalls in zip(*stops, strict=True):
+        end_times_ns = [stall.end_ns for stall in simultaneous_stalls]
+        assert max(end_times_ns) - min(end_times_ns) < 20_000_000
     shares = [float(line.partition(" had ")[2].partition("%")[0]) for line in completed.stderr.splitlines()]
     assert all(share > 90 for share in shares), completed.stderr

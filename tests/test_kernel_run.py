@@ -13,7 +13,8 @@ from tests.kernel.lane.command import pytest_arguments, writable_directories
 RUN = Path(__file__).parent / "kernel" / "run"
 
 
-def rejection(*arguments: str, **environment: str) -> str:
+def run_rejected(*arguments: str, **environment: str) -> str:
+    """Run the lane where it cannot run; return the last line of its message."""
     completed = subprocess.run(
         [sys.executable, str(RUN), *arguments],
         env={**os.environ, **environment},
@@ -39,13 +40,13 @@ def rejection(*arguments: str, **environment: str) -> str:
     ],
 )
 def test_files_can_be_given_by_name(extra: list[str], expected: list[str]) -> None:
-    """A test file of the lane can be given by its name, and without one all of tests/kernel runs."""
+    """A test file of the lane can be given by its name alone; without a test file the whole directory runs."""
     assert pytest_arguments(extra) == expected
 
 
 def test_missing_apt_get_is_reported(tmp_path: Path) -> None:
     """Without apt-get the message names a system that has it."""
-    assert "use Debian or Ubuntu" in rejection(PATH=str(tmp_path), LAVT_KERNEL=str(tmp_path / "kernel"))
+    assert "use Debian or Ubuntu" in run_rejected(PATH=str(tmp_path), LAVT_KERNEL=str(tmp_path / "kernel"))
 
 
 def test_unreachable_archive_is_reported(tmp_path: Path) -> None:
@@ -55,7 +56,7 @@ def test_unreachable_archive_is_reported(tmp_path: Path) -> None:
         fake_tool.write_text(f"#!{sys.executable}\nimport sys\nsys.exit('E: Could not resolve the archive')\n")
         fake_tool.chmod(0o755)
 
-    message = rejection(PATH=f"{tmp_path}{os.pathsep}{os.environ['PATH']}", LAVT_KERNEL=str(tmp_path / "kernel"))
+    message = run_rejected(PATH=f"{tmp_path}{os.pathsep}{os.environ['PATH']}", LAVT_KERNEL=str(tmp_path / "kernel"))
 
     assert "Could not resolve the archive" in message
     assert "connect this machine" in message
@@ -65,7 +66,7 @@ def test_unwritable_cache_is_reported(tmp_path: Path) -> None:
     """If the cache directory cannot be created, the message names LAVT_KERNEL."""
     (tmp_path / "file").touch()
 
-    assert "LAVT_KERNEL" in rejection(LAVT_KERNEL=str(tmp_path / "file" / "kernel"))
+    assert "LAVT_KERNEL" in run_rejected(LAVT_KERNEL=str(tmp_path / "file" / "kernel"))
 
 
 @pytest.mark.parametrize("has_progress", [False, True])

@@ -24,7 +24,7 @@ COUNTER_HZ = 2e9
 READING = 9_000_000_000, 50 * NS_PER_S
 """A reading of the counter and of this machine's clock."""
 FAIR_SERVER_MS = 60
-"""What ordinary programs get of each second if a machine uses its processor fully."""
+"""Time that ordinary programs get in each second if a machine uses its processor fully (the kernel's fair server)."""
 
 
 @pytest.fixture(autouse=True)
@@ -36,13 +36,13 @@ def counter(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def answer_with(*stalls: tuple[int, int, int], more: bool = False) -> dict[str, Any]:
-    """Return an answer of the host, whose clock reads 7 s, 1.5 s before the reading here."""
+    """Return an answer that the host made 1.5 s before `READING`, when its clock read 7 s."""
     return {
         "counter": READING[0] - 3_000_000_000,
         "mono_ns": 7 * NS_PER_S,
         "stalls": stalls,
         "more": more,
-        "above": True,
+        "has_realtime_priority": True,
         "processor_times": QUIET,
     }
 
@@ -53,9 +53,9 @@ def serial_line(*answers: dict[str, Any]) -> Iterator[str]:
     host, machine = os.openpty()
 
     def answer() -> None:
-        for each in answers:
+        for reply in answers:
             assert os.read(host, 1) == b"?"
-            os.write(host, json.dumps(each).encode() + b"\n")
+            os.write(host, json.dumps(reply).encode() + b"\n")
 
     thread = threading.Thread(target=answer)
     thread.start()
@@ -66,14 +66,14 @@ def serial_line(*answers: dict[str, Any]) -> Iterator[str]:
 
 
 def test_host_times_are_converted() -> None:
-    """A stall that ended 0.5 s before the host's answer, read here 1.5 s later, ended 2 s before the reading."""
+    """A stall that ended 0.5 s before the host's answer, 1.5 s before the machine's reading, ended 2 s before it."""
     with serial_line(answer_with(), answer_with((1, 6_400_000_000, 6_500_000_000))) as device:
         probe = HostProbe(device)
         assert probe.report() == (48_500_000_000, [Stall(1, 47_900_000_000, 48_000_000_000)])
         probe.end()
 
 
-def test_long_record_takes_several_answers() -> None:
+def test_long_record_needs_several_answers() -> None:
     """If the host has more stalls than fit into an answer, a report queries until it has all of them."""
     pieces = [answer_with((0, number, number + 1), more=number < 2) for number in range(3)]
     with serial_line(answer_with(), *pieces, answer_with()) as device:
@@ -124,7 +124,7 @@ def test_answers_have_a_limited_length() -> None:
         ("chrony and the probe disagree about the offset between the clocks: 1.00 and 9.00 ms", math.inf),
     ],
 )
-def test_least_stall_for_each_reason_against_a_drive(reason: str, least_ms: float) -> None:
+def test_least_stall_for_each_reason_of_an_invalid_drive(reason: str, least_ms: float) -> None:
     """Missing clock samples need a stall of 1.5 s; no stall explains reasons that do not depend on timing."""
     assert least_stall_ms(reason) == least_ms
 
@@ -138,12 +138,12 @@ def test_least_stall_for_each_reason_against_a_drive(reason: str, least_ms: floa
     ],
 )
 def test_least_stall_for_each_safe_stop(reason: str, least_ms: float) -> None:
-    """A stop by missing commands needs 100 ms; one by missing reports 60 ms less than their timeout."""
+    """A stall of 100 ms explains a stop without commands; without reports, 60 ms less than their timeout is enough."""
     assert least_stop_ms(reason) == least_ms
 
 
 def test_full_processor_use_excuses_nothing() -> None:
-    """The share of ordinary programs on a fully used processor is too short and too small to excuse a failure."""
+    """The time that ordinary programs get on a fully used processor excuses neither a stop nor a median."""
     assert STOP_STALL_MS > FAIR_SERVER_MS
     with_stalls = stalls_of(
         *(Stall(0, at_s * NS_PER_S, at_s * NS_PER_S + FAIR_SERVER_MS * NS_PER_MS) for at_s in range(10))
@@ -154,5 +154,5 @@ def test_full_processor_use_excuses_nothing() -> None:
 
 def test_many_short_stalls_excuse_a_drive() -> None:
     """A drive that was stalled for 15 % of its time, 3 ms at a time, is repeated."""
-    many = stalls_of(*(Stall(0, at * 20 * NS_PER_MS, (at * 20 + 3) * NS_PER_MS) for at in range(50)))
-    assert isinstance(excuse_slow_machine(AssertionError(), many, 0, NS_PER_S), HostStalled)
+    many_stalls = stalls_of(*(Stall(0, at * 20 * NS_PER_MS, (at * 20 + 3) * NS_PER_MS) for at in range(50)))
+    assert isinstance(excuse_slow_machine(AssertionError(), many_stalls, 0, NS_PER_S), HostStalled)

@@ -11,8 +11,18 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-from tests.lanes import FOLDERS, FULL, LANES, QUICK, REPOSITORY, TESTS, LaneSpec, runs_in_parallel, select_lanes
-from tests.support.lane_runner import LaneOutcome, closing_line, counts_of, run_lanes, table
+from tests.lanes import (
+    FULL,
+    LANES,
+    QUICK,
+    REPOSITORY,
+    SEQUENTIAL_FOLDERS,
+    TESTS,
+    LaneSpec,
+    runs_in_parallel,
+    select_lanes,
+)
+from tests.support.lane_runner import LaneOutcome, closing_line, parse_counts, run_lanes, table
 
 OPTIONS = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["pytest"]["ini_options"]
 PYTEST_LANES = {lane.name: lane.commands[0][3:] for lane in (*LANES, FULL) if "pytest" in lane.commands[0]}
@@ -24,10 +34,12 @@ def collected(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
     root = tmp_path_factory.mktemp("project")
     plain = "import pytest\n\ndef test_plain(): pass\n"
     marked = "".join(f"\n@pytest.mark.{marker}\ndef test_{marker}(): pass\n" for marker in ("full", "realtime"))
-    for folder in ("", "cli", *FOLDERS):
+    for folder in ("", "cli", *SEQUENTIAL_FOLDERS):
         directory = root / "tests" / folder
         directory.mkdir(exist_ok=True, parents=True)
-        (directory / f"test_{folder or 'root'}.py").write_text(plain if folder in FOLDERS else plain + marked)
+        (directory / f"test_{folder or 'root'}.py").write_text(
+            plain if folder in SEQUENTIAL_FOLDERS else plain + marked
+        )
     mark = "import pytest\n\ndef pytest_collection_modifyitems(items):\n    for item in items:\n"
     mark += "        if 'realtime' in item.path.parts: item.add_marker(pytest.mark.realtime)\n"
     (root / "tests" / "realtime" / "conftest.py").write_text(mark)
@@ -47,12 +59,12 @@ def collect_tests(root: Path, arguments: tuple[str, ...]) -> list[str]:
 
 
 def test_every_test_belongs_to_one_lane(collected: dict[str, set[str]]) -> None:
-    """The lanes' commands together run every test exactly once; the kernel lane runs its folder itself."""
-    tests = [f"tests/{folder}/test_{folder}.py::test_plain" for folder in ("cli", *FOLDERS)]
+    """The pytest lanes together run every test exactly once, except the kernel tests, which their own lane runs."""
+    tests = [f"tests/{folder}/test_{folder}.py::test_plain" for folder in ("cli", *SEQUENTIAL_FOLDERS)]
     tests += [f"tests/cli/test_cli.py::test_{marker}" for marker in ("full", "realtime")]
     tests += [f"tests/test_root.py::test_{marker}" for marker in ("plain", "full", "realtime")]
     tests.remove("tests/kernel/test_kernel.py::test_plain")
-    assert Counter(each for lane in collected.values() for each in lane) == Counter(tests)
+    assert Counter(test for lane in collected.values() for test in lane) == Counter(tests)
 
 
 def test_folder_and_marker_select_the_lane(collected: dict[str, set[str]]) -> None:
@@ -72,7 +84,7 @@ def test_tests_in_lane_folders_have_no_lane_marker() -> None:
     """A test in a lane's folder has no lane marker, because it would then be in two lanes, or in none."""
     marked = [
         path.relative_to(TESTS)
-        for folder in FOLDERS
+        for folder in SEQUENTIAL_FOLDERS
         for path in (TESTS / folder).rglob("test_*.py")
         if any(f"mark.{marker}" in path.read_text() for marker in ("full", "realtime"))
     ]
@@ -86,7 +98,7 @@ def test_only_untimed_lanes_run_in_parallel() -> None:
     assert runs_in_parallel("full", [TESTS, TESTS / "cli"])
     assert not runs_in_parallel("realtime", [TESTS])
     assert not runs_in_parallel(QUICK, [TESTS / "test_lanes.py"])
-    assert not any(runs_in_parallel(QUICK, [TESTS / folder]) for folder in FOLDERS)
+    assert not any(runs_in_parallel(QUICK, [TESTS / folder]) for folder in SEQUENTIAL_FOLDERS)
     assert not runs_in_parallel(QUICK, [TESTS / "kernel" / "lane"])
 
 
@@ -100,7 +112,7 @@ def test_every_lane_is_documented() -> None:
         "pytest tests/interop",
         "tests/kernel/run",
     ]
-    assert [each for each in [*commands, "tests.lanes", ".ci/run"] if each not in text] == []
+    assert [command for command in [*commands, "tests.lanes", ".ci/run"] if command not in text] == []
 
 
 def test_lanes_can_be_selected_by_name() -> None:
@@ -127,7 +139,7 @@ def run(*lanes: LaneSpec) -> tuple[int, str]:
     return run_lanes(lanes, write=output.append), "".join(output)
 
 
-def test_runner_adds_up_the_lanes() -> None:
+def test_runner_adds_up_the_results_of_the_lanes() -> None:
     """If all lanes pass, the exit code is 0, their outputs appear in order, and the last line has the totals."""
     code, output = run(
         LaneSpec("quick", (shell("echo one; echo '== 2 passed, 1 skipped, 3 deselected in 1.20s =='"),), 1),
@@ -158,7 +170,7 @@ def test_failing_lane_fails_the_run(meanwhile: bool) -> None:
     assert output.splitlines()[-1].startswith("2 passed, 1 failed in ")
 
 
-HANGS = """
+HANGING_PROGRAM = """
 import os, pathlib, time
 try:
     pathlib.Path(os.environ["LAVT_PROGRESS"]).write_text("test_a")
@@ -171,20 +183,20 @@ except KeyboardInterrupt:
 
 def test_lane_is_interrupted_at_its_time_limit() -> None:
     """A lane that exceeds its time limit is interrupted, so that pytest lists failures, and then killed."""
-    hangs = LaneSpec("hangs", ((sys.executable, "-c", HANGS), shell("echo never")), 1 / 12)
-    code, output = run(hangs, LaneSpec("next", (shell("echo came"),), 1))
+    hangs = LaneSpec("hangs", ((sys.executable, "-c", HANGING_PROGRAM), shell("echo never")), 1 / 12)
+    code, output = run(hangs, LaneSpec("next", (shell("echo started"),), 1))
     assert code == 1
     assert "took longer than 0.0833333 min, and was at: test_a" in output
     assert "failed so far" in output
     assert "never" not in output
-    assert "came" in output
+    assert "started" in output
 
 
 def test_running_test_is_in_the_progress_file(tmp_path: Path) -> None:
     """LAVT_PROGRESS has the name of the running test, and is empty after the last one."""
-    text = tmp_path / "progress"
+    progress_file = tmp_path / "progress"
     (tmp_path / "test_own.py").write_text(
-        f"from pathlib import Path\n\ndef test_own(): assert 'test_own' in Path({str(text)!r}).read_text()\n"
+        f"from pathlib import Path\n\ndef test_own(): assert 'test_own' in Path({str(progress_file)!r}).read_text()\n"
     )
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "tests.support.progress"]
     subprocess.run(
@@ -192,9 +204,9 @@ def test_running_test_is_in_the_progress_file(tmp_path: Path) -> None:
         cwd=REPOSITORY,
         check=True,
         capture_output=True,
-        env={**os.environ, "LAVT_PROGRESS": str(text)},
+        env={**os.environ, "LAVT_PROGRESS": str(progress_file)},
     )
-    assert text.read_text() == ""
+    assert progress_file.read_text() == ""
 
 
 def test_counts_are_parsed_from_pytest_output() -> None:
@@ -202,11 +214,11 @@ def test_counts_are_parsed_from_pytest_output() -> None:
     output = (
         "== session starts ==\n\x1b[31m== \x1b[1m1 failed\x1b[0m, 2 passed, 2 errors in 70.00s (0:01:10) ==\x1b[0m\n"
     )
-    assert counts_of(output + "= 1 passed in 2.00s =\n") == {"failed": 1, "passed": 3, "error": 2}
+    assert parse_counts(output + "= 1 passed in 2.00s =\n") == {"failed": 1, "passed": 3, "error": 2}
 
 
 def test_table_lists_lanes_and_failures() -> None:
-    """The table has a line with time and counts for each lane, followed by the reasons of failures."""
+    """The table has a line with time and counts for each lane, followed by the reasons for failures."""
     outcomes = [
         LaneOutcome("quick", 61.2, Counter(passed=5, rerun=1)),
         LaneOutcome("field", 5, Counter(failed=1), ["reason"]),

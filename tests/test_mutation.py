@@ -27,7 +27,9 @@ def sites() -> dict[str, list[Site]]:
 
 def mutated(source: str, operator: str) -> list[str]:
     """Return every source that an operator's mutations produce."""
-    return [each.apply_to(source) for site in find_sites("a.py", source) for each in site if each.operator == operator]
+    return [
+        mutant.apply_to(source) for site in find_sites("a.py", source) for mutant in site if mutant.operator == operator
+    ]
 
 
 def body(*lines: str) -> str:
@@ -97,10 +99,10 @@ def test_line_count_is_kept() -> None:
     """A mutation over several lines keeps the number of lines and everything after it."""
     source = body("a = g(", "    b,", "    c,", ")", "return (", "    a", "    + b", ")")
     for site in find_sites("a.py", source):
-        for each in site:
-            results_made = each.apply_to(source)
-            compile(results_made, "a.py", "exec")
-            assert results_made.count("\n") == source.count("\n")
+        for mutation_of_site in site:
+            mutant = mutation_of_site.apply_to(source)
+            compile(mutant, "a.py", "exec")
+            assert mutant.count("\n") == source.count("\n")
     assert mutated(source, "statement")[0].split("\n")[1:6] == ["    pass", "", "", "", "    return ("]
 
 
@@ -108,12 +110,12 @@ def test_mutation_key_is_stable() -> None:
     """A mutation's key stays the same when lines are added above it."""
     source = "class A:\n    def f(self, a):\n        g(a + 1)\n        g(a + 1)\n"
     found, moved = (
-        [each for site in find_sites("a.py", text) for each in site] for text in (source, f"import b\n\n{source}")
+        [mutant for site in find_sites("a.py", text) for mutant in site] for text in (source, f"import b\n\n{source}")
     )
-    assert [each.key for each in found] == [each.key for each in moved]
-    assert len({each.key for each in found}) == len(found)
-    assert {each.function for each in found} == {"A.f"}
-    assert [each.line_number + 2 for each in found] == [each.line_number for each in moved]
+    assert [mutant.key for mutant in found] == [mutant.key for mutant in moved]
+    assert len({mutant.key for mutant in found}) == len(found)
+    assert {mutant.function for mutant in found} == {"A.f"}
+    assert [mutant.line_number + 2 for mutant in found] == [mutant.line_number for mutant in moved]
 
 
 def test_every_path_of_the_table_exists() -> None:
@@ -126,22 +128,22 @@ def test_every_path_of_the_table_exists() -> None:
 
 
 def test_sample_follows_from_the_seed() -> None:
-    """The same seed gives the same mutants, a smaller count the first of them, and another seed other mutants."""
+    """The same seed gives the same mutants, a smaller count gives the first of them, another seed gives others."""
     sites = mutation.sites_of(["safety/takeover_requests.py", "transport/rtp/adaptive_hold.py"])
     sampled = mutation.sample(sites, 1, 30)
     assert sampled == mutation.sample(sites, 1, 30)
     assert sampled[:10] == mutation.sample(sites, 1, 10)
     assert sampled != mutation.sample(sites, 2, 30)
-    assert len({(each.module, each.begin, each.end, each.operator) for each in sampled}) == 30
-    assert {each.module for each in sampled} == set(sites)
+    assert len({(mutant.module, mutant.begin, mutant.end, mutant.operator) for mutant in sampled}) == 30
+    assert {mutant.module for mutant in sampled} == set(sites)
 
 
 def test_sampled_mutants_compile(sites: dict[str, list[Site]]) -> None:
     """Every sampled mutant compiles and differs from the source."""
-    for each in mutation.sample(sites, 1, 40):
-        source = (REPOSITORY / "src" / "lavt" / each.module).read_text()
-        compile(each.apply_to(source), each.module, "exec")
-        assert each.line != each.mutated
+    for mutant in mutation.sample(sites, 1, 40):
+        source = (REPOSITORY / "src" / "lavt" / mutant.module).read_text()
+        compile(mutant.apply_to(source), mutant.module, "exec")
+        assert mutant.line != mutant.mutated
 
 
 def make_result(by: str, module: str = "safety/takeover_requests.py") -> results.Result:
@@ -164,8 +166,8 @@ def test_results_are_saved(tmp_path: Path) -> None:
 def test_report_counts_accepted_survivors_separately() -> None:
     """The table has a row for each module and a total, and the share excludes accepted survivors."""
     accepted = {make_result("", "a.py").place: "equivalent"}
-    results_made = [make_result("", "a.py"), make_result("timeout", "b.py"), make_result("", "c.py")]
-    lines = results.report(results_made, accepted).splitlines()
+    mutant_results = [make_result("", "a.py"), make_result("timeout", "b.py"), make_result("", "c.py")]
+    lines = results.report(mutant_results, accepted).splitlines()
     assert [line.partition(":")[0] for line in lines[:2]] == ["survived", "accepted"]
     assert "src/lavt/c.py:3" in lines[0]
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines if line.startswith("|")]
@@ -219,12 +221,12 @@ def test_mutants_of_a_small_module_are_run(tmp_path: Path) -> None:
     )
     saved = [json.loads(line) for line in file.read_text().splitlines()]
     assert len(saved) == 3
-    assert any(each["caught"] for each in saved)
+    assert any(saved_result["caught"] for saved_result in saved)
     assert first.stdout == second.stdout
     assert "| vehicle/dbw/crc8.py | 3 |" in first.stdout
     assert second.stderr == ""
     source = (REPOSITORY / "src/lavt/vehicle/dbw/crc8.py").read_text()
-    assert all(each["line"] in source for each in saved)
+    assert all(saved_result["line"] in source for saved_result in saved)
     file.write_text(json.dumps({**saved[0], "caught": False, "by": ""}) + "\n")
     subprocess.run([*requested, "--rerun-survivors"], capture_output=True, text=True, check=True, timeout=250)
     assert [json.loads(line)["caught"] for line in file.read_text().splitlines()] == [False, saved[0]["caught"]]
@@ -304,8 +306,8 @@ def test_mutant_runs_in_a_copy(tmp_path: Path) -> None:
     (repository / "tests" / "test_a.py").write_text("from lavt.a import f\n\ndef test_f():\n    assert f(3) == 0\n")
     tree = WorkTree(tmp_path / "tree", repository)
     assert tree.run(["tests/test_a.py"], 60.0, unchanged=True).passed
-    of_operator = {site[0].operator: site[0] for site in find_sites("a.py", source)}
+    site_by_operator = {site[0].operator: site[0] for site in find_sites("a.py", source)}
     for operator, limit_s, failed in (("return value", 60.0, "tests/test_a.py::test_f"), ("statement", 5.0, ENDLESS)):
-        trial = tree.run_mutated(of_operator[operator], ["tests/test_a.py"], limit_s)
+        trial = tree.run_mutated(site_by_operator[operator], ["tests/test_a.py"], limit_s)
         assert trial.failed_test == failed
     assert module.read_text() == tree.source("a.py").read_text() == source

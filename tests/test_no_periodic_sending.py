@@ -15,7 +15,7 @@ PERIODIC = re.compile(
     r"send_periodic|_send_periodic_internal|\w*Cyclic\w*Task\w*|broadcastmanager|modify_data"  # python-can's
     r"|\w*BCM\w*|\w*bcm\w*|AF_CAN|PF_CAN|CAN_RAW"  # the kernel's, and sockets that could use it
 )
-"""Complete names; a string with such a name counts as well, as it may be used to look it up."""
+"""Complete names of periodic sending. A string with such a name also counts, because it may look the name up."""
 
 
 def periodic_sending(source: str) -> list[str]:
@@ -36,7 +36,7 @@ def _names(node: ast.AST) -> Iterator[str]:
 
 
 @pytest.mark.parametrize("path", sorted(SOURCE.rglob("*.py")), ids=lambda path: str(path.relative_to(SOURCE)))
-def test_none(path: Path) -> None:
+def test_no_module_sends_periodically(path: Path) -> None:
     """No module uses periodic sending of python-can or of the kernel, or opens a CAN socket of its own."""
     assert periodic_sending(path.read_text("utf-8")) == []
 
@@ -55,11 +55,11 @@ PLANTED = [
 
 
 @pytest.mark.parametrize("planted", PLANTED)
-def test_found(planted: str) -> None:
-    """A use of periodic sending is found, however it is written."""
+def test_planted_periodic_sending_is_found(planted: str) -> None:
+    """Periodic sending is found, however it is imported or called."""
     assert periodic_sending(planted)
 
 
-def test_others() -> None:
+def test_single_sends_are_allowed() -> None:
     """Single sends and comments are allowed."""
     assert not periodic_sending('"""Never send_periodic here."""\nbus.send(message, timeout=0)\nimport can')

@@ -1,4 +1,4 @@
-"""A drive in real time with Zenoh routers, UDP, H.264, the relay and a process per side; it asserts no upper limits."""
+"""A drive in real time with Zenoh routers, UDP, H.264, the relay and a process per side; no duration has a limit."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CHANGES = (
 
 @pytest.fixture(scope="module")
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the output directory of a drive of some seconds."""
+    """Drive for some seconds; return the output directory."""
     directory = tmp_path_factory.mktemp("real") / "run"
     run_once(plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), CHANGES)), directory)
     return directory
@@ -41,16 +41,17 @@ def records(out: Path) -> tuple[Record, Record]:
 def test_pictures_arrive_and_commands_are_accepted(records: tuple[Record, Record]) -> None:
     """The client reads the stamps in the vehicle's pictures, and the vehicle accepts commands made from them."""
     server, client = records
-    sent, read = (set(table.ints("stamp_ns").tolist()) for table in (server.table("frame"), client.table("picture")))
-    assert len(sent & read) > 30
+    tables = (server.table("frame"), client.table("picture"))
+    sent_stamps, read_stamps = (set(table.ints("stamp_ns").tolist()) for table in tables)
+    assert len(sent_stamps & read_stamps) > 30
     admissions = server.table("admission")
-    accepted = {
+    accepted_stamps = {
         stamp_ns
         for stamp_ns, verdict in zip(admissions.ints("stamp_ns").tolist(), admissions.texts("verdict"), strict=True)
         if verdict == "accepted"
     }
-    assert len(accepted) > 10
-    assert accepted <= sent & read
+    assert len(accepted_stamps) > 10
+    assert accepted_stamps <= sent_stamps & read_stamps
 
 
 def test_the_car_moved(records: tuple[Record, Record]) -> None:
@@ -68,7 +69,7 @@ def test_nothing_arrives_before_its_delay(out: Path, records: tuple[Record, Reco
     assert result["injected_ms"] == {"video": VIDEO_MS, "control": CONTROL_MS}
     server, client = records
     pictures = client.table("picture")
-    took_ns = (pictures.ints("read_wall_ns") - pictures.ints("stamp_ns"))[pictures.ints("stamp_ns") > 0]
-    assert took_ns.min() >= VIDEO_MS * 1e6
+    latency_ns = (pictures.ints("read_wall_ns") - pictures.ints("stamp_ns"))[pictures.ints("stamp_ns") > 0]
+    assert latency_ns.min() >= VIDEO_MS * 1e6
     admissions = server.table("admission")
     assert (admissions.ints("received_wall_ns") - admissions.ints("sent_wall_ns")).min() >= CONTROL_MS * 1e6

@@ -43,7 +43,7 @@ def test_test_that_changes_the_process_fails(name: str, monkeypatch: pytest.Monk
     """A test that leaves a process-wide setting changed fails, and the message names only that setting."""
     with pytest.raises(pytest.fail.Exception) as failure, process_unchanged():
         CHANGES[name](monkeypatch)
-    assert [each for each in process_state() if f"{each!r}: " in str(failure.value)] == [name]
+    assert [setting for setting in process_state() if f"{setting!r}: " in str(failure.value)] == [name]
 
 
 @pytest.mark.usefixtures("_restore")

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-NEEDS_UNICORN = """
+TEST_THAT_NEEDS_A_UNICORN = """
 from tests.require import need
 
 def test_needy():
@@ -46,7 +46,7 @@ def run_tests(folder: Path, required: str | None, tests: str, **variables: str) 
 def test_missing_requirement_fails(tmp_path: Path, required: str | None, code: int, expected: str) -> None:
     """A test skips if the machine lacks a requirement, and fails if LAVT_REQUIRE names it."""
     file = tmp_path / "test_needy.py"
-    file.write_text(NEEDS_UNICORN)
+    file.write_text(TEST_THAT_NEEDS_A_UNICORN)
 
     exit_code, output = run_tests(tmp_path, required, str(file))
 

@@ -17,7 +17,7 @@ from lavt.transport.messages import decode
 PROGRAM = Path(control_round_trip.__file__)
 
 
-def paced(p50_us: float) -> control_round_trip.Measured:
+def measurement(p50_us: float) -> control_round_trip.Measured:
     times = {"p50_us": p50_us, "p95_us": 2 * p50_us, "p99_us": 4 * p50_us, "lost": 0.0}
     return {"at_50_hz": times, "back_to_back": times}
 
@@ -30,22 +30,26 @@ def test_a_real_command_is_sent() -> None:
 
 def test_medians_over_rounds_and_ratios_to_raw_udp() -> None:
     """The summary has medians over the rounds, and their ratios to those of raw UDP."""
-    found = control_round_trip.summary({"udp": [paced(10), paced(20), paced(30)], "zenoh": [paced(50)]})
-    assert found["udp"]["at_50_hz"]["p50_us"] == 20
-    assert found["udp"]["at_50_hz"]["p50_ratio"] == 1
-    assert found["zenoh"]["back_to_back"]["p99_us"] == 200
-    assert found["zenoh"]["back_to_back"]["p99_ratio"] == 2.5
+    summary = control_round_trip.summary(
+        {"udp": [measurement(10), measurement(20), measurement(30)], "zenoh": [measurement(50)]}
+    )
+    assert summary["udp"]["at_50_hz"]["p50_us"] == 20
+    assert summary["udp"]["at_50_hz"]["p50_ratio"] == 1
+    assert summary["zenoh"]["back_to_back"]["p99_us"] == 200
+    assert summary["zenoh"]["back_to_back"]["p99_ratio"] == 2.5
 
 
 def test_without_raw_udp_there_are_no_ratios() -> None:
     """A carrier that is measured without raw UDP has times only."""
-    assert set(control_round_trip.summary({"zenoh": [paced(50)]})["zenoh"]["at_50_hz"]) == set(paced(1)["at_50_hz"])
+    assert set(control_round_trip.summary({"zenoh": [measurement(50)]})["zenoh"]["at_50_hz"]) == set(
+        measurement(1)["at_50_hz"]
+    )
 
 
 def test_lost_echoes_are_counted() -> None:
     """A lost echo is counted and is not part of the percentiles."""
-    found = control_round_trip.percentiles("udp", [1000, None, 3000])
-    assert (found["p50_us"], found["lost"]) == (2.0, 1)
+    times = control_round_trip.percentiles("udp", [1000, None, 3000])
+    assert (times["p50_us"], times["lost"]) == (2.0, 1)
 
 
 def test_a_missing_carrier_is_reported(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -67,21 +71,21 @@ def test_empty_measurements_are_rejected(arguments: list[str]) -> None:
 
 @pytest.mark.full
 def test_the_control_benchmark_runs() -> None:
-    """`benchmarks/control_round_trip.py` measures a command through two real routers compared with raw UDP."""
-    done = subprocess.run(
+    """`benchmarks/control_round_trip.py` measures a command's round trip over raw UDP and through two routers."""
+    completed = subprocess.run(
         [sys.executable, PROGRAM, "--only", "udp", "--only", "zenoh", "--rounds", "1", "--seconds", "1"],
         capture_output=True,
         text=True,
         check=False,
         timeout=200,
     )
-    assert done.returncode == 0, done.stderr
-    last = json.loads(done.stdout.splitlines()[-1])
-    assert list(last) == ["udp", "zenoh"]
+    assert completed.returncode == 0, completed.stderr
+    result = json.loads(completed.stdout.splitlines()[-1])
+    assert list(result) == ["udp", "zenoh"]
     for pace in ("at_50_hz", "back_to_back"):
-        assert last["udp"][pace]["p50_us"] > 0
-        assert last["zenoh"][pace]["p50_ratio"] > 0
-    assert "| Zenoh " in done.stdout
+        assert result["udp"][pace]["p50_us"] > 0
+        assert result["zenoh"][pace]["p50_ratio"] > 0
+    assert "| Zenoh " in completed.stdout
 
 
 def test_an_installed_carrier_returns_the_echo() -> None:
@@ -90,5 +94,5 @@ def test_an_installed_carrier_returns_the_echo() -> None:
     if not names:
         pytest.skip("needs pyzmq or cyclonedds: pip install pyzmq cyclonedds")
     for name in names:
-        found = control_round_trip.run(name, ("", ""), 0.1, 5)
-        assert found["back_to_back"]["lost"] == 0
+        measured = control_round_trip.run(name, ("", ""), 0.1, 5)
+        assert measured["back_to_back"]["lost"] == 0

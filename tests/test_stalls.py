@@ -16,7 +16,7 @@ from tests.support.stalls import (
     HostStalledEachTime,
     ProbeEnded,
     ProbeProcess,
-    Shared,
+    SharedResult,
     Stall,
     Stalls,
     idle_share,
@@ -39,11 +39,11 @@ class FakeProbe:
     """A fake probe that returns given reports in order."""
 
     reports: list[tuple[int, list[Stall]]] = field(default_factory=list)
-    above: bool = True
-    requested: int = 0
+    has_realtime_priority: bool = True
+    report_count: int = 0
 
     def report(self) -> tuple[int, list[Stall]]:  # noqa: D102 (of `Probe`)
-        self.requested += 1
+        self.report_count += 1
         return self.reports.pop(0) if self.reports else (2**62, [])
 
     def end(self) -> None:  # noqa: D102 (of `Probe`)
@@ -55,13 +55,13 @@ def stalls_of(*recorded: Stall) -> Stalls:
 
 
 @pytest.mark.parametrize(
-    ("since_ms", "until_ms", "found"),
+    ("since_ms", "until_ms", "count"),
     [(0, 99, 0), (0, 100, 1), (120, 130, 1), (150, 200, 1), (151, 200, 0), (0, 1000, 2)],
 )
-def test_only_overlapping_stalls_count(since_ms: int, until_ms: int, found: int) -> None:
+def test_only_overlapping_stalls_count(since_ms: int, until_ms: int, count: int) -> None:
     """A stall that ended before an interval, or began after it, does not overlap it."""
     stalls = [Stall(0, 100 * MS, 150 * MS), Stall(1, 600 * MS, 610 * MS)]
-    assert len(overlapping(stalls, since_ms * MS, until_ms * MS)) == found
+    assert len(overlapping(stalls, since_ms * MS, until_ms * MS)) == count
 
 
 def test_short_stalls_do_not_count() -> None:
@@ -80,11 +80,11 @@ def test_stalled_share_is_that_of_the_worst_processor() -> None:
 def test_passing_check_does_not_query_probes() -> None:
     """A check that passes does not wait for the probes."""
     stalls = stalls_of()
-    requested = stalls.probes[0].requested  # type: ignore[attr-defined]
+    before = stalls.probes[0].report_count  # type: ignore[attr-defined]
     stalls.require(True, "late", 0, 100)
-    with stalls.judging(0, 100):
+    with stalls.excusing_failures(0, 100):
         pass
-    assert stalls.probes[0].requested == requested  # type: ignore[attr-defined]
+    assert stalls.probes[0].report_count == before  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize(
@@ -110,7 +110,7 @@ def test_only_an_overlapping_stall_excuses_a_failure(stall: Stall | None, raised
 def test_stalled_share_excuses_a_rate(share: float, raised: type[Exception]) -> None:
     """A wrong rate fails unless a processor was stalled for the given share of the interval."""
     stalls = stalls_of(*(Stall(0, at * 100 * MS, (at * 100 + 10) * MS) for at in range(10)))
-    with pytest.raises(raised, match="slow") as caught, stalls.judging(0, 1000 * MS, share=share):
+    with pytest.raises(raised, match="slow") as caught, stalls.excusing_failures(0, 1000 * MS, share=share):
         raise AssertionError("slow")
     assert caught.type is raised
 
@@ -118,9 +118,9 @@ def test_stalled_share_excuses_a_rate(share: float, raised: type[Exception]) -> 
 def test_verdict_waits_for_a_complete_record() -> None:
     """Probes are queried until each has reported beyond the end of the interval."""
     late = Stall(0, 50 * MS, 90 * MS)
-    slow = FakeProbe([(0, []), (80 * MS, []), (99 * MS, [late]), (101 * MS, [])])
-    assert Stalls([slow], lambda: QUIET).during(0, 100 * MS) == [late]
-    assert slow.reports == []
+    slow_probe = FakeProbe([(0, []), (80 * MS, []), (99 * MS, [late]), (101 * MS, [])])
+    assert Stalls([slow_probe], lambda: QUIET).during(0, 100 * MS) == [late]
+    assert slow_probe.reports == []
 
 
 @pytest.mark.parametrize(
@@ -155,18 +155,18 @@ def test_low_priority_work_counts_as_idle() -> None:
 def test_stall_excuses_an_assertion_about_times(stall: Stall | None, raised: type[Exception]) -> None:
     """A stall excuses a failed assertion about times, but no other exception."""
     stalls = stalls_of(*([stall] if stall else []))
-    with pytest.raises(raised, match="late") as caught, stalls.judging(0, 100 * MS):
+    with pytest.raises(raised, match="late") as caught, stalls.excusing_failures(0, 100 * MS):
         raise AssertionError("late")
     assert caught.type is raised
     assert stalls.excused == (raised is HostStalled)
-    with pytest.raises(ValueError, match="broken"), stalls.judging(0, 100 * MS):
+    with pytest.raises(ValueError, match="broken"), stalls.excusing_failures(0, 100 * MS):
         raise ValueError("broken")
 
 
-def test_shared_value_is_made_again_after_a_stall() -> None:
-    """A shared value is made once, and again after each excuse, at most three times in all."""
+def test_shared_result_is_made_again_after_a_stall() -> None:
+    """A shared result is made once, and again after each excuse, at most three times in all."""
     stalls, numbers = stalls_of(), iter(range(9))
-    shared = Shared(stalls, lambda: next(numbers))
+    shared = SharedResult(stalls, lambda: next(numbers))
     assert [shared.get(), shared.get()] == [0, 0]
     stalls.excused += 1
     assert [shared.get(), shared.get()] == [1, 1]
@@ -176,22 +176,22 @@ def test_shared_value_is_made_again_after_a_stall() -> None:
     assert shared.get() == 2
 
 
-def test_failure_to_make_a_shared_value_fails_every_test() -> None:
-    """If a shared value cannot be made and no stall explains it, each request raises that failure."""
+def test_failure_to_make_a_shared_result_fails_every_test() -> None:
+    """If a shared result cannot be made and no stall explains it, each request raises that failure."""
     attempts = []
 
     def broken() -> None:
         attempts.append(1)
         raise AssertionError("it does not stop")
 
-    shared = Shared(stalls_of(), broken)
+    shared = SharedResult(stalls_of(), broken)
     for _ in range(4):
         with pytest.raises(AssertionError, match="does not stop"):
             shared.get()
     assert len(attempts) == 1
 
 
-def test_shared_value_is_given_up_after_three_stalls() -> None:
+def test_shared_result_is_given_up_after_three_stalls() -> None:
     """If the host stalls each of three attempts, later requests raise without another attempt."""
     attempts = []
 
@@ -199,7 +199,7 @@ def test_shared_value_is_given_up_after_three_stalls() -> None:
         attempts.append(1)
         raise HostStalled("300 ms")
 
-    shared = Shared(stalls_of(), stalled)
+    shared = SharedResult(stalls_of(), stalled)
     for _ in range(3):
         with pytest.raises(HostStalled, match="300 ms"):
             shared.get()
@@ -230,7 +230,7 @@ def stalled_fixture(stalls):
     from tests.support.stalls import HostStalled
     raise HostStalled("in its setup")
 """
-TESTS = """
+STALLED_TESTS = """
 from tests.support.stalls import HostStalled, HostStalledEachTime
 
 tries = []
@@ -257,7 +257,7 @@ def test_stalled_in_setup(stalled_fixture):
 def test_without_the_fixture():
     assert tries == [1, 1, 2, 2, 2, 3]
 """
-JUDGED = """
+TESTS_WITH_MARKER = """
 import pytest
 from tests.support.stalls import Stall
 
@@ -281,7 +281,7 @@ def test_fault():
 def test_tries():
     assert late == [1, 2]
 """
-FAULTS = """
+FAULTY_TESTS = """
 from tests.support.stalls import HostStalled
 
 tries = []
@@ -312,12 +312,12 @@ class EndedProbe(FakeProbe):
     """A fake probe that ends after its first report."""
 
     def report(self) -> tuple[int, list[Stall]]:  # noqa: D102 (of `Probe`)
-        if self.requested:
+        if self.report_count:
             raise ProbeEnded("the lateness probe of processor 7 ended with -9")
         return super().report()
 
 
-def run_inner(
+def run_session(
     pytester: pytest.Pytester, tests: str, *, after: str = BUSY, probe: type[FakeProbe] = FakeProbe
 ) -> pytest.RunResult:
     pytester.makeconftest(CONFTEST.format(before=QUIET, after=after, probe=probe.__name__))
@@ -327,7 +327,7 @@ def run_inner(
 
 def test_test_stalled_each_time_is_inconclusive(pytester: pytest.Pytester) -> None:
     """After two more attempts a stalled test is listed as inconclusive; it neither passes nor fails."""
-    result = run_inner(pytester, TESTS)
+    result = run_session(pytester, STALLED_TESTS)
     assert result.parseoutcomes() == {"passed": 3, "rerun": 5, "inconclusive": 3}
     assert result.ret == pytest.ExitCode.OK
     result.stdout.fnmatch_lines(
@@ -343,27 +343,27 @@ def test_test_stalled_each_time_is_inconclusive(pytester: pytest.Pytester) -> No
 
 def test_stall_excuses_a_test_with_the_marker(pytester: pytest.Pytester) -> None:
     """A marked test is repeated if a stall overlaps it, and fails immediately otherwise."""
-    result = run_inner(pytester, JUDGED)
+    result = run_session(pytester, TESTS_WITH_MARKER)
     assert result.parseoutcomes() == {"passed": 2, "failed": 1, "rerun": 1}
 
 
 def test_fault_is_never_excused(pytester: pytest.Pytester) -> None:
     """Only `HostStalled` itself lets a test be repeated, and earlier stalls do not excuse a failed attempt."""
-    result = run_inner(pytester, FAULTS)
+    result = run_session(pytester, FAULTY_TESTS)
     assert result.parseoutcomes() == {"failed": 3, "rerun": 1, "passed": 1}
     assert result.ret == pytest.ExitCode.TESTS_FAILED
 
 
 def test_session_fails_for_inconclusive_tests_on_an_idle_machine(pytester: pytest.Pytester) -> None:
     """Three inconclusive tests of six fail the session of an idle machine, with a message."""
-    result = run_inner(pytester, TESTS, after="cpu 40 0 0 60 0 0 0 0 0 0")
+    result = run_session(pytester, STALLED_TESTS, after="cpu 40 0 0 60 0 0 0 0 0 0")
     assert result.ret == pytest.ExitCode.TESTS_FAILED
     result.stdout.fnmatch_lines(["FAILED: 3 of 6 tests were inconclusive on a machine that was 60% idle"])
 
 
 def test_ended_probe_fails_the_session(pytester: pytest.Pytester) -> None:
     """A session fails if a probe ended early, even if all tests pass."""
-    result = run_inner(pytester, "def test_good(stalls): pass", probe=EndedProbe)
+    result = run_session(pytester, "def test_good(stalls): pass", probe=EndedProbe)
     assert result.parseoutcomes() == {"passed": 1}
     assert result.ret == pytest.ExitCode.TESTS_FAILED
     result.stdout.fnmatch_lines(["FAILED: the lateness probe of processor 7 ended with -9"])
@@ -383,9 +383,9 @@ print(time.monotonic_ns())
 """
 
 
-def spin(processor: int, how: str, duration_ms: int) -> tuple[int, int]:
+def spin(processor: int, priority: str, duration_ms: int) -> tuple[int, int]:
     """Occupy a processor; return when that began and ended."""
-    arguments = [sys.executable, "-I", "-S", "-c", SPIN, str(processor), how, str(duration_ms)]
+    arguments = [sys.executable, "-I", "-S", "-c", SPIN, str(processor), priority, str(duration_ms)]
     began, ended = subprocess.run(arguments, check=True, capture_output=True, text=True).stdout.split()
     return int(began), int(ended)
 
@@ -394,7 +394,7 @@ def spin(processor: int, how: str, duration_ms: int) -> tuple[int, int]:
 def measuring_stalls() -> Iterator[Stalls]:
     measured = Stalls.measured()
     try:
-        if not all(probe.above for probe in measured.probes):
+        if not all(probe.has_realtime_priority for probe in measured.probes):
             pytest.skip("needs the right to real-time priority")
         yield measured
     finally:
@@ -408,7 +408,7 @@ def test_stalled_processor_is_recorded() -> None:
         processor = min(os.sched_getaffinity(0))
         began_ns, ended_ns = spin(processor, "real-time", 100)
         recorded = stalls.during(began_ns, ended_ns, at_least_ms=60)
-        assert [each.processor for each in recorded if 60 < each.length_ms < 130] == [processor]
+        assert [stall.processor for stall in recorded if 60 < stall.length_ms < 130] == [processor]
 
 
 @pytest.mark.realtime
@@ -418,8 +418,8 @@ def test_busy_program_is_no_stall() -> None:
     One of five attempts without a stall is enough, because the host itself may stall the machine.
     """
     with measuring_stalls() as stalls:
-        tries = [spin(min(os.sched_getaffinity(0)), "nice", 200) for _ in range(5)]
-        assert not all(stalls.during(*each, at_least_ms=20) for each in tries)
+        attempts_ns = [spin(min(os.sched_getaffinity(0)), "nice", 200) for _ in range(5)]
+        assert not all(stalls.during(began_ns, ended_ns, at_least_ms=20) for began_ns, ended_ns in attempts_ns)
 
 
 @pytest.mark.realtime
@@ -449,7 +449,7 @@ time.sleep(60)
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM])
 def test_probes_end_with_pytest(how: signal.Signals) -> None:
-    """However pytest is killed, no probe remains."""
+    """Whether pytest is killed by SIGKILL or SIGTERM, no probe remains."""
     parent = subprocess.Popen([sys.executable, "-c", PARENT], stdout=subprocess.PIPE, text=True)
     assert parent.stdout is not None
     probes = parent.stdout.readline().split()
@@ -465,7 +465,7 @@ def wait_for_end(pid: int) -> None:
     clock = MachineClock()
     limit_ns = clock.now().mono_ns + 10 * NS_PER_S
     while is_running(pid):
-        assert clock.now().mono_ns < limit_ns, f"process {pid} is left"
+        assert clock.now().mono_ns < limit_ns, f"process {pid} still runs"
         pause(10 * NS_PER_MS)
 
 

@@ -50,18 +50,18 @@ def test_missing_gstreamer_is_reported_with_the_packages_to_install(
     assert "apt-get install" in message
 
 
-def test_a_frame_is_damaged_from_2_db_on_or_if_it_is_not_shown() -> None:
-    """A frame up to 2 dB below the loss-free decode is undamaged; one farther below it or not shown is damaged."""
+def test_a_frame_is_damaged_if_it_is_2_db_worse_or_not_shown() -> None:
+    """A frame is damaged if it is not shown, or more than 2 dB worse than in the loss-free decode."""
     loss_free = [10.0] * (WARM_UP_FRAMES + 4)
-    worse = {0: 10.0, 1: 10.0 * 10**0.19, 2: 10.0 * 10**0.21}
-    received = {WARM_UP_FRAMES + frame: error for frame, error in worse.items()}
+    squared_errors = {0: 10.0, 1: 10.0 * 10**0.19, 2: 10.0 * 10**0.21}
+    received = {WARM_UP_FRAMES + frame: error for frame, error in squared_errors.items()}
     assert undamaged_share(received, loss_free) == 0.5
     assert psnr_db(255.0**2) == 0.0
     assert psnr_db(0.0) == math.inf
 
 
-def test_the_link_is_the_same_for_either_side() -> None:
-    """Delay and loss of a packet depend only on its number: two links of one case agree on every packet."""
+def test_two_links_of_a_case_are_identical() -> None:
+    """Delay and loss of a packet depend only on its number, so two links of one case agree on every packet."""
     for case in CASES:
         one, other = PacketImpairment(case), PacketImpairment(case)
         assert [one.next_delay_ns() for _ in range(2000)] == [other.next_delay_ns() for _ in range(2000)]
@@ -69,15 +69,15 @@ def test_the_link_is_the_same_for_either_side() -> None:
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_the_link_follows_the_case(case: LinkCase) -> None:
-    """Over 100000 packets the loss, the burst length and the range of the further delay are those of the case."""
+    """Over 100000 packets the loss, the burst length and the range of the jitter are those of the case."""
     impairment = PacketImpairment(case)
     delays_ns = [impairment.next_delay_ns() for _ in range(100_000)]
-    lost = np.array([each is None for each in delays_ns])
+    lost = np.array([delay_ns is None for delay_ns in delays_ns])
     assert abs(lost.mean() - case.loss) <= 0.1 * case.loss
     if case.burst_packets:
         begins = lost[1:] & ~lost[:-1]
         assert abs(lost.sum() / begins.sum() - case.burst_packets) < 0.3
-    arrived_ns = [each for each in delays_ns if each is not None]
+    arrived_ns = [delay_ns for delay_ns in delays_ns if delay_ns is not None]
     assert 0 <= min(arrived_ns) <= max(arrived_ns) <= case.jitter_ms * 1e6
     assert max(arrived_ns) >= 0.99 * case.jitter_ms * 1e6
 
@@ -102,7 +102,7 @@ def test_traffic_is_counted_after_the_warm_up_by_payload_type() -> None:
     }
 
 
-def test_the_warm_up_is_additional() -> None:
+def test_warm_up_frames_are_additional() -> None:
     """A run of 10 s has 300 frames after the warm-up."""
     assert frames_of(10) - WARM_UP_FRAMES == 300
 
@@ -123,49 +123,49 @@ def test_growth_is_reported() -> None:
     """Growing memory, threads and latency are each reported; steady ones are not."""
     steady = [endurance.ResourceSample(float(at_s), 50_000, 5) for at_s in range(60)]
     growing = [endurance.ResourceSample(float(at_s), 50_000 + 10 * at_s, 5 + at_s // 50) for at_s in range(60)]
-    calm, slower = np.full(1200, 4.0), np.linspace(4.0, 8.0, 1200)
-    assert endurance.describe_growth({"sender": steady}, calm) == []
-    found = endurance.describe_growth({"sender": growing}, slower)
-    assert len(found) == 3
-    assert all(word in each for word, each in zip(("memory", "threads", "latency"), found, strict=True))
+    steady_latency_ms, growing_latency_ms = np.full(1200, 4.0), np.linspace(4.0, 8.0, 1200)
+    assert endurance.describe_growth({"sender": steady}, steady_latency_ms) == []
+    messages = endurance.describe_growth({"sender": growing}, growing_latency_ms)
+    assert len(messages) == 3
+    assert all(word in message for word, message in zip(("memory", "threads", "latency"), messages, strict=True))
 
 
 @pytest.mark.full
 def test_the_video_benchmark_runs() -> None:
-    """`benchmarks/video_vs_gstreamer.py` prints its tables and, last, the requested ratios and shares."""
-    done = subprocess.run(
+    """`benchmarks/video_vs_gstreamer.py` prints its tables and, in the last line, the requested ratios and shares."""
+    completed = subprocess.run(
         [sys.executable, BENCHMARKS / "video_vs_gstreamer.py", "--quick", "--only", "480p", "--only", "loss1"],
         capture_output=True,
         text=True,
         check=False,
         timeout=300,
     )
-    if done.returncode == 2 and not missing():
-        pytest.skip(f"Debian's GStreamer modules do not support this Python: {done.stderr}")
-    if done.returncode == 2:
-        need("gstreamer", done.stderr)
-    assert done.returncode == 0, done.stderr
-    last = json.loads(done.stdout.splitlines()[-1])
-    assert list(last) == ["480p", "loss1"]
-    assert list(last["480p"]) == ["median_ratio", "cpu_ratio", "over_floor_ms"]
-    assert list(last["loss1"]) == ["undamaged", "overhead", "gstreamer_undamaged"]
-    assert last["480p"]["median_ratio"] > 0
-    assert 0 < last["loss1"]["undamaged"] <= 1
-    assert "| ours 1 | " in done.stdout
-    assert "| GStreamer, usual | " in done.stdout
+    if completed.returncode == 2 and not missing():
+        pytest.skip(f"Debian's GStreamer modules do not support this Python: {completed.stderr}")
+    if completed.returncode == 2:
+        need("gstreamer", completed.stderr)
+    assert completed.returncode == 0, completed.stderr
+    result = json.loads(completed.stdout.splitlines()[-1])
+    assert list(result) == ["480p", "loss1"]
+    assert list(result["480p"]) == ["median_ratio", "cpu_ratio", "over_floor_ms"]
+    assert list(result["loss1"]) == ["undamaged", "overhead", "gstreamer_undamaged"]
+    assert result["480p"]["median_ratio"] > 0
+    assert 0 < result["loss1"]["undamaged"] <= 1
+    assert "| ours 1 | " in completed.stdout
+    assert "| GStreamer, usual | " in completed.stdout
 
 
 @pytest.mark.full
 def test_the_endurance_benchmark_runs() -> None:
     """`benchmarks/endurance.py` prints memory and threads of both processes, latency and, last, its verdict."""
-    done = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, BENCHMARKS / "endurance.py", "--minutes", "0.1"],
         capture_output=True,
         text=True,
         check=False,
         timeout=120,
     )
-    assert "| our_sender | " in done.stdout
-    assert "| our_receiver | " in done.stdout
-    assert "of 180." in done.stdout
-    assert done.stdout.splitlines()[-1].startswith(("Nothing grew", "Something grew"))
+    assert "| our_sender | " in completed.stdout
+    assert "| our_receiver | " in completed.stdout
+    assert "of 180." in completed.stdout
+    assert completed.stdout.splitlines()[-1].startswith(("Nothing grew", "Something grew"))

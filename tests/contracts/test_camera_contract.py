@@ -22,12 +22,12 @@ ROAD = load_road("a_key")
 X_M, Y_M, HEADING_RAD = ROAD.start
 POSE = Pose(0, X_M, Y_M, HEADING_RAD)
 MODEL = CameraModel(320, 240)
-LONG_S = 20.0
+TIMEOUT_S = 20.0
 RENDERERS: dict[str, Callable[[], Camera]] = {
     "simulated": lambda: SimCamera(model=MODEL, rate_hz=30.0, phase_ns=3, road=ROAD, seed=1, scenery="none"),
     "stand-in of the node tests": lambda: NoiseCamera(MODEL),
 }
-"""Cameras that render a picture of the given number, time and pose."""
+"""Cameras that render a picture for any frame number, time and pose."""
 each_camera = pytest.mark.parametrize("name", [*sorted(RENDERERS), "device"])
 
 
@@ -43,8 +43,8 @@ def camera(name: str, tmp_path: Path) -> Iterator[Camera]:
 
 
 def capture(camera: Camera, number: int, at_ns: int) -> CapturedFrame:
-    """Return a frame, waiting until there is one."""
-    assert not isinstance(camera, VideoDevice) or camera.wait(LONG_S)
+    """Wait until the camera has a frame, and return it."""
+    assert not isinstance(camera, VideoDevice) or camera.wait(TIMEOUT_S)
     frame = camera.capture(number, at_ns, POSE)
     assert frame is not None
     return frame
@@ -53,11 +53,11 @@ def capture(camera: Camera, number: int, at_ns: int) -> CapturedFrame:
 @pytest.mark.parametrize("name", sorted(RENDERERS))
 def test_rendered_pictures_are_byte_for_byte_reproducible(name: str) -> None:
     """Two equal rendering cameras return equal pictures for equal inputs, each in a buffer of its own."""
-    one, other = RENDERERS[name](), RENDERERS[name]()
-    other.capture(1, 5, POSE)
-    first, second, again = capture(one, 7, 9), capture(other, 7, 9), capture(one, 7, 9)
-    assert first.picture.tobytes() == second.picture.tobytes() == again.picture.tobytes()
-    assert not np.shares_memory(first.picture, again.picture)
+    camera, other_camera = RENDERERS[name](), RENDERERS[name]()
+    other_camera.capture(1, 5, POSE)
+    first, other, repeated = capture(camera, 7, 9), capture(other_camera, 7, 9), capture(camera, 7, 9)
+    assert first.picture.tobytes() == other.picture.tobytes() == repeated.picture.tobytes()
+    assert not np.shares_memory(first.picture, repeated.picture)
 
 
 @each_camera
@@ -71,7 +71,7 @@ def test_pictures_have_the_models_size(camera: Camera) -> None:
 
 @each_camera
 def test_a_frame_carries_its_number_and_its_capture_time_if_known(camera: Camera, name: str) -> None:
-    """A frame has the requested number; a rendered frame has the requested time, a file's frame has none."""
+    """A frame has the requested number; a rendered frame has the requested time, a frame from a file has none."""
     frame = capture(camera, 4, 99)
     assert (frame.number, frame.capture_ns) == (4, 99 if name in RENDERERS else None)
 

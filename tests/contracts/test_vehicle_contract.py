@@ -18,7 +18,7 @@ from lavt.vehicle.sim.simulator import Simulator
 from lavt.vehicle.vehicle import Vehicle
 
 ROAD = load_road("a_key")
-TICK_NS = 20 * NS_PER_MS
+MAX_PERIOD_NS = 20 * NS_PER_MS
 BRAKE = Actuation(0.0, 0.0, 1.0)
 
 
@@ -37,21 +37,21 @@ each_vehicle = pytest.mark.parametrize("name", sorted(VEHICLES))
 each_drivable = pytest.mark.parametrize("name", sorted(DRIVABLE))
 
 
-def run(vehicle: Vehicle, from_ns: int, actuation: Actuation, *, wanted: bool, seconds: float) -> int:
+def run(vehicle: Vehicle, start_ns: int, actuation: Actuation, *, should_engage: bool, seconds: float) -> int:
     """Call the vehicle as the actuator node does, at each wake time, and return the end time."""
-    now_ns, end_ns = from_ns, from_ns + round(seconds * NS_PER_S)
+    now_ns, end_ns = start_ns, start_ns + round(seconds * NS_PER_S)
     while now_ns < end_ns:
         vehicle.advance(now_ns)
-        vehicle.engage(wanted, now_ns)
+        vehicle.engage(should_engage, now_ns)
         vehicle.apply(actuation, now_ns)
-        now_ns = min(max(vehicle.next_wake_ns(), now_ns + 1), now_ns + TICK_NS, end_ns)
+        now_ns = min(max(vehicle.next_wake_ns(), now_ns + 1), now_ns + MAX_PERIOD_NS, end_ns)
     vehicle.advance(end_ns)
     return end_ns
 
 
 @each_vehicle
-def test_time_increases_up_to_the_call(name: str) -> None:
-    """A state's time never decreases or exceeds the time advanced to, and wake times lie in the future."""
+def test_state_times_and_wake_times(name: str) -> None:
+    """A state's time never decreases or exceeds the time of `advance`; the next wake time is later than the state."""
     vehicle = VEHICLES[name]()
     vehicle.advance(MONO_NS + 20 * NS_PER_MS)
     before_ns = vehicle.state().mono_ns
@@ -67,7 +67,7 @@ def test_time_increases_up_to_the_call(name: str) -> None:
 
 
 @each_vehicle
-def test_it_is_stationary_until_commanded(name: str) -> None:
+def test_a_vehicle_is_stationary_until_commanded(name: str) -> None:
     """Without a command the vehicle is stationary and has no events."""
     vehicle = VEHICLES[name]()
     assert vehicle.advance(MONO_NS + 3 * NS_PER_S) == []
@@ -76,7 +76,7 @@ def test_it_is_stationary_until_commanded(name: str) -> None:
 
 @each_vehicle
 def test_capabilities(name: str) -> None:
-    """Sizes and limits are positive and finite, and there is ground truth exactly if the vehicle says so."""
+    """Sizes and limits are positive and finite, and there is ground truth if and only if the capabilities say so."""
     vehicle = VEHICLES[name]()
     capabilities = vehicle.capabilities
     for value in (
@@ -107,14 +107,14 @@ def test_any_actuation_leaves_a_finite_state(name: str, requested: list[tuple[fl
 
 @each_drivable
 def test_an_engaged_vehicle_follows_commands(name: str) -> None:
-    """At standstill with the brake on the vehicle is engaged within 3 s; then it accelerates and turns as commanded."""
+    """A stationary, braked vehicle engages within 3 s, and then accelerates and turns as commanded."""
     vehicle = DRIVABLE[name]()
-    now_ns = run(vehicle, MONO_NS, BRAKE, wanted=False, seconds=0.5)
+    now_ns = run(vehicle, MONO_NS, BRAKE, should_engage=False, seconds=0.5)
     assert vehicle.state().inhibit_reason == ""
-    now_ns = run(vehicle, now_ns, BRAKE, wanted=True, seconds=3)
+    now_ns = run(vehicle, now_ns, BRAKE, should_engage=True, seconds=3)
     state = vehicle.state()
     assert (state.is_engaged, state.inhibit_reason, state.is_overridden, state.gear) == (True, "", False, "drive")
-    run(vehicle, now_ns, Actuation(0.05, 0.5, 0.0), wanted=True, seconds=2)
+    run(vehicle, now_ns, Actuation(0.05, 0.5, 0.0), should_engage=True, seconds=2)
     state = vehicle.state()
     assert 1.0 < state.speed_mps < 2.0, "1 m/s2 for 2 s, less the lags"
     assert state.steering_rad == pytest.approx(0.05, abs=0.002)
@@ -127,13 +127,13 @@ def test_an_engaged_vehicle_follows_commands(name: str) -> None:
 def test_a_disengaged_vehicle_stays_stationary(name: str) -> None:
     """A vehicle that is disengaged while driving, and braked, becomes stationary and stays so."""
     vehicle = DRIVABLE[name]()
-    now_ns = run(vehicle, MONO_NS, BRAKE, wanted=False, seconds=0.5)
-    now_ns = run(vehicle, now_ns, BRAKE, wanted=True, seconds=3)
-    now_ns = run(vehicle, now_ns, Actuation(0.0, 1.0, 0.0), wanted=True, seconds=2)
+    now_ns = run(vehicle, MONO_NS, BRAKE, should_engage=False, seconds=0.5)
+    now_ns = run(vehicle, now_ns, BRAKE, should_engage=True, seconds=3)
+    now_ns = run(vehicle, now_ns, Actuation(0.0, 1.0, 0.0), should_engage=True, seconds=2)
     assert vehicle.state().speed_mps > 2
-    now_ns = run(vehicle, now_ns, BRAKE, wanted=False, seconds=3)
+    now_ns = run(vehicle, now_ns, BRAKE, should_engage=False, seconds=3)
     assert vehicle.state().speed_mps == 0
-    run(vehicle, now_ns, BRAKE, wanted=False, seconds=1)
+    run(vehicle, now_ns, BRAKE, should_engage=False, seconds=1)
     truth = vehicle.ground_truth()
     assert truth is not None
     assert truth.speed_mps == 0

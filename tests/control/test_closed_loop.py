@@ -23,8 +23,8 @@ ROAD = load_road("a_key")
 
 
 @dataclass
-class Drive:
-    """The course of a drive."""
+class LaneKeepingDrive:
+    """What happened in a drive."""
 
     cross_track_m: list[float]
     speeds_mps: list[float]
@@ -32,11 +32,11 @@ class Drive:
     lane_state: LaneState
 
 
-def unchanged(picture: Picture) -> Picture:
+def keep(picture: Picture) -> Picture:
     return picture
 
 
-def mirrored(picture: Picture) -> Picture:
+def mirror(picture: Picture) -> Picture:
     return np.ascontiguousarray(picture[:, ::-1])
 
 
@@ -51,58 +51,58 @@ def drive(
     *,
     delay_ns: int = 60 * NS_PER_MS,
     seconds: float = 28,
-    change: Callable[[Picture], Picture] = unchanged,
+    change: Callable[[Picture], Picture] = keep,
     change_after_s: float = 1e9,
-) -> Drive:
+) -> LaneKeepingDrive:
     """Drive from standstill to an ending; `change` is applied to the pictures after `change_after_s`."""
     car = Simulator(road=ROAD, seed=1, start_mono_ns=0)
     detector, watch = LaneDetector(MODEL), LaneWatch()
     controller = make_controller("lane_keeper", PRESETS[preset], wheelbase_m=car.capabilities.wheelbase_m)
-    done = Drive([], [], [], "ok")
+    course = LaneKeepingDrive([], [], [], "ok")
     for number in range(round(seconds * 30)):
         now_ns = number * FRAME_NS
-        done.events += [event.kind for event in car.advance(now_ns)]
-        if {"completed", "collision", "off_road"} & set(done.events):
+        course.events += [event.kind for event in car.advance(now_ns)]
+        if {"completed", "collision", "off_road"} & set(course.events):
             break
         truth = car.ground_truth()
-        done.cross_track_m.append(truth.cross_track_m)
-        done.speeds_mps.append(truth.speed_mps)
+        course.cross_track_m.append(truth.cross_track_m)
+        course.speeds_mps.append(truth.speed_mps)
         picture = renderer.render(car.pose(), number)
         lane = detector.detect(picture if now_ns < change_after_s * NS_PER_S else change(picture))
-        done.lane_state = watch.check(lane.confidence, now_ns)
+        course.lane_state = watch.check(lane.confidence, now_ns)
         decision = controller.decide(lane, truth.speed_mps, now_ns)
-        brake = decision.brake if done.lane_state == "ok" else CLIENT_LIMITS.brake  # as the driver node does
+        brake = decision.brake if course.lane_state == "ok" else CLIENT_LIMITS.brake  # as the driver node does
         car.apply(Actuation(decision.steering_rad, decision.throttle, brake), now_ns + delay_ns)
-        if done.lane_state == "stop":
+        if course.lane_state == "stop":
             break
-    return done
+    return course
 
 
 @pytest.mark.parametrize("preset", ["designed", pytest.param("paper_calibrated", marks=pytest.mark.full)])
 def test_every_preset_drives_the_turn_at_60_ms(renderer: Renderer, preset: str) -> None:
-    """Each preset completes the 90 degree turn, 95 % of the time within 0.2 m of the centre."""
-    done = drive(renderer, preset)
-    assert done.events == ["completed"]
-    assert np.percentile(np.abs(done.cross_track_m), 95) < 0.2
-    assert max(done.speeds_mps) < 30 / 3.6 + 0.15
+    """Each preset completes the 90 degree turn and is within 0.2 m of the centre in 95 % of the frames."""
+    course = drive(renderer, preset)
+    assert course.events == ["completed"]
+    assert np.percentile(np.abs(course.cross_track_m), 95) < 0.2
+    assert max(course.speeds_mps) < 30 / 3.6 + 0.15
 
 
 def test_grey_pictures_lead_to_a_stop(renderer: Renderer) -> None:
     """With grey pictures the car follows its last path, slows down, and the lane watch returns "stop"."""
-    done = drive(renderer, "designed", change=lambda picture: np.full_like(picture, 128), change_after_s=8)
-    assert done.lane_state == "stop"
-    assert done.speeds_mps[-1] < done.speeds_mps[8 * 30] - 5
-    assert abs(done.cross_track_m[-1]) < 0.6
+    course = drive(renderer, "designed", change=lambda picture: np.full_like(picture, 128), change_after_s=8)
+    assert course.lane_state == "stop"
+    assert course.speeds_mps[-1] < course.speeds_mps[8 * 30] - 5
+    assert abs(course.cross_track_m[-1]) < 0.6
 
 
 def test_mirrored_pictures_lead_out_of_the_lane(renderer: Renderer) -> None:
-    """With mirrored pictures the car turns the wrong way, so it drives by its pictures."""
-    done = drive(
+    """With mirrored pictures the car turns the wrong way, which shows that it is steered from its pictures."""
+    course = drive(
         renderer,
         "designed",
         seconds=16,
-        change=lambda picture: np.ascontiguousarray(picture[:, ::-1]),
+        change=mirror,
         change_after_s=0,
     )
-    assert "lane_invasion" in done.events
-    assert np.max(np.abs(done.cross_track_m)) > 1.75
+    assert "lane_invasion" in course.events
+    assert np.max(np.abs(course.cross_track_m)) > 1.75

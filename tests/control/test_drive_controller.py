@@ -30,7 +30,7 @@ def lane(c0: float = 0.0, c1: float = 0.0, c2: float = 0.0, confidence: float = 
     return Lane((c0, c1, c2), 3.5, 3.6, 20.0, confidence)
 
 
-def keeper(preset: Preset = DESIGNED) -> LaneKeeper:
+def lane_keeper(preset: Preset = DESIGNED) -> LaneKeeper:
     return LaneKeeper(preset, wheelbase_m=WHEELBASE_M)
 
 
@@ -38,7 +38,7 @@ def keeper(preset: Preset = DESIGNED) -> LaneKeeper:
 def test_a_decision_is_in_the_range_of_a_command(name: str) -> None:
     """For any lane, pedals are in [0, 1], one of them is 0, and the path has finite points."""
     for centre in ((0.0, 0.0, 0.0), (6.0, 1.0, 0.05), (-30.0, 0.0, 0.0), (0.0, -5.0, 0.1)):
-        decision = keeper(PRESETS[name]).decide(lane(*centre), SPEED_MPS, 0)
+        decision = lane_keeper(PRESETS[name]).decide(lane(*centre), SPEED_MPS, 0)
         assert 0 <= decision.throttle <= 1
         assert 0 <= decision.brake <= 1
         assert decision.throttle * decision.brake == 0
@@ -47,23 +47,23 @@ def test_a_decision_is_in_the_range_of_a_command(name: str) -> None:
 
 
 @pytest.mark.parametrize("speed_mps", [5.0, SPEED_MPS, 14.0])
-def test_designed_keeps_to_3_mps2(speed_mps: float) -> None:
+def test_designed_limits_lateral_acceleration(speed_mps: float) -> None:
     """The designed preset never exceeds 3 m/s2 of lateral acceleration."""
-    decision = keeper().decide(lane(3.0), speed_mps, 0)
+    decision = lane_keeper().decide(lane(3.0), speed_mps, 0)
     for curvature in (curvature_per_m(decision.steering_rad, WHEELBASE_M), *decision.path_curvature_per_m):
         assert abs(curvature) * speed_mps**2 <= 3.0 + 1e-9
     assert curvature_per_m(decision.steering_rad, WHEELBASE_M) * speed_mps**2 == pytest.approx(3.0)
 
 
-def test_paper_calibrated_keeps_to_a_wheel_angle() -> None:
+def test_paper_calibrated_limits_the_wheel_angle() -> None:
     """The paper_calibrated preset never exceeds 0.21 rad, which is 5.2 m/s2 at 30 km/h."""
-    decision = keeper(PRESETS["paper_calibrated"]).decide(lane(-4.0), SPEED_MPS, 0)
+    decision = lane_keeper(PRESETS["paper_calibrated"]).decide(lane(-4.0), SPEED_MPS, 0)
     assert decision.steering_rad == pytest.approx(-0.21)
 
 
 def test_the_first_lane_is_followed() -> None:
     """The first lane is followed by the first decision."""
-    decision = keeper().decide(lane(0.3), 0.0, 123)
+    decision = lane_keeper().decide(lane(0.3), 0.0, 123)
     assert decision.steering_rad > 0
     assert decision.throttle == 1.0
 
@@ -79,19 +79,19 @@ def lose_lane(controller: LaneKeeper, after_ns: int) -> Decision:
 def test_without_a_lane_there_is_no_throttle() -> None:
     """Without a lane the controller applies neither throttle nor brake."""
     for after_ns in (FRAME_NS, STOP_AFTER_NS + FRAME_NS):
-        decision = lose_lane(keeper(), after_ns)
+        decision = lose_lane(lane_keeper(), after_ns)
         assert (decision.throttle, decision.brake) == (0.0, 0.0)
 
 
 def test_a_lost_lane_is_followed_from_memory() -> None:
     """Half a second after the lane was lost in a curve, the wheel still follows the curve."""
-    seen = keeper().decide(lane(c2=0.5 / 87), SPEED_MPS, 0)
-    assert lose_lane(keeper(), BRAKE_AFTER_NS).steering_rad == pytest.approx(seen.steering_rad, rel=0.15)
+    in_curve = lane_keeper().decide(lane(c2=0.5 / 87), SPEED_MPS, 0)
+    assert lose_lane(lane_keeper(), BRAKE_AFTER_NS).steering_rad == pytest.approx(in_curve.steering_rad, rel=0.15)
 
 
 def test_a_lost_lane_with_an_offset_is_reached() -> None:
     """A lane lost with a lateral offset is reached by dead reckoning, and the wheel straightens."""
-    controller = keeper()
+    controller = lane_keeper()
     first = controller.decide(lane(0.8), SPEED_MPS, 0).steering_rad
     for now_ns in range(FRAME_NS, 2 * NS_PER_S, FRAME_NS):
         last = controller.decide(lane(confidence=0.0), SPEED_MPS, now_ns).steering_rad
@@ -100,10 +100,10 @@ def test_a_lost_lane_with_an_offset_is_reached() -> None:
 
 def test_a_new_lane_replaces_the_remembered_one() -> None:
     """After a loss, the first new lane replaces the remembered one."""
-    controller = keeper()
+    controller = lane_keeper()
     lose_lane(controller, NS_PER_S)
-    again = controller.decide(lane(-0.5), SPEED_MPS, NS_PER_S + FRAME_NS)
-    assert again.steering_rad == keeper().decide(lane(-0.5), SPEED_MPS, 0).steering_rad
+    new_decision = controller.decide(lane(-0.5), SPEED_MPS, NS_PER_S + FRAME_NS)
+    assert new_decision.steering_rad == lane_keeper().decide(lane(-0.5), SPEED_MPS, 0).steering_rad
 
 
 def test_unknown_names_are_user_errors() -> None:

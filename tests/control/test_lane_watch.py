@@ -3,7 +3,7 @@ from lavt.control.lane_watch import BRAKE_AFTER_NS, LANE_CONFIDENCE, STOP_AFTER_
 START_NS = 7_000_000_000
 
 
-def test_without_a_lane_it_brakes_at_500_ms_and_stops_at_2500_ms() -> None:
+def test_without_a_lane_the_watch_brakes_at_500_ms_and_stops_at_2500_ms() -> None:
     """Without a lane for 0.5 s the watch returns "brake", for 2.5 s "stop"."""
     watch = LaneWatch()
     assert watch.check(1.0, START_NS) == "ok"
@@ -23,7 +23,7 @@ def test_a_lane_restarts_the_time() -> None:
 
 
 def test_without_any_lane_time_counts_from_the_first_picture() -> None:
-    """If no lane was ever seen, the time counts from the first picture."""
+    """If no lane was ever detected, the time counts from the first picture."""
     watch = LaneWatch()
     assert watch.check(0.0, START_NS) == "ok"
     assert watch.check(0.0, START_NS + STOP_AFTER_NS) == "stop"

@@ -59,12 +59,12 @@ def test_a_lane_beyond_the_lookahead_is_approached_at_the_largest_curvature() ->
 
 
 def test_the_circle_leads_to_the_goal() -> None:
-    """Driving the curvature for the length of its arc ends at the goal."""
-    bent = lane(0.5, 0.1, 0.01)
-    curvature = pursuit_curvature_per_m(bent, 8.0)
+    """A car that drives the pursuit curvature along its arc reaches the goal."""
+    curved_lane = lane(0.5, 0.1, 0.01)
+    curvature = pursuit_curvature_per_m(curved_lane, 8.0)
     half_angle_rad = math.asin(curvature * 8.0 / 2)
     x_m, y_m, _ = move_along_arc(ORIGIN, 2 * half_angle_rad / curvature, curvature)
-    assert (x_m, y_m) == pytest.approx(goal_point_m(bent, 8.0), abs=1e-3)
+    assert (x_m, y_m) == pytest.approx(goal_point_m(curved_lane, 8.0), abs=1e-3)
 
 
 def test_steering_and_curvature_are_inverse() -> None:
@@ -82,12 +82,12 @@ def test_the_path_on_a_curve_has_its_curvature() -> None:
 
 def test_the_path_leads_back_to_the_lane() -> None:
     """The path of a car 1 m off its lane and turned away leads to within 0.3 m of the centre."""
-    beside = lane(c0=-1.0, c1=-0.1)
-    place, curvature = ORIGIN, pursuit_curvature_per_m(beside, 6.0)
-    for following in pursuit_path_per_m(beside, 6.0, limit_per_m=1.0):
-        place = move_along_arc(place, PATH_STEP_M, curvature)
-        curvature = following
-    x_m, y_m, heading_rad = place
+    offset_lane = lane(c0=-1.0, c1=-0.1)
+    position, curvature = ORIGIN, pursuit_curvature_per_m(offset_lane, 6.0)
+    for next_curvature in pursuit_path_per_m(offset_lane, 6.0, limit_per_m=1.0):
+        position = move_along_arc(position, PATH_STEP_M, curvature)
+        curvature = next_curvature
+    x_m, y_m, heading_rad = position
     assert y_m == pytest.approx(-1.0 - 0.1 * x_m, abs=0.3)
     assert heading_rad == pytest.approx(math.atan(-0.1), abs=0.05)
 

@@ -22,7 +22,7 @@ FRAME_NS = 33_333_333
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Drive:
+class SyntheticDrive:
     """The parameters of a synthetic drive. Times count from the start of the drive."""
 
     seconds: float = 12.0
@@ -39,21 +39,21 @@ class Drive:
     server_host: str = "vehicle"
     client_host: str = "desk"
     ending: str | None = "completed"
-    wobble_m: float = 0.5
+    wave_amplitude_m: float = 0.5
     step_s: float = 0.0
     """The step of the client's wall clock."""
     stepped_s: float = 6.0
     """The time of the step; the default is the middle of a drive of default length."""
-    waited_s: int = 1
+    sampled_before_s: int = 1
     """The time before the drive in which both sides sampled their clocks."""
     server_counts: tuple[tuple[str, int], ...] = ()
     skipped: int = 0
     """The number of frames that the camera missed during the drive."""
     undecoded: int | None = 0
     """The number of undecoded frames from number 60 on; None: the record has no field `decoded`."""
-    server_unpolled_s: tuple[int, int] = (0, 0)
+    server_unsampled_s: tuple[int, int] = (0, 0)
     """The interval (end excluded) in which the server did not sample its clocks."""
-    client_unpolled_s: tuple[int, int] = (0, 0)
+    client_unsampled_s: tuple[int, int] = (0, 0)
     capture_ms: float | None = None
     """The time from a frame's exposure to its stamp; None: the camera does not report it."""
     server_clock: Callable[[int], dict[str, Any]] = lambda _second: {}
@@ -61,11 +61,11 @@ class Drive:
     client_clock: Callable[[int], dict[str, Any]] = lambda _second: {}
     probes: bool = True
     """True if the client's probe was answered, twice per second."""
-    there_ms: float = 0.3
+    to_server_ms: float = 0.3
     """The delay of a probe from the client to the server."""
-    back_ms: float = 0.3
+    to_client_ms: float = 0.3
     late: int = 0
-    """The number of events `late` of the physics."""
+    """The number of events `late`, which report late physics."""
     began_s: float = 0.0
     """The start of the drive on the true time scale."""
 
@@ -75,10 +75,10 @@ class Drive:
 
     def client(self, at_ns: int) -> Now:
         """Return the client's clocks at a time of the drive: behind by the offset, and losing `drift` per second."""
-        ticked = at_ns - round(at_ns * self.drift)
+        elapsed_ns = at_ns - round(at_ns * self.drift)
         step_ns = round(self.step_s * NS_PER_S) if at_ns > self.stepped_s * NS_PER_S else 0
         wall_ns = WALL_NS + round((self.began_s - self.offset_s) * NS_PER_S)
-        return Now(CLIENT_MONO_NS + ticked, wall_ns + ticked + step_ns)
+        return Now(CLIENT_MONO_NS + elapsed_ns, wall_ns + elapsed_ns + step_ns)
 
     def client_correction_s(self, at_ns: int) -> float:
         """Return the correction of a perfect time source on the client, which does not notice a step in the drive."""
@@ -98,15 +98,15 @@ def on_route(progress_m: float, left_m: float) -> tuple[float, float]:
     return (RADIUS_M - left_m) * math.sin(angle_rad), RADIUS_M - (RADIUS_M - left_m) * math.cos(angle_rad)
 
 
-def write_server(drive: Drive, path: Path) -> None:
+def write_server(drive: SyntheticDrive, path: Path) -> None:
     writer = RecordWriter(path, "server")
     writer.annotate("versions", {"lavt": "0.1.0"})
     writer.annotate("machine", {"cores": "2"})
     points = [on_route(index / 2, 0.0) for index in range(201)]
     writer.write("route", {"name": "A key", "length_m": 100.0, "points": points}, drive.server(0))
     end_ns = round(drive.seconds * NS_PER_S)
-    for second in range(-drive.waited_s, math.ceil(drive.seconds) + 2):
-        if second in range(*drive.server_unpolled_s):
+    for second in range(-drive.sampled_before_s, math.ceil(drive.seconds) + 2):
+        if second in range(*drive.server_unsampled_s):
             continue
         now = drive.server(second * NS_PER_S)
         clock = {"host": drive.server_host, "source": "chrony", "correction_s": 0.0, "bound_s": drive.bound_s}
@@ -132,8 +132,8 @@ def write_server(drive: Drive, path: Path) -> None:
     for index in range(round(drive.seconds * 60) + 1):
         at_ns = index * NS_PER_S // 60
         progress_m = 8.0 * at_ns / NS_PER_S
-        error_m = drive.wobble_m * math.sin(progress_m / 5)
-        slope_rad = math.atan(drive.wobble_m / 5 * math.cos(progress_m / 5))
+        error_m = drive.wave_amplitude_m * math.sin(progress_m / 5)
+        slope_rad = math.atan(drive.wave_amplitude_m / 5 * math.cos(progress_m / 5))
         mono_ns = drive.server(at_ns).mono_ns
         steering_rad = -0.05 * math.sin(progress_m / 5)
         x_m, y_m = on_route(progress_m, error_m)
@@ -147,7 +147,7 @@ def write_server(drive: Drive, path: Path) -> None:
     writer.close()
 
 
-def write_frame(writer: RecordWriter, drive: Drive, number: int) -> None:
+def write_frame(writer: RecordWriter, drive: SyntheticDrive, number: int) -> None:
     now = drive.server(number * FRAME_NS)
     frame = {
         "number": number,
@@ -170,9 +170,9 @@ def write_frame(writer: RecordWriter, drive: Drive, number: int) -> None:
     writer.write("timeline", {**timeline, "stages": stages}, now)
 
 
-def write_admission(writer: RecordWriter, drive: Drive, sequence: int, number: int, later_ns: int) -> None:
+def write_admission(writer: RecordWriter, drive: SyntheticDrive, sequence: int, number: int, delay_ns: int) -> None:
     read_ns = number * FRAME_NS + drive.tau_v_of_frame_ns(number)
-    sent_ns = read_ns + round(drive.client_ms * NS_PER_MS) + later_ns
+    sent_ns = read_ns + round(drive.client_ms * NS_PER_MS) + delay_ns
     received_ns = sent_ns + round(drive.tau_c_ms * NS_PER_MS)
     applied_ns = received_ns + round(drive.actuator_ms * NS_PER_MS)
     rejected = sequence % 100 == 98  # an even one is a repetition, so that no loop latency changes
@@ -195,10 +195,10 @@ def write_admission(writer: RecordWriter, drive: Drive, sequence: int, number: i
     writer.write("admission", admission, drive.server(applied_ns))
 
 
-def write_client(drive: Drive, path: Path) -> None:
+def write_client(drive: SyntheticDrive, path: Path) -> None:
     writer = RecordWriter(path, "client")
-    for second in range(-drive.waited_s, math.ceil(drive.seconds) + 2):
-        if second in range(*drive.client_unpolled_s):
+    for second in range(-drive.sampled_before_s, math.ceil(drive.seconds) + 2):
+        if second in range(*drive.client_unsampled_s):
             continue
         at_ns = second * NS_PER_S
         now = drive.client(at_ns)
@@ -206,7 +206,9 @@ def write_client(drive: Drive, path: Path) -> None:
         clock = {"host": drive.client_host, "source": "chrony", "correction_s": correction_s, "bound_s": drive.bound_s}
         sample = {"mono_ns": now.mono_ns, "wall_ns": now.wall_ns, **clock, **drive.client_clock(second)}
         writer.write("clock", sample, now)
-    for index in range(-2 * drive.waited_s, round(drive.seconds * 2) + 3 if drive.probes else -2 * drive.waited_s):
+    for index in range(
+        -2 * drive.sampled_before_s, round(drive.seconds * 2) + 3 if drive.probes else -2 * drive.sampled_before_s
+    ):
         write_probe(writer, drive, index)
     for number in range(-3, round(drive.seconds * NS_PER_S) // FRAME_NS + 1):
         stamp_ns = drive.server(number * FRAME_NS).wall_ns
@@ -233,15 +235,15 @@ def write_client(drive: Drive, path: Path) -> None:
     writer.close()
 
 
-def write_probe(writer: RecordWriter, drive: Drive, index: int) -> None:
+def write_probe(writer: RecordWriter, drive: SyntheticDrive, index: int) -> None:
     sent_ns = index * NS_PER_S // 2
-    reached_ns = sent_ns + round(drive.there_ms * NS_PER_MS)
-    answered_ns = reached_ns + NS_PER_MS // 10
-    arrived_ns = answered_ns + round(drive.back_ms * NS_PER_MS)
+    received_ns = sent_ns + round(drive.to_server_ms * NS_PER_MS)
+    answered_ns = received_ns + NS_PER_MS // 10
+    arrived_ns = answered_ns + round(drive.to_client_ms * NS_PER_MS)
     probe = ClockProbe(
         index % 2**32,
         drive.client(sent_ns).wall_ns,
-        drive.server(reached_ns).wall_ns,
+        drive.server(received_ns).wall_ns,
         drive.server(answered_ns).wall_ns,
         drive.client(arrived_ns).wall_ns,
     )
@@ -250,11 +252,11 @@ def write_probe(writer: RecordWriter, drive: Drive, index: int) -> None:
 
 @pytest.fixture(scope="session")
 def make_run() -> Callable[..., Path]:
-    """Return a function that writes both records of a synthetic drive into a directory; keywords are `Drive`'s."""
+    """Return a function that writes both records of a synthetic drive; its keywords are the fields of the drive."""
 
     def make(directory: Path, **settings: Any) -> Path:
         directory.mkdir(parents=True, exist_ok=True)
-        drive = Drive(**settings)
+        drive = SyntheticDrive(**settings)
         write_server(drive, directory / "server.mcap")
         write_client(drive, directory / "client.mcap")
         return directory

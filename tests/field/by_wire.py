@@ -1,4 +1,4 @@
-"""A server that drives a software car over CAN, as real processes, observed from the car's side."""
+"""A server that drives a software car over CAN: real processes, which the tests observe from the car's side."""
 
 from __future__ import annotations
 
@@ -31,18 +31,19 @@ from lavt.experiment.runs.side_configs import server_config
 GROUP = "239.74.163.2"
 """A UDP multicast group that serves as a CAN bus between processes where the kernel has none."""
 CLOCK = MachineClock()
-LONGEST_NS = 60 * NS_PER_S
-KIT_MS = 100
-"""A kit disengages this long after the last command, which it received before the fault."""
-ROOM_MS = 60
+MAX_WAIT_NS = 60 * NS_PER_S
+KIT_TIMEOUT_MS = 100
+"""A kit disengages this long after the last command that it received."""
+TOLERANCE_MS = 60
 """Tolerance for a busy machine, added to the design's limits."""
-BEFORE_MS = 200
-"""A stall of the host this long before the kit disengaged may be its cause."""
-STOP_BEFORE_MS, STOP_STALL_MS = 1500, 100
-"""The same for a safe stop, which begins after 500 ms and is reported within 200 ms; shorter stalls do not cause it."""
-SLOW_MS = 3000
-"""Many short stalls in this time before a stop may be its cause."""
-LATE = ("reports are missing", "did not stay enabled", "did not brake within")
+KIT_LOOKBACK_MS = 200
+"""A stall of the host explains that the kit disengaged if it ended at most this long before."""
+STOP_LOOKBACK_MS, STOP_STALL_MS = 1500, 100
+"""The same for a safe stop, which begins after 500 ms and is reported within 200 ms; and the shortest stall that can
+cause one."""
+SLOW_MACHINE_LOOKBACK_MS = 3000
+"""Many short stalls in this time before a stop may be its cause together."""
+TIMING_FAILURES = ("reports are missing", "did not stay enabled", "did not brake within")
 """The failures of `lavt can test-watchdog` that depend on timing."""
 GENERATIONS = ("dataspeed_gen1", "dataspeed_gen2")
 
@@ -54,16 +55,16 @@ def pass_watchdog_test(profile: str, work: Path, stalls: Stalls) -> RunConfig:
     with software_car(config) as car:
         command = [sys.executable, "-m", "lavt", "can", "test-watchdog", str(config), "--yes"]
         since_ns = CLOCK.now().mono_ns
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        message = f"{done.stderr}, {car.events}"
-        assert done.returncode == 0 or is_late(done.stderr), message
-        stalls.require(done.returncode == 0, message, since_ns, CLOCK.now().mono_ns)
+        completed = subprocess.run(command, capture_output=True, text=True, check=False)
+        message = f"{completed.stderr}, {car.events}"
+        assert completed.returncode == 0 or is_late(completed.stderr), message
+        stalls.require(completed.returncode == 0, message, since_ns, CLOCK.now().mono_ns)
     return run
 
 
 def is_late(message: str) -> bool:
     """Return whether the watchdog test failed in a way that a stalled host can cause."""
-    return any(part in message for part in LATE)
+    return any(part in message for part in TIMING_FAILURES)
 
 
 def write_config(run: RunConfig, path: Path) -> Path:
@@ -136,11 +137,11 @@ class SoftwareCarProcess:
             line = self._lines.get()
             if line is not None and "kind" in line:
                 self.events.append(line)
-        matching = (each for each in self.events if each["kind"] == kind and text in each["text"])
-        return next((each["mono_ns"] for each in matching if each["mono_ns"] >= since_ns), None)
+        matching = (event for event in self.events if event["kind"] == kind and text in event["text"])
+        return next((event["mono_ns"] for event in matching if event["mono_ns"] >= since_ns), None)
 
-    def wait(self, kind: str, text: str, *, since_ns: int = 0, within_ns: int = LONGEST_NS) -> int:
-        """Wait for an event and return its time, unless the watchdog brakes before.
+    def wait(self, kind: str, text: str, *, since_ns: int = 0, within_ns: int = MAX_WAIT_NS) -> int:
+        """Wait for an event and return its time; raise if the watchdog brakes first.
 
         An event that never comes is a failure, whatever the host did.
         """
@@ -161,7 +162,7 @@ class SoftwareCarProcess:
 
     def unexpected_release(self, braked_ns: int, message: str) -> Exception:
         """Return the exception for a kit that got no command in time without a fault."""
-        return self.verdict(message, braked_ns - BEFORE_MS * NS_PER_MS, braked_ns)
+        return self.verdict(message, braked_ns - KIT_LOOKBACK_MS * NS_PER_MS, braked_ns)
 
     def verdict(self, message: str, since_ns: int, until_ns: int) -> Exception:
         """Return the exception for a late reaction."""
@@ -169,13 +170,13 @@ class SoftwareCarProcess:
             return AssertionError(message)
         return self.stalls.verdict(message, since_ns, until_ns, stall_ms=self.stall_ms)
 
-    def wait_for_watchdog_ms(self, since_ns: int, *, room_ms: float = ROOM_MS) -> float:
+    def wait_for_watchdog_ms(self, since_ns: int, *, tolerance_ms: float = TOLERANCE_MS) -> float:
         """Wait until the watchdog brakes, check that it is in time, and return the time since `since_ns` in ms."""
         at_ns = self.wait("watchdog", "watchdog brakes: no command in time", since_ns=since_ns)
-        took_ms, limit_ms = ms_since(at_ns, since_ns), KIT_MS + room_ms
+        took_ms, limit_ms = ms_since(at_ns, since_ns), KIT_TIMEOUT_MS + tolerance_ms
         if took_ms >= limit_ms:
-            message = f"the kit brakes only {took_ms:.0f} ms after: {self.events}"
-            raise self.verdict(message, since_ns - KIT_MS * NS_PER_MS, since_ns + round(limit_ms * NS_PER_MS))
+            message = f"the kit brakes only after {took_ms:.0f} ms: {self.events}"
+            raise self.verdict(message, since_ns - KIT_TIMEOUT_MS * NS_PER_MS, since_ns + round(limit_ms * NS_PER_MS))
         return took_ms
 
     def wait_for_park_ms(self, since_ns: int) -> float:
@@ -248,19 +249,19 @@ class RunningDrive:
         if braked_ns is not None:
             failure = self.car.unexpected_release(braked_ns, message)
         else:
-            since_ns = now_ns - STOP_BEFORE_MS * NS_PER_MS
+            since_ns = now_ns - STOP_LOOKBACK_MS * NS_PER_MS
             failure = self.stalls.verdict(message, since_ns, now_ns, stall_ms=STOP_STALL_MS)
-        return excuse_slow_machine(failure, self.stalls, now_ns - SLOW_MS * NS_PER_MS, now_ns)
+        return excuse_slow_machine(failure, self.stalls, now_ns - SLOW_MACHINE_LOOKBACK_MS * NS_PER_MS, now_ns)
 
     def require_within(self, took_ms: float, limit_ms: float, since_ns: int, what: str) -> None:
         """Require that something took less than a limit; only stalls until the limit excuse a delay."""
         until_ns = since_ns + round(limit_ms * NS_PER_MS)
-        message = f"{what} only {took_ms:.0f} ms after: {self.car.events}"
+        message = f"{what} only after {took_ms:.0f} ms: {self.car.events}"
         self.stalls.require(took_ms < limit_ms, message, since_ns, until_ns, stall_ms=STOP_STALL_MS)
 
     def wait(self, condition: Callable[[dict[str, Any]], bool], failure: str) -> None:
-        """Wait for a condition on the server's status; never meeting it is a failure, whatever the host did."""
-        end_ns = CLOCK.now().mono_ns + LONGEST_NS
+        """Wait for a condition on the server's status; if it is never true the test fails, whatever the host did."""
+        end_ns = CLOCK.now().mono_ns + MAX_WAIT_NS
         while not condition(self.status()):
             assert CLOCK.now().mono_ns < end_ns, f"{failure}: {self.loop.server.latest}, {self.car.events}"
             pause(20 * NS_PER_MS)
@@ -268,15 +269,17 @@ class RunningDrive:
 
 @contextmanager
 def driving(run: RunConfig, work: Path, stalls: Stalls, *, program: Sequence[str] = LAVT) -> Iterator[RunningDrive]:
-    """Drive a software car at more than 5 m/s, through routers and sockets on the loopback."""
-    with started(run, work, stalls, program=program) as driven:
-        driven.reach_speed()
-        yield driven
+    """Drive a software car, through routers and sockets on the loopback; yield when it drives at more than 5 m/s."""
+    with running_drive(run, work, stalls, program=program) as drive:
+        drive.reach_speed()
+        yield drive
 
 
 @contextmanager
-def started(run: RunConfig, work: Path, stalls: Stalls, *, program: Sequence[str] = LAVT) -> Iterator[RunningDrive]:
-    """Run a software car, its server and a client."""
+def running_drive(
+    run: RunConfig, work: Path, stalls: Stalls, *, program: Sequence[str] = LAVT
+) -> Iterator[RunningDrive]:
+    """Run a software car, its server and a client, without waiting until the car drives."""
     config = write_config(run, work / "car.yaml")
     with software_car(config, stalls=stalls) as car, Processes(work) as processes:
         loop = start_loop(processes, plan_run(run), work, work, once=False, server_program=program)

@@ -11,7 +11,7 @@ from tests.require import need
 
 @pytest.fixture(scope="session")
 def namespaces() -> None:
-    """Skip unless network namespaces can be made."""
+    """Skip the test unless network namespaces can be made."""
     if kernel_lacks_namespaces():
         need("namespaces", "needs root and a kernel that lets it make network namespaces with NAT")
     if programs_missing():
@@ -19,15 +19,15 @@ def namespaces() -> None:
 
 
 @pytest.fixture(scope="session")
-def tell(request: pytest.FixtureRequest) -> Callable[[str], None]:
-    """Print a measurement, even if the test fails or its output is captured."""
+def print_report(request: pytest.FixtureRequest) -> Callable[[str], None]:
+    """Return a function that prints a measurement, even if the test fails or its output is captured."""
     plugins = request.config.pluginmanager
     reporter, capture = plugins.getplugin("terminalreporter"), plugins.getplugin("capturemanager")
     assert reporter is not None
     assert capture is not None
 
-    def lines(text: str) -> None:
+    def write_lines(text: str) -> None:
         with capture.global_and_fixture_disabled():
             reporter.write_line(f"\n{text}")
 
-    return lines
+    return write_lines

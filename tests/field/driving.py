@@ -1,4 +1,4 @@
-"""Run a loop whose ends are in network namespaces of their own, and break it on purpose."""
+"""Run a loop whose ends are in network namespaces of their own, and cause outages in it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from tests.field.namespaces import INTERNET, VEHICLE, Field, Way
+from tests.field.namespaces import INTERNET, VEHICLE, Direction, Field
 
 from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
@@ -19,8 +19,8 @@ from lavt.recording.record import Record, read_record
 
 SERVER = ("configs/server.yaml", "vehicle.route=straight", "vehicle.scenery=none", "vehicle.time_limit_s=3600")
 CLIENT = ("configs/client.yaml", f"video.server={VEHICLE}", "controller.rearm=true")
-BOTH = ("record.video=false",)
-OUTSIDE = Path(__file__).with_name("outside.py")
+BOTH_SIDES = ("record.video=false",)
+OBSERVER = Path(__file__).with_name("command_observer.py")
 POLL_NS = 20 * NS_PER_MS
 DRIVING_WITHIN_S = 90.0
 """Routers find each other, the client gets control, arms and speeds up: about 8 s on a quiet machine."""
@@ -34,7 +34,7 @@ def wait_until(expectation: str, condition: Callable[[], bool], limit_s: float =
         pause(POLL_NS)
 
 
-def _mixed(host: str) -> str:
+def _udp_endpoint(host: str) -> str:
     return f"udp/{host}:7448?rel=1;mixed_rel=1"
 
 
@@ -43,7 +43,7 @@ class Links:
     """The configs of the routers, the rendezvous and both sides, each with its changes."""
 
     vehicle: tuple[str, ...] = ("router-server.json5",)
-    operator: tuple[str, ...] = ("router-client.json5", f'connect.endpoints=["{_mixed(VEHICLE)}"]')
+    operator: tuple[str, ...] = ("router-client.json5", f'connect.endpoints=["{_udp_endpoint(VEHICLE)}"]')
     cloud: tuple[str, ...] = ()
     """Empty without a router in the cloud: the operator's router then dials the vehicle's."""
     rendezvous: tuple[str, ...] = ()
@@ -64,15 +64,15 @@ TCP = Links(
     ),
     ("router-client.json5", f'connect.endpoints=["tcp/{VEHICLE}:7448"]', "transport.link.tx.lease=10000"),
 )
-"""Zenoh's defaults: TCP and a lease of 10 s. The kernel buffers messages in an outage and delivers them afterwards."""
+"""Zenoh's defaults: TCP and a lease of 10 s. The kernel buffers messages during an outage and delivers them later."""
 CLOUD = Links(
     (
         "router-client.json5",
         'listen.endpoints=["tcp/127.0.0.1:7447"]',
-        f'connect.endpoints=["{_mixed(INTERNET)}"]',
+        f'connect.endpoints=["{_udp_endpoint(INTERNET)}"]',
     ),
-    ("router-client.json5", f'connect.endpoints=["{_mixed(INTERNET)}"]'),
-    ("router-server.json5", f'listen.endpoints=["{_mixed("0.0.0.0")}"]'),
+    ("router-client.json5", f'connect.endpoints=["{_udp_endpoint(INTERNET)}"]'),
+    ("router-server.json5", f'listen.endpoints=["{_udp_endpoint("0.0.0.0")}"]'),
 )
 """Both sides' routers dial a router in the cloud."""
 
@@ -97,7 +97,7 @@ def through_rendezvous(keys: Path) -> Links:
 
 @dataclass(frozen=True)
 class Outage:
-    """An outage with its begin and end; its effects are measured until the next outage begins."""
+    """An outage with its beginning and end; its effects are measured until the next outage begins."""
 
     name: str
     begin: Now
@@ -115,7 +115,7 @@ class Drive:
     server_program: tuple[str, ...] = LAVT
     outages: list[Outage] = field(default_factory=list)
     running: dict[str, Process] = field(default_factory=dict)
-    started: dict[str, int] = field(default_factory=dict)
+    start_counts: dict[str, int] = field(default_factory=dict)
     clock: MachineClock = field(default_factory=MachineClock)
 
     def start(self) -> None:
@@ -125,15 +125,15 @@ class Drive:
         if self.links.rendezvous:
             self.start_process("rendezvous")
         self.start_process("vehicle-router")
-        self.start_process("outside")
+        self.start_process("observer")
         self.start_process("server")
         self.start_process("operator-router")
         self.start_process("client")
 
     def start_process(self, role: str) -> Process:
         """Start or restart the process with a role, and wait until it is ready."""
-        self.started[role] = self.started.get(role, 0) + 1
-        name = f"{role}-{self.started[role]}"
+        self.start_counts[role] = self.start_counts.get(role, 0) + 1
+        name = f"{role}-{self.start_counts[role]}"
         out = str(self.work / name)
         links = self.links
         table: dict[str, tuple[str, list[str], tuple[str, ...]]] = {
@@ -143,7 +143,7 @@ class Drive:
             "rendezvous": ("internet", _network_arguments("rendezvous", *links.rendezvous), LAVT),
             "server": ("vehicle", _side_arguments("server", (*SERVER, *links.server), out), self.server_program),
             "client": ("operator", _side_arguments("client", (*CLIENT, *links.client), out), LAVT),
-            "outside": ("vehicle", [out], (str(OUTSIDE),)),
+            "observer": ("vehicle", [out], (str(OBSERVER),)),
         }
         part, arguments, program = table[role]
         process = self.networks.inside(part, lambda: self.processes.start(name, *arguments, program=program))
@@ -151,19 +151,19 @@ class Drive:
         self.running[role] = process
         return process
 
-    def reach(self, speed_mps: float) -> None:
-        """Wait until the vehicle is driven and has reached a speed."""
+    def reach_speed(self, speed_mps: float) -> None:
+        """Wait until the vehicle is driven, at this speed or more."""
 
-        def reached() -> bool:
+        def is_reached() -> bool:
             status = self.running["server"].latest.get("status", {})
             phase = self.running["client"].latest.get("status", {}).get("phase")
             return (status.get("safety"), phase) == ("driving", "driving") and bool(status["speed_mps"] >= speed_mps)
 
-        wait_until(f"the vehicle is driven with {speed_mps} m/s", reached)
+        wait_until(f"the vehicle is driven at {speed_mps} m/s", is_reached)
 
-    def cut(self, name: str, ways: Sequence[Way], duration_s: float) -> None:
+    def block_network(self, name: str, directions: Sequence[Direction], duration_s: float) -> None:
         """Block the network in these directions for a while."""
-        self.networks.block(ways)
+        self.networks.block(directions)
         begin = self.clock.now()
         pause(round(duration_s * NS_PER_S))
         self.networks.unblock()
@@ -191,18 +191,19 @@ class Drive:
     def records(self, side: str) -> list[Record]:
         """Read the records of all processes of a side."""
         return [
-            read_record(self.work / f"{side}-{number}" / f"{side}.mcap") for number in range(1, self.started[side] + 1)
+            read_record(self.work / f"{side}-{number}" / f"{side}.mcap")
+            for number in range(1, self.start_counts[side] + 1)
         ]
 
     def observed_commands(self) -> list[dict[str, Any]]:
         """Return every command that the observer recorded."""
-        lines = [json.loads(line) for line in (self.work / "outside-1").read_text().splitlines()]
-        assert not any("unreadable" in line for line in lines)
+        lines = [json.loads(line) for line in (self.work / "observer-1").read_text().splitlines()]
+        assert not any("invalid_message_bytes" in line for line in lines)
         return lines
 
 
 @contextmanager
-def driven(
+def running_loop(
     networks: Field, work: Path, links: Links = MIXED, server_program: tuple[str, ...] = LAVT
 ) -> Iterator[Drive]:
     """Run a loop in these networks."""
@@ -219,7 +220,7 @@ def _network_arguments(command: str, *file_and_changes: str) -> list[str]:
 
 def _side_arguments(side: str, config_and_changes: tuple[str, ...], out: str) -> list[str]:
     config, *changes = config_and_changes
-    return [side, config, *_sets([*changes, *BOTH]), "--out", out]
+    return [side, config, *_sets([*changes, *BOTH_SIDES]), "--out", out]
 
 
 def _sets(changes: Sequence[str]) -> list[str]:

@@ -9,8 +9,8 @@ only connections from inside and the ports that a test forwards:
 
     vehicle 192.168.1.2 ── vehicle-nat 203.0.113.2 ── internet ── 198.51.100.2 operator-nat ── 192.168.2.2 operator
 
-All are network namespaces of one kernel, and so have one clock. Their names contain the test's process id, by which the
-next test removes the namespaces of a test that was killed.
+All are network namespaces of one kernel, and so have one clock. Their names contain the process id of the test. If a
+test was killed, the next test finds its namespaces by this id and removes them.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from typing import Literal, TypeVar
 
 from tests.kernel.namespaces import command, inside
 
-Way = Literal["uplink", "downlink"]
+Direction = Literal["uplink", "downlink"]
 """uplink: client to server; downlink: server to client."""
 
 PACKAGES = ("iproute2", "nftables")
@@ -37,9 +37,9 @@ PREFIX = "lavt-field-"
 VEHICLE, OPERATOR, INTERNET = "203.0.113.2", "198.51.100.2", "198.51.100.1"
 VEHICLE_AT_HOME = "192.168.1.2"
 NEXT_VEHICLE, NEXT_OPERATOR = "203.0.113.7", "198.51.100.7"
-"""The addresses after a change."""
-INPUT_DEVICES: dict[Way, str] = {"uplink": "operator", "downlink": "vehicle"}
-"""The device by which packets of a direction enter the internet."""
+"""The public addresses of the home routers after a change of address."""
+INPUT_DEVICES: dict[Direction, str] = {"uplink": "operator", "downlink": "vehicle"}
+"""The device through which packets of a direction enter the internet."""
 INTERNET_RULES = (
     "add table inet outage",
     "add chain inet outage counting { type filter hook postrouting priority mangle; }",
@@ -85,45 +85,45 @@ class End:
 
 @dataclass(frozen=True)
 class Field:
-    """The network namespaces of a test process, by the names in the drawing above."""
+    """The network namespaces of a test process; `part` is a name in the drawing above."""
 
-    owner: int
+    owner_pid: int
 
     def name(self, part: str) -> str:
         """Return the system's name of a namespace."""
-        return f"{PREFIX}{self.owner}-{part}"
+        return f"{PREFIX}{self.owner_pid}-{part}"
 
     def run(self, part: str, *words: str) -> str:
         """Run a command in a namespace and return its output; the command must succeed."""
-        ended = subprocess.run(
+        completed = subprocess.run(
             ["ip", "netns", "exec", self.name(part), *words], capture_output=True, text=True, check=False
         )
-        assert ended.returncode == 0, f"{words}: {ended.stderr}"
-        return ended.stdout
+        assert completed.returncode == 0, f"{words}: {completed.stderr}"
+        return completed.stdout
 
     def inside(self, part: str, function: Callable[[], Result]) -> Result:
         """Call a function in a namespace, in which it may also start processes."""
         return inside(self.name(part), function)
 
-    def block(self, ways: Sequence[Way]) -> None:
+    def block(self, directions: Sequence[Direction]) -> None:
         """Silently drop all packets in these directions."""
-        rules = (f"add rule inet outage forward iifname {INPUT_DEVICES[way]} drop" for way in ways)
+        rules = (f"add rule inet outage forward iifname {INPUT_DEVICES[direction]} drop" for direction in directions)
         self.run("internet", "nft", "; ".join(rules))
 
     def unblock(self) -> None:
         """Forward all packets again."""
         self.run("internet", "nft", "flush chain inet outage forward")
 
-    def count(self, name: str, packets: str) -> None:
+    def count_packets(self, name: str, packets: str) -> None:
         """Start to count the internet's outgoing packets that match nft's expression `packets`."""
         rules = f"add counter inet outage {name}; add rule inet outage counting {packets} counter name {name}"
         self.run("internet", "nft", rules)
 
-    def counted(self, name: str) -> int:
-        """Return how many packets were counted."""
-        found = re.search(r"packets (\d+)", self.run("internet", "nft", f"list counter inet outage {name}"))
-        assert found is not None
-        return int(found[1])
+    def packet_count(self, name: str) -> int:
+        """Return how many packets the named counter has counted."""
+        match = re.search(r"packets (\d+)", self.run("internet", "nft", f"list counter inet outage {name}"))
+        assert match is not None
+        return int(match[1])
 
     def forward_ports(self, ports: Sequence[int]) -> None:
         """Forward these UDP ports from the vehicle's home router to the vehicle."""
@@ -146,11 +146,11 @@ class Field:
 
     def _join(self, end: End, router: End) -> None:
         """Link two namespaces; the second is the default route of the first."""
-        devices = [f"{each.device} netns {self.name(each.part)}" for each in (end, router)]
+        devices = [f"{link_end.device} netns {self.name(link_end.part)}" for link_end in (end, router)]
         command(f"ip link add {devices[0]} type veth peer name {devices[1]}")
-        for each in (end, router):
-            command(f"ip -n {self.name(each.part)} addr add {each.address}/24 dev {each.device}")
-            command(f"ip -n {self.name(each.part)} link set {each.device} up")
+        for link_end in (end, router):
+            command(f"ip -n {self.name(link_end.part)} addr add {link_end.address}/24 dev {link_end.device}")
+            command(f"ip -n {self.name(link_end.part)} link set {link_end.device} up")
         command(f"ip -n {self.name(end.part)} route add default via {router.address}")
 
     def _make(self, *parts: str) -> None:
@@ -207,8 +207,8 @@ def _field(*parts: str) -> Iterator[Field]:
 def remove_stale_namespaces() -> None:
     """Remove the namespaces of tests whose process has ended."""
     for name in _list_namespaces():
-        found = re.match(rf"{PREFIX}(\d+)-", name)
-        if found and not Path(f"/proc/{found[1]}").exists():
+        match = re.match(rf"{PREFIX}(\d+)-", name)
+        if match and not Path(f"/proc/{match[1]}").exists():
             _remove(name)
 
 

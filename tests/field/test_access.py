@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import pytest
 import zenoh
-from tests.field import attacked
-from tests.field.secured import (
+from tests.field import attacks
+from tests.field.secured_routers import (
     QUIC,
     ClientStandIn,
     Intruder,
@@ -31,7 +31,7 @@ from tests.field.secured import (
     tls_changes,
 )
 from tests.require import need
-from tests.support.stalls import BUSY_SHARE, LONG_STALL_MS, Shared, Stalls
+from tests.support.stalls import BUSY_SHARE, LONG_STALL_MS, SharedResult, Stalls
 
 from lavt.control.driver_limits import CLIENT_LIMITS
 from lavt.domain import NS_PER_MS, NS_PER_S
@@ -43,8 +43,8 @@ from lavt.transport.zenoh_link import quiet_logs
 
 pytest.importorskip("cryptography")
 
-DRIVES = {"commands", "queries", "session", "netem", "state", "alive"}
-EVERYTHING = DRIVES | {
+OPERATOR_EFFECTS = {"commands", "queries", "session", "netem", "state", "alive"}
+ALL_EFFECTS = OPERATOR_EFFECTS | {
     "wildcard commands",
     "deletes",
     "long commands",
@@ -53,13 +53,14 @@ EVERYTHING = DRIVES | {
     "forged replies",
     "others' commands",
 }
-WATCHES = {"state", "alive"}
-MAY = [("operator-1", DRIVES), ("operator-2", set()), ("monitor-1", WATCHES)]
-"""Names in certificates, and all that they achieve; operator-2 has a certificate, but is in no list."""
+MONITOR_EFFECTS = {"state", "alive"}
+EFFECTS_BY_NAME = [("operator-1", OPERATOR_EFFECTS), ("operator-2", set()), ("monitor-1", MONITOR_EFFECTS)]
+"""The effects that a session can achieve, by the name in its certificate. operator-2 has a certificate, but is in no
+list."""
 MAX_OPEN_SITES = 3
 """The maximum number of attacked sites without access lists."""
 NOBODY = 65534
-CONNECT = f"import os, socket, sys; os.setgroups([]); os.setgid({NOBODY}); os.setuid({NOBODY}); " + (
+CONNECT_AS_NOBODY = f"import os, socket, sys; os.setgroups([]); os.setgid({NOBODY}); os.setuid({NOBODY}); " + (
     "socket.socket(socket.AF_UNIX).connect(sys.argv[1])"
 )
 
@@ -168,72 +169,74 @@ def site(request: pytest.FixtureRequest) -> Site:
 
 
 @pytest.mark.parametrize("mode", ["client", "router"])
-@pytest.mark.parametrize(("name", "achieves"), MAY)
-def test_access_by_name(site: Site, name: str, achieves: set[str], mode: str) -> None:
+@pytest.mark.parametrize(("name", "effects"), EFFECTS_BY_NAME)
+def test_access_depends_on_the_certificates_name(site: Site, name: str, effects: set[str], mode: str) -> None:
     """The listed operator may send commands and queries, a monitor may only see the state, an unlisted name nothing.
 
     None of them succeeds with wildcards, deletes, long messages, forged states or forged replies.
     """
     with closing(site.intruder(name, mode)) as intruder:
         site.drive(intruder.attempt)
-        assert intruder.achieved(site) == achieves
+        assert intruder.achieved(site) == effects
 
 
-def test_without_the_lists(keys: Path) -> None:
-    """Without limits of access and size the same attempts all succeed, so the other tests would detect them.
+def test_without_access_lists_every_attack_succeeds(keys: Path) -> None:
+    """Without access lists and a size limit all attacks succeed, so the other tests would detect a success.
 
-    Without the lists all traffic may stop for good (docs/security.md, "What is not protected"), so that some attempts
-    fail; they are repeated at another site.
+    Without the lists all traffic may stop for good (docs/security.md, "What is not protected"). Then the attacks that
+    have not succeeded are repeated at another site.
     """
     achieved: set[str] = set()
     for _ in range(MAX_OPEN_SITES):
         with ExitStack() as stack:
             site = start_site(stack, keys, "access_control.enabled=false", "low_pass_filter=[]", cloud=False)
             intruder = stack.enter_context(closing(site.intruder("monitor-1", "router")))
-            achieved |= site.attack(intruder, EVERYTHING - achieved)
-        if achieved == EVERYTHING:
+            achieved |= site.attack(intruder, ALL_EFFECTS - achieved)
+        if achieved == ALL_EFFECTS:
             return
-    assert achieved == EVERYTHING
+    assert achieved == ALL_EFFECTS
 
 
-def test_operators_own_router(site: Site) -> None:
+def test_messages_pass_the_operators_own_router(site: Site) -> None:
     """Commands, queries, replies and states pass through the operator's own router."""
     site.drive()
     assert set(site.vehicle.commands) == {b"operator"}
     assert set(site.vehicle.queries) == {b"operator"}
 
 
-def test_other_authority(site: Site, keys: Path, others_keys: Path) -> None:
+def test_certificate_of_another_authority_gets_no_link(site: Site, keys: Path, others_keys: Path) -> None:
     """A certificate with the same name from another authority gets no link, and the drive continues."""
     with pytest.raises(zenoh.ZError):
         open_session(site.endpoint, authority=keys / "authority.pem", own=others_keys / "operator-1.pem")
     site.drive()
 
 
-def test_no_certificate(site: Site, keys: Path) -> None:
+def test_session_without_certificate_gets_no_link(site: Site, keys: Path) -> None:
     """A session without a certificate gets no link, and the drive continues."""
     with pytest.raises(zenoh.ZError):
         open_session(site.endpoint, authority=keys / "authority.pem")
     site.drive()
 
 
-@pytest.mark.parametrize(("whose", "name"), [("others_keys", "vehicle-1"), ("keys", "operator-1")])
-def test_false_vehicle(keys: Path, whose: str, name: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
-    """An operator does not link to a router of another authority or with a stolen operator's key."""
-    theirs = request.getfixturevalue(whose)
+@pytest.mark.parametrize(("keys_fixture", "name"), [("others_keys", "vehicle-1"), ("keys", "operator-1")])
+def test_operator_rejects_a_false_vehicle(
+    keys: Path, keys_fixture: str, name: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    """An operator links neither to a router with keys of another authority nor to one with a stolen operator's key."""
+    false_keys = request.getfixturevalue(keys_fixture)
     with Processes(tmp_path) as processes:
         false = start_router(
             processes,
             "false",
             "router-cloud-tls.json5",
             f'listen.endpoints=["{QUIC}"]',
-            *tls_changes(theirs, name, "listen"),
+            *tls_changes(false_keys, name, "listen"),
         )
         with pytest.raises(zenoh.ZError):
             open_session(quic_endpoint(false), authority=keys / "authority.pem", own=keys / "operator-1.pem")
 
 
-def test_garbage_at_the_port(site: Site) -> None:
+def test_garbage_at_the_port_does_not_stop_messages(site: Site) -> None:
     """Random datagrams at the open port, some of which begin like QUIC, do not stop commands, states or replies."""
     chance = stream(1, "garbage")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
@@ -249,7 +252,7 @@ def test_garbage_at_the_port(site: Site) -> None:
         pass
 
 
-def test_local_process_without_rights(direct_site: Site) -> None:
+def test_local_process_without_permission_cannot_connect(direct_site: Site) -> None:
     """Another user of the operator's machine, without write permission on the socket file, cannot connect."""
     if os.geteuid() != 0:
         need("root", "needs root, to become another user")
@@ -258,20 +261,20 @@ def test_local_process_without_rights(direct_site: Site) -> None:
 
     def as_nobody() -> subprocess.CompletedProcess[str]:
         return subprocess.run(
-            [sys.executable, "-c", CONNECT, str(path)],
+            [sys.executable, "-c", CONNECT_AS_NOBODY, str(path)],
             capture_output=True,
             text=True,
             check=False,
         )
 
     assert "PermissionError" in as_nobody().stderr
-    former = path.stat().st_mode
+    former_mode = path.stat().st_mode
     path.chmod(0o777)
     assert as_nobody().returncode == 0
-    path.chmod(former)
+    path.chmod(former_mode)
 
 
-def test_local_process_with_rights(direct_site: Site) -> None:
+def test_local_process_with_permission_can_publish_commands(direct_site: Site) -> None:
     """A process with write permission on the operator's socket can publish commands, which is why they are signed."""
     with closing(Intruder(open_session(f"unixsock-stream/{direct_site.operator_socket}"))) as intruder:
         direct_site.drive(intruder.attempt)
@@ -282,18 +285,20 @@ def test_local_process_with_rights(direct_site: Site) -> None:
 
 
 @pytest.fixture(scope="module")
-def attacked_drives(keys: Path, tmp_path_factory: pytest.TempPathFactory, stalls: Stalls) -> Shared[attacked.Drive]:
+def attacked_drives(
+    keys: Path, tmp_path_factory: pytest.TempPathFactory, stalls: Stalls
+) -> SharedResult[attacks.AttackedDrive]:
     """Drive with the secure configs, without an attack at first and then under one attack after the other."""
     pytest.importorskip("pylibsrtp")
-    return Shared(stalls, lambda: attacked.drive(tmp_path_factory.mktemp("attacked"), keys))
+    return SharedResult(stalls, lambda: attacks.drive(tmp_path_factory.mktemp("attacked"), keys))
 
 
 @pytest.fixture
-def attacked_drive(attacked_drives: Shared[attacked.Drive]) -> attacked.Drive:
+def attacked_drive(attacked_drives: SharedResult[attacks.AttackedDrive]) -> attacks.AttackedDrive:
     return attacked_drives.get()
 
 
-def whole(drive: attacked.Drive) -> tuple[int, int]:
+def attack_interval_ns(drive: attacks.AttackedDrive) -> tuple[int, int]:
     """Return when the quiet phase began and the last attack ended."""
     return drive.phases["quiet"][0], drive.phases["flood"][1]
 
@@ -303,12 +308,12 @@ def counted(record: Record, name: str) -> int:
     return int(np.sum(values[values != MISSING]))
 
 
-def during(drive: attacked.Drive, name: str, mono_ns: IntArray) -> Any:
+def during(drive: attacks.AttackedDrive, name: str, mono_ns: IntArray) -> Any:
     began_ns, ended_ns = drive.phases[name]
     return (mono_ns > began_ns) & (mono_ns < ended_ns)
 
 
-def accepted(drive: attacked.Drive) -> Table:
+def accepted(drive: attacks.AttackedDrive) -> Table:
     admissions = drive.server.table("admission")
     return admissions.where(np.array(admissions.texts("verdict")) == "accepted")
 
@@ -322,59 +327,59 @@ def rows(table: Table, *names: str) -> list[tuple[Any, ...]]:
     return list(zip(*(table.objects(name) for name in ("epoch", *names)), strict=True))
 
 
-def test_only_the_operators_commands_are_accepted(attacked_drive: attacked.Drive, stalls: Stalls) -> None:
-    """In every attack each accepted command is one that the client sent, unchanged, and none is accepted twice."""
+def test_only_the_operators_commands_are_accepted(attacked_drive: attacks.AttackedDrive, stalls: Stalls) -> None:
+    """Under every attack each accepted command is one that the client sent, unchanged, and none is accepted twice."""
     commands = accepted(attacked_drive)
     sent_by_client = set(rows(attacked_drive.client.table("control"), *FIELDS))
 
     assert set(rows(commands, *FIELDS)) <= sent_by_client
     assert len(set(rows(commands, "sequence"))) == len(commands)
     for name, phase in attacked_drive.phases.items():
-        with stalls.judging(*phase, stall_ms=LONG_STALL_MS):
+        with stalls.excusing_failures(*phase, stall_ms=LONG_STALL_MS):
             assert np.sum(during(attacked_drive, name, commands.ints("received_mono_ns"))) > 150
 
 
-def test_forged_messages_are_counted(attacked_drive: attacked.Drive, stalls: Stalls) -> None:
+def test_forged_messages_are_counted(attacked_drive: attacks.AttackedDrive, stalls: Stalls) -> None:
     """Thousands of replayed, altered and forged commands and requests are rejected and counted."""
     server = attacked_drive.server
-    with stalls.judging(*whole(attacked_drive), stall_ms=LONG_STALL_MS):
-        assert attacked_drive.sent["replayed"] > 1000
-        assert attacked_drive.sent["flood"] > 0.5 * attacked.FLOOD_PER_S * attacked.PHASE_NS / NS_PER_S
+    with stalls.excusing_failures(*attack_interval_ns(attacked_drive), stall_ms=LONG_STALL_MS):
+        assert attacked_drive.sent_counts["replayed"] > 1000
+        assert attacked_drive.sent_counts["flood"] > 0.5 * attacks.FLOOD_PER_S * attacks.PHASE_NS / NS_PER_S
         assert counted(server, "commands_forged") > 500
-        assert counted(server, "commands_screened_out") > 0.3 * attacked_drive.sent["flood"]
+        assert counted(server, "commands_screened_out") > 0.3 * attacked_drive.sent_counts["flood"]
         assert counted(server, "session_requests_of_another_time") > 10
         assert counted(server, "rejected: not newer than the last command") > 100
 
 
-def test_only_the_vehicles_states_are_accepted(attacked_drive: attacked.Drive, stalls: Stalls) -> None:
+def test_only_the_vehicles_states_are_accepted(attacked_drive: attacks.AttackedDrive, stalls: Stalls) -> None:
     """Every state that reached the client's driver is one that the server sent; others are counted."""
     names = ("sent_wall_ns", "state_mono_ns", "speed_mps", "safety", "applied_sequence")
-    sent, received = (
+    sent_states, received_states = (
         list(zip(*(record.table("state").objects(name) for name in names), strict=True))
         for record in (attacked_drive.server, attacked_drive.client)
     )
 
-    assert set(received) <= set(sent)
-    assert len(set(received)) == len(received)
-    with stalls.judging(*whole(attacked_drive), stall_ms=LONG_STALL_MS):
-        assert len(received) > 0.9 * len(sent) - 100
+    assert set(received_states) <= set(sent_states)
+    assert len(set(received_states)) == len(received_states)
+    with stalls.excusing_failures(*attack_interval_ns(attacked_drive), stall_ms=LONG_STALL_MS):
+        assert len(received_states) > 0.9 * len(sent_states) - 100
         assert counted(attacked_drive.client, "states_replayed") > 100
         assert counted(attacked_drive.client, "states_forged") > 100
 
 
-def test_the_drive_continues_under_every_attack(attacked_drive: attacked.Drive, stalls: Stalls) -> None:
+def test_the_drive_continues_under_every_attack(attacked_drive: attacks.AttackedDrive, stalls: Stalls) -> None:
     """During all attacks the vehicle is driven and never stops."""
     events = attacked_drive.server.table("event")
-    began_ns, ended_ns = whole(attacked_drive)
+    began_ns, ended_ns = attack_interval_ns(attacked_drive)
     meanwhile = events.where((events.ints("mono_ns") > began_ns) & (events.ints("mono_ns") < ended_ns))
 
-    with stalls.judging(began_ns, ended_ns, stall_ms=LONG_STALL_MS):
+    with stalls.excusing_failures(began_ns, ended_ns, stall_ms=LONG_STALL_MS):
         assert attacked_drive.last_status["safety"] == "driving"
         assert not [detail for detail in meanwhile.texts("detail") if "stop" in detail]
 
 
-def test_a_flood_does_not_delay_the_operator(attacked_drive: attacked.Drive, stalls: Stalls) -> None:
-    """Ten thousand commands a second with forged MACs delay the operator's by at most a period in the median."""
+def test_a_flood_does_not_delay_the_operator(attacked_drive: attacks.AttackedDrive, stalls: Stalls) -> None:
+    """Ten thousand forged commands a second delay the operator's by at most one command period in the median."""
     sent_ns = dict(
         zip(
             rows(attacked_drive.client.table("control"), "sequence"),
@@ -389,5 +394,5 @@ def test_a_flood_does_not_delay_the_operator(attacked_drive: attacked.Drive, sta
     )
     quiet, flood = (np.median(delays_ms[during(attacked_drive, name, received_ns)]) for name in ("quiet", "flood"))
 
-    with stalls.judging(*attacked_drive.phases["flood"], share=BUSY_SHARE):
+    with stalls.excusing_failures(*attacked_drive.phases["flood"], share=BUSY_SHARE):
         assert flood - quiet < COMMAND_PERIOD_MS, f"{quiet:.2f} ms, and under the flood {flood:.2f} ms"

@@ -8,7 +8,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from tests.field.namespaces import OPERATOR, VEHICLE, Field, Way, plain_field, remove_stale_namespaces
+from tests.field.namespaces import OPERATOR, VEHICLE, Direction, Field, plain_field, remove_stale_namespaces
 
 pytestmark = pytest.mark.usefixtures("namespaces")
 
@@ -18,20 +18,21 @@ PORT = 7000
 def test_an_outage_has_a_direction() -> None:
     """Packets are dropped in a blocked direction only, and pass again after unblocking."""
     with plain_field() as field:
-        ends = {"uplink": "operator", "downlink": "vehicle"}
-        to: dict[Way, str] = {"uplink": VEHICLE, "downlink": OPERATOR}
-        opened = {
-            part: field.inside(part, lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for part in ends.values()
+        senders = {"uplink": "operator", "downlink": "vehicle"}
+        destinations: dict[Direction, str] = {"uplink": VEHICLE, "downlink": OPERATOR}
+        sockets = {
+            part: field.inside(part, lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+            for part in senders.values()
         }
-        for each in opened.values():
-            each.bind(("", PORT))
-            each.settimeout(0.3)
+        for udp_socket in sockets.values():
+            udp_socket.bind(("", PORT))
+            udp_socket.settimeout(0.3)
 
-        def passes(way: Way) -> bool:
-            sender = opened.pop(ends[way])
-            (receiver,) = opened.values()
-            opened[ends[way]] = sender
-            sender.sendto(b"x", (to[way], PORT))
+        def passes(direction: Direction) -> bool:
+            sender = sockets.pop(senders[direction])
+            (receiver,) = sockets.values()
+            sockets[senders[direction]] = sender
+            sender.sendto(b"x", (destinations[direction], PORT))
             try:
                 return receiver.recv(10) == b"x"
             except TimeoutError:
@@ -48,19 +49,19 @@ def test_an_outage_has_a_direction() -> None:
         assert not passes("downlink")
         field.unblock()
         assert passes("downlink")
-        for each in opened.values():
-            each.close()
+        for udp_socket in sockets.values():
+            udp_socket.close()
 
 
 def test_namespaces_of_a_killed_test_are_removed() -> None:
-    """The namespaces of a test whose process has died are removed with their processes, and no others."""
-    died = subprocess.Popen(["true"])
-    died.wait()
-    theirs = Field(died.pid)
-    theirs._make("vehicle")
-    left = theirs.inside("vehicle", lambda: subprocess.Popen(["sleep", "600"]))
-    with plain_field() as ours:
-        assert left.wait(timeout=5) == -signal.SIGKILL
-        assert not Path("/run/netns", theirs.name("vehicle")).exists()
+    """The namespaces of a test whose process has ended are removed with their processes, and no others."""
+    ended_test = subprocess.Popen(["true"])
+    ended_test.wait()
+    stale_field = Field(ended_test.pid)
+    stale_field._make("vehicle")
+    left_behind = stale_field.inside("vehicle", lambda: subprocess.Popen(["sleep", "600"]))
+    with plain_field() as own_field:
+        assert left_behind.wait(timeout=5) == -signal.SIGKILL
+        assert not Path("/run/netns", stale_field.name("vehicle")).exists()
         remove_stale_namespaces()
-        assert Path("/run/netns", ours.name("vehicle")).exists()
+        assert Path("/run/netns", own_field.name("vehicle")).exists()

@@ -1,8 +1,8 @@
 """Outages of the network and killed or suspended processes, at full rate: when the vehicle stops and is driven again.
 
 One drive has all outages in turn. An observer independent of server and client records the commands that arrive at the
-vehicle's machine, `counting.py` decides which of them are stale, and the server's record says which were accepted and
-when the vehicle stopped. `docs/outages.md` has a table.
+vehicle's machine. `outage_effects.py` decides which of them are stale. The server's record says which commands were
+accepted and when the vehicle stopped. `docs/outages.md` has a table of the results.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from statistics import median
 
 import numpy as np
 import pytest
-from tests.field.counting import OutageEffects, measure, table
-from tests.field.driving import TCP, Drive, driven
-from tests.field.namespaces import Field, Way, plain_field
+from tests.field.driving import TCP, Drive, running_loop
+from tests.field.namespaces import Direction, Field, plain_field
+from tests.field.outage_effects import OutageEffects, effects_table, measure
 from tests.support.stalls import BUSY_SHARE, LONG_STALL_MS, Stalls
 
 from lavt.clock import pause
@@ -32,52 +32,59 @@ STOP_AFTER_S = 0.5
 STOP_MPS2 = 4.0
 """The design's limits, repeated here so that a change in the code fails a test."""
 
-WAYS: dict[str, Sequence[Way]] = {"downlink": ("downlink",), "uplink": ("uplink",), "both ways": ("downlink", "uplink")}
+DIRECTIONS: dict[str, Sequence[Direction]] = {
+    "downlink": ("downlink",),
+    "uplink": ("uplink",),
+    "both ways": ("downlink", "uplink"),
+}
 SHORT_S = 0.3
 LONG_S = (1.0, 3.0)
 """Shorter and longer than the routers' lease of 2 s."""
-DOWN_S = 3.0
+RESTART_AFTER_S = 3.0
+"""Time from the end of a process to its restart, and the duration of a suspension."""
 SPEED_MPS = 5.0
 LOAD_MARGIN_S = 0.15
-"""The delay that other programs may add to a single time."""
+"""The delay that other programs may add to a single measured time."""
 MEDIAN_MARGIN_S = 0.03
-BEFORE_S = 0.5
-"""A stall this long before an outage can explain that the vehicle is degraded already when it begins."""
+STALL_LOOKBACK_S = 0.5
+"""If the vehicle is degraded when an outage begins, a stall in this time before the outage explains it."""
 MAX_UNOBSERVED = 0.05
-"""The share of accepted commands that may have been dropped on their way to the observer."""
-MARGIN_S = 0.5
+"""The largest share of accepted commands that may have been dropped on their way to the observer."""
+BRAKE_DELAY_S = 0.5
 """Time for the brake pressure to build up."""
+CONTINUES_WITHIN_S = 0.5
+"""Limit from the end of an outage without a stop until the vehicle is driven again."""
 RECOVERY_S = 10.0
-"""From the end of an outage until the vehicle is driven again; 1.0 s of it is arming."""
+"""Limit from the end of an outage until the vehicle is driven again; 1.0 s of it is arming."""
 RECOVERY_NS = round(RECOVERY_S * NS_PER_S)
 MEDIAN_RECOVERY_S = 3.0
 
-SHORT = tuple(f"{name} {SHORT_S:g} s{again}" for again in ("", ", again") for name in WAYS)
-LONG = (*(f"{name} {duration_s:g} s" for duration_s in LONG_S for name in WAYS), "both ways 10 s")
-KILLED = ("vehicle's router killed", "operator's router killed", "client killed")
-FROZEN = "client frozen"
-STOPPING = (*LONG, *KILLED, FROZEN)
-SERVER = "server killed"
-ALL = (*SHORT, *STOPPING, SERVER)
+SHORT = tuple(f"{name} {SHORT_S:g} s{again}" for again in ("", ", again") for name in DIRECTIONS)
+LONG = (*(f"{name} {duration_s:g} s" for duration_s in LONG_S for name in DIRECTIONS), "both ways 10 s")
+PROCESS_KILLED = ("vehicle's router killed", "operator's router killed", "client killed")
+CLIENT_FROZEN = "client frozen"
+STOPPING_OUTAGES = (*LONG, *PROCESS_KILLED, CLIENT_FROZEN)
+SERVER_KILLED = "server killed"
+ALL_OUTAGES = (*SHORT, *STOPPING_OUTAGES, SERVER_KILLED)
 
-BUFFERED = ("both ways 1 s", "both ways 3 s")
+BUFFERED_OUTAGES = ("both ways 1 s", "both ways 3 s")
 """Outages of the link that buffers messages."""
 ACCEPTS_EVERYTHING = str(Path(__file__).parents[1] / "realtime" / "server_that_accepts_everything.py")
 
-Tell = Callable[[str], None]
+PrintReport = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class Driven:
+class OutageDriveResult:
     """The directory of a drive through outages, and the effects of each outage."""
 
     work: Path
-    rows: dict[str, OutageEffects]
+    effects: dict[str, OutageEffects]
 
 
-def begin_ns(row: OutageEffects, after_s: float = 0.0) -> int:
-    """Return the begin of an outage, or some seconds after it."""
-    return row.outage.begin.mono_ns + round(after_s * NS_PER_S)
+def begin_ns(effect: OutageEffects, after_s: float = 0.0) -> int:
+    """Return when an outage began, or a time `after_s` later."""
+    return effect.outage.begin.mono_ns + round(after_s * NS_PER_S)
 
 
 @pytest.fixture(scope="module")
@@ -86,154 +93,162 @@ def field(namespaces: None) -> Iterator[Field]:  # noqa: ARG001 (skips)
         yield field
 
 
-def cut(drive: Drive, names: Sequence[str]) -> None:
+def cause_network_outages(drive: Drive, names: Sequence[str]) -> None:
     for name in names:
-        ways, duration = name.removesuffix(", again").removesuffix(" s").rsplit(" ", 1)
-        drive.reach(SPEED_MPS)
-        drive.cut(name, WAYS[ways], float(duration))
+        directions, duration_s = name.removesuffix(", again").removesuffix(" s").rsplit(" ", 1)
+        drive.reach_speed(SPEED_MPS)
+        drive.block_network(name, DIRECTIONS[directions], float(duration_s))
         pause(NS_PER_S)  # the server's status is up to 0.2 s old
 
 
-def finish(drive: Drive, work: Path, tell: Tell, title: str) -> Driven:
-    rows = measure(drive)
-    (work / "outages.md").write_text(table(rows) + "\n")
-    tell(f"{title}\n{table(rows)}")
-    return Driven(work, {row.outage.name: row for row in rows})
+def measure_and_print(drive: Drive, work: Path, print_report: PrintReport, title: str) -> OutageDriveResult:
+    effects = measure(drive)
+    (work / "outages.md").write_text(effects_table(effects) + "\n")
+    print_report(f"{title}\n{effects_table(effects)}")
+    return OutageDriveResult(work, {effect.outage.name: effect for effect in effects})
 
 
 @pytest.fixture(scope="module")
-def all_outages(field: Field, tmp_path_factory: pytest.TempPathFactory, tell: Tell) -> Driven:
+def all_outages(field: Field, tmp_path_factory: pytest.TempPathFactory, print_report: PrintReport) -> OutageDriveResult:
     """Drive through all outages in turn, the killed server last."""
     work = tmp_path_factory.mktemp("outages")
-    with driven(field, work) as drive:
-        cut(drive, (*SHORT, *LONG))
-        for name, role in zip(KILLED, ("vehicle-router", "operator-router", "client"), strict=True):
-            drive.reach(SPEED_MPS)
-            drive.kill_and_restart(name, role, DOWN_S)
-        drive.reach(SPEED_MPS)
-        drive.freeze(FROZEN, "client", DOWN_S)
-        drive.reach(SPEED_MPS)
-        drive.kill_and_restart(SERVER, "server", DOWN_S)
-        drive.reach(SPEED_MPS)
-    return finish(drive, work, tell, "routers as shipped")
+    with running_loop(field, work) as drive:
+        cause_network_outages(drive, (*SHORT, *LONG))
+        for name, role in zip(PROCESS_KILLED, ("vehicle-router", "operator-router", "client"), strict=True):
+            drive.reach_speed(SPEED_MPS)
+            drive.kill_and_restart(name, role, RESTART_AFTER_S)
+        drive.reach_speed(SPEED_MPS)
+        drive.freeze(CLIENT_FROZEN, "client", RESTART_AFTER_S)
+        drive.reach_speed(SPEED_MPS)
+        drive.kill_and_restart(SERVER_KILLED, "server", RESTART_AFTER_S)
+        drive.reach_speed(SPEED_MPS)
+    return measure_and_print(drive, work, print_report, "routers as shipped")
 
 
-def drive_with_buffering_link(field: Field, work: Path, tell: Tell, title: str, program: tuple[str, ...]) -> Driven:
-    with driven(field, work, TCP, program) as drive:
-        cut(drive, BUFFERED)
-        drive.reach(SPEED_MPS)
-    return finish(drive, work, tell, title)
+def drive_with_buffering_link(
+    field: Field, work: Path, print_report: PrintReport, title: str, program: tuple[str, ...]
+) -> OutageDriveResult:
+    with running_loop(field, work, TCP, program) as drive:
+        cause_network_outages(drive, BUFFERED_OUTAGES)
+        drive.reach_speed(SPEED_MPS)
+    return measure_and_print(drive, work, print_report, title)
 
 
 @pytest.fixture(scope="module")
-def buffered(field: Field, tmp_path_factory: pytest.TempPathFactory, tell: Tell) -> Driven:
+def buffered(field: Field, tmp_path_factory: pytest.TempPathFactory, print_report: PrintReport) -> OutageDriveResult:
     """Drive with routers linked by TCP with a lease of 10 s."""
-    return drive_with_buffering_link(field, tmp_path_factory.mktemp("kept"), tell, "TCP, lease 10 s", LAVT)
+    return drive_with_buffering_link(field, tmp_path_factory.mktemp("buffered"), print_report, "TCP, lease 10 s", LAVT)
 
 
 @pytest.fixture(scope="module")
-def buffered_unguarded(field: Field, tmp_path_factory: pytest.TempPathFactory, tell: Tell) -> Driven:
+def buffered_unguarded(
+    field: Field, tmp_path_factory: pytest.TempPathFactory, print_report: PrintReport
+) -> OutageDriveResult:
     """Drive with the same routers and a server that accepts every command."""
     work = tmp_path_factory.mktemp("unguarded")
-    return drive_with_buffering_link(field, work, tell, "TCP, lease 10 s, no checks", (ACCEPTS_EVERYTHING,))
+    return drive_with_buffering_link(field, work, print_report, "TCP, lease 10 s, no checks", (ACCEPTS_EVERYTHING,))
 
 
-@pytest.mark.parametrize("outage", STOPPING)
-def test_a_command_timeout_degrades_and_stops_in_time(all_outages: Driven, stalls: Stalls, outage: str) -> None:
+@pytest.mark.parametrize("outage", STOPPING_OUTAGES)
+def test_a_command_timeout_degrades_and_stops_in_time(
+    all_outages: OutageDriveResult, stalls: Stalls, outage: str
+) -> None:
     """300 ms after the last command from a newer picture the vehicle is degraded; 200 ms later the safe stop begins."""
-    row = all_outages.rows[outage]
-    degraded_s, stop_s = row.command_gap_at_degraded_s, row.command_gap_at_safe_stop_s
+    effect = all_outages.effects[outage]
+    degraded_s, stop_s = effect.command_gap_at_degraded_s, effect.command_gap_at_safe_stop_s
 
     assert stop_s is not None
     assert stop_s >= STOP_AFTER_S
-    with stalls.judging(begin_ns(row, -BEFORE_S), begin_ns(row, STOP_AFTER_S + LOAD_MARGIN_S)):
+    with stalls.excusing_failures(begin_ns(effect, -STALL_LOOKBACK_S), begin_ns(effect, STOP_AFTER_S + LOAD_MARGIN_S)):
         assert degraded_s is not None, "the vehicle was degraded before the outage"
         assert degraded_s <= DEGRADED_AFTER_S + LOAD_MARGIN_S
         assert stop_s <= STOP_AFTER_S + LOAD_MARGIN_S
     assert degraded_s >= DEGRADED_AFTER_S
 
 
-def test_the_median_stop_begins_half_a_second_after_an_outage(all_outages: Driven, stalls: Stalls) -> None:
-    """In the median over all outages the vehicle is degraded 0.3 s, and its safe stop begins 0.5 s, after the begin."""
-    rows = [all_outages.rows[outage] for outage in STOPPING]
+def test_the_median_stop_begins_half_a_second_after_an_outage(all_outages: OutageDriveResult, stalls: Stalls) -> None:
+    """In the median the vehicle is degraded 0.3 s after an outage begins, and its safe stop begins after 0.5 s."""
+    effects = [all_outages.effects[outage] for outage in STOPPING_OUTAGES]
 
-    with stalls.judging(begin_ns(rows[0]), begin_ns(rows[-1], RECOVERY_S), share=BUSY_SHARE):
-        assert median(row.to_degraded_s or 0.0 for row in rows) <= DEGRADED_AFTER_S + MEDIAN_MARGIN_S
-        assert median(row.to_safe_stop_s or 0.0 for row in rows) <= STOP_AFTER_S + MEDIAN_MARGIN_S
-        assert median(row.command_gap_at_safe_stop_s or 0.0 for row in rows) <= STOP_AFTER_S + MEDIAN_MARGIN_S
+    with stalls.excusing_failures(begin_ns(effects[0]), begin_ns(effects[-1], RECOVERY_S), share=BUSY_SHARE):
+        assert median(effect.to_degraded_s or 0.0 for effect in effects) <= DEGRADED_AFTER_S + MEDIAN_MARGIN_S
+        assert median(effect.to_safe_stop_s or 0.0 for effect in effects) <= STOP_AFTER_S + MEDIAN_MARGIN_S
+        assert median(effect.command_gap_at_safe_stop_s or 0.0 for effect in effects) <= STOP_AFTER_S + MEDIAN_MARGIN_S
 
 
-@pytest.mark.parametrize("outage", STOPPING)
-def test_the_vehicle_is_stationary_in_time(all_outages: Driven, outage: str) -> None:
+@pytest.mark.parametrize("outage", STOPPING_OUTAGES)
+def test_the_vehicle_is_stationary_in_time(all_outages: OutageDriveResult, outage: str) -> None:
     """In a safe stop the vehicle decelerates with 4 m/s2 until it is stationary."""
-    row = all_outages.rows[outage]
+    effect = all_outages.effects[outage]
 
-    assert row.stopping_s is not None
-    assert row.stopped_from_mps is not None
-    assert row.stopping_s <= row.stopped_from_mps / STOP_MPS2 + MARGIN_S
+    assert effect.stopping_s is not None
+    assert effect.stopped_from_mps is not None
+    assert effect.stopping_s <= effect.stopped_from_mps / STOP_MPS2 + BRAKE_DELAY_S
 
 
-def test_most_outages_of_300_ms_cause_no_stop(all_outages: Driven, stalls: Stalls) -> None:
-    """Most outages of 0.3 s lead to degraded at most, and then the drive continues at once.
+def test_most_outages_of_300_ms_cause_no_stop(all_outages: OutageDriveResult, stalls: Stalls) -> None:
+    """Most outages of 0.3 s at most degrade the vehicle, and the drive continues at once.
 
     After lost commands QUIC, on which the routers' link is based, may delay the next ones until it has probed.
     """
-    rows = [all_outages.rows[name] for name in SHORT]
-    without_stop = [row for row in rows if row.to_safe_stop_s is None]
+    effects = [all_outages.effects[name] for name in SHORT]
+    without_stop = [effect for effect in effects if effect.to_safe_stop_s is None]
 
-    with stalls.judging(begin_ns(rows[0]), begin_ns(rows[-1], RECOVERY_S)):
+    with stalls.excusing_failures(begin_ns(effects[0]), begin_ns(effects[-1], RECOVERY_S)):
         assert len(without_stop) >= len(SHORT) / 2
-        assert all((row.to_driving_s or 0.0) < MARGIN_S for row in without_stop)
+        assert all((effect.to_driving_s or 0.0) < CONTINUES_WITHIN_S for effect in without_stop)
 
 
-@pytest.mark.parametrize("outage", [*STOPPING, SERVER])
-def test_the_drive_recovers_by_itself(all_outages: Driven, stalls: Stalls, outage: str) -> None:
+@pytest.mark.parametrize("outage", [*STOPPING_OUTAGES, SERVER_KILLED])
+def test_the_drive_recovers_by_itself(all_outages: OutageDriveResult, stalls: Stalls, outage: str) -> None:
     """After an outage a client that may arm again drives again within 10 s."""
-    row = all_outages.rows[outage]
+    effect = all_outages.effects[outage]
 
-    assert row.to_driving_s is not None
-    with stalls.judging(row.outage.end.mono_ns, row.outage.end.later(RECOVERY_NS).mono_ns, stall_ms=LONG_STALL_MS):
-        assert 0 < row.to_driving_s <= RECOVERY_S
+    assert effect.to_driving_s is not None
+    with stalls.excusing_failures(
+        effect.outage.end.mono_ns, effect.outage.end.later(RECOVERY_NS).mono_ns, stall_ms=LONG_STALL_MS
+    ):
+        assert 0 < effect.to_driving_s <= RECOVERY_S
 
 
-def test_the_median_recovery_is_short(all_outages: Driven, stalls: Stalls) -> None:
+def test_the_median_recovery_is_short(all_outages: OutageDriveResult, stalls: Stalls) -> None:
     """In the median the vehicle is driven again within 3 s of an outage's end, of which arming takes one."""
-    rows = [all_outages.rows[outage] for outage in (*STOPPING, SERVER)]
+    effects = [all_outages.effects[outage] for outage in (*STOPPING_OUTAGES, SERVER_KILLED)]
 
-    with stalls.judging(begin_ns(rows[0]), begin_ns(rows[-1], RECOVERY_S), share=BUSY_SHARE):
-        assert median(row.to_driving_s or 0.0 for row in rows) <= MEDIAN_RECOVERY_S
-
-
-@pytest.mark.parametrize("outage", ALL)
-def test_nothing_stale_is_accepted(all_outages: Driven, stalls: Stalls, outage: str) -> None:
-    """No command that is stale by the observer's record is accepted, and the observer recorded the accepted ones."""
-    row = all_outages.rows[outage]
-
-    assert row.stale_accepted == 0
-    assert row.accepted > 20
-    with stalls.judging(begin_ns(row), row.outage.end.later(RECOVERY_NS).mono_ns):
-        assert row.accepted_unobserved <= row.accepted * MAX_UNOBSERVED
+    with stalls.excusing_failures(begin_ns(effects[0]), begin_ns(effects[-1], RECOVERY_S), share=BUSY_SHARE):
+        assert median(effect.to_driving_s or 0.0 for effect in effects) <= MEDIAN_RECOVERY_S
 
 
-@pytest.mark.parametrize("outage", BUFFERED)
-def test_buffered_stale_commands_are_rejected(buffered: Driven, stalls: Stalls, outage: str) -> None:
-    """Commands that a link buffered in an outage reach the vehicle stale, and none of them is accepted."""
-    row = buffered.rows[outage]
+@pytest.mark.parametrize("outage", ALL_OUTAGES)
+def test_nothing_stale_is_accepted(all_outages: OutageDriveResult, stalls: Stalls, outage: str) -> None:
+    """No command that the observer knows to be stale is accepted, and the observer recorded the accepted commands."""
+    effect = all_outages.effects[outage]
 
-    assert row.stale_observed > 0
-    assert row.stale_accepted == 0
-    with stalls.judging(begin_ns(row), row.outage.end.later(RECOVERY_NS).mono_ns):
-        assert row.accepted_unobserved <= row.accepted * MAX_UNOBSERVED
+    assert effect.stale_accepted == 0
+    assert effect.accepted > 20
+    with stalls.excusing_failures(begin_ns(effect), effect.outage.end.later(RECOVERY_NS).mono_ns):
+        assert effect.accepted_unobserved <= effect.accepted * MAX_UNOBSERVED
 
 
-@pytest.mark.parametrize("outage", BUFFERED)
-def test_a_server_without_checks_accepts_stale_commands(buffered_unguarded: Driven, outage: str) -> None:
+@pytest.mark.parametrize("outage", BUFFERED_OUTAGES)
+def test_buffered_stale_commands_are_rejected(buffered: OutageDriveResult, stalls: Stalls, outage: str) -> None:
+    """Commands that a link buffered during an outage are stale when they reach the vehicle, and none is accepted."""
+    effect = buffered.effects[outage]
+
+    assert effect.stale_observed > 0
+    assert effect.stale_accepted == 0
+    with stalls.excusing_failures(begin_ns(effect), effect.outage.end.later(RECOVERY_NS).mono_ns):
+        assert effect.accepted_unobserved <= effect.accepted * MAX_UNOBSERVED
+
+
+@pytest.mark.parametrize("outage", BUFFERED_OUTAGES)
+def test_a_server_without_checks_accepts_stale_commands(buffered_unguarded: OutageDriveResult, outage: str) -> None:
     """Without the server's checks stale commands are accepted, so the tests above can fail."""
-    assert buffered_unguarded.rows[outage].stale_accepted > 0
+    assert buffered_unguarded.effects[outage].stale_accepted > 0
 
 
-def test_the_drive_is_at_full_rate(all_outages: Driven, stalls: Stalls) -> None:
-    """In the median the client sends a command at least every 20 ms, and the server 30 pictures a second."""
+def test_the_drive_is_at_full_rate(all_outages: OutageDriveResult, stalls: Stalls) -> None:
+    """In the median the client sends a command at least every 20 ms, and the server sends 30 frames a second."""
     client = read_record(all_outages.work / "client-1" / "client.mcap")
     server = read_record(all_outages.work / "server-1" / "server.mcap")
     commands_ns = client.table("control").mono_ns
@@ -241,7 +256,7 @@ def test_the_drive_is_at_full_rate(all_outages: Driven, stalls: Stalls) -> None:
     between_frames_s = np.diff(server.table("frame").ints("stamped_mono_ns")) / NS_PER_S
     between_pictures_s = np.diff(client.table("picture").mono_ns) / NS_PER_S
 
-    with stalls.judging(int(commands_ns[0]), int(commands_ns[-1]), share=BUSY_SHARE):
+    with stalls.excusing_failures(int(commands_ns[0]), int(commands_ns[-1]), share=BUSY_SHARE):
         assert np.median(between_commands_s) <= 0.021
         assert np.median(between_frames_s) == pytest.approx(1 / 30, abs=0.003)
         assert np.median(between_pictures_s) == pytest.approx(1 / 30, abs=0.005)

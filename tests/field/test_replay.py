@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.field.driving import MIXED, driven, wait_until
+from tests.field.driving import MIXED, running_loop, wait_until
 from tests.field.namespaces import OPERATOR, VEHICLE, VEHICLE_UPLINK_ROUTER, plain_field
-from tests.field.secured import make_keys
+from tests.field.secured_routers import make_keys
 
 from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_S
@@ -34,7 +34,7 @@ HELLO = b"LAVT\x01"
 def spoofed(source: tuple[str, int], target: tuple[str, int], payload: bytes) -> bytes:
     """Return an IPv4 packet with a UDP datagram; the kernel fills in the length and checksum of the IP header."""
     udp = struct.pack(">HHHH", source[1], target[1], 8 + len(payload), 0)
-    addresses = (socket.inet_aton(each[0]) for each in (source, target))
+    addresses = (socket.inet_aton(address) for address, _ in (source, target))
     return struct.pack(">BBHHHBBH4s4s", 0x45, 0, 0, 0, 0, 64, socket.IPPROTO_UDP, 0, *addresses) + udp + payload
 
 
@@ -52,7 +52,7 @@ def counted(record: Record, name: str) -> int:
     return int(np.sum(values[values != MISSING]))
 
 
-def test_a_replayed_hello_leaves_encrypted_video_readable(tmp_path: Path, tell: Callable[[str], None]) -> None:
+def test_a_replayed_hello_leaves_encrypted_video_readable(tmp_path: Path, print_report: Callable[[str], None]) -> None:
     """A hello that is replayed with the client's address and the attacker's makes no packet of the video unreadable.
 
     The attacker also forwards the challenges that it gets to the client, with the vehicle's address.
@@ -75,7 +75,7 @@ def test_a_replayed_hello_leaves_encrypted_video_readable(tmp_path: Path, tell: 
         listener.bind(("operator", ETH_P_IP))
         raw = field.inside("internet", lambda: socket.socket(socket.AF_INET, socket.SOCK_RAW, socket.IPPROTO_RAW))
         own = field.inside("internet", lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-        with listener, raw, own, driven(field, tmp_path, links) as drive:
+        with listener, raw, own, running_loop(field, tmp_path, links) as drive:
             client, hello = overhear(listener)
             wait_until("video arrives", lambda: "raw_tau_v_ms" in drive.running["client"].latest.get("status", {}))
             own.bind((VEHICLE_UPLINK_ROUTER.address, 0))
@@ -100,7 +100,7 @@ def test_a_replayed_hello_leaves_encrypted_video_readable(tmp_path: Path, tell: 
     at_server = counted(server_record, "path_stale"), counted(server_record, "datagrams_screened_out")
     pictures_ns = client_record.table("picture").mono_ns
     during = int(((pictures_ns > begin_ns) & (pictures_ns < end_ns)).sum())
-    tell(
+    print_report(
         f"{2 * sent} replays, {forwarded} challenges to the attacker: {unreadable} packets unreadable, {packets} "
         f"readable, {during} pictures in {(end_ns - begin_ns) / NS_PER_S:.1f} s; at the server {at_server}"
     )

@@ -15,4 +15,4 @@ def pytest_runtest_setup() -> None:
 
 @pytest.fixture(autouse=True)
 def _own_switch_interval(own_switch_interval: None) -> None:
-    """Set the switch interval, since our runtime runs in this process."""
+    """Restore the switch interval, because our runtime runs in this process and sets it."""

@@ -29,7 +29,7 @@ from lavt.transport.video.stamp_check import LEARNED_AFTER
 
 WIDTH_PX, HEIGHT_PX, RATE_HZ = 640, 480, 30
 COUNT = 60
-"""Number of frames, for two seconds; the tools send them in real time."""
+"""Number of frames: two seconds, because the tools send them in real time."""
 STAMPS_NS = [1_790_000_000 * NS_PER_S + number * NS_PER_S // RATE_HZ for number in range(COUNT)]
 
 GSTREAMER = (
@@ -47,7 +47,7 @@ FFMPEG = (
 )
 SINGLE, STAP_A, FU_A = "single NAL unit", "STAP-A", "FU-A"
 BASELINE, HIGH = (66, False), (100, True)
-"""Profile and whether the entropy coding is CABAC, from the parameter sets."""
+"""Profile, and whether the entropy coding is CABAC, as in the parameter sets."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,11 +56,11 @@ class GStreamerCase:
 
     encoder: str
     packets: tuple[str, ...]
-    """Packet types that must occur; most packets must have the first one."""
+    """Packet types that must occur; the first one must be the most frequent."""
     aggregate: str = "none"
     profile: str = "constrained-baseline"
     slices: int = 1
-    """Least number in each picture."""
+    """The smallest number of slices in each picture."""
 
 
 FAST, WITH_CABAC = "speed-preset=ultrafast", "speed-preset=medium cabac=true dct8x8=true bframes=0"
@@ -80,11 +80,11 @@ CASES = {
 def raw(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Write stamped pictures with motion as raw I420."""
     texture = stream(1, "texture").integers(40, 216, (HEIGHT_PX, WIDTH_PX, 3), dtype=np.uint8)
-    soft = cv2.GaussianBlur(texture, (0, 0), 4.0)
+    smooth_texture = cv2.GaussianBlur(texture, (0, 0), 4.0)
     path = tmp_path_factory.mktemp("raw") / "frames.i420"
     with path.open("wb") as file:
         for number, stamp_ns in enumerate(STAMPS_NS):
-            picture: Picture = np.roll(soft, 3 * number, axis=1)
+            picture: Picture = np.roll(smooth_texture, 3 * number, axis=1)
             write_stamp(picture, stamp_ns)
             file.write(cv2.cvtColor(picture, cv2.COLOR_BGR2YUV_I420).tobytes())
     return path
@@ -109,10 +109,12 @@ def receive_from(command: str, raw: Path, log: Path) -> list[tuple[RtpPacket, in
     return packets
 
 
-def units_of(packets: Sequence[tuple[RtpPacket, int]]) -> list[AccessUnit]:
+def reassemble(packets: Sequence[tuple[RtpPacket, int]]) -> list[AccessUnit]:
     """Return the access units of packets, as the receiver node reassembles them."""
     jitter_buffer, depacketizer = JitterBuffer(), Depacketizer()
-    ordered = [each for packet, arrived_ns in packets for each in jitter_buffer.push(packet, arrived_ns)]
+    ordered = [
+        ordered_packet for packet, arrived_ns in packets for ordered_packet in jitter_buffer.push(packet, arrived_ns)
+    ]
     ordered += jitter_buffer.expire(packets[-1][1] + NS_PER_S)
     units = [unit for packet, lost_before in ordered for unit in depacketizer.push(packet, lost_before)]
     assert (jitter_buffer.lost, jitter_buffer.stray, depacketizer.malformed) == (0, 0, 0)
@@ -133,16 +135,16 @@ def check_each_picture(units: Sequence[AccessUnit]) -> None:
     pictures = [decoder.decode(unit.data) for unit in units]
     assert not any(picture is None or picture.corrupt for picture in pictures)
     assert [read_stamp(picture.luma) for picture in pictures if picture is not None] == STAMPS_NS
-    # The sender's RTP clock has any base and runs as the stamps do, to one tick, as both are rounded.
-    ahead = [rtp_timestamp(stamp_ns) - unit.timestamp for stamp_ns, unit in zip(STAMPS_NS, units, strict=True)]
-    assert {(ticks - ahead[0] + 1) % 2**32 for ticks in ahead} <= {0, 1, 2}
+    # The sender's RTP clock begins anywhere and then runs like the stamps, within one tick, because both are rounded.
+    ticks_ahead = [rtp_timestamp(stamp_ns) - unit.timestamp for stamp_ns, unit in zip(STAMPS_NS, units, strict=True)]
+    assert {(ticks - ticks_ahead[0] + 1) % 2**32 for ticks in ticks_ahead} <= {0, 1, 2}
 
 
-def slices_of(unit: AccessUnit) -> int:
+def count_slices(unit: AccessUnit) -> int:
     return sum(nal[0] & 0x1F in {1, 5} for nal in split_nal_units(unit.data))
 
 
-def coding_of(keyframe: AccessUnit) -> tuple[int, bool]:
+def profile_and_cabac(keyframe: AccessUnit) -> tuple[int, bool]:
     """Return profile_idc and, after two numbers of one bit, entropy_coding_mode_flag (H.264, 7.3.2.1 and 7.3.2.2)."""
     sets = {nal[0] & 0x1F: nal for nal in split_nal_units(keyframe.data)}
     return sets[7][1], bool(sets[8][1] & 0x20)
@@ -156,23 +158,23 @@ def test_gstreamer_is_received(name: str, raw: Path, tmp_path: Path) -> None:
         encoder=case.encoder, profile=case.profile, aggregate=case.aggregate, raw="{raw}", port="{port}"
     )
     packets = receive_from(command, raw, tmp_path / "log")
-    units = units_of(packets)
+    units = reassemble(packets)
     check_each_picture(units)
     types = count_types(packets)
     assert types.keys() >= {*case.packets}
     assert types.most_common(1)[0][0] == case.packets[0]
-    assert coding_of(units[0]) == (HIGH if case.profile == "high" else BASELINE)
-    assert min(slices_of(unit) for unit in units) >= case.slices
+    assert profile_and_cabac(units[0]) == (HIGH if case.profile == "high" else BASELINE)
+    assert min(count_slices(unit) for unit in units) >= case.slices
 
 
 def test_ffmpeg_is_received(raw: Path, tmp_path: Path) -> None:
     """Each picture that ffmpeg sends by RTP arrives complete with its stamp."""
     packets = receive_from(FFMPEG, raw, tmp_path / "log")
-    check_each_picture(units_of(packets))
+    check_each_picture(reassemble(packets))
     assert count_types(packets).keys() >= {FU_A, STAP_A}
 
 
-def test_gstreamer_is_watched(raw: Path, tmp_path: Path) -> None:
+def test_watch_accepts_the_stamps_of_gstreamer(raw: Path, tmp_path: Path) -> None:
     """`lavt watch` accepts the stamps of all pictures that GStreamer sends, except the first from which it learns."""
     options = ["--bind", "127.0.0.1", "--port", "0", "--sender", "foreign", "--json"]
     program = [sys.executable, "-m", "lavt", "watch", *options]

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.interop.tools import read_frames, running
-from tests.support.ports import free_pair
+from tests.support.ports import free_port_pair
 
 from lavt.assembly.entropy import MachineEntropy
 from lavt.assembly.nodes import build_server
@@ -28,8 +28,8 @@ from lavt.transport.video.stamp import read_stamp
 SERVER = shipped("configs/server.yaml")
 WIDTH_PX, HEIGHT_PX = 320, 240
 FRAME_BYTES = WIDTH_PX * HEIGHT_PX * 3 // 2
-WANTED = 90
-"""Number of frames, for three seconds."""
+FRAMES_TO_RECEIVE = 90
+"""Three seconds of frames."""
 GSTREAMER = (
     "gst-launch-1.0 -q udpsrc address=127.0.0.1 port={port} buffer-size=4194304"
     " caps=application/x-rtp,media=video,clock-rate=90000,encoding-name=H264,payload=96"
@@ -94,29 +94,29 @@ def receive_with(command: str, port: int, log: Path) -> tuple[list[int], list[in
     """Run a tool until it has written enough raw frames; return the stamps sent and the stamps read."""
     with our_server(port) as stamps, running(command.split(), log, output=True) as tool:
         assert tool.stdout is not None
-        frames = list(read_frames(tool.stdout, FRAME_BYTES, WANTED))
-    assert len(frames) == WANTED, log.read_text(errors="replace")
+        frames = list(read_frames(tool.stdout, FRAME_BYTES, FRAMES_TO_RECEIVE))
+    assert len(frames) == FRAMES_TO_RECEIVE, log.read_text(errors="replace")
     lumas = [np.frombuffer(frame, np.uint8)[: WIDTH_PX * HEIGHT_PX].reshape(HEIGHT_PX, WIDTH_PX) for frame in frames]
     return stamps.sent, [read_stamp(luma) for luma in lumas]
 
 
-def check_each_in_order(sent: list[int], read: list[int]) -> None:
-    """Assert that the tool returned every frame in order, from its first one on."""
-    assert read[0] in sent
-    begin = sent.index(read[0])
-    assert read == sent[begin : begin + len(read)]
+def check_each_in_order(sent_stamps: list[int], read_stamps: list[int]) -> None:
+    """Assert that the tool returned every sent frame in order, from the first that it returned."""
+    assert read_stamps[0] in sent_stamps
+    begin = sent_stamps.index(read_stamps[0])
+    assert read_stamps == sent_stamps[begin : begin + len(read_stamps)]
 
 
 def test_gstreamer_receives_each_frame(tmp_path: Path) -> None:
     """GStreamer receives and decodes our stream, and each picture has the stamp of the sent frame."""
-    port = free_pair()
+    port = free_port_pair()
     check_each_in_order(*receive_with(GSTREAMER.format(port=port), port, tmp_path / "log"))
 
 
 @pytest.mark.parametrize("flags", ["", "-fflags nobuffer -flags low_delay"])
-def test_ffmpeg_receives_each_frame_by_our_sdp(flags: str, tmp_path: Path) -> None:
+def test_ffmpeg_receives_each_frame_with_our_sdp(flags: str, tmp_path: Path) -> None:
     """With the output of `lavt sdp` ffmpeg receives and decodes our stream, and each picture has its stamp."""
-    port, sdp = free_pair(), tmp_path / "lavt.sdp"
+    port, sdp = free_port_pair(), tmp_path / "lavt.sdp"
     settings = [part for change in config_changes(port) for part in ("--set", change)]
     with sdp.open("wb") as file:
         subprocess.run([sys.executable, "-m", "lavt", "sdp", str(SERVER), *settings], stdout=file, check=True)

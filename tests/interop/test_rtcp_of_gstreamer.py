@@ -23,7 +23,7 @@ from lavt.transport.rtp.rtcp import (
 from lavt.transport.rtp.rtp import RtpPacket
 
 CLOCK = MachineClock()
-OURS, THEIRS, RECEIVER = 77, 99, 88
+OUR_SSRC, GSTREAMER_SSRC, RECEIVER_SSRC = 77, 99, 88
 
 SESSION = """
 import json, sys
@@ -130,18 +130,18 @@ def test_gstreamer_reads_our_sender_reports() -> None:
     """GStreamer's receiver parses all fields of our sender report and returns its time in short format."""
     with gstreamer() as session:
         for number in range(65_530, 65_540):
-            session.push("rtp", packet(number, OURS))
+            session.push("rtp", packet(number, OUR_SSRC))
         wall_ns = 1_700_000_000_123_456_789
-        report = sender_report(OURS, wall_ns=wall_ns, rtp_timestamp=123, packets=10, octets=40, cname="camera@lavt")
+        report = sender_report(OUR_SSRC, wall_ns=wall_ns, rtp_timestamp=123, packets=10, octets=40, cname="camera@lavt")
         sent_ns = CLOCK.now().mono_ns
         session.push("rtcp", report)
         (sent,) = parse_announcement(report).reports
         block = read_report_with_age(session, highest_sequence=65_539)
-        assert block.media_ssrc == OURS
+        assert block.media_ssrc == OUR_SSRC
         assert block.last_report == ntp_to_short(sent.ntp_time)
         assert block.last_report_age_ns < CLOCK.now().mono_ns - sent_ns
         session.push("stats")
-        (source,) = (each for each in session.read("stats") if each["ssrc"] == OURS)
+        (source,) = (source for source in session.read("stats") if source["ssrc"] == OUR_SSRC)
         names = ("have-sr", "sr-ntptime", "sr-rtptime", "sr-packet-count", "sr-octet-count")
         assert [source[name] for name in names] == [True, sent.ntp_time, 123, 10, 40]
 
@@ -151,21 +151,21 @@ def test_gstreamer_reads_our_receiver_reports() -> None:
     """GStreamer's sender parses our receiver report, computes the round-trip time and accepts a picture loss."""
     with gstreamer() as session:
         for number in range(5):
-            session.push("send", packet(number, THEIRS))
+            session.push("send", packet(number, GSTREAMER_SSRC))
         while True:
             reports = parse_announcement(bytes.fromhex(session.read("rtcp"))).reports
             if reports:
                 break
         (sent,) = reports
-        assert (sent.ssrc, sent.packets, sent.octets) == (THEIRS, 5, 20)
+        assert (sent.ssrc, sent.packets, sent.octets) == (GSTREAMER_SSRC, 5, 20)
         six_seconds_ago = (ntp_to_short(sent.ntp_time) - 6 * 65_536) % 2**32
-        report = ReceptionReport(THEIRS, 65_541, 0.25, 3, 17, six_seconds_ago, 5 * NS_PER_S)
-        session.push("rtcp", receiver_report(RECEIVER, report, clock_ns=NS_PER_S))
-        session.push("rtcp", picture_loss(RECEIVER, THEIRS))
+        report = ReceptionReport(GSTREAMER_SSRC, 65_541, 0.25, 3, 17, six_seconds_ago, 5 * NS_PER_S)
+        session.push("rtcp", receiver_report(RECEIVER_SSRC, report, clock_ns=NS_PER_S))
+        session.push("rtcp", picture_loss(RECEIVER_SSRC, GSTREAMER_SSRC))
         while session.read("event") != "GstForceKeyUnit":
             pass
         session.push("stats")
-        (source,) = (each for each in session.read("stats") if each["ssrc"] == RECEIVER)
+        (source,) = (source for source in session.read("stats") if source["ssrc"] == RECEIVER_SSRC)
         names = ("have-rb", "rb-ssrc", "rb-fractionlost", "rb-packetslost", "rb-exthighestseq", "rb-jitter")
-        assert [source[name] for name in names] == [True, THEIRS, 64, 3, 65_541, 17]
+        assert [source[name] for name in names] == [True, GSTREAMER_SSRC, 64, 3, 65_541, 17]
         assert 65_536 <= source["rb-round-trip"] < 30 * 65_536

@@ -54,7 +54,7 @@ def missing() -> tuple[str, ...]:
     if python is None or subprocess.run([python, "-c", MODULES], check=False, capture_output=True).returncode:
         return ("GStreamer's modules for Debian's Python",)
     command = ["gst-inspect-1.0", "--exists"]
-    return tuple(each for each in ELEMENTS if subprocess.run([*command, each], check=False).returncode)
+    return tuple(element for element in ELEMENTS if subprocess.run([*command, element], check=False).returncode)
 
 
 @contextmanager

@@ -56,20 +56,21 @@ def machines() -> tuple[Machine, Machine]:
 @pytest.fixture
 def server_machine(machines: tuple[Machine, Machine]) -> Iterator[Machine]:
     """Return the vehicle's machine, which runs the tests."""
-    yield from restored_afterwards(machines[0])
+    yield from restoring_machine(machines[0])
 
 
 @pytest.fixture
 def client_machine(machines: tuple[Machine, Machine]) -> Iterator[Machine]:
     """Return the remote machine."""
-    yield from restored_afterwards(machines[1])
+    yield from restoring_machine(machines[1])
 
 
-def restored_afterwards(machine: Machine) -> Iterator[Machine]:
-    minus_raw_ns = machine.call(clocks.wall_minus_raw_ns)
+def restoring_machine(machine: Machine) -> Iterator[Machine]:
+    """Yield a machine; then stop its programs, reset its clock and delete its qdiscs."""
+    wall_minus_raw_ns = machine.call(clocks.wall_minus_raw_ns)
     yield machine
     machine.stop_all()
-    machine.call(clocks.restore, minus_raw_ns)
+    machine.call(clocks.restore, wall_minus_raw_ns)
     netem.clear(machine)
 
 
@@ -90,13 +91,13 @@ def report_figure(request: pytest.FixtureRequest) -> Callable[[str], None]:
 
 @pytest.fixture
 def true_offset_ns(server_machine: Machine, client_machine: Machine) -> Callable[[], int]:
-    """Return a function that measures the server's wall clock less the client's, by the counter that both read."""
+    """Return a function that measures the server's wall clock minus the client's, by the counter that both read."""
     return lambda: offset_ns(server_machine, client_machine)
 
 
 def offset_ns(server: Machine, client: Machine) -> int:
-    of_client = client.call(clocks.read_wall_clock)
-    return clocks.offset_ns(server.call(clocks.read_wall_clock), of_client)
+    client_reading = client.call(clocks.read_wall_clock)
+    return clocks.offset_ns(server.call(clocks.read_wall_clock), client_reading)
 
 
 @pytest.fixture

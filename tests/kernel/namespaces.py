@@ -11,7 +11,7 @@ import subprocess
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S
@@ -19,7 +19,8 @@ from lavt.transport.arrival import SO_TIMESTAMPNS
 
 DEVICES = {"server": "va", "client": "vb"}
 ADDRESSES = {"server": ("10.9.0.1", "fd09::1"), "client": ("10.9.0.2", "fd09::2")}
-MARK = struct.Struct(">8sIq")
+PACKET_HEADER = struct.Struct(">8sIq")
+"""Mark of the flow, packet number, and send time (wall clock, ns)."""
 DRAIN_S = 0.35
 """Time to wait for packets after the last one was sent."""
 _CLONE_NEWNET = 0x40000000
@@ -80,16 +81,16 @@ def inside(name: str, function: Callable[[], Result]) -> Result:
 
 @dataclass(frozen=True)
 class ProbeFlow:
-    """A test flow from one namespace to the other, between two ports, with a given first byte."""
+    """A test flow from one namespace to the other, between two ports; `first_byte` begins each packet."""
 
     name: str
     sender: Literal["server", "client"]
     protocol: Literal["udp", "tcp"]
-    source: int
-    destination: int
+    source_port: int
+    destination_port: int
     first_byte: int = 0x80
     version: Literal[4, 6] = 4
-    bytes_each: int = 200
+    packet_bytes: int = 200
 
     @property
     def receiver(self) -> Literal["server", "client"]:
@@ -97,40 +98,51 @@ class ProbeFlow:
         return "client" if self.sender == "server" else "server"
 
 
+class ArrivedPacket(NamedTuple):
+    """A packet that arrived."""
+
+    number: int
+    delay_ms: float
+    """One-way delay."""
+    received_ns: int
+    """Wall clock of the kernel."""
+
+
 @dataclass
 class Arrivals:
-    """The packets that arrived, in order: (number, one-way delay in milliseconds, receive time in nanoseconds)."""
+    """The packets of a flow that arrived, in order of arrival."""
 
     sent: int
-    arrived: list[tuple[int, float, int]] = field(default_factory=list)
+    arrived: list[ArrivedPacket] = field(default_factory=list)
 
     @property
     def numbers(self) -> list[int]:
         """Numbers in the order of arrival."""
-        return [number for number, _, _ in self.arrived]
+        return [packet.number for packet in self.arrived]
 
     @property
     def delays_ms(self) -> list[float]:
         """Delays in the order of arrival."""
-        return [delay_ms for _, delay_ms, _ in self.arrived]
+        return [packet.delay_ms for packet in self.arrived]
 
     @property
     def in_order_of_sending_ms(self) -> list[float]:
         """Delays in the order of sending."""
-        return [delay_ms for _, delay_ms, _ in sorted(self.arrived)]
+        return [packet.delay_ms for packet in sorted(self.arrived)]
 
     @property
     def inversions(self) -> int:
-        """How many packets arrived directly after a later one."""
+        """How many packets arrived directly after a packet that was sent later."""
         return sum(later < earlier for earlier, later in zip(self.numbers, self.numbers[1:], strict=False))
 
 
 def send_flows(
     flows: Sequence[ProbeFlow], count: int, period_ms: float, *, at: dict[int, Callable[[], None]] | None = None
 ) -> dict[str, Arrivals]:
-    """Send `count` packets of each flow, and return what arrived.
+    """Send `count` packets of each flow, one per `period_ms`, and return the arrivals by the flow's name.
 
-    `at` maps packet numbers to functions that a thread runs meanwhile; sending continues until they have returned.
+    `at` maps packet numbers to functions. A thread calls the function when that packet is due; sending continues until
+    all functions have returned.
     """
     clock = MachineClock()
     captures = {name: inside(name, lambda name=name: _open_capture(DEVICES[name])) for name in DEVICES}  # type: ignore[misc]
@@ -176,20 +188,20 @@ class _FlowSockets:
         family = socket.AF_INET if flow.version == 4 else socket.AF_INET6
         kind = socket.SOCK_DGRAM if flow.protocol == "udp" else socket.SOCK_STREAM
         receiver_address = ADDRESSES[flow.receiver][flow.version == 6]
-        self._receiver = inside(flow.receiver, lambda: _bound(family, kind, receiver_address, flow.destination))
+        self._receiver = inside(flow.receiver, lambda: _bound(family, kind, receiver_address, flow.destination_port))
         sender_address = ADDRESSES[flow.sender][flow.version == 6]
-        self._sender = inside(flow.sender, lambda: _bound(family, kind, sender_address, flow.source))
+        self._sender = inside(flow.sender, lambda: _bound(family, kind, sender_address, flow.source_port))
         self._accepted: list[socket.socket] = []
         if flow.protocol == "tcp":
             self._receiver.listen()
-        self._sender.connect((receiver_address, flow.destination))
+        self._sender.connect((receiver_address, flow.destination_port))
         if flow.protocol == "tcp":
             self._accepted.append(self._receiver.accept()[0])
             self._sender.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def send(self, number: int, now_ns: int) -> None:
-        data = bytes([self.flow.first_byte]) + MARK.pack(self.mark, number, now_ns)
-        self._sender.send(data.ljust(self.flow.bytes_each, b"."))
+        data = bytes([self.flow.first_byte]) + PACKET_HEADER.pack(self.mark, number, now_ns)
+        self._sender.send(data.ljust(self.flow.packet_bytes, b"."))
 
     def close(self) -> None:
         for sock in (*self._accepted, self._sender, self._receiver):
@@ -224,10 +236,12 @@ def _receive(captures: dict[str, socket.socket], names: dict[bytes, str], arriva
                 break
             if address[2] == socket.PACKET_OUTGOING:
                 continue
-            found = next(((mark, frame.index(mark)) for mark in names if mark in frame), None)
-            if found is None:
+            match = next(((mark, frame.index(mark)) for mark in names if mark in frame), None)
+            if match is None:
                 continue
-            _, number, sent_ns = MARK.unpack_from(frame, found[1])
+            _, number, sent_ns = PACKET_HEADER.unpack_from(frame, match[1])
             seconds, nanoseconds = struct.unpack_from("qq", ancillary[0][2])
-            stamp_ns = seconds * NS_PER_S + nanoseconds
-            arrivals[names[found[0]]].arrived.append((number, (stamp_ns - sent_ns) / NS_PER_MS, stamp_ns))
+            received_ns = seconds * NS_PER_S + nanoseconds
+            arrivals[names[match[0]]].arrived.append(
+                ArrivedPacket(number, (received_ns - sent_ns) / NS_PER_MS, received_ns)
+            )

@@ -1,6 +1,7 @@
 """`lavt server` drives a software car over the kernel's own CAN, with the client on another machine.
 
-Server, actuator and software car run on the vehicle's machine, which has one processor; router and client on the other.
+Server, actuator and software car run on the vehicle's machine, which has one processor; router and client run on the
+other machine.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ from typing import Any
 import pytest
 from tests.field.by_wire import (
     GENERATIONS,
-    KIT_MS,
-    ROOM_MS,
+    KIT_TIMEOUT_MS,
+    TOLERANCE_MS,
     SoftwareCarProcess,
     is_late,
     ms_since,
@@ -32,10 +33,10 @@ from tests.kernel.lane.driving import BY_WIRE, LoopPrograms, collect, start_by_w
 from tests.kernel.lane.machine import Machine, MachineError, wait_until
 from tests.kernel.lane.verdicts import (
     KIT_STALL_MS,
-    changes_of_safety,
     least_stop_ms,
     require_completed,
     require_valid,
+    safety_changes,
 )
 from tests.support.stalls import Stalls, excuse_slow_machine
 
@@ -47,14 +48,15 @@ pytestmark = [pytest.mark.timeout(900), pytest.mark.usefixtures("vcan")]
 
 ReportFigure = Callable[[str], None]
 
-SMALL = ("camera.width_px=320", "camera.height_px=240", "camera.rate_hz=15")
+SMALL_LOAD = ("camera.width_px=320", "camera.height_px=240", "camera.rate_hz=15")
 """A load for a user-mode kernel, with one processor and expensive system calls."""
-MOST_P95_M = 0.22
-COMMANDS = {0x200, 0x201, 0x202}
+MAX_P95_M = 0.22
+COMMAND_IDENTIFIERS = {0x200, 0x201, 0x202}
 """Steering, brake and throttle in generation 2's set `remote`."""
 LATE_FRAME_MS = 20
-SET_FLAGS = 0x8914
-"""SIOCSIFFLAGS of linux/sockios.h."""
+"""A frame that was sent before the process was frozen may arrive this much later."""
+SIOCSIFFLAGS = 0x8914
+"""linux/sockios.h"""
 PARKING_LIMIT_MS = 6000
 DRIVING_MPS = 5.0
 CLOCK = MachineClock()
@@ -72,7 +74,7 @@ def vcan() -> Iterator[None]:
 def set_interface_down(interface: str) -> None:
     """Set an interface down without starting a program, which would block a user-mode kernel."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
-        fcntl.ioctl(any_socket, SET_FLAGS, struct.pack("16sh14x", interface.encode(), 0))
+        fcntl.ioctl(any_socket, SIOCSIFFLAGS, struct.pack("16sh14x", interface.encode(), 0))
 
 
 def ip(*arguments: str) -> None:
@@ -88,22 +90,24 @@ def by_wire(profile: str, work: Path) -> tuple[str, ...]:
         "clock.source=probe",
         "video.bit_rate_bps=1000000",
         "record.video=false",
-        *SMALL,
+        *SMALL_LOAD,
     )
 
 
-def sets(changes: tuple[str, ...]) -> list[str]:
+def set_arguments(changes: tuple[str, ...]) -> list[str]:
     return [part for change in changes for part in ("--set", change)]
 
 
 def run_watchdog_test(machine: Machine, changes: tuple[str, ...], stalls: Stalls) -> None:
     """Run `lavt can test-watchdog`, which tests that the kit's watchdog brakes."""
-    with software_car(BY_WIRE, *sets(changes)) as car:
+    with software_car(BY_WIRE, *set_arguments(changes)) as car:
         since_ns = CLOCK.now().mono_ns
         try:
-            machine.run([machine.python, "-B", "-m", "lavt", "can", "test-watchdog", BY_WIRE, *sets(changes), "--yes"])
-        except MachineError as failed:
-            message = f"{failed}, {car.events}"
+            machine.run(
+                [machine.python, "-B", "-m", "lavt", "can", "test-watchdog", BY_WIRE, *set_arguments(changes), "--yes"]
+            )
+        except MachineError as failure:
+            message = f"{failure}, {car.events}"
             assert is_late(message), message
             raise stalls.verdict(message, since_ns, CLOCK.now().mono_ns, stall_ms=KIT_STALL_MS) from None
 
@@ -131,7 +135,7 @@ class ActiveDrive:
         wait_until("the vehicle drives at speed", is_driving, 90)
 
     def explain_stop(self, status: dict[str, Any], braked_ns: int | None) -> Exception:
-        """Return the exception for a stop without a cause."""
+        """Return the exception for a stop that no test caused."""
         now_ns = CLOCK.now().mono_ns
         since_ns = self.car.event_ns("enabled", "enabled: ") or now_ns
         message = f"stopped before it drove: {status}, {self.car.events}"
@@ -172,8 +176,8 @@ class CanLab:
         if not (self.proof_folder / f"{profile}.json").exists():
             run_watchdog_test(self.server, changes, self.stalls)
         out = self.work / "drive"
-        with software_car(BY_WIRE, *sets(changes), stalls=self.stalls, stall_ms=KIT_STALL_MS) as car:
-            client = ("clock.source=probe", *SMALL)
+        with software_car(BY_WIRE, *set_arguments(changes), stalls=self.stalls, stall_ms=KIT_STALL_MS) as car:
+            client = ("clock.source=probe", *SMALL_LOAD)
             loop = start_by_wire(self.server, self.client, out, server_changes=changes, client_changes=client)
             try:
                 active_drive = ActiveDrive(
@@ -203,7 +207,11 @@ def open_port() -> closing[CanPort]:
 
 def last_command_ns(port: CanPort) -> int:
     """Return when the last command so far was received."""
-    return max(each.arrived_ns for each in port.take(CLOCK.now().mono_ns) if each.frame.identifier in COMMANDS)
+    return max(
+        received.arrived_ns
+        for received in port.take(CLOCK.now().mono_ns)
+        if received.frame.identifier in COMMAND_IDENTIFIERS
+    )
 
 
 @pytest.mark.parametrize("profile", GENERATIONS)
@@ -214,7 +222,7 @@ def test_drive_over_can_completes(profile: str, lab: CanLab, report_figure: Repo
         wait_for_end(active_drive.loop, lambda _: None)
         drive = collect(active_drive.loop, lab.client, active_drive.out)
         braked_ns = active_drive.car.braked_ns()
-    figures = f"{profile}: {summary(drive.result)}; {'; '.join(changes_of_safety(drive))}"
+    figures = f"{profile}: {describe_result(drive.result)}; {'; '.join(safety_changes(drive))}"
     report_figure(figures)
     if drive.result["ending"] != "completed" and braked_ns is not None:
         raise excuse_slow_machine(
@@ -222,22 +230,22 @@ def test_drive_over_can_completes(profile: str, lab: CanLab, report_figure: Repo
         )
     require_completed(drive, lab.stalls)
     require_valid(drive, lab.stalls)
-    assert drive.result["p95_m"] <= MOST_P95_M
-    wheel = to_wheel(drive.result)
+    assert drive.result["p95_m"] <= MAX_P95_M
+    wheel = command_to_wheel_stage(drive.result)
     assert wheel["n"] > 100
     assert 0 < wheel["p50"] < wheel["p95"]
 
 
-def to_wheel(result: dict[str, Any]) -> dict[str, Any]:
+def command_to_wheel_stage(result: dict[str, Any]) -> dict[str, Any]:
     stages: list[dict[str, Any]] = result["stages_ms"]
     (stage,) = [stage for stage in stages if (stage["node"], stage["stage"]) == ("vehicle", "command to wheel")]
     return stage
 
 
-def summary(result: dict[str, Any]) -> str:
+def describe_result(result: dict[str, Any]) -> str:
     if result["ending"] != "completed":
         return str(result["ending"])
-    wheel, tau_v, tau_c = to_wheel(result), result["tau_v_ms"]["p50"], result["tau_c_ms"]["p50"]
+    wheel, tau_v, tau_c = command_to_wheel_stage(result), result["tau_v_ms"]["p50"], result["tau_c_ms"]["p50"]
     return (
         f"completed, P95 {result['p95_m']:.3f} m, command to wheel p50 {wheel['p50']:.1f}, p95 {wheel['p95']:.1f} ms "
         f"of {wheel['n']}, tau_v {tau_v:.1f}, tau_c {tau_c:.1f} ms, {result['invalid_reasons']}"
@@ -250,11 +258,10 @@ def test_lost_bus_stops_the_car(lab: CanLab, report_figure: ReportFigure) -> Non
         since_ns = CLOCK.now().mono_ns
         set_interface_down("vcan0")
         down_ms = ms_since(CLOCK.now().mono_ns, since_ns)
-        took_ms = active_drive.car.wait_for_watchdog_ms(since_ns, room_ms=down_ms + ROOM_MS)
+        took_ms = active_drive.car.wait_for_watchdog_ms(since_ns, tolerance_ms=down_ms + TOLERANCE_MS)
         active_drive.wait_until_stopped()
-        report_figure(
-            f"down took {down_ms:.0f} ms, the kit brakes {took_ms:.0f} ms after its begin, {active_drive.reason()}"
-        )
+        report_figure(f"the interface was down after {down_ms:.0f} ms, the kit brakes after {took_ms:.0f} ms")
+        report_figure(active_drive.reason())
         ip("link", "set", "vcan0", "up")
         pause(NS_PER_S)
         assert active_drive.car.event_ns("enabled", "enabled: ", since_ns=since_ns) is None
@@ -266,7 +273,7 @@ def test_silent_kit_stops_the_drive(lab: CanLab, report_figure: ReportFigure) ->
         since_ns = active_drive.car.execute("bus_off")
         took_ms = active_drive.car.wait_for_watchdog_ms(since_ns)
         active_drive.wait_until_stopped()
-        report_figure(f"the kit brakes {took_ms:.0f} ms after, {active_drive.reason()}")
+        report_figure(f"the kit brakes after {took_ms:.0f} ms, {active_drive.reason()}")
         active_drive.car.execute("bus_on")
         pause(NS_PER_S)
         assert active_drive.car.event_ns("enabled", "enabled: ", since_ns=since_ns) is None
@@ -275,7 +282,7 @@ def test_silent_kit_stops_the_drive(lab: CanLab, report_figure: ReportFigure) ->
 def test_frozen_actuator_sends_no_frames(lab: CanLab, report_figure: ReportFigure) -> None:
     """A frozen actuator process sends no frames, and after it is resumed it sends none of the earlier ones."""
     with lab.driving("dataspeed_gen2") as active_drive, open_port() as port:
-        pause(2 * KIT_MS * NS_PER_MS)  # the kit is being commanded by then, and the port receives it
+        pause(2 * KIT_TIMEOUT_MS * NS_PER_MS)  # the kit is being commanded by then, and the port receives it
         since_ns = CLOCK.now().mono_ns
         os.kill(active_drive.actuator_pid, signal.SIGSTOP)
         frozen_ns = CLOCK.now().mono_ns
@@ -286,7 +293,7 @@ def test_frozen_actuator_sends_no_frames(lab: CanLab, report_figure: ReportFigur
         finally:
             os.kill(active_drive.actuator_pid, signal.SIGCONT)
         pause(2 * NS_PER_S)  # the server has ended by itself, since it got no state for 0.5 s
-        report_figure(f"last command {ms_since(last_ns, since_ns):.0f} ms, the kit brakes {took_ms:.0f} ms after")
+        report_figure(f"last command {ms_since(last_ns, since_ns):.0f} ms, the kit brakes after {took_ms:.0f} ms")
         assert last_ns < frozen_ns + LATE_FRAME_MS * NS_PER_MS
         assert active_drive.car.event_ns("enabled", "enabled: ", since_ns=since_ns) is None
 
@@ -297,5 +304,5 @@ def test_killed_server_leaves_a_parked_car(lab: CanLab, report_figure: ReportFig
         since_ns = CLOCK.now().mono_ns
         lab.server.call(processes.send_signal, active_drive.loop.server.number, signal.SIGKILL)
         took_ms = active_drive.car.wait_for_park_ms(since_ns)
-        report_figure(f"in park {took_ms:.0f} ms after")
+        report_figure(f"in park after {took_ms:.0f} ms")
         assert took_ms < PARKING_LIMIT_MS

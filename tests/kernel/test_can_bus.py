@@ -16,7 +16,7 @@ from lavt.vehicle.dbw.bus import CanPort, is_virtual
 
 DEADLINE_S = 20
 STEERING = CanFrame(0x064, bytes(range(8)))
-FAR = CanFrame(0x1F01, b"\x01", is_extended=True)
+EXTENDED_FRAME = CanFrame(0x1F01, b"\x01", is_extended=True)
 
 
 def ip(*arguments: str) -> None:
@@ -59,7 +59,7 @@ def is_received(sender: CanPort, receiver: CanPort) -> bool:
         sender.take(now_ns())
         sender.send([STEERING], now_ns())
         pause(NS_PER_MS)
-        return any(each.frame == STEERING for each in receiver.take(now_ns()))
+        return any(received_frame.frame == STEERING for received_frame in receiver.take(now_ns()))
     except BusGone:
         return False
 
@@ -85,7 +85,7 @@ def test_frames_pass_unchanged(ports: tuple[CanPort, CanPort]) -> None:
     """Frames reach the other port unchanged with the kernel's receive time, and do not return to the sender."""
     one, other = ports
     before_ns = now_ns()
-    one.send([STEERING, FAR], before_ns)
+    one.send([STEERING, EXTENDED_FRAME], before_ns)
     received = []
 
     def has_all() -> bool:
@@ -93,8 +93,8 @@ def test_frames_pass_unchanged(ports: tuple[CanPort, CanPort]) -> None:
         return len(received) >= 2
 
     wait_until(has_all)
-    assert [each.frame for each in received] == [STEERING, FAR]
-    assert all(before_ns - NS_PER_MS < each.arrived_ns < now_ns() for each in received)
+    assert [received_frame.frame for received_frame in received] == [STEERING, EXTENDED_FRAME]
+    assert all(before_ns - NS_PER_MS < received_frame.arrived_ns < now_ns() for received_frame in received)
     assert one.take(now_ns()) == []
 
 

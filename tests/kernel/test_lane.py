@@ -69,7 +69,7 @@ def test_started_program_is_stopped_after_the_test(client_machine: Machine) -> N
 
 
 @JUDGES_TIMES
-def test_host_stalls_are_in_the_time_of_this_machine(server_machine: Machine, stalls: Stalls) -> None:
+def test_host_stalls_have_the_time_of_this_machine(server_machine: Machine, stalls: Stalls) -> None:
     """A report of the host's probes has this machine's time, within the 5 ms of a query, even on a slewed clock."""
     server_machine.call(clocks.set_drift, 500)
     pause(2 * NS_PER_S)
@@ -98,7 +98,7 @@ def test_clock_step_changes_the_true_offset(server_machine: Machine, true_offset
 def test_true_offset_agrees_with_ntp_exchanges(
     server_machine: Machine, client_machine: Machine, true_offset_ns: TrueOffset
 ) -> None:
-    """Four time stamps over the network give the true offset within half their round trip."""
+    """An NTP exchange (four time stamps) over the network gives the true offset within half its round trip."""
     server_machine.call(clocks.step, -70 * NS_PER_MS)
     client_machine.start_python("tests.kernel.lane.ntp_server", client_machine.address, str(NTP_PORT)).first_line()
 

@@ -16,7 +16,7 @@ from lavt.perception.calibration import calibrated, ground_to_picture
 
 ROAD_GREY, SKY_GREY = 85, 190
 MARK_WIDTH_M = 0.125
-FINE = 2  # rays along and across one pixel
+RAYS_PER_PIXEL_SIDE = 2
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Line:
     offset_m: float
     colour_bgr: tuple[int, int, int] = (225, 225, 225)
     dash_m: float = 9.0
-    """The painted length of each 9 m."""
+    """The painted length in each period of 9 m."""
     phase_m: float = 0.0
 
 
@@ -37,7 +37,7 @@ FOUR_LANES = (Line(8.75), Line(5.25, dash_m=3.0), *BROKEN_LANE, Line(-5.25))
 
 @dataclass(frozen=True)
 class Scene:
-    """A renderer of a straight or circular road from an offset to its centre."""
+    """A renderer of a straight or circular road, seen by a car beside its centre."""
 
     model: CameraModel
 
@@ -49,23 +49,23 @@ class Scene:
         heading_rad: float = 0.0,
     ) -> Picture:
         """Return the picture from a car `offset_m` left of the centre and turned left by `heading_rad`."""
-        places, x_m, y_m = fine_ground(self.model)
+        ray_indices, x_m, y_m = rays_on_near_ground(self.model)
         along, across = on_road(x_m, y_m, curvature_per_m, offset_m, heading_rad)
         fine = bare_ground(self.model).copy()
         rays = fine.reshape(-1, 3)
         for line in lines:
-            paint = np.flatnonzero(np.abs(across - line.offset_m) < MARK_WIDTH_M / 2)
-            paint = paint[np.mod(along[paint] - line.phase_m, 9.0) < line.dash_m]
-            rays[places[paint]] = line.colour_bgr
-        shrunk = cv2.resize(fine, (self.model.width_px, self.model.height_px), interpolation=cv2.INTER_AREA)
-        return np.asarray(shrunk.round(), dtype=np.uint8)
+            painted = np.flatnonzero(np.abs(across - line.offset_m) < MARK_WIDTH_M / 2)
+            painted = painted[np.mod(along[painted] - line.phase_m, 9.0) < line.dash_m]
+            rays[ray_indices[painted]] = line.colour_bgr
+        picture = cv2.resize(fine, (self.model.width_px, self.model.height_px), interpolation=cv2.INTER_AREA)
+        return np.asarray(picture.round(), dtype=np.uint8)
 
 
 @cache
-def fine_depths(model: CameraModel) -> tuple[FloatArray, FloatArray]:
-    """Return the ground (x, y) of each fine ray, infinite above the horizon."""
-    u = (np.arange(model.width_px * FINE) + 0.5) / FINE - 0.5
-    v = (np.arange(model.height_px * FINE) + 0.5) / FINE - 0.5
+def ground_of_rays(model: CameraModel) -> tuple[FloatArray, FloatArray]:
+    """Return x and y of the ground point that each ray hits; infinite above the horizon."""
+    u = (np.arange(model.width_px * RAYS_PER_PIXEL_SIDE) + 0.5) / RAYS_PER_PIXEL_SIDE - 0.5
+    v = (np.arange(model.height_px * RAYS_PER_PIXEL_SIDE) + 0.5) / RAYS_PER_PIXEL_SIDE - 0.5
     inverse = np.linalg.inv(ground_to_picture(calibrated(model)))
     rays = np.stack([*np.meshgrid(u, v), np.ones((len(v), len(u)))], axis=-1) @ inverse.T
     below = rays[..., 2] > 1e-9  # the inverse's third component is 1 / depth: positive below the horizon
@@ -74,17 +74,17 @@ def fine_depths(model: CameraModel) -> tuple[FloatArray, FloatArray]:
 
 
 @cache
-def fine_ground(model: CameraModel) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
-    """Return the fine rays that hit ground near enough to have lines, and the ground's x and y."""
-    x_m, y_m = (each.ravel() for each in fine_depths(model))
-    places = np.flatnonzero(x_m < 120)
-    return places, x_m[places], y_m[places]
+def rays_on_near_ground(model: CameraModel) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
+    """Return the indices of rays that hit the ground within 120 m, and x and y of their ground points."""
+    x_m, y_m = (coordinates.ravel() for coordinates in ground_of_rays(model))
+    ray_indices = np.flatnonzero(x_m < 120)
+    return ray_indices, x_m[ray_indices], y_m[ray_indices]
 
 
 @cache
 def bare_ground(model: CameraModel) -> NDArray[np.float32]:
-    """Return the picture of a road without lines, with one pixel per fine ray."""
-    x_m, _ = fine_depths(model)
+    """Return the picture of a road without lines, with one pixel per ray."""
+    x_m, _ = ground_of_rays(model)
     fine = np.full((*x_m.shape, 3), SKY_GREY, dtype=np.float32)
     fine[np.isfinite(x_m)] = ROAD_GREY
     return fine
@@ -93,7 +93,7 @@ def bare_ground(model: CameraModel) -> NDArray[np.float32]:
 def on_road(
     x_m: FloatArray, y_m: FloatArray, curvature_per_m: float, offset_m: float, heading_rad: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return vehicle-frame points as (along, across) of a road that starts straight ahead."""
+    """Convert points of the vehicle frame to (along, across) of a road that starts straight ahead."""
     cosine, sine = np.cos(heading_rad), np.sin(heading_rad)
     x, y = x_m * cosine - y_m * sine, offset_m + x_m * sine + y_m * cosine
     if curvature_per_m == 0:

@@ -9,7 +9,7 @@ from lavt.perception.bird_eye import STAMP_SIDE_PX, GroundGrid, bird_eye
 from lavt.perception.calibration import calibrated, ground_to_picture
 
 
-def seen_at(model: CameraModel, x_m: float, y_m: float) -> tuple[float, float]:
+def pixel_of(model: CameraModel, x_m: float, y_m: float) -> tuple[float, float]:
     u, v, depth = ground_to_picture(calibrated(model)) @ np.array([x_m, y_m, 1.0])
     return u / depth, v / depth
 
@@ -17,7 +17,7 @@ def seen_at(model: CameraModel, x_m: float, y_m: float) -> tuple[float, float]:
 def test_a_point_straight_ahead_is_in_the_middle_column() -> None:
     """A point on the vehicle's axis is in the middle column, and higher up the farther away it is."""
     model = CameraModel()
-    near, far = seen_at(model, 5.0, 0.0), seen_at(model, 20.0, 0.0)
+    near, far = pixel_of(model, 5.0, 0.0), pixel_of(model, 20.0, 0.0)
     assert near[0] == pytest.approx((model.width_px - 1) / 2)
     assert far[0] == pytest.approx((model.width_px - 1) / 2)
     assert near[1] == pytest.approx((model.height_px - 1) / 2 + 320 * 1.4 / (5.0 - 1.6))
@@ -27,13 +27,13 @@ def test_a_point_straight_ahead_is_in_the_middle_column() -> None:
 def test_a_point_on_the_left_is_left_of_the_middle() -> None:
     """A point left of the axis is left of the middle column by focal length x offset / depth."""
     model = CameraModel()
-    assert seen_at(model, 11.6, 2.0)[0] == pytest.approx((model.width_px - 1) / 2 - 320 * 2.0 / 10.0)
+    assert pixel_of(model, 11.6, 2.0)[0] == pytest.approx((model.width_px - 1) / 2 - 320 * 2.0 / 10.0)
 
 
 def test_pitching_down_raises_the_road() -> None:
     """A camera pitched down by the angle of a ground point has that point in the middle row."""
     pitch_rad = math.atan2(1.4, 10.0)
-    assert seen_at(CameraModel(pitch_rad=pitch_rad), 11.6, 0.0)[1] == pytest.approx((480 - 1) / 2)
+    assert pixel_of(CameraModel(pitch_rad=pitch_rad), 11.6, 0.0)[1] == pytest.approx((480 - 1) / 2)
 
 
 def test_a_ground_point_maps_to_its_cell() -> None:
@@ -41,7 +41,7 @@ def test_a_ground_point_maps_to_its_cell() -> None:
     model, grid = CameraModel(), GroundGrid()
     mapping = bird_eye(calibrated(model), grid)
     picture = np.zeros((model.height_px, model.width_px), dtype=np.uint8)
-    u, v = seen_at(model, 8.0, -1.5)
+    u, v = pixel_of(model, 8.0, -1.5)
     picture[round(v) - 1 : round(v) + 2, round(u) - 1 : round(u) + 2] = 255
     rows, columns = np.nonzero(mapping.from_above(mapping.region(picture)))
     assert np.mean(grid.row_x_m()[rows]) == pytest.approx(8.0, abs=0.1)
@@ -63,9 +63,9 @@ def test_without_a_time_stamp_its_corner_is_used() -> None:
     """A camera with road in the stamp's corner uses the corner when there is no time stamp."""
     camera = calibrated(CameraModel(field_of_view_rad=0.7, pitch_rad=0.3))
     white = np.full((480, 640), 255, dtype=np.uint8)
-    stamped, plain = (bird_eye(camera, GroundGrid(), stamped=each) for each in (True, False))
-    assert np.count_nonzero(stamped.from_above(stamped.region(white))) < np.count_nonzero(
-        plain.from_above(plain.region(white))
+    with_stamp, without_stamp = (bird_eye(camera, GroundGrid(), stamped=has_stamp) for has_stamp in (True, False))
+    assert np.count_nonzero(with_stamp.from_above(with_stamp.region(white))) < np.count_nonzero(
+        without_stamp.from_above(without_stamp.region(white))
     )
 
 

@@ -21,7 +21,7 @@ MODEL = CameraModel()
 GREY = np.full((480, 640, 3), 128, dtype=np.uint8)
 
 
-def at(lane: Lane, x_m: float) -> float:
+def centre_at(lane: Lane, x_m: float) -> float:
     return lane.centre[0] + lane.centre[1] * x_m + lane.centre[2] * x_m**2
 
 
@@ -35,7 +35,7 @@ def test_the_centre_is_found_on_every_curve(scene: Scene, lines: tuple[Line, ...
     """In one picture the centre is right within 5 cm from 4 to 18 m, down to a radius of 42 m."""
     lane = detect(scene.picture(lines, curvature_per_m))
     for x_m in (4.0, 8.0, 12.0, 18.0):
-        assert at(lane, x_m) == pytest.approx(centre_y_m(x_m, curvature_per_m), abs=0.05)
+        assert centre_at(lane, x_m) == pytest.approx(centre_y_m(x_m, curvature_per_m), abs=0.05)
     assert lane.confidence > 0.8
 
 
@@ -46,23 +46,25 @@ def test_the_lane_is_in_the_vehicles_frame(scene: Scene, offset_m: float, headin
     """For a car left of the centre and turned left, the centre is on the right and leads to the right."""
     lane = detect(scene.picture(FOUR_LANES, offset_m=offset_m, heading_rad=heading_rad))
     for x_m in (5.0, 9.0):
-        assert at(lane, x_m) == pytest.approx(-offset_m / np.cos(heading_rad) - x_m * np.tan(heading_rad), abs=0.05)
+        assert centre_at(lane, x_m) == pytest.approx(
+            -offset_m / np.cos(heading_rad) - x_m * np.tan(heading_rad), abs=0.05
+        )
     assert lane.width_m == pytest.approx(3.5, abs=0.06)
 
 
 def test_a_mirrored_picture_has_the_mirrored_lane(scene: Scene) -> None:
     """The lane in a mirrored picture is the mirrored lane."""
     picture = scene.picture(BROKEN_LANE, 1 / 42, offset_m=0.2)
-    seen, mirrored = detect(picture), detect(np.ascontiguousarray(picture[:, ::-1]))
-    assert mirrored.centre == pytest.approx([-value for value in seen.centre], abs=0.01)
+    lane, mirrored = detect(picture), detect(np.ascontiguousarray(picture[:, ::-1]))
+    assert mirrored.centre == pytest.approx([-value for value in lane.centre], abs=0.01)
 
 
 @pytest.mark.parametrize("phase_m", np.arange(0.0, 9.0, 1.5))
-def test_aligned_dashes_are_enough(scene: Scene, phase_m: float) -> None:
+def test_a_lane_with_aligned_gaps_is_found(scene: Scene, phase_m: float) -> None:
     """A lane whose two broken lines have their gaps side by side is found, wherever the dashes are."""
     lines = [Line(side * 1.75, dash_m=3.0, phase_m=phase_m) for side in (1, -1)]
     lane = detect(scene.picture(lines, 1 / 87))
-    assert at(lane, 8.0) == pytest.approx(centre_y_m(8.0, 1 / 87), abs=0.1)
+    assert centre_at(lane, 8.0) == pytest.approx(centre_y_m(8.0, 1 / 87), abs=0.1)
     assert lane.confidence > 0.5
 
 
@@ -85,16 +87,16 @@ def test_an_empty_picture_has_no_confidence(scene: Scene) -> None:
     """An empty picture has confidence 0, at the start and after a lane, and keeps the last lane."""
     detector = LaneDetector(MODEL)
     assert detector.detect(GREY).confidence == 0
-    seen = detector.detect(scene.picture(LANE, 1 / 87))
+    last_lane = detector.detect(scene.picture(LANE, 1 / 87))
     for _ in range(FORGET_AFTER + 2):
         empty = detector.detect(GREY)
         assert empty.confidence == 0
-        assert empty.centre == seen.centre
+        assert empty.centre == last_lane.centre
     assert detector.detect(scene.picture(LANE, -1 / 42)).centre == detect(scene.picture(LANE, -1 / 42)).centre
 
 
 def test_noise_is_not_a_lane() -> None:
-    """Black and white noise has too little confidence to drive by."""
+    """Black and white noise has too little confidence for driving."""
     noise = np.random.Generator(np.random.Philox(5)).integers(0, 2, (120, 160, 1)).astype(np.uint8) * 255
     assert detect(noise.repeat(4, 0).repeat(4, 1).repeat(3, 2)).confidence < TRACK_CONFIDENCE
 
@@ -113,26 +115,26 @@ def test_the_lane_is_kept_while_the_car_leaves_it(scene: Scene) -> None:
     detector = LaneDetector(MODEL)
     for offset_m in np.arange(0.0, 3.01, 0.3):
         lane = detector.detect(scene.picture(FOUR_LANES, offset_m=float(offset_m)))
-    assert at(lane, 8.0) == pytest.approx(-3.0, abs=0.3)  # the average lags by 0.2 m
+    assert centre_at(lane, 8.0) == pytest.approx(-3.0, abs=0.3)  # the average lags by 0.2 m
 
 
 @pytest.mark.parametrize("direction", [1, -1])
 def test_a_lane_is_dropped_one_width_away(scene: Scene, direction: int) -> None:
     """When a car reaches the middle of the next lane, the detector changes to that lane."""
     detector = LaneDetector(MODEL)
-    seen = [
+    centres_m = [
         detector.detect(scene.picture(FOUR_LANES, offset_m=float(offset_m))).centre[0]
         for offset_m in np.arange(0.0, direction * 4.2, direction * 0.1)
     ]
     offsets = np.arange(0.0, 4.2, 0.1)
-    old, new = (np.array(seen)[part] for part in (offsets < 3.2, offsets > 4.0))
-    assert np.abs(old + direction * offsets[offsets < 3.2]).max() < 0.2
-    assert np.abs(new + direction * (offsets[offsets > 4.0] - 3.5)).max() < 0.2
+    in_old_lane, in_new_lane = (np.array(centres_m)[selected] for selected in (offsets < 3.2, offsets > 4.0))
+    assert np.abs(in_old_lane + direction * offsets[offsets < 3.2]).max() < 0.2
+    assert np.abs(in_new_lane + direction * (offsets[offsets > 4.0] - 3.5)).max() < 0.2
 
 
 @pytest.mark.parametrize(
     "offset_m",
-    [-3.0, -2.5, -1.0, -0.5, 0.0, 0.5, 1.0, 2.5, 3.0],  # on a line either lane would be right
+    [-3.0, -2.5, -1.0, -0.5, 0.0, 0.5, 1.0, 2.5, 3.0],  # not on a line, where either lane would be right
 )
 @pytest.mark.parametrize("curvature_per_m", [0.0, 1 / 42])
 def test_after_a_gap_the_nearest_lane_is_found(scene: Scene, offset_m: float, curvature_per_m: float) -> None:
@@ -143,10 +145,10 @@ def test_after_a_gap_the_nearest_lane_is_found(scene: Scene, offset_m: float, cu
     detector.forget()
     lane = detector.detect(scene.picture(six_lanes, curvature_per_m, offset_m=float(offset_m)))
     expected_m = -float(np.remainder(offset_m + 1.75, 3.5) - 1.75)
-    assert at(lane, 5.0) == pytest.approx(expected_m + centre_y_m(5.0, curvature_per_m), abs=0.15)
+    assert centre_at(lane, 5.0) == pytest.approx(expected_m + centre_y_m(5.0, curvature_per_m), abs=0.15)
 
 
-def test_the_trace_contains_the_steps(scene: Scene) -> None:
+def test_the_trace_contains_windows_only_for_a_search(scene: Scene) -> None:
     """The trace of a searched picture contains windows, that of a followed picture does not."""
     detector = LaneDetector(MODEL)
     detector.detect(scene.picture())
@@ -174,20 +176,20 @@ def test_the_lane_is_found_through_any_lens(lens: dict[str, Any]) -> None:
     lane = LaneDetector(camera, stamped=False).detect(picture)
     assert lane.confidence > 0.7
     for x_m in (5.0, 10.0, 15.0):
-        assert at(lane, x_m) == pytest.approx(centre_y_m(x_m, 1 / 87) - 0.4, abs=0.1)
+        assert centre_at(lane, x_m) == pytest.approx(centre_y_m(x_m, 1 / 87) - 0.4, abs=0.1)
 
 
 def distorted(camera: CalibratedCamera, curvature_per_m: float, offset_m: float) -> Picture:
     """Return the picture of a road of four lanes in a calibrated camera, computed per pixel."""
     columns, rows = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
     ground = ground_points(camera, np.stack([columns, rows], axis=-1).reshape(-1, 2).astype(np.float64))
-    seen = np.isfinite(ground).all(axis=1) & (np.hypot(*np.nan_to_num(ground).T) < 60)
-    x_m, y_m = np.where(seen[:, None], ground, 0.0).T
+    is_visible = np.isfinite(ground).all(axis=1) & (np.hypot(*np.nan_to_num(ground).T) < 60)
+    x_m, y_m = np.where(is_visible[:, None], ground, 0.0).T
     along, across = on_road(x_m, y_m, curvature_per_m, offset_m, 0.0)
     shades = np.full((len(ground), 3), 85, dtype=np.uint8)
     for line in FOUR_LANES:
-        paint = (np.abs(across - line.offset_m) < 0.0625) & (np.mod(along - line.phase_m, 9.0) < line.dash_m)
-        shades[seen & paint] = line.colour_bgr
+        is_painted = (np.abs(across - line.offset_m) < 0.0625) & (np.mod(along - line.phase_m, 9.0) < line.dash_m)
+        shades[is_visible & is_painted] = line.colour_bgr
     return shades.reshape(camera.height_px, camera.width_px, 3)
 
 
@@ -209,7 +211,7 @@ def test_a_small_camera_finds_the_lane() -> None:
     """At 320 x 240 the centre is right within 10 cm."""
     model = CameraModel(320, 240)
     lane = LaneDetector(model).detect(Scene(model).picture(FOUR_LANES, 1 / 87))
-    assert at(lane, 8.0) == pytest.approx(centre_y_m(8.0, 1 / 87), abs=0.1)
+    assert centre_at(lane, 8.0) == pytest.approx(centre_y_m(8.0, 1 / 87), abs=0.1)
 
 
 def test_forget_makes_the_detector_take_the_nearest_lane(scene: Scene) -> None:

@@ -18,20 +18,22 @@ GRID = GroundGrid()
 CURVE = (0.2, -0.03, 0.012)
 
 
-def lines(centre: tuple[float, float, float], offsets_m: tuple[float, ...], x_m: np.ndarray | None = None) -> Points:
+def points_on_parallels(
+    centre: tuple[float, float, float], offsets_m: tuple[float, ...], x_m: np.ndarray | None = None
+) -> Points:
     """Return points on exact parallels of a centre."""
     x = np.arange(3.65, 20.0, 0.1) if x_m is None else x_m
     slope = centre[1] + 2 * centre[2] * x
     y = centre[0] + centre[1] * x + centre[2] * x * x
     across = np.repeat(offsets_m, 3) + np.tile([-0.04, 0.0, 0.04], len(offsets_m))
-    turned = np.sqrt(1 + slope**2)
+    slant = np.sqrt(1 + slope**2)
     return Points(
-        np.concatenate([x - slope / turned * offset for offset in across]),
-        np.concatenate([y + offset / turned for offset in across]),
+        np.concatenate([x - slope / slant * offset for offset in across]),
+        np.concatenate([y + offset / slant for offset in across]),
     )
 
 
-def follow(points: Points, width_m: float = 3.5) -> tuple[Sides, LaneFit | None]:
+def search_and_fit(points: Points, width_m: float = 3.5) -> tuple[Sides, LaneFit | None]:
     start = start_line(points, GRID, width_m)
     assert start is not None
     sides, _ = sides_by_windows(points, GRID, start, width_m)
@@ -55,7 +57,7 @@ def test_mask_cells_are_converted_to_ground_points() -> None:
 
 def test_a_curved_lane_is_found_and_fitted() -> None:
     """Windows follow a curve of 42 m radius, and the fit is within 3 cm of its centre."""
-    _, fit = follow(lines(CURVE, (1.75, -1.75)))
+    _, fit = search_and_fit(points_on_parallels(CURVE, (1.75, -1.75)))
     assert error_m(fit, CURVE) < 0.03
     assert fit is not None
     assert fit.width_m == pytest.approx(3.5, abs=0.03)
@@ -63,9 +65,9 @@ def test_a_curved_lane_is_found_and_fitted() -> None:
 
 
 def test_marks_of_adjacent_lanes_are_ignored() -> None:
-    """Of six lines the windows take the two beside the car, also when it is 0.6 m off the centre."""
-    points = lines((0.6, 0.0, 0.0), (8.75, 5.25, 1.75, -1.75, -5.25, -8.75))
-    sides, fit = follow(points)
+    """Of six lines the windows select the two next to the car, even if the car is 0.6 m off the centre."""
+    points = points_on_parallels((0.6, 0.0, 0.0), (8.75, 5.25, 1.75, -1.75, -5.25, -8.75))
+    sides, fit = search_and_fit(points)
     assert error_m(fit, (0.6, 0.0, 0.0)) < 0.02
     assert set(np.round(points.y_m[sides > 0] - 0.6, 1)) == {1.7, 1.8}
 
@@ -78,7 +80,7 @@ def test_points_near_a_known_lane_are_assigned_to_it() -> None:
 
 def test_one_line_is_enough() -> None:
     """With one line the centre is half the expected width beside it, and the confidence is about half."""
-    points = lines(CURVE, (-1.75,))
+    points = points_on_parallels(CURVE, (-1.75,))
     fit = fit_lane(points, sides_near(points, CURVE, 3.5), GRID, 3.5)
     assert error_m(fit, CURVE) < 0.03
     assert fit is not None
@@ -88,16 +90,19 @@ def test_one_line_is_enough() -> None:
 
 def test_an_implausible_width_is_not_used() -> None:
     """When two lines are not a lane's width apart, only the line with more points is used."""
-    long, short = lines((0.0, 0.0, 0.0), (1.75,)), lines((0.0, 0.0, 0.0), (-0.5,), np.arange(4, 9, 0.1))
-    points = Points(np.concatenate([long.x_m, short.x_m]), np.concatenate([long.y_m, short.y_m]))
-    sides = np.concatenate([np.full(len(long.x_m), 1), np.full(len(short.x_m), -1)]).astype(np.int8)
+    long_line, short_line = (
+        points_on_parallels((0.0, 0.0, 0.0), (1.75,)),
+        points_on_parallels((0.0, 0.0, 0.0), (-0.5,), np.arange(4, 9, 0.1)),
+    )
+    points = Points(np.concatenate([long_line.x_m, short_line.x_m]), np.concatenate([long_line.y_m, short_line.y_m]))
+    sides = np.concatenate([np.full(len(long_line.x_m), 1), np.full(len(short_line.x_m), -1)]).astype(np.int8)
     fit = fit_lane(points, sides, GRID, 3.5)
     assert error_m(fit, (0.0, 0.0, 0.0)) < 0.02
 
 
 def test_a_short_stretch_is_fitted_straight() -> None:
     """Less than 6 m of visible lane is fitted without curvature."""
-    points = lines(CURVE, (1.75, -1.75), np.arange(5.0, 10.0, 0.1))
+    points = points_on_parallels(CURVE, (1.75, -1.75), np.arange(5.0, 10.0, 0.1))
     fit = fit_lane(points, sides_near(points, CURVE, 3.5), GRID, 3.5)
     assert fit is not None
     assert fit.centre[2] == 0.0
@@ -105,8 +110,8 @@ def test_a_short_stretch_is_fitted_straight() -> None:
 
 def test_a_patch_beside_the_line_does_not_bend_the_fit() -> None:
     """Spots half a metre off a line do not bend the fit, but lower the share of paint on the lines."""
-    clean = lines(CURVE, (1.75, -1.75))
-    spots = lines(CURVE, (1.2,), np.arange(12.0, 14.0, 0.1))
+    clean = points_on_parallels(CURVE, (1.75, -1.75))
+    spots = points_on_parallels(CURVE, (1.2,), np.arange(12.0, 14.0, 0.1))
     points = Points(np.concatenate([clean.x_m, spots.x_m]), np.concatenate([clean.y_m, spots.y_m]))
     fit = fit_lane(points, sides_near(points, CURVE, 3.5), GRID, 3.5)
     assert error_m(fit, CURVE) < 0.04
@@ -119,7 +124,7 @@ def test_too_few_points_are_no_lane() -> None:
     nothing = Points(np.empty(0), np.empty(0))
     assert start_line(nothing, GRID, 3.5) is None
     assert fit_lane(nothing, np.empty(0, dtype=np.int8), GRID, 3.5) is None
-    few = lines((0.0, 0.0, 0.0), (1.75, -1.75), np.arange(5.0, 5.5, 0.1))
+    few = points_on_parallels((0.0, 0.0, 0.0), (1.75, -1.75), np.arange(5.0, 5.5, 0.1))
     assert fit_lane(few, sides_near(few, (0.0, 0.0, 0.0), 3.5), GRID, 3.5) is None
 
 

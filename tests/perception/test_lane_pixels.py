@@ -28,7 +28,7 @@ def test_a_yellow_mark_is_found() -> None:
 
 
 def test_grain_in_bright_light_is_not_paint() -> None:
-    """Stripes 40 levels brighter than a bright road, but only by a fifth, are not paint."""
+    """A stripe that is 40 levels brighter than a bright road, which is only a fifth, is not paint."""
     picture = road() + np.uint8(115)
     picture[:, 300:308] += np.uint8(40)
     assert not lane_pixels(picture).any()
@@ -42,7 +42,7 @@ def test_a_brightness_gradient_is_not_paint() -> None:
 
 
 def test_a_bright_area_is_not_paint_inside() -> None:
-    """A bright area wider than a mark is paint at its rim at most."""
+    """Of a bright area wider than a mark, at most the rim is paint."""
     picture = road()
     picture[:, 200:440] = 220
     assert not lane_pixels(picture)[:, 260:380].any()

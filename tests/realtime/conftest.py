@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tests.support.stalls import Shared, Stalls
+from tests.support.stalls import SharedResult, Stalls
 
 from lavt.clock import MachineClock, pause
 from lavt.config import RunConfig
@@ -52,7 +52,7 @@ def wait_until() -> Callable[[str, Callable[[], bool], float], None]:
 
 @pytest.fixture(scope="session")
 def planned() -> Callable[..., PlannedRun]:
-    """Plan a run in real time as in `lavt demo`, with changes of its config."""
+    """Return a function that plans a run in real time as `lavt demo` does, with changes of its config."""
 
     def plan(*changes: str, repetition: int = 0) -> PlannedRun:
         sets = ["time=real", f"repetition={repetition}", *changes]
@@ -94,7 +94,7 @@ class Demo:
         return summary
 
     @cached_property
-    def injected(self) -> dict[str, RealDrive]:
+    def drives_by_condition(self) -> dict[str, RealDrive]:
         """Return the drives in real time by condition."""
         drives = {}
         for name in ("L0", "L5"):
@@ -105,9 +105,9 @@ class Demo:
 
 def run_at_a_terminal(arguments: list[str]) -> tuple[int, str]:
     """Run a program with a terminal as standard output and error; return its exit code and output."""
-    terminal, end = pty.openpty()
-    program = subprocess.Popen(arguments, stdout=end, stderr=end, stdin=subprocess.DEVNULL)
-    os.close(end)
+    terminal, program_side = pty.openpty()
+    program = subprocess.Popen(arguments, stdout=program_side, stderr=program_side, stdin=subprocess.DEVNULL)
+    os.close(program_side)
     output = bytearray()
     while True:
         try:
@@ -122,7 +122,7 @@ def run_at_a_terminal(arguments: list[str]) -> tuple[int, str]:
 
 
 @pytest.fixture(scope="session")
-def demos(tmp_path_factory: pytest.TempPathFactory, stalls: Stalls) -> Shared[Demo]:
+def demos(tmp_path_factory: pytest.TempPathFactory, stalls: Stalls) -> SharedResult[Demo]:
     clock = MachineClock()
 
     def run() -> Demo:
@@ -131,10 +131,10 @@ def demos(tmp_path_factory: pytest.TempPathFactory, stalls: Stalls) -> Shared[De
         assert code == 0, output
         return Demo(out, code, output, since_ns, clock.now().mono_ns)
 
-    return Shared(stalls, run)
+    return SharedResult(stalls, run)
 
 
 @pytest.fixture
-def demo(demos: Shared[Demo]) -> Demo:
+def demo(demos: SharedResult[Demo]) -> Demo:
     """Return the demo, run once per session unless the host stalled it."""
     return demos.get()

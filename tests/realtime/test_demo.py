@@ -126,7 +126,7 @@ def test_delay_degrades_lane_keeping(demo: Demo, stalls: Stalls) -> None:
     """At L0 the P95 cross-track error is below 0.3 m; at L5 the car leaves the lane, in real and in virtual time."""
     for run in demo.summary["runs"]:
         if run["condition"] == "L0":
-            with stalls.judging(demo.since_ns, demo.until_ns, stall_ms=LONG_STALL_MS):
+            with stalls.excusing_failures(demo.since_ns, demo.until_ns, stall_ms=LONG_STALL_MS):
                 assert (run["ending"], run["lane_invasions"]) == ("completed", 0)
                 assert run["p95_m"] < 0.3
         if run["condition"] == "L5":

@@ -31,13 +31,13 @@ def test_the_same_drive_has_the_same_seed(demo: Demo, condition: str) -> None:
 def test_latencies_agree_in_real_and_virtual_time(demo: Demo, stalls: Stalls, condition: str, latency: str) -> None:
     """The medians of video, control and loop latency in real and in virtual time are within 5 ms."""
     real, virtual = pair(demo, condition)
-    with stalls.judging(demo.since_ns, demo.until_ns, share=BUSY_SHARE):
+    with stalls.excusing_failures(demo.since_ns, demo.until_ns, share=BUSY_SHARE):
         assert abs(real[latency]["p50"] - virtual[latency]["p50"]) < 5
 
 
 def test_lane_keeping_agrees_in_real_and_virtual_time(demo: Demo, stalls: Stalls) -> None:
     """Without delay a drive ends the same way, and its P95 cross-track error is within 30 % of that in real time."""
     real, virtual = pair(demo, "L0")
-    with stalls.judging(demo.since_ns, demo.until_ns, stall_ms=LONG_STALL_MS):
+    with stalls.excusing_failures(demo.since_ns, demo.until_ns, stall_ms=LONG_STALL_MS):
         assert real["ending"] == virtual["ending"]
         assert abs(real["p95_m"] - virtual["p95_m"]) < 0.3 * real["p95_m"]

@@ -15,7 +15,7 @@ import pytest
 import yaml
 from pydantic import BaseModel
 from tests.support.ports import free_port
-from tests.support.stalls import LONG_STALL_MS, Shared, Stalls
+from tests.support.stalls import LONG_STALL_MS, SharedResult, Stalls
 
 from lavt.clock import MachineClock
 from lavt.domain import NS_PER_S
@@ -27,7 +27,7 @@ from lavt.recording.record import Record, read_record
 
 Wait = Callable[[str, Callable[[], bool], float], None]
 
-BEGINS_S = 90.0
+START_LIMIT_S = 90.0
 """Processes start, routers find each other, a client gets control, arms and speeds up: 10 s on a quiet machine."""
 
 
@@ -45,13 +45,13 @@ def has_printed(process: Process, *words: str) -> bool:
 
 @dataclass
 class Session:
-    """A server and clients, started in the worst order, with what they reported and when they were ended."""
+    """A server and clients, started in the worst order, with their reports and the times at which they ended."""
 
     processes: Processes
     work: Path
     wait_until: Wait
     planned: PlannedRun
-    seen: dict[str, Any] = field(default_factory=dict)
+    observations: dict[str, Any] = field(default_factory=dict)
     at_ns: dict[str, int] = field(default_factory=dict)
     codes: dict[str, int | None] = field(default_factory=dict)
     clock: MachineClock = field(default_factory=MachineClock)
@@ -62,10 +62,10 @@ class Session:
         self.between = f"udp/127.0.0.1:{free_port(udp)}?rel=1;mixed_rel=1"
         self.probe_port = free_port(udp)
 
-    def client(self, name: str, who: str, *options: str) -> Process:
+    def client(self, name: str, operator: str, *options: str) -> Process:
         run = self.planned.config
         config = client_config(run, router=self.client_local, probe_port=self.probe_port)
-        path = self.write(name, config.model_copy(update={"who": who}))
+        path = self.write(name, config.model_copy(update={"who": operator}))
         process = self.processes.start(name, "client", path, "--out", str(self.work / name), *options)
         process.ready()
         return process
@@ -92,14 +92,14 @@ class Session:
         def reached() -> bool:
             return status(client).get("phase") == "driving" and status(server).get("speed_mps", 0.0) >= speed_mps
 
-        self.wait_until(f"{client.name} drives with {speed_mps} m/s", reached, BEGINS_S)
+        self.wait_until(f"{client.name} drives at {speed_mps} m/s", reached, START_LIMIT_S)
 
     def end(self, process: Process) -> None:
         self.at_ns[f"{process.name} interrupted"] = self.clock.now().mono_ns
         process.end()
         self.at_ns[f"{process.name} ended"] = self.clock.now().mono_ns
         self.codes[process.name] = process.popen.returncode
-        self.seen[f"last of {process.name}"] = process.last_line()
+        self.observations[f"last of {process.name}"] = process.last_line()
 
     @cached_property
     def record(self) -> Record:
@@ -110,7 +110,7 @@ class Session:
 @pytest.fixture(scope="module")
 def sessions(
     tmp_path_factory: pytest.TempPathFactory, wait_until: Wait, planned: Callable[..., PlannedRun], stalls: Stalls
-) -> Shared[Session]:
+) -> SharedResult[Session]:
     """Run a session in which control of the vehicle goes from one client to another."""
 
     def run() -> Session:
@@ -118,35 +118,38 @@ def sessions(
         with Processes(work) as processes:
             drive = Session(processes, work, wait_until, planned("vehicle.scenery=none", "controller.preset=designed"))
             first = drive.client("first", "operator-1")
-            drive.seen["first without a router"] = first.last_message()
+            drive.observations["first without a router"] = first.last_message()
             server = drive.server()
             drive.routers()
             drive.reach(server, first, 2.0)
 
             waiting = drive.client("waiting", "operator-2")
-            wait_until("a rejection", lambda: "operator-1" in status(waiting).get("session", ""), BEGINS_S)
-            drive.seen["waiting"], drive.seen["server while it waits"] = status(waiting), status(server)
+            wait_until("a rejection", lambda: "operator-1" in status(waiting).get("session", ""), START_LIMIT_S)
+            drive.observations["waiting"], drive.observations["server while it waits"] = status(waiting), status(server)
             drive.end(waiting)
 
             second = drive.client("second", "operator-2", "--take-over")
-            wait_until("a request at the client", lambda: has_printed(first, "operator-2", "SIGUSR2"), BEGINS_S)
-            wait_until("a request", lambda: status(server).get("requested_by") == "operator-2", BEGINS_S)
-            drive.seen["requested"] = status(server)
+            wait_until("a request at the client", lambda: has_printed(first, "operator-2", "SIGUSR2"), START_LIMIT_S)
+            wait_until("a request", lambda: status(server).get("requested_by") == "operator-2", START_LIMIT_S)
+            drive.observations["requested"] = status(server)
             first.popen.send_signal(signal.SIGUSR2)
             drive.reach(server, second, 1.0)
-            drive.seen["handed over"], drive.seen["first after handover"] = status(server), status(first)
+            drive.observations["handed over"], drive.observations["first after handover"] = (
+                status(server),
+                status(first),
+            )
 
             drive.end(second)
-            wait_until("a release", lambda: status(server).get("active_operator") == "", BEGINS_S)
+            wait_until("a release", lambda: status(server).get("active_operator") == "", START_LIMIT_S)
             drive.end(server)
             drive.end(first)
         return drive
 
-    return Shared(stalls, run)
+    return SharedResult(stalls, run)
 
 
 @pytest.fixture
-def session(sessions: Shared[Session]) -> Session:
+def session(sessions: SharedResult[Session]) -> Session:
     return sessions.get()
 
 
@@ -166,16 +169,16 @@ def event_ns(record: Record, *words: str) -> int:
 
 def test_a_client_started_before_its_router_and_server_drives(session: Session, server: Record) -> None:
     """A client that starts before the server and the routers reports once that it waits, and then drives."""
-    assert "no router answers" in session.seen["first without a router"]
-    assert "waiting" in session.seen["first without a router"]
+    assert "no router answers" in session.observations["first without a router"]
+    assert "waiting" in session.observations["first without a router"]
     assert event_ns(server, "arming -> driving")
 
 
 def test_a_second_client_learns_who_has_control(session: Session) -> None:
     """Without take-over a second client learns who has control, requests no handover, and ends with exit code 0."""
-    assert session.seen["waiting"]["phase"] == "seeking"
-    assert session.seen["waiting"]["active_operator"] == "operator-1"
-    at_server = session.seen["server while it waits"]
+    assert session.observations["waiting"]["phase"] == "seeking"
+    assert session.observations["waiting"]["active_operator"] == "operator-1"
+    at_server = session.observations["server while it waits"]
     assert (at_server["safety"], at_server["active_operator"], at_server["requested_by"]) == (
         "driving",
         "operator-1",
@@ -186,16 +189,16 @@ def test_a_second_client_learns_who_has_control(session: Session) -> None:
 
 def test_the_active_operator_hands_over_on_request(session: Session, server: Record, stalls: Stalls) -> None:
     """After a request and SIGUSR2 the active operator releases the vehicle, which stops; the requester drives it."""
-    requested = session.seen["requested"]
+    requested = session.observations["requested"]
     assert (requested["active_operator"], requested["requested_by"]) == ("operator-1", "operator-2")
-    assert session.seen["handed over"]["active_operator"] == "operator-2"
-    first = session.seen["first after handover"]
+    assert session.observations["handed over"]["active_operator"] == "operator-2"
+    first = session.observations["first after handover"]
     assert (first["phase"], first["session"]) == ("watching", "released")
     released_ns = event_ns(server, "release", "operator-1", "granted")
     assert event_ns(server, "driving -> safe_stop") >= released_ns
     acquired_ns = event_ns(server, "acquire", "operator-2", "granted")
     assert acquired_ns >= released_ns
-    with stalls.judging(released_ns, acquired_ns, stall_ms=LONG_STALL_MS):
+    with stalls.excusing_failures(released_ns, acquired_ns, stall_ms=LONG_STALL_MS):
         assert acquired_ns - released_ns < 2 * NS_PER_S
 
 
@@ -204,15 +207,15 @@ def test_ctrl_c_of_the_active_operator_releases_the_vehicle(session: Session, se
     released_ns = event_ns(server, "release", "operator-2", "granted")
     interrupted_ns = session.at_ns["second interrupted"]
     assert interrupted_ns < released_ns
-    with stalls.judging(interrupted_ns, released_ns, stall_ms=LONG_STALL_MS):
+    with stalls.excusing_failures(interrupted_ns, released_ns, stall_ms=LONG_STALL_MS):
         assert released_ns - interrupted_ns < NS_PER_S
-    assert "released" in session.seen["last of second"]["said"][-1]
+    assert "released" in session.observations["last of second"]["said"][-1]
     assert session.codes["second"] == 0
 
 
 def test_a_server_ends_with_its_vehicle_stopped(session: Session, server: Record) -> None:
     """After Ctrl-C the server waits for standstill and ends with exit code 0 and a complete record."""
-    assert "server ends" in session.seen["last of server"]["said"][-1]
+    assert "server ends" in session.observations["last of server"]["said"][-1]
     assert abs(server.table("truth").floats("speed_mps")[-1]) < 0.05
     assert session.codes["server"] == 0
     assert server.complete
@@ -222,5 +225,5 @@ def test_a_client_without_control_ends_soon(session: Session, stalls: Stalls) ->
     """Ctrl-C ends a client without control, whose server has ended, within 3 s and with exit code 0."""
     assert session.codes["first"] == 0
     interrupted_ns, ended_ns = session.at_ns["first interrupted"], session.at_ns["first ended"]
-    with stalls.judging(interrupted_ns, ended_ns, stall_ms=LONG_STALL_MS):
+    with stalls.excusing_failures(interrupted_ns, ended_ns, stall_ms=LONG_STALL_MS):
         assert ended_ns - interrupted_ns < 3 * NS_PER_S

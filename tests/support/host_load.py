@@ -2,9 +2,10 @@
 
     python -m tests.support.host_load --share 0.3 --stop-ms 300 --stops-every-s 20 --seed 1 -- COMMAND...
 
-Processes of the highest real-time priority, one on each processor, take a share of every 10 ms and, at random times,
-all processors together for a while. Meanwhile no other program runs, whatever its priority, as under a hypervisor that
-gives the processors to others. The load ends with the command, and returns its exit code. Needs root.
+Processes of the highest real-time priority, one on each processor, occupy a share of every 10 ms. At random times they
+also occupy all processors for a while (a "stop"). Meanwhile no other program runs, whatever its priority, as under a
+hypervisor that gives the processors to other machines. The load ends with the command, and returns its exit code. Needs
+root.
 """
 
 from __future__ import annotations
@@ -19,20 +20,20 @@ import time  # noqa: TID251 (spins, and so measures the machine itself)
 
 PRIORITY = 99
 PERIOD_NS = 10_000_000
-LONGEST_S = 4 * 3600
-"""Stops end after this time."""
+LAST_STOP_S = 4 * 3600
+"""No stop begins later than this."""
 MAX_SHARE = 0.95
 """The kernel's limit for real-time programs, as a share of each second (sched_rt_runtime_us)."""
 
 
-def stop_times(seed: int, every_s: float, stop_ms: float, longest_s: float = LONGEST_S) -> list[tuple[int, int]]:
-    """Return begin and end of each stop in ns from the start; the intervals between stops are exponential."""
+def stop_times(seed: int, every_s: float, stop_ms: float, last_stop_s: float = LAST_STOP_S) -> list[tuple[int, int]]:
+    """Return when each stop begins and ends, in ns from the start; the intervals between stops are exponential."""
     from lavt.streams import stream
 
     generator, stops, at_s = stream(seed, "host load"), [], 0.0
     while every_s > 0 and stop_ms > 0:
         at_s += float(generator.exponential(every_s))
-        if at_s > longest_s:
+        if at_s > last_stop_s:
             break
         stops.append((round(at_s * 1e9), round(at_s * 1e9 + stop_ms * 1e6)))
         at_s += stop_ms / 1e3
@@ -48,15 +49,15 @@ def spin_until(end_ns: int) -> int:
 
 
 def spin(processor: int) -> None:
-    """Occupy a processor as standard input says, until it ends; then print the requested and the actual CPU time.
+    """Occupy a processor as standard input says, until that ends; print the requested and the actual CPU time.
 
-    They differ if the kernel kept the processor from this program.
+    They differ if the kernel did not give the processor to this program.
     """
     os.sched_setaffinity(0, {processor})
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     begin_ns, share, stops = json.loads(sys.stdin.readline())
-    ended = select.poll()
-    ended.register(0, select.POLLIN | select.POLLHUP)
+    stdin_poll = select.poll()
+    stdin_poll.register(0, select.POLLIN | select.POLLHUP)
     spun_ns, used_before_ns = 0, time.process_time_ns()
     while True:
         now_ns = time.monotonic_ns()
@@ -65,13 +66,13 @@ def spin(processor: int) -> None:
             now_ns = time.monotonic_ns()
         next_ns = now_ns - (now_ns - begin_ns) % PERIOD_NS + PERIOD_NS
         spun_ns += spin_until(now_ns + round(share * (next_ns - now_ns)))
-        if ended.poll(max(next_ns - time.monotonic_ns(), 0) / 1e6):
+        if stdin_poll.poll(max(next_ns - time.monotonic_ns(), 0) / 1e6):
             break
     sys.stdout.write(json.dumps([spun_ns, time.process_time_ns() - used_before_ns, time.monotonic_ns() - begin_ns]))
 
 
 def run_under_load(command: list[str], share: float, stops: list[tuple[int, int]]) -> int:
-    """Run a command while the processors are occupied; return its exit code."""
+    """Run a command while the processors are occupied; return its exit code, or 128 plus the signal that killed it."""
     spinners = [
         subprocess.Popen(
             [sys.executable, "-I", "-S", __file__, "--processor", str(processor)],
@@ -93,10 +94,10 @@ def run_under_load(command: list[str], share: float, stops: list[tuple[int, int]
         answers = [spinner.communicate()[0] for spinner in spinners]
     for number, line in enumerate(answers):
         spun_ns, used_ns, lasted_ns = json.loads(line)
-        stopped = sum(begin < lasted_ns for begin, _ in stops)
+        stop_count = sum(begin < lasted_ns for begin, _ in stops)
         sys.stderr.write(
             f"host load: spinner {number} had {used_ns / spun_ns:.1%} of the requested time, "
-            f"{spun_ns / lasted_ns:.1%} of {lasted_ns / 1e9:.0f} s, with {stopped} stops\n"
+            f"{spun_ns / lasted_ns:.1%} of {lasted_ns / 1e9:.0f} s, with {stop_count} stops\n"
         )
     return code if code >= 0 else 128 - code
 

@@ -1,9 +1,10 @@
 """Pytest hooks: a test that the host stalled is run again, at most twice, and is then inconclusive.
 
-`tests/conftest.py` loads this plugin. A test may use the fixture `stalls`, directly or through another one; a test
-whose assertions are all about times has the marker `judges_times`, with the arguments of `Stalls.judging`. Both are
-run again only after `HostStalled`: any other exception fails the test, even one that was raised while a `HostStalled`
-was handled. A session fails if too many tests were inconclusive on an idle machine, or if a probe ended early.
+`tests/conftest.py` loads this plugin. A test that judges times uses the fixture `stalls`, directly or through another
+one. A test whose assertions are all about times has the marker `judges_times` instead, with the arguments of
+`Stalls.excusing_failures`. Both are run again only after `HostStalled`: any other exception fails the test, even one
+that was raised while a `HostStalled` was handled. A session fails if too many tests were inconclusive on an idle
+machine, or if a probe ended early.
 """
 
 from __future__ import annotations
@@ -12,10 +13,10 @@ from collections.abc import Generator
 from dataclasses import dataclass, field
 
 import pytest
-from tests.support.stalls import TRIES, HostStalled, ProbeEnded, Stalls, inconclusive_too_often
+from tests.support.stalls import MAX_ATTEMPTS, HostStalled, ProbeEnded, Stalls, inconclusive_too_often
 
-AGAIN = pytest.mark.flaky(reruns=TRIES - 1, rerun_except="^(?!HostStalled:)")
-"""pytest-rerunfailures searches "type: message" of the exception itself, not of its causes."""
+RERUN = pytest.mark.flaky(reruns=MAX_ATTEMPTS - 1, rerun_except="^(?!HostStalled:)")
+"""pytest-rerunfailures matches the pattern with "type: message" of the exception itself, not of its causes."""
 INCONCLUSIVE = "inconclusive"
 JUDGES_TIMES = "judges_times"
 
@@ -52,7 +53,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if item.get_closest_marker(JUDGES_TIMES) and "stalls" not in names:
             names.append("stalls")
         if "stalls" in names:
-            item.add_marker(AGAIN)
+            item.add_marker(RERUN)
 
 
 @pytest.hookimpl(wrapper=True)
@@ -63,7 +64,7 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None, None, None]:
         return (yield)
     measured = item.config.stash[SESSION].stalls
     assert measured is not None
-    with measured.judging(measured.clock.now().mono_ns, **marker.kwargs):
+    with measured.excusing_failures(measured.clock.now().mono_ns, **marker.kwargs):
         return (yield)
 
 
@@ -81,14 +82,14 @@ def pytest_runtest_makereport(
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_logreport(report: pytest.TestReport) -> Generator[None, object, object]:
-    """Call a last attempt that the host stalled inconclusive, before it is counted as failed."""
+    """Before a test is counted as failed: if the host stalled its last attempt, make its outcome inconclusive."""
     if report.failed and getattr(report, "host_stalled", False):
         vars(report)["outcome"] = INCONCLUSIVE
     return (yield)
 
 
 def pytest_report_teststatus(report: pytest.TestReport) -> tuple[str, str, tuple[str, dict[str, bool]]] | None:
-    """Return a category of their own for inconclusive tests."""
+    """Return the category, letter and word with which pytest reports inconclusive tests."""
     if report.outcome != INCONCLUSIVE:
         return None
     return INCONCLUSIVE, "I", ("INCONCLUSIVE", {"yellow": True})
@@ -122,8 +123,8 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
     """Print which tests were run again or were inconclusive and why, and how often the host stalled."""
-    for category, word in (("rerun", "AGAIN"), (INCONCLUSIVE, "INCONCLUSIVE")):
+    for category, label in (("rerun", "AGAIN"), (INCONCLUSIVE, "INCONCLUSIVE")):
         for report in terminalreporter.getreports(category):
-            terminalreporter.write_line(f"{word} {report.nodeid}: {report.longrepr.reprcrash.message}")
+            terminalreporter.write_line(f"{label} {report.nodeid}: {report.longrepr.reprcrash.message}")
     for line in config.stash[SESSION].messages:
         terminalreporter.write_line(line)

@@ -1,4 +1,4 @@
-"""Runs lanes sequentially, each with a time limit, and prints the results in a table."""
+"""Run lanes sequentially, each with a time limit, and print the results in a table."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ LOW_PRIORITY = 19
 POLL_NS = 100 * NS_PER_MS
 GRACE_NS = 10 * NS_PER_S
 """Time for a lane to end after SIGTERM."""
-COUNTED = ("passed", "failed", "error", "skipped", "rerun", "inconclusive")
+OUTCOMES = ("passed", "failed", "error", "skipped", "rerun", "inconclusive")
 SUMMARY = re.compile(r"^=+ (.*) in [\d.]+s(?: \([\d:]+\))? =+$", re.MULTILINE)
 COLOURS = re.compile(r"\x1b\[[\d;]*m")
 
 Write = Callable[[str], None]
 
 
-def counts_of(output: str) -> Counter[str]:
+def parse_counts(output: str) -> Counter[str]:
     """Return the numbers of passed tests, failed tests etc. from the closing lines of pytest in an output."""
     counts: Counter[str] = Counter()
     for line in SUMMARY.findall(COLOURS.sub("", output)):
@@ -46,7 +46,7 @@ class LaneOutcome:
     took_s: float
     counts: Counter[str]
     failures: list[str] = field(default_factory=list)
-    """Reasons of its failure; empty if it passed."""
+    """The reasons for its failure; empty if it passed."""
 
 
 class RunningLane:
@@ -55,13 +55,12 @@ class RunningLane:
     def __init__(self, lane: LaneSpec, folder: Path, *, niceness: int = 0) -> None:
         self.lane = lane
         self._niceness = niceness
-        self._left = list(lane.commands)
+        self._waiting_commands = list(lane.commands)
         self._command = ""
         self._process: subprocess.Popen[bytes] | None = None
         self._output = folder / f"{lane.name}.output"
-        self._progress = (
-            folder / lane.name / "progress"
-        )  # in its own folder, which the kernel lane's machines can write to
+        # The kernel lane's machines can write to this folder, which has nothing else.
+        self._progress = folder / lane.name / "progress"
         self._progress.parent.mkdir()
         self._output.touch()
         self._written_bytes = 0
@@ -84,8 +83,8 @@ class RunningLane:
                 f"took longer than {self.lane.limit_min:g} min, and was at: {running_test or 'no test'}"
             )
             self.end()
-        elif self._process is None and self._left:
-            self._process = self._start(self._left.pop(0))
+        elif self._process is None and self._waiting_commands:
+            self._process = self._start(self._waiting_commands.pop(0))
         elif self._process is None:
             self.running = False
 
@@ -103,9 +102,9 @@ class RunningLane:
             )
 
     def end(self) -> None:
-        """End it and all that it has started, at first as Ctrl-C does, so that pytest says what has failed by then."""
+        """End the lane and all its processes, first as Ctrl-C does, so that pytest reports the failures so far."""
         self.running = False
-        self._left.clear()
+        self._waiting_commands.clear()
         if self._process is None:
             return
         group, clock = self._process.pid, MachineClock()
@@ -128,14 +127,14 @@ class RunningLane:
 
     def outcome(self) -> LaneOutcome:
         """Return the result."""
-        counts = counts_of(self._output.read_text(errors="replace"))
+        counts = parse_counts(self._output.read_text(errors="replace"))
         return LaneOutcome(self.lane.name, (self._ended_ns - self._began_ns) / NS_PER_S, counts, self.failures)
 
 
 def run_lanes(lanes: Sequence[LaneSpec], *, write: Write) -> int:
     """Run lanes in their order; return 0 if all passed, else 1.
 
-    The output of a lane that runs meanwhile is written after the other's.
+    The output of a lane that runs at the same time (`meanwhile`) is written after that of the main lane.
     """
     outcomes: list[LaneOutcome] = []
     began_ns = MachineClock().now().mono_ns
@@ -144,49 +143,51 @@ def run_lanes(lanes: Sequence[LaneSpec], *, write: Write) -> int:
             running = [RunningLane(lane, Path(folder))]
             if lane.meanwhile is not None:
                 running.append(RunningLane(lane.meanwhile, Path(folder), niceness=LOW_PRIORITY))
-            write(f"\n---- {' and '.join(each.lane.name for each in running)}\n")
+            write(f"\n---- {' and '.join(running_lane.lane.name for running_lane in running)}\n")
             try:
                 _run_together(running, write)
             finally:
-                for each in running:
-                    each.end()
-            outcomes += [each.outcome() for each in running]
+                for running_lane in running:
+                    running_lane.end()
+            outcomes += [running_lane.outcome() for running_lane in running]
     write(f"\n{table(outcomes)}\n{closing_line(outcomes, (MachineClock().now().mono_ns - began_ns) / NS_PER_S)}\n")
-    return int(any(each.failures for each in outcomes))
+    return int(any(outcome.failures for outcome in outcomes))
 
 
 def _run_together(running: Sequence[RunningLane], write: Write) -> None:
-    while any(each.running for each in running):
-        for each in running:
-            each.poll()
-        unfinished = next((each for each in running if each.running), None)
-        for each in running:  # earlier lanes have ended, so their output is complete
-            write(each.new_output())
-            if each is unfinished:
+    while any(lane.running for lane in running):
+        for lane in running:
+            lane.poll()
+        unfinished = next((lane for lane in running if lane.running), None)
+        for lane in running:  # earlier lanes have ended, so their output is complete
+            write(lane.new_output())
+            if lane is unfinished:
                 break
         pause(POLL_NS)
-    for each in running:
-        write(each.new_output())
+    for lane in running:
+        write(lane.new_output())
 
 
 def table(outcomes: Sequence[LaneOutcome]) -> str:
-    """Return a table with one line per lane, followed by the reasons of failures."""
-    lines = [f"{'lane':<10}{'time':>8}" + "".join(f"{word:>{len(word) + 3}}" for word in COUNTED)]
-    for each in outcomes:
-        minutes, seconds = divmod(round(each.took_s), 60)
-        numbers = "".join(f"{each.counts[word]:>{len(word) + 3}}" for word in COUNTED)
-        lines.append(f"{each.name:<10}{f'{minutes}:{seconds:02}':>8}{numbers}{'   FAILED' if each.failures else ''}")
-    lines += [f"{each.name}: {reason}" for each in outcomes for reason in each.failures]
+    """Return a table with one line per lane, followed by the reasons for failures."""
+    lines = [f"{'lane':<10}{'time':>8}" + "".join(f"{word:>{len(word) + 3}}" for word in OUTCOMES)]
+    for outcome in outcomes:
+        minutes, seconds = divmod(round(outcome.took_s), 60)
+        numbers = "".join(f"{outcome.counts[word]:>{len(word) + 3}}" for word in OUTCOMES)
+        lines.append(
+            f"{outcome.name:<10}{f'{minutes}:{seconds:02}':>8}{numbers}{'   FAILED' if outcome.failures else ''}"
+        )
+    lines += [f"{outcome.name}: {reason}" for outcome in outcomes for reason in outcome.failures]
     return "\n".join(lines)
 
 
 def closing_line(outcomes: Sequence[LaneOutcome], took_s: float) -> str:
     """Return the totals in pytest's format; a lane that failed without a failed test counts as one failure."""
-    total = sum((each.counts for each in outcomes), Counter[str]())
+    total = sum((outcome.counts for outcome in outcomes), Counter[str]())
     failed = (
         total["failed"]
         + total["error"]
-        + sum(bool(each.failures) and not each.counts["failed"] + each.counts["error"] for each in outcomes)
+        + sum(bool(outcome.failures) and not outcome.counts["failed"] + outcome.counts["error"] for outcome in outcomes)
     )
     others = "".join(f", {total[word]} {word}" for word in ("skipped", "rerun", "inconclusive") if total[word])
     return f"{total['passed']} passed, {failed} failed{others} in {took_s:.0f}s"

@@ -1,11 +1,11 @@
-"""Measure how late one processor runs a program of real-time priority, until standard input ends.
+"""Measure how late one processor wakes a program of real-time priority, until standard input ends.
 
     python lateness_probe.py PROCESSOR
 
 The process sleeps for 8 ms at a time and records each late wake, with the time when it was due and the time when it
-came (CLOCK_MONOTONIC, ns). Its first line says whether it has real-time priority (SCHED_FIFO), which is above any
-niceness. It answers each byte on standard input with one line: the time, and the late wakes since the last answer. It
-ends with standard input or with its parent process. It imports nothing of LAVT, so that it starts fast.
+occurred (CLOCK_MONOTONIC, ns). Its first line says whether it has real-time priority (SCHED_FIFO), which is above any
+niceness. It answers each byte on standard input with one line: the present time, and the late wakes since the last
+answer. It ends with standard input or with its parent process. It imports nothing of LAVT, so that it starts fast.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ PERIOD_MS = 8
 """A shorter period costs more than 1 % of a processor. A stall is recorded at most this much too short."""
 LATE_NS = 1_000_000
 """Shorter delays are not recorded. A quiet machine wakes the probe within 0.1 ms."""
-SET_DEATH_SIGNAL = 1
-"""PR_SET_PDEATHSIG of linux/prctl.h."""
+PR_SET_PDEATHSIG = 1
+"""linux/prctl.h: the kernel sends this process a signal when its parent ends."""
 
 
 def take_priority() -> bool:
@@ -51,26 +51,26 @@ def answer(value: object) -> None:
 def main() -> None:
     """Measure one processor until standard input ends."""
     parent = os.getppid()
-    ctypes.CDLL(None).prctl(SET_DEATH_SIGNAL, signal.SIGKILL)
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         return
     os.sched_setaffinity(0, {int(sys.argv[1])})
     answer(take_priority())
-    late_ns = LATE_NS + 2 * round(time.clock_getres(time.CLOCK_MONOTONIC) * 1e9)
-    late: list[tuple[int, int]] = []
+    limit_ns = LATE_NS + 2 * round(time.clock_getres(time.CLOCK_MONOTONIC) * 1e9)
+    late_wakes: list[tuple[int, int]] = []
     poller = select.poll()
     poller.register(0, select.POLLIN)
     due_ns = time.monotonic_ns() + PERIOD_MS * 1_000_000
     while True:
         ready = poller.poll(PERIOD_MS)
         now_ns = time.monotonic_ns()
-        if now_ns - due_ns > late_ns:
-            late.append((due_ns, now_ns))
+        if now_ns - due_ns > limit_ns:
+            late_wakes.append((due_ns, now_ns))
         if ready:
             if not os.read(0, 4096):
                 return
-            answer([now_ns, late])
-            late.clear()
+            answer([now_ns, late_wakes])
+            late_wakes.clear()
         due_ns = time.monotonic_ns() + PERIOD_MS * 1_000_000
 
 

@@ -14,8 +14,8 @@ def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
         return port
 
 
-def free_pair() -> int:
-    """Return the first of two consecutive free UDP ports, because some tools expect RTCP at the second."""
+def free_port_pair() -> int:
+    """Return the first of two consecutive free UDP ports; some tools expect RTP at the first and RTCP at the second."""
     while True:
         port = free_port()
         with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as second:

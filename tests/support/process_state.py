@@ -1,7 +1,7 @@
-"""Pytest hooks and fixtures that check that every test leaves the pytest process unchanged.
+"""Pytest hooks and fixtures that check that no test changes the pytest process.
 
-`tests/conftest.py` loads this plugin. A test that changes the process would affect the tests after it: with another
-priority, other signal handlers, or another directory.
+`tests/conftest.py` loads this plugin. A test that changed the process, such as its priority, signal handlers or
+directory, would affect the tests after it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-OF_PYTEST = "PYTEST_"
+PYTEST_PREFIX = "PYTEST_"
 """Prefix of the environment variables that pytest itself sets while a test runs."""
 
 
@@ -35,7 +35,7 @@ def process_state() -> dict[str, Any]:
         "processors": os.sched_getaffinity(0),
         "switch interval": sys.getswitchinterval(),
         "directory": os.getcwd(),  # noqa: PTH109 (ten times as fast)
-        **{f"${key}": value for key, value in os.environ.items() if not key.startswith(OF_PYTEST)},
+        **{f"${key}": value for key, value in os.environ.items() if not key.startswith(PYTEST_PREFIX)},
         "signal mask": signal.pthread_sigmask(signal.SIG_BLOCK, ()),
         **{number.name: signal.getsignal(number) for number in SIGNALS},
     }
@@ -55,22 +55,22 @@ def process_unchanged() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def _process_unchanged() -> Iterator[None]:
-    """Check every test."""
+    """Check every test with `process_unchanged`."""
     with process_unchanged():
         yield
 
 
 @pytest.fixture
 def own_switch_interval() -> Iterator[None]:
-    """Restore the switch interval, which the real-time runtime sets."""
+    """Restore the switch interval after a test of the real-time runtime, which sets it."""
     before = sys.getswitchinterval()
     yield
     sys.setswitchinterval(before)
 
 
 @pytest.fixture
-def own_environment() -> Iterator[None]:
-    """Restore the environment variables that a library sets."""
+def restored_environment() -> Iterator[None]:
+    """Restore the environment variables after a test of a library that sets some."""
     before = dict(os.environ)
     yield
     for name in set(os.environ) - set(before):
@@ -79,8 +79,8 @@ def own_environment() -> Iterator[None]:
 
 
 @pytest.fixture
-def hangup_ends() -> Iterator[None]:
+def sighup_ends_programs() -> Iterator[None]:
     """Let SIGHUP end a program that the test starts, even if the tests run under `nohup`."""
-    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    previous = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     yield
-    signal.signal(signal.SIGHUP, before)
+    signal.signal(signal.SIGHUP, previous)

@@ -1,6 +1,7 @@
 """The record of times when the host stalled this machine, and verdicts on timing that use it.
 
-A test of real time can fail because a program is too slow, or because the host or hypervisor did not run this machine.
+A test of real time can fail because a program is too slow, or because the host (the hypervisor) did not run this
+machine.
 One probe for each processor (`lateness_probe.py`) distinguishes the two. It has real-time priority, so no program of
 LAVT, with a niceness of -15 at the least, can delay it. A failed timing assertion is excused (`HostStalled`) only if a
 probe was late at the relevant time; then pytest runs the test again, at most twice, and calls it inconclusive if the
@@ -35,11 +36,13 @@ BUSY_SHARE = 0.05
 SLOW_SHARE = 0.15
 """Share of a by-wire drive that must be stalled to explain a too slow machine. Without 15 ms of each 100 ms it still
 drives as usual (`docs/by_wire.md`)."""
-LISTED_MS = 10.0
+COUNTED_MS = 10.0
 """The session's summary counts stalls from this length."""
-LISTED_STALLS = 4
-TRIES = 3
-MOST_INCONCLUSIVE = 0.05
+MAX_DESCRIBED = 4
+"""A description names this many stalls."""
+MAX_ATTEMPTS = 3
+MAX_INCONCLUSIVE = 0.05
+"""The largest share of inconclusive tests with which a lane passes on a machine that is not busy."""
 BUSY_BELOW = 0.5
 """A machine that is idle for a smaller share is busy, and may leave any number of tests inconclusive."""
 
@@ -75,30 +78,32 @@ class Stall:
 def overlapping(stalls: Iterable[Stall], since_ns: int, until_ns: int, *, at_least_ms: float = 0.0) -> list[Stall]:
     """Return the stalls of at least a length that overlap an interval."""
     return [
-        each
-        for each in stalls
-        if each.begin_ns <= until_ns and each.end_ns >= since_ns and each.length_ms >= at_least_ms
+        stall
+        for stall in stalls
+        if stall.begin_ns <= until_ns and stall.end_ns >= since_ns and stall.length_ms >= at_least_ms
     ]
 
 
 def stalled_share(stalls: Iterable[Stall], since_ns: int, until_ns: int) -> float:
     """Return the share of an interval in which the processor with most stalls was stalled."""
     total_ns: dict[int, int] = {}
-    for each in overlapping(stalls, since_ns, until_ns):
-        within_ns = min(each.end_ns, until_ns) - max(each.begin_ns, since_ns)
-        total_ns[each.processor] = total_ns.get(each.processor, 0) + within_ns
+    for stall in overlapping(stalls, since_ns, until_ns):
+        within_ns = min(stall.end_ns, until_ns) - max(stall.begin_ns, since_ns)
+        total_ns[stall.processor] = total_ns.get(stall.processor, 0) + within_ns
     return max(total_ns.values(), default=0) / max(until_ns - since_ns, 1)
 
 
-def described(stalls: Sequence[Stall], since_ns: int) -> str:
+def describe(stalls: Sequence[Stall], since_ns: int) -> str:
     """Return a description of the longest stalls; their times count from `since_ns`."""
-    longest = sorted(sorted(stalls, key=lambda each: -each.length_ms)[:LISTED_STALLS], key=lambda each: each.begin_ns)
-    shown = [
-        f"{each.length_ms:.0f} ms on processor {each.processor} at {(each.begin_ns - since_ns) / NS_PER_MS:+.0f} ms"
-        for each in longest
+    longest = sorted(
+        sorted(stalls, key=lambda stall: -stall.length_ms)[:MAX_DESCRIBED], key=lambda stall: stall.begin_ns
+    )
+    descriptions = [
+        f"{stall.length_ms:.0f} ms on processor {stall.processor} at {(stall.begin_ns - since_ns) / NS_PER_MS:+.0f} ms"
+        for stall in longest
     ]
     more = len(stalls) - len(longest)
-    return ", ".join(shown) + (f" and {more} more" if more else "")
+    return ", ".join(descriptions) + (f" and {more} more" if more else "")
 
 
 def inconclusive_too_often(inconclusive: int, tests: int, idle_share: float) -> bool:
@@ -106,7 +111,7 @@ def inconclusive_too_often(inconclusive: int, tests: int, idle_share: float) -> 
 
     That is more than 5 % and more than one, if the machine was idle for more than half of the time.
     """
-    return idle_share > BUSY_BELOW and inconclusive > max(1, MOST_INCONCLUSIVE * tests)
+    return idle_share > BUSY_BELOW and inconclusive > max(1, MAX_INCONCLUSIVE * tests)
 
 
 def idle_share(before: str, after: str) -> float:
@@ -114,19 +119,21 @@ def idle_share(before: str, after: str) -> float:
 
     Time of programs with a positive niceness counts as idle, because other work may run at low priority.
     """
-    old, new = ([int(each) for each in line.split()[1:9]] for line in (before, after))
-    _user, nice, _system, idle, wait, *_others = differences = [now - then for now, then in zip(new, old, strict=True)]
+    before_ticks, after_ticks = ([int(number) for number in line.split()[1:9]] for line in (before, after))
+    _user, nice, _system, idle, wait, *_others = differences = [
+        now - then for now, then in zip(after_ticks, before_ticks, strict=True)
+    ]
     return (nice + idle + wait) / max(sum(differences), 1)
 
 
 class Probe(Protocol):
     """The interface of a probe."""
 
-    above: bool
+    has_realtime_priority: bool
     """Whether no program without real-time priority can delay the probe."""
 
     def report(self) -> tuple[int, list[Stall]]:
-        """Return the time, and the stalls since the last report; raise `ProbeEnded` if the probe has ended."""
+        """Return the time (ns) and the stalls since the last report; raise `ProbeEnded` if the probe has ended."""
         ...
 
     def end(self) -> None:
@@ -145,7 +152,7 @@ class ProbeProcess:
             stdout=subprocess.PIPE,
             start_new_session=True,
         )
-        self.above = bool(json.loads(self._line()))
+        self.has_realtime_priority = bool(json.loads(self._line()))
 
     @property
     def pid(self) -> int:
@@ -153,7 +160,7 @@ class ProbeProcess:
         return self._process.pid
 
     def report(self) -> tuple[int, list[Stall]]:
-        """Return the time, and the stalls since the last report."""
+        """Return the present time (ns) and the stalls since the last report."""
         assert self._process.stdin is not None
         try:
             self._process.stdin.write(b"?")
@@ -220,12 +227,15 @@ class Stalls:
                 self.recorded += stalls
             self._reported_ns = max(self._reported_ns, reported_ns)
 
-    def require(self, ok: object, message: str, since_ns: int, until_ns: int, *, stall_ms: float = STALL_MS) -> None:
-        """Raise AssertionError unless `ok`, or `HostStalled` if a stall of `stall_ms` overlaps the interval.
+    def require(
+        self, condition: object, message: str, since_ns: int, until_ns: int, *, stall_ms: float = STALL_MS
+    ) -> None:
+        """Unless `condition` is true, raise `HostStalled` if a stall overlaps the interval, or else AssertionError.
 
-        The interval ends with the limit at the latest: something late or missing was due before.
+        The interval ends at the test's time limit at the latest, because what is late or missing was due before the
+        limit.
         """
-        if not ok:
+        if not condition:
             raise self.verdict(message, since_ns, until_ns, stall_ms=stall_ms)
 
     def verdict(self, message: str, since_ns: int, until_ns: int, *, stall_ms: float = STALL_MS) -> Exception:
@@ -234,10 +244,10 @@ class Stalls:
         if not stalls:
             return AssertionError(message)
         self.excused += 1
-        return HostStalled(f"{described(stalls, since_ns)}; {message}")
+        return HostStalled(f"{describe(stalls, since_ns)}; {message}")
 
     def share_verdict(self, message: str, since_ns: int, until_ns: int, *, share: float) -> Exception:
-        """Return the exception for a rate or a median, which a stalled share of the time explains, but no single stall.
+        """Return the exception for a rate or a median; a stalled share of the time can explain it, but no single stall.
 
         The share is that of the processor with most stalls.
         """
@@ -246,10 +256,10 @@ class Stalls:
         if stalled < share:
             return AssertionError(message)
         self.excused += 1
-        return HostStalled(f"{stalled:.1%} of the time, {described(stalls, since_ns)}; {message}")
+        return HostStalled(f"{stalled:.1%} of the time, {describe(stalls, since_ns)}; {message}")
 
     @contextmanager
-    def judging(
+    def excusing_failures(
         self, since_ns: int, until_ns: int | None = None, *, stall_ms: float = STALL_MS, share: float | None = None
     ) -> Iterator[None]:
         """Excuse a failed assertion about times in this context, by one stall or, with `share`, by a stalled share.
@@ -258,12 +268,12 @@ class Stalls:
         """
         try:
             yield
-        except AssertionError as failed:
+        except AssertionError as failure:
             end_ns = self.clock.now().mono_ns if until_ns is None else until_ns
             if share is None:
-                verdict = self.verdict(str(failed), since_ns, end_ns, stall_ms=stall_ms)
+                verdict = self.verdict(str(failure), since_ns, end_ns, stall_ms=stall_ms)
             else:
-                verdict = self.share_verdict(str(failed), since_ns, end_ns, share=share)
+                verdict = self.share_verdict(str(failure), since_ns, end_ns, share=share)
             if isinstance(verdict, AssertionError):
                 raise
             raise verdict from None
@@ -274,18 +284,18 @@ class Stalls:
 
     def summary(self) -> str:
         """Return a summary of the record until the last report, by processor."""
-        gone_ns = max(self._reported_ns - self._began_ns, 1)
+        elapsed_ns = max(self._reported_ns - self._began_ns, 1)
         by_processor = []
-        for processor in sorted({each.processor for each in self.recorded}):
-            own = [each for each in self.recorded if each.processor == processor]
-            listed = [each for each in own if each.length_ms >= LISTED_MS]
-            share = stalled_share(own, self._began_ns, self._reported_ns)
-            longest_ms = max(each.length_ms for each in own)
+        for processor in sorted({stall.processor for stall in self.recorded}):
+            on_processor = [stall for stall in self.recorded if stall.processor == processor]
+            counted = [stall for stall in on_processor if stall.length_ms >= COUNTED_MS]
+            share = stalled_share(on_processor, self._began_ns, self._reported_ns)
+            longest_ms = max(stall.length_ms for stall in on_processor)
             by_processor.append(
-                f"processor {processor} {len(listed)}, longest {longest_ms:.0f} ms, {share:.2%} of the time"
+                f"processor {processor} {len(counted)}, longest {longest_ms:.0f} ms, {share:.2%} of the time"
             )
-        text = f"stalls over {LISTED_MS:.0f} ms in {gone_ns / NS_PER_S:.0f} s: {'; '.join(by_processor) or 'none'}"
-        if not all(probe.above for probe in self.probes):
+        text = f"stalls over {COUNTED_MS:.0f} ms in {elapsed_ns / NS_PER_S:.0f} s: {'; '.join(by_processor) or 'none'}"
+        if not all(probe.has_realtime_priority for probe in self.probes):
             text += " (no right to real-time priority: programs of the tests may have caused them)"
         return text
 
@@ -295,25 +305,29 @@ class Stalls:
             probe.end()
 
 
-class Shared(Generic[Result]):
-    """A value that several tests judge, such as a drive; made again, at most twice, after the host stalled a test."""
+class SharedResult(Generic[Result]):
+    """A result that several tests judge, such as a drive; it is made again, at most twice, after a stall."""
 
     def __init__(self, stalls: Stalls, make: Callable[[], Result]) -> None:
         self._stalls, self._make = stalls, make
-        self._made: list[Result] = []
+        self._results: list[Result] = []
         self._failure: Exception | None = None
-        self._left, self._excused = TRIES, 0
+        self._attempts_left, self._excused = MAX_ATTEMPTS, 0
 
     def get(self) -> Result:
-        """Return the last value; make it again if the record has excused a failure since.
+        """Return the last result; make it again if the record has excused a failure since then.
 
-        A failure to make it that no stall explains is raised for every test.
+        If making it fails and no stall explains this, the failure is raised for every test.
         """
-        if self._failure is None and self._left and not (self._made and self._excused == self._stalls.excused):
-            self._left -= 1
-            self._made.clear()
+        if (
+            self._failure is None
+            and self._attempts_left
+            and not (self._results and self._excused == self._stalls.excused)
+        ):
+            self._attempts_left -= 1
+            self._results.clear()
             try:
-                self._made.append(self._make())
+                self._results.append(self._make())
             except HostStalled:
                 raise
             except Exception as failure:
@@ -321,9 +335,9 @@ class Shared(Generic[Result]):
             self._excused = self._stalls.excused
         if self._failure is not None:
             raise self._failure
-        if not self._made:
+        if not self._results:
             raise HostStalledEachTime("the host stalled each attempt to make what this test judges")
-        return self._made[0]
+        return self._results[0]
 
 
 def excuse_slow_machine(failure: Exception, stalls: Stalls, since_ns: int, until_ns: int) -> Exception:
@@ -332,5 +346,5 @@ def excuse_slow_machine(failure: Exception, stalls: Stalls, since_ns: int, until
         return failure
     recorded = stalls.during(since_ns, until_ns)
     share = stalled_share(recorded, since_ns, until_ns)
-    message = f"stalled for {share:.1%} of the time, {described(recorded, since_ns)}; {failure}"
+    message = f"stalled for {share:.1%} of the time, {describe(recorded, since_ns)}; {failure}"
     return AssertionError(message) if share < SLOW_SHARE else HostStalled(message)

@@ -25,11 +25,11 @@ from lavt.experiment.analysis.clock_offset import (
 from lavt.recording.table import MISSING, Table, table_of
 
 TRUE_NS = 1_790_000_000 * NS_PER_S
-Ahead = Callable[[int], int]
+ClockError = Callable[[int], int]
 """A function from the true time since the start to the error of a host's wall clock, both in ns."""
 
 
-def samples(ahead: Ahead, *, begin_ms: int = 0, seconds: int = 30, **fields: Any) -> Table:
+def samples(ahead: ClockError, *, begin_ms: int = 0, seconds: int = 30, **fields: Any) -> Table:
     """Return the clock samples of a host whose time source knows the true time."""
     times_ns = range(begin_ms * NS_PER_MS, seconds * NS_PER_S, NS_PER_S)
     rows = [
@@ -39,7 +39,7 @@ def samples(ahead: Ahead, *, begin_ms: int = 0, seconds: int = 30, **fields: Any
     return table_of(rows, [0] * len(rows), [0] * len(rows))
 
 
-def errors_ns(offset: ClockOffset, client: Ahead, server: Ahead, *, seconds: int = 29) -> tuple[Any, Any]:
+def errors_ns(offset: ClockOffset, client: ClockError, server: ClockError, *, seconds: int = 29) -> tuple[Any, Any]:
     """Return the absolute error of Delta every 10 ms, and its bound."""
     true_ns = np.arange(NS_PER_S, seconds * NS_PER_S, 10 * NS_PER_MS)
     client_wall_ns = np.array([TRUE_NS + at + client(at) for at in true_ns.tolist()])
@@ -47,11 +47,11 @@ def errors_ns(offset: ClockOffset, client: Ahead, server: Ahead, *, seconds: int
     return np.abs(offset.at(client_wall_ns) - truth_ns), offset.bound_at(client_wall_ns)
 
 
-def drifting(offset_ms: float, ppm: float) -> Ahead:
+def drifting(offset_ms: float, ppm: float) -> ClockError:
     return lambda at_ns: round(offset_ms * NS_PER_MS + at_ns * ppm / 1e6)
 
 
-def slewed(offset_ms: float, ppm: float, from_s: float, until_s: float) -> Ahead:
+def steered_clock(offset_ms: float, ppm: float, from_s: float, until_s: float) -> ClockError:
     """Return a clock that is steered at a rate between two times."""
     return lambda at_ns: round(
         offset_ms * NS_PER_MS + (np.clip(at_ns / NS_PER_S, from_s, until_s) - from_s) * ppm * 1000
@@ -90,37 +90,37 @@ def test_drifting_clocks_are_interpolated() -> None:
     client, server = drifting(0, -7), drifting(250, 30)
     offset = offset_from_sources(samples(server), samples(client, begin_ms=370))
     assert offset is not None
-    wrong_ns, bound_ns = errors_ns(offset, client, server)
-    assert wrong_ns.max() < 1000
-    assert (wrong_ns <= bound_ns).all()
+    delta_error_ns, bound_ns = errors_ns(offset, client, server)
+    assert delta_error_ns.max() < 1000
+    assert (delta_error_ns <= bound_ns).all()
     assert bound_ns.max() < 3000
 
 
 @given(st.floats(-83_333, 83_333), st.floats(3, 20), st.floats(0, 8), st.sampled_from(["client", "server"]))
 @settings(max_examples=30, deadline=None)
 def test_delta_of_a_steered_clock_is_within_its_bound(ppm: float, from_s: float, lasts_s: float, side: str) -> None:
-    """At any rate at which chrony steers a clock, from and until any time, the error of Delta is within its bound."""
+    """While chrony steers a clock, at any rate and for any time, the error of Delta is within its bound."""
     clocks = {"client": drifting(0, -7), "server": drifting(250, 30)}
-    clocks[side] = slewed(100, ppm, from_s, from_s + lasts_s)
+    clocks[side] = steered_clock(100, ppm, from_s, from_s + lasts_s)
     offset = offset_from_sources(samples(clocks["server"]), samples(clocks["client"], begin_ms=370))
     assert offset is not None
-    wrong_ns, bound_ns = errors_ns(offset, clocks["client"], clocks["server"])
-    assert (wrong_ns <= bound_ns + 2).all()
+    delta_error_ns, bound_ns = errors_ns(offset, clocks["client"], clocks["server"])
+    assert (delta_error_ns <= bound_ns + 2).all()
 
 
 def test_query_time_widens_the_bound_only_while_steered() -> None:
     """A query that takes 100 ms widens the bound while the clock is steered, and only then."""
-    still, steered = drifting(0, 0), slewed(0, 10_000, 0, 100)
+    exact, steered = drifting(0, 0), steered_clock(0, 10_000, 0, 100)
     bounds_ms = []
-    for server in (still, steered):
-        offset = offset_from_sources(samples(server, asking_s=0.1), samples(still, asking_s=0.1))
+    for server in (exact, steered):
+        offset = offset_from_sources(samples(server, asking_s=0.1), samples(exact, asking_s=0.1))
         assert offset is not None
         bounds_ms.append(float(offset.bound_ns.max()) / NS_PER_MS)
     assert bounds_ms == pytest.approx([0.002, 0.502], abs=1e-3)
 
 
 def test_the_path_bound_replaces_both_root_distances() -> None:
-    """If the client follows the server and the path's bound is smaller than the root distance, the former is used."""
+    """If the client follows the server, the path's bound is used if it is smaller than the root distance."""
     client, server = drifting(0, 0), drifting(250, 0)
     path: dict[str, Any] = {
         "follows": "10.9.0.1",
@@ -139,8 +139,8 @@ def test_the_path_bound_replaces_both_root_distances() -> None:
 @pytest.mark.parametrize("lacking", ["client", "server"])
 def test_delta_needs_the_time_sources_of_both_hosts(lacking: str) -> None:
     """If one host has no sample with a known correction, Delta is unknown."""
-    of = {"client": samples(drifting(0, 0)), "server": samples(drifting(0, 0)), lacking: table_of([], [], [])}
-    assert offset_from_sources(of["server"], of["client"]) is None
+    tables = {"client": samples(drifting(0, 0)), "server": samples(drifting(0, 0)), lacking: table_of([], [], [])}
+    assert offset_from_sources(tables["server"], tables["client"]) is None
 
 
 @pytest.mark.parametrize("follower", ["client", "server"])
@@ -170,13 +170,13 @@ def test_a_host_follows_any_address_of_the_other() -> None:
     """A host follows the other if its source has any recorded address of the other, from any sample."""
     other = rows_of([{"addresses": None}, {"addresses": ["10.0.0.1", "10.0.0.2"]}, {"addresses": ["fe80::1"]}])
     sources = ["10.0.0.2", "10.0.0.3", "fe80::1", "", None]
-    found = follows_peer(rows_of([{"follows": each} for each in sources]), other)
-    assert found.tolist() == [True, False, True, False, False]
+    is_followed = follows_peer(rows_of([{"follows": source} for source in sources]), other)
+    assert is_followed.tolist() == [True, False, True, False, False]
 
 
 def test_steering_for_a_second_is_in_the_bound_around_it() -> None:
     """Steering by 1 % for a second gives a bound of 10 ms in this and the adjacent seconds, plus the query time's."""
-    server = samples(slewed(0, 10_000, 10, 11), asking_s=0.1)
+    server = samples(steered_clock(0, 10_000, 10, 11), asking_s=0.1)
     offset = offset_from_sources(server, samples(drifting(0, 0)))
     assert offset is not None
     expected_ms = [0.002, 10.002, 10.502, 10.502, 0.002]
@@ -186,13 +186,13 @@ def test_steering_for_a_second_is_in_the_bound_around_it() -> None:
 
 def test_steering_in_the_last_interval_is_in_the_bound() -> None:
     """A clock steered by 1 % in the last second has a bound of 10 ms in this second and in the one before."""
-    offset = offset_from_sources(samples(slewed(0, 10_000, 28, 40)), samples(drifting(0, 0)))
+    offset = offset_from_sources(samples(steered_clock(0, 10_000, 28, 40)), samples(drifting(0, 0)))
     assert offset is not None
     expected_ms = [0.002, 10.002, 10.002, 10.002]
     assert (offset.bound_ns[-4:] / NS_PER_MS).tolist() == pytest.approx(expected_ms, abs=1e-3)
 
 
-def stepwise(ppm: list[float]) -> list[dict[str, Any]]:
+def samples_with_rates(ppm: list[float]) -> list[dict[str, Any]]:
     """Return the samples of a host whose correction changes at another rate in each second."""
     values_ns = [0.0, *np.cumsum(ppm) * 1000]
     return [
@@ -203,7 +203,7 @@ def stepwise(ppm: list[float]) -> list[dict[str, Any]]:
 
 def test_each_second_has_the_bound_of_its_own_steering() -> None:
     """The bound at a time is that of the second which begins there, including the first and the last second."""
-    server = rows_of(stepwise([15_000, 20_000, 0, 20_000, 15_000]))
+    server = rows_of(samples_with_rates([15_000, 20_000, 0, 20_000, 15_000]))
     offset = offset_from_sources(server, samples(drifting(0, 0), seconds=6, bound_s=0.0))
     assert offset is not None
     assert (offset.bound_ns / NS_PER_MS).tolist() == pytest.approx([5, 20, 20, 20, 5, 5], abs=1e-3)
@@ -211,9 +211,10 @@ def test_each_second_has_the_bound_of_its_own_steering() -> None:
 
 def test_a_duplicate_sample_has_no_effect() -> None:
     """A duplicate sample has no effect."""
-    rows = stepwise([10.0, 20.0])
+    rows = samples_with_rates([10.0, 20.0])
     offsets = [
-        offset_from_sources(rows_of(each), samples(drifting(0, 0), seconds=3)) for each in (rows, rows + rows[1:2])
+        offset_from_sources(rows_of(sample_rows), samples(drifting(0, 0), seconds=3))
+        for sample_rows in (rows, rows + rows[1:2])
     ]
     assert offsets[0] is not None
     assert offsets[1] is not None
@@ -224,7 +225,7 @@ def test_a_duplicate_sample_has_no_effect() -> None:
 def test_steering_is_detected_from_three_samples_on() -> None:
     """Steering of a clock is detected with three samples, but not with two."""
     for seconds, bound_ms in ((2, 0.002), (3, 10.002)):
-        server = samples(slewed(0, 10_000, 1, 2), seconds=seconds)
+        server = samples(steered_clock(0, 10_000, 1, 2), seconds=seconds)
         offset = offset_from_sources(server, samples(drifting(0, 0), seconds=seconds))
         assert offset is not None
         assert offset.bound_ns.max() / NS_PER_MS == pytest.approx(bound_ms, abs=1e-3)
@@ -263,12 +264,12 @@ def test_samples_without_a_correction_are_ignored() -> None:
 )
 def test_the_bound_grows_outside_the_samples(first_ppm: float, middle_ppm: float, last_ppm: float) -> None:
     """Outside its times, the bound grows twice as fast as Delta changed at the faster of its two ends."""
-    rows = stepwise([first_ppm, middle_ppm, middle_ppm, last_ppm])
+    rows = samples_with_rates([first_ppm, middle_ppm, middle_ppm, last_ppm])
     values_ns = [row["correction_s"] * NS_PER_S for row in rows]
     for table in (rows, rows[::-1]):
         offset = offset_from_sources(rows_of(table), samples(drifting(0, 0), seconds=5))
         assert offset is not None
-        assert offset.delta_ns.tolist() == pytest.approx([-each for each in values_ns], abs=1)
+        assert offset.delta_ns.tolist() == pytest.approx([-value_ns for value_ns in values_ns], abs=1)
         assert offset.drift_outside == pytest.approx(20e-6, rel=0.01)
 
 
@@ -289,14 +290,14 @@ def test_one_sample_allows_for_any_drift() -> None:
 def test_samples_are_used_from_the_first_known_one_on(known: str, first: int | None, lacking: dict[str, Any]) -> None:
     """Samples are used from the first known one on; if a later one is unknown, none is used."""
     rows = [
-        {"wall_ns": index, "correction_s": 0.5, **({} if each == "1" else lacking)} for index, each in enumerate(known)
+        {"wall_ns": index, "correction_s": 0.5, **({} if flag == "1" else lacking)} for index, flag in enumerate(known)
     ]
-    found = known_samples(rows_of(rows)).ints("wall_ns").tolist()
-    assert found == ([] if first is None else list(range(first, len(known))))
+    used = known_samples(rows_of(rows)).ints("wall_ns").tolist()
+    assert used == ([] if first is None else list(range(first, len(known))))
 
 
-def probed(
-    client: Ahead, server: Ahead, delays_ms: Callable[[int], tuple[float, float]], *, seconds: int = 30
+def simulated_exchanges(
+    client: ClockError, server: ClockError, delays_ms: Callable[[int], tuple[float, float]], *, seconds: int = 30
 ) -> ProbeExchanges:
     """Return two exchanges per second with given times in each direction."""
     rows = []
@@ -318,12 +319,12 @@ def probed(
 def test_evaluation_of_an_exchange() -> None:
     """An exchange is assigned to the middle of its times on each clock; its round trip excludes the server's time."""
     names = ("sent_wall_ns", "received_wall_ns", "answered_wall_ns", "arrived_wall_ns")
-    found = probe_exchanges(table_of([dict(zip(names, (100, 1030, 1050, 160), strict=True))], [0], [0]))
-    assert found.client_wall_ns.tolist() == [130]
-    assert found.server_wall_ns.tolist() == [1040]
-    assert found.delta_ns.tolist() == [910.0]
-    assert found.round_trip_ns.tolist() == [40]
-    assert [len(found.within(*interval)) for interval in ((1040, 1040), (1041, 1050), (1030, 1039))] == [1, 0, 0]
+    exchanges = probe_exchanges(table_of([dict(zip(names, (100, 1030, 1050, 160), strict=True))], [0], [0]))
+    assert exchanges.client_wall_ns.tolist() == [130]
+    assert exchanges.server_wall_ns.tolist() == [1040]
+    assert exchanges.delta_ns.tolist() == [910.0]
+    assert exchanges.round_trip_ns.tolist() == [40]
+    assert [len(exchanges.within(*interval)) for interval in ((1040, 1040), (1041, 1050), (1030, 1039))] == [1, 0, 0]
 
 
 @given(st.integers(0, 2**32), st.floats(-240, 240), st.floats(-240, 240))
@@ -332,16 +333,20 @@ def test_delta_from_the_probe_is_within_its_bound(seed: int, client_ppm: float, 
     """With any path delays and any drift without fast steering, the error of Delta is within its bound."""
     delays_ms = np.random.default_rng(seed).lognormal(-1.0, 1.5, (60, 2))
     client, server = drifting(0, client_ppm), drifting(250, server_ppm)
-    offset = offset_from_probe(probed(client, server, lambda number: (delays_ms[number][0], delays_ms[number][1])))
+    offset = offset_from_probe(
+        simulated_exchanges(client, server, lambda number: (delays_ms[number][0], delays_ms[number][1]))
+    )
     assert offset is not None
-    wrong_ns, bound_ns = errors_ns(offset, client, server)
-    assert (wrong_ns <= bound_ns + 2).all()
+    delta_error_ns, bound_ns = errors_ns(offset, client, server)
+    assert (delta_error_ns <= bound_ns + 2).all()
 
 
 def test_the_exchange_with_the_smallest_bound_is_used() -> None:
     """One short round trip among long, asymmetric ones determines Delta, with a bound that grows by the drift."""
     client, server = drifting(0, 0), drifting(250, 0)
-    offset = offset_from_probe(probed(client, server, lambda number: (0.1, 0.1) if number == 20 else (0.1, 8.1)))
+    offset = offset_from_probe(
+        simulated_exchanges(client, server, lambda number: (0.1, 0.1) if number == 20 else (0.1, 8.1))
+    )
     assert offset is not None
     at_ns = np.array([TRUE_NS + 10 * NS_PER_S, TRUE_NS + 12 * NS_PER_S])
     assert offset.at(at_ns).tolist() == pytest.approx([250 * NS_PER_MS] * 2, abs=2)
@@ -352,7 +357,7 @@ def test_the_exchange_with_the_smallest_bound_is_used() -> None:
 
 def test_the_bound_grows_after_the_last_exchange() -> None:
     """At 20 s after the last exchange, the bound has grown by the possible drift in that time."""
-    exchanges = probed(drifting(0, 0), drifting(250, 0), lambda _: (0.1, 0.1), seconds=10)
+    exchanges = simulated_exchanges(drifting(0, 0), drifting(250, 0), lambda _: (0.1, 0.1), seconds=10)
     offset = offset_from_probe(exchanges)
     assert offset is not None
     last_ns = exchanges.client_wall_ns[-1]
@@ -362,7 +367,9 @@ def test_the_bound_grows_after_the_last_exchange() -> None:
 
 def test_an_exchange_with_impossible_times_is_ignored() -> None:
     """An exchange with impossible times, during which a clock was set, is ignored; without any, Delta is unknown."""
-    exchanges = probed(drifting(0, 0), lambda at_ns: -NS_PER_S if at_ns > 5 * NS_PER_S else 0, lambda _: (0.1, 0.1))
+    exchanges = simulated_exchanges(
+        drifting(0, 0), lambda at_ns: -NS_PER_S if at_ns > 5 * NS_PER_S else 0, lambda _: (0.1, 0.1)
+    )
     assert len(exchanges) == 60
     impossible = table_of(
         [{"sent_wall_ns": 10, "received_wall_ns": 5, "answered_wall_ns": 5, "arrived_wall_ns": 4}, {"sent_wall_ns": 1}],

@@ -23,7 +23,7 @@ from lavt.recording.record import Record, read_record
 from lavt.recording.table import Table, table_of
 
 MakeRun = Callable[..., Path]
-MICROSECOND_MS = 1e-3
+ONE_MICROSECOND_MS = 1e-3
 
 
 def measured(make_run: MakeRun, directory: Path, **settings: Any) -> RunMeasurement:
@@ -35,7 +35,7 @@ def table(rows: list[dict[str, Any]]) -> Table:
     return table_of(rows, [0] * len(rows), [0] * len(rows))
 
 
-def recorded(*events: tuple[str, int, str], last_ns: int = 0, **channels: list[dict[str, Any]]) -> Record:
+def record_of(*events: tuple[str, int, str], last_ns: int = 0, **channels: list[dict[str, Any]]) -> Record:
     """Return a record in memory of events and further channels."""
     named = [{"kind": kind, "mono_ns": mono_ns, "detail": detail} for kind, mono_ns, detail in events]
     tables = {name: table(rows) for name, rows in {"event": named, **channels}.items()}
@@ -62,8 +62,8 @@ BEGAN, ENDED = ("drive_began", 100, ""), ("ending", 200, "completed")
     ],
 )
 def test_the_driving_interval(events: list[tuple[str, int, str]], interval: tuple[int, int, str | None]) -> None:
-    """The drive reaches from the first `drive_began` to the next `ending`; it is empty or open where one is missing."""
-    assert driving_interval(recorded(*events, last_ns=500)) == interval
+    """A drive lasts from the first `drive_began` to the next `ending`; without one it is empty or has no end."""
+    assert driving_interval(record_of(*events, last_ns=500)) == interval
 
 
 def test_the_driving_interval_includes_its_edges() -> None:
@@ -74,8 +74,8 @@ def test_the_driving_interval_includes_its_edges() -> None:
         {"mono_ns": at_ns, "progress_m": progress_m, "cross_track_m": 1.0 if 100 <= at_ns <= 200 else 9.0}
         for at_ns, progress_m in ((99, 0.0), (100, 10.0), (150, 20.0), (200, 30.0), (201, 90.0))
     ]
-    server = recorded(BEGAN, *collisions, *invasions, ENDED, truth=truth)
-    entry = measure(server, recorded()).entry
+    server = record_of(BEGAN, *collisions, *invasions, ENDED, truth=truth)
+    entry = measure(server, record_of()).entry
     assert (entry["collisions"], entry["lane_invasions"]) == (3, 2)
     assert (entry["distance_m"], entry["max_m"]) == (20.0, 1.0)
     assert entry["collisions_per_km"] == pytest.approx(3 / 0.02)
@@ -85,24 +85,24 @@ def test_the_driving_interval_includes_its_edges() -> None:
 
 def test_duration_of_an_empty_drive() -> None:
     """A drive that ended at its start has a duration of 0 s; without a drive the duration is null."""
-    assert measure(recorded(BEGAN, ("ending", 100, "aborted")), recorded()).entry["duration_s"] == 0.0
-    assert measure(recorded(last_ns=100), recorded()).entry["duration_s"] is None
+    assert measure(record_of(BEGAN, ("ending", 100, "aborted")), record_of()).entry["duration_s"] == 0.0
+    assert measure(record_of(last_ns=100), record_of()).entry["duration_s"] is None
 
 
 def test_the_last_recorded_count_is_returned() -> None:
     """The last recorded value of a counter is returned, and None without one."""
-    record = recorded(counts=[{"late": 1}, {"late": 5}, {"other": 9}])
+    record = record_of(counts=[{"late": 1}, {"late": 5}, {"other": 9}])
     assert [last_count(record, name) for name in ("late", "other", "neither")] == [5, 9, None]
-    assert last_count(recorded(), "late") is None
+    assert last_count(record_of(), "late") is None
 
 
 def test_latencies_are_right_to_the_microsecond(make_run: MakeRun, tmp_path: Path) -> None:
     """With clocks 250 ms apart that drift by 20 ppm, tau_v, tau_c and the loop latency are exact to 1 us."""
     entry = measured(make_run, tmp_path).entry
     for name, p50_ms, spread_ms in (("tau_v_ms", 62.0, 2.0), ("loop_ms", 76.0, 2.0), ("tau_c_ms", 9.0, 0.0)):
-        assert entry[name]["p50"] == pytest.approx(p50_ms, abs=MICROSECOND_MS)
-        assert entry[name]["p5"] == pytest.approx(p50_ms - spread_ms, abs=MICROSECOND_MS)
-        assert entry[name]["p95"] == pytest.approx(p50_ms + spread_ms, abs=MICROSECOND_MS)
+        assert entry[name]["p50"] == pytest.approx(p50_ms, abs=ONE_MICROSECOND_MS)
+        assert entry[name]["p5"] == pytest.approx(p50_ms - spread_ms, abs=ONE_MICROSECOND_MS)
+        assert entry[name]["p95"] == pytest.approx(p50_ms + spread_ms, abs=ONE_MICROSECOND_MS)
     assert entry["delta"]["ms"] == pytest.approx(250.0, abs=0.2)
 
 
@@ -111,7 +111,7 @@ def test_the_clock_offset_affects_one_way_latencies_only(make_run: MakeRun, tmp_
     entry = measured(make_run, tmp_path, corrected=False).entry
     assert entry["tau_v_ms"]["p50"] == pytest.approx(62.0 - 250.0, abs=0.2)
     assert entry["tau_c_ms"]["p50"] == pytest.approx(9.0 + 250.0, abs=0.2)
-    assert entry["loop_ms"]["p50"] == pytest.approx(76.0, abs=MICROSECOND_MS)
+    assert entry["loop_ms"]["p50"] == pytest.approx(76.0, abs=ONE_MICROSECOND_MS)
 
 
 def test_one_way_latencies_have_the_bound_of_both_hosts(make_run: MakeRun, tmp_path: Path) -> None:
@@ -124,16 +124,16 @@ def test_one_way_latencies_have_the_bound_of_both_hosts(make_run: MakeRun, tmp_p
 def test_hosts_that_share_a_kernel_share_a_clock(make_run: MakeRun, tmp_path: Path) -> None:
     """If both sides report the same host, Delta is 0 with bound 0, regardless of the time sources."""
     settings = {"server_host": "one", "client_host": "one", "offset_s": 0.0, "drift": 0.0}
-    good = measured(make_run, tmp_path / "a", **settings)
-    assert good.entry["tau_v_ms"]["p50"] == pytest.approx(62.0, abs=1e-9)
-    assert good.clocks.bound_ms == 0.0
+    same_host = measured(make_run, tmp_path / "a", **settings)
+    assert same_host.entry["tau_v_ms"]["p50"] == pytest.approx(62.0, abs=1e-9)
+    assert same_host.clocks.bound_ms == 0.0
 
 
 def test_hosts_without_a_name_are_not_taken_for_one(make_run: MakeRun, tmp_path: Path) -> None:
     """Two sides that do not report their host do not get a bound of 0."""
     run = measured(make_run, tmp_path, server_host="", client_host="", bound_s=None, probes=False)
     assert run.clocks.bound_ms is None
-    assert run.entry["tau_v_ms"]["p50"] == pytest.approx(62.0, abs=MICROSECOND_MS)
+    assert run.entry["tau_v_ms"]["p50"] == pytest.approx(62.0, abs=ONE_MICROSECOND_MS)
     assert run.entry["tau_v_ms"]["bound"] is None
 
 
@@ -141,7 +141,7 @@ def test_the_parts_of_the_loop_add_up(make_run: MakeRun, tmp_path: Path) -> None
     """tau_v, client time, tau_c and actuator time add up to the loop latency to 1 us, although the clocks drift."""
     closure_ms = measured(make_run, tmp_path).closure_p95_ms
     assert closure_ms is not None
-    assert closure_ms < MICROSECOND_MS
+    assert closure_ms < ONE_MICROSECOND_MS
 
 
 def test_the_closure_error_is_absolute(make_run: MakeRun, tmp_path: Path) -> None:
@@ -172,10 +172,10 @@ def test_without_pictures_tau_v_is_unknown(make_run: MakeRun, tmp_path: Path) ->
 
 def test_a_clock_step_does_not_change_the_loop_latency(make_run: MakeRun, tmp_path: Path) -> None:
     """If the client's wall clock steps by 100 ms, loop latency and picture age do not change."""
-    still, stepped = measured(make_run, tmp_path / "a"), measured(make_run, tmp_path / "b", step_s=0.1)
-    assert stepped.entry["loop_ms"] == still.entry["loop_ms"]
-    assert stepped.entry["picture_age_ms"] == still.entry["picture_age_ms"]
-    assert stepped.entry["tau_v_ms"]["p95"] > still.entry["tau_v_ms"]["p95"] + 50
+    without_step, stepped = measured(make_run, tmp_path / "a"), measured(make_run, tmp_path / "b", step_s=0.1)
+    assert stepped.entry["loop_ms"] == without_step.entry["loop_ms"]
+    assert stepped.entry["picture_age_ms"] == without_step.entry["picture_age_ms"]
+    assert stepped.entry["tau_v_ms"]["p95"] > without_step.entry["tau_v_ms"]["p95"] + 50
 
 
 def test_only_frames_of_the_drive_are_counted(make_run: MakeRun, tmp_path: Path) -> None:
@@ -249,7 +249,7 @@ def test_missing_data_are_null_not_zero(make_run: MakeRun, tmp_path: Path) -> No
     nothing = read_record(tmp_path / "b" / "client.mcap", channels=())
     entry = measure(server, nothing).entry
     assert entry["tau_v_ms"] == {"p5": None, "p50": None, "p95": None, "bound": None, "n": 0}
-    assert entry["loop_ms"]["p50"] == pytest.approx(76.0, abs=MICROSECOND_MS)
+    assert entry["loop_ms"]["p50"] == pytest.approx(76.0, abs=ONE_MICROSECOND_MS)
     assert measure(nothing, nothing).entry["mae_m"] is None
     assert measure(nothing, nothing).entry["duration_s"] is None
 
@@ -314,7 +314,7 @@ def test_the_last_p95_is_that_of_the_whole_drive() -> None:
 
 
 def test_heading_error_of_two_halves() -> None:
-    """For 0.1 rad left over one half and 0.3 rad right over the other, mean is 0.2, RMS 0.2236 and P95 0.3 rad."""
+    """For 0.1 rad left in one half and 0.3 rad right in the other, the mean is 0.2, RMS 0.2236 and P95 0.3 rad."""
     rows = [{"progress_m": index * 0.25, "heading_error_rad": 0.1 if index < 50 else -0.3} for index in range(100)]
     statistics = heading_metrics(table(rows))
     assert statistics["heading_mae_rad"] == pytest.approx(0.2)
@@ -345,7 +345,7 @@ def test_the_route_length_is_recorded(make_run: MakeRun, tmp_path: Path) -> None
     [([], 0), ([0.0], 0), ([0.0, 0.2, 0.1], 1), ([0.0, 0.2, 0.195, 0.3], 0), ([0.0, -0.1, 0.1, -0.1, 0.1], 3)],
 )
 def test_reversals_within_the_deadband_are_ignored(angles: list[float], reversals: int) -> None:
-    """A turn back counts as a reversal from 0.01 rad on."""
+    """A change of steering direction counts as a reversal if it is at least 0.01 rad."""
     assert steering_reversals(np.array(angles)) == reversals
 
 

@@ -22,11 +22,11 @@ def table(rows: Sequence[Mapping[str, Any]]) -> Table:
     return table_of(rows, mono_ns, mono_ns)
 
 
-def record(samples: Sequence[Sample], *, drove: bool = False) -> Record:
+def record(samples: Sequence[Sample], *, with_drive: bool = False) -> Record:
     keys = ("mono_ns", "condition", "flow", "requested_ms", "measured_ms", "reason")
     rows = [dict(zip(keys, (round(sample[0] * 1e9), *sample[1:]), strict=True)) for sample in samples]
     tables = {"injection": table(rows)} if rows else {}
-    if drove:
+    if with_drive:
         events = (("drive_began", BEGAN_S, ""), ("ending", ENDED_S, "completed"))
         tables["event"] = table([{"mono_ns": s * 10**9, "kind": kind, "detail": detail} for kind, s, detail in events])
     return Record(Path("none"), True, tables, {}, ENDED_S * 10**9)
@@ -35,11 +35,11 @@ def record(samples: Sequence[Sample], *, drove: bool = False) -> Record:
 def reasons(
     video: Sequence[Sample], control: Sequence[Sample], requested_ms: Mapping[str, float] = REQUESTED_MS
 ) -> list[str]:
-    return recorded_reasons(record(video, drove=True), record(control), "L4", requested_ms)
+    return recorded_reasons(record(video, with_drive=True), record(control), "L4", requested_ms)
 
 
 def test_a_condition_in_force_throughout_the_drive_is_valid() -> None:
-    """Queues that do as requested from before the drive to its end are valid; what they do after it is irrelevant."""
+    """A run is valid if the queues are as requested from before the drive to its end; later changes are irrelevant."""
     assert reasons(VIDEO, CONTROL) == []
     assert reasons([(2, "", "", 0.0, None, ""), *VIDEO, (21, "", "", 0.0, None, "")], CONTROL) == []
 
@@ -71,22 +71,22 @@ def test_an_unrequested_delay_need_not_be_measured() -> None:
 
 def test_a_long_gap_between_measurements_is_a_reason() -> None:
     """A run is invalid if a queue was not measured for more than 20 s of the drive."""
-    early = [(-15, "L4", "video", 150.0, 150.2, "")]
-    (reason,) = reasons(early, CONTROL)
+    before_drive = [(-15, "L4", "video", 150.0, 150.2, "")]
+    (reason,) = reasons(before_drive, CONTROL)
     assert reason.startswith("the server ")
     assert reason.endswith(" 35 s")
-    gap = [*CONTROL, (30, "L4", "control", 75.0, 75.1, "")]
-    (reason,) = reasons(VIDEO, gap)
+    with_gap = [*CONTROL, (30, "L4", "control", 75.0, 75.1, "")]
+    (reason,) = reasons(VIDEO, with_gap)
     assert reason.startswith("the client ")
     assert reason.endswith(" 29 s")
 
 
-def test_a_run_without_a_condition_must_not_have_another_clients() -> None:
+def test_another_clients_condition_invalidates_a_run_without_one() -> None:
     """A run without a condition is invalid if another client's condition was in force."""
-    (reason,) = recorded_reasons(record(VIDEO, drove=True), record([]), "", REQUESTED_MS)
+    (reason,) = recorded_reasons(record(VIDEO, with_drive=True), record([]), "", REQUESTED_MS)
     assert "L4 was in force on the server" in reason
     ended = [VIDEO[0], (8, "", "", 0.0, None, "")]
-    assert recorded_reasons(record(ended, drove=True), record([]), "", REQUESTED_MS) == []
+    assert recorded_reasons(record(ended, with_drive=True), record([]), "", REQUESTED_MS) == []
 
 
 @pytest.mark.parametrize(

@@ -27,8 +27,8 @@ def test_the_relay_receives_the_whole_condition(name: str) -> None:
     assert video.downstream_injected == injected("video", requested.video_ms, requested.video, run.seed)
     assert control.upstream_injected == injected("control", requested.control_ms, requested.control, run.seed)
     assert video.upstream_injected is control.downstream_injected is None
-    constant = video.downstream_injected is None
-    assert video.downstream.constant_ms == pytest.approx(_inherent_ms() + (requested.video_ms if constant else 0))
+    is_constant = video.downstream_injected is None
+    assert video.downstream.constant_ms == pytest.approx(_inherent_ms() + (requested.video_ms if is_constant else 0))
 
 
 def _inherent_ms() -> float:
@@ -37,14 +37,14 @@ def _inherent_ms() -> float:
 
 
 def reasons(
-    held: tuple[float | None, float | None], late: tuple[float | None, float | None], **requested: Any
+    median_ms: tuple[float | None, float | None], lateness_ms: tuple[float | None, float | None], **requested: Any
 ) -> list[str]:
     directions = ("video downstream", "control upstream")
     return relay_reasons(
         {
             "requested_ms": requested,
-            "held_ms": dict(zip(directions, held, strict=True)),
-            "late_ms": dict(zip(directions, late, strict=True)),
+            "held_ms": dict(zip(directions, median_ms, strict=True)),
+            "late_ms": dict(zip(directions, lateness_ms, strict=True)),
         }
     )
 

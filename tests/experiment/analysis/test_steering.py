@@ -25,7 +25,7 @@ def sine(hertz: float, amplitude_rad: float, *, seconds: float = 30.0) -> tuple[
 
 
 def test_the_steering_rate_is_weighted_by_time() -> None:
-    """0.1 rad in 1 s and then nothing for 3 s is an RMS of 0.05 rad/s; rows of the same time have no weight."""
+    """A change of 0.1 rad in 1 s, then none for 3 s, is an RMS of 0.05 rad/s; rows with equal times have no weight."""
     times_s, angle_rad = np.array([0.0, 1.0, 1.0, 4.0]), np.array([0.0, 0.1, 0.1, 0.1])
     assert steering_rate_rms_radps(times_s, angle_rad) == pytest.approx(0.05)
     assert steering_rate_rms_radps(times_s[:1], angle_rad[:1]) is None
@@ -48,9 +48,9 @@ def test_an_oscillation_is_found(hertz: float) -> None:
 
 def test_the_spectrum_equals_scipys() -> None:
     """The spectrum equals SciPy's periodogram with the same window, except at 0 Hz and the highest frequency."""
-    even_rad = np.random.default_rng(1).normal(size=311).cumsum()
-    hertz, power = power_spectrum(even_rad)
-    expected = periodogram(even_rad, 20.0, "hann", nfft=4096, detrend="linear", scaling="spectrum")
+    angles_rad = np.random.default_rng(1).normal(size=311).cumsum()
+    hertz, power = power_spectrum(angles_rad)
+    expected = periodogram(angles_rad, 20.0, "hann", nfft=4096, detrend="linear", scaling="spectrum")
     assert hertz == pytest.approx(expected[0])
     assert power[1:-1] == pytest.approx(expected[1][1:-1])
 
@@ -62,7 +62,7 @@ def test_the_larger_of_two_oscillations_counts() -> None:
 
 
 def test_no_oscillation() -> None:
-    """A straight course, a bend, under 0.01 rad peak to peak, under three periods, and no rows: no oscillation."""
+    """Without a wave of 0.01 rad peak to peak and three periods, there is no oscillation."""
     times_s, small_rad = sine(0.4, 0.004)
     assert oscillation_hz(times_s, np.zeros(len(times_s))) is None
     assert oscillation_hz(times_s, 0.05 * times_s) is None

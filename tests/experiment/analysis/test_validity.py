@@ -25,7 +25,7 @@ def reasons(make_run: MakeRun, directory: Path, **settings: Any) -> list[str]:
 def test_a_run_without_faults_is_valid(make_run: MakeRun, tmp_path: Path) -> None:
     """A run without faults of the infrastructure is valid, whatever its ending."""
     assert reasons(make_run, tmp_path / "a") == []
-    assert reasons(make_run, tmp_path / "b", ending="collision", wobble_m=3.0) == []
+    assert reasons(make_run, tmp_path / "b", ending="collision", wave_amplitude_m=3.0) == []
 
 
 @pytest.mark.parametrize(
@@ -38,13 +38,13 @@ def test_a_run_without_faults_is_valid(make_run: MakeRun, tmp_path: Path) -> Non
         ({"late": 3}, "the physics was 180 ms late"),
         ({"skipped": 10}, "the camera missed 10 of 361 ticks"),
         ({"ending": None}, "the record has no ending"),
-        ({"server_unpolled_s": (4, 6)}, "the clock of the server was not sampled for 3.0 s"),
-        ({"server_unpolled_s": (-1, 3)}, "the clock of the server was not sampled for 3.0 s"),
-        ({"server_unpolled_s": (10, 15)}, "the clock of the server was not sampled for 3.0 s"),
-        ({"server_unpolled_s": (-1, 15)}, "the clock of the server was not sampled for 12.0 s"),
-        ({"client_unpolled_s": (4, 6)}, "the clock of the client was not sampled for 3.0 s"),
-        ({"client_unpolled_s": (6, 15)}, "the clock samples of the client cover 6.0 s of a drive of 12.0 s"),
-        ({"client_unpolled_s": (-1, 15)}, "the clock samples of the client cover 0.0 s of a drive of 12.0 s"),
+        ({"server_unsampled_s": (4, 6)}, "the clock of the server was not sampled for 3.0 s"),
+        ({"server_unsampled_s": (-1, 3)}, "the clock of the server was not sampled for 3.0 s"),
+        ({"server_unsampled_s": (10, 15)}, "the clock of the server was not sampled for 3.0 s"),
+        ({"server_unsampled_s": (-1, 15)}, "the clock of the server was not sampled for 12.0 s"),
+        ({"client_unsampled_s": (4, 6)}, "the clock of the client was not sampled for 3.0 s"),
+        ({"client_unsampled_s": (6, 15)}, "the clock samples of the client cover 6.0 s of a drive of 12.0 s"),
+        ({"client_unsampled_s": (-1, 15)}, "the clock samples of the client cover 0.0 s of a drive of 12.0 s"),
     ],
 )
 def test_each_infrastructure_fault_makes_the_run_invalid(
@@ -60,9 +60,9 @@ def test_each_infrastructure_fault_makes_the_run_invalid(
         {"late": 1},
         {"skipped": 3, "server_counts": (("record_overflow", 0),)},
         {"step_s": 0.0005},
-        {"server_unpolled_s": (4, 5), "client_unpolled_s": (7, 8)},
-        {"server_unpolled_s": (-1, 2)},
-        {"server_unpolled_s": (11, 15)},
+        {"server_unsampled_s": (4, 5), "client_unsampled_s": (7, 8)},
+        {"server_unsampled_s": (-1, 2)},
+        {"server_unsampled_s": (11, 15)},
     ],
 )
 def test_small_faults_are_tolerated(make_run: MakeRun, tmp_path: Path, settings: dict[str, Any]) -> None:
@@ -86,7 +86,7 @@ def following(**changes: Any) -> dict[str, Any]:
     return {"client_clock": client, "server_clock": lambda _second: {"addresses": [SERVER]}}
 
 
-def test_the_bound_of_a_following_client_is_the_paths(make_run: MakeRun, tmp_path: Path) -> None:
+def test_a_following_client_has_the_bound_of_its_path(make_run: MakeRun, tmp_path: Path) -> None:
     """If the client follows the server, the bound is half the peer delay + dispersion + skew x age."""
     make_run(tmp_path, bound_s=0.5, **following())
     server, client = read_record(tmp_path / "server.mcap"), read_record(tmp_path / "client.mcap")
@@ -167,8 +167,8 @@ ONE_REASON = {
     "a probe alone, with too long a round trip": (
         {
             "client_clock": lambda _second: {"source": "probe", "correction_s": None},
-            "there_ms": 3.0,
-            "back_ms": 3.0,
+            "to_server_ms": 3.0,
+            "to_client_ms": 3.0,
         },
         "the offset between the clocks is only known to 3.",
     ),
@@ -185,9 +185,9 @@ ONE_REASON = {
 def test_each_clock_fault_has_one_reason(make_run: MakeRun, tmp_path: Path, case: str) -> None:
     """Each fault of the clocks has one reason, for its cause and not for its consequences."""
     settings, expected = ONE_REASON[case]
-    found = reasons(make_run, tmp_path, **settings)
-    assert len(found) == 1, found
-    assert found[0].startswith(expected)
+    run_reasons = reasons(make_run, tmp_path, **settings)
+    assert len(run_reasons) == 1, run_reasons
+    assert run_reasons[0].startswith(expected)
 
 
 def test_a_step_of_a_shared_clock_has_one_reason(make_run: MakeRun, tmp_path: Path) -> None:
@@ -207,7 +207,7 @@ def test_a_clock_step_long_before_the_drive_is_accepted(
 ) -> None:
     """A step of the client's clock 20 s before the drive is no reason, and Delta is that after the step."""
     by_probe = {"client_clock": lambda _second: {"source": "probe", "correction_s": None}} if source == "probe" else {}
-    make_run(tmp_path, step_s=step_s, stepped_s=-20.0, waited_s=40, drift=0.0, **by_probe)
+    make_run(tmp_path, step_s=step_s, stepped_s=-20.0, sampled_before_s=40, drift=0.0, **by_probe)
     server, client = read_record(tmp_path / "server.mcap"), read_record(tmp_path / "client.mcap")
     measured = measure(server, client)
     assert invalid_reasons(server, client, measured) == []
@@ -218,22 +218,22 @@ def test_a_clock_step_long_before_the_drive_is_accepted(
 @pytest.mark.parametrize("stepped_s", [-3.0, 0.5, 11.5, 12.5])
 def test_a_clock_step_near_the_drive_makes_the_run_invalid(make_run: MakeRun, tmp_path: Path, stepped_s: float) -> None:
     """A clock step in the drive or within 5 s of it is a reason, even after a long wait before the drive."""
-    found = reasons(make_run, tmp_path, step_s=-1.0, stepped_s=stepped_s, waited_s=40)
-    assert found == ["the wall clock of the client stepped by -1000.0 ms"]
+    run_reasons = reasons(make_run, tmp_path, step_s=-1.0, stepped_s=stepped_s, sampled_before_s=40)
+    assert run_reasons == ["the wall clock of the client stepped by -1000.0 ms"]
 
 
 def test_clock_samples_are_required_during_the_drive_only(make_run: MakeRun, tmp_path: Path) -> None:
     """Clock samples may be missing before the drive, but not at its end."""
-    assert reasons(make_run, tmp_path / "before", client_unpolled_s=(-30, -20), waited_s=40) == []
-    assert reasons(make_run, tmp_path / "end", client_unpolled_s=(8, 15), waited_s=40) == [
+    assert reasons(make_run, tmp_path / "before", client_unsampled_s=(-30, -20), sampled_before_s=40) == []
+    assert reasons(make_run, tmp_path / "end", client_unsampled_s=(8, 15), sampled_before_s=40) == [
         "the clock samples of the client cover 9.0 s of a drive of 12.0 s"
     ]
 
 
 def test_fast_steering_is_not_a_step(make_run: MakeRun, tmp_path: Path) -> None:
     """Steering by 83 ms per second, chrony's maximum, moves both clocks of a host and is not a step."""
-    found = reasons(make_run, tmp_path, drift=-83_333e-6)
-    assert [reason for reason in found if "stepped" in reason] == []
+    run_reasons = reasons(make_run, tmp_path, drift=-83_333e-6)
+    assert [reason for reason in run_reasons if "stepped" in reason] == []
 
 
 def test_some_long_ntp_round_trips_are_tolerated(make_run: MakeRun, tmp_path: Path) -> None:
@@ -242,11 +242,11 @@ def test_some_long_ntp_round_trips_are_tolerated(make_run: MakeRun, tmp_path: Pa
     assert reasons(make_run, tmp_path, **busy) == []
 
 
-@pytest.mark.parametrize("silent", ["server_clock", "client_clock"])
-def test_without_chrony_the_probe_is_used(make_run: MakeRun, tmp_path: Path, silent: str) -> None:
+@pytest.mark.parametrize("side_without_chrony", ["server_clock", "client_clock"])
+def test_without_chrony_the_probe_is_used(make_run: MakeRun, tmp_path: Path, side_without_chrony: str) -> None:
     """If one side's chrony has no correction, Delta is the probe's, with a bound of over half the round trip."""
     unknown = {"correction_s": None, "bound_s": None, "status": "chrony is not installed"}
-    make_run(tmp_path, **{silent: lambda _second: unknown})
+    make_run(tmp_path, **{side_without_chrony: lambda _second: unknown})
     server, client = read_record(tmp_path / "server.mcap"), read_record(tmp_path / "client.mcap")
     measured = measure(server, client)
     assert invalid_reasons(server, client, measured) == []
@@ -264,12 +264,12 @@ def test_chrony_must_be_synchronised_before_the_drive(make_run: MakeRun, tmp_pat
     def client(from_second: int) -> dict[str, Any]:
         return {"client_clock": lambda second: {"correction_s": None} if second < from_second else {}}
 
-    found = {}
+    sources = {}
     for from_second in (0, 3):
         make_run(tmp_path / str(from_second), **client(from_second))
         records = [read_record(tmp_path / str(from_second) / f"{side}.mcap") for side in ("server", "client")]
-        found[from_second] = measure(*records).entry["delta"]["source"]
-    assert found == {0: "chrony", 3: "probe"}
+        sources[from_second] = measure(*records).entry["delta"]["source"]
+    assert sources == {0: "chrony", 3: "probe"}
 
 
 def test_a_closure_error_makes_the_run_invalid(make_run: MakeRun, tmp_path: Path) -> None:

@@ -65,7 +65,7 @@ def test_bisection_brackets_the_first_crossing() -> None:
 
 
 def test_a_criterion_that_is_not_monotone_is_marked() -> None:
-    """Of several crossings the first is bracketed, and the bracket is marked as not monotone."""
+    """The first of several crossings is bracketed, and the bracket is marked as not monotone."""
     found = first_bracket(lambda delay_ms: 50 <= delay_ms < 250, GRID_MS, 2.0)
     assert found == Bracket(48.4375, 50.0, monotone=False)
 
@@ -97,7 +97,7 @@ def test_the_zero_of_a_rate_is_bracketed(guess_ms: float) -> None:
 
 @pytest.mark.parametrize("zero_ms", [7.1, 12.0, 18.3, 23.2, 137.0])
 def test_the_zero_of_a_step_is_bracketed(zero_ms: float) -> None:
-    """The zero is within the bracket if only the sign of the rate is known."""
+    """If a rate has only a sign (it is infinite), its zero is still within the bracket."""
     found = zero_bracket(lambda delay_ms: math.copysign(math.inf, delay_ms - zero_ms), 100.0, 200.0, 2.0)
     assert found.low_ms is not None
     assert found.high_ms is not None
@@ -165,9 +165,9 @@ def payloads(*events: Event) -> dict[str, list[Any]]:
         "frame": [frame(number) for number in range(60)],
         # For each frame a rejected command, one that is applied after 80 ms, and its repetition.
         "admission": [
-            each
+            command
             for number in range(10, 50)
-            for each in (
+            for command in (
                 admission(number, number * 33 * MS + 70 * MS, verdict="rejected"),
                 admission(number, number * 33 * MS + 80 * MS, limited="steering rate" if number == 20 else ""),
                 admission(number, number * 33 * MS + 100 * MS),
@@ -217,7 +217,7 @@ def test_a_drive_that_never_began() -> None:
 # The summary of many seeds.
 
 
-def test_values_out_of_range_have_a_rank() -> None:
+def test_values_out_of_range_are_ranked_last() -> None:
     """With two of six seeds out of range, quartiles and interval are null where they fall among these."""
     found = summarize_boundaries([300.0, 310.0, 320.0, 330.0, math.inf, math.inf])
     assert found == {"p25": 312.5, "p50": 325.0, "p75": None, "interval": [300.0, None], "n": 4}
@@ -254,13 +254,13 @@ RUNS = [
 
 def test_groups_are_of_each_route_and_of_all() -> None:
     """There is a group for each route and one for all routes, with counts of searches that were not monotone."""
-    one, other, both = summarize_groups(RUNS)
-    assert [(each["route"], each["n"]) for each in (one, other, both)] == [("a", 6), ("b", 1), (None, 7)]
-    assert one["departure_ms"] == {"p25": 372.5, "p50": 385.0, "p75": 397.5, "interval": [360.0, 410.0], "n": 6}
-    assert one["completion_ms"] == {"p25": None, "p50": None, "p75": None, "interval": [None, None], "n": 0}
-    assert other["departure_ms"]["p50"] is None
-    assert both["not_monotone"] == {"onset": 0, "departure": 0, "completion": 1}
-    assert both["theory_ms"] == 341.0
+    route_a, route_b, all_routes = summarize_groups(RUNS)
+    assert [(group["route"], group["n"]) for group in (route_a, route_b, all_routes)] == [("a", 6), ("b", 1), (None, 7)]
+    assert route_a["departure_ms"] == {"p25": 372.5, "p50": 385.0, "p75": 397.5, "interval": [360.0, 410.0], "n": 6}
+    assert route_a["completion_ms"] == {"p25": None, "p50": None, "p75": None, "interval": [None, None], "n": 0}
+    assert route_b["departure_ms"]["p50"] is None
+    assert all_routes["not_monotone"] == {"onset": 0, "departure": 0, "completion": 1}
+    assert all_routes["theory_ms"] == 341.0
 
 
 def test_figure_and_table_show_every_group() -> None:
@@ -286,9 +286,9 @@ def config(*changes: str) -> BoundaryConfig:
     return load_config(BoundaryConfig, shipped("configs/boundary.yaml"), changes)
 
 
-def test_first_seeds_of_all_come_before_second_ones() -> None:
+def test_first_seeds_are_searched_before_second_seeds() -> None:
     """The first seed of every route and preset is searched before any second seed."""
-    names = [each.name for each in plan_boundary(config("routes=[a, b]", "repetitions=2"))]
+    names = [search.name for search in plan_boundary(config("routes=[a, b]", "repetitions=2"))]
     assert names[:4] == ["a designed 00", "a paper_calibrated 00", "b designed 00", "b paper_calibrated 00"]
     assert len(names) == 8
 
@@ -322,14 +322,14 @@ def test_the_video_delay_replaces_the_conditions() -> None:
 # Real searches.
 
 
-def small(*changes: str) -> BoundaryConfig:
+def small_search(*changes: str) -> BoundaryConfig:
     return config("routes=[a_key]", "presets=[paper_calibrated]", "repetitions=1", "longest_delay_ms=400", *changes)
 
 
 @pytest.mark.full
 def test_one_real_search() -> None:
     """Onset, within 10 ms of theory, departure and completion are found in this order of delay."""
-    (search,) = plan_boundary(small("grid_ms=200", "within_ms=10"))
+    (search,) = plan_boundary(small_search("grid_ms=200", "within_ms=10"))
     found = run_search(search)
     assert found["theory_ms"] == theoretical_ms(search.planned.config)
     assert found["onset_ms"] == pytest.approx(found["theory_ms"], abs=10)
@@ -342,8 +342,8 @@ def test_one_real_search() -> None:
 
 @pytest.mark.full
 def test_the_frame_age_limit_ends_completion() -> None:
-    """With a frame age limit of 100 ms the vehicle is not armed beyond: completion ends without oscillation."""
-    (search,) = plan_boundary(small("grid_ms=200", "within_ms=100", "safety.picture_age_limit_ms=100"))
+    """With a frame age limit of 100 ms the vehicle is not armed at a longer delay, so completion ends there."""
+    (search,) = plan_boundary(small_search("grid_ms=200", "within_ms=100", "safety.picture_age_limit_ms=100"))
     found = run_search(search)
     assert (found["onset_ms"], found["departure_ms"]) == (None, None)
     assert found["completion_ms"] == pytest.approx(100, abs=60)
@@ -351,7 +351,7 @@ def test_the_frame_age_limit_ends_completion() -> None:
 
 
 def test_departure_is_searched_where_drives_begin(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Departure is searched at delays at which drives begin, and drives that never begin do not affect it."""
+    """Departure is searched only at delays at which drives begin; drives that never begin do not affect it."""
 
     def fake(planned: PlannedRun) -> MonitoredRun:
         delay_ms = planned.config.network.video.delay_ms or 0.0
@@ -368,7 +368,7 @@ def test_departure_is_searched_where_drives_begin(monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(boundary_module, "drive_monitored", fake)
     monkeypatch.setattr(boundary_module, "straight_growth", lambda _: (math.nan, -math.inf))
-    (search,) = plan_boundary(small("grid_ms=100", "within_ms=2"))
+    (search,) = plan_boundary(small_search("grid_ms=100", "within_ms=2"))
     departure_ms = 137
     found = run_search(search)
     assert found["departure_ms"] == pytest.approx(147, abs=1)
@@ -391,18 +391,20 @@ def test_a_failed_search_does_not_stop_the_others(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(boundary_module, "run_search", fake)
     monkeypatch.setattr(boundary_module, "process_workers", in_this_process)
     lines: list[str] = []
-    found, failed, done = run_searches(plan_boundary(small("repetitions=3")), jobs=1, on_progress=lines.append)
-    assert (len(found), done) == (2, True)
+    results, failed, completed = run_searches(
+        plan_boundary(small_search("repetitions=3")), jobs=1, on_progress=lines.append
+    )
+    assert (len(results), completed) == (2, True)
     assert failed == [{"name": "a_key paper_calibrated 01", "why": "the vehicle was never armed"}]
     assert "a_key paper_calibrated 01: failed: the vehicle was never armed" in lines
 
 
-def killed_by(search: boundary_module.BoundarySearch) -> dict[str, Any]:
+def kill_process_in_repetition_1(search: boundary_module.BoundarySearch) -> dict[str, Any]:
     """Kill the process in repetition 1, and once in repetition 2; return an entry otherwise."""
     repetition = int(search.name[-2:])
-    mark = Path(search.planned.config.study.participant or "") / str(repetition)
-    if repetition == 1 or (repetition == 2 and not mark.exists()):
-        mark.touch()
+    marker_file = Path(search.planned.config.study.participant or "") / str(repetition)
+    if repetition == 1 or (repetition == 2 and not marker_file.exists()):
+        marker_file.touch()
         os.kill(os.getpid(), signal.SIGKILL)
     return run_entry("a_key", repetition)
 
@@ -410,39 +412,41 @@ def killed_by(search: boundary_module.BoundarySearch) -> dict[str, Any]:
 @pytest.mark.full
 def test_searches_of_a_dead_process_are_repeated(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Searches of a process that died are repeated alone; only one that kills its process again has failed."""
-    monkeypatch.setattr(boundary_module, "run_search", killed_by)
-    searches = plan_boundary(small("repetitions=5", f"study.participant={tmp_path}"))
-    found, failed, done = run_searches(searches, jobs=2, on_progress=lambda _: None)
-    assert [run["repetition"] for run in found] == [0, 2, 3, 4]
+    monkeypatch.setattr(boundary_module, "run_search", kill_process_in_repetition_1)
+    searches = plan_boundary(small_search("repetitions=5", f"study.participant={tmp_path}"))
+    results, failed, completed = run_searches(searches, jobs=2, on_progress=lambda _: None)
+    assert [run["repetition"] for run in results] == [0, 2, 3, 4]
     assert failed == [{"name": "a_key paper_calibrated 01", "why": "the process that searched it died"}]
-    assert done
+    assert completed
 
 
 def test_ctrl_c_keeps_the_found_boundaries(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """After Ctrl-C the searches in progress are finished, no others are started, and the files have all results."""
     monkeypatch.setattr(boundary_module, "run_search", lambda search: run_entry("a_key", int(search.name[-2:])))
     monkeypatch.setattr(boundary_module, "process_workers", in_this_process)
-    monkeypatch.setattr(_InThisProcess, "begins", 3)
+    monkeypatch.setattr(_InThisProcess, "max_calls", 3)
     lines: list[str] = []
 
-    def tell(line: str) -> None:
+    def interrupt_after_two(line: str) -> None:
         lines.append(line)
         if len(lines) == 2:
             raise KeyboardInterrupt
 
-    config = small("repetitions=5")
-    found, done = boundary_module.search_boundary(config, plan_boundary(config), tmp_path, jobs=1, on_progress=tell)
-    assert (len(lines), done) == (3, False)
-    assert [run["repetition"] for run in found["runs"]] == [0, 1, 2]
-    assert json.loads((tmp_path / "boundary.json").read_text()) == found
+    config = small_search("repetitions=5")
+    result, completed = boundary_module.search_boundary(
+        config, plan_boundary(config), tmp_path, jobs=1, on_progress=interrupt_after_two
+    )
+    assert (len(lines), completed) == (3, False)
+    assert [run["repetition"] for run in result["runs"]] == [0, 1, 2]
+    assert json.loads((tmp_path / "boundary.json").read_text()) == result
     assert (tmp_path / "boundary.csv").read_text().count("\n") == 4
     assert (tmp_path / "boundary.png").stat().st_size > 1000
 
 
 class _InThisProcess:
-    """An executor in this process that runs only the first `begins` submitted calls."""
+    """An executor in this process that runs only the first `max_calls` submitted calls."""
 
-    begins = 100
+    max_calls = 100
 
     def __init__(self) -> None:
         self.futures: list[Any] = []
@@ -456,7 +460,7 @@ class _InThisProcess:
 
         future: Future[Any] = Future()
         self.futures.append(future)
-        if len(self.futures) <= self.begins:
+        if len(self.futures) <= self.max_calls:
             try:
                 future.set_result(function(*arguments))
             except WorkError as error:
@@ -474,5 +478,5 @@ def test_the_path_of_a_road_file_is_a_route(tmp_path: Path) -> None:
     """The path of a road file works as a route."""
     road = tmp_path / "bend.yaml"
     road.write_text("title: Bend\nsegments: [{length_m: 60}, {length_m: 40, curvature_per_m: 0.02}]\n")
-    (search,) = plan_boundary(small(f"routes=[{road}]"))
+    (search,) = plan_boundary(small_search(f"routes=[{road}]"))
     assert search.planned.identity["route"] == str(road)

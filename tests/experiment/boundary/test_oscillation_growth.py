@@ -1,4 +1,4 @@
-"""Tests of the oscillation growth: of simple oscillations, and of the whole loop on a straight road against theory."""
+"""Tests of the oscillation growth: of simple oscillations, and of the whole loop, compared with theory."""
 
 from __future__ import annotations
 
@@ -12,24 +12,26 @@ from lavt.config import RunConfig
 from lavt.config_file import load_config, shipped
 from lavt.experiment.boundary.boundary import theoretical_ms, with_video_delay
 from lavt.experiment.boundary.oscillation_growth import (
-    CALM_START,
-    calm_seed,
+    NEAR_CENTRE_START,
     growth_per_s,
     half_period_peaks,
+    near_centre_seed,
     straight_growth,
 )
 from lavt.experiment.runs.monitored_run import MonitoredRun
 from lavt.vehicle.sim.simulator import start_offset
 
-LOOPBACK_MS = 11.8
-"""The delay from exposure to the wheel's command without injected delay; an approximate value is sufficient."""
-WITHIN_MS = 10.0
+DELAY_WITHOUT_INJECTION_MS = 11.8
+"""The delay from exposure to the applied command without injected delay; an approximate value is sufficient."""
+TOLERANCE_MS = 10.0
 
 CASES = list(itertools.product((0.74, 1.01, 1.3), (15, 30), (6.0, 10.0)))
-QUICK = (1.01, 30, 6.0)
+QUICK_CASE = (1.01, 30, 6.0)
 
 
-def oscillating_drive(rate_per_s: float, *, size_m: float = 0.01, limited_s: tuple[float, ...] = ()) -> MonitoredRun:
+def oscillating_drive(
+    rate_per_s: float, *, amplitude_m: float = 0.01, limited_s: tuple[float, ...] = ()
+) -> MonitoredRun:
     """Return a drive with an oscillation of period 2 s, at full speed after 5 s."""
     time_s = np.arange(0, 40, 0.02)
     return MonitoredRun(
@@ -37,7 +39,7 @@ def oscillating_drive(rate_per_s: float, *, size_m: float = 0.01, limited_s: tup
         lane_invasions=0,
         total_delay_ms=0.0,
         time_s=time_s,
-        cross_track_m=size_m * np.exp(rate_per_s * time_s) * np.cos(math.pi * time_s),
+        cross_track_m=amplitude_m * np.exp(rate_per_s * time_s) * np.cos(math.pi * time_s),
         speed_mps=np.where(time_s < 5, 2.0, 10.0),
         limited_s=np.array(limited_s),
     )
@@ -53,20 +55,20 @@ def test_a_half_period_reaches_from_crossing_to_crossing() -> None:
 
 @pytest.mark.parametrize("rate_per_s", [-0.3, -0.01, 0.01, 0.05])
 def test_the_growth_is_that_of_the_envelope(rate_per_s: float) -> None:
-    """The growth of an oscillation e^(rate t) cos is its rate."""
+    """The growth of an oscillation with the envelope e^(rate t) is its rate."""
     assert growth_per_s(oscillating_drive(rate_per_s)) == pytest.approx(rate_per_s, rel=0.01)
 
 
 def test_growth_is_measured_before_the_first_limit() -> None:
-    """Data after a command that safety limited are ignored, unless the speed had not settled then."""
+    """Growth is measured up to the first limited command after the speed has settled; earlier limits do not matter."""
     drive = oscillating_drive(0.05, limited_s=(0.1, 20.0))
     drive.cross_track_m[drive.time_s > 20] = 0.02
     assert growth_per_s(drive) == pytest.approx(0.05, rel=0.01)
 
 
-def test_too_large_an_oscillation_has_grown() -> None:
-    """If the linear range is exceeded before four half periods, the growth is infinite."""
-    assert growth_per_s(oscillating_drive(0.0, size_m=0.3)) == math.inf
+def test_an_oscillation_beyond_the_linear_range_has_infinite_growth() -> None:
+    """If an oscillation leaves the linear range before four half periods are complete, its growth is infinite."""
+    assert growth_per_s(oscillating_drive(0.0, amplitude_m=0.3)) == math.inf
 
 
 def test_an_approach_without_crossing_is_no_oscillation() -> None:
@@ -76,14 +78,14 @@ def test_an_approach_without_crossing_is_no_oscillation() -> None:
     assert growth_per_s(drive) == -math.inf
 
 
-def test_the_seed_of_a_straight_drive_has_a_calm_start() -> None:
+def test_a_straight_drive_starts_near_the_centre() -> None:
     """For any seed of a run, the straight drive starts near the centre, with a different seed for each run."""
-    seeds = [calm_seed(seed) for seed in range(5)]
+    seeds = [near_centre_seed(seed) for seed in range(5)]
     assert len(set(seeds)) == 5
     for seed in seeds:
         _, offset_m, heading_rad = start_offset(seed)
-        assert abs(offset_m) <= CALM_START[0]
-        assert abs(heading_rad) <= CALM_START[1]
+        assert abs(offset_m) <= NEAR_CENTRE_START[0]
+        assert abs(heading_rad) <= NEAR_CENTRE_START[1]
 
 
 def loop_config(lookahead_s: float, rate_hz: float, speed_mps: float, *changes: str) -> RunConfig:
@@ -92,7 +94,7 @@ def loop_config(lookahead_s: float, rate_hz: float, speed_mps: float, *changes: 
         f"controller.lookahead_s={lookahead_s}",
         f"controller.speed_mps={speed_mps}",
         f"camera.rate_hz={rate_hz}",
-        "safety.stopping_distance_limit_m=200",  # at 10 m/s the car would be slowed from 0.27 s on
+        "safety.stopping_distance_limit_m=200",  # at 10 m/s the default slows the car above 0.27 s of delay
         *changes,
     ]
     return load_config(RunConfig, shipped("configs/demo.yaml"), changed)
@@ -102,16 +104,16 @@ def check_onset(config: RunConfig) -> None:
     """Check that the oscillation decays at 9.5 ms below the theoretical delay, and grows at 9.5 ms above it."""
     theory_ms = theoretical_ms(config)
     assert theory_ms is not None
-    for side in (-1, 1):
-        requested_ms = theory_ms + side * (WITHIN_MS - 0.5) - LOOPBACK_MS
+    for sign in (-1, 1):
+        requested_ms = theory_ms + sign * (TOLERANCE_MS - 0.5) - DELAY_WITHOUT_INJECTION_MS
         total_ms, rate_per_s = straight_growth(with_video_delay(config, requested_ms))
-        assert abs(total_ms - theory_ms) <= WITHIN_MS
-        assert rate_per_s * side > 0, (total_ms, theory_ms)
+        assert abs(total_ms - theory_ms) <= TOLERANCE_MS
+        assert rate_per_s * sign > 0, (total_ms, theory_ms)
 
 
 @pytest.mark.parametrize(
     ("lookahead_s", "rate_hz", "speed_mps"),
-    [pytest.param(*case, marks=() if case == QUICK else pytest.mark.full) for case in CASES],
+    [pytest.param(*case, marks=() if case == QUICK_CASE else pytest.mark.full) for case in CASES],
 )
 def test_the_onset_matches_theory(lookahead_s: float, rate_hz: float, speed_mps: float) -> None:
     """On a straight road, far from every limit, the onset of growth is within 10 ms of the theory."""

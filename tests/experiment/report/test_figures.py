@@ -36,7 +36,11 @@ def point_names(axes: Axes) -> list[str]:
 
 def error_bars(axes: Axes) -> list[list[float]]:
     """Return the low and the high end of each error bar."""
-    bars = [each.lines[2][0] for each in axes.containers if isinstance(each, ErrorbarContainer) and each.has_yerr]
+    bars = [
+        container.lines[2][0]
+        for container in axes.containers
+        if isinstance(container, ErrorbarContainer) and container.has_yerr
+    ]
     return [[round(float(y), 9) for _, y in bar.get_segments()[0]] for bar in bars]
 
 
@@ -53,10 +57,12 @@ def test_points_with_overlapping_names_form_a_cluster() -> None:
 
 def test_the_degradation_figure_has_all_intervals_and_names() -> None:
     """Circles, diamonds and the paper's completion have intervals, and all points have names."""
-    its = {name: each for name, each in paper()["conditions"].items() if name in CONDITIONS}
-    completion, error = degradation_figure({"virtual": CONDITIONS}, its, COLOURS).axes
-    theirs = [[round(100 * end, 9) for end in each["completion_interval"]] for each in its.values()]
-    assert error_bars(completion) == [*theirs, [80.0, 100.0], [36.7, 56.7], [43.3, 63.3]]
+    paper_conditions = {name: condition for name, condition in paper()["conditions"].items() if name in CONDITIONS}
+    completion, error = degradation_figure({"virtual": CONDITIONS}, paper_conditions, COLOURS).axes
+    paper_intervals = [
+        [round(100 * end, 9) for end in condition["completion_interval"]] for condition in paper_conditions.values()
+    ]
+    assert error_bars(completion) == [*paper_intervals, [80.0, 100.0], [36.7, 56.7], [43.3, 63.3]]
     assert error_bars(error) == [[2.0, 3.0], [5.5, 6.5], [5.8, 6.8], *[[0.75, 1.5]] * 3]
     assert point_names(completion) == ["L2", "L3\nL4", "L2", "L4\nL3"]
     assert point_names(error) == ["L3", "L4", "L2", "L4\nL3", "L2"]

@@ -29,7 +29,7 @@ MakeRun = Callable[..., Path]
 ROUTE = "A <script>alert('1')</script> & \"key\" $^$"
 """A route name with special characters of HTML and of mathematical text in figures."""
 
-FAILED = [{"run": "<b>5</b>", "reason": '<img src=x onerror="alert(1)"> & more'}]
+FAILED_RUNS = [{"run": "<b>5</b>", "reason": '<img src=x onerror="alert(1)"> & more'}]
 """A failed run whose name and reason have special characters of HTML."""
 
 
@@ -58,14 +58,16 @@ def sweep(make_run: MakeRun, tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("sweep")
     add_run(make_run, directory, "0", seconds=3.0)
     add_run(make_run, directory, "1", seconds=3.0, condition="L1", video_ms=75.0)
-    add_run(make_run, directory, "2", seconds=2.0, condition="L1", video_ms=75.0, ending="collision", wobble_m=2.0)
+    add_run(
+        make_run, directory, "2", seconds=2.0, condition="L1", video_ms=75.0, ending="collision", wave_amplitude_m=2.0
+    )
     add_run(make_run, directory, "3", seconds=3.0, time="real", bound_s=0.003)
     add_run(make_run, directory, "5", seconds=3.0, time="real", client_clock=lambda _second: {"correction_s": None})
     add_run(
         make_run, directory, "6", seconds=3.0, time="real", server_host="a", client_host="a", offset_s=0.0, drift=0.0
     )
     (directory / "runs" / "4").mkdir()
-    write_report(directory, speed={"simulated_s": 30.0, "wall_s": 10.0, "jobs": 2}, failed=FAILED)
+    write_report(directory, speed={"simulated_s": 30.0, "wall_s": 10.0, "jobs": 2}, failed=FAILED_RUNS)
     return directory
 
 
@@ -135,7 +137,7 @@ def test_a_report_is_byte_for_byte_reproducible(sweep: Path) -> None:
     assert len(before) > 40
     directories = [sweep / "runs" / name for name in "012356"]
     drives = {directory: read_drive(directory, read_json(directory / "result.json")) for directory in directories}
-    write_report(sweep, drives=drives, failed=FAILED)
+    write_report(sweep, drives=drives, failed=FAILED_RUNS)
     assert files_of(sweep) == before
 
 
@@ -149,8 +151,8 @@ def test_csv_files_have_exact_numbers(sweep: Path) -> None:
     with (sweep / "report" / "tables" / "conditions_virtual_driving.csv").open(newline="") as file:
         rows = {row["condition"]: row for row in csv.DictReader(file)}
     entry = summary["conditions"]["L1"]
-    read = [float(rows["L1"][f"95 %, these routes {end} (share)"]) for end in ("low", "high")]
-    assert read == entry["completion_interval"]
+    interval = [float(rows["L1"][f"95 %, these routes {end} (share)"]) for end in ("low", "high")]
+    assert interval == entry["completion_interval"]
     assert float(rows["L1"]["lane invasions / km"]) == entry["lane_invasions_per_km"]
     with (sweep / "report" / "tables" / "conditions_virtual_latency.csv").open(newline="") as file:
         latencies = {row["condition"]: row for row in csv.DictReader(file)}
@@ -193,7 +195,7 @@ def test_texts_of_users_are_escaped(sweep: Path) -> None:
     page = PageTexts()
     page.feed(html)
     assert any(ROUTE in text for text in page.texts)
-    assert f"{FAILED[0]['run']}: {FAILED[0]['reason']}" in page.texts
+    assert f"{FAILED_RUNS[0]['run']}: {FAILED_RUNS[0]['reason']}" in page.texts
     assert any(ROUTE in text for text in page.alternatives)
 
 
@@ -217,7 +219,7 @@ class PageTexts(HTMLParser):
 def test_a_second_report_keeps_the_speed(sweep: Path) -> None:
     """A second report of the same runs has the same summary, including the speed of the sweep."""
     first = (sweep / "summary.json").read_bytes()
-    write_report(sweep, failed=FAILED)
+    write_report(sweep, failed=FAILED_RUNS)
     assert (sweep / "summary.json").read_bytes() == first
 
 

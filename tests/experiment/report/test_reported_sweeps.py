@@ -74,5 +74,5 @@ def test_a_single_sweep_has_no_name(sweeps: tuple[Path, Path], tmp_path: Path) -
     for directories in ([first], runs):
         report(directories, tmp_path / "out")
         summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-        assert not any("sweep" in each for each in [*summary["runs"], *summary["groups"]])
+        assert not any("sweep" in entry for entry in [*summary["runs"], *summary["groups"]])
         assert len(summary["runs"]) == 2

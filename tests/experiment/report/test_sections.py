@@ -39,7 +39,7 @@ MakeRun = Callable[..., Path]
 
 INJECTED = {"L0": (0, 0), "L1": (75, 0), "L2": (150, 0), "L3": (225, 0), "L4": (150, 75), "L5": (225, 100)}
 
-NEW_OF_CONDITION = (
+NEW_CONDITION_KEYS = (
     "completion_such_roads",
     "endings",
     "routes",
@@ -137,7 +137,7 @@ def all_parts(report: ReportContext) -> dict[str, str]:
         "routes": route_parts(report),
         "runs": run_parts(report),
     }
-    return {name: "\n".join(every) for name, every in parts.items()}
+    return {name: "\n".join(part_list) for name, part_list in parts.items()}
 
 
 def text_of(html: str) -> str:
@@ -145,7 +145,7 @@ def text_of(html: str) -> str:
 
 
 def test_results_are_compared_with_the_paper(tmp_path: Path) -> None:
-    """The tables have the paper's completion, latency and error, and Fisher's p for its contrasts."""
+    """The tables have the paper's completion, latency and error, and the p values of its contrasts by Fisher's test."""
     parts = all_parts(report_of(summarize(campaign(), None), tmp_path))
     assert "13.15" in parts["conditions"]
     titles = re.findall("<th[^>]*>(.*?)</th>", unescape(parts["conditions"]))
@@ -176,8 +176,8 @@ def test_figures_and_tables_name_their_group(tmp_path: Path) -> None:
     assert re.findall("<h3>(.*?)</h3>", parts["contrasts"]) == ["preset paper_calibrated", "preset designed"]
     assert parts["survival"].count("Virtual time (preset paper_calibrated).") == 2
     assert "Runs in virtual time are from one group (preset paper_calibrated)." in text_of(parts["degradation"])
-    alone = all_parts(report_of(summarize(campaign(), None), tmp_path))
-    assert "<h3>" not in alone["contrasts"]
+    single_group = all_parts(report_of(summarize(campaign(), None), tmp_path))
+    assert "<h3>" not in single_group["contrasts"]
 
 
 def test_the_bar_of_stages_is_the_loop(tmp_path: Path) -> None:
@@ -226,7 +226,7 @@ def test_a_summary_of_an_older_version_is_reported(tmp_path: Path) -> None:
     for entry in [summary, *summary["groups"]]:
         entry.pop("contrasts", None)
         for condition in entry["conditions"].values():
-            for key in NEW_OF_CONDITION:
+            for key in NEW_CONDITION_KEYS:
                 del condition[key]
     parts = all_parts(report_of(summary, tmp_path))
     assert [name for name, html in parts.items() if not html] == [

@@ -33,7 +33,7 @@ def test_the_results_name_the_largest_fall_of_completion() -> None:
 
 
 def test_no_fall_is_reported_if_there_is_none() -> None:
-    """Constant completion is reported as such, one condition without a fall, and no condition with no text."""
+    """Constant completion is reported as such; one condition has no fall; no condition gives no text."""
     assert "Completion does not fall" in results_sentences("It", conditions(1.0, 1.0, 1.0))
     assert "fall" not in results_sentences("It", conditions(1.0))
     assert results_sentences("It", {}) == ""

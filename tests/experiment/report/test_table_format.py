@@ -20,12 +20,12 @@ from lavt.experiment.report.table_format import (
     texts,
 )
 
-NASTY = 'a_b & 50 % of $x^2 #1 {~} \\ "<b>"\nτ'
+SPECIAL_TEXT = 'a_b & 50 % of $x^2 #1 {~} \\ "<b>"\nτ'
 
 TABLE = TableData(
     [texts("name"), numbers("error m", 2), shares("completed"), share_intervals("interval"), latencies("loop ms")],
     [
-        [NASTY, 1 / 3, 0.5, (0.123456789, 1.0), {"p5": 1.0, "p50": 2.25, "p95": 3.0, "n": 4}],
+        [SPECIAL_TEXT, 1 / 3, 0.5, (0.123456789, 1.0), {"p5": 1.0, "p50": 2.25, "p95": 3.0, "n": 4}],
         ["nothing", None, None, None, None],
     ],
 )
@@ -43,7 +43,7 @@ def test_csv_keeps_all_values_exactly() -> None:
         "interval high (share)",
         *parts,
     ]
-    assert first[0] == NASTY
+    assert first[0] == SPECIAL_TEXT
     assert [float(cell) for cell in first[1:]] == [1 / 3, 0.5, 0.123456789, 1.0, 2.25, 1.0, 3.0]
     assert second == ["nothing", "", "", "", "", "", "", ""]
 
@@ -75,7 +75,7 @@ def test_latex_reads_no_cell_as_an_option() -> None:
 def test_a_wide_latex_table_is_scaled_to_the_line() -> None:
     """A long column title is broken into lines, and a table that remains too wide is scaled."""
     column = numbers("collisions of the paper / run", 2)
-    narrow, wide = (tex_of(TableData([column] * many, [[1.0] * many])).splitlines() for many in (2, 12))
+    narrow, wide = (tex_of(TableData([column] * count, [[1.0] * count])).splitlines() for count in (2, 12))
     title = r"\shortstack[r]{collisions of\\the paper /\\run}"
     assert narrow[3] == rf"{title} & {title} \\"
     assert not any("graphicx" in line or "resizebox" in line for line in narrow)

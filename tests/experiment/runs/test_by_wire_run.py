@@ -45,11 +45,11 @@ def result_of(out: Path, kind: str, profile: str = GENERATIONS[0], route: str = 
 
 @pytest.mark.parametrize("profile", [pytest.param(GENERATIONS[0], marks=pytest.mark.full), GENERATIONS[1]])
 def test_a_route_is_driven_through_the_kit(profile: str, tmp_path: Path, speed_faults: list[SpeedFault]) -> None:
-    """A route is driven through the by-wire kit about as well as without, and the latency to the wheel is measured."""
-    result, without = result_of(tmp_path / "by-wire", "dbw", profile), result_of(tmp_path / "without", "simulator")
+    """A route is driven about as well through the kit as without it, and the latency to the wheel is measured."""
+    result, without_kit = result_of(tmp_path / "by-wire", "dbw", profile), result_of(tmp_path / "without", "simulator")
     assert (result["ending"], result["valid"]) == ("completed", True)
     assert result["p95_m"] <= 0.22
-    assert result["p95_m"] == pytest.approx(without["p95_m"], abs=0.03)
+    assert result["p95_m"] == pytest.approx(without_kit["p95_m"], abs=0.03)
     (wheel,) = [
         stage for stage in result["stages_ms"] if (stage["node"], stage["stage"]) == ("vehicle", "command to wheel")
     ]

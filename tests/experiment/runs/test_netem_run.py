@@ -21,7 +21,7 @@ from lavt.transport.netem.state import AppliedState, StateFiles, boot_id, networ
 from lavt.transport.netem.tc import Command
 
 
-class Kernel(NetemInterface):
+class FakeNetemInterface(NetemInterface):
     """A netem interface that records the commands of tc, and measures the requested delay plus `added_ms`."""
 
     def __init__(self, directory: Path) -> None:
@@ -33,8 +33,12 @@ class Kernel(NetemInterface):
     def record(self, command: Command) -> str:
         """Record a command; the interface has no root queue of ours until one is added."""
         if "show" in command:
-            ours = any("add dev lo root" in each for each in self.commands)
-            root = {"kind": "prio" if ours else "noqueue", "handle": "4c56:" if ours else "0:", "root": True}
+            has_our_root = any("add dev lo root" in recorded_command for recorded_command in self.commands)
+            root = {
+                "kind": "prio" if has_our_root else "noqueue",
+                "handle": "4c56:" if has_our_root else "0:",
+                "root": True,
+            }
             return "" if "filter" in command else json.dumps([root])
         self.commands.append(" ".join(command))
         return ""
@@ -44,8 +48,8 @@ class Kernel(NetemInterface):
     ) -> dict[str, ProbeResult]:
         """Return results as requested, plus `added_ms`."""
         return {
-            each.name: ProbeResult(count, 0, 0, 0, *[each.impairment.delay_ms + self.added_ms] * 3)
-            for each in probes(flows, exempt)
+            probe.name: ProbeResult(count, 0, 0, 0, *[probe.impairment.delay_ms + self.added_ms] * 3)
+            for probe in probes(flows, exempt)
         }
 
     def problems(self) -> list[str]:
@@ -58,62 +62,62 @@ class Kernel(NetemInterface):
         return []
 
 
-def run_by(kernel: NetemInterface, condition: str) -> NetemRun:
+def netem_run(interface: NetemInterface, condition: str) -> NetemRun:
     changes = ["time=real", "network.injection=netem", f"network.condition={condition}"]
-    return NetemRun(plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), changes)), kernel)
+    return NetemRun(plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), changes)), interface)
 
 
 def test_a_run_delays_its_own_ports_and_cleans_up(tmp_path: Path) -> None:
     """The flows of L4 are delayed at the ports of the run, measured before and after, and deleted at the end."""
-    kernel = Kernel(tmp_path)
-    with run_by(kernel, "L4") as netem:
+    interface = FakeNetemInterface(tmp_path)
+    with netem_run(interface, "L4") as netem:
         netem.apply(video_port=40_001, control_port=40_002)
         report = json.loads(json.dumps(netem.report()))
 
-    commands = "\n".join(kernel.commands)
+    commands = "\n".join(interface.commands)
     assert "match ip sport 40001 0xffff match u8 0x80 0xc0 at 28" in commands
     assert "match ip dport 40002 0xffff" in commands
-    assert kernel.commands[-1] == "tc qdisc del dev lo root"
+    assert interface.commands[-1] == "tc qdisc del dev lo root"
     assert (report["before"]["video"]["median_ms"], report["after"]["control"]["median_ms"]) == (150, 75)
     assert netem_reasons(report) == []
 
 
 def test_a_failed_run_cleans_up(tmp_path: Path) -> None:
     """The queue of a run is deleted, however the run ends."""
-    kernel = Kernel(tmp_path)
+    interface = FakeNetemInterface(tmp_path)
 
-    def stopped() -> None:
-        with run_by(kernel, "L1") as netem:
+    def interrupted_run() -> None:
+        with netem_run(interface, "L1") as netem:
             netem.apply(video_port=40_001, control_port=40_002)
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        stopped()
-    assert kernel.commands[-1] == "tc qdisc del dev lo root"
+        interrupted_run()
+    assert interface.commands[-1] == "tc qdisc del dev lo root"
 
 
 def test_a_rejected_run_keeps_the_queue_of_another_program(tmp_path: Path) -> None:
     """If another program uses the loopback, the run is rejected, and that program's queue remains."""
-    kernel = Kernel(tmp_path)
-    kernel.commands = ["tc qdisc add dev lo root"]
+    interface = FakeNetemInterface(tmp_path)
+    interface.commands = ["tc qdisc add dev lo root"]
     owner = os.getppid(), start_ticks(os.getppid())
     StateFiles(tmp_path).write(AppliedState("lo", network_namespace(), boot_id(), owner, "L3", ()))
-    with pytest.raises(UserError, match="L3 on lo"), kernel, run_by(kernel, "L1"):
+    with pytest.raises(UserError, match="L3 on lo"), interface, netem_run(interface, "L1"):
         pass
-    assert kernel.commands == ["tc qdisc add dev lo root"]
+    assert interface.commands == ["tc qdisc add dev lo root"]
 
 
 def test_a_delay_that_differs_from_the_request_is_a_reason(tmp_path: Path) -> None:
     """A delay that is 3 ms longer after the drive is a reason for each flow, with the time of measurement."""
-    kernel = Kernel(tmp_path)
-    with run_by(kernel, "L1") as netem:
+    interface = FakeNetemInterface(tmp_path)
+    with netem_run(interface, "L1") as netem:
         netem.apply(video_port=40_001, control_port=40_002)
-        kernel.added_ms = 3.0
+        interface.added_ms = 3.0
         report = netem.report()
 
     assert all(reason.startswith("after the drive: ") for reason in netem_reasons(report))
     assert any("video was delayed by 78.00 ms" in reason for reason in netem_reasons(report))
-    kernel.stopped = ["video: its correlated jitter has stopped"]
+    interface.stopped = ["video: its correlated jitter has stopped"]
     assert netem_reasons(netem.report())[0].startswith("video: ")
     assert netem_reasons({**report, "read_back": ["lo has no queue of ours"]})[0] == "lo has no queue of ours"
 

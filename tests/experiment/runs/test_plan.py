@@ -20,12 +20,12 @@ def planned(**keys: Any) -> list[PlannedRun]:
 
 @pytest.fixture
 def any_route(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let tests use routes that do not exist."""
+    """Allow routes that do not exist."""
     monkeypatch.setattr(plan, "check_names", lambda *_: None)
 
 
 @pytest.mark.usefixtures("any_route")
-def test_every_combination() -> None:
+def test_a_sweep_has_every_combination() -> None:
     """A sweep has every combination of route, condition and repetition once."""
     runs = planned(routes=["a_key", "b_key"], conditions=["L0", "L3", "L5"], repetitions=4)
     combinations = {(run.identity["route"], run.identity["condition"], run.identity["repetition"]) for run in runs}
@@ -34,12 +34,12 @@ def test_every_combination() -> None:
 
 @pytest.mark.usefixtures("any_route")
 def test_seeds_are_paired() -> None:
-    """A repetition on a route has the same seed under every condition; other repetitions and routes have others."""
+    """A repetition on a route has the same seed under every condition; others have other seeds."""
     runs = planned(routes=["a_key", "b_key"], conditions=["L0", "L3", "L5"], repetitions=4, seed=9)
     seeds: dict[tuple[str, int], set[int]] = {}
     for run in runs:
         seeds.setdefault((run.identity["route"], run.identity["repetition"]), set()).add(run.seed)
-    assert {len(each) for each in seeds.values()} == {1}
+    assert {len(paired_seeds) for paired_seeds in seeds.values()} == {1}
     assert len(set.union(*seeds.values())) == len(seeds) == 8
     assert all(run.identity["seed"] == run.seed for run in runs)
 
@@ -53,9 +53,9 @@ def test_seeds_are_paired_over_axes() -> None:
 
 def test_seed_of_a_single_run() -> None:
     """A single run has the seed of the first repetition in a sweep, and another base seed changes it."""
-    alone = plan_run(RunConfig(seed=5))
-    assert alone.seed == planned(conditions=["L0"], seed=5)[0].seed
-    assert alone.seed != plan_run(RunConfig(seed=6)).seed
+    single_run = plan_run(RunConfig(seed=5))
+    assert single_run.seed == planned(conditions=["L0"], seed=5)[0].seed
+    assert single_run.seed != plan_run(RunConfig(seed=6)).seed
 
 
 AXES = {
@@ -87,7 +87,7 @@ def test_axes_change_nested_values() -> None:
     assert runs[0].config.video.gop_frames == 15
 
 
-def test_several_axes() -> None:
+def test_axes_are_combined() -> None:
     """Further axes are combined: each value of one with each value of the other."""
     runs = planned(conditions=["L0"], axes={"video.gop_frames": [15, 30], "camera.rate_hz": [20.0, 30.0]})
     values = {(run.config.video.gop_frames, run.config.camera.rate_hz) for run in runs}

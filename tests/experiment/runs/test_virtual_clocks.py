@@ -22,14 +22,16 @@ from lavt.runtime.virtual import HostClock, VirtualHost, modelled_clock_source
 from lavt.transport.clock_sync.clock_report import ClockReport, unknown_clock
 
 Change = Callable[[VirtualLoop], None]
-APART = ("clocks.offset_ms=250.0", "clocks.drift_ppm=30.0")
+CLOCK_ERRORS = ("clocks.offset_ms=250.0", "clocks.drift_ppm=30.0")
 
 
 def drive_with(
     out: Path, *changes: str, change: Change = lambda _: None
 ) -> tuple[RunMeasurement, dict[str, Any], HostClock]:
     """Drive without pixels; return the measurement, `result.json`, and the server's clock (the client's is true)."""
-    planned = plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), ("fidelity=geometry", *APART, *changes)))
+    planned = plan_run(
+        load_config(RunConfig, shipped("configs/demo.yaml"), ("fidelity=geometry", *CLOCK_ERRORS, *changes))
+    )
     loop = build_loop(planned, out)
     change(loop)
     drive(loop)
@@ -45,8 +47,8 @@ def errors_ms(measured: RunMeasurement, offset: ClockOffset | None, server: Host
     client_wall_ns = np.arange(began_ns, ended_ns, 10 * NS_PER_MS)
     true_ns = client_wall_ns - server.wall_start_ns
     truth_ns = np.array([server.at(true).wall_ns for true in true_ns.tolist()]) - client_wall_ns
-    wrong_ns = np.abs(offset.at(client_wall_ns) - truth_ns)
-    return wrong_ns / NS_PER_MS, offset.bound_at(client_wall_ns) / NS_PER_MS
+    delta_error_ns = np.abs(offset.at(client_wall_ns) - truth_ns)
+    return delta_error_ns / NS_PER_MS, offset.bound_at(client_wall_ns) / NS_PER_MS
 
 
 def remove_time_sources(loop: VirtualLoop) -> None:
@@ -64,9 +66,9 @@ def test_both_estimates_are_within_their_bounds(tmp_path: Path) -> None:
     """With a server clock 250 ms ahead that drifts by 30 ppm, both clock estimates are within their bounds."""
     measured, result, server = drive_with(tmp_path / "run")
     for offset in (measured.clocks.offset, measured.clocks.probe):
-        wrong_ms, bound_ms = errors_ms(measured, offset, server)
-        assert (wrong_ms <= bound_ms).all()
-        assert wrong_ms.max() < 1.0
+        delta_error_ms, bound_ms = errors_ms(measured, offset, server)
+        assert (delta_error_ms <= bound_ms).all()
+        assert delta_error_ms.max() < 1.0
         assert bound_ms.max() < 2.0
     delta = result["delta"]
     assert delta["source"] == "model"
@@ -80,8 +82,8 @@ def test_the_probe_alone_with_injected_delay(tmp_path: Path) -> None:
     """Without time sources and with 100 ms on control, the probe's Delta is within its bound, and tau is correct."""
     _, with_sources, _ = drive_with(tmp_path / "sources", "network.condition=L5")
     measured, result, server = drive_with(tmp_path / "probe", "network.condition=L5", change=remove_time_sources)
-    wrong_ms, bound_ms = errors_ms(measured, measured.clocks.offset, server)
-    assert (wrong_ms <= bound_ms).all()
+    delta_error_ms, bound_ms = errors_ms(measured, measured.clocks.offset, server)
+    assert (delta_error_ms <= bound_ms).all()
     assert bound_ms.max() <= 2.0
     assert result["delta"]["source"] == "probe"
     assert result["valid"], result["invalid_reasons"]
@@ -90,7 +92,7 @@ def test_the_probe_alone_with_injected_delay(tmp_path: Path) -> None:
 
 
 def test_a_wrong_time_source_is_contradicted_by_the_probe(tmp_path: Path) -> None:
-    """A chrony behind 75 ms in one direction is wrong by half of it and contradicts the probe: the run is invalid."""
+    """A chrony with 75 ms of delay in one direction is wrong by half of it; the probe contradicts it: invalid."""
 
     def use_wrong_source(loop: VirtualLoop) -> None:
         host = loop.runtime.hosts["client"]
@@ -114,13 +116,13 @@ def test_a_probe_without_answers_makes_the_run_invalid(tmp_path: Path) -> None:
     assert (result["delta"]["probe_ms"], result["delta"]["probe_bound_ms"]) == (None, None)
 
 
-@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("has_time_sources", [True, False])
 @pytest.mark.parametrize("side", ["client", "server"])
-def test_a_clock_step_has_one_reason(tmp_path: Path, side: str, known: bool) -> None:
-    """A wall clock set by 1 s during the drive is the only reason against the run, with and without time sources."""
+def test_a_clock_step_has_one_reason(tmp_path: Path, side: str, has_time_sources: bool) -> None:
+    """A wall clock set by 1 s during the drive is the only reason of the invalid run, with and without time sources."""
 
     def step(loop: VirtualLoop) -> None:
-        if not known:
+        if not has_time_sources:
             remove_time_sources(loop)
         loop.runtime.hosts[side].clock.steps = [(10 * NS_PER_S, NS_PER_S)]
 

@@ -18,7 +18,7 @@ from lavt.experiment.runs.virtual_run import build_loop, drive
 from lavt.recording.record import read_record
 from lavt.recording.table import MISSING
 
-MORE = sorted(set(conditions()) - {"L0", "L1", "L2", "L3", "L4", "L5"})
+OTHER_CONDITIONS = sorted(set(conditions()) - {"L0", "L1", "L2", "L3", "L4", "L5"})
 
 
 def all_but_one_full(names: list[str], quick: str) -> list[Any]:
@@ -26,9 +26,9 @@ def all_but_one_full(names: list[str], quick: str) -> list[Any]:
     return [name if name == quick else pytest.param(name, marks=pytest.mark.full) for name in names]
 
 
-def driven(out: Path, *changes: str) -> dict[str, Any]:
-    given = ("vehicle.scenery=none", "record.video=false", *changes)
-    return run_once(plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), given)), out)
+def drive_run(out: Path, *further_changes: str) -> dict[str, Any]:
+    changes = ("vehicle.scenery=none", "record.video=false", *further_changes)
+    return run_once(plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), changes)), out)
 
 
 def link_counts(side: Path) -> dict[str, dict[str, int]]:
@@ -45,24 +45,24 @@ def link_counts(side: Path) -> dict[str, dict[str, int]]:
 
 def test_a_constant_delay_has_no_link_counters(tmp_path: Path) -> None:
     """With a constant delay only, the record has no counters of links."""
-    driven(tmp_path / "run", "fidelity=geometry", "network.condition=L4", "vehicle.time_limit_s=2")
+    drive_run(tmp_path / "run", "fidelity=geometry", "network.condition=L4", "vehicle.time_limit_s=2")
     assert link_counts(tmp_path / "run/server.mcap") == link_counts(tmp_path / "run/client.mcap") == {}
 
 
-@pytest.mark.parametrize("name", all_but_one_full(MORE, "loss_burst"))
+@pytest.mark.parametrize("name", all_but_one_full(OTHER_CONDITIONS, "loss_burst"))
 def test_every_condition_is_driven_reproducibly(name: str, tmp_path: Path) -> None:
     """Without pixels, every condition is completed in a valid run, with a reproducible digest."""
     changes = ("fidelity=geometry", f"network.condition={name}")
-    result, again = driven(tmp_path / "run", *changes), driven(tmp_path / "again", *changes)
+    result, repeated = drive_run(tmp_path / "run", *changes), drive_run(tmp_path / "again", *changes)
     assert (result["ending"], result["valid"], result["invalid_reasons"]) == ("completed", True, [])
-    assert result["digest"] == again["digest"]
-    other = driven(tmp_path / "other", *changes, "seed=2", "vehicle.time_limit_s=2")
+    assert result["digest"] == repeated["digest"]
+    other = drive_run(tmp_path / "other", *changes, "seed=2", "vehicle.time_limit_s=2")
     assert other["digest"] != result["digest"]
 
 
 def test_lost_packets_are_counted_and_missing(tmp_path: Path) -> None:
     """The sender's record has the number of lost packets, and the receiver's record lacks as many."""
-    driven(tmp_path / "run", "fidelity=pixels", "vehicle.time_limit_s=10", "network.condition=loss")
+    drive_run(tmp_path / "run", "fidelity=pixels", "vehicle.time_limit_s=10", "network.condition=loss")
     server, client = (read_record(tmp_path / f"run/{side}.mcap") for side in ("server", "client"))
     video = link_counts(tmp_path / "run/server.mcap")["link rtp"]
     control = link_counts(tmp_path / "run/client.mcap")["link control"]
@@ -74,11 +74,11 @@ def test_lost_packets_are_counted_and_missing(tmp_path: Path) -> None:
         assert 0 <= sent - counts["lost"] - received <= 10  # the others were in transit at the end
 
 
-@pytest.mark.parametrize("name", all_but_one_full(MORE, "reorder"))
+@pytest.mark.parametrize("name", all_but_one_full(OTHER_CONDITIONS, "reorder"))
 def test_video_under_every_condition(name: str, tmp_path: Path) -> None:
     """Real video passes a link under every condition, and the link's counters show its impairment."""
-    given = ("vehicle.scenery=none", "record.video=false", f"network.condition={name}")
-    planned = plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), given))
+    changes = ("vehicle.scenery=none", "record.video=false", f"network.condition={name}")
+    planned = plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), changes))
     loop = build_loop(planned, tmp_path / "run")
     drive(loop, limit_ns=4 * NS_PER_S)
     counts = link_counts(tmp_path / "run/server.mcap")["link rtp"]
@@ -91,8 +91,8 @@ def test_video_under_every_condition(name: str, tmp_path: Path) -> None:
 def test_a_trace_has_no_constant_delay_and_a_recorded_digest(tmp_path: Path) -> None:
     """The injected delay of a trace is null, and the record has the digest of every trace."""
     (tmp_path / "mine.csv").write_text("time_s,delay_ms\n0,20\n60,80\n")
-    given = (f"network.video.trace={tmp_path / 'mine.csv'}", "network.control.trace=fading.mahimahi")
-    planned = plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), (*given, "fidelity=geometry")))
+    changes = (f"network.video.trace={tmp_path / 'mine.csv'}", "network.control.trace=fading.mahimahi")
+    planned = plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), (*changes, "fidelity=geometry")))
     assert planned.identity["injected_ms"] == {"video": None, "control": 0.0}
     assert planned.identity["injected_least_ms"] == {"video": 0.0, "control": 0.0}
     result = run_once(planned, tmp_path / "run")
@@ -106,7 +106,7 @@ def test_a_trace_has_no_constant_delay_and_a_recorded_digest(tmp_path: Path) -> 
 
 def test_a_slow_link_ends_the_drive_in_a_valid_run(tmp_path: Path) -> None:
     """A queue of several seconds ends the drive by its frame age, and the run is valid."""
-    result = driven(tmp_path / "run", "network.condition=rate")
+    result = drive_run(tmp_path / "run", "network.condition=rate")
     assert (result["ending"], result["valid"], result["invalid_reasons"]) == ("safe_stop", True, [])
     assert result["loop_ms"]["p50"] > 1000
 

@@ -28,8 +28,8 @@ from lavt.streams import stream
 from lavt.transport.clock_sync.clock_report import ClockReport
 from lavt.vehicle.camera import CapturedFrame
 
-BARE = "vehicle.scenery=none"
-GREY_FROM_FRAME = 240  # 8 s: the car has 30 km/h and is about to enter the curve
+NO_SCENERY = "vehicle.scenery=none"
+GREY_FROM_FRAME = 240  # 8 s: the car drives at 30 km/h and is about to enter the curve
 
 Change = Callable[[VirtualLoop], None]
 
@@ -52,15 +52,15 @@ def records(out: Path) -> tuple[Record, Record]:
     return read_record(out / "server.mcap"), read_record(out / "client.mcap")
 
 
-def with_pictures(change: Callable[[int, Picture], Picture]) -> Change:
+def changing_pictures(change: Callable[[int, Picture], Picture]) -> Change:
     """Change the camera's pictures by a function of (frame number, picture)."""
 
     def install(loop: VirtualLoop) -> None:
         node = loop.server.camera
-        take = node._expose
+        original_expose = node._expose
 
         def expose(number: int, begin_ns: int, poses: Sequence[Pose]) -> CapturedFrame | None:
-            frame = take(number, begin_ns, poses)
+            frame = original_expose(number, begin_ns, poses)
             return None if frame is None else replace(frame, picture=change(number, frame.picture))
 
         node._expose = expose
@@ -120,9 +120,9 @@ def test_ignoring_the_clock_offset_makes_latencies_wrong(tmp_path: Path) -> None
             )
 
     out = tmp_path / "run"
-    run(out, planned(BARE), change=ignore_offset, seconds=5)
+    run(out, planned(NO_SCENERY), change=ignore_offset, seconds=5)
     entry = measure(*records(out)).entry
-    video_ms, control_ms = true_latencies_ms(planned(BARE))
+    video_ms, control_ms = true_latencies_ms(planned(NO_SCENERY))
     assert entry["tau_v_ms"]["p50"] == pytest.approx(video_ms - 250, abs=1)
     assert entry["tau_c_ms"]["p50"] == pytest.approx(control_ms + 250, abs=1)
     assert entry["loop_ms"]["p50"] == pytest.approx(video_ms + control_ms, abs=20)  # independent of the clock offset
@@ -131,7 +131,7 @@ def test_ignoring_the_clock_offset_makes_latencies_wrong(tmp_path: Path) -> None
 def test_the_injected_delay_is_measured(l0: Path, tmp_path: Path) -> None:
     """The medians of tau_v, tau_c and the loop latency at L5 are those at L0 plus the injected delay."""
     out = tmp_path / "l5"
-    run(out, planned(BARE, "network.condition=L5"), seconds=8)
+    run(out, planned(NO_SCENERY, "network.condition=L5"), seconds=8)
     before, after = measure(*records(l0)).entry, measure(*records(out)).entry
     for name, injected_ms in (("tau_v_ms", 225.0), ("tau_c_ms", 100.0), ("loop_ms", 325.0)):
         assert after[name]["p50"] - before[name]["p50"] == pytest.approx(injected_ms, abs=0.5), name
@@ -141,7 +141,7 @@ def test_the_injected_delay_is_measured(l0: Path, tmp_path: Path) -> None:
 def test_the_inherent_profile_has_the_papers_median_and_p95(tmp_path: Path) -> None:
     """With `paper_wifi5`, tau_v has the paper's median of 62 and P95 of 86 ms, and tau_c is 9 ms."""
     out = tmp_path / "run"
-    run(out, planned(BARE, "network.inherent=paper_wifi5"), seconds=30)
+    run(out, planned(NO_SCENERY, "network.inherent=paper_wifi5"), seconds=30)
     entry = measure(*records(out)).entry
     assert entry["tau_v_ms"]["p50"] == pytest.approx(62, abs=2)
     assert entry["tau_v_ms"]["p95"] == pytest.approx(86, abs=8)
@@ -150,7 +150,7 @@ def test_the_inherent_profile_has_the_papers_median_and_p95(tmp_path: Path) -> N
 
 # Reproducibility: digests.
 
-DIGEST = """
+DIGEST_PROGRAM = """
 import sys
 from pathlib import Path
 import cv2
@@ -166,7 +166,7 @@ print(loop.digest.hexdigest())
 
 
 def digest(out: Path, *changes: str, change: Change = lambda _: None) -> str:
-    digest: str = run(out, planned(BARE, *changes), change=change, seconds=3).digest.hexdigest()
+    digest: str = run(out, planned(NO_SCENERY, *changes), change=change, seconds=3).digest.hexdigest()
     return digest
 
 
@@ -178,11 +178,11 @@ def flip_a_pixel(number: int, picture: Picture) -> Picture:
 
 def flip_a_bit_of_a_command(loop: VirtualLoop) -> None:
     line = loop.runtime.links["control"].line
-    push, counted = line.push, iter(range(10**9))
+    push, numbers = line.push, iter(range(10**9))
 
     def flip(item: tuple[bytes, Any], now_ns: int, index: int, size_bytes: int = 0) -> int | None:
         payload, peer = item
-        if next(counted) == 50:
+        if next(numbers) == 50:
             payload = payload[:-12] + bytes([payload[-12] ^ 1]) + payload[-11:]
         return push((payload, peer), now_ns, index, size_bytes)
 
@@ -194,7 +194,7 @@ def test_the_digest_is_reproducible_and_sensitive(tmp_path: Path) -> None:
     digests = [
         digest(tmp_path / "first"),
         digest(tmp_path / "seed", "seed=2"),
-        digest(tmp_path / "pixel", change=with_pictures(flip_a_pixel)),
+        digest(tmp_path / "pixel", change=changing_pictures(flip_a_pixel)),
         digest(tmp_path / "bit", change=flip_a_bit_of_a_command),
     ]
     assert len(set(digests)) == 4
@@ -207,14 +207,14 @@ def test_the_digest_does_not_depend_on_the_hash_seed(tmp_path: Path) -> None:
     digests = set()
     for hash_seed in ("1", "2"):
         (tmp_path / hash_seed).mkdir()
-        done = subprocess.run(
-            [sys.executable, "-c", DIGEST, str(tmp_path / hash_seed)],
+        completed = subprocess.run(
+            [sys.executable, "-c", DIGEST_PROGRAM, str(tmp_path / hash_seed)],
             env={**os.environ, "PYTHONHASHSEED": hash_seed},
             capture_output=True,
             text=True,
             check=True,
         )
-        digests.add(done.stdout.strip())
+        digests.add(completed.stdout.strip())
     assert len(digests) == 1
 
 
@@ -231,7 +231,7 @@ def grey(number: int, picture: Picture) -> Picture:
     return picture if number < GREY_FROM_FRAME else np.full_like(picture, 128)
 
 
-def mirrored(_number: int, picture: Picture) -> Picture:
+def mirror(_number: int, picture: Picture) -> Picture:
     return np.ascontiguousarray(picture[:, ::-1])
 
 
@@ -239,7 +239,7 @@ def mirrored(_number: int, picture: Picture) -> Picture:
 def test_grey_pictures_stop_the_car(tmp_path: Path, change: Callable[[int, Picture], Picture]) -> None:
     """Grey pictures, noisy or constant, lead to a safe stop within 3 s."""
     out = tmp_path / "run"
-    run(out, planned(BARE), change=with_pictures(change), seconds=60)
+    run(out, planned(NO_SCENERY), change=changing_pictures(change), seconds=60)
     server, _ = records(out)
     frames = server.table("frame")
     grey_ns = int(frames.ints("stamped_mono_ns")[frames.ints("number") == GREY_FROM_FRAME][0])
@@ -257,7 +257,7 @@ def test_grey_pictures_stop_the_car(tmp_path: Path, change: Callable[[int, Pictu
 def test_mirrored_pictures_make_the_car_leave_its_lane(tmp_path: Path) -> None:
     """Mirrored pictures make the car leave its lane: the controller depends on the pictures."""
     out = tmp_path / "run"
-    run(out, planned(BARE), change=with_pictures(mirrored), seconds=60)
+    run(out, planned(NO_SCENERY), change=changing_pictures(mirror), seconds=60)
     entry = measure(*records(out)).entry
     assert entry["ending"] != "completed"
     assert entry["lane_invasions"] > 0
@@ -270,7 +270,7 @@ def test_a_lost_vehicle_state_stops_the_car(tmp_path: Path) -> None:
         loop.runtime.at(8 * NS_PER_S, lambda: setattr(loop.runtime.links["state"], "open", False))
 
     out = tmp_path / "run"
-    run(out, planned(BARE), change=lose_the_state, seconds=60)
+    run(out, planned(NO_SCENERY), change=lose_the_state, seconds=60)
     entry = measure(*records(out)).entry
     assert entry["ending"] == "safe_stop"
     assert entry["duration_s"] < 11
@@ -294,16 +294,16 @@ def test_a_step_of_the_wall_clock_changes_no_safety_state(tmp_path: Path, side: 
 
     run(out, config, change=follow, clocks=clocks)
     server, client = records(out)
-    safety = [
+    safety_changes = [
         detail
         for kind, detail in zip(server.table("event").texts("kind"), server.table("event").texts("detail"), strict=True)
         if kind == "safety"
     ]
-    assert [each.split(":")[0] for each in safety] == [
+    assert [detail.split(":")[0] for detail in safety_changes] == [
         "disarmed -> arming",
         "arming -> driving",
         "driving -> safe_stop",  # the route is completed
     ]
     result = run_result(config.identity, server, client)
     assert result["ending"] == "completed"
-    assert [each for each in result["invalid_reasons"] if "stepped" in each]
+    assert [reason for reason in result["invalid_reasons"] if "stepped" in reason]

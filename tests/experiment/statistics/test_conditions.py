@@ -9,16 +9,16 @@ def run(by_10m: list[float] | None = None, **changes: Any) -> dict[str, Any]:
     return {"route": "a", "repetition": 0, "seed": 1, "valid": True, "p95_by_10m": by_10m, **changes}
 
 
-def ended(ending: str, p95_m: float | None) -> dict[str, Any]:
+def run_with_ending(ending: str, p95_m: float | None) -> dict[str, Any]:
     return {"ending": ending, "p95_m": p95_m}
 
 
 def test_runs_are_compared_over_their_common_distance() -> None:
     """For valid runs of 30 and 20 m and an invalid one of 10 m, P95 up to 20 m is used."""
-    far, near, invalid = run([0.1, 0.2, 9.0]), run([0.5, 0.6]), run([0.0], valid=False)
-    distances = common_distances([far, near, invalid])
-    assert common_p95_m([far], distances) == [0.2]
-    assert common_p95_m([near], distances) == [0.6]
+    long_run, short_run, invalid_run = run([0.1, 0.2, 9.0]), run([0.5, 0.6]), run([0.0], valid=False)
+    distances = common_distances([long_run, short_run, invalid_run])
+    assert common_p95_m([long_run], distances) == [0.2]
+    assert common_p95_m([short_run], distances) == [0.6]
 
 
 def test_each_repetition_has_its_own_common_distance() -> None:
@@ -36,15 +36,15 @@ def test_repetitions_with_under_ten_metres_are_left_out() -> None:
 
 def test_runs_not_completed_rank_last() -> None:
     """With three of five runs completed, the quartiles are the second, the third, and null."""
-    runs = [ended("completed", error_m) for error_m in (3.0, 1.0, 2.0)]
-    runs += [ended("collision", 0.1), ended("timeout", 0.1)]
+    runs = [run_with_ending("completed", error_m) for error_m in (3.0, 1.0, 2.0)]
+    runs += [run_with_ending("collision", 0.1), run_with_ending("timeout", 0.1)]
     assert worst_rank_m(runs) == {"p25": 2.0, "p50": 3.0, "p75": None}
 
 
 def test_worst_ranks_of_few_runs() -> None:
     """One completed run is every quartile; without runs, or without a known error, the quartiles are null."""
-    nothing = {"p25": None, "p50": None, "p75": None}
-    assert worst_rank_m([ended("completed", 1.5)]) == {"p25": 1.5, "p50": 1.5, "p75": 1.5}
-    assert worst_rank_m([ended("collision", 1.5)]) == nothing
-    assert worst_rank_m([ended("completed", None)]) == nothing
-    assert worst_rank_m([]) == nothing
+    no_quartiles = {"p25": None, "p50": None, "p75": None}
+    assert worst_rank_m([run_with_ending("completed", 1.5)]) == {"p25": 1.5, "p50": 1.5, "p75": 1.5}
+    assert worst_rank_m([run_with_ending("collision", 1.5)]) == no_quartiles
+    assert worst_rank_m([run_with_ending("completed", None)]) == no_quartiles
+    assert worst_rank_m([]) == no_quartiles

@@ -18,22 +18,22 @@ def runs(condition: str, endings: str, **changes: Any) -> list[dict[str, Any]]:
             "repetition": index,
             "seed": 100 + index,
             "valid": True,
-            "ending": endings_of[each],
+            "ending": endings_of[letter],
             **changes,
         }
-        for index, each in enumerate(endings)
+        for index, letter in enumerate(endings)
     ]
 
 
 def test_mcnemars_p_value() -> None:
-    """Five pairs that differ one way give p = 2 / 2^5, three against one 10 / 16, and none 1."""
+    """If 5 pairs differ in the same way, p is 2 / 2^5; for 3 against 1 it is 10 / 16, and for no such pair 1."""
     assert mcnemar(5, 0) == pytest.approx(0.0625)
     assert mcnemar(3, 1) == pytest.approx(0.625)
     assert mcnemar(0, 0) == 1.0
 
 
 def test_fishers_p_value() -> None:
-    """Two of two against none of two gives p = 1 / 3."""
+    """For two of two successes against none of two, p is 1 / 3."""
     assert fisher(2, 2, 0, 2) == pytest.approx(1 / 3)
 
 
@@ -46,9 +46,9 @@ def test_a_contrast_pairs_runs_of_one_route_repetition_and_seed() -> None:
 
 
 def test_holms_correction_is_over_all_contrasts() -> None:
-    """Of two contrasts with p = 0.0625 and 1 the first is doubled; a condition that was not driven has none."""
+    """Of two p values, 0.0625 and 1, the smaller is doubled; a condition that was not driven has no contrast."""
     contrasts = paired_contrasts([*runs("L0", "ccccc"), *runs("L1", "ccccc"), *runs("L2", "xxxxx")])
-    assert [(each["a"], each["b"], each["p_holm"]) for each in contrasts] == [
+    assert [(contrast["a"], contrast["b"], contrast["p_holm"]) for contrast in contrasts] == [
         ("L0", "L1", 1.0),
         ("L1", "L2", pytest.approx(0.125)),
     ]
@@ -57,16 +57,16 @@ def test_holms_correction_is_over_all_contrasts() -> None:
 def test_runs_without_a_partner_are_ignored() -> None:
     """Invalid runs, other seeds, and runs with equal keys form no pairs; without pairs, p is null."""
     invalid = paired_contrasts([*runs("L0", "cc"), *runs("L1", "xx", valid=False)])
-    seeds = paired_contrasts([*runs("L0", "cc"), *runs("L1", "xx", seed=1)])
-    alike = paired_contrasts([*runs("L0", "cc"), *runs("L0", "xx"), *runs("L1", "xx")])
-    for contrasts in (invalid, seeds, alike):
-        assert [(each["pairs"], each["p"], each["p_holm"]) for each in contrasts] == [(0, None, None)]
+    other_seeds = paired_contrasts([*runs("L0", "cc"), *runs("L1", "xx", seed=1)])
+    equal_keys = paired_contrasts([*runs("L0", "cc"), *runs("L0", "xx"), *runs("L1", "xx")])
+    for contrasts in (invalid, other_seeds, equal_keys):
+        assert [(contrast["pairs"], contrast["p"], contrast["p_holm"]) for contrast in contrasts] == [(0, None, None)]
     assert paired_contrasts([]) == []
 
 
 def test_contrasts_of_the_papers_counts() -> None:
     """By Fisher's test, L1 and L2 differ; L3 and L4, of equal total delay, do not, nor do L2 and L3."""
-    contrasts = {(each["a"], each["b"]): each for each in paper()["contrasts"]}
+    contrasts = {(contrast["a"], contrast["b"]): contrast for contrast in paper()["contrasts"]}
     assert len(contrasts) == 6
     assert contrasts["L1", "L2"]["p"] == pytest.approx(0.00037, abs=5e-6)
     assert contrasts["L1", "L2"]["p_holm"] == pytest.approx(6 * contrasts["L1", "L2"]["p"])

@@ -14,19 +14,19 @@ from lavt.experiment.statistics.intervals import bootstrap_interval, exact_inter
     ("successes", "low", "high"), [(30, 0.025 ** (1 / 30), 1.0), (15, 0.3130, 0.6870), (0, 0.0, 1 - 0.025 ** (1 / 30))]
 )
 def test_the_interval_of_thirty_runs_is_exact(successes: int, low: float, high: float) -> None:
-    """The interval of 30 and 0 of 30 is the closed form of Clopper and Pearson, that of 15 the published one."""
+    """For 30 and 0 of 30 runs the interval has Clopper and Pearson's closed form; for 15 it is the published one."""
     assert exact_interval(successes, 30) == pytest.approx([low, high], abs=5e-5)
 
 
-def completed(probabilities: Sequence[float], runs: Sequence[int]) -> np.ndarray:
-    """Return the probability of each number of completed runs, over routes with these probabilities."""
-    chances = np.ones(1)
+def completion_distribution(probabilities: Sequence[float], runs: Sequence[int]) -> np.ndarray:
+    """Return the probability of each total number of completed runs; each route has a probability and a count."""
+    distribution = np.ones(1)
     for probability, count in zip(probabilities, runs, strict=True):
-        chances = np.convolve(chances, binom.pmf(np.arange(count + 1), count, probability))
-    return chances
+        distribution = np.convolve(distribution, binom.pmf(np.arange(count + 1), count, probability))
+    return distribution
 
 
-ROUTES = [
+ROUTE_PROBABILITIES = [
     (1.0, 1.0, 0.0, 1.0, 1.0, 1.0),
     (0.9, 0.9, 0.1, 0.9, 0.9, 0.9),
     (0.5,) * 6,
@@ -37,13 +37,13 @@ ROUTES = [
 ]
 
 
-@pytest.mark.parametrize("probabilities", ROUTES)
+@pytest.mark.parametrize("probabilities", ROUTE_PROBABILITIES)
 @pytest.mark.parametrize("runs", [(5,) * 6, (1,) * 6, (5, 5, 4, 5, 3, 5), (2, 20, 1, 1, 1, 5)])
 def test_the_pooled_interval_covers_the_mean_over_routes(probabilities: Sequence[float], runs: Sequence[int]) -> None:
     """For any routes, the interval includes the runs' mean probability in at least 95 % of experiments."""
     mean = float(np.dot(probabilities, runs)) / sum(runs)
     covered = 0.0
-    for count, chance in enumerate(completed(probabilities, runs)):
+    for count, chance in enumerate(completion_distribution(probabilities, runs)):
         low, high = exact_interval(count, sum(runs)) or [1.0, 0.0]
         covered += chance * (low <= mean + 1e-12 and mean - 1e-12 <= high)
     assert covered >= 0.95
@@ -55,10 +55,10 @@ def test_the_pooled_interval_covers_any_three_routes() -> None:
     intervals = [exact_interval(count, 15) or [1.0, 0.0] for count in range(16)]
     for probabilities in itertools.combinations_with_replacement(grid.tolist(), 3):
         mean = sum(probabilities) / 3
-        chances = completed(probabilities, (5, 5, 5))
+        distribution = completion_distribution(probabilities, (5, 5, 5))
         covered = sum(
             chance
-            for chance, (low, high) in zip(chances, intervals, strict=True)
+            for chance, (low, high) in zip(distribution, intervals, strict=True)
             if low - 1e-12 <= mean <= high + 1e-12
         )
         assert covered >= 0.95, probabilities
@@ -72,7 +72,7 @@ def test_intervals_of_too_few_values_are_null() -> None:
 
 
 def test_the_bootstrap_is_reproducible_and_accurate() -> None:
-    """The bootstrap interval is reproducible, and for 100 equal steps it is 1.96 standard errors to a tenth."""
+    """The interval is reproducible; for 100 evenly spaced values it is the mean +- 1.96 standard errors within 10 %."""
     values = [index / 99 for index in range(100)]
     interval = bootstrap_interval(values)
     assert interval == bootstrap_interval(values)
@@ -82,13 +82,13 @@ def test_the_bootstrap_is_reproducible_and_accurate() -> None:
 
 
 def test_the_bootstrap_of_three_is_their_range() -> None:
-    """One in 27 resamples of three values is three times the smallest: the 95 % interval is their range."""
+    """The 95 % interval of three values is their range: 1 in 27 resamples is the smallest value three times."""
     assert bootstrap_interval([0.2, 1.0, 0.6]) == pytest.approx([0.2, 1.0])
     assert bootstrap_interval([1.0, 1.0, 1.0]) == [1.0, 1.0]
 
 
 def test_holms_correction() -> None:
-    """0.01, 0.04, 0.03 become 0.03, 0.06, 0.06: the smallest times 3, the next times 2, none below the one before."""
+    """The smallest p value is multiplied by 3, the next by 2 and the largest by 1; none is below the one before it."""
     assert holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
 
 

@@ -81,8 +81,8 @@ def test_conditions_are_of_the_base_config_and_groups_of_every_combination() -> 
     assert all(group["conditions"]["L0"]["runs"] == 1 for group in summary["groups"])
 
 
-def grid(*, condition: str = "L0", bad_route: str | None = None, **changes: Any) -> list[dict[str, Any]]:
-    """Return six routes with five repetitions each, whose runs on `bad_route` ended early."""
+def campaign(*, condition: str = "L0", bad_route: str | None = None, **changes: Any) -> list[dict[str, Any]]:
+    """Return 30 runs, five on each of six routes; those on `bad_route` ended early."""
     return [
         run(condition=condition, route=route, repetition=repetition, seed=f"{route}{repetition}", **changes)
         | ({"ending": "safe_stop", "distance_m": 100.0 + repetition} if route == bad_route else {})
@@ -92,8 +92,8 @@ def grid(*, condition: str = "L0", bad_route: str | None = None, **changes: Any)
 
 
 def test_completion_by_route_and_for_such_roads() -> None:
-    """With one of six routes never completed, it is 25 of 30, 0 to 52 % on that one, and 50 to 100 % for such roads."""
-    condition = summarize(grid(bad_route="b"), SPEED)["conditions"]["L0"]
+    """If one of six routes is never completed, 25 of 30 runs are; that route has 0 to 52 %, such roads 50 to 100 %."""
+    condition = summarize(campaign(bad_route="b"), SPEED)["conditions"]["L0"]
     assert condition["endings"] == {"completed": 25, "safe_stop": 5}
     assert condition["completion_interval"] == exact_interval(25, 30)
     assert condition["completion_such_roads"] == [0.5, 1.0]
@@ -111,15 +111,15 @@ def test_completion_by_route_and_for_such_roads() -> None:
 
 
 @pytest.mark.parametrize("suffix", ["", ".yaml", ".yml"])
-def test_a_road_and_its_key_part_are_one(suffix: str) -> None:
-    """A route and the one with the suffix _key are one road, by name and by path."""
+def test_a_route_and_its_key_route_are_one_road(suffix: str) -> None:
+    """Two routes whose names differ by the suffix _key are one road, for names and for paths."""
     runs = [run(route=f"roads/my{suffix}"), run(route=f"roads/my_key{suffix}", ending="collision"), run(route="b")]
     assert road_rates(runs) == [1.0, 0.5]
 
 
 def test_one_road_has_no_interval_for_such_roads() -> None:
-    """A route and its key part are one road, from which nothing follows for others."""
-    runs = [each for each in grid() if each["route"] in {"a", "a_key"}]
+    """A route and its key route are one road, and from one road nothing follows for other roads."""
+    runs = [entry for entry in campaign() if entry["route"] in {"a", "a_key"}]
     assert summarize(runs, SPEED)["conditions"]["L0"]["completion_such_roads"] is None
 
 
@@ -157,11 +157,11 @@ def test_missing_values_are_left_out() -> None:
     assert condition["picture_age_ms"] == {"mean": 90.0, "p95": 99.0}
 
 
-def test_the_three_tracking_errors() -> None:
+def test_the_three_summaries_of_tracking_error() -> None:
     """P95 is given over completed runs, over the common distance, and with incomplete runs ranking last."""
     runs = [
-        *grid(p95_m=2.0, p95_by_10m=[0.1, 0.2, 0.3]),
-        *grid(condition="L1", bad_route="b", p95_m=4.0, p95_by_10m=[0.5, 0.6]),
+        *campaign(p95_m=2.0, p95_by_10m=[0.1, 0.2, 0.3]),
+        *campaign(condition="L1", bad_route="b", p95_m=4.0, p95_by_10m=[0.5, 0.6]),
     ]
     conditions = summarize(runs, SPEED)["conditions"]
     assert (conditions["L0"]["p95_m"], conditions["L1"]["p95_m"]) == (2.0, 4.0)
@@ -174,12 +174,12 @@ def test_the_three_tracking_errors() -> None:
 def test_groups_have_contrasts_of_their_own() -> None:
     """Runs are paired within a group only; the base config's contrasts are those of its group."""
     runs = [
-        each
+        entry
         for speed, bad in ((20, None), (30, "b"))
-        for each in (*grid(axes={"speed": speed}), *grid(condition="L1", bad_route=bad, axes={"speed": speed}))
+        for entry in (*campaign(axes={"speed": speed}), *campaign(condition="L1", bad_route=bad, axes={"speed": speed}))
     ]
     summary = summarize(runs, SPEED, base={"speed": 30})
-    pairs = [(each["contrasts"][0]["pairs"], each["contrasts"][0]["p"]) for each in summary["groups"]]
+    pairs = [(group["contrasts"][0]["pairs"], group["contrasts"][0]["p"]) for group in summary["groups"]]
     assert pairs == [(30, 1.0), (30, pytest.approx(0.0625))]
     assert summary["contrasts"] == summary["groups"][1]["contrasts"]
 

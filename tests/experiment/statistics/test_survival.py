@@ -13,7 +13,7 @@ def run(distance_m: float | None, ending: str, length_m: float | None = 100.0) -
 
 
 def test_survival_of_five_runs() -> None:
-    """With two of five runs ending at 30 and 60 m, the shares 1, 4/5, 3/5 survive, with exact intervals."""
+    """If two of five runs end at 30 and 60 m, the surviving shares are 1, 4/5 and 3/5, with exact intervals."""
     curve = survival(
         [run(60.0, "safe_stop"), run(99.6, "completed"), run(30.0, "collision"), *[run(99.0, "completed")] * 2]
     )
@@ -21,8 +21,8 @@ def test_survival_of_five_runs() -> None:
     assert curve["distance_m"] == [0.0, 30.0, 60.0, 100.0]
     assert curve["surviving"] == pytest.approx([1.0, 0.8, 0.6, 0.6])
     assert curve["incidence"] == {"collision": [0.0, 0.2, 0.2, 0.2], "safe_stop": [0.0, 0.0, 0.2, 0.2]}
-    bands = [exact_interval(count, 5) for count in (5, 4, 3, 3)]
-    assert list(zip(curve["low"], curve["high"], strict=True)) == [tuple(band or ()) for band in bands]
+    intervals = [exact_interval(count, 5) for count in (5, 4, 3, 3)]
+    assert list(zip(curve["low"], curve["high"], strict=True)) == [tuple(interval or ()) for interval in intervals]
 
 
 def test_survival_and_incidence_add_up_to_all_runs() -> None:
@@ -30,10 +30,10 @@ def test_survival_and_incidence_add_up_to_all_runs() -> None:
     curve = survival([run(10.0, "collision"), run(10.0, "off_road"), run(20.0, "timeout"), run(100.0, "completed")])
     assert curve is not None
     for index, share in enumerate(curve["surviving"]):
-        assert share + sum(each[index] for each in curve["incidence"].values()) == pytest.approx(1.0)
+        assert share + sum(incidence[index] for incidence in curve["incidence"].values()) == pytest.approx(1.0)
 
 
-def test_all_completed_and_none_completed() -> None:
+def test_survival_of_completed_and_of_ended_runs() -> None:
     """If all runs were completed, survival remains 1; if none was, it falls to 0."""
     all_completed = survival([run(100.0, "completed")] * 3)
     assert all_completed is not None

@@ -85,7 +85,9 @@ def test_every_key_is_present(summary: Any) -> None:
             assert condition.keys() == CONDITION_KEYS
             assert list(condition["routes"]) == list(condition["survival"]) == ["a_key", "b_key"]
             assert all(route.keys() == ROUTE_KEYS for route in condition["routes"].values())
-    assert [each.keys() for each in summary["contrasts"]] == [{"a", "b", "pairs", "only_a", "only_b", "p", "p_holm"}]
+    assert [contrast.keys() for contrast in summary["contrasts"]] == [
+        {"a", "b", "pairs", "only_a", "only_b", "p", "p_holm"}
+    ]
     assert summary["contrasts"][0]["pairs"] == 2
     assert summary["paper"]["conditions"]["L1"]["completed"] == 28
 

@@ -41,7 +41,7 @@ def two_runs() -> list[PlannedRun]:
 
 
 @pytest.fixture(scope="module")
-def swept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def sweep_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Drive a sweep of two runs in two processes, and return its directory."""
     out = tmp_path_factory.mktemp("sweep") / "out"
     open_sweep(out, resume=False)
@@ -49,14 +49,14 @@ def swept(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_a_sweep_writes_all_files(swept: Path) -> None:
+def test_a_sweep_writes_all_files(sweep_folder: Path) -> None:
     """A sweep writes a directory for each run with config, records and result, a summary, and a report."""
     for run in two_runs():
-        names = {path.name for path in (swept / "runs" / run.name).iterdir()}
+        names = {path.name for path in (sweep_folder / "runs" / run.name).iterdir()}
         assert names == {"config.yaml", "server.mcap", "client.mcap", "result.json"}
-    assert load_config(SweepConfig, swept / "sweep.yaml") == sweep_config()
-    assert (swept / "report" / "index.html").is_file()
-    summary = json.loads((swept / "summary.json").read_text())
+    assert load_config(SweepConfig, sweep_folder / "sweep.yaml") == sweep_config()
+    assert (sweep_folder / "report" / "index.html").is_file()
+    summary = json.loads((sweep_folder / "summary.json").read_text())
     assert list(summary["conditions"]) == ["L0", "L3"]
     assert summary["conditions"]["L3"]["injected_ms"] == {"video": 225.0, "control": 0.0}
     assert summary["speed"]["jobs"] == 2
@@ -64,14 +64,14 @@ def test_a_sweep_writes_all_files(swept: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def resumed(swept: Path) -> tuple[dict[str, Any], dict[str, Any], bool]:
+def resumed(sweep_folder: Path) -> tuple[dict[str, Any], dict[str, Any], bool]:
     """Return the summaries before and after the first run was driven again, and whether the second was unchanged."""
-    before = read_json(swept / "summary.json")
-    first, second = (swept / "runs" / run.name / RESULT for run in two_runs())
+    before = read_json(sweep_folder / "summary.json")
+    first, second = (sweep_folder / "runs" / run.name / RESULT for run in two_runs())
     before_ns = second.stat().st_mtime_ns
     first.unlink()  # as if it had been killed while driving
-    drive_sweep(sweep_config(), two_runs(), swept, jobs=1, on_progress=lambda _: None)
-    return before, read_json(swept / "summary.json"), second.stat().st_mtime_ns == before_ns
+    drive_sweep(sweep_config(), two_runs(), sweep_folder, jobs=1, on_progress=lambda _: None)
+    return before, read_json(sweep_folder / "summary.json"), second.stat().st_mtime_ns == before_ns
 
 
 def test_resuming_drives_only_missing_runs(resumed: tuple[dict[str, Any], dict[str, Any], bool]) -> None:
@@ -83,13 +83,13 @@ def test_resuming_drives_only_missing_runs(resumed: tuple[dict[str, Any], dict[s
 
 
 def test_the_speed_is_that_of_the_last_drives(
-    swept: Path, resumed: tuple[dict[str, Any], dict[str, Any], bool]
+    sweep_folder: Path, resumed: tuple[dict[str, Any], dict[str, Any], bool]
 ) -> None:
     """Runs from before do not count in a resumed sweep's speed; if no run is driven, the speed is kept."""
     speed = resumed[1]["speed"]
-    assert speed["simulated_s"] == read_json(swept / "runs" / two_runs()[0].name / RESULT)["duration_s"]
-    drive_sweep(sweep_config(), two_runs(), swept, jobs=2, on_progress=lambda _: None)
-    assert read_json(swept / "summary.json")["speed"] == speed
+    assert speed["simulated_s"] == read_json(sweep_folder / "runs" / two_runs()[0].name / RESULT)["duration_s"]
+    drive_sweep(sweep_config(), two_runs(), sweep_folder, jobs=2, on_progress=lambda _: None)
+    assert read_json(sweep_folder / "summary.json")["speed"] == speed
 
 
 def test_an_error_of_one_run_does_not_stop_the_others(tmp_path: Path) -> None:
@@ -105,30 +105,30 @@ def test_an_error_of_one_run_does_not_stop_the_others(tmp_path: Path) -> None:
     assert speed is not None
 
 
-def test_the_config_of_a_run_reproduces_it(swept: Path, tmp_path: Path) -> None:
+def test_the_config_of_a_run_reproduces_it(sweep_folder: Path, tmp_path: Path) -> None:
     """The config in a run directory, driven by itself, reproduces the digest of the run."""
-    directory = swept / "runs" / two_runs()[0].name
+    directory = sweep_folder / "runs" / two_runs()[0].name
     again = run_once(plan_run(load_config(RunConfig, directory / "config.yaml")), tmp_path / "again")
     assert again["digest"] == json.loads((directory / "result.json").read_text())["digest"]
 
 
-def test_resuming_with_another_config_is_rejected(swept: Path) -> None:
+def test_resuming_with_another_config_is_rejected(sweep_folder: Path) -> None:
     """A sweep that was driven with another config is not resumed."""
-    changed, before = sweep_config("seed=2"), (swept / "sweep.yaml").read_bytes()
+    changed, before = sweep_config("seed=2"), (sweep_folder / "sweep.yaml").read_bytes()
     with pytest.raises(UserError, match="another config"):
-        drive_sweep(changed, plan_sweep(changed), swept, jobs=1, on_progress=lambda _: None)
-    assert (swept / "sweep.yaml").read_bytes() == before
+        drive_sweep(changed, plan_sweep(changed), sweep_folder, jobs=1, on_progress=lambda _: None)
+    assert (sweep_folder / "sweep.yaml").read_bytes() == before
 
 
 @pytest.mark.parametrize(
     ("key", "value"), [("conditions", "[L1]"), ("repetitions", "2"), ("axes", "{study.block: [1]}")]
 )
-def test_resuming_a_sweep_of_other_runs_is_rejected(swept: Path, key: str, value: str) -> None:
+def test_resuming_a_sweep_of_other_runs_is_rejected(sweep_folder: Path, key: str, value: str) -> None:
     """A sweep with other or fewer runs is not resumed."""
-    changed, before = sweep_config(f"{key}={value}"), (swept / "sweep.yaml").read_bytes()
+    changed, before = sweep_config(f"{key}={value}"), (sweep_folder / "sweep.yaml").read_bytes()
     with pytest.raises(UserError, match=rf"another config \({key}\)"):
-        drive_sweep(changed, plan_sweep(changed), swept, jobs=1, on_progress=lambda _: None)
-    assert (swept / "sweep.yaml").read_bytes() == before
+        drive_sweep(changed, plan_sweep(changed), sweep_folder, jobs=1, on_progress=lambda _: None)
+    assert (sweep_folder / "sweep.yaml").read_bytes() == before
 
 
 BASES: list[tuple[tuple[str, ...], dict[str, Any]]] = [
@@ -160,7 +160,7 @@ def test_the_base_config_is_the_sweeps_own(changes: tuple[str, ...], base: dict[
 @pytest.mark.parametrize(
     ("number", "options"), [(signal.SIGINT, ()), (signal.SIGHUP, ()), (signal.SIGINT, ("--cluster", "local"))]
 )
-@pytest.mark.usefixtures("hangup_ends")
+@pytest.mark.usefixtures("sighup_ends_programs")
 def test_a_stopped_sweep_keeps_what_is_finished(number: int, options: tuple[str, ...], tmp_path: Path) -> None:
     """Ctrl-C or a closed terminal ends a sweep with a message, exit code 1 and no traceback.
 
@@ -170,7 +170,7 @@ def test_a_stopped_sweep_keeps_what_is_finished(number: int, options: tuple[str,
         pytest.importorskip("distributed")
     out = tmp_path / "out"
     sets = [part for change in ("fidelity=geometry", "repetitions=10") for part in ("--set", change)]
-    started = subprocess.Popen(
+    process = subprocess.Popen(
         [
             *(sys.executable, "-m", "lavt", "sweep", str(shipped("configs/sweep.yaml")), *sets, "--jobs", "2"),
             *("--out", str(out), *options),
@@ -184,9 +184,9 @@ def test_a_stopped_sweep_keeps_what_is_finished(number: int, options: tuple[str,
         if list(out.glob("runs/*/result.json")):
             break
         pause(20 * NS_PER_MS)
-    os.killpg(started.pid, number)  # as a terminal does: to all processes
-    _, stderr = started.communicate(timeout=60)
-    assert started.returncode == 1
+    os.killpg(process.pid, number)  # to all processes of the group, as a terminal does
+    _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 1
     assert "results are kept" in stderr
     assert "Traceback" not in stderr
     assert 0 < len(list(out.glob("runs/*/result.json"))) == len(list(out.glob("runs/*"))) < 60
@@ -234,7 +234,7 @@ def test_ctrl_c_in_an_import_keeps_the_exit_code(tmp_path: Path) -> None:
     """Ctrl-C during the import of the report, which executes a string, ends a sweep with its own exit code."""
     (tmp_path / "sitecustomize.py").write_text(SLOW_IMPORT)
     path = os.pathsep.join(filter(None, (str(tmp_path), os.environ.get("PYTHONPATH"))))
-    started = subprocess.Popen(
+    process = subprocess.Popen(
         [
             *(sys.executable, "-m", "lavt", "sweep", str(shipped("configs/sweep.yaml").resolve())),
             *("--set", "fidelity=geometry", "--set", "repetitions=10", "--out", "out"),
@@ -250,13 +250,13 @@ def test_ctrl_c_in_an_import_keeps_the_exit_code(tmp_path: Path) -> None:
         if (tmp_path / "importing").exists():
             break
         pause(20 * NS_PER_MS)
-    os.killpg(started.pid, signal.SIGINT)
-    _, stderr = started.communicate(timeout=60)
+    os.killpg(process.pid, signal.SIGINT)
+    _, stderr = process.communicate(timeout=60)
     assert "results are kept" in stderr
-    assert started.returncode == 1
+    assert process.returncode == 1
 
 
-def geometry(*changes: str) -> tuple[SweepConfig, list[PlannedRun]]:
+def geometry_sweep(*changes: str) -> tuple[SweepConfig, list[PlannedRun]]:
     config = load_config(
         SweepConfig, shipped("configs/sweep.yaml"), ["fidelity=geometry", "conditions=[L0, L3, L5]", *changes]
     )
@@ -264,11 +264,11 @@ def geometry(*changes: str) -> tuple[SweepConfig, list[PlannedRun]]:
 
 
 @pytest.mark.full
-@pytest.mark.usefixtures("own_environment")  # distributed sets variables for its workers
+@pytest.mark.usefixtures("restored_environment")  # distributed sets variables for its workers
 def test_digests_are_the_same_on_any_workers(tmp_path: Path) -> None:
     """Runs have the same digests when repeated, with one process, with two, and with Dask workers."""
     pytest.importorskip("distributed")
-    _, planned = geometry()
+    _, planned = geometry_sweep()
     workers = {"one": (1, None), "two": (2, None), "again": (2, None), "dask": (2, "local")}
     digests = {}
     for name, (jobs, cluster_address) in workers.items():
@@ -283,7 +283,7 @@ def test_digests_are_the_same_on_any_workers(tmp_path: Path) -> None:
     assert files == {path.relative_to(tmp_path / "two") for path in (tmp_path / "two").rglob("*")}
 
 
-class InlineRemote(Executor):
+class InlineRemoteExecutor(Executor):
     """An executor that drives remote runs inline, and tracks which of its futures are still referenced."""
 
     def __init__(self) -> None:
@@ -299,16 +299,16 @@ class InlineRemote(Executor):
 
 def test_files_of_remote_runs_are_freed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """When a remote run is reported, the files of the runs before it are no longer in memory."""
-    executor = InlineRemote()
+    executor = InlineRemoteExecutor()
     workers = Workers(executor, 1, remote=True)
     monkeypatch.setattr(lavt.experiment.sweep.sweep, "cluster_workers", lambda _address, _jobs: nullcontext(workers))
-    _, planned = geometry()
+    _, planned = geometry_sweep()
     counts: list[int] = []
 
-    def tell(_line: str) -> None:
+    def count_referenced(_line: str) -> None:
         counts.append(len(executor.referenced))
 
-    run_all(planned[:3], tmp_path, jobs=None, on_progress=tell, cluster_address="remote")
+    run_all(planned[:3], tmp_path, jobs=None, on_progress=count_referenced, cluster_address="remote")
     assert counts == [3, 2, 1]
 
 
@@ -316,7 +316,7 @@ def test_files_of_remote_runs_are_freed(tmp_path: Path, monkeypatch: pytest.Monk
 def test_a_missing_scheduler_is_an_error(tmp_path: Path) -> None:
     """An address without a Dask scheduler is a user error before anything is driven."""
     pytest.importorskip("distributed")
-    _, planned = geometry()
+    _, planned = geometry_sweep()
     with pytest.raises(UserError, match="no Dask scheduler answers at"):
         run_all(planned, tmp_path, jobs=None, on_progress=lambda _: None, cluster_address="tcp://127.0.0.1:1")
     with pytest.raises(UserError, match="--jobs is for this machine"):
@@ -324,11 +324,11 @@ def test_a_missing_scheduler_is_an_error(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def kill_a_worker(left: list[int]) -> None:
-    """Kill the first child process, `left[0]` times."""
+def kill_a_worker(remaining: list[int]) -> None:
+    """Kill the first child process, `remaining[0]` times."""
     children = multiprocessing.active_children()
-    if left[0] and children:
-        left[0] -= 1
+    if remaining[0] and children:
+        remaining[0] -= 1
         os.kill(int(children[0].pid or 0), signal.SIGKILL)
 
 
@@ -336,10 +336,10 @@ def kill_a_worker(left: list[int]) -> None:
 def test_a_new_worker_ignores_terminal_signals(number: signal.Signals) -> None:
     """A worker process ignores Ctrl-C and a closed terminal from its start on."""
     with process_workers(2) as workers:
-        begun = multiprocessing.active_children()
-        for each in begun:
-            os.kill(int(each.pid or 0), number)
-        assert workers.executor.submit(os.getpid).result(60) in {each.pid for each in begun}
+        workers_at_start = multiprocessing.active_children()
+        for worker in workers_at_start:
+            os.kill(int(worker.pid or 0), number)
+        assert workers.executor.submit(os.getpid).result(60) in {worker.pid for worker in workers_at_start}
         assert signal.pthread_sigmask(signal.SIG_BLOCK, ()) == set()
         assert workers.executor.submit(signal.pthread_sigmask, signal.SIG_BLOCK, ()).result(60) == set()
 
@@ -347,15 +347,15 @@ def test_a_new_worker_ignores_terminal_signals(number: signal.Signals) -> None:
 @pytest.mark.full
 def test_runs_of_a_killed_process_are_repeated(tmp_path: Path) -> None:
     """The runs of a killed process are driven again, and all runs are finished."""
-    _, planned = geometry()
-    left = [1]
-    driven, _ = run_all(planned, tmp_path, jobs=2, on_progress=lambda _: kill_a_worker(left))
-    assert left == [0]
+    _, planned = geometry_sweep()
+    remaining = [1]
+    driven, _ = run_all(planned, tmp_path, jobs=2, on_progress=lambda _: kill_a_worker(remaining))
+    assert remaining == [0]
     assert driven.failed == []
-    assert sorted(result["run"] for result in driven.results) == sorted(each.name for each in planned)
+    assert sorted(result["run"] for result in driven.results) == sorted(run.name for run in planned)
 
 
-class DiesAfterwards(Executor):
+class BrokenAfterRunExecutor(Executor):
     """An executor that drives inline and then fails like one whose process died after the run, which is rare."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -368,9 +368,9 @@ class DiesAfterwards(Executor):
 
 def test_a_run_whose_process_dies_after_it_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A run that had a result when its process died is kept and not driven again."""
-    workers = Workers(DiesAfterwards(), 1, remote=False)
+    workers = Workers(BrokenAfterRunExecutor(), 1, remote=False)
     monkeypatch.setattr(lavt.experiment.sweep.sweep, "process_workers", lambda _jobs: nullcontext(workers))
-    _, planned = geometry()
+    _, planned = geometry_sweep()
     driven, _ = run_all(planned[:1], tmp_path, jobs=1, on_progress=lambda _: None)
     assert driven.failed == []
     assert (
@@ -384,18 +384,18 @@ def test_a_killed_sweep_resumes_to_the_same_summary(tmp_path: Path) -> None:
     """A sweep that was killed (SIGKILL) and resumed has the summary of an undisturbed one."""
     sets = [part for change in ("fidelity=geometry", "conditions=[L0, L3, L5]") for part in ("--set", change)]
     command = [sys.executable, "-m", "lavt", "sweep", str(shipped("configs/sweep.yaml")), *sets, "--out"]
-    whole, killed = tmp_path / "whole", tmp_path / "killed"
-    subprocess.run([*command, str(whole)], check=True, capture_output=True)
-    started = subprocess.Popen([*command, str(killed)], stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    undisturbed, killed = tmp_path / "whole", tmp_path / "killed"
+    subprocess.run([*command, str(undisturbed)], check=True, capture_output=True)
+    process = subprocess.Popen([*command, str(killed)], stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
     for _ in range(600):
         if list(killed.glob("runs/*/result.json")):
             break
         pause(50 * NS_PER_MS)
-    started.kill()
-    started.wait()
+    process.kill()
+    process.wait()
     assert 0 < len(list(killed.glob("runs/*/result.json"))) < 6
     subprocess.run([*command, str(killed), "--resume"], check=True, capture_output=True)
-    summaries = [json.loads((out / "summary.json").read_text()) for out in (whole, killed)]
+    summaries = [json.loads((out / "summary.json").read_text()) for out in (undisturbed, killed)]
     for summary in summaries:
         del summary["speed"]
     assert summaries[0] == summaries[1]

@@ -12,7 +12,7 @@ PORT = 7700
 
 
 def serve(address: str, key: bytes) -> None:
-    """Answer (function, arguments, keywords) with (exception text or None, return value)."""
+    """Receive (function, arguments, keywords), call the function, and answer (exception text or None, return value)."""
     with Listener((address, PORT), authkey=key) as listener:
         while True:
             threading.Thread(target=_answer, args=(listener.accept(),), daemon=True).start()

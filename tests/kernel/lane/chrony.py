@@ -7,7 +7,8 @@ import os
 from tests.kernel.lane.machine import Machine, MachineError, StartedProgram, wait_until
 
 FOLDER = "/run/chrony"
-"""The directory that chronyc uses by default. chronyd makes no command socket in a directory that others may read."""
+"""The directory that chronyc uses by default. chronyd makes its command socket only in a directory that others cannot
+read."""
 FILES = (f"bindcmdaddress {FOLDER}/chronyd.sock", f"pidfile {FOLDER}/chronyd.pid")
 SERVE_OWN_CLOCK = ("local stratum 8", "allow")
 """Serve the machine's own clock to every client."""
@@ -15,7 +16,7 @@ SYNCHRONISATION_TIMEOUT_S = 60
 
 
 def follow_server(address: str, port: int = 123) -> str:
-    """Return the directive to follow a server closely: twice a second, with true send times (interleaved mode)."""
+    """Return the directive to follow a server closely: two polls a second, with true send times (interleaved mode)."""
     return f"server {address} port {port} iburst minpoll -1 maxpoll -1 xleave"
 
 
@@ -41,18 +42,18 @@ def chronyc(machine: Machine, report: str) -> list[str]:
 
 
 def correction_s(machine: Machine) -> float:
-    """Return chrony's reference time less the machine's wall clock: field 5 of `chronyc -c tracking`."""
+    """Return chrony's reference time minus the machine's wall clock: field 5 of `chronyc -c tracking`."""
     return float(chronyc(machine, "tracking")[4])
 
 
 def wait_synchronised(machine: Machine, *, updates: int = 1) -> None:
     """Wait until chrony has selected a source and received at least `updates` good answers."""
 
-    def synchronised() -> bool:
+    def is_synchronised() -> bool:
         fields = chronyc(machine, "tracking")
         return fields[0] != "00000000" and fields[13] == "Normal" and _count_good_answers(machine) >= updates
 
-    wait_until(f"chrony is synchronised on the {machine.name}'s machine", synchronised, SYNCHRONISATION_TIMEOUT_S)
+    wait_until(f"chrony is synchronised on the {machine.name}'s machine", is_synchronised, SYNCHRONISATION_TIMEOUT_S)
 
 
 def _count_good_answers(machine: Machine) -> int:

@@ -1,4 +1,4 @@
-"""One machine's clocks, read together with the processor's time stamp counter, which both machines share."""
+"""The clocks of one machine, read together with the processor's time stamp counter, which both machines share."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def read_counter() -> int:
 
 
 def read_wall_clock(attempts: int = 60) -> tuple[int, int]:
-    """Return counter and wall clock (ns), read together: the attempt with the least interruption."""
+    """Return counter and wall clock (ns), read together in the attempt with the least interruption."""
     best: tuple[int, int, int] | None = None
     for _ in range(attempts):
         before = read_counter()
@@ -60,14 +60,14 @@ def read_wall_clock(attempts: int = 60) -> tuple[int, int]:
 
 
 def read_monotonic_clock(attempts: int = 10) -> tuple[int, int]:
-    """Return counter and CLOCK_MONOTONIC (ns), read together: the attempt with the least interruption."""
-    attempts_read = [(read_counter(), time.monotonic_ns(), read_counter()) for _ in range(attempts)]
-    before, mono_ns, after = min(attempts_read, key=lambda each: each[2] - each[0])
+    """Return counter and CLOCK_MONOTONIC (ns), read together in the attempt with the least interruption."""
+    readings = [(read_counter(), time.monotonic_ns(), read_counter()) for _ in range(attempts)]
+    before, mono_ns, after = min(readings, key=lambda reading: reading[2] - reading[0])
     return (before + after) // 2, mono_ns
 
 
 def offset_ns(one: tuple[int, int], other: tuple[int, int]) -> int:
-    """Return one clock less another, from readings of each together with the counter."""
+    """Return one clock minus another (ns), from a reading (counter, ns) of each."""
     elapsed_ns = (one[0] - other[0]) / counter_hz() * NS_PER_S
     return one[1] - other[1] - round(elapsed_ns)
 
@@ -87,9 +87,9 @@ def read_raw_clock_ns() -> int:
 
 
 def wall_minus_raw_ns() -> int:
-    """Return the wall clock less the raw clock."""
-    attempts_read = [(read_raw_clock_ns(), time.time_ns(), read_raw_clock_ns()) for _ in range(60)]
-    before_ns, wall_ns, after_ns = min(attempts_read, key=lambda each: each[2] - each[0])
+    """Return the wall clock minus the raw clock (ns)."""
+    readings = [(read_raw_clock_ns(), time.time_ns(), read_raw_clock_ns()) for _ in range(60)]
+    before_ns, wall_ns, after_ns = min(readings, key=lambda reading: reading[2] - reading[0])
     return wall_ns - (before_ns + after_ns) // 2
 
 
@@ -100,20 +100,20 @@ def step(by_ns: int) -> None:
 
 
 def set_drift(by_ppm: float) -> None:
-    """Set the wall clock's frequency error in ppm (at most 500, either way)."""
+    """Set the wall clock's frequency error, from -500 to 500 ppm."""
     _adjtimex(Timex(modes=ADJ_FREQUENCY | ADJ_TICK, frequency=round(by_ppm * PPM), tick=TICK_US))
 
 
-def restore(minus_raw_ns: int) -> None:
-    """Reset the wall clock's frequency, and step the clock to this difference from the raw clock."""
+def restore(difference_ns: int) -> None:
+    """Reset the wall clock's frequency, and step the clock so that `wall_minus_raw_ns` is `difference_ns`."""
     set_drift(0)
     _adjtimex(Timex(modes=ADJ_STATUS, status=STA_UNSYNC))
-    step(minus_raw_ns - wall_minus_raw_ns())
+    step(difference_ns - wall_minus_raw_ns())
 
 
 def _counter_and_raw() -> tuple[int, int]:
-    attempts_read = [(read_counter(), read_raw_clock_ns(), read_counter()) for _ in range(60)]
-    before, raw, after = min(attempts_read, key=lambda each: each[2] - each[0])
+    readings = [(read_counter(), read_raw_clock_ns(), read_counter()) for _ in range(60)]
+    before, raw, after = min(readings, key=lambda reading: reading[2] - reading[0])
     return (before + after) // 2, raw
 
 

@@ -57,10 +57,10 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def pytest_arguments(extra: Sequence[str]) -> list[str]:
-    """Return pytest's arguments: names of test files are completed, and without one the directory is added."""
+    """Return pytest's arguments: names of test files are completed, and tests/kernel is added if no test is named."""
     arguments = [_complete_path(argument) for argument in extra]
-    named = any(REPOSITORY / argument.partition("::")[0] in (HERE, *HERE.glob("*.py")) for argument in arguments)
-    return arguments if named else [*arguments, "tests/kernel"]
+    has_tests = any(REPOSITORY / argument.partition("::")[0] in (HERE, *HERE.glob("*.py")) for argument in arguments)
+    return arguments if has_tests else [*arguments, "tests/kernel"]
 
 
 def _complete_path(argument: str) -> str:
@@ -97,22 +97,24 @@ def writable_directories(out: Path | None) -> list[Path]:
 
 
 def _environment() -> dict[str, str]:
-    """Return the environment of this program, with absolute paths."""
+    """Return the environment of this program, with absolute paths in PYTHONPATH."""
     python_path = os.environ.get("PYTHONPATH")
-    absolute = {"PYTHONPATH": os.pathsep.join(_START_PATHS)} if python_path else {}
+    absolute = {"PYTHONPATH": os.pathsep.join(_ABSOLUTE_PYTHON_PATH)} if python_path else {}
     return {**os.environ, **absolute, "PYTHONDONTWRITEBYTECODE": "1"}
 
 
-_START_PATHS = [str(Path(part).absolute()) for part in os.environ.get("PYTHONPATH", "").split(os.pathsep) if part]
+_ABSOLUTE_PYTHON_PATH = [
+    str(Path(part).absolute()) for part in os.environ.get("PYTHONPATH", "").split(os.pathsep) if part
+]
 
 
 def _native(tests: Sequence[str]) -> int:
     """Run the tests on this kernel, in a network namespace of their own."""
-    trial = "ip link set lo up && tc qdisc add dev lo root netem delay 1ms"
+    netem_trial = "ip link set lo up && tc qdisc add dev lo root netem delay 1ms"
     in_own_network = ["unshare", "--net", "sh", "-c"]
-    if os.geteuid() != 0 or any(shutil.which(each) is None for each in ("unshare", "ip", "tc")):
+    if os.geteuid() != 0 or any(shutil.which(program) is None for program in ("unshare", "ip", "tc")):
         raise LaneUnavailable("--native needs root, iproute2 and util-linux: become root, or leave --native out")
-    if subprocess.run([*in_own_network, trial], capture_output=True, check=False).returncode != 0:
+    if subprocess.run([*in_own_network, netem_trial], capture_output=True, check=False).returncode != 0:
         raise LaneUnavailable("this machine's own kernel has no netem: leave --native out")
     environment = {**_environment(), "LAVT_KERNEL_LANE": "native"}
     process = subprocess.Popen([*in_own_network, 'ip link set lo up; exec "$@"', "sh", *tests], env=environment)
@@ -152,7 +154,7 @@ def _pair(python: str, tests: Sequence[str], writable_directories: Sequence[Path
                     links=ends,
                     writable=writable_directories,
                     output=to,
-                    line=guest_line,
+                    serial_line=guest_line,
                     processor=processors[side % len(processors)],
                 )
                 guests.append(guest)
@@ -165,7 +167,7 @@ def _pair(python: str, tests: Sequence[str], writable_directories: Sequence[Path
 
 @contextmanager
 def _host_stalls(python: str) -> Iterator[tuple[int, int]]:
-    """Record this machine's stalls; yield the descriptors to read answers from and to write questions to."""
+    """Start `host_stalls`; yield the file descriptors to read its answers from and to write questions to."""
     question_reader, question_writer = os.pipe()
     answer_reader, answer_writer = os.pipe()
     recorder = [python, "-B", "-m", "tests.kernel.lane.host_stalls"]
@@ -203,7 +205,7 @@ def _watch_guests(guests: Sequence[Guest], output: int) -> int:
 
 
 def _forward_output(output: int, wait_s: float) -> bool:
-    """Forward a chunk of output if there is one in time; return False at the end of the output."""
+    """Forward a chunk of output if one comes within `wait_s`; return False at the end of the output."""
     if not select.select([output], [], [], wait_s)[0]:
         return wait_s > 0
     chunk = os.read(output, 65536)

@@ -1,4 +1,4 @@
-"""A drive between the two machines: starts routers, server and client on the right machines."""
+"""A drive with the two machines: start routers, server and client on their machines, and collect the result."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lavt.recording.record import Record, read_record
 REPOSITORY = Path(__file__).resolve().parents[3]
 SHORT_ROAD = REPOSITORY / "tests/kernel/roads/short.yaml"
 LOW_LOAD = ("vehicle.scenery=none",)
-"""A load that a user-mode kernel, with one processor and expensive system calls, can render in time."""
+"""A load that a user-mode kernel, with one processor and slow system calls, can render in time."""
 BY_WIRE = "configs/server-by-wire.yaml"
 ROUTER_PORT = 7448
 SESSION_PORT = 7447
@@ -118,9 +118,9 @@ def wait_for_end(loop: LoopPrograms, meanwhile: Callable[[LoopPrograms], None]) 
         meanwhile(loop)
         if not loop.server.running:
             return True
-        for each in loop.all():
-            if not each.running and each is not loop.server:
-                raise MachineError(f"{' '.join(each.command)} ended during the drive: {each.errors}")
+        for program in loop.all():
+            if not program.running and program is not loop.server:
+                raise MachineError(f"{' '.join(program.command)} ended during the drive: {program.errors}")
         return False
 
     wait_until(f"the drive has ended: {loop.server.command}", ended, DRIVE_TIMEOUT_S, every_ns=500_000_000)
@@ -128,8 +128,8 @@ def wait_for_end(loop: LoopPrograms, meanwhile: Callable[[LoopPrograms], None]) 
 
 def collect(loop: LoopPrograms, client: Machine, out: Path) -> DriveResult:
     """Stop the programs in order, join the records, and compute the result."""
-    for each in reversed(loop.all()):
-        each.stop()
+    for program in reversed(loop.all()):
+        program.stop()
     (out / "client").mkdir()
     for name in ("client.mcap", "config.yaml"):
         (out / "client" / name).write_bytes(client.read(out / "client" / name))
@@ -139,10 +139,12 @@ def collect(loop: LoopPrograms, client: Machine, out: Path) -> DriveResult:
     return DriveResult(run, server_record, client_record, measure(server_record, client_record), result)
 
 
-def reasons_against(finished_drive: DriveResult) -> list[str]:
-    """Return the reasons against a drive, without those of a slow machine: a user-mode kernel has one processor."""
-    slow = ("the physics was", "the camera missed")
-    return [reason for reason in finished_drive.result["invalid_reasons"] if not reason.startswith(slow)]
+def invalid_reasons(finished_drive: DriveResult) -> list[str]:
+    """Return why a drive is invalid, except for reasons that are normal on a slow machine with one processor."""
+    slow_machine_reasons = ("the physics was", "the camera missed")
+    return [
+        reason for reason in finished_drive.result["invalid_reasons"] if not reason.startswith(slow_machine_reasons)
+    ]
 
 
 def _start(machine: Machine, command: str, *arguments: str, changes: Sequence[str] = ()) -> StartedProgram:

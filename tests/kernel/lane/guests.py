@@ -35,7 +35,7 @@ SERIAL_LINE = "/run/line"
 
 MODULES = "usr/lib/uml/modules/*"
 KERNEL, LIBRARY_FOLDER = "linux.uml", "libraries"
-"""Names of the kernel and of its libraries in the guests' shared directory."""
+"""Names of the kernel's file and its libraries' folder in the guests' shared directory."""
 
 INIT = """#!{busybox} sh
 b={busybox}
@@ -121,15 +121,15 @@ def start_guest(
     links: Mapping[str, tuple[int, str]],
     writable: Sequence[Path],
     output: int,
-    line: tuple[int, int] | None = None,
+    serial_line: tuple[int, int] | None = None,
     processor: int,
 ) -> Guest:
     """Start a machine that runs `command` and ends with it.
 
     `links` maps each network device to its socket and address. `writable` lists the directories of the host that the
-    machine may write to. The command's output goes to the descriptor `output`, and `line` has the descriptors to read
-    from and write to for SERIAL_LINE. The machine runs on one of the host's processors: a system call of the guest is
-    two switches between processes, which took four times as long between two processors.
+    machine may write to. The command's output goes to the descriptor `output`, and `serial_line` has the descriptors
+    that SERIAL_LINE reads from and writes to. The machine runs on one of the host's processors, because each system
+    call of the guest is two switches between processes, which took four times as long between two processors.
     """
     busybox = program(tools, "busybox")
     setup = ["ip link set lo up"]
@@ -156,14 +156,14 @@ def start_guest(
     kernel = [str(scratch / KERNEL), "seccomp=auto", f"mem={MEMORY_MB}M", "rootfstype=hostfs", "rootflags=/", "ro"]
     kernel += [f"init={scratch / name}.init", "quiet", "loglevel=1", f"umid={name}", f"uml_dir={scratch}/"]
     kernel += ["con=null", "con0=null,fd:1", f"con1=null,fd:{output}", "ssl=null", *devices]
-    kernel += [f"con2=fd:{line[0]},fd:{line[1]}"] if line else []
+    kernel += [f"con2=fd:{serial_line[0]},fd:{serial_line[1]}"] if serial_line else []
     with (scratch / f"{name}.console").open("wb") as console:
         process = subprocess.Popen(
             kernel,
             stdin=subprocess.DEVNULL,
             stdout=console,
             stderr=subprocess.STDOUT,
-            pass_fds=[output, *(line or ()), *(descriptor for descriptor, _ in links.values())],
+            pass_fds=[output, *(serial_line or ()), *(descriptor for descriptor, _ in links.values())],
             start_new_session=True,  # Ctrl-C must reach only the program that started it, which stops it
             preexec_fn=partial(_configure_process, processor),  # noqa: PLW1509 (there are no threads here)
             env={

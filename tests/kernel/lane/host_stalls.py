@@ -2,10 +2,10 @@
 
     python -m tests.kernel.lane.host_stalls < QUESTIONS > ANSWERS
 
-A probe inside a machine cannot run before the machine does. So this program runs on the host, starts one lateness
-probe for each processor, and answers through pipes that the first machine sees as a serial line. Every machine has
-clocks of its own: each answer has the host's time together with the processor's counter, which all of them read, and
-`HostProbe` converts it to the machine's time.
+A probe inside a machine cannot run while the host stalls that machine. So this program runs on the host, starts one
+lateness probe for each processor, and answers through pipes that the first machine sees as a serial line. Every machine
+has clocks of its own: each answer has the host's time together with the processor's counter, which all of them read,
+and `HostProbe` converts it to the machine's time.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from tests.support.stalls import ProbeEnded, Stall, Stalls
 POLL_S = 0.5
 """Polling period. A clock may be slewed by 500 ppm, which in this time makes an error of 0.3 ms."""
 STALLS_PER_ANSWER = 40
-"""Maximum per answer. A user-mode kernel whose line has once been full (4 KB) receives nothing on it any more."""
+"""Maximum number of stalls in an answer. A user-mode kernel whose serial line was full once (4 KB) receives nothing on
+it any more."""
 
 
 def serve() -> None:
@@ -40,21 +41,21 @@ def serve() -> None:
 
 
 def _query(stalls: Stalls) -> dict[str, Any]:
-    """Return the time, and the oldest stalls that no earlier answer had."""
+    """Return the present time, and the oldest stalls that were in no earlier answer."""
     counter, mono_ns = clocks.read_monotonic_clock()
     try:
         stalls.collect()
     except ProbeEnded as error:
         return {"ended": str(error)}
-    listed = [[each.processor, each.begin_ns, each.end_ns] for each in stalls.recorded[:STALLS_PER_ANSWER]]
+    oldest = [[stall.processor, stall.begin_ns, stall.end_ns] for stall in stalls.recorded[:STALLS_PER_ANSWER]]
     del stalls.recorded[:STALLS_PER_ANSWER]
-    above = all(probe.above for probe in stalls.probes)
+    has_priority = all(probe.has_realtime_priority for probe in stalls.probes)
     return {
         "counter": counter,
         "mono_ns": mono_ns,
-        "stalls": listed,
+        "stalls": oldest,
         "more": bool(stalls.recorded),
-        "above": above,
+        "has_realtime_priority": has_priority,
         "processor_times": stalls.processor_times(),
     }
 
@@ -73,7 +74,7 @@ class HostProbe:
         self._recorded: list[Stall] = []
         self._processor_times = ""
         self._stopping = threading.Event()
-        self.above = bool(self._query_all()["above"])
+        self.has_realtime_priority = bool(self._query_all()["has_realtime_priority"])
         self._thread = threading.Thread(target=self._poll, daemon=True)
         self._thread.start()
 

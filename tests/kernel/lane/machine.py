@@ -1,4 +1,4 @@
-"""One interface to both machines: calls functions there, and runs, starts and stops programs."""
+"""One interface to both machines: call functions on a machine, and run, start and stop programs."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ class StartedProgram:
 
 
 def wait_until(description: str, condition: Callable[[], bool], timeout_s: float, every_ns: int = POLL_NS) -> None:
-    """Wait until a condition is true. Raise `MachineError` if it is not in time."""
+    """Wait until a condition is true. Raise `MachineError` after `timeout_s`."""
     for _ in range(max(1, round(timeout_s * NS_PER_S / every_ns))):
         if condition():
             return

@@ -1,4 +1,4 @@
-"""netem by hand: delays on what a machine sends to the other one, without LAVT."""
+"""netem without LAVT: delay the packets that a machine sends to the other one."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.kernel.lane.machine import Machine
 
 @contextmanager
 def netem_on_all(machine: Machine, *arguments: str) -> Iterator[None]:
-    """Apply `tc netem` with these arguments to all egress of the machine, with NTP and ARP, inside the context."""
+    """Apply `tc netem` with these arguments to all egress of the machine, also NTP and ARP, inside the context."""
     target = ["dev", machine.interface, "root"]
     machine.run(["tc", "qdisc", "add", *target, "netem", *arguments, "limit", "10000"])
     try:

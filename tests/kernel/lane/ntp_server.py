@@ -32,7 +32,7 @@ def machine_wall_ns() -> int:
 
 
 def independent_clock(offset_ns: int, drift_ppm: float) -> Clock:
-    """Return a clock that only starts from the machine's wall clock."""
+    """Return a clock that is set from the machine's wall clock once, and then runs independently."""
     begin_raw_ns = read_raw_clock_ns()
     begin_wall_ns = begin_raw_ns + wall_minus_raw_ns() + offset_ns
 
@@ -59,11 +59,11 @@ def serve(address: str, port: int, clock: Clock) -> None:
 
 
 def query_offset(address: str, port: int, exchanges: int = 50) -> tuple[int, int]:
-    """Return the server's clock less this machine's, and the round trip, in ns, of the fastest exchange."""
+    """Return the server's clock minus this machine's, and the round trip (ns), of the fastest exchange."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
         client.settimeout(2)
         client.connect((address, port))
-        return min((_exchange(client) for _ in range(exchanges)), key=lambda each: each[1])
+        return min((_exchange(client) for _ in range(exchanges)), key=lambda exchange: exchange[1])
 
 
 def _exchange(client: socket.socket) -> tuple[int, int]:

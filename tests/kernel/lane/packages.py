@@ -25,7 +25,9 @@ PACKAGES = (
     "chrony",
     "can-utils",
 )
-PACKAGE_LIST = "".join(f"{package}\n" for package in (*PACKAGES, *(f"{each}/{newer.SUITE}" for each in newer.PACKAGES)))
+PACKAGE_LIST = "".join(
+    f"{package}\n" for package in (*PACKAGES, *(f"{newer_package}/{newer.SUITE}" for newer_package in newer.PACKAGES))
+)
 """The packages that a directory was unpacked from."""
 PROGRAMS = ("usr/bin", "usr/sbin", "bin", "sbin")
 LIBRARIES = ("usr/lib/x86_64-linux-gnu", "lib/x86_64-linux-gnu")
@@ -68,13 +70,13 @@ def _fetch(folder: Path) -> None:
     apt_folder = folder / "apt"
     (apt_folder / "lists" / "partial").mkdir(parents=True)
     (apt_folder / "archives" / "partial").mkdir(parents=True)
-    retrying = ("-oAPT::Sandbox::User=root", "-oAcquire::Retries=3")  # apt's own user cannot write here
-    fresh = (*retrying, f"-oDir::State::Lists={apt_folder / 'lists'}", f"-oDir::Cache={apt_folder}")
+    common_options = ("-oAPT::Sandbox::User=root", "-oAcquire::Retries=3")  # apt's own user cannot write here
+    fresh_lists = (*common_options, f"-oDir::State::Lists={apt_folder / 'lists'}", f"-oDir::Cache={apt_folder}")
     print("fetching a user-mode kernel and its tools from Debian's packages, once", file=sys.stderr, flush=True)
-    error_text = _download(folder, retrying)
+    error_text = _download(folder, common_options)
     if error_text:
-        _apt(folder, "apt-get", *fresh, "update")
-        error_text = _download(folder, fresh)
+        _apt(folder, "apt-get", *fresh_lists, "update")
+        error_text = _download(folder, fresh_lists)
     if error_text:
         raise LaneUnavailable(
             f"cannot fetch the packages ({error_text}): connect this machine to Debian's archive and try again"
@@ -82,7 +84,7 @@ def _fetch(folder: Path) -> None:
     (folder / "root").mkdir()
     for package in sorted(folder.glob("*.deb")):
         subprocess.run(["dpkg", "-x", str(package), str(folder / "root")], check=True)
-    reason = newer.fetch(folder / "root" / newer.FOLDER, _apt, fresh)
+    reason = newer.fetch(folder / "root" / newer.FOLDER, _apt, fresh_lists)
     if reason:
         print(
             f"using this release's slower kernel, because {newer.SUITE}'s is not available ({reason}); to try again: "

@@ -1,7 +1,7 @@
-"""The error that ends the lane before it begins."""
+"""The error that is raised if the lane cannot run on this machine."""
 
 from __future__ import annotations
 
 
 class LaneUnavailable(Exception):
-    """An error that the lane cannot run here; its message says what to do."""
+    """The lane cannot run on this machine; the message says what to do."""

@@ -34,8 +34,10 @@ BEFORE_SYNC = (
     "10.9.0.1,0A090001,123,[UNSPEC],00000000,Normal,0,Invalid,0,0,1,0,1.000000000,0.000000,0.000000,00000000,,"
     "0.000000000,0.000000000,0.000000000,0.000000000,0.000000000,0.00,000,000,0000,No,No,Invalid,Invalid,1,0,0,0\n"
 )
-LOCAL = "7F7F0101,,8,1795292419.031279233,0.000000000,0.000000000,0.000000000,0.000,0.000,0.000,0.0,0.0,0.0,Normal\n"
-"""Output on the server of such a pair, which has no source."""
+OWN_CLOCK = (
+    "7F7F0101,,8,1795292419.031279233,0.000000000,0.000000000,0.000000000,0.000,0.000,0.000,0.0,0.0,0.0,Normal\n"
+)
+"""Output on the server of this pair, which has no source and serves its own clock."""
 BEFORE, AFTER = Now(0, 1795292432 * NS_PER_S), Now(20_000_000, 1795292432 * NS_PER_S + 20_000_000)
 
 
@@ -43,11 +45,11 @@ def run_that_returns(completed: Completed | None) -> Run:
     return lambda _command, _timeout_s: completed
 
 
-def parsed(answer: str) -> ClockReport:
+def parse(answer: str) -> ClockReport:
     return parse_chrony("host", answer, BEFORE, AFTER)
 
 
-def changed(line: str, **fields: str) -> str:
+def with_fields(line: str, **fields: str) -> str:
     parts = line.strip().split(",")
     for name, value in fields.items():
         parts[int(name.removeprefix("field"))] = value
@@ -56,7 +58,7 @@ def changed(line: str, **fields: str) -> str:
 
 def test_correction_and_bound_of_a_slow_clock() -> None:
     """A slow clock has a positive correction; the bound is half the root delay plus the root dispersion."""
-    report = parsed(TRACKING + "\n" + NTPDATA + "\n")
+    report = parse(TRACKING + "\n" + NTPDATA + "\n")
     assert (report.host, report.source, report.correction_s) == ("host", "chrony", 0.249678716)
     assert report.bound_s == pytest.approx(0.000182228 / 2 + 0.000052372, abs=1e-12)
     assert report.status == ""
@@ -64,57 +66,57 @@ def test_correction_and_bound_of_a_slow_clock() -> None:
 
 def test_fast_clock_has_a_negative_correction() -> None:
     """A fast clock has a negative correction."""
-    assert parsed(changed(TRACKING, field4="-0.000012000")).correction_s == -0.000012
+    assert parse(with_fields(TRACKING, field4="-0.000012000")).correction_s == -0.000012
 
 
 def test_peer_data_is_reported() -> None:
     """The report has chrony's source, the last sample's path, the good samples, the polling interval and the skew."""
-    report = parsed(TRACKING + "\n" + NTPDATA + "\n")
+    report = parse(TRACKING + "\n" + NTPDATA + "\n")
     assert (report.follows, report.skew_ppm, report.poll_s, report.good_samples) == ("10.9.0.1", 3.735, 1.0, 16)
     assert (report.peer_delay_s, report.peer_dispersion_s) == (0.000245972, 0.000029085)
 
 
 def test_report_time_and_age() -> None:
     """A report is for the middle of the query; its age is measured on the corrected clock."""
-    report = parsed(TRACKING)
+    report = parse(TRACKING)
     assert (report.mono_ns, report.wall_ns - BEFORE.wall_ns, report.asking_s) == (10_000_000, 10_000_000, 0.02)
     assert report.age_s == pytest.approx(1795292432.01 + 0.249678716 - 1795292431.937353491, abs=1e-6)
 
 
 def test_without_root_peer_data_is_unknown() -> None:
     """Without root the peer data is unknown, and all else is as for root."""
-    report = parsed(WITHOUT_ROOT)
+    report = parse(WITHOUT_ROOT)
     assert report.correction_s == 0.249678716
     assert (report.peer_delay_s, report.peer_dispersion_s, report.good_samples, report.poll_s) == (None,) * 4
 
 
 def test_data_of_other_sources_is_ignored() -> None:
     """The peer data is that of the selected source, not of another source."""
-    other = changed(NTPDATA, field0="10.9.0.7", field19="0.5")
-    assert parsed(f"{TRACKING}\n{other}\n{NTPDATA}").peer_delay_s == 0.000245972
-    assert parsed(f"{TRACKING}\n{other}").peer_delay_s is None
+    other = with_fields(NTPDATA, field0="10.9.0.7", field19="0.5")
+    assert parse(f"{TRACKING}\n{other}\n{NTPDATA}").peer_delay_s == 0.000245972
+    assert parse(f"{TRACKING}\n{other}").peer_delay_s is None
 
 
 def test_local_reference_has_zero_correction() -> None:
     """A chronyd without a source that serves its own clock has correction 0 with bound 0, and a status."""
-    report = parsed(LOCAL)
+    report = parse(OWN_CLOCK)
     assert (report.correction_s, report.bound_s, report.follows) == (0.0, 0.0, "")
     assert report.status == "its own clock is the reference"
 
 
 UNSYNCHRONISED = {
     "before the first sample": BEFORE_SYNC,
-    "leap status not normal": changed(TRACKING, field13="Not synchronised"),
-    "no reference": changed(TRACKING, field0="00000000"),
-    "text for the correction": changed(TRACKING, field4="slow"),
-    "nothing for the correction": changed(TRACKING, field4=""),
-    "nan for the correction": changed(TRACKING, field4="nan"),
-    "an infinite correction": changed(TRACKING, field4="inf"),
-    "text for the root delay": changed(TRACKING, field10="?"),
-    "nan for the root delay": changed(TRACKING, field10="nan"),
-    "a negative root delay": changed(TRACKING, field10="-1.0"),
-    "a negative dispersion": changed(TRACKING, field11="-0.1"),
-    "an infinite dispersion": changed(TRACKING, field11="inf"),
+    "leap status not normal": with_fields(TRACKING, field13="Not synchronised"),
+    "no reference": with_fields(TRACKING, field0="00000000"),
+    "text for the correction": with_fields(TRACKING, field4="slow"),
+    "nothing for the correction": with_fields(TRACKING, field4=""),
+    "nan for the correction": with_fields(TRACKING, field4="nan"),
+    "an infinite correction": with_fields(TRACKING, field4="inf"),
+    "text for the root delay": with_fields(TRACKING, field10="?"),
+    "nan for the root delay": with_fields(TRACKING, field10="nan"),
+    "a negative root delay": with_fields(TRACKING, field10="-1.0"),
+    "a negative dispersion": with_fields(TRACKING, field11="-0.1"),
+    "an infinite dispersion": with_fields(TRACKING, field11="inf"),
 }
 NOT_CHRONY = {
     "empty": "",
@@ -128,20 +130,20 @@ NOT_CHRONY = {
 @pytest.mark.parametrize("case", UNSYNCHRONISED)
 def test_unsynchronised_chrony_has_no_correction(case: str) -> None:
     """An unsynchronised clock, or invalid values, give a report without correction and with that status."""
-    report = parsed(UNSYNCHRONISED[case])
+    report = parse(UNSYNCHRONISED[case])
     assert (report.correction_s, report.bound_s, report.status) == (None, None, NOT_SYNCHRONISED)
 
 
 @pytest.mark.parametrize("case", NOT_CHRONY)
 def test_chrony_not_running(case: str) -> None:
     """An answer without chrony's tracking line means that chrony does not run."""
-    report = parsed(NOT_CHRONY[case])
+    report = parse(NOT_CHRONY[case])
     assert (report.correction_s, report.bound_s, report.status) == (None, None, NOT_RUNNING)
 
 
 def test_polling_interval_below_a_second() -> None:
-    """The polling interval is two to the power that chrony reports: its value in seconds is 0 for half a second."""
-    report = parsed(TRACKING + "\n" + changed(NTPDATA, field9="-1", field10="0"))
+    """The polling interval is 2 to the power that chrony reports, because its field in whole seconds would be 0."""
+    report = parse(TRACKING + "\n" + with_fields(NTPDATA, field9="-1", field10="0"))
     assert report.poll_s == 0.5
 
 
@@ -149,9 +151,9 @@ def test_polling_interval_below_a_second() -> None:
 @pytest.mark.parametrize("value", ["", "?", "nan", "-8", "inf"])
 def test_invalid_peer_data_is_unknown(field: int, value: str) -> None:
     """An invalid or negative value of the peer data is unknown; the other values are kept."""
-    report = parsed(TRACKING + "\n" + changed(NTPDATA, **{f"field{field}": value}))
+    report = parse(TRACKING + "\n" + with_fields(NTPDATA, **{f"field{field}": value}))
     peer_data = (report.peer_delay_s, report.peer_dispersion_s, report.poll_s, report.good_samples)
-    assert sum(each is None for each in peer_data) == 1
+    assert sum(value is None for value in peer_data) == 1
     assert report.correction_s == 0.249678716
 
 
@@ -167,10 +169,10 @@ FIELDS = st.text(max_size=8)
 )
 def test_any_answer_is_parsed(answer: str) -> None:
     """No answer raises; values are finite and, except for the correction, not negative."""
-    report = parsed(answer)
+    report = parse(answer)
     assert report.correction_s is None or math.isfinite(report.correction_s)
-    for each in (report.bound_s, report.age_s, report.peer_delay_s, report.peer_dispersion_s, report.poll_s):
-        assert each is None or 0 <= each < math.inf
+    for value in (report.bound_s, report.age_s, report.peer_delay_s, report.peer_dispersion_s, report.poll_s):
+        assert value is None or 0 <= value < math.inf
 
 
 def test_one_chronyc_answers_all_queries(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,7 +19,7 @@ from lavt.transport.clock_sync.probe import (
 )
 
 TIMES = st.integers(0, LATEST_NS - 1)
-KNOWN = st.tuples(st.floats(-1e9, 1e9), st.floats(0, 1e9))
+CORRECTIONS = st.tuples(st.floats(-1e9, 1e9), st.floats(0, 1e9))
 
 
 def test_layout_of_a_request() -> None:
@@ -41,12 +41,14 @@ def test_request_round_trip(sequence: int, sent_ns: int) -> None:
         decode_reply(data)
 
 
-@given(st.integers(0, 2**32 - 1), TIMES, TIMES, TIMES, st.one_of(st.none(), KNOWN))
+@given(st.integers(0, 2**32 - 1), TIMES, TIMES, TIMES, st.one_of(st.none(), CORRECTIONS))
 def test_reply_round_trip(
-    sequence: int, sent_ns: int, one_ns: int, other_ns: int, known: tuple[float, float] | None
+    sequence: int, sent_ns: int, first_ns: int, second_ns: int, correction: tuple[float, float] | None
 ) -> None:
     """A reply is decoded as it was encoded, with and without a correction, and is not a request."""
-    reply = ProbeReply(sequence, sent_ns, min(one_ns, other_ns), max(one_ns, other_ns), *(known or (None, None)))
+    reply = ProbeReply(
+        sequence, sent_ns, min(first_ns, second_ns), max(first_ns, second_ns), *(correction or (None, None))
+    )
     data = encode_reply(reply)
     assert decode_reply(data) == reply
     with pytest.raises(BadMessage):
@@ -74,10 +76,12 @@ def test_invalid_replies_are_rejected(case: str) -> None:
         decode_reply(BAD[case])
 
 
-@pytest.mark.parametrize("known", [(math.nan, 0.1), (math.inf, 0.1), (0.1, math.nan), (0.1, -1.0), (0.1, math.inf)])
-def test_invalid_correction_is_unknown(known: tuple[float, float]) -> None:
+@pytest.mark.parametrize(
+    "correction", [(math.nan, 0.1), (math.inf, 0.1), (0.1, math.nan), (0.1, -1.0), (0.1, math.inf)]
+)
+def test_invalid_correction_is_unknown(correction: tuple[float, float]) -> None:
     """A correction or bound that is not finite, or a negative bound, makes both unknown and keeps the times."""
-    reply = decode_reply(LAYOUT.pack(b"LC", 1, 1, 1, 2, 3, 4, *known))
+    reply = decode_reply(LAYOUT.pack(b"LC", 1, 1, 1, 2, 3, 4, *correction))
     assert reply == ProbeReply(1, 2, 3, 4, None, None)
 
 
@@ -95,7 +99,7 @@ def test_any_bytes_raise_only_bad_message(data: bytes) -> None:
 def test_true_offset_is_within_half_the_round_trip(
     delta_ns: int, forward_ns: int, return_ns: int, processing_ns: int, sent_ns: int
 ) -> None:
-    """However asymmetric the path is, Delta is within half the round trip of the exchange's offset."""
+    """For any asymmetry of the path, Delta differs from the exchange's offset by at most half the round trip."""
     received_ns = sent_ns + forward_ns
     answered_ns = received_ns + processing_ns
     probe = ClockProbe(1, sent_ns, received_ns + delta_ns, answered_ns + delta_ns, answered_ns + return_ns)

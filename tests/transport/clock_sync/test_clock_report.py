@@ -17,7 +17,7 @@ from lavt.transport.clock_sync.clock_report import (
 )
 from lavt.transport.clock_sync.persistent_process import Completed
 
-ROUTES = """Main:
+FIB_TRIE = """Main:
   +-- 0.0.0.0/1 2 0 2
      +-- 10.9.0.0/24 2 0 2
         +-- 10.9.0.0/30 2 0 2
@@ -37,10 +37,10 @@ ROUTES = """Main:
            /32 link BROADCAST
 """
 """/proc/net/fib_trie of a kernel with one network card."""
-SIX = """fe80000000000000000000fffe000002 02 40 20 80     vec0
+IF_INET6 = """fe80000000000000000000fffe000002 02 40 20 80     vec0
 00000000000000000000000000000001 01 80 10 80       lo
 """
-"""Its /proc/net/if_inet6."""
+"""/proc/net/if_inet6 of the same kernel."""
 
 
 def test_kernel_identity_is_constant() -> None:
@@ -88,8 +88,8 @@ def test_answer_within_two_seconds_counts(took_ns: int, *, in_time: bool) -> Non
 
 def test_host_addresses_of_both_families(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The host's own addresses of both families are listed, without networks, broadcast addresses and loopback."""
-    (tmp_path / "four").write_text(ROUTES)
-    (tmp_path / "six").write_text(SIX)
+    (tmp_path / "four").write_text(FIB_TRIE)
+    (tmp_path / "six").write_text(IF_INET6)
     monkeypatch.setattr(clock_report, "IPV4_ROUTES", tmp_path / "four")
     monkeypatch.setattr(clock_report, "IPV6_ADDRESSES", tmp_path / "six")
     assert host_addresses() == ("10.9.0.2", "fe80::ff:fe00:2")

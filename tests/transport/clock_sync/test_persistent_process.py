@@ -15,8 +15,8 @@ from lavt.transport.clock_sync.persistent_process import NOT_FOUND, Completed, S
 
 @pytest.fixture
 def shell() -> Iterator[Shell]:
-    with closing(Shell()) as opened:
-        yield opened
+    with closing(Shell()) as persistent_shell:
+        yield persistent_shell
 
 
 def test_one_shell_runs_all_programs(shell: Shell) -> None:

@@ -49,27 +49,27 @@ MASTER = """\ta6bb40.fffe.382888-1 seq 0 RESPONSE MANAGEMENT PORT_DATA_SET
 \t\tgmPresent                  false
 \t\tgmIdentity                 a6bb40.fffe.382888
 """
-"""Output for its master."""
+"""Output of pmc for that ptp4l's master."""
 NO_PTP4L = "sending: GET PORT_DATA_SET\nsending: GET CURRENT_DATA_SET\nsending: GET TIME_STATUS_NP\n"
 """Output without a ptp4l; pmc exits with 0 even so."""
 
 
-def parsed(answer: str) -> ClockReport:
+def parse(answer: str) -> ClockReport:
     return parse_ptp("host", answer, Now(0, 10**18), Now(120_000_000, 10**18 + 120_000_000))
 
 
 def test_correction_and_bound_of_a_slave() -> None:
     """The correction is the negative of the offset from the master; the bound is the mean path delay per step."""
-    report = parsed(SLAVE)
+    report = parse(SLAVE)
     assert (report.source, report.correction_s, report.bound_s) == ("ptp", -512e-9, 2304e-9)
     assert report.follows == "a6bb40.fffe.382888"
     assert (report.mono_ns, report.asking_s) == (60_000_000, 0.12)
-    assert parsed(SLAVE.replace("stepsRemoved     1", "stepsRemoved     3")).bound_s == pytest.approx(3 * 2304e-9)
+    assert parse(SLAVE.replace("stepsRemoved     1", "stepsRemoved     3")).bound_s == pytest.approx(3 * 2304e-9)
 
 
 def test_grandmaster_has_zero_correction() -> None:
     """A grandmaster that is master on a port has correction 0 with bound 0."""
-    report = parsed(MASTER)
+    report = parse(MASTER)
     assert (report.correction_s, report.bound_s, report.follows) == (0.0, 0.0, "a6bb40.fffe.382888")
 
 
@@ -85,20 +85,20 @@ def test_grandmaster_has_zero_correction() -> None:
 )
 def test_unsynchronised_ptp4l_has_no_correction(answer: str) -> None:
     """A ptp4l that is not a master and has not measured a path to one has no correction."""
-    report = parsed(answer)
+    report = parse(answer)
     assert (report.correction_s, report.bound_s, report.status) == (None, None, NO_MASTER)
 
 
 @pytest.mark.parametrize("answer", ["", NO_PTP4L, "gmPresent true", "\x00"])
 def test_ptp4l_not_running(answer: str) -> None:
     """An answer without the data sets means that ptp4l does not run."""
-    assert parsed(answer).status == NOT_RUNNING
+    assert parse(answer).status == NOT_RUNNING
 
 
 @given(st.lists(st.tuples(st.sampled_from(SLAVE.split()), st.text(max_size=8)), max_size=20))
 def test_any_answer_is_parsed(rows: list[tuple[str, str]]) -> None:
     """No answer raises, and a bound is finite and not negative."""
-    report = parsed("\n".join(f"{name} {value}" for name, value in rows) + "\ngmIdentity x\ngmPresent true\n")
+    report = parse("\n".join(f"{name} {value}" for name, value in rows) + "\ngmIdentity x\ngmPresent true\n")
     assert report.correction_s is None or math.isfinite(report.correction_s)
     assert report.bound_s is None or 0 <= report.bound_s < math.inf
 

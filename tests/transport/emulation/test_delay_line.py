@@ -39,8 +39,8 @@ def test_delay_depends_only_on_the_index() -> None:
 def test_seeds_and_names_are_independent(other: DelayModel) -> None:
     """Another seed or another name gives independent delays."""
     delay = DelayModel(0.0, WIFI, 1, "video")
-    ours, others = (np.log([each.delay_ns(index) for index in range(5_000)]) for each in (delay, other))
-    assert abs(float(np.corrcoef(ours, others)[0, 1])) < 0.05
+    delays, other_delays = (np.log([model.delay_ns(index) for index in range(5_000)]) for model in (delay, other))
+    assert abs(float(np.corrcoef(delays, other_delays)[0, 1])) < 0.05
 
 
 def test_consecutive_indices_are_independent() -> None:
@@ -54,7 +54,7 @@ def test_constant_does_not_change_the_jitter() -> None:
     """Under another condition the constant changes and the jitter stays the same, so that runs are paired."""
     without, delayed = DelayModel(0.0, WIFI, 1, "video"), DelayModel(75.0, WIFI, 1, "video")
     differences_ns = {delayed.delay_ns(index) - without.delay_ns(index) for index in range(200)}
-    assert max(abs(each - 75 * NS_PER_MS) for each in differences_ns) <= 1
+    assert max(abs(difference_ns - 75 * NS_PER_MS) for difference_ns in differences_ns) <= 1
 
 
 @given(
@@ -62,21 +62,21 @@ def test_constant_does_not_change_the_jitter() -> None:
     st.integers(0, 3),
 )
 def test_items_leave_in_order(arrivals: list[tuple[int, int]], seed: int) -> None:
-    """Every item leaves a line once, in order, when `push` said, and never before its delay has passed."""
+    """Every item leaves a line once, in order, at the time that `push` returned, and not before its delay is over."""
     delay = DelayModel(5.0, WIFI, seed, "line")
     line = DelayLine(delay)
     now_ns = 0
     due: list[int] = []
-    least: list[int] = []
+    earliest: list[int] = []
     for number, (pause_ns, index) in enumerate(arrivals):
         now_ns += pause_ns
         due_ns = line.push(number, now_ns, index)
         assert due_ns is not None
         due.append(due_ns)
-        least.append(now_ns + delay.delay_ns(index))
+        earliest.append(now_ns + delay.delay_ns(index))
     assert due == sorted(due)
-    assert all(a >= b for a, b in zip(due, least, strict=True))
-    assert due == np.maximum.accumulate(np.array(least, dtype=np.int64)).tolist()
+    assert all(due_ns >= earliest_ns for due_ns, earliest_ns in zip(due, earliest, strict=True))
+    assert due == np.maximum.accumulate(np.array(earliest, dtype=np.int64)).tolist()
     out = []
     while (next_ns := line.next_due_ns()) is not None:
         assert line.pop_due(next_ns - 1) == []

@@ -22,7 +22,7 @@ TIMEOUT_S = 5.0
 """How long a test waits for a datagram that must arrive."""
 VIDEO_MS, CONTROL_MS = 75.0, 40.0
 CHALLENGE = b"LAVT challenge"
-END_MARKER = b"that was all"
+END_MARKER = b"end of the datagrams"
 
 
 class UdpEnd:
@@ -52,11 +52,11 @@ class UdpEnd:
         return datagrams
 
     def receives_nothing(self) -> bool:
-        """Return whether no datagram has arrived so far."""
+        """Return whether no datagram has arrived since the last call of `received`."""
         return not self.received()
 
 
-class Net:
+class RelayNetwork:
     """A relay with a manual clock between one server and any number of clients."""
 
     def __init__(self, **delays: Any) -> None:
@@ -69,7 +69,7 @@ class Net:
             **{"video": DelayConfig(constant_ms=VIDEO_MS), "control": DelayConfig(constant_ms=CONTROL_MS), **delays},
         )
         self.relay = Relay(self.clock, flows(config))
-        self.at = {name: ("127.0.0.1", port) for name, port in self.relay.ports().items()}
+        self.relay_addresses = {name: ("127.0.0.1", port) for name, port in self.relay.ports().items()}
 
     def end(self) -> UdpEnd:
         """Open a socket that the net closes."""
@@ -88,13 +88,13 @@ class Net:
     def connect(self, flow: str) -> tuple[UdpEnd, tuple[str, int]]:
         """Open a client of a flow; return it and its address at the server."""
         client = self.end()
-        client.send(b"hello", self.at[flow])
+        client.send(b"hello", self.relay_addresses[flow])
         self.step()
         if flow == "control":
             self.advance(CONTROL_MS)
-        datagram, client_at = self.server[flow].receive()
+        datagram, address_at_server = self.server[flow].receive()
         assert datagram == b"hello"
-        return client, ("127.0.0.1", client_at[1])
+        return client, ("127.0.0.1", address_at_server[1])
 
     def close(self) -> None:
         """Close everything."""
@@ -104,10 +104,10 @@ class Net:
 
 
 @pytest.fixture
-def net() -> Iterator[Net]:
+def net() -> Iterator[RelayNetwork]:
     """A relay that delays video by 75 ms and control by 40 ms, and not the state."""
-    with closing(Net()) as opened:
-        yield opened
+    with closing(RelayNetwork()) as network:
+        yield network
 
 
 def rtp(timestamp: int, sequence: int = 0) -> bytes:
@@ -119,23 +119,23 @@ def sender_report() -> bytes:
 
 
 @pytest.mark.parametrize("datagram", [rtp(9000), sender_report()], ids=["RTP", "sender report"])
-def test_video_is_delayed(net: Net, datagram: bytes) -> None:
+def test_video_is_delayed(net: RelayNetwork, datagram: bytes) -> None:
     """RTP and sender reports to the client are sent exactly when their delay has passed."""
-    client, client_at = net.connect("video")
-    net.server["video"].send(datagram, client_at)
+    client, address_at_server = net.connect("video")
+    net.server["video"].send(datagram, address_at_server)
     net.step()
     assert client.receives_nothing()
     net.advance(VIDEO_MS - 0.001)
     assert client.receives_nothing()
     net.advance(0.001)
-    assert client.receive() == (datagram, net.at["video"])
+    assert client.receive() == (datagram, net.relay_addresses["video"])
 
 
-def test_challenges_are_not_delayed(net: Net) -> None:
+def test_challenges_are_not_delayed(net: RelayNetwork) -> None:
     """A challenge of path validation passes inline and overtakes delayed video."""
-    client, client_at = net.connect("video")
+    client, address_at_server = net.connect("video")
     for datagram in (rtp(9000), CHALLENGE):
-        net.server["video"].send(datagram, client_at)
+        net.server["video"].send(datagram, address_at_server)
         net.step()
     assert client.receive()[0] == CHALLENGE
     assert client.receives_nothing()
@@ -144,18 +144,18 @@ def test_challenges_are_not_delayed(net: Net) -> None:
 
 
 @pytest.mark.parametrize("datagram", [b"L hello", struct.pack(">BBHI", 0x81, 201, 1, 1), rtp(1), b"\xff"])
-def test_video_upstream_is_not_delayed(net: Net, datagram: bytes) -> None:
+def test_video_upstream_is_not_delayed(net: RelayNetwork, datagram: bytes) -> None:
     """Hellos, RTCP and all else that the client sends on the video's flow pass inline."""
     client, _ = net.connect("video")
-    client.send(datagram, net.at["video"])
+    client.send(datagram, net.relay_addresses["video"])
     net.step()
     assert net.server["video"].receive()[0] == datagram
 
 
-def test_control_is_delayed(net: Net) -> None:
+def test_control_is_delayed(net: RelayNetwork) -> None:
     """Datagrams from the client's router are delayed by the control delay."""
     client, _ = net.connect("control")
-    client.send(b"command", net.at["control"])
+    client.send(b"command", net.relay_addresses["control"])
     net.step()
     net.advance(CONTROL_MS - 0.001)
     assert net.server["control"].receives_nothing()
@@ -163,19 +163,19 @@ def test_control_is_delayed(net: Net) -> None:
     assert net.server["control"].receive()[0] == b"command"
 
 
-def test_state_is_not_delayed(net: Net) -> None:
+def test_state_is_not_delayed(net: RelayNetwork) -> None:
     """Datagrams from the server's router pass inline."""
-    client, client_at = net.connect("control")
-    net.server["control"].send(b"state", client_at)
+    client, address_at_server = net.connect("control")
+    net.server["control"].send(b"state", address_at_server)
     net.step()
-    assert client.receive() == (b"state", net.at["control"])
+    assert client.receive() == (b"state", net.relay_addresses["control"])
 
 
 def test_state_is_delayed_where_configured() -> None:
-    """With a delay of its own the state is delayed by that, and not by the control delay."""
-    with closing(Net(state=DelayConfig(constant_ms=VIDEO_MS))) as net:
-        client, client_at = net.connect("control")
-        net.server["control"].send(b"state", client_at)
+    """If the state has its own delay, it is delayed by this and not by the control delay."""
+    with closing(RelayNetwork(state=DelayConfig(constant_ms=VIDEO_MS))) as net:
+        client, address_at_server = net.connect("control")
+        net.server["control"].send(b"state", address_at_server)
         net.step()
         net.advance(VIDEO_MS - 0.001)
         assert client.receives_nothing()
@@ -183,11 +183,11 @@ def test_state_is_delayed_where_configured() -> None:
         assert client.receive()[0] == b"state"
 
 
-def test_each_client_has_its_own_address(net: Net) -> None:
+def test_each_client_has_its_own_address(net: RelayNetwork) -> None:
     """The server sees each client at an address of its own, and each client receives only its own datagrams."""
-    (one, one_at), (two, two_at) = net.connect("video"), net.connect("video")
-    assert one_at != two_at
-    for datagram, to in ((b"for one", one_at), (b"for two", two_at)):
+    (one, one_address), (two, two_address) = net.connect("video"), net.connect("video")
+    assert one_address != two_address
+    for datagram, to in ((b"for one", one_address), (b"for two", two_address)):
         net.server["video"].send(datagram, to)
         net.step()
     assert (one.receive()[0], two.receive()[0]) == (b"for one", b"for two")
@@ -195,11 +195,11 @@ def test_each_client_has_its_own_address(net: Net) -> None:
     assert two.receives_nothing()
 
 
-def test_datagrams_not_from_the_server_are_ignored(net: Net) -> None:
+def test_datagrams_not_from_the_server_are_ignored(net: RelayNetwork) -> None:
     """A datagram to a client's upstream socket is ignored unless it comes from the server."""
-    client, client_at = net.connect("video")
+    client, address_at_server = net.connect("video")
     for sender, datagram in ((net.end(), b"stolen"), (net.server["control"], b"wrong"), (net.server["video"], b"true")):
-        sender.send(datagram, client_at)
+        sender.send(datagram, address_at_server)
         net.step()
     assert client.receive()[0] == b"true"
     assert client.receives_nothing()
@@ -208,11 +208,11 @@ def test_datagrams_not_from_the_server_are_ignored(net: Net) -> None:
 def test_packets_of_a_frame_share_a_delay() -> None:
     """All packets of a frame share a delay, and a frame with a shorter delay waits for the frame before it."""
     delay = DelayConfig(constant_ms=10.0, jitter_median_ms=12.0, jitter_sigma=0.668)
-    with closing(Net(video=delay)) as net:
-        client, client_at = net.connect("video")
+    with closing(RelayNetwork(video=delay)) as net:
+        client, address_at_server = net.connect("video")
         sent = [rtp(timestamp, sequence) for timestamp in range(0, 60_000, 3_000) for sequence in range(3)]
         for datagram in sent:
-            net.server["video"].send(datagram, client_at)
+            net.server["video"].send(datagram, address_at_server)
             net.step()
         batches = []
         for _ in range(3_000):
@@ -224,16 +224,16 @@ def test_packets_of_a_frame_share_a_delay() -> None:
     assert all(len(batch) % 3 == 0 for batch in batches)
 
 
-def test_any_bytes_pass_unchanged(net: Net) -> None:
+def test_any_bytes_pass_unchanged(net: RelayNetwork) -> None:
     """Datagrams of any bytes and length pass unchanged; only their first bits decide whether they are delayed."""
-    client, client_at = net.connect("video")
+    client, address_at_server = net.connect("video")
     generator = stream(1, "garbage")
     up = [b"", b"\x80", bytes(65_000), *(generator.bytes(int(generator.integers(1, 60))) for _ in range(300))]
     for datagram in up:
-        client.send(datagram, net.at["video"])
+        client.send(datagram, net.relay_addresses["video"])
         net.step()
         assert net.server["video"].receive()[0] == datagram
-        net.server["video"].send(datagram, client_at)
+        net.server["video"].send(datagram, address_at_server)
         net.step()
         if len(datagram) >= 2 and datagram[0] >> 6 == 2:
             assert client.receives_nothing()
@@ -241,12 +241,12 @@ def test_any_bytes_pass_unchanged(net: Net) -> None:
         assert client.receive()[0] == datagram
 
 
-def test_relay_reports_the_measured_delays(net: Net) -> None:
+def test_relay_reports_the_measured_delays(net: RelayNetwork) -> None:
     """The relay reports the measured median delay of each flow and direction, None where nothing passed."""
     assert set(net.relay.held_ms().values()) == {None}
-    client, client_at = net.connect("video")
+    client, address_at_server = net.connect("video")
     for late_ms in (2.0, 7.0, 30.0):
-        net.server["video"].send(rtp(1), client_at)
+        net.server["video"].send(rtp(1), address_at_server)
         net.step()
         net.advance(VIDEO_MS + late_ms)
         client.receive()
@@ -258,18 +258,19 @@ def test_relay_reports_the_measured_delays(net: Net) -> None:
     }
 
 
-def send_through(net: Net, impairments: LinkConfig, count: int, period_ms: float) -> list[tuple[int, float]]:
+def send_through(net: RelayNetwork, impairments: LinkConfig, count: int, period_ms: float) -> list[tuple[int, float]]:
     """Send numbered packets through a net at a period; return the number and the arrival time of each that arrived."""
-    client, client_at = net.connect("video")
+    client, address_at_server = net.connect("video")
     arrived, begin_ns = [], net.clock.mono_ns
-    steps_a_period = round(period_ms * 2)
-    for step in range(count * steps_a_period + round(2 * (impairments.delay_ms + 8 * impairments.jitter_ms)) + 400):
-        number, rest = divmod(step, steps_a_period)
+    steps_per_period = round(period_ms * 2)
+    for step in range(count * steps_per_period + round(2 * (impairments.delay_ms + 8 * impairments.jitter_ms)) + 400):
+        number, rest = divmod(step, steps_per_period)
         if rest == 0 and number < count:
-            net.server["video"].send(rtp(3000 * number, number), client_at)
+            net.server["video"].send(rtp(3000 * number, number), address_at_server)
             net.step()
         arrived += [
-            (int.from_bytes(each[2:4], "big"), (net.clock.mono_ns - begin_ns) / NS_PER_MS) for each in client.received()
+            (int.from_bytes(datagram[2:4], "big"), (net.clock.mono_ns - begin_ns) / NS_PER_MS)
+            for datagram in client.received()
         ]
         net.advance(0.5)
     return arrived
@@ -291,7 +292,7 @@ LINKS = {
 def test_relay_follows_the_link_model(name: str) -> None:
     """The relay loses, delays and counts packets exactly as the model of the link."""
     impairments = LINKS[name]
-    with closing(Net(video=DelayConfig(link=impairments))) as net:
+    with closing(RelayNetwork(video=DelayConfig(link=impairments))) as net:
         requested = injected(
             "video", impairments.delay_ms, ImpairmentConfig(**impairments.model_dump(exclude={"delay_ms"})), 1
         )
@@ -300,11 +301,16 @@ def test_relay_follows_the_link_model(name: str) -> None:
         arrived = send_through(net, impairments, count := 60, 10.0)
         counts = net.relay.counts()
         late_ms = net.relay.late_ms()["video downstream"]
-    left = [model.departure_ns(round(10 * NS_PER_MS * number), 0, len(rtp(0))) for number in range(count)]
+    departures_ns = [model.departure_ns(round(10 * NS_PER_MS * number), 0, len(rtp(0))) for number in range(count)]
     # This test steps the relay every half millisecond.
-    expected = sorted((each, number) for number, each in enumerate(left) if each is not None)
+    expected = sorted(
+        (departed_ns, number) for number, departed_ns in enumerate(departures_ns) if departed_ns is not None
+    )
     assert [number for number, _ in arrived] == [number for _, number in expected]
-    assert all(0 <= at - each_ns / NS_PER_MS <= 0.5 for (_, at), (each_ns, _) in zip(arrived, expected, strict=True))
+    assert all(
+        0 <= arrived_ms - expected_ns / NS_PER_MS <= 0.5
+        for (_, arrived_ms), (expected_ns, _) in zip(arrived, expected, strict=True)
+    )
     assert counts == {"video downstream": model.counts}
     assert late_ms is not None
     assert 0 <= late_ms <= 0.5
@@ -312,10 +318,10 @@ def test_relay_follows_the_link_model(name: str) -> None:
 
 def test_control_loss_has_the_configured_share() -> None:
     """Upstream control loses about the configured share of its datagrams, and the counters agree."""
-    with closing(Net(control=DelayConfig(link=LinkConfig(loss=0.5)))) as net:
+    with closing(RelayNetwork(control=DelayConfig(link=LinkConfig(loss=0.5)))) as net:
         client = net.end()
         for number in range(200):
-            client.send(bytes([number]), net.at["control"])
+            client.send(bytes([number]), net.relay_addresses["control"])
             net.step()
         arrived = net.server["control"].received()
         counts = net.relay.counts()["control upstream"]
@@ -327,11 +333,11 @@ def test_control_loss_has_the_configured_share() -> None:
 
 def test_each_client_has_its_own_link() -> None:
     """The losses of one client do not depend on what other clients are sent."""
-    with closing(Net(video=DelayConfig(link=LinkConfig(loss=0.3)))) as net:
+    with closing(RelayNetwork(video=DelayConfig(link=LinkConfig(loss=0.3)))) as net:
         clients = [net.connect("video") for _ in range(2)]
         for number in range(100):
-            for _, client_at in clients:
-                net.server["video"].send(rtp(1, number), client_at)
+            for _, address_at_server in clients:
+                net.server["video"].send(rtp(1, number), address_at_server)
                 net.step()
         one, two = (client.received() for client, _ in clients)
     assert one == two
@@ -355,11 +361,11 @@ def test_invalid_links_are_rejected(link: LinkConfig, message: str) -> None:
 
 def test_counters_include_former_clients() -> None:
     """The counters of a flow include clients that the relay has removed."""
-    with closing(Net(control=DelayConfig(link=LinkConfig(loss=0.5)))) as net:
+    with closing(RelayNetwork(control=DelayConfig(link=LinkConfig(loss=0.5)))) as net:
         for _ in range(2):
             client = net.end()
             for number in range(40):
-                client.send(bytes([number]), net.at["control"])
+                client.send(bytes([number]), net.relay_addresses["control"])
                 net.step()
             net.advance(31_000)
         arrived = len(net.server["control"].received())
@@ -368,16 +374,16 @@ def test_counters_include_former_clients() -> None:
     assert counts["lost"] == 80 - arrived > 0
 
 
-def test_idle_client_is_removed(net: Net) -> None:
+def test_idle_client_is_removed(net: RelayNetwork) -> None:
     """A client idle for half a minute loses its socket when another connects, and gets a new one when it sends."""
-    client, client_at = net.connect("video")
+    client, address_at_server = net.connect("video")
     net.advance(31_000)
     net.connect("video")
-    client.send(b"again", net.at["video"])
+    client.send(b"again", net.relay_addresses["video"])
     net.step()
-    datagram, now_at = net.server["video"].receive()
+    datagram, new_address = net.server["video"].receive()
     assert datagram == b"again"
-    assert now_at[1] != client_at[1]
+    assert new_address[1] != address_at_server[1]
 
 
 def test_port_in_use_is_rejected() -> None:

@@ -17,17 +17,17 @@ MS = NS_PER_MS
 
 
 def test_capacity_repeats() -> None:
-    """A capacity trace repeats after its last time; the first opportunity at or after a time may be at that time."""
+    """A capacity trace repeats after its last time; `first_at` returns the first opportunity at a time or after it."""
     trace = parse_mahimahi("1\n5\n5\n10\n", "t")
     assert [trace.time_ns(number) // MS for number in range(10)] == [1, 5, 5, 10, 11, 15, 15, 20, 21, 25]
-    firsts = {0: 0, 1: 0, 2: 1, 5: 1, 6: 3, 10: 3, 11: 4, 15: 5, 16: 7, 20: 7, 21: 8}
-    assert {time_ms: trace.first_at(time_ms * MS) for time_ms in firsts} == firsts
+    first_opportunities = {0: 0, 1: 0, 2: 1, 5: 1, 6: 3, 10: 3, 11: 4, 15: 5, 16: 7, 20: 7, 21: 8}
+    assert {time_ms: trace.first_at(time_ms * MS) for time_ms in first_opportunities} == first_opportunities
 
 
 @given(st.lists(st.integers(0, 30), min_size=1, max_size=8), st.integers(0, 200 * MS))
 def test_first_opportunity_is_the_earliest(times_ms: list[int], time_ns: int) -> None:
     """For any trace and time, no earlier opportunity is at or after that time."""
-    trace = CapacityTrace(tuple(each * MS for each in (*sorted(times_ms), 31)))
+    trace = CapacityTrace(tuple(time_ms * MS for time_ms in (*sorted(times_ms), 31)))
     first = trace.first_at(time_ns)
     assert trace.time_ns(first) >= time_ns
     assert first == 0 or trace.time_ns(first - 1) < time_ns
@@ -99,9 +99,9 @@ def test_any_text_raises_only_user_errors(text: str) -> None:
 def test_shipped_traces_match_their_script() -> None:
     """The shipped traces are the output of their script, and are found by name without a path."""
     folder = shipped(TRACES)
-    made = runpy.run_path(str(folder / "make_traces.py"))
-    assert (folder / "fading.mahimahi").read_text() == made["fading"]()
-    assert (folder / "handover.csv").read_text() == made["handover"]()
+    script = runpy.run_path(str(folder / "make_traces.py"))
+    assert (folder / "fading.mahimahi").read_text() == script["fading"]()
+    assert (folder / "handover.csv").read_text() == script["handover"]()
     fading, handover = read_trace("fading.mahimahi"), read_trace("handover.csv")
     assert isinstance(fading, CapacityTrace)
     assert isinstance(handover, DelayTrace)

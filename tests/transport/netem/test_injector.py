@@ -22,7 +22,7 @@ TIMEOUT_S = 10.0
 
 
 class FakeQueues:
-    """A fake for the kernel's queues, which `tests/kernel` tests."""
+    """A fake for the kernel's queues; `tests/kernel` tests the real ones."""
 
     def __init__(self, failure: Exception | None = None, problems: tuple[str, ...] = ()) -> None:
         self.calls: list[Any] = []
@@ -84,8 +84,8 @@ def execute(queues: FakeQueues | None, *orders: InjectionOrder) -> list[Injectio
     return answers
 
 
-def test_repeated_order_is_only_measured() -> None:
-    """An order is applied and verified once, and measured when repeated; no flows, and closing, clear the interface."""
+def test_repeated_order_is_measured_only() -> None:
+    """An order is applied and verified once, and measured when repeated; no flows, or closing, clear the interface."""
     queues = FakeQueues()
     results = execute(
         queues, InjectionOrder(1, "L2", (VIDEO,)), InjectionOrder(1, "L2", (VIDEO,)), InjectionOrder(2, "", ())
@@ -95,8 +95,14 @@ def test_repeated_order_is_only_measured() -> None:
     assert results[1].problems.startswith("its jitter has stopped; ")
     assert "NTP: no packet came through" in results[1].problems
     assert results[2] == InjectionResult(2, "", "", ())
-    both = ((VIDEO,), (PROBE,))
-    assert queues.calls == [("L2", *both), ("verify", *both, 10), ("measure", *both, 10), "clear", "clear"]
+    flows_and_exempt = ((VIDEO,), (PROBE,))
+    assert queues.calls == [
+        ("L2", *flows_and_exempt),
+        ("verify", *flows_and_exempt, 10),
+        ("measure", *flows_and_exempt, 10),
+        "clear",
+        "clear",
+    ]
 
 
 def test_failure_is_reported_and_the_next_order_executed() -> None:

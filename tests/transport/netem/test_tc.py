@@ -80,7 +80,7 @@ QDISCS = json.dumps(
         },
     ]
 )
-FREE = '[{"kind":"noqueue","handle":"0:","root":true,"refcnt":2,"options":{}}]'
+NO_QDISC = '[{"kind":"noqueue","handle":"0:","root":true,"refcnt":2,"options":{}}]'
 FILTERS = """filter protocol ip pref 1 u32 chain 0
 filter protocol ip pref 1 u32 chain 0 fh 800: ht divisor 1
 filter protocol ip pref 1 u32 chain 0 fh 800::800 order 2048 key ht 800 bkt 0 *flowid 4c56:4 not_in_hw
@@ -97,10 +97,10 @@ filter protocol ipv6 pref 2 u32 chain 0 fh 801::800 order 2048 key ht 801 bkt 0 
 
 
 def test_commands_of_a_condition() -> None:
-    """L4 with delayed state on one machine is three netems behind a prio with six bands, and two filters for each."""
+    """L4 with delayed state on one machine is a prio with six bands and three netems, each with two filters."""
     flows = netem_flows(condition("L4"), "both", video_port=5600, control_port=7448, state_delay="with_video")
     ip = "u32 match u8 0x45 0xff at 0 match u16 0x0000 0x1fff at 6"
-    assert [as_typed(each) for each in first_commands("eth0", flows)] == [
+    assert [as_typed(command) for command in first_commands("eth0", flows)] == [
         "tc qdisc add dev eth0 root handle 4c56: prio bands 6",
         "tc qdisc add dev eth0 parent 4c56:4 handle 4c01: netem limit 10000 delay 150ms rate 10gbit",
         f"tc filter add dev eth0 parent 4c56: protocol ip prio 1 {ip} match ip protocol 17 0xff "
@@ -135,7 +135,7 @@ def test_commands_of_a_condition() -> None:
     ],
 )
 def test_netem_arguments_of_an_impairment(impairment: Impairment, arguments: str) -> None:
-    """Each impairment has these arguments, always with limit, delay and rate, since a change keeps omitted ones."""
+    """Each impairment has these arguments, always with limit, delay and rate, because a change keeps omitted ones."""
     assert " ".join(netem_arguments(impairment)) == f"netem limit 10000 {arguments}"
 
 
@@ -145,7 +145,7 @@ def test_queue_limit_grows_with_the_delay() -> None:
     assert netem_arguments(Impairment(4_900))[:3] == ["netem", "limit", "10000"]
 
 
-def test_uniform_jitter_uses_a_table_of_ours() -> None:
+def test_uniform_jitter_uses_the_table_of_lavt() -> None:
     """Uniform jitter uses LAVT's table: without a table a change would keep the previous one."""
     command = set_impairment(
         "lo", "video", Impairment(75, 10, jitter_distribution="uniform"), verb="change", tables="/run/lavt"
@@ -154,22 +154,22 @@ def test_uniform_jitter_uses_a_table_of_ours() -> None:
     assert command[-5:-2] == ["10ms", "distribution", "uniform"]
 
 
-def options_of(arguments: list[str]) -> dict[str, Any]:
-    """Return what tc reports for a netem with these arguments: a small model of tc."""
+def tc_options(arguments: list[str]) -> dict[str, Any]:
+    """Return the options that tc reports for a netem with these arguments, as a small model of tc does."""
     text = " ".join(arguments[3:])
     numbers = [float(word.rstrip("%gmbits")) for word in arguments if word[0].isdigit()]
     options: dict[str, Any] = {"limit": int(arguments[2]), "gap": 0}
-    rest = iter(numbers[1:])
-    options["delay"] = {"delay": next(rest) / 1000, "jitter": 0.0}
+    remaining_numbers = iter(numbers[1:])
+    options["delay"] = {"delay": next(remaining_numbers) / 1000, "jitter": 0.0}
     if "distribution" in text:
-        options["delay"]["jitter"] = next(rest) / 1000
+        options["delay"]["jitter"] = next(remaining_numbers) / 1000
     if "random" in text:
-        options["loss-random"] = {"loss": next(rest) / 100}
+        options["loss-random"] = {"loss": next(remaining_numbers) / 100}
     if "gemodel" in text:
-        options["loss-gemodel"] = {"p": next(rest) / 100, "r": next(rest) / 100}
+        options["loss-gemodel"] = {"p": next(remaining_numbers) / 100, "r": next(remaining_numbers) / 100}
     if "reorder" in text:
-        options |= {"reorder": {"reorder": next(rest) / 100}, "gap": 1}
-    options["rate"] = {"rate": 1_250_000_000 if text.endswith("10gbit") else int(next(rest)) // 8}
+        options |= {"reorder": {"reorder": next(remaining_numbers) / 100}, "gap": 1}
+    options["rate"] = {"rate": 1_250_000_000 if text.endswith("10gbit") else int(next(remaining_numbers)) // 8}
     return options
 
 
@@ -186,27 +186,27 @@ IMPAIRMENTS = st.builds(
 
 
 @given(IMPAIRMENTS)
-def test_any_impairment_is_read_back(impairment: Impairment) -> None:
+def test_any_impairment_is_parsed_back(impairment: Impairment) -> None:
     """Tc's report of a netem with the arguments of an impairment does not differ from that impairment."""
-    options = options_of(netem_arguments(impairment))
+    options = tc_options(netem_arguments(impairment))
     reported = [Qdisc("prio", "4c56:", "root", {}, 0), Qdisc("netem", "4c01:", "4c56:4", options, 0)]
     flow = ImpairedFlow("video", "udp", 5600, "source", impairment)
-    assert difference(flow, reported, [expected_filter(each) for each in filters(flow)]) == []
+    assert difference(flow, reported, [expected_filter(tc_filter) for tc_filter in filters(flow)]) == []
     if impairment.loss and impairment.loss_burst_packets > 1:
         assert parse_impairment(options).loss_burst_packets == pytest.approx(impairment.loss_burst_packets, rel=1e-3)
 
 
 def test_output_of_tc_is_parsed() -> None:
     """Qdiscs in JSON and filters in text, as iproute2 6.1 prints them, are parsed and match the request."""
-    qdiscs, found = parse_qdiscs(QDISCS), parse_filters(FILTERS)
+    qdiscs, parsed_filters = parse_qdiscs(QDISCS), parse_filters(FILTERS)
 
-    assert [(each.kind, each.handle, each.parent, each.waiting_packets) for each in qdiscs] == [
+    assert [(qdisc.kind, qdisc.handle, qdisc.parent, qdisc.waiting_packets) for qdisc in qdiscs] == [
         ("prio", "4c56:", "root", 0),
         ("netem", "4c01:", "4c56:4", 7),
     ]
     assert parse_impairment(qdiscs[1].options) == Impairment(150)
-    assert found == [expected_filter(each) for each in filters(VIDEO)]
-    assert difference(VIDEO, qdiscs, found) == []
+    assert parsed_filters == [expected_filter(tc_filter) for tc_filter in filters(VIDEO)]
+    assert difference(VIDEO, qdiscs, parsed_filters) == []
 
 
 @pytest.mark.parametrize(
@@ -296,7 +296,7 @@ def test_flows_on_exempt_ports_are_rejected(flows: list[ImpairedFlow], message: 
 class FakeTc:
     """A tc that reports what a test defines and records its commands."""
 
-    def __init__(self, qdiscs: str = FREE, filters: str = "") -> None:
+    def __init__(self, qdiscs: str = NO_QDISC, filters: str = "") -> None:
         self.qdiscs, self.filters, self.commands = qdiscs, filters, list[str]()
         self.rejects: Callable[[Command], bool] = lambda _command: False
 
@@ -321,7 +321,7 @@ def test_change_runs_only_the_necessary_commands(tmp_path: Path) -> None:
     assert first_change == [
         "tc qdisc change dev eth0 parent 4c56:4 handle 4c01: netem limit 10000 delay 30ms rate 10gbit"
     ]
-    assert [each.split(" u32")[0] for each in tc.commands[1:]] == [
+    assert [command.split(" u32")[0] for command in tc.commands[1:]] == [
         "tc qdisc change dev eth0 parent 4c56:4 handle 4c01: netem limit 10000 delay 0ms rate 10gbit",
         "tc qdisc add dev eth0 parent 4c56:5 handle 4c02: netem limit 10000 delay 75ms rate 10gbit",
         "tc filter del dev eth0 parent 4c56: protocol ip prio 1",
@@ -343,8 +343,8 @@ def test_failed_first_application_is_undone(tmp_path: Path) -> None:
     assert netem.applied() is None
 
 
-def test_foreign_root_is_rejected(tmp_path: Path) -> None:
-    """A root with a foreign handle is rejected before any command runs."""
+def test_foreign_root_qdisc_is_rejected(tmp_path: Path) -> None:
+    """A root qdisc with a foreign handle is rejected before any command runs."""
     tc = FakeTc('[{"kind":"fq_codel","handle":"8001:","root":true}]')
     netem = NetemInterface("eth0", directory=tmp_path, run=tc)
     calls: list[Callable[[], object]] = [lambda: netem.apply([VIDEO]), lambda: netem.clear(any_owner=True), netem.check]
@@ -493,9 +493,9 @@ def test_correlated_jitter_has_its_correlation_and_repeats() -> None:
         return values
 
     values = walk(3)
-    correlation = sum(a * b for a, b in pairwise(values)) / sum(a * a for a in values)
+    correlation = sum(earlier * later for earlier, later in pairwise(values)) / sum(value**2 for value in values)
     assert abs(correlation - 0.9) < 0.03
-    assert 0.8 < sum(a * a for a in values) / 4000 < 1.2
+    assert 0.8 < sum(value**2 for value in values) / 4000 < 1.2
     assert walk(3) == values
     assert walk(4) != values
 
@@ -568,7 +568,7 @@ def test_verification_reports_stopped_jitter(tmp_path: Path, monkeypatch: pytest
 def test_probes_of_a_condition() -> None:
     """The probes for L4 are its flows, the challenges, the other directions, NTP, ssh and the clock probe."""
     requested = probes([VIDEO, CONTROL], [ExemptPort("udp", 5602, "the clock probe")])
-    assert [(each.name, each.source, each.destination, each.impairment.delay_ms) for each in requested] == [
+    assert [(probe.name, probe.source, probe.destination, probe.impairment.delay_ms) for probe in requested] == [
         ("video", 5600, 9, 150),
         ("control", 9, 7448, 75),
         ("video, other direction", 9, 5600, 0),
@@ -583,22 +583,24 @@ def test_probes_of_a_condition() -> None:
 def test_measured_frames_are_summarized() -> None:
     """Lost, reordered and early frames are counted, and the delays are those of the delayed frames."""
     delays = [(0, 75.0), (1, 75.2), (3, 75.1), (2, 75.3), (9, 0.1), (4, 75.0), (5, 75.0), (6, 75.0), (7, 75.0)]
-    found = summarize(Impairment(75, reorder=0.25), 10, delays)
+    result = summarize(Impairment(75, reorder=0.25), 10, delays)
 
-    assert (found.sent, found.lost, found.early) == (10, 1, 1)
-    assert found.reordered == 5
-    assert found.median_ms == 75.0
+    assert (result.sent, result.lost, result.early) == (10, 1, 1)
+    assert result.reordered == 5
+    assert result.median_ms == 75.0
     assert summarize(Impairment(), 10, []) == ProbeResult(10, 10, 0, 0, None, None, None)
 
 
 AS_REQUESTED = {
-    each.name: ProbeResult(50, 0, 0, 0, each.impairment.delay_ms, each.impairment.delay_ms, each.impairment.delay_ms)
-    for each in probes([VIDEO])
+    probe.name: ProbeResult(
+        50, 0, 0, 0, probe.impairment.delay_ms, probe.impairment.delay_ms, probe.impairment.delay_ms
+    )
+    for probe in probes([VIDEO])
 }
 
 
 @pytest.mark.parametrize(
-    ("impairment", "name", "found", "message"),
+    ("impairment", "name", "measured", "message"),
     [
         (Impairment(150), "video", ProbeResult(50, 0, 0, 0, 148.0, 148.5, 149.0), "delayed by 148.50 ms"),
         (
@@ -645,7 +647,7 @@ AS_REQUESTED = {
     ],
 )
 def test_each_measured_difference_is_reported(
-    impairment: Impairment, name: str, found: ProbeResult, message: str
+    impairment: Impairment, name: str, measured: ProbeResult, message: str
 ) -> None:
     """Each quantity that differs from the request is reported once, and the others are not."""
     flow = ImpairedFlow("video", "udp", 5600, "source", impairment)
@@ -658,7 +660,7 @@ def test_each_measured_difference_is_reported(
         150.0,
         160.0,
     )
-    reasons = judge([flow], [], {**AS_REQUESTED, "video": good, name: found})
+    reasons = judge([flow], [], {**AS_REQUESTED, "video": good, name: measured})
 
     assert len(reasons) == 1
     assert message in reasons[0]
@@ -666,7 +668,7 @@ def test_each_measured_difference_is_reported(
 
 
 @pytest.mark.parametrize(
-    ("impairment", "found"),
+    ("impairment", "measured"),
     [
         (Impairment(150, loss=0.1, loss_burst_packets=5), ProbeResult(10, 10, 0, 0, None, None, None)),
         (Impairment(150, loss=0.5), ProbeResult(10, 9, 0, 0, None, None, None)),
@@ -675,10 +677,10 @@ def test_each_measured_difference_is_reported(
         (Impairment(150, 10, rate_bps=20_000), ProbeResult(50, 0, 0, 0, 150.0, 400.0, 600.0)),
     ],
 )
-def test_plausible_measurements_are_accepted(impairment: Impairment, found: ProbeResult) -> None:
+def test_plausible_measurements_are_accepted(impairment: Impairment, measured: ProbeResult) -> None:
     """Plausible shares of losses and reordering, a median that jitter allows, and any median with a rate pass."""
     flow = ImpairedFlow("video", "udp", 5600, "source", impairment)
-    assert judge([flow], [], {**AS_REQUESTED, "video": found}) == []
+    assert judge([flow], [], {**AS_REQUESTED, "video": measured}) == []
 
 
 def test_missing_interface_is_reported() -> None:

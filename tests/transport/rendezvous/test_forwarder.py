@@ -29,7 +29,7 @@ VEHICLE, OTHER = ("203.0.113.2", 40_000), ("203.0.113.66", 40_000)
 CLIENT, SECOND = ("198.51.100.2", 50_000), ("198.51.100.7", 50_001)
 HELLO = PathClient(b"t" * 16).hello(0)
 REPORT = struct.pack(">BBHI", 0x80, 201, 1, 7)
-T = 100 * NS_PER_S
+NOW_NS = 100 * NS_PER_S
 
 
 @pytest.fixture(scope="module")
@@ -40,24 +40,24 @@ def key() -> PrivateKey:
     return PrivateKey(Ed25519PrivateKey.generate())
 
 
-def registered(flow: str = "video") -> Forwarder:
+def registered_forwarder(flow: str = "video") -> Forwarder:
     """Return a forwarder without a key, at which the vehicle has registered."""
     forwarder = Forwarder("vehicle-1", "probe" if flow == "probe" else "video", None)
     registration = encode_registration("vehicle-1", "probe" if flow == "probe" else "video", 1, None)
-    assert forwarder.receive(registration, VEHICLE, T) is None
-    assert forwarder.vehicle_address(T) == VEHICLE
+    assert forwarder.receive(registration, VEHICLE, NOW_NS) is None
+    assert forwarder.vehicle_address(NOW_NS) == VEHICLE
     return forwarder
 
 
-def hello(forwarder: Forwarder, client: Address = CLIENT, now_ns: int = T) -> tuple[bytes, Address] | None:
+def send_hello(forwarder: Forwarder, client: Address = CLIENT, now_ns: int = NOW_NS) -> tuple[bytes, Address] | None:
     return forwarder.receive(HELLO, client, now_ns)
 
 
-def answer(forwarder: Forwarder, client: Address = CLIENT, now_ns: int = T) -> tuple[bytes, Address] | None:
+def send_answer(forwarder: Forwarder, client: Address = CLIENT, now_ns: int = NOW_NS) -> tuple[bytes, Address] | None:
     return forwarder.receive(wrap(client, b"answer"), VEHICLE, now_ns)
 
 
-def test_bytes_on_the_wire(key: PrivateKey) -> None:
+def test_wire_format(key: PrivateKey) -> None:
     """Registrations and wrapped datagrams have the bytes that docs/wire.md describes."""
     plain = b"LAVR\x01\x01" + (258).to_bytes(8, "big") + b"vehicle-1".ljust(32, b"\0") + b"video".ljust(8, b"\0")
     assert encode_registration("vehicle-1", "video", 258, None) == plain
@@ -75,25 +75,25 @@ def test_unwrapping_undoes_wrapping(host: object, port: int, datagram: bytes) ->
 
 def test_datagrams_are_forwarded_both_ways() -> None:
     """A client's datagram goes to the vehicle wrapped, and the vehicle's answer to the client unwrapped."""
-    forwarder = registered()
-    assert hello(forwarder) == (wrap(CLIENT, HELLO), VEHICLE)
-    assert forwarder.receive(REPORT, CLIENT, T) == (wrap(CLIENT, REPORT), VEHICLE)
-    assert answer(forwarder) == (b"answer", CLIENT)
+    forwarder = registered_forwarder()
+    assert send_hello(forwarder) == (wrap(CLIENT, HELLO), VEHICLE)
+    assert forwarder.receive(REPORT, CLIENT, NOW_NS) == (wrap(CLIENT, REPORT), VEHICLE)
+    assert send_answer(forwarder) == (b"answer", CLIENT)
     assert forwarder.counts == {"registrations": 1, "to_vehicle": 2, "to_clients": 1}
 
 
 def test_each_flow_accepts_its_own_datagrams() -> None:
     """From clients the video flow accepts hellos, answers and RTCP, and the probe flow requests; others are counted."""
-    video, probe = registered(), registered("probe")
+    video, probe = registered_forwarder(), registered_forwarder("probe")
     request = encode_request(1, 2)
     reply = encode_reply(ProbeReply(1, 2, 3, 4, None, None))
     rtp = Packetizer(1, 1).packetize(b"\0\0\0\1\x65abc", 1)[0]
-    assert probe.receive(request, CLIENT, T) == (wrap(CLIENT, request), VEHICLE)
-    for other in (HELLO, REPORT, rtp, reply, request + b"x", b""):
-        assert probe.receive(other, CLIENT, T) is None
-    for other in (request, rtp, b"", b"anything", HELLO + bytes(MAX_UPSTREAM_BYTES)):
-        assert video.receive(other, CLIENT, T) is None
-    assert video.receive(HELLO, VEHICLE, T) is None, "the vehicle cannot be its own client"
+    assert probe.receive(request, CLIENT, NOW_NS) == (wrap(CLIENT, request), VEHICLE)
+    for datagram in (HELLO, REPORT, rtp, reply, request + b"x", b""):
+        assert probe.receive(datagram, CLIENT, NOW_NS) is None
+    for datagram in (request, rtp, b"", b"anything", HELLO + bytes(MAX_UPSTREAM_BYTES)):
+        assert video.receive(datagram, CLIENT, NOW_NS) is None
+    assert video.receive(HELLO, VEHICLE, NOW_NS) is None, "the vehicle cannot be its own client"
     assert probe.counts["malformed"] == 6
     assert video.counts["malformed"] == 6
 
@@ -102,34 +102,34 @@ PREFIXES = [b"", b"LAVR", b"LAVR\x01\x01", b"LAVR\x01\x02", b"LAVT", b"LC\x01\x0
 
 
 @given(st.binary(max_size=200), st.sampled_from(PREFIXES), st.sampled_from([VEHICLE, OTHER, CLIENT]))
-def test_arbitrary_bytes(rest: bytes, prefix: bytes, sender: Address) -> None:
-    """An arbitrary datagram is counted, raises nothing, goes to the vehicle or nowhere, and never unregisters it."""
-    forwarder = registered()
-    forwarded = forwarder.receive(prefix + rest, sender, T)
+def test_arbitrary_datagrams_are_counted(rest: bytes, prefix: bytes, sender: Address) -> None:
+    """An arbitrary datagram is counted and raises nothing; at most it reaches the vehicle, which stays registered."""
+    forwarder = registered_forwarder()
+    forwarded = forwarder.receive(prefix + rest, sender, NOW_NS)
     assert forwarded is None or (forwarded[1] == VEHICLE and sender != VEHICLE)
-    assert forwarder.vehicle_address(T) == VEHICLE
+    assert forwarder.vehicle_address(NOW_NS) == VEHICLE
     assert sum(forwarder.counts.values()) == 2
 
 
 def test_the_vehicle_can_only_send_to_recent_clients() -> None:
     """The vehicle can send only to addresses that have sent something in the last 30 s."""
-    forwarder = registered()
-    assert answer(forwarder) is None
-    hello(forwarder)
-    assert answer(forwarder, SECOND) is None
-    assert answer(forwarder) is not None
-    late_ns = T + CLIENT_TIMEOUT_NS + 1
+    forwarder = registered_forwarder()
+    assert send_answer(forwarder) is None
+    send_hello(forwarder)
+    assert send_answer(forwarder, SECOND) is None
+    assert send_answer(forwarder) is not None
+    late_ns = NOW_NS + CLIENT_TIMEOUT_NS + 1
     forwarder.receive(encode_registration("vehicle-1", "video", 2, None), VEHICLE, late_ns)
-    assert answer(forwarder, now_ns=late_ns) is None
+    assert send_answer(forwarder, now_ns=late_ns) is None
     assert forwarder.counts["to_nobody"] == 3
 
 
 def test_only_the_vehicle_can_send_to_clients() -> None:
     """A wrapped datagram from any other address than the registered vehicle's is dropped."""
-    forwarder = registered()
-    hello(forwarder)
+    forwarder = registered_forwarder()
+    send_hello(forwarder)
     for other in (OTHER, CLIENT, (VEHICLE[0], VEHICLE[1] + 1)):
-        assert forwarder.receive(wrap(CLIENT, b"forged"), other, T) is None
+        assert forwarder.receive(wrap(CLIENT, b"forged"), other, NOW_NS) is None
     assert forwarder.counts["not_from_vehicle"] == 3
 
 
@@ -146,126 +146,126 @@ def test_only_the_vehicle_can_register(key: PrivateKey) -> None:
         encode_registration("vehicle-1", "video", 6, None) + good[54:],
         good[:-1] + bytes([good[-1] ^ 1]),
     ]
-    for each in forged:
-        forwarder.receive(each, OTHER, T)
+    for registration in forged:
+        forwarder.receive(registration, OTHER, NOW_NS)
     assert forwarder.counts == {"registrations_forged": 4}
-    assert forwarder.vehicle_address(T) is None
-    forwarder.receive(good, VEHICLE, T)
-    assert forwarder.vehicle_address(T) == VEHICLE
+    assert forwarder.vehicle_address(NOW_NS) is None
+    forwarder.receive(good, VEHICLE, NOW_NS)
+    assert forwarder.vehicle_address(NOW_NS) == VEHICLE
 
 
-def test_without_the_key(key: PrivateKey) -> None:
+def test_without_a_key_every_registration_is_accepted(key: PrivateKey) -> None:
     """Without a key, every registration with the vehicle's name and the flow is accepted, signed or not."""
     forwarder = Forwarder("vehicle-1", "video", None)
-    forwarder.receive(encode_registration("vehicle-1", "video", 1, key), VEHICLE, T)
-    assert forwarder.vehicle_address(T) == VEHICLE
-    forwarder.receive(encode_registration("vehicle-1", "video", 2, None), OTHER, T)
-    assert forwarder.vehicle_address(T) == OTHER
+    forwarder.receive(encode_registration("vehicle-1", "video", 1, key), VEHICLE, NOW_NS)
+    assert forwarder.vehicle_address(NOW_NS) == VEHICLE
+    forwarder.receive(encode_registration("vehicle-1", "video", 2, None), OTHER, NOW_NS)
+    assert forwarder.vehicle_address(NOW_NS) == OTHER
 
 
 @pytest.mark.parametrize(("vehicle", "flow"), [("vehicle-2", "video"), ("vehicle-1", "probe")])
-def test_another_vehicle_or_flow(vehicle: str, flow: str, key: PrivateKey) -> None:
+def test_registration_of_another_vehicle_or_flow_is_rejected(vehicle: str, flow: str, key: PrivateKey) -> None:
     """A registration of another vehicle or flow is rejected, even if it is signed with the right key."""
     forwarder = Forwarder("vehicle-1", "video", key.public)
     registration = encode_registration(vehicle, "probe" if flow == "probe" else "video", 1, key)
-    forwarder.receive(registration, VEHICLE, T)
+    forwarder.receive(registration, VEHICLE, NOW_NS)
     assert forwarder.counts == {"registrations_of_others": 1}
-    assert forwarder.vehicle_address(T) is None
+    assert forwarder.vehicle_address(NOW_NS) is None
 
 
-def test_replayed_registration(key: PrivateKey) -> None:
+def test_replayed_registration_is_rejected(key: PrivateKey) -> None:
     """A replayed or older registration is rejected."""
     forwarder = Forwarder("vehicle-1", "video", key.public)
-    old, new = (encode_registration("vehicle-1", "video", each, key) for each in (5, 6))
-    forwarder.receive(new, VEHICLE, T)
-    forwarder.receive(new, OTHER, T + 1)
-    forwarder.receive(old, OTHER, T + VEHICLE_TIMEOUT_NS)
-    assert forwarder.vehicle_address(T + VEHICLE_TIMEOUT_NS) == VEHICLE
+    old, new = (encode_registration("vehicle-1", "video", time_ns, key) for time_ns in (5, 6))
+    forwarder.receive(new, VEHICLE, NOW_NS)
+    forwarder.receive(new, OTHER, NOW_NS + 1)
+    forwarder.receive(old, OTHER, NOW_NS + VEHICLE_TIMEOUT_NS)
+    assert forwarder.vehicle_address(NOW_NS + VEHICLE_TIMEOUT_NS) == VEHICLE
     assert forwarder.counts["registrations_stale"] == 2
 
 
 def test_a_vehicle_moves_and_expires() -> None:
     """A newer registration from another address takes effect at once; after 10 s without one the vehicle is gone."""
-    forwarder = registered()
-    hello(forwarder)
-    forwarder.receive(encode_registration("vehicle-1", "video", 2, None), OTHER, T + 1)
-    assert hello(forwarder, now_ns=T + 1) == (wrap(CLIENT, HELLO), OTHER)
-    assert answer(forwarder, now_ns=T + 1) is None
-    gone_ns = T + 1 + VEHICLE_TIMEOUT_NS + 1
-    assert forwarder.vehicle_address(gone_ns - 1) == OTHER
-    assert hello(forwarder, now_ns=gone_ns) is None
-    assert forwarder.receive(wrap(CLIENT, b"late"), OTHER, gone_ns) is None
-    forwarder.receive(encode_registration("vehicle-1", "video", 1, None), VEHICLE, gone_ns)
-    assert forwarder.vehicle_address(gone_ns) == VEHICLE, "its clock may have been set back in the meantime"
+    forwarder = registered_forwarder()
+    send_hello(forwarder)
+    forwarder.receive(encode_registration("vehicle-1", "video", 2, None), OTHER, NOW_NS + 1)
+    assert send_hello(forwarder, now_ns=NOW_NS + 1) == (wrap(CLIENT, HELLO), OTHER)
+    assert send_answer(forwarder, now_ns=NOW_NS + 1) is None
+    expired_ns = NOW_NS + 1 + VEHICLE_TIMEOUT_NS + 1
+    assert forwarder.vehicle_address(expired_ns - 1) == OTHER
+    assert send_hello(forwarder, now_ns=expired_ns) is None
+    assert forwarder.receive(wrap(CLIENT, b"late"), OTHER, expired_ns) is None
+    forwarder.receive(encode_registration("vehicle-1", "video", 1, None), VEHICLE, expired_ns)
+    assert forwarder.vehicle_address(expired_ns) == VEHICLE, "its clock may have been set back in the meantime"
 
 
 def test_unanswered_clients_displace_no_answered_ones() -> None:
     """At most 64 clients that the vehicle has answered and 64 others are remembered, in tables of their own."""
-    forwarder = registered()
-    hello(forwarder)
-    answer(forwarder)
+    forwarder = registered_forwarder()
+    send_hello(forwarder)
+    send_answer(forwarder)
     for number in range(10 * MAX_CLIENTS):
-        hello(forwarder, ("192.0.2.1", 1000 + number), T + number)
-    assert answer(forwarder) == (b"answer", CLIENT)
+        send_hello(forwarder, ("192.0.2.1", 1000 + number), NOW_NS + number)
+    assert send_answer(forwarder) == (b"answer", CLIENT)
     assert len(forwarder._clients._unanswered) == MAX_CLIENTS
     for number in range(10 * MAX_CLIENTS):
-        hello(forwarder, ("192.0.2.1", 1000 + number), T)
-        answer(forwarder, ("192.0.2.1", 1000 + number))
+        send_hello(forwarder, ("192.0.2.1", 1000 + number), NOW_NS)
+        send_answer(forwarder, ("192.0.2.1", 1000 + number))
     assert len(forwarder._clients._answered) == MAX_CLIENTS
 
 
 def test_datagrams_to_the_vehicle_are_rate_limited() -> None:
     """Datagrams to the vehicle are limited per second, separately for clients that it has answered and for others."""
-    forwarder = registered()
-    hello(forwarder, SECOND)
-    answer(forwarder, SECOND)
-    unanswered = [hello(forwarder) is not None for _ in range(2 * UPSTREAM_PER_S)]
+    forwarder = registered_forwarder()
+    send_hello(forwarder, SECOND)
+    send_answer(forwarder, SECOND)
+    unanswered = [send_hello(forwarder) is not None for _ in range(2 * UPSTREAM_PER_S)]
     assert sum(unanswered) == UPSTREAM_PER_S - 1, "the first was SECOND's"
-    answered = [hello(forwarder, SECOND) is not None for _ in range(2 * UPSTREAM_PER_S)]
+    answered = [send_hello(forwarder, SECOND) is not None for _ in range(2 * UPSTREAM_PER_S)]
     assert sum(answered) == UPSTREAM_PER_S
-    assert hello(forwarder, now_ns=T + NS_PER_S) is not None
+    assert send_hello(forwarder, now_ns=NOW_NS + NS_PER_S) is not None
 
 
 def test_replayed_hellos_do_not_crowd_out_reports() -> None:
     """Replays of a client's hello, with its own address, do not use up the limit of its reports."""
-    forwarder = registered()
-    hello(forwarder)
-    answer(forwarder)
+    forwarder = registered_forwarder()
+    send_hello(forwarder)
+    send_answer(forwarder)
     for _ in range(10 * UPSTREAM_PER_S):
-        hello(forwarder)
+        send_hello(forwarder)
     assert forwarder.counts["too_many"] > 0
-    assert forwarder.receive(REPORT, CLIENT, T) is not None
+    assert forwarder.receive(REPORT, CLIENT, NOW_NS) is not None
 
 
 def test_replayed_hellos_from_many_addresses_do_not_displace_the_client() -> None:
     """The vehicle challenges few copies of a hello, so the rendezvous still forwards its video to the client."""
-    forwarder, path, client = registered(), PathServer(lambda: bytes(16)), PathClient(b"t" * 16)
+    forwarder, path, client = registered_forwarder(), PathServer(lambda: bytes(16)), PathClient(b"t" * 16)
     path.set_token(b"t" * 16)
 
     def through(datagram: bytes, sender: Address) -> bytes:
         """Return what the sender gets back from the vehicle."""
-        forwarded = forwarder.receive(datagram, sender, T)
-        reply = None if forwarded is None else path.receive(datagram, sender, T)
-        back = None if reply is None else forwarder.receive(wrap(sender, reply), VEHICLE, T)
+        forwarded = forwarder.receive(datagram, sender, NOW_NS)
+        reply = None if forwarded is None else path.receive(datagram, sender, NOW_NS)
+        back = None if reply is None else forwarder.receive(wrap(sender, reply), VEHICLE, NOW_NS)
         return b"" if back is None else back[0]
 
     newest = client.hello(0)
     through(client.answer(through(newest, CLIENT)) or b"", CLIENT)
-    assert path.open_address(T) == CLIENT
+    assert path.open_address(NOW_NS) == CLIENT
     for port in range(UPSTREAM_PER_S):
         through(newest, ("198.51.100.99", port + 1))
-    assert forwarder.receive(wrap(CLIENT, b"video"), VEHICLE, T) is not None
+    assert forwarder.receive(wrap(CLIENT, b"video"), VEHICLE, NOW_NS) is not None
 
 
 def test_forged_registrations_are_rate_limited(key: PrivateKey) -> None:
     """During a flood of forged registrations few signatures are verified, and the vehicle's next one is accepted."""
     forwarder = Forwarder("vehicle-1", "video", key.public)
-    forwarder.receive(encode_registration("vehicle-1", "video", 5, key), VEHICLE, T)
+    forwarder.receive(encode_registration("vehicle-1", "video", 5, key), VEHICLE, NOW_NS)
     forged = encode_registration("vehicle-1", "video", 6, None)
     for _ in range(2 * REGISTRATIONS_PER_S):
-        forwarder.receive(forged, OTHER, T + NS_PER_S)
+        forwarder.receive(forged, OTHER, NOW_NS + NS_PER_S)
     assert forwarder.counts["registrations_forged"] == REGISTRATIONS_PER_S
-    forwarder.receive(encode_registration("vehicle-1", "video", 7, key), VEHICLE, T + NS_PER_S)
+    forwarder.receive(encode_registration("vehicle-1", "video", 7, key), VEHICLE, NOW_NS + NS_PER_S)
     assert forwarder.counts["registrations"] == 2
 
 

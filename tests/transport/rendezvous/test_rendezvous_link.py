@@ -16,12 +16,12 @@ from lavt.transport.rendezvous.forwarder import Forwarder, encode_registration, 
 from lavt.transport.rendezvous.link import RendezvousLink, RendezvousPort
 from lavt.transport.video.path_validation import PathClient
 
-ARRIVES_S = 5.0
+TIMEOUT_S = 5.0
 ANY = ("127.0.0.1", 0)
 HELLO = PathClient(b"t" * 16).hello(0)
 
 
-class Setup:
+class VehicleBehindRendezvous:
     """A rendezvous, the vehicle's link through it, and the messages that the link delivered."""
 
     def __init__(self, stack: ExitStack) -> None:
@@ -44,26 +44,26 @@ class Setup:
 
     def receive(self) -> tuple[str, Any, Now, Any]:
         """Wait for the vehicle's next message."""
-        return self.received.get(timeout=ARRIVES_S)
+        return self.received.get(timeout=TIMEOUT_S)
 
 
 @pytest.fixture
-def setup() -> Iterator[Setup]:
+def setup() -> Iterator[VehicleBehindRendezvous]:
     """Make a rendezvous and a vehicle's link, open but not started."""
     with ExitStack() as stack:
-        yield Setup(stack)
+        yield VehicleBehindRendezvous(stack)
 
 
 @pytest.fixture
 def client() -> Iterator[socket.socket]:
     """Open a client's socket."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
-        opened.bind(ANY)
-        opened.settimeout(ARRIVES_S)
-        yield opened
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp_socket:
+        udp_socket.bind(ANY)
+        udp_socket.settimeout(TIMEOUT_S)
+        yield udp_socket
 
 
-def connect(setup: Setup, client: socket.socket) -> Any:
+def connect(setup: VehicleBehindRendezvous, client: socket.socket) -> Any:
     """Start both ends and send hellos until one arrives; return the peer that the vehicle's link gave it."""
     setup.rendezvous.start()
     setup.start()
@@ -75,7 +75,7 @@ def connect(setup: Setup, client: socket.socket) -> Any:
             continue
 
 
-def test_through_the_rendezvous_and_back(setup: Setup, client: socket.socket) -> None:
+def test_datagrams_pass_the_rendezvous_both_ways(setup: VehicleBehindRendezvous, client: socket.socket) -> None:
     """A client's datagram arrives with its address and a prefix, and a datagram to this peer reaches the client."""
     peer = connect(setup, client)
     assert peer == ("rendezvous:127.0.0.1", client.getsockname()[1])
@@ -85,7 +85,7 @@ def test_through_the_rendezvous_and_back(setup: Setup, client: socket.socket) ->
     assert setup.rendezvous.counts["to_clients"] == 1
 
 
-def test_direct_clients(setup: Setup, client: socket.socket) -> None:
+def test_clients_reach_the_vehicle_directly(setup: VehicleBehindRendezvous, client: socket.socket) -> None:
     """A client can reach the vehicle directly, and only datagrams from the rendezvous are unwrapped."""
     setup.start()
     wrapped = wrap(("192.0.2.9", 5004), HELLO)
@@ -97,7 +97,7 @@ def test_direct_clients(setup: Setup, client: socket.socket) -> None:
     assert client.recvfrom(100) == (b"challenge", ("127.0.0.1", setup.vehicle.port))
 
 
-def test_malformed_datagrams_from_the_rendezvous(client: socket.socket) -> None:
+def test_unwrapped_datagrams_from_the_rendezvous_are_counted(client: socket.socket) -> None:
     """A datagram from the rendezvous that is not wrapped is counted and not delivered."""
     received: queue.Queue[Any] = queue.Queue()
     link = RendezvousLink(
@@ -110,7 +110,7 @@ def test_malformed_datagrams_from_the_rendezvous(client: socket.socket) -> None:
     link.start(lambda *message: received.put(message))
     for datagram in (HELLO, b"", b"LAVR\x01\x02short", wrap(("192.0.2.9", 5004), b"last")):
         client.sendto(datagram, ("127.0.0.1", link.port))
-    assert received.get(timeout=ARRIVES_S)[1:4:2] == (b"last", ("rendezvous:192.0.2.9", 5004))
+    assert received.get(timeout=TIMEOUT_S)[1:4:2] == (b"last", ("rendezvous:192.0.2.9", 5004))
     assert link.counts["datagrams_not_wrapped"] == 3
     link.close()
 
@@ -118,9 +118,9 @@ def test_malformed_datagrams_from_the_rendezvous(client: socket.socket) -> None:
 @pytest.mark.realtime
 def test_each_registration_is_newer(client: socket.socket) -> None:
     """The link registers at once and then every second, with a later time even if the wall clock goes back."""
-    backward = ShiftedClock(wall_step_ns=-2 * NS_PER_S)
+    backward_clock = ShiftedClock(wall_step_ns=-2 * NS_PER_S)
     link = RendezvousLink(
-        backward,
+        backward_clock,
         "feedback",
         bind=ANY,
         rendezvous=client.getsockname(),

@@ -2,7 +2,8 @@ from __future__ import annotations
 
 import itertools
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple
 
 import pytest
 from hypothesis import given
@@ -39,19 +40,27 @@ def push_all(receiver: RepairReceiver, packets: Iterable[RtpPacket], now_ns: int
     return [recovered for packet in packets for recovered in receiver.push(packet, now_ns)]
 
 
-def counters(receiver: RepairReceiver) -> tuple[int, int, int]:
-    return receiver.recovered, receiver.malformed, receiver.unrepaired
+class Counters(NamedTuple):
+    """The counters of a repair receiver."""
+
+    recovered: int = 0
+    malformed: int = 0
+    unrepaired: int = 0
+
+
+def counters(receiver: RepairReceiver) -> Counters:
+    return Counters(receiver.recovered, receiver.malformed, receiver.unrepaired)
 
 
 EIGHT = frame(bytes([index]) * (20 + index) for index in range(8))
 REPAIRS = repairs_of(EIGHT, 2)
 
 
-def changed(packet: RtpPacket, **fields: int) -> RtpPacket:
-    """Return the repair packet with other bytes at the given positions of its payload."""
+def with_bytes(packet: RtpPacket, changed_bytes: Mapping[int, int]) -> RtpPacket:
+    """Return the repair packet with other bytes at these positions of its payload."""
     payload = bytearray(packet.payload)
-    for position, byte in fields.items():
-        payload[int(position[1:])] = byte
+    for position, byte in changed_bytes.items():
+        payload[position] = byte
     return with_payload(packet, bytes(payload))
 
 
@@ -60,7 +69,7 @@ def with_payload(packet: RtpPacket, payload: bytes) -> RtpPacket:
 
 
 def test_bytes_of_a_repair_packet() -> None:
-    """A repair packet has the format of docs/wire.md; for a frame of one packet P and Q are its own bytes."""
+    """A repair packet has the format of docs/wire.md; if a frame has one packet, P and Q are its bytes."""
     media = RtpPacket(96, 0xFFFE, 0x05060708, MEDIA_SSRC, marker=True, payload=b"abc")
     repairs = RepairSender(REPAIR_SSRC, 0xFFFF).repair([media.to_bytes()], 2)
     header = "01 60 fffe 01020304 0001 00"
@@ -79,14 +88,14 @@ def test_bytes_of_p_and_q() -> None:
 @pytest.mark.parametrize(
     ("packets", "blocks"), [(0, 0), (1, 1), (16, 1), (17, 2), (32, 2), (33, 3), (4080, 255), (4081, 0)]
 )
-def test_blocks(packets: int, blocks: int) -> None:
-    """A frame has the fewest blocks of at most 16 packets; a frame of more than 255 blocks gets no repair packets."""
+def test_number_of_blocks(packets: int, blocks: int) -> None:
+    """A frame is split into as few blocks of up to 16 packets as possible; above 255 blocks there is no repair."""
     media = frame([b"x"] * packets)
     for count in (0, 1, 2):
         assert len(repairs_of(media, count)) == blocks * count
 
 
-def test_order() -> None:
+def test_order_of_repair_packets() -> None:
     """The second repair packets of all blocks follow the first ones."""
     repairs = repairs_of(frame([b"x"] * 33), 2)
     assert [tuple(repair.payload[10:12]) for repair in repairs] == [(0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (2, 1)]
@@ -94,7 +103,7 @@ def test_order() -> None:
 
 
 @pytest.mark.parametrize("count", [-1, 3])
-def test_invalid_count(count: int) -> None:
+def test_invalid_number_of_repair_packets(count: int) -> None:
     """A number of repair packets other than 0, 1 or 2 is rejected."""
     with pytest.raises(UserError, match="choose"):
         RepairSender(1, 0).repair([], count)
@@ -107,7 +116,7 @@ def test_repair_packets_are_small() -> None:
 
 
 @pytest.mark.parametrize(("payload_bytes", "repairs"), [(1498, 2), (1499, 0)])
-def test_long_packets(payload_bytes: int, repairs: int) -> None:
+def test_long_packets_get_no_repair(payload_bytes: int, repairs: int) -> None:
     """A frame with a payload of more than 1498 bytes gets no repair packets; one with 1498 bytes does."""
     media = frame([b"short", b"x" * payload_bytes])
     assert len(repairs_of(media, 2)) == repairs
@@ -122,8 +131,8 @@ def test_the_largest_frame() -> None:
     receiver = RepairReceiver()
     assert push_all(receiver, [*media[:4079], repairs[254]]) == [media[4079]]
     # 4081 packets are 256 blocks.
-    assert push_all(receiver, [changed(repairs[0], _8=0x0F, _9=0xF1)]) == []
-    assert counters(receiver) == (1, 1, 0)
+    assert push_all(receiver, [with_bytes(repairs[0], {8: 0x0F, 9: 0xF1})]) == []
+    assert counters(receiver) == Counters(recovered=1, malformed=1)
 
 
 def test_the_first_sequence_number_wraps() -> None:
@@ -132,17 +141,17 @@ def test_the_first_sequence_number_wraps() -> None:
     assert RepairSender(1, 2**16 - 1).next_sequence == 2**16 - 1
 
 
-def test_burst() -> None:
+def test_burst_is_recovered() -> None:
     """A burst of as many packets as there are blocks is recovered from one repair packet for each block."""
     media = frame(bytes([index]) * 5 for index in range(40))
     receiver = RepairReceiver()
     arrived = [*media[:11], *media[14:], *repairs_of(media, 1)]
     assert sorted(push_all(receiver, arrived), key=lambda packet: packet.sequence) == media[11:14]
-    assert counters(receiver) == (3, 0, 0)
+    assert counters(receiver) == Counters(recovered=3)
 
 
 @pytest.mark.parametrize("lost", list(itertools.combinations(range(8), 2)))
-def test_two_lost(lost: tuple[int, int]) -> None:
+def test_any_two_lost_packets_are_recovered(lost: tuple[int, int]) -> None:
     """Any two packets of a block are recovered from two repair packets, equal to those sent, in order and once."""
     receiver = RepairReceiver()
     arrived = [packet for index, packet in enumerate(EIGHT) if index not in lost]
@@ -150,7 +159,7 @@ def test_two_lost(lost: tuple[int, int]) -> None:
     assert receiver.push(REPAIRS[0], 0) == []
     assert receiver.push(REPAIRS[1], 0) == [EIGHT[index] for index in lost]
     assert push_all(receiver, [*REPAIRS, *EIGHT]) == []
-    assert counters(receiver) == (2, 0, 0)
+    assert counters(receiver) == Counters(recovered=2)
 
 
 def test_media_after_repair() -> None:
@@ -159,7 +168,7 @@ def test_media_after_repair() -> None:
     assert push_all(receiver, [*EIGHT[:6], REPAIRS[0]]) == []
     assert receiver.push(EIGHT[7], 0) == [EIGHT[6]]
     assert receiver.push(EIGHT[6], 0) == []
-    assert counters(receiver) == (1, 0, 0)
+    assert counters(receiver) == Counters(recovered=1)
 
 
 def test_nothing_lost() -> None:
@@ -168,35 +177,37 @@ def test_nothing_lost() -> None:
     assert push_all(receiver, [*EIGHT, *REPAIRS]) == []
     assert receiver._open == {}
     assert receiver.push(EIGHT[0], BLOCK_TIMEOUT_NS) == []
-    assert counters(receiver) == (0, 0, 0)
+    assert counters(receiver) == Counters()
 
 
 def test_repair_before_media() -> None:
-    """Repair packets that arrive before media replace as many of them, and these are not returned again."""
+    """Two repair packets that arrive before the media replace two media packets, which are then returned only once."""
     receiver = RepairReceiver()
     assert push_all(receiver, [*REPAIRS, *EIGHT[:5]]) == []
     assert receiver.push(EIGHT[5], 0) == EIGHT[6:]
     assert push_all(receiver, EIGHT[6:]) == []
     assert receiver._open == {}
-    assert counters(receiver) == (2, 0, 0)
+    assert counters(receiver) == Counters(recovered=2)
 
 
-def test_given_up() -> None:
+def test_block_is_given_up_after_half_a_second() -> None:
     """A block with more losses than repair packets is given up after half a second, and counted."""
     receiver = RepairReceiver()
     push_all(receiver, [*EIGHT[:6], REPAIRS[0]], now_ns=7)
     next_frame = frame([b"n"], first=108, timestamp=12_000)
     receiver.push(next_frame[0], 7 + BLOCK_TIMEOUT_NS - 1)
-    assert counters(receiver) == (0, 0, 0)
+    assert counters(receiver) == Counters()
     assert receiver.push(EIGHT[6], 7 + BLOCK_TIMEOUT_NS) == []
-    assert counters(receiver) == (0, 0, 1)
+    assert counters(receiver) == Counters(unrepaired=1)
 
 
 FRAMES = st.lists(st.binary(min_size=1, max_size=60), min_size=1, max_size=60)
 
 
 @given(FRAMES, FRAMES, st.integers(1, 2), st.integers(0, 2**16 - 1), st.data())
-def test_any_loss(payloads: list[bytes], others: list[bytes], count: int, first: int, data: st.DataObject) -> None:
+def test_any_loss_within_the_repair_is_recovered(
+    payloads: list[bytes], others: list[bytes], count: int, first: int, data: st.DataObject
+) -> None:
     """A block with no more losses than repair packets is recovered, for any order, duplicates and sequence numbers."""
     frames = [frame(payloads, first), frame(others, first + len(payloads), 12_000)]
     sent = [packet for media in frames for packet in media + repairs_of(media, count)]
@@ -222,40 +233,40 @@ def test_any_loss(payloads: list[bytes], others: list[bytes], count: int, first:
     assert receiver.malformed == 0
 
 
-WRONG_HEADERS = [
+MALFORMED_HEADERS = [
     with_payload(REPAIRS[0], b""),
     with_payload(REPAIRS[0], REPAIRS[0].payload[:12]),
     with_payload(REPAIRS[0], REPAIRS[0].payload[:14]),
     with_payload(REPAIRS[0], REPAIRS[0].payload.ljust(12 + MAX_SYMBOL_BYTES + 1, b"\x00")),
-    changed(REPAIRS[0], _0=2),
-    changed(REPAIRS[0], _1=0x80),
-    changed(REPAIRS[0], _1=0xE0),
-    changed(REPAIRS[0], _1=REPAIR_PAYLOAD_TYPE),
-    changed(REPAIRS[0], _7=5),
-    changed(REPAIRS[0], _8=0, _9=0),
-    changed(REPAIRS[0], _8=0xFF, _9=0xFF),
-    changed(REPAIRS[0], _10=1),
-    changed(REPAIRS[0], _11=2),
+    with_bytes(REPAIRS[0], {0: 2}),
+    with_bytes(REPAIRS[0], {1: 0x80}),
+    with_bytes(REPAIRS[0], {1: 0xE0}),
+    with_bytes(REPAIRS[0], {1: REPAIR_PAYLOAD_TYPE}),
+    with_bytes(REPAIRS[0], {7: 5}),
+    with_bytes(REPAIRS[0], {8: 0, 9: 0}),
+    with_bytes(REPAIRS[0], {8: 0xFF, 9: 0xFF}),
+    with_bytes(REPAIRS[0], {10: 1}),
+    with_bytes(REPAIRS[0], {11: 2}),
 ]
 
 
-@pytest.mark.parametrize("repair", WRONG_HEADERS)
+@pytest.mark.parametrize("repair", MALFORMED_HEADERS)
 def test_malformed_header(repair: RtpPacket) -> None:
     """A repair packet with an invalid header is counted even if no packet was lost."""
     receiver = RepairReceiver()
     assert push_all(receiver, [*EIGHT, repair]) == []
-    assert counters(receiver) == (0, 1, 0)
+    assert counters(receiver) == Counters(malformed=1)
 
 
 @pytest.mark.parametrize(
     "repair",
     [
-        *WRONG_HEADERS,
+        *MALFORMED_HEADERS,
         # Cut off: shorter than the media of its block.
         with_payload(REPAIRS[0], REPAIRS[0].payload[:-1]),
         # The recovered payload would be longer than the packet, have bytes after its end, or be empty.
-        changed(REPAIRS[0], _12=REPAIRS[0].payload[12] ^ 1),
-        changed(REPAIRS[0], _40=REPAIRS[0].payload[40] ^ 1),
+        with_bytes(REPAIRS[0], {12: REPAIRS[0].payload[12] ^ 1}),
+        with_bytes(REPAIRS[0], {40: REPAIRS[0].payload[40] ^ 1}),
         repairs_of([*EIGHT[:3], with_payload(EIGHT[3], b""), *EIGHT[4:]], 1)[0],
     ],
 )
@@ -263,7 +274,7 @@ def test_malformed(repair: RtpPacket) -> None:
     """A malformed repair packet is counted and leaves no state."""
     receiver = RepairReceiver()
     assert push_all(receiver, [*EIGHT[:3], *EIGHT[4:], repair]) == []
-    assert counters(receiver) == (0, 1, 0)
+    assert counters(receiver) == Counters(malformed=1)
     assert receiver._open == {}
     assert receiver.push(REPAIRS[1], 0) == [EIGHT[3]]
 
@@ -271,18 +282,18 @@ def test_malformed(repair: RtpPacket) -> None:
 @pytest.mark.parametrize(
     "repair",
     [
-        changed(REPAIRS[1], _1=98),
-        changed(REPAIRS[1], _3=101),
-        changed(REPAIRS[1], _9=9),
+        with_bytes(REPAIRS[1], {1: 98}),
+        with_bytes(REPAIRS[1], {3: 101}),
+        with_bytes(REPAIRS[1], {9: 9}),
         with_payload(REPAIRS[1], REPAIRS[1].payload + b"\x00"),
-        changed(REPAIRS[0], _20=REPAIRS[0].payload[20] ^ 1),
+        with_bytes(REPAIRS[0], {20: REPAIRS[0].payload[20] ^ 1}),
     ],
 )
 def test_contradicting_repair_packets(repair: RtpPacket) -> None:
     """The second of two contradicting repair packets of a block is counted as malformed and dropped."""
     receiver = RepairReceiver()
     assert push_all(receiver, [*EIGHT[:6], REPAIRS[0], repair]) == []
-    assert counters(receiver) == (0, 1, 0)
+    assert counters(receiver) == Counters(malformed=1)
     assert receiver.push(REPAIRS[1], 0) == EIGHT[6:]
 
 
@@ -303,15 +314,17 @@ HEADERS = st.tuples(
 def test_any_bytes(pushed: list[bytes | RtpPacket]) -> None:
     """No repair payload raises an error, and invalid ones are counted as malformed."""
     receiver = RepairReceiver()
-    cut_off = 0
-    for one in pushed:
+    surely_malformed = 0
+    for pushed_item in pushed:
         packet = (
-            RtpPacket(REPAIR_PAYLOAD_TYPE, 0, 9000, 1, marker=False, payload=one) if isinstance(one, bytes) else one
+            RtpPacket(REPAIR_PAYLOAD_TYPE, 0, 9000, 1, marker=False, payload=pushed_item)
+            if isinstance(pushed_item, bytes)
+            else pushed_item
         )
-        cut_off += isinstance(one, bytes) and (len(one) < 15 or one[0] != 1)
+        surely_malformed += isinstance(pushed_item, bytes) and (len(pushed_item) < 15 or pushed_item[0] != 1)
         recovered = receiver.push(packet, 0)
         assert all(packet.timestamp == 9000 and packet.payload for packet in recovered)
-    assert cut_off <= receiver.malformed <= len(pushed)
+    assert surely_malformed <= receiver.malformed <= len(pushed)
 
 
 def test_bounded_memory() -> None:
@@ -321,7 +334,7 @@ def test_bounded_memory() -> None:
         media = frame([b"m"] * 4, first=4 * number, timestamp=number)
         push_all(receiver, [media[0], *repairs_of(media, 2)])
     assert len(receiver._open) == MAX_OPEN_BLOCKS
-    assert counters(receiver) == (0, 0, 2 * MAX_OPEN_BLOCKS)
+    assert counters(receiver) == Counters(unrepaired=2 * MAX_OPEN_BLOCKS)
     newest = frame([b"m"] * 4, first=4 * (3 * MAX_OPEN_BLOCKS - 1), timestamp=3 * MAX_OPEN_BLOCKS - 1)
     assert receiver.push(newest[1], 0) == newest[2:]
     size = sys.getsizeof(receiver._media)
@@ -340,15 +353,15 @@ def test_bounded_memory_of_long_packets() -> None:
 def test_repair_packet_from_long_ago() -> None:
     """A repair packet that is repeated when its media packets are no longer stored recovers nothing."""
     receiver = RepairReceiver()
-    alone = frame([b"alone"])
-    repair = repairs_of(alone, 1)[0]
-    assert receiver.push(repair, 0) == alone
+    single_packet = frame([b"alone"])
+    repair = repairs_of(single_packet, 1)[0]
+    assert receiver.push(repair, 0) == single_packet
     push_all(receiver, (RtpPacket(96, 101 + number, 7, MEDIA_SSRC, False, b"") for number in range(MAX_STORED_MEDIA)))
     assert receiver.push(repair, 0) == []
-    assert counters(receiver) == (1, 0, 0)
+    assert counters(receiver) == Counters(recovered=1)
 
 
-def test_new_stream() -> None:
+def test_new_stream_gives_up_old_blocks() -> None:
     """When the media stream changes, the blocks of the previous stream are given up and its repair packets rejected."""
     receiver = RepairReceiver()
     push_all(receiver, [*EIGHT[:6], REPAIRS[0]])
@@ -356,7 +369,7 @@ def test_new_stream() -> None:
     other = frame((b"other" for _ in range(8)), ssrc=9)
     assert push_all(receiver, [*other[:6], other[7]]) == []
     assert receiver.push(REPAIRS[1], 0) == []
-    assert counters(receiver) == (0, 1, 1)
+    assert counters(receiver) == Counters(malformed=1, unrepaired=1)
     assert receiver.push(repairs_of(other, 1)[0], 0) == [other[6]]
 
 
@@ -383,10 +396,10 @@ def test_same_storage_index() -> None:
     assert push_all(receiver, [*before, *EIGHT[:6], EIGHT[7], REPAIRS[0]]) == [EIGHT[6]]
 
 
-def test_access_unit() -> None:
+def test_access_unit_from_recovered_packets() -> None:
     """A depacketizer that gets the recovered packets returns the access unit that was sent."""
-    unit = b"\x00\x00\x00\x01\x67\x42\x80" + b"\x00\x00\x00\x01\x65" + bytes(range(1, 256)) * 30
-    datagrams = Packetizer(MEDIA_SSRC, 65_533).packetize(unit, 9000)
+    access_unit = b"\x00\x00\x00\x01\x67\x42\x80" + b"\x00\x00\x00\x01\x65" + bytes(range(1, 256)) * 30
+    datagrams = Packetizer(MEDIA_SSRC, 65_533).packetize(access_unit, 9000)
     repairs = RepairSender(REPAIR_SSRC, 0).repair(datagrams, 2)
     receiver = RepairReceiver()
     packets = []
@@ -398,7 +411,7 @@ def test_access_unit() -> None:
     depacketizer = Depacketizer()
     units = [unit for packet in packets for unit in depacketizer.push(packet, lost_before=False)]
     assert len(datagrams) > 5
-    assert [(one.data, one.complete, one.keyframe) for one in units] == [(unit, True, True)]
+    assert [(unit.data, unit.complete, unit.keyframe) for unit in units] == [(access_unit, True, True)]
 
 
 @pytest.mark.parametrize(

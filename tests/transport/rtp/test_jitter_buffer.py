@@ -15,6 +15,7 @@ MIN_HOLD_NS, MAX_HOLD_NS, WINDOW_NS = 10 * NS_PER_MS, 300 * NS_PER_MS, 30 * NS_P
 """The design's limits, repeated here: a change of the code's limits must change these, too."""
 HOLD_NS = 10 * NS_PER_MS
 STARTED_NS = HOLD_NS
+"""When the first packet leaves `started_buffer`."""
 
 
 def packet(sequence: int, ssrc: int = 7) -> RtpPacket:
@@ -22,11 +23,13 @@ def packet(sequence: int, ssrc: int = 7) -> RtpPacket:
 
 
 def numbers(ordered: Ordered) -> list[int]:
-    return [one.sequence for one, _ in ordered]
+    """Return the sequence numbers."""
+    return [ordered_packet.sequence for ordered_packet, _ in ordered]
 
 
 def gaps(ordered: Ordered) -> list[int]:
-    return [one.sequence for one, lost_before in ordered if lost_before]
+    """Return the sequence numbers of the packets that follow a gap."""
+    return [ordered_packet.sequence for ordered_packet, lost_before in ordered if lost_before]
 
 
 def started_buffer(first: int = 0, hold_ns: int | None = HOLD_NS) -> JitterBuffer:
@@ -37,8 +40,8 @@ def started_buffer(first: int = 0, hold_ns: int | None = HOLD_NS) -> JitterBuffe
     return buffer
 
 
-def test_start() -> None:
-    """The first packets wait one hold, so that the stream begins with the first sent, not the first to arrive."""
+def test_first_packets_wait_one_hold() -> None:
+    """The first packets wait one hold, so that a stream begins with the packet sent first, even if it arrives later."""
     buffer = JitterBuffer(HOLD_NS)
     assert buffer.next_wake_ns() is None
     assert buffer.highest_sequence == 0
@@ -56,8 +59,8 @@ def test_start() -> None:
     assert (buffer.duplicate, buffer.late) == (1, 1)
 
 
-def test_in_order() -> None:
-    """A packet in order leaves immediately, also across the wrap of the sequence numbers."""
+def test_packets_in_order_leave_immediately() -> None:
+    """A packet in order leaves immediately, even if the sequence numbers wrap."""
     buffer = started_buffer(65_534)
     assert [numbers(buffer.push(packet(number), STARTED_NS)) for number in (65_535, 0, 1)] == [[65_535], [0], [1]]
     assert buffer.highest_sequence == 2**16 + 1
@@ -96,7 +99,7 @@ def test_each_gap_has_its_own_hold() -> None:
     assert gaps(buffer.expire(STARTED_NS + HOLD_NS + 3)) == [4]
 
 
-def test_late_wake() -> None:
+def test_packet_after_an_expired_hold_closes_its_gap() -> None:
     """A packet that closes a gap after the hold has expired is used if the gap has not been given up yet."""
     buffer = started_buffer()
     buffer.push(packet(2), STARTED_NS)
@@ -105,7 +108,7 @@ def test_late_wake() -> None:
     assert numbers(buffer.push(packet(5), STARTED_NS + 4 * HOLD_NS)) == [4, 5]
 
 
-def test_late_and_duplicate() -> None:
+def test_late_and_duplicate_packets_are_dropped() -> None:
     """A packet that arrives after its gap was given up, or twice, is dropped and counted as late or duplicate."""
     buffer = started_buffer(10)
     buffer.push(packet(12), STARTED_NS)
@@ -121,17 +124,17 @@ def test_late_and_duplicate() -> None:
     assert buffer.late == 2
 
 
-def test_new_sender() -> None:
+def test_new_ssrc_begins_a_new_stream() -> None:
     """A new SSRC releases all buffered packets and begins a new stream, whose first packet is marked as after a gap."""
     buffer = started_buffer(50_000)
     buffer.push(packet(50_002), STARTED_NS)
     assert numbers(buffer.push(packet(40_000, ssrc=8), STARTED_NS)) == [50_002]
     ordered = buffer.expire(STARTED_NS + HOLD_NS)
-    assert [(one.ssrc, one.sequence, lost) for one, lost in ordered] == [(8, 40_000, True)]
+    assert [(first.ssrc, first.sequence, lost_before) for first, lost_before in ordered] == [(8, 40_000, True)]
     assert buffer.highest_sequence == 40_000
 
 
-def test_one_stray_packet() -> None:
+def test_stray_packet_is_dropped() -> None:
     """A single packet far from all others is dropped and counted, and the stream continues."""
     buffer = started_buffer()
     assert buffer.push(packet(MAX_JUMP + 1), STARTED_NS) == []
@@ -152,7 +155,7 @@ def test_the_farthest_packet_of_a_stream() -> None:
     assert (buffer.stray, buffer.duplicate, buffer.recovered) == (0, 1, 1)
 
 
-def test_stray_packets_apart() -> None:
+def test_stray_packets_that_are_not_consecutive() -> None:
     """Two stray packets that are not consecutive in number or arrival do not move the stream."""
     buffer = started_buffer()
     for number, released in ((20_000, []), (20_002, []), (1, [1]), (20_003, []), (2, [2])):
@@ -161,7 +164,7 @@ def test_stray_packets_apart() -> None:
 
 
 @pytest.mark.parametrize(("first", "second"), [(20_000, 20_001), (65_535, 0)])
-def test_jump(first: int, second: int) -> None:
+def test_two_consecutive_packets_move_the_stream(first: int, second: int) -> None:
     """Two consecutive packets in another range move the stream there, and neither of them is dropped."""
     buffer = started_buffer(10_000)
     assert buffer.push(packet(first), STARTED_NS) == []
@@ -181,7 +184,7 @@ def test_a_jump_keeps_the_wraps() -> None:
     assert buffer.highest_sequence == 2**16 + 50_001
 
 
-def test_delay_spike() -> None:
+def test_old_packets_after_a_delay_spike_are_late() -> None:
     """Many consecutive old packets are late packets and not a restart of the sender."""
     buffer = started_buffer()
     buffer.push(packet(1500), STARTED_NS)
@@ -211,11 +214,13 @@ def test_bounded_memory_of_losses() -> None:
 
 
 @given(st.integers(0, 2**16 - 1), st.permutations(range(30)), st.integers(0, 2**32))
-def test_any_order(first: int, order: list[int], start_ns: int) -> None:
+def test_any_order_within_a_hold_is_restored(first: int, order: list[int], start_ns: int) -> None:
     """Packets that arrive within one hold in any order leave in the order sent, none missing."""
     buffer = JitterBuffer(HOLD_NS)
     ordered = [
-        one for at, number in enumerate(order) for one in buffer.push(packet(first + number), start_ns + at * 1000)
+        ordered_packet
+        for position, number in enumerate(order)
+        for ordered_packet in buffer.push(packet(first + number), start_ns + position * 1000)
     ]
     ordered += buffer.expire(start_ns + HOLD_NS)
     assert numbers(ordered) == [(first + number) % 2**16 for number in range(30)]
@@ -247,7 +252,7 @@ def test_any_arrivals(first: int, arrivals: list[tuple[int, int]]) -> None:
 
 
 @given(st.lists(st.tuples(st.integers(0, 2**16 - 1), st.integers(0, 1), st.integers(0, HOLD_NS)), max_size=60))
-def test_any_numbers(arrivals: list[tuple[int, int, int]]) -> None:
+def test_regular_stream_passes_after_any_packets(arrivals: list[tuple[int, int, int]]) -> None:
     """After any sequence numbers and SSRCs a regular stream passes the buffer."""
     buffer = JitterBuffer(HOLD_NS)
     now_ns = 0
@@ -260,7 +265,7 @@ def test_any_numbers(arrivals: list[tuple[int, int, int]]) -> None:
 
 
 @pytest.mark.parametrize("first", [0, 40_000])
-def test_recovered(first: int) -> None:
+def test_recovered_packet_closes_its_gap(first: int) -> None:
     """A recovered packet closes its gap like one that arrived, and counts as recovered only."""
     buffer = started_buffer(first)
     assert buffer.push(packet(first + 2), STARTED_NS) == []
@@ -273,14 +278,14 @@ def test_recovered(first: int) -> None:
     assert buffer.duplicate == 1
 
 
-def test_recovered_in_vain() -> None:
-    """A recovered packet that is present, was given up, is far away or is of another stream is dropped."""
+def test_useless_recovered_packet_is_dropped() -> None:
+    """A recovered packet is dropped if it is present, was given up, is far from the newest or is of another stream."""
     buffer = started_buffer()
     assert buffer.push(packet(2), STARTED_NS) == []
     assert buffer.push_recovered(packet(2), STARTED_NS) == []
     assert numbers(buffer.expire(STARTED_NS + HOLD_NS)) == [2]
-    for one in (packet(1), packet(2), packet(3, ssrc=8), packet(2 + MAX_JUMP + 1)):
-        assert buffer.push_recovered(one, STARTED_NS + HOLD_NS) == []
+    for recovered in (packet(1), packet(2), packet(3, ssrc=8), packet(2 + MAX_JUMP + 1)):
+        assert buffer.push_recovered(recovered, STARTED_NS + HOLD_NS) == []
     counts = buffer.recovered, buffer.lost, buffer.late, buffer.duplicate, buffer.stray
     assert counts == (0, 1, 0, 0, 0)
     assert numbers(buffer.push(packet(3), STARTED_NS + HOLD_NS)) == [3]
@@ -354,9 +359,9 @@ def test_an_open_gap_does_not_lengthen_the_delay_of_later_packets() -> None:
     now_ns = STARTED_NS
     for number in range(2, 2000, 2):
         lost = number % 200 == 100
-        for each in (number,) if lost else (number, number - 1):
+        for sequence in (number,) if lost else (number, number - 1):
             now_ns += NS_PER_MS // 5
-            buffer.push(packet(each), now_ns)
+            buffer.push(packet(sequence), now_ns)
     assert buffer.reordered > 900
     assert measure_hold(buffer, 2001, now_ns + NS_PER_S) == MIN_HOLD_NS
 
@@ -378,12 +383,12 @@ def test_the_hold_stays_long_enough_for_repairs() -> None:
 def test_any_arrivals_with_an_adaptive_hold(arrivals: list[tuple[int, int]]) -> None:
     """For any arrivals no packet waits longer than the longest hold, and each is counted."""
     buffer = JitterBuffer()
-    left, now_ns = 0, 0
+    left_count, now_ns = 0, 0
     for number, pause_ns in arrivals:
         now_ns += pause_ns
-        left += len(buffer.push(packet(number), now_ns))
+        left_count += len(buffer.push(packet(number), now_ns))
         wake_ns = buffer.next_wake_ns()
         assert wake_ns is None or now_ns < wake_ns <= now_ns + MAX_HOLD_NS
-    left += len(buffer.expire(now_ns + MAX_HOLD_NS))
+    left_count += len(buffer.expire(now_ns + MAX_HOLD_NS))
     assert buffer.next_wake_ns() is None
-    assert left + buffer.late + buffer.duplicate == len(arrivals)
+    assert left_count + buffer.late + buffer.duplicate == len(arrivals)

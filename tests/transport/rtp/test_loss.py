@@ -1,4 +1,4 @@
-"""Stages 3 to 8 of the life of a frame over a link that loses and reorders packets: the meaning of `complete`."""
+"""Frames from the encoder to the stamp reader over a link that loses and reorders packets: what `complete` means."""
 
 from __future__ import annotations
 
@@ -52,13 +52,16 @@ def sent() -> SentFrames:
     return SentFrames()
 
 
-def test_reordered(sent: SentFrames) -> None:
+def test_frames_survive_reordering(sent: SentFrames) -> None:
     """Over a link that reorders within the hold every frame arrives complete and with its stamp."""
-    random = stream(1, "delay")
+    generator = stream(1, "delay")
     arrivals = []
     for number, datagrams in enumerate(sent.datagrams):
-        delays_ns = random.integers(0, MIN_HOLD_NS - NS_PER_MS, len(datagrams))
-        arrivals += [(number * FRAME_NS + int(delay), one) for delay, one in zip(delays_ns, datagrams, strict=True)]
+        delays_ns = generator.integers(0, MIN_HOLD_NS - NS_PER_MS, len(datagrams))
+        arrivals += [
+            (number * FRAME_NS + int(delay_ns), datagram)
+            for delay_ns, datagram in zip(delays_ns, datagrams, strict=True)
+        ]
     buffer, depacketizer, decoder = JitterBuffer(), Depacketizer(), Decoder()
     ordered: Ordered = []
     for now_ns, datagram in sorted(arrivals):
@@ -79,8 +82,8 @@ def test_reordered(sent: SentFrames) -> None:
 @settings(max_examples=60)
 @given(st.sets(st.integers(0, 500), max_size=12))
 @example(set())
-def test_lost(sent: SentFrames, lost: set[int]) -> None:
-    """Only the pictures from a keyframe to the first loss are trusted, and each is the one decoded without loss."""
+def test_only_pictures_before_a_loss_are_trusted(sent: SentFrames, lost: set[int]) -> None:
+    """The pictures from a keyframe to the first loss after it are trusted, and equal those decoded without loss."""
     packets = [parse_packet(datagram) for datagrams in sent.datagrams for datagram in datagrams]
     lost = {number % len(packets) for number in lost}
     damaged = {packets[number].timestamp for number in lost}
@@ -104,5 +107,7 @@ def test_lost(sent: SentFrames, lost: set[int]) -> None:
     timestamps = [rtp_timestamp(stamp_of(number)) for number in range(FRAMES)]
     groups = [timestamps[begin : begin + GOP_FRAMES] for begin in range(0, FRAMES, GOP_FRAMES)]
     assert trusted == [
-        timestamp for group in groups for timestamp in itertools.takewhile(lambda each: each not in damaged, group)
+        timestamp
+        for group in groups
+        for timestamp in itertools.takewhile(lambda timestamp: timestamp not in damaged, group)
     ]

@@ -23,8 +23,8 @@ def product(one: int, other: int) -> int:
     return total
 
 
-def slow_parity(symbols: Sequence[bytes]) -> list[bytes]:
-    """Return P and Q by their definition."""
+def parity_by_definition(symbols: Sequence[bytes]) -> list[bytes]:
+    """Return P and Q, computed byte by byte from their definition."""
     size = max(len(symbol) for symbol in symbols)
     p, q = bytearray(size), bytearray(size)
     power = 1
@@ -38,8 +38,8 @@ def slow_parity(symbols: Sequence[bytes]) -> list[bytes]:
 
 def random_symbols(count: int, size: int) -> list[bytes]:
     """Return symbols of pseudorandom bytes, the same in each run."""
-    drawn = shake_256(f"{count} {size}".encode()).digest(count * size)
-    return [drawn[index * size :][:size] for index in range(count)]
+    random_bytes = shake_256(f"{count} {size}".encode()).digest(count * size)
+    return [random_bytes[index * size :][:size] for index in range(count)]
 
 
 def without(symbols: Sequence[bytes], *indices: int) -> list[bytes | None]:
@@ -55,7 +55,7 @@ Q_BY_HAND = bytes.fromhex("3b 63")
 
 
 def test_parity_by_hand() -> None:
-    """P is the sum of the symbols and Q that of 2^i times symbol i, over the polynomial 0x11d."""
+    """P is the sum of all symbols i, and Q the sum of 2^i times symbol i, in the field with the polynomial 0x11d."""
     assert compute_parity(BY_HAND, 2) == [P_BY_HAND, Q_BY_HAND]
     assert compute_parity(BY_HAND, 1) == [P_BY_HAND]
     assert compute_parity(BY_HAND, 0) == []
@@ -78,24 +78,24 @@ def test_recovery_by_hand(indices: list[int], parities: Mapping[int, bytes]) -> 
 
 
 @given(st.lists(st.binary(max_size=40), min_size=1, max_size=40), st.data())
-def test_any_missing(symbols: list[bytes], data: st.DataObject) -> None:
-    """Any one or two missing symbols are recovered from as many or more parity symbols."""
+def test_any_missing_symbols_are_recovered(symbols: list[bytes], data: st.DataObject) -> None:
+    """One or two missing symbols are recovered from at least as many parity symbols."""
     parities = compute_parity(symbols, 2)
-    assert parities == slow_parity(symbols)
+    assert parities == parity_by_definition(symbols)
     lost = sorted(data.draw(st.sets(st.integers(0, len(symbols) - 1), min_size=1, max_size=2)))
     received = data.draw(st.sampled_from([[P, Q]] if len(lost) == 2 else [[P], [Q], [P, Q]]))
     padded = [symbol.ljust(len(parities[P]), b"\x00") for symbol in symbols]
-    recovered = recover(without(symbols, *lost), {which: parities[which] for which in received})
+    recovered = recover(without(symbols, *lost), {parity: parities[parity] for parity in received})
     assert recovered == [padded[index] for index in lost]
 
 
 @pytest.mark.parametrize("size", [1, 3])
-def test_every_count(size: int) -> None:
+def test_every_number_of_symbols(size: int) -> None:
     """P and Q of 1 to 255 symbols are those of the definition, and the first and last symbols are recovered."""
     for count in range(1, 256):
         symbols = random_symbols(count, size)
         p, q = compute_parity(symbols, 2)
-        assert [p, q] == slow_parity(symbols)
+        assert [p, q] == parity_by_definition(symbols)
         for index in {0, count // 2, count - 1}:
             assert recover(without(symbols, index), {P: p}) == [symbols[index]]
             assert recover(without(symbols, index), {Q: q}) == [symbols[index]]
@@ -130,8 +130,8 @@ def test_nothing_missing(parities: Mapping[int, bytes]) -> None:
 
 
 @pytest.mark.parametrize(("symbols", "count"), [(0, 1), (256, 1), (1, 3), (1, -1)])
-def test_no_parity(symbols: int, count: int) -> None:
-    """Parity of no symbols or of more than 255, and other than P and Q, is rejected."""
+def test_invalid_numbers_are_rejected(symbols: int, count: int) -> None:
+    """No symbols, more than 255 symbols, and a number of parity symbols other than 0, 1 or 2 are rejected."""
     with pytest.raises(ValueError, match="choose 0 to 2 of 1 to 255"):
         compute_parity([b"x"] * symbols, count)
 

@@ -17,7 +17,7 @@ from lavt.transport.rtp.rtp import RtpPacket
 SSRC = 7
 
 
-class Stream:
+class ReceivedStream:
     """Reception statistics with a jitter buffer, used as the receiver node does."""
 
     def __init__(self) -> None:
@@ -41,27 +41,28 @@ class Stream:
         self.jitter_buffer.expire(MIN_HOLD_NS)
 
 
-def losses(stream: Stream, at_ns: int) -> tuple[int, float, int]:
+def losses(stream: ReceivedStream, at_ns: int) -> tuple[int, float, int]:
+    """Return the highest sequence number, the lost fraction and the cumulative losses of a report."""
     report = stream.reception.report(at_ns)
     assert report is not None
     return report.highest_sequence, report.lost_fraction, report.cumulative_lost
 
 
-def sample(stream: Stream, at_ns: int) -> tuple[int, ...]:
+def sample(stream: ReceivedStream, at_ns: int) -> tuple[int, ...]:
     """Return packets, lost before repair, recovered, lost after repair, reordered, late and duplicate."""
     return astuple(stream.reception.sample(at_ns))[1:-2]
 
 
-def test_nothing_yet() -> None:
+def test_before_the_first_packet() -> None:
     """Before the first packet there is no report, and a sample is empty and has no duration."""
-    stream = Stream()
+    stream = ReceivedStream()
     assert stream.reception.report(NS_PER_S) is None
     assert stream.reception.sample(NS_PER_S) == ReceptionSample(0, 0, 0, 0, 0, 0, 0, 0, 0, None)
 
 
 def test_samples_follow_each_other() -> None:
     """The first sample begins with the first packet, each later one at the end of the previous sample."""
-    stream = Stream()
+    stream = ReceivedStream()
     stream.reception.sample(NS_PER_S)
     stream.arrive(1, 2 * NS_PER_S)
     assert stream.reception.sample(3 * NS_PER_S).duration_ns == NS_PER_S
@@ -70,7 +71,7 @@ def test_samples_follow_each_other() -> None:
 
 def test_loss_without_repair() -> None:
     """A packet that never arrives is lost before and after repair, once its hold has expired."""
-    stream = Stream()
+    stream = ReceivedStream()
     stream.start(100, 5)
     assert losses(stream, MIN_HOLD_NS) == (104, 0.0, 0)
     for number in (105, 107, 108):
@@ -85,7 +86,7 @@ def test_loss_without_repair() -> None:
 
 def test_a_recovered_packet_is_lost_before_repair_only() -> None:
     """A recovered packet counts as lost in the report and before repair, but not after repair."""
-    stream = Stream()
+    stream = ReceivedStream()
     stream.start(0, 2)
     stream.arrive(3, 20 * NS_PER_MS)
     stream.recover(2, 21 * NS_PER_MS)
@@ -96,7 +97,7 @@ def test_a_recovered_packet_is_lost_before_repair_only() -> None:
 
 def test_the_original_after_its_recovery() -> None:
     """A packet that arrives after it was recovered is a duplicate, and no longer lost."""
-    stream = Stream()
+    stream = ReceivedStream()
     stream.start(0, 2)
     stream.arrive(3, 20 * NS_PER_MS)
     stream.recover(2, 21 * NS_PER_MS)
@@ -107,9 +108,9 @@ def test_the_original_after_its_recovery() -> None:
     assert losses(stream, 23 * NS_PER_MS) == (3, 0.0, 0)
 
 
-def test_recovered_too_late() -> None:
+def test_useless_recovery_is_not_counted() -> None:
     """A packet that is recovered after it was given up, or that is present already, is not counted."""
-    stream = Stream()
+    stream = ReceivedStream()
     stream.start(0, 2)
     stream.arrive(3, 20 * NS_PER_MS)
     stream.jitter_buffer.expire(30 * NS_PER_MS)
@@ -120,7 +121,7 @@ def test_recovered_too_late() -> None:
 
 def test_reordered_late_and_duplicate() -> None:
     """A late packet is lost after repair but arrived; a reordered one is not lost."""
-    stream = Stream()
+    stream = ReceivedStream()
     stream.start(0, 2)
     stream.arrive(3, 20 * NS_PER_MS)
     stream.arrive(2, 25 * NS_PER_MS)
@@ -134,7 +135,7 @@ def test_reordered_late_and_duplicate() -> None:
     assert losses(stream, 52 * NS_PER_MS) == (5, 0.0, -1)
 
 
-FATES = {
+PACKET_FATES = {
     "arrives": [("arrive", 0)],
     "twice": [("arrive", 0), ("arrive", 2)],
     "reordered": [("arrive", 5)],
@@ -145,14 +146,14 @@ FATES = {
     "recovered before arrival": [("recover", 3), ("arrive", 6)],
     "recovered after arrival": [("arrive", 3), ("recover", 6)],
 }
-"""The events of a packet, each with its delay in ms."""
-SENT = st.lists(st.sampled_from(sorted(FATES)), max_size=20).map(lambda fates: [*fates, "arrives"])
+"""What can happen to a packet: its events, each with its delay in ms."""
+PERIOD = st.lists(st.sampled_from(sorted(PACKET_FATES)), max_size=20).map(lambda fates: [*fates, "arrives"])
 
 
-@given(st.integers(0, 2**16 - 1), st.lists(SENT, min_size=1, max_size=4))
-def test_losses_are_those_of_the_rfc(first: int, periods: list[list[str]]) -> None:
+@given(st.integers(0, 2**16 - 1), st.lists(PERIOD, min_size=1, max_size=4))
+def test_losses_match_the_rfc(first: int, periods: list[list[str]]) -> None:
     """For any events the report has the values that the program of RFC 3550, A.3, computes."""
-    stream = Stream()
+    stream = ReceivedStream()
     stream.start(first)
     number, at_ms, received = first, 20, 1
     expected_prior, received_prior = 0, 0
@@ -160,7 +161,7 @@ def test_losses_are_those_of_the_rfc(first: int, periods: list[list[str]]) -> No
         events = []
         for fate in fates:
             number, at_ms = number + 1, at_ms + 1
-            events += [(at_ms + after_ms, kind, number) for kind, after_ms in FATES[fate]]
+            events += [(at_ms + after_ms, kind, number) for kind, after_ms in PACKET_FATES[fate]]
         for event_ms, kind, event_number in sorted(events):
             stream.jitter_buffer.expire(event_ms * NS_PER_MS)
             {"arrive": stream.arrive, "recover": stream.recover}[kind](event_number, event_ms * NS_PER_MS)
@@ -178,10 +179,10 @@ def test_losses_are_those_of_the_rfc(first: int, periods: list[list[str]]) -> No
 
 def test_jitter_by_hand() -> None:
     """Jitter changes by a sixteenth of each change of transit time, over all packets, including those of one frame."""
-    stream = Stream()
+    stream = ReceivedStream()
     stream.arrive(1, 0, timestamp=0)
     stream.arrive(2, 1_100_000, timestamp=0)  # 99 ticks later in the same frame
-    stream.arrive(3, 34_433_334, timestamp=3000)  # a frame later than that, to the tick
+    stream.arrive(3, 34_433_334, timestamp=3000)  # exactly one frame period (3000 ticks) later
     report = stream.reception.report(0)
     assert report is not None
     ticks = 99 / 16 * 15 / 16
@@ -193,9 +194,9 @@ def test_jitter_by_hand() -> None:
     st.lists(st.tuples(st.integers(0, 10**8), st.integers(-(2**31), 2**31)), min_size=1, max_size=30),
     st.integers(0, 2**62),
 )
-def test_jitter_is_that_of_the_rfc(packets: list[tuple[int, int]], begin_ns: int) -> None:
+def test_jitter_matches_the_rfc(packets: list[tuple[int, int]], begin_ns: int) -> None:
     """The jitter is the value that the program of RFC 3550, A.8, computes, across the wraps of both clocks."""
-    stream = Stream()
+    stream = ReceivedStream()
     at_ns, timestamp, transit, jitter = begin_ns, 0, None, 0.0
     for number, (pause_ns, step) in enumerate(packets):
         at_ns, timestamp = at_ns + pause_ns, timestamp + step
@@ -212,14 +213,14 @@ def test_jitter_is_that_of_the_rfc(packets: list[tuple[int, int]], begin_ns: int
 
 def test_sequence_numbers_wrap() -> None:
     """The highest sequence number includes the wraps."""
-    stream = Stream()
+    stream = ReceivedStream()
     stream.start(65_534, 4)
     assert losses(stream, MIN_HOLD_NS) == (65_537, 0.0, 0)
 
 
 def test_sender_report_comes_back() -> None:
     """A reception report has the time of the last sender report, in short format, and the time since its arrival."""
-    stream = Stream()
+    stream = ReceivedStream()
     stream.arrive(1, 0)
     report = stream.reception.report(NS_PER_S)
     assert report is not None
@@ -237,7 +238,7 @@ def test_sender_report_comes_back() -> None:
 
 
 def test_a_round_trip_time_of_less_than_a_step() -> None:
-    """A round-trip time of less than a step is 0, and not None."""
+    """A round-trip time of less than one step (1/65536 s) is 0, and not None."""
     reception = Reception(JitterBuffer())
     sent_ns = 5 * NS_PER_S
     answer = ReferenceAnswer(1, ntp_to_short(elapsed_to_ntp(sent_ns)), 0)
@@ -247,14 +248,14 @@ def test_a_round_trip_time_of_less_than_a_step() -> None:
 
 def test_an_answer_gives_the_round_trip_time() -> None:
     """The sender's answer to our reference time gives the round-trip time; an answer to another receiver does not."""
-    stream = Stream()
+    stream = ReceivedStream()
     stream.arrive(1, 0)
-    sent_ns, kept_ns = 100 * NS_PER_S, 300 * NS_PER_MS
+    sent_ns, answer_delay_ns = 100 * NS_PER_S, 300 * NS_PER_MS
     middle = ntp_to_short(elapsed_to_ntp(sent_ns))
-    arrived_ns = sent_ns + kept_ns + 80 * NS_PER_MS
-    stream.reception.note_announcement(Announcement((), (ReferenceAnswer(6, middle, kept_ns),)), 5, arrived_ns)
+    arrived_ns = sent_ns + answer_delay_ns + 80 * NS_PER_MS
+    stream.reception.note_announcement(Announcement((), (ReferenceAnswer(6, middle, answer_delay_ns),)), 5, arrived_ns)
     assert stream.reception.round_trip_ns is None
-    stream.reception.note_announcement(Announcement((), (ReferenceAnswer(5, middle, kept_ns),)), 5, arrived_ns)
+    stream.reception.note_announcement(Announcement((), (ReferenceAnswer(5, middle, answer_delay_ns),)), 5, arrived_ns)
     assert stream.reception.round_trip_ns is not None
     assert abs(stream.reception.round_trip_ns - 80 * NS_PER_MS) < 50_000, "three steps of 1/65536 s"
     assert stream.reception.sample(arrived_ns).round_trip_us == stream.reception.round_trip_ns // 1000
@@ -262,7 +263,7 @@ def test_an_answer_gives_the_round_trip_time() -> None:
 
 def test_another_stream_begins_new_reports() -> None:
     """A report covers one SSRC; samples continue across streams."""
-    stream = Stream()
+    stream = ReceivedStream()
     stream.start(0, 2)
     stream.arrive(3, 20 * NS_PER_MS, timestamp=10**6)
     stream.arrive(5, 20 * NS_PER_MS)
@@ -276,7 +277,7 @@ def test_another_stream_begins_new_reports() -> None:
 
 def test_a_stray_packet_is_not_counted() -> None:
     """A stray packet counts neither as received nor in the jitter; two consecutive ones belong to the stream."""
-    stream = Stream()
+    stream = ReceivedStream()
     stream.start(0, 2)
     stream.arrive(30_000, 20 * NS_PER_MS, timestamp=10**9)
     report = stream.reception.report(20 * NS_PER_MS)

@@ -33,25 +33,25 @@ from lavt.transport.rtp.rtcp import (
 from lavt.transport.rtp.rtcp_xr import ReferenceAnswer, ReferenceTime, round_trip_of_answer_ns
 from lavt.transport.rtp.rtp import RtpPacket
 
-WORD = st.integers(0, 2**32 - 1)
-DELAY_NS = WORD.map(short_to_delay_ns)
+UINT32 = st.integers(0, 2**32 - 1)
+DELAY_NS = UINT32.map(short_to_delay_ns)
 CLOCK_NS = st.integers(0, 2**62)
 CNAME = st.text("abcdefghij@.", min_size=1, max_size=300)
 REPORTS = st.builds(
     ReceptionReport,
-    media_ssrc=WORD,
-    highest_sequence=WORD,
+    media_ssrc=UINT32,
+    highest_sequence=UINT32,
     lost_fraction=st.integers(0, 255).map(lambda part: part / 256),
     cumulative_lost=st.integers(-(2**23), 2**23 - 1),
-    jitter=WORD,
-    last_report=WORD,
+    jitter=UINT32,
+    last_report=UINT32,
     last_report_age_ns=DELAY_NS,
 )
-ANSWERS = st.builds(ReferenceAnswer, WORD, WORD, DELAY_NS)
+ANSWERS = st.builds(ReferenceAnswer, UINT32, UINT32, DELAY_NS)
 
 REPORT = ReceptionReport(2, 3, 0.25, 5, 6, 0xB44DB705, 5 * NS_PER_S + 250 * NS_PER_MS)
-SOME_REPORT = receiver_report(1, REPORT, clock_ns=NS_PER_S // 2, cname="ab")
-SOME_SENDER_REPORT = sender_report(
+EXAMPLE_REPORT = receiver_report(1, REPORT, clock_ns=NS_PER_S // 2, cname="ab")
+EXAMPLE_SENDER_REPORT = sender_report(
     9,
     wall_ns=0,
     rtp_timestamp=7,
@@ -76,12 +76,12 @@ LIMIT = "83 cd 0004 00000001 00000000 00000002"  # RFC 5104, section 4.2.1
 
 def test_receiver_report_as_in_the_rfcs() -> None:
     """A receiver report, its source description and its reference time have the formats of the RFCs."""
-    assert bytes.fromhex(RECEIVER_REPORT + DESCRIPTION + REFERENCE_TIME) == SOME_REPORT
+    assert bytes.fromhex(RECEIVER_REPORT + DESCRIPTION + REFERENCE_TIME) == EXAMPLE_REPORT
 
 
 def test_sender_report_as_in_the_rfcs() -> None:
     """A sender report, its source description and its answers have the formats of the RFCs."""
-    assert bytes.fromhex(SENDER_REPORT + SENDER_DESCRIPTION + ANSWER) == SOME_SENDER_REPORT
+    assert bytes.fromhex(SENDER_REPORT + SENDER_DESCRIPTION + ANSWER) == EXAMPLE_SENDER_REPORT
 
 
 def test_sender_report_without_answers() -> None:
@@ -123,7 +123,7 @@ def test_overhead_beyond_its_field() -> None:
     assert limit == BitRateLimit(2, 1000, 511)
 
 
-@given(WORD, WORD, st.integers(0, 2**80), st.integers(0, 511))
+@given(UINT32, UINT32, st.integers(0, 2**80), st.integers(0, 511))
 def test_max_bit_rate_round_trip(ssrc: int, media_ssrc: int, bit_rate_bps: int, overhead_bytes: int) -> None:
     """A limit is parsed as at most one part in 2^16 below the requested one, and never above it."""
     datagram = max_bit_rate(ssrc, media_ssrc, bit_rate_bps, overhead_bytes=overhead_bytes)
@@ -132,7 +132,7 @@ def test_max_bit_rate_round_trip(ssrc: int, media_ssrc: int, bit_rate_bps: int, 
     assert bit_rate_bps * (1 - 2**-16) <= limit.bit_rate_bps <= bit_rate_bps
 
 
-@given(WORD, REPORTS, CLOCK_NS, CNAME)
+@given(UINT32, REPORTS, CLOCK_NS, CNAME)
 def test_receiver_report_round_trip(ssrc: int, report: ReceptionReport, clock_ns: int, cname: str) -> None:
     """A written receiver report is parsed back unchanged, with its reference time."""
     datagram = receiver_report(ssrc, report, clock_ns=clock_ns, cname=cname)
@@ -142,7 +142,7 @@ def test_receiver_report_round_trip(ssrc: int, report: ReceptionReport, clock_ns
     assert parse_announcement(datagram) == Announcement()
 
 
-@given(WORD, CLOCK_NS, st.tuples(WORD, WORD, WORD), CNAME, st.lists(ANSWERS, max_size=3))
+@given(UINT32, CLOCK_NS, st.tuples(UINT32, UINT32, UINT32), CNAME, st.lists(ANSWERS, max_size=3))
 def test_sender_report_round_trip(
     ssrc: int, wall_ns: int, counts: tuple[int, int, int], cname: str, answers: list[ReferenceAnswer]
 ) -> None:
@@ -181,7 +181,7 @@ def test_values_beyond_their_fields() -> None:
     assert report == ReceptionReport(2, 9, 0.0, -(2**23), 0, 1, 0)
 
 
-def test_compound() -> None:
+def test_compound_datagrams_are_parsed() -> None:
     """Report blocks of sender reports are parsed, too, and unknown packets, formats and blocks are skipped."""
     with_block = "81 c8 000c 00000009" + "00" * 20 + REPORT_BLOCK
     unknown = (
@@ -221,7 +221,7 @@ INVALID_ENDS = (
     "a1ca000100000008",  # padding longer than the packet
     "a1ca000100000004" + DESCRIPTION,  # padding before the last packet
 )
-WRONG_FOR_SENDER = (
+INVALID_AT_THE_SENDER = (
     "82" + RECEIVER_REPORT[2:],
     "81c8000600000009" + "00" * 20,
     "81ce000100000001",
@@ -234,7 +234,7 @@ WRONG_FOR_SENDER = (
     "80cf0003 00000001 04000001 00000000",
     "80cf0005 00000001 04000003 00000000 00000000 00000000",
 )
-WRONG_FOR_RECEIVER = (
+INVALID_AT_THE_RECEIVER = (
     "80c8000500000009" + "00" * 16,
     "81c8000600000009" + "00" * 20,
     "80cf0000",
@@ -245,22 +245,22 @@ WRONG_FOR_RECEIVER = (
 
 
 @pytest.mark.parametrize("datagram", [*INVALID_BEGINNINGS, *(EMPTY_REPORT + end for end in INVALID_ENDS)])
-def test_not_rtcp(datagram: str) -> None:
-    """A datagram without a report first, cut off, of another version or with invalid padding raises `BadPacket`."""
+def test_invalid_rtcp_is_rejected(datagram: str) -> None:
+    """A datagram is rejected if it has no report first, is cut off, or has another version or invalid padding."""
     with pytest.raises(BadPacket):
         parse_feedback(bytes.fromhex(datagram))
     with pytest.raises(BadPacket):
         parse_announcement(bytes.fromhex(datagram))
 
 
-@pytest.mark.parametrize("packet", WRONG_FOR_SENDER)
+@pytest.mark.parametrize("packet", INVALID_AT_THE_SENDER)
 def test_wrong_lengths_for_the_sender(packet: str) -> None:
     """A report, request or reference time of an impossible length raises `BadPacket`."""
     with pytest.raises(BadPacket):
         parse_feedback(bytes.fromhex(EMPTY_REPORT + packet))
 
 
-@pytest.mark.parametrize("packet", WRONG_FOR_RECEIVER)
+@pytest.mark.parametrize("packet", INVALID_AT_THE_RECEIVER)
 def test_wrong_lengths_for_the_receiver(packet: str) -> None:
     """A sender report or an answer of an impossible length raises `BadPacket`."""
     with pytest.raises(BadPacket):
@@ -281,27 +281,27 @@ PACKETS = st.builds(
 @given(st.one_of(st.binary(max_size=80), st.lists(PACKETS, max_size=4).map(b"".join)))
 def test_any_bytes(data: bytes) -> None:
     """For any bytes a parser raises nothing but `BadPacket`."""
-    for head in (b"", b"\x81\xc9", bytes.fromhex(EMPTY_REPORT)):
+    for beginning in (b"", b"\x81\xc9", bytes.fromhex(EMPTY_REPORT)):
         for parse in (parse_feedback, parse_announcement):
             try:
-                parse(head + data)
+                parse(beginning + data)
             except BadPacket:
                 continue
-            assert (head + data)[1] in {200, 201}
+            assert (beginning + data)[1] in {200, 201}
 
 
 def test_ntp_times() -> None:
     """An NTP timestamp counts from 1900 for the wall clock, and from the clock's own epoch for any other."""
-    half_past = 1_500_000_000_500_000_000
-    assert wall_to_ntp(half_past) == (1_500_000_000 + 2_208_988_800) << 32 | 2**31
-    assert elapsed_to_ntp(half_past) == 1_500_000_000 << 32 | 2**31
+    wall_ns = 1_500_000_000_500_000_000
+    assert wall_to_ntp(wall_ns) == (1_500_000_000 + 2_208_988_800) << 32 | 2**31
+    assert elapsed_to_ntp(wall_ns) == 1_500_000_000 << 32 | 2**31
     assert ntp_to_short(0x0123_4567_89AB_CDEF) == 0x4567_89AB
     second_era_ns = (2**32 - 2_208_988_800) * NS_PER_S
     assert (wall_to_ntp(second_era_ns - 1) >> 32, wall_to_ntp(second_era_ns)) == (2**32 - 1, 0)
 
 
-@given(WORD)
-def test_delays(short: int) -> None:
+@given(UINT32)
+def test_delays_are_rounded_to_the_nearest(short: int) -> None:
     """A delay is converted to 1/65536 s and back with rounding to the nearest."""
     assert delay_to_short(short_to_delay_ns(short)) == short
     assert abs(short_to_delay_ns(short) * 65_536 - short * NS_PER_S) <= 32_768
@@ -316,14 +316,14 @@ STEP_NS = -(-NS_PER_S // 65_536)
 
 
 @given(CLOCK_NS, st.integers(0, 59 * NS_PER_S), st.integers(0, 65_000 * NS_PER_S))
-def test_both_sides_know_the_round_trip_time(sent_ns: int, trip_ns: int, kept_ns: int) -> None:
+def test_both_sides_know_the_round_trip_time(sent_ns: int, trip_ns: int, answer_delay_ns: int) -> None:
     """Each side computes the round-trip time to two steps of 1/65536 s, also across the wrap of the short format."""
-    arrived_ns = sent_ns + trip_ns + kept_ns
+    arrived_ns = sent_ns + trip_ns + answer_delay_ns
     # The sender's computation from a receiver report.
     last = ntp_to_short(wall_to_ntp(sent_ns))
-    trips = [(last, round_trip_ns(ntp_to_short(wall_to_ntp(arrived_ns)), last, kept_ns))]
+    trips = [(last, round_trip_ns(ntp_to_short(wall_to_ntp(arrived_ns)), last, answer_delay_ns))]
     last = ntp_to_short(elapsed_to_ntp(sent_ns))
-    trips.append((last, round_trip_of_answer_ns(ReferenceAnswer(1, last, kept_ns), arrived_ns)))
+    trips.append((last, round_trip_of_answer_ns(ReferenceAnswer(1, last, answer_delay_ns), arrived_ns)))
     for last, computed_ns in trips:
         if last == 0:
             assert computed_ns is None
@@ -342,7 +342,7 @@ def test_impossible_round_trips() -> None:
     assert round_trip_ns(65_535, 2**32 - 1, 0) == NS_PER_S
 
 
-def test_rtp_and_rtcp_are_told_apart() -> None:
+def test_rtp_and_rtcp_are_distinguished() -> None:
     """RTP of our payload type, with and without marker, and other datagrams are not RTCP."""
     for marker in (False, True):
         datagram = RtpPacket(96, 1, 2, 3, marker, b"").to_bytes()

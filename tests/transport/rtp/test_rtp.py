@@ -70,7 +70,7 @@ def test_header_as_in_the_rfc() -> None:
 
 
 def test_optional_parts_of_a_packet() -> None:
-    """Contributing sources, header extension and padding are not part of the payload."""
+    """Contributing sources, header extension and padding are not sent_packet of the payload."""
     fixed = bytes.fromhex("b2 60 0102 03040506 0708090a")
     sources, extension = b"c" * 8, bytes.fromhex("bede 0002") + b"e" * 8
     assert parse_packet(fixed + sources + extension + b"payload" + b"\x00\x00\x03").payload == b"payload"
@@ -90,7 +90,7 @@ def test_optional_parts_of_a_packet() -> None:
         "a0 60 0102 03040506 0708090a 0003",
     ],
 )
-def test_not_rtp(datagram: str) -> None:
+def test_invalid_rtp_is_rejected(datagram: str) -> None:
     """A datagram of another version, or shorter than its header says, raises `BadPacket`."""
     with pytest.raises(BadPacket):
         parse_packet(bytes.fromhex(datagram))
@@ -108,7 +108,7 @@ def test_any_bytes_as_packet(data: bytes) -> None:
         assert parsed.payload in datagram
 
 
-def test_split() -> None:
+def test_nal_units_are_split() -> None:
     """NAL units are found after long and short start codes, without trailing zeros and empty units."""
     assert split_nal_units(b"junk" + START + SPS + b"\x00\x00\x01" + PPS + b"\x00\x00" + START + START + IDR) == [
         SPS,
@@ -121,7 +121,7 @@ def test_split() -> None:
 
 
 @given(st.lists(NAL_UNITS, min_size=1, max_size=8), st.integers(64, 1500), st.integers(0, 2**32 - 1))
-def test_there_and_back(units: list[bytes], max_packet_bytes: int, timestamp: int) -> None:
+def test_access_unit_round_trip(units: list[bytes], max_packet_bytes: int, timestamp: int) -> None:
     """Any access unit is reassembled byte for byte and complete with its last packet."""
     data = byte_stream(*units)
     packets = packets_of(data, timestamp, max_packet_bytes)
@@ -133,28 +133,32 @@ def test_there_and_back(units: list[bytes], max_packet_bytes: int, timestamp: in
 
 
 @given(st.lists(NAL_UNITS, min_size=1, max_size=8), st.integers(64, 1500))
-def test_packets(units: list[bytes], max_packet_bytes: int) -> None:
-    """Packets keep to the size and the timestamp, their numbers continue across the wrap, the last has the marker."""
+def test_size_and_numbers_of_packets(units: list[bytes], max_packet_bytes: int) -> None:
+    """Packets have the size limit, one timestamp and consecutive numbers, also at the wrap; the last has the marker."""
     packetizer = Packetizer(ssrc=9, first_sequence=65_534, payload_type=99, max_packet_bytes=max_packet_bytes)
     datagrams = packetizer.packetize(byte_stream(*units), 1234)
     packets = [parse_packet(datagram) for datagram in datagrams]
     assert max(len(datagram) for datagram in datagrams) <= max_packet_bytes
-    assert [one.sequence for one in packets] == [(65_534 + index) % 2**16 for index in range(len(packets))]
-    assert [one.marker for one in packets] == [False] * (len(packets) - 1) + [True]
-    assert {(one.timestamp, one.ssrc, one.payload_type) for one in packets} == {(1234, 9, 99)}
+    assert [sent_packet.sequence for sent_packet in packets] == [
+        (65_534 + index) % 2**16 for index in range(len(packets))
+    ]
+    assert [sent_packet.marker for sent_packet in packets] == [False] * (len(packets) - 1) + [True]
+    assert {(sent_packet.timestamp, sent_packet.ssrc, sent_packet.payload_type) for sent_packet in packets} == {
+        (1234, 9, 99)
+    }
     assert packetizer.next_sequence == (65_534 + len(packets)) % 2**16
 
 
 def test_packet_types() -> None:
-    """Small consecutive units share a STAP-A, a single unit is sent unchanged, a large one in FU-A of equal size."""
+    """Small units share a STAP-A, a single unit is sent unchanged, and a large unit is split into equal FU-A."""
     packets = packets_of(KEYFRAME)
     assert packets[0].payload == bytes([0x78]) + b"\x00\x04" + SPS + b"\x00\x04" + PPS
     fragments = packets[1:]
-    assert [one.payload[0] for one in fragments] == [0x7C] * 5
-    assert [one.payload[1] for one in fragments] == [0x85, 0x05, 0x05, 0x05, 0x45]
-    sizes = [len(one.payload) for one in fragments]
+    assert [sent_packet.payload[0] for sent_packet in fragments] == [0x7C] * 5
+    assert [sent_packet.payload[1] for sent_packet in fragments] == [0x85, 0x05, 0x05, 0x05, 0x45]
+    sizes = [len(sent_packet.payload) for sent_packet in fragments]
     assert max(sizes) - min(sizes) <= 1
-    assert [one.payload for one in packets_of(START + SLICE + b"small")] == [SLICE + b"small"]
+    assert [sent_packet.payload for sent_packet in packets_of(START + SLICE + b"small")] == [SLICE + b"small"]
 
 
 @pytest.mark.parametrize("units", [(b"\x06sei", b"\x41slice"), (b"\x41slice", b"\x06sei")])
@@ -166,7 +170,7 @@ def test_nal_ref_idc_of_a_stap_a(units: tuple[bytes, bytes]) -> None:
 
 def test_headers_of_fragments() -> None:
     """Each fragment has the NRI and type of its unit, the first also the start bit and the last the end bit."""
-    payloads = [one.payload for one in packets_of(START + b"\x46" + b"s" * 5000)]
+    payloads = [sent_packet.payload for sent_packet in packets_of(START + b"\x46" + b"s" * 5000)]
     assert [payload[:2].hex() for payload in payloads] == ["5c86", "5c06", "5c06", "5c06", "5c46"]
 
 
@@ -174,10 +178,10 @@ def test_headers_of_fragments() -> None:
     ("unit_bytes", "types"),
     [([1188], [1]), ([1189], [28, 28]), ([1000, 183], [24]), ([1000, 184], [1, 1]), ([100, 1189, 100], [1, 28, 28, 1])],
 )
-def test_room_of_a_packet(unit_bytes: list[int], types: list[int]) -> None:
-    """A packet of 1200 bytes has room for a unit of 1188 bytes, or for units of 1188 bytes with type and sizes."""
+def test_capacity_of_a_packet(unit_bytes: list[int], types: list[int]) -> None:
+    """A packet of 1200 bytes holds a unit of 1188 bytes, or several whose type and size fields fit into these, too."""
     packets = packets_of(byte_stream(*(SLICE + b"p" * (size - 1) for size in unit_bytes)))
-    assert [one.payload[0] & 0x1F for one in packets] == types
+    assert [sent_packet.payload[0] & 0x1F for sent_packet in packets] == types
 
 
 def test_the_first_sequence_number_wraps() -> None:
@@ -192,7 +196,7 @@ def test_nothing_to_send() -> None:
 
 
 @pytest.mark.parametrize("size", [0, 63, 65_508])
-def test_bad_packet_size(size: int) -> None:
+def test_invalid_packet_size_is_rejected(size: int) -> None:
     """A packet size that no stream can use is rejected."""
     with pytest.raises(UserError, match="choose"):
         Packetizer(1, 0, max_packet_bytes=size)
@@ -201,7 +205,10 @@ def test_bad_packet_size(size: int) -> None:
 @pytest.mark.parametrize("size", [64, 65_507])
 def test_smallest_and_largest_packet_size(size: int) -> None:
     """Packets may have 64 to 65 507 bytes, the most that a datagram has room for."""
-    sizes = [len(one.to_bytes()) for one in packets_of(START + SLICE + b"p" * (size - 13), max_packet_bytes=size)]
+    sizes = [
+        len(sent_packet.to_bytes())
+        for sent_packet in packets_of(START + SLICE + b"p" * (size - 13), max_packet_bytes=size)
+    ]
     assert sizes == [size]
 
 
@@ -226,7 +233,9 @@ def test_fragments_before_a_gap_are_kept() -> None:
     push_all(depacketizer, packets[:3])
     (unit,) = push_all(depacketizer, packets[4:], lost_before=True)
     assert unit.data == KEYFRAME[: len(unit.data)]
-    assert len(unit.data) == len(byte_stream(SPS, PPS)) + 4 + 1 + sum(len(one.payload) - 2 for one in packets[1:3])
+    assert len(unit.data) == len(byte_stream(SPS, PPS)) + 4 + 1 + sum(
+        len(sent_packet.payload) - 2 for sent_packet in packets[1:3]
+    )
 
 
 def test_a_whole_access_unit_is_lost() -> None:
@@ -272,13 +281,13 @@ def test_a_slice_is_lost(missing: int) -> None:
     assert [(unit.timestamp, unit.complete) for unit in units] == [(1, False)]
 
 
-def test_only_useless_packets() -> None:
+def test_access_unit_of_useless_fragments() -> None:
     """An access unit of which only useless fragments arrived is returned empty and incomplete."""
     (unit,) = push_all(Depacketizer(), packets_of(PICTURE)[1:], lost_before=True)
     assert unit == AccessUnit(b"", 1, complete=False, keyframe=False)
 
 
-def test_lost_marker() -> None:
+def test_next_packet_replaces_a_lost_marker() -> None:
     """If the marker packet is lost, the access unit is returned with the first packet of the next one."""
     depacketizer = Depacketizer()
     small = byte_stream(SPS, PPS, IDR + b"s")
@@ -321,7 +330,7 @@ MALFORMED = {
 
 
 @pytest.mark.parametrize("payload", MALFORMED.values(), ids=MALFORMED.keys())
-def test_malformed(payload: bytes) -> None:
+def test_malformed_payload_is_counted(payload: bytes) -> None:
     """A payload that is not H.264 in mode 1 is counted and makes only its access unit incomplete."""
     depacketizer = Depacketizer()
     assert depacketizer.push(packet(SLICE + b"good"), False) == []
@@ -359,7 +368,7 @@ def test_fragments_of_another_unit_end_a_fragmented_unit() -> None:
     ]
 
 
-def test_a_peer_that_never_ends() -> None:
+def test_access_unit_without_end_uses_bounded_memory() -> None:
     """An access unit without end uses bounded memory; payloads beyond the limit are counted as malformed."""
     depacketizer = Depacketizer()
     piece = packet(SLICE + bytes(60_000))
@@ -415,7 +424,7 @@ class DatagramList:
         return len(datagram)
 
 
-def test_another_sender() -> None:
+def test_stream_of_ffmpeg_is_reassembled() -> None:
     """A stream sent by FFmpeg's RTP sender is reassembled with unchanged NAL units."""
     noise = stream(1, "noise")
     encoder = Encoder(160, 128, rate_hz=30, bit_rate_bps=2_000_000, gop_frames=4)
@@ -425,9 +434,14 @@ def test_another_sender() -> None:
     with av.open(file, "w", format="rtp", options=options) as container:
         video = container.add_stream("libx264", rate=30, width=160, height=128, pix_fmt="yuv420p")
         for number, access_unit in enumerate(sent):
-            one = av.Packet(access_unit)
-            one.stream, one.time_base, one.pts, one.dts = video, Fraction(1, 90_000), number * 3000, number * 3000
-            container.mux(one)
+            av_packet = av.Packet(access_unit)
+            av_packet.stream, av_packet.time_base, av_packet.pts, av_packet.dts = (
+                video,
+                Fraction(1, 90_000),
+                number * 3000,
+                number * 3000,
+            )
+            container.mux(av_packet)
     units = push_all(Depacketizer(), [parse_packet(datagram) for datagram in file.datagrams])
     assert [split_nal_units(unit.data) for unit in units] == [split_nal_units(access_unit) for access_unit in sent]
     assert all(unit.complete for unit in units)

@@ -15,7 +15,7 @@ pytest.importorskip("pylibsrtp")
 
 KEY, OTHER_KEY = bytes(range(KEY_BYTES)), bytes(range(1, KEY_BYTES + 1))
 MEDIA_SSRC, REPAIR_SSRC = 0x01020304, 0x0A0B0C0D
-CONTROL = struct.pack("!BBHIIIIII", 0x80, 200, 6, MEDIA_SSRC, 1, 2, 3, 4, 5)
+RTCP_REPORT = struct.pack("!BBHIIIIII", 0x80, 200, 6, MEDIA_SSRC, 1, 2, 3, 4, 5)
 """A sender report without report blocks."""
 
 
@@ -24,6 +24,7 @@ def packet(sequence: int, payload: bytes = b"picture", ssrc: int = MEDIA_SSRC) -
 
 
 def counters(unprotector: Unprotector) -> tuple[int, int]:
+    """Return the numbers of rejected and of replayed packets."""
     return unprotector.rejected, unprotector.replayed
 
 
@@ -50,7 +51,7 @@ def test_sequence_numbers_wrap() -> None:
     """Every packet is unprotected while the sequence numbers wrap twice."""
     protector, unprotector = Protector(KEY), Unprotector(KEY)
     packets = [packet(sequence) for sequence in range(32000, 2 * 65536 + 100, 3)]
-    assert [unprotector.unprotect(protector.protect(each)) for each in packets] == packets
+    assert [unprotector.unprotect(protector.protect(plain)) for plain in packets] == packets
     assert counters(unprotector) == (0, 0)
 
 
@@ -64,7 +65,7 @@ def test_reordered_at_the_wrap(order: list[int]) -> None:
     assert [unprotector.unprotect(protected[sequence]) for sequence in order] == [packet(number) for number in order]
 
 
-def test_missed_packets() -> None:
+def test_next_packet_after_many_missed_ones_is_accepted() -> None:
     """A receiver that missed 2^15 - 2 consecutive packets accepts the next one."""
     protector, unprotector = Protector(KEY), Unprotector(KEY)
     protected = [protector.protect(packet(sequence)) for sequence in range(65000, 65000 + 2**15)]
@@ -76,10 +77,10 @@ def test_first_packet_of_65535_missed() -> None:
     """If a stream begins at 65535 and that packet is lost, no other is accepted: streams must begin below 2^15."""
     protector, unprotector = Protector(KEY), Unprotector(KEY)
     protected = [protector.protect(packet(sequence)) for sequence in range(65535, 65535 + 100)]
-    assert [unprotector.unprotect(each) for each in protected[1:]] == [None] * 99
+    assert [unprotector.unprotect(datagram) for datagram in protected[1:]] == [None] * 99
 
 
-def test_window() -> None:
+def test_replay_window() -> None:
     """A packet 4095 numbers behind the newest is accepted, one 4096 behind is rejected."""
     protector, unprotector = Protector(KEY), Unprotector(KEY)
     protected = [protector.protect(packet(sequence)) for sequence in range(WINDOW_PACKETS + 1)]
@@ -89,7 +90,7 @@ def test_window() -> None:
     assert counters(unprotector) == (0, 1)
 
 
-def test_tampered_anywhere() -> None:
+def test_packet_with_any_changed_bit_is_rejected() -> None:
     """A packet with any bit changed, in header, payload or tag, is rejected; the original is accepted afterwards."""
     protector, unprotector = Protector(KEY), Unprotector(KEY)
     protected = protector.protect(packet(1))
@@ -101,7 +102,7 @@ def test_tampered_anywhere() -> None:
     assert unprotector.unprotect(protected) == packet(1)
 
 
-def test_truncated_anywhere() -> None:
+def test_truncated_packet_is_rejected() -> None:
     """A truncated packet is rejected."""
     unprotector = Unprotector(KEY)
     protected = Protector(KEY).protect(packet(1))
@@ -109,28 +110,28 @@ def test_truncated_anywhere() -> None:
     assert counters(unprotector) == (len(protected), 0)
 
 
-def test_replayed() -> None:
+def test_replayed_packets_are_rejected() -> None:
     """A packet that is received again after others is rejected and counted as a replay."""
     protector, unprotector = Protector(KEY), Unprotector(KEY)
     protected = [protector.protect(packet(sequence)) for sequence in range(10)]
-    assert all(unprotector.unprotect(each) for each in protected)
-    assert [unprotector.unprotect(each) for each in protected] == [None] * 10
+    assert all(unprotector.unprotect(datagram) for datagram in protected)
+    assert [unprotector.unprotect(datagram) for datagram in protected] == [None] * 10
     assert counters(unprotector) == (0, 10)
 
 
-def test_other_key() -> None:
+def test_packet_under_another_key_is_rejected() -> None:
     """A packet protected under another key is rejected."""
     unprotector = Unprotector(OTHER_KEY)
     assert unprotector.unprotect(Protector(KEY).protect(packet(1))) is None
-    assert unprotector.unprotect_rtcp(Protector(KEY).protect_rtcp(CONTROL)) is None
+    assert unprotector.unprotect_rtcp(Protector(KEY).protect_rtcp(RTCP_REPORT)) is None
     assert counters(unprotector) == (2, 0)
 
 
-def test_plain_packets() -> None:
+def test_plain_packets_are_rejected() -> None:
     """Unprotected packets are rejected."""
     unprotector = Unprotector(KEY)
     assert unprotector.unprotect(packet(1, bytes(100))) is None
-    assert unprotector.unprotect_rtcp(CONTROL) is None
+    assert unprotector.unprotect_rtcp(RTCP_REPORT) is None
     assert counters(unprotector) == (2, 0)
 
 
@@ -144,8 +145,8 @@ def test_any_bytes(garbage: bytes) -> None:
     assert sum(counters(unprotector)) == 2
 
 
-def test_garbage_between() -> None:
-    """Forged packets of the same stream with distant numbers do not prevent a later authentic one."""
+def test_forged_packets_do_not_block_authentic_ones() -> None:
+    """Forged packets of the same stream with distant numbers do not cause a later authentic packet to be rejected."""
     protector, unprotector = Protector(KEY), Unprotector(KEY)
     assert unprotector.unprotect(protector.protect(packet(1))) is not None
     for sequence in range(0, 2**16, 97):
@@ -153,18 +154,18 @@ def test_garbage_between() -> None:
     assert unprotector.unprotect(protector.protect(packet(2))) == packet(2)
 
 
-def test_control() -> None:
+def test_rtcp_is_encrypted_and_accepted_once() -> None:
     """RTCP packets are encrypted, accepted once each, and rejected if any bit is changed."""
     protector, unprotector = Protector(KEY), Unprotector(KEY)
-    first, second = protector.protect_rtcp(CONTROL), protector.protect_rtcp(CONTROL)
-    assert len(first) == len(CONTROL) + 20
-    assert first != second  # each has its own index
-    assert CONTROL[8:] not in first
+    first, second = protector.protect_rtcp(RTCP_REPORT), protector.protect_rtcp(RTCP_REPORT)
+    assert len(first) == len(RTCP_REPORT) + 20
+    assert first != second  # each packet has its own index
+    assert RTCP_REPORT[8:] not in first
     for bit in range(8 * len(first)):
         changed = bytearray(first)
         changed[bit // 8] ^= 1 << bit % 8
         assert unprotector.unprotect_rtcp(bytes(changed)) is None
-    assert [unprotector.unprotect_rtcp(each) for each in (second, first)] == [CONTROL, CONTROL]
+    assert [unprotector.unprotect_rtcp(datagram) for datagram in (second, first)] == [RTCP_REPORT, RTCP_REPORT]
     assert counters(unprotector) == (8 * len(first), 0)
     assert unprotector.unprotect_rtcp(first) is None
     assert counters(unprotector) == (8 * len(first), 1)
@@ -174,12 +175,12 @@ def test_two_streams_under_one_key() -> None:
     """Media and repair packets with the same number and key are encrypted differently, and both are accepted."""
     protector, unprotector = Protector(KEY), Unprotector(KEY)
     streams = [packet(sequence, bytes(40), ssrc) for sequence in range(5) for ssrc in (MEDIA_SSRC, REPAIR_SSRC)]
-    protected = [protector.protect(each) for each in streams]
-    assert len({each[12:] for each in protected}) == 10
-    assert [unprotector.unprotect(each) for each in protected] == streams
+    protected = [protector.protect(stream_packet) for stream_packet in streams]
+    assert len({datagram[12:] for datagram in protected}) == 10
+    assert [unprotector.unprotect(datagram) for datagram in protected] == streams
 
 
-def test_changed_ssrc() -> None:
+def test_packet_with_changed_ssrc_is_rejected() -> None:
     """A packet whose SSRC was changed to that of the other stream is rejected."""
     protector, unprotector = Protector(KEY), Unprotector(KEY)
     protected = protector.protect(packet(1))
@@ -188,8 +189,8 @@ def test_changed_ssrc() -> None:
     assert counters(unprotector) == (1, 0)
 
 
-def test_never_twice_under_one_number() -> None:
-    """A second packet with the same number is not protected, since two texts under one number allow forgeries."""
+def test_no_second_packet_under_one_number() -> None:
+    """A second packet with the same number is rejected, because two payloads under one number allow forgeries."""
     protector = Protector(KEY)
     protector.protect(packet(1, b"one"))
     with pytest.raises(WorkError, match="replay"):

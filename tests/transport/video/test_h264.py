@@ -28,8 +28,8 @@ def moving_pictures(count: int) -> list[Picture]:
 
 
 def encoder(**changes: float) -> Encoder:
-    numbers = {"rate_hz": 30, "bit_rate_bps": 1_000_000, "gop_frames": 15} | changes
-    return Encoder(WIDTH, HEIGHT, **numbers)  # type: ignore[arg-type]
+    settings_of_encoder = {"rate_hz": 30, "bit_rate_bps": 1_000_000, "gop_frames": 15} | changes
+    return Encoder(WIDTH, HEIGHT, **settings_of_encoder)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def nal_types(access_unit: bytes) -> list[int]:
     return [unit[0] & 0x1F for unit in split_nal_units(access_unit)]
 
 
-def test_no_hidden_frame(pictures: list[Picture]) -> None:
+def test_each_picture_is_decoded_without_delay(pictures: list[Picture]) -> None:
     """Each picture gives one access unit, which decodes to that picture with its stamp, without a frame of delay."""
     sender, receiver = encoder(), Decoder()
     for number, picture in enumerate(pictures):
@@ -70,20 +70,20 @@ def test_decoded_picture_resembles_the_original(pictures: list[Picture], access_
     plain[:] = 200, 100, 50
     plain[:STAMP_PX, :STAMP_PX] = 255
     plain[-STAMP_PX:, -STAMP_PX:] = 0
-    seen = Decoder().decode(encoder().encode(plain))
-    assert seen is not None
-    assert np.abs(seen.picture[120, 160].astype(int) - (200, 100, 50)).max() < 4
-    assert abs(int(seen.luma[20, 20]) - 235) < 3
-    assert abs(int(seen.luma[-20, -20]) - 16) < 3
+    decoded_plain = Decoder().decode(encoder().encode(plain))
+    assert decoded_plain is not None
+    assert np.abs(decoded_plain.picture[120, 160].astype(int) - (200, 100, 50)).max() < 4
+    assert abs(int(decoded_plain.luma[20, 20]) - 235) < 3
+    assert abs(int(decoded_plain.luma[-20, -20]) - 16) < 3
 
 
-def test_same_pictures_same_bytes(pictures: list[Picture], access_units: list[bytes]) -> None:
+def test_encoding_is_reproducible(pictures: list[Picture], access_units: list[bytes]) -> None:
     """Encoding is byte-for-byte reproducible by another encoder."""
     encode = encoder().encode
     assert [encode(picture) for picture in pictures] == access_units
 
 
-def test_pictures_stay_as_they_are(pictures: list[Picture]) -> None:
+def test_decoded_pictures_are_not_overwritten(pictures: list[Picture]) -> None:
     """A decoded picture is not overwritten when later pictures are encoded and decoded."""
     sender, receiver = encoder(), Decoder()
     first = receiver.decode(sender.encode(pictures[0]))
@@ -131,7 +131,7 @@ def test_empty_access_unit(access_units: list[bytes]) -> None:
     assert receiver.decode(access_units[1]) is not None
 
 
-def test_no_keyframe_yet(access_units: list[bytes]) -> None:
+def test_no_picture_before_a_keyframe(access_units: list[bytes]) -> None:
     """Access units before the first keyframe give no picture."""
     receiver = Decoder()
     assert [receiver.decode(unit) for unit in access_units[1:4]] == [None, None, None]
@@ -151,17 +151,17 @@ def test_keyframe_after_damage(access_units: list[bytes]) -> None:
     """A keyframe after a truncated picture decodes without any trace of the damage."""
     clean = Decoder().decode(access_units[15])
     assert clean is not None
-    for kept in range(100, len(access_units[14]), 97):
+    for kept_bytes in range(100, len(access_units[14]), 97):
         receiver = Decoder()
         receiver.decode(access_units[0])
-        receiver.decode(access_units[14][:kept])
+        receiver.decode(access_units[14][:kept_bytes])
         decoded = receiver.decode(access_units[15])
         assert decoded is not None
         assert np.array_equal(decoded.picture, clean.picture)
 
 
 def test_lost_access_units(access_units: list[bytes]) -> None:
-    """After two consecutive lost pictures each later access unit still gives a picture, and the keyframe its own."""
+    """After two consecutive lost frames each access unit gives a picture, and the next keyframe gives its own."""
     receiver = Decoder()
     receiver.decode(access_units[0])
     for number in range(3, 15):
@@ -172,7 +172,7 @@ def test_lost_access_units(access_units: list[bytes]) -> None:
     assert read_stamp(decoded.luma) == START_NS + 15 * FRAME_NS
 
 
-def test_other_size_on_the_way(access_units: list[bytes]) -> None:
+def test_sender_restarts_with_another_size(access_units: list[bytes]) -> None:
     """The decoder follows a sender that restarts with another picture size."""
     receiver = Decoder()
     receiver.decode(access_units[0])
@@ -211,7 +211,7 @@ def test_damage_is_deterministic(access_units: list[bytes], damage: list[tuple[i
 
 
 @pytest.mark.parametrize("size", [(321, 240), (320, 241), (62, 240), (320, 62), (8192, 8192)])
-def test_bad_sizes(size: tuple[int, int]) -> None:
+def test_invalid_sizes_are_rejected(size: tuple[int, int]) -> None:
     """Odd sizes, sizes smaller than the stamp and sizes beyond the decoder's limit are rejected."""
     with pytest.raises(UserError, match="choose"):
         Encoder(*size, rate_hz=30, bit_rate_bps=1_000_000, gop_frames=15)
@@ -221,19 +221,19 @@ def test_bad_sizes(size: tuple[int, int]) -> None:
     "change",
     [{"rate_hz": 0}, {"rate_hz": float("nan")}, {"bit_rate_bps": 0}, {"gop_frames": 0}, {"buffer_s": 0.0}],
 )
-def test_bad_rates(change: dict[str, float]) -> None:
+def test_invalid_rates_are_rejected(change: dict[str, float]) -> None:
     """Rates, keyframe intervals and buffers of zero are rejected."""
     with pytest.raises(UserError, match="choose"):
         encoder(**change)
 
 
-def test_bad_preset() -> None:
+def test_unknown_preset_is_rejected() -> None:
     """A preset that libx264 does not have is rejected, and the error names the valid ones."""
     with pytest.raises(UserError, match="ultrafast, superfast"):
         Encoder(WIDTH, HEIGHT, rate_hz=30, bit_rate_bps=1_000_000, gop_frames=15, preset="fastest")
 
 
-def test_picture_of_another_size() -> None:
+def test_picture_of_another_size_is_rejected() -> None:
     """A picture of another size than the encoder's is rejected."""
     with pytest.raises(UserError, match="shape"):
         encoder().encode(np.zeros((WIDTH, HEIGHT, 3), np.uint8))

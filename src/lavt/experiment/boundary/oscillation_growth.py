@@ -18,7 +18,7 @@ from lavt.vehicle.sim.simulator import start_offset
 ROAD = "straight"
 DRIVE_LIMIT_S = 45.0
 """The longest drive, including the time before arming."""
-CALM_START = (0.02, math.radians(0.2))
+NEAR_CENTRE_START = (0.02, math.radians(0.2))
 """The largest initial distance from the lane's centre (m) and heading error (rad): a small oscillation can grow."""
 
 SETTLED_SHARE = 0.01
@@ -63,19 +63,19 @@ def growth_per_s(drive: MonitoredRun) -> float:
 
 
 def straight_run(config: RunConfig) -> PlannedRun:
-    """Plan the run of `config` on a straight road instead of its route, with a calm start.
+    """Plan the run of `config` on a straight road instead of its route, with a start near the centre.
 
-    Its seed is the first in a series derived from the run's own seed whose start lies within `CALM_START`.
+    Its seed is the first in a series derived from the run's own seed whose start lies within `NEAR_CENTRE_START`.
     """
     vehicle = config.vehicle.model_copy(update={"route": ROAD})
     planned = plan_run(config.model_copy(update={"vehicle": vehicle}), name=ROAD)
     own = run_seed(config.seed, config.vehicle.route, config.repetition)
-    return replace(planned, seed=calm_seed(own))
+    return replace(planned, seed=near_centre_seed(own))
 
 
-def calm_seed(seed: int) -> int:
-    """Return the first seed with a calm start in the series that is derived from `seed`."""
-    limit_m, limit_rad = CALM_START
+def near_centre_seed(seed: int) -> int:
+    """Return the first seed with a start near the centre in the series that is derived from `seed`."""
+    limit_m, limit_rad = NEAR_CENTRE_START
     seeds = (run_seed(seed, ROAD, number) for number in itertools.count())
     return next(
         each

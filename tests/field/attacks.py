@@ -1,7 +1,7 @@
 """A drive with the secure configs, and an attacker at the operator's router that records, replays, alters and floods.
 
-The attacker has a session at the operator's router, which the permissions of the router's socket should prevent. So
-only the signatures protect the drive.
+The permissions of the router's socket should prevent this session. The tests assume that they failed, so that only the
+signatures protect the drive.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tests.field.secured import BASE, QUIC, direct, open_session, quic_endpoint, start_router, tls_changes
+from tests.field.secured_routers import BASE, QUIC, direct, open_session, quic_endpoint, start_router, tls_changes
 
 from lavt.clock import MachineClock, pause
 from lavt.config_file import shipped
@@ -25,16 +25,17 @@ PHASE_NS = 5 * NS_PER_S
 FLOOD_PER_S = 10_000
 START_LIMIT_S = 90.0
 BURST = 50
+"""Messages per call of `flood`."""
 SIGNATURE_BYTES = 64
 
 
 @dataclass
-class Drive:
-    """The records of a drive, and the begin and end of each attack (the machine's monotonic clock)."""
+class AttackedDrive:
+    """The records of a drive, and for each attack the number of messages and when it began and ended (ns)."""
 
     phases: dict[str, tuple[int, int]]
-    sent: dict[str, int]
-    shown: list[bytes]
+    sent_counts: dict[str, int]
+    states_at_operator: list[bytes]
     server: Record
     client: Record
     last_status: dict[str, Any]
@@ -48,12 +49,14 @@ class Insider:
         self.commands: list[bytes] = []
         self.states: list[bytes] = []
         self.queries: list[bytes] = []
-        self.sent: dict[str, int] = {}
+        self.sent_counts: dict[str, int] = {}
         self._chance = stream(1, "insider")
         self.session.declare_subscriber(
-            f"{BASE}/control", direct(lambda each: self.commands.append(bytes(each.payload)))
+            f"{BASE}/control", direct(lambda sample: self.commands.append(bytes(sample.payload)))
         )
-        self.session.declare_subscriber(f"{BASE}/state", direct(lambda each: self.states.append(bytes(each.payload))))
+        self.session.declare_subscriber(
+            f"{BASE}/state", direct(lambda sample: self.states.append(bytes(sample.payload)))
+        )
         self.session.declare_queryable(f"{BASE}/session", direct(self._forge))
         self._control = self.session.declare_publisher(f"{BASE}/control", **{**CONTROL, "express": False})
         self._state = self.session.declare_publisher(f"{BASE}/state", **CONTROL)
@@ -93,7 +96,7 @@ class Insider:
             self._put("flood", newest + self._chance.bytes(80))
 
     def _put(self, name: str, data: bytes) -> None:
-        self.sent[name] = self.sent.get(name, 0) + 1
+        self.sent_counts[name] = self.sent_counts.get(name, 0) + 1
         self._control.put(data)
 
     def close(self) -> None:
@@ -101,7 +104,7 @@ class Insider:
         self.session.close()
 
 
-def drive(work: Path, keys: Path) -> Drive:
+def drive(work: Path, keys: Path) -> AttackedDrive:
     """Drive without an attack at first, then under one attack after the other."""
     clock = MachineClock()
     with Processes(work) as processes:
@@ -123,11 +126,11 @@ def drive(work: Path, keys: Path) -> Drive:
         insider.close()
         client.end()
         server.end()
-        shown = [bytes(data) for data in insider.states]
-    return Drive(
+        states_at_operator = [bytes(data) for data in insider.states]
+    return AttackedDrive(
         phases,
-        insider.sent,
-        shown,
+        insider.sent_counts,
+        states_at_operator,
         read_record(work / "server" / "server.mcap"),
         read_record(work / "client" / "client.mcap"),
         status,
@@ -135,7 +138,7 @@ def drive(work: Path, keys: Path) -> Drive:
 
 
 def run_attack(clock: MachineClock, attack: Callable[[], None], period_ns: int) -> tuple[int, int]:
-    """Attack once per period for 5 s, catching up after a stall of the machine; return begin and end."""
+    """Attack once per period for 5 s, and catch up after a stall of the machine; return when it began and ended."""
     began_ns = clock.now().mono_ns
     number = 0
     while (now_ns := clock.now().mono_ns) < began_ns + PHASE_NS:
@@ -171,7 +174,7 @@ def start_secure_loop(processes: Processes, work: Path, keys: Path) -> tuple[Ins
         str(shipped("configs/server-secure.yaml")),
         "--out",
         str(work / "server"),
-        *sets(
+        *set_arguments(
             f"zenoh.router={sockets['vehicle']}",
             f"security.key={keys}/vehicle-1.sign.key",
             f"security.operators={{operator-1: {keys}/operator-1.sign.pub}}",
@@ -190,7 +193,7 @@ def start_secure_loop(processes: Processes, work: Path, keys: Path) -> tuple[Ins
         str(shipped("configs/client-secure.yaml")),
         "--out",
         str(work / "client"),
-        *sets(
+        *set_arguments(
             f"zenoh.router={sockets['operator']}",
             f"security.key={keys}/operator-1.sign.key",
             f"security.vehicle={keys}/vehicle-1.sign.pub",
@@ -205,7 +208,7 @@ def start_secure_loop(processes: Processes, work: Path, keys: Path) -> tuple[Ins
     return insider, server, client
 
 
-def sets(*changes: str) -> list[str]:
+def set_arguments(*changes: str) -> list[str]:
     """Return the command-line arguments for changes of a config."""
     return [word for change in changes for word in ("--set", change)]
 

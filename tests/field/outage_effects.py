@@ -1,10 +1,10 @@
-"""Measure the effects of outages from the server's records and from the observer's (`outside.py`).
+"""Measure the effects of outages from the records of the server and of the observer (`command_observer.py`).
 
-A command is stale if the vehicle has begun a safe stop, or its server was restarted, since the command or its picture
-was sent; or if it was sent more than 500 ms before it arrived. The observer reads send times and stamps, and knows when
-a command arrived at the vehicle's machine; all clocks are those of one kernel. The server's records say when the
-vehicle stopped and which commands it accepted. A busy router may drop a command for one of its subscribers, so the few
-accepted commands that the observer missed are judged by the server's record of them.
+A command is stale if, since the command or its picture was sent, the vehicle has begun a safe stop or its server was
+restarted. A command that was sent more than 500 ms before it arrived is also stale. The observer reads send times and
+stamps, and knows when a command arrived at the vehicle's machine; all processes read the clocks of one kernel. The
+server's records say when the vehicle stopped and which commands it accepted. A busy router may drop a command for one
+of its subscribers, so the few accepted commands that the observer missed are judged by the server's record of them.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from lavt.recording.table import IntArray
 
 MAX_AGE_NS = 500 * NS_PER_MS
 STANDSTILL_MPS = 0.05
-FOREVER_NS = 2**63 - 1
-TIME_HEADS = ("to degraded", "to safe stop", "to standstill", "to driving again")
-HEAD = ("outage", *TIME_HEADS, "commands observed", "stale", "accepted", "stale")
+END_OF_TIME_NS = 2**63 - 1
+TIME_COLUMNS = ("to degraded", "to safe stop", "to standstill", "to driving again")
+COLUMNS = ("outage", *TIME_COLUMNS, "commands observed", "stale", "accepted", "stale")
 CommandId = tuple[int, int]
 """Epoch and sequence of a command."""
 
@@ -50,7 +50,7 @@ class ReceivedCommand:
 
 @dataclass(frozen=True)
 class AcceptedCommand:
-    """A command that the server accepted, and whether its picture was newer than those before."""
+    """A command that the server accepted; it is fresh if its picture is newer than those of all earlier commands."""
 
     command: ReceivedCommand
     fresh: bool
@@ -58,22 +58,22 @@ class AcceptedCommand:
 
 @dataclass(frozen=True)
 class OutageEffects:
-    """The effects of one outage: times in seconds on the monotonic clock, None for what did not happen."""
+    """The effects of one outage: times in seconds from its beginning, or None for what did not happen."""
 
     outage: Outage
     to_degraded_s: float | None
     to_safe_stop_s: float | None
     to_standstill_s: float | None
     to_driving_s: float | None
-    """From the end of the outage."""
+    """Counted from the end of the outage."""
     command_gap_at_degraded_s: float | None
-    """Time since the last fresh command."""
+    """Time from the last fresh command to the degraded state."""
     command_gap_at_safe_stop_s: float | None
     stopping_s: float | None
     """From the safe stop to standstill."""
     stopped_from_mps: float | None
     observed: int
-    """Commands that the observer received from the begin of the outage to that of the next."""
+    """Commands that the observer received from the beginning of the outage to the beginning of the next one."""
     stale_observed: int
     accepted: int
     stale_accepted: int
@@ -83,7 +83,7 @@ class OutageEffects:
 def measure(drive: Drive) -> list[OutageEffects]:
     """Measure the effects of all outages of a drive that has ended."""
     evidence = _Evidence(drive)
-    begins = [outage.begin.mono_ns for outage in drive.outages] + [FOREVER_NS]
+    begins = [outage.begin.mono_ns for outage in drive.outages] + [END_OF_TIME_NS]
     return [evidence.measure(outage, until) for outage, until in zip(drive.outages, begins[1:], strict=True)]
 
 
@@ -92,26 +92,28 @@ class _Evidence:
 
     def __init__(self, drive: Drive) -> None:
         records = drive.records("server")
-        self.transitions = [each for record in records for each in transitions(record)]
-        self.accepted = [each for record in records for each in _accepted(record)]
+        self.transitions = [transition for record in records for transition in transitions(record)]
+        self.accepted = [command for record in records for command in _accepted(record)]
         truths = [record.table("truth") for record in records]
         self.truth_ns: IntArray = np.concatenate([truth.ints("mono_ns") for truth in truths])
         self.speed_mps: FloatArray = np.concatenate([truth.floats("speed_mps") for truth in truths])
-        self.observed = {each.command_id: each for each in map(_observed, drive.observed_commands())}
-        stops = [each.at for each in self.transitions if each.after == "safe_stop"]
-        restarts = [_begin(record) for record in records[1:]]
+        self.observed = {command.command_id: command for command in map(_observed, drive.observed_commands())}
+        stops = [transition.at for transition in self.transitions if transition.after == "safe_stop"]
+        restarts = [_first_time(record) for record in records[1:]]
         self.stops = sorted([*stops, *restarts], key=lambda stop: stop.mono_ns)
 
     def measure(self, outage: Outage, until_ns: int) -> OutageEffects:
         begin_ns = outage.begin.mono_ns
-        changes = [each for each in self.transitions if begin_ns < each.at.mono_ns < until_ns]
-        degraded = next((each for each in changes if each.after == "degraded"), None)
-        stop = next((each for each in changes if each.after == "safe_stop"), None)
-        left_driving = next((each for each in changes if each.before == "driving"), None)
-        driving = next((each for each in changes if each.after == "driving"), None)
+        changes = [transition for transition in self.transitions if begin_ns < transition.at.mono_ns < until_ns]
+        degraded = next((change for change in changes if change.after == "degraded"), None)
+        stop = next((change for change in changes if change.after == "safe_stop"), None)
+        left_driving = next((change for change in changes if change.before == "driving"), None)
+        driving = next((change for change in changes if change.after == "driving"), None)
         stationary_since_ns = None if stop is None else self._stationary_since_ns(stop.at.mono_ns)
-        observed = [each for each in self.observed.values() if begin_ns < each.at.mono_ns < until_ns]
-        accepted = [each.command for each in self.accepted if begin_ns < each.command.at.mono_ns < until_ns]
+        observed = [command for command in self.observed.values() if begin_ns < command.at.mono_ns < until_ns]
+        accepted = [
+            acceptance.command for acceptance in self.accepted if begin_ns < acceptance.command.at.mono_ns < until_ns
+        ]
         return OutageEffects(
             outage,
             _since(begin_ns, degraded),
@@ -123,10 +125,13 @@ class _Evidence:
             None if stop is None or stationary_since_ns is None else (stationary_since_ns - stop.at.mono_ns) / NS_PER_S,
             None if stop is None else float(self.speed_mps[np.searchsorted(self.truth_ns, stop.at.mono_ns)]),
             len(observed),
-            sum(self._is_stale(each, each.at.mono_ns) for each in observed),
+            sum(self._is_stale(command, command.at.mono_ns) for command in observed),
             len(accepted),
-            sum(self._is_stale(self.observed.get(each.command_id, each), each.at.mono_ns) for each in accepted),
-            sum(each.command_id not in self.observed for each in accepted),
+            sum(
+                self._is_stale(self.observed.get(command.command_id, command), command.at.mono_ns)
+                for command in accepted
+            ),
+            sum(command.command_id not in self.observed for command in accepted),
         )
 
     def _is_stale(self, command: ReceivedCommand, received_ns: int) -> bool:
@@ -136,7 +141,7 @@ class _Evidence:
         return is_from_before_stop or command.at.wall_ns - command.sent_wall_ns > MAX_AGE_NS
 
     def _since_fresh_command_s(self, transition: Transition) -> float:
-        fresh_ns = [each.command.at.mono_ns for each in self.accepted if each.fresh]
+        fresh_ns = [acceptance.command.at.mono_ns for acceptance in self.accepted if acceptance.fresh]
         return (transition.at.mono_ns - max(at_ns for at_ns in fresh_ns if at_ns < transition.at.mono_ns)) / NS_PER_S
 
     def _stationary_since_ns(self, after_ns: int) -> int | None:
@@ -161,10 +166,10 @@ def _accepted(record: Record) -> Iterator[AcceptedCommand]:
     fresh = np.append(True, stamps_ns[1:] > np.maximum.accumulate(stamps_ns)[:-1])[: len(commands)]
     columns = (commands.ints(f"{name}_ns") for name in ("sent_wall", "stamp", "received_mono", "received_wall"))
     rows = zip(commands.objects("epoch"), commands.ints("sequence"), *columns, fresh, strict=True)
-    for epoch, sequence, sent_wall_ns, stamp_ns, mono_ns, wall_ns, newer in rows:
+    for epoch, sequence, sent_wall_ns, stamp_ns, mono_ns, wall_ns, is_fresh in rows:
         at = Now(int(mono_ns), int(wall_ns))
         command = ReceivedCommand((epoch, int(sequence)), int(sent_wall_ns), int(stamp_ns), at)
-        yield AcceptedCommand(command, bool(newer))
+        yield AcceptedCommand(command, bool(is_fresh))
 
 
 def _observed(line: Mapping[str, Any]) -> ReceivedCommand:
@@ -172,7 +177,7 @@ def _observed(line: Mapping[str, Any]) -> ReceivedCommand:
     return ReceivedCommand((line["epoch"], line["sequence"]), line["sent_wall_ns"], line["stamp_ns"], at)
 
 
-def _begin(record: Record) -> Now:
+def _first_time(record: Record) -> Now:
     truth = record.table("truth")
     return Now(int(truth.mono_ns[0]), int(truth.wall_ns[0]))
 
@@ -181,9 +186,9 @@ def _since(begin_ns: int, transition: Transition | None) -> float | None:
     return None if transition is None else (transition.at.mono_ns - begin_ns) / NS_PER_S
 
 
-def table(rows: Sequence[OutageEffects]) -> str:
+def effects_table(rows: Sequence[OutageEffects]) -> str:
     """Return the effects of outages as a Markdown table; times in seconds."""
-    lines = [f"| {' | '.join(HEAD)} |", "|---" * len(HEAD) + "|"]
+    lines = [f"| {' | '.join(COLUMNS)} |", "|---" * len(COLUMNS) + "|"]
     for row in rows:
         times = (row.to_degraded_s, row.to_safe_stop_s, row.to_standstill_s, row.to_driving_s)
         counts = (row.observed, row.stale_observed, row.accepted, row.stale_accepted)

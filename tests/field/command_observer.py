@@ -1,9 +1,10 @@
 """Record every command at the vehicle's router, in a process that is independent of the server.
 
 The observer has a session of its own with the vehicle's router, and shares only that router and the kernel's clocks
-with the server. It writes one line per command: when it arrived here, its send time, and the stamp of its picture.
+with the server. It writes one line per command: when the command arrived here, its send time, and the
+stamp of its picture.
 
-    python tests/field/outside.py FILE
+    python tests/field/command_observer.py FILE
 """
 
 from __future__ import annotations
@@ -27,10 +28,11 @@ WRITE_PERIOD_NS = 50 * NS_PER_MS
 
 
 def line_of(payload: bytes, arrived: Now) -> str:
+    """Return a line of JSON: fields of a command and its arrival time, or the size of an invalid message."""
     try:
         command = decode(Command, payload)
     except BadMessage:
-        return json.dumps({"unreadable": len(payload)})
+        return json.dumps({"invalid_message_bytes": len(payload)})
     names = ("epoch", "sequence", "sent_wall_ns", "stamp_ns", "mode")
     values = {name: getattr(command, name) for name in names}
     return json.dumps({**values, "mono_ns": arrived.mono_ns, "wall_ns": arrived.wall_ns})

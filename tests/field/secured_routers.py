@@ -1,6 +1,7 @@
 """The shipped encrypted routers on the loopback, with a vehicle, an operator and attackers.
 
-All of these are bare Zenoh sessions, so that only the routers protect against the attackers, and nothing of LAVT.
+Vehicle, operator and attackers are plain Zenoh sessions without LAVT's gateway, so that only the routers protect
+against the attackers.
 """
 
 from __future__ import annotations
@@ -25,9 +26,10 @@ BASE = "lavt/vehicle-1"
 QUIC = "quic/127.0.0.1:0?mixed_rel=1"
 ROUND_NS = 20 * NS_PER_MS
 ROUNDS = 25
-"""The number of commands, states and replies that must arrive during an attack, so that the attack had time."""
+"""An attack lasts until so many commands, states and replies have arrived."""
 LIMIT_S = 15.0
-LONG = 5000
+"""Time limit of an attack."""
+LONG_COMMAND_BYTES = 5000
 
 
 def make_keys(directory: Path, *arguments: str) -> None:
@@ -35,13 +37,13 @@ def make_keys(directory: Path, *arguments: str) -> None:
     subprocess.run([sys.executable, "-m", "lavt", "keys", str(directory), *arguments], check=True, capture_output=True)
 
 
-def tls_changes(keys: Path, name: str, way: str) -> tuple[str, ...]:
-    """Return the config changes for the keys of a router that listens or connects (`way`)."""
+def tls_changes(keys: Path, name: str, action: str) -> tuple[str, ...]:
+    """Return the config changes for the keys of a router; `action` ("listen" or "connect") is what the router does."""
     base = "transport.link.tls"
     return (
         f"{base}.root_ca_certificate={keys}/authority.pem",
-        f"{base}.{way}_certificate={keys}/{name}.pem",
-        f"{base}.{way}_private_key={keys}/{name}.key",
+        f"{base}.{action}_certificate={keys}/{name}.pem",
+        f"{base}.{action}_private_key={keys}/{name}.key",
     )
 
 
@@ -52,8 +54,8 @@ def start_router(processes: Processes, name: str, file: str, *changes: str) -> P
 
 
 def quic_endpoint(router: Process) -> str:
-    """Return the endpoint at which other routers dial this one."""
-    return str(next(each for each in router.ready()["locators"] if each.startswith("quic/")))
+    """Return the QUIC endpoint that other routers dial."""
+    return str(next(locator for locator in router.ready()["locators"] if locator.startswith("quic/")))
 
 
 def port(endpoint: str) -> int:
@@ -170,18 +172,18 @@ class Site:
 
     def drive(self, action: Callable[[], None] = lambda: None) -> None:
         """Exchange messages until `ROUNDS` of each kind have arrived; call `action` in each round."""
-        commands, states, replies = (len(each) for each in self._arrived())
+        commands, states, replies = (len(messages) for messages in self._arrived())
         limit_ns = self._limit_ns()
         while True:
             self._round(action)
-            now_commands, now_states, now_replies = (len(each) for each in self._arrived())
+            now_commands, now_states, now_replies = (len(messages) for messages in self._arrived())
             rounds = min(now_commands - commands, now_states - states, (now_replies - replies) // 2)
             if rounds >= ROUNDS:
                 return
             assert self.clock.now().mono_ns < limit_ns, f"only {rounds} rounds arrived in {LIMIT_S:g} s"
 
     def attack(self, intruder: Intruder, aims: set[str]) -> set[str]:
-        """Let an intruder attack until it has achieved its aims or the time is up; return what it has achieved."""
+        """Let an intruder attack until it has achieved `aims` or the time is over; return what it has achieved."""
         limit_ns = self._limit_ns()
         while True:
             self._round(intruder.attempt)
@@ -202,14 +204,14 @@ class Site:
 
     def _arrived(self) -> tuple[list[bytes], list[bytes], list[bytes]]:
         return (
-            [each for each in self.vehicle.commands if each == self.operator.name],
-            [each for each in self.operator.received[f"{BASE}/state"] if each == b"state"],
-            [each for each in self.operator.replies if each.startswith(b"reply to ")],
+            [command for command in self.vehicle.commands if command == self.operator.name],
+            [state for state in self.operator.received[f"{BASE}/state"] if state == b"state"],
+            [reply for reply in self.operator.replies if reply.startswith(b"reply to ")],
         )
 
 
 class Intruder(ClientStandIn):
-    """An attacker with a session that tries everything: `attempt` in each round, `achieved` at the end."""
+    """An attacker with a session: `attempt` sends all kinds of messages, `achieved` returns their effects."""
 
     def __init__(self, session: Any) -> None:
         super().__init__(session, b"intruder")
@@ -228,28 +230,30 @@ class Intruder(ClientStandIn):
         for key in ("**", "lavt/**", "lavt/*/control", f"{BASE}/*"):
             self.session.put(key, b"wildcard")
         self.session.delete(f"{BASE}/control")
-        self.session.put(f"{BASE}/control", b"long" * (LONG // 4))
+        self.session.put(f"{BASE}/control", b"long" * (LONG_COMMAND_BYTES // 4))
         self.session.put(f"{BASE}/state", b"forged")
         for key in (f"{BASE}/session", f"{BASE}/netem", "lavt/**", "@/**"):
             self.query(key)
 
     def achieved(self, site: Site) -> set[str]:
         """Return the effects on vehicle and operator, and the kinds of messages that were received."""
-        seen = [each for key, payloads in self.received.items() for each in payloads if key != f"{BASE}/state"]
+        others_messages = [
+            payload for key, payloads in self.received.items() for payload in payloads if key != f"{BASE}/state"
+        ]
         replies = set(self.replies) - {b"forged"}
         effects = {
             "commands": b"intruder" in site.vehicle.commands,
             "wildcard commands": b"wildcard" in site.vehicle.commands,
             "deletes": site.vehicle.deleted > 0,
-            "long commands": any(len(each) >= LONG for each in site.vehicle.commands),
+            "long commands": any(len(command) >= LONG_COMMAND_BYTES for command in site.vehicle.commands),
             "queries": b"intruder" in site.vehicle.queries,
             "session": b"reply to session" in replies,
             "netem": b"reply to netem" in replies,
             "the routers' own state": bool(replies - {b"reply to session", b"reply to netem"}),
-            "forged state": any(each != b"state" for each in site.operator.received[f"{BASE}/state"]),
+            "forged state": any(state != b"state" for state in site.operator.received[f"{BASE}/state"]),
             "forged replies": b"forged" in site.operator.replies,
             "state": b"state" in self.received[f"{BASE}/state"],
-            "others' commands": site.operator.name in seen,
+            "others' commands": site.operator.name in others_messages,
             "alive": f"{BASE}/alive/server-1" in self.alive,
         }
         return {effect for effect, occurred in effects.items() if occurred}
