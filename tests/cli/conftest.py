@@ -13,6 +13,12 @@ from lavt.cli.main import main
 from lavt.runtime import process_priority
 
 
+@pytest.fixture(autouse=True)
+def unqueued_output(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave pytest's output alone."""
+    monkeypatch.setattr(console, "queue_output", lambda *_: None)
+
+
 @pytest.fixture
 def run(
     capsys: pytest.CaptureFixture[str],
@@ -22,7 +28,6 @@ def run(
 ) -> Run:
     """Return a function that runs `lavt` in this process, from an empty working directory."""
     monkeypatch.setattr(console, "reserve_stdout", lambda: None)  # it would redirect pytest's output
-    monkeypatch.setattr(console, "queue_output", lambda *_: None)
     monkeypatch.setattr(process_priority, "raise_priority", lambda *_: None)  # affects all tests
     monkeypatch.chdir(tmp_path)
 

@@ -10,12 +10,6 @@ from lavt.cli import console
 from lavt.errors import WorkError
 
 
-@pytest.fixture(autouse=True)
-def unqueued_output(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave pytest's output alone."""
-    monkeypatch.setattr(console, "queue_output", lambda *_: None)
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_each_termination_signal_sets_the_stop_event(number: signal.Signals) -> None:
     """Ctrl-C, SIGTERM and a closed terminal set the stop event; afterwards the former handlers are restored."""

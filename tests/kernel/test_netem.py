@@ -365,8 +365,9 @@ def test_scripts_and_command_have_the_same_effect(
 
 
 @pytest.fixture
-def lavt(capsys: pytest.CaptureFixture[str]) -> Callable[..., CommandResult]:
+def lavt(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., CommandResult]:
     """Return a function that runs a command of LAVT in this process, since starting one takes seconds here."""
+    monkeypatch.setattr(console, "queue_output", lambda *_: None)  # it would replace pytest's output
 
     def run(*arguments: str) -> CommandResult:
         with pytest.raises(SystemExit) as completed:

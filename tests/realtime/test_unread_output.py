@@ -84,4 +84,4 @@ def test_signals_end_a_client_and_a_server_whose_output_is_not_read(
         assert server.wait(END_LIMIT_S) == 0
     records = {side: read_record(tmp_path / side / f"{side}.mcap") for side in ("server", "client")}
     assert all(record.complete for record in records.values())
-    assert any("released" in detail for detail in records["server"].table("event").texts("detail"))
+    assert any("release" in detail for detail in records["server"].table("event").texts("detail"))
