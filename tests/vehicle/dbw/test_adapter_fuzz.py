@@ -1,0 +1,41 @@
+"""The whole by-wire vehicle with a hostile bus, a hostile car and stalls: invariants of the adapter."""
+
+from __future__ import annotations
+
+import gc
+from collections import Counter
+from typing import Literal, get_args
+
+import pytest
+from tests.vehicle.dbw.fuzzer import run_ticks
+
+from lavt.vehicle.dbw.states import State
+
+SEEDS, TICKS = (4, 25), 1500
+"""Of each generation in the quick lane and in the full one. A thousand ticks take about half a second."""
+MAX_NEW_OBJECTS = 300
+
+
+@pytest.mark.parametrize("generation", [1, 2])
+@pytest.mark.parametrize("seeds", [SEEDS[0], pytest.param(SEEDS[1], marks=pytest.mark.full)])
+def test_the_vehicle_keeps_its_invariants(generation: Literal[1, 2], seeds: int) -> None:
+    """Whatever happens, nothing raises, no state is reached twice at one instant, and every command is within limits.
+
+    `fuzzer.py` checks this in each tick. All states are reached.
+    """
+    states: Counter[str] = Counter()
+    for seed in range(seeds):
+        states += run_ticks(generation, seed, TICKS).states
+    assert set(states) == set(get_args(State))
+
+
+@pytest.mark.parametrize("generation", [1, 2])
+def test_nothing_grows(generation: Literal[1, 2]) -> None:
+    """The number of objects does not grow with the number of ticks."""
+    counts = []
+    for ticks in (300, 1200):
+        fuzzer = run_ticks(generation, 1, ticks)
+        gc.collect()
+        counts.append(len(gc.get_objects()))
+        del fuzzer
+    assert counts[1] - counts[0] < MAX_NEW_OBJECTS
