@@ -15,9 +15,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
+from msgspec import Struct
+
 from lavt.errors import UserError
 from lavt.transport.emulation.impairment import ImpairedFlow, Impairment
-from lavt.value import value
 
 DIRECTORY: Final = Path("/run/lavt")
 NO_OWNER: Final = (0, 0)
@@ -29,8 +30,7 @@ Owner = tuple[int, int]
 """A process's number and start time, because numbers are reused."""
 
 
-@value
-class AppliedState:
+class AppliedState(Struct, frozen=True):
     """What was applied to an interface, and the owner."""
 
     interface: str

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Final, Literal
 
-from lavt.value import value
+from msgspec import Struct
 
 Axis = Literal["steering", "brake", "throttle"]
 AXES: Final[tuple[Axis, ...]] = ("steering", "brake", "throttle")
@@ -77,8 +77,7 @@ class ReleaseReason(IntEnum):
     """The remote's switch is at emergency stop or pause."""
 
 
-@value
-class AxisOrder:
+class AxisOrder(Struct, frozen=True):
     """An order to an axis, of either generation."""
 
     axis: Axis
@@ -95,8 +94,7 @@ class AxisOrder:
     """None: the frame has no counter and only clears."""
 
 
-@value
-class GearOrder:
+class GearOrder(Struct, frozen=True):
     """An order to the gearbox."""
 
     is_valid: bool
@@ -104,8 +102,7 @@ class GearOrder:
     is_clearing: bool = False
 
 
-@value
-class SystemOrder:
+class SystemOrder(Struct, frozen=True):
     """An order to a kit of generation 2 as a whole."""
 
     is_valid: bool
