@@ -1,1 +1,1 @@
-"""The lane keeping controller: from a detected lane and a speed to steering and pedals (step 10)."""
+"""The lane keeping controller: from a detected lane and a speed to steering and pedals."""

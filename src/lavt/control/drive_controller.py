@@ -1,4 +1,4 @@
-"""Drive controllers: from a lane and a speed to steering and pedals (step 10 of the life of a frame)."""
+"""Drive controllers: from a lane and a speed to steering and pedals."""
 
 from __future__ import annotations
 

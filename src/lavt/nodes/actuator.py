@@ -1,4 +1,4 @@
-"""Steps 12 and 13 of the life of a frame: the command is accepted or rejected, and the vehicle executes it."""
+"""Accept or reject each received command, and apply accepted ones to the vehicle."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Steps 1 to 4 of the life of a frame: picture, stamp, H.264, RTP."""
+"""Capture a frame, stamp it, encode it and send its packets."""
 
 from __future__ import annotations
 

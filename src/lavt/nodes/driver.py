@@ -1,4 +1,4 @@
-"""Steps 7 to 10 of the life of a frame: picture and stamp (`picture_reader`), lane detection, command."""
+"""Turn received frames into commands: picture and stamp (`picture_reader`), lane detection, decision, command."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Steps 7 and 8 of the life of a frame: an access unit is decoded to a picture, and its stamp is read and checked."""
+"""Decode an access unit to a picture, and read and verify its stamp."""
 
 from __future__ import annotations
 

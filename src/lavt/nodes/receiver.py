@@ -1,4 +1,4 @@
-"""Step 6 of the life of a frame: packets are put in order and become access units."""
+"""Restore the order of received packets and reassemble access units."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Lane detection in pictures: step 9 of the life of a frame."""
+"""Lane detection in pictures."""

@@ -1,4 +1,4 @@
-"""The lane detector: finds the car's lane in a sequence of pictures, step 9 of the life of a frame."""
+"""The lane detector: finds the car's lane in a sequence of pictures."""
 
 from __future__ import annotations
 

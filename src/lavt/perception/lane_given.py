@@ -1,4 +1,4 @@
-"""A detector for lanes without pixels: step 9 of the life of a frame at fidelity `geometry`."""
+"""A detector that receives the lane itself instead of pixels, for fidelity `geometry`."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ import pytest
 
 from lavt.experiment.analysis.clock_validity import step_reasons
 from lavt.experiment.analysis.metrics import measure
-from lavt.experiment.analysis.results import IDENTITY, MEASURES, run_result, write_json
+from lavt.experiment.analysis.results import IDENTITY, run_result, write_json
 from lavt.experiment.analysis.validity import injection_reasons, invalid_reasons
 from lavt.recording.record import read_record
 
@@ -299,14 +299,24 @@ def test_the_injected_delay_is_compared_with_the_request() -> None:
 
 
 def test_a_result_has_every_key(make_run: MakeRun, tmp_path: Path) -> None:
-    """`result.json` has all keys, with null where they do not apply, and no NaN."""
+    """`result.json` has all keys of the run's identity, with null where they do not apply, every metric, and no NaN."""
     make_run(tmp_path)
     identity = {"run": "0001", "time": "virtual", "route": "A key", "condition": "L0", "seed": 7}
     server, client = read_record(tmp_path / "server.mcap"), read_record(tmp_path / "client.mcap")
     result = run_result(identity, server, client, digest="ab", reasons=["the relay died"])
     write_json(tmp_path / "result.json", {**result, "mae_m": float("nan")})
     read = json.loads((tmp_path / "result.json").read_text())
-    assert list(read) == [*IDENTITY, "digest", "ending", "valid", "invalid_reasons", *MEASURES]
+    metrics = measure(server, client).entry
+    assert list(read)[: len(IDENTITY)] == list(IDENTITY)
+    assert read.keys() == {*IDENTITY, "digest", "valid", "invalid_reasons", *metrics}
     assert read["participant"] is None
     assert read["mae_m"] is None
     assert (read["valid"], read["invalid_reasons"]) == (False, ["the relay died"])
+
+
+def test_every_metric_is_defined_in_the_documentation(make_run: MakeRun, tmp_path: Path) -> None:
+    """`docs/metrics.md` has each metric of a run by its key."""
+    make_run(tmp_path)
+    page = (Path(__file__).parents[3] / "docs" / "metrics.md").read_text()
+    entry = measure(read_record(tmp_path / "server.mcap"), read_record(tmp_path / "client.mcap")).entry
+    assert [key for key in entry if f"`{key}`" not in page] == []

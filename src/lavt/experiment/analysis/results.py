@@ -39,39 +39,6 @@ IDENTITY = (
 OPTIONAL_IDENTITY = ("axes", "changes", "injected_ms", "injected_least_ms")
 """Further such keys, which only some runs have."""
 
-MEASURES = (
-    "route_length_m",
-    "distance_m",
-    "duration_s",
-    "mae_m",
-    "rms_m",
-    "p95_m",
-    "max_m",
-    "p95_by_10m",
-    "heading_mae_rad",
-    "heading_rms_rad",
-    "heading_p95_rad",
-    "steering_rms_rad",
-    "steering_rate_rms_radps",
-    "steering_reversals_per_s",
-    "steering_reversals_per_km",
-    "oscillation_hz",
-    "collisions",
-    "lane_invasions",
-    "collisions_per_km",
-    "lane_invasions_per_km",
-    "loop_ms",
-    "picture_age_ms",
-    "age_at_actuation_ms",
-    "tau_v_ms",
-    "tau_c_ms",
-    "stages_ms",
-    "delta",
-    "frames_sent",
-    "frames_decoded",
-    "frames_unreadable",
-)
-
 
 def run_result(
     identity: Mapping[str, Any],
@@ -98,7 +65,7 @@ def run_result(
         "ending": measured.entry["ending"],
         "valid": not all_reasons,
         "invalid_reasons": all_reasons,
-        **{key: measured.entry[key] for key in MEASURES},
+        **measured.entry,
     }
 
 
