@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from lavt.domain import PATH_POINTS, Command, NetemReply, NetemRequest, SessionReply, SessionRequest, State
 from lavt.errors import BadMessage
 from lavt.streams import stream
-from lavt.transport.messages import MAX_MESSAGE_BYTES, VERSION, decode, encode
+from lavt.transport.messages import CHECKS, ELLIPSIS, MAX_MESSAGE_BYTES, REASON_BYTES, VERSION, decode, encode
 
 AnyMessage = Command | State | SessionRequest | SessionReply | NetemRequest | NetemReply
 
@@ -93,9 +93,9 @@ STATES = st.builds(
     steering_rad=ROAD_WHEEL,
     gear=st.sampled_from(["park", "reverse", "neutral", "drive"]),
     safety=st.sampled_from(["disarmed", "arming", "driving", "degraded", "safe_stop", "emergency_stop"]),
-    reason=text(200),
+    reason=text(REASON_BYTES),
     applied_sequence=st.integers(-1, 2**63 - 1),
-    rejected=text(200),
+    rejected=text(REASON_BYTES),
     limited=text(100),
     active_operator=st.one_of(st.just(""), NAMES),
     active_operator_instance=U64,
@@ -112,7 +112,7 @@ REQUESTS = st.builds(
 REPLIES = st.builds(
     SessionReply,
     granted=st.booleans(),
-    reason=text(200),
+    reason=text(REASON_BYTES),
     epoch=U64,
     token=st.one_of(st.just(b""), st.binary(min_size=16, max_size=16)),
     video_port=st.integers(0, 65535),
@@ -131,11 +131,42 @@ def test_round_trip(message: AnyMessage) -> None:
 @pytest.mark.parametrize("letter", ["a", "é", "€", "🚗"])
 def test_longest_texts_fit(letter: str) -> None:
     """A message with texts of the maximum length, of letters of any size in UTF-8, can be decoded."""
-    longest = letter * (200 // len(letter.encode()))
-    message = replace(STATE, reason=longest, rejected=longest, sent_wall_ns=2**63 - 1, applied_sequence=2**63 - 1)
+    longest = letter * (REASON_BYTES // len(letter.encode()))
+    message = replace(
+        STATE,
+        reason=longest,
+        rejected=longest,
+        limited="x" * 100,
+        active_operator="x" * 32,
+        requested_by="x" * 32,
+        sent_wall_ns=2**63 - 1,
+        state_mono_ns=2**63 - 1,
+        applied_sequence=2**63 - 1,
+        active_operator_instance=2**64 - 1,
+        instance=2**64 - 1,
+    )
     assert decode(State, encode(message)) == message
     with pytest.raises(BadMessage, match="reason"):
-        decode(State, encode(replace(message, reason=longest + letter)))
+        decode(State, wire(replace(message, reason=longest + letter)))
+
+
+ANY_TEXT = st.one_of(st.text(st.characters(categories=["L", "Cs", "So"]), max_size=2000), st.text())
+TEXTS: list[tuple[type[Any], str]] = [(State, "reason"), (State, "rejected"), (State, "limited")]
+TEXTS += [(SessionReply, "reason"), (SessionReply, "host"), (NetemRequest, "condition"), (NetemReply, "reason")]
+
+
+@given(st.sampled_from(TEXTS), ANY_TEXT)
+def test_any_text_is_readable(field: tuple[type[Any], str], text: str) -> None:
+    """A message with any text can be decoded: a text that is too long is cut between letters, and ends in an ellipsis.
+
+    A lone surrogate, as in a file's name that is not UTF-8, becomes a question mark.
+    """
+    kind, name = field
+    message: Any = MESSAGES[kind]
+    read = getattr(decode(kind, encode(replace(message, **{name: text}))), name)
+    complete = text.encode(errors="replace").decode()
+    assert read == complete or complete.startswith(read.removesuffix(ELLIPSIS))
+    assert read == complete or not CHECKS[kind][name](complete)
 
 
 def test_version_comes_first() -> None:
@@ -211,9 +242,9 @@ OUT_OF_RANGE: dict[type, dict[str, list[Any]]] = {
         "steering_rad": [*NOT_A_NUMBER, 1.0001, -1.0001],
         "gear": [*NOT_A_TEXT, "", "sideways"],
         "safety": [*NOT_A_TEXT, "", "safe"],
-        "reason": [*NOT_A_TEXT, "x" * 201],
+        "reason": [*NOT_A_TEXT, "x" * 301],
         "applied_sequence": [*NOT_AN_INTEGER, -2, 2**63],
-        "rejected": [*NOT_A_TEXT, "x" * 201],
+        "rejected": [*NOT_A_TEXT, "x" * 301],
         "limited": [*NOT_A_TEXT, "x" * 101],
         "active_operator": NOT_A_NAME_OR_EMPTY,
         "active_operator_instance": [*NOT_AN_INTEGER, -1],
@@ -228,7 +259,7 @@ OUT_OF_RANGE: dict[type, dict[str, list[Any]]] = {
     },
     SessionReply: {
         "granted": [0, 1, 1.0, "true", None, []],
-        "reason": [*NOT_A_TEXT, "x" * 201],
+        "reason": [*NOT_A_TEXT, "x" * 301],
         "epoch": [*NOT_AN_INTEGER, -1],
         "token": ["", "x" * 16, None, 0, bytes(15), bytes(17), [0] * 16],
         "video_port": [*NOT_AN_INTEGER, -1, 65536],
@@ -269,7 +300,7 @@ def test_every_field_is_checked(kind: type[Any], name: str) -> None:
 
 
 @pytest.mark.parametrize("kind", MESSAGES)
-@pytest.mark.parametrize("version", [0, 2, 4, -1, True, 3.0, "3", None, [3]])
+@pytest.mark.parametrize("version", [0, 3, 5, -1, True, 4.0, "4", None, [4]])
 def test_other_versions(kind: type[Any], version: Any) -> None:
     """A message whose version is not exactly the expected integer is rejected."""
     _, *values = msgpack.unpackb(encode(MESSAGES[kind]))

@@ -26,7 +26,6 @@ MEASURE_PERIOD_NS = 5 * NS_PER_S
 REQUEST_PERIOD_NS = NS_PER_S
 LEASE_MS = 5_000
 """The client renews once a second: four requests may be lost."""
-MAX_REASON_LENGTH = 300
 MAX_PENDING_REQUESTS = 64
 """Requests that may wait for the queues; the link keeps as many."""
 
@@ -278,4 +277,4 @@ def _earliest(*times_ns: int | None) -> int | None:
 
 
 def _reply(reason: str, peer: Peer) -> Send:
-    return Send("netem_reply", encode(NetemReply(reason == "", reason[:MAX_REASON_LENGTH])), peer)
+    return Send("netem_reply", encode(NetemReply(reason == "", reason)), peer)

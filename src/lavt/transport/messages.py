@@ -1,7 +1,8 @@
 """Encode and decode the messages between the two sides: msgpack arrays that begin with a version.
 
 A message on the wire is `[version, field, field, ..]`, the fields in the order of the class. `decode` raises
-`BadMessage` for data that is too long, not msgpack, of another version or shape, not finite, or out of range.
+`BadMessage` for data that is too long, not msgpack, of another version or shape, not finite, or out of range. `encode`
+cuts texts that are too long, such as a list of faults, because a state must be readable whatever its reason.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from functools import lru_cache
 from operator import attrgetter
 from typing import Any, TypeVar
@@ -19,10 +20,13 @@ import msgpack
 from lavt.domain import PATH_POINTS, Command, NetemReply, NetemRequest, SessionReply, SessionRequest, State
 from lavt.errors import BadMessage
 
-VERSION = 3
+VERSION = 4
 MAX_MESSAGE_BYTES = 1024
 NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_-]{0,31}\Z")
 """A valid name of a vehicle or client: it contains nothing that has a meaning in a Zenoh key."""
+REASON_BYTES = 300
+"""Limits a reason; a message with its longest texts is within `MAX_MESSAGE_BYTES`."""
+ELLIPSIS = "\N{HORIZONTAL ELLIPSIS}"
 MAX_DELAY_MS = 10_000.0
 """Limits what a client can request of a server, which needs as long to clear the delay."""
 
@@ -38,9 +42,21 @@ def _number(low: float, high: float) -> Check:
     return lambda value: type(value) in _NUMBERS and low <= value <= high  # false for NaN
 
 
-def _text(max_bytes: int) -> Check:
-    """Return a check of a text's length in bytes, so that texts of any letters fit into a message."""
-    return lambda value: type(value) is str and len(value.encode()) <= max_bytes
+@dataclass(frozen=True, slots=True)
+class _Text:
+    """A check of a text's length in bytes, so that texts of any letters fit into a message."""
+
+    max_bytes: int
+
+    def __call__(self, value: Any) -> bool:
+        return type(value) is str and len(value.encode()) <= self.max_bytes
+
+    def cut(self, text: str) -> str:
+        """Return the text without lone surrogates (of a file's name), cut to the limit and then with an ellipsis."""
+        data = text.encode(errors="replace")
+        if len(data) <= self.max_bytes:
+            return data.decode()
+        return data[: self.max_bytes - len(ELLIPSIS.encode())].decode(errors="ignore") + ELLIPSIS
 
 
 def _one_of(*choices: str) -> Check:
@@ -100,10 +116,10 @@ CHECKS: dict[type, dict[str, Check]] = {
         "steering_rad": ROAD_WHEEL,
         "gear": _one_of("park", "reverse", "neutral", "drive"),
         "safety": _one_of("disarmed", "arming", "driving", "degraded", "safe_stop", "emergency_stop"),
-        "reason": _text(200),
+        "reason": _Text(REASON_BYTES),
         "applied_sequence": _integer(-1, 2**63 - 1),
-        "rejected": _text(200),
-        "limited": _text(100),
+        "rejected": _Text(REASON_BYTES),
+        "limited": _Text(100),
         "active_operator": _name_or_empty,
         "active_operator_instance": U64,
         "requested_by": _name_or_empty,
@@ -117,17 +133,17 @@ CHECKS: dict[type, dict[str, Check]] = {
     },
     SessionReply: {
         "granted": lambda value: type(value) is bool,
-        "reason": _text(200),
+        "reason": _Text(REASON_BYTES),
         "epoch": U64,
         "token": _bytes(0, 16),
         "video_port": _integer(0, 65535),
-        "host": _text(64),
+        "host": _Text(64),
         "emergency_stop": LAST_STOP,
     },
     NetemRequest: {
         "who": _name,
         "instance": U64,
-        "condition": _text(32),
+        "condition": _Text(32),
         "lease_ms": _integer(0, 60_000),
         "delay_ms": _number(0.0, MAX_DELAY_MS),
         "jitter_ms": _number(0.0, MAX_DELAY_MS),
@@ -139,11 +155,16 @@ CHECKS: dict[type, dict[str, Check]] = {
         "reorder": UNIT,
         "state_delay_ms": _number(0.0, MAX_DELAY_MS),
     },
-    NetemReply: {"granted": lambda value: type(value) is bool, "reason": _text(400)},
+    NetemReply: {"granted": lambda value: type(value) is bool, "reason": _Text(400)},
 }
 
 _FIELD_NAMES: dict[type, tuple[str, ...]] = {kind: tuple(checks) for kind, checks in CHECKS.items()}
 _FIELD_CHECKS: dict[type, tuple[Check, ...]] = {kind: tuple(checks.values()) for kind, checks in CHECKS.items()}
+_TEXTS: dict[type, list[tuple[int, _Text]]] = {
+    kind: [(position, check) for position, check in enumerate(checks.values(), 1) if isinstance(check, _Text)]
+    for kind, checks in CHECKS.items()
+}
+"""The texts of a message, with their positions after the version."""
 _FIELD_VALUES: dict[type, Callable[[Any], tuple[Any, ...]]] = {
     kind: attrgetter(*(field.name for field in fields(kind))) for kind in CHECKS
 }
@@ -152,8 +173,11 @@ Kind = TypeVar("Kind", Command, State, SessionRequest, SessionReply, NetemReques
 
 
 def encode(message: Command | State | SessionRequest | SessionReply | NetemRequest | NetemReply) -> bytes:
-    """Return the bytes of `message` on the wire."""
-    packed: bytes = msgpack.packb([VERSION, *_FIELD_VALUES[type(message)](message)])
+    """Return the bytes of `message` on the wire, with texts cut to their limits."""
+    values = [VERSION, *_FIELD_VALUES[type(message)](message)]
+    for position, text in _TEXTS[type(message)]:
+        values[position] = text.cut(values[position])
+    packed: bytes = msgpack.packb(values)
     return packed
 
 
