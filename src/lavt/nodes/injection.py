@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from typing import Literal
 
 from msgspec import Struct
+from msgspec.structs import asdict
 
 from lavt.domain import NS_PER_MS, NS_PER_S, NetemReply, NetemRequest, Now
 from lavt.errors import BadMessage, UserError

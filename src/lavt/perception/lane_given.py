@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from msgspec.structs import replace
 
 from lavt.domain import Lane, SeenLane
 from lavt.perception.lane_detector import FORGET_AFTER, GRID, LANE_WIDTH_M, TRACK_CONFIDENCE, average_lane

@@ -6,10 +6,10 @@ import logging
 import threading
 from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any, Protocol
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 from lavt.domain import Command, NetemReply, NetemRequest, Now, SessionReply, SessionRequest, State
 from lavt.errors import BadMessage

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from lavt.domain import NS_PER_MS
 from lavt.vehicle.dbw.adapter import SEPARATOR

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import fields
 from typing import Final, Literal
 
 from msgspec import Struct
@@ -75,7 +74,7 @@ ALWAYS_EXEMPT: Final = (ExemptPort("udp", 123, "NTP"), ExemptPort("tcp", 22, "ss
 
 def check_impairment(name: str, impairment: Impairment) -> None:
     """Raise `UserError` for values that are out of range or contradict each other."""
-    numbers = [getattr(impairment, each.name) for each in fields(impairment) if each.name != "jitter_distribution"]
+    numbers = [getattr(impairment, name) for name in Impairment.__struct_fields__ if name != "jitter_distribution"]
     if not all(math.isfinite(number) and number >= 0 for number in numbers):
         raise UserError(f"{name}: the values of an impairment are finite and not negative: correct {impairment}")
     if max(impairment.loss, impairment.reorder, impairment.jitter_correlation) >= 1:
