@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import msgpack
+import msgspec
 import pytest
 from pydantic import Field
 from tests.field import by_wire
@@ -137,7 +138,9 @@ VERDICTS: list[tuple[Callable[[], Check], str, str]] = [
         "operator-1 has control",
     ),
     (
-        lambda: checks.check_vehicle(StateSample([replace(STATE, active_operator="")] * 50), "v-1", "1"),
+        lambda: checks.check_vehicle(
+            StateSample([msgspec.structs.replace(STATE, active_operator="")] * 50), "v-1", "1"
+        ),
         "ok",
         "no operator has control",
     ),

@@ -155,7 +155,7 @@ def test_longest_texts_fit(letter: str) -> None:
         instance=2**64 - 1,
     )
     assert decode(State, encode(message)) == message
-    with pytest.raises(BadMessage, match="reason"):
+    with pytest.raises(BadMessage):
         decode(State, wire(replace(message, reason=letter * (REASON_BYTES + 1))))
 
 
