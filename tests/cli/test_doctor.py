@@ -38,6 +38,7 @@ from lavt.transport.zenoh_link import Deliver, Router, Routers, ZenohLink, quiet
 STATE = State(
     1, 1, 0.0, 0.0, "park", "disarmed", "nobody has armed the vehicle yet", -1, "", active_operator="operator-1"
 )
+FREE = msgspec.structs.replace(STATE, active_operator="")
 NOW = Now(1, 1)
 REQUIREMENTS = ["av>=14", "numpy>=1.26", "cryptography>=42; extra == 'secure'"]
 INSTALLED = {"lavt": "0.1.0", "av": "14.0.1", "numpy": "2.0", "cryptography": None}
