@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from benchmarks.fuzzing.mutation import Chance, Corpus
 from benchmarks.fuzzing.target import START, NodeBench, Target, expect, payloads_on, total
+from msgspec.structs import replace
 
 from lavt.control.drive_controller import PRESETS, make_controller
 from lavt.control.driver_limits import CLIENT_LIMITS

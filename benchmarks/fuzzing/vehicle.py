@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 from benchmarks.fuzzing.mutation import Chance, Corpus
 from benchmarks.fuzzing.target import START, InvariantViolation, NodeBench, Target, expect, payloads_on, total
+from msgspec.structs import replace
 
 from lavt.assembly.entropy import SeededEntropy
 from lavt.domain import (

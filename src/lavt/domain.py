@@ -9,9 +9,8 @@ from __future__ import annotations
 from typing import Any, Literal
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
-
-from lavt.value import value
 
 Picture = NDArray[np.uint8]
 """An image: (height, width, 3), blue green red, 0 to 255."""
@@ -31,8 +30,7 @@ PATH_STEP_M = 2.0
 PATH_POINTS = 10
 
 
-@value
-class Now:
+class Now(Struct, frozen=True):
     """A reading of a host's two clocks."""
 
     mono_ns: int
@@ -43,8 +41,7 @@ class Now:
         return Now(self.mono_ns + duration_ns, self.wall_ns + duration_ns)
 
 
-@value
-class Pose:
+class Pose(Struct, frozen=True):
     """The pose of the vehicle's rear axle in the world frame, at a time of the server's monotonic clock."""
 
     mono_ns: int
@@ -53,8 +50,7 @@ class Pose:
     heading_rad: float
 
 
-@value
-class Actuation:
+class Actuation(Struct, frozen=True):
     """An actuation of the vehicle: road wheel angle, and pedals in [0, 1]."""
 
     steering_rad: float
@@ -62,8 +58,7 @@ class Actuation:
     brake: float
 
 
-@value
-class VehicleState:
+class VehicleState(Struct, frozen=True):
     """The reported state of a vehicle, at its own time `mono_ns` on the server's monotonic clock."""
 
     mono_ns: int
@@ -80,8 +75,7 @@ class VehicleState:
     """False: `speed_mps` may be wrong, and the car may move even if it is 0."""
 
 
-@value
-class GroundTruth:
+class GroundTruth(Struct, frozen=True):
     """The true state of a simulated vehicle; it is recorded on the server and never published."""
 
     mono_ns: int
@@ -103,8 +97,7 @@ EventKind = Literal["lane_invasion", "collision", "off_road", "completed", "time
 Ending = Literal["completed", "collision", "off_road", "timeout", "safe_stop"]
 
 
-@value
-class VehicleEvent:
+class VehicleEvent(Struct, frozen=True):
     """An event of a vehicle."""
 
     mono_ns: int
@@ -112,8 +105,7 @@ class VehicleEvent:
     detail: str
 
 
-@value
-class CameraModel:
+class CameraModel(Struct, frozen=True):
     """A pinhole camera on a vehicle: no distortion, principal point in the middle of the image.
 
     The pose is in the vehicle's frame, turned first by `yaw_rad` (positive to the left), then by `pitch_rad` (positive
@@ -137,8 +129,7 @@ class CameraModel:
         return self.width_px / 2 / float(np.tan(self.field_of_view_rad / 2))
 
 
-@value
-class Lane:
+class Lane(Struct, frozen=True):
     """The lane detected in one picture, in the vehicle's frame.
 
     The centre line is y = c0 + c1 x + c2 x^2, x metres ahead of the rear axle, valid from `near_m` to `far_m`.
@@ -152,8 +143,7 @@ class Lane:
     """0 (no lane in the picture) to 1 (both lines detected over the whole length)."""
 
 
-@value
-class SeenLane:
+class SeenLane(Struct, frozen=True):
     """The substitute of a picture if nothing is rendered: the lane that would be visible in it."""
 
     stamp_ns: int
@@ -163,8 +153,7 @@ class SeenLane:
     lane: Lane
 
 
-@value
-class Decision:
+class Decision(Struct, frozen=True):
     """The output of a controller: road wheel angle, pedals and planned path.
 
     `path_curvature_per_m` has `PATH_POINTS` values, `PATH_STEP_M` apart, left positive.
@@ -182,8 +171,7 @@ Operation = Literal["acquire", "request_handover", "release", "emergency_stop", 
 SafetyState = Literal["disarmed", "arming", "driving", "degraded", "safe_stop", "emergency_stop"]
 
 
-@value
-class Command:
+class Command(Struct, frozen=True):
     """A command of the client to the vehicle, at least 50 times a second."""
 
     epoch: int
@@ -203,8 +191,7 @@ class Command:
     """0, or the number of an emergency stop; numbers only grow."""
 
 
-@value
-class State:
+class State(Struct, frozen=True):
     """The state that the vehicle's side publishes 50 times a second."""
 
     sent_wall_ns: int
@@ -232,8 +219,7 @@ class State:
     """Random number of the server process."""
 
 
-@value
-class SessionRequest:
+class SessionRequest(Struct, frozen=True):
     """A client's session request to the server."""
 
     operation: Operation
@@ -244,8 +230,7 @@ class SessionRequest:
     """Number of an emergency stop; 0 for other operations."""
 
 
-@value
-class NetemRequest:
+class NetemRequest(Struct, frozen=True):
     """A client's request to the server: the impairment of what the vehicle's machine sends, and for how long."""
 
     who: str
@@ -267,16 +252,14 @@ class NetemRequest:
     """Delay of states and replies; the fields above apply to the video."""
 
 
-@value
-class NetemReply:
+class NetemReply(Struct, frozen=True):
     """The server's answer to a `NetemRequest`: whether the condition is in force."""
 
     granted: bool
     reason: str
 
 
-@value
-class SessionReply:
+class SessionReply(Struct, frozen=True):
     """The server's answer to a `SessionRequest`."""
 
     granted: bool

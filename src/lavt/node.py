@@ -9,8 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
+from msgspec import Struct
+
 from lavt.domain import Now
-from lavt.value import value
 
 Peer = Any
 """Opaque: the sender of a message, to which a reply can be sent (an address, a query). Only links read it."""
@@ -19,8 +20,7 @@ WAKE = "wake"
 """The channel of a node's wakes; its payload is None."""
 
 
-@value
-class Message:
+class Message(Struct, frozen=True):
     """A message to a node: channel, payload, arrival on this host, and sender."""
 
     channel: str
@@ -29,8 +29,7 @@ class Message:
     peer: Peer = None
 
 
-@value
-class Send:
+class Send(Struct, frozen=True):
     """A message from a node: a payload on a channel, to the channel's receivers or to one peer.
 
     On a channel that crosses the network the payload is bytes, elsewhere an object that is never modified.

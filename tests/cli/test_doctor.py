@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import msgpack
+import msgspec
 import pytest
 from pydantic import Field
 from tests.field import by_wire
@@ -37,6 +38,7 @@ from lavt.transport.zenoh_link import Deliver, Router, Routers, ZenohLink, quiet
 STATE = State(
     1, 1, 0.0, 0.0, "park", "disarmed", "nobody has armed the vehicle yet", -1, "", active_operator="operator-1"
 )
+FREE = msgspec.structs.replace(STATE, active_operator="")
 NOW = Now(1, 1)
 REQUIREMENTS = ["av>=14", "numpy>=1.26", "cryptography>=42; extra == 'secure'"]
 INSTALLED = {"lavt": "0.1.0", "av": "14.0.1", "numpy": "2.0", "cryptography": None}
@@ -137,7 +139,9 @@ VERDICTS: list[tuple[Callable[[], Check], str, str]] = [
         "operator-1 has control",
     ),
     (
-        lambda: checks.check_vehicle(StateSample([replace(STATE, active_operator="")] * 50), "v-1", "1"),
+        lambda: checks.check_vehicle(
+            StateSample([msgspec.structs.replace(STATE, active_operator="")] * 50), "v-1", "1"
+        ),
         "ok",
         "no operator has control",
     ),

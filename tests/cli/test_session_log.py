@@ -1,8 +1,7 @@
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
+from msgspec.structs import replace
 
 from lavt.cli.session_log import (
     FIRST_STATE_TIMEOUT_NS,

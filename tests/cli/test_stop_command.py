@@ -1,9 +1,9 @@
 from __future__ import annotations
 
 import queue
-from dataclasses import replace
 
 import pytest
+from msgspec.structs import replace
 
 from lavt.cli import stop
 from lavt.cli.session_log import NO_STATE_YET

@@ -16,7 +16,6 @@ SHARED_MODULES = {
     "lavt.vehicle.vehicle",
     "lavt.domain",
     "lavt.errors",
-    "lavt.value",
     "lavt.clock",
     "lavt.vehicle.ground_truth_wire",  # not sent over the bus
 }

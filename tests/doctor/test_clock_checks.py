@@ -1,8 +1,8 @@
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
+import msgspec
 import pytest
 
 from lavt.doctor.clock_checks import HINTS, ClockComparison, check_host, compare
@@ -44,7 +44,7 @@ def probes(delta_ms: float, *round_trips_ms: float) -> list[ClockProbe]:
 def compared(
     delta_ms: float = 250.0, *, reply: ProbeReply = REPLY, round_trip_ms: float = 0.3, **changes: Any
 ) -> ClockComparison:
-    report = dataclasses.replace(GOOD, **changes)
+    report = msgspec.structs.replace(GOOD, **changes)
     return compare(report, report, probes(delta_ms, 5.0, round_trip_ms, 9.0), reply, SERVER)
 
 
@@ -58,7 +58,7 @@ def test_a_good_clock() -> None:
 
 def test_a_clock_with_a_wide_bound() -> None:
     """A clock with a bound of 3 ms is not good enough."""
-    finding = check_host(dataclasses.replace(GOOD, bound_s=0.003))
+    finding = check_host(msgspec.structs.replace(GOOD, bound_s=0.003))
     assert not finding.good
     assert "3.00 ms" in finding.says[1]
 
@@ -91,7 +91,7 @@ def test_a_client_that_follows_another_host() -> None:
 
 def test_a_clock_that_is_steered_meanwhile() -> None:
     """The correction after the probing counts, and its change during the probing is added to the bound."""
-    before = dataclasses.replace(GOOD, correction_s=0.251)
+    before = msgspec.structs.replace(GOOD, correction_s=0.251)
     finding = compare(before, GOOD, probes(250.0, 0.3), REPLY, SERVER)
     assert finding.sources is not None
     assert [finding.sources.ms, finding.sources.bound_ms] == pytest.approx([250.0, 1.0 + 0.1 + 0.03 + 0.004])
@@ -125,7 +125,7 @@ def test_ntp_through_delay() -> None:
 def test_the_probe_alone(lacking: str) -> None:
     """If one side's time source has no estimate, Delta is the probe's alone, and the result says what that means."""
     unknown: dict[str, Any] = {"correction_s": None, "bound_s": None, "status": "chrony is not installed"}
-    reply = REPLY if lacking == "client" else dataclasses.replace(REPLY, correction_s=None, bound_s=None)
+    reply = REPLY if lacking == "client" else msgspec.structs.replace(REPLY, correction_s=None, bound_s=None)
     finding = compared(reply=reply, **(unknown if lacking == "client" else {}))
     assert finding.good
     assert finding.sources is None

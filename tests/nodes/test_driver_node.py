@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 from tests.nodes.stand_ins import MONO_NS, SMALL, WALL_NS, at, give, noise, of
 
 from lavt.channels import CHANNELS

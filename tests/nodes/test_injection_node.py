@@ -1,9 +1,9 @@
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 from tests.nodes.stand_ins import at, give, of
 
 from lavt.domain import NS_PER_MS, NS_PER_S, NetemReply, NetemRequest

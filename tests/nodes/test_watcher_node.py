@@ -1,9 +1,8 @@
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from tests.nodes.stand_ins import MONO_NS, WALL_NS, at, give, of
 
 from lavt.domain import NS_PER_S

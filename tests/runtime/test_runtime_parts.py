@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import count, repeat
 from typing import Any
 
+import msgspec
 import pytest
 
 from lavt.channels import CHANNELS
@@ -132,7 +133,7 @@ def test_unreadable_bytes_are_recorded(channel: str, data: bytes) -> None:
     recorded = ListRecorder()
     record(recorded, channel, data, NOW)
     ((_, payload, _),) = recorded.entries
-    fields = payload if isinstance(payload, dict) else asdict(payload)
+    fields = payload if isinstance(payload, dict) else msgspec.to_builtins(payload)
     assert fields["size_bytes"] == len(data)
     if channel not in ("rtp", "feedback"):
         assert payload["unreadable"] == data[:64].hex()

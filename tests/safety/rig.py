@@ -4,9 +4,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import count
 from typing import Any
+
+from msgspec.structs import replace
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation, Command, Operation, SessionReply, SessionRequest, VehicleState
 from lavt.safety.gate import CommandVerdict, SafetyGate

@@ -1,12 +1,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from itertools import pairwise
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 from tests.safety.rig import START_NS, WHEELBASE_M, vehicle_at
 
 from lavt.control.pure_pursuit import move_along_arc, steering_rad

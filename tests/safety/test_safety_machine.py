@@ -5,12 +5,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+from msgspec.structs import replace
 from tests.safety.rig import MAX_STEERING_RAD, TICK_NS, Rig, vehicle_at
 
 from lavt.domain import NS_PER_MS, NS_PER_S, PATH_POINTS, Operation, SafetyState

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import msgspec
 import pytest
 from tests.safety.rig import TICK_NS, WHEELBASE_M, Rig, vehicle_at
 
@@ -33,7 +34,7 @@ class Moving(Rig):
 
     def step(self, speed_mps: float) -> Actuation:
         angle_rad = self.gate.limiter.target_rad(self.vehicle)
-        self.vehicle = replace(vehicle_at(speed_mps, angle_rad), mono_ns=self.now_ns)
+        self.vehicle = msgspec.structs.replace(vehicle_at(speed_mps, angle_rad), mono_ns=self.now_ns)
         return self.actuation()
 
     def on(self, path: tuple[float, ...], angle_rad: float = 0.0) -> Moving:
@@ -113,7 +114,7 @@ def test_a_new_drive_never_uses_an_old_path() -> None:
     rig = Moving().on(LEFT)
     rig.roll(STOP_NS)
     rig.request("acquire")
-    rig.vehicle = replace(vehicle_at(0.0, 0.0), mono_ns=rig.now_ns)
+    rig.vehicle = msgspec.structs.replace(vehicle_at(0.0, 0.0), mono_ns=rig.now_ns)
     rig.arm_for(NS_PER_S)
     assert rig.state == "driving"
     assert rig.roll(NS_PER_S).steering_rad == 0.0

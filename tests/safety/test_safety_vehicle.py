@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 from tests.safety.rig import Rig, vehicle_at
 
 from lavt.domain import NS_PER_S

@@ -1,18 +1,27 @@
 from __future__ import annotations
 
 import tracemalloc
-from dataclasses import fields, replace
 from typing import Any
 
 import msgpack
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from lavt.domain import PATH_POINTS, Command, NetemReply, NetemRequest, SessionReply, SessionRequest, State
 from lavt.errors import BadMessage
 from lavt.streams import stream
-from lavt.transport.messages import CHECKS, ELLIPSIS, MAX_MESSAGE_BYTES, REASON_BYTES, VERSION, decode, encode
+from lavt.transport.messages import (
+    ELLIPSIS,
+    MAX_MESSAGE_BYTES,
+    REASON_BYTES,
+    TEXT_BYTES,
+    TYPES,
+    VERSION,
+    decode,
+    encode,
+)
 
 AnyMessage = Command | State | SessionRequest | SessionReply | NetemRequest | NetemReply
 
@@ -146,8 +155,8 @@ def test_longest_texts_fit(letter: str) -> None:
         instance=2**64 - 1,
     )
     assert decode(State, encode(message)) == message
-    with pytest.raises(BadMessage, match="reason"):
-        decode(State, wire(replace(message, reason=longest + letter)))
+    with pytest.raises(BadMessage):
+        decode(State, wire(replace(message, reason=letter * (REASON_BYTES + 1))))
 
 
 ANY_TEXT = st.one_of(st.text(st.characters(categories=["L", "Cs", "So"]), max_size=2000), st.text())
@@ -166,13 +175,13 @@ def test_any_text_is_readable(field: tuple[type[Any], str], text: str) -> None:
     read = getattr(decode(kind, encode(replace(message, **{name: text}))), name)
     complete = text.encode(errors="replace").decode()
     assert read == complete or complete.startswith(read.removesuffix(ELLIPSIS))
-    assert read == complete or not CHECKS[kind][name](complete)
+    assert read == complete or len(complete.encode()) > TEXT_BYTES[kind][name]
 
 
 def test_version_comes_first() -> None:
     """A message is a msgpack array of the version and the fields, in the order of the class."""
     values = msgpack.unpackb(encode(REQUEST))
-    assert values == [VERSION, *(getattr(REQUEST, each.name) for each in fields(REQUEST))]
+    assert values == [VERSION, *(getattr(REQUEST, name) for name in REQUEST.__struct_fields__)]
 
 
 @pytest.mark.parametrize("kind", MESSAGES)
@@ -286,12 +295,12 @@ OUT_OF_RANGE: dict[type, dict[str, list[Any]]] = {
 
 
 def wire(message: AnyMessage, **changed: Any) -> bytes:
-    values = [changed.get(each.name, getattr(message, each.name)) for each in fields(message)]
+    values = [changed.get(name, getattr(message, name)) for name in message.__struct_fields__]
     packed: bytes = msgpack.packb([VERSION, *values])
     return packed
 
 
-@pytest.mark.parametrize(("kind", "name"), [(kind, each.name) for kind in MESSAGES for each in fields(kind)])
+@pytest.mark.parametrize(("kind", "name"), [(kind, name) for kind, names in TYPES.items() for name in names])
 def test_every_field_is_checked(kind: type[Any], name: str) -> None:
     """A message is rejected if a field has a wrong type, is not finite or is out of range; booleans are not numbers."""
     for bad in OUT_OF_RANGE[kind][name]:

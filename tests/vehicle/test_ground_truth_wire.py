@@ -124,7 +124,7 @@ def with_event(*fields: object) -> tuple[object, ...]:
         with_truth(-1, *([0.5] * 8)),
         with_truth(2**63, *([0.5] * 8)),
         with_truth(0.5, *([0.5] * 8)),
-        with_truth(1, *([0.5] * 7), 1),
+        with_truth(1, *([0.5] * 7), True),
         with_truth(1, *([0.5] * 7), float("nan")),
         with_truth(1, float("inf"), *([0.5] * 7)),
         with_truth(1, *([0.5] * 7), "0.5"),

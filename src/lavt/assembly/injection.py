@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from typing import Final, Literal
 
 from lavt.config import ClientInjectionConfig, Condition, ImpairmentConfig, ServerInjectionConfig
@@ -72,7 +71,7 @@ def build_netem_impairment(delay_ms: float, impairment: ImpairmentConfig) -> Imp
 
 def build_impairment(delay_ms: float, impairment: ImpairmentConfig) -> Impairment:
     """Return the impairment of one flow without its trace and queue."""
-    names = {each.name for each in fields(Impairment)}
+    names = set(Impairment.__struct_fields__)
     return Impairment(delay_ms=delay_ms, **impairment.model_dump(include=names - {"delay_ms"}))
 
 

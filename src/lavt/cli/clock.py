@@ -5,9 +5,9 @@ from __future__ import annotations
 import queue
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import asdict
 from typing import Annotated, Any, Literal
 
+import msgspec
 import typer
 
 from lavt.assembly.clock_source import clock_source, interpreter
@@ -72,7 +72,7 @@ def clock(
             before, report = report, _read_report(read_source, source)
             finding = compare(before, report, probes, latest, address)
     if as_json:
-        console.print_json({**asdict(finding), "clock": asdict(report)})
+        console.print_json({**msgspec.to_builtins(finding), "clock": msgspec.to_builtins(report)})
     else:
         for sentence in finding.says:
             console.print_result(f"{sentence}.")

@@ -9,10 +9,10 @@ import sys
 import textwrap
 from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
+import msgspec
 import typer
 
 import lavt
@@ -74,7 +74,7 @@ def doctor(
             _show(check)
     problems = sum(check.verdict == "problem" for check in results)
     if as_json:
-        console.print_json({"good": problems == 0, "checks": [asdict(check) for check in results]})
+        console.print_json({"good": problems == 0, "checks": msgspec.to_builtins(results)})
     if problems:
         raise typer.Exit(1)
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from typing import Annotated, Any
 
+import msgspec
 import typer
 
 from lavt.assembly.injection import Protocol, Role, StateDelay, netem_flows
@@ -39,7 +39,7 @@ def show(interface: Interface, as_json: console.Json = False) -> None:
     """
     shown = NetemInterface(interface).status()
     applied = shown["applied"] if shown["ours"] else None
-    impairments = {name: asdict(each) for name, each in shown["impairments"].items()} if shown["ours"] else {}
+    impairments = msgspec.to_builtins(shown["impairments"]) if shown["ours"] else {}
     if as_json:
         owner = None if applied is None else {"condition": applied.condition, "owner_pid": applied.owner[0] or None}
         console.print_json({**shown, "impairments": impairments, "applied": owner})
@@ -185,7 +185,7 @@ def _print_messages(sentences: Sequence[str]) -> None:
 def _print_verification(verification: Verification, as_json: bool, context: Mapping[str, Any]) -> None:
     """Print the measured delays; as JSON, print the reasons for failure too."""
     if as_json:
-        measured = {name: asdict(each) for name, each in verification.measured.items()}
+        measured = msgspec.to_builtins(verification.measured)
         console.print_json({**context, "measured": measured, "reasons": verification.reasons})
         return
     for name, each in verification.measured.items():

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import replace
+
+from msgspec.structs import replace
 
 from lavt.domain import NS_PER_S, State
 from lavt.nodes.client_session import Phase

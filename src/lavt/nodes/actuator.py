@@ -6,13 +6,14 @@ from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from typing import Literal
 
+from msgspec import Struct
+
 from lavt.domain import NS_PER_MS, NS_PER_S, Command, Ending, Now, Pose, SessionRequest, State, VehicleEvent
 from lavt.errors import BadMessage
 from lavt.node import WAKE, Message, Send, Stage
 from lavt.nodes.payloads import Admission, AtWheel, Event, FrameWritten, Route, StationaryStatus
 from lavt.safety.gate import CommandVerdict, SafetyGate
 from lavt.transport.messages import decode, encode
-from lavt.value import value
 from lavt.vehicle.camera import FrameTimes
 from lavt.vehicle.vehicle import CountingVehicle, Vehicle
 
@@ -35,8 +36,7 @@ ENDINGS: dict[str, Ending] = {
 """Events that end a drive; a collision only if `after_collision` is "end"."""
 
 
-@value
-class ReceivedCommand:
+class ReceivedCommand(Struct, frozen=True):
     """A decoded command with its time of arrival."""
 
     command: Command
@@ -48,8 +48,7 @@ class ReceivedCommand:
         return self.command.stamp_ns
 
 
-@value
-class JudgedCommand:
+class JudgedCommand(Struct, frozen=True):
     """A command with the gate's decision."""
 
     received: ReceivedCommand

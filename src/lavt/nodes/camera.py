@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 
+from msgspec import Struct
+
 from lavt.domain import NS_PER_S, FramePayload, Now, Pose
 from lavt.errors import BadPacket
 from lavt.node import WAKE, Message, Send, Stage
@@ -13,7 +15,6 @@ from lavt.transport.rtp.rtcp import is_rtcp, parse_feedback
 from lavt.transport.video.frame_codec import PictureSender
 from lavt.transport.video.path_validation import PathServer
 from lavt.transport.video.stream_sender import StreamSender
-from lavt.value import value
 from lavt.vehicle.camera import Camera, CapturedFrame, CountingCamera, FrameTimes, TimedCamera, newest_pose
 
 KEYFRAME_PAUSE_NS = NS_PER_S // 10
@@ -24,8 +25,7 @@ REMEMBERED_POSES = 512
 """At 240 Hz twice the longest time that a picture may take from the opening of the shutter."""
 
 
-@value
-class StampedFrame:
+class StampedFrame(Struct, frozen=True):
     """A picture with its stamp in its pixels."""
 
     frame: CapturedFrame
@@ -35,8 +35,7 @@ class StampedFrame:
     picture: FramePayload
 
 
-@value
-class EncodedFrame:
+class EncodedFrame(Struct, frozen=True):
     """A stamped picture as H.264."""
 
     stamped: StampedFrame

@@ -6,6 +6,8 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import ClassVar, Literal, Protocol
 
+from msgspec import Struct
+
 from lavt.control.drive_controller import DriveController
 from lavt.control.driver_limits import ClientLimits
 from lavt.control.lane_watch import LaneState, LaneWatch
@@ -17,7 +19,6 @@ from lavt.nodes.payloads import DecodedFrame, LaneSeen, PathToken
 from lavt.nodes.picture_reader import PictureReader
 from lavt.perception.lane_detector import FOLLOWS_FOR_NS
 from lavt.transport.messages import decode, encode
-from lavt.value import value
 
 OperatorRequest = Literal["emergency_stop", "release"]
 """A request of the person at the client, on the channel `operator`."""
@@ -35,8 +36,7 @@ class LaneDetection(Protocol):
         ...
 
 
-@value
-class PerceivedFrame:
+class PerceivedFrame(Struct, frozen=True):
     """A decoded frame with the lane detected in it."""
 
     view: DecodedFrame

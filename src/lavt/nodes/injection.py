@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from typing import Literal
+
+from msgspec import Struct
+from msgspec.structs import asdict
 
 from lavt.domain import NS_PER_MS, NS_PER_S, NetemReply, NetemRequest, Now
 from lavt.errors import BadMessage, UserError
@@ -18,7 +20,6 @@ from lavt.nodes.payloads import InjectionSample, StationaryStatus
 from lavt.transport.emulation.impairment import ImpairedFlow, Impairment, check_flows
 from lavt.transport.messages import decode, encode
 from lavt.transport.netem.injector import InjectionOrder, InjectionResult
-from lavt.value import value
 
 MEASURE_PERIOD_NS = 5 * NS_PER_S
 """Period of the measurement of a condition in force."""
@@ -76,8 +77,7 @@ class _Queues:
         return [Send("inject", InjectionOrder(self._number, self.condition, self.flows))]
 
 
-@value
-class Lease:
+class Lease(Struct, frozen=True):
     """The client that controls the network condition, and until when."""
 
     client: tuple[str, int]

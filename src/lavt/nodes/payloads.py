@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from msgspec import Struct
+
 from lavt.domain import Lane
 from lavt.transport.video.frame_codec import ReceivedPicture
-from lavt.value import value
 
 
-@value
-class FrameWritten:
+class FrameWritten(Struct, frozen=True):
     """A frame was stamped and encoded on the server."""
 
     number: int
@@ -20,16 +20,14 @@ class FrameWritten:
     size_bytes: int
 
 
-@value
-class VideoUnit:
+class VideoUnit(Struct, frozen=True):
     """One H.264 access unit, sent or received."""
 
     stamp_ns: int
     data: bytes
 
 
-@value
-class ReceivedUnit:
+class ReceivedUnit(Struct, frozen=True):
     """A received access unit; times are on the client's monotonic clock."""
 
     data: bytes
@@ -40,8 +38,7 @@ class ReceivedUnit:
     """Arrival of the last packet."""
 
 
-@value
-class DecodedFrame:
+class DecodedFrame(Struct, frozen=True):
     """A decoded picture with a valid stamp."""
 
     stamp_ns: int
@@ -49,8 +46,7 @@ class DecodedFrame:
     received: ReceivedPicture
 
 
-@value
-class PictureRead:
+class PictureRead(Struct, frozen=True):
     """The outcome of decoding an access unit and reading its stamp."""
 
     stamp_ns: int | None
@@ -68,16 +64,14 @@ class PictureRead:
     read_wall_ns: int
 
 
-@value
-class LaneSeen:
+class LaneSeen(Struct, frozen=True):
     """The lane detected in a picture."""
 
     stamp_ns: int
     lane: Lane
 
 
-@value
-class Admission:
+class Admission(Struct, frozen=True):
     """The verdict on a command on the server, with its times."""
 
     epoch: int
@@ -98,8 +92,7 @@ class Admission:
     brake: float
 
 
-@value
-class AtWheel:
+class AtWheel(Struct, frozen=True):
     """A command that reached the wheels; times are on the server's monotonic clock."""
 
     sequence: int
@@ -110,8 +103,7 @@ class AtWheel:
     """Arrival of the vehicle's report that it steers by this command."""
 
 
-@value
-class Event:
+class Event(Struct, frozen=True):
     """An event in the server's record."""
 
     mono_ns: int
@@ -119,8 +111,7 @@ class Event:
     detail: str
 
 
-@value
-class Route:
+class Route(Struct, frozen=True):
     """The centre line of the driven lane, once at the start of a record."""
 
     name: str
@@ -128,24 +119,21 @@ class Route:
     points: tuple[tuple[float, float], ...]
 
 
-@value
-class PathToken:
+class PathToken(Struct, frozen=True):
     """The token with which the client validates its video path."""
 
     token: bytes
     port: int
 
 
-@value
-class StationaryStatus:
+class StationaryStatus(Struct, frozen=True):
     """Whether the vehicle is stationary and not active, and the active operator."""
 
     at_rest: bool
     active_operator: tuple[str, int] | None
 
 
-@value
-class InjectionSample:
+class InjectionSample(Struct, frozen=True):
     """The requested and measured impairment of a flow that this machine sends, at each change and periodically."""
 
     mono_ns: int

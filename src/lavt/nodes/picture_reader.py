@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 
+from msgspec import Struct
+
 from lavt.domain import Now
 from lavt.errors import BadPacket
 from lavt.node import Message, Send, Stage
 from lavt.nodes.payloads import DecodedFrame, PictureRead, ReceivedUnit, VideoUnit
 from lavt.transport.video.frame_codec import PictureReceiver, ReceivedPicture
 from lavt.transport.video.stamp import stamp_agrees
-from lavt.value import value
 
 
-@value
-class DecodedUnit:
+class DecodedUnit(Struct, frozen=True):
     """A received access unit with its decoded picture."""
 
     unit: ReceivedUnit
@@ -23,8 +23,7 @@ class DecodedUnit:
     decoded_mono_ns: int
 
 
-@value
-class StampRead:
+class StampRead(Struct, frozen=True):
     """A decoded picture with its stamp; 0: it could not be read."""
 
     decoded: DecodedUnit

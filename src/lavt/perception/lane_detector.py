@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
+from msgspec.structs import replace
 
 from lavt.domain import NS_PER_MS, CameraModel, Lane, Picture, SeenLane
 from lavt.perception.bird_eye import GroundGrid, bird_eye

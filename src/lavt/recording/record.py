@@ -20,7 +20,7 @@ from pydantic_core import from_json
 
 from lavt.domain import NS_PER_S, Now
 from lavt.errors import UserError, WorkError, describe_error
-from lavt.recording.json_payload import json_schema, serializer_of
+from lavt.recording.json_payload import json_schema, to_json
 from lavt.recording.mcap_reader import McapContent, Messages, read_mcap
 from lavt.recording.mcap_writer import McapFile
 from lavt.recording.table import EMPTY, Table, table_of
@@ -133,7 +133,7 @@ class RecordWriter:
                 self._schemas[payload_type] = self._mcap.add_schema(name, "jsonschema", schema)
             schema_id = self._schemas[payload_type]
         channel_id = self._mcap.add_channel("/" + channel, "json", schema_id)
-        serialize = _video_json if channel == VIDEO else serializer_of(payload_type)
+        serialize = _video_json if channel == VIDEO else to_json
         self._channels[channel][payload_type] = channel_id, serialize
         if self._digest is not None:
             self._digest.update(f"{self._side} {channel} is {channel_id}\n".encode())

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from msgspec import Struct
+
 from lavt.domain import Now
 from lavt.node import Message, Send, Stage
-from lavt.value import value
 
 
-@value
-class Timeline:
+class Timeline(Struct, frozen=True):
     """The end times of the stages of a pipeline, on the host's monotonic clock.
 
     The first entry is "wait", which ends when the first stage begins; `arrived_mono_ns` is the message's arrival.
@@ -23,8 +23,7 @@ class Timeline:
     stages: tuple[tuple[str, int], ...]
 
 
-@value
-class PipelineResult:
+class PipelineResult(Struct, frozen=True):
     """The result of a pipeline run: the sends, the end time, and the timeline if a value had a stamp."""
 
     sends: list[Send]

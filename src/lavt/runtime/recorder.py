@@ -6,13 +6,14 @@ import logging
 import threading
 from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any, Protocol
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from lavt.domain import Command, NetemReply, NetemRequest, Now, SessionReply, SessionRequest, State
 from lavt.errors import BadMessage
 from lavt.transport.messages import decode
-from lavt.value import value
 
 log = logging.getLogger(__name__)
 
@@ -65,8 +66,7 @@ def _without_token(data: bytes) -> object:
     return replace(reply, token=b"") if isinstance(reply, SessionReply) else reply
 
 
-@value
-class Packet:
+class Packet(Struct, frozen=True):
     """A datagram of the video; sequence and timestamp only if it is RTP (RFC 3550, section 5.1)."""
 
     sequence: int | None

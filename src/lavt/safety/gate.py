@@ -10,6 +10,8 @@ from collections import Counter
 from collections.abc import Callable
 from enum import StrEnum
 
+from msgspec import Struct
+
 from lavt.domain import Command, SafetyState, VehicleState
 from lavt.safety.issued_stamps import IssuedStamps
 from lavt.safety.limiter import Limiter
@@ -17,7 +19,6 @@ from lavt.safety.limits import Limits
 from lavt.safety.session import CommandEpoch, VehicleSession
 from lavt.safety.state_machine import SafetyStateMachine
 from lavt.safety.watchdog import Watchdog
-from lavt.value import value
 
 
 class RejectionReason(StrEnum):
@@ -40,8 +41,7 @@ INTERRUPTS_ARMING = (RejectionReason.NOT_ARMED, RejectionReason.NOT_STATIONARY, 
 """A command rejected for one of these reasons interrupts arming: input or vehicle were not at rest."""
 
 
-@value
-class CommandVerdict:
+class CommandVerdict(Struct, frozen=True):
     """The decision on a command; `reason` is None for an accepted one."""
 
     reason: RejectionReason | None = None

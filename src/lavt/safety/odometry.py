@@ -7,17 +7,17 @@ from bisect import bisect_right
 from collections import deque
 from operator import attrgetter
 
+from msgspec import Struct
+
 from lavt.control.pure_pursuit import ORIGIN, PlanarPose, clamp, curvature_per_m, move_along_arc
 from lavt.domain import NS_PER_S, VehicleState
-from lavt.value import value
 
 MAX_SPEED_MPS = 100.0
 MAX_CURVATURE_PER_M = 1.0
 """Reports beyond these are clamped, so that one bad report cannot ruin the sum."""
 
 
-@value
-class PoseFix:
+class PoseFix(Struct, frozen=True):
     """The pose of the rear axle at a time, in the frame of the first fix, with its speed and curvature."""
 
     mono_ns: int

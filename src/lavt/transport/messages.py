@@ -7,167 +7,136 @@ cuts texts that are too long, such as a list of faults, because a state must be 
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, fields
 from functools import lru_cache
 from operator import attrgetter
-from typing import Any, TypeVar
+from types import GenericAlias
+from typing import Annotated, Any, Literal, TypeVar
 
-import msgpack
+import msgspec
+from msgspec import Meta
 
-from lavt.domain import PATH_POINTS, Command, NetemReply, NetemRequest, SessionReply, SessionRequest, State
+from lavt.domain import (
+    PATH_POINTS,
+    Command,
+    Mode,
+    NetemReply,
+    NetemRequest,
+    Operation,
+    SafetyState,
+    SessionReply,
+    SessionRequest,
+    State,
+)
 from lavt.errors import BadMessage
 
 VERSION = 4
 MAX_MESSAGE_BYTES = 1024
 NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_-]{0,31}\Z")
 """A valid name of a vehicle or client: it contains nothing that has a meaning in a Zenoh key."""
-REASON_BYTES = 300
-"""Limits a reason; a message with its longest texts is within `MAX_MESSAGE_BYTES`."""
 ELLIPSIS = "\N{HORIZONTAL ELLIPSIS}"
 MAX_DELAY_MS = 10_000.0
 """Limits what a client can request of a server, which needs as long to clear the delay."""
 
+Version = Annotated[int, Meta(ge=VERSION, le=VERSION)]
+U64 = Annotated[int, Meta(ge=0)]
+Time = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+RoadWheel = Annotated[float, Meta(ge=-1.0, le=1.0)]
+Unit = Annotated[float, Meta(ge=0.0, le=1.0)]
+Delay = Annotated[float, Meta(ge=0.0, le=MAX_DELAY_MS)]
+Name = Annotated[str, Meta(pattern=NAME.pattern)]
+NameOrEmpty = Annotated[str, Meta(pattern=rf"^\Z|{NAME.pattern}")]
 
-Check = Callable[[Any], bool]
-_NUMBERS = frozenset((int, float))
-
-
-def _integer(low: int, high: int) -> Check:
-    return lambda value: type(value) is int and low <= value <= high
-
-
-def _number(low: float, high: float) -> Check:
-    return lambda value: type(value) in _NUMBERS and low <= value <= high  # false for NaN
-
-
-@dataclass(frozen=True, slots=True)
-class _Text:
-    """A check of a text's length in bytes, so that texts of any letters fit into a message."""
-
-    max_bytes: int
-
-    def __call__(self, value: Any) -> bool:
-        return type(value) is str and len(value.encode()) <= self.max_bytes
-
-    def cut(self, text: str) -> str:
-        """Return the text without lone surrogates (of a file's name), cut to the limit and then with an ellipsis."""
-        data = text.encode(errors="replace")
-        if len(data) <= self.max_bytes:
-            return data.decode()
-        return data[: self.max_bytes - len(ELLIPSIS.encode())].decode(errors="ignore") + ELLIPSIS
+REASON_BYTES = 300
+"""Limits a reason; a message with its longest texts is within `MAX_MESSAGE_BYTES`."""
+TEXT_BYTES: dict[type, dict[str, int]] = {
+    Command: {},
+    State: {"reason": REASON_BYTES, "rejected": REASON_BYTES, "limited": 100},
+    SessionRequest: {},
+    SessionReply: {"reason": REASON_BYTES, "host": 64},
+    NetemRequest: {"condition": 32},
+    NetemReply: {"reason": 400},
+}
+"""The longest texts that are sent, in bytes. A receiver accepts as many characters."""
 
 
-def _one_of(*choices: str) -> Check:
-    return lambda value: type(value) is str and value in choices
+def _text(kind: type, field: str) -> Any:
+    return Annotated[str, Meta(max_length=TEXT_BYTES[kind][field])]
 
 
-def _name(value: object) -> bool:
-    return type(value) is str and NAME.match(value) is not None
-
-
-def _name_or_empty(value: object) -> bool:
-    return value == "" or _name(value)
-
-
-def _bytes(*lengths: int) -> Check:
-    return lambda value: type(value) is bytes and len(value) in lengths
-
-
-def _curvatures(value: object) -> bool:
-    """Return whether the value is a tuple of curvatures; the sum is not finite if one of them is NaN or infinite."""
-    return (
-        type(value) is tuple
-        and len(value) == PATH_POINTS
-        and _NUMBERS.issuperset(map(type, value))
-        and min(value) >= -1.0
-        and max(value) <= 1.0
-        and math.isfinite(sum(value))
-    )
-
-
-U64 = _integer(0, 2**64 - 1)
-TIME = _integer(0, 2**63 - 1)
-LAST_STOP = _integer(0, 2**62)
-"""The highest number of an emergency stop in a reply: the operator's next number must still be a `TIME`."""
-ROAD_WHEEL = _number(-1.0, 1.0)
-UNIT = _number(0.0, 1.0)
-RATE = _integer(10_000, 10**11)
-
-CHECKS: dict[type, dict[str, Check]] = {
+TYPES: dict[type, dict[str, Any]] = {
     Command: {
         "epoch": U64,
-        "sequence": TIME,
-        "sent_wall_ns": TIME,
-        "stamp_ns": TIME,
-        "stamp_received_wall_ns": TIME,
-        "steering_rad": ROAD_WHEEL,
-        "throttle": UNIT,
-        "brake": UNIT,
-        "path_curvature_per_m": _curvatures,
-        "mode": _one_of("arm", "drive", "stop"),
-        "emergency_stop": TIME,
+        "sequence": Time,
+        "sent_wall_ns": Time,
+        "stamp_ns": Time,
+        "stamp_received_wall_ns": Time,
+        "steering_rad": RoadWheel,
+        "throttle": Unit,
+        "brake": Unit,
+        "path_curvature_per_m": Annotated[tuple[RoadWheel, ...], Meta(min_length=PATH_POINTS, max_length=PATH_POINTS)],
+        "mode": Mode,
+        "emergency_stop": Time,
     },
     State: {
-        "sent_wall_ns": TIME,
-        "state_mono_ns": TIME,
-        "speed_mps": _number(-100.0, 100.0),
-        "steering_rad": ROAD_WHEEL,
-        "gear": _one_of("park", "reverse", "neutral", "drive"),
-        "safety": _one_of("disarmed", "arming", "driving", "degraded", "safe_stop", "emergency_stop"),
-        "reason": _Text(REASON_BYTES),
-        "applied_sequence": _integer(-1, 2**63 - 1),
-        "rejected": _Text(REASON_BYTES),
-        "limited": _Text(100),
-        "active_operator": _name_or_empty,
+        "sent_wall_ns": Time,
+        "state_mono_ns": Time,
+        "speed_mps": Annotated[float, Meta(ge=-100.0, le=100.0)],
+        "steering_rad": RoadWheel,
+        "gear": Literal["park", "reverse", "neutral", "drive"],
+        "safety": SafetyState,
+        "reason": _text(State, "reason"),
+        "applied_sequence": Annotated[int, Meta(ge=-1, le=2**63 - 1)],
+        "rejected": _text(State, "rejected"),
+        "limited": _text(State, "limited"),
+        "active_operator": NameOrEmpty,
         "active_operator_instance": U64,
-        "requested_by": _name_or_empty,
+        "requested_by": NameOrEmpty,
         "instance": U64,
     },
-    SessionRequest: {
-        "operation": _one_of("acquire", "request_handover", "release", "emergency_stop", "clear_emergency_stop"),
-        "who": _name,
-        "instance": U64,
-        "number": TIME,
-    },
+    SessionRequest: {"operation": Operation, "who": Name, "instance": U64, "number": Time},
     SessionReply: {
-        "granted": lambda value: type(value) is bool,
-        "reason": _Text(REASON_BYTES),
+        "granted": bool,
+        "reason": _text(SessionReply, "reason"),
         "epoch": U64,
-        "token": _bytes(0, 16),
-        "video_port": _integer(0, 65535),
-        "host": _Text(64),
-        "emergency_stop": LAST_STOP,
+        "token": bytes,
+        "video_port": Annotated[int, Meta(ge=0, le=65535)],
+        "host": _text(SessionReply, "host"),
+        # lower than a `Time`, so that the operator has a next number
+        "emergency_stop": Annotated[int, Meta(ge=0, le=2**62)],
     },
     NetemRequest: {
-        "who": _name,
+        "who": Name,
         "instance": U64,
-        "condition": _Text(32),
-        "lease_ms": _integer(0, 60_000),
-        "delay_ms": _number(0.0, MAX_DELAY_MS),
-        "jitter_ms": _number(0.0, MAX_DELAY_MS),
-        "jitter_correlation": UNIT,
-        "jitter_distribution": _one_of("uniform", "normal", "pareto", "paretonormal"),
-        "loss": UNIT,
-        "loss_burst_packets": _number(0.0, 10_000.0),
-        "rate_bps": lambda value: type(value) is int and (value == 0 or RATE(value)),
-        "reorder": UNIT,
-        "state_delay_ms": _number(0.0, MAX_DELAY_MS),
+        "condition": _text(NetemRequest, "condition"),
+        "lease_ms": Annotated[int, Meta(ge=0, le=60_000)],
+        "delay_ms": Delay,
+        "jitter_ms": Delay,
+        "jitter_correlation": Unit,
+        "jitter_distribution": Literal["uniform", "normal", "pareto", "paretonormal"],
+        "loss": Unit,
+        "loss_burst_packets": Annotated[float, Meta(ge=0.0, le=10_000.0)],
+        "rate_bps": Annotated[int, Meta(ge=0, le=10**11)],
+        "reorder": Unit,
+        "state_delay_ms": Delay,
     },
-    NetemReply: {"granted": lambda value: type(value) is bool, "reason": _Text(400)},
+    NetemReply: {"granted": bool, "reason": _text(NetemReply, "reason")},
 }
+"""The fields of each message in their order, with types and ranges. NaN is in no range."""
 
-_FIELD_NAMES: dict[type, tuple[str, ...]] = {kind: tuple(checks) for kind, checks in CHECKS.items()}
-_FIELD_CHECKS: dict[type, tuple[Check, ...]] = {kind: tuple(checks.values()) for kind, checks in CHECKS.items()}
-_TEXTS: dict[type, list[tuple[int, _Text]]] = {
-    kind: [(position, check) for position, check in enumerate(checks.values(), 1) if isinstance(check, _Text)]
-    for kind, checks in CHECKS.items()
+CHECKS: dict[type, dict[str, Callable[[Any], bool]]] = {
+    SessionReply: {"token": lambda token: len(token) in {0, 16}},
+    NetemRequest: {"rate_bps": lambda rate_bps: rate_bps == 0 or rate_bps >= 10_000},
 }
-"""The texts of a message, with their positions after the version."""
+"""What a range cannot express."""
+
+_ENCODER = msgspec.msgpack.Encoder()
+_DECODERS: dict[type, msgspec.msgpack.Decoder[tuple[Any, ...]]] = {
+    kind: msgspec.msgpack.Decoder(GenericAlias(tuple, (Version, *fields.values()))) for kind, fields in TYPES.items()
+}
 _FIELD_VALUES: dict[type, Callable[[Any], tuple[Any, ...]]] = {
-    kind: attrgetter(*(field.name for field in fields(kind))) for kind in CHECKS
+    kind: attrgetter(*fields) for kind, fields in TYPES.items()
 }
 
 Kind = TypeVar("Kind", Command, State, SessionRequest, SessionReply, NetemRequest, NetemReply)
@@ -175,11 +144,19 @@ Kind = TypeVar("Kind", Command, State, SessionRequest, SessionReply, NetemReques
 
 def encode(message: Command | State | SessionRequest | SessionReply | NetemRequest | NetemReply) -> bytes:
     """Return the bytes of `message` on the wire, with texts cut to their limits."""
-    values = [VERSION, *_FIELD_VALUES[type(message)](message)]
-    for position, text in _TEXTS[type(message)]:
-        values[position] = text.cut(values[position])
-    packed: bytes = msgpack.packb(values)
-    return packed
+    kind = type(message)
+    cut = {name: _cut(getattr(message, name), max_bytes) for name, max_bytes in TEXT_BYTES[kind].items()}
+    if cut:
+        message = msgspec.structs.replace(message, **cut)
+    return _ENCODER.encode((VERSION, *_FIELD_VALUES[kind](message)))
+
+
+def _cut(text: str, max_bytes: int) -> str:
+    """Return the text without lone surrogates (of a file's name), cut to the limit and then with an ellipsis."""
+    data = text.encode(errors="replace")
+    if len(data) <= max_bytes:
+        return data.decode()
+    return data[: max_bytes - len(ELLIPSIS.encode())].decode(errors="ignore") + ELLIPSIS
 
 
 def decode(kind: type[Kind], data: bytes) -> Kind:
@@ -194,16 +171,18 @@ def _decode(kind: type[Any], data: bytes) -> Any:
     if len(data) > MAX_MESSAGE_BYTES:
         raise BadMessage(f"{len(data)} bytes exceed the maximum of a message ({MAX_MESSAGE_BYTES})")
     try:
-        values = msgpack.unpackb(data, use_list=False, raw=False, strict_map_key=True)
-    except Exception as error:  # the parser has half a dozen kinds of error, and bytes from outside may cause any
-        raise BadMessage("not msgpack") from error
-    checks = _FIELD_CHECKS[kind]
-    if type(values) is not tuple or len(values) != 1 + len(checks):
-        raise BadMessage(f"not an array of the fields of a {kind.__name__}")
-    version, *field_values = values
-    if type(version) is not int or version != VERSION:
-        raise BadMessage("a message of another version")
-    for index, check in enumerate(checks):
-        if not check(field_values[index]):
-            raise BadMessage(f"{kind.__name__}.{_FIELD_NAMES[kind][index]} is out of range")
-    return kind(*field_values)
+        _, *values = _DECODERS[kind].decode(data)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise BadMessage(_describe(kind, str(error))) from error
+    message = kind(*values)
+    for name, is_valid in CHECKS.get(kind, {}).items():
+        if not is_valid(getattr(message, name)):
+            raise BadMessage(f"{kind.__name__}.{name} is out of range")
+    return message
+
+
+def _describe(kind: type[Any], error: str) -> str:
+    """Return an error of the decoder, after the name of the field that it is about."""
+    index = re.search(r"`\$\[(\d+)\]", error)
+    name = "" if index is None else "." + ("version", *TYPES[kind])[int(index[1])]
+    return f"{kind.__name__}{name}: {error}"

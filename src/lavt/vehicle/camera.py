@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Protocol, runtime_checkable
 
+from msgspec import Struct
+
 from lavt.domain import NS_PER_S, CameraModel, FramePayload, Pose
-from lavt.value import value
 
 
-@value
-class CapturedFrame:
+class CapturedFrame(Struct, frozen=True):
     """A picture with its capture time: the middle of the exposure on the server's monotonic clock, None if unknown.
 
     For a V4L2 device the capture time is the driver's: the beginning of the exposure or the end of the transfer
@@ -25,8 +25,7 @@ class CapturedFrame:
     picture: FramePayload
 
 
-@value
-class FrameTimes:
+class FrameTimes(Struct, frozen=True):
     """The times at which a camera's shutter opens (or closes) for each frame, on the server's monotonic clock."""
 
     first_ns: int

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Protocol
 
-from lavt.value import value
+from msgspec import Struct
 
 
-@value
-class CanFrame:
+class CanFrame(Struct, frozen=True):
     """A CAN data frame. The length of `data`, 0 to 8 bytes, is the frame's DLC."""
 
     identifier: int
@@ -17,8 +16,7 @@ class CanFrame:
     is_extended: bool = False
 
 
-@value
-class ReceivedCanFrame:
+class ReceivedCanFrame(Struct, frozen=True):
     """A frame received from the bus, with its arrival time on this host's monotonic clock."""
 
     frame: CanFrame

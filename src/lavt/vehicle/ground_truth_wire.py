@@ -7,14 +7,13 @@ following datagrams, so that a lost datagram loses no event. All times are of th
 
 from __future__ import annotations
 
-import math
+import sys
 from collections import Counter, deque
 from collections.abc import Sequence
-from dataclasses import fields
-from operator import attrgetter
-from typing import Any, Final, get_args
+from typing import Annotated, Final
 
-import msgpack
+import msgspec
+from msgspec import Meta
 
 from lavt.domain import EventKind, GroundTruth, VehicleEvent
 
@@ -26,11 +25,17 @@ MAX_EVENTS: Final = 16
 MAX_DETAIL: Final = 200
 """Characters of an event's detail; a longer detail is cut."""
 MAX_BYTES: Final = 16_384
-TIME_LIMIT_NS: Final = 2**63
-KINDS: Final = frozenset(get_args(EventKind))
 
-_TRUTH_FIELDS = [field.name for field in fields(GroundTruth)]
-_truth_values = attrgetter(*_TRUTH_FIELDS)
+Time = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+Finite = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]
+Event = tuple[Time, Time, EventKind, Annotated[str, Meta(max_length=MAX_DETAIL)]]
+Datagram = tuple[
+    Annotated[int, Meta(ge=VERSION, le=VERSION)],
+    tuple[Time, Finite, Finite, Finite, Finite, Finite, Finite, Finite, Finite],
+    Annotated[tuple[Event, ...], Meta(max_length=MAX_EVENTS)],
+]
+_ENCODER = msgspec.msgpack.Encoder()
+_DECODER: msgspec.msgpack.Decoder[Datagram] = msgspec.msgpack.Decoder(Datagram)
 
 NumberedEvent = tuple[int, VehicleEvent]
 
@@ -38,7 +43,7 @@ NumberedEvent = tuple[int, VehicleEvent]
 def encode_truth(truth: GroundTruth, events: Sequence[NumberedEvent]) -> bytes:
     """Return a datagram with the truth and numbered events, at most `MAX_EVENTS`."""
     encoded = [(number, event.mono_ns, event.kind, event.detail[:MAX_DETAIL]) for number, event in events]
-    return bytes(msgpack.packb((VERSION, _truth_values(truth), encoded)))
+    return _ENCODER.encode((VERSION, msgspec.structs.astuple(truth), encoded))
 
 
 def decode_truth(datagram: bytes) -> tuple[GroundTruth, list[NumberedEvent]] | None:
@@ -46,41 +51,10 @@ def decode_truth(datagram: bytes) -> tuple[GroundTruth, list[NumberedEvent]] | N
     if len(datagram) > MAX_BYTES:
         return None
     try:
-        decoded = msgpack.unpackb(datagram, use_list=False)
-    except Exception:
+        _, truth, events = _DECODER.decode(datagram)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
         return None
-    if not (type(decoded) is tuple and len(decoded) == 3 and type(decoded[0]) is int and decoded[0] == VERSION):
-        return None
-    _, values, events = decoded
-    if not (_is_truth(values) and type(events) is tuple and len(events) <= MAX_EVENTS and all(map(_is_event, events))):
-        return None
-    return GroundTruth(*values), [(number, VehicleEvent(*event)) for number, *event in events]
-
-
-def _is_time(value: Any) -> bool:
-    return type(value) is int and 0 <= value < TIME_LIMIT_NS
-
-
-def _is_truth(values: Any) -> bool:
-    return (
-        type(values) is tuple
-        and len(values) == len(_TRUTH_FIELDS)
-        and _is_time(values[0])
-        and all(type(number) is float and math.isfinite(number) for number in values[1:])
-    )
-
-
-def _is_event(event: Any) -> bool:
-    return (
-        type(event) is tuple
-        and len(event) == 4
-        and _is_time(event[0])
-        and _is_time(event[1])
-        and type(event[2]) is str
-        and event[2] in KINDS
-        and type(event[3]) is str
-        and len(event[3]) <= MAX_DETAIL
-    )
+    return GroundTruth(*truth), [(number, VehicleEvent(at_ns, kind, detail)) for number, at_ns, kind, detail in events]
 
 
 class TruthSender:

@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
+from msgspec import Struct
+
 from lavt.domain import Actuation, GroundTruth, VehicleEvent, VehicleState
-from lavt.value import value
 
 
-@value
-class ReachedCommand:
+class ReachedCommand(Struct, frozen=True):
     """A command, applied at `applied_ns`, that the vehicle reported at `reached_ns` to be steering by."""
 
     applied_ns: int

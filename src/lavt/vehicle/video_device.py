@@ -14,11 +14,11 @@ from typing import Final, cast
 import cv2
 import cv2.utils.logging
 import numpy as np
+from msgspec import Struct
 
 from lavt.clock import Clock
 from lavt.domain import NS_PER_MS, NS_PER_S, CameraModel, Picture, Pose
 from lavt.errors import UserError
-from lavt.value import value
 from lavt.vehicle.camera import CapturedFrame
 
 log = logging.getLogger(__name__)
@@ -56,8 +56,7 @@ _TIMEOUT_MS: Final = 3000
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 
-@value
-class DeviceFormat:
+class DeviceFormat(Struct, frozen=True):
     """The size of a device's pictures, and the rate it reports; None if it reports none."""
 
     width_px: int
@@ -70,8 +69,7 @@ class DeviceFormat:
         return f"{self.width_px}x{self.height_px}{rate}"
 
 
-@value
-class _BufferedPicture:
+class _BufferedPicture(Struct, frozen=True):
     picture: Picture
     arrived_ns: int
     capture_ns: int | None

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import hmac
-from dataclasses import replace
 
 import pytest
+from msgspec.structs import replace
 
 from lavt.domain import SessionReply, SessionRequest
 from lavt.transport.messages import MAX_MESSAGE_BYTES, encode

@@ -5,9 +5,8 @@ The reports are those of generation 1: a command in bytes 2 and 3, in steps of 0
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
+from msgspec.structs import replace
 from tests.vehicle.dbw.rig import AdapterRig, driving, started
 
 from lavt.vehicle.can_frame import CanFrame

@@ -8,6 +8,7 @@ from copy import deepcopy
 from dataclasses import replace
 from itertools import pairwise
 
+import msgspec
 import pytest
 from tests.vehicle.dbw.rig import COARSE_MS, SPEED_SOURCES, START_NS, AdapterRig, both, driving, profile, road, started
 
@@ -117,13 +118,13 @@ def test_new_commands_are_sent_immediately(generation: int) -> None:
     rig.run_ms(500)
     rig.sent.clear()
     for index in range(60):
-        rig.actuation = replace(rig.actuation, steering_rad=0.01 + index * 1e-4)
+        rig.actuation = msgspec.structs.replace(rig.actuation, steering_rad=0.01 + index * 1e-4)
         rig.run_ms(1)
     times = sorted({at_ns for at_ns, _ in rig.sent})
     assert {later - earlier for earlier, later in pairwise(times)} == {5 * NS_PER_MS}
     rig.run_ms(100)
     rig.sent.clear()
-    rig.actuation = replace(rig.actuation, steering_rad=0.02)
+    rig.actuation = msgspec.structs.replace(rig.actuation, steering_rad=0.02)
     rig.run_until(lambda rig: bool(rig.sent), 10)
     assert rig.adapter._sender.sent_ns == rig.now_ns
 
@@ -276,7 +277,7 @@ def test_reached(generation: int) -> None:
     rig = driving(generation)
     rig.run_ms(500)
     rig.adapter.take_reached()
-    rig.actuation = replace(rig.actuation, steering_rad=0.012)
+    rig.actuation = msgspec.structs.replace(rig.actuation, steering_rad=0.012)
     rig.run_until(lambda rig: rig.adapter._requested == rig.actuation)
     requested_ns = rig.now_ns
     rig.run_ms(200)

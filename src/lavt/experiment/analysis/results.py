@@ -7,11 +7,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from lavt.errors import WorkError
 from lavt.experiment.analysis.injection_validity import absent_reasons
 from lavt.experiment.analysis.metrics import measure
 from lavt.experiment.analysis.validity import invalid_reasons
-from lavt.recording.json_payload import without_nan
+from lavt.recording.json_payload import to_json
 from lavt.recording.record import Record
 
 FAILED = "failed.json"
@@ -71,7 +73,7 @@ def run_result(
 
 def write_json(path: Path, value: Any) -> None:
     """Write `value` as indented JSON, atomically: a reader never sees an incomplete file. NaN becomes null."""
-    text = json.dumps(without_nan(value), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+    text = msgspec.json.format(to_json(value), indent=2).decode() + "\n"
     unfinished = path.with_name(path.name + ".part")
     unfinished.write_text(text, encoding="utf-8")
     unfinished.replace(path)

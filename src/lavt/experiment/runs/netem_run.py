@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from types import TracebackType
 from typing import Any
+
+import msgspec
 
 from lavt.assembly.injection import netem_flows
 from lavt.experiment.analysis.validity import injection_reasons
@@ -13,7 +14,6 @@ from lavt.experiment.runs.plan import PlannedRun
 from lavt.transport.emulation.impairment import ImpairedFlow, Impairment
 from lavt.transport.netem.netem import NetemInterface
 from lavt.transport.netem.probe import ProbeResult, judge
-from lavt.transport.netem.state import flows_from
 
 NETEM = "netem.json"
 """In a run directory: the flows requested of netem, and the measurements before and after the drive."""
@@ -77,7 +77,7 @@ class NetemRun:
         self._report = {
             "restored": self._restored,
             "commands": commands,
-            "flows": [asdict(flow) for flow in self._flows],
+            "flows": msgspec.to_builtins(self._flows),
             "before": self._measure(),
         }
 
@@ -91,17 +91,17 @@ class NetemRun:
         }
 
     def _measure(self) -> dict[str, Any]:
-        return {name: asdict(each) for name, each in self._netem.measure(self._flows).items()}
+        return dict(msgspec.to_builtins(self._netem.measure(self._flows)))
 
 
 def netem_reasons(report: Mapping[str, Any]) -> list[str]:
     """Return a reason for each difference between netem's requested and measured behaviour in `netem.json`."""
     try:
-        flows = flows_from(report["flows"])
+        flows = msgspec.convert(report["flows"], tuple[ImpairedFlow, ...])
         reasons = [str(each) for each in report["read_back"]]
         for when in ("before", "after"):
-            measured = {name: ProbeResult(**each) for name, each in report[when].items()}
+            measured = msgspec.convert(report[when], dict[str, ProbeResult])
             reasons += [f"{when} the drive: {reason}" for reason in judge(flows, (), measured)]
-    except (KeyError, TypeError, AttributeError):
+    except (KeyError, msgspec.ValidationError):
         return injection_reasons({"video": 0.0, "control": 0.0}, {})
     return reasons

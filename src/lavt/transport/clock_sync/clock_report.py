@@ -8,16 +8,16 @@ from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
 
+from msgspec import Struct
+
 from lavt.clock import Clock
 from lavt.domain import NS_PER_S, Now
 from lavt.transport.clock_sync.persistent_process import NOT_FOUND, Run
-from lavt.value import value
 
 TIMEOUT_S = 2.0
 
 
-@value
-class ClockReport:
+class ClockReport(Struct, frozen=True):
     """A report of a host's time source on the host's clock, with the clock readings at which it was made."""
 
     mono_ns: int

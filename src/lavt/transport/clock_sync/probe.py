@@ -15,8 +15,9 @@ from __future__ import annotations
 import math
 import struct
 
+from msgspec import Struct
+
 from lavt.errors import BadMessage
-from lavt.value import value
 
 DEFAULT_PORT = 5602
 """The server's UDP port."""
@@ -30,8 +31,7 @@ LATEST_NS = 2**62
 """In the year 2116; the sum of two such times fits into 64 bits."""
 
 
-@value
-class ProbeReply:
+class ProbeReply(Struct, frozen=True):
     """A reply on the wire; in a request only `sequence` and `sent_wall_ns` are known."""
 
     sequence: int
@@ -46,8 +46,7 @@ class ProbeReply:
     bound_s: float | None
 
 
-@value
-class ClockProbe:
+class ClockProbe(Struct, frozen=True):
     """One exchange with all four times, as it is recorded."""
 
     sequence: int

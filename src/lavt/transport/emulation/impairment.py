@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import fields
 from typing import Final, Literal
 
+from msgspec import Struct
+
 from lavt.errors import UserError
-from lavt.value import value
 
 ORDER_RATE_BPS: Final = 10_000_000_000
 """The rate of a flow without a rate limit. netem keeps order only with a rate; this one costs 1 us per packet."""
@@ -17,8 +17,7 @@ Distribution = Literal["normal", "uniform", "pareto", "paretonormal"]
 DISTRIBUTIONS: Final[tuple[Distribution, ...]] = ("normal", "uniform", "pareto", "paretonormal")
 
 
-@value
-class Impairment:
+class Impairment(Struct, frozen=True):
     """What a network does to the packets of a flow; by default nothing."""
 
     delay_ms: float = 0.0
@@ -46,8 +45,7 @@ class Impairment:
         return self.delay_ms + 4 * self.jitter_ms
 
 
-@value
-class ImpairedFlow:
+class ImpairedFlow(Struct, frozen=True):
     """The packets of one protocol that a machine sends from (`source`) or to (`destination`) a port."""
 
     name: Literal["video", "control", "state"]
@@ -62,8 +60,7 @@ class ImpairedFlow:
         return f"{self.name} ({self.protocol} {self.end} port {self.port})"
 
 
-@value
-class ExemptPort:
+class ExemptPort(Struct, frozen=True):
     """A port whose packets must never be delayed, and the service that uses it."""
 
     protocol: Literal["udp", "tcp"]
@@ -77,7 +74,7 @@ ALWAYS_EXEMPT: Final = (ExemptPort("udp", 123, "NTP"), ExemptPort("tcp", 22, "ss
 
 def check_impairment(name: str, impairment: Impairment) -> None:
     """Raise `UserError` for values that are out of range or contradict each other."""
-    numbers = [getattr(impairment, each.name) for each in fields(impairment) if each.name != "jitter_distribution"]
+    numbers = [getattr(impairment, name) for name in Impairment.__struct_fields__ if name != "jitter_distribution"]
     if not all(math.isfinite(number) and number >= 0 for number in numbers):
         raise UserError(f"{name}: the values of an impairment are finite and not negative: correct {impairment}")
     if max(impairment.loss, impairment.reorder, impairment.jitter_correlation) >= 1:

@@ -14,9 +14,10 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import Final
 
+from msgspec import Struct
+
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
-from lavt.value import value
 
 OPPORTUNITY_BYTES: Final = 1500
 CSV_HEADER: Final = ["time_s", "delay_ms"]
@@ -24,8 +25,7 @@ LONGEST_S: Final = 86_400
 LONGEST_DELAY_MS: Final = 60_000
 
 
-@value
-class CapacityTrace:
+class CapacityTrace(Struct, frozen=True):
     """A capacity over time: opportunities to deliver 1500 bytes each, in order, repeated after the last."""
 
     times_ns: tuple[int, ...]
@@ -42,8 +42,7 @@ class CapacityTrace:
         return lap * self.times_ns[-1] + self.times_ns[index]
 
 
-@value
-class DelayTrace:
+class DelayTrace(Struct, frozen=True):
     """A delay over time: points at strictly increasing times from 0, interpolated linearly and repeated."""
 
     times_ns: tuple[int, ...]

@@ -11,8 +11,9 @@ import subprocess
 import threading
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
 from typing import Final
+
+from msgspec.structs import replace
 
 from lavt.clock import Clock, MachineClock
 from lavt.domain import NS_PER_MS, NS_PER_S

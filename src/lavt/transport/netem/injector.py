@@ -8,6 +8,8 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
+from msgspec import Struct
+
 from lavt.clock import Clock
 from lavt.domain import Now
 from lavt.errors import LavtError
@@ -15,7 +17,6 @@ from lavt.node import Send
 from lavt.transport.emulation.impairment import ExemptPort, ImpairedFlow
 from lavt.transport.netem.netem import Verification
 from lavt.transport.netem.probe import ProbeResult, judge
-from lavt.value import value
 
 Deliver = Callable[[str, Any, Now, Any], None]
 
@@ -26,8 +27,7 @@ NO_INTERFACE = "no interface is configured for it: set injection.interface"
 log = logging.getLogger(__name__)
 
 
-@value
-class InjectionOrder:
+class InjectionOrder(Struct, frozen=True):
     """The flows whose impairments are in force from now on; without flows there are none."""
 
     number: int
@@ -35,8 +35,7 @@ class InjectionOrder:
     flows: tuple[ImpairedFlow, ...]
 
 
-@value
-class InjectionResult:
+class InjectionResult(Struct, frozen=True):
     """The result of an order."""
 
     number: int

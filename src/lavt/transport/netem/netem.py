@@ -17,6 +17,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final
 
+from msgspec import Struct
+
 from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import LavtError, UserError, WorkError
@@ -56,7 +58,6 @@ from lavt.transport.netem.tc import (
     show_qdiscs,
     uniform_table,
 )
-from lavt.value import value
 
 TC_TIMEOUT_S: Final = 10.0
 POLL_NS: Final = 10 * NS_PER_MS
@@ -118,8 +119,7 @@ def run_tc(command: Command) -> str:
     return completed.stdout
 
 
-@value
-class Verification:
+class Verification(Struct, frozen=True):
     """The result of a verification: `reasons` lists every difference from the request, and is empty without one."""
 
     reasons: list[str]

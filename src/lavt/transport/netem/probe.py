@@ -17,6 +17,8 @@ from collections.abc import Mapping, Sequence
 from statistics import median, quantiles
 from typing import Any, Final, Literal
 
+from msgspec import Struct
+
 from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
@@ -29,7 +31,6 @@ from lavt.transport.emulation.impairment import (
     gilbert,
     has_loss_bursts,
 )
-from lavt.value import value
 
 PERIOD_NS: Final = 20 * NS_PER_MS
 """Period of the frames of one flow."""
@@ -59,8 +60,7 @@ _LONGEST_FRAME: Final = 2048
 _RECEIVE_BUFFER_BYTES: Final = 1 << 20
 
 
-@value
-class ProbeSpec:
+class ProbeSpec(Struct, frozen=True):
     """Frames of one kind, and the impairment that they should get."""
 
     name: str
@@ -71,8 +71,7 @@ class ProbeSpec:
     first_byte: int = RTP
 
 
-@value
-class ProbeResult:
+class ProbeResult(Struct, frozen=True):
     """The measurement of a probe's frames: counts, and percentiles of the delay in milliseconds.
 
     `reordered` frames were passed by later ones. If a share of the packets is reordered, `early` counts the frames that

@@ -7,17 +7,17 @@ which clears the interface when it ends, or none, if `lavt netem apply` left the
 from __future__ import annotations
 
 import fcntl
-import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
+
+import msgspec
+from msgspec import Struct
 
 from lavt.errors import UserError
-from lavt.transport.emulation.impairment import ImpairedFlow, Impairment
-from lavt.value import value
+from lavt.transport.emulation.impairment import ImpairedFlow
 
 DIRECTORY: Final = Path("/run/lavt")
 NO_OWNER: Final = (0, 0)
@@ -29,8 +29,7 @@ Owner = tuple[int, int]
 """A process's number and start time, because numbers are reused."""
 
 
-@value
-class AppliedState:
+class AppliedState(Struct, frozen=True):
     """What was applied to an interface, and the owner."""
 
     interface: str
@@ -103,7 +102,7 @@ class StateFiles:
 
     def write(self, applied: AppliedState) -> None:
         """Store the state that is going to be applied."""
-        self.write_text(self._path(applied.interface).name, json.dumps(asdict(applied)))
+        self.write_text(self._path(applied.interface).name, msgspec.json.encode(applied).decode())
 
     def write_text(self, name: str, text: str) -> None:
         """Write a file atomically."""
@@ -141,20 +140,6 @@ class StateFiles:
     @staticmethod
     def _read(path: Path) -> AppliedState | None:
         try:
-            data = json.loads(path.read_text())
-            pid, start = data["owner"]
-            return AppliedState(
-                str(data["interface"]),
-                int(data["namespace"]),
-                str(data["boot"]),
-                (int(pid), int(start)),
-                str(data["condition"]),
-                flows_from(data["flows"]),
-            )
-        except (OSError, ValueError, TypeError, KeyError, AttributeError):
+            return msgspec.json.decode(path.read_bytes(), type=AppliedState)
+        except (OSError, ValueError):
             return None
-
-
-def flows_from(data: Sequence[Any]) -> tuple[ImpairedFlow, ...]:
-    """Return flows from the output of `dataclasses.asdict`; raise `TypeError` or `KeyError` for anything else."""
-    return tuple(ImpairedFlow(**{**each, "impairment": Impairment(**each["impairment"])}) for each in data)

@@ -22,9 +22,10 @@ import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final, Literal
 
+from msgspec import Struct
+
 from lavt.errors import WorkError
 from lavt.transport.emulation.impairment import ORDER_RATE_BPS, ImpairedFlow, Impairment, gilbert, has_loss_bursts
-from lavt.value import value
 
 Command = list[str]
 """A command and its arguments."""
@@ -39,8 +40,7 @@ TC_STEP_MS: Final = 0.002
 """tc counts delays in microseconds and loses up to one in each conversion."""
 
 
-@value
-class FlowPlacement:
+class FlowPlacement(Struct, frozen=True):
     """Where a flow is delayed: its band, the handle of its netem, and the number of its first filter."""
 
     band: int
@@ -60,8 +60,7 @@ PLACES: Final[Mapping[str, FlowPlacement]] = {
 }
 
 
-@value
-class U32Match:
+class U32Match(Struct, frozen=True):
     """One condition of a u32 filter: tc's input, and the 32 bits at an offset that tc reports."""
 
     text: str
@@ -75,8 +74,7 @@ class U32Match:
         return self.offset, self.bits, self.mask
 
 
-@value
-class TcFilter:
+class TcFilter(Struct, frozen=True):
     """A u32 filter that sends matching packets of one IP version to a flow's band."""
 
     filter_number: int
@@ -197,8 +195,7 @@ def as_typed(command: Sequence[str]) -> str:
     return shlex.join(command)
 
 
-@value
-class Qdisc:
+class Qdisc(Struct, frozen=True):
     """A queueing discipline as tc reports it; `parent` is "root" for the root."""
 
     kind: str

@@ -13,11 +13,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from msgspec import Struct
+
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import BadPacket, UserError
 from lavt.transport.rtp.parity import compute_parity, recover
 from lavt.transport.rtp.rtp import RtpPacket, parse_packet
-from lavt.value import value
 
 REPAIR_PAYLOAD_TYPE: Final = 97
 MAX_REPAIR_PACKETS: Final = 2
@@ -81,8 +82,7 @@ class RepairSender:
         return RtpPacket(REPAIR_PAYLOAD_TYPE, sequence, timestamp, self.ssrc, marker=False, payload=payload).to_bytes()
 
 
-@value
-class _BlockHeader:
+class _BlockHeader(Struct, frozen=True):
     """The fields that identify the media packets of a block; they are equal in all its repair packets."""
 
     payload_type: int

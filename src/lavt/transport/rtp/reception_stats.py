@@ -6,16 +6,16 @@ section 3); after repair, a packet is lost if the decoder did not get it.
 
 from __future__ import annotations
 
+from msgspec import Struct
+
 from lavt.transport.rtp.jitter_buffer import JitterBuffer
 from lavt.transport.rtp.ntp_time import ntp_to_short
 from lavt.transport.rtp.rtcp import Announcement, ReceptionReport, SenderReport
 from lavt.transport.rtp.rtcp_xr import round_trip_of_answer_ns
 from lavt.transport.rtp.rtp import RtpPacket
-from lavt.value import value
 
 
-@value
-class ReceptionSample:
+class ReceptionSample(Struct, frozen=True):
     """Reception between two samples. Counts are in packets since the previous sample, so their sums are totals."""
 
     duration_ns: int

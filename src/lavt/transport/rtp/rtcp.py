@@ -15,6 +15,8 @@ import struct
 from collections.abc import Iterator, Sequence
 from typing import Final
 
+from msgspec import Struct
+
 from lavt.errors import BadPacket
 from lavt.transport.rtp.ntp_time import delay_to_short, short_to_delay_ns, wall_to_ntp
 from lavt.transport.rtp.rtcp_xr import (
@@ -25,7 +27,6 @@ from lavt.transport.rtp.rtcp_xr import (
     write_answers,
     write_reference_time,
 )
-from lavt.value import value
 
 RECEIVER_CNAME: Final = "receiver@lavt"
 OVERHEAD_BYTES: Final = 40
@@ -61,8 +62,7 @@ _MAX_BIT_RATE_BPS: Final = (2**17 - 1) << 63
 _RTCP_HEADER_BYTES: Final = 8
 
 
-@value
-class SenderReport:
+class SenderReport(Struct, frozen=True):
     """The time of a sender's report, and the packets sent until then (RFC 3550, section 6.4.1)."""
 
     ssrc: int
@@ -75,8 +75,7 @@ class SenderReport:
     """Payload only."""
 
 
-@value
-class ReceptionReport:
+class ReceptionReport(Struct, frozen=True):
     """Reception quality of a stream at one receiver (RFC 3550, section 6.4.1)."""
 
     media_ssrc: int
@@ -94,8 +93,7 @@ class ReceptionReport:
     """Time from the arrival of that sender report to this report, in steps of 1/65536 s."""
 
 
-@value
-class BitRateLimit:
+class BitRateLimit(Struct, frozen=True):
     """A receiver's limit of the bit rate of one stream (RFC 5104, section 4.2.1.1)."""
 
     media_ssrc: int
@@ -104,8 +102,7 @@ class BitRateLimit:
     overhead_bytes: int
 
 
-@value
-class Feedback:
+class Feedback(Struct, frozen=True):
     """The contents of an RTCP datagram that concern a sender."""
 
     reports: tuple[ReceptionReport, ...] = ()
@@ -115,8 +112,7 @@ class Feedback:
     reference_times: tuple[ReferenceTime, ...] = ()
 
 
-@value
-class Announcement:
+class Announcement(Struct, frozen=True):
     """The contents of an RTCP datagram that concern a receiver."""
 
     reports: tuple[SenderReport, ...] = ()

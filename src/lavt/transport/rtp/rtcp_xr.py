@@ -10,9 +10,10 @@ import struct
 from collections.abc import Iterator, Sequence
 from typing import Final
 
+from msgspec import Struct
+
 from lavt.errors import BadPacket
 from lavt.transport.rtp.ntp_time import delay_to_short, elapsed_to_ntp, ntp_to_short, round_trip_ns, short_to_delay_ns
-from lavt.value import value
 
 _HEADER = struct.Struct("!BBH")
 _SSRC = struct.Struct("!I")
@@ -22,8 +23,7 @@ _REFERENCE_TIME_BLOCK: Final = 4
 _ANSWERS_BLOCK: Final = 5
 
 
-@value
-class ReferenceTime:
+class ReferenceTime(Struct, frozen=True):
     """The time of a receiver's clock when it wrote its report (RFC 3611, section 4.4)."""
 
     receiver_ssrc: int
@@ -31,8 +31,7 @@ class ReferenceTime:
     """In NTP short format."""
 
 
-@value
-class ReferenceAnswer:
+class ReferenceAnswer(Struct, frozen=True):
     """A reference time that a sender returns to its receiver (RFC 3611, section 4.5)."""
 
     receiver_ssrc: int

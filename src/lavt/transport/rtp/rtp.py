@@ -12,8 +12,9 @@ import struct
 from itertools import pairwise
 from typing import Final
 
+from msgspec import Struct
+
 from lavt.errors import BadPacket, UserError
-from lavt.value import value
 
 VIDEO_PAYLOAD_TYPE: Final = 96
 MAX_PACKET_BYTES: Final = 1200
@@ -42,8 +43,7 @@ _FU_START: Final = 0x80
 _FU_END: Final = 0x40
 
 
-@value
-class RtpPacket:
+class RtpPacket(Struct, frozen=True):
     """An RTP packet without contributing sources and extensions (RFC 3550, section 5.1)."""
 
     payload_type: int
@@ -170,8 +170,7 @@ def _fragment(unit: bytes, max_payload_bytes: int) -> list[bytes]:
     return [bytes((indicator, flag | kind)) + unit[begin:end] for flag, (begin, end) in pieces]
 
 
-@value
-class AccessUnit:
+class AccessUnit(Struct, frozen=True):
     """The received H.264 data of one picture."""
 
     data: bytes

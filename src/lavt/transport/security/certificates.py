@@ -18,12 +18,12 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric.ec import SECP256R1, EllipticCurvePrivateKey, generate_private_key
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+from msgspec import Struct
 
 from lavt.clock import calendar_time
 from lavt.domain import NS_PER_S
 from lavt.errors import UserError
 from lavt.transport.security.keys import NS_PER_DAY, expiry_line
-from lavt.value import value
 
 CLOCK_SKEW_NS: Final = NS_PER_DAY
 """Certificates are valid from this long before now: the clock of a vehicle that has just started may be behind."""
@@ -34,16 +34,14 @@ _HOST: Final = re.compile(rf"(?=.{{1,253}}\Z){_LABEL}(\.{_LABEL})*\Z")
 Kind = TypeVar("Kind", bound=x509.ExtensionType)
 
 
-@value
-class KeyPair:
+class KeyPair(Struct, frozen=True):
     """A private key and its public part, which is a certificate or a public key. Both are PEM."""
 
     private: bytes
     public: bytes
 
 
-@value
-class CertificateSummary:
+class CertificateSummary(Struct, frozen=True):
     """The fields of a certificate that `lavt keys` prints."""
 
     name: str

@@ -15,6 +15,8 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Any, Final
 
+from msgspec import Struct
+
 from lavt.domain import Command, NetemRequest, SessionReply, SessionRequest
 from lavt.errors import BadMessage
 from lavt.transport.messages import MAX_MESSAGE_BYTES, decode
@@ -27,7 +29,6 @@ from lavt.transport.security.keys import (
     decrypt,
     encrypt,
 )
-from lavt.value import value
 
 MAC_BYTES: Final = 16
 """A MAC costs a fiftieth of a signature, so it separates the active operator's messages from a flood."""
@@ -80,8 +81,7 @@ def _signed_part(data: bytes) -> bytes:
     return data[:-TRAILER_BYTES] if len(data) <= MAX_ENVELOPE_BYTES else b""
 
 
-@value
-class VerifiedRequest:
+class VerifiedRequest(Struct, frozen=True):
     """A request with a valid signature, and the data that its reply needs."""
 
     channel: str
@@ -257,16 +257,14 @@ class VehicleAuthenticator(NullVehicleAuthenticator):
             self._active_operator, self._macs = request.operator, _SessionMacs(reply.token)
 
 
-@value
-class VerifiedReply:
+class VerifiedReply(Struct, frozen=True):
     """The result of verifying a reply: its body, or the envelope to send as a retry, or neither."""
 
     body: bytes | None
     retry: bytes | None
 
 
-@value
-class VerifiedState:
+class VerifiedState(Struct, frozen=True):
     """The result of verifying a state; `body` is None if the state must not be shown."""
 
     body: bytes | None

@@ -12,13 +12,13 @@ from collections.abc import Callable
 from typing import Any, Final, Protocol
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from lavt.domain import FramePayload, Lane, Picture, SeenLane
 from lavt.errors import BadPacket
 from lavt.transport.video.h264 import DecodedPicture, Decoder, Encoder
 from lavt.transport.video.stamp import STAMP_PX, read_stamp, write_stamp, write_stamp_i420
-from lavt.value import value
 
 _IDR_PREFIX: Final = b"\x00\x00\x00\x01\x09\xf0\x00\x00\x00\x01\x65"
 """An access unit delimiter, and the header of a slice that refers to nothing (H.264, table 7-1)."""
@@ -139,8 +139,7 @@ class VideoReceiver:
         return self._read(received.luma)
 
 
-@value
-class RenderedPicture:
+class RenderedPicture(Struct, frozen=True):
     """A received picture that is exactly the rendered one."""
 
     picture: Picture
@@ -195,8 +194,7 @@ class InMemoryFrameCodec:
         return read_stamp(received.picture[:, :, 1])
 
 
-@value
-class ReceivedLane:
+class ReceivedLane(Struct, frozen=True):
     """A lane that was received instead of a picture."""
 
     picture: SeenLane

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from typing import Final
 
+from msgspec import Struct
+
 from lavt.domain import NS_PER_MS, Now
 from lavt.transport.rtp.fec import RedundancyController, RepairSender
 from lavt.transport.rtp.rtcp import BitRateLimit, Feedback, ReceptionReport, sender_report
 from lavt.transport.rtp.rtcp_xr import ReferenceAnswer, ReferenceTime
 from lavt.transport.rtp.rtp import MAX_PACKET_BYTES, RTP_HEADER_BYTES, Packetizer
 from lavt.transport.video.stamp import rtp_timestamp
-from lavt.value import value
 
 REPORT_PERIOD_NS: Final = 500 * NS_PER_MS
 """Period of sender reports; RFC 3550 (6.2) allows reports that are a small share of the stream."""
 
 
-@value
-class FramePackets:
+class FramePackets(Struct, frozen=True):
     """The datagrams of a frame. Plain receivers get only `media` and `report`, which every tool understands."""
 
     media: list[bytes]

@@ -7,8 +7,9 @@ from collections.abc import Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from typing import Literal
 
+from msgspec import Struct
+
 from lavt.domain import NS_PER_MS, NS_PER_S
-from lavt.value import value
 from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.dbw.crc8 import frame_crc8
 from lavt.vehicle.dbw.profile import AXES, TICK_LIMIT_NS, Axis, AxisCommand, ByWireLimits, Gear, Profile, SystemCommand
@@ -17,8 +18,7 @@ GEAR_PERIOD_NS = 100 * NS_PER_MS
 """Our choice: period at which a gear is requested until it is reported; the kit may still be shifting."""
 
 
-@value
-class KitCommands:
+class KitCommands(Struct, frozen=True):
     """Commands to the kit other than the actuation."""
 
     enabled: frozenset[Axis]
@@ -29,8 +29,7 @@ class KitCommands:
     system: Literal["", "enable", "disable"] = ""
 
 
-@value
-class DriveCommand:
+class DriveCommand(Struct, frozen=True):
     """The requested actuation: the steering wheel's angle with the bus's sign, and pedals as fractions."""
 
     wheel_deg: float

@@ -12,8 +12,9 @@ from collections.abc import Iterable, Mapping
 from enum import StrEnum
 from typing import Final
 
+from msgspec import Struct
+
 from lavt.domain import NS_PER_MS, NS_PER_S
-from lavt.value import value
 from lavt.vehicle.dbw.states import STATIONARY_BELOW_MPS
 
 MAX_FALL_MPS2: Final = 12.0
@@ -75,16 +76,14 @@ class SpeedFault(StrEnum):
         return self.value.partition(":")[0]
 
 
-@value
-class SpeedReport:
+class SpeedReport(Struct, frozen=True):
     """A reported speed and when it arrived."""
 
     mps: float
     mono_ns: int
 
 
-@value
-class Pedals:
+class Pedals(Struct, frozen=True):
     """The pedals that the kit is applying, as fractions."""
 
     throttle: float

@@ -6,8 +6,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Final, Literal
 
+from msgspec import Struct
+
 from lavt.domain import NS_PER_MS, NS_PER_S
-from lavt.value import value
 from lavt.vehicle.dbw.profile import AXES, COMMAND_TIMEOUT_NS, Axis, Gear
 
 State = Literal["idle", "clearing", "enabling", "engaged", "parking", "overridden", "lost"]
@@ -34,8 +35,7 @@ SENT_IN_STATE: Final[dict[State, str]] = {
 """Frames sent in each state."""
 
 
-@value
-class Situation:
+class Situation(Struct, frozen=True):
     """Inputs of the state machine."""
 
     wanted: bool
@@ -59,8 +59,7 @@ class Situation:
     """Time in the current state."""
 
 
-@value
-class TransitionRow:
+class TransitionRow(Struct, frozen=True):
     """A transition from any of its sources to its target; the first matching row counts.
 
     `condition` returns whether the row matches, or the reason as a text that is empty if it does not.

@@ -10,8 +10,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final, Literal
 
+from msgspec import Struct
+
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation
-from lavt.value import value
 from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.dbw.adapter import ByWireAdapter
 from lavt.vehicle.dbw.crc8 import has_valid_checksum
@@ -39,8 +40,7 @@ OBSERVED_KINDS: Final[tuple[Kind, ...]] = ("trip", "command_error", "fault", "re
 Phase = Literal["observing", "enabling", "monitoring", "done"]
 
 
-@value
-class WatchdogObservation:
+class WatchdogObservation(Struct, frozen=True):
     """The kit's behaviour after sending stopped; times in ns after the last frame."""
 
     released_ns: int

@@ -10,8 +10,9 @@ import math
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Sequence
 
+from msgspec import Struct
+
 from lavt.domain import NS_PER_S, EventKind, VehicleEvent
-from lavt.value import value
 from lavt.vehicle.sim.dynamics import CarMotion, CarParameters, Contact
 from lavt.vehicle.sim.road.cross_section import Rail
 from lavt.vehicle.sim.road.road import PROJECTION_WINDOW_M, Road
@@ -34,8 +35,7 @@ RoadPosition = tuple[float, float, float]
 """Station (m) and lateral offset (m) of a point of the body, and the road's heading (rad) there."""
 
 
-@value
-class TrackingError:
+class TrackingError(Struct, frozen=True):
     """A car's pose relative to its lane's centre; `GroundTruth` defines where each value is measured."""
 
     cross_track_m: float

@@ -6,8 +6,9 @@ import math
 from collections.abc import Callable
 from typing import Final
 
+from msgspec import Struct
+
 from lavt.errors import UserError
-from lavt.value import value
 from lavt.vehicle.software_car.gearbox import GEARS
 from lavt.vehicle.software_car.kit import Kit, check_known
 from lavt.vehicle.software_car.state import Gear
@@ -19,8 +20,7 @@ MAX_QUOTED = 40
 """Characters of the input that an error quotes."""
 
 
-@value
-class ConsoleCommand:
+class ConsoleCommand(Struct, frozen=True):
     """A console command: its argument, its meaning and its effect on a kit."""
 
     argument: str

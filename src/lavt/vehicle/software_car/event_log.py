@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable
 from typing import Any, Final
 
-from lavt.value import value
+from msgspec import Struct
+
 from lavt.vehicle.software_car.state import AXES, GearRejection, KitState, ReleaseReason
 
 
-@value
-class KitEvent:
+class KitEvent(Struct, frozen=True):
     """An event with its time on the machine's monotonic clock."""
 
     mono_ns: int

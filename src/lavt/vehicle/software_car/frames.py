@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from lavt.value import value
+from msgspec import Struct
+
 from lavt.vehicle.can_frame import CanFrame
 
 
-@value
-class BitField:
+class BitField(Struct, frozen=True):
     """A bit field of a message; `bit` is its lowest bit, with the message as one little-endian number."""
 
     name: str
@@ -26,8 +26,7 @@ class BitField:
         return (1 << self.width - 1) - 1 if self.is_signed else (1 << self.width) - 1
 
 
-@value
-class Layout:
+class Layout(Struct, frozen=True):
     """The fields of a message."""
 
     length: int

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
-from lavt.value import value
+from msgspec import Struct
+
 from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.software_car import generation_1, generation_2
 from lavt.vehicle.software_car.mechanics import Mechanics
 from lavt.vehicle.software_car.state import AxisOrder, GearOrder, KitState, SystemOrder
 
 
-@value
-class Generation:
+class Generation(Struct, frozen=True):
     """The messages and rules of one generation of the kit."""
 
     parse_order: Callable[[CanFrame, Mechanics, bool], AxisOrder | GearOrder | SystemOrder | None]

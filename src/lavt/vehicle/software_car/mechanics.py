@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 
-from lavt.value import value
+from msgspec import Struct
 
 MAX_WHEEL_RAD = 9.6
 """The largest steering wheel angle that a command can set."""
 MAX_WHEEL_RATE_RADPS = 17.5
 
 
-@value
-class Mechanics:
+class Mechanics(Struct, frozen=True):
     """Properties of a car with a by-wire kit."""
 
     steering_ratio: float = 14.8

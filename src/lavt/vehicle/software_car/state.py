@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Final, Literal
 
-from lavt.value import value
+from msgspec import Struct
+
 from lavt.vehicle.software_car.sensor_faults import SensorFaults
 
 Axis = Literal["steering", "brake", "throttle"]
@@ -78,8 +79,7 @@ class ReleaseReason(IntEnum):
     """The remote's switch is at emergency stop or pause."""
 
 
-@value
-class AxisOrder:
+class AxisOrder(Struct, frozen=True):
     """An order to an axis, of either generation."""
 
     axis: Axis
@@ -96,8 +96,7 @@ class AxisOrder:
     """None: the frame has no counter and only clears."""
 
 
-@value
-class GearOrder:
+class GearOrder(Struct, frozen=True):
     """An order to the gearbox."""
 
     is_valid: bool
@@ -105,8 +104,7 @@ class GearOrder:
     is_clearing: bool = False
 
 
-@value
-class SystemOrder:
+class SystemOrder(Struct, frozen=True):
     """An order to a kit of generation 2 as a whole."""
 
     is_valid: bool

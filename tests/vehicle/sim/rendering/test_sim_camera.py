@@ -1,5 +1,4 @@
-import dataclasses
-
+import msgspec
 import numpy as np
 import pytest
 from tests.vehicle.sim.rig import MODEL, camera_on, digest, picture_of, pose_at
@@ -66,7 +65,7 @@ def marks_in_view(road: Road, pose: Pose, model: CameraModel, offset_m: float, s
 @pytest.mark.parametrize("pitch_rad", [0.0, 0.12])
 def test_marks_are_at_their_projection(road: Road, turned_rad: float, pitch_rad: float) -> None:
     """A solid mark up to 30 m away is within a pixel of its projection."""
-    model = dataclasses.replace(MODEL, pitch_rad=pitch_rad)
+    model = msgspec.structs.replace(MODEL, pitch_rad=pitch_rad)
     pose = pose_at(road, 2.0, 0.3, turned_rad)
     picture = picture_of(camera_on(road, scenery="none", model=model), pose).astype(float).mean(axis=2)
     stations = np.arange(30.0, 43.0, 1.5)
@@ -111,7 +110,7 @@ def test_marks_have_their_colours(road: Road) -> None:
 def test_the_row_of_a_depth_is_the_projection_of_its_ground() -> None:
     """The row of a depth contains the projection of the ground at that depth, also for a pitched camera."""
     for pitch_rad in (0.0, 0.2):
-        model = dataclasses.replace(MODEL, pitch_rad=pitch_rad)
+        model = msgspec.structs.replace(MODEL, pitch_rad=pitch_rad)
         placement = place_camera(model, Pose(0, 0.0, 0.0, 0.0))
         _, v_px, _ = placement.project(np.array([model.x_m + 10.0, 0.0, 0.0]))
         assert row_of_depth(model, 10.0) - 1 < v_px <= row_of_depth(model, 10.0)
@@ -119,7 +118,7 @@ def test_the_row_of_a_depth_is_the_projection_of_its_ground() -> None:
 
 def test_the_homography_is_the_inverse_of_the_projection() -> None:
     """The ground point of a pixel projects back to the pixel."""
-    placement = place_camera(dataclasses.replace(MODEL, pitch_rad=0.1), Pose(0, 30.0, -7.0, 2.0))
+    placement = place_camera(msgspec.structs.replace(MODEL, pitch_rad=0.1), Pose(0, 30.0, -7.0, 2.0))
     ground = placement.ground_from_picture() @ np.array([123.0, 400.0, 1.0])
     assert placement.project(np.append(ground[:2] / ground[2], 0.0))[:2] == pytest.approx([123.0, 400.0])
 

@@ -7,9 +7,10 @@ Pixel coordinates are those of OpenCV: the middle of the top left pixel is (0, 0
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
+from msgspec.structs import replace
 
 from lavt.domain import CameraModel, FloatArray, Pose
 
