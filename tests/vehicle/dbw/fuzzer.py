@@ -31,6 +31,7 @@ from lavt.vehicle.vehicle import Capabilities
 CAPABILITIES = Capabilities(True, False, True, False, 2.8, 0.5, 0.5, 3.0, 8.0)
 KIT_STEP_NS = 5 * NS_PER_MS
 EPISODE_NS = 4 * NS_PER_S
+IDLE_NS = 300 * NS_PER_MS
 MAX_AWAITED = 64
 DRAWS = 1_000_000
 STEPS_MS = (1, 4, 4, 5, 10, 10, 20, 20)
@@ -180,7 +181,8 @@ class Fuzzer:
     def tick(self) -> None:
         """Advance by one tick, and check everything."""
         chance = self._chance
-        if self._now_ns >= self._episode_ns:
+        is_over = self._adapter._state == "idle" and self._now_ns >= self._unwanted_ns + IDLE_NS
+        if is_over or self._now_ns >= self._episode_ns:
             self._begin_episode()
         is_hostile = self._now_ns >= self._hostile_ns
         is_passing = self._adapter._state in {"clearing", "enabling", "parking"}
@@ -215,6 +217,7 @@ class Fuzzer:
         """Repair the car, and choose what happens to it in the next seconds."""
         chance, kit = self._chance, self._kit
         self._speed_mps, self._turned_rad = 0.0, None
+        kit.state.setpoint_rad = 0.0
         self._set_speed()
         self._port.failure_rate = self._hostility = self._wire_loss = 0.0
         for fault in {f"{part}.{bit}" for part, bits in kit._generation.faults.items() for bit in bits}:
