@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from contextlib import closing
-from dataclasses import replace
 from itertools import count
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from lavt.control.drive_controller import PRESETS, make_controller
 from lavt.domain import NS_PER_MS, NS_PER_S, CameraModel, Command, Now, SessionReply, SessionRequest

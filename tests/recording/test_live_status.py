@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from dataclasses import replace
+from msgspec.structs import replace
 
 from lavt.domain import NS_PER_MS, Now
 from lavt.nodes.payloads import Admission

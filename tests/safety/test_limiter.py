@@ -2,11 +2,11 @@ from __future__ import annotations
 
 import math
 import sys
-from dataclasses import replace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 from tests.safety.rig import MAX_STEERING_RAD, WHEELBASE_M, new_limiter, vehicle_at
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import pytest
+from msgspec.structs import replace
 from tests.safety.rig import MAX_BRAKING_MPS2, START_NS, Rig, vehicle_at
 
 from lavt.domain import NS_PER_MS, NS_PER_S

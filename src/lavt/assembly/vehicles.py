@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.metadata import entry_points
 
 import numpy as np
+from msgspec.structs import replace
 
 from lavt.assembly.by_wire import check_by_wire, inside, is_simulated
 from lavt.assembly.cameras import build_camera, camera_model, check_own_camera

@@ -3,10 +3,10 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from lavt.config import RunConfig
@@ -132,5 +132,5 @@ def test_an_invalid_netem_report_counts_as_unmeasured(report: dict[str, Any]) ->
 def test_a_flow_without_a_measurement_is_a_reason() -> None:
     """A flow of the report without a measurement is a reason."""
     flow = ImpairedFlow("video", "udp", 5600, "source", Impairment(75))
-    report = {"flows": [asdict(flow)], "read_back": [], "before": {}, "after": {}}
+    report = {"flows": msgspec.to_builtins([flow]), "read_back": [], "before": {}, "after": {}}
     assert "before the drive: video: no packet came through" in netem_reasons(report)

@@ -9,11 +9,11 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Literal
 
 import pytest
 from benchmarks.fuzzing.mutation import Chance
+from msgspec.structs import replace
 from tests.vehicle.dbw.rig import START_NS, profile
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation, VehicleState

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from typing import Final
+
+from msgspec.structs import replace
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation, VehicleEvent, VehicleState
 from lavt.vehicle.can_frame import CanFrame

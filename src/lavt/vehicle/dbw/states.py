@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Final, Literal
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.vehicle.dbw.profile import AXES, COMMAND_TIMEOUT_NS, Axis, Gear
