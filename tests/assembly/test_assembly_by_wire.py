@@ -11,7 +11,7 @@ from lavt.assembly.dbw import load_profile
 from lavt.config import DbwConfig, ServerConfig, ServerSecurityConfig, VehicleConfig
 from lavt.domain import NS_PER_S, State
 from lavt.safety.gate import RejectionReason
-from lavt.transport.messages import decode, encode
+from lavt.transport.messages import ELLIPSIS, decode, encode
 from lavt.vehicle.dbw.adapter import ByWireAdapter
 from lavt.vehicle.dbw.profile import Profile
 
@@ -80,4 +80,5 @@ def test_a_kit_that_is_off_and_has_no_proof_has_a_readable_state(known: Profile,
     reason = adapter.state().inhibit_reason
     state = State(0, 0, 0.0, 0.0, "park", "disarmed", reason, -1, f"{RejectionReason.INHIBITED}: {reason}")
     read = decode(State, encode(state))
-    assert (read.reason, read.rejected) == (state.reason, state.rejected)
+    assert read.reason == state.reason
+    assert state.rejected.startswith(read.rejected.removesuffix(ELLIPSIS))

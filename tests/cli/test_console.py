@@ -50,7 +50,7 @@ def test_nested_signals_do_not_deadlock() -> None:
     subprocess.run([sys.executable, "-c", SIGNAL_AT_EVERY_LINE], check=True, timeout=60)
 
 
-@pytest.mark.usefixtures("hangup_ends")
+@pytest.mark.usefixtures("sighup_ends_programs")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_interrupts_long_work(number: signal.Signals) -> None:
     """SIGTERM and a closed terminal end long work as Ctrl-C does; afterwards the former handlers are restored."""

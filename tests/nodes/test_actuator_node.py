@@ -19,7 +19,7 @@ from lavt.nodes.payloads import Admission, AtWheel, FrameWritten, Route
 from lavt.safety.gate import RejectionReason, SafetyGate
 from lavt.safety.limiter import Limiter
 from lavt.safety.limits import LIMITS
-from lavt.transport.messages import decode, encode
+from lavt.transport.messages import ELLIPSIS, decode, encode
 from lavt.vehicle.camera import FrameTimes
 from lavt.vehicle.vehicle import ReachedCommand
 
@@ -333,8 +333,9 @@ def test_a_state_with_a_long_inhibit_reason_is_readable(letter: str) -> None:
     bench.request("acquire")
     bench.command()
     for state in states(bench.go(2 * TICK_NS)):
-        assert (state.safety, state.reason[-20:]) == ("safe_stop", 20 * letter)
-        assert state.rejected[-20:] == 20 * letter
+        assert state.safety == "safe_stop"
+        assert state.reason.endswith(20 * letter + ELLIPSIS)
+        assert state.rejected.endswith(20 * letter + ELLIPSIS)
 
 
 def test_a_server_shutdown_stops_the_vehicle_and_ends_the_drive() -> None:

@@ -11,7 +11,7 @@ from lavt.node import WAKE, Send
 from lavt.nodes.injection import LEASE_MS, InjectionClient, InjectionNode
 from lavt.nodes.payloads import InjectionSample, StationaryStatus
 from lavt.transport.emulation.impairment import ImpairedFlow, Impairment
-from lavt.transport.messages import decode, encode
+from lavt.transport.messages import ELLIPSIS, decode, encode
 from lavt.transport.netem.injector import InjectionOrder, InjectionResult
 
 L4 = NetemRequest("alice", 7, "L4", LEASE_MS, 150.0, 0.0, 0.0, "normal", 0.0, 0.0, 0, 0.0, 0.0)
@@ -200,7 +200,8 @@ def test_a_long_reason_is_shortened() -> None:
     node = server()
     request(node, L4)
     (reason,) = rejections(done(node, 1, 300 * "ä"))
-    assert reason == 200 * "ä"
+    assert reason.startswith(190 * "ä")
+    assert reason.endswith(ELLIPSIS)
 
 
 def test_pending_requests_are_bounded() -> None:

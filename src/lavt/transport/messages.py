@@ -184,5 +184,7 @@ def _decode(kind: type[Any], data: bytes) -> Any:
 def _describe(kind: type[Any], error: str) -> str:
     """Return an error of the decoder, after the name of the field that it is about."""
     index = re.search(r"`\$\[(\d+)\]", error)
-    name = "" if index is None else "." + ("version", *TYPES[kind])[int(index[1])]
-    return f"{kind.__name__}{name}: {error}"
+    if index is None:
+        return f"{kind.__name__}: {error}"
+    number = int(index[1])
+    return f"{kind.__name__}.{list(TYPES[kind])[number - 1]}: {error}" if number else "a message of another version"

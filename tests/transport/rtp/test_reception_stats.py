@@ -1,9 +1,8 @@
 from __future__ import annotations
 
-from dataclasses import astuple
-
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import astuple
 
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.transport.rtp.adaptive_hold import MIN_HOLD_NS
