@@ -208,6 +208,25 @@ def test_events_in_the_car_reach_the_server(
         assert drive_in_progress.car.event_ns("enabled", "enabled: steering", since_ns=at_ns) is None
 
 
+@pytest.mark.parametrize("stuck_mps", [0, 3])
+def test_a_car_whose_speed_report_is_stuck_stops(
+    stuck_mps: int, print_report: PrintReport, drive: DriveWithProfile
+) -> None:
+    """A car whose reported speed is stuck is stopped, and is not put into park while it moves."""
+    with drive("dataspeed_gen1") as drive_in_progress:
+        since_ns = drive_in_progress.car.execute(f"stick_speed speed={stuck_mps}")
+        drive_in_progress.wait(
+            lambda status: status.get("safety") == "safe_stop", "the server does not report its stop"
+        )
+        stopping_m: list[float] = [drive_in_progress.status()["progress_m"]]
+        while len(stopping_m) < 2 or stopping_m[-1] - stopping_m[-2] > STATIONARY_MPS:
+            assert drive_in_progress.car.event_ns("gear", "gear PARK", since_ns=since_ns) is None
+            pause(NS_PER_S)
+            stopping_m.append(drive_in_progress.status()["progress_m"])
+        print_report(f"speed stuck at {stuck_mps} m/s: stopped {stopping_m[-1] - stopping_m[0]:.1f} m later")
+        assert drive_in_progress.status()["reason"]
+
+
 def test_a_server_that_ends_parks_the_car(print_report: PrintReport, drive: DriveWithProfile) -> None:
     """A server that gets Ctrl-C stops, parks and disengages the car, and ends with 0."""
     with drive("dataspeed_gen2") as drive_in_progress:
