@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from lavt.control.driver_limits import CLIENT_LIMITS
+from lavt.control.client_limits import CLIENT_LIMITS
 from lavt.domain import NS_PER_S, Actuation, VehicleState
 from lavt.errors import UserError
 from lavt.safety.limits import Limits

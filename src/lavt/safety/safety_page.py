@@ -14,7 +14,7 @@ from dataclasses import fields
 from itertools import pairwise
 from typing import Any, Final
 
-from lavt.control.driver_limits import CLIENT_LIMITS
+from lavt.control.client_limits import CLIENT_LIMITS
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
 from lavt.safety.gate import RejectionReason
