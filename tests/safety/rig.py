@@ -97,7 +97,7 @@ class Rig:
         return self
 
     def arm_for(self, duration_ns: int) -> None:
-        """Send an arm command from a new picture every tick, the last one at the very end of `duration_ns`."""
+        """Send an arm command from a new picture every `TICK_NS`, the last one at the end of `duration_ns`."""
         self.picture()
         self.send()
         for _ in range(duration_ns // TICK_NS):
