@@ -13,11 +13,11 @@ from itertools import groupby
 from operator import itemgetter
 
 from matplotlib.figure import Figure
-from tests.safety.stops import ALLOWED_BEYOND_M, ROUTES, Curve, Stop, stops
+from tests.safety.stops import ALLOWED_BEYOND_M, ROUTES, Curve, Stop, StopPair, stops
 
 from lavt.experiment.report.figure_style import COLOURS, new_figure
 
-CurveStops = list[tuple[Curve, Stop, Stop]]
+CurveStops = list[StopPair]
 FOLLOWING, HOLDING = "along the path", "wheel held"
 
 

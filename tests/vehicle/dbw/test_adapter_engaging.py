@@ -15,7 +15,7 @@ from tests.vehicle.dbw.rig import COARSE_MS, SPEED_SOURCES, START_NS, AdapterRig
 from lavt.domain import NS_PER_MS, Actuation
 from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.dbw.adapter import ByWireAdapter
-from lavt.vehicle.dbw.profile import LEAST_GAP_NS, PERIOD_NS
+from lavt.vehicle.dbw.profile import LEAST_GAP_NS, REPEAT_PERIOD_NS
 from lavt.vehicle.dbw.states import TABLE
 from lavt.vehicle.sim.simulator import Simulator
 from lavt.vehicle.software_car.state import AXES, Gear
@@ -126,7 +126,7 @@ def test_new_commands_are_sent_immediately(generation: int) -> None:
     rig.sent.clear()
     rig.actuation = msgspec.structs.replace(rig.actuation, steering_rad=0.02)
     rig.run_until(lambda rig: bool(rig.sent), 10)
-    assert rig.adapter._sender.sent_ns == rig.now_ns
+    assert rig.adapter._sender.last_set_ns == rig.now_ns
 
 
 @both
@@ -137,7 +137,7 @@ def test_unchanged_commands_are_repeated(generation: int) -> None:
     rig.sent.clear()
     rig.run_ms(200)
     times = sorted({at_ns for at_ns, _ in rig.sent})
-    assert {later - earlier for earlier, later in pairwise(times)} == {PERIOD_NS}
+    assert {later - earlier for earlier, later in pairwise(times)} == {REPEAT_PERIOD_NS}
     assert Counter(names(rig)).most_common(1)[0][1] == 10
 
 
@@ -325,7 +325,7 @@ def test_wake() -> None:
     rig = driving(1)
     for _ in range(50):
         wake_ns = rig.adapter.next_wake_ns()
-        assert rig.now_ns < wake_ns <= rig.now_ns + PERIOD_NS
+        assert rig.now_ns < wake_ns <= rig.now_ns + REPEAT_PERIOD_NS
         rig.run_ms(1)
 
 

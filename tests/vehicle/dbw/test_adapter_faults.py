@@ -543,7 +543,7 @@ def test_kit_not_ready(name: str, text: str) -> None:
 def test_drive_rejected(generation: int) -> None:
     """A rejected gear is reported with the kit's reason after 3 s, and the car is disengaged in PARK."""
     known = profile(f"dataspeed_gen{generation}")
-    gear = replace(known.gear, numbers={**known.gear.numbers, "drive": 5})
+    gear = replace(known.gear, codes={**known.gear.codes, "drive": 5})
     rig = AdapterRig(generation, profile=replace(known, gear=gear))
     rig.adapter.engage(True, rig.now_ns)
     took_ms = rig.run_until(is_lost)
@@ -562,7 +562,7 @@ def test_drive_rejected(generation: int) -> None:
 def test_a_shift_in_progress_is_awaited() -> None:
     """If DRIVE was requested but not reported, the axes stay enabled for 1 s before the car is disengaged in PARK."""
     known = profile("dataspeed_gen1")
-    rig = AdapterRig(1, profile=replace(known, gear=replace(known.gear, numbers={**known.gear.numbers, "drive": 5})))
+    rig = AdapterRig(1, profile=replace(known, gear=replace(known.gear, codes={**known.gear.codes, "drive": 5})))
     rig.adapter.engage(True, rig.now_ns)
     rig.run_until(lambda rig: rig.state == "enabling" and rig.adapter._is_shifting)
     rig.adapter.engage(False, rig.now_ns)
@@ -592,7 +592,7 @@ def test_park_rejected() -> None:
 def without_park() -> AdapterRig:
     """Return a stationary car whose kit rejects the number that the profile has for PARK."""
     known = profile("dataspeed_gen1")
-    rig = AdapterRig(1, profile=replace(known, gear=replace(known.gear, numbers={**known.gear.numbers, "park": 5})))
+    rig = AdapterRig(1, profile=replace(known, gear=replace(known.gear, codes={**known.gear.codes, "park": 5})))
     rig.engage()
     return rig
 

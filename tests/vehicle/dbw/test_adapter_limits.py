@@ -14,7 +14,7 @@ from tests.vehicle.dbw.rig import COARSE_MS, AdapterRig, both, driving, profile,
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation
 from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.dbw.crc8 import frame_crc8
-from lavt.vehicle.dbw.profile import LEAST_GAP_NS, PERIOD_NS, TICK_LIMIT_NS, ByWireLimits
+from lavt.vehicle.dbw.profile import LEAST_GAP_NS, REPEAT_PERIOD_NS, TICK_LIMIT_NS, ByWireLimits
 from lavt.vehicle.dbw.sending import DriveCommand, apply_limits
 from lavt.vehicle.sim.dynamics import LINCOLN_MKZ
 
@@ -65,7 +65,7 @@ def test_a_limited_command_is_sent_faster(generation: int) -> None:
     rig.run_ms(300, step_ms=COARSE_MS)
     rig.tick_ns = 50 * NS_PER_MS
     rig.actuation = Actuation(0.03, 0.0, 0.5)
-    for wait_ms, period_ns in ((60, LEAST_GAP_NS), (700, PERIOD_NS)):
+    for wait_ms, period_ns in ((60, LEAST_GAP_NS), (700, REPEAT_PERIOD_NS)):
         rig.run_ms(wait_ms)
         rig.sent.clear()
         rig.run_ms(150)
@@ -135,7 +135,7 @@ def test_steering_starts_at_the_reported_angle(generation: int) -> None:
     rig.actuation = Actuation(-0.2, 0.0, 1.0)
     rig.adapter.engage(True, rig.now_ns)
     rig.run_until(lambda rig: rig.state == "enabling")
-    assert rig.adapter._sender.sent_ns == rig.now_ns
+    assert rig.adapter._sender.last_set_ns == rig.now_ns
     rig.sent = [(at_ns, frame) for at_ns, frame in rig.sent if at_ns == rig.now_ns]
     first_deg = angles_deg(rig)[0][1]
     wheel_deg = math.degrees(0.2 * 14.8)

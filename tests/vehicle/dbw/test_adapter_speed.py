@@ -9,7 +9,7 @@ from tests.vehicle.dbw.test_adapter_and_gate import decide, new_gate
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation
 from lavt.safety.gate import SafetyGate
 from lavt.vehicle.can_frame import CanFrame
-from lavt.vehicle.dbw.speed_monitor import HOLD_NS
+from lavt.vehicle.dbw.speed_monitor import FULL_BRAKE_NS
 from lavt.vehicle.software_car.state import Gear
 
 GEAR_COMMAND = {1: 0x066, 2: 0x203}
@@ -71,7 +71,7 @@ def test_all_speeds_stuck_at_zero(generation: int) -> None:
     rig, gate = fast(generation)
     for source in SPEED_SOURCES[generation]:
         rig.kit.stick_speed(source, 0.0)
-    run(rig, gate, HOLD_NS)
+    run(rig, gate, FULL_BRAKE_NS)
     assert rig.speed_mps == 0.0
     assert rig.kit.state.gear == Gear.DRIVE
     run(rig, gate, 2 * NS_PER_S)

@@ -34,7 +34,7 @@ def sent(name: str, vector: dict[str, Any]) -> CanFrame | None:
         if known.axes[axis].message == message:
             return axis_command(known, axis, signals)
     if known.gear.message == message and set(signals) == {known.gear.value}:
-        gears = {number: gear for gear, number in known.gear.numbers.items()}
+        gears = {code: gear for gear, code in known.gear.codes.items()}
         gear = gears.get(signals[known.gear.value])
         return sender.gear_frame(gear) if gear else None
     if known.system and message == known.system.message and signals:

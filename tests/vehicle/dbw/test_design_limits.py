@@ -9,7 +9,7 @@ from lavt.vehicle.dbw import adapter, bus, codec, profile, reports, sending, sta
 
 LIMITS_MS = [
     ("sets of frames are at least 5 ms apart", profile.LEAST_GAP_NS, 5),
-    ("commands are sent every 20 ms", profile.PERIOD_NS, 20),
+    ("commands are sent every 20 ms", profile.REPEAT_PERIOD_NS, 20),
     ("clearing frames are sent every 50 ms", profile.CLEARING_PERIOD_NS, 50),
     ("a kit disengages after 100 ms", profile.COMMAND_TIMEOUT_NS, 100),
     ("an adapter sends nothing older than 60 ms", profile.TICK_LIMIT_NS, 60),

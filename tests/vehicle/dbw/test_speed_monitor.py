@@ -9,7 +9,7 @@ import pytest
 
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.vehicle.dbw.speed_monitor import (
-    HOLD_NS,
+    FULL_BRAKE_NS,
     STANDSTILL_NS,
     Pedals,
     SpeedFault,
@@ -80,7 +80,7 @@ def test_a_speed_that_drops_to_zero_is_a_fall() -> None:
 def test_the_fault_lasts_until_all_speeds_agree_on_standstill() -> None:
     """The fault ends after the car was braked for long enough, and every speed was 0 for a second."""
     rig = MonitorRig().run(1.0, NONE, *[noisy(constant(8.3))] * 5)
-    rig.run(HOLD_NS / NS_PER_S + 5.0, FULL_BRAKE, constant(0.0), *[constant(8.3)] * 4)
+    rig.run(FULL_BRAKE_NS / NS_PER_S + 5.0, FULL_BRAKE, constant(0.0), *[constant(8.3)] * 4)
     assert rig.monitor.fault is SpeedFault.FALL
     assert rig.monitor.speed_mps == pytest.approx(8.3, abs=0.01)
     rig.run(STANDSTILL_NS / NS_PER_S - 0.02, FULL_BRAKE, *[constant(0.0)] * 5)
@@ -92,7 +92,7 @@ def test_the_fault_lasts_until_all_speeds_agree_on_standstill() -> None:
 def test_a_fault_of_the_only_source_lasts_as_long_as_the_car_may_need() -> None:
     """Without another speed, the fault lasts until any speed within the limits is braked away."""
     rig = MonitorRig().run(1.0, NONE, noisy(constant(8.3)))
-    rig.run(HOLD_NS / NS_PER_S - 0.02, FULL_BRAKE, constant(0.0))
+    rig.run(FULL_BRAKE_NS / NS_PER_S - 0.02, FULL_BRAKE, constant(0.0))
     assert rig.monitor.fault is SpeedFault.FALL
     rig.run(0.1, FULL_BRAKE, constant(0.0))
     assert rig.monitor.fault is None
