@@ -9,7 +9,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
-from tests.vehicle.dbw.rig import COARSE_MS, AdapterRig, both, driving, profile, started, with_limits
+from tests.vehicle.dbw.rig import (
+    COARSE_MS,
+    AdapterRig,
+    both_generations,
+    driving_rig,
+    profile,
+    stationary_rig,
+    with_limits,
+)
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation
 from lavt.vehicle.can_frame import CanFrame
@@ -32,10 +40,10 @@ def angles_deg(rig: AdapterRig) -> list[tuple[int, float]]:
     ]
 
 
-@both
+@both_generations
 def test_angle(generation: int) -> None:
     """The commanded steering angle stays within the limit on either side, and each limited command is counted."""
-    rig = driving(generation, profile=with_limits(generation, steering_wheel_deg=30.0))
+    rig = driving_rig(generation, profile=with_limits(generation, steering_wheel_deg=30.0))
     rig.actuation = Actuation(0.5, 0.0, 0.2)
     rig.run_ms(500)
     rig.actuation = Actuation(-0.5, 0.0, 0.2)
@@ -45,10 +53,10 @@ def test_angle(generation: int) -> None:
     assert rig.adapter.counts["limited_wheel_deg"] > 20
 
 
-@both
+@both_generations
 def test_rate(generation: int) -> None:
     """The commanded steering rate stays within the limit, which is sent to the kit, rounded down to a step."""
-    rig = driving(generation, profile=with_limits(generation, steering_wheel_rate_degps=100.0))
+    rig = driving_rig(generation, profile=with_limits(generation, steering_wheel_rate_degps=100.0))
     rig.actuation = Actuation(0.2, 0.0, 0.0)
     rig.run_ms(400)
     requested = angles_deg(rig)
@@ -57,7 +65,7 @@ def test_rate(generation: int) -> None:
     assert requested[-1][1] > 30
 
 
-@both
+@both_generations
 def test_a_limited_command_is_sent_faster(generation: int) -> None:
     """While the steering rate limits the angle, a set is sent every 5 ms, and then every 20 ms."""
     rig = AdapterRig(generation, profile=with_limits(generation, steering_wheel_rate_degps=50.0))
@@ -73,7 +81,7 @@ def test_a_limited_command_is_sent_faster(generation: int) -> None:
         assert {later - earlier for earlier, later in pairwise(times)} == {period_ns}
 
 
-@both
+@both_generations
 def test_nothing_is_sent_before_the_first_tick(generation: int) -> None:
     """Before the first tick nothing is sent, even if driving is wanted, and the missing tick is counted once."""
     rig = AdapterRig(generation, start_frames=False)
@@ -93,7 +101,7 @@ def test_nothing_is_sent_before_the_first_tick(generation: int) -> None:
 def test_rate_of_the_kit() -> None:
     """The largest rate is sent in the kit's steps: 452 deg/s are 113 steps of 4 deg/s, in both generations."""
     for name, place in (("dataspeed_gen1", 3), ("dataspeed_gen2", 3)):
-        rig = started(int(name[-1]))
+        rig = stationary_rig(int(name[-1]))
         rig.engage()
         rates = {
             frame.data[place] for _, frame in rig.sent if frame.identifier in (0x064, 0x200) and len(frame.data) > 4
@@ -102,11 +110,11 @@ def test_rate_of_the_kit() -> None:
         assert rates <= {0, 113}
 
 
-@both
+@both_generations
 def test_pedals(generation: int) -> None:
     """Pedals are pressed no further and no faster than the limits, and released at once."""
     known = with_limits(generation, throttle=0.4, brake=0.5, throttle_rate_per_s=1.0, brake_rate_per_s=2.0)
-    rig = driving(generation, profile=known)
+    rig = driving_rig(generation, profile=known)
     rig.actuation = Actuation(0.0, 1.0, 0.0)
     rig.run_ms(1000)
     assert rig.kit.state.throttle == pytest.approx(0.4, abs=1e-3)
@@ -122,10 +130,10 @@ def test_pedals(generation: int) -> None:
     assert rig.kit.state.brake == 0.0
 
 
-@both
+@both_generations
 def test_steering_starts_at_the_reported_angle(generation: int) -> None:
     """The first angle after enabling differs from the reported one by at most one set's turn."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.actuation = Actuation(0.2, 0.0, 1.0)
     rig.run_until(lambda rig: rig.speed_mps == 0.0, step_ms=COARSE_MS)
     rig.run_ms(1000, step_ms=COARSE_MS)
@@ -167,10 +175,10 @@ def test_requests_within_the_limits_are_unchanged(wanted: DriveCommand) -> None:
     assert found == (replace(wanted, throttle=0.0) if wanted.brake > 0 else wanted)
 
 
-@both
+@both_generations
 def test_one_pedal(generation: int) -> None:
     """A request for throttle and brake together becomes the brake alone."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.actuation = Actuation(0.0, 0.5, 0.2)
     rig.run_ms(50)
     wheels = rig.moments[-1].wheels
@@ -190,11 +198,11 @@ def test_limits_are_the_simulators(name: str) -> None:
     assert rate_radps == pytest.approx(LINCOLN_MKZ.max_steering_rate_radps, abs=2e-3)
 
 
-@both
+@both_generations
 @pytest.mark.parametrize("wheel_deg", [435.5, -540.0, 600.0])
 def test_a_wheel_beyond_the_limit_inhibits(generation: int, wheel_deg: float) -> None:
     """A stationary car whose wheel is beyond the limit is not engaged; turned back, it is."""
-    rig = started(generation)
+    rig = stationary_rig(generation)
     turn_wheel(rig, wheel_deg)
     rig.adapter.engage(True, rig.now_ns)
     rig.run_ms(300, step_ms=COARSE_MS)
@@ -205,11 +213,11 @@ def test_a_wheel_beyond_the_limit_inhibits(generation: int, wheel_deg: float) ->
     assert rig.adapter.state().inhibit_reason == ""
 
 
-@both
+@both_generations
 @pytest.mark.parametrize("wheel_deg", [-540.0, 600.0])
 def test_a_wheel_beyond_the_limit_is_never_commanded(generation: int, wheel_deg: float) -> None:
     """A wheel that is turned too far while the kit is engaged is commanded to no angle beyond the limit."""
-    rig = started(generation)
+    rig = stationary_rig(generation)
     rig.adapter.engage(True, rig.now_ns)
     rig.run_until(lambda rig: rig.state == "clearing")
     turn_wheel(rig, wheel_deg)

@@ -7,7 +7,7 @@ from functools import cache
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.vehicle.dbw.rig import START_NS, driving, profile, started
+from tests.vehicle.dbw.rig import START_NS, driving_rig, profile, stationary_rig
 
 from lavt.domain import NS_PER_MS, Actuation
 from lavt.vehicle.can_frame import CanFrame
@@ -113,7 +113,7 @@ def test_any_frames_raise_nothing(name: str, happening: list[tuple[CanFrame, int
 @cache
 def reports_of(generation: int) -> tuple[CanFrame, ...]:
     """Return the reports that a driving kit sends in 100 ms."""
-    rig, found = driving(generation), []
+    rig, found = driving_rig(generation), []
     receive = rig.adapter.receive
 
     def keep(frame: CanFrame, now_ns: int) -> None:
@@ -130,7 +130,7 @@ def reports_of(generation: int) -> tuple[CanFrame, ...]:
 @settings(max_examples=25)
 def test_garbage_between_reports(generation: int, garbage: list[tuple[CanFrame, int]]) -> None:
     """Garbage between the reports of a stationary car never engages it while driving is not wanted."""
-    rig = started(generation)
+    rig = stationary_rig(generation)
     for frame, wait_ms in garbage:
         rig.adapter.receive(frame, rig.now_ns)
         rig.run_ms(wait_ms)

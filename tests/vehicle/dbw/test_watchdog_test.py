@@ -6,7 +6,7 @@ from collections.abc import Callable
 from itertools import pairwise
 
 import pytest
-from tests.vehicle.dbw.rig import START_NS, both, profile, road
+from tests.vehicle.dbw.rig import START_NS, both_generations, profile, road
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation, VehicleState
 from lavt.vehicle.can_frame import CanFrame
@@ -56,7 +56,7 @@ class Attempt:
         return all(actuator.is_enabled for actuator in self.kit.state.actuators.values())
 
 
-@both
+@both_generations
 def test_passed(generation: int) -> None:
     """The test passes for a kit that disengages 100 ms after the last frame and brakes; it leaves the gear in park."""
     attempt = Attempt(generation)
@@ -70,7 +70,7 @@ def test_passed(generation: int) -> None:
     assert not any(frame.identifier == GEAR_COMMANDS[generation] for _, frame in attempt.sent)
 
 
-@both
+@both_generations
 def test_enabled_for_half_a_second(generation: int) -> None:
     """The kit is enabled for half a second, with a brake of 0.3 and no throttle; then nothing is sent any more."""
     attempt = Attempt(generation)
@@ -109,7 +109,7 @@ def test_ticks(monkeypatch: pytest.MonkeyPatch) -> None:
     assert sending_ns[-1] - last_ns < 20 * NS_PER_MS
 
 
-@both
+@both_generations
 def test_without_watchdog(generation: int) -> None:
     """The test fails for a kit without watchdog, which disengages and does not brake."""
     test = Attempt(generation, has_watchdog=False).run()
@@ -157,7 +157,7 @@ def test_brakes_and_releases() -> None:
     assert "released the brake again" in attempt.run().failure
 
 
-@both
+@both_generations
 def test_driver_brakes(generation: int) -> None:
     """The test fails if the driver brakes before anything is sent, while the kit is enabled, or afterwards."""
     before = Attempt(generation)

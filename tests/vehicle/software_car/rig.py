@@ -178,10 +178,10 @@ def with_crc_broken(frame: CanFrame) -> CanFrame:
 
 
 ALL = set(AXES)
-both = pytest.mark.parametrize("generation", [1, 2])
+both_generations = pytest.mark.parametrize("generation", [1, 2])
 
 
-def driving(generation: int, **keys: Any) -> KitRig:
+def driving_rig(generation: int, **keys: Any) -> KitRig:
     """Return a kit that is enabled, in drive and moving."""
     rig = KitRig(generation, **keys)
     rig.enable()

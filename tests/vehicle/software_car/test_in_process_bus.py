@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cache
 
 import pytest
-from tests.vehicle.software_car.rig import START_NS, CommandValues, Sender1, Sender2, both
+from tests.vehicle.software_car.rig import START_NS, CommandValues, Sender1, Sender2, both_generations
 
 from lavt.domain import NS_PER_MS, NS_PER_S, GroundTruth, VehicleEvent
 from lavt.vehicle.can_frame import BusGone, ReceivedCanFrame
@@ -53,7 +53,7 @@ def drive(
     return received, truth, events
 
 
-@both
+@both_generations
 def test_a_drive_does_not_depend_on_polling(generation: int) -> None:
     """However often the port is polled, frames, their times, the ground truth and the events are the same."""
     requested = CommandValues(throttle=0.5, angle_deg=200.0)
@@ -64,7 +64,7 @@ def test_a_drive_does_not_depend_on_polling(generation: int) -> None:
     assert {event.kind for event in events} >= {"lane_invasion"}
 
 
-@both
+@both_generations
 def test_frames_are_transmitted_one_at_a_time(generation: int) -> None:
     """Reports sent together arrive in order, 250 us apart, the first one 250 us after it was sent."""
     port = port_of(generation)
