@@ -1,4 +1,4 @@
-"""Which steering commands the adapter takes as reached, with reported commands that each test chooses.
+"""Steering commands that the adapter counts as reached, for reported commands that each test chooses.
 
 The reports are those of generation 1: a command in bytes 2 and 3, in steps of 0.1 degrees.
 """
@@ -109,7 +109,9 @@ def test_a_repeated_angle_is_reached_again() -> None:
 def test_superseded_commands_are_not_reached() -> None:
     """A report of a command discards the earlier ones; later ones are still awaited."""
     car = ChosenReports(driving_rig(1))
-    (_, first), (second_ns, second), (third_ns, _) = [car.steer(each) for each in (FIRST_RAD, SECOND_RAD, FIRST_RAD)]
+    (_, first), (second_ns, second), (third_ns, _) = [
+        car.steer(angle_rad) for angle_rad in (FIRST_RAD, SECOND_RAD, FIRST_RAD)
+    ]
     assert car.choose(second) == [ReachedCommand(second_ns, car.rig.now_ns)]
     assert car.choose(first) == [ReachedCommand(third_ns, car.rig.now_ns)]
     assert car.choose(second) == []
@@ -128,7 +130,7 @@ def test_a_repeated_command_is_reached_once() -> None:
     car = ChosenReports(driving_rig(1))
     requested_ns, command = car.steer(FIRST_RAD)
     car.rig.run_ms(100)
-    assert [each.applied_ns for each in car.choose(command)] == [requested_ns]
+    assert [reached.applied_ns for reached in car.choose(command)] == [requested_ns]
     car.rig.run_ms(100)
     assert car.choose(car.before) == []
     car.rig.run_ms(100)

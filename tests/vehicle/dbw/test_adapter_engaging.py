@@ -1,4 +1,4 @@
-"""Engaging a kit, driving by it, and disengaging it in order."""
+"""Engaging a kit, driving through it, and disengaging it in order."""
 
 from __future__ import annotations
 
@@ -31,6 +31,15 @@ from lavt.vehicle.sim.simulator import Simulator
 from lavt.vehicle.software_car.state import AXES, Gear
 
 ALL = set(AXES)
+CLEARING_MS = 120
+"""Time in the state `clearing`."""
+SET_MS = 20
+"""Longest time until the next set of frames."""
+PEDAL_REPORT_MS, GEAR_REPORT_MS = 20, 100
+"""Periods of the pedals' and the gear's reports."""
+MAX_REACHED_MS = 5 + 10 + 1
+"""Longest time from a request to the report of it: the shortest time between two sets of frames, the period of the
+steering reports, and a step of the rig."""
 
 
 def names(rig: AdapterRig) -> list[str]:
@@ -60,11 +69,11 @@ def test_missing_reports_inhibit(generation: int) -> None:
 
 @both_generations
 def test_engaging(generation: int) -> None:
-    """Engaging takes CLEAR for 120 ms, all axes with the brake on, then DRIVE, and at most two gear reports' time."""
+    """Engaging clears for 120 ms, enables all axes with the brake on, and shifts to DRIVE, each as soon as it can."""
     rig = stationary_rig(generation)
     rig.adapter.engage(True, rig.now_ns)
     passed_ms = rig.run_until(lambda rig: rig.state == "engaged")
-    assert passed_ms <= 120 + 20 + 100 + 20
+    assert passed_ms <= CLEARING_MS + PEDAL_REPORT_MS + SET_MS + GEAR_REPORT_MS
     assert rig.enabled() == ALL
     assert rig.kit.state.gear == Gear.DRIVE
     assert rig.adapter.state().is_engaged
@@ -94,13 +103,13 @@ def test_clearing_frames_of_generation_1() -> None:
     rig.adapter.engage(True, rig.now_ns)
     rig.run_until(lambda rig: rig.state == "enabling")
     frames = [frame for _, frame in rig.sent]
-    a_set = [
+    frame_set = [
         CanFrame(0x064, bytes([0, 0, 2, 0])),
         CanFrame(0x060, bytes([0, 0, 0, 2])),
         CanFrame(0x062, bytes([0, 0, 0, 2])),
         CanFrame(0x066, bytes([0x80])),
     ]
-    assert frames[:12] == a_set * 3
+    assert frames[:12] == frame_set * 3
     times = sorted({at_ns for at_ns, _ in rig.sent})[:3]
     assert [later - earlier for earlier, later in pairwise(times)] == [50 * NS_PER_MS] * 2
 
@@ -115,7 +124,7 @@ def test_counters(generation: int) -> None:
     rig.engage()
     identifier = 0x064 if generation == 1 else 0x200
     data = [frame.data for _, frame in rig.sent if frame.identifier == identifier and len(frame.data) == 8]
-    counts = [each[7] if generation == 1 else each[6] & 15 for each in data]
+    counts = [frame_data[7] if generation == 1 else frame_data[6] & 15 for frame_data in data]
     modulus = 256 if generation == 1 else 16
     assert len(counts) > 100
     assert all((after - before) % modulus == 1 for before, after in pairwise(counts))
@@ -123,7 +132,7 @@ def test_counters(generation: int) -> None:
 
 @both_generations
 def test_new_commands_are_sent_immediately(generation: int) -> None:
-    """A tick with a new command sends it in the same millisecond, but sets are at least 5 ms apart."""
+    """A tick with a new command sends it in the same millisecond, but sets of frames are at least 5 ms apart."""
     rig = driving_rig(generation, tick_ms=1)
     rig.run_ms(500)
     rig.sent.clear()
@@ -167,7 +176,7 @@ def test_steering_and_speed(generation: int) -> None:
 
 @both_generations
 def test_parking(generation: int) -> None:
-    """A car that is no longer wanted brakes, shifts to PARK once it is stationary, and only then is disengaged."""
+    """When driving is no longer wanted the car brakes, shifts to PARK once stationary, and only then is disengaged."""
     rig = driving_rig(generation)
     rig.actuation = Actuation(0.0, 0.5, 0.0)
     rig.adapter.engage(False, rig.now_ns)
@@ -216,11 +225,11 @@ def test_a_parked_car_can_be_engaged_again(generation: int) -> None:
 @both_generations
 def test_engaging_can_be_cancelled(generation: int) -> None:
     """Engaging that is cancelled at any moment leaves the car in PARK, disengaged, without a watchdog trip."""
-    begun = stationary_rig(generation)
-    begun.adapter.engage(True, begun.now_ns)
+    engaging_rig = stationary_rig(generation)
+    engaging_rig.adapter.engage(True, engaging_rig.now_ns)
     for after_ms in range(0, 220, 7):
-        rig = begun.copy()
-        begun.run_ms(7)
+        rig = engaging_rig.copy()
+        engaging_rig.run_ms(7)
         rig.adapter.engage(False, rig.now_ns)
         rig.run_until(lambda rig: rig.state == "idle" and not rig.enabled(), 1000)
         rig.run_ms(200)
@@ -274,16 +283,17 @@ def test_user_commands() -> None:
     rig = AdapterRig(2, profile=profile("dataspeed_gen2:user"), commands="user")
     rig.engage()
     assert {frame.identifier for _, frame in rig.sent} == {0x210, 0x211, 0x212, 0x213, 0x216}
-    other = AdapterRig(2, profile=profile("dataspeed_gen2:user"), commands="remote")
-    other.adapter.engage(True, other.now_ns)
-    other.run_ms(1000)
-    assert other.adapter.state().inhibit_reason == "RemoteReport has STATE remote"
-    assert other.sent == []
+    remote_rig = AdapterRig(2, profile=profile("dataspeed_gen2:user"), commands="remote")
+    remote_rig.adapter.engage(True, remote_rig.now_ns)
+    remote_rig.run_ms(1000)
+    # The message RemoteReport says in its signal STATE that the kit accepts remote commands.
+    assert remote_rig.adapter.state().inhibit_reason == "RemoteReport has STATE remote"
+    assert remote_rig.sent == []
 
 
 @both_generations
 def test_reached(generation: int) -> None:
-    """A reported steering command is returned once as reached, with the time of its request, within 16 ms."""
+    """A steering command that the kit reports counts as reached: once, and within 16 ms of its request."""
     rig = driving_rig(generation)
     rig.run_ms(500)
     rig.adapter.take_reached()
@@ -292,40 +302,40 @@ def test_reached(generation: int) -> None:
     requested_ns = rig.now_ns
     rig.run_ms(200)
     reached = rig.adapter.take_reached()
-    assert [each.applied_ns for each in reached] == [requested_ns]
-    assert 0 < reached[0].reached_ns - requested_ns <= (5 + 10 + 1) * NS_PER_MS
+    assert [command.applied_ns for command in reached] == [requested_ns]
+    assert 0 < reached[0].reached_ns - requested_ns <= MAX_REACHED_MS * NS_PER_MS
     assert rig.adapter.take_reached() == []
 
 
 @both_generations
 def test_reached_while_weaving(generation: int) -> None:
-    """While the wheel turns to and fro, no command is reached before its request or later than 16 ms after it."""
+    """While the wheel turns to and fro, each reached command is reported within 16 ms of its request."""
     rig = driving_rig(generation, tick_ms=4)
     for index in range(1000):
         rig.actuation = Actuation(0.02 * math.sin(index / 20), 0.2, 0.0)
         rig.run_ms(1)
     reached = rig.adapter.take_reached()
     assert len(reached) > 80
-    assert all(0 < each.reached_ns - each.applied_ns <= (5 + 10 + 1) * NS_PER_MS for each in reached)
-    assert len({each.applied_ns for each in reached}) == len(reached)
+    assert all(0 < command.reached_ns - command.applied_ns <= MAX_REACHED_MS * NS_PER_MS for command in reached)
+    assert len({command.applied_ns for command in reached}) == len(reached)
 
 
 @both_generations
 def test_drives_as_the_simulator(generation: int) -> None:
-    """Actuation over CAN moves the car like actuation of the simulator itself: to 0.1 m after 5 s."""
+    """Actuation over CAN moves the car as actuation of the simulator itself does: they are within 0.1 m after 5 s."""
     rig = driving_rig(generation)
-    same = Simulator(road=road(), seed=1, start_mono_ns=START_NS)
-    same._car, same._index = deepcopy(rig.simulator._car), rig.simulator._index
-    started = rig.simulator.ground_truth()
+    reference = Simulator(road=road(), seed=1, start_mono_ns=START_NS)
+    reference._car, reference._index = deepcopy(rig.simulator._car), rig.simulator._index
+    start = rig.simulator.ground_truth()
     for step in range(250):
         requested = Actuation(0.01 * math.sin(step / 40), 0.2, 0.0)
         rig.actuation = requested
-        same.apply(requested, rig.now_ns)
+        reference.apply(requested, rig.now_ns)
         rig.run_ms(20)
-        same.advance(rig.now_ns)
-    other, own = same.ground_truth(), rig.simulator.ground_truth()
-    assert math.hypot(started.x_m - own.x_m, started.y_m - own.y_m) > 20
-    assert math.hypot(other.x_m - own.x_m, other.y_m - own.y_m) < 0.1
+        reference.advance(rig.now_ns)
+    expected, end = reference.ground_truth(), rig.simulator.ground_truth()
+    assert math.hypot(start.x_m - end.x_m, start.y_m - end.y_m) > 20
+    assert math.hypot(expected.x_m - end.x_m, expected.y_m - end.y_m) < 0.1
 
 
 def test_wake() -> None:

@@ -80,9 +80,9 @@ def test_counter_stuck(generation: int) -> None:
     def spoil(frame: CanFrame) -> CanFrame:
         if frame.identifier != STEERING[generation]:
             return frame
-        place = 7 if generation == 1 else 6
-        stuck.append(frame.data[place])
-        data = frame.data[:place] + bytes([stuck[0]]) + frame.data[place + 1 :]
+        counter_byte = 7 if generation == 1 else 6
+        stuck.append(frame.data[counter_byte])
+        data = frame.data[:counter_byte] + bytes([stuck[0]]) + frame.data[counter_byte + 1 :]
         return with_crc(frame.identifier, data) if generation == 2 else CanFrame(frame.identifier, data)
 
     rig.spoil = spoil
@@ -222,13 +222,13 @@ TEXTS = {
     "gear": "the driver has shifted",
 }
 PERIOD_MS = {"steering": 10, "brake": 20, "throttle": 20, "gear": 100}
-"""Of the reports with the override."""
+"""Periods of the reports that contain the override."""
 
 
 @both_generations
 @pytest.mark.parametrize("part", OVERRIDES)
 def test_override(generation: int, part: str) -> None:
-    """An override releases all axes at once in generation 2, and with the report of it in generation 1."""
+    """An override releases all axes: at once in generation 2, and when it is reported in generation 1."""
     rig = driving_rig(generation)
     override_ns = rig.now_ns
     OVERRIDES[part](rig)
@@ -347,7 +347,7 @@ def test_fault_without_a_watchdog() -> None:
 
 @both_generations
 def test_fault_latches(generation: int) -> None:
-    """After a fault that disappears the state stays `lost` until driving is not wanted; then the car can be engaged."""
+    """After a fault that disappears, `lost` lasts until driving is no longer wanted; then the car can be engaged."""
     name = "steering.FLTPWR" if generation == 1 else "steering.fault"
     rig = driving_rig(generation)
     rig.kit.set_fault(name, rig.now_ns)

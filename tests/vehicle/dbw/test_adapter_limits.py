@@ -67,7 +67,7 @@ def test_rate(generation: int) -> None:
 
 @both_generations
 def test_a_limited_command_is_sent_faster(generation: int) -> None:
-    """While the steering rate limits the angle, a set is sent every 5 ms, and then every 20 ms."""
+    """While the steering rate limits the angle, a set of frames is sent every 5 ms, and then every 20 ms."""
     rig = AdapterRig(generation, profile=with_limits(generation, steering_wheel_rate_degps=50.0))
     rig.engage()
     rig.run_ms(300, step_ms=COARSE_MS)
@@ -100,11 +100,11 @@ def test_nothing_is_sent_before_the_first_tick(generation: int) -> None:
 
 def test_rate_of_the_kit() -> None:
     """The largest rate is sent in the kit's steps: 452 deg/s are 113 steps of 4 deg/s, in both generations."""
-    for name, place in (("dataspeed_gen1", 3), ("dataspeed_gen2", 3)):
+    for name, rate_byte in (("dataspeed_gen1", 3), ("dataspeed_gen2", 3)):
         rig = stationary_rig(int(name[-1]))
         rig.engage()
         rates = {
-            frame.data[place] for _, frame in rig.sent if frame.identifier in (0x064, 0x200) and len(frame.data) > 4
+            frame.data[rate_byte] for _, frame in rig.sent if frame.identifier in (0x064, 0x200) and len(frame.data) > 4
         }
         assert 113 in rates
         assert rates <= {0, 113}
@@ -132,7 +132,7 @@ def test_pedals(generation: int) -> None:
 
 @both_generations
 def test_steering_starts_at_the_reported_angle(generation: int) -> None:
-    """The first angle after enabling differs from the reported one by at most one set's turn."""
+    """The first angle after enabling differs from the reported one by at most the turn allowed in one set of frames."""
     rig = driving_rig(generation)
     rig.actuation = Actuation(0.2, 0.0, 1.0)
     rig.run_until(lambda rig: rig.speed_mps == 0.0, step_ms=COARSE_MS)
@@ -159,20 +159,20 @@ any_wheel = st.builds(DriveCommand, st.floats(-3276, 3276), st.floats(0, 0.6), s
 @given(requested, any_wheel, st.integers(0, 10 * NS_PER_S))
 def test_limits_hold_for_any_request(wanted: DriveCommand, before: DriveCommand, passed_ns: int) -> None:
     """For any request and any wheel the limited command is in range, and from there no faster than the rates."""
-    found = apply_limits(LIMITS, wanted, before, passed_ns)
+    limited = apply_limits(LIMITS, wanted, before, passed_ns)
     passed_s = min(passed_ns, TICK_LIMIT_NS) / NS_PER_S
-    assert abs(found.wheel_deg) <= 400.0
+    assert abs(limited.wheel_deg) <= 400.0
     nearest_deg = min(max(before.wheel_deg, -400.0), 400.0)
-    assert abs(found.wheel_deg - nearest_deg) <= 300.0 * passed_s + 1e-9
-    assert 0.0 <= found.throttle <= min(0.6, before.throttle + 2.0 * passed_s)
-    assert 0.0 <= found.brake <= min(0.8, before.brake + 5.0 * passed_s)
+    assert abs(limited.wheel_deg - nearest_deg) <= 300.0 * passed_s + 1e-9
+    assert 0.0 <= limited.throttle <= min(0.6, before.throttle + 2.0 * passed_s)
+    assert 0.0 <= limited.brake <= min(0.8, before.brake + 5.0 * passed_s)
 
 
 @given(allowed)
 def test_requests_within_the_limits_are_unchanged(wanted: DriveCommand) -> None:
     """A request within the limits is unchanged, except that a brake request zeroes the throttle."""
-    found = apply_limits(LIMITS, wanted, wanted, 0)
-    assert found == (replace(wanted, throttle=0.0) if wanted.brake > 0 else wanted)
+    limited = apply_limits(LIMITS, wanted, wanted, 0)
+    assert limited == (replace(wanted, throttle=0.0) if wanted.brake > 0 else wanted)
 
 
 @both_generations

@@ -86,17 +86,17 @@ any_frame = st.builds(
     st.binary(max_size=8),
     st.booleans(),
 )
-steps = st.lists(st.tuples(any_frame, st.integers(0, 200 * NS_PER_MS), st.integers(0, 3)), max_size=60)
+histories = st.lists(st.tuples(any_frame, st.integers(0, 200 * NS_PER_MS), st.integers(0, 3)), max_size=60)
 
 
 @names
-@given(steps)
+@given(histories)
 @settings(max_examples=150)
-def test_any_frames_raise_nothing(name: str, happening: list[tuple[CanFrame, int, int]]) -> None:
+def test_any_frames_raise_nothing(name: str, history: list[tuple[CanFrame, int, int]]) -> None:
     """Any frames from the bus raise nothing, and without all reports the car is never engaged."""
     adapter = ByWireAdapter(profile(name), start_ns=START_NS)
     now_ns = START_NS
-    for frame, passed_ns, kind in happening:
+    for frame, passed_ns, kind in history:
         now_ns += passed_ns
         adapter.receive(frame, now_ns)
         adapter.set_actuation(Actuation(0.1, 0.5, 0.0), now_ns)
@@ -148,7 +148,9 @@ def test_a_flipped_bit(generation: int, data: st.DataObject) -> None:
     flipped = (int.from_bytes(frame.data, "little") ^ 1 << bit).to_bytes(len(frame.data), "little")
     adapter = ByWireAdapter(profile(f"dataspeed_gen{generation}"), start_ns=START_NS)
     adapter.receive(CanFrame(frame.identifier, flipped), START_NS)
-    known = {known.identifier: name for name, known in profile(f"dataspeed_gen{generation}").codec.messages.items()}
-    report = profile(f"dataspeed_gen{generation}").reports.get(known[frame.identifier])
+    names_by_identifier = {
+        facts.identifier: name for name, facts in profile(f"dataspeed_gen{generation}").codec.messages.items()
+    }
+    report = profile(f"dataspeed_gen{generation}").reports.get(names_by_identifier[frame.identifier])
     if report is not None and report.checksum:
         assert adapter._reports.counts["wrong_checksum"] == 1

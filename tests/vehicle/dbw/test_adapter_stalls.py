@@ -18,12 +18,12 @@ from lavt.vehicle.software_car.authority import WATCHDOG_BRAKE
 @pytest.mark.timeout(30)
 def test_a_stall_while_parking_ends(generation: int) -> None:
     """A stall while parking ends it, at whatever moment, if the kit has disengaged meanwhile: the watchdog brakes."""
-    begun = driving_rig(generation)
-    begun.adapter.engage(False, begun.now_ns)
-    begun.run_ms(50)
+    parking_rig = driving_rig(generation)
+    parking_rig.adapter.engage(False, parking_rig.now_ns)
+    parking_rig.run_ms(50)
     for moment_ms in range(9):
         for duration_ms in (80, 98, 100, 102, 150, 1000):
-            rig = begun.copy()
+            rig = parking_rig.copy()
             rig.run_ms(moment_ms)
             rig.stall_ms(duration_ms)
             rig.run_ms(250)
@@ -93,7 +93,7 @@ def test_a_released_axis_is_not_enabled_again() -> None:
 @both_generations
 @pytest.mark.parametrize("dropped", [1, 2, 3, 4])
 def test_dropped_frames_leave_no_gap_in_the_counters(generation: int, dropped: int) -> None:
-    """If the last frames of a set, or all, are not written the next ones have their numbers, and driving goes on."""
+    """If the last frames of a set, or all, are not written, the next ones get their counter values; driving goes on."""
     rig = driving_rig(generation)
     rig.run_until(lambda rig: bool(rig.sent) and rig.sent[-1][0] == rig.now_ns)
     for _ in range(5):

@@ -1,4 +1,4 @@
-"""The adapter's frames equal, byte for byte, those worked out by hand from the facts."""
+"""The adapter's frames equal, byte for byte, those worked out by hand from the published sources."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def axis_command(known: Profile, axis: Axis, signals: dict[str, Any]) -> CanFram
     if command.value not in signals or signals.get(kind, 0) != number:
         return None
     varied = {command.value, command.enable, command.count}
-    constants = {kind: number} | {name: each for name, each in signals.items() if name not in varied}
+    constants = {kind: number} | {name: value for name, value in signals.items() if name not in varied}
     sender = FrameSender(replace(known, axes={**known.axes, axis: replace(command, constants=constants)}), START_NS)
     sender._frame_counts[command.message] = signals.get(command.count, 0) + command.modulus - 1
     is_enabled = bool(signals.get(command.enable, 0))
@@ -83,7 +83,7 @@ def test_frames_equal_the_vectors(frame: CanFrame, vector: dict[str, Any]) -> No
 
 
 def test_every_sent_message_has_a_vector() -> None:
-    """Every message that the adapter sends has a vector, except two without a vector with any signal."""
+    """Every message that the adapter sends has a vector, except two whose vectors have no signals."""
     checked = {(name, vector["message"]) for name in NAMES for vector in vectors(name) if sent(name, vector)}
     missing = set()
     for name in NAMES:

@@ -33,9 +33,7 @@ LIMITS_MS = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("limit_ns", "limit_ms"), [each[1:] for each in LIMITS_MS], ids=[each[0] for each in LIMITS_MS]
-)
+@pytest.mark.parametrize(("limit_ns", "limit_ms"), [row[1:] for row in LIMITS_MS], ids=[row[0] for row in LIMITS_MS])
 def test_times(limit_ns: int, limit_ms: int) -> None:
     """Each time limit of driving by wire is the design's number of milliseconds, as an integer."""
     assert type(limit_ns) is int

@@ -1,4 +1,4 @@
-"""The shipped DBC files agree with the vectors worked out by hand, and mark everything that is not in the facts."""
+"""The shipped DBC files agree with the vectors worked out by hand, and mark everything that is not published."""
 
 from __future__ import annotations
 
@@ -158,12 +158,12 @@ def unverified(profile: str) -> set[str]:
 
 
 def test_unverified_of_generation_1() -> None:
-    """In generation 1 only the parking brake has a position that is not in the facts."""
+    """In generation 1 only the parking brake has a position that is not published."""
     assert unverified("dataspeed_gen1") == {"MiscCmd.PBRKCMD"}
 
 
 def test_unverified_of_generation_2() -> None:
-    """In generation 2 only the CRC of commands has a position that is in the facts."""
+    """In generation 2 only the CRC of commands has a published position."""
     everything = {
         f"{message.name}.{signal.name}"
         for message in DATABASES["dataspeed_gen2"].messages
@@ -188,7 +188,7 @@ def test_unverified_signals_have_a_comment(profile: str) -> None:
 
 @pytest.mark.parametrize("limit", WRITTEN["dataspeed_gen1"]["limits"], ids=lambda limit: limit["signal"])
 def test_limits(limit: dict[str, Any]) -> None:
-    """A command is encoded at the limits of the facts and rejected one step beyond."""
+    """A command is encoded at the published limits and rejected one step beyond."""
     message = DATABASES["dataspeed_gen1"].get_message_by_name(limit["message"])
     signal = message.get_signal_by_name(limit["signal"])
     multiplexer = selector_of(message)
@@ -228,7 +228,7 @@ TIMES = {  # period, timeout, ms
 
 @pytest.mark.parametrize("profile", PROFILES)
 def test_times(profile: str) -> None:
-    """Periods and timeouts are those of the facts, and there are no others."""
+    """Periods and timeouts are the published ones, and there are no others."""
     found = {}
     for message in DATABASES[profile].messages:
         assert message.dbc is not None

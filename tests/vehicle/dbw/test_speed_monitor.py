@@ -42,7 +42,7 @@ class MonitorRig:
         while self.now_ns < began_ns + round(duration_s * NS_PER_S):
             self.now_ns += PERIOD_NS
             passed_s = (self.now_ns - began_ns) / NS_PER_S
-            courses = {"speed": speed} | {f"wheel_{index}": each for index, each in enumerate(wheels, 1)}
+            courses = {"speed": speed} | {f"wheel_{index}": wheel for index, wheel in enumerate(wheels, 1)}
             courses |= {} if second is None else {"second_speed": second}
             reports = {name: SpeedReport(quantised(course(passed_s)), self.now_ns) for name, course in courses.items()}
             found = self.monitor.update(reports, pedals, self.now_ns)

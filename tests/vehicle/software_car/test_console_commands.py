@@ -125,7 +125,7 @@ def test_an_invalid_command_changes_nothing(line: str, key_words: list[str]) -> 
     before = repr(rig.kit.state)
     with pytest.raises(UserError) as error:
         execute(rig.kit, line, rig.now_ns)
-    assert [each for each in key_words if each not in str(error.value)] == []
+    assert [word for word in key_words if word not in str(error.value)] == []
     assert len(str(error.value)) < 200
     assert repr(rig.kit.state) == before
 

@@ -10,7 +10,7 @@ from lavt.vehicle.software_car.state import Gear, GearRejection, ReleaseReason
 @both_generations
 @pytest.mark.parametrize("axis", AXES)
 def test_override(generation: int, axis: str) -> None:
-    """An override releases its axis (generation 2: all), does not trip the watchdog, and stays until it is cleared."""
+    """An override releases its axis, or all in generation 2, trips no watchdog, and stays until it is cleared."""
     rig = driving_rig(generation)
     act = {"steering": rig.kit.driver_steers, "brake": rig.kit.driver_brakes, "throttle": rig.kit.driver_throttles}[
         axis

@@ -49,7 +49,7 @@ def test_a_faulty_axis_is_not_enabled(generation: int, name: str) -> None:
         ("reverse", ReleaseReason.LOCKOUT_REVERSE),
     ],
 )
-def test_what_inhibits_generation_2(name: str, reason: ReleaseReason) -> None:
+def test_an_inhibit_reason_of_generation_2_disengages(name: str, reason: ReleaseReason) -> None:
     """Belt, door and lockouts keep generation 2 in manual, with the reason; while driving it disengages and brakes."""
     rig = KitRig(2)
     rig.kit.inhibit(name, rig.now_ns)

@@ -46,7 +46,7 @@ class DrivenCar:
     def command(self, **keys: float) -> None:
         """Send a set of commands."""
         for frame in self.sender.commands(CommandValues(**keys)):  # type: ignore[arg-type]
-            self.reports += [(each.identifier, each.data) for each in self.car.receive(frame, self.now_ns)]
+            self.reports += [(report.identifier, report.data) for report in self.car.receive(frame, self.now_ns)]
 
     def wait_ms(self, duration_ms: int) -> None:
         """Advance the time."""
