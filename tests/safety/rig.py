@@ -120,7 +120,7 @@ class Rig:
         return self
 
     def clear(self, who: str = "alice", instance: int = 1, number: int | None = None) -> SessionReply:
-        """Request to clear the last emergency stop that the vehicle reported, or the given one."""
+        """Request to clear the last emergency stop that the vehicle reported, or the one with `number`."""
         last = self.request("acquire", who, instance).emergency_stop
         return self.request("clear_emergency_stop", who, instance, last if number is None else number)
 

@@ -187,15 +187,15 @@ def _accelerated(rig: AdapterRig) -> AdapterRig:
 
 def with_limits(generation: int, **limits: float) -> Profile:
     """Return a profile with other limits."""
-    found = profile(f"dataspeed_gen{generation}")
-    return replace(found, limits=replace(found.limits, **limits))
+    base_profile = profile(f"dataspeed_gen{generation}")
+    return replace(base_profile, limits=replace(base_profile.limits, **limits))
 
 
 def with_one_speed(generation: int) -> Profile:
     """Return a profile of a kit that reports no wheel speeds and no second speed."""
-    found = profile(f"dataspeed_gen{generation}")
-    reports = {name: report for name, report in found.reports.items() if name != "WheelSpeed"}
-    return replace(found, reports=reports, speeds_per_mps={"speed": found.speeds_per_mps["speed"]})
+    base_profile = profile(f"dataspeed_gen{generation}")
+    reports = {name: report for name, report in base_profile.reports.items() if name != "WheelSpeed"}
+    return replace(base_profile, reports=reports, speeds_per_mps={"speed": base_profile.speeds_per_mps["speed"]})
 
 
 both_generations = pytest.mark.parametrize("generation", [1, 2])

@@ -157,9 +157,9 @@ any_wheel = st.builds(DriveCommand, st.floats(-3276, 3276), st.floats(0, 0.6), s
 
 
 @given(requested, any_wheel, st.integers(0, 10 * NS_PER_S))
-def test_limits_hold_for_any_request(wanted: DriveCommand, before: DriveCommand, passed_ns: int) -> None:
+def test_limits_hold_for_any_request(command: DriveCommand, before: DriveCommand, passed_ns: int) -> None:
     """For any request and any wheel the limited command is in range, and from there no faster than the rates."""
-    limited = apply_limits(LIMITS, wanted, before, passed_ns)
+    limited = apply_limits(LIMITS, command, before, passed_ns)
     passed_s = min(passed_ns, TICK_LIMIT_NS) / NS_PER_S
     assert abs(limited.wheel_deg) <= 400.0
     nearest_deg = min(max(before.wheel_deg, -400.0), 400.0)
@@ -169,10 +169,10 @@ def test_limits_hold_for_any_request(wanted: DriveCommand, before: DriveCommand,
 
 
 @given(allowed)
-def test_requests_within_the_limits_are_unchanged(wanted: DriveCommand) -> None:
+def test_requests_within_the_limits_are_unchanged(command: DriveCommand) -> None:
     """A request within the limits is unchanged, except that a brake request zeroes the throttle."""
-    limited = apply_limits(LIMITS, wanted, wanted, 0)
-    assert limited == (replace(wanted, throttle=0.0) if wanted.brake > 0 else wanted)
+    limited = apply_limits(LIMITS, command, command, 0)
+    assert limited == (replace(command, throttle=0.0) if command.brake > 0 else command)
 
 
 @both_generations

@@ -113,16 +113,16 @@ def test_any_frames_raise_nothing(name: str, history: list[tuple[CanFrame, int, 
 @cache
 def reports_of(generation: int) -> tuple[CanFrame, ...]:
     """Return the reports that a driving kit sends in 100 ms."""
-    rig, found = driving_rig(generation), []
+    rig, received = driving_rig(generation), []
     receive = rig.adapter.receive
 
     def keep(frame: CanFrame, now_ns: int) -> None:
-        found.append(frame)
+        received.append(frame)
         receive(frame, now_ns)
 
     rig.adapter.receive = keep  # type: ignore[method-assign]
     rig.run_ms(100)
-    return tuple(found)
+    return tuple(received)
 
 
 @pytest.mark.parametrize("generation", [1, 2])

@@ -30,8 +30,8 @@ def test_alphanumeric() -> None:
 @pytest.mark.parametrize("vector", VECTORS["frames"], ids=lambda vector: f"{vector['identifier']:X} {vector['data']}")
 def test_frame(vector: dict[str, Any]) -> None:
     """The CRC of a frame covers its identifier, high byte first, and then its data."""
-    found = frame_crc8(vector["identifier"], bytes.fromhex(vector["data"]), extended=vector["extended"])
-    assert found == vector["crc"]
+    crc = frame_crc8(vector["identifier"], bytes.fromhex(vector["data"]), extended=vector["extended"])
+    assert crc == vector["crc"]
 
 
 @pytest.mark.parametrize("vector", VECTORS["plain"] + VECTORS["frames"], ids=lambda vector: vector["registers"])

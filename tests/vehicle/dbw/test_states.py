@@ -157,15 +157,15 @@ def test_the_cause_of_the_highest_priority_is_the_reason(first: str) -> None:
     """Of several causes the reason is an override, then missing reports, faults, trips and command errors."""
     present = TEXTS[TEXTS.index(first) :]
     causes: dict[str, Any] = {name: name.upper() for name in present}
-    found, why = next_state("engaged", replace(GOOD, wanted=False, **causes))
-    assert found == ("overridden" if first == "overrides" else "lost")
-    assert [name for name in present if name.upper() in why.partition(" (")[0]] == [first]
+    next_name, reason_text = next_state("engaged", replace(GOOD, wanted=False, **causes))
+    assert next_name == ("overridden" if first == "overrides" else "lost")
+    assert [name for name in present if name.upper() in reason_text.partition(" (")[0]] == [first]
 
 
 def test_a_cause_without_a_text_uses_its_row() -> None:
     """The reason for a cause without a text is the description of the table's row."""
-    why = reason("engaged", since_sent_ns=TIMEOUT_NS)
-    assert why in {row.description for row in TABLE if row.target == "lost"}
+    reason_text = reason("engaged", since_sent_ns=TIMEOUT_NS)
+    assert reason_text in {row.description for row in TABLE if row.target == "lost"}
     assert reason("engaged", wanted=False) in {row.description for row in TABLE if row.target == "parking"}
 
 

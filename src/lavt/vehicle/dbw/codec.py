@@ -110,7 +110,7 @@ class Codec:
         }
 
     def encode(self, message: str, values: Mapping[str, float], *, length: int | None = None) -> bytes:
-        """Encode a message and cut it to `length` bytes. Signals that are not given have the raw number 0.
+        """Encode a message and cut it to `length` bytes. A signal without a value has the raw number 0.
 
         Values are rounded to the nearest step. Raises ValueError for a message or signal that is not in the DBC, for a
         signal that its multiplexer excludes from this frame, and for a value out of range.

@@ -125,7 +125,7 @@ class SpeedMonitor:
 
     @property
     def speed_mps(self) -> float:
-        """The speed to drive by.
+        """The speed to drive with.
 
         It is `speed`, or the largest of all speeds if `speed` is implausible or that of a stationary car.
         """
