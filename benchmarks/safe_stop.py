@@ -13,17 +13,17 @@ from itertools import groupby
 from operator import itemgetter
 
 from matplotlib.figure import Figure
-from tests.safety.stops import ALLOWED_M, ROUTES, Curve, Stop, stops
+from tests.safety.stops import ALLOWED_BEYOND_M, ROUTES, Curve, Stop, StopPair, stops
 
 from lavt.experiment.report.figure_style import COLOURS, new_figure
 
-CurveStops = list[tuple[Curve, Stop, Stop]]
+CurveStops = list[StopPair]
 FOLLOWING, HOLDING = "along the path", "wheel held"
 
 
 def count_beyond(curve_stops: Sequence[Stop]) -> int:
     """Return how many stops left the lane by more than the allowed distance."""
-    return sum(stop.beyond_m > ALLOWED_M for stop in curve_stops)
+    return sum(stop.beyond_m > ALLOWED_BEYOND_M for stop in curve_stops)
 
 
 def format_worst(curve_stops: Sequence[Stop]) -> str:
@@ -54,7 +54,7 @@ def draw(curve_stops: CurveStops) -> Figure:
                 places = [stop.at_m for stop in group], [stop.beyond_m for stop in group]
                 axis.plot(*places, color=colour, label=name)
         axis.axhline(0.0, color="0.5", linewidth=0.8)
-        axis.axhline(ALLOWED_M, color="black", linewidth=0.8, linestyle="--")
+        axis.axhline(ALLOWED_BEYOND_M, color="black", linewidth=0.8, linestyle="--")
         axis.set_title(f"route {route}", fontsize="medium")
     for axis in axes[-2:]:
         axis.set_xlabel("last command at (m along the route)")

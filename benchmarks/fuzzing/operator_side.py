@@ -9,8 +9,8 @@ from benchmarks.fuzzing.mutation import Chance, Corpus
 from benchmarks.fuzzing.target import START, NodeBench, Target, expect, payloads_on, total
 from msgspec.structs import replace
 
+from lavt.control.client_limits import CLIENT_LIMITS
 from lavt.control.drive_controller import PRESETS, make_controller
-from lavt.control.driver_limits import CLIENT_LIMITS
 from lavt.domain import (
     NS_PER_MS,
     NS_PER_S,

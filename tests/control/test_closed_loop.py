@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from lavt.control.client_limits import CLIENT_LIMITS
 from lavt.control.drive_controller import PRESETS, make_controller
-from lavt.control.driver_limits import CLIENT_LIMITS
 from lavt.control.lane_watch import LaneState, LaneWatch
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation, CameraModel, Picture
 from lavt.perception.lane_detector import LaneDetector

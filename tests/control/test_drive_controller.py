@@ -11,10 +11,10 @@ from lavt.control.drive_controller import (
     LaneKeeper,
     Preset,
     SpeedPi,
-    confident_speed_mps,
     find_preset,
     make_controller,
     pedals,
+    speed_for_confidence_mps,
 )
 from lavt.control.lane_watch import BRAKE_AFTER_NS, STOP_AFTER_NS
 from lavt.control.pure_pursuit import curvature_per_m
@@ -189,4 +189,4 @@ def test_pedals(acceleration_mps2: float, expected: tuple[float, float]) -> None
 @pytest.mark.parametrize(("confidence", "share"), [(1.0, 1.0), (0.5, 1.0), (0.3, 0.6), (0.0, 0.4)])
 def test_lower_confidence_lowers_the_speed(confidence: float, share: float) -> None:
     """Full speed down to confidence 0.5, in proportion below that, never less than 0.4 of it."""
-    assert confident_speed_mps(10.0, confidence) == pytest.approx(10 * share)
+    assert speed_for_confidence_mps(10.0, confidence) == pytest.approx(10 * share)

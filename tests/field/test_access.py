@@ -33,7 +33,7 @@ from tests.field.secured_routers import (
 from tests.require import need
 from tests.support.stalls import BUSY_SHARE, LONG_STALL_MS, SharedResult, Stalls
 
-from lavt.control.driver_limits import CLIENT_LIMITS
+from lavt.control.client_limits import CLIENT_LIMITS
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.experiment.runs.processes import Processes
 from lavt.recording.record import Record

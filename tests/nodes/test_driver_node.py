@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from tests.nodes.stand_ins import MONO_NS, SMALL, WALL_NS, at, give, noise, of
 
 from lavt.channels import CHANNELS
-from lavt.control.driver_limits import CLIENT_LIMITS
+from lavt.control.client_limits import CLIENT_LIMITS
 from lavt.domain import (
     NS_PER_MS,
     NS_PER_S,

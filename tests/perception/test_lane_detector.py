@@ -10,7 +10,7 @@ from lavt.domain import CameraModel, Lane, Picture, SeenLane
 from lavt.perception.bird_eye import STAMP_SIDE_PX
 from lavt.perception.calibration import CalibratedCamera, calibrated
 from lavt.perception.lane_detector import (
-    FORGET_AFTER,
+    FORGET_AFTER_PICTURES,
     SMOOTHING,
     TRACK_CONFIDENCE,
     GroundTruthLaneDetector,
@@ -88,7 +88,7 @@ def test_an_empty_picture_has_no_confidence(scene: Scene) -> None:
     detector = LaneDetector(MODEL)
     assert detector.detect(GREY).confidence == 0
     last_lane = detector.detect(scene.picture(LANE, 1 / 87))
-    for _ in range(FORGET_AFTER + 2):
+    for _ in range(FORGET_AFTER_PICTURES + 2):
         empty = detector.detect(GREY)
         assert empty.confidence == 0
         assert empty.centre == last_lane.centre
@@ -239,8 +239,8 @@ def test_the_last_lane_is_kept_with_low_confidence() -> None:
     """A lane of low confidence changes only the confidence; after several, or `forget`, the average restarts."""
     detector = GroundTruthLaneDetector()
     detector.detect(true_lane(1.0))
-    lost = [detector.detect(true_lane(5.0, confidence=0.1)) for _ in range(FORGET_AFTER)]
-    assert [(lane.centre[0], lane.confidence) for lane in lost] == [(1.0, 0.1)] * FORGET_AFTER
+    lost = [detector.detect(true_lane(5.0, confidence=0.1)) for _ in range(FORGET_AFTER_PICTURES)]
+    assert [(lane.centre[0], lane.confidence) for lane in lost] == [(1.0, 0.1)] * FORGET_AFTER_PICTURES
     assert detector.detect(true_lane(3.0)).centre[0] == 3.0
     detector.forget()
     assert detector.detect(true_lane(7.0)).centre[0] == 7.0

@@ -97,7 +97,7 @@ class Rig:
         return self
 
     def arm_for(self, duration_ns: int) -> None:
-        """Send an arm command from a new picture every tick, the last one at the very end of `duration_ns`."""
+        """Send an arm command from a new picture every `TICK_NS`, the last one at the end of `duration_ns`."""
         self.picture()
         self.send()
         for _ in range(duration_ns // TICK_NS):
@@ -120,7 +120,7 @@ class Rig:
         return self
 
     def clear(self, who: str = "alice", instance: int = 1, number: int | None = None) -> SessionReply:
-        """Request to clear the last emergency stop that the vehicle reported, or the given one."""
+        """Request to clear the last emergency stop that the vehicle reported, or the one with `number`."""
         last = self.request("acquire", who, instance).emergency_stop
         return self.request("clear_emergency_stop", who, instance, last if number is None else number)
 

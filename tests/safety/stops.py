@@ -1,4 +1,4 @@
-"""Safe stops from every metre of a route's curves: the last command arrives there.
+"""Safe stops whose last command arrives at each metre of a route's curves.
 
 A route is driven once in virtual time at L0. The car starts at 30 km/h, because the curves of the key routes come
 before it could reach that speed. Pictures are rendered and the lane is detected in them (`fidelity: pixels`), so that
@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from itertools import groupby, repeat
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
 from lavt.config import RunConfig
 from lavt.config_file import parse_config
@@ -29,11 +30,13 @@ from lavt.vehicle.sim.simulator import Simulator
 
 ROUTES = ("a", "a_key", "b", "b_key", "c", "c_key")
 SPEED_MPS = 30 / 3.6
-BEFORE_M = 16.0
-"""A stop that begins this far before a curve ends in it: the car covers 14 m after its last command."""
-FIRST_M = 5.0
-"""A drive begins up to 2 m into its route, and 3 m later has a command from a picture taken at 30 km/h."""
-ALLOWED_M = 0.3
+LEAD_M = 16.0
+"""The first stop of a curve begins this far before it. As the car covers 14 m after its last command, the stop ends at
+the curve."""
+FIRST_STOP_M = 5.0
+"""No stop begins before this station: a drive begins up to 2 m into its route, and its first command from a picture
+that was taken at 30 km/h comes 3 m later."""
+ALLOWED_BEYOND_M = 0.3
 """Allowed distance of a corner of the body beyond the lane's edge."""
 
 
@@ -47,7 +50,7 @@ class Curve:
     radius_m: float
     """The smallest radius; left positive."""
     first_m: float
-    """Station of the first stop: before the curve, so that it ends in it, but not in the previous curve."""
+    """Station of the first stop: `LEAD_M` before the curve, but not in the previous curve."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,19 +68,29 @@ class Stop:
     """Safety state at standstill."""
 
 
+class StopPair(NamedTuple):
+    """Two stops after the same last command."""
+
+    curve: Curve
+    followed: Stop
+    """With path following."""
+    held: Stop
+    """Without path following: the wheel keeps its angle."""
+
+
 def curves(route: str, road: Road) -> list[Curve]:
     """Return the curves of a route: its segments that are not straight, joined if they bend to the same side."""
     found: list[Curve] = []
-    s_m, before_m = road.first_m, FIRST_M
+    s_m, before_m = road.first_m, FIRST_STOP_M
     for bend, pieces in groupby(
-        road.segments, key=lambda each: (each.curvature_per_m > 0) - (each.curvature_per_m < 0)
+        road.segments, key=lambda segment: (segment.curvature_per_m > 0) - (segment.curvature_per_m < 0)
     ):
         segments = list(pieces)
-        end_m = s_m + sum(each.length_m for each in segments)
+        end_m = s_m + sum(segment.length_m for segment in segments)
         if bend and s_m < road.length_m and end_m > 0:
-            tightest = max((each.curvature_per_m for each in segments), key=abs)
+            tightest = max((segment.curvature_per_m for segment in segments), key=abs)
             end_m = min(end_m, road.length_m)
-            found.append(Curve(route, max(s_m, 0.0), end_m, 1 / tightest, max(s_m - BEFORE_M, before_m)))
+            found.append(Curve(route, max(s_m, 0.0), end_m, 1 / tightest, max(s_m - LEAD_M, before_m)))
             before_m = end_m
         s_m = end_m
     return found
@@ -88,8 +101,8 @@ def metres(curve: Curve) -> range:
     return range(math.ceil(curve.first_m), math.floor(curve.to_m) + 1)
 
 
-def stops(route: str, condition: str = "L0") -> Iterator[tuple[Curve, Stop, Stop]]:
-    """Drive a route, and yield for each metre of each curve the stop with and without path following."""
+def stops(route: str, condition: str = "L0") -> Iterator[StopPair]:
+    """Drive a route, and yield the stops from each metre of each curve, with and without path following."""
     config = {
         "vehicle": {"route": route, "scenery": "none"},
         "network": {"inherent": "paper_wifi5", "condition": condition},
@@ -107,9 +120,9 @@ def stops(route: str, condition: str = "L0") -> Iterator[tuple[Curve, Stop, Stop
             for metre in metres(curve):
                 _drive_to(loop, car, metre)
                 node = _copied(actuator_of(loop))
-                held = _copied(node)
-                held.gate.watchdog._path.clear_path()  # disables path following
-                yield curve, _stopped(node), _stopped(held)
+                node_without_path = _copied(node)
+                node_without_path.gate.watchdog._path.clear_path()  # disables path following
+                yield StopPair(curve, _stopped(node), _stopped(node_without_path))
         for writer in loop.writers:
             writer.close()
 

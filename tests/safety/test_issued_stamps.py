@@ -21,7 +21,7 @@ def test_an_issued_stamp_is_known() -> None:
 
 @pytest.mark.parametrize(("age_ns", "known"), [(MEMORY_NS, True), (MEMORY_NS + 1, False)])
 def test_a_stamp_expires_exactly(age_ns: int, *, known: bool) -> None:
-    """A stamp is known for the length of the memory and no nanosecond longer, also when no other was issued."""
+    """A stamp is known for the length of the memory and no nanosecond longer, whether or not another one is issued."""
     for others in (False, True):
         stamps = IssuedStamps(MEMORY_NS, 5)
         stamps.add(777, 3, 100, 1)
@@ -41,7 +41,7 @@ def test_a_stamp_issued_twice_counts_as_the_newer_frame() -> None:
 
 
 def test_capture_time() -> None:
-    """The capture time is the camera's, else or if it is later the time of issue; equal pictures keep the first's."""
+    """The capture time is the camera's, at most the time of issue; equal pictures have that of the first one."""
     stamps = IssuedStamps(MEMORY_NS, 5)
     added = ((1, 100, 7, 90), (2, 200, 8, None), (3, 300, 8, 290), (4, 400, 9, 390), (5, 500, 10, 501))
     for stamp_ns, mono_ns, crc, captured_ns in added:
@@ -58,7 +58,7 @@ def test_only_the_last_5_s_are_kept(frames: list[tuple[int, int]]) -> None:
         now_ns += passed_ns
         stamps.add(stamp_ns, number, now_ns, number)
         last[stamp_ns] = (number, now_ns, now_ns)
-    alive = {stamp_ns: each for stamp_ns, each in last.items() if now_ns - each[1] <= MEMORY_NS}
+    alive = {stamp_ns: frame for stamp_ns, frame in last.items() if now_ns - frame[1] <= MEMORY_NS}
     assert stamps._issued == alive
     assert all(stamps.issued_ns(stamp_ns, now_ns) == at_ns for stamp_ns, (_, at_ns, _) in alive.items())
 

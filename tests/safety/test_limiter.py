@@ -158,8 +158,8 @@ def limited_at_excess(
 
 def test_excess_speed_is_braked_away() -> None:
     """Above the limit the throttle is removed and each m/s of excess brakes with 4 m/s2, at most a safe stop."""
-    full = LIMITS.stop_deceleration_mps2 / 6.0
-    for excess_mps, brake in ((0.25, full / 4), (1.0, full), (3.0, full)):
+    safe_stop_brake = LIMITS.stop_deceleration_mps2 / 6.0
+    for excess_mps, brake in ((0.25, safe_stop_brake / 4), (1.0, safe_stop_brake), (3.0, safe_stop_brake)):
         actuation, changed = limited_at_excess(Actuation(0.0, 0.8, 0.0), excess_mps)
         assert (actuation.throttle, changed) == (0.0, ("stopping distance",))
         assert actuation.brake == pytest.approx(brake)
@@ -167,11 +167,11 @@ def test_excess_speed_is_braked_away() -> None:
 
 def test_excess_speed_changes_either_pedal_alone() -> None:
     """Above the limit a throttle is removed also under a harder brake, and the brake is applied without one."""
-    full = LIMITS.stop_deceleration_mps2 / 6.0
+    safe_stop_brake = LIMITS.stop_deceleration_mps2 / 6.0
     assert limited_at_excess(Actuation(0.0, 0.8, 0.9), 1.0) == (Actuation(0.0, 0.0, 0.9), ("stopping distance",))
     actuation, changed = limited_at_excess(Actuation(0.0, 0.0, 0.1), 1.0)
     assert (actuation.throttle, changed) == (0.0, ("stopping distance",))
-    assert actuation.brake == pytest.approx(full)
+    assert actuation.brake == pytest.approx(safe_stop_brake)
 
 
 def test_the_stopping_distance_limit_releases_no_brake() -> None:

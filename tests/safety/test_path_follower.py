@@ -21,11 +21,11 @@ BEND_RAD = steering_rad(0.03, WHEELBASE_M)
 S_BEND = (0.0, 0.01, 0.02, 0.03, 0.03, 0.02, 0.0, -0.02, -0.03, -0.03)
 
 
-def new() -> PathFollower:
+def new_follower() -> PathFollower:
     return PathFollower(WHEELBASE_M, 5 * NS_PER_S)
 
 
-def seen(passed_ns: int, speed_mps: float, angle_rad: float = 0.0) -> VehicleState:
+def report_at(passed_ns: int, speed_mps: float, angle_rad: float = 0.0) -> VehicleState:
     return replace(vehicle_at(speed_mps, angle_rad), mono_ns=START_NS + passed_ns)
 
 
@@ -42,35 +42,35 @@ def stop(path: tuple[float, ...], *, every: int, picture_age_s: float = 0.0, ang
 
     The picture was taken `picture_age_s` before braking begins; until then the car drives the first curvature.
     """
-    follower, pose, covered_m, wanted_rad = new(), (0.0, 0.0, 0.0), 0.0, angle_rad
+    follower, pose, covered_m, target_rad = new_follower(), (0.0, 0.0, 0.0), 0.0, angle_rad
     for step in range(10_000):
         passed_s = step * STEP_S
         speed_mps = 30 / 3.6 - 4 * max(0.0, passed_s - picture_age_s)
         if speed_mps <= 0:
             break
         if step % every == 0:
-            follower.update_odometry(seen(round(passed_s * NS_PER_S), speed_mps, angle_rad))
+            follower.update_odometry(report_at(round(passed_s * NS_PER_S), speed_mps, angle_rad))
             if passed_s >= picture_age_s:
                 if follower.steering_rad(START_NS) is None:
                     follower.set_path(steering_rad(path[0], WHEELBASE_M), path, START_NS)
-                wanted_rad = follower.steering_rad(START_NS + round(passed_s * NS_PER_S)) or 0.0
-        angle_rad += (wanted_rad - angle_rad) * (1 - math.exp(-STEP_S / LAG_S))
+                target_rad = follower.steering_rad(START_NS + round(passed_s * NS_PER_S)) or 0.0
+        angle_rad += (target_rad - angle_rad) * (1 - math.exp(-STEP_S / LAG_S))
         pose = move_along_arc(pose, speed_mps * STEP_S, curvature_per_m(angle_rad, WHEELBASE_M))
         covered_m += speed_mps * STEP_S
     return Stopping(covered_m, pose, angle_rad)
 
 
-def lateral_offset_m(path: tuple[float, ...], done: Stopping) -> float:
+def lateral_offset_m(path: tuple[float, ...], stopped_car: Stopping) -> float:
     """Return the lateral distance from the path to the stopped car."""
-    on_x_m, on_y_m, heading_rad = pose_along_path((0.0, 0.0, 0.0), (path[0], *path), done.covered_m)
-    x_m, y_m, _ = done.pose
+    on_x_m, on_y_m, heading_rad = pose_along_path((0.0, 0.0, 0.0), (path[0], *path), stopped_car.covered_m)
+    x_m, y_m, _ = stopped_car.pose
     return (y_m - on_y_m) * math.cos(heading_rad) - (x_m - on_x_m) * math.sin(heading_rad)
 
 
 def test_without_a_path_there_is_no_angle() -> None:
     """Before the first path and after clearing it, no steering angle is returned."""
-    follower = new()
-    follower.update_odometry(seen(0, 8.0))
+    follower = new_follower()
+    follower.update_odometry(report_at(0, 8.0))
     assert follower.steering_rad(START_NS) is None
     follower.set_path(0.0, BEND, START_NS)
     assert follower.steering_rad(START_NS) is not None
@@ -80,11 +80,11 @@ def test_without_a_path_there_is_no_angle() -> None:
 
 def test_a_circular_path() -> None:
     """On a path of constant curvature the angle is the kinematic car's, also past the last point."""
-    follower = new()
-    follower.update_odometry(seen(0, 8.0, BEND_RAD))
+    follower = new_follower()
+    follower.update_odometry(report_at(0, 8.0, BEND_RAD))
     follower.set_path(BEND_RAD, BEND, START_NS)
     for passed_ns in (0, NS_PER_S, 4 * NS_PER_S):  # 0, 8 and 32 m
-        follower.update_odometry(seen(passed_ns, 8.0, BEND_RAD))
+        follower.update_odometry(report_at(passed_ns, 8.0, BEND_RAD))
         assert follower.steering_rad(START_NS + passed_ns) == pytest.approx(BEND_RAD, abs=1e-6)
 
 
@@ -92,23 +92,23 @@ def test_a_circular_path() -> None:
 @pytest.mark.parametrize("path", [BEND, S_BEND])
 def test_a_car_with_steering_lag_stops_on_the_path(path: tuple[float, ...], every: int) -> None:
     """A car with steering lag stops from 30 km/h within 0.15 m of its path, sampled at 240 or 30 Hz."""
-    done = stop(path, every=every)
-    assert done.covered_m > 8
-    assert abs(lateral_offset_m(path, done)) < 0.15
+    stopped_car = stop(path, every=every)
+    assert stopped_car.covered_m > 8
+    assert abs(lateral_offset_m(path, stopped_car)) < 0.15
 
 
 def test_the_path_begins_where_the_picture_was_taken() -> None:
     """A path from a picture that is 0.5 s old begins where that picture was taken."""
-    done = stop(S_BEND, every=1, picture_age_s=0.5)
-    assert done.covered_m > 12
-    assert abs(lateral_offset_m(S_BEND, done)) < 0.15
+    stopped_car = stop(S_BEND, every=1, picture_age_s=0.5)
+    assert stopped_car.covered_m > 12
+    assert abs(lateral_offset_m(S_BEND, stopped_car)) < 0.15
 
 
 def test_a_car_off_its_path_returns_to_it() -> None:
     """A car that drove straight on for 0.6 s in a bend steers to the same side, more than the bend does."""
-    follower = new()
+    follower = new_follower()
     for passed_ns in range(0, 600 * NS_PER_MS + 1, 20 * NS_PER_MS):
-        follower.update_odometry(seen(passed_ns, 8.0))
+        follower.update_odometry(report_at(passed_ns, 8.0))
     follower.set_path(BEND_RAD, BEND, START_NS)
     followed_rad = follower.steering_rad(START_NS + 600 * NS_PER_MS)
     assert followed_rad is not None
@@ -127,9 +127,9 @@ def test_the_angle_is_always_valid(
     path: tuple[float, ...], angle_rad: float, reports: list[tuple[float, float]]
 ) -> None:
     """For any path that can be received and any motion, the angle is finite and below 90 degrees."""
-    follower = new()
+    follower = new_follower()
     for number, report in enumerate(reports):
-        follower.update_odometry(seen(number * 100 * NS_PER_MS, *report))
+        follower.update_odometry(report_at(number * 100 * NS_PER_MS, *report))
         follower.set_path(angle_rad, path, START_NS)
         followed_rad = follower.steering_rad(START_NS + number * 100 * NS_PER_MS)
         assert followed_rad is not None

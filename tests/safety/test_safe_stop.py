@@ -11,7 +11,7 @@ from __future__ import annotations
 from functools import cache
 
 import pytest
-from tests.safety.stops import ALLOWED_M, ROUTES, SPEED_MPS, Curve, Stop, curves, metres, stops
+from tests.safety.stops import ALLOWED_BEYOND_M, ROUTES, SPEED_MPS, StopPair, curves, metres, stops
 
 from lavt.config import RunConfig
 from lavt.config_file import parse_config
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.full
 
 
 @cache
-def stops_of(route: str) -> list[tuple[Curve, Stop, Stop]]:
+def stops_of(route: str) -> list[StopPair]:
     """Return the stops of a route, which is driven once for all tests."""
     return list(stops(route))
 
@@ -34,9 +34,9 @@ def stops_of(route: str) -> list[tuple[Curve, Stop, Stop]]:
 def test_all_curves_of_the_six_routes_are_tested() -> None:
     """All bends of the six routes are tested: ten curves, with radii down to 42 m."""
     found = [
-        (each.route, round(each.from_m), round(each.to_m), round(each.radius_m))
+        (curve.route, round(curve.from_m), round(curve.to_m), round(curve.radius_m))
         for route in ROUTES
-        for each in curves(route, load_road(route))
+        for curve in curves(route, load_road(route))
     ]
     assert found == [
         ("a", 26, 92, -42),
@@ -55,33 +55,33 @@ def test_all_curves_of_the_six_routes_are_tested() -> None:
 @pytest.mark.parametrize("route", ROUTES)
 def test_the_stops_begin_at_every_metre(route: str) -> None:
     """The stops begin a metre apart, from 16 m before each curve to its end, at 30 km/h +- 1 km/h."""
-    done = stops_of(route)
+    pairs = stops_of(route)
     expected = [metre for curve in curves(route, load_road(route)) for metre in metres(curve)]
-    assert [int(stop.at_m) for _, stop, _ in done] == expected
-    assert all(abs(stop.speed_mps - SPEED_MPS) < 1 / 3.6 for _, stop, _ in done)
+    assert [int(pair.followed.at_m) for pair in pairs] == expected
+    assert all(abs(pair.followed.speed_mps - SPEED_MPS) < 1 / 3.6 for pair in pairs)
 
 
 @pytest.mark.parametrize("route", ROUTES)
 def test_a_safe_stop_stays_in_the_lane(route: str) -> None:
     """A safe stop from 30 km/h anywhere in a curve stays in the lane plus 0.3 m."""
-    followed = [stop for _, stop, _ in stops_of(route)]
+    followed = [pair.followed for pair in stops_of(route)]
     assert {stop.ended for stop in followed} == {"safe_stop"}
-    assert max(stop.beyond_m for stop in followed) <= ALLOWED_M
+    assert max(stop.beyond_m for stop in followed) <= ALLOWED_BEYOND_M
     assert max(stop.covered_m for stop in followed) < PATH_STEP_M * PATH_POINTS
 
 
 @pytest.mark.parametrize("route", ["a", "a_key", "b"])
 def test_a_stop_with_the_wheel_held_leaves_the_lane(route: str) -> None:
     """With the wheel held, stops in tight bends leave the lane plus 0.3 m, so path following is needed."""
-    done = stops_of(route)
-    assert {held.ended for _, _, held in done} == {"safe_stop"}
-    assert max(held.beyond_m for _, _, held in done) > ALLOWED_M
+    held = [pair.held for pair in stops_of(route)]
+    assert {stop.ended for stop in held} == {"safe_stop"}
+    assert max(stop.beyond_m for stop in held) > ALLOWED_BEYOND_M
 
 
 def test_a_safe_stop_under_delay_stays_in_the_lane() -> None:
-    """At L3, with pictures 2.5 m old, the car stops 0.1 m inside its lane; with the wheel held, 1 m outside."""
+    """At L3, 2.5 m beyond its last picture, the car stops 0.1 m inside its lane; with the wheel held, 1 m outside."""
     _, followed, held = zip(*stops("a", "L3"), strict=True)
-    assert max(stop.beyond_m for stop in followed) < -0.1  # it is + 0.02 m if the path begins where its command arrived
+    assert max(stop.beyond_m for stop in followed) < -0.1  # + 0.02 m if the path began where its command arrived
     assert max(stop.beyond_m for stop in held) > 1.0
 
 
@@ -94,9 +94,9 @@ def test_with_old_pictures_the_car_drives_slower() -> None:
         "safety": {"picture_age_limit_ms": 2000.0},
         "fidelity": "geometry",
     }
-    seen = drive_monitored(plan_run(parse_config(RunConfig, config, "the test")), limit_s=25)
-    speeds_mps = seen.speed_mps[seen.time_s > 10]
-    allowed_mps = stopping_speed_limit_mps(seen.total_delay_ms / 1000, LIMITS)
+    run = drive_monitored(plan_run(parse_config(RunConfig, config, "the test")), limit_s=25)
+    speeds_mps = run.speed_mps[run.time_s > 10]
+    allowed_mps = stopping_speed_limit_mps(run.total_delay_ms / 1000, LIMITS)
     assert allowed_mps < SPEED_MPS - 0.2
     assert max(abs(speeds_mps - allowed_mps)) < 0.1
-    assert len(seen.limited_s[seen.limited_s > 10]) > 100
+    assert len(run.limited_s[run.limited_s > 10]) > 100

@@ -19,13 +19,13 @@ def test_arming_takes_a_full_second() -> None:
     rig = Rig().acquire()
     rig.picture()
     rig.send()
-    begun_ns = rig.now_ns
+    began_ns = rig.now_ns
     assert rig.state == "arming"
     for _ in range(49):
         rig.go(TICK_NS)
         rig.picture()
         rig.send()
-    rig.go(begun_ns + NS_PER_S - 1 - rig.now_ns)
+    rig.go(began_ns + NS_PER_S - 1 - rig.now_ns)
     rig.picture()
     rig.send()
     assert rig.state == "arming"
@@ -64,7 +64,7 @@ def rolls_between_commands(rig: Rig) -> None:
     rig.vehicle = vehicle_at()
 
 
-BREAKS: dict[str, Callable[[Rig], object]] = {
+ARMING_VIOLATIONS: dict[str, Callable[[Rig], object]] = {
     "throttle": lambda rig: rig.send(throttle=0.01),
     "brake eased": lambda rig: rig.send(brake=0.29),
     "steering to the left": lambda rig: rig.send(steering_rad=0.11),
@@ -82,13 +82,13 @@ BREAKS: dict[str, Callable[[Rig], object]] = {
 }
 
 
-@pytest.mark.parametrize("name", sorted(BREAKS))
+@pytest.mark.parametrize("name", sorted(ARMING_VIOLATIONS))
 def test_an_unmet_condition_restarts_arming(name: str) -> None:
     """A condition that fails 0.6 s into arming restarts the second."""
     rig = Rig().acquire()
     rig.arm_for(600 * NS_PER_MS)
     assert rig.state == "arming"
-    BREAKS[name](rig)
+    ARMING_VIOLATIONS[name](rig)
     assert rig.state in ("disarmed", "arming")
     rig.arm_for(980 * NS_PER_MS)
     assert rig.state == "arming"
@@ -101,7 +101,7 @@ def test_arming_does_not_begin_with_an_unmet_condition(name: str) -> None:
     """An arm command with an unmet condition leaves the vehicle disarmed."""
     rig = Rig().acquire()
     rig.picture()
-    BREAKS[name](rig)
+    ARMING_VIOLATIONS[name](rig)
     assert rig.state == "disarmed"
 
 
@@ -116,7 +116,7 @@ def test_arming_does_not_begin_with_an_unmet_condition(name: str) -> None:
     ids=str,
 )
 def test_arming_begins_at_the_bounds_of_its_conditions(changes: dict[str, Any]) -> None:
-    """The lightest brake, the largest steering input and the first sequence number suffice for arming."""
+    """Arming begins with the lightest allowed brake, the largest neutral steering input and the first sequence."""
     rig = Rig().acquire()
     rig.picture()
     assert rig.send(**changes).accepted

@@ -14,8 +14,10 @@ from lavt.safety.limits import LIMITS
 DEGRADED_NS, STOP_NS = 300 * NS_PER_MS, 500 * NS_PER_MS
 
 
-def reasons(rig: Rig) -> dict[str, int]:
-    return {key.removeprefix("rejected: "): n for key, n in rig.gate.counts.items() if key.startswith("rejected: ")}
+def rejection_counts(rig: Rig) -> dict[str, int]:
+    return {
+        key.removeprefix("rejected: "): count for key, count in rig.gate.counts.items() if key.startswith("rejected: ")
+    }
 
 
 def test_a_valid_command_is_accepted_unchanged() -> None:
@@ -42,11 +44,11 @@ def test_a_rejected_command_has_a_reason_and_is_counted() -> None:
         ({"stamp_ns": forgotten_ns + 1}, RejectionReason.UNKNOWN_STAMP),
         ({"mode": "arm", "throttle": 0.0}, RejectionReason.ALREADY_ARMED),
     ):
-        before = reasons(rig).get(reason, 0)
+        before = rejection_counts(rig).get(reason, 0)
         verdict = rig.drive(**changes)
         assert (verdict.accepted, verdict.reason) == (False, reason)
         assert rig.gate.rejected == verdict.message == reason.value
-        assert reasons(rig)[reason] == before + 1
+        assert rejection_counts(rig)[reason] == before + 1
     assert rig.now_ns == now_ns
     assert rig.actuation().throttle == 0.25
 

@@ -18,8 +18,8 @@ from lavt.safety.gate import INTERRUPTS_ARMING
 from lavt.safety.limits import LIMITS
 from lavt.safety.state_machine import TRANSITIONS
 
-STEPS = {(before, after) for (before, _), after in TRANSITIONS.items()}
-WIRE = {
+TABLE_TRANSITIONS = {(before, after) for (before, _), after in TRANSITIONS.items()}
+COMMAND_VALUES = {
     "steering_rad": st.floats(-1, 1),
     "throttle": st.floats(0, 1),
     "brake": st.floats(0, 1),
@@ -30,7 +30,7 @@ WIRE = {
     "stamp_ns": st.integers(0, 2**63 - 1),
     "emergency_stop": st.sampled_from([0, 0, 0, 1, 2, 3]),
 }
-"""All values that `decode` accepts."""
+"""All values of a command that `decode` accepts."""
 SPEEDS = st.one_of(st.just(0.0), st.floats(-5, 40), st.just(math.nan))
 
 
@@ -55,14 +55,16 @@ class GateMachine(RuleBasedStateMachine):
         verdict = rig.gate.admit(command, rig.vehicle, rig.now_ns)
         if verdict.accepted and command.stamp_ns == rig.stamp_ns and rig.frame > self.newest_used:
             self.newest_used, self.used_ns = rig.frame, rig.now_ns
-        fresh = rig.now_ns - self.used_ns < LIMITS.degraded_after_ns
-        neutral = command.throttle == 0 and abs(command.steering_rad) <= LIMITS.arming_steering_rad
-        good = is_valid and command.mode == "arm" and neutral and fresh and command.brake >= LIMITS.arming_brake
-        kept = good and verdict.accepted and abs(rig.vehicle.speed_mps) < LIMITS.standstill_mps
-        if not kept and (verdict.accepted or verdict.reason in INTERRUPTS_ARMING):
+        is_fresh = rig.now_ns - self.used_ns < LIMITS.degraded_after_ns
+        is_neutral = command.throttle == 0 and abs(command.steering_rad) <= LIMITS.arming_steering_rad
+        is_braked = command.brake >= LIMITS.arming_brake
+        is_stationary = abs(rig.vehicle.speed_mps) < LIMITS.standstill_mps
+        is_arming = is_valid and command.mode == "arm" and is_neutral and is_fresh and is_braked
+        are_conditions_met = is_arming and verdict.accepted and is_stationary
+        if not are_conditions_met and (verdict.accepted or verdict.reason in INTERRUPTS_ARMING):
             self.met_since_ns = None
         self.transitions_follow_the_table()
-        if kept and self.met_since_ns is None:
+        if are_conditions_met and self.met_since_ns is None:
             self.met_since_ns = rig.now_ns
 
     @rule()
@@ -79,13 +81,16 @@ class GateMachine(RuleBasedStateMachine):
             self.rig.picture()
             self.send()
 
-    @rule(changes=st.fixed_dictionaries({}, optional=WIRE))
+    @rule(changes=st.fixed_dictionaries({}, optional=COMMAND_VALUES))
     def any_command(self, changes: dict[str, Any]) -> None:
         self.send(**changes)
 
     @rule(
         changes=st.fixed_dictionaries(
-            {}, optional={k: WIRE[k] for k in ("steering_rad", "throttle", "brake", "path_curvature_per_m")}
+            {},
+            optional={
+                name: COMMAND_VALUES[name] for name in ("steering_rad", "throttle", "brake", "path_curvature_per_m")
+            },
         )
     )
     def drive(self, changes: dict[str, Any]) -> None:
@@ -145,7 +150,7 @@ class GateMachine(RuleBasedStateMachine):
     def transitions_follow_the_table(self) -> None:
         for before, after, _ in self.rig.gate.machine.take_transitions():
             assert before == self.before
-            assert (before, after) in STEPS
+            assert (before, after) in TABLE_TRANSITIONS
             if (before, after) == ("arming", "driving"):
                 assert self.met_since_ns is not None
                 assert self.rig.now_ns - self.met_since_ns >= LIMITS.arming_hold_ns

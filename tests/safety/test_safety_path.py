@@ -21,7 +21,7 @@ LATER_LEFT = (0.0,) * 5 + (0.02,) * 5
 """Straight for 10 m, then left."""
 
 
-class Moving(Rig):
+class MovingRig(Rig):
     """A rig whose vehicle moves at constant speed, with the wheel at its target."""
 
     def roll(self, duration_ns: int, speed_mps: float = 8.0) -> Actuation:
@@ -37,7 +37,7 @@ class Moving(Rig):
         self.vehicle = msgspec.structs.replace(vehicle_at(speed_mps, angle_rad), mono_ns=self.now_ns)
         return self.actuation()
 
-    def on(self, path: tuple[float, ...], angle_rad: float = 0.0) -> Moving:
+    def drive_on(self, path: tuple[float, ...], angle_rad: float = 0.0) -> MovingRig:
         """Drive at 8 m/s with one command whose path is `path`."""
         self.armed()
         self.roll(TICK_NS)
@@ -48,13 +48,13 @@ class Moving(Rig):
 
 def test_before_the_timeout_the_command_steers() -> None:
     """Before the timeout, steering follows the last command, whatever its path."""
-    assert Moving().on(LEFT, 0.01).roll(280 * NS_PER_MS).steering_rad == 0.01
+    assert MovingRig().drive_on(LEFT, 0.01).roll(280 * NS_PER_MS).steering_rad == 0.01
 
 
 @pytest.mark.parametrize(("since_command_ns", "state"), [(400 * NS_PER_MS, "degraded"), (600 * NS_PER_MS, "safe_stop")])
 def test_a_command_timeout_steers_along_the_path(since_command_ns: int, state: str) -> None:
     """Degraded and in the safe stop, the vehicle steers along the last command's path."""
-    rig = Moving().on(LEFT)
+    rig = MovingRig().drive_on(LEFT)
     requested = rig.roll(since_command_ns)
     assert rig.state == state
     assert LEFT_RAD < requested.steering_rad < 3 * LEFT_RAD
@@ -62,7 +62,7 @@ def test_a_command_timeout_steers_along_the_path(since_command_ns: int, state: s
 
 def test_the_wheel_turns_where_the_path_bends() -> None:
     """On a path that bends after 10 m the wheel is straight before the bend and turned after it."""
-    rig = Moving().on(LATER_LEFT)
+    rig = MovingRig().drive_on(LATER_LEFT)
     assert abs(rig.roll(500 * NS_PER_MS).steering_rad) < 0.002
     assert rig.state == "safe_stop"
     assert rig.roll(2 * NS_PER_S).steering_rad == pytest.approx(LEFT_RAD, rel=0.1)
@@ -70,7 +70,7 @@ def test_the_wheel_turns_where_the_path_bends() -> None:
 
 def test_an_emergency_stop_follows_the_path_at_full_brake() -> None:
     """An emergency stop applies full brake and follows the path."""
-    rig = Moving().on(LEFT)
+    rig = MovingRig().drive_on(LEFT)
     rig.roll(TICK_NS)
     assert rig.request("emergency_stop", who="bob", number=1).granted
     requested = rig.roll(500 * NS_PER_MS)
@@ -82,7 +82,7 @@ def test_an_emergency_stop_follows_the_path_at_full_brake() -> None:
 @pytest.mark.parametrize("stop", ["stop", "release", "end_drive"])
 def test_every_stop_follows_the_path(stop: str) -> None:
     """A requested stop, a release and the end of the drive follow the path as well."""
-    rig = Moving().on(LEFT)
+    rig = MovingRig().drive_on(LEFT)
     if stop == "stop":
         rig.send(mode="stop")
     elif stop == "release":
@@ -94,7 +94,7 @@ def test_every_stop_follows_the_path(stop: str) -> None:
 
 def test_without_a_path_the_wheel_is_held() -> None:
     """Armed and moved before any drive command, the vehicle stops with its wheel still."""
-    rig = Moving()
+    rig = MovingRig()
     rig.vehicle = vehicle_at(0.0, 0.05)
     rig.armed()
     assert rig.roll(NS_PER_S).steering_rad == 0.05
@@ -103,7 +103,7 @@ def test_without_a_path_the_wheel_is_held() -> None:
 
 def test_at_standstill_the_path_is_dropped() -> None:
     """Once the stopped vehicle is stationary, its wheel stays still, also when the vehicle is moved later."""
-    rig = Moving().on(LATER_LEFT)
+    rig = MovingRig().drive_on(LATER_LEFT)
     rig.roll(STOP_NS)
     before = rig.roll(TICK_NS, speed_mps=0.0).steering_rad
     assert rig.roll(2 * NS_PER_S).steering_rad == before
@@ -111,7 +111,7 @@ def test_at_standstill_the_path_is_dropped() -> None:
 
 def test_a_new_drive_never_uses_an_old_path() -> None:
     """After arming again, a command timeout does not follow the path of the previous drive."""
-    rig = Moving().on(LEFT)
+    rig = MovingRig().drive_on(LEFT)
     rig.roll(STOP_NS)
     rig.request("acquire")
     rig.vehicle = msgspec.structs.replace(vehicle_at(0.0, 0.0), mono_ns=rig.now_ns)
@@ -125,7 +125,7 @@ def test_the_path_of_a_command_begins_where_its_picture_was_taken() -> None:
     """A path begins where its picture was taken, not where its command arrived."""
     steering = []
     for age_ns in (0, NS_PER_S):
-        rig = Moving(replace(LIMITS, picture_age_limit_ns=2 * NS_PER_S, degraded_after_ns=2 * NS_PER_S))
+        rig = MovingRig(replace(LIMITS, picture_age_limit_ns=2 * NS_PER_S, degraded_after_ns=2 * NS_PER_S))
         rig.armed()
         rig.roll(TICK_NS)
         stamp_ns = rig.picture()
@@ -140,7 +140,7 @@ def test_the_path_of_a_command_begins_where_its_picture_was_taken() -> None:
 
 def test_an_old_picture_slows_the_vehicle() -> None:
     """At 10 m/s, a command keeps its throttle up to a picture age of 0.25 s and is braked after that."""
-    rig = Moving().on((0.0,) * 10)
+    rig = MovingRig().drive_on((0.0,) * 10)
     assert rig.roll(240 * NS_PER_MS, 10.0).throttle == 0.5
     requested = rig.roll(40 * NS_PER_MS, 10.0)
     assert (rig.state, rig.gate.limiter.applied_limits) == ("driving", ("stopping distance",))

@@ -9,7 +9,7 @@ import pytest
 from msgspec.structs import replace
 from tests.safety.rig import Rig, vehicle_at
 
-from lavt.domain import NS_PER_S
+from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.safety.gate import RejectionReason
 
 FAULT: dict[str, Any] = {"inhibit_reason": "brake: fault", "is_engaged": False}
@@ -58,7 +58,7 @@ def test_a_vehicle_fault_stops_the_vehicle(state: str) -> None:
     """A fault while driving leads to a braked safe stop that reports the inhibit reason."""
     rig = Rig().driving()
     if state == "degraded":
-        rig.go(400_000_000)
+        rig.go(400 * NS_PER_MS)
     assert rig.state == state
     rig.vehicle = replace(vehicle_at(8.0), **FAULT)
     requested = rig.actuation()
@@ -83,7 +83,7 @@ def test_a_driver_override_disarms(state: str) -> None:
         rig.picture()
         rig.send()
     else:
-        rig.go({"driving": 0, "degraded": 400_000_000, "safe_stop": 600_000_000}[state])
+        rig.go({"driving": 0, "degraded": 400 * NS_PER_MS, "safe_stop": 600 * NS_PER_MS}[state])
     assert rig.state == state
     rig.vehicle = replace(vehicle_at(8.0), **OVERRIDE)
     epoch = rig.epoch
@@ -116,10 +116,10 @@ def test_the_vehicle_is_engaged_until_it_is_stationary() -> None:
     """The vehicle must be engaged while active, and after a stop until standstill."""
     rig = Rig()
     assert not rig.gate.watchdog.should_engage(vehicle_at())
-    assert not rig.gate.watchdog.should_engage(vehicle_at(8.0)), "it was never armed: a driver moves it"
+    assert not rig.gate.watchdog.should_engage(vehicle_at(8.0)), "a driver moves a vehicle that was never armed"
     rig.driving()
     assert rig.gate.watchdog.should_engage(vehicle_at())
-    rig.go(600_000_000)
+    rig.go(600 * NS_PER_MS)
     assert rig.gate.watchdog.should_engage(vehicle_at(8.0))
     assert not rig.gate.watchdog.should_engage(vehicle_at())
 
@@ -132,7 +132,7 @@ def test_after_a_stop_only_arming_engages_the_vehicle_again(stop: str) -> None:
     if stop == "emergency_stop":
         rig.request("emergency_stop", number=7)
     else:
-        rig.go(600_000_000)
+        rig.go(600 * NS_PER_MS)
     assert rig.state == stop
     assert rig.gate.watchdog.should_engage(vehicle_at(8.0))
     assert not rig.gate.watchdog.should_engage(vehicle_at())

@@ -26,8 +26,8 @@ def pedals(deceleration_mps2: float, lag_s: float = 0.2) -> list[float]:
     ]
 
 
-def test_a_stop_that_decelerates_as_wanted_keeps_its_pedal() -> None:
-    """With the wanted deceleration, the pedal stays at that of the stop."""
+def test_a_stop_that_decelerates_as_planned_keeps_its_pedal() -> None:
+    """With the planned deceleration, the pedal is not pressed further."""
     assert set(pedals(LIMITS.stop_deceleration_mps2)) == {LEAST}
 
 
@@ -66,7 +66,7 @@ def test_an_implausible_speed_brakes_fully_and_is_not_standstill() -> None:
 
 
 def test_the_next_stop_begins_at_its_own_speed() -> None:
-    """A pedal that was raised in one stop is the usual one at the begin of the next."""
+    """A pedal that was raised in one stop is the usual one at the beginning of the next."""
     brake = StopBrake(LIMITS, MAX_BRAKING_MPS2)
     brake.pedal(vehicle_at(8.0), START_NS)
     assert brake.pedal(vehicle_at(8.0), START_NS + 900 * NS_PER_MS) == 1.0

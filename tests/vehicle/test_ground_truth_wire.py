@@ -54,7 +54,7 @@ def test_events_keep_their_order() -> None:
     sender, receiver = TruthSender(START_NS), TruthReceiver()
     sender.make_datagram(truth_at(1), [event("1")])
     sender.make_datagram(truth_at(2), [event("2"), event("3")])
-    assert receiver.receive(sender.make_datagram(truth_at(3), [event("4")])) == [event(each) for each in "1234"]
+    assert receiver.receive(sender.make_datagram(truth_at(3), [event("4")])) == [event(detail) for detail in "1234"]
     assert receiver.receive(sender.make_datagram(truth_at(4), [event("5")])) == [event("5")]
 
 

@@ -35,8 +35,8 @@ def open_camera() -> Iterator[OpenCamera]:
         return opened[-1]
 
     yield device
-    for each in opened:
-        each.close()
+    for camera in opened:
+        camera.close()
 
 
 def now_ns() -> int:
@@ -94,11 +94,11 @@ def test_pictures_that_arrive_just_when_requested_are_not_missed(tmp_path: Path,
     next_frame(camera)
     assert camera.wait(LONG_S)
     due = FrameTimes(now_ns(), 50.0)
-    given = 0
+    frames = 0
     for number in range(150):
         pause(due.due_ns(number) - now_ns())
-        given += camera.capture(number, due.due_ns(number), None) is not None
-    assert given >= 145
+        frames += camera.capture(number, due.due_ns(number), None) is not None
+    assert frames >= 145
 
 
 @pytest.mark.realtime
@@ -124,13 +124,13 @@ def test_a_file_is_played_at_its_own_rate_in_a_loop(tmp_path: Path, open_camera:
     """A file's pictures are one period apart (median), the first follows the last, and none is lost."""
     camera = open_camera(write_video(tmp_path / "fast.avi", rate_hz=50.0), rate_hz=50.0)
 
-    came = []
+    arrivals = []
     for _ in range(2 * BARS):
         frame = next_frame(camera)
-        came.append((now_ns(), number_of(frame.picture)))
-    periods_ms = [(after[0] - before[0]) / NS_PER_MS for before, after in pairwise(came)]
+        arrivals.append((now_ns(), number_of(frame.picture)))
+    periods_ms = [(after[0] - before[0]) / NS_PER_MS for before, after in pairwise(arrivals)]
     assert 18 < median(periods_ms) < 22
-    assert [number for _, number in came].count(0) >= 2
+    assert [number for _, number in arrivals].count(0) >= 2
     assert camera.counts["times_opened_again"] >= 1
     assert camera.counts["times_lost"] == 0
 
@@ -221,9 +221,9 @@ def test_a_device_that_cannot_be_opened_is_rejected(
 ) -> None:
     """A missing device, or a file that is no camera, is an error of one line, and OpenCV prints nothing."""
     (tmp_path / "no_video.avi").write_bytes(bytes(5000))
-    given = str(tmp_path / device) if device.endswith(".avi") else device
+    device_or_path = str(tmp_path / device) if device.endswith(".avi") else device
     with pytest.raises(UserError, match="cannot be opened as a camera") as rejected:
-        open_camera(given)
+        open_camera(device_or_path)
     assert "\n" not in str(rejected.value)
     assert capfd.readouterr().err == ""
 
@@ -252,9 +252,9 @@ def test_a_lost_file_is_reopened(tmp_path: Path, open_camera: OpenCamera, caplog
     hidden = path.rename(tmp_path / "elsewhere.avi")
 
     wait_until(camera, "times_lost", 1)
-    begun_ns, tried = now_ns(), camera.counts["times_opened_again"]
-    wait_until(camera, "times_opened_again", tried + 2)
-    assert now_ns() - begun_ns > RETRY_S * NS_PER_S
+    lost_ns, opened_times = now_ns(), camera.counts["times_opened_again"]
+    wait_until(camera, "times_opened_again", opened_times + 2)
+    assert now_ns() - lost_ns > RETRY_S * NS_PER_S
     assert camera.capture(0, now_ns(), None) is None
     assert (camera.counts["times_lost"], camera.counts["times_back"]) == (1, 0)
     hidden.rename(path)
@@ -296,9 +296,9 @@ def test_pictures_of_another_size_are_dropped(tmp_path: Path, open_camera: OpenC
     other.replace(path)
 
     wait_until(camera, "pictures_of_another_size", 3)
-    read = camera.counts["pictures_read"]
+    pictures_read = camera.counts["pictures_read"]
     wait_until(camera, "pictures_of_another_size", 6)
-    assert camera.counts["pictures_read"] == read
+    assert camera.counts["pictures_read"] == pictures_read
 
 
 def test_closing_a_camera_ends_its_thread(

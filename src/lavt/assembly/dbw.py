@@ -210,7 +210,7 @@ class _ProfileBuilder:
             message=message.name,
             value=value.name,
             clear=self._optional_signal(message, sent.gear.clear),
-            numbers=dict(sent.gears),
+            codes=dict(sent.gears),
             checksum=self._checksum(message, sent.gear.checksum),
         )
 

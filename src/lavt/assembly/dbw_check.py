@@ -10,7 +10,7 @@ from typing import Final
 from lavt.config.dbw import CommandConfig, CommandSet, ProfileConfig, ReportConfig, SystemCommandConfig
 from lavt.domain import NS_PER_MS
 from lavt.vehicle.dbw.codec import Codec, MessageFacts, SignalFacts
-from lavt.vehicle.dbw.profile import AXES, PERIOD_NS, Profile
+from lavt.vehicle.dbw.profile import AXES, REPEAT_PERIOD_NS, Profile
 
 MAX_FRAME_BYTES: Final = 8
 MIN_PERIODS_PER_TIMEOUT: Final = 2
@@ -245,9 +245,9 @@ def _check_timeouts(config: ProfileConfig, codec: Codec) -> Iterator[str]:
         if message is None:
             continue
         if key.startswith("sent."):
-            if message.timeout_ns is not None and message.timeout_ns < MIN_PERIODS_PER_TIMEOUT * PERIOD_NS:
+            if message.timeout_ns is not None and message.timeout_ns < MIN_PERIODS_PER_TIMEOUT * REPEAT_PERIOD_NS:
                 timeout = _ms(message.timeout_ns)
-                yield f"{key}: {name} times out after {timeout}, too short for its period of {_ms(PERIOD_NS)}"
+                yield f"{key}: {name} times out after {timeout}, too short for its period of {_ms(REPEAT_PERIOD_NS)}"
             continue
         if key == "watchdog":
             continue

@@ -13,8 +13,8 @@ from lavt.assembly.injection import injection_client, injection_node
 from lavt.assembly.security import build_cipher
 from lavt.assembly.vehicles import check_vehicle, physics_sample_times
 from lavt.config import ClientConfig, ControllerConfig, SafetyConfig, ServerConfig, VehicleConfig
+from lavt.control.client_limits import CLIENT_LIMITS
 from lavt.control.drive_controller import DriveController, find_preset, make_controller
-from lavt.control.driver_limits import CLIENT_LIMITS
 from lavt.domain import NS_PER_MS, Now
 from lavt.errors import UserError
 from lavt.node import Node

@@ -29,25 +29,28 @@ MAX_BRAKING_MPS2 = 6.0
 """Deceleration at full brake, of the simulator's car."""
 
 PROPORTIONAL_PER_S = 0.8
-"""m/s2 for each m/s of error: a time constant of 1.3 s, slow compared with pedal lag plus network delay."""
+"""Acceleration in m/s2 for each m/s of speed error: its time constant, 1.3 s, is long compared with pedal lag plus
+network delay."""
 INTEGRAL_PER_S2 = 0.1
-"""m/s2 for each m/s of error and second: compensates drag and slope within some 8 s."""
+"""Change of the integral term in m/s2, for each second and m/s of error; compensates drag and slope within about 8
+s."""
 GENTLE_BRAKING_MPS2 = 1.5
-"""Largest deceleration of speed control, so that a few badly seen pictures cause no jolt."""
-INTEGRATE_WITHIN_MPS = 0.5
-"""Nothing is integrated farther from the target: the error there is a transient, not an offset."""
-INTEGRAL_WITHIN_MPS2 = 0.5
+"""Largest deceleration of speed control, so that a few pictures with a badly visible lane cause no jolt."""
+INTEGRATION_ERROR_LIMIT_MPS = 0.5
+"""A larger error is not integrated: it is a transient, not an offset."""
+MAX_INTEGRAL_MPS2 = 0.5
 """Largest integral term; drag and a slope of 5 % need no more."""
 FULL_SPEED_CONFIDENCE = 0.5
-"""From this confidence on, the full speed is driven: one line over the whole length, or both over half of it."""
-SLOWEST_SHARE = 0.4
-"""Share of the full speed at low confidence: 12 of 30 km/h, fast enough to reach the next marks."""
-LONGEST_STEP_S = 0.1
+"""From this confidence on, the car drives at full speed. It is reached by one line that is visible over the whole
+length, or by two lines that are visible over half of it."""
+MIN_SPEED_SHARE = 0.4
+"""Share of the full speed at low confidence: 12 km/h instead of 30, fast enough to reach the next marks."""
+MAX_STEP_S = 0.1
 """Longest time that one call integrates over."""
 
 
 class DriveController(Protocol):
-    """A controller that drives by the detected lane and has no clock of its own."""
+    """A controller that drives along the detected lane. It reads no clock."""
 
     def decide(self, lane: Lane, speed_mps: float, now_ns: int) -> Decision:
         """Return steering, pedals and path for the newest lane and reported speed, at `now_ns` (monotonic)."""
@@ -97,11 +100,11 @@ class SpeedPi:
         It is limited to `MAX_ACCELERATION_MPS2`, and to `GENTLE_BRAKING_MPS2` of braking.
         """
         error_mps = target_mps - speed_mps
-        if abs(error_mps) < INTEGRATE_WITHIN_MPS:
-            integral_mps2 = self._integral_mps2 + INTEGRAL_PER_S2 * error_mps * min(step_s, LONGEST_STEP_S)
-            self._integral_mps2 = min(max(integral_mps2, -INTEGRAL_WITHIN_MPS2), INTEGRAL_WITHIN_MPS2)
-        wanted_mps2 = PROPORTIONAL_PER_S * error_mps + self._integral_mps2
-        return min(max(wanted_mps2, -GENTLE_BRAKING_MPS2), MAX_ACCELERATION_MPS2)
+        if abs(error_mps) < INTEGRATION_ERROR_LIMIT_MPS:
+            integral_mps2 = self._integral_mps2 + INTEGRAL_PER_S2 * error_mps * min(step_s, MAX_STEP_S)
+            self._integral_mps2 = min(max(integral_mps2, -MAX_INTEGRAL_MPS2), MAX_INTEGRAL_MPS2)
+        unlimited_mps2 = PROPORTIONAL_PER_S * error_mps + self._integral_mps2
+        return min(max(unlimited_mps2, -GENTLE_BRAKING_MPS2), MAX_ACCELERATION_MPS2)
 
 
 def pedals(acceleration_mps2: float) -> tuple[float, float]:
@@ -111,15 +114,19 @@ def pedals(acceleration_mps2: float) -> tuple[float, float]:
     return 0.0, min(-acceleration_mps2 / MAX_BRAKING_MPS2, 1.0)
 
 
-def confident_speed_mps(speed_mps: float, confidence: float) -> float:
-    """Return the speed to drive at: `speed_mps` at high confidence, proportionally less below that."""
-    return speed_mps * min(max(confidence / FULL_SPEED_CONFIDENCE, SLOWEST_SHARE), 1.0)
+def speed_for_confidence_mps(speed_mps: float, confidence: float) -> float:
+    """Return the speed to drive at: `speed_mps` from `FULL_SPEED_CONFIDENCE` on, and proportionally less below that.
+
+    It is never less than `MIN_SPEED_SHARE` of `speed_mps`.
+    """
+    return speed_mps * min(max(confidence / FULL_SPEED_CONFIDENCE, MIN_SPEED_SHARE), 1.0)
 
 
 class LaneKeeper:
-    """A lane keeper: pure pursuit steering and PI speed control. Without a lane it follows the last one, unpowered.
+    """A lane keeper: pure pursuit steering and PI speed control.
 
-    The driver node decides, for every controller alike, when to brake and to stop without a lane.
+    Without a lane it follows the last one and uses no pedal. The driver node decides when a car without a lane brakes
+    and stops. It does so for every controller.
 
     As in the paper there is no delay compensation: the lane in the picture is taken as the present one.
     """
@@ -134,7 +141,7 @@ class LaneKeeper:
         self._decided_ns: int | None = None
 
     def decide(self, lane: Lane, speed_mps: float, now_ns: int) -> Decision:
-        """Return steering along the lane, or along the last one seen, with the pedals that keep the speed."""
+        """Return steering along the lane, or along the last one detected, with the pedals that keep the speed."""
         step_s = 0.0 if self._decided_ns is None else (now_ns - self._decided_ns) / NS_PER_S
         self._decided_ns = now_ns
         if lane.confidence >= LANE_CONFIDENCE:
@@ -155,14 +162,14 @@ class LaneKeeper:
 
     def _acceleration_mps2(self, confidence: float, speed_mps: float, step_s: float) -> float:
         if confidence < LANE_CONFIDENCE:
-            return 0.0  # no acceleration without a lane, and no jolt for each failed picture
-        target_mps = confident_speed_mps(self._preset.speed_mps, confidence)
+            return 0.0  # no throttle without a lane; and no brake, which would jolt at each failed picture
+        target_mps = speed_for_confidence_mps(self._preset.speed_mps, confidence)
         return self._speed_pi.acceleration_mps2(target_mps, speed_mps, step_s)
 
     def _curvature_limit_per_m(self, speed_mps: float) -> float:
         """Return the smaller of the steering limit and the lateral acceleration limit at this speed, as a curvature."""
-        by_wheel = curvature_per_m(self._preset.steering_limit_rad, self._wheelbase_m)
-        return min(by_wheel, self._preset.lateral_limit_mps2 / max(speed_mps, 1.0) ** 2)
+        steering_limit_per_m = curvature_per_m(self._preset.steering_limit_rad, self._wheelbase_m)
+        return min(steering_limit_per_m, self._preset.lateral_limit_mps2 / max(speed_mps, 1.0) ** 2)
 
 
 class ControllerFactory(Protocol):
@@ -194,9 +201,9 @@ def find_preset(name: str) -> Preset:
 def _factory(kind: str) -> ControllerFactory:
     if kind in CONTROLLERS:
         return CONTROLLERS[kind]
-    added = {entry.name: entry for entry in entry_points(group=ENTRY_POINTS)}
-    if kind not in added:
-        known = ", ".join(sorted({*CONTROLLERS, *added}))
+    registered = {entry.name: entry for entry in entry_points(group=ENTRY_POINTS)}
+    if kind not in registered:
+        known = ", ".join(sorted({*CONTROLLERS, *registered}))
         raise UserError(f"there is no controller {kind!r}; choose one of {known}")
-    factory: ControllerFactory = added[kind].load()
+    factory: ControllerFactory = registered[kind].load()
     return factory

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import Literal
 
-from lavt.control.driver_limits import CLIENT_LIMITS
+from lavt.control.client_limits import CLIENT_LIMITS
 
 LaneState = Literal["ok", "brake", "stop"]
 
 LANE_CONFIDENCE = 0.2
-"""Below this confidence no lane counts as seen: one line over 40 % of the length; a broken line alone gives 0.4."""
+"""A lane with less confidence counts as lost. 0.2 is one line over 40 % of the length; a broken line alone gives
+0.4."""
 BRAKE_AFTER_NS = CLIENT_LIMITS.no_lane_brake_ns
 STOP_AFTER_NS = CLIENT_LIMITS.no_lane_stop_ns
 
@@ -18,16 +19,17 @@ class LaneWatch:
     """A timer of the last confident lane detection."""
 
     def __init__(self) -> None:
-        self._seen_ns: int | None = None
+        self._last_lane_ns: int | None = None
 
     def check(self, confidence: float, now_ns: int) -> LaneState:
         """Return the reaction to the confidence of the newest picture's lane, at `now_ns` (monotonic).
 
-        Time counts from the first call. A lane seen again returns "ok"; the vehicle's side decides when a stop ends.
+        Time counts from the first call. When a lane is detected again, the result is "ok"; the server decides when a
+        stop ends.
         """
-        if self._seen_ns is None or confidence >= LANE_CONFIDENCE:
-            self._seen_ns = now_ns
-        lane_age_ns = now_ns - self._seen_ns
+        if self._last_lane_ns is None or confidence >= LANE_CONFIDENCE:
+            self._last_lane_ns = now_ns
+        lane_age_ns = now_ns - self._last_lane_ns
         if lane_age_ns >= STOP_AFTER_NS:
             return "stop"
         return "brake" if lane_age_ns >= BRAKE_AFTER_NS else "ok"

@@ -43,7 +43,7 @@ def lookahead_m(lookahead_s: float, speed_mps: float) -> float:
 def goal_point_m(lane: Lane, distance_m: float, pose: PlanarPose = ORIGIN) -> tuple[float, float]:
     """Return the point of the lane's centre that is ahead of `pose` and `distance_m` away from it.
 
-    If the lane's centre is farther away than that, return the point abreast.
+    If the lane's centre is farther away than that, return the point of the centre beside `pose`.
     """
     c0, c1, c2 = lane.centre
     from_x_m, from_y_m, _ = pose
@@ -58,15 +58,15 @@ def goal_point_m(lane: Lane, distance_m: float, pose: PlanarPose = ORIGIN) -> tu
     for _ in range(50):
         y_m = c0 + (c1 + c2 * x_m) * x_m
         ahead_m, left_m = x_m - from_x_m, y_m - from_y_m
-        off_m2 = ahead_m * ahead_m + left_m * left_m - farthest_m2
-        if -TOLERANCE_M2 < off_m2 < TOLERANCE_M2:
+        excess_m2 = ahead_m * ahead_m + left_m * left_m - farthest_m2
+        if -TOLERANCE_M2 < excess_m2 < TOLERANCE_M2:
             break
-        if off_m2 < 0:
+        if excess_m2 < 0:
             low_m = x_m
         else:
             high_m = x_m
         slope_m = 2 * (ahead_m + left_m * (c1 + 2 * c2 * x_m))
-        x_m = x_m - off_m2 / slope_m if slope_m > 0 else low_m
+        x_m = x_m - excess_m2 / slope_m if slope_m > 0 else low_m
         if not low_m < x_m < high_m:
             x_m = (low_m + high_m) / 2
     return x_m, y_m
@@ -85,7 +85,8 @@ def pursuit_path_per_m(
     """Return the curvatures, within +-`limit_per_m`, of the path from `pose` onto the lane's centre and along it.
 
     This is the path that pure pursuit would drive: `PATH_POINTS` values, `PATH_STEP_M` apart, the first one step ahead.
-    The curvature of the lane itself would not do: a car with an offset or heading error would keep it along that path.
+    The curvature of the lane itself would not serve: a car that followed it would keep its offset and its heading
+    error.
     """
     curvatures = []
     next_per_m = clamp(pursuit_curvature_per_m(lane, distance_m, pose), limit_per_m)

@@ -8,8 +8,8 @@ from typing import ClassVar, Literal, Protocol
 
 from msgspec import Struct
 
+from lavt.control.client_limits import ClientLimits
 from lavt.control.drive_controller import DriveController
-from lavt.control.driver_limits import ClientLimits
 from lavt.control.lane_watch import LaneState, LaneWatch
 from lavt.domain import Command, Decision, FramePayload, Lane, Mode, Now, SessionReply, State
 from lavt.errors import BadMessage

@@ -19,11 +19,12 @@ from lavt.perception.calibration import CalibratedCamera, ground_to_picture, pic
 STAMP_SIDE_PX = 64
 """Side of the top left square with the time stamp, which is masked where pictures have one."""
 STAMP_MARGIN_PX = 12
-"""Masked margin beside the stamp at a focal length of up to 320 px: its edges reach this far (half of `MARK_PX`)."""
+"""Width of the masked margin beside the stamp at a focal length of up to 320 px. The stamp's edges affect pixels up to
+this far away (half of `MARK_PX`)."""
 DistortionMaps = tuple[NDArray[np.int16], NDArray[np.uint16]]
 """OpenCV's fixed-point maps: the picture coordinates of each cell."""
-MARGIN_PX = 3
-"""Rows beyond the grid, for interpolation and smoothing over 5 rows."""
+ROW_MARGIN_PX = 3
+"""Additional rows above and below the grid, and below the stamp: interpolation and smoothing over 5 rows use them."""
 CENTRAL_HALF_WIDTH_M = 3.5
 """Half the width of the central strip of ground, which a camera must see."""
 MIN_VISIBLE_SHARE = 0.4
@@ -34,7 +35,8 @@ MIN_VISIBLE_SHARE = 0.4
 class GroundGrid:
     """The ground searched for lanes, divided into cells.
 
-    Closer than `near_m` the default camera sees less than a lane's width; at `far_m` a row of its picture is 0.9 m.
+    Closer than `near_m` the default camera sees less than a lane's width. At `far_m` a row of its picture covers 0.9 m
+    of ground.
     """
 
     near_m: float = 3.6
@@ -111,7 +113,7 @@ def bird_eye(camera: CalibratedCamera, grid: GroundGrid, *, stamped: bool = True
     with np.errstate(invalid="ignore"):
         inside = (u_px >= 0) & (u_px <= camera.width_px - 1) & (v_px >= 0) & (v_px <= camera.height_px - 1)
         margin_px = STAMP_MARGIN_PX * max(camera.scale, 1.0)
-        stamp = inside & (u_px < STAMP_SIDE_PX + margin_px) & (v_px < STAMP_SIDE_PX + MARGIN_PX) & stamped
+        stamp = inside & (u_px < STAMP_SIDE_PX + margin_px) & (v_px < STAMP_SIDE_PX + ROW_MARGIN_PX) & stamped
     ahead = np.abs(grid.column_y_m()) < CENTRAL_HALF_WIDTH_M
     visible = inside & ~stamp
     if visible[:, ahead].mean() < MIN_VISIBLE_SHARE or not visible[: grid.rows // 2, ahead].any():
@@ -119,14 +121,14 @@ def bird_eye(camera: CalibratedCamera, grid: GroundGrid, *, stamped: bool = True
             f"the camera does not see the road {grid.near_m} to {grid.far_m} m ahead of the rear axle; "
             "correct its position, yaw, pitch, roll, lens or picture size"
         )
-    top_px = max(math.floor(v_px[inside].min()) - MARGIN_PX, 0)
-    bottom_px = min(math.ceil(v_px[inside].max()) + MARGIN_PX, camera.height_px)
+    top_px = max(math.floor(v_px[inside].min()) - ROW_MARGIN_PX, 0)
+    bottom_px = min(math.ceil(v_px[inside].max()) + ROW_MARGIN_PX, camera.height_px)
     hidden = np.where(stamp, 0, 255).astype(np.uint8) if stamp.any() else None
     if not camera.distortion:
         shift = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, -top_px], [0.0, 0.0, 1.0]])
         homography = shift @ ground_to_picture(camera) @ grid.to_ground()
         return BirdEye(grid, top_px, bottom_px, homography, hidden)
-    maps = np.where(inside[..., None], pixels - (0, top_px), -9.0).astype(np.float32)
+    maps = np.where(inside[..., None], pixels - (0, top_px), -9.0).astype(np.float32)  # -9: outside the picture
     whole, fractions = cv2.convertMaps(maps[..., 0], maps[..., 1], cv2.CV_16SC2)
     return BirdEye(grid, top_px, bottom_px, (np.asarray(whole), np.asarray(fractions)), hidden)
 

@@ -20,9 +20,9 @@ REFERENCE_FOCAL_PX = 320.0
 """The focal length of the reference camera for sizes in pixels: 640 columns over 90 degrees."""
 
 RAY_STEPS = 8
-"""Steps from the lens's axis to a ray at which the image radius is checked to increase.
+"""Number of steps from the lens's axis to a ray. The image radius must increase with each step.
 
-A distortion polynomial folds back at some angle: it maps points beyond, which the lens does not see, into the picture.
+Beyond some angle a distortion polynomial folds back: it maps points that the lens does not see into the picture.
 """
 
 
@@ -93,8 +93,8 @@ def axes(camera: CalibratedCamera) -> FloatArray:
 
 def ground_to_camera(camera: CalibratedCamera) -> FloatArray:
     """Return the 3 x 3 matrix from ground (x, y, 1) to the camera's frame (right, down, forward), in metres."""
-    turn = axes(camera)
-    return np.column_stack([turn[:, 0], turn[:, 1], -turn @ np.array([camera.x_m, camera.y_m, camera.z_m])])
+    rotation = axes(camera)
+    return np.column_stack([rotation[:, 0], rotation[:, 1], -rotation @ np.array([camera.x_m, camera.y_m, camera.z_m])])
 
 
 def ground_to_picture(camera: CalibratedCamera) -> FloatArray:
@@ -110,9 +110,9 @@ def picture_points(camera: CalibratedCamera, ground_m: FloatArray) -> FloatArray
 
     Points behind the camera or outside the lens model's valid field are NaN; others may lie outside the picture.
     """
-    seen = np.column_stack([ground_m, np.ones(len(ground_m))]) @ ground_to_camera(camera).T
-    ahead = seen[:, 2] > 1e-6
-    rays = seen[:, :2] / np.where(ahead, seen[:, 2], 1.0)[:, None]
+    camera_points = np.column_stack([ground_m, np.ones(len(ground_m))]) @ ground_to_camera(camera).T
+    ahead = camera_points[:, 2] > 1e-6
+    rays = camera_points[:, :2] / np.where(ahead, camera_points[:, 2], 1.0)[:, None]
     pixels = _distort(camera, rays)
     pixels[~(ahead & _in_lens_field(camera, rays))] = np.nan
     return pixels
@@ -123,13 +123,12 @@ def _distort(camera: CalibratedCamera, rays: FloatArray) -> FloatArray:
     (fx, fy), (cx, cy) = camera.focal_px, camera.middle_px
     if not camera.distortion:
         return rays * (fx, fy) + (cx, cy)
-    factors = np.array(camera.distortion)
+    coefficients = np.array(camera.distortion)
     if camera.fisheye:
-        return np.asarray(cv2.fisheye.distortPoints(rays[:, None], camera.camera_matrix, factors), dtype=np.float64)[
-            :, 0
-        ]
-    forward = np.column_stack([rays, np.ones(len(rays))])
-    pixels = cv2.projectPoints(forward[:, None], np.zeros(3), np.zeros(3), camera.camera_matrix, factors)[0]
+        pixels = cv2.fisheye.distortPoints(rays[:, None], camera.camera_matrix, coefficients)
+    else:
+        forward = np.column_stack([rays, np.ones(len(rays))])
+        pixels = cv2.projectPoints(forward[:, None], np.zeros(3), np.zeros(3), camera.camera_matrix, coefficients)[0]
     return np.asarray(pixels, dtype=np.float64)[:, 0]
 
 

@@ -32,18 +32,18 @@ GRID = GroundGrid()
 LANE_WIDTH_M = 3.5
 """The lane's width until it has been measured."""
 TRACK_CONFIDENCE = 0.2
-"""A fit with less confidence (one line over 40 % of the length) is not followed."""
+"""A fit with less confidence is not followed. 0.2 is one line over 40 % of the length."""
 REFINEMENTS = 2
-"""The number of times a found lane is refitted: a curve visible nearby extends to points farther away."""
-FORGET_AFTER = 3
-"""Pictures without a lane after which the search restarts: a tenth of a second."""
+"""How often a found lane is fitted again. Each time, a curve that was fitted nearby reaches points farther away."""
+FORGET_AFTER_PICTURES = 3
+"""After this many pictures without a lane, a tenth of a second, the search restarts."""
 FOLLOWS_FOR_NS = 350 * NS_PER_MS
-"""A lane is not followed over a longer gap between pictures: the caller of `detect` then calls `forget`.
+"""The longest gap between pictures over which a lane is followed; after a longer one the caller calls `forget`.
 
 In that time a lane with a radius of 42 m moves sideways by `CORRIDOR_M`, 10 m ahead of a car that drives straight at
 30 km/h, so a line at the old position may be another one.
 """
-LEFT_AT_WIDTHS = 1.0
+DROP_LANE_AT_WIDTHS = 1.0
 """A lane is dropped when the car is this many lane widths off its centre: it is then in the middle of the next lane."""
 
 
@@ -88,11 +88,11 @@ class LaneDetector:
         self.trace: DetectionTrace | None = None
         self._lane_width_m = lane_width_m
         self._lane = Lane((0.0, 0.0, 0.0), lane_width_m, grid.near_m, grid.far_m, 0.0)
-        self._misses = FORGET_AFTER
+        self._misses = FORGET_AFTER_PICTURES
 
     def forget(self) -> None:
         """Search the nearest lane in the next picture, instead of following the last one."""
-        self._misses = FORGET_AFTER
+        self._misses = FORGET_AFTER_PICTURES
 
     def detect(self, picture_bgr: Picture) -> Lane:
         """Return the lane in the next picture; raise `ValueError` unless it is (height, width, 3) as the camera's."""
@@ -100,7 +100,7 @@ class LaneDetector:
             raise ValueError(f"a picture of shape {picture_bgr.shape}, not {self._shape}")
         mask = self.bird_eye.from_above(lane_pixels(self.bird_eye.region(picture_bgr), self._scale))
         points = mark_points(mask, self.bird_eye.grid)
-        tracked = self._misses < FORGET_AFTER
+        tracked = self._misses < FORGET_AFTER_PICTURES
         self.trace = self._follow(mask, points) if tracked else self._search(mask, points)
         fit = self.trace.fit
         if fit is None or fit.confidence < TRACK_CONFIDENCE:
@@ -126,7 +126,8 @@ class LaneDetector:
                 mask, points, np.zeros(len(points.x_m), dtype=np.int8), None, self._lane_width_m, (), None
             )
         sides, windows = sides_by_windows(points, grid, start, self._lane_width_m)
-        # Windows follow any curve, also a line that leads away; the start line is rough, but is based on all paint.
+        # The windows follow any curve, also a line that leads away from the lane. The start line is rough, but it is
+        # based on all paint.
         fits = (
             self._refine(points, fit_lane(points, sides, grid, self._lane_width_m)),
             self._refine(points, self._fit_near(points, start, self._lane_width_m)),
@@ -146,27 +147,28 @@ class LaneDetector:
 
 
 class GroundTruthLaneDetector:
-    """A detector for fidelity `geometry`: it averages the true lanes as `LaneDetector` does, for equal loop dynamics.
+    """A detector for fidelity `geometry`. It averages true lanes as `LaneDetector` averages detected ones.
 
-    When little of the lane is visible, the confidence is low and the lane is the last one detected.
+    Both therefore have the same effect on the control loop's dynamics. When little of the lane is visible, the
+    confidence is low and the lane is the last one detected.
     """
 
     def __init__(self) -> None:
         self._lane = Lane((0.0, 0.0, 0.0), LANE_WIDTH_M, GRID.near_m, GRID.far_m, 0.0)
-        self._misses = FORGET_AFTER
+        self._misses = FORGET_AFTER_PICTURES
 
     def forget(self) -> None:
         """Restart the average with the next lane."""
-        self._misses = FORGET_AFTER
+        self._misses = FORGET_AFTER_PICTURES
 
-    def detect(self, picture: SeenLane) -> Lane:
-        """Return the average of the lanes in this picture and those before."""
-        seen = picture.lane
-        if seen.confidence < TRACK_CONFIDENCE:
+    def detect(self, seen_lane: SeenLane) -> Lane:
+        """Return the average of this lane and those before."""
+        lane = seen_lane.lane
+        if lane.confidence < TRACK_CONFIDENCE:
             self._misses += 1
-            self._lane = replace(self._lane, confidence=seen.confidence)
+            self._lane = replace(self._lane, confidence=lane.confidence)
         else:
-            self._lane = average_lane(self._lane if self._misses < FORGET_AFTER else None, seen)
+            self._lane = average_lane(self._lane if self._misses < FORGET_AFTER_PICTURES else None, lane)
             self._misses = 0
         return self._lane
 
@@ -178,7 +180,7 @@ def contains_car(lane: LaneFit) -> bool:
 
 def car_has_left(lane: Lane) -> bool:
     """Return whether the car is so far off a lane that it is in the middle of the next one, or beyond."""
-    return _lateral_distance_m(lane.centre) > LEFT_AT_WIDTHS * lane.width_m
+    return _lateral_distance_m(lane.centre) > DROP_LANE_AT_WIDTHS * lane.width_m
 
 
 def _lateral_distance_m(centre: tuple[float, float, float]) -> float:

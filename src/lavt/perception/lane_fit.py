@@ -1,9 +1,9 @@
 """The lane fit: assigns bird's-eye paint to the left and right line, and fits the lane's centre.
 
-Both lines of a lane are fitted together, as two parallels of one centre y = c0 + c1 x + c2 x^2: a broken mark (3 m of
-paint, 6 m of gap) alone has too little paint to fit a curve, but two lines fill each other's gaps. A parallel at
-distance d from a curve with slope m is d sqrt(1 + m^2) from it along y, so the fit is linear with the slope of an
-earlier fit.
+Both lines of a lane are fitted together, as two parallels of one centre y = c0 + c1 x + c2 x^2. A broken line (3 m of
+paint, 6 m of gap) alone has too little paint to fit a curve, but two lines fill each other's gaps. Measured
+along y, the distance between a curve of slope m and its parallel at distance d is d sqrt(1 + m^2). With the slope of an
+earlier fit, the fit is therefore linear.
 """
 
 from __future__ import annotations
@@ -23,28 +23,51 @@ from lavt.perception.lane_pixels import Mask
 Sides = NDArray[np.int8]
 """For each point +1: left line, -1: right line, 0: neither."""
 
-PAINT_AT_LEAST = 128  # a cell of the bird's-eye mask is paint when half of it is
-CORRIDOR_M = 0.7  # around the expected line: far more than a car moves in one frame, far less than half a lane
-OUTLIER_M = 0.25  # off the second to last fit: two widths of a mark
-HALF_WEIGHT_M = (0.3, 0.15)  # off the first two fits: paint this far off has half weight, so that the majority wins
-POINTS_AT_LEAST = 25  # of a line: a quarter of a metre of paint at full width
-LINEAR_BELOW_M = 6.0  # of visible length: the curvature of a shorter line is noise
-WIDTH_WITHIN_M = (2.6, 4.4)  # a lane's width
-SLOPE_AT_MOST = 0.5  # of the lane relative to the car: a line with more crosses the lane
-CURVATURE_AT_MOST_PER_M = 1 / 15  # a car at walking pace could just follow it
+MIN_PAINT = 128
+"""A cell of the bird's-eye mask is paint when half of it is."""
+CORRIDOR_M = 0.7
+"""Half the width of the corridor around an expected line: far more than a car moves in one frame, far less than half a
+lane."""
+OUTLIER_M = 0.25
+"""Paint that is farther from the second to last fit is left out of the last one. It is two widths of a mark."""
+HALF_WEIGHT_M = (0.3, 0.15)
+"""In the first two fits, paint this far from the fit before has half weight, so that the majority wins."""
+MIN_LINE_POINTS = 25
+"""Fewer points are not a line: a quarter of a metre of paint at full width."""
+LINEAR_BELOW_M = 6.0
+"""A shorter visible length is fitted without curvature, which would be noise."""
+LANE_WIDTH_RANGE_M = (2.6, 4.4)
+"""Smallest and largest width of a lane."""
+MAX_SLOPE = 0.5
+"""Largest slope of the lane relative to the car: a line with more crosses the lane."""
+MAX_CURVATURE_PER_M = 1 / 15
+"""A car at walking pace could just follow it."""
 COLUMN_BIN_M = 0.1
-START_LENGTH_M = 12.0  # length of the start line's search: more than one period of broken marks
-START_SLOPES = (0.0, 0.05, -0.05, 0.1, -0.1, 0.15, -0.15, 0.2, -0.2, 0.25, -0.25)  # straight first, to win ties
-START_BENDS_PER_M = (0.0, 0.006, -0.006, 0.012, -0.012)  # half the curvature, down to a radius of 42 m
-WINDOW_M = (1.0, 0.6)  # a sliding window's length along x, and half its width
-WINDOW_POINTS_AT_LEAST = 6
+"""Width of the bins in which the search for the start line counts paint."""
+START_LENGTH_M = 12.0
+"""Length over which the start line is searched: more than one period of broken marks."""
+START_SLOPES = (0.0, 0.05, -0.05, 0.1, -0.1, 0.15, -0.15, 0.2, -0.2, 0.25, -0.25)
+"""Slopes of the start line that are tried, straight ahead first, so that it wins a tie."""
+START_BENDS_PER_M = (0.0, 0.006, -0.006, 0.012, -0.012)
+"""Half the curvatures of the start line that are tried, down to a radius of 42 m."""
+WINDOW_M = (1.0, 0.6)
+"""Length of a sliding window along x, and half its width."""
+MIN_WINDOW_POINTS = 6
+"""A window with fewer points measures no offset."""
 COVER_BIN_M = 0.5
-COVER_POINTS_AT_LEAST = 4  # a third of the points of a full mark in a bin
-COVER_LINE_M = 0.15  # a mark's half width, and as much for the error of the curve
-COVER_CLEAN = 0.6  # minimum share of the paint around the line (`CORRIDOR_M`) that is on it: by chance it is 0.2
-COVER_BINS_TOGETHER = 2  # adjacent bins: paint shorter than a metre is a spot
-COVER_REACH_M = 3.0  # half the gap of broken marks: paint counts for this much of the line before and behind it
-PARALLEL_VISIBLE_AT_LEAST = 0.2  # of the length, to be the line of a neighbouring lane
+"""Length of the bins in which the visible share of a line is counted."""
+MIN_COVER_POINTS = 4
+"""A bin with fewer points on the line shows no paint: a third of the points of a full mark."""
+COVER_LINE_M = 0.15
+"""Paint this close is on the line: a mark's half width, and as much for the error of the curve."""
+MIN_CLEAN_SHARE = 0.6
+"""Minimum share of the paint in the corridor (`CORRIDOR_M`) that is on the line. By chance it would be 0.2."""
+COVER_BINS_TOGETHER = 2
+"""Number of adjacent bins that must show paint: paint shorter than a metre is a spot."""
+COVER_REACH_M = 3.0
+"""Half the gap of broken marks: paint counts for this much of the line before and behind it."""
+MIN_PARALLEL_VISIBLE = 0.2
+"""Visible share that a parallel needs to be the line of a neighbouring lane."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +101,7 @@ class LaneFit:
 
 def mark_points(mask: Mask, grid: GroundGrid) -> Points:
     """Return the paint cells of a bird's-eye mask as points on the ground."""
-    found: Any = cv2.findNonZero(cv2.threshold(mask, PAINT_AT_LEAST - 1, 255, cv2.THRESH_BINARY)[1])
+    found: Any = cv2.findNonZero(cv2.threshold(mask, MIN_PAINT - 1, 255, cv2.THRESH_BINARY)[1])
     cells = np.empty((0, 2), dtype=np.int32) if found is None else np.reshape(found, (-1, 2))
     return Points(grid.row_x_m()[cells[:, 1]], grid.column_y_m()[cells[:, 0]])
 
@@ -106,7 +129,7 @@ def start_line(points: Points, grid: GroundGrid, width_m: float) -> tuple[float,
     spread_m = float(np.abs(y).max(initial=0.0)) + (max(START_SLOPES) + max(START_BENDS_PER_M) * far_m) * far_m
     lanes = 2 * math.ceil(spread_m / width_m)  # enough for all straightened paint, half of them on the right
     y_bins, bins_per_m = y / width_m * bins + lanes // 2 * bins, bins / width_m
-    best_score, best = WINDOW_POINTS_AT_LEAST, None
+    best_score, best = MIN_WINDOW_POINTS, None
     for bend in START_BENDS_PER_M:
         for slope in START_SLOPES:
             straight = (y_bins - (slope * bins_per_m + bend * bins_per_m * x) * x).astype(np.intp)
@@ -123,8 +146,8 @@ def sides_by_windows(
 ) -> tuple[Sides, tuple[tuple[float, float], ...]]:
     """Follow both lines from the near end with a pair of sliding windows that move together.
 
-    The windows follow the centre `start`, shifted by the last measured offset. Returns the sides and, for each pair,
-    its near end (x) and the offset of its middle to the left of `start`, in metres.
+    The windows follow the centre `start`, shifted by the last measured offset. Returns the sides and, for each
+    pair, its near end (x) and the offset of its middle to the left of `start`, in metres.
     """
     length_m, half_width_m = WINDOW_M
     offset_m = points.y_m - _evaluate_centre(points.x_m, start)[0]
@@ -139,7 +162,7 @@ def sides_by_windows(
             line_m = distance_m + side * width_m / 2
             in_window = inside & (np.abs(offset_m - line_m) < half_width_m)
             sides[in_window] = side
-            if np.count_nonzero(in_window) >= WINDOW_POINTS_AT_LEAST:
+            if np.count_nonzero(in_window) >= MIN_WINDOW_POINTS:
                 measured_offsets_m.append(float(np.mean(offset_m[in_window])) - line_m)
         if measured_offsets_m:
             distance_m += sum(measured_offsets_m) / len(measured_offsets_m)
@@ -167,7 +190,7 @@ def fit_lane(
     is_on_line = np.abs(_residual_m(line_points, side, *fit)) < OUTLIER_M
     kept, kept_side = Points(line_points.x_m[is_on_line], line_points.y_m[is_on_line]), side[is_on_line]
     fit = _fit_once(kept, kept_side, width_m, slopes_of=fit[0])
-    if fit is None or abs(fit[0][1]) > SLOPE_AT_MOST or 2 * abs(fit[0][2]) > CURVATURE_AT_MOST_PER_M:
+    if fit is None or abs(fit[0][1]) > MAX_SLOPE or 2 * abs(fit[0][2]) > MAX_CURVATURE_PER_M:
         return None
     centre, measured_m = fit
     across = _lateral_offset_m(points, centre)
@@ -186,18 +209,18 @@ def fit_lane(
 
 
 def has_parallel(points: Points, fit: LaneFit, grid: GroundGrid) -> bool:
-    """Return whether there are two lines a lane's width apart: both of the lane's, or one and a neighbour's."""
+    """Return whether there are two lines a lane's width apart: both of this lane, or one and one of a neighbour."""
     visible_sides = [
-        side for side, share in ((1, fit.left_visible), (-1, fit.right_visible)) if share >= PARALLEL_VISIBLE_AT_LEAST
+        side for side, share in ((1, fit.left_visible), (-1, fit.right_visible)) if share >= MIN_PARALLEL_VISIBLE
     ]
     if len(visible_sides) != 1:
         return len(visible_sides) == 2
     distance_m = np.abs(_lateral_offset_m(points, fit.centre) - visible_sides[0] * 1.5 * fit.width_m)
-    return _visible_share(points.x_m, distance_m, grid) >= PARALLEL_VISIBLE_AT_LEAST
+    return _visible_share(points.x_m, distance_m, grid) >= MIN_PARALLEL_VISIBLE
 
 
 def _evaluate_centre(x_m: FloatArray, centre: tuple[float, float, float]) -> tuple[FloatArray, FloatArray]:
-    """Return y of a centre at x, and the ratio of its parallels' distance along y to that across."""
+    """Return y of a centre at x, and the factor by which a parallel is farther away along y than across."""
     c0, c1, c2 = centre
     slope = c1 + 2 * c2 * x_m
     return c0 + (c1 + c2 * x_m) * x_m, np.sqrt(1 + slope * slope)
@@ -223,7 +246,7 @@ def _fit_once(
     """Fit centre and width by least squares; the parallels' slopes are those of an earlier centre."""
     left = int(np.count_nonzero(side > 0))
     right = len(side) - left
-    if max(left, right) < POINTS_AT_LEAST:
+    if max(left, right) < MIN_LINE_POINTS:
         return None
     x, y = points.x_m, points.y_m
     half_lane = side * _evaluate_centre(x, slopes_of)[1] / 2
@@ -231,11 +254,11 @@ def _fit_once(
     if float(np.ptp(x)) >= LINEAR_BELOW_M:
         curve.append(x * x)
     weight = curve[0] if weights is None else weights
-    if min(left, right) >= POINTS_AT_LEAST:
+    if min(left, right) >= MIN_LINE_POINTS:
         solved = _solve([*curve, half_lane], y, weight)
         if solved is None:
             return None
-        if WIDTH_WITHIN_M[0] <= solved[-1] <= WIDTH_WITHIN_M[1]:
+        if LANE_WIDTH_RANGE_M[0] <= solved[-1] <= LANE_WIDTH_RANGE_M[1]:
             return _centre(solved[:-1]), float(solved[-1])
     # One line, or two that are not a lane's width apart: use the one with more points.
     majority = side == (1 if left >= right else -1)
@@ -263,15 +286,15 @@ def _visible_share(x_m: FloatArray, distance_m: FloatArray, grid: GroundGrid) ->
     `distance_m` are the points' distances from the line. Paint is clean where most points near the line are on it.
     """
     bins = round((grid.far_m - grid.near_m) / COVER_BIN_M)
-    each = np.minimum(((x_m - grid.near_m) / COVER_BIN_M).astype(np.int64), bins - 1)
-    on_line = np.bincount(each[distance_m < COVER_LINE_M], minlength=bins)
-    beside = np.bincount(each[distance_m < CORRIDOR_M], minlength=bins)
-    clean = (on_line >= COVER_POINTS_AT_LEAST) & (on_line >= COVER_CLEAN * beside)
+    bin_of_point = np.minimum(((x_m - grid.near_m) / COVER_BIN_M).astype(np.int64), bins - 1)
+    on_line = np.bincount(bin_of_point[distance_m < COVER_LINE_M], minlength=bins)
+    beside = np.bincount(bin_of_point[distance_m < CORRIDOR_M], minlength=bins)
+    clean = (on_line >= MIN_COVER_POINTS) & (on_line >= MIN_CLEAN_SHARE * beside)
     runs = np.convolve(clean, np.ones(COVER_BINS_TOGETHER), mode="full") == COVER_BINS_TOGETHER
     # `ends` are the last bins of runs: the line is visible over each run and COVER_REACH_M beyond both its ends.
     reach = round(COVER_REACH_M / COVER_BIN_M)
     ends = np.flatnonzero(runs)
-    near = np.zeros(bins + 1)
-    np.add.at(near, np.maximum(ends - COVER_BINS_TOGETHER + 1 - reach, 0), 1)
-    np.add.at(near, np.minimum(ends + reach + 1, bins), -1)
-    return float(np.mean(np.cumsum(near)[:bins] > 0))
+    visibility_steps = np.zeros(bins + 1)
+    np.add.at(visibility_steps, np.maximum(ends - COVER_BINS_TOGETHER + 1 - reach, 0), 1)
+    np.add.at(visibility_steps, np.minimum(ends + reach + 1, bins), -1)
+    return float(np.mean(np.cumsum(visibility_steps)[:bins] > 0))

@@ -17,14 +17,15 @@ Mask = NDArray[np.uint8]
 
 WHITE_ABOVE_ROAD = 28
 """White paint is this much brighter than the mean around it, which changes with shadows and exposure as paint does."""
-WHITE_OVER_ROAD = 1.3
+WHITE_TO_ROAD_RATIO = 1.3
 """White paint is also this many times as bright: in bright light the grain of asphalt exceeds any fixed difference."""
-YELLOW_RED_OVER_BLUE = 55
+YELLOW_RED_MINUS_BLUE = 55
 """Yellow paint has this much less blue than red."""
-EDGE_AT_LEAST = 48
+MIN_EDGE_GRADIENT = 48
 """Minimum 3 x 3 Sobel gradient along a row: 12 grey levels between pixels two columns apart."""
-AROUND_PX = (65, 5)
-"""Width and height of the surroundings at a focal length of 320 px: three times the nearest mark (20 px at 2 m)."""
+SURROUNDINGS_PX = (65, 5)
+"""Width and height of the surroundings at a focal length of 320 px: three times as wide as the nearest mark (20 px at 2
+m)."""
 MARK_PX = 21
 """The width around an edge that may be the inside of a mark, at a focal length of 320 px."""
 
@@ -32,7 +33,7 @@ MARK_PX = 21
 def lane_pixels(region: Picture, scale: float = 1.0) -> Mask:
     """Return a mask of the pixels of `region`, (height, width, 3), that may belong to a lane's marks.
 
-    `scale` is the camera's focal length over 320 px, by which marks are wider.
+    `scale` is the camera's focal length divided by 320 px; marks are wider by this factor.
     """
     grey = grey_of(region)
     paint = cv2.bitwise_or(white_pixels(grey, scale), yellow_pixels(region))
@@ -46,23 +47,24 @@ def grey_of(region: Picture) -> NDArray[np.uint8]:
 
 def white_pixels(grey: NDArray[np.uint8], scale: float = 1.0) -> Mask:
     """Return a mask of pixels brighter than their surroundings, both by difference and by ratio."""
-    width, height = AROUND_PX
+    width, height = SURROUNDINGS_PX
     around = cv2.blur(grey, (_odd(width * scale), height))
-    above = cv2.threshold(cv2.subtract(grey, around), WHITE_ABOVE_ROAD, 255, cv2.THRESH_BINARY)[1]
-    over = cv2.threshold(cv2.addWeighted(grey, 1.0, around, -WHITE_OVER_ROAD, 0.0), 0, 255, cv2.THRESH_BINARY)[1]
-    return np.asarray(cv2.bitwise_and(above, over), dtype=np.uint8)
+    by_difference = cv2.threshold(cv2.subtract(grey, around), WHITE_ABOVE_ROAD, 255, cv2.THRESH_BINARY)[1]
+    excess = cv2.addWeighted(grey, 1.0, around, -WHITE_TO_ROAD_RATIO, 0.0)
+    by_ratio = cv2.threshold(excess, 0, 255, cv2.THRESH_BINARY)[1]
+    return np.asarray(cv2.bitwise_and(by_difference, by_ratio), dtype=np.uint8)
 
 
 def yellow_pixels(region: Picture) -> Mask:
     """Return a mask of pixels with much more red than blue, which yellow has and grey has not."""
     difference = cv2.subtract(cv2.extractChannel(region, 2), cv2.extractChannel(region, 0))
-    return np.asarray(cv2.threshold(difference, YELLOW_RED_OVER_BLUE, 255, cv2.THRESH_BINARY)[1], dtype=np.uint8)
+    return np.asarray(cv2.threshold(difference, YELLOW_RED_MINUS_BLUE, 255, cv2.THRESH_BINARY)[1], dtype=np.uint8)
 
 
 def edge_pixels(grey: NDArray[np.uint8], scale: float = 1.0) -> Mask:
     """Return a mask of pixels near a sharp edge along the row; patches of light and grass have softer edges."""
     gradient = cv2.convertScaleAbs(cv2.Sobel(grey, cv2.CV_16S, 1, 0, ksize=3))  # saturates at 255
-    sharp = cv2.threshold(gradient, EDGE_AT_LEAST, 255, cv2.THRESH_BINARY)[1]
+    sharp = cv2.threshold(gradient, MIN_EDGE_GRADIENT, 255, cv2.THRESH_BINARY)[1]
     near = np.ones((1, _odd(MARK_PX * scale)), dtype=np.uint8)
     return np.asarray(cv2.dilate(sharp, near), dtype=np.uint8)
 

@@ -78,18 +78,18 @@ def _mask_in_picture(mask: Picture, picture: Picture, bird_eye: BirdEye) -> Pict
 
 def _draw_ground_outline(camera: CalibratedCamera, picture: Picture, grid: GroundGrid) -> Picture:
     """Return the undistorted picture with an outline of the grid."""
-    straight, factors = picture.copy(), np.array(camera.distortion)
+    straight, coefficients = picture.copy(), np.array(camera.distortion)
     if camera.distortion:
         size, undistorted = (camera.width_px, camera.height_px), camera.camera_matrix
         make = cv2.fisheye.initUndistortRectifyMap if camera.fisheye else cv2.initUndistortRectifyMap
-        maps = make(camera.camera_matrix, factors, np.eye(3), undistorted, size, cv2.CV_16SC2)
+        maps = make(camera.camera_matrix, coefficients, np.eye(3), undistorted, size, cv2.CV_16SC2)
         straight = np.asarray(cv2.remap(picture, *maps, cv2.INTER_LINEAR), dtype=np.uint8)
     near, far, side = grid.near_m, grid.far_m, grid.half_width_m
     corners = np.array([[near, side], [far, side], [far, -side], [near, -side], [near, side]])
     rim = np.concatenate([np.linspace(a, b, 60) for a, b in pairwise(corners)])
-    seen = np.column_stack([rim, np.ones(len(rim))]) @ ground_to_picture(camera).T
-    seen = seen[seen[:, 2] > 0.1]
-    _draw_curve(straight, seen[:, :2] / seen[:, 2:], EXPECTED)
+    outline = np.column_stack([rim, np.ones(len(rim))]) @ ground_to_picture(camera).T
+    outline = outline[outline[:, 2] > 0.1]
+    _draw_curve(straight, outline[:, :2] / outline[:, 2:], EXPECTED)
     return straight
 
 
@@ -174,8 +174,8 @@ def _draw_lane(camera: CalibratedCamera, picture: Picture, lane: Lane) -> Pictur
 def _confidence_text(trace: DetectionTrace, lane: Lane) -> Picture:
     """Return a tile with the confidence and its components as text."""
     drawn = np.full((TILE_PX[1], TILE_PX[0], 3), 30, dtype=np.uint8)
-    enough = lane.confidence >= TRACK_CONFIDENCE
-    lines = [f"confidence {lane.confidence:.2f}: " + ("a lane" if enough else f"no lane (below {TRACK_CONFIDENCE})")]
+    has_lane = lane.confidence >= TRACK_CONFIDENCE
+    lines = [f"confidence {lane.confidence:.2f}: " + ("a lane" if has_lane else f"no lane (below {TRACK_CONFIDENCE})")]
     searched = trace.windows or trace.expected is None
     lines.append("searched with windows" if searched else "followed from the last picture")
     if trace.fit is None:
@@ -187,7 +187,7 @@ def _confidence_text(trace: DetectionTrace, lane: Lane) -> Picture:
             f"right line visible {fit.right_visible:.2f}",
             f"share of paint on the lines {fit.on_line_share:.2f}",
         ]
-    if enough:
+    if has_lane:
         c0, c1, c2 = lane.centre
         lines += [
             f"width {lane.width_m:.2f} m",
@@ -197,6 +197,6 @@ def _confidence_text(trace: DetectionTrace, lane: Lane) -> Picture:
             f"visible from {lane.near_m:.1f} to {lane.far_m:.1f} m",
         ]
     for number, line in enumerate(lines):
-        colour = (255, 255, 255) if number else ((120, 230, 120) if enough else (90, 90, 255))
+        colour = (255, 255, 255) if number else ((120, 230, 120) if has_lane else (90, 90, 255))
         cv2.putText(drawn, line, (10, 28 + 25 * number), cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1, cv2.LINE_AA)
     return drawn

@@ -168,8 +168,8 @@ class SafetyGate:
     def _arm(self, command: Command, vehicle: VehicleState, now_ns: int) -> None:
         is_neutral = command.throttle == 0 and abs(command.steering_rad) <= self._limits.arming_steering_rad
         is_braked = command.brake >= self._limits.arming_brake
-        is_supplied = self.watchdog.has_fresh_command(now_ns) and not self.issued_stamps.is_frozen
-        if not (is_neutral and is_braked and is_supplied):
+        has_fresh_pictures = self.watchdog.has_fresh_command(now_ns) and not self.issued_stamps.is_frozen
+        if not (is_neutral and is_braked and has_fresh_pictures):
             self.machine.trigger("arming interrupted")
         elif self.machine.state != "arming":
             self._arming_since_ns = now_ns

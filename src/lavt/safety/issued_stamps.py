@@ -3,6 +3,13 @@
 from __future__ import annotations
 
 from collections import deque
+from typing import NamedTuple
+
+
+class _IssuedFrame(NamedTuple):
+    number: int
+    issued_ns: int
+    captured_ns: int
 
 
 class IssuedStamps:
@@ -15,18 +22,21 @@ class IssuedStamps:
     def __init__(self, memory_ns: int, frozen_frames: int) -> None:
         self._memory_ns = memory_ns
         self._frozen_frames = frozen_frames
-        self._issued: dict[int, tuple[int, int, int]] = {}
+        self._issued: dict[int, _IssuedFrame] = {}
+        """The frames by stamp."""
         self._order: deque[tuple[int, int]] = deque()
+        """Time of issue and stamp of each frame, oldest first."""
         self._last_crc: int | None = None
         self._last_captured_ns = 0
         self._equal_frames = 0
+        """Number of the last frames that have equal pixels."""
 
     def add(self, stamp_ns: int, number: int, mono_ns: int, pixel_crc: int, captured_ns: int | None = None) -> None:
         """Store the stamp of a frame that was stamped at `mono_ns`; forget stamps older than the memory.
 
-        `pixel_crc` is a checksum of the pixels without the stamp. `captured_ns` is the camera's capture time; None: the
-        camera reports none. Then, and if it is later than `mono_ns`, `mono_ns` is used. A frame equal to the one before
-        it keeps that one's capture time.
+        `pixel_crc` is a checksum of the pixels without the stamp. `captured_ns` is the capture time that the camera
+        reports, or None. If it is None or later than `mono_ns`, `mono_ns` is stored as the capture time. A frame whose
+        pixels equal those of the frame before it has that frame's capture time.
         """
         if pixel_crc == self._last_crc:
             self._equal_frames += 1
@@ -34,25 +44,26 @@ class IssuedStamps:
             self._equal_frames = 1
             self._last_captured_ns = mono_ns if captured_ns is None else min(captured_ns, mono_ns)
         self._last_crc = pixel_crc
-        self._issued[stamp_ns] = (number, mono_ns, self._last_captured_ns)
+        self._issued[stamp_ns] = _IssuedFrame(number, mono_ns, self._last_captured_ns)
         self._order.append((mono_ns, stamp_ns))
         while self._order and self._order[0][0] < mono_ns - self._memory_ns:
             old_ns, old_stamp_ns = self._order.popleft()
-            if self._issued.get(old_stamp_ns, (0, old_ns, 0))[1] == old_ns:  # else it was issued again since
-                self._issued.pop(old_stamp_ns, None)
+            old_frame = self._issued.get(old_stamp_ns)
+            if old_frame is not None and old_frame.issued_ns == old_ns:  # else the stamp was issued again later
+                del self._issued[old_stamp_ns]
 
     def issued_ns(self, stamp_ns: int, now_ns: int) -> int | None:
         """Return when `stamp_ns` was issued; None: this server did not issue it, or longer ago than its memory."""
-        entry = self._issued.get(stamp_ns)
-        return entry[1] if entry is not None and now_ns - entry[1] <= self._memory_ns else None
+        frame = self._issued.get(stamp_ns)
+        return frame.issued_ns if frame is not None and now_ns - frame.issued_ns <= self._memory_ns else None
 
     def captured_ns(self, stamp_ns: int) -> int:
         """Return the capture time of the frame with a known stamp."""
-        return self._issued[stamp_ns][2]
+        return self._issued[stamp_ns].captured_ns
 
     def frame_number(self, stamp_ns: int) -> int:
         """Return the frame number of a known stamp."""
-        return self._issued[stamp_ns][0]
+        return self._issued[stamp_ns].number
 
     @property
     def is_frozen(self) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from lavt.control.driver_limits import CLIENT_LIMITS
+from lavt.control.client_limits import CLIENT_LIMITS
 from lavt.domain import NS_PER_S, Actuation, VehicleState
 from lavt.errors import UserError
 from lavt.safety.limits import Limits
@@ -48,7 +48,7 @@ class Limiter:
     ) -> Actuation:
         """Return `requested` within the limits at the vehicle's present speed; all values are finite.
 
-        `picture_age_ns` is the age of the picture that `requested` was made from; None: it was made from none.
+        `picture_age_ns` is the age of the picture that `requested` was made from; None: it was not made from a picture.
         """
         before_rad = self.target_rad(vehicle)
         step_rad = self.limits.steering_rate_radps * max(0, now_ns - self._at_ns) / NS_PER_S
@@ -68,9 +68,9 @@ class Limiter:
         if not -bound_rad <= steering_rad <= bound_rad:
             changed.append("lateral acceleration")
             steering_rad = min(max(steering_rad, -bound_rad), bound_rad)
-        reached_rad = steering_rad
+        rate_limited_rad = steering_rad
         if not before_rad - step_rad <= steering_rad <= before_rad + step_rad:
-            reached_rad = min(max(steering_rad, before_rad - step_rad), before_rad + step_rad)
+            rate_limited_rad = min(max(steering_rad, before_rad - step_rad), before_rad + step_rad)
             if abs(steering_rad - before_rad) > self.limits.steering_rate_radps * COMMAND_PERIOD_S:
                 changed.append("steering rate")
         throttle = requested.throttle
@@ -84,9 +84,9 @@ class Limiter:
             if excess_mps > 0 and (throttle > 0 or brake < minimum_brake):
                 throttle, brake = 0.0, max(brake, minimum_brake)
                 changed.append("stopping distance")
-        self._steering_rad, self._at_ns = reached_rad, max(now_ns, self._at_ns)
+        self._steering_rad, self._at_ns = rate_limited_rad, max(now_ns, self._at_ns)
         self.applied_limits = tuple(changed)
-        return Actuation(reached_rad, throttle, brake)
+        return Actuation(rate_limited_rad, throttle, brake)
 
     def _stopping_distance_brake(self, excess_mps: float) -> float:
         """Return the pedal that removes the excess speed in the settling time, at most that of a safe stop."""
@@ -96,7 +96,7 @@ class Limiter:
     def _lateral_limit_rad(self, speed_mps: float, is_known: bool) -> float:
         """Return the road wheel angle at which the lateral acceleration v^2 tan(angle) / wheelbase is at its limit.
 
-        A speed that is not known counts as the speed limit at least.
+        A speed that is not known counts as at least the speed limit.
         """
         if not is_known:
             reported_mps = abs(speed_mps) if math.isfinite(speed_mps) else 0.0
@@ -109,8 +109,9 @@ class Limiter:
 def stopping_speed_limit_mps(picture_age_s: float, limits: Limits) -> float:
     """Return the highest speed from which the car stops on the path of its last command, if no other command follows.
 
-    The car has driven on for the picture's age, drives on until the safe stop begins, and brakes: the speed v solves
-    v (age + `stop_after`) + v^2 / (2 `stop_deceleration`) = `stopping_distance_limit`. It falls with the picture's age.
+    Since the picture was taken, the car has driven for the picture's age. It drives on for `stop_after` until the safe
+    stop begins, and then brakes. So the speed v solves v (age + `stop_after`) + v^2 / (2 `stop_deceleration`) =
+    `stopping_distance_limit`; the older the picture, the lower it is.
     """
     unguided_s = picture_age_s + limits.stop_after_ns / NS_PER_S
     braking_mps2 = limits.stop_deceleration_mps2

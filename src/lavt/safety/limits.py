@@ -12,18 +12,21 @@ class Limits:
     """The limits that the vehicle enforces, whatever is commanded."""
 
     degraded_after_ns: int = 300 * NS_PER_MS
-    """Without a command from a newer picture: degraded. Nine frames at 30 Hz; peers' watchdogs are 100 to 500 ms."""
+    """Without a command from a newer picture for this long: degraded. These are nine frames at 30 Hz; the watchdogs of
+    similar systems wait 100 to 500 ms."""
     stop_after_ns: int = 500 * NS_PER_MS
-    """Without a command from a newer picture: safe stop. At 30 km/h the car has gone 4 m without guidance."""
+    """Without a command from a newer picture for this long: safe stop. At 30 km/h the car has then gone 4 m without
+    guidance."""
     degraded_deceleration_mps2: float = 1.0
-    """Gentle: most command timeouts end by themselves."""
+    """Deceleration while degraded. It is gentle, because most command timeouts end by themselves."""
     stop_deceleration_mps2: float = 4.0
-    """From 30 km/h to standstill in 2.1 s and 9 m; it leaves grip for steering."""
+    """Deceleration of a safe stop: from 30 km/h to standstill in 2.1 s and 9 m. It leaves grip for steering."""
     stop_settling_ns: int = 500 * NS_PER_MS
-    """From the begin of a safe stop until the speed must fall: the brake's lag is 0.2 s, and reports are up to 0.1 s
-    old."""
+    """Time from the beginning of a safe stop until the speed must fall: the brake's lag is 0.2 s, and reports are up to
+    0.1 s old."""
     stop_excess_mps: float = 0.5
-    """From this speed above that of the wanted safe stop, the brake is full; half of it adds half of the difference."""
+    """If the vehicle in a safe stop is faster than planned by this much, it brakes fully. If it is faster by half as
+    much, its brake is halfway between that of `stop_deceleration_mps2` and full."""
     stopping_distance_limit_m: float = PATH_STEP_M * PATH_POINTS
     """The stopping distance must lie on the path in the command (`stopping_speed_limit_mps`). Only a simulated vehicle
     may be configured beyond it, to study higher speeds and delays."""
@@ -36,17 +39,19 @@ class Limits:
     stamp_memory_ns: int = 5 * NS_PER_S
     """The server remembers the stamps that it issued for this long."""
     lateral_acceleration_mps2: float = 3.0
-    """As in openpilot (ISO 11270); a simulated vehicle may be configured up to 6."""
+    """The limit is that of openpilot (ISO 11270). A simulated vehicle may be configured up to 6 m/s2."""
     steering_rate_radps: float = 0.8
-    """Road wheel. It is above the 0.53 rad/s of the cars we know, so that it limits only faulty commands."""
+    """Rate of the road wheels' angle. It is above the 0.53 rad/s of the cars we know, so that it limits only faulty
+    commands."""
     speed_limit_mps: float = 40 / 3.6
-    """No throttle above it; the controllers drive 30 km/h."""
+    """Above this speed there is no throttle. The controllers drive 30 km/h."""
     arming_hold_ns: int = NS_PER_S
     """All arming conditions must be met for this long."""
     handover_request_timeout_ns: int = 3 * NS_PER_S
     """A handover request is renewed each second; after three missing renewals it expires."""
     reservation_ns: int = 5 * NS_PER_S
-    """A released vehicle is reserved for the requester for this long: it tries each second, and replies may be lost."""
+    """A released vehicle is reserved for the client that requested it for this long. That client tries each second to
+    acquire control, and replies may be lost."""
     arming_brake: float = 0.3
     """From this pedal position on, the brake counts as applied for arming."""
     arming_steering_rad: float = 0.1

@@ -1,7 +1,7 @@
 """Steering without commands: along the planned path of the last command, by the vehicle's own odometry.
 
-Each command contains the planned path, which begins where its picture was taken. When commands cease, odometry tells
-how far the car has come along that path and how far it is off it; pure pursuit of the path's points steers it.
+Each command contains the planned path, which begins where its picture was taken. When commands stop, odometry measures
+how far the car has come along that path and how far it is beside it, and pure pursuit of the path steers the car.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from lavt.safety.odometry import Odometry
 LOOKAHEAD_S = 0.5
 """Lookahead on the path, in seconds of driving.
 
-The lookahead compensates the wheel's lag. Pure pursuit crosses over at 2.2 / lookahead with a phase margin of 65
-degrees (`experiment/boundary/delay_margin.py`). At 0.5 s, a steering lag of 0.12 s costs 28 degrees and a sampling
-period of at most 33 ms costs 4, which leaves 33. A preset counts as designed from 30 degrees on; a shorter lookahead
-would leave less.
+The lookahead compensates the wheel's lag. The gain crossover of pure pursuit is at 2.2 / lookahead, with a phase margin
+of 65 degrees (`experiment/boundary/delay_margin.py`). At 0.5 s, a steering lag of 0.12 s costs 28 degrees and a
+sampling period of at most 33 ms costs 4, which leaves 33. A preset counts as designed from 30 degrees on; a shorter
+lookahead would leave less.
 """
 
 
@@ -70,9 +70,9 @@ class PathFollower:
 def pose_along_path(start: PlanarPose, curvatures_per_m: tuple[float, ...], along_m: float) -> PlanarPose:
     """Return the pose after `along_m` on a path from `start`, whose curvatures are `PATH_STEP_M` apart."""
     pose = start
-    for before, after in pairwise(curvatures_per_m):
+    for from_per_m, to_per_m in pairwise(curvatures_per_m):
         if along_m <= PATH_STEP_M:
-            return move_along_arc(pose, along_m, (before + after) / 2)
-        pose = move_along_arc(pose, PATH_STEP_M, (before + after) / 2)
+            return move_along_arc(pose, along_m, (from_per_m + to_per_m) / 2)
+        pose = move_along_arc(pose, PATH_STEP_M, (from_per_m + to_per_m) / 2)
         along_m -= PATH_STEP_M
     return move_along_arc(pose, along_m, curvatures_per_m[-1])

@@ -14,12 +14,12 @@ from dataclasses import fields
 from itertools import pairwise
 from typing import Any, Final
 
-from lavt.control.driver_limits import CLIENT_LIMITS
+from lavt.control.client_limits import CLIENT_LIMITS
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
 from lavt.safety.gate import RejectionReason
 from lavt.safety.limits import LIMITS
-from lavt.safety.state_machine import REASONS, TRANSITIONS, Trigger
+from lavt.safety.state_machine import TRANSITIONS, TRIGGER_MESSAGES, Trigger
 
 _BLOCK: Final = re.compile(r"<!-- drawn: (?P<name>[a-z ]+) -->\n(?P<drawn>.*?)<!-- drawn until here -->", re.DOTALL)
 
@@ -64,7 +64,7 @@ def draw_transitions() -> str:
         rows.setdefault((trigger, after), []).append(before)
     return _table(
         ("trigger", "from", "to", "message"),
-        [(trigger, ", ".join(befores), after, REASONS[trigger]) for (trigger, after), befores in rows.items()],
+        [(trigger, ", ".join(befores), after, TRIGGER_MESSAGES[trigger]) for (trigger, after), befores in rows.items()],
     )
 
 

@@ -12,7 +12,7 @@ from lavt.safety.state_machine import SafetyStateMachine
 from lavt.safety.takeover_requests import TakeoverRequests
 
 LARGEST_STORED_NUMBER = 2**62
-"""Numbers of emergency stops are times in nanoseconds: this one is in the year 2116."""
+"""The number of an emergency stop is its time in nanoseconds; this number is a time in the year 2116."""
 
 
 class CommandEpoch:
@@ -81,13 +81,13 @@ class VehicleSession:
         )
 
     def close(self) -> None:
-        """Stop the vehicle and end control for good, because the server shuts down."""
+        """Stop the vehicle and end control permanently, because the server shuts down."""
         self._is_closed = True
         self._machine.trigger("server shutdown")
         self._end_control()
 
     def raise_emergency_stop(self, number: int) -> bool:
-        """Stop the vehicle, and return True; for a number that is not higher than all before, only return False."""
+        """Stop the vehicle and return True; return False for a number that is not higher than all before."""
         if number <= self._emergency_stop_number:
             self._counts["emergency stop with an old number"] += self._machine.state != "emergency_stop"
             return False

@@ -70,8 +70,8 @@ TRANSITIONS: dict[tuple[SafetyState, Trigger], SafetyState] = {
 }
 """The next state for each state and trigger. A pair that is not in the table changes nothing."""
 
-REASONS: dict[Trigger, str] = {
-    "arming begins": "stationary, brake applied, input neutral, pictures fresh: arming takes 1 s",
+TRIGGER_MESSAGES: dict[Trigger, str] = {
+    "arming begins": "all arming conditions are met",
     "arming interrupted": "an arming condition was not met",
     "arming complete": "armed by the client",
     "command timeout": "no command from a newer picture",
@@ -87,13 +87,14 @@ REASONS: dict[Trigger, str] = {
     "drive over": "the drive is over",
     "server shutdown": "the server is shutting down",
 }
-"""The message for each trigger, in states and records."""
+"""The message for each trigger, as states and records contain it."""
 
 
 class SafetyStateMachine:
     """The safety state and its reason, changed by `TRANSITIONS` only.
 
-    `end_epoch` is called with each safe stop, emergency stop and driver override: commands from before are rejected.
+    `end_epoch` is called with each safe stop, emergency stop and driver override, so that earlier commands are
+    rejected.
     """
 
     def __init__(self, limits: Limits, end_epoch: Callable[[], None]) -> None:
@@ -108,7 +109,8 @@ class SafetyStateMachine:
         after = TRANSITIONS.get((self.state, trigger))
         if after is None:
             return
-        reason = f"{REASONS[trigger]}: {detail}" if detail else REASONS[trigger]
+        message = TRIGGER_MESSAGES[trigger]
+        reason = f"{message}: {detail}" if detail else message
         self._transitions.append((self.state, after, reason))
         self.state, self.reason = after, reason
         if after in ("safe_stop", "emergency_stop") or trigger == "driver override":

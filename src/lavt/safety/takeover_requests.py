@@ -9,12 +9,12 @@ from lavt.domain import SessionRequest
 
 @dataclass(frozen=True, slots=True)
 class _TakeoverRequest:
-    who: str
+    client_name: str
     instance: int
     until_ns: int
 
     def is_from(self, request: SessionRequest) -> bool:
-        return (request.who, request.instance) == (self.who, self.instance)
+        return (request.who, request.instance) == (self.client_name, self.instance)
 
 
 class TakeoverRequests:
@@ -32,19 +32,19 @@ class TakeoverRequests:
     def add(self, request: SessionRequest, now_ns: int) -> str:
         """Store or renew a handover request; return why it is rejected, or an empty string."""
         if self._request is not None and now_ns < self._request.until_ns and not self._request.is_from(request):
-            return f"{self._request.who} has requested control already"
+            return f"{self._request.client_name} has requested control already"
         self._request = _TakeoverRequest(request.who, request.instance, now_ns + self._handover_request_timeout_ns)
         return ""
 
     def requested_by(self, now_ns: int) -> str:
         """Return the name of the client whose request is pending; empty: there is none."""
-        return self._request.who if self._request is not None and now_ns < self._request.until_ns else ""
+        return self._request.client_name if self._request is not None and now_ns < self._request.until_ns else ""
 
     def reserve(self, now_ns: int) -> None:
         """Reserve the released vehicle for the client whose request is pending, if there is one."""
-        granted = self.requested_by(now_ns) and self._request
-        reserved_ns = now_ns + self._reservation_ns
-        self._reservation = _TakeoverRequest(granted.who, granted.instance, reserved_ns) if granted else None
+        pending = self.requested_by(now_ns) and self._request
+        until_ns = now_ns + self._reservation_ns
+        self._reservation = _TakeoverRequest(pending.client_name, pending.instance, until_ns) if pending else None
         self._request = None
 
     def reserved_for(self, request: SessionRequest, now_ns: int) -> str:
@@ -52,7 +52,7 @@ class TakeoverRequests:
         reservation = self._reservation
         if reservation is None or now_ns >= reservation.until_ns or reservation.is_from(request):
             return ""
-        return reservation.who
+        return reservation.client_name
 
     def clear(self) -> None:
         """Drop request and reservation: a client has acquired control."""

@@ -39,6 +39,7 @@ class Watchdog:
         self._captured_ns = 0
         """Capture time of the picture of `CommandEpoch.command`."""
         self._engages = False
+        """The last result of `should_engage`."""
 
     def reset_timeout(self, now_ns: int) -> None:
         """Restart the command timeout, because a fresh command was accepted."""
@@ -112,7 +113,7 @@ class Watchdog:
         state = self._machine.state
         command = self._epoch.command if state in ("driving", "degraded") else None
         throttle, brake = (command.throttle, command.brake) if command else (0.0, self._limits.arming_brake)
-        if state == "degraded":  # never releases a brake
+        if state == "degraded":  # no throttle, and the commanded brake is not released
             throttle, brake = 0.0, max(brake, self._pedal(self._limits.degraded_deceleration_mps2))
         elif state == "safe_stop":
             throttle, brake = 0.0, self._stop_brake.pedal(vehicle, now_ns)
@@ -125,7 +126,7 @@ class Watchdog:
         return self._limiter.limit(target, vehicle, now_ns, picture_age_ns)
 
     def _steering_target_rad(self, vehicle: VehicleState, now_ns: int) -> float:
-        """Return the commanded angle; without a command that of the last path; without a path the last target."""
+        """Return the commanded angle; without a command, that of the last path; without a path, the last target."""
         if self._machine.state == "driving" and self._epoch.command is not None:
             return self._epoch.command.steering_rad
         if self._machine.state in UNCOMMANDED:

@@ -54,7 +54,7 @@ class BusPort(Protocol):
         ...
 
     def next_wake_ns(self) -> int | None:
-        """Return the latest time at which `take` has a frame, or None if it is not known."""
+        """Return a time by which `take` returns a frame; None: that is not known."""
         ...
 
     def close(self) -> None:

@@ -10,7 +10,7 @@ from lavt.errors import UserError
 from lavt.vehicle.ground_truth_wire import MAX_BYTES, TruthReceiver
 
 MAX_DATAGRAMS = 256
-"""Datagrams read in one call: a second of them."""
+"""Largest number of datagrams that one call reads: those of a second."""
 
 
 class TruthSocket:

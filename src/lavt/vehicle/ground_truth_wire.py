@@ -66,7 +66,7 @@ class TruthSender:
     def __init__(self, start_ns: int) -> None:
         self._number = start_ns
         self._pending: deque[tuple[int, NumberedEvent]] = deque()
-        """Remaining repetitions of each event."""
+        """The events still to be sent, each with its remaining number of repetitions."""
 
     def make_datagram(self, truth: GroundTruth, new_events: Sequence[VehicleEvent]) -> bytes:
         """Return the next datagram; `new_events` are the events since the last one."""
@@ -74,7 +74,7 @@ class TruthSender:
             self._number += 1
             self._pending.append((REPEATS, (self._number, event)))
         chosen = [self._pending.popleft() for _ in range(min(MAX_EVENTS, len(self._pending)))]
-        self._pending.extendleft((left - 1, event) for left, event in reversed(chosen) if left > 1)
+        self._pending.extendleft((repeats - 1, event) for repeats, event in reversed(chosen) if repeats > 1)
         return encode_truth(truth, [event for _, event in chosen])
 
 
@@ -99,6 +99,6 @@ class TruthReceiver:
         else:
             self.counts["truths"] += 1
             self.newest = truth
-        new = [(number, event) for number, event in events if number > self._number]
-        self._number = max([self._number, *(number for number, _ in new)])
-        return [event for _, event in new]
+        new_events = [(number, event) for number, event in events if number > self._number]
+        self._number = max([self._number, *(number for number, _ in new_events)])
+        return [event for _, event in new_events]

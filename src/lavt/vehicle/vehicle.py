@@ -12,10 +12,11 @@ from lavt.domain import Actuation, GroundTruth, VehicleEvent, VehicleState
 
 
 class ReachedCommand(Struct, frozen=True):
-    """A command, applied at `applied_ns`, that the vehicle reported at `reached_ns` to be steering by."""
+    """A command whose steering has reached the wheels: the vehicle reported that it steers with it."""
 
     applied_ns: int
     reached_ns: int
+    """Time of the report."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +54,7 @@ class Vehicle(Protocol):
         ...
 
     def engage(self, wanted: bool, now_ns: int) -> None:
-        """Engage or disengage the vehicle. Repeated calls with the same `wanted` have no effect.
+        """Engage the vehicle if `wanted`, otherwise disengage it. A repeated call with the same `wanted` has no effect.
 
         A vehicle that needs time to engage reports in its state when it is engaged. A disengaged vehicle accepts no
         command but the brake, and stays in place once it is stationary.

@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 RETRY_S: Final = 1.0
 """The interval at which a camera without pictures is reopened."""
 MAX_CREDIBLE_RATE_HZ: Final = 1000.0
-"""Streams without a frame rate report that of their timestamps (90 kHz), which is ignored."""
+"""A higher rate is ignored: streams without a frame rate report that of their timestamps (90 kHz)."""
 RATE_TOLERANCE: Final = 0.01
 """Relative: 30 and 29.97 Hz count as equal."""
 MAX_BUFFER_AGE_NS: Final = NS_PER_S
@@ -167,7 +167,7 @@ class VideoDevice:
         return capture, picture
 
     def _open(self) -> cv2.VideoCapture:
-        """Open the device; without a device the result cannot be read from."""
+        """Open the device; if that fails, reading from the result fails."""
         if not self._is_v4l2:
             limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _TIMEOUT_MS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _TIMEOUT_MS]
             one_thread = [cv2.CAP_PROP_N_THREADS, 1]  # each further FFmpeg thread adds a frame of delay
@@ -212,7 +212,7 @@ class VideoDevice:
 
     def _store(self, capture: cv2.VideoCapture, picture: Picture) -> None:
         arrived_ns = self._clock.now().mono_ns
-        self._due_ns = max(self._due_ns + round(NS_PER_S / self.rate_hz), arrived_ns)  # delays are not caught up
+        self._due_ns = max(self._due_ns + round(NS_PER_S / self.rate_hz), arrived_ns)  # a delay is not made up for
         capture_ns = buffer_time_ns(capture.get(cv2.CAP_PROP_POS_MSEC), arrived_ns) if self._is_v4l2 else None
         with self._changed:
             if picture.shape != (self.model.height_px, self.model.width_px, 3):

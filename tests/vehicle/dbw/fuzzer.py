@@ -41,9 +41,9 @@ KINDS: tuple[Kind, ...] = ("lose", "flip", "forge", "repeat", "garbage", "comman
 
 
 def settled_states(state: State, now: Situation) -> list[tuple[State, str]]:
-    """Return the states of one instant; none may be reached twice, and the table must not lead on."""
+    """Return the states of one instant; none may be entered twice, and no further transition may be possible."""
     path = states_after(state, now)
-    reached = [each for each, _ in path]
+    reached = [entered for entered, _ in path]
     assert len({state, *reached}) == 1 + len(reached), (state, path)
     if path:
         assert next_state(reached[-1], replace(now, in_state_ns=0))[0] == reached[-1], (state, path)
@@ -162,7 +162,7 @@ class Fuzzer:
         self._vehicle = DbwVehicle(self._adapter, self._port, CAPABILITIES, start_ns=START_NS)
         self._old_frames: deque[CanFrame] = deque(maxlen=50)
         self._kinds: list[Kind] = []
-        self._hostility = self._wire_loss = self._stalls = self._acts = 0.0
+        self._hostility = self._wire_loss = self._stall_probability = self._action_probability = 0.0
         self._turned_rad: float | None = None
         """The driver has turned the wheels."""
         self._lost_identifier = 0
@@ -185,10 +185,11 @@ class Fuzzer:
         if is_over or self._now_ns >= self._episode_ns:
             self._begin_episode()
         is_hostile = self._now_ns >= self._hostile_ns
-        is_passing = self._adapter._state in {"clearing", "enabling", "parking"}
-        stalls = is_hostile and is_drawn(chance, 10 * self._stalls if is_passing else self._stalls)
+        is_transient = self._adapter._state in {"clearing", "enabling", "parking"}
+        stall_probability = 10 * self._stall_probability if is_transient else self._stall_probability
+        stalls = is_hostile and is_drawn(chance, stall_probability)
         self._run_car(chance.choice(STALLS_MS if stalls else STEPS_MS) * NS_PER_MS, is_hostile)
-        if is_hostile and is_drawn(chance, self._acts):
+        if is_hostile and is_drawn(chance, self._action_probability):
             self._act()
         if self._adapter._state == "clearing" and is_drawn(chance, 0.02):
             self._turn()
@@ -243,7 +244,8 @@ class Fuzzer:
         self._kinds = [kind for kind in KINDS if chance.below(2)]
         self._hostility = chance.choice((0.003, 0.03, 0.3, 1.0))
         self._wire_loss = chance.choice((0.0, 0.0, 0.02, 0.5))
-        self._stalls, self._acts = chance.choice((0.0, 0.01, 0.05)), chance.choice((0.0, 0.01, 0.1))
+        self._stall_probability = chance.choice((0.0, 0.01, 0.05))
+        self._action_probability = chance.choice((0.0, 0.01, 0.1))
         self._port.failure_rate = chance.choice((0.0, 0.0, 0.02, 0.3))
         self._lost_identifier = chance.choice((0, chance.choice([0, *self._kit._generation.reports])))
 
@@ -262,7 +264,7 @@ class Fuzzer:
             for frame in self._kit.frames_due(self._now_ns):
                 self._old_frames.append(frame)
                 frames = self._spoil(frame) if is_hostile else [frame]
-                self._port.waiting += [ReceivedCanFrame(each, self._now_ns) for each in frames]
+                self._port.waiting += [ReceivedCanFrame(frame_or_fake, self._now_ns) for frame_or_fake in frames]
 
     def _set_speed(self, steering_rad: float = 0.0) -> None:
         angle_rad = steering_rad if self._turned_rad is None else self._turned_rad

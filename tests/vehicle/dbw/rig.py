@@ -79,9 +79,9 @@ class AdapterRig:
             self.run_ms(400)
 
     def copy(self) -> AdapterRig:
-        """Return a rig in the same state that shares only immutable objects."""
-        constants = (self.profile, self.profile.codec, road(), *self.moments)
-        return deepcopy(self, {id(each): each for each in constants})
+        """Return a rig in the same state that shares only immutable objects with this one."""
+        shared = (self.profile, self.profile.codec, road(), *self.moments)
+        return deepcopy(self, {id(shared_object): shared_object for shared_object in shared})
 
     def run_ms(self, duration_ms: int, *, step_ms: int = 1) -> None:
         """Run for a time, in coarser steps where nothing is measured."""
@@ -153,26 +153,26 @@ class AdapterRig:
         return (self.now_ns - since_ns) // NS_PER_MS
 
 
-def started(generation: int) -> AdapterRig:
+def stationary_rig(generation: int) -> AdapterRig:
     """Return a stationary car whose reports have all been received."""
-    return _started(generation).copy()
+    return _stationary_rig(generation).copy()
 
 
-def driving(generation: int, *, tick_ms: int = 20, **keys: Any) -> AdapterRig:
+def driving_rig(generation: int, *, tick_ms: int = 20, **keys: Any) -> AdapterRig:
     """Return a car that drives at slightly more than 5 m/s, steered slightly to the left."""
-    rig = _accelerated(AdapterRig(generation, **keys)) if keys else _driving(generation).copy()
+    rig = _accelerated(AdapterRig(generation, **keys)) if keys else _driving_rig(generation).copy()
     rig.tick_ns = tick_ms * NS_PER_MS
     return rig
 
 
 @cache
-def _started(generation: int) -> AdapterRig:
+def _stationary_rig(generation: int) -> AdapterRig:
     return AdapterRig(generation)
 
 
 @cache
-def _driving(generation: int) -> AdapterRig:
-    return _accelerated(started(generation))
+def _driving_rig(generation: int) -> AdapterRig:
+    return _accelerated(stationary_rig(generation))
 
 
 def _accelerated(rig: AdapterRig) -> AdapterRig:
@@ -187,15 +187,15 @@ def _accelerated(rig: AdapterRig) -> AdapterRig:
 
 def with_limits(generation: int, **limits: float) -> Profile:
     """Return a profile with other limits."""
-    found = profile(f"dataspeed_gen{generation}")
-    return replace(found, limits=replace(found.limits, **limits))
+    base_profile = profile(f"dataspeed_gen{generation}")
+    return replace(base_profile, limits=replace(base_profile.limits, **limits))
 
 
 def with_one_speed(generation: int) -> Profile:
     """Return a profile of a kit that reports no wheel speeds and no second speed."""
-    found = profile(f"dataspeed_gen{generation}")
-    reports = {name: report for name, report in found.reports.items() if name != "WheelSpeed"}
-    return replace(found, reports=reports, speeds_per_mps={"speed": found.speeds_per_mps["speed"]})
+    base_profile = profile(f"dataspeed_gen{generation}")
+    reports = {name: report for name, report in base_profile.reports.items() if name != "WheelSpeed"}
+    return replace(base_profile, reports=reports, speeds_per_mps={"speed": base_profile.speeds_per_mps["speed"]})
 
 
-both = pytest.mark.parametrize("generation", [1, 2])
+both_generations = pytest.mark.parametrize("generation", [1, 2])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from tests.safety.rig import new_limiter
-from tests.vehicle.dbw.rig import AdapterRig, both, started
+from tests.vehicle.dbw.rig import AdapterRig, both_generations, stationary_rig
 
 from lavt.domain import SessionRequest
 from lavt.safety.gate import SafetyGate
@@ -23,10 +23,10 @@ def decide(rig: AdapterRig, gate: SafetyGate) -> None:
     rig.adapter.engage(gate.watchdog.should_engage(state), rig.now_ns)
 
 
-@both
+@both_generations
 def test_a_driver_who_drives_off_after_an_emergency_stop_is_left_alone(generation: int) -> None:
     """The kit is not engaged again if a driver drives off by hand after an emergency stop, from standstill and PARK."""
-    rig, gate = started(generation), new_gate()
+    rig, gate = stationary_rig(generation), new_gate()
     rig.engage()
     assert gate.session.answer(SessionRequest("emergency_stop", "alice", 1, 7), rig.adapter.state(), rig.now_ns).granted
     for _ in range(2000):

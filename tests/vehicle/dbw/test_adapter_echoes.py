@@ -1,4 +1,4 @@
-"""Which steering commands the adapter takes as reached, with reported commands that each test chooses.
+"""Steering commands that the adapter counts as reached, for reported commands that each test chooses.
 
 The reports are those of generation 1: a command in bytes 2 and 3, in steps of 0.1 degrees.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import pytest
 from msgspec.structs import replace
-from tests.vehicle.dbw.rig import AdapterRig, driving, started
+from tests.vehicle.dbw.rig import AdapterRig, driving_rig, stationary_rig
 
 from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.vehicle import ReachedCommand
@@ -66,7 +66,7 @@ class ChosenReports:
 @pytest.mark.parametrize(("age_ms", "is_known"), [(0, True), (180, True), (200, True), (220, False), (500, False)])
 def test_a_command_that_is_not_reported_is_forgotten(age_ms: int, is_known: bool) -> None:
     """A command is reached if it is reported within 200 ms; later reports of it are ignored, also if it is repeated."""
-    car = ChosenReports(driving(1))
+    car = ChosenReports(driving_rig(1))
     requested_ns, command = car.steer(FIRST_RAD)
     car.rig.run_ms(age_ms)
     assert car.choose(command) == [ReachedCommand(requested_ns, car.rig.now_ns)] * is_known
@@ -74,7 +74,7 @@ def test_a_command_that_is_not_reported_is_forgotten(age_ms: int, is_known: bool
 
 def test_only_old_commands_are_forgotten() -> None:
     """Discarding an expired command keeps the later ones."""
-    car = ChosenReports(driving(1))
+    car = ChosenReports(driving_rig(1))
     _, first = car.steer(FIRST_RAD)
     car.rig.run_ms(100)
     requested_ns, second = car.steer(SECOND_RAD)
@@ -85,7 +85,7 @@ def test_only_old_commands_are_forgotten() -> None:
 
 def test_all_old_commands_are_forgotten() -> None:
     """Two commands that expire before the next set of frames are both discarded."""
-    car = ChosenReports(driving(1))
+    car = ChosenReports(driving_rig(1))
     car.steer(FIRST_RAD)
     _, second = car.steer(SECOND_RAD)
     car.rig.run_ms(120)
@@ -99,7 +99,7 @@ def test_all_old_commands_are_forgotten() -> None:
 
 def test_a_repeated_angle_is_reached_again() -> None:
     """Each of three commands is reached at its own report, even if the last one equals the first."""
-    car = ChosenReports(driving(1))
+    car = ChosenReports(driving_rig(1))
     requested = [car.steer(angle_rad) for angle_rad in (FIRST_RAD, SECOND_RAD, FIRST_RAD)]
     for requested_ns, command in requested:
         car.rig.run_ms(5)
@@ -108,8 +108,10 @@ def test_a_repeated_angle_is_reached_again() -> None:
 
 def test_superseded_commands_are_not_reached() -> None:
     """A report of a command discards the earlier ones; later ones are still awaited."""
-    car = ChosenReports(driving(1))
-    (_, first), (second_ns, second), (third_ns, _) = [car.steer(each) for each in (FIRST_RAD, SECOND_RAD, FIRST_RAD)]
+    car = ChosenReports(driving_rig(1))
+    (_, first), (second_ns, second), (third_ns, _) = [
+        car.steer(angle_rad) for angle_rad in (FIRST_RAD, SECOND_RAD, FIRST_RAD)
+    ]
     assert car.choose(second) == [ReachedCommand(second_ns, car.rig.now_ns)]
     assert car.choose(first) == [ReachedCommand(third_ns, car.rig.now_ns)]
     assert car.choose(second) == []
@@ -117,7 +119,7 @@ def test_superseded_commands_are_not_reached() -> None:
 
 def test_a_command_that_was_not_sent_is_ignored() -> None:
     """A report of a command that was not sent reaches nothing, and commands that were sent are still awaited."""
-    car = ChosenReports(driving(1))
+    car = ChosenReports(driving_rig(1))
     requested_ns, command = car.steer(FIRST_RAD)
     assert car.choose(OTHER) == []
     assert car.choose(command) == [ReachedCommand(requested_ns, car.rig.now_ns)]
@@ -125,10 +127,10 @@ def test_a_command_that_was_not_sent_is_ignored() -> None:
 
 def test_a_repeated_command_is_reached_once() -> None:
     """A command that is repeated, or that the kit already reports, is reached only once."""
-    car = ChosenReports(driving(1))
+    car = ChosenReports(driving_rig(1))
     requested_ns, command = car.steer(FIRST_RAD)
     car.rig.run_ms(100)
-    assert [each.applied_ns for each in car.choose(command)] == [requested_ns]
+    assert [reached.applied_ns for reached in car.choose(command)] == [requested_ns]
     car.rig.run_ms(100)
     assert car.choose(car.before) == []
     car.rig.run_ms(100)
@@ -137,7 +139,7 @@ def test_a_repeated_command_is_reached_once() -> None:
 
 def test_an_override_discards_awaited_commands() -> None:
     """A command sent before an override by the driver is not reached by a report after it."""
-    car = ChosenReports(driving(1))
+    car = ChosenReports(driving_rig(1))
     _, command = car.steer(FIRST_RAD)
     car.rig.kit.driver_brakes(0.3, car.rig.now_ns)
     car.rig.run_until(lambda rig: rig.state == "overridden")
@@ -155,7 +157,7 @@ def enable(car: ChosenReports) -> None:
 
 def test_the_first_command_is_awaited_if_it_differs() -> None:
     """The first command, which has the reported angle, is awaited only if the kit reports another command."""
-    car = ChosenReports(started(1))
+    car = ChosenReports(stationary_rig(1))
     enable(car)
     assert car.choose(OTHER) == []
     assert car.choose(car.before) == []

@@ -1,4 +1,4 @@
-"""Engaging a kit, driving by it, and disengaging it in order."""
+"""Engaging a kit, driving through it, and disengaging it in order."""
 
 from __future__ import annotations
 
@@ -10,17 +10,36 @@ from itertools import pairwise
 
 import msgspec
 import pytest
-from tests.vehicle.dbw.rig import COARSE_MS, SPEED_SOURCES, START_NS, AdapterRig, both, driving, profile, road, started
+from tests.vehicle.dbw.rig import (
+    COARSE_MS,
+    SPEED_SOURCES,
+    START_NS,
+    AdapterRig,
+    both_generations,
+    driving_rig,
+    profile,
+    road,
+    stationary_rig,
+)
 
 from lavt.domain import NS_PER_MS, Actuation
 from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.dbw.adapter import ByWireAdapter
-from lavt.vehicle.dbw.profile import LEAST_GAP_NS, PERIOD_NS
+from lavt.vehicle.dbw.profile import LEAST_GAP_NS, REPEAT_PERIOD_NS
 from lavt.vehicle.dbw.states import TABLE
 from lavt.vehicle.sim.simulator import Simulator
 from lavt.vehicle.software_car.state import AXES, Gear
 
 ALL = set(AXES)
+CLEARING_MS = 120
+"""Time in the state `clearing`."""
+SET_MS = 20
+"""Longest time until the next set of frames."""
+PEDAL_REPORT_MS, GEAR_REPORT_MS = 20, 100
+"""Periods of the pedals' and the gear's reports."""
+MAX_REACHED_MS = 5 + 10 + 1
+"""Longest time from a request to the report of it: the shortest time between two sets of frames, the period of the
+steering reports, and a step of the rig."""
 
 
 def names(rig: AdapterRig) -> list[str]:
@@ -29,10 +48,10 @@ def names(rig: AdapterRig) -> list[str]:
     return [known[frame.identifier] for _, frame in rig.sent]
 
 
-@both
+@both_generations
 def test_idle_is_silent(generation: int) -> None:
     """In `idle` nothing is sent, there is no inhibit reason, and the car is not engaged."""
-    rig = started(generation)
+    rig = stationary_rig(generation)
     rig.run_ms(1000)
     state = rig.adapter.state()
     assert rig.sent == []
@@ -40,7 +59,7 @@ def test_idle_is_silent(generation: int) -> None:
     assert (state.gear, state.speed_mps) == ("park", 0.0)
 
 
-@both
+@both_generations
 def test_missing_reports_inhibit(generation: int) -> None:
     """Until every report has arrived once, each missing one is an inhibit reason by name."""
     rig = AdapterRig(generation, start_frames=False)
@@ -48,13 +67,13 @@ def test_missing_reports_inhibit(generation: int) -> None:
     assert inhibit_reason == "; ".join(f"no {message} yet" for message in rig.profile.reports)
 
 
-@both
+@both_generations
 def test_engaging(generation: int) -> None:
-    """Engaging takes CLEAR for 120 ms, all axes with the brake on, then DRIVE, and at most two gear reports' time."""
-    rig = started(generation)
+    """Engaging clears for 120 ms, enables all axes with the brake on, and shifts to DRIVE, each as soon as it can."""
+    rig = stationary_rig(generation)
     rig.adapter.engage(True, rig.now_ns)
     passed_ms = rig.run_until(lambda rig: rig.state == "engaged")
-    assert passed_ms <= 120 + 20 + 100 + 20
+    assert passed_ms <= CLEARING_MS + PEDAL_REPORT_MS + SET_MS + GEAR_REPORT_MS
     assert rig.enabled() == ALL
     assert rig.kit.state.gear == Gear.DRIVE
     assert rig.adapter.state().is_engaged
@@ -65,10 +84,10 @@ def test_engaging(generation: int) -> None:
     assert rig.events == []
 
 
-@both
+@both_generations
 def test_drive_is_requested_with_the_brake(generation: int) -> None:
     """DRIVE is requested with the holding brake on, even if no brake is requested, so that it is not rejected."""
-    rig = started(generation)
+    rig = stationary_rig(generation)
     rig.actuation = Actuation(0.0, 0.9, 0.0)
     rig.adapter.engage(True, rig.now_ns)
     rig.run_until(lambda rig: rig.kit.state.gear == Gear.DRIVE)
@@ -80,41 +99,41 @@ def test_drive_is_requested_with_the_brake(generation: int) -> None:
 
 def test_clearing_frames_of_generation_1() -> None:
     """Generation 1 is cleared with frames of four bytes at 20 Hz, and its gearbox with a frame of one byte."""
-    rig = started(1)
+    rig = stationary_rig(1)
     rig.adapter.engage(True, rig.now_ns)
     rig.run_until(lambda rig: rig.state == "enabling")
     frames = [frame for _, frame in rig.sent]
-    a_set = [
+    frame_set = [
         CanFrame(0x064, bytes([0, 0, 2, 0])),
         CanFrame(0x060, bytes([0, 0, 0, 2])),
         CanFrame(0x062, bytes([0, 0, 0, 2])),
         CanFrame(0x066, bytes([0x80])),
     ]
-    assert frames[:12] == a_set * 3
+    assert frames[:12] == frame_set * 3
     times = sorted({at_ns for at_ns, _ in rig.sent})[:3]
     assert [later - earlier for earlier, later in pairwise(times)] == [50 * NS_PER_MS] * 2
 
 
-@both
+@both_generations
 def test_counters(generation: int) -> None:
     """Counters increase by one with each frame, also across a pause."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.adapter.engage(False, rig.now_ns)
     rig.run_until(lambda rig: rig.state == "idle", 20_000, step_ms=COARSE_MS)
     rig.run_ms(500)
     rig.engage()
     identifier = 0x064 if generation == 1 else 0x200
     data = [frame.data for _, frame in rig.sent if frame.identifier == identifier and len(frame.data) == 8]
-    counts = [each[7] if generation == 1 else each[6] & 15 for each in data]
+    counts = [frame_data[7] if generation == 1 else frame_data[6] & 15 for frame_data in data]
     modulus = 256 if generation == 1 else 16
     assert len(counts) > 100
     assert all((after - before) % modulus == 1 for before, after in pairwise(counts))
 
 
-@both
+@both_generations
 def test_new_commands_are_sent_immediately(generation: int) -> None:
-    """A tick with a new command sends it in the same millisecond, but sets are at least 5 ms apart."""
-    rig = driving(generation, tick_ms=1)
+    """A tick with a new command sends it in the same millisecond, but sets of frames are at least 5 ms apart."""
+    rig = driving_rig(generation, tick_ms=1)
     rig.run_ms(500)
     rig.sent.clear()
     for index in range(60):
@@ -126,25 +145,25 @@ def test_new_commands_are_sent_immediately(generation: int) -> None:
     rig.sent.clear()
     rig.actuation = msgspec.structs.replace(rig.actuation, steering_rad=0.02)
     rig.run_until(lambda rig: bool(rig.sent), 10)
-    assert rig.adapter._sender.sent_ns == rig.now_ns
+    assert rig.adapter._sender.last_set_ns == rig.now_ns
 
 
-@both
+@both_generations
 def test_unchanged_commands_are_repeated(generation: int) -> None:
     """An unchanged command is sent every 20 ms."""
-    rig = driving(generation, tick_ms=4)
+    rig = driving_rig(generation, tick_ms=4)
     rig.run_ms(1000)
     rig.sent.clear()
     rig.run_ms(200)
     times = sorted({at_ns for at_ns, _ in rig.sent})
-    assert {later - earlier for earlier, later in pairwise(times)} == {PERIOD_NS}
+    assert {later - earlier for earlier, later in pairwise(times)} == {REPEAT_PERIOD_NS}
     assert Counter(names(rig)).most_common(1)[0][1] == 10
 
 
-@both
+@both_generations
 def test_steering_and_speed(generation: int) -> None:
     """The wheels follow the requested angle, left positive, and the state reports it with the speed and its time."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.actuation = Actuation(0.05, 0.1, 0.0)
     rig.run_ms(1000)
     state = rig.adapter.state()
@@ -155,10 +174,10 @@ def test_steering_and_speed(generation: int) -> None:
     assert state.gear == "drive"
 
 
-@both
+@both_generations
 def test_parking(generation: int) -> None:
-    """A car that is no longer wanted brakes, shifts to PARK once it is stationary, and only then is disengaged."""
-    rig = driving(generation)
+    """When driving is no longer wanted the car brakes, shifts to PARK once stationary, and only then is disengaged."""
+    rig = driving_rig(generation)
     rig.actuation = Actuation(0.0, 0.5, 0.0)
     rig.adapter.engage(False, rig.now_ns)
     rig.run_ms(100)
@@ -177,10 +196,10 @@ def test_parking(generation: int) -> None:
     assert rig.sent == []
 
 
-@both
+@both_generations
 def test_no_park_while_locked_wheels_slide(generation: int) -> None:
     """PARK is not requested when all speeds drop to 0 at once, as those of locked wheels, and the car moves."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.adapter.engage(False, rig.now_ns)
     rig.run_until(lambda rig: rig.speed_mps < 2.0)
     for source in SPEED_SOURCES[generation]:  # the wheels lock
@@ -193,34 +212,34 @@ def test_no_park_while_locked_wheels_slide(generation: int) -> None:
     assert rig.speed_mps == 0.0
 
 
-@both
+@both_generations
 def test_a_parked_car_can_be_engaged_again(generation: int) -> None:
     """A car that was parked can be engaged again."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.adapter.engage(False, rig.now_ns)
     rig.run_until(lambda rig: rig.state == "idle", 20_000, step_ms=COARSE_MS)
     rig.engage()
     assert rig.enabled() == ALL
 
 
-@both
+@both_generations
 def test_engaging_can_be_cancelled(generation: int) -> None:
     """Engaging that is cancelled at any moment leaves the car in PARK, disengaged, without a watchdog trip."""
-    begun = started(generation)
-    begun.adapter.engage(True, begun.now_ns)
+    engaging_rig = stationary_rig(generation)
+    engaging_rig.adapter.engage(True, engaging_rig.now_ns)
     for after_ms in range(0, 220, 7):
-        rig = begun.copy()
-        begun.run_ms(7)
+        rig = engaging_rig.copy()
+        engaging_rig.run_ms(7)
         rig.adapter.engage(False, rig.now_ns)
         rig.run_until(lambda rig: rig.state == "idle" and not rig.enabled(), 1000)
         rig.run_ms(200)
         assert (rig.enabled(), rig.kit.state.gear, rig.kit.state.watchdog) == (set(), Gear.PARK, 0), after_ms
 
 
-@both
+@both_generations
 def test_not_engaged_while_rolling(generation: int) -> None:
     """A moving car is not engaged."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.adapter = ByWireAdapter(rig.profile, start_ns=rig.now_ns)
     rig.is_ticking = False
     rig.adapter.engage(True, rig.now_ns)
@@ -248,11 +267,11 @@ def test_an_unknown_steering_sign_inhibits() -> None:
     assert "steering_sign" in rig.adapter.state().inhibit_reason
 
 
-@both
+@both_generations
 def test_negative_steering_sign(generation: int) -> None:
     """With the negative steering sign, sent and reported angles are inverted."""
     known = profile(f"dataspeed_gen{generation}")
-    rig = driving(generation, profile=replace(known, car=replace(known.car, steering_sign=-1)))
+    rig = driving_rig(generation, profile=replace(known, car=replace(known.car, steering_sign=-1)))
     rig.actuation = Actuation(0.05, 0.1, 0.0)
     rig.run_ms(1000)
     assert rig.simulator.state().steering_rad == pytest.approx(-0.05, abs=1e-3)
@@ -264,17 +283,18 @@ def test_user_commands() -> None:
     rig = AdapterRig(2, profile=profile("dataspeed_gen2:user"), commands="user")
     rig.engage()
     assert {frame.identifier for _, frame in rig.sent} == {0x210, 0x211, 0x212, 0x213, 0x216}
-    other = AdapterRig(2, profile=profile("dataspeed_gen2:user"), commands="remote")
-    other.adapter.engage(True, other.now_ns)
-    other.run_ms(1000)
-    assert other.adapter.state().inhibit_reason == "RemoteReport has STATE remote"
-    assert other.sent == []
+    remote_rig = AdapterRig(2, profile=profile("dataspeed_gen2:user"), commands="remote")
+    remote_rig.adapter.engage(True, remote_rig.now_ns)
+    remote_rig.run_ms(1000)
+    # The message RemoteReport says in its signal STATE that the kit accepts remote commands.
+    assert remote_rig.adapter.state().inhibit_reason == "RemoteReport has STATE remote"
+    assert remote_rig.sent == []
 
 
-@both
+@both_generations
 def test_reached(generation: int) -> None:
-    """A reported steering command is returned once as reached, with the time of its request, within 16 ms."""
-    rig = driving(generation)
+    """A steering command that the kit reports counts as reached: once, and within 16 ms of its request."""
+    rig = driving_rig(generation)
     rig.run_ms(500)
     rig.adapter.take_reached()
     rig.actuation = msgspec.structs.replace(rig.actuation, steering_rad=0.012)
@@ -282,57 +302,57 @@ def test_reached(generation: int) -> None:
     requested_ns = rig.now_ns
     rig.run_ms(200)
     reached = rig.adapter.take_reached()
-    assert [each.applied_ns for each in reached] == [requested_ns]
-    assert 0 < reached[0].reached_ns - requested_ns <= (5 + 10 + 1) * NS_PER_MS
+    assert [command.applied_ns for command in reached] == [requested_ns]
+    assert 0 < reached[0].reached_ns - requested_ns <= MAX_REACHED_MS * NS_PER_MS
     assert rig.adapter.take_reached() == []
 
 
-@both
+@both_generations
 def test_reached_while_weaving(generation: int) -> None:
-    """While the wheel turns to and fro, no command is reached before its request or later than 16 ms after it."""
-    rig = driving(generation, tick_ms=4)
+    """While the wheel turns to and fro, each reached command is reported within 16 ms of its request."""
+    rig = driving_rig(generation, tick_ms=4)
     for index in range(1000):
         rig.actuation = Actuation(0.02 * math.sin(index / 20), 0.2, 0.0)
         rig.run_ms(1)
     reached = rig.adapter.take_reached()
     assert len(reached) > 80
-    assert all(0 < each.reached_ns - each.applied_ns <= (5 + 10 + 1) * NS_PER_MS for each in reached)
-    assert len({each.applied_ns for each in reached}) == len(reached)
+    assert all(0 < command.reached_ns - command.applied_ns <= MAX_REACHED_MS * NS_PER_MS for command in reached)
+    assert len({command.applied_ns for command in reached}) == len(reached)
 
 
-@both
+@both_generations
 def test_drives_as_the_simulator(generation: int) -> None:
-    """Actuation over CAN moves the car like actuation of the simulator itself: to 0.1 m after 5 s."""
-    rig = driving(generation)
-    same = Simulator(road=road(), seed=1, start_mono_ns=START_NS)
-    same._car, same._index = deepcopy(rig.simulator._car), rig.simulator._index
-    started = rig.simulator.ground_truth()
+    """Actuation over CAN moves the car as actuation of the simulator itself does: they are within 0.1 m after 5 s."""
+    rig = driving_rig(generation)
+    reference = Simulator(road=road(), seed=1, start_mono_ns=START_NS)
+    reference._car, reference._index = deepcopy(rig.simulator._car), rig.simulator._index
+    start = rig.simulator.ground_truth()
     for step in range(250):
         requested = Actuation(0.01 * math.sin(step / 40), 0.2, 0.0)
         rig.actuation = requested
-        same.apply(requested, rig.now_ns)
+        reference.apply(requested, rig.now_ns)
         rig.run_ms(20)
-        same.advance(rig.now_ns)
-    other, own = same.ground_truth(), rig.simulator.ground_truth()
-    assert math.hypot(started.x_m - own.x_m, started.y_m - own.y_m) > 20
-    assert math.hypot(other.x_m - own.x_m, other.y_m - own.y_m) < 0.1
+        reference.advance(rig.now_ns)
+    expected, end = reference.ground_truth(), rig.simulator.ground_truth()
+    assert math.hypot(start.x_m - end.x_m, start.y_m - end.y_m) > 20
+    assert math.hypot(expected.x_m - end.x_m, expected.y_m - end.y_m) < 0.1
 
 
 def test_wake() -> None:
     """The adapter's next wake time is at most 100 ms away and never later than its next frames."""
     adapter = ByWireAdapter(profile("dataspeed_gen1"), start_ns=START_NS)
     assert adapter.next_wake_ns() == START_NS + 100 * NS_PER_MS
-    rig = driving(1)
+    rig = driving_rig(1)
     for _ in range(50):
         wake_ns = rig.adapter.next_wake_ns()
-        assert rig.now_ns < wake_ns <= rig.now_ns + PERIOD_NS
+        assert rig.now_ns < wake_ns <= rig.now_ns + REPEAT_PERIOD_NS
         rig.run_ms(1)
 
 
-@both
+@both_generations
 def test_wake_when_overdue(generation: int) -> None:
     """An overdue set of frames makes the next wake time the next nanosecond, not a time in the past."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.run_until(lambda rig: rig.now_ns - rig.sent[-1][0] >= LEAST_GAP_NS if rig.sent else False)
     rig.adapter.set_actuation(Actuation(0.1, 0.0, 0.0), rig.now_ns)
     assert rig.adapter.next_wake_ns() == rig.now_ns + 1
@@ -345,10 +365,10 @@ def test_every_state_is_reachable() -> None:
     assert sources == targets == {"idle", "clearing", "enabling", "engaged", "parking", "overridden", "lost"}
 
 
-@both
+@both_generations
 def test_a_non_finite_actuation_is_no_tick(generation: int) -> None:
     """A non-finite actuation is dropped and counted, and does not count as a tick."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.actuation = Actuation(math.nan, 0.1, 0.0)
     stopped_ns = rig.now_ns
     rig.run_ms(300)

@@ -12,7 +12,15 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from tests.vehicle.dbw.rig import COARSE_MS, SPEED_SOURCES, AdapterRig, both, driving, profile, started
+from tests.vehicle.dbw.rig import (
+    COARSE_MS,
+    SPEED_SOURCES,
+    AdapterRig,
+    both_generations,
+    driving_rig,
+    profile,
+    stationary_rig,
+)
 
 from lavt.domain import NS_PER_MS, Actuation
 from lavt.vehicle.can_frame import CanFrame
@@ -45,10 +53,10 @@ def stop_and_disengage(rig: AdapterRig) -> None:
 # Lost and invalid commands.
 
 
-@both
+@both_generations
 def test_commands_lost(generation: int) -> None:
     """Without commands the kit disengages 100 ms after the last one, and the watchdog brakes."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.run_until(lambda rig: bool(rig.sent) and last_sent_ns(rig) == rig.now_ns)
     cut_ns = rig.now_ns
     rig.spoil = lambda _: None
@@ -63,18 +71,18 @@ def test_commands_lost(generation: int) -> None:
     assert {event.kind for event in rig.events} == {"fault"}
 
 
-@both
+@both_generations
 def test_counter_stuck(generation: int) -> None:
     """A counter that does not change makes the kit release all axes with that frame and brake."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     stuck: list[int] = []
 
     def spoil(frame: CanFrame) -> CanFrame:
         if frame.identifier != STEERING[generation]:
             return frame
-        place = 7 if generation == 1 else 6
-        stuck.append(frame.data[place])
-        data = frame.data[:place] + bytes([stuck[0]]) + frame.data[place + 1 :]
+        counter_byte = 7 if generation == 1 else 6
+        stuck.append(frame.data[counter_byte])
+        data = frame.data[:counter_byte] + bytes([stuck[0]]) + frame.data[counter_byte + 1 :]
         return with_crc(frame.identifier, data) if generation == 2 else CanFrame(frame.identifier, data)
 
     rig.spoil = spoil
@@ -99,7 +107,7 @@ def with_crc(identifier: int, data: bytes) -> CanFrame:
 @pytest.mark.parametrize("part", [0, 1, 2])
 def test_wrong_checksum_of_a_command(part: int) -> None:
     """A wrong checksum on any axis makes a kit of generation 2 release all axes with that frame and brake."""
-    rig = driving(2)
+    rig = driving_rig(2)
     spoiled: list[int] = []
 
     def spoil(frame: CanFrame) -> CanFrame:
@@ -117,10 +125,10 @@ def test_wrong_checksum_of_a_command(part: int) -> None:
     assert rig.kit.state.brake == WATCHDOG_BRAKE
 
 
-@both
+@both_generations
 def test_without_ticks_nothing_is_sent(generation: int) -> None:
     """Without ticks nothing is sent after 60 ms, and the kit disengages 100 ms after the last frame."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.run_until(lambda rig: rig.adapter._requested_ns == rig.now_ns)
     stopped_ns, rig.is_ticking = rig.now_ns, False
     took_ms = rig.release_ms(stopped_ns)
@@ -135,10 +143,10 @@ def test_without_ticks_nothing_is_sent(generation: int) -> None:
     assert rig.enabled() == set()
 
 
-@both
+@both_generations
 def test_a_resumed_server_enables_nothing(generation: int) -> None:
     """A server that was frozen reads old frames from its buffers when it resumes, and sends nothing."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.run_until(lambda rig: bool(rig.sent) and last_sent_ns(rig) == rig.now_ns)
     frozen_ns, waiting = rig.now_ns, []
     rig.now_ns += 2000 * NS_PER_MS
@@ -165,11 +173,11 @@ FOREIGN_COMMANDS = {
 """Commands to an axis, of another length or to a gear, and to the system or a gear; their data does not matter."""
 
 
-@both
+@both_generations
 @pytest.mark.parametrize("which", [0, 1, 2])
 def test_foreign_commands_prevent_engaging(generation: int, which: int) -> None:
     """A kit is not engaged until 1 s after the last command of another sender: a server may still be stopping it."""
-    rig = started(generation)
+    rig = stationary_rig(generation)
     rig.adapter.receive(FOREIGN_COMMANDS[generation][which], rig.now_ns)
     rig.adapter.engage(True, rig.now_ns)
     rig.run_ms(999)
@@ -181,10 +189,10 @@ def test_foreign_commands_prevent_engaging(generation: int, which: int) -> None:
     assert rig.adapter.state().inhibit_reason == ""
 
 
-@both
+@both_generations
 def test_foreign_commands_end_driving(generation: int) -> None:
     """The first frame of another sender ends driving: throttle 0 and the requested brake."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.adapter.receive(FOREIGN_COMMANDS[generation][0], rig.now_ns)
     assert rig.state == "lost"
     assert "another sender" in rig.adapter.state().inhibit_reason
@@ -214,14 +222,14 @@ TEXTS = {
     "gear": "the driver has shifted",
 }
 PERIOD_MS = {"steering": 10, "brake": 20, "throttle": 20, "gear": 100}
-"""Of the reports with the override."""
+"""Periods of the reports that contain the override."""
 
 
-@both
+@both_generations
 @pytest.mark.parametrize("part", OVERRIDES)
 def test_override(generation: int, part: str) -> None:
-    """An override releases all axes at once in generation 2, and with the report of it in generation 1."""
-    rig = driving(generation)
+    """An override releases all axes: at once in generation 2, and when it is reported in generation 1."""
+    rig = driving_rig(generation)
     override_ns = rig.now_ns
     OVERRIDES[part](rig)
     if part in AXES:
@@ -237,11 +245,11 @@ def test_override(generation: int, part: str) -> None:
     assert rig.kit.state.watchdog == 0
 
 
-@both
+@both_generations
 @pytest.mark.parametrize("part", OVERRIDES)
 def test_override_is_latched(generation: int, part: str) -> None:
     """An override persists until the stationary car is disengaged, and its latch until the CLEAR that follows."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     OVERRIDES[part](rig)
     rig.run_until(lambda rig: rig.state == "overridden")
     HANDS_OFF[part](rig)
@@ -266,10 +274,10 @@ def test_override_is_latched(generation: int, part: str) -> None:
     assert rig.enabled() == set(AXES)
 
 
-@both
+@both_generations
 def test_an_active_override_is_not_cleared(generation: int) -> None:
     """With hands on the wheel an override cannot be cleared: after 3 s this is reported, and no axis was enabled."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.kit.driver_steers(3.0, rig.now_ns)
     stop_and_disengage(rig)
     rig.moments.clear()
@@ -293,7 +301,7 @@ FAULTS = [(1, name) for name in FAULTS_1] + [(2, f"{part}.fault") for part in (*
 @pytest.mark.parametrize(("generation", "name"), FAULTS)
 def test_fault(generation: int, name: str) -> None:
     """A fault makes the kit release all axes at once and brake; the next report names the part."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.kit.set_fault(name, rig.now_ns)
     assert rig.release_ms(rig.now_ns) == 0
     assert rig.kit.state.brake == WATCHDOG_BRAKE
@@ -306,7 +314,7 @@ def test_fault(generation: int, name: str) -> None:
 
 def test_gear_fault_of_generation_1() -> None:
     """A gearbox fault, which generation 1 ignores, causes throttle 0 and the requested brake within 100 ms."""
-    rig = driving(1)
+    rig = driving_rig(1)
     rig.kit.set_fault("gear.FLTBUS", rig.now_ns)
     fault_ns = rig.now_ns
     rig.run_until(lambda rig: rig.kit.state.throttle == 0.0)
@@ -320,7 +328,7 @@ def test_gear_fault_of_generation_1() -> None:
 
 def test_fault_without_a_watchdog() -> None:
     """A fault on a kit of generation 1 without watchdog leaves the other axes enabled: requested brake, no throttle."""
-    rig = driving(1, has_watchdog=False)
+    rig = driving_rig(1, has_watchdog=False)
     rig.kit.set_fault("steering.FLTPWR", rig.now_ns)
     fault_ns = rig.now_ns
     rig.run_until(lambda rig: rig.kit.state.throttle == 0.0)
@@ -337,11 +345,11 @@ def test_fault_without_a_watchdog() -> None:
     assert rig.kit.state.gear == Gear.PARK
 
 
-@both
+@both_generations
 def test_fault_latches(generation: int) -> None:
-    """After a fault that disappears the state stays `lost` until driving is not wanted; then the car can be engaged."""
+    """After a fault that disappears, `lost` lasts until driving is no longer wanted; then the car can be engaged."""
     name = "steering.FLTPWR" if generation == 1 else "steering.fault"
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.kit.set_fault(name, rig.now_ns)
     rig.run_ms(200, step_ms=COARSE_MS)
     rig.kit.set_fault(name, rig.now_ns, is_set=False)
@@ -354,11 +362,11 @@ def test_fault_latches(generation: int) -> None:
     assert rig.enabled() == set(AXES)
 
 
-@both
+@both_generations
 def test_fault_prevents_engaging(generation: int) -> None:
     """A fault before engaging is an inhibit reason, and nothing is sent."""
     name = "brake.FLT1" if generation == 1 else "brake.fault"
-    rig = started(generation)
+    rig = stationary_rig(generation)
     rig.kit.set_fault(name, rig.now_ns)
     rig.run_ms(50)
     rig.adapter.engage(True, rig.now_ns)
@@ -367,10 +375,10 @@ def test_fault_prevents_engaging(generation: int) -> None:
     assert "the brake has a fault" in rig.adapter.state().inhibit_reason
 
 
-@both
+@both_generations
 def test_watchdog_needs_an_override(generation: int) -> None:
     """After a watchdog trip the car can be engaged again only after an override by the driver."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.is_ticking = False
     rig.run_ms(300, step_ms=COARSE_MS)
     rig.is_ticking = True
@@ -397,10 +405,10 @@ def test_watchdog_needs_an_override(generation: int) -> None:
 # The bus.
 
 
-@both
+@both_generations
 def test_bus_off(generation: int) -> None:
     """A kit off the bus disengages 100 ms after the last command; the adapter notices by the reports' timeout."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.run_until(lambda rig: bool(rig.sent) and last_sent_ns(rig) == rig.now_ns)
     rig.kit.set_bus_off(rig.now_ns)
     cut_ns = rig.now_ns
@@ -416,10 +424,10 @@ def test_bus_off(generation: int) -> None:
     assert not rig.adapter.state().is_engaged
 
 
-@both
+@both_generations
 def test_bus_gone(generation: int) -> None:
     """A bus that is gone ends driving at once; the kit disengages 100 ms after the last command."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.run_until(lambda rig: bool(rig.sent) and last_sent_ns(rig) == rig.now_ns)
     cut_ns, rig.is_cut = rig.now_ns, True
     rig.adapter.on_bus_gone("can0 is down", rig.now_ns)
@@ -452,7 +460,7 @@ REPORTS: dict[int, tuple[str, ...]] = {
 @pytest.mark.parametrize(("generation", "message"), [(n, name) for n, names in REPORTS.items() for name in names])
 def test_report_missing(generation: int, message: str) -> None:
     """A missing report causes throttle 0 and the requested brake after its timeout."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     identifier = rig.profile.codec.messages[message].identifier
     received_ns = rig.adapter._reports._received_ns[message]
     rig.lose_report = lambda frame: frame.identifier == identifier
@@ -465,11 +473,11 @@ def test_report_missing(generation: int, message: str) -> None:
     assert rig.kit.state.brake == pytest.approx(0.6, abs=1e-3)
 
 
-@both
+@both_generations
 @pytest.mark.parametrize("name", ["angle", "speed"])
 def test_value_unknown(generation: int, name: str) -> None:
     """An unknown speed or angle counts as a missing report; the last speed is kept with its own time."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     known_ns = rig.adapter.state().mono_ns
     speed_mps = rig.adapter.state().speed_mps
     rig.kit.set_unknown(name)
@@ -484,7 +492,7 @@ def test_value_unknown(generation: int, name: str) -> None:
 
 def test_wrong_checksum_of_a_report() -> None:
     """A report of generation 2 with a wrong checksum is dropped and counted."""
-    rig = driving(2)
+    rig = driving_rig(2)
     before = rig.adapter.state()
     count = (rig.kit.state.sent[0x107] + 5) % 16
     frame = with_crc(0x107, struct.pack("<hhBBBB", 1700, 1700, 0, 0, count << 4, 0))
@@ -501,7 +509,7 @@ def test_wrong_checksum_of_a_report() -> None:
 @pytest.mark.parametrize(("position", "name"), [(0, "e stop"), (1, "pause")])
 def test_remote_switch(position: int, name: str) -> None:
     """The remote's switch at stop or pause makes the kit release all axes at once; the next report says so."""
-    rig = driving(2)
+    rig = driving_rig(2)
     rig.kit.switch_remote(position, rig.now_ns)
     assert rig.release_ms(rig.now_ns) == 0
     rig.run_until(is_lost, 101)
@@ -511,7 +519,7 @@ def test_remote_switch(position: int, name: str) -> None:
 
 def test_remote_switch_of_the_other_commands() -> None:
     """The remote's switch at control allowed, which the kit ignores, causes throttle 0 and the requested brake."""
-    rig = driving(2)
+    rig = driving_rig(2)
     rig.kit.switch_remote(3, rig.now_ns)
     switched_ns = rig.now_ns
     rig.run_until(lambda rig: rig.kit.state.throttle == 0.0)
@@ -528,7 +536,7 @@ def test_remote_switch_of_the_other_commands() -> None:
 )
 def test_kit_not_ready(name: str, text: str) -> None:
     """A kit of generation 2 that is not ready releases all axes at once, and reports the reason."""
-    rig = driving(2)
+    rig = driving_rig(2)
     rig.kit.inhibit(name, rig.now_ns)
     assert rig.release_ms(rig.now_ns) == 0
     rig.run_until(is_lost)
@@ -539,11 +547,11 @@ def test_kit_not_ready(name: str, text: str) -> None:
 # The gearbox.
 
 
-@both
+@both_generations
 def test_drive_rejected(generation: int) -> None:
     """A rejected gear is reported with the kit's reason after 3 s, and the car is disengaged in PARK."""
     known = profile(f"dataspeed_gen{generation}")
-    gear = replace(known.gear, numbers={**known.gear.numbers, "drive": 5})
+    gear = replace(known.gear, codes={**known.gear.codes, "drive": 5})
     rig = AdapterRig(generation, profile=replace(known, gear=gear))
     rig.adapter.engage(True, rig.now_ns)
     took_ms = rig.run_until(is_lost)
@@ -562,7 +570,7 @@ def test_drive_rejected(generation: int) -> None:
 def test_a_shift_in_progress_is_awaited() -> None:
     """If DRIVE was requested but not reported, the axes stay enabled for 1 s before the car is disengaged in PARK."""
     known = profile("dataspeed_gen1")
-    rig = AdapterRig(1, profile=replace(known, gear=replace(known.gear, numbers={**known.gear.numbers, "drive": 5})))
+    rig = AdapterRig(1, profile=replace(known, gear=replace(known.gear, codes={**known.gear.codes, "drive": 5})))
     rig.adapter.engage(True, rig.now_ns)
     rig.run_until(lambda rig: rig.state == "enabling" and rig.adapter._is_shifting)
     rig.adapter.engage(False, rig.now_ns)
@@ -574,7 +582,7 @@ def test_a_shift_in_progress_is_awaited() -> None:
 
 def test_park_rejected() -> None:
     """If PARK is rejected the car is kept stationary by its brake, and the reason is reported."""
-    rig = driving(1)
+    rig = driving_rig(1)
     rig.kit.set_fault("gear.FLTBUS", rig.now_ns)
     rig.actuation = Actuation(0.0, 0.0, 0.5)
     rig.run_until(lambda rig: rig.speed_mps == 0.0, step_ms=COARSE_MS)
@@ -592,7 +600,7 @@ def test_park_rejected() -> None:
 def without_park() -> AdapterRig:
     """Return a stationary car whose kit rejects the number that the profile has for PARK."""
     known = profile("dataspeed_gen1")
-    rig = AdapterRig(1, profile=replace(known, gear=replace(known.gear, numbers={**known.gear.numbers, "park": 5})))
+    rig = AdapterRig(1, profile=replace(known, gear=replace(known.gear, codes={**known.gear.codes, "park": 5})))
     rig.engage()
     return rig
 
@@ -625,7 +633,7 @@ def test_a_moving_car_need_not_park() -> None:
 @pytest.mark.parametrize("state", ["idle", "engaged", "lost", "overridden"])
 def test_park_is_required_only_after_driving(state: str) -> None:
     """A stationary car need not be in PARK in a state that does not park it."""
-    rig = started(1)
+    rig = stationary_rig(1)
     if state != "idle":
         rig.engage()
     if state == "lost":
@@ -639,16 +647,16 @@ def test_park_is_required_only_after_driving(state: str) -> None:
     assert (rig.state, rig.adapter.state().inhibit_reason) == (state, before)
 
 
-@both
+@both_generations
 def test_out_of_gear(generation: int) -> None:
     """A reported gear other than DRIVE ends driving, even without an override."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.kit.state.gear = Gear.NEUTRAL
     assert rig.run_until(is_lost) <= 101
     assert rig.adapter.state().inhibit_reason == "the gear is neutral instead of drive"
 
 
-@both
+@both_generations
 def test_every_end_of_driving_is_an_event(generation: int) -> None:
     """Every cause that ends driving emits events with texts, each once."""
     causes: list[Callable[[AdapterRig], Any]] = [
@@ -658,7 +666,7 @@ def test_every_end_of_driving_is_an_event(generation: int) -> None:
         lambda rig: setattr(rig, "is_ticking", False),
     ]
     for cause in causes:
-        rig = driving(generation)
+        rig = driving_rig(generation)
         cause(rig)
         rig.run_ms(500, step_ms=COARSE_MS)
         assert rig.events, cause

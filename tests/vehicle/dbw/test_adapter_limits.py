@@ -9,12 +9,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
-from tests.vehicle.dbw.rig import COARSE_MS, AdapterRig, both, driving, profile, started, with_limits
+from tests.vehicle.dbw.rig import (
+    COARSE_MS,
+    AdapterRig,
+    both_generations,
+    driving_rig,
+    profile,
+    stationary_rig,
+    with_limits,
+)
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation
 from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.dbw.crc8 import frame_crc8
-from lavt.vehicle.dbw.profile import LEAST_GAP_NS, PERIOD_NS, TICK_LIMIT_NS, ByWireLimits
+from lavt.vehicle.dbw.profile import LEAST_GAP_NS, REPEAT_PERIOD_NS, TICK_LIMIT_NS, ByWireLimits
 from lavt.vehicle.dbw.sending import DriveCommand, apply_limits
 from lavt.vehicle.sim.dynamics import LINCOLN_MKZ
 
@@ -32,10 +40,10 @@ def angles_deg(rig: AdapterRig) -> list[tuple[int, float]]:
     ]
 
 
-@both
+@both_generations
 def test_angle(generation: int) -> None:
     """The commanded steering angle stays within the limit on either side, and each limited command is counted."""
-    rig = driving(generation, profile=with_limits(generation, steering_wheel_deg=30.0))
+    rig = driving_rig(generation, profile=with_limits(generation, steering_wheel_deg=30.0))
     rig.actuation = Actuation(0.5, 0.0, 0.2)
     rig.run_ms(500)
     rig.actuation = Actuation(-0.5, 0.0, 0.2)
@@ -45,10 +53,10 @@ def test_angle(generation: int) -> None:
     assert rig.adapter.counts["limited_wheel_deg"] > 20
 
 
-@both
+@both_generations
 def test_rate(generation: int) -> None:
     """The commanded steering rate stays within the limit, which is sent to the kit, rounded down to a step."""
-    rig = driving(generation, profile=with_limits(generation, steering_wheel_rate_degps=100.0))
+    rig = driving_rig(generation, profile=with_limits(generation, steering_wheel_rate_degps=100.0))
     rig.actuation = Actuation(0.2, 0.0, 0.0)
     rig.run_ms(400)
     requested = angles_deg(rig)
@@ -57,15 +65,15 @@ def test_rate(generation: int) -> None:
     assert requested[-1][1] > 30
 
 
-@both
+@both_generations
 def test_a_limited_command_is_sent_faster(generation: int) -> None:
-    """While the steering rate limits the angle, a set is sent every 5 ms, and then every 20 ms."""
+    """While the steering rate limits the angle, a set of frames is sent every 5 ms, and then every 20 ms."""
     rig = AdapterRig(generation, profile=with_limits(generation, steering_wheel_rate_degps=50.0))
     rig.engage()
     rig.run_ms(300, step_ms=COARSE_MS)
     rig.tick_ns = 50 * NS_PER_MS
     rig.actuation = Actuation(0.03, 0.0, 0.5)
-    for wait_ms, period_ns in ((60, LEAST_GAP_NS), (700, PERIOD_NS)):
+    for wait_ms, period_ns in ((60, LEAST_GAP_NS), (700, REPEAT_PERIOD_NS)):
         rig.run_ms(wait_ms)
         rig.sent.clear()
         rig.run_ms(150)
@@ -73,7 +81,7 @@ def test_a_limited_command_is_sent_faster(generation: int) -> None:
         assert {later - earlier for earlier, later in pairwise(times)} == {period_ns}
 
 
-@both
+@both_generations
 def test_nothing_is_sent_before_the_first_tick(generation: int) -> None:
     """Before the first tick nothing is sent, even if driving is wanted, and the missing tick is counted once."""
     rig = AdapterRig(generation, start_frames=False)
@@ -92,21 +100,21 @@ def test_nothing_is_sent_before_the_first_tick(generation: int) -> None:
 
 def test_rate_of_the_kit() -> None:
     """The largest rate is sent in the kit's steps: 452 deg/s are 113 steps of 4 deg/s, in both generations."""
-    for name, place in (("dataspeed_gen1", 3), ("dataspeed_gen2", 3)):
-        rig = started(int(name[-1]))
+    for name, rate_byte in (("dataspeed_gen1", 3), ("dataspeed_gen2", 3)):
+        rig = stationary_rig(int(name[-1]))
         rig.engage()
         rates = {
-            frame.data[place] for _, frame in rig.sent if frame.identifier in (0x064, 0x200) and len(frame.data) > 4
+            frame.data[rate_byte] for _, frame in rig.sent if frame.identifier in (0x064, 0x200) and len(frame.data) > 4
         }
         assert 113 in rates
         assert rates <= {0, 113}
 
 
-@both
+@both_generations
 def test_pedals(generation: int) -> None:
     """Pedals are pressed no further and no faster than the limits, and released at once."""
     known = with_limits(generation, throttle=0.4, brake=0.5, throttle_rate_per_s=1.0, brake_rate_per_s=2.0)
-    rig = driving(generation, profile=known)
+    rig = driving_rig(generation, profile=known)
     rig.actuation = Actuation(0.0, 1.0, 0.0)
     rig.run_ms(1000)
     assert rig.kit.state.throttle == pytest.approx(0.4, abs=1e-3)
@@ -122,10 +130,10 @@ def test_pedals(generation: int) -> None:
     assert rig.kit.state.brake == 0.0
 
 
-@both
+@both_generations
 def test_steering_starts_at_the_reported_angle(generation: int) -> None:
-    """The first angle after enabling differs from the reported one by at most one set's turn."""
-    rig = driving(generation)
+    """The first angle after enabling differs from the reported one by at most the turn allowed in one set of frames."""
+    rig = driving_rig(generation)
     rig.actuation = Actuation(0.2, 0.0, 1.0)
     rig.run_until(lambda rig: rig.speed_mps == 0.0, step_ms=COARSE_MS)
     rig.run_ms(1000, step_ms=COARSE_MS)
@@ -135,7 +143,7 @@ def test_steering_starts_at_the_reported_angle(generation: int) -> None:
     rig.actuation = Actuation(-0.2, 0.0, 1.0)
     rig.adapter.engage(True, rig.now_ns)
     rig.run_until(lambda rig: rig.state == "enabling")
-    assert rig.adapter._sender.sent_ns == rig.now_ns
+    assert rig.adapter._sender.last_set_ns == rig.now_ns
     rig.sent = [(at_ns, frame) for at_ns, frame in rig.sent if at_ns == rig.now_ns]
     first_deg = angles_deg(rig)[0][1]
     wheel_deg = math.degrees(0.2 * 14.8)
@@ -149,28 +157,28 @@ any_wheel = st.builds(DriveCommand, st.floats(-3276, 3276), st.floats(0, 0.6), s
 
 
 @given(requested, any_wheel, st.integers(0, 10 * NS_PER_S))
-def test_limits_hold_for_any_request(wanted: DriveCommand, before: DriveCommand, passed_ns: int) -> None:
+def test_limits_hold_for_any_request(command: DriveCommand, before: DriveCommand, passed_ns: int) -> None:
     """For any request and any wheel the limited command is in range, and from there no faster than the rates."""
-    found = apply_limits(LIMITS, wanted, before, passed_ns)
+    limited = apply_limits(LIMITS, command, before, passed_ns)
     passed_s = min(passed_ns, TICK_LIMIT_NS) / NS_PER_S
-    assert abs(found.wheel_deg) <= 400.0
+    assert abs(limited.wheel_deg) <= 400.0
     nearest_deg = min(max(before.wheel_deg, -400.0), 400.0)
-    assert abs(found.wheel_deg - nearest_deg) <= 300.0 * passed_s + 1e-9
-    assert 0.0 <= found.throttle <= min(0.6, before.throttle + 2.0 * passed_s)
-    assert 0.0 <= found.brake <= min(0.8, before.brake + 5.0 * passed_s)
+    assert abs(limited.wheel_deg - nearest_deg) <= 300.0 * passed_s + 1e-9
+    assert 0.0 <= limited.throttle <= min(0.6, before.throttle + 2.0 * passed_s)
+    assert 0.0 <= limited.brake <= min(0.8, before.brake + 5.0 * passed_s)
 
 
 @given(allowed)
-def test_requests_within_the_limits_are_unchanged(wanted: DriveCommand) -> None:
+def test_requests_within_the_limits_are_unchanged(command: DriveCommand) -> None:
     """A request within the limits is unchanged, except that a brake request zeroes the throttle."""
-    found = apply_limits(LIMITS, wanted, wanted, 0)
-    assert found == (replace(wanted, throttle=0.0) if wanted.brake > 0 else wanted)
+    limited = apply_limits(LIMITS, command, command, 0)
+    assert limited == (replace(command, throttle=0.0) if command.brake > 0 else command)
 
 
-@both
+@both_generations
 def test_one_pedal(generation: int) -> None:
     """A request for throttle and brake together becomes the brake alone."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.actuation = Actuation(0.0, 0.5, 0.2)
     rig.run_ms(50)
     wheels = rig.moments[-1].wheels
@@ -190,11 +198,11 @@ def test_limits_are_the_simulators(name: str) -> None:
     assert rate_radps == pytest.approx(LINCOLN_MKZ.max_steering_rate_radps, abs=2e-3)
 
 
-@both
+@both_generations
 @pytest.mark.parametrize("wheel_deg", [435.5, -540.0, 600.0])
 def test_a_wheel_beyond_the_limit_inhibits(generation: int, wheel_deg: float) -> None:
     """A stationary car whose wheel is beyond the limit is not engaged; turned back, it is."""
-    rig = started(generation)
+    rig = stationary_rig(generation)
     turn_wheel(rig, wheel_deg)
     rig.adapter.engage(True, rig.now_ns)
     rig.run_ms(300, step_ms=COARSE_MS)
@@ -205,11 +213,11 @@ def test_a_wheel_beyond_the_limit_inhibits(generation: int, wheel_deg: float) ->
     assert rig.adapter.state().inhibit_reason == ""
 
 
-@both
+@both_generations
 @pytest.mark.parametrize("wheel_deg", [-540.0, 600.0])
 def test_a_wheel_beyond_the_limit_is_never_commanded(generation: int, wheel_deg: float) -> None:
     """A wheel that is turned too far while the kit is engaged is commanded to no angle beyond the limit."""
-    rig = started(generation)
+    rig = stationary_rig(generation)
     rig.adapter.engage(True, rig.now_ns)
     rig.run_until(lambda rig: rig.state == "clearing")
     turn_wheel(rig, wheel_deg)

@@ -7,7 +7,7 @@ from functools import cache
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.vehicle.dbw.rig import START_NS, driving, profile, started
+from tests.vehicle.dbw.rig import START_NS, driving_rig, profile, stationary_rig
 
 from lavt.domain import NS_PER_MS, Actuation
 from lavt.vehicle.can_frame import CanFrame
@@ -86,17 +86,17 @@ any_frame = st.builds(
     st.binary(max_size=8),
     st.booleans(),
 )
-steps = st.lists(st.tuples(any_frame, st.integers(0, 200 * NS_PER_MS), st.integers(0, 3)), max_size=60)
+histories = st.lists(st.tuples(any_frame, st.integers(0, 200 * NS_PER_MS), st.integers(0, 3)), max_size=60)
 
 
 @names
-@given(steps)
+@given(histories)
 @settings(max_examples=150)
-def test_any_frames_raise_nothing(name: str, happening: list[tuple[CanFrame, int, int]]) -> None:
+def test_any_frames_raise_nothing(name: str, history: list[tuple[CanFrame, int, int]]) -> None:
     """Any frames from the bus raise nothing, and without all reports the car is never engaged."""
     adapter = ByWireAdapter(profile(name), start_ns=START_NS)
     now_ns = START_NS
-    for frame, passed_ns, kind in happening:
+    for frame, passed_ns, kind in history:
         now_ns += passed_ns
         adapter.receive(frame, now_ns)
         adapter.set_actuation(Actuation(0.1, 0.5, 0.0), now_ns)
@@ -113,16 +113,16 @@ def test_any_frames_raise_nothing(name: str, happening: list[tuple[CanFrame, int
 @cache
 def reports_of(generation: int) -> tuple[CanFrame, ...]:
     """Return the reports that a driving kit sends in 100 ms."""
-    rig, found = driving(generation), []
+    rig, received = driving_rig(generation), []
     receive = rig.adapter.receive
 
     def keep(frame: CanFrame, now_ns: int) -> None:
-        found.append(frame)
+        received.append(frame)
         receive(frame, now_ns)
 
     rig.adapter.receive = keep  # type: ignore[method-assign]
     rig.run_ms(100)
-    return tuple(found)
+    return tuple(received)
 
 
 @pytest.mark.parametrize("generation", [1, 2])
@@ -130,7 +130,7 @@ def reports_of(generation: int) -> tuple[CanFrame, ...]:
 @settings(max_examples=25)
 def test_garbage_between_reports(generation: int, garbage: list[tuple[CanFrame, int]]) -> None:
     """Garbage between the reports of a stationary car never engages it while driving is not wanted."""
-    rig = started(generation)
+    rig = stationary_rig(generation)
     for frame, wait_ms in garbage:
         rig.adapter.receive(frame, rig.now_ns)
         rig.run_ms(wait_ms)
@@ -148,7 +148,9 @@ def test_a_flipped_bit(generation: int, data: st.DataObject) -> None:
     flipped = (int.from_bytes(frame.data, "little") ^ 1 << bit).to_bytes(len(frame.data), "little")
     adapter = ByWireAdapter(profile(f"dataspeed_gen{generation}"), start_ns=START_NS)
     adapter.receive(CanFrame(frame.identifier, flipped), START_NS)
-    known = {known.identifier: name for name, known in profile(f"dataspeed_gen{generation}").codec.messages.items()}
-    report = profile(f"dataspeed_gen{generation}").reports.get(known[frame.identifier])
+    names_by_identifier = {
+        facts.identifier: name for name, facts in profile(f"dataspeed_gen{generation}").codec.messages.items()
+    }
+    report = profile(f"dataspeed_gen{generation}").reports.get(names_by_identifier[frame.identifier])
     if report is not None and report.checksum:
         assert adapter._reports.counts["wrong_checksum"] == 1

@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import pytest
-from tests.vehicle.dbw.rig import COARSE_MS, SPEED_SOURCES, AdapterRig, both, driving, started, with_one_speed
+from tests.vehicle.dbw.rig import (
+    COARSE_MS,
+    SPEED_SOURCES,
+    AdapterRig,
+    both_generations,
+    driving_rig,
+    stationary_rig,
+    with_one_speed,
+)
 from tests.vehicle.dbw.test_adapter_and_gate import decide, new_gate
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation
 from lavt.safety.gate import SafetyGate
 from lavt.vehicle.can_frame import CanFrame
-from lavt.vehicle.dbw.speed_monitor import HOLD_NS
+from lavt.vehicle.dbw.speed_monitor import FULL_BRAKE_NS
 from lavt.vehicle.software_car.state import Gear
 
 GEAR_COMMAND = {1: 0x066, 2: 0x203}
@@ -18,7 +26,7 @@ SPEED_REPORT = {1: 0x065, 2: 0x107}
 
 def fast(generation: int) -> tuple[AdapterRig, SafetyGate]:
     """Return a car that drives at 8.3 m/s, and a gate in the state `driving`."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.simulator._car.motion.speed_mps = 8.3
     rig.actuation = Actuation(0.0, 0.1, 0.0)
     rig.run_ms(100, step_ms=COARSE_MS)
@@ -38,7 +46,7 @@ def run(rig: AdapterRig, gate: SafetyGate, duration_ns: int) -> None:
             assert GEAR_COMMAND[rig.generation] not in {frame.identifier for _, frame in rig.sent}
 
 
-@both
+@both_generations
 @pytest.mark.parametrize("stuck_mps", [0.0, 3.0])
 def test_a_stuck_speed_stops_the_car(generation: int, stuck_mps: float) -> None:
     """A speed stuck at 0 or at 3 m/s while the car drives at 8.3 m/s is a fault: full brake, and no PARK before
@@ -65,24 +73,24 @@ def test_a_stuck_speed_stops_the_car(generation: int, stuck_mps: float) -> None:
         assert rig.kit.state.gear == Gear.PARK
 
 
-@both
+@both_generations
 def test_all_speeds_stuck_at_zero(generation: int) -> None:
     """Even if all speeds drop to 0, the car brakes fully for long enough to stop before it is parked."""
     rig, gate = fast(generation)
     for source in SPEED_SOURCES[generation]:
         rig.kit.stick_speed(source, 0.0)
-    run(rig, gate, HOLD_NS)
+    run(rig, gate, FULL_BRAKE_NS)
     assert rig.speed_mps == 0.0
     assert rig.kit.state.gear == Gear.DRIVE
     run(rig, gate, 2 * NS_PER_S)
     assert (rig.kit.state.gear, rig.state) == (Gear.PARK, "idle")
 
 
-@both
+@both_generations
 @pytest.mark.parametrize("speed_mps", [0.0, 3.0])
 def test_a_stuck_speed_under_throttle(generation: int, speed_mps: float) -> None:
     """A speed that is stuck at the start, or at 3 m/s, ends the drive before the car is much faster."""
-    rig = started(generation)
+    rig = stationary_rig(generation)
     rig.engage()
     rig.actuation = Actuation(0.0, 1.0, 0.0)
     rig.run_until(lambda rig: rig.speed_mps >= speed_mps, 5000, step_ms=COARSE_MS)
@@ -92,7 +100,7 @@ def test_a_stuck_speed_under_throttle(generation: int, speed_mps: float) -> None
     assert not rig.adapter.state().is_speed_plausible
 
 
-@both
+@both_generations
 def test_a_stuck_speed_of_a_kit_with_one_speed(generation: int) -> None:
     """Without another speed, one stuck at 3 m/s under throttle still ends the drive."""
     rig = AdapterRig(generation, profile=with_one_speed(generation))
@@ -105,7 +113,7 @@ def test_a_stuck_speed_of_a_kit_with_one_speed(generation: int) -> None:
     assert not rig.adapter.state().is_speed_plausible
 
 
-@both
+@both_generations
 def test_a_scaled_speed_stops_the_car(generation: int) -> None:
     """A speed that becomes half the real one is a fault."""
     rig, gate = fast(generation)
@@ -114,7 +122,7 @@ def test_a_scaled_speed_stops_the_car(generation: int) -> None:
     assert (gate.state, rig.adapter.state().is_speed_plausible) == ("safe_stop", False)
 
 
-@both
+@both_generations
 @pytest.mark.parametrize("source", ["speed", "wheel_speed"])
 def test_a_missing_speed_stops_the_car(generation: int, source: str) -> None:
     """A speed or wheel speeds that are no longer reported stop the car."""
@@ -127,7 +135,7 @@ def test_a_missing_speed_stops_the_car(generation: int, source: str) -> None:
     assert not rig.adapter.state().is_engaged
 
 
-@both
+@both_generations
 def test_unknown_wheel_speeds_stop_the_car(generation: int) -> None:
     """Wheel speeds that are reported as unknown count as missing."""
     rig, gate = fast(generation)
@@ -136,7 +144,7 @@ def test_unknown_wheel_speeds_stop_the_car(generation: int) -> None:
     assert (gate.state, rig.speed_mps) == ("safe_stop", 0.0)
 
 
-@both
+@both_generations
 def test_a_safe_stop_with_weak_brakes_brakes_fully(generation: int) -> None:
     """If the brake has half its force, a safe stop presses it fully, and the speed is no fault."""
     rig, gate = fast(generation)
@@ -149,7 +157,7 @@ def test_a_safe_stop_with_weak_brakes_brakes_fully(generation: int) -> None:
     assert not any(name.startswith("speed_") for name in rig.adapter.counts)
 
 
-@both
+@both_generations
 def test_a_safe_stop_with_good_brakes_leaves_grip_for_steering(generation: int) -> None:
     """A safe stop that decelerates as wanted does not press the brake further, and raises no fault."""
     rig, gate = fast(generation)
@@ -164,7 +172,7 @@ def test_a_safe_stop_with_good_brakes_leaves_grip_for_steering(generation: int) 
 
 def test_a_repeated_report_is_no_report() -> None:
     """Reports of generation 2 whose counter does not change count as missing."""
-    rig = driving(2)
+    rig = driving_rig(2)
     first: list[CanFrame] = []
 
     def repeat(frame: CanFrame) -> bool:

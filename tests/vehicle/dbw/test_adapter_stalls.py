@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 
 import pytest
-from tests.vehicle.dbw.rig import COARSE_MS, AdapterRig, both, driving
+from tests.vehicle.dbw.rig import COARSE_MS, AdapterRig, both_generations, driving_rig
 
 from lavt.domain import Actuation
 from lavt.vehicle.can_frame import CanFrame
@@ -14,16 +14,16 @@ from lavt.vehicle.dbw.profile import AXES, Axis
 from lavt.vehicle.software_car.authority import WATCHDOG_BRAKE
 
 
-@both
+@both_generations
 @pytest.mark.timeout(30)
 def test_a_stall_while_parking_ends(generation: int) -> None:
     """A stall while parking ends it, at whatever moment, if the kit has disengaged meanwhile: the watchdog brakes."""
-    begun = driving(generation)
-    begun.adapter.engage(False, begun.now_ns)
-    begun.run_ms(50)
+    parking_rig = driving_rig(generation)
+    parking_rig.adapter.engage(False, parking_rig.now_ns)
+    parking_rig.run_ms(50)
     for moment_ms in range(9):
         for duration_ms in (80, 98, 100, 102, 150, 1000):
-            rig = begun.copy()
+            rig = parking_rig.copy()
             rig.run_ms(moment_ms)
             rig.stall_ms(duration_ms)
             rig.run_ms(250)
@@ -55,12 +55,12 @@ def forge_enabled(rig: AdapterRig, axis: Axis, *, is_enabled: bool) -> None:
     rig.lose_report = forge
 
 
-@both
+@both_generations
 @pytest.mark.parametrize("axis", AXES)
 @pytest.mark.parametrize("is_wanted", [True, False])
 def test_the_car_brakes_without_an_axis(generation: int, axis: Axis, is_wanted: bool) -> None:
     """If one axis is reported as released, driving or parking, the kit's watchdog brakes the car to a standstill."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.actuation = Actuation(0.01, 0.0, 0.4)
     rig.adapter.engage(is_wanted, rig.now_ns)
     rig.run_ms(30)
@@ -77,7 +77,7 @@ def test_the_car_brakes_without_an_axis(generation: int, axis: Axis, is_wanted: 
 
 def test_a_released_axis_is_not_enabled_again() -> None:
     """An axis that was released once is not enabled again while parking, even if it is reported as enabled again."""
-    rig = driving(1, has_watchdog=False)
+    rig = driving_rig(1, has_watchdog=False)
     rig.actuation = Actuation(0.01, 0.0, 0.4)
     forge_enabled(rig, "steering", is_enabled=False)
     rig.run_until(lambda rig: rig.state == "lost")
@@ -90,11 +90,11 @@ def test_a_released_axis_is_not_enabled_again() -> None:
     assert round(rig.kit.state.brake, 2) == 0.4
 
 
-@both
+@both_generations
 @pytest.mark.parametrize("dropped", [1, 2, 3, 4])
 def test_dropped_frames_leave_no_gap_in_the_counters(generation: int, dropped: int) -> None:
-    """If the last frames of a set, or all, are not written the next ones have their numbers, and driving goes on."""
-    rig = driving(generation)
+    """If the last frames of a set, or all, are not written, the next ones get their counter values; driving goes on."""
+    rig = driving_rig(generation)
     rig.run_until(lambda rig: bool(rig.sent) and rig.sent[-1][0] == rig.now_ns)
     for _ in range(5):
         sets = rig.adapter.counts["sets"]
@@ -116,10 +116,10 @@ def test_dropped_frames_leave_no_gap_in_the_counters(generation: int, dropped: i
         assert {(after - before) % modulus for before, after in pairwise(found)} == {1}
 
 
-@both
+@both_generations
 def test_sets_that_are_never_written_are_no_commands(generation: int) -> None:
     """If no frame is written for 100 ms this ends driving, as if none had been due."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.run_until(lambda rig: bool(rig.sent) and rig.sent[-1][0] == rig.now_ns)
     rig.dropped_frames = 9
     rig.run_ms(99)

@@ -1,4 +1,4 @@
-"""The adapter's frames equal, byte for byte, those worked out by hand from the facts."""
+"""The adapter's frames equal, byte for byte, those worked out by hand from the published sources."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def sent(name: str, vector: dict[str, Any]) -> CanFrame | None:
         if known.axes[axis].message == message:
             return axis_command(known, axis, signals)
     if known.gear.message == message and set(signals) == {known.gear.value}:
-        gears = {number: gear for gear, number in known.gear.numbers.items()}
+        gears = {code: gear for gear, code in known.gear.codes.items()}
         gear = gears.get(signals[known.gear.value])
         return sender.gear_frame(gear) if gear else None
     if known.system and message == known.system.message and signals:
@@ -50,7 +50,7 @@ def axis_command(known: Profile, axis: Axis, signals: dict[str, Any]) -> CanFram
     if command.value not in signals or signals.get(kind, 0) != number:
         return None
     varied = {command.value, command.enable, command.count}
-    constants = {kind: number} | {name: each for name, each in signals.items() if name not in varied}
+    constants = {kind: number} | {name: value for name, value in signals.items() if name not in varied}
     sender = FrameSender(replace(known, axes={**known.axes, axis: replace(command, constants=constants)}), START_NS)
     sender._frame_counts[command.message] = signals.get(command.count, 0) + command.modulus - 1
     is_enabled = bool(signals.get(command.enable, 0))
@@ -83,7 +83,7 @@ def test_frames_equal_the_vectors(frame: CanFrame, vector: dict[str, Any]) -> No
 
 
 def test_every_sent_message_has_a_vector() -> None:
-    """Every message that the adapter sends has a vector, except two without a vector with any signal."""
+    """Every message that the adapter sends has a vector, except two whose vectors have no signals."""
     checked = {(name, vector["message"]) for name in NAMES for vector in vectors(name) if sent(name, vector)}
     missing = set()
     for name in NAMES:

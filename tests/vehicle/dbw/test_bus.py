@@ -49,7 +49,7 @@ def receive(port: CanPort, count: int) -> list[CanFrame]:
         return len(received) >= count
 
     until(enough)
-    return [each.frame for each in received]
+    return [entry.frame for entry in received]
 
 
 @pytest.fixture
@@ -94,9 +94,9 @@ port = CanPort("udp_multicast", sys.argv[1], {"port": int(sys.argv[2])}, clock=M
 print("ready", flush=True)
 count = 0
 while count < 3:
-    for each in port.take(0):
+    for received in port.take(0):
         count += 1
-        port.send([each.frame], MachineClock().now().mono_ns)
+        port.send([received.frame], MachineClock().now().mono_ns)
     pause(1_000_000)
 port.close()
 """
@@ -221,7 +221,7 @@ def test_queue_is_bounded(opened: Callable[..., CanPort], raw: can.BusABC, monke
     for number in range(10):
         raw.send(can.Message(arbitration_id=number, is_extended_id=False))
     until(lambda: port.counts["overflowed"] == 6)
-    assert [each.frame.identifier for each in port.take(0)] == [6, 7, 8, 9]
+    assert [received.frame.identifier for received in port.take(0)] == [6, 7, 8, 9]
 
 
 def test_queue_holds_two_seconds_of_a_full_bus() -> None:
@@ -305,7 +305,7 @@ def test_frames_before_the_loss(opened: Callable[..., CanPort], device: Device) 
     port = opened("breakable", "stick", clock=ManualClock(0))
     device.incoming.extend([can.Message(arbitration_id=7, is_extended_id=False), OSError(errno.ENODEV, "gone")])
     until(lambda: device.shut_down == 1)
-    assert [each.frame.identifier for each in port.take(0)] == [7]
+    assert [received.frame.identifier for received in port.take(0)] == [7]
     with pytest.raises(BusGone):
         port.take(0)
 
@@ -455,10 +455,10 @@ def test_log(tmp_path: Path) -> None:
     """A written log is read back unchanged, to the microsecond."""
     written = [ReceivedCanFrame(STEERING, 1_700_000_000_000_001_000), ReceivedCanFrame(FAR, 1_700_000_000_500_000_000)]
     log = tmp_path / "drive.log"
-    log.write_text("".join(log_line(each.arrived_ns, "vcan0", each.frame) for each in written))
-    read = list(read_log(log))
-    assert [each.frame for each in read] == [each.frame for each in written]
-    assert [round(each.arrived_ns / 1000) for each in read] == [each.arrived_ns // 1000 for each in written]
+    log.write_text("".join(log_line(entry.arrived_ns, "vcan0", entry.frame) for entry in written))
+    read_back = list(read_log(log))
+    assert [entry.frame for entry in read_back] == [entry.frame for entry in written]
+    assert [round(entry.arrived_ns / 1000) for entry in read_back] == [entry.arrived_ns // 1000 for entry in written]
     assert log.read_text().splitlines()[1] == "(1700000000.500000) vcan0 00002F01#01"
 
 
@@ -476,4 +476,4 @@ def test_counts_of_a_log(tmp_path: Path) -> None:
     """Error and remote frames in a log are ignored."""
     log = tmp_path / "drive.log"
     log.write_text("(1.0) can0 20000080#0000000000000000\n(2.0) can0 060#R\n(3.0) can0 060#01\n")
-    assert [each.frame for each in read_log(log)] == [CanFrame(0x60, b"\x01")]
+    assert [entry.frame for entry in read_log(log)] == [CanFrame(0x60, b"\x01")]

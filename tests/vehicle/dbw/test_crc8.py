@@ -1,4 +1,4 @@
-"""The CRC of frames agrees with the vectors of the facts and with those worked out by hand."""
+"""The CRC of frames agrees with the published vectors and with those worked out by hand."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ FRAMES = st.tuples(st.integers(0, 0x7FF), st.binary(max_size=7))
 
 @pytest.mark.parametrize("vector", VECTORS["plain"], ids=lambda vector: vector["fact"])
 def test_plain(vector: dict[str, Any]) -> None:
-    """The CRC of bytes is as in the facts."""
+    """The CRC of bytes is as published."""
     assert crc8(bytes.fromhex(vector["data"])) == vector["crc"]
 
 
 def test_alphanumeric() -> None:
-    """The CRC of the 62 letters and digits is as in the facts."""
+    """The CRC of the 62 letters and digits is as published."""
     assert crc8(VECTORS["alphanumeric"]["text"].encode()) == VECTORS["alphanumeric"]["crc"]
 
 
 @pytest.mark.parametrize("vector", VECTORS["frames"], ids=lambda vector: f"{vector['identifier']:X} {vector['data']}")
 def test_frame(vector: dict[str, Any]) -> None:
     """The CRC of a frame covers its identifier, high byte first, and then its data."""
-    found = frame_crc8(vector["identifier"], bytes.fromhex(vector["data"]), extended=vector["extended"])
-    assert found == vector["crc"]
+    crc = frame_crc8(vector["identifier"], bytes.fromhex(vector["data"]), extended=vector["extended"])
+    assert crc == vector["crc"]
 
 
 @pytest.mark.parametrize("vector", VECTORS["plain"] + VECTORS["frames"], ids=lambda vector: vector["registers"])

@@ -9,7 +9,7 @@ from lavt.vehicle.dbw import adapter, bus, codec, profile, reports, sending, sta
 
 LIMITS_MS = [
     ("sets of frames are at least 5 ms apart", profile.LEAST_GAP_NS, 5),
-    ("commands are sent every 20 ms", profile.PERIOD_NS, 20),
+    ("commands are sent every 20 ms", profile.REPEAT_PERIOD_NS, 20),
     ("clearing frames are sent every 50 ms", profile.CLEARING_PERIOD_NS, 50),
     ("a kit disengages after 100 ms", profile.COMMAND_TIMEOUT_NS, 100),
     ("an adapter sends nothing older than 60 ms", profile.TICK_LIMIT_NS, 60),
@@ -33,9 +33,7 @@ LIMITS_MS = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("limit_ns", "limit_ms"), [each[1:] for each in LIMITS_MS], ids=[each[0] for each in LIMITS_MS]
-)
+@pytest.mark.parametrize(("limit_ns", "limit_ms"), [row[1:] for row in LIMITS_MS], ids=[row[0] for row in LIMITS_MS])
 def test_times(limit_ns: int, limit_ms: int) -> None:
     """Each time limit of driving by wire is the design's number of milliseconds, as an integer."""
     assert type(limit_ns) is int

@@ -1,4 +1,4 @@
-"""The shipped DBC files agree with the vectors worked out by hand, and mark everything that is not in the facts."""
+"""The shipped DBC files agree with the vectors worked out by hand, and mark everything that is not published."""
 
 from __future__ import annotations
 
@@ -63,16 +63,16 @@ def is_unverified(signal: Signal) -> bool:
     return mark is not None and mark.value == 1
 
 
-def full(message: Message, given_signals: dict[str, float]) -> dict[str, float]:
-    """Return all signals of a frame: the given ones, and the others as 0."""
+def with_all_signals(message: Message, values: dict[str, float]) -> dict[str, float]:
+    """Return the values of all signals of a frame: `values`, and 0 for the others."""
     multiplexer = selector_of(message)
-    selector = int(given_signals.get(multiplexer.name, 0)) if multiplexer else 0
-    return {signal.name: 0 for signal in selected(message, selector)} | given_signals
+    selector = int(values.get(multiplexer.name, 0)) if multiplexer else 0
+    return {signal.name: 0 for signal in selected(message, selector)} | values
 
 
 def encoded(message: Message, signals: dict[str, float]) -> bytes:
     """Return a frame's bytes, with its CRC if it has one."""
-    data = bytes(message.encode(full(message, signals)))
+    data = bytes(message.encode(with_all_signals(message, signals)))
     if any(signal.name == "CRC" for signal in message.signals):
         return data[:-1] + bytes([frame_crc8(message.frame_id, data[:-1])])
     return data
@@ -92,12 +92,14 @@ def test_encoded(message: Message, vector: dict[str, Any]) -> None:
 def test_decoded(message: Message, vector: dict[str, Any]) -> None:
     """The bytes worked out by hand are decoded to their values, to half a step."""
     data = bytes.fromhex(vector["data"])
-    found = message.decode(data, decode_choices=False, allow_truncated=True)
-    assert isinstance(found, dict)
-    for name, value in (full(message, vector["signals"]) if len(data) == message.length else vector["signals"]).items():
+    decoded = message.decode(data, decode_choices=False, allow_truncated=True)
+    assert isinstance(decoded, dict)
+    is_full = len(data) == message.length
+    expected = with_all_signals(message, vector["signals"]) if is_full else vector["signals"]
+    for name, value in expected.items():
         if name != "CRC":
             step = abs(message.get_signal_by_name(name).conversion.scale)
-            assert found[name] == pytest.approx(value, abs=step / 2 + 1e-9), name
+            assert decoded[name] == pytest.approx(value, abs=step / 2 + 1e-9), name
 
 
 @pytest.mark.parametrize("vector", [vector for vector in WRITTEN["dataspeed_gen2"]["vectors"] if "registers" in vector])
@@ -158,12 +160,12 @@ def unverified(profile: str) -> set[str]:
 
 
 def test_unverified_of_generation_1() -> None:
-    """In generation 1 only the parking brake has a position that is not in the facts."""
+    """In generation 1 only the parking brake has a position that is not published."""
     assert unverified("dataspeed_gen1") == {"MiscCmd.PBRKCMD"}
 
 
 def test_unverified_of_generation_2() -> None:
-    """In generation 2 only the CRC of commands has a position that is in the facts."""
+    """In generation 2 only the CRC of commands has a published position."""
     everything = {
         f"{message.name}.{signal.name}"
         for message in DATABASES["dataspeed_gen2"].messages
@@ -188,7 +190,7 @@ def test_unverified_signals_have_a_comment(profile: str) -> None:
 
 @pytest.mark.parametrize("limit", WRITTEN["dataspeed_gen1"]["limits"], ids=lambda limit: limit["signal"])
 def test_limits(limit: dict[str, Any]) -> None:
-    """A command is encoded at the limits of the facts and rejected one step beyond."""
+    """A command is encoded at the published limits and rejected one step beyond."""
     message = DATABASES["dataspeed_gen1"].get_message_by_name(limit["message"])
     signal = message.get_signal_by_name(limit["signal"])
     multiplexer = selector_of(message)
@@ -228,20 +230,20 @@ TIMES = {  # period, timeout, ms
 
 @pytest.mark.parametrize("profile", PROFILES)
 def test_times(profile: str) -> None:
-    """Periods and timeouts are those of the facts, and there are no others."""
-    found = {}
+    """Periods and timeouts are the published ones, and there are no others."""
+    times_by_message = {}
     for message in DATABASES[profile].messages:
         assert message.dbc is not None
         timeout = message.dbc.attributes.get("TimeoutMs")
         times = (message.cycle_time, timeout.value if timeout else None)
         if times != (None, None):
-            found[message.name] = times
-    assert found == TIMES[profile]
+            times_by_message[message.name] = times
+    assert times_by_message == TIMES[profile]
 
 
 def test_marks_of_invalid_values() -> None:
     """A report's number for "not valid" is decoded as a name, not as a value."""
     report = DATABASES["dataspeed_gen1"].get_message_by_name("SteeringReport")
-    found = report.decode(bytes.fromhex("00 80 00 00 00 80 80 00"))
-    assert isinstance(found, dict)
-    assert [str(found[name]) for name in ("ANGLE", "VEH_VEL", "TORQUE")] == ["INVALID"] * 3
+    decoded = report.decode(bytes.fromhex("00 80 00 00 00 80 80 00"))
+    assert isinstance(decoded, dict)
+    assert [str(decoded[name]) for name in ("ANGLE", "VEH_VEL", "TORQUE")] == ["INVALID"] * 3

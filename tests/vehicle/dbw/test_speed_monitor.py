@@ -9,7 +9,7 @@ import pytest
 
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.vehicle.dbw.speed_monitor import (
-    HOLD_NS,
+    FULL_BRAKE_NS,
     STANDSTILL_NS,
     Pedals,
     SpeedFault,
@@ -32,7 +32,7 @@ class MonitorRig:
     def __init__(self) -> None:
         self.monitor = SpeedMonitor(max_acceleration_mps2=2.0, max_braking_mps2=6.0)
         self.now_ns = START_NS
-        self.found: list[SpeedFault] = []
+        self.faults: list[SpeedFault] = []
 
     def run(
         self, duration_s: float, pedals: Pedals, speed: Course, *wheels: Course, second: Course | None = None
@@ -42,11 +42,11 @@ class MonitorRig:
         while self.now_ns < began_ns + round(duration_s * NS_PER_S):
             self.now_ns += PERIOD_NS
             passed_s = (self.now_ns - began_ns) / NS_PER_S
-            courses = {"speed": speed} | {f"wheel_{index}": each for index, each in enumerate(wheels, 1)}
+            courses = {"speed": speed} | {f"wheel_{index}": wheel for index, wheel in enumerate(wheels, 1)}
             courses |= {} if second is None else {"second_speed": second}
             reports = {name: SpeedReport(quantised(course(passed_s)), self.now_ns) for name, course in courses.items()}
-            found = self.monitor.update(reports, pedals, self.now_ns)
-            self.found += [] if found is None else [found]
+            fault = self.monitor.update(reports, pedals, self.now_ns)
+            self.faults += [] if fault is None else [fault]
         return self
 
 
@@ -74,13 +74,13 @@ def test_a_speed_that_drops_to_zero_is_a_fall() -> None:
     """A speed that becomes 0 at 8.3 m/s is implausible with its first report, and the car is not stationary."""
     rig = MonitorRig().run(1.0, NONE, noisy(constant(8.3)))
     rig.run(0.01, NONE, constant(0.0))
-    assert rig.found == [SpeedFault.FALL]
+    assert rig.faults == [SpeedFault.FALL]
 
 
 def test_the_fault_lasts_until_all_speeds_agree_on_standstill() -> None:
     """The fault ends after the car was braked for long enough, and every speed was 0 for a second."""
     rig = MonitorRig().run(1.0, NONE, *[noisy(constant(8.3))] * 5)
-    rig.run(HOLD_NS / NS_PER_S + 5.0, FULL_BRAKE, constant(0.0), *[constant(8.3)] * 4)
+    rig.run(FULL_BRAKE_NS / NS_PER_S + 5.0, FULL_BRAKE, constant(0.0), *[constant(8.3)] * 4)
     assert rig.monitor.fault is SpeedFault.FALL
     assert rig.monitor.speed_mps == pytest.approx(8.3, abs=0.01)
     rig.run(STANDSTILL_NS / NS_PER_S - 0.02, FULL_BRAKE, *[constant(0.0)] * 5)
@@ -92,7 +92,7 @@ def test_the_fault_lasts_until_all_speeds_agree_on_standstill() -> None:
 def test_a_fault_of_the_only_source_lasts_as_long_as_the_car_may_need() -> None:
     """Without another speed, the fault lasts until any speed within the limits is braked away."""
     rig = MonitorRig().run(1.0, NONE, noisy(constant(8.3)))
-    rig.run(HOLD_NS / NS_PER_S - 0.02, FULL_BRAKE, constant(0.0))
+    rig.run(FULL_BRAKE_NS / NS_PER_S - 0.02, FULL_BRAKE, constant(0.0))
     assert rig.monitor.fault is SpeedFault.FALL
     rig.run(0.1, FULL_BRAKE, constant(0.0))
     assert rig.monitor.fault is None
@@ -105,34 +105,34 @@ def test_a_stuck_speed_disagrees(other: str, stuck_mps: float) -> None:
     course = ramp(stuck_mps, 2.0)
     others = {"second": course} if other == "second" else {}
     rig = MonitorRig().run(1.5, THROTTLE, constant(stuck_mps), *[course] * (0 if others else 4), **others)
-    assert rig.found == [SpeedFault.DISAGREEMENT]
+    assert rig.faults == [SpeedFault.DISAGREEMENT]
 
 
 def test_a_scaled_speed_disagrees() -> None:
     """A speed of half that of the wheels is implausible."""
     rig = MonitorRig().run(4.0, THROTTLE, ramp(0.0, 1.0), *[ramp(0.0, 2.0)] * 4)
-    assert rig.found == [SpeedFault.DISAGREEMENT]
+    assert rig.faults == [SpeedFault.DISAGREEMENT]
 
 
 @pytest.mark.parametrize("sources", [1, 5])
 def test_a_frozen_speed_under_throttle(sources: int) -> None:
     """A moving car's speed that does not change under throttle is implausible, even if all sources agree."""
     rig = MonitorRig().run(2.1, THROTTLE, *[constant(3.0)] * sources)
-    assert rig.found == [SpeedFault.FROZEN]
+    assert rig.faults == [SpeedFault.FROZEN]
 
 
 @pytest.mark.parametrize("sources", [1, 5])
 def test_a_speed_that_stays_zero_under_throttle(sources: int) -> None:
     """A car that does not start at half throttle for 3 s may have a wrong speed."""
     rig = MonitorRig().run(3.1, THROTTLE, *[constant(0.0)] * sources)
-    assert rig.found == [SpeedFault.NO_START]
+    assert rig.faults == [SpeedFault.NO_START]
 
 
 @pytest.mark.parametrize("sources", [1, 5])
 def test_a_speed_that_does_not_answer_the_brake(sources: int) -> None:
     """A speed that does not fall while the brake is pressed is implausible."""
     rig = MonitorRig().run(1.6, HALF_BRAKE, *[noisy(constant(5.0))] * sources)
-    assert rig.found == [SpeedFault.NO_BRAKING]
+    assert rig.faults == [SpeedFault.NO_BRAKING]
 
 
 # No false alarms.
@@ -187,7 +187,7 @@ def test_normal_driving_raises_no_fault(situation: str) -> None:
     """Slip, locked wheels, hills, quantisation and stop-and-go are plausible."""
     rig = MonitorRig()
     NORMAL[situation](rig)
-    assert rig.found == []
+    assert rig.faults == []
 
 
 def test_any_moving_source_means_not_stationary() -> None:
@@ -197,7 +197,7 @@ def test_any_moving_source_means_not_stationary() -> None:
     assert rig.monitor.speed_mps == pytest.approx(0.4, abs=0.01)
     rig.run(0.01, NONE, *[constant(0.0)] * 5)
     assert rig.monitor.is_stationary
-    assert rig.found == []
+    assert rig.faults == []
 
 
 def test_an_old_report_is_not_compared() -> None:

@@ -60,7 +60,7 @@ def test_a_state_without_a_cause_does_not_change(state: State) -> None:
 
 
 Cause = tuple[str, dict[str, Any], dict[State, State]]
-"""Its name, its change of the situation, and the target of each state that it ends."""
+"""The cause's name, its change of the situation, and the target of each state that it ends."""
 WITHOUT: list[Cause] = [(f"without {axis}", {"enabled": ALL - {axis}}, {"engaged": "lost"}) for axis in AXES]
 CAUSES: list[Cause] = [
     ("override", {"overrides": "o"}, dict.fromkeys(("enabling", "engaged", "parking", "lost"), "overridden")),
@@ -155,17 +155,17 @@ TEXTS = ("overrides", "missing_reports", "faults", "trips", "command_errors")
 @pytest.mark.parametrize("first", TEXTS)
 def test_the_cause_of_the_highest_priority_is_the_reason(first: str) -> None:
     """Of several causes the reason is an override, then missing reports, faults, trips and command errors."""
-    given = TEXTS[TEXTS.index(first) :]
-    causes: dict[str, Any] = {name: name.upper() for name in given}
-    found, why = next_state("engaged", replace(GOOD, wanted=False, **causes))
-    assert found == ("overridden" if first == "overrides" else "lost")
-    assert [name for name in given if name.upper() in why.partition(" (")[0]] == [first]
+    present = TEXTS[TEXTS.index(first) :]
+    causes: dict[str, Any] = {name: name.upper() for name in present}
+    next_name, reason_text = next_state("engaged", replace(GOOD, wanted=False, **causes))
+    assert next_name == ("overridden" if first == "overrides" else "lost")
+    assert [name for name in present if name.upper() in reason_text.partition(" (")[0]] == [first]
 
 
 def test_a_cause_without_a_text_uses_its_row() -> None:
     """The reason for a cause without a text is the description of the table's row."""
-    why = reason("engaged", since_sent_ns=TIMEOUT_NS)
-    assert why in {row.description for row in TABLE if row.target == "lost"}
+    reason_text = reason("engaged", since_sent_ns=TIMEOUT_NS)
+    assert reason_text in {row.description for row in TABLE if row.target == "lost"}
     assert reason("engaged", wanted=False) in {row.description for row in TABLE if row.target == "parking"}
 
 
@@ -186,7 +186,7 @@ SEVERAL: list[tuple[State, dict[str, Any]]] = [
 
 @pytest.mark.parametrize(
     ("state", "cause", "known"),
-    [(*each, known) for each in SEVERAL for known in DETAILS if (each[0], known) != ("enabling", "trips")],
+    [(*case, known) for case in SEVERAL for known in DETAILS if (case[0], known) != ("enabling", "trips")],
 )  # a trip ends enabling immediately
 def test_other_reported_problems_are_in_the_reason(state: State, cause: dict[str, Any], known: str) -> None:
     """A reason contains the kit's other texts, and no empty part if there are none."""
@@ -194,10 +194,10 @@ def test_other_reported_problems_are_in_the_reason(state: State, cause: dict[str
     assert DETAILS[known] in text
     assert cause.get("overrides", "") in text
     assert SEPARATOR + "REASON" in reason(state, **{**cause, "command_errors": "ERROR", "reasons": "REASON"})
-    for each in (text, reason(state, **cause)):
+    for reason_text in (text, reason(state, **cause)):
         assert "()" not in text
-        assert "; ;" not in each
-        assert not each.endswith(("; ", " "))
+        assert "; ;" not in reason_text
+        assert not reason_text.endswith(("; ", " "))
 
 
 @pytest.mark.parametrize("axis", AXES)
@@ -205,9 +205,9 @@ def test_axes_that_are_not_enabled_are_named(axis: Axis) -> None:
     """A reason names exactly the axes that the kit released or did not enable; clearing names none."""
     others = {"enabled": ALL - {axis}}
     for text in (reason("engaged", **others), reason("enabling", **others, in_state_ns=LIMIT_NS)):
-        assert {each for each in AXES if each in text} == {axis}
+        assert {name for name in AXES if name in text} == {axis}
     assert reason("engaged", enabled=NONE).endswith(AXES[-1])
-    assert not any(each in reason("clearing", in_state_ns=LIMIT_NS, trips="TRIP") for each in AXES)
+    assert not any(name in reason("clearing", in_state_ns=LIMIT_NS, trips="TRIP") for name in AXES)
 
 
 def test_a_gear_that_was_not_reached_is_named() -> None:

@@ -35,7 +35,7 @@ def report(angle: int, count: int, *, damage: int = 0) -> CanFrame:
 
 
 def summary_of(traffic: BusTraffic, now_ns: int, name: str = "SteerReport1") -> MessageSummary:
-    return next(each for each in traffic.take_period(now_ns) if each.facts.name == name)
+    return next(summary for summary in traffic.take_period(now_ns) if summary.facts.name == name)
 
 
 def test_rate_and_changes() -> None:
@@ -57,7 +57,7 @@ def test_total() -> None:
     traffic.receive(ReceivedCanFrame(report(7, 1, damage=1), 0))
     traffic.take_period(NS_PER_S)
     traffic.receive(ReceivedCanFrame(report(8, 2), NS_PER_S))
-    (steering,) = (each for each in traffic.total(2 * NS_PER_S) if each.facts.name == "SteerReport1")
+    (steering,) = (summary for summary in traffic.total(2 * NS_PER_S) if summary.facts.name == "SteerReport1")
     assert (steering.frames, steering.rate_hz, steering.changed) == (2, 1.0, ("ANGLE",))
     assert len(steering.wrong) == 2
     assert "checksum" in steering.wrong[0]
@@ -82,7 +82,7 @@ def test_a_gap_longer_than_the_timeout_is_an_error(gap_ms: int, is_wrong: bool) 
     """A gap between reports that exceeds the timeout is an error, during the gap and in the period in which it ends."""
     traffic = new_traffic()
     traffic.receive(ReceivedCanFrame(report(7, 1), 0))
-    assert [f"{gap_ms} ms" in each for each in summary_of(traffic, gap_ms * NS_PER_MS).wrong] == [True] * is_wrong
+    assert [f"{gap_ms} ms" in error for error in summary_of(traffic, gap_ms * NS_PER_MS).wrong] == [True] * is_wrong
     traffic.receive(ReceivedCanFrame(report(7, 2), gap_ms * NS_PER_MS))
     assert len(summary_of(traffic, gap_ms * NS_PER_MS).wrong) == is_wrong
     assert summary_of(traffic, gap_ms * NS_PER_MS).wrong == ()
@@ -91,9 +91,10 @@ def test_a_gap_longer_than_the_timeout_is_an_error(gap_ms: int, is_wrong: bool) 
 def test_a_missing_report_is_an_error() -> None:
     """Expected reports are listed in the order of their identifiers, with an error if they were never received."""
     messages = new_traffic().take_period(0)
-    assert [each.facts.identifier for each in messages] == [0x100, 0x101, 0x102, 0x103, 0x106, 0x107, 0x2A4, 0x2D8]
-    assert {len(each.wrong) for each in messages} == {1}
-    assert all("never" in each.wrong[0] for each in messages)
+    identifiers = [summary.facts.identifier for summary in messages]
+    assert identifiers == [0x100, 0x101, 0x102, 0x103, 0x106, 0x107, 0x2A4, 0x2D8]
+    assert {len(summary.wrong) for summary in messages} == {1}
+    assert all("never" in summary.wrong[0] for summary in messages)
 
 
 def test_lengths() -> None:
@@ -127,7 +128,7 @@ def test_random_bus(frames: list[tuple[int, bytes]]) -> None:
     traffic = new_traffic()
     for identifier, data in frames:
         traffic.receive(ReceivedCanFrame(CanFrame(identifier, data), 0))
-    assert sum(each.frames for each in traffic.take_period(1)) + traffic.unknown.total() == len(frames)
+    assert sum(summary.frames for summary in traffic.take_period(1)) + traffic.unknown.total() == len(frames)
 
 
 def test_without_a_profile() -> None:

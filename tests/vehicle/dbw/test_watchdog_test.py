@@ -6,7 +6,7 @@ from collections.abc import Callable
 from itertools import pairwise
 
 import pytest
-from tests.vehicle.dbw.rig import START_NS, both, profile, road
+from tests.vehicle.dbw.rig import START_NS, both_generations, profile, road
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation, VehicleState
 from lavt.vehicle.can_frame import CanFrame
@@ -56,7 +56,7 @@ class Attempt:
         return all(actuator.is_enabled for actuator in self.kit.state.actuators.values())
 
 
-@both
+@both_generations
 def test_passed(generation: int) -> None:
     """The test passes for a kit that disengages 100 ms after the last frame and brakes; it leaves the gear in park."""
     attempt = Attempt(generation)
@@ -70,7 +70,7 @@ def test_passed(generation: int) -> None:
     assert not any(frame.identifier == GEAR_COMMANDS[generation] for _, frame in attempt.sent)
 
 
-@both
+@both_generations
 def test_enabled_for_half_a_second(generation: int) -> None:
     """The kit is enabled for half a second, with a brake of 0.3 and no throttle; then nothing is sent any more."""
     attempt = Attempt(generation)
@@ -104,12 +104,12 @@ def test_ticks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(attempt.test._adapter, "set_actuation", record)
     attempt.run()
     began_ns, last_ns = attempt.sent[0][0], attempt.sent[-1][0]
-    sending_ns = [each_ns for each_ns in ticks_ns if each_ns >= began_ns]
+    sending_ns = [tick_ns for tick_ns in ticks_ns if tick_ns >= began_ns]
     assert {after - before for before, after in pairwise(sending_ns)} == {20 * NS_PER_MS}
     assert sending_ns[-1] - last_ns < 20 * NS_PER_MS
 
 
-@both
+@both_generations
 def test_without_watchdog(generation: int) -> None:
     """The test fails for a kit without watchdog, which disengages and does not brake."""
     test = Attempt(generation, has_watchdog=False).run()
@@ -157,7 +157,7 @@ def test_brakes_and_releases() -> None:
     assert "released the brake again" in attempt.run().failure
 
 
-@both
+@both_generations
 def test_driver_brakes(generation: int) -> None:
     """The test fails if the driver brakes before anything is sent, while the kit is enabled, or afterwards."""
     before = Attempt(generation)
@@ -192,18 +192,18 @@ def with_wrong_checksum(frame: CanFrame) -> CanFrame:
 
 
 INHIBITED: list[tuple[Callable[[Attempt], object], str]] = [
-    (lambda it: setattr(it, "spoil", lambda _: None), "reports are missing: no "),
-    (lambda it: setattr(it, "spoil", with_wrong_checksum), "reports are missing: no "),
-    (lambda it: setattr(it.kit.state, "gear", Gear.DRIVE), "the gear is drive"),
-    (lambda it: it.kit.set_fault("steering.fault", START_NS), "the steering has a fault"),
-    (lambda it: it.kit.inhibit("door", START_NS), "a door is open"),
-    (lambda it: it.kit.switch_remote(1, START_NS), "RemoteReport has STATE pause"),
-    (lambda it: it.test.receive(CanFrame(0x201, bytes(8)), START_NS), "another sender"),
-    (lambda it: it.test.on_bus_gone("pulled out"), "pulled out"),
+    (lambda attempt: setattr(attempt, "spoil", lambda _: None), "reports are missing: no "),
+    (lambda attempt: setattr(attempt, "spoil", with_wrong_checksum), "reports are missing: no "),
+    (lambda attempt: setattr(attempt.kit.state, "gear", Gear.DRIVE), "the gear is drive"),
+    (lambda attempt: attempt.kit.set_fault("steering.fault", START_NS), "the steering has a fault"),
+    (lambda attempt: attempt.kit.inhibit("door", START_NS), "a door is open"),
+    (lambda attempt: attempt.kit.switch_remote(1, START_NS), "RemoteReport has STATE pause"),
+    (lambda attempt: attempt.test.receive(CanFrame(0x201, bytes(8)), START_NS), "another sender"),
+    (lambda attempt: attempt.test.on_bus_gone("pulled out"), "pulled out"),
 ]
 
 
-@pytest.mark.parametrize(("inhibit", "failure"), INHIBITED, ids=[each[1][:40] for each in INHIBITED])
+@pytest.mark.parametrize(("inhibit", "failure"), INHIBITED, ids=[case[1][:40] for case in INHIBITED])
 def test_inhibited(inhibit: Callable[[Attempt], object], failure: str) -> None:
     """The test fails without sending anything, and with the reason, if the kit may not be enabled at standstill."""
     attempt = Attempt(2)

@@ -1,4 +1,4 @@
-"""Encoders of commands that share no code with the kit, and a kit that is driven with them."""
+"""Encoders of commands that share no code with the kit, and a kit that receives their commands."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ class KitRig:
         self.send(*self.sender.commands(CommandValues(**keys)))
 
     def request_system(self, request: int = 1) -> None:
-        """CommandValues generation 2's system to enable (1) or disable (2); 0 requests nothing."""
+        """Request generation 2's system to enable (1) or disable (2); 0 requests nothing."""
         if isinstance(self.sender, Sender2):
             self.send(self.sender.system(request))
 
@@ -178,10 +178,10 @@ def with_crc_broken(frame: CanFrame) -> CanFrame:
 
 
 ALL = set(AXES)
-both = pytest.mark.parametrize("generation", [1, 2])
+both_generations = pytest.mark.parametrize("generation", [1, 2])
 
 
-def driving(generation: int, **keys: Any) -> KitRig:
+def driving_rig(generation: int, **keys: Any) -> KitRig:
     """Return a kit that is enabled, in drive and moving."""
     rig = KitRig(generation, **keys)
     rig.enable()

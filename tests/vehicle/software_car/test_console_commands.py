@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.vehicle.software_car.rig import START_NS, KitRig, driving
+from tests.vehicle.software_car.rig import START_NS, KitRig, driving_rig
 
 from lavt.domain import NS_PER_S
 from lavt.errors import UserError
@@ -49,7 +49,7 @@ INTERNAL_METHODS = {"receive", "frames_due", "actuation", "next_wake_ns", "sense
 )
 def test_a_command_has_its_effect(line: str, has_effect: Callable[[Kit], bool]) -> None:
     """Each command changes the kit as its name says."""
-    rig = driving(2)
+    rig = driving_rig(2)
     assert not has_effect(rig.kit)
     execute(rig.kit, line, rig.now_ns)
     assert has_effect(rig.kit)
@@ -91,7 +91,7 @@ def condition_of(rig: KitRig) -> tuple[object, ...]:
 @pytest.mark.parametrize(("lines", "brake"), [([], 0.5), (["no_watchdog"], 0.0), (["no_watchdog", "watchdog"], 0.5)])
 def test_the_watchdog_can_be_disabled(lines: list[str], brake: float) -> None:
     """After a command timeout a kit brakes with its watchdog and coasts without it."""
-    rig = driving(2)
+    rig = driving_rig(2)
     for line in lines:
         execute(rig.kit, line, rig.now_ns)
     rig.wait_ms(200)
@@ -121,11 +121,11 @@ def test_the_watchdog_can_be_disabled(lines: list[str], brake: float) -> None:
 )
 def test_an_invalid_command_changes_nothing(line: str, key_words: list[str]) -> None:
     """An invalid command is rejected with an error that names the input and the alternatives, and changes nothing."""
-    rig = driving(2)
+    rig = driving_rig(2)
     before = repr(rig.kit.state)
     with pytest.raises(UserError) as error:
         execute(rig.kit, line, rig.now_ns)
-    assert [each for each in key_words if each not in str(error.value)] == []
+    assert [word for word in key_words if word not in str(error.value)] == []
     assert len(str(error.value)) < 200
     assert repr(rig.kit.state) == before
 
@@ -133,7 +133,7 @@ def test_an_invalid_command_changes_nothing(line: str, key_words: list[str]) -> 
 @given(st.text() | st.tuples(st.sampled_from(sorted(COMMANDS)), st.text()).map(" ".join))
 def test_any_line_is_executed_or_rejected(line: str) -> None:
     """Any input is executed or rejected with an error of one line."""
-    rig, errors = driving(2), [""]
+    rig, errors = driving_rig(2), [""]
     try:
         execute(rig.kit, line, rig.now_ns)
     except UserError as error:

@@ -1,17 +1,17 @@
 """Overrides by the driver, and shifting."""
 
 import pytest
-from tests.vehicle.software_car.rig import ALL, AXES, KitRig, both, driving
+from tests.vehicle.software_car.rig import ALL, AXES, KitRig, both_generations, driving_rig
 
 from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.software_car.state import Gear, GearRejection, ReleaseReason
 
 
-@both
+@both_generations
 @pytest.mark.parametrize("axis", AXES)
 def test_override(generation: int, axis: str) -> None:
-    """An override releases its axis (generation 2: all), does not trip the watchdog, and stays until it is cleared."""
-    rig = driving(generation)
+    """An override releases its axis, or all in generation 2, trips no watchdog, and stays until it is cleared."""
+    rig = driving_rig(generation)
     act = {"steering": rig.kit.driver_steers, "brake": rig.kit.driver_brakes, "throttle": rig.kit.driver_throttles}[
         axis
     ]
@@ -30,10 +30,10 @@ def test_override(generation: int, axis: str) -> None:
     assert rig.enabled() == ALL
 
 
-@both
+@both_generations
 def test_an_active_override_is_not_cleared(generation: int) -> None:
     """CLEAR has no effect while the driver still acts."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.kit.driver_steers(-3.0, rig.now_ns)
     rig.command(clear=True)
     assert rig.kit.state.actuators["steering"].is_overridden
@@ -42,20 +42,20 @@ def test_an_active_override_is_not_cleared(generation: int) -> None:
     assert not rig.kit.state.actuators["steering"].is_overridden
 
 
-@both
+@both_generations
 def test_small_inputs_do_not_override(generation: int) -> None:
     """Less than 2 Nm on the wheel or a twentieth of a pedal is no override."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.kit.driver_steers(1.9, rig.now_ns)
     rig.kit.driver_brakes(0.04, rig.now_ns)
     rig.kit.driver_throttles(0.04, rig.now_ns)
     assert rig.enabled() == ALL
 
 
-@both
+@both_generations
 def test_ignore_prevents_an_override(generation: int) -> None:
     """With the ignore bit the driver cannot override."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.command(ignore=True)
     rig.kit.driver_steers(8.0, rig.now_ns)
     rig.kit.driver_brakes(1.0, rig.now_ns)
@@ -65,7 +65,7 @@ def test_ignore_prevents_an_override(generation: int) -> None:
 
 def test_clearing_frames_have_no_counter() -> None:
     """In generation 1 a frame of 4 bytes neither trips the watchdog, nor enables, nor prevents a timeout."""
-    rig = driving(1)
+    rig = driving_rig(1)
     for _ in range(4):
         rig.wait_ms(25)
         rig.send(*rig.sender.clearing())
@@ -77,13 +77,13 @@ def test_clearing_frames_have_no_counter() -> None:
 
 def test_a_full_clearing_frame_without_a_counter_trips() -> None:
     """In generation 1 a frame of 8 bytes with CLEAR and no counter trips the watchdog."""
-    rig = driving(1)
+    rig = driving_rig(1)
     rig.command()
     rig.send(*(CanFrame(frame.identifier, frame.data + bytes(4)) for frame in rig.sender.clearing()))
     assert (rig.enabled(), rig.kit.state.watchdog) == (set(), ReleaseReason.COUNTER)
 
 
-@both
+@both_generations
 def test_a_shift_needs_the_brake(generation: int) -> None:
     """A shift without the brake is rejected with 5 (press the brake); with the brake it is executed."""
     rig = KitRig(generation)
@@ -96,10 +96,10 @@ def test_a_shift_needs_the_brake(generation: int) -> None:
     assert (rig.kit.state.gear, rig.kit.state.gear_reject) == (Gear.DRIVE, GearRejection.NONE)
 
 
-@both
+@both_generations
 def test_reasons_for_rejected_gears(generation: int) -> None:
     """Gears are rejected with a reason: park while moving, reverse, after the driver's shift, or with a fault."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
 
     def rejection(gear: int) -> GearRejection:
         rig.command(brake=0.5)
@@ -119,7 +119,7 @@ def test_reasons_for_rejected_gears(generation: int) -> None:
     assert rig.kit.state.gear == Gear.NEUTRAL
 
 
-@both
+@both_generations
 def test_out_of_gear_the_throttle_has_no_effect(generation: int) -> None:
     """In park the car brakes, and in neutral the throttle has no effect, whether of the kit or of the driver."""
     rig = KitRig(generation)
@@ -135,14 +135,14 @@ def test_out_of_gear_the_throttle_has_no_effect(generation: int) -> None:
 
 def test_override_by_the_shifter() -> None:
     """Moving the shifter disengages generation 2; generation 1 reports it, and the sender has to disengage."""
-    rig = driving(2)
+    rig = driving_rig(2)
     rig.kit.driver_shifts(Gear.NEUTRAL, rig.now_ns)
     assert (rig.enabled(), rig.kit.state.disengaged, rig.kit.state.watchdog) == (
         set(),
         ReleaseReason.OVERRIDE,
         ReleaseReason.NONE,
     )
-    first = driving(1)
+    first = driving_rig(1)
     first.kit.driver_shifts(Gear.NEUTRAL, first.now_ns)
     first.command(enable=False)
     assert (first.kit.state.is_gear_overridden, first.kit.state.watchdog) == (True, ReleaseReason.NONE)
@@ -150,7 +150,7 @@ def test_override_by_the_shifter() -> None:
     assert not first.kit.state.is_gear_overridden
 
 
-@both
+@both_generations
 def test_the_driver_prevents_enabling(generation: int) -> None:
     """A command to enable while the driver brakes is an override that stays after the pedal was released."""
     rig = KitRig(generation)

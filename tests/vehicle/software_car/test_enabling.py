@@ -1,7 +1,7 @@
 """Enabling the axes of a kit, and commands of enabled axes."""
 
 import pytest
-from tests.vehicle.software_car.rig import ALL, CommandValues, KitRig, Sender2, both, driving, with_crc
+from tests.vehicle.software_car.rig import ALL, CommandValues, KitRig, Sender2, both_generations, driving_rig, with_crc
 
 from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.software_car.state import ReleaseReason, SystemState
@@ -42,7 +42,7 @@ def test_a_request_to_enable_expires() -> None:
         assert rig.enabled() == enabled
 
 
-@both
+@both_generations
 def test_disabling_in_park_does_not_trip(generation: int) -> None:
     """Disabling the kit in park at standstill does not trip the watchdog."""
     rig = KitRig(generation)
@@ -55,7 +55,7 @@ def test_disabling_in_park_does_not_trip(generation: int) -> None:
 
 def test_generation_2_needs_a_new_request() -> None:
     """After the kit has disengaged, continuing requests do not enable it: they must stop and begin again."""
-    rig = driving(2)
+    rig = driving_rig(2)
     rig.kit.driver_brakes(0.5, rig.now_ns)
     rig.kit.driver_brakes(0.0, rig.now_ns)
     rig.request_system()
@@ -80,29 +80,29 @@ def test_only_the_chosen_set_is_accepted() -> None:
     assert user.enabled() == ALL
 
 
-@both
+@both_generations
 def test_commands_reach_the_wheels(generation: int) -> None:
     """Angle, throttle and brake of a command reach the wheels unchanged."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.drive_ms(1000, angle_deg=-123.4, throttle=0.3, brake=0.2)
     assert rig.wheels() == (-123.4, 0.3, 0.2)
 
 
-@both
+@both_generations
 def test_steering_rate(generation: int) -> None:
     """At 25 steps, 100 deg/s, the wheel turns 10 degrees in 100 ms; without a rate it turns at 17.5 rad/s."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     for _ in range(5):
         rig.command(angle_deg=90.0, rate=25)
         rig.wait_ms(20)
     assert rig.wheels()[0] == 10.0
-    quick = driving(generation)
+    quick = driving_rig(generation)
     quick.command(angle_deg=300.0)
     quick.wait_ms(20)
     assert quick.wheels()[0] == pytest.approx(0.02 * 17.5 * 57.29578)
 
 
-@both
+@both_generations
 def test_steering_starts_at_the_current_angle(generation: int) -> None:
     """Once enabled, the kit turns the wheel from its current angle, not from the centre."""
     rig = KitRig(generation)
@@ -111,7 +111,7 @@ def test_steering_starts_at_the_current_angle(generation: int) -> None:
     assert rig.wheels()[0] == pytest.approx(0.2 * 14.8 * 57.29578)
 
 
-@both
+@both_generations
 def test_an_unknown_command_type_enables_nothing(generation: int) -> None:
     """A command of an unknown type counts as a command without its enable bit."""
     rig = KitRig(generation)
@@ -139,7 +139,7 @@ def test_an_unknown_command_type_enables_nothing(generation: int) -> None:
 )
 def test_generation_1_types_of_brake_command(kind: int, raw: float, fraction: float) -> None:
     """Brake commands by pedal (0.15 to 0.5), percent, torque (of 3412 Nm) and deceleration (of 6 m/s2) are scaled."""
-    rig = driving(1)
+    rig = driving_rig(1)
     _, brake, _ = rig.sender.commands(CommandValues(brake=raw))
     data = bytearray(brake.data)
     data[2] = kind << 4

@@ -1,7 +1,7 @@
 """Faults of a kit, conditions that inhibit it, and loss of the bus."""
 
 import pytest
-from tests.vehicle.software_car.rig import ALL, KitRig, both, driving
+from tests.vehicle.software_car.rig import ALL, KitRig, both_generations, driving_rig
 
 from lavt.errors import UserError
 from lavt.vehicle.software_car.authority import WATCHDOG_BRAKE
@@ -21,7 +21,7 @@ FAULTS = [
 @pytest.mark.parametrize(("generation", "name"), FAULTS)
 def test_a_fault_disengages_and_brakes(generation: int, name: str) -> None:
     """A fault while driving makes the kit release all axes and brake."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.kit.set_fault(name, rig.now_ns)
     assert (rig.enabled(), rig.kit.state.watchdog, rig.wheels()[2]) == (set(), ReleaseReason.FAULT, WATCHDOG_BRAKE)
 
@@ -49,7 +49,7 @@ def test_a_faulty_axis_is_not_enabled(generation: int, name: str) -> None:
         ("reverse", ReleaseReason.LOCKOUT_REVERSE),
     ],
 )
-def test_what_inhibits_generation_2(name: str, reason: ReleaseReason) -> None:
+def test_an_inhibit_reason_of_generation_2_disengages(name: str, reason: ReleaseReason) -> None:
     """Belt, door and lockouts keep generation 2 in manual, with the reason; while driving it disengages and brakes."""
     rig = KitRig(2)
     rig.kit.inhibit(name, rig.now_ns)
@@ -65,15 +65,15 @@ def test_what_inhibits_generation_2(name: str, reason: ReleaseReason) -> None:
 @pytest.mark.parametrize("remote_state", [0, 1])
 def test_the_remotes_switch(remote_state: int) -> None:
     """At emergency stop or pause generation 2 disengages and brakes, and is not ready."""
-    rig = driving(2)
+    rig = driving_rig(2)
     rig.kit.switch_remote(remote_state, rig.now_ns)
     assert (rig.enabled(), rig.wheels()[2], rig.kit.state.watchdog) == (set(), WATCHDOG_BRAKE, ReleaseReason.REMOTE)
 
 
-@both
+@both_generations
 def test_bus_off(generation: int) -> None:
     """Off the bus the kit sends and receives nothing, so that commands time out; back on the bus it sends again."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.wait_ms(20)
     rig.kit.set_bus_off(rig.now_ns)
     rig.last.clear()
@@ -85,7 +85,7 @@ def test_bus_off(generation: int) -> None:
     assert len(rig.last) == (5 if generation == 1 else 8)
 
 
-@both
+@both_generations
 def test_unknown_names_are_rejected(generation: int) -> None:
     """An unknown fault, inhibit reason, value or gear is rejected with the known ones."""
     kit = KitRig(generation).kit

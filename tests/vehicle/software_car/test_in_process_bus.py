@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cache
 
 import pytest
-from tests.vehicle.software_car.rig import START_NS, CommandValues, Sender1, Sender2, both
+from tests.vehicle.software_car.rig import START_NS, CommandValues, Sender1, Sender2, both_generations
 
 from lavt.domain import NS_PER_MS, NS_PER_S, GroundTruth, VehicleEvent
 from lavt.vehicle.can_frame import BusGone, ReceivedCanFrame
@@ -45,15 +45,15 @@ def drive(
         truth, new = port.truth(now_ns)
         events += new
         if passed_ms % 20 == 0:
-            early = passed_ms < 100
-            port.send(sender.commands(CommandValues(brake=0.5) if early else requested), now_ns)
-            if early:
+            is_enabling = passed_ms < 100
+            port.send(sender.commands(CommandValues(brake=0.5) if is_enabling else requested), now_ns)
+            if is_enabling:
                 port.send([*([sender.system(1)] if isinstance(sender, Sender2) else []), sender.gear(4)], now_ns)
     assert truth is not None
     return received, truth, events
 
 
-@both
+@both_generations
 def test_a_drive_does_not_depend_on_polling(generation: int) -> None:
     """However often the port is polled, frames, their times, the ground truth and the events are the same."""
     requested = CommandValues(throttle=0.5, angle_deg=200.0)
@@ -64,14 +64,14 @@ def test_a_drive_does_not_depend_on_polling(generation: int) -> None:
     assert {event.kind for event in events} >= {"lane_invasion"}
 
 
-@both
+@both_generations
 def test_frames_are_transmitted_one_at_a_time(generation: int) -> None:
     """Reports sent together arrive in order, 250 us apart, the first one 250 us after it was sent."""
     port = port_of(generation)
     received = port.take(START_NS + 15 * NS_PER_MS)
-    assert [(each.frame.identifier, each.arrived_ns - START_NS) for each in received] == [
-        (identifier, 10 * NS_PER_MS + place * FRAME_NS)
-        for place, identifier in enumerate([0x065, 0x06A] if generation == 1 else [0x100, 0x2A4], start=1)
+    assert [(arrival.frame.identifier, arrival.arrived_ns - START_NS) for arrival in received] == [
+        (identifier, 10 * NS_PER_MS + index * FRAME_NS)
+        for index, identifier in enumerate([0x065, 0x06A] if generation == 1 else [0x100, 0x2A4], start=1)
     ]
 
 
@@ -79,8 +79,8 @@ def test_frames_are_received_at_their_arrival() -> None:
     """A frame in transit is returned once, from its arrival time on."""
     port = port_of(2)
     assert port.take(START_NS + 10 * NS_PER_MS + FRAME_NS - 1) == []
-    assert [each.frame.identifier for each in port.take(START_NS + 10 * NS_PER_MS + FRAME_NS)] == [0x100]
-    assert [each.frame.identifier for each in port.take(START_NS + 12 * NS_PER_MS)] == [0x2A4]
+    assert [arrival.frame.identifier for arrival in port.take(START_NS + 10 * NS_PER_MS + FRAME_NS)] == [0x100]
+    assert [arrival.frame.identifier for arrival in port.take(START_NS + 12 * NS_PER_MS)] == [0x2A4]
     assert port.take(START_NS + 12 * NS_PER_MS) == []
 
 
@@ -89,11 +89,11 @@ def test_the_car_receives_frames_one_at_a_time() -> None:
     port, sender = port_of(2), Sender2()
     port.send(sender.commands(CommandValues(brake=0.5)), START_NS)
     actuators = port.car.kit.state.actuators
-    had = []
+    commanded_axes = []
     for quarters in range(5):
         port.take(START_NS + quarters * FRAME_NS)
-        had.append([axis for axis, actuator in actuators.items() if actuator.order])
-    assert had == [[], ["steering"], ["steering", "brake"], *[["steering", "brake", "throttle"]] * 2]
+        commanded_axes.append([axis for axis, actuator in actuators.items() if actuator.order])
+    assert commanded_axes == [[], ["steering"], ["steering", "brake"], *[["steering", "brake", "throttle"]] * 2]
 
 
 def test_a_set_waits_for_the_previous_one() -> None:
@@ -110,7 +110,7 @@ def test_a_set_waits_for_the_previous_one() -> None:
 def test_a_bus_without_delay() -> None:
     """Without delay frames arrive at once in either direction, and never before they were sent."""
     port, sender = port_of(2, delay_ns=0), Sender2()
-    assert [each.arrived_ns for each in port.take(START_NS + 10 * NS_PER_MS)] == [START_NS + 10 * NS_PER_MS] * 2
+    assert [arrival.arrived_ns for arrival in port.take(START_NS + 10 * NS_PER_MS)] == [START_NS + 10 * NS_PER_MS] * 2
     port.send(sender.commands(CommandValues(brake=0.5)), START_NS + 10 * NS_PER_MS)
     port.take(START_NS + 10 * NS_PER_MS)
     assert port.car.kit.state.actuators["brake"].order is not None
@@ -132,7 +132,7 @@ def test_polling_at_wake_times() -> None:
     now_ns = START_NS
     while now_ns < START_NS + NS_PER_S + 10 * NS_PER_MS:
         arrived = port.take(now_ns)
-        assert all(now_ns - each.arrived_ns <= 2 * NS_PER_MS for each in arrived)
+        assert all(now_ns - arrival.arrived_ns <= 2 * NS_PER_MS for arrival in arrived)
         received += arrived
         assert port.next_wake_ns() > now_ns
         now_ns = port.next_wake_ns()
@@ -160,4 +160,4 @@ def test_a_cut_bus() -> None:
         port.send(sender.commands(CommandValues()), START_NS + 100 * NS_PER_MS)
     assert port.car.kit.state.actuators["brake"].order is None
     port.cut("")
-    assert [each.frame.identifier for each in port.take(START_NS + 115 * NS_PER_MS)] == [0x100, 0x2A4]
+    assert [arrival.frame.identifier for arrival in port.take(START_NS + 115 * NS_PER_MS)] == [0x100, 0x2A4]

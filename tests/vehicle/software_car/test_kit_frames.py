@@ -22,8 +22,8 @@ identifiers = st.sampled_from(COMMANDS) | st.integers(0, 0x7FF)
 
 
 @pytest.mark.parametrize(("data", "crc"), [(b"", 0x00), (b"0", 0x71), (b"01", 0x28), (b"012", 0x24), (LETTERS, 0xA3)])
-def test_the_crc_matches_the_facts(data: bytes, crc: int) -> None:
-    """The CRC of the strings in the facts is as given there."""
+def test_the_crc_matches_the_published_values(data: bytes, crc: int) -> None:
+    """The CRC of the published strings is as published."""
     assert crc8(data) == crc
 
 

@@ -8,9 +8,9 @@ from tests.vehicle.software_car.rig import (
     START_NS,
     CommandValues,
     KitRig,
-    both,
+    both_generations,
     crc_by_division,
-    driving,
+    driving_rig,
     with_crc_broken,
 )
 
@@ -32,7 +32,7 @@ def reports(rig: KitRig) -> dict[int, bytes]:
     return rig.last
 
 
-@both
+@both_generations
 def test_reports_have_their_periods(generation: int) -> None:
     """Each report is sent once per period, exact to the nanosecond."""
     kit = KitRig(generation).kit
@@ -44,7 +44,7 @@ def test_reports_have_their_periods(generation: int) -> None:
         assert times[identifier] == list(range(period_ms * NS_PER_MS, 1001 * NS_PER_MS, period_ms * NS_PER_MS))
 
 
-@both
+@both_generations
 def test_a_late_call_returns_each_report_once(generation: int) -> None:
     """A call that is one second late returns each report once, and the next ones at their regular times."""
     kit = KitRig(generation).kit
@@ -56,7 +56,7 @@ def test_a_late_call_returns_each_report_once(generation: int) -> None:
 
 def test_generation_1_reports_of_a_drive() -> None:
     """Reports contain angle, command, speed, torque, the pedals' input, command and output, the gear, and ENABLED."""
-    rig = driving(1)
+    rig = driving_rig(1)
     rig.command(angle_deg=-45.0)
     rig.set_motion(10.0, steering_rad=math.radians(10.0))
     rig.kit.driver_steers(-1.5, rig.now_ns)
@@ -70,7 +70,7 @@ def test_generation_1_reports_of_a_drive() -> None:
 
 def test_generation_2_reports_of_a_drive() -> None:
     """In generation 2 the reports contain the same, with the state active, a counter and a checksum."""
-    rig = driving(2)
+    rig = driving_rig(2)
     rig.command(angle_deg=-45.0)
     rig.set_motion(10.0, steering_rad=math.radians(10.0))
     rig.kit.driver_steers(-1.5, rig.now_ns)
@@ -94,7 +94,7 @@ def test_generation_2_reports_of_a_drive() -> None:
 
 def test_generation_1_reports_a_timeout() -> None:
     """After a timeout every axis reports TMOUT and FLTWDC, not ENABLED, and the brake reports the watchdog."""
-    rig = driving(1)
+    rig = driving_rig(1)
     rig.last.clear()
     for _ in range(20):
         rig.wait_ms(10)
@@ -106,7 +106,7 @@ def test_generation_1_reports_a_timeout() -> None:
 
 def test_generation_1_reports_an_override() -> None:
     """OVERRIDE remains after the driver has released the pedal; DRIVER and the input follow the pedal."""
-    rig = driving(1)
+    rig = driving_rig(1)
     rig.kit.driver_brakes(1.0, rig.now_ns)
     found = reports(rig)
     assert (found[0x061][7], found[0x061][:2]) == (0b00000110, b"\xff\xff")
@@ -155,7 +155,7 @@ def test_generation_2_reports_why_it_disengaged() -> None:
     """Timeout, wrong checksum, repeated counter and override are reported by state, reason and bits."""
     found = {}
     for name, reason in (("timeout", 1), ("crc", 2), ("counter", 3), ("override", 4)):
-        rig = driving(2)
+        rig = driving_rig(2)
         frames = rig.sender.commands(CommandValues())
         if name == "crc":
             rig.send(with_crc_broken(frames[0]))
@@ -179,7 +179,7 @@ def test_generation_2_reports_why_it_disengaged() -> None:
 
 def test_generation_2_reports_an_override_of_another_axis() -> None:
     """In generation 2 each axis reports that another one is overridden."""
-    rig = driving(2)
+    rig = driving_rig(2)
     rig.kit.driver_brakes(0.5, rig.now_ns)
     found = reports(rig)
     other, latched = 1 << 7, 1

@@ -70,7 +70,7 @@ class RunnerRig:
 
     def collect_events(self) -> list[tuple[str, str]]:
         """Record and return the new events."""
-        events = [(each.kind, each.text) for each in self.runner.take_events()]
+        events = [(event.kind, event.text) for event in self.runner.take_events()]
         self.events += events
         return events
 
@@ -92,7 +92,11 @@ def test_reports_carry_their_own_times() -> None:
     rig.step_ms(35)
     due = [(frame.identifier, (made_ns - START_NS) / NS_PER_MS) for frame, made_ns in rig.bus.sent]
     fast, slow = (0x100, 0x2A4), (0x100, 0x101, 0x102, 0x107, 0x2A4)
-    assert due == [*((each, 10) for each in fast), *((each, 20) for each in slow), *((each, 30) for each in fast)]
+    assert due == [
+        *((identifier, 10) for identifier in fast),
+        *((identifier, 20) for identifier in slow),
+        *((identifier, 30) for identifier in fast),
+    ]
 
 
 def test_the_car_catches_up() -> None:
@@ -105,7 +109,7 @@ def test_the_car_catches_up() -> None:
     rig.runner.step(rig.now_ns)
     events = rig.runner.take_events()
     assert rig.now_ns - rig.car.simulator.state().mono_ns <= STEP_NS
-    (watchdog,) = [each for each in events if each.kind == "watchdog"]
+    (watchdog,) = [event for event in events if event.kind == "watchdog"]
     assert watchdog.text.startswith("watchdog brakes: ")
     assert watchdog.mono_ns == rig.now_ns - 220 * NS_PER_MS
     assert rig.runner.latest_ns == rig.now_ns - wake_ns
@@ -197,7 +201,7 @@ def test_events_of_the_simulator() -> None:
     rig = RunnerRig()
     rig.car.events.append(VehicleEvent(START_NS + 1, "lane_invasion", "to the left"))
     rig.runner.step(START_NS + 10 * NS_PER_MS)
-    assert [(each.mono_ns, each.kind, each.text) for each in rig.runner.take_events()] == [
+    assert [(event.mono_ns, event.kind, event.text) for event in rig.runner.take_events()] == [
         (START_NS + 1, "event", "lane_invasion: to the left")
     ]
     rig.step_ms(20)

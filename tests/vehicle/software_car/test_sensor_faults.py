@@ -5,10 +5,10 @@ from __future__ import annotations
 import struct
 
 import pytest
-from tests.vehicle.software_car.rig import KitRig, driving
+from tests.vehicle.software_car.rig import KitRig, driving_rig
 
 SPEED, WHEELS = {1: (0x065, 4), 2: (0x107, 0)}, {1: 0x06A, 2: 0x2A4}
-both = pytest.mark.parametrize("generation", [1, 2])
+both_generations = pytest.mark.parametrize("generation", [1, 2])
 
 
 def reported_mps(rig: KitRig) -> tuple[float, float]:
@@ -26,10 +26,10 @@ def reports(rig: KitRig) -> set[int]:
     return set(rig.last)
 
 
-@both
+@both_generations
 def test_a_stuck_and_a_scaled_speed(generation: int) -> None:
     """A source can report another speed than the car's; the others do not change."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.set_motion(5.0)
     rig.kit.stick_speed("speed", 3.0)
     rig.kit.scale_speed("wheel_speed", 0.5)
@@ -41,21 +41,21 @@ def test_a_stuck_and_a_scaled_speed(generation: int) -> None:
     assert reported_mps(rig) == pytest.approx((5.0, 5.0), abs=0.01)
 
 
-@both
+@both_generations
 @pytest.mark.parametrize("source", ["speed", "wheel_speed"])
 def test_a_dropped_speed(generation: int, source: str) -> None:
     """The message of a dropped source is not sent; the others are."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     before = reports(rig)
     rig.kit.drop_speed(source)
     missing = SPEED[generation][0] if source == "speed" else WHEELS[generation]
     assert reports(rig) == before - {missing}
 
 
-@both
+@both_generations
 def test_a_weak_brake(generation: int) -> None:
     """A weak brake acts on the wheels with a share of what its report says."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.command(brake=0.8)
     rig.kit.weaken_brake(0.25)
     assert rig.kit.state.brake == pytest.approx(0.8, abs=0.001)

@@ -4,7 +4,7 @@ import math
 from functools import cache
 
 import pytest
-from tests.vehicle.software_car.rig import START_NS, CommandValues, Sender1, Sender2, both
+from tests.vehicle.software_car.rig import START_NS, CommandValues, Sender1, Sender2, both_generations
 
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.vehicle.sim.road.road import Road, load_road
@@ -46,7 +46,7 @@ class DrivenCar:
     def command(self, **keys: float) -> None:
         """Send a set of commands."""
         for frame in self.sender.commands(CommandValues(**keys)):  # type: ignore[arg-type]
-            self.reports += [(each.identifier, each.data) for each in self.car.receive(frame, self.now_ns)]
+            self.reports += [(report.identifier, report.data) for report in self.car.receive(frame, self.now_ns)]
 
     def wait_ms(self, duration_ms: int) -> None:
         """Advance the time."""
@@ -61,7 +61,7 @@ class DrivenCar:
             self.wait_ms(20)
 
 
-@both
+@both_generations
 def test_a_straight_drive(generation: int) -> None:
     """Driven by hand-made frames, the car goes straight ahead at 5 m/s after 5 s, and reports its speed."""
     drive = DrivenCar(generation)
@@ -72,7 +72,7 @@ def test_a_straight_drive(generation: int) -> None:
     assert drive.simulator.pose().heading_rad == heading_rad
 
 
-@both
+@both_generations
 def test_the_wheels_reach_the_commanded_angle(generation: int) -> None:
     """29.6 degrees at the steering wheel are 2 degrees at the road wheels, to the left, and are reported."""
     drive = DrivenCar(generation)
@@ -83,7 +83,7 @@ def test_the_wheels_reach_the_commanded_angle(generation: int) -> None:
     assert int.from_bytes(angles[-1][:2], "little") == 296
 
 
-@both
+@both_generations
 def test_a_command_timeout_stops_the_car(generation: int) -> None:
     """Without commands the watchdog brakes the car to a standstill, from 5 m/s within 2.5 s."""
     drive = DrivenCar(generation)
@@ -94,7 +94,7 @@ def test_a_command_timeout_stops_the_car(generation: int) -> None:
     assert (drive.simulator.state().speed_mps, drive.speed_mps) == (0.0, 0.0)
 
 
-@both
+@both_generations
 def test_a_command_takes_effect_in_the_next_step(generation: int) -> None:
     """A command between two steps of 1/240 s takes effect from the next one on."""
     drive = DrivenCar(generation)
@@ -109,7 +109,7 @@ def test_a_command_takes_effect_in_the_next_step(generation: int) -> None:
     assert after.mono_ns - step_ns <= NS_PER_S // 240 + 1
 
 
-@both
+@both_generations
 def test_a_drive_is_reproducible(generation: int) -> None:
     """The same frames at the same times give the same reports and pose, however finely the car is advanced."""
     coarse, fine = DrivenCar(generation), DrivenCar(generation)

@@ -3,16 +3,25 @@
 from itertools import product
 
 import pytest
-from tests.vehicle.software_car.rig import ALL, AXES, CommandValues, KitRig, Sender2, both, driving, with_crc_broken
+from tests.vehicle.software_car.rig import (
+    ALL,
+    AXES,
+    CommandValues,
+    KitRig,
+    Sender2,
+    both_generations,
+    driving_rig,
+    with_crc_broken,
+)
 
 from lavt.vehicle.software_car.authority import WATCHDOG_BRAKE
 from lavt.vehicle.software_car.state import Gear, ReleaseReason, SystemState
 
 
-@both
+@both_generations
 def test_commands_time_out_after_100_ms(generation: int) -> None:
     """An actuator is disabled 100 ms after its last valid command, not 1 us earlier, and the kit brakes."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.command(throttle=0.5)
     rig.wait_ms(99.999)
     assert (rig.enabled(), rig.wheels()[1:]) == (ALL, (0.5, 0.0))
@@ -22,10 +31,10 @@ def test_commands_time_out_after_100_ms(generation: int) -> None:
     assert rig.kit.state.watchdog == ReleaseReason.TIMEOUT
 
 
-@both
+@both_generations
 def test_late_calls_give_the_same_state(generation: int) -> None:
     """A kit advanced each millisecond or once after a second is in the same state."""
-    often, late = driving(generation), driving(generation)
+    often, late = driving_rig(generation), driving_rig(generation)
     for rig in (often, late):
         rig.command(angle_deg=90.0, throttle=0.5, rate=25)
     for _ in range(1000):
@@ -36,11 +45,11 @@ def test_late_calls_give_the_same_state(generation: int) -> None:
     assert often.wheels() == late.wheels()
 
 
-@both
+@both_generations
 @pytest.mark.parametrize("part", [0, 1, 2])
 def test_a_timeout_of_one_axis_trips_the_watchdog(generation: int, part: int) -> None:
     """If commands to a single axis stop, the watchdog trips and all axes are released."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     for _ in range(5):
         rig.wait_ms(20)
         frames = rig.sender.commands(CommandValues(throttle=0.5))
@@ -51,7 +60,7 @@ def test_a_timeout_of_one_axis_trips_the_watchdog(generation: int, part: int) ->
 
 def test_without_a_watchdog_only_one_axis_is_released() -> None:
     """In generation 1 without watchdog a single axis times out, the kit does not brake, and new commands enable it."""
-    rig = driving(1, has_watchdog=False)
+    rig = driving_rig(1, has_watchdog=False)
     for _ in range(5):
         rig.wait_ms(20)
         rig.send(*rig.sender.commands(CommandValues(throttle=0.5))[1:])
@@ -60,10 +69,10 @@ def test_without_a_watchdog_only_one_axis_is_released() -> None:
     assert rig.enabled() == ALL
 
 
-@both
+@both_generations
 def test_a_repeated_counter_trips_the_watchdog(generation: int) -> None:
     """A command with the previous counter is rejected, and the kit brakes."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     frames = rig.sender.commands(CommandValues(throttle=0.5))
     rig.send(*frames)
     assert rig.enabled() == ALL
@@ -81,7 +90,7 @@ def test_a_repeated_counter_trips_the_watchdog(generation: int) -> None:
 )
 def test_counter_rules(generation: int, step: int, is_right: bool) -> None:
     """Generation 1's counter must increase by one; generation 2's must only differ."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.sender.count += step - 1
     rig.command()
     assert rig.enabled() == (ALL if is_right else set())
@@ -90,7 +99,7 @@ def test_counter_rules(generation: int, step: int, is_right: bool) -> None:
 def test_counters_wrap() -> None:
     """Counters wrap from 255 to 0 in generation 1 and from 15 to 0 in generation 2 without tripping the watchdog."""
     for generation in (1, 2):
-        rig = driving(generation)
+        rig = driving_rig(generation)
         rig.drive_ms(10_000)
         assert rig.enabled() == ALL
 
@@ -98,7 +107,7 @@ def test_counters_wrap() -> None:
 def test_a_wrong_checksum_trips_the_watchdog() -> None:
     """A command of generation 2 with a wrong checksum is rejected and reported as bad_crc, and the kit brakes."""
     for part in range(3):
-        rig = driving(2)
+        rig = driving_rig(2)
         frames = rig.sender.commands(CommandValues(angle_deg=50.0, throttle=0.5))
         rig.send(with_crc_broken(frames[part]))
         assert (rig.enabled(), rig.kit.state.watchdog, rig.kit.state.system) == (
@@ -134,10 +143,10 @@ def test_generation_1_disabled_in_gear_or_moving_trips() -> None:
         assert rig.kit.state.watchdog_brakes == (in_gear or speed_mps > 0)
 
 
-@both
+@both_generations
 def test_the_watchdog_brakes_until_an_override(generation: int) -> None:
     """The watchdog brakes, whatever is commanded, until the driver overrides; after CLEAR the kit can be enabled."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.wait_ms(100)
     for _ in range(10):
         rig.command(throttle=1.0, clear=True)
@@ -158,10 +167,10 @@ def test_the_watchdog_brakes_until_an_override(generation: int) -> None:
     assert rig.enabled() == ALL
 
 
-@both
+@both_generations
 def test_a_released_wheel_keeps_its_angle(generation: int) -> None:
     """When the kit disengages, the steering wheel keeps its actual angle, not the commanded one."""
-    rig = driving(generation)
+    rig = driving_rig(generation)
     rig.command(angle_deg=90.0)
     rig.wait_ms(50)
     rig.set_motion(10.0, steering_rad=0.05)

@@ -16,7 +16,7 @@ from lavt.vehicle.dbw.profile import (
     CLEARING_PERIOD_NS,
     COMMAND_TIMEOUT_NS,
     LEAST_GAP_NS,
-    PERIOD_NS,
+    REPEAT_PERIOD_NS,
     TICK_LIMIT_NS,
     Axis,
     Gear,
@@ -36,8 +36,9 @@ come from locked wheels; at 4 m/s2 a car that still slides is 1.2 m/s slower by 
 IDLE_PERIOD_NS: Final = 100 * NS_PER_MS
 """Call period of the adapter when nothing else is due."""
 ECHO_LIMIT_NS: Final = 200 * NS_PER_MS
-"""A command that the kit has not reported for this long was superseded by another."""
+"""A command that the kit has not reported after this time counts as superseded by another."""
 SEPARATOR: Final = "; "
+"""Between the texts of a reason."""
 NO_AXES: Final[frozenset[Axis]] = frozenset()
 
 
@@ -64,8 +65,8 @@ class ByWireAdapter:
         self._still_enabled: frozenset[Axis] = NO_AXES
         """Axes that were enabled when driving ended and still are."""
         self._needed_axes = frozenset({"brake"}) if profile.system is None else frozenset(AXES)
-        """Without these axes no command is sent any more: a kit that is enabled as a whole releases the brake as well,
-        without braking by itself, when another axis is commanded to be disabled."""
+        """If one of these axes is released, no command is sent any more. A kit that is enabled as a whole would, after
+        a command to disable any axis, release the brake as well and not brake by itself."""
         self._moved_ns = start_ns
         """Time of the last report that the car moves."""
         self._is_shifting = False
@@ -73,14 +74,14 @@ class ByWireAdapter:
         self._requested = Actuation(0.0, 0.0, 0.0)
         self._requested_ns: int | None = None
         self._last_commands: KitCommands | None = None
-        """Commands of the last set; None: nothing is being sent."""
+        """Commands of the last set of frames; None: nothing is being sent."""
         self._is_late = False
         self._known_problems: frozenset[str] = frozenset()
         self._events: list[VehicleEvent] = []
         self._awaited_echoes: deque[tuple[int, int]] = deque()
         """Steering commands sent and not yet reported, in steps of the kit, with the times of their request."""
         self._last_steering: int | None = None
-        """The steering command of the last set, in steps of the kit; None if it had none."""
+        """The steering command of the last set of frames, in steps of the kit; None if it had none."""
         self._reached: list[ReachedCommand] = []
         self._counts: Counter[str] = Counter()
         self._situation = self._current_situation(start_ns)
@@ -126,8 +127,8 @@ class ByWireAdapter:
         """Apply the transitions of this instant."""
         self._now_ns = now_ns
         self._check_speed(now_ns)
-        has_timed_out = now_ns - self._sender.sent_ns >= COMMAND_TIMEOUT_NS
-        enabled = NO_AXES if has_timed_out else self._reports.enabled  # reports may have waited for us
+        has_timed_out = now_ns - self._sender.last_set_ns >= COMMAND_TIMEOUT_NS
+        enabled = NO_AXES if has_timed_out else self._reports.enabled  # the reports may be old, after a stall
         self._still_enabled = enabled & self._still_enabled if self._state in {"lost", "parking"} else enabled
         self._is_shifting &= self._reports.gear != "drive"
         if not self._is_stationary():
@@ -147,8 +148,8 @@ class ByWireAdapter:
 
     def _check_speed(self, now_ns: int) -> None:
         """Compare the reported speeds with the pedals that the kit applies: the last ones sent, on enabled axes."""
-        has_timed_out = now_ns - self._sender.sent_ns >= COMMAND_TIMEOUT_NS
-        sent, enabled = self._sender.sent, NO_AXES if has_timed_out else self._reports.enabled
+        has_timed_out = now_ns - self._sender.last_set_ns >= COMMAND_TIMEOUT_NS
+        sent, enabled = self._sender.last_command, NO_AXES if has_timed_out else self._reports.enabled
         pedals = Pedals(sent.throttle if "throttle" in enabled else 0.0, sent.brake if "brake" in enabled else 0.0)
         if (fault := self._speed.update(self._reports.speeds, pedals, now_ns)) is not None:
             self._counts[fault.code] += 1
@@ -166,7 +167,7 @@ class ByWireAdapter:
             is_stationary=self._is_stationary(),
             inhibit_reason=_join([self._installation, missing_reports, faults, self._turned_too_far()]),
             missing_reports=missing_reports,
-            since_sent_ns=now_ns - self._sender.sent_ns,
+            since_sent_ns=now_ns - self._sender.last_set_ns,
             faults=faults,
             overrides=_join(reports.texts("override")),
             trips=_join(reports.texts("trip")),
@@ -217,7 +218,7 @@ class ByWireAdapter:
         return frames
 
     def on_dropped(self, frames: Sequence[CanFrame]) -> None:
-        """Note that these last ones of the frames that were due were not written."""
+        """Note that `frames`, which are the last ones of those that were due, were not written."""
         if frames:
             self._sender.take_back(frames)
 
@@ -225,23 +226,23 @@ class ByWireAdapter:
         return self._requested_ns is not None and now_ns - self._requested_ns <= TICK_LIMIT_NS
 
     def _due_ns(self, requested: DriveCommand) -> int:
-        """Return when the next set is due: earlier if the command has changed."""
+        """Return when the next set of frames is due: earlier if the command has changed."""
         if self._state == "clearing":
-            return self._sender.sent_ns + CLEARING_PERIOD_NS
-        return self._sender.sent_ns + (PERIOD_NS if requested == self._sender.sent else LEAST_GAP_NS)
+            return self._sender.last_set_ns + CLEARING_PERIOD_NS
+        return self._sender.last_set_ns + (REPEAT_PERIOD_NS if requested == self._sender.last_command else LEAST_GAP_NS)
 
     def _kit_commands(self) -> KitCommands | None:
         """Return the commands to the kit in the current state."""
-        reports, everything = self._reports, frozenset(AXES)
+        reports, all_axes = self._reports, frozenset(AXES)
         if self._state == "clearing":
             return KitCommands(NO_AXES, is_clearing=True)
         if self._state == "enabling":
-            is_enabled = reports.enabled == everything
+            is_enabled = reports.enabled == all_axes
             return KitCommands(
-                everything, gear="drive" if is_enabled and reports.gear != "drive" else None, system="enable"
+                all_axes, gear="drive" if is_enabled and reports.gear != "drive" else None, system="enable"
             )
         if self._state == "engaged":
-            return KitCommands(everything, system="enable")
+            return KitCommands(all_axes, system="enable")
         if self._state == "lost":
             return self._remaining_commands()
         if self._state == "parking":
@@ -249,7 +250,7 @@ class ByWireAdapter:
         return KitCommands(NO_AXES) if self._state == "overridden" else None
 
     def _parking_commands(self) -> KitCommands | None:
-        """Return the commands to brake, then shift to PARK, then disengage: a kit disengaged in gear trips."""
+        """Return the commands to brake, then shift to PARK, then disengage: disengaging in gear trips the watchdog."""
         is_shifting = self._is_shifting and self._now_ns - self._entered_ns < SHIFT_REPORT_LIMIT_NS
         if self._reports.gear == "park" and not is_shifting:
             return KitCommands(NO_AXES, system="disable")
@@ -286,18 +287,18 @@ class ByWireAdapter:
             return
         while self._awaited_echoes and self._requested_ns - self._awaited_echoes[0][1] > ECHO_LIMIT_NS:
             self._awaited_echoes.popleft()
-        number = round(self._sender.sent.wheel_deg / self._profile.command_step_deg)
-        if number != (self._reports.command if self._last_steering is None else self._last_steering):
-            self._awaited_echoes.append((number, self._requested_ns))
-        self._last_steering = number
+        steps = round(self._sender.last_command.wheel_deg / self._profile.command_step_deg)
+        if steps != (self._reports.command if self._last_steering is None else self._last_steering):
+            self._awaited_echoes.append((steps, self._requested_ns))
+        self._last_steering = steps
 
     def _match_echo(self, now_ns: int) -> None:
-        """Match the newest reported command with those sent; earlier ones were superseded."""
-        if not any(number == self._reports.command for number, _ in self._awaited_echoes):
+        """Match the newest reported command with those sent; the ones sent earlier were superseded."""
+        if not any(steps == self._reports.command for steps, _ in self._awaited_echoes):
             return
         while self._awaited_echoes:
-            number, requested_ns = self._awaited_echoes.popleft()
-            if number == self._reports.command:
+            steps, requested_ns = self._awaited_echoes.popleft()
+            if steps == self._reports.command:
                 self._reached.append(ReachedCommand(requested_ns, now_ns))
                 return
 
@@ -318,10 +319,10 @@ class ByWireAdapter:
         )
 
     def _inhibit_reason(self) -> str:
-        now = self._situation
-        reasons = [self._stop_reason if self._state in {"lost", "overridden"} else "", now.inhibit_reason]
-        if self._state == "parking" and now.is_stationary and now.in_state_ns >= ENABLING_LIMIT_NS:
-            reasons.append(_join(["the car is stationary but not in park", now.reasons]))
+        situation = self._situation
+        reasons = [self._stop_reason if self._state in {"lost", "overridden"} else "", situation.inhibit_reason]
+        if self._state == "parking" and situation.is_stationary and situation.in_state_ns >= ENABLING_LIMIT_NS:
+            reasons.append(_join(["the car is stationary but not in park", situation.reasons]))
         return _join(reasons)
 
     def next_wake_ns(self) -> int:
@@ -355,7 +356,7 @@ class ByWireAdapter:
 
 def _join(texts: Iterable[str]) -> str:
     """Join texts of one or more sentences, each sentence once."""
-    present = [each for each in texts if each]
+    present = [text for text in texts if text]
     if not present:  # nearly always
         return ""
-    return SEPARATOR.join(dict.fromkeys(part for each in present for part in each.split(SEPARATOR) if part))
+    return SEPARATOR.join(dict.fromkeys(part for text in present for part in text.split(SEPARATOR) if part))

@@ -39,10 +39,10 @@ QUEUE_FRAMES: Final = 8192
 POLL_S: Final = 0.1
 """Period at which the reader checks whether the port was closed."""
 LATEST_READ_NS: Final = NS_PER_S
-"""A frame that has waited longer is dropped: the reader was frozen, or the wall clock was stepped in between."""
+"""A frame that has waited longer is dropped: the reader was frozen, or the wall clock was stepped meanwhile."""
 IP_TIMEOUT_S: Final = 2
 
-logging.getLogger("can").addHandler(logging.NullHandler())  # its messages are in the errors
+logging.getLogger("can").addHandler(logging.NullHandler())  # the errors raised here contain its messages
 
 VIRTUAL_INTERFACES: Final = frozenset({"inside", "virtual", "udp_multicast"})
 STAMPED_BY_KERNEL: Final = frozenset({"socketcan", "udp_multicast"})

@@ -56,9 +56,9 @@ def parse_rules(data: bytes) -> tuple[set[int], bool]:
         if kind == RTM_NEWROUTE and body[:1] == bytes([CAN_FAMILY]):
             attributes = dict(_pieces(body[RULE.size :], ATTRIBUTE))
             found |= {
-                int.from_bytes(attributes[side][:4], sys.byteorder)
-                for side in (SOURCE, DESTINATION)
-                if side in attributes
+                int.from_bytes(attributes[attribute][:4], sys.byteorder)
+                for attribute in (SOURCE, DESTINATION)
+                if attribute in attributes
             }
     return found, False
 

@@ -1,6 +1,7 @@
 """The CRC of Dataspeed's second generation: SAE J1850, over a frame's identifier and then its data.
 
-Polynomial 0x1D (x^8 + x^4 + x^3 + x^2 + 1), initial value 0xFF, inverted at the end. Facts and vectors: `docs/can.md`.
+Polynomial 0x1D (x^8 + x^4 + x^3 + x^2 + 1), initial value 0xFF, inverted at the end. Sources and test vectors:
+`docs/can.md`.
 """
 
 from __future__ import annotations

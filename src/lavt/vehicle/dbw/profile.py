@@ -1,4 +1,4 @@
-"""A profile describes how to control one kind of by-wire kit. It is checked against its DBC before it gets here.
+"""A profile describes how to control one kind of by-wire kit. `lavt.assembly.dbw` has checked it against its DBC.
 
 This module converts units and signs. The bus has the steering wheel's angle; LAVT has the road wheels' angle, left
 positive. Pedals are fractions.
@@ -24,11 +24,11 @@ SPEEDS = (*VEHICLE_SPEEDS, *WHEEL_SPEEDS)
 """Names of the reported speeds. Only `speed` is used to drive; the others are compared with it."""
 
 LEAST_GAP_NS = 5 * NS_PER_MS
-"""Shortest time between sets of commands when the commands change."""
-PERIOD_NS = 20 * NS_PER_MS
-"""Longest time between sets of commands: 50 Hz, as the vendor's demo. The kit needs one within 100 ms."""
+"""Shortest time between two sets of frames; it applies when the commands change."""
+REPEAT_PERIOD_NS = 20 * NS_PER_MS
+"""Unchanged commands are repeated with this period: 50 Hz, as in the vendor's demo. The kit needs one within 100 ms."""
 CLEARING_PERIOD_NS = 50 * NS_PER_MS
-"""20 Hz, as in the facts."""
+"""Period of the frames that clear overrides: 20 Hz, as in the published sources (docs/can.md)."""
 COMMAND_TIMEOUT_NS = 100 * NS_PER_MS
 """A kit disengages this long after its last command."""
 TICK_LIMIT_NS = 60 * NS_PER_MS
@@ -39,7 +39,7 @@ IN_FRACTIONS = {"": 1.0, "%": 100.0}
 IN_METRES_PER_SECOND = {"m/s": 1.0, "km/h": 3.6}
 IN_RADIANS_PER_SECOND = {"rad/s": 1.0, "deg/s": math.degrees(1.0)}
 IN_DEGREES_PER_SECOND = {"": 1.0, "deg/s": 1.0, "rad/s": math.radians(1.0)}
-"""One unit of LAVT in the unit of a DBC; other units are rejected."""
+"""For each table: one unit of LAVT in the units that a DBC may have. Other units are rejected."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,14 +49,14 @@ class AxisCommand:
     message: str
     value: str
     per_unit: float
-    """In the DBC's unit: one degree of the steering wheel, or one full pedal."""
+    """One degree of the steering wheel, or one full pedal, in the DBC's unit."""
     constants: Mapping[str, float]
     """Values of signals that never change: the command type, the maximum rate."""
     enable: str
     clear: str
     count: str
     modulus: int
-    """Of the counter: it wraps here."""
+    """The counter counts modulo this number."""
     checksum: str
 
 
@@ -67,7 +67,8 @@ class GearCommand:
     message: str
     value: str
     clear: str
-    numbers: Mapping[Gear, int]
+    codes: Mapping[Gear, int]
+    """The value of the signal for each gear."""
     checksum: str
 
 
@@ -91,6 +92,7 @@ class SignalCondition:
     signal: str
     number: int | None
     text: str
+    """The text for people if the condition is met."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,12 +106,14 @@ class ReportSpec:
     """Signal names by value name."""
     no_value: Mapping[str, float]
     """By value name: the number that means "not known", in the DBC's unit. It is the lowest number of a signed signal,
-    although the facts on generation 2 do not say so."""
+    although the published sources on generation 2 do not say so."""
     override: tuple[SignalCondition, ...]
+    """The conditions that mean an override by the driver; the next three fields are of the same kind."""
     trip: tuple[SignalCondition, ...]
     command_error: tuple[SignalCondition, ...]
     fault: tuple[SignalCondition, ...]
     needs: Mapping[str, frozenset[int]]
+    """By signal: the values that it must have; any other value is a fault."""
     reasons: tuple[str, ...]
     """Signals with the reason for a rejection; 0 means no reason."""
     count: str
@@ -158,14 +162,16 @@ class Profile:
     name: str
     kit: Literal["dataspeed_1", "dataspeed_2"]
     commands: Literal["remote", "user"] | None
-    """The kit's set of commands in use; None if it has only one."""
+    """The command set in use; None if the kit has only one."""
     car: ByWireCar
     limits: ByWireLimits
     command_step_deg: float
+    """One step of the steering command that the kit reports."""
     axes: Mapping[Axis, AxisCommand]
     gear: GearCommand
     system: SystemCommand | None
     clearing_bytes: int | None
+    """Length of the frames that clear overrides; None: as long as other commands."""
     reports: Mapping[str, ReportSpec]
     """By message name."""
     watchdog: OwnBrake | None
@@ -173,6 +179,7 @@ class Profile:
     speeds_per_mps: Mapping[str, float]
     """By value name, one of `SPEEDS`: converts m/s into the unit of a reported speed. A kit has at least `speed`."""
     angle_per_deg: float
+    """One degree in the unit of the reported angle."""
     unverified: tuple[str, ...]
     """Names, as `message.signal`, of the signals in use whose position is an assumption."""
     codec: Codec

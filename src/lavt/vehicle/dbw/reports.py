@@ -38,7 +38,7 @@ class NewestReports:
         self._commands = _commands(profile)
         self._foreign_command: tuple[str, int] | None = None
         """Name and arrival time of the last command from another sender."""
-        self._gears = {number: gear for gear, number in profile.gear.numbers.items()}
+        self._gears = {code: gear for gear, code in profile.gear.codes.items()}
         self.counts: Counter[str] = Counter()
         self.speeds: dict[str, SpeedReport] = {"speed": SpeedReport(0.0, start_ns)}
         """The newest speed by name (`profile.SPEEDS`); before its first report, `speed` is 0 and the others missing."""
@@ -59,7 +59,8 @@ class NewestReports:
 
     def receive(self, frame: CanFrame, now_ns: int) -> None:
         """Process any frame from the bus."""
-        if (command := self._commands.get((frame.identifier, frame.is_extended))) is not None:  # of any length
+        # A command of another sender counts whatever its length.
+        if (command := self._commands.get((frame.identifier, frame.is_extended))) is not None:
             self.counts["foreign_commands"] += 1
             self._foreign_command = command, now_ns
             return
@@ -91,7 +92,7 @@ class NewestReports:
         if texts != self._texts_by_message.get(message):
             self._texts_by_message[message] = texts
             self._texts = {
-                kind: list(dict.fromkeys(text for each in self._texts_by_message.values() for text in each[kind]))
+                kind: list(dict.fromkeys(text for by_kind in self._texts_by_message.values() for text in by_kind[kind]))
                 for kind in KINDS
             }
 
@@ -110,7 +111,7 @@ class NewestReports:
             self.enabled = self.enabled | {axis} if known["enabled"] else self.enabled - {axis}
 
     def missing(self, now_ns: int) -> list[str]:
-        """Return a text for each report that is missing or too old to drive by."""
+        """Return a text for each report that is missing, or too old to drive with."""
         return [
             f"no {message} for {report.timeout_ns // NS_PER_MS} ms"
             if message in self._received_ns

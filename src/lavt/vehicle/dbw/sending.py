@@ -40,7 +40,8 @@ class DriveCommand(Struct, frozen=True):
 def apply_limits(limits: ByWireLimits, requested: DriveCommand, before: DriveCommand, passed_ns: int) -> DriveCommand:
     """Limit `requested`, `passed_ns` after `before` was sent; a brake request zeroes the throttle.
 
-    The limit of the angle counts more than that of its rate: a wheel that was turned beyond it is not commanded there.
+    The limit of the angle has priority over that of the rate: even if the wheel was turned beyond the limit of the
+    angle, no angle beyond it is commanded.
     """
     passed_s = min(passed_ns, TICK_LIMIT_NS) / NS_PER_S
     turn_deg = limits.steering_wheel_rate_degps * passed_s
@@ -67,34 +68,36 @@ def _within(number: float, least: float, most: float) -> float:
 
 
 class FrameSender:
-    """An encoder for sets of frames that keeps the last set's drive command."""
+    """An encoder for sets of frames. A set has one frame for each axis, and sometimes others."""
 
     def __init__(self, profile: Profile, start_ns: int) -> None:
         self._profile = profile
-        self.sent = DriveCommand(0.0, 0.0, 0.0)
-        """The last set's drive command; a disabled axis has the reported angle or a released pedal."""
-        self.sent_ns = start_ns
+        self.last_command = DriveCommand(0.0, 0.0, 0.0)
+        """The drive command of the last set; a disabled axis has the reported angle or a released pedal."""
+        self.last_set_ns = start_ns
+        """Time of the last set; before it, the time of the start."""
         self.counts: Counter[str] = Counter()
         """`sets`, and how often each limit took effect: `limited_wheel_deg`, `limited_throttle`, ..."""
         self._frame_counts: Counter[str] = Counter()
         """Number of frames per message, for its counter."""
         self._gear_ns: int | None = None
-        self._before: tuple[DriveCommand, int, int | None] = self.sent, start_ns, None
-        """`sent`, `sent_ns` and `_gear_ns` before the last set."""
+        """Time of the last request for a gear; None: no gear is requested."""
+        self._before: tuple[DriveCommand, int, int | None] = self.last_command, start_ns, None
+        """`last_command`, `last_set_ns` and `_gear_ns` before the last set."""
         self._messages = {(facts.identifier, facts.is_extended): facts for facts in profile.codec.messages.values()}
 
     def frames(self, commands: KitCommands, requested: DriveCommand, wheel_deg: float, now_ns: int) -> list[CanFrame]:
         """Return a set of frames. Steering starts from the reported angle `wheel_deg` once it is enabled."""
-        profile, passed_ns = self._profile, now_ns - self.sent_ns
-        self._before = self.sent, self.sent_ns, self._gear_ns
-        self.sent_ns = now_ns
+        profile, passed_ns = self._profile, now_ns - self.last_set_ns
+        self._before = self.last_command, self.last_set_ns, self._gear_ns
+        self.last_set_ns = now_ns
         self.counts["sets"] += 1
         if commands.is_clearing:
-            self.sent = DriveCommand(wheel_deg, 0.0, 0.0)
+            self.last_command = DriveCommand(wheel_deg, 0.0, 0.0)
             return self._clearing_frames()
-        allowed = apply_limits(profile.limits, requested, self.sent, passed_ns)
+        allowed = apply_limits(profile.limits, requested, self.last_command, passed_ns)
         self._count_limits(requested, allowed, commands.enabled)
-        self.sent = _choose(commands.enabled, allowed, DriveCommand(wheel_deg, 0.0, 0.0))
+        self.last_command = _choose(commands.enabled, allowed, DriveCommand(wheel_deg, 0.0, 0.0))
         values = {"steering": allowed.wheel_deg, "brake": allowed.brake, "throttle": allowed.throttle}
         frames = [self.axis_frame(axis, values[axis], is_enabled=axis in commands.enabled) for axis in AXES]
         if commands.system and profile.system is not None:
@@ -107,20 +110,23 @@ class FrameSender:
         return frames
 
     def take_back(self, dropped: Sequence[CanFrame]) -> None:
-        """Take back these last frames of the last set, which were not written: a counter's gap disengages a kit."""
-        sent, sent_ns, self._gear_ns = self._before
+        """Take back `dropped`, the last frames of the last set, which were not written.
+
+        A gap in a counter would disengage the kit.
+        """
+        earlier_command, earlier_set_ns, self._gear_ns = self._before
         axes = set(AXES)
         for frame in dropped:
             facts = self._messages[frame.identifier, frame.is_extended]
             axes -= {axis for axis in AXES if self._profile.axes[axis].message == facts.name}
             if len(frame.data) == facts.length:  # shorter ones have no counter
                 self._frame_counts[facts.name] -= 1
-        self.sent = _choose(axes, self.sent, sent)
+        self.last_command = _choose(axes, self.last_command, earlier_command)
         if not axes:
-            self.sent_ns = sent_ns
+            self.last_set_ns = earlier_set_ns
 
     def axis_frame(self, axis: Axis, number: float, *, is_enabled: bool) -> CanFrame:
-        """Return an axis's command: degrees of the steering wheel, or the fraction of a pedal."""
+        """Return an axis's command; `number` is in degrees of the steering wheel, or the fraction of a pedal."""
         command = self._profile.axes[axis]
         values = {command.value: number * command.per_unit if is_enabled else 0.0, command.enable: int(is_enabled)}
         return self._frame(
@@ -130,7 +136,7 @@ class FrameSender:
     def gear_frame(self, gear: Gear) -> CanFrame:
         """Return the command for a gear."""
         command = self._profile.gear
-        return self._frame(command.message, {command.value: command.numbers[gear]}, command.checksum)
+        return self._frame(command.message, {command.value: command.codes[gear]}, command.checksum)
 
     def _clearing_frames(self) -> list[CanFrame]:
         """Return the frames that clear overrides, of the length that the kit requires."""

@@ -2,8 +2,8 @@
 
 A kit reports `speed`, which is used to drive, and possibly others to compare it with: a second speed and those of the
 wheels. They may come from one control unit, so that all of them can be wrong together: the checks against the pedals
-detect that. An implausible speed is a fault until the car has been braked fully for `HOLD_NS` and every reported speed
-is that of a stationary car.
+detect that. An implausible speed is a fault until the car has been braked fully for `FULL_BRAKE_NS` and every reported
+speed is that of a stationary car.
 """
 
 from __future__ import annotations
@@ -25,36 +25,40 @@ wheels that spun regain grip within a report."""
 LOCKED_BELOW_MPS: Final = 0.5
 """A speed this much below what `MAX_FALL_MPS2` allows is that of locked wheels, or wrong."""
 LOCKED_NS: Final = 2 * NS_PER_S
-"""For this long after it, no speed means standstill: the holding brake of 1.8 m/s2 stops a car from `MAX_DROP_MPS`."""
+"""For this long after such a speed, no speed counts as standstill. In this time the holding brake of 1.8 m/s2 stops a
+car from `MAX_DROP_MPS`."""
 DISAGREEMENT_MPS: Final = 1.0
 DISAGREEMENT_SHARE: Final = 0.2
 """Two speeds may differ by 1 m/s and a fifth of the larger: brakes with anti-lock control slip by 10 to 20 %, and the
 radius of a tyre is known to a few per cent."""
 DISAGREEMENT_NS: Final = 500 * NS_PER_MS
-"""And by more for this long: anti-lock control cycles at 3 Hz or faster, and traction control is no slower."""
+"""For this long, two speeds may differ by more: anti-lock control cycles at 3 Hz or faster, and traction control is no
+slower."""
 SOURCE_LIMIT_NS: Final = 200 * NS_PER_MS
-"""An older report is not compared. Where it must not be missing, that inhibits driving by itself."""
+"""An older report is not compared. If the kit must send this report, its absence inhibits driving anyway."""
 LEAST_BRAKING_MPS2: Final = 3.0
 """A brake that should decelerate by this must slow the car even on a descent of 20 % (2 m/s2)."""
 BRAKE_SETTLING_NS: Final = 500 * NS_PER_MS
 """Dead time and lag of a brake, and of the throttle before it."""
 BRAKE_CHECK_NS: Final = NS_PER_S
 LEAST_BRAKED_MPS: Final = 0.2
-"""Within `BRAKE_CHECK_NS`; on ice, braking at 1 m/s2, it is 1 m/s."""
+"""A braked car must lose this speed within `BRAKE_CHECK_NS`. On ice, where it brakes with 1 m/s2, it loses 1 m/s."""
 BRAKE_CHECKED_ABOVE_MPS: Final = 1.0
+"""A slower car's brake is not checked."""
 CONSTANT_WITHIN_MPS: Final = 0.005
 """A speed that changes by less is constant: kits report steps of 0.01 km/h, 0.003 m/s."""
 MOVING_ABOVE_MPS: Final = 0.5
 """Below this, a constant speed is checked as that of a car that does not start."""
 FROZEN_ACCELERATION_MPS2: Final = 0.4
-"""On the level, a throttle for this much is more than drag balances below 40 km/h (0.12 m/s2 in the simulator)."""
+"""A throttle for this acceleration makes a car on a level road faster: below 40 km/h drag costs less (0.12 m/s2 in the
+simulator)."""
 FROZEN_NS: Final = 2 * NS_PER_S
-"""On a slope the throttle may balance weight and drag, but a real car's speed is never this constant for so long."""
+"""On a slope the throttle may balance weight and drag, but a real car's speed is never constant for so long."""
 STARTING_THROTTLE: Final = 0.5
 STARTING_NS: Final = 3 * NS_PER_S
 """A car that does not move for this long at half throttle does not start: the slope is too steep, a wheel is blocked,
 or it moves and its speed is wrong. All of them end the drive."""
-HOLD_NS: Final = 8 * NS_PER_S
+FULL_BRAKE_NS: Final = 8 * NS_PER_S
 """After an implausible speed, the car is braked fully for at least this long: 1.4 m/s2, a quarter of what the brakes
 should reach, stop a car from 40 km/h in this time."""
 STANDSTILL_NS: Final = NS_PER_S
@@ -116,23 +120,26 @@ class SpeedMonitor:
 
     @property
     def is_stationary(self) -> bool:
-        """Whether every reported speed is that of a stationary car, and its wheels have not locked just now."""
+        """Whether every reported speed is that of a stationary car, and no wheels have locked within `LOCKED_NS`."""
         return self._moved_ns < self._now_ns
 
     @property
     def speed_mps(self) -> float:
-        """The speed to drive by: the largest if the speed is implausible or says, alone, that the car is stationary."""
+        """The speed to drive with.
+
+        It is `speed`, or the largest of all speeds if `speed` is implausible or that of a stationary car.
+        """
         speed_mps = self._speeds["speed"].mps
         if self.fault is None and abs(speed_mps) >= STATIONARY_BELOW_MPS:
             return speed_mps
-        return max((each.mps for each in self._speeds.values()), key=abs)
+        return max((report.mps for report in self._speeds.values()), key=abs)
 
     def update(self, speeds: Mapping[str, SpeedReport], pedals: Pedals, now_ns: int) -> SpeedFault | None:
         """Process the newest speeds by name and the pedals; return a fault that begins now."""
         self._speeds, self._now_ns = speeds, now_ns
         has_fallen = self._has_fallen(speeds["speed"])
         is_locked = now_ns - self._locked_ns < LOCKED_NS
-        if is_locked or any(abs(each.mps) >= STATIONARY_BELOW_MPS for each in speeds.values()):
+        if is_locked or any(abs(report.mps) >= STATIONARY_BELOW_MPS for report in speeds.values()):
             self._moved_ns = now_ns
         checks = (
             (SpeedFault.FALL, has_fallen),
@@ -143,7 +150,7 @@ class SpeedMonitor:
         )
         found = next((fault for fault, is_present in checks if is_present), None)
         if self.fault is not None:
-            if now_ns - self._fault_ns >= HOLD_NS and now_ns - self._moved_ns >= STANDSTILL_NS:
+            if now_ns - self._fault_ns >= FULL_BRAKE_NS and now_ns - self._moved_ns >= STANDSTILL_NS:
                 self.fault = None
             return None
         if found is not None:
@@ -170,7 +177,7 @@ class SpeedMonitor:
     def _differs(self, now_ns: int) -> bool:
         """Return whether `speed` is neither near the second speed, nor near or between those of the wheels."""
         fresh_mps = {
-            name: abs(each.mps) for name, each in self._speeds.items() if now_ns - each.mono_ns <= SOURCE_LIMIT_NS
+            name: abs(report.mps) for name, report in self._speeds.items() if now_ns - report.mono_ns <= SOURCE_LIMIT_NS
         }
         speed_mps = fresh_mps.pop("speed", None)
         if speed_mps is None:

@@ -19,7 +19,8 @@ ENABLING_LIMIT_NS: Final = 3 * NS_PER_S
 """Our choice: clearing and enabling fail if they take longer."""
 PAUSE_NS: Final = 120 * NS_PER_MS
 """Minimum duration of `clearing` and `parking`. A kit that has disengaged ignores requests to enable until none came
-for 100 ms, so none is sent while clearing; and a kit is taken to be disengaged only after disabling for this long."""
+for 100 ms, so none is sent while clearing. And a kit counts as disengaged only after it was told to disable for this
+long."""
 
 SENT_IN_STATE: Final[dict[State, str]] = {
     "idle": "nothing",
@@ -27,10 +28,10 @@ SENT_IN_STATE: Final[dict[State, str]] = {
     "enabling": "all axes enabled, throttle 0, the holding brake; DRIVE once all axes are reported enabled",
     "engaged": "the requested actuation",
     "parking": "requested steering and brake, at least the holding brake, throttle 0; PARK once the car was stationary "
-    "for 300 ms; then no axis enabled. Before PARK, nothing once the brake, or any axis of generation 2, is released",
+    "for 300 ms; then no axis enabled. Nothing more if, before PARK, the brake (generation 2: any axis) is released",
     "overridden": "no axis enabled",
-    "lost": "requested steering and brake, throttle 0, on the axes that are still enabled; nothing once the brake, or "
-    "any axis of generation 2, is released",
+    "lost": "requested steering and brake, throttle 0, on the axes that are still enabled; nothing more once the "
+    "brake (generation 2: any axis) is released",
 }
 """Frames sent in each state."""
 
@@ -71,32 +72,32 @@ class TransitionRow(Struct, frozen=True):
     target: State
 
 
-def _released_axes(now: Situation) -> str:
+def _released_axes(situation: Situation) -> str:
     """Return a text that names the axes that are not enabled."""
-    axes = [axis for axis in AXES if axis not in now.enabled]
-    return f"the kit released {' and '.join(axes)}{_details(now)}" if axes else ""
+    axes = [axis for axis in AXES if axis not in situation.enabled]
+    return f"the kit released {' and '.join(axes)}{_details(situation)}" if axes else ""
 
 
-def _out_of_gear(now: Situation) -> str:
-    return "" if now.gear == "drive" else f"the gear is {now.gear or 'unknown'} instead of drive"
+def _out_of_gear(situation: Situation) -> str:
+    return "" if situation.gear == "drive" else f"the gear is {situation.gear or 'unknown'} instead of drive"
 
 
 def _timed_out(action: str) -> Callable[[Situation], str]:
-    def condition(now: Situation) -> str:
-        if now.in_state_ns < ENABLING_LIMIT_NS:
+    def condition(situation: Situation) -> str:
+        if situation.in_state_ns < ENABLING_LIMIT_NS:
             return ""
-        causes = [now.overrides, now.trips, now.command_errors]
+        causes = [situation.overrides, situation.trips, situation.command_errors]
         if action == "enable":
-            causes += [f"not enabled: {axis}" for axis in AXES if axis not in now.enabled]
-            causes += [_out_of_gear(now)]
-        text = "; ".join(filter(None, [*causes, now.reasons]))
+            causes += [f"not enabled: {axis}" for axis in AXES if axis not in situation.enabled]
+            causes += [_out_of_gear(situation)]
+        text = "; ".join(filter(None, [*causes, situation.reasons]))
         return f"the kit did not {action} within {ENABLING_LIMIT_NS // NS_PER_S} s: {text}"
 
     return condition
 
 
-def _details(now: Situation) -> str:
-    text = "; ".join(filter(None, [now.trips, now.command_errors, now.reasons]))
+def _details(situation: Situation) -> str:
+    text = "; ".join(filter(None, [situation.trips, situation.command_errors, situation.reasons]))
     return f" ({text})" if text else ""
 
 
@@ -104,115 +105,122 @@ TABLE: Final[tuple[TransitionRow, ...]] = (
     TransitionRow(
         ("enabling", "engaged", "parking", "lost"),
         "override by the driver",
-        lambda now: now.overrides and f"override by the driver: {now.overrides}",
+        lambda situation: situation.overrides and f"override by the driver: {situation.overrides}",
         "overridden",
     ),
     TransitionRow(
         ("clearing", "enabling", "engaged", "parking"),
         "the bus is gone, or a report is missing",
-        lambda now: now.missing_reports,
+        lambda situation: situation.missing_reports,
         "lost",
     ),
     TransitionRow(
         ("enabling", "engaged"),
         "no command was sent for 100 ms",
-        lambda now: now.since_sent_ns >= COMMAND_TIMEOUT_NS,
+        lambda situation: situation.since_sent_ns >= COMMAND_TIMEOUT_NS,
         "lost",
     ),
     TransitionRow(
         ("parking",),
         "no command was sent for 100 ms, and an axis is reported enabled",
-        lambda now: now.since_sent_ns >= COMMAND_TIMEOUT_NS and bool(now.enabled),
+        lambda situation: situation.since_sent_ns >= COMMAND_TIMEOUT_NS and bool(situation.enabled),
         "lost",
     ),
     TransitionRow(
         ("clearing", "enabling", "engaged"),
         "the kit reports a fault, or another sender commands it",
-        lambda now: now.faults,
+        lambda situation: situation.faults,
         "lost",
     ),
     TransitionRow(
         ("enabling", "engaged"),
         "the kit's watchdog has tripped",
-        lambda now: now.trips and now.trips + _details(now),
+        lambda situation: situation.trips and situation.trips + _details(situation),
         "lost",
     ),
     TransitionRow(("engaged",), "the kit released an axis", _released_axes, "lost"),
-    TransitionRow(("engaged",), "the kit reports late or invalid commands", lambda now: now.command_errors, "lost"),
+    TransitionRow(
+        ("engaged",), "the kit reports late or invalid commands", lambda situation: situation.command_errors, "lost"
+    ),
     TransitionRow(("engaged",), "the gear is not DRIVE", _out_of_gear, "lost"),
     TransitionRow(
-        ("clearing", "enabling", "engaged"), "driving is no longer wanted", lambda now: not now.wanted, "parking"
+        ("clearing", "enabling", "engaged"),
+        "driving is no longer wanted",
+        lambda situation: not situation.wanted,
+        "parking",
     ),
     TransitionRow(
         ("idle",),
         "driving is wanted, the car is stationary, and there is no inhibit reason",
-        lambda now: now.wanted and now.is_stationary and not now.inhibit_reason,
+        lambda situation: situation.wanted and situation.is_stationary and not situation.inhibit_reason,
         "clearing",
     ),
     TransitionRow(
         ("clearing",),
         "no override and no trip is reported, after at least 120 ms",
-        lambda now: now.in_state_ns >= PAUSE_NS and not now.overrides and not now.trips,
+        lambda situation: situation.in_state_ns >= PAUSE_NS and not situation.overrides and not situation.trips,
         "enabling",
     ),
     TransitionRow(("clearing",), "3 s have passed", _timed_out("clear"), "lost"),
     TransitionRow(
         ("enabling",),
         "all axes are reported enabled, and the gear is DRIVE",
-        lambda now: len(now.enabled) == len(AXES) and now.gear == "drive",
+        lambda situation: len(situation.enabled) == len(AXES) and situation.gear == "drive",
         "engaged",
     ),
     TransitionRow(("enabling",), "3 s have passed", _timed_out("enable"), "lost"),
     TransitionRow(
         ("parking",),
         "no axis is reported enabled, after at least 120 ms",
-        lambda now: now.in_state_ns >= PAUSE_NS and not now.enabled,
+        lambda situation: situation.in_state_ns >= PAUSE_NS and not situation.enabled,
         "idle",
     ),
     TransitionRow(
         ("lost",),
         "driving is no longer wanted, no report is missing, the brake is still enabled, and a command was sent within "
         "100 ms",
-        lambda now: (
-            not now.wanted
-            and not now.missing_reports
-            and "brake" in now.enabled
-            and now.since_sent_ns < COMMAND_TIMEOUT_NS
+        lambda situation: (
+            not situation.wanted
+            and not situation.missing_reports
+            and "brake" in situation.enabled
+            and situation.since_sent_ns < COMMAND_TIMEOUT_NS
         ),
         "parking",
     ),
     TransitionRow(
         ("lost",),
         "driving is no longer wanted, no report is missing, and no axis is enabled",
-        lambda now: not now.wanted and not now.missing_reports and not now.enabled,
+        lambda situation: not situation.wanted and not situation.missing_reports and not situation.enabled,
         "idle",
     ),
     TransitionRow(
         ("overridden",),
         "driving is no longer wanted, no report is missing, no axis is enabled, and the car is stationary",
-        lambda now: not now.wanted and now.is_stationary and not now.missing_reports and not now.enabled,
+        lambda situation: (
+            not situation.wanted and situation.is_stationary and not situation.missing_reports and not situation.enabled
+        ),
         "idle",
     ),
 )
 """Transitions between the states."""
 
 
-def next_state(state: State, now: Situation) -> tuple[State, str]:
+def next_state(state: State, situation: Situation) -> tuple[State, str]:
     """Return the next state and the reason; the same state and no reason if no row matches."""
     for row in TABLE:
-        if state in row.sources and (reason := row.condition(now)):
+        if state in row.sources and (reason := row.condition(situation)):
             return row.target, reason if isinstance(reason, str) else row.description
     return state, ""
 
 
-def states_after(state: State, now: Situation) -> list[tuple[State, str]]:
+def states_after(state: State, situation: Situation) -> list[tuple[State, str]]:
     """Return the states that follow from `state` at one instant, in order, with their reasons: no state twice."""
     found: list[tuple[State, str]] = []
     visited = {state}
     while True:
-        state, reason = next_state(state, now)
+        state, reason = next_state(state, situation)
         if state in visited:
             return found
         visited.add(state)
         found.append((state, reason))
-        now = replace(now, in_state_ns=0)
+        situation = replace(situation, in_state_ns=0)

@@ -20,7 +20,7 @@ Values = Mapping[str, float | None]
 MAX_UNKNOWN = 1000
 """Unknown identifiers that are counted separately."""
 OTHER_IDENTIFIERS = (-1, False)
-"""The key that counts all further ones."""
+"""The key under which all further unknown identifiers are counted."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -47,7 +47,7 @@ class KitAdapter(Protocol):
         ...
 
     def on_dropped(self, frames: Sequence[CanFrame]) -> None:
-        """Note that these last ones of the frames that were due were not written."""
+        """Note that `frames`, which are the last ones of those that were due, were not written."""
         ...
 
     def next_wake_ns(self) -> int:

@@ -64,7 +64,7 @@ class WatchdogTest:
         self._adapter = ByWireAdapter(profile, start_ns=start_ns)
         self._reports = NewestReports(profile, start_ns)
         self._phase: Phase = "observing"
-        self._since_ns = self._tick_ns = self._last_ns = start_ns
+        self._phase_start_ns = self._tick_ns = self._last_frame_ns = start_ns
         self._enabled_ns: int | None = None
         self._released_ns: int | None = None
         self._braked_ns: int | None = None
@@ -118,7 +118,7 @@ class WatchdogTest:
 
     def _observe(self, now_ns: int) -> list[CanFrame]:
         """Wait for all reports, and check that the kit may be enabled."""
-        passed_ns, missing = now_ns - self._since_ns, self._reports.missing(now_ns)
+        passed_ns, missing = now_ns - self._phase_start_ns, self._reports.missing(now_ns)
         if missing:
             if passed_ns >= REPORT_LIMIT_NS:
                 self._fail(f"the kit's reports are missing: {', '.join(missing)}")
@@ -148,24 +148,24 @@ class WatchdogTest:
             if now_ns - self._enabled_ns >= ENABLED_NS:
                 self._enter("monitoring", now_ns)
                 return []
-        frames = [each for each in self._adapter.frames_due(now_ns) if each.identifier != self._gear_command]
+        frames = [frame for frame in self._adapter.frames_due(now_ns) if frame.identifier != self._gear_command]
         state = self._adapter.state()
         if state.inhibit_reason or state.is_overridden:
             self._fail(f"the kit did not stay enabled: {state.inhibit_reason}")
             return []
         if frames:
-            self._last_ns = now_ns
+            self._last_frame_ns = now_ns
         return frames
 
     def _await_result(self, now_ns: int) -> list[CanFrame]:
         """Send nothing, and evaluate the kit's behaviour at the end of the phase."""
-        if now_ns - self._last_ns < MONITOR_NS:
+        if now_ns - self._last_frame_ns < MONITOR_NS:
             return []
         reports = self._reports
         overrides = reports.texts("override")
         if self._released_ns is None:
             self._fail("the kit did not release the brake: another sender may command it, or its timeout is off")
-        elif self._braked_ns is None or self._braked_ns - self._last_ns > BRAKE_WITHIN_NS:
+        elif self._braked_ns is None or self._braked_ns - self._last_frame_ns > BRAKE_WITHIN_NS:
             late = "" if self._braked_ns is None else f", but only after {self._ms(self._braked_ns)} ms"
             self._fail(
                 f"the kit did not brake within {BRAKE_WITHIN_NS // NS_PER_MS} ms of the last frame{late}, in gear "
@@ -177,7 +177,7 @@ class WatchdogTest:
             self._fail(f"override by the driver: {', '.join(overrides)}")
         else:
             kit_messages = "; ".join(text for kind in OBSERVED_KINDS for text in reports.texts(kind))
-            released_ns, braked_ns = self._released_ns - self._last_ns, self._braked_ns - self._last_ns
+            released_ns, braked_ns = self._released_ns - self._last_frame_ns, self._braked_ns - self._last_frame_ns
             self.observation = WatchdogObservation(released_ns, braked_ns, self._monitored_reports, kit_messages)
             self._phase = "done"
         return []
@@ -209,11 +209,11 @@ class WatchdogTest:
         return Actuation(self._adapter.state().steering_rad, 0.0, BRAKE)
 
     def _enter(self, phase: Phase, now_ns: int) -> None:
-        self._phase, self._since_ns = phase, now_ns
+        self._phase, self._phase_start_ns = phase, now_ns
 
     def _fail(self, reason: str) -> None:
         if not self.is_done:
             self.failure, self._phase = reason, "done"
 
     def _ms(self, at_ns: int) -> int:
-        return (at_ns - self._last_ns) // NS_PER_MS
+        return (at_ns - self._last_frame_ns) // NS_PER_MS

@@ -13,6 +13,7 @@ COMMAND_TIMEOUT_NS: Final = 100 * NS_PER_MS
 WATCHDOG_BRAKE: Final = 0.5
 """Our choice: the watchdog's brake, as a fraction."""
 ENABLE, DISABLE = 1, 2
+"""Requests of a `SystemOrder`; 0 requests nothing."""
 PAUSED, REMOTE, CONTROL_ALLOWED = 1, 2, 3
 """States of the remote's switch; 0 is the emergency stop."""
 
@@ -31,8 +32,8 @@ class Authority:
         self._requested_ns: int | None = None
         """Time of the newest request to enable; None once it has expired."""
         self._is_enable_pending, self._is_enable_used = False, False
-        """Whether the system is to become active, and whether the current requests have enabled it before: then they
-        must stop before new ones count."""
+        """Whether the system is to become active, and whether the current requests have enabled it already. In the
+        second case they must stop before new ones count."""
 
     def receive_system_order(self, order: SystemOrder, now_ns: int) -> None:
         """Process generation 2's order to the system."""
@@ -106,9 +107,9 @@ class Authority:
             state.watchdog, state.watchdog_axis, state.watchdog_brakes = reason, axis, True
         state.disengaged = reason
         self._is_enable_pending, self._is_enable_used = False, self._requested_ns is not None
-        for each in AXES if is_trip or self._generation.is_one_system else (axis,):
-            state.actuators[each].is_enabled = False
-            if each == "steering":
+        for released_axis in AXES if is_trip or self._generation.is_one_system else (axis,):
+            state.actuators[released_axis].is_enabled = False
+            if released_axis == "steering":
                 self._state.setpoint_rad = state.wheel_rad
 
     def override(self, axis: Axis) -> None:
@@ -119,8 +120,8 @@ class Authority:
     def clear(self, axis: Axis) -> None:
         """Clear overrides if the driver no longer acts, and the watchdog if a driver has ended its braking."""
         state = self._state
-        for each in AXES if self._generation.is_one_system else (axis,):
-            state.actuators[each].is_overridden &= state.actuators[each].driver_acts
+        for cleared_axis in AXES if self._generation.is_one_system else (axis,):
+            state.actuators[cleared_axis].is_overridden &= state.actuators[cleared_axis].driver_acts
         if self._generation.is_one_system:  # its gear command has no CLEAR
             state.is_gear_overridden = False
         if not state.watchdog_brakes:

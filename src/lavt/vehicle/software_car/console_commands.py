@@ -42,7 +42,7 @@ def parse_number(text: str) -> float:
 
 def parse_gear(text: str) -> Gear:
     """Parse the name of a gear. Raises `UserError` with the known names."""
-    return Gear[check_known(text.upper(), {each.name for each in GEARS}, "gear of this car")]
+    return Gear[check_known(text.upper(), {gear.name for gear in GEARS}, "gear of this car")]
 
 
 def parse_remote_state(text: str) -> int:

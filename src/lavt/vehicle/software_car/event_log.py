@@ -20,7 +20,7 @@ class KitEvent(Struct, frozen=True):
     text: str
 
 
-REASONS: Final = {
+RELEASE_REASONS: Final = {
     ReleaseReason.NONE: "nothing",
     ReleaseReason.TIMEOUT: "no command in time",
     ReleaseReason.CRC: "a wrong checksum",
@@ -36,7 +36,7 @@ REASONS: Final = {
     ReleaseReason.FAULT: "a fault",
     ReleaseReason.REMOTE: "the remote's switch",
 }
-REJECTIONS: Final = {
+GEAR_REJECTIONS: Final = {
     GearRejection.IN_PROGRESS: "shift in progress",
     GearRejection.OVERRIDE: "override by the driver",
     GearRejection.VEHICLE: "the brake is not pressed, or the car moves",
@@ -60,7 +60,7 @@ def _enabled_text(state: KitState, before: Any) -> str:
     axes = enabled(state)
     if set(axes) > set(before):
         return f"enabled: {', '.join(axes)}"
-    return f"released: {REASONS[state.disengaged]}" + (f"; remaining: {', '.join(axes)}" if axes else "")
+    return f"released: {RELEASE_REASONS[state.disengaged]}" + (f"; remaining: {', '.join(axes)}" if axes else "")
 
 
 def _overridden_text(state: KitState, _: Any) -> str:
@@ -73,21 +73,21 @@ def _gear_text(state: KitState, _: Any) -> str:
 
 
 def _rejection_text(state: KitState, _: Any) -> str:
-    reason = REJECTIONS.get(state.gear_reject)
+    reason = GEAR_REJECTIONS.get(state.gear_reject)
     return f"gear {state.gear_order} rejected: {reason}" if reason else "gear rejection cleared"
 
 
 def _watchdog_text(state: KitState, _: Any) -> str:
     if state.watchdog == ReleaseReason.NONE:
         return "watchdog cleared"
-    reason = f"{REASONS[state.watchdog]} ({state.watchdog_axis})"
+    reason = f"{RELEASE_REASONS[state.watchdog]} ({state.watchdog_axis})"
     if state.watchdog_brakes:
         return f"watchdog brakes: {reason}"
     return f"watchdog stopped braking and waits for CLEAR: {reason}"
 
 
 def _readiness_text(state: KitState, _: Any) -> str:
-    return f"not ready: {REASONS[state.not_ready]}" if state.not_ready != ReleaseReason.NONE else "ready"
+    return f"not ready: {RELEASE_REASONS[state.not_ready]}" if state.not_ready != ReleaseReason.NONE else "ready"
 
 
 OBSERVED: Final[dict[str, tuple[Callable[[KitState], Hashable], Callable[[KitState, Any], str]]]] = {

@@ -103,28 +103,29 @@ FAULTS: dict[str, tuple[str, ...]] = {
 """Faults of each part, by the bit that reports them; FLTWDC is reported by the watchdog."""
 
 PEDAL_TRAVEL = {"brake": (0.15, 0.50), "throttle": (0.15, 0.80)}
-"""Start and end of a pedal's travel, as fractions of its number (CMD_TYPE 1)."""
+"""Start and end of a pedal's travel, as fractions of the full command (CMD_TYPE 1)."""
 
-SOURCES: dict[tuple[Axis, ReleaseReason], int] = {
-    (axis, reason): 1 + 4 * place + kind
-    for place, axis in enumerate(AXES)
+WATCHDOG_SOURCES: dict[tuple[Axis, ReleaseReason], int] = {
+    (axis, reason): 1 + 4 * index + kind
+    for index, axis in enumerate(AXES)
     for kind, reason in enumerate(
         (ReleaseReason.COUNTER, ReleaseReason.DISABLED, ReleaseReason.TIMEOUT, ReleaseReason.FAULT)
     )
 }
-"""Numbers of the watchdog's sources, 1 to 15. The facts give the range and the kinds; the numbers are our choice."""
+"""Codes for why the watchdog tripped (WDCSRC), 1 to 15. The range and the kinds are published; the codes are our
+choice."""
 
 
-def pedal_fraction(axis: Axis, kind: int, command: int, mechanics: Mechanics) -> float | None:
+def pedal_fraction(axis: Axis, command_type: int, command: int, mechanics: Mechanics) -> float | None:
     """Return the requested fraction of a pedal, or None for a command type that the kit does not have."""
-    if kind == 1:
+    if command_type == 1:
         released, full = PEDAL_TRAVEL[axis]
         return within((command / FULL_PEDAL - released) / (full - released), 0.0, 1.0)
-    if kind == 2:
+    if command_type == 2:
         return command / FULL_PEDAL
-    if axis == "brake" and kind == 3:
+    if axis == "brake" and command_type == 3:
         return within(command / FULL_TORQUE_NM, 0.0, 1.0)
-    if axis == "brake" and kind == 6:
+    if axis == "brake" and command_type == 6:
         return within(min(command * 0.001, 10.0) / mechanics.max_braking_mps2, 0.0, 1.0)
     return None
 
@@ -177,7 +178,7 @@ def flag_fields(state: KitState, axis: Axis) -> dict[str, int]:
 def pedal_fields(state: KitState, axis: Axis, driver: float, output: float) -> dict[str, int]:
     """Return the fields that the reports of both pedals have."""
     actuator = state.actuators[axis]
-    source = SOURCES.get((state.watchdog_axis, state.watchdog), 0) if state.watchdog_axis else 0
+    source = WATCHDOG_SOURCES.get((state.watchdog_axis, state.watchdog), 0) if state.watchdog_axis else 0
     return {
         "input": round(driver * FULL_PEDAL),
         "command": round(actuator.order.target * FULL_PEDAL) if actuator.order else 0,
@@ -245,4 +246,5 @@ REPORTS: dict[int, tuple[int, Callable[[KitState, Mechanics], bytes]]] = {
     0x067: (100, gear_report),
     0x06A: (10, wheel_speeds),
 }
-"""By identifier: the period in milliseconds, taken from generation 2 as the facts give none, and the report."""
+"""By identifier: the period in milliseconds, and the report. The periods are those of generation 2, as none are
+published."""

@@ -39,9 +39,9 @@ SYSTEM_COMMAND_ID = 0x216
 UNKNOWN: Final = -0x8000
 
 ALL_OR_NONE = 2
-"""The third of the modes in the facts; the number is our choice."""
+"""Code of the third published mode of synchronisation; the code is our choice."""
 ANGLE, PERCENT = 2, 14
-"""The command types that the kit accepts, of those in the facts."""
+"""Those of the published command types that the kit accepts."""
 FULL_PEDAL = {"brake": 10_000, "throttle": 4_000}
 """A full pedal in steps of percent commands: 0.01 % and 0.025 %."""
 
@@ -137,8 +137,8 @@ def gear_report(state: KitState, _: Mechanics) -> dict[str, int]:
     }
 
 
-def reason_number(reason: ReleaseReason) -> int:
-    """Return a reason's number, or 0 for a reason that is not in the facts."""
+def reason_code(reason: ReleaseReason) -> int:
+    """Return a reason's code, or 0 for a reason that a kit does not report."""
     return reason if reason <= ReleaseReason.LOCKOUT_REVERSE else 0
 
 
@@ -146,8 +146,8 @@ def system_report(state: KitState, _: Mechanics) -> dict[str, int]:
     """Return the fields of the system report."""
     return {
         "state": int(state.system),
-        "reason_disengage": reason_number(state.disengaged),
-        "reason_not_ready": reason_number(state.not_ready),
+        "reason_disengage": reason_code(state.disengaged),
+        "reason_not_ready": reason_code(state.not_ready),
         "sync_mode": ALL_OR_NONE,
     }
 

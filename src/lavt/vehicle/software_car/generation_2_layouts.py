@@ -1,8 +1,8 @@
 """Message layouts of generation 2.
 
-The facts give the fields of every command in order, most of them with widths, but only the contents of reports.
-Positions of our own choice are listed in `UNVERIFIED`: they were never compared with a real kit. Reports have a
-counter and a checksum where there is room, which is our choice, too.
+The published sources (docs/can.md) give the fields of every command in order, most of them with widths. Of reports they
+give only the contents. Positions of our own choice are listed in `UNVERIFIED`: they were never compared with a real
+kit. Reports have a counter and a checksum where there is room, which is our choice, too.
 """
 
 from __future__ import annotations
@@ -14,32 +14,33 @@ from lavt.vehicle.software_car.frames import BitField, Layout
 UNVERIFIED: Final = {
     **dict.fromkeys(
         (0x200, 0x201, 0x202, 0x210, 0x211, 0x212),
-        "facts: order and widths of the fields, checksum in the last byte; our choice: the counter in bits 48 to 51",
+        "published: order and widths of the fields, checksum last; our choice: the counter in bits 48 to 51",
     ),
-    **dict.fromkeys((0x203, 0x213), "facts: 4-bit command first, checksum last; no counter, as none is listed"),
-    0x216: "facts: command, counter and checksum in this order; our assumption: half of the first byte each",
+    **dict.fromkeys((0x203, 0x213), "published: 4-bit command first, checksum last; no counter, as none is listed"),
+    0x216: "published: command, counter and checksum in this order; our assumption: half of the first byte each",
     **dict.fromkeys(
-        (0x100, 0x101, 0x102, 0x103), "facts: widths of the values; our choice: all positions and the pedals' steps"
+        (0x100, 0x101, 0x102, 0x103), "published: widths of the values; our choice: all positions and the pedals' steps"
     ),
-    0x106: "our choice: all positions, the numbers of the reasons and of the mode",
+    0x106: "our choice: all positions, and the codes of the reasons and of the mode",
     0x107: "our assumption: two consecutive speeds of 16 bits",
     0x2A4: "same layout as in generation 1",
     0x2D8: "our choice: all positions",
 }
 """Assumptions and choices of our own, by identifier."""
 
-PEDAL_FIELDS = (
+COMMAND_FIELDS = (
     BitField("type", 16, 4),
     BitField("enable", 20, 1),
     BitField("clear", 21, 1),
     BitField("ignore", 22, 1),
     BitField("count", 48, 4),
 )
-STEERING_COMMAND = Layout(8, (BitField("command", 0, 16, is_signed=True), *PEDAL_FIELDS, BitField("rate", 24, 8)))
-PEDAL_COMMAND = Layout(8, (BitField("command", 0, 16), *PEDAL_FIELDS))
+STEERING_COMMAND = Layout(8, (BitField("command", 0, 16, is_signed=True), *COMMAND_FIELDS, BitField("rate", 24, 8)))
+PEDAL_COMMAND = Layout(8, (BitField("command", 0, 16), *COMMAND_FIELDS))
 GEAR_COMMAND = Layout(4, (BitField("command", 0, 4),))
 SYSTEM_COMMAND = Layout(2, (BitField("command", 0, 4), BitField("count", 4, 4)))
 
+# `bad_crc`: a command had a wrong checksum; `bad_rc`: a command had a wrong counter ("rc" in the published sources).
 FLAG_NAMES = (
     "ready",
     "enabled",
@@ -52,7 +53,7 @@ FLAG_NAMES = (
     "override_latched",
     "external_control",
 )
-FLAGS = tuple(BitField(name, 40 + place, 1) for place, name in enumerate(FLAG_NAMES))
+FLAGS = tuple(BitField(name, 40 + index, 1) for index, name in enumerate(FLAG_NAMES))
 COUNT = BitField("count", 52, 4)
 PEDAL_REPORT = Layout(
     8, (BitField("input", 0, 12), BitField("command", 12, 12), BitField("output", 24, 12), *FLAGS, COUNT)
@@ -85,6 +86,7 @@ REPORT_LAYOUTS: Final = {
     0x107: Layout(
         8,
         (
+            # Two measurements of the car's speed: by the brakes, and by the propulsion.
             BitField("by_brakes", 0, 16, is_signed=True),
             BitField("by_propulsion", 16, 16, is_signed=True),
             BitField("direction_source", 32, 4),

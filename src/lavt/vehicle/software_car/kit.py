@@ -1,7 +1,7 @@
 """A by-wire kit, sans-IO: it takes frames and times, and returns frames and the actuation of the wheels.
 
-It behaves as the facts describe kits. Where the facts are silent, it does whatever reveals an adapter's mistakes best;
-such a behaviour is marked as our choice.
+It behaves as the published sources (docs/can.md) describe kits. Where they say nothing, it behaves so that an adapter's
+mistakes show best; such behaviour is marked as our choice.
 """
 
 from __future__ import annotations
@@ -118,9 +118,9 @@ class Kit:
     # Time.
 
     def _advance(self, now_ns: int) -> None:
-        """Advance to `now_ns`: orders time out, the steering wheel turns."""
+        """Advance to `now_ns`: let orders time out, and turn the steering wheel."""
         state = self.state
-        for deadline_ns, axis in sorted(each for each in self._deadlines() if each[0] <= now_ns):
+        for deadline_ns, axis in sorted(deadline for deadline in self._deadlines() if deadline[0] <= now_ns):
             actuator = state.actuators[axis]
             self._turn(deadline_ns)
             actuator.has_timed_out = actuator.order is not None and actuator.order.is_enabling
@@ -131,7 +131,7 @@ class Kit:
         self._turn(now_ns)
 
     def _deadlines(self) -> list[tuple[int, Axis]]:
-        """Return the time at which each axis's order times out."""
+        """Return when each axis's order times out, with the axis."""
         actuators = self.state.actuators
         return [(actuators[axis].received_ns + COMMAND_TIMEOUT_NS, axis) for axis in AXES if actuators[axis].order]
 
@@ -211,7 +211,7 @@ class Kit:
 
     def driver_shifts(self, gear: Gear, now_ns: int) -> None:
         """Move the shifter as the driver. Raises `UserError` for a gear that the car does not have."""
-        check_known(gear.name, {each.name for each in GEARS}, "gear of this car")
+        check_known(gear.name, {known_gear.name for known_gear in GEARS}, "gear of this car")
         self._advance(now_ns)
         state = self.state
         state.gear = gear

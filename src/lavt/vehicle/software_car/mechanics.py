@@ -15,13 +15,13 @@ class Mechanics(Struct, frozen=True):
     """Properties of a car with a by-wire kit."""
 
     steering_ratio: float = 14.8
-    """Steering wheel angle over road wheel angle."""
+    """Steering wheel angle divided by road wheel angle."""
     max_braking_mps2: float = 6.0
     """Deceleration at full brake: the simulator's."""
     tyre_radius_m: float = 0.33
-    """Our choice: not in the facts."""
+    """Our choice: not published."""
     steering_rate_step_deg: float = 4.0
-    """For generation 1: 2 deg/s with old firmware."""
+    """Step of generation 1's steering rate, in deg/s; 2 with old firmware."""
 
     def rate_radps(self, steps: int, step_deg: float) -> float:
         """Return a command's rate of the steering wheel; 0 means the maximum (our choice: the kit's default)."""

@@ -57,7 +57,7 @@ class SoftwareCarRunner:
             return
         self.step(now_ns)
         if command == HELP:
-            self._events += [KitEvent(now_ns, "help", each) for each in help_lines()]
+            self._events += [KitEvent(now_ns, "help", help_line) for help_line in help_lines()]
             return
         try:
             execute(self._car.kit, command, now_ns)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 MAX_REPORTED_MPS: Final = 90.0
-"""What every source can report."""
+"""The largest speed that every source can report."""
 
 SPEED_SOURCES: Final = ("speed", "second_speed", "wheel_speed")
 """The speeds that a kit reports; generation 1 has no second speed."""

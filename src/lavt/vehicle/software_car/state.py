@@ -56,9 +56,9 @@ class SystemState(IntEnum):
 class ReleaseReason(IntEnum):
     """Why a kit released its axes, or is not ready.
 
-    The facts name the reasons up to the lockouts and give no numbers: they are numbered in the order of the names. The
-    others are internal to the kit and not reported. The tenth, a delay before engaging again, is not simulated: its
-    length is not in the facts.
+    Up to the lockouts the names of the reasons are published, but no codes: these follow the order of the names. The
+    reasons after them are internal to the kit and not reported. The tenth published reason, a delay before engaging
+    again, is not simulated: its length is not published.
     """
 
     NONE = 0
@@ -125,7 +125,7 @@ class Actuator:
     is_enabled: bool = False
     driver_acts: bool = False
     is_overridden: bool = False
-    """Latched."""
+    """Latched until it is cleared."""
     has_timed_out: bool = False
     is_crc_bad: bool = False
     is_count_bad: bool = False
