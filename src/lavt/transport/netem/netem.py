@@ -129,9 +129,8 @@ class Verification(Struct, frozen=True):
 class NetemInterface:
     """netem on one interface. As a context manager it restores the interface at the end of the block.
 
-    With `persistent`, the impairments outlive this process and have no owner. `directory` contains the state files,
-    from which another process restores the interface after a crash. `seed` is the seed of correlated jitter. Raises
-    `UserError` for an invalid interface name.
+    With `persistent`, the impairments outlive this process and have no owner. `directory` has the state files
+    for restoring after a crash. `seed` is the seed of correlated jitter. Raises `UserError` for an invalid name.
     """
 
     def __init__(
@@ -254,9 +253,8 @@ class NetemInterface:
         actual = self._filters()
         expected = {expected_filter(tc_filter) for flow in flows for tc_filter in filters(flow)}
         reasons = [reason for flow in flows for reason in difference(flow, qdiscs, actual)]
-        return reasons + [
-            f"there is a filter that was not requested: {found[:3]}" for found in actual if found not in expected
-        ]
+        surplus = [found[:3] for found in actual if found not in expected]
+        return reasons + [f"there is a filter that was not requested: {found}" for found in surplus]
 
     def measure(
         self, flows: Sequence[ImpairedFlow], *, exempt: Sequence[ExemptPort] = (), count: int = 50
@@ -338,8 +336,8 @@ class NetemInterface:
     def _change(self, flows: Sequence[ImpairedFlow], qdiscs: Sequence[Qdisc]) -> list[Command]:
         """Change LAVT's qdiscs and filters to what is requested."""
         requested = {flow.name: flow for flow in flows}
-        actual_filters = set(self._filters()) if qdiscs else set()
-        requested_filters = {expected_filter(tc_filter): tc_filter for flow in flows for tc_filter in filters(flow)}
+        actual = set(self._filters()) if qdiscs else set()
+        expected = {expected_filter(tc_filter): tc_filter for flow in flows for tc_filter in filters(flow)}
         commands = []
         for name, place in PLACES.items():
             exists = _netem_at(place.handle, qdiscs) is not None
@@ -347,15 +345,10 @@ class NetemInterface:
                 impairment = requested[name].impairment if name in requested else Impairment()
                 verb = "change" if exists else "add"
                 commands.append(set_impairment(self.interface, name, impairment, verb=verb, tables=self._tables))  # type: ignore[arg-type]
-        commands += [
-            delete_filter(self.interface, found.number, found.version)
-            for found in sorted(actual_filters - set(requested_filters), key=str)
-        ]
-        commands += [
-            add_filter(self.interface, tc_filter)
-            for expected, tc_filter in requested_filters.items()
-            if expected not in actual_filters
-        ]
+        surplus = sorted(actual - set(expected), key=str)
+        missing = [tc_filter for key, tc_filter in expected.items() if key not in actual]
+        commands += [delete_filter(self.interface, found.number, found.version) for found in surplus]
+        commands += [add_filter(self.interface, tc_filter) for tc_filter in missing]
         return self._run_all(commands)
 
     def _clear(self, interface: str, *, at_once: bool) -> list[Command]:
