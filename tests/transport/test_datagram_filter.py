@@ -36,22 +36,27 @@ def open_path(path: PathServer, client: PathClient, address: tuple[str, int] = H
     assert path.open_address(T0) == address
 
 
-def passed(filter_: VideoPortFilter | ProbePortFilter, datagram: bytes, address: tuple[str, int], number: int) -> int:
-    """Return how many of `number` equal datagrams within a second pass."""
-    return sum(filter_.passes(datagram, address, T0 + at * NS_PER_MS // 10) for at in range(number))
+def count_passed(
+    port_filter: VideoPortFilter | ProbePortFilter, datagram: bytes, address: tuple[str, int], copies: int
+) -> int:
+    """Return how many of `copies` equal datagrams within one second pass."""
+    return sum(port_filter.passes(datagram, address, T0 + number * NS_PER_MS // 10) for number in range(copies))
 
 
-def exhaust(filter_: VideoPortFilter) -> None:
-    """Use up the budget of the second that begins at T0."""
-    assert passed(filter_, b"garbage", ELSEWHERE, 1000) == OTHER_DATAGRAMS_PER_S
+def exhaust(port_filter: VideoPortFilter) -> None:
+    """Use up the rate limit of the second that begins at T0."""
+    assert count_passed(port_filter, b"garbage", ELSEWHERE, 1000) == OTHER_DATAGRAMS_PER_S
 
 
 def test_strangers_datagrams_pass_at_a_limited_rate() -> None:
-    """Of all datagrams of unproven senders together, 200 a second pass."""
+    """Of the datagrams of all senders without an open path together, 200 a second pass."""
     path, client = new_path(), PathClient(TOKEN)
     video = VideoPortFilter(path)
     forged = PathClient(bytes(16)).hello(T0)
-    total = sum(passed(video, each, ELSEWHERE, 300) for each in (b"", b"LAVT", RTCP, forged, client.hello(T0)[:-1]))
+    total = sum(
+        count_passed(video, datagram, ELSEWHERE, 300)
+        for datagram in (b"", b"LAVT", RTCP, forged, client.hello(T0)[:-1])
+    )
     assert total == OTHER_DATAGRAMS_PER_S
     assert video.passes(b"garbage", ELSEWHERE, T0 + NS_PER_S)
 
@@ -69,7 +74,7 @@ def test_a_flood_does_not_keep_the_client_out() -> None:
         assert not video.passes(datagram, HOME, T0)
         assert not video.passes(datagram, ELSEWHERE, T0)
     path.receive(answer, HOME, T0)
-    assert passed(video, RTCP, HOME, 1000) == 1000
+    assert count_passed(video, RTCP, HOME, 1000) == 1000
     assert video.passes(client.hello(T0), ELSEWHERE, T0)
 
 
@@ -80,8 +85,8 @@ def test_replays_with_the_clients_address_pass_at_a_limited_rate() -> None:
     hello = client.hello(T0)
     answer = client.answer(path.receive(hello, HOME, T0) or b"") or b""
     path.receive(answer, HOME, T0)
-    assert passed(video, hello, HOME, 1000) == OTHER_DATAGRAMS_PER_S + 1
-    assert passed(video, answer, HOME, 1000) == 1
+    assert count_passed(video, hello, HOME, 1000) == OTHER_DATAGRAMS_PER_S + 1
+    assert count_passed(video, answer, HOME, 1000) == 1
 
 
 def test_hellos_with_a_new_token_pass() -> None:
@@ -98,20 +103,20 @@ def test_hellos_with_a_new_token_pass() -> None:
 
 
 def test_strangers_probes_do_not_crowd_out_the_clients() -> None:
-    """The host with the open path has a budget of probes of its own, directly or through the rendezvous."""
+    """The host with the open path has a rate limit of its own for probes, directly or through the rendezvous."""
     request = encode_request(1, 1)
     for address in (HOME, VIA_RENDEZVOUS):
         path = new_path()
         probe = ProbePortFilter(path)
         open_path(path, PathClient(TOKEN), address)
-        assert passed(probe, request, ELSEWHERE, 1000) == PROBES_PER_S
+        assert count_passed(probe, request, ELSEWHERE, 1000) == PROBES_PER_S
         assert probe.passes(request, (address[0], 40000), T0)
         assert not probe.passes(request, ELSEWHERE, T0)
-        assert passed(probe, request, address, 1000) == PROBES_PER_S - 1
+        assert count_passed(probe, request, address, 1000) == PROBES_PER_S - 1
 
 
 def test_datagrams_that_do_not_pass_are_counted_and_not_delivered() -> None:
-    """What does not pass is counted in the link's counts, and neither delivered nor recorded."""
+    """A datagram that does not pass is counted in the link's counts, and is neither delivered nor recorded."""
     delivered: list[tuple[str, Any]] = []
     counts: Counter[str] = Counter()
     deliver = filtered(
@@ -127,7 +132,7 @@ def test_datagrams_that_do_not_pass_are_counted_and_not_delivered() -> None:
 
 @given(st.binary(max_size=80), st.sampled_from([b"", b"LAVT\x01\x03", b"LAVT\x03\x03"]))
 def test_any_bytes(data: bytes, head: bytes) -> None:
-    """Arbitrary bytes raise nothing and do not pass beyond the budget."""
+    """Arbitrary bytes raise nothing and do not pass beyond the rate limit."""
     video = VideoPortFilter(new_path())
     exhaust(video)
     assert not video.passes(head + data, ELSEWHERE, T0)

@@ -67,7 +67,9 @@ NETEM = NetemRequest(
     state_delay_ms=150.0,
 )
 NETEM_REPLY = NetemReply(granted=False, reason="no")
-MESSAGES: dict[type, AnyMessage] = {type(each): each for each in (COMMAND, STATE, REQUEST, REPLY, NETEM, NETEM_REPLY)}
+MESSAGES: dict[type, AnyMessage] = {
+    type(message): message for message in (COMMAND, STATE, REQUEST, REPLY, NETEM, NETEM_REPLY)
+}
 
 U64 = st.integers(0, 2**64 - 1)
 TIME = st.integers(0, 2**63 - 1)
@@ -172,10 +174,10 @@ def test_any_text_is_readable(field: tuple[type[Any], str], text: str) -> None:
     """
     kind, name = field
     message: Any = MESSAGES[kind]
-    read = getattr(decode(kind, encode(replace(message, **{name: text}))), name)
+    decoded = getattr(decode(kind, encode(replace(message, **{name: text}))), name)
     complete = text.encode(errors="replace").decode()
-    assert read == complete or complete.startswith(read.removesuffix(ELLIPSIS))
-    assert read == complete or len(complete.encode()) > TEXT_BYTES[kind][name]
+    assert decoded == complete or complete.startswith(decoded.removesuffix(ELLIPSIS))
+    assert decoded == complete or len(complete.encode()) > TEXT_BYTES[kind][name]
 
 
 def test_version_comes_first() -> None:
@@ -218,7 +220,7 @@ NOT_A_NUMBER: list[Any] = [NAN, INF, -INF, True, "0", b"0", None, [], {}, 2**64 
 NOT_A_TEXT: list[Any] = [1, 1.0, True, None, b"drive", [], {}]
 NOT_A_TIME = [*NOT_AN_INTEGER, -1, 2**63, 2**64 - 1]
 NOT_A_NAME = [*NOT_A_TEXT, "", "a/b", "**", "*", "a b", "-a", "_a", "a\n", "é", "a" * 33, "$a", "a#"]
-NOT_A_NAME_OR_EMPTY = [each for each in NOT_A_NAME if each != ""]
+NOT_A_NAME_OR_EMPTY = [value for value in NOT_A_NAME if value != ""]
 POINTS = [0.0] * PATH_POINTS
 OUT_OF_RANGE: dict[type, dict[str, list[Any]]] = {
     Command: {

@@ -119,12 +119,12 @@ def test_send_to_a_peer(sender: socket.socket) -> None:
         assert sender.recvfrom(100) == (b"to you", ("127.0.0.1", link.port))
 
 
-@pytest.mark.parametrize("known", [True, False])
-def test_send_to_the_remote(sender: socket.socket, known: bool) -> None:
+@pytest.mark.parametrize("port_configured", [True, False])
+def test_send_to_the_remote(sender: socket.socket, port_configured: bool) -> None:
     """A client's link sends to its server, at the configured port or else at the port of the session's reply."""
     port = sender.getsockname()[1]
-    with closing(open_link(remote=("localhost", port if known else 0))) as link:
-        link.send(Send("feedback", b"hello", 9 if known else port))
+    with closing(open_link(remote=("localhost", port if port_configured else 0))) as link:
+        link.send(Send("feedback", b"hello", 9 if port_configured else port))
         assert sender.recv(100) == b"hello"
 
 
@@ -175,11 +175,11 @@ def test_only_from_one_host(sender: socket.socket) -> None:
     received = Received()
     with (
         closing(UdpLink(MachineClock(), "rtp", bind=ANY, only_from="127.0.0.2")) as link,
-        closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as known,
+        closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as permitted,
     ):
-        known.bind(("127.0.0.2", 0))
+        permitted.bind(("127.0.0.2", 0))
         link.start(received)
         sender.sendto(b"stranger", ("127.0.0.1", link.port))
-        known.sendto(b"known", ("127.0.0.1", link.port))
-        assert received.next()[1] == b"known"
+        permitted.sendto(b"permitted", ("127.0.0.1", link.port))
+        assert received.next()[1] == b"permitted"
         assert link.counts["datagrams_from_strangers"] == 1

@@ -42,7 +42,7 @@ class Received:
         self.payloads.append(payload)
         self.messages.put((channel, payload, arrived, peer))
 
-    def next(self, wanted: tuple[str, bytes], send: Callable[[], None] | None = None) -> tuple[Now, Any]:
+    def next(self, expected: tuple[str, bytes], send: Callable[[], None] | None = None) -> tuple[Now, Any]:
         """Wait for a payload on a channel; `send` sends it, repeatedly, because it may be lost or too early."""
         for _ in range(100):
             if send is not None:
@@ -51,14 +51,14 @@ class Received:
                 channel, payload, arrived, peer = self.messages.get(timeout=ARRIVES_S / 100)
             except queue.Empty:
                 continue
-            if (channel, payload) == wanted:
+            if (channel, payload) == expected:
                 return arrived, peer
-        raise AssertionError(f"did not receive {wanted}")
+        raise AssertionError(f"did not receive {expected}")
 
 
 def local(router: Router) -> str:
     """Return the loopback endpoint of a router."""
-    return next(each for each in router.locators() if each.startswith("tcp/"))
+    return next(locator for locator in router.locators() if locator.startswith("tcp/"))
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,7 @@ def routers() -> Iterator[tuple[str, str]]:
     with ExitStack() as stack:
         server = Router(CONFIGS / "router-server.json5", {"listen/endpoints": [LOCAL, BETWEEN]})
         stack.callback(server.close)
-        remote = next(each for each in server.locators() if each.startswith("udp/"))
+        remote = next(locator for locator in server.locators() if locator.startswith("udp/"))
         port = remote.partition("?")[0].rpartition(":")[2]
         client = Router(
             CONFIGS / "router-client.json5",
@@ -201,7 +201,7 @@ def test_vehicles_do_not_mix(pair: Pair, routers: tuple[str, str]) -> None:
 
 @pytest.mark.parametrize("channel", ["control", "session", "session_reply"])
 def test_an_error_in_a_receiving_thread_is_not_lost(routers: tuple[str, str], channel: str) -> None:
-    """An error in the delivery of a command, a query or a reply is that of a thread, which fails the process."""
+    """An error in the delivery of a message counts as the error of a thread, which fails the process."""
     failed: queue.Queue[BaseException] = queue.Queue()
 
     def deliver(received: str, _payload: Any, _arrived: Now, peer: Any) -> None:
@@ -221,7 +221,7 @@ def test_an_error_in_a_receiving_thread_is_not_lost(routers: tuple[str, str], ch
 
 
 def test_the_end_of_a_subscription_is_not_lost(routers: tuple[str, str]) -> None:
-    """A subscription that ends while the link is open is the error of a thread; closing the link still works."""
+    """A subscription that ends while the link is open counts as the error of a thread; closing the link still works."""
     failed: queue.Queue[BaseException] = queue.Queue()
     with fail_on_thread_errors(failed.put), closing(Pair(routers, "ended")) as pair:
         pair.server._declared[0].undeclare()
@@ -241,8 +241,8 @@ def test_liveliness(routers: tuple[str, str]) -> None:
             lambda sample: changes.put((str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)),
             history=True,
         )
-        known = {changes.get(timeout=ARRIVES_S) for _ in range(2)}
-        assert known == {(f"lavt/vehicle-1/alive/{who}", True) for who in ("server-1", "client-1")}
+        present = {changes.get(timeout=ARRIVES_S) for _ in range(2)}
+        assert present == {(f"lavt/vehicle-1/alive/{who}", True) for who in ("server-1", "client-1")}
         visitor = link("client", routers[1], who="visitor")
         visitor.start(Received())
         assert changes.get(timeout=ARRIVES_S) == ("lavt/vehicle-1/alive/visitor", True)
@@ -478,7 +478,9 @@ def test_shipped_configs(
         return
     if "-tls" in name:
         monkeypatch.chdir(request.getfixturevalue("keys").parent)
-    with closing(Router(CONFIGS / name, {"listen/endpoints": [each.format(tmp_path) for each in endpoints]})) as router:
+    with closing(
+        Router(CONFIGS / name, {"listen/endpoints": [endpoint.format(tmp_path) for endpoint in endpoints]})
+    ) as router:
         assert len(router.locators()) >= len(endpoints)
 
 
@@ -502,25 +504,25 @@ def test_shipped_configs_use_no_scouting(name: str) -> None:
 def test_one_side_dials(dialling: str, dialled: str) -> None:
     """Of two linked shipped routers only one dials, and both use the same parameters of the link."""
     endpoints = {
-        (name, way): json.loads(zenoh.Config.from_file(str(CONFIGS / name)).get_json(f"{way}/endpoints"))
+        (name, direction): json.loads(zenoh.Config.from_file(str(CONFIGS / name)).get_json(f"{direction}/endpoints"))
         for name in (dialling, dialled)
-        for way in ("listen", "connect")
+        for direction in ("listen", "connect")
     }
     assert endpoints[dialled, "connect"] == []
     (dials,) = endpoints[dialling, "connect"]
-    listens = next(each for each in endpoints[dialled, "listen"] if each.startswith("udp/"))
+    listens = next(endpoint for endpoint in endpoints[dialled, "listen"] if endpoint.startswith("udp/"))
     for endpoint in (dials, listens):
         assert set(endpoint.partition("?")[2].split(";")) == {"rel=1", "mixed_rel=1"}
-    assert all(each.startswith("tcp/127.0.0.1:") for each in endpoints[dialling, "listen"])
+    assert all(endpoint.startswith("tcp/127.0.0.1:") for endpoint in endpoints[dialling, "listen"])
 
 
 @pytest.mark.parametrize("name", sorted(path.name for path in CONFIGS.iterdir() if "-tls" in path.name))
 def test_encrypted_configs_restrict_access(name: str) -> None:
     """An encrypted router accepts sessions by a Unix socket only, requires mutual TLS and limits message sizes."""
     config = zenoh.Config.from_file(str(CONFIGS / name))
-    listened = json.loads(config.get_json("listen/endpoints"))
-    assert {each.partition("/")[0] for each in listened} <= {"unixsock-stream", "quic"}
-    assert all("mixed_rel=1" in each for each in listened if each.startswith("quic"))
+    endpoints = json.loads(config.get_json("listen/endpoints"))
+    assert {endpoint.partition("/")[0] for endpoint in endpoints} <= {"unixsock-stream", "quic"}
+    assert all("mixed_rel=1" in endpoint for endpoint in endpoints if endpoint.startswith("quic"))
     tls = json.loads(config.get_json("transport/link/tls"))
     assert (tls["enable_mtls"], tls["verify_name_on_connect"], tls["close_link_on_expiration"]) == (True, True, True)
     (limit,) = json.loads(config.get_json("low_pass_filter"))
@@ -528,8 +530,8 @@ def test_encrypted_configs_restrict_access(name: str) -> None:
     access = json.loads(config.get_json("access_control"))
     assert access["enabled"] is (name != "router-client-tls.json5")
     assert access["default_permission"] == "deny"
-    ruled = {rule["id"] for rule in access["rules"] or ()}
-    assert ruled == {rule for policy in access["policies"] or () for rule in policy["rules"]}
+    defined_rules = {rule["id"] for rule in access["rules"] or ()}
+    assert defined_rules == {rule for policy in access["policies"] or () for rule in policy["rules"]}
 
 
 @pytest.mark.parametrize("name", sorted(path.name for path in CONFIGS.glob("router-*.json5") if "tls" not in path.name))
@@ -552,8 +554,8 @@ def test_both_dial_a_router_in_the_cloud() -> None:
         port = cloud.locators()[0].partition("?")[0].rpartition(":")[2]
         dials = {"listen/endpoints": [LOCAL], "connect/endpoints": [f"udp/127.0.0.1:{port}?rel=1;mixed_rel=1"]}
         sides = [router(name, dials) for name in ("router-server-to-cloud.json5", "router-client.json5")]
-        far = stack.enter_context(closing(Pair((local(sides[0]), local(sides[1])), "vehicle-1")))
-        far.server_received.next(("control", b"far"), lambda: far.client.send(Send("control", b"far")))
-        found = far.client.routers()
-        assert found is not None
-        assert (found.linked, len(set(found.versions))) == (1, 1)
+        pair = stack.enter_context(closing(Pair((local(sides[0]), local(sides[1])), "vehicle-1")))
+        pair.server_received.next(("control", b"far"), lambda: pair.client.send(Send("control", b"far")))
+        routers = pair.client.routers()
+        assert routers is not None
+        assert (routers.linked, len(set(routers.versions))) == (1, 1)

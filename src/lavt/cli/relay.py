@@ -18,7 +18,7 @@ from lavt.runtime import process_priority
 from lavt.transport.emulation.delay_line import DelayModel, Lognormal
 from lavt.transport.emulation.impairment import Impairment
 from lavt.transport.emulation.link import LinkInjection
-from lavt.transport.emulation.relay import NONE, Relay, RelayedFlow, is_delayed_video, video_index
+from lavt.transport.emulation.relay import NO_DELAY, Relay, RelayedFlow, is_delayed_video, video_index
 
 
 def register(app: typer.Typer) -> None:
@@ -62,7 +62,7 @@ def flows(config: RelayConfig) -> list[RelayedFlow]:
         "video",
         _resolve("video_listen", config.video_listen),
         _resolve("video_server", config.video_server),
-        upstream=NONE,
+        upstream=NO_DELAY,
         downstream=_delay_model(config.video, seed, "video inherent"),
         delays_downstream=is_delayed_video,
         index_downstream=video_index,

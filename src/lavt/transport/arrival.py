@@ -1,4 +1,4 @@
-"""Arrival times of datagrams by the kernel, so that a process that reads its socket late does not add to the delay."""
+"""Arrival times of datagrams from the kernel: a process that reads its socket late does not add to the delay."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import struct
 from lavt.domain import NS_PER_S, Now
 
 SO_TIMESTAMPNS = 35
-"""Linux: the time of arrival as two 64-bit numbers, seconds and nanoseconds of the wall clock; not in `socket`."""
+"""Linux's socket option, which `socket` lacks: the time of arrival as two 64-bit numbers, seconds and nanoseconds of
+the wall clock."""
 ANCILLARY_BYTES = 64
 """The buffer size for ancillary data in `recvmsg`."""
 MAX_QUEUED_NS = 10 * NS_PER_S

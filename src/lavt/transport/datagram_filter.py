@@ -1,7 +1,7 @@
 """Cheap checks of the datagrams at the vehicle's UDP ports, before anything is queued or recorded.
 
 The active client's datagrams pass; all others pass at a limited rate, so that the record shows them and a flood delays
-nothing. One thread uses a filter: the one that receives.
+nothing. Only the receiving thread uses a filter.
 """
 
 from __future__ import annotations
@@ -15,10 +15,11 @@ from lavt.transport.udp_link import Deliver
 from lavt.transport.video.path_validation import Address, PathServer, client_datagram_number, is_path_datagram
 
 OTHER_DATAGRAMS_PER_S: Final = 200
-"""On the video's port. On a busy AMD EPYC, a stranger's datagram that passes took 15 to 30 us of CPU time, and one that
-does not a quarter to an eighth of that (`benchmarks/stranger_datagrams.py`, medians of three runs)."""
+"""The limit at the video's port. On a busy AMD EPYC, a stranger's datagram that passes took 15 to 30 us of CPU time,
+and one that does not a quarter to an eighth of that (`benchmarks/stranger_datagrams.py`, medians of three runs)."""
 PROBES_PER_S: Final = 200
-"""Of the active client's host, and separately of all others. A client sends 2 a second, `lavt clock` 20."""
+"""Limits the probes from the active client's host, and separately those from all others. A client sends 2 a second,
+`lavt clock` 20."""
 
 
 class DatagramFilter(Protocol):
@@ -53,7 +54,7 @@ class VideoPortFilter:
             return False
         if self._path.token is not self._token:
             self._token, self._numbers = self._path.token, {}
-        kind = datagram[4]
+        kind = datagram[4]  # hello or answer
         if number <= self._numbers.get(kind, 0) or not self._path.is_authentic(datagram):
             return False
         self._numbers[kind] = number

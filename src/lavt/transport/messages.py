@@ -37,7 +37,7 @@ NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_-]{0,31}\Z")
 """A valid name of a vehicle or client: it contains nothing that has a meaning in a Zenoh key."""
 ELLIPSIS = "\N{HORIZONTAL ELLIPSIS}"
 MAX_DELAY_MS = 10_000.0
-"""Limits what a client can request of a server, which needs as long to clear the delay."""
+"""The longest delay that a client can request of a server; clearing the delay takes as long."""
 
 Version = Annotated[int, Meta(ge=VERSION, le=VERSION)]
 U64 = Annotated[int, Meta(ge=0)]
@@ -49,7 +49,7 @@ Name = Annotated[str, Meta(pattern=NAME.pattern)]
 NameOrEmpty = Annotated[str, Meta(pattern=rf"^\Z|{NAME.pattern}")]
 
 REASON_BYTES = 300
-"""Limits a reason; a message with its longest texts is within `MAX_MESSAGE_BYTES`."""
+"""Limits a reason, so that even a message with its longest texts is within `MAX_MESSAGE_BYTES`."""
 TEXT_BYTES: dict[type, dict[str, int]] = {
     Command: {},
     State: {"reason": REASON_BYTES, "rejected": REASON_BYTES, "limited": 100},
@@ -103,7 +103,7 @@ TYPES: dict[type, dict[str, Any]] = {
         "token": bytes,
         "video_port": Annotated[int, Meta(ge=0, le=65535)],
         "host": _text(SessionReply, "host"),
-        # lower than a `Time`, so that the operator has a next number
+        # lower than the highest `Time`, so that the operator can send a higher number
         "emergency_stop": Annotated[int, Meta(ge=0, le=2**62)],
     },
     NetemRequest: {
@@ -129,7 +129,7 @@ CHECKS: dict[type, dict[str, Callable[[Any], bool]]] = {
     SessionReply: {"token": lambda token: len(token) in {0, 16}},
     NetemRequest: {"rate_bps": lambda rate_bps: rate_bps == 0 or rate_bps >= 10_000},
 }
-"""What a range cannot express."""
+"""Checks of fields that a range cannot express."""
 
 _ENCODER = msgspec.msgpack.Encoder()
 _DECODERS: dict[type, msgspec.msgpack.Decoder[tuple[Any, ...]]] = {
@@ -152,7 +152,7 @@ def encode(message: Command | State | SessionRequest | SessionReply | NetemReque
 
 
 def _cut(text: str, max_bytes: int) -> str:
-    """Return the text without lone surrogates (of a file's name), cut to the limit and then with an ellipsis."""
+    """Return the text without lone surrogates (as in a file's name); if it is too long, cut it and add an ellipsis."""
     data = text.encode(errors="replace")
     if len(data) <= max_bytes:
         return data.decode()
@@ -182,9 +182,9 @@ def _decode(kind: type[Any], data: bytes) -> Any:
 
 
 def _describe(kind: type[Any], error: str) -> str:
-    """Return an error of the decoder, after the name of the field that it is about."""
-    index = re.search(r"`\$\[(\d+)\]", error)
-    if index is None:
+    """Return an error of the decoder, preceded by the name of the field that is invalid."""
+    position = re.search(r"`\$\[(\d+)\]", error)
+    if position is None:
         return f"{kind.__name__}: {error}"
-    number = int(index[1])
-    return f"{kind.__name__}.{list(TYPES[kind])[number - 1]}: {error}" if number else "a message of another version"
+    index = int(position[1])  # 0 is the version
+    return f"{kind.__name__}.{list(TYPES[kind])[index - 1]}: {error}" if index else "a message of another version"

@@ -1,4 +1,4 @@
-"""UDP sockets for the video and the clock probe, with arrival times by the kernel."""
+"""UDP sockets for the video and the clock probe, with arrival times from the kernel."""
 
 from __future__ import annotations
 
@@ -26,11 +26,12 @@ MAX_DATAGRAM_BYTES = 65_535
 class UdpLink:
     """A UDP socket and a thread that receives.
 
-    Received datagrams are delivered on `channel`; `name` is the purpose of the port in messages. Without `remote` the
-    peer of a `Send` is the destination address. With `remote`, the server of a client, datagrams go to that host; the
-    peer is then the port, which is used if the port of `remote` is 0. Datagrams from any other address than the
-    server's are counted and not delivered. A link that only receives may be restricted to the numeric host
-    `only_from`. Raises `UserError` for a port that cannot be opened and for an unknown host.
+    Received datagrams are delivered on `channel`; `name` is the purpose of the port in error messages. Without `remote`
+    the peer of a `Send` is the destination address. A client passes the address of its server as `remote`: all
+    datagrams go to that host, and the peer of a `Send` is only a port, which is used if the port of `remote` is 0.
+    Datagrams from any other address than the server's are counted and not delivered. A link that only receives may be
+    restricted to the numeric host `only_from`. Raises `UserError` for a port that cannot be opened and for an unknown
+    host.
     """
 
     def __init__(
@@ -81,7 +82,7 @@ class UdpLink:
                 address = self._server = (self._remote[0], self._remote[1] or send.peer)
             try:
                 self._socket.sendto(send.payload, socket.MSG_DONTWAIT, address)
-            except OSError:  # lost, as on the network: no frame waits for the one before it
+            except OSError:  # it is lost, as on the network: no frame waits for an earlier one
                 self.counts["datagrams_not_sent"] += 1
 
     def close(self) -> None:
@@ -122,7 +123,7 @@ class UdpLink:
 def resolve_host(key: str, host: str) -> str:
     """Return the numeric address of a host; raise `UserError` that names the config `key` if it is unknown.
 
-    Resolved once, no datagram waits for a name server, and senders can be compared by address.
+    The host is resolved only once, so that no datagram waits for a name server and senders can be compared by address.
     """
     try:
         return socket.gethostbyname(host)

@@ -1,7 +1,8 @@
-"""Commands, states and session requests over Zenoh. Only this module imports it.
+"""Commands, states and session requests over Zenoh. Only this module imports `zenoh`.
 
 Each side has a Zenoh session with a router on its own machine, and the routers are linked to each other. Safety does
-not depend on Zenoh: after an outage it may deliver seconds of old commands, and its liveliness is as slow as its lease.
+not depend on Zenoh. After an outage it may deliver commands that are seconds old, and it reports a lost session only
+when the lease has expired.
 """
 
 from __future__ import annotations
@@ -50,8 +51,10 @@ CONTROL: dict[str, Any] = {
     "express": True,
     "reliability": zenoh.Reliability.BEST_EFFORT,
 }
-"""A late command is worthless: it is never resent, blocked or batched, and has the highest priority."""
+"""Zenoh's settings for commands: a late command is worthless, so it is never resent, blocked or batched, and it has the
+highest priority."""
 STATE: dict[str, Any] = {**CONTROL, "priority": zenoh.Priority.INTERACTIVE_HIGH}
+"""Zenoh's settings for states."""
 
 
 def quiet_logs() -> None:
@@ -110,8 +113,8 @@ def _has_listen_endpoints(config: zenoh.Config) -> bool:
     endpoints = config.get_json("listen/endpoints")
     if endpoints == zenoh.Config().get_json("listen/endpoints"):
         return False
-    named = json.loads(endpoints)
-    return bool(named.get("router") if isinstance(named, dict) else named)
+    configured = json.loads(endpoints)
+    return bool(configured.get("router") if isinstance(configured, dict) else configured)
 
 
 def _check_endpoints(config: zenoh.Config) -> Any:
@@ -172,8 +175,8 @@ class Routers(NamedTuple):
     """Zenoh's version in every router that reports it, the session's router first."""
 
 
-def _as_thread(handle: Callable[[str, Any], None], channel: str) -> Callable[[Any], None]:
-    """Return a callback for Zenoh's threads; an error in it counts as one that ends a thread of Python's."""
+def _zenoh_callback(handle: Callable[[str, Any], None], channel: str) -> Callable[[Any], None]:
+    """Return a callback for Zenoh's threads that treats an error in `handle` like the error of a Python thread."""
 
     def call(received: Any) -> None:
         try:
@@ -192,9 +195,9 @@ def _discard(_channel: str, _payload: bytes, _arrived: Now, _peer: object) -> No
 class ZenohLink:
     """A Zenoh session of one side, which publishes, subscribes, and sends or answers queries.
 
-    Raises `UserError` for an invalid config, and if no router answers. With `waiting`, a missing router is not an
-    error: `start` calls `waiting` with the reason and opens the session in the background as soon as a router answers.
-    Messages that are sent before then are counted as not sent.
+    `who` names this session in its liveliness token. Raises `UserError` for an invalid config, and if no router
+    answers. With `waiting`, a missing router is not an error: `start` calls `waiting` with the reason and opens the
+    session in the background as soon as a router answers. Messages that are sent before then are counted as not sent.
     """
 
     def __init__(
@@ -216,7 +219,7 @@ class ZenohLink:
         self._who = check_name("the client", who)
         self._queries: dict[str, dict[int, zenoh.Query]] = {channel: {} for channel in REPLY_CHANNELS}
         self._queries_lock = threading.Lock()
-        self._number = itertools.count()
+        self._query_numbers = itertools.count()
         self._config = _load(path, {"connect/endpoints": [router]} if router else {})
         endpoints = _check_endpoints(self._config)
         self._session: Any = None
@@ -275,7 +278,7 @@ class ZenohLink:
         )
         self._listener.start()
         for channel in REPLY_CHANNELS if self._side == "server" else ():
-            on_query: Any = zenoh.handlers.Callback(_as_thread(self._on_query, channel), indirect=False)
+            on_query: Any = zenoh.handlers.Callback(_zenoh_callback(self._on_query, channel), indirect=False)
             self._declared.append(session.declare_queryable(f"{self._base}/{channel}", on_query))
         self._declared.append(session.liveliness().declare_token(f"{self._base}/alive/{self._who}"))
 
@@ -337,7 +340,7 @@ class ZenohLink:
             self._deliver(channel, sample.payload.to_bytes(), self._clock.now(), None)
 
     def _query(self, channel: str, payload: bytes) -> None:
-        on_reply: Any = zenoh.handlers.Callback(_as_thread(self._on_reply, channel), indirect=False)
+        on_reply: Any = zenoh.handlers.Callback(_zenoh_callback(self._on_reply, channel), indirect=False)
         self._session.get(
             f"{self._base}/{channel}",
             on_reply,
@@ -355,7 +358,7 @@ class ZenohLink:
 
     def _on_query(self, channel: str, query: zenoh.Query) -> None:
         payload = b"" if query.payload is None else query.payload.to_bytes()
-        number = next(self._number)
+        number = next(self._query_numbers)
         with self._queries_lock:
             pending = self._queries[channel]
             pending[number] = query

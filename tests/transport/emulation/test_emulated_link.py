@@ -16,7 +16,7 @@ from lavt.errors import UserError
 from lavt.transport.emulation.delay_line import DelayLine, DelayModel
 from lavt.transport.emulation.impairment import DISTRIBUTIONS, Distribution, Impairment
 from lavt.transport.emulation.link import HEADER_BYTES, EmulatedLink, LinkInjection, check_injection
-from lavt.transport.emulation.random_process import LARGEST, quantiles
+from lavt.transport.emulation.random_process import LARGEST_QUANTILE, quantiles
 from lavt.transport.emulation.trace import Trace, parse_delays, parse_mahimahi
 
 MS = NS_PER_MS
@@ -119,7 +119,7 @@ def test_jitter_has_the_distribution_of_netem(distribution: Distribution) -> Non
     mean, deviation = DEVIATIONS[distribution]
     assert delays.mean() == pytest.approx(mean, abs=4 * deviation / COUNT**0.5 + 5e-4)
     assert delays.std() == pytest.approx(deviation, rel=0.03)
-    assert np.abs(delays).max() <= LARGEST
+    assert np.abs(delays).max() <= LARGEST_QUANTILE
     assert abs(float(np.corrcoef(delays[:-1], delays[1:])[0, 1])) < 4 / COUNT**0.5
 
 

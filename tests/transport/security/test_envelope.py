@@ -27,8 +27,9 @@ from lavt.transport.security.envelope import (
 )
 from lavt.transport.security.keys import PrivateKey
 
-KEPT, MAX_ENVELOPE_BYTES = 8, 1280
-"""The design's limits, repeated here so that a change in the code fails a test."""
+MAX_ENTRIES, MAX_ENVELOPE_BYTES = 8, 1280
+"""The limits of the design: pending requests or key agreements, and the size of an envelope. They are repeated here so
+that a change in the code fails a test."""
 COMMAND = Command(77, 3, 1, 2, 3, 0.1, 0.2, 0.0, (0.0,) * PATH_POINTS, "drive", 0)
 TOKEN = bytes(range(16))
 GRANTED = SessionReply(True, "", 77, TOKEN, 5600, "kernel", 0)
@@ -349,25 +350,26 @@ def test_pending_requests_are_bounded(pair: Pair) -> None:
     pair.acquire_control()
     requests = [pair.vehicle.verify_request("netem", pair.operator.sign_request("netem", b""))]
     requests += [
-        pair.vehicle.verify_request("session", pair.signed_request("acquire", number)) for number in range(3 * KEPT)
+        pair.vehicle.verify_request("session", pair.signed_request("acquire", number))
+        for number in range(3 * MAX_ENTRIES)
     ]
-    assert len(pair.operator._pending) == KEPT
+    assert len(pair.operator._pending) == MAX_ENTRIES
     replies = [pair.vehicle.sign_reply(request, encode(GRANTED)) for request in requests if request is not None]
     assert pair.operator.verify_reply("netem", replies[0]) == VerifiedReply(None, None)
-    assert pair.operator.verify_reply("session", replies[-KEPT - 1]) == VerifiedReply(None, None)
-    assert len(pair.operator._pending) == KEPT
-    assert pair.operator.verify_reply("session", replies[-KEPT]) != VerifiedReply(None, None)
+    assert pair.operator.verify_reply("session", replies[-MAX_ENTRIES - 1]) == VerifiedReply(None, None)
+    assert len(pair.operator._pending) == MAX_ENTRIES
+    assert pair.operator.verify_reply("session", replies[-MAX_ENTRIES]) != VerifiedReply(None, None)
 
 
 def test_key_agreements_are_bounded(pair: Pair) -> None:
     """The vehicle keeps the key agreements with the newest 8 clients."""
-    requests = [Pair().signed_request() for _ in range(3 * KEPT)]
-    publics = [request.public for each in requests if (request := pair.vehicle.verify_request("session", each))]
-    assert len(set(publics)) == 3 * KEPT
-    assert len(pair.vehicle._agreements) == KEPT
-    remembered = pair.vehicle.verify_request("session", requests[-KEPT])
+    requests = [Pair().signed_request() for _ in range(3 * MAX_ENTRIES)]
+    publics = [request.public for data in requests if (request := pair.vehicle.verify_request("session", data))]
+    assert len(set(publics)) == 3 * MAX_ENTRIES
+    assert len(pair.vehicle._agreements) == MAX_ENTRIES
+    remembered = pair.vehicle.verify_request("session", requests[-MAX_ENTRIES])
     assert remembered is not None
-    assert remembered.public == publics[-KEPT]
+    assert remembered.public == publics[-MAX_ENTRIES]
     forgotten = pair.vehicle.verify_request("session", requests[0])
     assert forgotten is not None
     assert forgotten.public != publics[0]

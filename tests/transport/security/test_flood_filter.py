@@ -23,7 +23,7 @@ def new_filter() -> FloodFilter:
     return FloodFilter(lambda: (EPOCH, SEQUENCE), lambda data: data.endswith(b"\0"))
 
 
-def passed(flood_filter: FloodFilter, bodies: list[bytes], *, from_active_operator: bool = True) -> int:
+def count_passed(flood_filter: FloodFilter, bodies: list[bytes], *, from_active_operator: bool = True) -> int:
     """Return how many of `bodies`, which arrive within one second, pass."""
     end = b"\0" if from_active_operator else b"\1"
     return sum(
@@ -35,7 +35,7 @@ def test_acceptable_commands_always_pass() -> None:
     """Commands of the epoch in force that are newer than the last one pass at any rate."""
     commands = [encode(replace(COMMAND, sequence=SEQUENCE + 1 + number)) for number in range(FLOOD_PER_S)]
     flood_filter = new_filter()
-    assert passed(flood_filter, commands) == FLOOD_PER_S
+    assert count_passed(flood_filter, commands) == FLOOD_PER_S
     assert not flood_filter.counts
 
 
@@ -51,24 +51,24 @@ def test_unacceptable_commands_are_rate_limited() -> None:
     }
     for name, flood in floods.items():
         flood_filter = new_filter()
-        assert (name, passed(flood_filter, flood)) == (name, OTHER_COMMANDS_PER_S)
+        assert (name, count_passed(flood_filter, flood)) == (name, OTHER_COMMANDS_PER_S)
         assert flood_filter.counts["commands_screened_out"] == FLOOD_PER_S - OTHER_COMMANDS_PER_S
 
 
 def always_passes(flood_filter: FloodFilter, command: Command) -> bool:
     """Return whether a command passes more often than the rate limit for unacceptable commands permits."""
     body = encode(command)
-    return passed(flood_filter, [body] * (OTHER_COMMANDS_PER_S + 1)) == OTHER_COMMANDS_PER_S + 1
+    return count_passed(flood_filter, [body] * (OTHER_COMMANDS_PER_S + 1)) == OTHER_COMMANDS_PER_S + 1
 
 
-@pytest.mark.parametrize("noted", [[5], [3, 5], [5, 3]])
-def test_commands_up_to_the_newest_authentic_one_are_replays(noted: list[int]) -> None:
+@pytest.mark.parametrize("authentic", [[5], [3, 5], [5, 3]])
+def test_commands_up_to_the_newest_authentic_one_are_replays(authentic: list[int]) -> None:
     """Commands up to the newest authentic one are rate-limited, in whatever order the authentic ones came."""
-    for after, always in ((4, False), (5, False), (6, True)):
+    for replayed, always in ((4, False), (5, False), (6, True)):
         flood_filter = new_filter()
-        for number in noted:
+        for number in authentic:
             flood_filter.note_authentic(encode(replace(COMMAND, sequence=SEQUENCE + number)))
-        assert always_passes(flood_filter, replace(COMMAND, sequence=SEQUENCE + after)) == always
+        assert always_passes(flood_filter, replace(COMMAND, sequence=SEQUENCE + replayed)) == always
 
 
 @pytest.mark.parametrize("next_epoch", [EPOCH - 1, EPOCH + 1])
@@ -91,8 +91,8 @@ def test_a_flood_by_others_does_not_displace_the_active_operator() -> None:
     """During a flood by others that copy epoch and sequence, the active operator's commands of an old epoch pass."""
     flood_filter = new_filter()
     flood = [encode(replace(COMMAND, sequence=SEQUENCE + number)) for number in range(FLOOD_PER_S)]
-    assert passed(flood_filter, flood, from_active_operator=False) == OTHER_COMMANDS_PER_S
-    assert passed(flood_filter, [encode(replace(COMMAND, epoch=7))] * 50) == 50
+    assert count_passed(flood_filter, flood, from_active_operator=False) == OTHER_COMMANDS_PER_S
+    assert count_passed(flood_filter, [encode(replace(COMMAND, epoch=7))] * 50) == 50
 
 
 def test_a_rate_limit_counts_per_second() -> None:

@@ -98,7 +98,8 @@ def test_replayed_requests_replies_and_states_are_rejected(pair: GatewayPair) ->
         ("control", COMMAND, "query")
     ]  # the gate rejects its sequence
     assert pair.client_received == client_received
-    assert pair.server.counts["session_requests_of_another_time"] == 2  # the very first one, and the replayed one
+    # The first request, before its retry, and the replayed one.
+    assert pair.server.counts["session_requests_of_another_time"] == 2
     assert pair.client.counts["states_replayed"] == 1
 
 
@@ -135,8 +136,9 @@ def test_states_of_a_restarted_server_cause_one_request_a_second(pair: GatewayPa
     """States of a restarted server are rejected until it has answered a request, which is sent once a second."""
     restarted = GatewayPair()
     restarted.client, pair.client = pair.client, restarted.client
-    ours, theirs = vars(restarted.server._authenticator), vars(pair.server._authenticator)
-    ours["_key"], ours["_operators"] = theirs["_key"], theirs["_operators"]
+    restarted_vehicle, vehicle = vars(restarted.server._authenticator), vars(pair.server._authenticator)
+    for name in ("_key", "_operators"):
+        restarted_vehicle[name] = vehicle[name]
     requested, times = [], []
     for number in range(100):
         restarted.server.send(Send("state", b"state"))
@@ -145,7 +147,7 @@ def test_states_of_a_restarted_server_cause_one_request_a_second(pair: GatewayPa
         restarted.client.receive("state", state.payload, Now(number * NS_PER_S // 50, 0), None)
         requested += pair.in_flight
         times += [number] * len(pair.in_flight)
-    assert [each.channel for each in requested] == ["session", "session"]
+    assert [send.channel for send in requested] == ["session", "session"]
     assert times == [0, 50]
     assert ("state", b"state") not in pair.client_received
     restarted.server.receive("session", requested[-1].payload, Now(0, 0), "query")
@@ -211,7 +213,7 @@ def test_a_retry_is_sent_in_another_thread() -> None:
     thread, sends = sent.get(timeout=10)
     assert thread is not threading.current_thread()
     assert thread.daemon
-    assert [each.channel for each in sends] == ["session"]
+    assert [send.channel for send in sends] == ["session"]
 
 
 def test_states_are_rate_limited(pair: GatewayPair) -> None:
@@ -220,7 +222,7 @@ def test_states_are_rate_limited(pair: GatewayPair) -> None:
         pair.client.receive("state", bytes(200), Now(2 * NS_PER_S, 0), None)
     assert pair.client.counts["states_screened_out"] == 10_000 - STATES_PER_S
     assert pair.client.counts["states_forged"] == STATES_PER_S
-    assert not [each for each in pair.client_received if each[0] == "state"]
+    assert not [payload for channel, payload in pair.client_received if channel == "state"]
 
 
 def test_a_flood_does_not_displace_authentic_messages(pair: GatewayPair) -> None:
@@ -233,9 +235,9 @@ def test_a_flood_does_not_displace_authentic_messages(pair: GatewayPair) -> None
     pair.server.send(Send("session_reply", GRANTED, "query"))
     pair.deliver_all()
     for flooded in (pair.client, pair.server):
-        channel, true = ("state", state.payload) if flooded is pair.client else ("session", query.payload)
+        channel, authentic = ("state", state.payload) if flooded is pair.client else ("session", query.payload)
         for number in range(2_000):
-            flooded.receive(channel, true if number % 2 else true[:-80] + bytes(80), now, number)
+            flooded.receive(channel, authentic if number % 2 else authentic[:-80] + bytes(80), now, number)
     pair.in_flight.clear()
     pair.server.send(Send("state", b"new"))
     pair.client.send(Send("session", ACQUIRE))

@@ -17,8 +17,8 @@ STAMP_NS = 1_790_000_000_123_456_789
 def through_rtp(access_units: list[bytes], lost: int | None = None) -> list[AccessUnit]:
     """Send access units as packets, of which one may be lost, and return the access units that arrive."""
     packetizer, jitter_buffer, depacketizer = Packetizer(7, 65_530), JitterBuffer(), Depacketizer()
-    packets = [each for number, unit in enumerate(access_units) for each in packetizer.packetize(unit, number)]
-    assert len(packets) == len(access_units), "one packet each"
+    packets = [packet for number, unit in enumerate(access_units) for packet in packetizer.packetize(unit, number)]
+    assert len(packets) == len(access_units), "one packet for each access unit"
     ordered = [
         pair
         for number, packet in enumerate(packets)
@@ -82,7 +82,9 @@ def test_a_lost_picture_damages_no_other() -> None:
     assert [unit.complete for unit in units] == [True, True, True]
     received = [codec.decode(unit.data) for unit in units]
     assert [
-        np.array_equal(each.picture, picture(number)) for each, number in zip(received, (0, 2, 3), strict=True) if each
+        np.array_equal(rendered.picture, picture(number))
+        for rendered, number in zip(received, (0, 2, 3), strict=True)
+        if rendered
     ]
     assert not codec._pictures
 

@@ -161,7 +161,7 @@ def test_keyframe_after_damage(access_units: list[bytes]) -> None:
 
 
 def test_lost_access_units(access_units: list[bytes]) -> None:
-    """After two consecutive lost frames each access unit gives a picture, and the next keyframe gives its own."""
+    """After two consecutive losses each access unit gives a picture; the next keyframe decodes to its own picture."""
     receiver = Decoder()
     receiver.decode(access_units[0])
     for number in range(3, 15):

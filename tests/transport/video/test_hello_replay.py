@@ -25,8 +25,8 @@ RTCP = bytes.fromhex("80c900010000000b")
 FRAME_NS, PACKETS_PER_FRAME = NS_PER_S // 30, 5
 REPORT_NS = 500 * NS_PER_MS
 POLL_NS = 5 * NS_PER_MS
-START_NS, END_NS = 2 * NS_PER_S, 8 * NS_PER_S
-"""The attack lasts from start to end; the path is open before it."""
+ATTACK_START_NS, ATTACK_END_NS = 2 * NS_PER_S, 8 * NS_PER_S
+"""The path is open before the attack."""
 
 pytestmark = pytest.mark.usefixtures("srtp")
 
@@ -39,7 +39,8 @@ def srtp() -> None:
 class Path:
     """A server that sends encrypted video, a client that receives it, and the network between them.
 
-    `fate` returns the delays at which a datagram arrives, none for a lost one, from source and content.
+    `fate` takes the source and the content of a datagram, and returns the delays with which its copies arrive; a lost
+    datagram has none.
     """
 
     def __init__(self, one_way_ns: int) -> None:
@@ -56,7 +57,7 @@ class Path:
         self.at_attacker: Callable[[bytes], None] = lambda _datagram: None
         self.fate: Callable[[Address, bytes], tuple[int, ...]] = lambda _source, _datagram: (one_way_ns,)
         self.arrivals: list[tuple[int, bool]] = []
-        """Of each video packet at the client: the time, and whether it could be decrypted."""
+        """For each video packet at the client, when it arrived, and whether the client could decrypt it."""
         self.sent = 0
         self._packets = count(1)
         self._events: list[tuple[int, int, Callable[[], None]]] = []
@@ -77,7 +78,7 @@ class Path:
 
         self.at(since_ns, repeat)
 
-    def run(self, until_ns: int = END_NS) -> None:
+    def run(self, until_ns: int = ATTACK_END_NS) -> None:
         """Run until a time."""
         while self._events and self._events[0][0] <= until_ns:
             self.now_ns, _, action = heapq.heappop(self._events)
@@ -88,11 +89,11 @@ class Path:
         for delay_ns in self.fate(source, datagram):
             self.at(self.now_ns + delay_ns, lambda: self._arrive(source, target, datagram))
 
-    def readable(self, begin_ns: int = START_NS, end_ns: int = END_NS) -> list[bool]:
+    def readable(self, begin_ns: int = ATTACK_START_NS, end_ns: int = ATTACK_END_NS) -> list[bool]:
         """Return for each packet that arrived in this time whether the client could decrypt it."""
         return [readable for at_ns, readable in self.arrivals if begin_ns <= at_ns < end_ns]
 
-    def longest_gap_ns(self, begin_ns: int = START_NS, end_ns: int = END_NS) -> int:
+    def longest_gap_ns(self, begin_ns: int = ATTACK_START_NS, end_ns: int = ATTACK_END_NS) -> int:
         """Return the longest time without readable video."""
         times_ns = [at_ns for at_ns, readable in self.arrivals if readable and begin_ns <= at_ns < end_ns]
         edges_ns = [begin_ns, *times_ns, end_ns]
@@ -150,11 +151,11 @@ class Path:
 
 def replay_hello(path: Path, source: Address, rate_hz: int) -> None:
     """Replay the first hello from `source` during the attack."""
-    path.every(NS_PER_S // rate_hz, lambda: path.send(source, SERVER, path.overheard[0]), START_NS)
+    path.every(NS_PER_S // rate_hz, lambda: path.send(source, SERVER, path.overheard[0]), ATTACK_START_NS)
 
 
 def hellos(path: Path) -> list[bytes]:
-    return [each for each in path.overheard if each[4] == 1]
+    return [datagram for datagram in path.overheard if datagram[4] == 1]
 
 
 @pytest.mark.parametrize(("rate_hz", "one_way_ms"), [(100, 100), (400, 25)])
@@ -189,9 +190,9 @@ def test_a_replayed_hello_neither_moves_nor_stops_the_video(source: Address) -> 
             path.send(source, SERVER, datagram)
             path.send(SERVER, HOME, datagram)
 
-    path.every(10 * NS_PER_MS, replay_everything, START_NS)
+    path.every(10 * NS_PER_MS, replay_everything, ATTACK_START_NS)
     path.at_attacker = lambda challenge: path.send(SERVER, HOME, challenge)
-    path.run(END_NS + NS_PER_S)
+    path.run(ATTACK_END_NS + NS_PER_S)
     assert path.server.open_address(path.now_ns) == HOME
     assert sum(path.readable(0)) >= path.sent - 3 * 30 * PACKETS_PER_FRAME
     assert path.longest_gap_ns() < 2 * FRAME_NS
@@ -293,12 +294,12 @@ def test_a_client_that_restarts_opens_the_path_with_its_own_token(token: bytes |
             path.send(HOME, SERVER, datagram)
             path.send(ATTACKER, SERVER, datagram)
 
-    path.at(START_NS, restart)
-    path.run(START_NS)
+    path.at(ATTACK_START_NS, restart)
+    path.run(ATTACK_START_NS)
     before = list(path.overheard)
-    path.every(20 * NS_PER_MS, replay_the_client_before, START_NS)
+    path.every(20 * NS_PER_MS, replay_the_client_before, ATTACK_START_NS)
     path.run()
-    late_ns = START_NS + NS_PER_S
+    late_ns = ATTACK_START_NS + NS_PER_S
     assert path.server.open_address(path.now_ns) == (HOME if token else None)
     assert all(path.readable(late_ns))
     assert (len(path.readable(late_ns)) > 700) == (token is not None)
@@ -309,7 +310,7 @@ def test_a_second_client_with_another_token_has_no_effect() -> None:
     path = Path(25 * NS_PER_MS)
     second = PathClient(OTHER_TOKEN, partial(SrtpCipher, "client"))
     for source in (ATTACKER, MOVED, HOME):
-        path.every(20 * NS_PER_MS, lambda source=source: path.send(source, SERVER, second.hello(0)), START_NS)  # type: ignore[misc]
+        path.every(20 * NS_PER_MS, lambda source=source: path.send(source, SERVER, second.hello(0)), ATTACK_START_NS)  # type: ignore[misc]
     path.run()
     assert path.server.wrong_token > 800
     assert all(path.readable())

@@ -267,12 +267,12 @@ def test_few_copies_of_a_hello_get_a_challenge() -> None:
     server, client = new_server(), PathClient(TOKEN)
     hello = client.hello(T0)
     challenges = [server.receive(hello, ("198.51.100.7", port), T0) for port in range(100)]
-    assert sum(each is not None for each in challenges) == 4
+    assert sum(challenge is not None for challenge in challenges) == 4
     assert server.receive(client.hello(T0), HOME, T0) is not None
 
 
 def test_an_open_path_keeps_its_cipher() -> None:
-    """A second answer from the address of the path changes no key while the path is open, and opens it afterwards."""
+    """A second answer from the path's address changes no key while the path is open, and reopens a closed path."""
     server, client = new_server(), PathClient(TOKEN)
     open_path(server, client, HOME, T0)
     cipher = server.cipher

@@ -8,7 +8,7 @@ from lavt.transport.rtp.fec import RepairSender
 from lavt.transport.rtp.ntp_time import elapsed_to_ntp, ntp_to_short
 from lavt.transport.rtp.rtcp import BitRateLimit, Feedback, ReceptionReport, parse_announcement
 from lavt.transport.rtp.rtcp_xr import ReferenceTime, round_trip_of_answer_ns
-from lavt.transport.rtp.rtp import Packetizer
+from lavt.transport.rtp.rtp import MAX_PACKET_BYTES, RTP_HEADER_BYTES, Packetizer
 from lavt.transport.video.stamp import rtp_timestamp
 from lavt.transport.video.stream_sender import StreamSender
 
@@ -75,13 +75,14 @@ def test_forget_receiver_resets_the_feedback() -> None:
     assert sender.bit_rate_limit_bps is None
 
 
-def test_a_limit_is_of_this_stream_and_of_its_payload() -> None:
+def test_a_limit_applies_to_this_stream_and_to_its_payload() -> None:
     """A limit of another stream is ignored; the headers that a limit includes are subtracted."""
     sender = stream()
     sender.receive_feedback(Feedback(limits=(BitRateLimit(OTHER, 10**6, 0),)), 0)
     assert sender.bit_rate_limit_bps is None
-    sender.receive_feedback(Feedback(limits=(BitRateLimit(SSRC, 10**6, 40),)), 0)
-    assert sender.bit_rate_limit_bps == 10**6 * 1188 // 1228
+    limit_bps, overhead_bytes, payload_bytes = 10**6, 40, MAX_PACKET_BYTES - RTP_HEADER_BYTES
+    sender.receive_feedback(Feedback(limits=(BitRateLimit(SSRC, limit_bps, overhead_bytes),)), 0)
+    assert sender.bit_rate_limit_bps == limit_bps * payload_bytes // (payload_bytes + overhead_bytes)
 
 
 def test_the_first_frame_has_a_report() -> None:
@@ -103,7 +104,7 @@ def test_sender_reports() -> None:
             announcement = parse_announcement(datagram)
             (report,) = announcement.reports
             assert (report.ssrc, report.rtp_timestamp) == (SSRC, rtp_timestamp(at(at_ns).wall_ns))
-            payload_bytes = sum(len(each) - 12 for each in packets.media)
+            payload_bytes = sum(len(packet) - RTP_HEADER_BYTES for packet in packets.media)
             assert report.octets == payload_bytes * report.packets // len(packets.media)
             reports.append((at_ns // NS_PER_MS, report.packets // len(packets.media), announcement.answers))
     assert [(ms, frames, len(answers)) for ms, frames, answers in reports] == [(0, 1, 1), (500, 6, 0), (1000, 11, 0)]

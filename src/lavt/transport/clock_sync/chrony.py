@@ -22,12 +22,12 @@ from lavt.transport.clock_sync.persistent_process import Completed, PersistentPr
 
 SOURCE = "chrony"
 REPORTS = ("tracking", "ntpdata")
-"""Without root only the first of these is available."""
+"""The reports that chronyc is asked for; without root only the first is available."""
 TRACKING_FIELDS = 14
 NTPDATA_FIELDS = 34
 SYNCHRONISED = {"Normal", "Insert second", "Delete second"}
 LOCAL_REFERENCE = "7F7F0101"
-"""Reference of a chronyd without a source whose own clock is the reference (directive `local`)."""
+"""The reference that chronyd reports while it has no source and uses its own clock (directive `local`)."""
 
 ABSENT = "chrony is not installed"
 NOT_RUNNING = "chrony is not running"
@@ -43,11 +43,11 @@ class Chronyc(PersistentProcess):
     """chronyc's answer to the unknown command, which follows its answers to all others."""
 
     def encode(self, command: Sequence[str]) -> str:
-        """Return each word as a command of its own, followed by a command that chronyc does not know."""
-        return "".join(f"{each}\n" for each in (*command, self.UNKNOWN_COMMAND))
+        """Return each word as a separate command, followed by a command that chronyc does not know."""
+        return "".join(f"{word}\n" for word in (*command, self.UNKNOWN_COMMAND))
 
     def parse_answer(self, answer: bytes) -> Completed | None:
-        """Return the output before chronyc's answer to the unknown command; None: that answer is not there yet."""
+        """Return the output before chronyc's answer to the unknown command, or None before that answer has arrived."""
         output = answer.decode(errors="replace")
         return Completed(0, output.removesuffix(self.END)) if output.endswith(self.END) else None
 
@@ -74,7 +74,7 @@ def parse_chrony(host: str, answer: str, before: Now, after: Now) -> ClockReport
     if tracking is None:
         return unknown_clock(middle, host, SOURCE, NOT_RUNNING)
     reference_s, correction_s, skew_ppm, delay_s, dispersion_s = (
-        parse_number(tracking[at]) for at in (3, 4, 9, 10, 11)
+        parse_number(tracking[column]) for column in (3, 4, 9, 10, 11)
     )
     if (
         tracking[13] not in SYNCHRONISED
@@ -103,16 +103,16 @@ def parse_chrony(host: str, answer: str, before: Now, after: Now) -> ClockReport
         peer_delay_s=peer_delay_s,
         peer_dispersion_s=peer_dispersion_s,
         good_samples=int(peer[33]) if peer and peer[33].isascii() and peer[33].isdigit() else None,
-        # Not the next field: that is a whole number, and 0 if chrony polls twice a second.
+        # The next field has the interval in whole seconds, which is 0 if chrony polls twice a second.
         poll_s=2.0**poll_log2 if poll_log2 is not None and -7 <= poll_log2 <= 24 else None,
         status="its own clock is the reference" if tracking[0] == LOCAL_REFERENCE else "",
     )
 
 
 def _parse_numbers(row: Sequence[str] | None, columns: Sequence[int]) -> list[float | None]:
-    """Return columns that cannot be negative, with None for invalid values and for all if there is no row."""
-    found = [None if row is None else parse_number(row[at]) for at in columns]
-    return [each if _not_negative(each) else None for each in found]
+    """Return the numbers in columns that cannot be negative; None for an invalid value, and for all without a row."""
+    numbers = [None if row is None else parse_number(row[column]) for column in columns]
+    return [number if _not_negative(number) else None for number in numbers]
 
 
 def _not_negative(*numbers: float | None) -> bool:

@@ -31,7 +31,7 @@ class ClockReport(Struct, frozen=True):
     bound_s: float | None = None
     """The largest error of the correction; None: unknown."""
     status: str = ""
-    """Why there is no correction, for people."""
+    """Why there is no correction, or what is special about it; for people."""
     asking_s: float = 0.0
     """How long the query took; the clocks were read in its middle."""
     follows: str = ""
@@ -80,7 +80,7 @@ def _addresses(ipv4_routes: str, ipv6_addresses: str) -> tuple[str, ...]:
         digits = line.partition(" ")[0]
         if len(digits) == 32:
             found.add(":".join(digits[start : start + 4] for start in range(0, 32, 4)))
-    return tuple(sorted({address for each in found if (address := plain_address(each))} - _LOOPBACK))
+    return tuple(sorted({address for text in found if (address := plain_address(text))} - _LOOPBACK))
 
 
 _LOOPBACK = {"127.0.0.1", "::1"}
@@ -113,13 +113,13 @@ def query_clock(
 ) -> ClockReport | None:
     """Run a program that reports on this host's clock, and parse its output.
 
-    `parse` gets the host, the output, and the clocks before and after. Return None if there was no answer in time: that
-    is a missed poll, and no statement about the clock.
+    `parse` takes the host, the output, and readings of the clocks before and after the query. Return None if there was
+    no answer in time: that is a missed poll, and no statement about the clock.
     """
     host, before = kernel_identity(), clock.now()
     completed = run(command, TIMEOUT_S)
     after = clock.now()
-    if completed is None or after.mono_ns - before.mono_ns > TIMEOUT_S * NS_PER_S:  # or this thread was delayed
+    if completed is None or after.mono_ns - before.mono_ns > TIMEOUT_S * NS_PER_S:  # late, or this thread was delayed
         return None
     if completed.code == NOT_FOUND:
         return unknown_clock(before, host, source, absent)

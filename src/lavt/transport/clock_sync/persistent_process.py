@@ -1,4 +1,4 @@
-"""A persistent process that answers queries, so that no query starts a process from here.
+"""A persistent process that answers queries, so that no query makes this process start another one.
 
 Starting a process blocks every thread of this one until the new program is loaded (Python keeps its lock over
 vfork(2)): 10 ms and more on a slow machine, once a second. So a persistent program is queried, or a persistent shell
@@ -65,17 +65,17 @@ class PersistentProcess(ABC):
                 return self._query(self.encode(command), timeout_s)
             except FileNotFoundError:
                 return Completed(NOT_FOUND, "")
-            except OSError:  # it was killed: the next query starts another
+            except OSError:  # the process was killed: the next query starts another one
                 self._kill()
                 return None
 
     def close(self) -> None:
-        """End the process; no command starts another."""
+        """End the process; later commands do not start another one."""
         with self._lock:
             self._is_closed = True
             self._kill()
 
-    def _query(self, encode: str, timeout_s: float) -> Completed | None:
+    def _query(self, encoded_command: str, timeout_s: float) -> Completed | None:
         if self._process is None:
             self._process = subprocess.Popen(  # noqa: S603 (the program is one of the two in the code)
                 self.program,
@@ -89,7 +89,7 @@ class PersistentProcess(ABC):
                     os.setpriority(os.PRIO_PROCESS, self._process.pid, self.niceness)
         assert self._process.stdin is not None  # noqa: S101 (Popen was called with a pipe)
         assert self._process.stdout is not None  # noqa: S101
-        os.write(self._process.stdin.fileno(), encode.encode())
+        os.write(self._process.stdin.fileno(), encoded_command.encode())
         limit_ns = self._clock.now().mono_ns + round(timeout_s * NS_PER_S)
         answer, output = b"", self._process.stdout.fileno()
         while (completed := self.parse_answer(answer)) is None:
@@ -124,7 +124,7 @@ class Shell(PersistentProcess):
     """Prefix of the line after a program's output."""
 
     def encode(self, command: Sequence[str]) -> str:
-        """Return a command line with every argument quoted."""
+        """Return a command line with every argument quoted, which also prints the exit code."""
         return f"{shlex.join(command)} 2>/dev/null </dev/null; printf '\\n{self.END} %s\\n' $?\n"
 
     def parse_answer(self, answer: bytes) -> Completed | None:

@@ -47,7 +47,7 @@ class ProbeReply(Struct, frozen=True):
 
 
 class ClockProbe(Struct, frozen=True):
-    """One exchange with all four times, as it is recorded."""
+    """One exchange with all four times (t1 to t4, in this order), as it is recorded."""
 
     sequence: int
     sent_wall_ns: int
@@ -63,7 +63,7 @@ class ClockProbe(Struct, frozen=True):
 
     @property
     def round_trip_ns(self) -> int:
-        """Time on the network. Delta is within half of it from `offset_ns`, however asymmetric the path is."""
+        """Time on the network. The error of `offset_ns` is at most half of it, however asymmetric the path is."""
         return self.arrived_wall_ns - self.sent_wall_ns - (self.answered_wall_ns - self.received_wall_ns)
 
 
@@ -80,9 +80,9 @@ def decode_request(data: bytes) -> tuple[int, int]:
 
 def encode_reply(reply: ProbeReply) -> bytes:
     """Return a reply in its wire format."""
-    known = [UNKNOWN if each is None else each for each in (reply.correction_s, reply.bound_s)]
+    estimate = [UNKNOWN if value is None else value for value in (reply.correction_s, reply.bound_s)]
     times = (reply.sent_wall_ns, reply.received_wall_ns, reply.answered_wall_ns)
-    return LAYOUT.pack(MAGIC, VERSION, REPLY, reply.sequence, *times, *known)
+    return LAYOUT.pack(MAGIC, VERSION, REPLY, reply.sequence, *times, *estimate)
 
 
 def decode_reply(data: bytes) -> ProbeReply:
@@ -90,14 +90,14 @@ def decode_reply(data: bytes) -> ProbeReply:
     sequence, sent_wall_ns, received_wall_ns, answered_wall_ns, correction_s, bound_s = _unpack(data, REPLY)
     if received_wall_ns > answered_wall_ns:
         raise BadMessage("a probe that was answered before it was received")
-    known = math.isfinite(correction_s) and 0 <= bound_s < math.inf
+    is_known = math.isfinite(correction_s) and 0 <= bound_s < math.inf
     return ProbeReply(
         sequence,
         sent_wall_ns,
         received_wall_ns,
         answered_wall_ns,
-        correction_s if known else None,
-        bound_s if known else None,
+        correction_s if is_known else None,
+        bound_s if is_known else None,
     )
 
 

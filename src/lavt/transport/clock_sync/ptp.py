@@ -31,8 +31,9 @@ def read_ptp(clock: Clock, run: Run) -> ClockReport | None:
 def parse_ptp(host: str, answer: str, before: Now, after: Now) -> ClockReport:
     """Parse pmc's answer to `PMC`, queried between two readings of the clocks; never raises.
 
-    The correction is the negative of `offsetFromMaster`. The bound is `meanPathDelay`, half of a round trip, for each
-    step to the grandmaster: an asymmetric path could hide all of it. A master's own clock is the reference.
+    The correction is the negative of `offsetFromMaster`. The bound is `meanPathDelay` (half of a round trip) times the
+    number of steps to the grandmaster, because an asymmetric path could hide an error of that size. If this host is the
+    master, its own clock is the reference: correction and bound are 0.
     """
     asking_ns = after.mono_ns - before.mono_ns
     middle = before.later(asking_ns // 2)

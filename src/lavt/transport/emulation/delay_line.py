@@ -1,8 +1,8 @@
 """Delays: a `DelayModel` computes the delay of an item, and a `DelayLine` queues items until they are due.
 
-The relay and the virtual runtime both use these. A model draws its jitter by the item's index from a named stream, so
-that runs with one seed stay paired whatever else is drawn. A line keeps the order of its items, unless an
-`EmulatedLink` reorders them.
+The relay and the virtual runtime both use these. A model draws the jitter of an item by the item's index from a named
+random-number stream, so two runs with one seed get the same jitter, whatever else they draw. A line keeps the order of
+its items; only an `EmulatedLink` may reorder them.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Lognormal:
 
 @dataclass(frozen=True, slots=True)
 class DelayModel:
-    """A constant delay plus optional jitter, which is drawn for each index from the stream `name` of `seed`."""
+    """A constant delay plus optional jitter, drawn for each index from the random-number stream `name` of `seed`."""
 
     constant_ms: float
     jitter: Lognormal | None = None
@@ -46,12 +46,12 @@ class DelayModel:
 
 @lru_cache(maxsize=256)
 def _lognormal_ms(seed: int, name: str, index: int, delay: Lognormal) -> float:
-    """Draw a lognormal delay. The packets of one frame share an index, hence the cache."""
-    return delay.median_ms * float(_jitter(seed, name).at(index).lognormal(0.0, delay.sigma))
+    """Draw a lognormal delay. It is cached because the packets of one frame share an index."""
+    return delay.median_ms * float(_jitter_stream(seed, name).at(index).lognormal(0.0, delay.sigma))
 
 
 @lru_cache(maxsize=4)
-def _jitter(seed: int, name: str) -> IndexedStream:
+def _jitter_stream(seed: int, name: str) -> IndexedStream:
     return IndexedStream(seed, name)
 
 
@@ -62,23 +62,26 @@ class DelayLine:
         self.delay = delay
         self.link = link
         self._waiting: list[tuple[int, int, Any]] = []
-        self._number = 0
-        self._last_ns = 0
+        """A heap of due time, number and item; the number keeps the order of items that are due at the same time."""
+        self._pushed = 0
+        """How many items were pushed; the number of the last one."""
+        self._last_due_ns = 0
 
     def push(self, item: Any, now_ns: int, index: int, size_bytes: int = 0) -> int | None:
-        """Queue `item`, which arrived at `now_ns`, and return when it is due; None: the link lost it.
+        """Queue `item`, which arrived at `now_ns`, and return when it is due, or None if the link lost it.
 
-        Without a link an item is due after its delay, but not before any earlier item.
+        `index` selects the delay of the item, and `size_bytes` is its size for the rate of the link. Without a link an
+        item is due after its delay, but not before any earlier item.
         """
         delay_ns = self.delay.delay_ns(index)
         if self.link is None:
-            due_ns = self._last_ns = max(now_ns + delay_ns, self._last_ns)
-        elif (left_ns := self.link.departure_ns(now_ns, delay_ns, size_bytes)) is None:
+            due_ns = self._last_due_ns = max(now_ns + delay_ns, self._last_due_ns)
+        elif (departure_ns := self.link.departure_ns(now_ns, delay_ns, size_bytes)) is None:
             return None
         else:
-            due_ns = left_ns
-        self._number += 1
-        heapq.heappush(self._waiting, (due_ns, self._number, item))
+            due_ns = departure_ns
+        self._pushed += 1
+        heapq.heappush(self._waiting, (due_ns, self._pushed, item))
         return due_ns
 
     def next_due_ns(self) -> int | None:

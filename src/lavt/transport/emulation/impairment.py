@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 from msgspec import Struct
 
 from lavt.errors import UserError
 
 ORDER_RATE_BPS: Final = 10_000_000_000
-"""The rate of a flow without a rate limit. netem keeps order only with a rate; this one costs 1 us per packet."""
+"""The rate that netem gets for a flow without a rate limit, because netem keeps packets in order only if it has a rate.
+This one adds 1 us to the delay of each packet."""
 
 Distribution = Literal["normal", "uniform", "pareto", "paretonormal"]
 DISTRIBUTIONS: Final[tuple[Distribution, ...]] = ("normal", "uniform", "pareto", "paretonormal")
@@ -22,7 +23,7 @@ class Impairment(Struct, frozen=True):
 
     delay_ms: float = 0.0
     jitter_ms: float = 0.0
-    """Standard deviation of the delay; for a uniform distribution half the width."""
+    """Standard deviation of the delay; for a uniform distribution half of its width."""
     jitter_correlation: float = 0.0
     """Correlation of the delay with the delay 20 ms before; see `transport/netem/correlated_jitter.py`."""
     jitter_distribution: Distribution = "normal"
@@ -30,7 +31,7 @@ class Impairment(Struct, frozen=True):
     loss_burst_packets: float = 0.0
     """Mean length of a loss burst (Gilbert-Elliott model); with 0 or 1 each packet is lost independently."""
     rate_bps: int = 0
-    """0: no limit."""
+    """The largest bit rate; 0: no limit."""
     reorder: float = 0.0
     """Share of packets that are not delayed and therefore overtake others."""
 
@@ -41,12 +42,12 @@ class Impairment(Struct, frozen=True):
 
     @property
     def longest_ms(self) -> float:
-        """A delay that hardly any packet exceeds."""
+        """A delay that hardly any packet exceeds: the mean plus four standard deviations."""
         return self.delay_ms + 4 * self.jitter_ms
 
 
 class ImpairedFlow(Struct, frozen=True):
-    """The packets of one protocol that a machine sends from (`source`) or to (`destination`) a port."""
+    """The packets of one protocol that a machine sends with `port` as their source or destination port (`end`)."""
 
     name: Literal["video", "control", "state"]
     protocol: Literal["udp", "tcp"]
@@ -74,7 +75,7 @@ ALWAYS_EXEMPT: Final = (ExemptPort("udp", 123, "NTP"), ExemptPort("tcp", 22, "ss
 
 def check_impairment(name: str, impairment: Impairment) -> None:
     """Raise `UserError` for values that are out of range or contradict each other."""
-    numbers = [getattr(impairment, name) for name in Impairment.__struct_fields__ if name != "jitter_distribution"]
+    numbers = [getattr(impairment, field) for field in Impairment.__struct_fields__ if field != "jitter_distribution"]
     if not all(math.isfinite(number) and number >= 0 for number in numbers):
         raise UserError(f"{name}: the values of an impairment are finite and not negative: correct {impairment}")
     if max(impairment.loss, impairment.reorder, impairment.jitter_correlation) >= 1:
@@ -83,7 +84,7 @@ def check_impairment(name: str, impairment: Impairment) -> None:
         raise UserError(f"{name}: jitter_distribution is one of {', '.join(DISTRIBUTIONS)}")
     if impairment.jitter_correlation and impairment.jitter_distribution != "normal":
         raise UserError(f"{name}: correlated jitter is normal: give jitter_distribution normal, or no correlation")
-    if impairment.loss_burst_packets > 1 and gilbert(impairment)[0] > 1:
+    if impairment.loss_burst_packets > 1 and gilbert(impairment).begin > 1:
         raise UserError(
             f"{name}: a loss of {impairment.loss:g} in bursts of {impairment.loss_burst_packets:g} packets leaves "
             "no room between them: give longer bursts or less loss"
@@ -112,18 +113,18 @@ def check_flows(flows: Sequence[ImpairedFlow], exempt: Sequence[ExemptPort] = ()
     """Raise `UserError` for an impairment that netem cannot produce, or a flow that covers an exempt port."""
     if not flows:
         raise UserError("there is no flow to delay: name at least one")
-    taken: dict[tuple[str, int, str], ImpairedFlow] = {}
+    flow_of_packets: dict[tuple[str, int, str], ImpairedFlow] = {}
     for flow in flows:
         check_netem_impairment(flow.name, flow.impairment)
         if not 1 <= flow.port <= 65_535:
             raise UserError(f"{flow.name}: {flow.port} is not a port number: give one between 1 and 65535")
-        for port in (*ALWAYS_EXEMPT, *exempt):
-            if (flow.protocol, flow.port) == (port.protocol, port.port):
+        for exempt_port in (*ALWAYS_EXEMPT, *exempt):
+            if (flow.protocol, flow.port) == (exempt_port.protocol, exempt_port.port):
                 raise UserError(
-                    f"{flow.description} would cover {port.service} (port {port.port}), which must never be delayed: "
-                    "give one of the two another port"
+                    f"{flow.description} would cover {exempt_port.service} (port {exempt_port.port}), "
+                    "which must never be delayed: give one of the two another port"
                 )
-        other = taken.setdefault((flow.protocol, flow.port, flow.end), flow)
+        other = flow_of_packets.setdefault((flow.protocol, flow.port, flow.end), flow)
         if other is not flow:
             raise UserError(
                 f"{flow.description} selects the same packets as {other.description}: give one of them another port"
@@ -137,7 +138,14 @@ def has_loss_bursts(impairment: Impairment) -> bool:
     return impairment.loss > 0 and impairment.loss_burst_packets > 1
 
 
-def gilbert(impairment: Impairment) -> tuple[float, float]:
-    """Return the probabilities per packet that a burst begins and ends, for the impairment's loss and mean burst."""
-    ends = 1 / impairment.loss_burst_packets
-    return impairment.loss * ends / (1 - impairment.loss), ends
+class BurstProbabilities(NamedTuple):
+    """The probabilities of the Gilbert-Elliott model, per packet: that a loss burst begins, and that it ends."""
+
+    begin: float
+    end: float
+
+
+def gilbert(impairment: Impairment) -> BurstProbabilities:
+    """Return the probabilities that give the impairment's loss and mean length of a burst."""
+    end = 1 / impairment.loss_burst_packets
+    return BurstProbabilities(impairment.loss * end / (1 - impairment.loss), end)

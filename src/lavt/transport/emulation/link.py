@@ -1,10 +1,11 @@
 """An emulated link without input and output: it decides which packets are lost and when the others leave.
 
-The virtual runtime and the relay use it. It emulates netem as `docs/netem.md` describes it, in the kernel's order: a
-packet is lost or not; of the others a share is reordered; the rest wait for their delay in order, and then for the
-rate. Beyond netem, a trace can define the delay or the capacity. Random numbers are drawn by packet number, or by time
-slot, from one stream per impairment. So adding an impairment does not change the others, and runs with one seed stay
-paired.
+The virtual runtime and the relay use it. It emulates netem as `docs/netem.md` describes it, in the kernel's order.
+First it decides whether a packet is lost. Of the other packets it reorders a share: these are not delayed. The rest
+wait in order, first for their delay and then for the rate. Unlike netem, it can also take the delay or the capacity
+from a trace. Each impairment has a random-number stream of its own, from which it draws by packet number or by time
+slot. So an additional impairment does not change the draws of the others, and two runs with one seed get the same
+draws.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ SLOT_NS: Final = 20 * NS_PER_MS
 
 @dataclass(frozen=True, slots=True)
 class LinkInjection:
-    """The impairment of one direction of a flow; `name` is the prefix of its random streams of `seed`."""
+    """The impairment of one direction of a flow; `name` is the prefix of its random-number streams."""
 
     impairment: Impairment
     seed: int
@@ -54,7 +55,8 @@ def check_injection(injected: LinkInjection) -> None:
 class EmulatedLink:
     """One direction of an emulated link; times are on the caller's clock, and a trace begins at `start_ns`.
 
-    Public counters, in packets: `lost` at random, `dropped` because the queue was full, `overtook` others.
+    Public counters, in packets: `packets` arrived, of which some were `lost` at random, some were `dropped` because the
+    queue was full, and some `overtook` others.
     """
 
     def __init__(self, injected: LinkInjection, start_ns: int = 0) -> None:
@@ -67,12 +69,16 @@ class EmulatedLink:
         self._reorder_draws = Draws(seed, f"{name} reorder")
         self._jitter_draws = Draws(seed, f"{name} jitter")
         self._correlated_jitter = CorrelatedProcess(seed, f"{name} wander", impairment.jitter_correlation)
-        self._deviations = quantiles(impairment.jitter_distribution)
+        self._jitter_quantiles = quantiles(impairment.jitter_distribution)
         self._delays = injected.trace if isinstance(injected.trace, DelayTrace) else None
         capacity = injected.trace if isinstance(injected.trace, CapacityTrace) else None
         self._bottleneck = Bottleneck(injected.queue_packets, impairment.rate_bps, capacity, start_ns)
-        self._early_ns = self._delayed_ns = self._last_ns = start_ns
-        """When the last reordered packet left, when the last delayed packet's delay ended, and when it left."""
+        self._reordered_departure_ns = start_ns
+        """When the last reordered packet left."""
+        self._delay_end_ns = start_ns
+        """When the delay of the last delayed packet ended."""
+        self._delayed_departure_ns = start_ns
+        """When the last delayed packet left, after it had waited for the rate."""
 
     @property
     def counts(self) -> dict[str, int]:
@@ -91,17 +97,17 @@ class EmulatedLink:
             self.lost += 1
             return None
         if impairment.reorder and self._reorder_draws.at(number) < impairment.reorder:
-            self._early_ns = max(arrived_ns + inherent_ns, self._early_ns)
-            self.overtook += self._early_ns < self._last_ns
-            return self._early_ns
+            self._reordered_departure_ns = max(arrived_ns + inherent_ns, self._reordered_departure_ns)
+            self.overtook += self._reordered_departure_ns < self._delayed_departure_ns
+            return self._reordered_departure_ns
         delay_ns = max(0, inherent_ns + self._injected_ns(arrived_ns, number))
-        self._delayed_ns = max(arrived_ns + delay_ns, self._delayed_ns)
-        left_ns = self._bottleneck.departure_ns(self._delayed_ns, size_bytes + HEADER_BYTES)
-        if left_ns is None:
+        self._delay_end_ns = max(arrived_ns + delay_ns, self._delay_end_ns)
+        departure_ns = self._bottleneck.departure_ns(self._delay_end_ns, size_bytes + HEADER_BYTES)
+        if departure_ns is None:
             self.dropped += 1
             return None
-        self._last_ns = left_ns
-        return left_ns
+        self._delayed_departure_ns = departure_ns
+        return departure_ns
 
     def _injected_ns(self, arrived_ns: int, number: int) -> int:
         """Return the injected delay; jitter can make it negative."""
@@ -110,12 +116,12 @@ class EmulatedLink:
         if impairment.jitter_ms and impairment.jitter_correlation:
             delay_ms += impairment.jitter_ms * self._correlated_jitter.at(elapsed_ns // SLOT_NS)
         elif impairment.jitter_ms:
-            delay_ms += impairment.jitter_ms * self._deviations[int(self._jitter_draws.at(number) * QUANTILES)]
+            delay_ms += impairment.jitter_ms * self._jitter_quantiles[int(self._jitter_draws.at(number) * QUANTILES)]
         return round(delay_ms * NS_PER_MS) + (0 if self._delays is None else self._delays.delay_ns(elapsed_ns))
 
 
 class Bottleneck:
-    """A queue of limited length in front of a rate or a capacity; with neither nothing waits."""
+    """A queue of limited length for packets that wait for a rate or a capacity; without either, no packet waits."""
 
     def __init__(self, queue_packets: int, rate_bps: int, capacity: CapacityTrace | None, start_ns: int) -> None:
         self._queue_packets, self._rate_bps, self._capacity, self._start_ns = (
@@ -127,41 +133,42 @@ class Bottleneck:
         self._departures_ns: deque[int] = deque()
         """Departure times of the packets in the queue."""
         self._free_ns = start_ns
-        self._number, self._left_bytes = -1, 0
-        """The last opportunity that was used, and the bytes left in it."""
+        """When the rate has sent all packets that have arrived so far."""
+        self._opportunity, self._left_bytes = -1, 0
+        """The number of the last opportunity that was used, and the bytes left in it."""
 
     def departure_ns(self, arrived_ns: int, size_bytes: int) -> int | None:
-        """Return when a packet that arrives now has passed, in order, or None if the queue is full."""
+        """Return when a packet that arrives at `arrived_ns` leaves, in order, or None if the queue is full."""
         if not (self._rate_bps or self._capacity):
             return arrived_ns
         while self._departures_ns and self._departures_ns[0] <= arrived_ns:
             self._departures_ns.popleft()
         if len(self._departures_ns) >= self._queue_packets:
             return None
-        left_ns = (
-            self._sent_ns(arrived_ns, size_bytes)
+        departure_ns = (
+            self._rate_departure_ns(arrived_ns, size_bytes)
             if self._capacity is None
-            else self._start_ns + self._delivered_ns(self._capacity, arrived_ns - self._start_ns, size_bytes)
+            else self._start_ns + self._capacity_departure_ns(self._capacity, arrived_ns - self._start_ns, size_bytes)
         )
-        self._departures_ns.append(left_ns)
-        return left_ns
+        self._departures_ns.append(departure_ns)
+        return departure_ns
 
-    def _sent_ns(self, arrived_ns: int, size_bytes: int) -> int:
-        """Return when the rate has sent a packet, after those before it."""
-        takes_ns = round(8 * size_bytes * NS_PER_S / self._rate_bps)
-        self._free_ns = max(arrived_ns, self._free_ns) + takes_ns
+    def _rate_departure_ns(self, arrived_ns: int, size_bytes: int) -> int:
+        """Return when a packet has been sent at the rate, after all earlier packets."""
+        duration_ns = round(8 * size_bytes * NS_PER_S / self._rate_bps)
+        self._free_ns = max(arrived_ns, self._free_ns) + duration_ns
         return self._free_ns
 
-    def _delivered_ns(self, capacity: CapacityTrace, elapsed_ns: int, size_bytes: int) -> int:
-        """Return when a packet's last byte is delivered.
+    def _capacity_departure_ns(self, capacity: CapacityTrace, elapsed_ns: int, size_bytes: int) -> int:
+        """Return when a packet's last byte is delivered, as a time since the start of the trace.
 
         As in Mahimahi, the rest of an opportunity goes to the next packet only if that packet is already waiting.
         """
         first = capacity.first_at(elapsed_ns)
-        if first > self._number:
-            self._number, self._left_bytes = first, OPPORTUNITY_BYTES
+        if first > self._opportunity:
+            self._opportunity, self._left_bytes = first, OPPORTUNITY_BYTES
         while size_bytes > self._left_bytes:
             size_bytes -= self._left_bytes
-            self._number, self._left_bytes = self._number + 1, OPPORTUNITY_BYTES
+            self._opportunity, self._left_bytes = self._opportunity + 1, OPPORTUNITY_BYTES
         self._left_bytes -= size_bytes
-        return capacity.time_ns(self._number)
+        return capacity.time_ns(self._opportunity)

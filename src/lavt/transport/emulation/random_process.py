@@ -1,7 +1,7 @@
-"""Random processes of a link: numbers drawn by index from named streams, and netem's distributions of jitter.
+"""Random processes of a link: numbers by index from named random-number streams, and netem's distributions of jitter.
 
-Numbers are drawn in blocks, because a generator for each packet would cost 20 us. A distribution is a table of 4096
-quantiles in standard deviations, like netem's tables (tc's `normal.dist`, `pareto.dist` and `paretonormal.dist`).
+Numbers are drawn in blocks, because making a generator for each packet would take 20 us. A distribution is a table of
+4096 quantiles in standard deviations, like netem's tables (tc's `normal.dist`, `pareto.dist` and `paretonormal.dist`).
 """
 
 from __future__ import annotations
@@ -15,15 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lavt.streams import stream
-from lavt.transport.emulation.impairment import Distribution
+from lavt.transport.emulation.impairment import BurstProbabilities, Distribution
 
-BLOCK: Final = 256
+NUMBERS_PER_BLOCK: Final = 256
 QUANTILES: Final = 4096
-LARGEST: Final = 32767 / 8192
-"""netem's tables contain 16-bit integers; 8192 is one standard deviation."""
+LARGEST_QUANTILE: Final = 32767 / 8192
+"""The largest value in netem's tables, which contain 16-bit integers; 8192 is one standard deviation."""
 PARETO_SHAPE: Final = 3.0
 
 Draw = Callable[[np.random.Generator, int], NDArray[np.float64]]
+"""Draws this many numbers from a generator."""
 
 
 def uniform(generator: np.random.Generator, count: int) -> NDArray[np.float64]:
@@ -37,7 +38,7 @@ def normal(generator: np.random.Generator, count: int) -> NDArray[np.float64]:
 
 
 class Draws:
-    """A sequence of random numbers: one for each index of the stream `name` of `seed`, in any order of access."""
+    """A random number for each index, from the random-number stream `name` of `seed`; indices can come in any order."""
 
     def __init__(self, seed: int, name: str, draw: Draw = uniform) -> None:
         self._seed, self._name, self._draw = seed, name, draw
@@ -46,35 +47,37 @@ class Draws:
 
     def at(self, index: int) -> float:
         """Return the number of this index."""
-        block = index // BLOCK
+        block = index // NUMBERS_PER_BLOCK
         if block != self._block:
             self._block = block
-            self._values = self._draw(stream(self._seed, self._name, block), BLOCK).tolist()
-        return self._values[index % BLOCK]
+            self._values = self._draw(stream(self._seed, self._name, block), NUMBERS_PER_BLOCK).tolist()
+        return self._values[index % NUMBERS_PER_BLOCK]
 
 
 @lru_cache
 def quantiles(distribution: Distribution) -> tuple[float, ...]:
     """Return one value for each of 4096 equally likely parts of a distribution, in netem's standard deviations.
 
-    The value is the middle of the part; for `pareto` it is the lower end. `uniform` is in units of its half width.
-    netem cuts `pareto` (shape 3) and `paretonormal` off at 4 standard deviations, so their true standard deviations are
-    0.82 and 0.83, and their means -0.03.
+    The value is the middle of the part; for `pareto` it is the lower end. The values of `uniform` are in units of half
+    of its width. netem's tables end at 4 standard deviations, which cuts off the tails of `pareto` (shape 3) and
+    `paretonormal`. So their true standard deviations are 0.82 and 0.83 instead of 1, and their means are -0.03 instead
+    of 0.
     """
     if distribution == "uniform":
         return tuple((2 * part + 1) / QUANTILES - 1 for part in range(QUANTILES))
-    bell = _normal()
+    normal_quantiles = _normal_quantiles()
     if distribution == "normal":
-        return bell
-    heavy = tuple(
-        min(LARGEST, ((1 - part / QUANTILES) ** (-1 / PARETO_SHAPE) - 1.5) * 4 / 3) for part in range(QUANTILES)
+        return normal_quantiles
+    pareto_quantiles = tuple(
+        min(LARGEST_QUANTILE, ((1 - part / QUANTILES) ** (-1 / PARETO_SHAPE) - 1.5) * 4 / 3)
+        for part in range(QUANTILES)
     )
     if distribution == "pareto":
-        return heavy
-    return tuple((each + 3 * other) / 4 for each, other in zip(bell, heavy, strict=True))
+        return pareto_quantiles
+    return tuple((one + 3 * other) / 4 for one, other in zip(normal_quantiles, pareto_quantiles, strict=True))
 
 
-def _normal() -> tuple[float, ...]:
+def _normal_quantiles() -> tuple[float, ...]:
     standard = NormalDist()
     return tuple(standard.inv_cdf((part + 0.5) / QUANTILES) for part in range(QUANTILES))
 
@@ -85,32 +88,38 @@ class CorrelatedProcess:
     def __init__(self, seed: int, name: str, correlation: float) -> None:
         self._draws = Draws(seed, name, normal)
         self._correlation = correlation
-        self._share = (1 - correlation**2) ** 0.5
+        self._innovation_gain = (1 - correlation**2) ** 0.5
         self._step = 0
         self._value = self._draws.at(0)
 
     def at(self, step: int) -> float:
-        """Return the deviation at a step, in standard deviations; an earlier step returns the latest deviation."""
+        """Return the deviation at a step in standard deviations; for a past step, return the current deviation."""
         while self._step < step:
             self._step += 1
-            self._value = self._correlation * self._value + self._share * self._draws.at(self._step)
+            innovation = self._innovation_gain * self._draws.at(self._step)
+            self._value = self._correlation * self._value + innovation
         return self._value
 
 
 class LossProcess:
-    """A loss process that is queried in order: independent losses, or bursts (Gilbert-Elliott model)."""
+    """Losses of packets: independent, or in bursts (Gilbert-Elliott model).
 
-    def __init__(self, seed: int, name: str, loss: float, bursts: tuple[float, float] | None) -> None:
+    `bursts` are the probabilities that a burst begins and ends; None: losses are independent, with probability `loss`.
+    `name` is the name of the random-number stream of `seed`.
+    """
+
+    def __init__(self, seed: int, name: str, loss: float, bursts: BurstProbabilities | None) -> None:
         self._draws = Draws(seed, name)
         self._loss, self._bursts = loss, bursts
-        self._bad = False
+        self._in_burst = False
 
     def is_lost(self, index: int) -> bool:
-        """Return whether the packet with this number is lost."""
+        """Return whether the packet with this number is lost; the packets must be queried in order."""
         drawn = self._draws.at(index)
         if self._bursts is None:
             return drawn < self._loss
-        begins, ends = self._bursts
-        lost = self._bad  # like the kernel: a packet's draw decides on the state of the next packet
-        self._bad = drawn < (1 - ends if lost else begins)  # small draws lose in both states: a higher loss adds losses
-        return lost
+        is_lost = self._in_burst
+        # As in the kernel, the draw of a packet decides whether the next one is lost. A small draw loses the next
+        # packet, inside and outside of a burst, so with the same draws a higher loss only adds losses.
+        self._in_burst = drawn < (1 - self._bursts.end if is_lost else self._bursts.begin)
+        return is_lost

@@ -1,8 +1,8 @@
 """A relay that delays without netem: one thread carries two UDP flows and delays the packets that netem would delay.
 
-Video, server to client: RTP and sender reports are delayed; the rest of that flow (challenges) is not. Control: packets
-from the client's router to the server's are delayed; packets back are delayed only where the state is to be delayed,
-too. Nothing upstream of the video (hellos, RTCP) is ever delayed.
+Video, from the server to the client: RTP and sender reports are delayed; the challenges in the same flow are not.
+Video, from the client to the server (hellos, RTCP): nothing is delayed. Control: packets from the client's router to
+the server's are delayed; packets in the other direction are delayed only if the state is to be delayed, too.
 """
 
 from __future__ import annotations
@@ -25,18 +25,19 @@ from lavt.transport.emulation.link import EmulatedLink, LinkInjection
 from lavt.transport.rtp.rtcp import is_rtcp
 
 LONGEST_DATAGRAM = 65_535
-BUFFER_BYTES = 4 * 1024 * 1024
+SOCKET_BUFFER_BYTES = 4 * 1024 * 1024
 LONGEST_PAUSE_S = 0.05
-MOST_CLIENTS = 64
-"""For each flow; every client has a socket."""
-CLIENT_SILENCE_NS = 30 * NS_PER_S
+"""The longest wait of one step of the relay."""
+MAX_CLIENTS = 64
+"""Limits the clients of each flow, because every client has a socket."""
+CLIENT_TIMEOUT_NS = 30 * NS_PER_S
 """A client that sends nothing for this long loses its socket."""
 
-SAMPLES = 20_000
-"""How many of the last datagrams the relay's medians cover."""
+MAX_SAMPLES = 20_000
+"""The relay's medians cover at most this many of the last datagrams in each direction of a client."""
 
 Address = tuple[str, int]
-NONE = DelayModel(0.0)
+NO_DELAY = DelayModel(0.0)
 
 
 def is_delayed_video(datagram: bytes) -> bool:
@@ -49,13 +50,13 @@ def video_index(datagram: bytes) -> int:
 
     A sender report has the timestamp of the frame that it was sent with, and shares that frame's delay.
     """
-    at = 16 if is_rtcp(datagram) else 4
-    return int(struct.unpack_from(">I", datagram, at)[0]) if len(datagram) >= at + 4 else 0
+    offset = 16 if is_rtcp(datagram) else 4
+    return int(struct.unpack_from(">I", datagram, offset)[0]) if len(datagram) >= offset + 4 else 0
 
 
 @dataclass(frozen=True, slots=True)
 class RelayedFlow:
-    """One UDP flow through the relay: the address for clients, the server's, and the delay in each direction."""
+    """A UDP flow through the relay: the address for clients, the server's address, and the delay of each direction."""
 
     name: str
     listen: Address
@@ -63,8 +64,9 @@ class RelayedFlow:
     upstream: DelayModel
     downstream: DelayModel
     delays_downstream: Callable[[bytes], bool] = lambda _datagram: True
+    """Returns whether a datagram from the server is delayed; by default all are."""
     index_downstream: Callable[[bytes], int] | None = None
-    """Maps a datagram to the index of its delay; None: datagrams are numbered."""
+    """Maps a datagram from the server to the index of its delay; None: the index is the datagram's number."""
     upstream_injected: LinkInjection | None = None
     downstream_injected: LinkInjection | None = None
     """Impairments beyond a delay; each client has links of its own."""
@@ -76,14 +78,17 @@ class _DelayedPath:
 
     line: DelayLine
     send: Callable[[bytes], object]
-    index: Callable[[bytes], int] | None
+    delay_index: Callable[[bytes], int] | None
+    """Maps a datagram to the index of its delay; None: the index is `count`."""
     is_delayed: Callable[[bytes], bool]
     count: int = 0
+    """How many datagrams were delayed."""
     scheduled_ns: int | None = None
-    held_ns: deque[int] = field(default_factory=lambda: deque(maxlen=SAMPLES))
+    """When the relay will send the first datagram of the line; None: the line is empty."""
+    delays_ns: deque[int] = field(default_factory=lambda: deque(maxlen=MAX_SAMPLES))
     """How long the last datagrams were delayed, from arrival to departure."""
-    late_ns: deque[int] = field(default_factory=lambda: deque(maxlen=SAMPLES))
-    """How much later than due they left."""
+    lateness_ns: deque[int] = field(default_factory=lambda: deque(maxlen=MAX_SAMPLES))
+    """How long after they were due the last datagrams left."""
 
 
 @dataclass
@@ -103,10 +108,13 @@ class Relay:
         self._clock = clock
         self._selector = selectors.SelectSelector()  # epoll's timeouts are whole milliseconds, rounded up
         self._heap: list[tuple[int, int, _DelayedPath]] = []
-        self._number = 0
+        """Due time, number of the entry, and path that has a datagram due then."""
+        self._entries = 0
+        """How many entries were put on the heap; the number of the last one."""
         self.start_ns = clock.now().mono_ns
         """The time at which traces begin."""
         self.not_sent = 0
+        """How many datagrams the system did not send."""
         self._flows: list[_ActiveFlow] = []
         try:
             for flow in flows:
@@ -117,34 +125,40 @@ class Relay:
 
     def ports(self) -> dict[str, int]:
         """Return the port that was opened for each flow."""
-        return {each.flow.name: each.port for each in self._flows}
+        return {active.flow.name: active.port for active in self._flows}
 
     def held_ms(self) -> dict[str, float | None]:
         """Return for each flow and direction the median delay of its datagrams, or None if there were none.
 
         The medians cover the current clients and their last datagrams.
         """
-        return {name: _median_ms([each for path in paths for each in path.held_ns]) for name, paths in self._paths()}
+        return {
+            name: _median_ms([delay_ns for path in paths for delay_ns in path.delays_ns])
+            for name, paths in self._paths()
+        }
 
     def late_ms(self) -> dict[str, float | None]:
-        """Return the same for how much later than due the datagrams left."""
-        return {name: _median_ms([each for path in paths for each in path.late_ns]) for name, paths in self._paths()}
+        """Return for each flow and direction the median time from due to departure of its datagrams, or None."""
+        return {
+            name: _median_ms([late_ns for path in paths for late_ns in path.lateness_ns])
+            for name, paths in self._paths()
+        }
 
     def counts(self) -> dict[str, dict[str, int]]:
         """Return the packet counters of each flow and direction that has a link, over all clients so far."""
-        counts = {name: _counted(paths) for name, paths in self._paths()}
-        for each in self._flows:
-            for direction, past_counts in each.past_counts.items():
-                counts[f"{each.flow.name} {direction}"].update(past_counts)
-        return {name: dict(each) for name, each in counts.items() if each}
+        counts = {name: _sum_counts(paths) for name, paths in self._paths()}
+        for active in self._flows:
+            for direction, past_counts in active.past_counts.items():
+                counts[f"{active.flow.name} {direction}"].update(past_counts)
+        return {name: dict(counter) for name, counter in counts.items() if counter}
 
     def _paths(self) -> Iterator[tuple[str, list[_DelayedPath]]]:
-        for each in self._flows:
-            for direction, paths in each.paths().items():
-                yield f"{each.flow.name} {direction}", paths
+        for active in self._flows:
+            for direction, paths in active.paths().items():
+                yield f"{active.flow.name} {direction}", paths
 
     def step(self, longest_pause_s: float = LONGEST_PAUSE_S) -> None:
-        """Wait for a datagram, a due time or the longest pause, whichever comes first, and handle it."""
+        """Wait until a datagram arrives or is due, or the longest pause has passed; forward the datagrams."""
         self._send_due()
         pause_s = longest_pause_s
         if self._heap:
@@ -155,8 +169,8 @@ class Relay:
 
     def close(self) -> None:
         """Close all sockets; queued datagrams are lost."""
-        for each in self._flows:
-            each.close()
+        for active in self._flows:
+            active.close()
         self._selector.close()
 
     def add_socket(self, sock: socket.socket, ready: Callable[[], None]) -> None:
@@ -178,12 +192,12 @@ class Relay:
         return arrival(ancillary, self._clock.now()).mono_ns
 
     def forward(self, path: _DelayedPath, datagram: bytes, arrived_ns: int) -> None:
-        """Send a datagram inline, or when its delay, counted from its arrival, has passed."""
+        """Send a datagram inline if it is not delayed, otherwise when its delay since its arrival has passed."""
         if not path.is_delayed(datagram):
             self._send(path, datagram)
             return
         path.count += 1
-        index = path.count if path.index is None else path.index(datagram)
+        index = path.count if path.delay_index is None else path.delay_index(datagram)
         path.line.push((datagram, arrived_ns), arrived_ns, index, len(datagram))
         self._schedule(path)
 
@@ -191,22 +205,22 @@ class Relay:
         """Schedule a path for when its first datagram is due, unless it is already scheduled by then."""
         due_ns = path.line.next_due_ns()
         if due_ns is not None and (path.scheduled_ns is None or due_ns < path.scheduled_ns):
-            self._number += 1
+            self._entries += 1
             path.scheduled_ns = due_ns
-            heapq.heappush(self._heap, (due_ns, self._number, path))
+            heapq.heappush(self._heap, (due_ns, self._entries, path))
 
     def _send_due(self) -> None:
         while self._heap and self._heap[0][0] <= (now_ns := self.now_ns()):
             due_at_ns, _, path = heapq.heappop(self._heap)
             if due_at_ns != path.scheduled_ns:
-                continue  # a reordered datagram had this path scheduled earlier
+                continue  # the entry is out of date: a reordered datagram of this path was due earlier
             path.scheduled_ns = None
             while (due_ns := path.line.next_due_ns()) is not None and due_ns <= now_ns:
                 for datagram, arrived_ns in path.line.pop_due(due_ns):
                     self._send(path, datagram)
                     sent_ns = self.now_ns()
-                    path.held_ns.append(sent_ns - arrived_ns)
-                    path.late_ns.append(sent_ns - due_ns)
+                    path.delays_ns.append(sent_ns - arrived_ns)
+                    path.lateness_ns.append(sent_ns - due_ns)
             self._schedule(path)
 
     def _send(self, path: _DelayedPath, datagram: bytes) -> None:
@@ -224,7 +238,7 @@ class _ActiveFlow:
         self._relay = relay
         self._clients: dict[Address, _Client] = {}
         self.past_counts: dict[str, Counter[str]] = {"upstream": Counter(), "downstream": Counter()}
-        """Packet counters of former clients."""
+        """Packet counters of removed clients, by direction."""
         self._socket = _bound_socket(flow.listen, flow.name)
         self.port = int(self._socket.getsockname()[1])
         relay.add_socket(self._socket, self._from_clients)
@@ -252,7 +266,7 @@ class _ActiveFlow:
         downstream = self._line(flow.downstream, flow.downstream_injected)
         client = _Client(
             towards_server,
-            _DelayedPath(upstream, lambda data: towards_server.sendto(data, flow.server), None, _always),
+            _DelayedPath(upstream, lambda data: towards_server.sendto(data, flow.server), None, _is_always_delayed),
             _DelayedPath(
                 downstream,
                 lambda data: self._socket.sendto(data, address),
@@ -276,21 +290,21 @@ class _ActiveFlow:
     def _remove_idle_clients(self) -> None:
         """Remove idle clients and, where there are too many, the client that has been idle for longest."""
         now_ns = self._relay.now_ns()
-        if len(self._clients) >= MOST_CLIENTS:
+        if len(self._clients) >= MAX_CLIENTS:
             self._remove_client(min(self._clients, key=lambda address: self._clients[address].last_received_ns))
         for address, client in list(self._clients.items()):
-            if now_ns - client.last_received_ns > CLIENT_SILENCE_NS:
+            if now_ns - client.last_received_ns > CLIENT_TIMEOUT_NS:
                 self._remove_client(address)
 
     def _remove_client(self, address: Address) -> None:
         client = self._clients.pop(address)
-        self.past_counts["upstream"].update(_counted([client.up]))
-        self.past_counts["downstream"].update(_counted([client.down]))
+        self.past_counts["upstream"].update(_sum_counts([client.up]))
+        self.past_counts["downstream"].update(_sum_counts([client.down]))
         self._relay.remove_socket(client.upstream_socket)
 
 
-def _counted(paths: Sequence[_DelayedPath]) -> Counter[str]:
-    """Add up the counters of the links of some paths."""
+def _sum_counts(paths: Sequence[_DelayedPath]) -> Counter[str]:
+    """Return the sums of the counters of the paths' links."""
     counts: Counter[str] = Counter()
     for path in paths:
         if path.line.link is not None:
@@ -302,7 +316,7 @@ def _median_ms(values_ns: Sequence[int]) -> float | None:
     return median(values_ns) / NS_PER_MS if values_ns else None
 
 
-def _always(_datagram: bytes) -> bool:
+def _is_always_delayed(_datagram: bytes) -> bool:
     return True
 
 
@@ -310,7 +324,7 @@ def _bound_socket(address: Address, name: str) -> socket.socket:
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     enable_arrival_times(sock)
     for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
-        sock.setsockopt(socket.SOL_SOCKET, option, BUFFER_BYTES)
+        sock.setsockopt(socket.SOL_SOCKET, option, SOCKET_BUFFER_BYTES)
     try:
         sock.bind(address)
     except OSError as error:

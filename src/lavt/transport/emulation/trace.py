@@ -1,8 +1,8 @@
 """Traces: recorded delays or capacities of a link, read from a file and replayed by the time since the start.
 
-Two formats. A capacity trace in Mahimahi's format has one whole number of milliseconds per line, each an opportunity
-to deliver 1500 bytes. A delay trace is CSV, `time_s,delay_ms`, with linear interpolation between the points. Both
-repeat after their last time.
+There are two formats. A capacity trace in Mahimahi's format has one whole number of milliseconds per line, each an
+opportunity to deliver 1500 bytes. A delay trace is CSV, `time_s,delay_ms`, with linear interpolation between the
+points. Both begin again after their last time.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ from lavt.errors import UserError
 
 OPPORTUNITY_BYTES: Final = 1500
 CSV_HEADER: Final = ["time_s", "delay_ms"]
-LONGEST_S: Final = 86_400
+LONGEST_TRACE_S: Final = 86_400
 LONGEST_DELAY_MS: Final = 60_000
 
 
 class CapacityTrace(Struct, frozen=True):
-    """A capacity over time: opportunities to deliver 1500 bytes each, in order, repeated after the last."""
+    """A capacity over time: opportunities to deliver 1500 bytes each, in order, which repeat after the last one."""
 
     times_ns: tuple[int, ...]
 
     def first_at(self, time_ns: int) -> int:
         """Return the number of the first opportunity at or after a time."""
         period_ns = self.times_ns[-1]
-        lap = max(0, time_ns - 1) // period_ns
-        return lap * len(self.times_ns) + bisect_left(self.times_ns, time_ns - lap * period_ns)
+        cycle = max(0, time_ns - 1) // period_ns
+        return cycle * len(self.times_ns) + bisect_left(self.times_ns, time_ns - cycle * period_ns)
 
     def time_ns(self, number: int) -> int:
-        """Return the time of the opportunity with this number; numbers continue through repetitions."""
-        lap, index = divmod(number, len(self.times_ns))
-        return lap * self.times_ns[-1] + self.times_ns[index]
+        """Return the time of the opportunity with this number; numbers continue when the opportunities repeat."""
+        cycle, index = divmod(number, len(self.times_ns))
+        return cycle * self.times_ns[-1] + self.times_ns[index]
 
 
 class DelayTrace(Struct, frozen=True):
@@ -52,9 +52,10 @@ class DelayTrace(Struct, frozen=True):
         """Return the delay of a packet that arrives at a time."""
         elapsed_ns = max(0, time_ns) % self.times_ns[-1]
         after = bisect_right(self.times_ns, elapsed_ns)
-        begin_ns, end_ns = self.times_ns[after - 1 : after + 1]
-        first_ns, last_ns = self.delays_ns[after - 1 : after + 1]
-        return first_ns + (last_ns - first_ns) * (elapsed_ns - begin_ns) // (end_ns - begin_ns)
+        time_before_ns, time_after_ns = self.times_ns[after - 1 : after + 1]
+        delay_before_ns, delay_after_ns = self.delays_ns[after - 1 : after + 1]
+        passed_ns, interval_ns = elapsed_ns - time_before_ns, time_after_ns - time_before_ns
+        return delay_before_ns + (delay_after_ns - delay_before_ns) * passed_ns // interval_ns
 
 
 Trace = CapacityTrace | DelayTrace
@@ -72,11 +73,11 @@ def parse_mahimahi(text: str, source: str) -> CapacityTrace:
             raise UserError(f"{source}: entry {number} is {after} ms, after one of {before} ms: sort the times")
     if not times_ms or times_ms[-1] == 0:
         raise UserError(f"{source} has no duration, so it cannot be repeated: give it an opportunity after 0 ms")
-    return CapacityTrace(tuple(each * NS_PER_MS for each in times_ms))
+    return CapacityTrace(tuple(time_ms * NS_PER_MS for time_ms in times_ms))
 
 
 def _parse_ms(entry: str, source: str) -> int:
-    if not (entry.isascii() and entry.isdigit() and len(entry) <= 9 and int(entry) <= LONGEST_S * 1000):
+    if not (entry.isascii() and entry.isdigit() and len(entry) <= 9 and int(entry) <= LONGEST_TRACE_S * 1000):
         raise UserError(
             f"{source}: {entry[:20]!r} is not a time of a Mahimahi trace: give whole milliseconds up to a day, one "
             "per line (a CSV file of delays needs a name that ends in .csv)"
@@ -110,7 +111,7 @@ def _parse_point(row: Sequence[str], source: str) -> tuple[int, int]:
         time_s, delay_ms = map(float, row)
     except ValueError:
         time_s = delay_ms = math.nan
-    if not (0 <= time_s <= LONGEST_S and 0 <= delay_ms <= LONGEST_DELAY_MS):
+    if not (0 <= time_s <= LONGEST_TRACE_S and 0 <= delay_ms <= LONGEST_DELAY_MS):
         raise UserError(
             f"{source}: {','.join(row)[:40]!r} is not a time in seconds up to a day and a delay in milliseconds up to "
             f"{LONGEST_DELAY_MS}: correct it"

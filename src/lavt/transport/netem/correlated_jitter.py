@@ -1,8 +1,9 @@
-"""Correlated jitter, which netem's own correlation does not produce (see docs/netem.md), in steps of the delay.
+"""Correlated jitter by changing the delay in steps, because netem's own correlation has no effect (docs/netem.md).
 
-Every 20 ms a flow gets a new delay: normally distributed around the impairment's delay, with its standard deviation,
-and correlated with the delay before (a first-order Gauss-Markov process). netem keeps order, so no packet overtakes
-another when the delay becomes shorter. The steps need a persistent process: they are a thread of the delay's owner.
+Every 20 ms a flow gets a new delay: normally distributed around the impairment's delay, with `jitter_ms` as its
+standard deviation, and correlated with the previous delay (a first-order Gauss-Markov process). LAVT gives every flow a
+rate, and with a rate netem keeps packets in order, so no packet overtakes another when the delay becomes shorter. A
+thread of the process that owns the impairments makes the steps, so this process must keep running.
 """
 
 from __future__ import annotations
@@ -30,7 +31,10 @@ STOP_TIMEOUT_S: Final = 5.0
 def next_deviation(
     impairment: Impairment, seed: int, name: str, index: int, previous: tuple[int, float] | None
 ) -> float:
-    """Return the deviation of the delay at step `index`, in standard deviations; `previous` is an earlier step's."""
+    """Return the deviation of the delay at step `index`, in standard deviations.
+
+    `previous` is the index and the deviation of an earlier step; None: this is the first step.
+    """
     innovation = float(stream(seed, f"{name} wander", index).standard_normal())
     if previous is None:
         return innovation
@@ -39,9 +43,9 @@ def next_deviation(
 
 
 class CorrelatedJitter:
-    """A thread that steps the delays of the flows with correlated jitter, until `stop` is called.
+    """A thread that changes the delays of the flows with correlated jitter in steps, until `stop` is called.
 
-    `environment` is that of tc.
+    `environment` contains the environment variables for tc.
     """
 
     def __init__(
@@ -59,7 +63,7 @@ class CorrelatedJitter:
         self._clock = clock or MachineClock()
         self._stopping = threading.Event()
         self._failed = False
-        self._stepped_ns = self._clock.now().mono_ns
+        self._last_step_ns = self._clock.now().mono_ns
         self._tc = subprocess.Popen(
             ["tc", "-force", "-batch", "-"],  # noqa: S607 (found by root's PATH, like every tc here)
             stdin=subprocess.PIPE,
@@ -73,7 +77,7 @@ class CorrelatedJitter:
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop stepping; the delays keep their last values."""
+        """Stop the steps; the delays keep their last values."""
         self._stopping.set()
         self._thread.join()
         if self._tc.stdin is not None:
@@ -87,20 +91,21 @@ class CorrelatedJitter:
 
     def problems(self) -> list[str]:
         """Return a message for each flow whose jitter has stopped: tc has ended, or there was no step for a second."""
-        if not self._failed and self._clock.now().mono_ns - self._stepped_ns <= STALLED_NS:
+        if not self._failed and self._clock.now().mono_ns - self._last_step_ns <= STALLED_NS:
             return []
         return [f"{flow.description}: its correlated jitter has stopped" for flow in self._flows]
 
     def _run(self) -> None:
-        states: dict[str, tuple[int, float]] = {}
+        last_steps: dict[str, tuple[int, float]] = {}
+        """Index and deviation of the last step, by flow."""
         begin_ns = self._clock.now().mono_ns
         while not self._stopping.is_set():
             index = (self._clock.now().mono_ns - begin_ns) // STEP_NS  # missed steps are skipped
             for flow in self._flows:
-                deviation = next_deviation(flow.impairment, self._seed, flow.name, index, states.get(flow.name))
-                states[flow.name] = index, deviation
+                deviation = next_deviation(flow.impairment, self._seed, flow.name, index, last_steps.get(flow.name))
+                last_steps[flow.name] = index, deviation
                 self._set_delay(flow, deviation)
-            self._stepped_ns = self._clock.now().mono_ns
+            self._last_step_ns = self._clock.now().mono_ns
             next_ns = begin_ns + (index + 1) * STEP_NS
             self._stopping.wait(max(0, next_ns - self._clock.now().mono_ns) / NS_PER_S)
 

@@ -1,4 +1,4 @@
-"""The injector: a thread that applies and measures the impairments that the injection node orders, with netem."""
+"""The injector: a thread that uses netem to apply and measure the impairments that the injection node orders."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from lavt.transport.netem.probe import ProbeResult, judge
 
 Deliver = Callable[[str, Any, Now, Any], None]
 
-FRAMES = 10
-"""How many frames measure a flow; they take a fifth of a second."""
+MEASURED_FRAMES = 10
+"""How many frames are sent to measure a flow; this takes a fifth of a second."""
 NO_INTERFACE = "no interface is configured for it: set injection.interface"
 
 log = logging.getLogger(__name__)
 
 
 class InjectionOrder(Struct, frozen=True):
-    """The flows whose impairments are in force from now on; without flows there are none."""
+    """An order that puts the impairments of these flows in force and ends all others."""
 
     number: int
     condition: str
@@ -55,13 +55,13 @@ class NetemQueues(Protocol):
         ...
 
     def verify(self, flows: Sequence[ImpairedFlow], *, exempt: Sequence[ExemptPort], count: int) -> Verification:
-        """Read back what is in force, and measure packets of the flows and of the exempt ports."""
+        """Read back what is in force, and measure `count` packets of each flow and of each exempt port."""
         ...
 
     def measure(
         self, flows: Sequence[ImpairedFlow], *, exempt: Sequence[ExemptPort], count: int
     ) -> dict[str, ProbeResult]:
-        """Measure the same without reading back."""
+        """Measure `count` packets of each flow and of each exempt port, without reading back."""
         ...
 
     def problems(self) -> list[str]:
@@ -86,8 +86,8 @@ class Injector:
         self._deliver = deliver
         self._queues = queues
         self._exempt = tuple(exempt)
-        self._applied = 0
-        """Number of the order in force; if it is repeated, its flows are only measured."""
+        self._applied_number = 0
+        """Number of the order in force; if the order is repeated, its flows are only measured."""
         self._orders: queue.Queue[InjectionOrder | None] = queue.Queue()
         self._thread = threading.Thread(target=self._process_orders, name="injector", daemon=True)
         self._thread.start()
@@ -111,7 +111,7 @@ class Injector:
         while (order := self._wait_for_newest()) is not None:
             try:
                 result = self._execute(order)
-            except Exception as error:  # the next order must be executed after any failure: it may be the one to clear
+            except Exception as error:  # whatever fails, the next order must be executed: it may clear the interface
                 log.exception("netem failed")
                 result = InjectionResult(order.number, f"{type(error).__name__}: {error}", "", ())
             self._deliver("injected", result, self._clock.now(), None)
@@ -133,15 +133,15 @@ class Injector:
             if not flows:
                 self._queues.clear()
                 return InjectionResult(order.number, "", "", ())
-            if order.number != self._applied:
+            if order.number != self._applied_number:
                 self._queues.apply(flows, exempt=self._exempt, condition=order.condition)
-                verification = self._queues.verify(flows, exempt=self._exempt, count=FRAMES)
+                verification = self._queues.verify(flows, exempt=self._exempt, count=MEASURED_FRAMES)
                 if verification.reasons:
                     return InjectionResult(order.number, "; ".join(verification.reasons), "", ())
             else:  # during a drive: no program is started, because that would delay the drive
-                measured = self._queues.measure(flows, exempt=self._exempt, count=FRAMES)
+                measured = self._queues.measure(flows, exempt=self._exempt, count=MEASURED_FRAMES)
                 verification = Verification(self._queues.problems() + judge(flows, self._exempt, measured), measured)
-            self._applied = order.number
+            self._applied_number = order.number
         except LavtError as error:
             return InjectionResult(order.number, str(error), "", ())
         measured_ms = tuple((flow.name, verification.measured[flow.name].median_ms) for flow in flows)

@@ -1,4 +1,4 @@
-"""netem on an interface: applied, changed while packets are queued, verified and cleared.
+"""Apply, change, verify and clear netem on an interface.
 
 This module uses no signals and no globals, so a long-running program can call it from any thread. A lock serialises
 the changes of several threads or programs.
@@ -62,7 +62,7 @@ from lavt.transport.netem.tc import (
 TC_TIMEOUT_S: Final = 10.0
 POLL_NS: Final = 10 * NS_PER_MS
 DRAIN_MARGIN_NS: Final = NS_PER_S
-"""How much longer than its longest delay a queue gets to drain."""
+"""A queue has its longest delay and this margin to drain."""
 
 RunCommand = Callable[[Command], str]
 """Runs a command and returns its standard output; raises `UserError` or `WorkError`."""
@@ -129,8 +129,8 @@ class Verification(Struct, frozen=True):
 class NetemInterface:
     """netem on one interface. As a context manager it restores the interface at the end of the block.
 
-    With `persistent`, the impairments outlive this process and have no owner. `directory` stores the state for a
-    restart. `seed` is the seed of correlated jitter. Raises `UserError` for an invalid interface name.
+    With `persistent`, the impairments outlive this process and have no owner. `directory` has the state files
+    for restoring after a crash. `seed` is the seed of correlated jitter. Raises `UserError` for an invalid name.
     """
 
     def __init__(
@@ -175,9 +175,9 @@ class NetemInterface:
         """
         with self._files.locked():
             return [
-                f"found {each.description}, which has died: {self._restore(each.interface)}"
-                for each in self._files.all()
-                if each.is_abandoned
+                f"found {state.description}, which has died: {self._restore(state.interface)}"
+                for state in self._files.all()
+                if state.is_abandoned
             ]
 
     def apply(
@@ -186,8 +186,8 @@ class NetemInterface:
         """Apply the impairments of `flows` and return the commands that did it.
 
         Existing impairments are changed without losing a packet, and those of other flows are removed. No flow may
-        cover a port of `exempt`. Raise `UserError` for impossible flows, and for an interface with a foreign root qdisc
-        or an impairment that another LAVT program owns.
+        cover a port of `exempt`. Raise `UserError` for flows that netem cannot produce, and for an interface with a
+        foreign root qdisc or an impairment that another LAVT program owns.
         """
         check_flows(flows, exempt)
         is_correlated = any(flow.impairment.jitter_correlation for flow in flows)
@@ -205,27 +205,27 @@ class NetemInterface:
                 AppliedState(self.interface, network_namespace(), boot_id(), self._owner, condition, tuple(flows))
             )
             self._stop_jitter()
-            ran = self._change(flows, qdiscs) if qdiscs else self._create(flows)
+            commands = self._change(flows, qdiscs) if qdiscs else self._create(flows)
             if is_correlated:
                 self._jitter = CorrelatedJitter(
                     self.interface, flows, tc_environment(), seed=self._seed, clock=self._clock
                 )
-            return ran
+            return commands
 
     def clear(self, *, at_once: bool = False, any_owner: bool = False) -> list[Command]:
         """Restore the interface and return the commands that did it; none if nothing here belongs to this owner.
 
-        Queued packets leave first, in order. Packets are lost only if a rate limit has queued more than passes within
-        the longest delay and two seconds, or with `at_once`, which loses all of them. `any_owner` also clears
+        Queued packets leave first, in order. They are lost only with `at_once`, which loses all of them, or if a rate
+        limit has queued more packets than leave within the longest delay plus two seconds. `any_owner` also clears
         impairments of other LAVT programs and persistent ones. Raise `UserError` for a foreign root qdisc.
         """
         with self._files.locked():
             self._stop_jitter()
             if not any_owner and self._current_owner() != self._owner:
                 return []
-            ran = self._clear(self.interface, at_once=at_once)
+            commands = self._clear(self.interface, at_once=at_once)
             self._files.remove(self.interface)
-            return ran
+            return commands
 
     def applied(self) -> AppliedState | None:
         """Return what was applied and by whom, or None if no state is stored."""
@@ -238,9 +238,9 @@ class NetemInterface:
         return {
             "interface": self.interface,
             "ours": _is_ours(qdiscs),
-            "queues": [f"{each.kind} {each.handle} {each.parent}" for each in qdiscs],
+            "queues": [f"{qdisc.kind} {qdisc.handle} {qdisc.parent}" for qdisc in qdiscs],
             "impairments": {
-                name: parse_impairment(found.options) for name, found in netems.items() if found is not None
+                name: parse_impairment(netem.options) for name, netem in netems.items() if netem is not None
             },
             "applied": self.applied(),
         }
@@ -250,12 +250,11 @@ class NetemInterface:
         qdiscs = parse_qdiscs(self._run(show_qdiscs(self.interface)))
         if not _is_ours(qdiscs):
             return [f"{self.interface} has no qdisc of LAVT"]
-        found = self._filters()
-        wanted = {expected_filter(each) for flow in flows for each in filters(flow)}
-        reasons = [reason for flow in flows for reason in difference(flow, qdiscs, found)]
-        return reasons + [
-            f"there is a filter that was not requested: {each[:3]}" for each in found if each not in wanted
-        ]
+        actual = self._filters()
+        expected = {expected_filter(tc_filter) for flow in flows for tc_filter in filters(flow)}
+        reasons = [reason for flow in flows for reason in difference(flow, qdiscs, actual)]
+        surplus = [found[:3] for found in actual if found not in expected]
+        return reasons + [f"there is a filter that was not requested: {found}" for found in surplus]
 
     def measure(
         self, flows: Sequence[ImpairedFlow], *, exempt: Sequence[ExemptPort] = (), count: int = 50
@@ -310,11 +309,11 @@ class NetemInterface:
         qdiscs = parse_qdiscs(self._run(show_qdiscs(interface)))
         if _is_ours(qdiscs):
             return qdiscs
-        for each in qdiscs:
-            if each.parent == "root" and each.handle != "0:":
+        for qdisc in qdiscs:
+            if qdisc.parent == "root" and qdisc.handle != "0:":
                 raise UserError(
-                    f"{interface} has a root qdisc that is not LAVT's ({each.kind} {each.handle}): delete it yourself "
-                    f"(`tc qdisc del dev {interface} root`), or name another interface"
+                    f"{interface} has a root qdisc that is not LAVT's ({qdisc.kind} {qdisc.handle}): delete it "
+                    f"yourself (`tc qdisc del dev {interface} root`), or name another interface"
                 )
         return []
 
@@ -337,8 +336,8 @@ class NetemInterface:
     def _change(self, flows: Sequence[ImpairedFlow], qdiscs: Sequence[Qdisc]) -> list[Command]:
         """Change LAVT's qdiscs and filters to what is requested."""
         requested = {flow.name: flow for flow in flows}
-        found = set(self._filters()) if qdiscs else set()
-        wanted = {expected_filter(each): each for flow in flows for each in filters(flow)}
+        actual = set(self._filters()) if qdiscs else set()
+        expected = {expected_filter(tc_filter): tc_filter for flow in flows for tc_filter in filters(flow)}
         commands = []
         for name, place in PLACES.items():
             exists = _netem_at(place.handle, qdiscs) is not None
@@ -346,8 +345,10 @@ class NetemInterface:
                 impairment = requested[name].impairment if name in requested else Impairment()
                 verb = "change" if exists else "add"
                 commands.append(set_impairment(self.interface, name, impairment, verb=verb, tables=self._tables))  # type: ignore[arg-type]
-        commands += [delete_filter(self.interface, *each[:2]) for each in sorted(found - set(wanted), key=str)]
-        commands += [add_filter(self.interface, each) for key, each in wanted.items() if key not in found]
+        surplus = sorted(actual - set(expected), key=str)
+        missing = [tc_filter for key, tc_filter in expected.items() if key not in actual]
+        commands += [delete_filter(self.interface, found.number, found.version) for found in surplus]
+        commands += [add_filter(self.interface, tc_filter) for tc_filter in missing]
         return self._run_all(commands)
 
     def _clear(self, interface: str, *, at_once: bool) -> list[Command]:
@@ -360,18 +361,18 @@ class NetemInterface:
         if at_once or not netems:
             return self._run_all([delete_root(interface)])
         longest_ms = max(parse_impairment(found.options).longest_ms for found in netems.values())
-        ran = self._run_all([set_impairment(interface, name, Impairment(), verb="change") for name in netems])
+        commands = self._run_all([set_impairment(interface, name, Impairment(), verb="change") for name in netems])
         self._wait_until_empty(interface, round(longest_ms * NS_PER_MS))
-        ran += self._run_all([delete_filters(interface)])
+        commands += self._run_all([delete_filters(interface)])
         self._wait_until_empty(interface, 0)
-        return ran + self._run_all([delete_root(interface)])
+        return commands + self._run_all([delete_root(interface)])
 
     def _wait_until_empty(self, interface: str, longest_delay_ns: int) -> None:
         limit_ns = self._clock.now().mono_ns + longest_delay_ns + DRAIN_MARGIN_NS
         handles = {place.handle for place in PLACES.values()}
         while self._clock.now().mono_ns < limit_ns:
             qdiscs = parse_qdiscs(self._run(show_qdiscs(interface)))
-            if not any(each.waiting_packets for each in qdiscs if each.handle in handles):
+            if not any(qdisc.waiting_packets for qdisc in qdiscs if qdisc.handle in handles):
                 return
             pause(POLL_NS)
 
@@ -392,8 +393,8 @@ def _exists(interface: str) -> bool:
 
 
 def _is_ours(qdiscs: Sequence[Qdisc]) -> bool:
-    return any(each.parent == "root" and each.handle == ROOT and each.kind == "prio" for each in qdiscs)
+    return any(qdisc.parent == "root" and qdisc.handle == ROOT and qdisc.kind == "prio" for qdisc in qdiscs)
 
 
 def _netem_at(handle: str, qdiscs: Sequence[Qdisc]) -> Qdisc | None:
-    return next((each for each in qdiscs if each.handle == handle and each.kind == "netem"), None)
+    return next((qdisc for qdisc in qdiscs if qdisc.handle == handle and qdisc.kind == "netem"), None)

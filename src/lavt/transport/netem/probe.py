@@ -1,9 +1,9 @@
-"""Measurement of an interface's queue on one machine: sends frames into it and captures them when they leave.
+"""Measure an interface's queue on one machine: send frames into it and capture them when they leave.
 
 A packet socket puts frames that look like those of a flow into the interface's queue. Another packet socket receives
-the kernel's copy of each frame after the queue, with the time (packet(7)). Both times are of this machine's wall clock.
-Nobody receives the frames: they go to 192.0.2.1 of the documentation range (RFC 5737) at the interface's own hardware
-address, which no switch forwards, with a time to live of 1. Needs root.
+the kernel's copy of each frame after the queue, with the time (packet(7)). The time at which a frame is sent is of the
+same wall clock. Nobody receives the frames: they go to 192.0.2.1 of the documentation range (RFC 5737) at the
+interface's own hardware address, which no switch forwards, with a time to live of 1. Needs root.
 """
 
 from __future__ import annotations
@@ -37,19 +37,20 @@ PERIOD_NS: Final = 20 * NS_PER_MS
 DRAIN_MARGIN_NS: Final = 300 * NS_PER_MS
 POLL_NS: Final = 10 * NS_PER_MS
 """Polling period for frames that are still in the queue."""
-LIMIT_MS: Final = 1.0
+MEDIAN_TOLERANCE_MS: Final = 1.0
 """Largest accepted difference between a median and the requested delay."""
-SIGMAS: Final = 4.0
-"""Largest accepted difference between a share and the request, in its standard deviations; plus one packet."""
+SHARE_TOLERANCE_SIGMAS: Final = 4.0
+"""Largest accepted difference between a measured and the requested share, in standard deviations of the binomial
+distribution; one packet is added to it."""
 OTHER_PORT: Final = 9
-"""Port of the other end of a frame: discard."""
-RTP: Final = 0x80
-PATH: Final = ord("L")
-"""First bytes of RTP and of the messages of path validation."""
+"""Port of the other end of a frame: that of the discard service."""
+RTP_FIRST_BYTE: Final = 0x80
+PATH_FIRST_BYTE: Final = ord("L")
+"""The first byte of a message of the path validation."""
 
 _SOURCE, _DESTINATION = socket.inet_aton("192.0.2.2"), socket.inet_aton("192.0.2.1")
 _LOCAL_ADDRESS: Final = b"\x02LAVT\0"
-"""Hardware address of the frames if the interface has none (the loopback), which drops them."""
+"""Destination hardware address of the frames if the interface has none, like the loopback, which drops them."""
 _SO_ATTACH_FILTER: Final = 26
 _SO_RCVBUFFORCE: Final = 33
 _ALL_PROTOCOLS, _IPV4 = 0x0003, 0x0800
@@ -68,14 +69,15 @@ class ProbeSpec(Struct, frozen=True):
     source: int
     destination: int
     impairment: Impairment
-    first_byte: int = RTP
+    first_byte: int = RTP_FIRST_BYTE
 
 
 class ProbeResult(Struct, frozen=True):
     """The measurement of a probe's frames: counts, and percentiles of the delay in milliseconds.
 
-    `reordered` frames were passed by later ones. If a share of the packets is reordered, `early` counts the frames that
-    were not delayed, and the percentiles are those of the others; None: fewer than two frames came through.
+    `reordered` frames were overtaken by later ones. If a share of the packets is reordered, `early` counts the frames
+    that were not delayed, and the percentiles are those of the others. They are None if fewer than two frames came
+    through.
     """
 
     sent: int
@@ -90,17 +92,19 @@ class ProbeResult(Struct, frozen=True):
 def probes(flows: Sequence[ImpairedFlow], exempt: Sequence[ExemptPort] = ()) -> list[ProbeSpec]:
     """Return the probes for flows, and for packets that must not be delayed."""
     impaired, unimpaired = [], []
-    taken = {(flow.protocol, flow.port, flow.end) for flow in flows}
+    impaired_ports = {(flow.protocol, flow.port, flow.end) for flow in flows}
     for flow in flows:
         outward, backward = (flow.port, OTHER_PORT), (OTHER_PORT, flow.port)
         if flow.end == "destination":
             outward, backward = backward, outward
         impaired.append(ProbeSpec(flow.name, flow.protocol, *outward, flow.impairment))
         other_end: Literal["source", "destination"] = "source" if flow.end == "destination" else "destination"
-        if (flow.protocol, flow.port, other_end) not in taken:
+        if (flow.protocol, flow.port, other_end) not in impaired_ports:
             unimpaired.append(ProbeSpec(f"{flow.name}, other direction", flow.protocol, *backward, Impairment()))
         if flow.name == "video":
-            unimpaired.append(ProbeSpec("challenges of the video's path", flow.protocol, *outward, Impairment(), PATH))
+            unimpaired.append(
+                ProbeSpec("challenges of the video's path", flow.protocol, *outward, Impairment(), PATH_FIRST_BYTE)
+            )
     unimpaired += [
         ProbeSpec(port.service, port.protocol, port.port, port.port, Impairment()) for port in (*ALWAYS_EXEMPT, *exempt)
     ]
@@ -174,12 +178,15 @@ def _check_delays(probe: ProbeSpec, found: ProbeResult | None) -> list[str]:
             else [f"{name}: no packet came through"]
         )
     reasons = []
-    if not (impairment.jitter_ms or impairment.rate_bps) and abs(found.median_ms - impairment.delay_ms) > LIMIT_MS:
+    if (
+        not (impairment.jitter_ms or impairment.rate_bps)
+        and abs(found.median_ms - impairment.delay_ms) > MEDIAN_TOLERANCE_MS
+    ):
         reasons.append(f"{name} was delayed by {found.median_ms:.2f} ms instead of {impairment.delay_ms:g} ms")
-    least_ms = impairment.delay_ms - 4 * impairment.jitter_ms - LIMIT_MS
+    least_ms = impairment.delay_ms - 4 * impairment.jitter_ms - MEDIAN_TOLERANCE_MS
     if (impairment.jitter_ms or impairment.rate_bps) and found.p5_ms < least_ms:
         reasons.append(f"{name} was delayed by {found.p5_ms:.2f} ms (p5); the least is {least_ms:.2f} ms")
-    most_ms = impairment.longest_ms + LIMIT_MS
+    most_ms = impairment.longest_ms + MEDIAN_TOLERANCE_MS
     if impairment.jitter_ms and not impairment.rate_bps and found.median_ms > most_ms:
         reasons.append(f"{name} was delayed by {found.median_ms:.2f} ms (median); the most is {most_ms:.2f} ms")
     if (
@@ -211,7 +218,7 @@ def _is_plausible_share(count: int, of: int, share: float, variance_factor: floa
     """Return whether a count is within the limits of a binomial share with its variance times `variance_factor`."""
     if share == 0:
         return count == 0
-    return abs(count - of * share) <= SIGMAS * math.sqrt(of * share * (1 - share) * variance_factor) + 1
+    return abs(count - of * share) <= SHARE_TOLERANCE_SIGMAS * math.sqrt(of * share * (1 - share) * variance_factor) + 1
 
 
 def _variance_factor(impairment: Impairment) -> float:
@@ -233,7 +240,7 @@ class _CapturedFrames:
         self.delays: list[list[tuple[int, float]]] = [[] for _ in requested]
 
     def mark(self, number: int, index: int, sent_ns: int) -> bytes:
-        """Return the bytes that identify a frame of this measurement."""
+        """Return the bytes that identify frame `number` of the probe `index` of this measurement."""
         return _MARK.pack(self._run_id, number * len(self._requested) + index, sent_ns)
 
     def receive(self) -> None:
@@ -252,12 +259,12 @@ class _CapturedFrames:
         if len(frame) < begin + _MARK.size:
             return
         run_id, serial, sent_ns = _MARK.unpack_from(frame, begin)
-        stamp = next(
+        kernel_time = next(
             (data for level, kind, data in ancillary if (level, kind) == (socket.SOL_SOCKET, SO_TIMESTAMPNS)), b""
         )
-        if run_id != self._run_id or len(stamp) < 16:
+        if run_id != self._run_id or len(kernel_time) < 16:
             return
-        seconds, nanoseconds = struct.unpack_from("qq", stamp)
+        seconds, nanoseconds = struct.unpack_from("qq", kernel_time)
         number, index = divmod(serial, len(self._requested))
         self.count += 1
         self.delays[index].append((number, (seconds * NS_PER_S + nanoseconds - sent_ns) / NS_PER_MS))
@@ -311,12 +318,12 @@ def _frame(probe: ProbeSpec, mark: bytes) -> bytes:
     """Return an IPv4 packet of a probe's kind. Nobody receives it, so UDP and TCP checksums are left out."""
     payload = bytes([probe.first_byte]) + mark
     if probe.protocol == "udp":
-        number = 17
+        protocol_number = 17
         body = struct.pack(">HHHH", probe.source, probe.destination, 8 + len(payload), 0) + payload
     else:
-        number = 6
+        protocol_number = 6
         body = struct.pack(">HHIIHHHH", probe.source, probe.destination, 0, 0, 5 << 12, 0, 0, 0) + payload
-    header = struct.pack(">BBHHHBBH4s4s", 0x45, 0, 20 + len(body), 0, 0, 1, number, 0, _SOURCE, _DESTINATION)
-    folded = sum(struct.unpack(">10H", header))
-    folded = (folded & 0xFFFF) + (folded >> 16)
-    return header[:10] + struct.pack(">H", ~folded & 0xFFFF) + header[12:] + body
+    header = struct.pack(">BBHHHBBH4s4s", 0x45, 0, 20 + len(body), 0, 0, 1, protocol_number, 0, _SOURCE, _DESTINATION)
+    checksum = sum(struct.unpack(">10H", header))
+    checksum = (checksum & 0xFFFF) + (checksum >> 16)
+    return header[:10] + struct.pack(">H", ~checksum & 0xFFFF) + header[12:] + body

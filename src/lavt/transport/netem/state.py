@@ -1,7 +1,7 @@
 """State files of interfaces with impairments, so that an interface is restored after a crash.
 
-There is one file for each interface and network namespace, written before tc is called. It names the owner: a process,
-which clears the interface when it ends, or none, if `lavt netem apply` left the impairments in place.
+There is one file for each interface and network namespace, written before tc is called. It names the owner: the process
+that clears the interface when it ends. Impairments that `lavt netem apply` leaves in place have no owner.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from lavt.transport.emulation.impairment import ImpairedFlow
 
 DIRECTORY: Final = Path("/run/lavt")
 NO_OWNER: Final = (0, 0)
-"""The owner of persistent impairments."""
+"""The value for persistent impairments, which no process owns."""
 _START_TICKS: Final = 19
 """Index of a process's start time among the fields after its name in /proc/PID/stat (proc(5): field 22)."""
 
 Owner = tuple[int, int]
-"""A process's number and start time, because numbers are reused."""
+"""A process ID and the start time of the process in kernel ticks, because process IDs are reused."""
 
 
 class AppliedState(Struct, frozen=True):
@@ -44,7 +44,8 @@ class AppliedState(Struct, frozen=True):
         """Whether the owner no longer runs, or the state is from an earlier boot."""
         if self.boot != boot_id():
             return True
-        return self.owner != NO_OWNER and self.owner[1] != start_ticks(self.owner[0])
+        pid, owner_start_ticks = self.owner
+        return self.owner != NO_OWNER and owner_start_ticks != start_ticks(pid)
 
     @property
     def description(self) -> str:
@@ -118,7 +119,7 @@ class StateFiles:
     def all(self) -> list[AppliedState]:
         """Return everything that was applied in this namespace."""
         found = [self._read(path) for path in sorted(self.directory.glob(f"netem-{network_namespace()}-*.json"))]
-        return [each for each in found if each is not None]
+        return [applied for applied in found if applied is not None]
 
     def remove(self, interface: str) -> None:
         """Delete the state of an interface."""

@@ -1,7 +1,7 @@
-"""Commands and output formats of tc: makes the commands for flows and parses what tc reports. Nothing is run here.
+"""Make the tc commands for flows, and parse what tc reports. Nothing is run here.
 
-The root of an interface becomes a `prio` qdisc with six bands. All traffic uses the first three, as with the kernel's
-default; filters send each impaired flow to a band of its own, with a netem of its own:
+The root of an interface becomes a `prio` qdisc with six bands. All other traffic uses the first three, as with the
+kernel's default qdisc. Filters send each impaired flow to a band of its own, with a netem of its own:
 
     root 4c56: prio ── 4c56:1 .. 4c56:3   everything else, untouched
                     ├─ 4c56:4 netem 4c01: video     RTP and sender reports, not the challenges of its path
@@ -9,8 +9,8 @@ default; filters send each impaired flow to a band of its own, with a netem of i
                     └─ 4c56:6 netem 4c03: state
 
 The handles identify LAVT's qdiscs. netem keeps order only with a rate (measured; tc-netem(8) does not mention it): a
-flow without a rate gets 10 Gbit/s, which costs 1 us per packet. So packets overtake only where that is requested, and
-neither by jitter nor when a delay becomes shorter, as in `transport/emulation/delay_line.py`.
+flow without a rate gets 10 Gbit/s, which costs 1 us per packet. So packets overtake others only if `reorder` requests
+it. Neither jitter nor a shorter delay reorders them. The emulated link (`transport/emulation/link.py`) does the same.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import math
 import re
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 from msgspec import Struct
 
@@ -33,11 +33,11 @@ Command = list[str]
 ROOT: Final = "4c56:"
 """Handle of LAVT's root qdisc, "LV" in ASCII."""
 BANDS: Final = 6
-LEAST_LIMIT_PACKETS: Final = 10_000
-PACKETS_PER_S: Final = 2_000
-"""Queue limit for each second of delay; the video sends about 400 packets per second, the control 50."""
+MIN_LIMIT_PACKETS: Final = 10_000
+LIMIT_PACKETS_PER_S: Final = 2_000
+"""The queue limit for each second of delay. The video sends about 400 packets per second, the control 50."""
 TC_STEP_MS: Final = 0.002
-"""tc counts delays in microseconds and loses up to one in each conversion."""
+"""tc counts delays in microseconds, and each conversion loses up to one microsecond."""
 
 
 class FlowPlacement(Struct, frozen=True):
@@ -58,10 +58,11 @@ PLACES: Final[Mapping[str, FlowPlacement]] = {
     "control": FlowPlacement(5, "4c02:", 3),
     "state": FlowPlacement(6, "4c03:", 5),
 }
+"""Where each flow is delayed, by its name."""
 
 
 class U32Match(Struct, frozen=True):
-    """One condition of a u32 filter: tc's input, and the 32 bits at an offset that tc reports."""
+    """One condition of a u32 filter: `text` is tc's input for it, and tc reports it as offset, bits and mask."""
 
     text: str
     offset: int
@@ -122,8 +123,8 @@ def set_impairment(
 ) -> Command:
     """Return the command that sets a flow's impairment, with all arguments: `change` keeps some that are left out.
 
-    `tables` is the directory of LAVT's table of the uniform distribution, which tc lacks: without a table a change
-    would keep the previous one.
+    `tables` is the directory of LAVT's table of the uniform distribution, which tc lacks. Without a table a change
+    would keep the table of the previous distribution.
     """
     placement = PLACES[name]
     uniform = (
@@ -134,8 +135,8 @@ def set_impairment(
 
 
 def netem_arguments(impairment: Impairment) -> list[str]:
-    """Return netem's arguments for an impairment; correlated jitter is not left to netem."""
-    limit = max(LEAST_LIMIT_PACKETS, math.ceil(PACKETS_PER_S * impairment.longest_ms / 1000))
+    """Return netem's arguments for an impairment without correlated jitter, which `CorrelatedJitter` makes."""
+    limit = max(MIN_LIMIT_PACKETS, math.ceil(LIMIT_PACKETS_PER_S * impairment.longest_ms / 1000))
     arguments = ["netem", "limit", str(limit), "delay", f"{_plain(impairment.delay_ms)}ms"]
     if impairment.jitter_ms and not impairment.jitter_correlation:
         arguments += [f"{_plain(impairment.jitter_ms)}ms", "distribution", impairment.jitter_distribution]
@@ -148,11 +149,11 @@ def netem_arguments(impairment: Impairment) -> list[str]:
     return [*arguments, "rate", f"{impairment.rate_bps}bit" if impairment.rate_bps else "10gbit"]
 
 
-def add_filter(interface: str, each: TcFilter) -> Command:
+def add_filter(interface: str, tc_filter: TcFilter) -> Command:
     """Return the command that adds a filter."""
-    arguments = " ".join(f"match {match.text}" for match in each.matches)
-    target = ["dev", interface, "parent", ROOT, "protocol", each.version, "prio", str(each.filter_number)]
-    return ["tc", "filter", "add", *target, "u32", *arguments.split(), "classid", each.parent]
+    arguments = " ".join(f"match {match.text}" for match in tc_filter.matches)
+    target = ["dev", interface, "parent", ROOT, "protocol", tc_filter.version, "prio", str(tc_filter.filter_number)]
+    return ["tc", "filter", "add", *target, "u32", *arguments.split(), "classid", tc_filter.parent]
 
 
 def delete_filter(interface: str, filter_number: int, version: str) -> Command:
@@ -177,7 +178,7 @@ def show_qdiscs(interface: str) -> Command:
 
 
 def show_filters(interface: str) -> Command:
-    """Return the command that lists LAVT's filters, as text: u32's JSON repeats a key."""
+    """Return the command that lists LAVT's filters, as text, because u32's JSON repeats a key."""
     return ["tc", "filter", "show", "dev", interface, "parent", ROOT]
 
 
@@ -186,7 +187,7 @@ def first_commands(interface: str, flows: Sequence[ImpairedFlow], *, tables: str
     commands = [add_root(interface)]
     for flow in flows:
         commands.append(set_impairment(interface, flow.name, flow.impairment, verb="add", tables=tables))
-        commands += [add_filter(interface, each) for each in filters(flow)]
+        commands += [add_filter(interface, tc_filter) for tc_filter in filters(flow)]
     return commands
 
 
@@ -225,8 +226,16 @@ def parse_qdiscs(text: str) -> list[Qdisc]:
 _FILTER: Final = re.compile(r"protocol (\S+) pref (\d+) u32 .*flowid (\S+)")
 _MATCH: Final = re.compile(r"^\s*match ([0-9a-f]{8})/([0-9a-f]{8}) at (\d+)$")
 
-FoundFilter = tuple[int, str, str, frozenset[tuple[int, int, int]]]
-"""Number, IP version, band, and matches: (offset, bits, mask) each."""
+
+class FoundFilter(NamedTuple):
+    """A u32 filter as tc reports it."""
+
+    number: int
+    version: str
+    """The IP version: "ip" or "ipv6"."""
+    band: str
+    matches: frozenset[tuple[int, int, int]]
+    """Offset, bits and mask of each match."""
 
 
 def parse_filters(text: str) -> list[FoundFilter]:
@@ -237,16 +246,17 @@ def parse_filters(text: str) -> list[FoundFilter]:
             found.append((int(head[2]), head[1], head[3], set()))
         elif (match := _MATCH.match(line)) is not None and found:
             found[-1][3].add((int(match[3]), int(match[1], 16), int(match[2], 16)))
-    return [(number, version, band, frozenset(matches)) for number, version, band, matches in found]
+    return [FoundFilter(number, version, band, frozenset(matches)) for number, version, band, matches in found]
 
 
-def expected_filter(each: TcFilter) -> FoundFilter:
+def expected_filter(tc_filter: TcFilter) -> FoundFilter:
     """Return a filter as tc reports it."""
-    return each.filter_number, each.version, each.parent, frozenset(match.read_back for match in each.matches)
+    matches = frozenset(match.read_back for match in tc_filter.matches)
+    return FoundFilter(tc_filter.filter_number, tc_filter.version, tc_filter.parent, matches)
 
 
 def parse_impairment(options: Mapping[str, Any]) -> Impairment:
-    """Return the impairment of a netem's options. tc does not report the distribution, so it is normal.
+    """Return the impairment of a netem's options. The distribution, which tc does not report, is normal.
 
     Raise `WorkError` for options that are not netem's.
     """
@@ -272,35 +282,35 @@ def parse_impairment(options: Mapping[str, Any]) -> Impairment:
 def difference(flow: ImpairedFlow, qdiscs: Iterable[Qdisc], found: Iterable[FoundFilter]) -> list[str]:
     """Compare a flow with tc's report, and return a message for each difference."""
     placement, requested = PLACES[flow.name], flow.impairment
-    netem = next((each for each in qdiscs if each.handle == placement.handle), None)
+    netem = next((qdisc for qdisc in qdiscs if qdisc.handle == placement.handle), None)
     if netem is None or netem.kind != "netem" or netem.parent != placement.parent:
         return [f"{flow.description} has no netem"]
     actual_impairment = parse_impairment(netem.options)
     is_correlated = bool(requested.jitter_correlation)  # then the delay varies, and netem has no jitter
     burst_packets = requested.loss_burst_packets * has_loss_bursts(requested)
-    delay_step_ms = TC_STEP_MS + 8 * requested.jitter_ms * is_correlated
+    delay_tolerance_ms = TC_STEP_MS + 8 * requested.jitter_ms * is_correlated
     jitter_ms = 0.0 if is_correlated else requested.jitter_ms
     reasons = [
         f"{flow.description}: {name} is {actual:g} instead of {expected:g}"
-        for name, actual, expected, step in (
-            ("delay_ms", actual_impairment.delay_ms, requested.delay_ms, delay_step_ms),
+        for name, actual, expected, tolerance in (
+            ("delay_ms", actual_impairment.delay_ms, requested.delay_ms, delay_tolerance_ms),
             ("jitter_ms", actual_impairment.jitter_ms, jitter_ms, TC_STEP_MS),
             ("loss", actual_impairment.loss, requested.loss, 1e-5),
             ("loss_burst_packets", actual_impairment.loss_burst_packets, burst_packets, 1e-3),
             ("rate_bps", actual_impairment.rate_bps, requested.rate_bps, 8),
             ("reorder", actual_impairment.reorder, requested.reorder, 1e-5),
         )
-        if abs(actual - expected) > step + 1e-5 * expected
+        if abs(actual - expected) > tolerance + 1e-5 * expected
     ]
-    if int(netem.options.get("limit", 0)) < LEAST_LIMIT_PACKETS:
+    if int(netem.options.get("limit", 0)) < MIN_LIMIT_PACKETS:
         reasons.append(f"{flow.description}: its queue limit is only {netem.options.get('limit')} packets")
     if not netem.options.get("rate"):
         reasons.append(f"{flow.description}: it has no rate, so packets overtake each other")
     actual_filters = set(found)
     reasons += [
-        f"{flow.description} has no filter for {each.version}"
-        for each in filters(flow)
-        if expected_filter(each) not in actual_filters
+        f"{flow.description} has no filter for {tc_filter.version}"
+        for tc_filter in filters(flow)
+        if expected_filter(tc_filter) not in actual_filters
     ]
     return reasons
 

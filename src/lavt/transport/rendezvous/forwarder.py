@@ -12,15 +12,15 @@ client address is the one in the vehicle's address-validation cookie. A rendezvo
 path. Threats:
 
 * Impersonating the vehicle: a registration is accepted only with the vehicle's signature and a later time than the
-  last one. A rendezvous that has just started, or has had no registration for 10 s, may accept an old one until the
-  vehicle's next (at most 1 s; longer only if the vehicle's clock was set back). Without a key, every registration with
-  the vehicle's name is accepted.
-* Reflection to a third party: the rendezvous sends to the registered vehicle, and from the vehicle to clients that sent
-  something in the last 30 s. Each datagram causes at most one, which differs in length by the wrapping. A registration
-  gets no reply.
-* Flooding the vehicle: only datagrams that look like the flow's pass, at a limited rate. Clients that the vehicle has
-  answered have a rate limit of their own, so that others cannot crowd them out, and so have hellos and answers, so that
-  replays with a client's address do not crowd out its reports.
+  last one. A rendezvous that has just started, or has had no registration for 10 s, may accept an old one. It is in
+  force until the vehicle's next registration arrives, after at most 1 s (longer only if the vehicle's clock was set
+  back). Without a key, every registration with the vehicle's name is accepted.
+* Reflection to a third party: the rendezvous sends datagrams of clients to the registered vehicle, and datagrams of the
+  vehicle to clients that sent something in the last 30 s. For each received datagram it sends at most one, whose length
+  differs only by the wrapping. A registration gets no reply.
+* Flooding the vehicle: only datagrams in a format of the flow pass, at a limited rate. Clients that the vehicle has
+  answered have a rate limit of their own, so that others cannot crowd them out. Hellos and answers also have a rate
+  limit of their own, so that replays with a client's address do not crowd out its reports.
 * Not covered: an attacker on the path to the rendezvous can forward a registration from another address before the
   original arrives, and so divert the flow for a second. It could as well drop the datagrams themselves.
 
@@ -53,12 +53,12 @@ VEHICLE_TIMEOUT_NS: Final = 10 * NS_PER_S
 CLIENT_TIMEOUT_NS: Final = 30 * NS_PER_S
 """A client gets nothing if it has sent nothing for this time."""
 MAX_CLIENTS: Final = 64
-"""Limits the clients that the vehicle has answered, and separately those that it has not."""
+"""Limits the number of clients that the vehicle has answered, and separately that of all other clients."""
 REGISTRATIONS_PER_S: Final = 50
-"""Limits the signatures verified from the vehicle's address, and separately those from other addresses."""
+"""Limits the registrations from the vehicle's address that are verified, and separately those from other addresses."""
 UPSTREAM_PER_S: Final = 200
-"""Limits the datagrams of clients that the vehicle has answered, and separately those of others; separately also those
-of path validation. A client sends 2.5 reports a second, as measured."""
+"""Limits each of four groups of datagrams: from clients that the vehicle has answered or from other clients, and of the
+path validation or not. A client sends 2.5 reports a second (measured)."""
 MAX_UPSTREAM_BYTES: Final = 1400
 
 _MAGIC: Final = b"LAVR"
@@ -186,21 +186,21 @@ class Forwarder:
             self.counts["malformed"] += 1
         elif address is None:
             self.counts["without_vehicle"] += 1
-        elif not self._takes(datagram, sender, now_ns):
+        elif not self._is_within_limit(datagram, sender, now_ns):
             self.counts["too_many"] += 1
         else:
             self.counts["to_vehicle"] += 1
             return wrap(sender, datagram), address
         return None
 
-    def _takes(self, datagram: bytes, sender: Address, now_ns: int) -> bool:
-        """Return whether a client's datagram is within the limit of its kind."""
+    def _is_within_limit(self, datagram: bytes, sender: Address, now_ns: int) -> bool:
+        """Count a client's datagram; return whether it is within the rate limit of its group."""
         is_answered = self._clients.note_datagram(sender, now_ns)
         return self._upstream_limiters[is_answered, is_path_datagram(datagram)].take(now_ns)
 
 
 class _Clients:
-    """The clients and when they last sent something, oldest first.
+    """The addresses of clients, each with the time at which the client last sent something; the oldest is first.
 
     Clients that the vehicle has answered are in a table of their own, so that others cannot displace them.
     """

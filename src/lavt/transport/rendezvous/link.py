@@ -14,8 +14,8 @@ from lavt.node import Send
 from lavt.transport.rendezvous.forwarder import REGISTER_EVERY_NS, Address, Forwarder, unwrap, wrap
 from lavt.transport.udp_link import Deliver, UdpLink
 
-_VIA: Final = "rendezvous:"
-"""Prefix of the host of a client behind the rendezvous, by which replies take the same way back."""
+_VIA_PREFIX: Final = "rendezvous:"
+"""Prefix of the host in the address of a client behind the rendezvous; replies to such an address go through it."""
 
 
 class RendezvousLink:
@@ -79,17 +79,17 @@ class RendezvousLink:
             self.counts["datagrams_not_wrapped"] += 1
             return
         (host, port), datagram = unwrapped
-        deliver(channel, datagram, arrived, (_VIA + host, port))
+        deliver(channel, datagram, arrived, (_VIA_PREFIX + host, port))
 
     def _route(self, send: Send) -> Send:
         host, port = send.peer
-        if not host.startswith(_VIA):
+        if not host.startswith(_VIA_PREFIX):
             return send
-        return Send(send.channel, wrap((host.removeprefix(_VIA), port), send.payload), self._rendezvous)
+        return Send(send.channel, wrap((host.removeprefix(_VIA_PREFIX), port), send.payload), self._rendezvous)
 
     def _keep_registered(self) -> None:
         while True:
-            # later than any before, even if the wall clock is set back
+            # later than any earlier one, even if the wall clock was set back
             self._registered_ns = max(self._registered_ns + 1, self._clock.now().wall_ns)
             self._link.send(Send("registration", self._registration(self._registered_ns), self._rendezvous))
             if self._closing.wait(REGISTER_EVERY_NS / NS_PER_S):

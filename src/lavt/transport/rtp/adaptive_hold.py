@@ -1,4 +1,4 @@
-"""Adaptive hold of the jitter buffer: packets after a gap wait as long as reordering has recently taken."""
+"""Adaptive hold of the jitter buffer: packets after a gap wait about as long as reordering has recently taken."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ MIN_HOLD_NS: Final = 10 * NS_PER_MS
 MAX_HOLD_NS: Final = 300 * NS_PER_MS
 """A frame that this hold would still delay is useless: a keyframe is requested instead."""
 WINDOW_NS: Final = 30 * NS_PER_S
+"""The hold depends on the reordering delays of the current window and of the previous one."""
 
 
 class AdaptiveHold:

@@ -1,7 +1,7 @@
 """Forward error correction of the video: repair packets from which a receiver recovers lost packets of a frame.
 
 A frame's packets are divided into blocks of at most 16, packet i into block i mod blocks, so that a burst is spread
-over the blocks. Each block has 0, 1 or 2 repair packets (`parity.py`), from which as many lost packets are recovered.
+over the blocks. Each block has 0, 1 or 2 repair packets (`parity.py`), which recover as many lost packets.
 They are sent after the frame's last packet, so they delay no media. Wire format: docs/wire.md, "Repair packets".
 """
 
@@ -27,11 +27,11 @@ MAX_BLOCK_PACKETS: Final = 16
 MAX_BLOCKS: Final = 255
 """In one frame; a frame of more than 16 * 255 packets gets no repair packets."""
 MAX_SYMBOL_BYTES: Final = 1500
-"""Longest payload with its length field: more than an Ethernet packet has. It limits the memory."""
+"""Longest payload with its length field: longer than in any Ethernet packet. It limits the memory."""
 MAX_STORED_MEDIA: Final = 4096
 """Media packets stored to recover lost ones: more than the largest frame has, some seconds of any stream."""
 MAX_OPEN_BLOCKS: Final = 64
-"""Most blocks that wait for more packets: a second of small frames that all lack some."""
+"""Most blocks that wait for more packets: as many as a second of small frames that all lack packets."""
 BLOCK_TIMEOUT_NS: Final = 500 * NS_PER_MS
 """Longest wait of a block: packets recovered later would be too late for their frame."""
 
@@ -119,7 +119,7 @@ class _Block:
     """The received parity symbols by `P` and `Q`."""
 
     def lacks(self, packet: RtpPacket) -> bool:
-        """Return whether a packet of the same SSRC is missing in this block."""
+        """Return whether `packet`, which has the block's SSRC, is missing in this block."""
         return packet.timestamp == self.header.timestamp and self.packets.get(packet.sequence, packet) is None
 
 
@@ -140,6 +140,7 @@ class RepairReceiver:
         self._media: list[RtpPacket | None] = [None] * MAX_STORED_MEDIA
         self._ssrc: int | None = None
         self._open: dict[tuple[int, int, int], _Block] = {}
+        """The blocks that wait for more packets, oldest first, by SSRC, timestamp and number of the block."""
 
     def push(self, packet: RtpPacket, now_ns: int) -> list[RtpPacket]:
         """Add a media or repair packet; return the media packets that are recovered by it.
@@ -250,7 +251,8 @@ LOSS_REMEMBERED_NS: Final = 30 * NS_PER_S
 HEAVY_LOSS_WINDOW_NS: Final = 5 * NS_PER_S
 """Some thousand packets at 2 Mb/s: one lost packet is not heavy loss, and heavy loss is detected within seconds."""
 HEAVY_LOSS_PER_MILLE: Final = 25
-"""From this loss on, one repair packet leaves more than 2 % of frames damaged (computed: two or more lost of 8 + 1)."""
+"""From this loss rate on, one repair packet leaves more than 2 % of frames damaged (computed: two or more of 8 media
+packets and 1 repair packet are lost)."""
 
 
 class RedundancyController:
@@ -258,6 +260,7 @@ class RedundancyController:
 
     def __init__(self) -> None:
         self._notes: deque[tuple[int, int, int]] = deque()
+        """Time, lost packets and expected packets of each note in the window, oldest first."""
         self._lost = 0
         self._expected = 0
         self._last_loss_ns: int | None = None

@@ -25,11 +25,11 @@ Ordered = list[tuple[RtpPacket, bool]]
 class JitterBuffer:
     """A jitter buffer for the packets of one RTP stream; a new SSRC begins a new stream.
 
-    `hold_ns` is how long a gap is waited for; None: adaptive, by the recent reordering delays of the network. Repair
-    packets have another SSRC and must not be pushed. Public counters, in packets: `late` arrived after they had been
-    given up, `duplicate` arrived twice, `lost` were given up (including late ones), `reordered` arrived after later
-    ones but within their hold, `stray` were isolated and far from all others, `recovered` were recovered within their
-    hold.
+    `hold_ns` is the longest wait for the packets of a gap; None: it adapts to the recent reordering delays of the
+    network. Repair packets have another SSRC and must not be pushed. Public counters, in packets: `late` arrived after
+    they had been given up, `duplicate` arrived twice, `lost` were given up (including late ones), `reordered` arrived
+    after later ones but within their hold, `stray` were isolated and far from all others, `recovered` were recovered
+    within their hold.
     """
 
     def __init__(self, hold_ns: int | None = None) -> None:
@@ -84,10 +84,10 @@ class JitterBuffer:
         A packet that is not missing, or that was given up, is dropped.
         """
         number = self._extend(packet.sequence)
-        waited_for = number not in self._buffered and (self._next is None or number >= self._next)
+        is_missing = number not in self._buffered and (self._next is None or number >= self._next)
         if packet.ssrc != self._ssrc or abs(number - self._highest) > MAX_JUMP:
             return []
-        if not waited_for:
+        if not is_missing:
             self._note_given_up(number, now_ns)
             return []
         self.recovered += 1
@@ -176,7 +176,9 @@ class JitterBuffer:
             self.lost += len(missing)
             self._given_up.update(dict.fromkeys(missing, self._gap_detected_ns()))
             if len(self._given_up) > 2 * MAX_JUMP:
-                self._given_up = {each: at for each, at in self._given_up.items() if each > first - MAX_JUMP}
+                self._given_up = {
+                    lost: detected_ns for lost, detected_ns in self._given_up.items() if lost > first - MAX_JUMP
+                }
             self._after_loss = True
         self._next = first
         return self._drain()

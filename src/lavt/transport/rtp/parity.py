@@ -42,8 +42,8 @@ def compute_parity(symbols: Sequence[bytes], count: int) -> list[bytes]:
 def recover(symbols: Sequence[bytes | None], parity_symbols: Mapping[int, bytes]) -> list[bytes]:
     """Return the symbols that are None, in order and with their padding of zeros.
 
-    `parity_symbols` are the received ones of `P` and `Q`, at least as many as symbols are missing. Raises `BadPacket`
-    for fewer, for more than 255 symbols, and for symbols longer than the parity symbols.
+    `parity_symbols` are the received parity symbols by `P` and `Q`, at least as many as symbols are missing. Raises
+    `BadPacket` for fewer parity symbols, for more than 255 symbols, and for symbols longer than the parity symbols.
     """
     lost = [index for index, symbol in enumerate(symbols) if symbol is None]
     used = [which for which in (P, Q) if which in parity_symbols][: len(lost)]
@@ -55,17 +55,18 @@ def recover(symbols: Sequence[bytes | None], parity_symbols: Mapping[int, bytes]
     size = len(parity_symbols[used[0]])
     if len(parity_symbols[used[-1]]) != size or max(map(len, known)) > size:
         raise BadPacket("parity symbols shorter than another symbol")
-    # Missing symbols are zeros here, so adding the known terms leaves only the missing terms of the parity.
+    # Missing symbols are zeros here, so adding the known terms to a parity symbol leaves only its missing terms.
     padded = _pad(known, size)
-    left = {which: _sum([*_TERMS[which](padded), parity_symbols[which]]) for which in used}
+    remainders = {which: _sum([*_TERMS[which](padded), parity_symbols[which]]) for which in used}
     first, last = lost[0], lost[-1]
     if len(lost) == 1:
-        return [left[P] if P in left else left[Q].translate(_TIMES[-first])]
-    # P leaves a + b, and Q 2^first a + 2^last b: so 2^-first Q + P is (2^(last - first) + 1) b.
-    mixed = _sum([left[Q].translate(_TIMES[-first]), left[P]])
+        return [remainders[P] if P in remainders else remainders[Q].translate(_TIMES[-first])]
+    # With the missing symbols a and b, P leaves a + b, and Q leaves 2^first a + 2^last b.
+    # So 2^-first Q + P is (2^(last - first) + 1) b.
+    mixed = _sum([remainders[Q].translate(_TIMES[-first]), remainders[P]])
     factor = _TIMES[last - first][1] ^ 1
     second = mixed.translate(_TIMES[-_EXPONENT[factor]])
-    return [_sum([left[P], second]), second]
+    return [_sum([remainders[P], second]), second]
 
 
 def _pad(symbols: Sequence[bytes], size: int) -> list[bytes]:

@@ -35,9 +35,10 @@ class ReceptionSample(Struct, frozen=True):
     duplicate: int
     """Packets that arrived twice, or after they had been recovered."""
     jitter_us: int
-    """Jitter at the end (RFC 3550, section 6.4.1). A frame's packets share a timestamp: it includes their spacing."""
+    """Jitter at the end (RFC 3550, section 6.4.1). It includes the spacing of a frame's packets, which share a
+    timestamp."""
     round_trip_us: int | None
-    """Last known round-trip time at the end, of a report to the sender and the sender's report that answers it."""
+    """Last known round-trip time at the end, from a report to the sender and the sender's answer to it."""
 
 
 class Reception:
@@ -69,15 +70,15 @@ class Reception:
         self._packets += 1
         if packet.ssrc != self._ssrc:
             self._begin_stream(packet.ssrc, arrived_ns)
-        strays, self._strays = self._strays, self._jitter_buffer.stray
-        if self._strays <= strays:
+        strays_before, self._strays = self._strays, self._jitter_buffer.stray
+        if self._strays <= strays_before:  # this packet is not a stray
             self._note_transit(packet.timestamp, arrived_ns)
 
     def note_announcement(self, announcement: Announcement, receiver_ssrc: int | None, arrived_ns: int) -> None:
         """Note a sender's datagram that arrived at `arrived_ns`, by the clock of our reports.
 
-        An answer to one of our reports gives the round-trip time. Our next report returns the time of its sender
-        report, from which the sender computes its own.
+        An answer to one of our reports gives our round-trip time. Our next report returns the time of the last sender
+        report, from which the sender computes its own round-trip time.
         """
         for report in announcement.reports:
             self._sender_report = report, arrived_ns
@@ -125,7 +126,7 @@ class Reception:
         """Begin a stream, since a report covers one stream only."""
         self._ssrc = ssrc
         self._transit, self._jitter = None, 0.0
-        self._packets_reported = self._arrived() - 1
+        self._packets_reported = self._arrived() - 1  # the first packet belongs to the first report
         self._lost_before_stream = self._lost_reported = self._lost_before_repair()
         if self._sampled_ns is None:
             self._sampled_ns = arrived_ns

@@ -3,10 +3,10 @@
 Sender to receiver: sender reports (RFC 3550, section 6.4.1) and, in extended reports (RFC 3611), the answer to the
 receiver's reference time (section 4.5). Receiver to sender: receiver reports (RFC 3550, section 6.4.2), the reference
 time (RFC 3611, section 4.4), picture-loss indications (RFC 4585, section 6.3.1) and the receiver's limit of the bit
-rate (RFC 5104, section 4.2.1). Both can compute the round-trip time without a common clock.
+rate (RFC 5104, section 4.2.1). Both ends can compute the round-trip time without a common clock.
 
 Every datagram written here begins with a report and a source description (RFC 3550, section 6.1). RTCP shares the port
-with RTP; the second byte of a datagram tells them apart (RFC 5761).
+with RTP; the second byte of a datagram distinguishes them (RFC 5761).
 """
 
 from __future__ import annotations
@@ -51,8 +51,11 @@ _PAYLOAD_FEEDBACK: Final = 206
 _EXTENDED_REPORT: Final = 207
 
 _CNAME: Final = 1
+"""Type of an item in a source description."""
 _MAX_BIT_RATE: Final = 3
+"""Type of a transport feedback, in the place of the count."""
 _PICTURE_LOSS: Final = 1
+"""Type of a payload feedback, in the place of the count."""
 
 _BEFORE_BLOCKS: Final = {_SENDER_REPORT: _SENDER_INFORMATION.size, _RECEIVER_REPORT: _SSRC.size}
 """Bytes of a report's body before its report blocks."""
@@ -143,7 +146,7 @@ def sender_report(
 def receiver_report(ssrc: int, report: ReceptionReport, *, clock_ns: int, cname: str = RECEIVER_CNAME) -> bytes:
     """Write the receiver report of receiver `ssrc` with its reference time; values are clamped to their fields.
 
-    `clock_ns` is any clock of the receiver that is never set; `round_trip_of_answer_ns` needs the same clock.
+    `clock_ns` is any clock of the receiver that is never stepped; `round_trip_of_answer_ns` needs the same clock.
     """
     fraction = min(max(int(report.lost_fraction * 256), 0), 255)
     lost = min(max(report.cumulative_lost, -_MAX_LOST - 1), _MAX_LOST) % 2**24

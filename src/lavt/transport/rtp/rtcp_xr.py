@@ -1,7 +1,8 @@
 """Extended reports (RFC 3611) that give the receiver the round-trip time, too: reference times and their answers.
 
 The receiver sends the time of its clock (section 4.4); the sender returns it with the delay since it arrived (section
-4.5). `rtcp.py` puts these bodies into RTCP packets of type 207. Blocks have the header of RTCP packets (section 3).
+4.5). `rtcp.py` puts these bodies into RTCP packets of type 207. The header of a block has the layout of an RTCP
+packet's header (section 3).
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ class ReferenceAnswer(Struct, frozen=True):
 
 
 def round_trip_of_answer_ns(answer: ReferenceAnswer, arrived_clock_ns: int) -> int | None:
-    """Return the round-trip time from an answer that arrived at `arrived_clock_ns`; None: it gives none.
+    """Return the round-trip time from an answer that arrived at `arrived_clock_ns`, or None if it gives none.
 
     The clock is that of the reference time. The caller checks by `receiver_ssrc` that the answer is for it.
     """
@@ -50,13 +51,13 @@ def round_trip_of_answer_ns(answer: ReferenceAnswer, arrived_clock_ns: int) -> i
 
 
 def write_reference_time(ssrc: int, clock_ns: int) -> bytes:
-    """Write the body with the clock of receiver `ssrc`, which may be any clock that is never set."""
+    """Write the body with the clock of receiver `ssrc`, which may be any clock that is never stepped."""
     return _body(ssrc, _REFERENCE_TIME_BLOCK, _REFERENCE_TIME.pack(elapsed_to_ntp(clock_ns)))
 
 
 def write_answers(ssrc: int, answers: Sequence[ReferenceAnswer]) -> bytes:
     """Write the body with the answers of sender `ssrc`."""
-    entries = [_ANSWER.pack(each.receiver_ssrc, each.time, delay_to_short(each.age_ns)) for each in answers]
+    entries = [_ANSWER.pack(answer.receiver_ssrc, answer.time, delay_to_short(answer.age_ns)) for answer in answers]
     return _body(ssrc, _ANSWERS_BLOCK, b"".join(entries))
 
 

@@ -2,8 +2,8 @@
 
 An access unit is one encoded picture: NAL units behind start codes (H.264, annex B). The packetizer uses single NAL
 unit packets, STAP-A for small consecutive units such as the parameter sets, and FU-A fragments of equal size; the
-depacketizer accepts any mix of these. It completes an access unit with its marker packet, so that no frame waits for
-the next.
+depacketizer accepts any mix of these. It finishes an access unit when its marker packet arrives, so that no frame waits
+for the next.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _MIN_PACKET_BYTES: Final = 64
 _NAL_TYPE: Final = 0x1F
 _NAL_REF_IDC: Final = 0x60
 _FORBIDDEN: Final = 0x80
-_NONE: Final = 0
+_NO_NAL_TYPE: Final = 0
 """No NAL unit has this type."""
 _SLICE_OF_IDR: Final = 5
 _PARAMETER_SET: Final = 7
@@ -132,21 +132,21 @@ class Packetizer:
         return datagrams
 
     def _to_payloads(self, units: list[bytes]) -> list[bytes]:
-        """Pack NAL units in order: neighbours together while they fit one packet, large ones in pieces."""
+        """Pack NAL units in order: small ones share a packet while they fit, large ones are split into fragments."""
         payloads: list[bytes] = []
-        together: list[bytes] = []
-        room = self._max_payload_bytes - 1
+        small_units: list[bytes] = []
+        free_bytes = self._max_payload_bytes - 1
         for unit in units:
-            if len(unit) + 2 > room and together:
-                payloads.append(_aggregate(together))
-                together, room = [], self._max_payload_bytes - 1
+            if len(unit) + 2 > free_bytes and small_units:
+                payloads.append(_aggregate(small_units))
+                small_units, free_bytes = [], self._max_payload_bytes - 1
             if len(unit) > self._max_payload_bytes:
                 payloads += _fragment(unit, self._max_payload_bytes)
             else:
-                together.append(unit)
-                room -= 2 + len(unit)
-        if together:
-            payloads.append(_aggregate(together))
+                small_units.append(unit)
+                free_bytes -= 2 + len(unit)
+        if small_units:
+            payloads.append(_aggregate(small_units))
         return payloads
 
 
@@ -177,9 +177,9 @@ class AccessUnit(Struct, frozen=True):
     """Annex B; b"" if nothing of it can be decoded."""
     timestamp: int
     complete: bool
-    """True if nothing is missing in it, nor directly before it unless it is a keyframe with parameter sets. Errors of
-    an incomplete picture persist in the pictures predicted from it, so pictures are in doubt from there to the next
-    complete keyframe."""
+    """True if no packet of it is missing, and none directly before it. Packets missing before it do not count if it is
+    a keyframe with parameter sets. Errors of an incomplete picture persist in the pictures predicted from it, so
+    pictures are in doubt from there to the next complete keyframe."""
     keyframe: bool
     """True if it has slices of an IDR picture: decoding can begin here."""
 
@@ -209,7 +209,7 @@ class Depacketizer:
             self._begin(packet.timestamp, after_loss=lost_before)
         elif lost_before:
             self._damaged = True
-            self._open_fragment = _NONE
+            self._open_fragment = _NO_NAL_TYPE
         if not self._add_payload(packet.payload):
             self.malformed += 1
             self._damaged = True
@@ -223,18 +223,18 @@ class Depacketizer:
         self._timestamp = timestamp
         self._after_loss = after_loss
         self._data = bytearray()
-        self._first_kind = _NONE
+        self._first_kind = _NO_NAL_TYPE
         self._keyframe = False
         self._damaged = False
-        self._open_fragment = _NONE
+        self._open_fragment = _NO_NAL_TYPE
 
     def _finish(self) -> AccessUnit:
         """Finish the current access unit and return it."""
-        damaged = self._damaged or self._open_fragment != _NONE
-        # After a loss the first packets of this unit, or a picture it refers to, may have been lost. A keyframe that
-        # begins with its parameter sets or a delimiter is complete all the same.
-        fresh = self._keyframe and self._first_kind in (_PARAMETER_SET, _DELIMITER)
-        complete = not damaged and bool(self._data) and (fresh or not self._after_loss)
+        damaged = self._damaged or self._open_fragment != _NO_NAL_TYPE
+        # After a loss the first packets of this unit, or a picture that it refers to, may have been lost. A keyframe
+        # that begins with its parameter sets or a delimiter lacks neither.
+        is_self_contained = self._keyframe and self._first_kind in (_PARAMETER_SET, _DELIMITER)
+        complete = not damaged and bool(self._data) and (is_self_contained or not self._after_loss)
         unit = AccessUnit(bytes(self._data), self._timestamp, complete, self._keyframe)
         self._begun = False
         return unit
@@ -246,9 +246,9 @@ class Depacketizer:
         kind = payload[0] & _NAL_TYPE
         if kind == _FU_A:
             return self._add_fragment(payload)
-        if self._open_fragment != _NONE:
+        if self._open_fragment != _NO_NAL_TYPE:
             self._damaged = True
-            self._open_fragment = _NONE
+            self._open_fragment = _NO_NAL_TYPE
         if kind == _STAP_A:
             return self._add_aggregate(payload)
         return self._begin_nal_unit(payload[0]) and self._append(payload[1:])
@@ -273,17 +273,17 @@ class Depacketizer:
             return False
         kind = payload[1] & _NAL_TYPE
         starts, ends = bool(payload[1] & _FU_START), bool(payload[1] & _FU_END)
-        if kind == _NONE or (starts and ends):
+        if kind == _NO_NAL_TYPE or (starts and ends):
             return False
         if starts:
-            self._damaged = self._damaged or self._open_fragment != _NONE
+            self._damaged = self._damaged or self._open_fragment != _NO_NAL_TYPE
             if not self._begin_nal_unit(payload[0] & ~_NAL_TYPE | kind):
                 return False
         elif self._open_fragment != kind:
             self._damaged = True
-            self._open_fragment = _NONE
+            self._open_fragment = _NO_NAL_TYPE
             return True
-        self._open_fragment = _NONE if ends else kind
+        self._open_fragment = _NO_NAL_TYPE if ends else kind
         return self._append(payload[2:])
 
     def _begin_nal_unit(self, header: int) -> bool:
@@ -291,7 +291,7 @@ class Depacketizer:
         kind = header & _NAL_TYPE
         if not 1 <= kind <= _LAST_SINGLE_NAL or header & _FORBIDDEN:
             return False
-        if self._first_kind == _NONE:
+        if self._first_kind == _NO_NAL_TYPE:
             self._first_kind = kind
         self._keyframe = self._keyframe or kind == _SLICE_OF_IDR
         self._data += _START_CODE

@@ -62,7 +62,7 @@ def new_authority(now_wall_ns: int, days: int) -> KeyPair:
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(_key_usage(authority=True), critical=True)
     )
-    return KeyPair(_private(key), _certificate(builder.sign(key, hashes.SHA256())))
+    return KeyPair(_private_pem(key), _certificate_pem(builder.sign(key, hashes.SHA256())))
 
 
 def new_certificate(
@@ -74,10 +74,10 @@ def new_certificate(
     The certificate is valid for `days`, but not longer than the authority's. Raise `UserError` for an authority that
     cannot be read or has expired.
     """
-    issuer, issuer_key = _authority(authority)
+    issuer, issuer_key = _load_authority(authority)
     begins, ends = calendar_time(now_wall_ns), issuer.not_valid_after_utc
     if ends <= begins:
-        raise UserError(f"the authority expired on {_day(issuer)}: make a new one, in another directory")
+        raise UserError(f"the authority expired on {_expiry_day(issuer)}: make a new one, in another directory")
     key = generate_private_key(SECP256R1())
     subject = x509.Name(
         [x509.NameAttribute(NameOID.COMMON_NAME, name), x509.NameAttribute(NameOID.ORGANIZATIONAL_UNIT_NAME, role)]
@@ -95,7 +95,7 @@ def new_certificate(
         )
         .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(issuer_key.public_key()), critical=False)
     )
-    return KeyPair(_private(key), _certificate(builder.sign(issuer_key, hashes.SHA256())))
+    return KeyPair(_private_pem(key), _certificate_pem(builder.sign(issuer_key, hashes.SHA256())))
 
 
 def new_signing_pair(now_wall_ns: int, days: int) -> KeyPair:
@@ -103,26 +103,29 @@ def new_signing_pair(now_wall_ns: int, days: int) -> KeyPair:
     key = Ed25519PrivateKey.generate()
     public = key.public_key().public_bytes(serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo)
     line = expiry_line(now_wall_ns + days * NS_PER_DAY)
-    return KeyPair(line + _private(key), line + public)
+    return KeyPair(line + _private_pem(key), line + public)
 
 
 def summarize(certificate: bytes, where: str) -> CertificateSummary:
-    """Return the summary of a PEM certificate; raise `UserError` that names `where` if it is not one."""
-    read = _read(certificate, where)
-    usages = _extension(read, x509.ExtendedKeyUsage)
+    """Return the summary of a PEM certificate; raise `UserError` that names its place `where` if it is not one."""
+    parsed = _load_certificate(certificate, where)
+    usages = _extension(parsed, x509.ExtendedKeyUsage)
     is_server = usages is not None and ExtendedKeyUsageOID.SERVER_AUTH in usages
-    names = _extension(read, x509.SubjectAlternativeName) if is_server else None
+    names = _extension(parsed, x509.SubjectAlternativeName) if is_server else None
     return CertificateSummary(
-        name=_subject(read, NameOID.COMMON_NAME),
-        role=_subject(read, NameOID.ORGANIZATIONAL_UNIT_NAME),
-        hosts=tuple(str(each.value) for each in names or ()),
-        expires=_day(read),
+        name=_subject(parsed, NameOID.COMMON_NAME),
+        role=_subject(parsed, NameOID.ORGANIZATIONAL_UNIT_NAME),
+        hosts=tuple(str(name.value) for name in names or ()),
+        expires=_expiry_day(parsed),
     )
 
 
 def days_left(certificate: bytes, where: str, now_wall_ns: int) -> float:
     """Return the days until a certificate expires, negative if it has; raise `UserError` as `summarize` does."""
-    return _read(certificate, where).not_valid_after_utc.timestamp() * NS_PER_S / NS_PER_DAY - now_wall_ns / NS_PER_DAY
+    return (
+        _load_certificate(certificate, where).not_valid_after_utc.timestamp() * NS_PER_S / NS_PER_DAY
+        - now_wall_ns / NS_PER_DAY
+    )
 
 
 def is_host(text: str) -> bool:
@@ -170,25 +173,25 @@ def _general_name(host: str) -> x509.GeneralName:
     return x509.DNSName(host) if address is None else x509.IPAddress(address)
 
 
-def _private(key: EllipticCurvePrivateKey | Ed25519PrivateKey) -> bytes:
+def _private_pem(key: EllipticCurvePrivateKey | Ed25519PrivateKey) -> bytes:
     return key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
 
 
-def _certificate(certificate: x509.Certificate) -> bytes:
+def _certificate_pem(certificate: x509.Certificate) -> bytes:
     return certificate.public_bytes(serialization.Encoding.PEM)
 
 
-def _read(certificate: bytes, where: str) -> x509.Certificate:
+def _load_certificate(certificate: bytes, where: str) -> x509.Certificate:
     try:
         return x509.load_pem_x509_certificate(certificate)
     except ValueError as error:
         raise UserError(f"{where} is not a PEM certificate: copy it back, or move it away") from error
 
 
-def _authority(authority: KeyPair) -> tuple[x509.Certificate, EllipticCurvePrivateKey]:
-    certificate = _read(authority.public, "the authority's certificate")
+def _load_authority(authority: KeyPair) -> tuple[x509.Certificate, EllipticCurvePrivateKey]:
+    certificate = _load_certificate(authority.public, "the authority's certificate")
     try:
         key = serialization.load_pem_private_key(authority.private, password=None)
     except (ValueError, TypeError, UnsupportedAlgorithm) as error:
@@ -198,12 +201,12 @@ def _authority(authority: KeyPair) -> tuple[x509.Certificate, EllipticCurvePriva
     return certificate, key
 
 
-def _day(certificate: x509.Certificate) -> str:
+def _expiry_day(certificate: x509.Certificate) -> str:
     return certificate.not_valid_after_utc.strftime("%Y-%m-%d")
 
 
 def _subject(certificate: x509.Certificate, part: x509.ObjectIdentifier) -> str:
-    return next((str(each.value) for each in certificate.subject.get_attributes_for_oid(part)), "")
+    return next((str(attribute.value) for attribute in certificate.subject.get_attributes_for_oid(part)), "")
 
 
 def _extension(certificate: x509.Certificate, kind: type[Kind]) -> Kind | None:

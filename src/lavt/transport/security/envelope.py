@@ -1,9 +1,10 @@
 """Signed envelopes for the messages that cross Zenoh, with protection against replays. Formats: `docs/wire.md`.
 
 A router's access list sees the neighbour and not the origin of a message, so any process that reaches the operator's
-router could publish. Commands and requests therefore carry the operator's signature, which the vehicle verifies; states
-and replies carry the vehicle's, which the operator verifies (Ed25519). Commands, requests and states also carry a MAC
-under the session's token, which is cheaper to verify. No input, output or clock here; callers do the locking.
+router could publish. Commands and requests therefore carry the operator's signature (Ed25519), which the vehicle
+verifies. States and replies carry the vehicle's signature, which the operator verifies. Commands, requests and states
+also carry a MAC under the session's token, which is cheaper to verify. No input, output or clock here; callers do the
+locking.
 """
 
 from __future__ import annotations
@@ -89,9 +90,11 @@ class VerifiedRequest(Struct, frozen=True):
     body: bytes
     """Empty: the request only asks for the next replay counter."""
     digest: bytes
+    """Digest of the request's envelope, which the reply repeats."""
     secret: bytes
+    """The secret shared with the client, which encrypts the reply."""
     public: bytes
-    """The server's public key of the agreement."""
+    """The server's public key of the agreement on the secret."""
     is_stale: bool
     """The replay counter is not the next one, so this may be a replay: the body is ignored and the client may retry."""
 
@@ -185,9 +188,11 @@ class VehicleAuthenticator(NullVehicleAuthenticator):
     def verify_request(self, channel: str, data: bytes) -> VerifiedRequest | None:
         """Return the request if an operator signed it in its own name, otherwise None."""
         signed, signature = _signed_part(data), data[-SIGNATURE_BYTES:]
-        at = REPLAY_COUNTER_BYTES + PUBLIC_KEY_BYTES + _NAME_BYTES
-        counter, public = signed[:REPLAY_COUNTER_BYTES], signed[REPLAY_COUNTER_BYTES : at - _NAME_BYTES]
-        operator, body = signed[at - _NAME_BYTES : at].rstrip(b"\0").decode("ascii", "replace"), signed[at:]
+        name_begin = REPLAY_COUNTER_BYTES + PUBLIC_KEY_BYTES
+        body_begin = name_begin + _NAME_BYTES
+        counter, public = signed[:REPLAY_COUNTER_BYTES], signed[REPLAY_COUNTER_BYTES:name_begin]
+        operator = signed[name_begin:body_begin].rstrip(b"\0").decode("ascii", "replace")
+        body = signed[body_begin:]
         key = self._operators.get(operator)
         if key is None or not key.verify(signature, _signing_context(channel, self._vehicle) + signed):
             self._counts[f"{channel}_requests_forged"] += 1
@@ -199,9 +204,10 @@ class VehicleAuthenticator(NullVehicleAuthenticator):
         is_next = counter == self._replay_counter(channel, operator)
         self._accepted_requests[channel, operator] += is_next
         # An emergency stop has a number of its own and cannot wait for a second request.
-        stale = body == b"" or not (is_next or _is_emergency_stop(channel, body))
-        self._counts[f"{channel}_requests_of_another_time"] += stale and body != b""
-        return VerifiedRequest(channel, operator, body, _digest(data), *agreed, stale)
+        is_stale = body == b"" or not (is_next or _is_emergency_stop(channel, body))
+        self._counts[f"{channel}_requests_of_another_time"] += is_stale and body != b""
+        secret, own_public = agreed
+        return VerifiedRequest(channel, operator, body, _digest(data), secret, own_public, is_stale)
 
     def _is_in_own_name(self, channel: str, operator: str, body: bytes) -> bool:
         """Return whether a request names the operator that signed it; an empty one passes."""
@@ -310,9 +316,10 @@ class OperatorAuthenticator:
     def verify_reply(self, channel: str, data: bytes) -> VerifiedReply:
         """Return the vehicle's reply to a pending request; each reply is accepted once."""
         digest, kind = data[:DIGEST_BYTES], data[DIGEST_BYTES : DIGEST_BYTES + 1]
-        at = DIGEST_BYTES + 1
-        end = at + REPLAY_COUNTER_BYTES
-        counter, public = data[at:end], data[end : end + PUBLIC_KEY_BYTES]
+        counter_begin = DIGEST_BYTES + 1
+        public_begin = counter_begin + REPLAY_COUNTER_BYTES
+        body_begin = public_begin + PUBLIC_KEY_BYTES
+        counter, public = data[counter_begin:public_begin], data[public_begin:body_begin]
         signed, signature = data[:-SIGNATURE_BYTES], data[-SIGNATURE_BYTES:]
         pending = self._pending.get(digest)
         if (
@@ -324,7 +331,7 @@ class OperatorAuthenticator:
             return self._reject_forged_reply(channel)
         context = _signing_context("secret", self._vehicle) + self._agreement.public + public
         secret = self._agreement.derive_secret(public, context)
-        body = None if secret is None else decrypt(secret, signed[end + PUBLIC_KEY_BYTES :], digest)
+        body = None if secret is None else decrypt(secret, signed[body_begin:], digest)
         if body is None:
             return self._reject_forged_reply(channel)
         self._drop_pending(channel, digest)

@@ -1,8 +1,8 @@
 """Cheap checks that keep a flood of commands away from the vehicle, before anything is queued or recorded.
 
-An acceptable command always passes, once: its length, version, epoch and sequence are right, and so is its MAC where
-messages are signed. All others pass at a limited rate: enough for a record that gives the reason, too few to delay
-anything.
+A command that the vehicle may accept always passes, once. Its length, version, epoch and sequence must be right, and
+its MAC if messages are signed. All others pass at a limited rate, which is enough for a record that gives the reason
+and too low to delay anything.
 """
 
 from __future__ import annotations

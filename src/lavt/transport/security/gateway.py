@@ -17,7 +17,7 @@ from lavt.transport.security.envelope import REQUESTS, NullVehicleAuthenticator,
 from lavt.transport.security.flood_filter import QUERIES_PER_S, FloodFilter, RateLimiter
 
 Deliver = Callable[[str, Any, Now, Peer], None]
-"""Takes (channel, payload, arrived, peer)."""
+"""Takes (channel, payload, arrived, peer) of each authentic message."""
 Carry = Callable[..., None]
 """Takes `Send`s and passes them to the link."""
 
@@ -69,7 +69,7 @@ class ServerGateway:
             verify = self._verify_command if channel == "control" else self._verify_request
             body = verify(channel, payload, arrived.mono_ns, peer)
             retry, self._retry = self._retry, None
-        if retry is not None:  # without the lock: the link may wait for its router, and the vehicle for the lock
+        if retry is not None:  # without the lock, for which the vehicle would wait while the link waits for its router
             self._carry(retry)
         if body is not None:
             self._deliver(channel, body, arrived, peer)
@@ -103,7 +103,7 @@ class ServerGateway:
     def send(self, *sends: Send) -> None:
         """Sign messages from the runtime and pass them to the link; a reply without a pending request is dropped."""
         with self._lock:
-            signed = [each for send in sends if (each := self._sign(send)) is not None]
+            signed = [message for send in sends if (message := self._sign(send)) is not None]
         self._carry(*signed)
 
     def _sign(self, send: Send) -> Send | None:

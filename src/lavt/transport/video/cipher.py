@@ -1,7 +1,7 @@
 """Encryption of the video's packets: none, or SRTP with keys that are used for one path only.
 
-The keys are derived from the session token, which only the two ends know where messages are signed, and from the
-challenge that opened the path. So each time the path is opened, each direction gets a new key and a packet index that
+The keys are derived from the session token and from the challenge that opened the path. If messages are signed, only
+the two ends know the token. So each time the path is opened, each direction gets a new key and a packet index that
 starts at 0.
 """
 

@@ -1,7 +1,8 @@
 """Codecs that stamp a picture, encode it as an access unit and decode it: H.264, and two shortcuts for virtual time.
 
-A shortcut replaces H.264 by one small access unit that depends on no other. RTP packets, order, delay and loss affect
-it as they affect video. Its content is text, so it contains neither a start code nor a zero byte.
+A shortcut replaces the H.264 data of a picture by one small access unit that depends on no other. The path from the RTP
+sender to the receiver, with its delay, reordering and loss, treats it like video. Its content is text, so it contains
+neither a start code nor a zero byte.
 """
 
 from __future__ import annotations
@@ -21,13 +22,15 @@ from lavt.transport.video.h264 import DecodedPicture, Decoder, Encoder
 from lavt.transport.video.stamp import STAMP_PX, read_stamp, write_stamp, write_stamp_i420
 
 _IDR_PREFIX: Final = b"\x00\x00\x00\x01\x09\xf0\x00\x00\x00\x01\x65"
-"""An access unit delimiter, and the header of a slice that refers to nothing (H.264, table 7-1)."""
+"""An access unit delimiter, and the NAL header of an IDR slice (H.264, table 7-1), which refers to no other picture."""
 _LANE: Final = struct.Struct("!Qq7d")
+"""A lane in an access unit: stamp, time, and seven numbers in the order of `_pack`."""
 Planes = NDArray[np.uint8]
 """A picture in I420: (height * 3 / 2, width), luma first."""
 MIN_BIT_RATE_BPS: Final = 50_000
-"""Lower limits are raised to this one: below it nobody could drive by the picture."""
+"""Lower limits are raised to this one, because nobody could drive with a worse picture."""
 CHECKSUM_ROW_STEP: Final = 16
+"""The checksum of a picture covers every sixteenth row."""
 MAX_STORED_PICTURES: Final = 300
 """Most pictures in transit: 10 s at 30 Hz, and 280 MB."""
 
@@ -37,7 +40,7 @@ class ReceivedPicture(Protocol):
 
     @property
     def picture(self) -> FramePayload:
-        """The picture for a detector; it may be converted only on access."""
+        """The picture, or the lane in its place, for a detector. A picture may be converted only on access."""
         ...
 
     @property
@@ -89,7 +92,7 @@ class VideoSender:
         self._bit_rate_bps = encoder.bit_rate_bps
 
     def prepare(self, picture: Picture) -> tuple[Planes, int]:
-        """Convert the picture to I420 unless it is; the checksum is a CRC-32 of its luma below the stamp.
+        """Convert to I420 unless the picture already is I420; the checksum is a CRC-32 of the luma below the stamp.
 
         It covers every sixteenth row: a live camera's noise changes each row, and a frozen camera's rows never change.
         """
@@ -107,14 +110,16 @@ class VideoSender:
 
     def limit_bit_rate(self, limit_bps: int | None) -> None:
         """Use the lower of the limit and the configured bit rate, but at least `MIN_BIT_RATE_BPS`."""
-        wanted_bps = self._bit_rate_bps if limit_bps is None else min(limit_bps, self._bit_rate_bps)
-        self._encoder.set_bit_rate(max(wanted_bps, MIN_BIT_RATE_BPS))
+        bit_rate_bps = self._bit_rate_bps if limit_bps is None else min(limit_bps, self._bit_rate_bps)
+        self._encoder.set_bit_rate(max(bit_rate_bps, MIN_BIT_RATE_BPS))
 
 
 class VideoReceiver:
     """An H.264 receiver for pictures of the configured `shape`, (height, width); None: of any shape.
 
-    `read` reads the stamp from the luma: `read_stamp`, or `read_clear_stamp` if the check of the stamp is weaker.
+    `read` reads the stamp from the luma. It is `read_stamp` for LAVT's own sender, whose RTP timestamps confirm each
+    stamp to within 12 us. For a foreign sender it is `read_clear_stamp`, because its stamps can be checked to within
+    milliseconds only, and a cell that is half old and half new could pass that check.
     """
 
     def __init__(
@@ -169,7 +174,7 @@ class InMemoryFrameCodec:
         write_stamp(prepared, stamp_ns)
         return prepared
 
-    def encode(self, stamped: Picture, *, keyframe: bool) -> bytes:  # noqa: ARG002 (each one is)
+    def encode(self, stamped: Picture, *, keyframe: bool) -> bytes:  # noqa: ARG002 (every access unit is a keyframe)
         """Store a copy of the picture, as the camera may reuse its buffer, and return its key."""
         self._key += 1
         self._pictures[self._key] = stamped.copy()
@@ -186,7 +191,7 @@ class InMemoryFrameCodec:
         picture = self._pictures.get(key)
         if picture is None:
             return None
-        self._pictures = {each: stored for each, stored in self._pictures.items() if each > key}
+        self._pictures = {stored_key: stored for stored_key, stored in self._pictures.items() if stored_key > key}
         return RenderedPicture(picture)
 
     def read_stamp(self, received: RenderedPicture) -> int:
@@ -198,6 +203,7 @@ class ReceivedLane(Struct, frozen=True):
     """A lane that was received instead of a picture."""
 
     picture: SeenLane
+    """The lane; named as in `ReceivedPicture`."""
     corrupt: bool = False
 
 
@@ -215,7 +221,7 @@ class LaneSender:
         """Return a copy of the lane with the stamp."""
         return SeenLane(stamp_ns, prepared.at_ns, prepared.lane)
 
-    def encode(self, stamped: SeenLane, *, keyframe: bool) -> bytes:  # noqa: ARG002 (each one is)
+    def encode(self, stamped: SeenLane, *, keyframe: bool) -> bytes:  # noqa: ARG002 (every access unit is a keyframe)
         """Encode the lane in hexadecimal digits."""
         return _IDR_PREFIX + _pack(stamped).hex().encode()
 

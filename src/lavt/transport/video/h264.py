@@ -39,8 +39,8 @@ cv2.setNumThreads(1)
 class Encoder:
     """An H.264 encoder of one stream of pictures (libx264); its output is byte-for-byte reproducible.
 
-    The stream keeps to `bit_rate_bps` over any `buffer_s`. A keyframe comes every `gop_frames` and on request, each
-    with its parameter sets in band. Each of several `threads` encodes a slice of every picture, so that no picture
+    In any time of `buffer_s` the stream keeps to `bit_rate_bps`. A keyframe comes every `gop_frames` and on request,
+    each with its parameter sets in band. Each of several `threads` encodes a slice of every picture, so that no picture
     waits for another. Raises `UserError` for settings that no stream can have.
     """
 

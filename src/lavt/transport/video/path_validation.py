@@ -6,15 +6,15 @@ The session reply, over Zenoh, gives the client a token. Then, between the clien
     server -> client   challenge  number, issued_ns, cookie, MAC cut to 8 bytes
     client -> server   answer     number, issued_ns, cookie, MAC
 
-The number counts the client's hellos; challenge and answer repeat it. MAC is HMAC-SHA256 under the token over all
+The number counts the client's hellos; challenge and answer repeat it. MAC is HMAC-SHA256 under the token over all bytes
 before it. The cookie is an address-validation cookie (compare RFC 9000, section 8.1): HMAC-SHA256, cut to 16 bytes,
 over number, time and the address *from which the server received the hello*, under a secret that never leaves the
 server and changes with each token. Behind a NAT or a relay the client cannot know that address, so it returns the
-cookie, and the server accepts the cookie only from that address. The server keeps only the highest number and
-up to four addresses of it, however many hellos arrive.
+cookie, and the server accepts the cookie only from that address. The server keeps only the highest number and up to
+four addresses of it, however many hellos arrive.
 
-* Aiming the video at a third party: its address must answer a challenge that was sent only there, even if the attacker
-  has the token.
+* Aiming the video at a third party: the third party's address must answer a challenge that was sent only there. Even an
+  attacker who has the token cannot answer it.
 * Redirecting the video by a forged hello or answer: needs the token. A hello opens or moves no path, and one without a
   valid MAC gets no reply. No reply is longer than the datagram it replies to.
 * Replaying a hello: a number below the highest gets no challenge, and the client answers one challenge to each of its
@@ -24,13 +24,14 @@ up to four addresses of it, however many hellos arrive.
   the one that opened the path. A restart or a new token invalidates all older cookies.
 * Making either end change its keys: the server keeps the key of a path that is open to the answer's address, and the
   client never drops the key in use.
-* Not covered: an attacker who reads each hello and whose copy overtakes it can delay the opening of a path, and have a
-  path opened by way of the attacker's address; one who drops datagrams can do so with the video.
+* Not covered: an attacker who reads each hello and whose copy overtakes it can delay the opening of a path, and can
+  make the path lead through the attacker's own address. An attacker who can drop datagrams can drop the video as well.
 
 If the video is encrypted, its keys are derived from the token and the challenge that opened the path, so each opening
 has its own. The client cannot know whether its answer arrives, so it keeps the keys of its last few answers.
 
-These datagrams begin with b"LAVT"; the first byte tells them from RTP and RTCP, whose version there is 2.
+These datagrams begin with b"LAVT"; the first byte distinguishes them from RTP and RTCP, whose first byte begins with
+version 2.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ _HEAD_BYTES: Final = len(_HELLO)
 _NUMBER: Final = slice(_HEAD_BYTES, _HEAD_BYTES + 8)
 _ISSUED: Final = slice(_NUMBER.stop, _NUMBER.stop + 8)
 _COOKIE: Final = slice(_ISSUED.stop, _ISSUED.stop + 16)
-_CHALLENGED: Final = slice(_NUMBER.start, _COOKIE.stop)
+_REPEATED: Final = slice(_NUMBER.start, _COOKIE.stop)
 """The parts of a challenge that its answer repeats."""
 _MAC_BYTES: Final = 32
 _CHALLENGE_MAC_BYTES: Final = 8
@@ -73,7 +74,7 @@ _CLIENT_SIZES: Final = {_HELLO: _NUMBER.stop + _MAC_BYTES, _ANSWER: _COOKIE.stop
 _MAX_CHALLENGES: Final = 4
 """Challenges to copies of one hello from different addresses: few, because each copy may have a false address."""
 _MAX_CIPHERS: Final = 16
-"""Two seconds of hellos: after that the server accepts no answer to them."""
+"""More than the hellos of two seconds: after that time the server accepts no answer to them."""
 
 
 def is_path_datagram(datagram: bytes) -> bool:
@@ -105,6 +106,7 @@ class PathClient:
         self._number = 0
         """Number of the last hello."""
         self._answered_number = 0
+        """Number of the hello whose challenge was answered last."""
         self._interval_ns = HELLO_INTERVAL_NS
         self._next_hello_ns = 0
 
@@ -126,10 +128,10 @@ class PathClient:
         if not hmac.compare_digest(mac, _mac(self._token, body)[:_CHALLENGE_MAC_BYTES]):
             return None
         self._answered_number = number
-        self._ciphers.insert(0, self._new_cipher(self._token, challenge[_CHALLENGED]))
+        self._ciphers.insert(0, self._new_cipher(self._token, challenge[_REPEATED]))
         if len(self._ciphers) > _MAX_CIPHERS:
-            self._ciphers.remove(next(each for each in reversed(self._ciphers) if each is not self._cipher))
-        answer = _ANSWER + challenge[_CHALLENGED]
+            self._ciphers.remove(next(cipher for cipher in reversed(self._ciphers) if cipher is not self._cipher))
+        answer = _ANSWER + challenge[_REPEATED]
         return answer + _mac(self._token, answer)
 
     def unprotect(self, packet: bytes) -> bytes | None:
@@ -210,9 +212,10 @@ class PathServer:
         self._address: Address | None = None
         self._hello_number = 0
         """The highest number of a hello."""
-        self._challenged: set[Address] = set()
+        self._challenged_addresses: set[Address] = set()
         """The addresses from which that hello came."""
-        self._opened_by_ns: int | None = None
+        self._opening_challenge_ns: int | None = None
+        """When the challenge was issued whose answer opened the path."""
         self._last_report_ns = 0
 
     def receive(self, datagram: bytes, address: Address, now_ns: int) -> bytes | None:
@@ -253,10 +256,14 @@ class PathServer:
     def _is_new_hello(self, number: int, address: Address) -> bool:
         """Return whether an authentic hello gets a challenge."""
         if number > self._hello_number:
-            self._hello_number, self._challenged = number, set()
-        if number < self._hello_number or address in self._challenged or len(self._challenged) == _MAX_CHALLENGES:
+            self._hello_number, self._challenged_addresses = number, set()
+        if (
+            number < self._hello_number
+            or address in self._challenged_addresses
+            or len(self._challenged_addresses) == _MAX_CHALLENGES
+        ):
             return False
-        self._challenged.add(address)
+        self._challenged_addresses.add(address)
         return True
 
     def is_open_to_host(self, host: str) -> bool:
@@ -271,33 +278,33 @@ class PathServer:
 
     def _challenge(self, number: int, address: Address, now_ns: int) -> bytes:
         """Return the challenge for `address`."""
-        challenged = number.to_bytes(8, "big") + now_ns.to_bytes(8, "big", signed=True)
-        body = _CHALLENGE + challenged + self._cookie(challenged, address)
+        number_and_time = number.to_bytes(8, "big") + now_ns.to_bytes(8, "big", signed=True)
+        body = _CHALLENGE + number_and_time + self._cookie(number_and_time, address)
         return body + _mac(self.token or b"", body)[:_CHALLENGE_MAC_BYTES]
 
     def _open(self, answer: bytes, address: Address, now_ns: int) -> None:
         """Open the path to `address` if `answer`, whose MAC is valid, answers a recent challenge sent to it."""
-        challenged = answer[_NUMBER.start : _ISSUED.stop]
-        if not hmac.compare_digest(answer[_COOKIE], self._cookie(challenged, address)):
+        number_and_time = answer[_NUMBER.start : _ISSUED.stop]
+        if not hmac.compare_digest(answer[_COOKIE], self._cookie(number_and_time, address)):
             self.wrong_address += 1
             return
         issued_ns = int.from_bytes(answer[_ISSUED], "big", signed=True)
-        used = self._opened_by_ns is not None and issued_ns <= self._opened_by_ns
-        if used or now_ns - issued_ns > CHALLENGE_LIFETIME_NS:
+        is_used = self._opening_challenge_ns is not None and issued_ns <= self._opening_challenge_ns
+        if is_used or now_ns - issued_ns > CHALLENGE_LIFETIME_NS:
             self.stale += 1
             return
         if self.open_address(now_ns) == address:
             self.unneeded += 1
             return
         self._address = address
-        self.cipher = self._new_cipher(self.token or b"", answer[_CHALLENGED])
-        self._opened_by_ns = issued_ns
+        self.cipher = self._new_cipher(self.token or b"", answer[_REPEATED])
+        self._opening_challenge_ns = issued_ns
         self._last_report_ns = now_ns
 
-    def _cookie(self, challenged: bytes, address: Address) -> bytes:
+    def _cookie(self, number_and_time: bytes, address: Address) -> bytes:
         """Return the cookie that binds a challenge's number and time to the address it is sent to."""
         host, port = address
-        signed = challenged + port.to_bytes(2, "big") + host.encode()
+        signed = number_and_time + port.to_bytes(2, "big") + host.encode()
         return hmac.digest(self._secret, signed, "sha256")[: _COOKIE.stop - _COOKIE.start]
 
 

@@ -3,7 +3,7 @@
 The stamp has 64 bits: nanoseconds of the server's wall clock just before encoding. It is 8 x 8 cells of 8 x 8 pixels in
 the top left corner, row by row, most significant bit first, white for 1. The cells lie on the grid of H.264's
 transform, so the stamp survives a low bit rate. A concealed picture may carry a stamp that is readable and wrong; the
-frame's RTP timestamp, which gives the same time in 90 kHz ticks, shows it.
+frame's RTP timestamp, which gives the same time in 90 kHz ticks, reveals this.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ _BITS_OF_BYTE = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1)
 _LUMA_OF_BYTE = np.where(_BITS_OF_BYTE, _WHITE, _BLACK).astype(np.uint8).repeat(_CELL_PX, axis=1)
 """(256, STAMP_PX): one row of pixels for each byte of a stamp."""
 
-_RTP_CLOCK_HZ_BY_10000 = 9
-_NS_PER_S_BY_10000 = 100_000
+_NS_PER_100_US = 100_000
+_RTP_TICKS_PER_100_US = 9
 
 
 def write_stamp(picture_bgr: Picture, stamp_ns: int) -> None:
@@ -86,29 +86,30 @@ def _check_room(height: int, width: int) -> None:
 def read_stamp(luma: NDArray[np.uint8]) -> int:
     """Read the stamp from the luma plane (height, width) of a decoded picture.
 
-    Two pixels in the middle of each cell decide if all of them are clear, else the mean of each cell's centre half.
-    The result is not trusted until `stamp_agrees` has confirmed it. Raises `BadPacket` for a picture that is too small
-    for a stamp, and for an array that is not a plane.
+    If in each cell both innermost pixels are clearly black or both are clearly white, they decide. Otherwise the mean
+    of each cell's centre half decides. The result is not trusted until `stamp_agrees` has confirmed it. Raises
+    `BadPacket` for a picture that is too small for a stamp, and for an array that is not a plane.
     """
     _check_plane(luma)
-    # The pixels are nearly always clear; summing takes five times as long.
+    # The innermost pixels are nearly always clear; summing the centre half takes five times as long.
     one, other = (luma[at:STAMP_PX:_CELL_PX, at:STAMP_PX:_CELL_PX].tobytes().translate(_DIGITS) for at in _INNERMOST)
     if one == other and _UNCLEAR not in one:
         return int(one, 2)
-    return _number(_cell_sums(luma) > _THRESHOLD * _CENTRE_PIXELS)
+    return _to_number(_cell_sums(luma) > _THRESHOLD * _CENTRE_PIXELS)
 
 
 def read_clear_stamp(luma: NDArray[np.uint8]) -> int:
     """Read the stamp as `read_stamp` does, but only if each cell is clearly black or clearly white.
 
-    Checks that are weaker than `stamp_agrees` need this: it rejects a cell that is half old and half new. Raises
-    `BadPacket` also if a cell is in the middle third between black and white.
+    It rejects a cell that is half old and half new. The check of a foreign sender's stamps (`LearnedBase`) needs this,
+    because it tolerates errors of milliseconds, while `stamp_agrees` tolerates microseconds. Raises `BadPacket` also if
+    a cell is in the middle third between black and white.
     """
     sums = _cell_sums(luma)
     white = sums > _CLEARLY_WHITE * _CENTRE_PIXELS
     if not (white | (sums < _CLEARLY_BLACK * _CENTRE_PIXELS)).all():
         raise BadPacket("a cell of the stamp is neither black nor white")
-    return _number(white)
+    return _to_number(white)
 
 
 def _cell_sums(luma: NDArray[np.uint8]) -> NDArray[np.uint16]:
@@ -124,7 +125,7 @@ def _check_plane(luma: NDArray[np.uint8]) -> None:
         raise BadPacket(f"a picture of shape {luma.shape} has no room for a stamp")
 
 
-def _number(white: NDArray[np.bool_]) -> int:
+def _to_number(white: NDArray[np.bool_]) -> int:
     return int.from_bytes(np.packbits(white).tobytes(), "big")
 
 
@@ -140,7 +141,7 @@ def has_stamp(picture_bgr: Picture) -> bool:
 
 def rtp_timestamp(stamp_ns: int) -> int:
     """Return the RTP timestamp of a frame stamped `stamp_ns`: 90 kHz ticks, modulo 2^32 (RFC 6184, section 5.1)."""
-    return stamp_ns * _RTP_CLOCK_HZ_BY_10000 // _NS_PER_S_BY_10000 % 2**32
+    return stamp_ns * _RTP_TICKS_PER_100_US // _NS_PER_100_US % 2**32
 
 
 def stamp_agrees(stamp_ns: int, rtp_timestamp_of_frame: int) -> bool:

@@ -1,8 +1,9 @@
 """Check of the stamps of a foreign sender, whose RTP timestamps have an arbitrary base (RFC 3550, section 5.1).
 
-LAVT's sender puts the stamp itself into the RTP timestamp, and `stamp_agrees` compares the two to 12 us. A foreign
-sender's timestamps start anywhere and give the time of capture, some milliseconds before the stamp. The check is that
-stamps advance as the timestamps do: both lie on one line, which is learned from the first of them.
+LAVT's sender puts the stamp itself into the RTP timestamp, and `stamp_agrees` compares the two to within 12 us. A
+foreign sender's timestamps start anywhere and give the time of capture, some milliseconds before the stamp. The check
+is that stamps advance as the timestamps do: stamps over timestamps lie on one line, which is learned from the first
+stamps.
 """
 
 from __future__ import annotations
@@ -17,14 +18,15 @@ and not more than the frame interval at up to 200 Hz, so that the stamp of the p
 LEARNED_AFTER: Final = 5
 """Stamps that must agree with each other before one is accepted."""
 RELEARN_AFTER_NS: Final = 12 * NS_PER_S
-"""How long stamps must agree with each other, and none with the line, before they replace the line although the
-timestamps continue. If a lost packet has left an old cell in the high bits, all stamps are wrong by the same amount
-until the next keyframe: 8.3 s at x264's default of 250 frames and 30 Hz."""
+"""If the timestamps continue without a jump, stamps replace the line only after they have agreed with each other, and
+none with the line, for this time. If a lost packet has left an old cell in the high bits, all stamps are wrong by the
+same amount until the next keyframe: 8.3 s at x264's default of 250 frames and 30 Hz."""
 JUMP_NS: Final = 60 * NS_PER_S
-"""If timestamps went back, or forward by more than this, the sender has restarted: the line is replaced sooner."""
+"""If timestamps went back, or forward by more than this, the sender has restarted: the line is replaced as
+soon as `LEARNED_AFTER` stamps agree with each other."""
 
 _AVERAGED_STAMPS: Final = 16
-"""The line is the mean of so many stamps: at 30 Hz a clock that drifts by 100 ppm is followed with a lag of 53 us."""
+"""The line is the mean of this many stamps: at 30 Hz a clock that drifts by 100 ppm is followed with a lag of 53 us."""
 
 
 class LearnedBase:
@@ -33,7 +35,8 @@ class LearnedBase:
     No stamp is accepted until `LEARNED_AFTER` stamps agree. When the sender restarts or steps its clock, the base is
     learned again. An accepted stamp may be wrong by twice `TOLERANCE_NS`; a stamp of 64 random bits is accepted with a
     probability of 5e-13 (10 ms in 2^64 ns). Concealed pixels are not random: pass only stamps of pictures that are not
-    in doubt, read by `read_clear_stamp`. Others have been observed to agree with each other on a base wrong by 1 s.
+    in doubt, read by `read_clear_stamp`. Stamps of pictures in doubt have been observed to agree with each other on a
+    base that was wrong by 1 s.
     """
 
     def __init__(self) -> None:
@@ -71,11 +74,11 @@ class _StampLine:
     def accept(self, stamp_ns: int, timestamp: int) -> bool:
         """Extend the line by a stamp if it lies on the line and is newer than the newest; return whether it does."""
         expected_ns = self._mean_ns + _ns_between(self.newest_timestamp, timestamp)
-        off_ns = stamp_ns - expected_ns
-        if abs(off_ns) > TOLERANCE_NS or stamp_ns <= self.newest_ns:
+        error_ns = stamp_ns - expected_ns
+        if abs(error_ns) > TOLERANCE_NS or stamp_ns <= self.newest_ns:
             return False
         self._accepted += 1
-        self._mean_ns = expected_ns + off_ns // min(self._accepted, _AVERAGED_STAMPS)
+        self._mean_ns = expected_ns + error_ns // min(self._accepted, _AVERAGED_STAMPS)
         self.newest_ns, self.newest_timestamp = stamp_ns, timestamp
         return True
 

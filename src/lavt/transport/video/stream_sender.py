@@ -14,7 +14,7 @@ from lavt.transport.rtp.rtp import MAX_PACKET_BYTES, RTP_HEADER_BYTES, Packetize
 from lavt.transport.video.stamp import rtp_timestamp
 
 REPORT_PERIOD_NS: Final = 500 * NS_PER_MS
-"""Period of sender reports; RFC 3550 (6.2) allows reports that are a small share of the stream."""
+"""Period of sender reports; RFC 3550 (section 6.2) allows it, because they are a small share of the stream."""
 
 
 class FramePackets(Struct, frozen=True):
@@ -38,7 +38,7 @@ class StreamSender:
         self._repairs = repairs
         self._repair_packets = repair_packets
         self._packets = self._octets = 0
-        self._report_ns = 0
+        self._next_report_ns = 0
         self.forget_receiver()
 
     def forget_receiver(self) -> None:
@@ -47,6 +47,7 @@ class StreamSender:
         self._redundancy = RedundancyController()
         self._reported: ReceptionReport | None = None
         self._reference: tuple[ReferenceTime, int] | None = None
+        """The last reference time without an answer, and when it arrived."""
 
     def packets(self, access_unit: bytes, stamp_ns: int, now: Now) -> FramePackets:
         """Return the datagrams of a frame that was stamped at `stamp_ns` of the wall clock."""
@@ -57,8 +58,8 @@ class StreamSender:
         self._packets += len(media)
         self._octets += sum(map(len, media)) - RTP_HEADER_BYTES * len(media)
         report = []
-        if now.mono_ns >= self._report_ns:
-            self._report_ns = now.mono_ns + REPORT_PERIOD_NS
+        if now.mono_ns >= self._next_report_ns:
+            self._next_report_ns = now.mono_ns + REPORT_PERIOD_NS
             report.append(self._report(now))
         return FramePackets(media, repair, report)
 
@@ -93,16 +94,16 @@ class StreamSender:
         )
 
     def _note_loss(self, report: ReceptionReport, now_ns: int) -> None:
-        """Note the losses between two reports; the first report, and one that is out of order, adds none."""
-        last, self._reported = self._reported, report
-        if last is None:
+        """Note the losses between two reports; the first report and reports out of order add none."""
+        previous, self._reported = self._reported, report
+        if previous is None:
             return
-        expected = (report.highest_sequence - last.highest_sequence) % 2**32
+        expected = (report.highest_sequence - previous.highest_sequence) % 2**32
         if 0 < expected < 2**31:
-            lost = min(max(report.cumulative_lost - last.cumulative_lost, 0), expected)
+            lost = min(max(report.cumulative_lost - previous.cumulative_lost, 0), expected)
             self._redundancy.note_loss(lost, expected, now_ns)
-        elif expected:
-            self._reported = last
+        elif expected:  # out of order: the newer report stays the one to compare with
+            self._reported = previous
 
 
 def _payload_bit_rate_bps(limit: BitRateLimit) -> int:
