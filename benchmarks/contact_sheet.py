@@ -27,7 +27,7 @@ QUALITY = 80
 
 def render_frame(road: Road, s_m: float, light: LightName) -> Picture:
     """Render the view of a car in the middle of its lane."""
-    x_m, y_m, heading_rad, _ = (float(value) for value in road.point(s_m))
+    x_m, y_m, heading_rad, _ = (float(value) for value in road.centre_at(s_m))
     renderer = Renderer(road, MODEL, seed=1, scenery="full", light=light)
     return renderer.render(Pose(0, x_m, y_m, heading_rad), round(s_m))
 

@@ -274,11 +274,11 @@ def _renderer(route: str, marks: str) -> tuple[Road, Renderer]:
 
 def _truth(road: Road, s_m: float, offset_m: float, turned_rad: float) -> FloatArray:
     """Return y of the lane's centre at `AHEAD_M` for a car at a station, beside the centre and turned."""
-    x_m, y_m, heading_rad, _ = (float(value) for value in road.point(s_m))
+    x_m, y_m, heading_rad, _ = (float(value) for value in road.centre_at(s_m))
     heading = heading_rad + turned_rad
     place = np.array([x_m - offset_m * np.sin(heading_rad), y_m + offset_m * np.cos(heading_rad)])
     stations = np.arange(s_m - 5, s_m + 30, 0.1)
-    points = np.column_stack(road.point(stations)[:2]) - place
+    points = np.column_stack(road.centre_at(stations)[:2]) - place
     ahead = points @ [np.cos(heading), np.sin(heading)]
     left = points @ [-np.sin(heading), np.cos(heading)]
     return np.asarray(np.interp(AHEAD_M, ahead, left), dtype=np.float64)
@@ -295,10 +295,10 @@ def cases(count: int, seed: int = 1, routes: tuple[str, ...] = ("a_key",)) -> It
             generator = stream(seed, f"degraded {kind}", number)
             route = str(generator.choice(routes))
             road, renderer = _renderer(route, marks)
-            s_m = float(generator.uniform(0, road.length_m - 25))
+            s_m = float(generator.uniform(0, road.route_length_m - 25))
             offset_m, turned_rad = float(generator.normal(0, 0.3)), float(generator.normal(0, 0.03))
-            x_m, y_m = road.across(s_m, offset_m)
-            heading_rad = float(road.point(s_m)[2]) + turned_rad
+            x_m, y_m = road.point_at(s_m, offset_m)
+            heading_rad = float(road.centre_at(s_m).heading_rad) + turned_rad
             pose = Pose(0, float(x_m), float(y_m), heading_rad)
             before = _renderer(route, "as it is")[1].render(pose, number)
             picture = before.copy() if marks == "as it is" else renderer.render(pose, number)

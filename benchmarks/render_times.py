@@ -38,11 +38,11 @@ CASES: tuple[tuple[CameraModel, SceneryKind, LightName, bool], ...] = (
 def measure_drive(road: Road, scene_renderer: Renderer, *, swerving: bool) -> FloatArray:
     """Return the CPU time of every frame of a drive at 30 km/h and 30 Hz, in milliseconds."""
     times = []
-    for number, s_m in enumerate(np.arange(0.0, road.length_m, FRAME_M)):
+    for number, s_m in enumerate(np.arange(0.0, road.route_length_m, FRAME_M)):
         phase = 2 * np.pi * s_m / SWERVE_EVERY_M if swerving else 0.0
-        x_m, y_m = road.across(s_m, SWERVE_M * np.sin(phase)).tolist()
+        x_m, y_m = road.point_at(s_m, SWERVE_M * np.sin(phase)).tolist()
         turned_rad = SWERVE_RAD * float(np.cos(phase)) if swerving else 0.0
-        pose = Pose(0, x_m, y_m, float(road.point(s_m)[2]) + turned_rad)
+        pose = Pose(0, x_m, y_m, float(road.centre_at(s_m).heading_rad) + turned_rad)
         begin_s = time.process_time()
         scene_renderer.render(pose, number)
         times.append((time.process_time() - begin_s) * 1000)

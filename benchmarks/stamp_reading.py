@@ -125,7 +125,7 @@ def scene(size: str) -> list[Planes]:
     to_planes = Encoder(width, height, rate_hz=RATE_HZ, bit_rate_bps=1_000_000, gop_frames=GOP_FRAMES).to_planes
     pictures = []
     for number in range(SCENE_FRAMES):
-        x_m, y_m, heading_rad, _ = (float(value) for value in road.point(FROM_M + number * SPEED_MPS / RATE_HZ))
+        x_m, y_m, heading_rad, _ = (float(value) for value in road.centre_at(FROM_M + number * SPEED_MPS / RATE_HZ))
         pictures.append(to_planes(renderer.render(Pose(0, x_m, y_m, heading_rad), number)).copy())
     return pictures + pictures[-2:0:-1]
 

@@ -30,7 +30,7 @@ def render_loop(stem: Path, width_px: int, height_px: int) -> None:
     planes = np.lib.format.open_memmap(stem.with_suffix(".npy"), "w+", np.uint8, shape)
     for number in range(LOOP_FRAMES):
         step = min(number, LOOP_FRAMES - number)
-        x_m, y_m, heading_rad, _ = (float(each) for each in road.point(FROM_M + step * FRAME_M))
+        x_m, y_m, heading_rad, _ = (float(each) for each in road.centre_at(FROM_M + step * FRAME_M))
         picture = renderer.render(Pose(0, x_m, y_m, heading_rad), number)
         cv2.cvtColor(picture, cv2.COLOR_BGR2YUV_I420, dst=planes[number])
 

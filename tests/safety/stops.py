@@ -74,9 +74,9 @@ def curves(route: str, road: Road) -> list[Curve]:
     ):
         segments = list(pieces)
         end_m = s_m + sum(each.length_m for each in segments)
-        if bend and s_m < road.length_m and end_m > 0:
+        if bend and s_m < road.route_length_m and end_m > 0:
             tightest = max((each.curvature_per_m for each in segments), key=abs)
-            end_m = min(end_m, road.length_m)
+            end_m = min(end_m, road.route_length_m)
             found.append(Curve(route, max(s_m, 0.0), end_m, 1 / tightest, max(s_m - BEFORE_M, before_m)))
             before_m = end_m
         s_m = end_m
