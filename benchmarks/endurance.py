@@ -97,17 +97,17 @@ class ResourceSampler:
 
 def describe_growth(samples: Mapping[str, Sequence[ResourceSample]], latency_ms: NDArray[np.float64]) -> list[str]:
     """Return a clause for each quantity that has grown."""
-    found = []
+    clauses = []
     for name, all_samples in samples.items():
         counted = without_first_quarter(all_samples)
         if (slope := growth_kb_per_minute(counted)) > MAX_GROWTH_KB_PER_MINUTE:
-            found.append(f"the memory of {name} grew by {slope:.0f} kB/min")
+            clauses.append(f"the memory of {name} grew by {slope:.0f} kB/min")
         if counted[-1].threads > counted[0].threads:
-            found.append(f"the threads of {name} grew from {counted[0].threads} to {counted[-1].threads}")
+            clauses.append(f"the threads of {name} grew from {counted[0].threads} to {counted[-1].threads}")
     first_ms, last_ms = quarter_medians_ms(latency_ms)
     if last_ms - first_ms > max(MAX_GROWTH_MS, first_ms / 4):
-        found.append(f"latency grew from {first_ms:.2f} to {last_ms:.2f} ms")
-    return found
+        clauses.append(f"latency grew from {first_ms:.2f} to {last_ms:.2f} ms")
+    return clauses
 
 
 def main() -> int:
@@ -134,9 +134,9 @@ def main() -> int:
     medians = ", ".join(f"{median_ms:.2f}" for median_ms in medians_ms(outcome.latency_ms))
     print(f"\nMedian latency of each 10 s: {medians} ms; first quarter {first_ms:.2f} ms, last {last_ms:.2f} ms.")
     print(f"Frames shown: {len(outcome.latency_ms)} of {outcome.sent}.")
-    found = describe_growth(sampler.samples, outcome.latency_ms)
-    print(f"Something grew: {'; '.join(found)}." if found else "Nothing grew.")
-    return 1 if found else 0
+    grown = describe_growth(sampler.samples, outcome.latency_ms)
+    print(f"Something grew: {'; '.join(grown)}." if grown else "Nothing grew.")
+    return 1 if grown else 0
 
 
 if __name__ == "__main__":

@@ -5,8 +5,8 @@
 The paper gives no gains, only how many of 30 drives were completed under each condition. For each pair of settings all
 six routes are driven in geometry fidelity, and a logistic curve is fitted to completion over injected delay. The output
 has the delay at which half of the drives are completed, the shares of completed drives, and the deviance of the
-paper's counts from these shares. The preset is not simply the pair with the smallest deviance: with it, completion only
-has to fall at the same delay as in the paper.
+paper's counts from these shares. The preset need not be the pair with the smallest deviance. It only has to make
+completion fall at the same delay as in the paper.
 """
 
 from __future__ import annotations

@@ -114,7 +114,7 @@ def driver(seed: int, *, stops_after: int | None = None) -> Target:  # noqa: ARG
         [encode(state_sent) for state_sent in (state, stopped, replace(stopped, safety="emergency_stop"))], packed=True
     )
     rejection = SessionReply(False, "held by bob", 0, b"", 5600, "", wall_ns)
-    replies = Corpus([encode(each) for each in (reply, rejection)], packed=True)
+    replies = Corpus([encode(answer) for answer in (reply, rejection)], packed=True)
     picture = RenderedPicture(np.zeros((HEIGHT_PX, WIDTH_PX, 3), np.uint8))
     inputs = 0
 

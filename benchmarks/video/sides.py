@@ -154,8 +154,8 @@ def _evaluate(run: Run, sender_cpu_ns: list[int], counts: dict[str, int], relaye
     stamps = run.table()[WARM_UP_FRAMES : run.frames, 0].tolist()
     rows = {stamp_ns: row for row, stamp_ns in enumerate(stamps, WARM_UP_FRAMES)}
     latency_ms, errors, cpu_ns = [], {}, []
-    with np.load(Path(run.folder) / "read.npz") as read:
-        for (stamp_ns, read_ns, at_cpu_ns), error in zip(read["rows"].tolist(), read["errors"].tolist(), strict=True):
+    with np.load(Path(run.folder) / "read.npz") as log:
+        for (stamp_ns, read_ns, at_cpu_ns), error in zip(log["rows"].tolist(), log["errors"].tolist(), strict=True):
             row = rows.pop(stamp_ns, None)
             if row is not None:
                 latency_ms.append((read_ns - stamp_ns) / NS_PER_MS)

@@ -28,13 +28,13 @@ def test_projection_inverts_station_and_offset(
     line = line_of(segments)
     s_m = -10.0 + share * (line.last_m + 10.0)
     x_m, y_m, heading_rad, _ = (float(value) for value in line.sample(s_m))
-    found = line.project(
+    projection = line.project(
         x_m - offset_m * math.sin(heading_rad),
         y_m + offset_m * math.cos(heading_rad),
         s_m + window_shift_m - 13.0,
         s_m + window_shift_m + 13.0,
     )
-    assert found[:3] == pytest.approx((s_m, offset_m, heading_rad), abs=1e-6)
+    assert projection[:3] == pytest.approx((s_m, offset_m, heading_rad), abs=1e-6)
 
 
 @settings(max_examples=50)

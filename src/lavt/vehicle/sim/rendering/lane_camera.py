@@ -90,33 +90,33 @@ class LaneCamera:
         near_m, far_m, half_width_m = self._near_m, self._far_m, self._half_width_m
         left_slope, right_slope = self._left_slope, self._right_slope
         lens_x_m, lens_y_m = self.model.x_m, self.model.y_m
-        centre, lines_seen = [], 0
+        centre, visible_line_points = [], 0
         # The two lines are written out: a loop over them would take half of this function's time.
         for centre_x, centre_y, left_x, left_y, right_x, right_y in self._line_points[
             first : first + self._count_ahead
         ]:
-            seen = 0
+            visible_lines = 0
             dx, dy = left_x - x_m, left_y - y_m
             ahead_m = dx * cosine + dy * sine
             if near_m <= ahead_m <= far_m:
                 left_m, depth_m = dy * cosine - dx * sine, ahead_m - lens_x_m
                 in_view = right_slope * depth_m <= left_m - lens_y_m <= left_slope * depth_m
                 if in_view and -half_width_m <= left_m <= half_width_m:
-                    seen = 1
+                    visible_lines = 1
             dx, dy = right_x - x_m, right_y - y_m
             ahead_m = dx * cosine + dy * sine
             if near_m <= ahead_m <= far_m:
                 left_m, depth_m = dy * cosine - dx * sine, ahead_m - lens_x_m
                 in_view = right_slope * depth_m <= left_m - lens_y_m <= left_slope * depth_m
                 if in_view and -half_width_m <= left_m <= half_width_m:
-                    seen += 1
-            if seen:
-                lines_seen += seen
+                    visible_lines += 1
+            if visible_lines:
+                visible_line_points += visible_lines
                 dx, dy = centre_x - x_m, centre_y - y_m
                 centre.append((dx * cosine + dy * sine, dy * cosine - dx * sine))
         if len(centre) < MIN_POINTS:
             return Lane((0.0, 0.0, 0.0), self._width_m, near_m, far_m, 0.0)
-        share = lines_seen * STATION_SPACING_M / (2 * (far_m - near_m))
+        share = visible_line_points * STATION_SPACING_M / (2 * (far_m - near_m))
         near_m, far_m = min(centre)[0], max(centre)[0]
         return Lane(
             _fit_centre(centre, far_m - near_m >= LINEAR_BELOW_M), self._width_m, near_m, far_m, min(share, 1.0)
