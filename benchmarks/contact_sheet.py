@@ -1,4 +1,4 @@
-"""Draw one sheet of the simulator's frames: every route in every light, from the driver's view.
+"""Draw one sheet of the simulator's pictures: each of the three routes at two places in every light.
 
 python benchmarks/contact_sheet.py [--out docs/pictures/frames.jpg]
 """
@@ -21,13 +21,13 @@ PLACES = (("a", 30.0), ("a", 205.0), ("b", 175.0), ("b", 470.0), ("c", 60.0), ("
 """Roads and stations (m) on them; the key parts are on the same roads."""
 
 CELL_PX = (480, 360)
-LABEL_PX = 22
-QUALITY = 80
+LABEL_HEIGHT_PX = 22
+JPEG_QUALITY = 80
 
 
 def render_frame(road: Road, s_m: float, light: LightName) -> Picture:
     """Render the view of a car in the middle of its lane."""
-    x_m, y_m, heading_rad, _ = (float(value) for value in road.point(s_m))
+    x_m, y_m, heading_rad, _ = (float(value) for value in road.centre_at(s_m))
     renderer = Renderer(road, MODEL, seed=1, scenery="full", light=light)
     return renderer.render(Pose(0, x_m, y_m, heading_rad), round(s_m))
 
@@ -35,8 +35,8 @@ def render_frame(road: Road, s_m: float, light: LightName) -> Picture:
 def label_cell(picture: Picture, text: str) -> Picture:
     """Return a cell of the sheet, labelled in its corner."""
     cell = np.asarray(cv2.resize(picture, CELL_PX, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-    cell[:LABEL_PX] = cell[:LABEL_PX] // 3
-    cv2.putText(cell, text, (6, LABEL_PX - 6), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
+    cell[:LABEL_HEIGHT_PX] = cell[:LABEL_HEIGHT_PX] // 3
+    cv2.putText(cell, text, (6, LABEL_HEIGHT_PX - 6), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
     return cell
 
 
@@ -51,7 +51,7 @@ def main() -> None:
         cells = [label_cell(render_frame(road, s_m, light), f"{road.title}, {s_m:.0f} m, {light}") for light in LIGHTS]
         rows.append(np.hstack(cells))
     out.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(out), np.vstack(rows), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    cv2.imwrite(str(out), np.vstack(rows), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     print(f"{out}: {out.stat().st_size / 1000:.0f} kB")
 
 

@@ -1,10 +1,11 @@
 """Measure the round trip of a command through two Zenoh routers, compared with raw UDP, pyzmq and CycloneDDS.
 
 The message is an encoded command. One process sends it, another one echoes it, and the first one measures the time.
-Zenoh is set up as in LAVT: a router for each side (`lavt router` with the files of `zenoh-configs/`, linked by
-`udp?rel=1;mixed_rel=1`), the quality of service of commands, and a callback that hands over to the node's thread. The
-others are two sockets, or two participants, that communicate directly. Everything is on the loopback of one machine, so
-processing is compared, not networks. All carriers take turns in each round.
+Zenoh is set up as in LAVT: with a router for each side (`lavt router` with the files of `zenoh-configs/`, linked by
+`udp?rel=1;mixed_rel=1`), with the quality of service of commands, and with a listening thread that passes messages to
+the node's thread. The other carriers are two sockets, or two participants, that communicate directly. All processes run
+on one machine and use its loopback, so the benchmark compares processing, not networks. All carriers take turns in each
+round.
 
 pyzmq and CycloneDDS are measured if they are installed: pip install pyzmq cyclonedds. LAVT does not need them.
 
@@ -39,30 +40,30 @@ from lavt.experiment.runs.processes import Processes
 from lavt.runtime import process_priority
 
 FOLDER = Path(__file__).parents[1]
-PACES = {"at_50_hz": "50 Hz", "back_to_back": "back to back"}
+PACE_LABELS = {"at_50_hz": "50 Hz", "back_to_back": "back to back"}
 PERCENTILES = (50, 95, 99)
-LOCAL = "tcp/127.0.0.1:0"
-BETWEEN = "udp/127.0.0.1:{port}?rel=1;mixed_rel=1"
+SESSION_ENDPOINT = "tcp/127.0.0.1:0"
+ROUTER_LINK = "udp/127.0.0.1:{port}?rel=1;mixed_rel=1"
 MAX_OVERHEAD_S = 30.0
-"""The limit of the time for start, discovery and end, besides the measurement."""
+"""The time limit for start, discovery and end, in addition to the time of the measurement."""
 
 Measured = dict[str, dict[str, float]]
 """Microseconds by percentile, and lost echoes, by pace."""
 
 
 def start_routers(processes: Processes) -> tuple[str, str]:
-    """Start the vehicle's router and the operator's, which dials it; return their endpoints for sessions."""
+    """Start the vehicle's router, and the operator's, which connects to it; return their endpoints for sessions."""
     endpoints = []
     remote_endpoint = ""
-    for side, listen in (("server", [LOCAL, BETWEEN.format(port=0)]), ("client", [LOCAL])):
+    for side, listen in (("server", [SESSION_ENDPOINT, ROUTER_LINK.format(port=0)]), ("client", [SESSION_ENDPOINT])):
         connect = [remote_endpoint] if remote_endpoint else []
         changes = [f"listen.endpoints={json.dumps(listen)}", f"connect.endpoints={json.dumps(connect)}"]
         words = [word for change in changes for word in ("--set", change)]
         router = processes.start(f"{side}-router", "router", f"zenoh-configs/router-{side}.json5", *words)
         locators = router.ready()["locators"]
-        endpoints.append(next(each for each in locators if each.startswith("tcp/")))
-        remote = next((each for each in locators if each.startswith("udp/")), "")
-        remote_endpoint = BETWEEN.format(port=remote.partition("?")[0].rpartition(":")[2])
+        endpoints.append(next(locator for locator in locators if locator.startswith("tcp/")))
+        remote = next((locator for locator in locators if locator.startswith("udp/")), "")
+        remote_endpoint = ROUTER_LINK.format(port=remote.partition("?")[0].rpartition(":")[2])
     return endpoints[0], endpoints[1]
 
 
@@ -104,11 +105,11 @@ def run(carrier: str, routers: tuple[str, str], seconds: float, messages: int) -
 
 def percentiles(carrier: str, times_ns: Sequence[int | None]) -> dict[str, float]:
     """Return percentiles in microseconds and the number of lost echoes; raise `WorkError` if all were lost."""
-    received_ns = [each for each in times_ns if each is not None]
+    received_ns = [time_ns for time_ns in times_ns if time_ns is not None]
     if not received_ns:
         raise WorkError(f"{carrier} lost every echo")
     values = np.percentile(received_ns, PERCENTILES) / 1000
-    named = {f"p{each}_us": round(float(value), 1) for each, value in zip(PERCENTILES, values, strict=True)}
+    named = {f"p{rank}_us": round(float(value), 1) for rank, value in zip(PERCENTILES, values, strict=True)}
     return {**named, "lost": len(times_ns) - len(received_ns)}
 
 
@@ -117,24 +118,30 @@ def summary(rounds: Mapping[str, Sequence[Measured]]) -> dict[str, Any]:
     medians: dict[str, Any] = {}
     for carrier, measured in rounds.items():
         medians[carrier] = {}
-        for pace in PACES:
-            values = {name: float(np.median([each[pace][name] for each in measured])) for name in measured[0][pace]}
+        for pace in PACE_LABELS:
+            values = {
+                name: float(np.median([of_round[pace][name] for of_round in measured])) for name in measured[0][pace]
+            }
             baseline = values if carrier == "udp" else medians.get("udp", {}).get(pace)
-            names = [f"p{each}" for each in PERCENTILES] if baseline else []
-            ratios = {f"{each}_ratio": round(values[f"{each}_us"] / baseline[f"{each}_us"], 2) for each in names}
+            names = [f"p{rank}" for rank in PERCENTILES] if baseline else []
+            ratios = {f"{name}_ratio": round(values[f"{name}_us"] / baseline[f"{name}_us"], 2) for name in names}
             medians[carrier][pace] = {**values, **ratios}
     return medians
 
 
 def table(medians: Mapping[str, Any]) -> str:
     """Return the medians as a Markdown table."""
-    heads = ["carrier", *(f"{words}: {' / '.join(f'p{each}' for each in PERCENTILES)}" for words in PACES.values())]
-    rows = [[CARRIERS[carrier].words, *(_cell(paces[pace]) for pace in PACES)] for carrier, paces in medians.items()]
+    ranks = " / ".join(f"p{rank}" for rank in PERCENTILES)
+    heads = ["carrier", *(f"{label}: {ranks}" for label in PACE_LABELS.values())]
+    rows = [
+        [CARRIERS[carrier].label, *(_cell(by_pace[pace]) for pace in PACE_LABELS)]
+        for carrier, by_pace in medians.items()
+    ]
     return "\n".join(f"| {' | '.join(row)} |" for row in (heads, ["---"] * len(heads), *rows))
 
 
 def _cell(values: Mapping[str, float]) -> str:
-    times = " / ".join(f"{values[f'p{each}_us']:.0f}" for each in PERCENTILES)
+    times = " / ".join(f"{values[f'p{rank}_us']:.0f}" for rank in PERCENTILES)
     ratio = values.get("p50_ratio")
     lost = f", {values['lost']:.0f} lost" if values["lost"] else ""
     return f"{times} us{lost}" + ("" if ratio is None else f" ({ratio:.1f} x)")
@@ -149,7 +156,7 @@ def measure(carriers: Sequence[str], rounds: int, seconds: float, messages: int)
             for carrier in carriers if number % 2 == 0 else reversed(carriers):
                 times = run(carrier, routers, seconds, messages)
                 measured[carrier].append(times)
-                cells = "; ".join(f"{words} {_cell(times[pace])}" for pace, words in PACES.items())
+                cells = "; ".join(f"{label} {_cell(times[pace])}" for pace, label in PACE_LABELS.items())
                 print(f"{number + 1} {carrier}: {cells}", flush=True)
     return summary(measured)
 
@@ -158,8 +165,8 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--seconds", type=float, default=10.0, help="at 50 Hz, in each run")
-    parser.add_argument("--messages", type=int, default=2000, help="back to back, in each run")
+    parser.add_argument("--seconds", type=float, default=10.0, help="time at 50 Hz in each run")
+    parser.add_argument("--messages", type=int, default=2000, help="number of messages back to back in each run")
     parser.add_argument("--only", action="append", choices=CARRIERS, help="a carrier; repeatable")
     options = parser.parse_args(words)
     if options.rounds < 1 or options.seconds <= 0 or options.messages < 1:
@@ -170,7 +177,7 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
 def main() -> int:
     """Measure the selected carriers that are installed, and return the exit code: 2 if none is."""
     options = arguments()
-    process_priority.raise_priority()  # as the server and the client do; routers and both sides inherit it
+    process_priority.raise_priority()  # as the server and the client do; the routers and both processes inherit it
     missing = [name for name, carrier in CARRIERS.items() if carrier.missing and name in (options.only or CARRIERS)]
     for name in missing:
         print(f"{name} is not measured: it is not installed (pip install {CARRIERS[name].package})", file=sys.stderr)

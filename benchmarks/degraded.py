@@ -1,7 +1,7 @@
 """Degraded pictures with ground truth, for which perception was not designed.
 
 A picture is rendered from a place on a road whose markings may have been changed, then painted on (`PAINT`), then
-degraded (`DEGRADED`). The truth about the lane's centre comes from the road, in the vehicle's frame.
+degraded (`DEGRADED`). The true position of the lane's centre is computed from the road, in the vehicle's frame.
 """
 
 from __future__ import annotations
@@ -24,7 +24,9 @@ from lavt.vehicle.sim.road.road import Road, load_road
 
 MODEL = CameraModel()
 AHEAD_M = np.array([5.0, 10.0, 15.0])
-Degrade = Callable[[Picture, np.random.Generator], Picture]
+"""Distances ahead of the rear axle at which the lane's centre is compared."""
+
+Degradation = Callable[[Picture, np.random.Generator], Picture]
 
 TAR, WORN_WHITE, WHITE, YELLOW, CONCRETE = (
     (38, 38, 40),
@@ -51,17 +53,18 @@ class DegradedCase:
 # Changed markings on the road itself.
 
 
-def _marks(keep: Callable[[RoadMark], RoadMark | None]) -> Callable[[Road], Road]:
-    return lambda road: replace(road, marks=tuple(new for mark in road.marks if (new := keep(mark)) is not None))
+def _with_marks(change: Callable[[RoadMark], RoadMark | None]) -> Callable[[Road], Road]:
+    """Return a function that changes the marks of a road; `change` returns None for a mark to be removed."""
+    return lambda road: replace(road, marks=tuple(new for mark in road.marks if (new := change(mark)) is not None))
 
 
 ROADS: dict[str, Callable[[Road], Road]] = {
     "as it is": lambda road: road,
-    "one line only": _marks(lambda mark: replace(mark, kind="solid") if mark.offset_m == -1.75 else None),
-    "left line missing": _marks(lambda mark: None if mark.offset_m > 0 else mark),
-    "right line missing": _marks(lambda mark: None if mark.offset_m < 0 else mark),
-    "all marks missing": _marks(lambda _: None),
-    "solid lines": _marks(lambda mark: replace(mark, kind="solid")),
+    "one line only": _with_marks(lambda mark: replace(mark, kind="solid") if mark.offset_m == -1.75 else None),
+    "left line missing": _with_marks(lambda mark: None if mark.offset_m > 0 else mark),
+    "right line missing": _with_marks(lambda mark: None if mark.offset_m < 0 else mark),
+    "all marks missing": _with_marks(lambda _: None),
+    "solid lines": _with_marks(lambda mark: replace(mark, kind="solid")),
 }
 NO_LANE = {
     "all marks missing",
@@ -83,13 +86,13 @@ NO_LANE = {
 def _strip(picture: Picture, line: list[tuple[float, float]], width_m: float, colour: tuple[int, int, int]) -> None:
     """Paint a strip along a line of ground points (x, y), antialiased."""
     points = np.array(line)
-    fine = np.concatenate([np.linspace(a, b, 40) for a, b in pairwise(points)])
-    along = np.gradient(fine, axis=0)
+    dense = np.concatenate([np.linspace(begin, end, 40) for begin, end in pairwise(points)])
+    along = np.gradient(dense, axis=0)
     across = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(np.hypot(*along.T), 1e-9)[:, None]
-    rim = np.concatenate([fine + across * width_m / 2, (fine - across * width_m / 2)[::-1]])
-    rim = rim[rim[:, 0] > MODEL.x_m + 0.6]
-    if len(rim) > 2:
-        pixels = picture_points(calibrated(MODEL), rim)
+    outline = np.concatenate([dense + across * width_m / 2, (dense - across * width_m / 2)[::-1]])
+    outline = outline[outline[:, 0] > MODEL.x_m + 0.6]
+    if len(outline) > 2:
+        pixels = picture_points(calibrated(MODEL), outline)
         cv2.fillPoly(picture, [np.round(pixels * 16).astype(np.int32)], colour, cv2.LINE_AA, 4)
 
 
@@ -167,9 +170,18 @@ def tree_shadows(picture: Picture, generator: np.random.Generator) -> Picture:
     return np.asarray(picture * (cv2.GaussianBlur(shade, (5, 5), 0) / 255.0), dtype=np.uint8)
 
 
-PAINT: dict[str, Degrade] = {
-    each.__name__.replace("_", " "): each
-    for each in (tar_seams, old_yellow_line, yellow_diversion, old_white_line, diagonal, crosswalk, arrow, tree_shadows)
+PAINT: dict[str, Degradation] = {
+    paint.__name__.replace("_", " "): paint
+    for paint in (
+        tar_seams,
+        old_yellow_line,
+        yellow_diversion,
+        old_white_line,
+        diagonal,
+        crosswalk,
+        arrow,
+        tree_shadows,
+    )
 }
 
 
@@ -177,10 +189,10 @@ PAINT: dict[str, Degrade] = {
 
 
 def _worn(picture: Picture, share: float) -> Picture:
-    """Reduce the contrast of what is brighter than its surroundings."""
-    around = cv2.medianBlur(picture, 31)
-    below = picture[240:].astype(np.float32), around[240:].astype(np.float32)
-    worn = np.where(below[0] > below[1] + 8, below[1] + (below[0] - below[1]) * (1 - share), below[0])
+    """Reduce the contrast of pixels that are brighter than their surroundings, in the lower half of the picture."""
+    surroundings = cv2.medianBlur(picture, 31)
+    ground, around = picture[240:].astype(np.float32), surroundings[240:].astype(np.float32)
+    worn = np.where(ground > around + 8, around + (ground - around) * (1 - share), ground)
     result = picture.copy()
     result[240:] = worn.astype(np.uint8)
     return result
@@ -227,7 +239,7 @@ def _low_rate(picture: Picture, _generator: np.random.Generator) -> Picture:
     """Return the tenth frame of H.264 at 200 kbit/s, which has block artefacts."""
     encoder = Encoder(640, 480, rate_hz=30.0, bit_rate_bps=200_000, gop_frames=300)
     decoder, shown = Decoder(), picture
-    for shift in range(10):  # the scene moves like a road, because a still one would become sharp
+    for shift in range(10):  # the picture moves like a road, because the codec would make a still one sharp
         moved = np.roll(picture, (9 - shift) * 3, axis=0)
         decoded = decoder.decode(encoder.encode(moved))
         shown = decoded.picture if decoded is not None else shown
@@ -240,7 +252,7 @@ def blocks(generator: np.random.Generator, side_px: int) -> Picture:
     return squares.repeat(side_px, 0).repeat(side_px, 1).repeat(3, 2)
 
 
-DEGRADED: dict[str, Degrade] = {
+DEGRADED: dict[str, Degradation] = {
     "worn by half": lambda picture, _: _worn(picture, 0.5),
     "worn by 80 %": lambda picture, _: _worn(picture, 0.8),
     "dark": lambda picture, generator: _noisy((picture * 0.2).astype(np.uint8), generator, 4),
@@ -273,12 +285,13 @@ def _renderer(route: str, marks: str) -> tuple[Road, Renderer]:
 
 
 def _truth(road: Road, s_m: float, offset_m: float, turned_rad: float) -> FloatArray:
-    """Return y of the lane's centre at `AHEAD_M` for a car at a station, beside the centre and turned."""
-    x_m, y_m, heading_rad, _ = (float(value) for value in road.point(s_m))
+    """Return y of the lane's centre at `AHEAD_M` for a car at a station, with an offset from the centre and a turn."""
+    x_m, y_m, heading_rad, _ = (float(value) for value in road.centre_at(s_m))
     heading = heading_rad + turned_rad
     place = np.array([x_m - offset_m * np.sin(heading_rad), y_m + offset_m * np.cos(heading_rad)])
     stations = np.arange(s_m - 5, s_m + 30, 0.1)
-    points = np.column_stack(road.point(stations)[:2]) - place
+    centre = road.centre_at(stations)
+    points = np.column_stack([centre.x_m, centre.y_m]) - place
     ahead = points @ [np.cos(heading), np.sin(heading)]
     left = points @ [-np.sin(heading), np.cos(heading)]
     return np.asarray(np.interp(AHEAD_M, ahead, left), dtype=np.float64)
@@ -286,7 +299,7 @@ def _truth(road: Road, s_m: float, offset_m: float, turned_rad: float) -> FloatA
 
 def cases(count: int, seed: int = 1, routes: tuple[str, ...] = ("a_key",)) -> Iterator[DegradedCase]:
     """Yield `count` pictures of every kind from random places of random routes, reproducible by the seed."""
-    kinds: list[tuple[str, str, Degrade | None]] = [(kind, kind, None) for kind in ROADS]
+    kinds: list[tuple[str, str, Degradation | None]] = [(kind, kind, None) for kind in ROADS]
     kinds += [(kind, "as it is", paint) for kind, paint in PAINT.items()]
     kinds += [(f"{paint.__name__} only", "all marks missing", paint) for paint in (kerb, diagonal, crosswalk)]
     kinds += [(kind, "as it is", degrade) for kind, degrade in DEGRADED.items()]
@@ -295,10 +308,10 @@ def cases(count: int, seed: int = 1, routes: tuple[str, ...] = ("a_key",)) -> It
             generator = stream(seed, f"degraded {kind}", number)
             route = str(generator.choice(routes))
             road, renderer = _renderer(route, marks)
-            s_m = float(generator.uniform(0, road.length_m - 25))
+            s_m = float(generator.uniform(0, road.route_length_m - 25))
             offset_m, turned_rad = float(generator.normal(0, 0.3)), float(generator.normal(0, 0.03))
-            x_m, y_m = road.across(s_m, offset_m)
-            heading_rad = float(road.point(s_m)[2]) + turned_rad
+            x_m, y_m = road.point_at(s_m, offset_m)
+            heading_rad = float(road.centre_at(s_m).heading_rad) + turned_rad
             pose = Pose(0, float(x_m), float(y_m), heading_rad)
             before = _renderer(route, "as it is")[1].render(pose, number)
             picture = before.copy() if marks == "as it is" else renderer.render(pose, number)

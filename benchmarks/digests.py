@@ -20,11 +20,11 @@ from lavt.experiment.runs.plan import PlannedRun, plan_sweep
 from lavt.experiment.sweep.sweep import run_all
 
 
-def digests(planned: list[PlannedRun], jobs: int, cluster_at: str | None) -> dict[str, str]:
+def digests(planned: list[PlannedRun], jobs: int, cluster_address: str | None) -> dict[str, str]:
     """Run everything, and return the digest of each run."""
     with TemporaryDirectory() as directory:
         completed, _ = run_all(
-            planned, Path(directory), jobs=jobs, on_progress=lambda _: None, cluster_address=cluster_at
+            planned, Path(directory), jobs=jobs, on_progress=lambda _: None, cluster_address=cluster_address
         )
     if completed.failed:
         raise SystemExit(f"failed: {completed.failed}")
@@ -46,12 +46,12 @@ def main() -> None:
         "1 job": (1, None),
         f"Dask, {options.jobs} workers": (options.jobs, "local"),
     }
-    clock, first = MachineClock(), None
-    for name, (jobs, cluster_at) in executors.items():
+    clock, reference = MachineClock(), None
+    for name, (jobs, cluster_address) in executors.items():
         begin_ns = clock.now().mono_ns
-        run_digests = digests(planned, jobs, cluster_at)
-        first = first or run_digests
-        different = sum(first[run] != digest for run, digest in run_digests.items())
+        run_digests = digests(planned, jobs, cluster_address)
+        reference = reference or run_digests
+        different = sum(reference[run] != digest for run, digest in run_digests.items())
         took_s = (clock.now().mono_ns - begin_ns) / NS_PER_S
         print(f"{name}: {len(run_digests)} runs, {different} digests differ, {took_s:.0f} s", flush=True)
 

@@ -1,7 +1,7 @@
 """Send video over loopback for minutes and check that memory, threads and latency do not grow.
 
-The two processes are those of our side in `video_vs_gstreamer.py`. Memory is the resident set of each, sampled twice a
-second; its growth is the slope of a line through the samples after the first quarter.
+The two processes are those of our side in `video_vs_gstreamer.py`. Memory is the resident set of each process,
+sampled twice a second. Its growth is the slope of a straight line through the samples after the first quarter.
 
     python benchmarks/endurance.py [--minutes 2]
 """
@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-sys.path.insert(0, str(Path(__file__).parents[1]))  # a program finds only the modules in its own folder
+sys.path.insert(0, str(Path(__file__).parents[1]))  # for the package `benchmarks`
 
 from benchmarks.video.clean import SIZES, describe_clean_run
 from benchmarks.video.pictures import render_loop
@@ -28,12 +28,12 @@ from benchmarks.video.sides import BenchmarkProcess, measure
 
 from lavt.runtime import process_priority
 
-SAMPLE_S = 0.5
-INTERVAL_S = 10
+SAMPLE_PERIOD_S = 0.5
+MEDIAN_INTERVAL_S = 10
 MAX_GROWTH_KB_PER_MINUTE = 100.0
-"""Less is the normal variation of an allocator; more would be visible after 30 minutes."""
+"""Growth up to this is the normal variation of an allocator; more would be visible after 30 minutes."""
 MAX_GROWTH_MS = 0.5
-"""An increase of the latency beyond this, and beyond a quarter of it, is growth and not chance."""
+"""Latency has grown if it has increased by more than this and by more than a quarter."""
 
 
 @dataclass(frozen=True)
@@ -59,13 +59,13 @@ def without_first_quarter(samples: Sequence[ResourceSample]) -> Sequence[Resourc
 
 def growth_kb_per_minute(samples: Sequence[ResourceSample]) -> float:
     """Return the slope of the straight line through memory over time."""
-    slope_kb_per_s, _ = np.polyfit([each.at_s for each in samples], [each.memory_kb for each in samples], 1)
+    slope_kb_per_s, _ = np.polyfit([sample.at_s for sample in samples], [sample.memory_kb for sample in samples], 1)
     return float(slope_kb_per_s) * 60
 
 
 def medians_ms(latency_ms: NDArray[np.float64]) -> list[float]:
     """Return the medians of intervals of 10 s; a shorter interval at the end is ignored unless it is the only one."""
-    frames = min(INTERVAL_S * RATE_HZ, len(latency_ms))
+    frames = min(MEDIAN_INTERVAL_S * RATE_HZ, len(latency_ms))
     return [float(np.median(latency_ms[at : at + frames])) for at in range(0, len(latency_ms) - frames + 1, frames)]
 
 
@@ -80,7 +80,7 @@ class ResourceSampler:
 
     def __init__(self, seconds: float) -> None:
         self.samples: dict[str, list[ResourceSample]] = {}
-        self._count = max(2, int(seconds / SAMPLE_S))
+        self._count = max(2, int(seconds / SAMPLE_PERIOD_S))
         self._pause = threading.Event()
 
     def start(self, processes: Sequence[BenchmarkProcess]) -> None:
@@ -89,40 +89,41 @@ class ResourceSampler:
 
     def _run(self, processes: list[BenchmarkProcess]) -> None:
         for number in range(self._count):
-            self._pause.wait(SAMPLE_S)
-            for each in processes:
-                self.samples.setdefault(each.name, []).append(sample_process(each.process_id, number * SAMPLE_S))
+            self._pause.wait(SAMPLE_PERIOD_S)
+            for process in processes:
+                sample = sample_process(process.process_id, number * SAMPLE_PERIOD_S)
+                self.samples.setdefault(process.name, []).append(sample)
 
 
 def describe_growth(samples: Mapping[str, Sequence[ResourceSample]], latency_ms: NDArray[np.float64]) -> list[str]:
     """Return a clause for each quantity that has grown."""
-    found = []
+    clauses = []
     for name, all_samples in samples.items():
         counted = without_first_quarter(all_samples)
         if (slope := growth_kb_per_minute(counted)) > MAX_GROWTH_KB_PER_MINUTE:
-            found.append(f"the memory of {name} grew by {slope:.0f} kB/min")
+            clauses.append(f"the memory of {name} grew by {slope:.0f} kB/min")
         if counted[-1].threads > counted[0].threads:
-            found.append(f"the threads of {name} grew from {counted[0].threads} to {counted[-1].threads}")
+            clauses.append(f"the threads of {name} grew from {counted[0].threads} to {counted[-1].threads}")
     first_ms, last_ms = quarter_medians_ms(latency_ms)
     if last_ms - first_ms > max(MAX_GROWTH_MS, first_ms / 4):
-        found.append(f"latency grew from {first_ms:.2f} to {last_ms:.2f} ms")
-    return found
+        clauses.append(f"latency grew from {first_ms:.2f} to {last_ms:.2f} ms")
+    return clauses
 
 
 def main() -> int:
     """Measure and print a table; return 1 if anything grew."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--minutes", type=float, default=2.0, help="length of the run, after a warm-up of 3 s")
-    requested = parser.parse_args()
-    if not 0 < requested.minutes <= 60:
+    options = parser.parse_args()
+    if not 0 < options.minutes <= 60:
         parser.error("--minutes must be above zero and at most 60")
     process_priority.raise_priority()  # as the server and the client do
-    sampler = ResourceSampler(requested.minutes * 60)  # the run also has a warm-up
+    sampler = ResourceSampler(options.minutes * 60)  # the run is longer than this by its warm-up
     with tempfile.TemporaryDirectory() as name:
-        run = describe_clean_run(Path(name), SIZES[0], requested.minutes * 60)
+        run = describe_clean_run(Path(name), SIZES[0], options.minutes * 60)
         render_loop(run.loop, run.width_px, run.height_px)
         outcome = measure("ours", run, when_started=sampler.start)
-    print("| process | memory MB, begin | end | kB/min | threads, begin | end |\n|---|---|---|---|---|---|")
+    print("| process | memory MB, beginning | end | kB/min | threads, beginning | end |\n|---|---|---|---|---|---|")
     for name, samples in sampler.samples.items():
         counted = without_first_quarter(samples)
         print(
@@ -130,12 +131,12 @@ def main() -> int:
             f"| {growth_kb_per_minute(counted):.1f} | {counted[0].threads} | {counted[-1].threads} |"
         )
     first_ms, last_ms = quarter_medians_ms(outcome.latency_ms)
-    medians = ", ".join(f"{each:.2f}" for each in medians_ms(outcome.latency_ms))
+    medians = ", ".join(f"{median_ms:.2f}" for median_ms in medians_ms(outcome.latency_ms))
     print(f"\nMedian latency of each 10 s: {medians} ms; first quarter {first_ms:.2f} ms, last {last_ms:.2f} ms.")
     print(f"Frames shown: {len(outcome.latency_ms)} of {outcome.sent}.")
-    found = describe_growth(sampler.samples, outcome.latency_ms)
-    print(f"Something grew: {'; '.join(found)}." if found else "Nothing grew.")
-    return 1 if found else 0
+    grown = describe_growth(sampler.samples, outcome.latency_ms)
+    print(f"Something grew: {'; '.join(grown)}." if grown else "Nothing grew.")
+    return 1 if grown else 0
 
 
 if __name__ == "__main__":

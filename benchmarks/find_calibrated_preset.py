@@ -1,12 +1,12 @@
-"""Find how the completion of drives depends on lookahead and steering limit, and compare it with the paper's.
+"""Measure how the completion of drives depends on lookahead and steering limit, and compare it with the paper's.
 
     python benchmarks/find_calibrated_preset.py [--repetitions 2] [--jobs N]
 
 The paper gives no gains, only how many of 30 drives were completed under each condition. For each pair of settings all
 six routes are driven in geometry fidelity, and a logistic curve is fitted to completion over injected delay. The output
 has the delay at which half of the drives are completed, the shares of completed drives, and the deviance of the
-paper's counts from these shares. The preset is not simply the pair with the smallest deviance: it only has to place the
-fall where the paper's is.
+paper's counts from these shares. The preset need not be the pair with the smallest deviance. It only has to make
+completion fall at the same delay as in the paper.
 """
 
 from __future__ import annotations
@@ -28,14 +28,15 @@ from lavt.config_file import conditions, load_config, parse_config, shipped
 from lavt.experiment.runs.plan import plan_sweep
 from lavt.experiment.sweep.sweep import run_all
 
-PAPER = {"L0": 30, "L1": 28, "L2": 15, "L3": 11, "L4": 9, "L5": 3}
-"""Completed drives of 30."""
+PAPER_COMPLETED = {"L0": 30, "L1": 28, "L2": 15, "L3": 11, "L4": 9, "L5": 3}
+"""The paper's number of completed drives of 30 under each condition."""
 LOOKAHEADS_S = (0.70, 0.74, 0.78, 0.82)
 STEERING_LIMITS_RAD = (0.18, 0.21, 0.24)
 MIN_WIDTH_MS = 5.0
+"""The smallest width of the fitted logistic curve."""
 
 Counts = Mapping[str, tuple[int, int]]
-"""Maps a condition to (completed, total)."""
+"""The numbers of completed drives and of all drives by condition."""
 
 
 def threshold_ms(counts: Counts) -> float:
@@ -53,18 +54,24 @@ def threshold_ms(counts: Counts) -> float:
 
 
 def deviance(counts: Counts) -> float:
-    """Return twice the log-likelihood lost by using our shares for the paper's counts, with half a drive added."""
+    """Return the deviance of the paper's counts from our shares.
+
+    It is twice the log-likelihood that the paper's counts lose if the paper's own shares are replaced by ours. Half a
+    completed and half a failed drive are added to ours, so that no share is 0 or 1.
+    """
     total = 0.0
-    for name, paper in PAPER.items():
+    for name, paper_completed in PAPER_COMPLETED.items():
         completed, runs = counts[name]
-        our_share, paper_share = (completed + 0.5) / (runs + 1), paper / 30
-        for share, number, other in ((our_share, paper, paper_share), (1 - our_share, 30 - paper, 1 - paper_share)):
-            total += 2 * number * (math.log(other) - math.log(share)) if number else 0.0
+        our_share, paper_share = (completed + 0.5) / (runs + 1), paper_completed / 30
+        completed_terms = (paper_completed, paper_share, our_share)
+        failed_terms = (30 - paper_completed, 1 - paper_share, 1 - our_share)
+        for number, paper_term, our_term in (completed_terms, failed_terms):
+            total += 2 * number * (math.log(paper_term) - math.log(our_term)) if number else 0.0
     return total
 
 
 def run_grid(repetitions: int, jobs: int | None) -> dict[tuple[float, float], Counts]:
-    """Drive the whole grid, and return the counts."""
+    """Drive with all pairs of lookahead (s) and steering limit (rad), and return the counts of each pair."""
     base = load_config(SweepConfig, shipped("configs/paper.yaml")).model_dump(mode="json")
     axes = {"controller.lookahead_s": list(LOOKAHEADS_S), "controller.steering_limit_rad": list(STEERING_LIMITS_RAD)}
     config = {**base, "fidelity": "geometry", "repetitions": repetitions, "axes": axes}
@@ -80,7 +87,7 @@ def run_grid(repetitions: int, jobs: int | None) -> dict[tuple[float, float], Co
         total[key] += 1
         completed[key] += result["ending"] == "completed"
     return {
-        pair: {name: (completed[(*pair, name)], total[(*pair, name)]) for name in PAPER}
+        pair: {name: (completed[(*pair, name)], total[(*pair, name)]) for name in PAPER_COMPLETED}
         for pair in itertools.product(LOOKAHEADS_S, STEERING_LIMITS_RAD)
     }
 
@@ -91,12 +98,15 @@ def main() -> None:
     parser.add_argument("--repetitions", type=int, default=2)
     parser.add_argument("--jobs", type=int, default=None)
     options = parser.parse_args()
-    paper: Counts = {name: (count, 30) for name, count in PAPER.items()}
-    print("| lookahead | limit | half completed at | " + " | ".join(PAPER) + " | deviance |")
-    print("|---" * (4 + len(PAPER)) + "|")
+    paper: Counts = {name: (count, 30) for name, count in PAPER_COMPLETED.items()}
+    print("| lookahead | limit | half completed at | " + " | ".join(PAPER_COMPLETED) + " | deviance |")
+    print("|---" * (4 + len(PAPER_COMPLETED)) + "|")
     rows = [
         ("paper", "", paper),
-        *((f"{k} s", f"{limit} rad", each) for (k, limit), each in run_grid(options.repetitions, options.jobs).items()),
+        *(
+            (f"{lookahead_s} s", f"{limit_rad} rad", counts)
+            for (lookahead_s, limit_rad), counts in run_grid(options.repetitions, options.jobs).items()
+        ),
     ]
     for lookahead, limit, counts in rows:
         shares = [f"{100 * completed / runs:.0f} %" for completed, runs in counts.values()]

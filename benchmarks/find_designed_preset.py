@@ -2,7 +2,7 @@
 
     python benchmarks/find_designed_preset.py
 
-It uses only the model of `lavt.experiment.boundary.delay_margin`, and no drives.
+The program makes no drives; it uses only the model of `lavt.experiment.boundary.delay_margin`.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ import math
 from lavt.experiment.boundary.delay_margin import LateralLoop, critical_delay_s, phase_margin_rad, smallest_lookahead_s
 
 MARGIN_RAD = math.radians(30)
-VIDEO_S = 0.062  # paper_wifi5, median, stamp written to stamp read
-CONTROL_S = 0.009  # paper_wifi5
-PROCESSING_S = 0.010  # perception, control and the path to the wheel; the zero-order hold is in the model
+VIDEO_S = 0.062  # median with paper_wifi5, from writing a stamp to reading it
+CONTROL_S = 0.009  # median with paper_wifi5
+PROCESSING_S = 0.010  # perception, control and the way to the wheel; the model contains the zero-order hold
 
 
 def main() -> None:
-    """Print the lookahead, and the margins of it and of the calibrated preset."""
+    """Print the lookahead, and the margins with it and with the calibrated preset."""
     delay_s = VIDEO_S + CONTROL_S + PROCESSING_S
     smallest_s = smallest_lookahead_s(MARGIN_RAD, delay_s)
     rounded_s = math.ceil(smallest_s * 100) / 100

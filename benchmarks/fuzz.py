@@ -2,15 +2,15 @@
 
     python benchmarks/fuzz.py [--inputs 10000000] [--seed 1] [--jobs 2] [--only vehicle_driven]
 
-Inputs are valid messages and datagrams that are truncated, spliced, replayed, or changed in single bits or fields, and
-random noise; they follow from the seed. Each target is the real node with simulated time, in a process of its own, and
-gets its share of the inputs. Needs the extra `secure` (pip install 'lavt[secure]').
+Inputs are random noise, and valid messages and datagrams that are truncated, spliced, replayed, or changed in single
+bits or fields. They are determined by the seed. Each target is the real node with simulated time, in a process of its
+own, and gets its share of the inputs. Needs the extra `secure` (pip install 'lavt[secure]').
 
 After each input the target checks its invariants: no command of a stranger is accepted, no video is sent without a
 request, no unsigned message is accepted, and every sent message can be decoded by the other side. Memory growth is the
 resident memory at the end compared with that after the first fifth of the inputs.
 
-Exits with 1 if anything broke or grew; the output has the input that broke it.
+Exits with 1 if a target broke or its memory grew; the output contains the input that broke it.
 """
 
 from __future__ import annotations
@@ -57,10 +57,11 @@ TARGETS: dict[str, tuple[Callable[[int], Target], float]] = {
 }
 """The function that makes each target, and the target's share of the inputs."""
 
-WARM_UP = 0.2
-"""The share of the inputs after which buffers have reached their size."""
-GROWN_KB = 4096
-"""More than this is growth; an allocator takes and returns some pages at any time."""
+WARM_UP_SHARE = 0.2
+"""The share of the inputs after which buffers have reached their final size."""
+
+MAX_GROWTH_KB = 4096
+"""Memory has grown if it has increased by more than this; an allocator takes and returns some pages at any time."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ class Outcome:
     @property
     def problem(self) -> str:
         """The failure or the growth; empty if there is neither."""
-        grown = f"{self.name} grew by {self.grown_kb} kB" if self.grown_kb > GROWN_KB else ""
+        grown = f"{self.name} grew by {self.grown_kb} kB" if self.grown_kb > MAX_GROWTH_KB else ""
         return self.failure or grown
 
 
@@ -104,23 +105,25 @@ def cpu_s() -> float:
 
 
 def fuzz(name: str, inputs: int, seed: int) -> Outcome:
-    """Feed inputs to one target until one breaks it."""
+    """Feed inputs to one target until all are fed or one breaks it."""
     target = TARGETS[name][0](seed)
     chance = Chance(seed, name)
     channels = tuple(target.corpora)
-    begin_s, warm_kb, summary, failure = cpu_s(), 0, "", ""
+    begin_s, memory_after_warm_up_kb, summary, failure = cpu_s(), 0, "", ""
     number, channel, data = -1, "", b""
     try:
         for number in range(inputs):
-            if number == int(WARM_UP * inputs):
-                warm_kb = memory_kb()
+            if number == int(WARM_UP_SHARE * inputs):
+                memory_after_warm_up_kb = memory_kb()
             channel = chance.choice(channels)
             data = next_input(target.corpora[channel], chance)
             target.feed(channel, data, chance)
         summary = target.finish()
     except Exception:  # any error is a finding
         failure = f"{name} broke at input {number} of seed {seed}, on {channel}: {data.hex()}\n{traceback.format_exc()}"
-    return Outcome(name, number + 1, cpu_s() - begin_s, target.rejected(), memory_kb() - warm_kb, summary, failure)
+    took_s = cpu_s() - begin_s
+    grown_kb = memory_kb() - memory_after_warm_up_kb
+    return Outcome(name, number + 1, took_s, target.rejected(), grown_kb, summary, failure)
 
 
 def fuzz_all(names: list[str], inputs: int, seed: int, jobs: int) -> list[Outcome]:
@@ -140,7 +143,7 @@ def fuzz_all(names: list[str], inputs: int, seed: int, jobs: int) -> list[Outcom
 def arguments(words: list[str] | None = None) -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--inputs", type=int, default=10_000_000, help="of all targets together")
+    parser.add_argument("--inputs", type=int, default=10_000_000, help="number of inputs for all targets together")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="number of processes")
     parser.add_argument("--only", action="append", choices=TARGETS, help="a target by name; repeatable")
@@ -151,7 +154,7 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
 
 
 def main() -> int:
-    """Fuzz, and return the exit code: 1 if anything broke or grew."""
+    """Fuzz, and return the exit code: 1 if a target broke or grew, 2 if a module is missing."""
     options = arguments()
     try:
         outcomes = fuzz_all(options.only or list(TARGETS), options.inputs, options.seed, options.jobs)

@@ -2,8 +2,8 @@
 
     python benchmarks/growth_onset.py [--lookaheads 0.74,1.01,1.3] [--rates 15,30] [--speeds 6,10] [--seeds 1]
 
-The drives use geometry fidelity, with the loopback's latency and a constant delay of the video. No limit is reached
-while the oscillation is measured. `docs/boundary.md` has the output.
+The drives use geometry fidelity, the latency of the loopback, and a constant delay of the video. While the oscillation
+is measured, neither steering nor speed reaches a limit. `docs/boundary.md` has the output.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from lavt.experiment.boundary.bisection import zero_bracket
 from lavt.experiment.boundary.boundary import theoretical_ms, with_video_delay
 from lavt.experiment.boundary.oscillation_growth import straight_growth
 
-LONGEST_MS = 1000.0
-WITHIN_MS = 0.5
+MAX_DELAY_MS = 1000.0
+PRECISION_MS = 0.5
 
 
 def case(lookahead_s: float, rate_hz: float, speed_mps: float, seed: int) -> RunConfig:
@@ -37,25 +37,25 @@ def case(lookahead_s: float, rate_hz: float, speed_mps: float, seed: int) -> Run
 
 def onset_ms(config: RunConfig, theory_ms: float) -> float:
     """Return the total delay at which the oscillation neither grows nor decays."""
-    added_ms = []
+    other_delay_ms = []
 
     def growth(delay_ms: float) -> float:
         total_ms, growth_per_s = straight_growth(with_video_delay(config, delay_ms))
-        added_ms.append(total_ms - delay_ms)
+        other_delay_ms.append(total_ms - delay_ms)
         return growth_per_s
 
-    bracket = zero_bracket(growth, theory_ms, LONGEST_MS, WITHIN_MS)
+    bracket = zero_bracket(growth, theory_ms, MAX_DELAY_MS, PRECISION_MS)
     if bracket.low_ms is None or bracket.high_ms is None:
-        raise SystemExit(f"no onset between 0 and {LONGEST_MS} ms")
-    return (bracket.low_ms + bracket.high_ms) / 2 + median(added_ms)
+        raise SystemExit(f"no onset between 0 and {MAX_DELAY_MS} ms")
+    return (bracket.low_ms + bracket.high_ms) / 2 + median(other_delay_ms)
 
 
 def main() -> None:
     """Print all cases as a Markdown table."""
     parser = argparse.ArgumentParser(description=__doc__)
     for name, default in (("lookaheads", "0.74,1.01,1.3"), ("rates", "15,30"), ("speeds", "6,10")):
-        parser.add_argument(f"--{name}", type=lambda text: [float(each) for each in text.split(",")], default=default)
-    parser.add_argument("--seeds", type=lambda text: [int(each) for each in text.split(",")], default="1")
+        parser.add_argument(f"--{name}", type=lambda text: [float(item) for item in text.split(",")], default=default)
+    parser.add_argument("--seeds", type=lambda text: [int(item) for item in text.split(",")], default="1")
     options = parser.parse_args()
     print("| lookahead | frame rate | speed | theory | measured | difference |")
     print("|---" * 6 + "|")

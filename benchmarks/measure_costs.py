@@ -1,9 +1,9 @@
 """Measure the durations of the loop's stages and links, and write them to `configs/costs.yaml` for virtual time.
 
-The program makes real drives over the loopback without injection, with all processes, and takes medians over their
-frames from the records: each stage from the timelines, waking a node as the time from a message's arrival to its first
-stage, and each link as the time from the end of the sender's pipeline to the arrival at the receiver (one machine has
-one clock).
+The program makes real drives over the loopback without injection, with all processes, and takes medians from their
+records. The duration of each stage is in the timelines. Waking a node takes the time from a message's arrival to the
+beginning of its first stage. A link takes the time from the end of the sender's pipeline to the arrival at the
+receiver; both times are of the same clock, because all processes are on one machine.
 
     python benchmarks/measure_costs.py [--drives 3] [--out configs/costs.yaml]
 """
@@ -29,8 +29,9 @@ from lavt.experiment.runs.plan import plan_run
 from lavt.experiment.runs.run import run_once
 from lavt.recording.record import Record, read_record
 
-US = 1000.0
-Samples = dict[tuple[str, str], list[float]]
+NS_PER_US = 1000.0
+StageSamples = dict[tuple[str, str], list[float]]
+"""Microseconds by node and stage."""
 
 
 def timelines(record: Record) -> list[tuple[str, str, int, int, list[tuple[str, int]]]]:
@@ -46,30 +47,30 @@ def timelines(record: Record) -> list[tuple[str, str, int, int, list[tuple[str, 
     return list(zip(*columns, strict=True))
 
 
-def add_stages(record: Record, stages: Samples) -> None:
-    """Collect the duration of every stage, and of waking a node for every message."""
+def add_stages(record: Record, stages: StageSamples) -> None:
+    """Add the duration of every stage, and the time of waking a node for every message."""
     for node, channel, _stamp_ns, arrived_ns, ends in timelines(record):
         if channel != "wake":
-            stages[node, f"wait_{channel}"].append((ends[0][1] - arrived_ns) / US)
+            stages[node, f"wait_{channel}"].append((ends[0][1] - arrived_ns) / NS_PER_US)
         for (_, begin_ns), (name, end_ns) in pairwise(ends):
-            stages[node, name].append((end_ns - begin_ns) / US)
+            stages[node, name].append((end_ns - begin_ns) / NS_PER_US)
 
 
 def add_links(server: Record, client: Record, links: dict[str, list[float]]) -> None:
-    """Collect the delays of the links: video by stamp, control and state by send time."""
+    """Add the delays of the links; frames are matched by their stamps, commands and states contain their send times."""
     sent = {stamp_ns: ends[-1][1] for node, _, stamp_ns, _, ends in timelines(server) if node == "camera"}
     for node, channel, stamp_ns, arrived_ns, _ in timelines(client):
         if node == "driver" and channel == "access_unit" and stamp_ns in sent:
-            links["video"].append((arrived_ns - sent[stamp_ns]) / US)
+            links["video"].append((arrived_ns - sent[stamp_ns]) / NS_PER_US)
     admission = server.table("admission")
-    links["control"] += ((admission.ints("received_wall_ns") - admission.ints("sent_wall_ns")) / US).tolist()
+    links["control"] += ((admission.ints("received_wall_ns") - admission.ints("sent_wall_ns")) / NS_PER_US).tolist()
     state = client.table("state")
-    links["state"] += ((state.wall_ns - state.ints("sent_wall_ns")) / US).tolist()
+    links["state"] += ((state.wall_ns - state.ints("sent_wall_ns")) / NS_PER_US).tolist()
 
 
 def measure_costs(drives: int) -> dict[str, Any]:
-    """Drive, and return the costs."""
-    stages: Samples = defaultdict(list)
+    """Make `drives` drives, and return the contents of the file of costs."""
+    stages: StageSamples = defaultdict(list)
     links: dict[str, list[float]] = defaultdict(list)
     loads = []
     for index in range(drives):
@@ -92,7 +93,7 @@ def measure_costs(drives: int) -> dict[str, Any]:
     machine = f"{os.cpu_count()} cores, {platform.machine()}, load {max(loads):.1f}, {drives} drives"
     return {
         "measured_on": machine,
-        "stages_us": {node: dict(each) for node, each in table.items()},
+        "stages_us": {node: dict(of_node) for node, of_node in table.items()},
         "links_us": link_us,
     }
 

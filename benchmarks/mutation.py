@@ -2,10 +2,11 @@
 
     python benchmarks/mutation.py [--seed 16] [--count 320] [--jobs 1] [--only safety/gate.py] [--out results.jsonl]
 
-A mutant has one small change in one place: a comparison, a number, a removed statement (`mutating/sites.py`). The
-places are sampled from all places of the modules in `mutating/modules.py`, and follow from the seed and the sources.
-Each mutant runs in a copy of the sources: first the tests of its module and, if they pass, the quick tests of its
-area. A mutant is caught if a test fails or the tests take ten times as long as without it.
+A mutant has one small change in one place, for example another comparison, another number, or a removed statement
+(`mutating/sites.py`). The places are sampled from all places of the modules in `mutating/modules.py`; the sample is
+determined by the seed and the sources. For each mutant the tests of its module run in a copy of the sources and, if
+they pass, the quick tests of its area. A mutant is caught if a test fails or if the tests take ten times as long as
+without it.
 
 With --out each result is saved in a file as a line of JSON, and a later run with the same file skips mutants that are
 in it; --rerun-survivors runs its survivors again. Survivors that are equivalent or accepted are listed with their
@@ -25,7 +26,7 @@ from queue import SimpleQueue
 from tempfile import TemporaryDirectory
 from threading import Lock
 
-sys.path.insert(0, str(Path(__file__).parents[1]))  # a program only finds modules in its own folder
+sys.path.insert(0, str(Path(__file__).parents[1]))  # for the package `benchmarks`
 
 from benchmarks.mutating.modules import MODULES, REPOSITORY, SOURCES, area_of, own_tests, rest_of_area
 from benchmarks.mutating.results import (
@@ -45,8 +46,9 @@ from lavt.errors import UserError
 from lavt.streams import stream
 
 MIN_LIMIT_S = 30.0
-"""The time limit of short tests, which other work on the machine may delay more than the factor allows."""
+"""The smallest time limit; other work on the machine may delay short tests by more than the factor allows."""
 UNMUTATED_LIMIT_S = 3600.0
+"""The time limit of the tests without a mutation."""
 
 
 def sites_of(modules: Sequence[str]) -> dict[str, list[Site]]:
@@ -55,7 +57,10 @@ def sites_of(modules: Sequence[str]) -> dict[str, list[Site]]:
 
 
 def sample(sites: Mapping[str, Sequence[Site]], seed: int, count: int) -> list[Mutation]:
-    """Return mutations of `count` sites, each site equally likely; a smaller count gives the first of them."""
+    """Return mutations of `count` random sites, each site equally likely.
+
+    With a smaller count and the same seed, the result is the beginning of that with a larger one.
+    """
     all_sites = [site for module_sites in sites.values() for site in module_sites]
     order = stream(seed, "mutation sites").permutation(len(all_sites))
     choices = stream(seed, "mutation replacements").integers(0, 2**32, size=len(all_sites))
@@ -146,11 +151,11 @@ def measure(options: argparse.Namespace, log: Callable[[str], None]) -> str:
         of_sources = {
             mutation.key: mutation for module_sites in sites.values() for site in module_sites for mutation in site
         }
-        survivors = [each for each in results.values() if not each.caught and each.place not in accepted]
-        for each in survivors:
-            if each.key not in of_sources:
-                log(f"no longer in the sources: {describe(each)}")
-        selected = todo = [of_sources[each.key] for each in survivors if each.key in of_sources]
+        survivors = [result for result in results.values() if not result.caught and result.place not in accepted]
+        for survivor in survivors:
+            if survivor.key not in of_sources:
+                log(f"no longer in the sources: {describe(survivor)}")
+        selected = todo = [of_sources[survivor.key] for survivor in survivors if survivor.key in of_sources]
     else:
         selected = sample(sites, options.seed, options.count)
         todo = [mutation for mutation in selected if mutation.key not in results]

@@ -2,9 +2,9 @@
 
     python -m benchmarks.perception_sheet [--count 25] [--picture docs/pictures/perception.jpg]
 
-The output has two tables over degraded pictures (`benchmarks/degraded.py`), by kind and by confidence, for a searching
-detector (the picture is its first) and a following one (it saw the unchanged road before), and then the cost of a
-picture.
+The output has two tables over degraded pictures (`benchmarks/degraded.py`), one by kind of picture and one by
+confidence, and then the cost of a picture. Each picture is shown to two detectors: to a searching one, which has seen
+no picture before, and to a tracking one, which has seen the unchanged road from the same place before.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from lavt.perception.panel import panel
 
 ERROR_LIMIT_M = 0.5
 """A lane is wrong if its centre is off by more than this at 10 m."""
-BINS = (0.0, 0.05, 0.2, 0.3, 0.4, 0.6, 0.8, 1.001)
+CONFIDENCE_BINS = (0.0, 0.05, 0.2, 0.3, 0.4, 0.6, 0.8, 1.001)
 UNDECIDED = "yellow diversion"
 """Its truth is ambiguous, so it is excluded from the table by confidence."""
 PICTURED_KINDS = ("as it is", "h264 200 kbit/s", "tree shadows", "old yellow line", "glare", "coarse blocks")
@@ -46,12 +46,12 @@ class LaneVerdict:
 
     @property
     def wrong(self) -> bool:
-        """Whether the lane is too far off to drive by."""
+        """Whether the lane is too far off to be followed."""
         return bool(self.error_m[1] > ERROR_LIMIT_M)
 
     @property
     def believed(self) -> bool:
-        """Whether the controller would believe the lane and drive by it."""
+        """Whether the controller would accept the lane and follow it."""
         return self.confidence >= LANE_CONFIDENCE
 
 
@@ -63,14 +63,14 @@ def check_lane(case: DegradedCase, lane: Lane) -> LaneVerdict:
 
 
 def check_case(case: DegradedCase) -> tuple[LaneVerdict, LaneVerdict]:
-    """Return the verdicts on a picture for a searching and a following detector."""
-    searching, following = LaneDetector(MODEL), LaneDetector(MODEL)
-    following.detect(case.before)
-    return check_lane(case, searching.detect(case.picture)), check_lane(case, following.detect(case.picture))
+    """Return the verdicts on a picture for a searching and a tracking detector."""
+    searching, tracking = LaneDetector(MODEL), LaneDetector(MODEL)
+    tracking.detect(case.before)
+    return check_lane(case, searching.detect(case.picture)), check_lane(case, tracking.detect(case.picture))
 
 
 def kinds_table(verdicts: Iterable[tuple[LaneVerdict, LaneVerdict]]) -> str:
-    """Return the table by kind: confidence, error, and how often a lane is wrong and accepted, or right and not."""
+    """Return the table by kind: confidence, error, and the numbers of wrong accepted and right rejected lanes."""
     by_kind = defaultdict(list)
     for pair in verdicts:
         by_kind[pair[0].kind].append(pair)
@@ -82,14 +82,15 @@ def kinds_table(verdicts: Iterable[tuple[LaneVerdict, LaneVerdict]]) -> str:
     ]
     for kind, pairs in by_kind.items():
         cells = [kind + (" (no lane there)" if kind in NO_LANE else "")]
-        for number, side in enumerate(zip(*pairs, strict=True)):
-            share = [verdict.confidence for verdict in side]
-            believed = [verdict.error_m[1] for verdict in side if verdict.believed and np.isfinite(verdict.error_m[1])]
-            cells.append(f"{np.percentile(share, 5):.2f}, {np.median(share):.2f}")
-            cells.append(f"{np.percentile(believed, 95):.2f} m" if believed else "")
-            cells.append(str(sum(verdict.wrong and verdict.believed for verdict in side)))
-            if number == 0:
-                cells.append(str(sum(not verdict.wrong and not verdict.believed for verdict in side)))
+        for is_tracking, of_detector in enumerate(zip(*pairs, strict=True)):
+            confidences = [verdict.confidence for verdict in of_detector]
+            errors_m = [verdict.error_m[1] for verdict in of_detector if verdict.believed]
+            errors_m = [error_m for error_m in errors_m if np.isfinite(error_m)]
+            cells.append(f"{np.percentile(confidences, 5):.2f}, {np.median(confidences):.2f}")
+            cells.append(f"{np.percentile(errors_m, 95):.2f} m" if errors_m else "")
+            cells.append(str(sum(verdict.wrong and verdict.believed for verdict in of_detector)))
+            if not is_tracking:
+                cells.append(str(sum(not verdict.wrong and not verdict.believed for verdict in of_detector)))
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
@@ -99,7 +100,7 @@ def reliability_table(verdicts: Iterable[LaneVerdict]) -> str:
     decided = [verdict for verdict in verdicts if verdict.kind != UNDECIDED]
     heads = " | ".join(f"{ahead:.0f} m: median, p95" for ahead in AHEAD_M)
     lines = [f"| confidence | pictures | wrong | {heads} |", "|---|---|---|" + "---|" * len(AHEAD_M)]
-    for low, high in pairwise(BINS):
+    for low, high in pairwise(CONFIDENCE_BINS):
         within = [verdict for verdict in decided if low <= verdict.confidence < high]
         if not within:
             continue
@@ -107,7 +108,7 @@ def reliability_table(verdicts: Iterable[LaneVerdict]) -> str:
         cells = []
         for column in errors.T:
             median, p95 = np.median(column), np.percentile(column, 95, method="nearest")
-            cells.append(", ".join(f"{each:.2f} m" if np.isfinite(each) else "no lane there" for each in (median, p95)))
+            cells.append(", ".join(f"{m:.2f} m" if np.isfinite(m) else "no lane there" for m in (median, p95)))
         wrong = sum(verdict.wrong for verdict in within)
         label = f"{low:.2f} to {min(high, 1):.2f}"
         lines.append(f"| {label} | {len(within)} | {100 * wrong / len(within):.1f} % | " + " | ".join(cells) + " |")
@@ -115,20 +116,21 @@ def reliability_table(verdicts: Iterable[LaneVerdict]) -> str:
 
 
 def cost_ms(pictures: Iterable[Picture]) -> tuple[float, float]:
-    """Return the median CPU time of a picture in milliseconds, for following and searching."""
+    """Return the median CPU time of a picture in milliseconds, for tracking and for searching."""
     detector = LaneDetector(MODEL)
-    spent: tuple[list[float], list[float]] = ([], [])
+    tracking_s: list[float] = []
+    searching_s: list[float] = []
     for picture in pictures:
         detector.forget()
         for number in range(10):
             begin_s = time.process_time()
             detector.detect(picture)
-            spent[number == 0].append(time.process_time() - begin_s)
-    return 1e3 * float(np.median(spent[0])), 1e3 * float(np.median(spent[1]))
+            (tracking_s if number else searching_s).append(time.process_time() - begin_s)
+    return 1e3 * float(np.median(tracking_s)), 1e3 * float(np.median(searching_s))
 
 
 def draw_sheet(sheet_cases: Iterable[DegradedCase]) -> Picture:
-    """Draw all steps for a picture of each kind, one below the other with titles."""
+    """Draw the steps of the detection in a picture of each kind, one below the other with titles."""
     rows = []
     for case in sheet_cases:
         detector = LaneDetector(MODEL)
@@ -156,13 +158,13 @@ def main() -> None:
             undamaged.append(case.picture)
     print(kinds_table(verdicts))
     for name, number in (("searching", 0), ("tracking", 1)):
-        each = [pair[number] for pair in verdicts]
-        decided_verdicts = [verdict for verdict in each if verdict.kind != UNDECIDED]
+        of_detector = [pair[number] for pair in verdicts]
+        decided_verdicts = [verdict for verdict in of_detector if verdict.kind != UNDECIDED]
         harmful = sum(verdict.wrong and verdict.believed for verdict in decided_verdicts)
         print(f"\n{name}: {harmful} of {len(decided_verdicts)} pictures are wrong and accepted")
-        print(f"\n{reliability_table(each)}")
-    following_ms, searching_ms = cost_ms(undamaged)
-    print(f"\ncost of a picture: tracking {following_ms:.2f} ms, searching {searching_ms:.2f} ms of CPU time (medians)")
+        print(f"\n{reliability_table(of_detector)}")
+    tracking_ms, searching_ms = cost_ms(undamaged)
+    print(f"\ncost of a picture: tracking {tracking_ms:.2f} ms, searching {searching_ms:.2f} ms of CPU time (medians)")
     if arguments.picture is not None:
         arguments.picture.parent.mkdir(parents=True, exist_ok=True)
         drawn = draw_sheet(first[kind] for kind in PICTURED_KINDS)

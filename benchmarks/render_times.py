@@ -1,6 +1,7 @@
 """Measure the cost of rendering: CPU time of frames over whole drives, in the lane and swerving, and memory.
 
-A swerving car leaves its lane by 6 m to both sides and turns by 0.6 rad.
+A swerving car leaves its lane by 6 m to both sides and turns by 0.6 rad. The memory is the largest that the process has
+used so far, because all cases run in one process.
 
     python benchmarks/render_times.py [--route b] [--drives 3]
 """
@@ -20,8 +21,8 @@ from lavt.vehicle.sim.rendering.light import LightName
 from lavt.vehicle.sim.rendering.renderer import Renderer, SceneryKind
 from lavt.vehicle.sim.road.road import Road, load_road
 
-FRAME_M = 8.33 / 30
-SWERVE_M, SWERVE_RAD, SWERVE_EVERY_M = 6.0, 0.6, 56.0
+METRES_PER_FRAME = 8.33 / 30
+SWERVE_M, SWERVE_RAD, SWERVE_PERIOD_M = 6.0, 0.6, 56.0
 VGA, HD = CameraModel(), CameraModel(1280, 720)
 CASES: tuple[tuple[CameraModel, SceneryKind, LightName, bool], ...] = (
     (VGA, "full", "noon", False),
@@ -38,11 +39,11 @@ CASES: tuple[tuple[CameraModel, SceneryKind, LightName, bool], ...] = (
 def measure_drive(road: Road, scene_renderer: Renderer, *, swerving: bool) -> FloatArray:
     """Return the CPU time of every frame of a drive at 30 km/h and 30 Hz, in milliseconds."""
     times = []
-    for number, s_m in enumerate(np.arange(0.0, road.length_m, FRAME_M)):
-        phase = 2 * np.pi * s_m / SWERVE_EVERY_M if swerving else 0.0
-        x_m, y_m = road.across(s_m, SWERVE_M * np.sin(phase)).tolist()
+    for number, s_m in enumerate(np.arange(0.0, road.route_length_m, METRES_PER_FRAME)):
+        phase = 2 * np.pi * s_m / SWERVE_PERIOD_M if swerving else 0.0
+        x_m, y_m = road.point_at(s_m, SWERVE_M * np.sin(phase)).tolist()
         turned_rad = SWERVE_RAD * float(np.cos(phase)) if swerving else 0.0
-        pose = Pose(0, x_m, y_m, float(road.point(s_m)[2]) + turned_rad)
+        pose = Pose(0, x_m, y_m, float(road.centre_at(s_m).heading_rad) + turned_rad)
         begin_s = time.process_time()
         scene_renderer.render(pose, number)
         times.append((time.process_time() - begin_s) * 1000)
@@ -50,13 +51,13 @@ def measure_drive(road: Road, scene_renderer: Renderer, *, swerving: bool) -> Fl
 
 
 def main() -> None:
-    """Print a table of medians over the drives, so that a single disturbance has no effect."""
+    """Print a table of medians over the drives, so that a disturbance of one drive has no effect."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--route", default="b")
     parser.add_argument("--drives", type=int, default=3)
     options = parser.parse_args()
     road = load_road(options.route)
-    print("picture    scenery  light     drive     prepare s  median ms  p99 ms  longest ms  memory MB")
+    print("picture    scenery  light     drive     prepare s  median ms  p99 ms  longest ms  peak memory so far MB")
     for model, scenery, light, swerving in CASES:
         measurements = []
         for _ in range(options.drives):
@@ -69,12 +70,12 @@ def main() -> None:
             measurements.append(
                 (prepare_s, float(np.median(times)), float(np.percentile(times, 99)), float(times.max()))
             )
-        prepare_s, middle_ms, p99_ms, longest_ms = (median(column) for column in zip(*measurements, strict=True))
-        memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000
+        prepare_s, median_ms, p99_ms, longest_ms = (median(column) for column in zip(*measurements, strict=True))
+        peak_memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000
         size, driving = f"{model.width_px}x{model.height_px}", "swerving" if swerving else "in lane"
         print(
-            f"{size:9}  {scenery:7}  {light:8}  {driving:8}  {prepare_s:9.2f}  {middle_ms:9.2f}  {p99_ms:6.1f}"
-            f"  {longest_ms:10.1f}  {memory_mb:9.0f}"
+            f"{size:9}  {scenery:7}  {light:8}  {driving:8}  {prepare_s:9.2f}  {median_ms:9.2f}  {p99_ms:6.1f}"
+            f"  {longest_ms:10.1f}  {peak_memory_mb:21.0f}"
         )
 
 

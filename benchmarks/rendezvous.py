@@ -2,10 +2,10 @@
 
     python benchmarks/rendezvous.py [--seconds 20]
 
-Pictures of 14 packets of 1216 bytes, 30 a second (4 Mbit/s), go from a socket that has registered as the vehicle to a
-client's socket: directly and through the rendezvous, in turns. A packet's latency is from its sending to the kernel's
-timestamp of its arrival. So the difference is the rendezvous's own processing, without any network. Prints a row for
-each way and finally a line of JSON.
+A socket that has registered as the vehicle sends frames to a client's socket, 30 a second, each of 14 packets of 1216
+bytes (4 Mbit/s). Every second frame goes through the rendezvous, the others directly. The latency of a packet is the
+time from its sending to the kernel's timestamp of its arrival, so the difference between the two ways is the
+rendezvous's own processing, without any network. Prints a row for each way and finally a line of JSON.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from lavt.transport.arrival import ANCILLARY_BYTES, arrival, enable_arrival_time
 from lavt.transport.rendezvous.forwarder import REGISTER_EVERY_NS, Address, encode_registration, wrap
 from lavt.transport.video.path_validation import PathClient
 
-HERE = "127.0.0.1"
-PACKETS, PACKET_BYTES, RATE_HZ = 14, 1216, 30
+LOOPBACK = "127.0.0.1"
+PACKETS_PER_FRAME, PACKET_BYTES, RATE_HZ = 14, 1216, 30
 WAIT_S = 1.0
-CHANGES = (f"bind={HERE}", "video_port=0", "probe_port=0")
+CHANGES = (f"bind={LOOPBACK}", "video_port=0", "probe_port=0")
 PERCENTILES = (50, 95, 99)
 
 
@@ -42,9 +42,9 @@ class LatencyProbe:
         self._clock = MachineClock()
         self._vehicle, self._client, self._rendezvous = vehicle, client, rendezvous
         enable_arrival_times(client)
-        for each in (vehicle, client):
-            each.bind((HERE, 0))
-            each.settimeout(WAIT_S)
+        for endpoint in (vehicle, client):
+            endpoint.bind((LOOPBACK, 0))
+            endpoint.settimeout(WAIT_S)
         self._registered_ns = 0
 
     def refresh(self) -> None:
@@ -57,13 +57,13 @@ class LatencyProbe:
         self._client.sendto(PathClient(bytes(16)).hello(0), self._rendezvous)
         self._vehicle.recv(2000)
 
-    def send_picture(self, *, through: bool) -> list[int]:
-        """Send a picture and return the latencies of its packets in nanoseconds."""
+    def send_frame(self, *, through: bool) -> list[int]:
+        """Send a frame, `through` the rendezvous or directly; return the latencies of its packets in nanoseconds."""
         client = self._client.getsockname()
-        for number in range(PACKETS):
+        for number in range(PACKETS_PER_FRAME):
             packet = struct.pack(">Bq", number, self._clock.now().wall_ns).ljust(PACKET_BYTES, b"\0")
             self._vehicle.sendto(wrap(client, packet) if through else packet, self._rendezvous if through else client)
-        return [self._receive_ns() for _ in range(PACKETS)]
+        return [self._receive_ns() for _ in range(PACKETS_PER_FRAME)]
 
     def _receive_ns(self) -> int:
         """Receive a packet and return its latency."""
@@ -75,31 +75,31 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=20.0)
-    pictures = max(2, round(parser.parse_args().seconds * RATE_HZ))
+    frames = max(2, round(parser.parse_args().seconds * RATE_HZ))
     process_priority.raise_priority()
     latencies_ns: dict[str, list[int]] = {"straight": [], "through": []}
     config = Path(__file__).parents[1] / "configs" / "rendezvous.yaml"
-    sets = [word for change in CHANGES for word in ("--set", change)]
+    options = [word for change in CHANGES for word in ("--set", change)]
     with (
         tempfile.TemporaryDirectory() as folder,
         Processes(Path(folder)) as processes,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client,
     ):
-        port = processes.start("rendezvous", "rendezvous", str(config), *sets).ready()["ready"]["video_port"]
-        probe = LatencyProbe(vehicle, client, (HERE, port))
-        for number in range(pictures):
+        port = processes.start("rendezvous", "rendezvous", str(config), *options).ready()["ready"]["video_port"]
+        probe = LatencyProbe(vehicle, client, (LOOPBACK, port))
+        for number in range(frames):
             probe.refresh()
             way = ("straight", "through")[number % 2]
-            latencies_ns[way] += probe.send_picture(through=way == "through")
+            latencies_ns[way] += probe.send_frame(through=way == "through")
             pause(NS_PER_S // RATE_HZ - NS_PER_MS)
     latencies_us = {
-        way: {f"p{each}": round(float(np.percentile(times_ns, each)) / NS_PER_US, 1) for each in PERCENTILES}
+        way: {f"p{rank}": round(float(np.percentile(times_ns, rank)) / NS_PER_US, 1) for rank in PERCENTILES}
         for way, times_ns in latencies_ns.items()
     }
     for way, percentiles in latencies_us.items():
         print(f"{way:>8}  " + "  ".join(f"{name} {us:7.1f} us" for name, us in percentiles.items()))
-    print(json.dumps({"us": latencies_us, "pictures": pictures, "python": sys.version.split()[0]}))
+    print(json.dumps({"us": latencies_us, "pictures": frames, "python": sys.version.split()[0]}))
 
 
 if __name__ == "__main__":

@@ -26,9 +26,9 @@ def count_beyond(curve_stops: Sequence[Stop]) -> int:
     return sum(stop.beyond_m > ALLOWED_BEYOND_M for stop in curve_stops)
 
 
-def format_worst(curve_stops: Sequence[Stop]) -> str:
+def format_worst(stops_of_kind: Sequence[Stop]) -> str:
     """Format how far a corner of the body got beyond the lane, and where the last command was."""
-    stop = max(curve_stops, key=lambda each: each.beyond_m)
+    stop = max(stops_of_kind, key=lambda stop: stop.beyond_m)
     return f"{stop.beyond_m:+.2f} m, at {stop.at_m:.0f} m"
 
 
@@ -47,8 +47,9 @@ def draw(curve_stops: CurveStops) -> Figure:
     figure = new_figure(5.0)
     axes = figure.subplots(3, 2, sharey=True).ravel()
     for axis, route in zip(axes, ROUTES, strict=True):
-        for curve, each in groupby((each for each in curve_stops if each[0].route == route), key=itemgetter(0)):
-            _, following, holding = zip(*each, strict=True)
+        of_route = (of_curve for of_curve in curve_stops if of_curve[0].route == route)
+        for curve, of_curve in groupby(of_route, key=itemgetter(0)):
+            _, following, holding = zip(*of_curve, strict=True)
             axis.axvspan(curve.from_m, curve.to_m, color="0.92")
             for group, name, colour in ((following, FOLLOWING, COLOURS[0]), (holding, HOLDING, COLOURS[4])):
                 places = [stop.at_m for stop in group], [stop.beyond_m for stop in group]
@@ -66,15 +67,15 @@ def draw(curve_stops: CurveStops) -> Figure:
 
 def main() -> None:
     """Compute all stops, print the tables, and draw the picture if a file is named."""
-    curve_stops = [each for route in ROUTES for each in stops(route)]
+    curve_stops = [curve_stop for route in ROUTES for curve_stop in stops(route)]
     print("| route | curve | bend, radius | stops | worst along the path | worst with the wheel held | of these out |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
-    for curve, each in groupby(curve_stops, key=itemgetter(0)):
-        print(format_row(curve, list(each)))
+    for curve, of_curve in groupby(curve_stops, key=itemgetter(0)):
+        print(format_row(curve, list(of_curve)))
     following = [stop for _, stop, _ in curve_stops]
     speeds_kmh = [stop.speed_mps * 3.6 for stop in following]
     print(f"\nlast command at {min(speeds_kmh):.1f} to {max(speeds_kmh):.1f} km/h")
-    print(f"way from the last command to standstill: at most {max(stop.covered_m for stop in following):.1f} m")
+    print(f"distance from the last command to standstill: at most {max(stop.covered_m for stop in following):.1f} m")
     print("\n| condition | stops | worst along the path | worst with the wheel held | of these out |")
     print("| --- | --- | --- | --- | --- |")
     for condition in ("L1", "L3", "L5"):

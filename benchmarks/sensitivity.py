@@ -28,12 +28,12 @@ DELAY_S = 0.081
 CONDITIONS = ("L0", "L1", "L2", "L3", "L5")
 """L4 has the same total delay as L3."""
 
-Values = Sequence[float]
+SettingValues = Sequence[float]
 
 
-def variations(preset: Preset) -> dict[str, Values]:
+def variations(preset: Preset) -> dict[str, SettingValues]:
     """Return the values for each setting, including the preset's own."""
-    limits: dict[str, Values] = (
+    limits: dict[str, SettingValues] = (
         {"controller.lateral_limit_mps2": (2.0, 3.0, 4.5)}
         if math.isfinite(preset.lateral_limit_mps2)
         else {"controller.steering_limit_rad": (0.14, 0.21, 0.30, 0.50)}
@@ -47,7 +47,7 @@ def variations(preset: Preset) -> dict[str, Values]:
 
 
 def loop_with(preset: Preset, key: str, value: float) -> LateralLoop:
-    """Return the theoretical loop with one setting changed; the theory has no limits."""
+    """Return the theoretical loop with one setting changed; the theory does not contain limits."""
     settings = {"controller.lookahead_s": preset.lookahead_s, "controller.speed_mps": preset.speed_mps, key: value}
     return LateralLoop(
         lookahead_s=settings["controller.lookahead_s"],
@@ -56,7 +56,7 @@ def loop_with(preset: Preset, key: str, value: float) -> LateralLoop:
     )
 
 
-def run_drives(preset: str, key: str, values: Values, options: argparse.Namespace) -> list[Mapping[str, Any]]:
+def run_drives(preset: str, key: str, values: SettingValues, options: argparse.Namespace) -> list[Mapping[str, Any]]:
     """Run every value under every condition, and return the results."""
     base = load_config(SweepConfig, shipped("configs/paper.yaml")).model_dump(mode="json")
     base["controller"]["preset"] = preset
@@ -83,7 +83,7 @@ def format_cell(results: Sequence[Mapping[str, Any]]) -> str:
     return f"{share}, {median(p95_m):.2f} m" if p95_m else share
 
 
-def print_table(preset: Preset, key: str, values: Values, options: argparse.Namespace) -> None:
+def print_table(preset: Preset, key: str, values: SettingValues, options: argparse.Namespace) -> None:
     """Print the table of one setting."""
     results = run_drives(preset.name, key, values, options)
     print(f"\n`{preset.name}`, `{key}`:\n")

@@ -1,10 +1,11 @@
-"""Measure what a stranger's datagram at the vehicle's video port costs, with and without the filter before the record.
+"""Measure the cost of a stranger's datagram at the vehicle's video port, with and without the filter before the record.
 
     python benchmarks/stranger_datagrams.py [--datagrams 20000] [--rounds 7]
 
-Both ways deliver the same datagrams, in turns, to the same camera node in the real-time runtime, with a record on disk.
-The cost is the CPU time of the whole process, including the threads of node and record, for each datagram. The filter
-passes 200 a second, which is included. Prints the median of each kind in microseconds and the ratio.
+The same datagrams are delivered, in turns with and without the filter, to the same camera node in the real-time
+runtime, with a record on disk. The cost is the CPU time of the whole process per datagram, including the threads of
+node and record. It includes the 200 datagrams a second that the filter lets pass. Prints for each kind of datagram the
+median costs in microseconds and their ratio.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from benchmarks.fuzzing.camera import FakeCamera
 TOKEN = bytes(range(16))
 STRANGER = ("198.51.100.7", 5004)
 BATCH = 1000
-"""Less than the node's queue."""
+"""Number of datagrams between two pauses; fewer than the node's queue holds."""
 
 
 def kinds() -> dict[str, bytes]:
@@ -72,8 +73,10 @@ def main() -> None:
             for _ in range(arguments.rounds):
                 for way, deliver in ways.items():
                     costs[way].append(cost_us(clock, deliver, datagram, arguments.datagrams))
-            before, after = (median(costs[way]) for way in ways)
-            sys.stdout.write(f"{kind}: {before:.1f} us, filtered {after:.2f} us, ratio {before / after:.1f}\n")
+            all_us, filtered_us = (median(costs[way]) for way in ways)
+            sys.stdout.write(
+                f"{kind}: {all_us:.1f} us, filtered {filtered_us:.2f} us, ratio {all_us / filtered_us:.1f}\n"
+            )
         runtime.stop()
         recorder.close(clock.now())
 

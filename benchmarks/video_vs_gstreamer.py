@@ -1,8 +1,9 @@
-"""Compare the video path with GStreamer's: latency and CPU time on a clean link, pictures on an impaired link.
+"""Compare LAVT's video path with GStreamer: latency and CPU time on a clean link, damaged pictures on an impaired link.
 
-Both sides send the same pictures with stamps from one process to another, in turns. Latency is the time from writing
-the stamp, just before encoding, until it was read from the decoded luma. GStreamer has its best settings, and once its
-usual ones. The program prints tables as it proceeds and, last, one line of JSON.
+LAVT and GStreamer ("sides") in turns send the same pictures with stamps from one process to another. Latency is the
+time from writing the stamp, just before encoding, until it has been read from the decoded luma. GStreamer is measured
+with its best settings, and in one run with its usual ones. The program prints tables as it proceeds and, at the end,
+one line of JSON.
 
     python benchmarks/video_vs_gstreamer.py [--pairs 5] [--seconds 15] [--frames 1800] [--quick] [--only 480p]
 """
@@ -17,7 +18,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1]))  # a program finds only the modules in its own folder
+sys.path.insert(0, str(Path(__file__).parents[1]))  # for the package `benchmarks`
 
 from benchmarks.video.clean import SIZES, run_clean_part
 from benchmarks.video.gstreamer import load_gstreamer

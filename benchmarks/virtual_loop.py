@@ -5,8 +5,8 @@
 The program drives like `lavt run` (`plan_run`, `build_loop`, `drive`), at L0, with everything recorded. It compares the
 CPU time of this process and its children, as the operating system counts it, with the virtual time of the drive, and
 takes medians over the repetitions. Building the loop (reading the road, painting the ground, opening the codec) is not
-part of a drive and has a figure of its own; imports have none. The stages are timed one by one in another drive, and
-must add up to that drive.
+part of a drive and has a figure of its own; imports are not measured. The stages are timed one by one in another drive.
+Together they must not take longer than that drive.
 
 The last line is JSON: the speed of each setting relative to real time, and two stages of the setting `full`; null where
 nothing was measured.
@@ -43,7 +43,7 @@ SETTINGS = {
     "bare": ("vehicle.scenery=none", "fidelity=pixels"),
     "geometry": ("fidelity=geometry",),
 }
-"""Settings by their names in the JSON (with `_x`): the whole loop, without scenery and codec, without pixels."""
+"""Settings by their names, which the JSON has with `_x`: the whole loop; without scenery and codec; without pixels."""
 
 PARTS = {
     "render": (("camera", "capture"),),
@@ -94,7 +94,7 @@ def drive_once(
 def stages_ms(changes: Iterable[str], limit_s: float) -> dict[str, float]:
     """Drive again with a timer around each stage; return CPU milliseconds per frame for each part and the rest.
 
-    Raise `WorkError` if the stages do not add up to the drive.
+    Raise `WorkError` if a stage took no time, or if all stages together took longer than the drive.
     """
     spent_s: defaultdict[tuple[str, str], float] = defaultdict(float)
 
@@ -121,7 +121,7 @@ def stages_ms(changes: Iterable[str], limit_s: float) -> dict[str, float]:
 
 
 def with_rest(stages: Mapping[str, float], whole: float) -> dict[str, float]:
-    """Return the stages and the rest of the whole, in its unit.
+    """Return the stages and the rest of the whole, all in one unit.
 
     Raise `WorkError` if a stage took no time, so that it was not measured, or if all stages took more than the whole.
     """
@@ -142,19 +142,19 @@ def measure(names: Iterable[str], routes: Sequence[str], repetitions: int, limit
         for route in routes:
             changes = (*SETTINGS[name], f"vehicle.route={route}")
             drives = [drive_once(changes, limit_s) for _ in range(repetitions)]
-            speed = median(each.simulated_s / each.drive_cpu_s for each in drives)
-            whole = median(each.simulated_s / (each.drive_cpu_s + each.build_cpu_s) for each in drives)
-            building_s = median(each.build_cpu_s for each in drives)
-            frame_ms = median(1e3 * each.drive_cpu_s / each.frames for each in drives)
+            speed = median(cost.simulated_s / cost.drive_cpu_s for cost in drives)
+            speed_with_building = median(cost.simulated_s / (cost.drive_cpu_s + cost.build_cpu_s) for cost in drives)
+            building_s = median(cost.build_cpu_s for cost in drives)
+            frame_ms = median(1e3 * cost.drive_cpu_s / cost.frames for cost in drives)
             stages = stages_ms(changes, limit_s)
             samples[f"{name}_x"].append(speed)
             if name == "full":
                 samples["perception_ms"].append(stages["perception"])
                 samples["render_ms"].append(stages["render"])
             print(f"{name}, {route}: {drives[0].simulated_s:.1f} s simulated, {repetitions} drives")
-            print(f"  {speed:.2f} times real time; with {building_s:.2f} s to build the loop {whole:.2f}")
+            print(f"  {speed:.2f} times real time; with {building_s:.2f} s to build the loop {speed_with_building:.2f}")
             parts = ", ".join(f"{stage} {ms:.3f}" for stage, ms in stages.items())
-            print(f"  a frame {frame_ms:.3f} ms; with a stopwatch {sum(stages.values()):.3f} ms: {parts}")
+            print(f"  a frame {frame_ms:.3f} ms; with a timer around each stage {sum(stages.values()):.3f} ms: {parts}")
     return {name: round(median(samples[name]), 3) if samples[name] else None for name in JSON_KEYS}
 
 

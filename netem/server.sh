@@ -13,10 +13,12 @@ trap '[ $? = 0 ] || tc qdisc del dev "$interface" root handle 4c56: 2>/dev/null'
 # Six bands: by default all traffic uses the first three; only filters send packets to the others.
 tc qdisc add dev "$interface" root handle 4c56: prio bands 6
 
-# The fourth band delays its packets. netem keeps order only with a rate; this one costs a microsecond per packet.
+# The fourth band delays its packets. netem keeps packets in order only if it also limits the rate; this limit takes a
+# microsecond per packet.
 tc qdisc add dev "$interface" parent 4c56:4 handle 4c01: netem limit 10000 delay "${video_ms}ms" rate 10gbit
 
-# Whole packets from the video's port whose payload begins like RTP (version 2), not the challenges of its path.
+# Packets, but not fragments, from the video's port whose payload begins like RTP (version 2). The challenges of the path
+# validation do not.
 tc filter add dev "$interface" parent 4c56: protocol ip prio 1 u32 match u8 0x45 0xff at 0 \
     match u16 0x0000 0x1fff at 6 match ip protocol 17 0xff match ip sport "$video_port" 0xffff \
     match u8 0x80 0xc0 at 28 classid 4c56:4

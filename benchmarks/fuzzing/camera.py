@@ -63,7 +63,7 @@ class FakeCamera:
         self.limit_bps = limit_bps
 
 
-HOME: tuple[str, int] = ("198.51.100.2", 4000)
+CLIENT_ADDRESS: tuple[str, int] = ("198.51.100.2", 4000)
 STRANGERS: Sequence[tuple[str, int]] = (
     ("203.0.113.9", 4000),
     ("203.0.113.9", 1),
@@ -76,12 +76,12 @@ def rtcp_reports() -> list[bytes]:
     """Return RTCP datagrams of a receiver of the stream with SSRC 2."""
     report = ReceptionReport(2, 500, 0.1, 20, 30, 5, NS_PER_S)
     negative_loss = replace(report, cumulative_lost=-5, highest_sequence=700)
-    reports = [receiver_report(1, each, clock_ns=START.mono_ns) for each in (report, negative_loss)]
+    reports = [receiver_report(1, block, clock_ns=START.mono_ns) for block in (report, negative_loss)]
     return [*reports, picture_loss(1, 2), max_bit_rate(1, 2, 2_000_000), reports[0] + picture_loss(1, 2)]
 
 
 def old_path() -> list[bytes]:
-    """Return hello, answer and challenge of an earlier session."""
+    """Return a hello, an answer and a challenge of an earlier session."""
     client, server = PathClient(bytes(16)), PathServer(lambda: bytes(32))
     server.set_token(bytes(16))
     challenge = server.receive(client.hello(0), STRANGERS[0], START.mono_ns) or b""
@@ -89,21 +89,21 @@ def old_path() -> list[bytes]:
 
 
 def feedback(seed: int) -> Target:
-    """Make a target for the video port: video goes to the validated address only, and replies amplify nothing."""
+    """Make a target for the video port: video goes to the validated address only, and no reply exceeds its request."""
     entropy, camera = SeededEntropy(seed, "feedback"), FakeCamera()
     stream = StreamSender(Packetizer(2, 0), RepairSender(3, 0))
     node = CameraNode(camera, camera, stream, PathServer(lambda: entropy.token(32)), start_ns=START.mono_ns)
-    frames = strayed = 0
+    frames = misdirected = 0
 
     def on_send(send: Send) -> None:
-        nonlocal frames, strayed
+        nonlocal frames, misdirected
         frames += send.channel == "frame"
-        strayed += send.channel == "rtp" and send.peer != HOME and not send.payload.startswith(b"LAVT")
+        misdirected += send.channel == "rtp" and send.peer != CLIENT_ADDRESS and not send.payload.startswith(b"LAVT")
 
     bench = NodeBench(node, on_send)
     token, reports = entropy.token(16), rtcp_reports()
     path = Corpus(old_path(), fields=((4, 1), (5, 1), (6, 8), (14, 8), (22, 16)))
-    words = tuple((at, 4) for at in range(4, 64, 4))
+    words = tuple((offset, 4) for offset in range(4, 64, 4))
     rtcp = Corpus(reports, fields=((0, 1), (1, 1), (2, 2), *words))
     bench.deliver("video_token", token)
     inputs = 0
@@ -112,9 +112,9 @@ def feedback(seed: int) -> Target:
 
     def validate_path() -> None:
         hello = client.hello(0)
-        [challenged] = bench.deliver("feedback", hello, HOME)
-        answer = client.answer(challenged.payload) or b""
-        bench.deliver("feedback", answer, HOME)
+        [challenge] = bench.deliver("feedback", hello, CLIENT_ADDRESS)
+        answer = client.answer(challenge.payload) or b""
+        bench.deliver("feedback", answer, CLIENT_ADDRESS)
         path.replays.extend((hello, answer))
 
     def feed(channel: str, data: bytes, chance: Chance) -> None:
@@ -122,15 +122,15 @@ def feedback(seed: int) -> Target:
         inputs += 1
         if inputs % 2000 == 1:
             validate_path()
-        peer = HOME if channel == "rtcp" and chance.below(2) else chance.choice(STRANGERS)
+        peer = CLIENT_ADDRESS if channel == "rtcp" and chance.below(2) else chance.choice(STRANGERS)
         sends = bench.deliver("feedback", data, peer)
         for send in sends:
             expect(send.peer == peer and len(send.payload) <= len(data), "a reply was longer than its request")
         expect(is_rtcp(data) or not sends or data in path.replays, "a stranger's hello was answered")
         bench.advance(STEP_NS)
         if inputs % 500 == 0:
-            bench.deliver("feedback", reports[0], HOME)
-        expect(strayed == 0, "video went to an address that was not validated")
+            bench.deliver("feedback", reports[0], CLIENT_ADDRESS)
+        expect(misdirected == 0, "video went to an address that was not validated")
 
     def rejected() -> int:
         return total(node.counts, "path_", "feedback_")
@@ -148,7 +148,7 @@ def probe_at_vehicle(seed: int) -> Target:  # noqa: ARG001 (it uses no random nu
     bench = NodeBench(node)
     sequence = count()
     corpus = Corpus(
-        [encode_request(next(sequence), START.wall_ns + each) for each in range(8)],
+        [encode_request(next(sequence), START.wall_ns + later_ns) for later_ns in range(8)],
         fields=((0, 2), (2, 1), (3, 1), (4, 4), (8, 8), (16, 8), (24, 8), (32, 8), (40, 8)),
     )
     inputs = answered = 0

@@ -13,15 +13,14 @@ import numpy as np
 from lavt.streams import stream
 
 MAX_NOISE_BYTES = 1500
-MAX_MUTATIONS = 3
-"""Per input."""
+MAX_MUTATIONS_PER_INPUT = 3
 
 SMALL_INTEGERS: Final = (0, 1, -1, 2, 127, 128, 255, 256, 65_535, 65_536)
 LARGE_INTEGERS: Final = (2**31 - 1, 2**31, 2**32, 2**53 + 1, 2**62, 2**62 + 1, 2**63 - 1, 2**63, 2**64 - 1)
 INTEGERS: Final = (*SMALL_INTEGERS, *LARGE_INTEGERS, -(2**31), -(2**63))
 FINITE: Final = (0.0, -0.0, 0.1, 1.0, -1.0, 1.0000001, 100.0, 1e308, -1e308, 5e-324)
 NUMBERS: Final = (*FINITE, float("inf"), -float("inf"), float("nan"))
-WORDS: Final = (
+TEXTS: Final = (
     "",
     "a",
     "arm",
@@ -52,7 +51,7 @@ WORDS: Final = (
     "1e5",
     "None",
 )
-OTHERS: Final[tuple[Any, ...]] = (
+OTHER_VALUES: Final[tuple[Any, ...]] = (
     None,
     True,
     False,
@@ -73,7 +72,7 @@ OTHERS: Final[tuple[Any, ...]] = (
     msgpack.ExtType(5, b"x"),
     msgpack.Timestamp(0),
 )
-VALUES: Final[tuple[Any, ...]] = (*INTEGERS, *NUMBERS, *WORDS, *OTHERS)
+VALUES: Final[tuple[Any, ...]] = (*INTEGERS, *NUMBERS, *TEXTS, *OTHER_VALUES)
 
 BOMBS: Final = (
     b"\xdd\xff\xff\xff\xff",
@@ -87,13 +86,16 @@ BOMBS: Final = (
     b"\xd8\xff",
     b"",
 )
-"""Prefixes that claim more data than there is, or nest deeper than any message does."""
+"""Prefixes that announce more data than follows, or that nest deeper than any message."""
 
 Item = TypeVar("Item")
 
 
 class Chance:
-    """Random numbers of a named stream, drawn by the thousand, because single draws are slower than the parsers."""
+    """Random numbers of a named random-number stream.
+
+    They are drawn by the thousand, because drawing each one alone would take longer than parsing an input.
+    """
 
     def __init__(self, seed: int, name: str) -> None:
         self._generator = stream(seed, f"fuzz {name}")
@@ -121,8 +123,8 @@ def _numbers(generator: np.random.Generator) -> Iterator[int]:
 class Corpus:
     """The valid inputs of one channel.
 
-    `fields` are offsets and lengths of the fields of a binary layout. In `packed` inputs, which are msgpack arrays,
-    single values are replaced. `replays` are repeated without changes.
+    `fields` are the offsets and lengths (bytes) of the fields of a binary layout. `packed` inputs are msgpack arrays,
+    in which single values are replaced. `replays` are inputs that are repeated without changes.
     """
 
     entries: Sequence[bytes]
@@ -142,8 +144,9 @@ def next_input(corpus: Corpus, chance: Chance) -> bytes:
     if kind <= 2 and corpus.replays:
         return chance.choice(corpus.replays)
     data = chance.choice(corpus.entries)
-    mutations = PACKED if corpus.packed else BINARY if corpus.fields else PLAIN
-    for _ in range(chance.below(MAX_MUTATIONS + 1)):
+    structured = PACKED_MUTATIONS if corpus.packed else BINARY_MUTATIONS
+    mutations = structured if corpus.packed or corpus.fields else UNSTRUCTURED_MUTATIONS
+    for _ in range(chance.below(MAX_MUTATIONS_PER_INPUT + 1)):
         data = chance.choice(mutations)(data, corpus, chance)
     return data
 
@@ -171,25 +174,25 @@ def _splice(data: bytes, corpus: Corpus, chance: Chance) -> bytes:
 
 
 def _overwrite(data: bytes, _corpus: Corpus, chance: Chance) -> bytes:
-    at, length = chance.below(len(data) + 1), 1 + chance.below(8)
-    filled = chance.choice((b"\x00", b"\xff", b"\x7f", b"\x80")) * length
-    return data[:at] + (filled if chance.below(2) else chance.bytes(length)) + data[at + length :]
+    offset, length = chance.below(len(data) + 1), 1 + chance.below(8)
+    repeated_byte = chance.choice((b"\x00", b"\xff", b"\x7f", b"\x80")) * length
+    return data[:offset] + (repeated_byte if chance.below(2) else chance.bytes(length)) + data[offset + length :]
 
 
 def _remove(data: bytes, _corpus: Corpus, chance: Chance) -> bytes:
-    at = chance.below(len(data) + 1)
-    return data[:at] + data[at + 1 + chance.below(16) :]
+    offset = chance.below(len(data) + 1)
+    return data[:offset] + data[offset + 1 + chance.below(16) :]
 
 
 def _change_field(data: bytes, corpus: Corpus, chance: Chance) -> bytes:
-    """Replace a field by a value that is near to or far from the old one."""
-    at, length = chance.choice(corpus.fields)
-    if at + length > len(data):
+    """Replace the value of a field by one that is near to or far from it."""
+    offset, length = chance.choice(corpus.fields)
+    if offset + length > len(data):
         return data
-    old, mask = int.from_bytes(data[at : at + length], "big"), (1 << 8 * length) - 1
-    near, half = chance.below(32), 1 << (8 * length - 1)
-    new: int = chance.choice((old + near, old - near, old + half, half, mask, chance.choice(INTEGERS)))
-    return data[:at] + (new & mask).to_bytes(length, "big") + data[at + length :]
+    old, mask = int.from_bytes(data[offset : offset + length], "big"), (1 << 8 * length) - 1
+    small, half = chance.below(32), 1 << (8 * length - 1)
+    new: int = chance.choice((old + small, old - small, old + half, half, mask, chance.choice(INTEGERS)))
+    return data[:offset] + (new & mask).to_bytes(length, "big") + data[offset + length :]
 
 
 def _change_value(data: bytes, _corpus: Corpus, chance: Chance) -> bytes:
@@ -208,16 +211,16 @@ def _change_shape(data: bytes, _corpus: Corpus, chance: Chance) -> bytes:
     """Insert, remove or swap values of a message."""
     try:
         values = msgpack.unpackb(data)
-        at, other = chance.below(len(values)), chance.below(len(values))
+        index, other = chance.below(len(values)), chance.below(len(values))
         kind = chance.below(3)
         if kind == 0:
-            values.insert(at, chance.choice(VALUES))
+            values.insert(index, chance.choice(VALUES))
         elif kind == 1:
-            values.pop(at)
+            values.pop(index)
         else:
-            values[at], values[other] = values[other], values[at]
+            values[index], values[other] = values[other], values[index]
         packed: bytes = msgpack.packb(values)
-    except Exception:  # as above
+    except Exception:  # an earlier mutation broke the message
         return data
     return packed
 
@@ -226,6 +229,14 @@ def _prepend_bomb(data: bytes, _corpus: Corpus, chance: Chance) -> bytes:
     return chance.choice(BOMBS) + data
 
 
-PLAIN: Final[tuple[Mutation, ...]] = (_flip, _truncate, _lengthen, _splice, _overwrite, _remove)
-BINARY: Final[tuple[Mutation, ...]] = (*PLAIN, *(_change_field,) * len(PLAIN))
-PACKED: Final[tuple[Mutation, ...]] = (*PLAIN, *(_change_value,) * len(PLAIN), _change_shape, _prepend_bomb)
+UNSTRUCTURED_MUTATIONS: Final[tuple[Mutation, ...]] = (_flip, _truncate, _lengthen, _splice, _overwrite, _remove)
+BINARY_MUTATIONS: Final[tuple[Mutation, ...]] = (
+    *UNSTRUCTURED_MUTATIONS,
+    *(_change_field,) * len(UNSTRUCTURED_MUTATIONS),
+)
+PACKED_MUTATIONS: Final[tuple[Mutation, ...]] = (
+    *UNSTRUCTURED_MUTATIONS,
+    *(_change_value,) * len(UNSTRUCTURED_MUTATIONS),
+    _change_shape,
+    _prepend_bomb,
+)

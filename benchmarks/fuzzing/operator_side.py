@@ -57,8 +57,8 @@ from lavt.transport.video.stamp import (
 
 FRAME_NS = NS_PER_S // 30
 STEP_NS = NS_PER_MS
-RESTART_INTERVAL = 2000
-"""Number of inputs after which the client is restarted, because it may have lost control."""
+INPUTS_PER_RESTART = 2000
+"""The client is restarted after this number of inputs, because it may have lost control."""
 WIDTH_PX, HEIGHT_PX = 128, 96
 TOKEN = bytes(range(16))
 
@@ -110,16 +110,18 @@ def driver(seed: int, *, stops_after: int | None = None) -> Target:  # noqa: ARG
     )
     stopped = replace(state, speed_mps=0.0, safety="safe_stop", rejected="not the epoch in force", requested_by="bob")
     reply = SessionReply(True, "", 2**63 + 1, TOKEN, 5600, "kernel", 0)
-    states = Corpus([encode(each) for each in (state, stopped, replace(stopped, safety="emergency_stop"))], packed=True)
+    states = Corpus(
+        [encode(state_sent) for state_sent in (state, stopped, replace(stopped, safety="emergency_stop"))], packed=True
+    )
     rejection = SessionReply(False, "held by bob", 0, b"", 5600, "", wall_ns)
-    replies = Corpus([encode(each) for each in (reply, rejection)], packed=True)
+    replies = Corpus([encode(answer) for answer in (reply, rejection)], packed=True)
     picture = RenderedPicture(np.zeros((HEIGHT_PX, WIDTH_PX, 3), np.uint8))
     inputs = 0
 
     def feed(channel: str, data: bytes, _chance: Chance) -> None:
         nonlocal inputs, unreadable
         inputs += 1
-        if stops_after is None and inputs % RESTART_INTERVAL == 0:
+        if stops_after is None and inputs % INPUTS_PER_RESTART == 0:
             unreadable = rejected()
             bench.node = new_driver()
         bench.deliver(channel, data)
@@ -173,16 +175,16 @@ def condition_at_operator(seed: int) -> Target:  # noqa: ARG001 (it uses no rand
 
 
 def units(seed: int, number: int) -> list[tuple[int, bytes]]:
-    """Return access units of small noisy pictures with their stamps; every tenth is a keyframe."""
+    """Return the stamps and access units of `number` small pictures of noise; every tenth is a keyframe."""
     encoder = Encoder(WIDTH_PX, HEIGHT_PX, rate_hz=30, bit_rate_bps=1_000_000, gop_frames=10)
     generator = stream(seed, "fuzz pictures")
-    made = []
+    stamped_units = []
     for frame in range(number):
         picture: Picture = generator.integers(0, 256, (HEIGHT_PX, WIDTH_PX, 3), dtype=np.uint8)
         stamp_ns = START.wall_ns + frame * FRAME_NS
         write_stamp(picture, stamp_ns)
-        made.append((stamp_ns, encoder.encode(picture)))
-    return made
+        stamped_units.append((stamp_ns, encoder.encode(picture)))
+    return stamped_units
 
 
 HEADER = ((0, 1), (1, 1), (2, 2), (4, 4), (8, 4), (12, 1), (13, 1), (14, 2))
@@ -190,21 +192,23 @@ HEADER = ((0, 1), (1, 1), (2, 2), (4, 4), (8, 4), (12, 1), (13, 1), (14, 2))
 
 
 def video_corpora(encoded: Sequence[bytes]) -> dict[str, Corpus]:
-    """Return media, repair and RTCP datagrams of two foreign streams, one of them with the true stream's SSRC."""
+    """Return media, repair and RTCP datagrams of two foreign RTP streams, one of which has the SSRC of the true one."""
     media, repair = [], []
     for foreign in (Packetizer(99, 5), Packetizer(77, 65_100)):
-        frames = [foreign.packetize(unit, 3000 * each) for each, unit in enumerate(encoded)]
+        frames = [foreign.packetize(unit, 3000 * frame) for frame, unit in enumerate(encoded)]
         media += [datagram for frame in frames for datagram in frame]
         repair += RepairSender(98, 0).repair(frames[0], 2)
-    answered = [ReferenceAnswer(0x4C415654, 12345, NS_PER_MS)]
+    answer = ReferenceAnswer(0x4C415654, 12345, NS_PER_MS)
     reports = [
-        sender_report(77, wall_ns=START.wall_ns, rtp_timestamp=5, packets=9, octets=900, cname="x@lavt", answered=each)
-        for each in ([], answered)
+        sender_report(
+            77, wall_ns=START.wall_ns, rtp_timestamp=5, packets=9, octets=900, cname="x@lavt", answered=answers
+        )
+        for answers in ([], [answer])
     ]
     server = PathServer(lambda: bytes(32))
     server.set_token(TOKEN)
     challenge = server.receive(PathClient(TOKEN).hello(0), ("198.51.100.2", 4000), START.mono_ns) or b""
-    words = tuple((at, 4) for at in range(4, 64, 4))
+    words = tuple((offset, 4) for offset in range(4, 64, 4))
     return {
         "rtp": Corpus(media, fields=HEADER),
         "repair": Corpus(repair, fields=(*HEADER, (16, 4), (20, 2), (22, 1), (23, 1))),
@@ -215,15 +219,15 @@ def video_corpora(encoded: Sequence[bytes]) -> dict[str, Corpus]:
 def video(seed: int) -> Target:
     """Make a target for the client's video port, which also gets a true stream: the sender can decode all feedback."""
     node = ReceiverNode(JitterBuffer(), Depacketizer(), 2_000_000)
-    shown = whole = inputs = frame = 0
+    units_sent = complete_units = inputs = frame = 0
 
     def on_send(send: Send) -> None:
-        nonlocal shown, whole
+        nonlocal units_sent, complete_units
         if send.channel == "feedback" and not is_path_datagram(send.payload):
             parse_feedback(send.payload)
         elif send.channel == "access_unit":
-            shown += 1
-            whole += send.payload.complete
+            units_sent += 1
+            complete_units += send.payload.complete
 
     bench = NodeBench(node, on_send)
     bench.deliver("path_token", PathToken(TOKEN, 5600))
@@ -231,14 +235,14 @@ def video(seed: int) -> Target:
     encoded = [unit for _, unit in units(seed, 30)]
     corpora = video_corpora(encoded[:10])
 
-    def true_frame() -> None:
+    def deliver_true_frame() -> None:
         """Deliver the next frame of the true stream; every second one loses its first packet."""
         nonlocal frame
         datagrams = packetizer.packetize(encoded[frame % len(encoded)], frame * 3000 % 2**32)
-        protecting = repairs.repair(datagrams, frame % 3)
+        repair_packets = repairs.repair(datagrams, frame % 3)
         corpora["rtp"].replays.extend(datagrams)
-        corpora["repair"].replays.extend(protecting)
-        for datagram in (*datagrams[frame % 2 :], *protecting):
+        corpora["repair"].replays.extend(repair_packets)
+        for datagram in (*datagrams[frame % 2 :], *repair_packets):
             bench.deliver("rtp", datagram)
         frame += 1
 
@@ -248,7 +252,7 @@ def video(seed: int) -> Target:
         bench.deliver("rtp", data)
         bench.advance(STEP_NS)
         if inputs % 33 == 0:
-            true_frame()
+            deliver_true_frame()
 
     def rejected() -> int:
         unreadable = total(node.counts, "packets_unreadable", "challenges_unreadable")
@@ -256,7 +260,7 @@ def video(seed: int) -> Target:
 
     def finish() -> str:
         recovered = node.counts["packets_recovered"]
-        return f"{shown} access units, {whole} complete, {recovered} packets recovered"
+        return f"{units_sent} access units, {complete_units} complete, {recovered} packets recovered"
 
     return Target(corpora, feed, rejected, finish)
 
@@ -266,10 +270,10 @@ def pictures(seed: int) -> Target:
     node = new_driver()
     bench = NodeBench(node)
     true_units = units(seed, 40)
-    corpus = Corpus([unit for _, unit in true_units], fields=tuple((at, 1) for at in range(64)))
+    corpus = Corpus([unit for _, unit in true_units], fields=tuple((offset, 1) for offset in range(64)))
     inputs = views = 0
 
-    def decoded(data: bytes, stamp_ns: int, *, complete: bool) -> Sequence[DecodedFrame]:
+    def decode_unit(data: bytes, stamp_ns: int, *, complete: bool) -> Sequence[DecodedFrame]:
         unit = ReceivedUnit(data, rtp_timestamp(stamp_ns), complete, complete, bench.now.mono_ns)
         shown: Sequence[DecodedFrame] = payloads_on(bench.deliver("access_unit", unit), "view")
         for view in shown:
@@ -279,10 +283,10 @@ def pictures(seed: int) -> Target:
     def feed(_channel: str, data: bytes, chance: Chance) -> None:
         nonlocal inputs, views
         inputs += 1
-        decoded(data, chance.choice(true_units)[0], complete=bool(chance.below(2)))
+        decode_unit(data, chance.choice(true_units)[0], complete=bool(chance.below(2)))
         bench.advance(STEP_NS)
         if inputs % 20 == 0:
-            views += sum(len(decoded(unit, stamp_ns, complete=True)) for stamp_ns, unit in true_units[:2])
+            views += sum(len(decode_unit(unit, stamp_ns, complete=True)) for stamp_ns, unit in true_units[:2])
 
     def finish() -> str:
         expect(inputs < 1000 or views > 0, "no true picture was shown")
@@ -296,8 +300,8 @@ def probe_at_operator(seed: int) -> Target:  # noqa: ARG001 (it uses no random n
     node = ProbingClockSyncNode(START.mono_ns)
     corpus = Corpus(
         [
-            encode_reply(ProbeReply(each, START.wall_ns, START.wall_ns + 5, START.wall_ns + 9, 0.1, 0.2))
-            for each in range(8)
+            encode_reply(ProbeReply(sequence, START.wall_ns, START.wall_ns + 5, START.wall_ns + 9, 0.1, 0.2))
+            for sequence in range(8)
         ],
         fields=((0, 2), (2, 1), (3, 1), (4, 4), (8, 8), (16, 8), (24, 8), (32, 8), (40, 8)),
     )
@@ -333,21 +337,21 @@ def stamps(seed: int) -> Target:
     """Make a target for stamps in luma planes of any shape: a stamp that is read has at most 64 bits."""
     generator = stream(seed, "fuzz planes")
     planes = []
-    for each in range(16):
+    for number in range(16):
         luma = generator.integers(0, 256, (STAMP_PX, STAMP_PX), dtype=np.uint8)
-        write_stamp_luma(luma, START.wall_ns + each)
+        write_stamp_luma(luma, START.wall_ns + number)
         planes.append(bytes((STAMP_PX, STAMP_PX)) + luma.tobytes())
     rejections = 0
 
     def feed(_channel: str, data: bytes, _chance: Chance) -> None:
         nonlocal rejections
-        sides = (data[0], data[1]) if len(data) > 1 else (0, 0)
+        rows, columns = (data[0], data[1]) if len(data) > 1 else (0, 0)
         pixels = np.frombuffer(data[2:], np.uint8)
-        whole = sides[0] * sides[1] > 0 and pixels.size >= sides[0] * sides[1]
-        luma = pixels[: sides[0] * sides[1]].reshape(sides) if whole else pixels
-        for read in (read_stamp, read_clear_stamp):
+        is_plane = 0 < rows * columns <= pixels.size
+        luma = pixels[: rows * columns].reshape((rows, columns)) if is_plane else pixels
+        for read_function in (read_stamp, read_clear_stamp):
             try:
-                expect(0 <= read(luma) < 2**64, "a stamp of more than 64 bits")
+                expect(0 <= read_function(luma) < 2**64, "a stamp of more than 64 bits")
             except BadPacket:
                 rejections += 1
 

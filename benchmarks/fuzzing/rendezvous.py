@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hmac
 
-from benchmarks.fuzzing.camera import HOME, STRANGERS, old_path, rtcp_reports
+from benchmarks.fuzzing.camera import CLIENT_ADDRESS, STRANGERS, old_path, rtcp_reports
 from benchmarks.fuzzing.mutation import Chance, Corpus
 from benchmarks.fuzzing.target import START, Target, expect, total
 
@@ -23,7 +23,7 @@ VEHICLE = ("203.0.113.2", 5600)
 
 
 class MacKey(PublicKey):
-    """A stand-in for the vehicle's key that uses a MAC: about 100 times faster, and as hard to forge."""
+    """A stand-in for the vehicle's key that uses a MAC, which is about 100 times faster and as hard to forge."""
 
     def __init__(self) -> None:
         pass
@@ -38,7 +38,7 @@ class MacKey(PublicKey):
 
 
 def rendezvous(_seed: int) -> Target:
-    """Make a target for the rendezvous, which sends only to the vehicle and its clients; no stranger can register."""
+    """Make a target for the rendezvous: it sends only to the vehicle and to clients, and no stranger can register."""
     key = MacKey()
     forwarder = Forwarder("vehicle-1", "video", key)
     now_ns, registered_ns = START.mono_ns, 0
@@ -49,7 +49,9 @@ def rendezvous(_seed: int) -> Target:
         return plain + key.sign(b"LAVT 1 registration vehicle-1\0" + plain)
 
     registrations = Corpus([registration(1), registration(2)], fields=((4, 1), (5, 1), (6, 8), (14, 32), (46, 8)))
-    wrapped = Corpus([wrap(each, b"video") for each in (HOME, VEHICLE)], fields=((4, 1), (5, 1), (6, 4), (10, 2)))
+    wrapped = Corpus(
+        [wrap(address, b"video") for address in (CLIENT_ADDRESS, VEHICLE)], fields=((4, 1), (5, 1), (6, 4), (10, 2))
+    )
     client = Corpus([*old_path(), *rtcp_reports()], fields=((0, 1), (1, 1), (4, 1), (5, 1), (6, 8)))
 
     def feed(channel: str, data: bytes, chance: Chance) -> None:
@@ -60,7 +62,9 @@ def rendezvous(_seed: int) -> Target:
             newest = registration(now_ns)
             forwarder.receive(newest, VEHICLE, now_ns)
             registrations.replays.append(newest)
-        sender = VEHICLE if channel == "wrapped" and chance.below(2) else chance.choice((HOME, *STRANGERS[:3]))
+        sender = (
+            VEHICLE if channel == "wrapped" and chance.below(2) else chance.choice((CLIENT_ADDRESS, *STRANGERS[:3]))
+        )
         forwarded = forwarder.receive(data, sender, now_ns)
         if forwarded is not None and sender != VEHICLE:
             expect(forwarded[1] == VEHICLE, "a stranger's datagram went to a third party")

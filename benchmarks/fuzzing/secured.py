@@ -10,7 +10,7 @@ from collections import deque
 from functools import partial
 from typing import Any
 
-from benchmarks.fuzzing.camera import HOME, FakeCamera, rtcp_reports
+from benchmarks.fuzzing.camera import CLIENT_ADDRESS, FakeCamera, rtcp_reports
 from benchmarks.fuzzing.mutation import Chance, Corpus
 from benchmarks.fuzzing.operator_side import STEP_NS, TOKEN, units, video_corpora
 from benchmarks.fuzzing.target import START, NodeBench, Target, expect, total
@@ -35,9 +35,9 @@ from lavt.transport.video.path_validation import PathClient, PathServer, is_path
 from lavt.transport.video.stream_sender import StreamSender
 
 GATEWAY_STEP_NS = 4 * NS_PER_MS
-"""Time between two inputs; at a higher rate the rate limiters would reject them unread."""
+"""Time between two inputs; with less, the rate limiters would reject most inputs unread."""
 EPOCH = 2**63 + 7
-EVERYWHERE = tuple((at, 1) for at in range(0, 400, 3))
+EVERY_THIRD_BYTE = tuple((offset, 1) for offset in range(0, 400, 3))
 ACQUIRE = encode(SessionRequest("acquire", "alice", 5, 0))
 GRANTED = encode(SessionReply(True, "", EPOCH, TOKEN, 5600, "kernel", 0))
 
@@ -52,7 +52,7 @@ def keys(seed: int) -> tuple[PrivateKey, PrivateKey]:
 
 
 def gateway_of_vehicle(seed: int) -> Target:
-    """Make a target for the vehicle's gateway: only the operator's commands pass, and no replayed request."""
+    """Make a target for the vehicle's gateway: it accepts the operator's commands only, and no replayed request."""
     vehicle_key, operator_key = keys(seed)
     delivered: list[tuple[str, bytes]] = []
     sent: list[Send] = []
@@ -88,8 +88,8 @@ def gateway_of_vehicle(seed: int) -> Target:
         return operator.sign_command(signed_bodies[-1])
 
     corpora = {
-        "session": Corpus([exchange(ACQUIRE, GRANTED), exchange(ACQUIRE, GRANTED)], fields=EVERYWHERE),
-        "control": Corpus([command() for _ in range(4)], fields=EVERYWHERE),
+        "session": Corpus([exchange(ACQUIRE, GRANTED), exchange(ACQUIRE, GRANTED)], fields=EVERY_THIRD_BYTE),
+        "control": Corpus([command() for _ in range(4)], fields=EVERY_THIRD_BYTE),
     }
     corpus_bodies = frozenset(signed_bodies)  # the newest of the later commands are replayed
     inputs = 0
@@ -116,9 +116,9 @@ def gateway_of_vehicle(seed: int) -> Target:
 
 
 def gateway_of_operator(seed: int) -> Target:
-    """Make a target for the operator's gateway: only the vehicle's states and replies pass, and each once."""
+    """Make a target for the operator's gateway: it accepts the vehicle's states and replies only, and each once."""
     vehicle_key, operator_key = keys(seed)
-    car = VehicleAuthenticator("car", vehicle_key, {"alice": operator_key.public})
+    vehicle = VehicleAuthenticator("car", vehicle_key, {"alice": operator_key.public})
     delivered: list[bytes] = []
     sent: list[Send] = []
     gateway = ClientGateway(
@@ -132,27 +132,27 @@ def gateway_of_operator(seed: int) -> Target:
 
     def answer(body: bytes) -> bytes:
         """Reply to the pending request, deliver the reply, and return its envelope."""
-        request = car.verify_request("session", sent.pop().payload)
+        request = vehicle.verify_request("session", sent.pop().payload)
         assert request is not None
-        reply = car.sign_reply(request, b"" if request.is_stale else body)
+        reply = vehicle.sign_reply(request, b"" if request.is_stale else body)
         gateway.receive("session_reply", reply, now, None)
         return reply
 
     def state(number: int) -> tuple[bytes, bytes]:
         body = encode(State(number, number, 8.0, 0.0, "drive", "driving", "", number, ""))
-        return body, car.sign_state(body)
+        return body, vehicle.sign_state(body)
 
     gateway.send(Send("session", ACQUIRE))
     replies = [answer(GRANTED), answer(GRANTED)]
-    old = [state(number)[1] for number in range(8)]
-    for each in old:
-        gateway.receive("state", each, now, None)
-    expect(len(delivered) == 1 + len(old), "the vehicle's own messages were rejected")
+    old_states = [state(number)[1] for number in range(8)]
+    for envelope in old_states:
+        gateway.receive("state", envelope, now, None)
+    expect(len(delivered) == 1 + len(old_states), "the vehicle's own messages were rejected")
     delivered.clear()
     corpora = {
-        "state": Corpus(old, fields=EVERYWHERE),
-        "session_reply": Corpus(replies, fields=EVERYWHERE),
-        "netem_reply": Corpus(replies, fields=EVERYWHERE),
+        "state": Corpus(old_states, fields=EVERY_THIRD_BYTE),
+        "session_reply": Corpus(replies, fields=EVERY_THIRD_BYTE),
+        "netem_reply": Corpus(replies, fields=EVERY_THIRD_BYTE),
     }
     inputs = 0
 
@@ -178,46 +178,46 @@ def encrypted_video(seed: int) -> Target:
     node = ReceiverNode(JitterBuffer(), Depacketizer(), 2_000_000, partial(SrtpCipher, "client"))
     server = PathServer(lambda: bytes(32), partial(SrtpCipher, "server"))
     server.set_token(TOKEN)
-    reported = whole = inputs = frame = sent_packets = 0
+    reports = complete_units = inputs = frame = sent_packets = 0
 
     def on_send(send: Send) -> None:
-        nonlocal reported, whole
+        nonlocal reports, complete_units
         if send.channel == "access_unit":
-            whole += send.payload.complete
+            complete_units += send.payload.complete
         elif send.channel == "feedback" and is_path_datagram(send.payload):
-            challenge = server.receive(send.payload, HOME, bench.now.mono_ns)
+            challenge = server.receive(send.payload, CLIENT_ADDRESS, bench.now.mono_ns)
             if challenge is not None:
                 bench.deliver("rtp", challenge)
         elif send.channel == "feedback":
             report = server.cipher.unprotect_rtcp(send.payload)
             expect(report is not None, "the server cannot decrypt a report")
             parse_feedback(report or b"")
-            reported += 1
+            reports += 1
 
     bench = NodeBench(node, on_send)
     bench.deliver("path_token", PathToken(TOKEN, 5600))
     bench.deliver(WAKE, None)
-    expect(server.open_address(bench.now.mono_ns) == HOME, "the path was not validated")
+    expect(server.open_address(bench.now.mono_ns) == CLIENT_ADDRESS, "the path was not validated")
     packetizer, repairs = Packetizer(77, 0), RepairSender(78, 0)
     encoded = [unit for _, unit in units(seed, 30)]
     corpora = video_corpora(encoded[:10])
     report = sender_report(77, wall_ns=1, rtp_timestamp=5, packets=9, octets=900, cname="x@lavt", answered=[])
     corpora["rtcp"].replays.append(server.cipher.protect_rtcp(report))
 
-    def true_frame() -> list[bytes]:
+    def next_true_frame() -> list[bytes]:
         nonlocal frame
         datagrams = packetizer.packetize(encoded[frame % len(encoded)], frame * 3000 % 2**32)
         frame += 1
-        return [server.cipher.protect(each) for each in (*datagrams, *repairs.repair(datagrams, 1))]
+        return [server.cipher.protect(datagram) for datagram in (*datagrams, *repairs.repair(datagrams, 1))]
 
-    protected = true_frame()
-    corpora["rtp"] = Corpus(protected, fields=EVERYWHERE)
+    protected = next_true_frame()
+    corpora["rtp"] = Corpus(protected, fields=EVERY_THIRD_BYTE)
 
     def feed(_channel: str, data: bytes, _chance: Chance) -> None:
         nonlocal inputs, sent_packets, protected
         inputs += 1
         if inputs % 33 == 1:
-            protected = protected if inputs == 1 else true_frame()
+            protected = protected if inputs == 1 else next_true_frame()
             for datagram in protected:
                 bench.deliver("rtp", datagram)
             sent_packets += len(protected)
@@ -228,7 +228,7 @@ def encrypted_video(seed: int) -> Target:
         expect(counted == sent_packets, f"{sent_packets} packets were sent, {counted} accepted")
 
     def finish() -> str:
-        return f"{whole} of {frame} frames complete, {reported} reports"
+        return f"{complete_units} of {frame} frames complete, {reports} reports"
 
     return Target(corpora, feed, lambda: total(node.counts, "packets_forged", "challenges_unreadable"), finish)
 
@@ -241,32 +241,33 @@ def encrypted_feedback(seed: int) -> Target:
     client = PathClient(TOKEN, partial(SrtpCipher, "client"))
     bench = NodeBench(node)
     bench.deliver("video_token", TOKEN)
-    [challenge] = bench.deliver("feedback", client.hello(0), HOME)
-    bench.deliver("feedback", client.answer(challenge.payload), HOME)
+    [challenge] = bench.deliver("feedback", client.hello(0), CLIENT_ADDRESS)
+    bench.deliver("feedback", client.answer(challenge.payload), CLIENT_ADDRESS)
     [packet] = Packetizer(77, 0).packetize(b"\0\0\1\x65", 0)
-    client.unprotect(path.cipher.protect(packet))  # from now on it uses the server's key
+    client.unprotect(path.cipher.protect(packet))  # from now on the client uses the server's key
     report, loss = rtcp_reports()[0], picture_loss(1, 2)
     corpus = Corpus(
-        [client.protect_rtcp(each) for each in (report, loss, report)], fields=tuple((at, 1) for at in range(96))
+        [client.protect_rtcp(plain) for plain in (report, loss, report)],
+        fields=tuple((offset, 1) for offset in range(96)),
     )
-    for each in corpus.entries:
-        bench.deliver("feedback", each, HOME)
+    for protected in corpus.entries:
+        bench.deliver("feedback", protected, CLIENT_ADDRESS)
     inputs, requested = 0, 1
 
     def feed(channel: str, data: bytes, _chance: Chance) -> None:
         nonlocal inputs, requested
         inputs += 1
-        bench.deliver(channel, data, HOME)
+        bench.deliver(channel, data, CLIENT_ADDRESS)
         bench.advance(STEP_NS)
         if inputs % 500 == 0:
             sent = client.protect_rtcp(loss if inputs % 1000 == 0 else report)
             requested += inputs % 1000 == 0
-            bench.deliver("feedback", sent, HOME)
+            bench.deliver("feedback", sent, CLIENT_ADDRESS)
             corpus.replays.append(sent)
         expect(node.counts.get("keyframes_on_request", 0) <= requested, "a keyframe was made without a request")
 
     def finish() -> str:
-        expect(path.open_address(bench.now.mono_ns) == HOME, "the path of a client that reports was closed")
+        expect(path.open_address(bench.now.mono_ns) == CLIENT_ADDRESS, "the path of a client that reports was closed")
         return f"{node.counts['keyframes_on_request']} of {requested} requests for a keyframe accepted"
 
     return Target({"feedback": corpus}, feed, lambda: total(node.counts, "path_", "feedback_"), finish)

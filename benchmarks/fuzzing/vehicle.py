@@ -38,8 +38,8 @@ from lavt.vehicle.vehicle import Capabilities, ReachedCommand
 FRAME_NS = NS_PER_S // 30
 STEP_NS = NS_PER_MS
 """Time between two inputs."""
-OPERATOR_INTERVAL = 20
-"""Number of inputs after which the true operator sends a command from a new picture."""
+INPUTS_PER_COMMAND = 20
+"""After this number of inputs the true operator sends a command made from a new frame."""
 STRAIGHT = (0.0,) * 10
 CAPABILITIES = Capabilities(
     simulated=True,
@@ -108,14 +108,14 @@ class VehicleSide:
         self.control = Corpus(old_commands(), packed=True)
         self.session = Corpus(requests(), packed=True)
 
-    def picture(self) -> None:
-        """Write a new stamp, as in the video."""
+    def write_frame(self) -> None:
+        """Write the stamp of a new frame, as the camera does."""
         self._frame += 1
         self.stamp_ns = self.bench.now.wall_ns
         frame = FrameWritten(self._frame, self.stamp_ns, self.bench.now.mono_ns, None, self._frame, 5000)
         self.bench.deliver("frame", frame)
 
-    def ask(self, operation: Any, number: int = 0) -> SessionReply:
+    def request(self, operation: Any, number: int = 0) -> SessionReply:
         """Send a session request of the operator and store the granted epoch."""
         request = encode(SessionRequest(operation, "operator", 2**63 + 5, number))
         [payload] = payloads_on(self.bench.deliver("session", request, 1), "session_reply")
@@ -125,11 +125,11 @@ class VehicleSide:
 
     def send_command(self) -> None:
         """Send the operator's next command, which others may replay."""
-        self.picture()
+        self.write_frame()
         if self.gate.state not in ("arming", "driving", "degraded"):
-            reply = self.ask("acquire")
+            reply = self.request("acquire")
             if self.gate.state == "emergency_stop":
-                self.ask("clear_emergency_stop", reply.emergency_stop)
+                self.request("clear_emergency_stop", reply.emergency_stop)
         self._sequence += 1
         driving = self.gate.state in ("driving", "degraded")
         now_ns = self.bench.now.wall_ns
@@ -161,13 +161,14 @@ class VehicleSide:
 
 
 def old_commands() -> list[bytes]:
-    """Return commands of an earlier session, whose stamps belong to no picture of this one."""
+    """Return commands of an earlier session, whose stamps belong to no frame of this one."""
     base = Command(
         2**63 + 12345, 2**40, START.wall_ns, START.wall_ns, START.wall_ns, 0.1, 0.5, 0.0, STRAIGHT, "drive", 0
     )
     arm = replace(base, mode="arm", throttle=0.0, brake=1.0, steering_rad=0.0)
     return [
-        encode(each) for each in (base, arm, replace(base, mode="stop"), replace(base, emergency_stop=START.wall_ns))
+        encode(command)
+        for command in (base, arm, replace(base, mode="stop"), replace(base, emergency_stop=START.wall_ns))
     ]
 
 
@@ -175,8 +176,8 @@ def requests() -> list[bytes]:
     """Return session requests of a stranger."""
     start_ns = START.wall_ns
     return [
-        encode(each)
-        for each in (
+        encode(request)
+        for request in (
             SessionRequest("acquire", "stranger", 77, 0),
             SessionRequest("request_handover", "stranger", 77, 0),
             SessionRequest("release", "stranger", 77, 0),
@@ -197,12 +198,12 @@ def _feed(side: VehicleSide, channel: str, data: bytes) -> list[Send]:
     return sends
 
 
-def _check_counts(side: VehicleSide, given: dict[str, int]) -> None:
+def _check_counts(side: VehicleSide, delivered: dict[str, int]) -> None:
     counts = side.node.counts
     commands = counts.get("commands_unreadable", 0) + total(counts, "rejected: ")
-    expect(commands == given["control"], f"{given['control']} commands were given, {commands} counted")
+    expect(commands == delivered["control"], f"{delivered['control']} commands were delivered, {commands} counted")
     queries = counts.get("session_requests_unreadable", 0) + total(counts, "session ")
-    expect(queries == given["session"], f"{given['session']} queries were given, {queries} counted")
+    expect(queries == delivered["session"], f"{delivered['session']} queries were delivered, {queries} counted")
 
 
 def _rejected(side: VehicleSide) -> int:
@@ -215,20 +216,20 @@ def _rejected(side: VehicleSide) -> int:
 def vehicle_at_rest(seed: int) -> Target:
     """Make a target for a vehicle without an operator: it brakes and is never armed by strangers."""
     side = VehicleSide(seed)
-    given = {"control": 0, "session": 0}
+    delivered = {"control": 0, "session": 0}
 
     def feed(channel: str, data: bytes, _chance: Chance) -> None:
-        given[channel] += 1
+        delivered[channel] += 1
         side.bench.advance(STEP_NS)
-        if sum(given.values()) % 33 == 0:
-            side.picture()
+        if sum(delivered.values()) % 33 == 0:
+            side.write_frame()
         _feed(side, channel, data)
         expect(side.gate.state in ("disarmed", "emergency_stop"), f"a stranger caused {side.gate.state}")
         requested = side.vehicle.requested
         expect((requested.throttle, requested.brake) == (0.0, 1.0), "the vehicle does not brake")
 
     def finish() -> str:
-        _check_counts(side, given)
+        _check_counts(side, delivered)
         return f"ended {side.gate.state}"
 
     return Target({"control": side.control, "session": side.session}, feed, lambda: _rejected(side), finish)
@@ -238,21 +239,22 @@ def vehicle_driven(seed: int) -> Target:
     """Make a target for a driven vehicle: no command of a stranger, nor a replayed one, is accepted.
 
     Anybody may stop the vehicle. Without signatures anybody may also take control of it after an emergency stop and
-    clear the stop; the operator then takes control again and arms it. Most emergency-stop numbers are old ones here.
+    clear the stop. The operator then takes control again and arms the vehicle. So that this happens seldom, the number
+    of the first emergency stop is so large that those of most later ones count as old.
     """
     side = VehicleSide(seed)
-    side.ask("acquire")
-    side.ask("emergency_stop", LARGEST_STORED_NUMBER)
+    side.request("acquire")
+    side.request("emergency_stop", LARGEST_STORED_NUMBER)
     side.arm()
-    inputs = driven = 0
+    inputs = inputs_while_driving = 0
 
     def feed(channel: str, data: bytes, _chance: Chance) -> None:
-        nonlocal inputs, driven
+        nonlocal inputs, inputs_while_driving
         inputs += 1
         if side.gate.state != "driving" and inputs % 500 == 0:
             side.arm()
         before, active_operator = side.gate.state, side.gate.session.active_operator
-        driven += before == "driving"
+        inputs_while_driving += before == "driving"
         _feed(side, channel, data)
         is_taken_over = (
             before == "emergency_stop"
@@ -264,7 +266,7 @@ def vehicle_driven(seed: int) -> Target:
         keeps_control = side.gate.session.active_operator == active_operator or before != "driving"
         expect(keeps_control, "a stranger took control of a driven vehicle")
         side.bench.advance(STEP_NS)
-        if inputs % OPERATOR_INTERVAL == 0 and side.gate.state == "driving":
+        if inputs % INPUTS_PER_COMMAND == 0 and side.gate.state == "driving":
             side.send_command()
             expect(side.vehicle.requested.throttle > 0, f"the operator's command was rejected: {side.gate.rejected}")
 
@@ -272,7 +274,7 @@ def vehicle_driven(seed: int) -> Target:
         {"control": side.control, "session": side.session},
         feed,
         lambda: _rejected(side),
-        lambda: f"{driven / inputs:.0%} while driving",
+        lambda: f"{inputs_while_driving / inputs:.0%} of the inputs while driving",
     )
 
 
@@ -312,7 +314,7 @@ def condition_at_vehicle(seed: int) -> Target:  # noqa: ARG001 (it uses no rando
 
     def finish() -> str:
         answered = rejected() + node.counts["netem granted"]
-        expect(answered == inputs, f"{inputs} queries were given, {answered} counted")
+        expect(answered == inputs, f"{inputs} queries were delivered, {answered} counted")
         return f"{node.counts['netem granted']} granted"
 
     return Target({"netem": corpus}, feed, rejected, finish)

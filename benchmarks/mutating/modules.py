@@ -101,7 +101,7 @@ MODULES: Final[dict[str, tuple[str, ...]]] = {
     f"{_DBW}/traffic.py": (f"{_DBW}/test_traffic.py",),
     f"{_DBW}/vehicle.py": (f"{_DBW}/test_vehicle.py", *_ADAPTER, "assembly/test_assembly_by_wire.py"),
 }
-"""Path below `src/lavt` to paths below `tests`, the most specific ones first."""
+"""The test files of each module, the most specific ones first; paths are below `src/lavt` and `tests`."""
 
 AREAS: Final[dict[str, tuple[str, ...]]] = {
     "safety": ("safety", "nodes", "test_life_of_a_frame.py"),
@@ -113,10 +113,10 @@ AREAS: Final[dict[str, tuple[str, ...]]] = {
         "experiment/report",
         "experiment/runs/test_join.py",
         "experiment/runs/test_plan.py",
-    ),  # the tests that analyse records; the others drive
+    ),  # these tests analyse records; the others make drives
     _DBW: (_DBW, "assembly/test_assembly_by_wire.py"),
 }
-"""Folder of a module to the wider tests, which run if the module's own tests pass."""
+"""The tests of each folder of modules, which run if the tests of the mutated module pass; paths are below `tests`."""
 
 
 def own_tests(module: str) -> tuple[str, ...]:

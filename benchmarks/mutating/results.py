@@ -16,7 +16,7 @@ from lavt.errors import UserError
 
 ACCEPTED_FILE: Final = Path(__file__).with_name("accepted.toml")
 KEYS: Final = ("module", "function", "line", "mutated")
-_KINDS: Final[dict[str, type | tuple[type, ...]]] = {
+_FIELD_TYPES: Final[dict[str, type | tuple[type, ...]]] = {
     "module": str,
     "function": str,
     "line": str,
@@ -46,7 +46,7 @@ class Result:
     operator: str
     caught: bool
     by: str
-    """The first test that failed, `timeout`, or pytest's exit status; empty if nothing caught it."""
+    """The first test that failed, `timeout`, or pytest's exit status; empty if no test caught the mutant."""
     took_s: float
 
     @property
@@ -61,7 +61,7 @@ class Result:
 
 
 def make_result(mutation: Mutation, by: str, took_s: float) -> Result:
-    """Return the result of a mutation; an empty `by` means that nothing caught it."""
+    """Return the result of a mutation; `by` is empty if no test caught it."""
     return Result(
         *mutation.key, mutation.line_number, mutation.operator, caught=bool(by), by=by, took_s=round(took_s, 2)
     )
@@ -79,7 +79,9 @@ def read_results(path: Path) -> dict[tuple[str, str, str, str, int], Result]:
     for number, line in enumerate(path.read_text().splitlines() if path.exists() else (), start=1):
         try:
             fields = json.loads(line)
-            if set(fields) != set(_KINDS) or not all(isinstance(fields[name], _KINDS[name]) for name in _KINDS):
+            if set(fields) != set(_FIELD_TYPES) or not all(
+                isinstance(fields[name], _FIELD_TYPES[name]) for name in _FIELD_TYPES
+            ):
                 raise ValueError
         except (ValueError, TypeError):
             raise UserError(f"{path}, line {number}: not a result of this program; choose another --out") from None
@@ -101,8 +103,8 @@ def load_accepted(path: Path, sites: Mapping[str, Iterable[Site]]) -> dict[Place
     """
     places = {
         (mutation.module, mutation.function, mutation.line, mutation.mutated)
-        for of_module in sites.values()
-        for site in of_module
+        for module_sites in sites.values()
+        for site in module_sites
         for mutation in site
     }
     accepted: dict[Place, str] = {}
@@ -124,21 +126,25 @@ def load_accepted(path: Path, sites: Mapping[str, Iterable[Site]]) -> dict[Place
 
 def report(results: Collection[Result], accepted: Mapping[Place, str]) -> str:
     """Return the survivors line by line, and a table of the modules."""
-    survivors = sorted((each for each in results if not each.caught), key=lambda each: (each.module, each.line_number))
-    new = [each for each in survivors if each.place not in accepted]
-    already_accepted = [each for each in survivors if each.place in accepted]
-    lines = [f"survived: {describe(each)}" for each in new]
-    lines += [f"accepted: {describe(each)}: {accepted[each.place]}" for each in already_accepted]
+    survivors = sorted(
+        (result for result in results if not result.caught), key=lambda result: (result.module, result.line_number)
+    )
+    new_survivors = [result for result in survivors if result.place not in accepted]
+    accepted_survivors = [result for result in survivors if result.place in accepted]
+    lines = [f"survived: {describe(result)}" for result in new_survivors]
+    lines += [f"accepted: {describe(result)}: {accepted[result.place]}" for result in accepted_survivors]
     lines += ["", "| module | mutants | caught | survived | accepted |", "|---|---|---|---|---|"]
-    for module in (*sorted({each.module for each in results}), ""):
+    for module in (*sorted({result.module for result in results}), ""):
         mutants, survived, accepted_count = (
-            sum(module in (each.module, "") for each in some) for some in (results, new, already_accepted)
+            sum(module in (result.module, "") for result in counted_results)
+            for counted_results in (results, new_survivors, accepted_survivors)
         )
         lines.append(
             f"| {module or 'all'} | {mutants} | {mutants - survived - accepted_count} | {survived} | {accepted_count} |"
         )
-    counted = len(results) - len(already_accepted)
+    counted = len(results) - len(accepted_survivors)
     if counted:
-        share = (counted - len(new)) / counted
-        lines += ["", f"caught: {counted - len(new)} of {counted} mutants that are not accepted, {share:.1%}"]
+        caught = counted - len(new_survivors)
+        share = caught / counted
+        lines += ["", f"caught: {caught} of {counted} mutants that are not accepted, {share:.1%}"]
     return "\n".join(lines)

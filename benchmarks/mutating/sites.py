@@ -95,7 +95,7 @@ def find_sites(module: str, source: str) -> list[Site]:
     """Return the sites of a module in the order of its text."""
     finder = _Finder(source)
     finder.visit(ast.parse(source))
-    seen: Counter[tuple[str, str, str]] = Counter()
+    occurrences: Counter[tuple[str, str, str]] = Counter()
     sites = []
     for begin, end, operator, function, replacements in sorted(finder.sites):
         number = source.count("\n", 0, begin) + 1
@@ -104,8 +104,8 @@ def find_sites(module: str, source: str) -> list[Site]:
         mutations = []
         for text in replacements:
             mutated = replace_text(source[first:last], begin - first, end - first, text).partition("\n")[0].strip()
-            occurrence = seen[function, line, mutated]
-            seen[function, line, mutated] += 1
+            occurrence = occurrences[function, line, mutated]
+            occurrences[function, line, mutated] += 1
             mutations.append(Mutation(module, function, number, operator, line, mutated, occurrence, begin, end, text))
         sites.append(tuple(mutations))
     return sites
@@ -118,11 +118,11 @@ class _Finder(ast.NodeVisitor):
         self.sites: list[tuple[int, int, str, str, tuple[str, ...]]] = []
         self._source = source
         self._lines = source.split("\n")
-        self._starts = [0]
+        self._line_offsets = [0]
         for line in self._lines:
-            self._starts.append(self._starts[-1] + len(line) + 1)
+            self._line_offsets.append(self._line_offsets[-1] + len(line) + 1)
         self._tokens = [
-            (self._starts[token.start[0] - 1] + token.start[1], token.string)
+            (self._line_offsets[token.start[0] - 1] + token.start[1], token.string)
             for token in tokenize.generate_tokens(io.StringIO(source).readline)
             if token.type in (tokenize.OP, tokenize.NAME) and token.string not in ("(", ")")
         ]
@@ -133,13 +133,13 @@ class _Finder(ast.NodeVisitor):
         self.sites.append((begin, end, operator, ".".join(self._names), replacements))
 
     def _offsets(self, node: ast.expr | ast.stmt) -> tuple[int, int]:
-        """Return the offsets of a node in characters, where `ast` counts bytes of UTF-8."""
+        """Return the offsets of a node in characters; `ast` gives columns in bytes of UTF-8."""
         assert node.end_lineno is not None
         assert node.end_col_offset is not None
         return self._offset(node.lineno, node.col_offset), self._offset(node.end_lineno, node.end_col_offset)
 
     def _offset(self, line_number: int, column_bytes: int) -> int:
-        return self._starts[line_number - 1] + len(self._lines[line_number - 1].encode()[:column_bytes].decode())
+        return self._line_offsets[line_number - 1] + len(self._lines[line_number - 1].encode()[:column_bytes].decode())
 
     def _between(self, before: ast.expr, after: ast.expr) -> tuple[int, int]:
         """Return the offsets of the operator between two operands."""
@@ -201,7 +201,7 @@ class _Finder(ast.NodeVisitor):
         self.generic_visit(node)
 
     def _condition(self, test: ast.expr) -> None:
-        """Add `not`, unless another operator makes the same mutation."""
+        """Add a `not` around a condition, unless another operator makes the same mutation."""
         negated = isinstance(test, ast.UnaryOp) and isinstance(test.op, ast.Not)
         compared = isinstance(test, ast.Compare) and len(test.ops) == 1 and isinstance(test.ops[0], NEGATED_BY_OPERATOR)
         if not (negated or compared or isinstance(test, ast.Constant)):
@@ -246,10 +246,14 @@ class _Finder(ast.NodeVisitor):
         if isinstance(node.value, bool):
             self._add(*self._offsets(node), "boolean", str(not node.value))
         elif isinstance(node.value, (int, float)):
-            others = dict.fromkeys((node.value + 1, node.value * 2))
-            others.pop(node.value, None)
+            other_numbers = dict.fromkeys((node.value + 1, node.value * 2))
+            other_numbers.pop(node.value, None)
             in_hex = self._text(node).lower().startswith("0x")
-            self._add(*self._offsets(node), "number", *(f"{other:#x}" if in_hex else repr(other) for other in others))
+            self._add(
+                *self._offsets(node),
+                "number",
+                *(f"{number:#x}" if in_hex else repr(number) for number in other_numbers),
+            )
 
     def visit_Call(self, node: ast.Call) -> None:
         """Swap `min` and `max`; skip log calls and the types of casts."""
@@ -285,23 +289,23 @@ class _Finder(ast.NodeVisitor):
             self.visit(node.value)
 
     def _statement(self, node: ast.stmt) -> None:
-        """Remove a statement of a function; without statements of a module or class nothing would run."""
+        """Remove a statement of a function; modules and classes would not work without any of theirs."""
         if self._in_function[-1]:
             self._add(*self._offsets(node), "statement", "pass")
 
     def visit_Return(self, node: ast.Return) -> None:
-        """Return None instead; False is already flipped."""
+        """Replace the returned value by None; False is left to the operator for booleans."""
         if node.value is not None:
             if not (isinstance(node.value, ast.Constant) and (node.value.value is None or node.value.value is False)):
                 self._add(*self._offsets(node.value), "return value", "None")
             self.visit(node.value)
 
     def visit_Break(self, node: ast.Break) -> None:
-        """Continue instead."""
+        """Replace `break` by `continue`."""
         self._add(*self._offsets(node), "break/continue", "continue")
 
     def visit_Continue(self, node: ast.Continue) -> None:
-        """Break instead."""
+        """Replace `continue` by `break`."""
         self._add(*self._offsets(node), "break/continue", "break")
 
 

@@ -22,7 +22,7 @@ from lavt.clock import MachineClock
 from lavt.domain import NS_PER_S
 
 COPIED: Final = ("src", "tests", "benchmarks")
-"""The rest is linked, because tests only read it."""
+"""The other files of the repository are linked, because tests only read them."""
 EXCLUDED: Final = (
     ".git",
     ".hypothesis",
@@ -50,6 +50,7 @@ OPTIONS: Final = (
     "--basetemp=temporary",
 )
 ENDLESS: Final = "timeout"
+"""The result of a mutant whose tests exceed the time limit."""
 _CLOCK = MachineClock()
 
 
@@ -80,7 +81,7 @@ class WorkTree:
         return self.directory / SOURCES / module
 
     def run(self, tests: Sequence[str], limit_s: float, *, unchanged: bool = False) -> Trial:
-        """Run the tests on the tree; an `unchanged` tree keeps the compiled files for later runs."""
+        """Run the tests on the tree; the compiled files of an `unchanged` tree are kept for later runs."""
         with (self.directory / "output.txt").open("w+") as output:
             begin_ns = _CLOCK.now().mono_ns
             process = subprocess.Popen(
@@ -111,7 +112,8 @@ class WorkTree:
         path = self.source(mutation.module)
         source = path.read_text()
         cached = path.parent / "__pycache__" / f"{path.stem}.{sys.implementation.cache_tag}.pyc"
-        cached.unlink(missing_ok=True)  # a file of the same length and second would count as compiled from this source
+        # Without this, a mutant of the same length that is written in the same second would not be compiled again.
+        cached.unlink(missing_ok=True)
         try:
             path.write_text(mutation.apply_to(source))
             return self.run(tests, limit_s)

@@ -1,1 +1,1 @@
-"""The processes of `control_round_trip.py`: who asks, who echoes, and what carries a message between them."""
+"""The processes of `control_round_trip.py`, and the carriers of messages between them."""

@@ -1,7 +1,8 @@
-"""What carries a message to another process and back: raw UDP, Zenoh through routers, pyzmq, CycloneDDS.
+"""The carriers of messages to another process and back: raw UDP, Zenoh through routers, pyzmq, CycloneDDS.
 
-Each carrier has two ends. The echo's end tells an address, with which the asker's end is made. pyzmq and CycloneDDS are
-imported only where they are asked for: LAVT does not need them.
+Each carrier has two ends: one in the process that echoes and one in the process that asks. The echoing end is created
+first, with an empty address; its own `address` is then passed to the asking end. pyzmq and CycloneDDS are imported only
+when they are used, because LAVT does not need them.
 """
 
 from __future__ import annotations
@@ -23,39 +24,39 @@ import zenoh
 from lavt.config_file import shipped
 from lavt.transport.zenoh_link import CONTROL, RECEIVE_RING_LENGTH
 
-LONGEST_BYTES: Final = 65_507
+MAX_DATAGRAM_BYTES: Final = 65_507
 LOOPBACK: Final = "127.0.0.1"
 Routers = tuple[str, str]
-"""Endpoints of the vehicle's and of the operator's: the echo is at the first one, the asker at the second."""
+"""Endpoints of the vehicle's router, to which the echoing end connects, and of the operator's, for the asking end."""
 DDS_CONFIG: Final = (
     "<CycloneDDS><Domain><General><Interfaces><NetworkInterface name='lo' multicast='false'/></Interfaces>"
     "<AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex>"
     f"<Peers><Peer address='{LOOPBACK}'/></Peers></Discovery></Domain></CycloneDDS>"
 )
-"""The loopback, and nobody else."""
+"""Only this machine: without multicast, on the loopback."""
 
 
-class End(Protocol):
+class CarrierEnd(Protocol):
     """One end of a carrier."""
 
     address: str
-    """What the other end needs to know."""
+    """The address that the other end needs."""
 
     def send(self, data: bytes) -> None:
         """Send a message."""
         ...
 
     def receive(self, timeout_s: float) -> bytes | None:
-        """Wait for the next message; None where none comes."""
+        """Wait for the next message; return None if none arrives in time."""
         ...
 
     def close(self) -> None:
-        """Leave."""
+        """Close the end."""
         ...
 
 
-class Udp:
-    """A UDP socket; it answers whoever sent last."""
+class UdpCarrier:
+    """A UDP socket, which sends to the address that it last received from."""
 
     def __init__(self, address: str, _routers: Routers) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -72,7 +73,7 @@ class Udp:
         """Wait for a datagram."""
         self._socket.settimeout(timeout_s)
         try:
-            data, self._peer = self._socket.recvfrom(LONGEST_BYTES)
+            data, self._peer = self._socket.recvfrom(MAX_DATAGRAM_BYTES)
         except TimeoutError:
             return None
         return data
@@ -82,48 +83,48 @@ class Udp:
         self._socket.close()
 
 
-class Zenoh:
-    """A session at a router of its own, as each side of LAVT has it, with the quality of service of commands."""
+class ZenohCarrier:
+    """A session at the router of its own side, as in LAVT, with the quality of service of commands."""
 
     def __init__(self, address: str, routers: Routers) -> None:
-        asks = address != ""
+        is_asking = address != ""
         config = zenoh.Config.from_file(str(shipped("zenoh-configs/session.json5")))
-        config.insert_json5("connect/endpoints", json.dumps([routers[asks]]))
+        config.insert_json5("connect/endpoints", json.dumps([routers[is_asking]]))
         self.address = "zenoh"
         self._session = zenoh.open(config)
-        self._heard: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-        said, heard = ("ask", "echo") if asks else ("echo", "ask")
+        self._received: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        sent_key, received_key = ("ask", "echo") if is_asking else ("echo", "ask")
         qos: dict[str, Any] = CONTROL
-        self._publisher = self._session.declare_publisher(f"lavt/round-trip/{said}", **qos)
+        self._publisher = self._session.declare_publisher(f"lavt/round-trip/{sent_key}", **qos)
         ring: Any = zenoh.handlers.RingChannel(RECEIVE_RING_LENGTH)
-        self._subscriber = self._session.declare_subscriber(f"lavt/round-trip/{heard}", ring)
+        self._subscriber = self._session.declare_subscriber(f"lavt/round-trip/{received_key}", ring)
         self._listener = threading.Thread(target=self._listen, daemon=True)
         self._listener.start()
 
     def _listen(self) -> None:
-        arriving = self._subscriber.handler
-        with suppress(zenoh.ZError):  # undeclared
+        samples = self._subscriber.handler
+        with suppress(zenoh.ZError):  # raised when the subscriber is undeclared
             while True:
-                self._heard.put(arriving.recv().payload.to_bytes())
+                self._received.put(samples.recv().payload.to_bytes())
 
     def send(self, data: bytes) -> None:
-        """Publish."""
+        """Publish a message."""
         self._publisher.put(data)
 
     def receive(self, timeout_s: float) -> bytes | None:
-        """Wait for what the thread that listens has put here, as a node does."""
+        """Wait for a message from the listening thread, as a node does."""
         with suppress(queue.Empty):
-            return self._heard.get(timeout=timeout_s)
+            return self._received.get(timeout=timeout_s)
         return None
 
     def close(self) -> None:
-        """Undeclare and close: without it the process would not end."""
+        """Undeclare the subscriber and close the session; otherwise the process would not end."""
         self._subscriber.undeclare()
         self._listener.join()
         self._session.close()
 
 
-class Pyzmq:
+class PyzmqCarrier:
     """Two pairs of PUB and SUB over TCP, without a broker."""
 
     def __init__(self, address: str, _routers: Routers) -> None:
@@ -131,19 +132,19 @@ class Pyzmq:
         self._context = zmq.Context()
         self._out, self._in = self._context.socket(zmq.PUB), self._context.socket(zmq.SUB)
         self._in.setsockopt(zmq.SUBSCRIBE, b"")
-        for each in (self._out, self._in):
-            each.setsockopt(zmq.LINGER, 0)
+        for zmq_socket in (self._out, self._in):
+            zmq_socket.setsockopt(zmq.LINGER, 0)
         self.address = address
         if address:
             to_port, from_port = json.loads(address)
             self._out.connect(f"tcp://{LOOPBACK}:{to_port}")
             self._in.connect(f"tcp://{LOOPBACK}:{from_port}")
         else:
-            ports = [each.bind_to_random_port(f"tcp://{LOOPBACK}") for each in (self._in, self._out)]
+            ports = [zmq_socket.bind_to_random_port(f"tcp://{LOOPBACK}") for zmq_socket in (self._in, self._out)]
             self.address = json.dumps(ports)
 
     def send(self, data: bytes) -> None:
-        """Publish."""
+        """Publish a message."""
         self._out.send(data)
 
     def receive(self, timeout_s: float) -> bytes | None:
@@ -158,11 +159,11 @@ class Pyzmq:
         self._context.destroy()
 
 
-class Dds:
-    """A writer and a reader of CycloneDDS, best effort, that keep the last sample."""
+class DdsCarrier:
+    """A writer and a reader of CycloneDDS, with best effort and a history of one sample."""
 
     def __init__(self, address: str, _routers: Routers) -> None:
-        os.environ["CYCLONEDDS_URI"] = DDS_CONFIG  # it is read when the first participant is made
+        os.environ["CYCLONEDDS_URI"] = DDS_CONFIG  # read when the first participant is created
         core, domain, idl, publish, subscribe, topics, types = (
             importlib.import_module(f"cyclonedds.{name}")
             for name in ("core", "domain", "idl", "pub", "sub", "topic", "idl.types")
@@ -173,14 +174,14 @@ class Dds:
         qos = core.Qos(core.Policy.Reliability.BestEffort, core.Policy.History.KeepLast(1))
         self.address = "dds"
         participant = domain.DomainParticipant()
-        said, heard = ("ask", "echo") if address else ("echo", "ask")
-        out, into = (topics.Topic(participant, f"lavt_round_trip_{each}", self._sample) for each in (said, heard))
-        self._writer = publish.DataWriter(participant, out, qos=qos)
-        self._reader = subscribe.DataReader(participant, into, qos=qos)
-        self._waits = core.WaitSet(participant)
+        names = ("ask", "echo") if address else ("echo", "ask")
+        sent, received = (topics.Topic(participant, f"lavt_round_trip_{name}", self._sample) for name in names)
+        self._writer = publish.DataWriter(participant, sent, qos=qos)
+        self._reader = subscribe.DataReader(participant, received, qos=qos)
+        self._wait_set = core.WaitSet(participant)
         anything = core.SampleState.Any | core.ViewState.Any | core.InstanceState.Alive
-        self._waits.attach(core.ReadCondition(self._reader, anything))
-        self._kept = (participant, out, into)
+        self._wait_set.attach(core.ReadCondition(self._reader, anything))
+        self._keep_alive = (participant, sent, received)
 
     def send(self, data: bytes) -> None:
         """Write a sample."""
@@ -188,7 +189,7 @@ class Dds:
 
     def receive(self, timeout_s: float) -> bytes | None:
         """Wait for a sample."""
-        if not self._waits.wait(round(timeout_s * 1e9)):
+        if not self._wait_set.wait(round(timeout_s * 1e9)):
             return None
         for sample in self._reader.take(1):
             if hasattr(sample, "data"):
@@ -196,28 +197,29 @@ class Dds:
         return None
 
     def close(self) -> None:
-        """Nothing to do: it ends with the process."""
+        """Do nothing: the participant ends with the process."""
 
 
 @dataclass(frozen=True)
 class Carrier:
     """A carrier in the table of results."""
 
-    words: str
-    end: Callable[[str, Routers], End]
+    label: str
+    end: Callable[[str, Routers], CarrierEnd]
     module: str = ""
-    """What has to be installed for it."""
+    """The module that it needs besides LAVT's dependencies; empty if none."""
     package: str = ""
+    """The package that has the module."""
 
     @property
     def missing(self) -> bool:
-        """Whether it cannot be measured here."""
+        """Whether its module is not installed."""
         return self.module != "" and find_spec(self.module) is None
 
 
 CARRIERS: Final[dict[str, Carrier]] = {
-    "udp": Carrier("raw UDP sockets", Udp),
-    "zenoh": Carrier("Zenoh through two routers, as LAVT has it", Zenoh),
-    "pyzmq": Carrier("pyzmq, PUB and SUB, no broker", Pyzmq, "zmq", "pyzmq"),
-    "cyclonedds": Carrier("CycloneDDS, best effort, no broker", Dds, "cyclonedds", "cyclonedds"),
+    "udp": Carrier("raw UDP sockets", UdpCarrier),
+    "zenoh": Carrier("Zenoh through two routers, as in LAVT", ZenohCarrier),
+    "pyzmq": Carrier("pyzmq, PUB and SUB, no broker", PyzmqCarrier, "zmq", "pyzmq"),
+    "cyclonedds": Carrier("CycloneDDS, best effort, no broker", DdsCarrier, "cyclonedds", "cyclonedds"),
 }

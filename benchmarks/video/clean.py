@@ -1,4 +1,4 @@
-"""The clean-link part: both sides in turns on loopback, with the latency of the codec alone in between."""
+"""The part on a clean link: both sides in turns on the loopback, and between them the latency of the codec alone."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from statistics import median
 from benchmarks.video.run import Run
 from benchmarks.video.sides import RunOutcome, Side, frames_of, measure, measure_floor_ms
 
-FLOOR_S = 6.0
-USUAL_JITTER_MS = 200
+MAX_FLOOR_RUN_S = 6.0
+USUAL_JITTER_BUFFER_MS = 200
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ SIZES = (Size("480p", 640, 480, 2_000_000), Size("720p", 1280, 720, 4_000_000))
 
 @dataclass(frozen=True)
 class ComparisonPair:
-    """Ours, tuned GStreamer and the codec's floor, measured one after the other."""
+    """A run of LAVT, a run of tuned GStreamer, and the codec's floor, measured one after the other."""
 
     ours: RunOutcome
     tuned: RunOutcome
@@ -48,7 +48,7 @@ class ComparisonPair:
 
     @property
     def cpu_ratio(self) -> float:
-        """Our CPU time for a frame divided by GStreamer's."""
+        """Our CPU time per frame divided by GStreamer's."""
         return self.ours.cpu_ms / self.tuned.cpu_ms
 
     @property
@@ -66,23 +66,23 @@ def measure_pairs(run: Run, pairs: int) -> Iterator[ComparisonPair]:
     """Yield `pairs` measured pairs; every second one begins with GStreamer."""
     for number in range(pairs):
         sides: tuple[Side, Side] = ("ours", "gstreamer") if number % 2 == 0 else ("gstreamer", "ours")
-        first, floor, second = measure(sides[0], run), _measure_floor_ms(run), measure(sides[1], run)
+        first, floor_ms, second = measure(sides[0], run), _measure_floor_ms(run), measure(sides[1], run)
         ours, tuned = (first, second) if sides[0] == "ours" else (second, first)
-        pair = ComparisonPair(ours, tuned, floor)
+        pair = ComparisonPair(ours, tuned, floor_ms)
         print(
-            f"  pair {number + 1}: ours {ours.median_ms:.2f}, GStreamer {tuned.median_ms:.2f}, floor {floor:.2f} ms",
+            f"  pair {number + 1}: ours {ours.median_ms:.2f}, GStreamer {tuned.median_ms:.2f}, floor {floor_ms:.2f} ms",
             file=sys.stderr,
         )
         yield pair
 
 
 def _measure_floor_ms(run: Run) -> float:
-    return measure_floor_ms(replace(run, frames=min(run.frames, frames_of(FLOOR_S))))
+    return measure_floor_ms(replace(run, frames=min(run.frames, frames_of(MAX_FLOOR_RUN_S))))
 
 
 def measure_usual(run: Run) -> RunOutcome:
-    """Measure GStreamer's usual configuration: a tuned encoder, but a jitter buffer and pictures shown when due."""
-    return measure("gstreamer", replace(run, jitter_ms=USUAL_JITTER_MS, synchronous=True))
+    """Measure GStreamer as usually configured: with a jitter buffer, and each picture shown when it is due."""
+    return measure("gstreamer", replace(run, jitter_ms=USUAL_JITTER_BUFFER_MS, synchronous=True))
 
 
 def format_row(name: str, outcome: RunOutcome) -> str:

@@ -26,7 +26,7 @@ ELEMENTS = (
     "udpsink",
 )
 BUFFER_BYTES = 4 * 1024 * 1024
-"""Buffer of the receiving socket, as large as ours."""
+"""The size of the receiving socket's buffer, which is that of LAVT's socket."""
 
 
 def load_gstreamer() -> Any:

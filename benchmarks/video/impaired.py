@@ -1,4 +1,4 @@
-"""The impaired-link part: shares of shown and damaged frames on a link that delays, reorders and loses packets."""
+"""The part on an impaired link, which delays, reorders and loses packets: shares of shown and of damaged frames."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ CASES = (
     LinkCase("burst5", loss=0.05, burst_packets=3),
 )
 GSTREAMER_JITTER_MS = {"reorder": (30,), "loss1": (0, 30), "loss5": (0, 30), "burst1": (30,), "burst5": (30,)}
-"""GStreamer's jitter buffers; the best result counts."""
+"""The lengths of GStreamer's jitter buffer that are measured in each case; the best result counts."""
 DAMAGED_DB = 2.0
-"""A picture whose PSNR is lower than the loss-free one by more than this is damaged."""
+"""A picture is damaged if its PSNR is lower than that of the loss-free picture by more than this."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class AssessedRun:
 
     outcome: RunOutcome
     undamaged: float
-    """Share of the frames that were shown with at most 2 dB below the loss-free decode."""
+    """Share of the frames that were shown undamaged."""
 
     @property
     def overhead(self) -> float:
@@ -76,7 +76,10 @@ def loss_free_errors(run: Run) -> list[float]:
 
 
 def undamaged_share(received: dict[int, float], loss_free: Sequence[float]) -> float:
-    """Return the share of frames after the warm-up that were received undamaged; arguments are errors by frame."""
+    """Return the share of frames after the warm-up that were received undamaged.
+
+    The arguments are the mean squared errors of the received and of the loss-free pictures, by frame.
+    """
     good = sum(
         frame in received and psnr_db(received[frame]) >= psnr_db(loss_free[frame]) - DAMAGED_DB
         for frame in range(WARM_UP_FRAMES, len(loss_free))
@@ -106,7 +109,7 @@ def run_impaired_part(folder: Path, case: LinkCase, *, frames: int) -> dict[str,
     return {
         "undamaged": round(ours.undamaged, 4),
         "overhead": round(ours.overhead, 4),
-        "gstreamer_undamaged": round(max(each.undamaged for each in gstreamer), 4),
+        "gstreamer_undamaged": round(max(assessed.undamaged for assessed in gstreamer), 4),
     }
 
 

@@ -1,4 +1,4 @@
-"""The log of received pictures that the receiving process of either side writes."""
+"""The log of received pictures, which the receiving processes of both sides write."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The pictures that both sides send: a seamless loop of the simulator's pictures, in files mapped into memory."""
+"""The pictures that both programs send: a seamless loop of the simulator's pictures, in files mapped into memory."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lavt.vehicle.sim.rendering.renderer import Renderer
 from lavt.vehicle.sim.road.road import load_road
 
 LOOP_FRAMES = 300
-FRAME_M = 8.33 / 30
+METRES_PER_FRAME = 8.33 / 30
 FROM_M = 175.0
 ROUTE = "b"
 
@@ -23,14 +23,14 @@ Planes = NDArray[np.uint8]
 
 
 def render_loop(stem: Path, width_px: int, height_px: int) -> None:
-    """Write a drive at 30 km/h, forward and then back, as STEM.npy; every picture has its own noise."""
+    """Write the pictures of a drive at 30 km/h, forward and then back, to STEM.npy; each picture has its own noise."""
     road = load_road(ROUTE)
     renderer = Renderer(road, CameraModel(width_px, height_px), seed=1, scenery="full")
     shape = (LOOP_FRAMES, height_px * 3 // 2, width_px)
     planes = np.lib.format.open_memmap(stem.with_suffix(".npy"), "w+", np.uint8, shape)
     for number in range(LOOP_FRAMES):
         step = min(number, LOOP_FRAMES - number)
-        x_m, y_m, heading_rad, _ = (float(each) for each in road.point(FROM_M + step * FRAME_M))
+        x_m, y_m, heading_rad, _ = (float(value) for value in road.centre_at(FROM_M + step * METRES_PER_FRAME))
         picture = renderer.render(Pose(0, x_m, y_m, heading_rad), number)
         cv2.cvtColor(picture, cv2.COLOR_BGR2YUV_I420, dst=planes[number])
 

@@ -1,4 +1,4 @@
-"""Our two sides as `lavt server` and `lavt client` build them, without the parts that do not concern the video."""
+"""LAVT's server and client as its commands build them, without the parts that do not concern the video."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ LOOPBACK = "127.0.0.1"
 
 
 class LoopCamera:
-    """A camera that copies the loop's pictures into its own buffer, in I420, as the other side does."""
+    """A camera that copies the loop's pictures into its own buffer, in I420, as GStreamer's sender does."""
 
     rate_hz = float(RATE_HZ)
     phase_ns = 0

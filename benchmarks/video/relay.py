@@ -1,7 +1,7 @@
 """The impaired link between the two processes of a run: it delays every datagram and loses some.
 
-Delay and loss of the sender's packets depend on the packet's number, so that both sides meet the same impairment.
-Datagrams of the reverse direction get the constant delay; datagrams of the path validation are not lost.
+Delay and loss of the sender's packets depend on the packet's number, so that LAVT and GStreamer get the same
+impairment. Datagrams of the reverse direction get only the constant delay, and so do those of the path validation.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from lavt.transport.emulation.random_process import Draws, LossProcess
 
 ONE_WAY_MS = 20
 BUFFER_BYTES = 4 * 1024 * 1024
-LONGEST_DATAGRAM = 65_535
+MAX_DATAGRAM_BYTES = 65_535
 SEED = 6
 MEDIA, REPAIR = 96, 97
 """Payload types of RTP."""
@@ -45,7 +45,7 @@ class LinkCase:
     """A further delay, uniform from 0 to this, independent for each packet, so that packets are reordered."""
     loss: float = 0.0
     burst_packets: float = 0.0
-    """Mean length of a burst; 0: packets are lost independently."""
+    """Mean number of packets in a burst of losses; 0 if packets are lost independently."""
 
     def to_json(self) -> str:
         """Return the case as JSON for the relay's command line."""
@@ -63,7 +63,7 @@ class PacketImpairment:
         self._number = 0
 
     def next_delay_ns(self) -> int | None:
-        """Return the further delay of the next packet; None: it is lost."""
+        """Return the further delay of the next packet, or None if it is lost."""
         number = self._number
         self._number += 1
         lost = self._losses.is_lost(number)
@@ -76,7 +76,7 @@ class TrafficCounter:
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
         self.late_ms: list[float] = []
-        """How much later than due each datagram left: an error of this machine, not the impairment."""
+        """For each datagram, how much later than due it was forwarded: an error of this machine, not the impairment."""
         self._frames = 0
 
     def note(self, datagram: bytes, *, lost: bool) -> None:
@@ -94,7 +94,10 @@ class TrafficCounter:
 def relay(
     near: socket.socket, far: socket.socket, far_peer: Address, case: LinkCase, *, near_sends: bool
 ) -> TrafficCounter:
-    """Relay datagrams between the peer that sends to `near` and `far_peer` until a line arrives on stdin."""
+    """Relay datagrams between `far_peer` and the peer that sends to `near` until a line arrives on stdin.
+
+    With `near_sends` the video comes from the near peer, otherwise from the far one.
+    """
     impairment, traffic = PacketImpairment(case), TrafficCounter()
     waiting: list[tuple[int, int, bytes, socket.socket, Address]] = []
     near_peer: Address | None = None
@@ -107,7 +110,7 @@ def relay(
         for receiver in (near, far):
             if receiver not in ready:
                 continue
-            datagram, address = receiver.recvfrom(LONGEST_DATAGRAM)
+            datagram, address = receiver.recvfrom(MAX_DATAGRAM_BYTES)
             due_ns = time.monotonic_ns() + ONE_WAY_MS * NS_PER_MS
             near_peer = address if receiver is near else near_peer
             if (receiver is near) is near_sends and datagram[0] >> 6 == 2:
@@ -130,9 +133,9 @@ def main() -> None:
     """Relay until a line arrives on stdin, then print the counters."""
     run, side, case = requested_run(), sys.argv[2], LinkCase(**json.loads(sys.argv[3]))
     near, far = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
-    for each in (near, far):
-        each.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
-        each.bind(("127.0.0.1", 0))
+    for endpoint in (near, far):
+        endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
+        endpoint.bind(("127.0.0.1", 0))
     freeze()
     with suppress(OSError):  # the relay stands for the network, so it gets priority over both sides if permitted
         os.setpriority(os.PRIO_PROCESS, 0, -20)

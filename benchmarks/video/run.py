@@ -24,7 +24,7 @@ MAX_FRAMES = 1 << 17
 """Capacity of the table of sent frames: more than an hour."""
 
 Table = NDArray[np.int64]
-"""A row (stamp_ns, number) for each sent frame, zero until it is sent; both processes map it into memory."""
+"""A row (stamp_ns, number) for each frame; zeros until the frame is sent. Both processes map the table into memory."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Run:
     keep: bool = False
     """Save the access units and the error of each received picture."""
     jitter_ms: int = 0
-    """GStreamer's jitter buffer."""
+    """The length of GStreamer's jitter buffer."""
     synchronous: bool = False
     """GStreamer shows each picture when it is due, instead of immediately."""
 
@@ -63,7 +63,7 @@ def create_table(folder: Path) -> None:
 
 def save_units(run: Run, units: Sequence[bytes]) -> None:
     """Save the access units of a run, in the order of its table."""
-    sizes = np.array([len(each) for each in units], np.int64)
+    sizes = np.array([len(unit) for unit in units], np.int64)
     np.savez(Path(run.folder) / "units.npz", data=np.frombuffer(b"".join(units), np.uint8), sizes=sizes)
 
 

@@ -50,7 +50,7 @@ class BenchmarkProcess:
         return self._process.pid
 
     def read_line(self) -> dict[str, Any]:
-        """Wait for its next line of JSON; raises `WorkError` if it ends without one."""
+        """Wait for the process's next line of JSON; raise `WorkError` if it ends without one."""
         assert self._process.stdout is not None
         line = self._process.stdout.readline()
         if not line:
@@ -59,13 +59,13 @@ class BenchmarkProcess:
         return entries
 
     def send_line(self) -> None:
-        """Send a line, which lets it begin or end."""
+        """Send a line, which tells the process to begin or to end."""
         assert self._process.stdin is not None
         self._process.stdin.write("\n")
         self._process.stdin.flush()
 
     def close(self) -> None:
-        """Wait for its end; kill it after 5 s."""
+        """Wait for the end of the process; kill it after 5 s."""
         assert self._process.stdin is not None
         self._process.stdin.close()
         try:
@@ -83,9 +83,9 @@ class RunOutcome:
     latency_ms: NDArray[np.float64]
     """Latency of each frame whose picture was shown with its stamp."""
     sender_cpu_ms: float
-    """CPU time for a frame."""
+    """CPU time per frame."""
     receiver_cpu_ms: float
-    """CPU time for a frame."""
+    """CPU time per frame."""
     errors: dict[int, float]
     """Mean squared error of each shown picture by its row in the table; -1 if errors were not requested."""
     relayed: dict[str, Any]
@@ -145,8 +145,8 @@ def measure(
             processes[1].send_line()
             relayed = processes[1].read_line()
     finally:
-        for each in processes:
-            each.close()
+        for process in processes:
+            process.close()
     return _evaluate(run, sent["cpu_ns"], received["counts"], relayed)
 
 
@@ -154,8 +154,8 @@ def _evaluate(run: Run, sender_cpu_ns: list[int], counts: dict[str, int], relaye
     stamps = run.table()[WARM_UP_FRAMES : run.frames, 0].tolist()
     rows = {stamp_ns: row for row, stamp_ns in enumerate(stamps, WARM_UP_FRAMES)}
     latency_ms, errors, cpu_ns = [], {}, []
-    with np.load(Path(run.folder) / "read.npz") as read:
-        for (stamp_ns, read_ns, at_cpu_ns), error in zip(read["rows"].tolist(), read["errors"].tolist(), strict=True):
+    with np.load(Path(run.folder) / "read.npz") as log:
+        for (stamp_ns, read_ns, at_cpu_ns), error in zip(log["rows"].tolist(), log["errors"].tolist(), strict=True):
             row = rows.pop(stamp_ns, None)
             if row is not None:
                 latency_ms.append((read_ns - stamp_ns) / NS_PER_MS)

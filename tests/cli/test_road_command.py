@@ -44,10 +44,10 @@ def test_a_drawing_has_a_map_the_curvature_and_views() -> None:
     above, detail, curvature, *views = figure.axes
     assert above.get_aspect() == detail.get_aspect() == 1.0
     (low_x, high_x), (low_y, high_y) = above.get_xlim(), above.get_ylim()
-    places = road.across(np.linspace(0.0, road.length_m, 50), 0.0)
+    places = road.point_at(np.linspace(0.0, road.route_length_m, 50), 0.0)
     assert ((places > (low_x, low_y)) & (places < (high_x, high_y))).all()
     (stations_m, curvatures_per_m) = curvature.lines[0].get_data(orig=True)
-    assert np.asarray(curvatures_per_m) == pytest.approx(road.point(np.asarray(stations_m))[3])
+    assert np.asarray(curvatures_per_m) == pytest.approx(road.centre_at(np.asarray(stations_m)).curvature_per_m)
     assert len(views) == VIEWS
     assert [axes.images[0].get_size() for axes in views] == [(480, 640)] * VIEWS
 

@@ -87,9 +87,9 @@ def curves(route: str, road: Road) -> list[Curve]:
     ):
         segments = list(pieces)
         end_m = s_m + sum(segment.length_m for segment in segments)
-        if bend and s_m < road.length_m and end_m > 0:
+        if bend and s_m < road.route_length_m and end_m > 0:
             tightest = max((segment.curvature_per_m for segment in segments), key=abs)
-            end_m = min(end_m, road.length_m)
+            end_m = min(end_m, road.route_length_m)
             found.append(Curve(route, max(s_m, 0.0), end_m, 1 / tightest, max(s_m - LEAD_M, before_m)))
             before_m = end_m
         s_m = end_m

@@ -122,8 +122,8 @@ def driven_route(config: ServerConfig) -> Route | None:
 
 def route_of(name: str, road: Road) -> Route:
     """Return the centre line of a road's lane for the record."""
-    x_m, y_m, _, _ = road.point(np.arange(0.0, road.length_m, ROUTE_STEP_M))
-    return Route(name, road.length_m, tuple(zip(x_m.tolist(), y_m.tolist(), strict=True)))
+    x_m, y_m, _, _ = road.centre_at(np.arange(0.0, road.route_length_m, ROUTE_STEP_M))
+    return Route(name, road.route_length_m, tuple(zip(x_m.tolist(), y_m.tolist(), strict=True)))
 
 
 def _build_simulated(config: ServerConfig, road: Road, camera: Camera) -> VehicleSetup:

@@ -47,7 +47,7 @@ def test_a_car_at_rest_stays_at_rest() -> None:
 @pytest.mark.parametrize("steering_rad", [0.02, -0.04])
 @pytest.mark.parametrize(("front_nprad", "rear_nprad"), [(155_495.0, 155_495.0), (90_000.0, 155_495.0), (2e5, 1.5e5)])
 def test_yaw_rate_on_a_circle_matches_theory(steering_rad: float, front_nprad: float, rear_nprad: float) -> None:
-    """At 30 km/h the yaw rate is within 1 % of v d / (L + K v^2), K = m (l_r / C_f - l_f / C_r) / L."""
+    """At 30 km/h the yaw rate is within 1 % of v d / (L + K v^2), where K = m (l_r / C_f - l_f / C_r) / L."""
     speed_mps = 30 / 3.6
     car = car_at(speed_mps, replace(CAR, front_stiffness_nprad=front_nprad, rear_stiffness_nprad=rear_nprad))
     cruise(car, speed_mps, steering_rad, 4.0)
@@ -201,10 +201,10 @@ def test_a_rail_stops_motion_into_it_and_adds_no_energy(
     motion = car.motion
     assert (motion.x_m, motion.y_m) == pytest.approx((0.02 * math.cos(out_rad), 0.02 * math.sin(out_rad)))
     assert energy_j(car) <= before_j + 1e-6
-    out = (math.cos(out_rad - 0.3), math.sin(out_rad - 0.3))
+    outward = (math.cos(out_rad - 0.3), math.sin(out_rad - 0.3))
     from_gravity_m = ahead_m - (CAR.wheelbase_m - CAR.front_axle_to_gravity_m)
-    outwards_mps = (motion.speed_mps - motion.yaw_rate_radps * left_m) * out[0]
-    outwards_mps += (motion.side_speed_mps + motion.yaw_rate_radps * from_gravity_m) * out[1]
+    outwards_mps = (motion.speed_mps - motion.yaw_rate_radps * left_m) * outward[0]
+    outwards_mps += (motion.side_speed_mps + motion.yaw_rate_radps * from_gravity_m) * outward[1]
     if motion.speed_mps > 0.0:  # a car is not pushed backwards: its remaining speed is removed instead
         assert outwards_mps >= -1e-9
 

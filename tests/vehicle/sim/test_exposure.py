@@ -65,17 +65,19 @@ def latencies_us(out: Path, *changes: str) -> list[int]:
     loop = build_loop(plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), changes)), out)
     drive(loop, limit_ns=2 * NS_PER_S)
     frames = read_record(out / "server.mcap").table("frame")
-    late_ns = frames.ints("stamped_mono_ns") - frames.ints("capture_ns")
-    return [round(each / 1000) for each in late_ns.tolist()]
+    latency_ns = frames.ints("stamped_mono_ns") - frames.ints("capture_ns")
+    return [round(value / 1000) for value in latency_ns.tolist()]
 
 
 def test_time_from_capture_to_stamp_in_virtual_time(tmp_path: Path) -> None:
     """In a virtual run a frame is stamped half the exposure, the delay and the stages' costs after its capture."""
     (tmp_path / "run").mkdir()
-    late_us = latencies_us(tmp_path / "run", "camera.exposure_ms=12.0", "camera.sensor_delay_ms=25.5")
+    measured_us = latencies_us(tmp_path / "run", "camera.exposure_ms=12.0", "camera.sensor_delay_ms=25.5")
     costs_us = read_costs().stages_us["camera"]
-    assert len(late_us) > 50
-    assert {abs(each - round(31_500 + costs_us["capture"] + costs_us["check"])) for each in late_us} <= {0, 1}
+    half_exposure_us, delay_us = 6_000, 25_500
+    expected_us = round(half_exposure_us + delay_us + costs_us["capture"] + costs_us["check"])
+    assert len(measured_us) > 50
+    assert {abs(latency_us - expected_us) for latency_us in measured_us} <= {0, 1}
 
 
 def sharpness(picture: Picture) -> float:
@@ -87,13 +89,13 @@ def sharpness(picture: Picture) -> float:
 def test_a_moving_car_has_motion_blur_and_a_stationary_one_has_none(road: Road) -> None:
     """At 30 km/h a longer exposure blurs the near road more; a stationary car's picture is not blurred."""
     moving = [pose_at(road, 8.33 * step / 240, mono_ns=grid_ns(step)) for step in range(10)]
-    steps = []
+    sharpness_by_exposure = []
     for exposure_ms in (0, 4, 16):
         camera = camera_on(road, scenery="none", exposure_ns=exposure_ms * NS_PER_MS)
         frame = camera.expose(3, grid_ns(3), moving)
         assert frame is not None
-        steps.append(sharpness(frame.picture))
-    assert all(later < 0.85 * earlier for earlier, later in pairwise(steps))
+        sharpness_by_exposure.append(sharpness(frame.picture))
+    assert all(longer < 0.85 * shorter for shorter, longer in pairwise(sharpness_by_exposure))
     stationary = [pose_at(road, 5.0, mono_ns=grid_ns(step)) for step in range(10)]
     frame = camera.expose(3, grid_ns(3), stationary)
     assert frame is not None

@@ -23,12 +23,12 @@ def road() -> Road:
 def motion_at(
     road: Road, s_m: float, lateral_m: float = 0.0, turned_rad: float = 0.0, speed_mps: float = 0.0
 ) -> CarMotion:
-    x_m, y_m = road.across(s_m, lateral_m).tolist()
-    return CarMotion(x_m, y_m, float(road.point(s_m)[2]) + turned_rad, speed_mps=speed_mps)
+    x_m, y_m = road.point_at(s_m, lateral_m).tolist()
+    return CarMotion(x_m, y_m, float(road.centre_at(s_m).heading_rad) + turned_rad, speed_mps=speed_mps)
 
 
 def events_along(road: Road, places: list[tuple[float, float]], turned_rad: float = 0.0) -> list[VehicleEvent]:
-    """Return the events of a car that is moved through positions (station, lateral offset)."""
+    """Return the events of a car that is placed at positions (station, lateral offset) one after the other."""
     monitor = RouteMonitor(road, CAR, near_s_m=places[0][0])
     events = []
     for index, (s_m, lateral_m) in enumerate(places):
@@ -90,8 +90,8 @@ def test_the_start_is_no_lane_invasion(road: Road) -> None:
 @pytest.mark.parametrize(("lateral_m", "kind"), [(-8.25, "rail"), (11.35, "barrier")])
 def test_a_corner_at_a_rail_is_one_collision(road: Road, lateral_m: float, kind: str) -> None:
     """A body whose side reaches the rail or the barrier has one collision, which names the obstacle."""
-    before = lateral_m - math.copysign(0.1, lateral_m)
-    assert "collision" not in kinds(events_along(road, [(5.0, before)]))
+    clear_of_it_m = lateral_m - math.copysign(0.1, lateral_m)
+    assert "collision" not in kinds(events_along(road, [(5.0, clear_of_it_m)]))
     events = [event for event in events_along(road, [(5.0, lateral_m), (5.0, lateral_m)]) if event.kind == "collision"]
     assert len(events) == 1
     assert kind in events[0].detail
@@ -118,7 +118,7 @@ def test_the_time_limit_counts_from_the_first_movement(road: Road) -> None:
     assert monitor.update(stationary, 0) == []
     assert monitor.update(stationary, began_ns - 1) == []
     assert monitor.update(moving, began_ns) == []
-    limit_ns = round((road.length_m / (30 / 3.6 / 3) + 30) * NS_PER_S)
+    limit_ns = round((road.route_length_m / (30 / 3.6 / 3) + 30) * NS_PER_S)
     assert monitor.update(stationary, began_ns + limit_ns) == []
     assert kinds(monitor.update(stationary, began_ns + limit_ns + 1)) == ["timeout"]
     assert monitor.update(stationary, began_ns + limit_ns + 2) == []
@@ -141,8 +141,8 @@ def test_an_edge_exactly_on_a_line_is_still_in_its_lane() -> None:
         assert kinds(monitor.update(motion_at(straight, 5.0, lateral_m), 1)) == ["lane_invasion"] * invasions
 
 
-def test_both_edges_can_leave_their_lanes_at_once(road: Road) -> None:
-    """A car across its lane has two lane invasions in one step, the left edge's first."""
+def test_both_edges_can_leave_their_lanes_in_one_step(road: Road) -> None:
+    """A car turned across the road has two lane invasions in one step, that of the left edge first."""
     events = events_along(road, [(5.0, 0.0), (5.0, 0.0)])
     assert events == []
     monitor = RouteMonitor(road, CAR, near_s_m=5.0)
@@ -205,8 +205,8 @@ def test_asphalt_is_limited_to_its_stations() -> None:
     """A lay-by beside the lane is road only between its stations."""
     paved = "paved: [{left_m: 2.25, right_m: -2.25}, {left_m: -2.25, right_m: -6, from_m: 30, to_m: 60}]"
     road = parse_road(f"title: x\nsegments: [{{length_m: 100}}]\n{paved}", source="x")
-    for s_m, off in ((20.0, True), (45.0, False), (70.0, True)):
-        assert ("off_road" in kinds(events_along(road, [(s_m, -4.0)]))) == off
+    for s_m, is_off_road in ((20.0, True), (45.0, False), (70.0, True)):
+        assert ("off_road" in kinds(events_along(road, [(s_m, -4.0)]))) == is_off_road
 
 
 def test_a_car_behind_a_rail_does_not_touch_it() -> None:
@@ -242,8 +242,9 @@ def test_a_contact_has_its_corner_depth_and_direction(road: Road) -> None:
     monitor.update(motion_at(road, 5.0, -6.5, -0.5), 0)
     (contact,) = monitor.contacts
     assert (contact.ahead_m, contact.left_m) == (CAR.rear_axle_to_front_m, -CAR.body_width_m / 2)
-    corner_m = -6.5 - 0.93 * math.cos(0.5) - 3.89 * math.sin(0.5)
-    assert contact.depth_m == pytest.approx(-9.15 - corner_m)
+    corner_offset_m = -6.5 - 0.93 * math.cos(0.5) - 3.89 * math.sin(0.5)
+    rail_offset_m = -9.15
+    assert contact.depth_m == pytest.approx(rail_offset_m - corner_offset_m)
     assert math.remainder(contact.out_rad - road.start[2] - math.pi / 2, 2 * math.pi) == pytest.approx(0.0)
     monitor.update(motion_at(road, 5.0), 1)
     assert monitor.contacts == ()
@@ -268,11 +269,11 @@ def test_skipping_checks_changes_no_events(
     road: Road, steps: list[tuple[float, float, float]], s_m: float, lateral_m: float
 ) -> None:
     """A monitor that skips checks within its margin reports the same events as one that checks every step."""
-    lazy, eager = RouteMonitor(road, CAR, near_s_m=s_m), RouteMonitor(road, CAR, near_s_m=s_m)
+    skipping, always_checking = RouteMonitor(road, CAR, near_s_m=s_m), RouteMonitor(road, CAR, near_s_m=s_m)
     turned_rad = 0.0
     for index, (ahead_m, beside_m, turn_rad) in enumerate(steps):
         s_m, lateral_m, turned_rad = s_m + ahead_m, lateral_m + beside_m, turned_rad + turn_rad
         motion = motion_at(road, s_m, lateral_m, turned_rad)
-        eager._event_margin._across_margin_m = 0.0
-        assert lazy.update(motion, index) == eager.update(motion, index)
-        assert (lazy.contacts == ()) == (eager.contacts == ())
+        always_checking._event_margin._across_margin_m = 0.0
+        assert skipping.update(motion, index) == always_checking.update(motion, index)
+        assert (skipping.contacts == ()) == (always_checking.contacts == ())

@@ -28,9 +28,11 @@ def simulator_on(road: Road, seed: int = 1, start_mono_ns: int = START_NS) -> Si
 def test_the_simulator_reports_its_capabilities(road: Road) -> None:
     """The simulator is a simulated `Vehicle` with virtual time, ground truth and the limits of its car."""
     vehicle: Vehicle = simulator_on(road)
-    can = vehicle.capabilities
-    assert (can.simulated, can.virtual_time, can.ground_truth, can.reset) == (True, True, True, False)
-    assert (can.wheelbase_m, can.max_steering_rad, can.max_braking_mps2) == (2.8448, 0.513, 6.0)
+    capabilities = vehicle.capabilities
+    assert (capabilities.simulated, capabilities.virtual_time) == (True, True)
+    assert (capabilities.ground_truth, capabilities.reset) == (True, False)
+    assert (capabilities.wheelbase_m, capabilities.max_steering_rad) == (2.8448, 0.513)
+    assert capabilities.max_braking_mps2 == 6.0
 
 
 def test_the_grid_does_not_drift(road: Road) -> None:
@@ -72,7 +74,7 @@ def test_one_long_advance_equals_many_short_ones(road: Road) -> None:
 
 
 def test_a_command_takes_effect_at_the_next_grid_point(road: Road) -> None:
-    """Commands applied while the physics is late take effect at their own times."""
+    """A command takes effect at the first grid point after it, also if `advance` is called much later."""
     late, punctual = simulator_on(road), simulator_on(road)
     first_ns, second_ns, end_ns = START_NS + 100 * NS_PER_MS, START_NS + 900 * NS_PER_MS, START_NS + 2 * NS_PER_S
     stop = Actuation(0.1, 0.0, 1.0)
@@ -128,19 +130,19 @@ def test_a_good_driver_completes_the_route(road: Road) -> None:
     simulator = simulator_on(road, seed=3)
     events: list[VehicleEvent] = []
     worst_m = 0.0
-    for tick in range(1, 20 * 50):
+    for command_number in range(1, 20 * 50):
         truth = simulator.ground_truth()
-        curvature = float(road.point(truth.progress_m + 0.15 * truth.speed_mps)[3])
+        curvature = float(road.centre_at(truth.progress_m + 0.15 * truth.speed_mps).curvature_per_m)
         steering_rad = 2.85 * curvature - 0.08 * truth.cross_track_m - 0.6 * truth.heading_error_rad
-        wanted = 0.8 * (30 / 3.6 - truth.speed_mps)
-        simulator.apply(Actuation(steering_rad, max(0.0, wanted), max(0.0, -wanted)), simulator.pose().mono_ns)
-        events += simulator.advance(START_NS + tick * 20 * NS_PER_MS)
+        pedal = 0.8 * (30 / 3.6 - truth.speed_mps)
+        simulator.apply(Actuation(steering_rad, max(0.0, pedal), max(0.0, -pedal)), simulator.pose().mono_ns)
+        events += simulator.advance(START_NS + command_number * 20 * NS_PER_MS)
         worst_m = max(worst_m, abs(simulator.ground_truth().cross_track_m))
         if events:
             break
     assert [event.kind for event in events] == ["completed"]
     assert worst_m < 0.5
-    assert simulator.ground_truth().progress_m >= road.length_m
+    assert simulator.ground_truth().progress_m >= road.route_length_m
 
 
 @settings(max_examples=25)
@@ -167,19 +169,19 @@ def test_steering_and_pedals_have_separate_dead_times(road: Road) -> None:
     car = replace(LINCOLN_MKZ, steering_dead_time_s=0.15, pedal_dead_time_s=0.05)
     simulator = Simulator(road=road, seed=1, start_mono_ns=0, parameters=car)
     simulator.apply(Actuation(0.02, 1.0, 0.0), 0)
-    seen = {}
+    steering_and_throttle = {}
     for at_ms in (49, 60, 149, 160, 150 + 120):
         simulator.advance(at_ms * NS_PER_MS)
-        seen[at_ms] = (simulator._car.motion.steering_rad, simulator._car.motion.throttle)
-    assert seen[49] == (0.0, 0.0)
-    assert seen[60][1] > 0.0
-    assert seen[149][0] == 0.0
-    assert seen[160][0] > 0.0
-    assert seen[270][0] == pytest.approx(0.02 * (1 - math.exp(-1)), rel=0.05)
+        steering_and_throttle[at_ms] = (simulator._car.motion.steering_rad, simulator._car.motion.throttle)
+    assert steering_and_throttle[49] == (0.0, 0.0)
+    assert steering_and_throttle[60][1] > 0.0
+    assert steering_and_throttle[149][0] == 0.0
+    assert steering_and_throttle[160][0] > 0.0
+    assert steering_and_throttle[270][0] == pytest.approx(0.02 * (1 - math.exp(-1)), rel=0.05)
 
 
 def test_dead_time_only_shifts_commands(road: Road) -> None:
-    """With a dead time the steering repeats, later, exactly its motion without one."""
+    """With a dead time, the steering makes exactly the same motion as without one, but later."""
     late_ns = 250 * NS_PER_MS  # a whole number of steps
     plain = Simulator(road=road, seed=1, start_mono_ns=0)
     delayed = Simulator(
@@ -212,7 +214,7 @@ rails: [{offset_m: 0.52, from_m: 20, kind: barrier}]
 
 
 def drive_into_the_rail(steering_rad: float, duration_s: float) -> tuple[Simulator, list[VehicleEvent], float]:
-    """Drive with constant steering and throttle through collisions; return car, events and deepest contact."""
+    """Drive with constant steering and throttle; return the simulator, the events and the deepest contact (m)."""
     simulator = Simulator(road=parse_road(RAILED, source="x"), seed=1, start_mono_ns=0, continue_after_collision=True)
     simulator.apply(Actuation(steering_rad, 0.6, 0.0), 0)
     events: list[VehicleEvent] = []
@@ -225,7 +227,7 @@ def drive_into_the_rail(steering_rad: float, duration_s: float) -> tuple[Simulat
 
 @pytest.mark.parametrize(("steering_rad", "name"), [(0.03, "barrier"), (-0.03, "rail")])
 def test_a_car_that_continues_after_a_collision_slides_along(steering_rad: float, name: str) -> None:
-    """A car steered into a rail has one collision, aligns with the rail, barely penetrates it, and drives on."""
+    """A car steered into a rail has one collision, enters it by less than 2 cm, aligns with it, and drives on."""
     simulator, events, deepest_m = drive_into_the_rail(steering_rad, 16.0)
     hits = [event.detail for event in events if event.kind == "collision"]
     assert len(hits) == 1

@@ -18,9 +18,9 @@ GRAVITY_MPS2 = 9.81
 
 
 RAIL_FRICTION = 0.4
-"""Friction between a car's side and a guard rail or concrete barrier.
+"""Friction coefficient between a car's side and a guard rail or concrete barrier.
 
-Our estimate: between sheet metal on steel and sheet metal on concrete.
+Our estimate: a value between sheet metal on steel and sheet metal on concrete.
 """
 
 
@@ -34,6 +34,7 @@ class CarParameters:
     body_width_m: float
     """Without mirrors."""
     front_axle_to_gravity_m: float
+    """Distance from the front axle to the centre of gravity."""
     mass_kg: float
     yaw_inertia_kgm2: float
     front_stiffness_nprad: float
@@ -43,7 +44,7 @@ class CarParameters:
     max_steering_rad: float
     max_steering_rate_radps: float
     steering_dead_time_s: float
-    """From a command until the wheels begin to follow it; likewise for the pedals."""
+    """Time from a command until the wheels begin to follow it; `pedal_dead_time_s` is that of the pedals."""
     steering_lag_s: float
     """Time constant of the wheels' first-order lag."""
     pedal_dead_time_s: float
@@ -58,7 +59,8 @@ class CarParameters:
 
 
 LINCOLN_MKZ = CarParameters(
-    # ApolloAuto/apollo, modules/common/data/vehicle_param.pb.txt, brand LINCOLN_MKZ (its width, 2.11 m, has mirrors).
+    # ApolloAuto/apollo, modules/common/data/vehicle_param.pb.txt, brand LINCOLN_MKZ. (Its width of 2.11 m includes the
+    # mirrors.)
     wheelbase_m=2.8448,
     rear_axle_to_front_m=3.89,
     rear_axle_to_rear_m=1.043,
@@ -66,7 +68,7 @@ LINCOLN_MKZ = CarParameters(
     max_steering_rate_radps=0.534,  # steering wheel at 8.552 rad/s
     max_acceleration_mps2=2.0,
     max_braking_mps2=6.0,
-    # Apollo's lateral controller for the same car (lat_controller_conf): four times 520 kg, an axle's stiffness.
+    # Apollo's lateral controller for the same car (lat_controller_conf): 520 kg on each wheel, stiffness of each axle.
     mass_kg=2080.0,
     front_stiffness_nprad=155_495.0,
     rear_stiffness_nprad=155_495.0,
@@ -140,10 +142,10 @@ class CarDynamics:
         self._brake_factor = _lag_factor(step_s, parameters.brake_lag_s)
         self._steering_factor = _lag_factor(step_s, parameters.steering_lag_s)
         self._max_steering_change_rad = parameters.max_steering_rate_radps * step_s
-        # The rate (1/s) at which tyres bring the car to rolling without slip, at the speed where the models meet.
-        stiffness = parameters.front_stiffness_nprad + parameters.rear_stiffness_nprad
-        settling = stiffness / (parameters.mass_kg * parameters.kinematic_below_mps)
-        self._rolling_factor = 1.0 - math.exp(-step_s * settling)
+        # The rate at which the tyres make the car roll without slip, at the speed where the models meet.
+        stiffness_nprad = parameters.front_stiffness_nprad + parameters.rear_stiffness_nprad
+        settling_per_s = stiffness_nprad / (parameters.mass_kg * parameters.kinematic_below_mps)
+        self._rolling_factor = 1.0 - math.exp(-step_s * settling_per_s)
 
     def _clamp(self, target: Actuation) -> Actuation:
         max_rad = self.parameters.max_steering_rad
@@ -155,9 +157,10 @@ class CarDynamics:
 
     def step(self, target: Actuation) -> None:
         """Advance by one time step under `target`; values out of range are clamped."""
-        if target is not self._last_request:  # mostly the same object for many steps
+        if target is not self._last_request:  # for many steps the caller passes the same object
             self._last_request, self._target = target, self._clamp(target)
-        # Read and write each attribute once: this function takes a tenth of a virtual run's time without pixels.
+        # Read and write each attribute once, for speed: in a virtual run without pixels this function takes a tenth of
+        # the time.
         target, parameters, motion, step_s = self._target, self.parameters, self.motion, self._step_s
         speed_mps, side_speed_mps, yaw_rate_radps = motion.speed_mps, motion.side_speed_mps, motion.yaw_rate_radps
         throttle = motion.throttle + (target.throttle - motion.throttle) * self._throttle_factor
@@ -192,8 +195,8 @@ class CarDynamics:
         # Move the rear axle with the heading at the middle of the step.
         rear_side_mps = side_speed_mps - self._to_rear_m * yaw_rate_radps
         turn_rad = yaw_rate_radps * step_s
-        middle_rad = motion.heading_rad + turn_rad / 2
-        cosine, sine = math.cos(middle_rad), math.sin(middle_rad)
+        middle_heading_rad = motion.heading_rad + turn_rad / 2
+        cosine, sine = math.cos(middle_heading_rad), math.sin(middle_heading_rad)
         motion.x_m += (speed_mps * cosine - rear_side_mps * sine) * step_s
         motion.y_m += (speed_mps * sine + rear_side_mps * cosine) * step_s
         motion.heading_rad += turn_rad
@@ -240,7 +243,7 @@ class CarDynamics:
         motion.yaw_rate_radps += (point[0] * sideways - point[1] * forward) / parameters.yaw_inertia_kgm2
 
     def _tyre_accelerations(self) -> tuple[float, float, float]:
-        """Return lateral and yaw acceleration by tyre side forces, and the deceleration by the steered front tyres."""
+        """Return the lateral and yaw acceleration by tyre side forces, and the deceleration by steered front tyres."""
         parameters, motion, to_rear_m = self.parameters, self.motion, self._to_rear_m
         to_front_m, front_grip_n, rear_grip_n = (
             parameters.front_axle_to_gravity_m,

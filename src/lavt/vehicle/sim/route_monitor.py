@@ -1,6 +1,6 @@
-"""The route monitor: tracks a car on its road and reports lane invasions, collisions, leaving the road and completion.
+"""The route monitor, which tracks a car on its road and reports the events of a drive.
 
-It also reports when the time limit is exceeded.
+The events are lane invasions, collisions, leaving the road, completion of the route, and exceeding the time limit.
 """
 
 from __future__ import annotations
@@ -20,16 +20,17 @@ from lavt.vehicle.sim.road.road import PROJECTION_WINDOW_M, Road
 REFERENCE_SPEED_MPS = 30.0 / 3.6
 TIMEOUT_SLOWNESS = 3.0
 TIMEOUT_ALLOWANCE_S = 30.0
-"""The default time limit is the route's time at a third of 30 km/h plus this allowance."""
+"""The default time limit is the time that the route takes at a third of 30 km/h, plus this allowance."""
 
 MOVING_MPS = 0.1
 """A drive's time counts from the moment the car first exceeds this speed."""
 
 CONTACT_GAP_NS = NS_PER_S // 2
-"""A contact later than this after the last one is another collision."""
+"""A contact that occurs later than this after the last one counts as another collision."""
 
 MAX_UNCHECKED_M = PROJECTION_WINDOW_M / 3
-"""The farthest the body may move between checks, because projections search around the last known station."""
+"""The distance that the body may move between checks. It is limited because projections search only around the last
+known station."""
 
 RoadPosition = tuple[float, float, float]
 """Station (m) and lateral offset (m) of a point of the body, and the road's heading (rad) there."""
@@ -43,28 +44,33 @@ class TrackingError(Struct, frozen=True):
     progress_m: float
 
 
-def time_limit_s(length_m: float) -> float:
+def time_limit_s(route_length_m: float) -> float:
     """Return the default time limit for a route of this length."""
-    return length_m / (REFERENCE_SPEED_MPS / TIMEOUT_SLOWNESS) + TIMEOUT_ALLOWANCE_S
+    return route_length_m / (REFERENCE_SPEED_MPS / TIMEOUT_SLOWNESS) + TIMEOUT_ALLOWANCE_S
 
 
 class RouteMonitor:
-    """A monitor of one drive: it reports timeout, leaving the road and completion once, other events each time."""
+    """A monitor of one drive, which begins near the station `near_s_m`.
+
+    The events `timeout`, `off_road` and `completed` are reported once, lane invasions and collisions each time.
+    """
 
     def __init__(self, road: Road, parameters: CarParameters, near_s_m: float, *, limit_s: float | None = None) -> None:
         self._road = road
-        half_m = parameters.body_width_m / 2
+        half_width_m = parameters.body_width_m / 2
         front_m, rear_m = parameters.rear_axle_to_front_m, -parameters.rear_axle_to_rear_m
-        self._corners = tuple(itertools.product((front_m, rear_m), (half_m, -half_m)))
+        self._corners = tuple(itertools.product((front_m, rear_m), (half_width_m, -half_width_m)))
         self._middle = ((front_m + rear_m) / 2, 0.0)
-        self._limit_ns = round((time_limit_s(road.length_m) if limit_s is None else limit_s) * NS_PER_S)
+        self._limit_ns = round((time_limit_s(road.route_length_m) if limit_s is None else limit_s) * NS_PER_S)
         self._began_ns: int | None = None
         self._lanes: tuple[int, int] | None = None
+        """The lanes of the body's left and right edge at the last check."""
         self._reported: set[EventKind] = set()
         self._near_s_m = near_s_m
         self._last_contact_ns: int | None = None
-        self._rails = tuple((rail, math.copysign(1.0, rail.offset_m)) for rail in road.rails)
-        self._event_margin = _EventMargin(road, reach_m=max(math.hypot(*corner) for corner in self._corners))
+        self._signed_rails = tuple((rail, math.copysign(1.0, rail.offset_m)) for rail in road.rails)
+        """Each rail with its side of the driven lane: 1 is left, -1 is right."""
+        self._event_margin = _EventMargin(road, body_reach_m=max(math.hypot(*corner) for corner in self._corners))
         self.contacts: tuple[Contact, ...] = ()
         """The body's contacts with rails at the last update."""
 
@@ -75,7 +81,7 @@ class RouteMonitor:
 
     def update(self, motion: CarMotion, at_ns: int) -> list[VehicleEvent]:
         """Return the events since the last call; it must be called at every step."""
-        # In contact with a rail, check every step: the contact may deepen or end, and lasts while the car stays in it.
+        # While the body touches a rail, check every step: the contact may deepen or end.
         can_skip = not self.contacts and self._event_margin.covers(motion)
         events = [] if can_skip else self._check_body(motion, at_ns)
         if self._began_ns is None:
@@ -101,8 +107,8 @@ class RouteMonitor:
             self._last_contact_ns = at_ns
         elif not self._on_asphalt(middle):
             events += self._report_once("off_road", f"the asphalt was left at {progress_m:.1f} m", at_ns)
-        if progress_m >= self._road.length_m:
-            events += self._report_once("completed", f"{self._road.length_m:.1f} m were driven", at_ns)
+        if progress_m >= self._road.route_length_m:
+            events += self._report_once("completed", f"{self._road.route_length_m:.1f} m were driven", at_ns)
         self._event_margin.restart(motion, ((progress_m, lateral_m, heading_rad), *corners, middle))
         return events
 
@@ -128,36 +134,37 @@ class RouteMonitor:
         """
         edges_m = self._road.lanes.edges_m
         lanes = (bisect_left(edges_m, left_m), bisect_right(edges_m, right_m))
-        before, self._lanes = self._lanes, lanes
-        if before is None:
+        previous_lanes, self._lanes = self._lanes, lanes
+        if previous_lanes is None:
             return []
         return [
             VehicleEvent(at_ns, "lane_invasion", f"{edge} edge from lane {old} to {new} from the right")
-            for edge, old, new in zip(("left", "right"), before, lanes, strict=True)
+            for edge, old, new in zip(("left", "right"), previous_lanes, lanes, strict=True)
             if old != new
         ]
 
     def _find_contacts(self, corners: Sequence[RoadPosition]) -> tuple[tuple[Contact, ...], Rail | None]:
-        """Return the corners inside a rail and that rail; a body entirely behind a rail does not touch it."""
-        found, touched_rail = [], None
-        highest_m, lowest_m = max([each[1] for each in corners]), min([each[1] for each in corners])
-        for rail, side in self._rails:
-            if (highest_m < rail.offset_m) if side > 0.0 else (lowest_m > rail.offset_m):
-                continue  # the common case: all corners are clear of the rail
-            depths_m = [side * (lateral_m - rail.offset_m) for _, lateral_m, _ in corners]
+        """Return the contacts of corners with rails, and the first rail touched; None without a contact."""
+        contacts, touched_rail = [], None
+        offsets_m = [lateral_m for _, lateral_m, _ in corners]
+        leftmost_m, rightmost_m = max(offsets_m), min(offsets_m)
+        for rail, sign in self._signed_rails:
+            if (leftmost_m < rail.offset_m) if sign > 0.0 else (rightmost_m > rail.offset_m):
+                continue  # the common case: no corner has reached the rail
+            depths_m = [sign * (offset_m - rail.offset_m) for offset_m in offsets_m]
             if min(depths_m) >= 0.0:
-                continue
+                continue  # the body is entirely behind the rail and does not touch it
             for (ahead_m, left_m), (s_m, _, heading_rad), depth_m in zip(self._corners, corners, depths_m, strict=True):
                 if depth_m >= 0.0 and rail.from_m <= s_m <= rail.to_m:
-                    # The way out is the shortest: across, or along the road for a car that hit an end of the rail.
-                    ways = (
-                        (depth_m, heading_rad - side * math.pi / 2),
+                    # The car is moved out by the shortest way: across the road, or along it from an end of the rail.
+                    depths_and_directions = (
+                        (depth_m, heading_rad - sign * math.pi / 2),
                         (s_m - rail.from_m, heading_rad + math.pi),
                         (rail.to_m - s_m, heading_rad),
                     )
-                    found.append(Contact(ahead_m, left_m, *min(ways)))
+                    contacts.append(Contact(ahead_m, left_m, *min(depths_and_directions)))
                     touched_rail = touched_rail or rail
-        return tuple(found), touched_rail
+        return tuple(contacts), touched_rail
 
     def _on_asphalt(self, position: RoadPosition) -> bool:
         s_m, lateral_m, _ = position
@@ -168,31 +175,35 @@ class RouteMonitor:
 
 
 class _EventMargin:
-    """The margin the body may move before an event is possible: until it may have reached the nearest boundary.
+    """The distance that the body may move before an event is possible, that is, before it may have reached a boundary.
 
     Boundaries are the edges of lanes and asphalt, the rails, the stations where asphalt and rails begin and end, and
-    the end of the route. When a point moves by d, its station changes by at most d / `_station_scale`: on the inside of
-    a curve stations are closer together than metres. Its lateral offset changes by its movement across the road's
-    direction at the last check, plus the distance by which the road may have bent away since. While the body is between
-    the rails, their ends do not matter.
+    the end of the route. While the body is between the rails, it cannot reach their ends.
+
+    When a point of the body moves by d, its station changes by at most d / `_station_scale`, because on the inside of a
+    curve a metre covers more than a metre of stations. Its lateral offset changes by at most the sum of two distances:
+    its movement across the direction that the road had at the last check, and the distance by which the road may have
+    bent away from that direction since then.
     """
 
-    def __init__(self, road: Road, reach_m: float) -> None:
-        self._reach_m = reach_m
-        across = [road.lanes.edges_m, *((strip.left_m, strip.right_m) for strip in road.paved)]
-        self._offsets_m = sorted({*itertools.chain(*across), *(rail.offset_m for rail in road.rails)})
-        asphalt = [end_m for strip in road.paved for end_m in (strip.from_m, strip.to_m)]
-        rails = [end_m for rail in road.rails for end_m in (rail.from_m, rail.to_m)]
-        self._stations_m = sorted({road.length_m, *filter(math.isfinite, asphalt)})
-        self._all_stations_m = sorted({*self._stations_m, *filter(math.isfinite, rails)})
+    def __init__(self, road: Road, body_reach_m: float) -> None:
+        self._body_reach_m = body_reach_m
+        edges_m = [*road.lanes.edges_m, *itertools.chain(*((strip.left_m, strip.right_m) for strip in road.paved))]
+        self._offsets_m = sorted({*edges_m, *(rail.offset_m for rail in road.rails)})
+        asphalt_ends_m = [end_m for strip in road.paved for end_m in (strip.from_m, strip.to_m)]
+        rail_ends_m = [end_m for rail in road.rails for end_m in (rail.from_m, rail.to_m)]
+        self._stations_m = sorted({road.route_length_m, *filter(math.isfinite, asphalt_ends_m)})
+        self._stations_and_rail_ends_m = sorted({*self._stations_m, *filter(math.isfinite, rail_ends_m)})
         self._between_rails_m = (
             max((rail.offset_m for rail in road.rails if rail.offset_m < 0.0), default=-math.inf),
             min((rail.offset_m for rail in road.rails if rail.offset_m >= 0.0), default=math.inf),
         )
-        widest_m = max(abs(self._offsets_m[0]), abs(self._offsets_m[-1])) + reach_m
-        tightest = max(max(abs(each.curvature_per_m), abs(each.end_curvature_per_m)) for each in road.segments)
-        self._station_scale = 1.0 - tightest * widest_m
-        self._bend_per_m = tightest / self._station_scale if self._station_scale > 0.0 else math.inf
+        max_offset_m = max(abs(self._offsets_m[0]), abs(self._offsets_m[-1])) + body_reach_m
+        max_curvature_per_m = max(
+            max(abs(segment.curvature_per_m), abs(segment.end_curvature_per_m)) for segment in road.segments
+        )
+        self._station_scale = 1.0 - max_curvature_per_m * max_offset_m
+        self._bend_per_m = max_curvature_per_m / self._station_scale if self._station_scale > 0.0 else math.inf
         self._reference_pose = (math.inf, math.inf, 0.0)
         self._across_direction = (0.0, 1.0)
         self._heading_spread_rad = 0.0
@@ -209,8 +220,8 @@ class _EventMargin:
         offsets_m = self._offsets_m
         self._across_margin_m = min([_distance_m(offsets_m, lateral_m) for _, lateral_m, _ in positions])
         right_m, left_m = self._between_rails_m
-        inside = all(right_m < lateral_m < left_m for _, lateral_m, _ in positions)
-        stations_m = self._stations_m if inside else self._all_stations_m
+        is_between_rails = all(right_m < lateral_m < left_m for _, lateral_m, _ in positions)
+        stations_m = self._stations_m if is_between_rails else self._stations_and_rail_ends_m
         along_m = min([_distance_m(stations_m, s_m) for s_m, _, _ in positions])
         self._along_margin_m = min(along_m * self._station_scale, MAX_UNCHECKED_M)
 
@@ -219,7 +230,7 @@ class _EventMargin:
         x_m, y_m, heading_rad = self._reference_pose
         dx_m, dy_m = motion.x_m - x_m, motion.y_m - y_m
         moved_m = math.hypot(dx_m, dy_m)
-        turned_m = self._reach_m * abs(motion.heading_rad - heading_rad)
+        turned_m = self._body_reach_m * abs(motion.heading_rad - heading_rad)
         max_moved_m = moved_m + turned_m
         if not max_moved_m < self._along_margin_m:
             return False
@@ -231,9 +242,9 @@ class _EventMargin:
         return across_m + self._bend_per_m * max_moved_m * max_moved_m / 2 < self._across_margin_m
 
 
-def _distance_m(lines_m: Sequence[float], at_m: float) -> float:
-    """Return the distance from a coordinate to the nearest of sorted lines."""
-    index = bisect_left(lines_m, at_m)
-    above_m = lines_m[index] - at_m if index < len(lines_m) else math.inf
-    below_m = at_m - lines_m[index - 1] if index else math.inf
+def _distance_m(boundaries_m: Sequence[float], at_m: float) -> float:
+    """Return the distance from a coordinate to the nearest of the sorted boundaries."""
+    index = bisect_left(boundaries_m, at_m)
+    above_m = boundaries_m[index] - at_m if index < len(boundaries_m) else math.inf
+    below_m = at_m - boundaries_m[index - 1] if index else math.inf
     return min(below_m, above_m)

@@ -14,10 +14,11 @@ from lavt.vehicle.vehicle import Capabilities, ReachedCommand
 
 STEPS_PER_S = 240
 
-START_LATERAL_M = 0.25
-START_HEADING_RAD = math.radians(1.5)
-START_AHEAD_M = 2.0
-"""Bounds of a run's offset from the route's start: to both sides, in heading, and ahead; the seed draws the values."""
+MAX_START_LATERAL_M = 0.25
+MAX_START_TURN_RAD = math.radians(1.5)
+MAX_START_AHEAD_M = 2.0
+"""A run starts at most this far beside the route's start (to both sides), turned from it, and ahead of it. The values
+are drawn from the seed."""
 
 INITIAL_ACTUATION = Actuation(steering_rad=0.0, throttle=0.0, brake=1.0)
 
@@ -28,20 +29,20 @@ def grid_ns(index: int) -> int:
 
 
 def start_offset(seed: int) -> tuple[float, float, float]:
-    """Return a run's start relative to the route's start: metres ahead, metres to the left, heading in rad."""
+    """Return a run's start relative to the route's start: m ahead, m to the left, and the turn to the left in rad."""
     return (
-        float(stream(seed, "start position").uniform(0.0, START_AHEAD_M)),
-        float(stream(seed, "start lateral").uniform(-START_LATERAL_M, START_LATERAL_M)),
-        float(stream(seed, "start heading").uniform(-START_HEADING_RAD, START_HEADING_RAD)),
+        float(stream(seed, "start position").uniform(0.0, MAX_START_AHEAD_M)),
+        float(stream(seed, "start lateral").uniform(-MAX_START_LATERAL_M, MAX_START_LATERAL_M)),
+        float(stream(seed, "start heading").uniform(-MAX_START_TURN_RAD, MAX_START_TURN_RAD)),
     )
 
 
 class Simulator:
     """A simulated `lavt.vehicle.vehicle.Vehicle`, stationary at the start with its brake on until a command arrives.
 
-    Physics is lazy: `advance` takes every step up to the time given, however late it is called. Steps lie on a grid of
-    1/240 s on the monotonic clock; the first grid point is at or after `start_mono_ns`. After a collision the car stays
-    where it is or, with `continue_after_collision`, slides along the obstacle.
+    Physics is lazy: `advance` makes up for all steps since its last call, however late it is called. The steps lie on a
+    grid of 1/240 s on the monotonic clock, which begins with the first grid point at or after `start_mono_ns`. After a
+    collision the car stays where it is or, with `continue_after_collision`, slides along the obstacle.
     """
 
     def __init__(
@@ -58,15 +59,18 @@ class Simulator:
         self._steering_dead_ns = round(parameters.steering_dead_time_s * NS_PER_S)
         self._pedal_dead_ns = round(parameters.pedal_dead_time_s * NS_PER_S)
         self._index = -(-start_mono_ns * STEPS_PER_S // NS_PER_S)
+        """The index of the newest grid point to which the physics has advanced."""
         ahead_m, lateral_m, turned_rad = start_offset(seed)
-        x_m, y_m = road.across(ahead_m, lateral_m).tolist()
-        motion = CarMotion(x_m, y_m, float(road.point(ahead_m)[2]) + turned_rad)
+        x_m, y_m = road.point_at(ahead_m, lateral_m).tolist()
+        motion = CarMotion(x_m, y_m, float(road.centre_at(ahead_m).heading_rad) + turned_rad)
         self._car = CarDynamics(parameters, motion, 1.0 / STEPS_PER_S)
         self._route_monitor = RouteMonitor(road, parameters, near_s_m=ahead_m, limit_s=limit_s)
         self._route_monitor.update(motion, grid_ns(self._index))
         self._actuation = INITIAL_ACTUATION
-        self._steering: deque[tuple[int, float]] = deque()
-        self._pedals: deque[tuple[int, float, float]] = deque()
+        self._steering_commands: deque[tuple[int, float]] = deque()
+        """Time of effect (ns) and steering angle (rad)."""
+        self._pedal_commands: deque[tuple[int, float, float]] = deque()
+        """Time of effect (ns), throttle and brake."""
         self._crashed = False
         self._state: VehicleState | None = None
         """The state at the newest grid point, cached once it has been read."""
@@ -90,7 +94,8 @@ class Simulator:
     def advance(self, to_ns: int) -> list[VehicleEvent]:
         """Take every step up to `to_ns` and return the events on the way, in order."""
         events: list[VehicleEvent] = []
-        car, monitor, steering, pedals = self._car, self._route_monitor, self._steering, self._pedals
+        car, monitor = self._car, self._route_monitor
+        steering, pedals = self._steering_commands, self._pedal_commands
         at_ns, next_ns = grid_ns(self._index), grid_ns(self._index + 1)
         self._state = None
         while next_ns <= to_ns:
@@ -116,8 +121,8 @@ class Simulator:
 
         Calls must have increasing times.
         """
-        self._steering.append((now_ns + self._steering_dead_ns, actuation.steering_rad))
-        self._pedals.append((now_ns + self._pedal_dead_ns, actuation.throttle, actuation.brake))
+        self._steering_commands.append((now_ns + self._steering_dead_ns, actuation.steering_rad))
+        self._pedal_commands.append((now_ns + self._pedal_dead_ns, actuation.throttle, actuation.brake))
 
     def engage(self, wanted: bool, now_ns: int) -> None:
         """Do nothing: the simulator is always engaged."""
@@ -129,12 +134,12 @@ class Simulator:
     def _apply_due_commands(self, at_ns: int) -> None:
         """Put the commands into effect whose dead time has passed."""
         steering_rad, throttle, brake = self._actuation.steering_rad, self._actuation.throttle, self._actuation.brake
-        while self._steering and self._steering[0][0] <= at_ns:
-            _, steering_rad = self._steering.popleft()
-        while self._pedals and self._pedals[0][0] <= at_ns:
-            _, throttle, brake = self._pedals.popleft()
-        before = self._actuation
-        if steering_rad != before.steering_rad or throttle != before.throttle or brake != before.brake:
+        while self._steering_commands and self._steering_commands[0][0] <= at_ns:
+            _, steering_rad = self._steering_commands.popleft()
+        while self._pedal_commands and self._pedal_commands[0][0] <= at_ns:
+            _, throttle, brake = self._pedal_commands.popleft()
+        previous = self._actuation
+        if steering_rad != previous.steering_rad or throttle != previous.throttle or brake != previous.brake:
             self._actuation = Actuation(steering_rad, throttle, brake)
 
     def state(self) -> VehicleState:

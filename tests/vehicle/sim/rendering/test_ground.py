@@ -20,13 +20,13 @@ marks: [{offset_m: 2, kind: broken, dash_m: 60, gap_m: 10, width_m: WIDTH}]
 def brightness(road: Road, s_m: FloatArray, offset_m: float, level: int) -> FloatArray:
     """Return the brightness of the texels at stations and an offset."""
     ground = Ground(road, LIGHTS["noon"], None)
-    found = []
-    for x_m, y_m in road.across(s_m, offset_m).tolist():
+    brightnesses = []
+    for x_m, y_m in road.point_at(s_m, offset_m).tolist():
         column, row = int(x_m // TILE_M[level]), int(y_m // TILE_M[level])
         tile = ground.tile(level, column, row)
         texel = tile[int(y_m % TILE_M[level] / SCALES_M[level]), int(x_m % TILE_M[level] / SCALES_M[level])]
-        found.append(float(texel.mean()))
-    return np.array(found)
+        brightnesses.append(float(texel.mean()))
+    return np.array(brightnesses)
 
 
 def test_a_long_dash_bends_with_the_road() -> None:

@@ -20,8 +20,8 @@ def camera(*, model: CameraModel = CameraModel(), **keys: int) -> LaneCamera:  #
 
 
 def pose_at(s_m: float, lateral_m: float = 0.0, turned_rad: float = 0.0, *, at_ns: int = 0, road: Road = ROAD) -> Pose:
-    x_m, y_m = road.across(s_m, lateral_m).tolist()
-    return Pose(at_ns, x_m, y_m, float(road.point(s_m)[2]) + turned_rad)
+    x_m, y_m = road.point_at(s_m, lateral_m).tolist()
+    return Pose(at_ns, x_m, y_m, float(road.centre_at(s_m).heading_rad) + turned_rad)
 
 
 def y_at(lane: Lane, x_m: float) -> float:
@@ -32,21 +32,21 @@ def y_at(lane: Lane, x_m: float) -> float:
 @pytest.mark.parametrize("turned_rad", [0.0, 0.1, -0.1])
 @pytest.mark.parametrize("lateral_m", [0.0, 0.5, -1.0])
 def test_the_lane_follows_the_road(lateral_m: float, turned_rad: float) -> None:
-    """The fitted centre is within 2 cm of the true one on a straight, and 15 cm where a curve begins or ends.
+    """The fitted centre is within 2 cm of the true one on a straight, and within 15 cm elsewhere.
 
-    No parabola follows the change from a straight to a radius of 42 m better, nor does one fitted to pixels.
+    Where a straight changes to a radius of 42 m, no parabola fits better than to 15 cm, also not one fitted to pixels.
     """
     lane_camera = camera()
-    for s_m in range(0, int(ROAD.length_m) - 25, 3):
+    for s_m in range(0, int(ROAD.route_length_m) - 25, 3):
         pose = pose_at(s_m, lateral_m, turned_rad)
         lane = lane_camera.observe_lane(pose)
         assert lane.confidence > 0.8
         for ahead_m in (6.0, 10.0, 14.0):
-            truth_x, truth_y = ROAD.across(s_m + ahead_m, 0.0).tolist()
+            truth_x, truth_y = ROAD.point_at(s_m + ahead_m, 0.0).tolist()
             dx, dy = truth_x - pose.x_m, truth_y - pose.y_m
             x_m = dx * math.cos(pose.heading_rad) + dy * math.sin(pose.heading_rad)
             y_m = dy * math.cos(pose.heading_rad) - dx * math.sin(pose.heading_rad)
-            straight = not ROAD.point(np.arange(s_m, s_m + 22.0))[3].any()
+            straight = not ROAD.centre_at(np.arange(s_m, s_m + 22.0)).curvature_per_m.any()
             assert abs(y_at(lane, x_m) - y_m) < (0.02 if straight else 0.15)
 
 
@@ -58,7 +58,7 @@ def test_confidence_is_the_visible_share_of_the_lane() -> None:
         assert confidences[0] > 0.95
         assert confidences == sorted(confidences, reverse=True)
         assert confidences[-1] == 0.0
-    assert 0.3 < beside[3] < 0.5, "from 6 m beside, one line is seen and the other is beyond 7 m"
+    assert 0.3 < beside[3] < 0.5, "from 6 m beside the centre, one line is visible and the other is beyond 7 m"
 
 
 @pytest.mark.parametrize(

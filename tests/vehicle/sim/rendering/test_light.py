@@ -29,7 +29,7 @@ def asphalt(light: LightName) -> FloatArray:
     """Return the mean colours (n, 3) of small areas of the driven lane ahead of the car along the route."""
     road = load_road("a_key")
     camera = camera_on(road, light=light)
-    pictures = [picture_of(camera, pose_at(road, s_m)) for s_m in np.arange(2.0, road.length_m, 6.0)]
+    pictures = [picture_of(camera, pose_at(road, s_m)) for s_m in np.arange(2.0, road.route_length_m, 6.0)]
     return np.array([picture[420:470, 300:340].reshape(-1, 3).mean(axis=0) for picture in pictures])
 
 
@@ -49,7 +49,7 @@ def test_only_the_sun_casts_shadows() -> None:
 
 
 def grey_at(picture: Picture, road: Road, station_m: float, lateral_m: float, s_m: float) -> float:
-    u_px, v_px, _ = place_camera(MODEL, pose_at(road, s_m)).project(np.append(road.across(station_m, lateral_m), 0.0))
+    u_px, v_px, _ = place_camera(MODEL, pose_at(road, s_m)).project(np.append(road.point_at(station_m, lateral_m), 0.0))
     return float(picture[round(v_px) - 1 : round(v_px) + 2, round(u_px) - 2 : round(u_px) + 3].mean())
 
 
@@ -58,7 +58,7 @@ def test_a_rails_shadow_falls_away_from_the_sun(road: Road) -> None:
     camera = camera_on(road, light="low_sun", scenery="light")
     picture = picture_of(camera, pose_at(road, 80.0))
     station_m = 88.0
-    ahead, left = road.across(station_m, [0.0, 1.0])
+    ahead, left = road.point_at(station_m, [0.0, 1.0])
     reach_m = 0.76 * float(LIGHTS["low_sun"].shadow_m @ (left - ahead))
     assert reach_m > 3.0  # the sun is to the right here
     inside = grey_at(picture, road, station_m, -9.15 + 0.85 * reach_m, 80.0)

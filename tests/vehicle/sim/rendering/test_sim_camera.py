@@ -54,7 +54,7 @@ def test_the_seed_changes_only_the_sensor_noise(road: Road) -> None:
 
 
 def marks_in_view(road: Road, pose: Pose, model: CameraModel, offset_m: float, stations: FloatArray) -> FloatArray:
-    ground = road.across(stations, offset_m)
+    ground = road.point_at(stations, offset_m)
     points = place_camera(model, pose).project(np.column_stack([ground, np.zeros(len(ground))]))
     inside = (points[:, 0] > 4) & (points[:, 0] < model.width_px - 5) & (points[:, 1] < model.height_px - 2)
     assert inside.sum() >= 3
@@ -84,9 +84,10 @@ def test_dashes_are_bright_and_gaps_are_not(road: Road) -> None:
     """On a broken line the middle of a dash is over 60 grey levels above its surroundings, that of a gap is not."""
     pose = pose_at(road, 0.0)
     picture = picture_of(camera_on(road, scenery="none"), pose).astype(float).mean(axis=2)
-    dashes = np.array([9.0]) + DASH_M / 2
-    for station, is_dash in [(float(dashes[0]), True), (float(dashes[0] + (DASH_M + GAP_M) / 2), False)]:
-        ground = np.append(road.across(station, 1.75), 0.0)
+    dash_middle_m = 9.0 + DASH_M / 2
+    gap_middle_m = dash_middle_m + (DASH_M + GAP_M) / 2
+    for station, is_dash in [(dash_middle_m, True), (gap_middle_m, False)]:
+        ground = np.append(road.point_at(station, 1.75), 0.0)
         u_px, v_px, _ = place_camera(MODEL, pose).project(ground)
         around = picture[round(v_px), round(u_px) - 25 : round(u_px) + 26]
         assert (picture[round(v_px), round(u_px)] - np.median(around) > 60) == is_dash
@@ -96,12 +97,12 @@ def test_marks_have_their_colours(road: Road) -> None:
     """The mark at the median is yellow (red far above blue), and the mark at the shoulder is white."""
     pose = pose_at(road, 0.0, 6.0)
     picture = picture_of(camera_on(road, scenery="none"), pose).astype(int)
-    u_px, v_px, _ = place_camera(MODEL, pose).project(np.append(road.across(10.0, 8.75), 0.0))
+    u_px, v_px, _ = place_camera(MODEL, pose).project(np.append(road.point_at(10.0, 8.75), 0.0))
     blue, _, red = picture[round(v_px), round(u_px)]
     assert red - blue > 60
     pose = pose_at(road, 0.0, -3.0)
     picture = picture_of(camera_on(road, scenery="none"), pose).astype(int)
-    u_px, v_px, _ = place_camera(MODEL, pose).project(np.append(road.across(10.0, -5.25), 0.0))
+    u_px, v_px, _ = place_camera(MODEL, pose).project(np.append(road.point_at(10.0, -5.25), 0.0))
     blue, _, red = picture[round(v_px), round(u_px)]
     assert abs(red - blue) < 25
     assert blue > 140
@@ -129,7 +130,7 @@ def test_rails_are_drawn_only_with_scenery(road: Road) -> None:
     pictures = {
         kind: picture_of(camera_on(road, scenery=kind), pose).astype(float) for kind in ("full", "light", "none")
     }
-    point = np.append(road.across(84.0, 12.25), 0.5)
+    point = np.append(road.point_at(84.0, 12.25), 0.5)
     u_px, v_px, _ = place_camera(MODEL, pose).project(point)
     place = np.s_[round(v_px) - 1 : round(v_px) + 2, round(u_px) - 3 : round(u_px) + 4]
     assert np.abs(pictures["light"][place].mean() - pictures["none"][place].mean()) > 25
@@ -185,11 +186,11 @@ def test_far_dashes_do_not_flicker(road: Road) -> None:
     rows = np.arange(round(horizon_row(MODEL)) + 4, row_of_depth(MODEL, 40.0))
     beside_px = 1.75 / MODEL.z_m * (rows - horizon_row(MODEL))
     columns = np.rint((MODEL.width_px - 1) / 2 + np.array([[-1.0], [1.0]]) * beside_px).astype(int)
-    seen = []
+    brightness = []
     for number in range(30):
         picture = picture_of(camera, pose_at(road, 90.0 + 0.1 * number), number).astype(float).mean(axis=2)
-        seen.append(np.mean([picture[rows, columns + side] for side in (-1, 0, 1)], axis=0))
-    assert np.abs(np.diff(seen, axis=0)).max() < 12.0
+        brightness.append(np.mean([picture[rows, columns + shift_px] for shift_px in (-1, 0, 1)], axis=0))
+    assert np.abs(np.diff(brightness, axis=0)).max() < 12.0
 
 
 @pytest.mark.parametrize("route", ["a_key", pytest.param("b", marks=pytest.mark.full)])
@@ -206,7 +207,7 @@ def test_a_prepared_camera_paints_few_tiles_while_driving(monkeypatch: pytest.Mo
         return paint(ground, level, square)
 
     monkeypatch.setattr(Ground, "_paint", counted_paint)
-    for s_m in np.arange(0.0, whole_road.length_m, 2.5):
+    for s_m in np.arange(0.0, whole_road.route_length_m, 2.5):
         painted.clear()
         picture_of(camera, pose_at(whole_road, s_m, 6.0 * np.sin(s_m / 9), 0.6 * np.cos(s_m / 9)))
         assert len(painted) <= 10

@@ -10,7 +10,7 @@ from lavt.vehicle.sim.road.centreline import Centreline, Segment
 
 CURVATURES = st.floats(-0.05, 0.05)
 LINES = st.builds(lambda length: Segment(length, 0.0, 0.0), st.floats(1.0, 80.0))
-ARCS = st.builds(lambda length, bent: Segment(length, bent, bent), st.floats(1.0, 80.0), CURVATURES)
+ARCS = st.builds(lambda length, curvature: Segment(length, curvature, curvature), st.floats(1.0, 80.0), CURVATURES)
 CLOTHOIDS = st.builds(Segment, st.floats(1.0, 80.0), CURVATURES, CURVATURES)
 SEGMENTS = st.lists(st.one_of(LINES, ARCS, CLOTHOIDS), min_size=1, max_size=6)
 
@@ -22,19 +22,19 @@ def line_of(segments: list[Segment]) -> Centreline:
 @settings(max_examples=200)
 @given(SEGMENTS, st.floats(0, 1), st.floats(-8.0, 8.0), st.floats(-12.0, 12.0))
 def test_projection_inverts_station_and_offset(
-    segments: list[Segment], share: float, offset_m: float, beside_m: float
+    segments: list[Segment], share: float, offset_m: float, window_shift_m: float
 ) -> None:
-    """A point constructed at a station and an offset projects back to them, for any segments."""
+    """A point constructed from a station and an offset is projected back to them, for any segments."""
     line = line_of(segments)
     s_m = -10.0 + share * (line.last_m + 10.0)
-    x_m, y_m, heading_rad, _ = (float(each) for each in line.point(s_m))
-    found = line.project(
+    x_m, y_m, heading_rad, _ = (float(value) for value in line.sample(s_m))
+    projection = line.project(
         x_m - offset_m * math.sin(heading_rad),
         y_m + offset_m * math.cos(heading_rad),
-        s_m + beside_m - 13.0,
-        s_m + beside_m + 13.0,
+        s_m + window_shift_m - 13.0,
+        s_m + window_shift_m + 13.0,
     )
-    assert found[:3] == pytest.approx((s_m, offset_m, heading_rad), abs=1e-6)
+    assert projection[:3] == pytest.approx((s_m, offset_m, heading_rad), abs=1e-6)
 
 
 @settings(max_examples=50)
@@ -45,7 +45,7 @@ def test_a_clothoids_position_is_the_integral_of_its_heading(length_m: float, be
     middles_m = (np.arange(200_000) + 0.5) * length_m / 200_000
     turn_rad = begin * middles_m + (end - begin) / length_m * middles_m**2 / 2
     step_m = length_m / 200_000
-    x_m, y_m, heading_rad, _ = line.point(length_m)
+    x_m, y_m, heading_rad, _ = line.sample(length_m)
     assert float(x_m) == pytest.approx(np.cos(turn_rad).sum() * step_m, abs=1e-4)
     assert float(y_m) == pytest.approx(np.sin(turn_rad).sum() * step_m, abs=1e-4)
     assert float(heading_rad) == pytest.approx((begin + end) / 2 * length_m, abs=1e-9)
@@ -54,20 +54,20 @@ def test_a_clothoids_position_is_the_integral_of_its_heading(length_m: float, be
 def test_a_clothoid_is_the_fresnel_integral() -> None:
     """A clothoid from straight to a radius of 50 m in 100 m ends at the tabulated point of Euler's spiral."""
     line = Centreline(0.0, (0.0, 0.0, 0.0), [Segment(100.0, 0.0, 0.02)])
-    x_m, y_m, _, _ = line.point(100.0)
-    # x = a sqrt(2) integral of cos t^2 to 1, y likewise with sin: 0.904524238, 0.310268302; a = 70.71 m
+    x_m, y_m, _, _ = line.sample(100.0)
+    # x and y are the integrals of cos t^2 and sin t^2 from 0 to 1 (0.904524238 and 0.310268302), times 100 m.
     assert (float(x_m), float(y_m)) == pytest.approx((90.4524238, 31.0268302), abs=1e-6)
 
 
 @settings(max_examples=100)
 @given(SEGMENTS)
 def test_a_centreline_is_continuous(segments: list[Segment]) -> None:
-    """Position and heading are continuous across every joint, and curvature is that of the segments."""
+    """Position and heading are continuous at every joint, and on both sides of it the curvature is the segment's."""
     line = line_of(segments)
     joint_m = -10.0
     for before, after in itertools.pairwise(segments):
         joint_m += before.length_m
-        x_m, y_m, heading_rad, curvature = line.point([joint_m - 1e-6, joint_m + 1e-6])
+        x_m, y_m, heading_rad, curvature = line.sample([joint_m - 1e-6, joint_m + 1e-6])
         assert math.hypot(x_m[1] - x_m[0], y_m[1] - y_m[0]) == pytest.approx(2e-6, abs=1e-7)
         assert heading_rad[1] - heading_rad[0] == pytest.approx(0.0, abs=1e-6)
         assert curvature.tolist() == pytest.approx([before.end_curvature_per_m, after.curvature_per_m], abs=1e-6)
@@ -76,7 +76,7 @@ def test_a_centreline_is_continuous(segments: list[Segment]) -> None:
 def test_a_centreline_is_straight_beyond_both_ends() -> None:
     """The line is straight before the first segment and after the last one."""
     line = line_of([Segment(30.0, 0.02, 0.02)])
-    _, _, heading_rad, curvature = line.point([-60.0, -11.0, 20.1, 70.0])
+    _, _, heading_rad, curvature = line.sample([-60.0, -11.0, 20.1, 70.0])
     assert heading_rad[0] == heading_rad[1]
     assert heading_rad[2] == heading_rad[3]
     assert curvature.tolist() == [0.0, 0.0, 0.0, 0.0]

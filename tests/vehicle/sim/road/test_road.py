@@ -15,7 +15,7 @@ ROUTES = {
     "c": (292.56, -90.17, 134.96, 216.68, 367.69, -0.43),
     "c_key": (163.68, -61.57, 134.96, 231.83, 367.64, 0.30),
 }
-"""Properties of the six routes' lane in the map."""
+"""Properties of the driven lane of the six routes, from the map that they come from."""
 
 
 @pytest.fixture(scope="module")
@@ -33,11 +33,11 @@ def test_a_route_has_the_shape_of_the_map(name: str) -> None:
     """A route's length, turn, smallest radius and start pose are those of the map's lane."""
     length_m, turn_deg, radius_m, *start = ROUTES[name]
     road = load_road(name)
-    assert road.length_m == pytest.approx(length_m, abs=0.01)
-    _, _, heading_rad, _ = road.point([0.0, road.length_m])
+    assert road.route_length_m == pytest.approx(length_m, abs=0.01)
+    heading_rad = road.centre_at([0.0, road.route_length_m]).heading_rad
     assert math.degrees(heading_rad[1] - heading_rad[0]) == pytest.approx(turn_deg, abs=0.02)
-    curvature = road.point(np.arange(0.0, road.length_m, 0.5))[3]
-    assert 1 / np.abs(curvature).max() == pytest.approx(radius_m, abs=0.01)
+    curvature_per_m = road.centre_at(np.arange(0.0, road.route_length_m, 0.5)).curvature_per_m
+    assert 1 / np.abs(curvature_per_m).max() == pytest.approx(radius_m, abs=0.01)
     x_m, y_m, start_rad = road.start
     assert (x_m, y_m, math.degrees(start_rad)) == pytest.approx(start, abs=0.01)
 
@@ -55,12 +55,12 @@ def test_a_route_has_the_lanes_of_the_map(name: str) -> None:
 
 @pytest.mark.parametrize("name", ROUTES)
 def test_a_road_extends_beyond_its_route(name: str) -> None:
-    """A road has at least 20 m before the start and 60 m beyond the end, and continues straight after these."""
+    """A road has at least 20 m before the start and 60 m beyond the end of its route, and is straight beyond them."""
     road = load_road(name)
     assert road.first_m <= -20.0
-    assert road.last_m > road.length_m + 60.0
+    assert road.last_m > road.route_length_m + 60.0
     for s_m in (road.first_m - 30.0, road.last_m):
-        step = np.diff(road.across([s_m, s_m + 20.0, s_m + 30.0], 0.0), axis=0)
+        step = np.diff(road.point_at([s_m, s_m + 20.0, s_m + 30.0], 0.0), axis=0)
         assert np.hypot(*step.T) == pytest.approx([20.0, 10.0])
 
 
@@ -69,8 +69,8 @@ def test_the_route_ends_where_the_map_says(road: Road) -> None:
     heading_rad = 3.1245246695832329  # the end is 42.464 m along the map's line and 12.25 m to its right
     x_m = 341.47150492643561 + 42.46406 * math.cos(heading_rad) + 12.25 * math.sin(heading_rad)
     y_m = -26.389396319849876 + 42.46406 * math.sin(heading_rad) - 12.25 * math.cos(heading_rad)
-    end_x_m, end_y_m, _, _ = road.point(road.length_m)
-    assert (float(end_x_m), float(end_y_m)) == pytest.approx((x_m, y_m), abs=0.001)
+    end = road.centre_at(road.route_length_m)
+    assert (float(end.x_m), float(end.y_m)) == pytest.approx((x_m, y_m), abs=0.001)
 
 
 @pytest.mark.parametrize(
@@ -80,28 +80,29 @@ def test_a_key_part_is_the_same_road_with_other_stations(key: str, whole: str, f
     """A key part has its line, marks, dashes, rails and ends in the same places as its whole road."""
     part, road = load_road(key), load_road(whole)
     stations_m = np.linspace(part.first_m, part.last_m, 50)
-    np.testing.assert_allclose(part.across(stations_m, -3.0), road.across(stations_m + from_m, -3.0), atol=1e-9)
+    np.testing.assert_allclose(part.point_at(stations_m, -3.0), road.point_at(stations_m + from_m, -3.0), atol=1e-9)
     assert (part.first_m, part.last_m) == pytest.approx((road.first_m - from_m, road.last_m - from_m))
-    for my_rail, their_rail in zip(part.rails, road.rails, strict=True):
-        assert (my_rail.from_m, my_rail.to_m) == pytest.approx((their_rail.from_m - from_m, their_rail.to_m - from_m))
-    for my_mark, their_mark in zip(part.marks, road.marks, strict=True):
-        assert (my_mark.from_m, my_mark.to_m) == pytest.approx((their_mark.from_m - from_m, their_mark.to_m - from_m))
-        mine_m = my_mark.dashes_m(part.first_m, part.last_m)
-        np.testing.assert_allclose(mine_m + from_m, their_mark.dashes_m(road.first_m, road.last_m))
+    for part_rail, rail in zip(part.rails, road.rails, strict=True):
+        assert (part_rail.from_m, part_rail.to_m) == pytest.approx((rail.from_m - from_m, rail.to_m - from_m))
+    for part_mark, mark in zip(part.marks, road.marks, strict=True):
+        assert (part_mark.from_m, part_mark.to_m) == pytest.approx((mark.from_m - from_m, mark.to_m - from_m))
+        dash_begins_m = part_mark.dash_begins_m(part.first_m, part.last_m)
+        np.testing.assert_allclose(dash_begins_m + from_m, mark.dash_begins_m(road.first_m, road.last_m))
 
 
 def test_a_broken_mark_has_whole_dashes_within_its_range(road: Road) -> None:
     """A broken mark has a whole dash in each period and none that exceeds its ends."""
     mark = next(mark for mark in road.marks if mark.kind == "broken" and math.isfinite(mark.from_m))
-    begin_m = mark.dashes_m(road.first_m, 100.0)
+    begin_m = mark.dash_begins_m(road.first_m, 100.0)
     assert (np.diff(begin_m) == mark.dash_m + mark.gap_m).all()
     assert mark.from_m <= begin_m[0] < mark.from_m + mark.dash_m + mark.gap_m
-    assert 100.0 - mark.dash_m - mark.gap_m - mark.dash_m < begin_m[-1] <= 100.0 - mark.dash_m
+    last_possible_m = 100.0 - mark.dash_m
+    assert last_possible_m - (mark.dash_m + mark.gap_m) < begin_m[-1] <= last_possible_m
 
 
 def test_projection_searches_only_near_the_last_station(road: Road) -> None:
     """A projection from a distant station stays within its window."""
-    x_m, y_m = road.across(100.0, 0.0).tolist()
+    x_m, y_m = road.point_at(100.0, 0.0).tolist()
     assert road.project(x_m, y_m, 20.0)[0] <= 35.0
 
 

@@ -18,18 +18,18 @@ def test_the_documented_example_is_a_valid_road() -> None:
     assert text is not None
     assert len(text[1].splitlines()) <= 10
     road = parse_road(text[1], source="my_bend.yaml")
-    assert (road.length_m, road.first_m, road.last_m) == (250.0, -20.0, 350.0)
+    assert (road.route_length_m, road.first_m, road.last_m) == (250.0, -20.0, 350.0)
     assert road.lanes.edges_m == (-1.75, 1.75, 5.25)
     assert [(mark.offset_m, mark.kind) for mark in road.marks] == [(-1.75, "solid"), (1.75, "broken"), (5.25, "solid")]
     assert [(strip.left_m, strip.right_m) for strip in road.paved] == [(5.75, -2.25)]
-    assert float(np.abs(road.point(np.arange(0.0, 250.0))[3]).max()) == pytest.approx(0.02)
+    assert float(np.abs(road.centre_at(np.arange(0.0, 250.0)).curvature_per_m).max()) == pytest.approx(0.02)
 
 
 def test_a_title_and_a_segment_make_a_road() -> None:
     """Every other key has a default: one lane of 3.5 m with marks and shoulders, from the origin along x."""
     road = parse_road(SHORT, source="x.yaml")
     assert road.start == (0.0, 0.0, 0.0)
-    assert road.length_m == 100.0
+    assert road.route_length_m == 100.0
     assert road.lanes.edges_m == (-1.75, 1.75)
     assert road.rails == ()
 
@@ -46,7 +46,7 @@ BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"{new}: &{new} [{', '.join([f'*{old}'] * 9)}]\n" for old, new in itertools.pairwise("abcdefghij")
 )
 BOMB += "title: x\nsegments: *j\n"
-"""Expanded it would have a thousand million words."""
+"""YAML of a few lines whose aliases expand to a thousand million words."""
 
 REJECTED = {
     "no segments": ("title: x", r"'segments' is missing"),
@@ -59,7 +59,10 @@ REJECTED = {
     "a text for a number": ("title: x\nsegments: [{length_m: '3'}]", r"'segments\.0\.length_m'.*number, not '3'"),
     "huge": ("title: x\nsegments: [{length_m: 1.0e+300}]", r"'segments\.0\.length_m'.*20000"),
     "an integer beyond floats": (f"title: x\nsegments: [{{length_m: 1{'0' * 400}}}]", r"'segments\.0\.length_m'"),
-    "long in all": ("title: x\nsegments: [{length_m: 15000}, {length_m: 15000}]", r"30000 m long: 20 km are enough"),
+    "too long in total": (
+        "title: x\nsegments: [{length_m: 15000}, {length_m: 15000}]",
+        r"30000 m long: 20 km are enough",
+    ),
     "driven lane": (SHORT + "lanes: {widths_m: [3, 3], driven: 2}", r"lanes\.driven is 2, but lanes count from 0 to 1"),
     "negative lane": (SHORT + "lanes: {driven: -1}", r"'lanes\.driven'"),
     "no asphalt": (SHORT + "paved: [{left_m: 9, right_m: 3}]", r"no asphalt from 0\.0 m to 100\.0 m"),
@@ -92,15 +95,15 @@ REJECTED = {
     "a list of itself": ("title: x\nsegments: &s [*s]", r"'segments\.0' .*keys and values, not this list"),
     "lists of lists of lists": (BOMB, r"'segments\.0' .*keys and values, not this list"),
     "not YAML": ("title: [", r"is not YAML"),
-    "a date that is none": ("title: 2026-13-45", r"is not YAML"),
-    "deep": ("[" * 1500, r"is not YAML"),
+    "an impossible date": ("title: 2026-13-45", r"is not YAML"),
+    "nested too deeply": ("[" * 1500, r"is not YAML"),
     "a list": ("- 3", r"keys and values.*not a list"),
     "nothing": ("", r"keys and values"),
-    "part of nothing": ("title: x\npart_of: z\nfrom_m: 0\nlength_m: 30", r"no road"),
+    "part of an unknown road": ("title: x\npart_of: z\nfrom_m: 0\nlength_m: 30", r"no road"),
     "part of a part": ("title: x\npart_of: a_key\nfrom_m: 0\nlength_m: 30", r"a_key is itself a part.*name the whole"),
     "part too long": ("title: x\npart_of: a\nfrom_m: 400\nlength_m: 30", r"a has only 5\.\d m from 400\.0 m on"),
     "part beyond its road": ("title: x\npart_of: a\nfrom_m: 1000\nlength_m: 30", r"a ends at 405\.\d m: from_m must"),
-    "dashes like dust": ("title: x\nsegments: [{length_m: 9}]\nmarks: [{offset_m: 1, dash_m: 0.01}]", r"dash_m.*0\.1"),
+    "dashes too short": ("title: x\nsegments: [{length_m: 9}]\nmarks: [{offset_m: 1, dash_m: 0.01}]", r"dash_m.*0\.1"),
     "part with segments": ("title: x\npart_of: a\nfrom_m: 0\nlength_m: 30\nsegments: []", r"unknown key 'segments'"),
 }
 

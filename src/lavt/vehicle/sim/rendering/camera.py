@@ -12,7 +12,7 @@ from lavt.vehicle.sim.rendering.renderer import Renderer, SceneryKind
 from lavt.vehicle.sim.road.road import Road
 
 MAX_EXTRAPOLATION_NS = 20 * NS_PER_MS
-"""The longest extrapolation beyond the newest pose; the physics may lag a little."""
+"""The longest extrapolation beyond the newest pose. It is longer than a step because the physics may lag a little."""
 
 
 class SimCamera:
@@ -66,8 +66,9 @@ class SimCamera:
 def interpolate_pose(poses: Sequence[Pose], at_ns: int) -> Pose | None:
     """Return the pose at a time, interpolated between poses sorted by time; None when all are later.
 
-    Beyond the newest pose the motion of the last two is extrapolated, for `MAX_EXTRAPOLATION_NS` at most: the physics
-    reports a pose after its time, so the last one is a step old when the shutter closes.
+    Beyond the newest pose, the motion between the last two poses is extrapolated for at most `MAX_EXTRAPOLATION_NS`.
+    This is necessary because the physics reports a pose after its time, so the newest pose is a step old when the
+    shutter closes.
     """
     before = newest_pose(poses, at_ns)
     if before is None or before.mono_ns == at_ns or len(poses) < 2:

@@ -21,8 +21,8 @@ from lavt.vehicle.sim.rendering.surface_wear import surface_wear
 from lavt.vehicle.sim.rendering.textures import SCALES_M, all_textures
 from lavt.vehicle.sim.road.road import Road
 from lavt.vehicle.sim.road.strips import (
+    MAX_PIECE_M,
     OVERLAP_M,
-    PIECE_M,
     Grey,
     Square,
     Strips,
@@ -35,8 +35,10 @@ TILE_M = (8.0, 16.0, 32.0, 32.0, 64.0)
 """The length of a tile's edge at each scale."""
 
 _MAX_TILES = (40, 60, 160, 400, 400)
-"""Cache sizes. The two finest scales are painted during the drive, a few tiles at a time; the others fit a road."""
-_GRAVEL_M = 1.6
+"""The number of cached tiles of each scale. The two finest scales are painted during the drive, a few tiles at a time;
+the tiles of the others along a whole road fit into the cache."""
+
+_GRAVEL_WIDTH_M = 1.6
 _PAINT = {"white": (212, 218, 216), "yellow": (62, 172, 208)}
 _TRACK_PROFILE = ((1.1, 4), (0.8, 8), (0.5, 12))
 """Wheel tracks, which are darker than the rest of a lane: width (m) and grey levels, widest first."""
@@ -49,37 +51,38 @@ class Ground:
 
     def __init__(self, road: Road, light: Light, shadows: Shadows | None) -> None:
         self._tiles: tuple[OrderedDict[tuple[int, int], Picture], ...] = tuple(OrderedDict() for _ in SCALES_M)
-        # Factors in 255ths: of a surface in the sun, and the share of it that is lost in full shadow.
-        self._lit = _bytes(np.array(light.lit))
-        self._dimmed = _bytes(1.0 - np.array(light.shade) / np.array(light.lit))
+        # Both in 255ths: the light on a surface in the sun, and the share of it that is missing in full shadow.
+        self._sunlight = _bytes(np.array(light.lit))
+        self._missing_in_shadow = _bytes(1.0 - np.array(light.shade) / np.array(light.lit))
         self._shadows = shadows
         self._gravel, self._asphalt = (
             join_strips(
                 [
-                    strip_along(road, each.left_m + wide_m, each.right_m - wide_m, each.from_m, each.to_m)
-                    for each in road.paved
+                    strip_along(road, strip.left_m + margin_m, strip.right_m - margin_m, strip.from_m, strip.to_m)
+                    for strip in road.paved
                 ]
             )
-            for wide_m in (_GRAVEL_M, 0.0)
+            for margin_m in (_GRAVEL_WIDTH_M, 0.0)
         )
         self._tracks = _tracks(road)
         self._wear = surface_wear(road)
         self._marks = [(colour, width_m, _marks(road, colour, width_m)) for colour, width_m in _mark_styles(road)]
 
-    def assemble(self, level: int, low: tuple[int, int], count: int) -> Picture:
-        """Return a picture of `count` x `count` tiles from the tile index `low` (x, y), with an unused fourth channel.
+    def assemble(self, level: int, first_tile: tuple[int, int], count: int) -> Picture:
+        """Return a picture of `count` x `count` tiles, the first of which has the index `first_tile` (x, y).
 
-        Row 0 is at low y, column 0 at low x; the middle of texel i is (i + 0.5) * scale from the corner. OpenCV warps
-        four bytes per texel in less than half the time of three.
+        Row 0 has the lowest y and column 0 the lowest x; the middle of texel i is (i + 0.5) * scale from the corner.
+        The picture has an unused fourth channel, because OpenCV warps four bytes per texel in less than half the time
+        of three.
         """
         pixels = round(TILE_M[level] / SCALES_M[level])
-        assemble = np.empty((count * pixels, count * pixels, 4), dtype=np.uint8)
+        assembled = np.empty((count * pixels, count * pixels, 4), dtype=np.uint8)
         for row in range(count):
             for column in range(count):
-                tile = self.tile(level, low[0] + column, low[1] + row)
+                tile = self.tile(level, first_tile[0] + column, first_tile[1] + row)
                 part = np.s_[row * pixels : (row + 1) * pixels, column * pixels : (column + 1) * pixels]
-                cv2.cvtColor(tile, cv2.COLOR_BGR2BGRA, assemble[part])
-        return assemble
+                cv2.cvtColor(tile, cv2.COLOR_BGR2BGRA, assembled[part])
+        return assembled
 
     def has_room(self, level: int) -> bool:
         """Return whether one more tile of a scale fits the cache without evicting another."""
@@ -108,11 +111,11 @@ class Ground:
         else:
             picture = _blend(self._paint_verge(level, square), self._paint_asphalt(level, square), asphalt)
         shade = None if self._shadows is None else self._shadows.mask(square)
-        lit = _multiply_colour(picture, self._lit)
+        sunlit = _multiply_colour(picture, self._sunlight)
         if shade is None:
-            return lit
-        gone = cv2.multiply(lit, _multiply_colour(cv2.merge((shade, shade, shade)), self._dimmed), scale=1 / 255)
-        return np.asarray(cv2.subtract(lit, gone), dtype=np.uint8)
+            return sunlit
+        missing_share = _multiply_colour(cv2.merge((shade, shade, shade)), self._missing_in_shadow)
+        return np.asarray(cv2.subtract(sunlit, cv2.multiply(sunlit, missing_share, scale=1 / 255)), dtype=np.uint8)
 
     def _paint_verge(self, level: int, square: Square) -> Picture:
         textures = all_textures()[level]
@@ -122,15 +125,15 @@ class Ground:
 
     def _paint_asphalt(self, level: int, square: Square) -> Picture:
         textures, scale_m = all_textures()[level], SCALES_M[level]
-        darker = np.zeros((square.pixels, square.pixels), dtype=np.uint8)
+        darkening = np.zeros((square.pixels, square.pixels), dtype=np.uint8)
         for strips, grey in self._tracks:
-            strips.fill(darker, square, grey)
+            strips.fill(darkening, square, grey)
         for wear in self._wear:
             # Strips thinner than a texel are still drawn about one texel wide: reduce their strength accordingly.
-            grey = round(wear.grey * min(1.0, wear.width_m / scale_m))
+            grey = round(wear.darkening * min(1.0, wear.width_m / scale_m))
             if grey:
-                wear.strips.fill(darker, square, grey)
-        worn = np.asarray(cv2.subtract(_crop_texture(textures.asphalt, square), darker), dtype=np.uint8)
+                wear.strips.fill(darkening, square, grey)
+        worn = np.asarray(cv2.subtract(_crop_texture(textures.asphalt, square), darkening), dtype=np.uint8)
         picture = np.asarray(cv2.merge((worn, worn, worn - 2)), dtype=np.uint8)
         for colour, width_m, strips in self._marks:
             paint = strips.mask(square)
@@ -177,10 +180,10 @@ def _tracks(road: Road) -> list[tuple[Strips, int]]:
     """Return the strips of wheel tracks and oil in every lane of the driven direction, with their grey levels."""
     edges = np.array(road.lanes.edges_m)
     centres = (edges[1:] + edges[:-1]) / 2
-    wheels = [centre + side for centre in centres for side in (-0.85, 0.85)]
+    wheels = [centre + from_centre_m for centre in centres for from_centre_m in (-0.85, 0.85)]
     bands = [(centres, *_OIL)] + [(wheels, width_m, grey) for width_m, grey in _TRACK_PROFILE]
     return [
-        (join_strips([strip_along(road, at + width_m / 2, at - width_m / 2) for at in offsets]), grey)
+        (join_strips([strip_along(road, middle_m + width_m / 2, middle_m - width_m / 2) for middle_m in offsets]), grey)
         for offsets, width_m, grey in bands
     ]
 
@@ -188,25 +191,28 @@ def _tracks(road: Road) -> list[tuple[Strips, int]]:
 def _mark_styles(road: Road) -> list[tuple[str, float]]:
     """Return the colours and widths (m) of marks, white first."""
     return [
-        (colour, each) for colour in _PAINT for each in sorted({m.width_m for m in road.marks if m.colour == colour})
+        (colour, width_m)
+        for colour in _PAINT
+        for width_m in sorted({mark.width_m for mark in road.marks if mark.colour == colour})
     ]
 
 
 def _marks(road: Road, colour: str, width_m: float) -> Strips:
-    found = []
+    """Return the strips of all marks of one colour and width."""
+    parts = []
     for mark in road.marks:
         if (mark.colour, mark.width_m) != (colour, width_m):
             continue
         left_m, right_m = mark.offset_m + mark.width_m / 2, mark.offset_m - mark.width_m / 2
         if mark.kind == "solid":
-            found.append(strip_along(road, left_m, right_m, mark.from_m, mark.to_m))
+            parts.append(strip_along(road, left_m, right_m, mark.from_m, mark.to_m))
             continue
-        begin = mark.dashes_m(road.first_m, road.last_m)
+        dash_begins_m = mark.dash_begins_m(road.first_m, road.last_m)
         # At least two pieces per dash, so that it bends with the road.
-        count = max(2, math.ceil(mark.dash_m / PIECE_M))
-        parts = (begin + np.arange(count)[:, None] * (mark.dash_m / count)).ravel()
-        found.append(strip_pieces(road, left_m, right_m, parts, parts + mark.dash_m / count + OVERLAP_M))
-    return join_strips(found)
+        count = max(2, math.ceil(mark.dash_m / MAX_PIECE_M))
+        begins_m = (dash_begins_m + np.arange(count)[:, None] * (mark.dash_m / count)).ravel()
+        parts.append(strip_pieces(road, left_m, right_m, begins_m, begins_m + mark.dash_m / count + OVERLAP_M))
+    return join_strips(parts)
 
 
 def _blend(under: Picture, over: Picture, alpha: Grey) -> Picture:
@@ -217,7 +223,7 @@ def _blend(under: Picture, over: Picture, alpha: Grey) -> Picture:
 
 
 def _mottle(grass: Picture, square: Square) -> Picture:
-    """Modulate the grass with wavelengths that do not divide its period, so that the repetition is not visible."""
+    """Vary the brightness of the grass with wavelengths that do not divide its period, which hides the repetition."""
     count = 16
     middle_m = (np.arange(count) + 0.5) * square.edge_m / count
     x_m, y_m = square.left_m + middle_m, (square.low_m + middle_m)[:, None]

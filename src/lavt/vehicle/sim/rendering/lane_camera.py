@@ -12,12 +12,15 @@ from lavt.vehicle.camera import CapturedFrame, newest_pose
 from lavt.vehicle.sim.road.road import Road
 
 LINEAR_BELOW_M = 6.0
-"""A visible length below this gives no curvature, as in `lane_fit`."""
-POINTS_AT_LEAST = 3
-_ABEAM_RAD = math.radians(89.9)
-"""Edges of the field of view are limited to this angle, because beyond it they cover no ground ahead."""
+"""If the visible part of the lane is shorter than this, no curvature is fitted, as in `lane_fit`."""
 
-STATION_M = 1.0
+MIN_POINTS = 3
+"""With fewer visible points of the centre no lane is fitted."""
+
+_ABEAM_RAD = math.radians(89.9)
+"""The edges of the field of view are limited to this angle, because beyond it there is no ground ahead."""
+
+STATION_SPACING_M = 1.0
 """The spacing of the sampled points on the lane's lines."""
 
 
@@ -26,7 +29,8 @@ class LaneCamera:
 
     It covers the detector's ground: `near_m` to `far_m` ahead of the rear axle and `half_width_m` to both sides, within
     the camera's field of view. The camera's position, yaw and horizontal angle matter; pitch and roll do not.
-    Confidence is the share of the lane's two lines within that ground. A car turned by more than 90 degrees sees none.
+    Confidence is the share of the lane's two lines within that ground. A car turned by more than 90 degrees sees no
+    lane.
     """
 
     def __init__(
@@ -54,11 +58,11 @@ class LaneCamera:
             math.tan(min(max(model.yaw_rad + edge_rad, -_ABEAM_RAD), _ABEAM_RAD)) for edge_rad in (half_rad, -half_rad)
         )
         self._width_m = road.lanes.widths_m[road.lanes.driven]
-        self._stations_ahead = math.ceil(math.hypot(far_m, half_width_m) / STATION_M) + 1
-        stations_m = np.arange(road.length_m / STATION_M + 2 * self._stations_ahead) * STATION_M
-        lines = [road.across(stations_m, offset_m) for offset_m in (0.0, self._width_m / 2, -self._width_m / 2)]
-        self._stations: list[list[float]] = np.concatenate(lines, axis=1).tolist()
-        """World x and y of the lane's centre, left line and right line at each station."""
+        self._count_ahead = math.ceil(math.hypot(far_m, half_width_m) / STATION_SPACING_M) + 1
+        stations_m = np.arange(road.route_length_m / STATION_SPACING_M + 2 * self._count_ahead) * STATION_SPACING_M
+        lines = [road.point_at(stations_m, offset_m) for offset_m in (0.0, self._width_m / 2, -self._width_m / 2)]
+        self._line_points: list[list[float]] = np.concatenate(lines, axis=1).tolist()
+        """One row for each station: world x and y of the lane's centre, of its left line, and of its right line."""
         self._near_s_m = 0.0
 
     def capture(self, number: int, at_ns: int, pose: Pose | None) -> CapturedFrame | None:
@@ -78,41 +82,41 @@ class LaneCamera:
         return self.capture(number, middle_ns, Pose(middle_ns, x_m, y_m, first.heading_rad + turn_rad / 2))
 
     def observe_lane(self, pose: Pose) -> Lane:
-        """Fit the driven lane's centre where its lines are in view; the confidence is 0 where none is."""
+        """Fit the driven lane's centre where its lines are in view; the confidence is 0 if none is."""
         self._near_s_m = self._road.project(pose.x_m, pose.y_m, self._near_s_m)[0]
-        first = max(math.ceil(self._near_s_m / STATION_M), 0)
+        first = max(math.ceil(self._near_s_m / STATION_SPACING_M), 0)
         cosine, sine = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
         x_m, y_m = pose.x_m, pose.y_m
         near_m, far_m, half_width_m = self._near_m, self._far_m, self._half_width_m
         left_slope, right_slope = self._left_slope, self._right_slope
         lens_x_m, lens_y_m = self.model.x_m, self.model.y_m
-        centre, lines_seen = [], 0
+        centre, visible_line_points = [], 0
         # The two lines are written out: a loop over them would take half of this function's time.
-        for centre_x, centre_y, left_x, left_y, right_x, right_y in self._stations[
-            first : first + self._stations_ahead
+        for centre_x, centre_y, left_x, left_y, right_x, right_y in self._line_points[
+            first : first + self._count_ahead
         ]:
-            seen = 0
+            visible_lines = 0
             dx, dy = left_x - x_m, left_y - y_m
             ahead_m = dx * cosine + dy * sine
             if near_m <= ahead_m <= far_m:
                 left_m, depth_m = dy * cosine - dx * sine, ahead_m - lens_x_m
                 in_view = right_slope * depth_m <= left_m - lens_y_m <= left_slope * depth_m
                 if in_view and -half_width_m <= left_m <= half_width_m:
-                    seen = 1
+                    visible_lines = 1
             dx, dy = right_x - x_m, right_y - y_m
             ahead_m = dx * cosine + dy * sine
             if near_m <= ahead_m <= far_m:
                 left_m, depth_m = dy * cosine - dx * sine, ahead_m - lens_x_m
                 in_view = right_slope * depth_m <= left_m - lens_y_m <= left_slope * depth_m
                 if in_view and -half_width_m <= left_m <= half_width_m:
-                    seen += 1
-            if seen:
-                lines_seen += seen
+                    visible_lines += 1
+            if visible_lines:
+                visible_line_points += visible_lines
                 dx, dy = centre_x - x_m, centre_y - y_m
                 centre.append((dx * cosine + dy * sine, dy * cosine - dx * sine))
-        if len(centre) < POINTS_AT_LEAST:
+        if len(centre) < MIN_POINTS:
             return Lane((0.0, 0.0, 0.0), self._width_m, near_m, far_m, 0.0)
-        share = lines_seen * STATION_M / (2 * (far_m - near_m))
+        share = visible_line_points * STATION_SPACING_M / (2 * (far_m - near_m))
         near_m, far_m = min(centre)[0], max(centre)[0]
         return Lane(
             _fit_centre(centre, far_m - near_m >= LINEAR_BELOW_M), self._width_m, near_m, far_m, min(share, 1.0)

@@ -1,4 +1,4 @@
-"""The lighting of a road: the sun's position, and the colours of sun, shade, sky and haze.
+"""The lighting of a road: the sun's position, and the colours of sunlight, shade, sky and haze.
 
 Surfaces are defined by their colours in the noon sun. A light multiplies these by one factor in the sun and another in
 the shade. The factors include a camera's exposure control, so an overcast day is not much darker than a sunny one. All
@@ -58,7 +58,10 @@ class Light:
         return np.asarray(-towards[:2] / towards[2])
 
     def upright_factors(self, normals: FloatArray) -> FloatArray:
-        """Return factors (n, 3) for upright faces with horizontal unit normals (n, 2); faces turned away are shaded."""
+        """Return factors (n, 3) for upright faces with horizontal unit normals (n, 2).
+
+        Faces turned away from the sun are in the shade.
+        """
         lit, shade = np.array(self.lit), np.array(self.shade)
         if not self.shadows:
             return np.broadcast_to(lit, (len(normals), 3))

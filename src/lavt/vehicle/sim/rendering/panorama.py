@@ -44,7 +44,7 @@ class Panorama:
 
 @lru_cache(maxsize=6)
 def _paint(rows: int, horizon: float, focal_px: float, light: Light, *, plain: bool) -> NDArray[np.uint32]:
-    """Return the panorama (rows, columns), each texel one word of blue, green, red and an unused byte."""
+    """Return the panorama (rows, columns); a texel is a 32-bit word of blue, green, red and an unused byte."""
     # The height of each row above the horizon, as a share of the focal length.
     height = np.asarray((horizon - np.arange(rows)) / focal_px, dtype=np.float64)[:, None]
     # Column c shows the azimuth -c, so that columns run to the right.

@@ -1,8 +1,9 @@
 """The renderer of a road for a camera on a car, on the CPU.
 
-The ground is warped from top-view tiles, in five bands of rows with finer scales nearer (a clipmap). Sky and hills are
-cropped from a panorama, upright objects are drawn from far to near, and sensor noise is added. A frame depends only on
-the poses, its number and the seed: it is byte-for-byte reproducible for equal versions and processor features.
+The ground is warped from top-view tiles, in five bands of picture rows; nearer bands use finer scales (a clipmap). Sky
+and hills are cropped from a panorama, upright objects are drawn from far to near, and sensor noise is added. A frame
+depends only on the poses, its number and the seed. It is byte-for-byte reproducible for equal versions and processor
+features.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from lavt.vehicle.sim.rendering.textures import SCALES_M
 from lavt.vehicle.sim.road.road import Road
 
 SceneryKind = Literal["full", "light", "none"]
-"""full: everything; light: no trees, lamp posts, buildings or clouds; none: no rails or shadows either."""
+"""full: everything; light: without trees, lamp posts, buildings and clouds; none: also without rails and shadows."""
 
 MAX_PARTS, MAX_INSTANTS = 8, 16
 """The maximum number of parts of an exposure, and of instants per part at which the near ground is drawn."""
@@ -44,15 +45,24 @@ BAND_FAR_M = (5.0, 11.0, 26.0, 60.0, 160.0)
 """The distance ahead of the camera that each scale of the ground reaches."""
 
 _MAX_LINES = 6
-_TEXELS_A_LINE = 2.5
-_STEP_PX = 3.0
+_TEXELS_PER_LINE = 2.5
+"""A picture row is drawn as the mean of at most `_MAX_LINES` lines, each of which covers about this many texels."""
+
+_MAX_STEP_PX = 3.0
+"""The distance that the picture may move between two instants of an exposure."""
+
 _NEAR_BANDS = 2
+"""The number of bands that motion blur treats as near ground."""
+
 _NOISE_DEVIATION = 2.2
 _NOISE_MARGIN_PX = 64
 _HAZE_FROM_M = 11.0
 _PREPARED_FROM_LEVEL = 2
-_SWERVE_M = 6.0
-_SWERVE_RAD = 0.6
+"""`prepare` paints this scale and the coarser ones; the finer ones are painted during the drive."""
+
+_PREPARED_SWERVE_M = 6.0
+_PREPARED_SWERVE_RAD = 0.6
+"""`prepare` paints the ground that is visible to a car this far beside the route, turned by this angle."""
 
 
 class Band:
@@ -76,7 +86,7 @@ class Band:
         self._tiles_around = math.ceil(reach_m / self._tile_m)
         middle_m = math.sqrt(max(near_m, 2.0) * far_m)
         row_m = middle_m**2 / (model.focal_px * model.z_m)
-        self.lines = min(max(round(row_m / (SCALES_M[level] * _TEXELS_A_LINE)), 1), _MAX_LINES)
+        self.lines = min(max(round(row_m / (SCALES_M[level] * _TEXELS_PER_LINE)), 1), _MAX_LINES)
 
     @property
     def tiles(self) -> int:
@@ -95,13 +105,13 @@ class Band:
         y_m = placement.y_m + self._ahead_m * math.sin(placement.heading_rad)
         return math.floor(x_m / self._tile_m) - self._tiles_around, math.floor(y_m / self._tile_m) - self._tiles_around
 
-    def texel_from_ground(self, low: tuple[int, int]) -> FloatArray:
-        """Return the 3 x 3 matrix from the world's ground to texels of the square whose first tile is `low`."""
+    def texel_from_ground(self, first_tile: tuple[int, int]) -> FloatArray:
+        """Return the 3 x 3 matrix from the world's ground to texels of the square of tiles."""
         scale_m = SCALES_M[self.level]
         return np.array(
             [
-                [1 / scale_m, 0.0, -low[0] * self._tile_m / scale_m - 0.5],
-                [0.0, 1 / scale_m, -low[1] * self._tile_m / scale_m - 0.5],
+                [1 / scale_m, 0.0, -first_tile[0] * self._tile_m / scale_m - 0.5],
+                [0.0, 1 / scale_m, -first_tile[1] * self._tile_m / scale_m - 0.5],
                 [0.0, 0.0, 1.0],
             ]
         )
@@ -120,17 +130,18 @@ class Renderer:
         self._bands = tuple(Band(self._level_model, level) for level in range(len(SCALES_M)))
         self._panorama = Panorama(self._level_model, self._bands[-1].first_row, LIGHTS[light], plain=scenery != "full")
         self._windows: list[tuple[tuple[int, int], Picture] | None] = [None] * len(self._bands)
+        """The square of tiles that each band used last: the index of its first tile, and its texels."""
         self._canvas = np.empty((self._level_model.height_px, self._level_model.width_px, 4), dtype=np.uint8)
         self._haze_factor, self._haze = _haze(self._level_model, self._bands, LIGHTS[light].haze)
         self._noise = _noise(model)
 
     def prepare(self) -> None:
         """Fill the caches whose first use would delay a frame: coarse ground along the route, sprites, textures."""
-        for s_m in np.arange(0.0, self._road.length_m + 16.0, 16.0):
-            heading_rad = float(self._road.point(s_m)[2])
-            for lateral_m in (-_SWERVE_M, 0.0, _SWERVE_M):
-                x_m, y_m = self._road.across(s_m, lateral_m).tolist()
-                for turned_rad in (-_SWERVE_RAD, 0.0, _SWERVE_RAD):
+        for s_m in np.arange(0.0, self._road.route_length_m + 16.0, 16.0):
+            heading_rad = float(self._road.centre_at(s_m).heading_rad)
+            for lateral_m in (-_PREPARED_SWERVE_M, 0.0, _PREPARED_SWERVE_M):
+                x_m, y_m = self._road.point_at(s_m, lateral_m).tolist()
+                for turned_rad in (-_PREPARED_SWERVE_RAD, 0.0, _PREPARED_SWERVE_RAD):
                     self._prepare_ground(place_camera(self._level_model, Pose(0, x_m, y_m, heading_rad + turned_rad)))
         if self._scenery is not None:
             self._scenery.prepare()
@@ -150,25 +161,25 @@ class Renderer:
         """
         parts = _part_count(self._motion_px(begin, end, self._bands[_NEAR_BANDS].end_row), MAX_PARTS)
         instants = _part_count(self._motion_px(begin, end, self._level_model.height_px - 1) / parts, MAX_INSTANTS)
-        light = np.zeros((self._model.height_px, self._model.width_px, 3), dtype=np.uint16)
+        total = np.zeros((self._model.height_px, self._model.width_px, 3), dtype=np.uint16)
         for part in range(parts):
             shares = (part + (np.arange(instants) + 0.5) / instants) / parts
-            near = [_interpolate_pose(begin, end, share) for share in shares.tolist()]
-            light += self._draw_world(_interpolate_pose(begin, end, (part + 0.5) / parts), near)
-        picture = ((light + parts // 2) // parts).astype(np.uint8)
+            near_poses = [_interpolate_pose(begin, end, share) for share in shares.tolist()]
+            total += self._draw_world(_interpolate_pose(begin, end, (part + 0.5) / parts), near_poses)
+        picture = ((total + parts // 2) // parts).astype(np.uint8)
         self._add_noise(picture, number)
         return picture
 
-    def _draw_world(self, pose: Pose, near: Sequence[Pose] = ()) -> Picture:
-        """Return the world seen from `pose`, without noise; the near ground is the mean of its views from `near`."""
+    def _draw_world(self, pose: Pose, near_poses: Sequence[Pose] = ()) -> Picture:
+        """Return the world seen from `pose`, without noise; with several `near_poses` the near ground is the mean."""
         placement = place_camera(self._level_model, pose)
         self._panorama.crop(placement.heading_rad, self._canvas[: self._bands[-1].first_row])
-        blurred = len(near) > 1
+        blurred = len(near_poses) > 1
         homography = placement.ground_from_picture()
         for band in self._bands[_NEAR_BANDS if blurred else 0 :]:
             self._warp(band, placement, homography)
         if blurred:
-            self._blur_near([place_camera(self._level_model, each) for each in near])
+            self._blur_near([place_camera(self._level_model, near_pose) for near_pose in near_poses])
         self._add_haze()
         picture = np.asarray(cv2.cvtColor(self._canvas, cv2.COLOR_BGRA2BGR), dtype=np.uint8)
         if self._scenery is not None:
@@ -179,30 +190,30 @@ class Renderer:
         rows = self._canvas[band.first_row : band.end_row]
         if not len(rows):
             return
-        low = band.first_tile(placement)
-        matrix = band.texel_from_ground(low) @ homography @ band.picture_from_lines
+        first_tile = band.first_tile(placement)
+        matrix = band.texel_from_ground(first_tile) @ homography @ band.picture_from_lines
         flags, size = cv2.WARP_INVERSE_MAP | cv2.INTER_LINEAR, (rows.shape[1], rows.shape[0] * band.lines)
-        window = self._window(band, low)
+        window = self._window(band, first_tile)
         if band.lines == 1:
             cv2.warpPerspective(window, matrix, size, rows, flags, cv2.BORDER_REPLICATE)
             return
         lines = cv2.warpPerspective(window, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
         # NumPy, because OpenCV's reduction by area takes longer than the warp.
-        light = np.add.reduce(lines.reshape(len(rows), band.lines, -1), axis=1, dtype=np.uint16)
-        rows.reshape(len(rows), -1)[:] = (light + band.lines // 2) // band.lines
+        total = np.add.reduce(lines.reshape(len(rows), band.lines, -1), axis=1, dtype=np.uint16)
+        rows.reshape(len(rows), -1)[:] = (total + band.lines // 2) // band.lines
 
-    def _window(self, band: Band, low: tuple[int, int]) -> Picture:
+    def _window(self, band: Band, first_tile: tuple[int, int]) -> Picture:
         cached = self._windows[band.level]
-        if cached is None or cached[0] != low:
-            cached = (low, self._ground.assemble(band.level, low, band.tiles))
+        if cached is None or cached[0] != first_tile:
+            cached = (first_tile, self._ground.assemble(band.level, first_tile, band.tiles))
             self._windows[band.level] = cached
         return cached[1]
 
     def _prepare_ground(self, placement: CameraPlacement) -> None:
         for band in self._bands[_PREPARED_FROM_LEVEL:]:
-            low = band.first_tile(placement)
+            first_x, first_y = band.first_tile(placement)
             for index in range(band.tiles**2 if self._ground.has_room(band.level) else 0):
-                self._ground.tile(band.level, low[0] + index % band.tiles, low[1] + index // band.tiles)
+                self._ground.tile(band.level, first_x + index % band.tiles, first_y + index // band.tiles)
 
     def _add_haze(self) -> None:
         rows = self._canvas[self._bands[-1].first_row :][: len(self._haze_factor)]
@@ -210,7 +221,7 @@ class Renderer:
             cv2.multiply(rows, self._haze_factor, rows, 1 / 255)
             cv2.add(rows, self._haze, rows)
 
-    def _apply_roll(self, level: Picture) -> Picture:
+    def _apply_roll(self, level_picture: Picture) -> Picture:
         model = self._model
         level_from_picture = np.empty((2, 3))
         level_from_picture[:, :2] = roll_matrix(-model.roll_rad)
@@ -218,21 +229,21 @@ class Renderer:
             principal_point(model)
         )
         flags = cv2.WARP_INVERSE_MAP | cv2.INTER_LINEAR
-        turned = cv2.warpAffine(level, level_from_picture, (model.width_px, model.height_px), flags=flags)
-        return np.asarray(turned, dtype=np.uint8)
+        rolled = cv2.warpAffine(level_picture, level_from_picture, (model.width_px, model.height_px), flags=flags)
+        return np.asarray(rolled, dtype=np.uint8)
 
     def _blur_near(self, placements: Sequence[CameraPlacement]) -> None:
         rows = self._canvas[self._bands[_NEAR_BANDS].end_row :]
-        light = np.zeros(rows.shape, dtype=np.uint16)
+        total = np.zeros(rows.shape, dtype=np.uint16)
         for placement in placements:
             homography = placement.ground_from_picture()
             for band in self._bands[:_NEAR_BANDS]:
                 self._warp(band, placement, homography)
-            light += rows
-        rows[:] = (light + len(placements) // 2) // len(placements)
+            total += rows
+        rows[:] = (total + len(placements) // 2) // len(placements)
 
     def _motion_px(self, begin: Pose, end: Pose, row: int) -> float:
-        """Return how far a row's corners, or the horizon if that is more, move in the picture."""
+        """Return how far the ends of a row move in the picture, or how far the horizon moves if that is more."""
         model = self._level_model
         first, last = place_camera(model, begin), place_camera(model, end)
         pixels = np.array([[0.0, row, 1.0], [model.width_px - 1.0, row, 1.0]])
@@ -240,8 +251,8 @@ class Renderer:
         turned_px = model.focal_px * abs(math.remainder(end.heading_rad - begin.heading_rad, 2 * math.pi))
         if (ground[:, 2] <= 0.0).any():
             return turned_px  # the row is above the horizon
-        places = np.column_stack([ground[:, :2] / ground[:, 2:], np.zeros(2)])
-        return max(float(np.hypot(*(last.project(places) - pixels)[:, :2].T).max()), turned_px)
+        points_m = np.column_stack([ground[:, :2] / ground[:, 2:], np.zeros(2)])
+        return max(float(np.hypot(*(last.project(points_m) - pixels)[:, :2].T).max()), turned_px)
 
     def _add_noise(self, picture: Picture, number: int) -> None:
         down, right = stream(self._seed, "sensor noise", number).integers(0, _NOISE_MARGIN_PX, 2).tolist()
@@ -250,7 +261,7 @@ class Renderer:
         cv2.subtract(picture, self._noise[1][part], picture)
 
 
-@lru_cache(maxsize=1)  # up to a gigabyte, for 600 m driven
+@lru_cache(maxsize=1)  # the tiles of one road take up to 0.2 GB
 def world(road: Road, scenery: SceneryKind, light_name: LightName) -> tuple[Ground, Scenery | None]:
     """Return a road's ground and scenery, cached for consecutive runs of a sweep."""
     light = LIGHTS[light_name]
@@ -262,7 +273,7 @@ def world(road: Road, scenery: SceneryKind, light_name: LightName) -> tuple[Grou
 
 
 def _part_count(moved_px: float, limit: int) -> int:
-    return min(max(math.ceil(moved_px / _STEP_PX), 1), limit)
+    return min(max(math.ceil(moved_px / _MAX_STEP_PX), 1), limit)
 
 
 def _interpolate_pose(begin: Pose, end: Pose, share: float) -> Pose:

@@ -21,27 +21,29 @@ FAR_M = 160.0
 """The distance beyond which nothing is drawn."""
 
 _WORLD_SEED = 0
-_DETAIL_M = 45.0
+_DETAIL_VISIBLE_TO_M = 45.0
 _POST_SPACING_M = 4.0
 _LAMP_SPACING_M = 36.0
 _STOREY_M = 3.2
-_AROUND_M = 110.0
-_TREE_EVERY_M2 = 480.0
-_BUILDING_EVERY_M2 = 6200.0
+_SCENERY_WIDTH_M = 110.0
+"""Trees and buildings stand up to this far from the asphalt."""
+
+_GROUND_PER_TREE_M2 = 480.0
+_GROUND_PER_BUILDING_M2 = 6200.0
 
 _BANDS: dict[str, tuple[tuple[float, float, tuple[int, int, int], float], ...]] = {
     "barrier": (
         (0.0, 0.86, (164, 170, 172), FAR_M),
-        (0.0, 0.22, (132, 138, 140), _DETAIL_M),
-        (0.78, 0.86, (190, 196, 198), _DETAIL_M),
+        (0.0, 0.22, (132, 138, 140), _DETAIL_VISIBLE_TO_M),
+        (0.78, 0.86, (190, 196, 198), _DETAIL_VISIBLE_TO_M),
     ),
     "rail": (
         (0.44, 0.76, (160, 158, 153), FAR_M),
-        (0.53, 0.62, (108, 108, 106), _DETAIL_M),
-        (0.62, 0.76, (178, 176, 170), _DETAIL_M),
+        (0.53, 0.62, (108, 108, 106), _DETAIL_VISIBLE_TO_M),
+        (0.62, 0.76, (178, 176, 170), _DETAIL_VISIBLE_TO_M),
     ),
 }
-"""The faces of a rail in painting order: lower and upper height (m), blue green red, and visible distance (m)."""
+"""The faces of a rail in painting order: lower and upper height (m), blue, green, red, and visible distance (m)."""
 
 _FACADES = ((158, 172, 190), (176, 182, 184), (120, 140, 168), (186, 200, 206))
 
@@ -50,13 +52,13 @@ _FACADES = ((158, 172, 190), (176, 182, 184), (120, 140, 168), (186, 200, 206))
 class Faces:
     """Upright quadrilaterals: corners (n, 4, 3) in m (begin low, end low, end high, begin high), colours (n, 3).
 
-    `normals` (n, 2) are horizontal unit vectors towards the road, `seen_to_m` (n,) the distances of visibility.
+    `normals` (n, 2) are horizontal unit vectors towards the road, `visible_to_m` (n,) the distances of visibility.
     """
 
     corners_m: FloatArray
     colours: FloatArray
     normals: FloatArray
-    seen_to_m: FloatArray
+    visible_to_m: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,11 +91,11 @@ class RoadsideObjects:
 
 def place_roadside_objects(road: Road, *, trees: bool) -> RoadsideObjects:
     """Place the objects along a road; `trees` includes trees, lamp posts and buildings."""
-    runs = [_rail_stations(road, rail) for rail in road.rails]
+    sampled_rails = [_rail_stations(road, rail) for rail in road.rails]
     placed_trees = _place_trees(road) if trees else np.empty((0, 4))
     return RoadsideObjects(
-        faces=_join_faces([*_rail_faces(road, runs), *_lamp_faces(road, runs if trees else [])]),
-        poles=_place_poles(road, runs, lamps=trees),
+        faces=_join_faces([*_rail_faces(road, sampled_rails), *_lamp_faces(road, sampled_rails if trees else [])]),
+        poles=_place_poles(road, sampled_rails, lamps=trees),
         trees=placed_trees,
         tree_road_rad=_road_heading(road, placed_trees[:, :2]),
         walls=_place_buildings(road) if trees else _NO_WALLS,
@@ -101,6 +103,7 @@ def place_roadside_objects(road: Road, *, trees: bool) -> RoadsideObjects:
 
 
 def _rail_stations(road: Road, rail: Rail) -> tuple[Rail, FloatArray]:
+    """Return a rail and the stations (n,) of its posts, which divide it into straight pieces."""
     first_m, last_m = max(rail.from_m, road.first_m), min(rail.to_m, road.last_m)
     return rail, np.linspace(first_m, last_m, max(2, round((last_m - first_m) / _POST_SPACING_M) + 1))
 
@@ -109,30 +112,30 @@ def _lamp_stations(stations: FloatArray) -> FloatArray:
     return np.arange(stations[0] + 6.0, stations[-1], _LAMP_SPACING_M)
 
 
-def _rail_faces(road: Road, runs: Sequence[tuple[Rail, FloatArray]]) -> list[Faces]:
-    found = []
-    for rail, stations in runs:
-        line = road.across(stations, rail.offset_m)
+def _rail_faces(road: Road, sampled_rails: Sequence[tuple[Rail, FloatArray]]) -> list[Faces]:
+    faces = []
+    for rail, stations in sampled_rails:
+        line = road.point_at(stations, rail.offset_m)
         # Vary the tone of the pieces, so that their motion is visible.
         tone = stream(_WORLD_SEED, "rail").uniform(-6, 6, len(line) - 1)[:, None]
         normals = _left_normals(line[:-1], line[1:]) * (-1.0 if rail.offset_m > 0 else 1.0)
-        for low_m, high_m, colour, seen_to_m in _BANDS[rail.kind]:
+        for low_m, high_m, colour, visible_to_m in _BANDS[rail.kind]:
             corners = _upright_faces(line[:-1], line[1:], low_m, high_m)
-            found.append(Faces(corners, np.array(colour) + tone, normals, np.full(len(tone), seen_to_m)))
-    return found
+            faces.append(Faces(corners, np.array(colour) + tone, normals, np.full(len(tone), visible_to_m)))
+    return faces
 
 
-def _lamp_faces(road: Road, runs: Sequence[tuple[Rail, FloatArray]]) -> list[Faces]:
-    """Create the arms of lamp posts, to both sides."""
-    found = []
-    for rail, stations in runs:
+def _lamp_faces(road: Road, sampled_rails: Sequence[tuple[Rail, FloatArray]]) -> list[Faces]:
+    """Create the arms of lamp posts, which extend to both sides of a barrier."""
+    faces = []
+    for rail, stations in sampled_rails:
         if rail.kind == "barrier":
             places = _lamp_stations(stations)
-            begin, end = road.across(places, rail.offset_m - 1.8), road.across(places, rail.offset_m + 1.8)
+            begin, end = road.point_at(places, rail.offset_m - 1.8), road.point_at(places, rail.offset_m + 1.8)
             corners = _upright_faces(begin, end, 9.35, 9.55)
             normals = _left_normals(begin, end)
-            found.append(Faces(corners, np.full((len(corners), 3), 104.0), normals, np.full(len(corners), FAR_M)))
-    return found
+            faces.append(Faces(corners, np.full((len(corners), 3), 104.0), normals, np.full(len(corners), FAR_M)))
+    return faces
 
 
 def _left_normals(begin: FloatArray, end: FloatArray) -> FloatArray:
@@ -148,23 +151,23 @@ def _upright_faces(begin: FloatArray, end: FloatArray, low_m: float, high_m: flo
     return np.stack([np.column_stack(corner) for corner in corners], axis=1)
 
 
-def _join_faces(faces: Sequence[Faces]) -> Faces:
+def _join_faces(parts: Sequence[Faces]) -> Faces:
     return Faces(
-        np.concatenate([np.empty((0, 4, 3)), *(each.corners_m for each in faces)]),
-        np.concatenate([np.empty((0, 3)), *(each.colours for each in faces)]),
-        np.concatenate([np.empty((0, 2)), *(each.normals for each in faces)]),
-        np.concatenate([np.empty(0), *(each.seen_to_m for each in faces)]),
+        np.concatenate([np.empty((0, 4, 3)), *(part.corners_m for part in parts)]),
+        np.concatenate([np.empty((0, 3)), *(part.colours for part in parts)]),
+        np.concatenate([np.empty((0, 2)), *(part.normals for part in parts)]),
+        np.concatenate([np.empty(0), *(part.visible_to_m for part in parts)]),
     )
 
 
-def _place_poles(road: Road, runs: Sequence[tuple[Rail, FloatArray]], *, lamps: bool) -> FloatArray:
+def _place_poles(road: Road, sampled_rails: Sequence[tuple[Rail, FloatArray]], *, lamps: bool) -> FloatArray:
     """Place posts of rails and lamp posts on barriers."""
     poles = [np.empty((0, 5))]
-    for rail, stations in runs:
+    for rail, stations in sampled_rails:
         if rail.kind == "rail":
-            place, shape = road.across(stations, rail.offset_m), (0.0, 0.72, 0.12)
+            place, shape = road.point_at(stations, rail.offset_m), (0.0, 0.72, 0.12)
         elif lamps:
-            place, shape = road.across(_lamp_stations(stations), rail.offset_m), (0.8, 9.5, 0.16)
+            place, shape = road.point_at(_lamp_stations(stations), rail.offset_m), (0.8, 9.5, 0.16)
         else:
             continue
         poles.append(np.column_stack([place, np.tile(shape, (len(place), 1))]))
@@ -176,7 +179,7 @@ def _road_middle(road: Road) -> tuple[FloatArray, FloatArray, float]:
     left_m = max(strip.left_m for strip in road.paved)
     right_m = min(strip.right_m for strip in road.paved)
     stations = np.arange(road.first_m - 40.0, road.last_m + 40.0, 4.0)
-    return road.across(stations, (left_m + right_m) / 2), road.point(stations)[2], (left_m - right_m) / 2
+    return road.point_at(stations, (left_m + right_m) / 2), road.centre_at(stations).heading_rad, (left_m - right_m) / 2
 
 
 def _road_heading(road: Road, places: FloatArray) -> FloatArray:
@@ -185,19 +188,19 @@ def _road_heading(road: Road, places: FloatArray) -> FloatArray:
     return np.asarray(heading_rad[nearest], dtype=np.float64)
 
 
-def _free_places(road: Road, name: str, every_m2: float, clear_m: float) -> FloatArray:
-    """Return random positions around the road, one per `every_m2`, none closer than `clear_m` to its asphalt."""
+def _free_places(road: Road, name: str, ground_per_object_m2: float, clearance_m: float) -> FloatArray:
+    """Return random positions around the road, none closer than `clearance_m` to its asphalt."""
     middle, _, half_width_m = _road_middle(road)
-    low, high = middle.min(axis=0) - _AROUND_M, middle.max(axis=0) + _AROUND_M
-    places = stream(_WORLD_SEED, name).uniform(low, high, (round(float(np.prod(high - low)) / every_m2), 2))
+    low, high = middle.min(axis=0) - _SCENERY_WIDTH_M, middle.max(axis=0) + _SCENERY_WIDTH_M
+    places = stream(_WORLD_SEED, name).uniform(low, high, (round(float(np.prod(high - low)) / ground_per_object_m2), 2))
     distance = np.full(len(places), np.inf)
     for x_m, y_m in middle:  # one point at a time: a table of all distances would be too large for a long road
         np.minimum(distance, np.hypot(places[:, 0] - x_m, places[:, 1] - y_m), out=distance)
-    return np.asarray(places[(distance > half_width_m + clear_m) & (distance < half_width_m + _AROUND_M)])
+    return np.asarray(places[(distance > half_width_m + clearance_m) & (distance < half_width_m + _SCENERY_WIDTH_M)])
 
 
 def _place_trees(road: Road) -> FloatArray:
-    places = _free_places(road, "tree places", _TREE_EVERY_M2, clear_m=6.0)
+    places = _free_places(road, "tree places", _GROUND_PER_TREE_M2, clearance_m=6.0)
     random = stream(_WORLD_SEED, "tree shapes")
     kinds = random.integers(0, TREE_KINDS, len(places))
     heights = np.where(
@@ -209,7 +212,7 @@ def _place_trees(road: Road) -> FloatArray:
 def _place_buildings(road: Road) -> Walls:
     random = stream(_WORLD_SEED, "building shapes")
     outlines, colours, normals, windows = [], [], [], []
-    for place in _free_places(road, "building places", _BUILDING_EVERY_M2, clear_m=24.0):
+    for place in _free_places(road, "building places", _GROUND_PER_BUILDING_M2, clearance_m=24.0):
         length_m, width_m, storeys = random.uniform(14, 34), random.uniform(10, 16), int(random.integers(2, 7))
         heading_rad = random.uniform(0, math.pi)
         colour = np.array(_FACADES[int(random.integers(0, len(_FACADES)))], dtype=np.float64)

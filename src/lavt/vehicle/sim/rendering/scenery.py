@@ -22,10 +22,12 @@ HAZE_M = 240.0
 """At this distance 63 % of an object's colour is haze."""
 
 _NEAR_M = 0.4
+"""Faces are cut off at this distance in front of the camera."""
+
 _SUBPIXEL_BITS = 4
-_LARGEST_PX = 4000.0
-_GLASS = (104.0, 88.0, 74.0)
-_POLE = 96.0
+_MAX_COORDINATE_PX = 4000.0
+_GLASS_COLOUR = (104.0, 88.0, 74.0)
+_POLE_GREY = 96.0
 
 Drawing = tuple[float, Callable[..., None], Any, Any]
 """Depth (m), the drawing function, and its two arguments after the picture."""
@@ -38,9 +40,9 @@ class Scenery:
         self._objects = objects
         faces, walls = objects.faces, objects.walls
         self._colours = faces.colours * light.upright_factors(faces.normals)
-        self._pole_colour = _POLE * light.upright_factors(np.zeros((1, 2)))
+        self._pole_colour = _POLE_GREY * light.upright_factors(np.zeros((1, 2)))
         self._wall_colours = walls.colours * light.upright_factors(walls.normals)
-        self._glass = np.array(_GLASS) * light.upright_factors(walls.normals)
+        self._glass = np.array(_GLASS_COLOUR) * light.upright_factors(walls.normals)
         # Sprites show trees with the sun on the left: they are mirrored where the sun is to the right of the road.
         mirrored = np.sin(light.azimuth_rad - objects.tree_road_rad) < 0
         self._trees = np.column_stack([objects.trees, mirrored])
@@ -67,7 +69,7 @@ class Scenery:
         faces = self._objects.faces
         corners = faces.corners_m
         ahead = _depth_m(corners[:, :2, :2], placement)
-        near = np.flatnonzero((ahead.max(axis=1) > _NEAR_M) & (ahead.min(axis=1) < faces.seen_to_m))
+        near = np.flatnonzero((ahead.max(axis=1) > _NEAR_M) & (ahead.min(axis=1) < faces.visible_to_m))
         ahead = ahead[near]
         points = placement.project(_clip(corners[near], ahead))
         inside = (points[..., 0].max(axis=1) > 0) & (points[..., 0].min(axis=1) < placement.model.width_px)
@@ -86,7 +88,7 @@ class Scenery:
         widths = np.clip(np.rint(poles[inside, 4] * placement.model.focal_px / depth), 1, 40).astype(int).tolist()
         shades = self._add_haze(np.broadcast_to(self._pole_colour, (len(depth), 3)), depth).tolist()
         styles = zip(shades, widths, strict=True)
-        # A pole is behind the face it carries.
+        # A pole counts as 0.3 m behind the face that it carries.
         return zip((depth + 0.3).tolist(), repeat(_line), _subpixels(ends[inside]).tolist(), styles)
 
     def _tree_drawings(self, placement: CameraPlacement) -> Iterable[Drawing]:
@@ -105,13 +107,14 @@ class Scenery:
         walls = self._objects.walls
         outlines = walls.outlines_m
         begin, end = outlines[:, 0, :2], outlines[:, 1, :2]
-        # A wall seen from outside has its begin on the left and its end on the right.
-        seen = (placement.x_m - begin[:, 0]) * (end - begin)[:, 1] > (placement.y_m - begin[:, 1]) * (end - begin)[:, 0]
+        # Seen from outside, a wall begins on the left and ends on the right.
+        along = end - begin
+        in_view = (placement.x_m - begin[:, 0]) * along[:, 1] > (placement.y_m - begin[:, 1]) * along[:, 0]
         ahead = _depth_m(outlines[:, :2, :2], placement)
-        seen &= (ahead.min(axis=1) > _NEAR_M) & (ahead.min(axis=1) < FAR_M * 1.2)
+        in_view &= (ahead.min(axis=1) > _NEAR_M) & (ahead.min(axis=1) < FAR_M * 1.2)
         points = placement.project(outlines)
-        seen &= (points[..., 0].max(axis=1) > 0) & (points[..., 0].min(axis=1) < placement.model.width_px)
-        visible = np.flatnonzero(seen)
+        in_view &= (points[..., 0].max(axis=1) > 0) & (points[..., 0].min(axis=1) < placement.model.width_px)
+        visible = np.flatnonzero(in_view)
         depth = ahead[visible].mean(axis=1)
         windows = [list(_subpixels(placement.project(walls.windows_m[wall]))) for wall in visible]
         walls_and_glass = (
@@ -149,7 +152,7 @@ def _depth_m(points_m: FloatArray, placement: CameraPlacement) -> FloatArray:
 
 
 def _clip(corners_m: FloatArray, ahead: FloatArray) -> FloatArray:
-    """Clip faces to the part in front of the camera; `ahead` (n, 2) are the depths of their begin and end."""
+    """Clip faces to the part in front of the camera; `ahead` (n, 2) are the depths of their two ends."""
     for near, far in ((0, 1), (1, 0)):
         cut = ahead[:, near] < _NEAR_M
         if cut.any():
@@ -160,5 +163,5 @@ def _clip(corners_m: FloatArray, ahead: FloatArray) -> FloatArray:
 
 
 def _subpixels(points: FloatArray) -> NDArray[np.int32]:
-    limited = np.minimum(np.maximum(points[..., :2], -_LARGEST_PX), _LARGEST_PX)
+    limited = np.minimum(np.maximum(points[..., :2], -_MAX_COORDINATE_PX), _MAX_COORDINATE_PX)
     return np.asarray(np.rint(limited * (1 << _SUBPIXEL_BITS)), dtype=np.int32)

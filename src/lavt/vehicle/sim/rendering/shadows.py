@@ -16,8 +16,9 @@ from lavt.vehicle.sim.road.strips import Grey, Square, Strips, join_strips, make
 
 _CLOUD_TEXELS = 128
 _CLOUD_TEXEL_M = 6.0
-_CLOUD_DEPTH = 150.0
-"""The darkest value of a cloud's shadow, of 255: some light passes through and around the cloud."""
+_DARKEST_CLOUD_SHADOW = 150.0
+"""The largest value of a cloud's shadow. It is less than 255, because some light passes through and around a cloud."""
+
 _MARGIN_M = 1.0
 
 
@@ -82,7 +83,7 @@ def _clouds() -> Grey:
     noise = seamless_noise("cloud shadows", _CLOUD_TEXELS, 8) + 0.45 * seamless_noise(
         "cloud shadows", _CLOUD_TEXELS, 20
     )
-    return np.rint(np.clip((noise - 0.75) * 1.6, 0.0, 1.0) * _CLOUD_DEPTH).astype(np.uint8)
+    return np.rint(np.clip((noise - 0.75) * 1.6, 0.0, 1.0) * _DARKEST_CLOUD_SHADOW).astype(np.uint8)
 
 
 def _draw_clouds(clouds: Grey, square: Square, mask: Grey) -> None:

@@ -24,9 +24,10 @@ TREE_WIDTH = _WIDTH_PX / _HEIGHT_PX
 """The width of a tree's sprite as a share of its height."""
 
 _SHADOW_REDUCTION = 4
-_MAX_CACHED_PX = 64
-_MAX_CACHED = 2000
+_MAX_CACHED_HEIGHT_PX = 64
+_MAX_CACHED_SPRITES = 2000
 _HAZE_STEPS = 24
+"""The haze on a tree is rounded to a multiple of 1 / 24."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +58,7 @@ class Trees:
         """
         foot_u, foot_v, height_px, kind, mirrored = shape
         variant = (int(kind), mirrored != 0, round(haze * _HAZE_STEPS))
-        if height_px > _MAX_CACHED_PX:
+        if height_px > _MAX_CACHED_HEIGHT_PX:
             self._draw_large(picture, variant, height_px, (foot_u, foot_v))
             return
         rows = round(height_px)
@@ -70,14 +71,14 @@ class Trees:
             part = np.s_[low_v - top : high_v - top, low_u - left : high_u - left]
             _blend(picture[low_v:high_v, low_u:high_u], sprite.colour[part], sprite.transmittance[part])
 
-    def _small_sprite(self, kind: int, mirrored: bool, step: int, rows: int) -> Sprite:
-        key = (kind, mirrored, step, rows)
+    def _small_sprite(self, kind: int, mirrored: bool, haze_step: int, rows: int) -> Sprite:
+        key = (kind, mirrored, haze_step, rows)
         sprite = self._cache.get(key)
         if sprite is None:
-            full_size = _full_size_sprite(self._light, kind, mirrored, step, 0)
+            full_size = _full_size_sprite(self._light, kind, mirrored, haze_step, 0)
             size = (max(2, round(rows * TREE_WIDTH)), rows)
             sprite = Sprite(_resize(full_size.colour, size), _resize(full_size.transmittance, size))
-            if len(self._cache) >= _MAX_CACHED:
+            if len(self._cache) >= _MAX_CACHED_SPRITES:
                 self._cache.clear()
             self._cache[key] = sprite
         return sprite
@@ -85,15 +86,15 @@ class Trees:
     def _draw_large(
         self, picture: Picture, variant: tuple[int, bool, int], height_px: float, foot_px: tuple[float, float]
     ) -> None:
-        """Draw only the visible part of a large tree, with subpixel scaling: otherwise large trees would jump."""
+        """Draw only the visible part of a large tree, scaled with subpixels, without which large trees would jump."""
         width_px = height_px * TREE_WIDTH
         left, top = foot_px[0] - width_px / 2, foot_px[1] - height_px
         low_u, high_u = max(round(left), 0), min(round(left + width_px), picture.shape[1])
         low_v, high_v = max(round(top), 0), min(round(top + height_px), picture.shape[0])
         if low_u >= high_u or low_v >= high_v:
             return
-        kind, mirrored, step = variant
-        full_size = _full_size_sprite(self._light, kind, mirrored, step, 1 if height_px < _HEIGHT_PX * 0.6 else 0)
+        kind, mirrored, haze_step = variant
+        full_size = _full_size_sprite(self._light, kind, mirrored, haze_step, 1 if height_px < _HEIGHT_PX * 0.6 else 0)
         scale = full_size.colour.shape[0] / height_px
         matrix = np.array(
             [
@@ -120,14 +121,14 @@ def _resize(image: Picture, size: tuple[int, int]) -> Picture:
 
 
 @lru_cache(maxsize=240)
-def _full_size_sprite(light: Light, kind: int, mirrored: bool, step: int, halvings: int) -> Sprite:
-    """Return a tree's sprite in full size, halved `halvings` times."""
+def _full_size_sprite(light: Light, kind: int, mirrored: bool, haze_step: int, halvings: int) -> Sprite:
+    """Return a tree's sprite, from full size halved `halvings` times."""
     if halvings:
-        larger = _full_size_sprite(light, kind, mirrored, step, halvings - 1)
+        larger = _full_size_sprite(light, kind, mirrored, haze_step, halvings - 1)
         size = (_WIDTH_PX >> halvings, _HEIGHT_PX >> halvings)
         return Sprite(_resize(larger.colour, size), _resize(larger.transmittance, size))
     clear, hazed, transmittance = _lit_tree(light, kind, mirrored)
-    share = step / _HAZE_STEPS
+    share = haze_step / _HAZE_STEPS
     return Sprite(np.asarray(cv2.addWeighted(clear, 1 - share, hazed, share, 0.0), dtype=np.uint8), transmittance)
 
 
@@ -147,7 +148,9 @@ def _lit_tree(light: Light, kind: int, mirrored: bool) -> tuple[Picture, Picture
         mean = colour[alpha > 0].mean(axis=0)
         lit = (mean + 0.45 * (colour - mean)) * np.array(light.lit)
     cover = alpha[..., None] / 255.0
-    clear, hazed = (np.clip(np.rint(each * cover), 0, 255).astype(np.uint8) for each in (lit, np.array(light.haze)))
+    clear, hazed = (
+        np.clip(np.rint(colours * cover), 0, 255).astype(np.uint8) for colours in (lit, np.array(light.haze))
+    )
     return clear, hazed, np.repeat(255 - alpha[..., None], 3, axis=2)
 
 

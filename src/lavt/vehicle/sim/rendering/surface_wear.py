@@ -17,9 +17,9 @@ from lavt.vehicle.sim.road.strips import Strips, join_strips, make_strips, strip
 _WORLD_SEED = 0
 _PATCH_SPACING_M = 16.0
 _CRACK_SPACING_M = 7.0
-_SEAM_M = 0.03
+_SEAM_WIDTH_M = 0.03
 _PAVER_WIDTH_M = 3.5
-"""The width in which a paver lays asphalt; seams lie between."""
+"""The width of a strip that a paver lays at a time; there is a seam between two strips."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,20 +28,20 @@ class SurfaceWear:
 
     strips: Strips
     width_m: float
-    grey: int
+    darkening: int
 
 
 def surface_wear(road: Road) -> list[SurfaceWear]:
     """Return all wear of one road, in painting order."""
     patches, edges = _patches(road)
     seams = [
-        strip_along(road, offset_m + _SEAM_M / 2, offset_m - _SEAM_M / 2, strip.from_m, strip.to_m)
+        strip_along(road, offset_m + _SEAM_WIDTH_M / 2, offset_m - _SEAM_WIDTH_M / 2, strip.from_m, strip.to_m)
         for strip in road.paved
         for offset_m in np.arange(strip.right_m + _PAVER_WIDTH_M, strip.left_m - 1.0, _PAVER_WIDTH_M)
     ]
     return [
         *(SurfaceWear(join_strips(strips), 2.0, grey) for grey, strips in patches.items()),
-        SurfaceWear(join_strips(seams), _SEAM_M, 12),
+        SurfaceWear(join_strips(seams), _SEAM_WIDTH_M, 12),
         SurfaceWear(edges, 0.05, 30),
         SurfaceWear(_cracks(road, "cracks", 0.018), 0.018, 34),
         SurfaceWear(_cracks(road, "sealed cracks", 0.07), 0.07, 26),
@@ -49,7 +49,7 @@ def surface_wear(road: Road) -> list[SurfaceWear]:
 
 
 def _patches(road: Road) -> tuple[dict[int, list[Strips]], Strips]:
-    """Return rectangular patches of newer asphalt by grey level, newer darker, and the seams around them."""
+    """Return rectangular patches of newer asphalt by how much darker they are, and the seams around them."""
     random = stream(_WORLD_SEED, "repairs")
     by_grey: dict[int, list[Strips]] = {7: [], 12: [], 17: []}
     edges = []
@@ -64,9 +64,9 @@ def _patches(road: Road) -> tuple[dict[int, list[Strips]], Strips]:
         by_grey[sorted(by_grey)[int(random.integers(len(by_grey)))]].append(
             strip_along(road, left_m, right_m, begin_m, end_m)
         )
-        edges += [strip_along(road, side + 0.025, side - 0.025, begin_m, end_m) for side in (left_m, right_m)]
-        cuts = np.array([begin_m, end_m])
-        edges.append(strip_pieces(road, left_m, right_m, cuts - 0.025, cuts + 0.025))
+        edges += [strip_along(road, edge_m + 0.025, edge_m - 0.025, begin_m, end_m) for edge_m in (left_m, right_m)]
+        ends_m = np.array([begin_m, end_m])
+        edges.append(strip_pieces(road, left_m, right_m, ends_m - 0.025, ends_m + 0.025))
     return by_grey, join_strips(edges)
 
 
@@ -86,7 +86,7 @@ def _cracks(road: Road, name: str, width_m: float) -> Strips:
         offset = random.uniform(strip.right_m, strip.left_m) + np.cumsum(left)
         inside = (offset < strip.left_m) & (station > first_m) & (station < last_m)
         if inside.sum() > 2:
-            cracks.append(_line(road.across(station[inside], offset[inside]), width_m))
+            cracks.append(_line(road.point_at(station[inside], offset[inside]), width_m))
     return join_strips(cracks)
 
 

@@ -24,7 +24,7 @@ Grey = NDArray[np.uint8]
 Field = NDArray[np.float32]
 
 _WORLD_SEED = 0
-"""The world is the same in every run; a run's seed changes only the sensor noise."""
+"""The world is the same in every run; of the pictures, a run's seed changes only the sensor noise."""
 
 
 @dataclass(frozen=True, slots=True)

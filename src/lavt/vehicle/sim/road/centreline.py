@@ -1,7 +1,8 @@
-"""The centreline of a road: straight segments, arcs and clothoids laid end to end with continuous heading.
+"""The centreline of a road: straight segments, arcs and clothoids joined end to end with continuous heading.
 
-A station `s_m` is a distance along the line. Positions on lines and arcs are in closed form. A clothoid's are
-integrated with the Gauss-Legendre rule over pieces that turn by at most a radian, which is exact to a nanometre.
+A station `s_m` is a distance along the line. Positions on lines and arcs are computed in closed form. Positions on
+clothoids are integrated with the Gauss-Legendre rule over pieces that turn by at most a radian, which is exact to a
+nanometre.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,16 +21,21 @@ from numpy.typing import ArrayLike
 from lavt.domain import FloatArray
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
-_SHARES_ARRAY = (_NODES + 1) / 2
-_SHARES = tuple(zip(((_NODES + 1) / 2).tolist(), (_WEIGHTS / 2).tolist(), strict=True))
-_TURN_RAD = 1.0
+_NODE_SHARES = (_NODES + 1) / 2
+"""The nodes of the integration rule as shares of a piece's length."""
+
+_NODE_SHARES_AND_WEIGHTS = tuple(zip(_NODE_SHARES.tolist(), (_WEIGHTS / 2).tolist(), strict=True))
+"""The node shares and their weights, whose sum is 1, as plain numbers."""
+
+_MAX_PIECE_TURN_RAD = 1.0
 """A clothoid is split into pieces that turn by this much at most, so that the integration rule is exact for each."""
 
 _STRAIGHT_PER_M = 1e-12
 """Less curvature counts as straight: over 20 km it amounts to 0.2 mm, and its inverse is too large to compute with."""
 
-_FOOT_M = 1e-9
-_FOOT_STEPS = 12
+_FOOT_TOLERANCE_M = 1e-9
+_MAX_FOOT_STEPS = 12
+"""The search for a foot on a clothoid ends with a step shorter than the tolerance, or after this number of steps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,10 +50,19 @@ class Segment:
         """Split a clothoid into pieces that turn by a radian at most; lines and arcs stay whole."""
         if self.end_curvature_per_m == self.curvature_per_m:
             return [self]
-        highest = max(abs(self.curvature_per_m), abs(self.end_curvature_per_m))
-        count = max(1, math.ceil(self.length_m * highest / _TURN_RAD))
-        bends = np.linspace(self.curvature_per_m, self.end_curvature_per_m, count + 1).tolist()
-        return [Segment(self.length_m / count, *each) for each in itertools.pairwise(bends)]
+        max_curvature_per_m = max(abs(self.curvature_per_m), abs(self.end_curvature_per_m))
+        count = max(1, math.ceil(self.length_m * max_curvature_per_m / _MAX_PIECE_TURN_RAD))
+        curvatures_per_m = np.linspace(self.curvature_per_m, self.end_curvature_per_m, count + 1).tolist()
+        return [Segment(self.length_m / count, begin, end) for begin, end in itertools.pairwise(curvatures_per_m)]
+
+
+class CentrelinePoints(NamedTuple):
+    """Points of a centreline: arrays of the shape of the stations that were asked for."""
+
+    x_m: FloatArray
+    y_m: FloatArray
+    heading_rad: FloatArray
+    curvature_per_m: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +87,7 @@ class _Piece:
             chord_m = along_m if abs(half_rad) < 1e-9 else along_m * math.sin(half_rad) / half_rad
             return chord_m * math.cos(half_rad), chord_m * math.sin(half_rad)
         ahead_m = left_m = 0.0
-        for share, weight in _SHARES:
+        for share, weight in _NODE_SHARES_AND_WEIGHTS:
             turn_rad = self.turn_rad(share * along_m)
             ahead_m += weight * math.cos(turn_rad)
             left_m += weight * math.sin(turn_rad)
@@ -79,18 +95,23 @@ class _Piece:
 
 
 _SearchRow = tuple[float, float, float, float, float, float, float, float, float, "_Piece | None"]
+"""The first and last station of the search; the piece's station, x, y, heading and curvature at its beginning; cosine
+and sine of the heading; and the piece itself if it is a clothoid. A plain tuple is unpacked faster than a named one."""
 
 
 class Centreline:
-    """Segments laid end to end from a pose; beyond both ends the line continues straight."""
+    """Segments joined end to end, the first one at station `first_m` and at `pose` (x, y in m, heading in rad).
+
+    Beyond both ends the line continues straight.
+    """
 
     def __init__(self, first_m: float, pose: tuple[float, float, float], segments: Sequence[Segment]) -> None:
         x_m, y_m, heading_rad = pose
         self._pieces: list[_Piece] = []
         s_m = first_m
-        # The straight extensions at both ends are pieces like the others, without a known beginning or end.
-        open_end = Segment(0.0, 0.0, 0.0)
-        for segment in (open_end, *(part for each in segments for part in each.split()), open_end):
+        # The straight extensions beyond both ends are pieces of length 0, which the searches extend to infinity.
+        extension = Segment(0.0, 0.0, 0.0)
+        for segment in (extension, *(part for whole in segments for part in whole.split()), extension):
             length_m, curvature_per_m = segment.length_m, segment.curvature_per_m
             if abs(curvature_per_m) < _STRAIGHT_PER_M:
                 curvature_per_m = 0.0
@@ -105,11 +126,10 @@ class Centreline:
         self.last_m = s_m
         self._begin_stations_m = [-math.inf, *(piece.s_m for piece in self._pieces[1:])]
 
-    def point(self, s_m: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return x, y (m), heading (rad) and curvature (1/m) at the stations `s_m`, an array of any shape."""
+    def sample(self, s_m: ArrayLike) -> CentrelinePoints:
+        """Return the points at the stations `s_m`, an array of any shape."""
         station = np.asarray(s_m, dtype=np.float64)
-        table = self._table
-        piece = table[np.searchsorted(np.array(self._begin_stations_m), station, side="right") - 1]
+        piece = self._piece_table[np.searchsorted(np.array(self._begin_stations_m), station, side="right") - 1]
         begin_m, x0_m, y0_m, heading0_rad, curvature0, rate = (piece[..., column] for column in range(6))
         along = station - begin_m
         half_turn = curvature0 * along / 2
@@ -117,12 +137,12 @@ class Centreline:
         ahead, left = chord * np.cos(half_turn), chord * np.sin(half_turn)
         clothoid = rate != 0.0
         if clothoid.any():
-            inner = along[..., None] * _SHARES_ARRAY
-            turn = inner * (curvature0[..., None] + rate[..., None] * inner / 2)
+            node_along = along[..., None] * _NODE_SHARES
+            turn = node_along * (curvature0[..., None] + rate[..., None] * node_along / 2)
             ahead = np.where(clothoid, np.cos(turn) @ _WEIGHTS / 2 * along, ahead)
             left = np.where(clothoid, np.sin(turn) @ _WEIGHTS / 2 * along, left)
         cosine, sine = np.cos(heading0_rad), np.sin(heading0_rad)
-        return (
+        return CentrelinePoints(
             x0_m + ahead * cosine - left * sine,
             y0_m + ahead * sine + left * cosine,
             heading0_rad + along * (curvature0 + rate * along / 2),
@@ -142,15 +162,15 @@ class Centreline:
             begin_m, end_m, s_m, x0_m, y0_m, heading_rad, curvature_per_m, cosine, sine, piece = search_table[index]
             if begin_m > last_m:
                 break
-            low_m = (max(first_m, begin_m)) - s_m
-            high_m = (min(last_m, end_m)) - s_m
+            low_m = max(first_m, begin_m) - s_m
+            high_m = min(last_m, end_m) - s_m
             dx_m, dy_m = x_m - x0_m, y_m - y0_m
             ahead_m, left_m = dx_m * cosine + dy_m * sine, dy_m * cosine - dx_m * sine
             turn_rad = 0.0
             if piece is not None:
                 along_m = _foot_m(piece, ahead_m, left_m, low_m, high_m)
-                reached_m, turn_rad = piece.displacement(along_m), piece.turn_rad(along_m)
-                ahead_m, left_m = _rotate(ahead_m - reached_m[0], left_m - reached_m[1], turn_rad)
+                (foot_ahead_m, foot_left_m), turn_rad = piece.displacement(along_m), piece.turn_rad(along_m)
+                ahead_m, left_m = _rotate(ahead_m - foot_ahead_m, left_m - foot_left_m, turn_rad)
                 curvature_per_m += piece.rate_per_m2 * along_m
             elif curvature_per_m == 0.0:
                 along_m = low_m if ahead_m < low_m else min(ahead_m, high_m)
@@ -174,42 +194,49 @@ class Centreline:
 
     @cached_property
     def _search_table(self) -> list[_SearchRow]:
-        """The values that a projection needs for each piece, as plain numbers; for a clothoid also the piece itself."""
+        """The values that a projection needs for each piece."""
         rows: list[_SearchRow] = []
-        for begin_m, end_m, each in zip(
+        for begin_m, end_m, piece in zip(
             self._begin_stations_m, [*self._begin_stations_m[1:], math.inf], self._pieces, strict=True
         ):
-            place = (each.s_m, each.x_m, each.y_m, each.heading_rad, each.curvature_per_m)
-            clothoid = each if each.rate_per_m2 else None
-            rows.append((begin_m, end_m, *place, math.cos(each.heading_rad), math.sin(each.heading_rad), clothoid))
+            place = (piece.s_m, piece.x_m, piece.y_m, piece.heading_rad, piece.curvature_per_m)
+            clothoid = piece if piece.rate_per_m2 else None
+            rows.append((begin_m, end_m, *place, math.cos(piece.heading_rad), math.sin(piece.heading_rad), clothoid))
         return rows
 
     @cached_property
-    def _table(self) -> FloatArray:
+    def _piece_table(self) -> FloatArray:
+        """The fields of each piece, (n, 6)."""
         return np.array(
             [
-                (each.s_m, each.x_m, each.y_m, each.heading_rad, each.curvature_per_m, each.rate_per_m2)
-                for each in self._pieces
+                (piece.s_m, piece.x_m, piece.y_m, piece.heading_rad, piece.curvature_per_m, piece.rate_per_m2)
+                for piece in self._pieces
             ]
         )
 
 
 def _foot_m(piece: _Piece, ahead_m: float, left_m: float, low_m: float, high_m: float) -> float:
-    """Return the arc length to a point's foot between `low_m` and `high_m`; the point is in the piece's first frame."""
+    """Return the arc length, from `low_m` to `high_m`, at which a clothoid is nearest to a point.
+
+    The point is given in the frame of the clothoid's beginning.
+    """
     along_m = (low_m + high_m) / 2
-    for _ in range(_FOOT_STEPS):
+    for _ in range(_MAX_FOOT_STEPS):
         # Step to the foot on the clothoid's osculating circle; the error shrinks with the step's cube.
-        reached_m = piece.displacement(along_m)
-        offset = _rotate(ahead_m - reached_m[0], left_m - reached_m[1], piece.turn_rad(along_m))
+        reached_ahead_m, reached_left_m = piece.displacement(along_m)
+        offset = _rotate(ahead_m - reached_ahead_m, left_m - reached_left_m, piece.turn_rad(along_m))
         step_m = _arc_foot_m(*offset, piece.curvature_per_m + piece.rate_per_m2 * along_m, 0.0)
-        before_m, along_m = along_m, min(max(along_m + step_m, low_m), high_m)
-        if abs(along_m - before_m) < _FOOT_M:
+        previous_m, along_m = along_m, min(max(along_m + step_m, low_m), high_m)
+        if abs(along_m - previous_m) < _FOOT_TOLERANCE_M:
             break
     return along_m
 
 
 def _arc_foot_m(ahead_m: float, left_m: float, curvature_per_m: float, middle_m: float) -> float:
-    """Return the arc length to a point's foot, on the turn nearest `middle_m`; the point is in the arc's frame."""
+    """Return the arc length at which a circle is nearest to a point: of all turns, on the one nearest `middle_m`.
+
+    The point is given in the frame of the arc's beginning.
+    """
     if abs(curvature_per_m) < _STRAIGHT_PER_M:
         return ahead_m
     sign = math.copysign(1.0, curvature_per_m)

@@ -1,6 +1,7 @@
 """The cross-section of a road: lanes, asphalt, marks, rails and barriers.
 
-Offsets are lateral, from the centre of the driven lane, left positive. Stations are along it, 0 at the route's start.
+Offsets are lateral distances from the centre of the driven lane, left positive. Stations are distances along it, 0 at
+the route's start.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 from lavt.domain import FloatArray
 
 DASH_M, GAP_M = 3.0, 6.0
-"""Default dash and gap of broken marks. Our choice, because the map of the six routes does not define them."""
+"""Default lengths of a dash and a gap of broken marks: our choice, because the map of the six routes has none."""
 
 
 @dataclass(frozen=True)
@@ -64,8 +65,8 @@ class RoadMark:
     dash_at_m: float = 0.0
     """A station where a dash begins, which fixes all other dashes."""
 
-    def dashes_m(self, first_m: float, last_m: float) -> FloatArray:
-        """Return the first stations of the mark's whole dashes between two stations, within its range."""
+    def dash_begins_m(self, first_m: float, last_m: float) -> FloatArray:
+        """Return the stations where the dashes begin that lie wholly between two stations and within the mark."""
         first_m, last_m = max(self.from_m, first_m), min(self.to_m, last_m)
         period_m = self.dash_m + self.gap_m
         counts = np.arange(
@@ -85,9 +86,9 @@ class Rail:
     to_m: float = math.inf
 
 
-Along = TypeVar("Along", PavedArea, RoadMark, Rail)
+RoadElement = TypeVar("RoadElement", PavedArea, RoadMark, Rail)
 
 
-def shift_stations(each: Along, by_m: float) -> Along:
-    """Return `each` with its stations counted from a point `by_m` further on."""
-    return replace(each, from_m=each.from_m - by_m, to_m=each.to_m - by_m)
+def shift_stations(element: RoadElement, by_m: float) -> RoadElement:
+    """Return `element` with its stations counted from a point `by_m` further on."""
+    return replace(element, from_m=element.from_m - by_m, to_m=element.to_m - by_m)

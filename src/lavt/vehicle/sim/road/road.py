@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from lavt.domain import FloatArray
 from lavt.errors import UserError
-from lavt.vehicle.sim.road.centreline import Centreline, Segment
+from lavt.vehicle.sim.road.centreline import Centreline, CentrelinePoints, Segment
 from lavt.vehicle.sim.road.cross_section import Lanes, PavedArea, Rail, RoadMark, shift_stations
 from lavt.vehicle.sim.road.road_file import RoadFile, read_road_file
 
@@ -29,14 +29,15 @@ PROJECTION_WINDOW_M = 15.0
 class Road:
     """A road and the route on it.
 
-    The route is stations 0 to `length_m`. The segments begin at station `first_m`, before the start, with the pose
-    `origin` (x, y in m, heading in rad, world frame), and end beyond the route's end. Beyond them the road is straight.
+    The route goes from station 0 to station `route_length_m`. The segments begin before its start, at station `first_m`
+    with the pose `origin` (x, y in m, heading in rad, world frame), and end beyond its end. Outside them the road is
+    straight.
     """
 
     title: str
     origin: tuple[float, float, float]
     first_m: float
-    length_m: float
+    route_length_m: float
     segments: tuple[Segment, ...]
     lanes: Lanes
     paved: tuple[PavedArea, ...]
@@ -51,16 +52,16 @@ class Road:
     @cached_property
     def start(self) -> tuple[float, float, float]:
         """The pose of the route's start in the world frame: x, y (m) and heading (rad)."""
-        x_m, y_m, heading_rad, _ = self.point(0.0)
+        x_m, y_m, heading_rad, _ = self.centre_at(0.0)
         return float(x_m), float(y_m), float(heading_rad)
 
-    def point(self, s_m: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return x, y (m), heading (rad) and curvature (1/m) of the lane's centre at the stations `s_m`, any shape."""
-        return self._centreline.point(s_m)
+    def centre_at(self, s_m: ArrayLike) -> CentrelinePoints:
+        """Return the points of the driven lane's centre at the stations `s_m`, an array of any shape."""
+        return self._centreline.sample(s_m)
 
-    def across(self, s_m: ArrayLike, offset_m: ArrayLike) -> FloatArray:
+    def point_at(self, s_m: ArrayLike, offset_m: ArrayLike) -> FloatArray:
         """Return world x, y (m) of the points at stations `s_m` and lateral offsets `offset_m`, shape (..., 2)."""
-        x_m, y_m, heading_rad, _ = self.point(s_m)
+        x_m, y_m, heading_rad, _ = self.centre_at(s_m)
         offset = np.asarray(offset_m, dtype=np.float64)
         return np.stack([x_m - offset * np.sin(heading_rad), y_m + offset * np.cos(heading_rad)], axis=-1)
 
@@ -73,18 +74,18 @@ class Road:
         window_m = PROJECTION_WINDOW_M
         return self._centreline.project(x_m, y_m, near_s_m - window_m, near_s_m + window_m)[:3]
 
-    def sub_route(self, title: str, from_m: float, length_m: float) -> Road:
+    def sub_route(self, title: str, from_m: float, route_length_m: float) -> Road:
         """Return the same road with a route that begins at station `from_m`; nothing on the ground changes."""
         return replace(
             self,
             title=title,
             first_m=self.first_m - from_m,
-            length_m=length_m,
-            paved=tuple(shift_stations(each, from_m) for each in self.paved),
+            route_length_m=route_length_m,
+            paved=tuple(shift_stations(strip, from_m) for strip in self.paved),
             marks=tuple(
-                replace(shift_stations(each, from_m), dash_at_m=each.dash_at_m - from_m) for each in self.marks
+                replace(shift_stations(mark, from_m), dash_at_m=mark.dash_at_m - from_m) for mark in self.marks
             ),
-            rails=tuple(shift_stations(each, from_m) for each in self.rails),
+            rails=tuple(shift_stations(rail, from_m) for rail in self.rails),
         )
 
     @cached_property
@@ -112,39 +113,42 @@ def parse_road(text: str, source: str) -> Road:
     Raises `UserError`, which names `source` and the key, if a key or a value is invalid. `part_of` names a road that
     comes with LAVT, or a file relative to the directory of `source`.
     """
-    read = read_road_file(text, source)
-    if isinstance(read, RoadFile):
-        return _make_road(read)
+    road_file = read_road_file(text, source)
+    if isinstance(road_file, RoadFile):
+        return _make_road(road_file)
     try:
-        whole_file = read_road_file(*_read_text(_resolve_part_of(source, read.part_of)))
+        whole_file = read_road_file(*_read_text(_resolve_part_of(source, road_file.part_of)))
     except UserError as error:
-        raise UserError(f"{source} is a part of {read.part_of}: {error}") from error
+        raise UserError(f"{source} is a part of {road_file.part_of}: {error}") from error
     if not isinstance(whole_file, RoadFile):
-        raise UserError(f"{source}: {read.part_of} is itself a part of a road: name the whole road as part_of")
+        raise UserError(f"{source}: {road_file.part_of} is itself a part of a road: name the whole road as part_of")
     whole = _make_road(whole_file)
-    available_m = whole.last_m - read.from_m
+    part_of, from_m = road_file.part_of, road_file.from_m
+    available_m = whole.last_m - from_m
     if available_m <= 0.0:
-        raise UserError(f"{source}: {read.part_of} ends at {whole.last_m:.1f} m: from_m must be less")
-    if read.length_m > available_m:
-        raise UserError(
-            f"{source}: {read.part_of} has only {available_m:.1f} m from {read.from_m} m on: shorten length_m"
-        )
-    return whole.sub_route(read.title, read.from_m, read.length_m)
+        raise UserError(f"{source}: {part_of} ends at {whole.last_m:.1f} m: from_m must be less")
+    if road_file.length_m > available_m:
+        raise UserError(f"{source}: {part_of} has only {available_m:.1f} m from {from_m} m on: shorten length_m")
+    return whole.sub_route(road_file.title, from_m, road_file.length_m)
 
 
-def _make_road(read: RoadFile) -> Road:
-    x_m, y_m, heading_rad = read.start
-    run_in_m = read.run_in_m
+def _make_road(road_file: RoadFile) -> Road:
+    x_m, y_m, heading_rad = road_file.start
+    before_start_m = road_file.run_in_m
     return Road(
-        title=read.title,
-        origin=(x_m - run_in_m * math.cos(heading_rad), y_m - run_in_m * math.sin(heading_rad), heading_rad),
-        first_m=-run_in_m,
-        length_m=read.route_m,
-        segments=read.all_segments,
-        lanes=read.lanes,
-        paved=read.all_paved,
-        marks=read.all_marks,
-        rails=read.rails,
+        title=road_file.title,
+        origin=(
+            x_m - before_start_m * math.cos(heading_rad),
+            y_m - before_start_m * math.sin(heading_rad),
+            heading_rad,
+        ),
+        first_m=-before_start_m,
+        route_length_m=road_file.route_length_m,
+        segments=road_file.all_segments,
+        lanes=road_file.lanes,
+        paved=road_file.all_paved,
+        marks=road_file.all_marks,
+        rails=road_file.rails,
     )
 
 

@@ -16,30 +16,30 @@ from lavt.errors import UserError
 from lavt.vehicle.sim.road.centreline import Segment
 from lavt.vehicle.sim.road.cross_section import DASH_M, GAP_M, Lanes, PavedArea, Rail, RoadMark
 
-SOLID_M = 0.125
-"""Default width of a mark, that of the map the six routes come from."""
+MARK_WIDTH_M = 0.125
+"""Default width of a mark, taken from the map that contains the six routes."""
 
-TIGHTEST_PER_M = 0.2
+MAX_CURVATURE_PER_M = 0.2
 """The largest curvature, which a car with a turning radius of 5 m can just follow."""
 
-SHORTEST_M = 10.0
+MIN_ROUTE_M = 10.0
 """The shortest route; cars start up to 2 m into it."""
 
-SHORTEST_DASH_M = 0.1
-"""The shortest dash and gap; hundreds of thousands of dashes would take minutes to draw and be invisible."""
+MIN_DASH_M = 0.1
+"""The shortest dash and gap. Hundreds of thousands of shorter ones would be invisible and take minutes to draw."""
 
-INNER_SHARE = 0.1
-"""The inner edge of the road must keep this share of the centre's length in a curve."""
+MIN_INNER_SHARE = 0.1
+"""In a curve, the inner edge of the road must be at least this share as long as the centre of the driven lane."""
 
 Coordinate = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-100_000, le=100_000)]
 Offset = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-200, le=200)]
 Station = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-20_000, le=20_000)]
 Length = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=20_000)]
-Dash = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=SHORTEST_DASH_M, le=20_000)]
-RouteLength = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=SHORTEST_M, le=20_000)]
+Dash = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=MIN_DASH_M, le=20_000)]
+RouteLength = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=MIN_ROUTE_M, le=20_000)]
 RunLength = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=2_000)]
 Width = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=20)]
-Curvature = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-TIGHTEST_PER_M, le=TIGHTEST_PER_M)]
+Curvature = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MAX_CURVATURE_PER_M, le=MAX_CURVATURE_PER_M)]
 Index = Annotated[int, Field(strict=True, ge=0)]
 Title = Annotated[str, Field(strict=True, min_length=1, max_length=100)]
 
@@ -61,7 +61,7 @@ class _SegmentKeys(_Keys):
     curvature_per_m: Curvature = 0.0
     end_curvature_per_m: Curvature | None = None
 
-    def segment(self) -> Segment:
+    def to_segment(self) -> Segment:
         end = self.end_curvature_per_m
         return Segment(self.length_m, self.curvature_per_m, self.curvature_per_m if end is None else end)
 
@@ -76,33 +76,33 @@ class _ShoulderKeys(_Keys):
     right_m: RunLength = 0.5
 
 
-class _Along(_Keys):
+class _RangeKeys(_Keys):
     from_m: Station = -math.inf
     to_m: Station = math.inf
 
 
-class _PavedKeys(_Along):
+class _PavedKeys(_RangeKeys):
     left_m: Offset
     right_m: Offset
 
 
-class _MarkKeys(_Along):
+class _MarkKeys(_RangeKeys):
     offset_m: Offset
     kind: Literal["solid", "broken"] = "solid"
     colour: Literal["white", "yellow"] = "white"
-    width_m: Width = SOLID_M
+    width_m: Width = MARK_WIDTH_M
     dash_m: Dash = DASH_M
     gap_m: Dash = GAP_M
     dash_at_m: Station = 0.0
 
 
-class _RailKeys(_Along):
+class _RailKeys(_RangeKeys):
     offset_m: Offset
     kind: Literal["rail", "barrier"] = "rail"
 
 
 class PartFile(_Keys):
-    """A file with a route on the road of another file, from a station of that file's route."""
+    """A file whose route lies on another file's road and begins at that road's station `from_m`."""
 
     title: Title
     part_of: Annotated[str, Field(strict=True, min_length=1)]
@@ -133,10 +133,10 @@ class RoadFile(_Keys):
     @property
     def segments_length_m(self) -> float:
         """The total length of the segments."""
-        return sum(each.length_m for each in self.segments)
+        return sum(segment.length_m for segment in self.segments)
 
     @property
-    def route_m(self) -> float:
+    def route_length_m(self) -> float:
         """The length of the route, by default that of all segments."""
         return self.segments_length_m if self.length_m is None else self.length_m
 
@@ -144,7 +144,7 @@ class RoadFile(_Keys):
     def all_segments(self) -> tuple[Segment, ...]:
         """The segments with the straight run-in before and the straight run-out after them."""
         run_in, run_out = Segment(self.run_in_m, 0.0, 0.0), Segment(self.run_out_m, 0.0, 0.0)
-        return run_in, *(each.segment() for each in self.segments), run_out
+        return run_in, *(segment.to_segment() for segment in self.segments), run_out
 
     @property
     def lanes(self) -> Lanes:
@@ -155,7 +155,7 @@ class RoadFile(_Keys):
     def all_paved(self) -> tuple[PavedArea, ...]:
         """The strips of asphalt, by default the lanes and their shoulders."""
         if self.paved is not None:
-            return tuple(PavedArea(**dict(each)) for each in self.paved)
+            return tuple(PavedArea(**dict(keys)) for keys in self.paved)
         edges_m, shoulders = self.lanes.edges_m, self.shoulders or _ShoulderKeys()
         return (PavedArea(edges_m[-1] + shoulders.left_m, edges_m[0] - shoulders.right_m),)
 
@@ -163,17 +163,17 @@ class RoadFile(_Keys):
     def all_marks(self) -> tuple[RoadMark, ...]:
         """The marks, by default white: solid at both edges and broken between lanes."""
         if self.marks is not None:
-            return tuple(RoadMark(**dict(each)) for each in self.marks)
+            return tuple(RoadMark(**dict(keys)) for keys in self.marks)
         edges_m = self.lanes.edges_m
-        outer = (edges_m[0], edges_m[-1])
+        solid_m = (edges_m[0], edges_m[-1])
         return tuple(
-            RoadMark(offset_m, "solid" if offset_m in outer else "broken", "white", SOLID_M) for offset_m in edges_m
+            RoadMark(edge_m, "solid" if edge_m in solid_m else "broken", "white", MARK_WIDTH_M) for edge_m in edges_m
         )
 
     @property
     def rails(self) -> tuple[Rail, ...]:
         """The rails and barriers."""
-        return tuple(Rail(**dict(each)) for each in self.rail_keys)
+        return tuple(Rail(**dict(keys)) for keys in self.rail_keys)
 
 
 @functools.lru_cache(maxsize=32)  # a sweep loads the same roads repeatedly, and parsing YAML takes 7 ms
@@ -187,17 +187,17 @@ def read_road_file(text: str, source: str) -> RoadFile | PartFile:
         raise UserError(f"{source} must contain keys and values, as docs/roads.md shows, not a {type(data).__name__}")
     kind = PartFile if "part_of" in data else RoadFile
     try:
-        read = kind.model_validate(data)
+        road_file = kind.model_validate(data)
     except ValidationError as error:
         problems = "; ".join(_describe_error(kind, problem) for problem in error.errors())
         raise UserError(f"{source} is not a road: {problems}") from error
-    if isinstance(read, RoadFile):
-        for problem in _problems(read):
+    if isinstance(road_file, RoadFile):
+        for problem in _find_problems(road_file):
             raise UserError(f"{source} is not a road: {problem}")
-    return read
+    return road_file
 
 
-def _problems(road: RoadFile) -> Iterable[str]:
+def _find_problems(road: RoadFile) -> Iterable[str]:
     """Yield the problems that concern more than one key."""
     lanes = road.lane_keys
     if lanes.driven >= len(lanes.widths_m):
@@ -206,10 +206,10 @@ def _problems(road: RoadFile) -> Iterable[str]:
     if road.paved is not None and road.shoulders is not None:
         yield "paved defines all asphalt: leave out shoulders"
     begin_m, end_m = -road.run_in_m, road.segments_length_m + road.run_out_m
-    for name, each in _ranges(road):
-        if each.from_m >= each.to_m:
-            yield f"{name} goes from {each.from_m} m to {each.to_m} m: from_m must be less than to_m"
-        if each.to_m <= begin_m or each.from_m >= end_m:
+    for name, keys in _named_ranges(road):
+        if keys.from_m >= keys.to_m:
+            yield f"{name} goes from {keys.from_m} m to {keys.to_m} m: from_m must be less than to_m"
+        if keys.to_m <= begin_m or keys.from_m >= end_m:
             yield f"{name} is not on the road, which lies from {begin_m} m to {end_m} m"
     for index, rail in enumerate(road.rails):
         if abs(rail.offset_m) <= lanes.widths_m[lanes.driven] / 2:
@@ -219,51 +219,55 @@ def _problems(road: RoadFile) -> Iterable[str]:
             yield f"a strip of paved has left_m {strip.left_m} and right_m {strip.right_m}: left is the greater offset"
     if road.segments_length_m > 20_000:
         yield f"the segments are {road.segments_length_m:.0f} m long: 20 km are enough"
-    elif road.route_m < SHORTEST_M:
-        yield f"the segments are only {road.segments_length_m:g} m long: a route has at least {SHORTEST_M:g} m"
-    elif road.route_m > road.segments_length_m:
-        yield f"length_m is {road.route_m}, but the segments are only {road.segments_length_m:.3f} m long: add to them"
+    elif road.route_length_m < MIN_ROUTE_M:
+        yield f"the segments are only {road.segments_length_m:g} m long: a route has at least {MIN_ROUTE_M:g} m"
+    elif road.route_length_m > road.segments_length_m:
+        segments = f"the segments are only {road.segments_length_m:.3f} m long"
+        yield f"length_m is {road.route_length_m}, but {segments}: add to them"
     yield from _find_tight_curves(road)
     yield from _find_unpaved(road)
 
 
-def _ranges(road: RoadFile) -> Iterable[tuple[str, _Along]]:
-    for name, each in (("paved", road.paved), ("marks", road.marks), ("rails", road.rail_keys)):
-        for index, along in enumerate(each or ()):
-            yield f"{name}.{index}", along
+def _named_ranges(road: RoadFile) -> Iterable[tuple[str, _RangeKeys]]:
+    """Yield each entry that has `from_m` and `to_m`, with its name in messages."""
+    for section, entries in (("paved", road.paved), ("marks", road.marks), ("rails", road.rail_keys)):
+        for index, keys in enumerate(entries or ()):
+            yield f"{section}.{index}", keys
 
 
 def _find_tight_curves(road: RoadFile) -> Iterable[str]:
-    """Yield a problem where the inner side of a curve reaches the circle's centre."""
-    offsets = [
+    """Yield a problem for the first curve whose inner edge comes too close to the centre of the circle."""
+    offsets_m = [
         *road.lanes.edges_m,
         *(mark.offset_m for mark in road.all_marks),
         *(rail.offset_m for rail in road.rails),
     ]
-    offsets += [edge for strip in road.all_paved for edge in (strip.left_m, strip.right_m)]
-    for index, segment in enumerate(road.segments):
-        placed = segment.segment()
-        for curvature in (placed.curvature_per_m, placed.end_curvature_per_m):
-            reach = max(offset * curvature for offset in offsets)
-            if reach > 1.0 - INNER_SHARE:
+    offsets_m += [edge_m for strip in road.all_paved for edge_m in (strip.left_m, strip.right_m)]
+    for index, keys in enumerate(road.segments):
+        segment = keys.to_segment()
+        for curvature_per_m in (segment.curvature_per_m, segment.end_curvature_per_m):
+            reach_in_radii = max(offset_m * curvature_per_m for offset_m in offsets_m)
+            if reach_in_radii > 1.0 - MIN_INNER_SHARE:
+                radius_m = abs(1 / curvature_per_m)
                 yield (
-                    f"segments.{index} has a radius of {abs(1 / curvature):.1f} m, but the road reaches "
-                    f"{abs(reach / curvature):.1f} m to the inside of the curve: make one wider or the other narrower"
+                    f"segments.{index} has a radius of {radius_m:.1f} m, but the road reaches "
+                    f"{abs(reach_in_radii / curvature_per_m):.1f} m to the inside of the curve: "
+                    "make one wider or the other narrower"
                 )
                 return
 
 
 def _find_unpaved(road: RoadFile) -> Iterable[str]:
-    """Yield a problem where the driven lane is not on asphalt along the whole route."""
-    half_m = road.lanes.widths_m[road.lanes.driven] / 2
+    """Yield a problem for the first part of the route on which the driven lane is not wholly on asphalt."""
+    half_width_m = road.lanes.widths_m[road.lanes.driven] / 2
     strips = road.all_paved
-    cuts = sorted({0.0, road.route_m, *(each for strip in strips for each in (strip.from_m, strip.to_m))})
-    for first_m, last_m in itertools.pairwise(each for each in cuts if 0.0 <= each <= road.route_m):
-        reached_m = half_m
+    ends_m = sorted({0.0, road.route_length_m, *(end_m for strip in strips for end_m in (strip.from_m, strip.to_m))})
+    for first_m, last_m in itertools.pairwise(end_m for end_m in ends_m if 0.0 <= end_m <= road.route_length_m):
+        covered_to_m = half_width_m  # the lane is on asphalt from its left edge to this offset
         for strip in sorted(strips, key=lambda strip: -strip.left_m):
-            if strip.from_m <= first_m and strip.to_m >= last_m and strip.left_m >= reached_m - 1e-6:
-                reached_m = min(reached_m, strip.right_m)
-        if reached_m > -half_m + 1e-6:
+            if strip.from_m <= first_m and strip.to_m >= last_m and strip.left_m >= covered_to_m - 1e-6:
+                covered_to_m = min(covered_to_m, strip.right_m)
+        if covered_to_m > -half_width_m + 1e-6:
             yield f"the driven lane lies on no asphalt from {first_m:.1f} m to {last_m:.1f} m: correct paved"
             return
 
@@ -271,17 +275,17 @@ def _find_unpaved(road: RoadFile) -> Iterable[str]:
 def _describe_error(kind: type[BaseModel], problem: Mapping[str, Any]) -> str:
     """Return a sentence about one invalid value."""
     location = [str(part)[:60] for part in problem["loc"]]
-    where = ".".join(location)
+    key = ".".join(location)
     if problem["type"] == "extra_forbidden":
         known = _known_keys(kind, problem["loc"][:-1])
         near = difflib.get_close_matches(location[-1], known, n=1, cutoff=0.4)
         hint = f"did you mean {near[0]!r}?" if near else f"the known keys are {', '.join(sorted(known))}"
-        return f"unknown key {where!r}: {hint}"
+        return f"unknown key {key!r}: {hint}"
     if problem["type"] == "missing":
-        return f"{where!r} is missing: add it"
+        return f"{key!r} is missing: add it"
     if problem["type"] == "model_type":
-        return f"{where!r} must contain keys and values, not {_format_value(problem['input'])}"
-    return f"{where!r}: {problem['msg']}, not {_format_value(problem['input'])}"
+        return f"{key!r} must contain keys and values, not {_format_value(problem['input'])}"
+    return f"{key!r}: {problem['msg']}, not {_format_value(problem['input'])}"
 
 
 def _format_value(value: Any) -> str:

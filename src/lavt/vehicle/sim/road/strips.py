@@ -13,11 +13,12 @@ from lavt.domain import FloatArray
 from lavt.vehicle.sim.road.road import Road
 
 Grey = NDArray[np.uint8]
+"""Grey levels or the values of a mask, 0 to 255, (rows, columns)."""
 
 OVERLAP_M = 0.03
-"""The overlap of a piece with the next one, so that no gap is visible."""
+"""The length by which a piece overlaps the next one, so that no gap is visible."""
 
-PIECE_M = 2.0
+MAX_PIECE_M = 2.0
 """The longest straight piece of a strip that follows the road."""
 
 _SUBPIXEL_BITS = 4
@@ -25,7 +26,7 @@ _SUBPIXEL_BITS = 4
 
 @dataclass(frozen=True, slots=True)
 class Square:
-    """A square of ground: its lower left corner in the world frame, the length of its edge, and metres per texel."""
+    """A square of ground: x of its left and y of its lower edge (world frame), length of an edge, metres per texel."""
 
     left_m: float
     low_m: float
@@ -67,19 +68,19 @@ def make_strips(corners_m: FloatArray) -> Strips:
     return Strips(corners_m, np.concatenate([corners_m.min(axis=1), corners_m.max(axis=1)], axis=1))
 
 
-def join_strips(found: Sequence[Strips]) -> Strips:
+def join_strips(parts: Sequence[Strips]) -> Strips:
     """Concatenate strips."""
-    return make_strips(np.concatenate([np.empty((0, 4, 2)), *(each.corners_m for each in found)]))
+    return make_strips(np.concatenate([np.empty((0, 4, 2)), *(part.corners_m for part in parts)]))
 
 
 def strip_along(road: Road, left_m: float, right_m: float, from_m: float = -np.inf, to_m: float = np.inf) -> Strips:
     """Create a strip along the road between two lateral offsets, divided into short pieces."""
     first_m, last_m = max(from_m, road.first_m), min(to_m, road.last_m)
-    cuts = np.linspace(first_m, last_m, max(2, round((last_m - first_m) / PIECE_M) + 1))
-    return strip_pieces(road, left_m, right_m, cuts[:-1], cuts[1:] + OVERLAP_M)
+    ends_m = np.linspace(first_m, last_m, max(2, round((last_m - first_m) / MAX_PIECE_M) + 1))
+    return strip_pieces(road, left_m, right_m, ends_m[:-1], ends_m[1:] + OVERLAP_M)
 
 
 def strip_pieces(road: Road, left_m: ArrayLike, right_m: ArrayLike, begin_m: FloatArray, end_m: FloatArray) -> Strips:
     """Create the quadrilaterals between the stations `begin_m` and `end_m` (n,) and two lateral offsets."""
-    ends = [(begin_m, left_m), (begin_m, right_m), (end_m, right_m), (end_m, left_m)]
-    return make_strips(np.stack([road.across(station, offset) for station, offset in ends], axis=1))
+    corners = [(begin_m, left_m), (begin_m, right_m), (end_m, right_m), (end_m, left_m)]
+    return make_strips(np.stack([road.point_at(station_m, offset_m) for station_m, offset_m in corners], axis=1))
