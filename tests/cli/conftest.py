@@ -15,7 +15,7 @@ from lavt.runtime import process_priority
 
 @pytest.fixture(autouse=True)
 def unqueued_output(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave pytest's output alone."""
+    """Keep commands from queueing their output, which would redirect pytest's."""
     monkeypatch.setattr(console, "queue_output", lambda *_: None)
 
 
@@ -24,19 +24,19 @@ def run(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
-    own_switch_interval: None,  # noqa: ARG001 (commands with a loop change it)
+    own_switch_interval: None,  # noqa: ARG001 (some commands change it)
 ) -> Run:
     """Return a function that runs `lavt` in this process, from an empty working directory."""
-    monkeypatch.setattr(console, "reserve_stdout", lambda: None)  # it would redirect pytest's output
-    monkeypatch.setattr(process_priority, "raise_priority", lambda *_: None)  # affects all tests
+    monkeypatch.setattr(console, "reserve_stdout", lambda: None)  # would redirect pytest's output
+    monkeypatch.setattr(process_priority, "raise_priority", lambda *_: None)  # would affect all tests
     monkeypatch.chdir(tmp_path)
 
     def run_here(*arguments: str) -> CommandResult:
         monkeypatch.setattr(sys, "argv", ["lavt", *arguments])
-        with pytest.raises(SystemExit) as ended:
+        with pytest.raises(SystemExit) as raised:
             main()
-        printed = capsys.readouterr()
-        code = ended.value.code
-        return CommandResult(code if isinstance(code, int) else 0, printed.out, printed.err)
+        output = capsys.readouterr()
+        code = raised.value.code
+        return CommandResult(code if isinstance(code, int) else 0, output.out, output.err)
 
     return run_here

@@ -28,7 +28,7 @@ CLIENT = str(shipped("configs/client.yaml"))
 RELAY = str(shipped("configs/relay.yaml"))
 RENDEZVOUS = str(shipped("configs/rendezvous.yaml"))
 ROUTER = str(shipped("zenoh-configs/router-server.json5"))
-ENDS_S = 60.0
+EXIT_TIMEOUT_S = 60.0
 
 
 def files(directory: Path) -> Mapping[str, bytes | None]:
@@ -38,7 +38,7 @@ def files(directory: Path) -> Mapping[str, bytes | None]:
     }
 
 
-BY_NETEM = [
+NETEM_OPTIONS = [
     part
     for change in ("time=real", "network.injection=netem", "network.inherent=loopback")
     for part in ("--set", change)
@@ -47,11 +47,11 @@ BAD_RUNS = {
     "unknown key": (["--set", "vehicle.rute=a_key"], "vehicle.rute"),
     "wrong type": (["--set", "seed=one"], "'seed'"),
     "out of range": (["--set", "camera.rate_hz=0"], "'camera.rate_hz'"),
-    "exposure longer than a frame": (["--set", "camera.exposure_ms=34"], "'camera.exposure_ms'"),
+    "exposure longer than a picture period": (["--set", "camera.exposure_ms=34"], "'camera.exposure_ms'"),
     "negative exposure": (["--set", "camera.exposure_ms=-1"], "'camera.exposure_ms'"),
-    "endless sensor delay": (["--set", "camera.sensor_delay_ms=5000"], "'camera.sensor_delay_ms'"),
+    "too long sensor delay": (["--set", "camera.sensor_delay_ms=5000"], "'camera.sensor_delay_ms'"),
     "unknown light": (["--set", "vehicle.light=moon"], "'vehicle.light'"),
-    "not a change": (["--set", "seed"], "a.b=value"),
+    "change without a value": (["--set", "seed"], "a.b=value"),
     "not YAML": (["--set", "seed=["], "not YAML"),
     "unknown condition": (["--set", "network.condition=L9"], "L0, L1, L2, L3, L4, L5"),
     "unknown route": (["--set", "vehicle.route=nowhere"], "a_key"),
@@ -59,7 +59,7 @@ BAD_RUNS = {
     "unknown preset": (["--set", "controller.preset=magic"], "designed, paper_calibrated"),
     "unknown preset in real time": (["--set", "controller.preset=magic", "--set", "time=real"], "designed"),
     "unknown controller": (["--set", "controller.kind=wizard"], "lane_keeper"),
-    "no pixels in real time": (["--set", "fidelity=geometry", "--set", "time=real"], "fidelity geometry"),
+    "no pictures in real time": (["--set", "fidelity=geometry", "--set", "time=real"], "fidelity geometry"),
     "unknown fidelity": (["--set", "fidelity=sketch"], "'geometry'"),
     "unknown vehicle": (["--set", "vehicle.kind=boat"], "simulator"),
     "unknown trace": (["--set", "network.video.trace=nowhere.csv"], "fading.mahimahi, handover.csv"),
@@ -77,15 +77,15 @@ BAD_RUNS = {
     ),
     "reordering without delay": (["--set", "network.video.reorder=0.1"], "reorder"),
     "a trace by netem": (
-        ["--set", "network.condition=handover", *BY_NETEM],
+        ["--set", "network.condition=handover", *NETEM_OPTIONS],
         "'handover.csv'",
     ),
     "a short queue by netem": (
-        ["--set", "network.condition=rate_short_queue", *BY_NETEM],
+        ["--set", "network.condition=rate_short_queue", *NETEM_OPTIONS],
         "queue_packets 50",
     ),
     "jitter beyond the delay by netem": (
-        ["--set", "network.video.jitter_ms=5", *BY_NETEM],
+        ["--set", "network.video.jitter_ms=5", *NETEM_OPTIONS],
         "a jitter of 5 ms",
     ),
     "loss without injection": (
@@ -105,10 +105,10 @@ def test_bad_runs(command: str, case: str, run: Run, tmp_path: Path) -> None:
     """An invalid run or sweep is rejected in one sentence, and no directory is created."""
     changes, reason = BAD_RUNS[case]
     if command == "sweep":
-        changes = [re.sub(r"network\.condition=(\w+)", r"conditions=[\1]", each) for each in changes]
-        changes = [each.replace("vehicle.route=nowhere", "routes=[nowhere]") for each in changes]
-    ended = run(command, SWEEP if command == "sweep" else DEMO, *changes, "--out", "mine")
-    assert reason in ended.rejected()
+        changes = [re.sub(r"network\.condition=(\w+)", r"conditions=[\1]", change) for change in changes]
+        changes = [change.replace("vehicle.route=nowhere", "routes=[nowhere]") for change in changes]
+    result = run(command, SWEEP if command == "sweep" else DEMO, *changes, "--out", "mine")
+    assert reason in result.rejected()
     assert files(tmp_path) == {}
 
 
@@ -133,20 +133,23 @@ def test_bad_boundaries(case: str, run: Run, tmp_path: Path) -> None:
 
 
 def test_settings_that_the_encoder_rejects(run: Run, tmp_path: Path) -> None:
-    """Settings that only the encoder rejects, after the car is built, create no directory either."""
-    ended = run("run", DEMO, "--set", "video.buffer_ms=0.5", "--set", "vehicle.scenery=none", "--out", "mine")
-    assert (ended.code, ended.out) == (2, "")
-    assert ended.err.splitlines()[-1].startswith("lavt: ")
-    assert "buffer cannot be 0.0005 s" in ended.err.splitlines()[-1]
+    """Settings that only the encoder rejects are rejected after the car is built, and no directory is created."""
+    result = run("run", DEMO, "--set", "video.buffer_ms=0.5", "--set", "vehicle.scenery=none", "--out", "mine")
+    assert (result.code, result.out) == (2, "")
+    assert result.err.splitlines()[-1].startswith("lavt: ")
+    assert "buffer cannot be 0.0005 s" in result.err.splitlines()[-1]
     assert files(tmp_path) == {}
 
 
-ON_LO = ("--interface", "lo", "--role", "server")
+LOOPBACK_SERVER = ("--interface", "lo", "--role", "server")
 BAD_NETEM = {
-    "unknown condition": (["apply", "L9", *ON_LO], "L0, L1, L2, L3, L4, L5"),
-    "the clock probe's port": (["apply", "L4", *ON_LO, "--video-port", "5602"], "the clock probe (port "),
-    "the probe moved onto the video": (["apply", "L4", *ON_LO, "--probe-port", "5600"], "the clock probe (port "),
-    "the port of NTP": (["apply", "L4", *ON_LO, "--video-port", "123"], "NTP"),
+    "unknown condition": (["apply", "L9", *LOOPBACK_SERVER], "L0, L1, L2, L3, L4, L5"),
+    "the clock probe's port": (["apply", "L4", *LOOPBACK_SERVER, "--video-port", "5602"], "the clock probe (port "),
+    "the probe moved onto the video": (
+        ["apply", "L4", *LOOPBACK_SERVER, "--probe-port", "5600"],
+        "the clock probe (port ",
+    ),
+    "the port of NTP": (["apply", "L4", *LOOPBACK_SERVER, "--video-port", "123"], "NTP"),
     "no interface's name": (["apply", "L4", "--role", "client", "--interface", "a/b"], "'a/b'"),
     "no such interface": (["show", "--interface", "nowhere0"], "nowhere0"),
     "nothing to verify": (["verify", "--interface", "nowhere0"], "nowhere0"),
@@ -163,17 +166,17 @@ def test_bad_netem(case: str, run: Run) -> None:
 
 def test_netem_dry_run(run: Run) -> None:
     """--dry-run needs neither root nor tc, and prints the commands, beginning with the root queue."""
-    ended = run("netem", "apply", "L2", *ON_LO, "--dry-run")
-    printed = json.loads(run("netem", "apply", "L2", *ON_LO, "--dry-run", "--json").out)
-    assert ended.code == 0
-    assert ended.out.splitlines()[:2] == [
+    result = run("netem", "apply", "L2", *LOOPBACK_SERVER, "--dry-run")
+    printed = json.loads(run("netem", "apply", "L2", *LOOPBACK_SERVER, "--dry-run", "--json").out)
+    assert result.code == 0
+    assert result.out.splitlines()[:2] == [
         "tc qdisc add dev lo root handle 4c56: prio bands 6",
         "tc qdisc add dev lo parent 4c56:4 handle 4c01: netem limit 10000 delay 150ms rate 10gbit",
     ]
-    assert [" ".join(command) for command in printed["commands"]] == ended.out.splitlines()
+    assert [" ".join(command) for command in printed["commands"]] == result.out.splitlines()
 
 
-MISSING = {
+MISSING_FILES = {
     "run": ["run", "nothing.yaml"],
     "sweep": ["sweep", "nothing.yaml"],
     "server": ["server", "nothing.yaml"],
@@ -186,14 +189,14 @@ MISSING = {
 }
 
 
-@pytest.mark.parametrize("command", MISSING)
+@pytest.mark.parametrize("command", MISSING_FILES)
 def test_missing_file(command: str, run: Run, tmp_path: Path) -> None:
     """A missing file or directory is named in one sentence, and nothing is created."""
-    assert "nothing" in run(*MISSING[command]).rejected()
+    assert "nothing" in run(*MISSING_FILES[command]).rejected()
     assert files(tmp_path) == {}
 
 
-WRONG_CONFIG = {
+CONFIGS_OF_OTHER_COMMANDS = {
     "run": ["run", SERVER],
     "server": ["server", DEMO],
     "client": ["client", DEMO],
@@ -204,13 +207,13 @@ WRONG_CONFIG = {
 }
 
 
-@pytest.mark.parametrize("command", WRONG_CONFIG)
+@pytest.mark.parametrize("command", CONFIGS_OF_OTHER_COMMANDS)
 def test_config_of_another_command(command: str, run: Run) -> None:
     """A config of another command is rejected in one sentence."""
-    run(*WRONG_CONFIG[command]).rejected()
+    run(*CONFIGS_OF_OTHER_COMMANDS[command]).rejected()
 
 
-OUT = {
+COMMANDS_WITH_OUT = {
     "run": ["run", DEMO, "--out"],
     "sweep": ["sweep", SWEEP, "--out"],
     "demo": ["demo", "--out"],
@@ -220,9 +223,9 @@ OUT = {
 
 
 @pytest.mark.parametrize("occupied", ["directory", "file"])
-@pytest.mark.parametrize("command", OUT)
+@pytest.mark.parametrize("command", COMMANDS_WITH_OUT)
 def test_nothing_is_overwritten(command: str, occupied: str, run: Run, tmp_path: Path) -> None:
-    """An existing file or directory at --out is rejected and stays unchanged."""
+    """If --out names an existing file or directory, the command is rejected and changes nothing."""
     mine = tmp_path / "mine"
     if occupied == "directory":
         (mine / "runs" / "a_key_L0_00").mkdir(parents=True)
@@ -231,7 +234,7 @@ def test_nothing_is_overwritten(command: str, occupied: str, run: Run, tmp_path:
     else:
         mine.write_bytes(b"weeks of work")
     before = files(tmp_path)
-    assert "mine" in run(*OUT[command], "mine").rejected()
+    assert "mine" in run(*COMMANDS_WITH_OUT[command], "mine").rejected()
     assert files(tmp_path) == before
 
 
@@ -252,31 +255,31 @@ def test_report_of_nothing(run: Run, tmp_path: Path) -> None:
     assert files(tmp_path) == {"empty": None, "file": b"x"}
 
 
-WHOLE = dict.fromkeys(IDENTITY)
-NO_RESULTS = {
+COMPLETE_RESULT = dict.fromkeys(IDENTITY)
+INVALID_RESULTS = {
     "empty file": ("", "b/result.json"),
     "truncated file": ('{"run": "a', "b/result.json"),
     "list": ("[]", "JSON object"),
     "number": ("7", "JSON object"),
     "empty object": ("{}", "run, time"),
     "without a seed": (json.dumps({key: None for key in IDENTITY if key != "seed"}), "seed"),
-    "invalid axes": (json.dumps({**WHOLE, "axes": [1]}), "'axes'"),
-    "invalid injection": (json.dumps({**WHOLE, "injected_ms": 5}), "'injected_ms'"),
+    "invalid axes": (json.dumps({**COMPLETE_RESULT, "axes": [1]}), "'axes'"),
+    "invalid injection": (json.dumps({**COMPLETE_RESULT, "injected_ms": 5}), "'injected_ms'"),
 }
 
 
-@pytest.mark.parametrize("case", NO_RESULTS)
+@pytest.mark.parametrize("case", INVALID_RESULTS)
 def test_report_of_an_invalid_result(case: str, run: Run, tmp_path: Path) -> None:
     """An invalid result.json ends the report with exit code 1 and one sentence, and no file of any run is changed."""
-    content, reason = NO_RESULTS[case]
-    for name, text in (("a", json.dumps(WHOLE)), ("b", content)):
+    content, reason = INVALID_RESULTS[case]
+    for name, text in (("a", json.dumps(COMPLETE_RESULT)), ("b", content)):
         (tmp_path / "sweep" / "runs" / name).mkdir(parents=True)
         (tmp_path / "sweep" / "runs" / name / "result.json").write_text(text)
     before = files(tmp_path)
-    ended = run("report", "sweep")
-    assert (ended.code, ended.out) == (1, "")
-    assert reason in ended.sentence()
-    assert "b/result.json" in ended.err
+    result = run("report", "sweep")
+    assert (result.code, result.out) == (1, "")
+    assert reason in result.sentence()
+    assert "b/result.json" in result.err
     assert files(tmp_path) == before
 
 
@@ -286,9 +289,9 @@ def test_report_of_a_boundary_without_runs(run: Run, tmp_path: Path) -> None:
     (tmp_path / "found" / "boundary.json").write_text('{"runs": [{}], "groups": [{}]}')
     assert "found" in run("report", "found").rejected()
     (tmp_path / "found" / "boundary.json").write_text('{"runs": [], "groups": 3}')
-    ended = run("report", "found")
-    assert (ended.code, ended.out) == (1, "")
-    assert "boundary.json" in ended.sentence()
+    result = run("report", "found")
+    assert (result.code, result.out) == (1, "")
+    assert "boundary.json" in result.sentence()
     assert list(files(tmp_path / "found")) == ["boundary.json"]
 
 
@@ -298,7 +301,7 @@ def test_nothing_to_resume(run: Run, tmp_path: Path) -> None:
     assert files(tmp_path) == {}
 
 
-SIDES = {
+BAD_SIDES = {
     "vehicle with a slash": (["server", SERVER, "--set", "vehicle_id=a/b"], "the vehicle 'a/b'"),
     "vehicle with wildcards": (["client", CLIENT, "--set", "vehicle_id='**'"], "the vehicle '**'"),
     "client without a name": (["client", CLIENT, "--set", "who=''"], "the client ''"),
@@ -322,13 +325,13 @@ SIDES = {
 }
 
 
-@pytest.mark.parametrize("way", ["listen", "connect"])
-def test_a_router_whose_private_key_others_may_read(way: str, run: Run, tmp_path: Path) -> None:
+@pytest.mark.parametrize("direction", ["listen", "connect"])
+def test_a_router_whose_private_key_others_may_read(direction: str, run: Run, tmp_path: Path) -> None:
     """A router does not start if other users may read the private key of its certificate."""
     key = tmp_path / "vehicle-1.key"
     key.touch(0o644)
     key.chmod(0o644)
-    change = f"transport.link.tls.{way}_private_key={key}"
+    change = f"transport.link.tls.{direction}_private_key={key}"
     assert str(key) in run("router", ROUTER, "--set", change, "--set", "listen.endpoints=[tcp/127.0.0.1:0]").rejected()
 
 
@@ -348,10 +351,10 @@ def test_an_expired_signing_key(side: str, config: str, run: Run, tmp_path: Path
     assert not (tmp_path / "mine").exists()
 
 
-@pytest.mark.parametrize("case", SIDES)
+@pytest.mark.parametrize("case", BAD_SIDES)
 def test_bad_sides(case: str, run: Run, tmp_path: Path) -> None:
     """An invalid config of a server, client, router or relay is rejected in one sentence, and nothing is created."""
-    arguments, reason = SIDES[case]
+    arguments, reason = BAD_SIDES[case]
     out = ["--out", "mine"] if arguments[0] in {"server", "client"} else []
     assert reason in run(*arguments, *out).rejected()
     assert files(tmp_path) == {}
@@ -382,18 +385,18 @@ COMMANDS = [
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help(command: str, run: Run) -> None:
     """Each command prints a help text with an example to standard output."""
-    ended = run(command, "--help")
-    assert ended.code == 0
-    assert f"Example: lavt {command}" in " ".join(ended.out.split())
-    assert ended.err == ""
+    result = run(command, "--help")
+    assert result.code == 0
+    assert f"Example: lavt {command}" in " ".join(result.out.split())
+    assert result.err == ""
 
 
 def test_list_of_commands(run: Run) -> None:
     """The help of `lavt` lists all commands."""
-    ended = run("--help")
-    assert ended.code == 0
-    assert sorted(each.name or "" for each in app.registered_commands) == sorted(COMMANDS)
-    assert all(command in ended.out for command in COMMANDS)
+    result = run("--help")
+    assert result.code == 0
+    assert sorted(command.name or "" for command in app.registered_commands) == sorted(COMMANDS)
+    assert all(command in result.out for command in COMMANDS)
 
 
 def test_join_of_nothing(run: Run, tmp_path: Path) -> None:
@@ -407,12 +410,12 @@ def test_join_of_nothing(run: Run, tmp_path: Path) -> None:
 def test_unknown_command(run: Run) -> None:
     """An unknown command or option, or a missing argument, ends with exit code 2 and an error on standard error."""
     for arguments in (["fly"], ["run", DEMO, "--fast"], ["run"]):
-        ended = run(*arguments)
-        assert (ended.code, ended.out) == (2, "")
-        assert "Error: " in ended.err
+        result = run(*arguments)
+        assert (result.code, result.out) == (2, "")
+        assert "Error: " in result.err
 
 
-def lavt_process(*arguments: str) -> subprocess.Popen[str]:
+def start_lavt(*arguments: str) -> subprocess.Popen[str]:
     """Start `lavt` in a process of its own."""
     return subprocess.Popen(
         [sys.executable, "-m", "lavt", *arguments],
@@ -453,17 +456,17 @@ def test_rendezvous_port_in_use(used_port: int, run: Run) -> None:
     assert f"127.0.0.1:{used_port}" in run("rendezvous", RENDEZVOUS, *changes).rejected()
 
 
-WATCHES = {
+BAD_WATCHES = {
     "address of another machine": (["--bind", "192.0.2.7"], "192.0.2.7:5600"),
     "unknown local host": (["--bind", "a" * 64], "a" * 64),
     "unknown sender": (["--from", "a" * 64], "--from"),
 }
 
 
-@pytest.mark.parametrize("case", WATCHES)
+@pytest.mark.parametrize("case", BAD_WATCHES)
 def test_bad_watch(case: str, run: Run) -> None:
     """An unknown host, or an address of another machine, is rejected in one sentence."""
-    arguments, reason = WATCHES[case]
+    arguments, reason = BAD_WATCHES[case]
     assert reason in run("watch", *arguments).rejected()
 
 
@@ -497,8 +500,8 @@ def test_client_with_an_unknown_server(router: str, run: Run, tmp_path: Path) ->
 def test_server_port_in_use(router: str, used_port: int, run: Run, tmp_path: Path) -> None:
     """A server's video port that is in use is rejected in one sentence, and nothing is created."""
     changes = (f"video.port={used_port}", "video.bind=127.0.0.1", f"zenoh.router={router}")
-    sets = [part for change in changes for part in ("--set", change)]
-    assert f"127.0.0.1:{used_port}" in run("server", SERVER, "--json", *sets, "--out", "mine").rejected()
+    options = [part for change in changes for part in ("--set", change)]
+    assert f"127.0.0.1:{used_port}" in run("server", SERVER, "--json", *options, "--out", "mine").rejected()
     assert files(tmp_path) == {}
 
 
@@ -516,21 +519,21 @@ def test_stop_without_a_router(run: Run) -> None:
 
 
 def test_bad_input_of_a_process(used_port: int) -> None:
-    """With invalid input, `python -m lavt` prints one sentence, nothing of Zenoh, and exits with code 2."""
-    process = lavt_process("router", ROUTER, "--json", "--set", f"listen.endpoints=[tcp/127.0.0.1:{used_port}]")
-    out, err = process.communicate(timeout=ENDS_S)
+    """With invalid input, `python -m lavt` prints one sentence and no log of Zenoh, and exits with code 2."""
+    process = start_lavt("router", ROUTER, "--json", "--set", f"listen.endpoints=[tcp/127.0.0.1:{used_port}]")
+    out, err = process.communicate(timeout=EXIT_TIMEOUT_S)
     assert f"tcp/127.0.0.1:{used_port}" in CommandResult(process.returncode, out, err).rejected()
 
 
 @pytest.mark.parametrize("command", [["client", CLIENT], ["server", SERVER, "--set", "video.port=0"]])
 def test_a_side_waits_for_its_router(command: list[str]) -> None:
-    """A server or client without a router says so once, waits, and exits with code 0 on Ctrl-C."""
+    """A server or client without a router prints one message, waits, and exits with code 0 on Ctrl-C."""
     ports = ["--set", "zenoh.router=tcp/127.0.0.1:1", "--set", f"clock.probe_port={1 if command[0] == 'client' else 0}"]
-    process = lavt_process(*command, *ports, "--json", "--set", "camera.width_px=128", "--set", "camera.height_px=128")
+    process = start_lavt(*command, *ports, "--json", "--set", "camera.width_px=128", "--set", "camera.height_px=128")
     assert process.stdout is not None
     assert '"ready"' in process.stdout.readline()
     process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=ENDS_S)
+    _, err = process.communicate(timeout=EXIT_TIMEOUT_S)
     assert process.returncode == 0
     assert err.count("\n") == 1
     assert "`lavt router" in err
@@ -548,11 +551,11 @@ def test_ctrl_c_ends_forwarders() -> None:
         "ready": ["rendezvous", RENDEZVOUS, "--json", "--set", "video_port=0", "--set", "probe_port=0"],
         "ports": ["relay", RELAY, "--json", "--set", "video_listen=127.0.0.1:0", "--set", "control_listen=127.0.0.1:0"],
     }
-    started = {key: lavt_process(*each) for key, each in arguments.items()}
-    for key, process in started.items():
+    processes = {key: start_lavt(*words) for key, words in arguments.items()}
+    for key, process in processes.items():
         assert process.stdout is not None
         assert f'"{key}"' in process.stdout.readline()
         process.send_signal(signal.SIGINT)
-    for process in started.values():
-        _, err = process.communicate(timeout=ENDS_S)
+    for process in processes.values():
+        _, err = process.communicate(timeout=EXIT_TIMEOUT_S)
         assert (process.returncode, err) == (0, "")

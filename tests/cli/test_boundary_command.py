@@ -11,7 +11,7 @@ from tests.support.command_line import Run
 from lavt.config_file import shipped
 
 BOUNDARY = str(shipped("configs/boundary.yaml"))
-SMALL = [
+SMALL_SEARCH = [
     "routes=[a_key]",
     "presets=[paper_calibrated]",
     "longest_delay_ms=300",
@@ -24,15 +24,15 @@ SMALL = [
 def test_results_are_printed_and_written(run: Run, tmp_path: Path) -> None:
     """The results are printed as JSON and written as JSON, as CSV with a row per seed, and as two figures."""
     out = tmp_path / "out"
-    changes = [part for each in SMALL for part in ("--set", each)]
+    changes = [part for change in SMALL_SEARCH for part in ("--set", change)]
     code, printed, messages = run("boundary", BOUNDARY, *changes, "--out", str(out), "--jobs", "1", "--json")
     assert code == 0
-    found = json.loads(printed)
-    assert found == json.loads((out / "boundary.json").read_text())
-    assert (found["schema"], found["failed"], found["config"]["within_ms"]) == (1, [], 30.0)
+    result = json.loads(printed)
+    assert result == json.loads((out / "boundary.json").read_text())
+    assert (result["schema"], result["failed"], result["config"]["within_ms"]) == (1, [], 30.0)
     with (out / "boundary.csv").open() as file:
         (row,) = csv.DictReader(file)
-    (searched,) = found["runs"]
+    (search,) = result["runs"]
     assert list(row) == [
         "route",
         "preset",
@@ -43,7 +43,7 @@ def test_results_are_printed_and_written(run: Run, tmp_path: Path) -> None:
         "completion_ms",
         "theory_ms",
     ]
-    assert float(row["onset_ms"]) == searched["onset_ms"]
+    assert float(row["onset_ms"]) == search["onset_ms"]
     assert {path.name for path in out.iterdir()} == {
         "boundary.csv",
         "boundary.json",

@@ -24,28 +24,28 @@ def run(run: Run) -> Run:
     return lambda *arguments: run("can", "check", *arguments)
 
 
-def edited(folder: Path, name: str, edit: Edit = lambda _: None, bits: tuple[str, str] = ("", "")) -> str:
-    """Write a copy of a shipped profile with a change in the profile or its DBC; return its path."""
+def edited(folder: Path, name: str, edit: Edit = lambda _: None, dbc_change: tuple[str, str] = ("", "")) -> str:
+    """Write a copy of a shipped profile, changed by `edit` and with a text of its DBC replaced; return its path."""
     source = shipped_profiles()[name]
     profile = yaml.safe_load(source.read_text())
     edit(profile)
     dbc = source.with_suffix(".dbc").read_text()
-    assert bits[0] in dbc
-    (folder / profile["dbc"]).write_text(dbc.replace(*bits, 1))
+    assert dbc_change[0] in dbc
+    (folder / profile["dbc"]).write_text(dbc.replace(*dbc_change, 1))
     path = folder / "mine.yaml"
     path.write_text(yaml.safe_dump(profile))
     return str(path)
 
 
 @pytest.mark.parametrize("name", [*PROFILES, "dataspeed_gen2:user"])
-def test_shipped(run: Run, name: str) -> None:
+def test_shipped_profiles_match(run: Run, name: str) -> None:
     """Each shipped profile matches its DBC."""
     code, out, err = run(name)
     assert (code, err) == (0, "")
     assert out.splitlines()[0].startswith(f"{name} and {name.partition(':')[0]}.dbc ")
 
 
-def test_unverified(run: Run) -> None:
+def test_unverified_signals(run: Run) -> None:
     """Unverified signals are listed, are not mismatches, and inhibit arming on a real bus."""
     code, out, _ = run("dataspeed_gen2", "--json")
     printed = json.loads(out)
@@ -65,7 +65,7 @@ def test_unknown_steering_sign(run: Run, tmp_path: Path) -> None:
     _, out, _ = run("dataspeed_gen1")
     assert "may not arm" in out.splitlines()[-1]
     assert "steering_sign" in out.splitlines()[-1]
-    code, out, _ = run(edited(tmp_path, "dataspeed_gen1", lambda it: it["vehicle"].update(steering_sign=1)))
+    code, out, _ = run(edited(tmp_path, "dataspeed_gen1", lambda profile: profile["vehicle"].update(steering_sign=1)))
     assert code == 0
     assert "may arm" in out.splitlines()[-1]
     assert "`lavt can test-watchdog`" in out.splitlines()[-1]
@@ -73,19 +73,19 @@ def test_unknown_steering_sign(run: Run, tmp_path: Path) -> None:
 
 def test_vendors_dbc(run: Run, tmp_path: Path) -> None:
     """With the vendor's DBC, which marks no signal as unverified, all signals are verified."""
-    vendors = tmp_path / "vendor.dbc"
-    vendors.write_text(
+    vendor_dbc = tmp_path / "vendor.dbc"
+    vendor_dbc.write_text(
         "\n".join(
             line
             for line in shipped_profiles()["dataspeed_gen2"].with_suffix(".dbc").read_text().splitlines()
             if not line.startswith('BA_ "Unverified"')
         )
     )
-    code, out, _ = run("dataspeed_gen2", "--dbc", str(vendors), "--json")
+    code, out, _ = run("dataspeed_gen2", "--dbc", str(vendor_dbc), "--json")
     assert code == 0
     assert json.loads(out) == {
         "profile": "dataspeed_gen2",
-        "dbc": str(vendors),
+        "dbc": str(vendor_dbc),
         "agree": True,
         "disagreements": [],
         "unverified": [],
@@ -94,17 +94,17 @@ def test_vendors_dbc(run: Run, tmp_path: Path) -> None:
     }
 
 
-def steering(**changes: Any) -> Edit:
+def edit_steering(**changes: Any) -> Edit:
     """Return an edit of the steering command."""
     return lambda profile: profile["sent"]["steering"].update(changes)
 
 
-def reported(part: str, **changes: Any) -> Edit:
+def edit_report(part: str, **changes: Any) -> Edit:
     """Return an edit of one report."""
     return lambda profile: profile["reports"][part].update(changes)
 
 
-def same(_: dict[str, Any]) -> None:
+def edit_nothing(_: dict[str, Any]) -> None:
     """Change nothing in the profile."""
 
 
@@ -112,148 +112,149 @@ UNCHANGED = ("", "")
 MISMATCHES: list[tuple[str, Edit, tuple[str, str], str, tuple[str, ...]]] = [
     (
         "dataspeed_gen1",
-        steering(message="SteerCmd"),
+        edit_steering(message="SteerCmd"),
         UNCHANGED,
         "sent.steering",
         ("SteerCmd", "SteeringCmd"),
     ),
     (
         "dataspeed_gen1",
-        steering(value="SCMD_ANGEL"),
+        edit_steering(value="SCMD_ANGEL"),
         UNCHANGED,
         "sent.steering.value",
         ("SCMD_ANGEL", "SCMD_ANGLE"),
     ),
     (
         "dataspeed_gen1",
-        steering(enable="SVEL", rate=""),
+        edit_steering(enable="SVEL", rate=""),
         UNCHANGED,
         "sent.steering.enable",
         ("SVEL", "SteeringCmd"),
     ),
     (
         "dataspeed_gen1",
-        steering(count="RES2"),
+        edit_steering(count="RES2"),
         UNCHANGED,
         "sent.steering.count",
         ("RES2", "SteeringCmd"),
     ),
     (
         "dataspeed_gen2",
-        steering(checksum="RC", count=""),
+        edit_steering(checksum="RC", count=""),
         UNCHANGED,
         "sent.steering.checksum",
         ("RC", "RemoteSteerCmd"),
     ),
     (
         "dataspeed_gen1",
-        steering(clear="EN"),
+        edit_steering(clear="EN"),
         UNCHANGED,
         "sent.steering",
         ("EN", "enable", "clear"),
     ),
     (
         "dataspeed_gen1",
-        lambda it: it["limits"].update(steering_wheel_deg=551.0),
+        lambda profile: profile["limits"].update(steering_wheel_deg=551.0),
         UNCHANGED,
         "sent.steering.value",
         ("551", "SCMD_ANGLE", "-550", "550"),
     ),
     (
         "dataspeed_gen1",
-        lambda it: it["sent"]["gears"].update(drive=3),
+        lambda profile: profile["sent"]["gears"].update(drive=3),
         UNCHANGED,
         "sent.gear.value",
         ("drive is 3", "GCMD", "NEUTRAL"),
     ),
     (
         "dataspeed_gen1",
-        lambda it: it["sent"]["gears"].update(drive=8),
+        lambda profile: profile["sent"]["gears"].update(drive=8),
         UNCHANGED,
         "sent.gear.value",
         ("drive is 8", "GCMD", "7"),
     ),
     (
         "dataspeed_gen2",
-        lambda it: it["sent"]["system"].update(enable=2),
+        lambda profile: profile["sent"]["system"].update(enable=2),
         UNCHANGED,
         "sent.system.value",
         ("enable is 2", "CMD", "DISABLE"),
     ),
     (
         "dataspeed_gen2",
-        reported("remote", needs={"STATE": [9]}),
+        edit_report("remote", needs={"STATE": [9]}),
         UNCHANGED,
         "reports.remote.needs.STATE",
         ("9", "STATE"),
     ),
     (
         "dataspeed_gen2",
-        reported("system", trip={"STATE=6": "tripped"}),
+        edit_report("system", trip={"STATE=6": "tripped"}),
         UNCHANGED,
         "reports.system.trip.STATE=6",
         ("6", "STATE"),
     ),
     (
         "dataspeed_gen2",
-        reported("steering", timeout_ms=101),
+        edit_report("steering", timeout_ms=101),
         UNCHANGED,
         "reports.steering.timeout_ms",
         ("101 ms", "100 ms"),
     ),
     (
         "dataspeed_gen2",
-        reported("gear", timeout_ms=199),
+        edit_report("gear", timeout_ms=199),
         UNCHANGED,
         "reports.gear.timeout_ms",
         ("199 ms", "GearReport1", "100 ms"),
     ),
     (
         "dataspeed_gen1",
-        same,
+        edit_nothing,
         ('BA_ "TimeoutMs" BO_ 96 100;', 'BA_ "TimeoutMs" BO_ 96 39;'),
         "sent.brake",
         ("BrakeCmd", "39 ms", "20 ms"),
     ),
     (
         "dataspeed_gen1",
-        lambda it: it["sent"].update(clearing_bytes=2),
+        lambda profile: profile["sent"].update(clearing_bytes=2),
         UNCHANGED,
         "sent.steering.clear",
         ("CLEAR", "2 bytes", "sent.clearing_bytes"),
     ),
     (
         "dataspeed_gen1",
-        same,
+        edit_nothing,
         ("BO_ 121 DriverAssist: 3 KIT", "BO_ 96 DriverAssist: 3 KIT"),
         "the DBC has two messages of identifier 0x060",
         ("BrakeCmd", "DriverAssist"),
     ),
     (
         "dataspeed_gen1",
-        steering(rate="SCMD_TORQUE"),
+        edit_steering(rate="SCMD_TORQUE"),
         UNCHANGED,
         "sent.steering.rate",
         ("SCMD_TORQUE", "SCMD_ANGLE"),
     ),
     (
         "dataspeed_gen2",
-        lambda it: it.update(commands=None),
+        lambda profile: profile.update(commands=None),
         UNCHANGED,
         "sent.steering",
         ("no message",),
     ),
 ]
+"""A shipped profile, an edit of it, a replacement in its DBC, and the key and names in the sentence on the mismatch."""
 
 
 @pytest.mark.parametrize(
-    ("planted", "key", "names"), [pytest.param(each[:3], *each[3:], id=each[3]) for each in MISMATCHES]
+    ("edit", "key", "names"), [pytest.param(case[:3], *case[3:], id=case[3]) for case in MISMATCHES]
 )
 def test_mismatch(
-    run: Run, tmp_path: Path, planted: tuple[str, Edit, tuple[str, str]], key: str, names: tuple[str, ...]
+    run: Run, tmp_path: Path, edit: tuple[str, Edit, tuple[str, str]], key: str, names: tuple[str, ...]
 ) -> None:
     """Each mismatch has a sentence that begins with the profile's key and names the signals; the exit code is 2."""
-    code, out, err = run(edited(tmp_path, *planted))
+    code, out, err = run(edited(tmp_path, *edit))
     assert (code, out) == (2, "")
     sentences = [line for line in err.splitlines() if line.startswith(f"{key}: ")]
     assert any(all(name in sentence for name in names) for sentence in sentences), err
@@ -261,7 +262,11 @@ def test_mismatch(
 
 def test_all_mismatches(run: Run, tmp_path: Path) -> None:
     """All mismatches are listed and counted."""
-    path = edited(tmp_path, "dataspeed_gen1", lambda it: (steering(count="A")(it), reported("gear", message="B")(it)))
+    path = edited(
+        tmp_path,
+        "dataspeed_gen1",
+        lambda profile: (edit_steering(count="A")(profile), edit_report("gear", message="B")(profile)),
+    )
     code, out, err = run(path, "--json")
     assert code == 2
     assert [line.partition(": ")[0] for line in err.splitlines()[:2]] == ["sent.steering.count", "reports.gear"]
@@ -271,7 +276,9 @@ def test_all_mismatches(run: Run, tmp_path: Path) -> None:
 
 def test_mismatch_found_by_loading(run: Run, tmp_path: Path) -> None:
     """An error that only loading the profile for driving finds is a mismatch, too."""
-    code, _, err = run(edited(tmp_path, "dataspeed_gen1", lambda it: it["sent"]["brake"].update(value="PCMD_TORQUE")))
+    code, _, err = run(
+        edited(tmp_path, "dataspeed_gen1", lambda profile: profile["sent"]["brake"].update(value="PCMD_TORQUE"))
+    )
     assert code == 2
     assert "PCMD_TORQUE of BrakeCmd" in err
 

@@ -21,7 +21,7 @@ LOG = """(1000.000000) can0 065#640000007D000001
 (1001.000000) can0 065#C80000007D000001
 (1001.250000) can0 555#00
 """
-"""Steering wheel at 10 and 20 degrees, 1.25 km/h; gear DRIVE; and an unknown message."""
+"""Steering wheel at 10 and then 20 degrees at 1.25 km/h, gear DRIVE, and an unknown message."""
 
 
 @pytest.fixture
@@ -40,11 +40,11 @@ def log(tmp_path: Path) -> Path:
 @contextmanager
 def sending(message: can.Message) -> Iterator[None]:
     """Send a message every 10 ms on the virtual bus `monitored`."""
-    ended = threading.Event()
+    is_over = threading.Event()
 
     def send() -> None:
         with can.Bus(interface="virtual", channel="monitored", ignore_config=True) as bus:
-            while not ended.wait(0.01):
+            while not is_over.wait(0.01):
                 bus.send(message)
 
     sender = threading.Thread(target=send)
@@ -52,7 +52,7 @@ def sending(message: can.Message) -> Iterator[None]:
     try:
         yield
     finally:
-        ended.set()
+        is_over.set()
         sender.join()
 
 
@@ -75,31 +75,31 @@ def test_log_as_json(run: Run, log: Path) -> None:
     assert code == 0
     assert (list(second), list(summary)) == (["second"], ["summary"])
     assert summary["summary"]["unknown"] == {"0x555": 1}
-    gear = next(each for each in summary["summary"]["messages"] if each["message"] == "GearReport")
+    gear = next(message for message in summary["summary"]["messages"] if message["message"] == "GearReport")
     assert (gear["identifier"], gear["frames"]) == (0x067, 1)
     assert gear["signals"]["STATE"] == {"value": 4, "unit": "", "name": "DRIVE", "unverified": False}
 
 
 def test_bus(run: Run, tmp_path: Path) -> None:
     """Frames on a bus are printed, and written to a log that can be read again."""
-    written = tmp_path / "received.log"
+    log_file = tmp_path / "received.log"
     with sending(can.Message(arbitration_id=0x067, data=b"\x01\x80", is_extended_id=False)):
         bus = ("--interface", "virtual", "--channel", "monitored")
-        code, out, _ = run("monitor", "dataspeed_gen1", *bus, "--seconds", "1", "--json", "--write", str(written))
+        code, out, _ = run("monitor", "dataspeed_gen1", *bus, "--seconds", "1", "--json", "--write", str(log_file))
     assert code == 0
-    (gear,) = (each for each in json.loads(out.splitlines()[-1])["summary"]["messages"] if each["frames"])
+    (gear,) = (message for message in json.loads(out.splitlines()[-1])["summary"]["messages"] if message["frames"])
     assert gear["signals"]["STATE"]["name"] == "PARK"
-    assert len(written.read_text().splitlines()) == gear["frames"] > 10
-    code, out, _ = run("monitor", "dataspeed_gen1", "--log", str(written))
+    assert len(log_file.read_text().splitlines()) == gear["frames"] > 10
+    code, out, _ = run("monitor", "dataspeed_gen1", "--log", str(log_file))
     assert f"GearReport 0x067  {gear['frames']} times" in out
 
 
 def test_silent_bus(run: Run) -> None:
     """On a silent bus the missing reports are named, and the exit code is 1."""
-    ended = run("monitor", "--interface", "virtual", "--channel", "silent", "--seconds", "1")
-    assert ended.code == 1
-    assert "SteerReport1 0x100  0 times, 0.0 of 100 per s  WRONG: " in ended.out
-    assert "virtual silent" in ended.sentence()
+    result = run("monitor", "--interface", "virtual", "--channel", "silent", "--seconds", "1")
+    assert result.code == 1
+    assert "SteerReport1 0x100  0 times, 0.0 of 100 per s  WRONG: " in result.out
+    assert "virtual silent" in result.sentence()
 
 
 def test_any_dbc(run: Run, log: Path, tmp_path: Path) -> None:

@@ -34,22 +34,22 @@ def run(run: Run) -> Run:
     return lambda *arguments: run("can", "test-watchdog", SERVER, *arguments)
 
 
-def by_wire_options(profile: str, port: int = 0, **others: str) -> list[str]:
+def by_wire_options(profile: str, port: int = 0, **dbw_changes: str) -> list[str]:
     """Return the options that turn the server's config into one of a by-wire car on a bus of its own."""
     dbw = {
         "profile": profile,
         "interface": "udp_multicast",
         "channel": GROUP,
         "options": f"{{port: {port}}}",
-        **others,
+        **dbw_changes,
     }
-    all_changes = ["vehicle.kind=dbw", *(f"vehicle.dbw.{key}={value}" for key, value in dbw.items())]
-    return [part for change in all_changes for part in ("--set", change)]
+    changes = ["vehicle.kind=dbw", *(f"vehicle.dbw.{key}={value}" for key, value in dbw.items())]
+    return [part for change in changes for part in ("--set", change)]
 
 
 @contextmanager
 def software_car(arguments: list[str], *commands: str) -> Iterator[None]:
-    """Run a software car in a process of its own, after these console commands."""
+    """Run a software car in a process of its own, and have it execute these console commands first."""
     with subprocess.Popen(
         [sys.executable, "-m", "lavt", "software-car", SERVER, *arguments, "--json"],
         stdin=subprocess.PIPE,
@@ -80,7 +80,7 @@ def port() -> int:
 @pytest.mark.realtime
 @pytest.mark.judges_times
 @pytest.mark.parametrize("profile", ["dataspeed_gen1", "dataspeed_gen2"])
-def test_passed(run: Run, tmp_path: Path, port: int, profile: str) -> None:
+def test_a_car_that_brakes_passes(run: Run, tmp_path: Path, port: int, profile: str) -> None:
     """A car that brakes without commands passes the test, and its proof applies to this bus and profile."""
     arguments = by_wire_options(profile, port, steering_sign="1")
     with software_car(arguments):
@@ -98,7 +98,7 @@ def test_passed(run: Run, tmp_path: Path, port: int, profile: str) -> None:
 
 @pytest.mark.realtime
 @pytest.mark.parametrize("profile", ["dataspeed_gen1", "dataspeed_gen2"])
-def test_failed(run: Run, tmp_path: Path, port: int, profile: str, stalls: Stalls) -> None:
+def test_a_car_that_does_not_brake_fails(run: Run, tmp_path: Path, port: int, profile: str, stalls: Stalls) -> None:
     """A car that does not brake fails the test, and any older proof is removed."""
     (tmp_path / "proof.json").write_text("an older proof")
     arguments = by_wire_options(profile, port, steering_sign="1")
@@ -114,9 +114,9 @@ def test_failed(run: Run, tmp_path: Path, port: int, profile: str, stalls: Stall
 
 def test_no_kit(run: Run, port: int) -> None:
     """Without a kit on the bus the test fails and names the missing report."""
-    ended = run(*by_wire_options("dataspeed_gen2", port), "--yes")
-    assert (ended.code, ended.out) == (1, "")
-    assert "SteerReport1" in ended.sentence()
+    result = run(*by_wire_options("dataspeed_gen2", port), "--yes")
+    assert (result.code, result.out) == (1, "")
+    assert "SteerReport1" in result.sentence()
 
 
 class Terminal(io.StringIO):
@@ -159,7 +159,7 @@ REJECTED: list[tuple[list[str], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("arguments", "reason"), REJECTED, ids=[each[1][:30] for each in REJECTED])
+@pytest.mark.parametrize(("arguments", "reason"), REJECTED, ids=[reason[:30] for _, reason in REJECTED])
 def test_rejected(run: Run, monkeypatch: pytest.MonkeyPatch, arguments: list[str], reason: str) -> None:
     """An unsuitable vehicle, bus, profile or file is rejected in one sentence before anything is sent."""
     monkeypatch.setattr(sys, "stdin", io.StringIO("yes\n"))
@@ -171,12 +171,12 @@ PROFILE = load_profile("dataspeed_gen2")
 WALL_NS = 1_790_000_000 * NS_PER_S
 
 
-def proof(tmp_path: Path, **others: Any) -> str:
+def write_proof(tmp_path: Path, **changes: Any) -> str:
     """Write a proof for generation 2 with some changed fields; return its path."""
     observation = WatchdogObservation(
         released_ns=100 * NS_PER_MS, braked_ns=120 * NS_PER_MS, reports=49, kit_messages=""
     )
-    fields = new_proof(observation, "park", PROFILE, CONFIG, WALL_NS).model_dump() | others
+    fields = new_proof(observation, "park", PROFILE, CONFIG, WALL_NS).model_dump() | changes
     path = tmp_path / "proof.json"
     path.write_text(json.dumps(fields))
     return str(path)
@@ -201,16 +201,16 @@ INVALID: list[tuple[dict[str, Any], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("others", "reason"), INVALID, ids=[next(iter(each[0])) for each in INVALID])
-def test_invalid_proof(tmp_path: Path, others: dict[str, Any], reason: str) -> None:
+@pytest.mark.parametrize(("changes", "reason"), INVALID, ids=[next(iter(changes)) for changes, _ in INVALID])
+def test_invalid_proof(tmp_path: Path, changes: dict[str, Any], reason: str) -> None:
     """A proof for another setup, of braking that was too slow, or with invalid fields is rejected with the reason."""
-    assert proof_rejection(proof(tmp_path), PROFILE, CONFIG, WALL_NS) == ""
-    assert reason in proof_rejection(proof(tmp_path, **others), PROFILE, CONFIG, WALL_NS)
+    assert proof_rejection(write_proof(tmp_path), PROFILE, CONFIG, WALL_NS) == ""
+    assert reason in proof_rejection(write_proof(tmp_path, **changes), PROFILE, CONFIG, WALL_NS)
 
 
 def test_a_proof_expires(tmp_path: Path) -> None:
     """A proof applies for the configured number of days."""
-    path, day_ns = proof(tmp_path), 86_400 * NS_PER_S
+    path, day_ns = write_proof(tmp_path), 86_400 * NS_PER_S
     assert proof_rejection(path, PROFILE, CONFIG, WALL_NS + 30 * day_ns) == ""
     assert "30" in proof_rejection(path, PROFILE, CONFIG, WALL_NS + 31 * day_ns)
     longer = CONFIG.model_copy(update={"watchdog_proof_days": 60})
@@ -234,7 +234,7 @@ def test_changed_profile_or_dbc(tmp_path: Path) -> None:
     mine.write_text(source.read_text())
     dbc.write_text(source.with_suffix(".dbc").read_text())
     config = CONFIG.model_copy(update={"profile": str(mine)})
-    path = proof(tmp_path)  # of the shipped profile, whose bytes are equal
+    path = write_proof(tmp_path)  # of the shipped profile, whose bytes are equal
     assert proof_rejection(path, PROFILE, config, WALL_NS) == ""
     dbc.write_text(dbc.read_text() + "\n")
     assert "another profile or DBC" in proof_rejection(path, PROFILE, config, WALL_NS)

@@ -40,7 +40,7 @@ def port() -> Iterator[int]:
 
 
 def test_a_server_is_probed(port: int, run: Run) -> None:
-    """For a server on this machine Delta is 0 within the bound, which is half of the shortest round trip."""
+    """For a server on this machine, Delta is at most the bound, which is half of the shortest round trip."""
     code, out, _ = run("clock", "--server", "localhost", "--port", str(port), "--seconds", "0.5", "--json")
     result = json.loads(out)
     assert abs(result["probe"]["ms"]) <= result["probe"]["bound_ms"] == result["round_trip_ms"] / 2
@@ -69,8 +69,8 @@ def test_the_source_is_read_before_and_after_the_probing(
     assert result["sources"] == pytest.approx({"ms": 1.0, "bound_ms": 0.1 + 0.05 + 0.1 + 1.0})
 
 
-def test_an_external_source_is_given_by_options(port: int, run: Run) -> None:
-    """With --source external, the given correction and bound are used, and the server's bound is added."""
+def test_options_set_an_external_source(port: int, run: Run) -> None:
+    """With --source external, correction and bound are those of the options, and the server's bound is added."""
     external = ("--source", "external", "--correction-ms", "0.05", "--bound-ms", "0.1")
     probing = ("--server", "localhost", "--port", str(port), "--seconds", "0.1", "--json")
     code, out, _ = run("clock", *probing, *external)
@@ -81,11 +81,11 @@ def test_an_external_source_is_given_by_options(port: int, run: Run) -> None:
 
 
 def test_no_server_answers(run: Run) -> None:
-    """If no server answers, the command says what to check and exits with 1."""
-    ended = run("clock", "--server", "127.0.0.1", "--port", "1", "--seconds", "0.1")
-    assert (ended.code, ended.out) == (1, "")
-    assert "127.0.0.1:1" in ended.sentence()
-    assert "`lavt server`" in ended.err
+    """If no server answers, the command prints what to check and exits with 1."""
+    result = run("clock", "--server", "127.0.0.1", "--port", "1", "--seconds", "0.1")
+    assert (result.code, result.out) == (1, "")
+    assert "127.0.0.1:1" in result.sentence()
+    assert "`lavt server`" in result.err
 
 
 @pytest.mark.parametrize(
@@ -110,7 +110,7 @@ def test_bad_input(arguments: tuple[str, ...], reason: str, run: Run) -> None:
 
 
 def test_a_machine_without_chrony(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without chronyc the command says what to install and exits with 1."""
+    """Without chronyc, the command prints what to install and exits with 1."""
     monkeypatch.setenv("PATH", "")
     code, out, err = run("clock")
     assert (code, err) == (1, "")

@@ -30,14 +30,14 @@ SIGNAL_AT_EVERY_LINE = """
 import signal, sys
 from lavt.cli import console
 
-def again(frame, event, argument):
+def raise_at_each_line(frame, event, argument):
     signal.raise_signal(signal.SIGTERM)
-    return again
+    return raise_at_each_line
 
 with console.stop_on_signals() as stop:
-    for use in (stop.set, stop.is_set, stop.clear, lambda: stop.wait(0.01), stop.clear, lambda: stop.wait(0.01)):
-        sys.settrace(again)
-        use()
+    for method in (stop.set, stop.is_set, stop.clear, lambda: stop.wait(0.01), stop.clear, lambda: stop.wait(0.01)):
+        sys.settrace(raise_at_each_line)
+        method()
         sys.settrace(None)
     assert stop.is_set() and stop.wait(0.01) and stop.wait()
     stop.clear()

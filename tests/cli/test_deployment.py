@@ -19,33 +19,33 @@ UNITS = sorted((DEPLOY / "systemd").glob("*.service"))
 PROGRAM = "/opt/lavt/.venv/bin/lavt"
 
 
-def unit(path: Path) -> configparser.ConfigParser:
+def read_unit(path: Path) -> configparser.ConfigParser:
     parsed = configparser.ConfigParser(interpolation=None)
-    parsed.optionxform = str  # type: ignore[assignment,method-assign]  # systemd's names have capitals
+    parsed.optionxform = str  # type: ignore[assignment,method-assign]  # keeps the capitals in systemd's names
     parsed.read(path)
     return parsed
 
 
-def lines(path: Path) -> list[str]:
+def config_lines(path: Path) -> list[str]:
     return [line for line in path.read_text().splitlines() if line and not line.startswith("#")]
 
 
 def test_the_servers_unit_allows_can() -> None:
     """The server may open a CAN socket, for a vehicle by wire; no other unit may."""
-    allowed = {path.name: unit(path)["Service"]["RestrictAddressFamilies"].split() for path in UNITS}
+    allowed = {path.name: read_unit(path)["Service"]["RestrictAddressFamilies"].split() for path in UNITS}
     assert [name for name, families in allowed.items() if "AF_CAN" in families] == ["lavt-server.service"]
 
 
 @pytest.mark.parametrize("path", UNITS, ids=lambda path: path.name)
 def test_units_start_existing_commands(path: Path) -> None:
     """Each unit starts an existing command of lavt with existing options and a file in /etc/lavt."""
-    program, command, *arguments = unit(path)["Service"]["ExecStart"].split()
+    program, command, *arguments = read_unit(path)["Service"]["ExecStart"].split()
     assert program == PROGRAM
-    helped = CliRunner().invoke(app, [command, "--help"])
-    assert helped.exit_code == 0
-    options = [each for each in arguments if each.startswith("-")]
-    assert all(option in helped.output for option in options)
-    (file,) = [each for each in arguments if each not in options]
+    help_result = CliRunner().invoke(app, [command, "--help"])
+    assert help_result.exit_code == 0
+    options = [word for word in arguments if word.startswith("-")]
+    assert all(option in help_result.output for option in options)
+    (file,) = [word for word in arguments if word not in options]
     assert re.fullmatch(r"/etc/lavt/\w+\.(yaml|json5)", file)
 
 
@@ -54,17 +54,17 @@ def test_units_are_valid_for_systemd(path: Path, tmp_path: Path) -> None:
     """systemd-analyze accepts each unit, with an existing program in place of the documented path."""
     if shutil.which("systemd-analyze") is None:
         need("systemd", "needs systemd-analyze: apt-get install systemd")
-    for each in UNITS:  # the units refer to each other
-        (tmp_path / each.name).write_text(each.read_text().replace(PROGRAM, shutil.which("true") or "/bin/true"))
+    for other in UNITS:  # the units refer to each other
+        (tmp_path / other.name).write_text(other.read_text().replace(PROGRAM, shutil.which("true") or "/bin/true"))
     command = ["systemd-analyze", "verify", "--man=no", str(tmp_path / path.name)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
 
 
 @pytest.mark.parametrize("path", UNITS, ids=lambda path: path.name)
 def test_units_run_without_root(path: Path) -> None:
     """Each unit runs as an unprivileged user and allows the process priority that LAVT requests."""
-    service = unit(path)["Service"]
+    service = read_unit(path)["Service"]
     assert (service["User"], service["Group"]) == ("lavt", "lavt")
     assert (service["CapabilityBoundingSet"], service["NoNewPrivileges"]) == ("", "yes")
     requested = process_priority.VEHICLE_NICENESS if path.name == "lavt-server.service" else process_priority.NICENESS
@@ -73,30 +73,30 @@ def test_units_run_without_root(path: Path) -> None:
 
 def test_the_directory_of_the_socket() -> None:
     """The router's unit alone creates /run/lavt, with its socket for one user, and keeps it when a unit stops."""
-    assert [path.name for path in UNITS if "RuntimeDirectory" in unit(path)["Service"]] == ["lavt-router.service"]
-    service = unit(DEPLOY / "systemd/lavt-router.service")["Service"]
+    assert [path.name for path in UNITS if "RuntimeDirectory" in read_unit(path)["Service"]] == ["lavt-router.service"]
+    service = read_unit(DEPLOY / "systemd/lavt-router.service")["Service"]
     assert (service["RuntimeDirectory"], service["RuntimeDirectoryMode"]) == ("lavt", "0750")
     assert service["RuntimeDirectoryPreserve"] == "yes"
     assert service["UMask"] == "0077"
 
 
 def test_the_client_is_started_by_a_person() -> None:
-    """Router, rendezvous and server restart after a failure and start at boot; a client does neither."""
-    restarts = {path.name: unit(path)["Service"]["Restart"] for path in UNITS}
+    """Router, rendezvous and server restart after a failure; a client does not, and does not start at boot either."""
+    restarts = {path.name: read_unit(path)["Service"]["Restart"] for path in UNITS}
     assert restarts == {
         "lavt-client.service": "no",
         "lavt-rendezvous.service": "on-failure",
         "lavt-router.service": "on-failure",
         "lavt-server.service": "on-failure",
     }
-    assert "Install" not in unit(DEPLOY / "systemd/lavt-client.service")
+    assert "Install" not in read_unit(DEPLOY / "systemd/lavt-client.service")
 
 
 def test_chrony_config_is_the_measured_one() -> None:
     """The lines for chrony are those of the tests on a real kernel, except for the addresses."""
     serve, allow = SERVE_OWN_CLOCK
-    assert lines(DEPLOY / "chrony/vehicle.conf") == [serve, f"{allow} 192.0.2.0/24"]
-    assert lines(DEPLOY / "chrony/operator.conf") == [follow_server("192.0.2.7").replace(" port 123", "")]
+    assert config_lines(DEPLOY / "chrony/vehicle.conf") == [serve, f"{allow} 192.0.2.0/24"]
+    assert config_lines(DEPLOY / "chrony/operator.conf") == [follow_server("192.0.2.7").replace(" port 123", "")]
 
 
 def test_the_documentation_names_existing_commands_and_files() -> None:
@@ -104,7 +104,7 @@ def test_the_documentation_names_existing_commands_and_files() -> None:
     text = (DEPLOY.parent / "docs/deployment.md").read_text()
     commands = set(re.findall(r"(?:^ {4}|`|/|&& )lavt ([a-z]+)\b", text, re.MULTILINE))
     assert commands >= {"doctor", "keys", "router", "server", "client", "stop", "clock", "join", "report"}
-    assert commands <= {each.name for each in app.registered_commands}
+    assert commands <= {command.name for command in app.registered_commands}
     files = set(re.findall(r"(?<![\w/])(?:configs|zenoh-configs|deploy)/[\w./-]*\w", text))
     assert len(files) > 12
     assert {file for file in files if not (DEPLOY.parent / file).exists()} == set()

@@ -38,18 +38,18 @@ from lavt.transport.zenoh_link import Deliver, Router, Routers, ZenohLink, quiet
 STATE = State(
     1, 1, 0.0, 0.0, "park", "disarmed", "nobody has armed the vehicle yet", -1, "", active_operator="operator-1"
 )
-FREE = msgspec.structs.replace(STATE, active_operator="")
+STATE_WITHOUT_OPERATOR = msgspec.structs.replace(STATE, active_operator="")
 NOW = Now(1, 1)
 REQUIREMENTS = ["av>=14", "numpy>=1.26", "cryptography>=42; extra == 'secure'"]
 INSTALLED = {"lavt": "0.1.0", "av": "14.0.1", "numpy": "2.0", "cryptography": None}
 
 
-def times(encode_ms: float, decode_ms: float = 1.0) -> CodecTimes:
+def codec_times(encode_ms: float, decode_ms: float = 1.0) -> CodecTimes:
     return CodecTimes([round(encode_ms * NS_PER_MS)] * 20, [round(decode_ms * NS_PER_MS)] * 20)
 
 
-def check_codec(measured: CodecTimes, side: str = "", cores: int = 2) -> Check:
-    return checks.check_codec(measured, size="640x480", rate_hz=50.0, side=side, cores=cores)
+def check_codec(times: CodecTimes, side: str = "", cores: int = 2) -> Check:
+    return checks.check_codec(times, size="640x480", rate_hz=50.0, side=side, cores=cores)
 
 
 def clock_report(bound_s: float) -> ClockReport:
@@ -60,16 +60,16 @@ def check_port(rejection: str, is_served: bool) -> Check:
     return checks.check_port("video port", "video.port", "0.0.0.0", 5600, rejection=rejection, is_served=is_served)
 
 
-def check_key_file(rejection: str = "", mode: int = 0o600, private: bool = True) -> Check:
-    return checks.check_key_file("security.key", Path("a.key"), rejection=rejection, mode=mode, private=private)
+def check_key_file(rejection: str = "", mode: int = 0o600, is_private: bool = True) -> Check:
+    return checks.check_key_file("security.key", Path("a.key"), rejection=rejection, mode=mode, is_private=is_private)
 
 
 def check_camera(sample: CameraSample | str) -> Check:
     return checks.check_camera(sample, name="/dev/video0", size="640x480", rate_hz=30.0)
 
 
-def camera_sample(rate_hz: float, timed: int = 0) -> CameraSample:
-    return CameraSample([round(number * 1e9 / rate_hz) for number in range(61)], timed)
+def camera_sample(rate_hz: float, with_capture_time: int = 0) -> CameraSample:
+    return CameraSample([round(number * 1e9 / rate_hz) for number in range(61)], with_capture_time)
 
 
 COMPARISON = ClockComparison(True, ("this clock", "both agree"), None, ClockEstimate(1.0, 0.5), 1.0)
@@ -84,13 +84,13 @@ VERDICTS: list[tuple[Callable[[], Check], str, str]] = [
         "at least 42",
     ),
     (lambda: checks.check_versions("3.11", INSTALLED, []), "ok", "Python 3.11"),
-    (lambda: check_codec(times(2.0)), "ok", "10% of a frame"),
-    (lambda: check_codec(times(11.0)), "warning", "55% of a frame"),
-    (lambda: check_codec(times(21.0)), "problem", "105% of a frame"),
-    (lambda: check_codec(times(21.0), "client"), "ok", "2 cores"),
-    (lambda: check_codec(times(1.0, 21.0), "server"), "ok", "2 cores"),
-    (lambda: check_codec(times(1.0, 21.0), "client"), "problem", "to decode takes 21.0 ms"),
-    (lambda: check_codec(times(2.0), cores=1), "warning", "1 core"),
+    (lambda: check_codec(codec_times(2.0)), "ok", "10% of the picture period"),
+    (lambda: check_codec(codec_times(11.0)), "warning", "55% of the picture period"),
+    (lambda: check_codec(codec_times(21.0)), "problem", "105% of the picture period"),
+    (lambda: check_codec(codec_times(21.0), "client"), "ok", "2 cores"),
+    (lambda: check_codec(codec_times(1.0, 21.0), "server"), "ok", "2 cores"),
+    (lambda: check_codec(codec_times(1.0, 21.0), "client"), "problem", "to decode takes 21.0 ms"),
+    (lambda: check_codec(codec_times(2.0), cores=1), "warning", "1 core"),
     (lambda: check_camera(camera_sample(30.0)), "ok", "no capture time"),
     (lambda: check_camera(camera_sample(29.0, 61)), "ok", "a capture time"),
     (lambda: check_camera(camera_sample(15.0)), "warning", " 15.0 pictures"),
@@ -107,8 +107,8 @@ VERDICTS: list[tuple[Callable[[], Check], str, str]] = [
     (lambda: checks.check_buffer(212_992), "warning", " 212992 bytes"),
     (lambda: checks.check_arrival(True), "ok", "records"),
     (lambda: checks.check_arrival(False), "warning", "does not record"),
-    (lambda: checks.check_timer(400, [NS_PER_MS // 10] * 20), "ok", "0.10 ms late (95 %: 0.10 ms)"),
-    (lambda: checks.check_timer(400, [0] * 18 + [5 * NS_PER_MS] * 2), "warning", "95 %: 5.00 ms"),
+    (lambda: checks.check_timer(400, [NS_PER_MS // 10] * 20), "ok", "0.10 ms late (p95 0.10 ms)"),
+    (lambda: checks.check_timer(400, [0] * 18 + [5 * NS_PER_MS] * 2), "warning", "p95 5.00 ms"),
     (lambda: checks.check_timer(400, [21 * NS_PER_MS] * 20), "problem", "21.00 ms late"),
     (lambda: checks.check_process_priority(-10), "ok", "nice -10"),
     (lambda: checks.check_process_priority(0), "warning", "ordinary priority"),
@@ -139,9 +139,7 @@ VERDICTS: list[tuple[Callable[[], Check], str, str]] = [
         "operator-1 has control",
     ),
     (
-        lambda: checks.check_vehicle(
-            StateSample([msgspec.structs.replace(STATE, active_operator="")] * 50), "v-1", "1"
-        ),
+        lambda: checks.check_vehicle(StateSample([STATE_WITHOUT_OPERATOR] * 50), "v-1", "1"),
         "ok",
         "no operator has control",
     ),
@@ -161,7 +159,7 @@ VERDICTS: list[tuple[Callable[[], Check], str, str]] = [
     (lambda: checks.check_keys_configured(False), "warning", "router"),
     (lambda: check_key_file(), "ok", "a.key is readable"),
     (lambda: check_key_file(mode=0o640), "problem", "mode 640"),
-    (lambda: check_key_file(mode=0o644, private=False), "ok", "a.key is readable"),
+    (lambda: check_key_file(mode=0o644, is_private=False), "ok", "a.key is readable"),
     (lambda: check_key_file("No such file or directory"), "problem", "cannot be read: No such file"),
     (lambda: checks.check_certificate(Path("a.pem"), 100.0), "ok", "valid for 100 days"),
     (lambda: checks.check_certificate(Path("a.pem"), 13.0), "warning", "valid for 13 days"),
@@ -176,14 +174,14 @@ VERDICTS: list[tuple[Callable[[], Check], str, str]] = [
 
 @pytest.mark.parametrize(("check", "verdict", "part"), VERDICTS)
 def test_verdicts(check: Callable[[], Check], verdict: str, part: str) -> None:
-    """Every check distinguishes good from bad, describes what it found, and suggests a fix if it is bad."""
+    """Every check returns its verdict and what it found, and suggests a fix with every warning and problem."""
     result = check()
     assert (result.verdict, part in result.found) == (verdict, True), result
     assert bool(result.do) == (verdict in {"warning", "problem"} or result.name == "video")
 
 
 def test_every_check_has_verdicts() -> None:
-    """Every check is in the table with at least two verdicts, except the video, which cannot be checked in advance."""
+    """Every check is in the table with at least two verdicts, except that of the video, which is never checked."""
     verdicts: dict[str, set[str]] = {}
     for check, verdict, _ in VERDICTS:
         for name in check.__code__.co_names:
@@ -192,7 +190,7 @@ def test_every_check_has_verdicts() -> None:
     assert {name for name in names if len(verdicts[name]) < 2} == set()
 
 
-MACHINE = [
+MACHINE_CHECKS = [
     "versions",
     "processor",
     "receive buffer",
@@ -209,7 +207,7 @@ def test_this_machine(run: Run) -> None:
     """Without a config this machine is checked; the exit code is 1 if and only if a check finds a problem."""
     code, out, _ = run("doctor", "--json")
     result = json.loads(out)
-    assert [check["name"] for check in result["checks"]] == MACHINE
+    assert [check["name"] for check in result["checks"]] == MACHINE_CHECKS
     problems = [check for check in result["checks"] if check["verdict"] == "problem"]
     assert (code, result["good"]) == ((1, False) if problems else (0, True))
     processor = result["checks"][1]["measured"]
@@ -224,9 +222,9 @@ def test_output_as_text(run: Run, monkeypatch: pytest.MonkeyPatch, verdict: Verd
     monkeypatch.setattr(doctor, "_checks", lambda *_: iter(checks))
     code, out, err = run("doctor")
     assert (code, err) == (1 if verdict == "problem" else 0, "")
-    one, other, fix = out.splitlines()
-    assert (one[:12].strip(), one[12:30].strip(), one[30:]) == ("ok", "receive buffer", "found this")
-    assert (other[:12].strip(), other[12:30].strip(), other[30:]) == (verdict, "netem", "found that")
+    first, second, fix = out.splitlines()
+    assert (first[:12].strip(), first[12:30].strip(), first[30:]) == ("ok", "receive buffer", "found this")
+    assert (second[:12].strip(), second[12:30].strip(), second[30:]) == (verdict, "netem", "found that")
     assert fix == " " * 30 + "-> do this"
 
 
@@ -248,9 +246,9 @@ def test_bad_input(run: Run, arguments: tuple[str, ...], reason: str) -> None:
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Skip the checks of the machine itself, and wait for a peer for one second only."""
-    monkeypatch.setattr(doctor, "_machine", lambda *_: iter(()))
-    monkeypatch.setattr(doctor, "PROBING_NS", 100 * NS_PER_MS)
-    monkeypatch.setattr(probes, "FIRST_STATE_NS", 1000 * NS_PER_MS)
+    monkeypatch.setattr(doctor, "_machine_checks", lambda *_: iter(()))
+    monkeypatch.setattr(doctor, "PROBE_DURATION_NS", 100 * NS_PER_MS)
+    monkeypatch.setattr(probes, "FIRST_STATE_TIMEOUT_NS", 1000 * NS_PER_MS)
 
 
 def check_config(path: Path, *changes: str) -> dict[str, Check]:
@@ -272,7 +270,7 @@ def test_camera_device(tmp_path: Path, rate_hz: float, size: tuple[int, int], ve
     """The camera of a server's config is opened and its picture rate is measured; another size or rate is a problem."""
     video = write_video(tmp_path / "video.avi", rate_hz=30.0)
     camera = ["source=device", f"device={video}", f"rate_hz={rate_hz}", f"width_px={size[0]}", f"height_px={size[1]}"]
-    changes = [f"camera.{each}" for each in camera]
+    changes = [f"camera.{setting}" for setting in camera]
     found = check_config(shipped("configs/server.yaml"), *changes, "zenoh.router=tcp/127.0.0.1:1")["camera"]
     assert found.verdict in verdicts
     assert part in found.found
@@ -281,9 +279,9 @@ def test_camera_device(tmp_path: Path, rate_hz: float, size: tuple[int, int], ve
 @pytest.mark.usefixtures("quick")
 def test_a_server_with_a_used_port_and_no_router() -> None:
     """For a server, a port that is in use and a router that does not answer are problems."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as user:
-        user.bind(("127.0.0.1", 0))
-        changes = ["video.bind=127.0.0.1", f"video.port={user.getsockname()[1]}", "clock.probe_port=0"]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as occupant:
+        occupant.bind(("127.0.0.1", 0))
+        changes = ["video.bind=127.0.0.1", f"video.port={occupant.getsockname()[1]}", "clock.probe_port=0"]
         found = check_config(shipped("configs/server.yaml"), *changes, "zenoh.router=tcp/127.0.0.1:1")
     assert [(name, check.verdict) for name, check in found.items()][2:] == [
         ("security", "warning"),
@@ -362,10 +360,10 @@ def check_client(run: Run, router: str, probe_port: int, vehicle: str, payload: 
 
 @pytest.mark.usefixtures("quick")
 def test_a_pair(run: Run, router: str, probe_port: int) -> None:
-    """For a client, the router, the vehicle's state, the clocks and the link are checked; the video is not."""
+    """For a client, router, vehicle state, link of the routers and clocks are checked, but not the video."""
     found = check_client(run, router, probe_port, "vehicle-1", encode(STATE))
     expected = ["security", "router", "vehicle", "link of routers", "clock probe", "video"]
-    assert [name for name in found if name not in MACHINE] == expected
+    assert [name for name in found if name not in MACHINE_CHECKS] == expected
     assert "operator-1" in found["vehicle"]["found"]
     assert found["vehicle"]["measured"]["states"] > 0
     assert found["link of routers"]["verdict"] == "ok"
@@ -447,7 +445,7 @@ def test_a_peer_of_another_version(run: Run, router: str, probe_port: int) -> No
 
 @pytest.mark.usefixtures("quick")
 def test_a_client_without_a_vehicle(router: str) -> None:
-    """Without states and answers to probes, both are problems, and the missing link of the routers is a warning."""
+    """Missing states and unanswered probes are problems, and a missing link of the routers is a warning."""
     changes = ["vehicle_id=away", f"zenoh.router={router}", "clock.probe_port=1"]
     found = check_config(shipped("configs/client.yaml"), *changes)
     assert {name: found[name].verdict for name in ("vehicle", "link of routers", "clock probe")} == {
@@ -459,7 +457,7 @@ def test_a_client_without_a_vehicle(router: str) -> None:
 
 @pytest.mark.usefixtures("quick")
 def test_an_unknown_host(router: str) -> None:
-    """An unknown host in video.server is a problem of the clock probe."""
+    """An unknown host in video.server is reported as a problem by the check of the clock probe."""
     found = check_config(shipped("configs/client.yaml"), f"zenoh.router={router}", f"video.server={'a' * 64}")
     assert found["clock probe"].verdict == "problem"
     assert "a" * 64 in found["clock probe"].found
@@ -506,20 +504,20 @@ def test_certificates(tmp_path: Path) -> None:
 
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "vehicle-1")])
-    begins = datetime(2026, 1, 1, tzinfo=UTC)
+    valid_from = datetime(2026, 1, 1, tzinfo=UTC)
     certificate = (
         x509.CertificateBuilder()
         .subject_name(name)
         .issuer_name(name)
         .public_key(key.public_key())
         .serial_number(1)
-        .not_valid_before(begins)
-        .not_valid_after(begins + timedelta(days=30))
+        .not_valid_before(valid_from)
+        .not_valid_after(valid_from + timedelta(days=30))
         .sign(key, hashes.SHA256())
     )
     (tmp_path / "vehicle-1.pem").write_bytes(certificate.public_bytes(Encoding.PEM))
     (tmp_path / "other.pem").write_text("no certificate")
-    now_ns = round(begins.timestamp()) * 10**9
+    now_ns = round(valid_from.timestamp()) * 10**9
     assert probes.certificates(tmp_path, now_ns) == [(tmp_path / "vehicle-1.pem", 30.0)]
     assert probes.certificates(tmp_path, now_ns + 31 * 86_400 * 10**9) == [(tmp_path / "vehicle-1.pem", -1.0)]
 
@@ -540,7 +538,7 @@ def test_a_kit_on_its_bus(tmp_path: Path) -> None:
         assert frames > 100
         assert "none.json" in reason
         assert "SteerReport1" not in reason
-    assert [each for each in car.events if each["kind"] == "enabled"] == []
+    assert [event for event in car.events if event["kind"] == "enabled"] == []
 
 
 @pytest.mark.usefixtures("quick")

@@ -1,4 +1,4 @@
-"""Commands of which a thread fails."""
+"""A command fails if one of its threads fails."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ NO_ROUTER = "tcp/127.0.0.1:1"
 PERIOD_S = 0.05
 
 
-def broken(*_: Any) -> Any:
+def fail(*_: Any) -> Any:
     raise RuntimeError("a receiving thread is broken")
 
 
 @contextmanager
-def datagrams(port: int) -> Iterator[None]:
+def sending(port: int) -> Iterator[None]:
     """Send datagrams to a port of this machine."""
-    done = threading.Event()
+    is_over = threading.Event()
 
     def send() -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-            while not done.wait(PERIOD_S):
+            while not is_over.wait(PERIOD_S):
                 sender.sendto(b"x", (HERE, port))
 
     thread = threading.Thread(target=send)
@@ -39,19 +39,19 @@ def datagrams(port: int) -> Iterator[None]:
     try:
         yield
     finally:
-        done.set()
+        is_over.set()
         thread.join()
 
 
 @pytest.mark.parametrize("command", ["watch", "rendezvous", "server"])
 def test_a_command_fails_with_its_receiving_thread(command: str, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A command whose receiving thread fails ends with exit code 1, where it would go on deaf."""
+    """If a receiving thread fails, the command exits with code 1 instead of running on without receiving."""
     port = free_port()
     arguments = {
         "watch": ["--bind", HERE, "--port", str(port)],
         "rendezvous": [
             str(shipped("configs/rendezvous.yaml")),
-            *(word for key in (f"bind={HERE}", f"video_port={port}", "probe_port=0") for word in ("--set", key)),
+            *(word for change in (f"bind={HERE}", f"video_port={port}", "probe_port=0") for word in ("--set", change)),
         ],
         "server": [
             str(shipped("configs/server.yaml")),
@@ -59,8 +59,8 @@ def test_a_command_fails_with_its_receiving_thread(command: str, run: Run, monke
             *("--set", f"zenoh.router={NO_ROUTER}", "--set", "vehicle.scenery=none"),
         ],
     }
-    monkeypatch.setattr(udp_link, "arrival", broken)
-    with datagrams(port):
+    monkeypatch.setattr(udp_link, "arrival", fail)
+    with sending(port):
         result = run(command, *arguments[command])
     assert result.code == 1, result
     assert "RuntimeError" in result.err.splitlines()[-1]

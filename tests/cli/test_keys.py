@@ -38,17 +38,17 @@ def directory(run: Run) -> Path:
     return Path("keys")
 
 
-def certificate(directory: Path, name: str) -> x509.Certificate:
+def read_certificate(directory: Path, name: str) -> x509.Certificate:
     return x509.load_pem_x509_certificate((directory / f"{name}.pem").read_bytes())
 
 
-def hosts(directory: Path, name: str) -> set[str]:
-    found = certificate(directory, name).extensions.get_extension_for_class(x509.SubjectAlternativeName)
-    return {str(each.value) for each in found.value}
+def certified_hosts(directory: Path, name: str) -> set[str]:
+    extension = read_certificate(directory, name).extensions.get_extension_for_class(x509.SubjectAlternativeName)
+    return {str(host.value) for host in extension.value}
 
 
-def usages(directory: Path, name: str) -> set[x509.ObjectIdentifier]:
-    return set(certificate(directory, name).extensions.get_extension_for_class(x509.ExtendedKeyUsage).value)
+def certified_usages(directory: Path, name: str) -> set[x509.ObjectIdentifier]:
+    return set(read_certificate(directory, name).extensions.get_extension_for_class(x509.ExtendedKeyUsage).value)
 
 
 def test_layout(directory: Path) -> None:
@@ -62,41 +62,41 @@ def test_layout(directory: Path) -> None:
 
 def test_certificates(directory: Path) -> None:
     """A certificate has the name and the key of its files and is signed by the authority."""
-    authority = certificate(directory, "authority")
+    authority = read_certificate(directory, "authority")
     for name in ("vehicle-1", "operator-1", "monitor-1", "cloud-1"):
-        found = certificate(directory, name)
-        found.verify_directly_issued_by(authority)
-        (common_name,) = found.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
+        certificate = read_certificate(directory, name)
+        certificate.verify_directly_issued_by(authority)
+        (common_name,) = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
         assert common_name.value == name
         key = serialization.load_pem_private_key((directory / f"{name}.key").read_bytes(), None)
         assert isinstance(key, ec.EllipticCurvePrivateKey)
         assert key.curve.name == "secp256r1"
-        assert key.public_key() == found.public_key()
-        assert found.not_valid_after_utc == authority.not_valid_after_utc
-        assert (found.not_valid_after_utc - found.not_valid_before_utc).days == 31
+        assert key.public_key() == certificate.public_key()
+        assert certificate.not_valid_after_utc == authority.not_valid_after_utc
+        assert (certificate.not_valid_after_utc - certificate.not_valid_before_utc).days == 31
 
 
 def test_server_certificates(directory: Path) -> None:
     """Vehicle and cloud may be TLS servers at the given hosts and the loopback; operator and monitor may not."""
     for name in ("vehicle-1", "cloud-1"):
-        assert hosts(directory, name) == {name, "127.0.0.1", "localhost", "192.0.2.7", "car.example.org"}
-        assert usages(directory, name) == {ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH}
+        assert certified_hosts(directory, name) == {name, "127.0.0.1", "localhost", "192.0.2.7", "car.example.org"}
+        assert certified_usages(directory, name) == {ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH}
     for name in ("operator-1", "monitor-1"):
-        assert hosts(directory, name) == {name}
-        assert usages(directory, name) == {ExtendedKeyUsageOID.CLIENT_AUTH}
+        assert certified_hosts(directory, name) == {name}
+        assert certified_usages(directory, name) == {ExtendedKeyUsageOID.CLIENT_AUTH}
 
 
 def test_signing_pairs(directory: Path) -> None:
-    """A name's public signing key verifies the signatures of its private one, and no two names have the same pair."""
-    publics = set()
+    """The public signing key of a name verifies signatures of its private key, and no two names have the same pair."""
+    public_keys = set()
     for name in ("vehicle-1", "operator-1"):
         key = serialization.load_pem_private_key((directory / f"{name}.sign.key").read_bytes(), None)
         public = serialization.load_pem_public_key((directory / f"{name}.sign.pub").read_bytes())
         assert isinstance(key, ed25519.Ed25519PrivateKey)
         assert isinstance(public, ed25519.Ed25519PublicKey)
         public.verify(key.sign(b"command"), b"command")
-        publics.add(public.public_bytes_raw())
-    assert len(publics) == 2
+        public_keys.add(public.public_bytes_raw())
+    assert len(public_keys) == 2
 
 
 def test_instructions(run: Run) -> None:
@@ -107,8 +107,8 @@ def test_instructions(run: Run) -> None:
     assert re.search(r"\b2\d{3}\b", lines[0])
     assert "authority.key" in lines[0]
     copied = {
-        line.split()[1].strip(","): set(then.split(": ")[1].split())
-        for line, then in zip(lines[1:-1:2], lines[2:-1:2], strict=True)
+        name_line.split()[1].strip(","): set(files_line.split(": ")[1].split())
+        for name_line, files_line in zip(lines[1:-1:2], lines[2:-1:2], strict=True)
     }
     own = {name: {"authority.pem", f"{name}.pem", f"{name}.key"} for name in ("car", "ann", "bob", "sky")}
     assert copied == {
@@ -120,14 +120,16 @@ def test_instructions(run: Run) -> None:
 
 
 def test_signing_keys_expire(run: Run, directory: Path) -> None:
-    """Signing keys expire together with the certificate, and the output has the day."""
+    """Signing keys expire together with the certificate, and the output has the date."""
     code, out, _ = run("keys", "--operator", "ann", "--days", "30")
     assert code == 0
     for ending in (".sign.key", ".sign.pub"):
         path = directory / f"ann{ending}"
         expires_ns = key_expiry_ns(path.read_bytes(), path)
         assert expires_ns is not None
-        assert abs(calendar_time(expires_ns) - certificate(directory, "ann").not_valid_after_utc) < timedelta(minutes=2)
+        assert abs(calendar_time(expires_ns) - read_certificate(directory, "ann").not_valid_after_utc) < timedelta(
+            minutes=2
+        )
         assert f"signing key until {calendar_time(expires_ns):%Y-%m-%d}" in out
 
 
@@ -137,9 +139,9 @@ def test_adding_names(run: Run, directory: Path) -> None:
     code, out, _ = run("keys", "--operator", "operator-2", "--days", "3000")
     assert code == 0
     assert "operator-1.sign.pub operator-2.sign.pub" in out
-    added, authority = certificate(directory, "operator-2"), certificate(directory, "authority")
-    added.verify_directly_issued_by(authority)
-    assert added.not_valid_after_utc == authority.not_valid_after_utc
+    new_certificate, authority = read_certificate(directory, "operator-2"), read_certificate(directory, "authority")
+    new_certificate.verify_directly_issued_by(authority)
+    assert new_certificate.not_valid_after_utc == authority.not_valid_after_utc
     assert {path: path.read_bytes() for path in before} == before
     assert len(list(directory.iterdir())) == len(before) + len(ENDINGS)
 
@@ -170,7 +172,7 @@ def test_bad_input(run: Run, arguments: list[str], sentence: str) -> None:
 
 
 def test_nothing_is_overwritten(run: Run, directory: Path) -> None:
-    """An existing name is rejected, and the command creates no file."""
+    """A name whose files exist is rejected, and the command creates no file."""
     before = {path: path.read_bytes() for path in directory.iterdir()}
     code, _, err = run("keys", "--operator", "operator-2", "--vehicle", "vehicle-1")
     assert code == 2
@@ -202,7 +204,7 @@ def test_directory_of_others(run: Run) -> None:
 
 
 def test_without_the_library(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without cryptography the error says what to install."""
+    """Without the library cryptography, the error names the package to install."""
     monkeypatch.delitem(sys.modules, "lavt.transport.security.certificates", raising=False)
     monkeypatch.setitem(sys.modules, "cryptography", None)
     import lavt.transport.security

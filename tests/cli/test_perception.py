@@ -31,7 +31,7 @@ distortion: [-0.28, 0.07, 0.0005, -0.0003, 0.0]
 x_m: 1.6
 z_m: 1.4
 """
-MATRIX = "fx_px: 330.0\nfy_px: 331.0\ncx_px: 321.0\ncy_px: 238.0"
+CAMERA_MATRIX = "fx_px: 330.0\nfy_px: 331.0\ncx_px: 321.0\ncy_px: 238.0"
 FISHEYE = "lens: fisheye\nwidth_px: 640\nheight_px: 480\nx_m: 1.6\nz_m: 1.4\n{}\n"
 ROAD = np.full((480, 640, 3), 85, dtype=np.uint8)
 Show = Callable[..., None]
@@ -93,7 +93,7 @@ def test_the_steps_of_a_video_are_a_video(show: Show) -> None:
         ("road.png", CALIBRATION.replace("fy_px: 331.0\n", ""), (), "field_of_view_deg"),
         ("road.png", CALIBRATION + "lens: fisheye\n", (), "must have 4 coefficients"),
         ("road.png", FISHEYE.format("field_of_view_deg: 90.0\ndistortion: [0, 0, 0, 0]"), (), "a fisheye needs fx_px"),
-        ("road.png", FISHEYE.format(MATRIX), (), "distortion"),
+        ("road.png", FISHEYE.format(CAMERA_MATRIX), (), "distortion"),
         ("road.png", CALIBRATION.replace("0.0005", "5e-04"), (), "write 5e-04 as 0.0005"),
         ("road.png", CALIBRATION, ("--out", "./road.png"), "road.png"),
         ("road.png", CALIBRATION.replace("x_m: 1.6\n", ""), (), "'x_m' is missing"),
@@ -108,17 +108,17 @@ def test_bad_input(show: Show, source: str, calibration: str, options: tuple[str
     Path("empty.mp4").touch()
     Path("record.mcap").touch()
     cv2.imwrite("small.png", ROAD[::2, ::2])
-    with pytest.raises(UserError) as rejected:
+    with pytest.raises(UserError) as raised:
         show(source, *options)
-    assert reason in str(rejected.value)
-    assert "Value error" not in str(rejected.value)
+    assert reason in str(raised.value)
+    assert "Value error" not in str(raised.value)
     assert not list(Path().glob("*steps*"))
-    kept = cv2.imread("road.png")
-    assert kept is not None
-    assert np.array_equal(kept, ROAD)
+    source_picture = cv2.imread("road.png")
+    assert source_picture is not None
+    assert np.array_equal(source_picture, ROAD)
 
 
-def test_a_client_drives_by_a_calibrated_camera(show: Show) -> None:  # noqa: ARG001 (its directory)
+def test_a_client_uses_a_calibrated_camera(show: Show) -> None:  # noqa: ARG001 (changes the directory)
     """The client uses the calibration file that `camera.calibration` names."""
     config = parse_config(ClientConfig, {"camera": {"calibration": "camera.yaml"}}, "test")
     nodes = build_client(config, MachineClock().now, MachineEntropy())

@@ -10,7 +10,7 @@ from lavt.domain import NS_PER_S
 
 
 def test_each_line_has_the_time_left(capsys: pytest.CaptureFixture[str]) -> None:
-    """Without a terminal, each finished run is a line with the number of finished runs and the estimated time left."""
+    """Without a terminal, each finished run has a line with the number of finished runs and the estimated time left."""
     with progress("driving", 5, clock=ManualClock(step_ns=30 * NS_PER_S)) as report_done:
         report_done("one: completed")
         report_done("two: collision")
@@ -21,7 +21,9 @@ def test_each_line_has_the_time_left(capsys: pytest.CaptureFixture[str]) -> None
     ]
 
 
-def test_titles_and_lines_are_no_markup(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_titles_and_lines_are_not_parsed_as_markup(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """On a terminal, braces and brackets in titles and lines are printed unchanged."""
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     monkeypatch.setenv("TERM", "xterm")

@@ -16,7 +16,7 @@ from lavt.transport.clock_sync.probe import encode_request
 from lavt.transport.rendezvous.forwarder import encode_registration, wrap
 
 HERE = "127.0.0.1"
-ENDS_S = 30.0
+EXIT_TIMEOUT_S = 30.0
 
 
 @contextmanager
@@ -39,22 +39,22 @@ def rendezvous(*options: str) -> Iterator[subprocess.Popen[str]]:
 @pytest.fixture
 def vehicle() -> Iterator[socket.socket]:
     """Open the vehicle's socket."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
-        opened.bind((HERE, 0))
-        opened.settimeout(ENDS_S)
-        yield opened
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle_socket:
+        vehicle_socket.bind((HERE, 0))
+        vehicle_socket.settimeout(EXIT_TIMEOUT_S)
+        yield vehicle_socket
 
 
 def test_output_as_text(vehicle: socket.socket) -> None:
     """The command prints its ports, then the vehicle's address for each flow, and exits with code 0 on Ctrl-C."""
     with rendezvous() as process:
         assert process.stdout is not None
-        first = re.search(r"video at port (\d+)", process.stdout.readline())
-        assert first is not None
-        vehicle.sendto(encode_registration("vehicle-1", "video", 1, None), (HERE, int(first[1])))
+        port = re.search(r"video at port (\d+)", process.stdout.readline())
+        assert port is not None
+        vehicle.sendto(encode_registration("vehicle-1", "video", 1, None), (HERE, int(port[1])))
         assert f"{HERE}:{vehicle.getsockname()[1]}" in process.stdout.readline()
         process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=ENDS_S)
+        out, err = process.communicate(timeout=EXIT_TIMEOUT_S)
     assert (process.returncode, out, err) == (0, "", "")
 
 
@@ -62,7 +62,7 @@ def test_output_as_json(vehicle: socket.socket) -> None:
     """As JSON, the command prints its ports, the vehicle's address, and finally the counts of each flow."""
     with rendezvous("--json") as process, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
         client.bind((HERE, 0))
-        client.settimeout(ENDS_S)
+        client.settimeout(EXIT_TIMEOUT_S)
         assert process.stdout is not None
         ports = json.loads(process.stdout.readline())["ready"]
         address = (HERE, ports["probe_port"])
@@ -74,6 +74,6 @@ def test_output_as_json(vehicle: socket.socket) -> None:
         vehicle.sendto(wrap(client.getsockname(), b"reply"), address)
         assert client.recv(100) == b"reply"
         process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=ENDS_S)
+        out, err = process.communicate(timeout=EXIT_TIMEOUT_S)
     counts = {"video": {}, "probe": {"registrations": 1, "to_vehicle": 1, "to_clients": 1}}
     assert (process.returncode, json.loads(out), err) == (0, {"counts": counts}, "")

@@ -13,7 +13,7 @@ from lavt.experiment.runs.processes import Processes
 
 TGKILL = 234
 """Linux's system call that sends a signal to one thread (x86-64)."""
-ENDS_S = 5.0
+EXIT_TIMEOUT_S = 5.0
 
 
 @pytest.mark.skipif((sys.platform, platform.machine()) != ("linux", "x86_64"), reason="needs the number of tgkill")
@@ -27,4 +27,4 @@ def test_signal_to_another_thread(tmp_path: Path) -> None:
         thread = max(int(task.name) for task in Path(f"/proc/{pid}/task").iterdir())
         assert thread != pid
         assert ctypes.CDLL(None).syscall(TGKILL, pid, thread, int(signal.SIGINT)) == 0
-        assert router.popen.wait(ENDS_S) == 0
+        assert router.popen.wait(EXIT_TIMEOUT_S) == 0

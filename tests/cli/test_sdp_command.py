@@ -6,13 +6,15 @@ from tests.support.command_line import Run
 from lavt.config_file import shipped
 
 SERVER = str(shipped("configs/server.yaml"))
-ONE = "video.send_to=['192.0.2.7:5004']"
-TWO = "video.send_to=['192.0.2.7:5004', '192.0.2.8:5006']"
+ONE_RECEIVER = "video.send_to=['192.0.2.7:5004']"
+TWO_RECEIVERS = "video.send_to=['192.0.2.7:5004', '192.0.2.8:5006']"
 
 
 def test_the_only_receiver(run: Run) -> None:
     """With one receiver in the config, its session description is the only output."""
-    code, out, err = run("sdp", SERVER, "--set", ONE, "--set", "camera.width_px=1280", "--set", "camera.height_px=720")
+    code, out, err = run(
+        "sdp", SERVER, "--set", ONE_RECEIVER, "--set", "camera.width_px=1280", "--set", "camera.height_px=720"
+    )
     assert (code, err) == (0, "")
     lines = out.split("\r\n")
     assert lines[0] == "v=0"
@@ -22,9 +24,9 @@ def test_the_only_receiver(run: Run) -> None:
     assert lines[-1] == ""
 
 
-def test_one_of_several(run: Run) -> None:
+def test_one_of_several_receivers(run: Run) -> None:
     """With several receivers, the description is for the one that --receiver names."""
-    code, out, _ = run("sdp", SERVER, "--set", TWO, "--receiver", "192.0.2.8:5006")
+    code, out, _ = run("sdp", SERVER, "--set", TWO_RECEIVERS, "--receiver", "192.0.2.8:5006")
     assert code == 0
     assert "c=IN IP4 192.0.2.8\r\n" in out
     assert "m=video 5006 " in out
@@ -32,13 +34,13 @@ def test_one_of_several(run: Run) -> None:
 
 REJECTED = {
     "no receiver": (["--set", "video.send_to=[]"], "video.send_to"),
-    "several receivers": (["--set", TWO], "--receiver"),
-    "unknown receiver": (["--set", ONE, "--receiver", "192.0.2.7:5005"], "192.0.2.7:5005"),
-    "invalid address": (["--set", ONE, "--receiver", "here"], "--receiver: 'here'"),
+    "several receivers": (["--set", TWO_RECEIVERS], "--receiver"),
+    "unknown receiver": (["--set", ONE_RECEIVER, "--receiver", "192.0.2.7:5005"], "192.0.2.7:5005"),
+    "invalid address": (["--set", ONE_RECEIVER, "--receiver", "here"], "--receiver: 'here'"),
     "invalid address in the config": (["--set", "video.send_to=[here]"], "video.send_to: 'here'"),
     "unknown host": (["--set", f"video.send_to=['{'a' * 64}:5004']"], "a" * 64),
     "port 0": (["--set", "video.send_to=['192.0.2.7:0']"], "192.0.2.7"),
-    "invalid size": (["--set", ONE, "--set", "camera.width_px=641"], "641"),
+    "invalid size": (["--set", ONE_RECEIVER, "--set", "camera.width_px=641"], "641"),
 }
 
 

@@ -31,10 +31,10 @@ STATE = State(
 CONTROLLED = replace(STATE, active_operator="operator-1")
 DRIVING = replace(CONTROLLED, safety="driving", reason="armed by the client")
 REQUESTED = replace(DRIVING, requested_by="operator-2")
-TICK_NS = 20 * NS_PER_MS
+STATE_PERIOD_NS = 20 * NS_PER_MS
 
 CHANGES: dict[str, tuple[State | None, State, str, list[tuple[str, ...]]]] = {
-    "nothing": (STATE, STATE, "", []),
+    "no change": (STATE, STATE, "", []),
     "first state": (None, DRIVING, "", [("operator-1", "control"), ("driving", "operator-1")]),
     "control acquired": (STATE, CONTROLLED, "", [("operator-1", "control")]),
     "handed over": (DRIVING, replace(DRIVING, active_operator="operator-2"), "", [("operator-2", "control")]),
@@ -64,7 +64,7 @@ def test_each_state_change_has_its_own_line(case: str) -> None:
     before, after, operator, parts = CHANGES[case]
     lines = state_lines(before, after, operator=operator)
     assert len(lines) == len(parts)
-    assert all(part in line for line, of_line in zip(lines, parts, strict=True) for part in of_line), lines
+    assert all(part in line for line, line_parts in zip(lines, parts, strict=True) for part in line_parts), lines
 
 
 PHASES: dict[tuple[Phase, str], tuple[str, ...]] = {
@@ -90,18 +90,18 @@ def test_each_change_is_logged_once() -> None:
     """A repeated state, phase or ending is logged once."""
     log = SessionLog("operator-1")
     for number in range(50):
-        log.add_state(DRIVING, number * TICK_NS, has_control=True)
+        log.add_state(DRIVING, number * STATE_PERIOD_NS, has_control=True)
         log.set_phase("stopped", "why")
         log.set_ending("completed")
-    active_operator, armed, phase, ending = log.take_lines(NS_PER_S)
-    assert "operator-1" in active_operator
-    assert armed.startswith("driving: ")
+    control, safety, phase, ending = log.take_lines(NS_PER_S)
+    assert "operator-1" in control
+    assert safety.startswith("driving: ")
     assert phase.endswith(": why")
     assert ending.endswith(": completed")
-    assert log.take_lines(NS_PER_S + TICK_NS) == []
+    assert log.take_lines(NS_PER_S + STATE_PERIOD_NS) == []
     log.set_ending(None)
     log.set_ending("completed")
-    assert log.take_lines(NS_PER_S + TICK_NS) == [ending]
+    assert log.take_lines(NS_PER_S + STATE_PERIOD_NS) == [ending]
 
 
 def test_rejections_are_logged_at_most_once_a_second_with_their_count() -> None:
@@ -110,7 +110,7 @@ def test_rejections_are_logged_at_most_once_a_second_with_their_count() -> None:
     logged = {}
     for number in range(100):
         log.add_rejection("too old")
-        if lines := log.take_lines(number * TICK_NS):
+        if lines := log.take_lines(number * STATE_PERIOD_NS):
             logged[number] = lines
     assert list(logged) == [0, 50]
     assert all(line.endswith(": too old") for (line,) in logged.values())
@@ -118,12 +118,12 @@ def test_rejections_are_logged_at_most_once_a_second_with_their_count() -> None:
 
 
 def test_a_client_logs_the_rejections_in_the_state() -> None:
-    """A client learns of rejections from the vehicle's state and logs one when the reason changes."""
+    """A client takes rejections from the vehicle's state, and logs one each time that the reason changes."""
     log = SessionLog("operator-1")
     log.add_state(STATE, 0)
     log.take_lines(0)
     for number in range(10):
-        log.add_state(replace(STATE, rejected="too old"), number * TICK_NS)
+        log.add_state(replace(STATE, rejected="too old"), number * STATE_PERIOD_NS)
     (line,) = log.take_lines(NS_PER_S)
     assert line.endswith(": too old")
 
@@ -135,8 +135,8 @@ def test_a_limit_is_logged_when_it_comes_into_force() -> None:
     log.take_lines(0)
     for number in range(200):
         limited = "lateral acceleration, speed" if number % 3 == 0 and not 50 <= number < 150 else ""
-        log.add_state(replace(STATE, limited=limited), number * TICK_NS)
-        logged += [(number, line) for line in log.take_lines(number * TICK_NS)]
+        log.add_state(replace(STATE, limited=limited), number * STATE_PERIOD_NS)
+        logged += [(number, line) for line in log.take_lines(number * STATE_PERIOD_NS)]
     assert logged == [
         (0, "limited: lateral acceleration"),
         (0, "limited: speed"),
@@ -161,16 +161,16 @@ def test_a_missing_state_is_logged() -> None:
 def test_a_client_without_a_first_state_logs_what_to_check() -> None:
     """A client without a state 3 s after its start logs once what to check; a server never does."""
     log, server = SessionLog("operator-1"), SessionLog()
-    for each in (log, server):
-        assert each.take_lines(5) == []
-        assert each.take_lines(5 + FIRST_STATE_TIMEOUT_NS - 1) == []
+    for session_log in (log, server):
+        assert session_log.take_lines(5) == []
+        assert session_log.take_lines(5 + FIRST_STATE_TIMEOUT_NS - 1) == []
     assert log.take_lines(5 + FIRST_STATE_TIMEOUT_NS) == [NO_STATE_YET]
     assert log.take_lines(5 + 9 * NS_PER_S) == []
     assert server.take_lines(5 + 9 * NS_PER_S) == []
 
 
 def test_the_last_line_describes_the_vehicle() -> None:
-    """A client's last line says whether its release was confirmed; a server's, whether its vehicle is stationary."""
+    """A client's last line says whether its release was confirmed, a server's whether its vehicle is stationary."""
     assert "released" in client_end_line(released=True)
     assert "not confirmed" in client_end_line(released=False)
     assert "stationary" in server_end_line(None)

@@ -33,7 +33,7 @@ GROUP = "239.74.163.2"
 TIMEOUT_S = 20
 
 
-class Program:
+class SoftwareCarProgram:
     """A `lavt software-car` process on a bus of its own, and this process's port on that bus."""
 
     def __init__(self, *changes: str, as_json: bool = True) -> None:
@@ -64,13 +64,13 @@ class Program:
         return value
 
     def wait_for(self, kind: str) -> dict[str, Any]:
-        """Return the next event of a kind."""
+        """Skip events until one of this kind; return it."""
         while (event := self.read_json()).get("kind") != kind:
             pass
         return event
 
     def type(self, line: str) -> None:
-        """Type a line."""
+        """Write a line to the standard input of the process."""
         assert self.process.stdin is not None
         self.process.stdin.write(line + "\n")
 
@@ -79,7 +79,7 @@ class Program:
         self.port.send(frames, MachineClock().now().mono_ns)
 
     def receive(self, is_done: Callable[[list[ReceivedCanFrame]], object]) -> list[ReceivedCanFrame]:
-        """Receive frames until `is_done` of them is true."""
+        """Receive frames until `is_done` returns a true value for all of them; return the frames."""
         received: list[ReceivedCanFrame] = []
         clock = MachineClock()
         end_ns = clock.now().mono_ns + TIMEOUT_S * NS_PER_S
@@ -96,16 +96,16 @@ class Program:
         return out, err
 
 
-Start = Callable[..., Program]
+Start = Callable[..., SoftwareCarProgram]
 
 
 @pytest.fixture
 def start() -> Iterator[Start]:
     """Return a function that starts programs, which are killed at the end of the test."""
-    programs: list[Program] = []
+    programs: list[SoftwareCarProgram] = []
 
-    def start_one(*changes: str, as_json: bool = True) -> Program:
-        programs.append(Program(*changes, as_json=as_json))
+    def start_one(*changes: str, as_json: bool = True) -> SoftwareCarProgram:
+        programs.append(SoftwareCarProgram(*changes, as_json=as_json))
         return programs[-1]
 
     yield start_one
@@ -141,13 +141,13 @@ def test_reports_and_ground_truth(start: Start) -> None:
     assert receiver.newest.speed_mps == 0.0
     assert receiver.newest.progress_m > 0.0
     for identifier, period_ms in ((0x100, 10), (0x101, 20), (0x103, 100)):
-        arrived = [each.arrived_ns for each in received if each.frame.identifier == identifier]
-        gaps_ms = [(after - before) / NS_PER_MS for before, after in itertools.pairwise(arrived)]
+        arrived_ns = [report.arrived_ns for report in received if report.frame.identifier == identifier]
+        gaps_ms = [(after - before) / NS_PER_MS for before, after in itertools.pairwise(arrived_ns)]
         assert statistics.median(gaps_ms) == pytest.approx(period_ms, abs=0.2 * period_ms)
     out, err = program.end()
-    (end,) = [json.loads(line) for line in out.splitlines()]
-    assert end["counts"]["frames_sent"] >= 760
-    assert end["counts"]["frames_heard"] == end["counts"]["frames_lost"] == 0
+    (last_line,) = [json.loads(line) for line in out.splitlines()]
+    assert last_line["counts"]["frames_sent"] >= 760
+    assert last_line["counts"]["frames_heard"] == last_line["counts"]["frames_lost"] == 0
     assert (program.process.returncode, err) == (0, "")
 
 
@@ -161,7 +161,7 @@ def test_a_fault_changes_the_reports(profile: str, identifier: int, start: Start
 
     def is_reported(is_set: int) -> Callable[[list[ReceivedCanFrame]], object]:
         def is_in_last_report(received: list[ReceivedCanFrame]) -> bool:
-            frames = [each.frame for each in received if each.frame.identifier == identifier]
+            frames = [report.frame for report in received if report.frame.identifier == identifier]
             return bool(frames) and unpack(layout, frames[-1].data)[fault] == is_set
 
         return is_in_last_report
@@ -199,12 +199,13 @@ def test_driven_by_another_process(generation: int, start: Start) -> None:
     assert "DRIVE" in program.wait_for("gear")["text"]
     assert "no command" in program.wait_for("enabled")["text"]
     assert "no command" in program.wait_for("watchdog")["text"]
-    speeds = [
-        int.from_bytes(each.frame.data[4:6] if generation == 1 else each.frame.data[:2], "little", signed=True) / 360
-        for each in program.port.take(0)
-        if each.frame.identifier == (0x065 if generation == 1 else 0x107)
+    speeds_mps = [
+        int.from_bytes(report.frame.data[4:6] if generation == 1 else report.frame.data[:2], "little", signed=True)
+        / 360
+        for report in program.port.take(0)
+        if report.frame.identifier == (0x065 if generation == 1 else 0x107)
     ]
-    assert max(speeds) > 0.5
+    assert max(speeds_mps) > 0.5
 
 
 @pytest.mark.realtime
@@ -237,7 +238,7 @@ def test_closed_standard_input(start: Start) -> None:
     assert (program.process.returncode, err) == (0, "")
 
 
-BAD = {
+BAD_SETTINGS = {
     "inside": (["interface=inside"], "vehicle.dbw.interface"),
     "unknown profile": (["profile=bicycle"], "'bicycle'"),
     "invalid address": (["truth=here"], "vehicle.dbw.truth: 'here'"),
@@ -247,10 +248,10 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("case", BAD)
+@pytest.mark.parametrize("case", BAD_SETTINGS)
 def test_bad_input(case: str, run: Run) -> None:
     """An invalid setting of the bus is rejected in one sentence with exit code 2."""
-    changes, reason = BAD[case]
+    changes, reason = BAD_SETTINGS[case]
     arguments = [part for change in changes for part in ("--set", f"vehicle.dbw.{change}")]
     assert reason in run("software-car", SERVER, *arguments).rejected()
 

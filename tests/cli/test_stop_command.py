@@ -13,16 +13,16 @@ from lavt.node import Send
 from lavt.transport.messages import encode
 
 REQUEST = SessionRequest("emergency_stop", "alice", 1, 60)
-STOPPED = SessionReply(True, "", 0, b"", 5600, "kernel", 60)
-OLD = SessionReply(False, "the number of this emergency stop is not a new one", 0, b"", 5600, "kernel", 59)
+ACCEPTED = SessionReply(True, "", 0, b"", 5600, "kernel", 60)
+EARLIER_NUMBER = SessionReply(False, "the number of this emergency stop is not a new one", 0, b"", 5600, "kernel", 59)
 
 
 def test_a_stop_is_repeated_until_it_is_answered(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The query is repeated after lost queries, garbage and replies to an earlier number, until its number is known."""
+    """The query is repeated after lost queries, garbage and replies to an earlier number, until it is answered."""
     monkeypatch.setattr(stop, "RETRY_PERIOD_S", 0.0)
-    known = replace(OLD, emergency_stop=60)
-    for answer in (STOPPED, known):
-        answers: list[bytes | None] = [None, b"garbage", encode(OLD), None, encode(answer)]
+    accepted_before = replace(EARLIER_NUMBER, emergency_stop=60)
+    for answer in (ACCEPTED, accepted_before):
+        answers: list[bytes | None] = [None, b"garbage", encode(EARLIER_NUMBER), None, encode(answer)]
         replies, queries = queue.Queue[bytes](), list[Send]()
 
         def send(
@@ -39,11 +39,11 @@ def test_a_stop_is_repeated_until_it_is_answered(monkeypatch: pytest.MonkeyPatch
         assert stop._query(send, replies, REQUEST) == answer
         assert queries == [Send("session", encode(REQUEST))] * 5
         assert stop._is_stopped(answer, 60)
-    assert not stop._is_stopped(OLD, 58)
+    assert not stop._is_stopped(EARLIER_NUMBER, 58)
 
 
 def test_a_missing_answer_points_to_the_doctor(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without an answer, `lavt stop` and `lavt client` name `lavt doctor`, because the keys may not match."""
+    """Without an answer, `lavt stop` and `lavt client` refer to `lavt doctor`, because the keys may not match."""
     monkeypatch.setattr(stop, "RETRY_PERIOD_S", 0.0)
     with pytest.raises(WorkError, match="`lavt doctor CONFIG`"):
         stop._query(lambda *_: None, queue.Queue(), REQUEST)

@@ -26,7 +26,7 @@ from lavt.transport.video.stamp_check import LEARNED_AFTER
 pytestmark = [pytest.mark.realtime, pytest.mark.judges_times]
 
 WIDTH_PX, HEIGHT_PX, RATE_HZ = 128, 96, 30
-ENDS_S = 60.0
+EXIT_TIMEOUT_S = 60.0
 
 
 @pytest.fixture
@@ -44,7 +44,7 @@ def port() -> int:
 @contextmanager
 def sending(port: int, *, base: int = 0, garbage: bool = False) -> Iterator[socket.socket]:
     """Send stamped keyframes to a port of this machine; `base` is the base of the RTP timestamps."""
-    done, clock = threading.Event(), MachineClock()
+    is_over, clock = threading.Event(), MachineClock()
     encoder = Encoder(WIDTH_PX, HEIGHT_PX, rate_hz=RATE_HZ, bit_rate_bps=1_000_000, gop_frames=1)
     packetizer = Packetizer(7, 0)
 
@@ -57,7 +57,7 @@ def sending(port: int, *, base: int = 0, garbage: bool = False) -> Iterator[sock
             datagrams = packetizer.packetize(unit, (rtp_timestamp(stamp_ns) + base) % 2**32)
             for datagram in [*datagrams, *([b"LAVT", b"", b"\x80" * 5] if garbage else [])]:
                 sender.sendto(datagram, ("127.0.0.1", port))
-            if done.wait(1 / RATE_HZ):
+            if is_over.wait(1 / RATE_HZ):
                 return
 
     with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as sender:
@@ -67,11 +67,11 @@ def sending(port: int, *, base: int = 0, garbage: bool = False) -> Iterator[sock
         try:
             yield sender
         finally:
-            done.set()
+            is_over.set()
             thread.join()
 
 
-def lines(out: str) -> list[tuple[str, Any]]:
+def parse_lines(out: str) -> list[tuple[str, Any]]:
     """Parse lines of JSON with one key each; return the keys with their values."""
     return [next(iter(json.loads(line).items())) for line in out.splitlines()]
 
@@ -83,7 +83,7 @@ def test_a_stream_of_lavt(run: Run, port: int) -> None:
         sender.setblocking(False)
         with pytest.raises(BlockingIOError):
             sender.recv(2048)
-    printed = lines(out)
+    printed = parse_lines(out)
     assert (code, err) == (0, "")
     assert [kind for kind, _ in printed] == ["watching", "second", "second", "summary"]
     assert printed[0][1] == {"port": port}
@@ -100,7 +100,7 @@ def test_a_foreign_stream(run: Run, port: int) -> None:
     """All stamps of a foreign sender are accepted, except the first ones from which the RTP base is learned."""
     with sending(port, base=123_456_789):
         code, out, _ = run("--port", str(port), "--seconds", "1", "--json", "--sender", "foreign")
-    kind, summary = lines(out)[-1]
+    kind, summary = parse_lines(out)[-1]
     assert (code, kind) == (0, "summary")
     assert summary["stamps_unreadable"] == LEARNED_AFTER - 1
     assert summary["stamps_accepted"] == summary["pictures"] - summary["stamps_unreadable"] > 0
@@ -126,30 +126,30 @@ def test_another_host(run: Run, port: int) -> None:
     """With --from, packets of that host are accepted from any port, and packets of other hosts are only counted."""
     with sending(port):
         code, out, _ = run("--port", str(port), "--seconds", "1", "--json", "--from", "127.0.0.2")
-        accepted = run("--port", str(port), "--seconds", "1", "--json", "--from", "localhost")
-    summary = lines(out)[-1][1]
+        result = run("--port", str(port), "--seconds", "1", "--json", "--from", "localhost")
+    summary = parse_lines(out)[-1][1]
     assert (code, summary["packets"]) == (1, 0)
     assert summary["datagrams_from_strangers"] > 0
-    summary = lines(accepted.out)[-1][1]
-    assert (accepted.code, summary["datagrams_from_strangers"]) == (0, 0)
+    summary = parse_lines(result.out)[-1][1]
+    assert (result.code, summary["datagrams_from_strangers"]) == (0, 0)
 
 
 def test_garbage(run: Run, port: int) -> None:
     """Datagrams that are not RTP are counted and dropped."""
     with sending(port, garbage=True):
         code, out, err = run("--port", str(port), "--seconds", "1", "--json")
-    summary = lines(out)[-1][1]
+    summary = parse_lines(out)[-1][1]
     assert (code, err) == (0, "")
     assert summary["datagrams_unreadable"] > summary["pictures"] > 0
     assert summary["stamps_unreadable"] == 0
 
 
 def test_no_packet(run: Run, port: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without packets a hint is printed once, the lines continue, and the exit code is 1."""
+    """Without packets, a hint is printed once, a line is printed each second, and the exit code is 1."""
     monkeypatch.setattr(watch, "HINT_AFTER_S", 1)
     code, out, err = run("--port", str(port), "--seconds", "2", "--json")
     assert code == 1
-    assert [kind for kind, _ in lines(out)] == ["watching", "second", "second", "summary"]
+    assert [kind for kind, _ in parse_lines(out)] == ["watching", "second", "second", "summary"]
     hint, error = err.splitlines()
     assert "0 other datagrams, 0 from other hosts" in hint
     assert error.startswith("lavt: ")
@@ -161,10 +161,10 @@ def test_ctrl_c() -> None:
     with subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         with sending(json.loads(process.stdout.readline())["watching"]["port"]):
-            assert any(json.loads(process.stdout.readline())["second"]["pictures"] for _ in range(int(ENDS_S)))
+            assert any(json.loads(process.stdout.readline())["second"]["pictures"] for _ in range(int(EXIT_TIMEOUT_S)))
             process.send_signal(signal.SIGINT)
-            out, err = process.communicate(timeout=ENDS_S)
+            out, err = process.communicate(timeout=EXIT_TIMEOUT_S)
     assert (process.returncode, err) == (0, "")
-    kind, summary = lines(out)[-1]
+    kind, summary = parse_lines(out)[-1]
     assert kind == "summary"
     assert summary["stamps_accepted"] > 0

@@ -41,7 +41,7 @@ def probes(delta_ms: float, *round_trips_ms: float) -> list[ClockProbe]:
     ]
 
 
-def compared(
+def compare_clocks(
     delta_ms: float = 250.0, *, reply: ProbeReply = REPLY, round_trip_ms: float = 0.3, **changes: Any
 ) -> ClockComparison:
     report = msgspec.structs.replace(GOOD, **changes)
@@ -65,14 +65,14 @@ def test_a_clock_with_a_wide_bound() -> None:
 
 @pytest.mark.parametrize("status", HINTS)
 def test_a_source_without_an_estimate(status: str) -> None:
-    """For a time source without an estimate, the result is its status and the fix."""
+    """For a time source without an estimate, the result is the source's status and a suggested fix."""
     finding = check_host(ClockReport(0, 0, "desk", "chrony", status=status))
     assert (finding.good, finding.says) == (False, (f"{status}: {HINTS[status]}",))
 
 
 def test_two_estimates_that_agree() -> None:
-    """The probe's estimate is from the shortest round trip, and the source's has the bound of the path."""
-    finding = compared(250.02)
+    """The probe's estimate is from the shortest round trip; the bound of the source's estimate is that of its path."""
+    finding = compare_clocks(250.02)
     assert finding.good
     assert finding.sources is not None
     assert finding.probe is not None
@@ -84,12 +84,12 @@ def test_two_estimates_that_agree() -> None:
 
 def test_a_client_that_follows_another_host() -> None:
     """If the client follows a third host, the bound is the sum of the client's and the server's bounds."""
-    finding = compared(follows="10.9.0.9")
+    finding = compare_clocks(follows="10.9.0.9")
     assert finding.sources is not None
     assert finding.sources.bound_ms == pytest.approx(0.6)
 
 
-def test_a_clock_that_is_steered_meanwhile() -> None:
+def test_a_clock_that_is_corrected_during_the_probing() -> None:
     """The correction after the probing counts, and its change during the probing is added to the bound."""
     before = msgspec.structs.replace(GOOD, correction_s=0.251)
     finding = compare(before, GOOD, probes(250.0, 0.3), REPLY, SERVER)
@@ -98,7 +98,7 @@ def test_a_clock_that_is_steered_meanwhile() -> None:
 
 
 def test_a_source_without_an_estimate_before_the_probing() -> None:
-    """If the time source has no estimate before the probing, Delta is the probe's, and the fix is suggested."""
+    """If the time source has no estimate before the probing, Delta is the probe's, and a fix is suggested."""
     before = ClockReport(0, 0, "desk", "chrony", status="chrony is not synchronised")
     finding = compare(before, GOOD, probes(250.0, 0.3), REPLY, SERVER)
     assert (finding.good, finding.sources) == (True, None)
@@ -106,16 +106,16 @@ def test_a_source_without_an_estimate_before_the_probing() -> None:
 
 
 def test_two_estimates_that_disagree() -> None:
-    """Estimates that differ by more than the sum of their bounds are not good; the result contains the difference."""
-    finding = compared(251.0)
+    """If two estimates differ by more than the sum of their bounds, the result is not good and has the difference."""
+    finding = compare_clocks(251.0)
     assert not finding.good
     assert "disagree" in finding.says[-1]
     assert "1.000 ms" in finding.says[-1]
 
 
 def test_ntp_through_delay() -> None:
-    """An NTP round trip more than a millisecond longer than the probe's is the only complaint."""
-    finding = compared(212.5, peer_delay_s=0.0752)
+    """If NTP's round trip is more than a millisecond longer than the probe's, this is the only complaint."""
+    finding = compare_clocks(212.5, peer_delay_s=0.0752)
     assert not finding.good
     assert all(part in finding.says[-1] for part in ("NTP", "75.20 ms", "0.30"))
     assert not any("agree" in sentence or "too wide" in sentence for sentence in finding.says)
@@ -123,19 +123,19 @@ def test_ntp_through_delay() -> None:
 
 @pytest.mark.parametrize("lacking", ["client", "server"])
 def test_the_probe_alone(lacking: str) -> None:
-    """If one side's time source has no estimate, Delta is the probe's alone, and the result says what that means."""
+    """If one side's time source has no estimate, Delta is the probe's alone, and the result describes its bound."""
     unknown: dict[str, Any] = {"correction_s": None, "bound_s": None, "status": "chrony is not installed"}
     reply = REPLY if lacking == "client" else msgspec.structs.replace(REPLY, correction_s=None, bound_s=None)
-    finding = compared(reply=reply, **(unknown if lacking == "client" else {}))
+    finding = compare_clocks(reply=reply, **(unknown if lacking == "client" else {}))
     assert finding.good
     assert finding.sources is None
     assert any("+250.000 ms ± 0.150 ms" in sentence for sentence in finding.says)
     assert any("asymmetry" in sentence for sentence in finding.says)
 
 
-def test_a_probe_over_a_long_path() -> None:
+def test_a_probe_with_a_long_round_trip() -> None:
     """From the probe alone, a round trip of 5 ms bounds Delta to 2.5 ms, which is not good enough."""
-    finding = compared(round_trip_ms=5.0, correction_s=None, bound_s=None)
+    finding = compare_clocks(round_trip_ms=5.0, correction_s=None, bound_s=None)
     assert not finding.good
     assert "2.50 ms" in finding.says[-1]
 

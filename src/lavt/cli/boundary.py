@@ -22,48 +22,48 @@ def register(app: typer.Typer) -> None:
 
 def boundary(
     config: Annotated[Path, typer.Argument(help="A boundary config in YAML, such as configs/boundary.yaml.")],
-    changes: console.Set = None,
-    out: console.Out = None,
+    changes: console.SetOption = None,
+    out: console.OutOption = None,
     jobs: Annotated[int | None, typer.Option(min=1, help="Number of parallel searches; default: one per core.")] = None,
-    as_json: console.Json = False,
+    as_json: console.JsonOption = False,
 ) -> None:
     """Find the maximum tolerable latency.
 
-    The search finds the total delays from which an oscillation grows, the car leaves its lane, and the drive fails, and
-    compares them with theory.
+    The search finds the smallest total delays at which an oscillation grows (onset), the car leaves its lane
+    (departure), and the car no longer completes the route (completion). It compares the onset with theory.
 
     Example: lavt boundary configs/boundary.yaml --set 'routes=[a_key]' --out out/boundary
     """
     from lavt.experiment.boundary.boundary import plan_boundary, search_boundary  # noqa: PLC0415 (slow: scipy)
 
-    requested = load_config(BoundaryConfig, config, changes or [])
-    searches = plan_boundary(requested)
+    settings = load_config(BoundaryConfig, config, changes or [])
+    searches = plan_boundary(settings)
     out = out or Path("out") / "boundary"
     prepare_directory(out)
-    with console.interruptible(), progress(f"boundary into {out}", len(searches)) as report_done:
-        found, is_complete = search_boundary(requested, searches, out, jobs=jobs, on_progress=report_done)
-    for failure in found["failed"]:
+    with console.interruptible(), progress(f"boundary search, results in {out}", len(searches)) as report_done:
+        result, is_complete = search_boundary(settings, searches, out, jobs=jobs, on_progress=report_done)
+    for failure in result["failed"]:
         console.print_message(f"failed: {failure['name']}: {failure['why']}")
     if not is_complete:
         raise WorkError(f"stopped; the results so far are in {out}")
     if as_json:
-        console.print_json(found)
+        console.print_json(result)
     else:
-        for line in boundary_table(found):
+        for line in _table_lines(result):
             console.print_result(line)
         console.print_result(f"boundary.json, .csv, .svg and .png are in {out}")
-    if found["failed"]:
+    if result["failed"]:
         raise typer.Exit(1)
 
 
-def boundary_table(found: dict[str, Any]) -> list[str]:
-    """Return the lines of a table with the medians and intervals for each route and preset."""
+def _table_lines(result: dict[str, Any]) -> list[str]:
+    """Return the lines of a table with the median and interval of each criterion, for each route and preset."""
     from lavt.experiment.report.boundary_section import ALL_ROUTES, span  # noqa: PLC0415 (slow: matplotlib)
-    from lavt.experiment.report.table_format import number  # noqa: PLC0415 (with them)
+    from lavt.experiment.report.table_format import number  # noqa: PLC0415 (a part of the slow report)
     from lavt.experiment.statistics.boundary_summary import CRITERIA  # noqa: PLC0415 (slow: scipy)
 
     table = [("route", "preset", "seeds", "theory", *CRITERIA)]
-    for group in found["groups"]:
+    for group in result["groups"]:
         cells = []
         for name in CRITERIA:
             summary = group[f"{name}_ms"]

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from itertools import chain
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import typer
 
@@ -28,16 +28,20 @@ from lavt.vehicle.dbw.traffic import BusTraffic, ExpectedMessages
 
 POLL_PERIOD_S = 0.02
 
-Batch = tuple[list[ReceivedCanFrame], int]
-"""The frames received since the batch before, and the time up to which they were received, ns."""
-
-Interface = Annotated[str | None, typer.Option(help="The CAN interface by python-can's name, such as socketcan.")]
+Interface = Annotated[str | None, typer.Option(help="python-can's name of the CAN interface, such as socketcan.")]
 Channel = Annotated[str | None, typer.Option(help="The interface's channel, such as can0.")]
 Option = Annotated[
     list[str] | None,
     typer.Option("--option", help="A further argument of python-can's Bus, as name=value; repeatable."),
 ]
 Dbc = Annotated[str, typer.Option(help="The vendor's DBC file, to use instead of the profile's.")]
+
+
+class FrameBatch(NamedTuple):
+    """The frames received since the previous batch, and the time up to which they were received."""
+
+    frames: list[ReceivedCanFrame]
+    end_ns: int
 
 
 def register(app: typer.Typer) -> None:
@@ -63,7 +67,7 @@ def monitor(
     log: Annotated[Path | None, typer.Option(help="Read a log (candump -L) instead of a bus.")] = None,
     write: Annotated[Path | None, typer.Option(help="Write the received frames to a log, as candump -L does.")] = None,
     seconds: Annotated[int | None, typer.Option(min=1, help="Stop after this time; default: on Ctrl-C.")] = None,
-    as_json: console.Json = False,
+    as_json: console.JsonOption = False,
 ) -> None:
     """Decode the messages on a CAN bus and report errors.
 
@@ -82,11 +86,11 @@ def monitor(
         if log is None:
             stop = stack.enter_context(console.stop_on_signals())
             port = stack.enter_context(closing(_open_port(config)))
-            batches, dropped, to_wall_ns = _read_bus(port, stop, seconds), port.counts, _mono_to_wall_ns()
+            batches, drop_counts, wall_offset_ns = _read_bus(port, stop, seconds), port.counts, _wall_offset_ns()
         else:
-            batches, dropped, to_wall_ns = _read_log(log), Counter[str](), 0
-        write_frame = stack.enter_context(_log_writer(write, config.channel, to_wall_ns))
-        if not _show_batches(batches, (codec, expected), dropped, write_frame, as_json):
+            batches, drop_counts, wall_offset_ns = _read_log(log), Counter[str](), 0
+        write_frame = stack.enter_context(_log_writer(write, config.channel, wall_offset_ns))
+        if not _show_batches(batches, (codec, expected), drop_counts, write_frame, as_json):
             raise WorkError(
                 f"no frame arrived on {config.interface} {config.channel}" if log is None else f"{log} is empty"
             )
@@ -95,7 +99,7 @@ def monitor(
 def check(
     name: Annotated[str, typer.Argument(metavar="PROFILE", help="A profile's name, or its YAML file.")],
     dbc: Dbc = "",
-    as_json: console.Json = False,
+    as_json: console.JsonOption = False,
 ) -> None:
     """Check a by-wire profile against its DBC file.
 
@@ -113,12 +117,12 @@ def check(
             mismatches = [str(error)]
     inhibit_reasons = [] if mismatches else real_bus_inhibit_reasons(profile)
     unverified = () if mismatches else profile.unverified
-    against = dbc or config.dbc
+    dbc_name = dbc or config.dbc
     if as_json:
         console.print_json(
             {
                 "profile": name,
-                "dbc": against,
+                "dbc": dbc_name,
                 "agree": not mismatches,
                 "disagreements": mismatches,
                 "unverified": unverified,
@@ -126,14 +130,14 @@ def check(
                 "real_bus_inhibit_reasons": inhibit_reasons,
             }
         )
-    for sentence in mismatches:
-        console.print_message(sentence)
+    for mismatch in mismatches:
+        console.print_message(mismatch)
     if mismatches:
         raise UserError(
-            f"{name} and {against} have {len(mismatches)} mismatches: change the profile, or name another DBC"
+            f"{name} and {dbc_name} have {len(mismatches)} mismatches: change the profile, or name another DBC"
         )
     if not as_json:
-        _show_match(name, against, unverified, inhibit_reasons)
+        _show_match(name, dbc_name, unverified, inhibit_reasons)
 
 
 def _show_match(name: str, dbc: str, unverified: Sequence[str], inhibit_reasons: Sequence[str]) -> None:
@@ -143,61 +147,64 @@ def _show_match(name: str, dbc: str, unverified: Sequence[str], inhibit_reasons:
         console.print_result(f"  {signal}")
     if not inhibit_reasons:
         console.print_result("on a real bus: may arm, after `lavt can test-watchdog` has passed")
-    for sentence in inhibit_reasons:
-        console.print_result(f"on a real bus: may not arm: {sentence}")
+    for reason in inhibit_reasons:
+        console.print_result(f"on a real bus: may not arm: {reason}")
 
 
 def _show_batches(
-    batches: Iterator[Batch],
-    messages: tuple[Codec, ExpectedMessages],
-    dropped: Counter[str],
+    batches: Iterator[FrameBatch],
+    codec_and_expected: tuple[Codec, ExpectedMessages],
+    drop_counts: Counter[str],
     write_frame: Callable[[ReceivedCanFrame], None],
     as_json: bool,
 ) -> bool:
-    """Show all batches each second and as a summary; return whether there was any frame."""
-    first = next(batches, ([], 0))
-    begin_ns = now_ns = first[1]
-    traffic = BusTraffic(*messages, start_ns=begin_ns)
-    view, shown_s, is_any = BusView(traffic, dropped, as_json), 0, False
+    """Show the frames of all batches, second by second and as a summary; return whether there was any frame."""
+    first = next(batches, FrameBatch([], 0))
+    start_ns = now_ns = first.end_ns
+    traffic = BusTraffic(*codec_and_expected, start_ns=start_ns)
+    view, shown_s, has_frames = BusView(traffic, drop_counts, as_json), 0, False
     with view.live():
         for frames, now_ns in chain([first], batches):
-            is_any = is_any or bool(frames)
+            has_frames = has_frames or bool(frames)
             for frame in frames:
                 traffic.receive(frame)
                 write_frame(frame)
-            if (now_ns - begin_ns) // NS_PER_S > shown_s:
-                shown_s = (now_ns - begin_ns) // NS_PER_S
-                view.show_second(now_ns - begin_ns, now_ns)
-    view.show_summary(now_ns - begin_ns, now_ns)
-    return is_any
+            if (now_ns - start_ns) // NS_PER_S > shown_s:
+                shown_s = (now_ns - start_ns) // NS_PER_S
+                view.show_second(now_ns - start_ns, now_ns)
+    view.show_summary(now_ns - start_ns, now_ns)
+    return has_frames
 
 
-def _read_bus(port: CanPort, stop: console.StopEvent, seconds: int | None) -> Iterator[Batch]:
+def _read_bus(port: CanPort, stop: console.StopEvent, seconds: int | None) -> Iterator[FrameBatch]:
     """Yield the frames received until the stop event, or for `seconds`; report a lost bus and retry."""
-    clock, failure = MachineClock(), ""
-    begin_ns = clock.now().mono_ns
+    clock, reported_error = MachineClock(), ""
+    start_ns = clock.now().mono_ns
     while not stop.wait(POLL_PERIOD_S):
         now_ns = clock.now().mono_ns
         try:
             frames, error = port.take(now_ns), ""
-        except BusGone as gone:
-            frames, error = [], str(gone)
-        if error != failure:
+        except BusGone as bus_gone:
+            frames, error = [], str(bus_gone)
+        if error != reported_error:
             console.print_message(f"lavt: {error}; retrying each second" if error else "lavt: the bus is back")
-            failure = error
-        yield frames, now_ns
-        if seconds is not None and now_ns - begin_ns >= seconds * NS_PER_S:
+            reported_error = error
+        yield FrameBatch(frames, now_ns)
+        if seconds is not None and now_ns - start_ns >= seconds * NS_PER_S:
             return
 
 
-def _read_log(path: Path) -> Iterator[Batch]:
+def _read_log(path: Path) -> Iterator[FrameBatch]:
     for frame in read_log(path):
-        yield [frame], frame.arrived_ns
+        yield FrameBatch([frame], frame.arrived_ns)
 
 
 @contextmanager
-def _log_writer(path: Path | None, channel: str, to_wall_ns: int) -> Iterator[Callable[[ReceivedCanFrame], None]]:
-    """Yield a function that writes a frame to the log at `path`; without a path it does nothing."""
+def _log_writer(path: Path | None, channel: str, wall_offset_ns: int) -> Iterator[Callable[[ReceivedCanFrame], None]]:
+    """Yield a function that writes a frame to the log at `path`, with its arrival time plus `wall_offset_ns`.
+
+    Without a path, the function does nothing.
+    """
     if path is None:
         yield lambda _: None
         return
@@ -206,17 +213,22 @@ def _log_writer(path: Path | None, channel: str, to_wall_ns: int) -> Iterator[Ca
     except OSError as error:
         raise UserError(f"{path} cannot be written ({error.strerror}): name another file") from error
     with file:
-        yield lambda received: file.writelines([log_line(received.arrived_ns + to_wall_ns, channel, received.frame)])
+        yield lambda received: file.writelines(
+            [log_line(received.arrived_ns + wall_offset_ns, channel, received.frame)]
+        )
 
 
 def _with_bus(config: DbwConfig, interface: str | None, channel: str | None, option: list[str] | None) -> DbwConfig:
-    """Return the config with the bus of the command line; another interface drops the config's options."""
+    """Return the config with the bus that the command line names.
+
+    If the command line names an interface, the config's options for the bus do not apply.
+    """
     options = {} if interface else dict(config.options)
-    for each in option or ():
-        name, equals, text = each.partition("=")
+    for text in option or ():
+        name, equals, value = text.partition("=")
         if not (name and equals):
-            raise UserError(f"--option {each!r} is not of the form name=value")
-        options[name] = parse_yaml(text, f"--option {name}")
+            raise UserError(f"--option {text!r} is not of the form name=value")
+        options[name] = parse_yaml(value, f"--option {name}")
     return config.model_copy(
         update={
             "interface": interface or config.interface,
@@ -232,7 +244,7 @@ def _open_port(config: DbwConfig) -> CanPort:
     return CanPort(config.interface, config.channel, config.options, clock=MachineClock())
 
 
-def _mono_to_wall_ns() -> int:
+def _wall_offset_ns() -> int:
     """Return the machine's wall-clock time minus its monotonic time."""
     now = MachineClock().now()
     return now.wall_ns - now.mono_ns

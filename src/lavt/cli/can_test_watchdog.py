@@ -26,23 +26,25 @@ from lavt.vehicle.dbw.profile import OwnBrake, Profile
 from lavt.vehicle.dbw.watchdog_test import BRAKE, BRAKE_WITHIN_NS, WatchdogTest
 
 POLL_PERIOD_S: Final = 0.002
-PREPARATION: Final = f"""The test enables the kit with the brake at {BRAKE} and then stops sending commands.
-The kit's watchdog must then brake.
+PREPARATION: Final = f"""The test enables the kit and commands a brake of {BRAKE} (1 is full braking).
+Then it stops sending commands, and the kit's watchdog must brake.
 Prepare the car first: it is stationary in park or neutral, with its wheels off the ground; nobody touches the wheel,
 the pedals or the shifter; and somebody is ready to press the kit's own emergency stop."""
 
 
 def run_watchdog_test(
     config: Annotated[Path, typer.Argument(help="A server config in YAML whose vehicle is by wire.")],
-    changes: console.Set = None,
+    changes: console.SetOption = None,
     out: Annotated[
         Path | None,
         typer.Option(help="The proof file to write.", show_default="vehicle.dbw.watchdog_proof of the config"),
     ] = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Confirm that the car is prepared: do not ask.")] = False,
-    as_json: console.Json = False,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Confirm that the car is prepared, so that the command does not ask.")
+    ] = False,
+    as_json: console.JsonOption = False,
 ) -> None:
-    """Test that the kit's watchdog brakes without commands.
+    """Test that the kit's watchdog brakes when commands stop.
 
     If the test passes, the command writes the proof file that arming requires. If it fails, the command writes no file
     and exits with 1.
@@ -55,38 +57,41 @@ def run_watchdog_test(
             f"the vehicle of {config} is of kind {settings.vehicle.kind}, not dbw: name a config of a by-wire vehicle"
         )
     dbw = settings.vehicle.dbw
-    file = out or Path(dbw.watchdog_proof or "watchdog_proof.json")
-    profile, watchdog = _load_testable(dbw)
+    proof_file = out or Path(dbw.watchdog_proof or "watchdog_proof.json")
+    profile, own_brake = _load_testable(dbw)
     process_priority.raise_priority()
     with closing(CanPort(dbw.interface, dbw.channel, dbw.options, clock=MachineClock())) as port:
         if not yes:
             _confirm(dbw)
-        _remove_old_proof(file)
-        test = WatchdogTest(profile, watchdog, start_ns=MachineClock().now().mono_ns)
+        _remove_old_proof(proof_file)
+        test = WatchdogTest(profile, own_brake, start_ns=MachineClock().now().mono_ns)
         _run(test, port)
     if test.observation is None:
         raise WorkError(f"the watchdog test failed: {test.failure}")
     proof = new_proof(test.observation, test.gear, profile, dbw, MachineClock().now().wall_ns)
-    _write(file, proof.model_dump_json(indent=1))
+    _write_proof(proof_file, proof.model_dump_json(indent=1))
     if as_json:
-        console.print_json({"file": str(file), **proof.model_dump()})
+        console.print_json({"file": str(proof_file), **proof.model_dump()})
         return
     console.print_result(
         f"the kit disengaged {proof.release_ms:g} ms after the last frame and braked after {proof.braked_ms:g} ms "
-        f"(limit {BRAKE_WITHIN_NS // 1_000_000} ms) in gear {proof.gear} ({proof.said}); proof: {file}"
+        f"(limit {BRAKE_WITHIN_NS // 1_000_000} ms) in gear {proof.gear} ({proof.said}); proof: {proof_file}"
     )
-    console.print_result("the kit brakes until a driver takes over: press the brake pedal")
+    console.print_result("the kit brakes until a driver overrides it by pressing the brake pedal")
 
 
 def _load_testable(dbw: DbwConfig) -> tuple[Profile, OwnBrake]:
-    """Return the profile and the sign of the kit's own braking; raise `UserError` if bus or profile is unsuitable."""
+    """Return the profile and the signal that reports the kit's own braking.
+
+    Raises `UserError` if bus or profile is unsuitable.
+    """
     if dbw.interface == "inside":
         raise UserError("a bus inside the server's process cannot be reached from here: name another interface")
     profile = load_profile(dbw.profile, dbw.dbc, dbw.steering_sign)
-    watchdog = profile.watchdog
-    if watchdog is None:
-        raise UserError(f"{dbw.profile} has no sign of the kit's own braking: set watchdog.signal in the profile")
-    if profile.car.steering_sign is None:  # the test keeps the wheel where it is, so its sign does not matter
+    own_brake = profile.watchdog
+    if own_brake is None:
+        raise UserError(f"{dbw.profile} names no signal of the kit's own braking: set watchdog.signal in the profile")
+    if profile.car.steering_sign is None:  # unimportant: the test keeps the angle
         profile = dataclasses.replace(profile, car=dataclasses.replace(profile.car, steering_sign=1))
     reasons = []
     if not is_virtual(dbw.interface, dbw.channel, dbw.options):
@@ -95,7 +100,7 @@ def _load_testable(dbw: DbwConfig) -> tuple[Profile, OwnBrake]:
             reasons.append("the proof must name the car: set vehicle.dbw.car to its serial number or VIN")
     if reasons:
         raise UserError(f"{dbw.profile} may not be used on {dbw.interface} {dbw.channel}: {'; '.join(reasons)}")
-    return profile, watchdog
+    return profile, own_brake
 
 
 def _confirm(dbw: DbwConfig) -> None:
@@ -104,7 +109,7 @@ def _confirm(dbw: DbwConfig) -> None:
         raise UserError("no terminal to ask whether the car is prepared: prepare it and pass --yes")
     console.print_message(f"{PREPARATION}\nType yes to begin on {dbw.interface} {dbw.channel}:")
     if sys.stdin.readline().strip() != "yes":
-        raise UserError("nothing was sent: prepare the car, and answer yes")
+        raise UserError("nothing was sent, because the answer was not yes: prepare the car, then answer yes")
 
 
 def _run(test: WatchdogTest, port: CanPort) -> None:
@@ -113,14 +118,14 @@ def _run(test: WatchdogTest, port: CanPort) -> None:
     with console.stop_on_signals() as stop:
         while not test.is_done:
             if stop.wait(POLL_PERIOD_S):
-                raise WorkError("stopped without a result; the kit may brake: press the brake pedal to take over")
+                raise WorkError("stopped without a result; the kit may brake: override it by pressing the brake pedal")
             try:
                 for received in port.take(clock.now().mono_ns):
                     test.receive(received.frame, received.arrived_ns)
                 now_ns = clock.now().mono_ns
                 port.send(test.frames_due(now_ns), now_ns)
-            except BusGone as gone:
-                test.on_bus_gone(str(gone))
+            except BusGone as error:
+                test.on_bus_gone(str(error))
 
 
 def _remove_old_proof(file: Path) -> None:
@@ -132,7 +137,7 @@ def _remove_old_proof(file: Path) -> None:
         raise UserError(f"{file} cannot be written ({error.strerror}): name another file with --out") from error
 
 
-def _write(file: Path, text: str) -> None:
+def _write_proof(file: Path, text: str) -> None:
     try:
         file.write_text(text + "\n")
     except OSError as error:

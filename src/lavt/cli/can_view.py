@@ -19,10 +19,10 @@ from lavt.vehicle.dbw.traffic import OTHER_IDENTIFIERS, BusTraffic, MessageSumma
 
 
 class BusView:
-    """A view of a bus that is printed each second, and as a summary at the end."""
+    """The messages on a bus, printed each second and, at the end, as a summary."""
 
-    def __init__(self, traffic: BusTraffic, counts: Mapping[str, int], as_json: bool) -> None:
-        self._traffic, self._counts, self._as_json = traffic, counts, as_json
+    def __init__(self, traffic: BusTraffic, drop_counts: Mapping[str, int], as_json: bool) -> None:
+        self._traffic, self._drop_counts, self._as_json = traffic, drop_counts, as_json
         self._live: Live | None = None
         self._printed: set[str] = set()
         """Names of the messages that have been printed."""
@@ -33,49 +33,49 @@ class BusView:
         if self._as_json or not sys.stdout.isatty():
             yield
             return
-        with Live(Text("nothing yet"), console=Console(), auto_refresh=False) as self._live:
+        with Live(Text("no message yet"), console=Console(), auto_refresh=False) as self._live:
             yield
         self._live = None
 
-    def show_second(self, passed_ns: int, now_ns: int) -> None:
-        """Show the messages since the last call."""
+    def show_second(self, elapsed_ns: int, now_ns: int) -> None:
+        """Show the messages since the last call; `elapsed_ns` is the time since the start."""
         messages = self._traffic.take_period(now_ns)
         if self._as_json:
-            console.print_json({"second": self._as_data(passed_ns, messages)})
+            console.print_json({"second": self._as_data(elapsed_ns, messages)})
         elif self._live is not None:
             self._live.update(_table(messages, self._other_lines()), refresh=True)
         else:
             for message in messages:
                 if message.wrong or message.changed or message.facts.name not in self._printed:
                     self._printed.add(message.facts.name)
-                    console.print_result(f"{passed_ns / NS_PER_S:.0f} s  {_line(message)}")
+                    console.print_result(f"{elapsed_ns / NS_PER_S:.0f} s  {_message_line(message)}")
 
-    def show_summary(self, passed_ns: int, now_ns: int) -> None:
-        """Show the messages of the whole time."""
+    def show_summary(self, elapsed_ns: int, now_ns: int) -> None:
+        """Show the messages since the start; `elapsed_ns` is the time since then."""
         messages = self._traffic.total(now_ns)
         if self._as_json:
-            console.print_json({"summary": self._as_data(passed_ns, messages)})
+            console.print_json({"summary": self._as_data(elapsed_ns, messages)})
             return
-        console.print_result(f"summary of {passed_ns / NS_PER_S:.1f} s:")
-        for line in [*map(_line, messages), *self._other_lines()]:
+        console.print_result(f"summary of {elapsed_ns / NS_PER_S:.1f} s:")
+        for line in [*map(_message_line, messages), *self._other_lines()]:
             console.print_result(f"  {line}")
 
     def _other_lines(self) -> list[str]:
         """Return the lines on frames of unknown messages and on dropped frames."""
         unknown = [f"{format_identifier(*key)} {count} times" for key, count in sorted(self._traffic.unknown.items())]
-        dropped = [f"{name.replace('_', ' ')} {count}" for name, count in self._counts.items() if count]
+        dropped = [f"{name.replace('_', ' ')} {count}" for name, count in self._drop_counts.items() if count]
         lines = {"not in the DBC": unknown, "dropped": dropped}
         return [f"{label}: {', '.join(counts)}" for label, counts in lines.items() if counts]
 
-    def _as_data(self, passed_ns: int, messages: Sequence[MessageSummary]) -> dict[str, Any]:
+    def _as_data(self, elapsed_ns: int, messages: Sequence[MessageSummary]) -> dict[str, Any]:
         unknown: Counter[str] = Counter()
         for key, count in self._traffic.unknown.items():
             unknown[format_identifier(*key)] += count
         return {
-            "passed_s": round(passed_ns / NS_PER_S, 3),
+            "passed_s": round(elapsed_ns / NS_PER_S, 3),
             "messages": [_message_data(message) for message in messages],
             "unknown": unknown,
-            "dropped": {name: count for name, count in self._counts.items() if count},
+            "dropped": {name: count for name, count in self._drop_counts.items() if count},
         }
 
 
@@ -86,11 +86,11 @@ def format_identifier(identifier: int, is_extended: bool) -> str:
     return f"0x{identifier:0{8 if is_extended else 3}X}"
 
 
-def _line(message: MessageSummary) -> str:
+def _message_line(message: MessageSummary) -> str:
     facts = message.facts
     identifier = format_identifier(facts.identifier, facts.is_extended)
     parts = [
-        f"{facts.name} {identifier}  {message.frames} times, {_rate(message)}",
+        f"{facts.name} {identifier}  {message.frames} times, {_rate_text(message)}",
         ", ".join(_signal_labels(message)),
         f"changed: {', '.join(message.changed)}" if message.changed else "",
         f"WRONG: {'; '.join(message.wrong)}" if message.wrong else "",
@@ -98,7 +98,7 @@ def _line(message: MessageSummary) -> str:
     return "  ".join(part for part in parts if part)
 
 
-def _rate(message: MessageSummary) -> str:
+def _rate_text(message: MessageSummary) -> str:
     nominal = f" of {NS_PER_S / message.facts.period_ns:g}" if message.facts.period_ns else ""
     return f"{message.rate_hz:.1f}{nominal} per s"
 

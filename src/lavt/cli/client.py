@@ -24,17 +24,18 @@ def register(app: typer.Typer) -> None:
 
 def client(
     config: Annotated[Path, typer.Argument(help="A client config in YAML, such as configs/client.yaml.")],
-    out: console.Out = None,
-    changes: console.Set = None,
+    out: console.OutOption = None,
+    changes: console.SetOption = None,
     take_over: Annotated[
         bool, typer.Option("--take-over", help="Ask the client in control to hand over the vehicle.")
     ] = False,
-    as_json: console.Json = False,
+    as_json: console.JsonOption = False,
 ) -> None:
     """Run the operator's side: acquire control, arm and drive.
 
-    The controller drives the vehicle by its video. SIGUSR1 triggers an emergency stop. SIGUSR2 releases the vehicle, to
-    the client that requests control if there is one. Ctrl-C releases the vehicle and exits.
+    The controller drives the vehicle from the pictures of its video. SIGUSR1 triggers an emergency stop. SIGUSR2 hands
+    the vehicle over to the client that requests control; if no client does, it releases the vehicle. Ctrl-C releases
+    the vehicle and exits.
 
     Example: lavt client configs/client.yaml --set video.server=192.0.2.7
     """

@@ -1,4 +1,4 @@
-"""`lavt clock`: measure how well two machines' clocks are synchronised."""
+"""`lavt clock`: report the error of this machine's clock and, with --server, the offset to another machine's clock."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from lavt.transport.clock_sync.probe import DEFAULT_PORT, ClockProbe, ProbeReply
 from lavt.transport.udp_link import UdpLink, resolve_host
 
 PROBE_PERIOD_NS = 50 * NS_PER_MS
-LAST_REPLY_NS = 500 * NS_PER_MS
-"""How long to wait for the last reply."""
+LAST_REPLY_TIMEOUT_NS = 500 * NS_PER_MS
+"""How long to wait for replies after the last request."""
 
 
 def register(app: typer.Typer) -> None:
@@ -44,12 +44,12 @@ def clock(
         float | None, typer.Option(help="For external: reference time minus this machine's wall clock.")
     ] = None,
     bound_ms: Annotated[float | None, typer.Option(help="For external: the largest error of the correction.")] = None,
-    as_json: console.Json = False,
+    as_json: console.JsonOption = False,
 ) -> None:
     """Report the error of this machine's clock.
 
-    With --server, the command also measures the offset to the vehicle's clock. It exits with 1 if the accuracy is not
-    good enough for one-way latencies.
+    With --server, the command also measures the offset to the vehicle's clock. It exits with 1 if the clock is not
+    accurate enough to measure one-way latencies.
 
     Example: lavt clock --server 192.0.2.7
     """
@@ -63,14 +63,14 @@ def clock(
         if address is None:
             finding = check_host(report)
         else:
-            probes, latest = probe(machine, address, port, round(seconds * NS_PER_S))
-            if latest is None:
+            probes, last_reply = probe(machine, address, port, round(seconds * NS_PER_S))
+            if last_reply is None:
                 raise WorkError(
                     f"no answer from {server}:{port} (UDP): is `lavt server` running there, is its "
                     f"clock.probe_port {port}, and does the firewall let it through?"
                 )
-            before, report = report, _read_report(read_source, source)
-            finding = compare(before, report, probes, latest, address)
+            report_before, report = report, _read_report(read_source, source)
+            finding = compare(report_before, report, probes, last_reply, address)
     if as_json:
         console.print_json({**msgspec.to_builtins(finding), "clock": msgspec.to_builtins(report)})
     else:
@@ -96,26 +96,27 @@ def probe(
     def deliver(_channel: str, payload: Any, arrived: Now, _peer: Any) -> None:
         replies.put((payload, arrived))
 
-    sent: dict[int, int] = {}
+    sent_wall_ns: dict[int, int] = {}
     link = UdpLink(machine, "probe_reply", bind=("", 0), remote=(address, port), name="probe")
     with closing(link):
         link.start(deliver)
         end_ns = machine.now().mono_ns + duration_ns
         while machine.now().mono_ns < end_ns:
-            sent[len(sent)] = machine.now().wall_ns
-            link.send(Send("probe_request", encode_request(len(sent) - 1, sent[len(sent) - 1])))
+            sequence = len(sent_wall_ns)
+            sent_wall_ns[sequence] = machine.now().wall_ns
+            link.send(Send("probe_request", encode_request(sequence, sent_wall_ns[sequence])))
             pause(PROBE_PERIOD_NS)
-        pause(LAST_REPLY_NS)
+        pause(LAST_REPLY_TIMEOUT_NS)
     probes: list[ClockProbe] = []
-    latest = None
+    last_reply = None
     while not replies.empty():
         payload, arrived = replies.get()
         try:
             reply = decode_reply(payload)
         except BadMessage:
             continue
-        if sent.pop(reply.sequence, None) == reply.sent_wall_ns:
+        if sent_wall_ns.pop(reply.sequence, None) == reply.sent_wall_ns:
             times = (reply.sent_wall_ns, reply.received_wall_ns, reply.answered_wall_ns, arrived.wall_ns)
             probes.append(ClockProbe(reply.sequence, *times))
-            latest = reply
-    return probes, latest
+            last_reply = reply
+    return probes, last_reply

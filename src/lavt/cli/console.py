@@ -17,9 +17,11 @@ import typer
 from lavt.errors import LavtError, UserError, WorkError
 from lavt.runtime.output import finish_output, queue_output
 
-Out = Annotated[Path | None, typer.Option(help="Output directory.")]
-Set = Annotated[list[str] | None, typer.Option("--set", help="Override a config value, as a.b=value; repeatable.")]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
+OutOption = Annotated[Path | None, typer.Option(help="Output directory.")]
+SetOption = Annotated[
+    list[str] | None, typer.Option("--set", help="Override a config value, as a.b=value; repeatable.")
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 
 
 def print_message(text: str) -> None:
@@ -38,15 +40,15 @@ def print_json(value: Any) -> None:
 
 
 def reserve_stdout() -> None:
-    """Redirect the output of libraries (Zenoh's log) to `sys.stderr`; `print_result` keeps standard output.
+    """Redirect what libraries write to standard output (Zenoh's log) to `sys.stderr`; only results are left there.
 
-    The libraries write to a pipe that is always read, so that they do not block either.
+    The libraries write to a pipe that a thread always reads, so that they never block.
     """
-    results = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
+    result_stream = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     read_end, write_end = os.pipe()
     os.dup2(write_end, sys.stdout.fileno())
     os.close(write_end)
-    sys.stdout = results
+    sys.stdout = result_stream
     threading.Thread(target=_copy_to_stderr, args=(read_end,), name="library output", daemon=True).start()
 
 
@@ -94,31 +96,31 @@ class StopEvent:
     """An event that a signal handler can set without a deadlock.
 
     A signal handler interrupts the main thread anywhere, even inside another handler: a second signal often follows the
-    first at once. `threading.Event.set` waits for a lock that the interrupted code may own, and so would wait for ever.
-    The methods of this class wait for no such lock.
+    first immediately. `threading.Event.set` waits for a lock. If the interrupted code owns that lock, the handler waits
+    for ever. The methods of this class wait for no such lock.
     """
 
     def __init__(self) -> None:
-        self._is_clear = threading.Lock()
-        """Locked while the event is clear."""
-        self._is_clear.acquire()
+        self._clear_lock = threading.Lock()
+        """A lock that is held while the event is clear."""
+        self._clear_lock.acquire()
 
     def set(self) -> None:
         """Set the event; setting it again changes nothing."""
         with suppress(RuntimeError):  # it was already set
-            self._is_clear.release()
+            self._clear_lock.release()
 
     def is_set(self) -> bool:
         """Return whether the event is set."""
-        return not self._is_clear.locked()
+        return not self._clear_lock.locked()
 
     def clear(self) -> None:
         """Clear the event."""
-        self._is_clear.acquire(blocking=False)
+        self._clear_lock.acquire(blocking=False)
 
     def wait(self, timeout_s: float | None = None) -> bool:
         """Wait until the event is set or `timeout_s` has passed (None: no timeout); return whether it is set."""
-        is_set = self._is_clear.acquire(timeout=-1 if timeout_s is None else timeout_s)
+        is_set = self._clear_lock.acquire(timeout=-1 if timeout_s is None else timeout_s)
         if is_set:
             self.set()
         return is_set
@@ -137,15 +139,15 @@ def stop_on_signals() -> Iterator[StopEvent]:
 
 
 @contextmanager
-def _signal_handlers(handler: Callable[..., None], *numbers: signal.Signals) -> Iterator[None]:
-    """Install `handler` for these signals and for SIGHUP (a closed terminal), and restore the former handlers.
+def _signal_handlers(handler: Callable[..., None], *signals: signal.Signals) -> Iterator[None]:
+    """Install `handler` for these signals and for SIGHUP (a closed terminal); restore the former handlers at the end.
 
     SIGHUP stays ignored if it was ignored before, as under `nohup`.
     """
     hangup = [] if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN else [signal.SIGHUP]
-    former = {number: signal.signal(number, handler) for number in (*numbers, *hangup)}
+    former_handlers = {number: signal.signal(number, handler) for number in (*signals, *hangup)}
     try:
         yield
     finally:
-        for number, former_handler in former.items():
+        for number, former_handler in former_handlers.items():
             signal.signal(number, former_handler)

@@ -1,4 +1,4 @@
-"""`lavt demo`: a short example of the testbed's main job."""
+"""`lavt demo`: drive under a few network conditions and report, as a short example of what LAVT measures."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def register(app: typer.Typer) -> None:
     app.command("demo")(demo)
 
 
-def demo(out: console.Out = None, as_json: console.Json = False) -> None:
+def demo(out: console.OutOption = None, as_json: console.JsonOption = False) -> None:
     """Run the demo: drive by video under L0 to L5 and report.
 
     The demo drives in real time under L0 and L5, and in virtual time under L0 to L5, all on this machine.
@@ -48,7 +48,7 @@ def demo(out: console.Out = None, as_json: console.Json = False) -> None:
     if as_json:
         console.print_json(summary)
     else:
-        _show(summary)
+        _print_table(summary)
         console.print_result(f"the report is {page}")
     if failed:
         raise typer.Exit(1)
@@ -56,30 +56,30 @@ def demo(out: console.Out = None, as_json: console.Json = False) -> None:
 
 def _drive_real(config: Path, out: Path) -> None:
     for name in REAL_CONDITIONS:
-        run = load_config(RunConfig, config, ["time=real", f"network.condition={name}"])
-        planned = plan_run(run, name=f"real_{run.vehicle.route}_{name}_00")
+        run_config = load_config(RunConfig, config, ["time=real", f"network.condition={name}"])
+        planned_run = plan_run(run_config, name=f"real_{run_config.vehicle.route}_{name}_00")
         with LiveView(f"real time, {name}") as view:
-            result = run_once(planned, out / "runs" / planned.name, progress=view.update)
+            result = run_once(planned_run, out / "runs" / planned_run.name, progress=view.update)
         console.print_message(f"real time, {name}: {result['ending']}")
 
 
 def _drive_virtual(config: Path, out: Path) -> tuple[bool, dict[str, Any] | None]:
-    """Drive the same route under all conditions; return whether any run failed, and the speed of virtual time."""
+    """Drive the same route under all conditions; return whether any run failed, and the summary's entry `speed`."""
     base = load_config(RunConfig, config, ["time=virtual"])
     axes = {"routes": [base.vehicle.route], "conditions": list(VIRTUAL_CONDITIONS)}
-    planned = plan_sweep(parse_config(SweepConfig, {**base.model_dump(mode="json"), **axes}, str(config)))
+    planned_runs = plan_sweep(parse_config(SweepConfig, {**base.model_dump(mode="json"), **axes}, str(config)))
     from lavt.experiment.sweep.sweep import run_all  # noqa: PLC0415 (slow: scipy, matplotlib)
 
-    with progress("virtual time, L0 to L5", len(planned)) as report_done:
-        driven, speed = run_all(planned, out / "runs", jobs=None, on_progress=report_done)
-    return bool(driven.failed), speed
+    with progress("virtual time, L0 to L5", len(planned_runs)) as report_done:
+        sweep_result, speed = run_all(planned_runs, out / "runs", jobs=None, on_progress=report_done)
+    return bool(sweep_result.failed), speed
 
 
-def _show(summary: dict[str, Any]) -> None:
-    """Print the table of conditions."""
+def _print_table(summary: dict[str, Any]) -> None:
+    """Print a table with one row for each run."""
     columns = ("time", "condition", "ending", "injected", "tau_v", "tau_c", "loop", "P95")
     units = ("", "", "", "video + control, ms", "ms", "ms", "ms", "cross-track, m")
-    table = Table(*("\n".join(each) for each in zip(columns, units, strict=True)))
+    table = Table(*("\n".join(heading) for heading in zip(columns, units, strict=True)))
     for run in summary["runs"]:
         injected_ms = run["injected_ms"]
         table.add_row(
@@ -87,15 +87,15 @@ def _show(summary: dict[str, Any]) -> None:
             run["condition"],
             run["ending"] + ("" if run["valid"] else ", not valid"),
             f"{injected_ms['video']:g} + {injected_ms['control']:g}",
-            _ms(run["tau_v_ms"]),
-            _ms(run["tau_c_ms"]),
-            _ms(run["loop_ms"]),
+            _format_latency(run["tau_v_ms"]),
+            _format_latency(run["tau_c_ms"]),
+            _format_latency(run["loop_ms"]),
             "" if run["p95_m"] is None else f"{run['p95_m']:.2f}",
         )
     Console(width=120).print(table)
 
 
-def _ms(summary: dict[str, Any]) -> str:
+def _format_latency(summary: dict[str, Any]) -> str:
     if summary["p50"] is None:
         return "unknown"
     bound = summary.get("bound")

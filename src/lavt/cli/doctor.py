@@ -33,11 +33,11 @@ from lavt.transport.clock_sync.clock_report import ClockReport
 from lavt.transport.udp_link import resolve_host
 from lavt.transport.zenoh_link import ZenohLink, quiet_logs
 
-PROBING_NS = NS_PER_S
+PROBE_DURATION_NS = NS_PER_S
 LISTEN_NS = NS_PER_S
 """How long to listen to a CAN bus; a kit's slowest report comes every 0.1 s."""
-WHO = "doctor"
-ANY_ADDRESS = "0.0.0.0"  # noqa: S104 (compared with, not bound)
+CLIENT_NAME = "doctor"
+ANY_ADDRESS = "0.0.0.0"  # noqa: S104 (no socket is bound to it)
 Settings = ServerConfig | ClientConfig
 CLIENT_ONLY_KEYS = {*(ClientConfig.model_fields.keys() - ServerConfig.model_fields.keys()), "video.server"}
 
@@ -51,8 +51,8 @@ def doctor(
     config: Annotated[
         Path | None, typer.Argument(help="A server or client config; default: check this machine only.")
     ] = None,
-    changes: console.Set = None,
-    as_json: console.Json = False,
+    changes: console.SetOption = None,
+    as_json: console.JsonOption = False,
 ) -> None:
     """Check whether this machine is ready to drive.
 
@@ -64,14 +64,14 @@ def doctor(
     console.reserve_stdout()
     process_priority.raise_priority()
     if config is None and changes:
-        raise UserError("--set changes a config: name one before it")
+        raise UserError("--set changes a value of a config: name a config before it")
     settings = None if config is None else _load(config, changes or [])
     quiet_logs()
     results = []
     for check in _checks(settings, MachineClock()):
         results.append(check)
         if not as_json:
-            _show(check)
+            _print_check(check)
     problems = sum(check.verdict == "problem" for check in results)
     if as_json:
         console.print_json({"good": problems == 0, "checks": msgspec.to_builtins(results)})
@@ -80,7 +80,7 @@ def doctor(
 
 
 def _load(path: Path, changes: list[str]) -> Settings:
-    """Read a config, as a client's if it has a key that only a client's has, else as a server's."""
+    """Read a config: a client's if the file or a change has a key that only a client's has, otherwise a server's."""
     data = read_yaml(path)
     video = data.get("video")
     keys = {*data, *(f"video.{key}" for key in (video if isinstance(video, dict) else {}))}
@@ -93,43 +93,43 @@ def _load(path: Path, changes: list[str]) -> Settings:
 
 def _checks(settings: Settings | None, clock: MachineClock) -> Iterator[Check]:
     config = ServerConfig() if settings is None else settings
-    yield from _machine(config, "" if settings is None else _side(settings), clock)
+    yield from _machine_checks(config, "" if settings is None else _side_name(settings), clock)
     report = probes.clock_report(config.clock, clock)
     yield checks.check_clock(report)
     yield checks.check_netem(probes.netem_rejection(config.injection.interface), config.injection.interface)
     if settings is None:
         return
-    yield from _security(settings, clock)
+    yield from _security_checks(settings, clock)
     if isinstance(settings, ServerConfig):
         if settings.camera.source == "device":
-            yield _camera(settings, clock)
+            yield _camera_check(settings, clock)
         if settings.vehicle.kind == "dbw" and not settings.vehicle.dbw.is_inside:
-            yield _by_wire(settings, clock)
-        yield from _ports(settings, clock)
-        yield from _zenoh(settings, clock)
+            yield _by_wire_check(settings, clock)
+        yield from _port_checks(settings, clock)
+        yield from _zenoh_checks(settings, clock)
     else:
-        yield from _zenoh(settings, clock)
-        yield _probe(settings, report, clock)
+        yield from _zenoh_checks(settings, clock)
+        yield _probe_check(settings, report, clock)
         yield checks.check_video(settings.video.server, settings.video.port)
 
 
-def _side(settings: Settings) -> str:
+def _side_name(settings: Settings) -> str:
     return "client" if isinstance(settings, ClientConfig) else "server"
 
 
-def _machine(config: Settings, side: str, clock: MachineClock) -> Iterator[Check]:
-    found, requirements = probes.packages()
-    yield checks.check_versions(platform.python_version(), found, requirements)
-    yield _codec(config, side, clock)
+def _machine_checks(config: Settings, side: str, clock: MachineClock) -> Iterator[Check]:
+    versions, requirements = probes.packages()
+    yield checks.check_versions(platform.python_version(), versions, requirements)
+    yield _codec_check(config, side, clock)
     yield checks.check_buffer(probes.receive_buffer_bytes())
-    yield checks.check_arrival(probes.arrivals_are_stamped())
-    yield checks.check_timer(*probes.timer(clock))
+    yield checks.check_arrival(probes.kernel_records_arrivals())
+    yield checks.check_timer(*probes.timer_accuracy(clock))
     yield checks.check_process_priority(probes.niceness())
     yield checks.check_governor(probes.governors())
 
 
-def _codec(config: Settings, side: str, clock: MachineClock) -> Check:
-    """Time the codec at the config's settings; for a client, settings of the server have their defaults."""
+def _codec_check(config: Settings, side: str, clock: MachineClock) -> Check:
+    """Time the codec with the config's settings; for a client, settings that only a server has are the defaults."""
     server = config if isinstance(config, ServerConfig) else _assumed_server(config)
     size = f"{server.camera.width_px}x{server.camera.height_px}"
     try:
@@ -141,14 +141,14 @@ def _codec(config: Settings, side: str, clock: MachineClock) -> Check:
     return checks.check_codec(times, size=size, rate_hz=server.camera.rate_hz, side=side, cores=cores)
 
 
-def _camera(settings: ServerConfig, clock: MachineClock) -> Check:
+def _camera_check(settings: ServerConfig, clock: MachineClock) -> Check:
     camera = settings.camera
     size = f"{camera.width_px}x{camera.height_px}"
     sample = probes.sample_camera(settings, clock)
     return checks.check_camera(sample, name=str(camera.device), size=size, rate_hz=camera.rate_hz)
 
 
-def _by_wire(settings: ServerConfig, clock: MachineClock) -> Check:
+def _by_wire_check(settings: ServerConfig, clock: MachineClock) -> Check:
     bus = f"{settings.vehicle.dbw.interface} {settings.vehicle.dbw.channel}"
     try:
         frames, inhibit_reason = listen(settings, clock, LISTEN_NS)
@@ -165,34 +165,38 @@ def _assumed_server(config: ClientConfig) -> ServerConfig:
     )
 
 
-def _security(settings: Settings, clock: MachineClock) -> Iterator[Check]:
+def _security_checks(settings: Settings, clock: MachineClock) -> Iterator[Check]:
     files = probes.key_files(settings.security)
     yield checks.check_keys_configured(bool(files))
-    for key, path, private in files:
+    for key, path, is_private in files:
         rejection, mode = probes.file_state(path)
-        yield checks.check_key_file(key, path, rejection=rejection, mode=mode, private=private)
+        yield checks.check_key_file(key, path, rejection=rejection, mode=mode, is_private=is_private)
         if not rejection:
             yield checks.check_signing_key(path, probes.signing_key_days_left(path, clock.now().wall_ns))
     rejection = probes.keys_rejection(settings)
     if rejection:
-        yield Check("keys", "problem", rejection, "copy this machine's files from `lavt keys` (docs/deployment.md)")
+        yield Check(
+            "keys", "problem", rejection, "copy the files that `lavt keys` lists for this machine (docs/deployment.md)"
+        )
     for folder in sorted({path.parent for _, path, _ in files}):
         for path, days_left in probes.certificates(folder, clock.now().wall_ns):
             yield checks.check_certificate(path, days_left)
 
 
-def _ports(settings: ServerConfig, clock: MachineClock) -> Iterator[Check]:
+def _port_checks(settings: ServerConfig, clock: MachineClock) -> Iterator[Check]:
     host, probe_port = settings.video.bind, settings.clock.probe_port
     ports = (("video port", "video.port", settings.video.port), ("probe port", "clock.probe_port", probe_port))
     rejections = {key: probes.bind_rejection(host, port) for _, key, port in ports}
     is_served = False
     if any(rejections.values()) and probe_port:
-        is_served = bool(probe(clock, "127.0.0.1" if host == ANY_ADDRESS else host, probe_port, PROBING_NS // 10)[0])
+        address = "127.0.0.1" if host == ANY_ADDRESS else host
+        clock_probes, _ = probe(clock, address, probe_port, PROBE_DURATION_NS // 10)  # this machine answers fast
+        is_served = bool(clock_probes)
     for name, key, port in ports:
         yield checks.check_port(name, key, host, port, rejection=rejections[key], is_served=is_served)
 
 
-def _zenoh(settings: Settings, clock: MachineClock) -> Iterator[Check]:
+def _zenoh_checks(settings: Settings, clock: MachineClock) -> Iterator[Check]:
     endpoint = settings.zenoh.router or f"the endpoint of {settings.zenoh.session}"
     if probes.keys_rejection(settings):
         yield Check("router", "not checked", "fix the keys first")
@@ -205,7 +209,7 @@ def _zenoh(settings: Settings, clock: MachineClock) -> Iterator[Check]:
             path=find_file(Path(settings.zenoh.session)),
             router=settings.zenoh.router,
             vehicle=settings.vehicle_id,
-            who=WHO,
+            who=CLIENT_NAME,
         )
     except UserError as error:
         yield checks.check_router(endpoint, str(error))
@@ -215,28 +219,29 @@ def _zenoh(settings: Settings, clock: MachineClock) -> Iterator[Check]:
         if isinstance(settings, ServerConfig):
             yield checks.check_link(link.routers(), has_vehicle=False)
             return
-        received = listener.listen(link, clock)
-        yield checks.check_vehicle(received, settings.vehicle_id, lavt.__version__)
-        yield checks.check_link(link.routers(), has_vehicle=bool(received.states or received.unreadable))
+        sample = listener.listen(link, clock)
+        yield checks.check_vehicle(sample, settings.vehicle_id, lavt.__version__)
+        yield checks.check_link(link.routers(), has_vehicle=bool(sample.states or sample.unreadable))
 
 
-def _probe(settings: ClientConfig, before: ClockReport | None, clock: MachineClock) -> Check:
+def _probe_check(settings: ClientConfig, report_before: ClockReport | None, clock: MachineClock) -> Check:
     host, port = settings.video.server, settings.clock.probe_port
     try:
         address = resolve_host("video.server", host)
     except UserError as error:
         return Check("clock probe", "problem", str(error), "set video.server to the vehicle's address")
-    probed, latest = probe(clock, address, port, PROBING_NS)
+    clock_probes, last_reply = probe(clock, address, port, PROBE_DURATION_NS)
     report = probes.clock_report(settings.clock, clock)
-    if latest is None or report is None:
+    if last_reply is None or report is None:
         return checks.check_probe(None, host, port)
-    return checks.check_probe(compare(before or report, report, probed, latest, address), host, port)
+    comparison = compare(report_before or report, report, clock_probes, last_reply, address)
+    return checks.check_probe(comparison, host, port)
 
 
-def _show(check: Check) -> None:
+def _print_check(check: Check) -> None:
     """Print a check, wrapped to the width of the terminal if there is one."""
     indent = " " * 30
     width = shutil.get_terminal_size().columns if sys.stdout.isatty() else 10**6
     lines = [check.found, *([f"-> {check.do}"] if check.do else [])]
-    wrapped = [part for line in lines for part in textwrap.wrap(line, max(30, width - len(indent)))]
-    console.print_result(f"{check.verdict:<12}{check.name:<17} " + f"\n{indent}".join(wrapped))
+    wrapped_lines = [part for line in lines for part in textwrap.wrap(line, max(30, width - len(indent)))]
+    console.print_result(f"{check.verdict:<12}{check.name:<17} " + f"\n{indent}".join(wrapped_lines))

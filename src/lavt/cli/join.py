@@ -21,7 +21,7 @@ def join(
     server: Annotated[Path, typer.Argument(help="The output directory of `lavt server`.")],
     client: Annotated[Path, typer.Argument(help="The output directory of `lavt client`.")],
     out: Annotated[Path, typer.Option(help="Output directory of the run.")],
-    as_json: console.Json = False,
+    as_json: console.JsonOption = False,
 ) -> None:
     """Join the records of two machines into one run.
 

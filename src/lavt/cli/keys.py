@@ -44,12 +44,14 @@ def register(app: typer.Typer) -> None:
 def keys(
     directory: Annotated[Path, typer.Argument(help="The authority's directory; created if it does not exist.")],
     vehicle: Annotated[Names, typer.Option(help="A vehicle's name, as in its config; repeatable.")] = None,
-    operator: Annotated[Names, typer.Option(help="An operator's name: may drive; repeatable.")] = None,
-    monitor: Annotated[Names, typer.Option(help="A monitor's name: may watch the state only; repeatable.")] = None,
+    operator: Annotated[Names, typer.Option(help="The name of an operator, who may drive; repeatable.")] = None,
+    monitor: Annotated[
+        Names, typer.Option(help="The name of a monitor, which may only read the state; repeatable.")
+    ] = None,
     cloud: Annotated[Names, typer.Option(help="The name of a router in the cloud; repeatable.")] = None,
     host: Annotated[
         Names,
-        typer.Option(help="An address or host name of these vehicles and clouds; repeatable."),
+        typer.Option(help="An address or host name of these vehicles and cloud routers; repeatable."),
     ] = None,
     days: Annotated[int, typer.Option(help="Validity of the certificates and signing keys in days.")] = DEFAULT_DAYS,
 ) -> None:
@@ -63,10 +65,10 @@ def keys(
     certificates = _certificates()
     roles = {"vehicle": vehicle or [], "operator": operator or [], "monitor": monitor or [], "cloud": cloud or []}
     hosts = tuple(host or ())
-    _check(certificates, roles, hosts, days)
+    _check_arguments(certificates, roles, hosts, days)
     _check_directory(directory, [name for names in roles.values() for name in names])
     now_wall_ns = MachineClock().now().wall_ns
-    authority = _authority(certificates, directory, now_wall_ns, days)
+    authority = _open_authority(certificates, directory, now_wall_ns, days)
     for role, names in roles.items():
         for name in names:
             server_hosts = hosts if role in LISTENING_ROLES else None
@@ -82,17 +84,17 @@ def keys(
 def _certificates() -> ModuleType:
     """Import the certificates module; raise `UserError` if its dependency is not installed."""
     try:
-        from lavt.transport.security import certificates  # noqa: PLC0415 (an extra)
+        from lavt.transport.security import certificates  # noqa: PLC0415 (an optional dependency)
     except ImportError as error:
         raise UserError(f"lavt keys needs cryptography ({error}): pip install 'lavt[secure]'") from error
     return certificates
 
 
-def _check(certificates: ModuleType, roles: Mapping[str, list[str]], hosts: Iterable[str], days: int) -> None:
+def _check_arguments(certificates: ModuleType, roles: Mapping[str, list[str]], hosts: Iterable[str], days: int) -> None:
     """Raise `UserError` for missing, invalid or repeated names, invalid hosts, and an invalid number of days."""
-    names = [name for each in roles.values() for name in each]
+    names = [name for role_names in roles.values() for name in role_names]
     if not names:
-        raise UserError("no names: give some, such as --vehicle vehicle-1 --operator operator-1")
+        raise UserError("no names: give at least one, such as --vehicle vehicle-1")
     for name in names:
         if not NAME.match(name) or name == AUTHORITY:
             raise UserError(
@@ -101,41 +103,41 @@ def _check(certificates: ModuleType, roles: Mapping[str, list[str]], hosts: Iter
             )
     repeated = [name for name, count in Counter(names).items() if count > 1]
     if repeated:
-        raise UserError(f"{repeated[0]!r} is given twice: access is by name, so names must be unique")
+        raise UserError(f"{repeated[0]!r} is named twice: access rights belong to a name, so names must be unique")
     for host in hosts:
         if not certificates.is_host(host):
             raise UserError(f"--host {host!r} is neither an address nor a host name: leave out port and protocol")
     if hosts and not any(roles[role] for role in LISTENING_ROLES):
-        raise UserError("--host is the address of a vehicle or cloud: name one with --vehicle or --cloud")
+        raise UserError("--host is the address of a vehicle or a cloud router: name one with --vehicle or --cloud")
     if not 1 <= days <= MAX_DAYS:
         raise UserError(f"--days {days}: choose 1 to {MAX_DAYS}")
 
 
 def _check_directory(directory: Path, names: Iterable[str]) -> None:
-    """Raise `UserError` for existing files, an incomplete authority, or a directory that others can read."""
+    """Raise `UserError` for names that have files, an incomplete authority, or a directory that others can read."""
     if not directory.exists():
         return
     if not directory.is_dir():
         raise UserError(f"{directory} is a file: name a directory")
     if directory.stat().st_mode & 0o077:
         raise UserError(f"other users can read {directory}, which is for private keys: chmod 700 {directory}")
-    files = [directory / f"{AUTHORITY}{ending}" for ending in (".key", ".pem")]
+    files = [directory / f"{AUTHORITY}{suffix}" for suffix in (".key", ".pem")]
     missing = [file for file in files if not file.exists()]
     if len(missing) == 1:
         raise UserError(f"{missing[0]} is missing: restore it, or create a new authority in another directory")
     for name in names:
-        for ending in (".key", ".pem", ".sign.key", ".sign.pub"):
-            if (directory / (name + ending)).exists():
+        for suffix in (".key", ".pem", ".sign.key", ".sign.pub"):
+            if (directory / (name + suffix)).exists():
                 raise UserError(
-                    f"{directory / (name + ending)} already exists: choose another name, or move the file away"
+                    f"{directory / (name + suffix)} already exists: choose another name, or move the file away"
                 )
 
 
-def _authority(certificates: ModuleType, directory: Path, now_wall_ns: int, days: int) -> KeyPair:
+def _open_authority(certificates: ModuleType, directory: Path, now_wall_ns: int, days: int) -> KeyPair:
     """Read the authority of the directory, or create one."""
-    key, shown = (directory / f"{AUTHORITY}{ending}" for ending in (".key", ".pem"))
+    key, certificate = (directory / f"{AUTHORITY}{suffix}" for suffix in (".key", ".pem"))
     if key.exists():
-        pair: KeyPair = certificates.KeyPair(key.read_bytes(), shown.read_bytes())
+        pair: KeyPair = certificates.KeyPair(key.read_bytes(), certificate.read_bytes())
         return pair
     directory.mkdir(mode=0o700, parents=True, exist_ok=True)
     pair = certificates.new_authority(now_wall_ns, days)
@@ -143,37 +145,38 @@ def _authority(certificates: ModuleType, directory: Path, now_wall_ns: int, days
     return pair
 
 
-def _write_pair(directory: Path, name: str, endings: tuple[str, str], pair: KeyPair) -> None:
+def _write_pair(directory: Path, name: str, suffixes: tuple[str, str], pair: KeyPair) -> None:
     """Write a private file, readable by its owner only, and its public file."""
-    for ending, content, mode in zip(endings, (pair.private, pair.public), (0o600, 0o644), strict=True):
-        created = os.open(directory / (name + ending), os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
-        with os.fdopen(created, "wb") as file:
+    for suffix, content, mode in zip(suffixes, (pair.private, pair.public), (0o600, 0o644), strict=True):
+        descriptor = os.open(directory / (name + suffix), os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+        with os.fdopen(descriptor, "wb") as file:
             file.write(content)
 
 
 def _list_certificates(certificates: ModuleType, directory: Path) -> list[CertificateSummary]:
     """Return the summaries of all certificates in the directory, sorted by role and name."""
-    found = [
+    summaries = [
         certificates.summarize(path.read_bytes(), str(path))
         for path in directory.glob("*.pem")
         if path.name != f"{AUTHORITY}.pem"
     ]
     order = list(PINNED_ROLES)
-    return sorted((each for each in found if each.role in order), key=lambda each: (order.index(each.role), each.name))
+    known = [summary for summary in summaries if summary.role in order]
+    return sorted(known, key=lambda summary: (order.index(summary.role), summary.name))
 
 
 def _instructions(directory: Path, authority: CertificateSummary, summaries: list[CertificateSummary]) -> list[str]:
     """Return the lines that list which files to copy to which machine."""
     lines = [f"{directory} is a test authority, valid until {authority.expires}; keep {AUTHORITY}.key on this machine."]
-    for one in summaries:
-        own = f"{AUTHORITY}.pem {one.name}.pem {one.name}.key"
-        signing = f" {one.name}.sign.key" if PINNED_ROLES[one.role] else ""
-        public = directory / f"{one.name}.sign.pub"
+    for summary in summaries:
+        own = f"{AUTHORITY}.pem {summary.name}.pem {summary.name}.key"
+        signing = f" {summary.name}.sign.key" if PINNED_ROLES[summary.role] else ""
+        public = directory / f"{summary.name}.sign.pub"
         expires_ns = key_expiry_ns(public.read_bytes(), public) if signing and public.exists() else None
         expires = "" if expires_ns is None else f", signing key until {calendar_time(expires_ns):%Y-%m-%d}"
-        pinned = "".join(f" {other.name}.sign.pub" for other in summaries if other.role in PINNED_ROLES[one.role])
-        hosts = f", reachable at {', '.join(one.hosts)}" if one.hosts else ""
-        lines.append(f"{one.role} {one.name}, valid until {one.expires}{expires}{hosts}")
+        pinned = "".join(f" {other.name}.sign.pub" for other in summaries if other.role in PINNED_ROLES[summary.role])
+        hosts = f", reachable at {', '.join(summary.hosts)}" if summary.hosts else ""
+        lines.append(f"{summary.role} {summary.name}, valid until {summary.expires}{expires}{hosts}")
         lines.append(f"  copy to its machine: {own}{signing}{pinned}")
     lines.append("Copy each .key to that one machine only, and make it readable by LAVT's user only (mode 0600).")
     return lines

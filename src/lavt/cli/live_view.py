@@ -15,7 +15,10 @@ UPDATES_PER_LINE = 25
 
 
 class LiveView:
-    """A view of speed, latencies and cross-track error of a drive on one machine, whose sides share a clock."""
+    """A view of speed, latencies and cross-track error of a drive whose two sides run on one machine.
+
+    The sides share a clock, so that the latencies need no correction for a clock offset.
+    """
 
     def __init__(self, title: str) -> None:
         self._title = title
@@ -38,7 +41,7 @@ class LiveView:
 
     def update(self, server: dict[str, Any], client: dict[str, Any]) -> None:
         """Show the newest status of both sides."""
-        text = f"{self._title}: {_line(server, client)}"
+        text = f"{self._title}: {_status_line(server, client)}"
         if self._live is not None:
             self._live.update(Text(text))
         elif self._updates % UPDATES_PER_LINE == 0:
@@ -46,7 +49,7 @@ class LiveView:
         self._updates += 1
 
 
-def _line(server: dict[str, Any], client: dict[str, Any]) -> str:
+def _status_line(server: dict[str, Any], client: dict[str, Any]) -> str:
     if "speed_mps" not in server:
         return "starting"
     figures = (
@@ -55,5 +58,9 @@ def _line(server: dict[str, Any], client: dict[str, Any]) -> str:
         ("tau_c", server.get("raw_tau_c_ms"), "6.1f", "ms"),
         ("cross-track", server.get("cross_track_m"), "+6.2f", "m"),
     )
-    shown = (f"{name} {value:{form}} {unit}".strip() for name, value, form, unit in figures if value is not None)
+    shown = (
+        f"{name} {value:{number_format}} {unit}".strip()
+        for name, value, number_format, unit in figures
+        if value is not None
+    )
     return f"{server.get('safety', ''):<10} " + "  ".join(shown)

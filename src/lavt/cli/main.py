@@ -76,7 +76,7 @@ def _print_version(is_requested: bool) -> None:
 
 
 @app.callback()
-def common(
+def global_options(
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,

@@ -32,20 +32,20 @@ def register(app: typer.Typer) -> None:
     app.add_typer(netem, name="netem")
 
 
-def show(interface: Interface, as_json: console.Json = False) -> None:
+def show(interface: Interface, as_json: console.JsonOption = False) -> None:
     """Show the delay queues of an interface.
 
     Example: lavt netem show --interface eth0
     """
-    shown = NetemInterface(interface).status()
-    applied = shown["applied"] if shown["ours"] else None
-    impairments = msgspec.to_builtins(shown["impairments"]) if shown["ours"] else {}
+    status = NetemInterface(interface).status()
+    applied = status["applied"] if status["ours"] else None
+    impairments = msgspec.to_builtins(status["impairments"]) if status["ours"] else {}
     if as_json:
         owner = None if applied is None else {"condition": applied.condition, "owner_pid": applied.owner[0] or None}
-        console.print_json({**shown, "impairments": impairments, "applied": owner})
+        console.print_json({**status, "impairments": impairments, "applied": owner})
         return
-    if not shown["ours"]:
-        console.print_result(f"{interface} has no delay queues of LAVT: {', '.join(shown['queues']) or 'no queue'}")
+    if not status["ours"]:
+        console.print_result(f"{interface} has no delay queues of LAVT: {', '.join(status['queues']) or 'no queue'}")
         return
     console.print_result(f"{interface} has {MADE_BY_HAND if applied is None else applied.description}")
     for name, impairment in impairments.items():
@@ -63,15 +63,17 @@ def apply(
     probe_port: ProbePort = probe.DEFAULT_PORT,
     state_delay: Annotated[StateDelay, typer.Option(help="with_video: delay the state like the video.")] = "none",
     hold: Annotated[bool, typer.Option("--hold", help="Run until Ctrl-C, then restore the interface.")] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the commands for a free interface only.")] = False,
-    as_json: console.Json = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Only print the commands, those for an interface without delay queues.")
+    ] = False,
+    as_json: console.JsonOption = False,
 ) -> None:
     """Apply a network condition to an interface and verify it.
 
     The condition delays packets that this machine sends, and stays in force after the command. The command reads the
     queues back and measures the delay. An existing condition is replaced without packet loss. If the verification
     fails, the command restores the interface. If the change fails on an interface that was already delayed, the command
-    says that some queues may be left.
+    says that some queues may be left on it.
 
     Example: lavt netem apply L4 --role server --interface eth0
     """
@@ -113,7 +115,9 @@ def apply(
         raise WorkError(f"stopped; {interface} is restored")
 
 
-def verify(interface: Interface, probe_port: ProbePort = probe.DEFAULT_PORT, as_json: console.Json = False) -> None:
+def verify(
+    interface: Interface, probe_port: ProbePort = probe.DEFAULT_PORT, as_json: console.JsonOption = False
+) -> None:
     """Verify the condition that was applied to an interface.
 
     The command reads the queues back and measures the delay.
@@ -135,7 +139,7 @@ def clear(
     at_once: Annotated[
         bool, typer.Option("--at-once", help="Drop the packets that are queued instead of waiting for them.")
     ] = False,
-    as_json: console.Json = False,
+    as_json: console.JsonOption = False,
 ) -> None:
     """Remove the delay from an interface, whoever applied it.
 
@@ -155,19 +159,19 @@ def clear(
 
 
 def _restore(netem: NetemInterface, was_delayed: bool) -> None:
-    """Clear an interface after a failed change; if it was already delayed, explain how to find what is left."""
+    """Clear an interface after a failed change; if it was already delayed, print how to find the queues left."""
     if not was_delayed:
         netem.clear()
         return
     console.print_message(
-        f"lavt: {netem.interface} was delayed before and is left as it is now: `lavt netem show --interface "
+        f"lavt: {netem.interface} was already delayed and is left as it is now: `lavt netem show --interface "
         f"{netem.interface}` shows its queues, `lavt netem clear --interface {netem.interface}` removes them"
     )
 
 
-def _print_commands(commands: Sequence[Command], as_json: bool, interface: str, name: str) -> None:
+def _print_commands(commands: Sequence[Command], as_json: bool, interface: str, condition_name: str) -> None:
     if as_json:
-        console.print_json({"interface": interface, "condition": name, "commands": commands})
+        console.print_json({"interface": interface, "condition": condition_name, "commands": commands})
     else:
         _print_command_lines(commands)
 
@@ -188,8 +192,8 @@ def _print_verification(verification: Verification, as_json: bool, context: Mapp
         measured = msgspec.to_builtins(verification.measured)
         console.print_json({**context, "measured": measured, "reasons": verification.reasons})
         return
-    for name, each in verification.measured.items():
-        console.print_result(f"measured: {name}: {_format_probe(each)}")
+    for flow, result in verification.measured.items():
+        console.print_result(f"measured: {flow}: {_format_probe(result)}")
     if not verification.reasons:
         console.print_result("verified: the queues and the measured delays match the condition")
 

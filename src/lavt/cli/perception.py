@@ -76,6 +76,6 @@ def _panels(
         if (width_px, height_px) != (camera.width_px, camera.height_px):
             raise UserError(
                 f"{source} is {width_px} x {height_px}, but the calibration is for {camera.width_px} x "
-                f"{camera.height_px}: use pictures of that size, or calibrate for these"
+                f"{camera.height_px}: use pictures of that size, or a calibration for this size"
             )
         yield panel(camera, detector, picture)

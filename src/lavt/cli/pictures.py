@@ -18,6 +18,7 @@ from lavt.transport.video.h264 import Decoder
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg")
 VIDEO_SUFFIXES = (".mp4", ".mkv")
 DEFAULT_RATE_HZ = 30.0
+"""The picture rate of a video whose file states no plausible one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,18 +36,18 @@ def read_pictures(path: Path) -> PictureFile:
         raise UserError(f"{path} does not exist: name a picture, a video or a record")
     if path.suffix == ".mcap":
         return PictureFile(_read_record(path), is_video=True)
-    # OpenCV does not log errors: the errors below describe them in one sentence.
+    # Keep OpenCV from logging errors: the errors raised below describe them in one sentence.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         data = np.fromfile(path, dtype=np.uint8)
-        still = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
+        picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
     except OSError as error:
         raise UserError(f"{path} cannot be read ({error.strerror}): name another file") from error
     except cv2.error:
-        still = None
-    if still is not None:
-        return PictureFile(iter([np.asarray(still, dtype=np.uint8)]), is_video=False)
+        picture = None
+    if picture is not None:
+        return PictureFile(iter([np.asarray(picture, dtype=np.uint8)]), is_video=False)
     video = cv2.VideoCapture(str(path))
     if not video.isOpened():
         raise UserError(f"{path} is not a readable picture or video: give PNG, JPEG, MP4, MKV or MCAP")
@@ -66,20 +67,20 @@ def _read_video(path: Path, video: cv2.VideoCapture) -> Iterator[Picture]:
 
 
 def _read_record(path: Path) -> Iterator[Picture]:
-    decoder, is_any = Decoder(), False
+    decoder, has_picture = Decoder(), False
     for _, unit in read_record(path, channels=()).video():
         decoded = decoder.decode(unit)
         if decoded is not None:
-            is_any = True
+            has_picture = True
             yield decoded.picture
-    if not is_any:
+    if not has_picture:
         raise UserError(
             f"{path} has no picture: name the complete client.mcap or server.mcap of a run with record.video"
         )
 
 
 def check_output(out: Path, *, source: Path, is_video: bool) -> None:
-    """Raise `UserError` if `out` has an unknown suffix, is in no directory, or is the source itself."""
+    """Raise `UserError` if `out` has an unknown suffix, is in a missing directory, or is the source."""
     suffixes = VIDEO_SUFFIXES if is_video else PICTURE_SUFFIXES
     if out.suffix.lower() not in suffixes:
         kind = "video" if is_video else "picture"

@@ -16,7 +16,7 @@ from lavt.domain import NS_PER_S
 
 @contextmanager
 def progress(title: str, total: int, *, clock: Clock | None = None) -> Iterator[Callable[[str], None]]:
-    """Yield a function to call with a line for each of the `total` runs that is done."""
+    """Yield a function that is called with one line of text each time that one of the `total` runs is done."""
     if not sys.stderr.isatty():
         console.print_message(f"{title}: {total} runs")
         yield _line_printer(total, clock or MachineClock())
@@ -35,13 +35,13 @@ def progress(title: str, total: int, *, clock: Clock | None = None) -> Iterator[
 
 def _line_printer(total: int, clock: Clock) -> Callable[[str], None]:
     """Return a function that prints a line with the number of runs done and the estimated time left."""
-    begin_ns, done = clock.now().mono_ns, 0
+    start_ns, done = clock.now().mono_ns, 0
 
     def print_line(line: str) -> None:
         nonlocal done
         done += 1
-        left_s = (clock.now().mono_ns - begin_ns) / done * (total - done) / NS_PER_S
-        console.print_message(f"{done} of {total}, {format_time_left(left_s)}: {line}")
+        time_left_s = (clock.now().mono_ns - start_ns) / done * (total - done) / NS_PER_S
+        console.print_message(f"{done} of {total}, {format_time_left(time_left_s)}: {line}")
 
     return print_line
 

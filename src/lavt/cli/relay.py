@@ -28,8 +28,8 @@ def register(app: typer.Typer) -> None:
 
 def relay(
     config: Annotated[Path, typer.Argument(help="A relay config in YAML.")],
-    changes: console.Set = None,
-    as_json: console.Json = False,
+    changes: console.SetOption = None,
+    as_json: console.JsonOption = False,
 ) -> None:
     """Forward video and control with injected latency.
 
@@ -39,9 +39,9 @@ def relay(
     """
     process_priority.raise_priority()
     settings = load_config(RelayConfig, config, changes or [])
-    running = Relay(MachineClock(), flows(settings))
+    forwarder = Relay(MachineClock(), flows(settings))
     with console.stop_on_signals() as stop:
-        ports = running.ports()
+        ports = forwarder.ports()
         if as_json:
             console.print_json({"ports": ports})
         else:
@@ -49,10 +49,12 @@ def relay(
                 f"relaying video at port {ports['video']} and control at port {ports['control']}; Ctrl-C ends it"
             )
         while not stop.is_set():
-            running.step()
+            forwarder.step()
     if as_json:
-        console.print_json({"held_ms": running.held_ms(), "late_ms": running.late_ms(), "counts": running.counts()})
-    running.close()
+        console.print_json(
+            {"held_ms": forwarder.held_ms(), "late_ms": forwarder.late_ms(), "counts": forwarder.counts()}
+        )
+    forwarder.close()
 
 
 def flows(config: RelayConfig) -> list[RelayedFlow]:
@@ -86,13 +88,14 @@ def _delay_model(config: DelayConfig, seed: int, name: str) -> DelayModel:
 
 
 def _link_injection(name: str, config: DelayConfig, seed: int) -> LinkInjection | None:
-    """Return the impairment of the config's `link`; None if it has none."""
+    """Return the injection that the config's `link` describes; None if all its values are defaults."""
     if config.link == LinkConfig():
         return None
     impairment = ImpairmentConfig(**config.link.model_dump(exclude={"delay_ms"}))
-    return injected(name, config.link.delay_ms, impairment, seed) or LinkInjection(
-        Impairment(delay_ms=config.link.delay_ms), seed, name
-    )
+    injection = injected(name, config.link.delay_ms, impairment, seed)
+    if injection is None:  # a constant delay only
+        return LinkInjection(Impairment(delay_ms=config.link.delay_ms), seed, name)
+    return injection
 
 
 def _resolve(key: str, text: str) -> tuple[str, int]:

@@ -27,20 +27,20 @@ def register(app: typer.Typer) -> None:
 
 def rendezvous(
     config: Annotated[Path, typer.Argument(help="A rendezvous config in YAML, such as configs/rendezvous.yaml.")],
-    changes: console.Set = None,
-    as_json: console.Json = False,
+    changes: console.SetOption = None,
+    as_json: console.JsonOption = False,
 ) -> None:
     """Forward video to clients from a vehicle behind NAT.
 
-    The command also forwards the clock probe. It runs in the cloud, where the vehicle registers, until Ctrl-C.
+    The command also forwards the clock probe. It runs in the cloud until Ctrl-C, and the vehicle registers with it.
 
     Example: lavt rendezvous configs/rendezvous.yaml --set vehicle_key=keys/vehicle-1.sign.pub
     """
     process_priority.raise_priority()
     settings = load_config(RendezvousConfig, config, changes or [])
     forwarders = open_rendezvous(settings, MachineClock())
-    ports = {f"{flow}_port": each.port for flow, each in forwarders.items()}
-    known: dict[FlowName, Address | None] = dict.fromkeys(forwarders)
+    ports = {f"{flow}_port": forwarder.port for flow, forwarder in forwarders.items()}
+    printed: dict[FlowName, Address | None] = dict.fromkeys(forwarders)
     failures: list[BaseException] = []
 
     def fail(error: BaseException) -> None:
@@ -48,8 +48,8 @@ def rendezvous(
         stop.set()
 
     with console.stop_on_signals() as stop, fail_on_thread_errors(fail):
-        for each in forwarders.values():
-            each.start()
+        for forwarder in forwarders.values():
+            forwarder.start()
         if as_json:
             console.print_json({"ready": ports})
         else:
@@ -58,20 +58,21 @@ def rendezvous(
                 "Ctrl-C ends it"
             )
         while not stop.wait(POLL_PERIOD_S):
-            addresses = {flow: each.vehicle_address() for flow, each in forwarders.items()}
-            for flow in (each for each in forwarders if addresses[each] != known[each]):
-                _print_address(settings.vehicle_id, flow, addresses[flow], as_json=as_json)
-            known.update(addresses)
-    for each in forwarders.values():
-        each.close()
+            for flow, forwarder in forwarders.items():
+                address = forwarder.vehicle_address()
+                if address != printed[flow]:
+                    _print_address(settings.vehicle_id, flow, address, as_json=as_json)
+                    printed[flow] = address
+    for forwarder in forwarders.values():
+        forwarder.close()
     if failures:
         raise WorkError(f"stopped because a part failed: {describe_error(failures[0])}")
     if as_json:
-        console.print_json({"counts": {flow: each.counts for flow, each in forwarders.items()}})
+        console.print_json({"counts": {flow: forwarder.counts for flow, forwarder in forwarders.items()}})
 
 
 def _print_address(vehicle: str, flow: str, address: Address | None, *, as_json: bool) -> None:
-    """Print the vehicle's address; None if it does not register any more."""
+    """Print the vehicle's new address for a flow; None: the vehicle no longer registers."""
     if as_json:
         console.print_json({"flow": flow, "vehicle_at": address})
     elif address is None:

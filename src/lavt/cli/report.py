@@ -25,7 +25,7 @@ def register(app: typer.Typer) -> None:
 
 def report(
     directories: Annotated[list[Path], typer.Argument(help="Directories of runs, of sweeps, and of `lavt boundary`.")],
-    out: console.Out = None,
+    out: console.OutOption = None,
 ) -> None:
     """Write a report of finished runs.
 
@@ -41,7 +41,7 @@ def report(
     boundaries = [_read_boundary(directory) for directory in directories if (directory / BOUNDARY).is_file()]
     run_dirs = {directory: _find_runs(directory) for directory in directories if not (directory / BOUNDARY).is_file()}
     if not run_dirs:
-        raise UserError(f"{directories[0]} has a boundary and no runs: name the directory of a sweep, too")
+        raise UserError(f"{directories[0]} has a boundary but no runs: name the directory of a sweep, too")
     runs = [run for runs in run_dirs.values() for run in runs]
     results = [_read_result(run / RESULT) for run in runs]  # read all before writing any
     for run, result in zip(runs, results, strict=True):
@@ -49,13 +49,13 @@ def report(
     names = _sweep_names(list(run_dirs))
     sweeps = {run: name for directory, name in names.items() for run in run_dirs[directory]}
     make_directory(out)
-    failed = [each for directory in run_dirs for each in read_failed(directory)]
-    base = _base(list(run_dirs), names)
+    failed = [run for directory in run_dirs for run in read_failed(directory)]
+    base = _base_config(list(run_dirs), names)
     page = write_report(out, run_dirs=runs, base=base, sweeps=sweeps, boundaries=boundaries, failed=failed)
     console.print_result(f"the report is {page}")
 
 
-def _base(directories: Sequence[Path], names: dict[Path, str]) -> dict[str, Any] | None:
+def _base_config(directories: Sequence[Path], names: dict[Path, str]) -> dict[str, Any] | None:
     """Return the base config of the first sweep, by which the report groups its runs; None if there is no sweep."""
     from lavt.experiment.sweep.sweep import recorded_base  # noqa: PLC0415 (slow: scipy, matplotlib)
 
@@ -66,22 +66,25 @@ def _base(directories: Sequence[Path], names: dict[Path, str]) -> dict[str, Any]
 
 
 def _sweep_names(directories: Sequence[Path]) -> dict[Path, str]:
-    """Name each sweep after its directory, with parent directories if needed to be unique; no names for one sweep."""
+    """Return a unique name for each sweep: its directory, with as many parent directories as needed.
+
+    A single sweep gets no name.
+    """
     sweeps = [directory for directory in directories if not (directory / RESULT).is_file()]
     if len(sweeps) < 2:
         return {}
     parts = {directory: directory.resolve().parts for directory in sweeps}
-    length = 1
-    while max(Counter(parts[directory][-length:] for directory in sweeps).values()) > 1:
-        length += 1
-    return {directory: "/".join(parts[directory][-length:]) for directory in sweeps}
+    part_count = 1
+    while max(Counter(parts[directory][-part_count:] for directory in sweeps).values()) > 1:
+        part_count += 1
+    return {directory: "/".join(parts[directory][-part_count:]) for directory in sweeps}
 
 
 def _read_boundary(directory: Path) -> dict[str, Any]:
     boundary: Any = read_json(directory / BOUNDARY)
     lists = [boundary.get(key) for key in ("runs", "groups")] if isinstance(boundary, dict) else []
-    if not lists or not all(isinstance(each, list) and each for each in lists):
-        raise WorkError(f"{directory / BOUNDARY} is not a boundary: it lacks runs or groups")
+    if not lists or not all(isinstance(entries, list) and entries for entries in lists):
+        raise WorkError(f"{directory / BOUNDARY} is not the result of a boundary search: it lacks runs or groups")
     return dict(boundary)
 
 

@@ -22,8 +22,8 @@ def register(app: typer.Typer) -> None:
 
 def router(
     file: Annotated[Path, typer.Argument(help="A Zenoh config in JSON5, such as one of zenoh-configs/.")],
-    changes: console.Set = None,
-    as_json: console.Json = False,
+    changes: console.SetOption = None,
+    as_json: console.JsonOption = False,
 ) -> None:
     """Run a Zenoh router until Ctrl-C.
 
@@ -34,10 +34,10 @@ def router(
     from lavt.transport.zenoh_link import Router, quiet_logs  # noqa: PLC0415 (slow: Zenoh)
 
     quiet_logs()
-    running = Router(find_file(file), parse_overrides(changes or []))
+    zenoh_router = Router(find_file(file), parse_overrides(changes or []))
     try:
         with console.stop_on_signals() as stop:
-            locators = running.locators()
+            locators = zenoh_router.locators()
             if as_json:
                 console.print_json({"locators": locators})
             else:
@@ -45,9 +45,9 @@ def router(
             while not stop.wait(POLL_PERIOD_S):
                 pass
     finally:
-        running.close()  # an open router would keep the process alive
+        zenoh_router.close()  # an open router would keep the process alive
 
 
 def parse_overrides(changes: list[str]) -> dict[str, Any]:
-    """Parse `--set a.b=value` into values by Zenoh's keys with slashes."""
+    """Parse changes of the form a.b=value; return the values by Zenoh's keys, such as a/b."""
     return {"/".join(parts): value for parts, value in map(split_change, changes)}

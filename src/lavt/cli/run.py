@@ -24,9 +24,9 @@ def register(app: typer.Typer) -> None:
 
 def run(
     config: Annotated[Path, typer.Argument(help="A run config in YAML, such as configs/demo.yaml.")],
-    changes: console.Set = None,
-    out: console.Out = None,
-    as_json: console.Json = False,
+    changes: console.SetOption = None,
+    out: console.OutOption = None,
+    as_json: console.JsonOption = False,
 ) -> None:
     """Drive one route under one network condition.
 
@@ -34,15 +34,15 @@ def run(
 
     Example: lavt run configs/demo.yaml --set network.condition=L2 --out out/l2
     """
-    planned = plan_run(load_config(RunConfig, config, changes or []))
+    planned_run = plan_run(load_config(RunConfig, config, changes or []))
     out = out or Path("out") / "run"
     check_directory(out)
     with console.interruptible():
-        for message in check_netem(planned):
+        for message in check_netem(planned_run):
             console.print_message(f"lavt: {message}")
-    title = f"driving {planned.config.vehicle.route} under {planned.config.network.condition}"
+    title = f"driving {planned_run.config.vehicle.route} under {planned_run.config.network.condition}"
     with console.interruptible(), LiveView(title) as view:
-        result = run_once(planned, out, progress=view.update)
+        result = run_once(planned_run, out, progress=view.update)
     print_run(result, out, as_json=as_json)
 
 
@@ -57,25 +57,25 @@ def print_run(result: dict[str, Any], out: Path, *, as_json: bool) -> None:
 
 def _summarize(result: dict[str, Any]) -> str:
     """Return a summary of a run in a few lines."""
-    loop, age, p95_m = result["loop_ms"], result["picture_age_ms"], result["p95_m"]
+    loop_ms, frame_age_ms = result["loop_ms"], result["picture_age_ms"]
     lines = [
         f"{result['route']} under {result['condition']}, seed {result['seed']}: {result['ending']} after "
-        f"{_number(result['distance_m'], 'm')}, cross-track P95 {_number(p95_m, 'm', 2)}",
-        f"loop latency {_number(loop['p50'], 'ms')} (p95 {_number(loop['p95'], 'ms')}), "
-        f"mean picture age {_number(age['mean'], 'ms')}",
-        f"tau_v {_latency(result['tau_v_ms'])}, tau_c {_latency(result['tau_c_ms'])}",
+        f"{_format_number(result['distance_m'], 'm')}, cross-track P95 {_format_number(result['p95_m'], 'm', 2)}",
+        f"loop latency {_format_number(loop_ms['p50'], 'ms')} (p95 {_format_number(loop_ms['p95'], 'ms')}), "
+        f"mean frame age {_format_number(frame_age_ms['mean'], 'ms')}",
+        f"tau_v {_format_latency(result['tau_v_ms'])}, tau_c {_format_latency(result['tau_c_ms'])}",
     ]
     if not result["valid"]:
         lines.append("this run is not valid: " + "; ".join(result["invalid_reasons"]))
     return "\n".join(lines)
 
 
-def _latency(summary: dict[str, Any]) -> str:
+def _format_latency(summary: dict[str, Any]) -> str:
     if summary["p50"] is None:
         return "unknown"
     bound = "no known bound" if summary["bound"] is None else f"± {summary['bound']:.2f} ms"
     return f"{summary['p50']:.1f} ms ({bound})"
 
 
-def _number(value: float | None, unit: str, digits: int = 1) -> str:
+def _format_number(value: float | None, unit: str, digits: int = 1) -> str:
     return "unknown" if value is None else f"{value:.{digits}f} {unit}"

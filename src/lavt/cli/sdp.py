@@ -1,4 +1,4 @@
-"""`lavt sdp`: print the session description (SDP) with which players show the video."""
+"""`lavt sdp`: print the session description (SDP) that a player needs to show the video."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def sdp(
     receiver: Annotated[
         str, typer.Option(help="The receiver in video.send_to, as host:port; required if there are several.")
     ] = "",
-    changes: console.Set = None,
+    changes: console.SetOption = None,
 ) -> None:
     """Print the SDP file for watching the video in a player.
 
@@ -49,20 +49,20 @@ def _choose_receiver(send_to: tuple[str, ...], receiver: str) -> tuple[str, int]
     """Return the address of the named receiver, or of the only one."""
     if not send_to:
         raise UserError("video.send_to is empty: name a receiver in it, as host:port")
-    known = [resolved_address("video.send_to", each) for each in send_to]
+    addresses = [resolved_address("video.send_to", text) for text in send_to]
     if not receiver:
-        if len(known) > 1:
+        if len(addresses) > 1:
             raise UserError(f"the video is sent to {', '.join(send_to)}: choose one of them with --receiver")
-        return known[0]
+        return addresses[0]
     requested = resolved_address("--receiver", receiver)
-    if requested not in known:
+    if requested not in addresses:
         raise UserError(f"{receiver} is not in video.send_to: add it, or choose {', '.join(send_to)}")
     return requested
 
 
 def _profile_level_id(settings: ServerConfig) -> str:
     """Return the profile and level of the server's encoder: the level depends on size, rates and buffer."""
-    black = np.zeros((settings.camera.height_px, settings.camera.width_px, 3), np.uint8)
+    picture = np.zeros((settings.camera.height_px, settings.camera.width_px, 3), np.uint8)
     sender = VIDEO.sender(settings)
-    planes, _ = sender.prepare(black)
+    planes, _ = sender.prepare(picture)
     return profile_level_id(sender.encode(planes, keyframe=True))

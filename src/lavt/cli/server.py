@@ -23,10 +23,10 @@ def register(app: typer.Typer) -> None:
 
 def server(
     config: Annotated[Path, typer.Argument(help="A server config in YAML, such as configs/server.yaml.")],
-    out: console.Out = None,
-    changes: console.Set = None,
+    out: console.OutOption = None,
+    changes: console.SetOption = None,
     once: Annotated[bool, typer.Option("--once", help="Exit when the first drive has ended.")] = False,
-    as_json: console.Json = False,
+    as_json: console.JsonOption = False,
 ) -> None:
     """Run the vehicle's side: stream video and execute commands.
 

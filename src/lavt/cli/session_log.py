@@ -1,4 +1,4 @@
-"""The log lines of a session: one line per change of the vehicle's state, of the client's phase, or of a rejection."""
+"""The log lines of a session: changes of the vehicle's state and of the client's phase, and rejected commands."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from lavt.domain import NS_PER_S, State
 from lavt.nodes.client_session import Phase
 
 REPEAT_NS = NS_PER_S
-"""A recurring event is logged at most once in this time, and counts as new after this time without it."""
+"""Rejections are logged at most once in this time. A limit that has not applied for this time is logged again."""
 STATE_TIMEOUT_NS = NS_PER_S
 """A client logs that the state is missing after this time; the vehicle sends its state 50 times a second."""
 FIRST_STATE_TIMEOUT_NS = 3 * NS_PER_S
@@ -23,7 +23,7 @@ STATE_AGAIN = "vehicle state received again"
 
 PHASES: dict[Phase, str] = {
     "seeking": "waiting for the vehicle: {reason}",
-    "arming": "control granted: arming the vehicle{waits}",
+    "arming": "control granted: arming the vehicle{but_reason}",
     "driving": "",
     "stopped": "control lost: {reason}",
     "watching": "{reason}; this client now only watches",
@@ -35,7 +35,7 @@ def phase_line(phase: Phase, reason: str) -> str:
     """Return the log line for the client's phase; empty if the phase needs none."""
     if phase == "seeking" and not reason:
         return ""
-    return PHASES[phase].format(reason=reason, waits=f", but {reason}" if reason else "")
+    return PHASES[phase].format(reason=reason, but_reason=f", but {reason}" if reason else "")
 
 
 def state_lines(before: State | None, after: State, *, operator: str) -> list[str]:
@@ -53,8 +53,8 @@ def state_lines(before: State | None, after: State, *, operator: str) -> list[st
             f"{after.active_operator} has control" if after.active_operator else "no operator has control any more"
         )
     if (after.safety, after.reason) != (before.safety, before.reason):
-        who = after.active_operator or before.active_operator or "the client"
-        lines.append(f"{after.safety}: {after.reason.replace('the client', who)}")
+        operator_name = after.active_operator or before.active_operator or "the client"
+        lines.append(f"{after.safety}: {after.reason.replace('the client', operator_name)}")
     if after.requested_by and after.requested_by != before.requested_by:
         lines.append(
             f"{after.requested_by} requests control; SIGUSR2 hands the vehicle over"
@@ -83,11 +83,11 @@ def server_end_line(speed_mps: float | None) -> str:
 class SessionLog:
     """A log that turns states, rejections and phases into lines, one line per change.
 
-    Times are of this machine's monotonic clock. `client` is the client's name; empty on the server.
+    Times are of this machine's monotonic clock. `client_name` is empty on the server.
     """
 
-    def __init__(self, client: str = "") -> None:
-        self._client = client
+    def __init__(self, client_name: str = "") -> None:
+        self._client_name = client_name
         self._lines: list[str] = []
         self._state: State | None = None
         self._logged_phase = ""
@@ -97,7 +97,7 @@ class SessionLog:
         self._state_missing = False
         self._rejected: Counter[str] = Counter()
         self._logged_rejections_ns: int | None = None
-        self._limited_ns: dict[str, int] = {}
+        self._limit_applied_ns: dict[str, int] = {}
 
     def add_state(self, state: State, now_ns: int, *, has_control: bool = False) -> None:
         """Log the changes of a state received at `now_ns`; `has_control`: this client believes it has control."""
@@ -105,12 +105,12 @@ class SessionLog:
             self._lines.append(STATE_AGAIN)
         self._state_missing, self._state_ns = False, now_ns
         before, self._state = self._state, state
-        self._lines += state_lines(before, state, operator=self._client if has_control else "")
+        self._lines += state_lines(before, state, operator=self._client_name if has_control else "")
         for limit in state.limited.split(", ") if state.limited else ():
-            if now_ns - self._limited_ns.get(limit, now_ns - REPEAT_NS) >= REPEAT_NS:
+            if now_ns - self._limit_applied_ns.get(limit, now_ns - REPEAT_NS) >= REPEAT_NS:
                 self._lines.append(f"limited: {limit}")
-            self._limited_ns[limit] = now_ns
-        if self._client and state.rejected and (before is None or state.rejected != before.rejected):
+            self._limit_applied_ns[limit] = now_ns
+        if self._client_name and state.rejected and (before is None or state.rejected != before.rejected):
             self.add_rejection(state.rejected)
 
     def add_rejection(self, reason: str) -> None:
@@ -125,13 +125,13 @@ class SessionLog:
         self._logged_phase = line
 
     def set_ending(self, ending: str | None) -> None:
-        """Log how the last drive ended; None before its end, or after the start of another."""
+        """Log how the last drive ended; `ending` is None before a drive ends, and again once the next one has begun."""
         if ending is not None and ending != self._logged_ending:
             self._lines.append(f"the drive has ended: {ending}")
         self._logged_ending = ending
 
     def take_lines(self, now_ns: int) -> list[str]:
-        """Return the lines since the last call, including those that are due at `now_ns`."""
+        """Return the lines since the last call, with those on rejections and a missing state due at `now_ns`."""
         self._add_rejection_counts(now_ns)
         self._add_missing_state(now_ns)
         lines, self._lines = self._lines, []
@@ -149,7 +149,7 @@ class SessionLog:
     def _add_missing_state(self, now_ns: int) -> None:
         if self._start_ns is None:
             self._start_ns = now_ns
-        if self._state_missing or not self._client:
+        if self._state_missing or not self._client_name:
             return
         if self._state_ns is None and now_ns - self._start_ns >= FIRST_STATE_TIMEOUT_NS:
             self._state_missing = True

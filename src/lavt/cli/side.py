@@ -1,4 +1,4 @@
-"""The run of a side in the foreground, shared by `lavt server` and `lavt client`: printed status and orderly end."""
+"""Run a server or a client in the foreground: print its status, and stop or release the vehicle before it ends."""
 
 from __future__ import annotations
 
@@ -17,20 +17,21 @@ from lavt.safety.state_machine import ACTIVE
 
 STATUS_PERIOD_S = 0.2
 POLL_PERIOD_S = 0.02
+"""How often a side that ends checks whether its vehicle is stationary or released."""
 RELEASE_TIMEOUT_S = 1.0
-"""How long a client that ends waits for the answer to its release; any network that is good enough to drive over is
-faster."""
+"""How long a client that ends waits for the answer to its release; any network that is good enough for driving delivers
+the answer sooner."""
 STOP_TIMEOUT_S = 6.0
-"""How long a server that ends waits for standstill: from 40 km/h with 4 m/s2 it takes 2.8 s."""
+"""How long a server that ends waits until the vehicle is stationary; a stop from 40 km/h with 4 m/s2 takes 2.8 s."""
 
 
-def run_side(side: Side, who: str, *, once: bool, as_json: bool, ready: Mapping[str, Any]) -> None:
+def run_side(side: Side, client_name: str, *, once: bool, as_json: bool, ready: Mapping[str, Any]) -> None:
     """Run until Ctrl-C, until a part fails or, with `once`, until the drive has ended; print the session's log.
 
-    `who` is the name of a client, empty for a server. Before it ends, a client releases the vehicle and a server stops
-    it. A second Ctrl-C ends the process immediately.
+    `client_name` is empty for a server. With `as_json`, `ready` is printed when the side has started. Before it ends,
+    a client releases the vehicle and a server stops it. A second Ctrl-C ends the process immediately.
     """
-    log, session, runtime = SessionLog(who), side.session, side.runtime
+    log, session, runtime = SessionLog(client_name), side.session, side.runtime
     with console.stop_on_signals() as stop, fail_on_thread_errors(runtime.fail):
         side.start()
         if as_json:
@@ -50,11 +51,11 @@ def run_side(side: Side, who: str, *, once: bool, as_json: bool, ready: Mapping[
 def _print_status(side: Side, log: SessionLog, *, as_json: bool, last_line: str = "") -> None:
     """Print the new lines of the log and then `last_line`; as JSON, print the status too."""
     session = side.session
-    for heard, at in side.live.take_updates():
-        if isinstance(heard, State):
-            log.add_state(heard, at.mono_ns, has_control=session is not None and session.has_control)
+    for update, received in side.live.take_updates():
+        if isinstance(update, State):
+            log.add_state(update, received.mono_ns, has_control=session is not None and session.has_control)
         else:
-            log.add_rejection(heard)
+            log.add_rejection(update)
     log.set_ending(side.live.ending())
     status = side.live.status()
     if session is not None:
@@ -70,7 +71,7 @@ def _print_status(side: Side, log: SessionLog, *, as_json: bool, last_line: str 
 
 
 def _release(side: Side, stop: console.StopEvent, session: ClientSession) -> str:
-    """Release the vehicle while the link is open, so that it stops and is free; return the last log line."""
+    """Release the vehicle before the link closes, so that it stops and has no operator; return the last log line."""
     if not session.has_control:
         return "the client ends; it had no control"
     side.send("operator", "release")
@@ -81,15 +82,16 @@ def _release(side: Side, stop: console.StopEvent, session: ClientSession) -> str
 def _stop_vehicle(side: Side, stop: console.StopEvent) -> str:
     """Stop the vehicle, wait until it is stationary, and return the last log line."""
     side.send("server_ends", None)
-    _wait(side, stop, STOP_TIMEOUT_S, lambda: _moving_speed_mps(side) is None)
-    return server_end_line(_moving_speed_mps(side))
+    _wait(side, stop, STOP_TIMEOUT_S, lambda: _speed_unless_stopped_mps(side) is None)
+    return server_end_line(_speed_unless_stopped_mps(side))
 
 
-def _moving_speed_mps(side: Side) -> float | None:
-    """Return the speed of the vehicle; None if it is stationary and not driven."""
+def _speed_unless_stopped_mps(side: Side) -> float | None:
+    """Return the vehicle's speed; None if it is stationary and not armed. An armed stationary vehicle has speed 0.0."""
     status = side.live.status()
     speed_mps: float = status.get("speed_mps", 0.0)
-    return speed_mps if status.get("safety") in ACTIVE or abs(speed_mps) >= LIMITS.standstill_mps else None
+    is_armed = status.get("safety") in ACTIVE
+    return speed_mps if is_armed or abs(speed_mps) >= LIMITS.standstill_mps else None
 
 
 def _wait(side: Side, stop: console.StopEvent, timeout_s: float, is_done: Callable[[], bool]) -> None:

@@ -32,6 +32,7 @@ from lavt.vehicle.software_car.event_log import KitEvent
 from lavt.vehicle.software_car.runner import SoftwareCarRunner
 
 MAX_LINE_BYTES: Final = 1000
+"""A longer input without a line break is executed as a line, so that the memory for it stays bounded."""
 INSIDE: Final = "inside"
 
 
@@ -41,9 +42,9 @@ def register(app: typer.Typer) -> None:
 
 
 def software_car(
-    config: Annotated[Path, typer.Argument(help="The config of the server that drives it, in YAML.")],
-    changes: console.Set = None,
-    as_json: console.Json = False,
+    config: Annotated[Path, typer.Argument(help="The YAML config of the server that drives the car.")],
+    changes: console.SetOption = None,
+    as_json: console.JsonOption = False,
 ) -> None:
     """Simulate a car with a by-wire kit on a CAN bus.
 
@@ -61,9 +62,9 @@ def software_car(
         )
     profile = load_profile(dbw.profile, dbw.dbc, dbw.steering_sign)
     road = load_road(settings.vehicle.route)
-    truth = resolved_address("vehicle.dbw.truth", dbw.truth) if dbw.truth else None
+    truth_address = resolved_address("vehicle.dbw.truth", dbw.truth) if dbw.truth else None
     clock = MachineClock()
-    build_software_car(settings, profile, road, start_ns=0)  # raises errors before the bus is opened
+    build_software_car(settings, profile, road, start_ns=0)  # reports errors before the bus is opened
     port = CanPort(dbw.interface, dbw.channel, dbw.options, clock=clock)
     try:
         if not is_virtual(dbw.interface, dbw.channel, dbw.options):
@@ -74,7 +75,14 @@ def software_car(
         with console.stop_on_signals() as stop, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             sender.setblocking(False)
             _print_ready(profile, dbw, as_json=as_json)
-            _run(runner, clock, stop, InputLines(), print_event, lambda datagram: _send(sender, truth, datagram))
+            _run(
+                runner,
+                clock,
+                stop,
+                InputLines(),
+                print_event,
+                lambda datagram: _send_truth(sender, truth_address, datagram),
+            )
     finally:
         port.close()
     if as_json:
@@ -88,7 +96,7 @@ def _run(
     stop: console.StopEvent,
     lines: InputLines,
     print_event: Callable[[KitEvent], None],
-    send: Callable[[bytes], None],
+    send_truth: Callable[[bytes], None],
 ) -> None:
     """Run the car until the stop event."""
     while not stop.is_set():
@@ -96,7 +104,7 @@ def _run(
         runner.step(now_ns)
         datagram = runner.make_truth_datagram()
         if datagram is not None:
-            send(datagram)
+            send_truth(datagram)
         for event in runner.take_events():
             print_event(event)
         pause_ns = max(runner.next_wake_ns() - clock.now().mono_ns, 0)
@@ -105,7 +113,10 @@ def _run(
 
 
 class InputLines:
-    """The lines on standard input, until it is closed; a background process reads no terminal."""
+    """The lines on standard input, until it is closed.
+
+    A background process, which may not read the terminal, gets an error from it that counts as closed input.
+    """
 
     def __init__(self) -> None:
         self._is_open = sys.stdin is not None
@@ -132,23 +143,23 @@ class InputLines:
         return [line.decode(errors="replace") for line in lines]
 
 
-def _send(sender: socket.socket, truth: tuple[str, int] | None, datagram: bytes) -> None:
-    if truth is not None:
+def _send_truth(sender: socket.socket, address: tuple[str, int] | None, datagram: bytes) -> None:
+    if address is not None:
         with suppress(OSError):  # the next datagram replaces this one
-            sender.sendto(datagram, truth)
+            sender.sendto(datagram, address)
 
 
 def _print_ready(profile: Profile, dbw: DbwConfig, *, as_json: bool) -> None:
     generation = GENERATIONS[profile.kit]
     if as_json:
-        keys = {"interface": dbw.interface, "channel": dbw.channel, "truth": dbw.truth}
-        ready: dict[str, Any] = {"generation": generation, "commands": profile.commands, **keys}
+        bus = {"interface": dbw.interface, "channel": dbw.channel, "truth": dbw.truth}
+        ready: dict[str, Any] = {"generation": generation, "commands": profile.commands, **bus}
         console.print_json({"ready": ready})
         return
     commands = f", {profile.commands} commands" if profile.commands else ""
     console.print_result(
         f"a car with a kit of generation {generation}{commands} on {dbw.interface} {dbw.channel}; "
-        f"its true position is sent {f'to {dbw.truth}' if dbw.truth else 'nowhere'}; type help for the commands, "
+        f"its true position is {f'sent to {dbw.truth}' if dbw.truth else 'not sent'}; type help for the commands, "
         "Ctrl-C ends it"
     )
 

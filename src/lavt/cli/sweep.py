@@ -23,15 +23,15 @@ def register(app: typer.Typer) -> None:
 
 def sweep(
     config: Annotated[Path, typer.Argument(help="A sweep config in YAML, such as configs/sweep.yaml.")],
-    changes: console.Set = None,
-    out: console.Out = None,
+    changes: console.SetOption = None,
+    out: console.OutOption = None,
     jobs: Annotated[int | None, typer.Option(min=1, help="Number of parallel runs; default: one per core.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue a stopped sweep in --out.")] = False,
     cluster: Annotated[
         str | None,
         typer.Option(metavar="ADDRESS|local", help="Run on Dask workers: those of a scheduler, or local ones."),
     ] = None,
-    as_json: console.Json = False,
+    as_json: console.JsonOption = False,
 ) -> None:
     """Drive routes under network conditions and report.
 
@@ -42,22 +42,24 @@ def sweep(
     from lavt.experiment.sweep.cluster import check_cluster  # noqa: PLC0415 (slow: scipy)
     from lavt.experiment.sweep.sweep import drive_sweep, is_finished, open_sweep  # noqa: PLC0415 (slow: scipy)
 
-    requested = load_config(SweepConfig, config, changes or [])
-    planned = plan_sweep(requested)
-    if cluster and any(each.config.time == "real" for each in planned):
-        raise UserError("--cluster is for virtual time: set time: virtual, or run without --cluster")
+    settings = load_config(SweepConfig, config, changes or [])
+    planned_runs = plan_sweep(settings)
+    if cluster and any(run.config.time == "real" for run in planned_runs):
+        raise UserError("--cluster needs virtual time: set time: virtual, or run without --cluster")
     out = out or Path("out") / "sweep"
     if cluster:
         check_cluster(cluster, jobs)
     open_sweep(out, resume=resume)
-    missing = sum(not is_finished(out / "runs" / each.name) for each in planned)
-    with console.interruptible(), progress(f"sweep into {out}", missing) as report_done:
-        page, driven = drive_sweep(requested, planned, out, jobs=jobs, on_progress=report_done, cluster_address=cluster)
-    for name, why in driven.failed:
-        console.print_message(f"failed: {name}: {why}")
+    remaining = sum(not is_finished(out / "runs" / run.name) for run in planned_runs)
+    with console.interruptible(), progress(f"sweep, results in {out}", remaining) as report_done:
+        page, result = drive_sweep(
+            settings, planned_runs, out, jobs=jobs, on_progress=report_done, cluster_address=cluster
+        )
+    for name, reason in result.failed:
+        console.print_message(f"failed: {name}: {reason}")
     if as_json:
         console.print_json(read_json(out / "summary.json"))
     else:
         console.print_result(f"the report is {page}")
-    if driven.failed:
+    if result.failed:
         raise typer.Exit(1)

@@ -23,7 +23,7 @@ from lavt.transport.udp_link import UdpLink, resolve_host
 HINT_AFTER_S = 5
 """After this time without a packet the command prints what to check."""
 CHECKS: Mapping[Sender, str] = {
-    "lavt": "each accepted stamp agrees with its RTP timestamp: its error is less than 12 us",
+    "lavt": "each accepted stamp agrees with its RTP timestamp, so the stamp's error is less than 12 us",
     "foreign": "the check is weaker: the base of the sender's RTP clock is learned from its stamps, so an accepted "
     "stamp may have an error of up to 10 ms",
 }
@@ -41,7 +41,7 @@ def watch(
         str | None, typer.Option("--from", help="Accept packets of this host only, from any port.")
     ] = None,
     sender: Annotated[
-        Sender, typer.Option(help="foreign: a sender with another base of its RTP clock, which allows a weaker check.")
+        Sender, typer.Option(help="foreign: a sender whose RTP clock has another base, so that the check is weaker.")
     ] = "lavt",
     reorder_hold_ms: Annotated[
         int | None,
@@ -53,7 +53,7 @@ def watch(
         ),
     ] = None,
     seconds: Annotated[int | None, typer.Option(min=1, help="Stop after this time; default: on Ctrl-C.")] = None,
-    as_json: console.Json = False,
+    as_json: console.JsonOption = False,
 ) -> None:
     """Receive an RTP/H.264 stream and measure its latency.
 
@@ -70,22 +70,23 @@ def watch(
     link = UdpLink(clock, "rtp", bind=(bind, port), only_from=only_from)
     with closing(link), console.stop_on_signals() as stop, fail_on_thread_errors(runtime.fail):
         _print_header(link.port, as_json)
-        runtime.start({})  # without a link to send on
+        runtime.start({})  # no link: the command sends nothing
         link.start(runtime.deliver)
         totals = nodes.totals()
         for second in _seconds(clock, stop, seconds):
             if runtime.stopped.is_set():
                 break
-            before, totals = totals, nodes.totals()
-            _print_statistics("second", nodes.between(before, totals), as_json)
+            previous_totals, totals = totals, nodes.totals()
+            _print_statistics("second", nodes.between(previous_totals, totals), as_json)
             if second == HINT_AFTER_S and not totals["packets"]:
                 console.print_message(_no_packet_hint(link, totals))
         runtime.stop()
     if runtime.failed is not None:
         raise WorkError(f"stopped because a part failed: {describe_error(runtime.failed)}")
     summary = nodes.between(Counter(), nodes.totals())
-    strangers = link.counts["datagrams_from_strangers"]
-    _print_statistics("summary", {**summary, "datagrams_from_strangers": strangers, "check": CHECKS[sender]}, as_json)
+    from_strangers = link.counts["datagrams_from_strangers"]
+    values = {**summary, "datagrams_from_strangers": from_strangers, "check": CHECKS[sender]}
+    _print_statistics("summary", values, as_json)
     if not summary["pictures"]:
         raise WorkError("no picture arrived")
     if not summary["stamps_accepted"]:
@@ -94,9 +95,9 @@ def watch(
 
 def _seconds(clock: MachineClock, stop: console.StopEvent, limit_s: int | None) -> Iterator[int]:
     """Yield the number of each second when it has passed, up to the limit or the stop event."""
-    begin_ns = clock.now().mono_ns
+    start_ns = clock.now().mono_ns
     for number in count(1) if limit_s is None else range(1, limit_s + 1):
-        if stop.wait(max(0, begin_ns + number * NS_PER_S - clock.now().mono_ns) / NS_PER_S):
+        if stop.wait(max(0, start_ns + number * NS_PER_S - clock.now().mono_ns) / NS_PER_S):
             return
         yield number
 

@@ -24,13 +24,21 @@ UNREADABLE_REASONS: Final = {
     "states_of_another_time": "signed by the vehicle, which does not answer this operator's key",
     "states_forged": "not signed by the vehicle that security.vehicle names",
 }
-"""Why a gateway rejects states, by the name of its count."""
-KEY_PACKAGES: Final = ("lavt", "eclipse-zenoh", "av", "opencv-python-headless", "numpy", "cryptography", "pylibsrtp")
-"""Packages whose versions matter between two machines."""
-CAMERA_SHARE: Final = 0.9
-"""The required share of the configured picture rate; below it, the exposure is longer than the picture period."""
-CERTIFICATE_DAYS: Final = 14.0
-"""The remaining validity below which a certificate should be renewed."""
+"""Why a gateway rejects states, by the name under which it counts them."""
+SHOWN_PACKAGES: Final = (
+    "lavt",
+    "eclipse-zenoh",
+    "av",
+    "opencv-python-headless",
+    "numpy",
+    "cryptography",
+    "pylibsrtp",
+)
+"""Packages whose versions are shown, so that the user can compare two machines."""
+MIN_PICTURE_RATE_SHARE: Final = 0.9
+"""The required share of the configured picture rate; a lower one means that the exposure exceeds the picture period."""
+RENEWAL_DAYS: Final = 14.0
+"""The remaining validity below which a certificate or a key should be renewed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +55,7 @@ class Check:
 
 @dataclass(frozen=True, slots=True)
 class CodecTimes:
-    """The processing times of synthetic pictures: to stamp and encode, and to decode and read the stamp."""
+    """The processing times of synthetic pictures: stamping and encoding, and decoding and reading the stamp."""
 
     encode_ns: Sequence[int]
     decode_ns: Sequence[int]
@@ -57,13 +65,13 @@ class CodecTimes:
 class CameraSample:
     """The arrival times of a camera's pictures, and how many of them have a capture time."""
 
-    came_ns: Sequence[int]
-    timed: int
+    arrived_ns: Sequence[int]
+    with_capture_time: int
 
 
 @dataclass(frozen=True, slots=True)
 class StateSample:
-    """The vehicle states received within `seconds` of the first, and the counts of unreadable messages by reason."""
+    """The vehicle states received within `seconds` of the first one, and the number of unreadable states by reason."""
 
     states: Sequence[State] = ()
     unreadable: Mapping[str, int] = field(default_factory=dict)
@@ -85,7 +93,7 @@ def check_versions(python: str, installed: Mapping[str, str | None], requirement
     if errors:
         do = "in LAVT's directory, with the Python that runs it: pip install -e ."
         return Check("versions", "problem", "; ".join(errors), do, measured)
-    versions = [f"{name} {version}" for name in KEY_PACKAGES if (version := installed.get(name)) is not None]
+    versions = [f"{name} {version}" for name in SHOWN_PACKAGES if (version := installed.get(name)) is not None]
     return Check("versions", "ok", ", ".join([f"Python {python}", *versions]), measured=measured)
 
 
@@ -94,14 +102,17 @@ def _version_tuple(version: str) -> tuple[int, ...]:
 
 
 def check_codec(times: CodecTimes, *, size: str, rate_hz: float, side: str, cores: int) -> Check:
-    """Check that the codec is fast enough for the picture rate; a "server" only encodes, a "client" only decodes."""
+    """Check that the codec is fast enough for the picture rate.
+
+    `side` is "server" for a machine that only encodes, "client" for one that only decodes, and empty for any other.
+    """
     period_ms = 1000.0 / rate_hz
     times_ns = {"encode": times.encode_ns, "decode": times.decode_ns}
-    median_ms = {name: median(each) / NS_PER_MS for name, each in times_ns.items()}
-    p95_ms = {name: sorted(each)[int(len(each) * 0.95)] / NS_PER_MS for name, each in times_ns.items()}
+    median_ms = {name: median(values) / NS_PER_MS for name, values in times_ns.items()}
+    p95_ms = {name: sorted(values)[int(len(values) * 0.95)] / NS_PER_MS for name, values in times_ns.items()}
     found = f"{size} at {rate_hz:g} Hz: " + ", ".join(
-        f"to {name} takes {median_ms[name]:.1f} ms (95 %: {p95_ms[name]:.1f} ms), "
-        f"{median_ms[name] / period_ms:.0%} of a frame"
+        f"to {name} takes {median_ms[name]:.1f} ms (p95 {p95_ms[name]:.1f} ms), "
+        f"{median_ms[name] / period_ms:.0%} of the picture period"
         for name in times_ns
     )
     measured = {
@@ -116,7 +127,7 @@ def check_codec(times: CodecTimes, *, size: str, rate_hz: float, side: str, core
         do = "use a lower camera.rate_hz, smaller pictures or a faster machine: this one is too slow"
         return Check("processor", "problem", found, do, measured)
     if max(p95_ms[name] for name in relevant) > period_ms / 2:
-        do = "close other programs, or use a lower camera.rate_hz or smaller pictures: the loop needs the other half"
+        do = "close other programs, or use a lower camera.rate_hz or smaller pictures: other work needs half of it"
         return Check("processor", "warning", found, do, measured)
     if cores < 2:
         return Check("processor", "warning", found, "use at least two cores: on one, video delays commands", measured)
@@ -137,13 +148,13 @@ def check_camera(sample: CameraSample | str, *, name: str, size: str, rate_hz: f
     if isinstance(sample, str):
         do = "fix this, or close the program that uses the camera: `lavt server` cannot start (docs/camera.md)"
         return Check("camera", "problem", sample, do)
-    pictures, times = len(sample.came_ns), sample.came_ns
-    measured_hz = (pictures - 1) * NS_PER_S / (times[-1] - times[0]) if pictures > 1 else 0.0
-    has_times = "have a capture time" if sample.timed else "have no capture time"
-    found = f"{name} delivers {measured_hz:.1f} pictures of {size} a second, which {has_times}"
-    measured = {"pictures": pictures, "rate_hz": measured_hz, "timed": sample.timed}
-    if measured_hz < rate_hz * CAMERA_SHARE:
-        do = f"{rate_hz:g} Hz are configured: add light (darkness makes exposure longer), or lower camera.rate_hz"
+    pictures, arrived_ns = len(sample.arrived_ns), sample.arrived_ns
+    measured_hz = (pictures - 1) * NS_PER_S / (arrived_ns[-1] - arrived_ns[0]) if pictures > 1 else 0.0
+    capture_times = "have a capture time" if sample.with_capture_time else "have no capture time"
+    found = f"{name} delivers {measured_hz:.1f} pictures of {size} a second, which {capture_times}"
+    measured = {"pictures": pictures, "rate_hz": measured_hz, "timed": sample.with_capture_time}
+    if measured_hz < rate_hz * MIN_PICTURE_RATE_SHARE:
+        do = f"{rate_hz:g} Hz are configured: add light (in the dark the exposure is longer), or lower camera.rate_hz"
         return Check("camera", "warning", found, do, measured)
     return Check("camera", "ok", found, measured=measured)
 
@@ -158,25 +169,25 @@ def check_buffer(granted_bytes: int) -> Check:
     return Check("receive buffer", "warning", found, do, measured)
 
 
-def check_arrival(stamped: bool) -> Check:
+def check_arrival(is_recorded: bool) -> Check:
     """Check that the kernel records the arrival time of datagrams."""
-    if stamped:
+    if is_recorded:
         found = "the kernel records when datagrams arrive"
         return Check("arrival times", "ok", found, measured={"stamped": True})
-    found = "the kernel does not record when datagrams arrive: time in the socket counts as network latency"
+    found = "the kernel does not record when datagrams arrive: their wait in the socket counts as network latency"
     return Check("arrival times", "warning", found, "use Linux 2.6.30 or newer, not in a sandbox", {"stamped": False})
 
 
 def check_timer(resolution_ns: int, late_ns: Sequence[int]) -> Check:
     """Check how late sleeps of 1 ms end, compared with the physics step of 4.2 ms and the command period of 20 ms."""
-    late = sorted(late_ns)
-    median_ns, p95_ns = median(late), late[int(len(late) * 0.95)]
+    sorted_ns = sorted(late_ns)
+    median_ns, p95_ns = median(sorted_ns), sorted_ns[int(len(sorted_ns) * 0.95)]
     found = (
-        f"a sleep of 1 ms ends {median_ns / NS_PER_MS:.2f} ms late (95 %: {p95_ns / NS_PER_MS:.2f} ms); the monotonic "
+        f"a sleep of 1 ms ends {median_ns / NS_PER_MS:.2f} ms late (p95 {p95_ns / NS_PER_MS:.2f} ms); the monotonic "
         f"clock has a resolution of {resolution_ns / NS_PER_US:.2f} µs"
     )
     measured = {"resolution_ns": resolution_ns, "late_ms": median_ns / NS_PER_MS, "late_p95_ms": p95_ns / NS_PER_MS}
-    do = "close other programs, give a virtual machine dedicated processors, or run LAVT as root (for priority)"
+    do = "close other programs, give a virtual machine dedicated processors, or run LAVT as root (for its priority)"
     if median_ns > COMMAND_PERIOD_NS:
         return Check("timer", "problem", found, do, measured)
     if p95_ns > PHYSICS_STEP_NS:
@@ -228,7 +239,7 @@ def check_netem(rejection: str, interface: str) -> Check:
     if not rejection:
         return Check("netem", "ok", "the kernel can delay packets, and this user may use it")
     if interface:
-        do = "fix this, or leave injection.interface empty: the side cannot start like this"
+        do = "fix this, or leave injection.interface empty: without netem, this side cannot start"
         return Check("netem", "problem", rejection, do, {"interface": interface})
     found = f"not available, but needed only to inject latency on this machine: {rejection}"
     return Check("netem", "ok", found)
@@ -279,9 +290,9 @@ def check_link(routers: Routers | None, *, has_vehicle: bool) -> Check:
 
 def check_vehicle(sample: StateSample, vehicle: str, version: str) -> Check:
     """Check that the vehicle's state arrives, can be read, and has the expected rate."""
-    states = len(sample.states)
-    rate_hz = states / sample.seconds
-    measured = {"states": states, "seconds": sample.seconds, "unreadable": dict(sample.unreadable)}
+    state_count = len(sample.states)
+    rate_hz = state_count / sample.seconds
+    measured = {"states": state_count, "seconds": sample.seconds, "unreadable": dict(sample.unreadable)}
     if sample.unreadable:
         reasons = [f"{UNREADABLE_REASONS.get(name, name)} ({count})" for name, count in sample.unreadable.items()]
         do = (
@@ -290,15 +301,18 @@ def check_vehicle(sample: StateSample, vehicle: str, version: str) -> Check:
         )
         found = f"states of {vehicle} cannot be read: {', '.join(reasons)}"
         return Check("vehicle", "problem", found, do, measured)
-    if not states:
-        do = "check that `lavt server` runs there, that both sides have one vehicle_id, and that the routers are linked"
+    if not state_count:
+        do = (
+            "check that `lavt server` runs there, that both sides have the same vehicle_id, "
+            "and that the routers are linked"
+        )
         return Check("vehicle", "problem", f"no state of {vehicle} arrives", do, measured)
     latest = sample.states[-1]
     operator = f"{latest.active_operator} has control" if latest.active_operator else "no operator has control"
     found = f"the state of {vehicle} arrives {rate_hz:.0f} times a second: {latest.safety}, {operator}"
     measured |= {"safety": latest.safety, "active_operator": latest.active_operator}
     if rate_hz < STATE_RATE_HZ / 2:
-        do = f"{STATE_RATE_HZ:.0f} a second are sent: look for packet loss (`ping`), or an overloaded machine"
+        do = f"the vehicle sends {STATE_RATE_HZ:.0f} a second: look for packet loss (`ping`) or an overloaded machine"
         return Check("vehicle", "warning", found, do, measured)
     return Check("vehicle", "ok", found, measured=measured)
 
@@ -307,7 +321,10 @@ def check_probe(comparison: ClockComparison | None, host: str, port: int) -> Che
     """Check the clocks of both machines against each other by probes; None: no probe was answered."""
     measured: dict[str, Any] = {"host": host, "port": port}
     if comparison is None:
-        do = "check that `lavt server` runs there, that clock.probe_port is equal on both sides, and that it is open"
+        do = (
+            "check that `lavt server` runs there, that clock.probe_port is equal on both sides, "
+            "and that this port is open"
+        )
         return Check("clock probe", "problem", f"no answer from UDP {host}:{port}", do, measured)
     measured |= {"round_trip_ms": comparison.round_trip_ms}
     estimate = comparison.probe
@@ -336,30 +353,30 @@ def check_keys_configured(is_secured: bool) -> Check:
     return Check("security", "warning", found, do)
 
 
-def check_key_file(key: str, path: Path, *, rejection: str, mode: int, private: bool) -> Check:
-    """Check that a key file is readable and, if private, readable by its owner only."""
+def check_key_file(key: str, path: Path, *, rejection: str, mode: int, is_private: bool) -> Check:
+    """Check that a key file is readable and, if it is private, that only its owner can read it."""
     if rejection:
         return Check(key, "problem", f"{path} cannot be read: {rejection}", "copy it here, or fix the config")
-    if private and mode & 0o077:
+    if is_private and mode & 0o077:
         found = f"{path} is a private key that other users can read (mode {mode & 0o777:o})"
         return Check(key, "problem", found, f"chmod 600 {path}; create new keys if others had access")
     return Check(key, "ok", f"{path} is readable")
 
 
 def check_signing_key(path: Path, days_left: float | None) -> Check:
-    """Check that a signing key is valid for some time; None: it has no expiry."""
+    """Check that a signing key remains valid for at least `RENEWAL_DAYS`; None: it has no expiry."""
     if days_left is None:
-        return Check(path.name, "warning", f"the key {path} never expires", "create new ones with `lavt keys`")
+        return Check(path.name, "warning", f"the key {path} never expires", "create a new one with `lavt keys`")
     return check_certificate(path, days_left, kind="key")
 
 
 def check_certificate(path: Path, days_left: float, *, kind: str = "certificate") -> Check:
-    """Check that a certificate, or a key, is valid for some time."""
+    """Check that a certificate, or a key, remains valid for at least `RENEWAL_DAYS`."""
     name, measured = path.name, {"days_left": round(days_left, 2)}
-    do = "create new ones with `lavt keys`, and copy them to all machines"
+    do = "create new certificates and keys with `lavt keys`, and copy them to all machines"
     if days_left < 0:
         return Check(name, "problem", f"the {kind} {path} expired {-days_left:.0f} days ago", do, measured)
     found = f"the {kind} {path} is valid for {days_left:.0f} days"
-    if days_left < CERTIFICATE_DAYS:
+    if days_left < RENEWAL_DAYS:
         return Check(name, "warning", found, do, measured)
     return Check(name, "ok", found, measured=measured)

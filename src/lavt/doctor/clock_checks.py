@@ -25,7 +25,7 @@ HINTS = {
 
 @dataclass(frozen=True, slots=True)
 class ClockEstimate:
-    """An estimate of Delta (server minus client) with its largest error."""
+    """An estimate of Delta, the server's clock minus the client's, with its largest error."""
 
     ms: float
     bound_ms: float
@@ -62,19 +62,20 @@ def check_host(report: ClockReport) -> ClockComparison:
 
 
 def compare(
-    before: ClockReport, report: ClockReport, probes: Sequence[ClockProbe], latest: ProbeReply, server: str
+    before: ClockReport, report: ClockReport, probes: Sequence[ClockProbe], last_reply: ProbeReply, server: str
 ) -> ClockComparison:
     """Compare this machine's clock with that of the server at the address `server`, which answered these probes.
 
-    `before` and `report` are the reports of this machine's time source before and after the probing. `report` is used.
-    The server's report is of some moment in between, so the change of this clock's correction is added to the bound.
+    `before` and `report` are the reports of this machine's time source before and after the probing. The estimate uses
+    `report`. The server's report is from a moment in between, so that the change from `before` to `report` is added to
+    the bound.
     """
     usable = [probe for probe in probes if probe.round_trip_ns >= 0]
     if not usable:
         return ClockComparison(False, ("no answer is usable: a clock was set during each probe, so try again later",))
     best = min(usable, key=lambda probe: probe.round_trip_ns)
     probe = ClockEstimate(best.offset_ns / NS_PER_MS, best.round_trip_ns / 2 / NS_PER_MS)
-    sources = _estimate_from_sources(before, report, latest, server)
+    sources = _estimate_from_sources(before, report, last_reply, server)
     round_trip_ms = best.round_trip_ns / NS_PER_MS
     sentences = [check_host(report).says[0]]
     complaints: list[str] = []
@@ -105,28 +106,32 @@ def compare(
                 f"the two estimates agree: they differ by {difference_ms:.3f} ms, allowed are {allowed_ms:.3f} ms"
             )
     sentences.append(f"the shortest of {len(usable)} round trips took {round_trip_ms:.3f} ms")
-    used = sources or probe
-    if not complaints and used.bound_ms > CLOCK_BOUND_LIMIT_MS:
-        complaints.append(_bound_complaint(used.bound_ms))
+    estimate = sources or probe
+    if not complaints and estimate.bound_ms > CLOCK_BOUND_LIMIT_MS:
+        complaints.append(_bound_complaint(estimate.bound_ms))
     return ClockComparison(not complaints, (*sentences, *complaints), sources, probe, round_trip_ms)
 
 
 def _estimate_from_sources(
-    before: ClockReport, report: ClockReport, latest: ProbeReply, server: str
+    before: ClockReport, report: ClockReport, last_reply: ProbeReply, server: str
 ) -> ClockEstimate | None:
     """Return Delta from the time sources of both machines; None if either has no estimate."""
-    known = (report.correction_s, report.bound_s, latest.correction_s, latest.bound_s)
-    if before.correction_s is None or known[0] is None or known[1] is None or known[2] is None or known[3] is None:
+    correction_s, bound_s = report.correction_s, report.bound_s
+    server_correction_s, server_bound_s = last_reply.correction_s, last_reply.bound_s
+    if before.correction_s is None or correction_s is None or bound_s is None:
+        return None
+    if server_correction_s is None or server_bound_s is None:
         return None
     path = (report.peer_delay_s, report.peer_dispersion_s, report.skew_ppm, report.age_s)
-    delay_s, dispersion_s, skew_ppm, age_s = (math.inf if each is None else each for each in path)
-    path_s = delay_s / 2 + dispersion_s + (skew_ppm / 1e6 * age_s if age_s else 0.0)
-    bound_s = min(known[1], path_s) if report.follows == server else known[1] + known[3]
-    moved_s = abs(known[0] - before.correction_s)
-    return ClockEstimate((known[0] - known[2]) * 1e3, (bound_s + moved_s) * 1e3)
+    delay_s, dispersion_s, skew_ppm, age_s = (math.inf if value is None else value for value in path)
+    path_bound_s = delay_s / 2 + dispersion_s + (skew_ppm / 1e6 * age_s if age_s else 0.0)
+    total_bound_s = min(bound_s, path_bound_s) if report.follows == server else bound_s + server_bound_s
+    change_s = abs(correction_s - before.correction_s)
+    return ClockEstimate((correction_s - server_correction_s) * 1e3, (total_bound_s + change_s) * 1e3)
 
 
 def _path_complaints(report: ClockReport, round_trip_ms: float, server: str) -> list[str]:
+    """Return a complaint if NTP's round trip is longer than the probe's; empty otherwise."""
     delay_ms = None if report.peer_delay_s is None else report.peer_delay_s * 1e3
     if report.follows != server or delay_ms is None or delay_ms <= round_trip_ms + PATH_LIMIT_MS:
         return []

@@ -12,7 +12,7 @@ from contextlib import closing, suppress
 from importlib.metadata import PackageNotFoundError, requires, version
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import cv2
 import numpy as np
@@ -23,7 +23,7 @@ from lavt.assembly.fidelity import VIDEO
 from lavt.assembly.security import build_authenticator, build_cipher, build_gateway
 from lavt.clock import MachineClock, pause
 from lavt.config import ClientCameraConfig, ClientConfig, ClockConfig, ServerConfig
-from lavt.doctor.checks import KEY_PACKAGES, CameraSample, CodecTimes, StateSample
+from lavt.doctor.checks import SHOWN_PACKAGES, CameraSample, CodecTimes, StateSample
 from lavt.domain import NS_PER_MS, NS_PER_S, Now, Picture, State
 from lavt.errors import BadMessage, LavtError, UserError, WorkError
 from lavt.streams import stream
@@ -35,14 +35,22 @@ from lavt.transport.security.keys import NS_PER_DAY, key_expiry_ns
 from lavt.transport.udp_link import RECEIVE_BUFFER_BYTES
 from lavt.transport.zenoh_link import ZenohLink
 
-PICTURES = 60
-STEP_PX = 4
+CODEC_PICTURES = 60
+SHIFT_PX_PER_PICTURE = 4
 CODEC_TIMEOUT_NS = 3 * NS_PER_S
 SLEEPS = 100
-FIRST_STATE_NS = 3 * NS_PER_S
-STATES_NS = NS_PER_S
-CAMERA_NS = 2 * NS_PER_S
-GOVERNORS = Path("/sys/devices/system/cpu")
+FIRST_STATE_TIMEOUT_NS = 3 * NS_PER_S
+STATE_SAMPLE_NS = NS_PER_S
+CAMERA_SAMPLE_NS = 2 * NS_PER_S
+PROCESSORS = Path("/sys/devices/system/cpu")
+
+
+class KeyFile(NamedTuple):
+    """A file that a config's `security` names: the key of the config, such as security.key, and the file's path."""
+
+    config_key: str
+    path: Path
+    is_private: bool
 
 
 def packages() -> tuple[dict[str, str | None], Sequence[str]]:
@@ -51,8 +59,9 @@ def packages() -> tuple[dict[str, str | None], Sequence[str]]:
         requirements = requires("lavt") or []
     except PackageNotFoundError:  # LAVT runs from the source tree and is not installed
         requirements = []
-    needed = [match[0] for each in requirements if "extra ==" not in each and (match := re.match(r"[\w.-]+", each))]
-    return {name: _version(name) for name in dict.fromkeys((*KEY_PACKAGES, *needed))}, requirements
+    required = [requirement for requirement in requirements if "extra ==" not in requirement]
+    names = [match[0] for requirement in required if (match := re.match(r"[\w.-]+", requirement))]
+    return {name: _version(name) for name in dict.fromkeys((*SHOWN_PACKAGES, *names))}, requirements
 
 
 def _version(name: str) -> str | None:
@@ -63,7 +72,7 @@ def _version(name: str) -> str | None:
 
 
 def codec_times(config: ServerConfig, clock: MachineClock) -> CodecTimes:
-    """Time the codec with synthetic pictures, as server and client use it; errors of the codec are raised."""
+    """Time the codec with synthetic pictures, as server and client use it; raise the codec's errors."""
     camera = config.camera
     client_camera = ClientCameraConfig(width_px=camera.width_px, height_px=camera.height_px, rate_hz=camera.rate_hz)
     sender, receiver = VIDEO.sender(config), VIDEO.receiver(ClientConfig(camera=client_camera))
@@ -87,62 +96,64 @@ def codec_times(config: ServerConfig, clock: MachineClock) -> CodecTimes:
 def _pictures(width_px: int, height_px: int) -> Iterator[Picture]:
     """Yield pictures of a moving smooth texture with some noise.
 
-    They are a little harder than the simulator's road: 2.2 ms to encode and 0.8 ms to decode, compared with 2.0 ms and
-    0.7 ms.
+    They are a little harder to encode than the simulator's road: on one machine they took 2.2 ms to encode and 0.8 ms
+    to decode. The road took 2.0 ms and 0.7 ms.
     """
     random = stream(1, "doctor")
     coarse = random.integers(0, 256, (height_px // 16 + 1, width_px // 16 + 1, 3), dtype=np.uint8)
-    wide = cv2.resize(coarse, (width_px + PICTURES * STEP_PX, height_px), interpolation=cv2.INTER_CUBIC)
+    wide = cv2.resize(
+        coarse, (width_px + CODEC_PICTURES * SHIFT_PX_PER_PICTURE, height_px), interpolation=cv2.INTER_CUBIC
+    )
     noise = random.integers(0, 6, (height_px, width_px, 3), dtype=np.uint8)
-    for number in range(PICTURES):
-        view = wide[:, number * STEP_PX : number * STEP_PX + width_px]
+    for number in range(CODEC_PICTURES):
+        view = wide[:, number * SHIFT_PX_PER_PICTURE : number * SHIFT_PX_PER_PICTURE + width_px]
         yield cast("Picture", cv2.add(view, np.roll(noise, 37 * number, axis=0)))
 
 
 def sample_camera(config: ServerConfig, clock: MachineClock) -> CameraSample | str:
-    """Take pictures from the configured camera for two seconds; return a string if it cannot be used."""
+    """Take pictures from the configured camera for two seconds; return the reason if it cannot be used."""
     try:
         camera = build_device(config)
     except UserError as error:
         return str(error)
-    came_ns, timed = [], 0
+    arrived_ns, with_capture_time = [], 0
     with closing(camera):
-        end_ns = clock.now().mono_ns + CAMERA_NS
+        end_ns = clock.now().mono_ns + CAMERA_SAMPLE_NS
         while (left_ns := end_ns - clock.now().mono_ns) > 0:
             if camera.wait(left_ns / NS_PER_S) and (frame := camera.capture(0, clock.now().mono_ns, None)):
-                came_ns.append(clock.now().mono_ns)
-                timed += frame.capture_ns is not None
-    return CameraSample(came_ns, timed)
+                arrived_ns.append(clock.now().mono_ns)
+                with_capture_time += frame.capture_ns is not None
+    return CameraSample(arrived_ns, with_capture_time)
 
 
 def receive_buffer_bytes() -> int:
     """Request LAVT's receive buffer as `UdpLink` does, and return the granted size (Linux reports it doubled)."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
-        opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-        return opened.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp_socket:
+        udp_socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+        return udp_socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
 
 
-def arrivals_are_stamped() -> bool:
+def kernel_records_arrivals() -> bool:
     """Send a datagram to this process, and return whether the kernel records its arrival time."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
-        opened.settimeout(1.0)
-        opened.bind(("127.0.0.1", 0))
-        enable_arrival_times(opened)
-        opened.sendto(b"doctor", opened.getsockname())
-        _, ancillary, _, _ = opened.recvmsg(64, ANCILLARY_BYTES)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp_socket:
+        udp_socket.settimeout(1.0)
+        udp_socket.bind(("127.0.0.1", 0))
+        enable_arrival_times(udp_socket)
+        udp_socket.sendto(b"doctor", udp_socket.getsockname())
+        _, ancillary, _, _ = udp_socket.recvmsg(64, ANCILLARY_BYTES)
     return any((level, kind) == (socket.SOL_SOCKET, SO_TIMESTAMPNS) for level, kind, _ in ancillary)
 
 
-def timer(clock: MachineClock) -> tuple[int, list[int]]:
+def timer_accuracy(clock: MachineClock) -> tuple[int, list[int]]:
     """Return the resolution of the monotonic clock, and by how much each of many sleeps of 1 ms was too long."""
     readings = [clock.now().mono_ns for _ in range(1000)]
     steps = [after - before for before, after in pairwise(readings) if after > before]
-    late = []
+    late_ns = []
     for _ in range(SLEEPS):
         start_ns = clock.now().mono_ns
         pause(NS_PER_MS)
-        late.append(clock.now().mono_ns - start_ns - NS_PER_MS)
-    return min(steps, default=0), late
+        late_ns.append(clock.now().mono_ns - start_ns - NS_PER_MS)
+    return min(steps, default=0), late_ns
 
 
 def niceness() -> int:
@@ -153,7 +164,7 @@ def niceness() -> int:
 def governors() -> list[str]:
     """Return the frequency governor of every processor; empty if the system does not report them."""
     found = []
-    for path in GOVERNORS.glob("cpu[0-9]*/cpufreq/scaling_governor"):
+    for path in PROCESSORS.glob("cpu[0-9]*/cpufreq/scaling_governor"):
         with suppress(OSError):
             found.append(path.read_text().strip())
     return found
@@ -172,8 +183,8 @@ def netem_rejection(interface: str) -> str:
     """
     command = ("unshare", "--net", "--", "tc", "qdisc", "add", "dev", "lo", "root")
     try:
-        for queue in (("handle", "1:", "prio"), ("netem", "delay", "1ms")):
-            run_tc([*command, *queue])
+        for qdisc in (("handle", "1:", "prio"), ("netem", "delay", "1ms")):
+            run_tc([*command, *qdisc])
         if interface:
             NetemInterface(interface).check()
     except LavtError as error:
@@ -183,29 +194,29 @@ def netem_rejection(interface: str) -> str:
 
 def bind_rejection(host: str, port: int) -> str:
     """Return why a UDP port cannot be opened; empty if it can."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp_socket:
         try:
-            opened.bind((host, port))
+            udp_socket.bind((host, port))
         except (OSError, ValueError) as error:
             return str(getattr(error, "strerror", error))
     return ""
 
 
 class StateListener:
-    """A receiver that counts the states of a link before the gateway, and keeps those that the gateway accepts."""
+    """A receiver of the vehicle's states: it counts all that arrive and keeps those that the gateway accepts."""
 
     def __init__(self, settings: ServerConfig | ClientConfig) -> None:
         self._accepted: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self._received = 0
         self._authenticator = build_authenticator(settings)
 
-    def _keep(self, channel: str, payload: Any, _arrived: Now, _peer: Any) -> None:
+    def _keep_state(self, channel: str, payload: Any, _arrived: Now, _peer: Any) -> None:
         if channel == "state":
             self._accepted.put(payload)
 
     def listen(self, link: ZenohLink, clock: MachineClock) -> StateSample:
         """Wait some seconds for the vehicle's first state, then collect states for one second."""
-        gateway = build_gateway(self._authenticator, self._keep, link.send, lambda: (0, -1))
+        gateway = build_gateway(self._authenticator, self._keep_state, link.send, lambda: (0, -1))
 
         def receive(channel: str, payload: Any, arrived: Now, peer: Any) -> None:
             self._received += channel == "state"
@@ -214,28 +225,28 @@ class StateListener:
         link.start(receive)
         states: list[State] = []
         unreadable: Counter[str] = Counter()
-        has_first, end_ns = False, clock.now().mono_ns + FIRST_STATE_NS
+        has_first, end_ns = False, clock.now().mono_ns + FIRST_STATE_TIMEOUT_NS
         while (left_ns := end_ns - clock.now().mono_ns) > 0:
             try:
                 payload = self._accepted.get(timeout=left_ns / NS_PER_S)
             except queue.Empty:
                 break
             if not has_first:
-                has_first, end_ns = True, clock.now().mono_ns + STATES_NS
+                has_first, end_ns = True, clock.now().mono_ns + STATE_SAMPLE_NS
             try:
                 states.append(decode(State, payload))
             except BadMessage as error:
                 unreadable[str(error)] += 1
         if self._received and not states and not unreadable:
             unreadable.update(gateway.counts or {"rejected by the gateway": self._received})
-        return StateSample(states, dict(unreadable), STATES_NS / NS_PER_S)
+        return StateSample(states, dict(unreadable), STATE_SAMPLE_NS / NS_PER_S)
 
 
-def key_files(section: Any) -> list[tuple[str, Path, bool]]:
-    """Return the files of a config's `security`: the key in the config, the file, and whether it is private."""
-    values: Mapping[str, Any] = {} if section is None else section.model_dump()
+def key_files(security: Any) -> list[KeyFile]:
+    """Return the files that a config's section `security` names; none if the section is None."""
+    values: Mapping[str, Any] = {} if security is None else security.model_dump()
     return [
-        (f"security.{name}", Path(path), name == "key")
+        KeyFile(f"security.{name}", Path(path), is_private=name == "key")
         for name, value in values.items()
         for name, path in (_flatten(name, value))
         if path
@@ -243,7 +254,7 @@ def key_files(section: Any) -> list[tuple[str, Path, bool]]:
 
 
 def _flatten(name: str, value: Any) -> list[tuple[str, str]]:
-    """Return the paths in a value by name: one for a string, and one per entry of a mapping."""
+    """Return names and paths: one pair for a string, and one for each entry of a mapping."""
     if isinstance(value, Mapping):
         return [(f"{name}.{part}", str(path)) for part, path in value.items()]
     return [(name, str(value))] if value else []
@@ -252,9 +263,9 @@ def _flatten(name: str, value: Any) -> list[tuple[str, str]]:
 def file_state(path: Path) -> tuple[str, int]:
     """Return why a file cannot be read (empty: it can), and its permission bits."""
     try:
-        with path.open("rb") as opened:
-            opened.read(1)
-            return "", os.fstat(opened.fileno()).st_mode & 0o777
+        with path.open("rb") as file:
+            file.read(1)
+            return "", os.fstat(file.fileno()).st_mode & 0o777
     except OSError as error:
         return str(error.strerror), 0
 
@@ -262,7 +273,7 @@ def file_state(path: Path) -> tuple[str, int]:
 def certificates(folder: Path, now_wall_ns: int) -> list[tuple[Path, float]]:
     """Return the certificates in a directory with their remaining days; empty without `cryptography`."""
     try:
-        from lavt.transport.security.certificates import days_left  # noqa: PLC0415 (an extra)
+        from lavt.transport.security.certificates import days_left  # noqa: PLC0415 (an optional dependency)
     except ImportError:
         return []
     found = []
