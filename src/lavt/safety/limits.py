@@ -12,41 +12,47 @@ class Limits:
     """The limits that the vehicle enforces, whatever is commanded."""
 
     degraded_after_ns: int = 300 * NS_PER_MS
-    """Without a command from a newer picture: degraded. Nine frames at 30 Hz; peers' watchdogs are 100 to 500 ms."""
+    """Without a command from a newer picture for this long: degraded. These are nine frames at 30 Hz; other systems'
+    watchdogs wait for 100 to 500 ms."""
     stop_after_ns: int = 500 * NS_PER_MS
-    """Without a command from a newer picture: safe stop. At 30 km/h the car has gone 4 m without guidance."""
+    """Without a command from a newer picture for this long: safe stop. At 30 km/h the car has driven 4 m without
+    guidance."""
     degraded_deceleration_mps2: float = 1.0
-    """Gentle: most command timeouts end by themselves."""
+    """Gentle, because most command timeouts end by themselves."""
     stop_deceleration_mps2: float = 4.0
-    """From 30 km/h to standstill in 2.1 s and 9 m; it leaves grip for steering."""
+    """Stops the car from 30 km/h in 2.1 s and 9 m, and leaves grip for steering."""
     stop_settling_ns: int = 500 * NS_PER_MS
-    """From the begin of a safe stop until the speed must fall: the brake's lag is 0.2 s, and reports are up to 0.1 s
-    old."""
+    """Time from the beginning of a safe stop until the planned speed of the stop begins to fall: the brake's lag is 0.2
+    s, and reports are up to 0.1 s old."""
     stop_excess_mps: float = 0.5
-    """From this speed above that of the wanted safe stop, the brake is full; half of it adds half of the difference."""
+    """At this much above the planned speed of a safe stop, the brake is full. At half of it, the brake is halfway
+    between that of a normal safe stop and full."""
     stopping_distance_limit_m: float = PATH_STEP_M * PATH_POINTS
-    """The stopping distance must lie on the path in the command (`stopping_speed_limit_mps`). Only a simulated vehicle
-    may be configured beyond it, to study higher speeds and delays."""
+    """The vehicle must be able to stop within this distance, which is the length of the path in a command
+    (`stopping_speed_limit_mps`). Only a simulated vehicle may be configured beyond it, to study higher speeds and
+    delays."""
     stopping_brake_settling_s: float = 0.25
-    """Time to brake away speed above `stopping_speed_limit_mps`. The brake's lag is 0.2 s: a shorter time would
-    oscillate. 1 m/s of excess already brakes like a safe stop, which is the maximum."""
+    """Time within which the brake removes speed above `stopping_speed_limit_mps`. With a shorter time the speed would
+    oscillate, because the brake's lag is 0.2 s. An excess of 1 m/s is braked like a safe stop, which is the maximum."""
     picture_age_limit_ns: int = 500 * NS_PER_MS
     """A command from an older picture is rejected. The age counts from the capture, or from the stamp if the camera
     reports no capture time. Only a simulated vehicle may be configured up to 2 s."""
     stamp_memory_ns: int = 5 * NS_PER_S
     """The server remembers the stamps that it issued for this long."""
     lateral_acceleration_mps2: float = 3.0
-    """As in openpilot (ISO 11270); a simulated vehicle may be configured up to 6."""
+    """The same as in openpilot (ISO 11270). Only a simulated vehicle may be configured up to 6 m/s2."""
     steering_rate_radps: float = 0.8
-    """Road wheel. It is above the 0.53 rad/s of the cars we know, so that it limits only faulty commands."""
+    """Rate of the road wheels' angle. It is above the 0.53 rad/s of the cars we know, so that it limits only faulty
+    commands."""
     speed_limit_mps: float = 40 / 3.6
-    """No throttle above it; the controllers drive 30 km/h."""
+    """No throttle above this speed; the controllers drive 30 km/h."""
     arming_hold_ns: int = NS_PER_S
     """All arming conditions must be met for this long."""
     handover_request_timeout_ns: int = 3 * NS_PER_S
-    """A handover request is renewed each second; after three missing renewals it expires."""
+    """A handover request is repeated each second; after three missing repetitions it expires."""
     reservation_ns: int = 5 * NS_PER_S
-    """A released vehicle is reserved for the requester for this long: it tries each second, and replies may be lost."""
+    """A released vehicle is reserved for the requester for this long. The requester tries each second, because replies
+    may be lost."""
     arming_brake: float = 0.3
     """From this pedal position on, the brake counts as applied for arming."""
     arming_steering_rad: float = 0.1
