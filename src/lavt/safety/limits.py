@@ -28,11 +28,12 @@ class Limits:
     """If the vehicle in a safe stop is faster than planned by this much, it brakes fully. If it is faster by half as
     much, its brake is halfway between that of `stop_deceleration_mps2` and full."""
     stopping_distance_limit_m: float = PATH_STEP_M * PATH_POINTS
-    """The stopping distance must lie on the path in the command (`stopping_speed_limit_mps`). Only a simulated vehicle
-    may be configured beyond it, to study higher speeds and delays."""
+    """The vehicle must be able to stop within this distance, which is the length of the path in a command
+    (`stopping_speed_limit_mps`). Only a simulated vehicle may be configured beyond it, to study higher speeds and
+    delays."""
     stopping_brake_settling_s: float = 0.25
-    """Time to brake away speed above `stopping_speed_limit_mps`. The brake's lag is 0.2 s: a shorter time would
-    oscillate. 1 m/s of excess already brakes like a safe stop, which is the maximum."""
+    """Time within which the brake removes speed above `stopping_speed_limit_mps`. With a shorter time the speed would
+    oscillate, because the brake's lag is 0.2 s. An excess of 1 m/s is braked like a safe stop, which is the maximum."""
     picture_age_limit_ns: int = 500 * NS_PER_MS
     """A command from an older picture is rejected. The age counts from the capture, or from the stamp if the camera
     reports no capture time. Only a simulated vehicle may be configured up to 2 s."""
@@ -48,7 +49,7 @@ class Limits:
     arming_hold_ns: int = NS_PER_S
     """All arming conditions must be met for this long."""
     handover_request_timeout_ns: int = 3 * NS_PER_S
-    """A handover request is renewed each second; after three missing renewals it expires."""
+    """A handover request is repeated each second; after three missing repetitions it expires."""
     reservation_ns: int = 5 * NS_PER_S
     """A released vehicle is reserved for the client that requested it for this long. That client tries each second to
     acquire control, and replies may be lost."""

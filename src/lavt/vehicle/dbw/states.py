@@ -25,13 +25,15 @@ long."""
 SENT_IN_STATE: Final[dict[State, str]] = {
     "idle": "nothing",
     "clearing": "CLEAR every 50 ms; no axis enabled",
-    "enabling": "all axes enabled, throttle 0, the holding brake; DRIVE once all axes are reported enabled",
+    "enabling": "all axes enabled, with throttle 0 and at least the holding brake; DRIVE once all axes are reported "
+    "enabled",
     "engaged": "the requested actuation",
-    "parking": "requested steering and brake, at least the holding brake, throttle 0; PARK once the car was stationary "
-    "for 300 ms; then no axis enabled. Nothing more if, before PARK, the brake (generation 2: any axis) is released",
+    "parking": "the requested steering, the requested brake but at least the holding brake, and throttle 0. PARK "
+    "once the car was stationary for 300 ms; once PARK is reported, no axis enabled. Nothing, if before "
+    "PARK the brake, or any axis of generation 2, is released",
     "overridden": "no axis enabled",
-    "lost": "requested steering and brake, throttle 0, on the axes that are still enabled; nothing more once the "
-    "brake (generation 2: any axis) is released",
+    "lost": "the requested steering, the requested brake and throttle 0, on the axes that are still enabled. "
+    "Nothing, if the brake, or any axis of generation 2, is released",
 }
 """Frames sent in each state."""
 
