@@ -84,6 +84,15 @@ def test_large_integers_are_never_rounded(tmp_path: Path) -> None:
     assert read_record(tmp_path / "a.mcap").table("counts").objects("number") == [WALL_NS, 2**64]
 
 
+def test_a_float_beyond_64_bits_is_missing_as_an_integer(tmp_path: Path) -> None:
+    """A float that no 64-bit integer can represent is missing in a column of integers, without a warning."""
+    writer = RecordWriter(tmp_path / "a.mcap", "server")
+    for index, number in enumerate((1e308, -(2.0**63), 5.0)):
+        writer.write("counts", {"number": number}, now(index))
+    writer.close()
+    assert read_record(tmp_path / "a.mcap").table("counts").ints("number").tolist() == [MISSING, MISSING, 5]
+
+
 def test_not_a_number_becomes_null(tmp_path: Path) -> None:
     """NaN and infinity, which JSON cannot represent, are written as null and read as NaN."""
     assert json.loads(to_json({"a": float("nan"), "b": [float("inf"), 1.5]})) == {"a": None, "b": [None, 1.5]}

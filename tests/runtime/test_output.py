@@ -104,3 +104,23 @@ def test_a_signal_ends_a_program_whose_output_is_not_read(number: signal.Signals
             process.kill()
     os.close(alive)
     os.close(told)
+
+
+FAILS_UNEXPECTEDLY = """
+from lavt.cli import console
+
+def run():
+    with console.stop_on_signals():
+        raise RuntimeError("unexpected")
+
+console.run_command(run)
+"""
+
+
+def test_an_unexpected_error_is_printed() -> None:
+    """The traceback of an unexpected error is printed although the output is queued."""
+    completed = subprocess.run(
+        [sys.executable, "-c", FAILS_UNEXPECTEDLY], capture_output=True, text=True, timeout=END_LIMIT_S, check=False
+    )
+    assert completed.returncode == 1
+    assert "RuntimeError: unexpected" in completed.stderr

@@ -21,7 +21,7 @@ from lavt.node import WAKE, Message, Send, Stage
 from lavt.nodes.payloads import StationaryStatus
 from lavt.runtime.pipe import CAPACITY, Pipe
 from lavt.runtime.realtime import RealRuntime
-from lavt.runtime.remote_node import FAILED_CHECKS, LATE_NS, START_CHECKS, NodeHost, RemoteNodeProxy
+from lavt.runtime.remote_node import FAILED_CHECKS, LATE_NS, SILENT_CHECKS, START_CHECKS, NodeHost, RemoteNodeProxy
 
 pytestmark = pytest.mark.usefixtures("own_switch_interval")
 
@@ -257,6 +257,17 @@ def test_a_remote_node_without_a_heartbeat_fails_the_run() -> None:
         wait_until(lambda: bool(both.outputs.of("event")))
         both.proxy.check_heartbeat()
         assert isinstance(both.main.failed, WorkError)
+
+
+@pytest.mark.usefixtures("no_checker")
+def test_a_heartbeat_while_the_silence_is_reported_prevents_the_failure() -> None:
+    """A node whose heartbeat arrives while its silence is reported has not failed."""
+    with rig() as both:
+        beat(both)
+        both.proxy._on_silent = lambda _: beat(both)
+        for _ in range(SILENT_CHECKS):
+            both.proxy.check_heartbeat()
+        assert both.main.failed is None
 
 
 @pytest.mark.usefixtures("no_checker")

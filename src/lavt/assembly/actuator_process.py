@@ -24,7 +24,7 @@ from lavt.domain import NS_PER_S
 from lavt.errors import UserError, WorkError
 from lavt.nodes.payloads import Event
 from lavt.runtime import process_priority
-from lavt.runtime.output import finish_output, queue_output
+from lavt.runtime.output import queue_output
 from lavt.runtime.realtime import RealRuntime
 from lavt.runtime.remote_node import NodeHost, RemoteNodeProxy
 from lavt.runtime.thread_failures import fail_on_thread_errors
@@ -36,7 +36,7 @@ STOP_TIMEOUT_S = 12.0
 """How long the vehicle may take to stop and disengage when the server ends; after an implausible speed it brakes for at
 least 8 s."""
 POLL_PERIOD_S = 0.05
-LONGEST_END_S = 11
+LONGEST_END_S = 13
 """The process is killed by its own alarm this long after the server's end, even if its node is stuck by then."""
 IGNORED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Signals that all processes of a terminal or service receive; the server's process handles them, and its end is
@@ -127,7 +127,6 @@ def serve_actuator(connection: Connection, config: ServerConfig, host: str, vide
     finally:
         host_of_node.close()
         vehicle.close()
-        finish_output()
 
 
 def _wait_until_disengaged(host: NodeHost, vehicle: DbwVehicle, clock: Clock) -> None:

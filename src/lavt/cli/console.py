@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import typer
 
 from lavt.errors import LavtError, UserError, WorkError
-from lavt.runtime.output import finish_output, queue_output
+from lavt.runtime.output import queue_output
 
 OutOption = Annotated[Path | None, typer.Option(help="Output directory.")]
 SetOption = Annotated[
@@ -70,8 +70,6 @@ def run_command(command: Callable[[], None]) -> None:
     except OSError as error:  # such as a full disk or a missing permission that no check anticipated
         print_message(f"lavt: {error}")
         raise SystemExit(1) from None
-    finally:
-        finish_output()
 
 
 @contextmanager

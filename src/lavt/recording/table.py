@@ -98,7 +98,7 @@ def _ints_of(column: NDArray[Any] | None, length: int) -> IntArray:
             if isinstance(value, int) and not isinstance(value, bool) and MISSING <= value <= -(MISSING + 1):
                 ints[index] = value
     elif column is not None:
-        known = np.isfinite(column.astype(np.float64))
+        known = np.abs(column.astype(np.float64)) < 2.0**63  # false for NaN
         ints[known] = column[known].astype(np.int64)
     return ints
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import io
 import os
 import sys
@@ -69,7 +70,12 @@ class QueuedOutput(io.TextIOBase):
 
 
 def queue_output(*names: StreamName) -> None:
-    """Replace these standard streams by queued ones for the rest of the program."""
+    """Replace these standard streams by queued ones until the program ends.
+
+    What they still have is written at exit, after the interpreter has printed the traceback of an error.
+    """
+    atexit.unregister(finish_output)
+    atexit.register(finish_output)
     for name in names:
         stream = getattr(sys, name)
         if not isinstance(stream, QueuedOutput):

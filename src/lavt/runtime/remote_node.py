@@ -121,10 +121,10 @@ class RemoteNodeProxy:
         runtime = self._runtime
         if runtime is None:
             return
-        self._missed += 1
-        if self._missed == SILENT_CHECKS:
+        self._missed = missed = self._missed + 1  # a heartbeat may reset it at any time
+        if missed == SILENT_CHECKS:
             self._on_silent(runtime)
-        if self._missed in {0, FAILED_CHECKS}:
+        if missed in {0, FAILED_CHECKS}:
             runtime.fail(WorkError(f"the process of the {self.name} does not respond"))
 
     def _with_peer(self, send: Send) -> Send:

@@ -2,8 +2,9 @@
 
 A failed drive is a fault, unless the record has a long enough stall at the relevant time. If a machine uses
 its processor fully, ordinary programs of the host get 50 to 60 ms of each second (the kernel's fair server). That is
-recorded as a stall, too. A fault that occupies the processor all the time would be excused by such a stall only if all
-three attempts failed within 200 ms of one. A machine by itself never causes longer stalls, or shares above 6 %.
+recorded as a stall, too, and makes a kit of a machine that is so busy disengage: commands are 20 ms apart, and programs
+wait for each other. A fault that occupies the processor all the time would be excused by such a stall only if all three
+attempts failed within 200 ms of one. A machine by itself never causes longer stalls, or shares above 6 %.
 """
 
 from __future__ import annotations
@@ -21,8 +22,7 @@ from lavt.experiment.analysis.metrics import driving_interval
 MARGIN_MS = 60
 """A stall may be this much shorter than the timeout that it causes: one period of the kit's commands or reports, and
 two more periods on a slow machine."""
-KIT_STALL_MS = KIT_TIMEOUT_MS - 30
-"""Commands are 20 ms apart. Longer than the stalls of a machine that uses its processor fully: those excuse no kit."""
+KIT_STALL_MS = KIT_TIMEOUT_MS - MARGIN_MS
 UNSAMPLED_STALL_MS = 1500
 """Clocks are sampled once a second, and a gap of up to 2.5 s is valid."""
 STALL_MS = {"the clock of the ": UNSAMPLED_STALL_MS, "the clock samples of the ": UNSAMPLED_STALL_MS}
