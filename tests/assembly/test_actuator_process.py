@@ -42,7 +42,7 @@ def serve_stuck(connection: Connection) -> None:
         "build_actuator": lambda *_, **__: StuckNode(),
         "driven_route": lambda *_: None,
         "STOP_TIMEOUT_S": 0.1,
-        "LONGEST_END_S": 1,
+        "KILL_AFTER_S": 1,
     }.items():
         setattr(actuator_process, name, replacement)
     process_priority.raise_priority = lambda *_: None

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from lavt.assembly.addresses import resolved_address
-from lavt.assembly.links import injected
+from lavt.assembly.links import link_injection
 from lavt.cli import console
 from lavt.clock import MachineClock
 from lavt.config import DelayConfig, ImpairmentConfig, LinkConfig, RelayConfig
@@ -90,7 +90,7 @@ def _link_injection(name: str, config: DelayConfig, seed: int) -> LinkInjection 
     if config.link == LinkConfig():
         return None
     impairment = ImpairmentConfig(**config.link.model_dump(exclude={"delay_ms"}))
-    return injected(name, config.link.delay_ms, impairment, seed) or LinkInjection(
+    return link_injection(name, config.link.delay_ms, impairment, seed) or LinkInjection(
         Impairment(delay_ms=config.link.delay_ms), seed, name
     )
 
