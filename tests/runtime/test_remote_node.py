@@ -21,7 +21,7 @@ from lavt.node import WAKE, Message, Send, Stage
 from lavt.nodes.payloads import StationaryStatus
 from lavt.runtime.pipe import CAPACITY, Pipe
 from lavt.runtime.realtime import RealRuntime
-from lavt.runtime.remote_node import FAILED_CHECKS, LATE_NS, START_CHECKS, NodeHost, RemoteNodeProxy
+from lavt.runtime.remote_node import FAILED_AFTER_CHECKS, FIRST_HEARTBEAT_CHECKS, LATE_NS, NodeHost, RemoteNodeProxy
 
 pytestmark = pytest.mark.usefixtures("own_switch_interval")
 
@@ -249,7 +249,7 @@ def test_a_remote_node_without_a_heartbeat_fails_the_run() -> None:
     with rig() as both:
         for _ in range(3):
             beat(both)
-            for _ in range(FAILED_CHECKS - 1):
+            for _ in range(FAILED_AFTER_CHECKS - 1):
                 both.proxy.check_heartbeat()
         assert both.silences == [both.main] * 3
         assert both.main.failed is None
@@ -263,7 +263,7 @@ def test_a_remote_node_without_a_heartbeat_fails_the_run() -> None:
 def test_the_first_heartbeat_may_take_longer() -> None:
     """Before the first heartbeat a node has 30 s; then the run fails."""
     with rig() as both:
-        for _ in range(START_CHECKS - 1):
+        for _ in range(FIRST_HEARTBEAT_CHECKS - 1):
             both.proxy.check_heartbeat()
         assert (both.silences, both.main.failed) == ([], None)
         both.proxy.check_heartbeat()
