@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from lavt import clock
-from lavt.clock import ATTEMPTS, MachineClock
+from lavt.clock import MAX_ATTEMPTS, MachineClock
 from lavt.domain import NS_PER_MS, Now
 
 
@@ -32,4 +32,4 @@ def test_the_last_attempt_is_returned(monkeypatch: pytest.MonkeyPatch) -> None:
     mono_ns, wall_ns = (iter(range(0, 100 * NS_PER_MS, NS_PER_MS)) for _ in range(2))
     monkeypatch.setattr(clock, "time", FakeTime(mono_ns, wall_ns))
 
-    assert MachineClock().now() == Now(ATTEMPTS * NS_PER_MS, (ATTEMPTS - 1) * NS_PER_MS)
+    assert MachineClock().now() == Now(MAX_ATTEMPTS * NS_PER_MS, (MAX_ATTEMPTS - 1) * NS_PER_MS)

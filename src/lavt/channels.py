@@ -1,4 +1,4 @@
-"""The table of all channels: sender, receivers, carrier, and how messages wait."""
+"""The table of all channels: who sends and receives each, what carries its messages, and how they wait."""
 
 from __future__ import annotations
 
@@ -7,17 +7,19 @@ from typing import Literal
 
 Carrier = Literal["local", "video", "zenoh", "probe", "clock", "netem", "record"]
 """local: between nodes of one side. video: the UDP flow of the video. zenoh: a key or a query. probe: the UDP flow of
-the clock probes. clock: the host's time source. netem: the host's queues. record: recorded only, without a receiver."""
+the clock probes. clock: the host's time source. netem: the host's network queues. record: recorded only, without a
+receiver."""
 
 Waiting = Literal["queue", "newest"]
-"""queue: in order; when full, the oldest is dropped. newest: a new message replaces the waiting one."""
+"""queue: messages are received in order; a full queue drops its oldest message. newest: a new message replaces the
+waiting one."""
 
 QUEUE_LENGTH = 4096
 """More than a second of packets."""
 COMMAND_QUEUE_LENGTH = 64
-"""A second of commands: older ones would be rejected anyway."""
+"""The commands of a second: older ones would be rejected anyway."""
 PROBE_QUEUE_LENGTH = 64
-"""A probe that waits for more than a few others is of little use."""
+"""A probe that waits behind more than a few others measures little but its own wait."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +33,8 @@ class Channel:
     length: int = QUEUE_LENGTH
     """Capacity of the queue."""
     inline: bool = False
-    """In real time the delivering thread runs the receiver's pipeline: for short and frequent pipelines."""
+    """In real time, the thread that delivers a message runs the receiver's pipeline; this suits short and frequent
+    pipelines."""
 
 
 CHANNELS: dict[str, Channel] = {
@@ -39,7 +42,8 @@ CHANNELS: dict[str, Channel] = {
     "pose": Channel("local", "actuator", ("camera",), "newest", inline=True),
     "frame": Channel("local", "camera", ("actuator",), inline=True),
     "video_token": Channel("local", "actuator", ("camera",)),
-    "rest": Channel("local", "actuator", ("injection",)),  # queues with the requests: a flood of them must not hide it
+    # A queue, because queues are served first: a flood of requests would delay a status that waits as "newest".
+    "rest": Channel("local", "actuator", ("injection",)),
     "server_ends": Channel("local", "operator", ("actuator",)),  # stops the vehicle before a server shutdown
     # client, between its nodes
     "access_unit": Channel("local", "receiver", ("driver",)),
@@ -57,12 +61,12 @@ CHANNELS: dict[str, Channel] = {
     "session_reply": Channel("zenoh", "actuator", ("driver",)),
     "netem": Channel("zenoh", "injection", ("injection",), length=COMMAND_QUEUE_LENGTH),
     "netem_reply": Channel("zenoh", "injection", ("injection",), length=COMMAND_QUEUE_LENGTH),
-    # clocks: the time source of each host, and probes between client and server
+    # clocks: the time source of each host, and the probes between client and server
     "probe_request": Channel("probe", "clock_sync", ("clock_sync",), length=PROBE_QUEUE_LENGTH),
     "probe_reply": Channel("probe", "clock_sync", ("clock_sync",), length=PROBE_QUEUE_LENGTH),
     "clock_query": Channel("clock", "clock_sync"),
     "clock_report": Channel("local", "clock_source", ("clock_sync",)),
-    # the queues of each host
+    # the network queues of each host
     "inject": Channel("netem", "injection"),
     "injected": Channel("local", "injector", ("injection",)),
     # recorded only

@@ -25,17 +25,18 @@ def _shortest_gap_ns() -> int:
 
 
 SIMULTANEOUS_NS = max(100_000, 3 * _shortest_gap_ns())
-"""Readings within this time count as simultaneous; a user-mode kernel needs more than 50 us for each."""
-ATTEMPTS = 4
+"""Two readings within this time count as simultaneous. It depends on the machine, because a reading takes more than
+50 us on a kernel that runs in user mode."""
+MAX_ATTEMPTS = 4
 
 
 class MachineClock:
     """The clocks of this machine."""
 
     def now(self) -> Now:
-        """Return a simultaneous reading of both clocks; repeat it if it was interrupted, up to `ATTEMPTS` times."""
+        """Return a simultaneous reading of both clocks; repeat an interrupted one, up to `MAX_ATTEMPTS` in all."""
         mono_ns = time.monotonic_ns()
-        for _ in range(ATTEMPTS):
+        for _ in range(MAX_ATTEMPTS):
             wall_ns = time.time_ns()
             before_ns, mono_ns = mono_ns, time.monotonic_ns()
             if mono_ns - before_ns <= SIMULTANEOUS_NS:
@@ -44,17 +45,17 @@ class MachineClock:
 
 
 def pause(duration_ns: int) -> None:
-    """Sleep for `duration_ns`; for the outermost loops of programs only."""
+    """Sleep for `duration_ns`; only the outermost loops of programs may call this."""
     if duration_ns > 0:
         time.sleep(duration_ns / NS_PER_S)
 
 
 def wall_time_ns(calendar_time: str) -> int:
-    """Return the wall clock time of a date and time with an offset, as `calendar_time` writes it; else `ValueError`."""
-    time = datetime.fromisoformat(calendar_time)
-    if time.tzinfo is None:
+    """Return the wall clock time of a date and time in ISO 8601; raise `ValueError` without an offset from UTC."""
+    moment = datetime.fromisoformat(calendar_time)
+    if moment.tzinfo is None:
         raise ValueError("no offset from UTC")
-    return round(time.timestamp()) * NS_PER_S
+    return round(moment.timestamp()) * NS_PER_S
 
 
 def calendar_time(wall_ns: int) -> datetime:

@@ -1,4 +1,4 @@
-"""Reading of configs from YAML files and `--set` changes; every error is reported in one sentence."""
+"""Reading of configs from YAML files and `--set` changes; each error is one sentence."""
 
 from __future__ import annotations
 
@@ -58,13 +58,13 @@ def read_yaml(path: Path) -> dict[str, Any]:
     return data
 
 
-def parse_yaml(text: str, where: str) -> Any:
-    """Parse YAML; raise `UserError`, which names the source `where`, for invalid text."""
+def parse_yaml(text: str, source: str) -> Any:
+    """Parse YAML; for invalid text raise `UserError`, whose sentence names `source`, the origin of the text."""
     try:
         return yaml.safe_load(text)
     except (yaml.YAMLError, ValueError, AttributeError, RecursionError) as error:
         # besides its own error, the library raises others for impossible dates, bad numbers and deep nesting
-        raise UserError(f"{where} is not YAML: {' '.join(str(error).split())}") from error
+        raise UserError(f"{source} is not YAML: {' '.join(str(error).split())}") from error
 
 
 def split_change(change: str) -> tuple[list[str], Any]:
@@ -76,12 +76,12 @@ def split_change(change: str) -> tuple[list[str], Any]:
     return parts, parse_yaml(text, f"--set {change!r}: the value")
 
 
-def parse_config(kind: type[Config], data: Mapping[str, Any], where: str) -> Config:
-    """Validate `data` against the schema of `kind`; `where` names the source of the data in errors."""
+def parse_config(kind: type[Config], data: Mapping[str, Any], source: str) -> Config:
+    """Validate `data` against the schema of `kind`; `source` is the origin of the data, which errors name."""
     try:
         return kind.model_validate(_with_tuples(kind, data))
     except ValidationError as error:
-        raise UserError(f"{where}: " + "; ".join(_describe(kind, problem) for problem in error.errors())) from error
+        raise UserError(f"{source}: " + "; ".join(_describe(kind, problem) for problem in error.errors())) from error
 
 
 @functools.cache
@@ -113,10 +113,10 @@ def _with_tuples(kind: type[BaseModel], data: Mapping[str, Any]) -> dict[str, An
     converted = dict(data)
     for name, field in kind.model_fields.items():
         value = converted.get(name)
-        section = field.annotation
-        if isinstance(value, dict) and isinstance(section, type) and issubclass(section, BaseModel):
-            converted[name] = _with_tuples(section, value)
-        elif isinstance(value, list) and typing.get_origin(section) is tuple:
+        annotation = field.annotation
+        if isinstance(value, dict) and isinstance(annotation, type) and issubclass(annotation, BaseModel):
+            converted[name] = _with_tuples(annotation, value)
+        elif isinstance(value, list) and typing.get_origin(annotation) is tuple:
             converted[name] = tuple(value)
     return converted
 
@@ -127,16 +127,18 @@ def _describe(kind: type[BaseModel], problem: Any) -> str:
     key = ".".join(location)
     if problem["type"] == "extra_forbidden":
         known = _keys(kind, location[:-1])
-        near = [name for name in known if name.startswith(location[-1])]  # the unit was left out
-        near = near or difflib.get_close_matches(location[-1], known, n=1, cutoff=0.4)
-        hint = f"did you mean {near[0]!r}?" if near else f"known keys are {', '.join(sorted(known))}"
+        similar = [name for name in known if name.startswith(location[-1])]  # the user left out the unit
+        similar = similar or difflib.get_close_matches(location[-1], known, n=1, cutoff=0.4)
+        hint = f"did you mean {similar[0]!r}?" if similar else f"known keys are {', '.join(sorted(known))}"
         return f"unknown key {key!r}: {hint}"
     if problem["type"] == "missing":
         return f"{key!r} is missing"
     if problem["type"] == "float_type" and (number := _parse_float(problem["input"])) is not None:
         return f"{key!r}: YAML reads {problem['input']} as text: write {problem['input']} as {number!r}"
-    message = str(problem["msg"]).removeprefix("Value error, ")  # pydantic's prefix of our validators' messages
-    if not key:  # a validator of several keys
+    message = str(problem["msg"]).removeprefix(
+        "Value error, "
+    )  # pydantic puts this before the messages of our validators
+    if not key:  # a validator that checks several keys together
         return message
     return f"{key!r}: {message}, not {problem['input']!r}"
 

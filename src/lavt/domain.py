@@ -16,8 +16,8 @@ Picture = NDArray[np.uint8]
 """An image: (height, width, 3), blue green red, 0 to 255."""
 
 FramePayload = Any
-"""Opaque payload of a frame, from camera to detector: a `Picture` or, if nothing is rendered, a `SeenLane`. Only these
-two and the frame codec read it."""
+"""The content of a frame from camera to detector: a `Picture` or, if nothing is rendered, a `SeenLane`. Only camera,
+frame codec and detector look into it."""
 
 FloatArray = NDArray[np.float64]
 
@@ -26,8 +26,8 @@ NS_PER_MS = 1_000_000
 NS_PER_US = 1_000
 
 PATH_STEP_M = 2.0
-"""A command contains the curvature of its planned path at 2, 4, .. 20 m ahead of the rear axle."""
 PATH_POINTS = 10
+"""A command contains the curvature of its planned path at 2, 4, ..., 20 m ahead of the rear axle."""
 
 
 class Now(Struct, frozen=True):
@@ -37,7 +37,7 @@ class Now(Struct, frozen=True):
     wall_ns: int
 
     def later(self, duration_ns: int) -> Now:
-        """Return the reading `duration_ns` later, without a step of the wall clock."""
+        """Return the reading that follows after `duration_ns` if the wall clock is not stepped."""
         return Now(self.mono_ns + duration_ns, self.wall_ns + duration_ns)
 
 
@@ -66,11 +66,11 @@ class VehicleState(Struct, frozen=True):
     steering_rad: float
     gear: Literal["park", "reverse", "neutral", "drive"]
     inhibit_reason: str = ""
-    """Why the vehicle does not accept commands; empty: it does."""
+    """Why the vehicle does not accept commands; empty: it accepts them."""
     is_engaged: bool = True
-    """The vehicle executes commands; engaging may take time after `Vehicle.engage`."""
+    """Whether the vehicle executes commands; engaging may take time after `Vehicle.engage`."""
     is_overridden: bool = False
-    """A driver in the car has taken over: no command reaches the wheels."""
+    """Whether the driver in the car has taken over, so that no command reaches the wheels."""
     is_speed_plausible: bool = True
     """False: `speed_mps` may be wrong, and the car may move even if it is 0."""
 
@@ -144,10 +144,10 @@ class Lane(Struct, frozen=True):
 
 
 class SeenLane(Struct, frozen=True):
-    """The substitute of a picture if nothing is rendered: the lane that would be visible in it."""
+    """The lane that would be visible in a picture; it replaces the picture if nothing is rendered."""
 
     stamp_ns: int
-    """0 until it is stamped."""
+    """0 until the frame is stamped."""
     at_ns: int
     """Capture time (server's monotonic clock)."""
     lane: Lane
@@ -167,7 +167,7 @@ class Decision(Struct, frozen=True):
 
 Mode = Literal["arm", "drive", "stop"]
 Operation = Literal["acquire", "request_handover", "release", "emergency_stop", "clear_emergency_stop"]
-"""hold: acquire control. ask: request a handover from the active operator."""
+"""acquire, release: control of the vehicle. request_handover: ask the active operator to release control."""
 SafetyState = Literal["disarmed", "arming", "driving", "degraded", "safe_stop", "emergency_stop"]
 
 
@@ -179,7 +179,7 @@ class Command(Struct, frozen=True):
     sent_wall_ns: int
     """Send time on the client's wall clock, for latency measurement only."""
     stamp_ns: int
-    """Stamp of the newest picture this command was made from; 0: none."""
+    """Stamp of the newest picture from which this command was made; 0: none."""
     stamp_received_wall_ns: int
     """When the client read that stamp, on its wall clock."""
     steering_rad: float
@@ -188,7 +188,7 @@ class Command(Struct, frozen=True):
     path_curvature_per_m: tuple[float, ...]
     mode: Mode
     emergency_stop: int
-    """0, or the number of an emergency stop; numbers only grow."""
+    """0: no emergency stop. Otherwise its number; a later emergency stop has a higher one."""
 
 
 class State(Struct, frozen=True):
@@ -206,15 +206,15 @@ class State(Struct, frozen=True):
     applied_sequence: int
     """Sequence number of the last accepted command; -1: none in this epoch."""
     rejected: str
-    """Why the last command was rejected, for 1 s; empty: none was."""
+    """Why the last rejected command was rejected, for 1 s after the rejection; otherwise empty."""
     limited: str = ""
-    """Names of the limits that changed the last accepted command; empty: none did."""
+    """Names of the limits that changed the last accepted command; empty: no limit changed it."""
     active_operator: str = ""
-    """Name of the client that has control; empty: none has."""
+    """Name of the client that has control; empty: no client has control."""
     active_operator_instance: int = 0
     """`SessionRequest.instance` of that client, which distinguishes clients of the same name."""
     requested_by: str = ""
-    """Name of the client that requests a handover; empty: none does."""
+    """Name of the client that requests a handover; empty: no client requests one."""
     instance: int = 0
     """Random number of the server process."""
 
@@ -231,7 +231,7 @@ class SessionRequest(Struct, frozen=True):
 
 
 class NetemRequest(Struct, frozen=True):
-    """A client's request to the server: the impairment of what the vehicle's machine sends, and for how long."""
+    """A client's request to the server: how to impair the packets of the vehicle's machine, and for how long."""
 
     who: str
     instance: int
@@ -239,7 +239,7 @@ class NetemRequest(Struct, frozen=True):
     condition: str
     """Name of the condition, for the records."""
     lease_ms: int
-    """Without another request, all impairments are removed after this time."""
+    """Without a further request, all impairments are removed after this time."""
     delay_ms: float
     jitter_ms: float
     jitter_correlation: float
@@ -249,7 +249,7 @@ class NetemRequest(Struct, frozen=True):
     rate_bps: int
     reorder: float
     state_delay_ms: float
-    """Delay of states and replies; the fields above apply to the video."""
+    """Delay of states and replies; the impairments in the fields above apply to the video."""
 
 
 class NetemReply(Struct, frozen=True):
@@ -266,7 +266,7 @@ class SessionReply(Struct, frozen=True):
     reason: str
     epoch: int
     token: bytes
-    """Validates the video path (16 bytes); empty if rejected."""
+    """Validates the video path (16 bytes); empty for a client without control."""
     video_port: int
     host: str
     """Identity of the server's kernel: processes on the same kernel share its clocks."""

@@ -25,7 +25,7 @@ class WorkError(LavtError):
 
 
 class PeerError(LavtError):
-    """Bytes from the network are invalid; the caller counts the error and continues."""
+    """Bytes from the network are invalid; the caller counts this error, drops the bytes and continues."""
 
 
 class BadMessage(PeerError):

@@ -1,7 +1,8 @@
 """The interface of a node: pipelines of stages, without input, output or a clock of its own.
 
-A runtime passes a message with its arrival time through the stages of a pipeline, each with its own `now`, sends the
-result of the last stage, and wakes the node when it is due. The same node objects run in real and in virtual time.
+A runtime passes a message with its arrival time through the stages of a pipeline and sends the result of the last one.
+Each stage gets the time at which it starts as `now`. The runtime also wakes the node at the times that it requests. The
+same node objects run in real and in virtual time.
 """
 
 from __future__ import annotations
@@ -14,10 +15,10 @@ from msgspec import Struct
 from lavt.domain import Now
 
 Peer = Any
-"""Opaque: the sender of a message, to which a reply can be sent (an address, a query). Only links read it."""
+"""The sender of a message, to which a reply can be sent: an address or a query. Only links look into it."""
 
 WAKE = "wake"
-"""The channel of a node's wakes; its payload is None."""
+"""The channel on which a runtime wakes a node; the payload is None."""
 
 
 class Message(Struct, frozen=True):
@@ -44,7 +45,7 @@ Stage = tuple[str, Callable[[Any, Now], Any]]
 """A name and a function of (result of the previous stage, now).
 
 The first stage of a pipeline gets the `Message`. A stage that returns None ends the pipeline; the last stage returns
-the list of `Send`s. If a result has an attribute `stamp_ns`, the timeline is recorded under that stamp.
+the list of `Send`s. If a result has an attribute `stamp_ns`, the end times of the stages are recorded with that stamp.
 """
 
 

@@ -1,7 +1,8 @@
-"""Named random streams of one seed.
+"""Named random-number streams, which are derived from one seed.
 
-A stream is indexed by the subject of its values (a frame number, a packet number). So value 17 of "video jitter" does
-not depend on other draws, and a new stream does not change the others: runs with the same seed stay paired.
+The entries of a stream have an index, such as a frame number or a packet number. Entry 17 of "video jitter" does not
+depend on what else was drawn, and a new stream does not change the others. So runs with the same seed can be compared
+in pairs.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ def stream(seed: int, name: str, index: int = 0) -> np.random.Generator:
 
 
 class IndexedStream:
-    """The stream `name` of `seed` for many entries: equal to `stream`, in a tenth of the time.
+    """The stream `name` of `seed` for many entries; it returns what `stream` does, in a tenth of the time.
 
     The generator that `at` returns is valid until the next call.
     """

@@ -42,7 +42,7 @@ def serve_stuck(connection: Connection) -> None:
         "build_actuator": lambda *_, **__: StuckNode(),
         "driven_route": lambda *_: None,
         "STOP_TIMEOUT_S": 0.1,
-        "LONGEST_END_S": 1,
+        "KILL_AFTER_S": 1,
     }.items():
         setattr(actuator_process, name, replacement)
     process_priority.raise_priority = lambda *_: None
@@ -53,13 +53,13 @@ def serve_stuck(connection: Connection) -> None:
 def test_a_stuck_actuator_does_not_outlive_its_server() -> None:
     """An actuator whose node never returns is killed soon after its server has ended."""
     context = multiprocessing.get_context("spawn")
-    ours, theirs = context.Pipe()
-    process = context.Process(target=serve_stuck, args=(theirs,))
+    own_end, actuator_end = context.Pipe()
+    process = context.Process(target=serve_stuck, args=(actuator_end,))
     process.start()
-    theirs.close()
+    actuator_end.close()
     try:
-        assert ours.recv() is None
-        ours.close()
+        assert own_end.recv() is None
+        own_end.close()
         process.join(60)
         assert process.exitcode == -signal.SIGALRM
     finally:

@@ -54,7 +54,7 @@ def test_run_seed(seed: int, route: str, repetition: int) -> None:
 
 def test_run_seeds_differ() -> None:
     """Different seeds, routes and repetitions give different seeds of runs."""
-    seeds = {run_seed(seed, route, again) for seed in range(5) for route in ("a", "b", "a 1") for again in range(50)}
+    seeds = {run_seed(seed, route, number) for seed in range(5) for route in ("a", "b", "a 1") for number in range(50)}
     assert len(seeds) == 5 * 3 * 50
 
 

@@ -18,6 +18,7 @@ from lavt.vehicle.dbw.profile import Profile
 
 @pytest.fixture
 def known() -> Profile:
+    """Return a profile with a known steering sign and only verified signals."""
     return load_profile("dataspeed_gen1", steering_sign=1)
 
 
@@ -73,7 +74,7 @@ def test_a_brake_too_weak_for_a_safe_stop_inhibits_arming(known: Profile, limit:
 
 @pytest.mark.parametrize("name", ["dataspeed_gen1", "dataspeed_gen2"])
 def test_a_kit_that_is_off_and_has_no_proof_has_a_readable_state(known: Profile, name: str) -> None:
-    """A state can be decoded that says that the kit is off and that its watchdog has not been tested."""
+    """The state of a kit that is off and has no watchdog proof can be decoded, with the beginning of its reasons."""
     profile = load_profile(name, steering_sign=1)
     adapter = ByWireAdapter(profile, start_ns=0, inhibit_reason=reason_for(REAL, known))
     adapter.frames_due(NS_PER_S)

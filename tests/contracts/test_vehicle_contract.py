@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.nodes.stand_ins import MONO_NS, FakeVehicle
 
-from lavt.assembly.by_wire import inside
+from lavt.assembly.by_wire import build_inside
 from lavt.config import DbwConfig, ServerConfig, VehicleConfig
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation, Now
 from lavt.vehicle.sim.road.road import load_road
@@ -24,7 +24,7 @@ BRAKE = Actuation(0.0, 0.0, 1.0)
 
 def by_wire(profile: str) -> Vehicle:
     dbw = DbwConfig(profile=profile, interface="inside", steering_sign=1)
-    return inside(ServerConfig(vehicle=VehicleConfig(kind="dbw", dbw=dbw)), ROAD, Now(MONO_NS, 0))
+    return build_inside(ServerConfig(vehicle=VehicleConfig(kind="dbw", dbw=dbw)), ROAD, Now(MONO_NS, 0))
 
 
 DRIVABLE: dict[str, Callable[[], Vehicle]] = {

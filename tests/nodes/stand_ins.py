@@ -33,19 +33,19 @@ CAPABILITIES = Capabilities(
 
 
 def at(mono_ns: int, wall_ns: int | None = None) -> Now:
-    """Return a clock reading `mono_ns` after the start; the wall clock is in step unless `wall_ns` is given."""
+    """Return a clock reading `mono_ns` after the start; the wall clock has advanced as much, or by `wall_ns`."""
     return Now(MONO_NS + mono_ns, WALL_NS + (mono_ns if wall_ns is None else wall_ns))
 
 
-def give(
+def deliver(
     node: Node, channel: str, payload: Any, now: Now, peer: Any = None, *, arrived: Now | None = None
 ) -> list[Send]:
-    """Send one message through a node whose stages take no time, and return its sends."""
+    """Deliver one message to a node whose stages take no time, and return the messages that the node sends."""
     message = Message(channel, payload, arrived or now, peer)
     return run_stages(node.name, node.pipelines[channel], message, now, repeat(now)).sends
 
 
-def of(sends: list[Send], channel: str) -> list[Any]:
+def payloads(sends: list[Send], channel: str) -> list[Any]:
     """Return the payloads on one channel."""
     return [send.payload for send in sends if send.channel == channel]
 
@@ -65,10 +65,10 @@ class NoiseCamera:
     broken: bool = False
     stuck: Picture | None = None
     """The picture to return each time."""
-    requested: list[tuple[int, int, Pose | None]] = field(default_factory=list)
+    captures: list[tuple[int, int, Pose | None]] = field(default_factory=list)
 
     def capture(self, number: int, at_ns: int, pose: Pose | None) -> CapturedFrame | None:
-        self.requested.append((number, at_ns, pose))
+        self.captures.append((number, at_ns, pose))
         if self.broken:
             return None
         return CapturedFrame(number, at_ns, noise(number, self.model) if self.stuck is None else self.stuck)

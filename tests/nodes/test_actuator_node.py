@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
-from tests.nodes.stand_ins import MONO_NS, FakeVehicle, at, give, of
+from tests.nodes.stand_ins import MONO_NS, FakeVehicle, at, deliver, payloads
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Command, EventKind, SessionReply, SessionRequest, State, VehicleEvent
 from lavt.node import WAKE, Send
@@ -23,7 +23,8 @@ from lavt.transport.messages import ELLIPSIS, decode, encode
 from lavt.vehicle.camera import FrameTimes
 from lavt.vehicle.vehicle import ReachedCommand
 
-TICK_NS = 20 * NS_PER_MS
+PERIOD_NS = 20 * NS_PER_MS
+"""The period of states, and of the commands of the test bench."""
 
 
 class Bench:
@@ -52,22 +53,22 @@ class Bench:
         self.epoch = 0
         self.sends: list[Send] = []
 
-    def take(self, channel: str, payload: Any, **where: Any) -> list[Send]:
-        sends = give(self.node, channel, payload, at(self.mono_ns), **where)
+    def deliver(self, channel: str, payload: Any, **where: Any) -> list[Send]:
+        sends = deliver(self.node, channel, payload, at(self.mono_ns), **where)
         self.sends += sends
         return sends
 
-    def go(self, duration_ns: int) -> list[Send]:
+    def advance(self, duration_ns: int) -> list[Send]:
         """Let time pass, and wake the node whenever it is due."""
         end_ns, sends = self.mono_ns + duration_ns, []
         while (wake_ns := self.node.next_wake_ns() - MONO_NS) <= end_ns:
             self.mono_ns = max(self.mono_ns, wake_ns)
-            sends += self.take(WAKE, None)
+            sends += self.deliver(WAKE, None)
         self.mono_ns = end_ns
         return sends
 
     def request(self, operation: Any, number: int = 0) -> SessionReply:
-        sends = self.take("session", encode(SessionRequest(operation, "alice", 1, number)), peer="query")
+        sends = self.deliver("session", encode(SessionRequest(operation, "alice", 1, number)), peer="query")
         (reply,) = [decode(SessionReply, send.payload) for send in sends if send.peer == "query"]
         self.epoch = reply.epoch or self.epoch
         return reply
@@ -75,14 +76,14 @@ class Bench:
     def picture(self) -> int:
         stamp_ns = at(self.mono_ns).wall_ns
         number = self.mono_ns // NS_PER_MS
-        self.take("frame", FrameWritten(number, stamp_ns, at(self.mono_ns).mono_ns, None, number, 1))
+        self.deliver("frame", FrameWritten(number, stamp_ns, at(self.mono_ns).mono_ns, None, number, 1))
         return stamp_ns
 
     def command(self, **changes: Any) -> Admission:
         self.sequence += 1
         stamp_ns = self.picture()
         command = Command(self.epoch, self.sequence, 11, stamp_ns, 22, 0.0, 0.0, 1.0, (0.0,) * 10, "arm", 0)
-        (admission,) = of(self.take("control", encode(replace(command, **changes))), "admission")
+        (admission,) = payloads(self.deliver("control", encode(replace(command, **changes))), "admission")
         assert isinstance(admission, Admission)
         return admission
 
@@ -96,19 +97,19 @@ class Bench:
     def armed(self) -> Bench:
         self.request("acquire")
         for _ in range(51):
-            self.go(TICK_NS)
+            self.advance(PERIOD_NS)
             self.command()
         assert self.gate.state == "driving"
         return self
 
     def events(self, kind: str) -> list[str]:
-        return [event.detail for event in of(self.sends, "event") if event.kind == kind]
+        return [event.detail for event in payloads(self.sends, "event") if event.kind == kind]
 
 
 def test_the_state_is_published_50_times_a_second() -> None:
     """The state is published 50 times a second, with the vehicle's own time and the safety state."""
     bench = Bench()
-    states = [decode(State, payload) for payload in of(bench.go(NS_PER_S - 1), "state")]
+    states = [decode(State, payload) for payload in payloads(bench.advance(NS_PER_S - 1), "state")]
     assert len(states) == 50
     assert {state.safety for state in states} == {"disarmed"}
     assert [state.state_mono_ns for state in states] == sorted(state.state_mono_ns for state in states)
@@ -120,7 +121,7 @@ def test_lazy_physics_advances_before_each_frame() -> None:
     bench, woken = Bench(sample_times=[frames]), []
     while (wake_ns := bench.node.next_wake_ns()) < MONO_NS + NS_PER_S:
         bench.mono_ns = wake_ns - MONO_NS
-        bench.take(WAKE, None)
+        bench.deliver(WAKE, None)
         woken.append(wake_ns)
         assert bench.vehicle.now_ns == wake_ns
     assert {frames.due_ns(number) - POSE_AHEAD_NS for number in range(30)} <= set(woken)
@@ -131,7 +132,7 @@ def test_a_late_node_publishes_one_state_and_reports_late_physics() -> None:
     """After a stall of 1 s the node publishes one state and reports that physics was late."""
     bench = Bench()
     bench.mono_ns = NS_PER_S
-    assert len(of(bench.take(WAKE, None), "state")) == 1
+    assert len(payloads(bench.deliver(WAKE, None), "state")) == 1
     assert bench.events("late") == ["995 ms"]
     assert bench.node.next_wake_ns() > at(NS_PER_S).mono_ns
 
@@ -170,29 +171,29 @@ def test_a_rejected_command_is_recorded_and_not_applied() -> None:
     assert (admission.verdict, admission.reason) == ("rejected", RejectionReason.WRONG_EPOCH)
     assert admission.applied_mono_ns is None
     assert len(bench.vehicle.applied) == before
-    (state,) = [decode(State, payload) for payload in of(bench.go(TICK_NS), "state")]
+    (state,) = [decode(State, payload) for payload in payloads(bench.advance(PERIOD_NS), "state")]
     assert state.rejected == RejectionReason.WRONG_EPOCH
 
 
 def test_a_command_is_judged_by_its_arrival() -> None:
-    """A command is judged by its arrival on the host; time in the node's queue does not count."""
+    """The gate checks a command at the time of its arrival on the host; its time in the node's queue does not count."""
     bench = Bench().armed()
     arrived = at(bench.mono_ns)
     stamp_ns = bench.picture()
     bench.mono_ns += 10 * NS_PER_MS
     command = Command(bench.epoch, 999, 1, stamp_ns, 2, 0.0, 0.0, 1.0, (0.0,) * 10, "drive", 0)
-    (admission,) = of(bench.take("control", encode(command), arrived=arrived), "admission")
+    (admission,) = payloads(bench.deliver("control", encode(command), arrived=arrived), "admission")
     assert (admission.received_mono_ns, admission.applied_mono_ns) == (arrived.mono_ns, at(bench.mono_ns).mono_ns)
 
 
 def test_without_drive_commands_the_vehicle_does_not_move_and_stops() -> None:
     """Armed without drive commands, the vehicle gets no throttle, degrades at 300 ms and stops at 500 ms."""
     bench = Bench().armed()
-    bench.go(299 * NS_PER_MS)
+    bench.advance(299 * NS_PER_MS)
     assert bench.safety == "driving"
-    bench.go(NS_PER_MS)
+    bench.advance(NS_PER_MS)
     assert bench.safety == "degraded"
-    bench.go(200 * NS_PER_MS)
+    bench.advance(200 * NS_PER_MS)
     assert bench.safety == "safe_stop"
     assert all(requested.throttle == 0 and requested.brake > 0 for requested in bench.vehicle.applied)
 
@@ -202,15 +203,15 @@ def test_a_drive_begins_and_ends_exactly_once() -> None:
     bench = Bench().armed()
     bench.drive()
     bench.vehicle.speed_mps = 8.0
-    bench.go(300 * NS_PER_MS)
+    bench.advance(300 * NS_PER_MS)
     bench.drive()
     assert bench.safety == "driving"
     bench.vehicle.next_events = [VehicleEvent(1, "lane_invasion", "left"), VehicleEvent(2, "completed", "")]
-    bench.go(TICK_NS)
+    bench.advance(PERIOD_NS)
     assert bench.safety == "safe_stop"
     bench.vehicle.next_events = [VehicleEvent(3, "collision", "")]
     bench.vehicle.speed_mps = 0.0
-    bench.go(NS_PER_S)
+    bench.advance(NS_PER_S)
     assert (bench.events("drive_began"), bench.events("ending")) == ([""], ["completed"])
     assert bench.events("lane_invasion") == ["left"]
 
@@ -219,10 +220,10 @@ def test_a_safe_stop_ends_the_drive_at_standstill() -> None:
     """A safe stop ends the drive at standstill; arming again begins a new drive."""
     bench = Bench().armed()
     bench.vehicle.speed_mps = 8.0
-    bench.go(NS_PER_S)
+    bench.advance(NS_PER_S)
     assert bench.events("ending") == []
     bench.vehicle.speed_mps = 0.0
-    bench.go(NS_PER_S)
+    bench.advance(NS_PER_S)
     assert bench.events("ending") == ["safe_stop"]
     bench.armed()
     assert len(bench.events("drive_began")) == 2
@@ -234,11 +235,11 @@ def test_whether_a_collision_ends_the_drive_is_a_setting(
 ) -> None:
     """With `after_collision: continue`, collisions are reported and the drive ends by a later event."""
     bench = Bench(after_collision=after_collision).armed()
-    happening: tuple[EventKind, ...] = ("collision", "collision", "completed")
-    for mono_ns, kind in enumerate(happening):
+    kinds: tuple[EventKind, ...] = ("collision", "collision", "completed")
+    for mono_ns, kind in enumerate(kinds):
         bench.drive()
         bench.vehicle.next_events = [VehicleEvent(mono_ns, kind, "")]
-        bench.go(TICK_NS)
+        bench.advance(PERIOD_NS)
     assert bench.events("ending") == endings
     assert len(bench.events("collision")) == 2
 
@@ -247,7 +248,7 @@ def test_an_event_before_the_drive_ends_no_drive() -> None:
     """An event before the drive is reported and ends no drive."""
     bench = Bench()
     bench.vehicle.next_events = [VehicleEvent(1, "collision", "hit from behind")]
-    bench.go(TICK_NS)
+    bench.advance(PERIOD_NS)
     assert bench.events("collision") == ["hit from behind"]
     assert bench.events("ending") == []
 
@@ -257,9 +258,9 @@ def test_the_token_goes_to_the_camera_when_it_changes() -> None:
     bench = Bench()
     bench.request("acquire")
     bench.request("acquire")
-    assert of(bench.sends, "video_token") == [bytes(16)]
+    assert payloads(bench.sends, "video_token") == [bytes(16)]
     bench.request("release")
-    assert of(bench.sends, "video_token") == [bytes(16), None]
+    assert payloads(bench.sends, "video_token") == [bytes(16), None]
 
 
 def test_transitions_and_requests_are_events() -> None:
@@ -280,7 +281,7 @@ def test_frozen_pictures_stop_the_vehicle_though_they_change_again() -> None:
     for number in range(6):
         stamp_ns = at(bench.mono_ns).wall_ns + number
         crc = -1 if number < 5 else 7
-        bench.take("frame", FrameWritten(5000 + number, stamp_ns, at(bench.mono_ns).mono_ns, None, crc, 1))
+        bench.deliver("frame", FrameWritten(5000 + number, stamp_ns, at(bench.mono_ns).mono_ns, None, crc, 1))
     assert bench.safety == "safe_stop"
 
 
@@ -288,40 +289,40 @@ def test_the_route_is_recorded_once() -> None:
     """The route is recorded once, at the start."""
     route = Route("a_key", 1.0, ((0.0, 0.0),))
     bench = Bench(route)
-    bench.go(NS_PER_S)
-    assert of(bench.sends, "route") == [route]
+    bench.advance(NS_PER_S)
+    assert payloads(bench.sends, "route") == [route]
 
 
 @given(st.binary(max_size=200))
 def test_unreadable_messages_are_counted(data: bytes) -> None:
     """Unreadable commands and requests are counted, not answered, and do not move the vehicle."""
     bench = Bench()
-    assert bench.take("control", data) == []
-    assert bench.take("session", data, peer=3) == []
+    assert bench.deliver("control", data) == []
+    assert bench.deliver("session", data, peer=3) == []
     counts = bench.node.counts
     assert (counts["commands_unreadable"], counts["session_requests_unreadable"]) == (1, 1)
     assert bench.vehicle.applied == []
 
 
 def states(sends: list[Send]) -> list[State]:
-    return [decode(State, payload) for payload in of(sends, "state")]
+    return [decode(State, payload) for payload in payloads(sends, "state")]
 
 
 def test_the_state_names_operator_and_requester() -> None:
     """The state names the active operator and the client that requests control, until that request expires."""
     bench = Bench().armed()
-    bench.take("session", encode(SessionRequest("request_handover", "bob", 7, 0)), peer="query")
-    reported = states(bench.go(2 * NS_PER_S))
+    bench.deliver("session", encode(SessionRequest("request_handover", "bob", 7, 0)), peer="query")
+    reported = states(bench.advance(2 * NS_PER_S))
     assert {(state.active_operator, state.requested_by) for state in reported} == {("alice", "bob")}
-    assert {state.requested_by for state in states(bench.go(NS_PER_S + TICK_NS))[-1:]} == {""}
+    assert {state.requested_by for state in states(bench.advance(NS_PER_S + PERIOD_NS))[-1:]} == {""}
 
 
 def test_a_rejection_is_reported_for_1_s() -> None:
     """The state contains the last rejection reason for 1 s."""
     bench = Bench().armed()
     bench.drive(epoch=99)
-    assert {state.rejected for state in states(bench.go(NS_PER_S - TICK_NS))} == {RejectionReason.WRONG_EPOCH}
-    assert {state.rejected for state in states(bench.go(3 * TICK_NS))[-1:]} == {""}
+    assert {state.rejected for state in states(bench.advance(NS_PER_S - PERIOD_NS))} == {RejectionReason.WRONG_EPOCH}
+    assert {state.rejected for state in states(bench.advance(3 * PERIOD_NS))[-1:]} == {""}
 
 
 @pytest.mark.parametrize("letter", ["a", "ä"])
@@ -329,10 +330,10 @@ def test_a_state_with_a_long_inhibit_reason_is_readable(letter: str) -> None:
     """However long the inhibit reason is, clients can read the state, which contains the reason's beginning."""
     bench = Bench().armed()
     bench.vehicle.inhibit_reason = 300 * letter
-    bench.go(TICK_NS)
+    bench.advance(PERIOD_NS)
     bench.request("acquire")
     bench.command()
-    for state in states(bench.go(2 * TICK_NS)):
+    for state in states(bench.advance(2 * PERIOD_NS)):
         assert state.safety == "safe_stop"
         assert state.reason.endswith(20 * letter + ELLIPSIS)
         assert state.rejected.endswith(20 * letter + ELLIPSIS)
@@ -342,30 +343,30 @@ def test_a_server_shutdown_stops_the_vehicle_and_ends_the_drive() -> None:
     """A server shutdown stops the vehicle, ends control, closes the video path and ends the drive."""
     bench = Bench().armed()
     bench.vehicle.speed_mps = 5.0
-    sends = bench.take("server_ends", None)
-    assert of(sends, "video_token") == [None]
-    last = states(bench.go(TICK_NS))[-1]
+    sends = bench.deliver("server_ends", None)
+    assert payloads(sends, "video_token") == [None]
+    last = states(bench.advance(PERIOD_NS))[-1]
     assert (last.safety, last.active_operator) == ("safe_stop", "")
     assert "shutting down" in last.reason
     assert bench.vehicle.applied[-1].brake > 0
     bench.vehicle.speed_mps = 0.0
-    bench.go(TICK_NS)
+    bench.advance(PERIOD_NS)
     assert bench.events("ending") == ["safe_stop"]
 
 
 def test_the_vehicle_is_engaged_from_arming_to_standstill() -> None:
     """The vehicle is engaged from arming on, until it is stationary after a stop."""
     bench = Bench()
-    bench.go(TICK_NS)
+    bench.advance(PERIOD_NS)
     assert not bench.vehicle.is_engage_requested
     bench.armed()
     bench.drive()
     assert bench.vehicle.is_engage_requested
     bench.vehicle.speed_mps = 5.0
-    bench.go(NS_PER_S)
+    bench.advance(NS_PER_S)
     assert (bench.safety, bench.vehicle.is_engage_requested) == ("safe_stop", True)
     bench.vehicle.speed_mps = 0.0
-    bench.go(TICK_NS)
+    bench.advance(PERIOD_NS)
     assert not bench.vehicle.is_engage_requested
 
 
@@ -374,11 +375,11 @@ def test_commands_that_reached_the_wheels_are_recorded() -> None:
     bench = Bench().armed()
     first, second = bench.drive(), bench.drive(steering_rad=0.1)
     assert first.applied_mono_ns is not None
-    bench.go(TICK_NS)
+    bench.advance(PERIOD_NS)
     applied_ns, reached_ns = second.applied_mono_ns or 0, at(bench.mono_ns).mono_ns
     bench.vehicle.reached = [ReachedCommand(applied_ns + 1, reached_ns)]
-    assert of(bench.go(TICK_NS), "wheel") == []
+    assert payloads(bench.advance(PERIOD_NS), "wheel") == []
     third = bench.drive()
     bench.vehicle.reached = [ReachedCommand(third.applied_mono_ns or 0, reached_ns)] * 2
-    reported = of(bench.go(TICK_NS), "wheel")
+    reported = payloads(bench.advance(PERIOD_NS), "wheel")
     assert reported == [AtWheel(third.sequence, third.stamp_ns, third.applied_mono_ns or 0, reached_ns)]

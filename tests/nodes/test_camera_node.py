@@ -5,7 +5,7 @@ from itertools import count
 from pathlib import Path
 
 import pytest
-from tests.nodes.stand_ins import MONO_NS, SMALL, NoiseCamera, at, give, noise, of
+from tests.nodes.stand_ins import MONO_NS, SMALL, NoiseCamera, at, deliver, noise, payloads
 from tests.support.clocks import ManualClock
 from tests.vehicle.moving_video import MODEL as MOVING
 from tests.vehicle.moving_video import number_of, write_video
@@ -58,25 +58,25 @@ def node_with(camera: Camera | None = None, *, send_to: tuple[tuple[str, int], .
 
 
 def wake(node: CameraNode, mono_ns: int, wall_ns: int | None = None) -> list[Send]:
-    return give(node, WAKE, None, at(mono_ns, wall_ns))
+    return deliver(node, WAKE, None, at(mono_ns, wall_ns))
 
 
 def validate_path(node: CameraNode, address: tuple[str, int] = HOME, mono_ns: int = 0) -> None:
     client = PathClient(TOKEN)
-    (challenge,) = of(give(node, "feedback", client.hello(0), at(mono_ns), address), "rtp")
-    assert give(node, "feedback", client.answer(challenge), at(mono_ns), address) == []
+    (challenge,) = payloads(deliver(node, "feedback", client.hello(0), at(mono_ns), address), "rtp")
+    assert deliver(node, "feedback", client.answer(challenge), at(mono_ns), address) == []
 
 
 def test_a_frame_is_sent_reported_and_recorded() -> None:
     """A frame is sent as packets with its RTP timestamp and reported with its stamp and size."""
     node = node_with(send_to=(HOME,))
     sends = wake(node, 0, wall_ns=123_456_789)
-    (frame,) = of(sends, "frame")
-    (unit,) = of(sends, "video")
+    (frame,) = payloads(sends, "frame")
+    (unit,) = payloads(sends, "video")
     assert (frame.number, frame.stamped_mono_ns, frame.capture_ns) == (0, MONO_NS, MONO_NS)
     assert frame.stamp_ns == unit.stamp_ns == at(0, 123_456_789).wall_ns
     assert frame.size_bytes == len(unit.data)
-    packets = [packet for packet in of(sends, "rtp") if not is_rtcp(packet)]
+    packets = [packet for packet in payloads(sends, "rtp") if not is_rtcp(packet)]
     assert {parse_packet(packet).timestamp for packet in packets} == {rtp_timestamp(frame.stamp_ns)}
 
 
@@ -95,7 +95,7 @@ def test_a_late_wake_skips_frames_and_counts_them() -> None:
     assert node.next_wake_ns() == MONO_NS + 5
     wake(node, 5)
     wake(node, 4 * FRAME_NS + 10 * NS_PER_MS)
-    assert [(number, at_ns) for number, at_ns, _ in camera.requested] == [
+    assert [(number, at_ns) for number, at_ns, _ in camera.captures] == [
         (0, MONO_NS + 5),
         (4, MONO_NS + 5 + round(4 * NS_PER_S / 30)),
     ]
@@ -109,27 +109,32 @@ def test_the_newest_pose_before_the_capture_is_used() -> None:
     node = node_with(camera)
     poses = [Pose(MONO_NS + offset_ns, 0.0, 0.0, 0.0) for offset_ns in (-5, -1, 0, 1, 7)]
     for pose in poses:
-        give(node, "pose", pose, at(10))
+        deliver(node, "pose", pose, at(10))
     wake(node, 10)
-    assert camera.requested[0][2] is poses[2]
+    assert camera.captures[0][2] is poses[2]
 
 
 def test_a_later_pose_is_not_used() -> None:
     """Poses later than the due time are not used."""
     camera = NoiseCamera()
     node = node_with(camera)
-    give(node, "pose", Pose(MONO_NS + 1, 0.0, 0.0, 0.0), at(2))
+    deliver(node, "pose", Pose(MONO_NS + 1, 0.0, 0.0, 0.0), at(2))
     wake(node, 2)
-    assert camera.requested[0][2] is None
+    assert camera.captures[0][2] is None
 
 
-@pytest.mark.parametrize("walls_ns", [[7] * 6, [7, 7, 8, 7, 8, 9], [1000, 1001, 1002, 1000, 1001, 1002]])
-def test_no_stamp_is_issued_twice(walls_ns: list[int]) -> None:
+@pytest.mark.parametrize("wall_times_ns", [[7] * 6, [7, 7, 8, 7, 8, 9], [1000, 1001, 1002, 1000, 1001, 1002]])
+def test_no_stamp_is_issued_twice(wall_times_ns: list[int]) -> None:
     """Each frame has its own stamp, also if the wall clock stands still or is stepped back."""
     node = node_with()
-    stamps = [of(wake(node, i * 2 * FRAME_NS, wall_ns), "frame")[0].stamp_ns for i, wall_ns in enumerate(walls_ns)]
+    stamps = [
+        payloads(wake(node, i * 2 * FRAME_NS, wall_ns), "frame")[0].stamp_ns for i, wall_ns in enumerate(wall_times_ns)
+    ]
     assert len(set(stamps)) == len(stamps)
-    assert max(abs(stamp_ns - at(0, wall_ns).wall_ns) for stamp_ns, wall_ns in zip(stamps, walls_ns, strict=True)) < 10
+    assert (
+        max(abs(stamp_ns - at(0, wall_ns).wall_ns) for stamp_ns, wall_ns in zip(stamps, wall_times_ns, strict=True))
+        < 10
+    )
 
 
 @pytest.mark.parametrize(("stuck", "fault"), [(True, True), (False, False)])
@@ -139,7 +144,7 @@ def test_a_repeated_buffer_is_frozen(*, stuck: bool, fault: bool) -> None:
     stamps = IssuedStamps(5 * NS_PER_S, 5)
     for number in range(5):
         assert not stamps.is_frozen
-        (frame,) = of(wake(node, number * FRAME_NS + NS_PER_MS), "frame")
+        (frame,) = payloads(wake(node, number * FRAME_NS + NS_PER_MS), "frame")
         stamps.add(frame.stamp_ns, frame.number, frame.stamped_mono_ns, frame.pixel_crc)
     assert stamps.is_frozen == fault
 
@@ -155,20 +160,20 @@ def test_a_missing_picture_is_counted_and_not_sent() -> None:
 def test_no_video_without_a_validated_path() -> None:
     """Video is sent to a validated address only, and only while it sends reports."""
     node = node_with()
-    assert of(wake(node, 0), "rtp") == []
-    assert give(node, "feedback", PathClient(TOKEN).hello(0), at(1), HOME) == []
-    give(node, "video_token", TOKEN, at(1))
-    assert of(wake(node, FRAME_NS + 1), "rtp") == []
+    assert payloads(wake(node, 0), "rtp") == []
+    assert deliver(node, "feedback", PathClient(TOKEN).hello(0), at(1), HOME) == []
+    deliver(node, "video_token", TOKEN, at(1))
+    assert payloads(wake(node, FRAME_NS + 1), "rtp") == []
     validate_path(node, mono_ns=FRAME_NS + 2)
     assert {send.peer for send in wake(node, 2 * FRAME_NS + 1) if send.channel == "rtp"} == {HOME}
-    assert of(wake(node, 3 * NS_PER_S), "rtp") == []
+    assert payloads(wake(node, 3 * NS_PER_S), "rtp") == []
     assert node.counts["frames_without_receiver"] == 3
 
 
 def test_configured_receivers_get_video_without_validation() -> None:
     """`send_to` addresses get every frame, in addition to the validated address."""
     node = node_with(send_to=(ELSEWHERE,))
-    give(node, "video_token", TOKEN, at(0))
+    deliver(node, "video_token", TOKEN, at(0))
     validate_path(node)
     assert {send.peer for send in wake(node, 0) if send.channel == "rtp"} == {HOME, ELSEWHERE}
 
@@ -176,28 +181,28 @@ def test_configured_receivers_get_video_without_validation() -> None:
 def test_keyframe_requests_are_rate_limited() -> None:
     """There is at most one requested keyframe in 100 ms."""
     node = node_with()
-    give(node, "video_token", TOKEN, at(0))
+    deliver(node, "video_token", TOKEN, at(0))
     validate_path(node)
-    sizes = []
+    are_keyframes = []
     for number in range(12):
-        give(node, "feedback", KEYFRAME_REQUEST, at(number * FRAME_NS + NS_PER_MS), HOME)
-        (unit,) = of(wake(node, number * FRAME_NS + 2 * NS_PER_MS), "video")
-        sizes.append(any(unit.data[i : i + 4] == b"\x00\x00\x01\x65" for i in range(len(unit.data))))
-    assert sizes[0]
+        deliver(node, "feedback", KEYFRAME_REQUEST, at(number * FRAME_NS + NS_PER_MS), HOME)
+        (unit,) = payloads(wake(node, number * FRAME_NS + 2 * NS_PER_MS), "video")
+        are_keyframes.append(any(unit.data[i : i + 4] == b"\x00\x00\x01\x65" for i in range(len(unit.data))))
+    assert are_keyframes[0]
     assert 3 <= node.counts["keyframes_on_request"] <= 4
-    assert sum(sizes) == node.counts["keyframes_on_request"]
+    assert sum(are_keyframes) == node.counts["keyframes_on_request"]
 
 
 def test_bit_rate_changes_are_rate_limited() -> None:
     """There is at most one bit rate change, and its keyframe, in 100 ms."""
     node = node_with()
-    give(node, "video_token", TOKEN, at(0))
+    deliver(node, "video_token", TOKEN, at(0))
     validate_path(node)
     keyframes = 0
     for number in range(30):
         limit = max_bit_rate(1, 2, 500_000 + number * 10_000, overhead_bytes=0)
-        give(node, "feedback", limit, at(number * FRAME_NS + NS_PER_MS), HOME)
-        (unit,) = of(wake(node, number * FRAME_NS + 2 * NS_PER_MS), "video")
+        deliver(node, "feedback", limit, at(number * FRAME_NS + NS_PER_MS), HOME)
+        (unit,) = payloads(wake(node, number * FRAME_NS + 2 * NS_PER_MS), "video")
         keyframes += any(unit.data[i : i + 4] == b"\x00\x00\x01\x65" for i in range(len(unit.data)))
     assert 8 <= keyframes <= 11
 
@@ -205,16 +210,16 @@ def test_bit_rate_changes_are_rate_limited() -> None:
 def test_other_addresses_have_no_effect() -> None:
     """RTCP and hellos from other addresses have no effect."""
     node = node_with()
-    give(node, "video_token", TOKEN, at(0))
+    deliver(node, "video_token", TOKEN, at(0))
     validate_path(node)
     wake(node, 0)
     forged = PathClient(bytes(16)).hello(0)
     for number in range(1, 90):
         for datagram in (KEYFRAME_REQUEST, REPORT, forged, b"LAVT", b"\x80\xc9", b""):
-            assert give(node, "feedback", datagram, at(number * FRAME_NS), ELSEWHERE) == []
+            assert deliver(node, "feedback", datagram, at(number * FRAME_NS), ELSEWHERE) == []
         sends = wake(node, number * FRAME_NS + NS_PER_MS)
         assert {send.peer for send in sends if send.channel == "rtp"} <= {HOME}
-    assert of(sends, "rtp") == []
+    assert payloads(sends, "rtp") == []
     assert node.counts.get("keyframes_on_request", 0) == 0
     assert node.counts["feedback_from_strangers"] == 2 * 89
 
@@ -222,38 +227,38 @@ def test_other_addresses_have_no_effect() -> None:
 def test_reports_keep_the_path_open_and_garbage_is_counted() -> None:
     """Receiver reports keep the video path open; unreadable RTCP is counted."""
     node = node_with()
-    give(node, "video_token", TOKEN, at(0))
+    deliver(node, "video_token", TOKEN, at(0))
     validate_path(node)
     for number in range(10):
-        give(node, "feedback", REPORT, at(number * NS_PER_S // 2), HOME)
-        give(node, "feedback", REPORT[:-3], at(number * NS_PER_S // 2), HOME)
-        assert of(wake(node, number * NS_PER_S // 2 + 1), "rtp")
+        deliver(node, "feedback", REPORT, at(number * NS_PER_S // 2), HOME)
+        deliver(node, "feedback", REPORT[:-3], at(number * NS_PER_S // 2), HOME)
+        assert payloads(wake(node, number * NS_PER_S // 2 + 1), "rtp")
     assert node.counts["feedback_unreadable"] == 10
-    give(node, "video_token", None, at(5 * NS_PER_S))
-    assert of(wake(node, 5 * NS_PER_S + 1), "rtp") == []
+    deliver(node, "video_token", None, at(5 * NS_PER_S))
+    assert payloads(wake(node, 5 * NS_PER_S + 1), "rtp") == []
 
 
-def heavy_loss(node: CameraNode, at_ns: int) -> None:
+def report_heavy_loss(node: CameraNode, at_ns: int) -> None:
     """Report to the node that 30 of 100 packets were lost."""
     for highest, lost in ((1000, 0), (1100, 30)):
         report = receiver_report(1, ReceptionReport(2, highest, lost / 100, lost, 0), clock_ns=at_ns)
-        give(node, "feedback", report, at(at_ns), HOME)
+        deliver(node, "feedback", report, at(at_ns), HOME)
 
 
 def test_repair_packets_go_to_the_validated_address_only() -> None:
     """Repair packets are sent after reported loss, to the validated address only."""
     node = node_with(send_to=(ELSEWHERE,))
-    give(node, "video_token", TOKEN, at(0))
+    deliver(node, "video_token", TOKEN, at(0))
     validate_path(node)
-    heavy_loss(node, NS_PER_MS)
-    kinds: dict[object, list[int]] = {HOME: [], ELSEWHERE: []}
+    report_heavy_loss(node, NS_PER_MS)
+    payload_types: dict[object, list[int]] = {HOME: [], ELSEWHERE: []}
     for send in wake(node, 2 * NS_PER_MS):
         if send.channel == "rtp" and not is_rtcp(send.payload):
-            kinds[send.peer].append(parse_packet(send.payload).payload_type)
+            payload_types[send.peer].append(parse_packet(send.payload).payload_type)
     repairs = node.counts["packets_of_repair"]
     assert repairs in {2, 4}, "two for each block of 16"
-    assert kinds[HOME] == [*kinds[ELSEWHERE], *[97] * repairs]
-    assert set(kinds[ELSEWHERE]) == {96}
+    assert payload_types[HOME] == [*payload_types[ELSEWHERE], *[97] * repairs]
+    assert set(payload_types[ELSEWHERE]) == {96}
 
 
 def test_a_sender_report_is_sent_every_500_ms() -> None:
@@ -262,8 +267,8 @@ def test_a_sender_report_is_sent_every_500_ms() -> None:
     reports = []
     for number in range(46):
         sends = wake(node, number * (FRAME_NS + 1))
-        packets = [packet for packet in of(sends, "rtp") if not is_rtcp(packet)]
-        for datagram in of(sends, "rtp"):
+        packets = [packet for packet in payloads(sends, "rtp") if not is_rtcp(packet)]
+        for datagram in payloads(sends, "rtp"):
             if is_rtcp(datagram):
                 (report,) = parse_announcement(datagram).reports
                 reports.append((number, report.rtp_timestamp == parse_packet(packets[0]).timestamp))
@@ -273,23 +278,23 @@ def test_a_sender_report_is_sent_every_500_ms() -> None:
 def test_the_receiver_may_request_a_lower_bit_rate() -> None:
     """A requested lower bit rate is applied; a higher one, or one from another address, is not."""
     node = node_with()
-    give(node, "video_token", TOKEN, at(0))
+    deliver(node, "video_token", TOKEN, at(0))
     validate_path(node)
 
     def mean_bytes(begin: int) -> float:
         """Return the mean frame size once the rate has settled; REPORT keeps the path open."""
         sizes: list[int] = []
         for number in range(begin, begin + 40):
-            give(node, "feedback", REPORT, at(number * FRAME_NS), HOME)
-            sizes += [each.size_bytes for each in of(wake(node, number * FRAME_NS + NS_PER_MS), "frame")]
+            deliver(node, "feedback", REPORT, at(number * FRAME_NS), HOME)
+            sizes += [each.size_bytes for each in payloads(wake(node, number * FRAME_NS + NS_PER_MS), "frame")]
         return sum(sizes[10:]) / 30
 
     own = mean_bytes(0)
-    give(node, "feedback", max_bit_rate(1, 2, 500_000, overhead_bytes=0), at(41 * FRAME_NS), HOME)
+    deliver(node, "feedback", max_bit_rate(1, 2, 500_000, overhead_bytes=0), at(41 * FRAME_NS), HOME)
     assert mean_bytes(42) < 0.5 * own
-    give(node, "feedback", max_bit_rate(1, 2, 9_000_000, overhead_bytes=0), at(90 * FRAME_NS), HOME)
+    deliver(node, "feedback", max_bit_rate(1, 2, 9_000_000, overhead_bytes=0), at(90 * FRAME_NS), HOME)
     assert mean_bytes(91) == pytest.approx(own, rel=0.2)
-    give(node, "feedback", max_bit_rate(1, 2, 500_000, overhead_bytes=0), at(140 * FRAME_NS), ELSEWHERE)
+    deliver(node, "feedback", max_bit_rate(1, 2, 500_000, overhead_bytes=0), at(140 * FRAME_NS), ELSEWHERE)
     assert mean_bytes(141) == pytest.approx(own, rel=0.2)
 
 
@@ -297,19 +302,19 @@ def test_pictures_of_a_video_device_are_sent(tmp_path: Path) -> None:
     """The pictures of a video device are sent once each, with their content and stamp."""
     path = write_video(tmp_path / "video.avi", rate_hz=30.0)
     receiver = VideoReceiver(Decoder(), (MOVING.height_px, MOVING.width_px))
-    seen = []
+    numbers = []
     clock = ManualClock(MONO_NS)
     with closing(VideoDevice(str(path), model=MOVING, rate_hz=30.0, clock=clock)) as device:
         node = node_with(device)
         for number in range(4):
             clock.mono_ns = MONO_NS + number * FRAME_NS
             assert device.wait(20.0)
-            (unit,) = of(wake(node, number * FRAME_NS), "video")
+            (unit,) = payloads(wake(node, number * FRAME_NS), "video")
             received = receiver.decode(unit.data)
             assert received is not None
             assert receiver.read_stamp(received) == unit.stamp_ns
-            seen.append(number_of(received.picture))
-    assert seen == sorted(set(seen))  # the number skipped depends on this machine
+            numbers.append(number_of(received.picture))
+    assert numbers == sorted(set(numbers))  # how many pictures are skipped depends on this machine
 
 
 def test_a_lost_video_device_is_counted(tmp_path: Path) -> None:
@@ -320,11 +325,11 @@ def test_a_lost_video_device_is_counted(tmp_path: Path) -> None:
     path.unlink()
     with closing(device):
         node = node_with(device)
-        (frame,) = of(wake(node, 0), "frame")
+        (frame,) = payloads(wake(node, 0), "frame")
         end_ns = clock.now().mono_ns + 20 * NS_PER_S
         while not node.counts.get("camera_times_lost") and clock.now().mono_ns < end_ns:
             device.wait(0.02)
-        assert [of(wake(node, number * FRAME_NS), "frame") for number in range(1, 20)] == [[]] * 19
+        assert [payloads(wake(node, number * FRAME_NS), "frame") for number in range(1, 20)] == [[]] * 19
     assert (frame.number, frame.capture_ns) == (0, None)
     assert node.counts["camera_pictures_read"] == node.counts["camera_times_lost"] == 1
     assert node.counts["frames_missing"] == 19

@@ -15,8 +15,8 @@ def new_session(*, rearm: bool = False) -> ClientSession:
 
 
 def test_commands_wait_for_the_network_condition() -> None:
-    """With `waits`, control is acquired, but commands wait until the network condition is in force."""
-    session = ClientSession("alice", 7, rearm=False, start_ns=100, waits=True)
+    """With `waits_for_condition`, control is acquired, but commands wait until the network condition is in force."""
+    session = ClientSession("alice", 7, rearm=False, start_ns=100, waits_for_condition=True)
     assert session.take_request(100) is not None
     session.handle_reply(GRANTED, 200)
     assert (session.phase, session.may_command) == ("arming", False)

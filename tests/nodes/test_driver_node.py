@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
-from tests.nodes.stand_ins import MONO_NS, SMALL, WALL_NS, at, give, noise, of
+from tests.nodes.stand_ins import MONO_NS, SMALL, WALL_NS, at, deliver, noise, payloads
 
 from lavt.channels import CHANNELS
 from lavt.control.client_limits import CLIENT_LIMITS
@@ -46,7 +46,7 @@ class FakeLaneDetector:
     """A fake `LaneDetector` that returns a straight lane with a given confidence."""
 
     confidence: float = 1.0
-    seen: list[Picture] = field(default_factory=list)
+    pictures: list[Picture] = field(default_factory=list)
     forget_calls: int = 0
 
     def forget(self) -> None:
@@ -55,7 +55,7 @@ class FakeLaneDetector:
 
     def detect(self, picture_bgr: Picture) -> Lane:
         """Return the lane."""
-        self.seen.append(picture_bgr)
+        self.pictures.append(picture_bgr)
         return Lane((0.0, 0.0, 0.0), 3.5, 3.6, 20.0, self.confidence)
 
 
@@ -83,41 +83,41 @@ class Bench:
         self.mono_ns = 0
         self.sends: list[Send] = []
 
-    def take(self, channel: str, payload: object) -> list[Send]:
-        sends = give(self.node, channel, payload, at(self.mono_ns))
+    def deliver(self, channel: str, payload: object) -> list[Send]:
+        sends = deliver(self.node, channel, payload, at(self.mono_ns))
         self.sends += sends
         return sends
 
     def view(self, picture: Picture | None = None) -> list[Command]:
         shown = noise(1) if picture is None else picture
         return commands(
-            self.take("view", DecodedFrame(WALL_NS + self.mono_ns, WALL_NS + self.mono_ns, RenderedPicture(shown)))
+            self.deliver("view", DecodedFrame(WALL_NS + self.mono_ns, WALL_NS + self.mono_ns, RenderedPicture(shown)))
         )
 
-    def go(self, duration_ns: int) -> list[tuple[int, Command]]:
+    def advance(self, duration_ns: int) -> list[tuple[int, Command]]:
         """Let time pass, wake the node whenever it is due, and return its commands with their times."""
         end_ns, made = self.mono_ns + duration_ns, []
         while (wake_ns := self.node.next_wake_ns()) is not None and wake_ns - MONO_NS <= end_ns:
             self.mono_ns = max(self.mono_ns, wake_ns - MONO_NS)
-            made += [(self.mono_ns, command) for command in commands(self.take(WAKE, None))]
+            made += [(self.mono_ns, command) for command in commands(self.deliver(WAKE, None))]
         self.mono_ns = end_ns
         return made
 
     def state(self, safety: str, speed_mps: float = 0.0, *, vehicle_ns: int | None = None, instance: int = 0) -> None:
-        """Deliver a state, at the time of the vehicle that is now or `vehicle_ns`."""
+        """Deliver a state, whose time on the vehicle's clock is the present time or `vehicle_ns`."""
         mono_ns = at(self.mono_ns).mono_ns if vehicle_ns is None else vehicle_ns
         state = State(1, mono_ns, speed_mps, 0.0, "drive", safety, "", -1, "", instance=instance)  # type: ignore[arg-type]
-        self.take("state", encode(state))
+        self.deliver("state", encode(state))
 
     def driving(self) -> Bench:
-        self.take("session_reply", encode(GRANTED))
+        self.deliver("session_reply", encode(GRANTED))
         self.state("driving")
         assert self.view()
         return self
 
 
 def commands(sends: list[Send]) -> list[Command]:
-    return [decode(Command, payload) for payload in of(sends, "control")]
+    return [decode(Command, payload) for payload in payloads(sends, "control")]
 
 
 def unit_of(picture: Picture, stamp_ns: int, rtp_ns: int | None = None) -> ReceivedUnit:
@@ -129,8 +129,8 @@ def unit_of(picture: Picture, stamp_ns: int, rtp_ns: int | None = None) -> Recei
     return ReceivedUnit(data, rtp_timestamp(stamp_ns if rtp_ns is None else rtp_ns), True, True, MONO_NS)
 
 
-def read(sends: list[Send]) -> PictureRead:
-    (picture,) = of(sends, "picture")
+def read_picture(sends: list[Send]) -> PictureRead:
+    (picture,) = payloads(sends, "picture")
     assert isinstance(picture, PictureRead)
     return picture
 
@@ -138,11 +138,15 @@ def read(sends: list[Send]) -> PictureRead:
 def test_a_picture_is_decoded_and_viewed() -> None:
     """A received access unit is decoded, its stamp read, and its view sent to perception."""
     bench = Bench()
-    sends = bench.take("access_unit", unit_of(noise(1), WALL_NS + 17))
-    assert (read(sends).stamp_ns, read(sends).readable, read(sends).in_doubt) == (WALL_NS + 17, True, False)
-    (view,) = of(sends, "view")
+    sends = bench.deliver("access_unit", unit_of(noise(1), WALL_NS + 17))
+    assert (read_picture(sends).stamp_ns, read_picture(sends).readable, read_picture(sends).in_doubt) == (
+        WALL_NS + 17,
+        True,
+        False,
+    )
+    (view,) = payloads(sends, "view")
     assert view.stamp_ns == WALL_NS + 17
-    assert read(sends).decoded
+    assert read_picture(sends).decoded
     assert bench.node.counts["frames_decoded"] == 1
 
 
@@ -155,41 +159,41 @@ def test_only_the_newest_view_waits() -> None:
 def test_a_stamp_that_disagrees_with_its_packets_is_never_used() -> None:
     """A picture whose stamp disagrees with its RTP timestamp is unreadable and not used."""
     bench = Bench()
-    sends = bench.take("access_unit", unit_of(noise(1), WALL_NS, rtp_ns=WALL_NS + NS_PER_MS))
-    assert (read(sends).stamp_ns, read(sends).readable) == (None, False)
-    assert read(sends).decoded
-    assert "RTP timestamp" in read(sends).reason
-    assert of(sends, "view") == []
+    sends = bench.deliver("access_unit", unit_of(noise(1), WALL_NS, rtp_ns=WALL_NS + NS_PER_MS))
+    assert (read_picture(sends).stamp_ns, read_picture(sends).readable) == (None, False)
+    assert read_picture(sends).decoded
+    assert "RTP timestamp" in read_picture(sends).reason
+    assert payloads(sends, "view") == []
     assert bench.node.counts["frames_unreadable"] == 1
 
 
 def test_a_picture_of_another_size_is_counted_and_not_used() -> None:
     """A picture of another size than configured is unreadable and not used."""
     bench = Bench()
-    sends = bench.take("access_unit", unit_of(noise(1, CameraModel(160, 128)), WALL_NS))
-    assert "160 x 128" in read(sends).reason
-    assert of(sends, "view") == []
+    sends = bench.deliver("access_unit", unit_of(noise(1, CameraModel(160, 128)), WALL_NS))
+    assert "160 x 128" in read_picture(sends).reason
+    assert payloads(sends, "view") == []
 
 
 def test_an_access_unit_without_a_picture() -> None:
     """An access unit without a picture is reported to the receiver and puts later pictures in doubt."""
     bench = Bench()
     unit = ReceivedUnit(b"\x00\x00\x00\x01\x65garbage", 0, False, True, MONO_NS)
-    sends = bench.take("access_unit", unit)
-    assert of(sends, "picture_lost") == [None]
-    assert read(sends).in_doubt
-    assert not read(sends).decoded
-    assert not read(bench.take("access_unit", unit_of(noise(1), WALL_NS))).in_doubt
+    sends = bench.deliver("access_unit", unit)
+    assert payloads(sends, "picture_lost") == [None]
+    assert read_picture(sends).in_doubt
+    assert not read_picture(sends).decoded
+    assert not read_picture(bench.deliver("access_unit", unit_of(noise(1), WALL_NS))).in_doubt
 
 
 def test_request_control_arm_and_drive() -> None:
     """The driver requests control, arms with the brake applied, and drives once the vehicle is driving."""
     bench = Bench()
     assert bench.view() == []
-    bench.go(0)
-    assert len(of(bench.sends, "session")) == 1
-    sends = bench.take("session_reply", encode(GRANTED))
-    assert of(sends, "path_token") == [PathToken(GRANTED.token, 5600)]
+    bench.advance(0)
+    assert len(payloads(bench.sends, "session")) == 1
+    sends = bench.deliver("session_reply", encode(GRANTED))
+    assert payloads(sends, "path_token") == [PathToken(GRANTED.token, 5600)]
     (arm,) = bench.view()
     assert (arm.mode, arm.epoch, arm.throttle, arm.brake, arm.steering_rad) == ("arm", 5, 0.0, 1.0, 0.0)
     bench.state("driving")
@@ -214,7 +218,7 @@ def test_perception_has_memory_only_while_driving() -> None:
 def test_a_command_is_sent_every_20_ms_between_pictures() -> None:
     """Between pictures a command is sent every 20 ms, with the stamp of the newest picture."""
     bench = Bench().driving()
-    made = bench.go(100 * NS_PER_MS)
+    made = bench.advance(100 * NS_PER_MS)
     assert [at_ns for at_ns, _ in made] == [each * 20 * NS_PER_MS for each in range(1, 6)]
     assert len({command.sequence for _, command in made}) == 5
     assert {command.stamp_ns for _, command in made} == {WALL_NS}
@@ -223,7 +227,7 @@ def test_a_command_is_sent_every_20_ms_between_pictures() -> None:
 def test_without_pictures_it_brakes_after_300_ms_and_stops_after_2500_ms() -> None:
     """Without a new picture the driver brakes after 300 ms and requests a stop after 2.5 s."""
     bench = Bench().driving()
-    made = bench.go(2600 * NS_PER_MS)
+    made = bench.advance(2600 * NS_PER_MS)
     for at_ns, command in made:
         mode = "stop" if at_ns >= 2500 * NS_PER_MS else "drive"
         assert command.mode == mode
@@ -233,12 +237,12 @@ def test_without_pictures_it_brakes_after_300_ms_and_stops_after_2500_ms() -> No
 
 
 @pytest.mark.parametrize(
-    ("lost_ns", "mode", "brakes"), [(280, "drive", False), (300, "drive", True), (2500, "stop", True)]
+    ("lost_ms", "mode", "brakes"), [(280, "drive", False), (300, "drive", True), (2500, "stop", True)]
 )
-def test_without_states_it_brakes_and_stops(lost_ns: int, mode: str, *, brakes: bool) -> None:
+def test_without_states_it_brakes_and_stops(lost_ms: int, mode: str, *, brakes: bool) -> None:
     """Without a new state the driver brakes after 300 ms and requests a stop after 2.5 s."""
     bench = Bench().driving()
-    for _ in range(lost_ns // 20):
+    for _ in range(lost_ms // 20):
         bench.mono_ns += 20 * NS_PER_MS
         (command,) = bench.view()
     assert command.mode == mode
@@ -280,13 +284,13 @@ def test_the_time_of_a_restarted_server_begins_anew() -> None:
 
 
 @pytest.mark.parametrize(
-    ("lost_ns", "mode", "brakes"), [(480, "drive", False), (520, "drive", True), (2520, "stop", True)]
+    ("lost_ms", "mode", "brakes"), [(480, "drive", False), (520, "drive", True), (2520, "stop", True)]
 )
-def test_without_a_lane_it_brakes_and_stops(lost_ns: int, mode: str, *, brakes: bool) -> None:
+def test_without_a_lane_it_brakes_and_stops(lost_ms: int, mode: str, *, brakes: bool) -> None:
     """Without a lane the driver brakes after 0.5 s and requests a stop after 2.5 s."""
     bench = Bench().driving()
     bench.detector.confidence = 0.0
-    for _ in range(lost_ns // 20):
+    for _ in range(lost_ms // 20):
         bench.mono_ns += 20 * NS_PER_MS
         bench.state("driving")
         (command,) = bench.view()
@@ -297,7 +301,7 @@ def test_without_a_lane_it_brakes_and_stops(lost_ns: int, mode: str, *, brakes: 
 def test_grey_pictures_lead_to_a_stop() -> None:
     """Grey pictures lead to a requested stop after 2.5 s, with the real detector."""
     bench = Bench(LaneDetector(CameraModel()))
-    bench.take("session_reply", encode(GRANTED))
+    bench.deliver("session_reply", encode(GRANTED))
     bench.state("driving")
     grey = np.full((480, 640, 3), 128, np.uint8)
     modes = []
@@ -311,8 +315,8 @@ def test_garbage_from_the_vehicle_is_counted() -> None:
     """Unreadable states and replies are counted and have no effect."""
     bench = Bench().driving()
     for data in (b"", b"\xc1", b"\x93\x01\x02\x03", bytes(2000)):
-        assert bench.take("state", data) == []
-        assert bench.take("session_reply", data) == []
+        assert bench.deliver("state", data) == []
+        assert bench.deliver("session_reply", data) == []
     assert bench.node.counts["states_unreadable"] == 4
     assert bench.node.counts["session_replies_unreadable"] == 4
     assert bench.session.phase == "driving"
@@ -322,9 +326,9 @@ def test_after_any_reply_an_emergency_stop_is_readable() -> None:
     """After any readable reply, the next emergency stop is a readable message."""
     for last in (2**62, 2**62 + 1, 2**63 - 1):
         bench = Bench().driving()
-        bench.take("session_reply", encode(replace(GRANTED, emergency_stop=last)))
-        sends = bench.take("operator", "emergency_stop")
-        assert decode(SessionRequest, of(sends, "session")[0]).operation == "emergency_stop"
+        bench.deliver("session_reply", encode(replace(GRANTED, emergency_stop=last)))
+        sends = bench.deliver("operator", "emergency_stop")
+        assert decode(SessionRequest, payloads(sends, "session")[0]).operation == "emergency_stop"
         assert commands(sends)[0].emergency_stop > 0
 
 
@@ -333,15 +337,15 @@ def test_any_bytes_are_survived(data: bytes) -> None:
     """No bytes on any external channel raise an exception."""
     bench = Bench()
     for channel in ("state", "session_reply"):
-        bench.take(channel, data)
-    bench.take("access_unit", ReceivedUnit(data, 0, True, True, MONO_NS))
+        bench.deliver(channel, data)
+    bench.deliver("access_unit", ReceivedUnit(data, 0, True, True, MONO_NS))
 
 
 def test_a_grant_without_a_token_opens_no_path() -> None:
     """A granted reply without a token opens no video path."""
     bench = Bench()
-    sends = bench.take("session_reply", encode(SessionReply(True, "", 0, b"", 5600, "kernel", 0)))
-    assert of(sends, "path_token") == []
+    sends = bench.deliver("session_reply", encode(SessionReply(True, "", 0, b"", 5600, "kernel", 0)))
+    assert payloads(sends, "path_token") == []
 
 
 def test_the_emergency_stop_is_in_every_command() -> None:
@@ -349,7 +353,7 @@ def test_the_emergency_stop_is_in_every_command() -> None:
     bench = Bench().driving()
     number = bench.session.raise_emergency_stop(Now(0, WALL_NS)).number
     bench.mono_ns += NS_PER_MS
-    made = [*bench.view(), *(command for _, command in bench.go(200 * NS_PER_MS))]
+    made = [*bench.view(), *(command for _, command in bench.advance(200 * NS_PER_MS))]
     assert len(made) == 11
     assert {(command.emergency_stop, command.mode, command.throttle) for command in made} == {(number, "stop", 0.0)}
 
@@ -370,16 +374,16 @@ def test_after_a_gap_the_lane_is_searched_without_memory(since_ns: int, forgets:
 
 
 def requests(sends: list[Send]) -> list[str]:
-    return [decode(SessionRequest, payload).operation for payload in of(sends, "session")]
+    return [decode(SessionRequest, payload).operation for payload in payloads(sends, "session")]
 
 
 def test_a_release_ends_all_commands() -> None:
     """A release is requested at once and ends all commands."""
     bench = Bench().driving()
-    sends = bench.take("operator", "release")
+    sends = bench.deliver("operator", "release")
     assert (requests(sends), commands(sends)) == (["release"], [])
     assert bench.view() == []
-    bench.take("session_reply", encode(SessionReply(True, "", 0, b"", 5600, "kernel", 0)))
+    bench.deliver("session_reply", encode(SessionReply(True, "", 0, b"", 5600, "kernel", 0)))
     assert bench.session.released
-    assert bench.go(NS_PER_S) == []
+    assert bench.advance(NS_PER_S) == []
     assert bench.node.next_wake_ns() is None

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 from msgspec.structs import replace
-from tests.nodes.stand_ins import at, give, of
+from tests.nodes.stand_ins import at, deliver, payloads
 
 from lavt.domain import NS_PER_MS, NS_PER_S, NetemReply, NetemRequest
 from lavt.node import WAKE, Send
@@ -25,16 +25,16 @@ def server(*, allowed: bool = True, simulated: bool = True) -> InjectionNode:
 
 
 def request(node: InjectionNode, condition: NetemRequest, after_ns: int = 0, peer: Any = 1) -> list[Send]:
-    return give(node, "netem", encode(condition), at(after_ns), peer)
+    return deliver(node, "netem", encode(condition), at(after_ns), peer)
 
 
 def done(node: InjectionNode | InjectionClient, number: int, reason: str = "", after_ns: int = 0) -> list[Send]:
     measured = () if reason else (("video", 150.2),)
-    return give(node, "injected", InjectionResult(number, reason, "", measured), at(after_ns))
+    return deliver(node, "injected", InjectionResult(number, reason, "", measured), at(after_ns))
 
 
 def rejections(sends: list[Send]) -> list[str]:
-    replies = [decode(NetemReply, payload) for payload in of(sends, "netem_reply")]
+    replies = [decode(NetemReply, payload) for payload in payloads(sends, "netem_reply")]
     assert all(reply.granted == (reply.reason == "") for reply in replies)
     return [reply.reason for reply in replies]
 
@@ -56,7 +56,7 @@ def test_a_condition_is_granted_when_in_force() -> None:
     sends = done(node, 1)
     assert rejections(sends) == [""]
     assert [send.peer for send in sends if send.channel == "netem_reply"] == [1]
-    assert of(sends, "injection") == [
+    assert payloads(sends, "injection") == [
         InjectionSample(at(0).mono_ns, "L4", "video", 150.0, 150.2, ""),
         InjectionSample(at(0).mono_ns, "L4", "state", 0.0, None, ""),
     ]
@@ -73,7 +73,7 @@ def test_a_repeated_request_renews_the_lease() -> None:
     node = in_force()
     assert node.next_wake_ns() == at(5 * NS_PER_S).mono_ns
     assert rejections(request(node, L4, 3 * NS_PER_S)) == [""]
-    give(node, WAKE, None, at(5 * NS_PER_S))
+    deliver(node, WAKE, None, at(5 * NS_PER_S))
     assert node.counts["netem_leases_ended"] == 0
 
 
@@ -83,11 +83,13 @@ def test_an_expired_lease_clears_the_queues() -> None:
     bob = replace(L4, who="bob", instance=8)
     [reason] = rejections(request(node, bob, NS_PER_S))
     assert "alice" in reason
-    assert give(node, WAKE, None, at(LEASE_MS * NS_PER_MS)) == [Send("inject", InjectionOrder(2, "", ()))]
-    sends = give(node, "injected", InjectionResult(2, "", "", ()), at(LEASE_MS * NS_PER_MS + 1))
-    assert of(sends, "injection") == [InjectionSample(at(LEASE_MS * NS_PER_MS + 1).mono_ns, "", "", 0.0, None, "")]
+    assert deliver(node, WAKE, None, at(LEASE_MS * NS_PER_MS)) == [Send("inject", InjectionOrder(2, "", ()))]
+    sends = deliver(node, "injected", InjectionResult(2, "", "", ()), at(LEASE_MS * NS_PER_MS + 1))
+    assert payloads(sends, "injection") == [
+        InjectionSample(at(LEASE_MS * NS_PER_MS + 1).mono_ns, "", "", 0.0, None, "")
+    ]
     assert node.next_wake_ns() is None
-    assert of(request(node, bob, 6 * NS_PER_S), "inject") == [InjectionOrder(3, "L4", (VIDEO, STATE))]
+    assert payloads(request(node, bob, 6 * NS_PER_S), "inject") == [InjectionOrder(3, "L4", (VIDEO, STATE))]
 
 
 def test_a_condition_is_changed_live() -> None:
@@ -100,13 +102,13 @@ def test_a_condition_in_force_is_measured_periodically() -> None:
     """A condition in force is measured and recorded every five seconds."""
     node = in_force()
     request(node, L4, 4 * NS_PER_S)
-    again = give(node, WAKE, None, at(5 * NS_PER_S))
+    again = deliver(node, WAKE, None, at(5 * NS_PER_S))
     assert again == [Send("inject", InjectionOrder(1, "L4", (VIDEO, STATE)))]
-    assert len(of(done(node, 1, after_ns=6 * NS_PER_S), "injection")) == 2
+    assert len(payloads(done(node, 1, after_ns=6 * NS_PER_S), "injection")) == 2
 
 
 @pytest.mark.parametrize(
-    ("settings", "status", "key_word"),
+    ("settings", "status", "expected_word"),
     [
         ({"allowed": False}, StationaryStatus(True, None), "injection.remote"),
         ({"simulated": False}, StationaryStatus(False, None), "stationary"),
@@ -114,25 +116,25 @@ def test_a_condition_in_force_is_measured_periodically() -> None:
     ],
 )
 def test_a_request_is_rejected_with_a_reason(
-    settings: dict[str, bool], status: StationaryStatus, key_word: str
+    settings: dict[str, bool], status: StationaryStatus, expected_word: str
 ) -> None:
     """A request is rejected if the config forbids it, a real vehicle drives, or another client has control."""
     node = server(**settings)
-    give(node, "rest", status, at(0))
+    deliver(node, "rest", status, at(0))
     sends = request(node, L4)
     [reason] = rejections(sends)
-    assert key_word in reason
-    assert of(sends, "inject") == []
+    assert expected_word in reason
+    assert payloads(sends, "inject") == []
 
 
 def test_a_real_vehicle_gets_a_condition_at_standstill_only() -> None:
     """A real vehicle gets a condition at standstill; while it drives the lease is renewed, but not changed."""
     node = server(simulated=False)
     assert rejections(request(node, L4)) != [""]
-    give(node, "rest", StationaryStatus(True, ("alice", 7)), at(0))
+    deliver(node, "rest", StationaryStatus(True, ("alice", 7)), at(0))
     request(node, L4)
     done(node, 1)
-    give(node, "rest", StationaryStatus(False, ("alice", 7)), at(0))
+    deliver(node, "rest", StationaryStatus(False, ("alice", 7)), at(0))
     assert rejections(request(node, L4, NS_PER_S)) == [""]
     [reason] = rejections(request(node, replace(L4, delay_ms=0.0), NS_PER_S))
     assert "stationary" in reason
@@ -141,8 +143,8 @@ def test_a_real_vehicle_gets_a_condition_at_standstill_only() -> None:
 def test_a_deviating_measurement_is_recorded() -> None:
     """A measurement that deviates from the request is recorded, and the condition stays in force."""
     node = in_force()
-    sends = give(node, "injected", InjectionResult(1, "", "video was late", (("video", 155.0),)), at(NS_PER_S))
-    assert of(sends, "injection")[0].reason == "video was late"
+    sends = deliver(node, "injected", InjectionResult(1, "", "video was late", (("video", 155.0),)), at(NS_PER_S))
+    assert payloads(sends, "injection")[0].reason == "video was late"
     assert rejections(request(node, L4, NS_PER_S)) == [""]
 
 
@@ -152,29 +154,31 @@ def test_failed_queues_are_cleared_and_end_the_lease() -> None:
     request(node, L4)
     sends = done(node, 1, reason="there is no tc")
     assert rejections(sends) == ["there is no tc"]
-    assert {sample.reason for sample in of(sends, "injection")} == {"there is no tc"}
-    assert of(sends, "inject") == [InjectionOrder(2, "", ())]
-    assert of(request(node, L4), "inject") == [InjectionOrder(3, "L4", (VIDEO, STATE))]
-    assert of(request(server(), replace(L4, who="bob")), "netem_reply") == []
+    assert {sample.reason for sample in payloads(sends, "injection")} == {"there is no tc"}
+    assert payloads(sends, "inject") == [InjectionOrder(2, "", ())]
+    assert payloads(request(node, L4), "inject") == [InjectionOrder(3, "L4", (VIDEO, STATE))]
+    assert payloads(request(server(), replace(L4, who="bob")), "netem_reply") == []
 
 
 def test_a_failed_clearing_is_repeated() -> None:
     """A failed clearing of the queues is repeated every second."""
     node = in_force()
-    give(node, WAKE, None, at(5 * NS_PER_S))
+    deliver(node, WAKE, None, at(5 * NS_PER_S))
     assert done(node, 2, reason="tc hangs", after_ns=6 * NS_PER_S)
     assert node.next_wake_ns() == at(7 * NS_PER_S).mono_ns
-    assert give(node, WAKE, None, at(7 * NS_PER_S)) == [Send("inject", InjectionOrder(3, "", ()))]
-    give(node, "injected", InjectionResult(3, "", "", ()), at(8 * NS_PER_S))
+    assert deliver(node, WAKE, None, at(7 * NS_PER_S)) == [Send("inject", InjectionOrder(3, "", ()))]
+    deliver(node, "injected", InjectionResult(3, "", "", ()), at(8 * NS_PER_S))
     assert node.next_wake_ns() is None
 
 
 def test_the_lease_ends_when_another_client_acquires_control() -> None:
     """The lease ends when another client acquires control of the vehicle."""
     node = in_force()
-    assert give(node, "rest", StationaryStatus(True, None), at(0)) == []
-    assert give(node, "rest", StationaryStatus(True, ("alice", 7)), at(0)) == []
-    assert give(node, "rest", StationaryStatus(True, ("bob", 8)), at(0)) == [Send("inject", InjectionOrder(2, "", ()))]
+    assert deliver(node, "rest", StationaryStatus(True, None), at(0)) == []
+    assert deliver(node, "rest", StationaryStatus(True, ("alice", 7)), at(0)) == []
+    assert deliver(node, "rest", StationaryStatus(True, ("bob", 8)), at(0)) == [
+        Send("inject", InjectionOrder(2, "", ()))
+    ]
 
 
 def test_an_impossible_impairment_is_rejected() -> None:
@@ -216,9 +220,9 @@ def test_pending_requests_are_bounded() -> None:
 def test_garbage_is_counted() -> None:
     """Unreadable requests and replies are counted and have no effect."""
     node, client = server(), new_client()
-    assert give(node, "netem", b"\x93garbage", at(0), 1) == []
+    assert deliver(node, "netem", b"\x93garbage", at(0), 1) == []
     assert node.counts["netem_requests_unreadable"] == 1
-    assert give(client, "netem_reply", b"", at(0)) == []
+    assert deliver(client, "netem_reply", b"", at(0)) == []
     assert client.counts["netem_replies_unreadable"] == 1
 
 
@@ -235,34 +239,34 @@ def test_the_client_delays_its_control_first() -> None:
     """The client delays its control first, and then requests the condition from the server once a second."""
     client = new_client()
     assert client.next_wake_ns() == at(0).mono_ns
-    assert give(client, WAKE, None, at(0)) == [Send("inject", InjectionOrder(1, "L4", (CONTROL,)))]
-    assert of(give(client, WAKE, None, at(NS_PER_S)), "netem") == []
-    give(client, "injected", InjectionResult(1, "", "", (("control", 75.1),)), at(NS_PER_S))
-    [payload] = of(give(client, WAKE, None, at(NS_PER_S)), "netem")
+    assert deliver(client, WAKE, None, at(0)) == [Send("inject", InjectionOrder(1, "L4", (CONTROL,)))]
+    assert payloads(deliver(client, WAKE, None, at(NS_PER_S)), "netem") == []
+    deliver(client, "injected", InjectionResult(1, "", "", (("control", 75.1),)), at(NS_PER_S))
+    [payload] = payloads(deliver(client, WAKE, None, at(NS_PER_S)), "netem")
     assert decode(NetemRequest, payload) == L4
     assert client.next_wake_ns() == at(2 * NS_PER_S).mono_ns
-    granted = give(client, "netem_reply", encode(NetemReply(True, "")), at(NS_PER_S))
+    granted = deliver(client, "netem_reply", encode(NetemReply(True, "")), at(NS_PER_S))
     assert granted == [Send("condition_in_force", "")]
-    assert len(of(give(client, WAKE, None, at(2 * NS_PER_S)), "netem")) == 1
+    assert len(payloads(deliver(client, WAKE, None, at(2 * NS_PER_S)), "netem")) == 1
 
 
 def test_a_failed_order_of_the_client_is_repeated() -> None:
     """If the client's own queue fails, the driver receives the reason, and the order is repeated after a second."""
     client = new_client()
-    give(client, WAKE, None, at(0))
-    sends = give(client, "injected", InjectionResult(1, "no tc", "", ()), at(0))
-    [reason] = of(sends, "condition_in_force")
+    deliver(client, WAKE, None, at(0))
+    sends = deliver(client, "injected", InjectionResult(1, "no tc", "", ()), at(0))
+    [reason] = payloads(sends, "condition_in_force")
     assert reason.endswith(": no tc")
-    assert of(give(client, WAKE, None, at(NS_PER_S)), "inject") == [InjectionOrder(2, "L4", (CONTROL,))]
+    assert payloads(deliver(client, WAKE, None, at(NS_PER_S)), "inject") == [InjectionOrder(2, "L4", (CONTROL,))]
 
 
 def test_a_rejection_is_reported_to_the_driver() -> None:
     """The driver receives the server's reason for a rejection."""
     client = new_client()
-    give(client, WAKE, None, at(0))
-    give(client, "injected", InjectionResult(1, "", "", ()), at(0))
-    rejected = give(client, "netem_reply", encode(NetemReply(False, "no")), at(0))
-    [reason] = of(rejected, "condition_in_force")
+    deliver(client, WAKE, None, at(0))
+    deliver(client, "injected", InjectionResult(1, "", "", ()), at(0))
+    rejected = deliver(client, "netem_reply", encode(NetemReply(False, "no")), at(0))
+    [reason] = payloads(rejected, "condition_in_force")
     assert reason.endswith(": no")
 
 

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.nodes.stand_ins import at, give, of
+from tests.nodes.stand_ins import at, deliver, payloads
 
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.node import WAKE, Send
@@ -24,7 +24,7 @@ UNIT = b"\x00\x00\x00\x01\x67\x42\x00\x1e\x00\x00\x00\x01\x68\xce\x00\x00\x00\x0
 def new_node(*, token: bool = True) -> ReceiverNode:
     node = ReceiverNode(JitterBuffer(), Depacketizer())
     if token:
-        give(node, "path_token", PathToken(TOKEN, PORT), at(0))
+        deliver(node, "path_token", PathToken(TOKEN, PORT), at(0))
     return node
 
 
@@ -43,24 +43,24 @@ def test_path_validation_by_hello_and_challenge() -> None:
     node = new_node()
     server = PathServer(lambda: bytes(32))
     server.set_token(TOKEN)
-    (hello,) = give(node, WAKE, None, at(0))
+    (hello,) = deliver(node, WAKE, None, at(0))
     assert (hello.channel, hello.peer, is_path_datagram(hello.payload)) == ("feedback", PORT, True)
     assert node.next_wake_ns() == at(HELLO_INTERVAL_NS).mono_ns
     challenge = server.receive(hello.payload, HOME, at(0).mono_ns)
-    (answer,) = give(node, "rtp", challenge, at(1))
+    (answer,) = deliver(node, "rtp", challenge, at(1))
     assert answer.channel == "feedback"
     server.receive(answer.payload, HOME, at(2).mono_ns)
     assert server.open_address(at(2).mono_ns) == HOME
-    assert give(node, WAKE, None, at(HELLO_INTERVAL_NS))
+    assert deliver(node, WAKE, None, at(HELLO_INTERVAL_NS))
 
 
 def test_the_same_token_again_changes_nothing() -> None:
     """A repeated token starts no new path validation; a new token does."""
     node = new_node()
-    give(node, WAKE, None, at(0))
-    give(node, "path_token", PathToken(TOKEN, PORT), at(1))
+    deliver(node, WAKE, None, at(0))
+    deliver(node, "path_token", PathToken(TOKEN, PORT), at(1))
     assert node.next_wake_ns() == at(HELLO_INTERVAL_NS).mono_ns
-    give(node, "path_token", PathToken(bytes(16), PORT), at(1))
+    deliver(node, "path_token", PathToken(bytes(16), PORT), at(1))
     assert node.next_wake_ns() == 0
 
 
@@ -69,12 +69,12 @@ def test_packets_become_access_units() -> None:
     node = new_node()
     first, second, _ = packets()
     for packet in first:
-        give(node, "rtp", packet, at(0))
-    (unit,) = of(give(node, WAKE, None, at(10 * NS_PER_MS)), "access_unit")
+        deliver(node, "rtp", packet, at(0))
+    (unit,) = payloads(deliver(node, WAKE, None, at(10 * NS_PER_MS)), "access_unit")
     assert (unit.complete, unit.keyframe, unit.rtp_timestamp) == (True, True, 0)
     for packet in second:
-        sends = give(node, "rtp", packet, at(12 * NS_PER_MS), arrived=at(11 * NS_PER_MS))
-    (unit,) = of(sends, "access_unit")
+        sends = deliver(node, "rtp", packet, at(12 * NS_PER_MS), arrived=at(11 * NS_PER_MS))
+    (unit,) = payloads(sends, "access_unit")
     assert unit.packet_mono_ns == at(11 * NS_PER_MS).mono_ns
 
 
@@ -86,11 +86,11 @@ def test_a_receiver_report_is_sent_every_500_ms() -> None:
     for at_ms in range(0, 2001, 5):
         if at_ms == 0:
             for packet in first:
-                give(node, "rtp", packet, at(0))
+                deliver(node, "rtp", packet, at(0))
         if at_ms == 600:
             for packet in [*second[:1], *second[2:], *third]:
-                give(node, "rtp", packet, at(600 * NS_PER_MS))
-        for send in give(node, WAKE, None, at(at_ms * NS_PER_MS)):
+                deliver(node, "rtp", packet, at(600 * NS_PER_MS))
+        for send in deliver(node, WAKE, None, at(at_ms * NS_PER_MS)):
             if send.channel == "feedback" and not is_path_datagram(send.payload):
                 reports += [(at_ms, report) for report in parse_feedback(send.payload).reports]
     assert [at_ms for at_ms, _ in reports] == [0, 500, 1000, 1500, 2000]
@@ -101,32 +101,34 @@ def test_a_receiver_report_is_sent_every_500_ms() -> None:
 
 
 def requests_keyframe(sends: list[Send]) -> bool:
-    datagrams = [each for each in of(sends, "feedback") if not is_path_datagram(each)]
+    datagrams = [each for each in payloads(sends, "feedback") if not is_path_datagram(each)]
     return any(parse_feedback(each).picture_loss for each in datagrams)
 
 
 def test_a_loss_requests_a_keyframe() -> None:
     """A loss or a missing picture requests a keyframe, at most once in 100 ms."""
     node = new_node()
-    assert give(node, "picture_lost", None, at(0)) == []
+    assert deliver(node, "picture_lost", None, at(0)) == []
     first, second, _ = packets()
     for packet in [*first, *second[1:]]:
-        give(node, "rtp", packet, at(0))
-    assert requests_keyframe(give(node, WAKE, None, at(10 * NS_PER_MS)))
-    times = [ms for ms in range(10, 400) if give(node, "picture_lost", None, at(ms * NS_PER_MS))]
+        deliver(node, "rtp", packet, at(0))
+    assert requests_keyframe(deliver(node, WAKE, None, at(10 * NS_PER_MS)))
+    times = [ms for ms in range(10, 400) if deliver(node, "picture_lost", None, at(ms * NS_PER_MS))]
     assert times == [110, 210, 310]
     assert node.counts["picture_loss_requests"] == 4
 
 
-def answered(node: ReceiverNode, round_trip_ns: int, begin_ns: int = 0) -> None:
+def answer_report(node: ReceiverNode, round_trip_ns: int, begin_ns: int = 0) -> None:
     """Let the node send a report, and answer it 30 ms after its arrival."""
-    (report,) = [each for each in of(give(node, WAKE, None, at(begin_ns)), "feedback") if not is_path_datagram(each)]
+    (report,) = [
+        each for each in payloads(deliver(node, WAKE, None, at(begin_ns)), "feedback") if not is_path_datagram(each)
+    ]
     (reference,) = parse_feedback(report).reference_times
     answer = ReferenceAnswer(reference.receiver_ssrc, reference.time, 30 * NS_PER_MS)
     datagram = sender_report(
         77, wall_ns=at(0).wall_ns, rtp_timestamp=0, packets=1, octets=1, cname="x", answered=[answer]
     )
-    assert give(node, "rtp", datagram, at(begin_ns + round_trip_ns + 30 * NS_PER_MS)) == []
+    assert deliver(node, "rtp", datagram, at(begin_ns + round_trip_ns + 30 * NS_PER_MS)) == []
 
 
 def test_a_keyframe_request_is_repeated_each_round_trip() -> None:
@@ -134,15 +136,17 @@ def test_a_keyframe_request_is_repeated_each_round_trip() -> None:
     node = new_node()
     first, second, third = packets()
     for packet in first:
-        give(node, "rtp", packet, at(0))
-    answered(node, 100 * NS_PER_MS)
+        deliver(node, "rtp", packet, at(0))
+    answer_report(node, 100 * NS_PER_MS)
     for packet in second[1:]:
-        give(node, "rtp", packet, at(200 * NS_PER_MS))
-    times = [ms for ms in range(200, 700) if requests_keyframe(give(node, WAKE, None, at(ms * NS_PER_MS)))]
-    assert times in ([210, 360, 510, 660], [210, 361, 512, 663]), "100 ms to 1/65536 s, and 50 ms"
+        deliver(node, "rtp", packet, at(200 * NS_PER_MS))
+    times = [ms for ms in range(200, 700) if requests_keyframe(deliver(node, WAKE, None, at(ms * NS_PER_MS)))]
+    assert times in ([210, 360, 510, 660], [210, 361, 512, 663]), (
+        "a round trip of 100 ms (to 1/65536 s), and 50 ms for the keyframe"
+    )
     for packet in third:
-        give(node, "rtp", packet, at(700 * NS_PER_MS))
-    assert not any(requests_keyframe(give(node, WAKE, None, at(ms * NS_PER_MS))) for ms in range(701, 1500))
+        deliver(node, "rtp", packet, at(700 * NS_PER_MS))
+    assert not any(requests_keyframe(deliver(node, WAKE, None, at(ms * NS_PER_MS))) for ms in range(701, 1500))
     assert node.counts["picture_loss_requests"] == 4
 
 
@@ -151,13 +155,13 @@ def test_keyframe_requests_use_the_present_round_trip() -> None:
     node = new_node()
     first, second, _ = packets()
     for packet in first:
-        give(node, "rtp", packet, at(0))
-    answered(node, 3 * NS_PER_S)
+        deliver(node, "rtp", packet, at(0))
+    answer_report(node, 3 * NS_PER_S)
     for packet in second[1:]:
-        give(node, "rtp", packet, at(4 * NS_PER_S))
-    assert requests_keyframe(give(node, WAKE, None, at(4 * NS_PER_S + 10 * NS_PER_MS)))
-    answered(node, 100 * NS_PER_MS, 4 * NS_PER_S + 600 * NS_PER_MS)
-    assert requests_keyframe(give(node, WAKE, None, at(4 * NS_PER_S + 740 * NS_PER_MS)))
+        deliver(node, "rtp", packet, at(4 * NS_PER_S))
+    assert requests_keyframe(deliver(node, WAKE, None, at(4 * NS_PER_S + 10 * NS_PER_MS)))
+    answer_report(node, 100 * NS_PER_MS, 4 * NS_PER_S + 600 * NS_PER_MS)
+    assert requests_keyframe(deliver(node, WAKE, None, at(4 * NS_PER_S + 740 * NS_PER_MS)))
 
 
 def test_a_repaired_loss_requests_no_keyframe() -> None:
@@ -166,15 +170,17 @@ def test_a_repaired_loss_requests_no_keyframe() -> None:
     first, second, _ = packets()
     repairs = RepairSender(78, 0).repair(second, 1)
     for packet in first:
-        give(node, "rtp", packet, at(0))
-    give(node, WAKE, None, at(10 * NS_PER_MS))
+        deliver(node, "rtp", packet, at(0))
+    deliver(node, WAKE, None, at(10 * NS_PER_MS))
     for packet in [*second[:2], *second[3:]]:
-        assert of(give(node, "rtp", packet, at(20 * NS_PER_MS)), "access_unit") == []
-    sends = give(node, "rtp", repairs[0], at(25 * NS_PER_MS))
-    assert [(unit.data, unit.complete) for unit in of(sends, "access_unit")] == [(UNIT, True)]
-    assert not requests_keyframe([*sends, *give(node, WAKE, None, at(50 * NS_PER_MS))])
+        assert payloads(deliver(node, "rtp", packet, at(20 * NS_PER_MS)), "access_unit") == []
+    sends = deliver(node, "rtp", repairs[0], at(25 * NS_PER_MS))
+    assert [(unit.data, unit.complete) for unit in payloads(sends, "access_unit")] == [(UNIT, True)]
+    assert not requests_keyframe([*sends, *deliver(node, WAKE, None, at(50 * NS_PER_MS))])
     assert [node.counts[f"packets_{name}"] for name in ("recovered", "lost", "of_repair")] == [1, 0, 1]
-    feedback = [each for each in of(give(node, WAKE, None, at(NS_PER_S)), "feedback") if not is_path_datagram(each)]
+    feedback = [
+        each for each in payloads(deliver(node, WAKE, None, at(NS_PER_S)), "feedback") if not is_path_datagram(each)
+    ]
     (report,) = [report for each in feedback for report in parse_feedback(each).reports]
     assert report.cumulative_lost == 1, "losses are counted before repair"
 
@@ -188,8 +194,8 @@ def test_reception_is_recorded_every_second() -> None:
         for number, frame in enumerate((first, second[1:], third)):
             if at_ms == 700 * number:
                 for packet in frame:
-                    give(node, "rtp", packet, at(at_ms * NS_PER_MS))
-        samples += of(give(node, WAKE, None, at(at_ms * NS_PER_MS)), "reception")
+                    deliver(node, "rtp", packet, at(at_ms * NS_PER_MS))
+        samples += payloads(deliver(node, WAKE, None, at(at_ms * NS_PER_MS)), "reception")
     assert [sample.duration_ns for sample in samples] == [0, NS_PER_S, NS_PER_S, NS_PER_S]
     assert [sample.packets for sample in samples] == [len(first), len(second) - 1, len(third), 0]
     assert [sample.lost_after_repair for sample in samples] == [0, 1, 0, 0]
@@ -198,12 +204,12 @@ def test_reception_is_recorded_every_second() -> None:
 def test_the_bit_rate_is_requested_with_each_report() -> None:
     """The configured maximum bit rate is sent with every report."""
     node = ReceiverNode(JitterBuffer(), Depacketizer(), 700_000)
-    give(node, "path_token", PathToken(TOKEN, PORT), at(0))
+    deliver(node, "path_token", PathToken(TOKEN, PORT), at(0))
     first, *_ = packets()
     for packet in first:
-        give(node, "rtp", packet, at(0))
+        deliver(node, "rtp", packet, at(0))
     for number in range(3):
-        sends = of(give(node, WAKE, None, at(number * NS_PER_S // 2)), "feedback")
+        sends = payloads(deliver(node, WAKE, None, at(number * NS_PER_S // 2)), "feedback")
         limits = [limit for each in sends if not is_path_datagram(each) for limit in parse_feedback(each).limits]
         assert [(limit.media_ssrc, limit.overhead_bytes) for limit in limits] == [(77, 0)]
         assert 699_990 <= limits[0].bit_rate_bps <= 700_000
@@ -213,8 +219,8 @@ def test_the_bit_rate_is_requested_with_each_report() -> None:
 def test_any_datagram_is_survived_and_counted(datagram: bytes) -> None:
     """Any datagram on the video port is a packet, a challenge, or counted as unreadable."""
     node = new_node()
-    give(node, "rtp", datagram, at(0))
-    give(node, WAKE, None, at(NS_PER_S))
+    deliver(node, "rtp", datagram, at(0))
+    deliver(node, WAKE, None, at(NS_PER_S))
     packets, *unreadable = (
         node.counts.get(name, 0) for name in ("packets", "packets_unreadable", "challenges_unreadable")
     )
@@ -226,5 +232,5 @@ def test_any_datagram_is_survived_and_counted(datagram: bytes) -> None:
 def test_a_challenge_without_a_session_is_counted() -> None:
     """A challenge without a session is counted and not answered."""
     node = new_node(token=False)
-    assert give(node, "rtp", b"LAVT" + bytes(26), at(0)) == []
+    assert deliver(node, "rtp", b"LAVT" + bytes(26), at(0)) == []
     assert node.counts["challenges_unreadable"] == 1

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from tests.nodes.stand_ins import MONO_NS, WALL_NS, at, give, of
+from tests.nodes.stand_ins import MONO_NS, WALL_NS, at, deliver, payloads
 
 from lavt.domain import NS_PER_S
 from lavt.nodes.payloads import PictureRead, ReceivedUnit
@@ -30,8 +30,8 @@ def units(count: int, size: tuple[int, int] = SIZES[0], *, contrast: float = 1.0
     return units
 
 
-def watched(node: WatcherNode, unit: ReceivedUnit) -> PictureRead:
-    (picture,) = of(give(node, "access_unit", unit, at(0)), "picture")
+def read_unit(node: WatcherNode, unit: ReceivedUnit) -> PictureRead:
+    (picture,) = payloads(deliver(node, "access_unit", unit, at(0)), "picture")
     assert isinstance(picture, PictureRead)
     return picture
 
@@ -39,16 +39,16 @@ def watched(node: WatcherNode, unit: ReceivedUnit) -> PictureRead:
 def test_pictures_of_any_size() -> None:
     """A watcher without a configured size reads and counts pictures of any size."""
     node = WatcherNode(PictureReader(VideoReceiver(Decoder(), None)))
-    read = [watched(node, units(1, size)[0]) for size in SIZES]
-    assert [picture.stamp_ns for picture in read] == [WALL_NS, WALL_NS]
+    pictures = [read_unit(node, units(1, size)[0]) for size in SIZES]
+    assert [picture.stamp_ns for picture in pictures] == [WALL_NS, WALL_NS]
     assert (node.counts["frames_decoded"], node.counts["frames_unreadable"]) == (2, 0)
 
 
 def test_a_view_is_dropped() -> None:
     """A watcher drops its own views."""
     node = WatcherNode(PictureReader(VideoReceiver(Decoder(), None)))
-    (view,) = of(give(node, "access_unit", units(1)[0], at(0)), "view")
-    assert give(node, "view", view, at(1)) == []
+    (view,) = payloads(deliver(node, "access_unit", units(1)[0], at(0)), "view")
+    assert deliver(node, "view", view, at(1)) == []
 
 
 @pytest.mark.parametrize("reads_doubtful", [True, False])
@@ -63,16 +63,16 @@ def test_pictures_in_doubt(reads_doubtful: bool) -> None:
     node = WatcherNode(PictureReader(VideoReceiver(Decoder(), None), agrees, reads_doubtful=reads_doubtful))
     first, second, third = units(3)
     again = units(1)[0]
-    read = [watched(node, unit) for unit in (first, replace(second, complete=False), third, again)]
-    assert [picture.in_doubt for picture in read] == [False, True, True, False]
+    pictures = [read_unit(node, unit) for unit in (first, replace(second, complete=False), third, again)]
+    assert [picture.in_doubt for picture in pictures] == [False, True, True, False]
     assert checked == ([0, 1, 2, 0] if reads_doubtful else [0, 0])
-    assert [picture.readable for picture in read] == [True, reads_doubtful, reads_doubtful, True]
+    assert [picture.readable for picture in pictures] == [True, reads_doubtful, reads_doubtful, True]
 
 
 def test_only_clear_stamps() -> None:
     """The strict reader rejects a stamp whose cells are neither black nor white."""
     (grey,) = units(1, contrast=0.2)
-    assert watched(WatcherNode(PictureReader(VideoReceiver(Decoder(), None))), grey).stamp_ns == WALL_NS
-    strict = watched(WatcherNode(PictureReader(VideoReceiver(Decoder(), None, read_clear_stamp))), grey)
+    assert read_unit(WatcherNode(PictureReader(VideoReceiver(Decoder(), None))), grey).stamp_ns == WALL_NS
+    strict = read_unit(WatcherNode(PictureReader(VideoReceiver(Decoder(), None, read_clear_stamp))), grey)
     assert strict.stamp_ns is None
     assert "neither black nor white" in strict.reason

@@ -114,8 +114,8 @@ def test_a_step_of_the_wall_clock_does_not_reorder_messages(tmp_path: Path) -> N
     assert read_record(tmp_path / "a.mcap").table("clock").ints("number").tolist() == [0, 1, 2]
 
 
-@pytest.mark.parametrize("kept", [0.3, 0.7, 0.999])
-def test_an_unfinished_file_is_recovered(tmp_path: Path, kept: float) -> None:
+@pytest.mark.parametrize("kept_share", [0.3, 0.7, 0.999])
+def test_an_unfinished_file_is_recovered(tmp_path: Path, kept_share: float) -> None:
     """From a file that was cut anywhere, every message of its whole chunks is read, and `complete` is False."""
     path = tmp_path / "a.mcap"
     writer = RecordWriter(path, "server")
@@ -124,12 +124,12 @@ def test_an_unfinished_file_is_recovered(tmp_path: Path, kept: float) -> None:
         writer.write("frame", {"number": index, "noise": noise.bytes(150)}, now(index))
     writer.close()
     whole = path.read_bytes()
-    path.write_bytes(whole[: int(len(whole) * kept)])
+    path.write_bytes(whole[: int(len(whole) * kept_share)])
     record = read_record(path)
     numbers = record.table("frame").ints("number").tolist()
     assert not record.complete
     assert numbers == list(range(len(numbers)))
-    assert len(numbers) > 2_000 * kept - 600
+    assert len(numbers) > 2_000 * kept_share - 600
 
 
 def test_a_file_that_was_never_closed_is_recovered(tmp_path: Path) -> None:

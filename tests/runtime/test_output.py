@@ -23,12 +23,12 @@ END_LIMIT_S = 30
 def pipe() -> Iterator[tuple[int, int]]:
     read_end, write_end = os.pipe()
     yield read_end, write_end
-    for each in (read_end, write_end):
-        os.close(each)
+    for end in (read_end, write_end):
+        os.close(end)
 
 
 def test_texts_are_written_in_order(pipe: tuple[int, int]) -> None:
-    """Texts are written in order and completely, whatever their letters."""
+    """Texts with any characters are written in order and completely."""
     output = QueuedOutput(pipe[1])
     print("one é", 2, file=output, flush=True)
     output.write("lone \udcff\n")
@@ -88,22 +88,24 @@ console.run_command(run)
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_a_program_whose_output_is_not_read(number: signal.Signals) -> None:
-    """A program prints into two full pipes that nobody reads; it goes on, and Ctrl-C and SIGTERM end it."""
-    alive, told = os.pipe()
-    program = PRINTS_UNTIL_STOPPED.format(descriptor=told)
+    """A program whose output fills two pipes that nobody reads continues, and Ctrl-C and SIGTERM end it."""
+    progress_read_end, progress_write_end = os.pipe()
+    program = PRINTS_UNTIL_STOPPED.format(descriptor=progress_write_end)
     command = [sys.executable, "-c", program]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, pass_fds=[told]) as process:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, pass_fds=[progress_write_end]
+    ) as process:
         try:
             received = 0
             while received < 100:  # ten times what fits into a pipe
-                assert select.select([alive], [], [], END_LIMIT_S)[0]
-                received += len(os.read(alive, 100))
+                assert select.select([progress_read_end], [], [], END_LIMIT_S)[0]
+                received += len(os.read(progress_read_end, 100))
             process.send_signal(number)
             assert process.wait(END_LIMIT_S) == 1
         finally:
             process.kill()
-    os.close(alive)
-    os.close(told)
+    os.close(progress_read_end)
+    os.close(progress_write_end)
 
 
 FAILS_UNEXPECTEDLY = """

@@ -21,7 +21,7 @@ from lavt.node import WAKE, Message, Send, Stage
 from lavt.nodes.payloads import StationaryStatus
 from lavt.runtime.pipe import CAPACITY, Pipe
 from lavt.runtime.realtime import RealRuntime
-from lavt.runtime.remote_node import FAILED_CHECKS, LATE_NS, SILENT_CHECKS, START_CHECKS, NodeHost, RemoteNodeProxy
+from lavt.runtime.remote_node import FAILED_AFTER_CHECKS, FIRST_HEARTBEAT_CHECKS, LATE_NS, SILENT_AFTER_CHECKS, NodeHost, RemoteNodeProxy
 
 pytestmark = pytest.mark.usefixtures("own_switch_interval")
 
@@ -105,24 +105,26 @@ class Rig:
     main: RealRuntime
     host: NodeHost
     disconnected: threading.Event
-    number: list[int]
+    status: list[int]
+    """The status of the node, as its only element."""
     silences: list[RealRuntime]
+    """The arguments of `on_silent`."""
 
 
 @contextmanager
 def rig() -> Iterator[Rig]:
-    ours, theirs = multiprocessing.Pipe()
-    node, neighbour, outputs, disconnected, number = Echo(), Neighbour(), FakeOutputs(), threading.Event(), [0]
+    server_end, node_end = multiprocessing.Pipe()
+    node, neighbour, outputs, disconnected, status = Echo(), Neighbour(), FakeOutputs(), threading.Event(), [0]
     silences: list[RealRuntime] = []
-    proxy = RemoteNodeProxy("actuator", ours, heartbeat="state", on_silent=silences.append)
+    proxy = RemoteNodeProxy("actuator", server_end, heartbeat="state", on_silent=silences.append)
     main = RealRuntime(CLOCK, [neighbour], outputs, lambda: None, {"actuator": proxy})
-    host = NodeHost(theirs, CLOCK, node, get_status=lambda: number[0], on_disconnect=disconnected.set)
+    host = NodeHost(node_end, CLOCK, node, get_status=lambda: status[0], on_disconnect=disconnected.set)
     main.start({"zenoh": outputs})
     proxy.start(main)
     host.start()
-    both = Rig(node, neighbour, outputs, proxy, main, host, disconnected, number, silences)
+    ends = Rig(node, neighbour, outputs, proxy, main, host, disconnected, status, silences)
     try:
-        yield both
+        yield ends
     finally:
         host.close()
         proxy.close(5)
@@ -133,14 +135,14 @@ def rig() -> Iterator[Rig]:
 @pytest.mark.judges_times
 def test_a_remote_node_receives_and_sends() -> None:
     """Messages reach the remote node with their arrival time; its sends reach nodes, links and the record."""
-    with rig() as both:
+    with rig() as ends:
         arrived = CLOCK.now()
-        both.main.deliver("control", b"drive", arrived)
-        wait_until(lambda: bool(both.neighbour.received))
-        assert [(each.payload, each.arrived) for each in both.node.received] == [(b"drive", arrived)]
-        assert both.neighbour.received == [StationaryStatus(at_rest=True, active_operator=None)]
-        assert both.outputs.of("control") == [b"drive"], "recorded once, in the process with the links"
-        wait_until(lambda: both.outputs.of("event") == ["received"])
+        ends.main.deliver("control", b"drive", arrived)
+        wait_until(lambda: bool(ends.neighbour.received))
+        assert [(each.payload, each.arrived) for each in ends.node.received] == [(b"drive", arrived)]
+        assert ends.neighbour.received == [StationaryStatus(at_rest=True, active_operator=None)]
+        assert ends.outputs.of("control") == [b"drive"], "recorded once, in the process with the links"
+        wait_until(lambda: ends.outputs.of("event") == ["received"])
 
 
 def test_threads_that_forward_requests_do_not_disturb_each_other() -> None:
@@ -148,8 +150,11 @@ def test_threads_that_forward_requests_do_not_disturb_each_other() -> None:
 
     Each built-in function that a thread calls lets the other threads run.
     """
-    ours, theirs = multiprocessing.Pipe()
-    proxy, errors = RemoteNodeProxy("actuator", ours, heartbeat="state", on_silent=lambda _: None), list[Exception]()
+    server_end, node_end = multiprocessing.Pipe()
+    proxy, errors = (
+        RemoteNodeProxy("actuator", server_end, heartbeat="state", on_silent=lambda _: None),
+        list[Exception](),
+    )
 
     def forward() -> None:
         try:
@@ -166,68 +171,68 @@ def test_threads_that_forward_requests_do_not_disturb_each_other() -> None:
         thread.join()
     threading.setprofile(None)
     proxy.close(0)
-    theirs.close()
+    node_end.close()
     assert errors == []
 
 
 def test_a_reply_goes_to_its_peer() -> None:
     """A reply of the remote node goes to the peer of its request."""
-    with rig() as both:
+    with rig() as ends:
         alice, bob = object(), object()
-        both.main.deliver("session", b"of alice", CLOCK.now(), alice)
-        both.main.deliver("session", b"of bob", CLOCK.now(), bob)
-        wait_until(lambda: len(both.outputs.sent) == 2)
-        assert [(send.payload, send.peer) for send in both.outputs.sent] == [(b"of alice", alice), (b"of bob", bob)]
+        ends.main.deliver("session", b"of alice", CLOCK.now(), alice)
+        ends.main.deliver("session", b"of bob", CLOCK.now(), bob)
+        wait_until(lambda: len(ends.outputs.sent) == 2)
+        assert [(send.payload, send.peer) for send in ends.outputs.sent] == [(b"of alice", alice), (b"of bob", bob)]
 
 
 def test_the_status_is_reported_before_messages() -> None:
     """The remote node's status is reported before its messages are sent."""
-    with rig() as both:
-        both.number[0] = 7
-        both.main.deliver("session", b"?", CLOCK.now(), object())
-        wait_until(lambda: bool(both.outputs.sent))
-        assert both.proxy.status == 7
+    with rig() as ends:
+        ends.status[0] = 7
+        ends.main.deliver("session", b"?", CLOCK.now(), object())
+        wait_until(lambda: bool(ends.outputs.sent))
+        assert ends.proxy.status == 7
 
 
 @pytest.mark.realtime
 def test_a_late_command_between_the_processes_is_dropped() -> None:
     """A command delayed by more than 60 ms between the processes is dropped and counted; a request is not."""
-    with rig() as both:
+    with rig() as ends:
         long_ago = CLOCK.now().later(-LATE_NS - NS_PER_MS)
-        both.main.deliver("control", b"stale", long_ago)
-        both.main.deliver("session", b"late", long_ago, "alice")
-        wait_until(lambda: bool(both.outputs.sent))
-        assert both.node.received == []
-    (counted,) = [each for each in both.outputs.of("counts") if each["node"] == "actuator's process"]
+        ends.main.deliver("control", b"stale", long_ago)
+        ends.main.deliver("session", b"late", long_ago, "alice")
+        wait_until(lambda: bool(ends.outputs.sent))
+        assert ends.node.received == []
+    (counted,) = [each for each in ends.outputs.of("counts") if each["node"] == "actuator's process"]
     assert (counted["control_late"], counted["session_late"], counted["record_overflow"]) == (1, 1, 0)
 
 
 def test_the_end_of_the_other_process_is_noticed() -> None:
     """The node's process is notified when the server's process closes the pipe."""
-    with rig() as both:
-        both.proxy._pipe.close(1)
-        assert both.disconnected.wait(10)
+    with rig() as ends:
+        ends.proxy._pipe.close(1)
+        assert ends.disconnected.wait(10)
 
 
 @pytest.mark.realtime
 @pytest.mark.judges_times
 def test_a_failing_remote_node_ends_the_run() -> None:
     """An error of the remote node ends the server's run with that error."""
-    with rig() as both:
-        both.main.deliver("control", b"break", CLOCK.now())
-        wait_until(lambda: both.host.runtime.failed is not None)
-        both.host.close()
-        wait_until(lambda: both.main.failed is not None)
-        assert "failed on purpose" in str(both.main.failed)
+    with rig() as ends:
+        ends.main.deliver("control", b"break", CLOCK.now())
+        wait_until(lambda: ends.host.runtime.failed is not None)
+        ends.host.close()
+        wait_until(lambda: ends.main.failed is not None)
+        assert "failed on purpose" in str(ends.main.failed)
 
 
 def test_the_end_of_the_nodes_process_ends_the_run() -> None:
     """The end of the node's process ends the server's run with an error."""
-    with rig() as both:
-        both.host._pipe.close(1)
-        wait_until(lambda: both.main.failed is not None)
-        assert isinstance(both.main.failed, WorkError)
-        assert "ended" in str(both.main.failed)
+    with rig() as ends:
+        ends.host._pipe.close(1)
+        wait_until(lambda: ends.main.failed is not None)
+        assert isinstance(ends.main.failed, WorkError)
+        assert "ended" in str(ends.main.failed)
 
 
 @pytest.fixture
@@ -236,73 +241,73 @@ def no_checker(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(RemoteNodeProxy, "_check_heartbeats", lambda _: None)
 
 
-def beat(both: Rig) -> None:
+def beat(ends: Rig) -> None:
     """Let the remote node record a state, and wait until the proxy has received it."""
-    count = len(both.outputs.of("state"))
-    both.host.runtime.record("state", b"", CLOCK.now())
-    wait_until(lambda: len(both.outputs.of("state")) > count)
+    count = len(ends.outputs.of("state"))
+    ends.host.runtime.record("state", b"", CLOCK.now())
+    wait_until(lambda: len(ends.outputs.of("state")) > count)
 
 
 @pytest.mark.usefixtures("no_checker")
 def test_a_remote_node_without_a_heartbeat_fails_the_run() -> None:
     """Without a heartbeat a silence is reported once, and then the run fails; a heartbeat in between prevents that."""
-    with rig() as both:
+    with rig() as ends:
         for _ in range(3):
-            beat(both)
-            for _ in range(FAILED_CHECKS - 1):
-                both.proxy.check_heartbeat()
-        assert both.silences == [both.main] * 3
-        assert both.main.failed is None
-        both.host.runtime.record("event", "alive, but without a state", CLOCK.now())
-        wait_until(lambda: bool(both.outputs.of("event")))
-        both.proxy.check_heartbeat()
-        assert isinstance(both.main.failed, WorkError)
+            beat(ends)
+            for _ in range(FAILED_AFTER_CHECKS - 1):
+                ends.proxy.check_heartbeat()
+        assert ends.silences == [ends.main] * 3
+        assert ends.main.failed is None
+        ends.host.runtime.record("event", "alive, but without a state", CLOCK.now())
+        wait_until(lambda: bool(ends.outputs.of("event")))
+        ends.proxy.check_heartbeat()
+        assert isinstance(ends.main.failed, WorkError)
 
 
 @pytest.mark.usefixtures("no_checker")
 def test_a_heartbeat_while_the_silence_is_reported_prevents_the_failure() -> None:
     """A node whose heartbeat arrives while its silence is reported has not failed."""
-    with rig() as both:
-        beat(both)
-        both.proxy._on_silent = lambda _: beat(both)
-        for _ in range(SILENT_CHECKS):
-            both.proxy.check_heartbeat()
-        assert both.main.failed is None
+    with rig() as ends:
+        beat(ends)
+        ends.proxy._on_silent = lambda _: beat(ends)
+        for _ in range(SILENT_AFTER_CHECKS):
+            ends.proxy.check_heartbeat()
+        assert ends.main.failed is None
 
 
 @pytest.mark.usefixtures("no_checker")
 def test_the_first_heartbeat_may_take_longer() -> None:
     """Before the first heartbeat a node has 30 s; then the run fails."""
-    with rig() as both:
-        for _ in range(START_CHECKS - 1):
-            both.proxy.check_heartbeat()
-        assert (both.silences, both.main.failed) == ([], None)
-        both.proxy.check_heartbeat()
-        assert isinstance(both.main.failed, WorkError)
+    with rig() as ends:
+        for _ in range(FIRST_HEARTBEAT_CHECKS - 1):
+            ends.proxy.check_heartbeat()
+        assert (ends.silences, ends.main.failed) == ([], None)
+        ends.proxy.check_heartbeat()
+        assert isinstance(ends.main.failed, WorkError)
 
 
 def test_heartbeats_are_checked() -> None:
     """A proxy checks heartbeats by itself from its start on."""
-    with rig() as both:
-        beat(both)
-        wait_until(lambda: both.main.failed is not None)
-        assert both.silences == [both.main]
+    with rig() as ends:
+        beat(ends)
+        wait_until(lambda: ends.main.failed is not None)
+        assert ends.silences == [ends.main]
 
 
 @pytest.mark.parametrize("where", ["sent", "read", "received"])
 def test_an_error_in_one_direction_closes_the_pipe(where: str) -> None:
     """An entry that cannot be sent, read or received closes the pipe at both ends."""
-    ours, theirs = multiprocessing.Pipe()
+    server_end, node_end = multiprocessing.Pipe()
     closed, other_closed = threading.Event(), threading.Event()
 
     def fail(_entry: object) -> None:
         raise LookupError("failed on purpose")
 
-    one, other = Pipe(ours, lambda _: None, closed.set), Pipe(theirs, fail, other_closed.set)
+    one, other = Pipe(server_end, lambda _: None, closed.set), Pipe(node_end, fail, other_closed.set)
     one.start()
     other.start()
     if where == "read":
-        ours.send_bytes(b"no entry")
+        server_end.send_bytes(b"no entry")
     else:
         one.send(threading.Lock() if where == "sent" else "an entry")
     assert other_closed.wait(10)
@@ -313,10 +318,10 @@ def test_an_error_in_one_direction_closes_the_pipe(where: str) -> None:
 
 def test_a_server_that_never_started_ends_the_nodes_process() -> None:
     """A server that fails before its start ends the node's process."""
-    ours, theirs = multiprocessing.Pipe()
+    server_end, node_end = multiprocessing.Pipe()
     disconnected = threading.Event()
-    proxy = RemoteNodeProxy("actuator", ours, heartbeat="state", on_silent=lambda _: None)
-    host = NodeHost(theirs, CLOCK, Echo(), get_status=lambda: 0, on_disconnect=disconnected.set)
+    proxy = RemoteNodeProxy("actuator", server_end, heartbeat="state", on_silent=lambda _: None)
+    host = NodeHost(node_end, CLOCK, Echo(), get_status=lambda: 0, on_disconnect=disconnected.set)
     host.start()
     proxy.close(5)
     assert disconnected.wait(10)
@@ -326,8 +331,8 @@ def test_a_server_that_never_started_ends_the_nodes_process() -> None:
 @pytest.mark.realtime
 def test_sending_without_a_reader_does_not_block() -> None:
     """Without a reader, sending does not block, and entries that do not fit are counted."""
-    ours, _theirs = multiprocessing.Pipe()
-    pipe = Pipe(ours, lambda _entry: None, lambda: None)
+    server_end, _node_end = multiprocessing.Pipe()
+    pipe = Pipe(server_end, lambda _entry: None, lambda: None)
     pipe.start()
     for _ in range(4 * CAPACITY):
         pipe.send(bytes(1000))
@@ -336,9 +341,9 @@ def test_sending_without_a_reader_does_not_block() -> None:
 
 def test_a_pipe_that_was_never_started_closes() -> None:
     """A pipe that was never started can be closed, which the other end notices."""
-    ours, theirs = multiprocessing.Pipe()
-    proxy = RemoteNodeProxy("actuator", ours, heartbeat="state", on_silent=lambda _: None)
+    server_end, node_end = multiprocessing.Pipe()
+    proxy = RemoteNodeProxy("actuator", server_end, heartbeat="state", on_silent=lambda _: None)
     proxy.close(1)
     with pytest.raises(EOFError):
-        theirs.recv_bytes()
-    theirs.close()
+        node_end.recv_bytes()
+    node_end.close()

@@ -41,7 +41,7 @@ class ListRecorder:
         self.entries.append((topic, payload, now))
 
     def close(self) -> None:
-        """Note that the record is complete."""
+        """Store that the record is complete."""
         self.is_closed = True
 
 
@@ -88,11 +88,11 @@ class Stamped:
 
 def test_each_stage_gets_the_time_after_the_one_before() -> None:
     """Each stage gets the result and end time of the one before, and the timeline has all end times."""
-    seen = []
+    calls = []
 
     def stage(result: object) -> Callable[[Any, Now], object]:
         def call(value: object, now: Now) -> object:
-            seen.append((value, now.mono_ns))
+            calls.append((value, now.mono_ns))
             return result
 
         return call
@@ -101,7 +101,7 @@ def test_each_stage_gets_the_time_after_the_one_before() -> None:
     sends = [Send("event", 1)]
     stages = [("a", stage(Stamped(42))), ("b", stage("bare")), ("c", stage(sends))]
     outcome = run_stages("node", stages, first, Now(1010, 5010), map(Now(1010, 5010).later, count(7, 7)))
-    assert seen == [(first, 1010), (Stamped(42), 1017), ("bare", 1024)]
+    assert calls == [(first, 1010), (Stamped(42), 1017), ("bare", 1024)]
     assert (outcome.sends, outcome.end) == (sends, Now(1031, 5031))
     assert outcome.timeline is not None
     assert (outcome.timeline.stamp_ns, outcome.timeline.arrived_mono_ns) == (42, 1000)
@@ -176,12 +176,12 @@ def test_a_record_is_complete_after_close() -> None:
 @pytest.mark.parametrize("is_blocked", [False, True])
 def test_the_live_status_does_not_depend_on_the_record(is_blocked: bool) -> None:
     """While the disk is full or does not answer, the ending and the figures are shown, and the record can be closed."""
-    go = threading.Event()
+    unblock = threading.Event()
 
     class Disk(ListRecorder):
         def write(self, *_: Any) -> None:
             if is_blocked:
-                go.wait()
+                unblock.wait()
             raise OSError("no space left on device")
 
     live, queued = LiveStatus(), QueuedRecorder(Disk(), close_timeout_s=0.02)
@@ -194,23 +194,23 @@ def test_the_live_status_does_not_depend_on_the_record(is_blocked: bool) -> None
     assert live.status()["reason"] == STATE.reason
     assert live.take_updates() == [(STATE, NOW)]
     queued.close(NOW)
-    go.set()
+    unblock.set()
 
 
 def test_a_full_record_queue_counts_lost_entries() -> None:
     """A full record queue loses and counts entries without blocking."""
-    recorded, go = ListRecorder(), threading.Event()
+    recorded, unblock = ListRecorder(), threading.Event()
 
     class Slow(ListRecorder):
         def write(self, topic: str, payload: Any, now: Now) -> None:
-            go.wait()
+            unblock.wait()
             recorded.write(topic, payload, now)
 
     recorder = QueuedRecorder(Slow(), capacity=3)
     for number in range(20):
         recorder.write("event", number, NOW)
     assert recorder.overflow >= 16
-    go.set()
+    unblock.set()
     recorder.close(NOW)
     written = [payload for topic, payload, _ in recorded.entries if topic == "event"]
     assert written == list(range(len(written)))

@@ -23,7 +23,7 @@ from lavt.transport.security.gateway import ClientGateway
 from lavt.transport.udp_link import UdpLink
 from lavt.vehicle import video_device
 
-HERE = "127.0.0.1"
+LOOPBACK = "127.0.0.1"
 WAIT_S = 30.0
 CLOCK = MachineClock()
 
@@ -33,6 +33,7 @@ class BrokenError(Exception):
 
 
 def broken(*_: Any) -> Any:
+    """Fail, in place of any function."""
     raise BrokenError
 
 
@@ -52,22 +53,22 @@ def runtime() -> Iterator[RealRuntime]:
 
 def break_udp(stack: ExitStack) -> None:
     """A received datagram cannot be processed."""
-    link = stack.enter_context(closing(UdpLink(CLOCK, "rtp", bind=(HERE, 0))))
+    link = stack.enter_context(closing(UdpLink(CLOCK, "rtp", bind=(LOOPBACK, 0))))
     link.start(broken)
     sender = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-    sender.sendto(b"x", (HERE, link.port))
+    sender.sendto(b"x", (LOOPBACK, link.port))
 
 
 def break_closed_socket(stack: ExitStack) -> None:
     """The socket is not open any more, though nobody has closed the link."""
-    link = stack.enter_context(closing(UdpLink(CLOCK, "rtp", bind=(HERE, 0))))
+    link = stack.enter_context(closing(UdpLink(CLOCK, "rtp", bind=(LOOPBACK, 0))))
     link._socket.close()
     link.start(lambda *_: None)
 
 
 def break_registration(stack: ExitStack) -> None:
     """A registration cannot be made."""
-    link = RendezvousLink(CLOCK, "rtp", bind=(HERE, 0), rendezvous=(HERE, 9), registration=broken)
+    link = RendezvousLink(CLOCK, "rtp", bind=(LOOPBACK, 0), rendezvous=(LOOPBACK, 9), registration=broken)
     stack.enter_context(closing(link)).start(lambda *_: None)
 
 
@@ -114,7 +115,7 @@ def test_an_error_of_a_camera_device_ends_the_runtime(
 
 
 def test_an_exit_of_a_thread_ends_the_runtime(runtime: RealRuntime) -> None:
-    """A thread that exits in the middle ends the runtime too; Python ignores it otherwise."""
+    """A thread that calls `sys.exit` ends the runtime, although Python by itself ignores that."""
 
     def leave() -> None:
         raise SystemExit
@@ -125,11 +126,11 @@ def test_an_exit_of_a_thread_ends_the_runtime(runtime: RealRuntime) -> None:
 
 
 def test_the_former_handler_is_restored() -> None:
-    """Afterwards, errors in threads are handled as before."""
-    former, failed = threading.excepthook, queue.Queue[BaseException]()
-    with fail_on_thread_errors(failed.put):
+    """After the context is left, errors in threads are handled as before."""
+    previous_hook, errors = threading.excepthook, queue.Queue[BaseException]()
+    with fail_on_thread_errors(errors.put):
         thread = threading.Thread(target=broken)
         thread.start()
         thread.join()
-    assert isinstance(failed.get_nowait(), BrokenError)
-    assert threading.excepthook == former
+    assert isinstance(errors.get_nowait(), BrokenError)
+    assert threading.excepthook == previous_hook

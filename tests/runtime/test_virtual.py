@@ -76,7 +76,7 @@ def test_a_hosts_clock_is_inverted_exactly(start_ns: int, mono_ns: int, drift_pp
 
 
 def test_offset_drift_and_steps() -> None:
-    """The wall clock has offset and steps, and both clocks drift."""
+    """The wall clock has an offset and steps, and both clocks drift."""
     clock = HostClock(7, 100, offset_ns=50, drift_ppb=1000, steps=[(2 * NS_PER_S, -30)])
     assert clock.at(0) == Now(7, 150)
     assert clock.at(NS_PER_S) == Now(NS_PER_S + 1007, NS_PER_S + 1150)
@@ -105,11 +105,11 @@ def test_a_busy_node_queues_messages() -> None:
     )
     runtime.run(200 * MS, lambda: False)
     assert [arrived // MS for _, arrived, _ in actuator.received[:4]] == [3, 23, 43, 63]
-    assert [begun // MS for _, _, begun in actuator.received[:4]] == [3, 33, 63, 93]
+    assert [started // MS for _, _, started in actuator.received[:4]] == [3, 33, 63, 93]
 
 
 def test_a_closed_link_loses_messages() -> None:
-    """A closed link loses new messages, and neither earlier nor later ones."""
+    """A closed link loses the messages that are sent while it is closed, and no others."""
     runtime, actuator = new_runtime(DelayModel(50.0))
     link = runtime.links["control"]
     runtime.at(110 * MS, lambda: setattr(link, "open", False))
@@ -132,7 +132,7 @@ def test_two_runs_are_equal() -> None:
 
 
 def test_a_run_ends_when_finished() -> None:
-    """A run ends when finished or at its limit, and returns which."""
+    """A run ends when it is finished or at its limit, and returns whether it is finished."""
     runtime, actuator = new_runtime(DelayModel(0.0))
     assert runtime.run(NS_PER_S, lambda: len(actuator.received) == 3)
     assert runtime.true_ns == 40 * MS

@@ -1,8 +1,8 @@
 """The actuator in a process of its own, which stops the vehicle when the server's process is frozen or killed.
 
 The server's process renders, encodes and sends pictures. Whatever happens to it, the actuator's process keeps running,
-detects the command timeout, and stops the vehicle. If the actuator's own process is frozen, it sends no frame, and the
-vehicle's own watchdog brakes.
+detects the command timeout, and stops the vehicle. If the actuator's process itself is frozen, it sends no CAN frames,
+and the watchdog of the kit in the vehicle brakes.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from lavt.vehicle.dbw.vehicle import DbwVehicle
 NAME = "actuator"
 READY_TIMEOUT_S = 30.0
 STOP_TIMEOUT_S = 12.0
-"""How long the vehicle may take to stop and disengage when the server ends; after an implausible speed it brakes for at
-least 8 s."""
+"""How long the vehicle may take to stop and disengage when the server ends. If its speed was implausible, it brakes for
+at least 8 s."""
 POLL_PERIOD_S = 0.05
-LONGEST_END_S = 13
-"""The process is killed by its own alarm this long after the server's end, even if its node is stuck by then."""
-IGNORED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""Signals that all processes of a terminal or service receive; the server's process handles them, and its end is
-detected."""
+KILL_AFTER_S = 13
+"""This long after the server's end, the process is killed by its own alarm, even if its node is stuck by then."""
+IGNORED_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Signals that all processes of a terminal or service receive. The server's process handles them; this process detects
+that the server's process ends."""
 
 log = logging.getLogger(__name__)
 
@@ -58,19 +58,19 @@ class ActuatorProcess(RemoteNodeProxy):
         return self._process.pid or 0
 
     def in_force(self) -> tuple[int, int]:
-        """Return the epoch in force and the sequence of its last accepted command, as last reported."""
+        """Return the epoch in force and the sequence number of its last accepted command, as last reported."""
         return self.status or (0, -1)
 
     def end(self) -> None:
         """Stop the vehicle, disengage, and wait for the end of the process."""
         self.close(STOP_TIMEOUT_S + 2)
         self._process.join(1)
-        if self._process.is_alive():  # it is frozen: it sends no frame, and the vehicle brakes by itself
+        if self._process.is_alive():  # it is frozen: it sends no CAN frames, and the kit brakes by itself
             self._process.kill()
 
 
 def _record_silence(runtime: RealRuntime) -> None:
-    """Record that the actuator's process reports no state any more."""
+    """Record that the actuator's process no longer reports a state."""
     now = runtime.now()
     log.warning("the process of the %s reports no state", NAME)
     runtime.record("event", Event(now.mono_ns, "silent", f"the process of the {NAME} reports no state"), now)
@@ -79,10 +79,10 @@ def _record_silence(runtime: RealRuntime) -> None:
 def start_actuator(config: ServerConfig, *, host: str, video_port: int) -> ActuatorProcess:
     """Start the process; raise its start-up error, which is a `UserError` for invalid input."""
     context = multiprocessing.get_context("spawn")
-    own_end, other_end = context.Pipe()
-    process = context.Process(target=serve_actuator, args=(other_end, config, host, video_port), name=NAME)
+    own_end, actuator_end = context.Pipe()
+    process = context.Process(target=serve_actuator, args=(actuator_end, config, host, video_port), name=NAME)
     process.start()
-    other_end.close()
+    actuator_end.close()
     try:
         error = own_end.recv() if own_end.poll(READY_TIMEOUT_S) else "it did not become ready in time"
     except EOFError:
@@ -100,8 +100,8 @@ def start_actuator(config: ServerConfig, *, host: str, video_port: int) -> Actua
 
 def serve_actuator(connection: Connection, config: ServerConfig, host: str, video_port: int) -> None:
     """Run the actuator's process: drive until the server's process ends or requests the end, then stop the vehicle."""
-    for number in IGNORED:
-        signal.signal(number, signal.SIG_IGN)
+    for signal_number in IGNORED_SIGNALS:
+        signal.signal(signal_number, signal.SIG_IGN)
     queue_output("stdout", "stderr")
     process_priority.raise_priority(process_priority.VEHICLE_NICENESS)
     clock = MachineClock()
@@ -110,30 +110,30 @@ def serve_actuator(connection: Connection, config: ServerConfig, host: str, vide
         node = build_actuator(
             config, vehicle, MachineEntropy(), start, host=host, video_port=video_port, route=driven_route(config)
         )
-    except Exception as error:  # the server's process reports any error
+    except Exception as error:  # the server's process reports it, whatever it is
         connection.send(error if isinstance(error, UserError) else f"{type(error).__name__}: {error}")
         return
     connection.send(None)
     disconnected = threading.Event()
-    host_of_node = NodeHost(connection, clock, node, get_status=node.gate.in_force, on_disconnect=disconnected.set)
-    host_of_node.start()
+    node_host = NodeHost(connection, clock, node, get_status=node.gate.in_force, on_disconnect=disconnected.set)
+    node_host.start()
     try:
-        with fail_on_thread_errors(host_of_node.runtime.fail):
-            while not disconnected.wait(POLL_PERIOD_S) and not host_of_node.runtime.stopped.is_set():
+        with fail_on_thread_errors(node_host.runtime.fail):
+            while not disconnected.wait(POLL_PERIOD_S) and not node_host.runtime.stopped.is_set():
                 pass
-            signal.alarm(LONGEST_END_S)
-            host_of_node.deliver("server_ends", None)
-            _wait_until_disengaged(host_of_node, vehicle, clock)
+            signal.alarm(KILL_AFTER_S)
+            node_host.deliver("server_ends", None)
+            _wait_until_disengaged(node_host, vehicle, clock)
     finally:
-        host_of_node.close()
+        node_host.close()
         vehicle.close()
 
 
-def _wait_until_disengaged(host: NodeHost, vehicle: DbwVehicle, clock: Clock) -> None:
+def _wait_until_disengaged(node_host: NodeHost, vehicle: DbwVehicle, clock: Clock) -> None:
     """Wait until the vehicle has stopped and is disengaged."""
     end_ns = clock.now().mono_ns + round(STOP_TIMEOUT_S * NS_PER_S)
-    never = threading.Event()
-    while clock.now().mono_ns < end_ns and not host.runtime.stopped.is_set():
-        never.wait(POLL_PERIOD_S)
+    never_set = threading.Event()
+    while clock.now().mono_ns < end_ns and not node_host.runtime.stopped.is_set():
+        never_set.wait(POLL_PERIOD_S)
         if vehicle.is_silent:
             return

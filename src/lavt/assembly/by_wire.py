@@ -28,7 +28,7 @@ def profile_of(config: DbwConfig) -> Profile:
     return load_profile(config.profile, config.dbc, config.steering_sign)
 
 
-def inside(config: ServerConfig, road: Road, start: Now) -> DbwVehicle:
+def build_inside(config: ServerConfig, road: Road, start: Now) -> DbwVehicle:
     """Build a by-wire vehicle whose kit and simulated car are in this process."""
     profile = profile_of(config.vehicle.dbw)
     car = build_software_car(config, profile, road, start.mono_ns)
@@ -66,12 +66,12 @@ def listen(config: ServerConfig, clock: Clock, duration_ns: int) -> tuple[int, s
     frames, end_ns = 0, now.mono_ns + duration_ns
     try:
         while (now_ns := clock.now().mono_ns) < end_ns:
-            for each in port.take(now_ns):
-                adapter.receive(each.frame, now_ns)
+            for received in port.take(now_ns):
+                adapter.receive(received.frame, now_ns)
                 frames += 1
             pause(POLL_PERIOD_NS)
-    except BusGone as gone:
-        return frames, str(gone)
+    except BusGone as error:
+        return frames, str(error)
     finally:
         port.close()
     adapter.engage(wanted=False, now_ns=end_ns)
@@ -84,7 +84,7 @@ def is_simulated(config: DbwConfig) -> bool:
 
 
 def capabilities_of(profile: Profile, *, simulated: bool, truth: bool) -> Capabilities:
-    """Return the capabilities of a car with this kit, from its profile."""
+    """Return the capabilities of a car with a kit, as its profile gives them."""
     car, limits = profile.car, profile.limits
     return Capabilities(
         simulated=simulated,

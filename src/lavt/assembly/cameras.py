@@ -1,4 +1,4 @@
-"""The construction of cameras, and of the camera geometry on the vehicle and on the client."""
+"""The construction of cameras, and of their geometry as the vehicle's machine and the client know it."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ CAMERAS: dict[str, Callable[[ServerConfig], Camera | None]] = {SIMULATED: lambda
 
 
 def build_camera(config: ServerConfig) -> Camera | None:
-    """Build the configured camera; return None for the simulator's own. Raise `UserError` for an unknown source."""
+    """Build the configured camera, or return None for the simulator's own. Raise `UserError` for an unknown source."""
     source = config.camera.source
     if source in CAMERAS:
         return CAMERAS[source](config)
@@ -113,12 +113,12 @@ def camera_of_file(path: Path) -> CalibratedCamera:
     if not isinstance(section, dict):
         raise UserError(f"{path}: camera must contain keys and values, not {section!r}")
     server_only = ServerCameraConfig.model_fields.keys() - CameraConfig.model_fields.keys()
-    geometry = {key: each for key, each in section.items() if key not in server_only}
+    geometry = {key: value for key, value in section.items() if key not in server_only}
     return client_camera(parse_config(ClientCameraConfig, geometry, f"{path}: camera"))
 
 
 def client_camera(config: ClientCameraConfig) -> CalibratedCamera:
-    """Return the camera of a client's config, from its calibration file if it names one, otherwise from its keys."""
+    """Return the camera of a client's config: from the calibration file that it names, otherwise from its keys."""
     if not config.calibration:
         return calibrated(camera_model(config))
     path = Path(config.calibration)

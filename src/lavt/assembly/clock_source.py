@@ -1,4 +1,4 @@
-"""The construction of the time source that is queried once a second for the error of this machine's clock."""
+"""The construction of the time source, which is queried once a second for the error of this machine's clock."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lavt.transport.clock_sync.ptp import read_ptp
 MS_PER_S = 1000.0
 
 
-def interpreter(config: ClockConfig) -> PersistentProcess:
+def query_process(config: ClockConfig) -> PersistentProcess:
     """Return the process that runs the commands of the configured time source; the caller closes it."""
     return Chronyc() if config.source == "chrony" else Shell()
 
@@ -22,7 +22,7 @@ def interpreter(config: ClockConfig) -> PersistentProcess:
 def clock_source(config: ClockConfig, clock: Clock, run: Run) -> Callable[[], ClockReport | None]:
     """Return a function that queries the configured time source and returns None on timeout.
 
-    `run` is the method of the source's `interpreter`.
+    `run` is the method of the source's `query_process`.
     """
 
     def external() -> ClockReport:
@@ -33,7 +33,7 @@ def clock_source(config: ClockConfig, clock: Clock, run: Run) -> Callable[[], Cl
         )
 
     def probe_only() -> ClockReport:
-        return unknown_clock(clock.now(), kernel_identity(), "probe", "left to the probe by clock.source")
+        return unknown_clock(clock.now(), kernel_identity(), "probe", "clock.source leaves the offset to the probe")
 
     sources: dict[str, Callable[[], ClockReport | None]] = {
         "chrony": lambda: read_chrony(clock, run),

@@ -45,7 +45,8 @@ from lavt.vehicle.dbw.profile import (
 from lavt.vehicle.dbw.traffic import ExpectedMessages
 
 MAX_PEDAL_STEP = 0.02
-"""The largest step of a pedal, as a share of its range; it detects a DBC without a scale for a raw 16-bit value."""
+"""The largest accepted step of a pedal's signal, as a share of the pedal's range. A raw 16-bit value whose scale is
+missing in the DBC has a larger step, and so is detected."""
 
 Choice = TypeVar("Choice", str, list[int])
 
@@ -57,10 +58,10 @@ def shipped_profiles() -> dict[str, Path]:
 
 
 def load_profile(name_or_path: str, dbc: str = "", steering_sign: Literal[1, -1] | None = None) -> Profile:
-    """Load a profile by its name or path, and check it against its DBC or `dbc`.
+    """Load a profile by its name or path, and check it against the file `dbc`, or by default against its own DBC.
 
-    The suffix `:remote` or `:user` of the name selects the set of commands. `steering_sign` is for a profile without a
-    sign. Raises `UserError` for a missing or invalid file, and if profile and DBC do not match.
+    The suffix `:remote` or `:user` of the name selects the set of commands. `steering_sign` is only for a profile
+    without a sign. Raises `UserError` for a missing or invalid file, and if profile and DBC do not match.
     """
     config, codec = read_profile(name_or_path, dbc)
     sign = _steering_sign(config, steering_sign, name_or_path)
@@ -85,7 +86,7 @@ def profile_digest(name_or_path: str, dbc: str = "") -> str:
     path = _profile_path(_split_suffix(name_or_path)[0])
     config = parse_config(ProfileConfig, read_yaml(path), str(path))
     return sha256(
-        b"".join(sha256(each.read_bytes()).digest() for each in (path, _dbc_path(path, config, dbc)))
+        b"".join(sha256(file.read_bytes()).digest() for file in (path, _dbc_path(path, config, dbc)))
     ).hexdigest()
 
 
@@ -101,28 +102,28 @@ def _dbc_path(path: Path, config: ProfileConfig, dbc: str) -> Path:
 
 
 def _split_suffix(name_or_path: str) -> tuple[str, CommandSet | None]:
-    """Split a profile's name into the name and the set of commands; None without a suffix."""
-    name, _, last = name_or_path.rpartition(":")
-    for each in get_args(CommandSet):
-        if name and last == each:
-            return name, each
+    """Split a profile's name into the name proper and the set of commands, which is None without a suffix."""
+    name, _, suffix = name_or_path.rpartition(":")
+    for command_set in get_args(CommandSet):
+        if name and suffix == command_set:
+            return name, command_set
     return name_or_path, None
 
 
-def _steering_sign(config: ProfileConfig, given: Literal[1, -1] | None, name: str) -> Literal[1, -1] | None:
+def _steering_sign(config: ProfileConfig, configured: Literal[1, -1] | None, name: str) -> Literal[1, -1] | None:
     own = config.vehicle.steering_sign
-    if own is not None and given is not None and own != given:
-        raise UserError(f"{name} has steering_sign {own}, not {given}: leave vehicle.dbw.steering_sign out")
-    return own if given is None else given
+    if own is not None and configured is not None and own != configured:
+        raise UserError(f"{name} has steering_sign {own}, not {configured}: leave vehicle.dbw.steering_sign out")
+    return own if configured is None else configured
 
 
 class _ProfileBuilder:
-    """A builder of a profile from its config and DBC, which tracks the signals in use."""
+    """A builder of a profile from its config and DBC; it notes every signal that the profile uses."""
 
     def __init__(self, config: ProfileConfig, codec: Codec, name: str) -> None:
         self.config, self.codec, self.name = config, codec, name
-        self.used: dict[str, bool] = {}
-        """Whether each signal in use (`message.signal`) is unverified."""
+        self.is_unverified: dict[str, bool] = {}
+        """For each signal in use (`message.signal`), whether its layout is unverified."""
 
     def build(self) -> Profile:
         """Return the profile."""
@@ -148,7 +149,7 @@ class _ProfileBuilder:
             watchdog=self._watchdog(),
             speeds_per_mps=self._speed_units(reports),
             angle_per_deg=self._unit_of(reports, "angle", IN_DEGREES),
-            unverified=tuple(name for name, is_unverified in self.used.items() if is_unverified),
+            unverified=tuple(name for name, is_unverified in self.is_unverified.items() if is_unverified),
             codec=self.codec,
         )
 
@@ -184,14 +185,14 @@ class _ProfileBuilder:
         )
 
     def _rate(self, message: MessageFacts, command: CommandConfig) -> float:
-        """Return the commanded rate: the limit, rounded down to a step of the signal, and at least one step.
+        """Return the commanded rate: the limit, rounded down to a multiple of the signal's step.
 
-        A higher rate would exceed the limit. 0 is not used, because it may select the kit's default.
+        Raise `UserError` if that is 0, which may select the kit's default rate.
         """
         signal = self._signal(message, command.rate)
-        unit = self._unit(signal, message, IN_DEGREES_PER_SECOND) / command.rate_unit_degps
-        wanted = min(self.config.limits.steering_wheel_rate_degps * unit, signal.maximum)
-        steps = math.floor(wanted / signal.scale + 1e-9)
+        per_degps = self._unit(signal, message, IN_DEGREES_PER_SECOND) / command.rate_unit_degps
+        limit = min(self.config.limits.steering_wheel_rate_degps * per_degps, signal.maximum)
+        steps = math.floor(limit / signal.scale + 1e-9)
         if steps < 1:
             raise UserError(
                 f"{self.name}: limits.steering_wheel_rate_degps is less than one step of {signal.name}: raise it"
@@ -236,10 +237,10 @@ class _ProfileBuilder:
         return ReportSpec(
             part=part,
             timeout_ns=report.timeout_ms * NS_PER_MS,
-            values={word: self._signal(message, signal).name for word, signal in report.values.items()},
+            values={value: self._signal(message, signal).name for value, signal in report.values.items()},
             no_value={
-                word: -(1 << signal.bits - 1) * signal.scale + signal.offset
-                for word, name in report.values.items()
+                value: -(1 << signal.bits - 1) * signal.scale + signal.offset
+                for value, name in report.values.items()
                 if (signal := self._signal(message, name)).is_signed
             },
             override=self._conditions(message, report.override),
@@ -272,13 +273,13 @@ class _ProfileBuilder:
         return tuple(parsed)
 
     def _check_complete(self, reports: Mapping[str, ReportSpec]) -> None:
-        """Raise `UserError` if a report that driving requires is missing."""
-        reported = {(report.part, word) for report in reports.values() for word in report.values}
+        """Raise `UserError` if a reported value that driving requires is missing."""
+        reported = {(report.part, value) for report in reports.values() for value in report.values}
         required = [*((axis, "enabled") for axis in AXES), ("steering", "angle"), ("gear", "gear")]
-        for part, word in required:
-            if (part, word) not in reported:
-                raise UserError(f"{self.name}: reports.{part}.values has no {word}: name its signal")
-        if not any(word == "speed" for _, word in reported):
+        for part, value in required:
+            if (part, value) not in reported:
+                raise UserError(f"{self.name}: reports.{part}.values has no {value}: name its signal")
+        if not any(value == "speed" for _, value in reported):
             raise UserError(f"{self.name}: no report has a speed: name its signal in reports.speed.values")
 
     # Look-ups in the DBC.
@@ -305,7 +306,7 @@ class _ProfileBuilder:
             raise UserError(
                 f"{self.name}: {message.name} of its DBC has no signal {name!r}: change the profile, or name another"
             )
-        self.used[f"{message.name}.{name}"] = message.signals[name].is_unverified
+        self.is_unverified[f"{message.name}.{name}"] = message.signals[name].is_unverified
         return message.signals[name]
 
     def _optional_signal(self, message: MessageFacts, name: str) -> str:
@@ -315,7 +316,7 @@ class _ProfileBuilder:
         return 1 << self._signal(message, name).bits if name else 1
 
     def _checksum(self, message: MessageFacts, name: str) -> str:
-        """Return the name of a checksum; raise `UserError` unless it is the last byte."""
+        """Return the name of a checksum's signal; raise `UserError` unless the signal is the last byte."""
         if name:
             signal = self._signal(message, name)
             if (signal.bits, signal.start // 8) != (8, message.length - 1):
@@ -325,6 +326,7 @@ class _ProfileBuilder:
         return name
 
     def _unit(self, signal: SignalFacts, message: MessageFacts, units: Mapping[str, float]) -> float:
+        """Return the factor that `units` has for the unit of a signal."""
         if signal.unit not in units:
             raise UserError(
                 f"{self.name}: {signal.name} of {message.name} is in {signal.unit!r}: name a signal in "
@@ -332,22 +334,22 @@ class _ProfileBuilder:
             )
         return units[signal.unit]
 
-    def _unit_of(self, reports: Mapping[str, ReportSpec], word: str, units: Mapping[str, float]) -> float:
-        """Return the unit of a reported value."""
-        name, report = next((name, report) for name, report in reports.items() if word in report.values)
+    def _unit_of(self, reports: Mapping[str, ReportSpec], value: str, units: Mapping[str, float]) -> float:
+        """Return the factor that `units` has for the unit of a reported value."""
+        name, report = next((name, report) for name, report in reports.items() if value in report.values)
         message = self.codec.messages[name]
-        return self._unit(message.signals[report.values[word]], message, units)
+        return self._unit(message.signals[report.values[value]], message, units)
 
     def _speed_units(self, reports: Mapping[str, ReportSpec]) -> dict[str, float]:
-        """Return the unit of each reported speed; a wheel's is converted by its radius."""
-        words = {word for report in reports.values() for word in report.values}
+        """Return the signal value of 1 m/s for each reported speed; the speed of a wheel is converted by its radius."""
+        reported = {value for report in reports.values() for value in report.values}
         radius_m = self.config.vehicle.wheel_radius_m
         return {
-            word: self._unit_of(reports, word, IN_RADIANS_PER_SECOND) / radius_m
-            if word in WHEEL_SPEEDS
-            else self._unit_of(reports, word, IN_METRES_PER_SECOND)
-            for word in SPEEDS
-            if word in words
+            speed: self._unit_of(reports, speed, IN_RADIANS_PER_SECOND) / radius_m
+            if speed in WHEEL_SPEEDS
+            else self._unit_of(reports, speed, IN_METRES_PER_SECOND)
+            for speed in SPEEDS
+            if speed in reported
         }
 
     def _check_range(self, message: MessageFacts, signal: SignalFacts, value: float) -> None:
@@ -359,8 +361,8 @@ class _ProfileBuilder:
             )
 
 
-def _join_or(words: Iterable[str]) -> str:
-    return " or ".join(words)
+def _join_or(alternatives: Iterable[str]) -> str:
+    return " or ".join(alternatives)
 
 
 def find_dbw(target: str) -> DbwConfig:
@@ -384,10 +386,11 @@ def find_dbw(target: str) -> DbwConfig:
 def expected_traffic(profile: Profile) -> ExpectedMessages:
     """Return the messages that a profile expects on its bus.
 
-    Checksums and counters are selected by signal name, and so include those of messages that the profile does not use.
+    Checksums and counters are known by the names of their signals, so they are also expected in messages that the
+    profile does not use.
     """
     axes = profile.axes.values()
-    checksums = {part.checksum for part in axes} | {part.checksum for part in profile.reports.values()}
+    checksums = {command.checksum for command in axes} | {report.checksum for report in profile.reports.values()}
     return ExpectedMessages(
         checksums=checksums - {""},
         counters={command.count for command in axes} - {""},

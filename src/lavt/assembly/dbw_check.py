@@ -1,4 +1,4 @@
-"""The check of a by-wire profile against its DBC: each mismatch is a sentence that begins with the profile's key."""
+"""The check of a by-wire profile against its DBC: each mismatch is a sentence that begins with a key of the profile."""
 
 from __future__ import annotations
 
@@ -14,29 +14,30 @@ from lavt.vehicle.dbw.profile import AXES, REPEAT_PERIOD_NS, Profile
 
 MAX_FRAME_BYTES: Final = 8
 MIN_PERIODS_PER_TIMEOUT: Final = 2
-"""A timeout tolerates one lost message."""
+"""So that a timeout tolerates one lost message."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Use:
-    """A use of a signal by the profile."""
+class _SignalUse:
+    """A signal that the profile uses."""
 
     key: str
-    """The profile's key, such as `sent.steering`."""
+    """The key of the profile that names the message, such as `sent.steering`."""
     message: MessageFacts
     signal: SignalFacts
     role: str
+    """The key below `key` that names the signal, such as `value`."""
 
 
 def find_mismatches(config: ProfileConfig, codec: Codec) -> list[str]:
     """Return all mismatches between a profile and its DBC.
 
-    The check covers the existence of messages and signals, identifiers and lengths, the positions and sizes of
-    switches, counters and checksums, the types of multiplexed commands, the ranges and names of limits and numbers, and
-    timeouts compared with periods.
+    The check covers: the existence of messages and signals, identifiers and lengths; the positions and sizes of
+    switches, counters and checksums; the types of multiplexed commands; the ranges of limits; the ranges and names of
+    the codes that the profile expects in signals; and timeouts compared with periods.
     """
     mismatches = [*_check_identifiers(codec)]
-    uses: list[_Use] = []
+    uses: list[_SignalUse] = []
     for key, message_name, roles in _messages(config):
         message = codec.messages.get(message_name)
         if message is None:
@@ -53,16 +54,19 @@ def find_mismatches(config: ProfileConfig, codec: Codec) -> list[str]:
                 hint = _nearest_hint(name, message.signals)
                 mismatches.append(f"{key}.{role}: {message.name} has no signal {name}{hint}")
             else:
-                uses.append(_Use(key, message, signal, role))
+                uses.append(_SignalUse(key, message, signal, role))
     for check in (_check_layouts, _check_multiplexing, _check_duplicates):
         mismatches += check(uses)
-    for check_numbers in (_check_limits, _check_numbers, _check_clearing):
-        mismatches += check_numbers(config, uses)
+    for check_with_config in (_check_limits, _check_codes, _check_clearing):
+        mismatches += check_with_config(config, uses)
     return [*mismatches, *_check_timeouts(config, codec)]
 
 
 def real_bus_inhibit_reasons(profile: Profile) -> list[str]:
-    """Return why a profile may not arm on a bus that may have a real kit, regardless of the kit's watchdog."""
+    """Return why a vehicle with this profile may not be armed on a bus that may have a real kit.
+
+    The test of the kit's watchdog is another condition, which is not checked here.
+    """
     reasons = []
     if profile.unverified:
         reasons.append(
@@ -94,11 +98,11 @@ def _messages(config: ProfileConfig) -> Iterator[tuple[str, str, list[tuple[str,
 
 def _report_signals(report: ReportConfig) -> Iterator[tuple[str, str]]:
     """Yield the signals of a report by role."""
-    for word, signal in report.values.items():
-        yield f"values.{word}", signal
+    for value, signal in report.values.items():
+        yield f"values.{value}", signal
     for group in ("override", "trip", "command_error", "fault"):
-        for sign in getattr(report, group):
-            yield f"{group}.{sign}", sign.partition("=")[0]
+        for condition in getattr(report, group):
+            yield f"{group}.{condition}", condition.partition("=")[0]
     for signal in report.needs:
         yield f"needs.{signal}", signal
     for signal in report.reasons:
@@ -124,50 +128,50 @@ def _check_identifiers(codec: Codec) -> Iterator[str]:
             yield f"the DBC has two messages of identifier 0x{message.identifier:03X}: {first} and {message.name}"
 
 
-def _is_switch(use: _Use) -> bool:
+def _is_switch(use: _SignalUse) -> bool:
     return use.signal.bits == 1
 
 
-def _is_last_byte(use: _Use) -> bool:
+def _is_last_byte(use: _SignalUse) -> bool:
     return use.signal.bits == 8 and use.signal.start // 8 == use.message.length - 1
 
 
-def _is_counter(use: _Use) -> bool:
+def _is_counter(use: _SignalUse) -> bool:
     return use.signal.bits > 1 and not use.signal.is_signed and use.signal.scale == 1
 
 
-LAYOUTS: Final[Mapping[str, tuple[Callable[[_Use], bool], str]]] = {
+LAYOUTS: Final[Mapping[str, tuple[Callable[[_SignalUse], bool], str]]] = {
     "enable": (_is_switch, "is not a single bit, as a switch must be"),
     "clear": (_is_switch, "is not a single bit, as a switch must be"),
     "values.enabled": (_is_switch, "is not a single bit, as a switch must be"),
     "count": (_is_counter, "is not an unsigned number of several bits, as a counter must be"),
     "checksum": (_is_last_byte, "is not the last byte, as a checksum must be here"),
 }
-"""The required layout of a signal by role: a predicate, and the sentence's end if the predicate is false."""
+"""The required layout of a signal by role: a predicate, and the end of the sentence that reports a violation."""
 
 
-def _check_layouts(uses: Sequence[_Use]) -> Iterator[str]:
+def _check_layouts(uses: Sequence[_SignalUse]) -> Iterator[str]:
     for use in uses:
         is_valid, complaint = LAYOUTS.get(use.role, (lambda _: True, ""))
         if not is_valid(use):
             yield f"{use.key}.{use.role}: {use.signal.name} of {use.message.name} {complaint}"
 
 
-def _check_multiplexing(uses: Sequence[_Use]) -> Iterator[str]:
+def _check_multiplexing(uses: Sequence[_SignalUse]) -> Iterator[str]:
     """Check that the multiplexer of a command's value has one type, and that the other signals belong to that type."""
     for value in uses:
         if value.role != "value" or not value.signal.multiplexer:
             continue
         if len(value.signal.branches) != 1:
-            numbers = ", ".join(map(str, sorted(value.signal.branches)))
-            yield f"{value.key}.value: {value.signal.name} is in several types ({numbers}): its type is ambiguous"
+            types = ", ".join(map(str, sorted(value.signal.branches)))
+            yield f"{value.key}.value: {value.signal.name} is in several types ({types}): its type is ambiguous"
         for other in uses:
-            is_multiplexed = other.key == value.key and other.signal.multiplexer == value.signal.multiplexer
-            if is_multiplexed and not value.signal.branches & other.signal.branches:
+            shares_multiplexer = other.key == value.key and other.signal.multiplexer == value.signal.multiplexer
+            if shares_multiplexer and not value.signal.branches & other.signal.branches:
                 yield f"{other.key}.{other.role}: {other.signal.name} shares no frame with {value.signal.name}"
 
 
-def _check_duplicates(uses: Sequence[_Use]) -> Iterator[str]:
+def _check_duplicates(uses: Sequence[_SignalUse]) -> Iterator[str]:
     """Check that no signal of a command has two roles."""
     roles: dict[tuple[str, str], str] = {}
     for use in uses:
@@ -177,7 +181,7 @@ def _check_duplicates(uses: Sequence[_Use]) -> Iterator[str]:
                 yield f"{use.key}: {use.signal.name} is both {first} and {use.role}"
 
 
-def _check_limits(config: ProfileConfig, uses: Sequence[_Use]) -> Iterator[str]:
+def _check_limits(config: ProfileConfig, uses: Sequence[_SignalUse]) -> Iterator[str]:
     """Check that the limits of the commands are in the ranges of their signals, if the unit is known."""
     limits = {
         "sent.steering": (-config.limits.steering_wheel_deg, config.limits.steering_wheel_deg, {"deg": 1.0}),
@@ -196,45 +200,45 @@ def _check_limits(config: ProfileConfig, uses: Sequence[_Use]) -> Iterator[str]:
                     )
 
 
-def _check_numbers(config: ProfileConfig, uses: Sequence[_Use]) -> Iterator[str]:
-    """Check that the profile's numbers are in range and have the same names in the DBC."""
+def _check_codes(config: ProfileConfig, uses: Sequence[_SignalUse]) -> Iterator[str]:
+    """Check that the profile's codes are in the ranges of their signals and have the same names in the DBC."""
     for use in uses:
-        for statement, number, meaning in _numbers(config, use):
+        for statement, code, meaning in _expected_codes(config, use):
             signal = use.signal
-            if not signal.minimum <= number <= signal.maximum:
+            if not signal.minimum <= code <= signal.maximum:
                 yield (f"{use.key}.{use.role}: {statement}, but the maximum of {signal.name} is {signal.maximum:g}")
-            elif signal.names and signal.names.get(number, "").upper() != meaning.upper() and meaning:
-                name = signal.names.get(number, "nothing")
-                yield f"{use.key}.{use.role}: {statement}, but the DBC calls {number} of {signal.name} {name}"
-            elif signal.names and number not in signal.names:
+            elif signal.names and signal.names.get(code, "").upper() != meaning.upper() and meaning:
+                name = signal.names.get(code, "nothing")
+                yield f"{use.key}.{use.role}: {statement}, but the DBC calls {code} of {signal.name} {name}"
+            elif signal.names and code not in signal.names:
                 yield f"{use.key}.{use.role}: {statement}, for which {signal.name} has no name in the DBC"
 
 
-def _numbers(config: ProfileConfig, use: _Use) -> Iterator[tuple[str, int, str]]:
-    """Yield the numbers that a use expects: a statement, the number, and its name in the DBC (empty: any name)."""
+def _expected_codes(config: ProfileConfig, use: _SignalUse) -> Iterator[tuple[str, int, str]]:
+    """Yield the codes that the profile expects: a statement, the code, and its name in the DBC (empty: any name)."""
     part = use.key.partition(".")[2]
     if use.key == "sent.gear" and use.role == "value":
-        yield from ((f"{gear} is {number}", number, gear) for gear, number in config.sent.gears.items())
+        yield from ((f"{gear} is {code}", code, gear) for gear, code in config.sent.gears.items())
     elif use.key == "sent.system" and use.role == "value":
         system = config.sent.system
         yield f"enable is {system.enable}", system.enable, "enable"
         yield f"disable is {system.disable}", system.disable, "disable"
     elif use.role.startswith("needs."):
-        needed = getattr(config.reports, part).needs[use.signal.name]
-        chosen = needed.get(config.commands or "remote", []) if isinstance(needed, dict) else needed
-        yield from ((f"{number} is expected", number, "") for number in chosen)
+        needs = getattr(config.reports, part).needs[use.signal.name]
+        expected = needs.get(config.commands or "remote", []) if isinstance(needs, dict) else needs
+        yield from ((f"{code} is expected", code, "") for code in expected)
     elif "=" in use.role:
         text = use.role.partition("=")[2]
         if text.isdecimal():
             yield f"{text} is expected", int(text), ""
 
 
-def _check_clearing(config: ProfileConfig, uses: Sequence[_Use]) -> Iterator[str]:
-    """Check that the signal that clears an override is in the bytes sent for it."""
+def _check_clearing(config: ProfileConfig, uses: Sequence[_SignalUse]) -> Iterator[str]:
+    """Check that a command that clears an override contains its clearing signal, because it may be sent shortened."""
     sent_bytes = config.sent.clearing_bytes or MAX_FRAME_BYTES
     for use in uses:
-        is_sent_short = use.role == "clear" and use.key.partition(".")[2] in AXES
-        if is_sent_short and use.signal.start // 8 >= sent_bytes:
+        is_clearing = use.role == "clear" and use.key.partition(".")[2] in AXES
+        if is_clearing and use.signal.start // 8 >= sent_bytes:
             yield f"{use.key}.clear: {use.signal.name} is not in the first {sent_bytes} bytes (sent.clearing_bytes)"
 
 

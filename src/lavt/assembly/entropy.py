@@ -33,7 +33,7 @@ class MachineEntropy:
 
 
 class SeededEntropy:
-    """A reproducible source of numbers for virtual time, where no attacker has to be kept out."""
+    """A reproducible source for virtual time, where no attacker could exploit predictable numbers."""
 
     def __init__(self, seed: int, name: str) -> None:
         self._generator = stream(seed, f"{name} entropy")
@@ -48,8 +48,9 @@ class SeededEntropy:
 
 
 def run_seed(seed: int, route: str, repetition: int) -> int:
-    """Return the seed of one repetition on a route, which is equal under all conditions, so that runs are paired.
+    """Return the seed of one repetition on a route.
 
-    The seed has 53 bits, the largest integer size that all JSON readers support.
+    The seed does not depend on the condition, so that runs under different conditions can be compared in pairs. It has
+    53 bits, the largest integer size that all JSON readers support.
     """
     return stream_key(seed, f"run {route} {repetition}") & (2**53 - 1)

@@ -1,4 +1,4 @@
-"""The fidelities of a run's pictures: coded video, rendered pixels, or the geometry of the lane alone."""
+"""The fidelities of a run's pictures: coded video, rendered pixels, or only the geometry of the lane."""
 
 from __future__ import annotations
 
@@ -76,4 +76,4 @@ FIDELITIES: dict[str, Callable[[], FidelityModel]] = {
     "pixels": _pixels,
     "geometry": _geometry,
 }
-"""The models by the config's `fidelity`; each run has its own model, whose sides may share a codec."""
+"""The models by the config's `fidelity`. Each run has its own model, because its two sides may share a codec."""

@@ -1,4 +1,4 @@
-"""The conversion of a condition to netem flows, by the role of the machine, and the nodes that request them."""
+"""The conversion of a condition to the flows that a machine impairs with netem, and the construction of their nodes."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ NO_CONDITION: Final = Condition(video_ms=0, control_ms=0)
 Role = Literal["server", "client", "both"]
 Protocol = Literal["udp", "tcp"]
 StateDelay = Literal["none", "with_video"]
-SENT_BY: Final[dict[Role, tuple[str, ...]]] = {
+FLOWS_SENT_BY: Final[dict[Role, tuple[str, ...]]] = {
     "server": ("video", "state"),
     "client": ("control",),
     "both": ("video", "control", "state"),
 }
-"""The flows that a machine of each role sends; with role both, server and client share the machine and its loopback."""
+"""The flows that a machine of each role sends; with role both, server and client share one machine."""
 
 
 def netem_flows(
@@ -36,7 +36,7 @@ def netem_flows(
 ) -> list[ImpairedFlow]:
     """Return the flows that a machine of this role impairs under a condition.
 
-    `control_port` is the port of the server's router, to which the client's router connects by `protocol`. Flows
+    `control_port` is the port of the server's router, to which the client's router connects with `protocol`. Flows
     without an impairment are included, so that another condition can be applied later without packet loss.
     """
     flows = [
@@ -51,7 +51,7 @@ def netem_flows(
     ]
     if state_delay == "with_video":
         flows.append(ImpairedFlow("state", protocol, control_port, "source", Impairment(delay_ms=requested.video_ms)))
-    return [flow for flow in flows if flow.name in SENT_BY[role]]
+    return [flow for flow in flows if flow.name in FLOWS_SENT_BY[role]]
 
 
 def build_netem_impairment(delay_ms: float, impairment: ImpairmentConfig) -> Impairment:
@@ -70,7 +70,7 @@ def build_netem_impairment(delay_ms: float, impairment: ImpairmentConfig) -> Imp
 
 
 def build_impairment(delay_ms: float, impairment: ImpairmentConfig) -> Impairment:
-    """Return the impairment of one flow without its trace and queue."""
+    """Return the impairment of one flow; its trace and the length of its queue are not part of it."""
     names = set(Impairment.__struct_fields__)
     return Impairment(delay_ms=delay_ms, **impairment.model_dump(include=names - {"delay_ms"}))
 

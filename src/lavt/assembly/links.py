@@ -17,17 +17,17 @@ TRACES: Final = "netem/traces"
 MAX_TRACE_BYTES: Final = 50_000_000
 
 
-def injected(name: str, delay_ms: float, impairment: ImpairmentConfig, seed: int) -> LinkInjection | None:
-    """Return the injection into the flow `name`; None if it is a constant delay or nothing.
+def link_injection(name: str, delay_ms: float, impairment: ImpairmentConfig, seed: int) -> LinkInjection | None:
+    """Return what a link injects into the flow `name`; None if that is only a constant delay, or nothing.
 
     Raises `UserError` for contradictory values and for a missing or invalid trace.
     """
     if impairment == ImpairmentConfig():
         return None
     trace = read_trace(impairment.trace) if impairment.trace else None
-    requested = LinkInjection(build_impairment(delay_ms, impairment), seed, name, trace, impairment.queue_packets)
-    check_injection(requested)
-    return requested
+    injection = LinkInjection(build_impairment(delay_ms, impairment), seed, name, trace, impairment.queue_packets)
+    check_injection(injection)
+    return injection
 
 
 def trace_path(name: str) -> Path:
@@ -46,7 +46,7 @@ def trace_path(name: str) -> Path:
 
 
 def trace_digests(requested: Condition) -> dict[str, str]:
-    """Return the SHA-256 of each trace of a condition by name, because a file can be changed after a run."""
+    """Return the SHA-256 of each trace of a condition by name; with it a run shows if a file is changed later."""
     names = [flow.trace for flow in (requested.video, requested.control) if flow.trace]
     return {name: sha256(trace_path(name).read_bytes()).hexdigest() for name in names}
 

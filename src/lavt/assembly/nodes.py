@@ -90,12 +90,12 @@ def limits_of(config: SafetyConfig, *, simulated: bool) -> Limits:
         picture_age_limit_ns=round(config.picture_age_limit_ms * NS_PER_MS),
         stopping_distance_limit_m=config.stopping_distance_limit_m,
     )
-    wider = (
+    exceeds_defaults = (
         limits.lateral_acceleration_mps2 > LIMITS.lateral_acceleration_mps2
         or limits.picture_age_limit_ns > LIMITS.picture_age_limit_ns
         or limits.stopping_distance_limit_m > LIMITS.stopping_distance_limit_m
     )
-    if wider and not simulated:
+    if exceeds_defaults and not simulated:
         raise UserError(
             f"only a simulated vehicle may have safety limits beyond {LIMITS.lateral_acceleration_mps2} m/s2, "
             f"{LIMITS.picture_age_limit_ns // NS_PER_MS} ms and {LIMITS.stopping_distance_limit_m:.0f} m: lower "
@@ -115,13 +115,13 @@ def build_server(
     fidelity: FidelityModel = VIDEO,
     lazy_physics: bool = False,
 ) -> ServerNodes:
-    """Build the server's nodes; their time starts after all slow preparations.
+    """Build the server's nodes; their start time is read after all slow preparations.
 
     With `lazy_physics`, a vehicle that catches up advances only when its state is read. This is for virtual time, where
-    no wake-up is late.
+    no wake is late.
     """
     setup = fidelity.vehicle_setup(config)
-    pictures = fidelity.sender(config)
+    picture_sender = fidelity.sender(config)
     start = now()
     sample_times = physics_sample_times(setup.camera, start.mono_ns) if lazy_physics and setup.catches_up else ()
     actuator = None
@@ -139,7 +139,7 @@ def build_server(
     return ServerNodes(
         CameraNode(
             setup.camera,
-            pictures,
+            picture_sender,
             StreamSender(
                 Packetizer(entropy.number(32), entropy.number(16)),
                 RepairSender(entropy.number(32), entropy.number(16)),
@@ -147,7 +147,7 @@ def build_server(
             ),
             PathServer(lambda: entropy.token(32), build_cipher(config)),
             start_ns=start.mono_ns,
-            send_to=[resolved_address("video.send_to", each) for each in config.video.send_to],
+            send_to=[resolved_address("video.send_to", address) for address in config.video.send_to],
         ),
         actuator,
         ClockSyncNode(start.mono_ns),
@@ -166,7 +166,7 @@ def build_actuator(
     route: Route | None,
     sample_times: Sequence[FrameTimes] = (),
 ) -> ActuatorNode:
-    """Build the actuator of a vehicle, whose physics advances at `sample_times` only, or at every step if empty."""
+    """Build the actuator of a vehicle. Physics advances at `sample_times` only or, if they are empty, at every step."""
     capabilities = vehicle.capabilities
     limits = limits_of(config.safety, simulated=capabilities.simulated)
     limiter = Limiter(
@@ -199,7 +199,7 @@ def build_client(
 ) -> ClientNodes:
     """Build the client's nodes."""
     controller = config.controller
-    pictures, detector = fidelity.receiver(config), fidelity.detector(config)
+    picture_receiver, detector = fidelity.receiver(config), fidelity.detector(config)
     hold_ms = config.video.reorder_hold_ms
     drive_controller = build_controller(controller)
     start = now()
@@ -210,7 +210,7 @@ def build_client(
         rearm=controller.rearm,
         start_ns=start.mono_ns,
         clear_stop=controller.clear_emergency_stop,
-        waits=config.injection.condition != "",
+        waits_for_condition=config.injection.condition != "",
         take_over=config.take_over,
     )
     return ClientNodes(
@@ -221,7 +221,7 @@ def build_client(
             build_cipher(config),
         ),
         DriverNode(
-            PictureReader(pictures),
+            PictureReader(picture_receiver),
             detector,
             drive_controller,
             session,

@@ -23,7 +23,7 @@ def open_flow(
     bind: Address,
     remote: Address | None,
 ) -> UdpLink | RendezvousLink:
-    """Open a side's socket for a flow; a server with a rendezvous also communicates through the rendezvous.
+    """Open a side's socket for a flow; that of a server with a rendezvous also communicates through the rendezvous.
 
     Raises `UserError` for a port that cannot be opened, an unknown host, and a key that cannot be read.
     """
@@ -54,7 +54,7 @@ def open_rendezvous(config: RendezvousConfig, clock: Clock) -> dict[FlowName, Re
         for flow, port in ports.items():
             opened[flow] = RendezvousPort(clock, Forwarder(vehicle, flow, key), bind=(config.bind, port), name=flow)
     except UserError:
-        for each in opened.values():
-            each.close()
+        for opened_port in opened.values():
+            opened_port.close()
         raise
     return opened

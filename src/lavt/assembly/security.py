@@ -27,7 +27,7 @@ def build_cipher(config: ServerConfig | ClientConfig) -> NewCipher:
 def build_authenticator(config: ServerConfig | ClientConfig, now_wall_ns: int | None = None) -> Authenticator:
     """Build a side's authenticator, None for a client without a key.
 
-    Raise `UserError` for a key that is unreadable, or has expired by `now_wall_ns`; None: any time is accepted.
+    Raise `UserError` for a key that is unreadable or has expired by `now_wall_ns`. With None, expiry is not checked.
     """
     if isinstance(config, ServerConfig):
         return build_vehicle_authenticator(config, now_wall_ns)
@@ -55,7 +55,7 @@ def build_vehicle_authenticator(config: ServerConfig, now_wall_ns: int | None = 
 
 
 def build_operator_authenticator(config: ClientConfig, now_wall_ns: int | None = None) -> OperatorAuthenticator | None:
-    """Build the operator's authenticator, None without a key; raise `UserError` for one unreadable or expired."""
+    """Build the operator's authenticator, None without a key; raise `UserError` for an unreadable or expired key."""
     security = config.security
     if not security.key:
         return None

@@ -1,12 +1,14 @@
-"""The composition root: a server or a client is put together here, in order, each part from those before it.
+"""The composition root, which builds a server or a client.
 
-1. Check the output directory and the interface for injected delay; read the keys.
+It does so in this order; each step uses what the steps before it have built:
+
+1. Check the output directory and the network interface on which delay is injected; read the keys.
 2. Open the sockets and the Zenoh session; they deliver nothing yet.
-3. Build the nodes. A vehicle by wire gets its actuator node in a process of its own.
+3. Build the nodes. For a by-wire vehicle, start the actuator node in a process of its own.
 4. Open the record, and build the runtime of the nodes.
 5. Build the gateway between the Zenoh session and the runtime, and the injector.
 
-`Side.start` then starts to deliver messages.
+`Side.start` then starts the delivery of messages.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from typing import Any, Literal
 import yaml
 
 from lavt.assembly.actuator_process import ActuatorProcess, start_actuator
-from lavt.assembly.clock_source import clock_source, interpreter
+from lavt.assembly.clock_source import clock_source, query_process
 from lavt.assembly.entropy import MachineEntropy
 from lavt.assembly.nodes import build_client, build_server
 from lavt.assembly.rendezvous import open_flow
@@ -53,11 +55,11 @@ PrintMessage = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Prepared:
-    """The parts of a side that are checked before anything is opened."""
+    """The parts of a side that are built before any socket is opened, to find wrong settings early."""
 
     authenticator: Authenticator
     queues: NetemInterface | None
-    """The queues of the interface for injected delay, if the config names one."""
+    """The network queues of the interface on which delay is injected; None if the config names no interface."""
     time_source: PersistentProcess
 
 
@@ -71,7 +73,10 @@ class Links:
 
 
 class Side:
-    """One side with all its parts; `start` runs it and `close` ends it and completes the record."""
+    """One side with all its parts; `start` runs it, and `close` ends it and completes the record.
+
+    `in_force` returns the epoch in force and the sequence number of its last accepted command.
+    """
 
     def __init__(
         self,
@@ -94,7 +99,7 @@ class Side:
         """The server's actuator if it runs in a process of its own."""
         self._links = links
         self._path = path
-        """The server's end of the video path, by which strangers' datagrams are dropped; None on a client."""
+        """The server's end of the video path, which decides whose datagrams are dropped; None on a client."""
         self._time_source = prepared.time_source
         self.live = LiveStatus()
         self._record = None if out is None else QueuedRecorder(_open_record(config, out))
@@ -128,9 +133,9 @@ class Side:
         self._deliver(channel, payload, self.clock.now(), None)
 
     def close(self) -> None:
-        """Stop the runtime, close everything, and complete the record; a part that fails keeps no other one open."""
+        """Stop the runtime, close all parts, and complete the record; all other parts are closed even if one fails."""
         links = self._links
-        with ExitStack() as parts:  # closes the last part first
+        with ExitStack() as parts:  # calls the last callback first
             parts.callback(self._close_record)
             for link in (links.zenoh, links.probe, links.video):
                 parts.callback(link.close)
@@ -165,9 +170,9 @@ class Side:
 def open_server(
     config: ServerConfig, out: Path | None, clock: Clock, print_message: PrintMessage
 ) -> Iterator[tuple[Side, dict[str, int]]]:
-    """Put a server together; yield it with its ports, and close it afterwards.
+    """Build a server, yield it with its ports and the process id of its actuator, and close it afterwards.
 
-    Raises `UserError` for a wrong config, before the output directory is touched.
+    Raises `UserError` for a wrong config, before the output directory is created.
     """
     with ExitStack() as opened:
         prepared = _prepare(config, out, clock, opened, print_message)
@@ -198,16 +203,16 @@ def open_server(
             actuator=actuator,
             path=nodes.camera.path,
         )
-        opened.pop_all()  # from here on the side closes them
+        opened.pop_all()  # from here on the side closes what was opened
     with closing(side):
         yield side, ready
 
 
 @contextmanager
 def open_client(config: ClientConfig, out: Path | None, clock: Clock, print_message: PrintMessage) -> Iterator[Side]:
-    """Put a client together, yield it, and close it afterwards.
+    """Build a client, yield it, and close it afterwards.
 
-    Raises `UserError` for a wrong config, before the output directory is touched.
+    Raises `UserError` for a wrong config, before the output directory is created.
     """
     with ExitStack() as opened:
         prepared = _prepare(config, out, clock, opened, print_message)
@@ -246,7 +251,7 @@ def _prepare(
     queues = NetemInterface(config.injection.interface) if config.injection.interface else None
     for message in () if queues is None else queues.check():
         print_message(message)
-    return Prepared(authenticator, queues, opened.enter_context(closing(interpreter(config.clock))))
+    return Prepared(authenticator, queues, opened.enter_context(closing(query_process(config.clock))))
 
 
 def _open_zenoh(config: ServerConfig | ClientConfig, clock: Clock, print_message: PrintMessage) -> ZenohLink:

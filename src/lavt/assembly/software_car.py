@@ -13,7 +13,7 @@ from lavt.vehicle.software_car.kit import Kit
 from lavt.vehicle.software_car.mechanics import Mechanics
 
 GENERATIONS: Final[dict[str, Literal[1, 2]]] = {"dataspeed_1": 1, "dataspeed_2": 2}
-"""The kit's generation by a profile's `kit`."""
+"""The kit's generation for each value of a profile's `kit`."""
 
 
 def build_software_car(config: ServerConfig, profile: Profile, road: Road, start_ns: int) -> SoftwareCar:

@@ -9,7 +9,7 @@ from importlib.metadata import entry_points
 import numpy as np
 from msgspec.structs import replace
 
-from lavt.assembly.by_wire import check_by_wire, inside, is_simulated
+from lavt.assembly.by_wire import build_inside, check_by_wire, is_simulated
 from lavt.assembly.cameras import build_camera, camera_model, check_own_camera
 from lavt.assembly.simulators import car_of, simulator_of
 from lavt.config import ServerConfig, VehicleConfig
@@ -27,8 +27,8 @@ from lavt.vehicle.vehicle import Vehicle
 CUSTOM_VEHICLES = "lavt.vehicles"
 """The group of entry points with which users add vehicles: functions like `build_simulator`."""
 
-
 ROUTE_STEP_M = 1.0
+"""The distance between the recorded points of a route."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,12 +37,12 @@ class VehicleSetup:
 
     camera: Camera
     start: Callable[[Now], Vehicle] | None
-    """Builds the vehicle when the loop starts, because the preparations take seconds; None: the vehicle is in the
+    """Builds the vehicle when the loop starts, after preparations that take seconds; None: the vehicle is in the
     actuator's own process (`actuator_process.py`)."""
     route: Route | None
     simulated: bool = False
     catches_up: bool = False
-    """Whether `advance` may be called late without loss of accuracy."""
+    """Whether the vehicle's `advance` may be called late without loss of accuracy."""
 
 
 def build_simulator(config: ServerConfig) -> VehicleSetup:
@@ -88,7 +88,7 @@ def _build_sim_camera(config: ServerConfig, road: Road) -> SimCamera:
 
 
 def build_geometry_setup(config: ServerConfig) -> VehicleSetup:
-    """Build the built-in simulator with a camera that returns the lane; raise `UserError` for other vehicles."""
+    """Build the built-in simulator with a camera that captures only the lane; raise `UserError` for other vehicles."""
     kind = config.vehicle.kind
     if kind != "simulator" and not (kind == "dbw" and config.vehicle.dbw.is_inside):
         raise UserError(
@@ -131,7 +131,7 @@ def _build_simulated(config: ServerConfig, road: Road, camera: Camera) -> Vehicl
     if config.vehicle.kind == "dbw":
 
         def start_inside(start: Now) -> Vehicle:
-            return inside(config, road, start)
+            return build_inside(config, road, start)
 
         return VehicleSetup(camera, start_inside, route, simulated=True)
     return VehicleSetup(
@@ -169,6 +169,8 @@ def check_vehicle(config: VehicleConfig) -> None:
 
 def physics_sample_times(camera: Camera, start_ns: int) -> list[FrameTimes]:
     """Return when the vehicle's pose is needed: when the shutter opens and, for a finite exposure, when it closes."""
-    opens = FrameTimes(start_ns + camera.phase_ns, camera.rate_hz)
+    opening_times = FrameTimes(start_ns + camera.phase_ns, camera.rate_hz)
     exposure_ns = camera.exposure_ns if isinstance(camera, TimedCamera) else 0
-    return [opens, replace(opens, first_ns=opens.first_ns + exposure_ns)] if exposure_ns else [opens]
+    if not exposure_ns:
+        return [opening_times]
+    return [opening_times, replace(opening_times, first_ns=opening_times.first_ns + exposure_ns)]

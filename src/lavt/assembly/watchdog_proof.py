@@ -18,7 +18,7 @@ from lavt.vehicle.dbw.watchdog_test import BRAKE, BRAKE_WITHIN_NS, LEAST_REPORTS
 
 NS_PER_DAY: Final = 86_400 * NS_PER_S
 CLOCK_TOLERANCE_DAYS: Final = 1
-"""The clock of the machine that made the proof may have been this far ahead."""
+"""The clock of the machine that made the proof may have been ahead of this machine's clock by this much."""
 RUN_TEST = "run `lavt can test-watchdog`"
 
 
@@ -48,12 +48,12 @@ def new_proof(
 def proof_rejection(path: str, profile: Profile, config: DbwConfig, wall_ns: int) -> str:
     """Return why the proof at `path` does not apply at `wall_ns` to this profile and the config's car and bus.
 
-    The result is empty if it applies.
+    The result is empty if the proof applies.
     """
     if not path:
         return f"the kit's watchdog has not been tested: {RUN_TEST} and name its file in vehicle.dbw.watchdog_proof"
     try:
-        proof = parse_config(WatchdogProof, _read(path), path)
+        proof = parse_config(WatchdogProof, _read_json_object(path), path)
     except UserError as error:
         return f"the kit's watchdog has no valid test ({error}): {RUN_TEST}"
     bus = (
@@ -80,7 +80,7 @@ def proof_rejection(path: str, profile: Profile, config: DbwConfig, wall_ns: int
 
 
 def _age_rejection(at: str, days: int, wall_ns: int) -> str:
-    """Return why a proof of the date `at` is not accepted now; empty if it is."""
+    """Return why a proof of the date `at` is not accepted at `wall_ns`; empty if it is accepted."""
     try:
         age_days = (wall_ns - wall_time_ns(at)) / NS_PER_DAY
     except (ValueError, OverflowError):
@@ -90,7 +90,7 @@ def _age_rejection(at: str, days: int, wall_ns: int) -> str:
     return "is from the future, by this machine's clock" if age_days < -CLOCK_TOLERANCE_DAYS else ""
 
 
-def _read(path: str) -> dict[str, object]:
+def _read_json_object(path: str) -> dict[str, object]:
     try:
         data = json.loads(Path(path).read_bytes())
     except OSError as error:

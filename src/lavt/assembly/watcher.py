@@ -25,7 +25,7 @@ Sender = Literal["lavt", "foreign"]
 
 
 class WatchNodes:
-    """A receiver that sends nothing, a watcher, and the recorder of both that keeps the stream's statistics."""
+    """A receiver that sends nothing and a watcher; as their recorder, this keeps the statistics of the stream."""
 
     def __init__(self, sender: Sender, reorder_hold_ms: int | None) -> None:
         self._reader = _reader(sender)
@@ -34,10 +34,10 @@ class WatchNodes:
         self.nodes = (self._receiver, WatcherNode(self._reader))
         self._latencies_ms = array("d")
         self._jitter_us = 0
-        self._reason = ""
+        self._unreadable_reason = ""
 
     def write(self, topic: str, payload: Any, now: Now) -> None:  # noqa: ARG002 (the protocol's)
-        """Record the latency of a picture, or why it has none, and the jitter of a second."""
+        """Store the latency of a picture, or the reason why it has none, and the jitter of the last second."""
         if topic == "picture":
             self._record_latency(payload)
         elif topic == "reception":
@@ -46,17 +46,17 @@ class WatchNodes:
 
     def _record_latency(self, picture: PictureRead) -> None:
         if picture.stamp_ns is None:
-            self._reason = picture.reason
+            self._unreadable_reason = picture.reason
         else:
             self._latencies_ms.append((picture.read_wall_ns - picture.stamp_ns) / NS_PER_MS)
 
     def totals(self) -> Counter[str]:
         """Return the counts since the start."""
-        received, pictures = Counter(self._receiver.counts), self._reader.counts
+        received, decoded = Counter(self._receiver.counts), self._reader.counts
         return Counter(
-            pictures=pictures["frames_decoded"],
+            pictures=decoded["frames_decoded"],
             stamps_accepted=len(self._latencies_ms),
-            stamps_unreadable=pictures["frames_unreadable"],
+            stamps_unreadable=decoded["frames_unreadable"],
             packets=received["packets"],
             lost=received["packets_lost"],
             reordered=received["packets_reordered"],
@@ -69,7 +69,7 @@ class WatchNodes:
         median_ms, p95_ms = np.percentile(latencies_ms, (50, 95)).tolist() if latencies_ms else (None, None)
         return {
             **{name: count - before[name] for name, count in after.items()},
-            "last_unreadable_reason": self._reason,
+            "last_unreadable_reason": self._unreadable_reason,
             "latency_median_ms": median_ms,
             "latency_p95_ms": p95_ms,
             "jitter_ms": self._jitter_us / 1000,
@@ -77,7 +77,7 @@ class WatchNodes:
 
 
 def _reader(sender: Sender) -> PictureReader:
-    """Return the reader for a sender's stamps; it reads no doubtful stamps of a foreign sender (weaker check)."""
+    """Return the reader for a sender's stamps. The check of foreign stamps is weak, so those in doubt are not read."""
     if sender == "lavt":
         return PictureReader(VideoReceiver(Decoder(), None))
     pictures = VideoReceiver(Decoder(), None, read_clear_stamp)

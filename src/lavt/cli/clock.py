@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 import typer
 
-from lavt.assembly.clock_source import clock_source, interpreter
+from lavt.assembly.clock_source import clock_source, query_process
 from lavt.cli import console
 from lavt.clock import MachineClock, pause
 from lavt.config import ClockConfig
@@ -57,7 +57,7 @@ def clock(
     config = parse_config(ClockConfig, requested, "lavt clock")
     address = None if server is None else resolve_host("--server", server)
     machine = MachineClock()
-    with closing(interpreter(config)) as process:
+    with closing(query_process(config)) as process:
         read_source = clock_source(config, machine, process.run)
         report = _read_report(read_source, source)
         if address is None:

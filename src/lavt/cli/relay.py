@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from lavt.assembly.addresses import resolved_address
-from lavt.assembly.links import injected
+from lavt.assembly.links import link_injection
 from lavt.cli import console
 from lavt.clock import MachineClock
 from lavt.config import DelayConfig, ImpairmentConfig, LinkConfig, RelayConfig
@@ -92,10 +92,9 @@ def _link_injection(name: str, config: DelayConfig, seed: int) -> LinkInjection 
     if config.link == LinkConfig():
         return None
     impairment = ImpairmentConfig(**config.link.model_dump(exclude={"delay_ms"}))
-    injection = injected(name, config.link.delay_ms, impairment, seed)
-    if injection is None:  # a constant delay only
-        return LinkInjection(Impairment(delay_ms=config.link.delay_ms), seed, name)
-    return injection
+    return link_injection(name, config.link.delay_ms, impairment, seed) or LinkInjection(
+        Impairment(delay_ms=config.link.delay_ms), seed, name
+    )
 
 
 def _resolve(key: str, text: str) -> tuple[str, int]:

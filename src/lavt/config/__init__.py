@@ -1,4 +1,4 @@
-"""The schema of all configs; the names of quantities have their units, and unknown keys are rejected."""
+"""The schema of all configs: keys of quantities end with their units, and unknown keys are rejected."""
 
 from __future__ import annotations
 
@@ -37,7 +37,8 @@ class VehicleConfig(Section):
     """The position of the sun and the state of the sky, see `docs/camera.md`."""
     car: str = "lincoln_mkz"
     steering_dead_time_ms: float | None = Field(None, ge=0, le=2000)
-    """From a command until the wheels begin to follow. Null, here and for the lags below: the car's own value."""
+    """The time from a command until the wheels begin to follow. Null, here and for the four keys below: the value of
+    `car`."""
     steering_lag_ms: float | None = Field(None, ge=0, le=2000)
     pedal_dead_time_ms: float | None = Field(None, ge=0, le=2000)
     throttle_lag_ms: float | None = Field(None, ge=0, le=5000)
@@ -51,16 +52,18 @@ class VehicleConfig(Section):
 
 
 ReorderHold = Literal["auto"] | Annotated[float, Field(ge=0, le=500)]
-"""How many ms a packet waits for missing earlier packets; auto: 10, or 1.25 times the largest recent reordering."""
+"""How many ms a packet waits for missing earlier packets; auto: 10, or 1.25 times the largest recent reordering if that
+is more."""
 
 
 class VideoConfig(Section):
     """The video: H.264 and RTP."""
 
     bit_rate_bps: int = Field(4_000_000, ge=50_000, le=50_000_000)
-    """The bit rate of H.264, an upper limit over any `buffer_ms`; headers and repair packets are added to it."""
+    """The bit rate of the H.264 stream, as an upper limit of the mean over any `buffer_ms`. Packet headers and repair
+    packets are sent in addition to it."""
     gop_frames: int = Field(30, ge=1, le=600)
-    """The longest distance between keyframes; after a loss a keyframe is sent on request."""
+    """The longest distance between keyframes; after a loss, the client requests an additional one."""
     buffer_ms: float = Field(100.0, gt=0, le=2000)
     """The decoder's buffer (VBV): no frame is larger than the bit rate times this duration."""
     preset: Literal["ultrafast", "superfast", "veryfast", "faster", "fast", "medium", "slow", "slower", "veryslow"] = (
@@ -68,9 +71,9 @@ class VideoConfig(Section):
     )
     """libx264's preset: a slower one gives better pictures at the same bit rate, and takes longer."""
     encoder_threads: int = Field(1, ge=1, le=16)
-    """The number of threads; each encodes a slice of every picture."""
+    """The number of threads of the encoder; each encodes a slice of every picture."""
     repair_packets: Literal["auto", 0, 1, 2] = "auto"
-    """Repair packets per frame (per 16 packets of a large frame); auto: by the reported loss."""
+    """Repair packets per frame, or per 16 packets of a larger frame; auto: the number follows the reported loss."""
     reorder_hold_ms: ReorderHold = "auto"
 
 
@@ -94,8 +97,8 @@ class NetworkConfig(Section):
     @property
     def changes(self) -> str | None:
         """The changes of the condition as text; None if there are none."""
-        flows = {"video": self.video.given, "control": self.control.given}
-        changes = [f"{flow}.{name} {value}" for flow, given in flows.items() for name, value in given.items()]
+        flows = {"video": self.video.replacements, "control": self.control.replacements}
+        changes = [f"{flow}.{name} {value}" for flow, values in flows.items() for name, value in values.items()]
         return ", ".join(changes) or None
 
 
@@ -105,14 +108,14 @@ class SafetyConfig(Section):
     lateral_acceleration_mps2: float = Field(3.0, gt=0, le=6.0)
     picture_age_limit_ms: float = Field(500.0, gt=0, le=2000)
     stopping_distance_limit_m: float = Field(20.0, gt=0, le=200)
-    """The distance in which the car must be able to stop; above 20 m, it may drive faster than was tested."""
+    """The distance in which the car must be able to stop; above 20 m, it may drive faster than it was tested."""
 
 
 class RecordConfig(Section):
     """The contents of the record."""
 
     video: bool = True
-    """Whether to record the access units as sent and as received: nine tenths of a record."""
+    """Whether to record the access units, as sent and as received; they are nine tenths of a record."""
 
     @property
     def left_out(self) -> frozenset[str]:
@@ -126,9 +129,9 @@ class ControllerConfig(Section):
     kind: str = "lane_keeper"
     preset: str = "designed"
     lookahead_s: float | None = Field(None, ge=0.2, le=5)
-    """How far ahead the car aims, in seconds of driving. This and the three keys below replace the preset's values."""
+    """How far ahead the car aims, in seconds of driving. This key and the three below replace the preset's values."""
     steering_limit_rad: float | None = Field(None, gt=0, le=0.5)
-    """The limit of the road wheels' angle."""
+    """The limit of the angle of the road wheels."""
     lateral_limit_mps2: float | None = Field(None, gt=0, le=20)
     speed_mps: float | None = Field(None, ge=1, le=11)
     """The target speed; the vehicle allows no throttle above 40 km/h in any case."""
@@ -154,7 +157,8 @@ class ControllerConfig(Section):
 class ClocksConfig(Section):
     """The clocks of the virtual hosts.
 
-    The client's clock is true. `offset_ms` and `drift_ppm` are the server's; `error_us` and `bound_us` model chrony.
+    The client's clock shows the true time. `offset_ms` and `drift_ppm` are those of the server's clock. `error_us` and
+    `bound_us` are what the modelled chrony reports: the error of its correction, and the bound of that error.
     """
 
     offset_ms: float = Field(250.0, ge=-60_000, le=60_000)
@@ -192,18 +196,20 @@ class RunConfig(Section):
     study: StudyConfig = StudyConfig()
     time: Literal["real", "virtual"] = "virtual"
     fidelity: Literal["video", "pixels", "geometry"] = "video"
-    """In virtual time: H.264-coded pictures; rendered pictures; or no pictures, only the lane that they would show."""
+    """For virtual time. video: H.264-coded pictures. pixels: rendered pictures. geometry: no pictures, only the lane
+    that they would show."""
     seed: int = Field(1, ge=0, lt=2**63)
     repetition: int = Field(0, ge=0)
-    """The number of this run among runs with one seed: each has its own start and noise, equal under all conditions."""
+    """The number of this run among the runs with the same seed. Each repetition has its own start and noise, which are
+    equal under all conditions."""
 
     @property
     def left_out(self) -> frozenset[str]:
         """Channels that are not recorded.
 
-        The access units of other fidelities are not video. Geometry is for sweeps of thousands of runs: it leaves out
-        channels whose contents are in other channels, too: commands (in `admission`), states (in `truth`) and packets
-        (in `frame` and `picture`).
+        With fidelity `pixels` or `geometry`, access units are not video. `geometry` is for sweeps of thousands of runs.
+        It therefore also leaves out channels whose contents other channels have: commands (in `admission`), states (in
+        `truth`) and packets (in `frame` and `picture`).
         """
         channels = {
             "video": self.record.left_out,
@@ -229,11 +235,11 @@ class BoundaryConfig(RunConfig):
     presets: tuple[str, ...] = ("designed", "paper_calibrated")
     repetitions: int = Field(10, ge=1, le=10_000)
     longest_delay_ms: float = Field(700.0, gt=0, le=5000)
-    """The longest delay of the video that is searched, in addition to the delay of the loop itself."""
+    """The longest delay of the video that the search tries; the delay of the loop itself is added to it."""
     grid_ms: float = Field(100.0, gt=0, le=1000)
-    """The distance between the delays that are tried first."""
+    """The search first tries delays at this distance."""
     within_ms: float = Field(2.0, ge=0.1, le=100)
-    """The accuracy of each boundary between two delays of the grid."""
+    """The accuracy to which the search then finds each boundary, between two delays of that grid."""
 
 
 class ZenohConfig(Section):
@@ -242,27 +248,27 @@ class ZenohConfig(Section):
     session: str = "zenoh-configs/session.json5"
     """A JSON5 file: a path, or the name of a shipped file."""
     router: str = ""
-    """The endpoint of the router; empty: the endpoint in the file."""
+    """The endpoint of the router; empty: the endpoint in that file."""
 
 
 class ClockConfig(Section):
     """The time source of this machine's clock, and the port of the clock probe."""
 
     source: Literal["chrony", "ptp", "external", "probe"] = "chrony"
-    """probe: no time source; the offset is from the probe alone."""
+    """probe: no time source is queried; the clock offset is known from the clock probe alone."""
     correction_ms: float | None = Field(None, ge=-86_400_000, le=86_400_000)
-    """For `external`: reference time minus this machine's wall clock."""
+    """For source `external`: reference time minus this machine's wall clock."""
     bound_ms: float | None = Field(None, ge=0, le=86_400_000)
-    """For `external`: the largest error of the correction."""
+    """For source `external`: the largest error of the correction."""
     probe_port: int = Field(probe.DEFAULT_PORT, ge=0, le=65535)
-    """The server's UDP port of the clock probe, which must not be delayed."""
+    """The server's UDP port of the clock probe, whose packets must not be delayed by injection."""
 
     @model_validator(mode="after")
     def _check_external(self) -> ClockConfig:
-        given = [self.correction_ms is not None, self.bound_ms is not None]
-        if self.source == "external" and not all(given):
+        are_set = [self.correction_ms is not None, self.bound_ms is not None]
+        if self.source == "external" and not all(are_set):
             raise ValueError("source external needs correction_ms and bound_ms")
-        if self.source != "external" and any(given):
+        if self.source != "external" and any(are_set):
             raise ValueError("correction_ms and bound_ms require source external: set it, or leave them out")
         return self
 
@@ -318,7 +324,7 @@ class ClientVideoConfig(Section):
 
     server: str = "127.0.0.1"
     port: int = Field(0, ge=0, le=65535)
-    """0: the port that the server sends in the session."""
+    """0: the port that the server names in the session."""
     max_bit_rate_bps: int | None = Field(None, ge=50_000, le=50_000_000)
     """The bit rate that the client requests if the server's own is higher."""
     reorder_hold_ms: ReorderHold = "auto"
@@ -331,7 +337,7 @@ class ClientConfig(Section):
     who: str = "operator-1"
     """The operator's name."""
     take_over: bool = False
-    """Ask the client in control to hand over the vehicle, see `docs/session.md`."""
+    """Whether to request a handover from the client in control, see `docs/session.md`."""
     controller: ControllerConfig = ControllerConfig()
     camera: ClientCameraConfig = ClientCameraConfig()
     video: ClientVideoConfig = ClientVideoConfig()
@@ -343,10 +349,10 @@ class ClientConfig(Section):
 
 
 class DelayConfig(Section):
-    """One direction of a relayed flow: a constant delay, a lognormal delay, and the impairments of a condition."""
+    """One direction of a relayed flow: a constant delay, a lognormal jitter, and the impairments of a condition."""
 
     constant_ms: float = Field(0.0, ge=0, le=70_000)
-    """The constant delay of the inherent profile and of the condition together."""
+    """The sum of the constant delays of the inherent latency and of the condition."""
     jitter_median_ms: float = Field(0.0, ge=0, le=60_000)
     jitter_sigma: float = Field(0.0, ge=0, le=3)
     link: LinkConfig = LinkConfig()

@@ -45,7 +45,7 @@ class ServerCameraConfig(CameraConfig):
     source: str = "simulated"
     """simulated: the simulator's camera; device: a real camera (`docs/camera.md`)."""
     device: str | int = "/dev/video0"
-    """For source device: a V4L2 device or its number, or the file or address of a video."""
+    """For source `device`: a V4L2 device or its number, or the file or address of a video."""
     format: str = Field("", pattern="^([!-~]{4})?$")
     """For a V4L2 device: the pixel format, such as MJPG; empty: the driver's choice."""
 
@@ -63,7 +63,8 @@ class CalibrationConfig(Section):
     width_px: int = Field(ge=64, le=8192)
     height_px: int = Field(ge=64, le=8192)
     field_of_view_deg: float | None = Field(None, gt=10, lt=150)
-    """The horizontal field of view, for square pixels and a centred axis; an alternative to the four keys below."""
+    """The horizontal field of view of a camera with square pixels and a centred optical axis; it replaces the four keys
+    below."""
     fx_px: float | None = Field(None, gt=0)
     fy_px: float | None = Field(None, gt=0)
     cx_px: float | None = None
@@ -83,7 +84,7 @@ class CalibrationConfig(Section):
     def _check_length(cls, distortion: tuple[float, ...], info: Any) -> tuple[float, ...]:
         lengths = (4,) if info.data.get("lens") == "fisheye" else (0, 4, 5, 8)
         if len(distortion) not in lengths:
-            raise ValueError(f"must have {' or '.join(str(each) for each in lengths)} coefficients for this lens")
+            raise ValueError(f"must have {' or '.join(str(length) for length in lengths)} coefficients for this lens")
         return distortion
 
     @model_validator(mode="after")

@@ -9,18 +9,18 @@ from pydantic import Field
 from lavt.config.section import Section
 
 CommandSet = Literal["remote", "user"]
-Word = Literal[
+ReportedValue = Literal[
     "enabled", "angle", "command", "gear", "speed", "second_speed", "wheel_1", "wheel_2", "wheel_3", "wheel_4"
 ]
 
 
 class CommandConfig(Section):
-    """A command: its message, and the names of its signals by role; an empty name: no such signal."""
+    """A command: its message, and the names of its signals by role. An empty name: the message has no such signal."""
 
     message: str | dict[CommandSet, str] = ""
-    """The message; by set of commands if the kit has several sets."""
+    """The message's name, or one name for each set of commands if the kit has several sets."""
     value: str = ""
-    """The commanded value, in the DBC's unit; its multiplexer follows from it."""
+    """The commanded value, in the DBC's unit. If the signal is multiplexed, its multiplexer is set accordingly."""
     enable: str = ""
     clear: str = ""
     rate: str = ""
@@ -30,7 +30,7 @@ class CommandConfig(Section):
     count: str = ""
     """The frame counter, which wraps around."""
     checksum: str = ""
-    """CRC-8 of SAE J1850 over identifier and data; the last byte."""
+    """The CRC-8 of SAE J1850 over identifier and data, which must be the last byte."""
 
 
 class SystemCommandConfig(Section):
@@ -53,38 +53,39 @@ class SentConfig(Section):
     gear: CommandConfig
     system: SystemCommandConfig = SystemCommandConfig()
     clearing_bytes: int | None = Field(None, ge=1, le=8)
-    """The number of bytes of a command that clears an override; null: all, with counter and checksum."""
+    """The number of bytes of a command that clears an override; null: all bytes, with counter and checksum."""
     gears: dict[Literal["park", "reverse", "neutral", "drive"], int] = Field(default_factory=dict)
+    """The value that commands each gear on the bus."""
 
 
 class ReportConfig(Section):
-    """A report of the kit; an empty message: no such report.
+    """A report of the kit; an empty message: the kit has no such report.
 
-    The keys of `override`, `trip`, `command_error` and `fault` are conditions, their values texts: `SIGNAL` is true if
-    the signal is not 0, `SIGNAL=7` if it is 7.
+    The keys of `override`, `trip`, `command_error` and `fault` are conditions, and their values are texts that describe
+    them. The condition `SIGNAL` is true if the signal is not 0, and `SIGNAL=7` if the signal is 7.
     """
 
     message: str = ""
     timeout_ms: int = Field(200, ge=10, le=5000)
     """Driving is inhibited if the report is missing for longer than this."""
-    values: dict[Word, str] = Field(default_factory=dict)
+    values: dict[ReportedValue, str] = Field(default_factory=dict)
     """The signal of each value, in the DBC's unit."""
     override: dict[str, str] = Field(default_factory=dict)
-    """The driver has taken over; CLEAR resets it."""
+    """Conditions under which the driver has taken over; CLEAR resets them."""
     trip: dict[str, str] = Field(default_factory=dict)
-    """The kit's watchdog has tripped; CLEAR resets it after a driver has taken over."""
+    """Conditions under which the kit's watchdog has tripped; CLEAR resets them after a driver has taken over."""
     command_error: dict[str, str] = Field(default_factory=dict)
-    """An error that the kit found in our commands, until the next correct command."""
+    """Errors that the kit found in LAVT's commands; it reports them until the next correct command."""
     fault: dict[str, str] = Field(default_factory=dict)
-    """A fault that inhibits driving while it is reported."""
+    """Faults that inhibit driving while they are reported."""
     needs: dict[str, list[int] | dict[CommandSet, list[int]]] = Field(default_factory=dict)
-    """The values that a signal must have; any other value inhibits driving."""
+    """For each of these signals, the values that it may have; any other value inhibits driving."""
     reasons: list[str] = Field(default_factory=list)
-    """Signals whose value, by its name in the DBC, explains why something is inhibited."""
+    """Signals whose value explains why driving is inhibited; the value is shown by its name in the DBC."""
     count: str = ""
     """The frame counter; a report that repeats the last one's counter is dropped."""
     checksum: str = ""
-    """As in a command; a report with a wrong checksum is dropped."""
+    """The checksum, as in a command; a report with a wrong checksum is dropped."""
 
 
 class ReportsConfig(Section):
@@ -101,7 +102,7 @@ class ReportsConfig(Section):
 
 
 class OwnBrakeConfig(Section):
-    """How the brake's report shows that the kit brakes by itself; an empty signal: it does not."""
+    """How the brake's report shows that the kit brakes by itself; an empty signal: the report does not show it."""
 
     signal: str = ""
     above: float = Field(0.0, ge=0)
@@ -117,13 +118,13 @@ class ByWireCarConfig(Section):
     steering_sign: Literal[1, -1] | None = None
     """1: left is positive on the bus; null: unknown."""
     wheel_radius_m: float = Field(0.33, gt=0.1, lt=1)
-    """Converts the reported wheel speeds."""
+    """The radius with which reported wheel speeds are converted to the speed of the car."""
     max_acceleration_mps2: float = Field(gt=0, le=20)
     max_braking_mps2: float = Field(gt=0, le=20)
 
 
 class ByWireLimitsConfig(Section):
-    """The limits of all commands on the bus. Rates of pedals apply to pressing; releasing is not limited."""
+    """The limits of all commands on the bus. The rates of pedals limit how fast a pedal is pressed, not its release."""
 
     steering_wheel_deg: float = Field(gt=0, le=3000)
     steering_wheel_rate_degps: float = Field(gt=0, le=3000)
@@ -171,15 +172,16 @@ class DbwConfig(Section):
     watchdog_proof: str = ""
     """The file that `lavt can test-watchdog` wrote."""
     watchdog_proof_days: int = Field(30, ge=1, le=365)
-    """A proof is accepted for this many days."""
+    """For how many days a proof is accepted."""
     car: str = Field("", max_length=64)
-    """The car's serial number or VIN, which a proof of a real bus names: kits do not report it as far as is known."""
+    """The car's serial number or VIN. The proof of a real bus names it, because kits, as far as is known, do not report
+    which car they are in."""
     steering_sign: Literal[1, -1] | None = None
-    """1: left is positive on the bus; for a profile without a sign."""
+    """1: left is positive on the bus. Only for a profile without a sign."""
 
     @property
     def is_inside(self) -> bool:
-        """Whether the kit is a software car in the server's process, which is possible in virtual time, too."""
+        """Whether the kit is a software car in the server's process; this works in virtual time, too."""
         return self.interface == "inside"
 
     def __hash__(self) -> int:

@@ -9,9 +9,9 @@ from pydantic import Field
 from lavt.config.section import Section
 from lavt.transport.emulation.link import QUEUE_PACKETS
 
-EARLY_SHARE: Final = {"video": 0.0, "control": 0.5}
-"""The largest share of undelayed packets with which the median must be delayed; a repair packet brings its frame early.
-"""
+MAX_UNDELAYED_SHARE: Final = {"video": 0.0, "control": 0.5}
+"""The largest share of undelayed packets with which at least half of the flow is still delayed. For video it is 0,
+because a single undelayed repair packet can complete its frame early."""
 
 
 class InjectionConfig(Section):
@@ -29,7 +29,8 @@ class ServerInjectionConfig(InjectionConfig):
     """The server's injection, which a client can request."""
 
     remote: bool = False
-    """Whether a client may request it: for a simulated vehicle at any time, otherwise while stationary and disarmed."""
+    """Whether a client may request injection: with a simulated vehicle at any time, otherwise while the vehicle is
+    stationary and disarmed."""
 
 
 class ClientInjectionConfig(InjectionConfig):
@@ -54,7 +55,7 @@ class ImpairmentConfig(Section):
     rate_bps: int = Field(0, ge=0, le=10_000_000_000)
     """0: no limit."""
     reorder: float = Field(0.0, ge=0, lt=1)
-    """The share of packets that are not delayed, and so overtake others."""
+    """The share of packets that are not delayed, so that they overtake others."""
     trace: str = ""
     """A delay (a name that ends in .csv) or a capacity (Mahimahi) over time: a file of `netem/traces`, or a path."""
     queue_packets: int = Field(QUEUE_PACKETS, ge=1, le=1_000_000)
@@ -87,15 +88,15 @@ class FlowChanges(Section):
     queue_packets: int | None = Field(None, ge=1, le=1_000_000)
 
     @property
-    def given(self) -> dict[str, Any]:
+    def replacements(self) -> dict[str, Any]:
         """The values that replace those of the condition, by name."""
         return self.model_dump(exclude_none=True)
 
     def apply_to(self, delay_ms: float, impairment: ImpairmentConfig) -> tuple[float, ImpairmentConfig]:
         """Return the changed delay and impairment."""
-        given = self.given
-        delay_ms = given.pop("delay_ms", delay_ms)
-        return delay_ms, ImpairmentConfig(**{**impairment.model_dump(), **given})
+        replacements = self.replacements
+        delay_ms = replacements.pop("delay_ms", delay_ms)
+        return delay_ms, ImpairmentConfig(**{**impairment.model_dump(), **replacements})
 
 
 class Condition(Section):
@@ -114,12 +115,15 @@ class Condition(Section):
     @property
     def constant_ms(self) -> dict[str, float | None]:
         """The delay of each flow; None if it follows a trace."""
-        return {name: None if each.has_delay_trace else delay_ms for name, (delay_ms, each) in self.flows.items()}
+        flows = self.flows.items()
+        return {name: None if impairment.has_delay_trace else delay_ms for name, (delay_ms, impairment) in flows}
 
     @property
     def least_ms(self) -> dict[str, float]:
-        """A lower bound of each flow's median delay, which jitter and reordering can make smaller than requested."""
+        """A lower bound of each flow's median delay, because jitter and reordering can make it less than requested."""
         return {
-            name: 0.0 if each.reorder > EARLY_SHARE[name] else max(0.0, delay_ms - 4 * each.jitter_ms)
-            for name, (delay_ms, each) in self.flows.items()
+            name: 0.0
+            if impairment.reorder > MAX_UNDELAYED_SHARE[name]
+            else max(0.0, delay_ms - 4 * impairment.jitter_ms)
+            for name, (delay_ms, impairment) in self.flows.items()
         }

@@ -12,7 +12,7 @@ class ServerRendezvousConfig(Section):
     """The rendezvous in the server's config; clients can still reach the vehicle directly."""
 
     host: str = ""
-    """The host of the rendezvous; empty: none."""
+    """The host of the rendezvous; empty: no rendezvous."""
     video_port: int = Field(5600, ge=1, le=65535)
     probe_port: int = Field(probe.DEFAULT_PORT, ge=1, le=65535)
 
@@ -24,6 +24,7 @@ class RendezvousConfig(Section):
     vehicle_key: str = ""
     """The file of the vehicle's key (NAME.sign.pub of `lavt keys`); empty: anyone can register under its name."""
     bind: str = "0.0.0.0"  # noqa: S104 (clients connect from anywhere)
-    """The public address, on a machine with several addresses: a NAT admits only replies from that address."""
+    """The address on which to receive. On a machine with several addresses, set the public one, because a NAT admits
+    only replies from the address to which the vehicle sent."""
     video_port: int = Field(5600, ge=0, le=65535)
     probe_port: int = Field(probe.DEFAULT_PORT, ge=0, le=65535)

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from lavt.assembly.cameras import build_device
-from lavt.assembly.clock_source import clock_source, interpreter
+from lavt.assembly.clock_source import clock_source, query_process
 from lavt.assembly.fidelity import VIDEO
 from lavt.assembly.security import build_authenticator, build_cipher, build_gateway
 from lavt.clock import MachineClock, pause
@@ -172,7 +172,7 @@ def governors() -> list[str]:
 
 def clock_report(config: ClockConfig, clock: MachineClock) -> ClockReport | None:
     """Query this machine's time source; return None if it times out."""
-    with closing(interpreter(config)) as process:
+    with closing(query_process(config)) as process:
         return clock_source(config, clock, process.run)()
 
 

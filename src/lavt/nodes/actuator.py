@@ -1,10 +1,10 @@
-"""Accept or reject each received command, and apply accepted ones to the vehicle."""
+"""The actuator node, which accepts or rejects each command and applies accepted ones to the vehicle."""
 
 from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from msgspec import Struct
 
@@ -19,13 +19,14 @@ from lavt.vehicle.vehicle import CountingVehicle, Vehicle
 
 STATE_PERIOD_NS = 20 * NS_PER_MS
 LATE_NS = 50 * NS_PER_MS
-"""A physics step this late is an event: the simulated vehicle stood still for this long."""
+"""A physics step that is this late is recorded as an event, because the simulated vehicle did not move meanwhile."""
 REJECTION_SHOWN_NS = NS_PER_S
-"""The state contains the last rejection for this long."""
+"""For this long after a rejection, the state contains its reason."""
 MAX_PENDING_COMMANDS = 64
-"""Commands of more than a second: one that has not reached the wheels by then never will."""
+"""The commands of more than a second: a command that has not reached the wheels by then never will."""
 POSE_AHEAD_NS = NS_PER_MS // 2
-"""A frame's pose is sent this long before the frame: a command that arrives then occupies the node for 0.2 ms."""
+"""The pose for a frame is sent this long before the frame is due, because a command that arrives in between occupies
+the node for 0.2 ms."""
 
 ENDINGS: dict[str, Ending] = {
     "completed": "completed",
@@ -33,7 +34,7 @@ ENDINGS: dict[str, Ending] = {
     "off_road": "off_road",
     "timeout": "timeout",
 }
-"""Events that end a drive; a collision only if `after_collision` is "end"."""
+"""The endings of a drive by the kind of the event that causes them; a collision only if `after_collision` is "end"."""
 
 
 class ReceivedCommand(Struct, frozen=True):
@@ -48,20 +49,30 @@ class ReceivedCommand(Struct, frozen=True):
         return self.command.stamp_ns
 
 
-class JudgedCommand(Struct, frozen=True):
-    """A command with the gate's decision."""
+class CheckedCommand(Struct, frozen=True):
+    """A command with the verdict of the gate."""
 
     received: ReceivedCommand
     stamp_ns: int
     verdict: CommandVerdict
     limited: tuple[str, ...] = ()
+    """Names of the limits that changed the command."""
+
+
+class PendingCommand(NamedTuple):
+    """An applied command whose arrival at the wheels the vehicle has not reported yet."""
+
+    applied_ns: int
+    sequence: int
+    stamp_ns: int
 
 
 class ActuatorNode:
     """The node that operates the vehicle: physics steps, safety gate, actuation and state reports.
 
-    Physics advances whenever the vehicle is due. With `sample_times` it advances lazily: just before each of these
-    times, and when the state is published. This is sufficient if physics catches up without loss and no wake is late.
+    Physics advances at the times that the vehicle requests. With `sample_times` it advances lazily: just before each of
+    these times, and when the state is published. This is sufficient if physics catches up without loss of accuracy and
+    no wake is late.
     """
 
     name = "actuator"
@@ -84,17 +95,18 @@ class ActuatorNode:
             kind: ending for kind, ending in ENDINGS.items() if (kind, after_collision) != ("collision", "continue")
         }
         self._publish_ns = start_ns
+        """When the next state is published."""
         self._sample_times = tuple(sample_times)
         self._next_sample = 0
         self._sample_ns = start_ns
+        """With sample times, when physics advances for the next one."""
         self._is_pose_due = True
         self._ending: str | None = None
         self._stationary_status: StationaryStatus | None = None
         self._is_driving = False
         self._limited: tuple[str, ...] = ()
         self._rejected_ns = start_ns
-        self._pending: deque[tuple[int, int, int]] = deque(maxlen=MAX_PENDING_COMMANDS)
-        """Time, sequence and stamp of applied commands, until the vehicle reports that they reached the wheels."""
+        self._pending: deque[PendingCommand] = deque(maxlen=MAX_PENDING_COMMANDS)
         self.pipelines: Mapping[str, Sequence[Stage]] = {
             "control": (
                 ("decode", self._decode),
@@ -111,8 +123,8 @@ class ActuatorNode:
     @property
     def counts(self) -> Mapping[str, int]:
         """Return the counts of the node, the safety gate and the vehicle."""
-        counted = self.vehicle.counts if isinstance(self.vehicle, CountingVehicle) else {}
-        return {**self._counts, **self.gate.counts, **counted}
+        vehicle_counts = self.vehicle.counts if isinstance(self.vehicle, CountingVehicle) else {}
+        return {**self._counts, **self.gate.counts, **vehicle_counts}
 
     def next_wake_ns(self) -> int:
         """Return when the vehicle, the watchdog or the state is due."""
@@ -130,24 +142,24 @@ class ActuatorNode:
             self._counts["commands_unreadable"] += 1
             return None
 
-    def _admit(self, received: ReceivedCommand, _now: Now) -> JudgedCommand:
+    def _admit(self, received: ReceivedCommand, _now: Now) -> CheckedCommand:
         verdict = self.gate.admit(received.command, self.vehicle.state(), received.arrived.mono_ns)
         if not verdict.accepted:
             self._rejected_ns = received.arrived.mono_ns
-        return JudgedCommand(received, received.stamp_ns, verdict)
+        return CheckedCommand(received, received.stamp_ns, verdict)
 
-    def _apply(self, judged: JudgedCommand, now: Now) -> JudgedCommand:
-        if not judged.verdict.accepted:
-            return judged
+    def _apply(self, checked: CheckedCommand, now: Now) -> CheckedCommand:
+        if not checked.verdict.accepted:
+            return checked
         self._actuate(now.mono_ns)
-        self._pending.append((now.mono_ns, judged.received.command.sequence, judged.stamp_ns))
+        self._pending.append(PendingCommand(now.mono_ns, checked.received.command.sequence, checked.stamp_ns))
         self._limited = self.gate.limiter.applied_limits
-        return JudgedCommand(judged.received, judged.stamp_ns, judged.verdict, self._limited)
+        return CheckedCommand(checked.received, checked.stamp_ns, checked.verdict, self._limited)
 
-    def _report(self, judged: JudgedCommand, now: Now) -> list[Send]:
-        command, arrived = judged.received.command, judged.received.arrived
-        accepted = judged.verdict.accepted
-        self._counts["commands_limited"] += bool(judged.limited)
+    def _report(self, checked: CheckedCommand, now: Now) -> list[Send]:
+        command, arrived = checked.received.command, checked.received.arrived
+        accepted = checked.verdict.accepted
+        self._counts["commands_limited"] += bool(checked.limited)
         admission = Admission(
             epoch=command.epoch,
             sequence=command.sequence,
@@ -158,8 +170,8 @@ class ActuatorNode:
             received_wall_ns=arrived.wall_ns,
             applied_mono_ns=now.mono_ns if accepted else None,
             verdict="accepted" if accepted else "rejected",
-            reason=judged.verdict.message,
-            limited=", ".join(judged.limited),
+            reason=checked.verdict.message,
+            limited=", ".join(checked.limited),
             mode=command.mode,
             steering_rad=command.steering_rad,
             throttle=command.throttle,
@@ -194,7 +206,7 @@ class ActuatorNode:
         self.gate.issued_stamps.add(
             frame.stamp_ns, frame.number, frame.stamped_mono_ns, frame.pixel_crc, frame.capture_ns
         )
-        # Check now: the next frame may end a series of equal pictures.
+        # Checked here and not at the next wake, because the next frame may end a series of equal pictures.
         self.gate.watchdog.check_timeouts(now.mono_ns)
 
     # Physics and state reports.
@@ -204,8 +216,8 @@ class ActuatorNode:
         events = self.vehicle.advance(now.mono_ns)
         self._is_pose_due = not self._sample_times or self._sample_ns <= now.mono_ns
         while self._sample_times and self._sample_ns <= now.mono_ns:
-            number, turn = divmod(self._next_sample, len(self._sample_times))
-            self._sample_ns = self._sample_times[turn].due_ns(number) - POSE_AHEAD_NS
+            frame_number, index = divmod(self._next_sample, len(self._sample_times))
+            self._sample_ns = self._sample_times[index].due_ns(frame_number) - POSE_AHEAD_NS
             self._next_sample += 1
         if now.mono_ns - due_ns > LATE_NS:
             late_ms = (now.mono_ns - due_ns) // NS_PER_MS
@@ -215,7 +227,7 @@ class ActuatorNode:
         return events
 
     def _actuate(self, now_ns: int) -> None:
-        """Engage or disengage the vehicle, and apply the present actuation."""
+        """Engage or disengage the vehicle, and apply the current actuation."""
         state = self.vehicle.state()
         actuation = self.gate.watchdog.actuation(state, now_ns)
         self.vehicle.engage(self.gate.watchdog.should_engage(state), now_ns)
@@ -271,18 +283,19 @@ class ActuatorNode:
         )
 
     def _report_reached_commands(self) -> list[Send]:
-        """Return a `wheel` record for each command that the vehicle reports to have reached the wheels."""
+        """Return an entry for the record for each command that, as the vehicle reports, has reached the wheels."""
         sends = []
         for reached in self.vehicle.take_reached():
-            while self._pending and self._pending[0][0] < reached.applied_ns:
+            while self._pending and self._pending[0].applied_ns < reached.applied_ns:
                 self._pending.popleft()
-            if self._pending and self._pending[0][0] == reached.applied_ns:
-                applied_ns, sequence, stamp_ns = self._pending.popleft()
-                sends.append(Send("wheel", AtWheel(sequence, stamp_ns, applied_ns, reached.reached_ns)))
+            if self._pending and self._pending[0].applied_ns == reached.applied_ns:
+                command = self._pending.popleft()
+                at_wheel = AtWheel(command.sequence, command.stamp_ns, command.applied_ns, reached.reached_ns)
+                sends.append(Send("wheel", at_wheel))
         return sends
 
     def _report_transitions(self, now: Now) -> list[Send]:
-        """Return events for each safety transition, the start of a drive and its end by a stop."""
+        """Return an event for each safety transition, for the start of a drive, and for its end by a stop."""
         sends = []
         for before, after, reason in self.gate.machine.take_transitions():
             sends.append(Send("event", Event(now.mono_ns, "safety", f"{before} -> {after}: {reason}")))

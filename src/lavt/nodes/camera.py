@@ -1,4 +1,4 @@
-"""Capture a frame, stamp it, encode it and send its packets."""
+"""The camera node, which captures frames, stamps and encodes them, and sends their packets."""
 
 from __future__ import annotations
 
@@ -18,15 +18,24 @@ from lavt.transport.video.stream_sender import StreamSender
 from lavt.vehicle.camera import Camera, CapturedFrame, CountingCamera, FrameTimes, TimedCamera, newest_pose
 
 KEYFRAME_PAUSE_NS = NS_PER_S // 10
-"""At most one keyframe on request or for a new bit rate in this time, so that requests cannot fill the link."""
+"""In this time, at most one keyframe is sent for a request or a new bit rate, so that requests cannot fill the link."""
 REMEMBERED_STAMPS = 512
-"""A stamp differs from this many before it: at 60 Hz that is more than the 5 s for which the safety gate knows them."""
+"""A new stamp differs from this many previous ones: at 60 Hz those of 8.5 s, longer than the 5 s for which the safety
+gate remembers stamps."""
 REMEMBERED_POSES = 512
-"""At 240 Hz twice the longest time that a picture may take from the opening of the shutter."""
+"""At 240 Hz the poses of 2.1 s: twice the longest time from the opening of the shutter until a picture is ready."""
+
+
+class PreparedFrame(Struct, frozen=True):
+    """A captured frame that is ready to be stamped."""
+
+    frame: CapturedFrame
+    picture: FramePayload
+    pixel_crc: int
 
 
 class StampedFrame(Struct, frozen=True):
-    """A picture with its stamp in its pixels."""
+    """A frame whose picture has the stamp in its pixels."""
 
     frame: CapturedFrame
     pixel_crc: int
@@ -65,7 +74,7 @@ class CameraNode:
     ) -> None:
         self._counts: Counter[str] = Counter()
         self._capture_now = camera.capture
-        self._counting = camera if isinstance(camera, CountingCamera) else None
+        self._counting_camera = camera if isinstance(camera, CountingCamera) else None
         self._pictures = pictures
         self._ready_after_ns, self._expose = 0, self._expose_inline
         if isinstance(camera, TimedCamera):
@@ -78,7 +87,7 @@ class CameraNode:
         self._next_frame = 0
         self._wake_ns = self._shutter_times.due_ns(0) + self._ready_after_ns
         self._poses: deque[Pose] = deque(maxlen=REMEMBERED_POSES)
-        self._keyframe_wanted = False
+        self._keyframe_requested = False
         self._keyframe_ns = 0
         self._limit_bps: int | None = None
         self._stamps: deque[int] = deque(maxlen=REMEMBERED_STAMPS)
@@ -100,10 +109,10 @@ class CameraNode:
     def counts(self) -> Mapping[str, int]:
         """Return the counts of the node, the camera and path validation."""
         path = self.path
-        counted = {} if self._counting is None else self._counting.counts
+        camera_counts = {} if self._counting_camera is None else self._counting_camera.counts
         return {
             **self._counts,
-            **{f"camera_{name}": number for name, number in counted.items()},
+            **{f"camera_{name}": number for name, number in camera_counts.items()},
             "path_malformed": path.malformed,
             "path_wrong_token": path.wrong_token,
             "path_wrong_address": path.wrong_address,
@@ -132,31 +141,31 @@ class CameraNode:
         """Capture a frame with a camera that has no exposure time and no sensor delay."""
         return self._capture_now(number, begin_ns, newest_pose(poses, begin_ns))
 
-    def _check(self, frame: CapturedFrame, _now: Now) -> tuple[CapturedFrame, FramePayload, int]:
-        """Do all work that needs no stamp, so that it adds no latency: the checksum and the codec's preparation."""
-        return frame, *self._pictures.prepare(frame.picture)
+    def _check(self, frame: CapturedFrame, _now: Now) -> PreparedFrame:
+        """Do the work that needs no stamp, so that it adds no latency: the checksum and the codec's preparation."""
+        return PreparedFrame(frame, *self._pictures.prepare(frame.picture))
 
-    def _stamp(self, checked: tuple[CapturedFrame, FramePayload, int], now: Now) -> StampedFrame:
-        frame, prepared, pixel_crc = checked
+    def _stamp(self, prepared: PreparedFrame, now: Now) -> StampedFrame:
         stamp_ns = now.wall_ns
         if stamp_ns > self._highest_stamp_ns:
             self._highest_stamp_ns = stamp_ns
-        else:  # no stamp is issued twice, even if the clock stands still or is stepped back
+        else:  # no stamp is issued twice, even if the clock does not advance or is stepped back
             while stamp_ns in self._stamps:
                 stamp_ns += 1
             self._highest_stamp_ns = max(self._highest_stamp_ns, stamp_ns)
         self._stamps.append(stamp_ns)
-        return StampedFrame(frame, pixel_crc, stamp_ns, now.mono_ns, self._pictures.write_stamp(prepared, stamp_ns))
+        picture = self._pictures.write_stamp(prepared.picture, stamp_ns)
+        return StampedFrame(prepared.frame, prepared.pixel_crc, stamp_ns, now.mono_ns, picture)
 
     def _encode(self, stamped: StampedFrame, now: Now) -> EncodedFrame:
         paused = now.mono_ns - self._keyframe_ns < KEYFRAME_PAUSE_NS
-        keyframe = self._keyframe_wanted and not paused
+        keyframe = self._keyframe_requested and not paused
         limit_bps = self._stream.bit_rate_limit_bps
         if limit_bps != self._limit_bps and not paused:
             self._limit_bps, self._keyframe_ns = limit_bps, now.mono_ns
             self._pictures.limit_bit_rate(limit_bps)
         if keyframe:
-            self._keyframe_wanted, self._keyframe_ns = False, now.mono_ns
+            self._keyframe_requested, self._keyframe_ns = False, now.mono_ns
             self._counts["keyframes_on_request"] += 1
         return EncodedFrame(stamped, stamped.stamp_ns, self._pictures.encode(stamped.picture, keyframe=keyframe))
 
@@ -175,14 +184,14 @@ class CameraNode:
             stamped.pixel_crc,
             len(unit),
         )
-        # First of all sends: a command from this frame may arrive 5 ms later, and the gate must know its stamp.
+        # Sent first, because a command from this frame may arrive 5 ms later, and the gate must know its stamp by then.
         sends = [Send("frame", frame)]
         if validated is not None:
             cipher = self.path.cipher
-            sends += [Send("rtp", cipher.protect(each), validated) for each in (*packets.media, *packets.repair)]
-            sends += [Send("rtp", cipher.protect_rtcp(each), validated) for each in packets.report]
-        plain = [*packets.media, *packets.report]
-        sends += [Send("rtp", each, address) for address in self._send_to for each in plain]
+            sends += [Send("rtp", cipher.protect(packet), validated) for packet in (*packets.media, *packets.repair)]
+            sends += [Send("rtp", cipher.protect_rtcp(report), validated) for report in packets.report]
+        unprotected = [*packets.media, *packets.report]
+        sends += [Send("rtp", packet, address) for address in self._send_to for packet in unprotected]
         return [*sends, Send("video", VideoUnit(encoded.stamp_ns, unit))]
 
     def _note_pose(self, message: Message, _now: Now) -> None:
@@ -211,5 +220,5 @@ class CameraNode:
             return None
         self.path.report(message.peer, now.mono_ns)
         self._stream.receive_feedback(feedback, now.mono_ns)
-        self._keyframe_wanted |= feedback.picture_loss
+        self._keyframe_requested |= feedback.picture_loss
         return None

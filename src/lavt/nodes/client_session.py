@@ -1,4 +1,4 @@
-"""The client's side of the session: acquire control, arm the vehicle, notice the loss of control."""
+"""The client's side of the session: it acquires control, arms the vehicle, and notices the loss of control."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Literal
 from lavt.domain import NS_PER_S, Now, Operation, SessionReply, SessionRequest, State
 
 Phase = Literal["seeking", "arming", "driving", "stopped", "watching"]
-"""seeking: no control yet. arming: commands request arming. driving: the vehicle executes drive commands. stopped: a
-safe stop; only a person, or `rearm`, begins again. watching: control was released or lost, for good."""
+"""seeking: no control yet. arming: commands request arming. driving: the vehicle executes drive commands. stopped:
+the vehicle has stopped, and only a person or `rearm` begins again. watching: control was released or lost for good."""
 
 REQUEST_PERIOD_NS = NS_PER_S
 
@@ -16,9 +16,10 @@ REQUEST_PERIOD_NS = NS_PER_S
 class ClientSession:
     """A client session that requests control until it is granted and the vehicle armed; repeated requests are harmless.
 
-    `rearm` begins again after a safe stop and with a restarted server, but not after a driver override, which disarms
-    the vehicle. `clear_stop` clears an emergency stop that is latched at the start. `waits` arms the vehicle only when
-    the network condition is in force. `take_over` requests a handover from the active operator.
+    With `rearm`, it requests control again after a safe stop and from a restarted server, but not after a driver
+    override, which disarms the vehicle. With `clear_stop`, it clears an emergency stop that exists at the start. With
+    `waits_for_condition`, it arms the vehicle only when the network condition is in force. With `take_over`, it
+    requests a handover from the active operator.
     """
 
     def __init__(
@@ -29,7 +30,7 @@ class ClientSession:
         rearm: bool,
         start_ns: int,
         clear_stop: bool = False,
-        waits: bool = False,
+        waits_for_condition: bool = False,
         take_over: bool = False,
     ) -> None:
         self.phase: Phase = "seeking"
@@ -45,19 +46,19 @@ class ClientSession:
         self._instance = instance
         self._rearm = rearm
         self._clear_stop = clear_stop
-        self._waits_reason = "the network condition is not in force yet" if waits else ""
+        self._waits_reason = "the network condition is not in force yet" if waits_for_condition else ""
         self._take_over = take_over
         self._next_operation: Operation = "acquire"
         """The next request while seeking; with `take_over`, "acquire" and "request_handover" alternate."""
         self._last_operation: Operation = "acquire"
         self._rejections: dict[Operation, str] = {}
-        """The last reply to each of the two operations."""
+        """The last reply to each operation that requests control, as text."""
         self._was_active_operator = False
         """A state has named this client as the active operator."""
         self._server = 0
         """Instance of the server process that sent the last state."""
         self._was_disarmed = False
-        """The server process under which this client drove has disarmed the vehicle since."""
+        """Since this client drove, the same server process has disarmed the vehicle."""
         self._request_ns = start_ns
         self._stop_ns: int | None = None
         """When the emergency stop is requested again; None: the vehicle knows of it."""
@@ -77,12 +78,12 @@ class ClientSession:
         """Return when the next request is due."""
         releasing = self.phase == "watching" and not self.released
         request_ns = self._request_ns if self.phase in ("seeking", "arming") or releasing else None
-        return min((each for each in (request_ns, self._stop_ns) if each is not None), default=None)
+        return min((time_ns for time_ns in (request_ns, self._stop_ns) if time_ns is not None), default=None)
 
     def take_request(self, now_ns: int) -> SessionRequest | None:
         """Return the request that is due at `now_ns`; None: none is due."""
-        due = self.next_wake_ns()
-        if due is None or now_ns < due:
+        due_ns = self.next_wake_ns()
+        if due_ns is None or now_ns < due_ns:
             return None
         if self._stop_ns is not None and now_ns >= self._stop_ns:
             self._stop_ns = now_ns + REQUEST_PERIOD_NS
@@ -110,7 +111,7 @@ class ClientSession:
         self._update_reason(reply)
         self._highest_emergency_stop = max(self._highest_emergency_stop, reply.emergency_stop)
         if self.emergency_stop and reply.emergency_stop > self.emergency_stop:
-            # The vehicle takes the stop for an old one, because our wall clock is behind: raise it with a newer number.
+            # The vehicle takes the stop for an old one, because our wall clock is behind: raise a newer one.
             self.emergency_stop = self._highest_emergency_stop = reply.emergency_stop + 1
             self._stop_ns = None if self._stop_ns is None else now_ns
         elif self.emergency_stop == reply.emergency_stop:
@@ -132,7 +133,7 @@ class ClientSession:
         else:
             is_handover_requested = reply.granted and self._last_operation == "request_handover"
             self._rejections[self._last_operation] = "handover requested" if is_handover_requested else reply.reason
-        self.reason = "; ".join(each for each in self._rejections.values() if each) or self._waits_reason
+        self.reason = "; ".join(reason for reason in self._rejections.values() if reason) or self._waits_reason
 
     def handle_state(self, state: State, now_ns: int) -> None:
         """Process a state of the vehicle."""
@@ -150,7 +151,7 @@ class ClientSession:
         elif self.phase == "stopped" and self._rearm and abs(state.speed_mps) < 0.05 and not self._was_disarmed:
             self.phase, self._request_ns = "seeking", now_ns
         if is_other and self._was_active_operator and self.phase not in ("seeking", "watching"):
-            # A takeover at standstill needs no consent: two clients that take control back would do so forever.
+            # A takeover at standstill needs no consent, so two clients that both took control back would never stop.
             self.phase, self.released = "watching", True
             self.reason = f"{state.active_operator} has taken control"
         self._was_active_operator |= is_own
@@ -159,8 +160,8 @@ class ClientSession:
         """Raise an emergency stop and return its request; every later command carries its number.
 
         The request is repeated until the vehicle answers it or reports the stop, because a client that does not drive
-        sends no commands. The number is the wall clock time or, if a higher one was seen, one more than that, so that
-        it also grows over restarts.
+        sends no commands. The number is the wall clock time or, if a higher number is known, one more than that number.
+        So it grows even if the client is restarted.
         """
         self.emergency_stop = self._highest_emergency_stop = max(self._highest_emergency_stop + 1, now.wall_ns)
         self._stop_ns = now.mono_ns + REQUEST_PERIOD_NS

@@ -1,4 +1,4 @@
-"""Clock synchronization records: reports of the host's time source, and probes from the client to the server."""
+"""The nodes that record the clock offset: reports of the host's time source, and probes between client and server."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from lavt.transport.clock_sync.probe import (
 )
 
 PERIOD_NS = NS_PER_S
-"""Between two queries of the host's time source."""
+"""Period of the queries of the host's time source."""
 PROBES_PER_PERIOD = 2
-"""With 5, virtual time without pictures was 3 to 7 % slower; with 2 the difference is lost in the noise."""
+"""With 5, runs in virtual time without pictures took 3 to 7 % longer; with 2 no difference could be measured."""
 
 
 class ClockSyncNode:
-    """The server's node: queries the host's time source once a second and answers probes."""
+    """The server's node, which queries the host's time source once a second and answers probes."""
 
     name = "clock_sync"
     wakes_per_period = 1
@@ -34,7 +34,7 @@ class ClockSyncNode:
     def __init__(self, start_ns: int) -> None:
         self.counts: Counter[str] = Counter()
         self._start_ns = start_ns
-        self._tick = 0
+        self._next_wake_number = 0
         self._queried_period = -1
         self._wake_period_ns = PERIOD_NS // self.wakes_per_period
         self._latest: ClockReport | None = None
@@ -46,14 +46,16 @@ class ClockSyncNode:
 
     def next_wake_ns(self) -> int:
         """Return when the next query or probe is due."""
-        return self._start_ns + self._tick * self._wake_period_ns
+        return self._start_ns + self._next_wake_number * self._wake_period_ns
 
     def _probe_pipelines(self) -> dict[str, Sequence[Stage]]:
         return {"probe_request": (("answer", self._answer),)}
 
     def _wake(self, _message: Message, now: Now) -> list[Send]:
         elapsed_ns = now.mono_ns - self._start_ns
-        self._tick = elapsed_ns // self._wake_period_ns + 1  # on the grid: lateness must not accumulate
+        self._next_wake_number = (
+            elapsed_ns // self._wake_period_ns + 1
+        )  # the next multiple of the period, so that lateness does not accumulate
         probes = self._probes(now)
         if elapsed_ns // PERIOD_NS == self._queried_period:
             return probes
@@ -74,14 +76,16 @@ class ClockSyncNode:
             self.counts["probes_rejected"] += 1
             return None
         received_ns = message.arrived.wall_ns
-        known = (None, None) if self._latest is None else (self._latest.correction_s, self._latest.bound_s)
-        # If the clock was set back in between, the reply shows a duration of 0: the true time of arrival is lost.
-        reply = ProbeReply(sequence, sent_wall_ns, received_ns, max(received_ns, now.wall_ns), *known)
+        latest = self._latest
+        correction_and_bound = (None, None) if latest is None else (latest.correction_s, latest.bound_s)
+        # If the clock was set back since the arrival, the reply shows a duration of 0, because the true one is unknown.
+        answered_ns = max(received_ns, now.wall_ns)
+        reply = ProbeReply(sequence, sent_wall_ns, received_ns, answered_ns, *correction_and_bound)
         return [Send("probe_reply", encode_reply(reply), message.peer)]
 
 
 class ProbingClockSyncNode(ClockSyncNode):
-    """The client's node: queries the host's time source once a second and probes the server's clock more often."""
+    """The client's node, which queries the host's time source and also probes the server's clock."""
 
     wakes_per_period = PROBES_PER_PERIOD
 

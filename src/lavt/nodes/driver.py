@@ -1,4 +1,7 @@
-"""Turn received frames into commands: picture and stamp (`picture_reader`), lane detection, decision, command."""
+"""The driver node, which turns received frames into commands.
+
+Its steps are: picture and stamp (`picture_reader`), lane detection, decision, command.
+"""
 
 from __future__ import annotations
 
@@ -47,8 +50,8 @@ class PerceivedFrame(Struct, frozen=True):
 class DriverNode:
     """The node that drives by the received pictures and the reported speed only.
 
-    Every picture is decoded, but the lane is detected only in the newest one that waits. A command is sent with each
-    detection, and at the latest `limits.command_period_ns` after the previous command.
+    Every access unit is decoded, but the lane is detected only in the newest picture that waits. A command is sent
+    with each detection, and at the latest `limits.command_period_ns` after the previous command.
     """
 
     name = "driver"
@@ -66,11 +69,12 @@ class DriverNode:
         self._reader = reader
         self._detector = detector
         self._controller = controller
-        self._watch = LaneWatch()
+        self._lane_watch = LaneWatch()
         self._limits = limits
         self._sequence = 0
         self._view: DecodedFrame | None = None
         self._view_ns = 0
+        """When a decision was made from the newest view."""
         self._detected_stamp_ns = 0
         self._decision: Decision | None = None
         self._lane_state: LaneState = "ok"
@@ -82,6 +86,7 @@ class DriverNode:
         self._state_ns = 0
         """When the newest state arrived."""
         self._command_ns: int | None = None
+        """When the next command is due; None: no command is due."""
         self.pipelines: Mapping[str, Sequence[Stage]] = {
             "access_unit": reader.stages,
             "view": (("perceive", self._perceive), ("decide", self._decide), ("command", self._command_now)),
@@ -110,20 +115,20 @@ class DriverNode:
         view: DecodedFrame = message.payload
         since_last_ns = view.stamp_ns - self._detected_stamp_ns
         self._detected_stamp_ns = view.stamp_ns
-        # After a stop or a gap another lane may be where the lane was. The gap is measured between stamps, since the
-        # car moved on meanwhile; a negative gap, from a clock that was set back, has an unknown length.
+        # After a stop or a gap, another lane may be where the lane was. The gap is measured between stamps, because the
+        # car moves in that time. A negative gap comes from a clock that was set back, so its length is unknown.
         if self.session.phase != "driving" or not 0 <= since_last_ns <= FOLLOWS_FOR_NS:
             self._detector.forget()
         return PerceivedFrame(view, view.stamp_ns, self._detector.detect(view.received.picture))
 
-    def _decide(self, seen: PerceivedFrame, now: Now) -> PerceivedFrame:
-        self._lane_state = self._watch.check(seen.lane.confidence, now.mono_ns)
-        self._decision = self._controller.decide(seen.lane, self._speed_mps, now.mono_ns)
-        self._view, self._view_ns = seen.view, now.mono_ns
-        return seen
+    def _decide(self, perceived: PerceivedFrame, now: Now) -> PerceivedFrame:
+        self._lane_state = self._lane_watch.check(perceived.lane.confidence, now.mono_ns)
+        self._decision = self._controller.decide(perceived.lane, self._speed_mps, now.mono_ns)
+        self._view, self._view_ns = perceived.view, now.mono_ns
+        return perceived
 
-    def _command_now(self, seen: PerceivedFrame, now: Now) -> list[Send]:
-        return [*self._command(now), Send("lane", LaneSeen(seen.stamp_ns, seen.lane))]
+    def _command_now(self, perceived: PerceivedFrame, now: Now) -> list[Send]:
+        return [*self._command(now), Send("lane", LaneSeen(perceived.stamp_ns, perceived.lane))]
 
     # Commands.
 
@@ -138,7 +143,7 @@ class DriverNode:
         return [] if request is None else [Send("session", encode(request))]
 
     def _command(self, now: Now) -> list[Send]:
-        """Return the present command; none without control or without a picture."""
+        """Return the current command; nothing without control or without a picture."""
         self._command_ns = None
         if self._view is None or self._decision is None or not self.session.may_command:
             return []
@@ -188,7 +193,7 @@ class DriverNode:
         return self._OPERATOR_REQUESTS[message.payload](self, now)
 
     def _raise_emergency_stop(self, now: Now) -> list[Send]:
-        """Send an emergency stop, at once as a request and from now on in every command."""
+        """Send an emergency stop: at once as a request, and from now on in every command."""
         return [Send("session", encode(self.session.raise_emergency_stop(now))), *self._command(now)]
 
     def _release(self, now: Now) -> list[Send]:

@@ -1,7 +1,7 @@
-"""Network conditions: the client requests one, and each side applies its part to the queues of its own machine.
+"""Network conditions: the client requests one, and each side applies its part to the network queues of its machine.
 
-A condition is a lease: if the client does not renew it, it ends, and all queues are cleared. The nodes do not touch
-queues; the link that carries `inject` does, and reports what it measured.
+A condition is a lease: if the client does not renew it, it ends, and all queues are cleared. The nodes only order this
+from the link that carries `inject`, which changes the queues and reports what it measured.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ from lavt.transport.messages import decode, encode
 from lavt.transport.netem.injector import InjectionOrder, InjectionResult
 
 MEASURE_PERIOD_NS = 5 * NS_PER_S
-"""Period of the measurement of a condition in force."""
+"""Period at which a condition in force is measured."""
 REQUEST_PERIOD_NS = NS_PER_S
 LEASE_MS = 5_000
 """The client renews once a second: four requests may be lost."""
 MAX_PENDING_REQUESTS = 64
-"""Requests that may wait for the queues; the link keeps as many."""
+"""Number of requests that may wait for the queues; the link keeps as many orders."""
 
 
 class _Queues:
-    """The last order to this machine's queues, and whether it is in force."""
+    """The last order to this machine's network queues, and whether it is in force."""
 
     def __init__(self) -> None:
         self.flows: tuple[ImpairedFlow, ...] = ()
         self.condition = ""
         self.in_force = False
         self.repeat_ns: int | None = None
-        """When the order is repeated: to measure the condition in force, or because it failed."""
+        """When the order is repeated, either to measure the condition in force or because the order failed."""
         self._number = 0
 
     def order(self, condition: str, flows: tuple[ImpairedFlow, ...]) -> list[Send]:
@@ -50,7 +50,7 @@ class _Queues:
         """Return the order again, if that is due."""
         if self.repeat_ns is None or now_ns < self.repeat_ns:
             return []
-        self.repeat_ns = None  # set by the result
+        self.repeat_ns = None  # the result of the order sets it again
         return self._inject() if self.in_force else self.order(self.condition, self.flows)
 
     def handle_result(self, result: InjectionResult, now: Now) -> list[Send] | None:
@@ -68,9 +68,9 @@ class _Queues:
         return [
             Send(
                 "injection",
-                InjectionSample(now.mono_ns, self.condition, name, each_ms, measured_ms.get(name), reason),
+                InjectionSample(now.mono_ns, self.condition, name, delay_ms, measured_ms.get(name), reason),
             )
-            for name, each_ms in requested_ms.items()
+            for name, delay_ms in requested_ms.items()
         ]
 
     def _inject(self) -> list[Send]:
@@ -78,16 +78,17 @@ class _Queues:
 
 
 class Lease(Struct, frozen=True):
-    """The client that controls the network condition, and until when."""
+    """The client that controls the network condition, and the time when that ends."""
 
     client: tuple[str, int]
     until_ns: int
 
 
 class InjectionNode:
-    """The server's node: applies the condition that one client at a time requests to what this machine sends.
+    """The server's node, which impairs what this machine sends as one client at a time requests.
 
-    A vehicle that is not `simulated` must be stationary and disarmed for a change; a lease may end at any time.
+    `control` is the protocol and the port of the link between the routers. A vehicle that is not `simulated` must be
+    stationary and disarmed for a change of the condition, but a lease may end at any time.
     """
 
     name = "injection"
@@ -108,7 +109,7 @@ class InjectionNode:
         self._queues = _Queues()
         self._lease: Lease | None = None
         self._status = StationaryStatus(False, None)
-        self._waiting: deque[Peer] = deque(maxlen=MAX_PENDING_REQUESTS)
+        self._waiting_peers: deque[Peer] = deque(maxlen=MAX_PENDING_REQUESTS)
         self.pipelines: Mapping[str, Sequence[Stage]] = {
             "netem": (("answer", self._answer),),
             "injected": (("note", self._handle_result),),
@@ -136,7 +137,7 @@ class InjectionNode:
         self._lease = Lease((request.who, request.instance), now.mono_ns + request.lease_ms * NS_PER_MS)
         if not is_change and self._queues.in_force:
             return [_reply("", message.peer)]
-        self._waiting.append(message.peer)
+        self._waiting_peers.append(message.peer)
         return self._queues.order(request.condition, flows) if is_change else []
 
     def _rejection(self, request: NetemRequest, *, is_change: bool) -> str:
@@ -183,13 +184,13 @@ class InjectionNode:
         sends = self._queues.handle_result(result, now)
         if sends is None:
             return []
-        sends += [_reply(result.reason, peer) for peer in self._waiting]
-        self._waiting.clear()
+        sends += [_reply(result.reason, peer) for peer in self._waiting_peers]
+        self._waiting_peers.clear()
         if not result.reason:
             return sends
         self.counts["netem_failed"] += 1
         self._lease = None
-        # A condition may have failed half-way, so clear the queues; a failed clearing is repeated every second.
+        # The order may have failed half-way, so the queues are cleared; a failed clearing is repeated every second.
         return [*sends, *self._queues.order("", ())] if self._queues.condition else sends
 
     def _wake(self, _message: Message, now: Now) -> list[Send]:
@@ -204,9 +205,9 @@ class InjectionNode:
 
 
 class InjectionClient:
-    """The client's node: delays the control on its own machine and periodically requests the rest from the server.
+    """The client's node, which delays commands on its own machine and requests the rest periodically from the server.
 
-    The driver arms when both are in force; without a condition it does not wait.
+    With a condition, the driver waits until both parts are in force before it arms the vehicle.
     """
 
     name = "injection"
@@ -273,7 +274,7 @@ class InjectionClient:
 
 
 def _earliest(*times_ns: int | None) -> int | None:
-    return min((each for each in times_ns if each is not None), default=None)
+    return min((time_ns for time_ns in times_ns if time_ns is not None), default=None)
 
 
 def _reply(reason: str, peer: Peer) -> Send:

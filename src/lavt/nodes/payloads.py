@@ -1,4 +1,4 @@
-"""Messages between the nodes of one side, and records."""
+"""The payloads of messages between the nodes of one side, and of entries in records."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class FrameWritten(Struct, frozen=True):
     stamped_mono_ns: int
     capture_ns: int | None
     pixel_crc: int
-    """Checksum of the picture without its stamp, which differs from that of a different picture."""
+    """Checksum of the picture without its stamp, by which different pictures can be distinguished."""
     size_bytes: int
 
 
@@ -50,11 +50,11 @@ class PictureRead(Struct, frozen=True):
     """The outcome of decoding an access unit and reading its stamp."""
 
     stamp_ns: int | None
-    """None: it could not be read."""
+    """None: the stamp could not be read."""
     readable: bool
     reason: str
     in_doubt: bool
-    """Parts of it, or of a picture it refers to, were lost since the last intact keyframe."""
+    """Parts of the picture, or of one to which it refers, were lost since the last intact keyframe."""
     decoded: bool
     """The decoder returned a picture."""
     rtp_timestamp: int
@@ -72,7 +72,7 @@ class LaneSeen(Struct, frozen=True):
 
 
 class Admission(Struct, frozen=True):
-    """The verdict on a command on the server, with its times."""
+    """The server's verdict on a command, with the command's times."""
 
     epoch: int
     sequence: int
@@ -85,7 +85,7 @@ class Admission(Struct, frozen=True):
     verdict: str
     reason: str
     limited: str
-    """Names of the limits that changed it, separated by commas."""
+    """Names of the limits that changed the command, separated by commas."""
     mode: str
     steering_rad: float
     throttle: float
@@ -98,7 +98,7 @@ class AtWheel(Struct, frozen=True):
     sequence: int
     stamp_ns: int
     applied_mono_ns: int
-    """As in its `Admission`."""
+    """As in the command's `Admission`."""
     wheel_mono_ns: int
     """Arrival of the vehicle's report that it steers by this command."""
 
@@ -127,7 +127,7 @@ class PathToken(Struct, frozen=True):
 
 
 class StationaryStatus(Struct, frozen=True):
-    """Whether the vehicle is stationary and not active, and the active operator."""
+    """Whether the vehicle is stationary and neither driven nor about to be driven, and the active operator."""
 
     at_rest: bool
     active_operator: tuple[str, int] | None
@@ -143,4 +143,4 @@ class InjectionSample(Struct, frozen=True):
     requested_ms: float
     measured_ms: float | None
     reason: str
-    """Why it is not in force, or which measurement deviates from the request; empty: neither."""
+    """Why the condition is not in force, or which measurement deviates from the request; empty: neither."""

@@ -1,4 +1,4 @@
-"""Decode an access unit to a picture, and read and verify its stamp."""
+"""The reader of pictures, which decodes access units and verifies the stamps in their pictures."""
 
 from __future__ import annotations
 
@@ -24,20 +24,22 @@ class DecodedUnit(Struct, frozen=True):
 
 
 class StampRead(Struct, frozen=True):
-    """A decoded picture with its stamp; 0: it could not be read."""
+    """A decoded picture with its stamp."""
 
     decoded: DecodedUnit
     stamp_ns: int
+    """0: the stamp could not be read."""
     reason: str
+    """Why the stamp could not be read; empty: it was read."""
 
 
 class PictureReader:
     """A reader that decodes every access unit and forwards pictures with a valid stamp.
 
-    A stamp is valid if `agrees(stamp, RTP timestamp)`. If that check is weak, `reads_doubtful` should be false, which
-    excludes pictures in doubt: their damaged stamps can agree with each other. `stages` is a node's pipeline for
-    "access_unit". It sends a "view" for each valid picture, and "picture_lost" if the decoder has no picture or had to
-    conceal errors in it.
+    A stamp is valid if `agrees(stamp, RTP timestamp)` is true. If that check is weak, `reads_doubtful` should be false:
+    stamps of pictures in doubt are then not read, because damaged ones could agree by chance. `stages` is a node's
+    pipeline for "access_unit". It sends a "view" for each picture with a valid stamp, and "picture_lost" if the decoder
+    has no picture or had to conceal errors in it.
     """
 
     def __init__(
@@ -79,15 +81,15 @@ class PictureReader:
             return StampRead(decoded, 0, "stamp and RTP timestamp disagree")
         return StampRead(decoded, stamp_ns, "")
 
-    def _show(self, read: StampRead, now: Now) -> list[Send]:
-        decoded, unit = read.decoded, read.decoded.unit
-        readable = read.reason == ""
+    def _show(self, stamp: StampRead, now: Now) -> list[Send]:
+        decoded, unit = stamp.decoded, stamp.decoded.unit
+        readable = stamp.reason == ""
         self.counts["frames_decoded"] += decoded.picture is not None
         self.counts["frames_unreadable"] += not readable
         picture = PictureRead(
-            read.stamp_ns if readable else None,
+            stamp.stamp_ns if readable else None,
             readable,
-            read.reason,
+            stamp.reason,
             self._in_doubt,
             decoded.picture is not None,
             unit.rtp_timestamp,
@@ -96,9 +98,9 @@ class PictureReader:
             now.mono_ns,
             now.wall_ns,
         )
-        sends = [Send("video", VideoUnit(read.stamp_ns, unit.data)), Send("picture", picture)]
+        sends = [Send("video", VideoUnit(stamp.stamp_ns, unit.data)), Send("picture", picture)]
         if decoded.picture is None or decoded.picture.corrupt:
             sends.append(Send("picture_lost", None))
         if decoded.picture is not None and readable:
-            sends.append(Send("view", DecodedFrame(read.stamp_ns, now.wall_ns, decoded.picture)))
+            sends.append(Send("view", DecodedFrame(stamp.stamp_ns, now.wall_ns, decoded.picture)))
         return sends

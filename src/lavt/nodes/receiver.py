@@ -1,9 +1,10 @@
-"""Restore the order of received packets and reassemble access units."""
+"""The receiver node, which restores the order of received packets and reassembles access units."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.errors import BadPacket
@@ -18,23 +19,33 @@ from lavt.transport.video.cipher import NewCipher, plain_cipher
 from lavt.transport.video.path_validation import PathClient, is_path_datagram
 
 REPORT_PERIOD_NS = 500 * NS_PER_MS
-"""Four reports within the 2 s after which the server closes a path without reports."""
+"""The server closes a path after 2 s without a report, in which four reports are due."""
 SAMPLE_PERIOD_NS = NS_PER_S
 """Period of the recorded statistics."""
-KEYFRAME_TAKES_NS = 50 * NS_PER_MS
-"""Time that a keyframe takes at the sender: the wait for the next picture, and its encoding."""
-UNKNOWN_ROUND_TRIP_NS = 50 * NS_PER_MS
-"""Assumed until a sender report gives the round trip."""
+KEYFRAME_DELAY_NS = 50 * NS_PER_MS
+"""How long the sender of the video takes to answer a keyframe request: it waits for the next picture and encodes it."""
+ASSUMED_ROUND_TRIP_NS = 50 * NS_PER_MS
+"""The assumed round trip until a sender report gives it."""
 SSRC = 0x4C415654
 """SSRC of the receiver in its reports: "LAVT"."""
+
+
+class OrderedPackets(NamedTuple):
+    """Received packets in order, for the depacketizer."""
+
+    packets: Ordered
+    arrived: Now
+    """When the message arrived that released the packets."""
+    sends: list[Send]
+    """Messages to send besides the access units."""
 
 
 class ReceiverNode:
     """The node that validates the video path, keeps it open with receiver reports, and receives the video.
 
-    Lost packets are recovered from repair packets, if there are enough of them. Otherwise pictures are in doubt up to
-    the next complete keyframe, which is requested at once and again after each round trip without one. Each report
-    requests `max_bit_rate_bps` from the sender.
+    Lost packets are recovered from repair packets, if there are enough of them. Otherwise pictures are in doubt until
+    the next complete keyframe. It is requested at once, and again after each round trip in which none arrives. With
+    each report, the receiver requests at most `max_bit_rate_bps` from the sender.
     """
 
     name = "receiver"
@@ -92,39 +103,39 @@ class ReceiverNode:
         return min((time for time in times if time is not None), default=None)
 
     def _note_token(self, message: Message, _now: Now) -> None:
-        token: PathToken = message.payload
-        if self._path is None or token.token != self._token:
-            self._token = token.token
-            self._path = PathClient(token.token, self._new_cipher)
-            self._port = token.port
+        path_token: PathToken = message.payload
+        if self._path is None or path_token.token != self._token:
+            self._token = path_token.token
+            self._path = PathClient(path_token.token, self._new_cipher)
+            self._port = path_token.port
 
-    def _receive(self, message: Message, now: Now) -> tuple[Ordered, Now, list[Send]] | None:
+    def _receive(self, message: Message, now: Now) -> OrderedPackets | None:
         """Process a datagram of any kind; count and drop an unreadable one."""
         datagram: bytes | None = message.payload
         if is_path_datagram(message.payload):
             answer = None if self._path is None else self._path.answer(message.payload)
             self._counts["challenges_unreadable"] += answer is None
-            return None if answer is None else ([], message.arrived, [self._feedback(answer)])
-        control = is_rtcp(message.payload)
+            return None if answer is None else OrderedPackets([], message.arrived, [self._feedback(answer)])
+        is_report = is_rtcp(message.payload)
         if self._path is not None:
-            datagram = (self._path.unprotect_rtcp if control else self._path.unprotect)(message.payload)
+            datagram = (self._path.unprotect_rtcp if is_report else self._path.unprotect)(message.payload)
         if datagram is None:
             self._counts["packets_forged"] += 1
             return None
         try:
-            if control:
+            if is_report:
                 announcement = parse_announcement(datagram)
-                # Without a path this node has sent no reports: answers in sender reports belong to another receiver.
+                # Without a path this node has sent no reports: answers in this sender report are for another receiver.
                 own_ssrc = None if self._path is None else SSRC
                 self._reception.note_announcement(announcement, own_ssrc, message.arrived.mono_ns)
                 return None
-            return self._order(datagram, message.arrived, now), message.arrived, []
+            return OrderedPackets(self._order(datagram, message.arrived, now), message.arrived, [])
         except BadPacket:
             self._counts["packets_unreadable"] += 1
             return None
 
     def _order(self, datagram: bytes, arrived: Now, now: Now) -> Ordered:
-        """Return the packets in order after this one, with recovered packets; raise `BadPacket`."""
+        """Return the packets that this one makes available in order, including recovered ones; raise `BadPacket`."""
         packet = parse_packet(datagram)
         ordered: Ordered = []
         if packet.payload_type == REPAIR_PAYLOAD_TYPE:
@@ -140,7 +151,7 @@ class ReceiverNode:
             ordered += self._jitter_buffer.push_recovered(recovered, now.mono_ns)
         return ordered
 
-    def _wake(self, message: Message, now: Now) -> tuple[Ordered, Now, list[Send]]:
+    def _wake(self, message: Message, now: Now) -> OrderedPackets:
         now_ns = now.mono_ns
         sends = []
         if self._path is not None and now_ns >= self._path.next_hello_ns():
@@ -154,9 +165,9 @@ class ReceiverNode:
                 sends.append(Send("reception", self._reception.sample(now_ns)))
             if self._repeats_requests():
                 sends += self._request_keyframe(now_ns)
-        return self._jitter_buffer.expire(now_ns), message.arrived, sends
+        return OrderedPackets(self._jitter_buffer.expire(now_ns), message.arrived, sends)
 
-    def _depacketize(self, ordered: tuple[Ordered, Now, list[Send]], now: Now) -> list[Send]:
+    def _depacketize(self, ordered: OrderedPackets, now: Now) -> list[Send]:
         packets, arrived, sends = ordered
         damaged = False
         for packet, lost_before in packets:
@@ -181,13 +192,13 @@ class ReceiverNode:
         return self._in_doubt and self._reception.round_trip_ns is not None
 
     def _request_due_ns(self) -> int:
-        """Return when the next keyframe request is allowed: when the keyframe of the last one should have arrived."""
+        """Return when the next keyframe request is allowed: when the answer to the last one should have arrived."""
         if self._requested_ns is None:
             return 0
         round_trip_ns = self._reception.round_trip_ns
-        return (
-            self._requested_ns + KEYFRAME_TAKES_NS + (UNKNOWN_ROUND_TRIP_NS if round_trip_ns is None else round_trip_ns)
-        )
+        if round_trip_ns is None:
+            round_trip_ns = ASSUMED_ROUND_TRIP_NS
+        return self._requested_ns + KEYFRAME_DELAY_NS + round_trip_ns
 
     def _request_keyframe(self, now_ns: int) -> list[Send]:
         """Return a keyframe request, unless a requested keyframe may still arrive."""
@@ -195,16 +206,16 @@ class ReceiverNode:
             return []
         self._requested_ns = now_ns
         self._counts["picture_loss_requests"] += 1
-        return [self._control(picture_loss(SSRC, self._media_ssrc))]
+        return [self._rtcp(picture_loss(SSRC, self._media_ssrc))]
 
     def _report(self, media_ssrc: int, now_ns: int) -> list[Send]:
         report = self._reception.report(now_ns)
-        sends = [] if report is None else [self._control(receiver_report(SSRC, report, clock_ns=now_ns))]
+        sends = [] if report is None else [self._rtcp(receiver_report(SSRC, report, clock_ns=now_ns))]
         if self._max_bit_rate_bps is not None:
-            sends.append(self._control(max_bit_rate(SSRC, media_ssrc, self._max_bit_rate_bps, overhead_bytes=0)))
+            sends.append(self._rtcp(max_bit_rate(SSRC, media_ssrc, self._max_bit_rate_bps, overhead_bytes=0)))
         return sends
 
-    def _control(self, packet: bytes) -> Send:
+    def _rtcp(self, packet: bytes) -> Send:
         return self._feedback(packet if self._path is None else self._path.protect_rtcp(packet))
 
     def _feedback(self, datagram: bytes) -> Send:

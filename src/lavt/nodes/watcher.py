@@ -1,4 +1,4 @@
-"""A node that decodes a video stream and does not drive."""
+"""The watcher node, which decodes a video stream and does not drive."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from lavt.nodes.picture_reader import PictureReader
 
 
 class WatcherNode:
-    """A node in the driver's place that reads and drops pictures; "picture" records the outcome of each."""
+    """A node in the driver's place, which reads pictures and drops them; "picture" records the outcome for each."""
 
     name = "driver"
-    """The receiver of pictures in the channel table."""
+    """The channel table names this node as the receiver of pictures."""
 
     def __init__(self, reader: PictureReader) -> None:
         self.counts: Mapping[str, int] = reader.counts

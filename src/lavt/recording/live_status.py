@@ -1,4 +1,4 @@
-"""The live status of a running side: the newest figures, and the ending of a drive, from what its record gets."""
+"""The live status of a running side: its newest figures and the ending of its drive, from the entries of its record."""
 
 from __future__ import annotations
 
@@ -9,19 +9,20 @@ from lavt.domain import NS_PER_MS, Now, State
 from lavt.runtime.recorder import decode_for_record
 
 MAX_PENDING = 4096
-"""Entries and updates that are kept until they are taken: the newest, of more than ten seconds."""
+"""How many entries, and how many updates, are kept until they are read: those of more than ten seconds."""
 
 StatusUpdate = tuple[State | str, Now]
 """A state of the vehicle or the reason for which a command was rejected, and its time."""
 
 
 class LiveStatus:
-    """A recorder that keeps the newest figures for display, whatever happens to the record.
+    """A recorder that keeps the newest figures for display, even if the record cannot be written.
 
     `write` is called by the threads of the runtime and only stores the entry; the other methods process the stored
     entries, and are for one thread.
 
-    The one-way latencies are raw: receiver's wall clock minus sender's, without a correction for the clock offset.
+    The one-way latencies are raw: the receiver's wall clock time minus the sender's, without a correction for the clock
+    offset.
     """
 
     def __init__(self) -> None:
@@ -38,7 +39,7 @@ class LiveStatus:
         }
 
     def write(self, topic: str, payload: Any, now: Now) -> None:
-        """Store one entry, if it is shown."""
+        """Store one entry, if the live status depends on its topic."""
         if topic in self._processors:
             self._entries.append((topic, payload, now))
 
@@ -82,7 +83,7 @@ class LiveStatus:
             self._updates.append((state, now))
 
     def _update_admission(self, admission: Any, now: Now) -> None:
-        if admission.verdict == "accepted":  # the send time of any other may be a stranger's
+        if admission.verdict == "accepted":  # any other command may be a stranger's, with a false send time
             self._status["raw_tau_c_ms"] = (admission.received_wall_ns - admission.sent_wall_ns) / NS_PER_MS
         if admission.reason:
             self._status["rejected"] = admission.reason

@@ -1,7 +1,7 @@
 """A fast reader of the MCAP files (mcap.dev/spec) that `mcap_writer.py` writes: a sweep reads millions of messages.
 
-The reader of the package `mcap` takes 10 us for a message, this one takes 1: it parses messages in place and skips
-the indexes, whose every entry the package reads. The package's classes read the rare records.
+The reader of the package `mcap` takes 10 us for a message, this one takes 1. It parses messages in place, and it skips
+the indexes, whereas the package reads every entry of them. The package's classes read the other, rare records.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from mcap.stream_reader import CRCValidationError
 from lavt.recording.mcap_writer import MAGIC
 
 _HEAD: Final = struct.Struct("<BQ")
-"""Opcode and length of the content that follows."""
+"""Opcode of a record, and length of the content that follows."""
 _MESSAGE: Final = struct.Struct("<HIQQ")
-"""Channel, sequence, log time and publish time; the data follow."""
+"""Channel, sequence number, log time and publish time of a message; its data follow."""
 _MESSAGE_OPCODE: Final = int(Opcode.MESSAGE)
 _CHANNEL_OPCODE: Final = int(Opcode.CHANNEL)
 _DAMAGE: Final = (
@@ -62,15 +62,15 @@ class McapContent:
     complete: bool = False
 
 
-def read_mcap(path: Path, wanted: Callable[[str], bool]) -> McapContent:
-    """Read the messages of `wanted` topics, and all metadata, up to the end or to the first damage."""
+def read_mcap(path: Path, is_wanted: Callable[[str], bool]) -> McapContent:
+    """Read all metadata and the messages of topics for which `is_wanted` is true, up to the end or the first damage."""
     content = McapContent()
     messages_of: dict[int, Messages | None] = {}
-    # A cut or damaged end raises. The chunks before it are intact: each has its own checksum.
+    # A cut or damaged end raises an error. The chunks before it are intact, because each has its own checksum.
     with path.open("rb") as stream, contextlib.suppress(*_DAMAGE), mmap(stream.fileno(), 0, access=ACCESS_READ) as file:
-        for opcode, begin, end in _records(file):
+        for opcode, begin, end in _find_records(file):
             if opcode == Opcode.CHUNK:
-                _parse_chunk(_decompress(Chunk.read(_stream(file[begin:end]))), messages_of, content, wanted)
+                _parse_chunk(_decompress(Chunk.read(_stream(file[begin:end]))), messages_of, content, is_wanted)
             elif opcode == Opcode.METADATA:
                 metadata = Metadata.read(_stream(file[begin:end]))
                 content.metadata[metadata.name] = dict(metadata.metadata)
@@ -80,8 +80,8 @@ def read_mcap(path: Path, wanted: Callable[[str], bool]) -> McapContent:
     return content
 
 
-def _records(file: mmap) -> Iterator[tuple[int, int, int]]:
-    """Yield opcode, begin and end of each record of the file; raise `ValueError` where the file is cut."""
+def _find_records(file: mmap) -> Iterator[tuple[int, int, int]]:
+    """Yield each record's opcode and the offsets between which its content is; raise `ValueError` for a cut file."""
     if file[: len(MAGIC)] != MAGIC:
         raise ValueError("not an MCAP file")
     end = len(MAGIC)
@@ -99,7 +99,7 @@ def _stream(record: bytes) -> ReadDataStream:
 
 
 def _decompress(chunk: Chunk) -> bytes:
-    """Return a chunk's decompressed content; raise `CRCValidationError` where its checksum is wrong."""
+    """Return a chunk's decompressed content; raise `CRCValidationError` if its checksum is wrong."""
     data = chunk.data
     if chunk.compression == "zstd":
         data = zstandard.ZstdDecompressor().decompress(data, max_output_size=chunk.uncompressed_size)
@@ -113,27 +113,28 @@ def _parse_chunk(
     chunk: bytes,
     messages_of: dict[int, Messages | None],
     content: McapContent,
-    wanted: Callable[[str], bool],
+    is_wanted: Callable[[str], bool],
 ) -> None:
-    head, message, head_size, message_size = _HEAD.unpack_from, _MESSAGE.unpack_from, _HEAD.size, _MESSAGE.size
+    unpack_head, unpack_message = _HEAD.unpack_from, _MESSAGE.unpack_from
+    head_size, message_size = _HEAD.size, _MESSAGE.size
     offset, end = 0, len(chunk)
     while offset < end:
-        opcode, length = head(chunk, offset)
+        opcode, length = unpack_head(chunk, offset)
         begin = offset + head_size
         offset = begin + length
         if opcode == _MESSAGE_OPCODE:
-            channel, _sequence, log_ns, publish_ns = message(chunk, begin)
+            channel, _sequence, log_ns, publish_ns = unpack_message(chunk, begin)
             messages = messages_of[channel]
             if messages is not None:
                 messages.data.append(chunk[begin + message_size : offset])
                 messages.publish_ns.append(publish_ns)
                 messages.log_ns.append(log_ns)
         elif opcode == _CHANNEL_OPCODE:
-            _register_channel(chunk[begin:offset], messages_of, content, wanted)
+            _register_channel(chunk[begin:offset], messages_of, content, is_wanted)
 
 
 def _register_channel(
-    record: bytes, messages_of: dict[int, Messages | None], content: McapContent, wanted: Callable[[str], bool]
+    record: bytes, messages_of: dict[int, Messages | None], content: McapContent, is_wanted: Callable[[str], bool]
 ) -> None:
     channel = Channel.read(_stream(record))
-    messages_of[channel.id] = content.topics.setdefault(channel.topic, Messages()) if wanted(channel.topic) else None
+    messages_of[channel.id] = content.topics.setdefault(channel.topic, Messages()) if is_wanted(channel.topic) else None

@@ -1,7 +1,7 @@
 """A fast writer of MCAP files (mcap.dev/spec): a record has hundreds of messages for each second of a drive.
 
-The writer of the package `mcap` takes 10 us for a message, this one takes 2. The package's classes write the rare
-records (header, schemas, channels, indexes), and its reader reads the files in tests.
+The writer of the package `mcap` takes 10 us for a message, this one takes 2. The package's classes write the other,
+rare records (header, schemas, channels, indexes), and the tests read the files with the package's reader.
 """
 
 from __future__ import annotations
@@ -32,13 +32,14 @@ from mcap.records import (
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 _MESSAGE: Final = struct.Struct("<BQHIQQ")
-"""Opcode, length of the content that follows, channel, sequence, log time and publish time; the data follow."""
+"""Opcode, length of the content that follows, channel, sequence number, log time and publish time; the data follow."""
 _MESSAGE_OPCODE: Final = int(Opcode.MESSAGE)
 _HEAD_BYTES: Final = 9
 _MESSAGE_FIELDS_BYTES: Final = _MESSAGE.size - _HEAD_BYTES
 _MESSAGE_INDEX: Final = struct.Struct("<BQHI")
 _COMPRESSION_LEVEL: Final = 1
-"""zstd's fastest ordinary level: a drive's JSON shrinks to a ninth. Level 3 takes a third longer for the same size."""
+"""The fastest ordinary level of zstd, which compresses the JSON of a drive to a ninth. Level 3 takes a third longer and
+gives the same size."""
 
 
 class McapFile:
@@ -64,19 +65,19 @@ class McapFile:
         return self._file.closed
 
     def add_schema(self, name: str, encoding: str, data: bytes) -> int:
-        """Add a schema and return its number."""
+        """Add a schema and return its id."""
         schema = Schema(id=len(self._schemas) + 1, name=name, encoding=encoding, data=data)
         self._schemas.append(schema)
         self._append(_bytes(schema))
         return schema.id
 
     def add_channel(self, topic: str, encoding: str, schema_id: int) -> int:
-        """Add a channel and return its number."""
-        number = len(self._channels) + 1
-        channel = Channel(id=number, topic=topic, message_encoding=encoding, metadata={}, schema_id=schema_id)
+        """Add a channel and return its id."""
+        channel_id = len(self._channels) + 1
+        channel = Channel(id=channel_id, topic=topic, message_encoding=encoding, metadata={}, schema_id=schema_id)
         self._channels.append(channel)
         self._append(_bytes(channel))
-        return number
+        return channel_id
 
     def add_messages(self, entries: Iterable[tuple[int, int, int, bytes]]) -> bytes:
         """Add messages, each (channel, log time, publish time, data), and return their uncompressed MCAP records."""
@@ -96,7 +97,7 @@ class McapFile:
         return written
 
     def add_metadata(self, name: str, entries: Mapping[str, str]) -> None:
-        """Add named entries that belong to no time."""
+        """Add named entries that have no time."""
         record = _bytes(Metadata(name=name, metadata=dict(entries)))
         self._metadata_indexes.append(MetadataIndex(offset=self._file.tell(), length=len(record), name=name))
         self._file.write(record)

@@ -1,4 +1,4 @@
-"""Output directories: nothing in them is ever overwritten, and none is created for work that cannot begin."""
+"""Output directories: no file in them is overwritten, and no directory is created for work that cannot begin."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ def check_directory(out: Path) -> None:
 
 
 def prepare_directory(out: Path) -> None:
-    """Create the directory; raise `UserError` where it exists and is not empty."""
+    """Create the directory; raise `UserError` if it exists and is not empty."""
     check_directory(out)
     make_directory(out)
 
 
 def make_directory(out: Path) -> None:
-    """Create the directory unless it exists; raise `UserError` where it cannot be created."""
+    """Create the directory unless it exists; raise `UserError` if it cannot be created."""
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

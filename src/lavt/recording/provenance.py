@@ -1,4 +1,4 @@
-"""The provenance of a record: versions and machine, as annotations that its digest does not cover."""
+"""The provenance of a record: versions and machine, as annotations, which the digest of the record does not cover."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ import lavt
 LIBRARIES = ("numpy", "opencv-python-headless", "av", "eclipse-zenoh")
 
 
-@functools.cache  # constant, and needed for every run
+@functools.cache  # it is constant, and every run needs it
 def provenance() -> Mapping[str, Mapping[str, str]]:
     """Return the versions of LAVT and its libraries, and a description of the machine."""
     return {
-        "versions": {"lavt": lavt.__version__, **{each: version(each) for each in LIBRARIES}},
+        "versions": {"lavt": lavt.__version__, **{library: version(library) for library in LIBRARIES}},
         "machine": {
             "system": platform.platform(),
             "processor": platform.machine(),

@@ -26,13 +26,13 @@ from lavt.recording.mcap_writer import McapFile
 from lavt.recording.table import EMPTY, Table, table_of
 
 FORMAT_VERSION = 2
-"""The version of the channels and their fields, in the metadata `format`. Records of version 1 do not name theirs."""
+"""The version of the channels and their fields, in the metadata `format`. Records without this entry have version 1."""
 
 CHUNK_BYTES = 64 * 1024
 """A crash loses at most one unfinished chunk: only whole chunks can be read again."""
 
 BUFFERED_MESSAGES = 64
-"""A crash also loses at most these messages, which are not in a chunk yet: a tenth of a second of a drive."""
+"""A crash also loses up to this many messages, which are not in a chunk yet: a tenth of a second of a drive."""
 
 VIDEO = "video"
 """The channel of access units; its payload has `stamp_ns` and `data`."""
@@ -62,7 +62,7 @@ Side = Literal["server", "client"]
 
 
 class Digest(Protocol):
-    """A digest as in `hashlib`, reduced to the method that the writers call."""
+    """A hash object as in `hashlib`, with only the method that the writers call."""
 
     def update(self, data: bytes, /) -> None:
         """Add bytes."""
@@ -72,9 +72,9 @@ class Digest(Protocol):
 class RecordWriter:
     """A writer of one side's record.
 
-    `digest`, if given, is updated with every message: side, channel, both times, length and JSON. Both sides of a run
-    in virtual time share one digest, which therefore also covers the order between them. It covers neither annotations
-    nor the channels in `left_out`, which are not recorded.
+    `digest`, if given, is updated with the side, channel, times, length and JSON of every message. Both sides of a run
+    in virtual time share one digest, which therefore also covers the order of messages on different sides. It covers
+    neither annotations nor the channels in `left_out`, which are not recorded.
     """
 
     def __init__(
@@ -86,12 +86,12 @@ class RecordWriter:
         self._mcap = McapFile(path, library=f"lavt {side}", chunk_bytes=CHUNK_BYTES)
         self._mcap.add_metadata(_FORMAT, {"version": str(FORMAT_VERSION)})
         self._channels: dict[str, dict[type, tuple[int, Callable[[Any], bytes]]]] = defaultdict(dict)
-        """For each channel and payload type, its number and its serializer."""
+        """For each channel and payload type, the id of the MCAP channel and the serializer."""
         self._schemas: dict[type, int] = {}
         self._buffer: list[tuple[str, Any, Now]] = []
 
     def write(self, channel: str, payload: Any, now: Now) -> None:
-        """Buffer one message for the topic "/" + `channel`: a dataclass or a dict that must not change afterwards.
+        """Buffer one message for the topic "/" + `channel`; its payload must not change afterwards.
 
         Raises `TypeError` for values that JSON cannot represent, at the latest in `close`.
         """
@@ -113,11 +113,11 @@ class RecordWriter:
             self._digest.update(self._side.encode() + written)
 
     def annotate(self, name: str, entries: Mapping[str, str]) -> None:
-        """Write metadata that do not belong to the run's result: versions, the machine."""
+        """Write metadata that are not results of the run, such as versions or the machine."""
         self._mcap.add_metadata(name, entries)
 
     def close(self) -> None:
-        """Finish the file. Without this call it can still be read, but is not `complete`."""
+        """Finish the file. Without this call the file can still be read, but its `Record` is not `complete`."""
         if not self._mcap.closed:
             self._flush()
             self._mcap.close()
@@ -146,14 +146,14 @@ def _video_json(payload: Any) -> bytes:
     )
     seconds, nanoseconds = divmod(stamp_ns, NS_PER_S)
     text = base64.b64encode(unit).decode("ascii")
-    # Formatted without `json`, as base64 needs no escaping and this is by far the largest message.
+    # Formatted without `json`, because this is by far the largest message and base64 needs no escaping.
     return (
         f'{{"timestamp":{{"sec":{seconds},"nsec":{nanoseconds}}},"frame_id":"camera","data":"{text}","format":"h264"}}'
     ).encode()
 
 
 class _Tables(Mapping[str, Table]):
-    """The tables of a record's channels, each parsed on first access: half of them are never read."""
+    """The tables of a record's channels. Each is parsed on first access, because half of them are never read."""
 
     def __init__(self, messages: Mapping[str, Messages]) -> None:
         self._messages = messages
@@ -190,7 +190,7 @@ class Record:
     last_ns: int
 
     def table(self, channel: str) -> Table:
-        """Return the messages of a channel; the table is empty where none were recorded."""
+        """Return the messages of a channel; the table is empty if none were recorded."""
         return self.tables.get(channel, EMPTY)
 
     def video(self) -> list[tuple[int, bytes]]:
@@ -209,42 +209,42 @@ class Record:
 def evaluating(path: Path) -> Iterator[None]:
     """Raise `UserError` if the records at `path`, which others may have written, have unexpected content.
 
-    The checksums of a record show damage. Content of another type or range than LAVT writes may cause any error in what
-    is computed from it.
+    Damage is not meant: checksums detect it. Content of another type or range than LAVT writes may cause any error in
+    a computation with it.
     """
     try:
         yield
     except (ArithmeticError, AttributeError, LookupError, MemoryError, RecursionError, TypeError, ValueError) as error:
-        what = " ".join(describe_error(error).split())
+        reason = " ".join(describe_error(error).split())
         raise UserError(
-            f"{path} has records that LAVT cannot evaluate ({what}): name a run that it recorded"
+            f"{path} has records that LAVT cannot evaluate ({reason}): name a run that it recorded"
         ) from error
 
 
 def read_record(path: Path, channels: Container[str] | None = None) -> Record:
     """Read the record at `path` into tables, without the video; `channels`, if given, limits the channels.
 
-    All whole chunks of an unfinished file (a crash, a full disk) are read. Raises `WorkError` where there is no file,
-    and `UserError` for a record in another format version.
+    Of a file that is unfinished after a crash or on a full disk, all whole chunks are read. Raises `WorkError` if there
+    is no file, and `UserError` for a record in another format version.
     """
     if not path.is_file():
         raise WorkError(f"there is no record at {path}")
 
-    def wanted(topic: str) -> bool:
+    def is_wanted(topic: str) -> bool:
         channel = topic.removeprefix("/")
         return channel != VIDEO and (channels is None or channel in channels)
 
-    content = read_mcap(path, wanted)
+    content = read_mcap(path, is_wanted)
     _check_version(path, content)
-    messages = {topic.removeprefix("/"): each for topic, each in content.topics.items() if each.data}
-    last_ns = max((max(each.publish_ns) for each in messages.values()), default=0)
-    return Record(path, content.complete, _Tables(messages), content.metadata, last_ns)
+    by_channel = {topic.removeprefix("/"): messages for topic, messages in content.topics.items() if messages.data}
+    last_ns = max((max(messages.publish_ns) for messages in by_channel.values()), default=0)
+    return Record(path, content.complete, _Tables(by_channel), content.metadata, last_ns)
 
 
 def _check_version(path: Path, content: McapContent) -> None:
     """Raise `UserError` for a record in another format version than `FORMAT_VERSION`.
 
-    The version is the file's first entry: only a file that was cut before any message lacks it, and is read as empty.
+    The version is the first entry of a file. A file without it that was cut before its first message is read as empty.
     """
     version = content.metadata.get(_FORMAT, {}).get("version")
     if version is None and not content.complete and not content.topics:

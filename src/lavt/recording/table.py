@@ -16,16 +16,17 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 MISSING = int(np.iinfo(np.int64).min)
-"""Null in a column of integers. A float column would have a resolution of 256 ns only for wall times (over 2^60 ns)."""
+"""Null in a column of integers. Floats cannot be used instead: for wall clock times, which exceed 2^60 ns, their
+resolution is only 256 ns."""
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Messages of one channel, in the order they were recorded.
+    """The messages of one channel, in the order in which they were recorded.
 
     `columns` has an array per field of the payload: int64 (null is `MISSING`), float64 (null is NaN), bool, or objects.
-    `mono_ns` and `wall_ns` are the times of recording on the recording host's clocks; payload fields of these names
-    are in `columns`.
+    `mono_ns` and `wall_ns` are the times of recording on the clocks of the recording host. Fields of the payload that
+    have the same names are in `columns`.
     """
 
     mono_ns: IntArray
@@ -36,7 +37,7 @@ class Table:
         return len(self.mono_ns)
 
     def ints(self, name: str) -> IntArray:
-        """Return a column of integers: `MISSING` for null, more than 64 bits, and a missing column."""
+        """Return a column of integers: `MISSING` for null, for more than 64 bits, and for a missing column."""
         column = self.columns.get(name)
         if column is None or column.dtype != np.int64:
             return _ints_of(column, len(self))
@@ -66,7 +67,7 @@ class Table:
         if column is None:
             return [""] * len(self)
         values = column.tolist()
-        if set(map(type, values)) <= {str}:  # nearly always, and ten times as fast
+        if set(map(type, values)) <= {str}:  # nearly always true, and ten times as fast
             return list(values)
         return [value if isinstance(value, str) else "" for value in values]
 
@@ -76,14 +77,16 @@ class Table:
         if column is None:
             return [None] * len(self)
         values = column.tolist()
-        if set(map(type, values)) <= {str, list, type(None)}:  # no null other than None
+        if set(map(type, values)) <= {str, list, type(None)}:  # such a column has no null other than None
             return list(values)
         return [None if _is_null(value) else value for value in values]
 
-    def where(self, chosen: BoolArray | IntArray) -> Table:
-        """Return the rows for which `chosen` is true, or those with the indexes `chosen` in that order."""
+    def where(self, selection: BoolArray | IntArray) -> Table:
+        """Return the rows for which `selection` is true, or those whose indexes are in `selection`, in its order."""
         return Table(
-            self.mono_ns[chosen], self.wall_ns[chosen], _Columns(self.columns, lambda name: self.columns[name][chosen])
+            self.mono_ns[selection],
+            self.wall_ns[selection],
+            _Columns(self.columns, lambda name: self.columns[name][selection]),
         )
 
 
@@ -107,14 +110,14 @@ EMPTY = Table(np.zeros(0, np.int64), np.zeros(0, np.int64))
 
 
 def table_of(rows: Sequence[Mapping[str, Any]], mono_ns: Sequence[int], wall_ns: Sequence[int]) -> Table:
-    """Return a table of `rows`; a field that a row lacks is null there."""
+    """Return a table of `rows`; a field that is missing in a row is null there."""
     names = dict.fromkeys(name for fields in {tuple(row): None for row in rows} for name in fields)
     columns = _Columns(names, lambda name: _column([row.get(name) for row in rows]))
     return Table(np.array(mono_ns, np.int64), np.array(wall_ns, np.int64), columns)
 
 
 class _Columns(Mapping[str, NDArray[Any]]):
-    """Columns that are each built on first access: of most channels only a few are ever read."""
+    """Columns, each of which is built on first access, because of most channels only a few are ever read."""
 
     def __init__(self, names: Iterable[str], build: Callable[[str], NDArray[Any]]) -> None:
         self._columns: dict[str, NDArray[Any] | None] = dict.fromkeys(names)

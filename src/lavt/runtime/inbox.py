@@ -1,4 +1,4 @@
-"""The inbox of a node: bounded queues, and the newest message only for pictures and states; losses are counted."""
+"""The inbox of a node, which has a bounded queue or only the newest message of each channel, and counts losses."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Inbox:
     def take_arrived(self, until_ns: int) -> Message | None:
         """Remove and return a queued message of an inline channel that arrived by `until_ns` (monotonic), or None.
 
-        A wake does not wait for channels of which only the newest message counts.
+        These messages are processed before a wake. Messages of "newest" channels are not.
         """
         for channel, queue in self._queues.items():
             if CHANNELS[channel].inline and queue and queue[0][1].arrived.mono_ns <= until_ns:

@@ -1,4 +1,4 @@
-"""Output that never blocks: a program that drives goes on, and ends, while nobody reads what it prints."""
+"""Output that never blocks: even if nobody reads what a program prints, the program continues and can end."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from queue import Empty, SimpleQueue
 from typing import Final, Literal
 
 CAPACITY: Final = 1000
-"""Texts that may wait: the JSON lines of three minutes of a drive."""
+"""Number of texts that may wait: the JSON lines of three minutes of a drive."""
 FINISH_TIMEOUT_S: Final = 1.0
-"""How long a program that ends waits for the reader of each stream."""
+"""How long a program waits at its end for the reader of each stream."""
 
 StreamName = Literal["stdout", "stderr"]
 
@@ -22,9 +22,9 @@ StreamName = Literal["stdout", "stderr"]
 class QueuedOutput(io.TextIOBase):
     """A text stream whose texts a thread writes to a file descriptor.
 
-    A write to a pipe or terminal that nobody reads blocks; signal handlers run, and then the write blocks again. Here
-    only the thread blocks. If the queue is full, the oldest text is dropped and counted, as are texts that cannot be
-    written. Any thread and signal handler may write.
+    An ordinary write to a pipe or terminal that nobody reads blocks; a signal handler interrupts it only for a moment.
+    Here only the thread blocks. If the queue is full, the oldest text is dropped and counted, as are texts that cannot
+    be written. Any thread and signal handler may write.
     """
 
     encoding = "utf-8"
@@ -65,7 +65,7 @@ class QueuedOutput(io.TextIOBase):
             try:
                 while data:
                     data = data[os.write(self._descriptor, data) :]
-            except OSError:  # its reader has ended, or its terminal is closed
+            except OSError:  # the reader has ended, or the terminal is closed
                 self.dropped += 1
 
 
@@ -80,13 +80,15 @@ def queue_output(*names: StreamName) -> None:
         stream = getattr(sys, name)
         if not isinstance(stream, QueuedOutput):
             stream.flush()
-            setattr(sys, name, QueuedOutput(os.dup(stream.fileno())))  # the stream closes its own
+            setattr(
+                sys, name, QueuedOutput(os.dup(stream.fileno()))
+            )  # a copy, because the replaced stream closes its own
 
 
 def finish_output() -> None:
-    """Write what the queued standard streams still have, within `FINISH_TIMEOUT_S` each; print what was dropped."""
+    """Write the queued texts, within `FINISH_TIMEOUT_S` for each stream, and the number of dropped ones."""
     streams = [stream for stream in (sys.stdout, sys.stderr) if isinstance(stream, QueuedOutput)]
     for stream in streams:
-        if stream is sys.stderr and (dropped := sum(each.dropped for each in streams)):
+        if stream is sys.stderr and (dropped := sum(queued.dropped for queued in streams)):
             stream.write(f"lavt: {dropped} texts were not printed, because they were not read in time\n")
         stream.finish()

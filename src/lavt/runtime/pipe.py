@@ -14,9 +14,10 @@ from queue import SimpleQueue
 from typing import Any, Final
 
 CAPACITY: Final = 8192
-"""Entries that are queued while the other process does not read: some ten seconds of a drive."""
+"""Number of entries that are queued while the other process does not read: those of some ten seconds of a drive."""
 
-CLOSE_S: Final = 1.0
+CLOSE_TIMEOUT_S: Final = 1.0
+"""How long closing waits for each thread to end."""
 
 log = logging.getLogger(__name__)
 
@@ -24,9 +25,10 @@ log = logging.getLogger(__name__)
 class Pipe:
     """A pipe end that sends any picklable entries in order, and calls `receive` for each entry in its own thread.
 
-    `send` never waits for the other process: entries that do not fit are dropped and counted. `on_closed` is called
-    once: when the other end is closed, its process has ended, or an entry could not be sent or received. An error in
-    one direction closes both. The processes belong to one program and trust each other.
+    `send` never waits for the other process: entries that do not fit into the queue are dropped and counted.
+    `on_closed` is called once, when the other end is closed, the other process has ended, or an entry could not be sent
+    or received. An error in one direction closes both directions. The processes belong to one program and trust each
+    other.
     """
 
     def __init__(self, connection: Connection, receive: Callable[[Any], None], on_closed: Callable[[], None]) -> None:
@@ -57,7 +59,7 @@ class Pipe:
         self._join(self._writer, wait_s)
         self._shut()
         for thread in (self._writer, self._reader):
-            self._join(thread, CLOSE_S)
+            self._join(thread, CLOSE_TIMEOUT_S)
         self._connection.close()
 
     def wait_closed(self, wait_s: float) -> None:
@@ -83,7 +85,7 @@ class Pipe:
                 entries.append(self._entries.get())
             is_last = None in entries
             try:
-                self._connection.send_bytes(pickle.dumps([each for each in entries if each is not None]))
+                self._connection.send_bytes(pickle.dumps([entry for entry in entries if entry is not None]))
             except (OSError, ValueError):  # the other process has ended, or this end was closed
                 return
             except Exception as error:  # an entry cannot be pickled

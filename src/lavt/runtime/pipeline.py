@@ -1,4 +1,4 @@
-"""Runs a message through the stages of a pipeline, each with its own `now`, and records the time of each."""
+"""Running of a message through the stages of a pipeline; the end time of each stage is kept."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from lavt.node import Message, Send, Stage
 class Timeline(Struct, frozen=True):
     """The end times of the stages of a pipeline, on the host's monotonic clock.
 
-    The first entry is "wait", which ends when the first stage begins; `arrived_mono_ns` is the message's arrival.
+    The first entry is "wait", the time in the inbox, which ends when the first stage begins. `arrived_mono_ns` is the
+    arrival of the message.
     """
 
     node: str
@@ -24,13 +25,13 @@ class Timeline(Struct, frozen=True):
 
 
 class PipelineResult(Struct, frozen=True):
-    """The result of a pipeline run: the sends, the end time, and the timeline if a value had a stamp."""
+    """The result of a pipeline run: the sends, the end time, and the timeline if the result of a stage had a stamp."""
 
     sends: list[Send]
     end: Now
     timeline: Timeline | None
-    called: int
-    """Number of stages that were called."""
+    stages_run: int
+    """Number of stages that were called; less than all if one returned None."""
 
 
 def run_stages(node: str, stages: Sequence[Stage], message: Message, start: Now, ends: Iterator[Now]) -> PipelineResult:
@@ -38,15 +39,15 @@ def run_stages(node: str, stages: Sequence[Stage], message: Message, start: Now,
     value: object = message
     now = start
     stamp_ns: int | None = None
-    done = [("wait", start.mono_ns)]
+    stage_ends = [("wait", start.mono_ns)]
     for name, stage in stages:
         value = stage(value, now)
         now = next(ends)
-        done.append((name, now.mono_ns))
+        stage_ends.append((name, now.mono_ns))
         stamp_ns = getattr(value, "stamp_ns", stamp_ns)
         if value is None:
             break
     timeline = None
     if stamp_ns:
-        timeline = Timeline(node, message.channel, stamp_ns, message.arrived.mono_ns, tuple(done))
-    return PipelineResult(value if isinstance(value, list) else [], now, timeline, len(done) - 1)
+        timeline = Timeline(node, message.channel, stamp_ns, message.arrived.mono_ns, tuple(stage_ends))
+    return PipelineResult(value if isinstance(value, list) else [], now, timeline, len(stage_ends) - 1)

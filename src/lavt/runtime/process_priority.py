@@ -1,4 +1,4 @@
-"""Process priority of LAVT's processes, raised if the system allows it (as root)."""
+"""The priority of LAVT's processes, which is raised if the system allows that (to root)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from contextlib import suppress
 from typing import Final
 
 NICENESS: Final = -10
-"""Default priority: before ordinary programs, without starving the system (0 is normal, -20 the highest)."""
+"""Default priority: above ordinary programs, without starving the system (0 is normal, -20 is the highest)."""
 VEHICLE_NICENESS: Final = -15
 """Priority of the actuator's process, above that of the server, and of a software car."""
 

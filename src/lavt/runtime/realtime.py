@@ -1,4 +1,4 @@
-"""The real-time runtime: sockets, Zenoh, one thread and inbox for each node, the machine's clocks."""
+"""The real-time runtime: links over the network, a thread and an inbox for each node, and the machine's clocks."""
 
 from __future__ import annotations
 
@@ -46,8 +46,9 @@ class Receiver(Protocol):
 class RealRuntime:
     """A runtime that runs the nodes of one side on the machine's clocks.
 
-    `links` has the link of each network carrier. `recorder` gets messages undecoded and must not block. A node that
-    fails ends the run; `failed` is the error. `remote_receivers` are the receivers of nodes in other processes.
+    `links` has the link of each carrier to the network. `recorder` gets messages undecoded and must not block. A node
+    that fails ends the run; `failed` is then its error. `remote_receivers` get the messages for nodes in other
+    processes.
     """
 
     def __init__(
@@ -71,7 +72,7 @@ class RealRuntime:
         """Start to wake nodes and to deliver messages."""
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         gc.collect()
-        gc.freeze()  # a full collection over the objects that exist by now would stall the nodes
+        gc.freeze()  # later collections ignore the objects that exist by now, and so stall the nodes less
         self.links.update(links)
         for worker in self._workers.values():
             worker.thread.start()
@@ -101,7 +102,7 @@ class RealRuntime:
             self._receivers[receiver].put(message)
 
     def record(self, topic: str, payload: Any, now: Now) -> None:
-        """Record an entry of another process."""
+        """Record an entry that another process reports."""
         self._recorder.write(topic, payload, now)
 
     def carry(self, carrier: Carrier, sends: Sequence[Send]) -> None:
@@ -109,14 +110,14 @@ class RealRuntime:
         self.links[carrier].send(*sends)
 
     def fail(self, error: BaseException) -> None:
-        """End the run because of an error; the first error counts."""
-        self.failed = self.failed or error  # later errors follow from the first
+        """End the run because of an error; only the first error is kept."""
+        self.failed = self.failed or error  # later errors are consequences of the first
         self.stopped.set()
         log.critical("%s: %s", type(error).__name__, error, exc_info=error)
 
     def run_pipeline(self, node: Node, message: Message) -> None:
         """Run a message through its pipeline and send the result."""
-        readings = iter(self._clock.now, None)
+        readings = iter(self._clock.now, None)  # each `next` reads the clocks
         outcome = run_stages(node.name, node.pipelines[message.channel], message, next(readings), readings)
         for carrier, sends in groupby(outcome.sends, lambda send: CHANNELS[send.channel].carrier):
             self._send(carrier, tuple(sends))
@@ -141,7 +142,7 @@ class RealRuntime:
             self._recorder.write(send.channel, send.payload, now)
 
     def _report_clock(self) -> None:
-        """Query the clock source in this thread, because a query of chrony takes a process and some milliseconds."""
+        """Query the clock source; this has its own thread, because a query of chrony takes some milliseconds."""
         report = self._clock_source()
         if report is not None:
             self.deliver("clock_report", report, self._clock.now())
@@ -150,8 +151,8 @@ class RealRuntime:
 class _Worker:
     """The thread of a node, which runs its wakes and waiting messages and sleeps in between.
 
-    Messages of inline channels run in the thread that delivers them, unless the node is busy, so that no thread has to
-    wake up. `_lock` is held by the thread that runs the node.
+    Unless the node is busy, messages of inline channels run in the thread that delivers them, so that no other thread
+    has to wake up. The thread that runs the node holds `_lock`.
     """
 
     def __init__(self, runtime: RealRuntime, node: Node) -> None:
@@ -202,11 +203,14 @@ class _Worker:
         try:
             self._runtime.run_pipeline(self.node, message)
             self._wake_ns = self.node.next_wake_ns()
-        except BaseException as error:  # any error of a node must end the run, not a part of it
+        except BaseException as error:  # whatever the error of a node is, it must end the whole run
             self._runtime.fail(error)
 
     def _next_message(self) -> Message | None:
-        """Return a due wake, or before it an inline message that arrived by then; else the next waiting message."""
+        """Return the next message to run; None: there is none.
+
+        A due wake comes first, except for inline messages that arrived before the time of the wake.
+        """
         self._wake_ns = wake_ns = self.node.next_wake_ns()
         if wake_ns is not None:
             now = self._runtime.now()

@@ -1,4 +1,4 @@
-"""Recording of messages: the recorded form of each, several recorders as one, and a queue in front of a disk."""
+"""Recording of messages: their recorded form, several recorders as one, and a recorder with a queue before the disk."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 
 POLL_PERIOD_S = 0.02
 CLOSE_TIMEOUT_S = 10.0
-"""How long the end of a record may take; a full queue takes a second on an ordinary disk."""
+"""How long completing a record may take; writing a full queue takes a second on an ordinary disk."""
 
 
 class Recorder(Protocol):
@@ -50,49 +50,51 @@ class Recorders:
             write(topic, payload, now)
 
 
-def _decoded(kind: type[Any]) -> Callable[[bytes], object]:
-    def read(data: bytes) -> object:
+def _decoder(kind: type[Any]) -> Callable[[bytes], object]:
+    """Return a function that decodes a message; it returns the beginning and size of unreadable bytes."""
+
+    def decode_or_describe(data: bytes) -> object:
         try:
             return decode(kind, data)
         except BadMessage:
             return {"unreadable": data[:64].hex(), "size_bytes": len(data)}
 
-    return read
+    return decode_or_describe
 
 
 def _without_token(data: bytes) -> object:
     """Return a session reply without its token, which is a secret: it validates the video path."""
-    reply = _decoded(SessionReply)(data)
+    reply = _decoder(SessionReply)(data)
     return replace(reply, token=b"") if isinstance(reply, SessionReply) else reply
 
 
 class Packet(Struct, frozen=True):
-    """A datagram of the video; sequence and timestamp only if it is RTP (RFC 3550, section 5.1)."""
+    """A datagram of the video; `sequence` and `timestamp` are None unless it is RTP (RFC 3550, section 5.1)."""
 
     sequence: int | None
     timestamp: int | None
     size_bytes: int
 
 
-def _packet(data: bytes) -> Packet:
+def _describe_packet(data: bytes) -> Packet:
     if len(data) < 12 or data[0] >> 6 != 2:
         return Packet(None, None, len(data))
     return Packet(int.from_bytes(data[2:4], "big"), int.from_bytes(data[4:8], "big"), len(data))
 
 
-def _size(data: bytes) -> object:
+def _describe_size(data: bytes) -> object:
     return {"size_bytes": len(data)}
 
 
 WIRE_DECODERS: dict[str, Callable[[bytes], object]] = {
-    "rtp": _packet,
-    "feedback": _size,
-    "control": _decoded(Command),
-    "state": _decoded(State),
-    "session": _decoded(SessionRequest),
+    "rtp": _describe_packet,
+    "feedback": _describe_size,
+    "control": _decoder(Command),
+    "state": _decoder(State),
+    "session": _decoder(SessionRequest),
     "session_reply": _without_token,
-    "netem": _decoded(NetemRequest),
-    "netem_reply": _decoded(NetemReply),
+    "netem": _decoder(NetemRequest),
+    "netem_reply": _decoder(NetemReply),
 }
 """The function that decodes the bytes of each network channel for the record."""
 
@@ -115,7 +117,8 @@ UNRECORDED = frozenset(
         "injected",
     }
 )
-"""Channels whose content is recorded in another form (truth, video units, clock and queue samples), or secret."""
+"""Channels that are not recorded: their content is secret, or recorded in another form (truth, access units, samples of
+clocks and network queues)."""
 
 
 def record(recorder: Recorder, channel: str, payload: Any, now: Now) -> None:
@@ -125,16 +128,16 @@ def record(recorder: Recorder, channel: str, payload: Any, now: Now) -> None:
 
 
 def decode_for_record(channel: str, payload: Any) -> Any:
-    """Return the recorded form of a message: the bytes of a network channel are decoded to fields."""
+    """Return the recorded form of a message: the bytes of a network channel are decoded."""
     decoder = WIRE_DECODERS.get(channel)
     return payload if decoder is None else decoder(payload)
 
 
 class QueuedRecorder:
-    """A recorder with a bounded queue and its own thread, so that nothing else waits for a disk.
+    """A recorder with a bounded queue and its own thread, so that no other thread waits for a disk.
 
-    The thread also decodes network bytes, which relieves the receiving threads. It polls the queue: waking it a
-    thousand times a second would cost more than the writing.
+    The thread also decodes network bytes, so that the receiving threads need not. It polls the queue, because waking it
+    a thousand times a second would cost more than the writing.
 
     Entries that do not fit or cannot be written are counted in `overflow`; a run with an overflow is invalid.
     """
@@ -160,7 +163,7 @@ class QueuedRecorder:
             self.overflow += 1
 
     def close(self, now: Now) -> None:
-        """Write the queued entries and the number of lost ones, and complete the record, unless that takes too long."""
+        """Write the queued entries and the number of lost ones, and complete the record, within `close_timeout_s`."""
         self._closed_at = now
         self._closed.set()
         self._thread.join(self._close_timeout_s)

@@ -1,7 +1,7 @@
 """A node in its own process: both ends of the connection to the runtime with the other nodes of its side.
 
-The node's process runs its pipelines and reports the results. The other process has the links, the record and the other
-nodes. Both use the same clocks, since they run on one machine.
+The node's process runs the node's pipelines and reports the results. The other process has the links, the record and
+the other nodes. Both processes use the same clocks, because they run on one machine.
 """
 
 from __future__ import annotations
@@ -22,31 +22,32 @@ from lavt.runtime.pipe import Pipe
 from lavt.runtime.realtime import MessageLink, RealRuntime
 
 LATE_NS: Final = 60 * NS_PER_MS
-"""A command that took longer between the processes is dropped, because one of them did not run meanwhile."""
+"""A message that took longer between the processes is late, because one of them did not run meanwhile. Late commands,
+states and replies are dropped."""
 MAX_PENDING_PEERS: Final = 64
-"""The last peers to which replies can be sent."""
-CLOSE_S: Final = 1.0
-CHECK_S: Final = 0.05
-"""Period at which the node's heartbeat is checked. Only checks are counted: a process that was frozen itself counts
-one."""
-START_CHECKS: Final = 600
-"""Checks that may pass until the first heartbeat: 30 s."""
-SILENT_CHECKS: Final = 2
-"""Checks without a heartbeat after which the node is silent: 0.1 s."""
-FAILED_CHECKS: Final = 10
-"""Checks without a heartbeat after which the node has failed: 0.5 s."""
+"""Replies can be sent to the peers of this many last messages."""
+CLOSE_TIMEOUT_S: Final = 1.0
+CHECK_PERIOD_S: Final = 0.05
+"""Period at which the node's heartbeat is checked. A silence is measured in checks, not in time: if the checking
+process itself was frozen, that counts as a single check."""
+FIRST_HEARTBEAT_CHECKS: Final = 600
+"""Number of checks that may pass until the first heartbeat: 30 s."""
+SILENT_AFTER_CHECKS: Final = 2
+"""Number of checks without a heartbeat after which the node is silent: 0.1 s."""
+FAILED_AFTER_CHECKS: Final = 10
+"""Number of checks without a heartbeat after which the node has failed: 0.5 s."""
 END: Final = ("end",)
 
 Report = tuple[Any, ...]
-"""An entry from the node's process: ("deliver", channel, payload, arrived), ("send", carrier, sends, when), ("record",
-topic, payload, when), ("status", the result of `get_status`), ("failed", reason)."""
+"""An entry from the node's process: ("deliver", channel, payload, arrived), ("send", carrier, sends, time), ("record",
+topic, payload, time), ("status", the result of `get_status`), ("failed", reason)."""
 
 
 class RemoteNodeProxy:
     """The proxy of a node in another process: it forwards messages to that process and executes its reports.
 
-    `heartbeat` is a topic that the node records all the time. `on_silent` is called when it has not done so for 0.1 s;
-    after 0.5 s the node has failed, which ends the run.
+    `heartbeat` is a topic that the node records all the time. `on_silent` is called when nothing was recorded on it for
+    0.1 s. After 0.5 s the node counts as failed, which ends the run.
     """
 
     def __init__(
@@ -54,7 +55,7 @@ class RemoteNodeProxy:
     ) -> None:
         self.name = name
         self._heartbeat, self._on_silent = heartbeat, on_silent
-        self._missed = -START_CHECKS
+        self._missed = -FIRST_HEARTBEAT_CHECKS
         """Checks without a heartbeat; negative before the first one."""
         self._closing = threading.Event()
         self._checker = threading.Thread(target=self._check_heartbeats, name=f"{name}'s heartbeat", daemon=True)
@@ -63,7 +64,7 @@ class RemoteNodeProxy:
         self._pipe = Pipe(connection, self._receive, self._on_closed)
         self._runtime: RealRuntime | None = None
         self._peers: dict[int, Peer] = {}
-        """The peers by number, set and taken by different threads."""
+        """The peers by the number that is sent instead of them; different threads add and remove them."""
         self._numbers = itertools.count(1)
 
     def start(self, runtime: RealRuntime) -> None:
@@ -86,10 +87,10 @@ class RemoteNodeProxy:
         self._closing.set()
         self._pipe.send(END)
         self._pipe.wait_closed(wait_s)
-        self._pipe.close(CLOSE_S)
+        self._pipe.close(CLOSE_TIMEOUT_S)
         if self._runtime is not None:
-            lost = {"node": f"to the {self.name}'s process", "messages_dropped": self._pipe.dropped}
-            self._runtime.record("counts", lost, self._runtime.now())
+            counts = {"node": f"to the {self.name}'s process", "messages_dropped": self._pipe.dropped}
+            self._runtime.record("counts", counts, self._runtime.now())
 
     def _receive(self, report: Report) -> None:
         runtime = self._runtime
@@ -101,8 +102,8 @@ class RemoteNodeProxy:
                 self._missed = 0
             runtime.record(*rest)
         elif kind == "send":
-            carrier, sends, when = rest
-            if runtime.now().mono_ns - when.mono_ns > LATE_NS:  # this process did not run: an old state is useless
+            carrier, sends, sent = rest
+            if runtime.now().mono_ns - sent.mono_ns > LATE_NS:  # this process did not run; an old state is useless
                 return
             runtime.carry(carrier, [self._with_peer(send) for send in sends])
         elif kind == "deliver":
@@ -113,7 +114,7 @@ class RemoteNodeProxy:
             runtime.fail(WorkError(rest[0]))
 
     def _check_heartbeats(self) -> None:
-        while not self._closing.wait(CHECK_S):
+        while not self._closing.wait(CHECK_PERIOD_S):
             self.check_heartbeat()
 
     def check_heartbeat(self) -> None:
@@ -122,9 +123,9 @@ class RemoteNodeProxy:
         if runtime is None:
             return
         self._missed = missed = self._missed + 1  # a heartbeat may reset it at any time
-        if missed == SILENT_CHECKS:
+        if missed == SILENT_AFTER_CHECKS:
             self._on_silent(runtime)
-        if missed in {0, FAILED_CHECKS}:
+        if missed in {0, FAILED_AFTER_CHECKS}:
             runtime.fail(WorkError(f"the process of the {self.name} does not respond"))
 
     def _with_peer(self, send: Send) -> Send:
@@ -136,7 +137,7 @@ class RemoteNodeProxy:
 
 
 class _OtherProcess:
-    """Recorder, link and other nodes for the node's runtime; all of them are at the other end of the pipe."""
+    """Recorder, link and other nodes for the node's runtime; it passes everything to the other end of the pipe."""
 
     def __init__(self, pipe: Pipe, clock: Clock, report_status: Callable[[], None]) -> None:
         self._pipe, self._clock, self._report_status = pipe, clock, report_status
@@ -158,8 +159,8 @@ class _OtherProcess:
 class NodeHost:
     """The runtime of a single node in its own process.
 
-    A changed `get_status` is reported before the node sends. `on_disconnect` is called when the other process has ended
-    or ends this one.
+    The result of `get_status` is reported before the node sends, if it has changed. `on_disconnect` is called when the
+    other process has ended or requests the end of this one.
     """
 
     def __init__(
@@ -188,7 +189,7 @@ class NodeHost:
         self._pipe.start()
 
     def deliver(self, channel: str, payload: Any) -> None:
-        """Deliver a message of this process to the node."""
+        """Deliver a message that originates in this process to the node."""
         self.runtime.put(Message(channel, payload, self._clock.now()))
 
     def _report_status(self) -> None:
@@ -203,19 +204,19 @@ class NodeHost:
         self.runtime.stop()
         if self.runtime.failed is not None:
             self._pipe.send(("failed", f"{self._node.name}: {self.runtime.failed}"))
-        lost = {"node": f"{self._node.name}'s process", "record_overflow": self._pipe.dropped, **self._late}
-        self._pipe.send(("record", "counts", lost, self._clock.now()))
-        self._pipe.close(CLOSE_S)
+        counts = {"node": f"{self._node.name}'s process", "record_overflow": self._pipe.dropped, **self._late}
+        self._pipe.send(("record", "counts", counts, self._clock.now()))
+        self._pipe.close(CLOSE_TIMEOUT_S)
 
     def _receive(self, entry: tuple[Any, ...]) -> None:
         if entry == END:
             self._on_disconnect()
             return
-        channel, payload, arrived, peer = entry
+        channel, payload, arrived, peer_number = entry
         now = self._clock.now()
         if now.mono_ns - arrived.mono_ns > LATE_NS:
             self._late[f"{channel}_late"] += 1
             if channel == "control":
                 return
             arrived = now
-        self.runtime.put(Message(channel, payload, arrived, peer or None))
+        self.runtime.put(Message(channel, payload, arrived, peer_number or None))

@@ -1,4 +1,4 @@
-"""Failures of threads: a thread that ends with an error fails its process, instead of leaving it deaf or blind."""
+"""Failures of threads: a thread that ends with an error fails its process, which would otherwise run on without it."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from contextlib import contextmanager
 def fail_on_thread_errors(fail: Callable[[BaseException], None]) -> Iterator[None]:
     """Call `fail` with each error that ends a thread of this process while the context is entered.
 
-    It applies to all threads, also to those of libraries and to those that were started before.
+    This applies to all threads, including those of libraries and those that were started before.
     """
-    former = threading.excepthook
+    previous_hook = threading.excepthook
 
     def handle(arguments: threading.ExceptHookArgs) -> None:
         fail(arguments.exc_value or arguments.exc_type())
@@ -22,4 +22,4 @@ def fail_on_thread_errors(fail: Callable[[BaseException], None]) -> Iterator[Non
     try:
         yield
     finally:
-        threading.excepthook = former
+        threading.excepthook = previous_hook

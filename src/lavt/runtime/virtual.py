@@ -1,7 +1,7 @@
-"""The virtual-time runtime: one event heap, simulated links, hosts with their own clocks, no waiting.
+"""The virtual-time runtime: one event heap, simulated links, and hosts with their own clocks.
 
-Pixels, codec and packets are real; only waiting is skipped. The same seed and configuration give a byte-for-byte
-reproducible result.
+Pixels, codec and packets are as in real time; only waiting is skipped. The same seed and configuration give a
+byte-for-byte reproducible result.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ NS_PER_PPB = 1_000_000_000
 class HostClock:
     """The two clocks of a virtual host, as exact functions of the true time.
 
-    `offset_ns` is the offset of the wall clock at true time 0, `drift_ppb` the drift of both clocks (parts in 10^9,
-    positive: too fast), and `steps` are steps of the wall clock: (true time, change), in order.
+    `offset_ns` is the offset of the wall clock at true time 0, and `drift_ppb` the drift of both clocks in parts per
+    10^9 (positive: too fast). `steps` are the steps of the wall clock as (true time, change), in order of time.
     """
 
     mono_start_ns: int
@@ -41,31 +41,32 @@ class HostClock:
     def at(self, true_ns: int) -> Now:
         """Return the reading of both clocks at a true time."""
         drift_ppb = self.drift_ppb
-        gone_ns = true_ns + true_ns * drift_ppb // NS_PER_PPB if drift_ppb else true_ns
-        wall_ns = self.wall_start_ns + self.offset_ns + gone_ns
+        elapsed_ns = true_ns + true_ns * drift_ppb // NS_PER_PPB if drift_ppb else true_ns
+        wall_ns = self.wall_start_ns + self.offset_ns + elapsed_ns
         if self.steps:
             wall_ns += sum(change_ns for at_ns, change_ns in self.steps if at_ns <= true_ns)
-        return Now(self.mono_start_ns + gone_ns, wall_ns)
+        return Now(self.mono_start_ns + elapsed_ns, wall_ns)
 
     def true_ns(self, mono_ns: int) -> int:
         """Return the first true time at which the monotonic clock shows at least `mono_ns`."""
-        gone_ns = mono_ns - self.mono_start_ns
+        elapsed_ns = mono_ns - self.mono_start_ns
         if not self.drift_ppb:
-            return gone_ns
-        guess_ns = gone_ns * NS_PER_PPB // (NS_PER_PPB + self.drift_ppb)
-        while guess_ns + guess_ns * self.drift_ppb // NS_PER_PPB < gone_ns:
-            guess_ns += 1
-        return guess_ns
+            return elapsed_ns
+        candidate_ns = elapsed_ns * NS_PER_PPB // (NS_PER_PPB + self.drift_ppb)
+        while candidate_ns + candidate_ns * self.drift_ppb // NS_PER_PPB < elapsed_ns:
+            candidate_ns += 1
+        return candidate_ns
 
 
 @dataclass
 class VirtualLink:
-    """A simulated link of one channel: a delay line with the numbering of its packets."""
+    """A simulated link of one channel: a delay line, and a function that selects the delay of each packet."""
 
     line: DelayLine
     index: Callable[[bytes, int], int]
     """Maps (payload, packet number) to the index of the packet's delay; packets of one frame share an index."""
     count: int = 0
+    """Number of packets that were sent."""
     open: bool = True
     """A closed link loses all packets."""
 
@@ -79,10 +80,11 @@ class VirtualHost:
     nodes: Sequence[Node]
     recorder: Recorder
     costs_ns: Mapping[tuple[str, str], int]
-    """Processing time by (node, stage), and by (node, "wait_CHANNEL") for waking the node; 0 if not listed."""
+    """Processing time by (node, stage). The time from a message on CHANNEL to the first stage has the key
+    (node, "wait_CHANNEL"). Times that are not listed are 0."""
     clock_source: Callable[[int], ClockReport]
     peer: Peer = None
-    """This host as the peer of its messages on the other side."""
+    """The peer that the other side sees as the sender of this host's messages."""
     left_out: frozenset[str] = frozenset()
     """Channels that are not recorded."""
     runners: dict[str, _NodeRunner] = field(default_factory=dict)
@@ -96,18 +98,18 @@ class VirtualHost:
             if self.runners.keys() >= set(row.receivers)
         }
         """The receiving nodes of this host by channel."""
-        self._read_ns = -1
-        self._read = Now(0, 0)
+        self._cached_ns = -1
+        self._cached_now = Now(0, 0)
 
     def now(self, true_ns: int) -> Now:
         """Return a reading of both clocks; the last reading is cached, because many events share a time."""
-        if true_ns != self._read_ns:
-            self._read_ns, self._read = true_ns, self.clock.at(true_ns)
-        return self._read
+        if true_ns != self._cached_ns:
+            self._cached_ns, self._cached_now = true_ns, self.clock.at(true_ns)
+        return self._cached_now
 
 
 class _NodeRunner:
-    """A node in virtual time: its inbox, the end of its present run, and its scheduled steps."""
+    """A node in virtual time, with its inbox and its scheduled steps; in each step it runs one pipeline or none."""
 
     def __init__(self, host: VirtualHost, node: Node) -> None:
         self.host = host
@@ -123,12 +125,13 @@ class _NodeRunner:
         """Each pipeline with the times from its start to the start of the first stage and to the end of each stage."""
         self.next_wake_ns = node.next_wake_ns
         self.free_ns = 0
+        """When the last pipeline run ends."""
         self.next_step_ns: int | None = None
         self.scheduled_ns: set[int] = set()
-        """Times of the next step and of all steps in the event heap, so that no time is scheduled twice."""
+        """Times of all steps in the event heap, so that no time is scheduled twice."""
         self.wake_mono_ns: int | None = None
         self.wake_ns: int | None = None
-        """`next_wake_ns` of the node, on its host's monotonic clock and in true time."""
+        """The node's next wake, on its host's monotonic clock (above) and in true time."""
         self.set_wake(node.next_wake_ns())
 
     def set_wake(self, wake_mono_ns: int | None) -> None:
@@ -162,17 +165,17 @@ class VirtualRuntime:
         heapq.heappush(self._heap, (true_ns, self._number, action, arguments))
 
     def run(self, limit_ns: int, finished: Callable[[], bool]) -> bool:
-        """Run until `finished()` or to the limit; return whether it finished."""
-        heap, take = self._heap, heapq.heappop
+        """Run until `finished()` is true or the true time is `limit_ns`; return whether `finished()` is true."""
+        heap, pop = self._heap, heapq.heappop
         while heap and heap[0][0] <= limit_ns:
-            self.true_ns, _, action, arguments = take(heap)
+            self.true_ns, _, action, arguments = pop(heap)
             action(*arguments)
             if finished():
                 return True
         return False
 
     def close(self) -> None:
-        """Record the counts of nodes, inboxes, and links that do more than delay."""
+        """Record the counts of nodes and inboxes, and those of links that do more than delay."""
         for host in self.hosts.values():
             now = host.clock.at(self.true_ns)
             for name, runner in host.runners.items():
@@ -184,7 +187,7 @@ class VirtualRuntime:
                     host.recorder.write("counts", {"node": f"link {channel}", **counts}, now)
 
     def deliver(self, side: str, channel: str, payload: Any, peer: Peer = None) -> None:
-        """Deliver a message to a side, now; record it if it came over the network."""
+        """Deliver a message to a side at the present true time; record it unless its channel is local."""
         host = self.hosts[side]
         arrived = host.now(self.true_ns)
         if CHANNELS[channel].carrier != "local" and channel not in host.unrecorded:
@@ -228,16 +231,16 @@ class VirtualRuntime:
         if ends_ns[-1]:
             times = map(host.clock.at, map(true_ns.__add__, ends_ns))
         outcome = run_stages(runner.node.name, stages, message, next(times), times)
-        took_ns = ends_ns[outcome.called]
-        runner.free_ns = free_ns = true_ns + took_ns
+        duration_ns = ends_ns[outcome.stages_run]
+        runner.free_ns = free_ns = true_ns + duration_ns
         if outcome.timeline is not None:
             host.recorder.write("timeline", outcome.timeline, outcome.end)
         if outcome.sends:
-            if took_ns:
+            if duration_ns:
                 self.at(free_ns, self._send_all, host, outcome.sends, outcome.end)
             else:
                 self._send_all(host, outcome.sends, outcome.end)
-        # Only a run of its pipelines changes a node's next wake.
+        # A node changes its next wake only while it runs a pipeline.
         wake_mono_ns = runner.next_wake_ns()
         if wake_mono_ns != runner.wake_mono_ns:
             runner.set_wake(wake_mono_ns)
@@ -250,7 +253,7 @@ class VirtualRuntime:
         write, unrecorded = host.recorder.write, host.unrecorded
         for send in sends:
             channel = send.channel
-            if channel not in unrecorded:  # as `record` does, without a call for each message
+            if channel not in unrecorded:  # does what `record` does, but without a call for each message
                 write(channel, WIRE_DECODERS[channel](send.payload) if channel in WIRE_DECODERS else send.payload, now)
             carrier = CHANNELS[channel].carrier
             if carrier == "record":
@@ -278,7 +281,7 @@ class VirtualRuntime:
 
 
 def modelled_clock_source(clock: HostClock, host: str, error_s: float, bound_s: float) -> Callable[[int], ClockReport]:
-    """Return a model of chrony on a virtual host, which reports the true offset plus `error_s`, and `bound_s`."""
+    """Return a model of chrony on a virtual host: its correction has the error `error_s` and the bound `bound_s`."""
 
     def report(true_ns: int) -> ClockReport:
         now = clock.at(true_ns)

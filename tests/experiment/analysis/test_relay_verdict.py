@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from lavt.assembly.links import injected
+from lavt.assembly.links import link_injection
 from lavt.cli.relay import flows
 from lavt.config import Condition, ImpairmentConfig, RunConfig
 from lavt.config_file import conditions, parse_config
@@ -24,8 +24,8 @@ def test_the_relay_receives_the_whole_condition(name: str) -> None:
     run = planned(name, inherent="paper_wifi5")
     video, control = flows(_relay_config(run, 5600, 7448))
     requested = run.requested
-    assert video.downstream_injected == injected("video", requested.video_ms, requested.video, run.seed)
-    assert control.upstream_injected == injected("control", requested.control_ms, requested.control, run.seed)
+    assert video.downstream_injected == link_injection("video", requested.video_ms, requested.video, run.seed)
+    assert control.upstream_injected == link_injection("control", requested.control_ms, requested.control, run.seed)
     assert video.upstream_injected is control.downstream_injected is None
     is_constant = video.downstream_injected is None
     assert video.downstream.constant_ms == pytest.approx(_inherent_ms() + (requested.video_ms if is_constant else 0))

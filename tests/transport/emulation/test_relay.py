@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from tests.support.clocks import ManualClock
 
-from lavt.assembly.links import injected
+from lavt.assembly.links import link_injection
 from lavt.cli.relay import flows
 from lavt.config import DelayConfig, ImpairmentConfig, LinkConfig, RelayConfig
 from lavt.domain import NS_PER_MS, NS_PER_S
@@ -293,7 +293,7 @@ def test_relay_follows_the_link_model(name: str) -> None:
     """The relay loses, delays and counts packets exactly as the model of the link."""
     impairments = LINKS[name]
     with closing(RelayNetwork(video=DelayConfig(link=impairments))) as net:
-        requested = injected(
+        requested = link_injection(
             "video", impairments.delay_ms, ImpairmentConfig(**impairments.model_dump(exclude={"delay_ms"})), 1
         )
         assert requested is not None

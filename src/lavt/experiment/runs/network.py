@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from lavt.assembly.links import injected
+from lavt.assembly.links import link_injection
 from lavt.config import Condition, Costs
 from lavt.transport.emulation.delay_line import DelayModel, Lognormal
 from lavt.transport.emulation.link import LinkInjection
@@ -68,8 +68,8 @@ def injected_network(profile: str, condition: Condition, costs: Costs, seed: int
         jitter = inherent.video_jitter
         control_ms = inherent.control_ms - costs.links_us["control"] / US_PER_MS - _stages_ms(costs, SENT_TO_RECEIVED)
     state_ms = condition.video_ms if state_delay == "with_video" else 0.0
-    video = injected("video", condition.video_ms, condition.video, seed)
-    control = injected("control", condition.control_ms, condition.control, seed)
+    video = link_injection("video", condition.video_ms, condition.video, seed)
+    control = link_injection("control", condition.control_ms, condition.control, seed)
     return NetworkDelays(
         DelayModel(max(0.0, video_ms) + (condition.video_ms if video is None else 0.0), jitter, seed, "video inherent"),
         DelayModel(max(0.0, control_ms) + (condition.control_ms if control is None else 0.0)),

@@ -10,7 +10,7 @@ from typing import Any
 
 from lavt.assembly.entropy import run_seed
 from lavt.assembly.injection import NO_CONDITION, netem_flows
-from lavt.assembly.links import injected
+from lavt.assembly.links import link_injection
 from lavt.assembly.nodes import check_names
 from lavt.config import Condition, RunConfig, SweepConfig
 from lavt.config_file import condition, parse_config
@@ -94,8 +94,8 @@ def _check_injection(config: RunConfig, requested: Condition) -> None:
             )
         check_flows(netem_flows(requested, "both", video_port=1, control_port=2, state_delay=network.state_delay))
     else:
-        injected("video", requested.video_ms, requested.video, seed=0)
-        injected("control", requested.control_ms, requested.control, seed=0)
+        link_injection("video", requested.video_ms, requested.video, seed=0)
+        link_injection("control", requested.control_ms, requested.control, seed=0)
 
 
 def plan_sweep(sweep: SweepConfig) -> list[PlannedRun]:
