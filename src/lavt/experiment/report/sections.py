@@ -132,7 +132,7 @@ def summary_parts(report: ReportContext) -> Parts:
     if failed:
         runs_failed = "1 run" if len(failed) == 1 else f"{len(failed)} runs"
         parts.append(html_page.paragraph(f"{runs_failed} failed and {'is' if len(failed) == 1 else 'are'} left out:"))
-        parts.append(html_page.bullets([f"{each['run']}: {each['reason']}" for each in failed]))
+        parts.append(html_page.bullets([f"{run['run']}: {run['reason']}" for run in failed]))
     return parts
 
 
