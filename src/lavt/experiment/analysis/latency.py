@@ -90,7 +90,8 @@ def control_latency_ns(command_verdicts: Table, offset: ClockOffset, began_ns: i
 class FramesWithCommands:
     """The frames that led to an accepted command.
 
-    `commands` has the first such command of each frame, in the order of the frames (rows of the channel `admission`).
+    `commands` has the first such command of each frame (rows of the channel `admission`), in the order of application.
+    The stamps are in the same order.
     """
 
     stamp_ns: IntArray
