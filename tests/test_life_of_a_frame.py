@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from lavt.control.drive_controller import PRESETS, make_controller
 from lavt.domain import NS_PER_MS, NS_PER_S, CameraModel, Command, Now, SessionReply, SessionRequest
-from lavt.experiment.analysis.latency import pair_loops
+from lavt.experiment.analysis.latency import frames_with_commands
 from lavt.node import Send
 from lavt.nodes.payloads import Admission, FrameWritten
 from lavt.perception.lane_detector import LaneDetector
@@ -289,5 +289,5 @@ def test_life_of_a_frame(tmp_path: Path) -> None:  # noqa: PLR0915 (one frame, f
         writer.write("frame", stamped, Now(START_NS, WALL_NS + START_NS))
         writer.write("admission", admission, Now(now_ns, WALL_NS + now_ns))
     record = read_record(tmp_path / "server.mcap")
-    loops = pair_loops(record.table("frame"), record.table("admission"), now_ns)
-    assert loops.loop_ns.tolist() == [picture_age_ns]
+    paired = frames_with_commands(record.table("frame"), record.table("admission"), now_ns)
+    assert paired.loop_ns.tolist() == [picture_age_ns]

@@ -21,7 +21,14 @@ from lavt.node import WAKE, Message, Send, Stage
 from lavt.nodes.payloads import StationaryStatus
 from lavt.runtime.pipe import CAPACITY, Pipe
 from lavt.runtime.realtime import RealRuntime
-from lavt.runtime.remote_node import FAILED_AFTER_CHECKS, FIRST_HEARTBEAT_CHECKS, LATE_NS, SILENT_AFTER_CHECKS, NodeHost, RemoteNodeProxy
+from lavt.runtime.remote_node import (
+    FAILED_AFTER_CHECKS,
+    FIRST_HEARTBEAT_CHECKS,
+    LATE_NS,
+    SILENT_AFTER_CHECKS,
+    NodeHost,
+    RemoteNodeProxy,
+)
 
 pytestmark = pytest.mark.usefixtures("own_switch_interval")
 

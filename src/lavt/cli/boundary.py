@@ -59,7 +59,7 @@ def boundary(
 def _table_lines(result: dict[str, Any]) -> list[str]:
     """Return the lines of a table with the median and interval of each criterion, for each route and preset."""
     from lavt.experiment.report.boundary_section import ALL_ROUTES, span  # noqa: PLC0415 (slow: matplotlib)
-    from lavt.experiment.report.table_format import number  # noqa: PLC0415 (a part of the slow report)
+    from lavt.experiment.report.table_format import format_number  # noqa: PLC0415 (a part of the slow report)
     from lavt.experiment.statistics.boundary_summary import CRITERIA  # noqa: PLC0415 (slow: scipy)
 
     table = [("route", "preset", "seeds", "theory", *CRITERIA)]
@@ -67,9 +67,15 @@ def _table_lines(result: dict[str, Any]) -> list[str]:
         cells = []
         for name in CRITERIA:
             summary = group[f"{name}_ms"]
-            cells.append(f"{number(summary['p50'], 0)} ({span(summary['interval'])})")
+            cells.append(f"{format_number(summary['p50'], 0)} ({span(summary['interval'])})")
         table.append(
-            (group["route"] or ALL_ROUTES, group["preset"], str(group["n"]), number(group["theory_ms"], 0), *cells)
+            (
+                group["route"] or ALL_ROUTES,
+                group["preset"],
+                str(group["n"]),
+                format_number(group["theory_ms"], 0),
+                *cells,
+            )
         )
     widths = [max(len(row[column]) for row in table) for column in range(len(table[0]))]
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in table]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lavt.experiment.analysis.clock_offset import NO_OFFSET
-from lavt.experiment.analysis.latency import control_latency_ns, picture_age, rtp_timestamp
+from lavt.experiment.analysis.latency import control_latency_ns, frame_age, rtp_timestamp
 from lavt.experiment.analysis.metrics import RunMeasurement, driving_interval, last_count, measure
 from lavt.experiment.analysis.steering import steering_reversals
 from lavt.experiment.analysis.tracking import (
@@ -144,23 +144,21 @@ def test_the_parts_of_the_loop_add_up(make_run: MakeRun, tmp_path: Path) -> None
     assert closure_ms < ONE_MICROSECOND_MS
 
 
-def test_the_closure_error_is_absolute(make_run: MakeRun, tmp_path: Path) -> None:
-    """With a client clock that loses 1 %, the closure error is 30 us of the client time of 3000 us, without a sign."""
+def test_the_closure_is_absolute(make_run: MakeRun, tmp_path: Path) -> None:
+    """With a client clock that loses 1 %, the closure is 30 us of the client time of 3000 us, without a sign."""
     closure_ms = measured(make_run, tmp_path, drift=0.01, spread_ms=0.0).closure_p95_ms
     assert closure_ms == pytest.approx(0.03, abs=0.002)
 
 
-def test_the_closure_error_is_the_95th_percentile(
-    make_run: MakeRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """For closure errors of 0, 1, .. 100 ms of either sign, the closure error is 95 ms."""
-    missing_ns = np.arange(101) * 1_000_000 * np.resize([1, -1], 101)
-    monkeypatch.setattr("lavt.experiment.analysis.metrics.closure_ns", lambda *_: missing_ns)
+def test_the_closure_is_the_95th_percentile(make_run: MakeRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """For latency-sum errors of 0, 1, .. 100 ms of either sign, the closure is 95 ms."""
+    errors_ns = np.arange(101) * 1_000_000 * np.resize([1, -1], 101)
+    monkeypatch.setattr("lavt.experiment.analysis.metrics.latency_sum_error_ns", lambda *_: errors_ns)
     assert measured(make_run, tmp_path, seconds=0.1).closure_p95_ms == pytest.approx(95.0)
 
 
 def test_without_pictures_tau_v_is_unknown(make_run: MakeRun, tmp_path: Path) -> None:
-    """Without pictures, tau_v, its bound and the closure error are unknown; tau_c and its bound are known."""
+    """Without pictures, tau_v, its bound and the closure are unknown; tau_c and its bound are known."""
     make_run(tmp_path, server_host="one", client_host="one")
     server = read_record(tmp_path / "server.mcap")
     run = measure(server, read_record(tmp_path / "client.mcap", channels=("clock",)))
@@ -171,7 +169,7 @@ def test_without_pictures_tau_v_is_unknown(make_run: MakeRun, tmp_path: Path) ->
 
 
 def test_a_clock_step_does_not_change_the_loop_latency(make_run: MakeRun, tmp_path: Path) -> None:
-    """If the client's wall clock steps by 100 ms, loop latency and picture age do not change."""
+    """If the client's wall clock steps by 100 ms, loop latency and frame age do not change."""
     without_step, stepped = measured(make_run, tmp_path / "a"), measured(make_run, tmp_path / "b", step_s=0.1)
     assert stepped.entry["loop_ms"] == without_step.entry["loop_ms"]
     assert stepped.entry["picture_age_ms"] == without_step.entry["picture_age_ms"]
@@ -201,26 +199,26 @@ def test_pictures_without_the_field_decoded_are_decoded(make_run: MakeRun, tmp_p
     assert (entry["frames_decoded"], entry["frames_unreadable"]) == (361, 7)
 
 
-def test_picture_age_is_the_loop_latency_plus_half_a_frame(make_run: MakeRun, tmp_path: Path) -> None:
-    """With a constant loop latency of 76 ms and a picture every 33.3 ms, the mean picture age is 92.7 ms."""
+def test_frame_age_is_the_loop_latency_plus_half_a_frame(make_run: MakeRun, tmp_path: Path) -> None:
+    """With a constant loop latency of 76 ms and a frame every 33.3 ms, the mean frame age is 92.7 ms."""
     age = measured(make_run, tmp_path, spread_ms=0.0).entry["picture_age_ms"]
     assert age["mean"] == pytest.approx(76 + 33.333 / 2, abs=0.05)
     assert age["p95"] == pytest.approx(76 + 33.333 * 0.95, abs=0.1)
 
 
-def test_picture_age_of_three_commands() -> None:
+def test_frame_age_of_three_commands() -> None:
     """For ages from 10 to 20, from 10 to 30 and from 5 to 15 ms the mean is 16.25 ms and the 95th percentile 28 ms."""
     millisecond = 1_000_000
     frames = table(
         [{"stamp_ns": n, "stamped_mono_ns": stamped * millisecond} for n, stamped in ((1, 0), (2, 10), (3, 35))]
     )
-    admissions = table(
+    command_verdicts = table(
         [
             {"stamp_ns": n, "verdict": "accepted", "applied_mono_ns": applied * millisecond}
             for n, applied in ((1, 10), (2, 20), (3, 40))
         ]
     )
-    age = picture_age(frames, admissions, 10 * millisecond, 50 * millisecond)
+    age = frame_age(frames, command_verdicts, 10 * millisecond, 50 * millisecond)
     assert age.mean_ms == pytest.approx((10 * 15 + 20 * 20 + 10 * 10) / 40)
     assert age.p95_ms == pytest.approx(28.0)
 

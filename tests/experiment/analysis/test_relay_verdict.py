@@ -62,7 +62,7 @@ def test_a_variable_delay_is_judged_by_its_lateness() -> None:
     """With more than a constant delay, only packets that are sent over 1 ms late are a reason."""
     assert reasons((500.0, 0.1), (0.3, 0.1), video=None, control=0.0) == []
     (reason,) = reasons((75.0, 0.1), (1.5, 0.1), video=None, control=0.0)
-    assert reason.startswith("video left the relay 1.5 ms later")
+    assert reason.startswith("the relay sent video packets 1.5 ms later")
     (reason,) = reasons((None, 0.1), (None, 0.1), video=None, control=0.0)
     assert "video was not measured" in reason
 

@@ -48,12 +48,12 @@ def test_frame_age_of_each_accepted_command() -> None:
     milliseconds = 1_000_000
     frames = table_of([{"stamp_ns": 7, "stamped_mono_ns": 10 * milliseconds}], [0], [0])
     rows = [(30, 7, "accepted"), (40, 7, "rejected"), (50, 7, "accepted"), (60, 8, "accepted"), (90, 7, "accepted")]
-    admissions = table_of(
+    command_verdicts = table_of(
         [{"applied_mono_ns": at * milliseconds, "stamp_ns": stamp, "verdict": verdict} for at, stamp, verdict in rows],
         [0] * len(rows),
         [0] * len(rows),
     )
-    ages_ns = ages_at_actuation_ns(frames, admissions, 0, 80 * milliseconds)
+    ages_ns = ages_at_actuation_ns(frames, command_verdicts, 0, 80 * milliseconds)
     assert np.divide(ages_ns, milliseconds).tolist() == [20.0, 40.0]
 
 

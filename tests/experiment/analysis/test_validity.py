@@ -36,7 +36,7 @@ def test_a_run_without_faults_is_valid(make_run: MakeRun, tmp_path: Path) -> Non
         ({"bound_s": None, "probes": False}, "the offset between the clocks has no bound"),
         ({"bound_s": 0.0011}, "only known to 2.20 ms"),
         ({"late": 3}, "the physics was 180 ms late"),
-        ({"skipped": 10}, "the camera missed 10 of 361 ticks"),
+        ({"skipped": 10}, "the camera missed 10 of 361 frames"),
         ({"ending": None}, "the record has no ending"),
         ({"server_unsampled_s": (4, 6)}, "the clock of the server was not sampled for 3.0 s"),
         ({"server_unsampled_s": (-1, 3)}, "the clock of the server was not sampled for 3.0 s"),
@@ -112,7 +112,7 @@ def test_a_slow_last_sample_does_not_widen_the_bound(make_run: MakeRun, tmp_path
 ONE_REASON = {
     "delay on NTP's path before it synchronised": (
         {**following(peer_delay_s=0.0756, correction_s=lambda second: 0.2875 + 20e-6 * second)},
-        "the NTP of the client goes through injected delay: its round trip is 75.60 ms, the probe's 0.60 ms",
+        "the NTP of the client goes through injected delay: its round trip is 75.60 ms, the probe's is 0.60 ms",
     ),
     "delay on NTP's path after it synchronised": (
         {**following(good_samples=lambda second: min(20 + second, 23))},
@@ -123,7 +123,7 @@ ONE_REASON = {
             "server_clock": lambda _second: {**GOOD_PATH, "follows": CLIENT, "peer_delay_s": 0.1},
             "client_clock": lambda _second: {"addresses": [CLIENT]},
         },
-        "the NTP of the server goes through injected delay: its round trip is 100.00 ms, the probe's 0.60 ms",
+        "the NTP of the server goes through injected delay: its round trip is 100.00 ms, the probe's is 0.60 ms",
     ),
     "chrony does not know the offset": (
         {"corrected": False},

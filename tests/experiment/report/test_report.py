@@ -271,13 +271,13 @@ def test_an_unknown_value_is_a_dash() -> None:
     """An unknown number, share, interval or latency is shown as a dash, and an unknown bound as "unknown"."""
     nothing = {"p5": None, "p50": None, "p95": None, "bound": None, "n": 0}
     dashes = [
-        table_format.number(None),
-        table_format.percent(None),
-        table_format.interval(None),
-        table_format.latency(nothing),
+        table_format.format_number(None),
+        table_format.format_percent(None),
+        table_format.format_interval(None),
+        table_format.format_latency(nothing),
     ]
     assert dashes == [table_format.NOTHING] * 4
-    unbounded = table_format.latency({"p5": 1.0, "p50": 2.0, "p95": 3.0, "bound": None, "n": 1})
+    unbounded = table_format.format_latency({"p5": 1.0, "p50": 2.0, "p95": 3.0, "bound": None, "n": 1})
     assert unbounded.replace(table_format.UNBROKEN, " ") == "2.0 ± unknown (1.0 to 3.0)"
 
 

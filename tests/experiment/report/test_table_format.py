@@ -9,21 +9,27 @@ from lavt.experiment.report.table_format import (
     UNBROKEN,
     TableData,
     csv_of,
+    format_probability,
     html_of,
-    latencies,
-    numbers,
-    probabilities,
-    probability,
-    share_intervals,
-    shares,
+    latency_column,
+    number_column,
+    probability_column,
+    share_column,
+    share_interval_column,
     tex_of,
-    texts,
+    text_column,
 )
 
 SPECIAL_TEXT = 'a_b & 50 % of $x^2 #1 {~} \\ "<b>"\nτ'
 
 TABLE = TableData(
-    [texts("name"), numbers("error m", 2), shares("completed"), share_intervals("interval"), latencies("loop ms")],
+    [
+        text_column("name"),
+        number_column("error m", 2),
+        share_column("completed"),
+        share_interval_column("interval"),
+        latency_column("loop ms"),
+    ],
     [
         [SPECIAL_TEXT, 1 / 3, 0.5, (0.123456789, 1.0), {"p5": 1.0, "p50": 2.25, "p95": 3.0, "n": 4}],
         ["nothing", None, None, None, None],
@@ -68,13 +74,13 @@ def test_latex_escapes_special_characters() -> None:
 
 def test_latex_reads_no_cell_as_an_option() -> None:
     """A row that begins with a bracket or a star is not an option of the line break before it."""
-    lines = tex_of(TableData([texts("name")], [["[1 m]"], ["*"]])).splitlines()
+    lines = tex_of(TableData([text_column("name")], [["[1 m]"], ["*"]])).splitlines()
     assert lines[5:7] == [r"{[}1 m] \\", r"{*} \\"]
 
 
 def test_a_wide_latex_table_is_scaled_to_the_line() -> None:
     """A long column title is broken into lines, and a table that remains too wide is scaled."""
-    column = numbers("collisions of the paper / run", 2)
+    column = number_column("collisions of the paper / run", 2)
     narrow, wide = (tex_of(TableData([column] * count, [[1.0] * count])).splitlines() for count in (2, 12))
     title = r"\shortstack[r]{collisions of\\the paper /\\run}"
     assert narrow[3] == rf"{title} & {title} \\"
@@ -89,7 +95,7 @@ def test_a_wide_latex_table_is_scaled_to_the_line() -> None:
 def test_latex_breaks_long_texts() -> None:
     """A column with a long text has line breaks, also inside JSON."""
     text = 'said: {"of_one":"word","of_two":"words, or more"}'
-    for column in (texts("endings"), texts("endings", is_long=True)):
+    for column in (text_column("endings"), text_column("endings", is_long=True)):
         lines = tex_of(TableData([column], [[text]])).splitlines()
         assert lines[1] == r"\begin{tabular}{p{6cm}}"
         assert lines[5] == (
@@ -107,7 +113,7 @@ def test_html_escapes_texts() -> None:
 
 def test_columns_without_values_are_left_out() -> None:
     """A column without a known value is left out; a column with one value remains."""
-    columns = [texts("name"), numbers("known"), share_intervals("unknown"), probabilities("p")]
+    columns = [text_column("name"), number_column("known"), share_interval_column("unknown"), probability_column("p")]
     table = TableData(columns, [["a", None, None, None], ["b", 1.0, None, None]]).without_empty()
     assert [column.title for column in table.columns] == ["name", "known"]
     assert table.rows == [["a", None], ["b", 1.0]]
@@ -115,4 +121,9 @@ def test_columns_without_values_are_left_out() -> None:
 
 def test_a_small_p_value_is_not_zero() -> None:
     """A p value has two significant digits, and a very small one is shown as less than 0.0001."""
-    assert [probability(p) for p in (None, 1.0, 0.0371, 0.00002)] == [NOTHING, "1", "0.037", f"<{UNBROKEN}0.0001"]
+    assert [format_probability(p) for p in (None, 1.0, 0.0371, 0.00002)] == [
+        NOTHING,
+        "1",
+        "0.037",
+        f"<{UNBROKEN}0.0001",
+    ]

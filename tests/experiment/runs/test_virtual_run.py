@@ -19,7 +19,7 @@ from lavt.config_file import condition, load_config, shipped
 from lavt.domain import NS_PER_S, Picture, Pose
 from lavt.experiment.analysis.metrics import driving_interval, measure
 from lavt.experiment.analysis.results import run_result
-from lavt.experiment.runs.network import STAMP_TO_STAMP, injected_network, virtual_network
+from lavt.experiment.runs.network import VIDEO_LATENCY_STAGES, injected_network, virtual_network
 from lavt.experiment.runs.plan import PlannedRun, plan_run
 from lavt.experiment.runs.virtual_run import VirtualLoop, build_loop, drive, host_clocks, read_costs
 from lavt.recording.record import Record, read_record
@@ -92,7 +92,7 @@ def true_latencies_ms(run: PlannedRun) -> tuple[float, float]:
         run.config.network.inherent, condition(run.config.network.condition), costs, run.seed, state_delay="none"
     )
     network = virtual_network(requested, costs)
-    stages_us = sum(costs.stages_us.get(node, {}).get(stage, 0.0) for node, stage in STAMP_TO_STAMP)
+    stages_us = sum(costs.stages_us.get(node, {}).get(stage, 0.0) for node, stage in VIDEO_LATENCY_STAGES)
     sending_us = costs.stages_us["driver"]["command"]
     return network.video.constant_ms + stages_us / 1000, network.control.constant_ms + sending_us / 1000
 

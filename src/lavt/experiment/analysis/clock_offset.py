@@ -1,4 +1,4 @@
-"""The clock offset Delta = t_server - t_client over a run, with its error bound, from time sources or probes."""
+"""The clock offset Delta = t_server - t_client during a run, with its error bound, from time sources or the probe."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from lavt.domain import NS_PER_S, FloatArray
 from lavt.recording.table import MISSING, BoolArray, IntArray, Table
 
 DRIFT_ALLOWANCE = 500e-6
-"""The largest unreported rate of change of Delta: a kernel steers by at most 500 ppm (ntpd, timesyncd), and two
-crystals differ by less. Only chrony can be faster, and it reports its corrections."""
+"""The largest rate at which Delta changes without a report of it: a kernel steers its clock by at most 500 ppm (ntpd,
+timesyncd), and two crystals differ by less. Only chrony can steer faster, and it reports its corrections."""
 
 
 @dataclass(frozen=True, slots=True)
 class ClockOffset:
-    """Delta at ascending times of the client's wall clock, and the bound of the error of the line between them.
+    """Delta at ascending times of the client's wall clock.
 
-    `bound_ns` is NaN where it is unknown. Before the first and after the last time the bound grows by `drift_outside`
-    (ns per ns).
+    Between these times Delta is interpolated linearly, and `bound_ns` limits the error of the result; it is NaN where
+    it is unknown. Before the first and after the last time the bound grows by `drift_outside` (ns per ns).
     """
 
     client_wall_ns: IntArray
@@ -33,9 +33,9 @@ class ClockOffset:
 
     def bound_at(self, client_wall_ns: IntArray) -> FloatArray:
         """Return the error bound of Delta in ns at wall times of the client."""
-        nearest = np.clip(client_wall_ns, self.client_wall_ns[0], self.client_wall_ns[-1])
-        beyond_ns = self.drift_outside * np.abs(client_wall_ns - nearest)
-        return np.asarray(_interpolate(nearest, self.client_wall_ns, self.bound_ns) + beyond_ns, np.float64)
+        nearest_ns = np.clip(client_wall_ns, self.client_wall_ns[0], self.client_wall_ns[-1])
+        outside_ns = self.drift_outside * np.abs(client_wall_ns - nearest_ns)
+        return np.asarray(_interpolate(nearest_ns, self.client_wall_ns, self.bound_ns) + outside_ns, np.float64)
 
     def on_server_ns(self, client_wall_ns: IntArray) -> IntArray:
         """Convert wall times of the client to the server's wall clock; `MISSING` remains `MISSING`."""
@@ -49,9 +49,9 @@ NO_OFFSET = ClockOffset(np.zeros(1, np.int64), np.zeros(1), np.zeros(1), 0.0)
 """The clock offset between two hosts that share a clock."""
 
 
-def _interpolate(wanted: IntArray, times: IntArray, values: FloatArray) -> FloatArray:
+def _interpolate(at_times: IntArray, times: IntArray, values: FloatArray) -> FloatArray:
     origin = times[0]  # a float represents differences of wall times exactly, but not wall times
-    return np.asarray(np.interp((wanted - origin).astype(float), (times - origin).astype(float), values), np.float64)
+    return np.asarray(np.interp((at_times - origin).astype(float), (times - origin).astype(float), values), np.float64)
 
 
 # From the hosts' own time sources.
@@ -65,13 +65,13 @@ class _Correction:
     correction_ns: FloatArray
     own_bound_ns: FloatArray
     peer_bound_ns: FloatArray
-    """The bound relative to the other host's clock, where the time source follows that host; else NaN.
+    """The bound relative to the other host's clock where the time source follows that host; NaN elsewhere.
 
-    The root distance covers the path to that host and beyond, from the best samples; the peer delay and dispersion
-    cover that path only, from the last sample. Both are valid bounds, and the smaller one is used.
+    There are two valid bounds, and the smaller one is used. The root distance covers the whole path to the reference,
+    from the best samples. The peer delay and dispersion cover only the path to the other host, from the last sample.
     """
     query_ns: FloatArray
-    """The largest change of the correction while the time source was queried."""
+    """The largest possible change of the correction during the query of the time source."""
 
     def at(self, reference_ns: IntArray, values: FloatArray) -> FloatArray:
         """Return a quantity of the samples at other times: interpolated linearly, constant outside the samples."""
@@ -79,27 +79,31 @@ class _Correction:
 
 
 def offset_from_sources(server: Table, client: Table) -> ClockOffset | None:
-    """Return Delta from the time sources of both hosts (their channels `clock`); None where one does not know it.
+    """Return Delta from the time sources of both hosts (their channels `clock`).
 
-    Its times are those of both hosts' samples, where both know their correction. Outside these times Delta is assumed
-    to change at most twice as fast as at the edge. The bound is that of the host which follows the other, or else the
-    sum of both hosts' own bounds; the possible error of the line between two samples is added (`docs/metrics.md`).
+    None if the correction of a host is unknown, or if the samples of the two hosts do not overlap in time.
+
+    The times of the result are the samples of both hosts, in the interval that the samples of each host cover. Outside
+    this interval Delta is assumed to change at most twice as fast as at the faster of its two ends. Where one host
+    follows the other, the bound is that of the follower, otherwise the sum of both hosts' own bounds. The possible
+    error of the interpolation between two samples is added (`docs/metrics.md`).
     """
-    hosts = [_correction(server, client), _correction(client, server)]
-    if hosts[0] is None or hosts[1] is None:
+    of_server, of_client = _correction(server, client), _correction(client, server)
+    if of_server is None or of_client is None:
         return None
-    of_server, of_client = hosts[0], hosts[1]
     times = np.union1d(of_server.reference_ns, of_client.reference_ns)
-    first, last = (pick(each.reference_ns[at] for each in (of_server, of_client)) for pick, at in ((max, 0), (min, -1)))
-    times = times[(times >= first) & (times <= last)]
+    first_ns = max(of_server.reference_ns[0], of_client.reference_ns[0])
+    last_ns = min(of_server.reference_ns[-1], of_client.reference_ns[-1])
+    times = times[(times >= first_ns) & (times <= last_ns)]
     if len(times) == 0:
         return None
     bound_ns = of_server.at(times, of_server.own_bound_ns) + of_client.at(times, of_client.own_bound_ns)
     for follower in (of_server, of_client):
         peer_bound_ns = follower.at(times, follower.peer_bound_ns)
         bound_ns = np.where(np.isfinite(peer_bound_ns), peer_bound_ns, bound_ns)
-    for each in (of_server, of_client):
-        bound_ns = bound_ns + each.at(times, each.query_ns) + _interpolation_error_ns(times, each)
+    for correction in (of_server, of_client):
+        query_ns = correction.at(times, correction.query_ns)
+        bound_ns = bound_ns + query_ns + _interpolation_error_ns(times, correction)
     correction_ns = of_client.at(times, of_client.correction_ns)
     delta_ns = correction_ns - of_server.at(times, of_server.correction_ns)
     drift_outside = 2 * float(np.max(np.abs(_rates(times, delta_ns))[[0, -1]])) if len(times) > 1 else DRIFT_ALLOWANCE
@@ -107,7 +111,10 @@ def offset_from_sources(server: Table, client: Table) -> ClockOffset | None:
 
 
 def known_samples(samples: Table) -> Table:
-    """Return the samples from the first with a known correction on; none where a later one does not know it."""
+    """Return the samples from the first one with a known correction to the end.
+
+    Return none of them where the correction is unknown in a later sample.
+    """
     known = np.isfinite(samples.floats("correction_s")) & (samples.ints("wall_ns") != MISSING)
     is_complete = known.any() and known[np.argmax(known) :].all()
     return samples.where(known if is_complete else np.zeros(len(samples), np.bool_))
@@ -116,7 +123,7 @@ def known_samples(samples: Table) -> Table:
 def follows_peer(samples: Table, other: Table) -> BoolArray:
     """Return for each of a host's samples whether its time source follows the other host."""
     addresses = {address for entry in other.objects("addresses") for address in entry or ()}
-    return np.array([each in addresses for each in samples.texts("follows")], np.bool_)
+    return np.array([address in addresses for address in samples.texts("follows")], np.bool_)
 
 
 def _correction(samples: Table, other: Table) -> _Correction | None:
@@ -143,16 +150,17 @@ def _rates(times: IntArray, values: FloatArray) -> FloatArray:
 
 
 def _interpolation_error_ns(times: IntArray, samples: _Correction) -> FloatArray:
-    """Return the largest error of the line between two samples.
+    """Return the largest error of the linear interpolation between two samples, at each of `times`.
 
-    The samples do not show when the steering of a clock began or ended between them: the whole change of slope to a
-    neighbouring line may have occurred at once.
+    The steering of a clock may begin or end at any moment between two samples. The bound assumes that the whole change
+    of slope to a neighbouring interval occurred at once.
     """
     if len(samples.reference_ns) < 3:
         return np.zeros(len(times))
     rates = _rates(samples.reference_ns, samples.correction_ns)
-    bends = np.abs(np.diff(rates))
-    error_ns = np.maximum(np.append(bends, 0.0), np.append(0.0, bends)) * np.diff(samples.reference_ns)
+    slope_changes = np.abs(np.diff(rates))
+    largest_changes = np.maximum(np.append(slope_changes, 0.0), np.append(0.0, slope_changes))
+    error_ns = largest_changes * np.diff(samples.reference_ns)
     interval = np.clip(np.searchsorted(samples.reference_ns, times, "right") - 1, 0, len(error_ns) - 1)
     return np.asarray(error_ns[interval], np.float64)
 
@@ -162,7 +170,10 @@ def _interpolation_error_ns(times: IntArray, samples: _Correction) -> FloatArray
 
 @dataclass(frozen=True, slots=True)
 class ProbeExchanges:
-    """Exchanges of the clock probe, in order: the time on both wall clocks, the measured Delta and the round trip."""
+    """Exchanges of the clock probe, in order of time.
+
+    Each has its time on both wall clocks, the measured Delta, and the round trip.
+    """
 
     client_wall_ns: IntArray
     server_wall_ns: IntArray
@@ -190,31 +201,34 @@ def probe_exchanges(probes: Table) -> ProbeExchanges:
     """
     names = ("sent_wall_ns", "received_wall_ns", "answered_wall_ns", "arrived_wall_ns")
     sent, received, answered, arrived = (probes.ints(name) for name in names)
-    found = ProbeExchanges(
+    exchanges = ProbeExchanges(
         sent + (arrived - sent) // 2,
         received + (answered - received) // 2,
         ((received - sent) + (answered - arrived)) / 2,
         (arrived - sent) - (answered - received),
     )
-    good = np.all([times != MISSING for times in (sent, received, answered, arrived)], axis=0)
-    good &= found.round_trip_ns >= 0
-    order = np.argsort(found.client_wall_ns[good], kind="stable")
-    return found.where(np.flatnonzero(good)[order])
+    is_valid = np.all([times != MISSING for times in (sent, received, answered, arrived)], axis=0)
+    is_valid &= exchanges.round_trip_ns >= 0
+    order = np.argsort(exchanges.client_wall_ns[is_valid], kind="stable")
+    return exchanges.where(np.flatnonzero(is_valid)[order])
 
 
 def offset_from_probe(exchanges: ProbeExchanges) -> ClockOffset | None:
-    """Return Delta from the probe alone, at the time of each exchange from the exchange with the smallest bound there.
+    """Return Delta from the probe alone, at the time of each exchange; None without exchanges.
 
-    The bound of an exchange is half its round trip, plus the possible drift of the clocks since or until then.
+    The value at a time is that of the exchange with the smallest bound at that time. The bound of an exchange is half
+    its round trip, plus the possible drift of the clocks between the exchange and that time.
     """
     if len(exchanges) == 0:
         return None
     times_ns = (exchanges.client_wall_ns - exchanges.client_wall_ns[0]).astype(float)
     half_ns = exchanges.round_trip_ns / 2
-    before = _running_argmin(half_ns - DRIFT_ALLOWANCE * times_ns)
-    after = len(exchanges) - 1 - _running_argmin((half_ns + DRIFT_ALLOWANCE * times_ns)[::-1])[::-1]
-    bounds_ns = [half_ns[each] + DRIFT_ALLOWANCE * np.abs(times_ns - times_ns[each]) for each in (before, after)]
-    delta_ns = exchanges.delta_ns[np.where(bounds_ns[0] <= bounds_ns[1], before, after)]
+    best_before = _running_argmin(half_ns - DRIFT_ALLOWANCE * times_ns)
+    best_after = len(exchanges) - 1 - _running_argmin((half_ns + DRIFT_ALLOWANCE * times_ns)[::-1])[::-1]
+    bounds_ns = [
+        half_ns[best] + DRIFT_ALLOWANCE * np.abs(times_ns - times_ns[best]) for best in (best_before, best_after)
+    ]
+    delta_ns = exchanges.delta_ns[np.where(bounds_ns[0] <= bounds_ns[1], best_before, best_after)]
     gaps_ns = np.diff(times_ns)
     between_ns = DRIFT_ALLOWANCE * np.maximum(np.append(gaps_ns, 0.0), np.append(0.0, gaps_ns)) / 2
     return ClockOffset(exchanges.client_wall_ns, delta_ns, np.minimum(*bounds_ns) + between_ns, DRIFT_ALLOWANCE)

@@ -1,4 +1,7 @@
-"""Reasons from the clocks for which a run is invalid: one reason per cause, without its consequences."""
+"""The reasons from the clocks for which a run is invalid.
+
+Each cause has one reason; the consequences of a cause are not reported in addition.
+"""
 
 from __future__ import annotations
 
@@ -11,34 +14,38 @@ from lavt.recording.record import Record
 from lavt.recording.table import MISSING, IntArray, Table
 
 STEP_LIMIT_MS = 5.0
-"""A wall clock that moves this much relative to the monotonic clock between two samples was set. Steering, however
-fast, moves both (clock_gettime(2)) and is not a step."""
+"""A wall clock that moves more than this relative to the monotonic clock between two samples was set. Steering, however
+fast, moves both clocks (clock_gettime(2)) and is not a step."""
 POLL_LIMIT_S = 2.5
-"""Clocks are sampled every second: at most one sample may be late or missing."""
+"""The longest time between two samples of a clock. Clocks are sampled every second, so one sample may be missing."""
 CLOCK_BOUND_LIMIT_MS = 2.0
 """With a larger bound, the split of the loop latency into tau_v and tau_c is too uncertain."""
 PATH_LIMIT_MS = 1.0
-"""With a round trip this much longer than the probe's, NTP does not take the probe's path."""
-STILL_LIMIT_POLLS = 5
+"""If NTP's round trip is longer than the probe's by more than this, NTP does not take the probe's path."""
+NO_SAMPLE_LIMIT_POLLS = 5
 """After this many polls without a good sample, chrony only extrapolates."""
-STILL_LEAST_S = 5.0
-"""A shorter time without a good sample is accepted at any poll interval: a busy machine loses some of many samples."""
+NO_SAMPLE_ALLOWED_S = 5.0
+"""A shorter time without a good sample is accepted at any poll interval, because a busy machine loses some samples."""
 
 Sides = tuple[tuple[str, Table, Table, IntArray], ...]
-"""For each side: name, its clock samples, the other side's, and start and end of the drive on its wall clock."""
+"""For each side: its name, its clock samples, the other side's samples, and start and end of the drive on its wall
+clock."""
 
 
 def step_reasons(server: Record, client: Record, clocks: RunClocks, began_ns: int, ended_ns: int) -> list[str]:
     """Return a reason for each wall clock that was set near the drive; two sides on one kernel share one clock."""
-    found = {
+    steps_ms = {
         "server": _step_ms(server.table("clock"), (began_ns, ended_ns)),
         "client": _step_ms(client.table("clock"), drive_on_client(server, client, began_ns, ended_ns)),
     }
-    reasons = [f"the wall clock of the {side} stepped by {ms:+.1f} ms" for side, ms in found.items() if ms is not None]
+    reasons = [
+        f"the wall clock of the {side} stepped by {ms:+.1f} ms" for side, ms in steps_ms.items() if ms is not None
+    ]
     return reasons[:1] if clocks.source == SAME_KERNEL else reasons
 
 
 def _step_ms(samples: Table, drive_ns: tuple[int, int]) -> float | None:
+    """Return the largest step of a side's wall clock near the drive; None where none exceeds `STEP_LIMIT_MS`."""
     mono_ns, wall_ns = samples.ints("mono_ns"), samples.ints("wall_ns")
     known = (mono_ns != MISSING) & (wall_ns != MISSING)
     mono_ns, wall_ns = mono_ns[known], wall_ns[known]
@@ -52,7 +59,7 @@ def _step_ms(samples: Table, drive_ns: tuple[int, int]) -> float | None:
 def poll_reasons(server: Record, client: Record, began_ns: int, ended_ns: int) -> list[str]:
     """Return a reason for each side that lacks clock samples between the start and the end of the drive.
 
-    Without them the clock offset is only a guess.
+    Without samples the clock offset is only a guess.
     """
     if began_ns > ended_ns:
         return []
@@ -74,16 +81,17 @@ def poll_reasons(server: Record, client: Record, began_ns: int, ended_ns: int) -
         for side, gap_ns in longest_ns.items()
         if gap_ns > limit_ns
     ]
-    near_ns = client_ns[(client_ns > client_began_ns - limit_ns) & (client_ns < client_ended_ns + limit_ns)]
+    near_drive_ns = client_ns[(client_ns > client_began_ns - limit_ns) & (client_ns < client_ended_ns + limit_ns)]
     is_covered = len(client_ns) and client_ns[0] - client_began_ns <= limit_ns >= client_ended_ns - client_ns[-1]
     if not is_covered:
-        covered_s, drive_s = (int(np.ptp(near_ns)) if len(near_ns) else 0) / NS_PER_S, (ended_ns - began_ns) / NS_PER_S
+        covered_s = (int(np.ptp(near_drive_ns)) if len(near_drive_ns) else 0) / NS_PER_S
+        drive_s = (ended_ns - began_ns) / NS_PER_S
         reasons.append(f"the clock samples of the client cover {covered_s:.1f} s of a drive of {drive_s:.1f} s")
     return reasons
 
 
 def _longest_gap_ns(sampled_ns: IntArray, began_ns: int, ended_ns: int) -> int:
-    """Return the longest time between two samples that overlaps the drive."""
+    """Return the longest time between two successive samples, of those times that overlap the drive."""
     in_drive = (sampled_ns[1:] > began_ns) & (sampled_ns[:-1] < ended_ns)
     return int(np.max(np.diff(sampled_ns)[in_drive], initial=0))
 
@@ -95,7 +103,11 @@ def _sampled_ns(record: Record) -> IntArray:
 
 
 def offset_reasons(server: Record, client: Record, clocks: RunClocks) -> list[str]:
-    """Return the reasons against Delta: an unfit time source, or else a disagreement, bound or probe that is unfit."""
+    """Return the reasons against Delta from the first of these checks that fails.
+
+    The checks are, in order: the time sources are usable, they agree with the probe, the bound of Delta is small
+    enough, and the probe had an answer.
+    """
     if clocks.source == SAME_KERNEL:
         return []
     of_server, of_client = server.table("clock"), client.table("clock")
@@ -103,8 +115,8 @@ def offset_reasons(server: Record, client: Record, clocks: RunClocks) -> list[st
         sides = (("server", of_server), ("client", of_client))
         statuses = ", ".join(f"{side}: {_last_status(samples)}" for side, samples in sides)
         return [f"the offset between the clocks is not known ({statuses}), and the probe had no answer"]
-    unfit = [] if clocks.source == PROBE else _source_reasons(of_server, of_client, clocks)
-    return unfit or _agreement_reasons(clocks) or _bound_reasons(clocks) or _unchecked_reasons(clocks)
+    source_reasons = [] if clocks.source == PROBE else _source_reasons(of_server, of_client, clocks)
+    return source_reasons or _agreement_reasons(clocks) or _bound_reasons(clocks) or _unchecked_reasons(clocks)
 
 
 def _last_status(samples: Table) -> str:
@@ -117,7 +129,7 @@ def _source_reasons(of_server: Table, of_client: Table, clocks: RunClocks) -> li
         ("client", of_client, of_server, clocks.client_wall_ns),
         ("server", of_server, of_client, clocks.server_wall_ns),
     )
-    reasons = [*_path_reasons(sides, clocks), *_still_reasons(sides)]
+    reasons = [*_path_reasons(sides, clocks), *_no_sample_reasons(sides)]
     masters = {name for samples in (of_server, of_client) for name in _grandmasters(samples)}
     if len(masters) > 1:
         reasons.append(f"the hosts follow different PTP grandmasters: {' and '.join(sorted(masters))}")
@@ -130,55 +142,56 @@ def _grandmasters(samples: Table) -> set[str]:
 
 
 def _path_reasons(sides: Sides, clocks: RunClocks) -> list[str]:
-    """Return a reason where NTP's shortest round trip between the hosts during the drive is longer than the probe's.
+    """Return a reason for each side whose NTP had a longer round trip to the other side than the probe had.
 
-    A busy machine delays some exchanges, an injected delay all of them.
+    The shortest round trips of the drive are compared, because a busy machine delays only some exchanges, but an
+    injected delay delays all of them.
     """
     reasons = []
     for side, samples, other, drive_ns in sides:
-        followed = _during(samples.where(follows_peer(samples, other)), drive_ns)
-        delays_ms = followed.floats("peer_delay_s") * 1e3
+        follower_samples = _during(samples.where(follows_peer(samples, other)), drive_ns)
+        delays_ms = follower_samples.floats("peer_delay_s") * 1e3
         delays_ms = delays_ms[np.isfinite(delays_ms)]
         if len(delays_ms) == 0 or len(clocks.probed) == 0:
             continue
-        found_ms, shortest_ms = float(delays_ms.min()), float(clocks.probed.round_trip_ns.min()) / NS_PER_MS
-        if found_ms > shortest_ms + PATH_LIMIT_MS:
+        ntp_ms, probe_ms = float(delays_ms.min()), float(clocks.probed.round_trip_ns.min()) / NS_PER_MS
+        if ntp_ms > probe_ms + PATH_LIMIT_MS:
             reasons.append(
-                f"the NTP of the {side} goes through injected delay: its round trip is {found_ms:.2f} ms, the probe's "
-                f"{shortest_ms:.2f} ms (limit {PATH_LIMIT_MS} ms more)"
+                f"the NTP of the {side} goes through injected delay: its round trip is {ntp_ms:.2f} ms, the probe's "
+                f"is {probe_ms:.2f} ms (limit: {PATH_LIMIT_MS} ms longer)"
             )
     return reasons
 
 
-def _still_reasons(sides: Sides) -> list[str]:
-    """Return a reason for each side where NTP accepted no sample for too long, in a time that overlaps the drive."""
+def _no_sample_reasons(sides: Sides) -> list[str]:
+    """Return a reason for each side whose NTP accepted no sample for too long, in a time that overlaps the drive."""
     reasons = []
     for side, samples, _, drive_ns in sides:
-        still = _longest_still_s(samples, drive_ns)
-        if still is not None:
-            still_s, limit_s = still
+        longest = _longest_without_sample_s(samples, drive_ns)
+        if longest is not None:
+            longest_s, limit_s = longest
             reasons.append(
-                f"the NTP of the {side} accepted no sample for {still_s:.1f} s (limit {STILL_LIMIT_POLLS} polls, "
+                f"the NTP of the {side} accepted no sample for {longest_s:.1f} s (limit {NO_SAMPLE_LIMIT_POLLS} polls, "
                 f"{limit_s:.1f} s): its path is lost or goes through injected delay, or the machine is too busy"
             )
     return reasons
 
 
-def _longest_still_s(samples: Table, drive_ns: IntArray) -> tuple[float, float] | None:
-    """Return the longest time without a good sample and its limit; None where the limit is met."""
-    good = samples.ints("good_samples")
-    counted = (good != MISSING) & np.isfinite(samples.floats("poll_s")) & (samples.ints("wall_ns") != MISSING)
-    samples, good = samples.where(counted), good[counted]
-    if len(good) == 0:
+def _longest_without_sample_s(samples: Table, drive_ns: IntArray) -> tuple[float, float] | None:
+    """Return the time without a good sample that exceeds its limit most, and this limit; None if none exceeds it."""
+    good_counts = samples.ints("good_samples")
+    is_known = (good_counts != MISSING) & np.isfinite(samples.floats("poll_s")) & (samples.ints("wall_ns") != MISSING)
+    samples, good_counts = samples.where(is_known), good_counts[is_known]
+    if len(good_counts) == 0:
         return None
-    begins = np.flatnonzero(np.diff(good, prepend=-1) != 0)
-    ends = np.append(begins[1:], len(good)) - 1
+    begins = np.flatnonzero(np.diff(good_counts, prepend=-1) != 0)
+    ends = np.append(begins[1:], len(good_counts)) - 1
     mono_ns, wall_ns = samples.ints("mono_ns"), samples.ints("wall_ns")
-    touches = (wall_ns[ends] >= drive_ns[0]) & (wall_ns[begins] <= drive_ns[1])
-    still_s = np.where(touches, (mono_ns[ends] - mono_ns[begins]) / NS_PER_S, 0.0)
-    limits_s = np.maximum(STILL_LIMIT_POLLS * samples.floats("poll_s")[begins], STILL_LEAST_S)
-    worst = int(np.argmax(still_s - limits_s))
-    return (float(still_s[worst]), float(limits_s[worst])) if still_s[worst] > limits_s[worst] else None
+    overlaps_drive = (wall_ns[ends] >= drive_ns[0]) & (wall_ns[begins] <= drive_ns[1])
+    times_s = np.where(overlaps_drive, (mono_ns[ends] - mono_ns[begins]) / NS_PER_S, 0.0)
+    limits_s = np.maximum(NO_SAMPLE_LIMIT_POLLS * samples.floats("poll_s")[begins], NO_SAMPLE_ALLOWED_S)
+    worst = int(np.argmax(times_s - limits_s))
+    return (float(times_s[worst]), float(limits_s[worst])) if times_s[worst] > limits_s[worst] else None
 
 
 def _during(samples: Table, drive_ns: IntArray) -> Table:
@@ -192,8 +205,8 @@ def _bound_reasons(clocks: RunClocks) -> list[str]:
         return ["the offset between the clocks has no bound"]
     if bound_ms > CLOCK_BOUND_LIMIT_MS:
         return [
-            f"the offset between the clocks is only known to {bound_ms:.2f} ms (limit {CLOCK_BOUND_LIMIT_MS} ms), "
-            f"by {clocks.source}"
+            f"the offset between the clocks is only known to {bound_ms:.2f} ms (limit {CLOCK_BOUND_LIMIT_MS} ms); "
+            f"its source is {clocks.source}"
         ]
     return []
 
@@ -214,5 +227,5 @@ def _agreement_reasons(clocks: RunClocks) -> list[str]:
     source_ms, probe_ms, allowed_ms = disagreement_ms
     return [
         f"{clocks.source} and the probe disagree about the offset between the clocks: {source_ms:.2f} and "
-        f"{probe_ms:.2f} ms, although both bounds together are {allowed_ms:.2f} ms"
+        f"{probe_ms:.2f} ms, although the sum of their error bounds is {allowed_ms:.2f} ms"
     ]

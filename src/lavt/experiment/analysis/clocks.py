@@ -24,15 +24,15 @@ from lavt.recording.table import MISSING, IntArray, Table
 SAME_KERNEL = "same kernel"
 PROBE = "probe"
 MARGIN_NS = 5 * NS_PER_S
-"""Clock data from this long before to this long after the drive are used: at 500 ppm an older sample would add 2.5 ms
-to the bound of Delta, which is more than a valid run may have."""
+"""Clock data from this long before to this long after the drive are used. At 500 ppm an older sample would add more
+than 2.5 ms to the bound of Delta, but in a valid run the bound is at most 2 ms."""
 
 
 @dataclass(frozen=True, slots=True)
 class RunClocks:
-    """Delta of a run with the name of its source, the probe's estimate, and the drive on both wall clocks.
+    """Delta of a run with the name of its source, the probe's estimate, and the times of the drive on both wall clocks.
 
-    `offset` is None where Delta is unknown, `probe` where the probe had no answer during the drive.
+    `offset` is None where Delta is unknown. `probe` is None where the probe had no answer during the drive.
     """
 
     source: str | None
@@ -41,8 +41,9 @@ class RunClocks:
     probed: ProbeExchanges
     """Exchanges during the drive."""
     client_wall_ns: IntArray
-    """Start and end of the drive on the client's wall clock; `server_wall_ns` on the server's."""
+    """Start and end of the drive on the client's wall clock, (2,)."""
     server_wall_ns: IntArray
+    """Start and end of the drive on the server's wall clock, (2,)."""
 
     @property
     def bound_ms(self) -> float | None:
@@ -62,21 +63,21 @@ class RunClocks:
         }
 
     def disagreement_ms(self) -> tuple[float, float, float] | None:
-        """Return Delta, the probe's Delta and the sum of both bounds where they contradict each other; None otherwise.
+        """Return Delta, the probe's Delta and the sum of both bounds, in ms, where the two estimates disagree.
 
-        Every exchange of the drive is compared with Delta at its own time. The values are those of the exchange that
-        exceeds the bounds most.
+        None where they agree. Every exchange of the drive is compared with Delta at its own time. The returned values
+        are those of the exchange whose difference exceeds the bounds most.
         """
         if self.offset is None or self.source == PROBE or len(self.probed) == 0:
             return None
         delta_ns = self.offset.at(self.probed.client_wall_ns)
         bound_ns = self.offset.bound_at(self.probed.client_wall_ns) + self.probed.round_trip_ns / 2
-        beyond_ns = np.abs(delta_ns - self.probed.delta_ns) - bound_ns
-        worst = int(np.argmax(np.nan_to_num(beyond_ns, nan=-np.inf)))
-        if not beyond_ns[worst] > 0:
+        excess_ns = np.abs(delta_ns - self.probed.delta_ns) - bound_ns
+        worst = int(np.argmax(np.nan_to_num(excess_ns, nan=-np.inf)))
+        if not excess_ns[worst] > 0:
             return None
         delta_ms, probe_ms, bound_ms = (
-            float(each[worst]) / NS_PER_MS for each in (delta_ns, self.probed.delta_ns, bound_ns)
+            float(values_ns[worst]) / NS_PER_MS for values_ns in (delta_ns, self.probed.delta_ns, bound_ns)
         )
         return delta_ms, probe_ms, bound_ms
 
@@ -108,10 +109,15 @@ class RunClocks:
 def run_clocks(server: Record, client: Record, began_ns: int, ended_ns: int) -> RunClocks:
     """Return Delta of a run whose drive is an interval of the server's monotonic clock.
 
-    Hosts that report the same name share a kernel and thus a clock: Delta and its bound are 0. Otherwise the first of
-    these that is known is used: the time sources of both hosts, where both know a bound throughout the drive and
-    neither is configured to use the probe; the probe alone; the time sources without a bound. Only data from the drive
-    and `MARGIN_NS` around it are used, because a clock may have been set earlier.
+    Hosts that report the same name share a kernel and thus a clock: Delta and its bound are 0. Otherwise the first
+    estimate in this list that is known is used:
+
+    1. the time sources of both hosts, with a bound throughout the drive;
+    2. the probe alone;
+    3. the time sources without a bound.
+
+    The time sources are not used where a host is configured to use the probe. Only data from the drive and up to
+    `MARGIN_NS` before and after it are used, because a clock may have been set earlier.
     """
     on_client_ns = drive_on_client(server, client, began_ns, ended_ns)
     of_server = _near(server.table("clock"), (began_ns, ended_ns))
@@ -137,16 +143,17 @@ def run_clocks(server: Record, client: Record, began_ns: int, ended_ns: int) -> 
 def drive_on_client(server: Record, client: Record, began_ns: int, ended_ns: int) -> tuple[int, int]:
     """Return start and end of the drive on the client's monotonic clock, which cannot be set.
 
-    Pictures have times on both monotonic clocks. The picture with the shortest latency gives the difference of the
-    clocks, as others may have waited for seconds in a full queue. Without any picture, the whole time in which the
-    client's clocks were sampled is returned, extended to the length of the drive.
+    A received frame has a time on both monotonic clocks: when it was stamped and when its stamp was read. The frame
+    with the shortest latency gives the difference of the clocks, because other frames may have waited for seconds in a
+    full queue. Without any received frame, the whole time in which the client's clocks were sampled is returned,
+    extended to at least the length of the drive.
     """
-    frames, pictures = frames_within(server.table("frame"), began_ns, ended_ns), client.table("picture")
-    stamped_ns = look_up(frames.ints("stamp_ns"), frames.ints("stamped_mono_ns"), pictures.ints("stamp_ns"))
-    read_ns = pictures.ints("read_mono_ns")
-    ahead_ns = (read_ns - stamped_ns)[(stamped_ns != MISSING) & (read_ns != MISSING)]
-    if len(ahead_ns):
-        return began_ns + int(ahead_ns.min()), ended_ns + int(ahead_ns.min())
+    frames, received_frames = frames_within(server.table("frame"), began_ns, ended_ns), client.table("picture")
+    stamped_ns = look_up(frames.ints("stamp_ns"), frames.ints("stamped_mono_ns"), received_frames.ints("stamp_ns"))
+    read_ns = received_frames.ints("read_mono_ns")
+    differences_ns = (read_ns - stamped_ns)[(stamped_ns != MISSING) & (read_ns != MISSING)]
+    if len(differences_ns):
+        return began_ns + int(differences_ns.min()), ended_ns + int(differences_ns.min())
     sampled_ns = client.table("clock").mono_ns
     first_ns, last_ns = (int(sampled_ns.min()), int(sampled_ns.max())) if len(sampled_ns) else (0, 0)
     return first_ns, max(last_ns, first_ns + ended_ns - began_ns)
@@ -159,13 +166,13 @@ def _near(samples: Table, drive_ns: tuple[int, int]) -> Table:
 
 def wall_ns(record: Record, mono_ns: int) -> int:
     """Return the wall time of a record's host at a monotonic time, from the nearest of its clock samples and events."""
-    nearest, found_ns = None, mono_ns
+    shortest_ns, result_ns = None, mono_ns
     for table in (record.table("clock"), record.table("event")):
         for message_mono_ns, message_wall_ns in zip(table.mono_ns.tolist(), table.wall_ns.tolist(), strict=True):
             distance_ns = abs(message_mono_ns - mono_ns)
-            if nearest is None or distance_ns < nearest:
-                nearest, found_ns = distance_ns, message_wall_ns - message_mono_ns + mono_ns
-    return found_ns
+            if shortest_ns is None or distance_ns < shortest_ns:
+                shortest_ns, result_ns = distance_ns, message_wall_ns - message_mono_ns + mono_ns
+    return result_ns
 
 
 def _share_kernel(server: Table, client: Table) -> bool:
@@ -178,12 +185,12 @@ def _use_probe_only(server: Table, client: Table) -> bool:
 
 
 def _is_bounded(offset: ClockOffset, server_wall_ns: IntArray) -> bool:
-    """Return whether the bound is known throughout, and from before the start of the drive on."""
+    """Return whether the bound is known at every time of `offset`, and the first time is before the drive."""
     known = np.isfinite(offset.bound_ns)
     return bool(known.all()) and bool(offset.client_wall_ns[0] <= _on_client(offset, server_wall_ns)[0])
 
 
 def _on_client(offset: ClockOffset, server_wall_ns: IntArray) -> IntArray:
-    """Convert wall times of the server to the client's wall clock, assuming a slow change of Delta."""
+    """Convert wall times of the server to the client's wall clock; Delta must change slowly."""
     guess_ns = server_wall_ns - offset.at(server_wall_ns)
     return np.asarray(server_wall_ns - offset.at(guess_ns), np.int64)

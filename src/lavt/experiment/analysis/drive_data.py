@@ -23,7 +23,8 @@ DRAWN = ("mono_ns", "x_m", "y_m", "progress_m", "cross_track_m", "steering_rad")
 class DriveData:
     """One run: its directory, its `result.json`, the ground truth of the driving interval, and the route's centre line.
 
-    `reference_m` is (points, 2). `truth` has the columns `DRAWN`, and no rows without a simulator.
+    `reference_m` is the centre line, (points, 2). `truth` has the columns `DRAWN`; it has no rows if the vehicle is not
+    the simulator's. `began_ns` is the start of the drive on the server's monotonic clock.
     """
 
     directory: Path
@@ -56,8 +57,8 @@ def extract_drive(record: Record, directory: Path, result: Mapping[str, Any]) ->
     reference_m = np.array(routes[0] if routes and routes[0] else np.zeros((0, 2)), np.float64)
     within = truth.where((truth_ns >= began_ns) & (truth_ns <= ended_ns))
     columns = {name: within.columns[name] for name in DRAWN if name in within.columns}
-    driven = Table(within.mono_ns, within.wall_ns, columns)
-    return DriveData(directory, result, driven, reference_m, began_ns, record.annotations)
+    drawn_truth = Table(within.mono_ns, within.wall_ns, columns)
+    return DriveData(directory, result, drawn_truth, reference_m, began_ns, record.annotations)
 
 
 def one_of_each_condition(drives: Sequence[DriveData]) -> list[DriveData]:
@@ -69,9 +70,9 @@ def one_of_each_condition(drives: Sequence[DriveData]) -> list[DriveData]:
 
 
 def capture_to_stamp_ms(server_record: Path) -> float | None:
-    """Return the median time from a frame's exposure to its stamp, which the loop latency excludes.
+    """Return the median time from the capture of a frame to its stamp, which the loop latency excludes.
 
-    None where the camera does not report the time of exposure.
+    None where the camera does not report the capture time.
     """
     server = read_record(server_record, channels=("frame", "event"))
     with evaluating(server_record):

@@ -1,7 +1,7 @@
 """Reasons against the delay injection of a run on two machines, from the measurements of their own netem queues.
 
-Each sample was judged when it was taken (`judge` in `transport/netem/probe.py`). This module checks the times and the
-conditions of the samples.
+A sample is one measurement of a queue (a row of the channel `injection`). When it was taken, it was compared with the
+request (`judge` in `transport/netem/probe.py`). This module checks the times and the conditions of the samples.
 """
 
 from __future__ import annotations
@@ -20,37 +20,37 @@ SENT_BY = {"video": "server", "control": "client"}
 """For each flow, the side whose queue delays it."""
 
 GAP_LIMIT_S = 20.0
-"""Both sides measure every 5 s, which takes a second plus the delay: after a longer gap the injection is unknown."""
-LEAST_SHARE = 0.9
+"""The longest time between two samples. Both sides measure every 5 s, and this takes a second plus the delay."""
+SMALLEST_LATENCY_SHARE = 0.9
 """The median latency must be at least this share of the injected delay."""
 
 
 def recorded_reasons(server: Record, client: Record, condition: str, requested_ms: Mapping[str, float]) -> list[str]:
     """Return the reasons against the injection of a run; `requested_ms` is the delay of its condition, by flow.
 
-    On the server, the samples from the last one before the drive to its end are checked. On the client all samples are
-    checked, because the drive is not known on its clock and it drives under one condition only. Without a condition
-    (empty) the server must not have had one in force, such as another client's.
+    On the server, the samples from the last one before the drive to the end of the drive are checked. On the client all
+    samples are checked, because the times of the drive on its clock are unknown, and it drives under one condition
+    only. If `condition` is empty, no condition may have been in force on the server, such as that of another client.
     """
     began_ns, ended_ns, _ = driving_interval(server)
     if not condition:
-        foreign = set(_in_force(server.table("injection"), began_ns, ended_ns).texts("condition")) - {""}
-        return [f"condition {each} was in force on the server, but this run did not request it" for each in foreign]
+        names = set(_in_force(server.table("injection"), began_ns, ended_ns).texts("condition")) - {""}
+        return [f"condition {name} was in force on the server, but this run did not request it" for name in names]
     samples = {
         "server": _in_force(server.table("injection"), began_ns, ended_ns),
         "client": client.table("injection"),
     }
     reasons = []
     for side, table in samples.items():
-        others = [each for each in table.texts("condition") if each != condition]
-        doubts = [each for each in table.texts("reason") if each]
+        others = [name for name in table.texts("condition") if name != condition]
+        doubts = [reason for reason in table.texts("reason") if reason]
         if len(table) == 0:
             reasons.append(f"the {side} did not report that condition {condition} was in force")
         elif (gap_s := _longest_gap_s(table, ended_ns if side == "server" else None)) > GAP_LIMIT_S:
             reasons.append(f"the {side} did not measure condition {condition} for {gap_s:.0f} s")
         elif others or doubts:
-            reason = f": {doubts[0]}" if doubts else ""
-            reasons.append(f"condition {condition} was not in force as requested on the {side} all the time{reason}")
+            doubt = f": {doubts[0]}" if doubts else ""
+            reasons.append(f"condition {condition} was not in force as requested on the {side} all the time{doubt}")
     unmeasured = [
         flow for flow, side in SENT_BY.items() if requested_ms[flow] and not _is_measured(samples[side], flow)
     ]
@@ -66,7 +66,11 @@ def _in_force(table: Table, began_ns: int, ended_ns: int) -> Table:
 
 
 def _longest_gap_s(table: Table, ended_ns: int | None) -> float:
-    """Return the longest time without a sample, up to the drive's end where it is known on the same clock."""
+    """Return the longest time without a sample.
+
+    `ended_ns` is the end of the drive on the clock of the samples; None where it is unknown. The time from the last
+    sample to this end is included.
+    """
     times_ns = np.sort(table.ints("mono_ns"))
     if ended_ns is not None:
         times_ns = np.append(times_ns, max(ended_ns, times_ns[-1]))
@@ -74,21 +78,23 @@ def _longest_gap_s(table: Table, ended_ns: int | None) -> float:
 
 
 def absent_reasons(entry: Mapping[str, Any], requested_ms: Mapping[str, float]) -> list[str]:
-    """Return a reason for each flow whose latency is less than its injected delay, which must be on another path.
+    """Return a reason for each flow whose latency is less than the requested delay.
+
+    The delay was then injected on another path.
 
     `entry` has `tau_v_ms` and `tau_c_ms` with their bounds, as in `result.json`.
     """
     reasons = []
     for flow, key in (("video", "tau_v_ms"), ("control", "tau_c_ms")):
         median_ms, bound_ms = entry[key]["p50"], entry[key]["bound"] or 0.0
-        if median_ms is not None and median_ms + bound_ms < LEAST_SHARE * requested_ms[flow]:
+        if median_ms is not None and median_ms + bound_ms < SMALLEST_LATENCY_SHARE * requested_ms[flow]:
             reasons.append(
-                f"the {flow} took {median_ms:.1f} ms in the median although {requested_ms[flow]:g} ms were injected: "
-                "the delay is not on its path, check interface and ports"
+                f"the {flow} latency is {median_ms:.1f} ms in the median, although {requested_ms[flow]:g} ms were "
+                "injected: the delay is not on its path, check interface and ports"
             )
     return reasons
 
 
 def _is_measured(table: Table, flow: str) -> bool:
-    chosen = np.array([each == flow for each in table.texts("flow")], np.bool_)
+    chosen = np.array([name == flow for name in table.texts("flow")], np.bool_)
     return bool(np.isfinite(table.where(chosen).floats("measured_ms")).any())

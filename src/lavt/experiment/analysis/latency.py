@@ -1,6 +1,10 @@
 """Latencies of a run, each a pure function of recorded tables. `docs/metrics.md` has the formulas.
 
 All of them cover the driving interval only, `began_ns` to `ended_ns` on the server's monotonic clock.
+
+`frames` are rows of the server's channel `frame`, one for each stamped frame. `received_frames` are rows of the
+client's channel `picture`, one for each frame that the client received and tried to decode. `command_verdicts` are rows
+of the server's channel `admission`, one for each command that reached the gate.
 """
 
 from __future__ import annotations
@@ -15,15 +19,15 @@ from lavt.experiment.analysis.clock_offset import ClockOffset
 from lavt.recording.table import MISSING, IntArray, Table
 
 
-def look_up(keys: IntArray, values: IntArray, wanted: IntArray) -> IntArray:
-    """Return for each of `wanted` the value of the first equal key; `MISSING` where no key is equal."""
-    found = np.full(len(wanted), MISSING, np.int64)
+def look_up(keys: IntArray, values: IntArray, searched_keys: IntArray) -> IntArray:
+    """Return for each of `searched_keys` the value of the first equal key; `MISSING` where no key is equal."""
+    found = np.full(len(searched_keys), MISSING, np.int64)
     if len(keys) == 0:
         return found
     order = np.argsort(keys, kind="stable")
-    position = np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)
-    hit = (keys[order][position] == wanted) & (wanted != MISSING)
-    found[hit] = values[order][position[hit]]
+    position = np.minimum(np.searchsorted(keys[order], searched_keys), len(keys) - 1)
+    is_found = (keys[order][position] == searched_keys) & (searched_keys != MISSING)
+    found[is_found] = values[order][position[is_found]]
     return found
 
 
@@ -36,35 +40,46 @@ def frames_within(frames: Table, began_ns: int, ended_ns: int) -> Table:
 def rtp_timestamp(stamp_ns: IntArray) -> IntArray:
     """Return the RTP timestamps (90 kHz, modulo 2^32) of frames with these stamps."""
     # 90 kHz is 9 ticks per 100 us. The division comes first, because stamp * 9 exceeds 64 bits.
-    whole, rest_ns = np.divmod(stamp_ns, 100_000)
-    return np.asarray((whole * 9 + rest_ns * 9 // 100_000) % 2**32, np.int64)
+    hundreds_of_us, rest_ns = np.divmod(stamp_ns, 100_000)
+    return np.asarray((hundreds_of_us * 9 + rest_ns * 9 // 100_000) % 2**32, np.int64)
 
 
-def pictures_of(pictures: Table, frames: Table) -> Table:
-    """Return the pictures of `frames`: matched by stamp where it was readable, otherwise by RTP timestamp."""
+def received_frames_of(received_frames: Table, frames: Table) -> Table:
+    """Return the rows of received frames that belong to `frames`.
+
+    A row is matched by the frame's stamp if the client could read it, otherwise by the RTP timestamp.
+    """
     stamps = frames.ints("stamp_ns")
-    by_stamp = np.isin(pictures.ints("stamp_ns"), stamps)
-    by_packet = np.isin(pictures.ints("rtp_timestamp"), rtp_timestamp(stamps))
-    return pictures.where(np.where(pictures.flags("readable"), by_stamp, by_packet))
+    matches_stamp = np.isin(received_frames.ints("stamp_ns"), stamps)
+    matches_packet = np.isin(received_frames.ints("rtp_timestamp"), rtp_timestamp(stamps))
+    return received_frames.where(np.where(received_frames.flags("readable"), matches_stamp, matches_packet))
 
 
-def decoded_pictures(pictures: Table) -> Table:
-    """Return the pictures that were decoded; those without the field `decoded` are included."""
-    return pictures.where(np.array([decoded is not False for decoded in pictures.objects("decoded")], np.bool_))
+def decoded_frames(received_frames: Table) -> Table:
+    """Return the rows of received frames that were decoded to a picture.
+
+    Rows without the field `decoded`, which older records do not have, count as decoded.
+    """
+    is_decoded = [decoded is not False for decoded in received_frames.objects("decoded")]
+    return received_frames.where(np.array(is_decoded, np.bool_))
 
 
-def video_latency_ns(pictures: Table, offset: ClockOffset) -> IntArray:
-    """Return tau_v of every readable picture: from stamp written to stamp read, on the server's clock."""
-    readable = pictures.where(pictures.flags("readable") & (pictures.ints("read_wall_ns") != MISSING))
+def video_latency_ns(received_frames: Table, offset: ClockOffset) -> IntArray:
+    """Return tau_v of every received frame with a readable stamp: from stamp written to stamp read.
+
+    Both times are on the server's wall clock.
+    """
+    is_known = received_frames.flags("readable") & (received_frames.ints("read_wall_ns") != MISSING)
+    readable = received_frames.where(is_known)
     return offset.on_server_ns(readable.ints("read_wall_ns")) - readable.ints("stamp_ns")
 
 
-def control_latency_ns(admissions: Table, offset: ClockOffset, began_ns: int, ended_ns: int) -> IntArray:
-    """Return tau_c of every accepted command: from sent to received, on the server's clock.
+def control_latency_ns(command_verdicts: Table, offset: ClockOffset, began_ns: int, ended_ns: int) -> IntArray:
+    """Return tau_c of every accepted command: from sent to received, on the server's wall clock.
 
-    Only accepted commands are certain to be those of the client in control: others may have any send time.
+    Only an accepted command is certain to come from the client in control. A rejected one may have any send time.
     """
-    commands = accepted_commands(admissions)
+    commands = accepted_commands(command_verdicts)
     received_ns = commands.ints("received_mono_ns")
     known = (commands.ints("sent_wall_ns") != MISSING) & (commands.ints("received_wall_ns") != MISSING)
     within = commands.where(known & (received_ns >= began_ns) & (received_ns <= ended_ns))
@@ -72,8 +87,12 @@ def control_latency_ns(admissions: Table, offset: ClockOffset, began_ns: int, en
 
 
 @dataclass(frozen=True, slots=True)
-class AcceptedLoops:
-    """The frames that led to an accepted command, each with its first such command (rows of `admission`)."""
+class FramesWithCommands:
+    """The frames that led to an accepted command.
+
+    `commands` has the first such command of each frame (rows of the channel `admission`), in the order of application.
+    The stamps are in the same order.
+    """
 
     stamp_ns: IntArray
     stamped_mono_ns: IntArray
@@ -95,16 +114,19 @@ class AcceptedLoops:
         return self.commands.ints("applied_mono_ns") - self.commands.ints("received_mono_ns")
 
 
-def accepted_commands(admissions: Table) -> Table:
+def accepted_commands(command_verdicts: Table) -> Table:
     """Return the accepted commands in the order in which they were applied."""
-    chosen = np.array([verdict == "accepted" for verdict in admissions.texts("verdict")], np.bool_)
-    commands = admissions.where(chosen & (admissions.ints("applied_mono_ns") != MISSING))
+    is_accepted = np.array([verdict == "accepted" for verdict in command_verdicts.texts("verdict")], np.bool_)
+    commands = command_verdicts.where(is_accepted & (command_verdicts.ints("applied_mono_ns") != MISSING))
     return commands.where(np.argsort(commands.ints("applied_mono_ns"), kind="stable"))
 
 
-def pair_loops(frames: Table, admissions: Table, ended_ns: int) -> AcceptedLoops:
-    """Pair each of `frames` with the first accepted command that carries its stamp and was applied by `ended_ns`."""
-    commands = accepted_commands(admissions)
+def frames_with_commands(frames: Table, command_verdicts: Table, ended_ns: int) -> FramesWithCommands:
+    """Pair each of `frames` with the first accepted command that carries its stamp and was applied by `ended_ns`.
+
+    Frames without such a command are left out.
+    """
+    commands = accepted_commands(command_verdicts)
     commands = commands.where(commands.ints("applied_mono_ns") <= ended_ns)
     stamped_ns = look_up(frames.ints("stamp_ns"), frames.ints("stamped_mono_ns"), commands.ints("stamp_ns"))
     _, first = np.unique(commands.ints("stamp_ns"), return_index=True)
@@ -112,15 +134,15 @@ def pair_loops(frames: Table, admissions: Table, ended_ns: int) -> AcceptedLoops
     chosen[first] = True
     chosen &= stamped_ns != MISSING
     commands = commands.where(chosen)
-    return AcceptedLoops(commands.ints("stamp_ns"), stamped_ns[chosen], commands)
+    return FramesWithCommands(commands.ints("stamp_ns"), stamped_ns[chosen], commands)
 
 
-def closure_ns(pictures: Table, paired: AcceptedLoops, offset: ClockOffset) -> IntArray:
+def latency_sum_error_ns(received_frames: Table, paired: FramesWithCommands, offset: ClockOffset) -> IntArray:
     """Return tau_v + client time + tau_c + actuator time - loop latency for every frame that has all of them.
 
-    The clock offset cancels in the sum. A clock that stepped and a command with another picture's times do not cancel.
+    The clock offset cancels in the sum. Errors from a clock step, or from times of the wrong picture, remain.
     """
-    readable = pictures.where(pictures.flags("readable"))
+    readable = received_frames.where(received_frames.flags("readable"))
     read_wall_ns = look_up(readable.ints("stamp_ns"), readable.ints("read_wall_ns"), paired.stamp_ns)
     commands = paired.commands
     needed = [read_wall_ns, *(commands.ints(name) for name in ("sent_wall_ns", "stamp_received_wall_ns"))]
@@ -132,35 +154,39 @@ def closure_ns(pictures: Table, paired: AcceptedLoops, offset: ClockOffset) -> I
 
 
 @dataclass(frozen=True, slots=True)
-class PictureAge:
-    """The time-weighted age of the picture behind the command in force; None where no command was in force."""
+class FrameAge:
+    """The time-weighted age of the frame from which the command in force was made.
+
+    None where no command was in force.
+    """
 
     mean_ms: float | None
     p95_ms: float | None
 
 
-def picture_age(frames: Table, admissions: Table, began_ns: int, ended_ns: int) -> PictureAge:
-    """Return the exact mean and 95th percentile of the picture age over the driving interval: it grows with slope 1.
+def frame_age(frames: Table, command_verdicts: Table, began_ns: int, ended_ns: int) -> FrameAge:
+    """Return the mean and the 95th percentile of the frame age during the driving interval.
 
-    `frames` are all frames of the run, because the first command in force may be older than the interval.
+    Both are exact: while a command is in force, the age of its frame grows by 1 s per second. `frames` are all frames
+    of the run, because the first command in force may be older than the interval.
     """
-    commands = accepted_commands(admissions)
+    commands = accepted_commands(command_verdicts)
     stamped_ns = look_up(frames.ints("stamp_ns"), frames.ints("stamped_mono_ns"), commands.ints("stamp_ns"))
     starts_ns = np.clip(commands.ints("applied_mono_ns"), began_ns, ended_ns)
     ends_ns = np.append(starts_ns[1:], ended_ns)[: len(starts_ns)]
-    used = (stamped_ns != MISSING) & (ends_ns > starts_ns)
-    youngest_ms = (starts_ns - stamped_ns)[used] / NS_PER_MS
-    oldest_ms = (ends_ns - stamped_ns)[used] / NS_PER_MS
+    in_force = (stamped_ns != MISSING) & (ends_ns > starts_ns)
+    youngest_ms = (starts_ns - stamped_ns)[in_force] / NS_PER_MS
+    oldest_ms = (ends_ns - stamped_ns)[in_force] / NS_PER_MS
     duration_ms = oldest_ms - youngest_ms
-    if not used.any():
-        return PictureAge(None, None)
+    if not in_force.any():
+        return FrameAge(None, None)
     mean_ms = float(np.sum(duration_ms * (youngest_ms + oldest_ms) / 2) / np.sum(duration_ms))
-    return PictureAge(mean_ms, _ramp_percentile(youngest_ms, oldest_ms, 0.95))
+    return FrameAge(mean_ms, _ramp_percentile(youngest_ms, oldest_ms, 0.95))
 
 
-def ages_at_actuation_ns(frames: Table, admissions: Table, began_ns: int, ended_ns: int) -> IntArray:
+def ages_at_actuation_ns(frames: Table, command_verdicts: Table, began_ns: int, ended_ns: int) -> IntArray:
     """Return the frame age at actuation of every accepted command: from its frame's stamp to its application."""
-    commands = accepted_commands(admissions)
+    commands = accepted_commands(command_verdicts)
     applied_ns = commands.ints("applied_mono_ns")
     stamped_ns = look_up(frames.ints("stamp_ns"), frames.ints("stamped_mono_ns"), commands.ints("stamp_ns"))
     known = (stamped_ns != MISSING) & (applied_ns >= began_ns) & (applied_ns <= ended_ns)
@@ -168,16 +194,17 @@ def ages_at_actuation_ns(frames: Table, admissions: Table, began_ns: int, ended_
 
 
 def _ramp_percentile(low: FloatArray, high: FloatArray, share: float) -> float:
-    """Return the time-weighted percentile of a quantity that repeatedly rises from `low` to `high` with slope 1.
+    """Return the time-weighted percentile `share` of a quantity that rises in ramps, all with slope 1.
 
-    The time spent below x is piecewise linear in x: its slope is the number of ramps that contain x.
+    Ramp i rises from `low[i]` to `high[i]`. The time that the quantity spends below x is piecewise linear in x, and the
+    slope of that function is the number of ramps that contain x.
     """
     ends = np.concatenate([low, high])
     order = np.argsort(ends, kind="stable")
-    ramps = np.cumsum(np.concatenate([np.ones(len(low)), -np.ones(len(high))])[order])
+    ramp_counts = np.cumsum(np.concatenate([np.ones(len(low)), -np.ones(len(high))])[order])
     corners = ends[order]
-    below = np.concatenate([[0.0], np.cumsum(ramps[:-1] * np.diff(corners))])
-    return float(np.interp(share * below[-1], below, corners))
+    time_below = np.concatenate([[0.0], np.cumsum(ramp_counts[:-1] * np.diff(corners))])
+    return float(np.interp(share * time_below[-1], time_below, corners))
 
 
 def percentiles_ms(times_ns: IntArray) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The measurements in `result.json`, computed from the two records of a run only."""
+"""The measurements in `result.json`, computed only from the two records of a run."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.experiment.analysis.clocks import RunClocks, run_clocks
 from lavt.experiment.analysis.latency import (
     ages_at_actuation_ns,
-    closure_ns,
     control_latency_ns,
-    decoded_pictures,
+    decoded_frames,
+    frame_age,
+    frames_with_commands,
     frames_within,
-    pair_loops,
+    latency_sum_error_ns,
     percentiles_ms,
-    picture_age,
-    pictures_of,
+    received_frames_of,
     video_latency_ns,
 )
 from lavt.experiment.analysis.stage_latency import stage_percentiles
@@ -40,8 +40,8 @@ from lavt.recording.table import MISSING, Table
 class RunMeasurement:
     """The measurements of a run.
 
-    `entry` has the keys of `result.json` from `ending` on. `closure_p95_ms` is the 95th percentile of the absolute
-    difference between the sum of the loop's parts and the loop latency, or None where it is unknown.
+    `entry` has the keys of `result.json` from `ending` on. `closure_p95_ms` is the closure: the 95th percentile of the
+    absolute difference between the sum of the loop's parts and the loop latency. It is None where it is unknown.
     """
 
     entry: Mapping[str, Any]
@@ -52,8 +52,8 @@ class RunMeasurement:
 def driving_interval(server: Record) -> tuple[int, int, str | None]:
     """Return start and end of the drive on the server's monotonic clock, and its ending.
 
-    Without an event `drive_began` the interval is empty. Without an event `ending` (a crash) it ends with the last
-    message of the record, and the ending is None.
+    Without an event `drive_began` the interval is empty. Without an event `ending`, as after a crash, the interval ends
+    with the last message of the record, and the ending is None.
     """
     began_ns: int | None = None
     ended_ns, ending = server.last_ns, None
@@ -70,15 +70,18 @@ def _events(events: Table) -> list[tuple[str, int, str]]:
 
 
 def measure(server: Record, client: Record) -> RunMeasurement:
-    """Compute every metric of a run. Metrics without data (no truth, no clock samples, no picture) are None."""
+    """Compute every metric of a run.
+
+    Metrics without data (no ground truth, no clock samples or no received frame) are None.
+    """
     began_ns, ended_ns, ending = driving_interval(server)
-    drove = began_ns <= ended_ns
+    has_begun = began_ns <= ended_ns
     clocks = run_clocks(server, client, began_ns, ended_ns)
     latencies, closure_p95_ms = _latencies(server, client, began_ns, ended_ns, clocks)
     entry = {
         "ending": ending,
         **_tracking(server, began_ns, ended_ns),
-        "duration_s": (ended_ns - began_ns) / NS_PER_S if drove else None,
+        "duration_s": (ended_ns - began_ns) / NS_PER_S if has_begun else None,
         **latencies,
         "delta": clocks.entry,
     }
@@ -108,29 +111,29 @@ def _tracking(server: Record, began_ns: int, ended_ns: int) -> dict[str, Any]:
 def _latencies(
     server: Record, client: Record, began_ns: int, ended_ns: int, clocks: RunClocks
 ) -> tuple[dict[str, Any], float | None]:
-    all_frames, admissions = server.table("frame"), server.table("admission")
+    all_frames, command_verdicts = server.table("frame"), server.table("admission")
     frames = frames_within(all_frames, began_ns, ended_ns)
-    pictures = decoded_pictures(pictures_of(client.table("picture"), frames))
-    paired = pair_loops(frames, admissions, ended_ns)
-    age = picture_age(all_frames, admissions, began_ns, ended_ns)
-    none = np.zeros(0, np.int64)
-    tau_v_ns, tau_c_ns, bound_ms, closure_p95_ms = none, none, clocks.bound_ms, None
+    decoded = decoded_frames(received_frames_of(client.table("picture"), frames))
+    paired = frames_with_commands(frames, command_verdicts, ended_ns)
+    age = frame_age(all_frames, command_verdicts, began_ns, ended_ns)
+    no_times = np.zeros(0, np.int64)
+    tau_v_ns, tau_c_ns, bound_ms, closure_p95_ms = no_times, no_times, clocks.bound_ms, None
     if clocks.offset is not None:
-        tau_v_ns = video_latency_ns(pictures, clocks.offset)
-        tau_c_ns = control_latency_ns(admissions, clocks.offset, began_ns, ended_ns)
-        closures_ns = closure_ns(pictures, paired, clocks.offset)
-        if len(closures_ns):
-            closure_p95_ms = float(np.percentile(np.abs(closures_ns), 95)) / NS_PER_MS
+        tau_v_ns = video_latency_ns(decoded, clocks.offset)
+        tau_c_ns = control_latency_ns(command_verdicts, clocks.offset, began_ns, ended_ns)
+        errors_ns = latency_sum_error_ns(decoded, paired, clocks.offset)
+        if len(errors_ns):
+            closure_p95_ms = float(np.percentile(np.abs(errors_ns), 95)) / NS_PER_MS
     entry = {
         "loop_ms": percentiles_ms(paired.loop_ns),
         "picture_age_ms": {"mean": age.mean_ms, "p95": age.p95_ms},
-        "age_at_actuation_ms": percentiles_ms(ages_at_actuation_ns(all_frames, admissions, began_ns, ended_ns)),
+        "age_at_actuation_ms": percentiles_ms(ages_at_actuation_ns(all_frames, command_verdicts, began_ns, ended_ns)),
         "tau_v_ms": _with_bound(percentiles_ms(tau_v_ns), bound_ms),
         "tau_c_ms": _with_bound(percentiles_ms(tau_c_ns), bound_ms),
         "stages_ms": stage_percentiles(server, client, frames, tau_c_ns, clocks.offset),
         "frames_sent": len(frames),
-        "frames_decoded": len(pictures),
-        "frames_unreadable": int(np.sum(~pictures.flags("readable"))),
+        "frames_decoded": len(decoded),
+        "frames_unreadable": int(np.sum(~decoded.flags("readable"))),
     }
     return entry, closure_p95_ms
 

@@ -36,10 +36,10 @@ IDENTITY = (
     "repetition",
     "seed",
 )
-"""The keys that identify a run, known before it is driven. Those that do not apply are null."""
+"""The keys that identify a run; their values are known before it is driven. A key that does not apply is null."""
 
 OPTIONAL_IDENTITY = ("axes", "changes", "injected_ms", "injected_least_ms")
-"""Further such keys, which only some runs have."""
+"""Further keys of the identity, which only some runs have."""
 
 
 def run_result(
@@ -52,13 +52,14 @@ def run_result(
 ) -> dict[str, Any]:
     """Compute the run's `result.json`, which is also its entry in `summary.json`, from its records.
 
-    `identity` has the keys `IDENTITY`, and may have `axes` (values of a sweep's further axes), `changes` (of the
-    condition), `injected_ms` (the requested delay) and `injected_least_ms` (where that is less), which are copied.
-    `reasons` are the reasons against the run that its records do not show.
+    `identity` has the keys `IDENTITY`. It may also have `axes` (the values of a sweep's further axes), `changes` (of
+    the condition), `injected_ms` (the requested delay) and `injected_least_ms` (the least expected delay, where it is
+    less than `injected_ms`); all of them are copied. `reasons` are further reasons for which the run is invalid, which
+    its records do not show.
     """
     measured = measure(server, client)
     all_reasons = [*invalid_reasons(server, client, measured), *reasons]
-    if not all_reasons and "injected_ms" in identity:  # with wrong clocks the latencies are wrong, too
+    if not all_reasons and "injected_ms" in identity:  # otherwise the latencies may be wrong
         all_reasons = absent_reasons(measured.entry, identity.get("injected_least_ms", identity["injected_ms"]))
     return {
         **{key: identity.get(key) for key in IDENTITY},

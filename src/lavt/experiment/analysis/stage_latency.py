@@ -9,7 +9,7 @@ import numpy as np
 
 from lavt.domain import NS_PER_MS
 from lavt.experiment.analysis.clock_offset import ClockOffset
-from lavt.experiment.analysis.latency import look_up, pictures_of, video_latency_ns
+from lavt.experiment.analysis.latency import look_up, received_frames_of, video_latency_ns
 from lavt.recording.record import Record
 from lavt.recording.table import MISSING, IntArray, Table
 
@@ -18,7 +18,7 @@ Stage = tuple[str, str]
 
 TO_WHEEL: Stage = ("vehicle", "command to wheel")
 AFTER_LOOP: frozenset[Stage] = frozenset({("actuator", "report"), TO_WHEEL})
-"""The stages after the command is applied, which ends the loop."""
+"""The stages after the loop, which ends when the command is applied."""
 
 StageDurations = list[tuple[Stage, IntArray]]
 """For each stage, in order, its duration for each frame that passed it."""
@@ -27,12 +27,15 @@ StageDurations = list[tuple[Stage, IntArray]]
 def stage_percentiles(
     server: Record, client: Record, frames: Table, tau_c_ns: IntArray, offset: ClockOffset | None
 ) -> list[dict[str, Any]]:
-    """Return for each stage of the pipeline of `frames`, in order, its latency (p50 and p95 in ms) and the count `n`.
+    """Return for each stage through which `frames` passed its latency (p50 and p95 in ms) and the count `n`.
 
-    The control link is tau_c of every accepted command. Without an `offset` the two network links are left out.
+    The stages are in the order of the pipeline. The control link is tau_c of every accepted command. Without an
+    `offset` the two network links are left out.
     """
-    pictures = pictures_of(client.table("picture"), frames)
-    video_ns = video_link_ns(server.table("timeline"), pictures, frames, offset) if offset else np.zeros(0, np.int64)
+    received_frames = received_frames_of(client.table("picture"), frames)
+    video_ns = np.zeros(0, np.int64)
+    if offset:
+        video_ns = video_link_ns(server.table("timeline"), received_frames, frames, offset)
     pipeline = chain(
         camera_stages(server, frames),
         [(("network", "video link"), video_ns)],
@@ -50,7 +53,7 @@ def _entry(stage: Stage, durations_ns: IntArray) -> dict[str, Any]:
 
 
 def camera_stages(server: Record, frames: Table) -> StageDurations:
-    """Return the durations of the camera's stages, from the stamp on: the loop begins there."""
+    """Return the durations of the camera's stages from the stamp on, because the loop begins with the stamp."""
     return _node_stages(server.table("timeline"), "camera", frames, from_stamp=True)
 
 
@@ -67,52 +70,63 @@ def actuator_stages(server: Record, frames: Table) -> StageDurations:
 
 
 def wheel_ns(server: Record, frames: Table) -> IntArray:
-    """Return the times from applying a command to the vehicle's report that it steers by it; empty without reports."""
+    """Return the times from the application of a command to the vehicle's report that it steers by this command.
+
+    Empty for a vehicle without such reports.
+    """
     wheel = server.table("wheel")
-    known = np.isin(wheel.ints("stamp_ns"), frames.ints("stamp_ns"))
-    return np.asarray((wheel.ints("wheel_mono_ns") - wheel.ints("applied_mono_ns"))[known], np.int64)
+    belongs = np.isin(wheel.ints("stamp_ns"), frames.ints("stamp_ns"))
+    return np.asarray((wheel.ints("wheel_mono_ns") - wheel.ints("applied_mono_ns"))[belongs], np.int64)
 
 
-def video_link_ns(timelines: Table, pictures: Table, frames: Table, offset: ClockOffset) -> IntArray:
-    """Return the times from a frame's last packet leaving the camera to the arrival of the packet that completed it.
+def video_link_ns(timelines: Table, received_frames: Table, frames: Table, offset: ClockOffset) -> IntArray:
+    """Return the time of each frame on the video link, in ns.
 
-    Each is tau_v minus the camera's time after the stamp, and minus the client's time until the stamp was read.
-    `timelines` are the server's.
+    It lasts from the moment when the camera sends the frame's last packet to the arrival of the packet that completed
+    the frame. It is computed as tau_v, minus the camera's time after the stamp, minus the client's time from the packet
+    to the reading of the stamp. `timelines` are the server's.
     """
     camera = timelines.where(np.array([node == "camera" for node in timelines.texts("node")], np.bool_))
-    left_ns = np.array([stages[-1][1] if stages else MISSING for stages in camera.objects("stages")], np.int64)
-    stamps = pictures.ints("stamp_ns")
-    left_ns = look_up(camera.ints("stamp_ns"), left_ns, stamps)
+    sent_ns = np.array([stages[-1][1] if stages else MISSING for stages in camera.objects("stages")], np.int64)
+    stamps = received_frames.ints("stamp_ns")
+    sent_ns = look_up(camera.ints("stamp_ns"), sent_ns, stamps)
     stamped_ns = look_up(frames.ints("stamp_ns"), frames.ints("stamped_mono_ns"), stamps)
-    needed = (pictures.ints(name) for name in ("read_wall_ns", "read_mono_ns", "packet_mono_ns"))
-    known = pictures.flags("readable") & np.all([each != MISSING for each in (left_ns, stamped_ns, *needed)], axis=0)
-    read = pictures.where(known)
-    on_client_ns = read.ints("read_mono_ns") - read.ints("packet_mono_ns")
-    return np.asarray(video_latency_ns(read, offset) - (left_ns - stamped_ns)[known] - on_client_ns, np.int64)
+    client_times = (received_frames.ints(name) for name in ("read_wall_ns", "read_mono_ns", "packet_mono_ns"))
+    has_times = np.all([times != MISSING for times in (sent_ns, stamped_ns, *client_times)], axis=0)
+    is_known = received_frames.flags("readable") & has_times
+    readable = received_frames.where(is_known)
+    on_camera_ns = (sent_ns - stamped_ns)[is_known]
+    on_client_ns = readable.ints("read_mono_ns") - readable.ints("packet_mono_ns")
+    return np.asarray(video_latency_ns(readable, offset) - on_camera_ns - on_client_ns, np.int64)
 
 
-def _receiver_ns(timelines: Table, pictures: Table, frames: Table) -> IntArray:
-    """Return the receiver's durations, from the packet that completed an access unit to the access unit at the driver.
+def _receiver_ns(timelines: Table, received_frames: Table, frames: Table) -> IntArray:
+    """Return the receiver's time for each frame, in ns.
 
-    They come from the pictures and the driver's timelines, as the receiver's own timelines have no stamps.
+    It lasts from the arrival of the packet that completed the access unit to the access unit's arrival at the driver.
+    Both times come from the driver's entries, because the receiver's own timelines have no stamps.
     """
     inputs = zip(timelines.texts("node"), timelines.texts("channel"), strict=True)
-    units = timelines.where(np.array([each == ("driver", "access_unit") for each in inputs], np.bool_))
+    units = timelines.where(np.array([node_input == ("driver", "access_unit") for node_input in inputs], np.bool_))
     stamps = frames.ints("stamp_ns")
-    packet_ns = look_up(pictures.ints("stamp_ns"), pictures.ints("packet_mono_ns"), stamps)
+    packet_ns = look_up(received_frames.ints("stamp_ns"), received_frames.ints("packet_mono_ns"), stamps)
     unit_ns = look_up(units.ints("stamp_ns"), units.ints("arrived_mono_ns"), stamps)
     known = (packet_ns != MISSING) & (unit_ns != MISSING)
     return np.asarray(unit_ns[known] - packet_ns[known], np.int64)
 
 
 def _node_stages(timelines: Table, node: str, frames: Table, *, from_stamp: bool = False) -> StageDurations:
-    """Return the durations of each stage of `node`, from the first timeline of each input channel for each frame."""
+    """Return the durations of each stage of `node`.
+
+    For each frame and each input channel, only the first timeline counts. With `from_stamp`, time before the stamp does
+    not count, and stages that ended before it are left out.
+    """
     timelines = timelines.where(np.array([name == node for name in timelines.texts("node")], np.bool_))
     stamps = timelines.ints("stamp_ns")
     stamped_ns = look_up(frames.ints("stamp_ns"), frames.ints("stamped_mono_ns"), stamps)
     durations_ns: dict[str, list[int]] = {}
-    seen: set[tuple[str, int]] = set()
-    for channel, stamp_ns, start_ns, arrived_ns, stages in zip(
+    counted: set[tuple[str, int]] = set()
+    for channel, stamp_ns, stamped_at_ns, arrived_ns, stages in zip(
         timelines.texts("channel"),
         stamps.tolist(),
         stamped_ns.tolist(),
@@ -120,13 +134,13 @@ def _node_stages(timelines: Table, node: str, frames: Table, *, from_stamp: bool
         timelines.objects("stages"),
         strict=True,
     ):
-        if start_ns == MISSING or (channel, stamp_ns) in seen:
+        if stamped_at_ns == MISSING or (channel, stamp_ns) in counted:
             continue
-        seen.add((channel, stamp_ns))
-        before_ns = max(arrived_ns, start_ns) if from_stamp else arrived_ns
+        counted.add((channel, stamp_ns))
+        begin_ns = max(arrived_ns, stamped_at_ns) if from_stamp else arrived_ns
         for name, end_ns in stages or []:
-            if end_ns > before_ns or not from_stamp:
+            if end_ns > begin_ns or not from_stamp:
                 stage = f"wait for {channel}" if name == "wait" else name
-                durations_ns.setdefault(stage, []).append(end_ns - before_ns)
-                before_ns = end_ns
-    return [((node, name), np.array(each, np.int64)) for name, each in durations_ns.items()]
+                durations_ns.setdefault(stage, []).append(end_ns - begin_ns)
+                begin_ns = end_ns
+    return [((node, name), np.array(durations, np.int64)) for name, durations in durations_ns.items()]

@@ -11,17 +11,18 @@ from lavt.experiment.analysis.tracking import distance_m, per_km, root_mean_squa
 from lavt.recording.table import Table
 
 REVERSAL_DEADBAND_RAD = 0.01
-"""The smallest turn back of the road wheels that counts as a steering reversal (0.57 degrees)."""
+"""A steering reversal is a turn of the road wheels back by more than this (0.57 degrees)."""
 
 MAX_DURATION_S = 24 * 3600
-"""A longer time is no drive, and its samples would fill the memory."""
+"""A longer time cannot be one drive, and its samples would fill the memory."""
 
 SAMPLE_RATE_HZ = 20.0
-"""The steering is resampled at this rate for its spectrum: no wheel oscillates at half of it."""
+"""The steering is resampled at this rate for its spectrum. No wheel oscillates as fast as half this rate."""
 LOWEST_HZ, HIGHEST_HZ = 0.1, 5.0
-"""Slower is the road, and faster is noise: the loop's own frequency lies between (`delay_margin.py`)."""
+"""The limits of the oscillation frequency. Slower steering follows the road, and faster steering is noise; the loop's
+own frequency lies between the limits (`delay_margin.py`)."""
 FEWEST_PERIODS = 3
-"""An oscillation has at least this many periods in the drive; fewer could be bends of the road."""
+"""An oscillation has at least this many periods in the drive. Fewer periods may be bends of the road."""
 
 
 def steering_metrics(truth: Table) -> dict[str, Any]:
@@ -29,19 +30,19 @@ def steering_metrics(truth: Table) -> dict[str, Any]:
     mono_ns, steering_rad = truth.ints("mono_ns"), truth.floats("steering_rad")
     known = np.isfinite(steering_rad)
     times_s, angle_rad = (mono_ns[known] - (mono_ns[known][0] if known.any() else 0)) / NS_PER_S, steering_rad[known]
-    reversals, driven_m = steering_reversals(angle_rad), distance_m(truth)
+    reversal_count, driven_m = steering_reversals(angle_rad), distance_m(truth)
     duration_s = float(times_s[-1]) if len(times_s) else 0.0
     return {
         "steering_rms_rad": root_mean_square(sampled_by_distance(truth, "steering_rad")),
         "steering_rate_rms_radps": steering_rate_rms_radps(times_s, angle_rad),
-        "steering_reversals_per_s": reversals / duration_s if duration_s > 0 else None,
-        "steering_reversals_per_km": per_km(reversals, driven_m) if len(times_s) else None,
+        "steering_reversals_per_s": reversal_count / duration_s if duration_s > 0 else None,
+        "steering_reversals_per_km": per_km(reversal_count, driven_m) if len(times_s) else None,
         "oscillation_hz": oscillation_hz(times_s, angle_rad),
     }
 
 
 def steering_rate_rms_radps(times_s: FloatArray, steering_rad: FloatArray) -> float | None:
-    """Return the time-weighted RMS of the steering rate between rows; None for fewer than two rows."""
+    """Return the time-weighted RMS of the steering rate between rows; None for fewer than two different times."""
     step_s = np.diff(times_s)
     if not (step_s > 0).any():
         return None
@@ -53,16 +54,17 @@ def oscillation_hz(times_s: FloatArray, steering_rad: FloatArray) -> float | Non
     """Return the frequency of the strongest steering oscillation.
 
     It is the highest peak of the periodogram (Hann window, mean and slope removed) between `LOWEST_HZ` and `HIGHEST_HZ`
-    with at least `FEWEST_PERIODS` in the drive; None where its peak-to-peak value is at most `REVERSAL_DEADBAND_RAD`.
+    with at least `FEWEST_PERIODS` in the drive. None without such a peak, or where the peak-to-peak amplitude of the
+    corresponding sine is at most `REVERSAL_DEADBAND_RAD`.
     """
     duration_s = float(times_s[-1] - times_s[0]) if len(times_s) else 0.0
     if duration_s > MAX_DURATION_S:
         raise ValueError(f"a drive of more than {MAX_DURATION_S // 3600} hours")
-    even_s = np.arange(0.0, duration_s, 1 / SAMPLE_RATE_HZ)
+    sampled_s = np.arange(0.0, duration_s, 1 / SAMPLE_RATE_HZ)
     if duration_s < FEWEST_PERIODS / HIGHEST_HZ:
         return None
-    even_rad = np.interp(even_s, times_s - times_s[0], steering_rad)
-    hertz, power = power_spectrum(even_rad)
+    sampled_rad = np.interp(sampled_s, times_s - times_s[0], steering_rad)
+    hertz, power = power_spectrum(sampled_rad)
     peaks = 1 + np.flatnonzero((power[1:-1] > power[:-2]) & (power[1:-1] > power[2:]))
     peaks = peaks[(hertz[peaks] >= max(LOWEST_HZ, FEWEST_PERIODS / duration_s)) & (hertz[peaks] <= HIGHEST_HZ)]
     if len(peaks) == 0:
@@ -72,28 +74,28 @@ def oscillation_hz(times_s: FloatArray, steering_rad: FloatArray) -> float | Non
     return float(hertz[highest]) if peak_to_peak_rad > REVERSAL_DEADBAND_RAD else None
 
 
-def power_spectrum(even_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return frequencies and the power at each, of angles sampled at `SAMPLE_RATE_HZ`; a sine's is amplitude^2 / 2.
+def power_spectrum(sampled_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return frequencies in Hz and the power at each of them, for angles sampled at `SAMPLE_RATE_HZ`.
 
-    Equal to `scipy.signal.periodogram` with `scaling="spectrum"`, whose import takes longer than a short drive without
-    pixels.
+    The power of a sine is amplitude^2 / 2. The result is equal to that of `scipy.signal.periodogram` with
+    `scaling="spectrum"`, whose import takes longer than a short drive without pixels.
     """
-    index = np.arange(len(even_rad))
-    line = np.polynomial.Polynomial.fit(index, even_rad, 1)(index)
-    window = np.hanning(len(even_rad) + 1)[:-1]
+    index = np.arange(len(sampled_rad))
+    line = np.polynomial.Polynomial.fit(index, sampled_rad, 1)(index)
+    window = np.hanning(len(sampled_rad) + 1)[:-1]
     # Zero padding resolves the peak more finely than one period per drive.
-    length = 1 << (8 * len(even_rad) - 1).bit_length()
-    amplitudes = np.abs(np.fft.rfft((even_rad - line) * window, length)) / window.sum()
+    length = 1 << (8 * len(sampled_rad) - 1).bit_length()
+    amplitudes = np.abs(np.fft.rfft((sampled_rad - line) * window, length)) / window.sum()
     hertz = np.fft.rfftfreq(length, 1 / SAMPLE_RATE_HZ)
     return np.asarray(hertz, np.float64), np.asarray(2 * amplitudes**2, np.float64)
 
 
 def steering_reversals(steering_rad: FloatArray) -> int:
-    """Return the number of turns back by more than `REVERSAL_DEADBAND_RAD` from the last extreme."""
+    """Return how often the steering turned back from its last extreme by more than `REVERSAL_DEADBAND_RAD`."""
     count, direction = 0, 0
     extreme = lowest = highest = steering_rad[0] if len(steering_rad) else 0.0
     for angle in steering_rad.tolist():
-        if direction == 0:  # unknown yet: the first turn sets it and is not a reversal
+        if direction == 0:  # the direction is unknown: the first turn determines it and is not a reversal
             lowest, highest = min(lowest, angle), max(highest, angle)
             if highest - lowest > REVERSAL_DEADBAND_RAD:
                 direction, extreme = (1 if angle == highest else -1), angle

@@ -8,13 +8,14 @@ from lavt.domain import FloatArray
 from lavt.recording.table import Table
 
 STEP_M = 0.25
-"""Errors are sampled by distance, so that slow or waiting phases do not count more than fast ones."""
+"""The distance between two samples of an error. Errors are sampled by distance and not by time, so that phases in which
+the car drives slowly or is stationary do not count more."""
 
 MAX_DISTANCE_M = 50_000
-"""A longer progress is no drive, and would take minutes to evaluate."""
+"""A longer progress cannot be one drive, and would take minutes to evaluate."""
 
 PARTIAL_STEP_M = 10
-"""The error from the start is kept at multiples of this distance, to compare runs that ended early."""
+"""The result has the error from the start to each multiple of this distance, to compare runs that ended early."""
 
 
 def sampled_by_distance(truth: Table, name: str) -> FloatArray:
@@ -29,11 +30,11 @@ def sampled_by_distance(truth: Table, name: str) -> FloatArray:
     if len(progress_m) == 0:
         return np.zeros(0)
     farthest_m = np.maximum.accumulate(progress_m)
-    new = np.concatenate([[True], progress_m[1:] > farthest_m[:-1]])
+    is_new_progress = np.concatenate([[True], progress_m[1:] > farthest_m[:-1]])
     if farthest_m[-1] - progress_m[0] > MAX_DISTANCE_M:
         raise ValueError(f"a drive of more than {MAX_DISTANCE_M / 1000:g} km")
     positions_m = np.arange(progress_m[0], farthest_m[-1] + 1e-9, STEP_M)
-    return np.asarray(np.interp(positions_m, progress_m[new], values[new]), np.float64)
+    return np.asarray(np.interp(positions_m, progress_m[is_new_progress], values[is_new_progress]), np.float64)
 
 
 def cross_track_metrics(truth: Table) -> dict[str, float | None]:
@@ -50,13 +51,13 @@ def cross_track_metrics(truth: Table) -> dict[str, float | None]:
 
 
 def p95_by_10m(truth: Table) -> list[float]:
-    """Return the 95th percentile of the distance from the lane's centre, from the start to 10 m, 20 m, .. of progress.
+    """Return the 95th percentile of the distance from the lane's centre up to each multiple of 10 m of progress.
 
-    Only full multiples of 10 m are included: the list is empty for less than 10 m.
+    Entry i covers the route from the start of the drive to 10 m x (i + 1). The list is empty for less than 10 m.
     """
     error_m = np.abs(sampled_by_distance(truth, "cross_track_m"))
-    step = round(PARTIAL_STEP_M / STEP_M)
-    return [float(np.percentile(error_m[: end + 1], 95)) for end in range(step, len(error_m), step)]
+    samples = round(PARTIAL_STEP_M / STEP_M)
+    return [float(np.percentile(error_m[: end + 1], 95)) for end in range(samples, len(error_m), samples)]
 
 
 def heading_metrics(truth: Table) -> dict[str, float | None]:

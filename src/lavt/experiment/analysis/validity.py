@@ -1,4 +1,7 @@
-"""The validity of a run: reasons for which it is invalid, from the infrastructure only, never from the driving."""
+"""The validity of a run: the reasons for which it is invalid.
+
+They concern the infrastructure only, never the driving.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +14,11 @@ from lavt.experiment.analysis.metrics import RunMeasurement, driving_interval, l
 from lavt.recording.record import Record
 
 CLOSURE_LIMIT_MS = 1.0
+"""A larger closure shows that a clock or the times of a command are wrong."""
 LATE_LIMIT = 0.01
-"""The largest share of the drive for which the physics may lag, in lags of over 50 ms."""
-SKIPPED_LIMIT = 0.01
-"""The largest share of camera ticks that may be missed."""
+"""The largest share of the drive for which the physics may be late; only delays of over 50 ms are counted."""
+MISSED_FRAMES_LIMIT = 0.01
+"""The largest share of its frames that the camera may miss."""
 INJECTION_LIMIT_MS = 1.0
 """The largest difference between the injected and the requested delay."""
 
@@ -25,7 +29,7 @@ def invalid_reasons(server: Record, client: Record, measured: RunMeasurement) ->
         *_record_reasons("server", server),
         *_record_reasons("client", client),
         *_clock_reasons(server, client, measured),
-        *_tick_reasons(server),
+        *_simulator_reasons(server),
     ]
 
 
@@ -38,7 +42,10 @@ def _record_reasons(side: str, record: Record) -> list[str]:
 
 
 def _clock_reasons(server: Record, client: Record, measured: RunMeasurement) -> list[str]:
-    """Return the reasons from the clocks; where a clock was set, other reasons are its consequences and left out."""
+    """Return the reasons from the clocks.
+
+    Where a clock was set, the offset and the closure are wrong in consequence, and are not reported.
+    """
     began_ns, ended_ns, _ = driving_interval(server)
     polls = poll_reasons(server, client, began_ns, ended_ns)
     steps = step_reasons(server, client, measured.clocks, began_ns, ended_ns)
@@ -57,7 +64,7 @@ def _closure_reasons(measured: RunMeasurement) -> list[str]:
     ]
 
 
-def _tick_reasons(server: Record) -> list[str]:
+def _simulator_reasons(server: Record) -> list[str]:
     """Return the reasons from the server's physics and camera during the drive."""
     began_ns, ended_ns, ending = driving_interval(server)
     reasons = [] if ending is not None else ["the record has no ending"]
@@ -71,21 +78,24 @@ def _tick_reasons(server: Record) -> list[str]:
     if sum(late_ms) * NS_PER_MS > LATE_LIMIT * (ended_ns - began_ns):
         reasons.append(f"the physics was {sum(late_ms)} ms late in total (limit {LATE_LIMIT:.0%} of the drive)")
     numbers = frames_within(server.table("frame"), began_ns, ended_ns).ints("number")
-    ticks = int(numbers[-1] - numbers[0]) + 1 if len(numbers) else 0
-    skipped = ticks - len(numbers)
-    if skipped > SKIPPED_LIMIT * ticks:
-        reasons.append(f"the camera missed {skipped} of {ticks} ticks (limit {SKIPPED_LIMIT:.0%})")
+    due = int(numbers[-1] - numbers[0]) + 1 if len(numbers) else 0
+    missed = due - len(numbers)
+    if missed > MISSED_FRAMES_LIMIT * due:
+        reasons.append(f"the camera missed {missed} of {due} frames (limit {MISSED_FRAMES_LIMIT:.0%})")
     return reasons
 
 
 def lateness_reasons(late_ms: Mapping[str, float | None]) -> list[str]:
-    """Return a reason for each direction in which the relay sent packets later than requested, in the median."""
+    """Return a reason for each direction in which the relay sent packets too late, or whose lateness is unknown.
+
+    `late_ms` has the median lateness of each direction, relative to the planned send times.
+    """
     reasons = []
     for direction, median_ms in late_ms.items():
         if median_ms is None:
             reasons.append(f"the injected delay of {direction} was not measured")
         elif abs(median_ms) > INJECTION_LIMIT_MS:
-            reasons.append(f"{direction} left the relay {median_ms:.1f} ms later than requested, in the median")
+            reasons.append(f"the relay sent {direction} packets {median_ms:.1f} ms later than planned, in the median")
     return reasons
 
 
@@ -93,9 +103,9 @@ def injection_reasons(requested_ms: Mapping[str, float], measured_ms: Mapping[st
     """Return a reason for each direction whose median delay in the relay or netem differs from the request."""
     reasons = []
     for direction, delay_ms in requested_ms.items():
-        found_ms = measured_ms.get(direction)
-        if found_ms is None:
+        median_ms = measured_ms.get(direction)
+        if median_ms is None:
             reasons.append(f"the injected delay of {direction} was not measured")
-        elif abs(found_ms - delay_ms) > INJECTION_LIMIT_MS:
-            reasons.append(f"{direction} was delayed by {found_ms:.1f} ms where {delay_ms:g} ms was requested")
+        elif abs(median_ms - delay_ms) > INJECTION_LIMIT_MS:
+            reasons.append(f"{direction} was delayed by {median_ms:.1f} ms, but {delay_ms:g} ms were requested")
     return reasons

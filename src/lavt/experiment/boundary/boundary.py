@@ -1,4 +1,4 @@
-"""The search for the maximum tolerable latency of a loop, for many seeds on all cores (`docs/boundary.md`)."""
+"""The search for the maximum tolerable latency of a loop, with many seeds and on all cores (`docs/boundary.md`)."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from lavt.experiment.sweep.workers import Workers, process_workers
 BOUNDARY = "boundary.json"
 FIELDS = ("route", "preset", "seed", "repetition", *(f"{name}_ms" for name in CRITERIA), "theory_ms")
 SEARCH_KEYS = frozenset({"routes", "presets", "repetition", "repetitions", "longest_delay_ms", "grid_ms", "within_ms"})
-"""The keys of a boundary config that are not a run's."""
+"""The keys of a boundary config that are not keys of a run's config."""
 
 ProgressCallback = Callable[[str], None]
 """A callback that shows one line of progress."""
@@ -43,7 +43,7 @@ TotalDelay = Callable[[float], float]
 
 @dataclass(frozen=True, slots=True)
 class BoundarySearch:
-    """One search: a run of one seed, route and preset without added delay, and the searched delays."""
+    """One search: a planned run of one seed, route and preset without added delay, and the delays to search."""
 
     planned: PlannedRun
     longest_delay_ms: float
@@ -57,10 +57,11 @@ class BoundarySearch:
 
 
 def plan_boundary(config: BoundaryConfig) -> list[BoundarySearch]:
-    """Plan the searches of every route with every preset, repeated; the first seed of each comes before any second one.
+    """Plan the searches of every route with every preset, once for each repetition.
 
-    Raises `UserError` for a run that `plan_run` rejects, for a run in real time or without the simulator, for a given
-    video delay, and for missing or duplicate routes or presets.
+    The first repetition of all searches comes before the second one. Raises `UserError` for a run that `plan_run`
+    rejects, for a run in real time or without the simulator, for a config with a video delay, and for missing or
+    duplicate routes or presets.
     """
     if config.time != "virtual" or config.vehicle.kind != "simulator":
         raise UserError(
@@ -94,7 +95,7 @@ def with_video_delay(config: RunConfig, delay_ms: float) -> RunConfig:
 
 
 def began(drive: MonitoredRun) -> bool:
-    """Return whether the drive began: the vehicle is never armed with pictures that are too old."""
+    """Return whether the drive began: a vehicle whose frames are too old is never armed."""
     return len(drive.time_s) > 0
 
 
@@ -104,7 +105,7 @@ def departed(drive: MonitoredRun) -> bool:
 
 
 def not_completed(drive: MonitoredRun) -> bool:
-    """Return whether the drive had another ending than the route's end."""
+    """Return whether the drive ended before the end of the route."""
     return drive.ending != "completed"
 
 
@@ -116,11 +117,11 @@ def run_search(search: BoundarySearch) -> dict[str, Any]:
     def drive(delay_ms: float) -> MonitoredRun:
         return drive_monitored(plan_run(with_video_delay(config, delay_ms), name=search.name))
 
-    added_ms: list[float] = []
+    without_added_ms: list[float] = []  # the total delay minus the added delay, of each drive on the straight road
 
     def growth(delay_ms: float) -> float:
         measured_ms, growth_per_s = straight_growth(with_video_delay(config, delay_ms))
-        added_ms.append(measured_ms - delay_ms)
+        without_added_ms.append(measured_ms - delay_ms)
         return growth_per_s
 
     grid_ms = _grid(search.longest_delay_ms, search.grid_ms)
@@ -130,16 +131,18 @@ def run_search(search: BoundarySearch) -> dict[str, Any]:
 
     def total_ms(delay_ms: float) -> float:
         measured_ms = drive(delay_ms).total_delay_ms
-        return first_total_ms + delay_ms if math.isnan(measured_ms) else measured_ms  # NaN: pictures were too old
+        return (
+            first_total_ms + delay_ms if math.isnan(measured_ms) else measured_ms
+        )  # NaN: the frames were too old to drive
 
     theory_ms = theoretical_ms(config)
     guess_ms = search.longest_delay_ms / 2 if theory_ms is None else theory_ms - first_total_ms
     onset = zero_bracket(functools.cache(growth), guess_ms, search.longest_delay_ms, search.within_ms)
-    begun_ms = [delay_ms for delay_ms in grid_ms if began(drive(delay_ms))]
-    departure = first_bracket(lambda delay_ms: departed(drive(delay_ms)), begun_ms, search.within_ms)
+    begun_grid_ms = [delay_ms for delay_ms in grid_ms if began(drive(delay_ms))]
+    departure = first_bracket(lambda delay_ms: departed(drive(delay_ms)), begun_grid_ms, search.within_ms)
     completion = first_bracket(lambda delay_ms: not_completed(drive(delay_ms)), grid_ms, search.within_ms)
-    found: dict[str, tuple[Bracket, TotalDelay]] = {
-        "onset": (onset, lambda delay_ms: delay_ms + float(np.nanmedian(added_ms))),
+    brackets: dict[str, tuple[Bracket, TotalDelay]] = {
+        "onset": (onset, lambda delay_ms: delay_ms + float(np.nanmedian(without_added_ms))),
         "departure": (departure, total_ms),
         "completion": (completion, total_ms),
     }
@@ -148,16 +151,16 @@ def run_search(search: BoundarySearch) -> dict[str, Any]:
         "preset": identity["preset"],
         "seed": identity["seed"],
         "repetition": identity["repetition"],
-        **{f"{name}_ms": _middle_ms(bracket, total) for name, (bracket, total) in found.items()},
+        **{f"{name}_ms": _middle_ms(bracket, total) for name, (bracket, total) in brackets.items()},
         "theory_ms": theory_ms,
         "searched_ms": [first_total_ms, total_ms(grid_ms[-1])],
-        "below": [name for name, (bracket, _) in found.items() if bracket.low_ms is None],
-        "not_monotone": [name for name, (bracket, _) in found.items() if not bracket.monotone],
+        "below": [name for name, (bracket, _) in brackets.items() if bracket.low_ms is None],
+        "not_monotone": [name for name, (bracket, _) in brackets.items() if not bracket.monotone],
     }
 
 
 def _grid(longest_ms: float, step_ms: float) -> list[float]:
-    """Return delays from 0 on, `step_ms` apart, and the longest delay."""
+    """Return the delays 0, `step_ms`, 2 x `step_ms` and so on below the longest delay, and the longest delay."""
     count = math.ceil(longest_ms / step_ms)
     return [*(number * step_ms for number in range(count)), longest_ms]
 
@@ -170,7 +173,10 @@ def _middle_ms(bracket: Bracket, total: TotalDelay) -> float | None:
 
 
 def theoretical_ms(config: RunConfig) -> float | None:
-    """Return the delay margin of the configured loop; None for a loop without a model, and without a finite margin."""
+    """Return the delay margin of the configured loop in ms.
+
+    None if there is no model of the loop, or if its margin is not finite.
+    """
     loop = configured_loop(config)
     critical_s = math.inf if loop is None else critical_delay_s(loop)
     return critical_s * 1000 if math.isfinite(critical_s) else None
@@ -181,15 +187,17 @@ def run_searches(
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]], bool]:
     """Run all searches, `jobs` at a time (None: one per core).
 
-    Returns the found boundaries in the order of `searches`, the failed searches with their reasons, and whether all
-    searches are done. After Ctrl-C they are not: the searches in progress are finished, and no others are started.
+    Returns the boundaries that were found, in the order of `searches`, the failed searches with their reasons, and
+    whether the call ran to its end. After Ctrl-C it did not: the searches in progress are finished, and no others are
+    started.
     """
     progress, done = _SearchProgress(on_progress), True
     try:
         _search_in_processes(progress, searches, jobs or os.cpu_count() or 1)
     except KeyboardInterrupt:
         done = False
-    return [progress.found[each.name] for each in searches if each.name in progress.found], progress.failed, done
+    found = [progress.found[search.name] for search in searches if search.name in progress.found]
+    return found, progress.failed, done
 
 
 class _SearchProgress:
@@ -202,7 +210,7 @@ class _SearchProgress:
 
     def search(self, workers: Workers, todo: Sequence[BoundarySearch]) -> list[BoundarySearch]:
         """Run searches, and return those that were not run because a worker's process died, in the order of `todo`."""
-        futures = {workers.executor.submit(run_search, each): each for each in todo}
+        futures = {workers.executor.submit(run_search, search): search for search in todo}
         broken: set[str] = set()
 
         def take(future: Future[dict[str, Any]]) -> None:
@@ -211,7 +219,7 @@ class _SearchProgress:
                 self.found[search.name] = future.result()
             except BrokenExecutor:
                 broken.add(search.name)
-            except Exception as error:  # of any kind: the other searches are independent of it
+            except Exception as error:  # the other searches continue, whatever this one raised
                 self.fail(search, describe_error(error))
             else:
                 self._on_progress(f"{search.name}: {_format_boundaries(self.found[search.name])}")
@@ -221,10 +229,10 @@ class _SearchProgress:
                 take(future)
         except KeyboardInterrupt:
             workers.stop()
-            for future in [each for each in futures if not each.cancelled()]:
+            for future in [future for future in futures if not future.cancelled()]:
                 take(future)
             raise
-        return [each for each in todo if each.name in broken]
+        return [search for search in todo if search.name in broken]
 
     def fail(self, search: BoundarySearch, reason: str) -> None:
         """Add a failed search."""
@@ -233,14 +241,18 @@ class _SearchProgress:
 
 
 def _search_in_processes(progress: _SearchProgress, todo: Sequence[BoundarySearch], jobs: int) -> None:
-    """Search in processes; a process that dies breaks the pool, and searches it may have begun are repeated alone."""
+    """Run the searches in a pool of processes.
+
+    A process that dies breaks the pool. The searches that it may have begun are then repeated, each in a pool of its
+    own.
+    """
     while todo:
         with process_workers(jobs) as workers:
             broken = progress.search(workers, todo)
-        for each in broken[:jobs]:  # searches begin in order, so only the first ones can have begun
+        for search in broken[:jobs]:  # searches begin in order, so only the first ones can have begun
             with process_workers(1) as single:
-                if progress.search(single, [each]):
-                    progress.fail(each, "the process that searched it died")
+                if progress.search(single, [search]):
+                    progress.fail(search, "the process that searched it died")
         todo = broken[jobs:]
 
 

@@ -5,14 +5,16 @@ behind a first-order steering lag; the controller is pure pursuit linearised abo
 
     command = -(2 wheelbase / lookahead^2) (lateral error + lookahead x heading error),
 
-computed once per frame from an exponential moving average and constant until the next command takes effect. The total
-delay, from the middle of exposure to the wheel's command, splits into whole frames and a fraction: within one frame the
-old command acts first and then the new one, so the sampled plant has two input matrices (Astrom and Wittenmark,
-Computer-Controlled Systems, section 3.2). The wait for the next picture, half a frame on average, is this model's
-zero-order hold and must not be added to the delay again. A car's dead time of steering adds to the total delay.
+computed once per frame from an exponential moving average of the lane, and constant until the next command takes
+effect. The total delay lasts from the middle of the exposure to the moment when the command is in force. It consists of
+a number of whole frame periods and a fraction of one. So in each frame period the old command acts first and then the
+new one, and the sampled plant has two input matrices (Astrom and Wittenmark, Computer-Controlled Systems, section 3.2).
+The wait for the next frame, half a frame period on average, is the zero-order hold of this model and must not be added
+to the delay again. The dead time of a car's steering is added to the total delay.
 
-Without lag, filter, hold and tyres the delay margin is `DELAY_PER_LOOKAHEAD` x lookahead / speed (Heredia and Ollero,
-Advanced Robotics 21, 2007, analyse that case), which is two to three times too large for a real car.
+Without the lag, the average, the zero-order hold and the tyres, the delay margin is `DELAY_PER_LOOKAHEAD` x lookahead /
+speed (Heredia and Ollero, Advanced Robotics 21, 2007, analyse that case), which is two to three times too large for a
+real car.
 """
 
 from __future__ import annotations
@@ -41,9 +43,9 @@ DELAY_PER_LOOKAHEAD = math.acos(math.sqrt(2) - 1) / math.sqrt(2 + 2 * math.sqrt(
 |L(jw)| = 1 at (w / a)^2 = 2 + 2 sqrt(2); the phase margin there, atan(w / a), is acos(sqrt(2) - 1)."""
 
 DEFAULT_CAR = LINCOLN_MKZ
-"""The simulator's car; the model uses its parameters of the lateral motion at small slip."""
+"""The simulator's car. The model uses only its parameters of the lateral motion at small slip."""
 
-_LONGEST_DELAY_S = 3.0  # beyond every delay of interest; the search ends there
+_LONGEST_DELAY_S = 3.0  # the search ends here, beyond every delay of interest
 _SEARCH_STEP_S = 0.005
 
 
@@ -55,24 +57,24 @@ class LateralLoop:
     speed_mps: float = 30 / 3.6
     frame_rate_hz: float = 30.0
     smoothing: float = SMOOTHING
-    """The weight of the newest picture in the moving average; 1 is no averaging."""
+    """The weight of the newest frame in the moving average; 1 means no averaging."""
     car: CarParameters = DEFAULT_CAR
     controller_wheelbase_m: float | None = None
-    """The wheelbase that the controller assumes; None: the car's."""
+    """The wheelbase that the controller assumes; None for the car's own."""
 
     @property
     def gain(self) -> FloatArray:
-        """The gains of pure pursuit on (lateral error of the rear axle, heading error), (2,)."""
+        """The gains of pure pursuit for the lateral error of the rear axle and for the heading error, (2,)."""
         distance_m = self.lookahead_s * self.speed_mps
         wheelbase_m = self.controller_wheelbase_m or self.car.wheelbase_m
         return -2 * wheelbase_m / distance_m**2 * np.array([1.0, distance_m])
 
 
 def configured_loop(config: RunConfig) -> LateralLoop | None:
-    """Return the loop of a run: preset with its changed settings, frame rate, car with lags and dead time.
+    """Return the loop of a run, with the run's controller settings, frame rate and car.
 
-    The lookahead is that at the preset's speed, within the controller's bounds. None where the car or the controller is
-    not LAVT's, as there is no model of it. Raises `UserError` for a preset or car that does not exist.
+    The lookahead is that at the preset's speed, within the controller's bounds. None if the car or the controller is
+    not LAVT's, because there is no model of it. Raises `UserError` for a preset or car that does not exist.
     """
     controller, vehicle = config.controller, config.vehicle
     if (controller.kind, vehicle.kind) != ("lane_keeper", "simulator"):
@@ -119,7 +121,10 @@ def _advance(a: FloatArray, b: FloatArray, duration_s: float) -> tuple[FloatArra
 
 @dataclass(frozen=True, slots=True)
 class _SampledPlant:
-    """The plant sampled once per frame: x' = transition x + by_old u[k - frames - 1] + by_new u[k - frames]."""
+    """The plant sampled once per frame.
+
+    x[k + 1] = transition x[k] + by_old u[k - frames - 1] + by_new u[k - frames]
+    """
 
     transition: FloatArray
     by_old: FloatArray
@@ -142,8 +147,9 @@ def _sampled(loop: LateralLoop, total_delay_s: float) -> _SampledPlant:
 def closed_loop(loop: LateralLoop, total_delay_s: float) -> FloatArray:
     """Return the state transition matrix of the closed loop over one frame.
 
-    The state is the car's five states, followed by the commands u[k - 1], u[k - 2] .. that still act. The newest of
-    them is the state of the moving average: the command is linear in the lane, so averaging either is the same.
+    The state consists of the car's five states, and the commands u[k - 1], u[k - 2] .. that still act. The newest of
+    these commands is also the state of the moving average: the command is a linear function of the lane, so the average
+    of the commands is the command for the average of the lanes.
     """
     sampled = _sampled(loop, total_delay_s)
     size, past = 5, sampled.frames + 1
@@ -168,7 +174,7 @@ def spectral_radius(loop: LateralLoop, total_delay_s: float) -> float:
 
 
 def critical_delay_s(loop: LateralLoop) -> float:
-    """Return the delay margin: the smallest total delay in seconds at which `loop` is unstable; infinite above 3 s."""
+    """Return the delay margin: the smallest total delay in seconds at which `loop` is unstable; infinity above 3 s."""
     for number in range(int(_LONGEST_DELAY_S / _SEARCH_STEP_S)):
         if spectral_radius(loop, number * _SEARCH_STEP_S) >= 1:
             if number == 0:
@@ -182,7 +188,7 @@ def critical_delay_s(loop: LateralLoop) -> float:
 
 
 def _response(loop: LateralLoop, sampled: _SampledPlant, frequencies_radps: FloatArray) -> ComplexArray:
-    """Return the frequency response of the open loop, cut at the controller's output, (n,)."""
+    """Return the frequency response of the loop, opened at the controller's output, (n,)."""
     z = np.exp(1j * frequencies_radps / loop.frame_rate_hz)[:, np.newaxis]
     delayed = sampled.by_new * z**-sampled.frames + sampled.by_old * z ** -(sampled.frames + 1)
     resolvents = z[..., np.newaxis] * np.eye(5) - sampled.transition
@@ -220,8 +226,8 @@ def phase_margin_rad(loop: LateralLoop, total_delay_s: float) -> float:
 def smallest_lookahead_s(margin_rad: float, total_delay_s: float) -> float:
     """Return the smallest lookahead in seconds with a phase margin of `margin_rad` at `total_delay_s`.
 
-    Everything else is the default of `LateralLoop`. The margin grows with the lookahead, as the crossover frequency
-    falls.
+    All other parameters are the defaults of `LateralLoop`. The phase margin grows with the lookahead, because the
+    crossover frequency falls.
     """
     return _crossing(
         lambda lookahead_s: phase_margin_rad(LateralLoop(lookahead_s), total_delay_s) - margin_rad, low=0.3, high=5.0

@@ -1,4 +1,4 @@
-"""The oscillation growth of a loop: whether a car's oscillation on a straight road grows or decays, by measurement."""
+"""The measured oscillation growth of a loop: whether a car's oscillation on a straight road grows or decays."""
 
 from __future__ import annotations
 
@@ -19,17 +19,19 @@ ROAD = "straight"
 DRIVE_LIMIT_S = 45.0
 """The longest drive, including the time before arming."""
 NEAR_CENTRE_START = (0.02, math.radians(0.2))
-"""The largest initial distance from the lane's centre (m) and heading error (rad): a small oscillation can grow."""
+"""The largest initial distance from the lane's centre (m) and heading error (rad). They are small, so that the
+oscillation has room to grow."""
 
 SETTLED_SHARE = 0.01
-"""The speed has settled when it stays this close to the final speed."""
+"""The speed has settled when it differs from the final speed by less than this share and remains so."""
 LINEAR_RANGE_M = 0.2
-"""Within this distance from the centre, tyres, wheel and commands are far from every limit, and the loop is linear."""
+"""Within this distance from the centre, the tyres, the steering angle and the commands are far from every limit, and
+the loop is linear."""
 FEWEST_HALF_PERIODS = 4
 
 
 def half_period_peaks(time_s: FloatArray, cross_track_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return time and size of the largest distance from the centre in each complete half period.
+    """Return times in s and values in m of the largest distance from the centre in each complete half period.
 
     A half period reaches from one crossing of the centre to the next.
     """
@@ -40,12 +42,12 @@ def half_period_peaks(time_s: FloatArray, cross_track_m: FloatArray) -> tuple[Fl
 
 
 def growth_per_s(drive: MonitoredRun) -> float:
-    """Return the oscillation growth in 1/s: the derivative of the logarithm of its size, negative for a decay.
+    """Return the oscillation growth in 1/s: the slope of the logarithm of the amplitude, negative for a decay.
 
-    It is the slope of the least-squares line through the logarithms of the peaks of all half periods, from the time at
-    which the speed has settled until the distance from the centre exceeds `LINEAR_RANGE_M` or a safety limit changes a
-    command. With fewer than four half periods it is infinite: positive where the range was exceeded, negative where
-    there was no oscillation or no drive.
+    It is the slope of the least-squares line through the logarithms of the peaks of all half periods. The evaluation
+    begins when the speed has settled. It ends when the distance from the centre exceeds `LINEAR_RANGE_M` or a safety
+    limit changes a command. With fewer than `FEWEST_HALF_PERIODS` the growth is infinite: positive if the evaluation
+    ended in this way, and negative if there was no oscillation or no drive.
     """
     if len(drive.time_s) == 0:
         return -math.inf
@@ -65,12 +67,13 @@ def growth_per_s(drive: MonitoredRun) -> float:
 def straight_run(config: RunConfig) -> PlannedRun:
     """Plan the run of `config` on a straight road instead of its route, with a start near the centre.
 
-    Its seed is the first in a series derived from the run's own seed whose start lies within `NEAR_CENTRE_START`.
+    A series of seeds is derived from the run's own seed. The run has the first of them whose start is within
+    `NEAR_CENTRE_START`.
     """
     vehicle = config.vehicle.model_copy(update={"route": ROAD})
     planned = plan_run(config.model_copy(update={"vehicle": vehicle}), name=ROAD)
-    own = run_seed(config.seed, config.vehicle.route, config.repetition)
-    return replace(planned, seed=near_centre_seed(own))
+    own_seed = run_seed(config.seed, config.vehicle.route, config.repetition)
+    return replace(planned, seed=near_centre_seed(own_seed))
 
 
 def near_centre_seed(seed: int) -> int:
@@ -78,9 +81,9 @@ def near_centre_seed(seed: int) -> int:
     limit_m, limit_rad = NEAR_CENTRE_START
     seeds = (run_seed(seed, ROAD, number) for number in itertools.count())
     return next(
-        each
-        for each in seeds
-        for _, offset_m, heading_rad in [start_offset(each)]
+        candidate
+        for candidate in seeds
+        for _, offset_m, heading_rad in [start_offset(candidate)]
         if abs(offset_m) <= limit_m and abs(heading_rad) <= limit_rad
     )
 

@@ -13,11 +13,20 @@ from matplotlib.lines import Line2D
 from lavt.experiment.report import html_page
 from lavt.experiment.report.files import save_figure, save_table
 from lavt.experiment.report.sections import Parts
-from lavt.experiment.report.table_format import LOW_HIGH, NOTHING, UNBROKEN, Column, TableData, number, numbers, texts
+from lavt.experiment.report.table_format import (
+    LOW_HIGH,
+    NOTHING,
+    UNBROKEN,
+    Column,
+    TableData,
+    format_number,
+    number_column,
+    text_column,
+)
 from lavt.experiment.statistics.boundary_summary import CRITERIA
 
 STYLES = {"onset": ("#0072b2", "o"), "departure": ("#e69f00", "s"), "completion": ("#d55e00", "D")}
-"""Colour (Okabe and Ito) and marker of each criterion; the markers differ, too."""
+"""Colour (Okabe and Ito) and marker of each criterion."""
 LABELS = {"onset": "oscillation begins to grow", "departure": "first leaves its lane", "completion": "not completed"}
 ROW_OFFSETS = {"onset": 0.26, "departure": 0.0, "completion": -0.26}
 """Upward offset of each criterion from the middle of its route's row."""
@@ -33,10 +42,10 @@ def boundary_parts(boundaries: Sequence[Boundary], report_dir: Path) -> Parts:
     for index, boundary in enumerate(boundaries, start=1):
         name = "boundary" if len(boundaries) == 1 else f"boundary_{index}"
         caption = (
-            "Total delay, from the middle of the exposure to the wheel's command, at which an oscillation begins to "
-            "grow, the vehicle first leaves its lane, and the route is no longer completed. Ticks are seeds, a large "
-            "point and its bar are the median and its 95 % interval, and the dashed line is the onset predicted by "
-            "theory."
+            "Total delay, from the middle of a frame's exposure to the moment when its command is in force, at which "
+            "an oscillation begins to grow, the vehicle first leaves its lane, and the route is no longer completed. "
+            "Each small tick is one seed. A large point is the median, and its bar the 95 % interval of the median. "
+            "The dashed line is the onset predicted by theory."
         )
         parts.append(html_page.bullets(boundary_sentences(boundary["groups"])))
         figure = boundary_figure(boundary)
@@ -53,9 +62,12 @@ def boundary_parts(boundaries: Sequence[Boundary], report_dir: Path) -> Parts:
 
 
 def boundary_sentences(groups: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return a sentence on each preset: the onset by theory and the delays found, over all routes if possible."""
-    over_all = [group for group in groups if group["route"] is None] or groups
-    return [_boundary_sentence(group) for group in over_all]
+    """Return a sentence for each preset on the onset by theory and the delays found.
+
+    The delays are those of all routes together if there are several routes.
+    """
+    shown = [group for group in groups if group["route"] is None] or groups
+    return [_boundary_sentence(group) for group in shown]
 
 
 def _boundary_sentence(group: Mapping[str, Any]) -> str:
@@ -68,30 +80,31 @@ def _boundary_sentence(group: Mapping[str, Any]) -> str:
     if group["theory_ms"] is not None:
         theory = f"theory predicts growing oscillation from a total delay of {group['theory_ms']:.0f} ms"
     return (
-        f"{group['preset']}, {route}: {theory}. Medians over {group['n']} seed{'s' if group['n'] > 1 else ''}: "
+        f"{group['preset']}, {route}: {theory}. Medians of {group['n']} seed{'s' if group['n'] > 1 else ''}: "
         f"oscillation begins to grow: {onset}; the vehicle first leaves its lane: {departure}; "
         f"the route is no longer completed: {completion}."
     )
 
 
 def boundary_figure(boundary: Boundary) -> Figure:
-    """Return the figure of total delays at which each criterion is first met: a panel for each preset, a row a route.
+    """Return the figure of the total delays at which each criterion is first met.
 
-    A tick is a seed, the large point the median, the bar its 95 % interval, and the dashed line the onset by theory.
-    Seeds that do not meet a criterion in the searched range are counted at the right edge, seeds that meet it from the
-    beginning at the left edge. An interval that ends out of range is drawn to its edge.
+    It has a panel for each preset, and in it a row for each route. A tick is one seed, the large point the median, the
+    bar the 95 % interval of the median, and the dashed line the onset by theory. The number at the right edge counts
+    the seeds that do not meet a criterion in the searched range, the number at the left edge those that meet it already
+    at the shortest delay. An interval with an end out of range is drawn to the edge of the range.
     """
     presets = list(dict.fromkeys(group["preset"] for group in boundary["groups"]))
-    rows = {preset: [each for each in boundary["groups"] if each["preset"] == preset] for preset in presets}
+    rows = {preset: [group for group in boundary["groups"] if group["preset"] == preset] for preset in presets}
     height_in = 1.0 + sum(0.75 + 0.5 * len(groups) for groups in rows.values())
     figure = Figure(figsize=(8, height_in), dpi=130, layout="constrained")
     panels = figure.subplots(
-        len(presets), 1, sharex=True, squeeze=False, height_ratios=[len(rows[each]) for each in rows]
+        len(presets), 1, sharex=True, squeeze=False, height_ratios=[len(groups) for groups in rows.values()]
     )
     for axes, preset in zip(panels[:, 0], presets, strict=True):
         _panel(axes, boundary["runs"], rows[preset])
         axes.set_title(preset, loc="left", fontsize=10)
-    panels[-1, 0].set_xlabel("total delay, from the middle of the exposure to the wheel's command (ms)")
+    panels[-1, 0].set_xlabel("total delay, from the middle of the exposure to the command in force (ms)")
     handles = [
         Line2D([], [], linestyle="none", marker=marker, color=colour, label=LABELS[name])
         for name, (colour, marker) in STYLES.items()
@@ -118,12 +131,16 @@ def _panel(axes: Axes, runs: Sequence[Mapping[str, Any]], groups: Sequence[Mappi
 def _criterion(
     axes: Axes, height: float, name: str, runs: Sequence[Mapping[str, Any]], group: Mapping[str, Any]
 ) -> None:
-    """Draw one criterion of one row: a tick for each seed, the median with its interval, and seeds out of range."""
+    """Draw one criterion of one row.
+
+    There is a tick for each seed, the median with its interval, and the number of seeds out of range at each edge.
+    """
     colour, marker = STYLES[name]
     found_ms = [run[f"{name}_ms"] for run in runs if run[f"{name}_ms"] is not None]
     axes.plot(found_ms, [height] * len(found_ms), "|", color=colour, markersize=7, alpha=0.55)
     summary = group[f"{name}_ms"]
-    lowest_ms, highest_ms = (f(run["searched_ms"][end] for run in runs) for end, f in ((0, min), (1, max)))
+    lowest_ms = min(run["searched_ms"][0] for run in runs)
+    highest_ms = max(run["searched_ms"][1] for run in runs)
     if summary["interval"] is not None:
         low_ms, high_ms = summary["interval"]
         low_ms, high_ms = lowest_ms if low_ms is None else low_ms, highest_ms if high_ms is None else high_ms
@@ -132,34 +149,39 @@ def _criterion(
         axes.plot(summary["p50"], height, marker, color=colour, markersize=6, markeredgecolor="white", zorder=3)
     below = sum(name in run["below"] for run in runs)
     above = len(runs) - len(found_ms) - below
-    for count, place_ms, (aside, side, sign) in (
+    for count, edge_ms, (offset_points, alignment, arrow) in (
         (below, lowest_ms, (-4, "right", "\N{LEFTWARDS ARROW}")),
         (above, highest_ms, (4, "left", "\N{RIGHTWARDS ARROW}")),
     ):
         if count:
             axes.annotate(
-                f"{sign}{count}",
-                (place_ms, height),
-                xytext=(aside, 0),
+                f"{arrow}{count}",
+                (edge_ms, height),
+                xytext=(offset_points, 0),
                 textcoords="offset points",
                 color=colour,
                 fontsize=8,
-                ha=side,
+                ha=alignment,
                 va="center",
             )
 
 
 def boundary_table(boundary: Boundary) -> TableData:
     """Return the table of all groups: median, its interval, and quartiles of each criterion, in ms."""
-    columns = [texts("route"), texts("preset"), numbers("seeds", 0), numbers("onset by theory (ms)", 0)]
+    columns = [
+        text_column("route"),
+        text_column("preset"),
+        number_column("seeds", 0),
+        number_column("onset by theory (ms)", 0),
+    ]
     for name in CRITERIA:
         columns += [
-            numbers(f"{LABELS[name]}: median (ms)", 0),
+            number_column(f"{LABELS[name]}: median (ms)", 0),
             Column(f"{LABELS[name]}: 95 % interval (ms)", span, LOW_HIGH),
             Column(f"{LABELS[name]}: quartiles (ms)", span, LOW_HIGH),
-            numbers(f"{LABELS[name]}: in range", 0),
+            number_column(f"{LABELS[name]}: in range", 0),
         ]
-    columns.append(numbers("not monotone", 0))
+    columns.append(number_column("not monotone", 0))
     return TableData(columns, [_row(group) for group in boundary["groups"]])
 
 
@@ -173,7 +195,7 @@ def _row(group: Mapping[str, Any]) -> list[Any]:
 
 
 def span(ends: Sequence[float | None] | None) -> str:
-    """Return two ends in whole milliseconds; an end out of range is a dash."""
+    """Return the two ends of a range in whole milliseconds; an end outside the searched range is a dash."""
     if ends is None or ends[0] is ends[1] is None:
         return NOTHING
-    return " to ".join(number(end, 0) for end in ends).replace(" ", UNBROKEN)
+    return " to ".join(format_number(end, 0) for end in ends).replace(" ", UNBROKEN)

@@ -18,17 +18,19 @@ Colours = Mapping[str, Any]
 """The colour of each condition."""
 
 KINDS = {"virtual": ("o", "virtual time"), "real": ("s", "real time")}
-"""Marker and label of runs in virtual and in real time; markers of real runs are hollow."""
+"""Marker and label of runs in virtual and in real time. The markers of runs in real time are hollow (`marker`)."""
 
 COLOURS = ("#0072b2", "#56b4e9", "#009e73", "#e69f00", "#d55e00", "#cc79a7")
 """Colours that people with any colour vision can distinguish (Okabe and Ito, "Color universal design")."""
 
 WIDTH_IN = 8.0
 LINE_CHARACTERS = 115
-"""The number of small characters that fit below a figure; a legend handle is as wide as 5."""
+"""The number of small characters that fit in a line below a figure."""
+HANDLE_CHARACTERS = 5
+"""The width of a legend handle, in small characters."""
 
-SMALL = 8
-"""Size of small text, in points."""
+SMALL_TEXT_POINTS = 8
+"""Size of small text."""
 
 NAME_OFFSETS = {
     "virtual": ((7, -2), "left", "top", "black"),
@@ -36,13 +38,14 @@ NAME_OFFSETS = {
     "paper": ((-7, 2), "right", "bottom", "0.45"),
     "group": ((7, 2), "left", "bottom", "black"),
 }
-"""Position of the names next to each kind of points (offset in text points, aligned edges), and their colour."""
+"""How names are written next to each kind of point: offset in points of text, horizontal and vertical alignment,
+colour."""
 
-NAMES = 14
-"""The number of names that fit in a panel, in height and in width."""
+NAMES_PER_PANEL = 14
+"""The number of names that fit in a panel, both in its height and in its width."""
 
 Point = tuple[str, float, float, Sequence[float] | None]
-"""A condition, its x, its y, and the interval of y."""
+"""Name, x and y of a condition, and the interval of y."""
 
 
 def condition_colours(names: Iterable[str]) -> dict[str, Any]:
@@ -55,7 +58,7 @@ def condition_colours(names: Iterable[str]) -> dict[str, Any]:
 
 
 def new_figure(height_in: float, width_in: float = WIDTH_IN) -> Figure:
-    """Return a new figure that is laid out when it is drawn."""
+    """Return a new figure whose layout is computed when it is drawn."""
     return Figure(figsize=(width_in, height_in), layout="constrained")
 
 
@@ -76,41 +79,44 @@ def marker(kind: str, colour: Any) -> dict[str, Any]:
 
 
 def name_style(kind: str) -> dict[str, Any]:
-    """Return position and colour of names; names of different kinds at one point do not overlap."""
-    offset, side, edge, colour = NAME_OFFSETS[kind]
+    """Return position and colour of the names of one kind of point.
+
+    The positions differ, so that names of different kinds at one place do not overlap.
+    """
+    offset, horizontal, vertical, colour = NAME_OFFSETS[kind]
     return {
         "xytext": offset,
-        "ha": side,
-        "va": edge,
+        "ha": horizontal,
+        "va": vertical,
         "color": colour,
         "textcoords": "offset points",
-        "fontsize": SMALL,
+        "fontsize": SMALL_TEXT_POINTS,
     }
 
 
 def clusters_of(points: Sequence[Point], axes: Axes) -> list[list[Point]]:
     """Return clusters of points whose names would overlap in `axes`, the upper points first."""
-    reach_x, reach_y = ((high - low) / NAMES for low, high in (axes.get_xlim(), axes.get_ylim()))
+    reach_x, reach_y = ((high - low) / NAMES_PER_PANEL for low, high in (axes.get_xlim(), axes.get_ylim()))
     clusters: list[list[Point]] = []
     for point in sorted(points, key=lambda point: (-point[2], point[0])):
         near = (
-            each
-            for each in clusters
-            if abs(each[-1][1] - point[1]) <= reach_x and abs(each[-1][2] - point[2]) <= reach_y
+            cluster
+            for cluster in clusters
+            if abs(cluster[-1][1] - point[1]) <= reach_x and abs(cluster[-1][2] - point[2]) <= reach_y
         )
-        cluster = next(near, None)
-        if cluster is None:
+        nearest = next(near, None)
+        if nearest is None:
             clusters.append([point])
         else:
-            cluster.append(point)
+            nearest.append(point)
     return clusters
 
 
 def legend_below(figure: Figure, handles: list[Any]) -> None:
     """Add a legend below all panels."""
-    lengths = [len(str(handle.get_label())) + 5 for handle in handles]
+    lengths = [len(str(handle.get_label())) + HANDLE_CHARACTERS for handle in handles]
     columns = len(handles) if sum(lengths) <= LINE_CHARACTERS else max(1, LINE_CHARACTERS // max(lengths))
-    figure.legend(handles=handles, fontsize=SMALL, ncols=columns, loc="outside lower center", frameon=False)
+    figure.legend(handles=handles, fontsize=SMALL_TEXT_POINTS, ncols=columns, loc="outside lower center", frameon=False)
 
 
 def kind_handles(kinds: Iterable[str]) -> list[Line2D]:

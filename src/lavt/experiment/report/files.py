@@ -18,10 +18,10 @@ LARGEST_SHOWN_BYTES = 400_000
 """The page shows the PNG of a figure whose SVG is larger, because a phone renders a large SVG slowly."""
 
 SHORT_ROWS = 30
-"""A table with more rows may be split between printed pages; its head is repeated on each."""
+"""A table with more rows may be split between printed pages; its head is then repeated on each page."""
 
 _SVG: Any = {"svg.hashsalt": "lavt", "svg.fonttype": "none", "path.simplify_threshold": 0.3}
-"""The SVG of a figure is byte-for-byte reproducible, and its texts remain texts."""
+"""With these settings the SVG of a figure is byte-for-byte reproducible, and its texts are stored as text."""
 
 _NO_METADATA = {"Date": None, "Creator": None, "Format": None, "Type": None}
 
@@ -43,7 +43,7 @@ def save_table(report_dir: Path, name: str, table: TableData) -> Markup:
 
 
 def link_table(report_dir: Path, name: str, table: TableData) -> Markup:
-    """Write a table that is too long for the page, and return the HTML that links to its files."""
+    """Write a table that is too long for the page, and return only links to its files as HTML."""
     return _save_table(report_dir, name, table, Markup(), is_short=True)
 
 

@@ -11,8 +11,8 @@ Group = Mapping[str, Any]
 STATISTICS = ("conditions", "contrasts")
 """The keys of a group that are not settings."""
 
-USUAL = ("fidelity", "inherent", "controller", "preset", "driver", "changes", "sweep")
-"""Settings of every run; any other setting is an axis of the sweep."""
+COMMON_SETTINGS = ("fidelity", "inherent", "controller", "preset", "driver", "changes", "sweep")
+"""The settings that every run has. Any other setting is an axis of the sweep."""
 
 
 def settings_of(group: Group) -> dict[str, Any]:
@@ -22,7 +22,7 @@ def settings_of(group: Group) -> dict[str, Any]:
 
 def axes_of(groups: Sequence[Group]) -> list[str]:
     """Return the names of the sweep's axes that have more than one value, in their order."""
-    names = dict.fromkeys(name for group in groups for name in settings_of(group) if name not in USUAL)
+    names = dict.fromkeys(name for group in groups for name in settings_of(group) if name not in COMMON_SETTINGS)
     return [name for name in names if len({str(group.get(name)) for group in groups}) > 1]
 
 
@@ -38,9 +38,12 @@ def _sort_key(value: Any) -> tuple[bool, float, str]:
 
 
 def differing(groups: Sequence[Group]) -> list[str]:
-    """Return the names of the fewest settings that distinguish the groups; axes come first."""
+    """Return the names of settings that together distinguish the groups; axes come first.
+
+    A setting is included only if it distinguishes groups that the settings before it do not.
+    """
     names: list[str] = []
-    for name in (*axes_of(groups), *USUAL):
+    for name in (*axes_of(groups), *COMMON_SETTINGS):
         if len(_values(groups, [*names, name])) > len(_values(groups, names)):
             names.append(name)
     return names
@@ -56,7 +59,7 @@ def title_of(group: Group, names: Sequence[str]) -> str:
 
 
 def short(name: str) -> str:
-    """Return the last two parts of a dotted name, such as the flow and its property."""
+    """Return the last two parts of a dotted name in words: "video delay ms" for "network.video.delay_ms"."""
     return " ".join(name.split(".")[-2:]).replace("_", " ")
 
 

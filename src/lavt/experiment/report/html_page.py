@@ -1,6 +1,6 @@
-"""The HTML of the report's page and of its parts, rendered from `templates/`; the page loads nothing from a network.
+"""The HTML of the report's page and of its parts, rendered from `templates/`.
 
-Every text that a function takes is escaped by the templates.
+The page loads nothing from a network. The templates escape every text that a function takes.
 """
 
 from __future__ import annotations
@@ -64,7 +64,10 @@ def bullets(texts: Sequence[str]) -> Markup:
 
 
 def figure(shown: str, files: Sequence[str], alternative: str, caption: str) -> Markup:
-    """Return the figure `shown` with its caption and links to `files`, the same figure in each format."""
+    """Return a figure with its caption and links to its files.
+
+    `shown` is the file that the page shows, `files` are all formats of the figure.
+    """
     return _part("figure", shown, files, alternative, caption)
 
 

@@ -1,4 +1,4 @@
-"""Figures of latency: measured over injected, its effect on driving, and stages. None reads a file."""
+"""Figures of latency: measured by injected latency, its effect on driving, and stages. No function reads a file."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from lavt.experiment.report.figure_style import (
-    SMALL,
+    SMALL_TEXT_POINTS,
     Colours,
     Conditions,
     Point,
@@ -36,7 +36,7 @@ DIAMOND: dict[str, Any] = {"marker": "D", "markersize": 4, "markerfacecolor": "w
 ERROR_LABEL = "P95 of cross-track error,\nmean of runs (m)"
 
 LatencyKey = tuple[str, str]
-"""Path of a latency in a condition: a key, and a key in its value."""
+"""Where a condition has a latency: the key of an entry, and the key in this entry."""
 
 LOOP: LatencyKey = ("loop_ms", "p50")
 
@@ -48,9 +48,9 @@ SCALES: Mapping[str, LatencyKey] = {
 
 
 def degradation_figure(kinds: Mapping[str, Conditions], paper: Conditions, colours: Colours) -> Figure:
-    """Return the figure of completion and cross-track error over loop latency and, if known, frame age.
+    """Return the figure of completion and cross-track error by loop latency and, if known, by frame age.
 
-    Each condition is a point. The conditions in `paper` are drawn at the paper's tau_v + tau_c. Diamonds are the error
+    Each condition is a point. The conditions in `paper` are drawn at the paper's tau_v + tau_c. Diamonds show the error
     of all runs up to the common distance.
     """
     scales = {label: latency for label, latency in SCALES.items() if any(_known(kinds, latency))}
@@ -61,14 +61,14 @@ def degradation_figure(kinds: Mapping[str, Conditions], paper: Conditions, colou
         completion, error = panels[:, column]
         for kind, conditions in {"paper": _with_totals(paper), **kinds}.items():
             shown = {
-                completion: _over(conditions, latency, "completion_rate", "completion_interval", 100.0),
-                error: _over(conditions, latency, "p95_m", "p95_interval"),
+                completion: _points(conditions, latency, "completion_rate", "completion_interval", 100.0),
+                error: _points(conditions, latency, "p95_m", "p95_interval"),
             }
             for axes, points in shown.items():
                 for point in points:
                     _draw(axes, point, PAPER_MARKER if kind == "paper" else marker(kind, colours[point[0]]))
                 named.append((axes, kind, points))
-            for point in _over(conditions, latency, "p95_common_m", "p95_common_interval"):
+            for point in _points(conditions, latency, "p95_common_m", "p95_common_interval"):
                 _draw(error, point, {**DIAMOND, "color": colours[point[0]], "zorder": 4})
         completion.margins(x=0.16)
         error.margins(x=0.16)
@@ -95,14 +95,17 @@ def _known(kinds: Mapping[str, Conditions], latency: LatencyKey) -> list[bool]:
     ]
 
 
-def _over(conditions: Conditions, latency: LatencyKey, value: str, bounds: str, unit: float = 1.0) -> list[Point]:
-    """Return the points of the conditions that have both values."""
+def _points(conditions: Conditions, latency: LatencyKey, value: str, bounds: str, scale: float = 1.0) -> list[Point]:
+    """Return the points of the conditions that have both the latency and the value.
+
+    `bounds` is the key of the value's interval; value and interval are multiplied by `scale`.
+    """
     key, part = latency
     points: list[Point] = []
     for name, entry in conditions.items():
         x, y, interval = (entry.get(key) or {}).get(part), entry.get(value), entry.get(bounds)
         if x is not None and y is not None:
-            points.append((name, x, y * unit, [bound * unit for bound in interval] if interval else None))
+            points.append((name, x, y * scale, [bound * scale for bound in interval] if interval else None))
     return points
 
 
@@ -126,17 +129,17 @@ def _write_names(axes: Axes, clusters: Sequence[Sequence[Point]], kind: str) -> 
 
 
 def presets_figure(groups: Mapping[str, Conditions], colours: Colours) -> Figure:
-    """Return the figure of completion and error over loop latency: a line for each group, a colour for each condition.
+    """Return the figure of completion and error by loop latency: a line for each group, a colour for each condition.
 
-    Conditions whose points overlap are named.
+    The names of conditions are written only where their points overlap.
     """
     figure = new_figure(3.8)
     completion, error = figure.subplots(1, 2)
     lines: list[tuple[Axes, list[Point]]] = []
     symbols = dict(zip(groups, "osD^vP", strict=False))
     for title, conditions in groups.items():
-        for axes, key, unit in ((completion, "completion_rate", 100.0), (error, "p95_m", 1.0)):
-            points = sorted(_over(conditions, LOOP, key, "", unit), key=lambda point: point[1])
+        for axes, key, scale in ((completion, "completion_rate", 100.0), (error, "p95_m", 1.0)):
+            points = sorted(_points(conditions, LOOP, key, "", scale), key=lambda point: point[1])
             lines.append((axes, points))
             dashes = (0, (1 + 2 * list(groups).index(title), 1)) if list(groups).index(title) else "solid"
             axes.plot([x for _, x, _, _ in points], [y for _, _, y, _ in points], color="0.6", linestyle=dashes)
@@ -157,10 +160,11 @@ def presets_figure(groups: Mapping[str, Conditions], colours: Colours) -> Figure
 
 
 def injected_figure(kinds: Mapping[str, Conditions], colours: Colours) -> Figure:
-    """Return the figure of measured one-way latency over injected delay, for video and control.
+    """Return the figure of measured one-way latency by injected delay, for video and control.
 
-    The upper panels show medians with bars from p5 to p95, and the line of the least latency plus the injected delay.
-    The lower panels show the deviation of the medians from this line; bars are the bound of the clock error.
+    The upper panels show medians with bars from p5 to p95, and a line for the expected latency: the median of the
+    condition with the least delay plus the additional injected delay. The lower panels show the deviation of the
+    medians from this line; bars are the bound of the clock error.
     """
     figure = new_figure(5.2)
     panels = figure.subplots(2, 2, sharex="col", height_ratios=[3, 2])
@@ -202,15 +206,15 @@ def _draw_injected(
     base_ms = points[0][2]["p50"] - points[0][1]
     farthest_ms = points[-1][1]
     above.plot([0, farthest_ms], [base_ms, base_ms + farthest_ms], color="0.6", linewidth=0.8, zorder=0)
-    together: dict[float, list[str]] = {}
+    names_by_delay: dict[float, list[str]] = {}
     for name, injected_ms, latency in points:
-        together.setdefault(injected_ms, []).append(name)
+        names_by_delay.setdefault(injected_ms, []).append(name)
         reach = [[latency["p50"] - latency["p5"]], [latency["p95"] - latency["p50"]]]
         style = {"capsize": 3, "linestyle": "none", **marker(kind, colours[name])}
         above.errorbar(injected_ms, latency["p50"], yerr=reach, **style)
         below.errorbar(injected_ms, latency["p50"] - injected_ms - base_ms, yerr=latency["bound"] or 0.0, **style)
     medians_ms = {injected_ms: latency["p50"] for _, injected_ms, latency in points}
-    for injected_ms, names in together.items():
+    for injected_ms, names in names_by_delay.items():
         above.annotate(", ".join(names), (injected_ms, medians_ms[injected_ms]), **name_style(kind))
     above.margins(x=0.15)
 
@@ -220,13 +224,18 @@ def stages_figure(stages: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
     figure = new_figure(0.42 * len(stages) + 1.6)
     axes = figure.subplots()
     colours = _stage_colours(stages)
-    for row, every in enumerate(stages.values()):
+    for row, entries in enumerate(stages.values()):
         left_ms = 0.0
-        for share in every:
-            colour = colours[share["node"], share["stage"]]
-            axes.barh(row, share["p50"] or 0.0, left=left_ms, color=colour, edgecolor="white", linewidth=0.3)
-            left_ms += share["p50"] or 0.0
-        text: dict[str, Any] = {"xytext": (4, 0), "textcoords": "offset points", "va": "center", "fontsize": SMALL}
+        for entry in entries:
+            colour = colours[entry["node"], entry["stage"]]
+            axes.barh(row, entry["p50"] or 0.0, left=left_ms, color=colour, edgecolor="white", linewidth=0.3)
+            left_ms += entry["p50"] or 0.0
+        text: dict[str, Any] = {
+            "xytext": (4, 0),
+            "textcoords": "offset points",
+            "va": "center",
+            "fontsize": SMALL_TEXT_POINTS,
+        }
         axes.annotate(f"{left_ms:.0f} ms", (left_ms, row), **text)
     axes.set_yticks(range(len(stages)), list(stages))
     axes.invert_yaxis()
@@ -238,14 +247,12 @@ def stages_figure(stages: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
     return figure
 
 
-def _stage_colours(every_condition: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[tuple[str, str], Any]:
-    """Return a shade of its node's colour for each stage."""
-    names = list(
-        dict.fromkeys((stage["node"], stage["stage"]) for stages in every_condition.values() for stage in stages)
-    )
+def _stage_colours(stages: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[tuple[str, str], Any]:
+    """Return a colour for each stage: a shade of the colour of its node."""
+    names = list(dict.fromkeys((entry["node"], entry["stage"]) for entries in stages.values() for entry in entries))
     colours = {}
     for node, stage in names:
-        stages = [name for of, name in names if of == node]
+        of_node = [name for node_name, name in names if node_name == node]
         shades = colormaps[NODE_COLOURS.get(node, OTHER_COLOURS)]
-        colours[node, stage] = shades(0.35 + 0.45 * stages.index(stage) / max(len(stages) - 1, 1))
+        colours[node, stage] = shades(0.35 + 0.45 * of_node.index(stage) / max(len(of_node) - 1, 1))
     return colours

@@ -57,16 +57,17 @@ def write_report(
     """Write `summary.json` and `report/` into `sweep_dir`, and return the page's path.
 
     `run_dirs` are the directories of the runs, by default those under `sweep_dir/runs`. `base` is passed to
-    `summary.summarize`. `speed` defaults to the value in the existing summary. `drives` has drives that are already
-    read, by run directory. `sweeps` has the sweep of each run directory if the runs are from several sweeps.
-    `boundaries` are the contents of `boundary.json` files. `failed` are the failed runs, as in `FAILED`; the page lists
-    them, and the runs without a readable result, as left out. Raises `WorkError` if no run is left.
+    `summary.summarize`. `speed` defaults to the value in the existing summary. `drives` has the data of drives that
+    were already read, by run directory. `sweeps` has the name of the sweep for each run directory if the runs are from
+    several sweeps. `boundaries` are the contents of `boundary.json` files. `failed` are the failed runs, as in
+    `FAILED`; the page lists them, and the runs without a readable result, as left out. Raises `WorkError` if no run is
+    left.
     """
     if run_dirs is None:
         run_dirs = sorted(path for path in (sweep_dir / "runs").glob("*") if path.is_dir())
     results, unfinished = _read_results(run_dirs, sweeps or {})
-    reported = {each["run"] for each in failed}
-    left_out = [*failed, *({"run": name, "reason": "no result"} for name in unfinished if name not in reported)]
+    failed_names = {run["run"] for run in failed}
+    left_out = [*failed, *({"run": name, "reason": "no result"} for name in unfinished if name not in failed_names)]
     if not results:
         raise WorkError(f"there is no finished run in {sweep_dir}: a run leaves a result.json in its directory")
     summary_path = sweep_dir / "summary.json"
@@ -110,13 +111,14 @@ def _sections(
 
 
 def read_failed(sweep_dir: Path) -> list[dict[str, str]]:
-    """Return the failed runs of a sweep with the reasons."""
+    """Return the failed runs of a sweep, each with its name (`run`) and its `reason`."""
     return list(read_json(sweep_dir / FAILED)) if (sweep_dir / FAILED).is_file() else []
 
 
 def _read_results(
     run_dirs: Sequence[Path], sweeps: Mapping[Path, str]
 ) -> tuple[list[tuple[Path, dict[str, Any]]], list[str]]:
+    """Return the directories of the finished runs with their results, and the names of the other runs."""
     results: list[tuple[Path, dict[str, Any]]] = []
     unfinished: list[str] = []
     for directory in run_dirs:

@@ -1,4 +1,4 @@
-"""Figures of single drives: trajectories, steering and received frames. None reads a file."""
+"""Figures of single drives: trajectories, steering and received frames. No function reads a file."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from lavt.experiment.analysis.drive_data import DriveData
 from lavt.experiment.report.figure_style import Colours, condition_handles, legend_below, new_figure, tidy
 
 DRAWN_EVERY_M = 0.5
-"""Distance between drawn points; denser points are indistinguishable and make a figure of 90 drives too large."""
+"""Distance between drawn points. Denser points cannot be distinguished and make the file of 90 drives too large."""
 
-CROSS: dict[str, Any] = {
+EARLY_END_MARKER: dict[str, Any] = {
     "color": "red",
     "marker": "x",
     "markersize": 6,
@@ -27,7 +27,7 @@ CROSS: dict[str, Any] = {
 
 
 def drawn_points(progress_m: FloatArray) -> list[int]:
-    """Return the rows of a drive that are drawn: one every `DRAWN_EVERY_M` of progress, and the last."""
+    """Return the indexes of a drive's rows that are drawn: one for each `DRAWN_EVERY_M` of progress, and the last."""
     if not len(progress_m):
         return []
     bins = np.floor(progress_m / DRAWN_EVERY_M)
@@ -43,8 +43,8 @@ def trajectories_figure(routes: Mapping[str, Sequence[DriveData]], colours: Colo
     """
     references = {route: max((drive.reference_m for drive in drives), key=len) for route, drives in routes.items()}
     rotated = {route: _rotation_to_x(reference_m) for route, reference_m in references.items()}
-    extents = {route: _extent(rotated[route](reference_m)) for route, reference_m in references.items()}
-    heights = [min(max(high / width, 0.12), 0.7) for width, high in extents.values()]
+    extents_m = {route: _extent(rotated[route](reference_m)) for route, reference_m in references.items()}
+    heights = [min(max(height_m / width_m, 0.12), 0.7) for width_m, height_m in extents_m.values()]
     figure = new_figure(7.2 * sum(heights) + 0.75 * len(heights) + 0.4)
     panels = figure.subplots(len(routes), 1, squeeze=False, height_ratios=heights)[:, 0]
     for axes, (route, drives) in zip(panels, routes.items(), strict=True):
@@ -58,7 +58,7 @@ def trajectories_figure(routes: Mapping[str, Sequence[DriveData]], colours: Colo
             if drive.result["ending"] != "completed":
                 ends.append(path_m[-1])
         if ends:
-            axes.plot(*np.transpose(ends), **CROSS)
+            axes.plot(*np.transpose(ends), **EARLY_END_MARKER)
         tidy(axes, "", "m", f"Route {route}, {len(drives)} runs")
         axes.set_aspect("equal", adjustable="datalim")
     panels[-1].set_xlabel("m")
@@ -67,7 +67,7 @@ def trajectories_figure(routes: Mapping[str, Sequence[DriveData]], colours: Colo
 
 
 def _rotation_to_x(reference_m: FloatArray) -> Any:
-    """Return a function that moves and rotates points (n, 2) so that the reference lies along x."""
+    """Return a function that moves and rotates points (n, 2) in m so that the reference lies along x."""
     if len(reference_m) < 2:
         return lambda points_m: points_m
     middle_m = reference_m.mean(axis=0)
@@ -79,6 +79,7 @@ def _rotation_to_x(reference_m: FloatArray) -> Any:
 
 
 def _extent(points_m: FloatArray) -> tuple[float, float]:
+    """Return the width and the height in m of the area to draw, with a margin."""
     if len(points_m) < 2:
         return 1.0, 0.5
     width_m, height_m = np.ptp(points_m, axis=0) + 12.0
@@ -103,7 +104,7 @@ def cross_track_figure(routes: Mapping[str, Sequence[DriveData]], colours: Colou
             if drive.result["ending"] != "completed":
                 ends.append((progress_m[-1], error_m[-1]))
         if ends:
-            axes.plot(*np.transpose(ends), **CROSS)
+            axes.plot(*np.transpose(ends), **EARLY_END_MARKER)
         tidy(axes, "", "", f"Route {route}")
     for axes in panels.flat[max(len(routes) - columns, 0) : len(routes)]:
         axes.set_xlabel("distance along the route (m)")
@@ -115,7 +116,9 @@ def cross_track_figure(routes: Mapping[str, Sequence[DriveData]], colours: Colou
 def _legend(figure: Figure, routes: Mapping[str, Sequence[DriveData]], colours: Colours) -> None:
     names = sorted({drive.condition for drives in routes.values() for drive in drives})
     reference = Line2D([], [], color="black", linewidth=3.5, label="lane centre")
-    legend_below(figure, [*condition_handles(names, colours), reference, Line2D([], [], label="ended early", **CROSS)])
+    legend_below(
+        figure, [*condition_handles(names, colours), reference, Line2D([], [], label="ended early", **EARLY_END_MARKER)]
+    )
 
 
 def time_figure(drives: Sequence[DriveData], colours: Colours) -> Figure:

@@ -22,20 +22,18 @@ SHOWN_FRAMES = 4
 DRAWN_GROUPS = 4
 """With more groups than this, the figures show only the runs of the base config, or else of the first group."""
 
-PANELS = 3
-"""Routes in one figure of trajectories: the paper has three key parts and three whole routes."""
+MAX_PANELS = 3
+"""The most routes in one figure of trajectories: the paper has three key parts and three whole routes."""
 
 DriveSets = Mapping[tuple[str, str], Sequence[DriveData]]
-"""Drives by kind of time and title of their group; each entry is drawn in figures of its own."""
+"""Drives by kind of time and title of their group. Each entry has figures of its own."""
 
 Runs = Sequence[tuple[Path, Mapping[str, object]]]
+"""Runs: the directory of each, and its entry in the summary's `runs`."""
 
 
 def drawn_runs(report: ReportContext, runs: Runs) -> dict[tuple[str, str], list[tuple[Path, Mapping[str, object]]]]:
-    """Return the runs whose drives are drawn, by kind of time and title of their group.
-
-    `runs` has directories, and entries of the summary's `runs`.
-    """
+    """Return the runs whose drives are drawn, by kind of time and title of their group."""
     groups, names = report.groups, differing(report.groups)
     if len(groups) > DRAWN_GROUPS:
         groups = report.base or groups[:1]
@@ -58,42 +56,48 @@ def read_drives(
 
 
 def trajectory_parts(report: ReportContext, sets: DriveSets) -> Parts:
-    """Return the figures of all trajectories, key parts and whole routes apart, and of their cross-track error."""
+    """Return the figures of all trajectories and of their cross-track error.
+
+    The trajectories on key parts and those on whole routes are in separate figures.
+    """
     parts = []
     for (kind, title), drives in sets.items():
         routes: dict[str, list[DriveData]] = {}
         for drive in sorted(drives, key=lambda drive: str(drive.result["route"])):
             if len(drive.truth):
                 routes.setdefault(str(drive.result["route"]), []).append(drive)
-        runs = f"{kind} time{f', {title}' if title else ''}"
+        origin = f"{kind} time{f', {title}' if title else ''}"
         suffix = "_".join(word for word in (kind, html_page.slug(title)) if word)
         for name, shown in _figures_of(list(routes)):
             figure = trajectories_figure({route: routes[route] for route in shown}, report.colours)
-            caption = f"All trajectories, {runs}; each route is rotated to fit. A red cross marks an early end."
+            caption = (
+                f"All trajectories, {origin}. Each route is rotated to fit. A red cross marks the end of a run that "
+                "ended early."
+            )
             alternative = f"trajectories on routes {', '.join(shown)}"
             parts.append(save_figure(report.directory, f"trajectories_{name}_{suffix}", figure, alternative, caption))
         if routes:
-            caption = f"Distance from the lane centre over distance along the route, {runs}."
+            caption = f"Distance from the lane centre along the route, {origin}."
             figure = cross_track_figure(routes, report.colours)
             parts.append(save_figure(report.directory, f"cross_track_{suffix}", figure, "cross-track error", caption))
     return parts
 
 
 def _figures_of(routes: Sequence[str]) -> list[tuple[str, Sequence[str]]]:
-    """Return the name and the routes of each figure: key parts first, at most `PANELS` routes in each."""
+    """Return the name and the routes of each figure: key parts first, at most `MAX_PANELS` routes in each."""
     kinds = {
         "key": [route for route in routes if road_of(route) != stem_of(route)],
         "whole": [route for route in routes if road_of(route) == stem_of(route)],
     }
     return [
-        (f"{name}{begin // PANELS + 1 if begin else ''}", members[begin : begin + PANELS])
+        (f"{name}{begin // MAX_PANELS + 1 if begin else ''}", members[begin : begin + MAX_PANELS])
         for name, members in kinds.items()
-        for begin in range(0, len(members), PANELS)
+        for begin in range(0, len(members), MAX_PANELS)
     ]
 
 
 def single_run_parts(report: ReportContext, sets: DriveSets) -> Parts:
-    """Return one run of each condition over time, and frames that the client received, for each kind of time."""
+    """Return for each kind of time a figure of one run of each condition, and frames that a client received."""
     parts = []
     for kind, drives in _first_sets(sets).items():
         chosen = one_of_each_condition(drives)
@@ -101,15 +105,16 @@ def single_run_parts(report: ReportContext, sets: DriveSets) -> Parts:
         if driven:
             names = ", ".join(str(drive.result["run"]) for drive in driven)
             caption = (
-                f"Road wheel angle and distance from the lane centre over time; left is positive. {kind.capitalize()} "
-                f"time, one run of each condition: {names}."
+                "Angle of the road wheels and distance from the lane centre over time; left is positive. The figure "
+                f"shows one run of each condition in {kind} time: {names}."
             )
             figure = time_figure(driven, report.colours)
             parts.append(save_figure(report.directory, f"time_{kind}", figure, "steering over time", caption))
         pictures = received_pictures(chosen[0].directory / "client.mcap")
         if pictures:
             caption = (
-                f"Frames as the client received them, run {chosen[0].result['run']}. The stamp is at the top left."
+                f"Frames as the client received them in the run {chosen[0].result['run']}. "
+                "The stamp is at the top left."
             )
             figure = frames_figure(pictures)
             parts.append(save_figure(report.directory, f"frames_{kind}", figure, "received frames", caption))
@@ -153,7 +158,10 @@ def received_pictures(client_record: Path) -> list[tuple[str, Picture]]:
 
 
 def machine_parts(report: ReportContext, sets: DriveSets) -> Parts:
-    """Return versions and machines as the drawn runs recorded them; runs with equal values share a table."""
+    """Return versions and machines as the drawn runs recorded them.
+
+    Runs with equal values share a table.
+    """
     drives = [drive for members in sets.values() for drive in members]
     by_html: dict[str, tuple[DriveData, int]] = {}
     for drive in drives:
@@ -162,7 +170,7 @@ def machine_parts(report: ReportContext, sets: DriveSets) -> Parts:
         by_html[html] = (first, count + 1)
     parts = []
     for number, (first, count) in enumerate(by_html.values(), start=1):
-        text = f"Recorded by {count} of {len(report.summary['runs'])} runs, the first is {first.result['run']}:"
+        text = f"Recorded by {count} of {len(report.summary['runs'])} runs; the first is {first.result['run']}:"
         table = machine_table(first.annotations)
         parts += [html_page.paragraph(text, is_note=True), save_table(report.directory, f"machine_{number}", table)]
     return parts

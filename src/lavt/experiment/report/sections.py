@@ -37,38 +37,39 @@ from lavt.experiment.report.tables import (
 Parts = list[Markup]
 
 ONE_CLOCK = (None, SAME_KERNEL)
-"""Sources of the clock offset without a value to show: none is known, or both sides share a clock."""
+"""The sources of a clock offset that has no value to show: None if it is unknown, or a clock that both sides share."""
 
 LATENCIES_NOTE = (
-    "Latencies are in ms: median ± bound of the clock error (p5 to p95). The loop latency, from a frame's stamp to the "
-    "application of its command, is measured on the server's clock alone and needs no clock offset."
+    "Each latency is given in ms as median ± bound of the clock error (p5 to p95). The loop latency, from a frame's "
+    "stamp to the application of its command, is measured on the server's clock alone, so it has no such bound."
 )
 PAPER_NOTE = " The paper did not measure the loop latency; the table shows the sum of its median τ video and τ control."
 PAPER_POINTS = (
-    " The paper's points are drawn at the sum of its two median one-way latencies. Their completion intervals are "
-    "computed from its counts; it gives no interval of the error."
+    " The paper's points are drawn at the sum of its two median one-way latencies. The intervals of its completion "
+    "are computed from its counts. It gives no interval of the error."
 )
 ROUTES_NOTE = " “95 %, these routes” is the exact confidence interval of completion for repeated runs of these routes."
 ROADS_NOTE = (
-    " “Range over roads” is the spread of completion between roads, where a route and its key part are one road; it is "
-    "not a 95 % interval."
+    " “Range over roads” shows how much completion differs between roads; a route and its key part count as one road. "
+    "It is not a 95 % interval."
 )
 ERRORS_NOTE = (
     " Each error is computed for each run and then averaged over the runs. P95 of the cross-track error is given in "
-    "three ways: over the completed runs, to be read together with the completion; over all runs, up to the common "
-    "distance, which all runs of a route and repetition reached; and as median (quartiles) of all runs, where a run "
-    "that ended early ranks last. docs/metrics.md defines each number."
+    "three ways. The first is the mean over the completed runs only, to be read together with the completion. The "
+    "second is the mean over all runs, each up to the common distance, which all runs of its route and repetition "
+    "reached. The third is the median (quartiles) of all runs, where a run that ended early ranks last. "
+    "docs/metrics.md defines each number."
 )
 STAGES_NOTE = (
-    "The first row, from capture to stamp, is from one run of each condition, the other rows from all its runs. The "
-    "bars leave out this row, which is before the loop, and the stages after the loop."
+    "The first row, from capture to stamp, is from one run of each condition. The other rows are from all runs of "
+    "the condition. The bars contain neither the first row, which is before the loop, nor the stages after the loop."
 )
 
-LEAST_REST_MS = 0.5
-"""A smaller rest of the loop is not shown as a stage."""
+SMALLEST_REST_MS = 0.5
+"""The part of the loop latency that belongs to no stage is shown as a stage if it is larger than this."""
 
-COMPARED_GROUPS = 6
-"""More groups than this are shown only in their table and in the figures of their axes."""
+MAX_COMPARED_GROUPS = 6
+"""If there are more groups, they are shown only in their table and in the figures of their axes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,13 +87,13 @@ class ReportContext:
 
     @property
     def kinds(self) -> dict[str, Conditions]:
-        """Return the conditions of each kind of time, without a kind that has none."""
+        """Return the conditions by kind of time; a kind of time without conditions is left out."""
         kinds = {"virtual": self.summary["conditions"], "real": self.summary["real"]}
         return {kind: conditions for kind, conditions in kinds.items() if conditions}
 
     @property
     def base(self) -> list[Group]:
-        """Return the groups that have the conditions of the base config; none if these span several groups."""
+        """Return the groups whose conditions are those of the base config; none if those are from several groups."""
         return [group for group in self.groups if group["conditions"] == self.summary["conditions"]]
 
     def paper(self, conditions: Conditions) -> Conditions:
@@ -100,12 +101,12 @@ class ReportContext:
         return matching_paper(conditions, (self.summary.get("paper") or {}).get("conditions") or {})
 
     def setup(self, kind: str) -> str:
-        """Return how the runs of a kind of time were made, and the group of its conditions if there are several."""
+        """Return a text on how the runs of a kind of time were made, and their group if there are several groups."""
         setup = run_setup([run for run in self.summary["runs"] if run["time"] == kind])
         return f"{setup[0].upper()}{setup[1:]}{self.base_title(kind)}"
 
     def base_title(self, kind: str = "virtual") -> str:
-        """Return the group of the conditions in virtual time, in brackets."""
+        """Return the title of the base config's group in brackets; "" for real time or without such a group."""
         names = differing(self.groups) or ["preset"]
         return f" ({title_of(self.base[0], names)})" if kind == "virtual" and self.base else ""
 
@@ -115,42 +116,47 @@ def summary_parts(report: ReportContext) -> Parts:
     runs, speed, failed = report.summary["runs"], report.summary["speed"], report.summary.get("failed")
     parts = [html_page.paragraph(runs_overview(runs))]
     names = differing(report.groups)
-    compared = report.groups if 1 < len(report.groups) <= COMPARED_GROUPS else []
-    named = {f"Virtual time, {title_of(group, names)}": group["conditions"] for group in compared}
-    if "virtual" in report.kinds and not named:
-        named = {f"Virtual time{report.base_title()}": report.kinds["virtual"]}
+    compared = report.groups if 1 < len(report.groups) <= MAX_COMPARED_GROUPS else []
+    conditions_by_name = {f"Virtual time, {title_of(group, names)}": group["conditions"] for group in compared}
+    if "virtual" in report.kinds and not conditions_by_name:
+        conditions_by_name = {f"Virtual time{report.base_title()}": report.kinds["virtual"]}
     if "real" in report.kinds:
-        named["Real time"] = report.kinds["real"]
-    sentences = [results_sentences(name, conditions) for name, conditions in named.items()]
+        conditions_by_name["Real time"] = report.kinds["real"]
+    sentences = [results_sentences(name, conditions) for name, conditions in conditions_by_name.items()]
     parts.append(html_page.bullets([sentence for sentence in sentences if sentence]))
     if speed["wall_s"]:
         factor = speed["simulated_s"] / speed["wall_s"]
         jobs = f"{speed['jobs']} parallel job{'s' if speed['jobs'] != 1 else ''}"
-        text = f"{speed['simulated_s']:.0f} s of driving were simulated in {speed['wall_s']:.0f} s with {jobs}: "
-        parts.append(html_page.paragraph(f"{text}{factor:.1f} times as fast as real time.", is_note=True))
+        text = f"{speed['simulated_s']:.0f} s of driving were simulated in {speed['wall_s']:.0f} s with {jobs}. "
+        parts.append(html_page.paragraph(f"{text}This is {factor:.1f} times as fast as real time.", is_note=True))
     if failed:
         runs_failed = "1 run" if len(failed) == 1 else f"{len(failed)} runs"
         parts.append(html_page.paragraph(f"{runs_failed} failed and {'is' if len(failed) == 1 else 'are'} left out:"))
-        parts.append(html_page.bullets([f"{each['run']}: {each['reason']}" for each in failed]))
+        parts.append(html_page.bullets([f"{run['run']}: {run['reason']}" for run in failed]))
     return parts
 
 
 def conditions_parts(report: ReportContext) -> Parts:
-    """Return the tables of the conditions for each kind of time, compared with the paper where it has them."""
+    """Return the tables of the conditions for each kind of time, with the paper's values where it has the condition."""
     if not report.kinds:
-        return [html_page.paragraph("No run has the values of the base config; see the table of groups.", is_note=True)]
+        return [
+            html_page.paragraph("No run has the settings of the base config. See the table of groups.", is_note=True)
+        ]
     parts = []
     for kind, conditions in report.kinds.items():
         paper = report.paper(conditions)
         parts.append(html_page.heading(report.setup(kind)))
         for name, make in (("driving", driving_table), ("latency", latency_table), ("error", error_table)):
             parts.append(save_table(report.directory, f"conditions_{kind}_{name}", make(conditions, paper)))
-    roads = any(entry.get("completion_such_roads") for of in report.kinds.values() for entry in of.values())
-    compared = any(report.paper(conditions) for conditions in report.kinds.values())
+    has_roads = any(
+        entry.get("completion_such_roads") for conditions in report.kinds.values() for entry in conditions.values()
+    )
+    has_paper = any(report.paper(conditions) for conditions in report.kinds.values())
     return [
         *parts,
         html_page.paragraph(
-            "".join((LATENCIES_NOTE, PAPER_NOTE * compared, ROUTES_NOTE, ROADS_NOTE * roads, ERRORS_NOTE)), is_note=True
+            "".join((LATENCIES_NOTE, PAPER_NOTE * has_paper, ROUTES_NOTE, ROADS_NOTE * has_roads, ERRORS_NOTE)),
+            is_note=True,
         ),
     ]
 
@@ -161,61 +167,64 @@ def contrast_parts(report: ReportContext) -> Parts:
     contrasts = summary.get("contrasts") or []
     if not contrasts:
         return []
-    shown = paper if report.paper(summary["conditions"]) else []
+    paper_contrasts = paper if report.paper(summary["conditions"]) else []
     names = differing(report.groups)
     base = title_of(report.base[0], names) if report.groups[1:] and report.base else ""
-    several = report.groups[1:] and len(report.groups) <= COMPARED_GROUPS
+    shows_all_groups = report.groups[1:] and len(report.groups) <= MAX_COMPARED_GROUPS
     parts = [html_page.heading(base)] if base else []
-    parts += [save_table(report.directory, "contrasts", contrast_table(contrasts, shown))]
-    for group in report.groups if several else []:
+    parts += [save_table(report.directory, "contrasts", contrast_table(contrasts, paper_contrasts))]
+    for group in report.groups if shows_all_groups else []:
         if group not in report.base[:1] and group.get("contrasts"):
             title = title_of(group, names)
             parts.append(html_page.heading(title))
             name = f"contrasts_{html_page.slug(title)}"
-            parts.append(save_table(report.directory, name, contrast_table(group["contrasts"], shown)))
-    fisher = " The paper's p values are from Fisher's exact test on its counts." if shown else ""
+            parts.append(save_table(report.directory, name, contrast_table(group["contrasts"], paper_contrasts)))
+    fisher = " The paper's p values are from Fisher's exact test on its counts." if paper_contrasts else ""
     note = (
-        "Each contrast compares completion under two conditions, with McNemar's exact test on pairs of runs with the "
-        "same route, repetition and seed. Holm's correction is applied over all contrasts, which were planned before "
-        f"the first run.{fisher}"
+        "Each contrast compares completion under two conditions by McNemar's exact test on pairs of runs with the "
+        "same route, repetition and seed. All contrasts were planned before the first run, and Holm's correction "
+        f"covers all of them.{fisher}"
     )
     parts.append(html_page.paragraph(note, is_note=True))
     return parts
 
 
 def _base_note(report: ReportContext) -> str:
-    """Return the caption's sentence on the group of the virtual runs if there are several groups."""
+    """Return a sentence for a caption on the group of the virtual runs; "" if there is only one group."""
     if len(report.groups) < 2 or not report.base:
         return ""
     return f" Runs in virtual time are from one group{report.base_title()}."
 
 
 def injected_parts(report: ReportContext) -> Parts:
-    """Return the figure of measured latency over injected delay."""
+    """Return the figure of measured latency by injected delay."""
     if not report.kinds:
         return []
     caption = (
-        "Measured one-way latency over injected delay: median, p5 to p95. The grey line is the latency of the "
-        "condition with the least delay, plus the injected delay. The lower panels show the deviation of each median "
-        "from this line; bars are the bound of the clock error."
-        f"{_base_note(report)}"
+        "Measured one-way latency by injected delay. Points are medians; bars in the upper panels reach from p5 to "
+        "p95. The grey line shows the expected latency: the median of the condition with the least delay, plus the "
+        "additional injected delay. The lower panels show the deviation of each median from this line, with the "
+        f"bound of the clock error as bars.{_base_note(report)}"
     )
     figure = injected_figure(report.kinds, report.colours)
-    return [save_figure(report.directory, "injected", figure, "measured latency over injected delay", caption)]
+    return [save_figure(report.directory, "injected", figure, "measured latency by injected delay", caption)]
 
 
 def degradation_parts(report: ReportContext) -> Parts:
-    """Return the figure of completion and error over latency."""
-    if not any(entry["loop_ms"]["p50"] is not None for of in report.kinds.values() for entry in of.values()):
+    """Return the figure of completion and error by latency."""
+    all_entries = [entry for conditions in report.kinds.values() for entry in conditions.values()]
+    if all(entry["loop_ms"]["p50"] is None for entry in all_entries):
         return []
     paper = report.paper(report.summary["conditions"])
     caption = (
-        "Completion and error over the median loop latency (from a frame's stamp to the application of its command) "
-        "and over the mean age of the frame behind the command in force. Bars are 95 % intervals. Stacked names are in "
-        "the vertical order of their points." + (PAPER_POINTS if paper else "") + _base_note(report)
+        "Completion and error by the median loop latency (from a frame's stamp to the application of its command), and "
+        "by the mean frame age (the age of the frame from which the command in force was made). Bars are 95 % "
+        "intervals. Names above each other are in the vertical order of their points."
+        + (PAPER_POINTS if paper else "")
+        + _base_note(report)
     )
     figure = degradation_figure(report.kinds, paper, report.colours)
-    return [save_figure(report.directory, "degradation", figure, "completion and error over latency", caption)]
+    return [save_figure(report.directory, "degradation", figure, "completion and error by latency", caption)]
 
 
 def survival_parts(report: ReportContext) -> Parts:
@@ -228,11 +237,11 @@ def survival_parts(report: ReportContext) -> Parts:
             "survival": (
                 survival_figure,
                 "Share of runs still driving at each distance (Kaplan-Meier). Each ending except completion is an "
-                "event; a completed run is censored at the end of its route. The files contain the 95 % intervals.",
+                "event, and a completed run is censored at the end of its route. The files contain the 95 % intervals.",
             ),
             "incidence": (
                 incidence_figure,
-                "Cumulative incidence: share of runs that ended in each way by each distance.",
+                "Cumulative incidence: the share of runs that ended in each way up to each distance.",
             ),
         }
         for name, (make, caption) in figures.items():
@@ -278,11 +287,14 @@ def _is_after_loop(stage: Mapping[str, Any]) -> bool:
 
 
 def _loop_of(entry: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """Return the stages of a condition's loop, and the rest of its median: waiting for the next tick."""
+    """Return the stages of a condition's loop, and the part of its median loop latency that belongs to no stage.
+
+    In this part a repeated command waits until it is due.
+    """
     stages, loop_ms = [stage for stage in entry["stages_ms"] if not _is_after_loop(stage)], entry["loop_ms"]["p50"]
     rest_ms = 0.0 if loop_ms is None else loop_ms - sum(stage["p50"] or 0.0 for stage in stages)
     rest = {"node": "rest", "stage": "waiting (median loop minus the sum of stages)", "p50": rest_ms}
-    return [*stages, rest] if rest_ms > LEAST_REST_MS else stages
+    return [*stages, rest] if rest_ms > SMALLEST_REST_MS else stages
 
 
 def group_parts(report: ReportContext) -> Parts:
@@ -291,13 +303,13 @@ def group_parts(report: ReportContext) -> Parts:
     if len(groups) < 2:
         return []
     parts = []
-    if len(groups) <= COMPARED_GROUPS:
+    if len(groups) <= MAX_COMPARED_GROUPS:
         figure = presets_figure({title_of(group, names): group["conditions"] for group in groups}, report.colours)
         caption = (
-            "Comparison of the groups, virtual time. The legend names the settings that differ. Conditions whose "
-            "points overlap are named, in the vertical order of their points."
+            "Comparison of the groups in virtual time. The legend names the settings that differ. Where the points "
+            "of several conditions overlap, their names are in the vertical order of the points."
         )
-        parts.append(save_figure(report.directory, "groups", figure, "groups compared", caption))
+        parts.append(save_figure(report.directory, "groups", figure, "comparison of the groups", caption))
     return [*parts, save_table(report.directory, "groups", group_table(groups, names))]
 
 
@@ -307,19 +319,23 @@ def axis_parts(report: ReportContext) -> Parts:
     if not axes:
         return []
     if len(axes) > 2:
-        return [html_page.paragraph(f"No figure can show {len(axes)} axes; see the table of groups.", is_note=True)]
+        return [
+            html_page.paragraph(
+                f"A figure can show two axes, but this sweep has {len(axes)}. See the table of groups.", is_note=True
+            )
+        ]
     along = sorted(axes, key=lambda axis: -_numeric_values(report.groups, axis))
     others = [name for name in differing(report.groups) if name not in axes]
-    alike: dict[str, list[Group]] = {}
+    groups_by_title: dict[str, list[Group]] = {}
     for group in report.groups:
-        alike.setdefault(title_of(group, others), []).append(group)
+        groups_by_title.setdefault(title_of(group, others), []).append(group)
     parts = []
-    for title, groups in alike.items():
+    for title, groups in groups_by_title.items():
         figure = axis_figure(groups, along, report.colours)
         names = " and ".join(short(axis) for axis in along)
-        caption = f"Driving results over {names}, virtual time{f', {title}' if title else ''}."
+        caption = f"Driving results by {names}, virtual time{f', {title}' if title else ''}."
         name = "_".join(["axes", *(html_page.slug(title),)]) if title else "axes"
-        parts.append(save_figure(report.directory, name, figure, f"driving results over {short(along[0])}", caption))
+        parts.append(save_figure(report.directory, name, figure, f"driving results by {short(along[0])}", caption))
     return parts
 
 
@@ -347,24 +363,27 @@ def run_parts(report: ReportContext) -> Parts:
 def clock_parts(report: ReportContext) -> Parts:
     """Return the clock offset of the runs in real time whose sides have separate clocks."""
     runs = report.summary["runs"]
-    apart = [run for run in runs if run["time"] == "real" and (run.get("delta") or {}).get("source") not in ONE_CLOCK]
-    if not apart:
+    two_clock_runs = [
+        run for run in runs if run["time"] == "real" and (run.get("delta") or {}).get("source") not in ONE_CLOCK
+    ]
+    if not two_clock_runs:
         return []
     parts = [
-        save_table(report.directory, "clocks", clock_table(apart)),
+        save_table(report.directory, "clocks", clock_table(two_clock_runs)),
         html_page.paragraph(
-            "The clock offset is the server's clock minus the client's in the middle of the run. The value after ± is "
-            "the largest bound during the run; it applies to each one-way latency. The hosts' time sources and the "
-            "probe are independent estimates; a run in which they contradict each other is invalid.",
+            "The clock offset is the server's clock minus the client's clock, in the middle of the drive. The value "
+            "after ± is the largest error bound during the drive, and it applies to each one-way latency. The time "
+            "sources of the hosts and the probe give two independent estimates; a run in which they contradict each "
+            "other is invalid.",
             is_note=True,
         ),
     ]
-    if any(run["delta"]["source"] == PROBE for run in apart):
+    if any(run["delta"]["source"] == PROBE for run in two_clock_runs):
         parts.append(
             html_page.paragraph(
-                "Source “probe”: no other time source reported the clock error. The probe's bound is half the round "
-                "trip plus the drift since then. It covers a difference between the two directions, which the probe "
-                "cannot see.",
+                "Source “probe” means that no other time source reported the clock error. The probe's bound is half "
+                "the round trip plus the possible drift since then. The probe cannot measure how the round trip "
+                "divides into the two directions, but the bound is valid for any division.",
                 is_note=True,
             )
         )

@@ -8,10 +8,10 @@ from typing import Any
 
 from lavt.experiment.report.figure_style import Conditions
 
-LISTED = 8
-"""A sentence with more names than this gives only their number; the tables list them."""
+MAX_LISTED_NAMES = 8
+"""If there are more names, a sentence gives only their number; the tables list them."""
 
-SAME_LOOP_MS = 3.0
+EQUAL_LOOP_LATENCY_MS = 3.0
 """Median loop latencies that differ by no more than this are treated as equal."""
 
 ConditionPoint = tuple[str, float, float]
@@ -19,21 +19,21 @@ ConditionPoint = tuple[str, float, float]
 
 
 def _by_latency(conditions: Conditions) -> list[list[ConditionPoint]]:
-    """Return the conditions with known loop latency and completion, grouped by equal latency, the lowest first."""
+    """Return the conditions with known loop latency and completion, in groups of equal latency, the lowest first."""
     known = [
         (name, float(entry["loop_ms"]["p50"]), float(entry["completion_rate"]))
         for name, entry in conditions.items()
         if entry["loop_ms"]["p50"] is not None and entry["completion_rate"] is not None
     ]
     begins_ms: list[float] = []
-    for _, loop_ms, _ in sorted(known, key=lambda each: each[1]):
-        if not begins_ms or loop_ms - begins_ms[-1] > SAME_LOOP_MS:
+    for _, loop_ms, _ in sorted(known, key=lambda point: point[1]):
+        if not begins_ms or loop_ms - begins_ms[-1] > EQUAL_LOOP_LATENCY_MS:
             begins_ms.append(loop_ms)
 
-    def level(each: ConditionPoint) -> int:
-        return sum(begin_ms <= each[1] for begin_ms in begins_ms)
+    def level(point: ConditionPoint) -> int:
+        return sum(begin_ms <= point[1] for begin_ms in begins_ms)
 
-    return [list(members) for _, members in groupby(sorted(known, key=lambda each: (level(each), each[0])), level)]
+    return [list(members) for _, members in groupby(sorted(known, key=lambda point: (level(point), point[0])), level)]
 
 
 def runs_overview(runs: Sequence[Mapping[str, Any]]) -> str:
@@ -54,43 +54,47 @@ def runs_overview(runs: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _listed(word: str, names: Sequence[str]) -> str:
-    if len(names) > LISTED:
+    if len(names) > MAX_LISTED_NAMES:
         return f"{len(names)} {word}s"
     return f"the {word}{'s' if len(names) > 1 else ''} {', '.join(names)}"
 
 
 def results_sentences(name: str, conditions: Conditions) -> str:
-    """Return the results of the runs called `name`: completion, its largest fall and P95; "" without conditions."""
+    """Return sentences on the results of the runs called `name`; "" without conditions.
+
+    They give the completion, its largest fall between two levels of latency, and P95 of the cross-track error.
+    """
     levels = _by_latency(conditions)
-    known = [each for level in levels for each in level]
+    known = [point for level in levels for point in level]
     if not known:
         return ""
     parts = []
-    if len(known) <= LISTED:
-        each = ", ".join(f"{condition} {rate * 100:.0f} % ({loop_ms:.0f} ms)" for condition, loop_ms, rate in known)
-        parts.append(f"Completed runs, with the median loop latency: {each}.")
+    if len(known) <= MAX_LISTED_NAMES:
+        rates = ", ".join(f"{condition} {rate * 100:.0f} % ({loop_ms:.0f} ms)" for condition, loop_ms, rate in known)
+        parts.append(f"Completed runs by condition, with the median loop latency: {rates}.")
     parts += _fall_sentences(levels)
     errors = [(condition, conditions[condition]["p95_m"]) for condition, _, _ in known]
     known_errors = [(condition, error_m) for condition, error_m in errors if error_m is not None]
     if len(known_errors) > 1:
         (first, first_m), (last, last_m) = known_errors[0], known_errors[-1]
         parts.append(
-            f"Mean P95 of the cross-track error of completed runs: {first_m:.2f} m at {first}, {last_m:.2f} m at "
-            f"{last}."
+            f"The P95 of the cross-track error, averaged over completed runs, is {first_m:.2f} m at {first} and "
+            f"{last_m:.2f} m at {last}."
         )
     return f"{name}. {' '.join(parts)}"
 
 
 def _fall_sentences(levels: Sequence[Sequence[ConditionPoint]]) -> list[str]:
-    falls = [each for lower, higher in pairwise(levels) for each in product(lower, higher)]
+    """Return sentences on the largest fall of completion, and on the latency from which fewer than half complete."""
+    falls = [pair for lower, higher in pairwise(levels) for pair in product(lower, higher)]
     if not falls:
         return []
     before, after = max(falls, key=lambda fall: fall[0][2] - fall[1][2])
     if before[2] <= after[2]:
         return ["Completion does not fall as latency increases."]
     parts = [
-        f"The largest fall is from {before[2] * 100:.0f} % at {before[0]} to {after[2] * 100:.0f} % at {after[0]}, "
-        f"between {before[1]:.0f} and {after[1]:.0f} ms of loop latency."
+        f"The largest fall of completion is from {before[2] * 100:.0f} % at {before[0]} to {after[2] * 100:.0f} % at "
+        f"{after[0]}, between {before[1]:.0f} and {after[1]:.0f} ms of loop latency."
     ]
     last = max((index for index, level in enumerate(levels) if any(rate >= 0.5 for _, _, rate in level)), default=-1)
     if last + 1 < len(levels):

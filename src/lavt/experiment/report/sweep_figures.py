@@ -1,4 +1,4 @@
-"""Figures of many runs: distance driven, endings, and results over an axis of the sweep. None reads a file."""
+"""Figures of many runs: distance driven, endings, and results by an axis of the sweep. No function reads a file."""
 
 from __future__ import annotations
 
@@ -20,15 +20,17 @@ ENDING_DASHES: Mapping[str, Any] = {
     "timeout": (0, (6, 1.5, 1, 1.5)),
 }
 
-MOST_BANDS = 2
-MOST_TICKS = 8
+MAX_BANDS = 2
+"""The intervals of survival are drawn for at most this many conditions, because more would overlap."""
+MAX_TICKS = 8
+"""With at most this many values, each value of an axis has a tick of its own."""
 
 AXIS_ROWS = (
     ("runs completed (%)", "completion_rate", 100.0),
     ("error, mean P95 (m)", "p95_m", 1.0),
     ("frame age (ms)", "picture_age_ms", 1.0),
 )
-"""The rows of panels over an axis of a sweep: label, key of a condition, factor."""
+"""The rows of panels: label, key of the value in a condition, and the scale by which the value is multiplied."""
 
 
 def routes_with_survival(conditions: Conditions) -> list[str]:
@@ -39,7 +41,7 @@ def routes_with_survival(conditions: Conditions) -> list[str]:
 def survival_figure(conditions: Conditions, colours: Colours) -> Figure:
     """Return the figure of runs still driving at each distance: a panel for each route, a line for each condition.
 
-    The 95 % intervals are drawn for at most `MOST_BANDS` conditions, because more would overlap.
+    The 95 % intervals are drawn for at most `MAX_BANDS` conditions.
     """
     routes = routes_with_survival(conditions)
     figure, panels = _panels(len(routes))
@@ -50,7 +52,7 @@ def survival_figure(conditions: Conditions, colours: Colours) -> Figure:
                 continue
             distance_m = curve["distance_m"]
             low, high, surviving = (np.array(curve[key], np.float64) * 100 for key in ("low", "high", "surviving"))
-            if len(conditions) <= MOST_BANDS:
+            if len(conditions) <= MAX_BANDS:
                 axes.fill_between(distance_m, low, high, step="post", color=colours[name], alpha=0.15, linewidth=0)
             axes.step(distance_m, surviving, where="post", color=colours[name], linewidth=width)
         tidy(axes, "", "", f"Route {route}")
@@ -62,29 +64,32 @@ def survival_figure(conditions: Conditions, colours: Colours) -> Figure:
 
 
 def incidence_figure(conditions: Conditions, colours: Colours) -> Figure:
-    """Return the figure of endings by distance: a panel for each route, a line style for each ending."""
+    """Return the figure of the share of runs that ended in each way, by distance.
+
+    It has a panel for each route, a line style for each ending, and a colour for each condition.
+    """
     routes = routes_with_survival(conditions)
     figure, panels = _panels(len(routes))
-    shown: dict[str, Any] = {}
+    dashes: dict[str, Any] = {}
     for axes, route in zip(panels, routes, strict=True):
         for (name, entry), width in zip(conditions.items(), _widths(len(conditions)), strict=True):
             curve = (entry.get("survival") or {}).get(route) or {"incidence": {}}
             for ending, incidence in (curve.get("incidence") or {}).items():
                 if any(incidence):
-                    shown[ending] = ENDING_DASHES.get(ending, "solid")
-                    style = {"color": colours[name], "linestyle": shown[ending], "linewidth": width}
+                    dashes[ending] = ENDING_DASHES.get(ending, "solid")
+                    style = {"color": colours[name], "linestyle": dashes[ending], "linewidth": width}
                     axes.step(curve["distance_m"], np.array(incidence, np.float64) * 100, where="post", **style)
         tidy(axes, "", "", f"Route {route}")
         axes.set_ylim(-4, 104)
     _label_distance(panels)
     figure.supylabel("runs ended in this way (%)", fontsize=10)
-    endings = [Line2D([], [], color="0.3", linestyle=dash, label=ending) for ending, dash in shown.items()]
+    endings = [Line2D([], [], color="0.3", linestyle=dash, label=ending) for ending, dash in dashes.items()]
     legend_below(figure, [*condition_handles(conditions, colours), *endings])
     return figure
 
 
 def _widths(count: int) -> list[float]:
-    """Return the width of each line; the first are wider, so that they remain visible under the later ones."""
+    """Return the width of each line. Earlier lines are wider, so that they remain visible under the later ones."""
     return [float(width) for width in np.linspace(4.0 if count > 1 else 1.2, 1.2, count)]
 
 
@@ -94,7 +99,7 @@ def _label_distance(panels: Sequence[Axes]) -> None:
 
 
 def _panels(count: int) -> tuple[Figure, list[Axes]]:
-    """Return a new figure with small panels of one scale, three in a row."""
+    """Return a new figure with `count` small panels that share the scale of y, three in a row."""
     columns = min(3, count)
     rows = -(-count // columns)
     figure = new_figure(2.0 * rows + 0.7)
@@ -105,12 +110,13 @@ def _panels(count: int) -> tuple[Figure, list[Axes]]:
 
 
 def axis_figure(groups: Sequence[Group], axes_names: Sequence[str], colours: Colours) -> Figure:
-    """Return the figure of one or two axes of a sweep: the first on x, a column of panels for each value of the second.
+    """Return the figure of results by one or two axes of a sweep.
 
-    Lines are conditions; the rows are completion, error and frame age, if they are known.
+    The first axis is on x, and each value of the second axis has a column of panels. Each line is a condition. The rows
+    are completion, error and frame age, if they are known.
     """
-    along, *second = axes_names
-    positions, labels = _positions([group.get(along) for group in groups])
+    x_axis, *second = axes_names
+    positions, labels = _positions([group.get(x_axis) for group in groups])
     columns = list(dict.fromkeys(str(group.get(second[0])) for group in groups)) if second else [""]
     names = sorted({name for group in groups for name in group["conditions"]})
     rows = [
@@ -123,11 +129,11 @@ def axis_figure(groups: Sequence[Group], axes_names: Sequence[str], colours: Col
     for column, value in enumerate(columns):
         members = [group for group in groups if not second or str(group.get(second[0])) == value]
         title = f"{short(second[0])} {value}" if second else ""
-        for row, (label, key, unit) in enumerate(rows):
+        for row, (label, key, scale) in enumerate(rows):
             axes = panels[row, column]
             for name, width in zip(names, _widths(len(names)), strict=True):
                 points = sorted(
-                    (positions[str(group.get(along))], _value(group["conditions"][name], key) * unit)
+                    (positions[str(group.get(x_axis))], _value(group["conditions"][name], key) * scale)
                     for group in members
                     if name in group["conditions"] and _has(group["conditions"][name], key)
                 )
@@ -135,13 +141,13 @@ def axis_figure(groups: Sequence[Group], axes_names: Sequence[str], colours: Col
                     x, y = zip(*points, strict=True)
                     axes.plot(x, y, marker="o", markersize=width + 2.5, linewidth=width, color=colours[name])
             tidy(axes, "", label if column == 0 else "", title if row == 0 else "")
-            if labels or len(positions) <= MOST_TICKS:
+            if labels or len(positions) <= MAX_TICKS:
                 axes.set_xticks(list(positions.values()), labels or list(positions))
     for axes in panels[:, 0]:
         axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
     panels[0, 0].set_ylim(-5, 105)
     for axes in panels[-1]:
-        axes.set_xlabel(short(along))
+        axes.set_xlabel(short(x_axis))
     legend_below(figure, list(condition_handles(names, colours)))
     return figure
 

@@ -13,16 +13,16 @@ from lavt.experiment.report.table_format import (
     UNBROKEN,
     Column,
     TableData,
-    intervals,
-    latencies,
-    number,
-    numbers,
-    percent,
-    probabilities,
-    share_intervals,
-    shares,
-    texts,
-    with_bound,
+    format_number,
+    format_percent,
+    format_with_bound,
+    interval_column,
+    latency_column,
+    number_column,
+    probability_column,
+    share_column,
+    share_interval_column,
+    text_column,
 )
 
 FLOWS = ("video", "control")
@@ -30,10 +30,11 @@ FLOWS = ("video", "control")
 COMPLETED_P95 = "p95 m, completed runs"
 COMMON_P95 = "p95 m, up to common distance"
 
-AFTERWARDS = ", after the loop"
+AFTER_LOOP_SUFFIX = ", after the loop"
+"""In the table of stages, marks a stage that is not part of the loop."""
 
 ENDED_EARLY = "ended early"
-"""The text of a quantile over all runs that falls among the runs that were not completed."""
+"""The text of a quantile of all runs if a run that was not completed has this rank."""
 
 FIDELITY_DESCRIPTIONS = {
     "video": "modelled network and clocks, real images, codec and packets",
@@ -43,7 +44,7 @@ FIDELITY_DESCRIPTIONS = {
 
 
 def run_setup(runs: Sequence[Mapping[str, Any]]) -> str:
-    """Return whether time was real, which parts were modelled, and what injected the delay."""
+    """Return a text on the runs' kind of time, the parts that were modelled, and the injection of the delay."""
     setups = {(run["time"], run.get("fidelity") or "video", run["injection"]) for run in runs}
     return "; ".join(
         f"virtual time, fidelity {fidelity}: {FIDELITY_DESCRIPTIONS[fidelity]}"
@@ -63,7 +64,10 @@ def matching_paper(conditions: Conditions, paper: Conditions) -> Conditions:
 
 
 def _table(entries: Iterable[Mapping[str, Any]], columns: Sequence[tuple[Column, str]]) -> TableData:
-    """Return the table with a row for each entry, without empty columns; a dotted key leads into nested entries."""
+    """Return the table with a row for each entry, without empty columns.
+
+    Each column has the key of its values; a key with dots is a path into nested entries.
+    """
     rows = [[_value(entry, key) for _, key in columns] for entry in entries]
     return TableData([column for column, _ in columns], rows).without_empty()
 
@@ -82,22 +86,22 @@ def _with_paper(conditions: Conditions, paper: Conditions) -> list[Mapping[str, 
 
 def latency_table(conditions: Conditions, paper: Conditions) -> TableData:
     """Return the table of injected and measured latency with the paper's values: one row for each condition."""
-    totals = {name: {**its, "total_ms": its["tau_v_ms"] + its["tau_c_ms"]} for name, its in paper.items()}
+    totals = {name: {**entry, "total_ms": entry["tau_v_ms"] + entry["tau_c_ms"]} for name, entry in paper.items()}
     return _table(
         _with_paper(conditions, totals),
         [
-            (texts("condition"), "condition"),
-            (numbers("injected video delay ms", 0), "injected_ms.video"),
-            (numbers("injected control delay ms", 0), "injected_ms.control"),
-            (latencies("τ video ms", bounded=True), "tau_v_ms"),
-            (numbers("the paper's τ video ms", 0), "paper.tau_v_ms"),
-            (latencies("τ control ms", bounded=True), "tau_c_ms"),
-            (numbers("the paper's τ control ms", 0), "paper.tau_c_ms"),
-            (latencies("loop latency ms"), "loop_ms"),
-            (numbers("the paper's τ video + τ control ms", 0), "paper.total_ms"),
-            (numbers("frame age, mean ms", 0), "picture_age_ms.mean"),
-            (numbers("frame age, p95 ms", 0), "picture_age_ms.p95"),
-            (latencies("frame age at actuation ms"), "age_at_actuation_ms"),
+            (text_column("condition"), "condition"),
+            (number_column("injected video delay ms", 0), "injected_ms.video"),
+            (number_column("injected control delay ms", 0), "injected_ms.control"),
+            (latency_column("τ video ms", bounded=True), "tau_v_ms"),
+            (number_column("the paper's τ video ms", 0), "paper.tau_v_ms"),
+            (latency_column("τ control ms", bounded=True), "tau_c_ms"),
+            (number_column("the paper's τ control ms", 0), "paper.tau_c_ms"),
+            (latency_column("loop latency ms"), "loop_ms"),
+            (number_column("the paper's τ video + τ control ms", 0), "paper.total_ms"),
+            (number_column("frame age, mean ms", 0), "picture_age_ms.mean"),
+            (number_column("frame age, p95 ms", 0), "picture_age_ms.p95"),
+            (latency_column("frame age at actuation ms"), "age_at_actuation_ms"),
         ],
     )
 
@@ -107,20 +111,20 @@ def driving_table(conditions: Conditions, paper: Conditions) -> TableData:
     return _table(
         [{**entry, "endings": _endings(entry)} for entry in _with_paper(conditions, paper)],
         [
-            (texts("condition"), "condition"),
-            (numbers("runs", 0), "runs"),
-            (shares("completed"), "completion_rate"),
-            (share_intervals("95 %, these routes"), "completion_interval"),
-            (share_intervals("range over roads"), "completion_such_roads"),
-            (shares("the paper's completed"), "paper.completion_rate"),
-            (share_intervals("the paper's 95 %"), "paper.completion_interval"),
-            (numbers("collisions / run", 2), "collisions_per_run"),
-            (numbers("the paper's collisions / run", 2), "paper.collisions_per_run"),
-            (numbers("collisions / km", 2), "collisions_per_km"),
-            (numbers("lane invasions / run", 2), "lane_invasions_per_run"),
-            (numbers("the paper's lane invasions / run", 2), "paper.lane_invasions_per_run"),
-            (numbers("lane invasions / km", 1), "lane_invasions_per_km"),
-            (texts("endings"), "endings"),
+            (text_column("condition"), "condition"),
+            (number_column("runs", 0), "runs"),
+            (share_column("completed"), "completion_rate"),
+            (share_interval_column("95 %, these routes"), "completion_interval"),
+            (share_interval_column("range over roads"), "completion_such_roads"),
+            (share_column("the paper's completed"), "paper.completion_rate"),
+            (share_interval_column("the paper's 95 %"), "paper.completion_interval"),
+            (number_column("collisions / run", 2), "collisions_per_run"),
+            (number_column("the paper's collisions / run", 2), "paper.collisions_per_run"),
+            (number_column("collisions / km", 2), "collisions_per_km"),
+            (number_column("lane invasions / run", 2), "lane_invasions_per_run"),
+            (number_column("the paper's lane invasions / run", 2), "paper.lane_invasions_per_run"),
+            (number_column("lane invasions / km", 1), "lane_invasions_per_km"),
+            (text_column("endings"), "endings"),
         ],
     )
 
@@ -134,29 +138,29 @@ def error_table(conditions: Conditions, paper: Conditions) -> TableData:
     return _table(
         _with_paper(conditions, paper),
         [
-            (texts("condition"), "condition"),
-            (numbers(f"{COMPLETED_P95}, mean of runs", 2), "p95_m"),
-            (intervals("95 % interval, completed runs m"), "p95_interval"),
-            (numbers("the paper's p95 m", 2), "paper.p95_m"),
-            (numbers(f"{COMMON_P95}, mean of runs", 2), "p95_common_m"),
-            (intervals("95 % interval, up to common distance m"), "p95_common_interval"),
-            (Column("p95 m, all runs ranked", _quartiles, ("p25", "p50", "p75")), "p95_worst_rank_m"),
-            (numbers("mean error m", 2), "mae_m"),
-            (numbers("rms m, mean of runs", 2), "rms_m"),
-            (numbers("maximum m, mean of runs", 2), "max_m"),
-            (numbers("heading rms rad", 3), "heading_rms_rad"),
-            (numbers("steering reversals / s", 2), "steering_reversals_per_s"),
-            (numbers("oscillation Hz", 2), "oscillation_hz"),
+            (text_column("condition"), "condition"),
+            (number_column(f"{COMPLETED_P95}, mean of runs", 2), "p95_m"),
+            (interval_column("95 % interval, completed runs m"), "p95_interval"),
+            (number_column("the paper's p95 m", 2), "paper.p95_m"),
+            (number_column(f"{COMMON_P95}, mean of runs", 2), "p95_common_m"),
+            (interval_column("95 % interval, up to common distance m"), "p95_common_interval"),
+            (Column("p95 m, all runs ranked", _format_quartiles, ("p25", "p50", "p75")), "p95_worst_rank_m"),
+            (number_column("mean error m", 2), "mae_m"),
+            (number_column("rms m, mean of runs", 2), "rms_m"),
+            (number_column("maximum m, mean of runs", 2), "max_m"),
+            (number_column("heading rms rad", 3), "heading_rms_rad"),
+            (number_column("steering reversals / s", 2), "steering_reversals_per_s"),
+            (number_column("oscillation Hz", 2), "oscillation_hz"),
         ],
     )
 
 
-def _quartiles(quartiles: Mapping[str, float | None] | None) -> str:
+def _format_quartiles(quartiles: Mapping[str, float | None] | None) -> str:
     """Return the median and both quartiles."""
     if quartiles is None:
         return NOTHING
     low, middle, high = (
-        ENDED_EARLY if quartiles[name] is None else number(quartiles[name], 2) for name in ("p25", "p50", "p75")
+        ENDED_EARLY if quartiles[name] is None else format_number(quartiles[name], 2) for name in ("p25", "p50", "p75")
     )
     return middle if low == middle == high else f"{middle} ({low} to {high})".replace(" ", UNBROKEN)
 
@@ -165,27 +169,34 @@ def contrast_table(contrasts: Sequence[Mapping[str, Any]], paper: Sequence[Mappi
     """Return the table of planned contrasts with the paper's p values, from Fisher's test on its counts."""
     published = {(contrast["a"], contrast["b"]): contrast for contrast in paper}
     entries = [
-        {**each, "contrast": f"{each['a']} – {each['b']}", "paper": published.get((each["a"], each["b"]))}
-        for each in contrasts
+        {
+            **contrast,
+            "contrast": f"{contrast['a']} – {contrast['b']}",
+            "paper": published.get((contrast["a"], contrast["b"])),
+        }
+        for contrast in contrasts
     ]
     return _table(
         entries,
         [
-            (texts("contrast"), "contrast"),
-            (numbers("pairs", 0), "pairs"),
-            (numbers("completed under first only", 0), "only_a"),
-            (numbers("completed under second only", 0), "only_b"),
-            (probabilities("p"), "p"),
-            (probabilities("p, Holm"), "p_holm"),
-            (probabilities("the paper's p"), "paper.p"),
-            (probabilities("the paper's p, Holm"), "paper.p_holm"),
+            (text_column("contrast"), "contrast"),
+            (number_column("pairs", 0), "pairs"),
+            (number_column("completed under first only", 0), "only_a"),
+            (number_column("completed under second only", 0), "only_b"),
+            (probability_column("p"), "p"),
+            (probability_column("p, Holm"), "p_holm"),
+            (probability_column("the paper's p"), "paper.p"),
+            (probability_column("the paper's p, Holm"), "paper.p_holm"),
         ],
     )
 
 
 def group_table(groups: Sequence[Group], names: Sequence[str]) -> TableData:
-    """Return the table of groups, which the settings `names` distinguish: one row for each condition of a group."""
-    entries = [  # numbers as keys of the settings, whose names may have dots
+    """Return the table of groups: one row for each condition of each group.
+
+    `names` are the settings that distinguish the groups.
+    """
+    entries = [  # the keys of the settings are indexes, because a dot in a setting's name would be read as a path
         {**entry, "condition": name, **{str(index): group.get(key) for index, key in enumerate(names)}}
         for group in groups
         for name, entry in group["conditions"].items()
@@ -193,17 +204,17 @@ def group_table(groups: Sequence[Group], names: Sequence[str]) -> TableData:
     return _table(
         entries,
         [
-            *((texts(short(name)), str(index)) for index, name in enumerate(names)),
-            (texts("condition"), "condition"),
-            (numbers("runs", 0), "runs"),
-            (shares("completed"), "completion_rate"),
-            (share_intervals("95 % interval"), "completion_interval"),
-            (numbers("collisions / run", 2), "collisions_per_run"),
-            (numbers("lane invasions / run", 2), "lane_invasions_per_run"),
-            (numbers(f"{COMPLETED_P95}, mean of runs", 2), "p95_m"),
-            (numbers(f"{COMMON_P95}, mean of runs", 2), "p95_common_m"),
-            (numbers("loop latency ms, median"), "loop_ms.p50"),
-            (numbers("frame age, mean ms", 0), "picture_age_ms.mean"),
+            *((text_column(short(name)), str(index)) for index, name in enumerate(names)),
+            (text_column("condition"), "condition"),
+            (number_column("runs", 0), "runs"),
+            (share_column("completed"), "completion_rate"),
+            (share_interval_column("95 % interval"), "completion_interval"),
+            (number_column("collisions / run", 2), "collisions_per_run"),
+            (number_column("lane invasions / run", 2), "lane_invasions_per_run"),
+            (number_column(f"{COMPLETED_P95}, mean of runs", 2), "p95_m"),
+            (number_column(f"{COMMON_P95}, mean of runs", 2), "p95_common_m"),
+            (number_column("loop latency ms, median"), "loop_ms.p50"),
+            (number_column("frame age, mean ms", 0), "picture_age_ms.mean"),
         ],
     )
 
@@ -211,14 +222,14 @@ def group_table(groups: Sequence[Group], names: Sequence[str]) -> TableData:
 def route_table(conditions: Conditions) -> TableData:
     """Return the table of routes: one row for each condition on each route."""
     columns = [
-        texts("route"),
-        texts("condition"),
-        numbers("runs", 0),
-        numbers("completed", 0),
-        shares("share"),
-        share_intervals("95 % interval"),
-        numbers(f"{COMPLETED_P95}, mean of runs", 2),
-        numbers(f"{COMMON_P95}, mean of runs", 2),
+        text_column("route"),
+        text_column("condition"),
+        number_column("runs", 0),
+        number_column("completed", 0),
+        share_column("share"),
+        share_interval_column("95 % interval"),
+        number_column(f"{COMPLETED_P95}, mean of runs", 2),
+        number_column(f"{COMMON_P95}, mean of runs", 2),
     ]
     keys = ("runs", "completed", "completion_rate", "completion_interval", "p95_m", "p95_common_m")
     routes = sorted({route for entry in conditions.values() for route in entry.get("routes") or {}})
@@ -234,7 +245,7 @@ def route_table(conditions: Conditions) -> TableData:
 def route_overview(conditions: Conditions) -> TableData:
     """Return the table of completed runs: one row for each route, one column for each condition."""
     routes = sorted({route for entry in conditions.values() for route in entry.get("routes") or {}})
-    columns = [texts("completed"), *(Column(name, lambda cell: cell or NOTHING) for name in conditions)]
+    columns = [text_column("completed"), *(Column(name, lambda cell: cell or NOTHING) for name in conditions)]
     rows = [
         [route, *(_completed((entry.get("routes") or {}).get(route)) for entry in conditions.values())]
         for route in routes
@@ -249,19 +260,21 @@ def _completed(entry: Mapping[str, Any] | None) -> str | None:
 def survival_table(conditions: Conditions) -> TableData:
     """Return the table of all steps of the survival curves, for use in other programs."""
     columns = [
-        texts("route"),
-        texts("condition"),
-        numbers("distance m", 1),
-        shares("still driving"),
-        share_intervals("95 % interval"),
-        texts("ended so far"),
+        text_column("route"),
+        text_column("condition"),
+        number_column("distance m", 1),
+        share_column("still driving"),
+        share_interval_column("95 % interval"),
+        text_column("ended so far"),
     ]
     rows = []
     for name, entry in conditions.items():
         for route, curve in (entry.get("survival") or {}).items():
             steps = zip(curve["distance_m"], curve["surviving"], curve["low"], curve["high"], strict=True)
             for index, (distance_m, surviving, low, high) in enumerate(steps):
-                ended = ", ".join(f"{ending} {percent(each[index])}" for ending, each in curve["incidence"].items())
+                ended = ", ".join(
+                    f"{ending} {format_percent(shares[index])}" for ending, shares in curve["incidence"].items()
+                )
                 rows.append([route, name, distance_m, surviving, (low, high), ended or None])
     return TableData(columns, rows)
 
@@ -279,18 +292,18 @@ def run_table(runs: Sequence[Mapping[str, Any]]) -> TableData:
     return _table(
         entries,
         [
-            (texts("run"), "run"),
-            (texts("sweep"), "sweep"),
-            (texts("time, fidelity, injection"), "setup"),
-            (texts("route"), "route"),
-            (texts("condition"), "condition"),
-            (texts("preset"), "preset"),
-            (texts("ending"), "ending"),
-            (numbers("distance m", 0), "distance_m"),
-            (numbers("loop latency ms, median"), "loop_ms.p50"),
-            (numbers("p95 error m", 2), "p95_m"),
-            (numbers("frame age, mean ms", 0), "picture_age_ms.mean"),
-            (texts("validity", is_long=True), "validity"),
+            (text_column("run"), "run"),
+            (text_column("sweep"), "sweep"),
+            (text_column("time, fidelity, injection"), "setup"),
+            (text_column("route"), "route"),
+            (text_column("condition"), "condition"),
+            (text_column("preset"), "preset"),
+            (text_column("ending"), "ending"),
+            (number_column("distance m", 0), "distance_m"),
+            (number_column("loop latency ms, median"), "loop_ms.p50"),
+            (number_column("p95 error m", 2), "p95_m"),
+            (number_column("frame age, mean ms", 0), "picture_age_ms.mean"),
+            (text_column("validity", is_long=True), "validity"),
         ],
     )
 
@@ -299,11 +312,11 @@ def clock_table(runs: Sequence[Mapping[str, Any]]) -> TableData:
     """Return the table of clock offsets, by their source and by the probe: one row for each run."""
     parts = ("", "bound")
     columns = [
-        texts("run"),
-        texts("source"),
-        Column("clock offset ms", lambda cell: with_bound(*cell, digits=3), parts),
-        numbers("drift ppm", 2),
-        Column("clock offset by probe ms", lambda cell: with_bound(*cell, digits=3), parts),
+        text_column("run"),
+        text_column("source"),
+        Column("clock offset ms", lambda cell: format_with_bound(*cell, digits=3), parts),
+        number_column("drift ppm", 2),
+        Column("clock offset by probe ms", lambda cell: format_with_bound(*cell, digits=3), parts),
     ]
     rows = [
         [
@@ -323,30 +336,30 @@ def stage_table(
 ) -> TableData:
     """Return the median latency of each stage in ms: one row for each stage, one column for each condition.
 
-    `captured_ms` is the time from capture to stamp by condition; it is the first row, before the loop begins.
+    `captured_ms` is the time from capture to stamp, by condition. It is the first row, because the loop begins later.
     """
-    names = list(dict.fromkeys((stage["node"], stage["stage"]) for every in stages.values() for stage in every))
-    durations = [{(stage["node"], stage["stage"]): stage["p50"] for stage in every} for every in stages.values()]
-    before: list[Any] = [(captured_ms or {}).get(name) for name in stages]
-    show = numbers("", 2).show
-    columns = [texts("stage, median ms"), *(Column(name, show) for name in stages)]
+    names = list(dict.fromkeys((stage["node"], stage["stage"]) for entries in stages.values() for stage in entries))
+    medians_ms = [{(stage["node"], stage["stage"]): stage["p50"] for stage in entries} for entries in stages.values()]
+    before_loop: list[Any] = [(captured_ms or {}).get(name) for name in stages]
+    show = number_column("", 2).show
+    columns = [text_column("stage, median ms"), *(Column(name, show) for name in stages)]
     rows = [
         [
-            f"{node}: {stage}{AFTERWARDS if (node, stage) in AFTER_LOOP else ''}",
-            *(of.get((node, stage)) for of in durations),
+            f"{node}: {stage}{AFTER_LOOP_SUFFIX if (node, stage) in AFTER_LOOP else ''}",
+            *(of_condition.get((node, stage)) for of_condition in medians_ms),
         ]
         for node, stage in names
     ]
-    return TableData(columns, [["camera: capture to stamp, before the loop", *before], *rows])
+    return TableData(columns, [["camera: capture to stamp, before the loop", *before_loop], *rows])
 
 
 def machine_table(annotations: Mapping[str, Mapping[str, str]]) -> TableData:
     """Return the table of versions and machines from a run's records."""
-    columns = [texts("category"), texts("property", is_long=True), texts("value", is_long=True)]
+    columns = [text_column("category"), text_column("property", is_long=True), text_column("value", is_long=True)]
     rows = [
         [name, key, value]
         for name in sorted(annotations)
         for key, value in annotations[name].items()
-        if key != "condition"  # no property of the machine; other tables show it
+        if key != "condition"  # not a property of the machine; other tables show it
     ]
     return TableData(columns, rows or [["not recorded", None, None]])

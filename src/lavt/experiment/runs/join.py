@@ -24,9 +24,10 @@ SIDES = ("server", "client")
 
 
 def join_sides(server_dir: Path, client_dir: Path, out: Path) -> dict[str, Any]:
-    """Create the run directory `out` from the directories of two sides, and return its result.
+    """Create the run directory `out` from the directories of the two sides, and return its result.
 
-    Raises `UserError` where a directory is not that of its side, or the two were not written in the same drive.
+    Raises `UserError` where a directory does not have the files of its side, or where the two directories were not
+    written in the same drive.
     """
     check_directory(out)
     for side, directory in zip(SIDES, (server_dir, client_dir), strict=True):
@@ -45,7 +46,7 @@ def join_sides(server_dir: Path, client_dir: Path, out: Path) -> dict[str, Any]:
 
 
 def run_config(server: ServerConfig, client: ClientConfig) -> RunConfig:
-    """Return the config of a run of two sides, as if both had been on one machine."""
+    """Return the config that a run of these two sides would have had on one machine."""
     requested = client.injection
     return RunConfig(
         vehicle=server.vehicle,
@@ -53,7 +54,7 @@ def run_config(server: ServerConfig, client: ClientConfig) -> RunConfig:
         camera=server.camera,
         video=VideoConfig(
             **{key: getattr(server.video, key) for key in VideoConfig.model_fields}
-            | {"reorder_hold_ms": client.video.reorder_hold_ms}  # the client applies its own
+            | {"reorder_hold_ms": client.video.reorder_hold_ms}  # the client uses its own value
         ),
         network=NetworkConfig(
             condition=requested.condition or "L0",
@@ -87,15 +88,15 @@ def _identity(name: str, run: RunConfig, client: ClientConfig) -> dict[str, Any]
 
 
 def _check_same_drive(server: Path, client: Path) -> None:
-    """Raise `UserError` where the client has read no stamp that the server wrote during the drive."""
+    """Raise `UserError` if the client read none of the stamps that the server wrote during the drive."""
     server_record = read_record(server, channels=("event", "frame"))
     with evaluating(server):
         began_ns, ended_ns, _ = driving_interval(server_record)
-        written = frames_within(server_record.table("frame"), began_ns, ended_ns).ints("stamp_ns")
+        written_stamps = frames_within(server_record.table("frame"), began_ns, ended_ns).ints("stamp_ns")
     with evaluating(client):
-        read = read_record(client, channels=("picture",)).table("picture").ints("stamp_ns")
-    if not np.isin(read[read != MISSING], written).any():
+        read_stamps = read_record(client, channels=("picture",)).table("picture").ints("stamp_ns")
+    if not np.isin(read_stamps[read_stamps != MISSING], written_stamps).any():
         raise UserError(
-            f"{client} has no picture of {server}: name two directories of the same drive; of a server with several "
+            f"{client} has no frame of {server}: name two directories of the same drive; of a server with several "
             "drives, only the first can be joined"
         )

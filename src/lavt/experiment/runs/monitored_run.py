@@ -1,4 +1,4 @@
-"""A drive in virtual time that is monitored in memory instead of recorded, for searches with many hundred drives."""
+"""A drive in virtual time that is monitored in memory and not recorded, for searches with many hundred drives."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CHANNELS = frozenset({"truth", "event", "frame", "admission"})
 """The channels that are kept in memory."""
 
 NEVER_NS = 2**62
-"""The start of a drive that did not begin."""
+"""Stands for the start of a drive that did not begin: it is later than all times of a run."""
 
 
 class InMemoryRecorder:
@@ -38,24 +38,27 @@ class InMemoryRecorder:
 
 @dataclass(frozen=True, slots=True)
 class MonitoredRun:
-    """The monitored quantities of one drive from its start to its ending; no rows where the vehicle was never armed."""
+    """The monitored quantities of one drive from its start to its ending.
+
+    The arrays are empty if the vehicle was never armed.
+    """
 
     ending: str | None
     lane_invasions: int
     total_delay_ms: float
-    """The median over frames from the middle of exposure to the first accepted command; NaN without any."""
+    """The median of the total delays of all frames with an accepted command; NaN without such a frame."""
     time_s: FloatArray
-    """The times since the start, for each row of `cross_track_m` and `speed_mps`."""
+    """Times since the start of the drive, (n,); `cross_track_m` and `speed_mps` have a value for each."""
     cross_track_m: FloatArray
     speed_mps: FloatArray
     limited_s: FloatArray
-    """The times since the start at which a safety limit of the vehicle changed a command."""
+    """The times since the start of the drive at which a safety limit of the vehicle changed a command."""
 
 
 def drive_monitored(planned: PlannedRun, *, limit_s: float = 3600.0) -> MonitoredRun:
     """Drive a run in virtual time without records, and return its monitored quantities.
 
-    The drive is the same as that of `run_once`. Its records are created in a temporary directory and stay empty.
+    The drive is identical to that of `run_once`. Its record files are created in a temporary directory and stay empty.
     """
     cv2.setNumThreads(1)
     recorder = InMemoryRecorder()
@@ -70,11 +73,12 @@ def drive_monitored(planned: PlannedRun, *, limit_s: float = 3600.0) -> Monitore
 def summarize_drive(payloads: dict[str, list[Any]]) -> MonitoredRun:
     """Return the monitored quantities of a drive, from the payloads of each channel of the server."""
     began_ns = next((event.mono_ns for event in payloads["event"] if event.kind == "drive_began"), NEVER_NS)
-    ended = next(((each.mono_ns, each.detail) for each in payloads["event"] if each.kind == "ending"), None)
-    ended_ns, ending = ended or (payloads["truth"][-1].mono_ns, None)
-    within = [truth for truth in payloads["truth"] if began_ns <= truth.mono_ns <= ended_ns]
-    accepted = [each for each in payloads["admission"] if each.verdict == "accepted" and each.mode == "drive"]
-    accepted = [each for each in accepted if began_ns <= each.applied_mono_ns <= ended_ns]
+    ending_event = next(((event.mono_ns, event.detail) for event in payloads["event"] if event.kind == "ending"), None)
+    ended_ns, ending = ending_event or (payloads["truth"][-1].mono_ns, None)
+    truths = [truth for truth in payloads["truth"] if began_ns <= truth.mono_ns <= ended_ns]
+    verdicts = payloads["admission"]
+    accepted = [command for command in verdicts if command.verdict == "accepted" and command.mode == "drive"]
+    accepted = [command for command in accepted if began_ns <= command.applied_mono_ns <= ended_ns]
 
     def since_began_s(times_ns: list[int]) -> FloatArray:
         return np.asarray((np.array(times_ns, np.int64) - began_ns) / NS_PER_S, np.float64)
@@ -84,10 +88,10 @@ def summarize_drive(payloads: dict[str, list[Any]]) -> MonitoredRun:
         ending=ending,
         lane_invasions=sum(event.kind == "lane_invasion" for event in events),
         total_delay_ms=_total_delay_ms(payloads["frame"], accepted),
-        time_s=since_began_s([truth.mono_ns for truth in within]),
-        cross_track_m=np.array([truth.cross_track_m for truth in within], np.float64),
-        speed_mps=np.array([truth.speed_mps for truth in within], np.float64),
-        limited_s=since_began_s([each.applied_mono_ns for each in accepted if each.limited]),
+        time_s=since_began_s([truth.mono_ns for truth in truths]),
+        cross_track_m=np.array([truth.cross_track_m for truth in truths], np.float64),
+        speed_mps=np.array([truth.speed_mps for truth in truths], np.float64),
+        limited_s=since_began_s([command.applied_mono_ns for command in accepted if command.limited]),
     )
 
 

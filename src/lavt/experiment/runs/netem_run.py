@@ -16,16 +16,18 @@ from lavt.transport.netem.netem import NetemInterface
 from lavt.transport.netem.probe import ProbeResult, judge
 
 NETEM = "netem.json"
-"""In a run directory: the flows requested of netem, and the measurements before and after the drive."""
+"""The file in a run directory that has the flows requested of netem, and the measurements before and after the
+drive."""
 LOOPBACK = "lo"
 DISCARD_PORT = 9
-"""A port without traffic (RFC 863)."""
+"""The port of the discard service (RFC 863), which has no traffic."""
 
 
 def check_netem(planned: PlannedRun) -> list[str]:
-    """Raise `UserError` where a run needs netem but it is unavailable; return what was restored after a crash.
+    """Check that netem is available if the run needs it; return messages on what was restored after a crash.
 
-    The check applies netem to an unused port, because only that shows whether root, tc and the kernel's netem exist.
+    The check applies netem to an unused port, because only this shows whether the process is root and whether tc and
+    the kernel's netem exist. Raises `UserError` where netem is unavailable.
     """
     if not uses_netem(planned):
         return []
@@ -41,9 +43,9 @@ def uses_netem(planned: PlannedRun) -> bool:
 
 
 class NetemRun:
-    """A context manager that delays the flows of one run on the loopback, and restores the loopback at its end.
+    """A context manager that delays the flows of one run on the loopback interface, and restores it at its end.
 
-    Entering it raises `UserError` where netem is unavailable, before anything is changed.
+    Entering it raises `UserError` where netem is unavailable, before it changes anything.
     """
 
     def __init__(self, planned: PlannedRun, netem: NetemInterface | None = None) -> None:
@@ -95,13 +97,13 @@ class NetemRun:
 
 
 def netem_reasons(report: Mapping[str, Any]) -> list[str]:
-    """Return a reason for each difference between netem's requested and measured behaviour in `netem.json`."""
+    """Return a reason for each difference between request and measurement; `report` is the content of `netem.json`."""
     try:
         flows = msgspec.convert(report["flows"], tuple[ImpairedFlow, ...])
-        reasons = [str(each) for each in report["read_back"]]
-        for when in ("before", "after"):
-            measured = msgspec.convert(report[when], dict[str, ProbeResult])
-            reasons += [f"{when} the drive: {reason}" for reason in judge(flows, (), measured)]
+        reasons = [str(reason) for reason in report["read_back"]]
+        for moment in ("before", "after"):
+            measured = msgspec.convert(report[moment], dict[str, ProbeResult])
+            reasons += [f"{moment} the drive: {reason}" for reason in judge(flows, (), measured)]
     except (KeyError, msgspec.ValidationError):
         return injection_reasons({"video": 0.0, "control": 0.0}, {})
     return reasons

@@ -11,7 +11,7 @@ from lavt.transport.emulation.link import LinkInjection
 
 US_PER_MS = 1000.0
 
-STAMP_TO_STAMP = (
+VIDEO_LATENCY_STAGES = (
     ("camera", "stamp"),
     ("camera", "encode"),
     ("camera", "packetize"),
@@ -19,14 +19,17 @@ STAMP_TO_STAMP = (
     ("driver", "decode"),
     ("driver", "read_stamp"),
 )
-"""The stages in tau_v: the link delay of a profile is its total minus these."""
-SENT_TO_RECEIVED = (("driver", "command"),)
-"""The stages in tau_c."""
+"""The stages that are part of tau_v. The link's delay in a profile is the profile's tau_v minus these stages."""
+CONTROL_LATENCY_STAGES = (("driver", "command"),)
+"""The stages that are part of tau_c."""
 
 
 @dataclass(frozen=True, slots=True)
 class BaselineLatency:
-    """The complete tau_v and tau_c of a network profile, without injection."""
+    """The complete tau_v and tau_c of a network profile, without injection.
+
+    `video_ms` is the constant part of tau_v, to which `video_jitter` adds a random part.
+    """
 
     video_ms: float
     video_jitter: Lognormal
@@ -43,8 +46,8 @@ INHERENT = {
 class NetworkDelays:
     """The delays of video, state (server to client), control (client to server), and traffic that is never delayed.
 
-    They include an injected constant delay. Any other injected impairment is in `video_injected` and
-    `control_injected`, with its constant part.
+    An injected delay that is only constant is included in them. Any other injected impairment, with its constant part,
+    is in `video_injected` or `control_injected`.
     """
 
     video: DelayModel
@@ -64,9 +67,11 @@ def injected_network(profile: str, condition: Condition, costs: Costs, seed: int
     inherent = INHERENT.get(profile)
     video_ms, jitter, control_ms = 0.0, None, 0.0
     if inherent is not None:
-        video_ms = inherent.video_ms - costs.links_us["video"] / US_PER_MS - _stages_ms(costs, STAMP_TO_STAMP)
+        video_ms = inherent.video_ms - costs.links_us["video"] / US_PER_MS - _stages_ms(costs, VIDEO_LATENCY_STAGES)
         jitter = inherent.video_jitter
-        control_ms = inherent.control_ms - costs.links_us["control"] / US_PER_MS - _stages_ms(costs, SENT_TO_RECEIVED)
+        control_ms = (
+            inherent.control_ms - costs.links_us["control"] / US_PER_MS - _stages_ms(costs, CONTROL_LATENCY_STAGES)
+        )
     state_ms = condition.video_ms if state_delay == "with_video" else 0.0
     video = link_injection("video", condition.video_ms, condition.video, seed)
     control = link_injection("control", condition.control_ms, condition.control, seed)
@@ -81,7 +86,7 @@ def injected_network(profile: str, condition: Condition, costs: Costs, seed: int
 
 
 def virtual_network(requested: NetworkDelays, costs: Costs) -> NetworkDelays:
-    """Return the delays plus the measured latency of a real loopback."""
+    """Return the requested delays plus the measured latency of a real loopback interface."""
     return replace(
         requested,
         video=_add_delay(requested.video, costs.links_us["video"]),

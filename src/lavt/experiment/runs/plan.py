@@ -18,12 +18,16 @@ from lavt.errors import UserError
 from lavt.transport.emulation.impairment import check_flows
 
 RESERVED_AXES = {"vehicle.route": "routes", "network.condition": "conditions", "repetition": "repetitions"}
-"""The config values that a sweep varies by keys of its own, and these keys."""
+"""The config values that a sweep varies by keys of its own, each with the name of this key."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedRun:
-    """A run to be driven: `identity` is the beginning of its `result.json`, `seed` the seed of this run."""
+    """A run to be driven.
+
+    `identity` is the beginning of its `result.json`. `seed` is the seed of this run alone, derived from the config's
+    seed.
+    """
 
     name: str
     config: RunConfig
@@ -73,13 +77,16 @@ def plan_run(config: RunConfig, *, name: str = "run", axes: Mapping[str, Any] | 
 
 
 def injected_entry(requested: Condition) -> dict[str, Any]:
-    """Return `injected_ms` (None for the delay of a trace) and, where it differs, the least expected delay."""
-    least = {} if requested.least_ms == requested.constant_ms else {"injected_least_ms": requested.least_ms}
-    return {"injected_ms": requested.constant_ms, **least}
+    """Return the entry `injected_ms`, and `injected_least_ms` if the least expected delay differs from it.
+
+    The delay of a trace is None.
+    """
+    least_entry = {} if requested.least_ms == requested.constant_ms else {"injected_least_ms": requested.least_ms}
+    return {"injected_ms": requested.constant_ms, **least_entry}
 
 
 def _check_injection(config: RunConfig, requested: Condition) -> None:
-    """Raise `UserError` where the chosen injection cannot do what the condition and the profile require."""
+    """Raise `UserError` where the chosen kind of injection cannot apply the condition and the inherent latency."""
     network = config.network
     if network.state_delay == "with_video" and requested.video.trace:
         raise UserError(
@@ -99,12 +106,12 @@ def _check_injection(config: RunConfig, requested: Condition) -> None:
 
 
 def plan_sweep(sweep: SweepConfig) -> list[PlannedRun]:
-    """Plan all runs of a sweep: routes x conditions x repetitions x all combinations of the further axes.
+    """Plan all runs of a sweep: all combinations of routes, conditions, repetitions and values of the further axes.
 
     Raises `UserError` for a run that `plan_run` rejects, for a sweep without runs, and for one with duplicate runs.
     """
     for key, reserved in itertools.product(sweep.axes, RESERVED_AXES):
-        if f"{reserved}.".startswith(f"{key}."):  # an axis over a whole section would set the reserved value, too
+        if f"{reserved}.".startswith(f"{key}."):  # an axis of a whole section would also set the reserved value
             raise UserError(f"the axis {key!r} is not a further one: use {RESERVED_AXES[reserved]!r} for {reserved!r}")
     base = sweep.model_dump(mode="json", exclude={"routes", "conditions", "repetition", "repetitions", "axes"})
     runs = []
@@ -112,7 +119,7 @@ def plan_sweep(sweep: SweepConfig) -> list[PlannedRun]:
         axes = dict(zip(sweep.axes, values, strict=True))
         for route, name, repetition in itertools.product(sweep.routes, sweep.conditions, range(sweep.repetitions)):
             changes = {"vehicle.route": route, "network.condition": name, "repetition": repetition, **axes}
-            config = parse_config(RunConfig, _changed(base, changes), "the sweep")
+            config = parse_config(RunConfig, _with_changes(base, changes), "the sweep")
             runs.append(plan_run(config, name=_name(route, name, repetition, axes), axes=axes))
     if not runs:
         raise UserError("the sweep has no run: give routes, conditions and axes at least one value each")
@@ -127,7 +134,7 @@ def _name(route: str, condition_name: str, repetition: int, axes: Mapping[str, A
     return "_".join("".join(c if (c.isascii() and c.isalnum()) or c in "=.-_" else "-" for c in part) for part in parts)
 
 
-def _changed(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+def _with_changes(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """Return a copy of nested sections with some values changed; raise `UserError` for a missing section."""
     result = dict(base)
     for key, value in changes.items():

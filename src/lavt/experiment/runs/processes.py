@@ -1,6 +1,6 @@
-"""Child processes of LAVT that run LAVT: each prints JSON lines, and is ended with SIGINT when its run ends.
+"""Child processes that run LAVT: each prints JSON lines, and is ended with SIGINT when its run ends.
 
-Only a run that is killed with SIGKILL leaves its processes behind.
+Processes are left behind only if the parent process is killed with SIGKILL.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from typing import Any
 
 from lavt.errors import UserError, WorkError
 
-READY_S = 60.0
-"""The time limit of a process for its first line; importing and preparing takes 1 to 5 s on a quiet machine."""
-END_S = 15.0
-"""The time limit of a process for its end after SIGINT; then it is killed."""
-USER_ERROR = 2
+READY_LIMIT_S = 60.0
+"""The time limit for the first line of a process, which takes 1 to 5 s on a quiet machine to import and prepare."""
+END_LIMIT_S = 15.0
+"""A process that has not ended this long after SIGINT is killed."""
+USER_ERROR_CODE = 2
 """The exit code of a program whose input was wrong."""
 LAVT = ("-m", "lavt")
-"""Python's arguments for the installed program. Tests replace it by programs with deliberate faults."""
+"""Python's arguments for the installed program. Tests replace them by those of programs with deliberate faults."""
 
 
 class Process:
@@ -36,7 +36,7 @@ class Process:
     def __init__(self, name: str, arguments: Sequence[str], log_dir: Path, program: Sequence[str] = LAVT) -> None:
         self.name = name
         self.latest: dict[str, Any] = {}
-        """The newest line."""
+        """The newest line of the process."""
         self._log = log_dir / f"{name}.log"
         self._first: queue.Queue[dict[str, Any] | None] = queue.Queue()
         with self._log.open("wb") as log:
@@ -54,14 +54,15 @@ class Process:
     def ready(self) -> dict[str, Any]:
         """Wait for the first line, and return it.
 
-        Raises `WorkError` where the process prints nothing or ends, and `UserError` where it ends for wrong input.
+        Raises `WorkError` where the process prints nothing in time or ends before, and `UserError` where it ends
+        because of wrong input.
         """
         try:
-            line = self._first.get(timeout=READY_S)
+            line = self._first.get(timeout=READY_LIMIT_S)
         except queue.Empty:
-            raise WorkError(f"{self.name} did not get ready within {READY_S:.0f} s") from None
+            raise WorkError(f"{self.name} did not get ready within {READY_LIMIT_S:.0f} s") from None
         if line is None:
-            if self.popen.wait() == USER_ERROR:
+            if self.popen.wait() == USER_ERROR_CODE:
                 raise UserError(self.last_message().removeprefix("lavt: "))
             raise WorkError(f"{self.name} did not start: {self.last_message()}")
         return line
@@ -82,7 +83,7 @@ class Process:
             self.popen.send_signal(signal.SIGCONT)  # a stopped process would not handle SIGINT
             self.popen.send_signal(signal.SIGINT)
             try:
-                self.popen.wait(END_S)
+                self.popen.wait(END_LIMIT_S)
             except subprocess.TimeoutExpired:
                 self.popen.kill()
         self.popen.wait()
@@ -96,7 +97,7 @@ class Process:
         return self.latest
 
     def _read(self) -> None:
-        """Read lines until the process ends, and end it if that fails: its run would wait for lines in vain."""
+        """Read lines until the process ends; kill it if reading fails, because its run would wait for lines in vain."""
         assert self.popen.stdout is not None  # noqa: S101 (it is a pipe)
         try:
             for text in self.popen.stdout:

@@ -33,14 +33,15 @@ from lavt.experiment.runs.virtual_run import read_costs
 from lavt.transport.emulation.delay_line import DelayModel
 
 RELAY = "relay.json"
-"""In a run directory: the delays requested of the relay, and those that it measured of its packets."""
+"""The file in a run directory that has the delays requested of the relay, and the delays that it measured."""
 DELAYED_DIRECTIONS = {"video": "video downstream", "control": "control upstream"}
 """The delayed direction of each relayed flow, as `relay.json` names it."""
 LOCAL_TCP = "tcp/127.0.0.1:0"
 SERVER_LISTENS = (LOCAL_TCP, "udp/127.0.0.1:0?rel=1;mixed_rel=1")
 BEGIN_LIMIT_S = 40
-"""The time limit for the start of the drive."""
+"""The time limit for the start of the drive, from the start of all processes."""
 RUN_LIMIT_S = 900
+"""The time limit for the ending of the drive, from the start of all processes."""
 UNIMPAIRED = ImpairmentConfig()
 STATUS_PERIOD_NS = 200 * NS_PER_MS
 
@@ -50,7 +51,7 @@ Progress = Callable[[dict[str, Any], dict[str, Any]], None]
 
 @dataclass(frozen=True, slots=True)
 class LoopProcesses:
-    """The processes of a run. With a relay, the client's side reaches the server's video and control only by it."""
+    """The processes of a run. With a relay, the client reaches the server's video and control only through it."""
 
     server_router: Process
     server: Process
@@ -76,9 +77,10 @@ def start_loop(
     server_program: Sequence[str] = LAVT,
     netem: NetemRun | None = None,
 ) -> LoopProcesses:
-    """Start all processes in order, each with the ports of those before it; the sides write their records into `out`.
+    """Start all processes in order, each with the ports of the earlier ones.
 
-    Without `once` the server keeps running after the first drive. `netem` is applied before the client starts.
+    The sides write their records into `out`, and the configs of the processes are written into `work`. Without `once`
+    the server keeps running after the first drive. `netem` is applied before the client starts.
     """
     run = planned.config
     server_router, local, remote = _start_router(processes, "server-router", "router-server.json5", SERVER_LISTENS)
@@ -107,7 +109,10 @@ def start_loop(
 
 
 def start_client_router(processes: Processes, dialled: str, listen: str = LOCAL_TCP) -> tuple[Process, str]:
-    """Start the client's router, and return it with its endpoint; as `listen`, this endpoint restarts it there."""
+    """Start the client's router, and return it with its endpoint.
+
+    A router that is started with this endpoint as `listen` takes the place of an earlier one.
+    """
     router, local, _ = _start_router(processes, "client-router", "router-client.json5", [listen], [dialled])
     return router, local
 
@@ -143,10 +148,11 @@ def _wait_for_ending(processes: Processes, loop: LoopProcesses, progress: Progre
     while loop.server.running and loop.server.latest.get("ending") is None:
         elapsed_s = (clock.now().mono_ns - start_ns) / NS_PER_S
         status = loop.server.latest.get("status", {})
-        ended = next((each for each in processes.started if not each.running and each is not loop.server), None)
+        others = (process for process in processes.started if process is not loop.server)
+        ended = next((process for process in others if not process.running), None)
         if ended is not None:
             code = ended.popen.returncode  # negative: the signal that ended it
-            raise WorkError(f"{ended.name} ended during the run with {code}: {ended.last_message()}")
+            raise WorkError(f"{ended.name} ended during the run with exit code {code}: {ended.last_message()}")
         not_begun = status.get("safety") in (None, "disarmed", "arming")
         if elapsed_s > RUN_LIMIT_S or (elapsed_s > BEGIN_LIMIT_S and not_begun):
             raise WorkError(f"the drive did not begin or end within {elapsed_s:.0f} s: {loop.client.latest} {status}")
@@ -158,9 +164,10 @@ def _wait_for_ending(processes: Processes, loop: LoopProcesses, progress: Progre
 
 
 def _requested_ms(planned: PlannedRun) -> dict[str, float | None]:
-    """Return the median delay requested of the relay per flow, including the inherent profile.
+    """Return the median delay requested of the relay for each flow, including the inherent latency.
 
-    None for a flow with more than a constant delay: its median depends on the other traffic.
+    It is None for a flow with another impairment than a constant delay, because its median depends on the other
+    traffic.
     """
     delays = _injected(planned)
     return {
@@ -170,16 +177,19 @@ def _requested_ms(planned: PlannedRun) -> dict[str, float | None]:
 
 
 def relay_reasons(relay: Mapping[str, Any]) -> list[str]:
-    """Return a reason for each flow whose delay in the relay differs from the request (the content of `relay.json`).
+    """Return a reason for each flow whose delay in the relay differs from the request; `relay` is from `relay.json`.
 
-    For a flow with more than a constant delay, the send times of packets are compared with those that were planned.
+    For a flow with another impairment than a constant delay, the send times of packets are compared with the planned
+    ones.
     """
     requested_ms = relay.get("requested_ms", {"video": 0.0, "control": 0.0})
-    constant = {flow: delay_ms for flow, delay_ms in requested_ms.items() if delay_ms is not None}
+    constant_ms = {flow: delay_ms for flow, delay_ms in requested_ms.items() if delay_ms is not None}
     held, late = relay.get("held_ms", {}), relay.get("late_ms", {})
     return [
-        *injection_reasons(constant, {flow: held.get(DELAYED_DIRECTIONS[flow]) for flow in constant}),
-        *lateness_reasons({flow: late.get(DELAYED_DIRECTIONS[flow]) for flow in requested_ms if flow not in constant}),
+        *injection_reasons(constant_ms, {flow: held.get(DELAYED_DIRECTIONS[flow]) for flow in constant_ms}),
+        *lateness_reasons(
+            {flow: late.get(DELAYED_DIRECTIONS[flow]) for flow in requested_ms if flow not in constant_ms}
+        ),
     ]
 
 
@@ -193,13 +203,13 @@ def _injected(planned: PlannedRun) -> NetworkDelays:
 def _start_router(
     processes: Processes, name: str, file: str, listen: Sequence[str], dialled: Sequence[str] = ()
 ) -> tuple[Process, str, str]:
-    """Start a router, and return it with its local endpoint and, for the server's router, its remote endpoint."""
+    """Start a router, and return it with its local endpoint (TCP) and its remote one (UDP, "" for the client's)."""
     endpoints = {"listen": listen, "connect": dialled}
-    changes = [part for key, each in endpoints.items() for part in ("--set", f"{key}.endpoints={json.dumps(each)}")]
+    changes = [part for key, value in endpoints.items() for part in ("--set", f"{key}.endpoints={json.dumps(value)}")]
     router = processes.start(name, "router", f"zenoh-configs/{file}", *changes)
     locators = router.ready()["locators"]
-    local = next(each for each in locators if each.startswith("tcp/"))
-    return router, local, next((each for each in locators if each.startswith("udp/")), "")
+    local = next(locator for locator in locators if locator.startswith("tcp/"))
+    return router, local, next((locator for locator in locators if locator.startswith("udp/")), "")
 
 
 def _relay_config(planned: PlannedRun, video_port: int, control_port: int) -> RelayConfig:

@@ -23,7 +23,7 @@ from lavt.recording.record import evaluating, read_record
 CONFIG = "config.yaml"
 RESULT = "result.json"
 NETWORK = "network"
-"""The value of `inherent` for a run on two machines: the latency is that of the network between them."""
+"""The value of `inherent` for a run on two machines, whose inherent latency is that of the network between them."""
 
 
 def run_once(planned: PlannedRun, out: Path, *, progress: Progress | None = None) -> dict[str, Any]:
@@ -32,7 +32,7 @@ def run_once(planned: PlannedRun, out: Path, *, progress: Progress | None = None
 
 
 def drive_once(planned: PlannedRun, out: Path, *, progress: Progress | None = None) -> DriveData:
-    """Drive as `run_once`, and return the result with the data for figures, as the records are in memory anyway."""
+    """Drive as `run_once` does, and return the result with the data for figures, because the records are in memory."""
     cv2.setNumThreads(1)  # more threads would change the order of summation, and runs would not be reproducible
     check_directory(out)
     digest = None
@@ -60,9 +60,9 @@ def _write_config(planned: PlannedRun, out: Path) -> None:
 
 
 def compute_result(out: Path, identity: Mapping[str, Any], digest: str | None) -> dict[str, Any]:
-    """Compute and write `result.json` from the files in `out`: records, and `relay.json` or `netem.json`.
+    """Compute and write `result.json` from the files in `out`: the records, and `relay.json` or `netem.json`.
 
-    Raises `UserError` for records with other content than LAVT writes.
+    Raises `UserError` for records whose content LAVT cannot have written.
     """
     with evaluating(out):
         return dict(_compute(out, identity, digest).result)

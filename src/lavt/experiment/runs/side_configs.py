@@ -18,7 +18,7 @@ from lavt.transport.clock_sync import probe
 
 
 def server_config(run: RunConfig, seed: int, *, router: str = "") -> ServerConfig:
-    """Return the server's config of a run, with any free port on the loopback."""
+    """Return the server's config of a run; its ports are free ports on the loopback interface."""
     return ServerConfig(
         vehicle=run.vehicle,
         camera=ServerCameraConfig(**run.camera.model_dump()),

@@ -32,16 +32,16 @@ from lavt.transport.emulation.relay import video_index
 
 SERVER_MONO_NS = 1_000 * NS_PER_S
 CLIENT_MONO_NS = 7_000 * NS_PER_S
-"""The monotonic clocks of two machines are unrelated."""
+"""The monotonic clocks at the start of every virtual run. They differ, because those of two machines are unrelated."""
 WALL_NS = 1_790_000_000 * NS_PER_S
-"""The true time at the start of every virtual run: a day of 2026."""
+"""The true wall time at the start of every virtual run, a day of 2026."""
 CLIENT_ADDRESS = ("198.51.100.2", 40_000)
 """The source address of the client's datagrams, from the documentation range (RFC 5737)."""
 SERVER_VIDEO_PORT = 5600
 ARMING_LIMIT_NS = 30 * NS_PER_S
 RUN_LIMIT_NS = 3600 * NS_PER_S
 AFTER_ENDING_NS = NS_PER_S // 5
-"""The time that is still recorded after the ending."""
+"""The recording continues for this time after the ending of the drive."""
 
 
 class DriveObserver:
@@ -53,7 +53,7 @@ class DriveObserver:
         self._truth: GroundTruth | None = None
 
     def status(self) -> dict[str, Any]:
-        """Return the newest figures of the drive for display."""
+        """Return the newest speed and cross-track error for display; empty before the first ground truth."""
         truth = self._truth
         return {} if truth is None else {"speed_mps": truth.speed_mps, "cross_track_m": truth.cross_track_m}
 
@@ -69,7 +69,7 @@ class DriveObserver:
 
 @dataclass(frozen=True, slots=True)
 class VirtualLoop:
-    """All parts of a virtual run before it is driven; tests modify them."""
+    """All parts of a virtual run that is not yet driven; tests modify them."""
 
     runtime: VirtualRuntime
     server: ServerNodes
@@ -94,7 +94,7 @@ def host_clocks(config: RunConfig) -> tuple[HostClock, HostClock]:
 
 
 def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostClock] | None = None) -> VirtualLoop:
-    """Build both sides of a run and the links between them, which record into `out`; create `out` if needed.
+    """Build both sides of a run, which record into `out`, and the links between them; create `out` if needed.
 
     Raises `UserError` for an invalid config, before the directory is created.
     """
@@ -174,8 +174,8 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
 def virtual_links(network: NetworkDelays) -> dict[str, VirtualLink]:
     """Return the links of all channels that cross the network.
 
-    In reality, commands and session requests share a path. Here each has its own delay line and random streams, so that
-    neither affects the other.
+    In reality, commands and session requests share a path. Here each has a delay line and random-number streams of its
+    own, so that neither affects the other.
     """
 
     def packet_count(_payload: bytes, count: int) -> int:
@@ -207,7 +207,7 @@ def drive(loop: VirtualLoop, *, limit_ns: int = RUN_LIMIT_NS, progress: Callable
     runtime, observer = loop.runtime, loop.observer
     if progress is not None:
         _report_every_second(runtime, progress)
-    gc.freeze()  # these objects exist until the end: garbage collections that visit them took over 3 % of the time
+    gc.freeze()  # these objects exist until the end, and garbage collections that visit them took over 3 % of the time
     try:
         armed = runtime.run(min(ARMING_LIMIT_NS, limit_ns), lambda: observer.began)
         if armed and runtime.run(limit_ns, lambda: observer.ending is not None):

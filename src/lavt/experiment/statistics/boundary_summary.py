@@ -1,4 +1,4 @@
-"""Summary of a boundary over many seeds: median, quartiles, and an exact confidence interval of the median."""
+"""Summary of the boundaries of many seeds: median, quartiles, and an exact confidence interval of the median."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from scipy.stats import quantile_test
 CRITERIA = ("onset", "departure", "completion")
 
 Run = Mapping[str, Any]
+"""An entry of `runs` in `boundary.json`."""
 
 
 def summarize_groups(runs: Sequence[Run]) -> list[dict[str, Any]]:
@@ -39,7 +40,10 @@ def _group(runs: Sequence[Run]) -> dict[str, Any]:
 
 
 def ranked_ms(run: Run, name: str) -> float:
-    """Return a run's boundary, or an infinite value for one outside the searched range, which has a rank only."""
+    """Return a run's boundary by a criterion in ms.
+
+    A boundary outside the searched range is infinite: its value is unknown, but not its rank.
+    """
     value_ms = run[f"{name}_ms"]
     if value_ms is not None:
         return float(value_ms)
@@ -49,10 +53,11 @@ def ranked_ms(run: Run, name: str) -> float:
 def summarize_boundaries(values_ms: Sequence[float]) -> dict[str, Any]:
     """Return quartiles, median and the median's confidence interval; values outside the searched range are infinite.
 
-    A quantile that falls among infinite values is null. The interval consists of the two order statistics that include
-    the median of the population with at least 95 %, for any distribution (`scipy.stats.quantile_test`; W. J. Conover,
-    Practical Nonparametric Statistics, section 3.2). It is null for fewer than six values, and an end is null where it
-    is out of range. `n` is the number of values in the range.
+    A quantile that depends on an infinite value is None. The ends of the interval are two order statistics, between
+    which the median of the population lies with a probability of at least 95 %, for any distribution
+    (`scipy.stats.quantile_test`; W. J. Conover, Practical Nonparametric Statistics, section 3.2). The interval is None
+    for fewer than six values, and one of its ends is None if it is out of range. `n` is the number of values in the
+    range.
     """
     quartiles = {f"p{share}": _quantile_ms(values_ms, share / 100) for share in (25, 50, 75)}
     return {**quartiles, "interval": _interval(values_ms), "n": sum(math.isfinite(value) for value in values_ms)}

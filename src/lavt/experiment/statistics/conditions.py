@@ -12,13 +12,14 @@ from lavt.experiment.statistics.intervals import bootstrap_interval, exact_inter
 from lavt.experiment.statistics.survival import survival
 
 Run = Mapping[str, Any]
-"""An entry of `runs`, as `results.run_result` returns it. Entries of older versions lack some keys."""
+"""An entry of `runs` in `summary.json`, as `results.run_result` returns it. Entries of older versions lack some
+keys."""
 
 CommonDistances = Mapping[tuple[Any, ...], int]
-"""The distances (in 10 m) at which runs are compared, by route, repetition and seed."""
+"""The common distance up to which runs are compared, in units of 10 m, by route, repetition and seed."""
 
 KEY_PART = "_key"
-"""The suffix of a route that is the key part of another: the two are the same road."""
+"""The suffix of a route that is the key part of another route. The two are on the same road."""
 
 MEANS = (
     "mae_m",
@@ -28,7 +29,8 @@ MEANS = (
     "steering_reversals_per_s",
     "oscillation_hz",
 )
-"""The measures whose mean over the valid runs that have them is in a condition's summary."""
+"""The measures whose mean is in the summary of a condition. The mean is that of the valid runs that have the
+measure."""
 
 QUARTILES = {"p25": 25, "p50": 50, "p75": 75}
 
@@ -36,7 +38,7 @@ QUARTILES = {"p25": 25, "p50": 50, "p75": 75}
 def summarize_conditions(runs: Iterable[Run]) -> dict[str, dict[str, Any]]:
     """Summarize runs by condition, sorted by name; all conditions have the same common distances."""
     members = group_by(runs, "condition")
-    distances = common_distances([run for each in members.values() for run in each])
+    distances = common_distances([run for group in members.values() for run in group])
     return {name: summarize_condition(members[name], distances) for name in sorted(members)}
 
 
@@ -89,12 +91,12 @@ def stem_of(route: str) -> str:
 
 
 def road_of(route: str) -> str:
-    """Return the name of the road to which a route or its key part belongs."""
+    """Return the name of the road of a route; a route and its key part have the same road."""
     return stem_of(route).removesuffix(KEY_PART)
 
 
 def road_rates(runs: Sequence[Run]) -> list[float]:
-    """Return the completion rate of each road, to which a route and its key part belong, by name or by path."""
+    """Return the completion rate of each road, sorted by road. A route and its key part have the same road."""
     members: dict[str, list[bool]] = {}
     for run in runs:
         members.setdefault(road_of(str(run["route"])), []).append(run["ending"] == "completed")
@@ -110,7 +112,7 @@ def group_by(runs: Iterable[Run], key: str) -> dict[str, list[Run]]:
 
 
 def common_distances(runs: Sequence[Run]) -> CommonDistances:
-    """Return for each route, repetition and seed the distance (in 10 m) that its valid runs of all conditions drove."""
+    """Return for each route, repetition and seed the distance, in units of 10 m, that all its valid runs reached."""
     distances: dict[tuple[Any, ...], int] = {}
     for run in runs:
         if run["valid"] and run.get("p95_by_10m") is not None:
@@ -119,19 +121,19 @@ def common_distances(runs: Sequence[Run]) -> CommonDistances:
 
 
 def common_p95_m(runs: Sequence[Run], distances: CommonDistances) -> list[float]:
-    """Return each run's P95 up to its common distance; runs with a common distance of 0 are left out."""
+    """Return the P95 of each run up to its common distance; runs whose common distance is 0 are left out."""
     with_distance = [(run, distances.get(_start(run), 0)) for run in runs if run.get("p95_by_10m")]
     return [float(run["p95_by_10m"][distance - 1]) for run, distance in with_distance if distance]
 
 
 def worst_rank_m(runs: Sequence[Run]) -> dict[str, float | None]:
-    """Return the quartiles of P95 over all runs, where a run that was not completed is worse than all completed ones.
+    """Return the quartiles of P95 of all runs; a run that was not completed ranks after all completed runs.
 
-    Each is the smallest value that the share of runs does not exceed; None where that is a run that was not completed.
-    A completed run with an unknown error is left out.
+    A quartile is the smallest P95 of a run that at least 25, 50 or 75 % of the runs do not exceed. It is None if this
+    run was not completed. A completed run whose error is unknown is left out.
     """
-    ranked = [run["p95_m"] if run["ending"] == "completed" else np.inf for run in runs]
-    known = [value for value in ranked if value is not None]
+    errors_m = [run["p95_m"] if run["ending"] == "completed" else np.inf for run in runs]
+    known = [value for value in errors_m if value is not None]
     quartiles = {
         name: float(np.percentile(known, share, method="inverted_cdf")) if known else np.inf
         for name, share in QUARTILES.items()
@@ -160,7 +162,10 @@ def _mean(values: Sequence[float]) -> float | None:
 
 
 def _per_km(runs: Sequence[Run], name: str) -> float | None:
-    """Return all events over all kilometres, so that a run of a few metres has no more weight than its distance."""
+    """Return the number of all events divided by the sum of all distances in km.
+
+    A run thus has a weight in proportion to its distance, and a run of a few metres has almost none.
+    """
     driven = [run for run in runs if run.get("distance_m")]
     return sum(run[name] for run in driven) / (sum(run["distance_m"] for run in driven) / 1000) if driven else None
 
@@ -172,7 +177,10 @@ def _injected_ms(runs: Sequence[Run]) -> dict[str, Any]:
 
 
 def _latency(entries: Sequence[Mapping[str, Any]], *, bounded: bool = False) -> dict[str, Any]:
-    """Return the median over runs of each percentile, and the largest bound, or None where a run has no bound."""
+    """Return for each percentile the median of all runs, and with `bounded` the largest bound.
+
+    The bound is None if one of the runs has no bound.
+    """
     known = [entry for entry in entries if entry["n"]]
     summary: dict[str, Any] = {
         name: float(np.median([entry[name] for entry in known])) if known else None for name in ("p5", "p50", "p95")
@@ -190,9 +198,14 @@ def _picture_age_ms(runs: Sequence[Run]) -> dict[str, float | None]:
 
 
 def _stages_ms(runs: Sequence[Run]) -> list[dict[str, Any]]:
-    """Return the median over runs of each stage's median latency, in the order of the pipeline."""
-    p50_ms: dict[tuple[str, str], list[float]] = {}
-    for run in sorted(runs, key=lambda run: -len(run.get("stages_ms") or [])):  # the one with most stages is the order
+    """Return for each stage the median of all runs' median latencies, in the order of the pipeline."""
+    medians_ms: dict[tuple[str, str], list[float]] = {}
+    for run in sorted(
+        runs, key=lambda run: -len(run.get("stages_ms") or [])
+    ):  # the run with most stages gives the order
         for entry in run.get("stages_ms") or []:
-            p50_ms.setdefault((entry["node"], entry["stage"]), []).append(entry["p50"])
-    return [{"node": node, "stage": stage, "p50": float(np.median(each))} for (node, stage), each in p50_ms.items()]
+            medians_ms.setdefault((entry["node"], entry["stage"]), []).append(entry["p50"])
+    return [
+        {"node": node, "stage": stage, "p50": float(np.median(values_ms))}
+        for (node, stage), values_ms in medians_ms.items()
+    ]

@@ -11,17 +11,18 @@ from scipy.stats import binomtest, fisher_exact
 from lavt.experiment.statistics.intervals import holm
 
 PLANNED = (("L0", "L1"), ("L1", "L2"), ("L2", "L3"), ("L2", "L4"), ("L3", "L4"), ("L3", "L5"))
-"""Chosen before any run was driven: each step of the injected delay, and L3 with L4, whose total delays are equal."""
+"""The contrasts, chosen before any run was driven: each step of the injected delay, and L3 with L4, whose total delays
+are equal."""
 
 PAIRED_BY = ("route", "repetition", "seed", "participant", "block")
-"""The keys that the two runs of a pair have in common: all but the condition."""
+"""The keys that are equal in the two runs of a pair; only the condition differs."""
 
 
 def paired_contrasts(runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Compare completion between conditions by pairs of runs, with Holm's correction over all returned contrasts.
+    """Compare completion between conditions by pairs of runs, with Holm's correction for all returned contrasts.
 
-    A contrast is returned if both its conditions were driven. Invalid runs and runs of one condition with equal keys
-    form no pairs. `p` is None without pairs.
+    A contrast is returned if both its conditions were driven. Invalid runs form no pairs. Nor do two runs of one
+    condition whose `PAIRED_BY` keys are equal, because their partners are ambiguous. `p` is None without pairs.
     """
     driven = {str(run["condition"]) for run in runs}
     completed = {name: _completed(runs, name) for name in driven}
@@ -42,7 +43,11 @@ def with_holm(contrasts: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def mcnemar(only_a: int, only_b: int) -> float:
-    """Return McNemar's exact two-sided p value; null hypothesis: both kinds of differing pairs are equally likely."""
+    """Return McNemar's exact two-sided p value.
+
+    `only_a` and `only_b` are the numbers of pairs of which only one run was completed. By the null hypothesis both
+    kinds of pairs are equally likely.
+    """
     differing = only_a + only_b
     return float(binomtest(only_a, differing, 0.5).pvalue) if differing else 1.0
 

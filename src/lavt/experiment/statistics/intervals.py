@@ -1,4 +1,4 @@
-"""Confidence intervals and corrections for numbers from few runs. `docs/metrics.md` explains their meaning."""
+"""Confidence intervals, and corrections of p values, for few runs. `docs/metrics.md` explains their meaning."""
 
 from __future__ import annotations
 
@@ -11,20 +11,21 @@ from scipy.stats import binomtest, bootstrap
 from lavt.streams import stream
 
 RESAMPLES = 10_000
+"""The number of bootstrap samples for an interval."""
 
 
 def exact_interval(successes: int, trials: int) -> list[float] | None:
     """Return the 95 % Clopper-Pearson interval of a proportion; None without trials.
 
-    It is valid for the mean of the trials' probabilities, even if they differ (Hoeffding, Annals of Mathematical
-    Statistics 27, 1956, theorem 4): trials on different routes may be pooled.
+    It is valid for the mean of the trials' probabilities even if these differ (Hoeffding, Annals of Mathematical
+    Statistics 27, 1956, theorem 4), so trials on different routes may be counted together.
     """
     if trials == 0:
         return None
     return list(_clopper_pearson(successes, trials))
 
 
-@cache  # a sweep needs few different intervals, many times each
+@cache  # a sweep needs few different intervals, each of them many times
 def _clopper_pearson(successes: int, trials: int) -> tuple[float, float]:
     interval = binomtest(successes, trials).proportion_ci(confidence_level=0.95, method="exact")
     return float(interval.low), float(interval.high)
@@ -49,7 +50,7 @@ def bootstrap_interval(values: Sequence[float]) -> list[float] | None:
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
-    """Return the p values of tests that were planned together, corrected by Holm's method; None stays None."""
+    """Return the p values of tests that were planned together, corrected by Holm's method; None remains None."""
     tested = sorted((p, index) for index, p in enumerate(p_values) if p is not None)
     corrected: list[float | None] = [None] * len(p_values)
     largest = 0.0

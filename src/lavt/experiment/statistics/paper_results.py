@@ -1,7 +1,8 @@
-"""The paper's results, for comparison with ours, with the intervals and tests that its counts allow.
+"""The paper's results, for comparison with ours, and the intervals and tests that can be computed from its counts.
 
 A. Khalil, J. Kwon, "Nonlinear Performance Degradation of Vision-Based Teleoperation under Network Latency", 2026.
-Six routes, five repetitions: 30 runs per condition. Its completion in percent is converted to a count of 30.
+It has six routes and five repetitions, so 30 runs per condition. Its completion in percent is converted to a number of
+these 30 runs.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ the results."""
 def paper() -> dict[str, Any]:
     """Return the paper's conditions with our keys and exact intervals, and its planned contrasts.
 
-    The contrasts are by Fisher's test, as the paper publishes only counts and its runs cannot be paired.
+    The contrasts use Fisher's test, because the paper publishes only counts, so its runs cannot be paired.
     """
     conditions = {name: _condition(dict(zip(COLUMNS, row, strict=True))) for name, row in TABLE.items()}
     contrasts = [

@@ -12,11 +12,11 @@ from lavt.experiment.statistics.paper_results import paper
 
 SCHEMA = 1
 
-GROUPING = ("fidelity", "inherent", "changes", "controller", "preset", "driver")
-"""The keys, besides a sweep's axes, that the runs of one group have in common."""
+GROUP_KEYS = ("fidelity", "inherent", "changes", "controller", "preset", "driver")
+"""The keys whose values are equal for all runs of a group. The axes of the sweep are further such keys."""
 
 SWEEP = "sweep"
-"""A further such key, the name of a run's sweep, where several sweeps are reported together."""
+"""A further key of a group if several sweeps are reported together: the name of a run's sweep."""
 
 
 def summarize(
@@ -29,17 +29,17 @@ def summarize(
     """Return the content of `summary.json` for the runs of a sweep.
 
     `base` has keys of a run (or of its `axes`) with their values in the sweep's base config. `conditions` summarizes
-    the virtual runs with all these values, or all virtual runs without `base`. `failed` lists the runs without a result
-    (`run`, `reason`).
+    the runs in virtual time that have all these values, or all runs in virtual time if there is no `base`. `failed`
+    lists the runs without a result (`run`, `reason`).
     """
     virtual = [run for run in runs if run["time"] == "virtual"]
-    wanted = dict(base or {})
-    of_base = [run for run in virtual if _settings(run, wanted) == wanted]
+    base_settings = dict(base or {})
+    of_base = [run for run in virtual if _settings(run, base_settings) == base_settings]
     return {
         "schema": SCHEMA,
         "speed": dict(speed) if speed else {"simulated_s": None, "wall_s": None, "jobs": None},
         "runs": [dict(run) for run in runs],
-        "failed": [dict(each) for each in failed],
+        "failed": [dict(run) for run in failed],
         "conditions": summarize_conditions(of_base),
         "contrasts": paired_contrasts(of_base),
         "real": summarize_conditions(run for run in runs if run["time"] == "real"),
@@ -54,10 +54,10 @@ def _settings(run: Run, names: Iterable[str]) -> dict[str, Any]:
 
 
 def _summarize_groups(runs: Sequence[Run]) -> list[dict[str, Any]]:
-    """Summarize each driven combination of the grouping keys and the further axes, in the order of the sweep."""
+    """Summarize the runs of each group, in the order of the runs; the axes of the sweep are group keys, too."""
     axes = list(dict.fromkeys(name for run in runs for name in run.get("axes") or {}))
     sweeps = [SWEEP] if any(SWEEP in run for run in runs) else []
-    names = [*GROUPING, *sweeps, *(name for name in axes if name not in GROUPING)]
+    names = [*GROUP_KEYS, *sweeps, *(name for name in axes if name not in GROUP_KEYS)]
     members: dict[str, list[Run]] = {}
     for run in runs:
         members.setdefault(json.dumps(_settings(run, names), sort_keys=True, default=str), []).append(run)

@@ -11,11 +11,11 @@ from lavt.experiment.statistics.intervals import exact_interval
 
 
 def survival(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
-    """Return the share of one route's valid runs that still drive, by distance, and the incidence of each ending.
+    """Return by distance the share of one route's valid runs that still drive, and the incidence of each ending.
 
-    Both are step functions: a value applies from its `distance_m` to the next. Any ending but `completed` is an event
-    at the distance driven; a completed run is censored at the route's length, where the steps end. Runs of unknown
-    distance are left out. None without runs.
+    Both are step functions: a value is valid from its `distance_m` to the next one. Any ending except `completed` is an
+    event at the distance driven. A completed run is censored at the length of the route, where the steps end. Runs
+    whose distance is unknown are left out. None without runs.
     """
     runs = [run for run in runs if run.get("distance_m") is not None]
     if not runs:
@@ -27,7 +27,7 @@ def survival(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
     distances_m = sorted({0.0, *ended_m, length_m})
     surviving = [float(share) for share in ecdf(lifetimes).sf.evaluate(distances_m)]
     # No run is censored before the end, so the number of runs that still drive at a distance is binomial.
-    bands = [
+    intervals = [
         exact_interval(sum(end_m > distance_m for end_m in ended_m) + len(runs) - len(ended), len(runs))
         for distance_m in distances_m
     ]
@@ -35,8 +35,8 @@ def survival(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
     return {
         "distance_m": distances_m,
         "surviving": surviving,
-        "low": [band[0] for band in bands if band],
-        "high": [band[1] for band in bands if band],
+        "low": [interval[0] for interval in intervals if interval],
+        "high": [interval[1] for interval in intervals if interval],
         "incidence": {
             ending: [
                 sum(run["ending"] == ending and end_m <= distance_m for run, end_m in zip(ended, ended_m, strict=True))

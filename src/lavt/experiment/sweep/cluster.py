@@ -15,7 +15,7 @@ from lavt.recording.provenance import provenance
 
 LOCAL = "local"
 """The address of Dask workers on this machine."""
-CONNECT_S = 10
+CONNECT_TIMEOUT_S = 10
 
 
 @contextmanager
@@ -31,19 +31,19 @@ def cluster_workers(address: str, jobs: int | None) -> Iterator[Workers]:
     if address == LOCAL:
         jobs = jobs or os.cpu_count() or 1
         with terminal_signals_blocked():
-            started = dask.LocalCluster(
+            local_cluster = dask.LocalCluster(
                 n_workers=jobs,
                 threads_per_worker=1,
                 dashboard_address=None,
                 protocol="tcp",
                 silence_logs=logging.CRITICAL,
             )
-        with started, dask.Client(started) as client:
+        with local_cluster, dask.Client(local_cluster) as client:
             client.run(ignore_terminal_signals)
             yield _checked_workers(client, address)
         return
     try:
-        client = dask.Client(address, timeout=CONNECT_S)
+        client = dask.Client(address, timeout=CONNECT_TIMEOUT_S)
     except (OSError, TimeoutError, ValueError) as error:
         raise UserError(
             f"no Dask scheduler answers at {address} ({error}): start one with 'dask scheduler', or name another"
@@ -53,7 +53,7 @@ def cluster_workers(address: str, jobs: int | None) -> Iterator[Workers]:
 
 
 def check_cluster(address: str, jobs: int | None) -> None:
-    """Raise the `UserError` that `cluster_workers` would, before any work begins."""
+    """Raise `UserError` where `cluster_workers` would raise it, before any work begins."""
     if address == LOCAL:
         _dask()
     else:
@@ -73,10 +73,11 @@ def _checked_workers(client: Any, address: str) -> Workers:
     threads: Mapping[str, int] = client.nthreads()
     if not threads:
         raise UserError(f"the Dask scheduler at {address} has no worker: start some with 'dask worker --nthreads 1'")
-    crowded = [worker for worker, count in threads.items() if count != 1]
-    if crowded:
+    several_threads = [worker for worker, count in threads.items() if count != 1]
+    if several_threads:
+        worker = several_threads[0]
         raise UserError(
-            f"the Dask worker {crowded[0]} has {threads[crowded[0]]} threads, but a run needs a process of its own: "
+            f"the Dask worker {worker} has {threads[worker]} threads, but a run needs a process of its own: "
             "start it with --nthreads 1, and --nworkers for more"
         )
     try:
@@ -95,5 +96,5 @@ def _checked_workers(client: Any, address: str) -> Workers:
 
 def local_versions() -> dict[str, str]:
     """Return the versions on which the digest of a run depends."""
-    here = provenance()
-    return {**here["versions"], "python": here["machine"]["python"]}
+    recorded = provenance()
+    return {**recorded["versions"], "python": recorded["machine"]["python"]}

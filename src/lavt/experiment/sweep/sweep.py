@@ -30,7 +30,7 @@ from lavt.experiment.sweep.workers import Workers, process_workers
 from lavt.recording.output_directory import prepare_directory
 
 SWEEP = "sweep.yaml"
-"""In the directory of a sweep: its complete config."""
+"""The file in the directory of a sweep that has its complete config."""
 
 ProgressCallback = Callable[[str], None]
 """A callback that shows one line of progress."""
@@ -38,7 +38,11 @@ ProgressCallback = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class SweepResult:
-    """The results of a sweep's runs, the data of those driven by this call, and the failed runs with their reasons."""
+    """The results of a sweep's runs.
+
+    `results` has all runs, including those of earlier calls, `drives` the data of the runs that this call drove, and
+    `failed` the names of the failed runs with their reasons.
+    """
 
     results: Sequence[Mapping[str, Any]]
     drives: Sequence[DriveData]
@@ -56,15 +60,16 @@ def run_all(
     """Drive the runs that have no result yet, `jobs` at a time (None: one per core), or one by one in real time.
 
     With `cluster_address`, the Dask workers of that scheduler drive them. Returns all results, including those of
-    earlier calls, and the entry `speed` of the summary for the virtual runs of this call; None without such runs.
+    earlier calls, and the entry `speed` of the summary. This entry is for the virtual runs of this call; it is None
+    without such runs.
     """
     clock = MachineClock()
     start_ns = clock.now().mono_ns
-    before = [read_json(runs_dir / each.name / RESULT) for each in planned if is_finished(runs_dir / each.name)]
-    todo = [each for each in planned if not is_finished(runs_dir / each.name)]
+    earlier = [read_json(runs_dir / run.name / RESULT) for run in planned if is_finished(runs_dir / run.name)]
+    todo = [run for run in planned if not is_finished(runs_dir / run.name)]
     progress = _SweepProgress(runs_dir, on_progress)
     if cluster_address is None:
-        jobs = 1 if any(each.config.time == "real" for each in todo) else jobs or os.cpu_count() or 1
+        jobs = 1 if any(run.config.time == "real" for run in todo) else jobs or os.cpu_count() or 1
         _drive_in_processes(progress, todo, jobs)
     elif todo:
         with cluster_workers(cluster_address, jobs) as workers:
@@ -72,15 +77,15 @@ def run_all(
             progress.drive(workers, todo)
     results = [drive.result for drive in progress.drives]
     simulated = [result for result in results if result["time"] == "virtual"]
-    driven = SweepResult([*before, *results], progress.drives, progress.failed)
+    sweep_result = SweepResult([*earlier, *results], progress.drives, progress.failed)
     if not simulated:
-        return driven, None
+        return sweep_result, None
     speed = {
         "simulated_s": sum(result["duration_s"] or 0.0 for result in simulated),
         "wall_s": (clock.now().mono_ns - start_ns) / NS_PER_S,
         "jobs": jobs,
     }
-    return driven, speed
+    return sweep_result, speed
 
 
 def is_finished(directory: Path) -> bool:
@@ -99,10 +104,11 @@ class _SweepProgress:
 
     def drive(self, workers: Workers, todo: Sequence[PlannedRun]) -> list[PlannedRun]:
         """Drive runs, and return those that were not driven because a worker's process died."""
-        futures = {workers.submit(each, self.runs_dir / each.name): each for each in todo}
+        futures = {workers.submit(run, self.runs_dir / run.name): run for run in todo}
         broken = []
-        # The import of matplotlib and SciPy takes long, so it overlaps the drives. It is not in the main thread: where
-        # Ctrl-C interrupts the execution of a string, as for a dataclass, `python -m` dies although it was handled.
+        # The import of matplotlib and SciPy takes long, so it runs during the drives. It is not in the main thread: the
+        # definition of a dataclass executes a string, and where Ctrl-C interrupts this, `python -m` dies even if the
+        # interrupt is handled.
         threading.Thread(target=import_module, args=("lavt.experiment.report.report",)).start()
         try:
             for future in as_completed(list(futures)):
@@ -111,7 +117,7 @@ class _SweepProgress:
                     drive = workers.collect(future.result(), self.runs_dir / planned.name)
                 except BrokenExecutor:
                     broken.append(planned)
-                except Exception as error:  # of any kind: the other runs are independent of it
+                except Exception as error:  # the other runs continue, whatever this one raised
                     self.fail(planned, describe_error(error))
                 else:
                     self.take(planned, drive)
@@ -133,29 +139,35 @@ class _SweepProgress:
 
 
 def _drive_in_processes(progress: _SweepProgress, todo: Sequence[PlannedRun], jobs: int) -> None:
-    """Drive runs in processes; where one dies, the pool breaks, and the runs that had begun are driven again, alone."""
+    """Drive the runs in a pool of processes.
+
+    A process that dies breaks the pool. The runs that had begun are then driven again, each in a pool of its own.
+    """
     while todo:
         with process_workers(jobs) as workers:
             broken = progress.drive(workers, todo)
-        begun = [each for each in broken if (progress.runs_dir / each.name).exists()]
+        begun = [run for run in broken if (progress.runs_dir / run.name).exists()]
         _remove_unfinished(broken, progress.runs_dir)
-        for each in begun:
-            directory = progress.runs_dir / each.name
+        for run in begun:
+            directory = progress.runs_dir / run.name
             if is_finished(directory):  # the process died after the run
-                progress.take(each, read_drive(directory, read_json(directory / RESULT)))
+                progress.take(run, read_drive(directory, read_json(directory / RESULT)))
                 continue
             with process_workers(1) as single:
-                if progress.drive(single, [each]):
-                    progress.fail(each, "the process that drove it died, twice")
-        todo = [each for each in broken if each not in begun]
+                if progress.drive(single, [run]):
+                    progress.fail(run, "the process that drove it died, twice")
+        todo = [run for run in broken if run not in begun]
         if todo and not begun:
-            for each in todo:
-                progress.fail(each, "its process died before it began")
+            for run in todo:
+                progress.fail(run, "its process died before it began")
             return
 
 
 def open_sweep(out: Path, *, resume: bool) -> None:
-    """Create the directory of a sweep, or check that a sweep to resume has one; raise `UserError` otherwise."""
+    """Create the directory of a new sweep, or check that the directory of a sweep to resume exists.
+
+    Raises `UserError` where it does not exist, or where it cannot be created.
+    """
     if resume and not out.is_dir():
         raise UserError(f"there is nothing to resume in {out}: omit --resume to begin")
     if not resume:
@@ -179,36 +191,40 @@ def drive_sweep(
     _check_sweep(config, out)
     runs_dir = out / "runs"
     runs_dir.mkdir(exist_ok=True)
-    for each in planned:
-        if is_finished(runs_dir / each.name):
-            _check_config(each, runs_dir / each.name)
+    for run in planned:
+        if is_finished(runs_dir / run.name):
+            _check_config(run, runs_dir / run.name)
     (out / SWEEP).write_text(yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
     _remove_unfinished(planned, runs_dir)
-    driven, speed = run_all(planned, runs_dir, jobs=jobs, on_progress=on_progress, cluster_address=cluster_address)
-    failed = [{"run": name, "reason": reason} for name, reason in driven.failed]
+    sweep_result, speed = run_all(
+        planned, runs_dir, jobs=jobs, on_progress=on_progress, cluster_address=cluster_address
+    )
+    failed = [{"run": name, "reason": reason} for name, reason in sweep_result.failed]
     write_json(out / FAILED, failed)
-    if not driven.results:
-        raise WorkError("no run was finished: " + "; ".join(f"{name}: {reason}" for name, reason in driven.failed))
+    if not sweep_result.results:
+        raise WorkError(
+            "no run was finished: " + "; ".join(f"{name}: {reason}" for name, reason in sweep_result.failed)
+        )
     from lavt.experiment.report.report import write_report  # noqa: PLC0415 (slow: see `_SweepProgress.drive`)
 
-    drives = {drive.directory: drive for drive in driven.drives}
-    return write_report(out, speed=speed, base=base_of(config, planned), drives=drives, failed=failed), driven
+    drives = {drive.directory: drive for drive in sweep_result.drives}
+    return write_report(out, speed=speed, base=base_of(config, planned), drives=drives, failed=failed), sweep_result
 
 
 def base_of(config: SweepConfig, planned: Sequence[PlannedRun]) -> dict[str, Any]:
-    """Return the value of each further axis in the sweep's base config, which identifies the runs of that config.
+    """Return the value of each further axis in the sweep's base config. These values identify the runs of that config.
 
-    No run is of the base config where one of its values is not among those of the axis.
+    If such a value is not among the values of its axis, the sweep has no run of the base config.
     """
     base = {key: _value_at(config, key) for key in config.axes}
     for run, key in itertools.product(planned, config.axes):
         if _value_at(run.config, key) == _value_at(config, key):
-            base[key] = run.identity["axes"][key]  # in the notation of the axis: 20 or 20.0, a section or a part of it
+            base[key] = run.identity["axes"][key]  # as the axis writes the value: 20 or 20.0, a section or a part of it
     return base
 
 
 def recorded_base(out: Path) -> dict[str, Any] | None:
-    """Return `base_of` of the sweep in `out`; None without a sweep's config there."""
+    """Return `base_of` for the sweep whose config is in `out`; None if there is no such config."""
     if not (out / SWEEP).is_file():
         return None
     config = load_config(SweepConfig, out / SWEEP)
@@ -220,10 +236,10 @@ def _value_at(config: RunConfig, key: str) -> Any:
 
 
 def _check_sweep(config: SweepConfig, out: Path) -> None:
-    """Raise `UserError` where another sweep was begun in `out`: the report would mix the runs of both sweeps."""
+    """Raise `UserError` where another sweep was begun in `out`, because a report would mix the runs of both."""
     if not (out / SWEEP).is_file():
         return
-    begun, requested = (each.model_dump(mode="json") for each in (load_config(SweepConfig, out / SWEEP), config))
+    begun, requested = (sweep.model_dump(mode="json") for sweep in (load_config(SweepConfig, out / SWEEP), config))
     different = [key for key in requested if requested[key] != begun[key]]
     if different:
         raise UserError(
@@ -239,7 +255,7 @@ def _check_config(planned: PlannedRun, directory: Path) -> None:
 
 def _remove_unfinished(planned: Sequence[PlannedRun], runs_dir: Path) -> None:
     """Remove the directories of killed runs, which have no result, so that these runs are driven again."""
-    for each in planned:
-        directory = runs_dir / each.name
+    for run in planned:
+        directory = runs_dir / run.name
         if directory.is_dir() and not is_finished(directory):
             shutil.rmtree(directory)

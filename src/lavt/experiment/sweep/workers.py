@@ -1,7 +1,8 @@
-"""The workers that drive the runs of a sweep: processes of this machine, or Dask workers on many.
+"""The workers that drive the runs of a sweep: processes of this machine, or Dask workers on one or several machines.
 
-Both are `concurrent.futures` executors (`cluster.py` has Dask's). Local processes write a run into its directory.
-Remote workers need no access to this machine's files: they write into a temporary directory and send its files back.
+Both are `concurrent.futures` executors (`cluster.py` creates Dask's). Local processes write the files of a run directly
+into its directory. Remote workers need no access to this machine's files: they write into a temporary directory and
+send its files back.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from lavt.experiment.runs.run import RESULT, drive_once
 from lavt.recording.output_directory import prepare_directory
 
 TERMINAL_SIGNALS = (signal.SIGINT, signal.SIGHUP)
-"""The signals of Ctrl-C and of a closed terminal."""
+"""The signals that Ctrl-C and the closing of a terminal send."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,16 +37,16 @@ class Workers:
     remote: bool
 
     def submit(self, planned: PlannedRun, directory: Path) -> Future[Any]:
-        """Start a run; its future's result is for `collect`."""
+        """Start a run; the result of its future is the argument of `collect`."""
         if self.remote:
             return self.executor.submit(drive_remotely, planned)
         return self.executor.submit(drive_once, planned, directory)
 
-    def collect(self, done: Any, directory: Path) -> DriveData:
+    def collect(self, result: Any, directory: Path) -> DriveData:
         """Return the data of a finished run, after writing its files into `directory` if it was remote."""
-        drive: DriveData = done
+        drive: DriveData = result
         if self.remote:
-            drive, files = done
+            drive, files = result
             write_files(files, directory)
         return replace(drive, directory=directory)
 
@@ -63,7 +64,7 @@ def process_workers(jobs: int) -> Iterator[Workers]:
     context = multiprocessing.get_context("spawn")  # a fork would copy locks that are never released
     with terminal_signals_blocked():
         executor = ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin_process)
-    with terminal_signals_blocked():  # again, as the start of Python's resource tracker has unblocked SIGINT
+    with terminal_signals_blocked():  # again: the start of Python's resource tracker unblocked SIGINT
         for _ in range(jobs):
             executor.submit(os.getpid)  # starts a process
     with executor:
@@ -72,7 +73,10 @@ def process_workers(jobs: int) -> Iterator[Workers]:
 
 @contextmanager
 def terminal_signals_blocked() -> Iterator[None]:
-    """Block the terminal's signals; processes started meanwhile inherit this until `ignore_terminal_signals`."""
+    """Block the terminal's signals.
+
+    Processes that are started meanwhile inherit the blocked signals, until they call `ignore_terminal_signals`.
+    """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, TERMINAL_SIGNALS)
     try:
         yield
@@ -81,7 +85,7 @@ def terminal_signals_blocked() -> Iterator[None]:
 
 
 def ignore_terminal_signals() -> None:
-    """Ignore the terminal's signals: all its processes receive them, but only the parent handles them."""
+    """Ignore the terminal's signals, which all its processes receive, but only the parent process handles."""
     for number in TERMINAL_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, TERMINAL_SIGNALS)
@@ -93,7 +97,7 @@ def _begin_process() -> None:
 
 
 def _end_with_parent() -> None:
-    """Exit when the parent has ended, so that no old process writes into a resumed sweep."""
+    """Exit when the parent process has ended, so that no process of an old sweep writes into a resumed one."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         try:
@@ -111,7 +115,7 @@ def drive_remotely(planned: PlannedRun) -> tuple[DriveData, dict[str, bytes]]:
 
 
 def write_files(files: Mapping[str, bytes], directory: Path) -> None:
-    """Write the files of a run; the result comes last, because its existence marks the run as finished."""
+    """Write the files of a run, and the result last, because its existence marks the run as finished."""
     prepare_directory(directory)
     for name in sorted(files, key=lambda name: name == RESULT):
         unfinished = directory / f"{name}.part"
