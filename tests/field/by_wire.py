@@ -227,6 +227,11 @@ class RunningDrive:
     actuator_pid: int
     stalls: Stalls
 
+    @property
+    def pids(self) -> tuple[int, int]:
+        """The ids of the actuator's and of the server's process."""
+        return self.actuator_pid, self.loop.server.popen.pid
+
     def status(self) -> dict[str, Any]:
         """Return the newest status that the server printed."""
         status: dict[str, Any] = self.loop.server.latest.get("status", {})
@@ -283,8 +288,10 @@ def running_drive(
     config = write_config(run, work / "car.yaml")
     with software_car(config, stalls=stalls) as car, Processes(work) as processes:
         loop = start_loop(processes, plan_run(run), work, work, once=False, server_program=program)
+        drive = RunningDrive(car, loop, work, loop.server_ready["actuator_pid"], stalls)
         try:
-            yield RunningDrive(car, loop, work, loop.server_ready["actuator_pid"], stalls)
+            yield drive
         finally:
-            with suppress(ProcessLookupError):  # a stopped process cannot end, and would keep its ports
-                os.killpg(loop.server.popen.pid, signal.SIGCONT)
+            for pid in drive.pids:
+                with suppress(ProcessLookupError):  # a stopped process cannot end, and would keep its ports
+                    os.kill(pid, signal.SIGCONT)

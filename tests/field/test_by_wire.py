@@ -70,6 +70,7 @@ def test_a_route_is_driven_over_can(print_report: PrintReport, drive: DriveWithP
             raise drive_in_progress.unexpected_stop()
         if os.geteuid() == 0:  # other users may lack the permission
             assert os.getpriority(os.PRIO_PROCESS, drive_in_progress.actuator_pid) == process_priority.VEHICLE_NICENESS
+            assert os.getsid(drive_in_progress.actuator_pid) == drive_in_progress.actuator_pid
         ended_ns = CLOCK.now().mono_ns
         parked_ms = drive_in_progress.car.wait_for_park_ms(ended_ns - NS_PER_S)
         print_report(f"parked {parked_ms:.0f} ms after the end of the drive was reported")
@@ -177,12 +178,14 @@ def test_a_stalled_machine_leaves_a_braking_car(
     """If both processes are frozen or killed, the kit disengages after 100 ms and brakes, and it stays disengaged."""
     with drive("dataspeed_gen2") as drive_in_progress:
         since_ns = CLOCK.now().mono_ns
-        os.killpg(drive_in_progress.loop.server.popen.pid, fault)
+        for pid in drive_in_progress.pids:
+            os.kill(pid, fault)
         took_ms = drive_in_progress.car.wait_for_watchdog_ms(since_ns)
         print_report(f"server and actuator, {fault.name}: the kit brakes after {took_ms:.0f} ms")
         if fault == signal.SIGSTOP:
             pause(2 * NS_PER_S)
-            os.killpg(drive_in_progress.loop.server.popen.pid, signal.SIGCONT)
+            for pid in drive_in_progress.pids:
+                os.kill(pid, signal.SIGCONT)
             pause(NS_PER_S)
             assert drive_in_progress.car.event_ns("enabled", "enabled: ", since_ns=since_ns) is None
             drive_in_progress.wait(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import multiprocessing
+import os
 import signal
 import threading
 from multiprocessing.connection import Connection
@@ -103,6 +104,7 @@ def serve_actuator(connection: Connection, config: ServerConfig, host: str, vide
     for signal_number in IGNORED_SIGNALS:
         signal.signal(signal_number, signal.SIG_IGN)
     queue_output("stdout", "stderr")
+    os.setsid()  # a session that the kernel schedules apart from the server's
     process_priority.raise_priority(process_priority.VEHICLE_NICENESS)
     clock = MachineClock()
     try:

@@ -124,7 +124,7 @@ def _machine_checks(config: Settings, side: str, clock: MachineClock) -> Iterato
     yield checks.check_buffer(probes.receive_buffer_bytes())
     yield checks.check_arrival(probes.kernel_records_arrivals())
     yield checks.check_timer(*probes.timer_accuracy(clock))
-    yield checks.check_process_priority(probes.niceness())
+    yield checks.check_process_priority(probes.niceness(), process_priority.session_niceness())
     yield checks.check_governor(probes.governors())
 
 

@@ -195,9 +195,16 @@ def check_timer(resolution_ns: int, late_ns: Sequence[int]) -> Check:
     return Check("timer", "ok", found, measured=measured)
 
 
-def check_process_priority(niceness: int) -> Check:
-    """Check that LAVT's processes have a higher priority than ordinary ones."""
-    name, measured = "process priority", {"niceness": niceness}
+def check_process_priority(niceness: int, session_niceness: int | None) -> Check:
+    """Check that LAVT's processes have a higher priority than ordinary ones.
+
+    The niceness of the session is None if the kernel does not share the processors among sessions.
+    """
+    name, measured = "process priority", {"niceness": niceness, "session_niceness": session_niceness}
+    if niceness < 0 and session_niceness is not None and session_niceness >= 0:
+        found = f"LAVT's processes have priority (nice {niceness}) over those of this terminal's session only"
+        do = "run them as services, as in deploy/systemd/, or first run `echo -10 > /proc/self/autogroup` here, as root"
+        return Check(name, "warning", found, do, measured)
     if niceness < 0:
         found = f"LAVT's processes have priority over ordinary ones (nice {niceness})"
         return Check(name, "ok", found, measured=measured)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from contextlib import suppress
+from pathlib import Path
 from typing import Final
 
 NICENESS: Final = -10
@@ -11,11 +12,28 @@ NICENESS: Final = -10
 VEHICLE_NICENESS: Final = -15
 """Priority of the actuator's process, above that of the server, and of a software car."""
 
+SESSION: Final = Path("/proc/self/autogroup")
+"""The niceness of this process's session. With automatic task groups, Linux shares the processors among sessions, and
+the niceness of a process counts only within its session."""
+
 
 def raise_priority(niceness: int = NICENESS) -> None:
-    """Raise the priority of this process; without permission, do nothing.
+    """Raise the priority of this process, and that of its session if it leads one; without permission, do nothing.
 
-    Other load on the machine must not show as latency. Threads started later inherit the priority.
+    Other load on the machine must not show as latency. Threads started later inherit the priority. The session of a
+    shell keeps its priority.
     """
     with suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, 0, niceness)
+    if os.getsid(0) == os.getpid():
+        with suppress(OSError):
+            SESSION.write_text(str(niceness))
+
+
+def session_niceness() -> int | None:
+    """Return the niceness of this process's session, or None if the kernel does not share processors among sessions."""
+    try:
+        is_enabled = Path("/proc/sys/kernel/sched_autogroup_enabled").read_text().strip() == "1"
+        return int(SESSION.read_text().rpartition("nice")[2]) if is_enabled else None
+    except (OSError, ValueError):
+        return None
