@@ -12,7 +12,7 @@ from benchmarks.fuzzing.target import Target
 
 from lavt.safety.gate import RejectionReason, SafetyGate
 
-QUICK_INPUTS, FULL_INPUTS = 50_000, 2_000_000
+QUICK_INPUTS, FULL_INPUTS = 20_000, 2_000_000
 """Two million inputs take about a minute of CPU time."""
 VALID = Corpus([bytes(range(64))], fields=((2, 4),))
 

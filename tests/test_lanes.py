@@ -22,7 +22,10 @@ from tests.lanes import (
     runs_in_parallel,
     select_lanes,
 )
+from tests.support import lane_runner
 from tests.support.lane_runner import LaneOutcome, closing_line, parse_counts, run_lanes, table
+
+from lavt.domain import NS_PER_S
 
 OPTIONS = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["pytest"]["ini_options"]
 PYTEST_LANES = {lane.name: lane.commands[0][3:] for lane in (*LANES, FULL) if "pytest" in lane.commands[0]}
@@ -181,8 +184,9 @@ except KeyboardInterrupt:
 """
 
 
-def test_lane_is_interrupted_at_its_time_limit() -> None:
+def test_lane_is_interrupted_at_its_time_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     """A lane that exceeds its time limit is interrupted, so that pytest lists failures, and then killed."""
+    monkeypatch.setattr(lane_runner, "GRACE_NS", 2 * NS_PER_S)
     hangs = LaneSpec("hangs", ((sys.executable, "-c", HANGING_PROGRAM), shell("echo never")), 1 / 12)
     code, output = run(hangs, LaneSpec("next", (shell("echo started"),), 1))
     assert code == 1

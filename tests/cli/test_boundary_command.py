@@ -6,6 +6,7 @@ import csv
 import json
 from pathlib import Path
 
+import pytest
 from tests.support.command_line import Run
 
 from lavt.config_file import shipped
@@ -21,6 +22,7 @@ SMALL_SEARCH = [
 ]
 
 
+@pytest.mark.full
 def test_results_are_printed_and_written(run: Run, tmp_path: Path) -> None:
     """The results are printed as JSON and written as JSON, as CSV with a row per seed, and as two figures."""
     out = tmp_path / "out"

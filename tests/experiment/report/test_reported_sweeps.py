@@ -67,6 +67,7 @@ def test_two_sweeps_in_one_report_are_separate_groups(sweeps: tuple[Path, Path],
     }
 
 
+@pytest.mark.full
 def test_a_single_sweep_has_no_name(sweeps: tuple[Path, Path], tmp_path: Path) -> None:
     """In a report of one directory or of single runs, no run and no group has the name of a sweep."""
     first, second = sweeps
