@@ -72,7 +72,7 @@ class VehicleState(Struct, frozen=True):
     is_overridden: bool = False
     """Whether the driver in the car has taken over, so that no command reaches the wheels."""
     is_speed_plausible: bool = True
-    """False: `speed_mps` may be wrong, and the car may move even if it is 0."""
+    """False: `speed_mps` may be wrong, and the car may move even if it is 0; this is a vehicle fault."""
 
 
 class GroundTruth(Struct, frozen=True):

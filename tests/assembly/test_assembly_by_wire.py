@@ -58,10 +58,9 @@ def test_unverified_signals_inhibit_arming_on_a_real_bus() -> None:
     assert "unverified" not in reason_for(virtual, unverified)
 
 
-def test_a_missing_sign_or_proof_inhibits_arming(known: Profile) -> None:
-    """An unknown steering sign or a missing watchdog proof inhibits arming, even on a virtual bus."""
+def test_a_missing_proof_inhibits_arming(known: Profile) -> None:
+    """A missing watchdog proof inhibits arming, even on a virtual bus."""
     config = DbwConfig(interface="virtual", channel="test")
-    assert "vehicle.dbw.steering_sign" in reason_for(config, load_profile("dataspeed_gen1"))
     assert "vehicle.dbw.watchdog_proof" in reason_for(config, known)
 
 

@@ -85,6 +85,7 @@ class FakeVehicle:
     is_engage_requested: bool = False
     reached: list[ReachedCommand] = field(default_factory=list)
     inhibit_reason: str = ""
+    steering_rad: float = 0.0
 
     @property
     def capabilities(self) -> Capabilities:
@@ -106,7 +107,7 @@ class FakeVehicle:
         return reached
 
     def state(self) -> VehicleState:
-        return VehicleState(self.now_ns, self.speed_mps, 0.0, "drive", self.inhibit_reason)
+        return VehicleState(self.now_ns, self.speed_mps, self.steering_rad, "drive", self.inhibit_reason)
 
     def ground_truth(self) -> GroundTruth | None:
         return None

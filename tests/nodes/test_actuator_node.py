@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from itertools import count
 from typing import Any, Literal
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 from tests.nodes.stand_ins import MONO_NS, FakeVehicle, at, deliver, payloads
@@ -19,6 +20,7 @@ from lavt.nodes.payloads import Admission, AtWheel, FrameWritten, Route
 from lavt.safety.gate import RejectionReason, SafetyGate
 from lavt.safety.limiter import Limiter
 from lavt.safety.limits import LIMITS
+from lavt.safety.state_machine import TRIGGER_MESSAGES
 from lavt.transport.messages import ELLIPSIS, decode, encode
 from lavt.vehicle.camera import FrameTimes
 from lavt.vehicle.vehicle import ReachedCommand
@@ -337,6 +339,31 @@ def test_a_state_with_a_long_inhibit_reason_is_readable(letter: str) -> None:
         assert state.safety == "safe_stop"
         assert state.reason.endswith(20 * letter + ELLIPSIS)
         assert state.rejected.endswith(20 * letter + ELLIPSIS)
+
+
+@given(speed_mps=st.floats(), steering_rad=st.floats())
+@example(speed_mps=101.0, steering_rad=-1.01)
+@example(speed_mps=math.nan, steering_rad=math.nan)
+def test_any_vehicle_state_is_readable(speed_mps: float, steering_rad: float) -> None:
+    """Whatever speed and angle a vehicle reports, its state is readable: values in the range unchanged, others at its
+    end.
+    """
+    bench = Bench()
+    bench.vehicle.speed_mps, bench.vehicle.steering_rad = speed_mps, steering_rad
+    (state,) = [decode(State, state) for state in payloads(bench.advance(PERIOD_NS), "state")][-1:]
+    for reported, published, bound in ((speed_mps, state.speed_mps, 100.0), (steering_rad, state.steering_rad, 1.0)):
+        assert published == (reported if abs(reported) <= bound else math.copysign(bound, published))
+        assert math.isnan(reported) or reported * published >= 0
+
+
+@pytest.mark.parametrize("speed_mps", [math.nan, math.inf])
+def test_a_speed_that_is_no_number_stops_and_is_reported(speed_mps: float) -> None:
+    """A speed that is not finite leads to a safe stop whose reason is readable, and is not published as standstill."""
+    bench = Bench().armed()
+    bench.vehicle.speed_mps = speed_mps
+    state = decode(State, payloads(bench.advance(2 * PERIOD_NS), "state")[-1])
+    assert (state.safety, state.speed_mps) == ("safe_stop", 100.0)
+    assert state.reason.startswith(TRIGGER_MESSAGES["vehicle fault"])
 
 
 def test_a_server_shutdown_stops_the_vehicle_and_ends_the_drive() -> None:

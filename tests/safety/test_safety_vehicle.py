@@ -158,3 +158,21 @@ def test_a_state_that_is_not_finite_is_a_vehicle_fault(changes: dict[str, Any]) 
     assert rig.state == "safe_stop"
     assert actuation.throttle == 0.0
     assert math.isfinite(actuation.steering_rad)
+
+
+@pytest.mark.parametrize("state", ["arming", "driving", "degraded"])
+@pytest.mark.parametrize("speed_mps", [0.0, 11.0])
+def test_an_implausible_speed_is_a_vehicle_fault(state: str, speed_mps: float) -> None:
+    """A vehicle that says that its speed may be wrong is stopped with full brake, even without an inhibit reason."""
+    rig = Rig().acquire()
+    rig.picture()
+    rig.send()
+    if state != "arming":
+        rig = Rig().driving()
+    if state == "degraded":
+        rig.go(400 * NS_PER_MS)
+    assert rig.state == state
+    rig.vehicle = replace(vehicle_at(speed_mps), is_speed_plausible=False)
+    actuation = rig.actuation()
+    assert rig.state == ("disarmed" if state == "arming" else "safe_stop")
+    assert (actuation.throttle, actuation.brake) == (0.0, 1.0)

@@ -103,8 +103,6 @@ def inhibit_reason_of(server: ServerConfig, profile: Profile, wall_ns: int) -> s
     """Return why the vehicle must not be armed with this config at `wall_ns`; empty if it may."""
     config = server.vehicle.dbw
     is_real = not is_virtual(config.interface, config.channel, config.options)
-    if profile.car.steering_sign is None:
-        return "the sign of steering to the left is unknown: test it with the wheels up, set vehicle.dbw.steering_sign"
     if is_real and not server.security.key:
         return (
             f"{config.interface} {config.channel} may have a real car, which anyone who reaches the router could drive"

@@ -42,7 +42,8 @@ from lavt.vehicle.dbw.profile import (
     SignalCondition,
     SystemCommand,
 )
-from lavt.vehicle.dbw.traffic import ExpectedMessages
+from lavt.vehicle.dbw.speed_monitor import CONSTANT_WITHIN_MPS
+from lavt.vehicle.dbw.states import STATIONARY_BELOW_MPS
 
 MAX_PEDAL_STEP = 0.02
 """The largest accepted step of a pedal's signal, as a share of the pedal's range. A raw 16-bit value whose scale is
@@ -134,6 +135,8 @@ class _ProfileBuilder:
             if (report := getattr(config.reports, part)).message
         }
         self._check_complete(reports)
+        speeds_per_mps = self._speed_units(reports)
+        self._check_speed_steps(reports, speeds_per_mps)
         return Profile(
             name=self.name,
             kit=config.kit,
@@ -147,7 +150,7 @@ class _ProfileBuilder:
             clearing_bytes=config.sent.clearing_bytes,
             reports=reports,
             watchdog=self._watchdog(),
-            speeds_per_mps=self._speed_units(reports),
+            speeds_per_mps=speeds_per_mps,
             angle_per_deg=self._unit_of(reports, "angle", IN_DEGREES),
             unverified=tuple(name for name, is_unverified in self.is_unverified.items() if is_unverified),
             codec=self.codec,
@@ -352,6 +355,19 @@ class _ProfileBuilder:
             if speed in reported
         }
 
+    def _check_speed_steps(self, reports: Mapping[str, ReportSpec], speeds_per_mps: Mapping[str, float]) -> None:
+        """Raise `UserError` for a speed whose step is too large for the checks of `speed_monitor.py`."""
+        for speed, per_mps in speeds_per_mps.items():
+            name, report = next((name, report) for name, report in reports.items() if speed in report.values)
+            signal = self.codec.messages[name].signals[report.values[speed]]
+            step_mps = 0.0 if signal.is_float else abs(signal.scale) / per_mps
+            largest_mps = CONSTANT_WITHIN_MPS if speed == "speed" else STATIONARY_BELOW_MPS
+            if step_mps > largest_mps:
+                raise UserError(
+                    f"{self.name}: {signal.name} of {name} has steps of {step_mps:.3g} m/s, too coarse to check the "
+                    f"speed with: name a signal with steps of at most {largest_mps:g} m/s as {speed}"
+                )
+
     def _check_range(self, message: MessageFacts, signal: SignalFacts, value: float) -> None:
         tolerance = abs(signal.scale) / 2
         if not signal.minimum - tolerance <= value <= signal.maximum + tolerance:
@@ -381,19 +397,3 @@ def find_dbw(target: str) -> DbwConfig:
     if not isinstance(section, dict):
         raise UserError(f"{path} has no vehicle of kind dbw with a section dbw: name one that has, or a profile")
     return parse_config(DbwConfig, section, f"{path}: vehicle.dbw")
-
-
-def expected_traffic(profile: Profile) -> ExpectedMessages:
-    """Return the messages that a profile expects on its bus.
-
-    Checksums and counters are known by the names of their signals, so they are also expected in messages that the
-    profile does not use.
-    """
-    axes = profile.axes.values()
-    checksums = {command.checksum for command in axes} | {report.checksum for report in profile.reports.values()}
-    return ExpectedMessages(
-        checksums=checksums - {""},
-        counters={command.count for command in axes} - {""},
-        timeouts_ns={message: report.timeout_ns for message, report in profile.reports.items()},
-        short_lengths=frozenset() if profile.clearing_bytes is None else {profile.clearing_bytes},
-    )

@@ -11,7 +11,7 @@ from typing import Annotated, NamedTuple
 
 import typer
 
-from lavt.assembly.dbw import expected_traffic, find_dbw, load_profile, read_profile
+from lavt.assembly.dbw import find_dbw, load_profile, read_profile
 from lavt.assembly.dbw_check import find_mismatches, real_bus_inhibit_reasons
 from lavt.cli import console
 from lavt.cli.can_test_watchdog import run_watchdog_test
@@ -24,7 +24,7 @@ from lavt.errors import UserError, WorkError
 from lavt.vehicle.can_frame import BusGone, ReceivedCanFrame
 from lavt.vehicle.dbw.bus import CanPort, log_line, read_log
 from lavt.vehicle.dbw.codec import Codec
-from lavt.vehicle.dbw.traffic import BusTraffic, ExpectedMessages
+from lavt.vehicle.dbw.traffic import BusTraffic, ExpectedMessages, expected_traffic
 
 POLL_PERIOD_S = 0.02
 

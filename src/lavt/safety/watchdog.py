@@ -75,6 +75,8 @@ class Watchdog:
             self._machine.trigger("vehicle fault", vehicle.inhibit_reason)
         elif not (math.isfinite(vehicle.speed_mps) and math.isfinite(vehicle.steering_rad)):
             self._machine.trigger("vehicle fault", "its speed or steering angle is not a finite number")
+        elif not vehicle.is_speed_plausible:
+            self._machine.trigger("vehicle fault", "its speed is not plausible")
         elif not vehicle.is_engaged and self._machine.state in ("driving", "degraded"):
             self._machine.trigger("vehicle fault")
         elif not self._limits.is_stationary(vehicle):

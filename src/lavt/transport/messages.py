@@ -7,6 +7,7 @@ cuts texts that are too long, such as a list of faults, because a state must be 
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 from functools import lru_cache
@@ -38,11 +39,13 @@ NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_-]{0,31}\Z")
 ELLIPSIS = "\N{HORIZONTAL ELLIPSIS}"
 MAX_DELAY_MS = 10_000.0
 """The longest delay that a client can request of a server; clearing the delay takes as long."""
+SPEED_BOUND_MPS = 100.0
+ROAD_WHEEL_BOUND_RAD = 1.0
 
 Version = Annotated[int, Meta(ge=VERSION, le=VERSION)]
 U64 = Annotated[int, Meta(ge=0)]
 Time = Annotated[int, Meta(ge=0, le=2**63 - 1)]
-RoadWheel = Annotated[float, Meta(ge=-1.0, le=1.0)]
+RoadWheel = Annotated[float, Meta(ge=-ROAD_WHEEL_BOUND_RAD, le=ROAD_WHEEL_BOUND_RAD)]
 Unit = Annotated[float, Meta(ge=0.0, le=1.0)]
 Delay = Annotated[float, Meta(ge=0.0, le=MAX_DELAY_MS)]
 Name = Annotated[str, Meta(pattern=NAME.pattern)]
@@ -65,6 +68,9 @@ def _text(kind: type, field: str) -> Any:
     return Annotated[str, Meta(max_length=TEXT_BYTES[kind][field])]
 
 
+BOUNDS: dict[type, dict[str, float]] = {State: {"speed_mps": SPEED_BOUND_MPS, "steering_rad": ROAD_WHEEL_BOUND_RAD}}
+"""The largest magnitudes of numbers that a vehicle reports. They are sent instead of larger ones, and of NaN."""
+
 TYPES: dict[type, dict[str, Any]] = {
     Command: {
         "epoch": U64,
@@ -82,7 +88,7 @@ TYPES: dict[type, dict[str, Any]] = {
     State: {
         "sent_wall_ns": Time,
         "state_mono_ns": Time,
-        "speed_mps": Annotated[float, Meta(ge=-100.0, le=100.0)],
+        "speed_mps": Annotated[float, Meta(ge=-SPEED_BOUND_MPS, le=SPEED_BOUND_MPS)],
         "steering_rad": RoadWheel,
         "gear": Literal["park", "reverse", "neutral", "drive"],
         "safety": SafetyState,
@@ -143,11 +149,14 @@ Kind = TypeVar("Kind", Command, State, SessionRequest, SessionReply, NetemReques
 
 
 def encode(message: Command | State | SessionRequest | SessionReply | NetemRequest | NetemReply) -> bytes:
-    """Return the bytes of `message` on the wire, with texts cut to their limits."""
+    """Return the bytes of `message` on the wire, with texts and reported numbers within their limits."""
     kind = type(message)
-    cut = {name: _cut(getattr(message, name), max_bytes) for name, max_bytes in TEXT_BYTES[kind].items()}
-    if cut:
-        message = msgspec.structs.replace(message, **cut)
+    limited: dict[str, str | float] = {
+        name: _cut(getattr(message, name), max_bytes) for name, max_bytes in TEXT_BYTES[kind].items()
+    }
+    limited |= {name: _bounded(getattr(message, name), bound) for name, bound in BOUNDS.get(kind, {}).items()}
+    if limited:
+        message = msgspec.structs.replace(message, **limited)
     return _ENCODER.encode((VERSION, *_FIELD_VALUES[kind](message)))
 
 
@@ -157,6 +166,11 @@ def _cut(text: str, max_bytes: int) -> str:
     if len(data) <= max_bytes:
         return data.decode()
     return data[: max_bytes - len(ELLIPSIS.encode())].decode(errors="ignore") + ELLIPSIS
+
+
+def _bounded(number: float, bound: float) -> float:
+    """Return the number within -bound and bound; NaN becomes `bound`, so that it is never taken for standstill."""
+    return bound if math.isnan(number) else min(max(number, -bound), bound)
 
 
 def decode(kind: type[Kind], data: bytes) -> Kind:

@@ -86,6 +86,68 @@ def test_all_speeds_stuck_at_zero(generation: int) -> None:
     assert (rig.kit.state.gear, rig.state) == (Gear.PARK, "idle")
 
 
+def with_speeds_stuck_at_zero(generation: int) -> tuple[AdapterRig, SafetyGate]:
+    """Return a stationary engaged car whose reported speeds stay 0, and a gate in the state `driving`."""
+    rig, gate = stationary_rig(generation).copy(), new_gate()
+    rig.engage()
+    for source in SPEED_SOURCES[generation]:
+        rig.kit.stick_speed(source, 0.0)
+    gate.machine.state = "driving"
+    gate.watchdog.should_engage(rig.adapter.state())
+    rig.sent.clear()
+    return rig, gate
+
+
+@both_generations
+@pytest.mark.parametrize("throttle", [0.1, 0.2, 0.45, 1.0])
+def test_all_speeds_stuck_at_zero_since_standstill(generation: int, throttle: float) -> None:
+    """If all speeds stay 0 while the car drives off, the drive ends before it is faster than 3 m/s, whatever the
+    throttle; the car is not parked before it is stationary.
+    """
+    rig, gate = with_speeds_stuck_at_zero(generation)
+    rig.actuation = Actuation(0.0, throttle, 0.0)
+    rig.run_until(lambda rig: not rig.adapter.state().is_speed_plausible, 40_000, step_ms=COARSE_MS)
+    assert 1.0 < rig.speed_mps < 3.0
+    run(rig, gate, 11 * NS_PER_S)
+    assert gate.state == "safe_stop"
+    assert (rig.speed_mps, rig.kit.state.gear) == (0.0, Gear.PARK)
+
+
+@both_generations
+@pytest.mark.parametrize("coasting_ms", [0, 2000])
+def test_a_stop_before_stuck_speeds_are_found(generation: int, coasting_ms: int) -> None:
+    """If all speeds stay 0 and the drive ends before this is found, the car is not parked before it is stationary."""
+    rig, gate = with_speeds_stuck_at_zero(generation)
+    rig.actuation = Actuation(0.0, 0.45, 0.0)
+    rig.run_ms(2500, step_ms=COARSE_MS)
+    rig.actuation = Actuation(0.0, 0.0, 0.0)
+    rig.run_ms(coasting_ms, step_ms=COARSE_MS)
+    assert rig.speed_mps > 1.4
+    gate.machine.trigger("stop requested")
+    run(rig, gate, 4 * NS_PER_S)
+    assert (rig.speed_mps, rig.kit.state.gear) == (0.0, Gear.PARK)
+    assert not any(name.startswith("speed_") for name in rig.adapter.counts)
+
+
+@both_generations
+def test_wheels_that_lock_on_ice(generation: int) -> None:
+    """A car that slides on ice with locked wheels is not parked before it is stationary."""
+    rig, gate = stationary_rig(generation).copy(), new_gate()
+    rig.engage()
+    rig.actuation = Actuation(0.0, 0.5, 0.0)
+    rig.run_until(lambda rig: rig.speed_mps >= 2.6, step_ms=COARSE_MS)
+    rig.kit.weaken_brake(0.8 / 6)
+    rig.actuation = Actuation(0.0, 0.0, 1.0)
+    rig.run_until(lambda rig: rig.speed_mps <= 2.4)
+    for source in SPEED_SOURCES[generation]:
+        rig.kit.stick_speed(source, 0.0)
+    rig.sent.clear()
+    gate.machine.state = "emergency_stop"
+    run(rig, gate, 5 * NS_PER_S)
+    assert (rig.speed_mps, rig.kit.state.gear) == (0.0, Gear.PARK)
+    assert not any(name.startswith("speed_") for name in rig.adapter.counts)
+
+
 @both_generations
 @pytest.mark.parametrize("speed_mps", [0.0, 3.0])
 def test_a_stuck_speed_under_throttle(generation: int, speed_mps: float) -> None:

@@ -134,6 +134,42 @@ def test_a_pedal_without_its_scale(tmp_path: Path) -> None:
     assert "PCMD_PERCENT of BrakeCmd is 100% of a pedal" in error
 
 
+SPEED_SIGNALS = {
+    "speed": ("dataspeed_gen1", "SG_ VEH_VEL : 32|16@1- (0.01,0)", "VEH_VEL"),
+    "a second speed": ("dataspeed_gen2", "SG_ BY_PROPULSION : 16|16@1- (0.01,0)", "BY_PROPULSION"),
+    "a wheel": ("dataspeed_gen1", "SG_ WHEEL_3 : 32|16@1- (0.01,0)", "WHEEL_3"),
+}
+
+
+@pytest.mark.parametrize(
+    ("speed", "step", "is_fine_enough"),
+    [
+        ("speed", 0.018, True),
+        ("speed", 0.0181, False),
+        ("speed", 0.1, False),
+        ("speed", -0.1, False),
+        ("speed", 1.0, False),
+        ("a second speed", 0.36, True),
+        ("a second speed", 0.37, False),
+        ("a wheel", 0.3, True),
+        ("a wheel", 0.31, False),
+    ],
+)
+def test_the_step_of_a_speed(tmp_path: Path, speed: str, step: float, is_fine_enough: bool) -> None:
+    """A speed with steps over 0.005 m/s is rejected, because it would seem frozen in normal driving; a speed to compare
+    it with may have steps of 0.1 m/s.
+    """
+    name, signal, signal_name = SPEED_SIGNALS[speed]
+    text = shipped_profiles()[name].with_suffix(".dbc").read_text()
+    assert text.count(signal) == 1
+    dbc = tmp_path / "coarse.dbc"
+    dbc.write_text(text.replace(signal, signal.replace("0.01", str(step))))
+    if is_fine_enough:
+        load_profile(name, str(dbc))
+    else:
+        assert signal_name in rejected(name, dbc=str(dbc))
+
+
 REJECTED: list[tuple[str, dict[str, Any], str]] = [
     ("dataspeed_gen1", {"sent__brake__value": "PCMD_PRECENT"}, "BrakeCmd of its DBC has no signal 'PCMD_PRECENT'"),
     ("dataspeed_gen1", {"sent__brake__message": "BreakCmd"}, "its DBC has no message 'BreakCmd'"),

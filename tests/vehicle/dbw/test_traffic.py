@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lavt.assembly.dbw import expected_traffic, load_profile
+from lavt.assembly.dbw import load_profile
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.vehicle.can_frame import CanFrame, ReceivedCanFrame
 from lavt.vehicle.dbw.crc8 import frame_crc8
@@ -16,6 +16,7 @@ from lavt.vehicle.dbw.traffic import (
     BusTraffic,
     ExpectedMessages,
     MessageSummary,
+    expected_traffic,
     signal_text,
 )
 

@@ -22,16 +22,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from lavt.clock import Clock
-from lavt.domain import NS_PER_MS, NS_PER_S, Now
+from lavt.domain import NS_PER_S, Now
 from lavt.errors import UserError
 from lavt.vehicle.can_frame import BusGone, CanFrame, ReceivedCanFrame
 from lavt.vehicle.dbw.can_gateway import gateway_interfaces
+from lavt.vehicle.dbw.profile import TICK_LIMIT_NS
 
 if TYPE_CHECKING:
     from can import BusABC, Message
 
-TICK_LIMIT_NS: Final = 60 * NS_PER_MS
-"""An older frame is not written: the program that made it may have been frozen since."""
 REOPEN_NS: Final = NS_PER_S
 """Shortest time between attempts to reopen a lost bus."""
 QUEUE_FRAMES: Final = 8192

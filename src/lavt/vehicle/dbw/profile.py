@@ -32,7 +32,7 @@ CLEARING_PERIOD_NS = 50 * NS_PER_MS
 COMMAND_TIMEOUT_NS = 100 * NS_PER_MS
 """A kit disengages this long after its last command."""
 TICK_LIMIT_NS = 60 * NS_PER_MS
-"""Commands requested longer ago are not sent."""
+"""Commands requested longer ago are not sent, and not written: the program may have been frozen since."""
 
 IN_DEGREES = {"deg": 1.0, "rad": math.radians(1.0)}
 IN_FRACTIONS = {"": 1.0, "%": 100.0}

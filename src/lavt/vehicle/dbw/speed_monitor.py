@@ -15,6 +15,7 @@ from typing import Final
 from msgspec import Struct
 
 from lavt.domain import NS_PER_MS, NS_PER_S
+from lavt.vehicle.dbw.profile import COMMAND_TIMEOUT_NS
 from lavt.vehicle.dbw.states import STATIONARY_BELOW_MPS
 
 MAX_FALL_MPS2: Final = 12.0
@@ -24,9 +25,9 @@ MAX_DROP_MPS: Final = 2.5
 wheels that spun regain grip within a report."""
 LOCKED_BELOW_MPS: Final = 0.5
 """A speed this much below what `MAX_FALL_MPS2` allows is that of locked wheels, or wrong."""
-LOCKED_NS: Final = 2 * NS_PER_S
-"""For this long after such a speed, no speed counts as standstill. In this time the holding brake of 1.8 m/s2 stops a
-car from `MAX_DROP_MPS`."""
+ICE_BRAKING_MPS2: Final = 1.0
+"""A braked car on ice loses at least this. While a car whose wheels have locked may slide, no speed counts as
+standstill."""
 DISAGREEMENT_MPS: Final = 1.0
 DISAGREEMENT_SHARE: Final = 0.2
 """Two speeds may differ by 1 m/s and a fifth of the larger: brakes with anti-lock control slip by 10 to 20 %, and the
@@ -42,7 +43,7 @@ BRAKE_SETTLING_NS: Final = 500 * NS_PER_MS
 """Dead time and lag of a brake, and of the throttle before it."""
 BRAKE_CHECK_NS: Final = NS_PER_S
 LEAST_BRAKED_MPS: Final = 0.2
-"""A braked car must lose this speed within `BRAKE_CHECK_NS`. On ice, where it brakes with 1 m/s2, it loses 1 m/s."""
+"""A braked car must lose this speed within `BRAKE_CHECK_NS`. On ice it loses 1 m/s."""
 BRAKE_CHECKED_ABOVE_MPS: Final = 1.0
 """A slower car's brake is not checked."""
 CONSTANT_WITHIN_MPS: Final = 0.005
@@ -54,10 +55,12 @@ FROZEN_ACCELERATION_MPS2: Final = 0.4
 simulator)."""
 FROZEN_NS: Final = 2 * NS_PER_S
 """On a slope the throttle may balance weight and drag, but a real car's speed is never constant for so long."""
-STARTING_THROTTLE: Final = 0.5
-STARTING_NS: Final = 3 * NS_PER_S
-"""A car that does not move for this long at half throttle does not start: the slope is too steep, a wheel is blocked,
-or it moves and its speed is wrong. All of them end the drive."""
+ROLLING_RESISTANCE_MPS2: Final = 0.1
+"""Deceleration of a rolling car on a level road, 1 % of its weight."""
+UNANSWERED_MPS: Final = 2.7
+"""A car that does not move, although throttle for this speed was applied, does not start: the slope is too steep, a
+wheel is blocked, or it moves and its speed is wrong. All of them end the drive. A car that reaches 2 m/s2 has 1.4 s to
+start at full throttle, and 3 s at half throttle."""
 FULL_BRAKE_NS: Final = 8 * NS_PER_S
 """After an implausible speed, the car is braked fully for at least this long: 1.4 m/s2, a quarter of what the brakes
 should reach, stop a car from 40 km/h in this time."""
@@ -110,17 +113,24 @@ class SpeedMonitor:
         self._least_mps = 0.0
         """The least speed that the car can have now, after those before."""
         self._now_ns = 0
-        self._moved_ns = self._locked_ns = -LOCKED_NS
-        """Time of the last update at which the car may have moved, or at which its wheels had locked."""
+        self._moved_ns = -STANDSTILL_NS
+        """Time of the last update at which the car may have moved."""
+        self._sliding_mps = 0.0
+        """The speed that the car has now if it slides on ice since its highest speed."""
+        self._slides_until_ns = 0
+        """Until then, the car may slide with locked wheels."""
+        self._unanswered_mps = 0.0
+        """The speed that a car on a level road may have by the throttle since the reported speed last changed."""
+        self._answer_mps = 0.0
+        """The reported speed at its last change."""
         self._agreed_ns: int | None = None
         self._brake_reference: SpeedReport | None = None
         """The speed at the start of the present check of the brake; its time is that of the pedal before settling."""
         self._frozen_reference: SpeedReport | None = None
-        self._starting_reference: SpeedReport | None = None
 
     @property
     def is_stationary(self) -> bool:
-        """Whether every reported speed is that of a stationary car, and no wheels have locked within `LOCKED_NS`."""
+        """Whether every reported speed is that of a stationary car that neither slides nor has driven off unnoticed."""
         return self._moved_ns < self._now_ns
 
     @property
@@ -136,17 +146,19 @@ class SpeedMonitor:
 
     def update(self, speeds: Mapping[str, SpeedReport], pedals: Pedals, now_ns: int) -> SpeedFault | None:
         """Process the newest speeds by name and the pedals; return a fault that begins now."""
+        passed_ns = min(now_ns - self._now_ns, COMMAND_TIMEOUT_NS)  # a kit releases the throttle after this time
         self._speeds, self._now_ns = speeds, now_ns
+        self._update_unanswered(pedals, passed_ns / NS_PER_S)
         has_fallen = self._has_fallen(speeds["speed"])
-        is_locked = now_ns - self._locked_ns < LOCKED_NS
-        if is_locked or any(abs(report.mps) >= STATIONARY_BELOW_MPS for report in speeds.values()):
+        may_move = now_ns < self._slides_until_ns or self._unanswered_mps >= STATIONARY_BELOW_MPS
+        if may_move or any(abs(report.mps) >= STATIONARY_BELOW_MPS for report in speeds.values()):
             self._moved_ns = now_ns
         checks = (
             (SpeedFault.FALL, has_fallen),
             (SpeedFault.DISAGREEMENT, self._disagrees(now_ns)),
             (SpeedFault.NO_BRAKING, self._is_unbraked(pedals.brake, now_ns)),
             (SpeedFault.FROZEN, self._is_frozen(pedals, now_ns)),
-            (SpeedFault.NO_START, self._does_not_start(pedals, now_ns)),
+            (SpeedFault.NO_START, self._unanswered_mps >= UNANSWERED_MPS),
         )
         found = next((fault for fault, is_present in checks if is_present), None)
         if self.fault is not None:
@@ -165,8 +177,9 @@ class SpeedMonitor:
             return False
         least_mps = self._least_mps - MAX_FALL_MPS2 * passed_s
         self._least_mps = max(abs(speed.mps), least_mps)
+        self._sliding_mps = max(abs(speed.mps), self._sliding_mps - ICE_BRAKING_MPS2 * passed_s)
         if abs(speed.mps) < least_mps - LOCKED_BELOW_MPS:
-            self._locked_ns = speed.mono_ns
+            self._slides_until_ns = speed.mono_ns + round(self._sliding_mps / ICE_BRAKING_MPS2 * NS_PER_S)
         return abs(speed.mps) < least_mps - MAX_DROP_MPS
 
     def _disagrees(self, now_ns: int) -> bool:
@@ -205,25 +218,23 @@ class SpeedMonitor:
         return speed_mps > reference.mps - LEAST_BRAKED_MPS
 
     def _is_frozen(self, pedals: Pedals, now_ns: int) -> bool:
-        is_pressed = pedals.brake == 0 and pedals.throttle * self._max_acceleration_mps2 >= FROZEN_ACCELERATION_MPS2
-        reference = self._constant_since(self._frozen_reference, is_pressed, now_ns)
-        self._frozen_reference = reference
-        return reference is not None and reference.mps > MOVING_ABOVE_MPS and now_ns - reference.mono_ns >= FROZEN_NS
-
-    def _does_not_start(self, pedals: Pedals, now_ns: int) -> bool:
-        is_pressed = pedals.brake == 0 and pedals.throttle >= STARTING_THROTTLE
-        reference = self._constant_since(self._starting_reference, is_pressed, now_ns)
-        self._starting_reference = reference
-        return reference is not None and reference.mps <= MOVING_ABOVE_MPS and now_ns - reference.mono_ns >= STARTING_NS
-
-    def _constant_since(self, reference: SpeedReport | None, is_pressed: bool, now_ns: int) -> SpeedReport | None:
-        """Return `reference` while the throttle is pressed and the speed constant, else a new one, or None."""
-        if not is_pressed:
-            return None
-        speed_mps = abs(self._speeds["speed"].mps)
+        speed_mps, reference = abs(self._speeds["speed"].mps), self._frozen_reference
+        if pedals.brake > 0 or pedals.throttle * self._max_acceleration_mps2 < FROZEN_ACCELERATION_MPS2:
+            self._frozen_reference = None
+            return False
         if reference is None or abs(speed_mps - reference.mps) > CONSTANT_WITHIN_MPS:
-            return SpeedReport(speed_mps, now_ns)
-        return reference
+            self._frozen_reference = SpeedReport(speed_mps, now_ns)
+            return False
+        return reference.mps > MOVING_ABOVE_MPS and now_ns - reference.mono_ns >= FROZEN_NS
+
+    def _update_unanswered(self, pedals: Pedals, passed_s: float) -> None:
+        speed_mps = abs(self._speeds["speed"].mps)
+        if speed_mps > MOVING_ABOVE_MPS or abs(speed_mps - self._answer_mps) > CONSTANT_WITHIN_MPS:
+            self._answer_mps, self._unanswered_mps = speed_mps, 0.0
+            return
+        braking_mps2 = min(pedals.brake * self._max_braking_mps2, ICE_BRAKING_MPS2) + ROLLING_RESISTANCE_MPS2
+        acceleration_mps2 = pedals.throttle * self._max_acceleration_mps2 - braking_mps2
+        self._unanswered_mps = max(0.0, self._unanswered_mps + acceleration_mps2 * passed_s)
 
 
 def _is_outside(speed_mps: float, others_mps: Iterable[float]) -> bool:

@@ -14,6 +14,7 @@ from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.vehicle.can_frame import CanFrame, ReceivedCanFrame
 from lavt.vehicle.dbw.codec import Codec, MessageFacts, SignalFacts
 from lavt.vehicle.dbw.crc8 import has_valid_checksum
+from lavt.vehicle.dbw.profile import Profile
 
 Values = Mapping[str, float | None]
 
@@ -35,6 +36,22 @@ class ExpectedMessages:
     """By message name, for messages that must be received."""
     short_lengths: AbstractSet[int] = frozenset()
     """Lengths that a frame may have although its message is longer."""
+
+
+def expected_traffic(profile: Profile) -> ExpectedMessages:
+    """Return the messages that a profile expects on its bus.
+
+    Checksums and counters are known by the names of their signals, so they are also expected in messages that the
+    profile does not use.
+    """
+    axes = profile.axes.values()
+    checksums = {command.checksum for command in axes} | {report.checksum for report in profile.reports.values()}
+    return ExpectedMessages(
+        checksums=checksums - {""},
+        counters={command.count for command in axes} - {""},
+        timeouts_ns={message: report.timeout_ns for message, report in profile.reports.items()},
+        short_lengths=frozenset() if profile.clearing_bytes is None else {profile.clearing_bytes},
+    )
 
 
 @dataclass(frozen=True, slots=True)
