@@ -115,7 +115,7 @@ def armed_gate(car: Simulator) -> tuple[SafetyGate, Gateways, SessionReply]:
             mode="arm",
             emergency_stop=0,
         )
-        assert gate.admit(arm, car.state(), at_ns).accepted
+        assert gate.admit(arm, car.state(), at_ns, at_ns).accepted
     assert gate.state == "driving"
     return gate, gateways, reply
 
@@ -248,9 +248,9 @@ def test_life_of_a_frame(tmp_path: Path) -> None:  # noqa: PLR0915 (one frame, f
     picture_age_ns = now_ns - START_NS
     assert picture_age_ns == round(VIDEO_DELAY_MS + CONTROL_DELAY_MS) * NS_PER_MS + MIN_HOLD_NS
     car.advance(now_ns)
-    verdict = gate.admit(received, car.state(), now_ns)
+    verdict = gate.admit(received, car.state(), now_ns, now_ns)
     assert verdict.accepted
-    assert gate.admit(received, car.state(), now_ns).reason == RejectionReason.OLD_SEQUENCE
+    assert gate.admit(received, car.state(), now_ns, now_ns).reason == RejectionReason.OLD_SEQUENCE
 
     # Command 9. It is within the limits and stays as it is; a wheel angle out of range is limited.
     actuation = gate.watchdog.actuation(car.state(), now_ns)

@@ -10,6 +10,7 @@ from msgspec.structs import replace
 
 from lavt.assembly.entropy import SeededEntropy
 from lavt.domain import (
+    LARGEST_STORED_STOP,
     NS_PER_MS,
     NS_PER_S,
     Actuation,
@@ -29,7 +30,6 @@ from lavt.nodes.payloads import FrameWritten, StationaryStatus
 from lavt.safety.gate import SafetyGate
 from lavt.safety.limiter import Limiter
 from lavt.safety.limits import LIMITS
-from lavt.safety.session import LARGEST_STORED_NUMBER
 from lavt.transport.emulation.impairment import check_flows
 from lavt.transport.messages import MAX_MESSAGE_BYTES, decode, encode
 from lavt.transport.netem.injector import InjectionOrder, InjectionResult
@@ -244,7 +244,7 @@ def vehicle_driven(seed: int) -> Target:
     """
     side = VehicleSide(seed)
     side.request("acquire")
-    side.request("emergency_stop", LARGEST_STORED_NUMBER)
+    side.request("emergency_stop", LARGEST_STORED_STOP)
     side.arm()
     inputs = inputs_while_driving = 0
 

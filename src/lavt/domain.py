@@ -6,7 +6,7 @@ origin on the ground under the middle of the rear axle. `mono_ns` is a host's mo
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from msgspec import Struct
@@ -166,6 +166,10 @@ class Decision(Struct, frozen=True):
 
 
 Mode = Literal["arm", "drive", "stop"]
+LARGEST_STORED_STOP: Final = 2**62
+"""The number of an emergency stop is its time in nanoseconds; this number is a time in the year 2116. The vehicle does
+not remember a higher one, so it executes such a stop only from a request or command that cannot be a replay."""
+
 Operation = Literal["acquire", "request_handover", "release", "emergency_stop", "clear_emergency_stop"]
 """acquire, release: control of the vehicle. request_handover: ask the active operator to release control."""
 SafetyState = Literal["disarmed", "arming", "driving", "degraded", "safe_stop", "emergency_stop"]

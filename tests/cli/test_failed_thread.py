@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import socket
 import threading
 from collections.abc import Iterator
@@ -9,11 +10,13 @@ from contextlib import contextmanager
 from typing import Any
 
 import pytest
+import zenoh
 from tests.support.command_line import Run
 from tests.support.ports import free_port
 
 from lavt.config_file import shipped
 from lavt.transport import udp_link
+from lavt.transport.zenoh_link import Router, ZenohLink
 
 HERE = "127.0.0.1"
 NO_ROUTER = "tcp/127.0.0.1:1"
@@ -62,5 +65,28 @@ def test_a_command_fails_with_its_receiving_thread(command: str, run: Run, monke
     monkeypatch.setattr(udp_link, "arrival", fail)
     with sending(port):
         result = run(command, *arguments[command])
+    assert result.code == 1, result
+    assert "RuntimeError" in result.err.splitlines()[-1]
+
+
+def test_a_server_fails_if_a_session_opened_later_cannot_declare(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """If the declarations of a session that opens in the background fail, the server exits with code 1."""
+    endpoint = f"tcp/{HERE}:{free_port(socket.SOCK_STREAM)}"
+    router = Router(shipped("zenoh-configs/router-server.json5"), {"listen/endpoints": [endpoint]})
+    open_session, attempts = zenoh.open, itertools.count()
+
+    def open_later(config: zenoh.Config) -> zenoh.Session:
+        if next(attempts) == 0:
+            raise zenoh.ZError("no router")
+        return open_session(config)
+
+    monkeypatch.setattr(zenoh, "open", open_later)
+    monkeypatch.setattr(ZenohLink, "_declare", fail)
+    settings = (f"video.bind={HERE}", f"video.port={free_port()}", "clock.probe_port=0", "vehicle.scenery=none")
+    changes = (word for change in (*settings, f"zenoh.router={endpoint}") for word in ("--set", change))
+    try:
+        result = run("server", str(shipped("configs/server.yaml")), *changes)
+    finally:
+        router.close()
     assert result.code == 1, result
     assert "RuntimeError" in result.err.splitlines()[-1]

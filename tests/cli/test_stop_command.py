@@ -1,50 +1,104 @@
 from __future__ import annotations
 
 import queue
+import socket
 
 import pytest
 from msgspec.structs import replace
+from tests.support.clocks import ManualClock
+from tests.support.command_line import Run
+from tests.support.ports import free_port
 
 from lavt.cli import stop
 from lavt.cli.session_log import NO_STATE_YET
-from lavt.domain import SessionReply, SessionRequest
+from lavt.config_file import shipped
+from lavt.domain import NS_PER_MS, NS_PER_S, SessionReply, SessionRequest
 from lavt.errors import WorkError
 from lavt.node import Send
-from lavt.transport.messages import encode
+from lavt.transport.messages import decode, encode
+from lavt.transport.zenoh_link import Router
 
 REQUEST = SessionRequest("emergency_stop", "alice", 1, 60)
 ACCEPTED = SessionReply(True, "", 0, b"", 5600, "kernel", 60)
-EARLIER_NUMBER = SessionReply(False, "the number of this emergency stop is not a new one", 0, b"", 5600, "kernel", 59)
+REJECTED = SessionReply(False, "the number of this emergency stop is not a new one", 0, b"", 5600, "kernel", 59)
+CONFIG = str(shipped("configs/client.yaml"))
 
 
-def test_a_stop_is_repeated_until_it_is_answered(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The query is repeated after lost queries, garbage and replies to an earlier number, until it is answered."""
+class Vehicle:
+    """A vehicle that gives one of the `answers` to each query, and then none."""
+
+    def __init__(self, *answers: bytes | None) -> None:
+        self.answers = list(answers)
+        self.replies: queue.Queue[bytes] = queue.Queue()
+        self.numbers: list[int] = []
+
+    def send(self, *sends: Send) -> None:
+        """Receive queries."""
+        for query in sends:
+            self.numbers.append(decode(SessionRequest, query.payload).number)
+            answer = self.answers.pop(0) if self.answers else None
+            if answer is not None:
+                self.replies.put(answer)
+
+
+def repeat(vehicle: Vehicle, timeout_s: float = 10.0) -> None:
+    """Repeat the stop, with a clock that advances by 100 ms at each reading."""
+    clock = ManualClock(step_ns=100 * NS_PER_MS)
+    stop._repeat_until_confirmed(vehicle.send, vehicle.replies, REQUEST, clock, timeout_s)
+
+
+@pytest.fixture(autouse=True)
+def no_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Take only the replies that have arrived already."""
     monkeypatch.setattr(stop, "RETRY_PERIOD_S", 0.0)
-    accepted_before = replace(EARLIER_NUMBER, emergency_stop=60)
-    for answer in (ACCEPTED, accepted_before):
-        answers: list[bytes | None] = [None, b"garbage", encode(EARLIER_NUMBER), None, encode(answer)]
-        replies, queries = queue.Queue[bytes](), list[Send]()
-
-        def send(
-            *sends: Send,
-            answers: list[bytes | None] = answers,
-            queries: list[Send] = queries,
-            replies: queue.Queue[bytes] = replies,
-        ) -> None:
-            queries.extend(sends)
-            reply = answers[len(queries) - 1]
-            if reply is not None:
-                replies.put(reply)
-
-        assert stop._query(send, replies, REQUEST) == answer
-        assert queries == [Send("session", encode(REQUEST))] * 5
-        assert stop._is_stopped(answer, 60)
-    assert not stop._is_stopped(EARLIER_NUMBER, 58)
 
 
-def test_a_missing_answer_points_to_the_doctor(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without an answer, `lavt stop` and `lavt client` refer to `lavt doctor`, because the keys may not match."""
-    monkeypatch.setattr(stop, "RETRY_PERIOD_S", 0.0)
-    with pytest.raises(WorkError, match="`lavt doctor CONFIG`"):
-        stop._query(lambda *_: None, queue.Queue(), REQUEST)
+@pytest.mark.parametrize("confirmation", [ACCEPTED, replace(REJECTED, emergency_stop=60)])
+def test_a_stop_is_repeated_until_it_is_confirmed(confirmation: SessionReply) -> None:
+    """The query is repeated after lost queries, garbage and replies to an earlier number, until it is confirmed."""
+    vehicle = Vehicle(None, b"garbage", encode(REJECTED), None, encode(confirmation))
+    repeat(vehicle)
+    assert vehicle.numbers == [60] * 5
+
+
+def test_a_clock_behind_the_last_stop_is_no_obstacle() -> None:
+    """If the vehicle knows a higher number, the stop is repeated with the next one, again if that was overtaken too."""
+    vehicle = Vehicle(
+        encode(replace(REJECTED, emergency_stop=70)),
+        encode(replace(REJECTED, emergency_stop=90)),
+        None,
+        encode(replace(ACCEPTED, emergency_stop=91)),
+    )
+    repeat(vehicle)
+    assert vehicle.numbers == [60, 71, 91, 91]
+
+
+@pytest.mark.parametrize("timeout_s", [1.0, 10.0])
+def test_a_stop_without_confirmation_fails_after_the_timeout(timeout_s: float) -> None:
+    """The stop is repeated until the timeout; the error says that it was not confirmed, and names `lavt doctor`."""
+    vehicle = Vehicle()
+    with pytest.raises(WorkError, match=r"NOT confirmed.*`lavt doctor CONFIG`"):
+        repeat(vehicle, timeout_s)
+    assert len(vehicle.numbers) == round(timeout_s * NS_PER_S) // (100 * NS_PER_MS) - 1
     assert "`lavt doctor CONFIG`" in NO_STATE_YET
+
+
+def test_without_a_router_the_stop_is_reported_as_not_sent(run: Run) -> None:
+    """Without a router the command fails at once and says that the stop was not sent."""
+    endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    sentence = run("stop", CONFIG, "--set", f"zenoh.router={endpoint}").rejected()
+    assert "NOT sent" in sentence
+    assert endpoint in sentence
+
+
+def test_without_a_vehicle_the_exit_code_is_1(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a router but no vehicle, the command fails with exit code 1 and says that the stop was not confirmed."""
+    monkeypatch.setattr(stop, "RETRY_PERIOD_S", 0.1)
+    endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    router = Router(shipped("zenoh-configs") / "router-client.json5", {"listen/endpoints": [endpoint]})
+    try:
+        result = run("stop", CONFIG, "--timeout", "0.3", "--set", f"zenoh.router={endpoint}")
+    finally:
+        router.close()
+    assert (result.code, result.out) == (1, "")
+    assert "NOT confirmed" in result.sentence()

@@ -117,6 +117,20 @@ def test_the_state_is_published_50_times_a_second() -> None:
     assert [state.state_mono_ns for state in states] == sorted(state.state_mono_ns for state in states)
 
 
+@pytest.mark.parametrize(("waited_ns", "accepted"), [(0, True), (LIMITS.picture_age_limit_ns, False)])
+def test_the_age_of_a_picture_is_judged_when_its_command_is_applied(waited_ns: int, accepted: bool) -> None:
+    """A command that waits in a stalled process until its picture is too old is rejected, though it arrived in time."""
+    bench = Bench().armed()
+    stamp_ns = bench.picture()
+    bench.sequence += 1
+    command = Command(bench.epoch, bench.sequence, 11, stamp_ns, 22, 0.0, 0.5, 0.0, (0.0,) * 10, "drive", 0)
+    arrived = at(bench.mono_ns + 200 * NS_PER_MS)
+    bench.mono_ns += 200 * NS_PER_MS + waited_ns
+    (admission,) = payloads(bench.deliver("control", encode(command), arrived=arrived), "admission")
+    assert admission.received_mono_ns == arrived.mono_ns
+    assert admission.reason == ("" if accepted else RejectionReason.PICTURE_TOO_OLD)
+
+
 def test_lazy_physics_advances_before_each_frame() -> None:
     """With sample times, physics advances just before each frame and for each state, not at each physics step."""
     frames = FrameTimes(MONO_NS + 7 * NS_PER_MS, 30.0)

@@ -87,7 +87,7 @@ class Rig:
         return replace(command, **changes)
 
     def send(self, **changes: Any) -> CommandVerdict:
-        return self.gate.admit(self.command(**changes), self.vehicle, self.now_ns)
+        return self.gate.admit(self.command(**changes), self.vehicle, self.now_ns, self.now_ns)
 
     def drive(self, **changes: Any) -> CommandVerdict:
         return self.send(**{"mode": "drive", "throttle": 0.5, "brake": 0.0, **changes})

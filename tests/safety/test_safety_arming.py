@@ -8,10 +8,9 @@ from typing import Any
 import pytest
 from tests.safety.rig import TICK_NS, Rig, vehicle_at
 
-from lavt.domain import NS_PER_MS, NS_PER_S
+from lavt.domain import LARGEST_STORED_STOP, NS_PER_MS, NS_PER_S
 from lavt.safety.gate import RejectionReason
 from lavt.safety.limits import LIMITS
-from lavt.safety.session import LARGEST_STORED_NUMBER
 
 
 def test_arming_takes_a_full_second() -> None:
@@ -255,11 +254,52 @@ def test_the_largest_emergency_stop_number(beyond: int) -> None:
     rig = Rig().armed()
     rig.request("emergency_stop", "bob", 2, number=40)
     rig.clear()
-    reply = rig.request("emergency_stop", "bob", 2, number=LARGEST_STORED_NUMBER + beyond)
+    reply = rig.request("emergency_stop", "bob", 2, number=LARGEST_STORED_STOP + beyond)
     assert (reply.granted, rig.state) == (True, "emergency_stop")
-    assert reply.emergency_stop == (40 if beyond else LARGEST_STORED_NUMBER)
+    assert reply.emergency_stop == (40 if beyond else LARGEST_STORED_STOP)
     assert rig.clear().granted
     assert rig.state == "disarmed"
+
+
+def test_an_emergency_stop_too_high_to_be_stored_stops_once() -> None:
+    """A replayed command whose emergency stop is too high to be stored stops the vehicle once, and prevents no arming.
+
+    A newer command with the same number stops it again.
+    """
+    rig = Rig().driving()
+    stop = rig.command(mode="drive", emergency_stop=LARGEST_STORED_STOP + 1)
+    rig.gate.admit(stop, rig.vehicle, rig.now_ns, rig.now_ns)
+    assert rig.state == "emergency_stop"
+    assert rig.clear().granted
+    for _ in range(60):
+        rig.go(TICK_NS)
+        rig.picture()
+        rig.gate.admit(stop, rig.vehicle, rig.now_ns, rig.now_ns)
+        rig.send()
+    assert rig.state == "driving"
+    rig.send(emergency_stop=LARGEST_STORED_STOP + 1)
+    assert rig.state == "emergency_stop"
+
+
+def test_recorded_emergency_stops_do_not_block_the_operator_forever() -> None:
+    """After a restart, each recorded emergency stop stops the vehicle at most once, and later ones still stop it."""
+    rig = Rig().acquire()
+    recorded = [rig.command(epoch=5, emergency_stop=number) for number in (10, 20, 30)]
+    for stop in recorded:
+        rig.gate.admit(stop, rig.vehicle, rig.now_ns, rig.now_ns)
+        assert rig.state == "emergency_stop"
+        assert rig.clear().granted
+    rig.request("acquire")
+    for _ in range(60):
+        rig.go(TICK_NS)
+        rig.picture()
+        for stop in recorded:
+            rig.gate.admit(stop, rig.vehicle, rig.now_ns, rig.now_ns)
+            assert not rig.request("emergency_stop", "bob", 2, number=stop.emergency_stop).granted
+        rig.send()
+    assert rig.state == "driving"
+    assert rig.request("emergency_stop", "bob", 2, number=31).granted
+    assert rig.state == "emergency_stop"
 
 
 def test_a_command_with_an_emergency_stop_never_moves_the_vehicle() -> None:

@@ -260,7 +260,7 @@ def test_nothing_queued_in_an_outage_is_accepted_after_it() -> None:
         rig.go(TICK_NS)
         rig.picture()
         queued.append(rig.command(mode="drive", throttle=1.0, brake=0.0))
-    verdicts = [rig.gate.admit(command, rig.vehicle, rig.now_ns) for command in queued]
+    verdicts = [rig.gate.admit(command, rig.vehicle, rig.now_ns, rig.now_ns) for command in queued]
     assert not any(verdict.accepted for verdict in verdicts)
     assert rig.state == "safe_stop"
 
@@ -286,8 +286,8 @@ def test_a_reordered_command_is_rejected() -> None:
     rig = Rig().armed()
     rig.picture()
     first, second = (rig.command(mode="drive", throttle=throttle, brake=0.0) for throttle in (0.2, 0.6))
-    assert rig.gate.admit(second, rig.vehicle, rig.now_ns).accepted
-    assert not rig.gate.admit(first, rig.vehicle, rig.now_ns).accepted
+    assert rig.gate.admit(second, rig.vehicle, rig.now_ns, rig.now_ns).accepted
+    assert not rig.gate.admit(first, rig.vehicle, rig.now_ns, rig.now_ns).accepted
     assert rig.actuation().throttle == 0.6
 
 

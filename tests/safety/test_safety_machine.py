@@ -52,7 +52,7 @@ class GateMachine(RuleBasedStateMachine):
         rig = self.rig
         command = rig.command(**changes)
         is_valid = command.epoch == rig.gate.epoch.number and not command.emergency_stop
-        verdict = rig.gate.admit(command, rig.vehicle, rig.now_ns)
+        verdict = rig.gate.admit(command, rig.vehicle, rig.now_ns, rig.now_ns)
         if verdict.accepted and command.stamp_ns == rig.stamp_ns and rig.frame > self.newest_used:
             self.newest_used, self.used_ns = rig.frame, rig.now_ns
         is_fresh = rig.now_ns - self.used_ns < LIMITS.degraded_after_ns

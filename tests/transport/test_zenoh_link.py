@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 import json
 import queue
 import socket
@@ -332,6 +333,54 @@ def test_waiting_for_a_router() -> None:
         received.next(("control", b"now"), lambda: waiting.send(Send("control", b"now")))
     assert len(reasons) == 1
     assert endpoint in reasons[0]
+
+
+class RefusingSession:
+    """A real Zenoh session that declares no queryable."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self.session = session
+
+    def __getattr__(self, name: str) -> Any:
+        """Return an attribute of the real session."""
+        return getattr(self.session, name)
+
+    def declare_queryable(self, *_: Any) -> Any:
+        """Fail like a session whose router has gone."""
+        raise zenoh.ZError("no")
+
+
+def test_a_failed_declaration_in_the_background_is_not_silent(
+    routers: tuple[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """If a session that opens later cannot declare everything, its thread fails, and the session is closed."""
+    failed: queue.Queue[BaseException] = queue.Queue()
+    opened: list[RefusingSession] = []
+    open_session, attempts = zenoh.open, itertools.count()
+
+    def open_later(config: zenoh.Config) -> Any:
+        if next(attempts) == 0:
+            raise zenoh.ZError("no router")
+        opened.append(RefusingSession(open_session(config)))
+        return opened[-1]
+
+    monkeypatch.setattr(zenoh, "open", open_later)
+    waiting = ZenohLink(
+        MachineClock(),
+        side="server",
+        path=SESSION,
+        router=routers[0],
+        vehicle="refused",
+        who="server-1",
+        waiting=lambda _: None,
+    )
+    with fail_on_thread_errors(failed.put), closing(waiting):
+        waiting.start(Received())
+        assert isinstance(failed.get(timeout=ARRIVES_S), zenoh.ZError)
+        waiting.send(Send("state", b"x"))
+    assert waiting.counts["state_not_sent"] == 1
+    assert [session.session.is_closed() for session in opened] == [True]
+    assert failed.empty()
 
 
 def test_closing_while_waiting_for_a_router() -> None:

@@ -31,9 +31,9 @@ def sdp(
 ) -> None:
     """Print the SDP file for watching the video in a player.
 
-    The file is for a receiver in video.send_to. Pass the same --set options as to the server. Play it on the receiver's
-    machine: ffplay -protocol_whitelist file,udp,rtp -fflags nobuffer -flags low_delay lavt.sdp (docs/watching.md has
-    more players).
+    The file is for a receiver in video.send_to, which is empty in the shipped configs. Pass the same --set options as
+    to the server. Play it on the receiver's machine: ffplay -protocol_whitelist file,udp,rtp -fflags nobuffer -flags
+    low_delay lavt.sdp (docs/watching.md has more players).
 
     Example: lavt sdp configs/server.yaml --set 'video.send_to=["127.0.0.1:5004"]' > lavt.sdp
     """
@@ -48,7 +48,10 @@ def sdp(
 def _choose_receiver(send_to: tuple[str, ...], receiver: str) -> tuple[str, int]:
     """Return the address of the named receiver, or of the only one."""
     if not send_to:
-        raise UserError("video.send_to is empty: name a receiver in it, as host:port")
+        raise UserError(
+            "video.send_to is empty: name a receiver as for the server, such as --set "
+            """'video.send_to=["127.0.0.1:5004"]'"""
+        )
     addresses = [resolved_address("video.send_to", text) for text in send_to]
     if not receiver:
         if len(addresses) > 1:

@@ -8,24 +8,25 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from msgspec.structs import replace
 
 from lavt.assembly.entropy import MachineEntropy
 from lavt.assembly.security import build_authenticator, build_gateway
 from lavt.cli import console
-from lavt.clock import MachineClock
+from lavt.clock import Clock, MachineClock
 from lavt.config import ClientConfig
 from lavt.config_file import find_file, load_config
-from lavt.domain import Now, SessionReply, SessionRequest
-from lavt.errors import BadMessage, WorkError
+from lavt.domain import NS_PER_S, Now, SessionReply, SessionRequest
+from lavt.errors import BadMessage, UserError, WorkError
 from lavt.node import Send
 from lavt.transport.messages import decode, encode
 from lavt.transport.security.gateway import Carry
 from lavt.transport.zenoh_link import ZenohLink, quiet_logs
 
 RETRY_PERIOD_S = 0.1
-TRIES = 30
-"""Number of tries, which take 3 s. Measured during a flood of 1000 queries a second, of which the vehicle accepts 100:
-five of five stops succeeded with this number of tries, and none of six with a single query."""
+"""Measured during a flood of 1000 queries a second, of which the vehicle accepts 100: five of five stops succeeded
+within 30 tries, and none of six with a single query."""
+TIMEOUT_S = 10.0
 
 
 def register(app: typer.Typer) -> None:
@@ -35,11 +36,15 @@ def register(app: typer.Typer) -> None:
 
 def stop(
     config: Annotated[Path, typer.Argument(help="A client config in YAML, such as configs/client.yaml.")],
+    timeout: Annotated[
+        float, typer.Option(min=RETRY_PERIOD_S, help="How long to repeat the stop until the vehicle confirms it, in s.")
+    ] = TIMEOUT_S,
     changes: console.SetOption = None,
 ) -> None:
-    """Trigger an emergency stop, whoever has control.
+    """Trigger an emergency stop, whoever has control, and wait until the vehicle confirms it.
 
-    The vehicle cannot be armed again until the emergency stop is cleared:
+    The exit code is 0 only if the vehicle has confirmed the stop. The vehicle cannot be armed again until the emergency
+    stop is cleared:
     lavt client configs/client.yaml --set controller.clear_emergency_stop=true
 
     Example: lavt stop configs/client.yaml
@@ -54,46 +59,47 @@ def stop(
         if channel == "session_reply":
             replies.put(payload)
 
-    link = ZenohLink(
-        clock,
-        side="client",
-        path=find_file(Path(settings.zenoh.session)),
-        router=settings.zenoh.router,
-        vehicle=settings.vehicle_id,
-        who=settings.who,
-    )
+    try:
+        link = ZenohLink(
+            clock,
+            side="client",
+            path=find_file(Path(settings.zenoh.session)),
+            router=settings.zenoh.router,
+            vehicle=settings.vehicle_id,
+            who=settings.who,
+        )
+    except UserError as error:
+        raise UserError(f"the emergency stop was NOT sent, so stop the vehicle by other means: {error}") from error
     gateway = build_gateway(authenticator, deliver, link.send, lambda: (0, -1))
     link.start(gateway.receive, queries_only=True)
     try:
-        instance, stop_number = MachineEntropy().number(64), clock.now().wall_ns
-        reply = _query(gateway.send, replies, SessionRequest("emergency_stop", settings.who, instance, stop_number))
-        if not _is_stopped(reply, stop_number):  # numbers must increase, but this clock is behind the last number
-            stop_number = reply.emergency_stop + 1
-            reply = _query(gateway.send, replies, SessionRequest("emergency_stop", settings.who, instance, stop_number))
-        if not _is_stopped(reply, stop_number):
-            raise WorkError(f"the vehicle rejected the emergency stop: {reply.reason}")
+        instance = MachineEntropy().number(64)
+        request = SessionRequest("emergency_stop", settings.who, instance, clock.now().wall_ns)
+        _repeat_until_confirmed(gateway.send, replies, request, clock, timeout)
         console.print_result(f"{settings.vehicle_id} accepted the emergency stop")
     finally:
         link.close()
 
 
-def _is_stopped(reply: SessionReply, number: int) -> bool:
-    """Return whether the vehicle accepted the stop of this number, now or in an earlier query whose reply was lost."""
-    return reply.granted or reply.emergency_stop == number
-
-
-def _query(send: Carry, replies: queue.Queue[bytes], request: SessionRequest) -> SessionReply:
-    """Send the query until it is answered; return the reply, or raise `WorkError` after all tries.
+def _repeat_until_confirmed(
+    send: Carry, replies: queue.Queue[bytes], request: SessionRequest, clock: Clock, timeout_s: float
+) -> None:
+    """Send the request until the vehicle confirms the stop; raise `WorkError` after `timeout_s`.
 
     A single query may be lost or exceed the vehicle's rate limit. Repeated queries with one number count as one stop.
     """
-    for _ in range(TRIES):
+    until_ns = clock.now().mono_ns + round(timeout_s * NS_PER_S)
+    while clock.now().mono_ns < until_ns:
         send(Send("session", encode(request)))
         with suppress(queue.Empty, BadMessage):
             reply = decode(SessionReply, replies.get(timeout=RETRY_PERIOD_S))
-            if reply.granted or reply.emergency_stop >= request.number:  # any other reply is to an earlier number
-                return reply
+            # It confirms this stop, or an earlier query for it whose reply was lost.
+            if reply.granted or reply.emergency_stop == request.number:
+                return
+            if reply.emergency_stop > request.number:  # numbers must increase, and this clock is behind the last one
+                request = replace(request, number=reply.emergency_stop + 1)
     raise WorkError(
-        "no vehicle answers; is its server running, is vehicle_id correct, and do the keys match? "
+        f"the emergency stop was NOT confirmed within {timeout_s:g} s, and the vehicle may still be moving: stop it by "
+        "other means and repeat this command. Is its server running, is vehicle_id correct, and do the keys match? "
         "Run `lavt doctor CONFIG` to find out"
     )

@@ -142,8 +142,8 @@ class ActuatorNode:
             self._counts["commands_unreadable"] += 1
             return None
 
-    def _admit(self, received: ReceivedCommand, _now: Now) -> CheckedCommand:
-        verdict = self.gate.admit(received.command, self.vehicle.state(), received.arrived.mono_ns)
+    def _admit(self, received: ReceivedCommand, now: Now) -> CheckedCommand:
+        verdict = self.gate.admit(received.command, self.vehicle.state(), received.arrived.mono_ns, now.mono_ns)
         if not verdict.accepted:
             self._rejected_ns = received.arrived.mono_ns
         return CheckedCommand(received, received.stamp_ns, verdict)

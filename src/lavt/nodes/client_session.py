@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from lavt.domain import NS_PER_S, Now, Operation, SessionReply, SessionRequest, State
+from lavt.safety.limits import LIMITS
 
 Phase = Literal["seeking", "arming", "driving", "stopped", "watching"]
 """seeking: no control yet. arming: commands request arming. driving: the vehicle executes drive commands. stopped:
@@ -148,7 +149,12 @@ class ClientSession:
             self.phase = "driving"
         elif self.phase == "driving" and state.safety in ("disarmed", "safe_stop", "emergency_stop"):
             self.phase, self.reason = "stopped", state.reason
-        elif self.phase == "stopped" and self._rearm and abs(state.speed_mps) < 0.05 and not self._was_disarmed:
+        elif (
+            self.phase == "stopped"
+            and self._rearm
+            and abs(state.speed_mps) < LIMITS.standstill_mps
+            and not self._was_disarmed
+        ):
             self.phase, self._request_ns = "seeking", now_ns
         if is_other and self._was_active_operator and self.phase not in ("seeking", "watching"):
             # A takeover at standstill needs no consent, so two clients that both took control back would never stop.

@@ -12,7 +12,7 @@ from enum import StrEnum
 
 from msgspec import Struct
 
-from lavt.domain import Command, SafetyState, VehicleState
+from lavt.domain import LARGEST_STORED_STOP, Command, SafetyState, VehicleState
 from lavt.safety.issued_stamps import IssuedStamps
 from lavt.safety.limiter import Limiter
 from lavt.safety.limits import Limits
@@ -102,11 +102,15 @@ class SafetyGate:
         """Return the present epoch and the sequence number last accepted in it; safe to call from any thread."""
         return self.epoch.number, self.epoch.sequence
 
-    def admit(self, command: Command, vehicle: VehicleState, now_ns: int) -> CommandVerdict:
-        """Accept or reject a command that was received at `now_ns`."""
+    def admit(self, command: Command, vehicle: VehicleState, arrived_ns: int, now_ns: int) -> CommandVerdict:
+        """Accept or reject a command that arrived at `arrived_ns` and is applied at `now_ns` if it is accepted.
+
+        The command timeout counts from its arrival. The age of its picture is judged at its application, which is later
+        if the node or its process was stalled.
+        """
         self.watchdog.check_vehicle(vehicle)
-        self.watchdog.check_timeouts(now_ns)  # before the command: one that arrives at the timeout is too late
-        if command.emergency_stop:
+        self.watchdog.check_timeouts(arrived_ns)  # before the command: one that arrives at the timeout is too late
+        if command.emergency_stop and (command.emergency_stop <= LARGEST_STORED_STOP or self._is_newer(command)):
             self.session.raise_emergency_stop(command.emergency_stop)
         reason = self.rejection_reason(command, vehicle, now_ns)
         if reason is not None:
@@ -115,9 +119,9 @@ class SafetyGate:
         is_fresh = self._is_fresh(command)
         if is_fresh:
             self._newest_frame = self.issued_stamps.frame_number(command.stamp_ns)
-            self.watchdog.reset_timeout(now_ns)
+            self.watchdog.reset_timeout(arrived_ns)
         if command.mode == "arm":
-            self._arm(command, vehicle, now_ns)
+            self._arm(command, vehicle, arrived_ns)
         elif command.mode == "stop":
             self.machine.trigger("stop requested")
         else:
@@ -127,7 +131,7 @@ class SafetyGate:
         return ACCEPTED
 
     def rejection_reason(self, command: Command, vehicle: VehicleState, now_ns: int) -> RejectionReason | None:
-        """Return why a command is rejected; None: it is accepted. The cheap checks come first."""
+        """Return why a command is not applied at `now_ns`; None: it is accepted. The cheap checks come first."""
         state = self.machine.state
         if self.session.active_operator is None or command.epoch != self.epoch.number:
             return RejectionReason.WRONG_EPOCH
@@ -152,6 +156,10 @@ class SafetyGate:
         if command.mode == "arm" and vehicle.inhibit_reason:
             return RejectionReason.INHIBITED
         return None
+
+    def _is_newer(self, command: Command) -> bool:
+        """Return whether a command is of the present epoch and newer than the last accepted one, so not a replay."""
+        return command.epoch == self.epoch.number and command.sequence > self.epoch.sequence
 
     def _reject(self, reason: RejectionReason, vehicle: VehicleState) -> CommandVerdict:
         if reason in INTERRUPTS_ARMING:

@@ -36,7 +36,7 @@ class Limits:
     oscillate, because the brake's lag is 0.2 s. An excess of 1 m/s is braked like a safe stop, which is the maximum."""
     picture_age_limit_ns: int = 500 * NS_PER_MS
     """A command from an older picture is rejected. The age counts from the capture, or from the stamp if the camera
-    reports no capture time. Only a simulated vehicle may be configured up to 2 s."""
+    reports no capture time, until the command is applied. Only a simulated vehicle may be configured up to 2 s."""
     stamp_memory_ns: int = 5 * NS_PER_S
     """The server remembers the stamps that it issued for this long."""
     lateral_acceleration_mps2: float = 3.0

@@ -6,13 +6,10 @@ from collections import Counter
 from collections.abc import Callable
 from typing import ClassVar
 
-from lavt.domain import Command, Operation, SessionReply, SessionRequest, VehicleState
+from lavt.domain import LARGEST_STORED_STOP, Command, Operation, SessionReply, SessionRequest, VehicleState
 from lavt.safety.limits import Limits
 from lavt.safety.state_machine import SafetyStateMachine
 from lavt.safety.takeover_requests import TakeoverRequests
-
-LARGEST_STORED_NUMBER = 2**62
-"""The number of an emergency stop is its time in nanoseconds; this number is a time in the year 2116."""
 
 
 class CommandEpoch:
@@ -91,7 +88,7 @@ class VehicleSession:
         if number <= self._emergency_stop_number:
             self._counts["emergency stop with an old number"] += self._machine.state != "emergency_stop"
             return False
-        if number <= LARGEST_STORED_NUMBER:  # a higher one is not stored: it would leave no number for the next stop
+        if number <= LARGEST_STORED_STOP:  # a higher one is not stored: it would leave no number for the next stop
             self._emergency_stop_number = number
         self._machine.trigger("emergency stop")
         return True

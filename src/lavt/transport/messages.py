@@ -19,6 +19,7 @@ import msgspec
 from msgspec import Meta
 
 from lavt.domain import (
+    LARGEST_STORED_STOP,
     PATH_POINTS,
     Command,
     Mode,
@@ -110,7 +111,7 @@ TYPES: dict[type, dict[str, Any]] = {
         "video_port": Annotated[int, Meta(ge=0, le=65535)],
         "host": _text(SessionReply, "host"),
         # lower than the highest `Time`, so that the operator can send a higher number
-        "emergency_stop": Annotated[int, Meta(ge=0, le=2**62)],
+        "emergency_stop": Annotated[int, Meta(ge=0, le=LARGEST_STORED_STOP)],
     },
     NetemRequest: {
         "who": Name,

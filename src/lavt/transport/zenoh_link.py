@@ -262,10 +262,15 @@ class ZenohLink:
                 session = zenoh.open(self._config)
             except zenoh.ZError:
                 self.counts["router_unreachable"] += 1
-            else:
+                continue
+            try:
                 self._declare(session)
-                self._session = session
-                return
+            except BaseException:  # this thread's error fails the process, whose end must not wait for the session
+                self._closing.set()
+                self._close(session)
+                raise
+            self._session = session
+            return
 
     def _declare(self, session: zenoh.Session) -> None:
         received, sent, qos = ("control", "state", STATE) if self._side == "server" else ("state", "control", CONTROL)
@@ -319,14 +324,16 @@ class ZenohLink:
         self._closing.set()
         if self._opener is not None:
             self._opener.join()
-        if self._session is None:
-            return
+        if self._session is not None:
+            self._close(self._session)
+
+    def _close(self, session: zenoh.Session) -> None:
         for declared in self._declared:
             with suppress(zenoh.ZError):  # the session has been closed already
                 declared.undeclare()
         if self._listener is not None:
             self._listener.join()
-        self._session.close()
+        session.close()
 
     def _listen(self, channel: str, ring: Any) -> None:
         """Deliver received messages until the subscriber is undeclared."""

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
 from lavt.transport.emulation.delay_line import DelayLine, DelayModel
-from lavt.transport.emulation.impairment import DISTRIBUTIONS, Distribution, Impairment
+from lavt.transport.emulation.impairment import DISTRIBUTIONS, Distribution, Impairment, gilbert
 from lavt.transport.emulation.link import HEADER_BYTES, EmulatedLink, LinkInjection, check_injection
-from lavt.transport.emulation.random_process import LARGEST_QUANTILE, quantiles
+from lavt.transport.emulation.random_process import LARGEST_QUANTILE, LossProcess, quantiles
 from lavt.transport.emulation.trace import Trace, parse_delays, parse_mahimahi
 
 MS = NS_PER_MS
@@ -341,6 +341,20 @@ def test_higher_loss_loses_more_packets() -> None:
     )
     assert not (few_lost & ~many_lost).any()
     assert many_lost.sum() > few_lost.sum() > 0
+
+
+@given(st.floats(1.1, 20.0), st.floats(0.01, 1.0), st.floats(1.01, 3.0), st.integers(0, 2**32 - 1))
+def test_higher_loss_in_bursts_of_the_same_length_loses_more_packets(
+    burst: float, share: float, factor: float, seed: int
+) -> None:
+    """In bursts, a higher loss adds losses up to the documented limit of the lower loss."""
+    lower = share * (1 - 1 / burst)
+    higher = min(lower * factor, burst / (burst + 1))
+    few, many = (
+        LossProcess(seed, "x", loss, gilbert(Impairment(loss=loss, loss_burst_packets=burst)))
+        for loss in (lower, higher)
+    )
+    assert all(many.is_lost(index) or not is_lost for index in range(300) for is_lost in (few.is_lost(index),))
 
 
 def test_loss_does_not_change_reordering() -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import socket
 import struct
 
 import pytest
@@ -11,6 +12,7 @@ from lavt.transport.clock_sync.probe import ProbeReply, encode_reply, encode_req
 from lavt.transport.rendezvous.forwarder import (
     CLIENT_TIMEOUT_NS,
     MAX_CLIENTS,
+    MAX_UNANSWERED,
     MAX_UPSTREAM_BYTES,
     REGISTRATIONS_PER_S,
     UPSTREAM_PER_S,
@@ -55,6 +57,17 @@ def send_hello(forwarder: Forwarder, client: Address = CLIENT, now_ns: int = NOW
 
 def send_answer(forwarder: Forwarder, client: Address = CLIENT, now_ns: int = NOW_NS) -> tuple[bytes, Address] | None:
     return forwarder.receive(wrap(client, b"answer"), VEHICLE, now_ns)
+
+
+def flood(forwarder: Forwarder, count: int) -> int:
+    """Send hellos from as many hosts, at the common limit; return when the last one arrived."""
+    now_ns = NOW_NS
+    for number in range(count):
+        now_ns = NOW_NS + number * NS_PER_S // UPSTREAM_PER_S
+        if number % UPSTREAM_PER_S == 0:
+            forwarder.receive(encode_registration("vehicle-1", "video", 2 + number, None), VEHICLE, now_ns)
+        send_hello(forwarder, (socket.inet_ntoa((number + 1).to_bytes(4, "big")), 9), now_ns)
+    return now_ns
 
 
 def test_wire_format(key: PrivateKey) -> None:
@@ -200,17 +213,15 @@ def test_a_vehicle_moves_and_expires() -> None:
 
 
 def test_unanswered_clients_displace_no_answered_ones() -> None:
-    """At most 64 clients that the vehicle has answered and 64 others are remembered, in tables of their own."""
+    """Clients that the vehicle has answered and others are remembered in tables of their own, of limited size."""
     forwarder = registered_forwarder()
     send_hello(forwarder)
     send_answer(forwarder)
-    for number in range(10 * MAX_CLIENTS):
-        send_hello(forwarder, ("192.0.2.1", 1000 + number), NOW_NS + number)
-    assert send_answer(forwarder) == (b"answer", CLIENT)
-    assert len(forwarder._clients._unanswered) == MAX_CLIENTS
-    for number in range(10 * MAX_CLIENTS):
-        send_hello(forwarder, ("192.0.2.1", 1000 + number), NOW_NS)
-        send_answer(forwarder, ("192.0.2.1", 1000 + number))
+    now_ns = flood(forwarder, 2 * MAX_UNANSWERED)
+    assert send_answer(forwarder, now_ns=now_ns) == (b"answer", CLIENT)
+    assert len(forwarder._clients._unanswered) == MAX_UNANSWERED
+    for client in list(forwarder._clients._unanswered):
+        send_answer(forwarder, client, now_ns)
     assert len(forwarder._clients._answered) == MAX_CLIENTS
 
 
@@ -219,11 +230,49 @@ def test_datagrams_to_the_vehicle_are_rate_limited() -> None:
     forwarder = registered_forwarder()
     send_hello(forwarder, SECOND)
     send_answer(forwarder, SECOND)
-    unanswered = [send_hello(forwarder) is not None for _ in range(2 * UPSTREAM_PER_S)]
+    hosts = [f"203.0.113.{number % 100}" for number in range(2 * UPSTREAM_PER_S)]
+    unanswered = [send_hello(forwarder, (host, 9)) is not None for host in hosts]
     assert sum(unanswered) == UPSTREAM_PER_S - 1, "the first was SECOND's"
     answered = [send_hello(forwarder, SECOND) is not None for _ in range(2 * UPSTREAM_PER_S)]
     assert sum(answered) == UPSTREAM_PER_S
     assert send_hello(forwarder, now_ns=NOW_NS + NS_PER_S) is not None
+
+
+def test_a_strangers_flood_does_not_keep_a_new_client_out() -> None:
+    """While one host sends more than the common limit, from many ports, every hello of a new client is forwarded."""
+    forwarder = registered_forwarder()
+    for now_ns in range(NOW_NS, NOW_NS + 5 * NS_PER_S, NS_PER_S // 2):
+        for port in range(1, 2 * UPSTREAM_PER_S):
+            send_hello(forwarder, (OTHER[0], port), now_ns)
+            forwarder.receive(REPORT, (OTHER[0], port), now_ns)
+        assert send_hello(forwarder, now_ns=now_ns) is not None
+        assert forwarder.receive(REPORT, CLIENT, now_ns) is not None
+    assert send_answer(forwarder, now_ns=now_ns) is not None
+
+
+def test_strangers_do_not_displace_a_client_before_its_challenge() -> None:
+    """A flood from many addresses after a client's hello does not prevent the vehicle's answer for 5 s."""
+    forwarder = registered_forwarder()
+    send_hello(forwarder)
+    last_ns = NOW_NS + 4 * NS_PER_S
+    for now_ns in range(NOW_NS, last_ns + 1, NS_PER_S):
+        for number in range(3 * UPSTREAM_PER_S):
+            send_hello(forwarder, (f"203.0.113.{number % 250}", 1 + number), now_ns)
+            forwarder.receive(REPORT, (f"203.0.113.{number % 250}", 1001 + number), now_ns)
+    assert send_answer(forwarder, now_ns=last_ns) is not None
+
+
+def test_a_flood_of_false_addresses_uses_little_memory_and_spares_answered_clients() -> None:
+    """Of more hosts than the common limit, only those that passed are remembered, and answered clients still pass."""
+    forwarder = registered_forwarder()
+    send_hello(forwarder)
+    send_answer(forwarder)
+    for number in range(10 * UPSTREAM_PER_S):
+        send_hello(forwarder, (socket.inet_ntoa((number + 1).to_bytes(4, "big")), 9))
+    assert len(forwarder._clients._unanswered) == UPSTREAM_PER_S - 1, "the first was the client's"
+    assert all(len(limiter._passed) <= UPSTREAM_PER_S for limiter in forwarder._unanswered_limiters.values())
+    assert send_hello(forwarder) is not None
+    assert forwarder.receive(REPORT, CLIENT, NOW_NS) is not None
 
 
 def test_replayed_hellos_do_not_crowd_out_reports() -> None:

@@ -31,7 +31,8 @@ class GatewayPair:
     """A server's and a client's gateway; messages between them wait in `in_flight` until the test delivers them."""
 
     def __init__(self) -> None:
-        vehicle, alice = PrivateKey(Ed25519PrivateKey.generate()), PrivateKey(Ed25519PrivateKey.generate())
+        vehicle, alice, bob = (PrivateKey(Ed25519PrivateKey.generate()) for _ in range(3))
+        self.bob = OperatorAuthenticator("car", "bob", bob, vehicle.public)
         self.in_flight: list[Send] = []
         self.server_received: list[tuple[str, bytes, Any]] = []
         self.client_received: list[tuple[str, bytes]] = []
@@ -39,7 +40,7 @@ class GatewayPair:
             lambda channel, payload, _arrived, peer: self.server_received.append((channel, payload, peer)),
             lambda *sends: self.in_flight.extend(sends),
             lambda: (7, 2),
-            VehicleAuthenticator("car", vehicle, {"alice": alice.public}),
+            VehicleAuthenticator("car", vehicle, {"alice": alice.public, "bob": bob.public}),
         )
         self.client = ClientGateway(
             lambda channel, payload, _arrived, _peer: self.client_received.append((channel, payload)),
@@ -113,6 +114,20 @@ def test_replays_of_a_rejected_command_are_rate_limited(pair: GatewayPair) -> No
     for _ in range(10_000):
         pair.server.receive("control", rejected, Now(2 * NS_PER_S, 0), None)
     assert len(pair.server_received) - before == 1 + OTHER_COMMANDS_PER_S
+    pair.client.send(Send("control", NEXT_COMMAND))
+    pair.deliver_all(2 * NS_PER_S)
+    assert pair.server_received[-1] == ("control", NEXT_COMMAND, "query")
+
+
+def test_another_operators_emergency_stop_does_not_displace_the_active_operators_commands(pair: GatewayPair) -> None:
+    """After another operator's stop with the highest sequence, commands still pass during a flood of replays."""
+    pair.client.send(Send("control", COMMAND))
+    recorded = pair.in_flight.pop().payload
+    stop = encode(Command(7, 2**63 - 1, 1, 2, 3, 0.1, 0.2, 0.0, (0.0,) * PATH_POINTS, "drive", 1))
+    pair.server.receive("control", pair.bob.sign_command(stop), Now(2 * NS_PER_S, 0), None)
+    assert [body for _, body, _ in pair.server_received[-1:]] == [stop]
+    for _ in range(2 * OTHER_COMMANDS_PER_S):
+        pair.server.receive("control", recorded, Now(2 * NS_PER_S, 0), None)
     pair.client.send(Send("control", NEXT_COMMAND))
     pair.deliver_all(2 * NS_PER_S)
     assert pair.server_received[-1] == ("control", NEXT_COMMAND, "query")

@@ -10,8 +10,9 @@ from lavt.domain import NS_PER_S, FloatArray
 from lavt.recording.table import MISSING, BoolArray, IntArray, Table
 
 DRIFT_ALLOWANCE = 500e-6
-"""The largest rate at which Delta changes without a report of it: a kernel steers its clock by at most 500 ppm (ntpd,
-timesyncd), and two crystals differ by less. Only chrony can steer faster, and it reports its corrections."""
+"""The assumed largest rate at which Delta changes without a report of it. 500 ppm is the largest frequency correction
+of a Linux kernel (`MAXFREQ`) and its rate for adjtime() (`MAX_TICKADJ`); two crystals differ by less. Chrony can steer
+faster, and reports its corrections. `docs/metrics.md` says when the assumption is wrong."""
 
 
 @dataclass(frozen=True, slots=True)

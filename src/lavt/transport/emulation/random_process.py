@@ -105,7 +105,9 @@ class LossProcess:
     """Losses of packets: independent, or in bursts (Gilbert-Elliott model).
 
     `bursts` are the probabilities that a burst begins and ends; None: losses are independent, with probability `loss`.
-    `name` is the name of the random-number stream of `seed`.
+    `name` is the name of the random-number stream of `seed`. With the same stream, a higher loss loses all packets of a
+    lower one and others if both are independent, or if both have the same mean length of a burst and the lower loss is
+    at most 1 - 1 / that length. (With more loss in such short bursts, a burst is less likely to go on than to begin.)
     """
 
     def __init__(self, seed: int, name: str, loss: float, bursts: BurstProbabilities | None) -> None:
@@ -120,6 +122,6 @@ class LossProcess:
             return drawn < self._loss
         is_lost = self._in_burst
         # As in the kernel, the draw of a packet decides whether the next one is lost. A small draw loses the next
-        # packet, inside and outside of a burst, so with the same draws a higher loss only adds losses.
+        # packet, inside and outside of a burst.
         self._in_burst = drawn < (1 - self._bursts.end if is_lost else self._bursts.begin)
         return is_lost

@@ -21,6 +21,9 @@ path. Threats:
 * Flooding the vehicle: only datagrams in a format of the flow pass, at a limited rate. Clients that the vehicle has
   answered have a rate limit of their own, so that others cannot crowd them out. Hellos and answers also have a rate
   limit of their own, so that replays with a client's address do not crowd out its reports.
+* Keeping new clients out: each host that the vehicle has not answered has a rate limit of its own within the common
+  one. A dropped datagram displaces no client. A flood from 20 hosts or more, or with that many false addresses, still
+  uses up the common limit, and then keeps new clients out while it lasts.
 * Not covered: an attacker on the path to the rendezvous can forward a registration from another address before the
   original arrives, and so divert the flow for a second. It could as well drop the datagrams themselves.
 
@@ -41,7 +44,7 @@ from lavt.transport.clock_sync.probe import decode_request
 from lavt.transport.rtp.rtcp import is_rtcp
 from lavt.transport.security.flood_filter import RateLimiter
 from lavt.transport.security.keys import SIGNATURE_BYTES, PrivateKey, PublicKey
-from lavt.transport.video.path_validation import is_path_datagram
+from lavt.transport.video.path_validation import client_datagram_number, is_path_datagram
 
 FlowName = Literal["video", "probe"]
 Address = tuple[str, int]
@@ -53,12 +56,17 @@ VEHICLE_TIMEOUT_NS: Final = 10 * NS_PER_S
 CLIENT_TIMEOUT_NS: Final = 30 * NS_PER_S
 """A client gets nothing if it has sent nothing for this time."""
 MAX_CLIENTS: Final = 64
-"""Limits the number of clients that the vehicle has answered, and separately that of all other clients."""
+"""Limits the number of clients that the vehicle has answered."""
 REGISTRATIONS_PER_S: Final = 50
 """Limits the registrations from the vehicle's address that are verified, and separately those from other addresses."""
 UPSTREAM_PER_S: Final = 200
 """Limits each of four groups of datagrams: from clients that the vehicle has answered or from other clients, and of the
 path validation or not. A client sends 2.5 reports a second (measured)."""
+HOST_PER_S: Final = 10
+"""Limits the datagrams of each host, within each of the two groups from clients that the vehicle has not answered. Such
+a client sends 2 hellos a second, or 7 if the video has ended, until the vehicle answers one."""
+MAX_UNANSWERED: Final = 10 * UPSTREAM_PER_S
+"""Limits the number of clients that the vehicle has not answered: those of 5 s or more, and an answer takes less."""
 MAX_UPSTREAM_BYTES: Final = 1400
 
 _MAGIC: Final = b"LAVR"
@@ -95,7 +103,7 @@ def _signing_context(vehicle: str) -> bytes:
 
 
 def _may_be_video(datagram: bytes) -> bool:
-    return is_path_datagram(datagram) or is_rtcp(datagram)
+    return client_datagram_number(datagram) is not None or is_rtcp(datagram)
 
 
 def _is_probe(datagram: bytes) -> bool:
@@ -128,12 +136,10 @@ class Forwarder:
         self._clients = _Clients()
         self._signature_limiters = {True: RateLimiter(REGISTRATIONS_PER_S), False: RateLimiter(REGISTRATIONS_PER_S)}
         """By whether the registration comes from the vehicle's address."""
-        self._upstream_limiters = {
-            (is_answered, is_validation): RateLimiter(UPSTREAM_PER_S)
-            for is_answered in (True, False)
-            for is_validation in (True, False)
-        }
-        """By whether the vehicle has answered the client, and whether the datagram belongs to the path validation."""
+        self._answered_limiters = {True: RateLimiter(UPSTREAM_PER_S), False: RateLimiter(UPSTREAM_PER_S)}
+        """By whether the datagram belongs to the path validation; of clients that the vehicle has answered."""
+        self._unanswered_limiters = {True: _HostLimiter(), False: _HostLimiter()}
+        """The same of all other clients."""
 
     def vehicle_address(self, now_ns: int) -> Address | None:
         """Return the address from which the vehicle registered; None if there is none or the registration expired."""
@@ -194,9 +200,36 @@ class Forwarder:
         return None
 
     def _is_within_limit(self, datagram: bytes, sender: Address, now_ns: int) -> bool:
-        """Count a client's datagram; return whether it is within the rate limit of its group."""
-        is_answered = self._clients.note_datagram(sender, now_ns)
-        return self._upstream_limiters[is_answered, is_path_datagram(datagram)].take(now_ns)
+        """Return whether a client's datagram is within the rate limits; if so, count it and note the client."""
+        is_validation = is_path_datagram(datagram)
+        if self._clients.is_answered(sender):
+            is_within_limit = self._answered_limiters[is_validation].take(now_ns)
+        else:
+            is_within_limit = self._unanswered_limiters[is_validation].take(sender[0], now_ns)
+        if is_within_limit:
+            self._clients.note_datagram(sender, now_ns)
+        return is_within_limit
+
+
+class _HostLimiter:
+    """A limit on the datagrams per second, and a lower one on those of each host, counted in windows of one second."""
+
+    def __init__(self) -> None:
+        self._since_ns = 0
+        self._left = UPSTREAM_PER_S
+        self._passed: Counter[str] = Counter()
+        """The datagrams that passed in this window, by host: at most `UPSTREAM_PER_S` entries."""
+
+    def take(self, host: str, now_ns: int) -> bool:
+        """Return whether one more datagram of `host` is within both limits; if so, count it."""
+        if now_ns - self._since_ns >= NS_PER_S:
+            self._since_ns, self._left = now_ns, UPSTREAM_PER_S
+            self._passed.clear()
+        if self._left == 0 or self._passed[host] >= HOST_PER_S:
+            return False
+        self._left -= 1
+        self._passed[host] += 1
+        return True
 
 
 class _Clients:
@@ -209,11 +242,16 @@ class _Clients:
         self._answered: dict[Address, int] = {}
         self._unanswered: dict[Address, int] = {}
 
-    def note_datagram(self, client: Address, now_ns: int) -> bool:
-        """Note that a client sent something; return whether the vehicle has answered it before."""
-        is_answered = client in self._answered
-        _put(self._answered if is_answered else self._unanswered, client, now_ns)
-        return is_answered
+    def is_answered(self, client: Address) -> bool:
+        """Return whether the vehicle has answered a client."""
+        return client in self._answered
+
+    def note_datagram(self, client: Address, now_ns: int) -> None:
+        """Note that a client sent something."""
+        if self.is_answered(client):
+            _put(self._answered, client, now_ns, MAX_CLIENTS)
+        else:
+            _put(self._unanswered, client, now_ns, MAX_UNANSWERED)
 
     def note_answer(self, client: Address, now_ns: int) -> bool:
         """Note that the vehicle sends to a client; return whether the client has sent something recently."""
@@ -222,16 +260,16 @@ class _Clients:
             received_ns = self._unanswered.pop(client, None)
             if received_ns is None:
                 return False
-            _put(self._answered, client, received_ns)
+            _put(self._answered, client, received_ns, MAX_CLIENTS)
         if now_ns - received_ns <= CLIENT_TIMEOUT_NS:
             return True
         del self._answered[client]
         return False
 
 
-def _put(table: dict[Address, int], client: Address, received_ns: int) -> None:
-    """Put a client at the end of a table; drop the first if there are too many."""
+def _put(table: dict[Address, int], client: Address, received_ns: int, limit: int) -> None:
+    """Put a client at the end of a table; drop the first if there are more than `limit`."""
     table.pop(client, None)
     table[client] = received_ns
-    if len(table) > MAX_CLIENTS:
+    if len(table) > limit:
         del table[next(iter(table))]

@@ -71,7 +71,7 @@ class FloodFilter:
         return False
 
     def note_authentic(self, body: bytes) -> None:
-        """Note a verified command: from now on this command and earlier ones are replays."""
+        """Note a verified command of the active operator: from now on it and earlier ones are replays."""
         head = _head(body)
         if head is not None and head[0] == self._in_force()[0]:
             self._newest = max(self._newest, head) if self._newest[0] == head[0] else head

@@ -78,7 +78,8 @@ class ServerGateway:
         if not self._flood_filter.passes(payload, self._authenticator.unverified_body(payload), now_ns):
             return None
         body = self._authenticator.verify_command(payload)
-        if body is not None:
+        # The sequence number of another operator's emergency stop says nothing about the active operator's commands.
+        if body is not None and self._authenticator.is_from_active_operator(payload):
             self._flood_filter.note_authentic(body)
         return body
 

@@ -261,7 +261,7 @@ class Renderer:
         cv2.subtract(picture, self._noise[1][part], picture)
 
 
-@lru_cache(maxsize=1)  # the tiles of one road take up to 0.2 GB
+@lru_cache(maxsize=1)  # the tiles of one road take up to 221 MB
 def world(road: Road, scenery: SceneryKind, light_name: LightName) -> tuple[Ground, Scenery | None]:
     """Return a road's ground and scenery, cached for consecutive runs of a sweep."""
     light = LIGHTS[light_name]
