@@ -44,6 +44,12 @@ class MachineClock:
         return Now(mono_ns, wall_ns)
 
 
+def suspended_ns() -> int:
+    """Return for how long this machine has been suspended since its start; an interrupted call returns less."""
+    boot_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)  # read first, so that an interruption makes the result less
+    return boot_ns - time.monotonic_ns()
+
+
 def pause(duration_ns: int) -> None:
     """Sleep for `duration_ns`; only the outermost loops of programs may call this."""
     if duration_ns > 0:

@@ -25,6 +25,7 @@ from lavt.runtime.remote_node import (
     FAILED_AFTER_CHECKS,
     FIRST_HEARTBEAT_CHECKS,
     LATE_NS,
+    MAX_PENDING_PEERS,
     SILENT_AFTER_CHECKS,
     NodeHost,
     RemoteNodeProxy,
@@ -190,6 +191,32 @@ def test_a_reply_goes_to_its_peer() -> None:
         ends.main.deliver("session", b"of bob", CLOCK.now(), bob)
         wait_until(lambda: len(ends.outputs.sent) == 2)
         assert [(send.payload, send.peer) for send in ends.outputs.sent] == [(b"of alice", alice), (b"of bob", bob)]
+
+
+def test_a_blocked_reply_delays_neither_heartbeats_nor_messages(monkeypatch: pytest.MonkeyPatch) -> None:
+    """While a link blocks on a reply, heartbeats, messages and other nodes' messages are processed."""
+    with rig() as ends:
+        blocked, resumed = threading.Event(), threading.Event()
+        send = ends.outputs.send
+
+        def block_replies(*sends: Send) -> None:
+            if any(each.channel == "session_reply" for each in sends):
+                blocked.set()
+                resumed.wait(20)
+            send(*sends)
+
+        monkeypatch.setattr(ends.outputs, "send", block_replies)
+        for _ in range(2 * MAX_PENDING_PEERS):
+            ends.main.deliver("session", b"?", CLOCK.now(), "alice")
+        assert blocked.wait(10)
+        beat(ends)
+        ends.host.runtime.links["zenoh"].send(Send("state", b"a state"))
+        wait_until(lambda: Send("state", b"a state") in ends.outputs.sent)
+        ends.main.deliver("control", b"drive", CLOCK.now())
+        wait_until(lambda: bool(ends.neighbour.received))
+        assert ends.proxy._replies.qsize() <= MAX_PENDING_PEERS
+        assert ends.main.failed is None
+        resumed.set()
 
 
 def test_the_status_is_reported_before_messages() -> None:

@@ -123,7 +123,10 @@ def _run(test: WatchdogTest, port: CanPort) -> None:
                 for received in port.take(clock.now().mono_ns):
                     test.receive(received.frame, received.arrived_ns)
                 now_ns = clock.now().mono_ns
-                port.send(test.frames_due(now_ns), now_ns)
+                frames = test.frames_due(now_ns)
+                written = port.send(frames, now_ns)
+                if written < len(frames):
+                    test.on_bus_gone(f"it accepted only {written} of {len(frames)} frames")
             except BusGone as error:
                 test.on_bus_gone(str(error))
 

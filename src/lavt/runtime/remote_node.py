@@ -9,11 +9,12 @@ from __future__ import annotations
 import itertools
 import threading
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection
+from queue import SimpleQueue
 from typing import Any, Final
 
-from lavt.channels import CHANNELS
+from lavt.channels import CHANNELS, Carrier
 from lavt.clock import Clock
 from lavt.domain import NS_PER_MS, Now
 from lavt.errors import WorkError
@@ -66,11 +67,15 @@ class RemoteNodeProxy:
         self._peers: dict[int, Peer] = {}
         """The peers by the number that is sent instead of them; different threads add and remove them."""
         self._numbers = itertools.count(1)
+        self._replies: SimpleQueue[tuple[Carrier, list[Send]] | None] = SimpleQueue()
+        self._replier = threading.Thread(target=self._send_replies, name=f"{name}'s replies", daemon=True)
+        self._replies_dropped = 0
 
     def start(self, runtime: RealRuntime) -> None:
         """Start to forward messages."""
         self._runtime = runtime
         self._pipe.start()
+        self._replier.start()
         self._checker.start()
 
     def put(self, message: Message) -> None:
@@ -89,7 +94,13 @@ class RemoteNodeProxy:
         self._pipe.wait_closed(wait_s)
         self._pipe.close(CLOSE_TIMEOUT_S)
         if self._runtime is not None:
-            counts = {"node": f"to the {self.name}'s process", "messages_dropped": self._pipe.dropped}
+            self._replies.put(None)
+            self._replier.join(CLOSE_TIMEOUT_S)
+            counts = {
+                "node": f"to the {self.name}'s process",
+                "messages_dropped": self._pipe.dropped,
+                "replies_dropped": self._replies_dropped,
+            }
             self._runtime.record("counts", counts, self._runtime.now())
 
     def _receive(self, report: Report) -> None:
@@ -105,13 +116,28 @@ class RemoteNodeProxy:
             carrier, sends, sent = rest
             if runtime.now().mono_ns - sent.mono_ns > LATE_NS:  # this process did not run; an old state is useless
                 return
-            runtime.carry(carrier, [self._with_peer(send) for send in sends])
+            self._carry(runtime, carrier, sends)
         elif kind == "deliver":
             runtime.deliver(*rest)
         elif kind == "status":
             (self.status,) = rest
         elif kind == "failed":
             runtime.fail(WorkError(rest[0]))
+
+    def _carry(self, runtime: RealRuntime, carrier: Carrier, sends: Sequence[Send]) -> None:
+        """Send messages, but replies from a thread of their own: Zenoh blocks for seconds if its router is frozen."""
+        others = [send for send in sends if send.peer is None]
+        replies = [Send(send.channel, send.payload, self._peers.pop(send.peer, None)) for send in sends if send.peer]
+        if others:
+            runtime.carry(carrier, others)
+        if replies and self._replies.qsize() < MAX_PENDING_PEERS:
+            self._replies.put((carrier, replies))
+        elif replies:
+            self._replies_dropped += 1
+
+    def _send_replies(self) -> None:
+        while self._runtime is not None and (entry := self._replies.get()) is not None:
+            self._runtime.carry(*entry)
 
     def _check_heartbeats(self) -> None:
         while not self._closing.wait(CHECK_PERIOD_S):
@@ -127,9 +153,6 @@ class RemoteNodeProxy:
             self._on_silent(runtime)
         if missed in {0, FAILED_AFTER_CHECKS}:
             runtime.fail(WorkError(f"the process of the {self.name} does not respond"))
-
-    def _with_peer(self, send: Send) -> Send:
-        return send if send.peer is None else Send(send.channel, send.payload, self._peers.pop(send.peer, None))
 
     def _on_closed(self) -> None:
         if not self._closing.is_set() and self._runtime is not None:

@@ -4,7 +4,7 @@ import copy
 import csv
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from html import unescape
 from pathlib import Path
 from typing import Any
@@ -123,7 +123,7 @@ def report_of(summary: dict[str, Any], directory: Path) -> ReportContext:
     return ReportContext(summary, directory, condition_colours(names))
 
 
-SECTIONS: dict[str, Callable[[ReportContext], list[str]]] = {
+SECTIONS: dict[str, Callable[[ReportContext], Sequence[str]]] = {
     "summary": summary_parts,
     "conditions": conditions_parts,
     "contrasts": contrast_parts,

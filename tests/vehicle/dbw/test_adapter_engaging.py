@@ -374,3 +374,25 @@ def test_a_non_finite_actuation_is_no_tick(generation: int) -> None:
     rig.run_ms(300)
     assert rig.adapter.counts["actuations_rejected"] == 15
     assert max(at_ns for at_ns, _ in rig.sent) - stopped_ns <= 60 * NS_PER_MS
+
+
+@both_generations
+@pytest.mark.timeout(30)
+@pytest.mark.parametrize("after_ms", [0, 1, 10, 19, 60])
+def test_enabling_cancelled_early_disables_the_kit(generation: int, after_ms: int) -> None:
+    """If enabling in gear is cancelled, even before the kit has reported its axes, the car is parked, then disabled."""
+    rig = stationary_rig(generation)
+    rig.actuation = Actuation(0.0, 0.0, 1.0)
+    rig.kit.driver_shifts(Gear.NEUTRAL, rig.now_ns)
+    rig.run_ms(200)
+    rig.adapter.engage(True, rig.now_ns)
+    rig.run_until(lambda rig: rig.state == "enabling")
+    rig.run_ms(after_ms)
+    rig.adapter.engage(False, rig.now_ns)
+    gears = set()
+    while rig.state != "idle":
+        rig.run_ms(1)
+        gears.add(rig.kit.state.gear)
+    assert (Gear.DRIVE in gears) == (after_ms == 60)
+    assert (rig.enabled(), rig.kit.state.gear, rig.kit.state.watchdog) == (set(), Gear.PARK, 0)
+    assert rig.events == []

@@ -574,6 +574,7 @@ def test_a_shift_in_progress_is_awaited() -> None:
     rig.adapter.engage(True, rig.now_ns)
     rig.run_until(lambda rig: rig.state == "enabling" and rig.adapter._is_shifting)
     rig.adapter.engage(False, rig.now_ns)
+    rig.run_until(lambda rig: rig.state == "parking")
     rig.run_ms(999)
     assert (rig.state, rig.enabled()) == ("parking", set(AXES))
     rig.run_ms(1)

@@ -7,7 +7,7 @@ from itertools import pairwise
 import pytest
 from tests.vehicle.dbw.rig import COARSE_MS, AdapterRig, both_generations, driving_rig
 
-from lavt.domain import Actuation
+from lavt.domain import NS_PER_MS, Actuation
 from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.dbw.crc8 import frame_crc8
 from lavt.vehicle.dbw.profile import AXES, Axis
@@ -127,3 +127,28 @@ def test_sets_that_are_never_written_are_no_commands(generation: int) -> None:
     rig.run_ms(1)
     assert rig.state == "lost"
     assert any("no command was sent" in event.detail for event in rig.events)
+
+
+@both_generations
+@pytest.mark.parametrize("dropped", [1, 2, 9])
+def test_frames_that_were_not_written_are_due_at_the_next_tick(generation: int, dropped: int) -> None:
+    """A set that was not written completely is not repeated before the next call, and is due again then."""
+    rig = driving_rig(generation)
+    rig.run_until(lambda rig: bool(rig.sent) and rig.sent[-1][0] == rig.now_ns)
+    rig.dropped_frames = dropped
+    sets = rig.adapter.counts["sets"]
+    rig.run_until(lambda rig: rig.adapter.counts["sets"] > sets)
+    assert rig.adapter.next_wake_ns() - rig.now_ns > 10 * NS_PER_MS
+    rig.dropped_frames, written = 0, len(rig.sent)
+    rig.run_ms(1)
+    assert len(rig.sent) - written >= 3
+
+
+@both_generations
+def test_a_buffer_with_room_for_one_frame_at_a_time_ends_driving(generation: int) -> None:
+    """If only the first frame of each set is written, the kit releases the other axes, which ends driving."""
+    rig = driving_rig(generation)
+    rig.dropped_frames = 2 if generation == 1 else 3
+    rig.run_ms(150)
+    assert rig.state == "lost"
+    assert rig.kit.state.brake == WATCHDOG_BRAKE

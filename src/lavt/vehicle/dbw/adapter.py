@@ -74,7 +74,7 @@ class ByWireAdapter:
         self._requested = Actuation(0.0, 0.0, 0.0)
         self._requested_ns: int | None = None
         self._last_commands: KitCommands | None = None
-        """Commands of the last set of frames; None: nothing is being sent."""
+        """Commands of the last set of frames; None: nothing is being sent, or the set was not written completely."""
         self._is_late = False
         self._known_problems: frozenset[str] = frozenset()
         self._events: list[VehicleEvent] = []
@@ -218,9 +218,13 @@ class ByWireAdapter:
         return frames
 
     def on_dropped(self, frames: Sequence[CanFrame]) -> None:
-        """Note that `frames`, which are the last ones of those that were due, were not written."""
+        """Note that `frames`, which are the last ones of those that were due, were not written.
+
+        A complete set is due at the next tick.
+        """
         if frames:
             self._sender.take_back(frames)
+            self._last_commands = None
 
     def _is_fresh(self, now_ns: int) -> bool:
         return self._requested_ns is not None and now_ns - self._requested_ns <= TICK_LIMIT_NS
@@ -237,10 +241,8 @@ class ByWireAdapter:
         if self._state == "clearing":
             return KitCommands(NO_AXES, is_clearing=True)
         if self._state == "enabling":
-            is_enabled = reports.enabled == all_axes
-            return KitCommands(
-                all_axes, gear="drive" if is_enabled and reports.gear != "drive" else None, system="enable"
-            )
+            may_shift = self._wanted and reports.enabled == all_axes and reports.gear != "drive"
+            return KitCommands(all_axes, gear="drive" if may_shift else None, system="enable")
         if self._state == "engaged":
             return KitCommands(all_axes, system="enable")
         if self._state == "lost":

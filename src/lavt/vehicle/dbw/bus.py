@@ -11,41 +11,46 @@ import errno
 import json
 import logging
 import secrets
+import select
 import socket
 import subprocess
 import threading
 from collections import Counter, deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from lavt.clock import Clock
+from lavt.clock import Clock, suspended_ns
 from lavt.domain import NS_PER_S, Now
 from lavt.errors import UserError
 from lavt.vehicle.can_frame import BusGone, CanFrame, ReceivedCanFrame
 from lavt.vehicle.dbw.can_gateway import gateway_interfaces
-from lavt.vehicle.dbw.profile import TICK_LIMIT_NS
+from lavt.vehicle.dbw.kernel_arrival import ArrivalTimes
+from lavt.vehicle.dbw.profile import COMMAND_TIMEOUT_NS, TICK_LIMIT_NS
 
 if TYPE_CHECKING:
     from can import BusABC, Message
 
 REOPEN_NS: Final = NS_PER_S
-"""Shortest time between attempts to reopen a lost bus."""
+"""Pause before each attempt to reopen a lost bus. All reports from before the loss are old by its end."""
 QUEUE_FRAMES: Final = 8192
 """Capacity of the receive queue: two seconds of a full 500 kbit/s bus. If it is full, the oldest frames are dropped."""
 POLL_S: Final = 0.1
-"""Period at which the reader checks whether the port was closed."""
+"""Period at which the port's thread checks whether the port was closed."""
+CLOSE_TIMEOUT_S: Final = 1.0
+"""A driver that blocks the port's thread for longer is left behind with it when the port is closed."""
 LATEST_READ_NS: Final = NS_PER_S
-"""A frame that has waited longer is dropped: the reader was frozen, or the wall clock was stepped meanwhile."""
+"""A frame that has waited longer is dropped: this process was frozen."""
 IP_TIMEOUT_S: Final = 2
 
 logging.getLogger("can").addHandler(logging.NullHandler())  # the errors raised here contain its messages
 
 VIRTUAL_INTERFACES: Final = frozenset({"inside", "virtual", "udp_multicast"})
 STAMPED_BY_KERNEL: Final = frozenset({"socketcan", "udp_multicast"})
-"""Interfaces whose frames carry the kernel's wall time of arrival; the others use clocks of their devices."""
+"""Interfaces whose frames carry the kernel's wall time of arrival; the others use clocks of their devices. They have a
+descriptor that is readable if and only if a frame is waiting."""
 RECEIVES_OWN_FRAMES: Final = "udp_multicast"
 """Its socket is a member of the group it sends to, so own frames are marked."""
 BUS_OFF_BIT: Final = 0x40
@@ -55,54 +60,75 @@ TEMPORARY_ERRORS: Final = frozenset({None, errno.ENOBUFS, errno.EAGAIN})
 
 
 class CanPort:
-    """A `BusPort` on a CAN bus. `send` and `take` are for one thread; a thread of the port reads.
+    """A `BusPort` on a CAN bus. `send` and `take` are for one thread and never block.
 
-    `counts`: `frames_too_old` were not sent; `error_frames`, `remote_frames`, `fd_frames`, `unreadable`,
-    `read_too_late` and `own_frames` were received and dropped; `overflowed` were dropped from a full queue.
+    A thread of the port reads, and reopens a lost bus, which takes some drivers a second.
+
+    `counts`: `frames_too_old` and `buffer_full` were not sent; `error_frames`, `remote_frames`, `fd_frames`,
+    `unreadable`, `read_too_late` and `own_frames` were received and dropped; `overflowed` were dropped from a full
+    queue. `suspended` returns for how long the machine has been suspended since its start, in ns.
 
     Raises `UserError` if python-can is missing or the bus cannot be opened.
     """
 
-    def __init__(self, interface: str, channel: str, options: Mapping[str, Any], *, clock: Clock) -> None:
+    def __init__(
+        self,
+        interface: str,
+        channel: str,
+        options: Mapping[str, Any],
+        *,
+        clock: Clock,
+        suspended: Callable[[], int] = suspended_ns,
+    ) -> None:
         self._interface, self._channel, self._options = interface, channel, dict(options)
-        self._clock = clock
+        self._clock, self._suspended = clock, suspended
         self._mark = secrets.token_hex(8) if interface == RECEIVES_OWN_FRAMES else None
         self._received: deque[ReceivedCanFrame] = deque(maxlen=QUEUE_FRAMES)
         self._gone_reason = ""
-        self._tried_ns = clock.now().mono_ns
+        self._suspended_ns = suspended()
+        self._closing = threading.Event()
         self.counts: Counter[str] = Counter()
-        self._open()
+        bus = _open_bus(interface, channel, self._options)
+        self._bus: BusABC | None = bus
+        """The open bus; None: it is lost. Whoever sets it to None lets the thread shut that bus down."""
+        self._thread = threading.Thread(target=self._run, args=(bus,), name="can", daemon=True)
+        self._thread.start()
 
     def send(self, frames: Sequence[CanFrame], made_ns: int) -> int:
         """Write frames made at `made_ns`, in order and without blocking, but none older than `TICK_LIMIT_NS`.
 
-        Return how many were written. The age is checked right before each write. Raises `BusGone` without writing the
-        remaining frames.
+        Return how many were written: fewer if the transmit buffer is full, which is no loss of the bus. The age is
+        checked right before each write. Raises `BusGone` without writing the remaining frames.
         """
         for written, frame in enumerate(frames):
-            if self._bus is None:
-                raise BusGone(self._gone_reason, written)
             message = self._message(frame)
+            self._check_suspension()
+            bus = self._bus
+            if bus is None:
+                raise BusGone(self._gone_reason, written)
             if self._clock.now().mono_ns - made_ns > TICK_LIMIT_NS:
                 self.counts["frames_too_old"] += len(frames) - written
                 return written
             try:
-                self._bus.send(message, timeout=0)
+                bus.send(message, timeout=0)
             except Exception as error:  # of any driver
-                reason = f"{self._interface} {self._channel} cannot be written to ({_error_text(error)})"
-                if _error_number(error) not in TEMPORARY_ERRORS:
-                    self._lose(reason)
-                raise BusGone(reason, written) from error
+                if _error_number(error) in TEMPORARY_ERRORS:
+                    self.counts["buffer_full"] += len(frames) - written
+                    return written
+                self._lose(f"{self._interface} {self._channel} cannot be written to ({_error_text(error)})")
+                raise BusGone(self._gone_reason, written) from error
         return len(frames)
 
-    def take(self, now_ns: int) -> list[ReceivedCanFrame]:
+    def take(self, now_ns: int) -> list[ReceivedCanFrame]:  # noqa: ARG002 (other ports need it)
         """Return the frames received since the last call, in order, without own frames.
 
-        A lost bus is reopened, at most once each `REOPEN_NS`. Raises `BusGone` until that succeeds.
+        Raises `BusGone` while the bus is lost.
         """
+        self._check_suspension()
+        is_lost = self._bus is None
         taken = [self._received.popleft() for _ in range(len(self._received))]
-        if self._bus is None and not taken:
-            self._reopen(now_ns)
+        if is_lost and not taken:
+            raise BusGone(self._gone_reason)
         return taken
 
     def next_wake_ns(self) -> int | None:
@@ -110,45 +136,61 @@ class CanPort:
         return None
 
     def close(self) -> None:
-        """Close the bus and wait for the reader."""
+        """Close the bus, and wait for the port's thread for at most `CLOSE_TIMEOUT_S`."""
+        self._closing.set()
         self._lose("the port is closed")
-        self._reader.join()
+        self._thread.join(CLOSE_TIMEOUT_S)
 
-    def _open(self) -> None:
-        bus = _open_bus(self._interface, self._channel, self._options)
-        self._bus: BusABC | None = bus
-        self._reader = threading.Thread(target=self._read, args=(bus,), name="can", daemon=True)
-        self._reader.start()
-
-    def _reopen(self, now_ns: int) -> None:
-        if now_ns - self._tried_ns < REOPEN_NS or self._reader.is_alive():
-            raise BusGone(self._gone_reason)
-        self._tried_ns = now_ns
-        try:
-            self._open()
-        except UserError as error:
-            self._gone_reason = str(error)
-            raise BusGone(self._gone_reason) from error
+    def _check_suspension(self) -> None:
+        """Lose the bus if the machine was suspended: the monotonic clock stood still, so every age is too small."""
+        before_ns, self._suspended_ns = self._suspended_ns, max(self._suspended(), self._suspended_ns)
+        if self._suspended_ns - before_ns >= COMMAND_TIMEOUT_NS:
+            self._lose("the machine was suspended")
 
     def _lose(self, reason: str) -> None:
         self._gone_reason = reason
-        self._bus = None  # makes the reader end and shut the bus down
+        self._bus = None
+
+    def _run(self, bus: BusABC | None) -> None:
+        """Read frames and reopen the bus after each loss, until the port is closed."""
+        while bus is not None:
+            self._read(bus)
+            bus = self._reopen()
+
+    def _reopen(self) -> BusABC | None:
+        """Try to open the bus until that succeeds; return None once the port is closed."""
+        while not self._closing.wait(REOPEN_NS / NS_PER_S):
+            try:
+                self._bus = bus = _open_bus(self._interface, self._channel, self._options)
+            except UserError as error:
+                self._gone_reason = str(error)
+            else:
+                return bus
+        return None
 
     def _read(self, bus: BusABC) -> None:
         """Read frames until the bus is lost or the port closed, then shut the bus down."""
+        arrivals = ArrivalTimes(self._clock.now())
         try:
-            while self._bus is bus:
-                self._read_once(bus)
+            while self._bus is bus and not self._closing.is_set():
+                self._read_once(bus, arrivals)
         except Exception as error:  # of any driver
             if self._bus is bus:
                 self._lose(f"{self._interface} {self._channel} cannot be read ({_error_text(error)})")
         finally:
+            if self._bus is bus:
+                self._lose("the port is closed")
             with suppress(Exception):  # the bus may be broken already
                 bus.shutdown()
 
-    def _read_once(self, bus: BusABC) -> None:
+    def _read_once(self, bus: BusABC, arrivals: ArrivalTimes) -> None:
+        timeout_s = POLL_S
+        if self._interface in STAMPED_BY_KERNEL:
+            if not self._is_readable(bus, arrivals):
+                return
+            timeout_s = 0
         try:
-            message = bus.recv(POLL_S)
+            message = bus.recv(timeout_s)
         except BlockingIOError:  # the announced datagram was dropped for its wrong checksum
             return
         except Exception as error:
@@ -157,9 +199,17 @@ class CanPort:
             self.counts["unreadable"] += 1  # a datagram that is not a frame: anyone can send one
             return
         if message is not None:
-            self._receive(message, self._clock.now())
+            self._receive(message, self._clock.now(), arrivals)
 
-    def _receive(self, message: Message, now: Now) -> None:
+    def _is_readable(self, bus: BusABC, arrivals: ArrivalTimes) -> bool:
+        """Wait for a frame for at most `POLL_S`, by the monotonic clock; python-can's timeouts use the wall clock."""
+        now, ends = self._clock.now(), [bus.fileno()]
+        if select.select(ends, [], [], 0)[0]:
+            return True
+        arrivals.note_empty(now)
+        return bool(select.select(ends, [], [], POLL_S)[0])
+
+    def _receive(self, message: Message, now: Now, arrivals: ArrivalTimes) -> None:
         if self._mark is not None and message.channel == self._mark:
             self.counts["own_frames"] += 1
             return
@@ -170,11 +220,10 @@ class CanPort:
             return
         arrived_ns = now.mono_ns
         if self._interface in STAMPED_BY_KERNEL:
-            waited_ns = now.wall_ns - round(message.timestamp * NS_PER_S)
-            if waited_ns > LATEST_READ_NS:
+            arrived_ns = arrivals.arrived_ns(round(message.timestamp * NS_PER_S), now)
+            if now.mono_ns - arrived_ns > LATEST_READ_NS:
                 self.counts["read_too_late"] += 1
                 return
-            arrived_ns -= max(waited_ns, 0)
         self.counts["overflowed"] += len(self._received) == QUEUE_FRAMES
         self._received.append(ReceivedCanFrame(frame, arrived_ns))
 

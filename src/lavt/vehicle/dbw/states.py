@@ -18,15 +18,15 @@ STATIONARY_BELOW_MPS: Final = 0.1
 ENABLING_LIMIT_NS: Final = 3 * NS_PER_S
 """Our choice: clearing and enabling fail if they take longer."""
 PAUSE_NS: Final = 120 * NS_PER_MS
-"""Minimum duration of `clearing` and `parking`. A kit that has disengaged ignores requests to enable until none came
-for 100 ms, so none is sent while clearing. And a kit counts as disengaged only after it was told to disable for this
-long."""
+"""Minimum duration of `clearing` and `parking`, and of `enabling` if it is cancelled. A kit that has disengaged ignores
+requests to enable until none came for 100 ms, so none is sent while clearing. A kit counts as disengaged only after it
+was told to disable for this long. And only by then has it reported the axes that it has enabled."""
 
 SENT_IN_STATE: Final[dict[State, str]] = {
     "idle": "nothing",
     "clearing": "CLEAR every 50 ms; no axis enabled",
     "enabling": "all axes enabled, with throttle 0 and at least the holding brake; DRIVE once all axes are reported "
-    "enabled",
+    "enabled, if driving is still wanted",
     "engaged": "the requested actuation",
     "parking": "the requested steering, the requested brake but at least the holding brake, and throttle 0. PARK "
     "once the car was stationary for 300 ms; once PARK is reported, no axis enabled. Nothing, if before "
@@ -146,9 +146,12 @@ TABLE: Final[tuple[TransitionRow, ...]] = (
     ),
     TransitionRow(("engaged",), "the gear is not DRIVE", _out_of_gear, "lost"),
     TransitionRow(
-        ("clearing", "enabling", "engaged"),
-        "driving is no longer wanted",
-        lambda situation: not situation.wanted,
+        ("clearing", "engaged"), "driving is no longer wanted", lambda situation: not situation.wanted, "parking"
+    ),
+    TransitionRow(
+        ("enabling",),
+        "driving is no longer wanted, after at least 120 ms",
+        lambda situation: not situation.wanted and situation.in_state_ns >= PAUSE_NS,
         "parking",
     ),
     TransitionRow(

@@ -106,13 +106,14 @@ class SoftwareCarRunner:
 
     def _send(self, frames: Sequence[CanFrame], made_ns: int) -> None:
         try:
-            self._port.send(frames, made_ns)
+            written = self._port.send(frames, made_ns)
         except BusGone as gone:
+            written = gone.written
             self._note_bus_gone(str(gone), made_ns)
-            self.counts["frames_lost"] += len(frames)
-            return
-        self.counts["frames_sent"] += len(frames)
-        self._note_bus_back(made_ns)
+        else:
+            self._note_bus_back(made_ns)
+        self.counts["frames_sent"] += written
+        self.counts["frames_lost"] += len(frames) - written
 
     def _note_bus_gone(self, reason: str, now_ns: int) -> None:
         if not self._is_lost:
@@ -120,7 +121,7 @@ class SoftwareCarRunner:
         self._is_lost, self._lost_ns = True, now_ns
 
     def _note_bus_back(self, now_ns: int) -> None:
-        """Log that the bus is back once it has been for 1 s: a full queue is a short-lived error."""
+        """Log that the bus is back once it has been for 1 s."""
         if self._is_lost and now_ns - self._lost_ns >= NS_PER_S:
             self._is_lost = False
             self._events.append(KitEvent(now_ns, "bus", "the bus is back"))
