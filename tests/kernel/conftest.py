@@ -6,7 +6,7 @@ Each test finds the machines unchanged: no programs of an earlier test, clocks r
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 
 import pytest
@@ -19,6 +19,8 @@ from tests.kernel.lane.verdicts import require_valid
 from tests.require import need
 from tests.support.inconclusive import SESSION
 from tests.support.stalls import Stalls
+
+from lavt.experiment.analysis.invalid_reason import InvalidCode
 
 LANE = os.environ.get("LAVT_KERNEL_LANE", "")
 """`pair` in the first of two machines, `native` on this machine's own kernel; set only by tests/kernel/run."""
@@ -106,7 +108,7 @@ def drive(
 ) -> Callable[..., DriveResult]:
     """Return a function that drives over both machines, from starting the four programs to the result.
 
-    The drive must be valid, except for a reason that begins with `expected_reason`.
+    The drive must be valid, except for reasons with the expected codes.
     """
 
     def drive_once(
@@ -114,14 +116,14 @@ def drive(
         *,
         server: tuple[str, ...] = (),
         client: tuple[str, ...] = (),
-        expected_reason: str | None = None,
+        expected_codes: Collection[InvalidCode] = (),
         meanwhile: Callable[[LoopPrograms], None] = lambda _: None,
     ) -> DriveResult:
         out = tmp_path / f"{name}-{len(list(tmp_path.iterdir()))}"
         loop = start_loop(server_machine, client_machine, out, server_changes=server, client_changes=client)
         wait_for_end(loop, meanwhile)
         finished_drive = collect(loop, client_machine, out)
-        require_valid(finished_drive, stalls, expected_reason)
+        require_valid(finished_drive, stalls, expected_codes)
         return finished_drive
 
     return drive_once

@@ -20,6 +20,7 @@ from lavt.clock import MachineClock, pause
 from lavt.config import RunConfig
 from lavt.config_file import load_config, shipped
 from lavt.domain import NS_PER_MS, NS_PER_S
+from lavt.experiment.analysis.invalid_reason import InvalidReason
 from lavt.experiment.analysis.metrics import measure
 from lavt.experiment.runs.plan import PlannedRun, plan_run
 from lavt.experiment.runs.real_run import relay_reasons
@@ -67,7 +68,7 @@ class RealDrive:
 
     out: Path
     result: dict[str, Any]
-    relay_reasons: list[str]
+    relay_reasons: list[InvalidReason]
     closure_p95_ms: float | None
 
 

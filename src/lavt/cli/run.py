@@ -66,7 +66,7 @@ def _summarize(result: dict[str, Any]) -> str:
         f"tau_v {_format_latency(result['tau_v_ms'])}, tau_c {_format_latency(result['tau_c_ms'])}",
     ]
     if not result["valid"]:
-        lines.append("this run is not valid: " + "; ".join(result["invalid_reasons"]))
+        lines.append("this run is not valid: " + "; ".join(reason["text"] for reason in result["invalid_reasons"]))
     return "\n".join(lines)
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from lavt.experiment.analysis.injection_validity import absent_reasons, recorded_reasons
+from lavt.experiment.analysis.invalid_reason import InvalidCode, InvalidReason
 from lavt.recording.record import Record
 from lavt.recording.table import Table, table_of
 
@@ -34,7 +35,7 @@ def record(samples: Sequence[Sample], *, with_drive: bool = False) -> Record:
 
 def reasons(
     video: Sequence[Sample], control: Sequence[Sample], requested_ms: Mapping[str, float] = REQUESTED_MS
-) -> list[str]:
+) -> list[InvalidReason]:
     return recorded_reasons(record(video, with_drive=True), record(control), "L4", requested_ms)
 
 
@@ -45,23 +46,23 @@ def test_a_condition_in_force_throughout_the_drive_is_valid() -> None:
 
 
 @pytest.mark.parametrize(
-    ("video", "control", "expected"),
+    ("video", "control", "code", "fact"),
     [
-        ([], CONTROL, "the server did not report"),
-        (VIDEO, [], "the client did not report"),
-        (VIDEO[1:], CONTROL, "the server did not report"),
-        ([*VIDEO, (18, "", "", 0.0, None, "")], CONTROL, "not in force as requested on the server"),
-        ([(5, "L5", "video", 225.0, 225.1, ""), *VIDEO[1:]], CONTROL, "not in force as requested on the server"),
-        ([VIDEO[0], (15, "L4", "video", 150.0, None, "no tc")], CONTROL, "on the server all the time: no tc"),
-        (VIDEO, [*CONTROL, (9, "L4", "control", 75.0, 79.0, "late")], "requested on the client all the time: late"),
-        (VIDEO, [(1, "L4", "control", 75.0, None, "")], "control was not measured"),
+        ([], CONTROL, InvalidCode.INJECTION_NOT_IN_FORCE, "server"),
+        (VIDEO, [], InvalidCode.INJECTION_NOT_IN_FORCE, "client"),
+        (VIDEO[1:], CONTROL, InvalidCode.INJECTION_NOT_IN_FORCE, "server"),
+        ([*VIDEO, (18, "", "", 0.0, None, "")], CONTROL, InvalidCode.INJECTION_NOT_IN_FORCE, "server"),
+        ([(5, "L5", "video", 225.0, 225.1, ""), *VIDEO[1:]], CONTROL, InvalidCode.INJECTION_NOT_IN_FORCE, "server"),
+        ([VIDEO[0], (15, "L4", "video", 150.0, None, "no tc")], CONTROL, InvalidCode.INJECTION_NOT_IN_FORCE, "no tc"),
+        (VIDEO, [*CONTROL, (9, "L4", "control", 75.0, 79.0, "late")], InvalidCode.INJECTION_NOT_IN_FORCE, "late"),
+        (VIDEO, [(1, "L4", "control", 75.0, None, "")], InvalidCode.INJECTION_NOT_MEASURED, "control"),
     ],
 )
 def test_a_condition_that_was_not_in_force_is_a_reason(
-    video: list[Sample], control: list[Sample], expected: str
+    video: list[Sample], control: list[Sample], code: InvalidCode, fact: str
 ) -> None:
     """A side without a report before the drive, with another condition, a failure or a doubt makes the run invalid."""
-    assert [reason for reason in reasons(video, control) if expected in reason]
+    assert [reason for reason in reasons(video, control) if reason.code is code and fact in reason.text]
 
 
 def test_an_unrequested_delay_need_not_be_measured() -> None:
@@ -73,18 +74,21 @@ def test_a_long_gap_between_measurements_is_a_reason() -> None:
     """A run is invalid if a queue was not measured for more than 20 s of the drive."""
     before_drive = [(-15, "L4", "video", 150.0, 150.2, "")]
     (reason,) = reasons(before_drive, CONTROL)
-    assert reason.startswith("the server ")
-    assert reason.endswith(" 35 s")
+    assert reason.code is InvalidCode.INJECTION_NOT_MEASURED
+    assert "server" in reason.text
+    assert "35 s" in reason.text
     with_gap = [*CONTROL, (30, "L4", "control", 75.0, 75.1, "")]
     (reason,) = reasons(VIDEO, with_gap)
-    assert reason.startswith("the client ")
-    assert reason.endswith(" 29 s")
+    assert reason.code is InvalidCode.INJECTION_NOT_MEASURED
+    assert "client" in reason.text
+    assert "29 s" in reason.text
 
 
 def test_another_clients_condition_invalidates_a_run_without_one() -> None:
     """A run without a condition is invalid if another client's condition was in force."""
     (reason,) = recorded_reasons(record(VIDEO, with_drive=True), record([]), "", REQUESTED_MS)
-    assert "L4 was in force on the server" in reason
+    assert reason.code is InvalidCode.INJECTION_NOT_REQUESTED
+    assert "L4" in reason.text
     ended = [VIDEO[0], (8, "", "", 0.0, None, "")]
     assert recorded_reasons(record(ended, with_drive=True), record([]), "", REQUESTED_MS) == []
 
@@ -98,4 +102,6 @@ def test_latencies_below_the_injected_delay_are_a_reason(
 ) -> None:
     """If the video or control latency is below the injected delay, the delay was on another path: invalid."""
     entry = {"tau_v_ms": {"p50": tau_v_ms, "bound": 0.2}, "tau_c_ms": {"p50": tau_c_ms, "bound": None}}
-    assert [reason.split()[1] for reason in absent_reasons(entry, REQUESTED_MS)] == flows
+    found = absent_reasons(entry, REQUESTED_MS)
+    assert {reason.code for reason in found} <= {InvalidCode.INJECTION_NOT_ON_PATH}
+    assert [reason.text.split()[1] for reason in found] == flows

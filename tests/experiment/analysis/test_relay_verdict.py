@@ -10,6 +10,7 @@ from lavt.assembly.links import link_injection
 from lavt.cli.relay import flows
 from lavt.config import Condition, ImpairmentConfig, RunConfig
 from lavt.config_file import conditions, parse_config
+from lavt.experiment.analysis.invalid_reason import InvalidCode, InvalidReason, not_measured
 from lavt.experiment.runs.plan import PlannedRun, injected_entry, plan_run
 from lavt.experiment.runs.real_run import _relay_config, _requested_ms, relay_reasons
 
@@ -38,7 +39,7 @@ def _inherent_ms() -> float:
 
 def reasons(
     median_ms: tuple[float | None, float | None], lateness_ms: tuple[float | None, float | None], **requested: Any
-) -> list[str]:
+) -> list[InvalidReason]:
     directions = ("video downstream", "control upstream")
     return relay_reasons(
         {
@@ -53,24 +54,26 @@ def test_a_constant_delay_is_judged_by_its_median() -> None:
     """The median of a constant delay must be within 1 ms of the request, whatever the reported lateness."""
     assert reasons((75.9, 0.1), (0.9, 0.1), video=75.0, control=0.0) == []
     (reason,) = reasons((76.1, 0.1), (0.0, 0.1), video=75.0, control=0.0)
-    assert reason.startswith("video was delayed by 76.1 ms")
+    assert reason.code is InvalidCode.INJECTION_DIFFERS
+    assert "76.1 ms" in reason.text
     (reason,) = reasons((75.0, None), (0.0, None), video=75.0, control=0.0)
-    assert "control was not measured" in reason
+    assert reason == not_measured("control")
 
 
 def test_a_variable_delay_is_judged_by_its_lateness() -> None:
     """With more than a constant delay, only packets that are sent over 1 ms late are a reason."""
     assert reasons((500.0, 0.1), (0.3, 0.1), video=None, control=0.0) == []
     (reason,) = reasons((75.0, 0.1), (1.5, 0.1), video=None, control=0.0)
-    assert reason.startswith("the relay sent video packets 1.5 ms later")
+    assert reason.code is InvalidCode.INJECTION_DIFFERS
+    assert "1.5 ms" in reason.text
     (reason,) = reasons((None, 0.1), (None, 0.1), video=None, control=0.0)
-    assert "video was not measured" in reason
+    assert reason == not_measured("video")
 
 
 def test_a_relay_without_measurements_is_a_reason() -> None:
     """Without the relay's measurements, the injected delay of each flow is unknown."""
     for reason, flow in zip(relay_reasons({}), ("video", "control"), strict=True):
-        assert f"{flow} was not measured" in reason
+        assert reason == not_measured(flow)
 
 
 def test_only_a_constant_delay_has_a_requested_median() -> None:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -8,6 +9,7 @@ from typing import Any
 import pytest
 
 from lavt.experiment.analysis.clock_validity import step_reasons
+from lavt.experiment.analysis.invalid_reason import InvalidCode, InvalidReason, not_measured
 from lavt.experiment.analysis.metrics import measure
 from lavt.experiment.analysis.results import IDENTITY, run_result, write_json
 from lavt.experiment.analysis.validity import injection_reasons, invalid_reasons
@@ -16,10 +18,16 @@ from lavt.recording.record import read_record
 MakeRun = Callable[..., Path]
 
 
-def reasons(make_run: MakeRun, directory: Path, **settings: Any) -> list[str]:
+def reasons(make_run: MakeRun, directory: Path, **settings: Any) -> list[InvalidReason]:
     make_run(directory, **settings)
     server, client = read_record(directory / "server.mcap"), read_record(directory / "client.mcap")
     return invalid_reasons(server, client, measure(server, client))
+
+
+def require_one(found: list[InvalidReason], code: InvalidCode, *facts: str) -> None:
+    """Require exactly one reason, with this code and these facts in its text."""
+    assert [reason.code for reason in found] == [code], found
+    assert all(fact in found[0].text for fact in facts), found
 
 
 def test_a_run_without_faults_is_valid(make_run: MakeRun, tmp_path: Path) -> None:
@@ -29,29 +37,34 @@ def test_a_run_without_faults_is_valid(make_run: MakeRun, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("settings", "expected"),
+    ("settings", "code", "fact"),
     [
-        ({"server_counts": (("record_overflow", 3),)}, "the record of the server lost 3 messages"),
-        ({"step_s": 0.02}, "the wall clock of the client stepped by +20.0 ms"),
-        ({"bound_s": None, "probes": False}, "the offset between the clocks has no bound"),
-        ({"bound_s": 0.0011}, "only known to 2.20 ms"),
-        ({"late": 3}, "the physics was 180 ms late"),
-        ({"skipped": 10}, "the camera missed 10 of 361 frames"),
-        ({"ending": None}, "the record has no ending"),
-        ({"server_unsampled_s": (4, 6)}, "the clock of the server was not sampled for 3.0 s"),
-        ({"server_unsampled_s": (-1, 3)}, "the clock of the server was not sampled for 3.0 s"),
-        ({"server_unsampled_s": (10, 15)}, "the clock of the server was not sampled for 3.0 s"),
-        ({"server_unsampled_s": (-1, 15)}, "the clock of the server was not sampled for 12.0 s"),
-        ({"client_unsampled_s": (4, 6)}, "the clock of the client was not sampled for 3.0 s"),
-        ({"client_unsampled_s": (6, 15)}, "the clock samples of the client cover 6.0 s of a drive of 12.0 s"),
-        ({"client_unsampled_s": (-1, 15)}, "the clock samples of the client cover 0.0 s of a drive of 12.0 s"),
+        (
+            {"server_counts": (("record_overflow", 3),)},
+            InvalidCode.RECORD_OVERFLOW,
+            "3 messages",
+        ),
+        ({"step_s": 0.02}, InvalidCode.CLOCK_STEP, "+20.0 ms"),
+        ({"bound_s": None, "probes": False}, InvalidCode.CLOCK_BOUND, ""),
+        ({"bound_s": 0.0011}, InvalidCode.CLOCK_BOUND, "2.20 ms"),
+        ({"late": 3}, InvalidCode.PHYSICS_LATE, "180 ms"),
+        ({"skipped": 10}, InvalidCode.FRAMES_MISSED, "10 of 361"),
+        ({"ending": None}, InvalidCode.NO_ENDING, ""),
+        ({"server_unsampled_s": (4, 6)}, InvalidCode.CLOCK_NOT_SAMPLED, "3.0 s"),
+        ({"server_unsampled_s": (-1, 3)}, InvalidCode.CLOCK_NOT_SAMPLED, "3.0 s"),
+        ({"server_unsampled_s": (10, 15)}, InvalidCode.CLOCK_NOT_SAMPLED, "3.0 s"),
+        ({"server_unsampled_s": (-1, 15)}, InvalidCode.CLOCK_NOT_SAMPLED, "12.0 s"),
+        ({"client_unsampled_s": (4, 6)}, InvalidCode.CLOCK_NOT_SAMPLED, "3.0 s"),
+        ({"client_unsampled_s": (6, 15)}, InvalidCode.CLOCK_NOT_SAMPLED, "6.0 s of a drive of 12.0 s"),
+        ({"client_unsampled_s": (-1, 15)}, InvalidCode.CLOCK_NOT_SAMPLED, "0.0 s of a drive of 12.0 s"),
     ],
 )
 def test_each_infrastructure_fault_makes_the_run_invalid(
-    make_run: MakeRun, tmp_path: Path, settings: dict[str, Any], expected: str
+    make_run: MakeRun, tmp_path: Path, settings: dict[str, Any], code: InvalidCode, fact: str
 ) -> None:
     """Each fault of the infrastructure makes the run invalid, with a reason that names it."""
-    assert [reason for reason in reasons(make_run, tmp_path, **settings) if expected in reason]
+    found = reasons(make_run, tmp_path, **settings)
+    assert [reason for reason in found if reason.code is code and fact in reason.text]
 
 
 @pytest.mark.parametrize(
@@ -112,37 +125,44 @@ def test_a_slow_last_sample_does_not_widen_the_bound(make_run: MakeRun, tmp_path
 ONE_REASON = {
     "delay on NTP's path before it synchronised": (
         {**following(peer_delay_s=0.0756, correction_s=lambda second: 0.2875 + 20e-6 * second)},
-        "the NTP of the client goes through injected delay: its round trip is 75.60 ms, the probe's is 0.60 ms",
+        InvalidCode.NTP_THROUGH_DELAY,
+        ("client", "75.60 ms", "0.60 ms"),
     ),
     "delay on NTP's path after it synchronised": (
         {**following(good_samples=lambda second: min(20 + second, 23))},
-        "the NTP of the client accepted no sample for 10.0 s (limit 5 polls, 5.0 s)",
+        InvalidCode.NTP_NO_SAMPLE,
+        ("client", "10.0 s", "5 polls", "5.0 s"),
     ),
     "the server follows the client through delay": (
         {
             "server_clock": lambda _second: {**GOOD_PATH, "follows": CLIENT, "peer_delay_s": 0.1},
             "client_clock": lambda _second: {"addresses": [CLIENT]},
         },
-        "the NTP of the server goes through injected delay: its round trip is 100.00 ms, the probe's is 0.60 ms",
+        InvalidCode.NTP_THROUGH_DELAY,
+        ("server", "100.00 ms", "0.60 ms"),
     ),
     "chrony does not know the offset": (
         {"corrected": False},
-        "chrony and the probe disagree about the offset between the clocks: 0.00 and ",
+        InvalidCode.CLOCK_DISAGREEMENT,
+        ("chrony", "0.00 and "),
     ),
     "both use their own clock as the reference": (
         {"corrected": False, "bound_s": 0.0},
-        "chrony and the probe disagree about the offset between the clocks: 0.00 and ",
+        InvalidCode.CLOCK_DISAGREEMENT,
+        ("chrony", "0.00 and "),
     ),
     "a wrong external correction": (
         {
             "server_clock": lambda _second: {"source": "external", "correction_s": -0.003, "bound_s": 0.001},
             "client_clock": lambda _second: {"source": "external"},
         },
-        "external and the probe disagree about the offset between the clocks: ",
+        InvalidCode.CLOCK_DISAGREEMENT,
+        ("external",),
     ),
     "no bound, and no probe": (
         {"bound_s": None, "probes": False},
-        "the offset between the clocks has no bound",
+        InvalidCode.CLOCK_BOUND,
+        (),
     ),
     "no chrony, and no probe": (
         {
@@ -150,19 +170,21 @@ ONE_REASON = {
             "client_clock": lambda _second: {"correction_s": None, "status": "chrony is not synchronised"},
             "probes": False,
         },
-        "the offset between the clocks is not known (server: chrony is not installed, client: chrony is not "
-        "synchronised)",
+        InvalidCode.CLOCK_UNKNOWN,
+        ("server: chrony is not installed", "client: chrony is not synchronised"),
     ),
     "no probe": (
         {"probes": False},
-        "the probe had no answer during the drive",
+        InvalidCode.CLOCK_UNCHECKED,
+        ("clock.probe_port",),
     ),
     "two grandmasters": (
         {
             "server_clock": lambda _second: {"source": "ptp", "follows": "a"},
             "client_clock": lambda _second: {"source": "ptp", "follows": "b"},
         },
-        "the hosts follow different PTP grandmasters: a and b",
+        InvalidCode.PTP_GRANDMASTERS,
+        ("a and b",),
     ),
     "a probe alone, with too long a round trip": (
         {
@@ -170,13 +192,15 @@ ONE_REASON = {
             "to_server_ms": 3.0,
             "to_client_ms": 3.0,
         },
-        "the offset between the clocks is only known to 3.",
+        InvalidCode.CLOCK_BOUND,
+        ("3.",),
     ),
-    "the client's clock is set forward": ({"step_s": 1.0}, "the wall clock of the client stepped by +1000.0 ms"),
-    "the client's clock is set back": ({"step_s": -1.0}, "the wall clock of the client stepped by -1000.0 ms"),
+    "the client's clock is set forward": ({"step_s": 1.0}, InvalidCode.CLOCK_STEP, ("client", "+1000.0 ms")),
+    "the client's clock is set back": ({"step_s": -1.0}, InvalidCode.CLOCK_STEP, ("client", "-1000.0 ms")),
     "the client's clock is set, without time sources": (
         {"step_s": 1.0, "client_clock": lambda _second: {"source": "probe", "correction_s": None}},
-        "the wall clock of the client stepped by +1000.0 ms",
+        InvalidCode.CLOCK_STEP,
+        ("client", "+1000.0 ms"),
     ),
 }
 
@@ -184,10 +208,8 @@ ONE_REASON = {
 @pytest.mark.parametrize("case", ONE_REASON)
 def test_each_clock_fault_has_one_reason(make_run: MakeRun, tmp_path: Path, case: str) -> None:
     """Each fault of the clocks has one reason, for its cause and not for its consequences."""
-    settings, expected = ONE_REASON[case]
-    run_reasons = reasons(make_run, tmp_path, **settings)
-    assert len(run_reasons) == 1, run_reasons
-    assert run_reasons[0].startswith(expected)
+    settings, code, facts = ONE_REASON[case]
+    require_one(reasons(make_run, tmp_path, **settings), code, *facts)
 
 
 def test_a_step_of_a_shared_clock_has_one_reason(make_run: MakeRun, tmp_path: Path) -> None:
@@ -195,9 +217,8 @@ def test_a_step_of_a_shared_clock_has_one_reason(make_run: MakeRun, tmp_path: Pa
     make_run(tmp_path / "a", step_s=1.0, server_host="one", client_host="one", offset_s=0.0, drift=0.0)
     client = read_record(tmp_path / "a" / "client.mcap")
     sampled_ns = client.table("clock").ints("mono_ns").tolist()
-    assert step_reasons(client, client, measure(client, client).clocks, sampled_ns[0], sampled_ns[-1]) == [
-        "the wall clock of the server stepped by +1000.0 ms"
-    ]
+    found = step_reasons(client, client, measure(client, client).clocks, sampled_ns[0], sampled_ns[-1])
+    require_one(found, InvalidCode.CLOCK_STEP, "server", "+1000.0 ms")
 
 
 @pytest.mark.parametrize("source", ["chrony", "probe"])
@@ -219,21 +240,20 @@ def test_a_clock_step_long_before_the_drive_is_accepted(
 def test_a_clock_step_near_the_drive_makes_the_run_invalid(make_run: MakeRun, tmp_path: Path, stepped_s: float) -> None:
     """A clock step in the drive or within 5 s of it is a reason, even after a long wait before the drive."""
     run_reasons = reasons(make_run, tmp_path, step_s=-1.0, stepped_s=stepped_s, sampled_before_s=40)
-    assert run_reasons == ["the wall clock of the client stepped by -1000.0 ms"]
+    require_one(run_reasons, InvalidCode.CLOCK_STEP, "client", "-1000.0 ms")
 
 
 def test_clock_samples_are_required_during_the_drive_only(make_run: MakeRun, tmp_path: Path) -> None:
     """Clock samples may be missing before the drive, but not at its end."""
     assert reasons(make_run, tmp_path / "before", client_unsampled_s=(-30, -20), sampled_before_s=40) == []
-    assert reasons(make_run, tmp_path / "end", client_unsampled_s=(8, 15), sampled_before_s=40) == [
-        "the clock samples of the client cover 9.0 s of a drive of 12.0 s"
-    ]
+    found = reasons(make_run, tmp_path / "end", client_unsampled_s=(8, 15), sampled_before_s=40)
+    require_one(found, InvalidCode.CLOCK_NOT_SAMPLED, "client", "9.0 s", "12.0 s")
 
 
 def test_fast_steering_is_not_a_step(make_run: MakeRun, tmp_path: Path) -> None:
     """Steering by 83 ms per second, chrony's maximum, moves both clocks of a host and is not a step."""
     run_reasons = reasons(make_run, tmp_path, drift=-83_333e-6)
-    assert [reason for reason in run_reasons if "stepped" in reason] == []
+    assert InvalidCode.CLOCK_STEP not in {reason.code for reason in run_reasons}
 
 
 def test_some_long_ntp_round_trips_are_tolerated(make_run: MakeRun, tmp_path: Path) -> None:
@@ -277,8 +297,7 @@ def test_a_closure_error_makes_the_run_invalid(make_run: MakeRun, tmp_path: Path
     make_run(tmp_path / "a")
     make_run(tmp_path / "b", tau_v_ms=64.5)
     server, client = read_record(tmp_path / "a" / "server.mcap"), read_record(tmp_path / "b" / "client.mcap")
-    (reason,) = invalid_reasons(server, client, measure(server, client))
-    assert "loop latency by 2.50 ms" in reason
+    require_one(invalid_reasons(server, client, measure(server, client)), InvalidCode.CLOSURE, "2.50 ms")
 
 
 def test_an_incomplete_record_makes_the_run_invalid(make_run: MakeRun, tmp_path: Path) -> None:
@@ -286,16 +305,20 @@ def test_an_incomplete_record_makes_the_run_invalid(make_run: MakeRun, tmp_path:
     path = make_run(tmp_path) / "client.mcap"
     path.write_bytes(path.read_bytes()[:-100])
     server, client = read_record(tmp_path / "server.mcap"), read_record(path)
-    assert "the record of the client is not complete" in invalid_reasons(server, client, measure(server, client))
+    found = invalid_reasons(server, client, measure(server, client))
+    require_one(
+        [reason for reason in found if reason.code is InvalidCode.RECORD_INCOMPLETE],
+        InvalidCode.RECORD_INCOMPLETE,
+        "client",
+    )
 
 
 def test_the_injected_delay_is_compared_with_the_request() -> None:
     """A measured delay that differs by over 1 ms from the request, or is missing, is a reason."""
     assert injection_reasons({"video": 75.0, "control": 0.0}, {"video": 75.6, "control": 0.2}) == []
-    (reason,) = injection_reasons({"video": 75.0}, {"video": 60.0})
-    assert reason.startswith("video was delayed by 60.0 ms")
-    (reason,) = injection_reasons({"control": 0.0}, {})
-    assert "control was not measured" in reason
+    found = injection_reasons({"video": 75.0}, {"video": 60.0})
+    require_one(found, InvalidCode.INJECTION_DIFFERS, "video", "60.0 ms")
+    require_one(injection_reasons({"control": 0.0}, {}), InvalidCode.INJECTION_NOT_MEASURED, "control")
 
 
 def test_a_result_has_every_key(make_run: MakeRun, tmp_path: Path) -> None:
@@ -303,7 +326,7 @@ def test_a_result_has_every_key(make_run: MakeRun, tmp_path: Path) -> None:
     make_run(tmp_path)
     identity = {"run": "0001", "time": "virtual", "route": "A key", "condition": "L0", "seed": 7}
     server, client = read_record(tmp_path / "server.mcap"), read_record(tmp_path / "client.mcap")
-    result = run_result(identity, server, client, digest="ab", reasons=["the relay died"])
+    result = run_result(identity, server, client, digest="ab", reasons=[not_measured("video")])
     write_json(tmp_path / "result.json", {**result, "mae_m": float("nan")})
     read = json.loads((tmp_path / "result.json").read_text())
     metrics = measure(server, client).entry
@@ -311,7 +334,10 @@ def test_a_result_has_every_key(make_run: MakeRun, tmp_path: Path) -> None:
     assert read.keys() == {*IDENTITY, "digest", "valid", "invalid_reasons", *metrics}
     assert read["participant"] is None
     assert read["mae_m"] is None
-    assert (read["valid"], read["invalid_reasons"]) == (False, ["the relay died"])
+    assert (read["valid"], read["invalid_reasons"]) == (
+        False,
+        [{"code": "injection_not_measured", "text": not_measured("video").text}],
+    )
 
 
 def test_every_metric_is_defined_in_the_documentation(make_run: MakeRun, tmp_path: Path) -> None:
@@ -320,3 +346,10 @@ def test_every_metric_is_defined_in_the_documentation(make_run: MakeRun, tmp_pat
     page = (Path(__file__).parents[3] / "docs" / "metrics.md").read_text()
     entry = measure(read_record(tmp_path / "server.mcap"), read_record(tmp_path / "client.mcap")).entry
     assert [key for key in entry if f"`{key}`" not in page] == []
+
+
+def test_the_page_explains_every_code() -> None:
+    """`docs/metrics.md` has a row for each code of an invalid run, and no other row."""
+    page = (Path(__file__).parents[3] / "docs" / "metrics.md").read_text()
+    section = page.partition("\n## Validity")[2].partition("\n## ")[0]
+    assert re.findall(r"^\| `(\w+)` \|", section, re.MULTILINE) == list(InvalidCode)

@@ -12,6 +12,7 @@ import pytest
 from lavt.config import RunConfig
 from lavt.config_file import load_config, shipped
 from lavt.errors import UserError
+from lavt.experiment.analysis.invalid_reason import not_measured
 from lavt.experiment.runs.netem_run import NetemRun, netem_reasons
 from lavt.experiment.runs.plan import plan_run
 from lavt.transport.emulation.impairment import ExemptPort, ImpairedFlow, Impairment
@@ -115,22 +116,22 @@ def test_a_delay_that_differs_from_the_request_is_a_reason(tmp_path: Path) -> No
         interface.added_ms = 3.0
         report = netem.report()
 
-    assert all(reason.startswith("after the drive: ") for reason in netem_reasons(report))
-    assert any("video was delayed by 78.00 ms" in reason for reason in netem_reasons(report))
+    assert all(reason.text.startswith("after the drive: ") for reason in netem_reasons(report))
+    assert any("video was delayed by 78.00 ms" in reason.text for reason in netem_reasons(report))
     interface.stopped = ["video: its correlated jitter has stopped"]
-    assert netem_reasons(netem.report())[0].startswith("video: ")
-    assert netem_reasons({**report, "read_back": ["lo has no queue of ours"]})[0] == "lo has no queue of ours"
+    assert netem_reasons(netem.report())[0].text.startswith("video: ")
+    assert netem_reasons({**report, "read_back": ["lo has no queue of ours"]})[0].text == "lo has no queue of ours"
 
 
 @pytest.mark.parametrize("report", [{}, {"flows": 3}, {"flows": [], "read_back": [], "before": {"video": {}}}])
 def test_an_invalid_netem_report_counts_as_unmeasured(report: dict[str, Any]) -> None:
     """With an invalid `netem.json`, the injected delay of each flow counts as not measured."""
     for reason, flow in zip(netem_reasons(report), ("video", "control"), strict=True):
-        assert f"{flow} was not measured" in reason
+        assert reason == not_measured(flow)
 
 
 def test_a_flow_without_a_measurement_is_a_reason() -> None:
     """A flow of the report without a measurement is a reason."""
     flow = ImpairedFlow("video", "udp", 5600, "source", Impairment(75))
     report = {"flows": msgspec.to_builtins([flow]), "read_back": [], "before": {}, "after": {}}
-    assert "before the drive: video: no packet came through" in netem_reasons(report)
+    assert "before the drive: video: no packet came through" in {reason.text for reason in netem_reasons(report)}

@@ -8,8 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from tests.kernel.lane.machine import Machine, MachineError, StartedProgram, wait_until
 
+from lavt.experiment.analysis.invalid_reason import InvalidCode, InvalidReason
 from lavt.experiment.analysis.metrics import RunMeasurement, measure
 from lavt.experiment.runs.join import join_sides
 from lavt.recording.record import Record, read_record
@@ -139,12 +141,13 @@ def collect(loop: LoopPrograms, client: Machine, out: Path) -> DriveResult:
     return DriveResult(run, server_record, client_record, measure(server_record, client_record), result)
 
 
-def invalid_reasons(finished_drive: DriveResult) -> list[str]:
+SLOW_MACHINE_CODES = (InvalidCode.PHYSICS_LATE, InvalidCode.FRAMES_MISSED)
+
+
+def invalid_reasons(finished_drive: DriveResult) -> list[InvalidReason]:
     """Return why a drive is invalid, except for reasons that are normal on a slow machine with one processor."""
-    slow_machine_reasons = ("the physics was", "the camera missed")
-    return [
-        reason for reason in finished_drive.result["invalid_reasons"] if not reason.startswith(slow_machine_reasons)
-    ]
+    reasons = msgspec.convert(finished_drive.result["invalid_reasons"], list[InvalidReason])
+    return [reason for reason in reasons if reason.code not in SLOW_MACHINE_CODES]
 
 
 def _start(machine: Machine, command: str, *arguments: str, changes: Sequence[str] = ()) -> StartedProgram:

@@ -11,12 +11,14 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Collection
 
 from tests.field.by_wire import KIT_TIMEOUT_MS, STOP_LOOKBACK_MS, STOP_STALL_MS
 from tests.kernel.lane.driving import DriveResult, invalid_reasons
 from tests.support.stalls import Stalls
 
 from lavt.domain import NS_PER_MS
+from lavt.experiment.analysis.invalid_reason import InvalidCode
 from lavt.experiment.analysis.metrics import driving_interval
 
 MARGIN_MS = 60
@@ -25,8 +27,8 @@ two more periods on a slow machine."""
 KIT_STALL_MS = KIT_TIMEOUT_MS - MARGIN_MS
 UNSAMPLED_STALL_MS = 1500
 """Clocks are sampled once a second, and a gap of up to 2.5 s is valid."""
-STALL_MS = {"the clock of the ": UNSAMPLED_STALL_MS, "the clock samples of the ": UNSAMPLED_STALL_MS}
-"""The shortest stall that explains why a drive is invalid, by the beginning of the reason.
+STALL_MS = {InvalidCode.CLOCK_NOT_SAMPLED: UNSAMPLED_STALL_MS}
+"""The shortest stall that explains why a drive is invalid, by the code of the reason.
 
 No stall explains other reasons: incomplete records, lost messages and stepped clocks do not depend on timing, and the
 time sources and the sum of the loop's parts are judged by shortest round trips or by 95 of 100 samples.
@@ -37,20 +39,15 @@ processor fully."""
 REPORTS = re.compile(r"Report\w* for (\d+) ms")
 
 
-def require_valid(drive: DriveResult, stalls: Stalls, expected_reason: str | None = None) -> None:
-    """Require that a drive is valid, except for the reason that the test expects."""
-    reasons = [
-        reason for reason in invalid_reasons(drive) if expected_reason is None or not reason.startswith(expected_reason)
-    ]
+def require_valid(drive: DriveResult, stalls: Stalls, expected_codes: Collection[InvalidCode] = ()) -> None:
+    """Require that a drive is valid, except for the reasons that the test expects."""
+    reasons = [reason for reason in invalid_reasons(drive) if reason.code not in expected_codes]
     if reasons:
         began_ns, ended_ns, _ = driving_interval(drive.server)
-        least_ms = max(map(least_stall_ms, reasons))
-        raise stalls.verdict("; ".join(reasons), min(began_ns, ended_ns), ended_ns, stall_ms=least_ms)
-
-
-def least_stall_ms(reason: str) -> float:
-    """Return the length of the shortest stall that explains why a drive is invalid; infinite if none does."""
-    return next((least_ms for begin, least_ms in STALL_MS.items() if reason.startswith(begin)), math.inf)
+        least_ms = max(STALL_MS.get(reason.code, math.inf) for reason in reasons)
+        raise stalls.verdict(
+            "; ".join(reason.text for reason in reasons), min(began_ns, ended_ns), ended_ns, stall_ms=least_ms
+        )
 
 
 def require_completed(drive: DriveResult, stalls: Stalls) -> None:

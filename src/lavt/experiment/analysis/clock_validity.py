@@ -10,6 +10,7 @@ import numpy as np
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.experiment.analysis.clock_offset import follows_peer
 from lavt.experiment.analysis.clocks import MARGIN_NS, PROBE, SAME_KERNEL, RunClocks, drive_on_client
+from lavt.experiment.analysis.invalid_reason import InvalidCode, InvalidReason
 from lavt.recording.record import Record
 from lavt.recording.table import MISSING, IntArray, Table
 
@@ -32,14 +33,18 @@ Sides = tuple[tuple[str, Table, Table, IntArray], ...]
 clock."""
 
 
-def step_reasons(server: Record, client: Record, clocks: RunClocks, began_ns: int, ended_ns: int) -> list[str]:
+def step_reasons(
+    server: Record, client: Record, clocks: RunClocks, began_ns: int, ended_ns: int
+) -> list[InvalidReason]:
     """Return a reason for each wall clock that was set near the drive; two sides on one kernel share one clock."""
     steps_ms = {
         "server": _step_ms(server.table("clock"), (began_ns, ended_ns)),
         "client": _step_ms(client.table("clock"), drive_on_client(server, client, began_ns, ended_ns)),
     }
     reasons = [
-        f"the wall clock of the {side} stepped by {ms:+.1f} ms" for side, ms in steps_ms.items() if ms is not None
+        InvalidReason(InvalidCode.CLOCK_STEP, f"the wall clock of the {side} stepped by {ms:+.1f} ms")
+        for side, ms in steps_ms.items()
+        if ms is not None
     ]
     return reasons[:1] if clocks.source == SAME_KERNEL else reasons
 
@@ -56,7 +61,7 @@ def _step_ms(samples: Table, drive_ns: tuple[int, int]) -> float | None:
     return float(jumps_ms[np.argmax(np.abs(jumps_ms))])
 
 
-def poll_reasons(server: Record, client: Record, began_ns: int, ended_ns: int) -> list[str]:
+def poll_reasons(server: Record, client: Record, began_ns: int, ended_ns: int) -> list[InvalidReason]:
     """Return a reason for each side that lacks clock samples between the start and the end of the drive.
 
     Without samples the clock offset is only a guess.
@@ -77,7 +82,10 @@ def poll_reasons(server: Record, client: Record, began_ns: int, ended_ns: int) -
     }
     limit_ns = POLL_LIMIT_S * NS_PER_S
     reasons = [
-        f"the clock of the {side} was not sampled for {gap_ns / NS_PER_S:.1f} s (limit {POLL_LIMIT_S} s)"
+        InvalidReason(
+            InvalidCode.CLOCK_NOT_SAMPLED,
+            f"the clock of the {side} was not sampled for {gap_ns / NS_PER_S:.1f} s (limit {POLL_LIMIT_S} s)",
+        )
         for side, gap_ns in longest_ns.items()
         if gap_ns > limit_ns
     ]
@@ -86,7 +94,8 @@ def poll_reasons(server: Record, client: Record, began_ns: int, ended_ns: int) -
     if not is_covered:
         covered_s = (int(np.ptp(near_drive_ns)) if len(near_drive_ns) else 0) / NS_PER_S
         drive_s = (ended_ns - began_ns) / NS_PER_S
-        reasons.append(f"the clock samples of the client cover {covered_s:.1f} s of a drive of {drive_s:.1f} s")
+        text = f"the clock samples of the client cover {covered_s:.1f} s of a drive of {drive_s:.1f} s"
+        reasons.append(InvalidReason(InvalidCode.CLOCK_NOT_SAMPLED, text))
     return reasons
 
 
@@ -102,7 +111,7 @@ def _sampled_ns(record: Record) -> IntArray:
     return np.sort(mono_ns[mono_ns != MISSING])
 
 
-def offset_reasons(server: Record, client: Record, clocks: RunClocks) -> list[str]:
+def offset_reasons(server: Record, client: Record, clocks: RunClocks) -> list[InvalidReason]:
     """Return the reasons against Delta from the first of these checks that fails.
 
     The checks are, in order: the time sources are usable, they agree with the probe, the bound of Delta is small
@@ -114,7 +123,8 @@ def offset_reasons(server: Record, client: Record, clocks: RunClocks) -> list[st
     if clocks.source is None:
         sides = (("server", of_server), ("client", of_client))
         statuses = ", ".join(f"{side}: {_last_status(samples)}" for side, samples in sides)
-        return [f"the offset between the clocks is not known ({statuses}), and the probe had no answer"]
+        text = f"the offset between the clocks is not known ({statuses}), and the probe had no answer"
+        return [InvalidReason(InvalidCode.CLOCK_UNKNOWN, text)]
     source_reasons = [] if clocks.source == PROBE else _source_reasons(of_server, of_client, clocks)
     return source_reasons or _agreement_reasons(clocks) or _bound_reasons(clocks) or _unchecked_reasons(clocks)
 
@@ -124,7 +134,7 @@ def _last_status(samples: Table) -> str:
     return statuses[-1] if statuses else "no usable sample"
 
 
-def _source_reasons(of_server: Table, of_client: Table, clocks: RunClocks) -> list[str]:
+def _source_reasons(of_server: Table, of_client: Table, clocks: RunClocks) -> list[InvalidReason]:
     sides: Sides = (
         ("client", of_client, of_server, clocks.client_wall_ns),
         ("server", of_server, of_client, clocks.server_wall_ns),
@@ -132,7 +142,8 @@ def _source_reasons(of_server: Table, of_client: Table, clocks: RunClocks) -> li
     reasons = [*_path_reasons(sides, clocks), *_no_sample_reasons(sides)]
     masters = {name for samples in (of_server, of_client) for name in _grandmasters(samples)}
     if len(masters) > 1:
-        reasons.append(f"the hosts follow different PTP grandmasters: {' and '.join(sorted(masters))}")
+        text = f"the hosts follow different PTP grandmasters: {' and '.join(sorted(masters))}"
+        reasons.append(InvalidReason(InvalidCode.PTP_GRANDMASTERS, text))
     return reasons
 
 
@@ -141,7 +152,7 @@ def _grandmasters(samples: Table) -> set[str]:
     return {name for source, name in names if source == "ptp" and name}
 
 
-def _path_reasons(sides: Sides, clocks: RunClocks) -> list[str]:
+def _path_reasons(sides: Sides, clocks: RunClocks) -> list[InvalidReason]:
     """Return a reason for each side whose NTP had a longer round trip to the other side than the probe had.
 
     The shortest round trips of the drive are compared, because a busy machine delays only some exchanges, but an
@@ -156,24 +167,26 @@ def _path_reasons(sides: Sides, clocks: RunClocks) -> list[str]:
             continue
         ntp_ms, probe_ms = float(delays_ms.min()), float(clocks.probed.round_trip_ns.min()) / NS_PER_MS
         if ntp_ms > probe_ms + PATH_LIMIT_MS:
-            reasons.append(
+            text = (
                 f"the NTP of the {side} goes through injected delay: its round trip is {ntp_ms:.2f} ms, the probe's "
                 f"is {probe_ms:.2f} ms (limit: {PATH_LIMIT_MS} ms longer)"
             )
+            reasons.append(InvalidReason(InvalidCode.NTP_THROUGH_DELAY, text))
     return reasons
 
 
-def _no_sample_reasons(sides: Sides) -> list[str]:
+def _no_sample_reasons(sides: Sides) -> list[InvalidReason]:
     """Return a reason for each side whose NTP accepted no sample for too long, in a time that overlaps the drive."""
     reasons = []
     for side, samples, _, drive_ns in sides:
         longest = _longest_without_sample_s(samples, drive_ns)
         if longest is not None:
             longest_s, limit_s = longest
-            reasons.append(
+            text = (
                 f"the NTP of the {side} accepted no sample for {longest_s:.1f} s (limit {NO_SAMPLE_LIMIT_POLLS} polls, "
                 f"{limit_s:.1f} s): its path is lost or goes through injected delay, or the machine is too busy"
             )
+            reasons.append(InvalidReason(InvalidCode.NTP_NO_SAMPLE, text))
     return reasons
 
 
@@ -199,33 +212,36 @@ def _during(samples: Table, drive_ns: IntArray) -> Table:
     return samples.where((wall_ns >= drive_ns[0]) & (wall_ns <= drive_ns[1]))
 
 
-def _bound_reasons(clocks: RunClocks) -> list[str]:
+def _bound_reasons(clocks: RunClocks) -> list[InvalidReason]:
     bound_ms = clocks.bound_ms
     if bound_ms is None:
-        return ["the offset between the clocks has no bound"]
+        return [InvalidReason(InvalidCode.CLOCK_BOUND, "the offset between the clocks has no bound")]
     if bound_ms > CLOCK_BOUND_LIMIT_MS:
-        return [
+        text = (
             f"the offset between the clocks is only known to {bound_ms:.2f} ms (limit {CLOCK_BOUND_LIMIT_MS} ms); "
             f"its source is {clocks.source}"
-        ]
+        )
+        return [InvalidReason(InvalidCode.CLOCK_BOUND, text)]
     return []
 
 
-def _unchecked_reasons(clocks: RunClocks) -> list[str]:
+def _unchecked_reasons(clocks: RunClocks) -> list[InvalidReason]:
     if clocks.probe is not None:
         return []
-    return [
+    text = (
         "the probe had no answer during the drive, so the offset between the clocks was not checked: open the server's "
         "UDP port clock.probe_port"
-    ]
+    )
+    return [InvalidReason(InvalidCode.CLOCK_UNCHECKED, text)]
 
 
-def _agreement_reasons(clocks: RunClocks) -> list[str]:
+def _agreement_reasons(clocks: RunClocks) -> list[InvalidReason]:
     disagreement_ms = clocks.disagreement_ms()
     if disagreement_ms is None:
         return []
     source_ms, probe_ms, allowed_ms = disagreement_ms
-    return [
+    text = (
         f"{clocks.source} and the probe disagree about the offset between the clocks: {source_ms:.2f} and "
         f"{probe_ms:.2f} ms, although the sum of their error bounds is {allowed_ms:.2f} ms"
-    ]
+    )
+    return [InvalidReason(InvalidCode.CLOCK_DISAGREEMENT, text)]

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from lavt.domain import NS_PER_S
+from lavt.experiment.analysis.invalid_reason import InvalidCode, InvalidReason, not_measured
 from lavt.experiment.analysis.metrics import driving_interval
 from lavt.recording.record import Record
 from lavt.recording.table import Table
@@ -25,7 +26,9 @@ SMALLEST_LATENCY_SHARE = 0.9
 """The median latency must be at least this share of the injected delay."""
 
 
-def recorded_reasons(server: Record, client: Record, condition: str, requested_ms: Mapping[str, float]) -> list[str]:
+def recorded_reasons(
+    server: Record, client: Record, condition: str, requested_ms: Mapping[str, float]
+) -> list[InvalidReason]:
     """Return the reasons against the injection of a run; `requested_ms` is the delay of its condition, by flow.
 
     On the server, the samples from the last one before the drive to the end of the drive are checked. On the client all
@@ -35,7 +38,8 @@ def recorded_reasons(server: Record, client: Record, condition: str, requested_m
     began_ns, ended_ns, _ = driving_interval(server)
     if not condition:
         names = set(_in_force(server.table("injection"), began_ns, ended_ns).texts("condition")) - {""}
-        return [f"condition {name} was in force on the server, but this run did not request it" for name in names]
+        text = "condition {} was in force on the server, but this run did not request it"
+        return [InvalidReason(InvalidCode.INJECTION_NOT_REQUESTED, text.format(name)) for name in names]
     samples = {
         "server": _in_force(server.table("injection"), began_ns, ended_ns),
         "client": client.table("injection"),
@@ -45,16 +49,19 @@ def recorded_reasons(server: Record, client: Record, condition: str, requested_m
         others = [name for name in table.texts("condition") if name != condition]
         doubts = [reason for reason in table.texts("reason") if reason]
         if len(table) == 0:
-            reasons.append(f"the {side} did not report that condition {condition} was in force")
+            text = f"the {side} did not report that condition {condition} was in force"
+            reasons.append(InvalidReason(InvalidCode.INJECTION_NOT_IN_FORCE, text))
         elif (gap_s := _longest_gap_s(table, ended_ns if side == "server" else None)) > GAP_LIMIT_S:
-            reasons.append(f"the {side} did not measure condition {condition} for {gap_s:.0f} s")
+            text = f"the {side} did not measure condition {condition} for {gap_s:.0f} s"
+            reasons.append(InvalidReason(InvalidCode.INJECTION_NOT_MEASURED, text))
         elif others or doubts:
             doubt = f": {doubts[0]}" if doubts else ""
-            reasons.append(f"condition {condition} was not in force as requested on the {side} all the time{doubt}")
+            text = f"condition {condition} was not in force as requested on the {side} all the time{doubt}"
+            reasons.append(InvalidReason(InvalidCode.INJECTION_NOT_IN_FORCE, text))
     unmeasured = [
         flow for flow, side in SENT_BY.items() if requested_ms[flow] and not _is_measured(samples[side], flow)
     ]
-    return reasons + [f"the injected delay of {flow} was not measured" for flow in unmeasured]
+    return reasons + [not_measured(flow) for flow in unmeasured]
 
 
 def _in_force(table: Table, began_ns: int, ended_ns: int) -> Table:
@@ -77,7 +84,7 @@ def _longest_gap_s(table: Table, ended_ns: int | None) -> float:
     return float(np.max(np.diff(times_ns), initial=0)) / NS_PER_S
 
 
-def absent_reasons(entry: Mapping[str, Any], requested_ms: Mapping[str, float]) -> list[str]:
+def absent_reasons(entry: Mapping[str, Any], requested_ms: Mapping[str, float]) -> list[InvalidReason]:
     """Return a reason for each flow whose latency is less than the requested delay.
 
     The delay was then injected on another path.
@@ -88,10 +95,11 @@ def absent_reasons(entry: Mapping[str, Any], requested_ms: Mapping[str, float]) 
     for flow, key in (("video", "tau_v_ms"), ("control", "tau_c_ms")):
         median_ms, bound_ms = entry[key]["p50"], entry[key]["bound"] or 0.0
         if median_ms is not None and median_ms + bound_ms < SMALLEST_LATENCY_SHARE * requested_ms[flow]:
-            reasons.append(
+            text = (
                 f"the {flow} latency is {median_ms:.1f} ms in the median, although {requested_ms[flow]:g} ms were "
                 "injected: the delay is not on its path, check interface and ports"
             )
+            reasons.append(InvalidReason(InvalidCode.INJECTION_NOT_ON_PATH, text))
     return reasons
 
 

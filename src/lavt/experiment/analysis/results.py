@@ -11,6 +11,7 @@ import msgspec
 
 from lavt.errors import WorkError
 from lavt.experiment.analysis.injection_validity import absent_reasons
+from lavt.experiment.analysis.invalid_reason import InvalidReason
 from lavt.experiment.analysis.metrics import measure
 from lavt.experiment.analysis.validity import invalid_reasons
 from lavt.recording.json_payload import to_json
@@ -48,7 +49,7 @@ def run_result(
     client: Record,
     *,
     digest: str | None = None,
-    reasons: Sequence[str] = (),
+    reasons: Sequence[InvalidReason] = (),
 ) -> dict[str, Any]:
     """Compute the run's `result.json`, which is also its entry in `summary.json`, from its records.
 
@@ -67,7 +68,7 @@ def run_result(
         "digest": digest,
         "ending": measured.entry["ending"],
         "valid": not all_reasons,
-        "invalid_reasons": all_reasons,
+        "invalid_reasons": msgspec.to_builtins(all_reasons),
         **measured.entry,
     }
 

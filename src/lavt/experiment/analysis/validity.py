@@ -9,6 +9,7 @@ from collections.abc import Mapping
 
 from lavt.domain import NS_PER_MS
 from lavt.experiment.analysis.clock_validity import offset_reasons, poll_reasons, step_reasons
+from lavt.experiment.analysis.invalid_reason import InvalidCode, InvalidReason, not_measured
 from lavt.experiment.analysis.latency import frames_within
 from lavt.experiment.analysis.metrics import RunMeasurement, driving_interval, last_count
 from lavt.recording.record import Record
@@ -23,8 +24,8 @@ INJECTION_LIMIT_MS = 1.0
 """The largest difference between the injected and the requested delay."""
 
 
-def invalid_reasons(server: Record, client: Record, measured: RunMeasurement) -> list[str]:
-    """Return the reasons for which a run is invalid, a sentence each; the list is empty for a valid run."""
+def invalid_reasons(server: Record, client: Record, measured: RunMeasurement) -> list[InvalidReason]:
+    """Return the reasons for which a run is invalid; the list is empty for a valid run."""
     return [
         *_record_reasons("server", server),
         *_record_reasons("client", client),
@@ -33,15 +34,23 @@ def invalid_reasons(server: Record, client: Record, measured: RunMeasurement) ->
     ]
 
 
-def _record_reasons(side: str, record: Record) -> list[str]:
-    reasons = [] if record.complete else [f"the record of the {side} is not complete"]
+def _record_reasons(side: str, record: Record) -> list[InvalidReason]:
+    reasons = (
+        []
+        if record.complete
+        else [InvalidReason(InvalidCode.RECORD_INCOMPLETE, f"the record of the {side} is not complete")]
+    )
     lost = last_count(record, "record_overflow") or 0
     if lost > 0:
-        reasons.append(f"the record of the {side} lost {lost} messages because its queue was full")
+        reasons.append(
+            InvalidReason(
+                InvalidCode.RECORD_OVERFLOW, f"the record of the {side} lost {lost} messages because its queue was full"
+            )
+        )
     return reasons
 
 
-def _clock_reasons(server: Record, client: Record, measured: RunMeasurement) -> list[str]:
+def _clock_reasons(server: Record, client: Record, measured: RunMeasurement) -> list[InvalidReason]:
     """Return the reasons from the clocks.
 
     Where a clock was set, the offset and the closure are wrong in consequence, and are not reported.
@@ -54,20 +63,23 @@ def _clock_reasons(server: Record, client: Record, measured: RunMeasurement) -> 
     return [*offset_reasons(server, client, measured.clocks), *polls, *_closure_reasons(measured)]
 
 
-def _closure_reasons(measured: RunMeasurement) -> list[str]:
+def _closure_reasons(measured: RunMeasurement) -> list[InvalidReason]:
     closure_ms = measured.closure_p95_ms
     if closure_ms is None or closure_ms <= CLOSURE_LIMIT_MS:
         return []
     return [
-        f"the sum of the loop's parts differs from the loop latency by {closure_ms:.2f} ms (p95, limit "
-        f"{CLOSURE_LIMIT_MS} ms)"
+        InvalidReason(
+            InvalidCode.CLOSURE,
+            f"the sum of the loop's parts differs from the loop latency by {closure_ms:.2f} ms (p95, limit "
+            f"{CLOSURE_LIMIT_MS} ms)",
+        )
     ]
 
 
-def _simulator_reasons(server: Record) -> list[str]:
+def _simulator_reasons(server: Record) -> list[InvalidReason]:
     """Return the reasons from the server's physics and camera during the drive."""
     began_ns, ended_ns, ending = driving_interval(server)
-    reasons = [] if ending is not None else ["the record has no ending"]
+    reasons = [] if ending is not None else [InvalidReason(InvalidCode.NO_ENDING, "the record has no ending")]
     events = server.table("event")
     events = events.where((events.ints("mono_ns") >= began_ns) & (events.ints("mono_ns") <= ended_ns))
     late_ms = [
@@ -76,16 +88,18 @@ def _simulator_reasons(server: Record) -> list[str]:
         if kind == "late"
     ]
     if sum(late_ms) * NS_PER_MS > LATE_LIMIT * (ended_ns - began_ns):
-        reasons.append(f"the physics was {sum(late_ms)} ms late in total (limit {LATE_LIMIT:.0%} of the drive)")
+        text = f"the physics was {sum(late_ms)} ms late in total (limit {LATE_LIMIT:.0%} of the drive)"
+        reasons.append(InvalidReason(InvalidCode.PHYSICS_LATE, text))
     numbers = frames_within(server.table("frame"), began_ns, ended_ns).ints("number")
     due = int(numbers[-1] - numbers[0]) + 1 if len(numbers) else 0
     missed = due - len(numbers)
     if missed > MISSED_FRAMES_LIMIT * due:
-        reasons.append(f"the camera missed {missed} of {due} frames (limit {MISSED_FRAMES_LIMIT:.0%})")
+        text = f"the camera missed {missed} of {due} frames (limit {MISSED_FRAMES_LIMIT:.0%})"
+        reasons.append(InvalidReason(InvalidCode.FRAMES_MISSED, text))
     return reasons
 
 
-def lateness_reasons(late_ms: Mapping[str, float | None]) -> list[str]:
+def lateness_reasons(late_ms: Mapping[str, float | None]) -> list[InvalidReason]:
     """Return a reason for each direction in which the relay sent packets too late, or whose lateness is unknown.
 
     `late_ms` has the median lateness of each direction, relative to the planned send times.
@@ -93,19 +107,23 @@ def lateness_reasons(late_ms: Mapping[str, float | None]) -> list[str]:
     reasons = []
     for direction, median_ms in late_ms.items():
         if median_ms is None:
-            reasons.append(f"the injected delay of {direction} was not measured")
+            reasons.append(not_measured(direction))
         elif abs(median_ms) > INJECTION_LIMIT_MS:
-            reasons.append(f"the relay sent {direction} packets {median_ms:.1f} ms later than planned, in the median")
+            text = f"the relay sent {direction} packets {median_ms:.1f} ms later than planned, in the median"
+            reasons.append(InvalidReason(InvalidCode.INJECTION_DIFFERS, text))
     return reasons
 
 
-def injection_reasons(requested_ms: Mapping[str, float], measured_ms: Mapping[str, float | None]) -> list[str]:
+def injection_reasons(
+    requested_ms: Mapping[str, float], measured_ms: Mapping[str, float | None]
+) -> list[InvalidReason]:
     """Return a reason for each direction whose median delay in the relay or netem differs from the request."""
     reasons = []
     for direction, delay_ms in requested_ms.items():
         median_ms = measured_ms.get(direction)
         if median_ms is None:
-            reasons.append(f"the injected delay of {direction} was not measured")
+            reasons.append(not_measured(direction))
         elif abs(median_ms - delay_ms) > INJECTION_LIMIT_MS:
-            reasons.append(f"{direction} was delayed by {median_ms:.1f} ms, but {delay_ms:g} ms were requested")
+            text = f"{direction} was delayed by {median_ms:.1f} ms, but {delay_ms:g} ms were requested"
+            reasons.append(InvalidReason(InvalidCode.INJECTION_DIFFERS, text))
     return reasons

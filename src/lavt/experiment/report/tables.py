@@ -285,7 +285,9 @@ def run_table(runs: Sequence[Mapping[str, Any]]) -> TableData:
         {
             **run,
             "setup": f"{run['time']}, {run.get('fidelity') or 'video'}, {run['injection']}",
-            "validity": "valid" if run["valid"] else "invalid: " + "; ".join(run["invalid_reasons"]),
+            "validity": "valid"
+            if run["valid"]
+            else "invalid: " + "; ".join(reason["text"] for reason in run["invalid_reasons"]),
         }
         for run in runs
     ]

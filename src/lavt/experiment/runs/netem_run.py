@@ -9,6 +9,7 @@ from typing import Any
 import msgspec
 
 from lavt.assembly.injection import netem_flows
+from lavt.experiment.analysis.invalid_reason import InvalidCode, InvalidReason
 from lavt.experiment.analysis.validity import injection_reasons
 from lavt.experiment.runs.plan import PlannedRun
 from lavt.transport.emulation.impairment import ImpairedFlow, Impairment
@@ -96,14 +97,14 @@ class NetemRun:
         return dict(msgspec.to_builtins(self._netem.measure(self._flows)))
 
 
-def netem_reasons(report: Mapping[str, Any]) -> list[str]:
+def netem_reasons(report: Mapping[str, Any]) -> list[InvalidReason]:
     """Return a reason for each difference between request and measurement; `report` is the content of `netem.json`."""
     try:
         flows = msgspec.convert(report["flows"], tuple[ImpairedFlow, ...])
-        reasons = [str(reason) for reason in report["read_back"]]
+        texts = [str(text) for text in report["read_back"]]
         for moment in ("before", "after"):
             measured = msgspec.convert(report[moment], dict[str, ProbeResult])
-            reasons += [f"{moment} the drive: {reason}" for reason in judge(flows, (), measured)]
+            texts += [f"{moment} the drive: {text}" for text in judge(flows, (), measured)]
     except (KeyError, msgspec.ValidationError):
         return injection_reasons({"video": 0.0, "control": 0.0}, {})
-    return reasons
+    return [InvalidReason(InvalidCode.INJECTION_DIFFERS, text) for text in texts]

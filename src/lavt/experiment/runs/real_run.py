@@ -22,6 +22,7 @@ from lavt.clock import MachineClock, pause
 from lavt.config import DelayConfig, ImpairmentConfig, LinkConfig, RelayConfig
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import WorkError
+from lavt.experiment.analysis.invalid_reason import InvalidReason
 from lavt.experiment.analysis.results import write_json
 from lavt.experiment.analysis.validity import injection_reasons, lateness_reasons
 from lavt.experiment.runs.netem_run import NETEM, NetemRun, uses_netem
@@ -176,7 +177,7 @@ def _requested_ms(planned: PlannedRun) -> dict[str, float | None]:
     }
 
 
-def relay_reasons(relay: Mapping[str, Any]) -> list[str]:
+def relay_reasons(relay: Mapping[str, Any]) -> list[InvalidReason]:
     """Return a reason for each flow whose delay in the relay differs from the request; `relay` is from `relay.json`.
 
     For a flow with another impairment than a constant delay, the send times of packets are compared with the planned

@@ -12,6 +12,7 @@ import yaml
 from lavt.errors import WorkError
 from lavt.experiment.analysis.drive_data import DriveData, extract_drive
 from lavt.experiment.analysis.injection_validity import recorded_reasons
+from lavt.experiment.analysis.invalid_reason import InvalidReason
 from lavt.experiment.analysis.results import read_json, run_result, write_json
 from lavt.experiment.runs.netem_run import NETEM, netem_reasons
 from lavt.experiment.runs.plan import PlannedRun
@@ -70,7 +71,7 @@ def compute_result(out: Path, identity: Mapping[str, Any], digest: str | None) -
 
 def _compute(out: Path, identity: Mapping[str, Any], digest: str | None) -> DriveData:
     server, client = read_record(out / "server.mcap"), read_record(out / "client.mcap")
-    reasons = []
+    reasons: list[InvalidReason] = []
     if identity["injection"] == "relay":
         relay = read_json(out / RELAY) if (out / RELAY).is_file() else {}
         reasons = relay_reasons(relay)
