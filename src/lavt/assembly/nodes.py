@@ -117,8 +117,8 @@ def build_server(
 ) -> ServerNodes:
     """Build the server's nodes; their start time is read after all slow preparations.
 
-    With `lazy_physics`, a vehicle that catches up advances only when its state is read. This is for virtual time, where
-    no wake is late.
+    With `lazy_physics`, a vehicle whose setup `catches_up` advances only when its state is read. This requires that no
+    wake is late, so it is for virtual time only.
     """
     setup = fidelity.vehicle_setup(config)
     picture_sender = fidelity.sender(config)
