@@ -82,6 +82,6 @@ def _reader(sender: Sender) -> PictureReader:
     The check of foreign stamps is weak, so that those of frames in doubt are not read.
     """
     if sender == "lavt":
-        return PictureReader(VideoReceiver(Decoder(), None))
-    receiver = VideoReceiver(Decoder(), None, read_clear_stamp)
+        return PictureReader(VideoReceiver(Decoder(), shape=None))
+    receiver = VideoReceiver(Decoder(), shape=None, read=read_clear_stamp)
     return PictureReader(receiver, LearnedBase().agrees, reads_doubtful=False)
