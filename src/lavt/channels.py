@@ -42,7 +42,8 @@ CHANNELS: dict[str, Channel] = {
     "pose": Channel("local", "actuator", ("camera",), "newest", inline=True),
     "frame": Channel("local", "camera", ("actuator",), inline=True),
     "video_token": Channel("local", "actuator", ("camera",)),
-    # A queue, because queues are served first: a flood of requests would delay a status that waits as "newest".
+    # Whether the vehicle is stationary, and who has control. It waits in a queue, because queues are served first: a
+    # flood of requests would delay a status that waits as "newest".
     "rest": Channel("local", "actuator", ("injection",)),
     "server_ends": Channel("local", "operator", ("actuator",)),  # stops the vehicle before a server shutdown
     # client, between its nodes

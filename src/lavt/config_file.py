@@ -135,9 +135,8 @@ def _describe(kind: type[BaseModel], problem: Any) -> str:
         return f"{key!r} is missing"
     if problem["type"] == "float_type" and (number := _parse_float(problem["input"])) is not None:
         return f"{key!r}: YAML reads {problem['input']} as text: write {problem['input']} as {number!r}"
-    message = str(problem["msg"]).removeprefix(
-        "Value error, "
-    )  # pydantic puts this before the messages of our validators
+    # Pydantic puts "Value error, " before the messages of LAVT's validators.
+    message = str(problem["msg"]).removeprefix("Value error, ")
     if not key:  # a validator that checks several keys together
         return message
     return f"{key!r}: {message}, not {problem['input']!r}"

@@ -23,7 +23,7 @@ from lavt.cli import doctor
 from lavt.clock import MachineClock
 from lavt.config import Section, ServerConfig
 from lavt.config_file import load_config, parse_config, shipped
-from lavt.doctor import checks, probes
+from lavt.doctor import checks, measurements
 from lavt.doctor.checks import CameraSample, Check, CodecTimes, StateSample, Verdict
 from lavt.doctor.clock_checks import ClockComparison, ClockEstimate
 from lavt.domain import NS_PER_MS, NS_PER_S, Now, State
@@ -250,7 +250,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Skip the checks of the machine itself, and wait for a peer for one second only."""
     monkeypatch.setattr(doctor, "_machine_checks", lambda *_: iter(()))
     monkeypatch.setattr(doctor, "PROBE_DURATION_NS", 100 * NS_PER_MS)
-    monkeypatch.setattr(probes, "FIRST_STATE_TIMEOUT_NS", 1000 * NS_PER_MS)
+    monkeypatch.setattr(measurements, "FIRST_STATE_TIMEOUT_NS", 1000 * NS_PER_MS)
 
 
 def check_config(path: Path, *changes: str) -> dict[str, Check]:
@@ -487,12 +487,12 @@ def test_key_files(tmp_path: Path) -> None:
     private.write_text("key")
     private.chmod(0o644)
     section = Security(key=str(private), operators={"operator-1": str(public)})
-    files = probes.key_files(section)
+    files = measurements.key_files(section)
     assert files == [("security.key", private, True), ("security.operators.operator-1", public, False)]
-    assert probes.file_state(private) == ("", 0o644)
-    assert probes.file_state(public) == ("No such file or directory", 0)
+    assert measurements.file_state(private) == ("", 0o644)
+    assert measurements.file_state(public) == ("No such file or directory", 0)
     assert stat.S_IMODE(private.stat().st_mode) == 0o644
-    assert probes.key_files(Security()) == []
+    assert measurements.key_files(Security()) == []
 
 
 def test_certificates(tmp_path: Path) -> None:
@@ -520,8 +520,8 @@ def test_certificates(tmp_path: Path) -> None:
     (tmp_path / "vehicle-1.pem").write_bytes(certificate.public_bytes(Encoding.PEM))
     (tmp_path / "other.pem").write_text("no certificate")
     now_ns = round(valid_from.timestamp()) * 10**9
-    assert probes.certificates(tmp_path, now_ns) == [(tmp_path / "vehicle-1.pem", 30.0)]
-    assert probes.certificates(tmp_path, now_ns + 31 * 86_400 * 10**9) == [(tmp_path / "vehicle-1.pem", -1.0)]
+    assert measurements.certificates(tmp_path, now_ns) == [(tmp_path / "vehicle-1.pem", 30.0)]
+    assert measurements.certificates(tmp_path, now_ns + 31 * 86_400 * 10**9) == [(tmp_path / "vehicle-1.pem", -1.0)]
 
 
 @pytest.mark.realtime

@@ -59,7 +59,10 @@ class ActuatorProcess(RemoteNodeProxy):
         return self._process.pid or 0
 
     def in_force(self) -> tuple[int, int]:
-        """Return the epoch in force and the sequence number of its last accepted command, as last reported."""
+        """Return the epoch in force and the sequence number of its last accepted command, as last reported.
+
+        Before the first report the result is (0, -1): no epoch and no command.
+        """
         return self.status or (0, -1)
 
     def end(self) -> None:
@@ -137,5 +140,5 @@ def _wait_until_disengaged(node_host: NodeHost, vehicle: DbwVehicle, clock: Cloc
     never_set = threading.Event()
     while clock.now().mono_ns < end_ns and not node_host.runtime.stopped.is_set():
         never_set.wait(POLL_PERIOD_S)
-        if vehicle.is_silent:
+        if vehicle.is_silent:  # no commands are sent to the kit: it is released, or a driver overrides it
             return

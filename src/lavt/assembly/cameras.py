@@ -1,4 +1,4 @@
-"""The construction of cameras, and of their geometry as the vehicle's machine and the client know it."""
+"""The construction of cameras, and of their geometry from the server's config, the client's config or a calibration."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def camera_model(config: CameraConfig) -> CameraModel:
 def calibrated_camera(config: CalibrationConfig) -> CalibratedCamera:
     """Return the camera of a calibration."""
     centre_px = ((config.width_px - 1) / 2, (config.height_px - 1) / 2)
-    if config.field_of_view_deg is None:
+    if config.field_of_view_deg is None:  # then the four keys below are set, which the schema checks
         focal_px = (config.fx_px or 0.0, config.fy_px or 0.0)
         centre_px = (config.cx_px or 0.0, config.cy_px or 0.0)
     else:

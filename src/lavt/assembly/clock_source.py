@@ -22,7 +22,7 @@ def query_process(config: ClockConfig) -> PersistentProcess:
 def clock_source(config: ClockConfig, clock: Clock, run: Run) -> Callable[[], ClockReport | None]:
     """Return a function that queries the configured time source and returns None on timeout.
 
-    `run` is the method of the source's `query_process`.
+    `run` is the method `run` of the process that `query_process` returns.
     """
 
     def external() -> ClockReport:

@@ -207,9 +207,9 @@ class _ProfileBuilder:
         value = self._signal(message, sent.gear.value)
         for gear in ("park", "drive"):
             if gear not in sent.gears:
-                raise UserError(f"{self.name}: sent.gears has no {gear}: add its number")
-        for number in sent.gears.values():
-            self._check_range(message, value, number)
+                raise UserError(f"{self.name}: sent.gears has no {gear}: add its code")
+        for code in sent.gears.values():
+            self._check_range(message, value, code)
         return GearCommand(
             message=message.name,
             value=value.name,
@@ -223,8 +223,8 @@ class _ProfileBuilder:
             return None
         message = self._message(command.message)
         value = self._signal(message, command.value)
-        for number in (command.enable, command.disable):
-            self._check_range(message, value, number)
+        for code in (command.enable, command.disable):
+            self._check_range(message, value, code)
         return SystemCommand(
             message=message.name,
             value=value.name,
@@ -241,7 +241,7 @@ class _ProfileBuilder:
             part=part,
             timeout_ns=report.timeout_ms * NS_PER_MS,
             values={value: self._signal(message, signal).name for value, signal in report.values.items()},
-            no_value={
+            no_value={  # the lowest value of each signed signal means "not known"
                 value: -(1 << signal.bits - 1) * signal.scale + signal.offset
                 for value, name in report.values.items()
                 if (signal := self._signal(message, name)).is_signed
@@ -251,8 +251,8 @@ class _ProfileBuilder:
             command_error=self._conditions(message, report.command_error),
             fault=self._conditions(message, report.fault),
             needs={
-                self._signal(message, signal).name: frozenset(self._select_set(numbers, f"{part}.needs.{signal}"))
-                for signal, numbers in report.needs.items()
+                self._signal(message, signal).name: frozenset(self._select_set(codes, f"{part}.needs.{signal}"))
+                for signal, codes in report.needs.items()
             },
             reasons=tuple(self._signal(message, signal).name for signal in report.reasons),
             count=self._optional_signal(message, report.count),
@@ -373,7 +373,7 @@ class _ProfileBuilder:
         if not signal.minimum - tolerance <= value <= signal.maximum + tolerance:
             raise UserError(
                 f"{self.name}: {value:g} is out of range for {signal.name} of {message.name}, which is from "
-                f"{signal.minimum:g} to {signal.maximum:g}: change the limit or the number in the profile"
+                f"{signal.minimum:g} to {signal.maximum:g}: change the limit or the code in the profile"
             )
 
 

@@ -33,8 +33,8 @@ def find_mismatches(config: ProfileConfig, codec: Codec) -> list[str]:
     """Return all mismatches between a profile and its DBC.
 
     The check covers: the existence of messages and signals, identifiers and lengths; the positions and sizes of
-    switches, counters and checksums; the types of multiplexed commands; the ranges of limits; the ranges and names of
-    the codes that the profile expects in signals; and timeouts compared with periods.
+    switches, counters and checksums; the multiplexer values of multiplexed commands; the ranges of limits; the ranges
+    and names of the codes that the profile expects in signals; and timeouts compared with periods.
     """
     mismatches = [*_check_identifiers(codec)]
     uses: list[_SignalUse] = []
@@ -158,13 +158,16 @@ def _check_layouts(uses: Sequence[_SignalUse]) -> Iterator[str]:
 
 
 def _check_multiplexing(uses: Sequence[_SignalUse]) -> Iterator[str]:
-    """Check that the multiplexer of a command's value has one type, and that the other signals belong to that type."""
+    """Check that a command is sent for exactly one value of its multiplexer, together with its other signals."""
     for value in uses:
         if value.role != "value" or not value.signal.multiplexer:
             continue
         if len(value.signal.branches) != 1:
-            types = ", ".join(map(str, sorted(value.signal.branches)))
-            yield f"{value.key}.value: {value.signal.name} is in several types ({types}): its type is ambiguous"
+            values = ", ".join(map(str, sorted(value.signal.branches)))
+            yield (
+                f"{value.key}.value: {value.signal.name} is in the frames of several multiplexer values ({values}): "
+                "which to send is ambiguous"
+            )
         for other in uses:
             shares_multiplexer = other.key == value.key and other.signal.multiplexer == value.signal.multiplexer
             if shares_multiplexer and not value.signal.branches & other.signal.branches:
@@ -208,8 +211,8 @@ def _check_codes(config: ProfileConfig, uses: Sequence[_SignalUse]) -> Iterator[
             if not signal.minimum <= code <= signal.maximum:
                 yield (f"{use.key}.{use.role}: {statement}, but the maximum of {signal.name} is {signal.maximum:g}")
             elif signal.names and signal.names.get(code, "").upper() != meaning.upper() and meaning:
-                name = signal.names.get(code, "nothing")
-                yield f"{use.key}.{use.role}: {statement}, but the DBC calls {code} of {signal.name} {name}"
+                name = f"is named {signal.names[code]!r}" if code in signal.names else "has no name"
+                yield f"{use.key}.{use.role}: {statement}, but in the DBC the value {code} of {signal.name} {name}"
             elif signal.names and code not in signal.names:
                 yield f"{use.key}.{use.role}: {statement}, for which {signal.name} has no name in the DBC"
 
@@ -234,7 +237,10 @@ def _expected_codes(config: ProfileConfig, use: _SignalUse) -> Iterator[tuple[st
 
 
 def _check_clearing(config: ProfileConfig, uses: Sequence[_SignalUse]) -> Iterator[str]:
-    """Check that a command that clears an override contains its clearing signal, because it may be sent shortened."""
+    """Check that the clearing signal of a command is in its first `sent.clearing_bytes` bytes.
+
+    To clear an override, only these bytes of the command are sent.
+    """
     sent_bytes = config.sent.clearing_bytes or MAX_FRAME_BYTES
     for use in uses:
         is_clearing = use.role == "clear" and use.key.partition(".")[2] in AXES

@@ -1,4 +1,4 @@
-"""The conversion of a condition to the flows that a machine impairs with netem, and the construction of their nodes."""
+"""The conversion of a condition to the flows that netem impairs, and the construction of the injection nodes."""
 
 from __future__ import annotations
 
@@ -88,6 +88,7 @@ def injection_node(config: ServerInjectionConfig, *, simulated: bool, video_port
 def injection_client(config: ClientInjectionConfig, who: str, instance: int, start_ns: int) -> InjectionClient:
     """Build the client's injection node; raise `UserError` for a condition that is unknown or cannot be requested."""
     requested = condition(config.condition) if config.condition else NO_CONDITION
+    # A client sends only control, so that the port of the video does not matter.
     [control] = netem_flows(
         requested, "client", video_port=0, control_port=config.control_port, protocol=config.control_protocol
     )

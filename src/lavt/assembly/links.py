@@ -46,7 +46,7 @@ def trace_path(name: str) -> Path:
 
 
 def trace_digests(requested: Condition) -> dict[str, str]:
-    """Return the SHA-256 of each trace of a condition by name; with it a run shows if a file is changed later."""
+    """Return the SHA-256 of each trace of a condition by name; runs record it to show if a file was changed later."""
     names = [flow.trace for flow in (requested.video, requested.control) if flow.trace]
     return {name: sha256(trace_path(name).read_bytes()).hexdigest() for name in names}
 

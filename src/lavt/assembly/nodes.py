@@ -117,8 +117,8 @@ def build_server(
 ) -> ServerNodes:
     """Build the server's nodes; their start time is read after all slow preparations.
 
-    With `lazy_physics`, a vehicle that catches up advances only when its state is read. This is for virtual time, where
-    no wake is late.
+    With `lazy_physics`, a vehicle whose setup `catches_up` advances only when its state is read. This requires that no
+    wake is late, so it is for virtual time only.
     """
     setup = fidelity.vehicle_setup(config)
     picture_sender = fidelity.sender(config)
@@ -141,11 +141,11 @@ def build_server(
             setup.camera,
             picture_sender,
             StreamSender(
-                Packetizer(entropy.number(32), entropy.number(16)),
-                RepairSender(entropy.number(32), entropy.number(16)),
+                Packetizer(ssrc=entropy.number(32), first_sequence=entropy.number(16)),
+                RepairSender(ssrc=entropy.number(32), first_sequence=entropy.number(16)),
                 None if config.video.repair_packets == "auto" else config.video.repair_packets,
             ),
-            PathServer(lambda: entropy.token(32), build_cipher(config)),
+            PathServer(new_secret=lambda: entropy.token(32), new_cipher=build_cipher(config)),
             start_ns=start.mono_ns,
             send_to=[resolved_address("video.send_to", address) for address in config.video.send_to],
         ),

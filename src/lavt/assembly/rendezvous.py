@@ -23,7 +23,7 @@ def open_flow(
     bind: Address,
     remote: Address | None,
 ) -> UdpLink | RendezvousLink:
-    """Open a side's socket for a flow; that of a server with a rendezvous also communicates through the rendezvous.
+    """Open a side's socket for a flow. If a server's config names a rendezvous, the socket also works through it.
 
     Raises `UserError` for a port that cannot be opened, an unknown host, and a key that cannot be read.
     """

@@ -61,6 +61,7 @@ class Prepared:
     queues: NetemInterface | None
     """The network queues of the interface on which delay is injected; None if the config names no interface."""
     time_source: PersistentProcess
+    """The process that queries the time source of this machine's clock."""
 
 
 @dataclass(frozen=True)
@@ -230,7 +231,7 @@ def open_client(config: ClientConfig, out: Path | None, clock: Clock, print_mess
             nodes.all,
             out=out,
             prepared=prepared,
-            in_force=lambda: (0, -1),
+            in_force=lambda: (0, -1),  # only a server's gateway calls it
             session=nodes.driver.session,
         )
         opened.pop_all()

@@ -61,14 +61,14 @@ def build_dbw(config: ServerConfig) -> VehicleSetup:
     if dbw.truth:
         check_own_camera(config)
         camera = _build_sim_camera(config, load_road(config.vehicle.route))
-        return VehicleSetup(camera, None, None, simulated=is_simulated(dbw))
+        return VehicleSetup(camera, start=None, route=None, simulated=is_simulated(dbw))
     device = build_camera(config)
     if device is None:
         raise UserError(
             "a real car needs a real camera: set camera.source device and camera.device, or set vehicle.dbw.truth for "
             "`lavt software-car`"
         )
-    return VehicleSetup(device, None, None)
+    return VehicleSetup(device, start=None, route=None)
 
 
 def _build_sim_camera(config: ServerConfig, road: Road) -> SimCamera:
@@ -116,7 +116,7 @@ def camera_phase_ns(config: ServerConfig) -> int:
 
 
 def driven_route(config: ServerConfig) -> Route | None:
-    """Return the road of a software car on a bus; None for a real car."""
+    """Return the route of a by-wire car on a bus: known for a software car that sends ground truth, otherwise None."""
     return route_of(config.vehicle.route, load_road(config.vehicle.route)) if config.vehicle.dbw.truth else None
 
 

@@ -77,8 +77,11 @@ class WatchNodes:
 
 
 def _reader(sender: Sender) -> PictureReader:
-    """Return the reader for a sender's stamps. The check of foreign stamps is weak, so those in doubt are not read."""
+    """Return the reader for a sender's stamps.
+
+    The check of foreign stamps is weak, so that those of frames in doubt are not read.
+    """
     if sender == "lavt":
-        return PictureReader(VideoReceiver(Decoder(), None))
-    pictures = VideoReceiver(Decoder(), None, read_clear_stamp)
-    return PictureReader(pictures, LearnedBase().agrees, reads_doubtful=False)
+        return PictureReader(VideoReceiver(Decoder(), shape=None))
+    receiver = VideoReceiver(Decoder(), shape=None, read=read_clear_stamp)
+    return PictureReader(receiver, LearnedBase().agrees, reads_doubtful=False)

@@ -88,6 +88,7 @@ def monitor(
             port = stack.enter_context(closing(_open_port(config)))
             batches, drop_counts, wall_offset_ns = _read_bus(port, stop, seconds), port.counts, _wall_offset_ns()
         else:
+            # A log has wall-clock times already.
             batches, drop_counts, wall_offset_ns = _read_log(log), Counter[str](), 0
         write_frame = stack.enter_context(_log_writer(write, config.channel, wall_offset_ns))
         if not _show_batches(batches, (codec, expected), drop_counts, write_frame, as_json):

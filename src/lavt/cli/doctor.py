@@ -23,7 +23,7 @@ from lavt.cli.clock import probe
 from lavt.clock import MachineClock
 from lavt.config import ClientConfig, ServerCameraConfig, ServerConfig
 from lavt.config_file import find_file, load_config, read_yaml, split_change
-from lavt.doctor import checks, probes
+from lavt.doctor import checks, measurements
 from lavt.doctor.checks import Check
 from lavt.doctor.clock_checks import compare
 from lavt.domain import NS_PER_S
@@ -94,9 +94,9 @@ def _load(path: Path, changes: list[str]) -> Settings:
 def _checks(settings: Settings | None, clock: MachineClock) -> Iterator[Check]:
     config = ServerConfig() if settings is None else settings
     yield from _machine_checks(config, "" if settings is None else _side_name(settings), clock)
-    report = probes.clock_report(config.clock, clock)
+    report = measurements.clock_report(config.clock, clock)
     yield checks.check_clock(report)
-    yield checks.check_netem(probes.netem_rejection(config.injection.interface), config.injection.interface)
+    yield checks.check_netem(measurements.netem_rejection(config.injection.interface), config.injection.interface)
     if settings is None:
         return
     yield from _security_checks(settings, clock)
@@ -118,14 +118,14 @@ def _side_name(settings: Settings) -> str:
 
 
 def _machine_checks(config: Settings, side: str, clock: MachineClock) -> Iterator[Check]:
-    versions, requirements = probes.packages()
+    versions, requirements = measurements.packages()
     yield checks.check_versions(platform.python_version(), versions, requirements)
     yield _codec_check(config, side, clock)
-    yield checks.check_buffer(probes.receive_buffer_bytes())
-    yield checks.check_arrival(probes.kernel_records_arrivals())
-    yield checks.check_timer(*probes.timer_accuracy(clock))
-    yield checks.check_process_priority(probes.niceness(), process_priority.session_niceness())
-    yield checks.check_governor(probes.governors())
+    yield checks.check_buffer(measurements.receive_buffer_bytes())
+    yield checks.check_arrival(measurements.kernel_records_arrivals())
+    yield checks.check_timer(*measurements.timer_accuracy(clock))
+    yield checks.check_process_priority(measurements.niceness(), process_priority.session_niceness())
+    yield checks.check_governor(measurements.governors())
 
 
 def _codec_check(config: Settings, side: str, clock: MachineClock) -> Check:
@@ -133,7 +133,7 @@ def _codec_check(config: Settings, side: str, clock: MachineClock) -> Check:
     server = config if isinstance(config, ServerConfig) else _assumed_server(config)
     size = f"{server.camera.width_px}x{server.camera.height_px}"
     try:
-        times = probes.codec_times(server, clock)
+        times = measurements.codec_times(server, clock)
     except (LavtError, OSError, ValueError) as error:  # PyAV's errors derive from OSError or ValueError
         do = "check that PyAV has libx264 (`pip install --force-reinstall av`) and that the picture size is supported"
         return Check("processor", "problem", f"pictures of {size} cannot be encoded and decoded here: {error}", do)
@@ -144,7 +144,7 @@ def _codec_check(config: Settings, side: str, clock: MachineClock) -> Check:
 def _camera_check(settings: ServerConfig, clock: MachineClock) -> Check:
     camera = settings.camera
     size = f"{camera.width_px}x{camera.height_px}"
-    sample = probes.sample_camera(settings, clock)
+    sample = measurements.sample_camera(settings, clock)
     return checks.check_camera(sample, name=str(camera.device), size=size, rate_hz=camera.rate_hz)
 
 
@@ -166,27 +166,27 @@ def _assumed_server(config: ClientConfig) -> ServerConfig:
 
 
 def _security_checks(settings: Settings, clock: MachineClock) -> Iterator[Check]:
-    files = probes.key_files(settings.security)
+    files = measurements.key_files(settings.security)
     yield checks.check_keys_configured(bool(files))
     for key, path, is_private in files:
-        rejection, mode = probes.file_state(path)
+        rejection, mode = measurements.file_state(path)
         yield checks.check_key_file(key, path, rejection=rejection, mode=mode, is_private=is_private)
         if not rejection:
-            yield checks.check_signing_key(path, probes.signing_key_days_left(path, clock.now().wall_ns))
-    rejection = probes.keys_rejection(settings)
+            yield checks.check_signing_key(path, measurements.signing_key_days_left(path, clock.now().wall_ns))
+    rejection = measurements.keys_rejection(settings)
     if rejection:
         yield Check(
             "keys", "problem", rejection, "copy the files that `lavt keys` lists for this machine (docs/deployment.md)"
         )
     for folder in sorted({path.parent for _, path, _ in files}):
-        for path, days_left in probes.certificates(folder, clock.now().wall_ns):
+        for path, days_left in measurements.certificates(folder, clock.now().wall_ns):
             yield checks.check_certificate(path, days_left)
 
 
 def _port_checks(settings: ServerConfig, clock: MachineClock) -> Iterator[Check]:
     host, probe_port = settings.video.bind, settings.clock.probe_port
     ports = (("video port", "video.port", settings.video.port), ("probe port", "clock.probe_port", probe_port))
-    rejections = {key: probes.bind_rejection(host, port) for _, key, port in ports}
+    rejections = {key: measurements.bind_rejection(host, port) for _, key, port in ports}
     is_served = False
     if any(rejections.values()) and probe_port:
         address = "127.0.0.1" if host == ANY_ADDRESS else host
@@ -198,10 +198,10 @@ def _port_checks(settings: ServerConfig, clock: MachineClock) -> Iterator[Check]
 
 def _zenoh_checks(settings: Settings, clock: MachineClock) -> Iterator[Check]:
     endpoint = settings.zenoh.router or f"the endpoint of {settings.zenoh.session}"
-    if probes.keys_rejection(settings):
+    if measurements.keys_rejection(settings):
         yield Check("router", "not checked", "fix the keys first")
         return
-    listener = probes.StateListener(settings)
+    listener = measurements.StateListener(settings)
     try:
         link = ZenohLink(
             clock,
@@ -231,7 +231,7 @@ def _probe_check(settings: ClientConfig, report_before: ClockReport | None, cloc
     except UserError as error:
         return Check("clock probe", "problem", str(error), "set video.server to the vehicle's address")
     clock_probes, last_reply = probe(clock, address, port, PROBE_DURATION_NS)
-    report = probes.clock_report(settings.clock, clock)
+    report = measurements.clock_report(settings.clock, clock)
     if last_reply is None or report is None:
         return checks.check_probe(None, host, port)
     comparison = compare(report_before or report, report, clock_probes, last_reply, address)

@@ -31,7 +31,7 @@ PINNED_ROLES: Final[Mapping[str, tuple[str, ...]]] = {
     "monitor": ("vehicle",),
     "cloud": (),
 }
-"""The roles whose signatures each role verifies with their public keys."""
+"""The roles whose signatures each role verifies with their public keys. A cloud router neither verifies nor signs."""
 
 Names = list[str] | None
 

@@ -16,7 +16,7 @@ from lavt.domain import NS_PER_S
 
 @contextmanager
 def progress(title: str, total: int, *, clock: Clock | None = None) -> Iterator[Callable[[str], None]]:
-    """Yield a function that is called with one line of text each time that one of the `total` runs is done."""
+    """Yield a function; call it with one line of text whenever one of the `total` runs is done."""
     if not sys.stderr.isatty():
         console.print_message(f"{title}: {total} runs")
         yield _line_printer(total, clock or MachineClock())

@@ -92,9 +92,10 @@ def _link_injection(name: str, config: DelayConfig, seed: int) -> LinkInjection 
     if config.link == LinkConfig():
         return None
     impairment = ImpairmentConfig(**config.link.model_dump(exclude={"delay_ms"}))
-    return link_injection(name, config.link.delay_ms, impairment, seed) or LinkInjection(
-        Impairment(delay_ms=config.link.delay_ms), seed, name
-    )
+    injection = link_injection(name, config.link.delay_ms, impairment, seed)
+    if injection is None:  # the link has only a constant delay
+        return LinkInjection(Impairment(delay_ms=config.link.delay_ms), seed, name)
+    return injection
 
 
 def _resolve(key: str, text: str) -> tuple[str, int]:

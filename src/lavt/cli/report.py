@@ -56,7 +56,10 @@ def report(
 
 
 def _base_config(directories: Sequence[Path], names: dict[Path, str]) -> dict[str, Any] | None:
-    """Return the base config of the first sweep, by which the report groups its runs; None if there is no sweep."""
+    """Return the base config by which the report groups its runs; None if there is none.
+
+    It is that of the only directory or, if there are several sweeps (`names`), that of the first one with its name.
+    """
     from lavt.experiment.sweep.sweep import recorded_base  # noqa: PLC0415 (slow: scipy, matplotlib)
 
     if len(directories) == 1:

@@ -10,7 +10,7 @@ from lavt.domain import NS_PER_S, State
 from lavt.nodes.client_session import Phase
 
 REPEAT_NS = NS_PER_S
-"""Rejections are logged at most once in this time. A limit that has not applied for this time is logged again."""
+"""Rejections are logged at most once in this time. A limit is logged again if it has not applied for this time."""
 STATE_TIMEOUT_NS = NS_PER_S
 """A client logs that the state is missing after this time; the vehicle sends its state 50 times a second."""
 FIRST_STATE_TIMEOUT_NS = 3 * NS_PER_S

@@ -27,6 +27,7 @@ CHECKS: Mapping[Sender, str] = {
     "foreign": "the check is weaker: the base of the sender's RTP clock is learned from its stamps, so an accepted "
     "stamp may have an error of up to 10 ms",
 }
+"""How stamps are checked, by the kind of sender; printed with the summary."""
 
 
 def register(app: typer.Typer) -> None:

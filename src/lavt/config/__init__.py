@@ -237,7 +237,7 @@ class BoundaryConfig(RunConfig):
     longest_delay_ms: float = Field(700.0, gt=0, le=5000)
     """The longest delay of the video that the search tries; the delay of the loop itself is added to it."""
     grid_ms: float = Field(100.0, gt=0, le=1000)
-    """The search first tries delays at this distance."""
+    """The search first tries delays that are this far apart."""
     within_ms: float = Field(2.0, ge=0.1, le=100)
     """The accuracy to which the search then finds each boundary, between two delays of that grid."""
 

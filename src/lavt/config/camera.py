@@ -54,7 +54,7 @@ class ClientCameraConfig(CameraConfig):
     """The camera in the client's config."""
 
     calibration: str = ""
-    """A calibration file, which replaces all keys above except the rate; empty: the keys above apply."""
+    """A calibration file, which replaces all other keys except `rate_hz`; empty: the other keys apply."""
 
 
 class CalibrationConfig(Section):

@@ -208,10 +208,10 @@ class WatchdogProof(Section):
     brake: float
     """The brake command before the commands stopped."""
     release_ms: float = Field(ge=0)
-    """From the last frame until the brake was reported as not enabled."""
+    """From the last frame until the kit released the brake: it was reported as not enabled."""
     braked_ms: float = Field(ge=0)
     """From the last frame until the kit was reported to brake by itself."""
     reports: int
     """The number of brake reports after the commands stopped."""
     said: str
-    """The kit's other reports, as text."""
+    """The texts of the trips, command errors, faults and reasons that the kit then reported."""

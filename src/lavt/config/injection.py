@@ -120,7 +120,11 @@ class Condition(Section):
 
     @property
     def least_ms(self) -> dict[str, float]:
-        """A lower bound of each flow's median delay, because jitter and reordering can make it less than requested."""
+        """A lower bound of each flow's median delay, which jitter and reordering can make less than requested.
+
+        It is 0 if the reordered share exceeds `MAX_UNDELAYED_SHARE`, otherwise the delay minus four standard deviations
+        of the jitter.
+        """
         return {
             name: 0.0
             if impairment.reorder > MAX_UNDELAYED_SHARE[name]

@@ -1,1 +1,1 @@
-"""The checks of `lavt doctor`, and the probes that measure a machine for them."""
+"""The checks of `lavt doctor` and `lavt clock`, and the measurements of a machine that they judge."""

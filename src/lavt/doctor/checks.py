@@ -127,7 +127,10 @@ def check_codec(times: CodecTimes, *, size: str, rate_hz: float, side: str, core
         do = "use a lower camera.rate_hz, smaller pictures or a faster machine: this one is too slow"
         return Check("processor", "problem", found, do, measured)
     if max(p95_ms[name] for name in relevant) > period_ms / 2:
-        do = "close other programs, or use a lower camera.rate_hz or smaller pictures: other work needs half of it"
+        do = (
+            "close other programs, or use a lower camera.rate_hz or smaller pictures: other work needs half of the "
+            "picture period"
+        )
         return Check("processor", "warning", found, do, measured)
     if cores < 2:
         return Check("processor", "warning", found, "use at least two cores: on one, video delays commands", measured)

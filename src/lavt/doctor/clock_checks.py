@@ -40,7 +40,9 @@ class ClockComparison:
     says: tuple[str, ...]
     """The result in sentences."""
     sources: ClockEstimate | None = None
+    """Delta from the time sources of both machines; None if either has no estimate."""
     probe: ClockEstimate | None = None
+    """Delta from the probe; None if no usable probe was answered."""
     round_trip_ms: float | None = None
 
 
@@ -124,6 +126,7 @@ def _estimate_from_sources(
         return None
     path = (report.peer_delay_s, report.peer_dispersion_s, report.skew_ppm, report.age_s)
     delay_s, dispersion_s, skew_ppm, age_s = (math.inf if value is None else value for value in path)
+    # If this machine follows the server, only the path between the two limits the accuracy of Delta.
     path_bound_s = delay_s / 2 + dispersion_s + (skew_ppm / 1e6 * age_s if age_s else 0.0)
     total_bound_s = min(bound_s, path_bound_s) if report.follows == server else bound_s + server_bound_s
     change_s = abs(correction_s - before.correction_s)

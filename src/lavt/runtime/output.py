@@ -72,7 +72,7 @@ class QueuedOutput(io.TextIOBase):
 def queue_output(*names: StreamName) -> None:
     """Replace these standard streams by queued ones until the program ends.
 
-    What they still have is written at exit, after the interpreter has printed the traceback of an error.
+    Texts that are queued at exit are written then, after the interpreter has printed the traceback of an error.
     """
     atexit.unregister(finish_output)
     atexit.register(finish_output)
@@ -80,9 +80,8 @@ def queue_output(*names: StreamName) -> None:
         stream = getattr(sys, name)
         if not isinstance(stream, QueuedOutput):
             stream.flush()
-            setattr(
-                sys, name, QueuedOutput(os.dup(stream.fileno()))
-            )  # a copy, because the replaced stream closes its own
+            descriptor = os.dup(stream.fileno())  # a copy, because the replaced stream closes its own
+            setattr(sys, name, QueuedOutput(descriptor))
 
 
 def finish_output() -> None:

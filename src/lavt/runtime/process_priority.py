@@ -10,7 +10,7 @@ from typing import Final
 NICENESS: Final = -10
 """Default priority: above ordinary programs, without starving the system (0 is normal, -20 is the highest)."""
 VEHICLE_NICENESS: Final = -15
-"""Priority of the actuator's process, above that of the server, and of a software car."""
+"""Priority of the actuator's process and of a software car: above that of the server."""
 
 SESSION: Final = Path("/proc/self/autogroup")
 """The niceness of this process's session. With automatic task groups, Linux shares the processors among sessions, and

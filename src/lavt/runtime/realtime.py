@@ -129,7 +129,7 @@ class RealRuntime:
         return self._clock.now()
 
     def _send(self, carrier: Carrier, sends: Sequence[Send]) -> None:
-        """Send and record messages of one carrier; the packets of a frame leave without a gap."""
+        """Send messages of one carrier, then record them: so the packets of a frame leave without a gap."""
         now = self._clock.now()
         if carrier == "local":
             for send in sends:

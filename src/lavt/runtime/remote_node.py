@@ -125,7 +125,7 @@ class RemoteNodeProxy:
             runtime.fail(WorkError(rest[0]))
 
     def _carry(self, runtime: RealRuntime, carrier: Carrier, sends: Sequence[Send]) -> None:
-        """Send messages, but replies from a thread of their own: Zenoh blocks for seconds if its router is frozen."""
+        """Send messages; replies in a thread of their own, because a frozen router blocks them for seconds in Zenoh."""
         others = [send for send in sends if send.peer is None]
         replies = [Send(send.channel, send.payload, self._peers.pop(send.peer, None)) for send in sends if send.peer]
         if others:
@@ -151,7 +151,7 @@ class RemoteNodeProxy:
         self._missed = missed = self._missed + 1  # a heartbeat may reset it at any time
         if missed == SILENT_AFTER_CHECKS:
             self._on_silent(runtime)
-        if missed in {0, FAILED_AFTER_CHECKS}:
+        if missed in {0, FAILED_AFTER_CHECKS}:  # 0: the first heartbeat has not come in time
             runtime.fail(WorkError(f"the process of the {self.name} does not respond"))
 
     def _on_closed(self) -> None:

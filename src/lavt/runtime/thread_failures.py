@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def fail_on_thread_errors(fail: Callable[[BaseException], None]) -> Iterator[None]:
-    """Call `fail` with each error that ends a thread of this process while the context is entered.
+    """Call `fail` with each error that ends a thread of this process during the `with` block.
 
     This applies to all threads, including those of libraries and those that were started before.
     """

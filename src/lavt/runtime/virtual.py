@@ -140,9 +140,9 @@ class _NodeRunner:
         self.wake_ns = None if wake_mono_ns is None else self.host.clock.true_ns(wake_mono_ns)
 
 
-def _end_times_ns(costs_ns: Mapping[tuple[str, str], int], node: str, steps: Sequence[str]) -> tuple[int, ...]:
-    """Return the end time of each step, relative to the start of the first."""
-    return tuple(accumulate(costs_ns.get((node, step), 0) for step in steps))
+def _end_times_ns(costs_ns: Mapping[tuple[str, str], int], node: str, names: Sequence[str]) -> tuple[int, ...]:
+    """Return the end times of a pipeline's wait and stages, in order of `names`, relative to the start of the wait."""
+    return tuple(accumulate(costs_ns.get((node, name), 0) for name in names))
 
 
 class VirtualRuntime:

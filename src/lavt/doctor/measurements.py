@@ -1,4 +1,4 @@
-"""The probes of `lavt doctor`: each function measures one property of this machine or its peer, without a verdict."""
+"""The measurements of `lavt doctor`: each function measures one property of a machine, without a verdict."""
 
 from __future__ import annotations
 
@@ -37,6 +37,8 @@ from lavt.transport.zenoh_link import ZenohLink
 
 CODEC_PICTURES = 60
 SHIFT_PX_PER_PICTURE = 4
+NOISE_SHIFT_PX_PER_PICTURE = 37
+"""The noise moves in another way than the texture, so that the encoder cannot predict it."""
 CODEC_TIMEOUT_NS = 3 * NS_PER_S
 SLEEPS = 100
 FIRST_STATE_TIMEOUT_NS = 3 * NS_PER_S
@@ -107,7 +109,7 @@ def _pictures(width_px: int, height_px: int) -> Iterator[Picture]:
     noise = random.integers(0, 6, (height_px, width_px, 3), dtype=np.uint8)
     for number in range(CODEC_PICTURES):
         view = wide[:, number * SHIFT_PX_PER_PICTURE : number * SHIFT_PX_PER_PICTURE + width_px]
-        yield cast("Picture", cv2.add(view, np.roll(noise, 37 * number, axis=0)))
+        yield cast("Picture", cv2.add(view, np.roll(noise, NOISE_SHIFT_PX_PER_PICTURE * number, axis=0)))
 
 
 def sample_camera(config: ServerConfig, clock: MachineClock) -> CameraSample | str:
