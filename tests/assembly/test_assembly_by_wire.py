@@ -18,7 +18,7 @@ from lavt.vehicle.dbw.profile import Profile
 
 @pytest.fixture
 def verified_profile() -> Profile:
-    """Return a profile with a verified_profile steering sign and only verified signals."""
+    """Return a profile with a known steering sign and only verified signals."""
     return load_profile("dataspeed_gen1", steering_sign=1)
 
 
@@ -51,7 +51,7 @@ def test_a_real_bus_without_a_car_inhibits_arming(verified_profile: Profile) -> 
 
 
 def test_unverified_signals_inhibit_arming_on_a_real_bus() -> None:
-    """Unverified signals inhibit arming on any bus that is not verified_profile to be virtual."""
+    """Unverified signals inhibit arming on any bus that is not known to be virtual."""
     unverified = load_profile("dataspeed_gen2")
     assert "unverified" in reason_for(REAL_BUS, unverified)
     virtual = DbwConfig(interface="udp_multicast", channel="239.74.163.2")
