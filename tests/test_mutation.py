@@ -147,7 +147,7 @@ def test_sampled_mutants_compile(sites: dict[str, list[Site]]) -> None:
 
 
 def make_result(caught_by: str, module: str = "safety/takeover_requests.py") -> results.Result:
-    """Return the result of a mutant that a test has caught; if `caught_by` is empty, the mutant survived."""
+    """Return the result of a mutant; `caught_by` is a test or "timeout", and empty for a mutant that survived."""
     return results.Result(module, "f", "g(a < b)", "g(a <= b)", 0, 3, "comparison", bool(caught_by), caught_by, 1.0)
 
 

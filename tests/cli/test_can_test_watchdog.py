@@ -163,7 +163,7 @@ REJECTED: list[tuple[list[str], str]] = [
 def test_rejected(run: Run, monkeypatch: pytest.MonkeyPatch, arguments: list[str], reason: str) -> None:
     """An unsuitable vehicle, bus, profile or file, or no terminal for the confirmation, is rejected in one sentence.
 
-    Nothing is sent before.
+    Nothing has been sent by then.
     """
     monkeypatch.setattr(sys, "stdin", io.StringIO("yes\n"))
     assert reason in run(*arguments).rejected()

@@ -157,9 +157,9 @@ def test_delta_needs_the_time_sources_of_both_hosts(lacking: str) -> None:
     ],
 )
 def test_the_bound_of_a_host_that_follows_the_other(follower: str, path: dict[str, Any], bound_ms: float) -> None:
-    """The bound is the smaller of the follower's path bound and root distance; otherwise both root distances add up.
+    """If a host follows the other, the bound is the smaller of its path bound and its root distance.
 
-    They add up if no host follows the other.
+    If no host follows the other, both root distances add up.
     """
     own = {"follows": "10.9.0.1", "skew_ppm": 0.0, "age_s": 0.0, "bound_s": 0.002, **path}
     tables = {
@@ -174,9 +174,9 @@ def test_the_bound_of_a_host_that_follows_the_other(follower: str, path: dict[st
 
 def test_a_host_follows_any_address_of_the_other() -> None:
     """A host follows the other if its source has any recorded address of the other, from any sample."""
-    other = as_table([{"addresses": None}, {"addresses": ["10.0.0.1", "10.0.0.2"]}, {"addresses": ["fe80::1"]}])
+    followed_host = as_table([{"addresses": None}, {"addresses": ["10.0.0.1", "10.0.0.2"]}, {"addresses": ["fe80::1"]}])
     sources = ["10.0.0.2", "10.0.0.3", "fe80::1", "", None]
-    is_followed = follows_peer(as_table([{"follows": source} for source in sources]), other)
+    is_followed = follows_peer(as_table([{"follows": source} for source in sources]), followed_host)
     assert is_followed.tolist() == [True, False, True, False, False]
 
 

@@ -66,7 +66,7 @@ def test_exchanges_of_an_interval() -> None:
 def test_the_shortest_exchange_determines_delta() -> None:
     """The shortest exchange is also used at other times, where its bound has grown by 500 ppm of the time between.
 
-    Each bound also has 500 ppm of half the longer gap to the next exchanges.
+    In addition, each bound contains 500 ppm of half the longer of the two adjacent gaps.
     """
     rows = [
         exchange(TRUE_NS + at_ms * NS_PER_MS, half_round_trip_us * 1000, delta_us * 1000)
