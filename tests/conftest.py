@@ -1,4 +1,4 @@
-"""Configuration of all tests: the number of processors, and plugins such as that for tests that the host stalled."""
+"""Configuration of all tests: how many run in parallel, the profiles of Hypothesis, and the plugins of `support`."""
 
 from __future__ import annotations
 

@@ -21,8 +21,9 @@ class FakeTime:
 
 def test_an_interrupted_reading_is_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
     """A reading of both clocks that was interrupted for 5 ms is repeated."""
-    mono_ns = iter([0, 5 * NS_PER_MS, 5 * NS_PER_MS + 50])
-    monkeypatch.setattr(clock, "time", FakeTime(mono_ns, iter([1000, 1000 + 5 * NS_PER_MS])))
+    # Read in turn: monotonic, wall and monotonic clock; then, in the repetition, wall and monotonic clock.
+    mono_ns, wall_ns = iter([0, 5 * NS_PER_MS, 5 * NS_PER_MS + 50]), iter([1000, 1000 + 5 * NS_PER_MS])
+    monkeypatch.setattr(clock, "time", FakeTime(mono_ns, wall_ns))
 
     assert MachineClock().now() == Now(5 * NS_PER_MS + 50, 1000 + 5 * NS_PER_MS)
 

@@ -13,12 +13,13 @@ MODULE = [sys.executable, "-m", "tests.support.host_load"]
 
 def test_stop_times_follow_from_the_seed() -> None:
     """The same seed gives the same stop times and another seed others, with the requested mean rate."""
-    stops = stop_times(1, 20, 300, 20_000)
-    assert stops == stop_times(1, 20, 300, 20_000) != stop_times(2, 20, 300, 20_000)
-    assert 850 < len(stops) < 1150
+    settings = {"every_s": 20.0, "stop_ms": 300.0, "last_stop_s": 20_000.0}
+    stops = stop_times(1, **settings)
+    assert stops == stop_times(1, **settings) != stop_times(2, **settings)
+    assert 850 < len(stops) < 1150  # 20000 s / (20 s + 300 ms) = 985 are expected
     assert all(end - begin == 300_000_000 for begin, end in stops)
     assert all(end <= begin for (_, end), (begin, _) in pairwise(stops))
-    assert stop_times(1, 0, 300) == []
+    assert stop_times(1, every_s=0, stop_ms=300) == []
 
 
 @pytest.mark.parametrize("arguments", [["--share", "0.3"], ["--share", "0.7", "--stop-ms", "300", "--", "true"]])

@@ -45,6 +45,8 @@ WALL_NS = 1_790_000_000 * NS_PER_S
 START_NS = 100 * NS_PER_S
 VIDEO_DELAY_MS, CONTROL_DELAY_MS = 75.0, 20.0
 CHALLENGE = bytes(range(16))
+ARMING_FRAMES = 51
+"""Frames with an arming command each, 20 ms apart: slightly more than a second. The frame of the test is the next."""
 
 
 class Gateways:
@@ -84,12 +86,12 @@ class Gateways:
 
 def armed_gate(car: Simulator) -> tuple[SafetyGate, Gateways, SessionReply]:
     """Acquire control of the car through both gateways, and arm it, which takes a second."""
-    able = car.capabilities
+    capabilities = car.capabilities
     limiter = Limiter(
         LIMITS,
-        wheelbase_m=able.wheelbase_m,
-        max_steering_rad=able.max_steering_rad,
-        max_braking_mps2=able.max_braking_mps2,
+        wheelbase_m=capabilities.wheelbase_m,
+        max_steering_rad=capabilities.max_steering_rad,
+        max_braking_mps2=capabilities.max_braking_mps2,
     )
     numbers = count(1)
     gate = SafetyGate(LIMITS, limiter, new_epoch=lambda: next(numbers), new_token=lambda: bytes(16))
@@ -99,8 +101,8 @@ def armed_gate(car: Simulator) -> tuple[SafetyGate, Gateways, SessionReply]:
     answer = gate.session.answer(request, car.state(), START_NS)
     gateways.server.send(Send("session_reply", encode(answer), "query"))
     reply = decode(SessionReply, gateways.exchange())
-    for number in range(51):
-        at_ns = START_NS - (51 - number) * 20 * NS_PER_MS
+    for number in range(ARMING_FRAMES):
+        at_ns = START_NS - (ARMING_FRAMES - number) * 20 * NS_PER_MS
         gate.issued_stamps.add(WALL_NS + at_ns, number, at_ns, pixel_crc=number)
         arm = Command(
             epoch=reply.epoch,
@@ -132,7 +134,7 @@ def test_life_of_a_frame(tmp_path: Path) -> None:  # noqa: PLR0915 (one frame, f
     car.advance(now_ns)
 
     # Frame 1. The camera captures a frame with its capture time.
-    frame = camera.capture(51, now_ns, car.pose())
+    frame = camera.capture(ARMING_FRAMES, now_ns, car.pose())
     assert frame is not None
     assert (frame.capture_ns, frame.picture.shape) == (START_NS, (480, 640, 3))
 
@@ -172,9 +174,9 @@ def test_life_of_a_frame(tmp_path: Path) -> None:  # noqa: PLR0915 (one frame, f
         plain = ciphers[1].unprotect(datagram)
         assert plain is not None
         packet = parse_packet(plain)
-        media = [] if packet.ssrc == 8 else [packet]
-        for each in (*media, *repair_receiver.push(packet, now_ns)):
-            ordered += jitter_buffer.push(each, now_ns)
+        media_packets = [] if packet.ssrc == 8 else [packet]
+        for media_packet in (*media_packets, *repair_receiver.push(packet, now_ns)):
+            ordered += jitter_buffer.push(media_packet, now_ns)
     assert repair_receiver.recovered == 1
     now_ns += MIN_HOLD_NS  # the first packets of a stream wait for any that were sent before them
     ordered += jitter_buffer.expire(now_ns)
@@ -196,9 +198,9 @@ def test_life_of_a_frame(tmp_path: Path) -> None:  # noqa: PLR0915 (one frame, f
     # Frame 9. The lane is detected in the picture: 8 m ahead its centre agrees with the ground truth.
     lane = LaneDetector(model).detect(decoded.picture)
     truth = car.ground_truth()
-    seen_y_m = lane.centre[0] + 8 * lane.centre[1] + 64 * lane.centre[2]
+    detected_y_m = lane.centre[0] + 8 * lane.centre[1] + 8**2 * lane.centre[2]
     assert lane.confidence > 0.5
-    assert abs(seen_y_m - (-truth.cross_track_m - 8 * truth.heading_error_rad)) < 0.1
+    assert abs(detected_y_m - (-truth.cross_track_m - 8 * truth.heading_error_rad)) < 0.1
 
     # Frame 10. The controller decides from the lane: throttle, and steering towards the centre.
     controller = make_controller("lane_keeper", PRESETS["designed"], car.capabilities.wheelbase_m)

@@ -68,7 +68,7 @@ def body(*lines: str) -> str:
 )
 def test_operators(operator: str, line: str, expected: list[str]) -> None:
     """Each operator replaces exactly one operator, value or statement."""
-    assert mutated(body(line), operator) == [body(other) for other in expected]
+    assert mutated(body(line), operator) == [body(expected_line) for expected_line in expected]
 
 
 @pytest.mark.parametrize(
@@ -146,16 +146,17 @@ def test_sampled_mutants_compile(sites: dict[str, list[Site]]) -> None:
         assert mutant.line != mutant.mutated
 
 
-def make_result(by: str, module: str = "safety/takeover_requests.py") -> results.Result:
-    return results.Result(module, "f", "g(a < b)", "g(a <= b)", 0, 3, "comparison", bool(by), by, 1.0)
+def make_result(caught_by: str, module: str = "safety/takeover_requests.py") -> results.Result:
+    """Return the result of a mutant; `caught_by` is a test or "timeout", and empty for a mutant that survived."""
+    return results.Result(module, "f", "g(a < b)", "g(a <= b)", 0, 3, "comparison", bool(caught_by), caught_by, 1.0)
 
 
 def test_results_are_saved(tmp_path: Path) -> None:
     """The last result of a mutant counts, and an invalid line is a user error."""
     file = tmp_path / "results.jsonl"
     assert results.read_results(file) == {}
-    for by in ("", "tests/test_a.py::test_b"):
-        results.append_result(file, make_result(by))
+    for caught_by in ("", "tests/test_a.py::test_b"):
+        results.append_result(file, make_result(caught_by))
     assert list(results.read_results(file).values()) == [make_result("tests/test_a.py::test_b")]
     for line in ("[]", '{"module": "a"}', "nothing"):
         file.write_text(line)
@@ -180,8 +181,10 @@ def test_report_counts_accepted_survivors_separately() -> None:
     assert "50.0%" in lines[-1]
 
 
-def make_entry(of: Mutation) -> str:
-    fields = {"module": of.module, "function": of.function, "line": of.line, "mutated": of.mutated, "reason": "x"}
+def make_entry(mutant: Mutation) -> str:
+    """Return a mutant's entry in the list of accepted survivors."""
+    names = ("module", "function", "line", "mutated")
+    fields = {**{name: getattr(mutant, name) for name in names}, "reason": "x"}
     return "[[accepted]]\n" + "".join(f"{name} = {json.dumps(text)}\n" for name, text in fields.items())
 
 
@@ -217,7 +220,7 @@ def test_mutants_of_a_small_module_are_run(tmp_path: Path) -> None:
     requested = [sys.executable, str(PROGRAM), "--only", "vehicle/dbw/crc8.py", "--out", str(file)]
     first, second = (
         subprocess.run([*requested, "--count", "3"], capture_output=True, text=True, check=True, timeout=250)
-        for _ in "12"
+        for _ in range(2)
     )
     saved = [json.loads(line) for line in file.read_text().splitlines()]
     assert len(saved) == 3

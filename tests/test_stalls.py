@@ -447,13 +447,13 @@ time.sleep(60)
 """
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM])
-def test_probes_end_with_pytest(how: signal.Signals) -> None:
+@pytest.mark.parametrize("with_signal", [signal.SIGKILL, signal.SIGTERM])
+def test_probes_end_with_pytest(with_signal: signal.Signals) -> None:
     """Whether pytest is killed by SIGKILL or SIGTERM, no probe remains."""
     parent = subprocess.Popen([sys.executable, "-c", PARENT], stdout=subprocess.PIPE, text=True)
     assert parent.stdout is not None
     probes = parent.stdout.readline().split()
-    parent.send_signal(how)
+    parent.send_signal(with_signal)
     parent.wait()
     parent.stdout.close()
     assert probes

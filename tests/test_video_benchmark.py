@@ -85,12 +85,16 @@ def test_the_link_follows_the_case(case: LinkCase) -> None:
 def test_traffic_is_counted_after_the_warm_up_by_payload_type() -> None:
     """Bytes and losses are counted from the last packet of the warm-up on, by payload type; RTCP is not counted."""
     traffic = TrafficCounter()
-    media, last, repair, report = (bytes([0x80, kind]) + bytes(98) for kind in (96, 96 | 0x80, 97, 200))
+    media_type, repair_type, rtcp_type, marker = 96, 97, 200, 0x80
+    media, last_of_frame, repair, report = (
+        bytes([0x80, second_byte]) + bytes(98)
+        for second_byte in (media_type, media_type | marker, repair_type, rtcp_type)
+    )
     for _ in range(WARM_UP_FRAMES - 1):
         traffic.note(media, lost=True)
-        traffic.note(last, lost=False)
+        traffic.note(last_of_frame, lost=False)
     assert traffic.counts == {}
-    for datagram, lost in ((last, False), (media, True), (repair, False), (repair, True), (report, True)):
+    for datagram, lost in ((last_of_frame, False), (media, True), (repair, False), (repair, True), (report, True)):
         traffic.note(datagram, lost=lost)
     assert traffic.counts == {
         "media_bytes": 200,

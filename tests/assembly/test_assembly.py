@@ -60,12 +60,14 @@ def test_run_seeds_differ() -> None:
 
 def test_seeded_entropy() -> None:
     """Seeded entropy is reproducible by seed and name, and returns numbers and tokens of the requested length."""
-    one, same, other = (SeededEntropy(seed, name) for seed, name in ((1, "server"), (1, "server"), (1, "client")))
-    values = [one.number(64), one.number(32), one.token(16)]
-    assert values == [same.number(64), same.number(32), same.token(16)]
-    assert values[0] != other.number(64)
-    assert len(one.token(16)) == 16
-    assert all(0 <= one.number(16) < 2**16 for _ in range(200))
+    entropy, equal, of_another_name = (
+        SeededEntropy(seed, name) for seed, name in ((1, "server"), (1, "server"), (1, "client"))
+    )
+    values = [entropy.number(64), entropy.number(32), entropy.token(16)]
+    assert values == [equal.number(64), equal.number(32), equal.token(16)]
+    assert values[0] != of_another_name.number(64)
+    assert len(entropy.token(16)) == 16
+    assert all(0 <= entropy.number(16) < 2**16 for _ in range(200))
 
 
 def test_machine_entropy() -> None:
@@ -148,18 +150,21 @@ def test_unknown_vehicle() -> None:
 def test_configured_settings_replace_those_of_the_preset() -> None:
     """A configured lookahead, limit or speed changes the commands, and results list the changed settings."""
     changed = ControllerConfig(preset="designed", lookahead_s=2.0, speed_mps=5.0)
-    lane = Lane((0.5, 0.0, 0.0), 3.5, 3.6, 20.0, 1.0)
-    far, near = (build_controller(config).decide(lane, 8.0, 0) for config in (changed, ControllerConfig()))
+    lane = Lane(centre=(0.5, 0.0, 0.0), width_m=3.5, near_m=3.6, far_m=20.0, confidence=1.0)
+    by_changed, by_preset = (build_controller(config).decide(lane, 8.0, 0) for config in (changed, ControllerConfig()))
 
-    assert 0 < far.steering_rad < near.steering_rad
-    assert (far.throttle, near.brake) == (0.0, 0.0)
-    assert far.brake > 0
+    assert 0 < by_changed.steering_rad < by_preset.steering_rad
+    assert (by_changed.throttle, by_preset.brake) == (0.0, 0.0)
+    assert by_changed.brake > 0
     assert changed.settings == "designed, lookahead_s 2, speed_mps 5"
     assert ControllerConfig().settings == "designed"
 
 
 def test_lazy_physics_advances_for_frames_and_states_only() -> None:
-    """With lazy physics the simulator advances for frames and states only; a vehicle that cannot catch up does not."""
+    """With lazy physics the simulator advances only for frames and states, 30 and 50 a second.
+
+    A vehicle that cannot catch up still advances at every step.
+    """
     config = ServerConfig(camera=ServerCameraConfig(width_px=128, height_px=128))
     every_step, lazy, without_catching_up = (
         build_server(

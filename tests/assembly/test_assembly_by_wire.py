@@ -17,13 +17,13 @@ from lavt.vehicle.dbw.profile import Profile
 
 
 @pytest.fixture
-def known() -> Profile:
+def verified_profile() -> Profile:
     """Return a profile with a known steering sign and only verified signals."""
     return load_profile("dataspeed_gen1", steering_sign=1)
 
 
 WALL_NS = 1_790_000_000 * NS_PER_S
-REAL = DbwConfig(interface="socketcan", channel="no_such_bus", car="VIN 1")
+REAL_BUS = DbwConfig(interface="socketcan", channel="no_such_bus", car="VIN 1")
 KEYS = ServerSecurityConfig(key="vehicle.sign.key", operators={"alice": "alice.sign.pub"})
 
 
@@ -34,51 +34,53 @@ def reason_for(
     return inhibit_reason_of(server, profile, wall_ns)
 
 
-def test_a_real_bus_without_keys_inhibits_arming(known: Profile) -> None:
+def test_a_real_bus_without_keys_inhibits_arming(verified_profile: Profile) -> None:
     """A bus that may have a real car is not driven without signing keys; a virtual bus is."""
-    assert "security.key" in reason_for(REAL, known, ServerSecurityConfig())
-    assert "security.key" not in reason_for(REAL, known)
+    assert "security.key" in reason_for(REAL_BUS, verified_profile, ServerSecurityConfig())
+    assert "security.key" not in reason_for(REAL_BUS, verified_profile)
     virtual = DbwConfig(interface="udp_multicast", channel="239.74.163.2")
-    assert "security.key" not in reason_for(virtual, known, ServerSecurityConfig())
+    assert "security.key" not in reason_for(virtual, verified_profile, ServerSecurityConfig())
     routed = virtual.model_copy(update={"options": {"hop_limit": 1}})
-    assert "security.key" in reason_for(routed, known, ServerSecurityConfig())
+    assert "security.key" in reason_for(routed, verified_profile, ServerSecurityConfig())
 
 
-def test_a_real_bus_without_a_car_inhibits_arming(known: Profile) -> None:
+def test_a_real_bus_without_a_car_inhibits_arming(verified_profile: Profile) -> None:
     """A bus that may have a real car needs the car's name, which its watchdog proof must have."""
-    assert "vehicle.dbw.car" in reason_for(REAL.model_copy(update={"car": ""}), known)
-    assert "vehicle.dbw.watchdog_proof" in reason_for(REAL, known)
+    assert "vehicle.dbw.car" in reason_for(REAL_BUS.model_copy(update={"car": ""}), verified_profile)
+    assert "vehicle.dbw.watchdog_proof" in reason_for(REAL_BUS, verified_profile)
 
 
 def test_unverified_signals_inhibit_arming_on_a_real_bus() -> None:
     """Unverified signals inhibit arming on any bus that is not known to be virtual."""
     unverified = load_profile("dataspeed_gen2")
-    assert "unverified" in reason_for(REAL, unverified)
+    assert "unverified" in reason_for(REAL_BUS, unverified)
     virtual = DbwConfig(interface="udp_multicast", channel="239.74.163.2")
     assert "unverified" not in reason_for(virtual, unverified)
 
 
-def test_a_missing_proof_inhibits_arming(known: Profile) -> None:
+def test_a_missing_proof_inhibits_arming(verified_profile: Profile) -> None:
     """A missing watchdog proof inhibits arming, even on a virtual bus."""
     config = DbwConfig(interface="virtual", channel="test")
-    assert "vehicle.dbw.watchdog_proof" in reason_for(config, known)
+    assert "vehicle.dbw.watchdog_proof" in reason_for(config, verified_profile)
 
 
 @pytest.mark.parametrize(("limit", "is_enough"), [(0.66, False), (0.67, True)])
-def test_a_brake_too_weak_for_a_safe_stop_inhibits_arming(known: Profile, limit: float, is_enough: bool) -> None:
+def test_a_brake_too_weak_for_a_safe_stop_inhibits_arming(
+    verified_profile: Profile, limit: float, is_enough: bool
+) -> None:
     """A brake limit below the 4 m/s2 of a safe stop, on which all speed limits depend, inhibits arming."""
-    reason = reason_for(REAL, replace(known, limits=replace(known.limits, brake=limit)))
+    reason = reason_for(REAL_BUS, replace(verified_profile, limits=replace(verified_profile.limits, brake=limit)))
     assert ("limits.brake" in reason) is not is_enough
 
 
 @pytest.mark.parametrize("name", ["dataspeed_gen1", "dataspeed_gen2"])
-def test_a_kit_that_is_off_and_has_no_proof_has_a_readable_state(known: Profile, name: str) -> None:
+def test_a_kit_that_is_off_and_has_no_proof_has_a_readable_state(verified_profile: Profile, name: str) -> None:
     """The state of a kit that is off and has no watchdog proof can be decoded, with the beginning of its reasons."""
     profile = load_profile(name, steering_sign=1)
-    adapter = ByWireAdapter(profile, start_ns=0, inhibit_reason=reason_for(REAL, known))
+    adapter = ByWireAdapter(profile, start_ns=0, inhibit_reason=reason_for(REAL_BUS, verified_profile))
     adapter.frames_due(NS_PER_S)
     reason = adapter.state().inhibit_reason
     state = State(0, 0, 0.0, 0.0, "park", "disarmed", reason, -1, f"{RejectionReason.INHIBITED}: {reason}")
-    read = decode(State, encode(state))
-    assert read.reason == state.reason
-    assert state.rejected.startswith(read.rejected.removesuffix(ELLIPSIS))
+    decoded = decode(State, encode(state))
+    assert decoded.reason == state.reason
+    assert state.rejected.startswith(decoded.rejected.removesuffix(ELLIPSIS))

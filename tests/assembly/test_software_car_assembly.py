@@ -26,7 +26,7 @@ def build(profile: str, config: ServerConfig | None = None) -> SoftwareCar:
         ("dataspeed_gen2:user", "user"),
     ],
 )
-def test_the_kit_is_the_profiles(profile: str, accepted: str) -> None:
+def test_the_kit_obeys_the_commands_of_its_profile(profile: str, accepted: str) -> None:
     """The kit obeys the commands of the generation and set that the profile is for, and no others."""
     senders: dict[str, Sender1 | Sender2] = {
         "generation 1": Sender1(),
@@ -51,6 +51,8 @@ def test_the_car_matches_the_config() -> None:
 
 def test_a_config_with_bus_options_is_hashable() -> None:
     """Configs with equal bus options are equal and have equal hashes, so that they can be keys of a cache."""
-    one, same, other = (VehicleConfig(dbw=DbwConfig(options={"port": port})) for port in (1, 1, 2))
-    assert hash(one) == hash(same)
-    assert len({one, same, other}) == 2
+    config, equal_config, different_config = (
+        VehicleConfig(dbw=DbwConfig(options={"port": port})) for port in (1, 1, 2)
+    )
+    assert hash(config) == hash(equal_config)
+    assert len({config, equal_config, different_config}) == 2

@@ -161,7 +161,7 @@ def test_bad_netem(case: str, run: Run) -> None:
     """Invalid arguments of `lavt netem` are rejected in one sentence before anything is changed."""
     arguments, reason = BAD_NETEM[case]
     rejected = run("netem", *arguments).rejected()
-    assert reason in rejected or "no tc" in rejected
+    assert reason in rejected or "no tc" in rejected  # on a machine without tc
 
 
 def test_netem_dry_run(run: Run) -> None:
@@ -284,7 +284,7 @@ def test_report_of_an_invalid_result(case: str, run: Run, tmp_path: Path) -> Non
 
 
 def test_report_of_a_boundary_without_runs(run: Run, tmp_path: Path) -> None:
-    """A boundary without runs is rejected, and an invalid boundary.json ends the report with exit code 1."""
+    """A boundary.json without runs is rejected, and an invalid one ends the report with exit code 1."""
     (tmp_path / "found").mkdir()
     (tmp_path / "found" / "boundary.json").write_text('{"runs": [{}], "groups": [{}]}')
     assert "found" in run("report", "found").rejected()
@@ -344,8 +344,8 @@ def test_an_expired_signing_key(side: str, config: str, run: Run, tmp_path: Path
     private.write_bytes(pair.private)
     private.chmod(0o600)
     public.write_bytes(pair.public)
-    other = f"security.operators={{a: {public}}}" if side == "server" else f"security.vehicle={public}"
-    sentence = run(side, config, "--set", f"security.key={private}", "--set", other, "--out", "mine").rejected()
+    peer_key = f"security.operators={{a: {public}}}" if side == "server" else f"security.vehicle={public}"
+    sentence = run(side, config, "--set", f"security.key={private}", "--set", peer_key, "--out", "mine").rejected()
     assert str(private) in sentence or str(public) in sentence
     assert "1970-01-02" in sentence
     assert not (tmp_path / "mine").exists()

@@ -275,7 +275,7 @@ def test_all_mismatches(run: Run, tmp_path: Path) -> None:
 
 
 def test_mismatch_found_by_loading(run: Run, tmp_path: Path) -> None:
-    """An error that only loading the profile for driving finds is a mismatch, too."""
+    """An error that is found only when the profile is loaded for driving is reported as a mismatch, too."""
     code, _, err = run(
         edited(tmp_path, "dataspeed_gen1", lambda profile: profile["sent"]["brake"].update(value="PCMD_TORQUE"))
     )

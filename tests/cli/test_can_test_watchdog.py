@@ -25,7 +25,7 @@ from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.vehicle.dbw.watchdog_test import WatchdogObservation
 
 SERVER = str(shipped("configs/server.yaml"))
-GROUP = "239.74.163.2"
+MULTICAST_GROUP = "239.74.163.2"
 
 
 @pytest.fixture
@@ -39,7 +39,7 @@ def by_wire_options(profile: str, port: int = 0, **dbw_changes: str) -> list[str
     dbw = {
         "profile": profile,
         "interface": "udp_multicast",
-        "channel": GROUP,
+        "channel": MULTICAST_GROUP,
         "options": f"{{port: {port}}}",
         **dbw_changes,
     }
@@ -92,7 +92,7 @@ def test_a_car_that_brakes_passes(run: Run, tmp_path: Path, port: int, profile: 
     assert printed == written
     assert 100 <= written["release_ms"] <= written["braked_ms"] <= 500
     assert written["gear"] == "park"
-    config = DbwConfig(profile=profile, interface="udp_multicast", channel=GROUP, options={"port": port})
+    config = DbwConfig(profile=profile, interface="udp_multicast", channel=MULTICAST_GROUP, options={"port": port})
     assert proof_rejection("proof.json", load_profile(profile), config, MachineClock().now().wall_ns) == ""
 
 
@@ -161,12 +161,15 @@ REJECTED: list[tuple[list[str], str]] = [
 
 @pytest.mark.parametrize(("arguments", "reason"), REJECTED, ids=[reason[:30] for _, reason in REJECTED])
 def test_rejected(run: Run, monkeypatch: pytest.MonkeyPatch, arguments: list[str], reason: str) -> None:
-    """An unsuitable vehicle, bus, profile or file is rejected in one sentence before anything is sent."""
+    """An unsuitable vehicle, bus, profile or file, or no terminal for the confirmation, is rejected in one sentence.
+
+    Nothing has been sent by then.
+    """
     monkeypatch.setattr(sys, "stdin", io.StringIO("yes\n"))
     assert reason in run(*arguments).rejected()
 
 
-CONFIG = DbwConfig(profile="dataspeed_gen2", interface="udp_multicast", channel=GROUP)
+CONFIG = DbwConfig(profile="dataspeed_gen2", interface="udp_multicast", channel=MULTICAST_GROUP)
 PROFILE = load_profile("dataspeed_gen2")
 WALL_NS = 1_790_000_000 * NS_PER_S
 

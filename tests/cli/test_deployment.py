@@ -54,8 +54,8 @@ def test_units_are_valid_for_systemd(path: Path, tmp_path: Path) -> None:
     """systemd-analyze accepts each unit, with an existing program in place of the documented path."""
     if shutil.which("systemd-analyze") is None:
         need("systemd", "needs systemd-analyze: apt-get install systemd")
-    for other in UNITS:  # the units refer to each other
-        (tmp_path / other.name).write_text(other.read_text().replace(PROGRAM, shutil.which("true") or "/bin/true"))
+    for unit in UNITS:  # the units refer to each other
+        (tmp_path / unit.name).write_text(unit.read_text().replace(PROGRAM, shutil.which("true") or "/bin/true"))
     command = ["systemd-analyze", "verify", "--man=no", str(tmp_path / path.name)]
     result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert (result.returncode, result.stdout, result.stderr) == (0, "", "")

@@ -68,8 +68,8 @@ def check_camera(sample: CameraSample | str) -> Check:
     return checks.check_camera(sample, name="/dev/video0", size="640x480", rate_hz=30.0)
 
 
-def camera_sample(rate_hz: float, with_capture_time: int = 0) -> CameraSample:
-    return CameraSample([round(number * 1e9 / rate_hz) for number in range(61)], with_capture_time)
+def camera_sample(rate_hz: float, pictures_with_capture_time: int = 0) -> CameraSample:
+    return CameraSample([round(number * 1e9 / rate_hz) for number in range(61)], pictures_with_capture_time)
 
 
 COMPARISON = ClockComparison(True, ("this clock", "both agree"), None, ClockEstimate(1.0, 0.5), 1.0)
@@ -273,9 +273,9 @@ def test_camera_device(tmp_path: Path, rate_hz: float, size: tuple[int, int], ve
     video = write_video(tmp_path / "video.avi", rate_hz=30.0)
     camera = ["source=device", f"device={video}", f"rate_hz={rate_hz}", f"width_px={size[0]}", f"height_px={size[1]}"]
     changes = [f"camera.{setting}" for setting in camera]
-    found = check_config(shipped("configs/server.yaml"), *changes, "zenoh.router=tcp/127.0.0.1:1")["camera"]
-    assert found.verdict in verdicts
-    assert part in found.found
+    checks_by_name = check_config(shipped("configs/server.yaml"), *changes, "zenoh.router=tcp/127.0.0.1:1")
+    assert checks_by_name["camera"].verdict in verdicts
+    assert part in checks_by_name["camera"].found
 
 
 @pytest.mark.usefixtures("quick")
@@ -352,9 +352,9 @@ def check_client(run: Run, router: str, probe_port: int, vehicle: str, payload: 
         who="server",
     )
     changes = [f"vehicle_id={vehicle}", f"zenoh.router={router}", f"clock.probe_port={probe_port}"]
-    sets = [part for change in changes for part in ("--set", change)]
+    set_options = [part for change in changes for part in ("--set", change)]
     with sending(server, lambda: server.send(Send("state", payload))):
-        code, out, _ = run("doctor", str(shipped("configs/client.yaml")), "--json", *sets)
+        code, out, _ = run("doctor", str(shipped("configs/client.yaml")), "--json", *set_options)
     result = json.loads(out)
     assert code == (0 if result["good"] else 1)
     return {check["name"]: check for check in result["checks"]}

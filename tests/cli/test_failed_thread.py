@@ -18,9 +18,9 @@ from lavt.config_file import shipped
 from lavt.transport import udp_link
 from lavt.transport.zenoh_link import Router, ZenohLink
 
-HERE = "127.0.0.1"
+LOOPBACK = "127.0.0.1"
 NO_ROUTER = "tcp/127.0.0.1:1"
-PERIOD_S = 0.05
+SENDING_PERIOD_S = 0.05
 
 
 def fail(*_: Any) -> Any:
@@ -34,8 +34,8 @@ def sending(port: int) -> Iterator[None]:
 
     def send() -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-            while not is_over.wait(PERIOD_S):
-                sender.sendto(b"x", (HERE, port))
+            while not is_over.wait(SENDING_PERIOD_S):
+                sender.sendto(b"x", (LOOPBACK, port))
 
     thread = threading.Thread(target=send)
     thread.start()
@@ -51,14 +51,18 @@ def test_a_command_fails_with_its_receiving_thread(command: str, run: Run, monke
     """If a receiving thread fails, the command exits with code 1 instead of running on without receiving."""
     port = free_port()
     arguments = {
-        "watch": ["--bind", HERE, "--port", str(port)],
+        "watch": ["--bind", LOOPBACK, "--port", str(port)],
         "rendezvous": [
             str(shipped("configs/rendezvous.yaml")),
-            *(word for change in (f"bind={HERE}", f"video_port={port}", "probe_port=0") for word in ("--set", change)),
+            *(
+                word
+                for change in (f"bind={LOOPBACK}", f"video_port={port}", "probe_port=0")
+                for word in ("--set", change)
+            ),
         ],
         "server": [
             str(shipped("configs/server.yaml")),
-            *("--set", f"video.bind={HERE}", "--set", f"video.port={port}", "--set", "clock.probe_port=0"),
+            *("--set", f"video.bind={LOOPBACK}", "--set", f"video.port={port}", "--set", "clock.probe_port=0"),
             *("--set", f"zenoh.router={NO_ROUTER}", "--set", "vehicle.scenery=none"),
         ],
     }
@@ -71,7 +75,7 @@ def test_a_command_fails_with_its_receiving_thread(command: str, run: Run, monke
 
 def test_a_server_fails_if_a_session_opened_later_cannot_declare(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """If the declarations of a session that opens in the background fail, the server exits with code 1."""
-    endpoint = f"tcp/{HERE}:{free_port(socket.SOCK_STREAM)}"
+    endpoint = f"tcp/{LOOPBACK}:{free_port(socket.SOCK_STREAM)}"
     router = Router(shipped("zenoh-configs/router-server.json5"), {"listen/endpoints": [endpoint]})
     open_session, attempts = zenoh.open, itertools.count()
 
@@ -82,7 +86,7 @@ def test_a_server_fails_if_a_session_opened_later_cannot_declare(run: Run, monke
 
     monkeypatch.setattr(zenoh, "open", open_later)
     monkeypatch.setattr(ZenohLink, "_declare", fail)
-    settings = (f"video.bind={HERE}", f"video.port={free_port()}", "clock.probe_port=0", "vehicle.scenery=none")
+    settings = (f"video.bind={LOOPBACK}", f"video.port={free_port()}", "clock.probe_port=0", "vehicle.scenery=none")
     changes = (word for change in (*settings, f"zenoh.router={endpoint}") for word in ("--set", change))
     try:
         result = run("server", str(shipped("configs/server.yaml")), *changes)

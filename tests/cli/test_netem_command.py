@@ -37,14 +37,14 @@ class SimulatedInterface(NetemInterface):
         self.commands.append(line)
         return ""
 
-    def verify(self, *_arguments: object, **_more: object) -> Verification:
+    def verify(self, *_arguments: object, **_keywords: object) -> Verification:
         """Return a successful verification."""
         return Verification([], {})
 
 
 def apply_to(interface: SimulatedInterface, monkeypatch: pytest.MonkeyPatch) -> None:
     """Run `lavt netem apply L4 --role server --interface eth0`."""
-    monkeypatch.setattr(command, "NetemInterface", lambda *_arguments, **_more: interface)
+    monkeypatch.setattr(command, "NetemInterface", lambda *_arguments, **_keywords: interface)
     command.apply("L4", "eth0", "server")
 
 

@@ -56,7 +56,8 @@ def test_the_steps_of_a_picture_are_drawn(show: Show) -> None:
     show("road.png")
     steps = cv2.imread("road-steps.png")
     assert steps is not None
-    assert steps.shape == (3 * 324, 4 * 400, 3)
+    rows, columns, height_px, width_px = 3, 4, 324, 400
+    assert steps.shape == (rows * height_px, columns * width_px, 3)
     assert steps[:24].max() > 200  # the labels
 
 

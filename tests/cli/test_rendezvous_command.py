@@ -15,14 +15,14 @@ from lavt.config_file import shipped
 from lavt.transport.clock_sync.probe import encode_request
 from lavt.transport.rendezvous.forwarder import encode_registration, wrap
 
-HERE = "127.0.0.1"
+LOOPBACK = "127.0.0.1"
 EXIT_TIMEOUT_S = 30.0
 
 
 @contextmanager
 def rendezvous(*options: str) -> Iterator[subprocess.Popen[str]]:
     """Run the command on free ports."""
-    changes = [word for change in (f"bind={HERE}", "video_port=0", "probe_port=0") for word in ("--set", change)]
+    changes = [word for change in (f"bind={LOOPBACK}", "video_port=0", "probe_port=0") for word in ("--set", change)]
     process = subprocess.Popen(
         [sys.executable, "-m", "lavt", "rendezvous", str(shipped("configs/rendezvous.yaml")), *changes, *options],
         stdout=subprocess.PIPE,
@@ -40,7 +40,7 @@ def rendezvous(*options: str) -> Iterator[subprocess.Popen[str]]:
 def vehicle() -> Iterator[socket.socket]:
     """Open the vehicle's socket."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle_socket:
-        vehicle_socket.bind((HERE, 0))
+        vehicle_socket.bind((LOOPBACK, 0))
         vehicle_socket.settimeout(EXIT_TIMEOUT_S)
         yield vehicle_socket
 
@@ -51,8 +51,8 @@ def test_output_as_text(vehicle: socket.socket) -> None:
         assert process.stdout is not None
         port = re.search(r"video at port (\d+)", process.stdout.readline())
         assert port is not None
-        vehicle.sendto(encode_registration("vehicle-1", "video", 1, None), (HERE, int(port[1])))
-        assert f"{HERE}:{vehicle.getsockname()[1]}" in process.stdout.readline()
+        vehicle.sendto(encode_registration("vehicle-1", "video", 1, None), (LOOPBACK, int(port[1])))
+        assert f"{LOOPBACK}:{vehicle.getsockname()[1]}" in process.stdout.readline()
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=EXIT_TIMEOUT_S)
     assert (process.returncode, out, err) == (0, "", "")
@@ -61,11 +61,11 @@ def test_output_as_text(vehicle: socket.socket) -> None:
 def test_output_as_json(vehicle: socket.socket) -> None:
     """As JSON, the command prints its ports, the vehicle's address, and finally the counts of each flow."""
     with rendezvous("--json") as process, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
-        client.bind((HERE, 0))
+        client.bind((LOOPBACK, 0))
         client.settimeout(EXIT_TIMEOUT_S)
         assert process.stdout is not None
         ports = json.loads(process.stdout.readline())["ready"]
-        address = (HERE, ports["probe_port"])
+        address = (LOOPBACK, ports["probe_port"])
         vehicle.sendto(encode_registration("vehicle-1", "probe", 1, None), address)
         expected = {"flow": "probe", "vehicle_at": list(vehicle.getsockname())}
         assert json.loads(process.stdout.readline()) == expected

@@ -19,6 +19,9 @@ rails: [{offset_m: -4, kind: barrier, to_m: 30}]
 """
 
 
+ASPHALT_BGR, GRASS_BGR = (0x96, 0x90, 0x8D), (0xD5, 0xE8, 0xDF)
+
+
 @pytest.fixture
 def bend(tmp_path: Path) -> Path:
     path = tmp_path / "bend.yaml"
@@ -33,7 +36,7 @@ def test_a_custom_road_is_drawn(run: Run, bend: Path, tmp_path: Path) -> None:
     assert (code, str(out) in printed) == (0, True)
     picture = cv2.imread(str(out))
     assert picture is not None
-    for colour in ((0x96, 0x90, 0x8D), (0xD5, 0xE8, 0xDF)):
+    for colour in (ASPHALT_BGR, GRASS_BGR):
         assert (np.abs(picture.astype(int) - colour).max(axis=-1) < 3).sum() > 1000
 
 

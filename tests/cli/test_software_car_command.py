@@ -29,7 +29,7 @@ from lavt.vehicle.software_car.generation_1 import STEERING_REPORT
 from lavt.vehicle.software_car.generation_2_layouts import REPORT_LAYOUTS
 
 SERVER = str(shipped("configs/server.yaml"))
-GROUP = "239.74.163.2"
+MULTICAST_GROUP = "239.74.163.2"
 TIMEOUT_S = 20
 
 
@@ -37,7 +37,7 @@ class SoftwareCarProgram:
     """A `lavt software-car` process on a bus of its own, and this process's port on that bus."""
 
     def __init__(self, *changes: str, as_json: bool = True) -> None:
-        bus = ["vehicle.dbw.interface=udp_multicast", f"vehicle.dbw.channel={GROUP}"]
+        bus = ["vehicle.dbw.interface=udp_multicast", f"vehicle.dbw.channel={MULTICAST_GROUP}"]
         port = free_port()
         options = [f"vehicle.dbw.options={{port: {port}}}"]
         arguments = [part for change in (*bus, *options, *changes) for part in ("--set", change)]
@@ -49,7 +49,7 @@ class SoftwareCarProgram:
             text=True,
             bufsize=1,
         )
-        self.port = CanPort("udp_multicast", GROUP, {"port": port}, clock=MachineClock())
+        self.port = CanPort("udp_multicast", MULTICAST_GROUP, {"port": port}, clock=MachineClock())
 
     def read_line(self) -> str:
         """Read the next printed line."""
@@ -89,9 +89,9 @@ class SoftwareCarProgram:
             pause(NS_PER_MS)
         return received
 
-    def end(self, number: signal.Signals = signal.SIGINT) -> tuple[str, str]:
+    def end(self, with_signal: signal.Signals = signal.SIGINT) -> tuple[str, str]:
         """End the process by a signal; return the rest of its output."""
-        self.process.send_signal(number)
+        self.process.send_signal(with_signal)
         out, err = self.process.communicate(timeout=TIMEOUT_S)
         return out, err
 
@@ -130,7 +130,7 @@ def test_reports_and_ground_truth(start: Start) -> None:
             "generation": 2,
             "commands": "remote",
             "interface": "udp_multicast",
-            "channel": GROUP,
+            "channel": MULTICAST_GROUP,
             "truth": address,
         }
         program.receive(bool)
@@ -186,12 +186,14 @@ def test_driven_by_another_process(generation: int, start: Start) -> None:
     program = start(f"vehicle.dbw.profile=dataspeed_gen{generation}")
     program.read_json()
     sender: Sender1 | Sender2 = Sender1() if generation == 1 else Sender2()
-    for index in range(125):
-        program.send(*sender.commands(CommandValues(brake=0.5) if index < 25 else CommandValues(throttle=0.4)))
+    braking_commands, all_commands = 25, 125
+    for index in range(all_commands):
+        values = CommandValues(brake=0.5) if index < braking_commands else CommandValues(throttle=0.4)
+        program.send(*sender.commands(values))
         if index in {10, 12} and isinstance(sender, Sender2):
             program.send(sender.system(1))
         if index == 20:
-            program.send(sender.gear(4))
+            program.send(sender.gear(4))  # DRIVE
         pause(20 * NS_PER_MS)
     enabled = program.wait_for("enabled")
     while not enabled["text"].endswith(": steering, brake, throttle"):  # generation 1 enables one axis after another
@@ -199,7 +201,7 @@ def test_driven_by_another_process(generation: int, start: Start) -> None:
     assert "DRIVE" in program.wait_for("gear")["text"]
     assert "no command" in program.wait_for("enabled")["text"]
     assert "no command" in program.wait_for("watchdog")["text"]
-    speeds_mps = [
+    speeds_mps = [  # reported in 0.01 km/h
         int.from_bytes(report.frame.data[4:6] if generation == 1 else report.frame.data[:2], "little", signed=True)
         / 360
         for report in program.port.take(0)
@@ -212,7 +214,7 @@ def test_driven_by_another_process(generation: int, start: Start) -> None:
 def test_output_as_text(start: Start) -> None:
     """Without `--json` the car prints its bus, and each event with the time since the start."""
     program = start(as_json=False)
-    assert f"udp_multicast {GROUP}" in program.read_line()
+    assert f"udp_multicast {MULTICAST_GROUP}" in program.read_line()
     program.type("driver_shifts DRIVE")
     assert program.read_line().endswith(" s  driver_shifts DRIVE\n")
     time_s, _, text = program.read_line().partition(" s  ")

@@ -22,6 +22,8 @@ REQUEST = SessionRequest("emergency_stop", "alice", 1, 60)
 ACCEPTED = SessionReply(True, "", 0, b"", 5600, "kernel", 60)
 REJECTED = SessionReply(False, "the number of this emergency stop is not a new one", 0, b"", 5600, "kernel", 59)
 CONFIG = str(shipped("configs/client.yaml"))
+READING_STEP_NS = 100 * NS_PER_MS
+"""The clock of `repeat` advances by this at each reading, and so between two queries."""
 
 
 class Vehicle:
@@ -42,8 +44,8 @@ class Vehicle:
 
 
 def repeat(vehicle: Vehicle, timeout_s: float = 10.0) -> None:
-    """Repeat the stop, with a clock that advances by 100 ms at each reading."""
-    clock = ManualClock(step_ns=100 * NS_PER_MS)
+    """Repeat the stop until it is confirmed or the timeout is over."""
+    clock = ManualClock(step_ns=READING_STEP_NS)
     stop._repeat_until_confirmed(vehicle.send, vehicle.replies, REQUEST, clock, timeout_s)
 
 
@@ -62,7 +64,7 @@ def test_a_stop_is_repeated_until_it_is_confirmed(confirmation: SessionReply) ->
 
 
 def test_a_clock_behind_the_last_stop_is_no_obstacle() -> None:
-    """If the vehicle knows a higher number, the stop is repeated with the next one, again if that was overtaken too."""
+    """If the vehicle knows a higher number, the stop is repeated with the number after it, as often as necessary."""
     vehicle = Vehicle(
         encode(replace(REJECTED, emergency_stop=70)),
         encode(replace(REJECTED, emergency_stop=90)),
@@ -79,7 +81,7 @@ def test_a_stop_without_confirmation_fails_after_the_timeout(timeout_s: float) -
     vehicle = Vehicle()
     with pytest.raises(WorkError, match=r"NOT confirmed.*`lavt doctor CONFIG`"):
         repeat(vehicle, timeout_s)
-    assert len(vehicle.numbers) == round(timeout_s * NS_PER_S) // (100 * NS_PER_MS) - 1
+    assert len(vehicle.numbers) == round(timeout_s * NS_PER_S) // READING_STEP_NS - 1
     assert "`lavt doctor CONFIG`" in NO_STATE_YET
 
 

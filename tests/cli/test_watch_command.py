@@ -43,7 +43,7 @@ def port() -> int:
 
 @contextmanager
 def sending(port: int, *, base: int = 0, garbage: bool = False) -> Iterator[socket.socket]:
-    """Send stamped keyframes to a port of this machine; `base` is the base of the RTP timestamps."""
+    """Send stamped keyframes to a port of this machine; `base` is added to their RTP timestamps."""
     is_over, clock = threading.Event(), MachineClock()
     encoder = Encoder(WIDTH_PX, HEIGHT_PX, rate_hz=RATE_HZ, bit_rate_bps=1_000_000, gop_frames=1)
     packetizer = Packetizer(7, 0)
@@ -97,7 +97,7 @@ def test_a_stream_of_lavt(run: Run, port: int) -> None:
 
 
 def test_a_foreign_stream(run: Run, port: int) -> None:
-    """All stamps of a foreign sender are accepted, except the first ones from which the RTP base is learned."""
+    """All stamps of a foreign sender are accepted, except the first, from which the base of timestamps is learned."""
     with sending(port, base=123_456_789):
         code, out, _ = run("--port", str(port), "--seconds", "1", "--json", "--sender", "foreign")
     kind, summary = parse_lines(out)[-1]

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.nodes.stand_ins import NoiseCamera
-from tests.vehicle.moving_video import MODEL as MOVING
+from tests.vehicle.moving_video import MODEL as MODEL_OF_THE_VIDEO
 from tests.vehicle.moving_video import write_video
 
 from lavt.clock import MachineClock
@@ -37,7 +37,7 @@ def camera(name: str, tmp_path: Path) -> Iterator[Camera]:
         yield RENDERERS[name]()
         return
     path = write_video(tmp_path / "video.avi", rate_hz=30.0)
-    device = VideoDevice(str(path), model=MOVING, rate_hz=30.0, clock=MachineClock())
+    device = VideoDevice(str(path), model=MODEL_OF_THE_VIDEO, rate_hz=30.0, clock=MachineClock())
     yield device
     device.close()
 

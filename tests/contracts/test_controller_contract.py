@@ -14,11 +14,11 @@ from lavt.domain import NS_PER_S, PATH_POINTS, Decision, Lane
 FRAME_NS = NS_PER_S // 30
 LANES = st.builds(
     Lane,
-    st.tuples(st.floats(-5, 5), st.floats(-1, 1), st.floats(-0.1, 0.1)),
-    st.floats(2, 5),
-    st.just(3.6),
-    st.floats(5, 20),
-    st.floats(0, 1),
+    centre=st.tuples(st.floats(-5, 5), st.floats(-1, 1), st.floats(-0.1, 0.1)),
+    width_m=st.floats(2, 5),
+    near_m=st.just(3.6),
+    far_m=st.floats(5, 20),
+    confidence=st.floats(0, 1),
 )
 OBSERVATIONS = st.lists(st.tuples(LANES, st.floats(0, 20)), min_size=1, max_size=12)
 every_controller = pytest.mark.parametrize(
@@ -58,7 +58,11 @@ def test_decisions_are_in_range_and_reproducible(
 @pytest.mark.parametrize("speed_mps", [0.0, 2.0, 8.3, 15.0])
 def test_without_a_lane_there_is_no_throttle(kind: str, preset: str, speed_mps: float) -> None:
     """Without a lane there is no throttle, whether or not a lane was detected before."""
-    for with_lane in ([], [(Lane((0.0, 0.0, 0.0), 3.5, 3.6, 20.0, 1.0), speed_mps)]):
-        without_lane = [(Lane((0.0, 0.0, 0.0), 3.5, 3.6, 20.0, 0.0), speed_mps)] * 40
+    detected, undetected = (
+        Lane(centre=(0.0, 0.0, 0.0), width_m=3.5, near_m=3.6, far_m=20.0, confidence=confidence)
+        for confidence in (1.0, 0.0)
+    )
+    for with_lane in ([], [(detected, speed_mps)]):
+        without_lane = [(undetected, speed_mps)] * 40
         decisions = decide(new(kind, preset), with_lane + without_lane)[len(with_lane) :]
         assert all(decision.throttle == 0 for decision in decisions)

@@ -53,9 +53,9 @@ def dependencies(package: str) -> set[str]:
     names: set[str] = set()
     unread_files = list(python_files(package))
     while unread_files:
-        new = imported_modules(unread_files.pop()) - names
-        names |= new
-        unread_files += [path for name in new if (path := module_file(name)) is not None]
+        new_names = imported_modules(unread_files.pop()) - names
+        names |= new_names
+        unread_files += [path for name in new_names if (path := module_file(name)) is not None]
     return {name for name in names if not name.startswith(package)} - {"lavt.vehicle"}
 
 

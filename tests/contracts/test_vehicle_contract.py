@@ -51,7 +51,7 @@ def run(vehicle: Vehicle, start_ns: int, actuation: Actuation, *, should_engage:
 
 @each_vehicle
 def test_state_times_and_wake_times(name: str) -> None:
-    """A state's time never decreases or exceeds the time of `advance`; the next wake time is later than the state."""
+    """A state's time never decreases or exceeds the time of `advance`; the next wake time is later than this time."""
     vehicle = VEHICLES[name]()
     vehicle.advance(MONO_NS + 20 * NS_PER_MS)
     before_ns = vehicle.state().mono_ns
@@ -95,9 +95,9 @@ def test_capabilities(name: str) -> None:
 def test_any_actuation_leaves_a_finite_state(name: str, requested: list[tuple[float, float, float, int]]) -> None:
     """Any actuations within their ranges leave a finite state and a steering angle within the limits."""
     vehicle, now_ns = VEHICLES[name](), MONO_NS
-    for steering_rad, throttle, brake, ms in requested:
+    for steering_rad, throttle, brake, duration_ms in requested:
         vehicle.apply(Actuation(steering_rad, throttle, brake), now_ns)
-        now_ns += ms * NS_PER_MS
+        now_ns += duration_ms * NS_PER_MS
         events = vehicle.advance(now_ns)
         assert [event.mono_ns for event in events] == sorted(event.mono_ns for event in events)
         state = vehicle.state()

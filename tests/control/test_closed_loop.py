@@ -24,7 +24,7 @@ ROAD = load_road("a_key")
 
 @dataclass
 class LaneKeepingDrive:
-    """What happened in a drive."""
+    """The errors, speeds and events of a drive, and the last state of the lane watch."""
 
     cross_track_m: list[float]
     speeds_mps: list[float]
@@ -58,51 +58,52 @@ def drive(
     car = Simulator(road=ROAD, seed=1, start_mono_ns=0)
     detector, watch = LaneDetector(MODEL), LaneWatch()
     controller = make_controller("lane_keeper", PRESETS[preset], wheelbase_m=car.capabilities.wheelbase_m)
-    course = LaneKeepingDrive([], [], [], "ok")
+    result = LaneKeepingDrive([], [], [], "ok")
     for number in range(round(seconds * 30)):
         now_ns = number * FRAME_NS
-        course.events += [event.kind for event in car.advance(now_ns)]
-        if {"completed", "collision", "off_road"} & set(course.events):
+        result.events += [event.kind for event in car.advance(now_ns)]
+        if {"completed", "collision", "off_road"} & set(result.events):
             break
         truth = car.ground_truth()
-        course.cross_track_m.append(truth.cross_track_m)
-        course.speeds_mps.append(truth.speed_mps)
+        result.cross_track_m.append(truth.cross_track_m)
+        result.speeds_mps.append(truth.speed_mps)
         picture = renderer.render(car.pose(), number)
         lane = detector.detect(picture if now_ns < change_after_s * NS_PER_S else change(picture))
-        course.lane_state = watch.check(lane.confidence, now_ns)
+        result.lane_state = watch.check(lane.confidence, now_ns)
         decision = controller.decide(lane, truth.speed_mps, now_ns)
-        brake = decision.brake if course.lane_state == "ok" else CLIENT_LIMITS.brake  # as the driver node does
+        brake = decision.brake if result.lane_state == "ok" else CLIENT_LIMITS.brake  # as the driver node does
         car.apply(Actuation(decision.steering_rad, decision.throttle, brake), now_ns + delay_ns)
-        if course.lane_state == "stop":
+        if result.lane_state == "stop":
             break
-    return course
+    return result
 
 
 @pytest.mark.parametrize("preset", ["designed", pytest.param("paper_calibrated", marks=pytest.mark.full)])
 def test_every_preset_drives_the_turn_at_60_ms(renderer: Renderer, preset: str) -> None:
     """Each preset completes the 90 degree turn and is within 0.2 m of the centre in 95 % of the frames."""
-    course = drive(renderer, preset)
-    assert course.events == ["completed"]
-    assert np.percentile(np.abs(course.cross_track_m), 95) < 0.2
-    assert max(course.speeds_mps) < 30 / 3.6 + 0.15
+    result = drive(renderer, preset)
+    assert result.events == ["completed"]
+    assert np.percentile(np.abs(result.cross_track_m), 95) < 0.2
+    assert max(result.speeds_mps) < 30 / 3.6 + 0.15
 
 
 def test_grey_pictures_lead_to_a_stop(renderer: Renderer) -> None:
     """With grey pictures the car follows its last path, slows down, and the lane watch returns "stop"."""
-    course = drive(renderer, "designed", change=lambda picture: np.full_like(picture, 128), change_after_s=8)
-    assert course.lane_state == "stop"
-    assert course.speeds_mps[-1] < course.speeds_mps[8 * 30] - 5
-    assert abs(course.cross_track_m[-1]) < 0.6
+    result = drive(renderer, "designed", change=lambda picture: np.full_like(picture, 128), change_after_s=8)
+    assert result.lane_state == "stop"
+    assert result.speeds_mps[-1] < result.speeds_mps[8 * 30] - 5
+    assert abs(result.cross_track_m[-1]) < 0.6
 
 
 def test_mirrored_pictures_lead_out_of_the_lane(renderer: Renderer) -> None:
     """With mirrored pictures the car turns the wrong way, which shows that it is steered from its pictures."""
-    course = drive(
+    result = drive(
         renderer,
         "designed",
         seconds=16,
         change=mirror,
         change_after_s=0,
     )
-    assert "lane_invasion" in course.events
-    assert np.max(np.abs(course.cross_track_m)) > 1.75
+    assert "lane_invasion" in result.events
+    half_lane_width_m = 1.75
+    assert np.max(np.abs(result.cross_track_m)) > half_lane_width_m

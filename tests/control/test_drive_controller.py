@@ -24,10 +24,12 @@ from lavt.errors import UserError
 WHEELBASE_M = 2.8448
 SPEED_MPS = 30 / 3.6
 FRAME_NS = NS_PER_S // 30
+CURVE_C2_PER_M = 0.5 / 87
+"""The quadratic coefficient of a lane that curves to the left with a radius of 87 m."""
 
 
 def lane(c0: float = 0.0, c1: float = 0.0, c2: float = 0.0, confidence: float = 1.0) -> Lane:
-    return Lane((c0, c1, c2), 3.5, 3.6, 20.0, confidence)
+    return Lane(centre=(c0, c1, c2), width_m=3.5, near_m=3.6, far_m=20.0, confidence=confidence)
 
 
 def lane_keeper(preset: Preset = DESIGNED) -> LaneKeeper:
@@ -70,7 +72,7 @@ def test_the_first_lane_is_followed() -> None:
 
 def lose_lane(controller: LaneKeeper, after_ns: int) -> Decision:
     """Return the decision at `after_ns`, after one picture of a left curve and then pictures without a lane."""
-    decision = controller.decide(lane(c2=0.5 / 87), SPEED_MPS, 0)
+    decision = controller.decide(lane(c2=CURVE_C2_PER_M), SPEED_MPS, 0)
     for now_ns in range(FRAME_NS, after_ns + 1, FRAME_NS):
         decision = controller.decide(lane(confidence=0.0), SPEED_MPS, now_ns)
     return decision
@@ -85,7 +87,7 @@ def test_without_a_lane_there_is_no_throttle() -> None:
 
 def test_a_lost_lane_is_followed_from_memory() -> None:
     """Half a second after the lane was lost in a curve, the wheel still follows the curve."""
-    in_curve = lane_keeper().decide(lane(c2=0.5 / 87), SPEED_MPS, 0)
+    in_curve = lane_keeper().decide(lane(c2=CURVE_C2_PER_M), SPEED_MPS, 0)
     assert lose_lane(lane_keeper(), BRAKE_AFTER_NS).steering_rad == pytest.approx(in_curve.steering_rad, rel=0.15)
 
 
@@ -138,8 +140,8 @@ def drive(pi: SpeedPi, seconds: float, speed_mps: float, slope_mps2: float = 0.0
     """Return the speeds of a car with a lag of 0.2 s and a constant deceleration `slope_mps2`."""
     speeds, acceleration = [speed_mps], 0.0
     for _ in range(round(seconds * 30)):
-        wanted = pi.acceleration_mps2(SPEED_MPS, speeds[-1], 1 / 30)
-        acceleration += (wanted - acceleration) / 6
+        requested = pi.acceleration_mps2(SPEED_MPS, speeds[-1], 1 / 30)
+        acceleration += (requested - acceleration) / (0.2 * 30)
         speeds.append(speeds[-1] + (acceleration - slope_mps2) / 30)
     return speeds
 
@@ -188,5 +190,5 @@ def test_pedals(acceleration_mps2: float, expected: tuple[float, float]) -> None
 
 @pytest.mark.parametrize(("confidence", "share"), [(1.0, 1.0), (0.5, 1.0), (0.3, 0.6), (0.0, 0.4)])
 def test_lower_confidence_lowers_the_speed(confidence: float, share: float) -> None:
-    """Full speed down to confidence 0.5, in proportion below that, never less than 0.4 of it."""
+    """The speed is full down to a confidence of 0.5, lower in proportion below that, and never under 0.4 of it."""
     assert speed_for_confidence_mps(10.0, confidence) == pytest.approx(10 * share)

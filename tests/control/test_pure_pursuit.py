@@ -18,7 +18,7 @@ WHEELBASE_M = 2.8448
 
 
 def lane(c0: float = 0.0, c1: float = 0.0, c2: float = 0.0) -> Lane:
-    return Lane((c0, c1, c2), 3.5, 3.6, 20.0, 1.0)
+    return Lane(centre=(c0, c1, c2), width_m=3.5, near_m=3.6, far_m=20.0, confidence=1.0)
 
 
 @pytest.mark.parametrize(("speed_mps", "expected_m"), [(0.0, 4.0), (2.0, 4.0), (8.0, 8.0), (30.0, 20.0)])
@@ -75,9 +75,10 @@ def test_steering_and_curvature_are_inverse() -> None:
 
 def test_the_path_on_a_curve_has_its_curvature() -> None:
     """On the centre of a gentle curve, the path has the lane's curvature."""
-    path = pursuit_path_per_m(lane(c2=0.5 / 135), 6.0, limit_per_m=1.0)
+    radius_m = 135
+    path = pursuit_path_per_m(lane(c2=0.5 / radius_m), 6.0, limit_per_m=1.0)
     assert len(path) == PATH_POINTS
-    assert path[:5] == pytest.approx([1 / 135] * 5, rel=0.1)
+    assert path[:5] == pytest.approx([1 / radius_m] * 5, rel=0.1)
 
 
 def test_the_path_leads_back_to_the_lane() -> None:

@@ -91,9 +91,11 @@ class SyntheticDrive:
 
 
 RADIUS_M = 120.0
+"""The route is a left curve of this radius."""
 
 
 def on_route(progress_m: float, left_m: float) -> tuple[float, float]:
+    """Return x and y (m) of a point `left_m` to the left of the route."""
     angle_rad = progress_m / RADIUS_M
     return (RADIUS_M - left_m) * math.sin(angle_rad), RADIUS_M - (RADIUS_M - left_m) * math.cos(angle_rad)
 
@@ -175,7 +177,7 @@ def write_admission(writer: RecordWriter, drive: SyntheticDrive, sequence: int, 
     sent_ns = read_ns + round(drive.client_ms * NS_PER_MS) + delay_ns
     received_ns = sent_ns + round(drive.tau_c_ms * NS_PER_MS)
     applied_ns = received_ns + round(drive.actuator_ms * NS_PER_MS)
-    rejected = sequence % 100 == 98  # an even one is a repetition, so that no loop latency changes
+    rejected = sequence % 100 == 98  # even numbers are repeated commands, without which every loop latency is the same
     admission: dict[str, Any] = {
         "epoch": 1,
         "sequence": sequence,
@@ -212,7 +214,7 @@ def write_client(drive: SyntheticDrive, path: Path) -> None:
         write_probe(writer, drive, index)
     for number in range(-3, round(drive.seconds * NS_PER_S) // FRAME_NS + 1):
         stamp_ns = drive.server(number * FRAME_NS).wall_ns
-        read = drive.client(number * FRAME_NS + drive.tau_v_of_frame_ns(number))
+        read_at = drive.client(number * FRAME_NS + drive.tau_v_of_frame_ns(number))
         decoded = not 60 <= number < 60 + (drive.undecoded or 0)
         readable = decoded and number % 50 != 49
         picture: dict[str, Any] = {
@@ -221,17 +223,17 @@ def write_client(drive: SyntheticDrive, path: Path) -> None:
             "reason": "" if readable else "checksum" if decoded else "no picture",
             **({} if drive.undecoded is None else {"decoded": decoded}),
             "rtp_timestamp": stamp_ns * 9 // 100_000 % 2**32,
-            "packet_mono_ns": read.mono_ns - 10 * NS_PER_MS,
-            "decoded_mono_ns": read.mono_ns - 1 * NS_PER_MS,
-            "read_mono_ns": read.mono_ns,
-            "read_wall_ns": read.wall_ns,
+            "packet_mono_ns": read_at.mono_ns - 10 * NS_PER_MS,
+            "decoded_mono_ns": read_at.mono_ns - 1 * NS_PER_MS,
+            "read_mono_ns": read_at.mono_ns,
+            "read_wall_ns": read_at.wall_ns,
         }
-        writer.write("picture", picture, read)
-        arrived_ns = read.mono_ns - 4 * NS_PER_MS
+        writer.write("picture", picture, read_at)
+        arrived_ns = read_at.mono_ns - 4 * NS_PER_MS
         ends = (("reorder", 1), ("decode", 3), ("read_stamp", 4), ("lane", 6), ("control", 7))
         stages = [[name, arrived_ns + milliseconds * NS_PER_MS] for name, milliseconds in ends]
         timeline = {"node": "driver", "stamp_ns": stamp_ns, "channel": "access_unit", "arrived_mono_ns": arrived_ns}
-        writer.write("timeline", {**timeline, "stages": stages}, read)
+        writer.write("timeline", {**timeline, "stages": stages}, read_at)
     writer.close()
 
 

@@ -1,7 +1,7 @@
 """A drive with the secure configs, and an attacker at the operator's router that records, replays, alters and floods.
 
-The permissions of the router's socket should prevent this session. The tests assume that they failed, so that only the
-signatures protect the drive.
+The permissions of the router's socket should prevent the attacker's session. The tests assume that they have failed,
+so that only the signatures protect the drive.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ FLOOD_PER_S = 10_000
 START_LIMIT_S = 90.0
 BURST = 50
 """Messages per call of `flood`."""
-SIGNATURE_BYTES = 64
+MAC_BYTES, SIGNATURE_BYTES = 16, 64
+"""Sizes of the MAC and the signature at the end of a signed command, as in docs/wire.md."""
 
 
 @dataclass
@@ -91,9 +92,10 @@ class Insider:
 
     def flood(self) -> None:
         """Send a burst of copies of the newest command with a random MAC and signature."""
-        newest = self.commands[-1][:-80]
+        authenticator_bytes = MAC_BYTES + SIGNATURE_BYTES
+        body = self.commands[-1][:-authenticator_bytes]
         for _ in range(BURST):
-            self._put("flood", newest + self._chance.bytes(80))
+            self._put("flood", body + self._chance.bytes(authenticator_bytes))
 
     def _put(self, name: str, data: bytes) -> None:
         self.sent_counts[name] = self.sent_counts.get(name, 0) + 1

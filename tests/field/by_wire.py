@@ -37,10 +37,10 @@ KIT_TIMEOUT_MS = 100
 TOLERANCE_MS = 60
 """Tolerance for a busy machine, added to the design's limits."""
 KIT_LOOKBACK_MS = 200
-"""A stall of the host explains that the kit disengaged if it ended at most this long before."""
+"""A stall of the host excuses a kit that disengages at most this long after the end of the stall."""
 STOP_LOOKBACK_MS, STOP_STALL_MS = 1500, 100
-"""The same for a safe stop, which begins after 500 ms and is reported within 200 ms; and the shortest stall that can
-cause one."""
+"""The same for a safe stop, which begins 500 ms after the last command and is reported within 200 ms; and the shortest
+stall that can cause a safe stop."""
 SLOW_MACHINE_LOOKBACK_MS = 3000
 """Many short stalls in this time before a stop may be its cause together."""
 TIMING_FAILURES = ("reports are missing", "did not stay enabled", "did not brake within")
@@ -161,11 +161,11 @@ class SoftwareCarProcess:
         return self.event_ns("watchdog", "watchdog brakes")
 
     def unexpected_release(self, braked_ns: int, message: str) -> Exception:
-        """Return the exception for a kit that got no command in time without a fault."""
+        """Return the exception for a kit that got no command in time although the test had caused no fault."""
         return self.verdict(message, braked_ns - KIT_LOOKBACK_MS * NS_PER_MS, braked_ns)
 
     def verdict(self, message: str, since_ns: int, until_ns: int) -> Exception:
-        """Return the exception for a late reaction."""
+        """Return the exception for a late reaction: `HostStalled` if the host stalled between the times."""
         if self.stalls is None:
             return AssertionError(message)
         return self.stalls.verdict(message, since_ns, until_ns, stall_ms=self.stall_ms)
@@ -248,7 +248,7 @@ class RunningDrive:
         return self.status().get("safety") == "safe_stop" or self.car.braked_ns() is not None
 
     def unexpected_stop(self) -> Exception:
-        """Return the exception for a stop without a fault; call it soon after the stop."""
+        """Return the exception for a stop that the test did not cause; call it soon after the stop."""
         message, braked_ns = f"it stopped: {self.loop.server.latest}, {self.car.events}", self.car.braked_ns()
         now_ns = CLOCK.now().mono_ns
         if braked_ns is not None:

@@ -1,8 +1,8 @@
 """Record every command at the vehicle's router, in a process that is independent of the server.
 
 The observer has a session of its own with the vehicle's router, and shares only that router and the kernel's clocks
-with the server. It writes one line per command: when the command arrived here, its send time, and the
-stamp of its picture.
+with the server. It writes one line per command: when the observer received the command, its send time, and the stamp
+of its frame.
 
     python tests/field/command_observer.py FILE
 """

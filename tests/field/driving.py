@@ -136,7 +136,8 @@ class Drive:
         name = f"{role}-{self.start_counts[role]}"
         out = str(self.work / name)
         links = self.links
-        table: dict[str, tuple[str, list[str], tuple[str, ...]]] = {
+        # For each role: the part of the network in which it runs, its arguments, and its program.
+        starts: dict[str, tuple[str, list[str], tuple[str, ...]]] = {
             "vehicle-router": ("vehicle", _network_arguments("router", *links.vehicle), LAVT),
             "operator-router": ("operator", _network_arguments("router", *links.operator), LAVT),
             "cloud-router": ("internet", _network_arguments("router", *links.cloud), LAVT),
@@ -145,7 +146,7 @@ class Drive:
             "client": ("operator", _side_arguments("client", (*CLIENT, *links.client), out), LAVT),
             "observer": ("vehicle", [out], (str(OBSERVER),)),
         }
-        part, arguments, program = table[role]
+        part, arguments, program = starts[role]
         process = self.networks.inside(part, lambda: self.processes.start(name, *arguments, program=program))
         process.ready()
         self.running[role] = process
@@ -215,13 +216,13 @@ def running_loop(
 
 def _network_arguments(command: str, *file_and_changes: str) -> list[str]:
     folder = {"router": "zenoh-configs", "rendezvous": "configs"}[command]
-    return [command, *(f"{folder}/{file}" for file in file_and_changes[:1]), *_sets(file_and_changes[1:])]
+    return [command, *(f"{folder}/{file}" for file in file_and_changes[:1]), *_set_arguments(file_and_changes[1:])]
 
 
 def _side_arguments(side: str, config_and_changes: tuple[str, ...], out: str) -> list[str]:
     config, *changes = config_and_changes
-    return [side, config, *_sets([*changes, *BOTH_SIDES]), "--out", out]
+    return [side, config, *_set_arguments([*changes, *BOTH_SIDES]), "--out", out]
 
 
-def _sets(changes: Sequence[str]) -> list[str]:
+def _set_arguments(changes: Sequence[str]) -> list[str]:
     return [part for change in changes for part in ("--set", change)]

@@ -1,7 +1,8 @@
 """Run `lavt` with a thread that blocks the interpreter for three seconds as soon as a file exists.
 
-The file is in the directory `LAVT_HOG`: `hog_server` for the server's process, and `hog_actuator` for the actuator's,
-which the server starts and which therefore runs this program, too.
+The environment variable `LAVT_HOG` names the directory of the file. The file is `hog_server` for the server's process
+and `hog_actuator` for the actuator's. The server starts the actuator's process by multiprocessing's `spawn`, which
+imports this file there, too, under another `__name__`.
 """
 
 from __future__ import annotations

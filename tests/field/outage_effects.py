@@ -72,6 +72,7 @@ class OutageEffects:
     stopping_s: float | None
     """From the safe stop to standstill."""
     stopped_from_mps: float | None
+    """Speed at the beginning of the safe stop."""
     observed: int
     """Commands that the observer received from the beginning of the outage to the beginning of the next one."""
     stale_observed: int
@@ -83,8 +84,8 @@ class OutageEffects:
 def measure(drive: Drive) -> list[OutageEffects]:
     """Measure the effects of all outages of a drive that has ended."""
     evidence = _Evidence(drive)
-    begins = [outage.begin.mono_ns for outage in drive.outages] + [END_OF_TIME_NS]
-    return [evidence.measure(outage, until) for outage, until in zip(drive.outages, begins[1:], strict=True)]
+    begins_ns = [outage.begin.mono_ns for outage in drive.outages] + [END_OF_TIME_NS]
+    return [evidence.measure(outage, until) for outage, until in zip(drive.outages, begins_ns[1:], strict=True)]
 
 
 class _Evidence:

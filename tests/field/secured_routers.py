@@ -26,7 +26,7 @@ BASE = "lavt/vehicle-1"
 QUIC = "quic/127.0.0.1:0?mixed_rel=1"
 ROUND_NS = 20 * NS_PER_MS
 ROUNDS = 25
-"""An attack lasts until so many commands, states and replies have arrived."""
+"""Messages are exchanged until so many commands, states and replies have arrived."""
 LIMIT_S = 15.0
 """Time limit of an attack."""
 LONG_COMMAND_BYTES = 5000
@@ -49,8 +49,8 @@ def tls_changes(keys: Path, name: str, action: str) -> tuple[str, ...]:
 
 def start_router(processes: Processes, name: str, file: str, *changes: str) -> Process:
     """Start `lavt router` with a shipped config and `--set` for each change."""
-    sets = [word for change in changes for word in ("--set", change)]
-    return processes.start(name, "router", str(shipped(f"zenoh-configs/{file}")), *sets)
+    set_options = [word for change in changes for word in ("--set", change)]
+    return processes.start(name, "router", str(shipped(f"zenoh-configs/{file}")), *set_options)
 
 
 def quic_endpoint(router: Process) -> str:

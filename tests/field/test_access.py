@@ -94,7 +94,7 @@ def start_site(stack: ExitStack, keys: Path, *changes: str, cloud: bool) -> Site
     sockets = {name: work / f"{name}.sock" for name in ("vehicle", "operator")}
     local = {name: f"unixsock-stream/{path}" for name, path in sockets.items()}
     if cloud:
-        middle = start_router(
+        cloud_router = start_router(
             processes,
             "cloud",
             "router-cloud-tls.json5",
@@ -102,7 +102,7 @@ def start_site(stack: ExitStack, keys: Path, *changes: str, cloud: bool) -> Site
             *tls_changes(keys, "cloud-1", "listen"),
             *changes,
         )
-        endpoint = quic_endpoint(middle)
+        endpoint = quic_endpoint(cloud_router)
         vehicle = start_router(
             processes,
             "vehicle",
@@ -225,7 +225,7 @@ def test_operator_rejects_a_false_vehicle(
     """An operator links neither to a router with keys of another authority nor to one with a stolen operator's key."""
     false_keys = request.getfixturevalue(keys_fixture)
     with Processes(tmp_path) as processes:
-        false = start_router(
+        false_vehicle = start_router(
             processes,
             "false",
             "router-cloud-tls.json5",
@@ -233,7 +233,7 @@ def test_operator_rejects_a_false_vehicle(
             *tls_changes(false_keys, name, "listen"),
         )
         with pytest.raises(zenoh.ZError):
-            open_session(quic_endpoint(false), authority=keys / "authority.pem", own=keys / "operator-1.pem")
+            open_session(quic_endpoint(false_vehicle), authority=keys / "authority.pem", own=keys / "operator-1.pem")
 
 
 def test_garbage_at_the_port_does_not_stop_messages(site: Site) -> None:
@@ -303,40 +303,40 @@ def attack_interval_ns(drive: attacks.AttackedDrive) -> tuple[int, int]:
     return drive.phases["quiet"][0], drive.phases["flood"][1]
 
 
-def counted(record: Record, name: str) -> int:
+def total_count(record: Record, name: str) -> int:
     values = record.table("counts").ints(name)
     return int(np.sum(values[values != MISSING]))
 
 
-def during(drive: attacks.AttackedDrive, name: str, mono_ns: IntArray) -> Any:
+def is_during(drive: attacks.AttackedDrive, name: str, mono_ns: IntArray) -> Any:
     began_ns, ended_ns = drive.phases[name]
     return (mono_ns > began_ns) & (mono_ns < ended_ns)
 
 
-def accepted(drive: attacks.AttackedDrive) -> Table:
+def accepted_commands(drive: attacks.AttackedDrive) -> Table:
     admissions = drive.server.table("admission")
     return admissions.where(np.array(admissions.texts("verdict")) == "accepted")
 
 
 COMMAND_PERIOD_MS = CLIENT_LIMITS.command_period_ns / NS_PER_MS
-FIELDS = ("sequence", "steering_rad", "throttle", "brake", "mode", "stamp_ns", "sent_wall_ns")
+COMMAND_FIELDS = ("sequence", "steering_rad", "throttle", "brake", "mode", "stamp_ns", "sent_wall_ns")
 
 
-def rows(table: Table, *names: str) -> list[tuple[Any, ...]]:
+def command_rows(table: Table, *names: str) -> list[tuple[Any, ...]]:
     """Return the epoch and the named columns of each row."""
     return list(zip(*(table.objects(name) for name in ("epoch", *names)), strict=True))
 
 
 def test_only_the_operators_commands_are_accepted(attacked_drive: attacks.AttackedDrive, stalls: Stalls) -> None:
     """Under every attack each accepted command is one that the client sent, unchanged, and none is accepted twice."""
-    commands = accepted(attacked_drive)
-    sent_by_client = set(rows(attacked_drive.client.table("control"), *FIELDS))
+    commands = accepted_commands(attacked_drive)
+    sent_by_client = set(command_rows(attacked_drive.client.table("control"), *COMMAND_FIELDS))
 
-    assert set(rows(commands, *FIELDS)) <= sent_by_client
-    assert len(set(rows(commands, "sequence"))) == len(commands)
+    assert set(command_rows(commands, *COMMAND_FIELDS)) <= sent_by_client
+    assert len(set(command_rows(commands, "sequence"))) == len(commands)
     for name, phase in attacked_drive.phases.items():
         with stalls.excusing_failures(*phase, stall_ms=LONG_STALL_MS):
-            assert np.sum(during(attacked_drive, name, commands.ints("received_mono_ns"))) > 150
+            assert np.sum(is_during(attacked_drive, name, commands.ints("received_mono_ns"))) > 150
 
 
 def test_forged_messages_are_counted(attacked_drive: attacks.AttackedDrive, stalls: Stalls) -> None:
@@ -345,10 +345,10 @@ def test_forged_messages_are_counted(attacked_drive: attacks.AttackedDrive, stal
     with stalls.excusing_failures(*attack_interval_ns(attacked_drive), stall_ms=LONG_STALL_MS):
         assert attacked_drive.sent_counts["replayed"] > 1000
         assert attacked_drive.sent_counts["flood"] > 0.5 * attacks.FLOOD_PER_S * attacks.PHASE_NS / NS_PER_S
-        assert counted(server, "commands_forged") > 500
-        assert counted(server, "commands_screened_out") > 0.3 * attacked_drive.sent_counts["flood"]
-        assert counted(server, "session_requests_of_another_time") > 10
-        assert counted(server, "rejected: not newer than the last command") > 100
+        assert total_count(server, "commands_forged") > 500
+        assert total_count(server, "commands_screened_out") > 0.3 * attacked_drive.sent_counts["flood"]
+        assert total_count(server, "session_requests_of_another_time") > 10
+        assert total_count(server, "rejected: not newer than the last command") > 100
 
 
 def test_only_the_vehicles_states_are_accepted(attacked_drive: attacks.AttackedDrive, stalls: Stalls) -> None:
@@ -363,36 +363,39 @@ def test_only_the_vehicles_states_are_accepted(attacked_drive: attacks.AttackedD
     assert len(set(received_states)) == len(received_states)
     with stalls.excusing_failures(*attack_interval_ns(attacked_drive), stall_ms=LONG_STALL_MS):
         assert len(received_states) > 0.9 * len(sent_states) - 100
-        assert counted(attacked_drive.client, "states_replayed") > 100
-        assert counted(attacked_drive.client, "states_forged") > 100
+        assert total_count(attacked_drive.client, "states_replayed") > 100
+        assert total_count(attacked_drive.client, "states_forged") > 100
 
 
 def test_the_drive_continues_under_every_attack(attacked_drive: attacks.AttackedDrive, stalls: Stalls) -> None:
     """During all attacks the vehicle is driven and never stops."""
     events = attacked_drive.server.table("event")
     began_ns, ended_ns = attack_interval_ns(attacked_drive)
-    meanwhile = events.where((events.ints("mono_ns") > began_ns) & (events.ints("mono_ns") < ended_ns))
+    events_of_attacks = events.where((events.ints("mono_ns") > began_ns) & (events.ints("mono_ns") < ended_ns))
 
     with stalls.excusing_failures(began_ns, ended_ns, stall_ms=LONG_STALL_MS):
         assert attacked_drive.last_status["safety"] == "driving"
-        assert not [detail for detail in meanwhile.texts("detail") if "stop" in detail]
+        assert not [detail for detail in events_of_attacks.texts("detail") if "stop" in detail]
 
 
 def test_a_flood_does_not_delay_the_operator(attacked_drive: attacks.AttackedDrive, stalls: Stalls) -> None:
     """Ten thousand forged commands a second delay the operator's by at most one command period in the median."""
     sent_ns = dict(
         zip(
-            rows(attacked_drive.client.table("control"), "sequence"),
+            command_rows(attacked_drive.client.table("control"), "sequence"),
             attacked_drive.client.table("control").mono_ns,
             strict=True,
         )
     )
-    commands = accepted(attacked_drive)
+    commands = accepted_commands(attacked_drive)
     received_ns = commands.ints("received_mono_ns")
     delays_ms = np.array(
-        [(at_ns - sent_ns[key]) / NS_PER_MS for key, at_ns in zip(rows(commands, "sequence"), received_ns, strict=True)]
+        [
+            (at_ns - sent_ns[key]) / NS_PER_MS
+            for key, at_ns in zip(command_rows(commands, "sequence"), received_ns, strict=True)
+        ]
     )
-    quiet, flood = (np.median(delays_ms[during(attacked_drive, name, received_ns)]) for name in ("quiet", "flood"))
+    quiet, flood = (np.median(delays_ms[is_during(attacked_drive, name, received_ns)]) for name in ("quiet", "flood"))
 
     with stalls.excusing_failures(*attacked_drive.phases["flood"], share=BUSY_SHARE):
         assert flood - quiet < COMMAND_PERIOD_MS, f"{quiet:.2f} ms, and under the flood {flood:.2f} ms"

@@ -34,7 +34,7 @@ COMMAND_TIMEOUT_MS = 500
 """The server stops the car this long after the last command."""
 STATIONARY_MPS = 0.05
 BUSY_S = 0.8
-"""An actuator that spins uses more of a second; one that waits uses a fifth of it."""
+"""An actuator that spins uses more than this of a second of processor time; one that waits uses a fifth of it."""
 PARKING_LIMIT_MS = 6000
 """A car that drives at 5 m/s or more is stationary and in park within this time."""
 
@@ -136,9 +136,9 @@ def test_a_stalled_actuator_leaves_a_braking_car(
 
 @pytest.mark.parametrize("duration_ms", [120, 135, 150])
 def test_a_stall_while_parking_ends(duration_ms: int, print_report: PrintReport, drive: DriveWithProfile) -> None:
-    """An actuator that is stopped for a moment while parking reports again, does not spin, and ends with its server.
+    """An actuator that is suspended for a moment while parking reports again, does not spin, and ends with its server.
 
-    The gearbox has a fault, so that parking lasts.
+    The gearbox has a fault, so that the actuator keeps trying to park.
     """
     with drive("dataspeed_gen1") as drive_in_progress:
         drive_in_progress.car.execute("fault gear.FLTBUS")
@@ -157,7 +157,9 @@ def test_a_stall_while_parking_ends(duration_ms: int, print_report: PrintReport,
         before_s = used_cpu_s(drive_in_progress.actuator_pid)
         pause(NS_PER_S)
         used_s = used_cpu_s(drive_in_progress.actuator_pid) - before_s
-        print_report(f"stopped for {duration_ms} ms while parking: the actuator uses {used_s:.2f} s of the next second")
+        print_report(
+            f"suspended for {duration_ms} ms while parking: the actuator uses {used_s:.2f} s of the next second"
+        )
         assert used_s < BUSY_S
         assert server.poll() is None, "the actuator reports its state"
         server.send_signal(signal.SIGINT)
@@ -168,7 +170,8 @@ def test_a_stall_while_parking_ends(duration_ms: int, print_report: PrintReport,
 def used_cpu_s(pid: int) -> float:
     """Return the processor time of a process so far."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    user_ticks, system_ticks = int(fields[11]), int(fields[12])
+    return (user_ticks + system_ticks) / os.sysconf("SC_CLK_TCK")
 
 
 @pytest.mark.parametrize("fault", [signal.SIGSTOP, signal.SIGKILL])
@@ -221,12 +224,12 @@ def test_a_car_whose_speed_report_is_stuck_stops(
         drive_in_progress.wait(
             lambda status: status.get("safety") == "safe_stop", "the server does not report its stop"
         )
-        stopping_m: list[float] = [drive_in_progress.status()["progress_m"]]
-        while len(stopping_m) < 2 or stopping_m[-1] - stopping_m[-2] > STATIONARY_MPS:
+        progress_m: list[float] = [drive_in_progress.status()["progress_m"]]
+        while len(progress_m) < 2 or progress_m[-1] - progress_m[-2] > STATIONARY_MPS:
             assert drive_in_progress.car.event_ns("gear", "gear PARK", since_ns=since_ns) is None
             pause(NS_PER_S)
-            stopping_m.append(drive_in_progress.status()["progress_m"])
-        print_report(f"speed stuck at {stuck_mps} m/s: stopped {stopping_m[-1] - stopping_m[0]:.1f} m later")
+            progress_m.append(drive_in_progress.status()["progress_m"])
+        print_report(f"speed stuck at {stuck_mps} m/s: stopped {progress_m[-1] - progress_m[0]:.1f} m later")
         assert drive_in_progress.status()["reason"]
 
 

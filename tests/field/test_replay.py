@@ -25,9 +25,10 @@ VIDEO_PORT = 5600
 """As in configs/server.yaml."""
 ATTACK_NS = 4 * NS_PER_S
 RATE_HZ = 1000
-"""Twice the 480 a second that made all video unreadable before hellos were numbered."""
+"""Replays a second: twice the 480 that made all video unreadable before hellos were numbered."""
 ETH_P_IP = 0x0800
-HEADERS_BYTES = 28
+HEADERS_BYTES = 20 + 8
+"""Size of the IP and the UDP header."""
 HELLO = b"LAVT\x01"
 
 
@@ -47,13 +48,13 @@ def overhear(listener: socket.socket) -> tuple[tuple[str, int], bytes]:
             return (socket.inet_ntoa(packet[12:16]), port), packet[HEADERS_BYTES:]
 
 
-def counted(record: Record, name: str) -> int:
+def total_count(record: Record, name: str) -> int:
     values = record.table("counts").ints(name)
     return int(np.sum(values[values != MISSING]))
 
 
 def test_a_replayed_hello_leaves_encrypted_video_readable(tmp_path: Path, print_report: Callable[[str], None]) -> None:
-    """A hello that is replayed with the client's address and the attacker's makes no packet of the video unreadable.
+    """A hello, replayed from the client's and from the attacker's address, makes no packet of the video unreadable.
 
     The attacker also forwards the challenges that it gets to the client, with the vehicle's address.
     """
@@ -73,38 +74,41 @@ def test_a_replayed_hello_leaves_encrypted_video_readable(tmp_path: Path, print_
             "internet", lambda: socket.socket(socket.AF_PACKET, socket.SOCK_DGRAM, socket.htons(ETH_P_IP))
         )
         listener.bind(("operator", ETH_P_IP))
-        raw = field.inside("internet", lambda: socket.socket(socket.AF_INET, socket.SOCK_RAW, socket.IPPROTO_RAW))
-        own = field.inside("internet", lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-        with listener, raw, own, running_loop(field, tmp_path, links) as drive:
-            client, hello = overhear(listener)
+        raw_socket = field.inside(
+            "internet", lambda: socket.socket(socket.AF_INET, socket.SOCK_RAW, socket.IPPROTO_RAW)
+        )
+        own_socket = field.inside("internet", lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        with listener, raw_socket, own_socket, running_loop(field, tmp_path, links) as drive:
+            client_address, hello = overhear(listener)
             wait_until("video arrives", lambda: "raw_tau_v_ms" in drive.running["client"].latest.get("status", {}))
-            own.bind((VEHICLE_UPLINK_ROUTER.address, 0))
-            own.setblocking(False)
+            own_socket.bind((VEHICLE_UPLINK_ROUTER.address, 0))
+            own_socket.setblocking(False)
             begin_ns, sent, forwarded = clock.now().mono_ns, 0, 0
             while (elapsed_ns := clock.now().mono_ns - begin_ns) < ATTACK_NS:
                 while sent < elapsed_ns * RATE_HZ // NS_PER_S:
                     sent += 1
-                    raw.sendto(spoofed(client, (VEHICLE, VIDEO_PORT), hello), (VEHICLE, 0))
-                    own.sendto(hello, (VEHICLE, VIDEO_PORT))
+                    raw_socket.sendto(spoofed(client_address, (VEHICLE, VIDEO_PORT), hello), (VEHICLE, 0))
+                    own_socket.sendto(hello, (VEHICLE, VIDEO_PORT))
                     try:
-                        challenge = own.recv(2048)
+                        challenge = own_socket.recv(2048)
                     except BlockingIOError:
                         continue
                     forwarded += 1
-                    raw.sendto(spoofed((VEHICLE, VIDEO_PORT), client, challenge), (OPERATOR, 0))
+                    raw_socket.sendto(spoofed((VEHICLE, VIDEO_PORT), client_address, challenge), (OPERATOR, 0))
                 pause(NS_PER_S // RATE_HZ)
             end_ns = clock.now().mono_ns
             pause(NS_PER_S)
         (server_record,), (client_record,) = drive.records("server"), drive.records("client")
-    packets, unreadable = counted(client_record, "packets"), counted(client_record, "packets_forged")
-    at_server = counted(server_record, "path_stale"), counted(server_record, "datagrams_screened_out")
+    packets, unreadable = total_count(client_record, "packets"), total_count(client_record, "packets_forged")
+    at_server = total_count(server_record, "path_stale"), total_count(server_record, "datagrams_screened_out")
     pictures_ns = client_record.table("picture").mono_ns
-    during = int(((pictures_ns > begin_ns) & (pictures_ns < end_ns)).sum())
+    pictures_during_attack = int(((pictures_ns > begin_ns) & (pictures_ns < end_ns)).sum())
     print_report(
         f"{2 * sent} replays, {forwarded} challenges to the attacker: {unreadable} packets unreadable, {packets} "
-        f"readable, {during} pictures in {(end_ns - begin_ns) / NS_PER_S:.1f} s; at the server {at_server}"
+        f"readable, {pictures_during_attack} pictures in {(end_ns - begin_ns) / NS_PER_S:.1f} s; "
+        f"at the server {at_server}"
     )
 
     assert sent > 0.5 * RATE_HZ * ATTACK_NS / NS_PER_S
     assert unreadable == 0
-    assert during > 0
+    assert pictures_during_attack > 0

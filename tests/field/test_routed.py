@@ -74,6 +74,7 @@ class AddressChangeDrive:
     """The records of a drive during which the operator's address changed, and counts of video packets."""
 
     changed: Now
+    """When the operator's address changed."""
     ended: Now
     server: Record
     client: Record
@@ -174,8 +175,8 @@ def test_nat_drops_unsolicited_datagrams(field: Field, video_path: str) -> None:
         operator.sendto(b"expected", (VEHICLE, VIDEO_PORT))
 
         if video_path == "forwarded ports":
-            datagram, (sender, _port) = forwarded.recvfrom(100)
-            assert (datagram, sender) == (b"expected", OPERATOR)
+            datagram, (sender_address, _port) = forwarded.recvfrom(100)
+            assert (datagram, sender_address) == (b"expected", OPERATOR)
         else:
             with pytest.raises(TimeoutError):
                 forwarded.recvfrom(100)

@@ -1,3 +1,5 @@
+"""RTCP between GStreamer's `rtpsession` and our reports, in both directions."""
+
 from __future__ import annotations
 
 import json
@@ -110,6 +112,7 @@ def gstreamer() -> Iterator[GStreamerSession]:
 
 
 def packet(sequence: int, ssrc: int) -> bytes:
+    """Return an RTP packet with four bytes of payload."""
     return RtpPacket(96, sequence % 2**16, 3000 * sequence, ssrc, True, b"\x41abc").to_bytes()
 
 
@@ -167,5 +170,6 @@ def test_gstreamer_reads_our_receiver_reports() -> None:
         session.push("stats")
         (source,) = (source for source in session.read("stats") if source["ssrc"] == RECEIVER_SSRC)
         names = ("have-rb", "rb-ssrc", "rb-fractionlost", "rb-packetslost", "rb-exthighestseq", "rb-jitter")
-        assert [source[name] for name in names] == [True, GSTREAMER_SSRC, 64, 3, 65_541, 17]
+        assert [source[name] for name in names] == [True, GSTREAMER_SSRC, 0.25 * 256, 3, 65_541, 17]
+        # The 6 s since the sender report, minus the 5 s that the receiver says it waited; in 1/65536 s.
         assert 65_536 <= source["rb-round-trip"] < 30 * 65_536

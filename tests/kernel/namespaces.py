@@ -151,13 +151,13 @@ def send_flows(
     names = {flow_sockets.mark: flow_sockets.flow.name for flow_sockets in sockets}
     try:
         begin_ns = clock.now().mono_ns
-        meanwhile: list[threading.Thread] = []
+        threads: list[threading.Thread] = []
         for number in itertools.takewhile(
-            lambda number: number < count or any(thread.is_alive() for thread in meanwhile), itertools.count()
+            lambda number: number < count or any(thread.is_alive() for thread in threads), itertools.count()
         ):
             if at and number in at:
-                meanwhile.append(threading.Thread(target=at[number]))
-                meanwhile[-1].start()
+                threads.append(threading.Thread(target=at[number]))
+                threads[-1].start()
             for flow_sockets in sockets:
                 flow_sockets.send(number, clock.now().wall_ns)
                 arrivals[flow_sockets.flow.name].sent = number + 1
@@ -165,7 +165,7 @@ def send_flows(
             while clock.now().mono_ns < begin_ns + round((number + 1) * period_ms * NS_PER_MS):
                 pause(NS_PER_MS // 2)
                 _receive(captures, names, arrivals)
-        for thread in meanwhile:
+        for thread in threads:
             thread.join()
         end_ns = clock.now().mono_ns + round(DRAIN_S * NS_PER_S)
         while clock.now().mono_ns < end_ns:

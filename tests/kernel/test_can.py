@@ -49,7 +49,7 @@ pytestmark = [pytest.mark.timeout(900), pytest.mark.usefixtures("vcan")]
 ReportFigure = Callable[[str], None]
 
 SMALL_LOAD = ("camera.width_px=320", "camera.height_px=240", "camera.rate_hz=15")
-"""A load for a user-mode kernel, with one processor and expensive system calls."""
+"""A load that a user-mode kernel, with one processor and slow system calls, can process in time."""
 MAX_P95_M = 0.22
 COMMAND_IDENTIFIERS = {0x200, 0x201, 0x202}
 """Steering, brake and throttle in generation 2's set `remote`."""
@@ -81,7 +81,7 @@ def ip(*arguments: str) -> None:
     subprocess.run(["ip", *arguments], check=True)
 
 
-def by_wire(profile: str, work: Path) -> tuple[str, ...]:
+def by_wire_changes(profile: str, work: Path) -> tuple[str, ...]:
     """Return changes of the server's config, which also apply to the software car."""
     return (
         f"vehicle.dbw.profile={profile}",
@@ -172,7 +172,7 @@ class CanLab:
     @contextmanager
     def driving(self, profile: str) -> Iterator[ActiveDrive]:
         """Drive a software car at speed; the watchdog test runs first, once per profile."""
-        changes = by_wire(profile, self.proof_folder)
+        changes = by_wire_changes(profile, self.proof_folder)
         if not (self.proof_folder / f"{profile}.json").exists():
             run_watchdog_test(self.server, changes, self.stalls)
         out = self.work / "drive"
@@ -292,7 +292,7 @@ def test_frozen_actuator_sends_no_frames(lab: CanLab, report_figure: ReportFigur
             last_ns = last_command_ns(port)
         finally:
             os.kill(active_drive.actuator_pid, signal.SIGCONT)
-        pause(2 * NS_PER_S)  # the server has ended by itself, since it got no state for 0.5 s
+        pause(2 * NS_PER_S)  # the server has ended already, because it got no state of the actuator for 0.5 s
         report_figure(f"last command {ms_since(last_ns, since_ns):.0f} ms, the kit brakes after {took_ms:.0f} ms")
         assert last_ns < frozen_ns + LATE_FRAME_MS * NS_PER_MS
         assert active_drive.car.event_ns("enabled", "enabled: ", since_ns=since_ns) is None

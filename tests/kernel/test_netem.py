@@ -56,7 +56,7 @@ DELAYED_FLOWS = [
     ProbeFlow("control", "client", "udp", 40_002, CONTROL),
     ProbeFlow("control over IPv6", "client", "udp", 40_003, CONTROL, version=6),
 ]
-OTHER_FLOWS = [
+UNDELAYED_FLOWS = [
     ProbeFlow("challenges of the video's path", "server", "udp", VIDEO, 40_010, first_byte=ord("L")),
     ProbeFlow("RTCP and hellos upstream", "client", "udp", 40_011, VIDEO),
     ProbeFlow("state", "server", "udp", CONTROL, 40_012),
@@ -75,10 +75,10 @@ OTHER_FLOWS = [
 def baseline() -> Iterator[dict[str, float]]:
     """Create two namespaces, and return the median delay of every flow without injection; delete them afterwards."""
     create_namespaces()
-    send_flows([*DELAYED_FLOWS, *OTHER_FLOWS], 3, 10)  # the first packets wait for address resolution
+    send_flows([*DELAYED_FLOWS, *UNDELAYED_FLOWS], 3, 10)  # the first packets wait for address resolution
     yield {
         name: median(arrivals.delays_ms)
-        for name, arrivals in send_flows([*DELAYED_FLOWS, *OTHER_FLOWS], 30, 10).items()
+        for name, arrivals in send_flows([*DELAYED_FLOWS, *UNDELAYED_FLOWS], 30, 10).items()
     }
     delete_namespaces()
 
@@ -118,7 +118,7 @@ def test_each_condition_delays_only_video_and_control(
     shifts_ms = {}
     for name in CONDITIONS:
         apply_condition(sides, name)
-        arrivals = send_flows([*DELAYED_FLOWS, *OTHER_FLOWS], 40, 20)
+        arrivals = send_flows([*DELAYED_FLOWS, *UNDELAYED_FLOWS], 40, 20)
         requested = condition(name)
         for flow_name, arrived in arrivals.items():
             expected_ms = requested.video_ms if flow_name.startswith("video") else requested.control_ms
@@ -248,7 +248,9 @@ def test_jitter_spreads_delays_in_order(
     sides: dict[str, NetemInterface], distribution: Any, min_ms: float, max_ms: float
 ) -> None:
     """Under 10 ms of jitter the delays' interquartile range is that of the distribution, and no packet is reordered."""
-    apply_to_video(sides, Impairment(75, jitter_ms=5, jitter_distribution="pareto"))  # its table must not stay
+    apply_to_video(
+        sides, Impairment(75, jitter_ms=5, jitter_distribution="pareto")
+    )  # its distribution must be replaced
     apply_to_video(sides, Impairment(75, jitter_ms=10, jitter_distribution=distribution))
     arrivals = send_flows([DELAYED_FLOWS[0]], 100, 30)["video"]
     p5, p25, p75, p95 = (quantiles(arrivals.delays_ms, n=20)[index] for index in (0, 4, 14, 18))
@@ -353,7 +355,7 @@ def test_scripts_and_command_have_the_same_effect(
     def tc_output() -> tuple[Any, str]:
         return qdiscs(side), command(f"tc -n {side} filter show dev {device}")
 
-    free = tc_output()
+    before = tc_output()
     command(f"ip netns exec {side} sh {folder}/{script}")
     by_script = tc_output()
     command(f"ip netns exec {side} sh {folder}/clear.sh {device}")
@@ -361,7 +363,7 @@ def test_scripts_and_command_have_the_same_effect(
     apply_condition(sides, name)
 
     assert by_script == tc_output()
-    assert cleared == free
+    assert cleared == before
 
 
 @pytest.fixture
@@ -417,10 +419,10 @@ def test_apply_restores_the_interface_if_verification_fails(lavt: Callable[..., 
 
 
 @pytest.mark.parametrize(
-    ("name", "number"), [("L1", signal.SIGINT), ("L1", signal.SIGHUP), ("jitter_correlated", signal.SIGINT)]
+    ("name", "with_signal"), [("L1", signal.SIGINT), ("L1", signal.SIGHUP), ("jitter_correlated", signal.SIGINT)]
 )
 def test_held_impairment_ends_with_its_command(
-    lavt: Callable[..., CommandResult], stalls: Stalls, name: str, number: signal.Signals
+    lavt: Callable[..., CommandResult], stalls: Stalls, name: str, with_signal: signal.Signals
 ) -> None:
     """`lavt netem apply --hold` rejects other programs, and restores the interface when its process group is ended."""
     before = command("tc -j qdisc show dev lo")
@@ -434,7 +436,7 @@ def test_held_impairment_ends_with_its_command(
         measured_ns = CLOCK.now().mono_ns
         rejected = lavt("netem", "apply", "L2", "--role", "server", "--interface", "lo")
         with_delay = command("tc -j qdisc show dev lo")
-        os.killpg(holder.pid, number)
+        os.killpg(holder.pid, with_signal)
         holder.wait(30)
 
     with stalls.excusing_failures(since_ns, measured_ns, share=MEDIAN_SHARE):
@@ -447,8 +449,8 @@ def test_held_impairment_ends_with_its_command(
 
 
 def planned(*changes: str) -> PlannedRun:
-    sets = ["time=real", "network.injection=netem", *changes]
-    return plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), sets))
+    all_changes = ["time=real", "network.injection=netem", *changes]
+    return plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), all_changes))
 
 
 @JUDGES_MEDIANS
@@ -470,7 +472,7 @@ def test_drive_with_netem_measures_the_injected_delay(
 ) -> None:
     """A short drive under L4 on lo measures 150 and 75 ms before and after, and restores lo."""
     before = command("tc -j qdisc show dev lo")
-    sets = [
+    changes = [
         "time=real",
         "network.injection=netem",
         "network.condition=L4",
@@ -481,10 +483,10 @@ def test_drive_with_netem_measures_the_injected_delay(
         "camera.rate_hz=10",
         "record.video=false",
     ]
-    changes = [word for setting in sets for word in ("--set", setting)]
+    set_options = [word for change in changes for word in ("--set", change)]
     out = tmp_path / "run"
     since_ns = CLOCK.now().mono_ns
-    completed = lavt("run", str(shipped("configs/demo.yaml")), *changes, "--out", str(out), "--json")
+    completed = lavt("run", str(shipped("configs/demo.yaml")), *set_options, "--out", str(out), "--json")
     assert completed.code == 0, completed.err[-500:]
     output = json.loads((out / "netem.json").read_text())
     result = json.loads((out / "result.json").read_text())
@@ -506,9 +508,9 @@ def test_interrupted_run_restores_the_loopback(tmp_path: Path) -> None:
     """SIGINT during a run with netem ends the run in order and restores lo."""
     before = command("tc -j qdisc show dev lo")
     arguments = ["run", str(shipped("configs/demo.yaml")), "--out", str(tmp_path / "run")]
-    sets = ["--set", "time=real", "--set", "network.injection=netem", "--set", "network.condition=L4"]
+    set_options = ["--set", "time=real", "--set", "network.injection=netem", "--set", "network.condition=L4"]
     with subprocess.Popen(
-        [sys.executable, "-B", "-m", "lavt", *arguments, *sets],
+        [sys.executable, "-B", "-m", "lavt", *arguments, *set_options],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,

@@ -161,13 +161,13 @@ def test_each_condition_shifts_latencies_by_its_delay(
 def test_delta_is_true_while_the_server_clock_is_slewed(
     drive: DriveOnce, truth: TrueOffsetSamples, server_machine: Machine, client_machine: Machine
 ) -> None:
-    """While chrony slews the server's clock towards a third one, Delta is within 1 ms of the truth and its bound."""
+    """While chrony slews the server's clock towards a third one, Delta is within its bound and 1 ms of the truth."""
     server_machine.start_python(
         "tests.kernel.lane.ntp_server", "127.0.0.1", str(NTP_PORT), str(400 * NS_PER_MS), "20"
     ).first_line()
-    # The drive delays the third clock's answers by much more than they varied before: chrony would reject them.
-    third = f"{follow_server('127.0.0.1', NTP_PORT)} maxdelaydevratio 1000"
-    start_chronyd(server_machine, third, "maxslewrate 500", "allow", adjusts_clock=True)
+    # The drive delays the third clock's answers by much more than they varied before; by default chrony rejects such.
+    third_clock = f"{follow_server('127.0.0.1', NTP_PORT)} maxdelaydevratio 1000"
+    start_chronyd(server_machine, third_clock, "maxslewrate 500", "allow", adjusts_clock=True)
     wait_synchronised(server_machine, updates=4)
     start_chronyd(client_machine, follow_server(server_machine.address))
     wait_synchronised(client_machine, updates=10)
@@ -224,22 +224,23 @@ def test_wall_clock_step_changes_no_safety_state(
         expected_codes=(InvalidCode.CLOCK_STEP,),
         meanwhile=step,
     )
-    changes_made = safety_changes(finished_drive)
+    changes = safety_changes(finished_drive)
     assert stepped_loops
     require_completed(finished_drive, stalls)
     require_never_degraded(finished_drive, stalls)
-    changes = ["disarmed -> arming", "arming -> driving", "driving -> safe_stop"]
-    assert [change.partition(":")[0] for change in changes_made] == changes
-    assert changes_made[-1].endswith("the drive is over")
+    expected_changes = ["disarmed -> arming", "arming -> driving", "driving -> safe_stop"]
+    assert [change.partition(":")[0] for change in changes] == expected_changes
+    assert changes[-1].endswith("the drive is over")
     reasons = invalid_reasons(finished_drive)
     assert [reason.code for reason in reasons] == [InvalidCode.CLOCK_STEP]
-    assert f"the wall clock of the server stepped by {step_s * 1000:+d}"[:-2] in reasons[0].text
+    without_last_two_digits = f"{step_s * 1000:+d}"[:-2]
+    assert f"the wall clock of the server stepped by {without_last_two_digits}" in reasons[0].text
 
 
 def test_probe_alone_is_true_under_control_delay(
     drive: DriveOnce, truth: TrueOffsetSamples, server_machine: Machine
 ) -> None:
-    """Without chrony, 100 ms of control delay leave Delta within the probe's bound: the probe's port is not delayed."""
+    """Without chrony, Delta is within the probe's bound under 100 ms of control delay: the probe is not delayed."""
     server_machine.call(clocks.step, 250 * NS_PER_MS)
     finished_drive = drive(
         "probe", server=(*SHORT_DRIVE, *SERVER_INJECTION), client=client_changes_for("L5"), meanwhile=truth.sample

@@ -56,8 +56,8 @@ def planned() -> Callable[..., PlannedRun]:
     """Return a function that plans a run in real time as `lavt demo` does, with changes of its config."""
 
     def plan(*changes: str, repetition: int = 0) -> PlannedRun:
-        sets = ["time=real", f"repetition={repetition}", *changes]
-        return plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), sets))
+        all_changes = ["time=real", f"repetition={repetition}", *changes]
+        return plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), all_changes))
 
     return plan
 

@@ -90,7 +90,7 @@ CONDITION_KEYS = {
     "stages_ms",
     "survival",
 }
-VIRTUAL = ["L0", "L1", "L2", "L3", "L4", "L5"]
+VIRTUAL_CONDITIONS = ["L0", "L1", "L2", "L3", "L4", "L5"]
 
 
 def test_the_demo_drives_in_real_and_in_virtual_time(demo: Demo) -> None:
@@ -98,7 +98,7 @@ def test_the_demo_drives_in_real_and_in_virtual_time(demo: Demo) -> None:
     runs: dict[tuple[str, str], list[str]] = {}
     for run in demo.summary["runs"]:
         runs.setdefault((run["time"], run["injection"]), []).append(run["condition"])
-    assert runs == {("real", "relay"): ["L0", "L5"], ("virtual", "model"): VIRTUAL}
+    assert runs == {("real", "relay"): ["L0", "L5"], ("virtual", "model"): VIRTUAL_CONDITIONS}
     assert all(run["preset"] == "paper_calibrated" for run in demo.summary["runs"])
 
 
@@ -118,7 +118,7 @@ def test_the_summary_has_the_agreed_keys(demo: Demo) -> None:
     assert all(run.keys() >= RUN_KEYS for run in demo.summary["runs"])
     conditions = [*demo.summary["conditions"].values(), *demo.summary["real"].values()]
     assert all(set(condition) == CONDITION_KEYS for condition in conditions)
-    assert list(demo.summary["conditions"]) == VIRTUAL
+    assert list(demo.summary["conditions"]) == VIRTUAL_CONDITIONS
     assert demo.summary["groups"]
 
 

@@ -1,3 +1,5 @@
+"""A drive in real time under attack: random datagrams at all UDP ports, and garbage and replays at the router."""
+
 from __future__ import annotations
 
 import socket
@@ -139,17 +141,17 @@ def drives(
             ended_ns = clock.now().mono_ns
             attacker.close()
             status = loop.server.latest["status"]
-            ending_s = {}
+            ending_took_s = {}
             for process in (loop.client, loop.server):
                 interrupted_ns = clock.now().mono_ns
                 process.end()
-                ending_s[process.name] = (clock.now().mono_ns - interrupted_ns) / NS_PER_S
+                ending_took_s[process.name] = (clock.now().mono_ns - interrupted_ns) / NS_PER_S
             return SimpleNamespace(
                 began_ns=began_ns,
                 ended_ns=ended_ns,
                 received=attacker.received,
                 status=status,
-                ending_s=ending_s,
+                ending_took_s=ending_took_s,
                 codes=[process.popen.returncode for process in (loop.client, loop.server)],
                 server=read_record(work / "server" / "server.mcap"),
                 client=read_record(work / "client" / "client.mcap"),
@@ -177,15 +179,15 @@ def test_a_drive_continues_under_attack(attacked: SimpleNamespace, stalls: Stall
     admissions = attacked.server.table("admission")
     accepted = admissions.where(np.array(admissions.texts("verdict")) == "accepted")
     at_ns = accepted.ints("received_mono_ns")
-    meanwhile = accepted.where((at_ns > attacked.began_ns) & (at_ns < attacked.ended_ns))
-    age_ms = (meanwhile.ints("received_wall_ns") - meanwhile.ints("stamp_ns")) / NS_PER_MS
+    during_attack = accepted.where((at_ns > attacked.began_ns) & (at_ns < attacked.ended_ns))
+    age_ms = (during_attack.ints("received_wall_ns") - during_attack.ints("stamp_ns")) / NS_PER_MS
 
     with stalls.excusing_failures(attacked.began_ns, attacked.ended_ns, stall_ms=LONG_STALL_MS):
         assert attacked.status["safety"] == "driving"
     with stalls.excusing_failures(attacked.began_ns, attacked.ended_ns, share=BUSY_SHARE):
         assert np.median(age_ms) < 60
-        pictures = 30 * (attacked.ended_ns - attacked.began_ns) / NS_PER_S
-        assert len(np.unique(meanwhile.ints("stamp_ns"))) > 0.5 * pictures
+        sent_frames = 30 * (attacked.ended_ns - attacked.began_ns) / NS_PER_S
+        assert len(np.unique(during_attack.ints("stamp_ns"))) > 0.5 * sent_frames
 
 
 def test_no_message_of_a_stranger_is_accepted(attacked: SimpleNamespace) -> None:
@@ -204,18 +206,18 @@ def test_strangers_do_not_damage_pictures(attacked: SimpleNamespace, stalls: Sta
     """Datagrams of strangers at the client's video port cause no lost or doubtful pictures."""
     pictures = attacked.client.table("picture")
     at_ns = pictures.ints("read_mono_ns")
-    meanwhile = pictures.where((at_ns > attacked.began_ns) & (at_ns < attacked.ended_ns))
+    during_attack = pictures.where((at_ns > attacked.began_ns) & (at_ns < attacked.ended_ns))
 
     with stalls.excusing_failures(attacked.began_ns, attacked.ended_ns):  # the sockets of a stalled side overflow
-        assert np.mean(meanwhile.flags("readable")) > 0.99
-        assert np.mean(meanwhile.flags("in_doubt")) < 0.05
+        assert np.mean(during_attack.flags("readable")) > 0.99
+        assert np.mean(during_attack.flags("in_doubt")) < 0.05
 
 
 def test_rejected_messages_are_counted_in_the_record(attacked: SimpleNamespace, stalls: Stalls) -> None:
     """The records of both sides have the numbers of rejected datagrams and messages."""
     server, client = attacked.server, attacked.client
-    at_node = ("feedback_from_strangers", "path_malformed", "path_wrong_token", "probes_rejected")
-    at_server = sum(total_count(server, name) for name in (*at_node, "datagrams_screened_out"))
+    node_counters = ("feedback_from_strangers", "path_malformed", "path_wrong_token", "probes_rejected")
+    at_server = sum(total_count(server, name) for name in (*node_counters, "datagrams_screened_out"))
     netem = total_count(server, "netem_requests_unreadable") + total_count(server, "netem_requests_screened_out")
     with stalls.excusing_failures(attacked.began_ns, attacked.ended_ns):  # the sockets of a stalled side overflow
         assert at_server > 0.9 * 2 * DATAGRAMS
@@ -234,7 +236,7 @@ def test_ctrl_c_ends_both_sides(attacked: SimpleNamespace, stalls: Stalls) -> No
     """SIGINT during a drive ends `lavt server` and `lavt client` within 5 s, with exit code 0 and complete records."""
     assert attacked.codes == [0, 0]
     with stalls.excusing_failures(attacked.ended_ns, stall_ms=LONG_STALL_MS):
-        assert max(attacked.ending_s.values()) < END_LIMIT_S
+        assert max(attacked.ending_took_s.values()) < END_LIMIT_S
     assert attacked.server.complete
     assert attacked.client.complete
     assert total_count(attacked.server, "record_overflow") == 0

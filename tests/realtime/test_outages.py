@@ -40,7 +40,7 @@ DRIVING_WITHIN_S = 60.0
 """Routers find each other, the client gets control, arms and speeds up: about 8 s on a quiet machine."""
 BRAKE_DELAY_S = 0.5
 """Time for the brake pressure to build up."""
-LIGHT = ("vehicle.scenery=none", "controller.preset=designed")
+LOW_LOAD = ("vehicle.scenery=none", "controller.preset=designed")
 LATE_STATE = ("network.condition=L1", "network.state_delay=with_video")
 """The client learns 75 ms late that the vehicle has stopped, and sends commands of the old epoch until then."""
 ACCEPTS_EVERYTHING = Path(__file__).with_name("server_that_accepts_everything.py")
@@ -143,7 +143,7 @@ def drives(
     def drive_with_outages() -> LoopWithOutages:
         work = tmp_path_factory.mktemp("outages")
         with Processes(work) as processes:
-            drive = LoopWithOutages(processes, work, wait_until, planned(*LIGHT, *LATE_STATE))
+            drive = LoopWithOutages(processes, work, wait_until, planned(*LOW_LOAD, *LATE_STATE))
             drive.start()
             break_network(drive)
             drive.reach(FAST_MPS)
@@ -170,7 +170,9 @@ def unguarded(tmp_path_factory: pytest.TempPathFactory, wait_until: Wait, planne
     """Drive through the same network outages with a server that accepts every command."""
     work = tmp_path_factory.mktemp("unguarded")
     with Processes(work) as processes:
-        drive = LoopWithOutages(processes, work, wait_until, planned(*LIGHT, *LATE_STATE), (str(ACCEPTS_EVERYTHING),))
+        drive = LoopWithOutages(
+            processes, work, wait_until, planned(*LOW_LOAD, *LATE_STATE), (str(ACCEPTS_EVERYTHING),)
+        )
         drive.start()
         break_network(drive)
         drive.reach(MOVING_MPS)
@@ -188,7 +190,7 @@ def unguarded_server(unguarded: LoopWithOutages) -> Record:
     return unguarded.record
 
 
-def accepted(record: Record) -> Table:
+def accepted_commands(record: Record) -> Table:
     admissions = record.table("admission")
     return admissions.where(np.array(admissions.texts("verdict")) == "accepted")
 
@@ -206,7 +208,7 @@ def transition(record: Record, into: str, after_ns: int) -> Now:
 
 def last_fresh_ns(record: Record, before_ns: int) -> int:
     """Return when the last command from a newer picture than any before was received."""
-    commands = accepted(record)
+    commands = accepted_commands(record)
     commands = commands.where(commands.ints("received_mono_ns") < before_ns)
     stamps_ns = commands.ints("stamp_ns")
     fresh = np.append(True, stamps_ns[1:] > np.maximum.accumulate(stamps_ns)[:-1])
@@ -215,13 +217,13 @@ def last_fresh_ns(record: Record, before_ns: int) -> int:
 
 def count_stale(record: Record, stop: Now) -> int:
     """Count the commands accepted after `stop` whose epoch, send time or picture is from before it."""
-    commands = accepted(record)
+    commands = accepted_commands(record)
     before = commands.ints("received_mono_ns") <= stop.mono_ns
     old_epochs = set(commands.where(before).objects("epoch"))
     after = commands.where(~before)
-    of_old_epoch = np.array([epoch in old_epochs for epoch in after.objects("epoch")], np.bool_)
-    old = of_old_epoch | (after.ints("sent_wall_ns") <= stop.wall_ns) | (after.ints("stamp_ns") <= stop.wall_ns)
-    return int(np.sum(old))
+    is_of_old_epoch = np.array([epoch in old_epochs for epoch in after.objects("epoch")], np.bool_)
+    is_stale = is_of_old_epoch | (after.ints("sent_wall_ns") <= stop.wall_ns) | (after.ints("stamp_ns") <= stop.wall_ns)
+    return int(np.sum(is_stale))
 
 
 OUTAGES = ("router killed", "network stalled", "client killed", "client suspended")
@@ -268,7 +270,7 @@ def test_nothing_from_before_a_stop_is_accepted_after_it(drive: LoopWithOutages,
     armed = transition(server, "driving", stop.mono_ns)
 
     assert count_stale(server, stop) == 0
-    assert np.sum(accepted(server).ints("received_mono_ns") > armed.mono_ns) > 20
+    assert np.sum(accepted_commands(server).ints("received_mono_ns") > armed.mono_ns) > 20
 
 
 @pytest.mark.parametrize("outage", ["router killed", "network stalled"])

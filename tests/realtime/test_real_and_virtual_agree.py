@@ -10,8 +10,8 @@ from tests.support.stalls import BUSY_SHARE, LONG_STALL_MS, Stalls
 
 CONDITIONS = ("L0", "L5")
 COMPARED = (("tau_v_ms", "L0"), ("tau_v_ms", "L5"), ("tau_c_ms", "L0"), ("tau_c_ms", "L5"), ("loop_ms", "L0"))
-"""Not the loop at L5: there the car leaves its lane, and encoding and perception take longer than `configs/costs.yaml`
-says, which was measured in the lane (perception 3.1 ms instead of 2.1 ms)."""
+"""The loop latency at L5 is not compared. There the car leaves its lane, and encoding and perception take longer than
+the times in `configs/costs.yaml`, which were measured in the lane (perception takes 3.1 ms instead of 2.1 ms)."""
 
 
 def pair(demo: Demo, condition: str) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -45,7 +45,10 @@ def has_printed(process: Process, *words: str) -> bool:
 
 @dataclass
 class Session:
-    """A server and clients, started in the worst order, with their reports and the times at which they ended."""
+    """A server and clients, with their reports and the times at which they ended.
+
+    They start in the worst order: a client, the server, and only then the routers.
+    """
 
     processes: Processes
     work: Path
@@ -58,20 +61,20 @@ class Session:
 
     def __post_init__(self) -> None:
         udp, tcp = socket.SOCK_DGRAM, socket.SOCK_STREAM
-        self.server_local, self.client_local = (f"tcp/127.0.0.1:{free_port(tcp)}" for _ in range(2))
-        self.between = f"udp/127.0.0.1:{free_port(udp)}?rel=1;mixed_rel=1"
+        self.server_endpoint, self.client_endpoint = (f"tcp/127.0.0.1:{free_port(tcp)}" for _ in range(2))
+        self.link_of_routers = f"udp/127.0.0.1:{free_port(udp)}?rel=1;mixed_rel=1"
         self.probe_port = free_port(udp)
 
     def client(self, name: str, operator: str, *options: str) -> Process:
         run = self.planned.config
-        config = client_config(run, router=self.client_local, probe_port=self.probe_port)
+        config = client_config(run, router=self.client_endpoint, probe_port=self.probe_port)
         path = self.write(name, config.model_copy(update={"who": operator}))
         process = self.processes.start(name, "client", path, "--out", str(self.work / name), *options)
         process.ready()
         return process
 
     def server(self) -> Process:
-        config = server_config(self.planned.config, self.planned.seed, router=self.server_local)
+        config = server_config(self.planned.config, self.planned.seed, router=self.server_endpoint)
         clock = config.clock.model_copy(update={"probe_port": self.probe_port})
         path = self.write("server", config.model_copy(update={"clock": clock}))
         process = self.processes.start("server", "server", path, "--out", str(self.work / "server"))
@@ -79,9 +82,9 @@ class Session:
         return process
 
     def routers(self) -> None:
-        listen = f"listen.endpoints={json.dumps([self.server_local, self.between])}"
+        listen = f"listen.endpoints={json.dumps([self.server_endpoint, self.link_of_routers])}"
         self.processes.start("server-router", "router", "zenoh-configs/router-server.json5", "--set", listen).ready()
-        start_client_router(self.processes, self.between, self.client_local)
+        start_client_router(self.processes, self.link_of_routers, self.client_endpoint)
 
     def write(self, name: str, config: BaseModel) -> str:
         path = self.work / f"{name}.yaml"

@@ -21,7 +21,7 @@ from lavt.experiment.runs.processes import Processes
 from lavt.experiment.runs.side_configs import client_config, server_config
 from lavt.recording.record import read_record
 
-BEGINS_S = 150.0
+DRIVING_WITHIN_S = 150.0
 UNREAD_S = 5
 """A pipe of one page is full after two seconds of status lines."""
 END_LIMIT_S = 15.0
@@ -35,9 +35,9 @@ def unread(program: str, config: BaseModel, work: Path) -> Iterator[subprocess.P
     path.write_text(yaml.safe_dump(config.model_dump(mode="json")))
     command = [sys.executable, "-m", "lavt", program, str(path), "--out", str(work / program), "--json"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
-        for each in (process.stdout, process.stderr):
-            assert each is not None
-            fcntl.fcntl(each, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
+        for pipe in (process.stdout, process.stderr):
+            assert pipe is not None
+            fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
         try:
             yield process
         finally:
@@ -76,7 +76,7 @@ def test_signals_end_a_client_and_a_server_whose_output_is_not_read(
         ready = first_line(server.stdout)["ready"]
         ports = {key: ready[key] for key in ("video_port", "probe_port")}
         client = stack.enter_context(unread("client", client_config(run.config, router=local, **ports), tmp_path))
-        wait_until("the car drives", lambda: is_driving(tmp_path / "server" / "server.mcap"), BEGINS_S)
+        wait_until("the car drives", lambda: is_driving(tmp_path / "server" / "server.mcap"), DRIVING_WITHIN_S)
         pause(UNREAD_S * NS_PER_S)
         client.send_signal(signal.SIGTERM)
         assert client.wait(END_LIMIT_S) == 0

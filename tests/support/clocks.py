@@ -23,7 +23,7 @@ class ManualClock:
 
 
 class ShiftedClock:
-    """This machine's clocks with offsets; the offset of the wall clock grows by `wall_step_ns` at each reading."""
+    """This machine's clocks, `mono_ns` and `wall_ns` ahead; the wall clock gains `wall_step_ns` at each reading."""
 
     def __init__(self, *, mono_ns: int = 0, wall_ns: int = 0, wall_step_ns: int = 0) -> None:
         self._mono_ns, self._wall_ns, self._wall_step_ns = mono_ns, wall_ns, wall_step_ns

@@ -49,9 +49,10 @@ def spin_until(end_ns: int) -> int:
 
 
 def spin(processor: int) -> None:
-    """Occupy a processor as standard input says, until that ends; print the requested and the actual CPU time.
+    """Occupy a processor as standard input says, until standard input ends.
 
-    They differ if the kernel did not give the processor to this program.
+    Print the requested CPU time, the actual CPU time, and the time since the start, in ns. The first two differ if the
+    kernel did not give the processor to this program.
     """
     os.sched_setaffinity(0, {processor})
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))

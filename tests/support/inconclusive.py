@@ -1,10 +1,10 @@
-"""Pytest hooks: a test that the host stalled is run again, at most twice, and is then inconclusive.
+"""Pytest hooks: a test that the host stalled is run again, at most twice; if its last run stalls, it is inconclusive.
 
 `tests/conftest.py` loads this plugin. A test that judges times uses the fixture `stalls`, directly or through another
 one. A test whose assertions are all about times has the marker `judges_times` instead, with the arguments of
-`Stalls.excusing_failures`. Both are run again only after `HostStalled`: any other exception fails the test, even one
-that was raised while a `HostStalled` was handled. A session fails if too many tests were inconclusive on an idle
-machine, or if a probe ended early.
+`Stalls.excusing_failures`. Tests of both kinds are run again only after `HostStalled`: any other exception fails the
+test, even one that was raised while a `HostStalled` was handled. A session fails if too many tests were inconclusive on
+an idle machine, or if a probe ended early.
 """
 
 from __future__ import annotations
@@ -23,11 +23,13 @@ JUDGES_TIMES = "judges_times"
 
 @dataclass
 class SessionState:
-    """The state of this session's verdicts."""
+    """What the hooks keep during a session."""
 
     stalls: Stalls | None = None
     tests: set[str] = field(default_factory=set)
+    """Ids of the tests that have run."""
     messages: list[str] = field(default_factory=list)
+    """Lines for the summary in the terminal."""
 
 
 SESSION = pytest.StashKey[SessionState]()

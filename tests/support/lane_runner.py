@@ -21,7 +21,7 @@ from lavt.domain import NS_PER_MS, NS_PER_S
 LOW_PRIORITY = 19
 POLL_NS = 100 * NS_PER_MS
 GRACE_NS = 10 * NS_PER_S
-"""Time for a lane to end after SIGTERM."""
+"""Time for a lane to end after SIGINT, and again after SIGTERM."""
 OUTCOMES = ("passed", "failed", "error", "skipped", "rerun", "inconclusive")
 SUMMARY = re.compile(r"^=+ (.*) in [\d.]+s(?: \([\d:]+\))? =+$", re.MULTILINE)
 COLOURS = re.compile(r"\x1b\[[\d;]*m")
@@ -189,5 +189,5 @@ def closing_line(outcomes: Sequence[LaneOutcome], took_s: float) -> str:
         + total["error"]
         + sum(bool(outcome.failures) and not outcome.counts["failed"] + outcome.counts["error"] for outcome in outcomes)
     )
-    others = "".join(f", {total[word]} {word}" for word in ("skipped", "rerun", "inconclusive") if total[word])
-    return f"{total['passed']} passed, {failed} failed{others} in {took_s:.0f}s"
+    other_counts = "".join(f", {total[word]} {word}" for word in ("skipped", "rerun", "inconclusive") if total[word])
+    return f"{total['passed']} passed, {failed} failed{other_counts} in {took_s:.0f}s"

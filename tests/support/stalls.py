@@ -1,11 +1,10 @@
 """The record of times when the host stalled this machine, and verdicts on timing that use it.
 
 A test of real time can fail because a program is too slow, or because the host (the hypervisor) did not run this
-machine.
-One probe for each processor (`lateness_probe.py`) distinguishes the two. It has real-time priority, so no program of
-LAVT, with a niceness of -15 at the least, can delay it. A failed timing assertion is excused (`HostStalled`) only if a
-probe was late at the relevant time; then pytest runs the test again, at most twice, and calls it inconclusive if the
-host stalls each time (`inconclusive.py`). Assertions on safety are plain `assert`s and are never excused.
+machine. One probe for each processor (`lateness_probe.py`) distinguishes the two. The probe has real-time priority, so
+no program of LAVT can delay it: their niceness is -15 or more. A failed timing assertion is excused (`HostStalled`)
+only if a probe was late at the relevant time. Then pytest runs the test again, at most twice, and calls it inconclusive
+if the host stalls its last run, too (`inconclusive.py`). Assertions on safety are plain `assert`s and never excused.
 
 Without the right to real-time priority the probes are ordinary processes. They are still used, because LAVT's programs
 then have no priority either; but programs may cause a stall, and the summary says so.
@@ -167,8 +166,8 @@ class ProbeProcess:
             self._process.stdin.flush()
         except BrokenPipeError:
             raise self._ended() from None
-        now_ns, late = json.loads(self._line())
-        return now_ns, [Stall(self.processor, begin_ns, end_ns) for begin_ns, end_ns in late]
+        now_ns, late_wakes = json.loads(self._line())
+        return now_ns, [Stall(self.processor, begin_ns, end_ns) for begin_ns, end_ns in late_wakes]
 
     def end(self) -> None:
         """End the process."""
@@ -239,7 +238,7 @@ class Stalls:
             raise self.verdict(message, since_ns, until_ns, stall_ms=stall_ms)
 
     def verdict(self, message: str, since_ns: int, until_ns: int, *, stall_ms: float = STALL_MS) -> Exception:
-        """Return the exception for a failure in an interval."""
+        """Return the exception for a failure: `HostStalled` if a stall overlaps the interval, else AssertionError."""
         stalls = self.during(since_ns, until_ns, at_least_ms=stall_ms)
         if not stalls:
             return AssertionError(message)
@@ -247,9 +246,9 @@ class Stalls:
         return HostStalled(f"{describe(stalls, since_ns)}; {message}")
 
     def share_verdict(self, message: str, since_ns: int, until_ns: int, *, share: float) -> Exception:
-        """Return the exception for a rate or a median; a stalled share of the time can explain it, but no single stall.
+        """Return the exception for a wrong rate or median: `HostStalled` if the stalled share of the time is large.
 
-        The share is that of the processor with most stalls.
+        A single stall does not excuse it. The share is that of the processor with most stalls.
         """
         stalls = self.during(since_ns, until_ns)
         stalled = stalled_share(stalls, since_ns, until_ns)

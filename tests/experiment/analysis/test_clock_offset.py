@@ -25,6 +25,7 @@ from lavt.experiment.analysis.clock_offset import (
 from lavt.recording.table import MISSING, Table, table_of
 
 TRUE_NS = 1_790_000_000 * NS_PER_S
+"""The true time at the start, from which all other times count."""
 ClockError = Callable[[int], int]
 """A function from the true time since the start to the error of a host's wall clock, both in ns."""
 
@@ -58,7 +59,7 @@ def steered_clock(offset_ms: float, ppm: float, from_s: float, until_s: float) -
     )
 
 
-def rows_of(rows: list[dict[str, Any]]) -> Table:
+def as_table(rows: list[dict[str, Any]]) -> Table:
     return table_of(rows, [0] * len(rows), [0] * len(rows))
 
 
@@ -109,14 +110,15 @@ def test_delta_of_a_steered_clock_is_within_its_bound(ppm: float, from_s: float,
 
 
 def test_query_time_widens_the_bound_only_while_steered() -> None:
-    """A query that takes 100 ms widens the bound while the clock is steered, and only then."""
+    """A query that takes 100 ms widens the bound by 0.5 ms while the clock is steered by 1 %, and only then."""
     exact, steered = drifting(0, 0), steered_clock(0, 10_000, 0, 100)
     bounds_ms = []
     for server in (exact, steered):
         offset = offset_from_sources(samples(server, asking_s=0.1), samples(exact, asking_s=0.1))
         assert offset is not None
         bounds_ms.append(float(offset.bound_ns.max()) / NS_PER_MS)
-    assert bounds_ms == pytest.approx([0.002, 0.502], abs=1e-3)
+    hosts_ms, query_ms = 2 * 0.001, 0.01 * 100 / 2
+    assert bounds_ms == pytest.approx([hosts_ms, hosts_ms + query_ms], abs=1e-3)
 
 
 def test_the_path_bound_replaces_both_root_distances() -> None:
@@ -133,7 +135,8 @@ def test_the_path_bound_replaces_both_root_distances() -> None:
         samples(server, bound_s=0.1, addresses=["10.9.0.1", "fe80::1"]), samples(client, bound_s=0.05, **path)
     )
     assert offset is not None
-    assert offset.bound_ns.max() == pytest.approx(200_000 + 10_000 + 10_000)
+    half_delay_ns, dispersion_ns, skew_times_age_ns = 200_000, 10_000, 10_000
+    assert offset.bound_ns.max() == pytest.approx(half_delay_ns + dispersion_ns + skew_times_age_ns)
 
 
 @pytest.mark.parametrize("lacking", ["client", "server"])
@@ -154,7 +157,10 @@ def test_delta_needs_the_time_sources_of_both_hosts(lacking: str) -> None:
     ],
 )
 def test_the_bound_of_a_host_that_follows_the_other(follower: str, path: dict[str, Any], bound_ms: float) -> None:
-    """The bound is the smaller of the follower's path bound and root distance, or else the sum of both hosts'."""
+    """If a host follows the other, the bound is the smaller of its path bound and its root distance.
+
+    If no host follows the other, both root distances add up.
+    """
     own = {"follows": "10.9.0.1", "skew_ppm": 0.0, "age_s": 0.0, "bound_s": 0.002, **path}
     tables = {
         "client": samples(drifting(0, 0), bound_s=0.003, addresses=["10.9.0.1"]),
@@ -168,14 +174,17 @@ def test_the_bound_of_a_host_that_follows_the_other(follower: str, path: dict[st
 
 def test_a_host_follows_any_address_of_the_other() -> None:
     """A host follows the other if its source has any recorded address of the other, from any sample."""
-    other = rows_of([{"addresses": None}, {"addresses": ["10.0.0.1", "10.0.0.2"]}, {"addresses": ["fe80::1"]}])
+    followed_host = as_table([{"addresses": None}, {"addresses": ["10.0.0.1", "10.0.0.2"]}, {"addresses": ["fe80::1"]}])
     sources = ["10.0.0.2", "10.0.0.3", "fe80::1", "", None]
-    is_followed = follows_peer(rows_of([{"follows": source} for source in sources]), other)
+    is_followed = follows_peer(as_table([{"follows": source} for source in sources]), followed_host)
     assert is_followed.tolist() == [True, False, True, False, False]
 
 
 def test_steering_for_a_second_is_in_the_bound_around_it() -> None:
-    """Steering by 1 % for a second gives a bound of 10 ms in this and the adjacent seconds, plus the query time's."""
+    """Steering by 1 % for a second gives a bound of 10 ms in this and the adjacent seconds.
+
+    At the beginning and the end of the steering the query time adds 0.5 ms.
+    """
     server = samples(steered_clock(0, 10_000, 10, 11), asking_s=0.1)
     offset = offset_from_sources(server, samples(drifting(0, 0)))
     assert offset is not None
@@ -203,7 +212,7 @@ def samples_with_rates(ppm: list[float]) -> list[dict[str, Any]]:
 
 def test_each_second_has_the_bound_of_its_own_steering() -> None:
     """The bound at a time is that of the second which begins there, including the first and the last second."""
-    server = rows_of(samples_with_rates([15_000, 20_000, 0, 20_000, 15_000]))
+    server = as_table(samples_with_rates([15_000, 20_000, 0, 20_000, 15_000]))
     offset = offset_from_sources(server, samples(drifting(0, 0), seconds=6, bound_s=0.0))
     assert offset is not None
     assert (offset.bound_ns / NS_PER_MS).tolist() == pytest.approx([5, 20, 20, 20, 5, 5], abs=1e-3)
@@ -213,7 +222,7 @@ def test_a_duplicate_sample_has_no_effect() -> None:
     """A duplicate sample has no effect."""
     rows = samples_with_rates([10.0, 20.0])
     offsets = [
-        offset_from_sources(rows_of(sample_rows), samples(drifting(0, 0), seconds=3))
+        offset_from_sources(as_table(sample_rows), samples(drifting(0, 0), seconds=3))
         for sample_rows in (rows, rows + rows[1:2])
     ]
     assert offsets[0] is not None
@@ -232,13 +241,16 @@ def test_steering_is_detected_from_three_samples_on() -> None:
 
 
 def test_delta_covers_the_time_that_both_hosts_know() -> None:
-    """Delta has the times of both hosts' samples from the later first to the earlier last sample, inclusively."""
+    """Delta is known at both hosts' sample times, from the later of their first to the earlier of their last samples.
+
+    Without a time at which both hosts are known, Delta is unknown.
+    """
     offset = offset_from_sources(samples(drifting(0, 0), seconds=20), samples(drifting(0, 0), begin_ms=5500))
     assert offset is not None
     times_ms = ((offset.client_wall_ns - TRUE_NS) // NS_PER_MS).tolist()
     assert times_ms == list(range(5500, 19001, 500))
-    apart = offset_from_sources(samples(drifting(0, 0), seconds=5), samples(drifting(0, 0), begin_ms=10_000))
-    assert apart is None
+    without_overlap = offset_from_sources(samples(drifting(0, 0), seconds=5), samples(drifting(0, 0), begin_ms=10_000))
+    assert without_overlap is None
 
 
 def test_times_are_on_the_clients_wall_clock() -> None:
@@ -253,21 +265,24 @@ def test_samples_without_a_correction_are_ignored() -> None:
     """Delta begins with the first known corrections; if a host loses its correction later, Delta is unknown."""
     rows = [{"wall_ns": TRUE_NS + at * NS_PER_S, "correction_s": 0.0, "bound_s": 0.0} for at in range(5)]
     unknown = [{**row, "correction_s": None} for row in rows]
-    offset = offset_from_sources(rows_of(unknown[:2] + rows[2:]), rows_of(rows))
+    offset = offset_from_sources(as_table(unknown[:2] + rows[2:]), as_table(rows))
     assert offset is not None
     assert offset.client_wall_ns.tolist() == [row["wall_ns"] for row in rows[2:]]
-    assert offset_from_sources(rows_of(rows[:2] + unknown[2:3] + rows[3:]), rows_of(rows)) is None
+    assert offset_from_sources(as_table(rows[:2] + unknown[2:3] + rows[3:]), as_table(rows)) is None
 
 
 @pytest.mark.parametrize(
     ("first_ppm", "middle_ppm", "last_ppm"), [(10.0, 50.0, 0.0), (0.0, 50.0, 10.0), (-10.0, 0.0, 5.0), (5.0, 0.0, -10)]
 )
 def test_the_bound_grows_outside_the_samples(first_ppm: float, middle_ppm: float, last_ppm: float) -> None:
-    """Outside its times, the bound grows twice as fast as Delta changed at the faster of its two ends."""
+    """Outside the samples, the bound grows at twice the rate of Delta in the first or the last second.
+
+    The faster of the two rates counts.
+    """
     rows = samples_with_rates([first_ppm, middle_ppm, middle_ppm, last_ppm])
     values_ns = [row["correction_s"] * NS_PER_S for row in rows]
     for table in (rows, rows[::-1]):
-        offset = offset_from_sources(rows_of(table), samples(drifting(0, 0), seconds=5))
+        offset = offset_from_sources(as_table(table), samples(drifting(0, 0), seconds=5))
         assert offset is not None
         assert offset.delta_ns.tolist() == pytest.approx([-value_ns for value_ns in values_ns], abs=1)
         assert offset.drift_outside == pytest.approx(20e-6, rel=0.01)
@@ -283,17 +298,20 @@ def test_one_sample_allows_for_any_drift() -> None:
 
 
 @pytest.mark.parametrize(
-    ("known", "first"),
+    ("known_flags", "first_used"),
     [("11", 0), ("01", 1), ("0011", 2), ("10", None), ("101", None), ("0101", None), ("00", None), ("", None)],
 )
 @pytest.mark.parametrize("lacking", [{"correction_s": None}, {"wall_ns": None}])
-def test_samples_are_used_from_the_first_known_one_on(known: str, first: int | None, lacking: dict[str, Any]) -> None:
+def test_samples_are_used_from_the_first_known_one_on(
+    known_flags: str, first_used: int | None, lacking: dict[str, Any]
+) -> None:
     """Samples are used from the first known one on; if a later one is unknown, none is used."""
     rows = [
-        {"wall_ns": index, "correction_s": 0.5, **({} if flag == "1" else lacking)} for index, flag in enumerate(known)
+        {"wall_ns": index, "correction_s": 0.5, **({} if flag == "1" else lacking)}
+        for index, flag in enumerate(known_flags)
     ]
-    used = known_samples(rows_of(rows)).ints("wall_ns").tolist()
-    assert used == ([] if first is None else list(range(first, len(known))))
+    used = known_samples(as_table(rows)).ints("wall_ns").tolist()
+    assert used == ([] if first_used is None else list(range(first_used, len(known_flags))))
 
 
 def simulated_exchanges(
@@ -350,8 +368,9 @@ def test_the_exchange_with_the_smallest_bound_is_used() -> None:
     assert offset is not None
     at_ns = np.array([TRUE_NS + 10 * NS_PER_S, TRUE_NS + 12 * NS_PER_S])
     assert offset.at(at_ns).tolist() == pytest.approx([250 * NS_PER_MS] * 2, abs=2)
-    between_ns = DRIFT_ALLOWANCE * NS_PER_S / 4
-    expected = [100_000 + between_ns, 100_000 + DRIFT_ALLOWANCE * 2 * NS_PER_S + between_ns]
+    half_round_trip_ns, drift_in_half_a_gap_ns = 100_000, DRIFT_ALLOWANCE * NS_PER_S / 4
+    at_exchange_ns = half_round_trip_ns + drift_in_half_a_gap_ns
+    expected = [at_exchange_ns, at_exchange_ns + DRIFT_ALLOWANCE * 2 * NS_PER_S]
     assert offset.bound_at(at_ns).tolist() == pytest.approx(expected, rel=0.01)
 
 
@@ -366,7 +385,10 @@ def test_the_bound_grows_after_the_last_exchange() -> None:
 
 
 def test_an_exchange_with_impossible_times_is_ignored() -> None:
-    """An exchange with impossible times, during which a clock was set, is ignored; without any, Delta is unknown."""
+    """An exchange with impossible or missing times is ignored, and without another exchange Delta is unknown.
+
+    An exchange after which the server's clock was set is not ignored.
+    """
     exchanges = simulated_exchanges(
         drifting(0, 0), lambda at_ns: -NS_PER_S if at_ns > 5 * NS_PER_S else 0, lambda _: (0.1, 0.1)
     )

@@ -14,6 +14,7 @@ from lavt.recording.table import Table, table_of
 REQUESTED_MS = {"video": 150.0, "control": 75.0}
 BEGAN_S, ENDED_S = 10, 20
 Sample = tuple[float, str, str, float, float | None, str]
+"""Time (s), condition, flow, requested and measured delay (ms), and the reason against the measurement, or ""."""
 VIDEO: list[Sample] = [(5, "L4", "video", 150.0, 150.2, ""), (15, "L4", "video", 150.0, 150.4, "")]
 CONTROL: list[Sample] = [(1, "L4", "control", 75.0, 75.1, "")]
 
@@ -29,7 +30,9 @@ def record(samples: Sequence[Sample], *, with_drive: bool = False) -> Record:
     tables = {"injection": table(rows)} if rows else {}
     if with_drive:
         events = (("drive_began", BEGAN_S, ""), ("ending", ENDED_S, "completed"))
-        tables["event"] = table([{"mono_ns": s * 10**9, "kind": kind, "detail": detail} for kind, s, detail in events])
+        tables["event"] = table(
+            [{"mono_ns": at_s * 10**9, "kind": kind, "detail": detail} for kind, at_s, detail in events]
+        )
     return Record(Path("none"), True, tables, {}, ENDED_S * 10**9)
 
 
@@ -100,7 +103,7 @@ def test_another_clients_condition_invalidates_a_run_without_one() -> None:
 def test_latencies_below_the_injected_delay_are_a_reason(
     tau_v_ms: float | None, tau_c_ms: float | None, flows: list[str]
 ) -> None:
-    """If the video or control latency is below the injected delay, the delay was on another path: invalid."""
+    """A run whose video or control latency is below the injected delay is invalid: the delay was on another path."""
     entry = {"tau_v_ms": {"p50": tau_v_ms, "bound": 0.2}, "tau_c_ms": {"p50": tau_c_ms, "bound": None}}
     found = absent_reasons(entry, REQUESTED_MS)
     assert {reason.code for reason in found} <= {InvalidCode.INJECTION_NOT_ON_PATH}

@@ -85,8 +85,8 @@ def test_only_a_constant_delay_has_a_requested_median() -> None:
 def test_least_expected_delay() -> None:
     """Jitter and reordering reduce the least expected delay of a condition."""
     assert injected_entry(conditions()["L4"]) == {"injected_ms": {"video": 150, "control": 75}}
-    jitter, early = ImpairmentConfig(jitter_ms=10), ImpairmentConfig(reorder=0.5)
+    jitter, reordering = ImpairmentConfig(jitter_ms=10), ImpairmentConfig(reorder=0.5)
     requested = Condition(video_ms=75, control_ms=30, video=jitter, control=jitter)
-    assert injected_entry(requested)["injected_least_ms"] == {"video": 35, "control": 0}
-    requested = Condition(video_ms=75, control_ms=30, video=early)
+    assert injected_entry(requested)["injected_least_ms"] == {"video": 75 - 4 * 10, "control": 0}
+    requested = Condition(video_ms=75, control_ms=30, video=reordering)
     assert injected_entry(requested)["injected_least_ms"] == {"video": 0, "control": 30}

@@ -28,7 +28,7 @@ def test_stage_latencies_in_pipeline_order(make_run: MakeRun, tmp_path: Path) ->
         ("network", "control link"),
     ]
     assert stages["driver", "decode"]["p50"] == pytest.approx(2.0)
-    # Of tau_v, 62 ms, the camera takes 5 after the stamp, and the client 10 from the packet to the stamp.
+    # Of tau_v, 62 ms, the camera takes 5 after the stamp, and the client 10 from the packet to reading the stamp.
     link = stages["network", "video link"]
     assert (link["p50"], link["p95"]) == pytest.approx((47.0, 49.0), abs=1e-3)
     assert link["n"] == entry["tau_v_ms"]["n"]

@@ -32,7 +32,7 @@ def test_the_steering_rate_is_weighted_by_time() -> None:
 
 
 def test_reversals_are_counted_by_time_and_by_distance() -> None:
-    """Three turns back in 4 s and 40 m are 0.75 per second and 75 per kilometre."""
+    """Three reversals in 4 s and 40 m are 0.75 per second and 75 per kilometre."""
     angles = [0.0] * 36 + [0.1, -0.1, 0.1, -0.1, -0.1]
     entry = steering_metrics(truth(angles))
     assert entry["steering_reversals_per_s"] == pytest.approx(0.75)

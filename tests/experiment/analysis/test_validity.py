@@ -79,7 +79,7 @@ def test_each_infrastructure_fault_makes_the_run_invalid(
     ],
 )
 def test_small_faults_are_tolerated(make_run: MakeRun, tmp_path: Path, settings: dict[str, Any]) -> None:
-    """With under 1 % missed ticks, a clock step below the limit or one missing clock sample, a run is valid."""
+    """A run is valid with one late event, under 1 % missed frames, a small clock step or one missing clock sample."""
     assert reasons(make_run, tmp_path, **settings) == []
 
 
@@ -90,7 +90,7 @@ GOOD_PATH = {"peer_delay_s": 0.0006, "peer_dispersion_s": 0.00003, "skew_ppm": 4
 
 
 def following(**changes: Any) -> dict[str, Any]:
-    """Return the settings of a run whose client follows its server, with chrony's data for root."""
+    """Return the settings of a run whose client follows its server, with the data that chrony gives to root only."""
 
     def client(second: int) -> dict[str, Any]:
         path = {**GOOD_PATH, "follows": SERVER, "addresses": [CLIENT], "good_samples": 20 + second}
@@ -122,7 +122,7 @@ def test_a_slow_last_sample_does_not_widen_the_bound(make_run: MakeRun, tmp_path
     assert reasons(make_run, tmp_path, bound_s=0.0005, **slow) == []
 
 
-ONE_REASON = {
+CLOCK_FAULTS = {
     "delay on NTP's path before it synchronised": (
         {**following(peer_delay_s=0.0756, correction_s=lambda second: 0.2875 + 20e-6 * second)},
         InvalidCode.NTP_THROUGH_DELAY,
@@ -203,12 +203,13 @@ ONE_REASON = {
         ("client", "+1000.0 ms"),
     ),
 }
+"""For each fault the settings of the drive, and the code and facts of the only reason."""
 
 
-@pytest.mark.parametrize("case", ONE_REASON)
+@pytest.mark.parametrize("case", CLOCK_FAULTS)
 def test_each_clock_fault_has_one_reason(make_run: MakeRun, tmp_path: Path, case: str) -> None:
     """Each fault of the clocks has one reason, for its cause and not for its consequences."""
-    settings, code, facts = ONE_REASON[case]
+    settings, code, facts = CLOCK_FAULTS[case]
     require_one(reasons(make_run, tmp_path, **settings), code, *facts)
 
 
@@ -272,14 +273,15 @@ def test_without_chrony_the_probe_is_used(make_run: MakeRun, tmp_path: Path, sid
     assert invalid_reasons(server, client, measured) == []
     delta = measured.entry["delta"]
     assert delta["source"] == "probe"
-    assert delta["ms"] == delta["probe_ms"] == pytest.approx(250.0 + 20e-6 * 6000, abs=0.001)
+    at_middle_of_drive_ms = 250.0 + 20e-6 * 6000
+    assert delta["ms"] == delta["probe_ms"] == pytest.approx(at_middle_of_drive_ms, abs=0.001)
     assert 0.3 < delta["bound_ms"] == delta["probe_bound_ms"] < 0.5
     assert measured.entry["tau_v_ms"]["p50"] == pytest.approx(62.0, abs=0.02)
     assert measured.entry["tau_v_ms"]["bound"] == delta["bound_ms"]
 
 
 def test_chrony_must_be_synchronised_before_the_drive(make_run: MakeRun, tmp_path: Path) -> None:
-    """A chrony is used only if it has a correction from before the start of the drive on."""
+    """A chrony is used only if it had a correction before the drive and during the whole drive."""
 
     def client(from_second: int) -> dict[str, Any]:
         return {"client_clock": lambda second: {"correction_s": None} if second < from_second else {}}

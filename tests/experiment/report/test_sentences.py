@@ -33,7 +33,7 @@ def test_the_results_name_the_largest_fall_of_completion() -> None:
 
 
 def test_no_fall_is_reported_if_there_is_none() -> None:
-    """Constant completion is reported as such; one condition has no fall; no condition gives no text."""
+    """Constant completion is reported as such; with one condition no fall is named, and without conditions no text."""
     assert "Completion does not fall" in results_sentences("It", conditions(1.0, 1.0, 1.0))
     assert "fall" not in results_sentences("It", conditions(1.0))
     assert results_sentences("It", {}) == ""
@@ -49,7 +49,10 @@ def test_many_routes_and_conditions_are_counted() -> None:
 
 
 def test_conditions_with_equal_loop_latency_are_sorted_by_name() -> None:
-    """Loop latencies that differ by half a millisecond count as equal, also for the latency at which half fail."""
+    """Conditions whose loop latencies differ by at most 3 ms count as equally slow.
+
+    This also holds for the sentence "At ... ms and above, fewer than half".
+    """
     rates = {"L2": (222.5, 0.9), "L3": (297.6, 0.53), "L4": (297.4, 0.47), "L5": (397.3, 0.1)}
     conditions = {
         name: {"loop_ms": {"p50": loop_ms}, "completion_rate": rate, "p95_m": None}

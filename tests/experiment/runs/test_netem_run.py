@@ -109,7 +109,10 @@ def test_a_rejected_run_keeps_the_queue_of_another_program(tmp_path: Path) -> No
 
 
 def test_a_delay_that_differs_from_the_request_is_a_reason(tmp_path: Path) -> None:
-    """A delay that is 3 ms longer after the drive is a reason for each flow, with the time of measurement."""
+    """A delay that is 3 ms longer after the drive is a reason for each flow, with the time of measurement.
+
+    A part of netem that has stopped and a missing queue are reasons, too.
+    """
     interface = FakeNetemInterface(tmp_path)
     with netem_run(interface, "L1") as netem:
         netem.apply(video_port=40_001, control_port=40_002)

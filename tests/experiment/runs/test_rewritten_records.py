@@ -1,4 +1,4 @@
-"""Records that were rewritten by others: valid files and checksums, and any content."""
+"""Tests of records that another program has rewritten: files and checksums are valid, but messages have any content."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ TEXTS = [
     b"1e999",
     b'{"a":1,"a":2}',
     b"[" * 5000,
-    *(json.dumps(each).encode() for each in VALUES),
+    *(json.dumps(value).encode() for value in VALUES),
 ]
 TIMES_NS = [0, 2**63 - 1, 2**63, 2**64 - 1]
 
@@ -43,10 +43,13 @@ TIMES_NS = [0, 2**63 - 1, 2**63, 2**64 - 1]
 def topics(make_run: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Topics:
     """Return the messages of a short drive."""
     directory = make_run(tmp_path_factory.mktemp("drive"), seconds=2.0, capture_ms=5.0)
-    read = {side: read_mcap(directory / f"{side}.mcap", lambda _: True).topics for side in SIDES}
+    topics_of_sides = {side: read_mcap(directory / f"{side}.mcap", lambda _: True).topics for side in SIDES}
     return {
-        side: {topic: list(zip(each.log_ns, each.publish_ns, each.data, strict=True)) for topic, each in of.items()}
-        for side, of in read.items()
+        side: {
+            topic: list(zip(messages.log_ns, messages.publish_ns, messages.data, strict=True))
+            for topic, messages in topics.items()
+        }
+        for side, topics in topics_of_sides.items()
     }
 
 
@@ -62,7 +65,7 @@ def write(directory: Path, side: str, topics: list[tuple[str, Rows]]) -> None:
 
 
 def mutated(rows: Rows, generator: Any) -> Rows:
-    """Return messages of which some, or all, have another field, content or time, or less fields."""
+    """Return messages of which some, or all, have another value, content or time, lack a field, or are left out."""
 
     def any_of(values: list[Any]) -> Any:
         return values[generator.integers(len(values))]
@@ -72,9 +75,9 @@ def mutated(rows: Rows, generator: Any) -> Rows:
     name, time_ns, share = any_of(names), any_of(TIMES_NS), any_of([0.01, 0.5, 1.0])
     changed = []
     for log_ns, publish_ns, data in rows:
-        fields, new = json.loads(data), (log_ns, publish_ns, data)
+        fields = json.loads(data)
         if generator.random() > share:
-            changed.append(new)
+            changed.append((log_ns, publish_ns, data))
         elif kind == "value":
             changed.append((log_ns, publish_ns, json.dumps({**fields, name: value}).encode()))
         elif kind == "missing":

@@ -92,7 +92,10 @@ def test_the_probe_alone_with_injected_delay(tmp_path: Path) -> None:
 
 
 def test_a_wrong_time_source_is_contradicted_by_the_probe(tmp_path: Path) -> None:
-    """A chrony with 75 ms of delay in one direction is wrong by half of it; the probe contradicts it: invalid."""
+    """A time source that is wrong by 37.5 ms contradicts the probe, and the run is invalid.
+
+    Such an error comes from NTP through 75 ms of delay in one direction.
+    """
 
     def use_wrong_source(loop: VirtualLoop) -> None:
         host = loop.runtime.hosts["client"]
@@ -101,7 +104,7 @@ def test_a_wrong_time_source_is_contradicted_by_the_probe(tmp_path: Path) -> Non
     _, result, _ = drive_with(tmp_path / "run", change=use_wrong_source)
     (reason,) = result["invalid_reasons"]
     assert reason["code"] == "clock_disagreement"
-    assert ": 287." in reason["text"]
+    assert ": 287." in reason["text"]  # 250 + 37.5 ms
 
 
 def test_a_probe_without_answers_makes_the_run_invalid(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from lavt.experiment.runs.virtual_run import build_loop, drive
 from lavt.recording.record import read_record
 from lavt.recording.table import MISSING
 
-OTHER_CONDITIONS = sorted(set(conditions()) - {"L0", "L1", "L2", "L3", "L4", "L5"})
+IMPAIRED_CONDITIONS = sorted(set(conditions()) - {"L0", "L1", "L2", "L3", "L4", "L5"})
 
 
 def all_but_one_full(names: list[str], quick: str) -> list[Any]:
@@ -49,15 +49,15 @@ def test_a_constant_delay_has_no_link_counters(tmp_path: Path) -> None:
     assert link_counts(tmp_path / "run/server.mcap") == link_counts(tmp_path / "run/client.mcap") == {}
 
 
-@pytest.mark.parametrize("name", all_but_one_full(OTHER_CONDITIONS, "loss_burst"))
+@pytest.mark.parametrize("name", all_but_one_full(IMPAIRED_CONDITIONS, "loss_burst"))
 def test_every_condition_is_driven_reproducibly(name: str, tmp_path: Path) -> None:
     """Without pixels, every condition is completed in a valid run, with a reproducible digest."""
     changes = ("fidelity=geometry", f"network.condition={name}")
     result, repeated = drive_run(tmp_path / "run", *changes), drive_run(tmp_path / "again", *changes)
     assert (result["ending"], result["valid"], result["invalid_reasons"]) == ("completed", True, [])
     assert result["digest"] == repeated["digest"]
-    other = drive_run(tmp_path / "other", *changes, "seed=2", "vehicle.time_limit_s=2")
-    assert other["digest"] != result["digest"]
+    other_seed = drive_run(tmp_path / "other", *changes, "seed=2", "vehicle.time_limit_s=2")
+    assert other_seed["digest"] != result["digest"]
 
 
 def test_lost_packets_are_counted_and_missing(tmp_path: Path) -> None:
@@ -74,7 +74,7 @@ def test_lost_packets_are_counted_and_missing(tmp_path: Path) -> None:
         assert 0 <= sent - counts["lost"] - received <= 10  # the others were in transit at the end
 
 
-@pytest.mark.parametrize("name", all_but_one_full(OTHER_CONDITIONS, "reorder"))
+@pytest.mark.parametrize("name", all_but_one_full(IMPAIRED_CONDITIONS, "reorder"))
 def test_video_under_every_condition(name: str, tmp_path: Path) -> None:
     """Real video passes a link under every condition, and the link's counters show its impairment."""
     changes = ("vehicle.scenery=none", "record.video=false", f"network.condition={name}")

@@ -107,7 +107,7 @@ def test_latencies_are_correct_within_their_bound(l0: Path) -> None:
 
 
 def test_ignoring_the_clock_offset_makes_latencies_wrong(tmp_path: Path) -> None:
-    """Time sources that ignore the offset make tau_v and tau_c wrong by it: the test above can fail."""
+    """Time sources that ignore the clock offset make tau_v and tau_c wrong by it, so the test above can fail."""
 
     def ignore_offset(loop: VirtualLoop) -> None:
         for side, host in loop.runtime.hosts.items():
@@ -190,7 +190,7 @@ def flip_a_bit_of_a_command(loop: VirtualLoop) -> None:
 
 
 def test_the_digest_is_reproducible_and_sensitive(tmp_path: Path) -> None:
-    """Equal runs have equal digests; another seed, one changed pixel or one changed bit of a command changes them."""
+    """Equal runs have equal digests; another seed, one other pixel or one other bit of a command gives another."""
     digests = [
         digest(tmp_path / "first"),
         digest(tmp_path / "seed", "seed=2"),

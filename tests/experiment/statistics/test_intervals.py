@@ -77,12 +77,16 @@ def test_the_bootstrap_is_reproducible_and_accurate() -> None:
     interval = bootstrap_interval(values)
     assert interval == bootstrap_interval(values)
     assert interval is not None
-    assert interval[0] == pytest.approx(0.5 - 1.96 * 0.0291, abs=0.006)
-    assert interval[1] == pytest.approx(0.5 + 1.96 * 0.0291, abs=0.006)
+    mean, standard_error = 0.5, 0.0291
+    assert interval[0] == pytest.approx(mean - 1.96 * standard_error, abs=0.006)
+    assert interval[1] == pytest.approx(mean + 1.96 * standard_error, abs=0.006)
 
 
 def test_the_bootstrap_of_three_is_their_range() -> None:
-    """The 95 % interval of three values is their range: 1 in 27 resamples is the smallest value three times."""
+    """The 95 % interval of three values is their range.
+
+    More than 2.5 % of the resamples, 1 in 27, consist of the smallest value three times, and as many of the largest.
+    """
     assert bootstrap_interval([0.2, 1.0, 0.6]) == pytest.approx([0.2, 1.0])
     assert bootstrap_interval([1.0, 1.0, 1.0]) == [1.0, 1.0]
 

@@ -92,7 +92,10 @@ def campaign(*, condition: str = "L0", bad_route: str | None = None, **changes: 
 
 
 def test_completion_by_route_and_for_such_roads() -> None:
-    """If one of six routes is never completed, 25 of 30 runs are; that route has 0 to 52 %, such roads 50 to 100 %."""
+    """If one of six routes is never completed, its interval is 0 to 52 %, and that for such roads 50 to 100 %.
+
+    The interval for such roads is for the completion on other roads of the same kind.
+    """
     condition = summarize(campaign(bad_route="b"), SPEED)["conditions"]["L0"]
     assert condition["endings"] == {"completed": 25, "safe_stop": 5}
     assert condition["completion_interval"] == exact_interval(25, 30)
@@ -175,8 +178,11 @@ def test_groups_have_contrasts_of_their_own() -> None:
     """Runs are paired within a group only; the base config's contrasts are those of its group."""
     runs = [
         entry
-        for speed, bad in ((20, None), (30, "b"))
-        for entry in (*campaign(axes={"speed": speed}), *campaign(condition="L1", bad_route=bad, axes={"speed": speed}))
+        for speed, bad_route in ((20, None), (30, "b"))
+        for entry in (
+            *campaign(axes={"speed": speed}),
+            *campaign(condition="L1", bad_route=bad_route, axes={"speed": speed}),
+        )
     ]
     summary = summarize(runs, SPEED, base={"speed": 30})
     pairs = [(group["contrasts"][0]["pairs"], group["contrasts"][0]["p"]) for group in summary["groups"]]
@@ -185,7 +191,7 @@ def test_groups_have_contrasts_of_their_own() -> None:
 
 
 def test_results_of_an_older_version_are_summarised() -> None:
-    """Keys that an older result lacks are null or empty, and its others are summarized."""
+    """Keys that an older result lacks are null or empty, and its other keys are summarized."""
     condition = summarize([run()], SPEED)["conditions"]["L0"]
     assert condition["completion_rate"] == 1.0
     assert (condition["p95_common_m"], condition["mae_m"], condition["stages_ms"]) == (None, None, [])
@@ -202,7 +208,7 @@ def test_a_summary_without_runs() -> None:
 
 def test_the_bound_of_a_condition_is_the_largest() -> None:
     """The bound of a condition's latency is the largest of its runs, and null if one run has none."""
-    other = run()["tau_v_ms"]
-    runs = [run(), run(tau_v_ms={**other, "bound": 0.8}), run(tau_c_ms={**other, "bound": None})]
+    latency = run()["tau_v_ms"]
+    runs = [run(), run(tau_v_ms={**latency, "bound": 0.8}), run(tau_c_ms={**latency, "bound": None})]
     condition = summarize(runs, SPEED)["conditions"]["L0"]
     assert (condition["tau_v_ms"]["bound"], condition["tau_c_ms"]["bound"]) == (0.8, None)

@@ -1,4 +1,4 @@
-"""Tests of the summary of a small driven sweep: the keys on which the report and others rely, and their consistency."""
+"""Tests of the summary of a small driven sweep: its keys, on which the report and users rely, and their consistency."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def summary(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 
 def test_every_key_is_present(summary: Any) -> None:
-    """Runs, conditions, routes, groups, contrasts and the paper have the keys on which others rely."""
+    """Runs, conditions, routes, groups, contrasts and the paper have the keys on which the report and users rely."""
     assert all(run.keys() >= RUN_KEYS and run["valid"] for run in summary["runs"])
     for conditions in (summary["conditions"], *(group["conditions"] for group in summary["groups"])):
         assert list(conditions) == ["L0", "L1"]

@@ -17,7 +17,8 @@ CALIBRATION_S = 0.2
 ADJ_FREQUENCY, ADJ_STATUS, ADJ_SETOFFSET, ADJ_NANO, ADJ_TICK = 0x2, 0x10, 0x100, 0x2000, 0x4000
 STA_UNSYNC = 0x40
 TICK_US = 10_000
-PPM = 65_536
+"""The kernel's default tick: the clock runs at its nominal rate."""
+UNITS_PER_PPM = 65_536
 """The kernel's unit of frequency is 2^-16 ppm."""
 
 
@@ -66,10 +67,10 @@ def read_monotonic_clock(attempts: int = 10) -> tuple[int, int]:
     return (before + after) // 2, mono_ns
 
 
-def offset_ns(one: tuple[int, int], other: tuple[int, int]) -> int:
-    """Return one clock minus another (ns), from a reading (counter, ns) of each."""
-    elapsed_ns = (one[0] - other[0]) / counter_hz() * NS_PER_S
-    return one[1] - other[1] - round(elapsed_ns)
+def offset_ns(reading: tuple[int, int], reference: tuple[int, int]) -> int:
+    """Return a clock minus a reference clock (ns), from a reading (counter, ns) of each."""
+    elapsed_ns = (reading[0] - reference[0]) / counter_hz() * NS_PER_S
+    return reading[1] - reference[1] - round(elapsed_ns)
 
 
 @cache
@@ -101,7 +102,7 @@ def step(by_ns: int) -> None:
 
 def set_drift(by_ppm: float) -> None:
     """Set the wall clock's frequency error, from -500 to 500 ppm."""
-    _adjtimex(Timex(modes=ADJ_FREQUENCY | ADJ_TICK, frequency=round(by_ppm * PPM), tick=TICK_US))
+    _adjtimex(Timex(modes=ADJ_FREQUENCY | ADJ_TICK, frequency=round(by_ppm * UNITS_PER_PPM), tick=TICK_US))
 
 
 def restore(difference_ns: int) -> None:

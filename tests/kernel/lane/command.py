@@ -49,8 +49,8 @@ def main(arguments: Sequence[str]) -> int:
         os.chdir(REPOSITORY)
         python = find_interpreter()
         compileall.compile_dir(REPOSITORY / "src", quiet=2)  # the slow machines start LAVT a hundred times
-        tests = [python, "-B", "-m", "pytest", "-p", "no:cacheprovider", *pytest_arguments(extra)]
-        return _native(tests) if options.native else _pair(python, tests, out)
+        pytest_command = [python, "-B", "-m", "pytest", "-p", "no:cacheprovider", *pytest_arguments(extra)]
+        return _native(pytest_command) if options.native else _pair(python, pytest_command, out)
     except LaneUnavailable as error:
         print(f"tests/kernel/run: {error}", file=sys.stderr)
         return 2
@@ -74,9 +74,9 @@ def _complete_path(argument: str) -> str:
 def find_interpreter() -> str:
     """Return a Python that has LAVT and pytest: this one, or the repository's environment."""
     for python in (sys.executable, str(REPOSITORY / ".venv/bin/python")):
-        has_both = [python, "-c", "import lavt, pytest"]
+        import_both = [python, "-c", "import lavt, pytest"]
         with suppress(OSError):
-            if subprocess.run(has_both, capture_output=True, env=_environment(), check=False).returncode == 0:
+            if subprocess.run(import_both, capture_output=True, env=_environment(), check=False).returncode == 0:
                 return python
     raise LaneUnavailable(
         "no Python here has LAVT and pytest: python3 -m venv .venv && .venv/bin/pip install -e '.[all]'"
@@ -108,7 +108,7 @@ _ABSOLUTE_PYTHON_PATH = [
 ]
 
 
-def _native(tests: Sequence[str]) -> int:
+def _native(pytest_command: Sequence[str]) -> int:
     """Run the tests on this kernel, in a network namespace of their own."""
     netem_trial = "ip link set lo up && tc qdisc add dev lo root netem delay 1ms"
     in_own_network = ["unshare", "--net", "sh", "-c"]
@@ -117,7 +117,9 @@ def _native(tests: Sequence[str]) -> int:
     if subprocess.run([*in_own_network, netem_trial], capture_output=True, check=False).returncode != 0:
         raise LaneUnavailable("this machine's own kernel has no netem: leave --native out")
     environment = {**_environment(), "LAVT_KERNEL_LANE": "native"}
-    process = subprocess.Popen([*in_own_network, 'ip link set lo up; exec "$@"', "sh", *tests], env=environment)
+    process = subprocess.Popen(
+        [*in_own_network, 'ip link set lo up; exec "$@"', "sh", *pytest_command], env=environment
+    )
     try:
         return process.wait()
     finally:
@@ -125,7 +127,8 @@ def _native(tests: Sequence[str]) -> int:
         process.wait()
 
 
-def _pair(python: str, tests: Sequence[str], writable_directories: Sequence[Path]) -> int:
+def _pair(python: str, pytest_command: Sequence[str], writable_directories: Sequence[Path]) -> int:
+    """Run the tests on the first of two machines."""
     tools = fetch_packages(Path(os.environ.get("LAVT_KERNEL") or REPOSITORY / ".kernel").absolute())
     environment = {**_environment(), "LAVT_KERNEL_LANE": "pair", "LAVT_KERNEL_KEY": secrets.token_hex(16)}
     environment.setdefault("COLUMNS", str(shutil.get_terminal_size().columns))
@@ -134,17 +137,20 @@ def _pair(python: str, tests: Sequence[str], writable_directories: Sequence[Path
     agent = [python, "-B", "-m", "tests.kernel.lane.agent", CLIENT["vec1"]]
     processors = sorted(os.sched_getaffinity(0))
     guests: list[Guest] = []
-    with TemporaryDirectory(prefix="lavt-kernel-") as folder, _host_stalls(python) as line:
+    with TemporaryDirectory(prefix="lavt-kernel-") as folder, _host_stalls(python) as stall_line:
         scratch = Path(folder)
         prepare(tools, scratch)
         links = {device: socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM) for device in SERVER}
         output, output_writer = os.pipe()
         agent_output = os.open(scratch / "client.output", os.O_WRONLY | os.O_CREAT)
         try:
-            for side, (name, command, addresses, to, guest_line) in enumerate(
-                [("server", tests, SERVER, output_writer, line), ("client", agent, CLIENT, agent_output, None)]
+            for index, (name, command, addresses, guest_output, guest_line) in enumerate(
+                [
+                    ("server", pytest_command, SERVER, output_writer, stall_line),
+                    ("client", agent, CLIENT, agent_output, None),
+                ]
             ):
-                ends = {device: (pair[side].fileno(), addresses[device]) for device, pair in links.items()}
+                ends = {device: (pair[index].fileno(), addresses[device]) for device, pair in links.items()}
                 guest = start_guest(
                     name,
                     command,
@@ -153,9 +159,9 @@ def _pair(python: str, tests: Sequence[str], writable_directories: Sequence[Path
                     environment=environment,
                     links=ends,
                     writable=writable_directories,
-                    output=to,
+                    output=guest_output,
                     serial_line=guest_line,
-                    processor=processors[side % len(processors)],
+                    processor=processors[index % len(processors)],
                 )
                 guests.append(guest)
             os.close(output_writer)

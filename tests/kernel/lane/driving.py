@@ -151,8 +151,8 @@ def invalid_reasons(finished_drive: DriveResult) -> list[InvalidReason]:
 
 
 def _start(machine: Machine, command: str, *arguments: str, changes: Sequence[str] = ()) -> StartedProgram:
-    sets = [part for change in changes for part in ("--set", change)]
+    set_options = [part for change in changes for part in ("--set", change)]
     return machine.start(
-        [machine.python, "-B", "-m", "lavt", command, *arguments, *sets, "--json"],
+        [machine.python, "-B", "-m", "lavt", command, *arguments, *set_options, "--json"],
         environment={"OPENCV_FOR_THREADS_NUM": "1"},
     )

@@ -136,8 +136,8 @@ def start_guest(
     devices = []
     for device, (descriptor, address) in links.items():
         setup.append(f"ip address add {address}/24 dev {device} && ip link set {device} up")
-        station, host = address.split(".")[2:]
-        devices.append(f"{device}:transport=fd,fd={descriptor},mac=02:00:00:00:{int(station):02x}:{int(host):02x}")
+        mac_end = ":".join(f"{int(byte):02x}" for byte in address.split(".")[2:])
+        devices.append(f"{device}:transport=fd,fd={descriptor},mac=02:00:00:00:{mac_end}")
     _write_program(
         scratch / f"{name}.init",
         INIT.format(

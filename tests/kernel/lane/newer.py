@@ -1,8 +1,9 @@
-"""A newer user-mode kernel than that of the host's release, from Debian's next release, if it is available.
+"""Fetch and install the user-mode kernel of Debian's next release, if there is one: it is faster than the host's.
 
 Since 6.16 the kernel does not need ptrace (`seccomp=auto`). A system call then takes 9 instead of 19 us, the first
 access to a page 21 instead of 92 us, a fork of a Python program 9 instead of 26 ms (7.2 compared with 6.1, on one
-processor of a virtual machine). It needs the C library that it was built with, which is also newer than the host's.
+processor of a virtual machine). The kernel needs the C library that it was built with, which is also newer than the
+host's.
 """
 
 from __future__ import annotations
@@ -68,21 +69,23 @@ def _archive(folder: Path, apt: Apt, options: Sequence[str]) -> str:
 def install(tools: Path, kernel: Path, libraries: Path) -> bool:
     """Install the newer kernel and its C library; return False if they were not fetched.
 
-    The library has its own loader. The kernel's program header names the loader, so the name is changed in a copy: as
-    an argument of the loader, the kernel would take the loader's memory for its own.
+    The library has its own loader. The kernel's program header names the host's loader, so it is changed in a copy of
+    the kernel to name the library's. (To start the kernel as `LOADER KERNEL` instead does not work: the kernel would
+    take the loader's memory for its own.)
     """
     kernel_file, loader = tools / FOLDER / KERNEL, tools / FOLDER / LOADER
     if not kernel_file.is_file() or not loader.exists():
         return False
-    program, name = bytearray(kernel_file.read_bytes()), bytes(loader.resolve()) + b"\0"
+    program, loader_name = bytearray(kernel_file.read_bytes()), bytes(loader.resolve()) + b"\0"
     (first,) = struct.unpack_from("<Q", program, FIRST_HEADER_AT)
     (count,) = struct.unpack_from("<H", program, COUNT_AT)
     for offset in range(first, first + HEADER.size * count, HEADER.size):
         kind, flags, _, virtual, physical, _, _, alignment = HEADER.unpack_from(program, offset)
         if kind == PT_INTERP:
-            size = len(name)
+            size = len(loader_name)
+            # The header's offset is that of the name, which is appended to the file.
             HEADER.pack_into(program, offset, kind, flags, len(program), virtual, physical, size, size, alignment)
-    kernel.write_bytes(program + name)
+    kernel.write_bytes(program + loader_name)
     kernel.chmod(0o755)
     libraries.symlink_to(loader.parent)
     return True

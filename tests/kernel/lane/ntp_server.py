@@ -51,7 +51,7 @@ def serve(address: str, port: int, clock: Clock) -> None:
         while True:
             request, client = server.recvfrom(2048)
             received = to_ntp(clock())
-            if len(request) < HEADER.size or request[0] & 7 != 3:
+            if len(request) < HEADER.size or request[0] & 7 != FROM_CLIENT & 7:  # not of a client's mode
                 continue
             _, _, poll, *_, sent = HEADER.unpack(request[: HEADER.size])
             answer = HEADER.pack(FROM_SERVER, 1, poll, -20, 0, 0, b"TEST", received, sent, received, to_ntp(clock()))
@@ -67,6 +67,7 @@ def query_offset(address: str, port: int, exchanges: int = 50) -> tuple[int, int
 
 
 def _exchange(client: socket.socket) -> tuple[int, int]:
+    """Return the server's clock minus this machine's, and the round trip (ns)."""
     sent_ns = machine_wall_ns()
     client.send(HEADER.pack(FROM_CLIENT, 0, 0, 0, 0, 0, b"", 0, 0, 0, to_ntp(sent_ns)))
     answer = client.recv(2048)

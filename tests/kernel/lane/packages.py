@@ -106,8 +106,8 @@ def _missing_libraries(folder: Path, options: Sequence[str]) -> list[str]:
     depends = ("--recurse", "--important", "--no-pre-depends")
     listed = _apt(folder, "apt-cache", *options, "depends", *depends, *PACKAGES).stdout
     libraries = set(re.findall(r"^\s*\|?Depends: (lib[^\s:]+)", listed, re.MULTILINE))
-    known = _apt(folder, "dpkg-query", "-W", "-f", "${db:Status-Status} ${Package}\n").stdout.splitlines()
-    installed = {line.partition(" ")[2] for line in known if line.startswith("installed ")}
+    status_lines = _apt(folder, "dpkg-query", "-W", "-f", "${db:Status-Status} ${Package}\n").stdout.splitlines()
+    installed = {line.partition(" ")[2] for line in status_lines if line.startswith("installed ")}
     return sorted(libraries - installed - set(PACKAGES))
 
 

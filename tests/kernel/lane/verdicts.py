@@ -1,10 +1,10 @@
 """Verdicts on failed drives: which stalls of the host explain a failure.
 
-A failed drive is a fault, unless the record has a long enough stall at the relevant time. If a machine uses
-its processor fully, ordinary programs of the host get 50 to 60 ms of each second (the kernel's fair server). That is
-recorded as a stall, too, and makes a kit of a machine that is so busy disengage: commands are 20 ms apart, and programs
-wait for each other. A fault that occupies the processor all the time would be excused by such a stall only if all three
-attempts failed within 200 ms of one. A machine by itself never causes longer stalls, or shares above 6 %.
+A failed drive is a fault, unless a long enough stall was recorded at the relevant time. If a machine uses its processor
+fully, ordinary programs of the host get 50 to 60 ms of each second (the kernel's fair server). This time is recorded as
+a stall of the machine, too. Such stalls make the kit of a busy machine disengage, because commands are 20 ms apart
+and programs wait for each other. A fault that occupies the processor all the time would be excused by such a stall only
+if all three attempts failed within 200 ms of one. A machine by itself never causes longer stalls, or shares above 6 %.
 """
 
 from __future__ import annotations
