@@ -42,15 +42,17 @@ def recorded_reasons(server: Record, client: Record, condition: str, requested_m
     }
     reasons = []
     for side, table in samples.items():
-        others = [name for name in table.texts("condition") if name != condition]
-        doubts = [reason for reason in table.texts("reason") if reason]
+        other_conditions = [name for name in table.texts("condition") if name != condition]
+        deviations = [reason for reason in table.texts("reason") if reason]
         if len(table) == 0:
             reasons.append(f"the {side} did not report that condition {condition} was in force")
         elif (gap_s := _longest_gap_s(table, ended_ns if side == "server" else None)) > GAP_LIMIT_S:
             reasons.append(f"the {side} did not measure condition {condition} for {gap_s:.0f} s")
-        elif others or doubts:
-            doubt = f": {doubts[0]}" if doubts else ""
-            reasons.append(f"condition {condition} was not in force as requested on the {side} all the time{doubt}")
+        elif other_conditions or deviations:
+            first_deviation = f": {deviations[0]}" if deviations else ""
+            reasons.append(
+                f"condition {condition} was not in force as requested on the {side} all the time{first_deviation}"
+            )
     unmeasured = [
         flow for flow, side in SENT_BY.items() if requested_ms[flow] and not _is_measured(samples[side], flow)
     ]
