@@ -46,9 +46,11 @@ SESSION_ENDPOINT = "tcp/127.0.0.1:0"
 ROUTER_LINK = "udp/127.0.0.1:{port}?rel=1;mixed_rel=1"
 MAX_OVERHEAD_S = 30.0
 """The time limit for start, discovery and end, in addition to the time of the measurement."""
+MAX_MEAN_ROUND_TRIP_S = 0.01
+"""The time limit for a message that is sent back to back."""
 
-Measured = dict[str, dict[str, float]]
-"""Microseconds by percentile, and lost echoes, by pace."""
+PaceResults = dict[str, dict[str, float]]
+"""For each pace, the percentiles of the round trip in microseconds, and the number of lost echoes."""
 
 
 def start_routers(processes: Processes) -> tuple[str, str]:
@@ -67,11 +69,11 @@ def start_routers(processes: Processes) -> tuple[str, str]:
     return endpoints[0], endpoints[1]
 
 
-def start_side(*words: str) -> subprocess.Popen[str]:
-    """Start a process of `round_trip/side.py`."""
+def start_process(*words: str) -> subprocess.Popen[str]:
+    """Start a process of `round_trip/process.py`."""
     paths = os.pathsep.join([str(FOLDER), str(Path(lavt.__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
     return subprocess.Popen(
-        [sys.executable, "-m", "benchmarks.round_trip.side", *words],
+        [sys.executable, "-m", "benchmarks.round_trip.process", *words],
         stdout=subprocess.PIPE,
         text=True,
         cwd=FOLDER,
@@ -79,18 +81,18 @@ def start_side(*words: str) -> subprocess.Popen[str]:
     )
 
 
-def run(carrier: str, routers: tuple[str, str], seconds: float, messages: int) -> Measured:
+def run(carrier: str, routers: tuple[str, str], seconds: float, messages: int) -> PaceResults:
     """Measure one carrier once; raise `WorkError` if a process fails."""
     endpoints = json.dumps(routers)
-    echo = start_side("echo", carrier, endpoints)
+    echo = start_process("echo", carrier, endpoints)
     try:
         assert echo.stdout is not None
         line = echo.stdout.readline()
         if not line:
             raise WorkError(f"the echo process of {carrier} ended too early; see above")
-        sender = start_side("ask", carrier, endpoints, json.loads(line)["address"], str(seconds), str(messages))
+        sender = start_process("ask", carrier, endpoints, json.loads(line)["address"], str(seconds), str(messages))
         try:
-            output, _ = sender.communicate(timeout=MAX_OVERHEAD_S + 2 * seconds + messages / 100)
+            output, _ = sender.communicate(timeout=MAX_OVERHEAD_S + 2 * seconds + MAX_MEAN_ROUND_TRIP_S * messages)
         except subprocess.TimeoutExpired:
             sender.kill()
             raise WorkError(f"the round trips of {carrier} did not end") from None
@@ -113,7 +115,7 @@ def percentiles(carrier: str, times_ns: Sequence[int | None]) -> dict[str, float
     return {**named, "lost": len(times_ns) - len(received_ns)}
 
 
-def summary(rounds: Mapping[str, Sequence[Measured]]) -> dict[str, Any]:
+def summary(rounds: Mapping[str, Sequence[PaceResults]]) -> dict[str, Any]:
     """Return medians over the rounds by carrier and pace, with ratios to raw UDP if that was measured."""
     medians: dict[str, Any] = {}
     for carrier, measured in rounds.items():
@@ -149,7 +151,7 @@ def _cell(values: Mapping[str, float]) -> str:
 
 def measure(carriers: Sequence[str], rounds: int, seconds: float, messages: int) -> dict[str, Any]:
     """Measure all carriers in turns, in reverse order in every second round."""
-    measured: dict[str, list[Measured]] = {carrier: [] for carrier in carriers}
+    measured: dict[str, list[PaceResults]] = {carrier: [] for carrier in carriers}
     with tempfile.TemporaryDirectory() as folder, Processes(Path(folder)) as processes:
         routers = start_routers(processes)
         for number in range(rounds):

@@ -1,7 +1,9 @@
 """Degraded pictures with ground truth, for which perception was not designed.
 
-A picture is rendered from a place on a road whose markings may have been changed, then painted on (`PAINT`), then
-degraded (`DEGRADED`). The true position of the lane's centre is computed from the road, in the vehicle's frame.
+A picture is rendered from a place on a road. Its kind has one change: other marks on the road (`ROADS`), paint on the
+ground (`PAINT`), or a degraded picture (`DEGRADED`). Only `kerb only`, `diagonal only` and `crosswalk only` have two
+changes: paint on a road without marks. The true position of the lane's centre is computed from the road, in the
+vehicle's frame.
 """
 
 from __future__ import annotations
@@ -26,7 +28,11 @@ MODEL = CameraModel()
 AHEAD_M = np.array([5.0, 10.0, 15.0])
 """Distances ahead of the rear axle at which the lane's centre is compared."""
 
+RIGHT_LINE_M = -1.75
+"""Offset of the driven lane's right line from the lane's centre."""
+
 Degradation = Callable[[Picture, np.random.Generator], Picture]
+"""A function that paints on a picture or degrades it."""
 
 TAR, WORN_WHITE, WHITE, YELLOW, CONCRETE = (
     (38, 38, 40),
@@ -60,12 +66,13 @@ def _with_marks(change: Callable[[RoadMark], RoadMark | None]) -> Callable[[Road
 
 ROADS: dict[str, Callable[[Road], Road]] = {
     "as it is": lambda road: road,
-    "one line only": _with_marks(lambda mark: replace(mark, kind="solid") if mark.offset_m == -1.75 else None),
+    "one line only": _with_marks(lambda mark: replace(mark, kind="solid") if mark.offset_m == RIGHT_LINE_M else None),
     "left line missing": _with_marks(lambda mark: None if mark.offset_m > 0 else mark),
     "right line missing": _with_marks(lambda mark: None if mark.offset_m < 0 else mark),
     "all marks missing": _with_marks(lambda _: None),
     "solid lines": _with_marks(lambda mark: replace(mark, kind="solid")),
 }
+"""Changes of a road's marks, by kind of picture."""
 NO_LANE = {
     "all marks missing",
     "kerb only",
@@ -82,6 +89,9 @@ NO_LANE = {
 
 # Paint on the ground.
 
+SUBPIXEL_BITS = 4
+"""OpenCV draws at integer coordinates, which have this number of fractional bits."""
+
 
 def _strip(picture: Picture, line: list[tuple[float, float]], width_m: float, colour: tuple[int, int, int]) -> None:
     """Paint a strip along a line of ground points (x, y), antialiased."""
@@ -90,10 +100,10 @@ def _strip(picture: Picture, line: list[tuple[float, float]], width_m: float, co
     along = np.gradient(dense, axis=0)
     across = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(np.hypot(*along.T), 1e-9)[:, None]
     outline = np.concatenate([dense + across * width_m / 2, (dense - across * width_m / 2)[::-1]])
-    outline = outline[outline[:, 0] > MODEL.x_m + 0.6]
+    outline = outline[outline[:, 0] > MODEL.x_m + 0.6]  # points behind the camera have no place in the picture
     if len(outline) > 2:
-        pixels = picture_points(calibrated(MODEL), outline)
-        cv2.fillPoly(picture, [np.round(pixels * 16).astype(np.int32)], colour, cv2.LINE_AA, 4)
+        pixels = picture_points(calibrated(MODEL), outline) * 2**SUBPIXEL_BITS
+        cv2.fillPoly(picture, [np.round(pixels).astype(np.int32)], colour, cv2.LINE_AA, SUBPIXEL_BITS)
 
 
 def tar_seams(picture: Picture, generator: np.random.Generator) -> Picture:
@@ -183,6 +193,7 @@ PAINT: dict[str, Degradation] = {
         tree_shadows,
     )
 }
+"""Paint on the ground, by kind of picture."""
 
 
 # Light, lens, noise, codec.
@@ -276,6 +287,7 @@ DEGRADED: dict[str, Degradation] = {
     "noise only": lambda _, generator: generator.integers(0, 256, (480, 640, 3)).astype(np.uint8),
     "coarse blocks": lambda _, generator: blocks(generator, int(generator.choice([2, 4, 8, 16, 32]))),
 }
+"""Degradations of the whole picture, by kind of picture."""
 
 
 @lru_cache(maxsize=16)

@@ -23,12 +23,12 @@ from lavt.experiment.sweep.sweep import run_all
 def digests(planned: list[PlannedRun], jobs: int, cluster_address: str | None) -> dict[str, str]:
     """Run everything, and return the digest of each run."""
     with TemporaryDirectory() as directory:
-        completed, _ = run_all(
+        sweep_result, _ = run_all(
             planned, Path(directory), jobs=jobs, on_progress=lambda _: None, cluster_address=cluster_address
         )
-    if completed.failed:
-        raise SystemExit(f"failed: {completed.failed}")
-    return {result["run"]: result["digest"] for result in completed.results}
+    if sweep_result.failed:
+        raise SystemExit(f"failed: {sweep_result.failed}")
+    return {result["run"]: result["digest"] for result in sweep_result.results}
 
 
 def main() -> None:

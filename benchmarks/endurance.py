@@ -1,6 +1,6 @@
 """Send video over loopback for minutes and check that memory, threads and latency do not grow.
 
-The two processes are those of our side in `video_vs_gstreamer.py`. Memory is the resident set of each process,
+The two processes are those of LAVT in `video_vs_gstreamer.py`. Memory is the resident set of each process,
 sampled twice a second. Its growth is the slope of a straight line through the samples after the first quarter.
 
     python benchmarks/endurance.py [--minutes 2]
@@ -23,8 +23,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # for the package `benchmark
 
 from benchmarks.video.clean import SIZES, describe_clean_run
 from benchmarks.video.pictures import render_loop
+from benchmarks.video.processes import BenchmarkProcess, measure
 from benchmarks.video.run import RATE_HZ
-from benchmarks.video.sides import BenchmarkProcess, measure
 
 from lavt.runtime import process_priority
 
@@ -66,7 +66,9 @@ def growth_kb_per_minute(samples: Sequence[ResourceSample]) -> float:
 def medians_ms(latency_ms: NDArray[np.float64]) -> list[float]:
     """Return the medians of intervals of 10 s; a shorter interval at the end is ignored unless it is the only one."""
     frames = min(MEDIAN_INTERVAL_S * RATE_HZ, len(latency_ms))
-    return [float(np.median(latency_ms[at : at + frames])) for at in range(0, len(latency_ms) - frames + 1, frames)]
+    return [
+        float(np.median(latency_ms[begin : begin + frames])) for begin in range(0, len(latency_ms) - frames + 1, frames)
+    ]
 
 
 def quarter_medians_ms(latency_ms: NDArray[np.float64]) -> tuple[float, float]:
@@ -99,11 +101,11 @@ def describe_growth(samples: Mapping[str, Sequence[ResourceSample]], latency_ms:
     """Return a clause for each quantity that has grown."""
     clauses = []
     for name, all_samples in samples.items():
-        counted = without_first_quarter(all_samples)
-        if (slope := growth_kb_per_minute(counted)) > MAX_GROWTH_KB_PER_MINUTE:
+        later_samples = without_first_quarter(all_samples)
+        if (slope := growth_kb_per_minute(later_samples)) > MAX_GROWTH_KB_PER_MINUTE:
             clauses.append(f"the memory of {name} grew by {slope:.0f} kB/min")
-        if counted[-1].threads > counted[0].threads:
-            clauses.append(f"the threads of {name} grew from {counted[0].threads} to {counted[-1].threads}")
+        if later_samples[-1].threads > later_samples[0].threads:
+            clauses.append(f"the threads of {name} grew from {later_samples[0].threads} to {later_samples[-1].threads}")
     first_ms, last_ms = quarter_medians_ms(latency_ms)
     if last_ms - first_ms > max(MAX_GROWTH_MS, first_ms / 4):
         clauses.append(f"latency grew from {first_ms:.2f} to {last_ms:.2f} ms")
@@ -125,10 +127,10 @@ def main() -> int:
         outcome = measure("ours", run, when_started=sampler.start)
     print("| process | memory MB, beginning | end | kB/min | threads, beginning | end |\n|---|---|---|---|---|---|")
     for name, samples in sampler.samples.items():
-        counted = without_first_quarter(samples)
+        later_samples = without_first_quarter(samples)
         print(
-            f"| {name} | {counted[0].memory_kb / 1000:.1f} | {counted[-1].memory_kb / 1000:.1f} "
-            f"| {growth_kb_per_minute(counted):.1f} | {counted[0].threads} | {counted[-1].threads} |"
+            f"| {name} | {later_samples[0].memory_kb / 1000:.1f} | {later_samples[-1].memory_kb / 1000:.1f} "
+            f"| {growth_kb_per_minute(later_samples):.1f} | {later_samples[0].threads} | {later_samples[-1].threads} |"
         )
     first_ms, last_ms = quarter_medians_ms(outcome.latency_ms)
     medians = ", ".join(f"{median_ms:.2f}" for median_ms in medians_ms(outcome.latency_ms))

@@ -28,8 +28,10 @@ from lavt.config_file import conditions, load_config, parse_config, shipped
 from lavt.experiment.runs.plan import plan_sweep
 from lavt.experiment.sweep.sweep import run_all
 
+PAPER_RUNS = 30
+"""The paper's number of drives under each condition."""
 PAPER_COMPLETED = {"L0": 30, "L1": 28, "L2": 15, "L3": 11, "L4": 9, "L5": 3}
-"""The paper's number of completed drives of 30 under each condition."""
+"""The paper's number of completed drives under each condition."""
 LOOKAHEADS_S = (0.70, 0.74, 0.78, 0.82)
 STEERING_LIMITS_RAD = (0.18, 0.21, 0.24)
 MIN_WIDTH_MS = 5.0
@@ -62,9 +64,9 @@ def deviance(counts: Counts) -> float:
     total = 0.0
     for name, paper_completed in PAPER_COMPLETED.items():
         completed, runs = counts[name]
-        our_share, paper_share = (completed + 0.5) / (runs + 1), paper_completed / 30
+        our_share, paper_share = (completed + 0.5) / (runs + 1), paper_completed / PAPER_RUNS
         completed_terms = (paper_completed, paper_share, our_share)
-        failed_terms = (30 - paper_completed, 1 - paper_share, 1 - our_share)
+        failed_terms = (PAPER_RUNS - paper_completed, 1 - paper_share, 1 - our_share)
         for number, paper_term, our_term in (completed_terms, failed_terms):
             total += 2 * number * (math.log(paper_term) - math.log(our_term)) if number else 0.0
     return total
@@ -77,12 +79,12 @@ def run_grid(repetitions: int, jobs: int | None) -> dict[tuple[float, float], Co
     config = {**base, "fidelity": "geometry", "repetitions": repetitions, "axes": axes}
     planned = plan_sweep(parse_config(SweepConfig, config, "the grid"))
     with TemporaryDirectory() as directory:
-        runs, _ = run_all(planned, Path(directory), jobs=jobs, on_progress=lambda _: None)
-    if runs.failed:
-        raise SystemExit(f"failed: {runs.failed}")
+        sweep_result, _ = run_all(planned, Path(directory), jobs=jobs, on_progress=lambda _: None)
+    if sweep_result.failed:
+        raise SystemExit(f"failed: {sweep_result.failed}")
     completed: Counter[tuple[float, float, str]] = Counter()
     total: Counter[tuple[float, float, str]] = Counter()
-    for result in runs.results:
+    for result in sweep_result.results:
         key = (*(result["axes"][name] for name in axes), result["condition"])
         total[key] += 1
         completed[key] += result["ending"] == "completed"
@@ -98,7 +100,7 @@ def main() -> None:
     parser.add_argument("--repetitions", type=int, default=2)
     parser.add_argument("--jobs", type=int, default=None)
     options = parser.parse_args()
-    paper: Counts = {name: (count, 30) for name, count in PAPER_COMPLETED.items()}
+    paper: Counts = {name: (count, PAPER_RUNS) for name, count in PAPER_COMPLETED.items()}
     print("| lookahead | limit | half completed at | " + " | ".join(PAPER_COMPLETED) + " | deviance |")
     print("|---" * (4 + len(PAPER_COMPLETED)) + "|")
     rows = [

@@ -14,7 +14,8 @@ from lavt.experiment.boundary.delay_margin import LateralLoop, critical_delay_s,
 MARGIN_RAD = math.radians(30)
 VIDEO_S = 0.062  # median with paper_wifi5, from writing a stamp to reading it
 CONTROL_S = 0.009  # median with paper_wifi5
-PROCESSING_S = 0.010  # perception, control and the way to the wheel; the model contains the zero-order hold
+PROCESSING_S = 0.010  # perception, control and the way to the wheel; the model itself contains the wait for a frame
+CALIBRATED_LOOKAHEAD_S = 0.74  # of the preset `paper_calibrated`, for comparison
 
 
 def main() -> None:
@@ -24,7 +25,7 @@ def main() -> None:
     rounded_s = math.ceil(smallest_s * 100) / 100
     print(f"total delay at L0              {1e3 * delay_s:.0f} ms")
     print(f"smallest lookahead for 30 deg  {smallest_s:.4f} s, rounded up {rounded_s:.2f} s")
-    for name, lookahead_s in (("designed", rounded_s), ("paper_calibrated", 0.74)):
+    for name, lookahead_s in (("designed", rounded_s), ("paper_calibrated", CALIBRATED_LOOKAHEAD_S)):
         loop = LateralLoop(lookahead_s)
         margin_deg = math.degrees(phase_margin_rad(loop, delay_s))
         critical_ms = 1e3 * critical_delay_s(loop)

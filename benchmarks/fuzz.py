@@ -105,7 +105,7 @@ def cpu_s() -> float:
 
 
 def fuzz(name: str, inputs: int, seed: int) -> Outcome:
-    """Feed inputs to one target until all are fed or one breaks it."""
+    """Feed inputs to one target, until all are fed or until one of them breaks the target."""
     target = TARGETS[name][0](seed)
     chance = Chance(seed, name)
     channels = tuple(target.corpora)

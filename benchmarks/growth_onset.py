@@ -37,17 +37,17 @@ def case(lookahead_s: float, rate_hz: float, speed_mps: float, seed: int) -> Run
 
 def onset_ms(config: RunConfig, theory_ms: float) -> float:
     """Return the total delay at which the oscillation neither grows nor decays."""
-    other_delay_ms = []
+    without_added_ms = []  # the total delay minus the added delay of the video, of each drive
 
     def growth(delay_ms: float) -> float:
         total_ms, growth_per_s = straight_growth(with_video_delay(config, delay_ms))
-        other_delay_ms.append(total_ms - delay_ms)
+        without_added_ms.append(total_ms - delay_ms)
         return growth_per_s
 
     bracket = zero_bracket(growth, theory_ms, MAX_DELAY_MS, PRECISION_MS)
     if bracket.low_ms is None or bracket.high_ms is None:
         raise SystemExit(f"no onset between 0 and {MAX_DELAY_MS} ms")
-    return (bracket.low_ms + bracket.high_ms) / 2 + median(other_delay_ms)
+    return (bracket.low_ms + bracket.high_ms) / 2 + median(without_added_ms)
 
 
 def main() -> None:

@@ -50,7 +50,7 @@ def timelines(record: Record) -> list[tuple[str, str, int, int, list[tuple[str, 
 def add_stages(record: Record, stages: StageSamples) -> None:
     """Add the duration of every stage, and the time of waking a node for every message."""
     for node, channel, _stamp_ns, arrived_ns, ends in timelines(record):
-        if channel != "wake":
+        if channel != "wake":  # the first entry of `ends` is the beginning of the first stage
             stages[node, f"wait_{channel}"].append((ends[0][1] - arrived_ns) / NS_PER_US)
         for (_, begin_ns), (name, end_ns) in pairwise(ends):
             stages[node, name].append((end_ns - begin_ns) / NS_PER_US)
@@ -89,6 +89,7 @@ def measure_costs(drives: int) -> dict[str, Any]:
     for (node, stage), samples in sorted(stages.items()):
         table[node][stage] = round(median(samples), 1)
     link_us = {name: round(float(np.median(samples)), 1) for name, samples in sorted(links.items())}
+    # A command's send time is read before the driver's stage `command`, so the measured delay contains this stage.
     link_us["control"] = round(link_us["control"] - table["driver"]["command"], 1)
     machine = f"{os.cpu_count()} cores, {platform.machine()}, load {max(loads):.1f}, {drives} drives"
     return {

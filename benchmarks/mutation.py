@@ -6,7 +6,7 @@ A mutant has one small change in one place, for example another comparison, anot
 (`mutating/sites.py`). The places are sampled from all places of the modules in `mutating/modules.py`; the sample is
 determined by the seed and the sources. For each mutant the tests of its module run in a copy of the sources and, if
 they pass, the quick tests of its area. A mutant is caught if a test fails or if the tests take ten times as long as
-without it.
+without the mutation.
 
 With --out each result is saved in a file as a line of JSON, and a later run with the same file skips mutants that are
 in it; --rerun-survivors runs its survivors again. Survivors that are equivalent or accepted are listed with their
@@ -78,8 +78,8 @@ class MutantRunner:
         self._limits_s: dict[tuple[str, ...], float] = {}
         self._lock = Lock()
 
-    def check(self, tests: tuple[str, ...], tree: WorkTree) -> float:
-        """Return the time limit of the tests with a mutant. Raise `UserError` if they fail without one."""
+    def limit_s(self, tests: tuple[str, ...], tree: WorkTree) -> float:
+        """Return the time limit of the tests with a mutant. Raise `UserError` if they fail without a mutant."""
         with self._lock:
             if tests not in self._limits_s:
                 trial = tree.run(tests, UNMUTATED_LIMIT_S, unchanged=True)
@@ -91,7 +91,7 @@ class MutantRunner:
     def run(self, mutations: Sequence[Mutation]) -> Iterator[Result]:
         """Run all mutations, and yield each result when it is available."""
         for module in sorted({mutation.module for mutation in mutations}):
-            self.check(own_tests(module), self._first)
+            self.limit_s(own_tests(module), self._first)  # checks the tests before the first mutant
         trees: SimpleQueue[WorkTree] = SimpleQueue()
         trees.put(self._first)
         for number in range(1, self._jobs):
@@ -114,8 +114,8 @@ class MutantRunner:
     def _run_mutation(self, mutation: Mutation, tree: WorkTree) -> Result:
         took_s = 0.0
         own, area = own_tests(mutation.module), area_of(mutation.module)
-        for tests, checked in ((own, own), (rest_of_area(mutation.module), area)):
-            trial = tree.run_mutated(mutation, tests, self.check(checked, tree))
+        for tests, timed_tests in ((own, own), (rest_of_area(mutation.module), area)):
+            trial = tree.run_mutated(mutation, tests, self.limit_s(timed_tests, tree))
             took_s += trial.took_s
             if not trial.passed:
                 return make_result(mutation, trial.failed_test, took_s)
@@ -148,14 +148,16 @@ def measure(options: argparse.Namespace, log: Callable[[str], None]) -> str:
     sites = {module: all_sites[module] for module in options.only or MODULES}
     results = read_results(options.out) if options.out else {}
     if options.rerun_survivors:
-        of_sources = {
+        current_mutations = {
             mutation.key: mutation for module_sites in sites.values() for site in module_sites for mutation in site
         }
         survivors = [result for result in results.values() if not result.caught and result.place not in accepted]
         for survivor in survivors:
-            if survivor.key not in of_sources:
+            if survivor.key not in current_mutations:
                 log(f"no longer in the sources: {describe(survivor)}")
-        selected = todo = [of_sources[survivor.key] for survivor in survivors if survivor.key in of_sources]
+        selected = todo = [
+            current_mutations[survivor.key] for survivor in survivors if survivor.key in current_mutations
+        ]
     else:
         selected = sample(sites, options.seed, options.count)
         todo = [mutation for mutation in selected if mutation.key not in results]

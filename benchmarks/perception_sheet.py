@@ -31,7 +31,7 @@ ERROR_LIMIT_M = 0.5
 """A lane is wrong if its centre is off by more than this at 10 m."""
 CONFIDENCE_BINS = (0.0, 0.05, 0.2, 0.3, 0.4, 0.6, 0.8, 1.001)
 UNDECIDED = "yellow diversion"
-"""Its truth is ambiguous, so it is excluded from the table by confidence."""
+"""The kind of picture whose true lane is ambiguous; it is excluded from the table by confidence."""
 PICTURED_KINDS = ("as it is", "h264 200 kbit/s", "tree shadows", "old yellow line", "glare", "coarse blocks")
 
 
@@ -150,10 +150,10 @@ def main() -> None:
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     verdicts, undamaged = [], []
-    first: dict[str, DegradedCase] = {}
+    first_cases: dict[str, DegradedCase] = {}
     for case in cases(arguments.count, routes=tuple(arguments.routes)):
         verdicts.append(check_case(case))
-        first.setdefault(case.kind, case)
+        first_cases.setdefault(case.kind, case)
         if case.kind in {"as it is", "solid lines"}:
             undamaged.append(case.picture)
     print(kinds_table(verdicts))
@@ -167,9 +167,9 @@ def main() -> None:
     print(f"\ncost of a picture: tracking {tracking_ms:.2f} ms, searching {searching_ms:.2f} ms of CPU time (medians)")
     if arguments.picture is not None:
         arguments.picture.parent.mkdir(parents=True, exist_ok=True)
-        drawn = draw_sheet(first[kind] for kind in PICTURED_KINDS)
-        half = cv2.resize(drawn, None, fx=0.7, fy=0.7, interpolation=cv2.INTER_AREA)
-        cv2.imwrite(str(arguments.picture), half, [cv2.IMWRITE_JPEG_QUALITY, 82])
+        drawn = draw_sheet(first_cases[kind] for kind in PICTURED_KINDS)
+        reduced = cv2.resize(drawn, None, fx=0.7, fy=0.7, interpolation=cv2.INTER_AREA)
+        cv2.imwrite(str(arguments.picture), reduced, [cv2.IMWRITE_JPEG_QUALITY, 82])
 
 
 if __name__ == "__main__":

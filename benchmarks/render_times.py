@@ -34,6 +34,7 @@ CASES: tuple[tuple[CameraModel, SceneryKind, LightName, bool], ...] = (
     (HD, "full", "noon", False),
     (HD, "full", "low_sun", True),
 )
+"""Camera, scenery and light, and whether the car swerves."""
 
 
 def measure_drive(road: Road, scene_renderer: Renderer, *, swerving: bool) -> FloatArray:

@@ -4,8 +4,8 @@
 
 A socket that has registered as the vehicle sends frames to a client's socket, 30 a second, each of 14 packets of 1216
 bytes (4 Mbit/s). Every second frame goes through the rendezvous, the others directly. The latency of a packet is the
-time from its sending to the kernel's timestamp of its arrival, so the difference between the two ways is the
-rendezvous's own processing, without any network. Prints a row for each way and finally a line of JSON.
+time from its sending to the kernel's timestamp of its arrival, so the difference between the two ways is the time that
+the rendezvous itself takes, without any network. Prints a row for each way and finally a line of JSON.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ CHANGES = (f"bind={LOOPBACK}", "video_port=0", "probe_port=0")
 PERCENTILES = (50, 95, 99)
 
 
-class LatencyProbe:
+class LatencyMeter:
     """The sockets of a vehicle and a client, which measure latencies directly and through a rendezvous."""
 
     def __init__(self, vehicle: socket.socket, client: socket.socket, rendezvous: Address) -> None:
@@ -87,11 +87,11 @@ def main() -> None:
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client,
     ):
         port = processes.start("rendezvous", "rendezvous", str(config), *options).ready()["ready"]["video_port"]
-        probe = LatencyProbe(vehicle, client, (LOOPBACK, port))
+        meter = LatencyMeter(vehicle, client, (LOOPBACK, port))
         for number in range(frames):
-            probe.refresh()
+            meter.refresh()
             way = ("straight", "through")[number % 2]
-            latencies_ns[way] += probe.send_frame(through=way == "through")
+            latencies_ns[way] += meter.send_frame(through=way == "through")
             pause(NS_PER_S // RATE_HZ - NS_PER_MS)
     latencies_us = {
         way: {f"p{rank}": round(float(np.percentile(times_ns, rank)) / NS_PER_US, 1) for rank in PERCENTILES}

@@ -52,8 +52,8 @@ def draw(curve_stops: CurveStops) -> Figure:
             _, following, holding = zip(*of_curve, strict=True)
             axis.axvspan(curve.from_m, curve.to_m, color="0.92")
             for group, name, colour in ((following, FOLLOWING, COLOURS[0]), (holding, HOLDING, COLOURS[4])):
-                places = [stop.at_m for stop in group], [stop.beyond_m for stop in group]
-                axis.plot(*places, color=colour, label=name)
+                at_m, beyond_m = [stop.at_m for stop in group], [stop.beyond_m for stop in group]
+                axis.plot(at_m, beyond_m, color=colour, label=name)
         axis.axhline(0.0, color="0.5", linewidth=0.8)
         axis.axhline(ALLOWED_BEYOND_M, color="black", linewidth=0.8, linestyle="--")
         axis.set_title(f"route {route}", fontsize="medium")
@@ -68,7 +68,9 @@ def draw(curve_stops: CurveStops) -> Figure:
 def main() -> None:
     """Compute all stops, print the tables, and draw the picture if a file is named."""
     curve_stops = [curve_stop for route in ROUTES for curve_stop in stops(route)]
-    print("| route | curve | bend, radius | stops | worst along the path | worst with the wheel held | of these out |")
+    print(
+        "| route | curve | bend, radius | stops | worst along the path | worst with a constant angle | of these out |"
+    )
     print("| --- | --- | --- | --- | --- | --- | --- |")
     for curve, of_curve in groupby(curve_stops, key=itemgetter(0)):
         print(format_row(curve, list(of_curve)))
@@ -76,7 +78,7 @@ def main() -> None:
     speeds_kmh = [stop.speed_mps * 3.6 for stop in following]
     print(f"\nlast command at {min(speeds_kmh):.1f} to {max(speeds_kmh):.1f} km/h")
     print(f"distance from the last command to standstill: at most {max(stop.covered_m for stop in following):.1f} m")
-    print("\n| condition | stops | worst along the path | worst with the wheel held | of these out |")
+    print("\n| condition | stops | worst along the path | worst with a constant angle | of these out |")
     print("| --- | --- | --- | --- | --- |")
     for condition in ("L1", "L3", "L5"):
         _, delayed, holding = zip(*stops("a", condition), strict=True)

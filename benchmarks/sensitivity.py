@@ -70,10 +70,10 @@ def run_drives(preset: str, key: str, values: SettingValues, options: argparse.N
     }
     planned = plan_sweep(parse_config(SweepConfig, config, "sensitivity"))
     with TemporaryDirectory() as directory:
-        completed, _ = run_all(planned, Path(directory), jobs=options.jobs, on_progress=lambda _: None)
-    if completed.failed:
-        raise SystemExit(f"failed: {completed.failed}")
-    return list(completed.results)
+        sweep_result, _ = run_all(planned, Path(directory), jobs=options.jobs, on_progress=lambda _: None)
+    if sweep_result.failed:
+        raise SystemExit(f"failed: {sweep_result.failed}")
+    return list(sweep_result.results)
 
 
 def format_cell(results: Sequence[Mapping[str, Any]]) -> str:

@@ -10,8 +10,8 @@ packets arrived or were recovered.
 
 Each stamp is checked in two ways. The first is the check of LAVT's own stamps, by the RTP timestamp. The second is the
 check of a foreign sender's stamps: the timestamps have a base of their own and give the time of capture, which is up to
-4 ms before the stamp. This second check is made three times: with all pictures, with those whose cells are clear, and
-with those whose cells are clear and that are not in doubt.
+4 ms before the stamp. This second check is made three times: with all pictures, with those whose stamp has only clear
+cells (clearly black or white, see `read_clear_stamp`), and with those that also are not in doubt.
 """
 
 from __future__ import annotations
@@ -48,6 +48,7 @@ RATES_KBPS = (200, 350, 460, 700, 1000, 2000, 3200, 4000, 8000)
 RATE_HZ = 30
 GOP_FRAMES = 30
 BUFFER_S = 0.1
+"""The decoder buffer that the encoder's rate control assumes."""
 
 ROUTE, FIRST_STATION_M, SPEED_MPS, SCENE_FRAMES = "b", 150.0, 8.33, 60
 
@@ -61,8 +62,11 @@ request, as in `nodes/camera.py`."""
 FRAME_NS = NS_PER_S // RATE_HZ
 START_NS = 1_760_000_000_123_456_789
 STAMP_JITTER_NS = 3 * NS_PER_MS
+"""The largest random delay of a stamp."""
 FOREIGN_BASE = 4_294_000_000
+"""The base of the foreign sender's RTP timestamps; they soon wrap at 2^32."""
 FOREIGN_JITTER_NS = 4 * NS_PER_MS
+"""The longest time from a foreign sender's capture to its stamp."""
 
 Planes = NDArray[np.uint8]
 
@@ -218,8 +222,8 @@ class StampStudyReader:
     def read(self, unit: AccessUnit) -> None:
         """Decode an access unit and check its stamp in all ways."""
         picture = self.decoder.decode(unit.data)
-        whole = unit.complete and picture is not None and not picture.corrupt
-        self.in_doubt = not whole or (self.in_doubt and not unit.keyframe)
+        is_undamaged = unit.complete and picture is not None and not picture.corrupt
+        self.in_doubt = not is_undamaged or (self.in_doubt and not unit.keyframe)
         if picture is not None:
             accepted = self._check_as_own(picture, unit.timestamp)
             intact = self.missing_packets[unit.timestamp] == 0

@@ -37,6 +37,8 @@ from benchmarks.fuzzing.camera import FakeCamera
 
 TOKEN = bytes(range(16))
 STRANGER = ("198.51.100.7", 5004)
+NEVER_AFTER_NS = 10**15
+"""Longer than any measurement."""
 BATCH = 1000
 """Number of datagrams between two pauses; fewer than the node's queue holds."""
 
@@ -61,14 +63,15 @@ def main() -> None:
     path = PathServer(lambda: bytes(32))
     path.set_token(TOKEN)
     stream = StreamSender(Packetizer(2, 0), RepairSender(3, 0))
-    node = CameraNode(camera, camera, stream, path, start_ns=clock.now().mono_ns + 10**15)
+    never_ns = clock.now().mono_ns + NEVER_AFTER_NS  # the camera must not capture frames during the measurement
+    node = CameraNode(camera, camera, stream, path, start_ns=never_ns)
     with tempfile.TemporaryDirectory() as directory:
         recorder = QueuedRecorder(RecordWriter(Path(directory) / "server.mcap", "server"))
         runtime = RealRuntime(clock, [node], recorder, lambda: None)
         runtime.start({"video": DiscardingLink()})
         ways = {"all": runtime.deliver, "filtered": filtered(runtime.deliver, VideoPortFilter(path), Counter())}
         for kind, datagram in kinds().items():
-            ways["all"]("feedback", datagram, clock.now(), STRANGER)
+            ways["all"]("feedback", datagram, clock.now(), STRANGER)  # the first datagram of a kind is not measured
             costs: dict[str, list[float]] = {way: [] for way in ways}
             for _ in range(arguments.rounds):
                 for way, deliver in ways.items():
@@ -91,9 +94,9 @@ class DiscardingLink:
 def cost_us(clock: MachineClock, deliver: Deliver, datagram: bytes, number: int) -> float:
     """Return the CPU time for each of `number` datagrams, until node and record have processed them."""
     begin_ns = time.process_time_ns()
-    for at in range(number):
+    for index in range(number):
         deliver("feedback", datagram, clock.now(), STRANGER)
-        if at % BATCH == 0:
+        if index % BATCH == 0:
             pause(20 * NS_PER_MS)
     pause(100 * NS_PER_MS)
     return (time.process_time_ns() - begin_ns) / NS_PER_US / number

@@ -1,9 +1,9 @@
 """Compare LAVT's video path with GStreamer: latency and CPU time on a clean link, damaged pictures on an impaired link.
 
-LAVT and GStreamer ("sides") in turns send the same pictures with stamps from one process to another. Latency is the
-time from writing the stamp, just before encoding, until it has been read from the decoded luma. GStreamer is measured
-with its best settings, and in one run with its usual ones. The program prints tables as it proceeds and, at the end,
-one line of JSON.
+The two programs, LAVT ("ours") and GStreamer, take turns: each sends the same pictures with stamps from one process to
+another. Latency is the time from writing the stamp, just before encoding, until it has been read from the decoded luma.
+GStreamer is measured with its best settings, and in one run with its usual ones. Tables are printed as the measurement
+proceeds and, at the end, one line of JSON.
 
     python benchmarks/video_vs_gstreamer.py [--pairs 5] [--seconds 15] [--frames 1800] [--quick] [--only 480p]
 """
@@ -43,7 +43,7 @@ def parts(requested: argparse.Namespace, folder: Path) -> dict[str, Callable[[],
 def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     """Parse the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--pairs", type=int, default=5, help="runs of each side on the clean link")
+    parser.add_argument("--pairs", type=int, default=5, help="runs of each program on the clean link")
     parser.add_argument("--seconds", type=float, default=15.0, help="length of each run, after a warm-up of 3 s")
     parser.add_argument("--frames", type=int, default=1800, help="frames of each run on the impaired link")
     parser.add_argument("--only", action="append", help="name of a part in the last line; may be repeated")

@@ -16,7 +16,7 @@ from lavt.experiment.runs.run import run_once
 
 
 def main() -> None:
-    """Drive at L0 and at L3, and print a line for each."""
+    """Drive at L0 and at L3, and print a line for each drive."""
     directory = Path(sys.argv[1] if len(sys.argv) > 1 else mkdtemp(prefix="lavt-"))
     for condition in ("L0", "L3"):
         changes = [f"network.condition={condition}", "vehicle.scenery=none"]

@@ -35,6 +35,7 @@ class Stanley:
         """Return wheel angle and pedals for the newest lane (vehicle frame, left positive) and speed."""
         del now_ns
         c0, c1, c2 = lane.centre
+        # The lane's centre is y = c0 + c1 x + c2 x^2 from the rear axle; both errors are those of the front axle.
         error_m = c0 + (c1 + c2 * self._wheelbase_m) * self._wheelbase_m
         heading_rad = math.atan(c1 + 2 * c2 * self._wheelbase_m)
         steering_rad = heading_rad + math.atan2(self.gain_per_s * error_m, max(speed_mps, 1.0))

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from benchmarks import control_round_trip
 from benchmarks.round_trip import carriers
-from benchmarks.round_trip.side import command
+from benchmarks.round_trip.process import command
 
 from lavt.domain import Command
 from lavt.runtime import process_priority
@@ -17,7 +17,7 @@ from lavt.transport.messages import decode
 PROGRAM = Path(control_round_trip.__file__)
 
 
-def measurement(p50_us: float) -> control_round_trip.Measured:
+def measurement(p50_us: float) -> control_round_trip.PaceResults:
     times = {"p50_us": p50_us, "p95_us": 2 * p50_us, "p99_us": 4 * p50_us, "lost": 0.0}
     return {"at_50_hz": times, "back_to_back": times}
 

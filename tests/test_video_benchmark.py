@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from benchmarks import endurance, video_vs_gstreamer
 from benchmarks.video.impaired import CASES, psnr_db, undamaged_share
+from benchmarks.video.processes import WARM_UP_FRAMES, frames_of
 from benchmarks.video.relay import LinkCase, PacketImpairment, TrafficCounter
-from benchmarks.video.sides import WARM_UP_FRAMES, frames_of
 from tests.interop.tools import missing
 from tests.require import need
 

@@ -23,11 +23,23 @@ from lavt.transport.clock_sync.probe import LAYOUT, decode_reply, encode_request
 from lavt.transport.rtp.fec import RepairSender
 from lavt.transport.rtp.rtcp import ReceptionReport, is_rtcp, max_bit_rate, picture_loss, receiver_report
 from lavt.transport.rtp.rtp import Packetizer
-from lavt.transport.video.path_validation import PathClient, PathServer
+from lavt.transport.video.path_validation import PathClient, PathServer, is_path_datagram
 from lavt.transport.video.stream_sender import StreamSender
 from lavt.vehicle.camera import CapturedFrame
 
 STEP_NS = NS_PER_MS
+"""Time between two inputs."""
+INPUTS_PER_HELLO = 2000
+"""After this number of inputs the true client validates its path again."""
+INPUTS_PER_REPORT = 500
+"""After this number of inputs the true client sends a report, so that its path stays open."""
+
+PATH_FIELDS = ((4, 1), (5, 1), (6, 8), (14, 8), (22, 16))
+"""Offset and length of the fields after the magic number in a datagram of the path validation."""
+RTCP_FIELDS = ((0, 1), (1, 1), (2, 2), *((offset, 4) for offset in range(4, 64, 4)))
+"""Offset and length of the fields of the RTCP header and of the 32-bit words after it."""
+PROBE_FIELDS = ((0, 2), (2, 1), (3, 1), (4, 4), (8, 8), (16, 8), (24, 8), (32, 8), (40, 8))
+"""Offset and length of the fields of a clock probe (`LAYOUT`)."""
 
 
 class FakeCamera:
@@ -74,7 +86,15 @@ STRANGERS: Sequence[tuple[str, int]] = (
 
 def rtcp_reports() -> list[bytes]:
     """Return RTCP datagrams of a receiver of the stream with SSRC 2."""
-    report = ReceptionReport(2, 500, 0.1, 20, 30, 5, NS_PER_S)
+    report = ReceptionReport(
+        media_ssrc=2,
+        highest_sequence=500,
+        lost_fraction=0.1,
+        cumulative_lost=20,
+        jitter=30,
+        last_report=5,
+        last_report_age_ns=NS_PER_S,
+    )
     negative_loss = replace(report, cumulative_lost=-5, highest_sequence=700)
     reports = [receiver_report(1, block, clock_ns=START.mono_ns) for block in (report, negative_loss)]
     return [*reports, picture_loss(1, 2), max_bit_rate(1, 2, 2_000_000), reports[0] + picture_loss(1, 2)]
@@ -98,13 +118,13 @@ def feedback(seed: int) -> Target:
     def on_send(send: Send) -> None:
         nonlocal frames, misdirected
         frames += send.channel == "frame"
-        misdirected += send.channel == "rtp" and send.peer != CLIENT_ADDRESS and not send.payload.startswith(b"LAVT")
+        is_video = send.channel == "rtp" and not is_path_datagram(send.payload)  # a challenge may go to any address
+        misdirected += is_video and send.peer != CLIENT_ADDRESS
 
     bench = NodeBench(node, on_send)
     token, reports = entropy.token(16), rtcp_reports()
-    path = Corpus(old_path(), fields=((4, 1), (5, 1), (6, 8), (14, 8), (22, 16)))
-    words = tuple((offset, 4) for offset in range(4, 64, 4))
-    rtcp = Corpus(reports, fields=((0, 1), (1, 1), (2, 2), *words))
+    path = Corpus(old_path(), fields=PATH_FIELDS)
+    rtcp = Corpus(reports, fields=RTCP_FIELDS)
     bench.deliver("video_token", token)
     inputs = 0
 
@@ -120,7 +140,7 @@ def feedback(seed: int) -> Target:
     def feed(channel: str, data: bytes, chance: Chance) -> None:
         nonlocal inputs
         inputs += 1
-        if inputs % 2000 == 1:
+        if inputs % INPUTS_PER_HELLO == 1:
             validate_path()
         peer = CLIENT_ADDRESS if channel == "rtcp" and chance.below(2) else chance.choice(STRANGERS)
         sends = bench.deliver("feedback", data, peer)
@@ -128,7 +148,7 @@ def feedback(seed: int) -> Target:
             expect(send.peer == peer and len(send.payload) <= len(data), "a reply was longer than its request")
         expect(is_rtcp(data) or not sends or data in path.replays, "a stranger's hello was answered")
         bench.advance(STEP_NS)
-        if inputs % 500 == 0:
+        if inputs % INPUTS_PER_REPORT == 0:
             bench.deliver("feedback", reports[0], CLIENT_ADDRESS)
         expect(misdirected == 0, "video went to an address that was not validated")
 
@@ -149,7 +169,7 @@ def probe_at_vehicle(seed: int) -> Target:  # noqa: ARG001 (it uses no random nu
     sequence = count()
     corpus = Corpus(
         [encode_request(next(sequence), START.wall_ns + later_ns) for later_ns in range(8)],
-        fields=((0, 2), (2, 1), (3, 1), (4, 4), (8, 8), (16, 8), (24, 8), (32, 8), (40, 8)),
+        fields=PROBE_FIELDS,
     )
     inputs = answered = 0
 

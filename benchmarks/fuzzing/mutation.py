@@ -137,7 +137,7 @@ Mutation = Callable[[bytes, Corpus, Chance], bytes]
 
 
 def next_input(corpus: Corpus, chance: Chance) -> bytes:
-    """Return the next input: a valid one with up to three mutations, a replay, or noise."""
+    """Return the next input: noise (1 of 16 inputs), a replay (2 of 16), or a valid one with up to three mutations."""
     kind = chance.below(16)
     if kind == 0:
         return chance.bytes(chance.below(MAX_NOISE_BYTES))

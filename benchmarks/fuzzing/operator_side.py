@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from benchmarks.fuzzing.camera import PROBE_FIELDS, RTCP_FIELDS
 from benchmarks.fuzzing.mutation import Chance, Corpus
 from benchmarks.fuzzing.target import START, NodeBench, Target, expect, payloads_on, total
 from msgspec.structs import replace
@@ -31,6 +32,7 @@ from lavt.nodes.driver import DriverNode
 from lavt.nodes.injection import InjectionClient
 from lavt.nodes.payloads import DecodedFrame, PathToken, ReceivedUnit
 from lavt.nodes.picture_reader import PictureReader
+from lavt.nodes.receiver import SSRC as RECEIVER_SSRC
 from lavt.nodes.receiver import ReceiverNode
 from lavt.streams import stream
 from lavt.transport.clock_sync.probe import ProbeReply, decode_request, encode_reply
@@ -57,8 +59,13 @@ from lavt.transport.video.stamp import (
 
 FRAME_NS = NS_PER_S // 30
 STEP_NS = NS_PER_MS
+"""Time between two inputs."""
+INPUTS_PER_FRAME = FRAME_NS // STEP_NS
+"""After this number of inputs a true frame arrives."""
 INPUTS_PER_RESTART = 2000
 """The client is restarted after this number of inputs, because it may have lost control."""
+FEWEST_INPUTS = 1000
+"""With fewer inputs, a target need not have sent a command or shown a picture."""
 WIDTH_PX, HEIGHT_PX = 128, 96
 TOKEN = bytes(range(16))
 
@@ -90,7 +97,7 @@ def driver(seed: int, *, stops_after: int | None = None) -> Target:  # noqa: ARG
 
     With `stops_after` a person stops the vehicle after that many inputs. Without it the client is restarted repeatedly.
     """
-    commands = drive_commands = unreadable = 0
+    commands = drive_commands = rejected_before_restart = 0
 
     def on_send(send: Send) -> None:
         nonlocal commands, drive_commands
@@ -111,7 +118,7 @@ def driver(seed: int, *, stops_after: int | None = None) -> Target:  # noqa: ARG
     stopped = replace(state, speed_mps=0.0, safety="safe_stop", rejected="not the epoch in force", requested_by="bob")
     reply = SessionReply(True, "", 2**63 + 1, TOKEN, 5600, "kernel", 0)
     states = Corpus(
-        [encode(state_sent) for state_sent in (state, stopped, replace(stopped, safety="emergency_stop"))], packed=True
+        [encode(message) for message in (state, stopped, replace(stopped, safety="emergency_stop"))], packed=True
     )
     rejection = SessionReply(False, "held by bob", 0, b"", 5600, "", wall_ns)
     replies = Corpus([encode(answer) for answer in (reply, rejection)], packed=True)
@@ -119,23 +126,24 @@ def driver(seed: int, *, stops_after: int | None = None) -> Target:  # noqa: ARG
     inputs = 0
 
     def feed(channel: str, data: bytes, _chance: Chance) -> None:
-        nonlocal inputs, unreadable
+        nonlocal inputs, rejected_before_restart
         inputs += 1
         if stops_after is None and inputs % INPUTS_PER_RESTART == 0:
-            unreadable = rejected()
+            rejected_before_restart = rejected()
             bench.node = new_driver()
         bench.deliver(channel, data)
         bench.advance(STEP_NS)
-        if inputs % 33 == 0:
+        if inputs % INPUTS_PER_FRAME == 0:
             bench.deliver("view", DecodedFrame(bench.now.wall_ns, bench.now.wall_ns, picture))
         if inputs == stops_after:
             bench.deliver("operator", "emergency_stop")
 
     def rejected() -> int:
-        return unreadable + total(bench.node.counts, "states_unreadable", "session_replies_unreadable")
+        rejected_since = total(bench.node.counts, "states_unreadable", "session_replies_unreadable")
+        return rejected_before_restart + rejected_since
 
     def finish() -> str:
-        expect(inputs < 1000 or commands > 0, "the driver sent no commands")
+        expect(inputs < FEWEST_INPUTS or commands > 0, "the driver sent no commands")
         return f"{commands} commands, {drive_commands} of them in mode drive"
 
     return Target({"state": states, "session_reply": replies}, feed, rejected, finish)
@@ -187,8 +195,8 @@ def units(seed: int, number: int) -> list[tuple[int, bytes]]:
     return stamped_units
 
 
-HEADER = ((0, 1), (1, 1), (2, 2), (4, 4), (8, 4), (12, 1), (13, 1), (14, 2))
-"""Fields of the RTP header and of the beginning of the payload."""
+RTP_FIELDS = ((0, 1), (1, 1), (2, 2), (4, 4), (8, 4), (12, 1), (13, 1), (14, 2))
+"""Offset and length of the fields of the RTP header and of the beginning of the payload."""
 
 
 def video_corpora(encoded: Sequence[bytes]) -> dict[str, Corpus]:
@@ -198,7 +206,7 @@ def video_corpora(encoded: Sequence[bytes]) -> dict[str, Corpus]:
         frames = [foreign.packetize(unit, 3000 * frame) for frame, unit in enumerate(encoded)]
         media += [datagram for frame in frames for datagram in frame]
         repair += RepairSender(98, 0).repair(frames[0], 2)
-    answer = ReferenceAnswer(0x4C415654, 12345, NS_PER_MS)
+    answer = ReferenceAnswer(RECEIVER_SSRC, 12345, NS_PER_MS)
     reports = [
         sender_report(
             77, wall_ns=START.wall_ns, rtp_timestamp=5, packets=9, octets=900, cname="x@lavt", answered=answers
@@ -208,11 +216,10 @@ def video_corpora(encoded: Sequence[bytes]) -> dict[str, Corpus]:
     server = PathServer(lambda: bytes(32))
     server.set_token(TOKEN)
     challenge = server.receive(PathClient(TOKEN).hello(0), ("198.51.100.2", 4000), START.mono_ns) or b""
-    words = tuple((offset, 4) for offset in range(4, 64, 4))
     return {
-        "rtp": Corpus(media, fields=HEADER),
-        "repair": Corpus(repair, fields=(*HEADER, (16, 4), (20, 2), (22, 1), (23, 1))),
-        "rtcp": Corpus([*reports, challenge], fields=((0, 1), (1, 1), (2, 2), *words)),
+        "rtp": Corpus(media, fields=RTP_FIELDS),
+        "repair": Corpus(repair, fields=(*RTP_FIELDS, (16, 4), (20, 2), (22, 1), (23, 1))),
+        "rtcp": Corpus([*reports, challenge], fields=RTCP_FIELDS),
     }
 
 
@@ -251,7 +258,7 @@ def video(seed: int) -> Target:
         inputs += 1
         bench.deliver("rtp", data)
         bench.advance(STEP_NS)
-        if inputs % 33 == 0:
+        if inputs % INPUTS_PER_FRAME == 0:
             deliver_true_frame()
 
     def rejected() -> int:
@@ -289,7 +296,7 @@ def pictures(seed: int) -> Target:
             views += sum(len(decode_unit(unit, stamp_ns, complete=True)) for stamp_ns, unit in true_units[:2])
 
     def finish() -> str:
-        expect(inputs < 1000 or views > 0, "no true picture was shown")
+        expect(inputs < FEWEST_INPUTS or views > 0, "no true picture was shown")
         return f"{views} of {inputs // 20 * 2} true pictures shown"
 
     return Target({"access_unit": corpus}, feed, lambda: node.counts["frames_unreadable"], finish)
@@ -303,7 +310,7 @@ def probe_at_operator(seed: int) -> Target:  # noqa: ARG001 (it uses no random n
             encode_reply(ProbeReply(sequence, START.wall_ns, START.wall_ns + 5, START.wall_ns + 9, 0.1, 0.2))
             for sequence in range(8)
         ],
-        fields=((0, 2), (2, 1), (3, 1), (4, 4), (8, 8), (16, 8), (24, 8), (32, 8), (40, 8)),
+        fields=PROBE_FIELDS,
     )
     requested = accepted = inputs = 0
 

@@ -10,9 +10,9 @@ from collections import deque
 from functools import partial
 from typing import Any
 
-from benchmarks.fuzzing.camera import CLIENT_ADDRESS, FakeCamera, rtcp_reports
+from benchmarks.fuzzing.camera import CLIENT_ADDRESS, INPUTS_PER_REPORT, FakeCamera, rtcp_reports
 from benchmarks.fuzzing.mutation import Chance, Corpus
-from benchmarks.fuzzing.operator_side import STEP_NS, TOKEN, units, video_corpora
+from benchmarks.fuzzing.operator_side import INPUTS_PER_FRAME, STEP_NS, TOKEN, units, video_corpora
 from benchmarks.fuzzing.target import START, NodeBench, Target, expect, total
 from benchmarks.fuzzing.vehicle import STRAIGHT
 
@@ -36,8 +36,11 @@ from lavt.transport.video.stream_sender import StreamSender
 
 GATEWAY_STEP_NS = 4 * NS_PER_MS
 """Time between two inputs; with less, the rate limiters would reject most inputs unread."""
+INPUTS_PER_MESSAGE = 20
+"""After this number of inputs the operator sends a true command, or the vehicle a true state."""
 EPOCH = 2**63 + 7
 EVERY_THIRD_BYTE = tuple((offset, 1) for offset in range(0, 400, 3))
+"""Fields to mutate (offset, length). A third of the bytes is enough, because a signature covers all bytes alike."""
 ACQUIRE = encode(SessionRequest("acquire", "alice", 5, 0))
 GRANTED = encode(SessionReply(True, "", EPOCH, TOKEN, 5600, "kernel", 0))
 
@@ -52,7 +55,10 @@ def keys(seed: int) -> tuple[PrivateKey, PrivateKey]:
 
 
 def gateway_of_vehicle(seed: int) -> Target:
-    """Make a target for the vehicle's gateway: it accepts the operator's commands only, and no replayed request."""
+    """Make a target for the vehicle's gateway: it accepts only commands that the operator signed, and no old request.
+
+    A repeated command passes the gateway, and only the command gate, which is not part of this target, rejects it.
+    """
     vehicle_key, operator_key = keys(seed)
     delivered: list[tuple[str, bytes]] = []
     sent: list[Send] = []
@@ -91,7 +97,9 @@ def gateway_of_vehicle(seed: int) -> Target:
         "session": Corpus([exchange(ACQUIRE, GRANTED), exchange(ACQUIRE, GRANTED)], fields=EVERY_THIRD_BYTE),
         "control": Corpus([command() for _ in range(4)], fields=EVERY_THIRD_BYTE),
     }
-    corpus_bodies = frozenset(signed_bodies)  # the newest of the later commands are replayed
+    corpus_bodies = frozenset(
+        signed_bodies
+    )  # always replayable; of later commands, only the newest (`signed_bodies`) are
     inputs = 0
 
     def feed(channel: str, data: bytes, _chance: Chance) -> None:
@@ -101,10 +109,10 @@ def gateway_of_vehicle(seed: int) -> Target:
         gateway.receive(channel, data, now, "stranger")
         for accepted_on, body in delivered:
             is_authentic = accepted_on == "control" and (body in signed_bodies or body in corpus_bodies)
-            expect(is_authentic, f"a forged or replayed message was accepted on {accepted_on}")
+            expect(is_authentic, f"a forged command or a forged or replayed request was accepted on {accepted_on}")
         delivered.clear()
         sent.clear()
-        if inputs % 20 == 0:
+        if inputs % INPUTS_PER_MESSAGE == 0:
             signed = command()
             gateway.receive("control", signed, now, None)
             expect(delivered == [("control", signed_bodies[-1])], "the operator's command was rejected")
@@ -131,7 +139,10 @@ def gateway_of_operator(seed: int) -> Target:
     now = START
 
     def answer(body: bytes) -> bytes:
-        """Reply to the pending request, deliver the reply, and return its envelope."""
+        """Reply to the pending request, deliver the reply, and return its envelope.
+
+        The first reply is a retry, after which the gateway sends the request again. So two calls complete one request.
+        """
         request = vehicle.verify_request("session", sent.pop().payload)
         assert request is not None
         reply = vehicle.sign_reply(request, b"" if request.is_stale else body)
@@ -163,7 +174,7 @@ def gateway_of_operator(seed: int) -> Target:
         gateway.receive(channel, data, now, None)
         expect(delivered == [], f"a forged or replayed message was accepted on {channel}")
         sent.clear()
-        if inputs % 20 == 0:
+        if inputs % INPUTS_PER_MESSAGE == 0:
             body, signed = state(100 + inputs)
             gateway.receive("state", signed, now, None)
             expect(delivered == [body], "the vehicle's state was rejected")
@@ -216,7 +227,7 @@ def encrypted_video(seed: int) -> Target:
     def feed(_channel: str, data: bytes, _chance: Chance) -> None:
         nonlocal inputs, sent_packets, protected
         inputs += 1
-        if inputs % 33 == 1:
+        if inputs % INPUTS_PER_FRAME == 1:
             protected = protected if inputs == 1 else next_true_frame()
             for datagram in protected:
                 bench.deliver("rtp", datagram)
@@ -244,10 +255,11 @@ def encrypted_feedback(seed: int) -> Target:
     [challenge] = bench.deliver("feedback", client.hello(0), CLIENT_ADDRESS)
     bench.deliver("feedback", client.answer(challenge.payload), CLIENT_ADDRESS)
     [packet] = Packetizer(77, 0).packetize(b"\0\0\1\x65", 0)
-    client.unprotect(path.cipher.protect(packet))  # from now on the client uses the server's key
-    report, loss = rtcp_reports()[0], picture_loss(1, 2)
+    # The first packet shows the client which of its candidate keys the server uses.
+    client.unprotect(path.cipher.protect(packet))
+    report, keyframe_request = rtcp_reports()[0], picture_loss(1, 2)
     corpus = Corpus(
-        [client.protect_rtcp(plain) for plain in (report, loss, report)],
+        [client.protect_rtcp(plain) for plain in (report, keyframe_request, report)],
         fields=tuple((offset, 1) for offset in range(96)),
     )
     for protected in corpus.entries:
@@ -259,9 +271,10 @@ def encrypted_feedback(seed: int) -> Target:
         inputs += 1
         bench.deliver(channel, data, CLIENT_ADDRESS)
         bench.advance(STEP_NS)
-        if inputs % 500 == 0:
-            sent = client.protect_rtcp(loss if inputs % 1000 == 0 else report)
-            requested += inputs % 1000 == 0
+        if inputs % INPUTS_PER_REPORT == 0:
+            requests_keyframe = inputs % (2 * INPUTS_PER_REPORT) == 0
+            sent = client.protect_rtcp(keyframe_request if requests_keyframe else report)
+            requested += requests_keyframe
             bench.deliver("feedback", sent, CLIENT_ADDRESS)
             corpus.replays.append(sent)
         expect(node.counts.get("keyframes_on_request", 0) <= requested, "a keyframe was made without a request")

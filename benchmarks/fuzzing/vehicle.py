@@ -35,9 +35,10 @@ from lavt.transport.messages import MAX_MESSAGE_BYTES, decode, encode
 from lavt.transport.netem.injector import InjectionOrder, InjectionResult
 from lavt.vehicle.vehicle import Capabilities, ReachedCommand
 
-FRAME_NS = NS_PER_S // 30
 STEP_NS = NS_PER_MS
 """Time between two inputs."""
+INPUTS_PER_FRAME = NS_PER_S // 30 // STEP_NS
+"""After this number of inputs the camera writes a frame, if nobody drives the vehicle."""
 INPUTS_PER_COMMAND = 20
 """After this number of inputs the true operator sends a command made from a new frame."""
 STRAIGHT = (0.0,) * 10
@@ -221,7 +222,7 @@ def vehicle_at_rest(seed: int) -> Target:
     def feed(channel: str, data: bytes, _chance: Chance) -> None:
         delivered[channel] += 1
         side.bench.advance(STEP_NS)
-        if sum(delivered.values()) % 33 == 0:
+        if sum(delivered.values()) % INPUTS_PER_FRAME == 0:
             side.write_frame()
         _feed(side, channel, data)
         expect(side.gate.state in ("disarmed", "emergency_stop"), f"a stranger caused {side.gate.state}")
@@ -239,8 +240,8 @@ def vehicle_driven(seed: int) -> Target:
     """Make a target for a driven vehicle: no command of a stranger, nor a replayed one, is accepted.
 
     Anybody may stop the vehicle. Without signatures anybody may also take control of it after an emergency stop and
-    clear the stop. The operator then takes control again and arms the vehicle. So that this happens seldom, the number
-    of the first emergency stop is so large that those of most later ones count as old.
+    clear the stop. The operator then takes control again and arms the vehicle. To make this rare, the first emergency
+    stop has the largest number that is stored: most later ones have a smaller number, count as old, and do nothing.
     """
     side = VehicleSide(seed)
     side.request("acquire")

@@ -206,6 +206,7 @@ class Carrier:
 
     label: str
     end: Callable[[str, Routers], CarrierEnd]
+    """Creates an end from the address of the other end (empty for the echoing end) and the routers."""
     module: str = ""
     """The module that it needs besides LAVT's dependencies; empty if none."""
     package: str = ""

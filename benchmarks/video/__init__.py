@@ -1,1 +1,1 @@
-"""The processes of `video_vs_gstreamer.py` and `endurance.py`, and the code that both sides share."""
+"""The processes of `video_vs_gstreamer.py` and `endurance.py`, and the code that LAVT's and GStreamer's share."""

@@ -1,4 +1,4 @@
-"""The part on a clean link: both sides in turns on the loopback, and between them the latency of the codec alone."""
+"""The part on a clean link: both programs in turns on the loopback, and between them the latency of the codec alone."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 
+from benchmarks.video.processes import Program, RunOutcome, frames_of, measure, measure_floor_ms
 from benchmarks.video.run import Run
-from benchmarks.video.sides import RunOutcome, Side, frames_of, measure, measure_floor_ms
 
 MAX_FLOOR_RUN_S = 6.0
 USUAL_JITTER_BUFFER_MS = 200
@@ -35,6 +35,7 @@ class ComparisonPair:
     ours: RunOutcome
     tuned: RunOutcome
     floor_ms: float
+    """The latency of encoding and decoding alone."""
 
     @property
     def median_ratio(self) -> float:
@@ -65,9 +66,9 @@ def describe_clean_run(folder: Path, size: Size, seconds: float) -> Run:
 def measure_pairs(run: Run, pairs: int) -> Iterator[ComparisonPair]:
     """Yield `pairs` measured pairs; every second one begins with GStreamer."""
     for number in range(pairs):
-        sides: tuple[Side, Side] = ("ours", "gstreamer") if number % 2 == 0 else ("gstreamer", "ours")
-        first, floor_ms, second = measure(sides[0], run), _measure_floor_ms(run), measure(sides[1], run)
-        ours, tuned = (first, second) if sides[0] == "ours" else (second, first)
+        order: tuple[Program, Program] = ("ours", "gstreamer") if number % 2 == 0 else ("gstreamer", "ours")
+        first, floor_ms, second = measure(order[0], run), _measure_floor_ms(run), measure(order[1], run)
+        ours, tuned = (first, second) if order[0] == "ours" else (second, first)
         pair = ComparisonPair(ours, tuned, floor_ms)
         print(
             f"  pair {number + 1}: ours {ours.median_ms:.2f}, GStreamer {tuned.median_ms:.2f}, floor {floor_ms:.2f} ms",
@@ -82,7 +83,7 @@ def _measure_floor_ms(run: Run) -> float:
 
 def measure_usual(run: Run) -> RunOutcome:
     """Measure GStreamer as usually configured: with a jitter buffer, and each picture shown when it is due."""
-    return measure("gstreamer", replace(run, jitter_ms=USUAL_JITTER_BUFFER_MS, synchronous=True))
+    return measure("gstreamer", replace(run, jitter_buffer_ms=USUAL_JITTER_BUFFER_MS, synchronous=True))
 
 
 def format_row(name: str, outcome: RunOutcome) -> str:
@@ -99,19 +100,19 @@ def run_clean_part(folder: Path, size: Size, *, pairs: int, seconds: float) -> d
     print(f"\n## {size.name}, {size.bit_rate_bps / 1e6:g} Mb/s, {pairs} pairs of {seconds:g} s\n")
     print("| run | median ms | p95 ms | CPU sender ms/frame | CPU receiver ms/frame | frames shown |")
     print("|---|---|---|---|---|---|")
-    measured = []
+    measured_pairs = []
     for pair in measure_pairs(run, pairs):
-        measured.append(pair)
-        print(format_row(f"ours {len(measured)}", pair.ours))
-        print(format_row(f"GStreamer, tuned {len(measured)}", pair.tuned))
-        print(f"| floor {len(measured)} | {pair.floor_ms:.2f} | | | | |", flush=True)
+        measured_pairs.append(pair)
+        print(format_row(f"ours {len(measured_pairs)}", pair.ours))
+        print(format_row(f"GStreamer, tuned {len(measured_pairs)}", pair.tuned))
+        print(f"| floor {len(measured_pairs)} | {pair.floor_ms:.2f} | | | | |", flush=True)
     print(format_row("GStreamer, usual", measure_usual(run)))
     ratios = {
-        "median_ratio": median(pair.median_ratio for pair in measured),
-        "cpu_ratio": median(pair.cpu_ratio for pair in measured),
-        "over_floor_ms": median(pair.over_floor_ms for pair in measured),
+        "median_ratio": median(pair.median_ratio for pair in measured_pairs),
+        "cpu_ratio": median(pair.cpu_ratio for pair in measured_pairs),
+        "over_floor_ms": median(pair.over_floor_ms for pair in measured_pairs),
     }
-    p95 = median(pair.p95_ratio for pair in measured)
+    p95 = median(pair.p95_ratio for pair in measured_pairs)
     print(
         f"\nOurs / tuned GStreamer, median over pairs: median {ratios['median_ratio']:.2f}, p95 {p95:.2f}, "
         f"CPU {ratios['cpu_ratio']:.2f}; ours is {ratios['over_floor_ms']:.2f} ms above the codec's floor.",

@@ -68,6 +68,6 @@ def receiver_pipeline(run: Run) -> str:
     return (
         f"udpsrc name=socket address=127.0.0.1 port=0 buffer-size={BUFFER_BYTES} "
         "caps=application/x-rtp,media=video,clock-rate=90000,encoding-name=H264,payload=96 "
-        f"! rtpjitterbuffer latency={run.jitter_ms} ! rtph264depay ! avdec_h264 max-threads=1 max-errors=-1 "
+        f"! rtpjitterbuffer latency={run.jitter_buffer_ms} ! rtph264depay ! avdec_h264 max-threads=1 max-errors=-1 "
         f"! appsink name=pictures max-buffers=0 sync={str(run.synchronous).lower()}"
     )

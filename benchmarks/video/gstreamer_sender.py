@@ -8,6 +8,7 @@ import numpy as np
 from benchmarks.video.gstreamer import load_gstreamer, sender_pipeline
 from benchmarks.video.pictures import picture_of, planes_loop
 from benchmarks.video.run import (
+    RATE_HZ,
     Pace,
     Run,
     cpu_ns,
@@ -55,8 +56,8 @@ def _send(gst: Any, run: Run, source: Any, loop: NDArray[np.uint8]) -> list[int]
         stamp_ns = wall_ns()
         write_stamp_i420(planes, stamp_ns)
         buffer.unmap(mapped)
-        buffer.pts = buffer.dts = number * NS_PER_S // 30
-        buffer.duration = NS_PER_S // 30
+        buffer.pts = buffer.dts = number * NS_PER_S // RATE_HZ
+        buffer.duration = NS_PER_S // RATE_HZ
         table[number, 1] = number
         table[number, 0] = stamp_ns
         source.push_buffer(buffer)

@@ -1,4 +1,4 @@
-"""The part on an impaired link, which delays, reorders and loses packets: shares of shown and of damaged frames."""
+"""The part on an impaired link, which delays, reorders and loses packets: shares of shown and of undamaged frames."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ import numpy as np
 from benchmarks.video.clean import SIZES
 from benchmarks.video.floor import open_decoder
 from benchmarks.video.pictures import picture_of, planes_loop, squared_error
+from benchmarks.video.processes import WARM_UP_FRAMES, Program, RunOutcome, measure
 from benchmarks.video.relay import LinkCase
 from benchmarks.video.run import Run, load_units
-from benchmarks.video.sides import WARM_UP_FRAMES, RunOutcome, Side, measure
 
 from lavt.errors import WorkError
 
@@ -26,7 +26,7 @@ CASES = (
     LinkCase("burst1", loss=0.01, burst_packets=3),
     LinkCase("burst5", loss=0.05, burst_packets=3),
 )
-GSTREAMER_JITTER_MS = {"reorder": (30,), "loss1": (0, 30), "loss5": (0, 30), "burst1": (30,), "burst5": (30,)}
+GSTREAMER_JITTER_BUFFERS_MS = {"reorder": (30,), "loss1": (0, 30), "loss5": (0, 30), "burst1": (30,), "burst5": (30,)}
 """The lengths of GStreamer's jitter buffer that are measured in each case; the best result counts."""
 DAMAGED_DB = 2.0
 """A picture is damaged if its PSNR is lower than that of the loss-free picture by more than this."""
@@ -99,9 +99,9 @@ def run_impaired_part(folder: Path, case: LinkCase, *, frames: int) -> dict[str,
     ours = _measure_quality("ours", run, case)
     _print_row("ours", ours)
     gstreamer = []
-    for jitter_ms in GSTREAMER_JITTER_MS[case.name]:
-        gstreamer.append(_measure_quality("gstreamer", replace(run, jitter_ms=jitter_ms), case))
-        _print_row(f"GStreamer, jitter buffer {jitter_ms} ms", gstreamer[-1])
+    for jitter_buffer_ms in GSTREAMER_JITTER_BUFFERS_MS[case.name]:
+        gstreamer.append(_measure_quality("gstreamer", replace(run, jitter_buffer_ms=jitter_buffer_ms), case))
+        _print_row(f"GStreamer, jitter buffer {jitter_buffer_ms} ms", gstreamer[-1])
     if not case.loss:
         return {"shown": round(ours.outcome.shown, 4)}
     if case.burst_packets:
@@ -113,9 +113,9 @@ def run_impaired_part(folder: Path, case: LinkCase, *, frames: int) -> dict[str,
     }
 
 
-def _measure_quality(side: Side, run: Run, case: LinkCase) -> AssessedRun:
-    outcome = measure(side, run, (case.to_json(),))
-    print(f"  {case.name}: {side} done, {outcome.counts}", file=sys.stderr)
+def _measure_quality(program: Program, run: Run, case: LinkCase) -> AssessedRun:
+    outcome = measure(program, run, (case.to_json(),))
+    print(f"  {case.name}: {program} done, {outcome.counts}", file=sys.stderr)
     return AssessedRun(outcome, undamaged_share(outcome.errors, loss_free_errors(run)))
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.video.picture_log import PictureLog
-from benchmarks.video.product import LOOPBACK, LastPictureReceiver, SideRuntime, build_receiver_nodes
+from benchmarks.video.product import LOOPBACK, LastPictureReceiver, ProcessRuntime, build_receiver_nodes
 from benchmarks.video.run import TOKEN, print_json, requested_run, wait_for_line
 
 from lavt.domain import Now
@@ -21,7 +21,7 @@ class PictureRecorder:
         self.pictures: LastPictureReceiver | None = None
         self._log = log
 
-    def write(self, topic: str, payload: Any, now: Now) -> None:  # noqa: ARG002 (the recorder's)
+    def write(self, topic: str, payload: Any, now: Now) -> None:  # noqa: ARG002 (part of the protocol)
         """Note a picture whose stamp was read, and finally the nodes' counts."""
         if topic == "picture" and payload.readable and self.pictures is not None:
             self._log.note(payload.stamp_ns, payload.read_wall_ns, self.pictures.last.luma)
@@ -34,13 +34,13 @@ def main() -> None:
     run = requested_run()
     log = PictureLog(run)
     recorder = PictureRecorder(log)
-    side = SideRuntime("rtp", recorder, remote=(LOOPBACK, run.port))
-    nodes, recorder.pictures = build_receiver_nodes(run, side.clock)
-    runtime = side.start(nodes)
-    runtime.deliver("path_token", PathToken(TOKEN, run.port), side.clock.now())
-    print_json({"port": side.port})
+    process = ProcessRuntime("rtp", recorder, remote=(LOOPBACK, run.port))
+    nodes, recorder.pictures = build_receiver_nodes(run, process.clock)
+    runtime = process.start(nodes)
+    runtime.deliver("path_token", PathToken(TOKEN, run.port), process.clock.now())
+    print_json({"port": process.port})
     wait_for_line()
-    side.close()
+    process.close()
     log.save(Path(run.folder) / "read.npz")
     print_json({"counts": recorder.counts})
 

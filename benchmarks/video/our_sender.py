@@ -6,7 +6,7 @@ import threading
 from typing import Any
 
 import numpy as np
-from benchmarks.video.product import SideRuntime, build_sender_nodes
+from benchmarks.video.product import ProcessRuntime, build_sender_nodes
 from benchmarks.video.run import TOKEN, Run, Table, cpu_ns, print_json, requested_run, save_units, wait_for_line
 
 from lavt.domain import Now
@@ -23,7 +23,7 @@ class SentFrameRecorder:
         self._table: Table = run.table()
         self._run = run
 
-    def write(self, topic: str, payload: Any, now: Now) -> None:  # noqa: ARG002 (the recorder's)
+    def write(self, topic: str, payload: Any, now: Now) -> None:  # noqa: ARG002 (part of the protocol)
         """Note a sent frame."""
         sent = self.sent
         if sent >= self._run.frames:
@@ -44,14 +44,14 @@ def main() -> None:
     """Send the requested number of frames after a line arrives on stdin."""
     run = requested_run()
     recorder = SentFrameRecorder(run)
-    side = SideRuntime("feedback", recorder)
-    print_json({"port": side.port})
+    process = ProcessRuntime("feedback", recorder)
+    print_json({"port": process.port})
     wait_for_line()
-    runtime = side.start(build_sender_nodes(run, side.clock, side.port))
-    runtime.deliver("video_token", TOKEN, side.clock.now())
+    runtime = process.start(build_sender_nodes(run, process.clock, process.port))
+    runtime.deliver("video_token", TOKEN, process.clock.now())
     while not recorder.done.wait(0.5) and not runtime.stopped.is_set():
         pass
-    side.close()
+    process.close()
     save_units(run, recorder.units)
     print_json({"cpu_ns": recorder.cpu_ns[: recorder.sent].tolist()})
 

@@ -1,4 +1,4 @@
-"""The log of received pictures, which the receiving processes of both sides write."""
+"""The log of received pictures, which the receiving processes of both programs write."""
 
 from __future__ import annotations
 
@@ -40,6 +40,7 @@ class PictureLog:
         np.savez(path, rows=self._rows[: self._noted], errors=self._errors[: self._noted])
 
     def _number_of(self, stamp_ns: int) -> int | None:
+        """Return the number of the frame that was sent with a stamp; None if no frame was."""
         while sent_ns := int(self._table[len(self._numbers), 0]):
             self._numbers[sent_ns] = int(self._table[len(self._numbers), 1])
         return self._numbers.get(stamp_ns)

@@ -75,8 +75,8 @@ class MessageRecorder(Protocol):
         ...
 
 
-class SideRuntime:
-    """One side of the benchmark: its nodes, its video socket and its runtime."""
+class ProcessRuntime:
+    """LAVT's part of a sending or receiving process: nodes, video socket and runtime."""
 
     def __init__(self, channel: str, recorder: MessageRecorder, *, remote: tuple[str, int] | None = None) -> None:
         self.clock = MachineClock()

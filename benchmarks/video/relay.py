@@ -18,8 +18,8 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 
 import numpy as np
+from benchmarks.video.processes import WARM_UP_FRAMES
 from benchmarks.video.run import freeze, print_json, requested_run
-from benchmarks.video.sides import WARM_UP_FRAMES
 
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.transport.emulation.impairment import Impairment, gilbert
@@ -32,6 +32,7 @@ SEED = 6
 MEDIA, REPAIR = 96, 97
 """Payload types of RTP."""
 MARKER = 0x80
+"""Bit in the byte of the payload type; it is set in the last packet of a frame."""
 
 Address = tuple[str, int]
 
@@ -113,7 +114,8 @@ def relay(
             datagram, address = receiver.recvfrom(MAX_DATAGRAM_BYTES)
             due_ns = time.monotonic_ns() + ONE_WAY_MS * NS_PER_MS
             near_peer = address if receiver is near else near_peer
-            if (receiver is near) is near_sends and datagram[0] >> 6 == 2:
+            is_rtp = datagram[0] >> 6 == 2  # the version of RTP and RTCP; other datagrams belong to the path validation
+            if (receiver is near) is near_sends and is_rtp:
                 delay_ns = impairment.next_delay_ns()
                 traffic.note(datagram, lost=delay_ns is None)
                 if delay_ns is None:
@@ -131,16 +133,16 @@ def relay(
 
 def main() -> None:
     """Relay until a line arrives on stdin, then print the counters."""
-    run, side, case = requested_run(), sys.argv[2], LinkCase(**json.loads(sys.argv[3]))
+    run, program, case = requested_run(), sys.argv[2], LinkCase(**json.loads(sys.argv[3]))
     near, far = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
     for endpoint in (near, far):
         endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
         endpoint.bind(("127.0.0.1", 0))
     freeze()
-    with suppress(OSError):  # the relay stands for the network, so it gets priority over both sides if permitted
+    with suppress(OSError):  # the relay stands for the network, so it gets priority over both processes if permitted
         os.setpriority(os.PRIO_PROCESS, 0, -20)
     print_json({"port": near.getsockname()[1]})
-    traffic = relay(near, far, ("127.0.0.1", run.port), case, near_sends=side == "gstreamer")
+    traffic = relay(near, far, ("127.0.0.1", run.port), case, near_sends=program == "gstreamer")
     late_ms = traffic.late_ms or [0.0]
     print_json({**traffic.counts, "late_p99_ms": float(np.percentile(late_ms, 99)), "late_max_ms": max(late_ms)})
 

@@ -17,6 +17,7 @@ from lavt.domain import NS_PER_S
 
 RATE_HZ = 30
 VBV_MS = 100
+"""The decoder buffer (VBV) that the encoder's rate control assumes."""
 GOP_FRAMES = 30
 TOKEN = bytes(16)
 """Token of our video path; in a drive it comes with the session."""
@@ -41,7 +42,7 @@ class Run:
     """Port of the process that was started first."""
     keep: bool = False
     """Save the access units and the error of each received picture."""
-    jitter_ms: int = 0
+    jitter_buffer_ms: int = 0
     """The length of GStreamer's jitter buffer."""
     synchronous: bool = False
     """GStreamer shows each picture when it is due, instead of immediately."""

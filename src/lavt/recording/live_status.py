@@ -9,7 +9,7 @@ from lavt.domain import NS_PER_MS, Now, State
 from lavt.runtime.recorder import decode_for_record
 
 MAX_PENDING = 4096
-"""How many entries, and how many updates, are kept until they are read: those of more than ten seconds."""
+"""At most this many entries, and this many updates, are kept until they are read: enough for more than ten seconds."""
 
 StatusUpdate = tuple[State | str, Now]
 """A state of the vehicle or the reason for which a command was rejected, and its time."""
@@ -44,7 +44,7 @@ class LiveStatus:
             self._entries.append((topic, payload, now))
 
     def ending(self) -> str | None:
-        """Return how the last drive ended; None before its end, or after the start of another."""
+        """Return how the last drive ended; None before its end, and again after the start of another drive."""
         self._process_entries()
         return self._ending
 

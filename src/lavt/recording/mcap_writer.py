@@ -1,7 +1,8 @@
-"""A fast writer of MCAP files (mcap.dev/spec): a record has hundreds of messages for each second of a drive.
+"""A fast writer of MCAP files (mcap.dev/spec): a side writes hundreds of messages for each second of a drive.
 
-The writer of the package `mcap` takes 10 us for a message, this one takes 2. The package's classes write the other,
-rare records (header, schemas, channels, indexes), and the tests read the files with the package's reader.
+The writer of the package `mcap` takes 10 us for a message, this one takes 2 us. The package's classes write the other,
+rare records (header, schemas, channels, indexes), and the tests read the files with the package's reader. In this
+module, "record" has MCAP's meaning: one entry of the file, such as a message, a channel or an index.
 """
 
 from __future__ import annotations
@@ -35,8 +36,13 @@ _MESSAGE: Final = struct.Struct("<BQHIQQ")
 """Opcode, length of the content that follows, channel, sequence number, log time and publish time; the data follow."""
 _MESSAGE_OPCODE: Final = int(Opcode.MESSAGE)
 _HEAD_BYTES: Final = 9
+"""Opcode of a record, and length of the content that follows."""
 _MESSAGE_FIELDS_BYTES: Final = _MESSAGE.size - _HEAD_BYTES
 _MESSAGE_INDEX: Final = struct.Struct("<BQHI")
+"""Opcode, length of the content that follows, channel, and length of the entries (log time and offset) that follow."""
+_MESSAGE_INDEX_FIELDS_BYTES: Final = _MESSAGE_INDEX.size - _HEAD_BYTES
+_FOOTER_BYTES: Final = 20
+"""Length of a footer's content: two offsets and a checksum."""
 _COMPRESSION_LEVEL: Final = 1
 """The fastest ordinary level of zstd, which compresses the JSON of a drive to a ninth. Level 3 takes a third longer and
 gives the same size."""
@@ -109,7 +115,7 @@ class McapFile:
         begin = self._file.tell()
         records = [*self._schemas, *self._channels, self._statistics(), *self._chunk_indexes, *self._metadata_indexes]
         summary = b"".join(_bytes(record) for record in records)
-        crc = zlib.crc32(summary + struct.pack("<BQQQ", Opcode.FOOTER, 20, begin, 0))
+        crc = zlib.crc32(summary + struct.pack("<BQQQ", Opcode.FOOTER, _FOOTER_BYTES, begin, 0))
         footer = Footer(summary_start=begin, summary_offset_start=0, summary_crc=crc)
         self._file.write(summary + _bytes(footer) + MAGIC)
         self._file.close()
@@ -181,7 +187,8 @@ class McapFile:
 
 def _message_index(channel_id: int, entries: list[int]) -> bytes:
     packed = struct.pack(f"<{len(entries)}Q", *entries)
-    return _MESSAGE_INDEX.pack(Opcode.MESSAGE_INDEX, 6 + len(packed), channel_id, len(packed)) + packed
+    length = _MESSAGE_INDEX_FIELDS_BYTES + len(packed)
+    return _MESSAGE_INDEX.pack(Opcode.MESSAGE_INDEX, length, channel_id, len(packed)) + packed
 
 
 def _bytes(record: McapRecord) -> bytes:

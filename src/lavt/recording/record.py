@@ -74,7 +74,7 @@ class RecordWriter:
 
     `digest`, if given, is updated with the side, channel, times, length and JSON of every message. Both sides of a run
     in virtual time share one digest, which therefore also covers the order of messages on different sides. It covers
-    neither annotations nor the channels in `left_out`, which are not recorded.
+    neither annotations nor the channels in `left_out`; these channels are not recorded.
     """
 
     def __init__(
@@ -209,8 +209,8 @@ class Record:
 def evaluating(path: Path) -> Iterator[None]:
     """Raise `UserError` if the records at `path`, which others may have written, have unexpected content.
 
-    Damage is not meant: checksums detect it. Content of another type or range than LAVT writes may cause any error in
-    a computation with it.
+    Such content is intact (checksums detect damage), but has another type or range than LAVT writes, and may cause any
+    error in a computation with it.
     """
     try:
         yield

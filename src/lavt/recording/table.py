@@ -25,8 +25,8 @@ class Table:
     """The messages of one channel, in the order in which they were recorded.
 
     `columns` has an array per field of the payload: int64 (null is `MISSING`), float64 (null is NaN), bool, or objects.
-    `mono_ns` and `wall_ns` are the times of recording on the clocks of the recording host. Fields of the payload that
-    have the same names are in `columns`.
+    `mono_ns` and `wall_ns` are the times of recording on the clocks of the recording host. If the payload itself has
+    fields named `mono_ns` or `wall_ns`, those are in `columns`.
     """
 
     mono_ns: IntArray

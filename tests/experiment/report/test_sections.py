@@ -14,7 +14,7 @@ import pytest
 
 from lavt.experiment.analysis.results import run_result, write_json
 from lavt.experiment.report.figure_style import condition_colours
-from lavt.experiment.report.groups import axes_of, differing, in_order, is_of, title_of
+from lavt.experiment.report.groups import axes_of, differing_settings, in_order, is_in_group, title_of
 from lavt.experiment.report.report import write_report
 from lavt.experiment.report.run_figures import drawn_points
 from lavt.experiment.report.sections import (
@@ -262,7 +262,7 @@ def test_two_presets_are_separate_groups(tmp_path: Path) -> None:
     assert summary["conditions"]["L5"]["completed"] == 0
     report = report_of(summary, tmp_path)
     parts = parts_of(report, "summary", "conditions", "contrasts", "runs", "groups")
-    assert [title_of(group, differing(report.groups)) for group in report.groups] == [
+    assert [title_of(group, differing_settings(report.groups)) for group in report.groups] == [
         "preset paper_calibrated",
         "preset designed",
     ]
@@ -279,7 +279,7 @@ def test_two_presets_are_separate_groups(tmp_path: Path) -> None:
 def test_sweeps_with_equal_settings_are_separate_groups() -> None:
     """Two sweeps with the same settings are two groups, distinguished by their names."""
     groups = summarize([*campaign(sweep="x"), *campaign(sweep="y")], None)["groups"]
-    assert [title_of(group, differing(groups)) for group in groups] == ["sweep x", "sweep y"]
+    assert [title_of(group, differing_settings(groups)) for group in groups] == ["sweep x", "sweep y"]
     assert "sweep" not in summarize(campaign(), None)["groups"][0]
 
 
@@ -305,9 +305,9 @@ def test_group_titles_are_as_short_as_possible() -> None:
     """A setting that an axis implies is not in the title of a group, and groups are sorted by their axis values."""
     runs = [run_of("L0", axes={"loss": loss}, changes=f"loss {loss}") for loss in (10.0, 2.0)]
     groups = in_order(summarize(runs, None)["groups"])
-    assert differing(groups) == ["loss"]
+    assert differing_settings(groups) == ["loss"]
     assert [title_of(group, ["loss"]) for group in groups] == ["loss 2.0", "loss 10.0"]
-    assert [is_of(runs[1], group) for group in groups] == [True, False]
+    assert [is_in_group(runs[1], group) for group in groups] == [True, False]
 
 
 def test_a_sweep_without_runs_of_its_base_config_shows_groups(tmp_path: Path) -> None:

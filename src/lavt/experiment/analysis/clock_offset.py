@@ -19,8 +19,8 @@ faster, and reports its corrections. `docs/metrics.md` says when the assumption 
 class ClockOffset:
     """Delta at ascending times of the client's wall clock.
 
-    Between these times Delta is interpolated linearly, and `bound_ns` limits the error of the result; it is NaN where
-    it is unknown. Before the first and after the last time the bound grows by `drift_outside` (ns per ns).
+    Between these times Delta is interpolated linearly, and `bound_ns` limits the error of the result, or is NaN where
+    no limit is known. Before the first and after the last time the bound grows by `drift_outside` (ns per ns).
     """
 
     client_wall_ns: IntArray
@@ -65,11 +65,12 @@ class _Correction:
     reference_ns: IntArray
     correction_ns: FloatArray
     own_bound_ns: FloatArray
+    """The bound relative to the reference: NTP's root distance, which covers the whole path, from the best samples."""
     peer_bound_ns: FloatArray
     """The bound relative to the other host's clock where the time source follows that host; NaN elsewhere.
 
-    There are two valid bounds, and the smaller one is used. The root distance covers the whole path to the reference,
-    from the best samples. The peer delay and dispersion cover only the path to the other host, from the last sample.
+    It is the smaller of two valid bounds: `own_bound_ns`, and the bound from the peer delay and dispersion, which cover
+    only the path to the other host, from the last sample.
     """
     query_ns: FloatArray
     """The largest possible change of the correction during the query of the time source."""
@@ -84,10 +85,10 @@ def offset_from_sources(server: Table, client: Table) -> ClockOffset | None:
 
     None if the correction of a host is unknown, or if the samples of the two hosts do not overlap in time.
 
-    The times of the result are the samples of both hosts, in the interval that the samples of each host cover. Outside
-    this interval Delta is assumed to change at most twice as fast as at the faster of its two ends. Where one host
-    follows the other, the bound is that of the follower, otherwise the sum of both hosts' own bounds. The possible
-    error of the interpolation between two samples is added (`docs/metrics.md`).
+    The times of the result are those of the samples of both hosts, in the interval that the samples of both hosts
+    cover. Outside this interval Delta is assumed to change at most twice as fast as at that end of the interval where
+    it changes faster. Where one host follows the other, the bound is that of the follower, otherwise the sum of both
+    hosts' own bounds. The possible error of the interpolation between two samples is added (`docs/metrics.md`).
     """
     of_server, of_client = _correction(server, client), _correction(client, server)
     if of_server is None or of_client is None:
@@ -218,7 +219,8 @@ def offset_from_probe(exchanges: ProbeExchanges) -> ClockOffset | None:
     """Return Delta from the probe alone, at the time of each exchange; None without exchanges.
 
     The value at a time is that of the exchange with the smallest bound at that time. The bound of an exchange is half
-    its round trip, plus the possible drift of the clocks between the exchange and that time.
+    its round trip, plus the possible drift of the clocks between the exchange and that time. The drift in half of the
+    longer gap to a neighbouring exchange is added, because Delta is interpolated between the exchanges.
     """
     if len(exchanges) == 0:
         return None
@@ -231,8 +233,8 @@ def offset_from_probe(exchanges: ProbeExchanges) -> ClockOffset | None:
     ]
     delta_ns = exchanges.delta_ns[np.where(bounds_ns[0] <= bounds_ns[1], best_before, best_after)]
     gaps_ns = np.diff(times_ns)
-    between_ns = DRIFT_ALLOWANCE * np.maximum(np.append(gaps_ns, 0.0), np.append(0.0, gaps_ns)) / 2
-    return ClockOffset(exchanges.client_wall_ns, delta_ns, np.minimum(*bounds_ns) + between_ns, DRIFT_ALLOWANCE)
+    interpolation_ns = DRIFT_ALLOWANCE * np.maximum(np.append(gaps_ns, 0.0), np.append(0.0, gaps_ns)) / 2
+    return ClockOffset(exchanges.client_wall_ns, delta_ns, np.minimum(*bounds_ns) + interpolation_ns, DRIFT_ALLOWANCE)
 
 
 def _running_argmin(values: FloatArray) -> IntArray:

@@ -90,7 +90,7 @@ def poll_reasons(server: Record, client: Record, began_ns: int, ended_ns: int) -
         if gap_ns > limit_ns
     ]
     near_drive_ns = client_ns[(client_ns > client_began_ns - limit_ns) & (client_ns < client_ended_ns + limit_ns)]
-    is_covered = len(client_ns) and client_ns[0] - client_began_ns <= limit_ns >= client_ended_ns - client_ns[-1]
+    is_covered = len(client_ns) and max(client_ns[0] - client_began_ns, client_ended_ns - client_ns[-1]) <= limit_ns
     if not is_covered:
         covered_s = (int(np.ptp(near_drive_ns)) if len(near_drive_ns) else 0) / NS_PER_S
         drive_s = (ended_ns - began_ns) / NS_PER_S

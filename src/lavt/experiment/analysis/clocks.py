@@ -92,6 +92,7 @@ class RunClocks:
         return largest_ns / NS_PER_MS if np.isfinite(largest_ns) else None
 
     def _middle_ms(self, offset: ClockOffset | None) -> float | None:
+        """Return Delta in the middle of the drive."""
         if offset is None:
             return None
         began_ns, ended_ns = self.client_wall_ns.tolist()

@@ -46,17 +46,17 @@ def recorded_reasons(
     }
     reasons = []
     for side, table in samples.items():
-        others = [name for name in table.texts("condition") if name != condition]
-        doubts = [reason for reason in table.texts("reason") if reason]
+        other_conditions = [name for name in table.texts("condition") if name != condition]
+        deviations = [reason for reason in table.texts("reason") if reason]
         if len(table) == 0:
             text = f"the {side} did not report that condition {condition} was in force"
             reasons.append(InvalidReason(InvalidCode.INJECTION_NOT_IN_FORCE, text))
         elif (gap_s := _longest_gap_s(table, ended_ns if side == "server" else None)) > GAP_LIMIT_S:
             text = f"the {side} did not measure condition {condition} for {gap_s:.0f} s"
             reasons.append(InvalidReason(InvalidCode.INJECTION_NOT_MEASURED, text))
-        elif others or doubts:
-            doubt = f": {doubts[0]}" if doubts else ""
-            text = f"condition {condition} was not in force as requested on the {side} all the time{doubt}"
+        elif other_conditions or deviations:
+            first_deviation = f": {deviations[0]}" if deviations else ""
+            text = f"condition {condition} was not in force as requested on the {side} all the time{first_deviation}"
             reasons.append(InvalidReason(InvalidCode.INJECTION_NOT_IN_FORCE, text))
     unmeasured = [
         flow for flow, side in SENT_BY.items() if requested_ms[flow] and not _is_measured(samples[side], flow)

@@ -51,8 +51,8 @@ def received_frames_of(received_frames: Table, frames: Table) -> Table:
     """
     stamps = frames.ints("stamp_ns")
     matches_stamp = np.isin(received_frames.ints("stamp_ns"), stamps)
-    matches_packet = np.isin(received_frames.ints("rtp_timestamp"), rtp_timestamp(stamps))
-    return received_frames.where(np.where(received_frames.flags("readable"), matches_stamp, matches_packet))
+    matches_timestamp = np.isin(received_frames.ints("rtp_timestamp"), rtp_timestamp(stamps))
+    return received_frames.where(np.where(received_frames.flags("readable"), matches_stamp, matches_timestamp))
 
 
 def decoded_frames(received_frames: Table) -> Table:
@@ -157,7 +157,7 @@ def latency_sum_error_ns(received_frames: Table, paired: FramesWithCommands, off
 class FrameAge:
     """The time-weighted age of the frame from which the command in force was made.
 
-    None where no command was in force.
+    Both values are None where no command was in force at any time.
     """
 
     mean_ms: float | None
@@ -168,7 +168,7 @@ def frame_age(frames: Table, command_verdicts: Table, began_ns: int, ended_ns: i
     """Return the mean and the 95th percentile of the frame age during the driving interval.
 
     Both are exact: while a command is in force, the age of its frame grows by 1 s per second. `frames` are all frames
-    of the run, because the first command in force may be older than the interval.
+    of the run, because the first command in force may come from a frame that was stamped before the interval.
     """
     commands = accepted_commands(command_verdicts)
     stamped_ns = look_up(frames.ints("stamp_ns"), frames.ints("stamped_mono_ns"), commands.ints("stamp_ns"))

@@ -17,7 +17,7 @@ MAX_DURATION_S = 24 * 3600
 """A longer time cannot be one drive, and its samples would fill the memory."""
 
 SAMPLE_RATE_HZ = 20.0
-"""The steering is resampled at this rate for its spectrum. No wheel oscillates as fast as half this rate."""
+"""The steering is resampled at this rate for its spectrum. No road wheel oscillates at half this rate or faster."""
 LOWEST_HZ, HIGHEST_HZ = 0.1, 5.0
 """The limits of the oscillation frequency. Slower steering follows the road, and faster steering is noise; the loop's
 own frequency lies between the limits (`delay_margin.py`)."""
@@ -78,15 +78,16 @@ def power_spectrum(sampled_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return frequencies in Hz and the power at each of them, for angles sampled at `SAMPLE_RATE_HZ`.
 
     The power of a sine is amplitude^2 / 2. The result is equal to that of `scipy.signal.periodogram` with
-    `scaling="spectrum"`, whose import takes longer than a short drive without pixels.
+    `scaling="spectrum"`. That function is not used, because the import of `scipy.signal` takes longer than a short
+    drive without pixels.
     """
     index = np.arange(len(sampled_rad))
-    line = np.polynomial.Polynomial.fit(index, sampled_rad, 1)(index)
+    trend = np.polynomial.Polynomial.fit(index, sampled_rad, 1)(index)
     window = np.hanning(len(sampled_rad) + 1)[:-1]
     # Zero padding resolves the peak more finely than one period per drive.
-    length = 1 << (8 * len(sampled_rad) - 1).bit_length()
-    amplitudes = np.abs(np.fft.rfft((sampled_rad - line) * window, length)) / window.sum()
-    hertz = np.fft.rfftfreq(length, 1 / SAMPLE_RATE_HZ)
+    padded_length = 1 << (8 * len(sampled_rad) - 1).bit_length()
+    amplitudes = np.abs(np.fft.rfft((sampled_rad - trend) * window, padded_length)) / window.sum()
+    hertz = np.fft.rfftfreq(padded_length, 1 / SAMPLE_RATE_HZ)
     return np.asarray(hertz, np.float64), np.asarray(2 * amplitudes**2, np.float64)
 
 

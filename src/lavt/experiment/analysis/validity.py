@@ -90,9 +90,9 @@ def _simulator_reasons(server: Record) -> list[InvalidReason]:
     if sum(late_ms) * NS_PER_MS > LATE_LIMIT * (ended_ns - began_ns):
         text = f"the physics was {sum(late_ms)} ms late in total (limit {LATE_LIMIT:.0%} of the drive)"
         reasons.append(InvalidReason(InvalidCode.PHYSICS_LATE, text))
-    numbers = frames_within(server.table("frame"), began_ns, ended_ns).ints("number")
-    due = int(numbers[-1] - numbers[0]) + 1 if len(numbers) else 0
-    missed = due - len(numbers)
+    frame_numbers = frames_within(server.table("frame"), began_ns, ended_ns).ints("number")
+    due = int(frame_numbers[-1] - frame_numbers[0]) + 1 if len(frame_numbers) else 0
+    missed = due - len(frame_numbers)
     if missed > MISSED_FRAMES_LIMIT * due:
         text = f"the camera missed {missed} of {due} frames (limit {MISSED_FRAMES_LIMIT:.0%})"
         reasons.append(InvalidReason(InvalidCode.FRAMES_MISSED, text))

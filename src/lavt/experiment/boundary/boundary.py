@@ -32,6 +32,7 @@ from lavt.experiment.sweep.workers import Workers, process_workers
 
 BOUNDARY = "boundary.json"
 FIELDS = ("route", "preset", "seed", "repetition", *(f"{name}_ms" for name in CRITERIA), "theory_ms")
+"""The columns of `boundary.csv`."""
 SEARCH_KEYS = frozenset({"routes", "presets", "repetition", "repetitions", "longest_delay_ms", "grid_ms", "within_ms"})
 """The keys of a boundary config that are not keys of a run's config."""
 
@@ -47,8 +48,9 @@ class BoundarySearch:
 
     planned: PlannedRun
     longest_delay_ms: float
-    grid_ms: float
+    grid_step_ms: float
     within_ms: float
+    """The width to which the bracket of a boundary is reduced."""
 
     @property
     def name(self) -> str:
@@ -124,16 +126,16 @@ def run_search(search: BoundarySearch) -> dict[str, Any]:
         without_added_ms.append(measured_ms - delay_ms)
         return growth_per_s
 
-    grid_ms = _grid(search.longest_delay_ms, search.grid_ms)
+    grid_ms = _grid(search.longest_delay_ms, search.grid_step_ms)
     first_total_ms = drive(0.0).total_delay_ms
     if math.isnan(first_total_ms):
         raise WorkError("the drive does not begin even without added delay: try lavt run with the same config")
 
     def total_ms(delay_ms: float) -> float:
         measured_ms = drive(delay_ms).total_delay_ms
-        return (
-            first_total_ms + delay_ms if math.isnan(measured_ms) else measured_ms
-        )  # NaN: the frames were too old to drive
+        if math.isnan(measured_ms):  # the frames were too old to drive
+            return first_total_ms + delay_ms
+        return measured_ms
 
     theory_ms = theoretical_ms(config)
     guess_ms = search.longest_delay_ms / 2 if theory_ms is None else theory_ms - first_total_ms

@@ -121,7 +121,7 @@ def _advance(a: FloatArray, b: FloatArray, duration_s: float) -> tuple[FloatArra
 
 @dataclass(frozen=True, slots=True)
 class _SampledPlant:
-    """The plant sampled once per frame.
+    """The plant sampled once per frame; in each frame period the old command u acts first and then the new one.
 
     x[k + 1] = transition x[k] + by_old u[k - frames - 1] + by_new u[k - frames]
     """
@@ -139,9 +139,9 @@ def _sampled(loop: LateralLoop, total_delay_s: float) -> _SampledPlant:
     frames = int(total_delay_s / period_s)
     fraction_s = min(max(total_delay_s - frames * period_s, 0.0), period_s)
     transition, _ = _advance(a, b, period_s)
-    _, early = _advance(a, b, fraction_s)
-    rest, late = _advance(a, b, period_s - fraction_s)
-    return _SampledPlant(transition, by_old=rest @ early, by_new=late, frames=frames)
+    _, by_old_at_change = _advance(a, b, fraction_s)
+    after_change, by_new = _advance(a, b, period_s - fraction_s)
+    return _SampledPlant(transition, by_old=after_change @ by_old_at_change, by_new=by_new, frames=frames)
 
 
 def closed_loop(loop: LateralLoop, total_delay_s: float) -> FloatArray:
@@ -169,7 +169,7 @@ def closed_loop(loop: LateralLoop, total_delay_s: float) -> FloatArray:
 
 
 def spectral_radius(loop: LateralLoop, total_delay_s: float) -> float:
-    """Return the factor by which the slowest mode grows per frame; the loop is stable if it is below 1."""
+    """Return the factor by which the least damped mode grows per frame; the loop is stable if it is below 1."""
     return float(np.max(np.abs(np.linalg.eigvals(closed_loop(loop, total_delay_s)))))
 
 

@@ -37,7 +37,7 @@ Boundary = Mapping[str, Any]
 
 
 def boundary_parts(boundaries: Sequence[Boundary], report_dir: Path) -> Parts:
-    """Return the sentences, the figure and the table of each boundary, the contents of a `boundary.json`."""
+    """Return the sentences, the figure and the table for the contents of each `boundary.json`."""
     parts = []
     for index, boundary in enumerate(boundaries, start=1):
         name = "boundary" if len(boundaries) == 1 else f"boundary_{index}"
@@ -188,9 +188,8 @@ def boundary_table(boundary: Boundary) -> TableData:
 def _row(group: Mapping[str, Any]) -> list[Any]:
     cells = [group["route"] or ALL_ROUTES, group["preset"], group["n"], group["theory_ms"]]
     for name in CRITERIA:
-        of_criterion = group[f"{name}_ms"]
-        quartiles = [of_criterion["p25"], of_criterion["p75"]]
-        cells += [of_criterion["p50"], of_criterion["interval"], quartiles, of_criterion["n"]]
+        summary = group[f"{name}_ms"]
+        cells += [summary["p50"], summary["interval"], [summary["p25"], summary["p75"]], summary["n"]]
     return [*cells, sum(group["not_monotone"].values())]
 
 

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 Conditions = Mapping[str, Mapping[str, Any]]
-"""The value of `conditions` or `real` in a summary."""
+"""The summary of each condition by its name: the value of `conditions` or `real` in `summary.json`."""
 
 Colours = Mapping[str, Any]
 """The colour of each condition."""

@@ -1,4 +1,7 @@
-"""Groups of a summary: the settings of each group, and the settings in which groups differ."""
+"""Groups of a summary: the settings of each group, and the settings in which groups differ.
+
+A group has the runs in virtual time with the same settings; they differ in route, condition and repetition only.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +40,7 @@ def _sort_key(value: Any) -> tuple[bool, float, str]:
     return not is_number, float(value) if is_number else 0.0, str(value)
 
 
-def differing(groups: Sequence[Group]) -> list[str]:
+def differing_settings(groups: Sequence[Group]) -> list[str]:
     """Return the names of settings that together distinguish the groups; axes come first.
 
     A setting is included only if it distinguishes groups that the settings before it do not.
@@ -55,15 +58,15 @@ def _values(groups: Sequence[Group], names: Sequence[str]) -> set[tuple[str, ...
 
 def title_of(group: Group, names: Sequence[str]) -> str:
     """Return a title of the group from the settings `names`."""
-    return ", ".join(f"{short(name)} {'none' if group.get(name) is None else group[name]}" for name in names)
+    return ", ".join(f"{short_name(name)} {'none' if group.get(name) is None else group[name]}" for name in names)
 
 
-def short(name: str) -> str:
+def short_name(name: str) -> str:
     """Return the last two parts of a dotted name in words: "video delay ms" for "network.video.delay_ms"."""
     return " ".join(name.split(".")[-2:]).replace("_", " ")
 
 
-def is_of(run: Mapping[str, Any], group: Group) -> bool:
+def is_in_group(run: Mapping[str, Any], group: Group) -> bool:
     """Return whether a run belongs to a group."""
     axes = run.get("axes") or {}
     return all(

@@ -36,11 +36,11 @@ DIAMOND: dict[str, Any] = {"marker": "D", "markersize": 4, "markerfacecolor": "w
 ERROR_LABEL = "P95 of cross-track error,\nmean of runs (m)"
 
 LatencyKey = tuple[str, str]
-"""Where a condition has a latency: the key of an entry, and the key in this entry."""
+"""Where the summary of a condition has a latency: the key of an entry, and the key in this entry."""
 
 LOOP: LatencyKey = ("loop_ms", "p50")
 
-SCALES: Mapping[str, LatencyKey] = {
+X_LATENCIES: Mapping[str, LatencyKey] = {
     "loop latency, median (ms)": LOOP,
     "frame age, mean (ms)": ("picture_age_ms", "mean"),
 }
@@ -53,11 +53,11 @@ def degradation_figure(kinds: Mapping[str, Conditions], paper: Conditions, colou
     Each condition is a point. The conditions in `paper` are drawn at the paper's tau_v + tau_c. Diamonds show the error
     of all runs up to the common distance.
     """
-    scales = {label: latency for label, latency in SCALES.items() if any(_known(kinds, latency))}
+    x_latencies = {label: latency for label, latency in X_LATENCIES.items() if any(_known(kinds, latency))}
     named: list[tuple[Axes, str, list[Point]]] = []
     figure = new_figure(5.6)
-    panels = figure.subplots(2, len(scales), sharex="col", sharey="row", squeeze=False)
-    for column, (label, latency) in enumerate(scales.items()):
+    panels = figure.subplots(2, len(x_latencies), sharex="col", sharey="row", squeeze=False)
+    for column, (label, latency) in enumerate(x_latencies.items()):
         completion, error = panels[:, column]
         for kind, conditions in {"paper": _with_totals(paper), **kinds}.items():
             shown = {
@@ -117,8 +117,8 @@ def _with_totals(paper: Conditions) -> Conditions:
 def _draw(axes: Axes, point: Point, style: Mapping[str, Any]) -> None:
     """Draw a point, with its interval if it has one."""
     _, x, y, interval = point
-    reach = None if interval is None else [[max(y - interval[0], 0)], [max(interval[1] - y, 0)]]
-    axes.errorbar(x, y, yerr=reach, capsize=3, linestyle="none", elinewidth=1, **style)
+    bar_lengths = None if interval is None else [[max(y - interval[0], 0)], [max(interval[1] - y, 0)]]
+    axes.errorbar(x, y, yerr=bar_lengths, capsize=3, linestyle="none", elinewidth=1, **style)
 
 
 def _write_names(axes: Axes, clusters: Sequence[Sequence[Point]], kind: str) -> None:
@@ -137,11 +137,11 @@ def presets_figure(groups: Mapping[str, Conditions], colours: Colours) -> Figure
     completion, error = figure.subplots(1, 2)
     lines: list[tuple[Axes, list[Point]]] = []
     symbols = dict(zip(groups, "osD^vP", strict=False))
-    for title, conditions in groups.items():
+    for number, (title, conditions) in enumerate(groups.items()):
+        dashes = (0, (1 + 2 * number, 1)) if number else "solid"  # each group has longer dashes than the one before
         for axes, key, scale in ((completion, "completion_rate", 100.0), (error, "p95_m", 1.0)):
             points = sorted(_points(conditions, LOOP, key, "", scale), key=lambda point: point[1])
             lines.append((axes, points))
-            dashes = (0, (1 + 2 * list(groups).index(title), 1)) if list(groups).index(title) else "solid"
             axes.plot([x for _, x, _, _ in points], [y for _, _, y, _ in points], color="0.6", linestyle=dashes)
             for name, x, y, _ in points:
                 axes.plot(x, y, marker=symbols[title], color=colours[name], linestyle="none")
@@ -151,11 +151,11 @@ def presets_figure(groups: Mapping[str, Conditions], colours: Colours) -> Figure
     error.set_ylim(0, 1.1 * error.get_ylim()[1])
     for axes, points in lines:
         _write_names(axes, [cluster for cluster in clusters_of(points, axes) if len(cluster) > 1], "group")
-    groups_shown = [
+    group_handles = [
         Line2D([], [], color="0.4", marker=symbols[title], label=title, linestyle="none") for title in groups
     ]
     names = dict.fromkeys(name for conditions in groups.values() for name in conditions)
-    legend_below(figure, [*groups_shown, *(Patch(color=colours[name], label=name) for name in names)])
+    legend_below(figure, [*group_handles, *(Patch(color=colours[name], label=name) for name in names)])
     return figure
 
 
@@ -209,9 +209,9 @@ def _draw_injected(
     names_by_delay: dict[float, list[str]] = {}
     for name, injected_ms, latency in points:
         names_by_delay.setdefault(injected_ms, []).append(name)
-        reach = [[latency["p50"] - latency["p5"]], [latency["p95"] - latency["p50"]]]
+        bar_lengths = [[latency["p50"] - latency["p5"]], [latency["p95"] - latency["p50"]]]
         style = {"capsize": 3, "linestyle": "none", **marker(kind, colours[name])}
-        above.errorbar(injected_ms, latency["p50"], yerr=reach, **style)
+        above.errorbar(injected_ms, latency["p50"], yerr=bar_lengths, **style)
         below.errorbar(injected_ms, latency["p50"] - injected_ms - base_ms, yerr=latency["bound"] or 0.0, **style)
     medians_ms = {injected_ms: latency["p50"] for _, injected_ms, latency in points}
     for injected_ms, names in names_by_delay.items():

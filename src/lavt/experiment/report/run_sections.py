@@ -9,24 +9,26 @@ from lavt.domain import Picture
 from lavt.experiment.analysis.drive_data import DriveData, capture_to_stamp_ms, one_of_each_condition, read_drive
 from lavt.experiment.report import html_page
 from lavt.experiment.report.files import save_figure, save_table
-from lavt.experiment.report.groups import differing, is_of, title_of
+from lavt.experiment.report.groups import differing_settings, is_in_group, title_of
 from lavt.experiment.report.run_figures import cross_track_figure, frames_figure, time_figure, trajectories_figure
 from lavt.experiment.report.sections import Parts, ReportContext
 from lavt.experiment.report.table_format import html_of
 from lavt.experiment.report.tables import machine_table
-from lavt.experiment.statistics.conditions import road_of, stem_of
+from lavt.experiment.statistics.conditions import is_key_part
 from lavt.recording.record import read_record
 
 SHOWN_FRAMES = 4
 
 DRAWN_GROUPS = 4
-"""With more groups than this, the figures show only the runs of the base config, or else of the first group."""
+"""With more groups than this, the figures show only the groups whose conditions are those of the sweep's base config,
+or the first group if there are none."""
 
 MAX_PANELS = 3
 """The most routes in one figure of trajectories: the paper has three key parts and three whole routes."""
 
 DriveSets = Mapping[tuple[str, str], Sequence[DriveData]]
-"""Drives by kind of time and title of their group. Each entry has figures of its own."""
+"""Drives by kind of time (`virtual` or `real`) and by title of their group (see `groups.py`; "" in real time). Each
+entry has figures of its own."""
 
 Runs = Sequence[tuple[Path, Mapping[str, object]]]
 """Runs: the directory of each, and its entry in the summary's `runs`."""
@@ -34,23 +36,23 @@ Runs = Sequence[tuple[Path, Mapping[str, object]]]
 
 def drawn_runs(report: ReportContext, runs: Runs) -> dict[tuple[str, str], list[tuple[Path, Mapping[str, object]]]]:
     """Return the runs whose drives are drawn, by kind of time and title of their group."""
-    groups, names = report.groups, differing(report.groups)
+    groups, names = report.groups, differing_settings(report.groups)
     if len(groups) > DRAWN_GROUPS:
         groups = report.base or groups[:1]
     recorded = [run for run in runs if (run[0] / "server.mcap").is_file()]
     chosen = {("virtual", title_of(group, names)): group for group in groups}
     virtual = [run for run in recorded if run[1]["time"] == "virtual"]
-    sets = {key: [run for run in virtual if is_of(run[1], group)] for key, group in chosen.items()}
+    sets = {key: [run for run in virtual if is_in_group(run[1], group)] for key, group in chosen.items()}
     sets["real", ""] = [run for run in recorded if run[1]["time"] == "real"]
     return {key: members for key, members in sets.items() if members}
 
 
 def read_drives(
-    sets: Mapping[tuple[str, str], Runs], known: Mapping[Path, DriveData]
+    sets: Mapping[tuple[str, str], Runs], already_read: Mapping[Path, DriveData]
 ) -> dict[tuple[str, str], list[DriveData]]:
-    """Return the drives of `sets`, reading those that are not in `known`."""
+    """Return the drives of `sets`, reading those that are not in `already_read`."""
     return {
-        key: [known.get(directory) or read_drive(directory, run) for directory, run in members]
+        key: [already_read.get(directory) or read_drive(directory, run) for directory, run in members]
         for key, members in sets.items()
     }
 
@@ -85,13 +87,13 @@ def trajectory_parts(report: ReportContext, sets: DriveSets) -> Parts:
 
 def _figures_of(routes: Sequence[str]) -> list[tuple[str, Sequence[str]]]:
     """Return the name and the routes of each figure: key parts first, at most `MAX_PANELS` routes in each."""
-    kinds = {
-        "key": [route for route in routes if road_of(route) != stem_of(route)],
-        "whole": [route for route in routes if road_of(route) == stem_of(route)],
+    routes_by_name = {
+        "key": [route for route in routes if is_key_part(route)],
+        "whole": [route for route in routes if not is_key_part(route)],
     }
     return [
         (f"{name}{begin // MAX_PANELS + 1 if begin else ''}", members[begin : begin + MAX_PANELS])
-        for name, members in kinds.items()
+        for name, members in routes_by_name.items()
         for begin in range(0, len(members), MAX_PANELS)
     ]
 

@@ -14,7 +14,7 @@ from lavt.experiment.analysis.stage_latency import AFTER_LOOP
 from lavt.experiment.report import html_page
 from lavt.experiment.report.figure_style import Colours, Conditions
 from lavt.experiment.report.files import link_table, save_figure, save_table
-from lavt.experiment.report.groups import Group, axes_of, differing, in_order, short, title_of
+from lavt.experiment.report.groups import Group, axes_of, differing_settings, in_order, short_name, title_of
 from lavt.experiment.report.latency_figures import degradation_figure, injected_figure, presets_figure, stages_figure
 from lavt.experiment.report.sentences import results_sentences, runs_overview
 from lavt.experiment.report.sweep_figures import axis_figure, incidence_figure, routes_with_survival, survival_figure
@@ -107,7 +107,7 @@ class ReportContext:
 
     def base_title(self, kind: str = "virtual") -> str:
         """Return the title of the base config's group in brackets; "" for real time or without such a group."""
-        names = differing(self.groups) or ["preset"]
+        names = differing_settings(self.groups) or ["preset"]
         return f" ({title_of(self.base[0], names)})" if kind == "virtual" and self.base else ""
 
 
@@ -115,7 +115,7 @@ def summary_parts(report: ReportContext) -> Parts:
     """Return the summary: the runs, their results, the speed of the simulation, and the failed runs."""
     runs, speed, failed = report.summary["runs"], report.summary["speed"], report.summary.get("failed")
     parts = [html_page.paragraph(runs_overview(runs))]
-    names = differing(report.groups)
+    names = differing_settings(report.groups)
     compared = report.groups if 1 < len(report.groups) <= MAX_COMPARED_GROUPS else []
     conditions_by_name = {f"Virtual time, {title_of(group, names)}": group["conditions"] for group in compared}
     if "virtual" in report.kinds and not conditions_by_name:
@@ -168,7 +168,7 @@ def contrast_parts(report: ReportContext) -> Parts:
     if not contrasts:
         return []
     paper_contrasts = paper if report.paper(summary["conditions"]) else []
-    names = differing(report.groups)
+    names = differing_settings(report.groups)
     base = title_of(report.base[0], names) if report.groups[1:] and report.base else ""
     shows_all_groups = report.groups[1:] and len(report.groups) <= MAX_COMPARED_GROUPS
     parts = [html_page.heading(base)] if base else []
@@ -299,7 +299,7 @@ def _loop_of(entry: Mapping[str, Any]) -> list[Mapping[str, Any]]:
 
 def group_parts(report: ReportContext) -> Parts:
     """Return the comparison of the groups: presets, sweeps, fidelities, further axes."""
-    groups, names = report.groups, differing(report.groups)
+    groups, names = report.groups, differing_settings(report.groups)
     if len(groups) < 2:
         return []
     parts = []
@@ -324,22 +324,24 @@ def axis_parts(report: ReportContext) -> Parts:
                 f"A figure can show two axes, but this sweep has {len(axes)}. See the table of groups.", is_note=True
             )
         ]
-    along = sorted(axes, key=lambda axis: -_numeric_values(report.groups, axis))
-    others = [name for name in differing(report.groups) if name not in axes]
+    most_numeric_first = sorted(axes, key=lambda axis: -_numeric_values(report.groups, axis))
+    other_settings = [name for name in differing_settings(report.groups) if name not in axes]
     groups_by_title: dict[str, list[Group]] = {}
     for group in report.groups:
-        groups_by_title.setdefault(title_of(group, others), []).append(group)
+        groups_by_title.setdefault(title_of(group, other_settings), []).append(group)
     parts = []
     for title, groups in groups_by_title.items():
-        figure = axis_figure(groups, along, report.colours)
-        names = " and ".join(short(axis) for axis in along)
+        figure = axis_figure(groups, most_numeric_first, report.colours)
+        names = " and ".join(short_name(axis) for axis in most_numeric_first)
         caption = f"Driving results by {names}, virtual time{f', {title}' if title else ''}."
         name = "_".join(["axes", *(html_page.slug(title),)]) if title else "axes"
-        parts.append(save_figure(report.directory, name, figure, f"driving results by {short(along[0])}", caption))
+        alternative = f"driving results by {short_name(most_numeric_first[0])}"
+        parts.append(save_figure(report.directory, name, figure, alternative, caption))
     return parts
 
 
 def _numeric_values(groups: Sequence[Group], axis: str) -> int:
+    """Return how many different numbers an axis has as values; 0 for an axis of texts."""
     values = {group.get(axis) for group in groups if isinstance(group.get(axis), int | float)}
     return len(values)
 

@@ -25,13 +25,13 @@ def _by_latency(conditions: Conditions) -> list[list[ConditionPoint]]:
         for name, entry in conditions.items()
         if entry["loop_ms"]["p50"] is not None and entry["completion_rate"] is not None
     ]
-    begins_ms: list[float] = []
+    level_begins_ms: list[float] = []
     for _, loop_ms, _ in sorted(known, key=lambda point: point[1]):
-        if not begins_ms or loop_ms - begins_ms[-1] > EQUAL_LOOP_LATENCY_MS:
-            begins_ms.append(loop_ms)
+        if not level_begins_ms or loop_ms - level_begins_ms[-1] > EQUAL_LOOP_LATENCY_MS:
+            level_begins_ms.append(loop_ms)
 
     def level(point: ConditionPoint) -> int:
-        return sum(begin_ms <= point[1] for begin_ms in begins_ms)
+        return sum(begin_ms <= point[1] for begin_ms in level_begins_ms)
 
     return [list(members) for _, members in groupby(sorted(known, key=lambda point: (level(point), point[0])), level)]
 
@@ -90,11 +90,12 @@ def _fall_sentences(levels: Sequence[Sequence[ConditionPoint]]) -> list[str]:
     if not falls:
         return []
     before, after = max(falls, key=lambda fall: fall[0][2] - fall[1][2])
-    if before[2] <= after[2]:
+    (before_name, before_ms, before_rate), (after_name, after_ms, after_rate) = before, after
+    if before_rate <= after_rate:
         return ["Completion does not fall as latency increases."]
     parts = [
-        f"The largest fall of completion is from {before[2] * 100:.0f} % at {before[0]} to {after[2] * 100:.0f} % at "
-        f"{after[0]}, between {before[1]:.0f} and {after[1]:.0f} ms of loop latency."
+        f"The largest fall of completion is from {before_rate * 100:.0f} % at {before_name} to "
+        f"{after_rate * 100:.0f} % at {after_name}, between {before_ms:.0f} and {after_ms:.0f} ms of loop latency."
     ]
     last = max((index for index, level in enumerate(levels) if any(rate >= 0.5 for _, _, rate in level)), default=-1)
     if last + 1 < len(levels):

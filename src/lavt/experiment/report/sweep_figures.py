@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from lavt.experiment.report.figure_style import Colours, Conditions, condition_handles, legend_below, new_figure, tidy
-from lavt.experiment.report.groups import Group, short
+from lavt.experiment.report.groups import Group, short_name
 
 ENDING_DASHES: Mapping[str, Any] = {
     "collision": "solid",
@@ -20,6 +20,8 @@ ENDING_DASHES: Mapping[str, Any] = {
     "timeout": (0, (6, 1.5, 1, 1.5)),
 }
 
+PANELS_PER_ROW = 3
+"""The panels of routes in a row of a figure."""
 MAX_BANDS = 2
 """The intervals of survival are drawn for at most this many conditions, because more would overlap."""
 MAX_TICKS = 8
@@ -94,13 +96,13 @@ def _widths(count: int) -> list[float]:
 
 
 def _label_distance(panels: Sequence[Axes]) -> None:
-    for axes in panels[-3:]:
+    for axes in panels[-PANELS_PER_ROW:]:
         axes.set_xlabel("distance driven (m)")
 
 
 def _panels(count: int) -> tuple[Figure, list[Axes]]:
-    """Return a new figure with `count` small panels that share the scale of y, three in a row."""
-    columns = min(3, count)
+    """Return a new figure with `count` small panels that share the scale of y, `PANELS_PER_ROW` in a row."""
+    columns = min(PANELS_PER_ROW, count)
     rows = -(-count // columns)
     figure = new_figure(2.0 * rows + 0.7)
     panels = list(figure.subplots(rows, columns, squeeze=False, sharey=True).flat)
@@ -128,7 +130,7 @@ def axis_figure(groups: Sequence[Group], axes_names: Sequence[str], colours: Col
     panels = figure.subplots(len(rows), len(columns), squeeze=False, sharex=True, sharey="row")
     for column, value in enumerate(columns):
         members = [group for group in groups if not second or str(group.get(second[0])) == value]
-        title = f"{short(second[0])} {value}" if second else ""
+        title = f"{short_name(second[0])} {value}" if second else ""
         for row, (label, key, scale) in enumerate(rows):
             axes = panels[row, column]
             for name, width in zip(names, _widths(len(names)), strict=True):
@@ -147,7 +149,7 @@ def axis_figure(groups: Sequence[Group], axes_names: Sequence[str], colours: Col
         axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
     panels[0, 0].set_ylim(-5, 105)
     for axes in panels[-1]:
-        axes.set_xlabel(short(x_axis))
+        axes.set_xlabel(short_name(x_axis))
     legend_below(figure, list(condition_handles(names, colours)))
     return figure
 

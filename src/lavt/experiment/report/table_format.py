@@ -248,5 +248,5 @@ def _tex(text: str) -> str:
 
 
 def _tex_long(text: str) -> str:
-    """Escape a text, and permit line breaks after commas and colons, because a cell may hold JSON without spaces."""
+    """Escape a text, and permit line breaks after commas and colons, because a cell may contain JSON without spaces."""
     return re.sub(r"([,:])(?=[^\s~])", r"\1\\allowbreak{}", _tex(text))

@@ -7,7 +7,7 @@ from typing import Any
 
 from lavt.experiment.analysis.stage_latency import AFTER_LOOP
 from lavt.experiment.report.figure_style import Conditions
-from lavt.experiment.report.groups import Group, short
+from lavt.experiment.report.groups import Group, short_name
 from lavt.experiment.report.table_format import (
     NOTHING,
     UNBROKEN,
@@ -167,12 +167,12 @@ def _format_quartiles(quartiles: Mapping[str, float | None] | None) -> str:
 
 def contrast_table(contrasts: Sequence[Mapping[str, Any]], paper: Sequence[Mapping[str, Any]]) -> TableData:
     """Return the table of planned contrasts with the paper's p values, from Fisher's test on its counts."""
-    published = {(contrast["a"], contrast["b"]): contrast for contrast in paper}
+    paper_contrasts = {(contrast["a"], contrast["b"]): contrast for contrast in paper}
     entries = [
         {
             **contrast,
             "contrast": f"{contrast['a']} – {contrast['b']}",
-            "paper": published.get((contrast["a"], contrast["b"])),
+            "paper": paper_contrasts.get((contrast["a"], contrast["b"])),
         }
         for contrast in contrasts
     ]
@@ -204,7 +204,7 @@ def group_table(groups: Sequence[Group], names: Sequence[str]) -> TableData:
     return _table(
         entries,
         [
-            *((text_column(short(name)), str(index)) for index, name in enumerate(names)),
+            *((text_column(short_name(name)), str(index)) for index, name in enumerate(names)),
             (text_column("condition"), "condition"),
             (number_column("runs", 0), "runs"),
             (share_column("completed"), "completion_rate"),

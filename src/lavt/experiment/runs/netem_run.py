@@ -25,7 +25,7 @@ DISCARD_PORT = 9
 
 
 def check_netem(planned: PlannedRun) -> list[str]:
-    """Check that netem is available if the run needs it; return messages on what was restored after a crash.
+    """Check that netem is available if the run needs it; return messages on what was restored after an earlier crash.
 
     The check applies netem to an unused port, because only this shows whether the process is root and whether tc and
     the kernel's netem exist. Raises `UserError` where netem is unavailable.
@@ -105,6 +105,6 @@ def netem_reasons(report: Mapping[str, Any]) -> list[InvalidReason]:
         for moment in ("before", "after"):
             measured = msgspec.convert(report[moment], dict[str, ProbeResult])
             texts += [f"{moment} the drive: {text}" for text in judge(flows, (), measured)]
-    except (KeyError, msgspec.ValidationError):
+    except (KeyError, msgspec.ValidationError):  # neither delay was measured
         return injection_reasons({"video": 0.0, "control": 0.0}, {})
     return [InvalidReason(InvalidCode.INJECTION_DIFFERS, text) for text in texts]

@@ -46,8 +46,8 @@ INHERENT = {
 class NetworkDelays:
     """The delays of video, state (server to client), control (client to server), and traffic that is never delayed.
 
-    An injected delay that is only constant is included in them. Any other injected impairment, with its constant part,
-    is in `video_injected` or `control_injected`.
+    An injected delay that is only constant is included in these four. Any other injected impairment, with its constant
+    part, is in `video_injected` or `control_injected`.
     """
 
     video: DelayModel

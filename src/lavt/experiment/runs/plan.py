@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -99,6 +100,7 @@ def _check_injection(config: RunConfig, requested: Condition) -> None:
                 f"netem cannot do the lognormal part of network.inherent {network.inherent}: choose loopback, or "
                 "network.injection relay"
             )
+        # Any two ports: the real ones are free ports that are chosen when the run starts.
         check_flows(netem_flows(requested, "both", video_port=1, control_port=2, state_delay=network.state_delay))
     else:
         link_injection("video", requested.video_ms, requested.video, seed=0)
@@ -117,10 +119,11 @@ def plan_sweep(sweep: SweepConfig) -> list[PlannedRun]:
     runs = []
     for values in itertools.product(*sweep.axes.values()):
         axes = dict(zip(sweep.axes, values, strict=True))
-        for route, name, repetition in itertools.product(sweep.routes, sweep.conditions, range(sweep.repetitions)):
-            changes = {"vehicle.route": route, "network.condition": name, "repetition": repetition, **axes}
+        keys = itertools.product(sweep.routes, sweep.conditions, range(sweep.repetitions))
+        for route, condition_name, repetition in keys:
+            changes = {"vehicle.route": route, "network.condition": condition_name, "repetition": repetition, **axes}
             config = parse_config(RunConfig, _with_changes(base, changes), "the sweep")
-            runs.append(plan_run(config, name=_name(route, name, repetition, axes), axes=axes))
+            runs.append(plan_run(config, name=_name(route, condition_name, repetition, axes), axes=axes))
     if not runs:
         raise UserError("the sweep has no run: give routes, conditions and axes at least one value each")
     duplicates = [name for name, count in Counter(run.name for run in runs).items() if count > 1]
@@ -131,7 +134,7 @@ def plan_sweep(sweep: SweepConfig) -> list[PlannedRun]:
 
 def _name(route: str, condition_name: str, repetition: int, axes: Mapping[str, Any]) -> str:
     parts = [route, condition_name, f"{repetition:02d}", *(f"{key}={value}" for key, value in axes.items())]
-    return "_".join("".join(c if (c.isascii() and c.isalnum()) or c in "=.-_" else "-" for c in part) for part in parts)
+    return "_".join(re.sub("[^A-Za-z0-9=._-]", "-", part) for part in parts)
 
 
 def _with_changes(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

@@ -185,11 +185,11 @@ def relay_reasons(relay: Mapping[str, Any]) -> list[InvalidReason]:
     """
     requested_ms = relay.get("requested_ms", {"video": 0.0, "control": 0.0})
     constant_ms = {flow: delay_ms for flow, delay_ms in requested_ms.items() if delay_ms is not None}
-    held, late = relay.get("held_ms", {}), relay.get("late_ms", {})
+    measured_ms, lateness_ms = relay.get("held_ms", {}), relay.get("late_ms", {})
     return [
-        *injection_reasons(constant_ms, {flow: held.get(DELAYED_DIRECTIONS[flow]) for flow in constant_ms}),
+        *injection_reasons(constant_ms, {flow: measured_ms.get(DELAYED_DIRECTIONS[flow]) for flow in constant_ms}),
         *lateness_reasons(
-            {flow: late.get(DELAYED_DIRECTIONS[flow]) for flow in requested_ms if flow not in constant_ms}
+            {flow: lateness_ms.get(DELAYED_DIRECTIONS[flow]) for flow in requested_ms if flow not in constant_ms}
         ),
     ]
 

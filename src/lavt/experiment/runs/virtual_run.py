@@ -175,20 +175,21 @@ def virtual_links(network: NetworkDelays) -> dict[str, VirtualLink]:
     """Return the links of all channels that cross the network.
 
     In reality, commands and session requests share a path. Here each has a delay line and random-number streams of its
-    own, so that neither affects the other.
+    own, so that neither affects the other. The random delay of a packet is selected by the packet's number, or for
+    video by its frame.
     """
 
-    def packet_count(_payload: bytes, count: int) -> int:
-        return count
+    def packet_number(_payload: bytes, number: int) -> int:
+        return number
 
     def link(
-        delay: DelayModel, injected: LinkInjection | None = None, index: Callable[[bytes, int], int] = packet_count
+        delay: DelayModel, injected: LinkInjection | None = None, index: Callable[[bytes, int], int] = packet_number
     ) -> VirtualLink:
         return VirtualLink(DelayLine(delay, None if injected is None else EmulatedLink(injected)), index)
 
     session = None if network.control_injected is None else replace(network.control_injected, name="session")
     return {
-        "rtp": link(network.video, network.video_injected, lambda payload, _count: video_index(payload)),
+        "rtp": link(network.video, network.video_injected, lambda payload, _number: video_index(payload)),
         "control": link(network.control, network.control_injected),
         "state": link(network.state),
         "feedback": link(network.never_delayed),

@@ -85,14 +85,19 @@ def completion(runs: Sequence[Run]) -> dict[str, Any]:
     }
 
 
-def stem_of(route: str) -> str:
-    """Return a route's name, or the path of its file without ".yaml"."""
-    return route.removesuffix(".yaml").removesuffix(".yml")
+def is_key_part(route: str) -> bool:
+    """Return whether a route is the key part of another route."""
+    return _route_name(route).endswith(KEY_PART)
 
 
 def road_of(route: str) -> str:
     """Return the name of the road of a route; a route and its key part have the same road."""
-    return stem_of(route).removesuffix(KEY_PART)
+    return _route_name(route).removesuffix(KEY_PART)
+
+
+def _route_name(route: str) -> str:
+    """Return a route's name, or the path of its file without ".yaml"."""
+    return route.removesuffix(".yaml").removesuffix(".yml")
 
 
 def road_rates(runs: Sequence[Run]) -> list[float]:
@@ -129,8 +134,8 @@ def common_p95_m(runs: Sequence[Run], distances: CommonDistances) -> list[float]
 def worst_rank_m(runs: Sequence[Run]) -> dict[str, float | None]:
     """Return the quartiles of P95 of all runs; a run that was not completed ranks after all completed runs.
 
-    A quartile is the smallest P95 of a run that at least 25, 50 or 75 % of the runs do not exceed. It is None if this
-    run was not completed. A completed run whose error is unknown is left out.
+    A quartile is the smallest P95 of any run such that at least 25, 50 or 75 % of the runs have no larger P95. It is
+    None if the run with this P95 was not completed. A completed run whose error is unknown is left out.
     """
     errors_m = [run["p95_m"] if run["ending"] == "completed" else np.inf for run in runs]
     known = [value for value in errors_m if value is not None]
@@ -142,6 +147,7 @@ def worst_rank_m(runs: Sequence[Run]) -> dict[str, float | None]:
 
 
 def _start(run: Run) -> tuple[Any, ...]:
+    """Return the values that runs with the same start on the same route share, under whatever condition."""
     return run["route"], run.get("repetition"), run.get("seed")
 
 
@@ -200,9 +206,8 @@ def _picture_age_ms(runs: Sequence[Run]) -> dict[str, float | None]:
 def _stages_ms(runs: Sequence[Run]) -> list[dict[str, Any]]:
     """Return for each stage the median of all runs' median latencies, in the order of the pipeline."""
     medians_ms: dict[tuple[str, str], list[float]] = {}
-    for run in sorted(
-        runs, key=lambda run: -len(run.get("stages_ms") or [])
-    ):  # the run with most stages gives the order
+    most_stages_first = sorted(runs, key=lambda run: -len(run.get("stages_ms") or []))  # the first run gives the order
+    for run in most_stages_first:
         for entry in run.get("stages_ms") or []:
             medians_ms.setdefault((entry["node"], entry["stage"]), []).append(entry["p50"])
     return [

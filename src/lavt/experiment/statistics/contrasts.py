@@ -45,8 +45,8 @@ def with_holm(contrasts: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 def mcnemar(only_a: int, only_b: int) -> float:
     """Return McNemar's exact two-sided p value.
 
-    `only_a` and `only_b` are the numbers of pairs of which only one run was completed. By the null hypothesis both
-    kinds of pairs are equally likely.
+    `only_a` and `only_b` are the numbers of pairs of which only one run was completed. Under the null hypothesis
+    both kinds of pairs are equally likely.
     """
     differing = only_a + only_b
     return float(binomtest(only_a, differing, 0.5).pvalue) if differing else 1.0

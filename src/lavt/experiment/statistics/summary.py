@@ -13,7 +13,9 @@ from lavt.experiment.statistics.paper_results import paper
 SCHEMA = 1
 
 GROUP_KEYS = ("fidelity", "inherent", "changes", "controller", "preset", "driver")
-"""The keys whose values are equal for all runs of a group. The axes of the sweep are further such keys."""
+"""The keys whose values are equal for all runs of a group. The axes of the sweep are further such keys.
+
+The runs of a group thus differ only in route, condition, repetition and seed, and in the keys of a study."""
 
 SWEEP = "sweep"
 """A further key of a group if several sweeps are reported together: the name of a run's sweep."""
@@ -28,9 +30,9 @@ def summarize(
 ) -> dict[str, Any]:
     """Return the content of `summary.json` for the runs of a sweep.
 
-    `base` has keys of a run (or of its `axes`) with their values in the sweep's base config. `conditions` summarizes
-    the runs in virtual time that have all these values, or all runs in virtual time if there is no `base`. `failed`
-    lists the runs without a result (`run`, `reason`).
+    `base` has keys of a run (or of its `axes`) with their values in the sweep's base config, which is the config
+    without its axes. `conditions` summarizes the runs in virtual time that have all these values, or all runs in
+    virtual time if there is no `base`. `failed` lists the runs without a result (`run`, `reason`).
     """
     virtual = [run for run in runs if run["time"] == "virtual"]
     base_settings = dict(base or {})

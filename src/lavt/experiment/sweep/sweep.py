@@ -212,9 +212,10 @@ def drive_sweep(
 
 
 def base_of(config: SweepConfig, planned: Sequence[PlannedRun]) -> dict[str, Any]:
-    """Return the value of each further axis in the sweep's base config. These values identify the runs of that config.
+    """Return the value of each further axis in the sweep's base config, which is the config without its axes.
 
-    If such a value is not among the values of its axis, the sweep has no run of the base config.
+    These values identify the runs of the base config. If such a value is not among the values of its axis, the sweep
+    has no run of the base config.
     """
     base = {key: _value_at(config, key) for key in config.axes}
     for run, key in itertools.product(planned, config.axes):
@@ -239,8 +240,8 @@ def _check_sweep(config: SweepConfig, out: Path) -> None:
     """Raise `UserError` where another sweep was begun in `out`, because a report would mix the runs of both."""
     if not (out / SWEEP).is_file():
         return
-    begun, requested = (sweep.model_dump(mode="json") for sweep in (load_config(SweepConfig, out / SWEEP), config))
-    different = [key for key in requested if requested[key] != begun[key]]
+    recorded, requested = (sweep.model_dump(mode="json") for sweep in (load_config(SweepConfig, out / SWEEP), config))
+    different = [key for key in requested if requested[key] != recorded[key]]
     if different:
         raise UserError(
             f"{out} was begun with another config ({', '.join(different)}): resume with that one, or name another --out"

@@ -20,7 +20,8 @@ import lavt
 from lavt.domain import NS_PER_MS
 from lavt.errors import WorkError
 
-Side = Literal["ours", "gstreamer"]
+Program = Literal["ours", "gstreamer"]
+"""The program that sends and receives in a run: LAVT or GStreamer."""
 
 WARM_UP_FRAMES = 3 * RATE_HZ
 """Frames that are sent first and not counted."""
@@ -89,7 +90,9 @@ class RunOutcome:
     errors: dict[int, float]
     """Mean squared error of each shown picture by its row in the table; -1 if errors were not requested."""
     relayed: dict[str, Any]
+    """The counters of the relay; empty without a relay."""
     counts: dict[str, int]
+    """The counters of LAVT's receiving nodes; empty for GStreamer."""
 
     @property
     def shown(self) -> float:
@@ -113,15 +116,15 @@ class RunOutcome:
 
 
 def measure(
-    side: Side,
+    program: Program,
     run: Run,
     relay: Sequence[str] = (),
     *,
     when_started: Callable[[Sequence[BenchmarkProcess]], None] = lambda _processes: None,
 ) -> RunOutcome:
-    """Run one side; `relay` are the arguments of the relay, if there is one. `when_started` gets the processes."""
+    """Run a program; `relay` are the arguments of the relay, if there is one. `when_started` gets the processes."""
     create_table(Path(run.folder))
-    order = {"ours": ("our_sender", "our_receiver"), "gstreamer": ("gstreamer_receiver", "gstreamer_sender")}[side]
+    order = {"ours": ("our_sender", "our_receiver"), "gstreamer": ("gstreamer_receiver", "gstreamer_sender")}[program]
     processes: list[BenchmarkProcess] = []
 
     def start(name: str, port: int, *more: str) -> dict[str, Any]:
@@ -131,9 +134,9 @@ def measure(
     try:
         port = start(order[0], 0)["port"]
         if relay:
-            port = start("relay", port, side, *relay)["port"]
+            port = start("relay", port, program, *relay)["port"]
         start(order[1], port)
-        sender, receiver = (processes[0], processes[-1]) if side == "ours" else (processes[-1], processes[0])
+        sender, receiver = (processes[0], processes[-1]) if program == "ours" else (processes[-1], processes[0])
         when_started(processes)
         sender.send_line()
         sent = sender.read_line()
@@ -161,11 +164,11 @@ def _evaluate(run: Run, sender_cpu_ns: list[int], counts: dict[str, int], relaye
                 latency_ms.append((read_ns - stamp_ns) / NS_PER_MS)
                 cpu_ns.append(at_cpu_ns)
                 errors[row] = error
-    steps = sender_cpu_ns[WARM_UP_FRAMES:]
+    counted_cpu_ns = sender_cpu_ns[WARM_UP_FRAMES:]  # after each frame
     return RunOutcome(
         len(stamps),
         np.array(latency_ms),
-        (steps[-1] - steps[0]) / (len(steps) - 1) / NS_PER_MS,
+        (counted_cpu_ns[-1] - counted_cpu_ns[0]) / (len(counted_cpu_ns) - 1) / NS_PER_MS,
         (cpu_ns[-1] - cpu_ns[0]) / (len(cpu_ns) - 1) / NS_PER_MS if len(cpu_ns) > 1 else float("nan"),
         errors,
         relayed,
