@@ -15,7 +15,7 @@ from lavt.errors import UserError, WorkError
 from lavt.transport.clock_sync import probe
 from lavt.transport.emulation.impairment import ExemptPort, check_flows
 from lavt.transport.netem.netem import NetemInterface, Verification
-from lavt.transport.netem.probe import ProbeResult
+from lavt.transport.netem.queue_probe import ProbeResult
 from lavt.transport.netem.state import DIRECTORY
 from lavt.transport.netem.tc import Command, as_typed, first_commands
 

@@ -66,7 +66,7 @@ def flows(config: RelayConfig) -> list[RelayedFlow]:
         _resolve("video_server", config.video_server),
         upstream=NO_DELAY,
         downstream=_delay_model(config.video, seed, "video inherent"),
-        delays_downstream=is_delayed_video,
+        is_delayed_downstream=is_delayed_video,
         index_downstream=video_index,
         downstream_injected=_link_injection("video", config.video, seed),
     )

@@ -23,7 +23,8 @@ LATE_NS = 50 * NS_PER_MS
 REJECTION_SHOWN_NS = NS_PER_S
 """For this long after a rejection, the state contains its reason."""
 MAX_PENDING_COMMANDS = 64
-"""The commands of more than a second: a command that has not reached the wheels by then never will."""
+"""How many applied commands can wait for the vehicle's report that they reached the wheels: more than are applied in a
+second. A command that has not reached the wheels by then never will."""
 POSE_AHEAD_NS = NS_PER_MS // 2
 """The pose for a frame is sent this long before the frame is due, because a command that arrives in between occupies
 the node for 0.2 ms."""
@@ -70,9 +71,9 @@ class PendingCommand(NamedTuple):
 class ActuatorNode:
     """The node that operates the vehicle: physics steps, safety gate, actuation and state reports.
 
-    Physics advances at the times that the vehicle requests. With `sample_times` it advances lazily: just before each of
-    these times, and when the state is published. This is sufficient if physics catches up without loss of accuracy and
-    no wake is late.
+    Physics advances at the times that the vehicle requests. With `sample_times`, the times at which the camera needs
+    the vehicle's pose, it advances lazily: just before each of these times, and when the state is published. This is
+    sufficient if physics catches up without loss of accuracy and no wake is late.
     """
 
     name = "actuator"
@@ -206,7 +207,8 @@ class ActuatorNode:
         self.gate.issued_stamps.add(
             frame.stamp_ns, frame.number, frame.stamped_mono_ns, frame.pixel_crc, frame.capture_ns
         )
-        # Checked here and not at the next wake, because the next frame may end a series of equal pictures.
+        # Checked here, because a further frame may end the series of equal pictures (a frozen camera) before the next
+        # wake.
         self.gate.watchdog.check_timeouts(now.mono_ns)
 
     # Physics and state reports.

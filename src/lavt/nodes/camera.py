@@ -18,12 +18,13 @@ from lavt.transport.video.stream_sender import StreamSender
 from lavt.vehicle.camera import Camera, CapturedFrame, CountingCamera, FrameTimes, TimedCamera, newest_pose
 
 KEYFRAME_PAUSE_NS = NS_PER_S // 10
-"""In this time, at most one keyframe is sent for a request or a new bit rate, so that requests cannot fill the link."""
+"""Shortest time between two keyframes that are sent on request, or because the encoder restarts with a new bit rate: so
+that requests cannot fill the link."""
 REMEMBERED_STAMPS = 512
-"""A new stamp differs from this many previous ones: at 60 Hz those of 8.5 s, longer than the 5 s for which the safety
-gate remembers stamps."""
+"""A new stamp differs from this many previous ones. At 60 Hz they cover 8.5 s; the safety gate remembers stamps for
+5 s."""
 REMEMBERED_POSES = 512
-"""At 240 Hz the poses of 2.1 s: twice the longest time from the opening of the shutter until a picture is ready."""
+"""At 240 Hz they cover 2.1 s: twice the longest time from the opening of the shutter until a picture is ready."""
 
 
 class PreparedFrame(Struct, frozen=True):
@@ -90,12 +91,13 @@ class CameraNode:
         self._keyframe_requested = False
         self._keyframe_ns = 0
         self._limit_bps: int | None = None
+        """The receiver's bit-rate limit with which the encoder works now."""
         self._stamps: deque[int] = deque(maxlen=REMEMBERED_STAMPS)
         self._highest_stamp_ns = 0
         self.pipelines: Mapping[str, Sequence[Stage]] = {
             WAKE: (
                 ("capture", self._capture),
-                ("check", self._check),
+                ("check", self._prepare),  # this name is in records and in `costs.yaml`
                 ("stamp", self._stamp),
                 ("encode", self._encode),
                 ("packetize", self._packetize),
@@ -141,7 +143,7 @@ class CameraNode:
         """Capture a frame with a camera that has no exposure time and no sensor delay."""
         return self._capture_now(number, begin_ns, newest_pose(poses, begin_ns))
 
-    def _check(self, frame: CapturedFrame, _now: Now) -> PreparedFrame:
+    def _prepare(self, frame: CapturedFrame, _now: Now) -> PreparedFrame:
         """Do the work that needs no stamp, so that it adds no latency: the checksum and the codec's preparation."""
         return PreparedFrame(frame, *self._pictures.prepare(frame.picture))
 

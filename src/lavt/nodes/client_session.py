@@ -112,7 +112,7 @@ class ClientSession:
         self._update_reason(reply)
         self._highest_emergency_stop = max(self._highest_emergency_stop, reply.emergency_stop)
         if self.emergency_stop and reply.emergency_stop > self.emergency_stop:
-            # The vehicle takes the stop for an old one, because our wall clock is behind: raise a newer one.
+            # The vehicle takes the stop for an old one, because this client's wall clock is behind: raise a newer one.
             self.emergency_stop = self._highest_emergency_stop = reply.emergency_stop + 1
             self._stop_ns = None if self._stop_ns is None else now_ns
         elif self.emergency_stop == reply.emergency_stop:

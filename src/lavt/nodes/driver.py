@@ -74,7 +74,7 @@ class DriverNode:
         self._sequence = 0
         self._view: DecodedFrame | None = None
         self._view_ns = 0
-        """When a decision was made from the newest view."""
+        """When a decision was made from `_view`, the newest decoded frame."""
         self._detected_stamp_ns = 0
         self._decision: Decision | None = None
         self._lane_state: LaneState = "ok"

@@ -1,7 +1,8 @@
 """Network conditions: the client requests one, and each side applies its part to the network queues of its machine.
 
-A condition is a lease: if the client does not renew it, it ends, and all queues are cleared. The nodes only order this
-from the link that carries `inject`, which changes the queues and reports what it measured.
+A condition is a lease: if the client does not renew it, it ends, and all queues are cleared. The nodes do not change
+the queues themselves. They send orders on the channel `inject` to a link, the injector, which changes the queues and
+reports what it measured.
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ MEASURE_PERIOD_NS = 5 * NS_PER_S
 """Period at which a condition in force is measured."""
 REQUEST_PERIOD_NS = NS_PER_S
 LEASE_MS = 5_000
-"""The client renews once a second: four requests may be lost."""
+"""The client renews its lease once a second, so four requests in a row may be lost."""
 MAX_PENDING_REQUESTS = 64
-"""Number of requests that may wait for the queues; the link keeps as many orders."""
+"""Number of requests whose reply may wait until the queues have been changed."""
 
 
 class _Queues:
@@ -78,9 +79,10 @@ class _Queues:
 
 
 class Lease(Struct, frozen=True):
-    """The client that controls the network condition, and the time when that ends."""
+    """The client that controls the network condition, and the time when its control ends."""
 
     client: tuple[str, int]
+    """Its name and the instance of its process."""
     until_ns: int
 
 
@@ -205,9 +207,10 @@ class InjectionNode:
 
 
 class InjectionClient:
-    """The client's node, which delays commands on its own machine and requests the rest periodically from the server.
+    """The client's node, which delays commands on its own machine and requests the other delays from the server.
 
-    With a condition, the driver waits until both parts are in force before it arms the vehicle.
+    The request is repeated, because it renews the lease. With a condition, the driver waits until both parts are in
+    force before it arms the vehicle.
     """
 
     name = "injection"

@@ -19,7 +19,7 @@ from lavt.transport.video.cipher import NewCipher, plain_cipher
 from lavt.transport.video.path_validation import PathClient, is_path_datagram
 
 REPORT_PERIOD_NS = 500 * NS_PER_MS
-"""The server closes a path after 2 s without a report, in which four reports are due."""
+"""The server closes a path after 2 s without a report: four of them must be missing."""
 SAMPLE_PERIOD_NS = NS_PER_S
 """Period of the recorded statistics."""
 KEYFRAME_DELAY_NS = 50 * NS_PER_MS
@@ -125,7 +125,7 @@ class ReceiverNode:
         try:
             if is_report:
                 announcement = parse_announcement(datagram)
-                # Without a path this node has sent no reports: answers in this sender report are for another receiver.
+                # Without a path, as in `lavt watch`, this node sends no reports: all answers are for other receivers.
                 own_ssrc = None if self._path is None else SSRC
                 self._reception.note_announcement(announcement, own_ssrc, message.arrived.mono_ns)
                 return None

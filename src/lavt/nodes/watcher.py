@@ -10,10 +10,10 @@ from lavt.nodes.picture_reader import PictureReader
 
 
 class WatcherNode:
-    """A node in the driver's place, which reads pictures and drops them; "picture" records the outcome for each."""
+    """A node in the driver's place, which reads pictures and drops them; the channel "picture" records each outcome."""
 
     name = "driver"
-    """The channel table names this node as the receiver of pictures."""
+    """Not "watcher", because pictures are sent to the node of this name (`channels.py`)."""
 
     def __init__(self, reader: PictureReader) -> None:
         self.counts: Mapping[str, int] = reader.counts

@@ -16,7 +16,8 @@ from lavt.transport.video.path_validation import Address, PathServer, client_dat
 
 OTHER_DATAGRAMS_PER_S: Final = 200
 """The limit at the video's port. On a busy AMD EPYC, a stranger's datagram that passes took 15 to 30 us of CPU time,
-and one that does not a quarter to an eighth of that (`benchmarks/stranger_datagrams.py`, medians of three runs)."""
+and one that does not pass took a quarter to an eighth of that (`benchmarks/stranger_datagrams.py`, medians of three
+runs)."""
 PROBES_PER_S: Final = 200
 """Limits the probes from the active client's host, and separately those from all others. A client sends 2 a second,
 `lavt clock` 20."""

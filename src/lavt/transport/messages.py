@@ -2,7 +2,7 @@
 
 A message on the wire is `[version, field, field, ..]`, the fields in the order of the class. `decode` raises
 `BadMessage` for data that is too long, not msgpack, of another version or shape, not finite, or out of range. `encode`
-cuts texts that are too long, such as a list of faults, because a state must be readable whatever its reason.
+cuts texts that are too long, such as a list of faults, because a state must be readable however long its texts are.
 """
 
 from __future__ import annotations
@@ -42,12 +42,15 @@ MAX_DELAY_MS = 10_000.0
 """The longest delay that a client can request of a server; clearing the delay takes as long."""
 SPEED_BOUND_MPS = 100.0
 ROAD_WHEEL_BOUND_RAD = 1.0
+CURVATURE_BOUND_PER_M = 1.0
 
 Version = Annotated[int, Meta(ge=VERSION, le=VERSION)]
 U64 = Annotated[int, Meta(ge=0)]
-Time = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+U63 = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+"""Times, and numbers that grow: the non-negative half of a signed 64-bit integer."""
 RoadWheel = Annotated[float, Meta(ge=-ROAD_WHEEL_BOUND_RAD, le=ROAD_WHEEL_BOUND_RAD)]
-Unit = Annotated[float, Meta(ge=0.0, le=1.0)]
+Curvature = Annotated[float, Meta(ge=-CURVATURE_BOUND_PER_M, le=CURVATURE_BOUND_PER_M)]
+ZeroToOne = Annotated[float, Meta(ge=0.0, le=1.0)]
 Delay = Annotated[float, Meta(ge=0.0, le=MAX_DELAY_MS)]
 Name = Annotated[str, Meta(pattern=NAME.pattern)]
 NameOrEmpty = Annotated[str, Meta(pattern=rf"^\Z|{NAME.pattern}")]
@@ -75,20 +78,20 @@ BOUNDS: dict[type, dict[str, float]] = {State: {"speed_mps": SPEED_BOUND_MPS, "s
 TYPES: dict[type, dict[str, Any]] = {
     Command: {
         "epoch": U64,
-        "sequence": Time,
-        "sent_wall_ns": Time,
-        "stamp_ns": Time,
-        "stamp_received_wall_ns": Time,
+        "sequence": U63,
+        "sent_wall_ns": U63,
+        "stamp_ns": U63,
+        "stamp_received_wall_ns": U63,
         "steering_rad": RoadWheel,
-        "throttle": Unit,
-        "brake": Unit,
-        "path_curvature_per_m": Annotated[tuple[RoadWheel, ...], Meta(min_length=PATH_POINTS, max_length=PATH_POINTS)],
+        "throttle": ZeroToOne,
+        "brake": ZeroToOne,
+        "path_curvature_per_m": Annotated[tuple[Curvature, ...], Meta(min_length=PATH_POINTS, max_length=PATH_POINTS)],
         "mode": Mode,
-        "emergency_stop": Time,
+        "emergency_stop": U63,
     },
     State: {
-        "sent_wall_ns": Time,
-        "state_mono_ns": Time,
+        "sent_wall_ns": U63,
+        "state_mono_ns": U63,
         "speed_mps": Annotated[float, Meta(ge=-SPEED_BOUND_MPS, le=SPEED_BOUND_MPS)],
         "steering_rad": RoadWheel,
         "gear": Literal["park", "reverse", "neutral", "drive"],
@@ -102,7 +105,7 @@ TYPES: dict[type, dict[str, Any]] = {
         "requested_by": NameOrEmpty,
         "instance": U64,
     },
-    SessionRequest: {"operation": Operation, "who": Name, "instance": U64, "number": Time},
+    SessionRequest: {"operation": Operation, "who": Name, "instance": U64, "number": U63},
     SessionReply: {
         "granted": bool,
         "reason": _text(SessionReply, "reason"),
@@ -110,7 +113,7 @@ TYPES: dict[type, dict[str, Any]] = {
         "token": bytes,
         "video_port": Annotated[int, Meta(ge=0, le=65535)],
         "host": _text(SessionReply, "host"),
-        # lower than the highest `Time`, so that the operator can send a higher number
+        # lower than the highest `U63`, so that the operator can send a higher number
         "emergency_stop": Annotated[int, Meta(ge=0, le=LARGEST_STORED_STOP)],
     },
     NetemRequest: {
@@ -120,12 +123,12 @@ TYPES: dict[type, dict[str, Any]] = {
         "lease_ms": Annotated[int, Meta(ge=0, le=60_000)],
         "delay_ms": Delay,
         "jitter_ms": Delay,
-        "jitter_correlation": Unit,
+        "jitter_correlation": ZeroToOne,
         "jitter_distribution": Literal["uniform", "normal", "pareto", "paretonormal"],
-        "loss": Unit,
+        "loss": ZeroToOne,
         "loss_burst_packets": Annotated[float, Meta(ge=0.0, le=10_000.0)],
         "rate_bps": Annotated[int, Meta(ge=0, le=10**11)],
-        "reorder": Unit,
+        "reorder": ZeroToOne,
         "state_delay_ms": Delay,
     },
     NetemReply: {"granted": bool, "reason": _text(NetemReply, "reason")},

@@ -82,7 +82,7 @@ class UdpLink:
                 address = self._server = (self._remote[0], self._remote[1] or send.peer)
             try:
                 self._socket.sendto(send.payload, socket.MSG_DONTWAIT, address)
-            except OSError:  # it is lost, as on the network: no frame waits for an earlier one
+            except OSError:  # the datagram is lost, as on the network: no frame waits for an earlier one
                 self.counts["datagrams_not_sent"] += 1
 
     def close(self) -> None:

@@ -288,7 +288,7 @@ class ZenohLink:
         self._declared.append(session.liveliness().declare_token(f"{self._base}/alive/{self._who}"))
 
     def send(self, *sends: Send) -> None:
-        """Send messages of this side; count those that cannot be sent now, since a newer one always follows."""
+        """Send messages of this side; one that cannot be sent now is counted and dropped, since a newer one follows."""
         for send in sends:
             self._send(send)
 

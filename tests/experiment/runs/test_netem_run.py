@@ -17,7 +17,7 @@ from lavt.experiment.runs.netem_run import NetemRun, netem_reasons
 from lavt.experiment.runs.plan import plan_run
 from lavt.transport.emulation.impairment import ExemptPort, ImpairedFlow, Impairment
 from lavt.transport.netem.netem import NetemInterface
-from lavt.transport.netem.probe import ProbeResult, probes
+from lavt.transport.netem.queue_probe import ProbeResult, queue_probes
 from lavt.transport.netem.state import AppliedState, StateFiles, boot_id, network_namespace, start_ticks
 from lavt.transport.netem.tc import Command
 
@@ -50,7 +50,7 @@ class FakeNetemInterface(NetemInterface):
         """Return results as requested, plus `added_ms`."""
         return {
             probe.name: ProbeResult(count, 0, 0, 0, *[probe.impairment.delay_ms + self.added_ms] * 3)
-            for probe in probes(flows, exempt)
+            for probe in queue_probes(flows, exempt)
         }
 
     def problems(self) -> list[str]:

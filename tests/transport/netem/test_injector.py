@@ -12,7 +12,7 @@ from lavt.node import Send
 from lavt.transport.emulation.impairment import ExemptPort, ImpairedFlow, Impairment
 from lavt.transport.netem.injector import InjectionOrder, InjectionResult, Injector
 from lavt.transport.netem.netem import Verification
-from lavt.transport.netem.probe import ProbeResult
+from lavt.transport.netem.queue_probe import ProbeResult
 
 VIDEO = ImpairedFlow("video", "udp", 5600, "source", Impairment(150.0))
 UNIMPAIRED = ImpairedFlow("video", "udp", 5600, "source", Impairment())

@@ -32,7 +32,7 @@ from lavt.transport.emulation.impairment import (
 )
 from lavt.transport.netem.correlated_jitter import CorrelatedJitter, next_deviation
 from lavt.transport.netem.netem import NetemInterface, run_tc
-from lavt.transport.netem.probe import ProbeResult, judge, measure, probes, summarize
+from lavt.transport.netem.queue_probe import ProbeResult, judge, measure, queue_probes, summarize
 from lavt.transport.netem.state import (
     NO_OWNER,
     AppliedState,
@@ -564,9 +564,9 @@ def test_verification_reports_stopped_jitter(tmp_path: Path, monkeypatch: pytest
     assert netem.verify([VIDEO]).reasons == ["stopped"]
 
 
-def test_probes_of_a_condition() -> None:
-    """The probes for L4 are its flows, the challenges, the other directions, NTP, ssh and the clock probe."""
-    requested = probes([VIDEO, CONTROL], [ExemptPort("udp", 5602, "the clock probe")])
+def test_queue_probes_of_a_condition() -> None:
+    """The queue probes for L4 are its flows, the challenges, the other directions, NTP, ssh and the clock probe."""
+    requested = queue_probes([VIDEO, CONTROL], [ExemptPort("udp", 5602, "the clock probe")])
     assert [(probe.name, probe.source, probe.destination, probe.impairment.delay_ms) for probe in requested] == [
         ("video", 5600, 9, 150),
         ("control", 9, 7448, 75),
@@ -579,8 +579,8 @@ def test_probes_of_a_condition() -> None:
     ]
 
 
-def test_measured_frames_are_summarized() -> None:
-    """Lost, reordered and early frames are counted, and the delays are those of the delayed frames."""
+def test_measured_packets_are_summarized() -> None:
+    """Lost, reordered and early test packets are counted, and the delays are those of the delayed packets."""
     delays = [(0, 75.0), (1, 75.2), (3, 75.1), (2, 75.3), (9, 0.1), (4, 75.0), (5, 75.0), (6, 75.0), (7, 75.0)]
     result = summarize(Impairment(75, reorder=0.25), 10, delays)
 
@@ -594,7 +594,7 @@ AS_REQUESTED = {
     probe.name: ProbeResult(
         50, 0, 0, 0, probe.impairment.delay_ms, probe.impairment.delay_ms, probe.impairment.delay_ms
     )
-    for probe in probes([VIDEO])
+    for probe in queue_probes([VIDEO])
 }
 
 
@@ -702,10 +702,10 @@ def test_measuring_an_interface_that_goes_down_fails(monkeypatch: pytest.MonkeyP
     getattr(opened.return_value, call).side_effect = down
     monkeypatch.setattr(socket, "socket", opened)
     with pytest.raises(UserError, match=r"eth0 \(Network is down\)"):
-        measure("eth0", probes([VIDEO]), count=1)
+        measure("eth0", queue_probes([VIDEO]), count=1)
 
 
 def test_measuring_a_missing_interface_fails() -> None:
     """Measuring a missing interface raises a `UserError` that names it, or that asks for root."""
     with pytest.raises(UserError, match=r"nowhere0|only root may measure"):
-        measure("nowhere0", probes([VIDEO]))
+        measure("nowhere0", queue_probes([VIDEO]))

@@ -1,7 +1,7 @@
 """Reasons against the delay injection of a run on two machines, from the measurements of their own netem queues.
 
 A sample is one measurement of a queue (a row of the channel `injection`). When it was taken, it was compared with the
-request (`judge` in `transport/netem/probe.py`). This module checks the times and the conditions of the samples.
+request (`judge` in `transport/netem/queue_probe.py`). This module checks the times and the conditions of the samples.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from lavt.experiment.analysis.validity import injection_reasons
 from lavt.experiment.runs.plan import PlannedRun
 from lavt.transport.emulation.impairment import ImpairedFlow, Impairment
 from lavt.transport.netem.netem import NetemInterface
-from lavt.transport.netem.probe import ProbeResult, judge
+from lavt.transport.netem.queue_probe import ProbeResult, judge
 
 NETEM = "netem.json"
 """The file in a run directory that has the flows requested of netem, and the measurements before and after the

@@ -63,9 +63,9 @@ def read_chrony(clock: Clock, run: Run) -> ClockReport | None:
 def parse_chrony(host: str, answer: str, before: Now, after: Now) -> ClockReport:
     """Parse chronyc's answer to `REPORTS`, queried between two readings of the clocks; never raises.
 
-    Field 5 of "tracking" is the correction, positive if the local clock is slow. The bound is the root distance: half
-    the root delay plus the root dispersion. The "ntpdata" line of the selected source is used. The correction is
-    unknown before chrony has synchronised, and if the lines are not chrony's.
+    Field 5 of "tracking" (counted from 1) is the correction, positive if the local clock is slow. The bound is the root
+    distance: half the root delay plus the root dispersion. The "ntpdata" line of the selected source is used. The
+    correction is unknown before chrony has synchronised, and if the lines are not chrony's.
     """
     asking_ns = after.mono_ns - before.mono_ns
     middle = before.later(asking_ns // 2)

@@ -74,7 +74,8 @@ def quantiles(distribution: Distribution) -> tuple[float, ...]:
     )
     if distribution == "pareto":
         return pareto_quantiles
-    return tuple((one + 3 * other) / 4 for one, other in zip(normal_quantiles, pareto_quantiles, strict=True))
+    pairs = zip(normal_quantiles, pareto_quantiles, strict=True)
+    return tuple((normal_quantile + 3 * pareto_quantile) / 4 for normal_quantile, pareto_quantile in pairs)
 
 
 def _normal_quantiles() -> tuple[float, ...]:
@@ -105,9 +106,10 @@ class LossProcess:
     """Losses of packets: independent, or in bursts (Gilbert-Elliott model).
 
     `bursts` are the probabilities that a burst begins and ends; None: losses are independent, with probability `loss`.
-    `name` is the name of the random-number stream of `seed`. With the same stream, a higher loss loses all packets of a
-    lower one and others if both are independent, or if both have the same mean length of a burst and the lower loss is
-    at most 1 - 1 / that length. (With more loss in such short bursts, a burst is less likely to go on than to begin.)
+    `name` is the name of the random-number stream of `seed`. With the same stream, a process with a higher loss loses
+    every packet that one with a lower loss loses, and more. This is true if both lose packets independently, or if both
+    have the same mean length of a burst and the lower loss is at most 1 - 1 / that length. (With more loss in such
+    short bursts, a burst is less likely to go on than to begin.)
     """
 
     def __init__(self, seed: int, name: str, loss: float, bursts: BurstProbabilities | None) -> None:

@@ -33,6 +33,8 @@ MAX_CLIENTS = 64
 CLIENT_TIMEOUT_NS = 30 * NS_PER_S
 """A client that sends nothing for this long loses its socket."""
 
+MAX_DRAINED = 64
+"""How many datagrams of one socket are received before the other sockets have their turn."""
 MAX_SAMPLES = 20_000
 """The relay's medians cover at most this many of the last datagrams in each direction of a client."""
 
@@ -63,7 +65,7 @@ class RelayedFlow:
     server: Address
     upstream: DelayModel
     downstream: DelayModel
-    delays_downstream: Callable[[bytes], bool] = lambda _datagram: True
+    is_delayed_downstream: Callable[[bytes], bool] = lambda _datagram: True
     """Returns whether a datagram from the server is delayed; by default all are."""
     index_downstream: Callable[[bytes], int] | None = None
     """Maps a datagram from the server to the index of its delay; None: the index is the datagram's number."""
@@ -211,8 +213,8 @@ class Relay:
 
     def _send_due(self) -> None:
         while self._heap and self._heap[0][0] <= (now_ns := self.now_ns()):
-            due_at_ns, _, path = heapq.heappop(self._heap)
-            if due_at_ns != path.scheduled_ns:
+            scheduled_ns, _, path = heapq.heappop(self._heap)
+            if scheduled_ns != path.scheduled_ns:
                 continue  # the entry is out of date: a reordered datagram of this path was due earlier
             path.scheduled_ns = None
             while (due_ns := path.line.next_due_ns()) is not None and due_ns <= now_ns:
@@ -271,7 +273,7 @@ class _ActiveFlow:
                 downstream,
                 lambda data: self._socket.sendto(data, address),
                 flow.index_downstream,
-                flow.delays_downstream,
+                flow.is_delayed_downstream,
             ),
             self._relay.now_ns(),
         )
@@ -336,9 +338,9 @@ def _bound_socket(address: Address, name: str) -> socket.socket:
 
 
 def _drain(sock: socket.socket) -> list[tuple[bytes, Ancillary, Address]]:
-    """Return all waiting datagrams, up to a limit that lets the other sockets have their turn."""
+    """Return all waiting datagrams, but at most `MAX_DRAINED`."""
     datagrams = []
-    for _ in range(64):
+    for _ in range(MAX_DRAINED):
         try:
             datagram, ancillary, _flags, address = sock.recvmsg(LONGEST_DATAGRAM, ANCILLARY_BYTES)
         except BlockingIOError:

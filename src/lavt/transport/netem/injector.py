@@ -16,12 +16,12 @@ from lavt.errors import LavtError
 from lavt.node import Send
 from lavt.transport.emulation.impairment import ExemptPort, ImpairedFlow
 from lavt.transport.netem.netem import Verification
-from lavt.transport.netem.probe import ProbeResult, judge
+from lavt.transport.netem.queue_probe import ProbeResult, judge
 
 Deliver = Callable[[str, Any, Now, Any], None]
 
-MEASURED_FRAMES = 10
-"""How many frames are sent to measure a flow; this takes a fifth of a second."""
+MEASURED_PACKETS = 10
+"""How many test packets are sent to measure a flow; this takes a fifth of a second."""
 NO_INTERFACE = "no interface is configured for it: set injection.interface"
 
 log = logging.getLogger(__name__)
@@ -135,11 +135,11 @@ class Injector:
                 return InjectionResult(order.number, "", "", ())
             if order.number != self._applied_number:
                 self._queues.apply(flows, exempt=self._exempt, condition=order.condition)
-                verification = self._queues.verify(flows, exempt=self._exempt, count=MEASURED_FRAMES)
+                verification = self._queues.verify(flows, exempt=self._exempt, count=MEASURED_PACKETS)
                 if verification.reasons:
                     return InjectionResult(order.number, "; ".join(verification.reasons), "", ())
-            else:  # during a drive: no program is started, because that would delay the drive
-                measured = self._queues.measure(flows, exempt=self._exempt, count=MEASURED_FRAMES)
+            else:  # a repeated order, so the car may drive: no program is started, because that would delay the drive
+                measured = self._queues.measure(flows, exempt=self._exempt, count=MEASURED_PACKETS)
                 verification = Verification(self._queues.problems() + judge(flows, self._exempt, measured), measured)
             self._applied_number = order.number
         except LavtError as error:

@@ -24,7 +24,7 @@ from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import LavtError, UserError, WorkError
 from lavt.transport.emulation.impairment import ExemptPort, ImpairedFlow, Impairment, check_flows
 from lavt.transport.netem.correlated_jitter import CorrelatedJitter
-from lavt.transport.netem.probe import ProbeResult, judge, measure, probes
+from lavt.transport.netem.queue_probe import ProbeResult, judge, measure, queue_probes
 from lavt.transport.netem.state import (
     DIRECTORY,
     NO_OWNER,
@@ -62,7 +62,7 @@ from lavt.transport.netem.tc import (
 TC_TIMEOUT_S: Final = 10.0
 POLL_NS: Final = 10 * NS_PER_MS
 DRAIN_MARGIN_NS: Final = NS_PER_S
-"""A queue has its longest delay and this margin to drain."""
+"""A queue gets as long to drain as its longest delay and this margin."""
 
 RunCommand = Callable[[Command], str]
 """Runs a command and returns its standard output; raises `UserError` or `WorkError`."""
@@ -260,7 +260,7 @@ class NetemInterface:
         self, flows: Sequence[ImpairedFlow], *, exempt: Sequence[ExemptPort] = (), count: int = 50
     ) -> dict[str, ProbeResult]:
         """Measure packets of each flow, and packets that must not be delayed, on their way through the queue."""
-        return measure(self.interface, probes(flows, exempt), count=count)
+        return measure(self.interface, queue_probes(flows, exempt), count=count)
 
     def verify(
         self, flows: Sequence[ImpairedFlow], *, exempt: Sequence[ExemptPort] = (), count: int = 50

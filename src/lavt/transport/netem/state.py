@@ -23,7 +23,8 @@ DIRECTORY: Final = Path("/run/lavt")
 NO_OWNER: Final = (0, 0)
 """The value for persistent impairments, which no process owns."""
 _START_TICKS: Final = 19
-"""Index of a process's start time among the fields after its name in /proc/PID/stat (proc(5): field 22)."""
+"""Index of a process's start time among the fields after its name in /proc/PID/stat. In proc(5), which counts all
+fields from 1, it is field 22."""
 
 Owner = tuple[int, int]
 """A process ID and the start time of the process in kernel ticks, because process IDs are reused."""

@@ -87,8 +87,9 @@ class TcFilter(Struct, frozen=True):
 def filters(flow: ImpairedFlow) -> list[TcFilter]:
     """Return the filters of a flow, for IPv4 and for IPv6.
 
-    They match whole packets only (first fragments, no IPv4 options, no IPv6 extension headers), so that the offsets are
-    right. On the video's port they match only payloads that begin like RTP and RTCP (version 2).
+    They match only packets whose ports are at fixed offsets: unfragmented ones and first fragments, without IPv4
+    options and IPv6 extension headers. On the video's port they match only payloads that begin like RTP and RTCP
+    (version 2).
     """
     placement = PLACES[flow.name]
     protocol_number = {"udp": 17, "tcp": 6}[flow.protocol]
@@ -286,7 +287,9 @@ def difference(flow: ImpairedFlow, qdiscs: Iterable[Qdisc], found: Iterable[Foun
     if netem is None or netem.kind != "netem" or netem.parent != placement.parent:
         return [f"{flow.description} has no netem"]
     actual_impairment = parse_impairment(netem.options)
-    is_correlated = bool(requested.jitter_correlation)  # then the delay varies, and netem has no jitter
+    # With correlated jitter, LAVT changes netem's delay in steps (by less than 8 standard deviations), and netem itself
+    # has no jitter.
+    is_correlated = bool(requested.jitter_correlation)
     burst_packets = requested.loss_burst_packets * has_loss_bursts(requested)
     delay_tolerance_ms = TC_STEP_MS + 8 * requested.jitter_ms * is_correlated
     jitter_ms = 0.0 if is_correlated else requested.jitter_ms

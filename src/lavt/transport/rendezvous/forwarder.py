@@ -66,7 +66,8 @@ HOST_PER_S: Final = 10
 """Limits the datagrams of each host, within each of the two groups from clients that the vehicle has not answered. Such
 a client sends 2 hellos a second, or 7 if the video has ended, until the vehicle answers one."""
 MAX_UNANSWERED: Final = 10 * UPSTREAM_PER_S
-"""Limits the number of clients that the vehicle has not answered: those of 5 s or more, and an answer takes less."""
+"""Limits the number of clients that the vehicle has not answered. So many need 5 s to arrive at the rate limit, and an
+answer takes less than that."""
 MAX_UPSTREAM_BYTES: Final = 1400
 
 _MAGIC: Final = b"LAVR"
@@ -137,9 +138,9 @@ class Forwarder:
         self._signature_limiters = {True: RateLimiter(REGISTRATIONS_PER_S), False: RateLimiter(REGISTRATIONS_PER_S)}
         """By whether the registration comes from the vehicle's address."""
         self._answered_limiters = {True: RateLimiter(UPSTREAM_PER_S), False: RateLimiter(UPSTREAM_PER_S)}
-        """By whether the datagram belongs to the path validation; of clients that the vehicle has answered."""
+        """For clients that the vehicle has answered, by whether the datagram belongs to the path validation."""
         self._unanswered_limiters = {True: _HostLimiter(), False: _HostLimiter()}
-        """The same of all other clients."""
+        """The same for clients that the vehicle has not answered."""
 
     def vehicle_address(self, now_ns: int) -> Address | None:
         """Return the address from which the vehicle registered; None if there is none or the registration expired."""

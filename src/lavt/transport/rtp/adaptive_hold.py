@@ -9,7 +9,7 @@ from lavt.domain import NS_PER_MS, NS_PER_S
 MIN_HOLD_NS: Final = 10 * NS_PER_MS
 """The hold on a network that keeps packets in order: a missing packet is lost there, and waiting for it adds delay."""
 MAX_HOLD_NS: Final = 300 * NS_PER_MS
-"""A frame that this hold would still delay is useless: a keyframe is requested instead."""
+"""A frame that waits longer than this is too old to be useful: a keyframe is requested instead."""
 WINDOW_NS: Final = 30 * NS_PER_S
 """The hold depends on the reordering delays of the current window and of the previous one."""
 

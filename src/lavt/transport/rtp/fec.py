@@ -1,8 +1,9 @@
 """Forward error correction of the video: repair packets from which a receiver recovers lost packets of a frame.
 
-A frame's packets are divided into blocks of at most 16, packet i into block i mod blocks, so that a burst is spread
-over the blocks. Each block has 0, 1 or 2 repair packets (`parity.py`), which recover as many lost packets.
-They are sent after the frame's last packet, so they delay no media. Wire format: docs/wire.md, "Repair packets".
+A frame's packets are divided into n blocks of at most 16 packets. Packet i goes into block i modulo n, so that a burst
+of losses is spread over the blocks. Each block has 0, 1 or 2 repair packets (`parity.py`), which recover as many lost
+packets. They are sent after the frame's last packet, so they delay no media. Wire format: docs/wire.md, "Repair
+packets".
 """
 
 from __future__ import annotations
@@ -22,14 +23,15 @@ from lavt.transport.rtp.rtp import RtpPacket, parse_packet
 
 REPAIR_PAYLOAD_TYPE: Final = 97
 MAX_REPAIR_PACKETS: Final = 2
-"""For one block: P, and Q as a second one."""
+"""For one block: the parity symbol P and, as a second one, Q (`parity.py`)."""
 MAX_BLOCK_PACKETS: Final = 16
 MAX_BLOCKS: Final = 255
 """In one frame; a frame of more than 16 * 255 packets gets no repair packets."""
 MAX_SYMBOL_BYTES: Final = 1500
 """Longest payload with its length field: longer than in any Ethernet packet. It limits the memory."""
 MAX_STORED_MEDIA: Final = 4096
-"""Media packets stored to recover lost ones: more than the largest frame has, some seconds of any stream."""
+"""Media packets stored to recover lost ones: more than the largest frame has, and as many as some seconds of any stream
+have."""
 MAX_OPEN_BLOCKS: Final = 64
 """Most blocks that wait for more packets: as many as a second of small frames that all lack packets."""
 BLOCK_TIMEOUT_NS: Final = 500 * NS_PER_MS

@@ -1,8 +1,9 @@
 """Jitter buffer: it restores the order of sequence numbers without delaying packets that arrive in order.
 
 A packet in order leaves immediately. A packet after a gap waits for the missing ones, for at most one hold since the
-gap was detected; then the gap is given up. The first packets of a stream wait one hold, since the first to arrive may
-not be the first sent: otherwise a reordered keyframe at the start would cost the whole first group of pictures.
+gap was detected; then the gap is given up. The first packets of a stream also wait one hold, since the first to arrive
+may not be the first sent. Without this wait, reordering in the first keyframe would cost the whole first group of
+pictures.
 """
 
 from __future__ import annotations

@@ -75,10 +75,10 @@ class Reception:
             self._note_transit(packet.timestamp, arrived_ns)
 
     def note_announcement(self, announcement: Announcement, receiver_ssrc: int | None, arrived_ns: int) -> None:
-        """Note a sender's datagram that arrived at `arrived_ns`, by the clock of our reports.
+        """Note a sender's datagram that arrived at `arrived_ns`, on the clock that this receiver's reports use.
 
-        An answer to one of our reports gives our round-trip time. Our next report returns the time of the last sender
-        report, from which the sender computes its own round-trip time.
+        An answer to one of these reports gives `round_trip_ns`. The next of these reports returns the time of the last
+        sender report, from which the sender computes the round-trip time, too.
         """
         for report in announcement.reports:
             self._sender_report = report, arrived_ns
@@ -119,11 +119,14 @@ class Reception:
             duration_ns, self._sampled_ns = now_ns - self._sampled_ns, now_ns
         round_trip_us = None if self.round_trip_ns is None else self.round_trip_ns // 1000
         return ReceptionSample(
-            duration_ns=duration_ns, jitter_us=round(self._jitter * 100 / 9), round_trip_us=round_trip_us, **since
+            duration_ns=duration_ns,
+            jitter_us=round(self._jitter * 100 / 9),  # a tick of the RTP clock (90 kHz) is 100 / 9 us
+            round_trip_us=round_trip_us,
+            **since,
         )
 
     def _begin_stream(self, ssrc: int, arrived_ns: int) -> None:
-        """Begin a stream, since a report covers one stream only."""
+        """Begin the statistics of another stream, since a report covers one stream only."""
         self._ssrc = ssrc
         self._transit, self._jitter = None, 0.0
         self._packets_reported = self._arrived() - 1  # the first packet belongs to the first report

@@ -110,7 +110,7 @@ class Feedback(Struct, frozen=True):
 
     reports: tuple[ReceptionReport, ...] = ()
     picture_loss: bool = False
-    """The receiver requests a keyframe."""
+    """The receiver lost a picture, and so requests a keyframe."""
     limits: tuple[BitRateLimit, ...] = ()
     reference_times: tuple[ReferenceTime, ...] = ()
 
@@ -202,18 +202,18 @@ def parse_feedback(datagram: bytes) -> Feedback:
     reports: list[ReceptionReport] = []
     limits: list[BitRateLimit] = []
     references: list[ReferenceTime] = []
-    lost = False
+    picture_lost = False
     for count, kind, body in _packets(datagram):
         if kind in _BEFORE_BLOCKS:
             reports += _report_blocks(kind, count, body)
         elif (kind, count) == (_PAYLOAD_FEEDBACK, _PICTURE_LOSS):
             _check(len(body) == _FEEDBACK.size, "picture-loss indication of a wrong length")
-            lost = True
+            picture_lost = True
         elif (kind, count) == (_TRANSPORT_FEEDBACK, _MAX_BIT_RATE):
             limits += _limits(body)
         elif kind == _EXTENDED_REPORT:
             references += read_reference_times(body)
-    return Feedback(tuple(reports), lost, tuple(limits), tuple(references))
+    return Feedback(tuple(reports), picture_lost, tuple(limits), tuple(references))
 
 
 def parse_announcement(datagram: bytes) -> Announcement:

@@ -1,8 +1,8 @@
-"""Extended reports (RFC 3611) that give the receiver the round-trip time, too: reference times and their answers.
+"""Extended reports (RFC 3611) that give the receiver the round-trip time: reference times and their answers.
 
-The receiver sends the time of its clock (section 4.4); the sender returns it with the delay since it arrived (section
-4.5). `rtcp.py` puts these bodies into RTCP packets of type 207. The header of a block has the layout of an RTCP
-packet's header (section 3).
+The sender gets it from ordinary reports (RFC 3550). For this one, the receiver sends the time of its clock (section
+4.4), and the sender returns it with the delay since it arrived (section 4.5). `rtcp.py` puts these bodies into RTCP
+packets of type 207. The header of a block has the layout of an RTCP packet's header (section 3).
 """
 
 from __future__ import annotations

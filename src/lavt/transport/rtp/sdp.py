@@ -1,4 +1,4 @@
-"""Session description (SDP, RFC 8866) of our RTP stream: the file with which a plain RTP receiver opens it."""
+"""Session description (SDP, RFC 8866) of LAVT's RTP stream: the file with which a plain RTP receiver opens it."""
 
 from __future__ import annotations
 

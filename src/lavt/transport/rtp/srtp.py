@@ -26,8 +26,8 @@ KEY_BYTES: Final = 28
 MAX_PACKET_BYTES: Final = 1352
 """Longest packet to protect: with the most that libsrtp adds it must fit into pylibsrtp's buffer of 1500 bytes."""
 WINDOW_PACKETS: Final = 4096
-"""Replay window. A packet less far behind the newest of its SSRC is accepted: 0.3 s of 50 Mb/s in packets of 460 bytes
-or more."""
+"""Replay window: a packet that is fewer than this many packets behind the newest of its SSRC is accepted. At 50 Mb/s in
+packets of 460 bytes or more, it covers 0.3 s."""
 
 
 class Protector:

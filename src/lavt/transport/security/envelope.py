@@ -397,7 +397,7 @@ def _digest(data: bytes) -> bytes:
 
 
 def _has_stored_number(channel: str, body: bytes) -> bool:
-    """Return whether a request is an emergency stop whose number the vehicle remembers, so that a replay is known."""
+    """Return whether a request is an emergency stop whose number the vehicle stores, so that it recognizes a replay."""
     if channel != "session" or body == b"":
         return False
     request = decode(SessionRequest, body)

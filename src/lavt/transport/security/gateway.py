@@ -69,7 +69,7 @@ class ServerGateway:
             verify = self._verify_command if channel == "control" else self._verify_request
             body = verify(channel, payload, arrived.mono_ns, peer)
             retry, self._retry = self._retry, None
-        if retry is not None:  # without the lock, for which the vehicle would wait while the link waits for its router
+        if retry is not None:  # outside the lock: the link may wait for its router, and `send` must not wait for that
             self._carry(retry)
         if body is not None:
             self._deliver(channel, body, arrived, peer)

@@ -1,8 +1,8 @@
 """Encryption of the video's packets: none, or SRTP with keys that are used for one path only.
 
-The keys are derived from the session token and from the challenge that opened the path. If messages are signed, only
-the two ends know the token. So each time the path is opened, each direction gets a new key and a packet index that
-starts at 0.
+The keys are derived from the session token and from the challenge that opened the path. So each time the path is
+opened, each direction gets a new key, and a packet index that starts at 0. The token is a secret of the two ends only
+if messages are signed.
 """
 
 from __future__ import annotations
@@ -71,6 +71,7 @@ def plain_cipher(_token: bytes, _challenge: bytes) -> Cipher:
 def _derive_key(sender: End, token: bytes, challenge: bytes) -> bytes:
     """Derive the key of one direction.
 
-    The token is as good as random, so one step of HMAC-SHA256 is enough (RFC 5869).
+    The token is random, so HKDF's first step (extraction) is not needed, and its second step (expansion) is one
+    HMAC-SHA256 (RFC 5869, section 3.3).
     """
     return hmac.digest(token, _LABELS[sender] + challenge, "sha256")[:KEY_BYTES]

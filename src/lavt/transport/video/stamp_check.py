@@ -19,8 +19,8 @@ LEARNED_AFTER: Final = 5
 """Stamps that must agree with each other before one is accepted."""
 RELEARN_AFTER_NS: Final = 12 * NS_PER_S
 """If the timestamps continue without a jump, stamps replace the line only after they have agreed with each other, and
-none with the line, for this time. If a lost packet has left an old cell in the high bits, all stamps are wrong by the
-same amount until the next keyframe: 8.3 s at x264's default of 250 frames and 30 Hz."""
+none with the line, for this time. If a lost packet has left a cell of an older stamp in the high bits, all stamps are
+wrong by the same amount until the next keyframe: 8.3 s at x264's default of 250 frames and 30 Hz."""
 JUMP_NS: Final = 60 * NS_PER_S
 """If timestamps went back, or forward by more than this, the sender has restarted: the line is replaced as
 soon as `LEARNED_AFTER` stamps agree with each other."""

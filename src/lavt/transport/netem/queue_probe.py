@@ -1,9 +1,10 @@
-"""Measure an interface's queue on one machine: send frames into it and capture them when they leave.
+"""Queue probes: measure an interface's queue on one machine with test packets, captured when they leave the queue.
 
-A packet socket puts frames that look like those of a flow into the interface's queue. Another packet socket receives
-the kernel's copy of each frame after the queue, with the time (packet(7)). The time at which a frame is sent is of the
-same wall clock. Nobody receives the frames: they go to 192.0.2.1 of the documentation range (RFC 5737) at the
-interface's own hardware address, which no switch forwards, with a time to live of 1. Needs root.
+A packet socket puts test packets that look like those of a flow into the interface's queue. Another packet socket
+receives the kernel's copy of each packet after the queue, with the time of departure (packet(7)). The sending time is
+read from the same clock, the wall clock. Nobody receives the test packets: they go to 192.0.2.1 of the documentation
+range (RFC 5737) at the interface's own hardware address, which no switch forwards, with a time to live of 1. Needs
+root.
 """
 
 from __future__ import annotations
@@ -33,36 +34,36 @@ from lavt.transport.emulation.impairment import (
 )
 
 PERIOD_NS: Final = 20 * NS_PER_MS
-"""Period of the frames of one flow."""
+"""Period of the test packets of one queue probe."""
 DRAIN_MARGIN_NS: Final = 300 * NS_PER_MS
 POLL_NS: Final = 10 * NS_PER_MS
-"""Polling period for frames that are still in the queue."""
+"""Polling period for test packets that are still in the queue."""
 MEDIAN_TOLERANCE_MS: Final = 1.0
 """Largest accepted difference between a median and the requested delay."""
 SHARE_TOLERANCE_SIGMAS: Final = 4.0
 """Largest accepted difference between a measured and the requested share, in standard deviations of the binomial
 distribution; one packet is added to it."""
 OTHER_PORT: Final = 9
-"""Port of the other end of a frame: that of the discard service."""
+"""Port of the other end of a test packet: that of the discard service."""
 RTP_FIRST_BYTE: Final = 0x80
 PATH_FIRST_BYTE: Final = ord("L")
 """The first byte of a message of the path validation."""
 
 _SOURCE, _DESTINATION = socket.inet_aton("192.0.2.2"), socket.inet_aton("192.0.2.1")
 _LOCAL_ADDRESS: Final = b"\x02LAVT\0"
-"""Destination hardware address of the frames if the interface has none, like the loopback, which drops them."""
+"""Destination hardware address of test packets if the interface has none, like the loopback, which drops them."""
 _SO_ATTACH_FILTER: Final = 26
 _SO_RCVBUFFORCE: Final = 33
 _ALL_PROTOCOLS, _IPV4 = 0x0003, 0x0800
 _MARK: Final = struct.Struct(">QIq")
-"""Identifier of the measurement, number of the frame, time of sending."""
+"""Identifier of the measurement, serial number of the test packet, time of sending."""
 _HEADER_BYTES: Final = {"udp": 28, "tcp": 40}
-_LONGEST_FRAME: Final = 2048
+_LONGEST_PACKET: Final = 2048
 _RECEIVE_BUFFER_BYTES: Final = 1 << 20
 
 
-class ProbeSpec(Struct, frozen=True):
-    """Frames of one kind, and the impairment that they should get."""
+class QueueProbe(Struct, frozen=True):
+    """Test packets of one kind, and the impairment that they should get."""
 
     name: str
     protocol: Literal["udp", "tcp"]
@@ -73,11 +74,11 @@ class ProbeSpec(Struct, frozen=True):
 
 
 class ProbeResult(Struct, frozen=True):
-    """The measurement of a probe's frames: counts, and percentiles of the delay in milliseconds.
+    """The measurement of a queue probe: counts of its test packets, and percentiles of their delay in milliseconds.
 
-    `reordered` frames were overtaken by later ones. If a share of the packets is reordered, `early` counts the frames
-    that were not delayed, and the percentiles are those of the others. They are None if fewer than two frames came
-    through.
+    `reordered` counts packets that left after a later one. netem reorders by sending a share of the packets at once. If
+    such a share is requested, `early` counts them, and the percentiles are those of the delayed packets. These are None
+    if fewer than two delayed packets left the queue.
     """
 
     sent: int
@@ -89,30 +90,31 @@ class ProbeResult(Struct, frozen=True):
     p95_ms: float | None
 
 
-def probes(flows: Sequence[ImpairedFlow], exempt: Sequence[ExemptPort] = ()) -> list[ProbeSpec]:
-    """Return the probes for flows, and for packets that must not be delayed."""
+def queue_probes(flows: Sequence[ImpairedFlow], exempt: Sequence[ExemptPort] = ()) -> list[QueueProbe]:
+    """Return the queue probes for flows, and for packets that must not be delayed."""
     impaired, unimpaired = [], []
     impaired_ports = {(flow.protocol, flow.port, flow.end) for flow in flows}
     for flow in flows:
         outward, backward = (flow.port, OTHER_PORT), (OTHER_PORT, flow.port)
         if flow.end == "destination":
             outward, backward = backward, outward
-        impaired.append(ProbeSpec(flow.name, flow.protocol, *outward, flow.impairment))
+        impaired.append(QueueProbe(flow.name, flow.protocol, *outward, flow.impairment))
         other_end: Literal["source", "destination"] = "source" if flow.end == "destination" else "destination"
         if (flow.protocol, flow.port, other_end) not in impaired_ports:
-            unimpaired.append(ProbeSpec(f"{flow.name}, other direction", flow.protocol, *backward, Impairment()))
+            unimpaired.append(QueueProbe(f"{flow.name}, other direction", flow.protocol, *backward, Impairment()))
         if flow.name == "video":
             unimpaired.append(
-                ProbeSpec("challenges of the video's path", flow.protocol, *outward, Impairment(), PATH_FIRST_BYTE)
+                QueueProbe("challenges of the video's path", flow.protocol, *outward, Impairment(), PATH_FIRST_BYTE)
             )
     unimpaired += [
-        ProbeSpec(port.service, port.protocol, port.port, port.port, Impairment()) for port in (*ALWAYS_EXEMPT, *exempt)
+        QueueProbe(port.service, port.protocol, port.port, port.port, Impairment())
+        for port in (*ALWAYS_EXEMPT, *exempt)
     ]
     return impaired + unimpaired
 
 
-def measure(interface: str, requested: Sequence[ProbeSpec], *, count: int = 50) -> dict[str, ProbeResult]:
-    """Send `count` frames for each probe, `PERIOD_NS` apart, and return the results by probe name.
+def measure(interface: str, requested: Sequence[QueueProbe], *, count: int = 50) -> dict[str, ProbeResult]:
+    """Send `count` test packets for each queue probe, `PERIOD_NS` apart, and return the results by probe name.
 
     Raise `UserError` without root, and for an interface that does not exist or is down.
     """
@@ -124,15 +126,15 @@ def measure(interface: str, requested: Sequence[ProbeSpec], *, count: int = 50) 
         ) from error
 
 
-def _measure(interface: str, requested: Sequence[ProbeSpec], count: int) -> dict[str, ProbeResult]:
+def _measure(interface: str, requested: Sequence[QueueProbe], count: int) -> dict[str, ProbeResult]:
     clock = MachineClock()
     with _open(interface) as receiver, _open_sender() as sender:
-        captured = _CapturedFrames(receiver, requested, clock.now().mono_ns)
+        captured = _CapturedPackets(receiver, requested, clock.now().mono_ns)
         link = (interface, _IPV4, 0, 0, _hardware_address(interface))
         begin_ns = clock.now().mono_ns
         for number in range(count):
             for index, probe in enumerate(requested):
-                _send(sender, _frame(probe, captured.mark(number, index, clock.now().wall_ns)), link)
+                _send(sender, _test_packet(probe, captured.mark(number, index, clock.now().wall_ns)), link)
             pause(begin_ns + (number + 1) * PERIOD_NS - clock.now().mono_ns)
             captured.receive()  # the kernel takes the times, so this need not be prompt
         longest_ns = round(max(probe.impairment.longest_ms for probe in requested) * NS_PER_MS)
@@ -146,7 +148,7 @@ def _measure(interface: str, requested: Sequence[ProbeSpec], count: int) -> dict
 
 
 def summarize(impairment: Impairment, sent: int, delays: Sequence[tuple[int, float]]) -> ProbeResult:
-    """Summarize the frames of a probe: (number, delay in milliseconds), in the order of departure."""
+    """Summarize the test packets of a queue probe: (number, delay in milliseconds), in the order of departure."""
     newest, reordered = -1, 0
     for number, _ in delays:
         reordered += number < newest
@@ -164,10 +166,12 @@ def judge(
     flows: Sequence[ImpairedFlow], exempt: Sequence[ExemptPort], measured: Mapping[str, ProbeResult]
 ) -> list[str]:
     """Return a message for each measurement that differs from the request."""
-    return [reason for probe in probes(flows, exempt) for reason in _check_delays(probe, measured.get(probe.name))]
+    return [
+        reason for probe in queue_probes(flows, exempt) for reason in _check_delays(probe, measured.get(probe.name))
+    ]
 
 
-def _check_delays(probe: ProbeSpec, found: ProbeResult | None) -> list[str]:
+def _check_delays(probe: QueueProbe, found: ProbeResult | None) -> list[str]:
     name, impairment = probe.name, probe.impairment
     if found is None:
         return [f"{name}: no packet came through"]
@@ -199,7 +203,7 @@ def _check_delays(probe: ProbeSpec, found: ProbeResult | None) -> list[str]:
     return reasons + _check_counts(probe, found)
 
 
-def _check_counts(probe: ProbeSpec, found: ProbeResult) -> list[str]:
+def _check_counts(probe: QueueProbe, found: ProbeResult) -> list[str]:
     name, impairment = probe.name, probe.impairment
     reasons = []
     if not _is_plausible_share(found.lost, found.sent, impairment.loss, _variance_factor(impairment)):
@@ -214,11 +218,15 @@ def _check_counts(probe: ProbeSpec, found: ProbeResult) -> list[str]:
     return reasons
 
 
-def _is_plausible_share(count: int, of: int, share: float, variance_factor: float) -> bool:
-    """Return whether a count is within the limits of a binomial share with its variance times `variance_factor`."""
+def _is_plausible_share(count: int, packets: int, share: float, variance_factor: float) -> bool:
+    """Return whether `count` of `packets` is plausible if each packet counts with probability `share`.
+
+    The variance is that of the binomial distribution times `variance_factor`.
+    """
     if share == 0:
         return count == 0
-    return abs(count - of * share) <= SHARE_TOLERANCE_SIGMAS * math.sqrt(of * share * (1 - share) * variance_factor) + 1
+    deviation = math.sqrt(packets * share * (1 - share) * variance_factor)
+    return abs(count - packets * share) <= SHARE_TOLERANCE_SIGMAS * deviation + 1
 
 
 def _variance_factor(impairment: Impairment) -> float:
@@ -229,10 +237,10 @@ def _variance_factor(impairment: Impairment) -> float:
     return (1 + correlation) / (1 - correlation)
 
 
-class _CapturedFrames:
-    """The captured frames of each probe, as (number, delay in milliseconds) in the order of departure."""
+class _CapturedPackets:
+    """The captured test packets of each probe, as (number, delay in milliseconds) in the order of departure."""
 
-    def __init__(self, receiver: socket.socket, requested: Sequence[ProbeSpec], run_id: int) -> None:
+    def __init__(self, receiver: socket.socket, requested: Sequence[QueueProbe], run_id: int) -> None:
         self._receiver = receiver
         self._requested = requested
         self._run_id = run_id
@@ -240,25 +248,25 @@ class _CapturedFrames:
         self.delays: list[list[tuple[int, float]]] = [[] for _ in requested]
 
     def mark(self, number: int, index: int, sent_ns: int) -> bytes:
-        """Return the bytes that identify frame `number` of the probe `index` of this measurement."""
+        """Return the bytes that identify test packet `number` of the probe `index` of this measurement."""
         return _MARK.pack(self._run_id, number * len(self._requested) + index, sent_ns)
 
     def receive(self) -> None:
-        """Receive all frames that have left so far."""
+        """Receive all test packets that have left so far."""
         while True:
             try:
-                frame, ancillary, _flags, address = self._receiver.recvmsg(_LONGEST_FRAME, ANCILLARY_BYTES)
+                packet, ancillary, _flags, address = self._receiver.recvmsg(_LONGEST_PACKET, ANCILLARY_BYTES)
             except BlockingIOError:
                 return
             if address[2] == socket.PACKET_OUTGOING:
-                self._record(frame, ancillary)
+                self._record(packet, ancillary)
 
-    def _record(self, frame: bytes, ancillary: Sequence[Any]) -> None:
-        protocol = {17: "udp", 6: "tcp"}.get(frame[9] if len(frame) > 9 else 0, "")
-        begin = _HEADER_BYTES.get(protocol, _LONGEST_FRAME) + 1
-        if len(frame) < begin + _MARK.size:
+    def _record(self, packet: bytes, ancillary: Sequence[Any]) -> None:
+        protocol = {17: "udp", 6: "tcp"}.get(packet[9] if len(packet) > 9 else 0, "")
+        begin = _HEADER_BYTES.get(protocol, _LONGEST_PACKET) + 1
+        if len(packet) < begin + _MARK.size:
             return
-        run_id, serial, sent_ns = _MARK.unpack_from(frame, begin)
+        run_id, serial, sent_ns = _MARK.unpack_from(packet, begin)
         kernel_time = next(
             (data for level, kind, data in ancillary if (level, kind) == (socket.SOL_SOCKET, SO_TIMESTAMPNS)), b""
         )
@@ -271,7 +279,7 @@ class _CapturedFrames:
 
 
 def _open(interface: str) -> socket.socket:
-    """Open the socket that captures departing frames to our address, without their link-layer header."""
+    """Open the socket that captures departing packets to the test address, without their link-layer header."""
     try:
         receiver = socket.socket(socket.AF_PACKET, socket.SOCK_DGRAM, 0)
     except PermissionError as error:
@@ -279,10 +287,10 @@ def _open(interface: str) -> socket.socket:
     try:
         receiver.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         receiver.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _RECEIVE_BUFFER_BYTES)
-        # BPF: load the word at 16 (the destination); if it is ours accept the whole packet, else none of it.
-        ours = int.from_bytes(_DESTINATION, "big")
-        code = [(0x20, 0, 0, 16), (0x15, 0, 1, ours), (0x06, 0, 0, 0xFFFF), (0x06, 0, 0, 0)]
-        program = ctypes.create_string_buffer(b"".join(struct.pack("HBBI", *each) for each in code))
+        # BPF: load the word at 16 (the destination); if it is the test address, accept the packet, otherwise drop it.
+        destination = int.from_bytes(_DESTINATION, "big")
+        code = [(0x20, 0, 0, 16), (0x15, 0, 1, destination), (0x06, 0, 0, 0xFFFF), (0x06, 0, 0, 0)]
+        program = ctypes.create_string_buffer(b"".join(struct.pack("HBBI", *instruction) for instruction in code))
         filtered = struct.pack("HL", len(code), ctypes.addressof(program))
         receiver.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, filtered)
         receiver.bind((interface, _ALL_PROTOCOLS))
@@ -297,9 +305,9 @@ def _open_sender() -> socket.socket:
     return socket.socket(socket.AF_PACKET, socket.SOCK_DGRAM, 0)
 
 
-def _send(sender: socket.socket, frame: bytes, link: tuple[str, int, int, int, bytes]) -> None:
+def _send(sender: socket.socket, packet: bytes, link: tuple[str, int, int, int, bytes]) -> None:
     try:
-        sender.sendto(frame, link)
+        sender.sendto(packet, link)
     except BlockingIOError:
         return
     except OSError as error:  # netem also reports the packets that it drops
@@ -314,8 +322,8 @@ def _hardware_address(interface: str) -> bytes:
     return address if any(address) else _LOCAL_ADDRESS
 
 
-def _frame(probe: ProbeSpec, mark: bytes) -> bytes:
-    """Return an IPv4 packet of a probe's kind. Nobody receives it, so UDP and TCP checksums are left out."""
+def _test_packet(probe: QueueProbe, mark: bytes) -> bytes:
+    """Return a test packet (IPv4) of a probe. Nobody receives it, so UDP and TCP checksums are left out."""
     payload = bytes([probe.first_byte]) + mark
     if probe.protocol == "udp":
         protocol_number = 17
