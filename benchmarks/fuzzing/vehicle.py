@@ -268,7 +268,9 @@ def vehicle_driven(seed: int) -> Target:
         side.bench.advance(STEP_NS)
         if inputs % INPUTS_PER_COMMAND == 0 and side.gate.state == "driving":
             side.send_command()
-            expect(side.vehicle.requested.throttle > 0, f"the operator's command was rejected: {side.gate.last_rejection}")
+            expect(
+                side.vehicle.requested.throttle > 0, f"the operator's command was rejected: {side.gate.last_rejection}"
+            )
 
     return Target(
         {"control": side.control, "session": side.session},
