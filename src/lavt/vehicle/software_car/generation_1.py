@@ -21,7 +21,7 @@ FULL_TORQUE_NM = 3412
 UNKNOWN: Final = -0x8000
 """Value of a 16-bit field whose quantity is unknown."""
 CLEARING_LENGTH = 4
-"""A command of this length in bytes has no counter and only clears an override."""
+"""A command of this length in bytes has no counter and only clears: an override, and the watchdog."""
 
 PEDAL_COMMAND = (
     BitField("command", 0, 16),

@@ -94,7 +94,7 @@ class AxisOrder(Struct, frozen=True):
     rate_radps: float = 0.0
     """The largest rate of the steering wheel."""
     count: int | None = None
-    """None: the frame has no counter and only clears an override."""
+    """None: the frame has no counter and only clears: an override, and the watchdog."""
 
 
 class GearOrder(Struct, frozen=True):
