@@ -158,7 +158,7 @@ class VehicleSide:
             self.send_command()
             if self.gate.state == "driving":
                 return
-        raise InvariantViolation(f"the operator cannot arm the vehicle: {self.gate.rejected}")
+        raise InvariantViolation(f"the operator cannot arm the vehicle: {self.gate.last_rejection}")
 
 
 def old_commands() -> list[bytes]:
@@ -269,7 +269,9 @@ def vehicle_driven(seed: int) -> Target:
         side.bench.advance(STEP_NS)
         if inputs % INPUTS_PER_COMMAND == 0 and side.gate.state == "driving":
             side.send_command()
-            expect(side.vehicle.requested.throttle > 0, f"the operator's command was rejected: {side.gate.rejected}")
+            expect(
+                side.vehicle.requested.throttle > 0, f"the operator's command was rejected: {side.gate.last_rejection}"
+            )
 
     return Target(
         {"control": side.control, "session": side.session},

@@ -28,7 +28,7 @@ def test_a_valid_command_is_accepted_unchanged() -> None:
     assert rig.drive(steering_rad=0.001, throttle=0.4).accepted
     assert rig.actuation() == Actuation(0.001, 0.4, 0.0)
     assert rig.gate.epoch.sequence == rig.sequence
-    assert rig.gate.rejected == ""
+    assert rig.gate.last_rejection == ""
 
 
 def test_a_rejected_command_has_a_reason_and_is_counted() -> None:
@@ -47,7 +47,7 @@ def test_a_rejected_command_has_a_reason_and_is_counted() -> None:
         before = rejection_counts(rig).get(reason, 0)
         verdict = rig.drive(**changes)
         assert (verdict.accepted, verdict.reason) == (False, reason)
-        assert rig.gate.rejected == verdict.message == reason.value
+        assert rig.gate.last_rejection == verdict.message == reason.value
         assert rejection_counts(rig)[reason] == before + 1
     assert rig.now_ns == now_ns
     assert rig.actuation().throttle == 0.25

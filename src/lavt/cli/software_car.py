@@ -87,7 +87,7 @@ def software_car(
         port.close()
     if as_json:
         counts = {**runner.counts, **port.counts}
-        console.print_json({"counts": counts, "latest_ms": runner.latest_ns / NS_PER_MS})
+        console.print_json({"counts": counts, "latest_ms": runner.max_delay_ns / NS_PER_MS})
 
 
 def _run(

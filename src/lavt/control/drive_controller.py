@@ -80,9 +80,9 @@ that a vehicle allows by default. Valid for the simulator's default car (steerin
 PAPER_CALIBRATED = Preset("paper_calibrated", lookahead_s=0.74, steering_limit_rad=0.21)
 """The preset that reproduces the paper, which gives no gains; fitted only to where the paper's completion rate falls.
 
-Lookahead and steering limit (5.2 m/s2 at 30 km/h) put the collapse between L2 and L3; every other figure follows from
-them. They leave a phase margin of 19 degrees at L0, too little for a designed controller. Valid for the simulator's
-default car.
+Lookahead and steering limit (5.2 m/s2 at 30 km/h) were chosen so that the completion rate collapses between the
+conditions L2 and L3, as in the paper; no other figure was fitted. They leave a phase margin of 19 degrees at L0, too
+little for a designed controller. Valid for the simulator's default car.
 """
 
 PRESETS = {preset.name: preset for preset in (DESIGNED, PAPER_CALIBRATED)}

@@ -9,14 +9,14 @@ from lavt.control.client_limits import CLIENT_LIMITS
 LaneState = Literal["ok", "brake", "stop"]
 
 LANE_CONFIDENCE = 0.2
-"""A lane with less confidence counts as lost. 0.2 is one line over 40 % of the length; a broken line alone gives
-0.4."""
+"""A lane with less confidence counts as lost. 0.2 is the confidence if only one line is visible, over 40 % of the
+length; a broken line that is visible alone gives 0.4."""
 BRAKE_AFTER_NS = CLIENT_LIMITS.no_lane_brake_ns
 STOP_AFTER_NS = CLIENT_LIMITS.no_lane_stop_ns
 
 
 class LaneWatch:
-    """A timer of the last confident lane detection."""
+    """A timer of the time since the last confident lane detection."""
 
     def __init__(self) -> None:
         self._last_lane_ns: int | None = None

@@ -276,7 +276,7 @@ class ActuatorNode:
             safety=self.gate.state,
             reason=self.gate.machine.reason,
             applied_sequence=self.gate.epoch.sequence,
-            rejected=self.gate.rejected if now.mono_ns - self._rejected_ns < REJECTION_SHOWN_NS else "",
+            rejected=self.gate.last_rejection if now.mono_ns - self._rejected_ns < REJECTION_SHOWN_NS else "",
             limited=", ".join(self._limited),
             active_operator=active_operator,
             active_operator_instance=active_operator_instance,

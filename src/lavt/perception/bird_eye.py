@@ -83,8 +83,8 @@ class BirdEye:
     bottom_px: int
     region_from_grid: FloatArray | DistortionMaps
     """From the grid to the cropped rows: a homography, or maps for a lens with distortion."""
-    hidden: NDArray[np.uint8] | None
-    """0 for cells that the time stamp covers, 255 for others; None when it covers none."""
+    unstamped_mask: NDArray[np.uint8] | None
+    """255 for cells that the time stamp does not cover, 0 for those that it covers; None when it covers none."""
 
     def region(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return the rows of `picture` that contain the grid, without a copy."""
@@ -98,8 +98,8 @@ class BirdEye:
         else:
             flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
             visible = cv2.warpPerspective(region, self.region_from_grid, size, flags=flags)
-        if self.hidden is not None:
-            visible = cv2.bitwise_and(visible, visible, mask=self.hidden)
+        if self.unstamped_mask is not None:
+            visible = cv2.bitwise_and(visible, visible, mask=self.unstamped_mask)
         return np.asarray(visible, dtype=np.uint8)
 
 
@@ -114,23 +114,23 @@ def bird_eye(camera: CalibratedCamera, grid: GroundGrid, *, stamped: bool = True
         inside = (u_px >= 0) & (u_px <= camera.width_px - 1) & (v_px >= 0) & (v_px <= camera.height_px - 1)
         margin_px = STAMP_MARGIN_PX * max(camera.scale, 1.0)
         stamp = inside & (u_px < STAMP_SIDE_PX + margin_px) & (v_px < STAMP_SIDE_PX + ROW_MARGIN_PX) & stamped
-    ahead = np.abs(grid.column_y_m()) < CENTRAL_HALF_WIDTH_M
+    central = np.abs(grid.column_y_m()) < CENTRAL_HALF_WIDTH_M
     visible = inside & ~stamp
-    if visible[:, ahead].mean() < MIN_VISIBLE_SHARE or not visible[: grid.rows // 2, ahead].any():
+    if visible[:, central].mean() < MIN_VISIBLE_SHARE or not visible[: grid.rows // 2, central].any():
         raise UserError(
             f"the camera does not see the road {grid.near_m} to {grid.far_m} m ahead of the rear axle; "
             "correct its position, yaw, pitch, roll, lens or picture size"
         )
     top_px = max(math.floor(v_px[inside].min()) - ROW_MARGIN_PX, 0)
     bottom_px = min(math.ceil(v_px[inside].max()) + ROW_MARGIN_PX, camera.height_px)
-    hidden = np.where(stamp, 0, 255).astype(np.uint8) if stamp.any() else None
+    unstamped_mask = np.where(stamp, 0, 255).astype(np.uint8) if stamp.any() else None
     if not camera.distortion:
         shift = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, -top_px], [0.0, 0.0, 1.0]])
         homography = shift @ ground_to_picture(camera) @ grid.to_ground()
-        return BirdEye(grid, top_px, bottom_px, homography, hidden)
+        return BirdEye(grid, top_px, bottom_px, homography, unstamped_mask)
     maps = np.where(inside[..., None], pixels - (0, top_px), -9.0).astype(np.float32)  # -9: outside the picture
     whole, fractions = cv2.convertMaps(maps[..., 0], maps[..., 1], cv2.CV_16SC2)
-    return BirdEye(grid, top_px, bottom_px, (np.asarray(whole), np.asarray(fractions)), hidden)
+    return BirdEye(grid, top_px, bottom_px, (np.asarray(whole), np.asarray(fractions)), unstamped_mask)
 
 
 def _cell_pixels(camera: CalibratedCamera, grid: GroundGrid) -> FloatArray:

@@ -1,4 +1,4 @@
-"""The lane detectors: from a sequence of pictures, and from lanes without pixels."""
+"""The lane detectors: one for pictures, and one for the true lanes of a camera without pixels."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ GRID = GroundGrid()
 LANE_WIDTH_M = 3.5
 """The lane's width until it has been measured."""
 TRACK_CONFIDENCE = 0.2
-"""A fit with less confidence is not followed. 0.2 is one line over 40 % of the length."""
+"""A fit with less confidence is not followed. 0.2 is the confidence if only one line is visible, over 40 % of the
+length."""
 REFINEMENTS = 2
 """How often a found lane is fitted again. Each time, a curve that was fitted nearby reaches points farther away."""
 FORGET_AFTER_PICTURES = 3
@@ -40,8 +41,8 @@ FORGET_AFTER_PICTURES = 3
 FOLLOWS_FOR_NS = 350 * NS_PER_MS
 """The longest gap between pictures over which a lane is followed; after a longer one the caller calls `forget`.
 
-In that time a lane with a radius of 42 m moves sideways by `CORRIDOR_M`, 10 m ahead of a car that drives straight at
-30 km/h, so a line at the old position may be another one.
+In that time, for a car that drives straight at 30 km/h, a lane with a radius of 42 m moves sideways by `CORRIDOR_M` at
+10 m ahead. So after a longer gap a line at the old position may be another one.
 """
 DROP_LANE_AT_WIDTHS = 1.0
 """A lane is dropped when the car is this many lane widths off its centre: it is then in the middle of the next lane."""
@@ -95,7 +96,7 @@ class LaneDetector:
         self._misses = FORGET_AFTER_PICTURES
 
     def detect(self, picture_bgr: Picture) -> Lane:
-        """Return the lane in the next picture; raise `ValueError` unless it is (height, width, 3) as the camera's."""
+        """Return the lane in the next picture; raise `ValueError` unless its shape is the camera's, (h, w, 3)."""
         if picture_bgr.shape != self._shape:
             raise ValueError(f"a picture of shape {picture_bgr.shape}, not {self._shape}")
         mask = self.bird_eye.from_above(lane_pixels(self.bird_eye.region(picture_bgr), self._scale))

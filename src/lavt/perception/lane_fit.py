@@ -151,21 +151,21 @@ def sides_by_windows(
     """
     length_m, half_width_m = WINDOW_M
     offset_m = points.y_m - _evaluate_centre(points.x_m, start)[0]
-    distance_m = 0.0
+    middle_m = 0.0
     sides = np.zeros(len(points.x_m), dtype=np.int8)
     windows = []
     for low_m in np.arange(grid.near_m, grid.far_m, length_m):
         inside = (points.x_m >= low_m) & (points.x_m < low_m + length_m)
         measured_offsets_m = []
-        windows.append((float(low_m), distance_m))
+        windows.append((float(low_m), middle_m))
         for side in (1, -1):
-            line_m = distance_m + side * width_m / 2
+            line_m = middle_m + side * width_m / 2
             in_window = inside & (np.abs(offset_m - line_m) < half_width_m)
             sides[in_window] = side
             if np.count_nonzero(in_window) >= MIN_WINDOW_POINTS:
                 measured_offsets_m.append(float(np.mean(offset_m[in_window])) - line_m)
         if measured_offsets_m:
-            distance_m += sum(measured_offsets_m) / len(measured_offsets_m)
+            middle_m += sum(measured_offsets_m) / len(measured_offsets_m)
     return sides, tuple(windows)
 
 
@@ -192,24 +192,24 @@ def fit_lane(
     fit = _fit_once(kept, kept_side, width_m, slopes_of=fit[0])
     if fit is None or abs(fit[0][1]) > MAX_SLOPE or 2 * abs(fit[0][2]) > MAX_CURVATURE_PER_M:
         return None
-    centre, measured_m = fit
-    across = _lateral_offset_m(points, centre)
-    outside_m = np.abs(across) - measured_m / 2
-    near_line = np.abs(outside_m)
+    centre, fitted_width_m = fit
+    offset_m = _lateral_offset_m(points, centre)
+    outside_m = np.abs(offset_m) - fitted_width_m / 2  # distance beyond the nearer line; negative inside the lane
+    line_distance_m = np.abs(outside_m)
     return LaneFit(
         centre=centre,
-        width_m=measured_m,
+        width_m=fitted_width_m,
         near_m=float(kept.x_m.min()),
         far_m=float(kept.x_m.max()),
-        left_visible=_visible_share(points.x_m[across > 0], near_line[across > 0], grid),
-        right_visible=_visible_share(points.x_m[across < 0], near_line[across < 0], grid),
-        on_line_share=float(np.count_nonzero(near_line < OUTLIER_M))
+        left_visible=_visible_share(points.x_m[offset_m > 0], line_distance_m[offset_m > 0], grid),
+        right_visible=_visible_share(points.x_m[offset_m < 0], line_distance_m[offset_m < 0], grid),
+        on_line_share=float(np.count_nonzero(line_distance_m < OUTLIER_M))
         / max(int(np.count_nonzero(outside_m < CORRIDOR_M)), 1),
     )
 
 
 def has_parallel(points: Points, fit: LaneFit, grid: GroundGrid) -> bool:
-    """Return whether there are two lines a lane's width apart: both of this lane, or one and one of a neighbour."""
+    """Return whether there are two lines a lane's width apart: both of this lane, or one and the next beyond it."""
     visible_sides = [
         side for side, share in ((1, fit.left_visible), (-1, fit.right_visible)) if share >= MIN_PARALLEL_VISIBLE
     ]

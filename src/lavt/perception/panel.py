@@ -131,10 +131,10 @@ def _draw_points(trace: DetectionTrace, grid: GroundGrid) -> Picture:
                 _draw_curve(drawn, _cells(line, grid), EXPECTED, 1)
     length_m, half_width_m = WINDOW_M
     c0, c1, c2 = trace.expected
-    for low_m, off_m in trace.windows:
+    for low_m, offset_m in trace.windows:
         middle_m = low_m + length_m / 2
         for side in (1, -1):
-            y_m = c0 + (c1 + c2 * middle_m) * middle_m + off_m + side * trace.expected_width_m / 2
+            y_m = c0 + (c1 + c2 * middle_m) * middle_m + offset_m + side * trace.expected_width_m / 2
             box = np.array([[low_m, y_m + half_width_m], [low_m + length_m, y_m - half_width_m]])
             first, second = np.round(_cells(box, grid)).astype(int).tolist()
             cv2.rectangle(drawn, first, second, EXPECTED, 1)

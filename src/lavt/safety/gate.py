@@ -38,7 +38,7 @@ class RejectionReason(StrEnum):
 
 
 INTERRUPTS_ARMING = (RejectionReason.NOT_ARMED, RejectionReason.NOT_STATIONARY, RejectionReason.INHIBITED)
-"""A command rejected for one of these reasons interrupts arming: input or vehicle were not at rest."""
+"""A command rejected for one of these reasons interrupts arming: the input or the vehicle was not at rest."""
 
 
 class CommandVerdict(Struct, frozen=True):
@@ -80,7 +80,7 @@ class SafetyGate:
         self.limiter = limiter
         self.instance = instance
         self.counts: Counter[str] = Counter()
-        self.rejected = ""
+        self.last_rejection = ""
         """Message of the last rejection."""
         self.issued_stamps = IssuedStamps(limits.stamp_memory_ns, limits.frozen_frames)
         self.epoch = CommandEpoch(new_epoch)
@@ -166,7 +166,7 @@ class SafetyGate:
             self.machine.trigger("arming interrupted")
         self.counts[f"rejected: {reason}"] += 1
         verdict = CommandVerdict(reason, vehicle.inhibit_reason if reason is RejectionReason.INHIBITED else "")
-        self.rejected = verdict.message
+        self.last_rejection = verdict.message
         return verdict
 
     def _is_fresh(self, command: Command) -> bool:

@@ -29,7 +29,7 @@ class IssuedStamps:
         self._last_crc: int | None = None
         self._last_captured_ns = 0
         self._equal_frames = 0
-        """Number of the last frames that have equal pixels."""
+        """Number of frames in a row, up to the last one, that have equal pixels."""
 
     def add(self, stamp_ns: int, number: int, mono_ns: int, pixel_crc: int, captured_ns: int | None = None) -> None:
         """Store the stamp of a frame that was stamped at `mono_ns`; forget stamps older than the memory.

@@ -101,7 +101,7 @@ class Limiter:
         if not is_known:
             reported_mps = abs(speed_mps) if math.isfinite(speed_mps) else 0.0
             speed_mps = max(reported_mps, self.limits.speed_limit_mps)
-        if abs(speed_mps) < 0.1:
+        if abs(speed_mps) < 0.1:  # so slow that no angle reaches the limit
             return math.pi / 2
         return math.atan(self.wheelbase_m * self.limits.lateral_acceleration_mps2 / (speed_mps * speed_mps))
 

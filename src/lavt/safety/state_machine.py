@@ -106,14 +106,14 @@ class SafetyStateMachine:
 
     def trigger(self, trigger: Trigger, detail: str = "") -> None:
         """Make the transition of a trigger, if the table has one from the present state."""
-        after = TRANSITIONS.get((self.state, trigger))
-        if after is None:
+        next_state = TRANSITIONS.get((self.state, trigger))
+        if next_state is None:
             return
         message = TRIGGER_MESSAGES[trigger]
         reason = f"{message}: {detail}" if detail else message
-        self._transitions.append((self.state, after, reason))
-        self.state, self.reason = after, reason
-        if after in ("safe_stop", "emergency_stop") or trigger == "driver override":
+        self._transitions.append((self.state, next_state, reason))
+        self.state, self.reason = next_state, reason
+        if next_state in ("safe_stop", "emergency_stop") or trigger == "driver override":
             self._end_epoch()
 
     def take_transitions(self) -> list[tuple[SafetyState, SafetyState, str]]:

@@ -42,7 +42,7 @@ class TakeoverRequests:
 
     def reserve(self, now_ns: int) -> None:
         """Reserve the released vehicle for the client whose request is pending, if there is one."""
-        pending = self.requested_by(now_ns) and self._request
+        pending = self._request if self.requested_by(now_ns) else None
         until_ns = now_ns + self._reservation_ns
         self._reservation = _TakeoverRequest(pending.client_name, pending.instance, until_ns) if pending else None
         self._request = None

@@ -16,8 +16,8 @@ class CapturedFrame(Struct, frozen=True):
     For a V4L2 device the capture time is the driver's: the beginning of the exposure or the end of the transfer
     (docs/camera.md).
 
-    The picture is (height, width, 3) in blue, green, red order, or I420 as the camera delivers it,
-    (height * 3 / 2, width), which goes into the encoder unchanged.
+    The picture has the shape (height, width, 3), in blue, green, red order. If the camera delivers I420, it has the
+    shape (height * 3 / 2, width) instead, and goes into the encoder unchanged.
     """
 
     number: int

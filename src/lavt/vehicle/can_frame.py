@@ -26,7 +26,7 @@ class ReceivedCanFrame(Struct, frozen=True):
 class BusGone(Exception):
     """Raised when the bus cannot be written to or read from; the message gives the reason.
 
-    `written` is the number of frames that were written before.
+    `written` is the number of frames that were written before the bus was lost.
     """
 
     def __init__(self, reason: str, written: int = 0) -> None:
@@ -54,7 +54,7 @@ class BusPort(Protocol):
         ...
 
     def next_wake_ns(self) -> int | None:
-        """Return a time by which `take` returns a frame; None: that is not known."""
+        """Return a time by which `take` will have a frame to return, or None if no such time is known."""
         ...
 
     def close(self) -> None:

@@ -10,7 +10,7 @@ from lavt.errors import UserError
 from lavt.vehicle.ground_truth_wire import MAX_BYTES, TruthReceiver
 
 MAX_DATAGRAMS = 256
-"""Largest number of datagrams that one call reads: those of a second."""
+"""Largest number of datagrams that one call reads: about as many as a software car sends in a second."""
 
 
 class TruthSocket:

@@ -30,7 +30,7 @@ MAX_CREDIBLE_RATE_HZ: Final = 1000.0
 RATE_TOLERANCE: Final = 0.01
 """Relative: 30 and 29.97 Hz count as equal."""
 MAX_BUFFER_AGE_NS: Final = NS_PER_S
-"""An older buffer time is from another clock, because V4L2 drivers queue a few pictures at most."""
+"""A buffer time that is further in the past must be of another clock: V4L2 drivers queue only a few pictures."""
 WAIT_PERIODS: Final = 0.25
 """The longest wait of `capture` for a picture, in frame periods.
 
@@ -38,7 +38,8 @@ A camera has a clock of its own. Where pictures arrive just when they are reques
 many of them. The wait exceeds the jitter, so a picture is missed only when the clocks have drifted apart by a period.
 """
 MAX_AGE_PERIODS: Final = 2
-"""With equal rates a picture waits one period at most; after two periods the camera has stopped."""
+"""If the camera and the requests have the same rate, a picture waits at most one period to be requested. If the newest
+picture is older than two periods, the camera has stopped."""
 COUNTER_NAMES: Final = (
     "pictures_read",
     "pictures_replaced",  # by a newer one, before a request
@@ -51,6 +52,7 @@ COUNTER_NAMES: Final = (
 )
 CLOSE_TIMEOUT_S: Final = 2.0
 _TIMEOUT_MS: Final = 3000
+"""FFmpeg's limit for opening a file or address, and for reading a picture from it."""
 
 # This module logs a lost camera once; without this OpenCV would print a message at each attempt.
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
@@ -212,7 +214,7 @@ class VideoDevice:
 
     def _store(self, capture: cv2.VideoCapture, picture: Picture) -> None:
         arrived_ns = self._clock.now().mono_ns
-        self._due_ns = max(self._due_ns + round(NS_PER_S / self.rate_hz), arrived_ns)  # a delay is not made up for
+        self._due_ns = max(self._due_ns + round(NS_PER_S / self.rate_hz), arrived_ns)  # no catching up after a delay
         capture_ns = buffer_time_ns(capture.get(cv2.CAP_PROP_POS_MSEC), arrived_ns) if self._is_v4l2 else None
         with self._changed:
             if picture.shape != (self.model.height_px, self.model.width_px, 3):

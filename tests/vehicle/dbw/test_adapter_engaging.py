@@ -188,7 +188,7 @@ def test_parking(generation: int) -> None:
     assert rig.enabled() == ALL
     rig.run_until(lambda rig: rig.state == "idle")
     assert rig.enabled() == set()
-    assert rig.kit.state.watchdog == 0
+    assert rig.kit.state.watchdog_reason == 0
     assert rig.speed_mps < 0.1
     assert rig.adapter.state().inhibit_reason == ""
     rig.sent.clear()
@@ -233,7 +233,7 @@ def test_engaging_can_be_cancelled(generation: int) -> None:
         rig.adapter.engage(False, rig.now_ns)
         rig.run_until(lambda rig: rig.state == "idle" and not rig.enabled(), 1000)
         rig.run_ms(200)
-        assert (rig.enabled(), rig.kit.state.gear, rig.kit.state.watchdog) == (set(), Gear.PARK, 0), after_ms
+        assert (rig.enabled(), rig.kit.state.gear, rig.kit.state.watchdog_reason) == (set(), Gear.PARK, 0), after_ms
 
 
 @both_generations
@@ -394,5 +394,5 @@ def test_enabling_cancelled_early_disables_the_kit(generation: int, after_ms: in
         rig.run_ms(1)
         gears.add(rig.kit.state.gear)
     assert (Gear.DRIVE in gears) == (after_ms == 60)
-    assert (rig.enabled(), rig.kit.state.gear, rig.kit.state.watchdog) == (set(), Gear.PARK, 0)
+    assert (rig.enabled(), rig.kit.state.gear, rig.kit.state.watchdog_reason) == (set(), Gear.PARK, 0)
     assert rig.events == []

@@ -242,7 +242,7 @@ def test_override(generation: int, part: str) -> None:
     assert (state.is_overridden, state.is_engaged) == (True, False)
     assert "override by the driver" in state.inhibit_reason
     assert any(TEXTS[part] in event.detail for event in rig.events)
-    assert rig.kit.state.watchdog == 0
+    assert rig.kit.state.watchdog_reason == 0
 
 
 @both_generations
@@ -399,7 +399,7 @@ def test_watchdog_needs_an_override(generation: int) -> None:
     rig.run_ms(200, step_ms=COARSE_MS)
     rig.engage()
     assert rig.enabled() == set(AXES)
-    assert rig.kit.state.watchdog == 0
+    assert rig.kit.state.watchdog_reason == 0
 
 
 # The bus.
@@ -564,7 +564,7 @@ def test_drive_rejected(generation: int) -> None:
     rig.adapter.engage(False, rig.now_ns)
     rig.run_until(lambda rig: rig.state == "idle")
     assert rig.enabled() == set()
-    assert rig.kit.state.watchdog == 0
+    assert rig.kit.state.watchdog_reason == 0
 
 
 def test_a_shift_in_progress_is_awaited() -> None:

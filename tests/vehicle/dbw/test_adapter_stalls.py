@@ -29,7 +29,7 @@ def test_a_stall_while_parking_ends(generation: int) -> None:
             rig.run_ms(250)
             assert rig.speed_mps > 1.0
             if duration_ms == 80:
-                assert (rig.state, rig.enabled(), rig.kit.state.watchdog) == ("parking", set(AXES), 0), moment_ms
+                assert (rig.state, rig.enabled(), rig.kit.state.watchdog_reason) == ("parking", set(AXES), 0), moment_ms
             if duration_ms > 100:
                 assert (rig.state, rig.kit.state.brake) == ("idle", WATCHDOG_BRAKE), (moment_ms, duration_ms)
             assert len(rig.events) == len({event.detail for event in rig.events})
@@ -102,7 +102,7 @@ def test_dropped_frames_leave_no_gap_in_the_counters(generation: int, dropped: i
         rig.run_until(lambda rig: rig.adapter.counts["sets"] > sets)  # noqa: B023 (called in the loop)
         rig.dropped_frames = 0
         rig.run_ms(40)
-    assert (rig.state, rig.enabled(), rig.kit.state.watchdog) == ("engaged", set(AXES), 0)
+    assert (rig.state, rig.enabled(), rig.kit.state.watchdog_reason) == ("engaged", set(AXES), 0)
     codec = rig.profile.codec
     counts: dict[str, list[float]] = {}
     for _, frame in rig.sent:

@@ -40,7 +40,7 @@ INTERNAL_METHODS = {"receive", "frames_due", "actuation", "next_wake_ns", "sense
         ("scale_speed second_speed=0.5", lambda kit: kit.state.sensor_faults.factors == {"second_speed": 0.5}),
         ("drop_speed speed", lambda kit: kit.state.sensor_faults.dropped == {"speed"}),
         ("weaken_brake 0.25", lambda kit: kit.state.brake_share == 0.25),
-        ("inhibit seat belt", lambda kit: kit.state.not_ready == ReleaseReason.SEAT_BELT),
+        ("inhibit seat belt", lambda kit: kit.state.not_ready_reason == ReleaseReason.SEAT_BELT),
         ("switch_remote emergency_stop", lambda kit: kit.state.remote_state == 0),
         ("switch_remote pause", lambda kit: kit.state.remote_state == 1),
         ("switch_remote control_allowed", lambda kit: kit.state.remote_state == 3),
@@ -85,7 +85,7 @@ def condition_of(rig: KitRig) -> tuple[object, ...]:
     state, frame_count = rig.kit.state, len(rig.kit.frames_due(rig.now_ns))
     faults = [sorted(actuator.faults) for actuator in state.actuators.values()]
     reports = faults, sorted(state.invalid), deepcopy(state.sensor_faults), state.brake_share
-    return *reports, state.not_ready, state.remote_state, frame_count
+    return *reports, state.not_ready_reason, state.remote_state, frame_count
 
 
 @pytest.mark.parametrize(("lines", "brake"), [([], 0.5), (["no_watchdog"], 0.0), (["no_watchdog", "watchdog"], 0.5)])

@@ -22,7 +22,7 @@ def test_override(generation: int, axis: str) -> None:
     rig.drive_ms(1000, throttle=0.1)
     rig.request_system()
     assert rig.enabled() == ALL - released
-    assert rig.kit.state.watchdog == ReleaseReason.NONE
+    assert rig.kit.state.watchdog_reason == ReleaseReason.NONE
     rig.request_system(0)
     rig.send(*rig.sender.clearing())
     rig.command()
@@ -69,7 +69,7 @@ def test_clearing_frames_have_no_counter() -> None:
     for _ in range(4):
         rig.wait_ms(25)
         rig.send(*rig.sender.clearing())
-    assert rig.kit.state.watchdog == ReleaseReason.TIMEOUT
+    assert rig.kit.state.watchdog_reason == ReleaseReason.TIMEOUT
     other = KitRig(1)
     other.send(*(CanFrame(frame.identifier, b"\xff\xff\xff\xff") for frame in other.sender.clearing()))
     assert other.enabled() == set()
@@ -80,7 +80,7 @@ def test_a_full_clearing_frame_without_a_counter_trips() -> None:
     rig = driving_rig(1)
     rig.command()
     rig.send(*(CanFrame(frame.identifier, frame.data + bytes(4)) for frame in rig.sender.clearing()))
-    assert (rig.enabled(), rig.kit.state.watchdog) == (set(), ReleaseReason.COUNTER)
+    assert (rig.enabled(), rig.kit.state.watchdog_reason) == (set(), ReleaseReason.COUNTER)
 
 
 @both_generations
@@ -137,7 +137,7 @@ def test_override_by_the_shifter() -> None:
     """Moving the shifter disengages generation 2; generation 1 reports it, and the sender has to disengage."""
     rig = driving_rig(2)
     rig.kit.driver_shifts(Gear.NEUTRAL, rig.now_ns)
-    assert (rig.enabled(), rig.kit.state.disengaged, rig.kit.state.watchdog) == (
+    assert (rig.enabled(), rig.kit.state.disengage_reason, rig.kit.state.watchdog_reason) == (
         set(),
         ReleaseReason.OVERRIDE,
         ReleaseReason.NONE,
@@ -145,7 +145,7 @@ def test_override_by_the_shifter() -> None:
     first = driving_rig(1)
     first.kit.driver_shifts(Gear.NEUTRAL, first.now_ns)
     first.command(enable=False)
-    assert (first.kit.state.is_gear_overridden, first.kit.state.watchdog) == (True, ReleaseReason.NONE)
+    assert (first.kit.state.is_gear_overridden, first.kit.state.watchdog_reason) == (True, ReleaseReason.NONE)
     first.send(first.sender.gear(0, clear=True))
     assert not first.kit.state.is_gear_overridden
 

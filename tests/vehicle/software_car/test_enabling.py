@@ -50,7 +50,7 @@ def test_disabling_in_park_does_not_trip(generation: int) -> None:
     rig.request_system(2)
     rig.command(enable=False)
     state = rig.kit.state
-    assert (rig.enabled(), state.watchdog, state.watchdog_brakes) == (set(), ReleaseReason.NONE, False)
+    assert (rig.enabled(), state.watchdog_reason, state.watchdog_brakes) == (set(), ReleaseReason.NONE, False)
 
 
 def test_generation_2_needs_a_new_request() -> None:

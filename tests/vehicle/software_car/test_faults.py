@@ -23,7 +23,11 @@ def test_a_fault_disengages_and_brakes(generation: int, name: str) -> None:
     """A fault while driving makes the kit release all axes and brake."""
     rig = driving_rig(generation)
     rig.kit.set_fault(name, rig.now_ns)
-    assert (rig.enabled(), rig.kit.state.watchdog, rig.wheels()[2]) == (set(), ReleaseReason.FAULT, WATCHDOG_BRAKE)
+    assert (rig.enabled(), rig.kit.state.watchdog_reason, rig.wheels()[2]) == (
+        set(),
+        ReleaseReason.FAULT,
+        WATCHDOG_BRAKE,
+    )
 
 
 @pytest.mark.parametrize(("generation", "name"), FAULTS)
@@ -55,7 +59,7 @@ def test_an_inhibit_reason_of_generation_2_disengages(name: str, reason: Release
     rig.kit.inhibit(name, rig.now_ns)
     rig.command()
     rig.request_system()
-    assert (rig.enabled(), rig.kit.state.system, rig.kit.state.not_ready) == (set(), SystemState.MANUAL, reason)
+    assert (rig.enabled(), rig.kit.state.system, rig.kit.state.not_ready_reason) == (set(), SystemState.MANUAL, reason)
     rig.kit.inhibit(None, rig.now_ns)
     assert rig.enabled() == ALL
     rig.kit.inhibit(name, rig.now_ns)
@@ -67,7 +71,11 @@ def test_the_remotes_switch(remote_state: int) -> None:
     """At emergency stop or pause generation 2 disengages and brakes, and is not ready."""
     rig = driving_rig(2)
     rig.kit.switch_remote(remote_state, rig.now_ns)
-    assert (rig.enabled(), rig.wheels()[2], rig.kit.state.watchdog) == (set(), WATCHDOG_BRAKE, ReleaseReason.REMOTE)
+    assert (rig.enabled(), rig.wheels()[2], rig.kit.state.watchdog_reason) == (
+        set(),
+        WATCHDOG_BRAKE,
+        ReleaseReason.REMOTE,
+    )
 
 
 @both_generations
@@ -79,7 +87,7 @@ def test_bus_off(generation: int) -> None:
     rig.last.clear()
     rig.drive_ms(80, throttle=0.5)
     assert rig.last == {}
-    assert (rig.enabled(), rig.kit.state.watchdog) == (set(), ReleaseReason.TIMEOUT)
+    assert (rig.enabled(), rig.kit.state.watchdog_reason) == (set(), ReleaseReason.TIMEOUT)
     rig.kit.set_bus_off(rig.now_ns, is_off=False)
     rig.wait_ms(100)
     assert len(rig.last) == (5 if generation == 1 else 8)

@@ -89,7 +89,7 @@ def test_a_command_timeout_stops_the_car(generation: int) -> None:
     drive = DrivenCar(generation)
     drive.keep_speed_ms(5_000, speed_mps=5.0)
     drive.wait_ms(100)
-    assert drive.car.kit.state.watchdog == ReleaseReason.TIMEOUT
+    assert drive.car.kit.state.watchdog_reason == ReleaseReason.TIMEOUT
     drive.wait_ms(2_400)
     assert (drive.simulator.state().speed_mps, drive.speed_mps) == (0.0, 0.0)
 

@@ -28,7 +28,7 @@ def test_commands_time_out_after_100_ms(generation: int) -> None:
     rig.wait_ms(0.001)
     assert (rig.enabled(), rig.wheels()[1:]) == (set(), (0.0, WATCHDOG_BRAKE))
     assert all(actuator.has_timed_out for actuator in rig.kit.state.actuators.values())
-    assert rig.kit.state.watchdog == ReleaseReason.TIMEOUT
+    assert rig.kit.state.watchdog_reason == ReleaseReason.TIMEOUT
 
 
 @both_generations
@@ -54,7 +54,7 @@ def test_a_timeout_of_one_axis_trips_the_watchdog(generation: int, part: int) ->
         rig.wait_ms(20)
         frames = rig.sender.commands(CommandValues(throttle=0.5))
         rig.send(*(frame for index, frame in enumerate(frames) if index != part))
-    assert (rig.enabled(), rig.kit.state.watchdog) == (set(), ReleaseReason.TIMEOUT)
+    assert (rig.enabled(), rig.kit.state.watchdog_reason) == (set(), ReleaseReason.TIMEOUT)
     assert rig.kit.state.watchdog_axis == AXES[part]
 
 
@@ -78,7 +78,7 @@ def test_a_repeated_counter_trips_the_watchdog(generation: int) -> None:
     assert rig.enabled() == ALL
     rig.wait_ms(20)
     rig.send(frames[2])
-    assert (rig.enabled(), rig.kit.state.watchdog, rig.wheels()[1:]) == (
+    assert (rig.enabled(), rig.kit.state.watchdog_reason, rig.wheels()[1:]) == (
         set(),
         ReleaseReason.COUNTER,
         (0.0, WATCHDOG_BRAKE),
@@ -110,7 +110,7 @@ def test_a_wrong_checksum_trips_the_watchdog() -> None:
         rig = driving_rig(2)
         frames = rig.sender.commands(CommandValues(angle_deg=50.0, throttle=0.5))
         rig.send(with_crc_broken(frames[part]))
-        assert (rig.enabled(), rig.kit.state.watchdog, rig.kit.state.system) == (
+        assert (rig.enabled(), rig.kit.state.watchdog_reason, rig.kit.state.system) == (
             set(),
             ReleaseReason.CRC,
             SystemState.FAULT,

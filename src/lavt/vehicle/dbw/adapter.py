@@ -43,7 +43,7 @@ NO_AXES: Final[frozenset[Axis]] = frozenset()
 
 
 class ByWireAdapter:
-    """A controller for one by-wire kit, described by a profile.
+    """A controller for the by-wire kit that a profile describes.
 
     Each call of `set_actuation` is a tick; frames are sent only while the newest tick is at most 60 ms old.
     `inhibit_reason` is a property of the installation: unless it is empty, the kit is never engaged.
@@ -65,8 +65,8 @@ class ByWireAdapter:
         self._still_enabled: frozenset[Axis] = NO_AXES
         """Axes that were enabled when driving ended and still are."""
         self._needed_axes = frozenset({"brake"}) if profile.system is None else frozenset(AXES)
-        """If one of these axes is released, no command is sent any more. A kit that is enabled as a whole would, after
-        a command to disable any axis, release the brake as well and not brake by itself."""
+        """If one of these axes is released, no command is sent any more. A kit that is enabled as a whole needs all:
+        after a command to disable any axis, it would release the brake as well, and not brake by itself."""
         self._moved_ns = start_ns
         """Time of the last report that the car moves."""
         self._is_shifting = False
@@ -104,7 +104,7 @@ class ByWireAdapter:
         self._update_state(now_ns)
 
     def on_bus_gone(self, reason: str, now_ns: int) -> None:
-        """Note that the bus is gone; the next frame ends this condition."""
+        """Note that the bus is gone; the next received frame ends this condition."""
         self._bus_error = reason
         self._update_state(now_ns)
 
@@ -283,6 +283,7 @@ class ByWireAdapter:
     # Commands that reached the wheels.
 
     def _expect_echo(self, commands: KitCommands) -> None:
+        """Expect the kit to report the steering command just sent, if it differs from the one before."""
         if "steering" not in commands.enabled or self._requested_ns is None:
             self._awaited_echoes.clear()
             self._last_steering = None
@@ -295,7 +296,7 @@ class ByWireAdapter:
         self._last_steering = steps
 
     def _match_echo(self, now_ns: int) -> None:
-        """Match the newest reported command with those sent; the ones sent earlier were superseded."""
+        """Match the newest reported command with those sent; the ones sent before the match were superseded."""
         if not any(steps == self._reports.command for steps, _ in self._awaited_echoes):
             return
         while self._awaited_echoes:
@@ -357,7 +358,7 @@ class ByWireAdapter:
 
 
 def _join(texts: Iterable[str]) -> str:
-    """Join texts of one or more sentences, each sentence once."""
+    """Join texts, each of which may consist of several parts already joined; keep each part once."""
     present = [text for text in texts if text]
     if not present:  # nearly always
         return ""

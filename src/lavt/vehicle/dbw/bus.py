@@ -34,25 +34,26 @@ if TYPE_CHECKING:
     from can import BusABC, Message
 
 REOPEN_NS: Final = NS_PER_S
-"""Pause before each attempt to reopen a lost bus. All reports from before the loss are old by its end."""
+"""Pause before each attempt to reopen a lost bus. After it, all reports from before the loss are too old to be used."""
 QUEUE_FRAMES: Final = 8192
 """Capacity of the receive queue: two seconds of a full 500 kbit/s bus. If it is full, the oldest frames are dropped."""
 POLL_S: Final = 0.1
 """Period at which the port's thread checks whether the port was closed."""
 CLOSE_TIMEOUT_S: Final = 1.0
-"""A driver that blocks the port's thread for longer is left behind with it when the port is closed."""
+"""Closing the port waits this long for its thread. If a driver blocks the thread for longer, both are left running."""
 LATEST_READ_NS: Final = NS_PER_S
-"""A frame that has waited longer is dropped: this process was frozen."""
+"""A frame that has waited longer to be read is dropped: this process was frozen."""
 IP_TIMEOUT_S: Final = 2
 
 logging.getLogger("can").addHandler(logging.NullHandler())  # the errors raised here contain its messages
 
 VIRTUAL_INTERFACES: Final = frozenset({"inside", "virtual", "udp_multicast"})
 STAMPED_BY_KERNEL: Final = frozenset({"socketcan", "udp_multicast"})
-"""Interfaces whose frames carry the kernel's wall time of arrival; the others use clocks of their devices. They have a
-descriptor that is readable if and only if a frame is waiting."""
+"""Interfaces whose frames carry the kernel's wall time of arrival, and whose descriptor is readable if and only if a
+frame is waiting. The times of other interfaces are those of their devices' clocks."""
 RECEIVES_OWN_FRAMES: Final = "udp_multicast"
-"""Its socket is a member of the group it sends to, so own frames are marked."""
+"""This interface's socket is a member of the multicast group that it sends to. Own frames are marked, so that they can
+be recognised and dropped."""
 BUS_OFF_BIT: Final = 0x40
 """In the identifier of an error frame of SocketCAN (linux/can/error.h, CAN_ERR_BUSOFF)."""
 TEMPORARY_ERRORS: Final = frozenset({None, errno.ENOBUFS, errno.EAGAIN})

@@ -18,7 +18,7 @@ NLMSG_ERROR, NLMSG_DONE = 2, 3
 DUMP_REQUEST: Final = 0x301
 """NLM_F_REQUEST and NLM_F_DUMP."""
 CAN_FAMILY, GATEWAY_CAN_TO_CAN = 29, 1
-"""The family of the rules; no CAN socket is opened here."""
+"""PF_CAN and CGW_TYPE_CAN_CAN, the family and the type of the rules; no CAN socket is opened here."""
 SOURCE, DESTINATION = 9, 10
 """CGW_SRC_IF and CGW_DST_IF."""
 HEADER, RULE, ATTRIBUTE = struct.Struct("=IHHII"), struct.Struct("=BBH"), struct.Struct("=HH")
@@ -27,7 +27,10 @@ MAX_BYTES = 1 << 20
 
 
 def gateway_interfaces() -> frozenset[int]:
-    """Return the indices of the interfaces that are the source or destination of a rule; `OSError` if unreadable."""
+    """Return the indices of the interfaces that are the source or destination of a rule.
+
+    Raises `OSError` if the rules cannot be read.
+    """
     found: set[int] = set()
     with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, socket.NETLINK_ROUTE) as link:
         link.settimeout(TIMEOUT_S)
@@ -45,7 +48,10 @@ def gateway_interfaces() -> frozenset[int]:
 
 
 def parse_rules(data: bytes) -> tuple[set[int], bool]:
-    """Return the interfaces in a datagram of rules, and whether it is the last one; `OSError` if it is an error."""
+    """Return the interfaces in a datagram of rules, and whether it is the last one.
+
+    Raises `OSError` if the datagram reports an error.
+    """
     found: set[int] = set()
     for kind, body in _pieces(data, HEADER):
         if kind == NLMSG_DONE:

@@ -32,7 +32,8 @@ CLEARING_PERIOD_NS = 50 * NS_PER_MS
 COMMAND_TIMEOUT_NS = 100 * NS_PER_MS
 """A kit disengages this long after its last command."""
 TICK_LIMIT_NS = 60 * NS_PER_MS
-"""Commands requested longer ago are not sent, and not written: the program may have been frozen since."""
+"""The adapter does not send a command that was requested longer ago, and the bus's port does not write it: the program
+may have been frozen since."""
 
 IN_DEGREES = {"deg": 1.0, "rad": math.radians(1.0)}
 IN_FRACTIONS = {"": 1.0, "%": 100.0}
@@ -105,8 +106,8 @@ class ReportSpec:
     values: Mapping[str, str]
     """Signal names by value name."""
     no_value: Mapping[str, float]
-    """By value name: the number that means "not known", in the DBC's unit. It is the lowest number of a signed signal,
-    although the published sources on generation 2 do not say so."""
+    """By value name: the number that means "not known", in the DBC's unit. It is the lowest number of a signed signal;
+    for generation 2 this is our assumption."""
     override: tuple[SignalCondition, ...]
     """The conditions that mean an override by the driver; the next three fields are of the same kind."""
     trip: tuple[SignalCondition, ...]
@@ -153,6 +154,7 @@ class ByWireLimits:
     throttle_rate_per_s: float
     brake_rate_per_s: float
     holding_brake: float
+    """The least brake while the kit is enabled before driving, and while the car is parked after driving."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,8 +23,8 @@ OTHER_COMMANDER_NS: Final = NS_PER_S
 class NewestReports:
     """The newest report of each message in a profile.
 
-    `counts` has the reports that could not be used: `wrong_checksum`, `repeated_counter`, `value_unknown` (the codec
-    counts the others), and `foreign_commands`, commands that another sender sent to the kit.
+    `counts` has the reports that could not be used (`wrong_checksum`, `repeated_counter`, `value_unknown`; the codec
+    counts frames that it cannot decode), and `foreign_commands`, commands that another sender sent to the kit.
     """
 
     def __init__(self, profile: Profile, start_ns: int) -> None:
@@ -163,7 +163,10 @@ class NewestReports:
 
 
 def _commands(profile: Profile) -> dict[tuple[int, bool], str]:
-    """Return the names of the profile's commands by identifier; a bus does not return own frames."""
+    """Return the names of the profile's commands by identifier.
+
+    If one of them is received, another sender has sent it, because a bus does not return own frames.
+    """
     names = [*(command.message for command in profile.axes.values()), profile.gear.message]
     names += [] if profile.system is None else [profile.system.message]
     messages = profile.codec.messages

@@ -38,7 +38,7 @@ class DriveCommand(Struct, frozen=True):
 
 
 def apply_limits(limits: ByWireLimits, requested: DriveCommand, before: DriveCommand, passed_ns: int) -> DriveCommand:
-    """Limit `requested`, `passed_ns` after `before` was sent; a brake request zeroes the throttle.
+    """Limit `requested`, which is sent `passed_ns` after the command `before`; a brake request zeroes the throttle.
 
     The limit of the angle has priority over that of the rate: even if the wheel was turned beyond the limit of the
     angle, no angle beyond it is commanded.
@@ -112,7 +112,7 @@ class FrameSender:
     def take_back(self, dropped: Sequence[CanFrame]) -> None:
         """Take back `dropped`, the last frames of the last set, which were not written.
 
-        A gap in a counter would disengage the kit.
+        Their counter values are used again, because a gap in a counter would disengage the kit.
         """
         earlier_command, earlier_set_ns, self._gear_ns = self._before
         axes = set(AXES)

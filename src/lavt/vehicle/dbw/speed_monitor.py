@@ -1,9 +1,9 @@
-"""The plausibility of the reported speeds: against each other, the pedals, and what a car can do.
+"""Checks whether the reported speeds are plausible: against each other, the pedals, and what a car can do.
 
 A kit reports `speed`, which is used to drive, and possibly others to compare it with: a second speed and those of the
-wheels. They may come from one control unit, so that all of them can be wrong together: the checks against the pedals
-detect that. An implausible speed is a fault until the car has been braked fully for `FULL_BRAKE_NS` and every reported
-speed is that of a stationary car.
+wheels. All of them may come from one control unit and be wrong together, which the checks against the pedals detect. An
+implausible speed is a fault until the car has been braked fully for `FULL_BRAKE_NS` and every reported speed is that of
+a stationary car.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ MAX_FALL_MPS2: Final = 12.0
 MAX_DROP_MPS: Final = 2.5
 """A speed may be this much below what `MAX_FALL_MPS2` allows: below about 2 m/s anti-lock brakes let wheels lock, and
 wheels that spun regain grip within a report."""
-LOCKED_BELOW_MPS: Final = 0.5
+LOCKED_DROP_MPS: Final = 0.5
 """A speed this much below what `MAX_FALL_MPS2` allows is that of locked wheels, or wrong."""
 ICE_BRAKING_MPS2: Final = 1.0
 """A braked car on ice loses at least this. While a car whose wheels have locked may slide, no speed counts as
 standstill."""
 DISAGREEMENT_MPS: Final = 1.0
 DISAGREEMENT_SHARE: Final = 0.2
-"""Two speeds may differ by 1 m/s and a fifth of the larger: brakes with anti-lock control slip by 10 to 20 %, and the
+"""Two speeds may differ by 1 m/s plus a fifth of the larger: brakes with anti-lock control slip by 10 to 20 %, and the
 radius of a tyre is known to a few per cent."""
 DISAGREEMENT_NS: Final = 500 * NS_PER_MS
 """For this long, two speeds may differ by more: anti-lock control cycles at 3 Hz or faster, and traction control is no
@@ -40,7 +40,7 @@ SOURCE_LIMIT_NS: Final = 200 * NS_PER_MS
 LEAST_BRAKING_MPS2: Final = 3.0
 """A brake that should decelerate by this must slow the car even on a descent of 20 % (2 m/s2)."""
 BRAKE_SETTLING_NS: Final = 500 * NS_PER_MS
-"""Dead time and lag of a brake, and of the throttle before it."""
+"""Dead time and lag of a brake, and of a throttle that was pressed before the brake."""
 BRAKE_CHECK_NS: Final = NS_PER_S
 LEAST_BRAKED_MPS: Final = 0.2
 """A braked car must lose this speed within `BRAKE_CHECK_NS`. On ice it loses 1 m/s."""
@@ -59,8 +59,8 @@ ROLLING_RESISTANCE_MPS2: Final = 0.1
 """Deceleration of a rolling car on a level road, 1 % of its weight."""
 UNANSWERED_MPS: Final = 2.7
 """A car that does not move, although throttle for this speed was applied, does not start: the slope is too steep, a
-wheel is blocked, or it moves and its speed is wrong. All of them end the drive. A car that reaches 2 m/s2 has 1.4 s to
-start at full throttle, and 3 s at half throttle."""
+wheel is blocked, or it moves and its speed is wrong. Each of these ends the drive. A car that reaches 2 m/s2 has 1.4 s
+to start at full throttle, and 3 s at half throttle."""
 FULL_BRAKE_NS: Final = 8 * NS_PER_S
 """After an implausible speed, the car is braked fully for at least this long: 1.4 m/s2, a quarter of what the brakes
 should reach, stop a car from 40 km/h in this time."""
@@ -111,7 +111,7 @@ class SpeedMonitor:
         self._checked = SpeedReport(0.0, 0)
         """The newest `speed` that was checked for a fall."""
         self._least_mps = 0.0
-        """The least speed that the car can have now, after those before."""
+        """The least speed that the car can have now, given the speeds reported earlier."""
         self._now_ns = 0
         self._moved_ns = -STANDSTILL_NS
         """Time of the last update at which the car may have moved."""
@@ -120,10 +120,11 @@ class SpeedMonitor:
         self._slides_until_ns = 0
         """Until then, the car may slide with locked wheels."""
         self._unanswered_mps = 0.0
-        """The speed that a car on a level road may have by the throttle since the reported speed last changed."""
+        """The speed that the throttle may have given a car on a level road since the reported speed last changed."""
         self._answer_mps = 0.0
         """The reported speed at its last change."""
         self._agreed_ns: int | None = None
+        """Time of the last update at which the speeds did not differ."""
         self._brake_reference: SpeedReport | None = None
         """The speed at the start of the present check of the brake; its time is that of the pedal before settling."""
         self._frozen_reference: SpeedReport | None = None
@@ -170,7 +171,7 @@ class SpeedMonitor:
         return found
 
     def _has_fallen(self, speed: SpeedReport) -> bool:
-        """Return whether the speed is below the least that it can be after the speeds before."""
+        """Return whether the speed is below the least that it can be, given the speeds reported earlier."""
         before, self._checked = self._checked, speed
         passed_s = (speed.mono_ns - before.mono_ns) / NS_PER_S
         if passed_s <= 0:
@@ -178,7 +179,7 @@ class SpeedMonitor:
         least_mps = self._least_mps - MAX_FALL_MPS2 * passed_s
         self._least_mps = max(abs(speed.mps), least_mps)
         self._sliding_mps = max(abs(speed.mps), self._sliding_mps - ICE_BRAKING_MPS2 * passed_s)
-        if abs(speed.mps) < least_mps - LOCKED_BELOW_MPS:
+        if abs(speed.mps) < least_mps - LOCKED_DROP_MPS:
             self._slides_until_ns = speed.mono_ns + round(self._sliding_mps / ICE_BRAKING_MPS2 * NS_PER_S)
         return abs(speed.mps) < least_mps - MAX_DROP_MPS
 

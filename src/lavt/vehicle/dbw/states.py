@@ -18,9 +18,10 @@ STATIONARY_BELOW_MPS: Final = 0.1
 ENABLING_LIMIT_NS: Final = 3 * NS_PER_S
 """Our choice: clearing and enabling fail if they take longer."""
 PAUSE_NS: Final = 120 * NS_PER_MS
-"""Minimum duration of `clearing` and `parking`, and of `enabling` if it is cancelled. A kit that has disengaged ignores
-requests to enable until none came for 100 ms, so none is sent while clearing. A kit counts as disengaged only after it
-was told to disable for this long. And only by then has it reported the axes that it has enabled."""
+"""Minimum duration of `clearing` and `parking`, and of `enabling` if it is cancelled. In `clearing` no request to
+enable is sent, because a kit that has disengaged ignores such requests until none came for 100 ms. In `parking` a kit
+counts as disengaged only after it was commanded to disable for this long. In `enabling` a kit needs this long to report
+which axes it has enabled."""
 
 SENT_IN_STATE: Final[dict[State, str]] = {
     "idle": "nothing",

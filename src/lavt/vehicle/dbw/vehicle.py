@@ -51,7 +51,7 @@ class KitAdapter(Protocol):
         ...
 
     def next_wake_ns(self) -> int:
-        """Return the latest time at which frames are due or a report is missing."""
+        """Return the latest time for the next call: frames are due then, or a report counts as missing."""
         ...
 
     def state(self) -> VehicleState:
@@ -149,7 +149,7 @@ class DbwVehicle:
         return self._newest_truth
 
     def next_wake_ns(self) -> int:
-        """Return the latest time at which frames are due or expected."""
+        """Return the latest time for the next call: frames are due to be sent then, or expected from the bus."""
         port_ns = self._port.next_wake_ns()
         return min(self._adapter.next_wake_ns(), self._polled_ns + POLL_PERIOD_NS if port_ns is None else port_ns)
 

@@ -33,7 +33,7 @@ BRAKE_WITHIN_NS: Final = 500 * NS_PER_MS
 MONITOR_NS: Final = NS_PER_S
 """The kit is monitored for this long after the last frame."""
 LEAST_REPORTS: Final = 10
-"""The kit must report the brake at least this often in that time; generation 2 does so 50 times."""
+"""The kit must report the brake at least this often within `MONITOR_NS`; generation 2 does so 50 times."""
 OBSERVED_KINDS: Final[tuple[Kind, ...]] = ("trip", "command_error", "fault", "reason")
 """The kinds of texts that are part of the observation."""
 
@@ -50,7 +50,7 @@ class WatchdogObservation(Struct, frozen=True):
     reports: int
     """Number of brake reports after the last frame."""
     kit_messages: str
-    """Other texts that the kit's reports gave."""
+    """Texts of the kinds `OBSERVED_KINDS` from the kit's reports."""
 
 
 class WatchdogTest:

@@ -83,7 +83,7 @@ LINCOLN_MKZ = CarParameters(
     throttle_lag_s=0.2,
     brake_lag_s=0.2,
     rolling_resistance_mps2=0.1,  # 1 % of the weight
-    drag_per_m=0.0002,  # half of 1.2 kg/m3 x 0.3 x 2.3 m2 over the mass
+    drag_per_m=0.0002,  # half of 1.2 kg/m3 x 0.3 x 2.3 m2, divided by the mass
     kinematic_below_mps=3.0,  # the dynamic model is stiff at 2 m/s and singular at rest
 )
 

@@ -128,7 +128,7 @@ class Simulator:
         """Do nothing: the simulator is always engaged."""
 
     def take_reached(self) -> list[ReachedCommand]:
-        """Return nothing: every command takes effect after the dead times."""
+        """Return an empty list: the simulator does not report when the wheels reach a command."""
         return []
 
     def _apply_due_commands(self, at_ns: int) -> None:

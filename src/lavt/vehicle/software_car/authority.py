@@ -9,7 +9,7 @@ from lavt.vehicle.software_car.generations import Generation
 from lavt.vehicle.software_car.state import AXES, Axis, KitState, ReleaseReason, SystemOrder, SystemState
 
 COMMAND_TIMEOUT_NS: Final = 100 * NS_PER_MS
-"""An actuator is disabled, and a request to enable expires, this long after the last valid one."""
+"""This long after its last valid order an actuator is disabled; a request to enable expires after the same time."""
 WATCHDOG_BRAKE: Final = 0.5
 """Our choice: the watchdog's brake, as a fraction."""
 ENABLE, DISABLE = 1, 2
@@ -32,8 +32,8 @@ class Authority:
         self._requested_ns: int | None = None
         """Time of the newest request to enable; None once it has expired."""
         self._is_enable_pending, self._is_enable_used = False, False
-        """Whether the system is to become active, and whether the current requests have enabled it already. In the
-        second case they must stop before new ones count."""
+        """Whether the system is to become active, and whether the current series of requests has enabled it already. In
+        the second case, the series must stop before a new request counts."""
 
     def receive_system_order(self, order: SystemOrder, now_ns: int) -> None:
         """Process generation 2's order to the system."""
@@ -58,22 +58,21 @@ class Authority:
         for axis in AXES:
             if not state.actuators[axis].may_be_enabled:
                 self.release(axis, ReleaseReason.FAULT if state.actuators[axis].faults else ReleaseReason.DISABLED)
-        state.not_ready = self._not_ready_reason()
-        if state.not_ready != ReleaseReason.NONE and self._generation.is_one_system:
-            self.release("steering", state.not_ready)
-        ready = [
-            axis for axis in AXES if state.actuators[axis].may_be_enabled and state.not_ready == ReleaseReason.NONE
-        ]
-        if not self._generation.is_one_system or (len(ready) == len(AXES) and self._is_enable_pending):
-            self._enable(ready)
+        state.not_ready_reason = self._not_ready_reason()
+        if state.not_ready_reason != ReleaseReason.NONE and self._generation.is_one_system:
+            self.release("steering", state.not_ready_reason)
+        is_ready = state.not_ready_reason == ReleaseReason.NONE
+        ready_axes = [axis for axis in AXES if is_ready and state.actuators[axis].may_be_enabled]
+        if not self._generation.is_one_system or (len(ready_axes) == len(AXES) and self._is_enable_pending):
+            self._enable(ready_axes)
         state.system = self._system_state()
         state.throttle, state.brake = self._pedals()
 
     def _not_ready_reason(self) -> ReleaseReason:
         """Return why the kit as a whole is not ready."""
         state = self._state
-        if state.watchdog != ReleaseReason.NONE or not self._generation.is_one_system:
-            return state.watchdog
+        if state.watchdog_reason != ReleaseReason.NONE or not self._generation.is_one_system:
+            return state.watchdog_reason
         if state.gear_faults or any(actuator.faults for actuator in state.actuators.values()):
             return ReleaseReason.FAULT
         if state.is_overridden:
@@ -83,9 +82,9 @@ class Authority:
     def _system_state(self) -> SystemState:
         if self._state.actuators["steering"].is_enabled:
             return SystemState.ACTIVE
-        if self._state.watchdog != ReleaseReason.NONE or self._state.not_ready == ReleaseReason.FAULT:
+        if self._state.watchdog_reason != ReleaseReason.NONE or self._state.not_ready_reason == ReleaseReason.FAULT:
             return SystemState.FAULT
-        return SystemState.READY if self._state.not_ready == ReleaseReason.NONE else SystemState.MANUAL
+        return SystemState.READY if self._state.not_ready_reason == ReleaseReason.NONE else SystemState.MANUAL
 
     def _enable(self, axes: list[Axis]) -> None:
         for axis in axes:
@@ -104,8 +103,8 @@ class Authority:
         )
         is_trip = self.has_watchdog and not is_commanded and not state.is_overridden
         if is_trip:
-            state.watchdog, state.watchdog_axis, state.watchdog_brakes = reason, axis, True
-        state.disengaged = reason
+            state.watchdog_reason, state.watchdog_axis, state.watchdog_brakes = reason, axis, True
+        state.disengage_reason = reason
         self._is_enable_pending, self._is_enable_used = False, self._requested_ns is not None
         for released_axis in AXES if is_trip or self._generation.is_one_system else (axis,):
             state.actuators[released_axis].is_enabled = False
@@ -125,7 +124,7 @@ class Authority:
         if self._generation.is_one_system:  # its gear command has no CLEAR
             state.is_gear_overridden = False
         if not state.watchdog_brakes:
-            state.watchdog, state.watchdog_axis = ReleaseReason.NONE, None
+            state.watchdog_reason, state.watchdog_axis = ReleaseReason.NONE, None
 
     def _pedals(self) -> tuple[float, float]:
         """Return throttle and brake, each the maximum of kit and driver; out of gear the throttle has no effect."""
@@ -133,6 +132,6 @@ class Authority:
         for axis, actuator in state.actuators.items():
             if actuator.is_enabled and actuator.order is not None:
                 requested[axis] = actuator.order.target
-        watchdog = WATCHDOG_BRAKE if state.watchdog_brakes else 0.0
+        watchdog_brake = WATCHDOG_BRAKE if state.watchdog_brakes else 0.0
         throttle = max(requested["throttle"], state.driver_throttle) if state.is_in_gear else 0.0
-        return throttle, max(requested["brake"], state.driver_brake, watchdog)
+        return throttle, max(requested["brake"], state.driver_brake, watchdog_brake)

@@ -24,7 +24,7 @@ class ConsoleCommand(Struct, frozen=True):
     """A console command: its argument, its meaning and its effect on a kit."""
 
     argument: str
-    """Empty: none."""
+    """Name of the argument in the help text; empty if the command takes none."""
     meaning: str
     execute: Callable[[Kit, str, int], None]
 

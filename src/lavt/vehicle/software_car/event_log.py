@@ -56,11 +56,11 @@ def overridden(state: KitState) -> tuple[str, ...]:
     return (*axes, "gear") if state.is_gear_overridden else tuple(axes)
 
 
-def _enabled_text(state: KitState, before: Any) -> str:
+def _enabled_text(state: KitState, previous_axes: Any) -> str:
     axes = enabled(state)
-    if set(axes) > set(before):
+    if set(axes) > set(previous_axes):
         return f"enabled: {', '.join(axes)}"
-    return f"released: {RELEASE_REASONS[state.disengaged]}" + (f"; remaining: {', '.join(axes)}" if axes else "")
+    return f"released: {RELEASE_REASONS[state.disengage_reason]}" + (f"; remaining: {', '.join(axes)}" if axes else "")
 
 
 def _overridden_text(state: KitState, _: Any) -> str:
@@ -78,16 +78,17 @@ def _rejection_text(state: KitState, _: Any) -> str:
 
 
 def _watchdog_text(state: KitState, _: Any) -> str:
-    if state.watchdog == ReleaseReason.NONE:
+    if state.watchdog_reason == ReleaseReason.NONE:
         return "watchdog cleared"
-    reason = f"{RELEASE_REASONS[state.watchdog]} ({state.watchdog_axis})"
+    reason = f"{RELEASE_REASONS[state.watchdog_reason]} ({state.watchdog_axis})"
     if state.watchdog_brakes:
         return f"watchdog brakes: {reason}"
     return f"watchdog stopped braking and waits for CLEAR: {reason}"
 
 
 def _readiness_text(state: KitState, _: Any) -> str:
-    return f"not ready: {RELEASE_REASONS[state.not_ready]}" if state.not_ready != ReleaseReason.NONE else "ready"
+    reason = state.not_ready_reason
+    return f"not ready: {RELEASE_REASONS[reason]}" if reason != ReleaseReason.NONE else "ready"
 
 
 OBSERVED: Final[dict[str, tuple[Callable[[KitState], Hashable], Callable[[KitState, Any], str]]]] = {
@@ -95,10 +96,11 @@ OBSERVED: Final[dict[str, tuple[Callable[[KitState], Hashable], Callable[[KitSta
     "overridden": (overridden, _overridden_text),
     "gear": (lambda state: state.gear, _gear_text),
     "rejected": (lambda state: (state.gear_reject, state.gear_order if state.gear_reject else 0), _rejection_text),
-    "watchdog": (lambda state: (state.watchdog, state.watchdog_brakes), _watchdog_text),
-    "readiness": (lambda state: state.not_ready, _readiness_text),
+    "watchdog": (lambda state: (state.watchdog_reason, state.watchdog_brakes), _watchdog_text),
+    "readiness": (lambda state: state.not_ready_reason, _readiness_text),
 }
-"""By kind: the observed value, and the text for its change, from the state and the previous value."""
+"""By kind: a function that returns the observed value of a state, and one that returns the text for its change, given
+the new state and the previous value."""
 
 
 class StateObserver:

@@ -19,8 +19,9 @@ from lavt.vehicle.software_car.state import AXES, Axis, AxisOrder, GearOrder, Ki
 FULL_PEDAL = 65535
 FULL_TORQUE_NM = 3412
 UNKNOWN: Final = -0x8000
+"""Value of a 16-bit field whose quantity is unknown."""
 CLEARING_LENGTH = 4
-"""A command of this length has no counter and only clears."""
+"""A command of this length in bytes has no counter and only clears: an override, and the watchdog."""
 
 PEDAL_COMMAND = (
     BitField("command", 0, 16),
@@ -100,20 +101,20 @@ FAULTS: dict[str, tuple[str, ...]] = {
     "throttle": ("FLT1", "FLT2", "FLTPWR"),
     "gear": ("FLTBUS",),
 }
-"""Faults of each part, by the bit that reports them; FLTWDC is reported by the watchdog."""
+"""For each part, the bits that report its faults. FLTWDC is not among them: the watchdog sets it."""
 
 PEDAL_TRAVEL = {"brake": (0.15, 0.50), "throttle": (0.15, 0.80)}
 """Start and end of a pedal's travel, as fractions of the full command (CMD_TYPE 1)."""
 
 WATCHDOG_SOURCES: dict[tuple[Axis, ReleaseReason], int] = {
-    (axis, reason): 1 + 4 * index + kind
-    for index, axis in enumerate(AXES)
-    for kind, reason in enumerate(
+    (axis, reason): 1 + 4 * axis_index + reason_index
+    for axis_index, axis in enumerate(AXES)
+    for reason_index, reason in enumerate(
         (ReleaseReason.COUNTER, ReleaseReason.DISABLED, ReleaseReason.TIMEOUT, ReleaseReason.FAULT)
     )
 }
-"""Codes for why the watchdog tripped (WDCSRC), 1 to 15. The range and the kinds are published; the codes are our
-choice."""
+"""Codes for why the watchdog tripped (WDCSRC). That there are codes from 1 to 15, and which kinds of reasons they are
+for, is published; which code is for which axis and reason is our choice."""
 
 
 def pedal_fraction(axis: Axis, command_type: int, command: int, mechanics: Mechanics) -> float | None:
@@ -169,7 +170,7 @@ def flag_fields(state: KitState, axis: Axis) -> dict[str, int]:
     return {
         "enabled": actuator.is_enabled,
         "override": actuator.is_overridden,
-        "FLTWDC": state.watchdog != ReleaseReason.NONE,
+        "FLTWDC": state.watchdog_reason != ReleaseReason.NONE,
         "timeout": actuator.has_timed_out,
         **dict.fromkeys(actuator.faults, 1),
     }
@@ -178,7 +179,7 @@ def flag_fields(state: KitState, axis: Axis) -> dict[str, int]:
 def pedal_fields(state: KitState, axis: Axis, driver: float, output: float) -> dict[str, int]:
     """Return the fields that the reports of both pedals have."""
     actuator = state.actuators[axis]
-    source = WATCHDOG_SOURCES.get((state.watchdog_axis, state.watchdog), 0) if state.watchdog_axis else 0
+    source = WATCHDOG_SOURCES.get((state.watchdog_axis, state.watchdog_reason), 0) if state.watchdog_axis else 0
     return {
         "input": round(driver * FULL_PEDAL),
         "command": round(actuator.order.target * FULL_PEDAL) if actuator.order else 0,
@@ -246,5 +247,5 @@ REPORTS: dict[int, tuple[int, Callable[[KitState, Mechanics], bytes]]] = {
     0x067: (100, gear_report),
     0x06A: (10, wheel_speeds),
 }
-"""By identifier: the period in milliseconds, and the report. The periods are those of generation 2, as none are
-published."""
+"""By identifier: the period in milliseconds, and the function that encodes the report. The periods are those of
+generation 2, because none are published for generation 1."""

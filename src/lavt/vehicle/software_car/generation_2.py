@@ -37,11 +37,14 @@ PARTS: Final[tuple[Axis | None, ...]] = ("steering", "brake", "throttle", None)
 """The parts that a set's commands are for, by the offset from the set's identifier; the last is the gearbox."""
 SYSTEM_COMMAND_ID = 0x216
 UNKNOWN: Final = -0x8000
+"""Value of a 16-bit field whose quantity is unknown."""
+UNKNOWN_ANGLE: Final = -0x2000
+"""Value of the 14-bit field of an unknown steering wheel angle."""
 
 ALL_OR_NONE = 2
 """Code of the third published mode of synchronisation; the code is our choice."""
 ANGLE, PERCENT = 2, 14
-"""Those of the published command types that the kit accepts."""
+"""The command types that the kit accepts; more are published."""
 FULL_PEDAL = {"brake": 10_000, "throttle": 4_000}
 """A full pedal in steps of percent commands: 0.01 % and 0.025 %."""
 
@@ -89,7 +92,7 @@ def parse_order(frame: CanFrame, mechanics: Mechanics, is_remote: bool) -> AxisO
 def flag_fields(state: KitState, axis: Axis) -> dict[str, int]:
     """Return the flags that the reports of all three axes have."""
     actuator = state.actuators[axis]
-    others = (state.actuators[other] for other in AXES if other != axis)
+    other_actuators = (state.actuators[other_axis] for other_axis in AXES if other_axis != axis)
     return {
         "ready": not (actuator.faults or actuator.is_overridden or actuator.driver_acts),
         "enabled": actuator.is_enabled,
@@ -98,7 +101,7 @@ def flag_fields(state: KitState, axis: Axis) -> dict[str, int]:
         "bad_crc": actuator.is_crc_bad,
         "bad_rc": actuator.is_count_bad,
         "override_active": actuator.driver_acts,
-        "override_other": state.is_gear_overridden or any(other.is_overridden for other in others),
+        "override_other": state.is_gear_overridden or any(other.is_overridden for other in other_actuators),
         "override_latched": actuator.is_overridden,
         "external_control": actuator.is_enabled,
     }
@@ -108,7 +111,7 @@ def steering_report(state: KitState, _: Mechanics) -> dict[str, int]:
     """Return the fields of the steering report."""
     order = state.actuators["steering"].order
     return {
-        "angle": -0x2000 if "angle" in state.invalid else tenths_of_degree(state.wheel_rad),
+        "angle": UNKNOWN_ANGLE if "angle" in state.invalid else tenths_of_degree(state.wheel_rad),
         "command": tenths_of_degree(order.target) if order else 0,
         "torque": round(state.driver_torque_nm / 0.0625),
         **flag_fields(state, "steering"),
@@ -146,8 +149,8 @@ def system_report(state: KitState, _: Mechanics) -> dict[str, int]:
     """Return the fields of the system report."""
     return {
         "state": int(state.system),
-        "reason_disengage": reason_code(state.disengaged),
-        "reason_not_ready": reason_code(state.not_ready),
+        "reason_disengage": reason_code(state.disengage_reason),
+        "reason_not_ready": reason_code(state.not_ready_reason),
         "sync_mode": ALL_OR_NONE,
     }
 
@@ -182,7 +185,7 @@ def report_encoder(
 ) -> Callable[[KitState, Mechanics], bytes]:
     """Return a function that encodes a report, with counter and checksum if there is room."""
     layout = REPORT_LAYOUTS[identifier]
-    if layout == WHEEL_SPEEDS:  # full
+    if layout == WHEEL_SPEEDS:  # no room: the four speeds take all 8 bytes
         return lambda state, mechanics: pack(layout, values(state, mechanics))
 
     def report(state: KitState, mechanics: Mechanics) -> bytes:
@@ -208,4 +211,4 @@ REPORTS: dict[int, tuple[int, Callable[[KitState, Mechanics], bytes]]] = {
         0x2D8: (100, remote_report),
     }.items()
 }
-"""By identifier: the period in milliseconds, and the report."""
+"""By identifier: the period in milliseconds, and the function that encodes the report."""

@@ -17,7 +17,7 @@ UNVERIFIED: Final = {
         "published: order and widths of the fields, checksum last; our choice: the counter in bits 48 to 51",
     ),
     **dict.fromkeys((0x203, 0x213), "published: 4-bit command first, checksum last; no counter, as none is listed"),
-    0x216: "published: command, counter and checksum in this order; our assumption: half of the first byte each",
+    0x216: "published: command, counter and checksum in this order; our assumption: 4 bits for each of the first two",
     **dict.fromkeys(
         (0x100, 0x101, 0x102, 0x103), "published: widths of the values; our choice: all positions and the pedals' steps"
     ),

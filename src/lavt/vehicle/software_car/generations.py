@@ -18,12 +18,12 @@ class Generation(Struct, frozen=True):
 
     parse_order: Callable[[CanFrame, Mechanics, bool], AxisOrder | GearOrder | SystemOrder | None]
     reports: dict[int, tuple[int, Callable[[KitState, Mechanics], bytes]]]
-    """By identifier: the period in milliseconds, and the report."""
+    """By identifier: the period in milliseconds, and the function that encodes the report."""
     faults: dict[str, tuple[str, ...]]
     speed_messages: dict[str, int]
     """The identifier of the message of each source of speed."""
     follows: Callable[[int, int], bool]
-    """Whether a counter is a valid successor of another."""
+    """Whether the second counter is a valid successor of the first."""
     is_one_system: bool
     """All axes are enabled and released together, and enabled only after an order to the system."""
 
@@ -34,7 +34,7 @@ GENERATIONS: Final = {
         generation_1.REPORTS,
         generation_1.FAULTS,
         generation_1.SPEED_MESSAGES,
-        lambda before, count: count == (before + 1) % 256,
+        lambda previous, count: count == (previous + 1) % 256,
         is_one_system=False,
     ),
     2: Generation(
@@ -42,7 +42,7 @@ GENERATIONS: Final = {
         generation_2.REPORTS,
         generation_2.FAULTS,
         generation_2.SPEED_MESSAGES,
-        lambda before, count: count != before,
+        lambda previous, count: count != previous,
         is_one_system=True,
     ),
 }

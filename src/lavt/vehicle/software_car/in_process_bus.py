@@ -11,7 +11,8 @@ from lavt.vehicle.can_frame import BusGone, CanFrame, ReceivedCanFrame
 from lavt.vehicle.software_car.car import SoftwareCar
 
 FRAME_NS: Final = 250 * NS_PER_US
-"""Transmission time of a frame of 8 bytes at 500 kbit/s: 125 bits, of 111 to 135 depending on stuff bits."""
+"""Transmission time of a frame of 8 data bytes at 500 kbit/s. Such a frame has 111 to 135 bits, depending on its stuff
+bits; assumed are 125."""
 
 
 class BusDirection:

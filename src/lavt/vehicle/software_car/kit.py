@@ -28,7 +28,7 @@ from lavt.vehicle.software_car.state import (
 )
 
 OVERRIDE_TORQUE_NM: Final = 2.0
-"""Our choice: a torque on the steering wheel from here on is an override."""
+"""Our choice: a torque of the driver on the steering wheel of at least this value is an override."""
 INHIBIT_REASONS: Final = {
     "seat belt": ReleaseReason.SEAT_BELT,
     "door": ReleaseReason.DOOR,
@@ -98,8 +98,8 @@ class Kit:
             return
         actuator.is_crc_bad = False
         if order.count is not None:
-            before, actuator.count = actuator.count, order.count
-            actuator.is_count_bad = not self._follows(before, order.count)
+            previous_count, actuator.count = actuator.count, order.count
+            actuator.is_count_bad = not self._follows(previous_count, order.count)
             if actuator.is_count_bad:
                 self._authority.release(order.axis, ReleaseReason.COUNTER)
                 return
@@ -111,9 +111,9 @@ class Kit:
         if actuator.driver_acts and order.is_enabling and not order.ignores_driver:
             self._authority.override(order.axis)
 
-    def _follows(self, before: int | None, count: int) -> bool:
+    def _follows(self, previous_count: int | None, count: int) -> bool:
         is_checked = self._authority.has_watchdog or self._generation.is_one_system
-        return before is None or not is_checked or self._generation.follows(before, count)
+        return previous_count is None or not is_checked or self._generation.follows(previous_count, count)
 
     # Time.
 
@@ -150,20 +150,20 @@ class Kit:
     # Outputs.
 
     def frames_due(self, now_ns: int) -> list[CanFrame]:
-        """Return the reports that are due, each once however late the call is."""
+        """Return the reports that are due. If the call is late by several periods, a report is returned only once."""
         self._advance(now_ns)
         if now_ns < self._next_due_ns:
             return []
         frames = []
         dropped = {self._generation.speed_messages[source] for source in self.state.sensor_faults.dropped}
-        for identifier, (period_ms, make) in self._generation.reports.items():
+        for identifier, (period_ms, encode) in self._generation.reports.items():
             late_ns = now_ns - self._due_ns[identifier]
             if late_ns >= 0:
                 period_ns = period_ms * NS_PER_MS
                 self._due_ns[identifier] += (late_ns // period_ns + 1) * period_ns
                 if identifier in dropped:
                     continue
-                frames.append(CanFrame(identifier, make(self.state, self._mechanics)))
+                frames.append(CanFrame(identifier, encode(self.state, self._mechanics)))
                 self.state.sent[identifier] = self.state.sent.get(identifier, 0) + 1
         self._next_due_ns = min(self._due_ns.values())
         return [] if self._is_bus_off else frames

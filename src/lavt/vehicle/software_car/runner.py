@@ -17,9 +17,9 @@ from lavt.vehicle.software_car.event_log import KitEvent, StateObserver
 class SoftwareCarRunner:
     """A loop that advances a software car and connects it to a bus port.
 
-    Call `step` at each `next_wake_ns`, or later: the car takes all its steps at their own times, however late the call
-    is. Received frames have their arrival times. Frames to send have the times at which they were due, so that a port
-    can reject those that are too old.
+    Call `step` at each `next_wake_ns`, or later: however late the call is, the car takes each of its steps at the time
+    of that step. A received frame is processed at its arrival time. A frame to send is given to the port with the time
+    at which it was due, so that the port can reject it if it is too old.
     """
 
     def __init__(self, car: SoftwareCar, port: BusPort, *, start_ns: int) -> None:
@@ -32,12 +32,12 @@ class SoftwareCarRunner:
         self._is_lost, self._lost_ns = False, 0
         self._events: list[KitEvent] = []
         self.counts: Counter[str] = Counter(frames_sent=0, frames_heard=0, frames_lost=0)
-        self.latest_ns = 0
+        self.max_delay_ns = 0
         """The largest delay of a step so far."""
 
     def step(self, now_ns: int) -> None:
         """Process received frames, advance to `now_ns`, and send the frames due until then."""
-        self.latest_ns = max(self.latest_ns, now_ns - self._car.next_wake_ns())
+        self.max_delay_ns = max(self.max_delay_ns, now_ns - self._car.next_wake_ns())
         for received in self._take_frames(now_ns):
             at_ns = min(max(received.arrived_ns, self._now_ns), now_ns)
             self._advance(at_ns)
@@ -121,7 +121,7 @@ class SoftwareCarRunner:
         self._is_lost, self._lost_ns = True, now_ns
 
     def _note_bus_back(self, now_ns: int) -> None:
-        """Log that the bus is back once it has been for 1 s."""
+        """Log that the bus is back, once nothing has failed for 1 s."""
         if self._is_lost and now_ns - self._lost_ns >= NS_PER_S:
             self._is_lost = False
             self._events.append(KitEvent(now_ns, "bus", "the bus is back"))

@@ -1,4 +1,4 @@
-"""The state of a by-wire kit: its orders, its actuators, the driver, and the car.
+"""The state of a by-wire kit: the commands that it received (here called orders), its actuators, the driver, the car.
 
 Angles and torques are those of the steering wheel, left positive; pedals are fractions, 0 to 1.
 """
@@ -19,7 +19,8 @@ AXES: Final[tuple[Axis, ...]] = ("steering", "brake", "throttle")
 STATIONARY_BELOW_MPS = 0.1
 """Our choice: below this speed the car is stationary."""
 OVERRIDE_PEDAL: Final = 0.05
-"""Our choice: a pedal pressed from here on is an override. A shift needs as much brake."""
+"""Our choice: a pedal pressed at least this far, as a fraction, is an override. To shift, the brake must be pressed
+this far, too."""
 
 
 class Gear(IntEnum):
@@ -56,9 +57,9 @@ class SystemState(IntEnum):
 class ReleaseReason(IntEnum):
     """Why a kit released its axes, or is not ready.
 
-    Up to the lockouts the names of the reasons are published, but no codes: these follow the order of the names. The
-    reasons after them are internal to the kit and not reported. The tenth published reason, a delay before engaging
-    again, is not simulated: its length is not published.
+    For the reasons up to the lockouts, the names are published but not the codes; here the codes follow the order of
+    the names. The reasons after the lockouts are internal to the kit and not reported. Code 10 is missing: the tenth
+    published reason, a delay before engaging again, is not simulated, because the length of the delay is not published.
     """
 
     NONE = 0
@@ -93,7 +94,7 @@ class AxisOrder(Struct, frozen=True):
     rate_radps: float = 0.0
     """The largest rate of the steering wheel."""
     count: int | None = None
-    """None: the frame has no counter and only clears."""
+    """None: the frame has no counter and only clears: an override, and the watchdog."""
 
 
 class GearOrder(Struct, frozen=True):
@@ -169,13 +170,14 @@ class KitState:
     gear_faults: set[str] = field(default_factory=set)
     # The kit as a whole.
     system: SystemState = SystemState.MANUAL
-    disengaged: ReleaseReason = ReleaseReason.NONE
-    not_ready: ReleaseReason = ReleaseReason.NONE
-    watchdog: ReleaseReason = ReleaseReason.NONE
+    disengage_reason: ReleaseReason = ReleaseReason.NONE
+    not_ready_reason: ReleaseReason = ReleaseReason.NONE
+    watchdog_reason: ReleaseReason = ReleaseReason.NONE
     """Why the watchdog tripped; latched until it is cleared after an override by the driver."""
     watchdog_axis: Axis | None = None
     watchdog_brakes: bool = False
     remote_state: int = 2
+    """State of the remote's switch, one of `REMOTE_STATES` in `console_commands.py`."""
     sent: dict[int, int] = field(default_factory=dict)
     """Number of frames sent, by identifier."""
 

@@ -227,7 +227,7 @@ def _mottle(grass: Picture, square: Square) -> Picture:
     count = 16
     middle_m = (np.arange(count) + 0.5) * square.edge_m / count
     x_m, y_m = square.left_m + middle_m, (square.low_m + middle_m)[:, None]
-    light = 0.92 + 0.09 * np.sin(0.071 * x_m + 0.113 * y_m) + 0.07 * np.sin(0.157 * x_m - 0.093 * y_m + 1.0)
-    levels = np.rint(light * 200.0).astype(np.uint8)
+    brightness = 0.92 + 0.09 * np.sin(0.071 * x_m + 0.113 * y_m) + 0.07 * np.sin(0.157 * x_m - 0.093 * y_m + 1.0)
+    levels = np.rint(brightness * 200.0).astype(np.uint8)
     fine = cv2.resize(cv2.merge((levels, levels, levels)), grass.shape[1::-1], interpolation=cv2.INTER_LINEAR)
     return np.asarray(cv2.multiply(grass, fine, scale=1 / 200), dtype=np.uint8)

@@ -23,8 +23,9 @@ _RIDGES = (
     (0.062, ((0.022, 3, 0.0), (0.015, 7, 1.0)), (186.0, 172.0, 150.0), 0.62),
     (0.036, ((0.012, 5, 2.0), (0.008, 13, 0.0)), (152.0, 152.0, 128.0), 0.42),
 )
-"""Hills: mean height, waves (height, number around the horizon, phase), colour at noon, share of haze."""
-_WOOD = (112.0, 122.0, 104.0)
+"""Hills: mean height, waves (height, number around the horizon, phase), colour at noon, share of haze. Heights are
+shares of the focal length."""
+_WOOD_COLOUR = (112.0, 122.0, 104.0)
 
 
 class Panorama:
@@ -47,7 +48,7 @@ def _paint(rows: int, horizon: float, focal_px: float, light: Light, *, plain: b
     """Return the panorama (rows, columns); a texel is a 32-bit word of blue, green, red and an unused byte."""
     # The height of each row above the horizon, as a share of the focal length.
     height = np.asarray((horizon - np.arange(rows)) / focal_px, dtype=np.float64)[:, None]
-    # Column c shows the azimuth -c, so that columns run to the right.
+    # A column shows the azimuth -turn: azimuths increase to the left, and columns to the right.
     turn = np.arange(_COLUMNS) / _COLUMNS * 2 * math.pi
     rise = np.clip(height / 0.75, 0.0, 1.0) ** 0.6
     sky = np.array(light.haze) * (1 - rise[..., None]) + np.array(light.zenith) * rise[..., None]
@@ -61,7 +62,7 @@ def _paint(rows: int, horizon: float, focal_px: float, light: Light, *, plain: b
         for mean, waves, colour, haze in _RIDGES:
             ridge = mean + sum((wave * np.sin(count * turn + phase) for wave, count, phase in waves), np.zeros(1))
             _add_ridge(picture, height, ridge, _hazed_colour(colour, light, haze))
-    _add_ridge(picture, height, 0.020 + 0.0035 * _wood_outline(), _hazed_colour(_WOOD, light, 0.2))
+    _add_ridge(picture, height, 0.020 + 0.0035 * _wood_outline(), _hazed_colour(_WOOD_COLOUR, light, 0.2))
     words = np.zeros((rows, _COLUMNS, 4), dtype=np.uint8)
     words[..., :3] = np.clip(np.rint(picture), 0, 255)
     return np.asarray(words.view(np.uint32)[..., 0], dtype=np.uint32)

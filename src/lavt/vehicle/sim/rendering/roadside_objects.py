@@ -31,7 +31,7 @@ _SCENERY_WIDTH_M = 110.0
 _GROUND_PER_TREE_M2 = 480.0
 _GROUND_PER_BUILDING_M2 = 6200.0
 
-_BANDS: dict[str, tuple[tuple[float, float, tuple[int, int, int], float], ...]] = {
+_RAIL_FACES: dict[str, tuple[tuple[float, float, tuple[int, int, int], float], ...]] = {
     "barrier": (
         (0.0, 0.86, (164, 170, 172), FAR_M),
         (0.0, 0.22, (132, 138, 140), _DETAIL_VISIBLE_TO_M),
@@ -90,7 +90,7 @@ class RoadsideObjects:
 
 
 def place_roadside_objects(road: Road, *, trees: bool) -> RoadsideObjects:
-    """Place the objects along a road; `trees` includes trees, lamp posts and buildings."""
+    """Place the objects along a road: rails and barriers, and with `trees` also trees, lamp posts and buildings."""
     sampled_rails = [_rail_stations(road, rail) for rail in road.rails]
     placed_trees = _place_trees(road) if trees else np.empty((0, 4))
     return RoadsideObjects(
@@ -119,7 +119,7 @@ def _rail_faces(road: Road, sampled_rails: Sequence[tuple[Rail, FloatArray]]) ->
         # Vary the tone of the pieces, so that their motion is visible.
         tone = stream(_WORLD_SEED, "rail").uniform(-6, 6, len(line) - 1)[:, None]
         normals = _left_normals(line[:-1], line[1:]) * (-1.0 if rail.offset_m > 0 else 1.0)
-        for low_m, high_m, colour, visible_to_m in _BANDS[rail.kind]:
+        for low_m, high_m, colour, visible_to_m in _RAIL_FACES[rail.kind]:
             corners = _upright_faces(line[:-1], line[1:], low_m, high_m)
             faces.append(Faces(corners, np.array(colour) + tone, normals, np.full(len(tone), visible_to_m)))
     return faces

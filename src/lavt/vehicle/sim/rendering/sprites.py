@@ -172,10 +172,10 @@ def _paint_tree(kind: int) -> tuple[Picture, Grey]:
     middle = _WIDTH_PX // 2
     if kind != TREE_KINDS - 1:
         _paint_trunk(colour, alpha, middle, random)
-    for u, v, radius, light in _leaf_tufts(kind, random):
-        shade = np.clip(leaf * light + random.uniform(-5, 5, 3), 0, 255).tolist()
+    for u, v, radius, brightness in _leaf_tufts(kind, random):
+        tuft_colour = np.clip(leaf * brightness + random.uniform(-5, 5, 3), 0, 255).tolist()
         centre, size = (round(u * 8), round(v * 8)), round(radius * 8)
-        cv2.circle(colour, centre, size, shade, -1, cv2.LINE_AA, 3)
+        cv2.circle(colour, centre, size, tuft_colour, -1, cv2.LINE_AA, 3)
         cv2.circle(alpha, centre, size, (255,), -1, cv2.LINE_AA, 3)
     return colour, alpha
 
@@ -201,13 +201,13 @@ def _leaf_tufts(kind: int, random: np.random.Generator) -> FloatArray:
         tier = 1.0 - 0.28 * np.mod(down * 8.0, 1.0)[::-1]
         u = middle + across * (4 + down * 72) * tier
         v = 8 + down * 214 + 10 * np.abs(across)
-        light = 0.60 - 0.28 * across + random.uniform(-0.20, 0.20, count) + 0.1 * (1 - down)
+        brightness = 0.60 - 0.28 * across + random.uniform(-0.20, 0.20, count) + 0.1 * (1 - down)
         near = random.uniform(0, 1, count)
     else:
-        u, v, light, near = _crown(kind, random, count, middle)
+        u, v, brightness, near = _crown(kind, random, count, middle)
     order = np.argsort(near)
     radius = random.uniform(1.4, 3.6, count)
-    return np.stack([u, v, radius, light], axis=-1)[order]
+    return np.stack([u, v, radius, brightness], axis=-1)[order]
 
 
 def _crown(
@@ -228,7 +228,7 @@ def _crown(
     u_in, v_in = np.cos(turn) * out, np.sin(turn) * out
     u = middle + clump_u[clump] + u_in * clump_size[clump]
     v = centre_v + clump_v[clump] + v_in * clump_size[clump]
-    light = 0.80 - 0.26 * u_in - 0.34 * v_in
-    light += -0.14 * clump_u[clump] / half_width - 0.26 * clump_v[clump] / half_height + 0.16 * clump_near[clump]
-    light += random.uniform(-0.16, 0.16, count)
-    return u, np.minimum(v, _HEIGHT_PX - 3.0), light, clump_near[clump] + 0.25 * random.uniform(0, 1, count)
+    brightness = 0.80 - 0.26 * u_in - 0.34 * v_in
+    brightness += -0.14 * clump_u[clump] / half_width - 0.26 * clump_v[clump] / half_height + 0.16 * clump_near[clump]
+    brightness += random.uniform(-0.16, 0.16, count)
+    return u, np.minimum(v, _HEIGHT_PX - 3.0), brightness, clump_near[clump] + 0.25 * random.uniform(0, 1, count)

@@ -18,6 +18,8 @@ _WORLD_SEED = 0
 _PATCH_SPACING_M = 16.0
 _CRACK_SPACING_M = 7.0
 _SEAM_WIDTH_M = 0.03
+_PATCH_SEAM_WIDTH_M = 0.05
+"""The width of the seam around a patch."""
 _PAVER_WIDTH_M = 3.5
 """The width of a strip that a paver lays at a time; there is a seam between two strips."""
 
@@ -33,7 +35,7 @@ class SurfaceWear:
 
 def surface_wear(road: Road) -> list[SurfaceWear]:
     """Return all wear of one road, in painting order."""
-    patches, edges = _patches(road)
+    patches, patch_seams = _patches(road)
     seams = [
         strip_along(road, offset_m + _SEAM_WIDTH_M / 2, offset_m - _SEAM_WIDTH_M / 2, strip.from_m, strip.to_m)
         for strip in road.paved
@@ -42,7 +44,7 @@ def surface_wear(road: Road) -> list[SurfaceWear]:
     return [
         *(SurfaceWear(join_strips(strips), 2.0, grey) for grey, strips in patches.items()),
         SurfaceWear(join_strips(seams), _SEAM_WIDTH_M, 12),
-        SurfaceWear(edges, 0.05, 30),
+        SurfaceWear(patch_seams, _PATCH_SEAM_WIDTH_M, 30),
         SurfaceWear(_cracks(road, "cracks", 0.018), 0.018, 34),
         SurfaceWear(_cracks(road, "sealed cracks", 0.07), 0.07, 26),
     ]
@@ -52,7 +54,8 @@ def _patches(road: Road) -> tuple[dict[int, list[Strips]], Strips]:
     """Return rectangular patches of newer asphalt by how much darker they are, and the seams around them."""
     random = stream(_WORLD_SEED, "repairs")
     by_grey: dict[int, list[Strips]] = {7: [], 12: [], 17: []}
-    edges = []
+    half_seam_m = _PATCH_SEAM_WIDTH_M / 2
+    seams = []
     count = int((road.last_m - road.first_m) / _PATCH_SPACING_M * len(road.paved))
     for _ in range(count):
         strip = road.paved[int(random.integers(len(road.paved)))]
@@ -64,10 +67,13 @@ def _patches(road: Road) -> tuple[dict[int, list[Strips]], Strips]:
         by_grey[sorted(by_grey)[int(random.integers(len(by_grey)))]].append(
             strip_along(road, left_m, right_m, begin_m, end_m)
         )
-        edges += [strip_along(road, edge_m + 0.025, edge_m - 0.025, begin_m, end_m) for edge_m in (left_m, right_m)]
+        seams += [
+            strip_along(road, edge_m + half_seam_m, edge_m - half_seam_m, begin_m, end_m)
+            for edge_m in (left_m, right_m)
+        ]
         ends_m = np.array([begin_m, end_m])
-        edges.append(strip_pieces(road, left_m, right_m, ends_m - 0.025, ends_m + 0.025))
-    return by_grey, join_strips(edges)
+        seams.append(strip_pieces(road, left_m, right_m, ends_m - half_seam_m, ends_m + half_seam_m))
+    return by_grey, join_strips(seams)
 
 
 def _cracks(road: Road, name: str, width_m: float) -> Strips:

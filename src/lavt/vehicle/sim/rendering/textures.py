@@ -78,10 +78,10 @@ def _make_finest() -> Textures:
     blades = seamless_noise("blades", size, size // 2)
     tufts = seamless_noise("tufts", size, 200) + seamless_noise("tufts", size, 64)
     meadow = seamless_noise("meadow", size, 9)
-    light = 1.0 + 0.10 * blades + 0.07 * tufts + 0.06 * meadow
+    brightness = 1.0 + 0.10 * blades + 0.07 * tufts + 0.06 * meadow
     dry = 0.5 + 0.22 * seamless_noise("dry", size, 24)
     grass = np.stack([46 + 18 * dry, 96 + 12 * dry, 78 + 44 * dry], axis=-1)
-    grass *= light[..., None]
+    grass *= brightness[..., None]
     pebbles = 1.0 + 0.07 * stones + 0.10 * grain + 0.04 * tufts
     gravel = np.array([98, 112, 122], dtype=np.float32) * pebbles[..., None]
     chips = 0.9 * stones + 0.6 * grain + 1.3 * seamless_noise("chips", size, 160)

@@ -66,7 +66,7 @@ class RoadMark:
     """A station where a dash begins, which fixes all other dashes."""
 
     def dash_begins_m(self, first_m: float, last_m: float) -> FloatArray:
-        """Return the stations where the dashes begin that lie wholly between two stations and within the mark."""
+        """Return where the dashes begin (stations), for the dashes wholly between two stations and within the mark."""
         first_m, last_m = max(self.from_m, first_m), min(self.to_m, last_m)
         period_m = self.dash_m + self.gap_m
         counts = np.arange(
