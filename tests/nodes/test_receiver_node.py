@@ -29,8 +29,9 @@ def new_node(*, token: bool = True) -> ReceiverNode:
 
 
 def packets(number: int = 3) -> list[list[bytes]]:
+    """Return the packets of each of several frames."""
     packetizer = Packetizer(77, 100)
-    return [packetizer.packetize(UNIT, 3000 * each) for each in range(number)]
+    return [packetizer.packetize(UNIT, 3000 * index) for index in range(number)]
 
 
 def test_without_a_token_nothing_is_sent() -> None:
@@ -119,7 +120,7 @@ def test_a_loss_requests_a_keyframe() -> None:
 
 
 def answer_report(node: ReceiverNode, round_trip_ns: int, begin_ns: int = 0) -> None:
-    """Let the node send a report, and answer it 30 ms after its arrival."""
+    """Let the node send a report, and deliver the answer, which the sender sent 30 ms after the report arrived."""
     (report,) = [
         each for each in payloads(deliver(node, WAKE, None, at(begin_ns)), "feedback") if not is_path_datagram(each)
     ]
@@ -142,7 +143,7 @@ def test_a_keyframe_request_is_repeated_each_round_trip() -> None:
         deliver(node, "rtp", packet, at(200 * NS_PER_MS))
     times = [ms for ms in range(200, 700) if requests_keyframe(deliver(node, WAKE, None, at(ms * NS_PER_MS)))]
     assert times in ([210, 360, 510, 660], [210, 361, 512, 663]), (
-        "a round trip of 100 ms (to 1/65536 s), and 50 ms for the keyframe"
+        "the requests are a round trip of 100 ms (rounded to 1/65536 s) and 50 ms for the keyframe apart"
     )
     for packet in third:
         deliver(node, "rtp", packet, at(700 * NS_PER_MS))
