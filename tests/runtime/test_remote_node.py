@@ -332,22 +332,22 @@ def test_heartbeats_are_checked() -> None:
 def test_an_error_in_one_direction_closes_the_pipe(failing_step: str) -> None:
     """An entry that cannot be sent, read or received closes the pipe at both ends."""
     server_end, node_end = multiprocessing.Pipe()
-    closed, other_closed = threading.Event(), threading.Event()
+    server_closed, node_closed = threading.Event(), threading.Event()
 
     def fail(_entry: object) -> None:
         raise LookupError("failed on purpose")
 
-    one, other = Pipe(server_end, lambda _: None, closed.set), Pipe(node_end, fail, other_closed.set)
-    one.start()
-    other.start()
+    server_pipe, node_pipe = Pipe(server_end, lambda _: None, server_closed.set), Pipe(node_end, fail, node_closed.set)
+    server_pipe.start()
+    node_pipe.start()
     if failing_step == "read":
         server_end.send_bytes(b"no entry")
     else:
-        one.send(threading.Lock() if failing_step == "send" else "an entry")
-    assert other_closed.wait(10)
-    other.close(1)
-    assert closed.wait(10)
-    one.close(1)
+        server_pipe.send(threading.Lock() if failing_step == "send" else "an entry")
+    assert node_closed.wait(10)
+    node_pipe.close(1)
+    assert server_closed.wait(10)
+    server_pipe.close(1)
 
 
 def test_a_server_that_never_started_ends_the_nodes_process() -> None:
