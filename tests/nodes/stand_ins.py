@@ -18,7 +18,7 @@ from lavt.vehicle.vehicle import Capabilities, ReachedCommand
 
 MONO_NS = 1_000 * NS_PER_S
 WALL_NS = 1_790_000_000 * NS_PER_S
-SMALL = CameraModel(width_px=128, height_px=96)
+SMALL_CAMERA = CameraModel(width_px=128, height_px=96)
 CAPABILITIES = Capabilities(
     simulated=True,
     virtual_time=True,
@@ -50,7 +50,7 @@ def payloads(sends: list[Send], channel: str) -> list[Any]:
     return [send.payload for send in sends if send.channel == channel]
 
 
-def noise(number: int, model: CameraModel = SMALL) -> Picture:
+def noise(number: int, model: CameraModel = SMALL_CAMERA) -> Picture:
     generator = np.random.default_rng(number)
     return generator.integers(0, 256, (model.height_px, model.width_px, 3), dtype=np.uint8)
 
@@ -59,7 +59,7 @@ def noise(number: int, model: CameraModel = SMALL) -> Picture:
 class NoiseCamera:
     """A `Camera` with small pictures that are all different; it stores the arguments of each call."""
 
-    model: CameraModel = SMALL
+    model: CameraModel = SMALL_CAMERA
     rate_hz: float = 30.0
     phase_ns: int = 0
     broken: bool = False

@@ -27,6 +27,20 @@ from lavt.vehicle.vehicle import ReachedCommand
 
 PERIOD_NS = 20 * NS_PER_MS
 """The period of states, and of the commands of the test bench."""
+ARM = Command(
+    epoch=0,
+    sequence=0,
+    sent_wall_ns=11,
+    stamp_ns=0,
+    stamp_received_wall_ns=22,
+    steering_rad=0.0,
+    throttle=0.0,
+    brake=1.0,
+    path_curvature_per_m=(0.0,) * 10,
+    mode="arm",
+    emergency_stop=0,
+)
+DRIVE = replace(ARM, mode="drive", throttle=0.5, brake=0.0)
 
 
 class Bench:
@@ -55,8 +69,8 @@ class Bench:
         self.epoch = 0
         self.sends: list[Send] = []
 
-    def deliver(self, channel: str, payload: Any, **where: Any) -> list[Send]:
-        sends = deliver(self.node, channel, payload, at(self.mono_ns), **where)
+    def deliver(self, channel: str, payload: Any, **options: Any) -> list[Send]:
+        sends = deliver(self.node, channel, payload, at(self.mono_ns), **options)
         self.sends += sends
         return sends
 
@@ -76,15 +90,16 @@ class Bench:
         return reply
 
     def picture(self) -> int:
+        """Report a sent frame to the node, as the camera does, and return its stamp."""
         stamp_ns = at(self.mono_ns).wall_ns
         number = self.mono_ns // NS_PER_MS
         self.deliver("frame", FrameWritten(number, stamp_ns, at(self.mono_ns).mono_ns, None, number, 1))
         return stamp_ns
 
     def command(self, **changes: Any) -> Admission:
+        """Send an arm command from a new frame, changed by `changes`, and return the gate's verdict."""
         self.sequence += 1
-        stamp_ns = self.picture()
-        command = Command(self.epoch, self.sequence, 11, stamp_ns, 22, 0.0, 0.0, 1.0, (0.0,) * 10, "arm", 0)
+        command = replace(ARM, epoch=self.epoch, sequence=self.sequence, stamp_ns=self.picture())
         (admission,) = payloads(self.deliver("control", encode(replace(command, **changes))), "admission")
         assert isinstance(admission, Admission)
         return admission
@@ -123,7 +138,7 @@ def test_the_age_of_a_picture_is_judged_when_its_command_is_applied(waited_ns: i
     bench = Bench().armed()
     stamp_ns = bench.picture()
     bench.sequence += 1
-    command = Command(bench.epoch, bench.sequence, 11, stamp_ns, 22, 0.0, 0.5, 0.0, (0.0,) * 10, "drive", 0)
+    command = replace(DRIVE, epoch=bench.epoch, sequence=bench.sequence, stamp_ns=stamp_ns)
     arrived = at(bench.mono_ns + 200 * NS_PER_MS)
     bench.mono_ns += 200 * NS_PER_MS + waited_ns
     (admission,) = payloads(bench.deliver("control", encode(command), arrived=arrived), "admission")
@@ -149,7 +164,7 @@ def test_a_late_node_publishes_one_state_and_reports_late_physics() -> None:
     bench = Bench()
     bench.mono_ns = NS_PER_S
     assert len(payloads(bench.deliver(WAKE, None), "state")) == 1
-    assert bench.events("late") == ["995 ms"]
+    assert bench.events("late") == ["995 ms"], "the first physics step was due after 1/240 s"
     assert bench.node.next_wake_ns() > at(NS_PER_S).mono_ns
 
 
@@ -197,7 +212,7 @@ def test_a_command_is_judged_by_its_arrival() -> None:
     arrived = at(bench.mono_ns)
     stamp_ns = bench.picture()
     bench.mono_ns += 10 * NS_PER_MS
-    command = Command(bench.epoch, 999, 1, stamp_ns, 2, 0.0, 0.0, 1.0, (0.0,) * 10, "drive", 0)
+    command = replace(DRIVE, epoch=bench.epoch, sequence=999, stamp_ns=stamp_ns)
     (admission,) = payloads(bench.deliver("control", encode(command), arrived=arrived), "admission")
     assert (admission.received_mono_ns, admission.applied_mono_ns) == (arrived.mono_ns, at(bench.mono_ns).mono_ns)
 
@@ -215,7 +230,7 @@ def test_without_drive_commands_the_vehicle_does_not_move_and_stops() -> None:
 
 
 def test_a_drive_begins_and_ends_exactly_once() -> None:
-    """A drive begins when armed and has one ending: the first ending event."""
+    """A drive begins when the vehicle is armed, and ends once: with the first event that ends a drive."""
     bench = Bench().armed()
     bench.drive()
     bench.vehicle.speed_mps = 8.0
@@ -359,8 +374,9 @@ def test_a_state_with_a_long_inhibit_reason_is_readable(letter: str) -> None:
 @example(speed_mps=101.0, steering_rad=-1.01)
 @example(speed_mps=math.nan, steering_rad=math.nan)
 def test_any_vehicle_state_is_readable(speed_mps: float, steering_rad: float) -> None:
-    """Whatever speed and angle a vehicle reports, its state is readable: values in the range unchanged, others at its
-    end.
+    """A state is readable whatever speed and angle the vehicle reports.
+
+    Values within the range of a state are published unchanged, any others as the range's nearest end.
     """
     bench = Bench()
     bench.vehicle.speed_mps, bench.vehicle.steering_rad = speed_mps, steering_rad
@@ -418,7 +434,7 @@ def test_commands_that_reached_the_wheels_are_recorded() -> None:
     assert first.applied_mono_ns is not None
     bench.advance(PERIOD_NS)
     applied_ns, reached_ns = second.applied_mono_ns or 0, at(bench.mono_ns).mono_ns
-    bench.vehicle.reached = [ReachedCommand(applied_ns + 1, reached_ns)]
+    bench.vehicle.reached = [ReachedCommand(applied_ns + 1, reached_ns)]  # no command was applied at this time
     assert payloads(bench.advance(PERIOD_NS), "wheel") == []
     third = bench.drive()
     bench.vehicle.reached = [ReachedCommand(third.applied_mono_ns or 0, reached_ns)] * 2

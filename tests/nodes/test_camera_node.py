@@ -5,7 +5,7 @@ from itertools import count
 from pathlib import Path
 
 import pytest
-from tests.nodes.stand_ins import MONO_NS, SMALL, NoiseCamera, at, deliver, noise, payloads
+from tests.nodes.stand_ins import MONO_NS, SMALL_CAMERA, NoiseCamera, at, deliver, noise, payloads
 from tests.support.clocks import ManualClock
 from tests.vehicle.moving_video import MODEL as MOVING
 from tests.vehicle.moving_video import number_of, write_video
@@ -38,11 +38,13 @@ TOKEN = bytes(range(16))
 HOME, ELSEWHERE = ("198.51.100.2", 4000), ("203.0.113.9", 4000)
 REPORT = receiver_report(1, ReceptionReport(2, 1, 0.0, 0, 0), clock_ns=0)
 KEYFRAME_REQUEST = picture_loss(1, 2)
+KEYFRAME_START = b"\x00\x00\x01\x65"
+"""The start code and header of a NAL unit that only keyframes contain."""
 
 
 def node_with(camera: Camera | None = None, *, send_to: tuple[tuple[str, int], ...] = ()) -> CameraNode:
     numbers = count()
-    model = SMALL if camera is None else camera.model
+    model = SMALL_CAMERA if camera is None else camera.model
     pictures = VideoSender(
         Encoder(model.width_px, model.height_px, rate_hz=30, bit_rate_bps=2_000_000, gop_frames=1000)
     )
@@ -158,7 +160,7 @@ def test_a_missing_picture_is_counted_and_not_sent() -> None:
 
 
 def test_no_video_without_a_validated_path() -> None:
-    """Video is sent to a validated address only, and only while it sends reports."""
+    """Video is sent only to a validated address, and only while reports arrive from this address."""
     node = node_with()
     assert payloads(wake(node, 0), "rtp") == []
     assert deliver(node, "feedback", PathClient(TOKEN).hello(0), at(1), HOME) == []
@@ -184,26 +186,26 @@ def test_keyframe_requests_are_rate_limited() -> None:
     deliver(node, "video_token", TOKEN, at(0))
     validate_path(node)
     are_keyframes = []
-    for number in range(12):
+    for number in range(12):  # 0.4 s
         deliver(node, "feedback", KEYFRAME_REQUEST, at(number * FRAME_NS + NS_PER_MS), HOME)
         (unit,) = payloads(wake(node, number * FRAME_NS + 2 * NS_PER_MS), "video")
-        are_keyframes.append(any(unit.data[i : i + 4] == b"\x00\x00\x01\x65" for i in range(len(unit.data))))
+        are_keyframes.append(KEYFRAME_START in unit.data)
     assert are_keyframes[0]
     assert 3 <= node.counts["keyframes_on_request"] <= 4
     assert sum(are_keyframes) == node.counts["keyframes_on_request"]
 
 
 def test_bit_rate_changes_are_rate_limited() -> None:
-    """There is at most one bit rate change, and its keyframe, in 100 ms."""
+    """The bit rate changes at most once in 100 ms, because each change restarts the encoder, which sends a keyframe."""
     node = node_with()
     deliver(node, "video_token", TOKEN, at(0))
     validate_path(node)
     keyframes = 0
-    for number in range(30):
+    for number in range(30):  # 1 s
         limit = max_bit_rate(1, 2, 500_000 + number * 10_000, overhead_bytes=0)
         deliver(node, "feedback", limit, at(number * FRAME_NS + NS_PER_MS), HOME)
         (unit,) = payloads(wake(node, number * FRAME_NS + 2 * NS_PER_MS), "video")
-        keyframes += any(unit.data[i : i + 4] == b"\x00\x00\x01\x65" for i in range(len(unit.data)))
+        keyframes += KEYFRAME_START in unit.data
     assert 8 <= keyframes <= 11
 
 
@@ -219,9 +221,9 @@ def test_other_addresses_have_no_effect() -> None:
             assert deliver(node, "feedback", datagram, at(number * FRAME_NS), ELSEWHERE) == []
         sends = wake(node, number * FRAME_NS + NS_PER_MS)
         assert {send.peer for send in sends if send.channel == "rtp"} <= {HOME}
-    assert payloads(sends, "rtp") == []
+    assert payloads(sends, "rtp") == [], "HOME has sent no report for 2 s"
     assert node.counts.get("keyframes_on_request", 0) == 0
-    assert node.counts["feedback_from_strangers"] == 2 * 89
+    assert node.counts["feedback_from_strangers"] == 2 * 89, "the requests and the reports"
 
 
 def test_reports_keep_the_path_open_and_garbage_is_counted() -> None:
@@ -256,7 +258,7 @@ def test_repair_packets_go_to_the_validated_address_only() -> None:
         if send.channel == "rtp" and not is_rtcp(send.payload):
             payload_types[send.peer].append(parse_packet(send.payload).payload_type)
     repairs = node.counts["packets_of_repair"]
-    assert repairs in {2, 4}, "two for each block of 16"
+    assert repairs in {2, 4}, "two for each block of at most 16 packets"
     assert payload_types[HOME] == [*payload_types[ELSEWHERE], *[97] * repairs]
     assert set(payload_types[ELSEWHERE]) == {96}
 
@@ -286,16 +288,16 @@ def test_the_receiver_may_request_a_lower_bit_rate() -> None:
         sizes: list[int] = []
         for number in range(begin, begin + 40):
             deliver(node, "feedback", REPORT, at(number * FRAME_NS), HOME)
-            sizes += [each.size_bytes for each in payloads(wake(node, number * FRAME_NS + NS_PER_MS), "frame")]
+            sizes += [frame.size_bytes for frame in payloads(wake(node, number * FRAME_NS + NS_PER_MS), "frame")]
         return sum(sizes[10:]) / 30
 
-    own = mean_bytes(0)
+    configured_rate_bytes = mean_bytes(0)
     deliver(node, "feedback", max_bit_rate(1, 2, 500_000, overhead_bytes=0), at(41 * FRAME_NS), HOME)
-    assert mean_bytes(42) < 0.5 * own
+    assert mean_bytes(42) < 0.5 * configured_rate_bytes
     deliver(node, "feedback", max_bit_rate(1, 2, 9_000_000, overhead_bytes=0), at(90 * FRAME_NS), HOME)
-    assert mean_bytes(91) == pytest.approx(own, rel=0.2)
+    assert mean_bytes(91) == pytest.approx(configured_rate_bytes, rel=0.2)
     deliver(node, "feedback", max_bit_rate(1, 2, 500_000, overhead_bytes=0), at(140 * FRAME_NS), ELSEWHERE)
-    assert mean_bytes(141) == pytest.approx(own, rel=0.2)
+    assert mean_bytes(141) == pytest.approx(configured_rate_bytes, rel=0.2)
 
 
 def test_pictures_of_a_video_device_are_sent(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from lavt.domain import NS_PER_S, Now, SafetyState, SessionReply, State
 from lavt.nodes.client_session import ClientSession
 
 GRANTED = SessionReply(True, "", 5, bytes(16), 5600, "kernel", 0)
-REJECTED = SessionReply(False, "bob has control", 0, b"", 5600, "kernel", 70)
+REJECTED = SessionReply(False, "bob has control", 0, b"", 5600, "kernel", emergency_stop=70)
 
 
 def new_session(*, rearm: bool = False) -> ClientSession:
@@ -125,7 +125,7 @@ def test_rearm_requests_control_from_a_restarted_server(stopped: bool) -> None:
 
 
 def test_an_emergency_stop_has_a_new_number() -> None:
-    """An emergency stop number is the wall clock time, or one more than the highest number seen."""
+    """The number of an emergency stop is the wall clock's time, or one more than the highest known number if higher."""
     session = new_session()
     session.handle_reply(REJECTED, 200)
     request = session.raise_emergency_stop(Now(0, 60))
@@ -150,8 +150,8 @@ def test_an_emergency_stop_is_repeated_until_answered(released: bool) -> None:
         session.handle_reply(GRANTED, 200)
         session.release(300)
     first = session.raise_emergency_stop(Now(400, 60))
-    others = {due(session, 400), due(session, 400 + NS_PER_S - 1)}
-    assert others <= {"acquire", "release", ""}
+    earlier_operations = {due(session, 400), due(session, 400 + NS_PER_S - 1)}
+    assert earlier_operations <= {"acquire", "release", ""}
     assert session.next_wake_ns() == 400 + NS_PER_S
     assert session.take_request(400 + NS_PER_S) == first
     assert session.take_request(400 + 2 * NS_PER_S) == first
@@ -180,6 +180,7 @@ def state_of(active_operator: str, safety: SafetyState = "driving", instance: in
 
 
 def due(session: ClientSession, now_ns: int) -> str:
+    """Return the operation that the session requests at this time, or "" if it requests none."""
     request = session.take_request(now_ns)
     return "" if request is None else request.operation
 

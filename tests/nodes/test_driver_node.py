@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
-from tests.nodes.stand_ins import MONO_NS, SMALL, WALL_NS, at, deliver, noise, payloads
+from tests.nodes.stand_ins import MONO_NS, SMALL_CAMERA, WALL_NS, at, deliver, noise, payloads
 
 from lavt.channels import CHANNELS
 from lavt.control.client_limits import CLIENT_LIMITS
@@ -56,7 +56,7 @@ class FakeLaneDetector:
     def detect(self, picture_bgr: Picture) -> Lane:
         """Return the lane."""
         self.pictures.append(picture_bgr)
-        return Lane((0.0, 0.0, 0.0), 3.5, 3.6, 20.0, self.confidence)
+        return Lane(centre=(0.0, 0.0, 0.0), width_m=3.5, near_m=3.6, far_m=20.0, confidence=self.confidence)
 
 
 class FakeController:
@@ -74,7 +74,7 @@ class Bench:
         self.detector = FakeLaneDetector()
         self.session = ClientSession("alice", 1, rearm=False, start_ns=MONO_NS)
         self.node = DriverNode(
-            PictureReader(VideoReceiver(Decoder(), (SMALL.height_px, SMALL.width_px))),
+            PictureReader(VideoReceiver(Decoder(), (SMALL_CAMERA.height_px, SMALL_CAMERA.width_px))),
             detector or self.detector,
             FakeController(),
             self.session,
@@ -89,6 +89,7 @@ class Bench:
         return sends
 
     def view(self, picture: Picture | None = None) -> list[Command]:
+        """Deliver a decoded picture to perception, and return the commands that the node sends."""
         shown = noise(1) if picture is None else picture
         return commands(
             self.deliver("view", DecodedFrame(WALL_NS + self.mono_ns, WALL_NS + self.mono_ns, RenderedPicture(shown)))
@@ -96,12 +97,12 @@ class Bench:
 
     def advance(self, duration_ns: int) -> list[tuple[int, Command]]:
         """Let time pass, wake the node whenever it is due, and return its commands with their times."""
-        end_ns, made = self.mono_ns + duration_ns, []
+        end_ns, timed_commands = self.mono_ns + duration_ns, []
         while (wake_ns := self.node.next_wake_ns()) is not None and wake_ns - MONO_NS <= end_ns:
             self.mono_ns = max(self.mono_ns, wake_ns - MONO_NS)
-            made += [(self.mono_ns, command) for command in commands(self.deliver(WAKE, None))]
+            timed_commands += [(self.mono_ns, command) for command in commands(self.deliver(WAKE, None))]
         self.mono_ns = end_ns
-        return made
+        return timed_commands
 
     def state(self, safety: str, speed_mps: float = 0.0, *, vehicle_ns: int | None = None, instance: int = 0) -> None:
         """Deliver a state, whose time on the vehicle's clock is the present time or `vehicle_ns`."""
@@ -121,6 +122,7 @@ def commands(sends: list[Send]) -> list[Command]:
 
 
 def unit_of(picture: Picture, stamp_ns: int, rtp_ns: int | None = None) -> ReceivedUnit:
+    """Return the access unit of a stamped picture; its packets have the RTP timestamp of `rtp_ns`, or of the stamp."""
     height_px, width_px, _ = picture.shape
     encoder = Encoder(width_px, height_px, rate_hz=30, bit_rate_bps=4_000_000, gop_frames=30)
     picture = picture.copy()
@@ -218,22 +220,22 @@ def test_perception_has_memory_only_while_driving() -> None:
 def test_a_command_is_sent_every_20_ms_between_pictures() -> None:
     """Between pictures a command is sent every 20 ms, with the stamp of the newest picture."""
     bench = Bench().driving()
-    made = bench.advance(100 * NS_PER_MS)
-    assert [at_ns for at_ns, _ in made] == [each * 20 * NS_PER_MS for each in range(1, 6)]
-    assert len({command.sequence for _, command in made}) == 5
-    assert {command.stamp_ns for _, command in made} == {WALL_NS}
+    timed_commands = bench.advance(100 * NS_PER_MS)
+    assert [at_ns for at_ns, _ in timed_commands] == [number * 20 * NS_PER_MS for number in range(1, 6)]
+    assert len({command.sequence for _, command in timed_commands}) == 5
+    assert {command.stamp_ns for _, command in timed_commands} == {WALL_NS}
 
 
 def test_without_pictures_it_brakes_after_300_ms_and_stops_after_2500_ms() -> None:
     """Without a new picture the driver brakes after 300 ms and requests a stop after 2.5 s."""
     bench = Bench().driving()
-    made = bench.advance(2600 * NS_PER_MS)
-    for at_ns, command in made:
+    timed_commands = bench.advance(2600 * NS_PER_MS)
+    for at_ns, command in timed_commands:
         mode = "stop" if at_ns >= 2500 * NS_PER_MS else "drive"
         assert command.mode == mode
         assert (command.throttle == 0) == (at_ns >= 300 * NS_PER_MS)
         assert (command.brake >= CLIENT_LIMITS.brake) == (at_ns >= 300 * NS_PER_MS)
-    assert made[-1][1].mode == "stop"
+    assert timed_commands[-1][1].mode == "stop"
 
 
 @pytest.mark.parametrize(
@@ -305,7 +307,7 @@ def test_grey_pictures_lead_to_a_stop() -> None:
     bench.state("driving")
     grey = np.full((480, 640, 3), 128, np.uint8)
     modes = []
-    for _ in range(77):
+    for _ in range(77):  # 2.57 s
         modes += [command.mode for command in bench.view(grey)]
         bench.mono_ns += FRAME_NS
     assert (modes[0], modes[-1]) == ("drive", "stop")
@@ -353,9 +355,9 @@ def test_the_emergency_stop_is_in_every_command() -> None:
     bench = Bench().driving()
     number = bench.session.raise_emergency_stop(Now(0, WALL_NS)).number
     bench.mono_ns += NS_PER_MS
-    made = [*bench.view(), *(command for _, command in bench.advance(200 * NS_PER_MS))]
-    assert len(made) == 11
-    assert {(command.emergency_stop, command.mode, command.throttle) for command in made} == {(number, "stop", 0.0)}
+    sent = [*bench.view(), *(command for _, command in bench.advance(200 * NS_PER_MS))]
+    assert len(sent) == 11, "one for the picture, and one every 20 ms"
+    assert {(command.emergency_stop, command.mode, command.throttle) for command in sent} == {(number, "stop", 0.0)}
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,10 @@ def request(node: InjectionNode, condition: NetemRequest, after_ns: int = 0, pee
     return deliver(node, "netem", encode(condition), at(after_ns), peer)
 
 
-def done(node: InjectionNode | InjectionClient, number: int, reason: str = "", after_ns: int = 0) -> list[Send]:
+def deliver_result(
+    node: InjectionNode | InjectionClient, number: int, reason: str = "", after_ns: int = 0
+) -> list[Send]:
+    """Deliver the injector's result of the order `number`; with a reason, the order failed."""
     measured = () if reason else (("video", 150.2),)
     return deliver(node, "injected", InjectionResult(number, reason, "", measured), at(after_ns))
 
@@ -39,10 +42,11 @@ def rejections(sends: list[Send]) -> list[str]:
     return [reply.reason for reply in replies]
 
 
-def in_force(condition: NetemRequest = L4) -> InjectionNode:
+def server_with_condition(condition: NetemRequest = L4) -> InjectionNode:
+    """Return a server with a condition in force."""
     node = server()
     request(node, condition)
-    done(node, 1)
+    deliver_result(node, 1)
     return node
 
 
@@ -53,7 +57,7 @@ def test_a_condition_is_granted_when_in_force() -> None:
     """A condition is granted once the queues report that it is in force."""
     node = server()
     assert request(node, L4) == [Send("inject", InjectionOrder(1, "L4", (VIDEO, STATE)))]
-    sends = done(node, 1)
+    sends = deliver_result(node, 1)
     assert rejections(sends) == [""]
     assert [send.peer for send in sends if send.channel == "netem_reply"] == [1]
     assert payloads(sends, "injection") == [
@@ -70,7 +74,7 @@ def test_a_state_delay_applies_to_the_router() -> None:
 
 def test_a_repeated_request_renews_the_lease() -> None:
     """A repeated request for a condition in force is granted at once and renews the lease."""
-    node = in_force()
+    node = server_with_condition()
     assert node.next_wake_ns() == at(5 * NS_PER_S).mono_ns
     assert rejections(request(node, L4, 3 * NS_PER_S)) == [""]
     deliver(node, WAKE, None, at(5 * NS_PER_S))
@@ -79,7 +83,7 @@ def test_a_repeated_request_renews_the_lease() -> None:
 
 def test_an_expired_lease_clears_the_queues() -> None:
     """An expired lease clears the queues, and another client may request a condition."""
-    node = in_force()
+    node = server_with_condition()
     bob = replace(L4, who="bob", instance=8)
     [reason] = rejections(request(node, bob, NS_PER_S))
     assert "alice" in reason
@@ -94,17 +98,17 @@ def test_an_expired_lease_clears_the_queues() -> None:
 
 def test_a_condition_is_changed_live() -> None:
     """A changed condition is applied without clearing the queues in between."""
-    [send] = request(in_force(), replace(L4, condition="L5", delay_ms=225.0), NS_PER_S)
+    [send] = request(server_with_condition(), replace(L4, condition="L5", delay_ms=225.0), NS_PER_S)
     assert send == Send("inject", InjectionOrder(2, "L5", (replace(VIDEO, impairment=Impairment(225.0)), STATE)))
 
 
 def test_a_condition_in_force_is_measured_periodically() -> None:
     """A condition in force is measured and recorded every five seconds."""
-    node = in_force()
+    node = server_with_condition()
     request(node, L4, 4 * NS_PER_S)
     again = deliver(node, WAKE, None, at(5 * NS_PER_S))
     assert again == [Send("inject", InjectionOrder(1, "L4", (VIDEO, STATE)))]
-    assert len(payloads(done(node, 1, after_ns=6 * NS_PER_S), "injection")) == 2
+    assert len(payloads(deliver_result(node, 1, after_ns=6 * NS_PER_S), "injection")) == 2
 
 
 @pytest.mark.parametrize(
@@ -133,7 +137,7 @@ def test_a_real_vehicle_gets_a_condition_at_standstill_only() -> None:
     assert rejections(request(node, L4)) != [""]
     deliver(node, "rest", StationaryStatus(True, ("alice", 7)), at(0))
     request(node, L4)
-    done(node, 1)
+    deliver_result(node, 1)
     deliver(node, "rest", StationaryStatus(False, ("alice", 7)), at(0))
     assert rejections(request(node, L4, NS_PER_S)) == [""]
     [reason] = rejections(request(node, replace(L4, delay_ms=0.0), NS_PER_S))
@@ -142,7 +146,7 @@ def test_a_real_vehicle_gets_a_condition_at_standstill_only() -> None:
 
 def test_a_deviating_measurement_is_recorded() -> None:
     """A measurement that deviates from the request is recorded, and the condition stays in force."""
-    node = in_force()
+    node = server_with_condition()
     sends = deliver(node, "injected", InjectionResult(1, "", "video was late", (("video", 155.0),)), at(NS_PER_S))
     assert payloads(sends, "injection")[0].reason == "video was late"
     assert rejections(request(node, L4, NS_PER_S)) == [""]
@@ -152,7 +156,7 @@ def test_failed_queues_are_cleared_and_end_the_lease() -> None:
     """If the queues fail, the client receives the reason, the queues are cleared, and the lease ends."""
     node = server()
     request(node, L4)
-    sends = done(node, 1, reason="there is no tc")
+    sends = deliver_result(node, 1, reason="there is no tc")
     assert rejections(sends) == ["there is no tc"]
     assert {sample.reason for sample in payloads(sends, "injection")} == {"there is no tc"}
     assert payloads(sends, "inject") == [InjectionOrder(2, "", ())]
@@ -162,9 +166,9 @@ def test_failed_queues_are_cleared_and_end_the_lease() -> None:
 
 def test_a_failed_clearing_is_repeated() -> None:
     """A failed clearing of the queues is repeated every second."""
-    node = in_force()
+    node = server_with_condition()
     deliver(node, WAKE, None, at(5 * NS_PER_S))
-    assert done(node, 2, reason="tc hangs", after_ns=6 * NS_PER_S)
+    assert deliver_result(node, 2, reason="tc hangs", after_ns=6 * NS_PER_S)
     assert node.next_wake_ns() == at(7 * NS_PER_S).mono_ns
     assert deliver(node, WAKE, None, at(7 * NS_PER_S)) == [Send("inject", InjectionOrder(3, "", ()))]
     deliver(node, "injected", InjectionResult(3, "", "", ()), at(8 * NS_PER_S))
@@ -173,7 +177,7 @@ def test_a_failed_clearing_is_repeated() -> None:
 
 def test_the_lease_ends_when_another_client_acquires_control() -> None:
     """The lease ends when another client acquires control of the vehicle."""
-    node = in_force()
+    node = server_with_condition()
     assert deliver(node, "rest", StationaryStatus(True, None), at(0)) == []
     assert deliver(node, "rest", StationaryStatus(True, ("alice", 7)), at(0)) == []
     assert deliver(node, "rest", StationaryStatus(True, ("bob", 8)), at(0)) == [
@@ -183,7 +187,7 @@ def test_the_lease_ends_when_another_client_acquires_control() -> None:
 
 def test_an_impossible_impairment_is_rejected() -> None:
     """An impairment that netem cannot apply is rejected, and the condition in force stays."""
-    node = in_force()
+    node = server_with_condition()
     [reason] = rejections(request(node, replace(L4, condition="wild", delay_ms=10.0, jitter_ms=20.0)))
     assert reason.startswith("video: ")
     assert "20 ms" in reason
@@ -195,15 +199,15 @@ def test_the_result_of_a_replaced_order_is_ignored() -> None:
     node = server()
     request(node, L4)
     request(node, replace(L4, condition="L5", delay_ms=225.0))
-    assert done(node, 1) == []
-    assert rejections(done(node, 2)) == ["", ""]
+    assert deliver_result(node, 1) == []
+    assert rejections(deliver_result(node, 2)) == ["", ""]
 
 
 def test_a_long_reason_is_shortened() -> None:
     """A reply with a long reason, of letters of any size in UTF-8, can be decoded."""
     node = server()
     request(node, L4)
-    (reason,) = rejections(done(node, 1, 300 * "ä"))
+    (reason,) = rejections(deliver_result(node, 1, 300 * "ä"))
     assert reason.startswith(190 * "ä")
     assert reason.endswith(ELLIPSIS)
 
@@ -213,7 +217,7 @@ def test_pending_requests_are_bounded() -> None:
     node = server()
     for peer in range(1000):
         request(node, replace(L4, delay_ms=float(peer)), peer=peer)
-    replies = [send.peer for send in done(node, 1000) if send.channel == "netem_reply"]
+    replies = [send.peer for send in deliver_result(node, 1000) if send.channel == "netem_reply"]
     assert replies == list(range(1000 - 64, 1000))
 
 

@@ -29,8 +29,9 @@ def new_node(*, token: bool = True) -> ReceiverNode:
 
 
 def packets(number: int = 3) -> list[list[bytes]]:
+    """Return the packets of each of several frames."""
     packetizer = Packetizer(77, 100)
-    return [packetizer.packetize(UNIT, 3000 * each) for each in range(number)]
+    return [packetizer.packetize(UNIT, 3000 * index) for index in range(number)]
 
 
 def test_without_a_token_nothing_is_sent() -> None:
@@ -100,9 +101,12 @@ def test_a_receiver_report_is_sent_every_500_ms() -> None:
     assert reports[3][1].lost_fraction == 0
 
 
+def rtcp_datagrams(sends: list[Send]) -> list[bytes]:
+    return [datagram for datagram in payloads(sends, "feedback") if not is_path_datagram(datagram)]
+
+
 def requests_keyframe(sends: list[Send]) -> bool:
-    datagrams = [each for each in payloads(sends, "feedback") if not is_path_datagram(each)]
-    return any(parse_feedback(each).picture_loss for each in datagrams)
+    return any(parse_feedback(datagram).picture_loss for datagram in rtcp_datagrams(sends))
 
 
 def test_a_loss_requests_a_keyframe() -> None:
@@ -119,10 +123,8 @@ def test_a_loss_requests_a_keyframe() -> None:
 
 
 def answer_report(node: ReceiverNode, round_trip_ns: int, begin_ns: int = 0) -> None:
-    """Let the node send a report, and answer it 30 ms after its arrival."""
-    (report,) = [
-        each for each in payloads(deliver(node, WAKE, None, at(begin_ns)), "feedback") if not is_path_datagram(each)
-    ]
+    """Let the node send a report, and deliver the answer, which the sender sent 30 ms after the report arrived."""
+    (report,) = rtcp_datagrams(deliver(node, WAKE, None, at(begin_ns)))
     (reference,) = parse_feedback(report).reference_times
     answer = ReferenceAnswer(reference.receiver_ssrc, reference.time, 30 * NS_PER_MS)
     datagram = sender_report(
@@ -142,7 +144,7 @@ def test_a_keyframe_request_is_repeated_each_round_trip() -> None:
         deliver(node, "rtp", packet, at(200 * NS_PER_MS))
     times = [ms for ms in range(200, 700) if requests_keyframe(deliver(node, WAKE, None, at(ms * NS_PER_MS)))]
     assert times in ([210, 360, 510, 660], [210, 361, 512, 663]), (
-        "a round trip of 100 ms (to 1/65536 s), and 50 ms for the keyframe"
+        "the requests are a round trip of 100 ms (rounded to 1/65536 s) and 50 ms for the keyframe apart"
     )
     for packet in third:
         deliver(node, "rtp", packet, at(700 * NS_PER_MS))
@@ -178,10 +180,8 @@ def test_a_repaired_loss_requests_no_keyframe() -> None:
     assert [(unit.data, unit.complete) for unit in payloads(sends, "access_unit")] == [(UNIT, True)]
     assert not requests_keyframe([*sends, *deliver(node, WAKE, None, at(50 * NS_PER_MS))])
     assert [node.counts[f"packets_{name}"] for name in ("recovered", "lost", "of_repair")] == [1, 0, 1]
-    feedback = [
-        each for each in payloads(deliver(node, WAKE, None, at(NS_PER_S)), "feedback") if not is_path_datagram(each)
-    ]
-    (report,) = [report for each in feedback for report in parse_feedback(each).reports]
+    datagrams = rtcp_datagrams(deliver(node, WAKE, None, at(NS_PER_S)))
+    (report,) = [report for datagram in datagrams for report in parse_feedback(datagram).reports]
     assert report.cumulative_lost == 1, "losses are counted before repair"
 
 
@@ -209,8 +209,8 @@ def test_the_bit_rate_is_requested_with_each_report() -> None:
     for packet in first:
         deliver(node, "rtp", packet, at(0))
     for number in range(3):
-        sends = payloads(deliver(node, WAKE, None, at(number * NS_PER_S // 2)), "feedback")
-        limits = [limit for each in sends if not is_path_datagram(each) for limit in parse_feedback(each).limits]
+        datagrams = rtcp_datagrams(deliver(node, WAKE, None, at(number * NS_PER_S // 2)))
+        limits = [limit for datagram in datagrams for limit in parse_feedback(datagram).limits]
         assert [(limit.media_ssrc, limit.overhead_bytes) for limit in limits] == [(77, 0)]
         assert 699_990 <= limits[0].bit_rate_bps <= 700_000
 

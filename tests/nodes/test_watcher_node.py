@@ -62,8 +62,8 @@ def test_pictures_in_doubt(reads_doubtful: bool) -> None:
 
     node = WatcherNode(PictureReader(VideoReceiver(Decoder(), None), agrees, reads_doubtful=reads_doubtful))
     first, second, third = units(3)
-    again = units(1)[0]
-    pictures = [read_unit(node, unit) for unit in (first, replace(second, complete=False), third, again)]
+    keyframe = units(1)[0]
+    pictures = [read_unit(node, unit) for unit in (first, replace(second, complete=False), third, keyframe)]
     assert [picture.in_doubt for picture in pictures] == [False, True, True, False]
     assert checked == ([0, 1, 2, 0] if reads_doubtful else [0, 0])
     assert [picture.readable for picture in pictures] == [True, reads_doubtful, reads_doubtful, True]

@@ -1,4 +1,4 @@
-"""Pictures of roads: flat grey ground with painted lines, through the pinhole of `CameraModel`."""
+"""Render pictures of roads for the tests: flat grey ground with painted lines, seen by a pinhole camera."""
 
 from __future__ import annotations
 
@@ -51,13 +51,13 @@ class Scene:
         """Return the picture from a car `offset_m` left of the centre and turned left by `heading_rad`."""
         ray_indices, x_m, y_m = rays_on_near_ground(self.model)
         along, across = on_road(x_m, y_m, curvature_per_m, offset_m, heading_rad)
-        fine = bare_ground(self.model).copy()
-        rays = fine.reshape(-1, 3)
+        colours = bare_ground(self.model).copy()  # of all rays, of which each pixel averages several
+        rays = colours.reshape(-1, 3)
         for line in lines:
             painted = np.flatnonzero(np.abs(across - line.offset_m) < MARK_WIDTH_M / 2)
             painted = painted[np.mod(along[painted] - line.phase_m, 9.0) < line.dash_m]
             rays[ray_indices[painted]] = line.colour_bgr
-        picture = cv2.resize(fine, (self.model.width_px, self.model.height_px), interpolation=cv2.INTER_AREA)
+        picture = cv2.resize(colours, (self.model.width_px, self.model.height_px), interpolation=cv2.INTER_AREA)
         return np.asarray(picture.round(), dtype=np.uint8)
 
 
@@ -85,9 +85,9 @@ def rays_on_near_ground(model: CameraModel) -> tuple[NDArray[np.intp], FloatArra
 def bare_ground(model: CameraModel) -> NDArray[np.float32]:
     """Return the picture of a road without lines, with one pixel per ray."""
     x_m, _ = ground_of_rays(model)
-    fine = np.full((*x_m.shape, 3), SKY_GREY, dtype=np.float32)
-    fine[np.isfinite(x_m)] = ROAD_GREY
-    return fine
+    colours = np.full((*x_m.shape, 3), SKY_GREY, dtype=np.float32)
+    colours[np.isfinite(x_m)] = ROAD_GREY
+    return colours
 
 
 def on_road(

@@ -8,6 +8,9 @@ from lavt.errors import UserError
 from lavt.perception.bird_eye import STAMP_SIDE_PX, GroundGrid, bird_eye
 from lavt.perception.calibration import calibrated, ground_to_picture
 
+FOCAL_PX = 320
+"""The focal length of `CameraModel()`, which is 1.6 m ahead of the rear axle and 1.4 m above the ground."""
+
 
 def pixel_of(model: CameraModel, x_m: float, y_m: float) -> tuple[float, float]:
     u, v, depth = ground_to_picture(calibrated(model)) @ np.array([x_m, y_m, 1.0])
@@ -20,14 +23,14 @@ def test_a_point_straight_ahead_is_in_the_middle_column() -> None:
     near, far = pixel_of(model, 5.0, 0.0), pixel_of(model, 20.0, 0.0)
     assert near[0] == pytest.approx((model.width_px - 1) / 2)
     assert far[0] == pytest.approx((model.width_px - 1) / 2)
-    assert near[1] == pytest.approx((model.height_px - 1) / 2 + 320 * 1.4 / (5.0 - 1.6))
+    assert near[1] == pytest.approx((model.height_px - 1) / 2 + FOCAL_PX * 1.4 / (5.0 - 1.6))
     assert far[1] < near[1]
 
 
 def test_a_point_on_the_left_is_left_of_the_middle() -> None:
     """A point left of the axis is left of the middle column by focal length x offset / depth."""
     model = CameraModel()
-    assert pixel_of(model, 11.6, 2.0)[0] == pytest.approx((model.width_px - 1) / 2 - 320 * 2.0 / 10.0)
+    assert pixel_of(model, 11.6, 2.0)[0] == pytest.approx((model.width_px - 1) / 2 - FOCAL_PX * 2.0 / (11.6 - 1.6))
 
 
 def test_pitching_down_raises_the_road() -> None:

@@ -36,22 +36,23 @@ def cameras(draw: st.DrawFn) -> CalibratedCamera:
     )
 
 
-GROUND = np.array([[x, y] for x in (4.0, 6.0, 9.0, 13.0, 19.0) for y in (-5.0, -1.75, 0.0, 1.75, 5.0)])
+GROUND_POINTS = np.array([[x, y] for x in (4.0, 6.0, 9.0, 13.0, 19.0) for y in (-5.0, -1.75, 0.0, 1.75, 5.0)])
 
 
-def inside(camera: CalibratedCamera, pixels: np.ndarray) -> np.ndarray:
+def are_inside(camera: CalibratedCamera, pixels: np.ndarray) -> np.ndarray:
+    """Return for each pixel whether the spots that the tests draw around it are in the picture."""
     with np.errstate(invalid="ignore"):
-        ahead = (pixels > 17) & (pixels < (camera.width_px - 18, camera.height_px - 18))
-    return np.asarray(ahead.all(axis=1))
+        inside = (pixels > 17) & (pixels < (camera.width_px - 18, camera.height_px - 18))
+    return np.asarray(inside.all(axis=1))
 
 
 @settings(max_examples=60, derandomize=True)
 @given(cameras())
 def test_projection_and_inverse_projection_agree(camera: CalibratedCamera) -> None:
     """The inverse projection of a ground point's pixel is the point within 1 cm, through any lens."""
-    pixels = picture_points(camera, GROUND)
-    seen = inside(camera, pixels)
-    assert np.abs(ground_points(camera, pixels[seen]) - GROUND[seen]).max(initial=0.0) < 0.01
+    pixels = picture_points(camera, GROUND_POINTS)
+    visible = are_inside(camera, pixels)
+    assert np.abs(ground_points(camera, pixels[visible]) - GROUND_POINTS[visible]).max(initial=0.0) < 0.01
 
 
 @settings(max_examples=20, derandomize=True)
@@ -60,20 +61,21 @@ def test_a_ground_point_maps_to_its_cell_through_any_lens(camera: CalibratedCame
     """A spot in the distorted picture at a ground point's projection appears in that point's cell."""
     grid = GroundGrid()
     mapping = bird_eye(camera, grid, stamped=False)
-    pixels = picture_points(camera, GROUND)
-    for (x_m, y_m), (u, v) in zip(GROUND[inside(camera, pixels)], pixels[inside(camera, pixels)], strict=True):
+    pixels = picture_points(camera, GROUND_POINTS)
+    visible = are_inside(camera, pixels)
+    for (x_m, y_m), (u, v) in zip(GROUND_POINTS[visible], pixels[visible], strict=True):
         picture = np.zeros((camera.height_px, camera.width_px), dtype=np.uint8)
-        beside = round(60 / x_m)  # some 0.2 m: more than a cell
-        picture[round(v) - 1 : round(v) + 2, round(u) - beside : round(u) + beside + 1] = 255
+        half_width_px = round(60 / x_m)  # some 0.2 m: more than a cell
+        picture[round(v) - 1 : round(v) + 2, round(u) - half_width_px : round(u) + half_width_px + 1] = 255
         # The size of the spot on the ground limits the accuracy of its position.
-        near, left = ground_points(camera, np.array([[u, v + 2], [u - beside, v]]))
+        near_end, left_end = ground_points(camera, np.array([[u, v + 2], [u - half_width_px, v]]))
         rows, columns = np.nonzero(mapping.from_above(mapping.region(picture)))
         if len(rows) == 0:
-            assert abs(x_m - near[0]) < 0.2 or x_m > 12  # three rows of pixels between two rows of cells
+            assert abs(x_m - near_end[0]) < 0.2 or x_m > 12  # three rows of pixels between two rows of cells
             continue
         off_x_m, off_y_m = grid.row_x_m()[rows].mean() - x_m, grid.column_y_m()[columns].mean() - y_m
-        assert abs(off_x_m) < 0.1 + abs(x_m - near[0]) + abs(x_m - left[0])
-        assert abs(off_y_m) < 0.05 + abs(y_m - left[1]) + abs(y_m - near[1])
+        assert abs(off_x_m) < 0.1 + abs(x_m - near_end[0]) + abs(x_m - left_end[0])
+        assert abs(off_y_m) < 0.05 + abs(y_m - left_end[1]) + abs(y_m - near_end[1])
 
 
 def test_yaw_pitch_and_roll_have_their_signs() -> None:

@@ -1,4 +1,4 @@
-"""Confidence on degraded pictures; benchmarks/perception_sheet.py prints the figures."""
+"""Test the confidence on degraded pictures; benchmarks/perception_sheet.py prints the tables of docs/perception.md."""
 
 from __future__ import annotations
 
@@ -32,7 +32,10 @@ VerdictsByKind = dict[str, list[tuple[LaneVerdict, LaneVerdict]]]
 
 @pytest.fixture(scope="module", params=[1, pytest.param(3, marks=pytest.mark.full)], ids="{} of each".format)
 def verdicts(request: pytest.FixtureRequest) -> VerdictsByKind:
-    """Return the verdicts (searched, followed) on pictures of each kind, with another seed than the docs use."""
+    """Return two verdicts on each picture, by kind: when the lane was searched, and when it was followed.
+
+    The seed differs from that of docs/perception.md.
+    """
     by_kind: VerdictsByKind = defaultdict(list)
     for case in cases(request.param, seed=7):
         by_kind[case.kind].append(check_case(case))

@@ -3,7 +3,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.perception.conftest import BROKEN_LANE, FOUR_LANES, LANE, Line, Scene, centre_y_m, on_road
+from tests.perception.conftest import (
+    BROKEN_LANE,
+    FOUR_LANES,
+    LANE,
+    MARK_WIDTH_M,
+    ROAD_GREY,
+    Line,
+    Scene,
+    centre_y_m,
+    on_road,
+)
 from tests.perception.lens import ground_points
 
 from lavt.domain import CameraModel, Lane, Picture, SeenLane
@@ -72,9 +82,9 @@ def test_a_lane_with_aligned_gaps_is_found(scene: Scene, phase_m: float) -> None
 def test_the_lane_does_not_depend_on_the_light(scene: Scene, light: float) -> None:
     """In darker or brighter light the lane is the same and the confidence remains high."""
     picture = scene.picture(FOUR_LANES, 1 / 87)
-    bright, other = detect(picture), detect((picture * light).astype(np.uint8))
-    assert other.centre == pytest.approx(bright.centre, abs=0.02)
-    assert other.confidence > 0.8
+    original, relit = detect(picture), detect((picture * light).astype(np.uint8))
+    assert relit.centre == pytest.approx(original.centre, abs=0.02)
+    assert relit.confidence > 0.8
 
 
 def test_a_yellow_line_is_a_line(scene: Scene) -> None:
@@ -111,7 +121,7 @@ def test_lanes_are_averaged_after_the_first(scene: Scene) -> None:
 
 
 def test_the_lane_is_kept_while_the_car_leaves_it(scene: Scene) -> None:
-    """While a car drifts into the next lane, the detector follows the lane it came from."""
+    """While a car drifts into the next lane, the detector keeps following the lane from which the car came."""
     detector = LaneDetector(MODEL)
     for offset_m in np.arange(0.0, 3.01, 0.3):
         lane = detector.detect(scene.picture(FOUR_LANES, offset_m=float(offset_m)))
@@ -186,9 +196,10 @@ def distorted(camera: CalibratedCamera, curvature_per_m: float, offset_m: float)
     is_visible = np.isfinite(ground).all(axis=1) & (np.hypot(*np.nan_to_num(ground).T) < 60)
     x_m, y_m = np.where(is_visible[:, None], ground, 0.0).T
     along, across = on_road(x_m, y_m, curvature_per_m, offset_m, 0.0)
-    shades = np.full((len(ground), 3), 85, dtype=np.uint8)
+    shades = np.full((len(ground), 3), ROAD_GREY, dtype=np.uint8)
     for line in FOUR_LANES:
-        is_painted = (np.abs(across - line.offset_m) < 0.0625) & (np.mod(along - line.phase_m, 9.0) < line.dash_m)
+        is_painted = np.abs(across - line.offset_m) < MARK_WIDTH_M / 2
+        is_painted &= np.mod(along - line.phase_m, 9.0) < line.dash_m
         shades[is_visible & is_painted] = line.colour_bgr
     return shades.reshape(camera.height_px, camera.width_px, 3)
 

@@ -21,7 +21,7 @@ CURVE = (0.2, -0.03, 0.012)
 def points_on_parallels(
     centre: tuple[float, float, float], offsets_m: tuple[float, ...], x_m: np.ndarray | None = None
 ) -> Points:
-    """Return points on exact parallels of a centre."""
+    """Return the points of painted lines, 8 cm wide, at exact distances `offsets_m` to the left of a curved centre."""
     x = np.arange(3.65, 20.0, 0.1) if x_m is None else x_m
     slope = centre[1] + 2 * centre[2] * x
     y = centre[0] + centre[1] * x + centre[2] * x * x
@@ -69,7 +69,7 @@ def test_marks_of_adjacent_lanes_are_ignored() -> None:
     points = points_on_parallels((0.6, 0.0, 0.0), (8.75, 5.25, 1.75, -1.75, -5.25, -8.75))
     sides, fit = search_and_fit(points)
     assert error_m(fit, (0.6, 0.0, 0.0)) < 0.02
-    assert set(np.round(points.y_m[sides > 0] - 0.6, 1)) == {1.7, 1.8}
+    assert set(np.round(points.y_m[sides > 0] - 0.6, 1)) == {1.7, 1.8}, "the left line, at 1.75 m"
 
 
 def test_points_near_a_known_lane_are_assigned_to_it() -> None:

@@ -116,7 +116,7 @@ def test_a_step_of_the_wall_clock_does_not_reorder_messages(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("kept_share", [0.3, 0.7, 0.999])
 def test_an_unfinished_file_is_recovered(tmp_path: Path, kept_share: float) -> None:
-    """From a file that was cut anywhere, every message of its whole chunks is read, and `complete` is False."""
+    """From a file that was cut anywhere, all messages of its whole chunks are read, and `complete` is False."""
     path = tmp_path / "a.mcap"
     writer = RecordWriter(path, "server")
     noise = np.random.Generator(np.random.Philox(1))
@@ -129,7 +129,7 @@ def test_an_unfinished_file_is_recovered(tmp_path: Path, kept_share: float) -> N
     numbers = record.table("frame").ints("number").tolist()
     assert not record.complete
     assert numbers == list(range(len(numbers)))
-    assert len(numbers) > 2_000 * kept_share - 600
+    assert len(numbers) > 2_000 * kept_share - 600, "the messages of at most one chunk, fewer than 600, are lost"
 
 
 def test_a_file_that_was_never_closed_is_recovered(tmp_path: Path) -> None:
@@ -166,7 +166,7 @@ def test_a_missing_record_is_an_error(tmp_path: Path) -> None:
 @pytest.mark.parametrize("version", [None, "1", "3"])
 @pytest.mark.parametrize("complete", [True, False])
 def test_another_format_version_is_an_error(tmp_path: Path, version: str | None, complete: bool) -> None:
-    """Reading a record of another format version, or without one, is one sentence that names the readable version."""
+    """A record of another format version, or without one, is an error of one sentence that names the readable one."""
     path = tmp_path / "server.mcap"
     file = McapFile(path, library="lavt server", chunk_bytes=0)
     if version is not None:

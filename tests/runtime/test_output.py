@@ -1,4 +1,4 @@
-"""Standard streams whose texts a thread writes."""
+"""Test standard streams whose texts are queued and written by a thread, so that an unread pipe blocks no program."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ class ListRecorder:
         self.sent += sends
 
 
-class Ticker:
+class PeriodicNode:
     """A node that wakes every 10 ms and stores its lateness; the message b"break" makes it fail."""
 
     name = "driver"
@@ -44,15 +44,15 @@ class Ticker:
         self.threads: set[str] = set()
         self._next_ns = start_ns
         self.pipelines: Mapping[str, Sequence[Stage]] = {
-            WAKE: (("tick", self._tick),),
+            WAKE: (("wake", self._wake),),
             "state": (("receive", self._receive),),
         }
 
     def next_wake_ns(self) -> int:
-        """Return when the next tick is due."""
+        """Return when the next wake is due."""
         return self._next_ns
 
-    def _tick(self, _message: Message, now: Now) -> list[Send]:
+    def _wake(self, _message: Message, now: Now) -> list[Send]:
         self.late_ns.append(now.mono_ns - self._next_ns)
         self._next_ns = now.mono_ns + 10 * NS_PER_MS
         self.threads.add(threading.current_thread().name)
@@ -64,9 +64,9 @@ class Ticker:
             raise ValueError("failed on purpose")
 
 
-def start() -> tuple[RealRuntime, Ticker, ListRecorder]:
+def start() -> tuple[RealRuntime, PeriodicNode, ListRecorder]:
     clock, recorded = MachineClock(), ListRecorder()
-    node = Ticker(clock.now().mono_ns)
+    node = PeriodicNode(clock.now().mono_ns)
     runtime = RealRuntime(clock, [node], recorded, lambda: ClockReport(0, 0, "host", "none"))
     runtime.start({"zenoh": recorded})
     return runtime, node, recorded
@@ -100,7 +100,7 @@ def test_a_failing_node_ends_the_run() -> None:
     assert "driver" not in {thread.name for thread in threading.enumerate()}
 
 
-class FailingWake(Ticker):
+class FailingWake(PeriodicNode):
     """A node whose `next_wake_ns` fails."""
 
     def next_wake_ns(self) -> int:

@@ -62,8 +62,8 @@ class FakeOutputs:
 
 
 @dataclass
-class Echo:
-    """An "actuator" node that answers requests and sends to its neighbours."""
+class FakeActuator:
+    """A node with the actuator's name, which returns requests as replies and sends to its neighbours."""
 
     name: str = "actuator"
     counts: Counter[str] = field(default_factory=Counter)
@@ -106,7 +106,7 @@ class Neighbour:
 class Rig:
     """Both ends in one process."""
 
-    node: Echo
+    node: FakeActuator
     neighbour: Neighbour
     outputs: FakeOutputs
     proxy: RemoteNodeProxy
@@ -122,7 +122,7 @@ class Rig:
 @contextmanager
 def rig() -> Iterator[Rig]:
     server_end, node_end = multiprocessing.Pipe()
-    node, neighbour, outputs, disconnected, status = Echo(), Neighbour(), FakeOutputs(), threading.Event(), [0]
+    node, neighbour, outputs, disconnected, status = FakeActuator(), Neighbour(), FakeOutputs(), threading.Event(), [0]
     silences: list[RealRuntime] = []
     proxy = RemoteNodeProxy("actuator", server_end, heartbeat="state", on_silent=silences.append)
     main = RealRuntime(CLOCK, [neighbour], outputs, lambda: None, {"actuator": proxy})
@@ -147,7 +147,7 @@ def test_a_remote_node_receives_and_sends() -> None:
         arrived = CLOCK.now()
         ends.main.deliver("control", b"drive", arrived)
         wait_until(lambda: bool(ends.neighbour.received))
-        assert [(each.payload, each.arrived) for each in ends.node.received] == [(b"drive", arrived)]
+        assert [(message.payload, message.arrived) for message in ends.node.received] == [(b"drive", arrived)]
         assert ends.neighbour.received == [StationaryStatus(at_rest=True, active_operator=None)]
         assert ends.outputs.of("control") == [b"drive"], "recorded once, in the process with the links"
         wait_until(lambda: ends.outputs.of("event") == ["received"])
@@ -156,7 +156,7 @@ def test_a_remote_node_receives_and_sends() -> None:
 def test_threads_that_forward_requests_do_not_disturb_each_other() -> None:
     """Threads that forward requests at the same time, none of which is answered, cause no error.
 
-    Each built-in function that a thread calls lets the other threads run.
+    To provoke errors, each thread lets the others run whenever a built-in function returns.
     """
     server_end, node_end = multiprocessing.Pipe()
     proxy, errors = (
@@ -200,7 +200,7 @@ def test_a_blocked_reply_delays_neither_heartbeats_nor_messages(monkeypatch: pyt
         send = ends.outputs.send
 
         def block_replies(*sends: Send) -> None:
-            if any(each.channel == "session_reply" for each in sends):
+            if any(reply.channel == "session_reply" for reply in sends):
                 blocked.set()
                 resumed.wait(20)
             send(*sends)
@@ -237,8 +237,8 @@ def test_a_late_command_between_the_processes_is_dropped() -> None:
         ends.main.deliver("session", b"late", long_ago, "alice")
         wait_until(lambda: bool(ends.outputs.sent))
         assert ends.node.received == []
-    (counted,) = [each for each in ends.outputs.of("counts") if each["node"] == "actuator's process"]
-    assert (counted["control_late"], counted["session_late"], counted["record_overflow"]) == (1, 1, 0)
+    (counts,) = [entry for entry in ends.outputs.of("counts") if entry["node"] == "actuator's process"]
+    assert (counts["control_late"], counts["session_late"], counts["record_overflow"]) == (1, 1, 0)
 
 
 def test_the_end_of_the_other_process_is_noticed() -> None:
@@ -328,26 +328,26 @@ def test_heartbeats_are_checked() -> None:
         assert ends.silences == [ends.main]
 
 
-@pytest.mark.parametrize("where", ["sent", "read", "received"])
-def test_an_error_in_one_direction_closes_the_pipe(where: str) -> None:
+@pytest.mark.parametrize("failing_step", ["send", "read", "receive"])
+def test_an_error_in_one_direction_closes_the_pipe(failing_step: str) -> None:
     """An entry that cannot be sent, read or received closes the pipe at both ends."""
     server_end, node_end = multiprocessing.Pipe()
-    closed, other_closed = threading.Event(), threading.Event()
+    server_closed, node_closed = threading.Event(), threading.Event()
 
     def fail(_entry: object) -> None:
         raise LookupError("failed on purpose")
 
-    one, other = Pipe(server_end, lambda _: None, closed.set), Pipe(node_end, fail, other_closed.set)
-    one.start()
-    other.start()
-    if where == "read":
+    server_pipe, node_pipe = Pipe(server_end, lambda _: None, server_closed.set), Pipe(node_end, fail, node_closed.set)
+    server_pipe.start()
+    node_pipe.start()
+    if failing_step == "read":
         server_end.send_bytes(b"no entry")
     else:
-        one.send(threading.Lock() if where == "sent" else "an entry")
-    assert other_closed.wait(10)
-    other.close(1)
-    assert closed.wait(10)
-    one.close(1)
+        server_pipe.send(threading.Lock() if failing_step == "send" else "an entry")
+    assert node_closed.wait(10)
+    node_pipe.close(1)
+    assert server_closed.wait(10)
+    server_pipe.close(1)
 
 
 def test_a_server_that_never_started_ends_the_nodes_process() -> None:
@@ -355,7 +355,7 @@ def test_a_server_that_never_started_ends_the_nodes_process() -> None:
     server_end, node_end = multiprocessing.Pipe()
     disconnected = threading.Event()
     proxy = RemoteNodeProxy("actuator", server_end, heartbeat="state", on_silent=lambda _: None)
-    host = NodeHost(node_end, CLOCK, Echo(), get_status=lambda: 0, on_disconnect=disconnected.set)
+    host = NodeHost(node_end, CLOCK, FakeActuator(), get_status=lambda: 0, on_disconnect=disconnected.set)
     host.start()
     proxy.close(5)
     assert disconnected.wait(10)

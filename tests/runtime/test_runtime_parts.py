@@ -1,4 +1,4 @@
-"""Inbox, pipeline and recording."""
+"""Test the parts of a runtime: the inbox, the pipeline and the recorders."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_queued_messages_come_first() -> None:
     inbox = Inbox()
     for channel, payload in (("state", 1), ("access_unit", 2), ("view", 3), ("access_unit", 4), ("state", 5)):
         inbox.put(message(channel, payload))
-    taken = [each.payload for each in iter(inbox.take, None)]
+    taken = [message.payload for message in iter(inbox.take, None)]
     assert taken == [2, 4, 5, 3]
     assert inbox.counts == {"state_replaced": 1}
 
@@ -63,7 +63,7 @@ def test_packets_that_arrived_before_a_wake_come_first() -> None:
     assert inbox.take_arrived(999) is None
     (taken,) = iter(lambda: inbox.take_arrived(1000), None)
     assert taken.payload == 1000
-    assert [each.payload for each in iter(inbox.take, None)] == [900, 1001]
+    assert [message.payload for message in iter(inbox.take, None)] == [900, 1001]
 
 
 def test_a_full_queue_drops_its_oldest_message() -> None:
@@ -75,7 +75,7 @@ def test_a_full_queue_drops_its_oldest_message() -> None:
         inbox.put(message("control", number))
     inbox.put(message("frame", "last"))
     assert inbox.counts == {"control_dropped": 2}
-    taken = [each.payload for each in iter(inbox.take, None)]
+    taken = [message.payload for message in iter(inbox.take, None)]
     assert taken == ["first", *range(2, length + 2), "last"]
 
 
@@ -214,5 +214,5 @@ def test_a_full_record_queue_counts_lost_entries() -> None:
     recorder.close(NOW)
     written = [payload for topic, payload, _ in recorded.entries if topic == "event"]
     assert written == list(range(len(written)))
-    assert 3 <= len(written) <= 4
+    assert 3 <= len(written) <= 4, "three in the queue, and perhaps one that the thread had taken"
     assert recorded.entries[-1][:2] == ("counts", {"record_overflow": 20 - len(written)})

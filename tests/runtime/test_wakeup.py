@@ -8,7 +8,7 @@ from lavt.runtime.wakeup import WakeEvent
 
 
 def test_setting_twice_wakes_once() -> None:
-    """An event set before the wait, once or twice, ends one wait; after that, and after clearing, it is clear."""
+    """Setting an event once or twice ends one wait only. After that wait, or after `clear`, the event is not set."""
     event = WakeEvent()
     event.set()
     event.set()

@@ -14,7 +14,8 @@ from lavt.safety.gate import CommandVerdict, SafetyGate
 from lavt.safety.limiter import Limiter
 from lavt.safety.limits import LIMITS, Limits
 
-TICK_NS = 20 * NS_PER_MS
+COMMAND_PERIOD_NS = 20 * NS_PER_MS
+"""Period of the client's commands and pictures in the tests."""
 START_NS = 1_000 * NS_PER_S
 WALL_NS = 1_790_000_000 * NS_PER_S
 WHEELBASE_M = 2.8448
@@ -97,11 +98,11 @@ class Rig:
         return self
 
     def arm_for(self, duration_ns: int) -> None:
-        """Send an arm command from a new picture every `TICK_NS`, the last one at the end of `duration_ns`."""
+        """Send an arm command from a new picture in each period, the last one at the end of `duration_ns`."""
         self.picture()
         self.send()
-        for _ in range(duration_ns // TICK_NS):
-            self.go(TICK_NS)
+        for _ in range(duration_ns // COMMAND_PERIOD_NS):
+            self.go(COMMAND_PERIOD_NS)
             self.picture()
             self.send()
 

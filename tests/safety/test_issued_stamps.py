@@ -22,10 +22,10 @@ def test_an_issued_stamp_is_known() -> None:
 @pytest.mark.parametrize(("age_ns", "known"), [(MEMORY_NS, True), (MEMORY_NS + 1, False)])
 def test_a_stamp_expires_exactly(age_ns: int, *, known: bool) -> None:
     """A stamp is known for the length of the memory and no nanosecond longer, whether or not another one is issued."""
-    for others in (False, True):
+    for is_another_issued in (False, True):
         stamps = IssuedStamps(MEMORY_NS, 5)
         stamps.add(777, 3, 100, 1)
-        if others:
+        if is_another_issued:
             stamps.add(778, 4, 100 + age_ns, 2)
         assert (stamps.issued_ns(777, 100 + age_ns) is not None) == known
 
@@ -43,6 +43,7 @@ def test_a_stamp_issued_twice_counts_as_the_newer_frame() -> None:
 def test_capture_time() -> None:
     """The capture time is the camera's, at most the time of issue; equal pictures have that of the first one."""
     stamps = IssuedStamps(MEMORY_NS, 5)
+    # Stamp, time of issue, checksum, capture time.
     added = ((1, 100, 7, 90), (2, 200, 8, None), (3, 300, 8, 290), (4, 400, 9, 390), (5, 500, 10, 501))
     for stamp_ns, mono_ns, crc, captured_ns in added:
         stamps.add(stamp_ns, stamp_ns, mono_ns, crc, captured_ns)

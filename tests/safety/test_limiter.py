@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
-from tests.safety.rig import MAX_STEERING_RAD, WHEELBASE_M, new_limiter, vehicle_at
+from tests.safety.rig import MAX_BRAKING_MPS2, MAX_STEERING_RAD, WHEELBASE_M, new_limiter, vehicle_at
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation
 from lavt.errors import UserError
@@ -64,13 +64,13 @@ def test_a_change_reached_within_a_command_period_is_not_reported() -> None:
     """A target that the rate limit allows within 20 ms is not reported as limited."""
     period_rad = LIMITS.steering_rate_radps * COMMAND_PERIOD_S
     for from_rad in (0.0, 0.1, -0.1):
-        for turn_rad, named in ((0.0159, ()), (0.0161, ("steering rate",))):
+        for turn_rad, named in ((period_rad - 1e-4, ()), (period_rad + 1e-4, ("steering rate",))):
             for sign in (1, -1):
                 limiter = new_limiter()
                 limiter.reset(from_rad, 0)
                 requested = Actuation(from_rad + sign * turn_rad, 0.0, 0.0)
                 actuation = limiter.limit(requested, vehicle_at(0.0), 4 * NS_PER_MS)
-                assert actuation.steering_rad == pytest.approx(from_rad + sign * 0.0032)
+                assert actuation.steering_rad == pytest.approx(from_rad + sign * LIMITS.steering_rate_radps * 0.004)
                 assert limiter.applied_limits == named
     assert limited(Actuation(period_rad, 0.0, 0.0), 0.0, after_ns=4 * NS_PER_MS)[1] == ()
 
@@ -157,8 +157,8 @@ def limited_at_excess(
 
 
 def test_excess_speed_is_braked_away() -> None:
-    """Above the limit the throttle is removed and each m/s of excess brakes with 4 m/s2, at most a safe stop."""
-    safe_stop_brake = LIMITS.stop_deceleration_mps2 / 6.0
+    """Above the limit the throttle is removed, and the brake gives 4 m/s2 per m/s of excess, at most a safe stop's."""
+    safe_stop_brake = LIMITS.stop_deceleration_mps2 / MAX_BRAKING_MPS2
     for excess_mps, brake in ((0.25, safe_stop_brake / 4), (1.0, safe_stop_brake), (3.0, safe_stop_brake)):
         actuation, changed = limited_at_excess(Actuation(0.0, 0.8, 0.0), excess_mps)
         assert (actuation.throttle, changed) == (0.0, ("stopping distance",))
@@ -167,7 +167,7 @@ def test_excess_speed_is_braked_away() -> None:
 
 def test_excess_speed_changes_either_pedal_alone() -> None:
     """Above the limit a throttle is removed also under a harder brake, and the brake is applied without one."""
-    safe_stop_brake = LIMITS.stop_deceleration_mps2 / 6.0
+    safe_stop_brake = LIMITS.stop_deceleration_mps2 / MAX_BRAKING_MPS2
     assert limited_at_excess(Actuation(0.0, 0.8, 0.9), 1.0) == (Actuation(0.0, 0.0, 0.9), ("stopping distance",))
     actuation, changed = limited_at_excess(Actuation(0.0, 0.0, 0.1), 1.0)
     assert (actuation.throttle, changed) == (0.0, ("stopping distance",))
@@ -191,7 +191,7 @@ def test_the_stopping_distance_limit_releases_no_brake() -> None:
     )
 )
 def test_the_limits_hold_for_any_request(requested: list[tuple[float, float, float, float, int]]) -> None:
-    """For any requests at any speeds, angle and rate hold at once, lateral acceleration as the rate allows."""
+    """For any request, angle and rate are always within limits, lateral acceleration as soon as the rate allows."""
     limiter = new_limiter()
     limiter.reset(0.0, 0)
     before_rad, now_ns = 0.0, 0

@@ -81,7 +81,8 @@ def test_a_stop_with_the_wheel_held_leaves_the_lane(route: str) -> None:
 def test_a_safe_stop_under_delay_stays_in_the_lane() -> None:
     """At L3, 2.5 m beyond its last picture, the car stops 0.1 m inside its lane; with the wheel held, 1 m outside."""
     _, followed, held = zip(*stops("a", "L3"), strict=True)
-    assert max(stop.beyond_m for stop in followed) < -0.1  # + 0.02 m if the path began where its command arrived
+    # If the path began where its command arrived, this would be + 0.02 m.
+    assert max(stop.beyond_m for stop in followed) < -0.1
     assert max(stop.beyond_m for stop in held) > 1.0
 
 

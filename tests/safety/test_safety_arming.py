@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from tests.safety.rig import TICK_NS, Rig, vehicle_at
+from tests.safety.rig import COMMAND_PERIOD_NS, Rig, vehicle_at
 
 from lavt.domain import LARGEST_STORED_STOP, NS_PER_MS, NS_PER_S
 from lavt.safety.gate import RejectionReason
@@ -21,7 +21,7 @@ def test_arming_takes_a_full_second() -> None:
     began_ns = rig.now_ns
     assert rig.state == "arming"
     for _ in range(49):
-        rig.go(TICK_NS)
+        rig.go(COMMAND_PERIOD_NS)
         rig.picture()
         rig.send()
     rig.go(began_ns + NS_PER_S - 1 - rig.now_ns)
@@ -53,7 +53,7 @@ def freezes(rig: Rig) -> None:
 
 def no_new_pictures(rig: Rig) -> None:
     for _ in range(300 // 20):
-        rig.go(TICK_NS)
+        rig.go(COMMAND_PERIOD_NS)
         rig.send()
 
 
@@ -272,7 +272,7 @@ def test_an_emergency_stop_too_high_to_be_stored_stops_once() -> None:
     assert rig.state == "emergency_stop"
     assert rig.clear().granted
     for _ in range(60):
-        rig.go(TICK_NS)
+        rig.go(COMMAND_PERIOD_NS)
         rig.picture()
         rig.gate.admit(stop, rig.vehicle, rig.now_ns, rig.now_ns)
         rig.send()
@@ -291,7 +291,7 @@ def test_recorded_emergency_stops_do_not_block_the_operator_forever() -> None:
         assert rig.clear().granted
     rig.request("acquire")
     for _ in range(60):
-        rig.go(TICK_NS)
+        rig.go(COMMAND_PERIOD_NS)
         rig.picture()
         for stop in recorded:
             rig.gate.admit(stop, rig.vehicle, rig.now_ns, rig.now_ns)
@@ -309,7 +309,7 @@ def test_a_command_with_an_emergency_stop_never_moves_the_vehicle() -> None:
     rig.clear()
     rig.request("acquire")
     for _ in range(100):
-        rig.go(TICK_NS)
+        rig.go(COMMAND_PERIOD_NS)
         rig.picture()
         assert not rig.send(emergency_stop=3).accepted
     assert rig.state == "disarmed"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from tests.safety.rig import MAX_BRAKING_MPS2, TICK_NS, Rig, vehicle_at
+from tests.safety.rig import COMMAND_PERIOD_NS, MAX_BRAKING_MPS2, Rig, vehicle_at
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation
 from lavt.safety.gate import RejectionReason
@@ -23,7 +23,7 @@ def rejection_counts(rig: Rig) -> dict[str, int]:
 def test_a_valid_command_is_accepted_unchanged() -> None:
     """A valid command within all limits reaches the vehicle unchanged."""
     rig = Rig().armed()
-    rig.go(TICK_NS)
+    rig.go(COMMAND_PERIOD_NS)
     rig.picture()
     assert rig.drive(steering_rad=0.001, throttle=0.4).accepted
     assert rig.actuation() == Actuation(0.001, 0.4, 0.0)
@@ -35,13 +35,13 @@ def test_a_rejected_command_has_a_reason_and_is_counted() -> None:
     """A rejected command has a reason, is counted under it, and does not replace the last command."""
     rig = Rig().driving(throttle=0.25)
     now_ns = rig.now_ns
-    forgotten_ns = rig.stamp_ns
+    newest_stamp_ns = rig.stamp_ns
     for changes, reason in (
         ({"epoch": rig.epoch + 1}, RejectionReason.WRONG_EPOCH),
         ({"sequence": rig.sequence}, RejectionReason.OLD_SEQUENCE),
         ({"emergency_stop": 0, "sequence": 0}, RejectionReason.OLD_SEQUENCE),
         ({"stamp_ns": 0}, RejectionReason.UNKNOWN_STAMP),
-        ({"stamp_ns": forgotten_ns + 1}, RejectionReason.UNKNOWN_STAMP),
+        ({"stamp_ns": newest_stamp_ns + 1}, RejectionReason.UNKNOWN_STAMP),
         ({"mode": "arm", "throttle": 0.0}, RejectionReason.ALREADY_ARMED),
     ):
         before = rejection_counts(rig).get(reason, 0)
@@ -91,7 +91,7 @@ def test_the_stopping_speed_limit_counts_from_the_capture() -> None:
     for sensor_delay_ns in (0, 400 * NS_PER_MS):
         rig = Rig().armed()
         rig.vehicle = vehicle_at(speed_mps=11.0)
-        rig.go(TICK_NS)
+        rig.go(COMMAND_PERIOD_NS)
         rig.picture(captured_ns=rig.now_ns - sensor_delay_ns)
         assert rig.drive().accepted
         pedals.append(rig.actuation().brake)
@@ -149,12 +149,12 @@ def test_the_watchdog_needs_no_wake() -> None:
 def test_repeated_stamps_do_not_reset_the_command_timeout() -> None:
     """Commands that repeat the same stamp do not reset the command timeout."""
     rig = Rig().driving()
-    for _ in range(STOP_NS // TICK_NS - 1):
-        rig.go(TICK_NS)
+    for _ in range(STOP_NS // COMMAND_PERIOD_NS - 1):
+        rig.go(COMMAND_PERIOD_NS)
         rig.drive()
     assert rig.state == "degraded"
     assert rig.actuation().throttle == 0.0
-    rig.go(TICK_NS)
+    rig.go(COMMAND_PERIOD_NS)
     assert rig.state == "safe_stop"
 
 
@@ -163,11 +163,11 @@ def test_older_pictures_do_not_reset_the_command_timeout() -> None:
     rig = Rig().armed()
     stamps = []
     for _ in range(5):
-        rig.go(TICK_NS)
+        rig.go(COMMAND_PERIOD_NS)
         stamps.append(rig.picture())
     assert rig.drive(stamp_ns=stamps[-1]).accepted
-    for number in range(STOP_NS // TICK_NS):
-        rig.go(TICK_NS)
+    for number in range(STOP_NS // COMMAND_PERIOD_NS):
+        rig.go(COMMAND_PERIOD_NS)
         rig.drive(stamp_ns=stamps[number % 5])
     assert rig.state == "safe_stop"
 
@@ -178,7 +178,7 @@ def test_a_step_of_the_wall_clock_changes_nothing(step_ns: int) -> None:
     rig = Rig().driving()
     rig.wall_step_ns = step_ns
     for _ in range(100):
-        rig.go(TICK_NS)
+        rig.go(COMMAND_PERIOD_NS)
         rig.picture()
         assert rig.drive().accepted
         assert rig.state == "driving"
@@ -218,13 +218,13 @@ def test_a_command_timeout_never_releases_a_brake() -> None:
 def test_degraded_accepts_no_command_from_a_picture_already_used() -> None:
     """A degraded vehicle accepts no command from a picture already used, not even its steering."""
     rig = Rig().driving(steering_rad=0.02)
-    rig.go(TICK_NS)
+    rig.go(COMMAND_PERIOD_NS)
     rig.actuation()
-    rig.go(TICK_NS)
+    rig.go(COMMAND_PERIOD_NS)
     assert rig.actuation().steering_rad == 0.02
     rig.go(DEGRADED_NS)
     assert rig.drive(steering_rad=-0.3).reason == RejectionReason.PICTURE_NOT_NEWER
-    rig.go(TICK_NS)
+    rig.go(COMMAND_PERIOD_NS)
     assert rig.actuation().steering_rad == 0.02
 
 
@@ -242,7 +242,7 @@ def test_safe_stop_is_latched_under_a_new_epoch() -> None:
     assert rig.drive().reason == RejectionReason.NOT_ARMED
     assert rig.send().reason == RejectionReason.NOT_STATIONARY
     for _ in range(50):
-        rig.go(TICK_NS)
+        rig.go(COMMAND_PERIOD_NS)
         rig.picture()
         rig.drive()
         rig.send(epoch=old_epoch)
@@ -257,7 +257,7 @@ def test_nothing_queued_in_an_outage_is_accepted_after_it() -> None:
     rig = Rig().driving()
     queued = []
     for _ in range(150):
-        rig.go(TICK_NS)
+        rig.go(COMMAND_PERIOD_NS)
         rig.picture()
         queued.append(rig.command(mode="drive", throttle=1.0, brake=0.0))
     verdicts = [rig.gate.admit(command, rig.vehicle, rig.now_ns, rig.now_ns) for command in queued]

@@ -11,7 +11,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 from msgspec.structs import replace
-from tests.safety.rig import MAX_STEERING_RAD, TICK_NS, Rig, vehicle_at
+from tests.safety.rig import COMMAND_PERIOD_NS, MAX_STEERING_RAD, Rig, vehicle_at
 
 from lavt.domain import NS_PER_MS, NS_PER_S, PATH_POINTS, Operation, SafetyState
 from lavt.safety.gate import INTERRUPTS_ARMING
@@ -77,7 +77,7 @@ class GateMachine(RuleBasedStateMachine):
         self.rig.request("acquire")
         self.rig.vehicle = vehicle_at(0.0, self.rig.vehicle.steering_rad)
         for _ in range(round(seconds * 50)):
-            self.pass_time(TICK_NS)
+            self.pass_time(COMMAND_PERIOD_NS)
             self.rig.picture()
             self.send()
 
@@ -107,7 +107,7 @@ class GateMachine(RuleBasedStateMachine):
             self.rig.picture(-1)
         self.met_since_ns = None
 
-    @rule(duration_ns=st.sampled_from([0, 1, NS_PER_MS, TICK_NS, 200 * NS_PER_MS, 300 * NS_PER_MS, NS_PER_S]))
+    @rule(duration_ns=st.sampled_from([0, 1, NS_PER_MS, COMMAND_PERIOD_NS, 200 * NS_PER_MS, 300 * NS_PER_MS, NS_PER_S]))
     def pass_time(self, duration_ns: int) -> None:
         self.rig.go(duration_ns)
         if self.rig.now_ns - self.used_ns >= LIMITS.degraded_after_ns:

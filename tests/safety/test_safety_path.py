@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import msgspec
 import pytest
-from tests.safety.rig import TICK_NS, WHEELBASE_M, Rig, vehicle_at
+from tests.safety.rig import COMMAND_PERIOD_NS, WHEELBASE_M, Rig, vehicle_at
 
 from lavt.control.pure_pursuit import steering_rad
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation
@@ -25,10 +25,10 @@ class MovingRig(Rig):
     """A rig whose vehicle moves at constant speed, with the wheel at its target."""
 
     def roll(self, duration_ns: int, speed_mps: float = 8.0) -> Actuation:
-        """Let time pass with an actuation every tick, and return the last actuation."""
+        """Let time pass with an actuation every `COMMAND_PERIOD_NS`, and return the last actuation."""
         requested = self.step(speed_mps)
-        for _ in range(duration_ns // TICK_NS):
-            self.go(TICK_NS)
+        for _ in range(duration_ns // COMMAND_PERIOD_NS):
+            self.go(COMMAND_PERIOD_NS)
             requested = self.step(speed_mps)
         return requested
 
@@ -40,7 +40,7 @@ class MovingRig(Rig):
     def drive_on(self, path: tuple[float, ...], angle_rad: float = 0.0) -> MovingRig:
         """Drive at 8 m/s with one command whose path is `path`."""
         self.armed()
-        self.roll(TICK_NS)
+        self.roll(COMMAND_PERIOD_NS)
         self.picture()
         assert self.drive(steering_rad=angle_rad, path_curvature_per_m=path).accepted
         return self
@@ -71,7 +71,7 @@ def test_the_wheel_turns_where_the_path_bends() -> None:
 def test_an_emergency_stop_follows_the_path_at_full_brake() -> None:
     """An emergency stop applies full brake and follows the path."""
     rig = MovingRig().drive_on(LEFT)
-    rig.roll(TICK_NS)
+    rig.roll(COMMAND_PERIOD_NS)
     assert rig.request("emergency_stop", who="bob", number=1).granted
     requested = rig.roll(500 * NS_PER_MS)
     assert rig.state == "emergency_stop"
@@ -105,7 +105,7 @@ def test_at_standstill_the_path_is_dropped() -> None:
     """Once the stopped vehicle is stationary, its wheel stays still, also when the vehicle is moved later."""
     rig = MovingRig().drive_on(LATER_LEFT)
     rig.roll(STOP_NS)
-    before = rig.roll(TICK_NS, speed_mps=0.0).steering_rad
+    before = rig.roll(COMMAND_PERIOD_NS, speed_mps=0.0).steering_rad
     assert rig.roll(2 * NS_PER_S).steering_rad == before
 
 
@@ -127,7 +127,7 @@ def test_the_path_of_a_command_begins_where_its_picture_was_taken() -> None:
     for age_ns in (0, NS_PER_S):
         rig = MovingRig(replace(LIMITS, picture_age_limit_ns=2 * NS_PER_S, degraded_after_ns=2 * NS_PER_S))
         rig.armed()
-        rig.roll(TICK_NS)
+        rig.roll(COMMAND_PERIOD_NS)
         stamp_ns = rig.picture()
         rig.roll(age_ns)
         assert rig.drive(stamp_ns=stamp_ns, steering_rad=0.0, path_curvature_per_m=LATER_LEFT).accepted

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from tests.safety.rig import TICK_NS, Rig, vehicle_at
+from tests.safety.rig import COMMAND_PERIOD_NS, Rig, vehicle_at
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Operation, SessionRequest
 from lavt.safety.gate import RejectionReason
@@ -171,7 +171,7 @@ def test_without_consent_a_driven_vehicle_is_not_handed_over() -> None:
         assert not reply.granted
         assert "alice has control" in reply.reason
         for _ in range(50):
-            rig.go(TICK_NS)
+            rig.go(COMMAND_PERIOD_NS)
             rig.picture()
             assert rig.drive().accepted
 
@@ -202,9 +202,9 @@ def test_a_new_active_operator_arms_at_standstill() -> None:
     rig.picture()
     assert rig.send().reason == RejectionReason.NOT_STATIONARY
     rig.vehicle = vehicle_at(0.0)
-    rig.arm_for(NS_PER_S - TICK_NS)
+    rig.arm_for(NS_PER_S - COMMAND_PERIOD_NS)
     assert rig.state == "arming"
-    rig.arm_for(TICK_NS)
+    rig.arm_for(COMMAND_PERIOD_NS)
     assert rig.state == "driving"
 
 

@@ -12,7 +12,7 @@ from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.safety.limits import LIMITS
 from lavt.safety.stop_brake import StopBrake
 
-LEAST = LIMITS.stop_deceleration_mps2 / MAX_BRAKING_MPS2
+PLANNED_PEDAL = LIMITS.stop_deceleration_mps2 / MAX_BRAKING_MPS2
 
 
 def pedals(deceleration_mps2: float, lag_s: float = 0.2) -> list[float]:
@@ -28,14 +28,14 @@ def pedals(deceleration_mps2: float, lag_s: float = 0.2) -> list[float]:
 
 def test_a_stop_that_decelerates_as_planned_keeps_its_pedal() -> None:
     """With the planned deceleration, the pedal is not pressed further."""
-    assert set(pedals(LIMITS.stop_deceleration_mps2)) == {LEAST}
+    assert set(pedals(LIMITS.stop_deceleration_mps2)) == {PLANNED_PEDAL}
 
 
 @pytest.mark.parametrize("deceleration_mps2", [0.0, 1.0, 2.0, 3.0])
 def test_a_stop_that_decelerates_too_little_brakes_fully(deceleration_mps2: float) -> None:
     """With too little deceleration, the pedal rises, up to full, and is not released."""
     pressed = pedals(deceleration_mps2)
-    assert pressed[0] == LEAST
+    assert pressed[0] == PLANNED_PEDAL
     assert pressed == sorted(pressed)
     assert pressed[-1] == 1.0
 
@@ -45,7 +45,7 @@ def test_a_stop_at_a_speed_that_is_no_speed(speed_mps: float) -> None:
     """The pedal is full, or rises to full, for a speed that is not finite or huge."""
     brake = StopBrake(LIMITS, MAX_BRAKING_MPS2)
     brake.pedal(vehicle_at(speed_mps), START_NS)
-    assert brake.pedal(vehicle_at(speed_mps), START_NS + 3 * NS_PER_S) in {LEAST, 1.0}
+    assert brake.pedal(vehicle_at(speed_mps), START_NS + 3 * NS_PER_S) in {PLANNED_PEDAL, 1.0}
     assert brake.pedal(vehicle_at(math.nan), START_NS + 3 * NS_PER_S) == 1.0
 
 
@@ -71,4 +71,4 @@ def test_the_next_stop_begins_at_its_own_speed() -> None:
     brake.pedal(vehicle_at(8.0), START_NS)
     assert brake.pedal(vehicle_at(8.0), START_NS + 900 * NS_PER_MS) == 1.0
     brake.reset()
-    assert brake.pedal(vehicle_at(8.0), START_NS + NS_PER_S) == LEAST
+    assert brake.pedal(vehicle_at(8.0), START_NS + NS_PER_S) == PLANNED_PEDAL

@@ -72,9 +72,9 @@ MESSAGES: dict[type, AnyMessage] = {
 }
 
 U64 = st.integers(0, 2**64 - 1)
-TIME = st.integers(0, 2**63 - 1)
-ROAD_WHEEL = st.floats(-1, 1)
-UNIT = st.floats(0, 1)
+U63 = st.integers(0, 2**63 - 1)
+ANGLE = st.floats(-1, 1)
+PEDAL = st.floats(0, 1)
 
 
 def text(max_bytes: int) -> st.SearchStrategy[str]:
@@ -85,23 +85,23 @@ NAMES = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9_-]{0,31}", fullmatch=True)
 COMMANDS = st.builds(
     Command,
     epoch=U64,
-    sequence=TIME,
-    sent_wall_ns=TIME,
-    stamp_ns=TIME,
-    stamp_received_wall_ns=TIME,
-    steering_rad=ROAD_WHEEL,
-    throttle=UNIT,
-    brake=UNIT,
-    path_curvature_per_m=st.tuples(*[ROAD_WHEEL] * PATH_POINTS),
+    sequence=U63,
+    sent_wall_ns=U63,
+    stamp_ns=U63,
+    stamp_received_wall_ns=U63,
+    steering_rad=ANGLE,
+    throttle=PEDAL,
+    brake=PEDAL,
+    path_curvature_per_m=st.tuples(*[st.floats(-1, 1)] * PATH_POINTS),
     mode=st.sampled_from(["arm", "drive", "stop"]),
-    emergency_stop=TIME,
+    emergency_stop=U63,
 )
 STATES = st.builds(
     State,
-    sent_wall_ns=TIME,
-    state_mono_ns=TIME,
+    sent_wall_ns=U63,
+    state_mono_ns=U63,
     speed_mps=st.floats(-100, 100),
-    steering_rad=ROAD_WHEEL,
+    steering_rad=ANGLE,
     gear=st.sampled_from(["park", "reverse", "neutral", "drive"]),
     safety=st.sampled_from(["disarmed", "arming", "driving", "degraded", "safe_stop", "emergency_stop"]),
     reason=text(REASON_BYTES),
@@ -118,7 +118,7 @@ REQUESTS = st.builds(
     operation=st.sampled_from(["acquire", "request_handover", "release", "emergency_stop", "clear_emergency_stop"]),
     who=NAMES,
     instance=U64,
-    number=TIME,
+    number=U63,
 )
 REPLIES = st.builds(
     SessionReply,
@@ -218,18 +218,18 @@ NAN, INF = float("nan"), float("inf")
 NOT_AN_INTEGER: list[Any] = [True, False, 1.0, NAN, "1", b"1", None, [], {}, -(2**63)]
 NOT_A_NUMBER: list[Any] = [NAN, INF, -INF, True, "0", b"0", None, [], {}, 2**64 - 1]
 NOT_A_TEXT: list[Any] = [1, 1.0, True, None, b"drive", [], {}]
-NOT_A_TIME = [*NOT_AN_INTEGER, -1, 2**63, 2**64 - 1]
+NOT_A_U63 = [*NOT_AN_INTEGER, -1, 2**63, 2**64 - 1]
 NOT_A_NAME = [*NOT_A_TEXT, "", "a/b", "**", "*", "a b", "-a", "_a", "a\n", "é", "a" * 33, "$a", "a#"]
 NOT_A_NAME_OR_EMPTY = [value for value in NOT_A_NAME if value != ""]
 POINTS = [0.0] * PATH_POINTS
 OUT_OF_RANGE: dict[type, dict[str, list[Any]]] = {
     Command: {
         "epoch": [*NOT_AN_INTEGER, -1],
-        "sequence": NOT_A_TIME,
-        "sent_wall_ns": NOT_A_TIME,
-        "stamp_ns": NOT_A_TIME,
-        "stamp_received_wall_ns": NOT_A_TIME,
-        "emergency_stop": NOT_A_TIME,
+        "sequence": NOT_A_U63,
+        "sent_wall_ns": NOT_A_U63,
+        "stamp_ns": NOT_A_U63,
+        "stamp_received_wall_ns": NOT_A_U63,
+        "emergency_stop": NOT_A_U63,
         "steering_rad": [*NOT_A_NUMBER, 1.0001, -1.0001],
         "throttle": [*NOT_A_NUMBER, 1.0001, -0.0001],
         "brake": [*NOT_A_NUMBER, 1.0001, -0.0001],
@@ -247,8 +247,8 @@ OUT_OF_RANGE: dict[type, dict[str, list[Any]]] = {
         "mode": [*NOT_A_TEXT, "", "fly", "Drive", "drive "],
     },
     State: {
-        "sent_wall_ns": NOT_A_TIME,
-        "state_mono_ns": NOT_A_TIME,
+        "sent_wall_ns": NOT_A_U63,
+        "state_mono_ns": NOT_A_U63,
         "speed_mps": [*NOT_A_NUMBER, 100.1, -100.1],
         "steering_rad": [*NOT_A_NUMBER, 1.0001, -1.0001],
         "gear": [*NOT_A_TEXT, "", "sideways"],
@@ -266,7 +266,7 @@ OUT_OF_RANGE: dict[type, dict[str, list[Any]]] = {
         "operation": [*NOT_A_TEXT, "", "steal"],
         "who": NOT_A_NAME,
         "instance": [*NOT_AN_INTEGER, -1],
-        "number": NOT_A_TIME,
+        "number": NOT_A_U63,
     },
     SessionReply: {
         "granted": [0, 1, 1.0, "true", None, []],
@@ -275,7 +275,7 @@ OUT_OF_RANGE: dict[type, dict[str, list[Any]]] = {
         "token": ["", "x" * 16, None, 0, bytes(15), bytes(17), [0] * 16],
         "video_port": [*NOT_AN_INTEGER, -1, 65536],
         "host": [*NOT_A_TEXT, "x" * 65],
-        "emergency_stop": [*NOT_A_TIME, 2**62 + 1],
+        "emergency_stop": [*NOT_A_U63, 2**62 + 1],
     },
     NetemRequest: {
         "who": NOT_A_NAME,

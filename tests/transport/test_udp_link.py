@@ -18,7 +18,7 @@ from lavt.streams import stream
 from lavt.transport.udp_link import UdpLink
 
 ARRIVES_S = 5.0
-ANY = ("127.0.0.1", 0)
+ANY_PORT = ("127.0.0.1", 0)
 
 
 class Received:
@@ -37,14 +37,14 @@ class Received:
 
 
 def open_link(clock: Clock | None = None, remote: tuple[str, int] | None = None) -> UdpLink:
-    return UdpLink(clock or MachineClock(), "rtp", bind=ANY, remote=remote)
+    return UdpLink(clock or MachineClock(), "rtp", bind=ANY_PORT, remote=remote)
 
 
 @pytest.fixture
 def sender() -> Iterator[socket.socket]:
     """Open a socket on the loopback that belongs to no link."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened_socket:
-        opened_socket.bind(ANY)
+        opened_socket.bind(ANY_PORT)
         opened_socket.settimeout(ARRIVES_S)
         yield opened_socket
 
@@ -74,6 +74,7 @@ def test_time_of_arrival(sender: socket.socket) -> None:
 
 def test_arrival_on_both_clocks(sender: socket.socket) -> None:
     """A kernel timestamp of 5 s ago puts the arrival 5 s back on the wall clock and on the monotonic clock."""
+    # The link's wall clock is 5 s ahead of the kernel's, so the timestamp of a datagram that is sent now is 5 s old.
     received, clock = Received(), ShiftedClock(mono_ns=10**15, wall_ns=5 * NS_PER_S)
     with closing(open_link(clock)) as link:
         before = MachineClock().now()
@@ -89,6 +90,7 @@ def test_arrival_on_both_clocks(sender: socket.socket) -> None:
 @pytest.mark.parametrize("wall_s", [-5.0, 3600.0])
 def test_stepped_clock(sender: socket.socket, wall_s: float) -> None:
     """A kernel timestamp in the future or an hour old is ignored, and the time of reading is used."""
+    # For a link whose wall clock is ahead of the kernel's by `wall_s`, a timestamp of now is that old.
     received, clock = Received(), ShiftedClock(mono_ns=10**15, wall_ns=round(wall_s * NS_PER_S))
     with closing(open_link(clock)) as link:
         before = clock.now()
@@ -131,7 +133,7 @@ def test_send_to_the_remote(sender: socket.socket, port_configured: bool) -> Non
 def test_unsendable_datagrams_are_counted() -> None:
     """A datagram that the system rejects is counted and raises nothing."""
     with closing(open_link()) as link:
-        for payload, address in ((bytes(70_000), ANY), (b"x", ("255.255.255.255", 9)), (b"x", ANY)):
+        for payload, address in ((bytes(70_000), ANY_PORT), (b"x", ("255.255.255.255", 9)), (b"x", ANY_PORT)):
             link.send(Send("rtp", payload, address))
         assert link.counts == {"datagrams_not_sent": 3}
 
@@ -174,7 +176,7 @@ def test_only_from_one_host(sender: socket.socket) -> None:
     """A link with `only_from` receives from any port of that host; datagrams of other hosts are counted."""
     received = Received()
     with (
-        closing(UdpLink(MachineClock(), "rtp", bind=ANY, only_from="127.0.0.2")) as link,
+        closing(UdpLink(MachineClock(), "rtp", bind=ANY_PORT, only_from="127.0.0.2")) as link,
         closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as permitted,
     ):
         permitted.bind(("127.0.0.2", 0))

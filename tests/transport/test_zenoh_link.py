@@ -27,8 +27,10 @@ ARRIVES_S = 10.0
 CONFIGS = shipped("zenoh-configs")
 SESSION = CONFIGS / "session.json5"
 LOCAL = "tcp/127.0.0.1:0"
-BETWEEN = "udp/127.0.0.1:0?rel=1;mixed_rel=1"
-QUIET = "scouting: { multicast: { enabled: false } }, adminspace: { enabled: true }"
+"""An endpoint at which a router listens for sessions of its own machine."""
+ROUTER_LINK = "udp/127.0.0.1:0?rel=1;mixed_rel=1"
+"""An endpoint at which a router listens for other routers."""
+REQUIRED_KEYS = "scouting: { multicast: { enabled: false } }, adminspace: { enabled: true }"
 
 
 class Received:
@@ -67,7 +69,7 @@ def routers() -> Iterator[tuple[str, str]]:
     """Start the shipped routers on free ports, linked to each other; yield the endpoint of each side's router."""
     quiet_logs()
     with ExitStack() as stack:
-        server = Router(CONFIGS / "router-server.json5", {"listen/endpoints": [LOCAL, BETWEEN]})
+        server = Router(CONFIGS / "router-server.json5", {"listen/endpoints": [LOCAL, ROUTER_LINK]})
         stack.callback(server.close)
         remote = next(locator for locator in server.locators() if locator.startswith("udp/"))
         port = remote.partition("?")[0].rpartition(":")[2]
@@ -408,23 +410,23 @@ def test_bad_endpoint(endpoint: str) -> None:
 
 
 ROUTER_PROBLEMS = {
-    "unknown key": (f'{{ mode: "router", lisen: {{}}, {QUIET} }}', "unknown field `lisen`"),
+    "unknown key": (f'{{ mode: "router", lisen: {{}}, {REQUIRED_KEYS} }}', "unknown field `lisen`"),
     "wrong mode": ('{ mode: "routr" }', "unknown variant `routr`"),
-    "wrong type": (f'{{ mode: "router", listen: {{ endpoints: 5 }}, {QUIET} }}', "invalid type"),
+    "wrong type": (f'{{ mode: "router", listen: {{ endpoints: 5 }}, {REQUIRED_KEYS} }}', "invalid type"),
     "not JSON5": ('{ mode: "router', "not a Zenoh config"),
     "empty": ("", "not a Zenoh config"),
-    "mode of a session": (f'{{ mode: "client", {QUIET} }}', 'mode: "router"'),
-    "no mode": (f"{{ {QUIET} }}", 'mode: "router"'),
-    "no listen endpoints": (f'{{ mode: "router", {QUIET} }}', "no listen endpoints"),
-    "an empty list": (f'{{ mode: "router", listen: {{ endpoints: [] }}, {QUIET} }}', "no listen endpoints"),
+    "mode of a session": (f'{{ mode: "client", {REQUIRED_KEYS} }}', 'mode: "router"'),
+    "no mode": (f"{{ {REQUIRED_KEYS} }}", 'mode: "router"'),
+    "no listen endpoints": (f'{{ mode: "router", {REQUIRED_KEYS} }}', "no listen endpoints"),
+    "an empty list": (f'{{ mode: "router", listen: {{ endpoints: [] }}, {REQUIRED_KEYS} }}', "no listen endpoints"),
     "endpoints of a peer": (
-        f'{{ mode: "router", listen: {{ endpoints: {{ peer: ["{LOCAL}"] }} }}, {QUIET} }}',
+        f'{{ mode: "router", listen: {{ endpoints: {{ peer: ["{LOCAL}"] }} }}, {REQUIRED_KEYS} }}',
         "no listen endpoints",
     ),
     "no admin space": (f'{{ mode: "router", listen: {{ endpoints: ["{LOCAL}"] }} }}', "adminspace"),
-    "unknown protocol": (f'{{ mode: "router", listen: {{ endpoints: ["foo/127.0.0.1:0"] }}, {QUIET} }}', "foo"),
+    "unknown protocol": (f'{{ mode: "router", listen: {{ endpoints: ["foo/127.0.0.1:0"] }}, {REQUIRED_KEYS} }}', "foo"),
     "address of another machine": (
-        f'{{ mode: "router", listen: {{ endpoints: ["tcp/192.0.2.1:0"] }}, {QUIET} }}',
+        f'{{ mode: "router", listen: {{ endpoints: ["tcp/192.0.2.1:0"] }}, {REQUIRED_KEYS} }}',
         "192.0.2.1",
     ),
 }
@@ -488,9 +490,9 @@ def test_port_in_use() -> None:
 
 ENCRYPTED = "quic/127.0.0.1:0?mixed_rel=1"
 ENDPOINTS = {
-    "router-server.json5": [LOCAL, BETWEEN],
+    "router-server.json5": [LOCAL, ROUTER_LINK],
     "router-client.json5": [LOCAL],
-    "router-cloud.json5": [LOCAL, BETWEEN],
+    "router-cloud.json5": [LOCAL, ROUTER_LINK],
     "router-server-to-cloud.json5": [LOCAL],
     "router-server-tls.json5": ["unixsock-stream/{}/zenoh.sock", ENCRYPTED],
     "router-client-tls.json5": ["unixsock-stream/{}/zenoh.sock"],
@@ -599,7 +601,7 @@ def test_both_dial_a_router_in_the_cloud() -> None:
             stack.callback(opened.close)
             return opened
 
-        cloud = router("router-cloud.json5", {"listen/endpoints": [BETWEEN]})
+        cloud = router("router-cloud.json5", {"listen/endpoints": [ROUTER_LINK]})
         port = cloud.locators()[0].partition("?")[0].rpartition(":")[2]
         dials = {"listen/endpoints": [LOCAL], "connect/endpoints": [f"udp/127.0.0.1:{port}?rel=1;mixed_rel=1"]}
         sides = [router(name, dials) for name in ("router-server-to-cloud.json5", "router-client.json5")]

@@ -50,6 +50,7 @@ def parse(answer: str) -> ClockReport:
 
 
 def with_fields(line: str, **fields: str) -> str:
+    """Return one of chronyc's lines with other values; `field0` is the first one."""
     parts = line.strip().split(",")
     for name, value in fields.items():
         parts[int(name.removeprefix("field"))] = value
@@ -147,7 +148,7 @@ def test_polling_interval_below_a_second() -> None:
     assert report.poll_s == 0.5
 
 
-@pytest.mark.parametrize("field", [19, 20, 9, 33])
+@pytest.mark.parametrize("field", [19, 20, 9, 33])  # delay, dispersion, polling interval, good samples
 @pytest.mark.parametrize("value", ["", "?", "nan", "-8", "inf"])
 def test_invalid_peer_data_is_unknown(field: int, value: str) -> None:
     """An invalid or negative value of the peer data is unknown; the other values are kept."""

@@ -59,7 +59,7 @@ def parse(answer: str) -> ClockReport:
 
 
 def test_correction_and_bound_of_a_slave() -> None:
-    """The correction is the negative of the offset from the master; the bound is the mean path delay per step."""
+    """The correction is the negative offset from the master; the bound is the mean path delay times the steps."""
     report = parse(SLAVE)
     assert (report.source, report.correction_s, report.bound_s) == ("ptp", -512e-9, 2304e-9)
     assert report.follows == "a6bb40.fffe.382888"

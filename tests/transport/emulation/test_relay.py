@@ -259,7 +259,10 @@ def test_relay_reports_the_measured_delays(net: RelayNetwork) -> None:
 
 
 def send_through(net: RelayNetwork, impairments: LinkConfig, count: int, period_ms: float) -> list[tuple[int, float]]:
-    """Send numbered packets through a net at a period; return the number and the arrival time of each that arrived."""
+    """Send numbered packets through a net at a period; return the number and the time (ms) of each that arrived.
+
+    The relay is stepped every half millisecond.
+    """
     client, address_at_server = net.connect("video")
     arrived, begin_ns = [], net.clock.mono_ns
     steps_per_period = round(period_ms * 2)
@@ -302,7 +305,6 @@ def test_relay_follows_the_link_model(name: str) -> None:
         counts = net.relay.counts()
         late_ms = net.relay.late_ms()["video downstream"]
     departures_ns = [model.departure_ns(round(10 * NS_PER_MS * number), 0, len(rtp(0))) for number in range(count)]
-    # This test steps the relay every half millisecond.
     expected = sorted(
         (departed_ns, number) for number, departed_ns in enumerate(departures_ns) if departed_ns is not None
     )

@@ -17,7 +17,7 @@ MS = NS_PER_MS
 
 
 def test_capacity_repeats() -> None:
-    """A capacity trace repeats after its last time; `first_at` returns the first opportunity at a time or after it."""
+    """A capacity trace repeats after its last time; `first_at` returns the number of the first entry from a time on."""
     trace = parse_mahimahi("1\n5\n5\n10\n", "t")
     assert [trace.time_ns(number) // MS for number in range(10)] == [1, 5, 5, 10, 11, 15, 15, 20, 21, 25]
     first_opportunities = {0: 0, 1: 0, 2: 1, 5: 1, 6: 3, 10: 3, 11: 4, 15: 5, 16: 7, 20: 7, 21: 8}

@@ -85,7 +85,7 @@ def execute(queues: FakeQueues | None, *orders: InjectionOrder) -> list[Injectio
 
 
 def test_repeated_order_is_measured_only() -> None:
-    """An order is applied and verified once, and measured when repeated; no flows, or closing, clear the interface."""
+    """An order is applied once, then only measured. An order without flows, and closing, clear the queues."""
     queues = FakeQueues()
     results = execute(
         queues, InjectionOrder(1, "L2", (VIDEO,)), InjectionOrder(1, "L2", (VIDEO,)), InjectionOrder(2, "", ())

@@ -27,11 +27,13 @@ from lavt.transport.rtp.rtp import Packetizer
 from lavt.transport.security.keys import PrivateKey
 from lavt.transport.video.path_validation import PathClient, PathServer
 
-VEHICLE, OTHER = ("203.0.113.2", 40_000), ("203.0.113.66", 40_000)
-CLIENT, SECOND = ("198.51.100.2", 50_000), ("198.51.100.7", 50_001)
+VEHICLE, OTHER_ADDRESS = ("203.0.113.2", 40_000), ("203.0.113.66", 40_000)
+CLIENT, SECOND_CLIENT = ("198.51.100.2", 50_000), ("198.51.100.7", 50_001)
 HELLO = PathClient(b"t" * 16).hello(0)
 REPORT = struct.pack(">BBHI", 0x80, 201, 1, 7)
 NOW_NS = 100 * NS_PER_S
+UNSIGNED_BYTES = 4 + 1 + 1 + 8 + 32 + 8
+"""Length of a registration before its signature; the fields are in docs/wire.md."""
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +62,7 @@ def send_answer(forwarder: Forwarder, client: Address = CLIENT, now_ns: int = NO
 
 
 def flood(forwarder: Forwarder, count: int) -> int:
-    """Send hellos from as many hosts, at the common limit; return when the last one arrived."""
+    """Send hellos, each from its own host, at the limit for unanswered clients; return the time of the last one."""
     now_ns = NOW_NS
     for number in range(count):
         now_ns = NOW_NS + number * NS_PER_S // UPSTREAM_PER_S
@@ -75,8 +77,8 @@ def test_wire_format(key: PrivateKey) -> None:
     plain = b"LAVR\x01\x01" + (258).to_bytes(8, "big") + b"vehicle-1".ljust(32, b"\0") + b"video".ljust(8, b"\0")
     assert encode_registration("vehicle-1", "video", 258, None) == plain
     signed = encode_registration("vehicle-1", "video", 258, key)
-    assert signed[:54] == plain
-    assert key.public.verify(signed[54:], b"LAVT 1 registration vehicle-1\0" + plain)
+    assert signed[:UNSIGNED_BYTES] == plain
+    assert key.public.verify(signed[UNSIGNED_BYTES:], b"LAVT 1 registration vehicle-1\0" + plain)
     assert wrap(("192.0.2.9", 258), b"rest") == b"LAVR\x01\x02" + bytes([192, 0, 2, 9, 1, 2]) + b"rest"
 
 
@@ -114,7 +116,7 @@ def test_each_flow_accepts_its_own_datagrams() -> None:
 PREFIXES = [b"", b"LAVR", b"LAVR\x01\x01", b"LAVR\x01\x02", b"LAVT", b"LC\x01\x00"]
 
 
-@given(st.binary(max_size=200), st.sampled_from(PREFIXES), st.sampled_from([VEHICLE, OTHER, CLIENT]))
+@given(st.binary(max_size=200), st.sampled_from(PREFIXES), st.sampled_from([VEHICLE, OTHER_ADDRESS, CLIENT]))
 def test_arbitrary_datagrams_are_counted(rest: bytes, prefix: bytes, sender: Address) -> None:
     """An arbitrary datagram is counted and raises nothing; at most it reaches the vehicle, which stays registered."""
     forwarder = registered_forwarder()
@@ -129,7 +131,7 @@ def test_the_vehicle_can_only_send_to_recent_clients() -> None:
     forwarder = registered_forwarder()
     assert send_answer(forwarder) is None
     send_hello(forwarder)
-    assert send_answer(forwarder, SECOND) is None
+    assert send_answer(forwarder, SECOND_CLIENT) is None
     assert send_answer(forwarder) is not None
     late_ns = NOW_NS + CLIENT_TIMEOUT_NS + 1
     forwarder.receive(encode_registration("vehicle-1", "video", 2, None), VEHICLE, late_ns)
@@ -141,7 +143,7 @@ def test_only_the_vehicle_can_send_to_clients() -> None:
     """A wrapped datagram from any other address than the registered vehicle's is dropped."""
     forwarder = registered_forwarder()
     send_hello(forwarder)
-    for other in (OTHER, CLIENT, (VEHICLE[0], VEHICLE[1] + 1)):
+    for other in (OTHER_ADDRESS, CLIENT, (VEHICLE[0], VEHICLE[1] + 1)):
         assert forwarder.receive(wrap(CLIENT, b"forged"), other, NOW_NS) is None
     assert forwarder.counts["not_from_vehicle"] == 3
 
@@ -156,11 +158,11 @@ def test_only_the_vehicle_can_register(key: PrivateKey) -> None:
     forged = [
         encode_registration("vehicle-1", "video", 5, None),
         encode_registration("vehicle-1", "video", 5, stranger),
-        encode_registration("vehicle-1", "video", 6, None) + good[54:],
+        encode_registration("vehicle-1", "video", 6, None) + good[UNSIGNED_BYTES:],
         good[:-1] + bytes([good[-1] ^ 1]),
     ]
     for registration in forged:
-        forwarder.receive(registration, OTHER, NOW_NS)
+        forwarder.receive(registration, OTHER_ADDRESS, NOW_NS)
     assert forwarder.counts == {"registrations_forged": 4}
     assert forwarder.vehicle_address(NOW_NS) is None
     forwarder.receive(good, VEHICLE, NOW_NS)
@@ -172,8 +174,8 @@ def test_without_a_key_every_registration_is_accepted(key: PrivateKey) -> None:
     forwarder = Forwarder("vehicle-1", "video", None)
     forwarder.receive(encode_registration("vehicle-1", "video", 1, key), VEHICLE, NOW_NS)
     assert forwarder.vehicle_address(NOW_NS) == VEHICLE
-    forwarder.receive(encode_registration("vehicle-1", "video", 2, None), OTHER, NOW_NS)
-    assert forwarder.vehicle_address(NOW_NS) == OTHER
+    forwarder.receive(encode_registration("vehicle-1", "video", 2, None), OTHER_ADDRESS, NOW_NS)
+    assert forwarder.vehicle_address(NOW_NS) == OTHER_ADDRESS
 
 
 @pytest.mark.parametrize(("vehicle", "flow"), [("vehicle-2", "video"), ("vehicle-1", "probe")])
@@ -191,8 +193,8 @@ def test_replayed_registration_is_rejected(key: PrivateKey) -> None:
     forwarder = Forwarder("vehicle-1", "video", key.public)
     old, new = (encode_registration("vehicle-1", "video", time_ns, key) for time_ns in (5, 6))
     forwarder.receive(new, VEHICLE, NOW_NS)
-    forwarder.receive(new, OTHER, NOW_NS + 1)
-    forwarder.receive(old, OTHER, NOW_NS + VEHICLE_TIMEOUT_NS)
+    forwarder.receive(new, OTHER_ADDRESS, NOW_NS + 1)
+    forwarder.receive(old, OTHER_ADDRESS, NOW_NS + VEHICLE_TIMEOUT_NS)
     assert forwarder.vehicle_address(NOW_NS + VEHICLE_TIMEOUT_NS) == VEHICLE
     assert forwarder.counts["registrations_stale"] == 2
 
@@ -201,13 +203,13 @@ def test_a_vehicle_moves_and_expires() -> None:
     """A newer registration from another address takes effect at once; after 10 s without one the vehicle is gone."""
     forwarder = registered_forwarder()
     send_hello(forwarder)
-    forwarder.receive(encode_registration("vehicle-1", "video", 2, None), OTHER, NOW_NS + 1)
-    assert send_hello(forwarder, now_ns=NOW_NS + 1) == (wrap(CLIENT, HELLO), OTHER)
+    forwarder.receive(encode_registration("vehicle-1", "video", 2, None), OTHER_ADDRESS, NOW_NS + 1)
+    assert send_hello(forwarder, now_ns=NOW_NS + 1) == (wrap(CLIENT, HELLO), OTHER_ADDRESS)
     assert send_answer(forwarder, now_ns=NOW_NS + 1) is None
     expired_ns = NOW_NS + 1 + VEHICLE_TIMEOUT_NS + 1
-    assert forwarder.vehicle_address(expired_ns - 1) == OTHER
+    assert forwarder.vehicle_address(expired_ns - 1) == OTHER_ADDRESS
     assert send_hello(forwarder, now_ns=expired_ns) is None
-    assert forwarder.receive(wrap(CLIENT, b"late"), OTHER, expired_ns) is None
+    assert forwarder.receive(wrap(CLIENT, b"late"), OTHER_ADDRESS, expired_ns) is None
     forwarder.receive(encode_registration("vehicle-1", "video", 1, None), VEHICLE, expired_ns)
     assert forwarder.vehicle_address(expired_ns) == VEHICLE, "its clock may have been set back in the meantime"
 
@@ -228,12 +230,12 @@ def test_unanswered_clients_displace_no_answered_ones() -> None:
 def test_datagrams_to_the_vehicle_are_rate_limited() -> None:
     """Datagrams to the vehicle are limited per second, separately for clients that it has answered and for others."""
     forwarder = registered_forwarder()
-    send_hello(forwarder, SECOND)
-    send_answer(forwarder, SECOND)
+    send_hello(forwarder, SECOND_CLIENT)
+    send_answer(forwarder, SECOND_CLIENT)
     hosts = [f"203.0.113.{number % 100}" for number in range(2 * UPSTREAM_PER_S)]
     unanswered = [send_hello(forwarder, (host, 9)) is not None for host in hosts]
-    assert sum(unanswered) == UPSTREAM_PER_S - 1, "the first was SECOND's"
-    answered = [send_hello(forwarder, SECOND) is not None for _ in range(2 * UPSTREAM_PER_S)]
+    assert sum(unanswered) == UPSTREAM_PER_S - 1, "the first was the second client's"
+    answered = [send_hello(forwarder, SECOND_CLIENT) is not None for _ in range(2 * UPSTREAM_PER_S)]
     assert sum(answered) == UPSTREAM_PER_S
     assert send_hello(forwarder, now_ns=NOW_NS + NS_PER_S) is not None
 
@@ -243,8 +245,8 @@ def test_a_strangers_flood_does_not_keep_a_new_client_out() -> None:
     forwarder = registered_forwarder()
     for now_ns in range(NOW_NS, NOW_NS + 5 * NS_PER_S, NS_PER_S // 2):
         for port in range(1, 2 * UPSTREAM_PER_S):
-            send_hello(forwarder, (OTHER[0], port), now_ns)
-            forwarder.receive(REPORT, (OTHER[0], port), now_ns)
+            send_hello(forwarder, (OTHER_ADDRESS[0], port), now_ns)
+            forwarder.receive(REPORT, (OTHER_ADDRESS[0], port), now_ns)
         assert send_hello(forwarder, now_ns=now_ns) is not None
         assert forwarder.receive(REPORT, CLIENT, now_ns) is not None
     assert send_answer(forwarder, now_ns=now_ns) is not None
@@ -312,7 +314,7 @@ def test_forged_registrations_are_rate_limited(key: PrivateKey) -> None:
     forwarder.receive(encode_registration("vehicle-1", "video", 5, key), VEHICLE, NOW_NS)
     forged = encode_registration("vehicle-1", "video", 6, None)
     for _ in range(2 * REGISTRATIONS_PER_S):
-        forwarder.receive(forged, OTHER, NOW_NS + NS_PER_S)
+        forwarder.receive(forged, OTHER_ADDRESS, NOW_NS + NS_PER_S)
     assert forwarder.counts["registrations_forged"] == REGISTRATIONS_PER_S
     forwarder.receive(encode_registration("vehicle-1", "video", 7, key), VEHICLE, NOW_NS + NS_PER_S)
     assert forwarder.counts["registrations"] == 2
@@ -320,4 +322,5 @@ def test_forged_registrations_are_rate_limited(key: PrivateKey) -> None:
 
 def test_the_longest_packet_fits_the_minimum_mtu() -> None:
     """The longest packet, an encrypted and wrapped repair packet, fits into 1280 bytes with its IP and UDP headers."""
-    assert 28 + len(wrap(CLIENT, bytes(1200 + 14 + 16))) <= 1280
+    ip_and_udp_bytes, media_bytes, repair_bytes, srtp_bytes = 28, 1200, 14, 16
+    assert ip_and_udp_bytes + len(wrap(CLIENT, bytes(media_bytes + repair_bytes + srtp_bytes))) <= 1280

@@ -17,7 +17,7 @@ from lavt.transport.rendezvous.link import RendezvousLink, RendezvousPort
 from lavt.transport.video.path_validation import PathClient
 
 TIMEOUT_S = 5.0
-ANY = ("127.0.0.1", 0)
+ANY_PORT = ("127.0.0.1", 0)
 HELLO = PathClient(b"t" * 16).hello(0)
 
 
@@ -27,12 +27,12 @@ class VehicleBehindRendezvous:
     def __init__(self, stack: ExitStack) -> None:
         self.received: queue.Queue[tuple[str, Any, Now, Any]] = queue.Queue()
         forwarder = Forwarder("vehicle-1", "video", None)
-        self.rendezvous = RendezvousPort(MachineClock(), forwarder, bind=ANY, name="video")
+        self.rendezvous = RendezvousPort(MachineClock(), forwarder, bind=ANY_PORT, name="video")
         stack.callback(self.rendezvous.close)
         self.vehicle = RendezvousLink(
             MachineClock(),
             "feedback",
-            bind=ANY,
+            bind=ANY_PORT,
             rendezvous=("127.0.0.1", self.rendezvous.port),
             registration=lambda wall_ns: encode_registration("vehicle-1", "video", wall_ns, None),
         )
@@ -58,13 +58,13 @@ def setup() -> Iterator[VehicleBehindRendezvous]:
 def client() -> Iterator[socket.socket]:
     """Open a client's socket."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp_socket:
-        udp_socket.bind(ANY)
+        udp_socket.bind(ANY_PORT)
         udp_socket.settimeout(TIMEOUT_S)
         yield udp_socket
 
 
 def connect(setup: VehicleBehindRendezvous, client: socket.socket) -> Any:
-    """Start both ends and send hellos until one arrives; return the peer that the vehicle's link gave it."""
+    """Start both ends and send hellos until one arrives; return the client as the vehicle's link names it."""
     setup.rendezvous.start()
     setup.start()
     while True:
@@ -103,14 +103,15 @@ def test_unwrapped_datagrams_from_the_rendezvous_are_counted(client: socket.sock
     link = RendezvousLink(
         MachineClock(),
         "feedback",
-        bind=ANY,
+        bind=ANY_PORT,
         rendezvous=client.getsockname(),
         registration=lambda wall_ns: encode_registration("vehicle-1", "video", wall_ns, None),
     )
     link.start(lambda *message: received.put(message))
     for datagram in (HELLO, b"", b"LAVR\x01\x02short", wrap(("192.0.2.9", 5004), b"last")):
         client.sendto(datagram, ("127.0.0.1", link.port))
-    assert received.get(timeout=TIMEOUT_S)[1:4:2] == (b"last", ("rendezvous:192.0.2.9", 5004))
+    _, payload, _, peer = received.get(timeout=TIMEOUT_S)
+    assert (payload, peer) == (b"last", ("rendezvous:192.0.2.9", 5004))
     assert link.counts["datagrams_not_wrapped"] == 3
     link.close()
 
@@ -122,7 +123,7 @@ def test_each_registration_is_newer(client: socket.socket) -> None:
     link = RendezvousLink(
         backward_clock,
         "feedback",
-        bind=ANY,
+        bind=ANY_PORT,
         rendezvous=client.getsockname(),
         registration=lambda wall_ns: wall_ns.to_bytes(8, "big"),
     )

@@ -52,8 +52,8 @@ def counters(receiver: RepairReceiver) -> Counters:
     return Counters(receiver.recovered, receiver.malformed, receiver.unrepaired)
 
 
-EIGHT = frame(bytes([index]) * (20 + index) for index in range(8))
-REPAIRS = repairs_of(EIGHT, 2)
+EIGHT_PACKETS = frame(bytes([index]) * (20 + index) for index in range(8))
+REPAIRS = repairs_of(EIGHT_PACKETS, 2)
 
 
 def with_bytes(packet: RtpPacket, changed_bytes: Mapping[int, int]) -> RtpPacket:
@@ -154,38 +154,38 @@ def test_burst_is_recovered() -> None:
 def test_any_two_lost_packets_are_recovered(lost: tuple[int, int]) -> None:
     """Any two packets of a block are recovered from two repair packets, equal to those sent, in order and once."""
     receiver = RepairReceiver()
-    arrived = [packet for index, packet in enumerate(EIGHT) if index not in lost]
+    arrived = [packet for index, packet in enumerate(EIGHT_PACKETS) if index not in lost]
     assert push_all(receiver, arrived) == []
     assert receiver.push(REPAIRS[0], 0) == []
-    assert receiver.push(REPAIRS[1], 0) == [EIGHT[index] for index in lost]
-    assert push_all(receiver, [*REPAIRS, *EIGHT]) == []
+    assert receiver.push(REPAIRS[1], 0) == [EIGHT_PACKETS[index] for index in lost]
+    assert push_all(receiver, [*REPAIRS, *EIGHT_PACKETS]) == []
     assert counters(receiver) == Counters(recovered=2)
 
 
 def test_media_after_repair() -> None:
     """A media packet that arrives after the repair packet also completes a block."""
     receiver = RepairReceiver()
-    assert push_all(receiver, [*EIGHT[:6], REPAIRS[0]]) == []
-    assert receiver.push(EIGHT[7], 0) == [EIGHT[6]]
-    assert receiver.push(EIGHT[6], 0) == []
+    assert push_all(receiver, [*EIGHT_PACKETS[:6], REPAIRS[0]]) == []
+    assert receiver.push(EIGHT_PACKETS[7], 0) == [EIGHT_PACKETS[6]]
+    assert receiver.push(EIGHT_PACKETS[6], 0) == []
     assert counters(receiver) == Counters(recovered=1)
 
 
 def test_nothing_lost() -> None:
     """Without loss no packet is recovered, no block stays open and no counter changes."""
     receiver = RepairReceiver()
-    assert push_all(receiver, [*EIGHT, *REPAIRS]) == []
+    assert push_all(receiver, [*EIGHT_PACKETS, *REPAIRS]) == []
     assert receiver._open == {}
-    assert receiver.push(EIGHT[0], BLOCK_TIMEOUT_NS) == []
+    assert receiver.push(EIGHT_PACKETS[0], BLOCK_TIMEOUT_NS) == []
     assert counters(receiver) == Counters()
 
 
 def test_repair_before_media() -> None:
     """Two repair packets that arrive before the media replace two media packets, which are then returned only once."""
     receiver = RepairReceiver()
-    assert push_all(receiver, [*REPAIRS, *EIGHT[:5]]) == []
-    assert receiver.push(EIGHT[5], 0) == EIGHT[6:]
-    assert push_all(receiver, EIGHT[6:]) == []
+    assert push_all(receiver, [*REPAIRS, *EIGHT_PACKETS[:5]]) == []
+    assert receiver.push(EIGHT_PACKETS[5], 0) == EIGHT_PACKETS[6:]
+    assert push_all(receiver, EIGHT_PACKETS[6:]) == []
     assert receiver._open == {}
     assert counters(receiver) == Counters(recovered=2)
 
@@ -193,11 +193,11 @@ def test_repair_before_media() -> None:
 def test_block_is_given_up_after_half_a_second() -> None:
     """A block with more losses than repair packets is given up after half a second, and counted."""
     receiver = RepairReceiver()
-    push_all(receiver, [*EIGHT[:6], REPAIRS[0]], now_ns=7)
+    push_all(receiver, [*EIGHT_PACKETS[:6], REPAIRS[0]], now_ns=7)
     next_frame = frame([b"n"], first=108, timestamp=12_000)
     receiver.push(next_frame[0], 7 + BLOCK_TIMEOUT_NS - 1)
     assert counters(receiver) == Counters()
-    assert receiver.push(EIGHT[6], 7 + BLOCK_TIMEOUT_NS) == []
+    assert receiver.push(EIGHT_PACKETS[6], 7 + BLOCK_TIMEOUT_NS) == []
     assert counters(receiver) == Counters(unrepaired=1)
 
 
@@ -206,10 +206,10 @@ FRAMES = st.lists(st.binary(min_size=1, max_size=60), min_size=1, max_size=60)
 
 @given(FRAMES, FRAMES, st.integers(1, 2), st.integers(0, 2**16 - 1), st.data())
 def test_any_loss_within_the_repair_is_recovered(
-    payloads: list[bytes], others: list[bytes], count: int, first: int, data: st.DataObject
+    payloads: list[bytes], next_payloads: list[bytes], count: int, first: int, data: st.DataObject
 ) -> None:
     """A block with no more losses than repair packets is recovered, for any order, duplicates and sequence numbers."""
-    frames = [frame(payloads, first), frame(others, first + len(payloads), 12_000)]
+    frames = [frame(payloads, first), frame(next_payloads, first + len(payloads), 12_000)]
     sent = [packet for media in frames for packet in media + repairs_of(media, count)]
     lost = data.draw(st.sets(st.integers(0, len(sent) - 1), max_size=12))
     twice = data.draw(st.lists(st.integers(0, len(sent) - 1), max_size=6))
@@ -235,26 +235,27 @@ def test_any_loss_within_the_repair_is_recovered(
 
 MALFORMED_HEADERS = [
     with_payload(REPAIRS[0], b""),
-    with_payload(REPAIRS[0], REPAIRS[0].payload[:12]),
-    with_payload(REPAIRS[0], REPAIRS[0].payload[:14]),
+    with_payload(REPAIRS[0], REPAIRS[0].payload[:12]),  # no symbol
+    with_payload(REPAIRS[0], REPAIRS[0].payload[:14]),  # a symbol without payload
     with_payload(REPAIRS[0], REPAIRS[0].payload.ljust(12 + MAX_SYMBOL_BYTES + 1, b"\x00")),
-    with_bytes(REPAIRS[0], {0: 2}),
-    with_bytes(REPAIRS[0], {1: 0x80}),
+    with_bytes(REPAIRS[0], {0: 2}),  # version
+    with_bytes(REPAIRS[0], {1: 0x80}),  # payload type of the media
     with_bytes(REPAIRS[0], {1: 0xE0}),
     with_bytes(REPAIRS[0], {1: REPAIR_PAYLOAD_TYPE}),
-    with_bytes(REPAIRS[0], {7: 5}),
-    with_bytes(REPAIRS[0], {8: 0, 9: 0}),
+    with_bytes(REPAIRS[0], {7: 5}),  # SSRC of the media
+    with_bytes(REPAIRS[0], {8: 0, 9: 0}),  # number of the frame's packets
     with_bytes(REPAIRS[0], {8: 0xFF, 9: 0xFF}),
-    with_bytes(REPAIRS[0], {10: 1}),
-    with_bytes(REPAIRS[0], {11: 2}),
+    with_bytes(REPAIRS[0], {10: 1}),  # number of the block
+    with_bytes(REPAIRS[0], {11: 2}),  # neither P nor Q
 ]
+"""Repair packets with an invalid field of the header, which is described in docs/wire.md."""
 
 
 @pytest.mark.parametrize("repair", MALFORMED_HEADERS)
 def test_malformed_header(repair: RtpPacket) -> None:
     """A repair packet with an invalid header is counted even if no packet was lost."""
     receiver = RepairReceiver()
-    assert push_all(receiver, [*EIGHT, repair]) == []
+    assert push_all(receiver, [*EIGHT_PACKETS, repair]) == []
     assert counters(receiver) == Counters(malformed=1)
 
 
@@ -267,34 +268,34 @@ def test_malformed_header(repair: RtpPacket) -> None:
         # The recovered payload would be longer than the packet, have bytes after its end, or be empty.
         with_bytes(REPAIRS[0], {12: REPAIRS[0].payload[12] ^ 1}),
         with_bytes(REPAIRS[0], {40: REPAIRS[0].payload[40] ^ 1}),
-        repairs_of([*EIGHT[:3], with_payload(EIGHT[3], b""), *EIGHT[4:]], 1)[0],
+        repairs_of([*EIGHT_PACKETS[:3], with_payload(EIGHT_PACKETS[3], b""), *EIGHT_PACKETS[4:]], 1)[0],
     ],
 )
 def test_malformed(repair: RtpPacket) -> None:
     """A malformed repair packet is counted and leaves no state."""
     receiver = RepairReceiver()
-    assert push_all(receiver, [*EIGHT[:3], *EIGHT[4:], repair]) == []
+    assert push_all(receiver, [*EIGHT_PACKETS[:3], *EIGHT_PACKETS[4:], repair]) == []
     assert counters(receiver) == Counters(malformed=1)
     assert receiver._open == {}
-    assert receiver.push(REPAIRS[1], 0) == [EIGHT[3]]
+    assert receiver.push(REPAIRS[1], 0) == [EIGHT_PACKETS[3]]
 
 
 @pytest.mark.parametrize(
     "repair",
     [
-        with_bytes(REPAIRS[1], {1: 98}),
-        with_bytes(REPAIRS[1], {3: 101}),
-        with_bytes(REPAIRS[1], {9: 9}),
+        with_bytes(REPAIRS[1], {1: 98}),  # payload type of the media
+        with_bytes(REPAIRS[1], {3: 101}),  # first sequence number
+        with_bytes(REPAIRS[1], {9: 9}),  # number of the frame's packets
         with_payload(REPAIRS[1], REPAIRS[1].payload + b"\x00"),
-        with_bytes(REPAIRS[0], {20: REPAIRS[0].payload[20] ^ 1}),
+        with_bytes(REPAIRS[0], {20: REPAIRS[0].payload[20] ^ 1}),  # another P
     ],
 )
 def test_contradicting_repair_packets(repair: RtpPacket) -> None:
     """The second of two contradicting repair packets of a block is counted as malformed and dropped."""
     receiver = RepairReceiver()
-    assert push_all(receiver, [*EIGHT[:6], REPAIRS[0], repair]) == []
+    assert push_all(receiver, [*EIGHT_PACKETS[:6], REPAIRS[0], repair]) == []
     assert counters(receiver) == Counters(malformed=1)
-    assert receiver.push(REPAIRS[1], 0) == EIGHT[6:]
+    assert receiver.push(REPAIRS[1], 0) == EIGHT_PACKETS[6:]
 
 
 HEADERS = st.tuples(
@@ -307,10 +308,10 @@ HEADERS = st.tuples(
     st.integers(0, 2).map(lambda which: bytes([which])),
     st.binary(max_size=40),
 ).map(b"".join)
-"""Payloads that resemble those of repair packets for the packets of EIGHT."""
+"""Payloads that resemble those of repair packets for the packets of EIGHT_PACKETS."""
 
 
-@given(st.lists(st.one_of(st.binary(max_size=60), HEADERS, st.sampled_from(EIGHT)), max_size=30))
+@given(st.lists(st.one_of(st.binary(max_size=60), HEADERS, st.sampled_from(EIGHT_PACKETS)), max_size=30))
 def test_any_bytes(pushed: list[bytes | RtpPacket]) -> None:
     """No repair payload raises an error, and invalid ones are counted as malformed."""
     receiver = RepairReceiver()
@@ -364,7 +365,7 @@ def test_repair_packet_from_long_ago() -> None:
 def test_new_stream_gives_up_old_blocks() -> None:
     """When the media stream changes, the blocks of the previous stream are given up and its repair packets rejected."""
     receiver = RepairReceiver()
-    push_all(receiver, [*EIGHT[:6], REPAIRS[0]])
+    push_all(receiver, [*EIGHT_PACKETS[:6], REPAIRS[0]])
     # The sequence numbers and timestamp are the same: only the SSRC differs.
     other = frame((b"other" for _ in range(8)), ssrc=9)
     assert push_all(receiver, [*other[:6], other[7]]) == []
@@ -378,22 +379,22 @@ def test_same_numbers_of_another_frame() -> None:
     receiver = RepairReceiver()
     stale = frame((b"stale" for _ in range(8)), timestamp=1)
     later = frame((b"later" for _ in range(8)), timestamp=2)
-    assert push_all(receiver, [*stale, *EIGHT[:6], REPAIRS[0], later[7]]) == []
-    assert receiver.push(EIGHT[7], 0) == [EIGHT[6]]
+    assert push_all(receiver, [*stale, *EIGHT_PACKETS[:6], REPAIRS[0], later[7]]) == []
+    assert receiver.push(EIGHT_PACKETS[7], 0) == [EIGHT_PACKETS[6]]
 
 
 def test_same_numbers_of_another_stream() -> None:
     """Media packets of another SSRC with a block's sequence numbers and timestamp do not belong to it."""
     receiver = RepairReceiver()
     other = frame((b"other" for _ in range(8)), ssrc=9)
-    assert push_all(receiver, [*other, *EIGHT[:6], EIGHT[7], REPAIRS[0]]) == [EIGHT[6]]
+    assert push_all(receiver, [*other, *EIGHT_PACKETS[:6], EIGHT_PACKETS[7], REPAIRS[0]]) == [EIGHT_PACKETS[6]]
 
 
 def test_same_storage_index() -> None:
     """Media packets with the same storage index are not confused."""
     receiver = RepairReceiver()
     before = frame((b"before" for _ in range(8)), first=(100 - MAX_STORED_MEDIA) % 2**16)
-    assert push_all(receiver, [*before, *EIGHT[:6], EIGHT[7], REPAIRS[0]]) == [EIGHT[6]]
+    assert push_all(receiver, [*before, *EIGHT_PACKETS[:6], EIGHT_PACKETS[7], REPAIRS[0]]) == [EIGHT_PACKETS[6]]
 
 
 def test_access_unit_from_recovered_packets() -> None:
@@ -415,7 +416,7 @@ def test_access_unit_from_recovered_packets() -> None:
 
 
 @pytest.mark.parametrize(
-    ("notes", "now_s", "count"),
+    ("notes", "now_s", "count"),  # a note: lost packets, expected packets, time in s
     [
         ([], 0, 0),
         ([(0, 1000, 0)], 1, 0),

@@ -1,4 +1,4 @@
-"""Frames from the encoder to the stamp reader over a link that loses and reorders packets: what `complete` means."""
+"""Test what `complete` means, with frames from encoder to stamp reader over a link that loses and reorders packets."""
 
 from __future__ import annotations
 

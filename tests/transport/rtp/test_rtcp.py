@@ -208,13 +208,13 @@ INVALID_BEGINNINGS = (
     RECEIVER_REPORT[:-2],
     PICTURE_LOSS,
     DESCRIPTION,
-    "81c90000 81c90000",
-    "41" + RECEIVER_REPORT[2:],
+    "81c90000 81c90000",  # reports without an SSRC
+    "41" + RECEIVER_REPORT[2:],  # version 1
 )
 INVALID_ENDS = (
-    "81ce",
-    "81ca0005",
-    "41ce0000",
+    "81ce",  # half a header
+    "81ca0005",  # a header without its 5 words
+    "41ce0000",  # version 1
     "a1ca0000",  # padding without room for its own length
     "a1ca000100000000",  # padding of length 0
     "a1ca000100000003",  # padding that is not whole words
@@ -222,25 +222,25 @@ INVALID_ENDS = (
     "a1ca000100000004" + DESCRIPTION,  # padding before the last packet
 )
 INVALID_AT_THE_SENDER = (
-    "82" + RECEIVER_REPORT[2:],
-    "81c8000600000009" + "00" * 20,
-    "81ce000100000001",
-    "81ce0003000000010000000200000000",
-    "83cd0002 00000001 00000000",
-    "83cd0003 00000001 00000000 00000002",
-    "83cd0001 00000001",
-    "80cf0000",
-    "80cf0002 00000001 04000001",
-    "80cf0003 00000001 04000001 00000000",
-    "80cf0005 00000001 04000003 00000000 00000000 00000000",
+    "82" + RECEIVER_REPORT[2:],  # one report block instead of two
+    "81c8000600000009" + "00" * 20,  # a sender report without its report block
+    "81ce000100000001",  # a picture-loss indication without the SSRC of the media
+    "81ce0003000000010000000200000000",  # a picture-loss indication that is too long
+    "83cd0002 00000001 00000000",  # a bit rate limit without an entry
+    "83cd0003 00000001 00000000 00000002",  # with half an entry
+    "83cd0001 00000001",  # without the SSRC of the media
+    "80cf0000",  # an extended report without an SSRC
+    "80cf0002 00000001 04000001",  # a reference time without content
+    "80cf0003 00000001 04000001 00000000",  # of one word instead of two
+    "80cf0005 00000001 04000003 00000000 00000000 00000000",  # of three words
 )
 INVALID_AT_THE_RECEIVER = (
-    "80c8000500000009" + "00" * 16,
-    "81c8000600000009" + "00" * 20,
-    "80cf0000",
-    "80cf0002 00000009 05000003",
-    "80cf0003 00000009 05000001 00000001",
-    "80cf0006 00000009 05000004" + "00" * 16,
+    "80c8000500000009" + "00" * 16,  # a sender report that is too short
+    "81c8000600000009" + "00" * 20,  # a sender report without its report block
+    "80cf0000",  # an extended report without an SSRC
+    "80cf0002 00000009 05000003",  # an answer without content
+    "80cf0003 00000009 05000001 00000001",  # of one word instead of three
+    "80cf0006 00000009 05000004" + "00" * 16,  # of four words
 )
 
 

@@ -28,7 +28,7 @@ PACKETS = st.builds(
     marker=st.booleans(),
     payload=st.binary(max_size=100),
 )
-# NAL units as an encoder makes them: of a single NAL unit type, without start codes, without a zero at the end.
+# NAL units as an encoder makes them: of types 1 to 23, without start codes, and without a zero at the end.
 BODIES = st.binary(max_size=5000).map(lambda body: body.replace(b"\x00", b"\x07"))
 NAL_UNITS = st.builds(lambda kind, body: bytes([0x60 | kind]) + body + b"\x80", st.integers(1, 23), BODIES)
 
@@ -70,7 +70,7 @@ def test_header_as_in_the_rfc() -> None:
 
 
 def test_optional_parts_of_a_packet() -> None:
-    """Contributing sources, header extension and padding are not sent_packet of the payload."""
+    """Contributing sources, header extension and padding are not part of the payload."""
     fixed = bytes.fromhex("b2 60 0102 03040506 0708090a")
     sources, extension = b"c" * 8, bytes.fromhex("bede 0002") + b"e" * 8
     assert parse_packet(fixed + sources + extension + b"payload" + b"\x00\x00\x03").payload == b"payload"
@@ -81,13 +81,13 @@ def test_optional_parts_of_a_packet() -> None:
     "datagram",
     [
         "",
-        "80 60 0102 03040506 070809",
-        "40 60 0102 03040506 0708090a",
-        "82 60 0102 03040506 0708090a 00000000",
-        "90 60 0102 03040506 0708090a bede",
-        "90 60 0102 03040506 0708090a bede 0002 00000000",
-        "a0 60 0102 03040506 0708090a 0000",
-        "a0 60 0102 03040506 0708090a 0003",
+        "80 60 0102 03040506 070809",  # a header that is too short
+        "40 60 0102 03040506 0708090a",  # version 1
+        "82 60 0102 03040506 0708090a 00000000",  # one contributing source instead of two
+        "90 60 0102 03040506 0708090a bede",  # half the header of an extension
+        "90 60 0102 03040506 0708090a bede 0002 00000000",  # one word of an extension instead of two
+        "a0 60 0102 03040506 0708090a 0000",  # padding of length 0
+        "a0 60 0102 03040506 0708090a 0003",  # two bytes of padding instead of three
     ],
 )
 def test_invalid_rtp_is_rejected(datagram: str) -> None:

@@ -145,7 +145,7 @@ def test_an_altered_command_is_rejected(pair: Pair) -> None:
         altered = signed[:at] + bytes([signed[at] ^ 1]) + signed[at + 1 :]
         before_signature = at < len(signed) - 64
         assert not (before_signature and pair.vehicle.is_from_active_operator(altered))
-        in_mac = len(signed) - 80 <= at < len(signed) - 64
+        in_mac = len(signed) - TRAILER_BYTES <= at < len(signed) - 64
         assert (pair.vehicle.verify_command(altered) is None) != in_mac
 
 

@@ -66,9 +66,9 @@ class GatewayPair:
 
 @pytest.fixture
 def pair() -> GatewayPair:
-    made = GatewayPair()
-    made.acquire_control()
-    return made
+    new_pair = GatewayPair()
+    new_pair.acquire_control()
+    return new_pair
 
 
 def test_gateways_deliver_each_message_once_and_unchanged(pair: GatewayPair) -> None:
@@ -149,6 +149,7 @@ def test_a_forged_signature_does_not_displace_the_true_command(pair: GatewayPair
 
 def test_states_of_a_restarted_server_cause_one_request_a_second(pair: GatewayPair) -> None:
     """States of a restarted server are rejected until it has answered a request, which is sent once a second."""
+    # The first client now talks to a second server, which gets the keys of the first one as if it had restarted.
     restarted = GatewayPair()
     restarted.client, pair.client = pair.client, restarted.client
     restarted_vehicle, vehicle = vars(restarted.server._authenticator), vars(pair.server._authenticator)

@@ -14,6 +14,8 @@ from lavt.transport.video.h264 import Decoder, Encoder
 from lavt.transport.video.stamp import STAMP_PX, read_stamp, write_stamp
 
 WIDTH, HEIGHT = 320, 240
+GOP_FRAMES = 15
+"""Access unit 15 of the tests is therefore the second keyframe."""
 START_NS = 1_790_000_000_000_000_000
 FRAME_NS = 33_333_333
 
@@ -28,7 +30,7 @@ def moving_pictures(count: int) -> list[Picture]:
 
 
 def encoder(**changes: float) -> Encoder:
-    settings_of_encoder = {"rate_hz": 30, "bit_rate_bps": 1_000_000, "gop_frames": 15} | changes
+    settings_of_encoder = {"rate_hz": 30, "bit_rate_bps": 1_000_000, "gop_frames": GOP_FRAMES} | changes
     return Encoder(WIDTH, HEIGHT, **settings_of_encoder)  # type: ignore[arg-type]
 
 
@@ -98,7 +100,7 @@ def test_decoded_pictures_are_not_overwritten(pictures: list[Picture]) -> None:
 def test_keyframes(access_units: list[bytes]) -> None:
     """A keyframe comes every `gop_frames` frames and carries its parameter sets in band."""
     for number, access_unit in enumerate(access_units):
-        assert ({7, 8, 5} <= set(nal_types(access_unit))) == (number % 15 == 0)
+        assert ({7, 8, 5} <= set(nal_types(access_unit))) == (number % GOP_FRAMES == 0)
 
 
 def test_keyframe_on_request(pictures: list[Picture]) -> None:
@@ -135,7 +137,7 @@ def test_no_picture_before_a_keyframe(access_units: list[bytes]) -> None:
     """Access units before the first keyframe give no picture."""
     receiver = Decoder()
     assert [receiver.decode(unit) for unit in access_units[1:4]] == [None, None, None]
-    assert receiver.decode(access_units[15]) is not None
+    assert receiver.decode(access_units[GOP_FRAMES]) is not None
 
 
 def test_truncated_access_unit(access_units: list[bytes]) -> None:
@@ -149,13 +151,13 @@ def test_truncated_access_unit(access_units: list[bytes]) -> None:
 
 def test_keyframe_after_damage(access_units: list[bytes]) -> None:
     """A keyframe after a truncated picture decodes without any trace of the damage."""
-    clean = Decoder().decode(access_units[15])
+    clean = Decoder().decode(access_units[GOP_FRAMES])
     assert clean is not None
-    for kept_bytes in range(100, len(access_units[14]), 97):
+    for kept_bytes in range(100, len(access_units[GOP_FRAMES - 1]), 97):
         receiver = Decoder()
         receiver.decode(access_units[0])
-        receiver.decode(access_units[14][:kept_bytes])
-        decoded = receiver.decode(access_units[15])
+        receiver.decode(access_units[GOP_FRAMES - 1][:kept_bytes])
+        decoded = receiver.decode(access_units[GOP_FRAMES])
         assert decoded is not None
         assert np.array_equal(decoded.picture, clean.picture)
 
@@ -164,12 +166,12 @@ def test_lost_access_units(access_units: list[bytes]) -> None:
     """After two consecutive losses each access unit gives a picture; the next keyframe decodes to its own picture."""
     receiver = Decoder()
     receiver.decode(access_units[0])
-    for number in range(3, 15):
+    for number in range(3, GOP_FRAMES):
         decoded = receiver.decode(access_units[number])
         assert decoded is not None
-    decoded = receiver.decode(access_units[15])
+    decoded = receiver.decode(access_units[GOP_FRAMES])
     assert decoded is not None
-    assert read_stamp(decoded.luma) == START_NS + 15 * FRAME_NS
+    assert read_stamp(decoded.luma) == START_NS + GOP_FRAMES * FRAME_NS
 
 
 def test_sender_restarts_with_another_size(access_units: list[bytes]) -> None:
@@ -189,16 +191,16 @@ def test_any_bytes(access_units: list[bytes], data: bytes, start_code: bool) -> 
     receiver = Decoder()
     receiver.decode(access_units[0])
     receiver.decode(b"\x00\x00\x00\x01" * start_code + data)
-    decoded = receiver.decode(access_units[15])
+    decoded = receiver.decode(access_units[GOP_FRAMES])
     assert decoded is not None
-    assert read_stamp(decoded.luma) == START_NS + 15 * FRAME_NS
+    assert read_stamp(decoded.luma) == START_NS + GOP_FRAMES * FRAME_NS
 
 
 @settings(max_examples=40)
 @given(st.lists(st.tuples(st.integers(0, 14), st.integers(0, 10**6), st.integers(1, 255)), min_size=1, max_size=12))
 def test_damage_is_deterministic(access_units: list[bytes], damage: list[tuple[int, int, int]]) -> None:
     """Decoding a damaged stream is reproducible: concealment does not depend on uninitialized memory."""
-    units = [bytearray(unit) for unit in access_units[:15]]
+    units = [bytearray(unit) for unit in access_units[:GOP_FRAMES]]
     for number, at, flip in damage:
         units[number][at % len(units[number])] ^= flip
     first, second = Decoder(), Decoder()

@@ -137,7 +137,7 @@ def test_answer_from_another_address(address: tuple[str, int]) -> None:
 
 
 def test_third_party() -> None:
-    """A peer with the token cannot open the path to an address with an answer to another address's challenge."""
+    """A peer that has the token cannot open the path to another address by answering a challenge to its own."""
     server = new_server()
     answer = answer_for(server, ELSEWHERE)
     server.receive(answer, HOME, T0)
@@ -222,7 +222,7 @@ def test_report_from_elsewhere() -> None:
 
 
 def test_forged_and_old_challenges_are_not_answered() -> None:
-    """The client answers a challenge only if its MAC is valid, and if it is the first to its hello or a later one."""
+    """The client answers a challenge only if its MAC is valid and it has answered none to this hello or a later one."""
     server, client = new_server(), PathClient(TOKEN)
     challenge = server.receive(client.hello(T0), HOME, T0)
     hello = client.hello(T0 + 1)
@@ -251,7 +251,7 @@ def test_a_challenge_to_a_hello_that_was_not_sent_is_not_answered() -> None:
 
 
 def test_replayed_hello() -> None:
-    """A hello gets one challenge; older ones get none from any address, and the newest one from a second address."""
+    """The newest hello gets one challenge at each of two addresses; older hellos get none."""
     server, client = new_server(), PathClient(TOKEN)
     old, new = client.hello(T0), client.hello(T0)
     assert server.receive(new, ELSEWHERE, T0) is not None

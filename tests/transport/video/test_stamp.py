@@ -155,7 +155,7 @@ def test_clear_stamp() -> None:
 
 
 def test_rtp_timestamp() -> None:
-    """The RTP timestamp counts 90 kHz ticks of the stamp and wraps at 32 bits."""
+    """The RTP timestamp is the stamp in units of 1/90000 s, and wraps at 32 bits."""
     assert rtp_timestamp(1_000_000_000) == 90_000
     assert rtp_timestamp(11_111) == 0
     assert rtp_timestamp(11_112) == 1
@@ -171,7 +171,7 @@ def test_agreement(stamp_ns: int, bit: int) -> None:
 
 
 def off_ns(read_ns: int, true_ns: int) -> float:
-    """Return the error of a stamp, modulo the wrap of the RTP timestamp (2^32 ticks, 13.3 h)."""
+    """Return the error of a stamp, modulo the wrap of the RTP timestamp (after 2^32 units of 1/90000 s, 13.3 h)."""
     ninths = abs(read_ns - true_ns) * 9 % (2**32 * 100_000)
     return min(ninths, 2**32 * 100_000 - ninths) / 9
 

@@ -1,3 +1,5 @@
+"""Test how the stamps of a foreign sender are checked, whose RTP timestamps begin at an unknown value (the base)."""
+
 from __future__ import annotations
 
 from itertools import pairwise
@@ -14,7 +16,7 @@ from lavt.transport.video.stamp_check import JUMP_NS, LEARNED_AFTER, RELEARN_AFT
 
 START_NS = 1_760_000_000_123_456_789
 FRAME_NS = NS_PER_S // 30
-TICKS = st.integers(min_value=0, max_value=2**32 - 1)
+TIMESTAMPS = st.integers(min_value=0, max_value=2**32 - 1)
 STAMPS = st.integers(min_value=0, max_value=2**64 - 1)
 
 
@@ -24,8 +26,8 @@ def sent_pairs(
     """Return stamps and RTP timestamps of a sender that stamps each picture up to `jitter_ns` after its capture."""
     late_ns = stream(1, "stamped late").integers(0, jitter_ns + 1, count).tolist()
     captured_ns = [begin_ns + number * FRAME_NS for number in range(count)]
-    ticks = [(base + round((ns - begin_ns) * (1 + drift) * 9 / 100_000)) % 2**32 for ns in captured_ns]
-    return [(ns + late, tick) for ns, late, tick in zip(captured_ns, late_ns, ticks, strict=True)]
+    timestamps = [(base + round((ns - begin_ns) * (1 + drift) * 9 / 100_000)) % 2**32 for ns in captured_ns]
+    return [(ns + late, timestamp) for ns, late, timestamp in zip(captured_ns, late_ns, timestamps, strict=True)]
 
 
 def learned_check(base: int = 0) -> tuple[LearnedBase, int, int]:
@@ -36,7 +38,7 @@ def learned_check(base: int = 0) -> tuple[LearnedBase, int, int]:
     return check, *pairs[-1]
 
 
-@given(TICKS)
+@given(TIMESTAMPS)
 def test_every_stamp_of_a_steady_sender_is_accepted(base: int) -> None:
     """All stamps are accepted from the fifth one on, for any base and across the wrap of 2^32."""
     check = LearnedBase()
@@ -51,12 +53,12 @@ def test_the_wrap_of_the_timestamps() -> None:
     assert check.agrees(stamp_ns + 2 * FRAME_NS, 3000)
 
 
-@given(STAMPS, TICKS)
+@given(STAMPS, TIMESTAMPS)
 def test_garbage(stamp_ns: int, timestamp: int) -> None:
     """After learning, a stamp is accepted only if it is newer than the last and within 5 ms of its timestamp's time."""
     check, last_ns, last_timestamp = learned_check(77)
-    ticks = (timestamp - last_timestamp + 2**31) % 2**32 - 2**31
-    expected_ns = last_ns + ticks * 100_000 // 9
+    difference = (timestamp - last_timestamp + 2**31) % 2**32 - 2**31
+    expected_ns = last_ns + difference * 100_000 // 9
     near = abs(stamp_ns - expected_ns) <= TOLERANCE_NS and stamp_ns > last_ns
     assert check.agrees(stamp_ns, timestamp) == near
 
@@ -116,7 +118,8 @@ def test_jitter_beyond_the_tolerance() -> None:
     """No base is learned from stamps with a jitter of tens of milliseconds."""
     check = LearnedBase()
     pairs = [
-        (stamp_ns + (number % 3) * 40 * NS_PER_MS, tick) for number, (stamp_ns, tick) in enumerate(sent_pairs(300))
+        (stamp_ns + (number % 3) * 40 * NS_PER_MS, timestamp)
+        for number, (stamp_ns, timestamp) in enumerate(sent_pairs(300))
     ]
     assert not any(check.agrees(*pair) for pair in pairs)
 
@@ -142,8 +145,8 @@ def test_a_sender_that_paused() -> None:
     """After a pause of more than a minute in which the clocks diverged, the base is learned again from five stamps."""
     check, last_ns, last_timestamp = learned_check(1000)
     begin_ns = last_ns + JUMP_NS + NS_PER_S
-    ticks = last_timestamp + rtp_timestamp(JUMP_NS + NS_PER_S + 2 * TOLERANCE_NS)
-    accepted = [check.agrees(*pair) for pair in sent_pairs(10, ticks, begin_ns)]
+    new_base = last_timestamp + rtp_timestamp(JUMP_NS + NS_PER_S + 2 * TOLERANCE_NS)
+    accepted = [check.agrees(*pair) for pair in sent_pairs(10, new_base, begin_ns)]
     assert accepted == [False] * (LEARNED_AFTER - 1) + [True] * (11 - LEARNED_AFTER)
 
 
@@ -168,7 +171,7 @@ def test_a_step_of_the_senders_clock() -> None:
         assert all(accepted[first:])
 
 
-@given(st.lists(st.tuples(STAMPS, TICKS), max_size=30))
+@given(st.lists(st.tuples(STAMPS, TIMESTAMPS), max_size=30))
 def test_any_stamps(pairs: list[tuple[int, int]]) -> None:
     """No stamps and timestamps raise an error, and none is accepted before the fifth stamp."""
     check = LearnedBase()

@@ -13,10 +13,10 @@ from lavt.transport.video.stamp import rtp_timestamp
 from lavt.transport.video.stream_sender import StreamSender
 
 UNIT = b"\x00\x00\x00\x01\x65" + bytes([9] * 5000)
-SSRC, OTHER = 5, 6
+SSRC, OTHER_SSRC = 5, 6
 
 
-def stream(repair_packets: int | None = None) -> StreamSender:
+def new_sender(repair_packets: int | None = None) -> StreamSender:
     return StreamSender(Packetizer(SSRC, 65_000), RepairSender(7, 0), repair_packets)
 
 
@@ -31,7 +31,7 @@ def report_loss(sender: StreamSender, highest: int, lost: int, at_ns: int, ssrc:
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_a_fixed_number_of_repair_packets(count: int) -> None:
     """A configured number of repair packets does not depend on the reported loss."""
-    sender = stream(count)
+    sender = new_sender(count)
     report_loss(sender, 100, 0, 0)
     report_loss(sender, 200, 50, 1)
     assert count_repairs(sender, 2) == count
@@ -39,7 +39,7 @@ def test_a_fixed_number_of_repair_packets(count: int) -> None:
 
 def test_repair_packets_by_the_reported_loss() -> None:
     """A block gets no repair packet without loss, one after a loss, two during heavy loss, and none 30 s after it."""
-    sender = stream()
+    sender = new_sender()
     report_loss(sender, 10_000, 0, 0)
     assert count_repairs(sender, 1) == 0
     report_loss(sender, 10_300, 1, NS_PER_S)
@@ -52,11 +52,11 @@ def test_repair_packets_by_the_reported_loss() -> None:
 
 def test_losses_are_those_between_two_reports() -> None:
     """Losses before the first report, of another stream or in an old report are ignored; a wrap is not a loss."""
-    sender = stream()
+    sender = new_sender()
     report_loss(sender, 2**32 - 100, 5000, 0)
     assert count_repairs(sender, 1) == 0, "before the first report"
     report_loss(sender, 50, 5000, 2)
-    report_loss(sender, 1000, 7000, 3, ssrc=OTHER)
+    report_loss(sender, 1000, 7000, 3, ssrc=OTHER_SSRC)
     report_loss(sender, 20, 9000, 4)
     assert count_repairs(sender, 5) == 0, "no loss after a wrap, another stream, an old report"
     report_loss(sender, 150, 5001, 6)
@@ -65,7 +65,7 @@ def test_losses_are_those_between_two_reports() -> None:
 
 def test_forget_receiver_resets_the_feedback() -> None:
     """Losses and the bit rate limit of a receiver are discarded when another one begins."""
-    sender = stream()
+    sender = new_sender()
     report_loss(sender, 100, 0, 0)
     report_loss(sender, 200, 50, 1)
     sender.receive_feedback(Feedback(limits=(BitRateLimit(SSRC, 10**6, 0),)), at(1).mono_ns)
@@ -77,8 +77,8 @@ def test_forget_receiver_resets_the_feedback() -> None:
 
 def test_a_limit_applies_to_this_stream_and_to_its_payload() -> None:
     """A limit of another stream is ignored; the headers that a limit includes are subtracted."""
-    sender = stream()
-    sender.receive_feedback(Feedback(limits=(BitRateLimit(OTHER, 10**6, 0),)), 0)
+    sender = new_sender()
+    sender.receive_feedback(Feedback(limits=(BitRateLimit(OTHER_SSRC, 10**6, 0),)), 0)
     assert sender.bit_rate_limit_bps is None
     limit_bps, overhead_bytes, payload_bytes = 10**6, 40, MAX_PACKET_BYTES - RTP_HEADER_BYTES
     sender.receive_feedback(Feedback(limits=(BitRateLimit(SSRC, limit_bps, overhead_bytes),)), 0)
@@ -87,12 +87,12 @@ def test_a_limit_applies_to_this_stream_and_to_its_payload() -> None:
 
 def test_the_first_frame_has_a_report() -> None:
     """A sender report is due with the first frame, even if the monotonic clock is at 0."""
-    assert len(stream().packets(UNIT, 0, Now(0, 0)).report) == 1
+    assert len(new_sender().packets(UNIT, 0, Now(0, 0)).report) == 1
 
 
 def test_sender_reports() -> None:
     """A sender report every 500 ms counts the packets sent until then and answers the last reference time once."""
-    sender = stream()
+    sender = new_sender()
     requested_ns = 7 * NS_PER_S
     sender.receive_feedback(
         Feedback(reference_times=(ReferenceTime(9, ntp_to_short(elapsed_to_ntp(requested_ns))),)), at(0).mono_ns

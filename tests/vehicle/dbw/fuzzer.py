@@ -28,16 +28,30 @@ from lavt.vehicle.software_car.kit import Kit
 from lavt.vehicle.software_car.state import Gear
 from lavt.vehicle.vehicle import Capabilities
 
-CAPABILITIES = Capabilities(True, False, True, False, 2.8, 0.5, 0.5, 3.0, 8.0)
+CAPABILITIES = Capabilities(
+    simulated=True,
+    virtual_time=False,
+    ground_truth=True,
+    reset=False,
+    wheelbase_m=2.8,
+    max_steering_rad=0.5,
+    max_steering_rate_radps=0.5,
+    max_acceleration_mps2=3.0,
+    max_braking_mps2=8.0,
+)
 KIT_STEP_NS = 5 * NS_PER_MS
 EPISODE_NS = 4 * NS_PER_S
 IDLE_NS = 300 * NS_PER_MS
+"""An episode ends early if the adapter is idle this long after driving is no longer wanted."""
 MAX_AWAITED = 64
 DRAWS = 1_000_000
+"""Resolution of the probabilities."""
 STEPS_MS = (1, 4, 4, 5, 10, 10, 20, 20)
 STALLS_MS = (*range(57, 64), *range(95, 106), 130, 250, 400, 1000)
+"""Stalls mostly around the limits of 60 ms (age of a command) and 100 ms (the kit's timeout)."""
 Kind = Literal["lose", "flip", "forge", "repeat", "garbage", "command"]
 KINDS: tuple[Kind, ...] = ("lose", "flip", "forge", "repeat", "garbage", "command")
+"""What can happen to a report; `command` adds a command of another sender."""
 
 
 def settled_states(state: State, now: Situation) -> list[tuple[State, str]]:
@@ -164,9 +178,10 @@ class Fuzzer:
         self._kinds: list[Kind] = []
         self._hostility = self._wire_loss = self._stall_probability = self._action_probability = 0.0
         self._turned_rad: float | None = None
-        """The driver has turned the wheels."""
+        """The angle to which the driver has turned the road wheels, if any."""
         self._lost_identifier = 0
-        self._hostile_ns = self._unwanted_ns = self._episode_ns = START_NS
+        self._hostile_ns = self._unwanted_ns = self._episode_end_ns = START_NS
+        """When the bus becomes hostile, when driving is no longer wanted, and when the episode ends."""
         self._actuation = Actuation(0.0, 0.0, 1.0)
         messages = self._profile.codec.messages
         self._used_bits = {
@@ -182,7 +197,7 @@ class Fuzzer:
         """Advance by one tick, and check everything."""
         chance = self._chance
         is_over = self._adapter._state == "idle" and self._now_ns >= self._unwanted_ns + IDLE_NS
-        if is_over or self._now_ns >= self._episode_ns:
+        if is_over or self._now_ns >= self._episode_end_ns:
             self._begin_episode()
         is_hostile = self._now_ns >= self._hostile_ns
         is_transient = self._adapter._state in {"clearing", "enabling", "parking"}
@@ -233,7 +248,7 @@ class Fuzzer:
         kit.driver_brakes(0.5, self._now_ns)
         kit.driver_brakes(0.0, self._now_ns)
         self._unwanted_ns = self._hostile_ns = self._now_ns
-        self._episode_ns = self._now_ns + EPISODE_NS
+        self._episode_end_ns = self._now_ns + EPISODE_NS
         for _ in range(30):  # not wanted, and honest: the adapter becomes idle
             self._run_car(20 * NS_PER_MS, is_hostile=False)
             self._vehicle.engage(False, self._now_ns)
@@ -293,8 +308,8 @@ class Fuzzer:
         if kind == "garbage":
             identifier = chance.choice((chance.below(0x800), frame.identifier))
             return [frame, CanFrame(identifier, chance.bytes(chance.below(9)), is_drawn(chance, 0.1))]
-        facts = self._profile.codec.messages[chance.choice(self._commands)]
-        return [frame, CanFrame(facts.identifier, bytes(facts.length))] if is_drawn(chance, 0.05) else [frame]
+        command = self._profile.codec.messages[chance.choice(self._commands)]
+        return [frame, CanFrame(command.identifier, bytes(command.length))] if is_drawn(chance, 0.05) else [frame]
 
     def _used_bit(self, frame: CanFrame) -> int:
         """Return a bit of a value that the adapter uses, or bit 0."""

@@ -14,19 +14,19 @@ from lavt.vehicle.vehicle import ReachedCommand
 
 COMMAND, REPORT = 0x064, 0x065
 FIRST_RAD, SECOND_RAD = 0.012, 0.014
-OTHER = bytes([0x77, 0x01])
+UNSENT_COMMAND = bytes([0x77, 0x01])
 """A command that is never sent."""
 
 
 class ChosenReports:
-    """A car whose steering reports contain the command that was chosen last, at first the one before the test."""
+    """A car whose steering reports contain the newest argument of `choose`, at first the command before the test."""
 
     def __init__(self, rig: AdapterRig) -> None:
         self.rig = rig
         self._data, self._command = b"", b""
         rig.lose_report = self._replace
         rig.run_ms(500)
-        self.before = self._command = self._data[2:4]
+        self.initial_command = self._command = self._data[2:4]
         rig.adapter.take_reached()
 
     def _replace(self, frame: CanFrame) -> bool:
@@ -65,7 +65,7 @@ class ChosenReports:
 
 @pytest.mark.parametrize(("age_ms", "is_known"), [(0, True), (180, True), (200, True), (220, False), (500, False)])
 def test_a_command_that_is_not_reported_is_forgotten(age_ms: int, is_known: bool) -> None:
-    """A command is reached if it is reported within 200 ms; later reports of it are ignored, also if it is repeated."""
+    """A command is reached if it is reported within 200 ms; later reports are ignored, although it is still sent."""
     car = ChosenReports(driving_rig(1))
     requested_ns, command = car.steer(FIRST_RAD)
     car.rig.run_ms(age_ms)
@@ -121,7 +121,7 @@ def test_a_command_that_was_not_sent_is_ignored() -> None:
     """A report of a command that was not sent reaches nothing, and commands that were sent are still awaited."""
     car = ChosenReports(driving_rig(1))
     requested_ns, command = car.steer(FIRST_RAD)
-    assert car.choose(OTHER) == []
+    assert car.choose(UNSENT_COMMAND) == []
     assert car.choose(command) == [ReachedCommand(requested_ns, car.rig.now_ns)]
 
 
@@ -132,7 +132,7 @@ def test_a_repeated_command_is_reached_once() -> None:
     car.rig.run_ms(100)
     assert [reached.applied_ns for reached in car.choose(command)] == [requested_ns]
     car.rig.run_ms(100)
-    assert car.choose(car.before) == []
+    assert car.choose(car.initial_command) == []
     car.rig.run_ms(100)
     assert car.choose(command) == []
 
@@ -159,10 +159,10 @@ def test_the_first_command_is_awaited_if_it_differs() -> None:
     """The first command, which has the reported angle, is awaited only if the kit reports another command."""
     car = ChosenReports(stationary_rig(1))
     enable(car)
-    assert car.choose(OTHER) == []
-    assert car.choose(car.before) == []
+    assert car.choose(UNSENT_COMMAND) == []
+    assert car.choose(car.initial_command) == []
     car.rig.adapter.engage(False, car.rig.now_ns)
     car.rig.run_until(lambda rig: rig.state == "idle")
-    assert car.choose(OTHER) == []
+    assert car.choose(UNSENT_COMMAND) == []
     enable(car)
-    assert len(car.choose(car.before)) == 1
+    assert len(car.choose(car.initial_command)) == 1

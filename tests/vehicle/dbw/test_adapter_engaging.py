@@ -30,7 +30,7 @@ from lavt.vehicle.dbw.states import TABLE
 from lavt.vehicle.sim.simulator import Simulator
 from lavt.vehicle.software_car.state import AXES, Gear
 
-ALL = set(AXES)
+ALL_AXES = set(AXES)
 CLEARING_MS = 120
 """Time in the state `clearing`."""
 SET_MS = 20
@@ -44,8 +44,8 @@ steering reports, and a step of the rig."""
 
 def names(rig: AdapterRig) -> list[str]:
     """Return the DBC's names of the messages that were sent."""
-    known = {facts.identifier: name for name, facts in rig.profile.codec.messages.items()}
-    return [known[frame.identifier] for _, frame in rig.sent]
+    names_by_identifier = {message.identifier: name for name, message in rig.profile.codec.messages.items()}
+    return [names_by_identifier[frame.identifier] for _, frame in rig.sent]
 
 
 @both_generations
@@ -74,7 +74,7 @@ def test_engaging(generation: int) -> None:
     rig.adapter.engage(True, rig.now_ns)
     passed_ms = rig.run_until(lambda rig: rig.state == "engaged")
     assert passed_ms <= CLEARING_MS + PEDAL_REPORT_MS + SET_MS + GEAR_REPORT_MS
-    assert rig.enabled() == ALL
+    assert rig.enabled() == ALL_AXES
     assert rig.kit.state.gear == Gear.DRIVE
     assert rig.adapter.state().is_engaged
     rig.run_ms(20)
@@ -183,9 +183,9 @@ def test_parking(generation: int) -> None:
     rig.run_ms(100)
     assert rig.kit.state.throttle == 0.0
     assert rig.kit.state.brake == pytest.approx(rig.profile.limits.holding_brake, abs=1e-3)
-    assert rig.enabled() == ALL
+    assert rig.enabled() == ALL_AXES
     rig.run_until(lambda rig: rig.kit.state.gear == Gear.PARK, 10_000)
-    assert rig.enabled() == ALL
+    assert rig.enabled() == ALL_AXES
     rig.run_until(lambda rig: rig.state == "idle")
     assert rig.enabled() == set()
     assert rig.kit.state.watchdog_reason == 0
@@ -219,7 +219,7 @@ def test_a_parked_car_can_be_engaged_again(generation: int) -> None:
     rig.adapter.engage(False, rig.now_ns)
     rig.run_until(lambda rig: rig.state == "idle", 20_000, step_ms=COARSE_MS)
     rig.engage()
-    assert rig.enabled() == ALL
+    assert rig.enabled() == ALL_AXES
 
 
 @both_generations
@@ -259,8 +259,8 @@ def test_an_inhibited_installation_is_not_engaged() -> None:
 
 def test_an_unknown_steering_sign_inhibits() -> None:
     """A car whose steering sign is not known is not engaged."""
-    known = profile("dataspeed_gen1")
-    rig = AdapterRig(1, profile=replace(known, car=replace(known.car, steering_sign=None)))
+    base_profile = profile("dataspeed_gen1")
+    rig = AdapterRig(1, profile=replace(base_profile, car=replace(base_profile.car, steering_sign=None)))
     rig.adapter.engage(True, rig.now_ns)
     rig.run_ms(1000)
     assert rig.sent == []
@@ -270,8 +270,8 @@ def test_an_unknown_steering_sign_inhibits() -> None:
 @both_generations
 def test_negative_steering_sign(generation: int) -> None:
     """With the negative steering sign, sent and reported angles are inverted."""
-    known = profile(f"dataspeed_gen{generation}")
-    rig = driving_rig(generation, profile=replace(known, car=replace(known.car, steering_sign=-1)))
+    base_profile = profile(f"dataspeed_gen{generation}")
+    rig = driving_rig(generation, profile=replace(base_profile, car=replace(base_profile.car, steering_sign=-1)))
     rig.actuation = Actuation(0.05, 0.1, 0.0)
     rig.run_ms(1000)
     assert rig.simulator.state().steering_rad == pytest.approx(-0.05, abs=1e-3)

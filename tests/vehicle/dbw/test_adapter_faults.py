@@ -174,11 +174,11 @@ FOREIGN_COMMANDS = {
 
 
 @both_generations
-@pytest.mark.parametrize("which", [0, 1, 2])
-def test_foreign_commands_prevent_engaging(generation: int, which: int) -> None:
+@pytest.mark.parametrize("command_index", [0, 1, 2])
+def test_foreign_commands_prevent_engaging(generation: int, command_index: int) -> None:
     """A kit is not engaged until 1 s after the last command of another sender: a server may still be stopping it."""
     rig = stationary_rig(generation)
-    rig.adapter.receive(FOREIGN_COMMANDS[generation][which], rig.now_ns)
+    rig.adapter.receive(FOREIGN_COMMANDS[generation][command_index], rig.now_ns)
     rig.adapter.engage(True, rig.now_ns)
     rig.run_ms(999)
     assert (rig.state, rig.sent) == ("idle", [])
@@ -215,7 +215,7 @@ HANDS_OFF: dict[str, Callable[[AdapterRig], None]] = {
     "throttle": lambda rig: rig.kit.driver_throttles(0.0, rig.now_ns),
     "gear": lambda _: None,
 }
-TEXTS = {
+OVERRIDE_TEXTS = {
     "steering": "the driver steers",
     "brake": "the driver brakes",
     "throttle": "the driver presses the throttle",
@@ -241,14 +241,14 @@ def test_override(generation: int, part: str) -> None:
     state = rig.adapter.state()
     assert (state.is_overridden, state.is_engaged) == (True, False)
     assert "override by the driver" in state.inhibit_reason
-    assert any(TEXTS[part] in event.detail for event in rig.events)
+    assert any(OVERRIDE_TEXTS[part] in event.detail for event in rig.events)
     assert rig.kit.state.watchdog_reason == 0
 
 
 @both_generations
 @pytest.mark.parametrize("part", OVERRIDES)
 def test_override_is_latched(generation: int, part: str) -> None:
-    """An override persists until the stationary car is disengaged, and its latch until the CLEAR that follows."""
+    """The adapter's override lasts until the stationary car is disengaged, the kit's until the CLEAR that follows."""
     rig = driving_rig(generation)
     OVERRIDES[part](rig)
     rig.run_until(lambda rig: rig.state == "overridden")
@@ -550,9 +550,9 @@ def test_kit_not_ready(name: str, text: str) -> None:
 @both_generations
 def test_drive_rejected(generation: int) -> None:
     """A rejected gear is reported with the kit's reason after 3 s, and the car is disengaged in PARK."""
-    known = profile(f"dataspeed_gen{generation}")
-    gear = replace(known.gear, codes={**known.gear.codes, "drive": 5})
-    rig = AdapterRig(generation, profile=replace(known, gear=gear))
+    base_profile = profile(f"dataspeed_gen{generation}")
+    gear = replace(base_profile.gear, codes={**base_profile.gear.codes, "drive": 5})
+    rig = AdapterRig(generation, profile=replace(base_profile, gear=gear))
     rig.adapter.engage(True, rig.now_ns)
     took_ms = rig.run_until(is_lost)
     assert 3120 <= took_ms <= 3160
@@ -569,8 +569,10 @@ def test_drive_rejected(generation: int) -> None:
 
 def test_a_shift_in_progress_is_awaited() -> None:
     """If DRIVE was requested but not reported, the axes stay enabled for 1 s before the car is disengaged in PARK."""
-    known = profile("dataspeed_gen1")
-    rig = AdapterRig(1, profile=replace(known, gear=replace(known.gear, codes={**known.gear.codes, "drive": 5})))
+    base_profile = profile("dataspeed_gen1")
+    rig = AdapterRig(
+        1, profile=replace(base_profile, gear=replace(base_profile.gear, codes={**base_profile.gear.codes, "drive": 5}))
+    )
     rig.adapter.engage(True, rig.now_ns)
     rig.run_until(lambda rig: rig.state == "enabling" and rig.adapter._is_shifting)
     rig.adapter.engage(False, rig.now_ns)
@@ -600,8 +602,10 @@ def test_park_rejected() -> None:
 
 def without_park() -> AdapterRig:
     """Return a stationary car whose kit rejects the number that the profile has for PARK."""
-    known = profile("dataspeed_gen1")
-    rig = AdapterRig(1, profile=replace(known, gear=replace(known.gear, codes={**known.gear.codes, "park": 5})))
+    base_profile = profile("dataspeed_gen1")
+    rig = AdapterRig(
+        1, profile=replace(base_profile, gear=replace(base_profile.gear, codes={**base_profile.gear.codes, "park": 5}))
+    )
     rig.engage()
     return rig
 

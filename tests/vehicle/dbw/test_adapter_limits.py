@@ -26,7 +26,15 @@ from lavt.vehicle.dbw.profile import LEAST_GAP_NS, REPEAT_PERIOD_NS, TICK_LIMIT_
 from lavt.vehicle.dbw.sending import DriveCommand, apply_limits
 from lavt.vehicle.sim.dynamics import LINCOLN_MKZ
 
-LIMITS = ByWireLimits(400.0, 300.0, 0.6, 0.8, 2.0, 5.0, 0.3)
+LIMITS = ByWireLimits(
+    steering_wheel_deg=400.0,
+    steering_wheel_rate_degps=300.0,
+    throttle=0.6,
+    brake=0.8,
+    throttle_rate_per_s=2.0,
+    brake_rate_per_s=5.0,
+    holding_brake=0.3,
+)
 STEERING = {1: 0x064, 2: 0x200}
 
 
@@ -113,8 +121,8 @@ def test_rate_of_the_kit() -> None:
 @both_generations
 def test_pedals(generation: int) -> None:
     """Pedals are pressed no further and no faster than the limits, and released at once."""
-    known = with_limits(generation, throttle=0.4, brake=0.5, throttle_rate_per_s=1.0, brake_rate_per_s=2.0)
-    rig = driving_rig(generation, profile=known)
+    limited_profile = with_limits(generation, throttle=0.4, brake=0.5, throttle_rate_per_s=1.0, brake_rate_per_s=2.0)
+    rig = driving_rig(generation, profile=limited_profile)
     rig.actuation = Actuation(0.0, 1.0, 0.0)
     rig.run_ms(1000)
     assert rig.kit.state.throttle == pytest.approx(0.4, abs=1e-3)
@@ -124,7 +132,7 @@ def test_pedals(generation: int) -> None:
     assert rig.moments[25].wheels.throttle == 0.0
     assert rig.moments[-1].wheels.brake == pytest.approx(0.5, abs=1e-3)
     rising = [moment.wheels.brake for moment in rig.moments]
-    assert rising[150] <= 2.0 * 0.151 + 2.0 * 0.02
+    assert rising[150] <= 2.0 * 0.151 + 2.0 * 0.02, "at 2 per s, in 0.151 s and one more set of frames"
     rig.actuation = Actuation(0.0, 0.0, 0.0)
     rig.run_ms(25)
     assert rig.kit.state.brake == 0.0
@@ -147,7 +155,7 @@ def test_steering_starts_at_the_reported_angle(generation: int) -> None:
     rig.sent = [(at_ns, frame) for at_ns, frame in rig.sent if at_ns == rig.now_ns]
     first_deg = angles_deg(rig)[0][1]
     wheel_deg = math.degrees(0.2 * 14.8)
-    assert abs(first_deg - wheel_deg) <= 452 * 0.06 + 0.1
+    assert abs(first_deg - wheel_deg) <= 452 * 0.06 + 0.1, "60 ms at 452 deg/s, and a step of 0.1 deg"
 
 
 any_number = st.floats(allow_nan=False, allow_infinity=False)
@@ -189,12 +197,14 @@ def test_one_pedal(generation: int) -> None:
 @pytest.mark.parametrize("name", ["dataspeed_gen1", "dataspeed_gen2"])
 def test_limits_are_the_simulators(name: str) -> None:
     """With the shipped profiles the software car has the simulator's dimensions, angles and pedals."""
-    known = profile(name)
-    assert known.car.wheelbase_m == LINCOLN_MKZ.wheelbase_m
-    assert known.car.max_braking_mps2 == LINCOLN_MKZ.max_braking_mps2
-    assert known.car.max_acceleration_mps2 == LINCOLN_MKZ.max_acceleration_mps2
-    assert known.road_rad(known.limits.steering_wheel_deg) == pytest.approx(LINCOLN_MKZ.max_steering_rad, abs=1e-3)
-    rate_radps = known.road_rad(known.limits.steering_wheel_rate_degps)
+    shipped_profile = profile(name)
+    assert shipped_profile.car.wheelbase_m == LINCOLN_MKZ.wheelbase_m
+    assert shipped_profile.car.max_braking_mps2 == LINCOLN_MKZ.max_braking_mps2
+    assert shipped_profile.car.max_acceleration_mps2 == LINCOLN_MKZ.max_acceleration_mps2
+    assert shipped_profile.road_rad(shipped_profile.limits.steering_wheel_deg) == pytest.approx(
+        LINCOLN_MKZ.max_steering_rad, abs=1e-3
+    )
+    rate_radps = shipped_profile.road_rad(shipped_profile.limits.steering_wheel_rate_degps)
     assert rate_radps == pytest.approx(LINCOLN_MKZ.max_steering_rate_radps, abs=2e-3)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import cache
 
 import pytest
@@ -33,15 +34,15 @@ def order_of(name: str, frame: CanFrame) -> AxisOrder:
 @given(data=st.data())
 def test_all_commands_are_understood(name: str, data: st.DataObject) -> None:
     """The kit parses every command within the limits as it was sent, to half a step, valid and enabling."""
-    known, sender = profile(name), FrameSender(profile(name), START_NS)
+    base_profile, sender = profile(name), FrameSender(profile(name), START_NS)
     axis = data.draw(st.sampled_from(AXES))
-    sender._frame_counts[known.axes[axis].message] = data.draw(st.integers(0, 1000))
+    sender._frame_counts[base_profile.axes[axis].message] = data.draw(st.integers(0, 1000))
     if axis == "steering":
-        most = known.limits.steering_wheel_deg
+        most = base_profile.limits.steering_wheel_deg
         angle_deg = data.draw(st.floats(-most, most))
         order = order_of(name, sender.axis_frame(axis, angle_deg, is_enabled=True))
-        assert order.target * 57.29577951308232 == pytest.approx(angle_deg, abs=0.05 + 1e-9)
-        assert order.rate_radps * 57.29577951308232 == pytest.approx(452.0)
+        assert math.degrees(order.target) == pytest.approx(angle_deg, abs=0.05 + 1e-9)
+        assert math.degrees(order.rate_radps) == pytest.approx(452.0)
     else:
         fraction = data.draw(st.floats(0, 1))
         order = order_of(name, sender.axis_frame(axis, fraction, is_enabled=True))
@@ -59,16 +60,16 @@ def test_all_commands_are_understood(name: str, data: st.DataObject) -> None:
 @given(data=st.data())
 def test_all_reports_are_understood(name: str, data: st.DataObject) -> None:
     """The adapter reads every angle and speed that a report can hold, to half a step."""
-    known = profile(name)
-    adapter = ByWireAdapter(known, start_ns=START_NS)
+    base_profile = profile(name)
+    adapter = ByWireAdapter(base_profile, start_ns=START_NS)
     angle = data.draw(st.integers(-5500, 5500))
     raw = angle.to_bytes(2, "little", signed=True)
     if name == "dataspeed_gen1":
         adapter.receive(CanFrame(0x065, raw + bytes(6)), START_NS)
     else:
-        fourteen = (angle & 0x3FFF).to_bytes(2, "little")
-        adapter.receive(frame_with_crc(0x100, fourteen + bytes(6)), START_NS)
-    assert adapter.state().steering_rad == pytest.approx(known.road_rad(angle / 10), abs=1e-12)
+        angle_bits = (angle & 0x3FFF).to_bytes(2, "little")
+        adapter.receive(frame_with_crc(0x100, angle_bits + bytes(6)), START_NS)
+    assert adapter.state().steering_rad == pytest.approx(base_profile.road_rad(angle / 10), abs=1e-12)
 
 
 def frame_with_crc(identifier: int, data: bytes) -> CanFrame:
@@ -96,12 +97,12 @@ def test_any_frames_raise_nothing(name: str, history: list[tuple[CanFrame, int, 
     """Any frames from the bus raise nothing, and without all reports the car is never engaged."""
     adapter = ByWireAdapter(profile(name), start_ns=START_NS)
     now_ns = START_NS
-    for frame, passed_ns, kind in history:
+    for frame, passed_ns, request in history:  # a request of 1 disengages, 2 and 3 engage
         now_ns += passed_ns
         adapter.receive(frame, now_ns)
         adapter.set_actuation(Actuation(0.1, 0.5, 0.0), now_ns)
-        if kind:
-            adapter.engage(kind > 1, now_ns)
+        if request:
+            adapter.engage(request > 1, now_ns)
         adapter.frames_due(now_ns)
         assert adapter.next_wake_ns() > now_ns
         state = adapter.state()
@@ -149,7 +150,7 @@ def test_a_flipped_bit(generation: int, data: st.DataObject) -> None:
     adapter = ByWireAdapter(profile(f"dataspeed_gen{generation}"), start_ns=START_NS)
     adapter.receive(CanFrame(frame.identifier, flipped), START_NS)
     names_by_identifier = {
-        facts.identifier: name for name, facts in profile(f"dataspeed_gen{generation}").codec.messages.items()
+        message.identifier: name for name, message in profile(f"dataspeed_gen{generation}").codec.messages.items()
     }
     report = profile(f"dataspeed_gen{generation}").reports.get(names_by_identifier[frame.identifier])
     if report is not None and report.checksum:

@@ -17,7 +17,7 @@ from lavt.vehicle.software_car.authority import WATCHDOG_BRAKE
 @both_generations
 @pytest.mark.timeout(30)
 def test_a_stall_while_parking_ends(generation: int) -> None:
-    """A stall while parking ends it, at whatever moment, if the kit has disengaged meanwhile: the watchdog brakes."""
+    """If the kit disengages in a stall while parking, at whatever moment, parking ends, and the watchdog brakes."""
     parking_rig = driving_rig(generation)
     parking_rig.adapter.engage(False, parking_rig.now_ns)
     parking_rig.run_ms(50)
@@ -39,17 +39,17 @@ def forge_enabled(rig: AdapterRig, axis: Axis, *, is_enabled: bool) -> None:
     """Forge the axis's reports: they say whether it is enabled."""
     codec = rig.profile.codec
     message, spec = next((name, spec) for name, spec in rig.profile.reports.items() if spec.part == axis)
-    facts = codec.messages[message]
+    identifier = codec.messages[message].identifier
 
     def forge(frame: CanFrame) -> bool:
-        decoded = codec.decode(frame) if frame.identifier == facts.identifier else None
+        decoded = codec.decode(frame) if frame.identifier == identifier else None
         if decoded is None:
             return False
         values = {name: value or 0.0 for name, value in decoded[1].items()}
         data = codec.encode(message, values | {spec.values["enabled"]: int(is_enabled)})
         if spec.checksum:
-            data = data[:-1] + bytes([frame_crc8(facts.identifier, data[:-1])])
-        rig.adapter.receive(CanFrame(facts.identifier, data), rig.now_ns)
+            data = data[:-1] + bytes([frame_crc8(identifier, data[:-1])])
+        rig.adapter.receive(CanFrame(identifier, data), rig.now_ns)
         return True
 
     rig.lose_report = forge

@@ -15,56 +15,58 @@ from lavt.vehicle.dbw.profile import AXES, Axis, Profile
 from lavt.vehicle.dbw.sending import DriveCommand, FrameSender, KitCommands
 
 NAMES = ("dataspeed_gen1", "dataspeed_gen2", "dataspeed_gen2:user")
-NONE: frozenset[Axis] = frozenset()
+NO_AXES: frozenset[Axis] = frozenset()
 
 
 def vectors(name: str) -> list[dict[str, Any]]:
     text = (Path(__file__).parent / "vectors" / f"{name.partition(':')[0]}.yaml").read_text()
-    found: list[dict[str, Any]] = yaml.safe_load(text)["vectors"]
-    return found
+    loaded: list[dict[str, Any]] = yaml.safe_load(text)["vectors"]
+    return loaded
 
 
-def sent(name: str, vector: dict[str, Any]) -> CanFrame | None:
+def adapter_frame(name: str, vector: dict[str, Any]) -> CanFrame | None:
     """Return the adapter's frame for a vector, or None if the adapter never sends such a frame."""
-    known, signals, message = profile(name), dict(vector["signals"]), vector["message"]
-    sender = FrameSender(known, START_NS)
+    base_profile, signals, message = profile(name), dict(vector["signals"]), vector["message"]
+    sender = FrameSender(base_profile, START_NS)
     if signals.pop("CLEAR", 0):
-        return clearing_frame(known, message, signals)
+        return clearing_frame(base_profile, message, signals)
     for axis in AXES:
-        if known.axes[axis].message == message:
-            return axis_command(known, axis, signals)
-    if known.gear.message == message and set(signals) == {known.gear.value}:
-        gears = {code: gear for gear, code in known.gear.codes.items()}
-        gear = gears.get(signals[known.gear.value])
+        if base_profile.axes[axis].message == message:
+            return axis_command(base_profile, axis, signals)
+    if base_profile.gear.message == message and set(signals) == {base_profile.gear.value}:
+        gears = {code: gear for gear, code in base_profile.gear.codes.items()}
+        gear = gears.get(signals[base_profile.gear.value])
         return sender.gear_frame(gear) if gear else None
-    if known.system and message == known.system.message and signals:
+    if base_profile.system and message == base_profile.system.message and signals:
         sender._frame_counts[message] = signals["RC"] - 1
-        return sender._system_frame(known.system, "enable" if signals["CMD"] == 1 else "disable")
+        return sender._system_frame(base_profile.system, "enable" if signals["CMD"] == 1 else "disable")
     return None
 
 
-def axis_command(known: Profile, axis: Axis, signals: dict[str, Any]) -> CanFrame | None:
+def axis_command(base_profile: Profile, axis: Axis, signals: dict[str, Any]) -> CanFrame | None:
     """Return an axis's command of the profile's type; signals that the adapter never changes become constants."""
-    command = known.axes[axis]
+    command = base_profile.axes[axis]
     kind, number = next(iter(command.constants.items()))
     if command.value not in signals or signals.get(kind, 0) != number:
         return None
     varied = {command.value, command.enable, command.count}
     constants = {kind: number} | {name: value for name, value in signals.items() if name not in varied}
-    sender = FrameSender(replace(known, axes={**known.axes, axis: replace(command, constants=constants)}), START_NS)
+    sender = FrameSender(
+        replace(base_profile, axes={**base_profile.axes, axis: replace(command, constants=constants)}), START_NS
+    )
     sender._frame_counts[command.message] = signals.get(command.count, 0) + command.modulus - 1
     is_enabled = bool(signals.get(command.enable, 0))
     return sender.axis_frame(axis, signals[command.value] / command.per_unit, is_enabled=is_enabled)
 
 
-def clearing_frame(known: Profile, message: str, signals: dict[str, Any]) -> CanFrame | None:
+def clearing_frame(base_profile: Profile, message: str, signals: dict[str, Any]) -> CanFrame | None:
     """Return a frame that clears overrides."""
-    if message not in {command.message for command in known.axes.values()} | {known.gear.message}:
+    if message not in {command.message for command in base_profile.axes.values()} | {base_profile.gear.message}:
         return None
-    sender = FrameSender(known, START_NS)
+    sender = FrameSender(base_profile, START_NS)
     sender._frame_counts[message] = signals.get("RC", 0) - 1
-    frames = sender.frames(KitCommands(NONE, is_clearing=True), DriveCommand(0.0, 0.0, 0.0), 0.0, START_NS)
-    identifier = known.codec.messages[message].identifier
+    frames = sender.frames(KitCommands(NO_AXES, is_clearing=True), DriveCommand(0.0, 0.0, 0.0), 0.0, START_NS)
+    identifier = base_profile.codec.messages[message].identifier
     return next(frame for frame in frames if frame.identifier == identifier)
 
 
@@ -72,7 +74,7 @@ CASES = [
     pytest.param(frame, vector, id=f"{name}: {vector['name']}")
     for name in NAMES
     for vector in vectors(name)
-    if (frame := sent(name, vector)) is not None
+    if (frame := adapter_frame(name, vector)) is not None
 ]
 
 
@@ -84,11 +86,11 @@ def test_frames_equal_the_vectors(frame: CanFrame, vector: dict[str, Any]) -> No
 
 def test_every_sent_message_has_a_vector() -> None:
     """Every message that the adapter sends has a vector, except two whose vectors have no signals."""
-    checked = {(name, vector["message"]) for name in NAMES for vector in vectors(name) if sent(name, vector)}
+    checked = {(name, vector["message"]) for name in NAMES for vector in vectors(name) if adapter_frame(name, vector)}
     missing = set()
     for name in NAMES:
-        known = profile(name)
-        messages = {command.message for command in known.axes.values()} | {known.gear.message}
-        messages |= {known.system.message} if known.system else set()
+        base_profile = profile(name)
+        messages = {command.message for command in base_profile.axes.values()} | {base_profile.gear.message}
+        messages |= {base_profile.system.message} if base_profile.system else set()
         missing |= {(name, message) for message in messages} - checked
     assert missing == {("dataspeed_gen2:user", "UserGearCmd"), ("dataspeed_gen2:user", "UserThrtlCmd")}

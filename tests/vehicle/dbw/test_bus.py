@@ -32,7 +32,7 @@ GROUP = "239.74.163.2"
 DEADLINE_S = 20
 STEERING = CanFrame(0x064, bytes(8))
 BRAKE = CanFrame(0x060, bytes(range(8)))
-FAR = CanFrame(0x2F01, b"\x01", is_extended=True)
+EXTENDED = CanFrame(0x2F01, b"\x01", is_extended=True)
 
 
 def until(done: Callable[[], bool]) -> None:
@@ -40,7 +40,7 @@ def until(done: Callable[[], bool]) -> None:
         if done():
             return
         pause(NS_PER_MS)
-    raise AssertionError("it did not happen")
+    raise AssertionError(f"the condition was not met within {DEADLINE_S} s")
 
 
 def receive(port: CanPort, count: int) -> list[CanFrame]:
@@ -56,11 +56,11 @@ def receive(port: CanPort, count: int) -> list[CanFrame]:
 
 
 @pytest.fixture
-def opened() -> Iterator[Callable[..., CanPort]]:
+def open_port() -> Iterator[Callable[..., CanPort]]:
     """Return a function that opens ports, which are closed after the test."""
     ports: list[CanPort] = []
 
-    def open_port(
+    def open_new_port(
         interface: str = "virtual",
         channel: str = "test",
         clock: Clock | None = None,
@@ -70,13 +70,13 @@ def opened() -> Iterator[Callable[..., CanPort]]:
         ports.append(CanPort(interface, channel, options, clock=clock or MachineClock(), suspended=suspended))
         return ports[-1]
 
-    yield open_port
+    yield open_new_port
     for port in ports:
         port.close()
 
 
 @pytest.fixture
-def raw() -> Iterator[can.BusABC]:
+def raw_bus() -> Iterator[can.BusABC]:
     """Return another participant on the bus `test`."""
     with can.Bus(interface="virtual", channel="test", ignore_config=True) as bus:
         yield bus
@@ -86,11 +86,11 @@ def now_ns() -> int:
     return MachineClock().now().mono_ns
 
 
-def test_virtual(opened: Callable[..., CanPort]) -> None:
+def test_virtual(open_port: Callable[..., CanPort]) -> None:
     """Frames arrive unchanged and in order at every other port of the bus, and not at their sender."""
-    one, other = opened(), opened()
-    one.send([STEERING, BRAKE, FAR], now_ns())
-    assert receive(other, 3) == [STEERING, BRAKE, FAR]
+    one, other = open_port(), open_port()
+    one.send([STEERING, BRAKE, EXTENDED], now_ns())
+    assert receive(other, 3) == [STEERING, BRAKE, EXTENDED]
     other.send([BRAKE], now_ns())
     assert receive(one, 1) == [BRAKE]
 
@@ -111,24 +111,26 @@ port.close()
 """
 
 
-def test_two_processes(opened: Callable[..., CanPort]) -> None:
+def test_two_processes(open_port: Callable[..., CanPort]) -> None:
     """Over `udp_multicast` two processes receive each other's frames and not their own, which the group sends back."""
     number = free_port()
-    port = opened("udp_multicast", GROUP, port=number)
+    port = open_port("udp_multicast", GROUP, port=number)
     with subprocess.Popen(
         [sys.executable, "-c", OTHER_PROCESS, GROUP, str(number)], stdout=subprocess.PIPE, text=True
     ) as echo:
         assert echo.stdout is not None
         assert echo.stdout.readline() == "ready\n"
         before_ns = now_ns()
-        port.send([STEERING, BRAKE, FAR], before_ns)
-        assert receive(port, 3) == [STEERING, BRAKE, FAR]
+        port.send([STEERING, BRAKE, EXTENDED], before_ns)
+        assert receive(port, 3) == [STEERING, BRAKE, EXTENDED]
         assert echo.wait(DEADLINE_S) == 0
     until(lambda: port.counts["own_frames"] == 3)
     assert not port.take(0)
 
 
-def test_udp_multicast_stays_on_this_machine(opened: Callable[..., CanPort], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_udp_multicast_stays_on_this_machine(
+    open_port: Callable[..., CanPort], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Frames of `udp_multicast`, which counts as virtual, stay on the machine unless the user sets `hop_limit`."""
     requested: list[dict[str, Any]] = []
     open_bus = can.Bus
@@ -138,16 +140,16 @@ def test_udp_multicast_stays_on_this_machine(opened: Callable[..., CanPort], mon
         return open_bus(**keys)
 
     monkeypatch.setattr(can, "Bus", record)
-    opened("udp_multicast", GROUP, port=free_port())
-    opened("udp_multicast", GROUP, port=free_port(), hop_limit=1)
-    opened()
+    open_port("udp_multicast", GROUP, port=free_port())
+    open_port("udp_multicast", GROUP, port=free_port(), hop_limit=1)
+    open_port()
     assert [keys.get("hop_limit") for keys in requested] == [0, 1, None]
 
 
-def test_arrival(opened: Callable[..., CanPort]) -> None:
+def test_arrival(open_port: Callable[..., CanPort]) -> None:
     """A frame's arrival time is the kernel's, on the monotonic clock, however late it is taken."""
     number = free_port()
-    port, other = opened("udp_multicast", GROUP, port=number), opened("udp_multicast", GROUP, port=number)
+    port, other = open_port("udp_multicast", GROUP, port=number), open_port("udp_multicast", GROUP, port=number)
     before_ns = now_ns()
     other.send([STEERING], before_ns)
     taken: list[ReceivedCanFrame] = []
@@ -160,10 +162,10 @@ def test_arrival(opened: Callable[..., CanPort]) -> None:
     assert before_ns - NS_PER_MS < taken[0].arrived_ns < now_ns()
 
 
-def test_garbage_datagrams(opened: Callable[..., CanPort]) -> None:
+def test_garbage_datagrams(open_port: Callable[..., CanPort]) -> None:
     """Datagrams of the group that are not frames are counted, and the next frame is received."""
     number = free_port()
-    port, other = opened("udp_multicast", GROUP, port=number), opened("udp_multicast", GROUP, port=number)
+    port, other = open_port("udp_multicast", GROUP, port=number), open_port("udp_multicast", GROUP, port=number)
     garbage = [b"", b"\xff", b"\x80", b"\xc0", bytes(2000), b"\x81\xaearbitration_id\xcb?\xf8\0\0\0\0\0\0"]
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
         for datagram in garbage:
@@ -175,31 +177,31 @@ def test_garbage_datagrams(opened: Callable[..., CanPort]) -> None:
 
 
 @pytest.mark.parametrize(("age_ns", "is_sent"), [(60 * NS_PER_MS, True), (60 * NS_PER_MS + 1, False)])
-def test_too_old(opened: Callable[..., CanPort], raw: can.BusABC, age_ns: int, is_sent: bool) -> None:
+def test_too_old(open_port: Callable[..., CanPort], raw_bus: can.BusABC, age_ns: int, is_sent: bool) -> None:
     """A frame made more than 60 ms before its write is counted and not written."""
-    port = opened(clock=ManualClock(5 * NS_PER_S))
+    port = open_port(clock=ManualClock(5 * NS_PER_S))
     port.send([STEERING], 5 * NS_PER_S - age_ns)
-    assert (raw.recv(0) is not None) is is_sent
+    assert (raw_bus.recv(0) is not None) is is_sent
     assert port.counts["frames_too_old"] == (not is_sent)
 
 
-def test_too_old_while_writing(opened: Callable[..., CanPort], raw: can.BusABC) -> None:
+def test_too_old_while_writing(open_port: Callable[..., CanPort], raw_bus: can.BusABC) -> None:
     """The age is checked before each frame, so that a writer frozen between two frames does not write the rest."""
     clock = ManualClock(0)
-    port = opened(clock=clock)
+    port = open_port(clock=clock)
     clock.step_ns = 25 * NS_PER_MS
     assert port.send([STEERING, BRAKE, STEERING, BRAKE], 0) == 2
-    assert [getattr(raw.recv(0), "arbitration_id", None) for _ in range(3)] == [0x064, 0x060, None]
+    assert [getattr(raw_bus.recv(0), "arbitration_id", None) for _ in range(3)] == [0x064, 0x060, None]
     assert port.counts["frames_too_old"] == 2
 
 
-def test_other_frames(opened: Callable[..., CanPort], raw: can.BusABC) -> None:
+def test_other_frames(open_port: Callable[..., CanPort], raw_bus: can.BusABC) -> None:
     """Error frames, remote frames and CAN FD frames are counted and dropped."""
-    port = opened()
-    raw.send(can.Message(is_error_frame=True, arbitration_id=0x04))
-    raw.send(can.Message(is_remote_frame=True, arbitration_id=0x60))
-    raw.send(can.Message(is_fd=True, arbitration_id=0x60, data=bytes(12), is_extended_id=False))
-    raw.send(can.Message(arbitration_id=0x60, data=b"\x07", is_extended_id=False))
+    port = open_port()
+    raw_bus.send(can.Message(is_error_frame=True, arbitration_id=0x04))
+    raw_bus.send(can.Message(is_remote_frame=True, arbitration_id=0x60))
+    raw_bus.send(can.Message(is_fd=True, arbitration_id=0x60, data=bytes(12), is_extended_id=False))
+    raw_bus.send(can.Message(arbitration_id=0x60, data=b"\x07", is_extended_id=False))
     assert receive(port, 1) == [CanFrame(0x60, b"\x07")]
     assert {name: count for name, count in port.counts.items() if count} == {
         "error_frames": 1,
@@ -208,12 +210,14 @@ def test_other_frames(opened: Callable[..., CanPort], raw: can.BusABC) -> None:
     }
 
 
-def test_queue_is_bounded(opened: Callable[..., CanPort], raw: can.BusABC, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_queue_is_bounded(
+    open_port: Callable[..., CanPort], raw_bus: can.BusABC, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A full queue keeps the newest frames and counts the dropped ones."""
     monkeypatch.setattr(bus_module, "QUEUE_FRAMES", 4)
-    port = opened()
+    port = open_port()
     for number in range(10):
-        raw.send(can.Message(arbitration_id=number, is_extended_id=False))
+        raw_bus.send(can.Message(arbitration_id=number, is_extended_id=False))
     until(lambda: port.counts["overflowed"] == 6)
     assert [received.frame.identifier for received in port.take(0)] == [6, 7, 8, 9]
 
@@ -312,9 +316,9 @@ def test_reopening_period() -> None:
     assert bus_module.REOPEN_NS == NS_PER_S
 
 
-def test_bus_gone_and_back(opened: Callable[..., CanPort], device: Device) -> None:
+def test_bus_gone_and_back(open_port: Callable[..., CanPort], device: Device) -> None:
     """A lost bus raises an error in reading and writing until it is reopened, and then receives again."""
-    port = opened("breakable", "stick", clock=ManualClock(0))
+    port = open_port("breakable", "stick", clock=ManualClock(0))
     device.may_open.clear()
     device.open_error = OSError(errno.ENODEV, "No such device")
     device.incoming.append(can.CanOperationError("Error receiving: Network is down", errno.ENETDOWN))
@@ -335,9 +339,9 @@ def test_bus_gone_and_back(opened: Callable[..., CanPort], device: Device) -> No
 
 
 @pytest.mark.timeout(10)
-def test_a_slow_opening_blocks_nobody(opened: Callable[..., CanPort], device: Device) -> None:
+def test_a_slow_opening_blocks_nobody(open_port: Callable[..., CanPort], device: Device) -> None:
     """While a driver is opening a lost bus, reading and writing raise an error at once, and the port can be closed."""
-    port = opened("breakable", "stick", clock=ManualClock(0))
+    port = open_port("breakable", "stick", clock=ManualClock(0))
     device.may_open.clear()
     device.incoming.append(OSError(errno.ENODEV, "gone"))
     until(lambda: device.shut_down == 1)
@@ -352,9 +356,9 @@ def test_a_slow_opening_blocks_nobody(opened: Callable[..., CanPort], device: De
     until(lambda: device.shut_down == device.opened == 2)
 
 
-def test_frames_before_the_loss(opened: Callable[..., CanPort], device: Device) -> None:
+def test_frames_before_the_loss(open_port: Callable[..., CanPort], device: Device) -> None:
     """Frames received before the bus was lost are returned first."""
-    port = opened("breakable", "stick", clock=ManualClock(0))
+    port = open_port("breakable", "stick", clock=ManualClock(0))
     device.incoming.extend([can.Message(arbitration_id=7, is_extended_id=False), OSError(errno.ENODEV, "gone")])
     until(lambda: device.shut_down == 1)
     assert [received.frame.identifier for received in port.take(0)] == [7]
@@ -370,9 +374,9 @@ def test_frames_before_the_loss(opened: Callable[..., CanPort], device: Device) 
         can.CanTimeoutError(),
     ],
 )
-def test_a_full_buffer_is_no_loss(opened: Callable[..., CanPort], device: Device, error: Exception) -> None:
+def test_a_full_buffer_is_no_loss(open_port: Callable[..., CanPort], device: Device, error: Exception) -> None:
     """Frames that do not fit into the transmit buffer are counted and dropped, and the bus can be used on."""
-    port = opened("breakable", "stick", clock=ManualClock(0))
+    port = open_port("breakable", "stick", clock=ManualClock(0))
     device.send_error = error
     assert port.send([STEERING, BRAKE], 0) == 0
     assert port.counts["buffer_full"] == 2
@@ -389,9 +393,9 @@ def test_a_full_buffer_is_no_loss(opened: Callable[..., CanPort], device: Device
         OSError(errno.ENODEV, "No such device"),
     ],
 )
-def test_a_failed_write_loses_the_bus(opened: Callable[..., CanPort], device: Device, error: Exception) -> None:
+def test_a_failed_write_loses_the_bus(open_port: Callable[..., CanPort], device: Device, error: Exception) -> None:
     """A failed write for another reason raises an error at once, and the bus is reopened."""
-    port = opened("breakable", "stick", clock=ManualClock(0))
+    port = open_port("breakable", "stick", clock=ManualClock(0))
     device.may_open.clear()
     device.send_error = error
     with pytest.raises(BusGone, match=r"breakable stick cannot be written to") as raised:
@@ -406,10 +410,10 @@ def test_a_failed_write_loses_the_bus(opened: Callable[..., CanPort], device: De
     assert port.send([STEERING], 0) == 1
 
 
-def test_a_suspended_machine(opened: Callable[..., CanPort], device: Device) -> None:
+def test_a_suspended_machine(open_port: Callable[..., CanPort], device: Device) -> None:
     """A suspension of 100 ms or more counts as a loss of the bus: nothing is written until the bus is reopened."""
     suspended_ms = [5000]
-    port = opened("breakable", "stick", clock=ManualClock(0), suspended=lambda: suspended_ms[0] * NS_PER_MS)
+    port = open_port("breakable", "stick", clock=ManualClock(0), suspended=lambda: suspended_ms[0] * NS_PER_MS)
     for step_ms, is_lost in ((99, False), (-80, False), (100, False), (100, True)):
         suspended_ms[0] += step_ms
         device.may_open.clear()
@@ -435,10 +439,10 @@ def test_suspended_time_of_this_machine() -> None:
 
 
 @pytest.fixture
-def stamped(opened: Callable[..., CanPort], device: Device, monkeypatch: pytest.MonkeyPatch) -> StampedFrames:
+def stamped(open_port: Callable[..., CanPort], device: Device, monkeypatch: pytest.MonkeyPatch) -> StampedFrames:
     monkeypatch.setitem(can.interfaces.BACKENDS, "udp_multicast", (__name__, "BreakableBus"))
     clock = ManualClock(10 * NS_PER_S, wall_ahead_ns=1_790_000_000 * NS_PER_S)
-    return StampedFrames(opened("udp_multicast", "stick", clock=clock), device, clock)
+    return StampedFrames(open_port("udp_multicast", "stick", clock=clock), device, clock)
 
 
 @dataclass
@@ -512,9 +516,9 @@ def test_a_port_closes_whatever_the_wall_clock_does(monkeypatch: pytest.MonkeyPa
         assert not port._thread.is_alive()
 
 
-def test_bus_off(opened: Callable[..., CanPort], device: Device) -> None:
+def test_bus_off(open_port: Callable[..., CanPort], device: Device) -> None:
     """An error frame with bus-off means that the bus is lost."""
-    port = opened("breakable", "stick", clock=ManualClock(0))
+    port = open_port("breakable", "stick", clock=ManualClock(0))
     device.incoming.append(can.Message(is_error_frame=True, arbitration_id=0x40, is_extended_id=False))
     until(lambda: device.shut_down == 1)
     with pytest.raises(BusGone, match="bus-off"):
@@ -627,7 +631,10 @@ def test_is_virtual_unknown(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> 
 
 def test_log(tmp_path: Path) -> None:
     """A written log is read back unchanged, to the microsecond."""
-    written = [ReceivedCanFrame(STEERING, 1_700_000_000_000_001_000), ReceivedCanFrame(FAR, 1_700_000_000_500_000_000)]
+    written = [
+        ReceivedCanFrame(STEERING, 1_700_000_000_000_001_000),
+        ReceivedCanFrame(EXTENDED, 1_700_000_000_500_000_000),
+    ]
     log = tmp_path / "drive.log"
     log.write_text("".join(log_line(entry.arrived_ns, "vcan0", entry.frame) for entry in written))
     read_back = list(read_log(log))

@@ -62,9 +62,9 @@ def awkward(tmp_path: Path) -> Codec:
 def test_vectors(codec: Codec, vector: dict[str, Any]) -> None:
     """A frame worked out by hand is the encoding of its values, except for its CRC, and is decoded to them."""
     data = bytes.fromhex(vector["data"])
-    made = codec.encode(vector["message"], vector["signals"], length=len(data))
+    encoded = codec.encode(vector["message"], vector["signals"], length=len(data))
     has_crc = "CRC" in codec.messages[vector["message"]].signals
-    assert made[: len(data) - has_crc] == data[: len(data) - has_crc]
+    assert encoded[: len(data) - has_crc] == data[: len(data) - has_crc]
     decoded = codec.decode(CanFrame(vector["id"], data), short=True)
     assert decoded is not None
     assert decoded[0] == vector["message"]
@@ -142,8 +142,8 @@ def test_rejected(message: str, values: dict[str, float], reason: str) -> None:
         GENERATION_1.encode(message, values)
 
 
-def test_facts() -> None:
-    """The facts about a message contain its identifier, times and signals, and which of these are unverified."""
+def test_description_of_a_message() -> None:
+    """The description of a message contains its identifier, times and signals, and which of these are unverified."""
     report = GENERATION_2.messages["SteerReport1"]
     assert (report.identifier, report.is_extended, report.length) == (0x100, False, 8)
     assert (report.timeout_ns, report.period_ns) == (100_000_000, 10_000_000)

@@ -45,7 +45,7 @@ def test_a_step_while_many_frames_wait(step_ms: int) -> None:
 
 
 def test_impossible_stamps() -> None:
-    """A stamp that fits no reading gives a time between the last empty queue, the previous frame, and the reading."""
+    """A stamp that fits no reading gives a time from the last empty queue or the previous frame to the reading."""
     arrivals = ArrivalTimes(at(90))
     assert arrivals.arrived_ns(0, at(101)) == 90 * NS_PER_MS
     assert arrivals.arrived_ns(at(95).wall_ns, at(102)) == 95 * NS_PER_MS

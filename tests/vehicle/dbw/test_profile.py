@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from lavt.vehicle.dbw.sending import FrameSender
 NAMES = ("dataspeed_gen1", "dataspeed_gen2", "dataspeed_gen2:user", "dataspeed_gen2:remote")
 
 
-def changed(folder: Path, name: str, **changes: Any) -> Path:
+def write_changed_profile(folder: Path, name: str, **changes: Any) -> Path:
     """Write a profile with other values; a key is a path with __ between its parts, and None removes it."""
     shipped = shipped_profiles()[name]
     data = yaml.safe_load(shipped.read_text())
@@ -35,7 +36,7 @@ def changed(folder: Path, name: str, **changes: Any) -> Path:
     return path
 
 
-def rejected(name_or_path: str | Path, **keys: Any) -> str:
+def rejection_message(name_or_path: str | Path, **keys: Any) -> str:
     with pytest.raises(UserError) as error:
         load_profile(str(name_or_path), **keys)
     message = str(error.value)
@@ -46,10 +47,10 @@ def rejected(name_or_path: str | Path, **keys: Any) -> str:
 def test_shipped() -> None:
     """The two shipped profiles agree with their DBC files."""
     assert list(shipped_profiles()) == ["dataspeed_gen1", "dataspeed_gen2"]
-    known = {name: load_profile(name) for name in NAMES}
-    assert {profile.kit for name, profile in known.items() if "gen2" in name} == {"dataspeed_2"}
-    assert known["dataspeed_gen1"].kit == "dataspeed_1"
-    assert [known[name].commands for name in NAMES] == [None, "remote", "user", "remote"]
+    profiles = {name: load_profile(name) for name in NAMES}
+    assert {profile.kit for name, profile in profiles.items() if "gen2" in name} == {"dataspeed_2"}
+    assert profiles["dataspeed_gen1"].kit == "dataspeed_1"
+    assert [profiles[name].commands for name in NAMES] == [None, "remote", "user", "remote"]
 
 
 def test_angles_in_radians(tmp_path: Path) -> None:
@@ -59,7 +60,7 @@ def test_angles_in_radians(tmp_path: Path) -> None:
         assert text.count(before) == 1
         text = text.replace(before, '(0.001,0) [-10|10] "rad"')
     (tmp_path / "radians.dbc").write_text(text)
-    profile = load_profile(str(changed(tmp_path, "dataspeed_gen1", dbc=str(tmp_path / "radians.dbc"))))
+    profile = load_profile(str(write_changed_profile(tmp_path, "dataspeed_gen1", dbc=str(tmp_path / "radians.dbc"))))
     command = FrameSender(profile, 0).axis_frame("steering", 90.0, is_enabled=True)
     assert int.from_bytes(command.data[:2], "little", signed=True) == 1571
     reports = NewestReports(profile, 0)
@@ -85,31 +86,31 @@ def test_steering_sign() -> None:
     assert load_profile("dataspeed_gen1", steering_sign=-1).car.steering_sign == -1
     assert load_profile("dataspeed_gen2").car.steering_sign == 1
     assert load_profile("dataspeed_gen2", steering_sign=1).car.steering_sign == 1
-    assert "steering_sign 1, not -1" in rejected("dataspeed_gen2", steering_sign=-1)
+    assert "steering_sign 1, not -1" in rejection_message("dataspeed_gen2", steering_sign=-1)
 
 
 def test_units() -> None:
     """The steering wheel's angle is the road wheels' angle times the ratio and the sign, in degrees."""
-    known = load_profile("dataspeed_gen1", steering_sign=-1)
-    assert known.wheel_deg(0.1) == pytest.approx(-0.1 * 57.29577951308232 * 14.8)
-    assert known.road_rad(known.wheel_deg(0.123)) == pytest.approx(0.123)
+    loaded_profile = load_profile("dataspeed_gen1", steering_sign=-1)
+    assert loaded_profile.wheel_deg(0.1) == pytest.approx(-math.degrees(0.1) * 14.8)
+    assert loaded_profile.road_rad(loaded_profile.wheel_deg(0.123)) == pytest.approx(0.123)
 
 
 @pytest.mark.parametrize("name", ["dataspeed_gen3", "dataspeed_gen2:usr", ":user"])
 def test_no_such_profile(name: str) -> None:
     """A profile that does not exist is rejected with the known names."""
-    assert repr(name) in rejected(name)
-    assert "dataspeed_gen1, dataspeed_gen2" in rejected(name)
+    assert repr(name) in rejection_message(name)
+    assert "dataspeed_gen1, dataspeed_gen2" in rejection_message(name)
 
 
 def test_a_single_set_of_commands() -> None:
     """A set of commands cannot be chosen if the profile has only one."""
-    assert ":user" in rejected("dataspeed_gen1:user")
+    assert ":user" in rejection_message("dataspeed_gen1:user")
 
 
 def test_own_file(tmp_path: Path) -> None:
     """A path to a file is a profile, and a set of commands can be chosen with it."""
-    path = changed(tmp_path, "dataspeed_gen2", limits__steering_wheel_deg=100.0)
+    path = write_changed_profile(tmp_path, "dataspeed_gen2", limits__steering_wheel_deg=100.0)
     assert load_profile(str(path)).limits.steering_wheel_deg == 100.0
     assert load_profile(f"{path}:user").commands == "user"
 
@@ -122,7 +123,9 @@ def test_other_dbc(tmp_path: Path) -> None:
     vendors.write_text("\n".join(line for line in text.splitlines() if not line.startswith('BA_ "Unverified"')))
     assert load_profile("dataspeed_gen2", str(vendors)).unverified == ()
     vendors.write_text(text.replace("RemoteSteerCmd", "SteerCmdRemote"))
-    assert "has no message 'RemoteSteerCmd': change the profile" in rejected("dataspeed_gen2", dbc=str(vendors))
+    assert "has no message 'RemoteSteerCmd': change the profile" in rejection_message(
+        "dataspeed_gen2", dbc=str(vendors)
+    )
 
 
 def test_a_pedal_without_its_scale(tmp_path: Path) -> None:
@@ -130,7 +133,7 @@ def test_a_pedal_without_its_scale(tmp_path: Path) -> None:
     text = shipped_profiles()["dataspeed_gen1"].with_suffix(".dbc").read_text()
     bare = tmp_path / "bare.dbc"
     bare.write_text(text.replace("m2 : 0|16@1+ (0.000015259021896696421,0) [0|1]", "m2 : 0|16@1+ (1,0) [0|65535]"))
-    error = rejected("dataspeed_gen1", dbc=str(bare))
+    error = rejection_message("dataspeed_gen1", dbc=str(bare))
     assert "PCMD_PERCENT of BrakeCmd is 100% of a pedal" in error
 
 
@@ -167,7 +170,7 @@ def test_the_step_of_a_speed(tmp_path: Path, speed: str, step: float, is_fine_en
     if is_fine_enough:
         load_profile(name, str(dbc))
     else:
-        assert signal_name in rejected(name, dbc=str(dbc))
+        assert signal_name in rejection_message(name, dbc=str(dbc))
 
 
 REJECTED: list[tuple[str, dict[str, Any], str]] = [
@@ -201,7 +204,7 @@ REJECTED: list[tuple[str, dict[str, Any], str]] = [
 @pytest.mark.parametrize(("name", "changes", "message"), REJECTED, ids=[message for _, _, message in REJECTED])
 def test_rejected(tmp_path: Path, name: str, changes: dict[str, Any], message: str) -> None:
     """The error for a wrong profile has one line and names the key or the signal."""
-    assert message in rejected(changed(tmp_path, name, **changes))
+    assert message in rejection_message(write_changed_profile(tmp_path, name, **changes))
 
 
 def test_section() -> None:

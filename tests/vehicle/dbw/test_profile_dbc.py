@@ -21,25 +21,25 @@ from lavt.vehicle.dbw.crc8 import frame_crc8
 PROFILES = ("dataspeed_gen1", "dataspeed_gen2")
 
 
-def loaded(profile: str) -> Database:
+def load_database(profile: str) -> Database:
     text = (files("lavt.vehicle.dbw") / "profiles" / f"{profile}.dbc").read_text("ascii")
     database = cantools.database.load_string(text, "dbc")
     assert isinstance(database, Database)
     return database
 
 
-def written(profile: str) -> dict[str, Any]:
+def load_vectors(profile: str) -> dict[str, Any]:
     found: dict[str, Any] = yaml.safe_load((Path(__file__).parent / "vectors" / f"{profile}.yaml").read_text())
     return found
 
 
-DATABASES = {profile: loaded(profile) for profile in PROFILES}
-WRITTEN = {profile: written(profile) for profile in PROFILES}
+DATABASES = {profile: load_database(profile) for profile in PROFILES}
+VECTOR_FILES = {profile: load_vectors(profile) for profile in PROFILES}
 
 CASES = [
     pytest.param(DATABASES[profile].get_message_by_name(vector["message"]), vector, id=f"{profile}: {vector['name']}")
     for profile in PROFILES
-    for vector in WRITTEN[profile]["vectors"]
+    for vector in VECTOR_FILES[profile]["vectors"]
 ]
 MESSAGES = [
     pytest.param(message, id=f"{profile}: {message.name}")
@@ -102,7 +102,9 @@ def test_decoded(message: Message, vector: dict[str, Any]) -> None:
             assert decoded[name] == pytest.approx(value, abs=step / 2 + 1e-9), name
 
 
-@pytest.mark.parametrize("vector", [vector for vector in WRITTEN["dataspeed_gen2"]["vectors"] if "registers" in vector])
+@pytest.mark.parametrize(
+    "vector", [vector for vector in VECTOR_FILES["dataspeed_gen2"]["vectors"] if "registers" in vector]
+)
 def test_crc_by_hand(vector: dict[str, Any]) -> None:
     """The last byte of a frame of generation 2 is its CRC."""
     *data, crc = bytes.fromhex(vector["data"])
@@ -188,7 +190,7 @@ def test_unverified_signals_have_a_comment(profile: str) -> None:
             assert (signal.comment or "").startswith("Unverified") is is_unverified(signal), (message.name, signal.name)
 
 
-@pytest.mark.parametrize("limit", WRITTEN["dataspeed_gen1"]["limits"], ids=lambda limit: limit["signal"])
+@pytest.mark.parametrize("limit", VECTOR_FILES["dataspeed_gen1"]["limits"], ids=lambda limit: limit["signal"])
 def test_limits(limit: dict[str, Any]) -> None:
     """A command is encoded at the published limits and rejected one step beyond."""
     message = DATABASES["dataspeed_gen1"].get_message_by_name(limit["message"])

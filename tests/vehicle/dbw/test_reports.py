@@ -32,7 +32,7 @@ def test_units(angle_unit: str, wheel_deg: float, speed_unit: str, speed_mps: fl
 
 
 def test_deadline() -> None:
-    """The next deadline is that of the first report to become 200 ms old, without those that are so already."""
+    """The next deadline is when a report becomes 200 ms old; reports that are older already do not count."""
     reports = NewestReports(profile("dataspeed_gen1"), START_NS)
     assert reports.deadline_ns(START_NS) is None
     reports.receive(ANGLE_AND_SPEED, START_NS)

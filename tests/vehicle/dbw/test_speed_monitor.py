@@ -21,7 +21,7 @@ START_NS = 5 * NS_PER_S
 PERIOD_NS = 10 * NS_PER_MS
 SPEED_STEP_MPS = 0.01 / 3.6
 """Step of the kits' reports."""
-NONE, FULL_BRAKE, HALF_BRAKE, THROTTLE = Pedals(0.0, 0.0), Pedals(0.0, 1.0), Pedals(0.0, 0.5), Pedals(0.5, 0.0)
+NO_PEDAL, FULL_BRAKE, HALF_BRAKE, THROTTLE = Pedals(0.0, 0.0), Pedals(0.0, 1.0), Pedals(0.0, 0.5), Pedals(0.5, 0.0)
 Course = Callable[[float], float]
 """A speed in m/s as a function of time in s."""
 
@@ -72,14 +72,14 @@ def noisy(course: Course, amplitude_mps: float = 0.05) -> Course:
 
 def test_a_speed_that_drops_to_zero_is_a_fall() -> None:
     """A speed that becomes 0 at 8.3 m/s is implausible with its first report, and the car is not stationary."""
-    rig = MonitorRig().run(1.0, NONE, noisy(constant(8.3)))
-    rig.run(0.01, NONE, constant(0.0))
+    rig = MonitorRig().run(1.0, NO_PEDAL, noisy(constant(8.3)))
+    rig.run(0.01, NO_PEDAL, constant(0.0))
     assert rig.faults == [SpeedFault.FALL]
 
 
 def test_the_fault_lasts_until_all_speeds_agree_on_standstill() -> None:
     """The fault ends after the car was braked for long enough, and every speed was 0 for a second."""
-    rig = MonitorRig().run(1.0, NONE, *[noisy(constant(8.3))] * 5)
+    rig = MonitorRig().run(1.0, NO_PEDAL, *[noisy(constant(8.3))] * 5)
     rig.run(FULL_BRAKE_NS / NS_PER_S + 5.0, FULL_BRAKE, constant(0.0), *[constant(8.3)] * 4)
     assert rig.monitor.fault is SpeedFault.FALL
     assert rig.monitor.speed_mps == pytest.approx(8.3, abs=0.01)
@@ -91,7 +91,7 @@ def test_the_fault_lasts_until_all_speeds_agree_on_standstill() -> None:
 
 def test_a_fault_of_the_only_source_lasts_as_long_as_the_car_may_need() -> None:
     """Without another speed, the fault lasts until any speed within the limits is braked away."""
-    rig = MonitorRig().run(1.0, NONE, noisy(constant(5.0)))
+    rig = MonitorRig().run(1.0, NO_PEDAL, noisy(constant(5.0)))
     rig.run(FULL_BRAKE_NS / NS_PER_S - 0.02, FULL_BRAKE, constant(0.0))
     assert rig.monitor.fault is SpeedFault.FALL
     rig.run(0.1, FULL_BRAKE, constant(0.0))
@@ -126,7 +126,7 @@ def test_a_frozen_speed_under_throttle(sources: int) -> None:
 def test_a_speed_that_stays_zero_under_throttle(throttle: float, sources: int) -> None:
     """Whatever the throttle, a speed of 0 is implausible before a car on a level road is faster than 2.75 m/s."""
     acceleration_mps2 = throttle * 2.0 - 0.1
-    rig = MonitorRig().run(0.1, NONE, *[constant(0.0)] * sources)
+    rig = MonitorRig().run(0.1, NO_PEDAL, *[constant(0.0)] * sources)
     rig.run(2.6 / acceleration_mps2, Pedals(throttle, 0.0), *[constant(0.0)] * sources)
     assert rig.faults == []
     rig.run(0.15 / acceleration_mps2, Pedals(throttle, 0.0), *[constant(0.0)] * sources)
@@ -137,7 +137,7 @@ def test_pulses_of_throttle_add_up() -> None:
     """A throttle that is pressed for a second at a time does not hide a speed that is stuck at 0."""
     rig = MonitorRig()
     for _ in range(5):
-        rig.run(1.0, Pedals(0.4, 0.0), constant(0.0)).run(1.0, NONE, constant(0.0))
+        rig.run(1.0, Pedals(0.4, 0.0), constant(0.0)).run(1.0, NO_PEDAL, constant(0.0))
     assert rig.faults == [SpeedFault.NO_START]
 
 
@@ -145,7 +145,7 @@ def test_a_car_that_did_not_answer_the_throttle_is_not_stationary() -> None:
     """After throttle without an answer the car may move, until a brake on ice would have stopped it."""
     rig = MonitorRig().run(2.0, Pedals(0.5, 0.0), *[constant(0.0)] * 5)
     assert not rig.monitor.is_stationary
-    rig.run(1.0, NONE, *[constant(0.0)] * 5)
+    rig.run(1.0, NO_PEDAL, *[constant(0.0)] * 5)
     assert not rig.monitor.is_stationary
     rig.run(1.4, FULL_BRAKE, *[constant(0.0)] * 5)
     assert not rig.monitor.is_stationary
@@ -165,7 +165,7 @@ def test_a_speed_that_answers_the_throttle_is_believed() -> None:
 @pytest.mark.parametrize("speed_mps", [1.5, 2.4])
 def test_locked_wheels_on_ice_are_no_standstill(speed_mps: float) -> None:
     """A car whose wheels lock is not stationary for as long as it may slide at 1 m/s2."""
-    rig = MonitorRig().run(1.0, NONE, *[noisy(constant(speed_mps), 0.01)] * 5)
+    rig = MonitorRig().run(1.0, NO_PEDAL, *[noisy(constant(speed_mps), 0.01)] * 5)
     rig.run(speed_mps - 0.1, FULL_BRAKE, *[constant(0.0)] * 5)
     assert not rig.monitor.is_stationary
     rig.run(0.2, FULL_BRAKE, *[constant(0.0)] * 5)
@@ -175,7 +175,7 @@ def test_locked_wheels_on_ice_are_no_standstill(speed_mps: float) -> None:
 
 def test_wheels_that_lock_in_a_stop_may_have_slipped_before() -> None:
     """If wheels lock at the end of hard braking, the car may be as fast as if it had slid from the beginning."""
-    rig = MonitorRig().run(1.0, NONE, *[noisy(constant(8.0), 0.01)] * 5)
+    rig = MonitorRig().run(1.0, NO_PEDAL, *[noisy(constant(8.0), 0.01)] * 5)
     rig.run(0.6, FULL_BRAKE, *[ramp(8.0, -10.0)] * 5)
     rig.run(7.2, FULL_BRAKE, *[constant(0.0)] * 5)
     assert not rig.monitor.is_stationary
@@ -187,7 +187,7 @@ def test_the_fault_of_a_fast_car_lasts_as_long_as_it_may_slide() -> None:
     """If all speeds drop to 0 at 11.1 m/s, as with locked wheels on ice, the fault lasts until such a car is stationary
     for a second.
     """
-    rig = MonitorRig().run(1.0, NONE, *[noisy(constant(11.1), 0.01)] * 5)
+    rig = MonitorRig().run(1.0, NO_PEDAL, *[noisy(constant(11.1), 0.01)] * 5)
     rig.run(12.0, FULL_BRAKE, *[constant(0.0)] * 5)
     assert rig.monitor.fault is SpeedFault.FALL
     rig.run(0.2, FULL_BRAKE, *[constant(0.0)] * 5)
@@ -217,7 +217,7 @@ NORMAL: dict[str, Callable[[MonitorRig], object]] = {
         *[lambda s, wheel=wheel: 0.0 if (10 * s + wheel) % 4 < 1 else 0.8 * ramp(11.1, -4.0)(s) for wheel in range(4)],
     ),
     "all wheels lock on gravel at 2 m/s": lambda rig: (
-        rig.run(1.0, NONE, *[noisy(constant(2.0))] * 5),
+        rig.run(1.0, NO_PEDAL, *[noisy(constant(2.0))] * 5),
         rig.run(1.0, FULL_BRAKE, *[constant(0.0)] * 5),
     ),
     "ice: full brakes, 1 m/s2": lambda rig: rig.run(11.0, FULL_BRAKE, *[ramp(11.1, -1.0)] * 5),
@@ -232,7 +232,7 @@ NORMAL: dict[str, Callable[[MonitorRig], object]] = {
         5.0, THROTTLE, noisy(constant(5.0)), *[noisy(constant(4.5))] * 2, *[noisy(constant(5.5))] * 2
     ),
     "stop and go": lambda rig: [
-        rig.run(2 * math.pi, pedals, *[stop_and_go] * 5) for pedals in (NONE, Pedals(0.2, 0.0), NONE)
+        rig.run(2 * math.pi, pedals, *[stop_and_go] * 5) for pedals in (NO_PEDAL, Pedals(0.2, 0.0), NO_PEDAL)
     ],
     "waiting with the brake": lambda rig: rig.run(20.0, FULL_BRAKE, *[constant(0.0)] * 5),
     "holding on a hill by throttle for a moment": lambda rig: rig.run(5.0, Pedals(0.3, 0.0), *[constant(0.0)] * 5),
@@ -251,7 +251,7 @@ NORMAL: dict[str, Callable[[MonitorRig], object]] = {
     "braking down a hill of 20 % with half the pedal": lambda rig: rig.run(
         4.0, HALF_BRAKE, *[lambda s: 5.0 + 2.0 * min(s, 0.3) - max(0.0, s - 0.3)] * 5
     ),
-    "standstill reported with noise": lambda rig: rig.run(10.0, NONE, *[lambda s: 0.04 * math.sin(50 * s)] * 5),
+    "standstill reported with noise": lambda rig: rig.run(10.0, NO_PEDAL, *[lambda s: 0.04 * math.sin(50 * s)] * 5),
 }
 
 
@@ -265,10 +265,10 @@ def test_normal_driving_raises_no_fault(situation: str) -> None:
 
 def test_any_moving_source_means_not_stationary() -> None:
     """A car is stationary only if every source says so; until then, the largest speed counts."""
-    rig = MonitorRig().run(0.1, NONE, constant(0.0), *[constant(0.0)] * 3, constant(0.4))
+    rig = MonitorRig().run(0.1, NO_PEDAL, constant(0.0), *[constant(0.0)] * 3, constant(0.4))
     assert not rig.monitor.is_stationary
     assert rig.monitor.speed_mps == pytest.approx(0.4, abs=0.01)
-    rig.run(0.01, NONE, *[constant(0.0)] * 5)
+    rig.run(0.01, NO_PEDAL, *[constant(0.0)] * 5)
     assert rig.monitor.is_stationary
     assert rig.faults == []
 

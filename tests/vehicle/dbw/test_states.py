@@ -15,8 +15,8 @@ from lavt.vehicle.dbw.adapter import SEPARATOR
 from lavt.vehicle.dbw.profile import AXES, Axis
 from lavt.vehicle.dbw.states import TABLE, Situation, State, TransitionRow, next_state, states_after
 
-ALL: frozenset[Axis] = frozenset(AXES)
-NONE: frozenset[Axis] = frozenset()
+ALL_AXES: frozenset[Axis] = frozenset(AXES)
+NO_AXES: frozenset[Axis] = frozenset()
 PAUSE_NS, LIMIT_NS, TIMEOUT_NS = 120 * NS_PER_MS, 3000 * NS_PER_MS, 100 * NS_PER_MS
 GOOD = Situation(
     wanted=True,
@@ -29,17 +29,17 @@ GOOD = Situation(
     trips="",
     command_errors="",
     reasons="",
-    enabled=ALL,
+    enabled=ALL_AXES,
     gear="drive",
     in_state_ns=0,
 )
 STAYS: dict[State, Situation] = {
-    "idle": replace(GOOD, wanted=False, enabled=NONE, gear="park"),
-    "clearing": replace(GOOD, enabled=NONE, gear="park"),
-    "enabling": replace(GOOD, enabled=NONE, gear="park"),
+    "idle": replace(GOOD, wanted=False, enabled=NO_AXES, gear="park"),
+    "clearing": replace(GOOD, enabled=NO_AXES, gear="park"),
+    "enabling": replace(GOOD, enabled=NO_AXES, gear="park"),
     "engaged": GOOD,
     "parking": replace(GOOD, wanted=False),
-    "overridden": replace(GOOD, enabled=NONE),
+    "overridden": replace(GOOD, enabled=NO_AXES),
     "lost": GOOD,
 }
 """For each state a situation in which it does not change."""
@@ -61,7 +61,7 @@ def test_a_state_without_a_cause_does_not_change(state: State) -> None:
 
 Cause = tuple[str, dict[str, Any], dict[State, State]]
 """The cause's name, its change of the situation, and the target of each state that it ends."""
-WITHOUT: list[Cause] = [(f"without {axis}", {"enabled": ALL - {axis}}, {"engaged": "lost"}) for axis in AXES]
+WITHOUT: list[Cause] = [(f"without {axis}", {"enabled": ALL_AXES - {axis}}, {"engaged": "lost"}) for axis in AXES]
 CAUSES: list[Cause] = [
     ("override", {"overrides": "o"}, dict.fromkeys(("enabling", "engaged", "parking", "lost"), "overridden")),
     ("report missing", {"missing_reports": "u"}, dict.fromkeys(("clearing", "enabling", "engaged", "parking"), "lost")),
@@ -89,11 +89,11 @@ def test_a_cause_ends_its_states(state: State, changes: dict[str, Any], targets:
     assert target(state, **changes) == targets.get(state, state)
 
 
-WANTED = {"wanted": True, "enabled": NONE, "gear": "park"}
+WANTED = {"wanted": True, "enabled": NO_AXES, "gear": "park"}
 NOT_WANTED = {"wanted": False}
-RELEASED = {"wanted": False, "enabled": NONE}
+RELEASED = {"wanted": False, "enabled": NO_AXES}
 INHIBITED = {**WANTED, "inhibit_reason": "h"}
-READY = {"enabled": ALL, "gear": "drive"}
+READY = {"enabled": ALL_AXES, "gear": "drive"}
 ROWS: list[tuple[State, dict[str, Any], State]] = [
     ("idle", WANTED, "clearing"),
     ("idle", {**WANTED, "is_stationary": False}, "idle"),
@@ -109,7 +109,7 @@ ROWS: list[tuple[State, dict[str, Any], State]] = [
     ("clearing", NOT_WANTED, "parking"),
     ("enabling", READY, "engaged"),
     ("enabling", {**READY, "gear": "neutral"}, "enabling"),
-    *(("enabling", {**READY, "enabled": ALL - {axis}}, "enabling") for axis in AXES),
+    *(("enabling", {**READY, "enabled": ALL_AXES - {axis}}, "enabling") for axis in AXES),
     ("enabling", {**READY, "in_state_ns": LIMIT_NS}, "engaged"),
     ("enabling", {"in_state_ns": LIMIT_NS - 1}, "enabling"),
     ("enabling", {"in_state_ns": LIMIT_NS}, "lost"),
@@ -121,10 +121,10 @@ ROWS: list[tuple[State, dict[str, Any], State]] = [
     ("parking", {**RELEASED, "in_state_ns": PAUSE_NS}, "idle"),
     ("parking", {**RELEASED, "wanted": True, "in_state_ns": PAUSE_NS}, "idle"),
     *(("parking", {"enabled": frozenset({axis}), "in_state_ns": LIMIT_NS}, "parking") for axis in AXES),
-    ("lost", {"enabled": NONE, "in_state_ns": LIMIT_NS}, "lost"),
+    ("lost", {"enabled": NO_AXES, "in_state_ns": LIMIT_NS}, "lost"),
     ("lost", NOT_WANTED, "parking"),
     ("lost", {**NOT_WANTED, "enabled": frozenset({"brake"})}, "parking"),
-    ("lost", {**NOT_WANTED, "enabled": ALL - {"brake"}}, "lost"),
+    ("lost", {**NOT_WANTED, "enabled": ALL_AXES - {"brake"}}, "lost"),
     ("lost", {**NOT_WANTED, "since_sent_ns": TIMEOUT_NS - 1}, "parking"),
     ("lost", {**NOT_WANTED, "since_sent_ns": TIMEOUT_NS}, "lost"),
     ("lost", {**RELEASED, "since_sent_ns": TIMEOUT_NS}, "idle"),
@@ -145,7 +145,7 @@ ROWS: list[tuple[State, dict[str, Any], State]] = [
 
 @pytest.mark.parametrize(("state", "changes", "follows"), ROWS)
 def test_a_row_needs_all_of_its_conditions(state: State, changes: dict[str, Any], follows: State) -> None:
-    """A state is left only if every condition of a row is met, and in the nanosecond in which its time has passed."""
+    """A row applies only if all its conditions are met; one with a minimum duration applies exactly from then on."""
     assert target(state, **changes) == follows
 
 
@@ -177,22 +177,22 @@ def test_a_gear_is_named() -> None:
 
 
 DETAILS = {"trips": "TRIP", "command_errors": "ERROR", "reasons": "REASON"}
-SEVERAL: list[tuple[State, dict[str, Any]]] = [
+CASES: list[tuple[State, dict[str, Any]]] = [
     ("engaged", {"trips": "TRIP"}),
-    ("engaged", {"enabled": NONE}),
+    ("engaged", {"enabled": NO_AXES}),
     ("clearing", {"in_state_ns": LIMIT_NS, "overrides": "OVERRIDE"}),
     ("enabling", {"in_state_ns": LIMIT_NS}),
 ]
 
 
 @pytest.mark.parametrize(
-    ("state", "cause", "known"),
-    [(*case, known) for case in SEVERAL for known in DETAILS if (case[0], known) != ("enabling", "trips")],
+    ("state", "cause", "detail"),
+    [(*case, detail) for case in CASES for detail in DETAILS if (case[0], detail) != ("enabling", "trips")],
 )  # a trip ends enabling immediately
-def test_other_reported_problems_are_in_the_reason(state: State, cause: dict[str, Any], known: str) -> None:
-    """A reason contains the kit's other texts, and no empty part if there are none."""
-    text = reason(state, **{**cause, known: DETAILS[known]})
-    assert DETAILS[known] in text
+def test_other_reported_problems_are_in_the_reason(state: State, cause: dict[str, Any], detail: str) -> None:
+    """A reason contains the trips, command errors and reasons that the kit reports, and no empty part without them."""
+    text = reason(state, **{**cause, detail: DETAILS[detail]})
+    assert DETAILS[detail] in text
     assert cause.get("overrides", "") in text
     assert SEPARATOR + "REASON" in reason(state, **{**cause, "command_errors": "ERROR", "reasons": "REASON"})
     for reason_text in (text, reason(state, **cause)):
@@ -204,16 +204,16 @@ def test_other_reported_problems_are_in_the_reason(state: State, cause: dict[str
 @pytest.mark.parametrize("axis", AXES)
 def test_axes_that_are_not_enabled_are_named(axis: Axis) -> None:
     """A reason names exactly the axes that the kit released or did not enable; clearing names none."""
-    others = {"enabled": ALL - {axis}}
+    others = {"enabled": ALL_AXES - {axis}}
     for text in (reason("engaged", **others), reason("enabling", **others, in_state_ns=LIMIT_NS)):
         assert {name for name in AXES if name in text} == {axis}
-    assert reason("engaged", enabled=NONE).endswith(AXES[-1])
+    assert reason("engaged", enabled=NO_AXES).endswith(AXES[-1])
     assert not any(name in reason("clearing", in_state_ns=LIMIT_NS, trips="TRIP") for name in AXES)
 
 
 def test_a_gear_that_was_not_reached_is_named() -> None:
     """If DRIVE was not reached in time the reason names the gear; in DRIVE it names only the missing axes."""
-    assert "park" in reason("enabling", enabled=ALL, in_state_ns=LIMIT_NS)
+    assert "park" in reason("enabling", enabled=ALL_AXES, in_state_ns=LIMIT_NS)
     assert "gear" not in reason("enabling", gear="drive", in_state_ns=LIMIT_NS)
     assert "gear" not in reason("clearing", in_state_ns=LIMIT_NS, trips="TRIP")
 
@@ -242,7 +242,7 @@ def situations() -> Iterator[Situation]:
 
 
 def test_no_states_follow_each_other_in_a_cycle_at_one_instant() -> None:
-    """With any inputs, the transitions of one instant end, and no state is reached twice by them."""
+    """For any inputs, a chain of transitions at one instant ends, and reaches no state twice."""
     assert list(CHOICES) == list(Situation.__struct_fields__)
     for now in situations():
         at_once = replace(now, in_state_ns=0)
@@ -261,7 +261,7 @@ def test_transitions_of_one_instant_follow_the_table() -> None:
     stalled = replace(STAYS["parking"], since_sent_ns=TIMEOUT_NS)
     (lost,) = states_after("parking", stalled)
     assert lost == next_state("parking", stalled)
-    missed = replace(GOOD, wanted=False, enabled=NONE, in_state_ns=LIMIT_NS)
+    missed = replace(GOOD, wanted=False, enabled=NO_AXES, in_state_ns=LIMIT_NS)
     assert [state for state, _ in states_after("engaged", missed)] == ["lost", "idle"]
     assert states_after("idle", STAYS["idle"]) == []
 

@@ -14,7 +14,17 @@ from lavt.vehicle.dbw.adapter import ByWireAdapter
 from lavt.vehicle.dbw.vehicle import DbwVehicle, TruthSource
 from lavt.vehicle.vehicle import Capabilities, ReachedCommand
 
-CAPABILITIES = Capabilities(True, False, True, False, 2.8, 0.5, 0.5, 3.0, 8.0)
+CAPABILITIES = Capabilities(
+    simulated=True,
+    virtual_time=False,
+    ground_truth=True,
+    reset=False,
+    wheelbase_m=2.8,
+    max_steering_rad=0.5,
+    max_steering_rate_radps=0.5,
+    max_acceleration_mps2=3.0,
+    max_braking_mps2=8.0,
+)
 SPEED = CanFrame(0x065, bytes([0, 0, 0, 0, 100, 0, 0, 0]))
 """A SteeringReport of generation 1 with a speed above zero."""
 
@@ -61,7 +71,7 @@ def port() -> StandInPort:
     return StandInPort()
 
 
-def made(port: StandInPort, truth: TruthSource | None = None) -> DbwVehicle:
+def new_vehicle(port: StandInPort, truth: TruthSource | None = None) -> DbwVehicle:
     adapter = ByWireAdapter(profile("dataspeed_gen1"), start_ns=START_NS)
     return DbwVehicle(adapter, port, CAPABILITIES, start_ns=START_NS, truth=truth)
 
@@ -72,7 +82,7 @@ def truth_at(mono_ns: int) -> GroundTruth:
 
 def test_without_truth(port: StandInPort) -> None:
     """Without a source of ground truth a vehicle returns none, and still processes its kit's reports."""
-    vehicle = made(port)
+    vehicle = new_vehicle(port)
     port.waiting = [ReceivedCanFrame(SPEED, START_NS + 1)]
     assert vehicle.advance(START_NS + NS_PER_MS) == []
     assert vehicle.ground_truth() is None
@@ -87,7 +97,7 @@ def test_truth_and_events(port: StandInPort) -> None:
         (truth_at(START_NS + 5), [VehicleEvent(START_NS + 5, "collision", ""), VehicleEvent(START_NS, "off_road", "")]),
         (None, []),
     ]
-    vehicle = made(port, lambda _: truths.pop(0))
+    vehicle = new_vehicle(port, lambda _: truths.pop(0))
     assert vehicle.ground_truth() == truth_at(START_NS)
     override = CanFrame(0x061, bytes([0, 0, 0, 0, 0, 0, 0, 0x10]))  # a foot on the brake
     port.waiting = [ReceivedCanFrame(override, START_NS + 3)]
@@ -105,7 +115,7 @@ def test_truth_and_events(port: StandInPort) -> None:
 @pytest.mark.parametrize(("arrived_ns", "counted_ns"), [(-7, -7), (0, 0), (1, 0)])
 def test_arrival(port: StandInPort, arrived_ns: int, counted_ns: int) -> None:
     """A frame counts from its arrival, but never from later than now."""
-    vehicle = made(port)
+    vehicle = new_vehicle(port)
     now_ns = START_NS + NS_PER_MS
     port.waiting = [ReceivedCanFrame(SPEED, now_ns + arrived_ns)]
     vehicle.apply(Actuation(0.0, 0.0, 0.0), now_ns)
@@ -114,7 +124,7 @@ def test_arrival(port: StandInPort, arrived_ns: int, counted_ns: int) -> None:
 
 def test_wake(port: StandInPort) -> None:
     """The bus is polled every 10 ms or when the port requires it, and no later than the adapter requires."""
-    vehicle = made(port)
+    vehicle = new_vehicle(port)
     vehicle.advance(START_NS + NS_PER_MS)
     assert vehicle.next_wake_ns() == START_NS + 11 * NS_PER_MS
     port.wake_ns = START_NS + 2 * NS_PER_MS
@@ -125,7 +135,7 @@ def test_wake(port: StandInPort) -> None:
 
 def test_bus_gone(port: StandInPort) -> None:
     """A lost bus inhibits driving until a frame arrives, and raises nothing in reading or writing."""
-    vehicle = made(port)
+    vehicle = new_vehicle(port)
     port.is_gone = True
     vehicle.advance(START_NS + 1)
     vehicle.apply(Actuation(0.0, 0.0, 0.0), START_NS + 2)
@@ -161,7 +171,7 @@ def test_engage_and_reached(port: StandInPort, monkeypatch: pytest.MonkeyPatch) 
 
 def test_write_fails(port: StandInPort, monkeypatch: pytest.MonkeyPatch) -> None:
     """A bus that cannot be written to inhibits driving, even if it can be read."""
-    vehicle = made(port)
+    vehicle = new_vehicle(port)
 
     def fail(*_: object) -> None:
         raise BusGone("no more room")
@@ -177,7 +187,7 @@ def test_frames_that_were_not_written(
     port: StandInPort, monkeypatch: pytest.MonkeyPatch, written: int, is_gone: bool
 ) -> None:
     """The adapter gets the frames back that the port did not write, also if the bus is gone meanwhile."""
-    vehicle = made(port)
+    vehicle = new_vehicle(port)
     frames = [CanFrame(number, bytes(8)) for number in range(3)]
     dropped: list[CanFrame] = []
 
@@ -196,7 +206,7 @@ def test_frames_that_were_not_written(
 
 def test_delegation(port: StandInPort) -> None:
     """Capabilities, counts, silence and closing are those of the adapter and the port."""
-    vehicle = made(port)
+    vehicle = new_vehicle(port)
     port.waiting = [ReceivedCanFrame(CanFrame(0x555, bytes(8)), START_NS)]
     before = vehicle.counts.get("unknown_identifier", 0)
     vehicle.advance(START_NS + 1)

@@ -128,7 +128,7 @@ def delayed(attempt: Attempt, by_ms: int) -> Callable[[CanFrame], CanFrame | Non
         if attempt.now_ns - braking_ns[0] >= by_ms * NS_PER_MS:
             return frame
         data = bytearray(frame.data)
-        data[6] &= 0xF7
+        data[6] &= 0xF7  # without WDCBRK
         return CanFrame(frame.identifier, bytes(data))
 
     return spoil

@@ -127,7 +127,7 @@ def test_pedals_follow_with_their_lag() -> None:
 
 
 def test_full_braking_distance_matches_theory() -> None:
-    """From 30 km/h the car stops after v^2 / 2a + v T - a T^2 / 2, for braking a behind a lag T, and stays at rest."""
+    """From 30 km/h the car stops after v^2 / 2a + v T - a T^2 / 2, if its deceleration a has a lag T, and stays."""
     speed_mps = 30 / 3.6
     car = car_at(speed_mps)
     drive(car, Actuation(0.0, 0.0, 1.0), 3.0)
@@ -195,7 +195,7 @@ def test_a_rail_stops_motion_into_it_and_adds_no_energy(
 ) -> None:
     """After a contact the point is outside the rail and does not move into it, and the car has gained no energy."""
     car = CarDynamics(CAR, CarMotion(0.0, 0.0, 0.3, speed_mps, side_mps, yaw_radps), STEP_S)
-    ahead_m, left_m = (3.89, 0.93) if front else (-1.043, -0.93)
+    ahead_m, left_m = (3.89, 0.93) if front else (-1.043, -0.93)  # the front left or the rear right corner
     before_j = energy_j(car)
     car.resolve_contact(Contact(ahead_m, left_m, 0.02, out_rad))
     motion = car.motion

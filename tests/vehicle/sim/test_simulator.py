@@ -269,4 +269,4 @@ def test_a_car_that_hits_the_end_of_a_rail_stops_before_it() -> None:
     assert [event.kind for event in events].count("collision") == 1
     assert max(steps_m) < 0.06
     assert simulator.state().speed_mps < 0.3
-    assert simulator.ground_truth().progress_m < 20.0 - 3.6
+    assert simulator.ground_truth().progress_m < 20.0 - 3.6, "the front is 3.89 m ahead of the rear axle"

@@ -14,6 +14,9 @@ from lavt.vehicle.software_car.kit import Kit
 
 START_NS = 77_000_000_123
 AXES = ("steering", "brake", "throttle")
+STEERING_RATIO = 14.8
+"""Angle of the steering wheel divided by that of the road wheels."""
+DEGREES_PER_RAD = 57.29577951308232
 
 
 def crc_by_division(identifier: int, data: bytes) -> int:
@@ -167,7 +170,7 @@ class KitRig:
         """Return the actuation of the wheels: steering wheel in degrees, throttle, brake."""
         actuation = self.kit.actuation(self.now_ns)
         return (
-            round(actuation.steering_rad * 14.8 * 57.29577951308232, 6),
+            round(actuation.steering_rad * STEERING_RATIO * DEGREES_PER_RAD, 6),
             round(actuation.throttle, 4),
             round(actuation.brake, 4),
         )
@@ -177,7 +180,7 @@ def with_crc_broken(frame: CanFrame) -> CanFrame:
     return CanFrame(frame.identifier, frame.data[:-1] + bytes([frame.data[-1] ^ 1]))
 
 
-ALL = set(AXES)
+ALL_AXES = set(AXES)
 both_generations = pytest.mark.parametrize("generation", [1, 2])
 
 

@@ -1,7 +1,7 @@
 """Overrides by the driver, and shifting."""
 
 import pytest
-from tests.vehicle.software_car.rig import ALL, AXES, KitRig, both_generations, driving_rig
+from tests.vehicle.software_car.rig import ALL_AXES, AXES, KitRig, both_generations, driving_rig
 
 from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.software_car.state import Gear, GearRejection, ReleaseReason
@@ -16,18 +16,18 @@ def test_override(generation: int, axis: str) -> None:
         axis
     ]
     act(3.0 if axis == "steering" else 0.3, rig.now_ns)
-    released = ALL if generation == 2 else {axis}
-    assert rig.enabled() == ALL - released
+    released = ALL_AXES if generation == 2 else {axis}
+    assert rig.enabled() == ALL_AXES - released
     act(0.0, rig.now_ns)
     rig.drive_ms(1000, throttle=0.1)
     rig.request_system()
-    assert rig.enabled() == ALL - released
+    assert rig.enabled() == ALL_AXES - released
     assert rig.kit.state.watchdog_reason == ReleaseReason.NONE
     rig.request_system(0)
     rig.send(*rig.sender.clearing())
     rig.command()
     rig.request_system()
-    assert rig.enabled() == ALL
+    assert rig.enabled() == ALL_AXES
 
 
 @both_generations
@@ -49,7 +49,7 @@ def test_small_inputs_do_not_override(generation: int) -> None:
     rig.kit.driver_steers(1.9, rig.now_ns)
     rig.kit.driver_brakes(0.04, rig.now_ns)
     rig.kit.driver_throttles(0.04, rig.now_ns)
-    assert rig.enabled() == ALL
+    assert rig.enabled() == ALL_AXES
 
 
 @both_generations
@@ -60,7 +60,7 @@ def test_ignore_prevents_an_override(generation: int) -> None:
     rig.kit.driver_steers(8.0, rig.now_ns)
     rig.kit.driver_brakes(1.0, rig.now_ns)
     rig.command(ignore=True)
-    assert rig.enabled() == ALL
+    assert rig.enabled() == ALL_AXES
 
 
 def test_clearing_frames_have_no_counter() -> None:
@@ -142,12 +142,12 @@ def test_override_by_the_shifter() -> None:
         ReleaseReason.OVERRIDE,
         ReleaseReason.NONE,
     )
-    first = driving_rig(1)
-    first.kit.driver_shifts(Gear.NEUTRAL, first.now_ns)
-    first.command(enable=False)
-    assert (first.kit.state.is_gear_overridden, first.kit.state.watchdog_reason) == (True, ReleaseReason.NONE)
-    first.send(first.sender.gear(0, clear=True))
-    assert not first.kit.state.is_gear_overridden
+    rig_1 = driving_rig(1)
+    rig_1.kit.driver_shifts(Gear.NEUTRAL, rig_1.now_ns)
+    rig_1.command(enable=False)
+    assert (rig_1.kit.state.is_gear_overridden, rig_1.kit.state.watchdog_reason) == (True, ReleaseReason.NONE)
+    rig_1.send(rig_1.sender.gear(0, clear=True))
+    assert not rig_1.kit.state.is_gear_overridden
 
 
 @both_generations
@@ -160,4 +160,4 @@ def test_the_driver_prevents_enabling(generation: int) -> None:
     rig.kit.driver_brakes(0.0, rig.now_ns)
     rig.command()
     rig.request_system()
-    assert rig.enabled() == (set() if generation == 2 else ALL - {"brake"})
+    assert rig.enabled() == (set() if generation == 2 else ALL_AXES - {"brake"})

@@ -1,7 +1,17 @@
 """Enabling the axes of a kit, and commands of enabled axes."""
 
 import pytest
-from tests.vehicle.software_car.rig import ALL, CommandValues, KitRig, Sender2, both_generations, driving_rig, with_crc
+from tests.vehicle.software_car.rig import (
+    ALL_AXES,
+    DEGREES_PER_RAD,
+    STEERING_RATIO,
+    CommandValues,
+    KitRig,
+    Sender2,
+    both_generations,
+    driving_rig,
+    with_crc,
+)
 
 from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.software_car.state import ReleaseReason, SystemState
@@ -22,19 +32,19 @@ def test_generation_2_needs_a_request_and_commands_to_all_axes() -> None:
     rig.command()
     assert (rig.enabled(), rig.kit.state.system) == (set(), SystemState.READY)
     rig.request_system()
-    assert (rig.enabled(), rig.kit.state.system) == (ALL, SystemState.ACTIVE)
+    assert (rig.enabled(), rig.kit.state.system) == (ALL_AXES, SystemState.ACTIVE)
     other = KitRig(2)
     other.request_system()
     steering, brake, throttle = other.sender.commands(CommandValues())
     other.send(steering, brake)
     assert other.enabled() == set()
     other.send(throttle)
-    assert other.enabled() == ALL
+    assert other.enabled() == ALL_AXES
 
 
 def test_a_request_to_enable_expires() -> None:
     """A request to enable expires after 100 ms: later commands enable nothing."""
-    for wait_ms, enabled in ((99.999, ALL), (100, set())):
+    for wait_ms, enabled in ((99.999, ALL_AXES), (100, set())):
         rig = KitRig(2)
         rig.request_system()
         rig.wait_ms(wait_ms)
@@ -64,7 +74,7 @@ def test_generation_2_needs_a_new_request() -> None:
     assert (rig.enabled(), rig.kit.state.system) == (set(), SystemState.READY)
     rig.request_system(2)
     rig.request_system()
-    assert rig.enabled() == ALL
+    assert rig.enabled() == ALL_AXES
 
 
 def test_only_the_chosen_set_is_accepted() -> None:
@@ -77,7 +87,7 @@ def test_only_the_chosen_set_is_accepted() -> None:
     user = KitRig(2, commands="user")
     user.sender = Sender2(0x210)
     user.enable()
-    assert user.enabled() == ALL
+    assert user.enabled() == ALL_AXES
 
 
 @both_generations
@@ -99,7 +109,7 @@ def test_steering_rate(generation: int) -> None:
     quick = driving_rig(generation)
     quick.command(angle_deg=300.0)
     quick.wait_ms(20)
-    assert quick.wheels()[0] == pytest.approx(0.02 * 17.5 * 57.29578)
+    assert quick.wheels()[0] == pytest.approx(0.02 * 17.5 * DEGREES_PER_RAD)
 
 
 @both_generations
@@ -108,7 +118,7 @@ def test_steering_starts_at_the_current_angle(generation: int) -> None:
     rig = KitRig(generation)
     rig.set_motion(0.0, steering_rad=0.2)
     rig.enable()
-    assert rig.wheels()[0] == pytest.approx(0.2 * 14.8 * 57.29578)
+    assert rig.wheels()[0] == pytest.approx(0.2 * STEERING_RATIO * DEGREES_PER_RAD)
 
 
 @both_generations
@@ -117,12 +127,12 @@ def test_an_unknown_command_type_enables_nothing(generation: int) -> None:
     rig = KitRig(generation)
     rig.request_system()
     rig.command(angle_deg=1.0)
-    assert rig.enabled() == ALL
+    assert rig.enabled() == ALL_AXES
     _, brake, _ = rig.sender.commands(CommandValues(brake=0.5))
     data = bytearray(brake.data)
     data[2] = 7 << 4 if generation == 1 else 1 << 4 | 7
     rig.send(CanFrame(0x060, bytes(data)) if generation == 1 else with_crc(0x201, bytes(data[:-1])))
-    assert rig.enabled() == (ALL - {"brake"} if generation == 1 else set())
+    assert rig.enabled() == (ALL_AXES - {"brake"} if generation == 1 else set())
 
 
 @pytest.mark.parametrize(
@@ -154,6 +164,6 @@ def test_a_repeated_counter_invalidates_a_request() -> None:
     rig.request_system()
     rig.sender.count -= 1
     rig.request_system(2)
-    assert rig.enabled() == ALL
+    assert rig.enabled() == ALL_AXES
     rig.request_system(2)
     assert rig.enabled() == set()

@@ -1,7 +1,7 @@
 """Faults of a kit, conditions that inhibit it, and loss of the bus."""
 
 import pytest
-from tests.vehicle.software_car.rig import ALL, KitRig, both_generations, driving_rig
+from tests.vehicle.software_car.rig import ALL_AXES, KitRig, both_generations, driving_rig
 
 from lavt.errors import UserError
 from lavt.vehicle.software_car.authority import WATCHDOG_BRAKE
@@ -32,15 +32,15 @@ def test_a_fault_disengages_and_brakes(generation: int, name: str) -> None:
 
 @pytest.mark.parametrize(("generation", "name"), FAULTS)
 def test_a_faulty_axis_is_not_enabled(generation: int, name: str) -> None:
-    """A part with a fault is not enabled, and generation 2 not at all; clearing the fault allows it again."""
+    """An axis with a fault is not enabled, and in generation 2 no axis is; clearing the fault allows it again."""
     rig = KitRig(generation)
     rig.kit.set_fault(name, rig.now_ns)
     rig.command()
     rig.request_system()
-    assert rig.enabled() == (set() if generation == 2 else ALL - {name.split(".", maxsplit=1)[0]})
+    assert rig.enabled() == (set() if generation == 2 else ALL_AXES - {name.split(".", maxsplit=1)[0]})
     rig.kit.set_fault(name, rig.now_ns, is_set=False)
     rig.command()
-    assert rig.enabled() == ALL
+    assert rig.enabled() == ALL_AXES
 
 
 @pytest.mark.parametrize(
@@ -61,7 +61,7 @@ def test_an_inhibit_reason_of_generation_2_disengages(name: str, reason: Release
     rig.request_system()
     assert (rig.enabled(), rig.kit.state.system, rig.kit.state.not_ready_reason) == (set(), SystemState.MANUAL, reason)
     rig.kit.inhibit(None, rig.now_ns)
-    assert rig.enabled() == ALL
+    assert rig.enabled() == ALL_AXES
     rig.kit.inhibit(name, rig.now_ns)
     assert (rig.enabled(), rig.kit.state.watchdog_brakes) == (set(), True)
 

@@ -1,4 +1,4 @@
-"""A bus within the process to a software car."""
+"""Test the bus that connects to a software car in the same process."""
 
 from __future__ import annotations
 
@@ -90,8 +90,8 @@ def test_the_car_receives_frames_one_at_a_time() -> None:
     port.send(sender.commands(CommandValues(brake=0.5)), START_NS)
     actuators = port.car.kit.state.actuators
     commanded_axes = []
-    for quarters in range(5):
-        port.take(START_NS + quarters * FRAME_NS)
+    for frame_times in range(5):
+        port.take(START_NS + frame_times * FRAME_NS)
         commanded_axes.append([axis for axis, actuator in actuators.items() if actuator.order])
     assert commanded_axes == [[], ["steering"], ["steering", "brake"], *[["steering", "brake", "throttle"]] * 2]
 
@@ -136,7 +136,7 @@ def test_polling_at_wake_times() -> None:
         received += arrived
         assert port.next_wake_ns() > now_ns
         now_ns = port.next_wake_ns()
-    assert len(received) == 100 * 2 + 50 * 3 + 10 * 3
+    assert len(received) == 100 * 2 + 50 * 3 + 10 * 3, "two reports have 100 Hz, three 50 Hz and three 10 Hz"
 
 
 def test_events_are_returned_once() -> None:

@@ -61,6 +61,7 @@ def test_generation_1_reports_of_a_drive() -> None:
     rig.set_motion(10.0, steering_rad=math.radians(10.0))
     rig.kit.driver_steers(-1.5, rig.now_ns)
     found = reports(rig)
+    # Angle and command in 0.1 degrees at the steering wheel, speed in 1/360 m/s, torque in 1/16 Nm, flags.
     assert found[0x065] == struct.pack("<hHhbB", 1480, -450 & 0x7FFF, 3600, -24, 0b00000001)
     assert found[0x061] == struct.pack("<HHHBB", 0, 8192, 8192, 0, 0b00000001)
     assert found[0x063] == struct.pack("<HHHBB", 0, 16384, 16384, 0, 0b00000001)

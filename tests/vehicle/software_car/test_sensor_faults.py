@@ -8,6 +8,7 @@ import pytest
 from tests.vehicle.software_car.rig import KitRig, driving_rig
 
 SPEED, WHEELS = {1: (0x065, 4), 2: (0x107, 0)}, {1: 0x06A, 2: 0x2A4}
+"""By generation: identifier and position of the speed, and identifier of the wheel speeds."""
 both_generations = pytest.mark.parametrize("generation", [1, 2])
 
 

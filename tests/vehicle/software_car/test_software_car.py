@@ -127,4 +127,4 @@ def test_a_car_without_commands_is_stationary() -> None:
     car = SoftwareCar(Kit(2, start_ns=START_NS), Simulator(road=road(), seed=1, start_mono_ns=START_NS))
     frames = car.advance(START_NS + NS_PER_S)
     assert car.simulator.state().speed_mps == 0.0
-    assert len(frames) == 100 * 2 + 50 * 3 + 10 * 3
+    assert len(frames) == 100 * 2 + 50 * 3 + 10 * 3, "two reports have 100 Hz, three 50 Hz and three 10 Hz"

@@ -4,8 +4,10 @@ from itertools import product
 
 import pytest
 from tests.vehicle.software_car.rig import (
-    ALL,
+    ALL_AXES,
     AXES,
+    DEGREES_PER_RAD,
+    STEERING_RATIO,
     CommandValues,
     KitRig,
     Sender2,
@@ -24,7 +26,7 @@ def test_commands_time_out_after_100_ms(generation: int) -> None:
     rig = driving_rig(generation)
     rig.command(throttle=0.5)
     rig.wait_ms(99.999)
-    assert (rig.enabled(), rig.wheels()[1:]) == (ALL, (0.5, 0.0))
+    assert (rig.enabled(), rig.wheels()[1:]) == (ALL_AXES, (0.5, 0.0))
     rig.wait_ms(0.001)
     assert (rig.enabled(), rig.wheels()[1:]) == (set(), (0.0, WATCHDOG_BRAKE))
     assert all(actuator.has_timed_out for actuator in rig.kit.state.actuators.values())
@@ -46,16 +48,16 @@ def test_late_calls_give_the_same_state(generation: int) -> None:
 
 
 @both_generations
-@pytest.mark.parametrize("part", [0, 1, 2])
-def test_a_timeout_of_one_axis_trips_the_watchdog(generation: int, part: int) -> None:
+@pytest.mark.parametrize("axis_index", [0, 1, 2])
+def test_a_timeout_of_one_axis_trips_the_watchdog(generation: int, axis_index: int) -> None:
     """If commands to a single axis stop, the watchdog trips and all axes are released."""
     rig = driving_rig(generation)
     for _ in range(5):
         rig.wait_ms(20)
         frames = rig.sender.commands(CommandValues(throttle=0.5))
-        rig.send(*(frame for index, frame in enumerate(frames) if index != part))
+        rig.send(*(frame for index, frame in enumerate(frames) if index != axis_index))
     assert (rig.enabled(), rig.kit.state.watchdog_reason) == (set(), ReleaseReason.TIMEOUT)
-    assert rig.kit.state.watchdog_axis == AXES[part]
+    assert rig.kit.state.watchdog_axis == AXES[axis_index]
 
 
 def test_without_a_watchdog_only_one_axis_is_released() -> None:
@@ -66,7 +68,7 @@ def test_without_a_watchdog_only_one_axis_is_released() -> None:
         rig.send(*rig.sender.commands(CommandValues(throttle=0.5))[1:])
     assert (rig.enabled(), rig.kit.state.watchdog_brakes) == ({"brake", "throttle"}, False)
     rig.command()
-    assert rig.enabled() == ALL
+    assert rig.enabled() == ALL_AXES
 
 
 @both_generations
@@ -75,7 +77,7 @@ def test_a_repeated_counter_trips_the_watchdog(generation: int) -> None:
     rig = driving_rig(generation)
     frames = rig.sender.commands(CommandValues(throttle=0.5))
     rig.send(*frames)
-    assert rig.enabled() == ALL
+    assert rig.enabled() == ALL_AXES
     rig.wait_ms(20)
     rig.send(frames[2])
     assert (rig.enabled(), rig.kit.state.watchdog_reason, rig.wheels()[1:]) == (
@@ -93,7 +95,7 @@ def test_counter_rules(generation: int, step: int, is_right: bool) -> None:
     rig = driving_rig(generation)
     rig.sender.count += step - 1
     rig.command()
-    assert rig.enabled() == (ALL if is_right else set())
+    assert rig.enabled() == (ALL_AXES if is_right else set())
 
 
 def test_counters_wrap() -> None:
@@ -101,22 +103,22 @@ def test_counters_wrap() -> None:
     for generation in (1, 2):
         rig = driving_rig(generation)
         rig.drive_ms(10_000)
-        assert rig.enabled() == ALL
+        assert rig.enabled() == ALL_AXES
 
 
 def test_a_wrong_checksum_trips_the_watchdog() -> None:
     """A command of generation 2 with a wrong checksum is rejected and reported as bad_crc, and the kit brakes."""
-    for part in range(3):
+    for axis_index in range(3):
         rig = driving_rig(2)
         frames = rig.sender.commands(CommandValues(angle_deg=50.0, throttle=0.5))
-        rig.send(with_crc_broken(frames[part]))
+        rig.send(with_crc_broken(frames[axis_index]))
         assert (rig.enabled(), rig.kit.state.watchdog_reason, rig.kit.state.system) == (
             set(),
             ReleaseReason.CRC,
             SystemState.FAULT,
         )
         assert [rig.kit.state.actuators[axis].is_crc_bad for axis in ("steering", "brake", "throttle")] == [
-            index == part for index in range(3)
+            index == axis_index for index in range(3)
         ]
         assert rig.wheels()[1:] == (0.0, WATCHDOG_BRAKE)
 
@@ -164,7 +166,7 @@ def test_the_watchdog_brakes_until_an_override(generation: int) -> None:
     rig.request_system(0)
     rig.command(clear=True)
     rig.request_system()
-    assert rig.enabled() == ALL
+    assert rig.enabled() == ALL_AXES
 
 
 @both_generations
@@ -175,6 +177,6 @@ def test_a_released_wheel_keeps_its_angle(generation: int) -> None:
     rig.wait_ms(50)
     rig.set_motion(10.0, steering_rad=0.05)
     rig.wait_ms(50)
-    assert rig.wheels()[0] == pytest.approx(0.05 * 14.8 * 57.29578)
+    assert rig.wheels()[0] == pytest.approx(0.05 * STEERING_RATIO * DEGREES_PER_RAD)
     rig.wait_ms(1000)
-    assert rig.wheels()[0] == pytest.approx(0.05 * 14.8 * 57.29578)
+    assert rig.wheels()[0] == pytest.approx(0.05 * STEERING_RATIO * DEGREES_PER_RAD)

@@ -1,4 +1,4 @@
-"""Pictures in the three lights."""
+"""Test pictures in the three lights: noon, low sun and overcast."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from lavt.vehicle.sim.rendering.light import LIGHTS, LightName
 from lavt.vehicle.sim.rendering.pinhole import place_camera
 from lavt.vehicle.sim.road.road import Road, load_road
 
-NAMES: tuple[LightName, ...] = ("noon", "low_sun", "overcast")
+LIGHT_NAMES: tuple[LightName, ...] = ("noon", "low_sun", "overcast")
+RAIL_OFFSET_M, RAIL_HEIGHT_M = -9.15, 0.76
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +36,7 @@ def asphalt(light: LightName) -> FloatArray:
 
 def test_the_low_sun_is_warm_and_dark() -> None:
     """A low sun makes the road darker and redder than at noon; under clouds the road is not reddish."""
-    noon, low, clouds = (np.median(asphalt(light), axis=0) for light in NAMES)
+    noon, low, clouds = (np.median(asphalt(light), axis=0) for light in LIGHT_NAMES)
     assert low.mean() < 0.9 * noon.mean()
     assert low[2] / low[0] > 1.2 * noon[2] / noon[0]
     assert clouds[2] <= clouds[0]
@@ -59,14 +60,14 @@ def test_a_rails_shadow_falls_away_from_the_sun(road: Road) -> None:
     picture = picture_of(camera, pose_at(road, 80.0))
     station_m = 88.0
     ahead, left = road.point_at(station_m, [0.0, 1.0])
-    reach_m = 0.76 * float(LIGHTS["low_sun"].shadow_m @ (left - ahead))
+    reach_m = RAIL_HEIGHT_M * float(LIGHTS["low_sun"].shadow_m @ (left - ahead))
     assert reach_m > 3.0  # the sun is to the right here
-    inside = grey_at(picture, road, station_m, -9.15 + 0.85 * reach_m, 80.0)
-    beyond = grey_at(picture, road, station_m, -9.15 + 1.5 * reach_m, 80.0)
+    inside = grey_at(picture, road, station_m, RAIL_OFFSET_M + 0.85 * reach_m, 80.0)
+    beyond = grey_at(picture, road, station_m, RAIL_OFFSET_M + 1.5 * reach_m, 80.0)
     assert inside < 0.7 * beyond
 
 
-@pytest.mark.parametrize("light", NAMES)
+@pytest.mark.parametrize("light", LIGHT_NAMES)
 def test_marks_stand_out_in_every_light(road: Road, light: LightName) -> None:
     """In every light a solid mark is at least 1.5 times as bright as the asphalt beside it."""
     picture = picture_of(camera_on(road, light=light), pose_at(road, 0.0)).astype(np.uint8)
@@ -82,7 +83,7 @@ print(digest(picture_of(camera_on(road, light="{light}"), pose_at(road, 70.0, 0.
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("light", NAMES)
+@pytest.mark.parametrize("light", LIGHT_NAMES)
 def test_a_frame_is_byte_for_byte_reproducible(road: Road, light: LightName) -> None:
     """Equal pose, number and seed give equal bytes with cold and warm caches, and in another process."""
     renderer.world.cache_clear()

@@ -54,6 +54,7 @@ def test_the_seed_changes_only_the_sensor_noise(road: Road) -> None:
 
 
 def marks_in_view(road: Road, pose: Pose, model: CameraModel, offset_m: float, stations: FloatArray) -> FloatArray:
+    """Return the projections (n, 3) of a mark's points at these stations, of those that are in the picture."""
     ground = road.point_at(stations, offset_m)
     points = place_camera(model, pose).project(np.column_stack([ground, np.zeros(len(ground))]))
     inside = (points[:, 0] > 4) & (points[:, 0] < model.width_px - 5) & (points[:, 1] < model.height_px - 2)
@@ -74,10 +75,10 @@ def test_marks_are_at_their_projection(road: Road, turned_rad: float, pitch_rad:
         # The mark's projection is exact at v_px; the row is up to half a pixel away, so follow the mark to the row.
         near = marks_in_view(road, pose, model, -5.25, np.arange(25.0, 50.0, 0.02))
         at_row = near[np.argmin(np.abs(near[:, 1] - row)), 0]
-        reach = np.arange(max(column - 14, 0), min(column + 15, model.width_px))
-        bright = np.clip(picture[row, reach] - np.median(picture[row, reach]) - 18.0, 0.0, None)
+        near_columns = np.arange(max(column - 14, 0), min(column + 15, model.width_px))
+        bright = np.clip(picture[row, near_columns] - np.median(picture[row, near_columns]) - 18.0, 0.0, None)
         assert bright.sum() > 20
-        assert (bright * reach).sum() / bright.sum() == pytest.approx(at_row, abs=1.0)
+        assert (bright * near_columns).sum() / bright.sum() == pytest.approx(at_row, abs=1.0)
 
 
 def test_dashes_are_bright_and_gaps_are_not(road: Road) -> None:
@@ -175,9 +176,9 @@ def test_a_turned_camera_has_marks_at_their_projection(road: Road, scenery: Scen
         row, column = round(v_px), round(u_px)
         near = marks_in_view(road, pose, TURNED, -1.75, np.arange(3.0, 10.0, 0.005))
         at_row = near[np.argmin(np.abs(near[:, 1] - row)), 0]
-        reach = np.arange(max(column - 30, 0), min(column + 31, TURNED.width_px))
-        bright = np.clip(picture[row, reach] - np.median(picture[row, reach]) - 40.0, 0.0, None)
-        assert (bright * reach).sum() / bright.sum() == pytest.approx(at_row, abs=1.5)
+        near_columns = np.arange(max(column - 30, 0), min(column + 31, TURNED.width_px))
+        bright = np.clip(picture[row, near_columns] - np.median(picture[row, near_columns]) - 40.0, 0.0, None)
+        assert (bright * near_columns).sum() / bright.sum() == pytest.approx(at_row, abs=1.5)
 
 
 def test_far_dashes_do_not_flicker(road: Road) -> None:

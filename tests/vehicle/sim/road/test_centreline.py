@@ -14,9 +14,12 @@ ARCS = st.builds(lambda length, curvature: Segment(length, curvature, curvature)
 CLOTHOIDS = st.builds(Segment, st.floats(1.0, 80.0), CURVATURES, CURVATURES)
 SEGMENTS = st.lists(st.one_of(LINES, ARCS, CLOTHOIDS), min_size=1, max_size=6)
 
+FIRST_M = -10.0
+"""The station at which the lines of the tests begin."""
+
 
 def line_of(segments: list[Segment]) -> Centreline:
-    return Centreline(-10.0, (3.0, -2.0, 0.7), segments)
+    return Centreline(FIRST_M, (3.0, -2.0, 0.7), segments)
 
 
 @settings(max_examples=200)
@@ -26,7 +29,7 @@ def test_projection_inverts_station_and_offset(
 ) -> None:
     """A point constructed from a station and an offset is projected back to them, for any segments."""
     line = line_of(segments)
-    s_m = -10.0 + share * (line.last_m + 10.0)
+    s_m = FIRST_M + share * (line.last_m - FIRST_M)
     x_m, y_m, heading_rad, _ = (float(value) for value in line.sample(s_m))
     projection = line.project(
         x_m - offset_m * math.sin(heading_rad),
@@ -64,7 +67,7 @@ def test_a_clothoid_is_the_fresnel_integral() -> None:
 def test_a_centreline_is_continuous(segments: list[Segment]) -> None:
     """Position and heading are continuous at every joint, and on both sides of it the curvature is the segment's."""
     line = line_of(segments)
-    joint_m = -10.0
+    joint_m = FIRST_M
     for before, after in itertools.pairwise(segments):
         joint_m += before.length_m
         x_m, y_m, heading_rad, curvature = line.sample([joint_m - 1e-6, joint_m + 1e-6])
