@@ -31,7 +31,7 @@ def test_the_same_drive_has_the_same_seed(demo: Demo, condition: str) -> None:
 
 def computation_ms(result: dict[str, Any]) -> float:
     """Return the sum of the medians of the stages that depend on the machine's speed."""
-    return sum(stage["p50"] for stage in result["stages_ms"] if stage["stage"] in COMPUTATION)
+    return sum(float(stage["p50"]) for stage in result["stages_ms"] if stage["stage"] in COMPUTATION)
 
 
 @pytest.mark.parametrize("condition", CONDITIONS)
