@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import pytest
+from tests.support.clocks import ManualClock
 
+from lavt.assembly import by_wire
 from lavt.assembly.by_wire import inhibit_reason_of
 from lavt.assembly.dbw import load_profile
+from lavt.assembly.software_car import build_software_car
 from lavt.config import DbwConfig, ServerConfig, ServerSecurityConfig, VehicleConfig
-from lavt.domain import NS_PER_S, State
+from lavt.domain import NS_PER_MS, NS_PER_S, State
 from lavt.safety.gate import RejectionReason
 from lavt.transport.messages import ELLIPSIS, decode, encode
+from lavt.vehicle.can_frame import CanFrame, ReceivedCanFrame
 from lavt.vehicle.dbw.adapter import ByWireAdapter
 from lavt.vehicle.dbw.profile import Profile
+from lavt.vehicle.sim.road.road import load_road
+from lavt.vehicle.software_car.runner import SoftwareCarRunner
 
 
 @pytest.fixture
@@ -84,3 +91,47 @@ def test_a_kit_that_is_off_and_has_no_proof_has_a_readable_state(verified_profil
     decoded = decode(State, encode(state))
     assert decoded.reason == state.reason
     assert state.rejected.startswith(decoded.rejected.removesuffix(ELLIPSIS))
+
+
+class CarOnABus:
+    """A port to a bus with a software car, which is silent from a time on."""
+
+    def __init__(self, config: ServerConfig, silent_ns: int) -> None:
+        profile = load_profile(config.vehicle.dbw.profile, steering_sign=1)
+        car = build_software_car(config, profile, load_road("a_key"), start_ns=0)
+        self._runner, self._silent_ns = SoftwareCarRunner(car, self, start_ns=0), silent_ns
+        self._sent: list[CanFrame] = []
+        self._is_car = False
+
+    def send(self, frames: Sequence[CanFrame], _made_ns: int) -> int:
+        """Put frames of the car on the bus."""
+        self._sent += frames
+        return len(frames)
+
+    def take(self, now_ns: int) -> list[ReceivedCanFrame]:
+        """Return the car's frames; the car itself receives none."""
+        if self._is_car or now_ns >= self._silent_ns:
+            return []
+        self._is_car = True
+        self._runner.step(now_ns)
+        self._is_car = False
+        frames, self._sent = self._sent, []
+        return [ReceivedCanFrame(frame, now_ns) for frame in frames]
+
+    def next_wake_ns(self) -> None:
+        """Return None: the arrival of frames cannot be predicted."""
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+@pytest.mark.parametrize("silent_ns", [400 * NS_PER_MS, 2 * NS_PER_S])
+def test_a_bus_that_became_silent_inhibits_driving(monkeypatch: pytest.MonkeyPatch, silent_ns: int) -> None:
+    """Reports that are old at the end of listening count as missing, although they had arrived."""
+    dbw = DbwConfig(interface="virtual", channel="test", profile="dataspeed_gen1", steering_sign=1)
+    config, clock = ServerConfig(vehicle=VehicleConfig(kind="dbw", dbw=dbw)), ManualClock()
+    monkeypatch.setattr(by_wire, "CanPort", lambda *_, **__: CarOnABus(config, silent_ns))
+    monkeypatch.setattr(by_wire, "pause", lambda pause_ns: clock.advance(pause_ns / NS_PER_MS))
+    frames, reason = by_wire.listen(config, clock, NS_PER_S)
+    assert frames > 0
+    assert ("SteeringReport" in reason) == (silent_ns < NS_PER_S), reason

@@ -74,7 +74,7 @@ def listen(config: ServerConfig, clock: Clock, duration_ns: int) -> tuple[int, s
         return frames, str(error)
     finally:
         port.close()
-    adapter.engage(wanted=False, now_ns=end_ns)
+    adapter.frames_due(end_ns)  # none are due; the reports' ages are judged again
     return frames, adapter.state().inhibit_reason
 
 

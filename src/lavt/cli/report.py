@@ -58,14 +58,15 @@ def report(
 def _base_config(directories: Sequence[Path], names: dict[Path, str]) -> dict[str, Any] | None:
     """Return the base config by which the report groups its runs; None if there is none.
 
-    It is that of the only directory or, if there are several sweeps (`names`), that of the first one with its name.
+    It is that of the first sweep, with its name if there are several (`names`).
     """
     from lavt.experiment.sweep.sweep import recorded_base  # noqa: PLC0415 (slow: scipy, matplotlib)
 
-    if len(directories) == 1:
-        return recorded_base(directories[0])
-    first = next(iter(names), None)
-    return None if first is None else {**(recorded_base(first) or {}), "sweep": names[first]}
+    first = next((directory for directory in directories if not (directory / RESULT).is_file()), None)
+    if first is None:
+        return None
+    base = recorded_base(first)
+    return {**(base or {}), "sweep": names[first]} if first in names else base
 
 
 def _sweep_names(directories: Sequence[Path]) -> dict[Path, str]:
