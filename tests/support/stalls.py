@@ -64,7 +64,7 @@ class ProbeEnded(Exception):
 class Stall:
     """An interval in which one processor did not run its probe (CLOCK_MONOTONIC)."""
 
-    processor: int
+    processor: int | str
     begin_ns: int
     end_ns: int
 
@@ -85,7 +85,7 @@ def overlapping(stalls: Iterable[Stall], since_ns: int, until_ns: int, *, at_lea
 
 def stalled_share(stalls: Iterable[Stall], since_ns: int, until_ns: int) -> float:
     """Return the share of an interval in which the processor with most stalls was stalled."""
-    total_ns: dict[int, int] = {}
+    total_ns: dict[int | str, int] = {}
     for stall in overlapping(stalls, since_ns, until_ns):
         within_ns = min(stall.end_ns, until_ns) - max(stall.begin_ns, since_ns)
         total_ns[stall.processor] = total_ns.get(stall.processor, 0) + within_ns
@@ -143,8 +143,8 @@ class Probe(Protocol):
 class ProbeProcess:
     """A process that runs `lateness_probe.py` on one processor."""
 
-    def __init__(self, processor: int) -> None:
-        self.processor = processor
+    def __init__(self, processor: int, name: str = "") -> None:
+        self.processor: int | str = name or processor
         self._process = subprocess.Popen(
             [sys.executable, "-I", "-S", PROBE, str(processor)],
             stdin=subprocess.PIPE,
@@ -285,7 +285,7 @@ class Stalls:
         """Return a summary of the record until the last report, by processor."""
         elapsed_ns = max(self._reported_ns - self._began_ns, 1)
         by_processor = []
-        for processor in sorted({stall.processor for stall in self.recorded}):
+        for processor in sorted({stall.processor for stall in self.recorded}, key=str):
             on_processor = [stall for stall in self.recorded if stall.processor == processor]
             counted = [stall for stall in on_processor if stall.length_ms >= COUNTED_MS]
             share = stalled_share(on_processor, self._began_ns, self._reported_ns)
