@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from tests.perception.lens import ground_points
 
@@ -46,7 +46,14 @@ def are_inside(camera: CalibratedCamera, pixels: np.ndarray) -> np.ndarray:
     return np.asarray(inside.all(axis=1))
 
 
+AT_THE_FOLD = CalibratedCamera(
+    640, 480, (250.0, 250.0), (300.0, 220.0), 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, distortion=(-0.21875, 0.0, 0.0, 0.0, 0.0)
+)
+"""A lens whose distortion folds back just before one of the ground points."""
+
+
 @settings(max_examples=60, derandomize=True)
+@example(AT_THE_FOLD)
 @given(cameras())
 def test_projection_and_inverse_projection_agree(camera: CalibratedCamera) -> None:
     """The inverse projection of a ground point's pixel is the point within 1 cm, through any lens."""

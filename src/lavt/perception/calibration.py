@@ -20,7 +20,7 @@ REFERENCE_FOCAL_PX = 320.0
 """The focal length of the reference camera for sizes in pixels: 640 columns over 90 degrees."""
 
 RAY_STEPS = 8
-"""Number of steps from the lens's axis to a ray. The image radius must increase with each step.
+"""Number of steps from the lens's axis to a ray. The image radius must increase with each step, and one step beyond.
 
 Beyond some angle a distortion polynomial folds back: it maps points that the lens does not see into the picture.
 """
@@ -138,6 +138,6 @@ def _in_lens_field(camera: CalibratedCamera, rays: FloatArray) -> NDArray[np.boo
         return np.ones(len(rays), dtype=np.bool_)
     radii = [
         np.hypot(*((_distort(camera, rays * step / RAY_STEPS) - camera.middle_px) / camera.focal_px).T)
-        for step in range(RAY_STEPS + 1)
+        for step in range(RAY_STEPS + 2)
     ]
     return np.asarray(np.all(np.diff(radii, axis=0) > 0, axis=0))
