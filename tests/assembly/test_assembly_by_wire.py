@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -101,6 +102,7 @@ class CarOnABus:
         car = build_software_car(config, profile, load_road("a_key"), start_ns=0)
         self._runner, self._silent_ns = SoftwareCarRunner(car, self, start_ns=0), silent_ns
         self._sent: list[CanFrame] = []
+        self.counts: Counter[str] = Counter()
         self._is_car = False
 
     def send(self, frames: Sequence[CanFrame], _made_ns: int) -> int:
