@@ -305,7 +305,7 @@ class Stalls:
 
 
 class SharedResult(Generic[Result]):
-    """A result that several tests judge, such as a drive; it is made again, at most twice, after a stall."""
+    """A result that several tests judge, such as a drive. After a stall the drive is repeated, at most twice."""
 
     def __init__(self, stalls: Stalls, make: Callable[[], Result]) -> None:
         self._stalls, self._make = stalls, make
@@ -314,7 +314,7 @@ class SharedResult(Generic[Result]):
         self._attempts_left, self._excused = MAX_ATTEMPTS, 0
 
     def get(self) -> Result:
-        """Return the last result; make it again if the record has excused a failure since then.
+        """Return the last result; repeat what makes it if the record has excused a failure since then.
 
         If making it fails and no stall explains this, the failure is raised for every test.
         """

@@ -6,25 +6,15 @@ from collections import Counter
 from collections.abc import Sequence
 
 import pytest
+from tests.vehicle.dbw.fuzzer import CAPABILITIES
 from tests.vehicle.dbw.rig import START_NS, profile
 
 from lavt.domain import NS_PER_MS, Actuation, GroundTruth, VehicleEvent
 from lavt.vehicle.can_frame import BusGone, CanFrame, ReceivedCanFrame
 from lavt.vehicle.dbw.adapter import ByWireAdapter
 from lavt.vehicle.dbw.vehicle import DbwVehicle, TruthSource
-from lavt.vehicle.vehicle import Capabilities, ReachedCommand
+from lavt.vehicle.vehicle import ReachedCommand
 
-CAPABILITIES = Capabilities(
-    simulated=True,
-    virtual_time=False,
-    ground_truth=True,
-    reset=False,
-    wheelbase_m=2.8,
-    max_steering_rad=0.5,
-    max_steering_rate_radps=0.5,
-    max_acceleration_mps2=3.0,
-    max_braking_mps2=8.0,
-)
 SPEED = CanFrame(0x065, bytes([0, 0, 0, 0, 100, 0, 0, 0]))
 """A SteeringReport of generation 1 with a speed above zero."""
 

@@ -237,7 +237,7 @@ class RepairReceiver:
             self._give_up(key)
 
     def _expire(self, now_ns: int) -> None:
-        """Give up the blocks that have timed out; the oldest are first."""
+        """Give up the blocks that have timed out; `_open` has the oldest block first."""
         for key, block in list(self._open.items()):
             if now_ns - block.opened_ns < BLOCK_TIMEOUT_NS:
                 return
