@@ -60,7 +60,7 @@ def keys(
     Run the command again to add names. The authority is for tests only: its private key has no password. The command
     overwrites nothing.
 
-    Example: lavt keys keys --vehicle vehicle-1 --operator operator-1 --host 192.0.2.7
+    Example: lavt keys ./keys --vehicle vehicle-1 --operator operator-1 --host 192.0.2.7
     """
     certificates = _certificates()
     roles = {"vehicle": vehicle or [], "operator": operator or [], "monitor": monitor or [], "cloud": cloud or []}
