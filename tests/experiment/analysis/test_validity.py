@@ -11,7 +11,7 @@ import pytest
 from lavt.experiment.analysis.clock_validity import step_reasons
 from lavt.experiment.analysis.invalid_reason import InvalidCode, InvalidReason, not_measured
 from lavt.experiment.analysis.metrics import measure
-from lavt.experiment.analysis.results import IDENTITY, run_result, write_json
+from lavt.experiment.analysis.results import IDENTITY, OPTIONAL_IDENTITY, run_result, write_json
 from lavt.experiment.analysis.validity import injection_reasons, invalid_reasons
 from lavt.recording.record import read_record
 
@@ -347,7 +347,14 @@ def test_every_metric_is_defined_in_the_documentation(make_run: MakeRun, tmp_pat
     make_run(tmp_path)
     page = (Path(__file__).parents[3] / "docs" / "metrics.md").read_text()
     entry = measure(read_record(tmp_path / "server.mcap"), read_record(tmp_path / "client.mcap")).entry
-    assert [key for key in entry if f"`{key}`" not in page] == []
+    assert [key for key in (*entry, *entry["delta"]) if f"`{key}`" not in page] == []
+
+
+def test_every_key_of_the_identity_is_defined_in_the_documentation() -> None:
+    """`docs/metrics.md` has each key of a run's identity, in the section on it."""
+    page = (Path(__file__).parents[3] / "docs" / "metrics.md").read_text()
+    section = page.partition("\n## Identity of a run")[2].partition("\n## ")[0]
+    assert [key for key in (*IDENTITY, *OPTIONAL_IDENTITY, "digest") if f"`{key}`" not in section] == []
 
 
 def test_the_page_explains_every_code() -> None:

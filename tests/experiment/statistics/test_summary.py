@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -212,3 +213,11 @@ def test_the_bound_of_a_condition_is_the_largest() -> None:
     runs = [run(), run(tau_v_ms={**latency, "bound": 0.8}), run(tau_c_ms={**latency, "bound": None})]
     condition = summarize(runs, SPEED)["conditions"]["L0"]
     assert (condition["tau_v_ms"]["bound"], condition["tau_c_ms"]["bound"]) == (0.8, None)
+
+
+def test_every_value_is_defined_in_the_documentation() -> None:
+    """`docs/metrics.md` has each key of the summary, of a condition and of a contrast."""
+    page = (Path(__file__).parents[3] / "docs" / "metrics.md").read_text()
+    summary = summarize([run(), run(condition="L1")], SPEED)
+    keys = {*summary, *summary["conditions"]["L0"], *summary["contrasts"][0], *summary["groups"][0]} - {"a", "b"}
+    assert {key for key in keys if f"`{key}`" not in page and f"    {key} " not in page} == set()

@@ -15,6 +15,7 @@ from lavt.transport.security.envelope import MAX_ENVELOPE_BYTES, OperatorAuthent
 pytest.importorskip("cryptography", reason="an extra: pip install 'lavt[secure]'")
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PublicKey
 
 from lavt.transport.security.keys import KeyAgreement, PrivateKey, decrypt
 
@@ -85,8 +86,9 @@ def test_bytes_of_a_reply(session: Session, *, stale: bool) -> None:
     counter = session.vehicle.sign_state(b"")[:8] + bytes(7) + b"\2"
     assert (signed[:16], signed[16:17], signed[17:33]) == (digest, b"\1" if stale else b"\0", counter)
     server = signed[33:65]
-    secret = client.derive_secret(server, b"LAVT 1 secret car\0" + client.public + server)
-    assert secret is not None
+    shared = client._key.exchange(X25519PublicKey.from_public_bytes(server))
+    extracted = hmac.digest(bytes(32), shared, "sha256")  # RFC 5869 with 32 zeros as salt
+    secret = hmac.digest(extracted, b"LAVT 1 secret car\0" + client.public + server + b"\1", "sha256")
     assert decrypt(secret, signed[65:], digest) == GRANTED
 
 

@@ -1,3 +1,4 @@
+import dataclasses
 import itertools
 import re
 from pathlib import Path
@@ -6,6 +7,7 @@ import numpy as np
 import pytest
 
 from lavt.errors import UserError
+from lavt.vehicle.sim.dynamics import LINCOLN_MKZ
 from lavt.vehicle.sim.road.road import load_road, parse_road
 
 SHORT = "title: x\nsegments: [{length_m: 100}]\n"
@@ -23,6 +25,16 @@ def test_the_documented_example_is_a_valid_road() -> None:
     assert [(mark.offset_m, mark.kind) for mark in road.marks] == [(-1.75, "solid"), (1.75, "broken"), (5.25, "solid")]
     assert [(strip.left_m, strip.right_m) for strip in road.paved] == [(5.75, -2.25)]
     assert float(np.abs(road.centre_at(np.arange(0.0, 250.0)).curvature_per_m).max()) == pytest.approx(0.02)
+
+
+def test_the_parameters_of_the_car_are_documented() -> None:
+    """docs/roads.md has each parameter of the car with its value, and the extent of its body."""
+    page = DOCS.read_text()
+    rows = re.findall(r"^\| `(\w+)` \| ([\d.]+) \|", page.partition("## The car")[2], re.MULTILINE)
+    assert {name: float(value) for name, value in rows} == dataclasses.asdict(LINCOLN_MKZ)
+    car = LINCOLN_MKZ
+    extent = f"{-car.rear_axle_to_rear_m} m to {car.rear_axle_to_front_m} m along the car, and {car.body_width_m / 2} m"
+    assert extent in page
 
 
 def test_a_title_and_a_segment_make_a_road() -> None:
