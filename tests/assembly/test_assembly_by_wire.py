@@ -105,7 +105,7 @@ class CarOnABus:
         self.counts: Counter[str] = Counter()
         self._car_is_stepping = False
 
-        def send(self, frames: Sequence[CanFrame], _made_ns: int) -> int:
+    def send(self, frames: Sequence[CanFrame], _made_ns: int) -> int:
         """Put frames of the car on the bus."""
         self._sent += frames
         return len(frames)

@@ -71,7 +71,7 @@ def test_pictures_have_the_models_size(camera: Camera) -> None:
 
 @each_camera
 def test_a_frame_carries_its_number_and_its_capture_time_if_known(camera: Camera, name: str) -> None:
-    """A frame has the requested number; a rendered frame has the requested capture time, a frame from a file has none."""
+    """A frame has the requested number; only a rendered frame has the requested capture time, others have none."""
     frame = capture(camera, 4, 99)
     assert (frame.number, frame.capture_ns) == (4, 99 if name in RENDERERS else None)
 

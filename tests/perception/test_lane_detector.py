@@ -247,7 +247,7 @@ def test_true_lanes_are_averaged_as_by_the_lane_detector() -> None:
 
 
 def test_the_last_lane_is_kept_with_low_confidence() -> None:
-    """A lane of low confidence changes only the confidence; after several of these, or `forget`, the average restarts."""
+    """A lane of low confidence changes only the confidence; after several, or after `forget`, the average restarts."""
     detector = GroundTruthLaneDetector()
     detector.detect(true_lane(1.0))
     lost = [detector.detect(true_lane(5.0, confidence=0.1)) for _ in range(FORGET_AFTER_PICTURES)]

@@ -64,7 +64,7 @@ def as_table(rows: list[dict[str, Any]]) -> Table:
 
 
 def test_interpolation_of_an_offset() -> None:
-    """Between samples, Delta and its bound are interpolated linearly; outside, Delta is constant and the bound grows."""
+    """Delta and its bound are linear between samples; outside, Delta is constant and the bound grows."""
     times_ns = np.array([0, 100, 200])
     offset = ClockOffset(TRUE_NS + times_ns, np.array([10.0, 30.0, 20.0]), np.array([4.0, 8.0, 6.0]), 0.5)
     at_ns = TRUE_NS + np.array([-20, 0, 3, 50, 99, 100, 200, 260])
@@ -275,7 +275,7 @@ def test_samples_without_a_correction_are_ignored() -> None:
     ("first_ppm", "middle_ppm", "last_ppm"), [(10.0, 50.0, 0.0), (0.0, 50.0, 10.0), (-10.0, 0.0, 5.0), (5.0, 0.0, -10)]
 )
 def test_the_bound_grows_outside_the_samples(first_ppm: float, middle_ppm: float, last_ppm: float) -> None:
-    """Outside the samples, the bound grows at twice the rate of Delta in the first or last second, whichever is faster."""
+    """Outside the samples, the bound grows at twice the larger of Delta's rates in the first and the last second."""
     rows = samples_with_rates([first_ppm, middle_ppm, middle_ppm, last_ppm])
     values_ns = [row["correction_s"] * NS_PER_S for row in rows]
     for table in (rows, rows[::-1]):

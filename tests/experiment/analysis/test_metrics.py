@@ -263,7 +263,7 @@ def test_missing_data_are_null_not_zero(make_run: MakeRun, tmp_path: Path) -> No
 
 
 def test_tracking_of_a_sine(make_run: MakeRun, tmp_path: Path) -> None:
-    """A sinusoidal path has, as shares of its amplitude, a mean error of 2/pi, an RMS of 1/sqrt(2) and a maximum of 1."""
+    """The errors of a sinusoidal path, divided by its amplitude: mean 2/pi, RMS 1/sqrt(2), maximum 1."""
     entry = measured(make_run, tmp_path, seconds=12 * np.pi).entry
     assert entry["mae_m"] == pytest.approx(0.5 * 2 / np.pi, abs=0.005)
     assert entry["rms_m"] == pytest.approx(0.5 / np.sqrt(2), abs=0.005)
@@ -308,7 +308,7 @@ def test_the_first_passage_counts() -> None:
 
 
 def test_p95_up_to_every_ten_metres() -> None:
-    """With an error of 1 m for 10 m and then 3 m, P95 is 1 m up to 10 m and 3 m up to 20 m; a partial 10 m has no P95."""
+    """If the error is 1 m for 10 m and then 3 m, P95 is 1 m up to 10 m and 3 m up to 20 m; a partial 10 m has none."""
     rows = [{"progress_m": 5.0 + index * 0.25, "cross_track_m": -1.0 if index <= 40 else 3.0} for index in range(101)]
     assert p95_by_10m(table(rows)) == [1.0, 3.0]
     assert p95_by_10m(table(rows[:41])) == [1.0]

@@ -43,7 +43,7 @@ def reasons(
 
 
 def test_a_condition_in_force_throughout_the_drive_is_valid() -> None:
-    """A run is valid if the queues are as requested from before the drive to its end; changes before and after are irrelevant."""
+    """A run is valid if the queues are as requested from before the drive to its end, whatever happens later."""
     assert reasons(VIDEO, CONTROL) == []
     assert reasons([(2, "", "", 0.0, None, ""), *VIDEO, (21, "", "", 0.0, None, "")], CONTROL) == []
 

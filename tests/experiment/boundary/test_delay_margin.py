@@ -46,7 +46,7 @@ def test_the_simplified_loop_has_the_textbook_delay_margin() -> None:
     )
     bound_s = DELAY_PER_LOOKAHEAD * 2.0
     assert pytest.approx(0.52049, abs=1e-5) == DELAY_PER_LOOKAHEAD
-    # The difference of up to 3 % is due to 1 ms of lag, half a frame of hold and the 7 ms relaxation of the tyres at 1 m/s.
+    # The difference, up to 3 %, is due to 1 ms of lag, half a frame of hold and 7 ms of tyre relaxation at 1 m/s.
     assert spectral_radius(simplified, 0.97 * bound_s) < 1 < spectral_radius(simplified, bound_s)
 
 
@@ -94,7 +94,7 @@ def test_the_smallest_lookahead_has_the_requested_margin() -> None:
         ),
     ],
 )
-def test_four_changes_reduce_the_delay_margin(smaller_margin: LateralLoop, larger_margin: LateralLoop) -> None:
+def test_four_changes_reduce_the_margin(smaller_margin: LateralLoop, larger_margin: LateralLoop) -> None:
     """A higher speed, a lower frame rate, more averaging and a longer steering lag each reduce the delay margin."""
     assert critical_delay_s(smaller_margin) < critical_delay_s(larger_margin)
 

@@ -21,7 +21,7 @@ from lavt.experiment.runs.virtual_run import build_loop, drive
 from lavt.recording.record import read_record
 
 P95_TOLERANCE_M = 0.05
-"""The largest error of the detector's lane position: one cell. The largest measured difference of P95 is 0.027 m between
+"""The largest error of the detector's lane position: one cell. The largest measured difference of P95: 0.027 m between
 geometry and video (L0 and L2, both presets, two seeds), and 0.008 m between pixels and video."""
 
 
@@ -81,7 +81,7 @@ def test_the_digest_is_reproducible_without_video(fidelity: str, tmp_path: Path)
 
 @pytest.mark.parametrize("fidelity", ["pixels", "geometry"])
 def test_records_without_video(fidelity: str, tmp_path: Path) -> None:
-    """Access units are recorded at fidelity video only, and at geometry no channel repeats the data of another channel."""
+    """Access units are recorded only at fidelity video; at geometry no channel repeats the data of another."""
     loop = build_loop(planned(f"fidelity={fidelity}"), tmp_path / "run")
     drive(loop, limit_ns=3 * NS_PER_S)
     server, client = (read_record(tmp_path / "run" / name) for name in ("server.mcap", "client.mcap"))

@@ -14,7 +14,7 @@ from lavt.experiment.statistics.intervals import bootstrap_interval, exact_inter
     ("successes", "low", "high"), [(30, 0.025 ** (1 / 30), 1.0), (15, 0.3130, 0.6870), (0, 0.0, 1 - 0.025 ** (1 / 30))]
 )
 def test_the_interval_of_thirty_runs_is_exact(successes: int, low: float, high: float) -> None:
-    """For 0 and 30 of 30 runs the interval is Clopper and Pearson's closed form; for 15 it is the published interval."""
+    """For 0 and 30 of 30 runs the interval is Clopper and Pearson's closed form; for 15 of 30 it is as published."""
     assert exact_interval(successes, 30) == pytest.approx([low, high], abs=5e-5)
 
 
