@@ -19,8 +19,8 @@ def test_without_a_lane_the_watch_brakes_at_500_ms_and_stops_at_2500_ms() -> Non
     assert watch.check(0.0, START_NS + STOP_AFTER_NS) == "stop"
 
 
-def test_a_lane_restarts_the_time() -> None:
-    """One picture with a lane restarts the time."""
+def test_a_lane_restarts_the_timer() -> None:
+    """One picture with a lane restarts the timer."""
     watch = LaneWatch()
     watch.check(1.0, START_NS)
     assert watch.check(0.0, START_NS + BRAKE_AFTER_NS) == "brake"
@@ -28,8 +28,8 @@ def test_a_lane_restarts_the_time() -> None:
     assert watch.check(0.0, START_NS + 2 * BRAKE_AFTER_NS) == "ok"
 
 
-def test_without_any_lane_time_counts_from_the_first_picture() -> None:
-    """If no lane was ever detected, the time counts from the first picture."""
+def test_the_first_picture_starts_the_timer() -> None:
+    """If no lane was ever detected, the timer counts from the first picture."""
     watch = LaneWatch()
     assert watch.check(0.0, START_NS) == "ok"
     assert watch.check(0.0, START_NS + STOP_AFTER_NS) == "stop"

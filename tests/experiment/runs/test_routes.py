@@ -16,7 +16,7 @@ pytestmark = pytest.mark.full
 
 ROUTES = ("a", "a_key", "b", "b_key", "c", "c_key")
 MAX_P95_M, MAX_MEAN_P95_M = 0.22, 0.15
-"""The limits are far below the 0.8 m to either line, so that any departure under delay is an effect of the delay."""
+"""Limits far smaller than the 0.8 m to either line: if a car departs under delay, the delay is the cause."""
 
 
 def drive_without_delay(out: Path, *changes: str) -> list[Mapping[str, Any]]:

@@ -38,7 +38,7 @@ def test_the_parameters_of_the_car_are_documented() -> None:
 
 
 def test_a_title_and_a_segment_make_a_road() -> None:
-    """Every other key has a default: one lane of 3.5 m with marks and shoulders, from the origin along x."""
+    """A road file needs only a title and a segment: by default there is one lane, from the origin along x."""
     road = parse_road(SHORT, source="x.yaml")
     assert road.start == (0.0, 0.0, 0.0)
     assert road.route_length_m == 100.0
@@ -47,7 +47,7 @@ def test_a_title_and_a_segment_make_a_road() -> None:
 
 
 def test_a_road_is_loaded_from_its_path(tmp_path: Path) -> None:
-    """A path ending in .yaml is loaded as a road, and `part_of` is relative to its directory."""
+    """A path that ends in .yaml is loaded as a road, and `part_of` is relative to its directory."""
     (tmp_path / "whole.yaml").write_text(SHORT)
     (tmp_path / "part.yaml").write_text("title: y\npart_of: whole.yaml\nfrom_m: 40\nlength_m: 50\n")
     part = load_road(str(tmp_path / "part.yaml"))
@@ -130,7 +130,7 @@ def test_an_invalid_road_file_is_rejected(name: str) -> None:
 
 @pytest.mark.parametrize(("name", "content"), [("missing.yaml", None), ("bytes.yaml", b"\xff\xfe"), ("dir.yaml", "")])
 def test_an_unreadable_file_is_rejected(name: str, content: bytes | str | None, tmp_path: Path) -> None:
-    """A path that does not exist, is a directory or is not text is rejected with an error that names it."""
+    """A path that does not exist, is a directory or is not text is rejected with an error that names the path."""
     path = tmp_path / name
     if isinstance(content, bytes):
         path.write_bytes(content)
