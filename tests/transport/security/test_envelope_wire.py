@@ -75,7 +75,7 @@ def test_bytes_of_commands_states_and_requests(session: Session) -> None:
 @pytest.mark.parametrize("stale", [False, True])
 def test_bytes_of_a_reply(session: Session, *, stale: bool) -> None:
     """A reply carries a signature and no MAC, as `docs/wire.md` describes."""
-    client = session.operator._agreement = KeyAgreement()
+    client_agreement = session.operator._agreement = KeyAgreement()
     data = session.operator.sign_request("session", ACQUIRE)
     request = session.vehicle.verify_request("session", data)
     assert request is not None
@@ -84,8 +84,9 @@ def test_bytes_of_a_reply(session: Session, *, stale: bool) -> None:
     digest = hashlib.sha256(data).digest()[:16]
     counter = session.vehicle.sign_state(b"")[:8] + bytes(7) + b"\2"
     assert (signed[:16], signed[16:17], signed[17:33]) == (digest, b"\1" if stale else b"\0", counter)
-    server = signed[33:65]
-    secret = client.derive_secret(server, b"LAVT 1 secret car\0" + client.public + server)
+    server_public = signed[33:65]
+    context = b"LAVT 1 secret car\0" + client_agreement.public + server_public
+    secret = client_agreement.derive_secret(server_public, context)
     assert secret is not None
     assert decrypt(secret, signed[65:], digest) == GRANTED
 
