@@ -98,7 +98,9 @@ class VehicleSide:
 
     def __init__(self, seed: int) -> None:
         entropy = SeededEntropy(seed, "vehicle")
-        limiter = Limiter(LIMITS, wheelbase_m=2.8448, max_steering_rad=0.513, max_braking_mps2=6.0)
+        limiter = Limiter(
+            LIMITS, wheelbase_m=2.8448, max_steering_rad=0.513, max_acceleration_mps2=2.0, max_braking_mps2=6.0
+        )
         self.gate = SafetyGate(
             LIMITS, limiter, new_epoch=lambda: entropy.number(64), new_token=lambda: entropy.token(16), video_port=5600
         )
