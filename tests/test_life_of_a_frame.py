@@ -94,6 +94,7 @@ def armed_gate(car: Simulator) -> tuple[SafetyGate, Gateways, SessionReply]:
         LIMITS,
         wheelbase_m=capabilities.wheelbase_m,
         max_steering_rad=capabilities.max_steering_rad,
+        max_acceleration_mps2=capabilities.max_acceleration_mps2,
         max_braking_mps2=capabilities.max_braking_mps2,
     )
     numbers = count(1)

@@ -12,7 +12,7 @@ from enum import StrEnum
 
 from msgspec import Struct
 
-from lavt.domain import LARGEST_STORED_STOP, Command, SafetyState, VehicleState
+from lavt.domain import Command, SafetyState, VehicleState
 from lavt.safety.issued_stamps import IssuedStamps
 from lavt.safety.limiter import Limiter
 from lavt.safety.limits import Limits
@@ -110,7 +110,7 @@ class SafetyGate:
         """
         self.watchdog.check_vehicle(vehicle)
         self.watchdog.check_timeouts(arrived_ns)  # before the command: one that arrives at the timeout is too late
-        if command.emergency_stop and (command.emergency_stop <= LARGEST_STORED_STOP or self._is_newer(command)):
+        if command.emergency_stop:
             self.session.raise_emergency_stop(command.emergency_stop)
         reason = self.rejection_reason(command, vehicle, now_ns)
         if reason is not None:
@@ -156,10 +156,6 @@ class SafetyGate:
         if command.mode == "arm" and vehicle.inhibit_reason:
             return RejectionReason.INHIBITED
         return None
-
-    def _is_newer(self, command: Command) -> bool:
-        """Return whether a command is of the present epoch and newer than the last accepted one, so not a replay."""
-        return command.epoch == self.epoch.number and command.sequence > self.epoch.sequence
 
     def _reject(self, reason: RejectionReason, vehicle: VehicleState) -> CommandVerdict:
         if reason in INTERRUPTS_ARMING:
