@@ -150,7 +150,7 @@ def test_a_row_needs_all_of_its_conditions(state: State, changes: dict[str, Any]
 
 
 TEXTS = ("overrides", "missing_reports", "faults", "trips", "command_errors")
-"""Causes with texts of their own, in order of priority."""
+"""Causes that have texts, in order of priority."""
 
 
 @pytest.mark.parametrize("first", TEXTS)
