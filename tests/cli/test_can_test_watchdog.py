@@ -206,7 +206,7 @@ INVALID: list[tuple[dict[str, Any], str]] = [
 
 @pytest.mark.parametrize(("changes", "reason"), INVALID, ids=[next(iter(changes)) for changes, _ in INVALID])
 def test_invalid_proof(tmp_path: Path, changes: dict[str, Any], reason: str) -> None:
-    """A proof for another setup, of braking that was too slow, or with invalid fields is rejected with the reason."""
+    """A proof of another setup, of braking that was too late, or with an invalid field is rejected with the reason."""
     assert proof_rejection(write_proof(tmp_path), PROFILE, CONFIG, WALL_NS) == ""
     assert reason in proof_rejection(write_proof(tmp_path, **changes), PROFILE, CONFIG, WALL_NS)
 

@@ -41,7 +41,7 @@ def test_a_custom_road_is_drawn(run: Run, bend: Path, tmp_path: Path) -> None:
 
 
 def test_a_drawing_has_a_map_the_curvature_and_views() -> None:
-    """The map is to scale with the whole road, the curvature is that of the road, and the views are camera pictures."""
+    """The map is to scale and shows the whole road, the curvature is the road's, and the views are camera pictures."""
     road = load_road("a_key")
     figure = draw_road(road, model=CameraModel(), scenery="none")
     overview, detail, curvature, *views = figure.axes

@@ -100,7 +100,7 @@ def test_links_delay_exactly_and_keep_order() -> None:
 
 
 def test_a_busy_node_queues_messages() -> None:
-    """If a node takes longer than the interval of its messages, they wait, and each keeps its time of arrival."""
+    """If a node takes longer than the interval of its messages, messages wait, each with its time of arrival."""
     runtime, actuator = new_runtime(
         DelayModel(0.0), costs_ns={("actuator", "receive"): 30 * MS, ("driver", "send"): 3 * MS}
     )

@@ -322,7 +322,7 @@ def test_other_versions(kind: type[Any], version: Any) -> None:
 
 @pytest.mark.parametrize("kind", MESSAGES)
 def test_other_shapes(kind: type[Any]) -> None:
-    """A message with too many or too few fields, of another class, or that is not an array, is rejected."""
+    """A message is rejected if it has too many or too few fields, is of another class or is not an array."""
     values = msgpack.unpackb(encode(MESSAGES[kind]))
     shapes = [[*values, 0], values[:-1], [], {1: values}, values[0], None, "x", [values]]
     shapes += [msgpack.unpackb(encode(other)) for other_kind, other in MESSAGES.items() if other_kind is not kind]

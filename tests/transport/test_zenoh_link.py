@@ -180,7 +180,7 @@ def test_queries(pair: Pair, channel: str, reply: str) -> None:
 
 
 def test_reply_without_a_query(pair: Pair) -> None:
-    """A reply without a pending query, or to one that has been answered, is not sent."""
+    """A reply is not sent if no query is pending, or if the query has been answered."""
     query = Send("session", b"number")
     _, peer = pair.server_received.next(("session", b"number"), lambda: pair.client.send(query))
     pair.server.send(Send("session_reply", b"no query", 10**9), Send("netem_reply", b"no query", peer))

@@ -57,7 +57,7 @@ def test_no_impairment_adds_no_delay() -> None:
 
 @pytest.mark.parametrize("loss", [0.01, 0.1, 0.5])
 def test_losses_are_independent_with_the_requested_share(loss: float) -> None:
-    """The requested share of packets is lost, each independently, within four standard deviations."""
+    """The requested share of packets is lost, and losses do not depend on each other."""
     emulated_link = link(Impairment(loss=loss))
     lost = np.array([delay_ns is None for delay_ns in delays_ns(emulated_link)])
     assert lost.mean() == pytest.approx(loss, abs=4 * (loss * (1 - loss) / COUNT) ** 0.5)

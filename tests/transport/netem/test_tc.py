@@ -293,7 +293,7 @@ def test_flows_on_exempt_ports_are_rejected(flows: list[ImpairedFlow], message: 
 
 
 class FakeTc:
-    """A tc that reports what a test defines and records its commands."""
+    """A simulated tc, which reports the qdiscs and filters that a test sets, and records its commands."""
 
     def __init__(self, qdiscs: str = NO_QDISC, filters: str = "") -> None:
         self.qdiscs, self.filters, self.commands = qdiscs, filters, list[str]()

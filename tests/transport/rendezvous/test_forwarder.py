@@ -217,7 +217,7 @@ def test_a_vehicle_moves_and_expires() -> None:
 
 
 def test_unanswered_clients_displace_no_answered_ones() -> None:
-    """Unanswered clients displace no answered client, and the numbers of both that are remembered are limited."""
+    """Unanswered clients displace no answered client; of either kind only a limited number is remembered."""
     forwarder = registered_forwarder()
     send_hello(forwarder)
     send_answer(forwarder)

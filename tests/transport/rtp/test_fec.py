@@ -446,7 +446,7 @@ def test_redundancy_controller(notes: list[tuple[int, int, float]], now_s: float
 
 
 def test_redundancy_controller_forgets() -> None:
-    """The controller keeps only the notes within its window."""
+    """The controller keeps only the notes of the last 5 s."""
     controller = RedundancyController()
     for number in range(1000):
         controller.note_loss(0, 10, number * 100 * NS_PER_MS)

@@ -215,7 +215,7 @@ def test_bounded_memory_of_losses() -> None:
 
 @given(st.integers(0, 2**16 - 1), st.permutations(range(30)), st.integers(0, 2**32))
 def test_any_order_within_a_hold_is_restored(first: int, order: list[int], start_ns: int) -> None:
-    """Packets that arrive within one hold in any order leave in the order sent, none missing."""
+    """All packets that arrive within one hold, in any order, leave in the order in which they were sent."""
     buffer = JitterBuffer(HOLD_NS)
     ordered = [
         ordered_packet
@@ -267,7 +267,7 @@ def test_regular_stream_passes_after_any_packets(arrivals: list[tuple[int, int, 
 
 @pytest.mark.parametrize("first", [0, 40_000])
 def test_recovered_packet_closes_its_gap(first: int) -> None:
-    """A recovered packet closes its gap like one that arrived, and counts as recovered only."""
+    """A recovered packet closes its gap as a received packet does, and changes only the counter `recovered`."""
     buffer = started_buffer(first)
     assert buffer.push(packet(first + 2), STARTED_NS) == []
     ordered = buffer.push_recovered(packet(first + 1), STARTED_NS + 1)

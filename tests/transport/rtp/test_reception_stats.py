@@ -177,7 +177,7 @@ def test_losses_match_the_rfc(first: int, periods: list[list[str]]) -> None:
 
 
 def test_jitter_by_hand() -> None:
-    """Jitter changes by a sixteenth of each change of transit time, over all packets, including those of one frame."""
+    """Each packet, also within a frame, moves the jitter by a sixteenth towards the change of transit time."""
     stream = ReceivedStream()
     stream.arrive(1, 0, timestamp=0)
     stream.arrive(2, 1_100_000, timestamp=0)  # 99 units of 1/90000 s later, in the same frame

@@ -317,7 +317,7 @@ STEP_NS = -(-NS_PER_S // 65_536)
 
 @given(CLOCK_NS, st.integers(0, 59 * NS_PER_S), st.integers(0, 65_000 * NS_PER_S))
 def test_both_sides_know_the_round_trip_time(sent_ns: int, trip_ns: int, answer_delay_ns: int) -> None:
-    """Each side computes the round-trip time to within two steps of 1/65536 s, also when the short format wraps."""
+    """Each side's round-trip time is wrong by at most two steps of 1/65536 s, also when the short format wraps."""
     arrived_ns = sent_ns + trip_ns + answer_delay_ns
     by_wall_clock, by_receiver_clock = ntp_to_short(wall_to_ntp(sent_ns)), ntp_to_short(elapsed_to_ntp(sent_ns))
     sender_result_ns = round_trip_ns(ntp_to_short(wall_to_ntp(arrived_ns)), by_wall_clock, answer_delay_ns)

@@ -227,7 +227,7 @@ def test_a_packet_is_lost(missing: int) -> None:
 
 
 def test_fragments_before_a_gap_are_kept() -> None:
-    """Of a NAL unit with a lost fragment, the fragments before the gap are kept and those after it dropped."""
+    """If a fragment of a NAL unit is lost, the earlier fragments are kept and the later ones are dropped."""
     packets = packetize(KEYFRAME)
     depacketizer = Depacketizer()
     push_all(depacketizer, packets[:3])

@@ -24,7 +24,7 @@ def new_filter() -> FloodFilter:
 
 
 def count_passed(flood_filter: FloodFilter, bodies: list[bytes], *, from_active_operator: bool = True) -> int:
-    """Return how many of `bodies`, which arrive within one second, pass."""
+    """Send `bodies` within one second; return how many of them the filter passes."""
     end = b"\0" if from_active_operator else b"\1"
     return sum(
         flood_filter.passes(body + end, body, number * NS_PER_S // len(bodies)) for number, body in enumerate(bodies)

@@ -214,7 +214,7 @@ def test_damage_is_deterministic(access_units: list[bytes], damage: list[tuple[i
 
 @pytest.mark.parametrize("size", [(321, 240), (320, 241), (62, 240), (320, 62), (8192, 8192)])
 def test_invalid_sizes_are_rejected(size: tuple[int, int]) -> None:
-    """Odd sizes, sizes smaller than the stamp and sizes beyond the decoder's limit are rejected."""
+    """Sizes that are odd, smaller than the stamp or larger than the decoder's limit are rejected."""
     with pytest.raises(UserError, match="choose"):
         Encoder(*size, rate_hz=30, bit_rate_bps=1_000_000, gop_frames=15)
 

@@ -366,7 +366,7 @@ def test_bad_token() -> None:
 
 
 def test_a_lost_path_is_requested_long_before_the_command_timeout() -> None:
-    """A hello follows a lost video within half of the 300 ms command timeout after which a vehicle is degraded."""
+    """If the video is lost, a hello follows within half of the 300 ms after which a vehicle is degraded."""
     assert HELLO_AGAIN_NS <= 300_000_000 // 2
 
 
