@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import threading
+import tracemalloc
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -17,7 +18,9 @@ from pathlib import Path
 from typing import Any
 
 import can
+import msgpack
 import pytest
+from can.interfaces.udp_multicast.utils import pack_message
 from tests.support.clocks import ManualClock
 from tests.support.ports import free_port
 
@@ -170,10 +173,65 @@ def test_garbage_datagrams(open_port: Callable[..., CanPort]) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
         for datagram in garbage:
             stranger.sendto(datagram, (GROUP, number))
-    until(lambda: port.counts["unreadable"] == len(garbage) - 1)  # one of them is a frame with the identifier 0
-    receive(port, 1)
+    until(lambda: port.counts["unreadable"] == len(garbage))
     other.send([BRAKE], now_ns())
     assert receive(port, 1) == [BRAKE]
+
+
+def test_a_datagram_allocates_no_more_than_its_size(open_port: Callable[..., CanPort]) -> None:
+    """A datagram with a number as its data, which python-can takes for a number of bytes to allocate, is dropped."""
+    number = free_port()
+    port = open_port("udp_multicast", GROUP, port=number)
+    fields = msgpack.unpackb(pack_message(can.Message(arbitration_id=0x064, is_extended_id=False)))
+    tracemalloc.start()
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+            stranger.sendto(msgpack.packb({**fields, "data": 200_000_000}), (GROUP, number))
+        until(lambda: port.counts["unreadable"] == 1)
+        assert tracemalloc.get_traced_memory()[1] < 50_000_000
+    finally:
+        tracemalloc.stop()
+
+
+def test_messages_of_a_stranger_on_a_multicast_bus(open_port: Callable[..., CanPort]) -> None:
+    """On a multicast bus, error, remote and CAN FD frames, and messages whose values contradict each other, are counted
+    and dropped. None of them is a loss of the bus, not even one that says bus-off.
+    """
+    number = free_port()
+    port = open_port("udp_multicast", GROUP, port=number)
+    messages = [
+        can.Message(arbitration_id=0x040, is_error_frame=True, is_extended_id=False, data=bytes(8)),
+        can.Message(arbitration_id=0x065, is_error_frame=True, is_extended_id=False, data=bytes(8)),
+        can.Message(arbitration_id=0x065, is_remote_frame=True, is_extended_id=False, dlc=8),
+        can.Message(arbitration_id=0x065, is_fd=True, is_extended_id=False, data=bytes(8)),
+        can.Message(arbitration_id=0x065, is_error_frame=True, is_remote_frame=True, is_extended_id=False),
+        can.Message(arbitration_id=0x800, is_extended_id=False, data=bytes(8)),
+        can.Message(arbitration_id=0x065, is_extended_id=False, data=bytes(8), dlc=7),
+        can.Message(arbitration_id=0x065, is_extended_id=False, data=bytes(12)),
+        can.Message(arbitration_id=BRAKE.identifier, is_extended_id=False, data=BRAKE.data),
+    ]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        for message in messages:
+            stranger.sendto(pack_message(message), (GROUP, number))
+    assert receive(port, 1) == [BRAKE]
+    assert {name: count for name, count in port.counts.items() if count} == {
+        "error_frames": 2,
+        "remote_frames": 1,
+        "fd_frames": 1,
+        "unreadable": 4,
+    }
+
+
+def test_a_read_error_loses_a_multicast_bus(
+    open_port: Callable[..., CanPort], device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An error of the system, or of the driver, while a multicast bus is read is a loss of the bus."""
+    monkeypatch.setitem(can.interfaces.BACKENDS, "udp_multicast", (__name__, "BreakableBus"))
+    port = open_port("udp_multicast", "stick", clock=ManualClock(0))
+    for error in (OSError(errno.ENETDOWN, "Network is down"), can.CanOperationError("odd")):
+        device.put(error)
+    until(lambda: device.opened == 3)
+    assert not port.counts["unreadable"]
 
 
 @pytest.mark.parametrize(("age_ns", "is_sent"), [(60 * NS_PER_MS, True), (60 * NS_PER_MS + 1, False)])
@@ -241,13 +299,15 @@ class Device:
     """Opening waits for it."""
     on_receive: Callable[[], None] = lambda: None
     """Called in each read, before it returns a frame."""
-    ends: tuple[socket.socket, socket.socket] = field(default_factory=socket.socketpair)
+    ends: tuple[socket.socket, socket.socket] = field(
+        default_factory=lambda: socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    )
     """The first end is readable while frames of `put` wait."""
 
-    def put(self, message: can.Message) -> None:
-        """Let the driver receive a message that its descriptor announces."""
-        self.incoming.append(message)
-        self.ends[1].send(b"x")
+    def put(self, result: can.Message | Exception) -> None:
+        """Let the driver receive a message, or raise an error, that its descriptor announces by a datagram."""
+        self.incoming.append(result)
+        self.ends[1].send(pack_message(can.Message()))
 
 
 DEVICES: dict[str, Device] = {}
@@ -269,7 +329,7 @@ class BreakableBus(can.BusABC):
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:  # noqa: ARG002 (python-can's)
         if self.device.ends[0] in select.select([self.device.ends[0]], [], [], 0)[0]:
-            self.device.ends[0].recv(1)
+            self.device.ends[0].recv(1)  # the whole datagram
         if not self.device.incoming:
             pause(NS_PER_MS)
             return None, False
@@ -356,14 +416,104 @@ def test_a_slow_opening_blocks_nobody(open_port: Callable[..., CanPort], device:
     until(lambda: device.shut_down == device.opened == 2)
 
 
-def test_frames_before_the_loss(open_port: Callable[..., CanPort], device: Device) -> None:
-    """Frames received before the bus was lost are returned first."""
+def test_frames_before_the_loss_are_dropped(open_port: Callable[..., CanPort], device: Device) -> None:
+    """Frames received before the bus was lost are not returned, neither before nor after it is open again."""
     port = open_port("breakable", "stick", clock=ManualClock(0))
     device.incoming.extend([can.Message(arbitration_id=7, is_extended_id=False), OSError(errno.ENODEV, "gone")])
     until(lambda: device.shut_down == 1)
-    assert [received.frame.identifier for received in port.take(0)] == [7]
     with pytest.raises(BusGone):
         port.take(0)
+    until_back(port)
+    device.incoming.append(can.Message(arbitration_id=8, is_extended_id=False))
+    assert receive(port, 1) == [CanFrame(8, b"")]
+
+
+def test_frames_before_a_suspension_are_dropped(open_port: Callable[..., CanPort], device: Device) -> None:
+    """Frames queued before a suspension, and one that is being read while it is noticed, are never returned: the
+    monotonic clock, by which their age is known, stood still.
+    """
+    suspended = [0]
+    port = open_port("breakable", "stick", clock=ManualClock(0), suspended=lambda: suspended[0])
+    is_reading, may_read = threading.Event(), threading.Event()
+    device.incoming.append(can.Message(arbitration_id=6, is_extended_id=False))
+    until(lambda: not device.incoming)
+
+    def wait() -> None:
+        is_reading.set()
+        assert may_read.wait(DEADLINE_S)
+
+    device.on_receive = wait
+    device.incoming.append(can.Message(arbitration_id=7, is_extended_id=False))
+    assert is_reading.wait(DEADLINE_S)
+    suspended[0] = NS_PER_S
+    with pytest.raises(BusGone, match="suspended"):
+        port.take(0)
+    may_read.set()
+    until_back(port)
+    device.on_receive = lambda: None
+    device.incoming.append(can.Message(arbitration_id=8, is_extended_id=False))
+    assert receive(port, 1) == [CanFrame(8, b"")]
+
+
+def test_a_bus_opened_during_a_suspension_is_opened_again(open_port: Callable[..., CanPort], device: Device) -> None:
+    """A bus that was being reopened when the machine was suspended may have frames from before it: it is not used."""
+    suspended = [0]
+    port = open_port("breakable", "stick", clock=ManualClock(0), suspended=lambda: suspended[0])
+    device.may_open.clear()
+    device.incoming.append(OSError(errno.ENODEV, "gone"))
+    until(lambda: device.shut_down == 1)
+    pause(3 * bus_module.REOPEN_NS)
+    suspended[0] = NS_PER_S
+    with pytest.raises(BusGone):
+        port.take(0)
+    device.may_open.set()
+    until_back(port)
+    assert (device.opened, device.shut_down) == (3, 2)
+
+
+def test_the_port_survives_any_error_of_opening(open_port: Callable[..., CanPort], device: Device) -> None:
+    """If reopening fails with an error of the system, such as too many open files, it is tried again."""
+    port = open_port("breakable", "stick", clock=ManualClock(0))
+    failures = [OSError(errno.EMFILE, "Too many open files"), OSError(), MemoryError()]
+
+    def no_descriptor(*keys: Any) -> can.BusABC:
+        if failures:
+            raise failures.pop()
+        return open_bus(*keys)
+
+    open_bus = bus_module._open_bus
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bus_module, "_open_bus", no_descriptor)
+        device.incoming.append(OSError(errno.ENODEV, "gone"))
+        until(lambda: device.opened == 2)
+    until_back(port)
+
+
+def test_a_frame_that_arrives_while_the_bus_opens_is_not_newer(
+    open_port: Callable[..., CanPort], device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A frame that arrived before the port first read the bus has its true time of arrival."""
+    monkeypatch.setitem(can.interfaces.BACKENDS, "udp_multicast", (__name__, "BreakableBus"))
+    clock = ManualClock(10 * NS_PER_S, wall_ahead_ns=1_790_000_000 * NS_PER_S)
+    stamp_s = clock.now().wall_ns / NS_PER_S
+    open_bus = bus_module._open_bus
+
+    def open_slowly(*keys: Any) -> can.BusABC:
+        bus = open_bus(*keys)
+        clock.advance(500)
+        return bus
+
+    monkeypatch.setattr(bus_module, "_open_bus", open_slowly)
+    device.put(can.Message(arbitration_id=7, is_extended_id=False, timestamp=stamp_s))
+    port = open_port("udp_multicast", "stick", clock=clock)
+    taken: list[ReceivedCanFrame] = []
+
+    def is_there() -> bool:
+        taken.extend(port.take(0))
+        return bool(taken)
+
+    until(is_there)
+    assert abs(taken[0].arrived_ns - 10 * NS_PER_S) < 1000
 
 
 @pytest.mark.parametrize(
@@ -391,6 +541,9 @@ def test_a_full_buffer_is_no_loss(open_port: Callable[..., CanPort], device: Dev
     [
         can.CanOperationError("Failed to transmit: Network is down", errno.ENETDOWN),
         OSError(errno.ENODEV, "No such device"),
+        can.CanOperationError("the device does not answer"),
+        OSError("no number"),
+        RuntimeError(),
     ],
 )
 def test_a_failed_write_loses_the_bus(open_port: Callable[..., CanPort], device: Device, error: Exception) -> None:

@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from lavt.clock import Clock, suspended_ns
 from lavt.domain import NS_PER_S, Now
@@ -28,6 +28,7 @@ from lavt.errors import UserError
 from lavt.vehicle.can_frame import BusGone, CanFrame, ReceivedCanFrame
 from lavt.vehicle.dbw.can_gateway import gateway_interfaces
 from lavt.vehicle.dbw.kernel_arrival import ArrivalTimes
+from lavt.vehicle.dbw.multicast_datagram import DatagramCheck
 from lavt.vehicle.dbw.profile import COMMAND_TIMEOUT_NS, TICK_LIMIT_NS
 
 if TYPE_CHECKING:
@@ -56,8 +57,24 @@ RECEIVES_OWN_FRAMES: Final = "udp_multicast"
 be recognised and dropped."""
 BUS_OFF_BIT: Final = 0x40
 """In the identifier of an error frame of SocketCAN (linux/can/error.h, CAN_ERR_BUSOFF)."""
-TEMPORARY_ERRORS: Final = frozenset({None, errno.ENOBUFS, errno.EAGAIN})
-"""Errors of a write that mean that a buffer is full; a new socket would not help."""
+FULL_BUFFER_TEXT: Final = "Transmit buffer full"
+"""Error of python-can's SocketCAN interface, which has no number."""
+
+
+class OpenBus(NamedTuple):
+    """An open bus. The frames received from it are dropped with it: after a loss, their age may not be known."""
+
+    driver: BusABC
+    received: deque[ReceivedCanFrame]
+    arrivals: ArrivalTimes
+    check: DatagramCheck | None
+
+    def shut_down(self) -> None:
+        """Close the driver's bus, which may be broken already."""
+        if self.check is not None:
+            self.check.close()
+        with suppress(Exception):
+            self.driver.shutdown()
 
 
 class CanPort:
@@ -67,7 +84,7 @@ class CanPort:
 
     `counts`: `frames_too_old` and `buffer_full` were not sent; `error_frames`, `remote_frames`, `fd_frames`,
     `unreadable`, `read_too_late` and `own_frames` were received and dropped; `overflowed` were dropped from a full
-    queue. `suspended` returns for how long the machine has been suspended since its start, in ns.
+    queue. `suspended` returns for how long the machine was suspended since its start, in ns.
 
     Raises `UserError` if python-can is missing or the bus cannot be opened.
     """
@@ -84,13 +101,12 @@ class CanPort:
         self._interface, self._channel, self._options = interface, channel, dict(options)
         self._clock, self._suspended = clock, suspended
         self._mark = secrets.token_hex(8) if interface == RECEIVES_OWN_FRAMES else None
-        self._received: deque[ReceivedCanFrame] = deque(maxlen=QUEUE_FRAMES)
         self._gone_reason = ""
         self._suspended_ns = suspended()
         self._closing = threading.Event()
         self.counts: Counter[str] = Counter()
-        bus = _open_bus(interface, channel, self._options)
-        self._bus: BusABC | None = bus
+        bus = self._open()
+        self._bus: OpenBus | None = bus
         """The open bus; None: it is lost. Whoever sets it to None lets the thread shut that bus down."""
         self._thread = threading.Thread(target=self._run, args=(bus,), name="can", daemon=True)
         self._thread.start()
@@ -111,9 +127,9 @@ class CanPort:
                 self.counts["frames_too_old"] += len(frames) - written
                 return written
             try:
-                bus.send(message, timeout=0)
+                bus.driver.send(message, timeout=0)
             except Exception as error:  # of any driver
-                if _error_number(error) in TEMPORARY_ERRORS:
+                if _is_buffer_full(error):
                     self.counts["buffer_full"] += len(frames) - written
                     return written
                 self._lose(f"{self._interface} {self._channel} cannot be written to ({_error_text(error)})")
@@ -126,11 +142,10 @@ class CanPort:
         Raises `BusGone` while the bus is lost.
         """
         self._check_suspension()
-        is_lost = self._bus is None
-        taken = [self._received.popleft() for _ in range(len(self._received))]
-        if is_lost and not taken:
+        bus = self._bus
+        if bus is None:
             raise BusGone(self._gone_reason)
-        return taken
+        return [bus.received.popleft() for _ in range(len(bus.received))]
 
     def next_wake_ns(self) -> int | None:
         """Return None: the arrival of frames cannot be predicted."""
@@ -152,88 +167,97 @@ class CanPort:
         self._gone_reason = reason
         self._bus = None
 
-    def _run(self, bus: BusABC | None) -> None:
+    def _run(self, bus: OpenBus | None) -> None:
         """Read frames and reopen the bus after each loss, until the port is closed."""
         while bus is not None:
             self._read(bus)
             bus = self._reopen()
 
-    def _reopen(self) -> BusABC | None:
+    def _open(self) -> OpenBus:
+        opened = self._clock.now()  # before the first frame can arrive
+        driver = _open_bus(self._interface, self._channel, self._options)
+        check = DatagramCheck(driver.fileno()) if self._interface == RECEIVES_OWN_FRAMES else None
+        return OpenBus(driver, deque(maxlen=QUEUE_FRAMES), ArrivalTimes(opened), check)
+
+    def _reopen(self) -> OpenBus | None:
         """Try to open the bus until that succeeds; return None once the port is closed."""
         while not self._closing.wait(REOPEN_NS / NS_PER_S):
+            suspended_ns = self._suspended()
             try:
-                self._bus = bus = _open_bus(self._interface, self._channel, self._options)
-            except UserError as error:
-                self._gone_reason = str(error)
+                bus = self._open()
+            except Exception as error:  # the system's, too: there may be no descriptor left
+                self._gone_reason = _error_text(error)
             else:
-                return bus
+                if self._suspended() - suspended_ns < COMMAND_TIMEOUT_NS:
+                    self._bus = bus
+                    return bus
+                bus.shut_down()
         return None
 
-    def _read(self, bus: BusABC) -> None:
+    def _read(self, bus: OpenBus) -> None:
         """Read frames until the bus is lost or the port closed, then shut the bus down."""
-        arrivals = ArrivalTimes(self._clock.now())
         try:
             while self._bus is bus and not self._closing.is_set():
-                self._read_once(bus, arrivals)
+                self._read_once(bus)
         except Exception as error:  # of any driver
             if self._bus is bus:
                 self._lose(f"{self._interface} {self._channel} cannot be read ({_error_text(error)})")
         finally:
             if self._bus is bus:
                 self._lose("the port is closed")
-            with suppress(Exception):  # the bus may be broken already
-                bus.shutdown()
+            bus.shut_down()
 
-    def _read_once(self, bus: BusABC, arrivals: ArrivalTimes) -> None:
+    def _read_once(self, bus: OpenBus) -> None:
         timeout_s = POLL_S
         if self._interface in STAMPED_BY_KERNEL:
-            if not self._is_readable(bus, arrivals):
+            if not self._is_readable(bus):
                 return
             timeout_s = 0
         try:
-            message = bus.recv(timeout_s)
+            if bus.check is not None and bus.check.drop_malformed():
+                self.counts["unreadable"] += 1
+                return
+            message = bus.driver.recv(timeout_s)
         except BlockingIOError:  # the announced datagram was dropped for its wrong checksum
             return
         except Exception as error:
-            if self._interface != RECEIVES_OWN_FRAMES or isinstance(error.__cause__, OSError):
+            if bus.check is None or error.__cause__ is None or isinstance(error.__cause__, OSError):
                 raise
-            self.counts["unreadable"] += 1  # a datagram that is not a frame: anyone can send one
+            self.counts["unreadable"] += 1  # its values contradict each other
             return
         if message is not None:
-            self._receive(message, self._clock.now(), arrivals)
+            self._receive(message, self._clock.now(), bus)
 
-    def _is_readable(self, bus: BusABC, arrivals: ArrivalTimes) -> bool:
+    def _is_readable(self, bus: OpenBus) -> bool:
         """Wait for a frame for at most `POLL_S`, by the monotonic clock; python-can's timeouts use the wall clock."""
-        now, ends = self._clock.now(), [bus.fileno()]
+        now, ends = self._clock.now(), [bus.driver.fileno()]
         if select.select(ends, [], [], 0)[0]:
             return True
-        arrivals.note_empty(now)
+        bus.arrivals.note_empty(now)
         return bool(select.select(ends, [], [], POLL_S)[0])
 
-    def _receive(self, message: Message, now: Now, arrivals: ArrivalTimes) -> None:
+    def _receive(self, message: Message, now: Now, bus: OpenBus) -> None:
         if self._mark is not None and message.channel == self._mark:
             self.counts["own_frames"] += 1
             return
-        if message.is_error_frame and message.arbitration_id & BUS_OFF_BIT:
+        is_error_of_controller = message.is_error_frame and self._interface not in VIRTUAL_INTERFACES
+        if is_error_of_controller and message.arbitration_id & BUS_OFF_BIT:
             raise BusGone("the controller is bus-off")
         frame = _data_frame(message, self.counts)
         if frame is None:
             return
         arrived_ns = now.mono_ns
         if self._interface in STAMPED_BY_KERNEL:
-            arrived_ns = arrivals.arrived_ns(round(message.timestamp * NS_PER_S), now)
+            arrived_ns = bus.arrivals.arrived_ns(round(message.timestamp * NS_PER_S), now)
             if now.mono_ns - arrived_ns > LATEST_READ_NS:
                 self.counts["read_too_late"] += 1
                 return
-        self.counts["overflowed"] += len(self._received) == QUEUE_FRAMES
-        self._received.append(ReceivedCanFrame(frame, arrived_ns))
+        self.counts["overflowed"] += len(bus.received) == QUEUE_FRAMES
+        bus.received.append(ReceivedCanFrame(frame, arrived_ns))
 
     def _message(self, frame: CanFrame) -> Message:
         message: Message = _library().Message(
-            arbitration_id=frame.identifier,
-            is_extended_id=frame.is_extended,
-            data=frame.data,
-            channel=self._mark,
+            arbitration_id=frame.identifier, is_extended_id=frame.is_extended, data=frame.data, channel=self._mark
         )
         return message
 
@@ -323,7 +347,7 @@ def _data_frame(message: Message, counts: Counter[str]) -> CanFrame | None:
         counts["remote_frames"] += 1
     elif message.is_fd:
         counts["fd_frames"] += 1
-    elif type(message.arbitration_id) is not int or len(message.data) > 8:  # udp_multicast carries anything
+    elif type(message.arbitration_id) is not int or len(message.data) > 8:  # a driver's fault
         counts["unreadable"] += 1
     else:
         return CanFrame(message.arbitration_id, bytes(message.data), bool(message.is_extended_id))
@@ -339,6 +363,12 @@ def _error_number(error: Exception) -> int | None:
         if isinstance(code, int):
             return code
     return None
+
+
+def _is_buffer_full(error: Exception) -> bool:
+    """Return whether a write failed because a buffer is full; a new socket would not help."""
+    has_no_room = isinstance(error, _library().CanTimeoutError) or str(error) == FULL_BUFFER_TEXT
+    return has_no_room or _error_number(error) in {errno.ENOBUFS, errno.EAGAIN}
 
 
 def _error_text(error: Exception) -> str:
