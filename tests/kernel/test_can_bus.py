@@ -12,7 +12,8 @@ from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
 from lavt.vehicle.can_frame import BusGone, CanFrame
-from lavt.vehicle.dbw.bus import CanPort, is_virtual
+from lavt.vehicle.dbw.bus import CanPort
+from lavt.vehicle.dbw.virtual_bus import is_virtual
 
 DEADLINE_S = 20
 STEERING = CanFrame(0x064, bytes(range(8)))

@@ -14,9 +14,10 @@ from lavt.errors import UserError
 from lavt.safety.limits import LIMITS
 from lavt.vehicle.can_frame import BusGone, BusPort
 from lavt.vehicle.dbw.adapter import ByWireAdapter
-from lavt.vehicle.dbw.bus import CanPort, is_virtual
+from lavt.vehicle.dbw.bus import CanPort
 from lavt.vehicle.dbw.profile import Profile
 from lavt.vehicle.dbw.vehicle import POLL_PERIOD_NS, DbwVehicle, TruthSource
+from lavt.vehicle.dbw.virtual_bus import is_virtual
 from lavt.vehicle.ground_truth_socket import TruthSocket
 from lavt.vehicle.sim.road.road import Road
 from lavt.vehicle.software_car.in_process_bus import InProcessPort

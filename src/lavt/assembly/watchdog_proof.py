@@ -12,8 +12,8 @@ from lavt.config.dbw import DbwConfig, WatchdogProof
 from lavt.config_file import parse_config
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
-from lavt.vehicle.dbw.bus import is_virtual
 from lavt.vehicle.dbw.profile import Profile
+from lavt.vehicle.dbw.virtual_bus import is_virtual
 from lavt.vehicle.dbw.watchdog_test import BRAKE, BRAKE_WITHIN_NS, LEAST_REPORTS, WatchdogObservation
 
 NS_PER_DAY: Final = 86_400 * NS_PER_S

@@ -21,8 +21,9 @@ from lavt.config_file import load_config
 from lavt.errors import UserError, WorkError
 from lavt.runtime import process_priority
 from lavt.vehicle.can_frame import BusGone
-from lavt.vehicle.dbw.bus import CanPort, is_virtual
+from lavt.vehicle.dbw.bus import CanPort
 from lavt.vehicle.dbw.profile import OwnBrake, Profile
+from lavt.vehicle.dbw.virtual_bus import is_virtual
 from lavt.vehicle.dbw.watchdog_test import BRAKE, BRAKE_WITHIN_NS, WatchdogTest
 
 POLL_PERIOD_S: Final = 0.002

@@ -25,8 +25,9 @@ from lavt.config_file import load_config
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
 from lavt.runtime import process_priority
-from lavt.vehicle.dbw.bus import CanPort, is_virtual
+from lavt.vehicle.dbw.bus import CanPort
 from lavt.vehicle.dbw.profile import Profile
+from lavt.vehicle.dbw.virtual_bus import is_virtual
 from lavt.vehicle.sim.road.road import load_road
 from lavt.vehicle.software_car.event_log import KitEvent
 from lavt.vehicle.software_car.runner import SoftwareCarRunner

@@ -29,7 +29,8 @@ from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
 from lavt.vehicle.can_frame import BusGone, CanFrame, ReceivedCanFrame
 from lavt.vehicle.dbw import bus as bus_module
-from lavt.vehicle.dbw.bus import CanPort, is_virtual, log_line, read_log
+from lavt.vehicle.dbw.bus import CanPort, log_line, read_log
+from lavt.vehicle.dbw.virtual_bus import is_virtual
 
 GROUP = "239.74.163.2"
 DEADLINE_S = 20
@@ -163,6 +164,22 @@ def test_arrival(open_port: Callable[..., CanPort]) -> None:
 
     until(is_there)
     assert before_ns - NS_PER_MS < taken[0].arrived_ns < now_ns()
+
+
+def test_frames_that_the_ports_thread_has_not_read(
+    open_port: Callable[..., CanPort], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`take` returns frames that have arrived even if the port's thread has not run since, which may wait its turn."""
+
+    def never_readable(*_: object) -> bool:
+        pause(10 * NS_PER_MS)
+        return False
+
+    monkeypatch.setattr(CanPort, "_is_readable", never_readable)
+    options = {"interface": "udp_multicast", "channel": GROUP, "port": free_port()}
+    one, other = open_port(**options), open_port(**options)
+    one.send([STEERING, BRAKE], now_ns())
+    assert receive(other, 2) == [STEERING, BRAKE]
 
 
 def test_garbage_datagrams(open_port: Callable[..., CanPort]) -> None:
@@ -761,7 +778,7 @@ def test_is_virtual(
     program.chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr("lavt.vehicle.dbw.bus.socket.if_nametoindex", lambda _: 3)
-    monkeypatch.setattr("lavt.vehicle.dbw.bus.gateway_interfaces", frozenset)
+    monkeypatch.setattr("lavt.vehicle.dbw.virtual_bus.gateway_interfaces", frozenset)
     assert is_virtual(*bus) is expected
 
 
@@ -771,10 +788,10 @@ def test_a_forwarded_bus_is_not_virtual(monkeypatch: pytest.MonkeyPatch) -> None
     def unreadable() -> frozenset[int]:
         raise OSError
 
-    monkeypatch.setattr("lavt.vehicle.dbw.bus._link_kind", lambda _: "vcan")
+    monkeypatch.setattr("lavt.vehicle.dbw.virtual_bus._link_kind", lambda _: "vcan")
     monkeypatch.setattr("lavt.vehicle.dbw.bus.socket.if_nametoindex", lambda _: 3)
     for read, expected in ((lambda: frozenset({4, 5}), True), (lambda: frozenset({3, 5}), False), (unreadable, False)):
-        monkeypatch.setattr("lavt.vehicle.dbw.bus.gateway_interfaces", read)
+        monkeypatch.setattr("lavt.vehicle.dbw.virtual_bus.gateway_interfaces", read)
         assert is_virtual("socketcan", "vcan0", {}) is expected
 
 

@@ -8,12 +8,10 @@ the kernel (CAN_BCM), must not be used anywhere: it would repeat the last comman
 from __future__ import annotations
 
 import errno
-import json
 import logging
 import secrets
 import select
 import socket
-import subprocess
 import threading
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -26,10 +24,10 @@ from lavt.clock import Clock, suspended_ns
 from lavt.domain import NS_PER_S, Now
 from lavt.errors import UserError
 from lavt.vehicle.can_frame import BusGone, CanFrame, ReceivedCanFrame
-from lavt.vehicle.dbw.can_gateway import gateway_interfaces
 from lavt.vehicle.dbw.kernel_arrival import ArrivalTimes
 from lavt.vehicle.dbw.multicast_datagram import DatagramCheck
 from lavt.vehicle.dbw.profile import COMMAND_TIMEOUT_NS, TICK_LIMIT_NS
+from lavt.vehicle.dbw.virtual_bus import RECEIVES_OWN_FRAMES, VIRTUAL_INTERFACES
 
 if TYPE_CHECKING:
     from can import BusABC, Message
@@ -42,19 +40,16 @@ POLL_S: Final = 0.1
 """Period at which the port's thread checks whether the port was closed."""
 CLOSE_TIMEOUT_S: Final = 1.0
 """Closing the port waits this long for its thread. If a driver blocks the thread for longer, both are left running."""
+MAX_DIRECT_READS: Final = 256
+"""The most frames that `take` itself reads: 60 ms of a full 500 kbit/s bus. The port's thread reads the others."""
 LATEST_READ_NS: Final = NS_PER_S
 """A frame that has waited longer to be read is dropped: this process was frozen."""
-IP_TIMEOUT_S: Final = 2
 
 logging.getLogger("can").addHandler(logging.NullHandler())  # the errors raised here contain its messages
 
-VIRTUAL_INTERFACES: Final = frozenset({"inside", "virtual", "udp_multicast"})
 STAMPED_BY_KERNEL: Final = frozenset({"socketcan", "udp_multicast"})
 """Interfaces whose frames carry the kernel's wall time of arrival, and whose descriptor is readable if and only if a
 frame is waiting. The times of other interfaces are those of their devices' clocks."""
-RECEIVES_OWN_FRAMES: Final = "udp_multicast"
-"""This interface's socket is a member of the multicast group that it sends to. Own frames are marked, so that they can
-be recognised and dropped."""
 BUS_OFF_BIT: Final = 0x40
 """In the identifier of an error frame of SocketCAN (linux/can/error.h, CAN_ERR_BUSOFF)."""
 FULL_BUFFER_TEXT: Final = "Transmit buffer full"
@@ -68,6 +63,8 @@ class OpenBus(NamedTuple):
     received: deque[ReceivedCanFrame]
     arrivals: ArrivalTimes
     check: DatagramCheck | None
+    reading: threading.Lock
+    """Held by the thread that reads a frame."""
 
     def shut_down(self) -> None:
         """Close the driver's bus, which may be broken already."""
@@ -139,9 +136,12 @@ class CanPort:
     def take(self, now_ns: int) -> list[ReceivedCanFrame]:  # noqa: ARG002 (other ports need it)
         """Return the frames received since the last call, in order, without own frames.
 
-        Raises `BusGone` while the bus is lost.
+        Frames that the port's thread has not read yet, because it waits for a processor, are included if the kernel
+        stamped them. Raises `BusGone` while the bus is lost.
         """
         self._check_suspension()
+        if (bus := self._bus) is not None and self._interface in STAMPED_BY_KERNEL:
+            self._read_waiting(bus)
         bus = self._bus
         if bus is None:
             raise BusGone(self._gone_reason)
@@ -177,7 +177,7 @@ class CanPort:
         opened = self._clock.now()  # before the first frame can arrive
         driver = _open_bus(self._interface, self._channel, self._options)
         check = DatagramCheck(driver.fileno()) if self._interface == RECEIVES_OWN_FRAMES else None
-        return OpenBus(driver, deque(maxlen=QUEUE_FRAMES), ArrivalTimes(opened), check)
+        return OpenBus(driver, deque(maxlen=QUEUE_FRAMES), ArrivalTimes(opened), check, threading.Lock())
 
     def _reopen(self) -> OpenBus | None:
         """Try to open the bus until that succeeds; return None once the port is closed."""
@@ -198,27 +198,44 @@ class CanPort:
         """Read frames until the bus is lost or the port closed, then shut the bus down."""
         try:
             while self._bus is bus and not self._closing.is_set():
-                self._read_once(bus)
+                if self._interface not in STAMPED_BY_KERNEL:
+                    self._read_frame(bus, POLL_S)
+                elif self._is_readable(bus):
+                    with bus.reading:
+                        self._read_frame(bus, 0)
         except Exception as error:  # of any driver
-            if self._bus is bus:
-                self._lose(f"{self._interface} {self._channel} cannot be read ({_error_text(error)})")
+            self._lose_broken(bus, error)
         finally:
             if self._bus is bus:
                 self._lose("the port is closed")
             bus.shut_down()
 
-    def _read_once(self, bus: OpenBus) -> None:
-        timeout_s = POLL_S
-        if self._interface in STAMPED_BY_KERNEL:
-            if not self._is_readable(bus):
-                return
-            timeout_s = 0
+    def _read_waiting(self, bus: OpenBus) -> None:
+        """Read the frames that wait, unless the port's thread is reading one."""
+        if not bus.reading.acquire(blocking=False):
+            return
+        try:
+            for _ in range(MAX_DIRECT_READS):
+                if not select.select([bus.driver.fileno()], [], [], 0)[0]:
+                    break
+                self._read_frame(bus, 0)
+        except Exception as error:  # of any driver
+            self._lose_broken(bus, error)
+        finally:
+            bus.reading.release()
+
+    def _lose_broken(self, bus: OpenBus, error: Exception) -> None:
+        if self._bus is bus:
+            self._lose(f"{self._interface} {self._channel} cannot be read ({_error_text(error)})")
+
+    def _read_frame(self, bus: OpenBus, timeout_s: float) -> None:
+        """Wait for a frame for at most `timeout_s`, and read it."""
         try:
             if bus.check is not None and bus.check.drop_malformed():
                 self.counts["unreadable"] += 1
                 return
             message = bus.driver.recv(timeout_s)
-        except BlockingIOError:  # the announced datagram was dropped for its wrong checksum
+        except BlockingIOError:  # none waits, or the announced datagram was dropped for its wrong checksum
             return
         except Exception as error:
             if bus.check is None or error.__cause__ is None or isinstance(error.__cause__, OSError):
@@ -260,18 +277,6 @@ class CanPort:
             arbitration_id=frame.identifier, is_extended_id=frame.is_extended, data=frame.data, channel=self._mark
         )
         return message
-
-
-def is_virtual(interface: str, channel: str, options: Mapping[str, Any]) -> bool:
-    """Return whether a bus exists in software only, so that no real kit can be on it; False if that is not known.
-
-    A vcan that a gateway rule of the kernel names is not virtual, nor is a multicast that leaves this machine.
-    """
-    if interface == RECEIVES_OWN_FRAMES:
-        return bool(options.get("hop_limit", 0) == 0)
-    if interface in VIRTUAL_INTERFACES:
-        return True
-    return interface == "socketcan" and _link_kind(channel) == "vcan" and not _is_forwarded(channel)
 
 
 def read_log(path: Path) -> Iterator[ReceivedCanFrame]:
@@ -375,26 +380,3 @@ def _error_text(error: Exception) -> str:
     """Return the first lines of an error's and its cause's messages."""
     lines = [str(candidate).partition("\n")[0] for candidate in (error, error.__cause__) if candidate is not None]
     return ": ".join(dict.fromkeys(line for line in lines if line)) or type(error).__name__
-
-
-def _is_forwarded(channel: str) -> bool:
-    """Return whether a gateway rule names an interface; True if the rules cannot be read."""
-    try:
-        return socket.if_nametoindex(channel) in gateway_interfaces()
-    except OSError:
-        return True
-
-
-def _link_kind(channel: str) -> str:
-    """Return the kernel's name of a network interface's kind, empty if it is not known."""
-    try:
-        output = subprocess.run(  # noqa: S603 (the arguments go through no shell)
-            ["ip", "-details", "-json", "link", "show", "dev", channel],  # noqa: S607 (wherever the system has it)
-            capture_output=True,
-            check=True,
-            timeout=IP_TIMEOUT_S,
-        ).stdout
-        (link,) = json.loads(output)
-        return str(link["linkinfo"]["info_kind"])
-    except (OSError, subprocess.SubprocessError, ValueError, LookupError, TypeError):
-        return ""
