@@ -76,10 +76,11 @@ def main() -> None:
     print("| lookahead | frame rate | speed | theory | measured | difference |")
     print("|---" * 6 + "|")
     rows = []
-    for *loop, seed in itertools.product(options.lookaheads, options.rates, options.speeds, options.seeds):
-        config = case(*loop, seed)
+    cases = itertools.product(options.lookaheads, options.rates, options.speeds, options.seeds)
+    for lookahead_s, rate_hz, speed_mps, seed in cases:
+        config = case(lookahead_s, rate_hz, speed_mps, seed)
         theory_ms = theoretical_ms(config)
-        rows.append(table_row(*loop, theory_ms, onset_ms(config, theory_ms)))
+        rows.append(table_row(lookahead_s, rate_hz, speed_mps, theory_ms, onset_ms(config, theory_ms)))
         print(rows[-1], flush=True)
     if any(NOTHING in row for row in rows):
         print(f"\n{NOTHING}: no growing oscillation by theory, or none measured with 0 to {MAX_DELAY_MS:g} ms added")

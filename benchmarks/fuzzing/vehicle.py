@@ -10,7 +10,6 @@ from msgspec.structs import replace
 
 from lavt.assembly.entropy import SeededEntropy
 from lavt.domain import (
-    LARGEST_STORED_STOP,
     NS_PER_MS,
     NS_PER_S,
     Actuation,
@@ -242,12 +241,10 @@ def vehicle_driven(seed: int) -> Target:
     """Make a target for a driven vehicle: no command of a stranger, nor a replayed one, is accepted.
 
     Anybody may stop the vehicle. Without signatures anybody may also take control of it after an emergency stop and
-    clear the stop. The operator then takes control again and arms the vehicle. To make this rare, the first emergency
-    stop has the largest number that is stored: most later ones have a smaller number, count as old, and do nothing.
+    clear the stop. The operator then takes control again and arms the vehicle.
     """
     side = VehicleSide(seed)
     side.request("acquire")
-    side.request("emergency_stop", LARGEST_STORED_STOP)
     side.arm()
     inputs = inputs_while_driving = 0
 
