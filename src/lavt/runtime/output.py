@@ -22,7 +22,7 @@ StreamName = Literal["stdout", "stderr"]
 class QueuedOutput(io.TextIOBase):
     """A text stream whose texts a thread writes to a file descriptor.
 
-    An ordinary write to a pipe or terminal that nobody reads blocks; a signal handler interrupts it only for a moment.
+    If nobody reads a pipe or terminal, an ordinary write blocks, and a signal handler interrupts it only for a moment.
     Here only the thread blocks. If the queue is full, the oldest text is dropped and counted, as are texts that cannot
     be written. Any thread and signal handler may write.
     """
@@ -72,7 +72,7 @@ class QueuedOutput(io.TextIOBase):
 def queue_output(*names: StreamName) -> None:
     """Replace these standard streams by queued ones until the program ends.
 
-    Texts that are queued at exit are written then, after the interpreter has printed the traceback of an error.
+    At exit, the queued texts are written after the interpreter has printed the traceback of an error.
     """
     atexit.unregister(finish_output)
     atexit.register(finish_output)

@@ -1,4 +1,4 @@
-"""The priority of LAVT's processes, which is raised if the system allows that (to root)."""
+"""The priority of LAVT's processes, which is raised if the system permits this, as it does for root."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ VEHICLE_NICENESS: Final = -15
 """Priority of the actuator's process and of a software car: above that of the server."""
 
 SESSION: Final = Path("/proc/self/autogroup")
-"""The niceness of this process's session. With automatic task groups, Linux shares the processors among sessions, and
-the niceness of a process counts only within its session."""
+"""The niceness of this process's session. With automatic task groups, Linux shares the processors among sessions; the
+niceness of a process then has an effect only inside its session."""
 
 
 def raise_priority(niceness: int = NICENESS) -> None:
