@@ -1,11 +1,11 @@
 """An emulated link without input and output: it decides which packets are lost and when the others leave.
 
 The virtual runtime and the relay use it. It emulates netem as `docs/netem.md` describes it, in the kernel's order.
-First it decides whether a packet is lost. Of the other packets it reorders a share: these are not delayed. The rest
-wait in order, first for their delay and then for the rate. Unlike netem, it can also take the delay or the capacity
-from a trace. Each impairment has a random-number stream of its own, from which it draws by packet number or by time
-slot. So an additional impairment does not change the draws of the others, and two runs with one seed get the same
-draws.
+First the link decides whether a packet is lost. A share of the other packets is reordered: these packets are not
+delayed. The rest wait in order, first for their delay and then for the rate. Unlike netem, the link can also take the
+delay or the capacity from a trace. Each impairment draws from its own random-number stream, by packet number or by time
+slot. So an additional impairment does not change the draws of the other impairments, and two runs with one seed get the
+same draws.
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ class Bottleneck:
         self._departures_ns: deque[int] = deque()
         """Departure times of the packets in the queue."""
         self._free_ns = start_ns
-        """When the rate has sent all packets that have arrived so far."""
+        """When all packets that have arrived so far have been sent at the rate."""
         self._opportunity, self._left_bytes = -1, 0
         """The number of the last opportunity that was used, and the bytes left in it."""
 
