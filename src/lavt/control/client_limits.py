@@ -30,7 +30,7 @@ class ClientLimits:
     command_period_ns: int = 20 * NS_PER_MS
     """Longest interval between commands."""
     brake: float = 0.67
-    """Brake pedal while pictures, states or lanes are missing: 4 m/s2 on a car with 6 m/s2 at full pedal."""
+    """Brake pedal when pictures, states or lanes are missing: 4 m/s2 on a car with 6 m/s2 at full pedal."""
 
 
 CLIENT_LIMITS = ClientLimits()

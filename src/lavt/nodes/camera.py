@@ -174,7 +174,7 @@ class CameraNode:
 
     def _packetize(self, encoded: EncodedFrame, now: Now) -> list[Send]:
         stamped, unit = encoded.stamped, encoded.access_unit
-        packets = self._stream.packets(unit, encoded.stamp_ns, now)
+        packets = self._stream.make_packets(unit, encoded.stamp_ns, now)
         validated = self.path.open_address(now.mono_ns)
         self._counts["frames_sent"] += 1
         self._counts["frames_without_receiver"] += validated is None and not self._send_to

@@ -26,7 +26,7 @@ MEASURE_PERIOD_NS = 5 * NS_PER_S
 """Period at which a condition in force is measured."""
 REQUEST_PERIOD_NS = NS_PER_S
 LEASE_MS = 5_000
-"""The client renews its lease once a second, so four requests in a row may be lost."""
+"""The client renews its lease once a second, so the lease survives the loss of four requests in a row."""
 MAX_PENDING_REQUESTS = 64
 """Largest number of requests whose reply waits until the queues have been changed."""
 
@@ -90,7 +90,7 @@ class InjectionNode:
     """The server's node, which impairs packets that this machine sends, on the request of one client at a time.
 
     `control` is the protocol and the port of the link between the routers. A vehicle that is not `simulated` must be
-    stationary and disarmed for a change of the condition, but a lease may end at any time.
+    stationary and disarmed for a change of the condition, but a lease can end at any time.
     """
 
     name = "injection"
@@ -193,7 +193,7 @@ class InjectionNode:
             return sends
         self.counts["netem_failed"] += 1
         self._lease = None
-        # The order may have failed half-way, so the queues are cleared; a failed clearing is repeated every second.
+        # Perhaps the order failed half-way, so the queues are cleared. If clearing fails, it is repeated every second.
         return [*sends, *self._queues.order("", ())] if self._queues.condition else sends
 
     def _wake(self, _message: Message, now: Now) -> list[Send]:

@@ -151,7 +151,8 @@ def sides_by_windows(
     position of the pair, its near end (x) and the offset of its middle to the left of `start`, in metres.
     """
     length_m, half_width_m = WINDOW_M
-    offset_m = points.y_m - _evaluate_centre(points.x_m, start)[0]
+    start_y_m, _ = _evaluate_centre(points.x_m, start)
+    offset_m = points.y_m - start_y_m
     middle_m = 0.0
     sides = np.zeros(len(points.x_m), dtype=np.int8)
     windows = []
@@ -226,7 +227,8 @@ def has_parallel(points: Points, fit: LaneFit, grid: GroundGrid) -> bool:
     ]
     if len(visible_sides) != 1:
         return len(visible_sides) == 2
-    distance_m = np.abs(_lateral_offset_m(points, fit.centre) - visible_sides[0] * 1.5 * fit.width_m)
+    (side,) = visible_sides
+    distance_m = np.abs(_lateral_offset_m(points, fit.centre) - side * 1.5 * fit.width_m)
     return _visible_share(points.x_m, distance_m, grid) >= MIN_PARALLEL_VISIBLE
 
 

@@ -32,7 +32,7 @@ MARK_PX = 21
 
 
 def lane_pixels(region: Picture, scale: float = 1.0) -> Mask:
-    """Return a mask of the pixels of `region`, (height, width, 3), that may belong to a lane's marks.
+    """Return a mask of the pixels of `region`, (height, width, 3), that can belong to a lane's marks.
 
     `scale` is the camera's focal length divided by 320 px; marks are wider by this factor.
     """

@@ -56,11 +56,12 @@ def _make_tile(label: str, tile: Picture) -> Picture:
     """Return a tile with a picture scaled to fit and its label above."""
     width, height = TILE_PX
     factor = min(width / tile.shape[1], height / tile.shape[0])
-    size = (max(round(tile.shape[1] * factor), 1), max(round(tile.shape[0] * factor), 1))
-    shrunk = cv2.resize(tile, size, interpolation=cv2.INTER_AREA if factor < 1 else cv2.INTER_NEAREST)
+    scaled_width, scaled_height = max(round(tile.shape[1] * factor), 1), max(round(tile.shape[0] * factor), 1)
+    interpolation = cv2.INTER_AREA if factor < 1 else cv2.INTER_NEAREST
+    scaled = cv2.resize(tile, (scaled_width, scaled_height), interpolation=interpolation)
     whole = np.full((height + LABEL_PX, width, 3), 30, dtype=np.uint8)
-    left, top = (width - size[0]) // 2, LABEL_PX + (height - size[1]) // 2
-    whole[top : top + size[1], left : left + size[0]] = shrunk
+    left, top = (width - scaled_width) // 2, LABEL_PX + (height - scaled_height) // 2
+    whole[top : top + scaled_height, left : left + scaled_width] = scaled
     cv2.putText(whole, label, (6, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
     return whole
 
@@ -108,10 +109,11 @@ def _cells(points: FloatArray, grid: GroundGrid) -> FloatArray:
 
 def _parallel_line(centre: tuple[float, float, float], offset_m: float, near_m: float, far_m: float) -> FloatArray:
     """Return ground points (n, 2) along the parallel of a centre, `offset_m` to its left."""
+    c0, c1, c2 = centre
     x = np.linspace(near_m, far_m, 60)
-    slope = centre[1] + 2 * centre[2] * x
-    across = np.column_stack([-slope, np.ones_like(slope)]) / np.hypot(slope, 1.0)[:, None]
-    return np.column_stack([x, centre[0] + (centre[1] + centre[2] * x) * x]) + offset_m * across
+    slope = c1 + 2 * c2 * x
+    to_the_left = np.column_stack([-slope, np.ones_like(slope)]) / np.hypot(slope, 1.0)[:, None]
+    return np.column_stack([x, c0 + (c1 + c2 * x) * x]) + offset_m * to_the_left
 
 
 def _draw_points(trace: DetectionTrace, grid: GroundGrid) -> Picture:

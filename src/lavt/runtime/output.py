@@ -12,7 +12,7 @@ from queue import Empty, SimpleQueue
 from typing import Final, Literal
 
 CAPACITY: Final = 1000
-"""Number of texts that may wait: the JSON lines of three minutes of a drive."""
+"""Largest number of texts that wait: the JSON lines of three minutes of a drive."""
 FINISH_TIMEOUT_S: Final = 1.0
 """How long a program waits at its end for the reader of each stream."""
 

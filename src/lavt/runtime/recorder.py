@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 
 POLL_PERIOD_S = 0.02
 CLOSE_TIMEOUT_S = 10.0
-"""How long completing a record may take; writing a full queue takes a second on an ordinary disk."""
+"""Longest time for the completion of a record; to write a full queue takes a second on an ordinary disk."""
 
 
 class Recorder(Protocol):
@@ -39,7 +39,7 @@ class RecordFile(Recorder, Protocol):
 
 
 class Recorders:
-    """A recorder that passes each entry to several recorders, none of which may block or raise."""
+    """A recorder that passes each entry to several recorders, which must neither block nor raise."""
 
     def __init__(self, *recorders: Recorder) -> None:
         self._writes = tuple(recorder.write for recorder in recorders)

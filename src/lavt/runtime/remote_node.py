@@ -32,7 +32,7 @@ CHECK_PERIOD_S: Final = 0.05
 """Period at which the node's heartbeat is checked. A silence is measured in checks, not in time: if the checking
 process itself was frozen, only one check is missed."""
 FIRST_HEARTBEAT_CHECKS: Final = 600
-"""Number of checks that may pass until the first heartbeat: 30 s."""
+"""Number of checks after which the first heartbeat must have come: 30 s."""
 SILENT_AFTER_CHECKS: Final = 2
 """Number of checks without a heartbeat after which the node is silent: 0.1 s."""
 FAILED_AFTER_CHECKS: Final = 10
@@ -110,9 +110,10 @@ class RemoteNodeProxy:
             return
         kind, *rest = report
         if kind == "record":
-            if rest[0] == self._heartbeat:
+            topic, payload, now = rest
+            if topic == self._heartbeat:
                 self._missed = 0
-            runtime.record(*rest)
+            runtime.record(topic, payload, now)
         elif kind == "send":
             carrier, sends, sent = rest
             if runtime.now().mono_ns - sent.mono_ns > LATE_NS:  # one process did not run; an old state is useless
@@ -123,7 +124,8 @@ class RemoteNodeProxy:
         elif kind == "status":
             (self.status,) = rest
         elif kind == "failed":
-            runtime.fail(WorkError(rest[0]))
+            (reason,) = rest
+            runtime.fail(WorkError(reason))
 
     def _carry(self, runtime: RealRuntime, carrier: Carrier, sends: Sequence[Send]) -> None:
         """Send messages. Another thread sends the replies: if a router is frozen, Zenoh blocks replies for seconds."""

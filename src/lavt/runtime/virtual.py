@@ -155,12 +155,13 @@ class VirtualRuntime:
         self.links = dict(links)
         self._other = {side: next(other for other in self.hosts if other != side) for side in self.hosts}
         self._heap: list[tuple[int, int, Callable[..., None], tuple[Any, ...]]] = []
+        """The events: true time, number, action and its arguments. The number keeps the order of events at one time."""
         self._number = 0
         for host in hosts:
             for runner in host.runners.values():
                 self._schedule(runner, 0)
 
-    def at(self, true_ns: int, action: Callable[..., None], *arguments: Any) -> None:
+    def call_at(self, true_ns: int, action: Callable[..., None], *arguments: Any) -> None:
         """Call `action` with `arguments` at a true time."""
         self._number += 1
         heapq.heappush(self._heap, (true_ns, self._number, action, arguments))
@@ -238,7 +239,7 @@ class VirtualRuntime:
             host.recorder.write("timeline", outcome.timeline, outcome.end)
         if outcome.sends:
             if duration_ns:
-                self.at(free_ns, self._send_all, host, outcome.sends, outcome.end)
+                self.call_at(free_ns, self._send_all, host, outcome.sends, outcome.end)
             else:
                 self._send_all(host, outcome.sends, outcome.end)
         # A node changes its next wake only while it runs a pipeline.
@@ -274,7 +275,7 @@ class VirtualRuntime:
         payload: bytes = send.payload
         due_ns = link.line.push((payload, host.peer), self.true_ns, link.index(payload, link.count), len(payload))
         if due_ns is not None:
-            self.at(due_ns, self._arrive, link, send.channel, self._other[host.side])
+            self.call_at(due_ns, self._arrive, link, send.channel, self._other[host.side])
 
     def _arrive(self, link: VirtualLink, channel: str, side: str) -> None:
         for payload, peer in link.line.pop_due(self.true_ns):

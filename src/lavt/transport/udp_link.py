@@ -79,7 +79,8 @@ class UdpLink:
         for send in sends:
             address = send.peer
             if self._remote is not None:
-                address = self._server = (self._remote[0], self._remote[1] or send.peer)
+                host, port = self._remote
+                address = self._server = (host, port or send.peer)
             try:
                 self._socket.sendto(send.payload, socket.MSG_DONTWAIT, address)
             except OSError:  # the datagram is lost, as on the network: no frame waits for an earlier one

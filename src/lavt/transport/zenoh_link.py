@@ -315,9 +315,10 @@ class ZenohLink:
             if reply.ok is not None
         ]
         reports.sort(key=lambda report: report["zid"] not in own_routers)
-        if not reports or reports[0]["zid"] not in own_routers:
+        own_report = reports[0] if reports else None
+        if own_report is None or own_report["zid"] not in own_routers:
             return None
-        linked = sum(session["whatami"] == "router" for session in reports[0]["sessions"])
+        linked = sum(session["whatami"] == "router" for session in own_report["sessions"])
         return Routers(linked, tuple(report["version"].partition("-")[0] for report in reports))
 
     def close(self) -> None:

@@ -59,7 +59,7 @@ class PersistentProcess(ABC):
     def run(self, command: Sequence[str], timeout_s: float) -> Completed | None:
         """Run a command to completion. Return None if it takes too long, or the process has died or was closed."""
         with self._lock:
-            if self._is_closed:  # a query of another thread may come later than `close`
+            if self._is_closed:  # a query of another thread can come later than `close`
                 return None
             try:
                 return self._query(self.encode(command), timeout_s)
@@ -109,7 +109,7 @@ class PersistentProcess(ABC):
                 os.killpg(self._process.pid, signal.SIGKILL)  # including its children, in its session
             for pipe in (self._process.stdin, self._process.stdout):
                 if pipe is not None:
-                    pipe.close()  # without reading: a child outside the session may keep the other end open for ever
+                    pipe.close()  # without reading: a child outside the session can keep the other end open for ever
             self._process.wait()
             self._process = None
 

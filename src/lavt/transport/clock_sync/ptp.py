@@ -38,9 +38,9 @@ def parse_ptp(host: str, answer: str, before: Now, after: Now) -> ClockReport:
     """
     query_ns = after.mono_ns - before.mono_ns
     middle = before.later(query_ns // 2)
-    rows = [line.split() for line in answer.splitlines()]
-    fields = {row[0]: row[1] for row in rows if len(row) == 2}
-    states = [row[1] for row in rows if len(row) == 2 and row[0] == "portState"]
+    pairs = [words for line in answer.splitlines() if len(words := line.split()) == 2]
+    fields = dict(pairs)
+    states = [value for name, value in pairs if name == "portState"]
     if "gmIdentity" not in fields:
         return unknown_clock(middle, host, SOURCE, NOT_RUNNING)
     offset_ns, path_ns, steps = (

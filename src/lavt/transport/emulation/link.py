@@ -41,7 +41,7 @@ class LinkInjection:
 
 
 def check_injection(injected: LinkInjection) -> None:
-    """Raise `UserError` for contradictory values. Jitter may exceed the delay: negative delays are cut off at 0."""
+    """Raise `UserError` for contradictory values. Jitter can be larger than the delay: a negative delay becomes 0."""
     impairment, name = injected.impairment, injected.name
     check_impairment(name, impairment)
     if impairment.reorder and not (
@@ -55,8 +55,8 @@ def check_injection(injected: LinkInjection) -> None:
 class EmulatedLink:
     """One direction of an emulated link; times are on the caller's clock, and a trace begins at `start_ns`.
 
-    Public counters, in packets: `packets` arrived, of which some were `lost` at random, some were `dropped` because the
-    queue was full, and some `overtook` others.
+    Public counters, in packets: `packets` arrived. Of these, `lost` were lost at random, `dropped` were dropped because
+    the queue was full, and `overtook` left before an earlier packet.
     """
 
     def __init__(self, injected: LinkInjection, start_ns: int = 0) -> None:

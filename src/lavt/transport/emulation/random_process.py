@@ -107,9 +107,9 @@ class LossProcess:
 
     `bursts` are the probabilities that a burst begins and ends; None: losses are independent, with probability `loss`.
     `name` is the name of the random-number stream of `seed`. With the same stream, a process with a higher loss loses
-    every packet that one with a lower loss loses, and more. This is true if both lose packets independently, or if both
-    have the same mean length of a burst and the lower loss is at most 1 - 1 / that length. (If the lower loss is
-    higher, a burst is less likely to continue than to begin.)
+    every packet that a process with a lower loss loses, and more. This is true if both lose packets independently, or
+    if both have the same mean length of a burst and the lower loss is at most 1 - 1 / that length. (If the lower loss
+    is higher, a burst is less likely to continue than to begin.)
     """
 
     def __init__(self, seed: int, name: str, loss: float, bursts: BurstProbabilities | None) -> None:

@@ -76,7 +76,7 @@ class NetemQueues(Protocol):
 class Injector:
     """A link that executes injection orders one after the other; without `queues` only transparent flows are possible.
 
-    No order may cover a port of `exempt`.
+    Orders for flows that cover a port of `exempt` fail.
     """
 
     def __init__(
@@ -111,7 +111,7 @@ class Injector:
         while (order := self._wait_for_newest()) is not None:
             try:
                 result = self._execute(order)
-            except Exception as error:  # whatever fails, the next order must be executed: it may clear the interface
+            except Exception as error:  # whatever fails, later orders must be executed, such as a clearing
                 log.exception("netem failed")
                 result = InjectionResult(order.number, f"{type(error).__name__}: {error}", "", ())
             self._deliver("injected", result, self._clock.now(), None)

@@ -171,50 +171,50 @@ def judge(
     ]
 
 
-def _check_delays(probe: QueueProbe, found: ProbeResult | None) -> list[str]:
+def _check_delays(probe: QueueProbe, result: ProbeResult | None) -> list[str]:
     name, impairment = probe.name, probe.impairment
-    if found is None:
+    if result is None:
         return [f"{name}: no packet came through"]
-    if found.median_ms is None or found.p5_ms is None or found.p95_ms is None:
+    if result.median_ms is None or result.p5_ms is None or result.p95_ms is None:
         return (
-            _check_counts(probe, found)
+            _check_counts(probe, result)
             if impairment.loss or impairment.reorder
             else [f"{name}: no packet came through"]
         )
     reasons = []
     if (
         not (impairment.jitter_ms or impairment.rate_bps)
-        and abs(found.median_ms - impairment.delay_ms) > MEDIAN_TOLERANCE_MS
+        and abs(result.median_ms - impairment.delay_ms) > MEDIAN_TOLERANCE_MS
     ):
-        reasons.append(f"{name} was delayed by {found.median_ms:.2f} ms instead of {impairment.delay_ms:g} ms")
+        reasons.append(f"{name} was delayed by {result.median_ms:.2f} ms instead of {impairment.delay_ms:g} ms")
     least_ms = impairment.delay_ms - 4 * impairment.jitter_ms - MEDIAN_TOLERANCE_MS
-    if (impairment.jitter_ms or impairment.rate_bps) and found.p5_ms < least_ms:
-        reasons.append(f"{name} was delayed by {found.p5_ms:.2f} ms (p5); the least is {least_ms:.2f} ms")
+    if (impairment.jitter_ms or impairment.rate_bps) and result.p5_ms < least_ms:
+        reasons.append(f"{name} was delayed by {result.p5_ms:.2f} ms (p5); the least is {least_ms:.2f} ms")
     most_ms = impairment.longest_ms + MEDIAN_TOLERANCE_MS
-    if impairment.jitter_ms and not impairment.rate_bps and found.median_ms > most_ms:
-        reasons.append(f"{name} was delayed by {found.median_ms:.2f} ms (median); the most is {most_ms:.2f} ms")
+    if impairment.jitter_ms and not impairment.rate_bps and result.median_ms > most_ms:
+        reasons.append(f"{name} was delayed by {result.median_ms:.2f} ms (median); the most is {most_ms:.2f} ms")
     if (
         impairment.jitter_ms
         and not impairment.jitter_correlation
-        and found.p95_ms - found.p5_ms < impairment.jitter_ms / 2
+        and result.p95_ms - result.p5_ms < impairment.jitter_ms / 2
     ):
-        spread_ms = found.p95_ms - found.p5_ms
+        spread_ms = result.p95_ms - result.p5_ms
         reasons.append(f"{name} has a jitter of {spread_ms:.2f} ms (p5 to p95) instead of {impairment.jitter_ms:g} ms")
-    return reasons + _check_counts(probe, found)
+    return reasons + _check_counts(probe, result)
 
 
-def _check_counts(probe: QueueProbe, found: ProbeResult) -> list[str]:
+def _check_counts(probe: QueueProbe, result: ProbeResult) -> list[str]:
     name, impairment = probe.name, probe.impairment
     reasons = []
-    if not _is_plausible_share(found.lost, found.sent, impairment.loss, _variance_factor(impairment)):
-        reasons.append(f"{name}: {found.lost} of {found.sent} packets were lost instead of {impairment.loss:.1%}")
-    arrived = found.sent - found.lost
-    if not _is_plausible_share(found.early, arrived, impairment.reorder, 1.0):
+    if not _is_plausible_share(result.lost, result.sent, impairment.loss, _variance_factor(impairment)):
+        reasons.append(f"{name}: {result.lost} of {result.sent} packets were lost instead of {impairment.loss:.1%}")
+    arrived = result.sent - result.lost
+    if not _is_plausible_share(result.early, arrived, impairment.reorder, 1.0):
         reasons.append(
-            f"{name}: {found.early} of {arrived} packets overtook others instead of {impairment.reorder:.1%}"
+            f"{name}: {result.early} of {arrived} packets overtook others instead of {impairment.reorder:.1%}"
         )
-    if found.reordered and not impairment.reorder:
-        reasons.append(f"{name}: {found.reordered} packets were reordered")
+    if result.reordered and not impairment.reorder:
+        reasons.append(f"{name}: {result.reordered} packets were reordered")
     return reasons
 
 

@@ -51,7 +51,7 @@ class RepairSender:
         self.ssrc = ssrc
         self.next_sequence = first_sequence % _SEQUENCES
 
-    def repair(self, datagrams: Sequence[bytes], count: int) -> list[bytes]:
+    def make_repair_packets(self, datagrams: Sequence[bytes], count: int) -> list[bytes]:
         """Return `count` repair packets for each block of a frame, to be sent after it.
 
         `datagrams` are all RTP packets of the frame, in order, as the `Packetizer` returned them. A frame of more than

@@ -133,7 +133,7 @@ class Packetizer:
         return datagrams
 
     def _to_payloads(self, units: list[bytes]) -> list[bytes]:
-        """Pack NAL units in order: small ones share a packet while they fit, large ones are split into fragments."""
+        """Pack NAL units in order: small ones share packets, large ones are split into fragments."""
         payloads: list[bytes] = []
         small_units: list[bytes] = []
         free_bytes = self._max_payload_bytes - 1

@@ -49,12 +49,12 @@ class StreamSender:
         self._reference: tuple[ReferenceTime, int] | None = None
         """The last reference time of the receiver that was not answered yet, and when it arrived."""
 
-    def packets(self, access_unit: bytes, stamp_ns: int, now: Now) -> FramePackets:
+    def make_packets(self, access_unit: bytes, stamp_ns: int, now: Now) -> FramePackets:
         """Return the datagrams of a frame that was stamped at `stamp_ns` of the wall clock."""
         timestamp = rtp_timestamp(stamp_ns)
         media = self._packetizer.packetize(access_unit, timestamp)
         count = self._redundancy.repair_packets(now.mono_ns) if self._repair_packets is None else self._repair_packets
-        repair = self._repairs.repair(media, count) if count else []
+        repair = self._repairs.make_repair_packets(media, count) if count else []
         self._packets += len(media)
         self._octets += sum(map(len, media)) - RTP_HEADER_BYTES * len(media)
         report = []
