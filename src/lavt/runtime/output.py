@@ -80,7 +80,7 @@ def queue_output(*names: StreamName) -> None:
         stream = getattr(sys, name)
         if not isinstance(stream, QueuedOutput):
             stream.flush()
-            descriptor = os.dup(stream.fileno())  # a copy, because the replaced stream closes its own
+            descriptor = os.dup(stream.fileno())  # a copy: the replaced stream closes the original
             setattr(sys, name, QueuedOutput(descriptor))
 
 

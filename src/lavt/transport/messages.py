@@ -39,13 +39,15 @@ NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_-]{0,31}\Z")
 """A valid name of a vehicle or client: it contains nothing that has a meaning in a Zenoh key."""
 ELLIPSIS = "\N{HORIZONTAL ELLIPSIS}"
 MAX_DELAY_MS = 10_000.0
-"""The longest delay that a client can request of a server; clearing the delay takes as long."""
+"""The longest delay that a client can request of a server. Clearing a delay takes as long, because the delayed packets
+leave first."""
 SPEED_BOUND_MPS = 100.0
 ROAD_WHEEL_BOUND_RAD = 1.0
 CURVATURE_BOUND_PER_M = 1.0
 
 Version = Annotated[int, Meta(ge=VERSION, le=VERSION)]
 U64 = Annotated[int, Meta(ge=0)]
+"""Epochs and instances of processes; msgpack itself limits the number to 64 bits."""
 U63 = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 """Times, and numbers that grow: the non-negative half of a signed 64-bit integer."""
 RoadWheel = Annotated[float, Meta(ge=-ROAD_WHEEL_BOUND_RAD, le=ROAD_WHEEL_BOUND_RAD)]

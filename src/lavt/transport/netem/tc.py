@@ -63,7 +63,7 @@ PLACES: Final[Mapping[str, FlowPlacement]] = {
 
 
 class U32Match(Struct, frozen=True):
-    """One condition of a u32 filter: `text` is tc's input for it, and tc reports it as offset, bits and mask."""
+    """One match of a u32 filter: `text` is tc's input for the match, which tc reports as offset, bits and mask."""
 
     text: str
     offset: int
