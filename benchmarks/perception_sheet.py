@@ -25,7 +25,7 @@ from lavt.control.lane_watch import LANE_CONFIDENCE
 from lavt.domain import FloatArray, Lane, Picture
 from lavt.perception.calibration import calibrated
 from lavt.perception.lane_detector import LaneDetector
-from lavt.perception.panel import panel
+from lavt.perception.panel import draw_panel
 
 ERROR_LIMIT_M = 0.5
 """A lane is wrong if its centre is off by more than this at 10 m."""
@@ -134,7 +134,7 @@ def draw_sheet(sheet_cases: Iterable[DegradedCase]) -> Picture:
     rows = []
     for case in sheet_cases:
         detector = LaneDetector(MODEL)
-        drawn = panel(calibrated(MODEL), detector, case.picture)
+        drawn = draw_panel(calibrated(MODEL), detector, case.picture)
         title = np.full((34, drawn.shape[1], 3), 90, dtype=np.uint8)
         cv2.putText(title, case.kind, (10, 25), cv2.FONT_HERSHEY_SIMPLEX, 0.8, (255, 255, 255), 2, cv2.LINE_AA)
         rows += [title, drawn]

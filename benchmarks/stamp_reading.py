@@ -261,7 +261,7 @@ def study_link(size: str, rate_kbps: int, loss: float, repair: int, frames: int)
         now_ns = number * FRAME_NS
         stamp_ns = START_NS + now_ns + int(generator.integers(STAMP_JITTER_NS))
         datagrams = sender.send(number, pictures[number % len(pictures)], stamp_ns)
-        repair_datagrams = sender.repair.repair(datagrams, repair)
+        repair_datagrams = sender.repair.make_repair_packets(datagrams, repair)
         arrived = [datagram for datagram in (*datagrams, *repair_datagrams) if generator.random() >= loss]
         timestamp = rtp_timestamp(stamp_ns)
         captured_ns = stamp_ns - int(generator.integers(FOREIGN_JITTER_NS))

@@ -18,7 +18,7 @@ tc qdisc add dev "$interface" root handle 4c56: prio bands 6
 tc qdisc add dev "$interface" parent 4c56:4 handle 4c01: netem limit 10000 delay "${video_ms}ms" rate 10gbit
 
 # Packets, but not fragments, from the video's port whose payload begins like RTP (version 2). The challenges of the path
-# validation do not.
+# validation begin differently, so they are not delayed.
 tc filter add dev "$interface" parent 4c56: protocol ip prio 1 u32 match u8 0x45 0xff at 0 \
     match u16 0x0000 0x1fff at 6 match ip protocol 17 0xff match ip sport "$video_port" 0xffff \
     match u8 0x80 0xc0 at 28 classid 4c56:4

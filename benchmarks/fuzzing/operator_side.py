@@ -205,7 +205,7 @@ def video_corpora(encoded: Sequence[bytes]) -> dict[str, Corpus]:
     for foreign in (Packetizer(99, 5), Packetizer(77, 65_100)):
         frames = [foreign.packetize(unit, 3000 * frame) for frame, unit in enumerate(encoded)]
         media += [datagram for frame in frames for datagram in frame]
-        repair += RepairSender(98, 0).repair(frames[0], 2)
+        repair += RepairSender(98, 0).make_repair_packets(frames[0], 2)
     answer = ReferenceAnswer(RECEIVER_SSRC, 12345, NS_PER_MS)
     reports = [
         sender_report(
@@ -246,7 +246,7 @@ def video(seed: int) -> Target:
         """Deliver the next frame of the true stream; every second one loses its first packet."""
         nonlocal frame
         datagrams = packetizer.packetize(encoded[frame % len(encoded)], frame * 3000 % 2**32)
-        repair_packets = repairs.repair(datagrams, frame % 3)
+        repair_packets = repairs.make_repair_packets(datagrams, frame % 3)
         corpora["rtp"].replays.extend(datagrams)
         corpora["repair"].replays.extend(repair_packets)
         for datagram in (*datagrams[frame % 2 :], *repair_packets):

@@ -219,7 +219,9 @@ def encrypted_video(seed: int) -> Target:
         nonlocal frame
         datagrams = packetizer.packetize(encoded[frame % len(encoded)], frame * 3000 % 2**32)
         frame += 1
-        return [server.cipher.protect(datagram) for datagram in (*datagrams, *repairs.repair(datagrams, 1))]
+        return [
+            server.cipher.protect(datagram) for datagram in (*datagrams, *repairs.make_repair_packets(datagrams, 1))
+        ]
 
     protected = next_true_frame()
     corpora["rtp"] = Corpus(protected, fields=EVERY_THIRD_BYTE)

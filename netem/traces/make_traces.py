@@ -25,7 +25,7 @@ def fading() -> str:
 
 
 def handover() -> str:
-    """Return a delay of 20 ms that rises to 180 ms within 0.2 s and falls back within a second, every 10 s, in CSV."""
+    """Return a delay of 20 ms that every 10 s rises to 180 ms, in 0.2 s, and falls back, in a second; in CSV."""
     points = [(0.0, 20), (6.0, 20), (6.2, 180), (7.2, 20), (10.0, 20)]
     return "time_s,delay_ms\n" + "".join(f"{time_s:g},{delay_ms}\n" for time_s, delay_ms in points)
 

@@ -31,7 +31,7 @@ from lavt.nodes.client_session import ClientSession
 from lavt.nodes.driver import DriverNode
 from lavt.nodes.payloads import DecodedFrame, PathToken, PictureRead, ReceivedUnit
 from lavt.nodes.picture_reader import PictureReader
-from lavt.perception.lane_detector import FOLLOWS_FOR_NS, LaneDetector
+from lavt.perception.lane_detector import LONGEST_GAP_NS, LaneDetector
 from lavt.transport.messages import decode, encode
 from lavt.transport.video.frame_codec import RenderedPicture, VideoReceiver
 from lavt.transport.video.h264 import Decoder, Encoder
@@ -364,7 +364,7 @@ def test_the_emergency_stop_is_in_every_command() -> None:
 
 @pytest.mark.parametrize(
     ("since_ns", "forgets"),
-    [(FRAME_NS, False), (FOLLOWS_FOR_NS, False), (FOLLOWS_FOR_NS + 1, True), (-FRAME_NS, True)],
+    [(FRAME_NS, False), (LONGEST_GAP_NS, False), (LONGEST_GAP_NS + 1, True), (-FRAME_NS, True)],
     ids=["next", "just in time", "after a gap", "clock set back"],
 )
 def test_after_a_gap_the_lane_is_searched_without_memory(since_ns: int, forgets: bool) -> None:

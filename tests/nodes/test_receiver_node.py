@@ -170,7 +170,7 @@ def test_a_repaired_loss_requests_no_keyframe() -> None:
     """A packet recovered by a repair packet completes its access unit without a keyframe request."""
     node = new_node()
     first, second, _ = packets_of_frames()
-    repairs = RepairSender(78, 0).repair(second, 1)
+    repairs = RepairSender(78, 0).make_repair_packets(second, 1)
     for packet in first:
         deliver(node, "rtp", packet, at(0))
     deliver(node, WAKE, None, at(10 * NS_PER_MS))

@@ -5,7 +5,7 @@ import pytest
 
 from lavt.domain import CameraModel
 from lavt.errors import UserError
-from lavt.perception.bird_eye import STAMP_SIDE_PX, GroundGrid, bird_eye
+from lavt.perception.bird_eye import STAMP_SIDE_PX, GroundGrid, make_bird_eye
 from lavt.perception.calibration import calibrated, ground_to_picture
 
 FOCAL_PX = 320
@@ -42,11 +42,11 @@ def test_a_point_at_the_pitch_angle_is_in_the_middle_row() -> None:
 def test_a_ground_point_maps_to_its_cell() -> None:
     """A spot in the picture at a ground point's projection appears in the grid cell of that point."""
     model, grid = CameraModel(), GroundGrid()
-    mapping = bird_eye(calibrated(model), grid)
+    mapping = make_bird_eye(calibrated(model), grid)
     picture = np.zeros((model.height_px, model.width_px), dtype=np.uint8)
     u, v = pixel_of(model, 8.0, -1.5)
     picture[round(v) - 1 : round(v) + 2, round(u) - 1 : round(u) + 2] = 255
-    rows, columns = np.nonzero(mapping.from_above(mapping.region(picture)))
+    rows, columns = np.nonzero(mapping.view_from_above(mapping.region(picture)))
     assert np.mean(grid.row_x_m()[rows]) == pytest.approx(8.0, abs=0.1)
     assert np.mean(grid.column_y_m()[columns]) == pytest.approx(-1.5, abs=0.03)
 
@@ -56,19 +56,19 @@ def test_a_ground_point_maps_to_its_cell() -> None:
 )
 def test_the_stamp_is_masked(model: CameraModel) -> None:
     """A picture that is white only in the stamp has an empty bird's-eye view."""
-    mapping = bird_eye(calibrated(model), GroundGrid())
+    mapping = make_bird_eye(calibrated(model), GroundGrid())
     picture = np.zeros((model.height_px, model.width_px), dtype=np.uint8)
     picture[:STAMP_SIDE_PX, :STAMP_SIDE_PX] = 255
-    assert not mapping.from_above(mapping.region(picture)).any()
+    assert not mapping.view_from_above(mapping.region(picture)).any()
 
 
 def test_without_a_stamp_its_corner_is_used() -> None:
     """If pictures have no stamp, the bird's-eye view includes the road in the stamp's corner."""
     camera = calibrated(CameraModel(field_of_view_rad=0.7, pitch_rad=0.3))
     white = np.full((480, 640), 255, dtype=np.uint8)
-    with_stamp, without_stamp = (bird_eye(camera, GroundGrid(), stamped=has_stamp) for has_stamp in (True, False))
-    assert np.count_nonzero(with_stamp.from_above(with_stamp.region(white))) < np.count_nonzero(
-        without_stamp.from_above(without_stamp.region(white))
+    with_stamp, without_stamp = (make_bird_eye(camera, GroundGrid(), stamped=has_stamp) for has_stamp in (True, False))
+    assert np.count_nonzero(with_stamp.view_from_above(with_stamp.region(white))) < np.count_nonzero(
+        without_stamp.view_from_above(without_stamp.region(white))
     )
 
 
@@ -78,4 +78,4 @@ def test_without_a_stamp_its_corner_is_used() -> None:
 def test_a_camera_that_does_not_see_the_road_is_rejected(model: CameraModel) -> None:
     """A camera that does not see the road is rejected with a `UserError`."""
     with pytest.raises(UserError, match="does not see the road"):
-        bird_eye(calibrated(model), GroundGrid())
+        make_bird_eye(calibrated(model), GroundGrid())

@@ -6,7 +6,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from tests.perception.lens import ground_points
 
-from lavt.perception.bird_eye import GroundGrid, bird_eye
+from lavt.perception.bird_eye import GroundGrid, make_bird_eye
 from lavt.perception.calibration import CalibratedCamera, axes, picture_points
 
 COMMON_LENS = st.tuples(
@@ -67,7 +67,7 @@ def test_projection_and_inverse_projection_agree(camera: CalibratedCamera) -> No
 def test_a_ground_point_maps_to_its_cell_through_any_lens(camera: CalibratedCamera) -> None:
     """A spot in the distorted picture at a ground point's projection appears in the grid cell of that point."""
     grid = GroundGrid()
-    mapping = bird_eye(camera, grid, stamped=False)
+    mapping = make_bird_eye(camera, grid, stamped=False)
     pixels = picture_points(camera, GROUND_POINTS)
     visible = are_inside(camera, pixels)
     for (x_m, y_m), (u, v) in zip(GROUND_POINTS[visible], pixels[visible], strict=True):
@@ -77,7 +77,7 @@ def test_a_ground_point_maps_to_its_cell_through_any_lens(camera: CalibratedCame
         # The size of the spot on the ground limits the accuracy of its position.
         ends = np.array([[u, v + 2], [u - half_width_px, v]])
         (near_x_m, near_y_m), (left_x_m, left_y_m) = ground_points(camera, ends)
-        rows, columns = np.nonzero(mapping.from_above(mapping.region(picture)))
+        rows, columns = np.nonzero(mapping.view_from_above(mapping.region(picture)))
         if len(rows) == 0:
             # The spot's three rows of pixels can lie between two rows of cells.
             assert abs(x_m - near_x_m) < 0.2 or x_m > 12

@@ -113,8 +113,8 @@ def test_a_closed_link_loses_messages() -> None:
     """A closed link loses the messages that are sent while it is closed, and no others."""
     runtime, actuator = new_runtime(DelayModel(50.0))
     link = runtime.links["control"]
-    runtime.at(110 * MS, lambda: setattr(link, "open", False))
-    runtime.at(210 * MS, lambda: setattr(link, "open", True))
+    runtime.call_at(110 * MS, lambda: setattr(link, "open", False))
+    runtime.call_at(210 * MS, lambda: setattr(link, "open", True))
     runtime.run(400 * MS, lambda: False)
     numbers = [int.from_bytes(payload, "big") for payload, _, _ in actuator.received]
     assert numbers == [1, 2, 3, 4, 5, 6, 12, 13, 14, 15, 16, 17, 18]

@@ -16,7 +16,7 @@ from lavt.domain import Picture
 from lavt.errors import UserError
 from lavt.perception.calibration import CalibratedCamera
 from lavt.perception.lane_detector import GRID, LANE_WIDTH_M, LaneDetector
-from lavt.perception.panel import panel
+from lavt.perception.panel import draw_panel
 from lavt.transport.video.stamp import has_stamp
 
 
@@ -78,4 +78,4 @@ def _panels(
                 f"{source} is {width_px} x {height_px}, but the calibration is for {camera.width_px} x "
                 f"{camera.height_px}: use pictures of that size, or a calibration for this size"
             )
-        yield panel(camera, detector, picture)
+        yield draw_panel(camera, detector, picture)

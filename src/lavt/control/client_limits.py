@@ -12,16 +12,17 @@ class ClientLimits:
     """The limits that the client enforces on itself."""
 
     no_picture_brake_ns: int = 300 * NS_PER_MS
-    """Without a new picture for this long: brake. The vehicle has the same limit, so both begin to brake together."""
+    """Without a new picture for this long: brake. A vehicle without a newer command brakes by itself after the same
+    time."""
     no_picture_stop_ns: int = 2500 * NS_PER_MS
     """Without a new picture for this long: request a safe stop."""
     no_state_brake_ns: int = 300 * NS_PER_MS
     """Without a newer state of the vehicle for this long: brake. By then 15 states are missing, and the speed that the
-    controller uses is 300 ms old. A state is newer if its own time, on the vehicle's clock, is later."""
+    controller uses is 300 ms old. A state is newer if its `state_mono_ns` is later."""
     no_state_stop_ns: int = 2500 * NS_PER_MS
     """Without a newer state of the vehicle for this long: request a safe stop."""
     no_lane_brake_ns: int = 500 * NS_PER_MS
-    """Without a lane for this long: brake. At 30 km/h the car has driven 4 m by then, of the 16 m of lane that it saw
+    """Without a lane for this long: brake. By then a car at 30 km/h has driven 4 m of the 16 m of lane that it saw
     last."""
     no_lane_stop_ns: int = 2500 * NS_PER_MS
     """Without a lane for this long: request a safe stop. By then, 2 s of braking have slowed the simulator's car from
@@ -29,7 +30,7 @@ class ClientLimits:
     command_period_ns: int = 20 * NS_PER_MS
     """Longest interval between commands."""
     brake: float = 0.67
-    """Brake pedal while pictures, states or lanes are missing: 4 m/s2 on a car with 6 m/s2 at full pedal."""
+    """Brake pedal when pictures, states or lanes are missing: 4 m/s2 on a car with 6 m/s2 at full pedal."""
 
 
 CLIENT_LIMITS = ClientLimits()

@@ -24,29 +24,29 @@ from lavt.errors import UserError
 WHEEL_LIMIT_RAD = 0.5
 """Largest road wheel angle of a car."""
 MAX_ACCELERATION_MPS2 = 2.0
-"""Acceleration at full throttle, of the simulator's car."""
+"""Acceleration of the simulator's car at full throttle."""
 MAX_BRAKING_MPS2 = 6.0
-"""Deceleration at full brake, of the simulator's car."""
+"""Deceleration of the simulator's car at full brake."""
 
 PROPORTIONAL_PER_S = 0.8
-"""Acceleration in m/s2 for each m/s of speed error: its time constant, 1.3 s, is long compared with pedal lag plus
-network delay."""
+"""Acceleration in m/s2 for each m/s of speed error. The loop's time constant, 1.3 s, is long compared with pedal lag
+plus network delay."""
 INTEGRAL_PER_S2 = 0.1
-"""Change of the integral term in m/s2, for each second and m/s of error; compensates drag and slope within about 8
-s."""
+"""Change of the integral term in m/s2 per second, for each m/s of error. The term compensates drag and slope within
+about 8 s."""
 GENTLE_BRAKING_MPS2 = 1.5
-"""Largest deceleration of speed control, so that a few pictures with a badly visible lane cause no jolt."""
+"""Largest deceleration that speed control requests, so that a few pictures with a badly visible lane cause no jolt."""
 INTEGRATION_ERROR_LIMIT_MPS = 0.5
 """A larger error is not integrated: it is a transient, not an offset."""
 MAX_INTEGRAL_MPS2 = 0.5
 """Largest integral term; drag and a slope of 5 % need no more."""
 FULL_SPEED_CONFIDENCE = 0.5
-"""From this confidence on, the car drives at full speed. It is reached by one line that is visible over the whole
-length, or by two lines that are visible over half of it."""
+"""From this confidence on, the car drives at full speed. One line that is visible over the whole length gives this
+confidence, and so do two lines that are visible over half of the length."""
 MIN_SPEED_SHARE = 0.4
 """Share of the full speed at low confidence: 12 km/h instead of 30, fast enough to reach the next marks."""
 MAX_STEP_S = 0.1
-"""Longest time that one call integrates over."""
+"""The longest step that the integral term takes for one decision."""
 
 
 class DriveController(Protocol):
@@ -71,18 +71,19 @@ class Preset:
 DESIGNED = Preset("designed", lookahead_s=1.01, lateral_limit_mps2=3.0)
 """The default preset, designed from a model and not tuned under delay.
 
-The lookahead is the smallest one with 30 degrees of phase margin in the sampled-data model of
-`lavt.experiment.boundary.delay_margin`, at 30 km/h and 81 ms from exposure to wheel command (`paper_wifi5`: 62 + 9 ms,
-and 10 ms of processing), rounded up: `benchmarks/find_designed_preset.py` prints it. 3 m/s2 is the lateral acceleration
-that a vehicle allows by default. Valid for the simulator's default car (steering lag 0.12 s, no dead time).
+The lookahead is the smallest one with 30 degrees of phase margin at 30 km/h, rounded up. The margin is computed by the
+sampled-data model of `lavt.experiment.boundary.delay_margin`, for 81 ms from exposure to wheel command: 62 + 9 ms of
+the network `paper_wifi5`, and 10 ms of processing. `benchmarks/find_designed_preset.py` prints the lookahead. 3 m/s2 is
+the lateral acceleration that a vehicle allows by default. The preset is valid for the simulator's default car (steering
+lag 0.12 s, no dead time).
 """
 
 PAPER_CALIBRATED = Preset("paper_calibrated", lookahead_s=0.74, steering_limit_rad=0.21)
-"""The preset that reproduces the paper, which gives no gains; fitted only to where the paper's completion rate falls.
+"""The preset that reproduces the paper, which publishes no gains.
 
 Lookahead and steering limit (5.2 m/s2 at 30 km/h) were chosen so that the completion rate collapses between the
-conditions L2 and L3, as in the paper; no other figure was fitted. They leave a phase margin of 19 degrees at L0, too
-little for a designed controller. Valid for the simulator's default car.
+conditions L2 and L3, as in the paper; nothing else was fitted. The lookahead leaves a phase margin of 19 degrees at L0,
+too little for a designed controller. The preset is valid for the simulator's default car.
 """
 
 PRESETS = {preset.name: preset for preset in (DESIGNED, PAPER_CALIBRATED)}
@@ -97,7 +98,7 @@ class SpeedPi:
     def acceleration_mps2(self, target_mps: float, speed_mps: float, step_s: float) -> float:
         """Return the acceleration to command now, `step_s` after the last call.
 
-        It is limited to `MAX_ACCELERATION_MPS2`, and to `GENTLE_BRAKING_MPS2` of braking.
+        The result is between -`GENTLE_BRAKING_MPS2` and `MAX_ACCELERATION_MPS2`.
         """
         error_mps = target_mps - speed_mps
         if abs(error_mps) < INTEGRATION_ERROR_LIMIT_MPS:
@@ -108,16 +109,16 @@ class SpeedPi:
 
 
 def pedals(acceleration_mps2: float) -> tuple[float, float]:
-    """Return throttle and brake for an acceleration, each in [0, 1] and one of them 0."""
+    """Return throttle and brake for an acceleration, each in [0, 1] and at least one of them 0."""
     if acceleration_mps2 >= 0:
         return min(acceleration_mps2 / MAX_ACCELERATION_MPS2, 1.0), 0.0
     return 0.0, min(-acceleration_mps2 / MAX_BRAKING_MPS2, 1.0)
 
 
 def speed_for_confidence_mps(speed_mps: float, confidence: float) -> float:
-    """Return the speed to drive at: `speed_mps` from `FULL_SPEED_CONFIDENCE` on, and proportionally less below that.
+    """Return the speed to drive at: `speed_mps` times a share that depends on the confidence.
 
-    It is never less than `MIN_SPEED_SHARE` of `speed_mps`.
+    The share rises in proportion to the confidence, from `MIN_SPEED_SHARE` to 1 at `FULL_SPEED_CONFIDENCE`.
     """
     return speed_mps * min(max(confidence / FULL_SPEED_CONFIDENCE, MIN_SPEED_SHARE), 1.0)
 
@@ -125,10 +126,10 @@ def speed_for_confidence_mps(speed_mps: float, confidence: float) -> float:
 class LaneKeeper:
     """A lane keeper: pure pursuit steering and PI speed control.
 
-    Without a lane it follows the last one and uses no pedal. The driver node decides when a car without a lane brakes
-    and stops. It does so for every controller.
+    Without a lane it follows the last lane and uses no pedal. For every controller, the driver node decides when a car
+    without a lane brakes and stops.
 
-    As in the paper there is no delay compensation: the lane in the picture is taken as the present one.
+    As in the paper there is no delay compensation: the lane in the picture is used as if it were the present one.
     """
 
     def __init__(self, preset: Preset, *, wheelbase_m: float) -> None:
@@ -141,7 +142,7 @@ class LaneKeeper:
         self._decided_ns: int | None = None
 
     def decide(self, lane: Lane, speed_mps: float, now_ns: int) -> Decision:
-        """Return steering along the lane, or along the last one detected, with the pedals that keep the speed."""
+        """Return steering along the lane, or along the last lane detected, with the pedals that keep the speed."""
         step_s = 0.0 if self._decided_ns is None else (now_ns - self._decided_ns) / NS_PER_S
         self._decided_ns = now_ns
         if lane.confidence >= LANE_CONFIDENCE:
@@ -162,7 +163,7 @@ class LaneKeeper:
 
     def _acceleration_mps2(self, confidence: float, speed_mps: float, step_s: float) -> float:
         if confidence < LANE_CONFIDENCE:
-            return 0.0  # no throttle without a lane; and no brake, which would jolt at each failed picture
+            return 0.0  # no throttle without a lane; no brake either, or the car would jolt at each failed picture
         target_mps = speed_for_confidence_mps(self._preset.speed_mps, confidence)
         return self._speed_pi.acceleration_mps2(target_mps, speed_mps, step_s)
 

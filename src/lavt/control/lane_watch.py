@@ -9,8 +9,8 @@ from lavt.control.client_limits import CLIENT_LIMITS
 LaneState = Literal["ok", "brake", "stop"]
 
 LANE_CONFIDENCE = 0.2
-"""A lane with less confidence counts as lost. 0.2 is the confidence if only one line is visible, over 40 % of the
-length; a broken line that is visible alone gives 0.4."""
+"""A lane with less confidence is treated as lost. One line that is visible over 40 % of the length gives 0.2; a broken
+line without the other line gives 0.4."""
 BRAKE_AFTER_NS = CLIENT_LIMITS.no_lane_brake_ns
 STOP_AFTER_NS = CLIENT_LIMITS.no_lane_stop_ns
 
@@ -24,8 +24,8 @@ class LaneWatch:
     def check(self, confidence: float, now_ns: int) -> LaneState:
         """Return the reaction to the confidence of the newest picture's lane, at `now_ns` (monotonic).
 
-        Time counts from the first call. When a lane is detected again, the result is "ok"; the server decides when a
-        stop ends.
+        The time without a lane begins at the first call or the last confident lane. When a lane is detected again, the
+        result is "ok"; the server decides when a stop ends.
         """
         if self._last_lane_ns is None or confidence >= LANE_CONFIDENCE:
             self._last_lane_ns = now_ns

@@ -1,8 +1,8 @@
 """Pure pursuit steering, and the path that it would follow.
 
-The car aims at the point of the lane's centre at the lookahead distance from its rear axle, and takes the circle that
-leads there: curvature = 2 sin(angle to that point) / lookahead (R. C. Coulter, Implementation of the Pure Pursuit Path
-Tracking Algorithm, CMU-RI-TR-92-01).
+The car aims at the point of the lane's centre that is the lookahead distance away from the rear axle, and takes the
+circle that leads there: curvature = 2 sin(angle to that point) / lookahead (R. C. Coulter, Implementation of the Pure
+Pursuit Path Tracking Algorithm, CMU-RI-TR-92-01).
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ import math
 from lavt.domain import PATH_POINTS, PATH_STEP_M, Lane
 
 LOOKAHEAD_RANGE_M = (4.0, 20.0)
-"""Below 4 m the camera sees no road, and the wheel would twitch at low speed; beyond 20 m it sees no marks."""
+"""Nearer than 4 m the camera sees no road, and the wheel would twitch at low speed. Beyond 20 m the camera sees no
+marks."""
 TOLERANCE_M2 = 1e-6
 """Tolerance of the goal's squared distance: 0.1 micrometres at the shortest lookahead."""
 
@@ -35,7 +36,7 @@ def move_along_arc(pose: PlanarPose, distance_m: float, curvature_per_m: float) 
 
 
 def lookahead_m(lookahead_s: float, speed_mps: float) -> float:
-    """Return the lookahead distance: `lookahead_s` of driving, within `LOOKAHEAD_RANGE_M`."""
+    """Return the lookahead distance: what the car drives in `lookahead_s`, clamped to `LOOKAHEAD_RANGE_M`."""
     nearest_m, farthest_m = LOOKAHEAD_RANGE_M
     return min(max(lookahead_s * speed_mps, nearest_m), farthest_m)
 
@@ -43,22 +44,22 @@ def lookahead_m(lookahead_s: float, speed_mps: float) -> float:
 def goal_point_m(lane: Lane, distance_m: float, pose: PlanarPose = ORIGIN) -> tuple[float, float]:
     """Return the point of the lane's centre that is ahead of `pose` and `distance_m` away from it.
 
-    If the lane's centre is farther away than that, return the point of the centre beside `pose`.
+    If the lane's centre is farther away than `distance_m`, return the point of the centre beside `pose`.
     """
     c0, c1, c2 = lane.centre
     from_x_m, from_y_m, _ = pose
-    farthest_m2 = distance_m * distance_m
+    distance_m2 = distance_m * distance_m
     aside_m = c0 + (c1 + c2 * from_x_m) * from_x_m - from_y_m
     if abs(aside_m) >= distance_m:
         return from_x_m, from_y_m + aside_m
-    # Newton's method on the squared distance, three or four steps; it starts at the goal of a straight lane
-    # and is bracketed by the nearest point known to be too far and the farthest known to be too near.
+    # Newton's method on the squared distance takes three or four steps. It starts at the goal of a straight lane.
+    # The point at `low_m` is known to be too near, the point at `high_m` too far.
     low_m, high_m = from_x_m, from_x_m + distance_m
-    x_m = from_x_m + math.sqrt(farthest_m2 - aside_m * aside_m)
+    x_m = from_x_m + math.sqrt(distance_m2 - aside_m * aside_m)
     for _ in range(50):
         y_m = c0 + (c1 + c2 * x_m) * x_m
         ahead_m, left_m = x_m - from_x_m, y_m - from_y_m
-        excess_m2 = ahead_m * ahead_m + left_m * left_m - farthest_m2
+        excess_m2 = ahead_m * ahead_m + left_m * left_m - distance_m2
         if -TOLERANCE_M2 < excess_m2 < TOLERANCE_M2:
             break
         if excess_m2 < 0:
@@ -85,8 +86,7 @@ def pursuit_path_per_m(
     """Return the curvatures, within +-`limit_per_m`, of the path from `pose` onto the lane's centre and along it.
 
     This is the path that pure pursuit would drive: `PATH_POINTS` values, `PATH_STEP_M` apart, the first one step ahead.
-    The curvature of the lane itself would not serve: a car that followed it would keep its offset and its heading
-    error.
+    A car that followed the curvature of the lane itself would keep its offset from the lane and its heading error.
     """
     curvatures = []
     next_per_m = clamp(pursuit_curvature_per_m(lane, distance_m, pose), limit_per_m)

@@ -23,11 +23,11 @@ LATE_NS = 50 * NS_PER_MS
 REJECTION_SHOWN_NS = NS_PER_S
 """For this long after a rejection, the state contains its reason."""
 MAX_PENDING_COMMANDS = 64
-"""How many applied commands can wait for the vehicle's report that they reached the wheels: more than are applied in a
-second. A command that has not reached the wheels by then never will."""
+"""How many applied commands can wait for the vehicle's report that they reached the wheels. It is more than are applied
+in a second, and a command that has not reached the wheels after a second never will."""
 POSE_AHEAD_NS = NS_PER_MS // 2
-"""The pose for a frame is sent this long before the frame is due, because a command that arrives in between occupies
-the node for 0.2 ms."""
+"""The pose for a frame is sent this long before the frame is due, because a command can occupy the node for 0.2 ms just
+before that time."""
 
 ENDINGS: dict[str, Ending] = {
     "completed": "completed",
@@ -35,7 +35,7 @@ ENDINGS: dict[str, Ending] = {
     "off_road": "off_road",
     "timeout": "timeout",
 }
-"""The endings of a drive by the kind of the event that causes them; a collision only if `after_collision` is "end"."""
+"""The ending of a drive for each kind of event that ends it. A collision does so only if `after_collision` is "end"."""
 
 
 class ReceivedCommand(Struct, frozen=True):
@@ -71,9 +71,9 @@ class PendingCommand(NamedTuple):
 class ActuatorNode:
     """The node that operates the vehicle: physics steps, safety gate, actuation and state reports.
 
-    Physics advances at the times that the vehicle requests. With `sample_times`, the times at which the camera needs
-    the vehicle's pose, it advances lazily: just before each of these times, and when the state is published. This is
-    sufficient if physics catches up without loss of accuracy and no wake is late.
+    Physics advances at the times that the vehicle requests. `sample_times` are the times at which the camera needs the
+    vehicle's pose. If they are given, physics advances lazily: just before each of these times, and when the state is
+    published. This requires that physics catches up without loss of accuracy and that no wake is late.
     """
 
     name = "actuator"
@@ -100,7 +100,7 @@ class ActuatorNode:
         self._sample_times = tuple(sample_times)
         self._next_sample = 0
         self._sample_ns = start_ns
-        """With sample times, when physics advances for the next one."""
+        """When physics advances for the next sample time, if there are sample times."""
         self._is_pose_due = True
         self._ending: str | None = None
         self._stationary_status: StationaryStatus | None = None
@@ -207,8 +207,8 @@ class ActuatorNode:
         self.gate.issued_stamps.add(
             frame.stamp_ns, frame.number, frame.stamped_mono_ns, frame.pixel_crc, frame.capture_ns
         )
-        # Checked here, because a further frame may end the series of equal pictures (a frozen camera) before the next
-        # wake.
+        # A series of equal pictures (a frozen camera) is a timeout. It is checked now, because a different picture
+        # could end the series before the next wake.
         self.gate.watchdog.check_timeouts(now.mono_ns)
 
     # Physics and state reports.
@@ -285,7 +285,7 @@ class ActuatorNode:
         )
 
     def _report_reached_commands(self) -> list[Send]:
-        """Return an entry for the record for each command that, as the vehicle reports, has reached the wheels."""
+        """Return a record entry for each command that has reached the wheels according to the vehicle's reports."""
         sends = []
         for reached in self.vehicle.take_reached():
             while self._pending and self._pending[0].applied_ns < reached.applied_ns:

@@ -18,13 +18,14 @@ from lavt.transport.video.stream_sender import StreamSender
 from lavt.vehicle.camera import Camera, CapturedFrame, CountingCamera, FrameTimes, TimedCamera, newest_pose
 
 KEYFRAME_PAUSE_NS = NS_PER_S // 10
-"""Shortest time between two keyframes that are sent on request, or because the encoder restarts with a new bit rate: so
-that requests cannot fill the link."""
+"""Shortest time between two keyframes that the receiver causes, by a keyframe request or a new bit-rate limit. So
+requests cannot fill the link."""
 REMEMBERED_STAMPS = 512
-"""A new stamp differs from this many previous ones. At 60 Hz they cover 8.5 s; the safety gate remembers stamps for
+"""A new stamp differs from this many previous stamps. At 60 Hz these cover 8.5 s; the safety gate remembers stamps for
 5 s."""
 REMEMBERED_POSES = 512
-"""At 240 Hz they cover 2.1 s: twice the longest time from the opening of the shutter until a picture is ready."""
+"""At 240 Hz these poses cover 2.1 s: twice the longest time from the opening of the shutter until a picture is
+ready."""
 
 
 class PreparedFrame(Struct, frozen=True):
@@ -56,9 +57,9 @@ class EncodedFrame(Struct, frozen=True):
 class CameraNode:
     """The node that captures, stamps and encodes pictures, and sends them to the validated receiver.
 
-    A frame is due when its shutter opens. The node wakes when the frame's picture is ready: after exposure and sensor
-    delay of a `TimedCamera`, at once for other cameras. Late wakes skip frames and count them. `send_to` lists
-    receivers that get the video without path validation.
+    A frame is due when the shutter opens for it. The node wakes when the frame's picture is ready: after exposure and
+    sensor delay of a `TimedCamera`, at once for other cameras. A late wake skips frames, which are counted. `send_to`
+    lists receivers that get the video without path validation.
     """
 
     name = "camera"
@@ -91,7 +92,7 @@ class CameraNode:
         self._keyframe_requested = False
         self._keyframe_ns = 0
         self._limit_bps: int | None = None
-        """The receiver's bit-rate limit with which the encoder works now."""
+        """The receiver's bit-rate limit that the encoder uses now."""
         self._stamps: deque[int] = deque(maxlen=REMEMBERED_STAMPS)
         self._highest_stamp_ns = 0
         self.pipelines: Mapping[str, Sequence[Stage]] = {
@@ -173,7 +174,7 @@ class CameraNode:
 
     def _packetize(self, encoded: EncodedFrame, now: Now) -> list[Send]:
         stamped, unit = encoded.stamped, encoded.access_unit
-        packets = self._stream.packets(unit, encoded.stamp_ns, now)
+        packets = self._stream.make_packets(unit, encoded.stamp_ns, now)
         validated = self.path.open_address(now.mono_ns)
         self._counts["frames_sent"] += 1
         self._counts["frames_without_receiver"] += validated is None and not self._send_to
@@ -186,7 +187,7 @@ class CameraNode:
             stamped.pixel_crc,
             len(unit),
         )
-        # Sent first, because a command from this frame may arrive 5 ms later, and the gate must know its stamp by then.
+        # Sent first: the gate must know the frame's stamp before a command from this frame arrives, perhaps 5 ms later.
         sends = [Send("frame", frame)]
         if validated is not None:
             cipher = self.path.cipher
@@ -220,7 +221,7 @@ class CameraNode:
         except BadPacket:
             self._counts["feedback_unreadable"] += 1
             return None
-        self.path.report(message.peer, now.mono_ns)
+        self.path.note_report(message.peer, now.mono_ns)
         self._stream.receive_feedback(feedback, now.mono_ns)
         self._keyframe_requested |= feedback.picture_loss
         return None

@@ -9,7 +9,8 @@ from lavt.safety.limits import LIMITS
 
 Phase = Literal["seeking", "arming", "driving", "stopped", "watching"]
 """seeking: no control yet. arming: commands request arming. driving: the vehicle executes drive commands. stopped:
-the vehicle has stopped, and only a person or `rearm` begins again. watching: control was released or lost for good."""
+the vehicle has stopped, and drives again only if a person or `rearm` requests it. watching: control was released or
+lost for good."""
 
 REQUEST_PERIOD_NS = NS_PER_S
 
@@ -47,7 +48,8 @@ class ClientSession:
         self._instance = instance
         self._rearm = rearm
         self._clear_stop = clear_stop
-        self._waits_reason = "the network condition is not in force yet" if waits_for_condition else ""
+        self._wait_reason = "the network condition is not in force yet" if waits_for_condition else ""
+        """Why this client must not arm the vehicle yet; empty: it can."""
         self._take_over = take_over
         self._next_operation: Operation = "acquire"
         """The next request while seeking; with `take_over`, "acquire" and "request_handover" alternate."""
@@ -62,14 +64,14 @@ class ClientSession:
         """Since this client drove, the same server process has disarmed the vehicle."""
         self._request_ns = start_ns
         self._stop_ns: int | None = None
-        """When the emergency stop is requested again; None: the vehicle knows of it."""
+        """When the request of the emergency stop is repeated; None: there is no stop, or the vehicle knows of it."""
         self._last_stop = 0
         """Number of the vehicle's last emergency stop, by its last reply."""
 
     @property
     def may_command(self) -> bool:
         """Return whether commands may be sent: there is an epoch, and the network condition is in force."""
-        return self.phase == "driving" or (self.phase == "arming" and not self._waits_reason)
+        return self.phase == "driving" or (self.phase == "arming" and not self._wait_reason)
 
     @property
     def has_control(self) -> bool:
@@ -105,8 +107,8 @@ class ClientSession:
 
     def handle_condition(self, reason: str) -> None:
         """Store why the network condition is not in force; an empty `reason` ends the wait for good."""
-        if self._waits_reason:
-            self._waits_reason = self.reason = reason
+        if self._wait_reason:
+            self._wait_reason = self.reason = reason
 
     def handle_reply(self, reply: SessionReply, now_ns: int) -> None:
         """Process the server's reply to a request."""
@@ -131,7 +133,7 @@ class ClientSession:
         else:
             is_handover_requested = reply.granted and self._last_operation == "request_handover"
             self._rejections[self._last_operation] = "handover requested" if is_handover_requested else reply.reason
-        self.reason = "; ".join(reason for reason in self._rejections.values() if reason) or self._waits_reason
+        self.reason = "; ".join(reason for reason in self._rejections.values() if reason) or self._wait_reason
 
     def handle_state(self, state: State, now_ns: int) -> None:
         """Process a state of the vehicle."""
@@ -140,9 +142,9 @@ class ClientSession:
         self.safety, self._server = state.safety, state.instance
         if state.safety == "emergency_stop":
             self._stop_ns = None
-        is_own = (state.active_operator, state.active_operator_instance) == (self._who, self._instance)
-        is_other = state.active_operator != "" and not is_own
-        if self.phase == "arming" and state.safety == "driving" and not is_other:
+        names_this_client = (state.active_operator, state.active_operator_instance) == (self._who, self._instance)
+        names_other_client = state.active_operator != "" and not names_this_client
+        if self.phase == "arming" and state.safety == "driving" and not names_other_client:
             self.phase = "driving"
         elif self.phase == "driving" and state.safety in ("disarmed", "safe_stop", "emergency_stop"):
             self.phase, self.reason = "stopped", state.reason
@@ -153,11 +155,11 @@ class ClientSession:
             and not self._was_disarmed
         ):
             self.phase, self._request_ns = "seeking", now_ns
-        if is_other and self._was_active_operator and self.phase not in ("seeking", "watching"):
-            # A takeover at standstill needs no consent, so two clients that both took control back would never stop.
+        if names_other_client and self._was_active_operator and self.phase not in ("seeking", "watching"):
+            # A takeover at standstill needs no consent: two clients that took control back would alternate for ever.
             self.phase, self.released = "watching", True
             self.reason = f"{state.active_operator} has taken control"
-        self._was_active_operator |= is_own
+        self._was_active_operator |= names_this_client
 
     def raise_emergency_stop(self, now: Now) -> SessionRequest:
         """Raise an emergency stop and return its request; every later command carries its number.

@@ -53,9 +53,8 @@ class ClockSyncNode:
 
     def _wake(self, _message: Message, now: Now) -> list[Send]:
         elapsed_ns = now.mono_ns - self._start_ns
-        self._next_wake_number = (
-            elapsed_ns // self._wake_period_ns + 1
-        )  # the next multiple of the period, so that lateness does not accumulate
+        # The next wake is at a multiple of the period, so that lateness does not accumulate.
+        self._next_wake_number = elapsed_ns // self._wake_period_ns + 1
         probes = self._probes(now)
         if elapsed_ns // PERIOD_NS == self._queried_period:
             return probes
@@ -98,7 +97,7 @@ class ProbingClockSyncNode(ClockSyncNode):
         return {"probe_reply": (("compare", self._compare),)}
 
     def _probes(self, now: Now) -> list[Send]:
-        """Return a probe; a reply is accepted once, for a probe of the last two seconds."""
+        """Return a probe. One reply to it is accepted, within two seconds."""
         self._sequence = (self._sequence + 1) % SEQUENCES
         self._sent_ns[self._sequence] = now.wall_ns
         if len(self._sent_ns) > 2 * PROBES_PER_PERIOD:

@@ -20,7 +20,7 @@ from lavt.node import WAKE, Message, Send, Stage
 from lavt.nodes.client_session import ClientSession
 from lavt.nodes.payloads import DecodedFrame, LaneSeen, PathToken
 from lavt.nodes.picture_reader import PictureReader
-from lavt.perception.lane_detector import FOLLOWS_FOR_NS
+from lavt.perception.lane_detector import LONGEST_GAP_NS
 from lavt.transport.messages import decode, encode
 
 OperatorRequest = Literal["emergency_stop", "release"]
@@ -50,7 +50,7 @@ class PerceivedFrame(Struct, frozen=True):
 class DriverNode:
     """The node that drives by the received pictures and the reported speed only.
 
-    Every access unit is decoded, but the lane is detected only in the newest picture that waits. A command is sent
+    Every access unit is decoded, but the lane is detected only in the newest waiting picture. A command is sent
     with each detection, and at the latest `limits.command_period_ns` after the previous command.
     """
 
@@ -73,8 +73,9 @@ class DriverNode:
         self._limits = limits
         self._sequence = 0
         self._view: DecodedFrame | None = None
+        """The frame from which the newest decision was made."""
         self._view_ns = 0
-        """When a decision was made from `_view`, the newest decoded frame."""
+        """When that decision was made."""
         self._detected_stamp_ns = 0
         self._decision: Decision | None = None
         self._lane_state: LaneState = "ok"
@@ -115,9 +116,9 @@ class DriverNode:
         view: DecodedFrame = message.payload
         since_last_ns = view.stamp_ns - self._detected_stamp_ns
         self._detected_stamp_ns = view.stamp_ns
-        # After a stop or a gap, another lane may be where the lane was. The gap is measured between stamps, because the
-        # car moves in that time. A negative gap comes from a clock that was set back, so its length is unknown.
-        if self.session.phase != "driving" or not 0 <= since_last_ns <= FOLLOWS_FOR_NS:
+        # After a stop or a gap, another lane can be where the lane was. The gap between the stamps is the time in which
+        # the car moved. A negative gap comes from a clock that was set back, so the true gap is unknown.
+        if self.session.phase != "driving" or not 0 <= since_last_ns <= LONGEST_GAP_NS:
             self._detector.forget()
         return PerceivedFrame(view, view.stamp_ns, self._detector.detect(view.received.picture))
 

@@ -1,8 +1,8 @@
 """Network conditions: the client requests one, and each side applies its part to the network queues of its machine.
 
-A condition is a lease: if the client does not renew it, it ends, and all queues are cleared. The nodes do not change
-the queues themselves. They send orders on the channel `inject` to a link, the injector, which changes the queues and
-reports what it measured.
+A condition is in force under a lease: if the client does not renew the lease, the lease ends and all queues are
+cleared. The nodes do not change the queues themselves. They send orders on the channel `inject` to a link, the
+injector, which changes the queues and reports what it measured.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ MEASURE_PERIOD_NS = 5 * NS_PER_S
 """Period at which a condition in force is measured."""
 REQUEST_PERIOD_NS = NS_PER_S
 LEASE_MS = 5_000
-"""The client renews its lease once a second, so four requests in a row may be lost."""
+"""The client renews its lease once a second, so the lease survives the loss of four requests in a row."""
 MAX_PENDING_REQUESTS = 64
-"""Number of requests whose reply may wait until the queues have been changed."""
+"""Largest number of requests whose reply waits until the queues have been changed."""
 
 
 class _Queues:
@@ -55,7 +55,7 @@ class _Queues:
         return self._inject() if self.in_force else self.order(self.condition, self.flows)
 
     def handle_result(self, result: InjectionResult, now: Now) -> list[Send] | None:
-        """Process the result of the newest order and return its samples; None: the result is of an older order."""
+        """Process a result and return its samples; None: the result belongs to an older order than the newest one."""
         if result.number != self._number:
             return None
         self.in_force = result.reason == ""
@@ -87,10 +87,10 @@ class Lease(Struct, frozen=True):
 
 
 class InjectionNode:
-    """The server's node, which impairs what this machine sends as one client at a time requests.
+    """The server's node, which impairs packets that this machine sends, on the request of one client at a time.
 
     `control` is the protocol and the port of the link between the routers. A vehicle that is not `simulated` must be
-    stationary and disarmed for a change of the condition, but a lease may end at any time.
+    stationary and disarmed for a change of the condition, but a lease can end at any time.
     """
 
     name = "injection"
@@ -143,6 +143,7 @@ class InjectionNode:
         return self._queues.order(request.condition, flows) if is_change else []
 
     def _rejection(self, request: NetemRequest, *, is_change: bool) -> str:
+        """Return why a request is rejected; empty: it is granted."""
         if not self._allowed:
             return "this server does not allow clients to inject delay: set injection.remote: true in its config"
         client = (request.who, request.instance)
@@ -192,7 +193,7 @@ class InjectionNode:
             return sends
         self.counts["netem_failed"] += 1
         self._lease = None
-        # The order may have failed half-way, so the queues are cleared; a failed clearing is repeated every second.
+        # Perhaps the order failed half-way, so the queues are cleared. If clearing fails, it is repeated every second.
         return [*sends, *self._queues.order("", ())] if self._queues.condition else sends
 
     def _wake(self, _message: Message, now: Now) -> list[Send]:
@@ -209,8 +210,8 @@ class InjectionNode:
 class InjectionClient:
     """The client's node, which delays commands on its own machine and requests the other delays from the server.
 
-    The request is repeated, because it renews the lease. With a condition, the driver waits until both parts are in
-    force before it arms the vehicle.
+    The request is repeated, because it renews the lease. With a condition, the driver arms the vehicle only when the
+    delays of both machines are in force.
     """
 
     name = "injection"

@@ -16,7 +16,7 @@ class FrameWritten(Struct, frozen=True):
     stamped_mono_ns: int
     capture_ns: int | None
     pixel_crc: int
-    """Checksum of the picture without its stamp, by which different pictures can be distinguished."""
+    """Checksum of the picture without its stamp, by which a frozen camera is detected."""
     size_bytes: int
 
 
@@ -35,7 +35,7 @@ class ReceivedUnit(Struct, frozen=True):
     complete: bool
     keyframe: bool
     packet_mono_ns: int
-    """Arrival of the last packet."""
+    """Arrival of the message that released its last packet from the jitter buffer."""
 
 
 class DecodedFrame(Struct, frozen=True):
@@ -54,7 +54,7 @@ class PictureRead(Struct, frozen=True):
     readable: bool
     reason: str
     in_doubt: bool
-    """Parts of the picture, or of one to which it refers, were lost since the last intact keyframe."""
+    """Since the last intact keyframe, parts of this picture or of an earlier one were lost."""
     decoded: bool
     """The decoder returned a picture."""
     rtp_timestamp: int
@@ -117,6 +117,7 @@ class Route(Struct, frozen=True):
     name: str
     length_m: float
     points: tuple[tuple[float, float], ...]
+    """(x, y) in metres."""
 
 
 class PathToken(Struct, frozen=True):
@@ -127,14 +128,16 @@ class PathToken(Struct, frozen=True):
 
 
 class StationaryStatus(Struct, frozen=True):
-    """Whether the vehicle is stationary and neither driven nor about to be driven, and the active operator."""
+    """Whether the vehicle is at rest, and who has control."""
 
     at_rest: bool
+    """The vehicle is stationary, is not driven and is not about to be driven."""
     active_operator: tuple[str, int] | None
+    """Name and instance."""
 
 
 class InjectionSample(Struct, frozen=True):
-    """The requested and measured impairment of a flow that this machine sends, at each change and periodically."""
+    """The requested and the measured delay of a flow that this machine sends, at each change and periodically."""
 
     mono_ns: int
     condition: str

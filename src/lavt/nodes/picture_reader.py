@@ -37,9 +37,9 @@ class PictureReader:
     """A reader that decodes every access unit and forwards pictures with a valid stamp.
 
     A stamp is valid if `agrees(stamp, RTP timestamp)` is true. If that check is weak, `reads_doubtful` should be false:
-    stamps of pictures in doubt are then not read, because damaged ones could agree by chance. `stages` is a node's
+    stamps of pictures in doubt are then not read, because damaged stamps could agree by chance. `stages` is a node's
     pipeline for "access_unit". It sends a "view" for each picture with a valid stamp, and "picture_lost" if the decoder
-    has no picture or had to conceal errors in it.
+    returned no picture or concealed errors in it.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class PictureReader:
         return DecodedUnit(unit, picture, now.mono_ns)
 
     def _read_stamp(self, decoded: DecodedUnit, now: Now) -> StampRead:
-        decoded = DecodedUnit(decoded.unit, decoded.picture, now.mono_ns)
+        decoded = DecodedUnit(decoded.unit, decoded.picture, now.mono_ns)  # decoding has ended now
         if decoded.picture is None:
             return StampRead(decoded, 0, "no picture")
         if self._in_doubt and not self._reads_doubtful:

@@ -19,13 +19,13 @@ from lavt.transport.video.cipher import NewCipher, plain_cipher
 from lavt.transport.video.path_validation import PathClient, is_path_datagram
 
 REPORT_PERIOD_NS = 500 * NS_PER_MS
-"""The server closes a path after 2 s without a report: four of them must be missing."""
+"""The server closes a path after 2 s without a report, that is after four missing reports."""
 SAMPLE_PERIOD_NS = NS_PER_S
 """Period of the recorded statistics."""
 KEYFRAME_DELAY_NS = 50 * NS_PER_MS
 """How long the sender of the video takes to answer a keyframe request: it waits for the next picture and encodes it."""
 ASSUMED_ROUND_TRIP_NS = 50 * NS_PER_MS
-"""The assumed round trip until a sender report gives it."""
+"""The round trip that is assumed until it has been measured."""
 SSRC = 0x4C415654
 """SSRC of the receiver in its reports: "LAVT"."""
 
@@ -43,9 +43,9 @@ class OrderedPackets(NamedTuple):
 class ReceiverNode:
     """The node that validates the video path, keeps it open with receiver reports, and receives the video.
 
-    Lost packets are recovered from repair packets, if there are enough of them. Otherwise pictures are in doubt until
-    the next complete keyframe. It is requested at once, and again after each round trip in which none arrives. With
-    each report, the receiver requests at most `max_bit_rate_bps` from the sender.
+    Lost packets are recovered from repair packets, if enough of those arrive. Otherwise pictures are in doubt until the
+    next complete keyframe. A keyframe is requested at once, and again after each round trip in which none arrives. With
+    each report, the receiver requests a bit rate of at most `max_bit_rate_bps` from the sender.
     """
 
     name = "receiver"
@@ -112,7 +112,7 @@ class ReceiverNode:
     def _receive(self, message: Message, now: Now) -> OrderedPackets | None:
         """Process a datagram of any kind; count and drop an unreadable one."""
         datagram: bytes | None = message.payload
-        if is_path_datagram(message.payload):
+        if is_path_datagram(message.payload):  # a challenge: the server checks that the client has this address
             answer = None if self._path is None else self._path.answer(message.payload)
             self._counts["challenges_unreadable"] += answer is None
             return None if answer is None else OrderedPackets([], message.arrived, [self._feedback(answer)])
@@ -125,7 +125,8 @@ class ReceiverNode:
         try:
             if is_report:
                 announcement = parse_announcement(datagram)
-                # Without a path, as in `lavt watch`, this node sends no reports: all answers are for other receivers.
+                # Without a path, as in `lavt watch`, this node sends no reports: the sender's answers to reports are
+                # all for other receivers.
                 own_ssrc = None if self._path is None else SSRC
                 self._reception.note_announcement(announcement, own_ssrc, message.arrived.mono_ns)
                 return None
@@ -135,7 +136,7 @@ class ReceiverNode:
             return None
 
     def _order(self, datagram: bytes, arrived: Now, now: Now) -> Ordered:
-        """Return the packets that this one makes available in order, including recovered ones; raise `BadPacket`."""
+        """Return the packets that a datagram makes available in order, also recovered ones; raise `BadPacket`."""
         packet = parse_packet(datagram)
         ordered: Ordered = []
         if packet.payload_type == REPAIR_PAYLOAD_TYPE:
@@ -146,7 +147,7 @@ class ReceiverNode:
             if self._path is not None:
                 self._path.video_arrived(now.mono_ns)
             ordered = self._jitter_buffer.push(packet, now.mono_ns)
-            self._reception.received(packet, arrived.mono_ns)
+            self._reception.note_packet(packet, arrived.mono_ns)
         for recovered in self._repair.push(packet, now.mono_ns):
             ordered += self._jitter_buffer.push_recovered(recovered, now.mono_ns)
         return ordered
@@ -201,7 +202,7 @@ class ReceiverNode:
         return self._requested_ns + KEYFRAME_DELAY_NS + round_trip_ns
 
     def _request_keyframe(self, now_ns: int) -> list[Send]:
-        """Return a keyframe request, unless a requested keyframe may still arrive."""
+        """Return a keyframe request, unless the answer to the last one could still arrive."""
         if self._media_ssrc is None or self._path is None or now_ns < self._request_due_ns():
             return []
         self._requested_ns = now_ns

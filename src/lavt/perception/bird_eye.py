@@ -17,14 +17,15 @@ from lavt.errors import UserError
 from lavt.perception.calibration import CalibratedCamera, ground_to_picture, picture_points
 
 STAMP_SIDE_PX = 64
-"""Side of the top left square with the time stamp, which is masked where pictures have one."""
+"""Side of the top left square with the time stamp, which is masked if the pictures are stamped."""
 STAMP_MARGIN_PX = 12
 """Width of the masked margin beside the stamp at a focal length of up to 320 px. The stamp's edges affect pixels up to
 this far away (half of `MARK_PX`)."""
 DistortionMaps = tuple[NDArray[np.int16], NDArray[np.uint16]]
-"""OpenCV's fixed-point maps: the picture coordinates of each cell."""
+"""OpenCV's fixed-point maps, whole parts and fractions: for each cell its coordinates in the cropped rows."""
 ROW_MARGIN_PX = 3
-"""Additional rows above and below the grid, and below the stamp: interpolation and smoothing over 5 rows use them."""
+"""Additional rows of pixels above and below the grid, and below the stamp. Interpolation and smoothing over 5 rows use
+them."""
 CENTRAL_HALF_WIDTH_M = 3.5
 """Half the width of the central strip of ground, which a camera must see."""
 MIN_VISIBLE_SHARE = 0.4
@@ -35,8 +36,8 @@ MIN_VISIBLE_SHARE = 0.4
 class GroundGrid:
     """The ground searched for lanes, divided into cells.
 
-    Closer than `near_m` the default camera sees less than a lane's width. At `far_m` a row of its picture covers 0.9 m
-    of ground.
+    Nearer than `near_m` the default camera sees less than a lane's width. At `far_m` a row of pixels covers 0.9 m of
+    ground.
     """
 
     near_m: float = 3.6
@@ -63,7 +64,7 @@ class GroundGrid:
         """Return y of the middle of each column, leftmost first, (columns,)."""
         return self.half_width_m - (np.arange(self.columns, dtype=np.float64) + 0.5) * self.step_y_m
 
-    def to_ground(self) -> FloatArray:
+    def cell_to_ground(self) -> FloatArray:
         """Return the 3 x 3 matrix from (column, row, 1) to (x, y, 1)."""
         return np.array(
             [
@@ -84,13 +85,13 @@ class BirdEye:
     region_from_grid: FloatArray | DistortionMaps
     """From the grid to the cropped rows: a homography, or maps for a lens with distortion."""
     unstamped_mask: NDArray[np.uint8] | None
-    """255 for cells that the time stamp does not cover, 0 for those that it covers; None when it covers none."""
+    """255 for cells that the time stamp does not cover, 0 for cells that it covers; None if it covers no cell."""
 
     def region(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return the rows of `picture` that contain the grid, without a copy."""
         return picture[self.top_px : self.bottom_px]
 
-    def from_above(self, region: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def view_from_above(self, region: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Map cropped rows to the grid, (grid.rows, grid.columns); cells outside the picture are black."""
         size = (self.grid.columns, self.grid.rows)
         if isinstance(self.region_from_grid, tuple):
@@ -103,10 +104,10 @@ class BirdEye:
         return np.asarray(visible, dtype=np.uint8)
 
 
-def bird_eye(camera: CalibratedCamera, grid: GroundGrid, *, stamped: bool = True) -> BirdEye:
+def make_bird_eye(camera: CalibratedCamera, grid: GroundGrid, *, stamped: bool = True) -> BirdEye:
     """Create the mapping for a camera; `stamped` is whether its pictures contain the time stamp.
 
-    Raises `UserError` when the camera does not see the road that the grid covers.
+    Raises `UserError` if the camera sees too little of the road that the grid covers.
     """
     pixels = _cell_pixels(camera, grid)
     u_px, v_px = pixels[..., 0], pixels[..., 1]
@@ -126,7 +127,7 @@ def bird_eye(camera: CalibratedCamera, grid: GroundGrid, *, stamped: bool = True
     unstamped_mask = np.where(stamp, 0, 255).astype(np.uint8) if stamp.any() else None
     if not camera.distortion:
         shift = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, -top_px], [0.0, 0.0, 1.0]])
-        homography = shift @ ground_to_picture(camera) @ grid.to_ground()
+        homography = shift @ ground_to_picture(camera) @ grid.cell_to_ground()
         return BirdEye(grid, top_px, bottom_px, homography, unstamped_mask)
     maps = np.where(inside[..., None], pixels - (0, top_px), -9.0).astype(np.float32)  # -9: outside the picture
     whole, fractions = cv2.convertMaps(maps[..., 0], maps[..., 1], cv2.CV_16SC2)
@@ -134,8 +135,8 @@ def bird_eye(camera: CalibratedCamera, grid: GroundGrid, *, stamped: bool = True
 
 
 def _cell_pixels(camera: CalibratedCamera, grid: GroundGrid) -> FloatArray:
-    """Return the picture coordinates of the middle of each cell, (rows, columns, 2); NaN where it is not visible."""
+    """Return the picture coordinates of the middle of each cell, (rows, columns, 2); NaN for an invisible middle."""
     columns, rows = np.meshgrid(np.arange(grid.columns), np.arange(grid.rows))
     cells = np.stack([columns, rows, np.ones_like(columns)], axis=-1).reshape(-1, 3)
-    ground = cells @ grid.to_ground()[:2].T
+    ground = cells @ grid.cell_to_ground()[:2].T
     return picture_points(camera, ground).reshape(grid.rows, grid.columns, 2)

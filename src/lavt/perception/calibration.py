@@ -20,9 +20,10 @@ REFERENCE_FOCAL_PX = 320.0
 """The focal length of the reference camera for sizes in pixels: 640 columns over 90 degrees."""
 
 RAY_STEPS = 8
-"""Number of steps from the lens's axis to a ray. The image radius must increase with each step, and one step beyond.
+"""Number of steps from the lens's axis to a ray. The distance from the picture's middle must increase with each step,
+and also one step beyond the ray.
 
-Beyond some angle a distortion polynomial folds back: it maps points that the lens does not see into the picture.
+Beyond some angle a distortion polynomial folds back: points that the lens cannot see get positions inside the picture.
 """
 
 
@@ -30,8 +31,8 @@ Beyond some angle a distortion polynomial folds back: it maps points that the le
 class CalibratedCamera:
     """A camera with its lens and its pose on the vehicle.
 
-    `yaw_rad` is positive to the left, `pitch_rad` downwards, `roll_rad` with the right side down. The vehicle's axes
-    are turned by yaw, then pitch, then roll. `distortion` is empty for a lens without distortion.
+    `yaw_rad` is positive to the left, `pitch_rad` downwards, `roll_rad` with the right side down. Turned by yaw, then
+    pitch, then roll, the vehicle's axes become the camera's. `distortion` is empty for a lens without distortion.
     """
 
     width_px: int
@@ -78,7 +79,7 @@ def calibrated(model: CameraModel) -> CalibratedCamera:
 
 
 def axes(camera: CalibratedCamera) -> FloatArray:
-    """Return the camera's axes in the vehicle's frame, (3, 3): rows right, down and forward."""
+    """Return the camera's axes in the vehicle's frame, (3, 3): the rows are right, down and forward."""
     yaw, pitch, roll = camera.yaw_rad, camera.pitch_rad, camera.roll_rad
     ahead = np.array([math.cos(yaw), math.sin(yaw), 0.0])
     right = np.array([math.sin(yaw), -math.cos(yaw), 0.0])
@@ -108,7 +109,7 @@ def ground_to_picture(camera: CalibratedCamera) -> FloatArray:
 def picture_points(camera: CalibratedCamera, ground_m: FloatArray) -> FloatArray:
     """Project ground points (n, 2) into the distorted picture: (n, 2) in pixels.
 
-    Points behind the camera or outside the lens model's valid field are NaN; others may lie outside the picture.
+    Points behind the camera or outside the lens model's valid field are NaN. The result can lie outside the picture.
     """
     camera_points = np.column_stack([ground_m, np.ones(len(ground_m))]) @ ground_to_camera(camera).T
     ahead = camera_points[:, 2] > 1e-6

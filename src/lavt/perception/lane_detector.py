@@ -9,7 +9,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from lavt.domain import NS_PER_MS, CameraModel, Lane, Picture, SeenLane
-from lavt.perception.bird_eye import GroundGrid, bird_eye
+from lavt.perception.bird_eye import GroundGrid, make_bird_eye
 from lavt.perception.calibration import CalibratedCamera, calibrated
 from lavt.perception.lane_fit import (
     OUTLIER_M,
@@ -32,32 +32,32 @@ GRID = GroundGrid()
 LANE_WIDTH_M = 3.5
 """The lane's width until it has been measured."""
 TRACK_CONFIDENCE = 0.2
-"""A fit with less confidence is not followed. 0.2 is the confidence if only one line is visible, over 40 % of the
-length."""
+"""A fit with less confidence is not followed. One line that is visible over 40 % of the length gives 0.2."""
 REFINEMENTS = 2
-"""How often a found lane is fitted again. Each time, a curve that was fitted nearby reaches points farther away."""
+"""How often a lane that was found is fitted again. Each time the curve reaches points that are farther away."""
 FORGET_AFTER_PICTURES = 3
 """After this many pictures without a lane, a tenth of a second, the search restarts."""
-FOLLOWS_FOR_NS = 350 * NS_PER_MS
+LONGEST_GAP_NS = 350 * NS_PER_MS
 """The longest gap between pictures over which a lane is followed; after a longer one the caller calls `forget`.
 
-In that time, for a car that drives straight at 30 km/h, a lane with a radius of 42 m moves sideways by `CORRIDOR_M` at
-10 m ahead. So after a longer gap a line at the old position may be another one.
+In this time a car drives 2.9 m at 30 km/h. If it drives straight and the lane has a radius of 42 m, the lane 10 m ahead
+of the car moves sideways by `CORRIDOR_M`. After a longer gap another line could be at the old position.
 """
 DROP_LANE_AT_WIDTHS = 1.0
-"""A lane is dropped when the car is this many lane widths off its centre: it is then in the middle of the next lane."""
+"""A lane is dropped when the car is this many lane widths off its centre: the car is then in the middle of the next
+lane."""
 
 
 @dataclass(frozen=True, slots=True)
 class DetectionTrace:
-    """The lane detection trace: the results of all steps for one picture, for inspection."""
+    """The results of all steps of lane detection in one picture, for inspection."""
 
     mask: Mask
     """The marks in the bird's-eye view, (grid.rows, grid.columns)."""
     points: Points
     sides: Sides
     expected: tuple[float, float, float] | None
-    """The centre near which the lines were searched; None without a start line."""
+    """The lane's centre near which the lines were searched; None without a start line."""
     expected_width_m: float
     windows: tuple[tuple[float, float], ...]
     """The sliding windows of a search, as `sides_by_windows` returns them; empty if the lane was followed."""
@@ -69,9 +69,9 @@ class LaneDetector:
     """A lane detector that searches with sliding windows at first, then follows the lane, and averages over pictures.
 
     Confidence is (visible share of the left line + visible share of the right line) / 2 x (share of the paint in and
-    beside the lane that is on its lines, scaled to 0 for speckle and 1 for clean lines). Visible paint counts for 3 m
-    in both directions. Confidence refers to the newest picture alone: without a lane in it the confidence is 0 and the
-    lane is the last one detected. docs/perception.md lists the values to expect.
+    beside the lane that is on its lines, scaled to 0 for speckle and 1 for clean lines). A line is visible where it has
+    paint, and 3 m before and behind. Confidence refers to the newest picture alone: without a lane in it the confidence
+    is 0 and the lane is the last one detected. docs/perception.md lists the values to expect.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class LaneDetector:
         calibration = calibrated(camera) if isinstance(camera, CameraModel) else camera
         self._shape = (calibration.height_px, calibration.width_px, 3)
         self._scale = calibration.scale
-        self.bird_eye = bird_eye(calibration, grid, stamped=stamped)
+        self.bird_eye = make_bird_eye(calibration, grid, stamped=stamped)
         self.trace: DetectionTrace | None = None
         self._lane_width_m = lane_width_m
         self._lane = Lane((0.0, 0.0, 0.0), lane_width_m, grid.near_m, grid.far_m, 0.0)
@@ -98,8 +98,8 @@ class LaneDetector:
     def detect(self, picture_bgr: Picture) -> Lane:
         """Return the lane in the next picture; raise `ValueError` unless its shape is the camera's, (h, w, 3)."""
         if picture_bgr.shape != self._shape:
-            raise ValueError(f"a picture of shape {picture_bgr.shape}, not {self._shape}")
-        mask = self.bird_eye.from_above(lane_pixels(self.bird_eye.region(picture_bgr), self._scale))
+            raise ValueError(f"the picture has the shape {picture_bgr.shape}, not {self._shape}")
+        mask = self.bird_eye.view_from_above(lane_pixels(self.bird_eye.region(picture_bgr), self._scale))
         points = mark_points(mask, self.bird_eye.grid)
         tracked = self._misses < FORGET_AFTER_PICTURES
         self.trace = self._follow(mask, points) if tracked else self._search(mask, points)
@@ -127,8 +127,8 @@ class LaneDetector:
                 mask, points, np.zeros(len(points.x_m), dtype=np.int8), None, self._lane_width_m, (), None
             )
         sides, windows = sides_by_windows(points, grid, start, self._lane_width_m)
-        # The windows follow any curve, also a line that leads away from the lane. The start line is rough, but it is
-        # based on all paint.
+        # The windows follow any curve, also a line that leads away from the lane. The start line is rough, but is based
+        # on all paint. So both are fitted, and the fit with more confidence wins.
         fits = (
             self._refine(points, fit_lane(points, sides, grid, self._lane_width_m)),
             self._refine(points, self._fit_near(points, start, self._lane_width_m)),
@@ -150,8 +150,8 @@ class LaneDetector:
 class GroundTruthLaneDetector:
     """A detector for fidelity `geometry`. It averages true lanes as `LaneDetector` averages detected ones.
 
-    Both therefore have the same effect on the control loop's dynamics. When little of the lane is visible, the
-    confidence is low and the lane is the last one detected.
+    Both detectors therefore have the same effect on the control loop's dynamics. When little of the lane is visible,
+    the confidence is low and the lane is the last one detected.
     """
 
     def __init__(self) -> None:
@@ -163,7 +163,7 @@ class GroundTruthLaneDetector:
         self._misses = FORGET_AFTER_PICTURES
 
     def detect(self, seen_lane: SeenLane) -> Lane:
-        """Return the average of this lane and those before."""
+        """Return the moving average of this lane and the previous ones."""
         lane = seen_lane.lane
         if lane.confidence < TRACK_CONFIDENCE:
             self._misses += 1
@@ -175,7 +175,7 @@ class GroundTruthLaneDetector:
 
 
 def contains_car(lane: LaneFit) -> bool:
-    """Return whether the car is in a lane, within a fit's accuracy; on a line it is in both lanes."""
+    """Return whether the car is in a lane, within a fit's accuracy; a car on a line is in the lanes on both sides."""
     return _lateral_distance_m(lane.centre) <= lane.width_m / 2 + OUTLIER_M
 
 

@@ -1,16 +1,17 @@
 """The lane fit: assigns bird's-eye paint to the left and right line, and fits the lane's centre.
 
 Both lines of a lane are fitted together, as two parallels of one centre y = c0 + c1 x + c2 x^2. A broken line (3 m of
-paint, 6 m of gap) alone has too little paint to fit a curve, but two lines fill each other's gaps. Measured
-along y, the distance between a curve of slope m and its parallel at distance d is d sqrt(1 + m^2). With the slope of an
-earlier fit, the fit is therefore linear.
+paint, 6 m of gap) alone has too little paint to fit a curve, but two lines fill each other's gaps. The distance along y
+between a curve of slope m and its parallel at distance d is d sqrt(1 + m^2). If m is taken from an earlier fit, the fit
+is therefore linear.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -24,32 +25,32 @@ Sides = NDArray[np.int8]
 """For each point +1: left line, -1: right line, 0: neither."""
 
 MIN_PAINT = 128
-"""A cell of the bird's-eye mask is paint when half of it is."""
+"""A cell of the bird's-eye mask, 0 to 255, is paint from this value on: half of the cell is covered by paint."""
 CORRIDOR_M = 0.7
 """Half the width of the corridor around an expected line: far more than a car moves in one frame, far less than half a
 lane."""
 OUTLIER_M = 0.25
-"""Paint that is farther from the second to last fit is left out of the last one. It is two widths of a mark."""
+"""Paint that is farther than this from the last but one fit is left out of the last fit. It is two widths of a mark."""
 HALF_WEIGHT_M = (0.3, 0.15)
-"""In the first two fits, paint this far from the fit before has half weight, so that the majority wins."""
+"""In two weighted fits, paint at this distance from the previous fit has half weight, so that the majority wins."""
 MIN_LINE_POINTS = 25
-"""Fewer points are not a line: a quarter of a metre of paint at full width."""
+"""Fewer points are not a line: about a metre of a mark at full width has this many cells."""
 LINEAR_BELOW_M = 6.0
 """A shorter visible length is fitted without curvature, which would be noise."""
 LANE_WIDTH_RANGE_M = (2.6, 4.4)
 """Smallest and largest width of a lane."""
 MAX_SLOPE = 0.5
-"""Largest slope of the lane relative to the car: a line with more crosses the lane."""
+"""Largest slope of the lane relative to the car: a steeper line crosses the lane."""
 MAX_CURVATURE_PER_M = 1 / 15
-"""A car at walking pace could just follow it."""
+"""Largest curvature of a lane: a car at walking pace could just follow it."""
 COLUMN_BIN_M = 0.1
 """Width of the bins in which the search for the start line counts paint."""
 START_LENGTH_M = 12.0
 """Length over which the start line is searched: more than one period of broken marks."""
 START_SLOPES = (0.0, 0.05, -0.05, 0.1, -0.1, 0.15, -0.15, 0.2, -0.2, 0.25, -0.25)
-"""Slopes of the start line that are tried, straight ahead first, so that it wins a tie."""
+"""Slopes that are tried for the start line. Straight ahead is the first, so that it wins a tie."""
 START_BENDS_PER_M = (0.0, 0.006, -0.006, 0.012, -0.012)
-"""Half the curvatures of the start line that are tried, down to a radius of 42 m."""
+"""Values of c2, which is half the curvature, that are tried for the start line: down to a radius of 42 m."""
 WINDOW_M = (1.0, 0.6)
 """Length of a sliding window along x, and half its width."""
 MIN_WINDOW_POINTS = 6
@@ -59,13 +60,13 @@ COVER_BIN_M = 0.5
 MIN_COVER_POINTS = 4
 """A bin with fewer points on the line shows no paint: a third of the points of a full mark."""
 COVER_LINE_M = 0.15
-"""Paint this close is on the line: a mark's half width, and as much for the error of the curve."""
+"""Paint this near is on the line: half the width of a mark, plus slightly more for the error of the curve."""
 MIN_CLEAN_SHARE = 0.6
 """Minimum share of the paint in the corridor (`CORRIDOR_M`) that is on the line. By chance it would be 0.2."""
 COVER_BINS_TOGETHER = 2
 """Number of adjacent bins that must show paint: paint shorter than a metre is a spot."""
 COVER_REACH_M = 3.0
-"""Half the gap of broken marks: paint counts for this much of the line before and behind it."""
+"""Half the gap of broken marks: paint makes this much of the line before and behind it visible."""
 MIN_PARALLEL_VISIBLE = 0.2
 """Visible share that a parallel needs to be the line of a neighbouring lane."""
 
@@ -107,7 +108,7 @@ def mark_points(mask: Mask, grid: GroundGrid) -> Points:
 
 
 def sides_near(points: Points, centre: tuple[float, float, float], width_m: float) -> Sides:
-    """Assign points to the lines of a known lane if they are near them."""
+    """Assign each point that is near a line of a known lane to that line."""
     middle, slope_factor = _evaluate_centre(points.x_m, centre)
     offset = points.y_m - middle
     line = width_m / 2 * slope_factor
@@ -116,11 +117,11 @@ def sides_near(points: Points, centre: tuple[float, float, float], width_m: floa
 
 
 def start_line(points: Points, grid: GroundGrid, width_m: float) -> tuple[float, float, float] | None:
-    """Estimate the centre c0, c1, c2 of the lane the car is in; None without paint.
+    """Estimate the centre c0, c1, c2 of the lane that contains the car; None without paint.
 
-    For several slopes and bends the paint is straightened and counted along y modulo the lane's width. Both lines of
-    the lane, and those of its neighbours, then coincide; the highest peak wins. Lanes repeat every `width_m`, so
-    exactly one of them has its centre within half a width of the car.
+    For several slopes and bends the paint is straightened and counted along y modulo the lane's width. The lines of the
+    lane and of its neighbours then coincide; the slope and bend with the highest peak win. Lanes repeat every
+    `width_m`, so exactly one of them has its centre at most half a width from the car.
     """
     near = points.x_m < grid.near_m + START_LENGTH_M
     bins = round(width_m / COLUMN_BIN_M)
@@ -147,10 +148,11 @@ def sides_by_windows(
     """Follow both lines from the near end with a pair of sliding windows that move together.
 
     The windows follow the centre `start`, shifted by the last measured offset. Returns the sides and, for each
-    pair, its near end (x) and the offset of its middle to the left of `start`, in metres.
+    position of the pair, its near end (x) and the offset of its middle to the left of `start`, in metres.
     """
     length_m, half_width_m = WINDOW_M
-    offset_m = points.y_m - _evaluate_centre(points.x_m, start)[0]
+    start_y_m, _ = _evaluate_centre(points.x_m, start)
+    offset_m = points.y_m - start_y_m
     middle_m = 0.0
     sides = np.zeros(len(points.x_m), dtype=np.int8)
     windows = []
@@ -174,25 +176,32 @@ def fit_lane(
 ) -> LaneFit | None:
     """Fit a lane to the points of its lines, iteratively reweighted by their residuals; None when there is none.
 
-    `width_m` is the expected width, used where only one line is visible or the measured width is not a lane's.
+    `width_m` is the expected width, which is used if only one line is visible or the measured width is not a lane's.
     `expected` is the expected centre, if there is one.
     """
     lane_indices = np.flatnonzero(sides)
     line_points, side = Points(points.x_m[lane_indices], points.y_m[lane_indices]), sides[lane_indices]
-    fit = _fit_once(line_points, side, width_m, slopes_of=(0.0, 0.0, 0.0)) if expected is None else (expected, width_m)
+    fit: _CentreFit | None
+    if expected is None:
+        fit = _fit_once(line_points, side, width_m, slope_centre=(0.0, 0.0, 0.0))
+    else:
+        fit = _CentreFit(expected, width_m)
     for half_weight_m in HALF_WEIGHT_M:
         if fit is None:
             return None
         weights = 1 / (1 + (_residual_m(line_points, side, *fit) / half_weight_m) ** 2)
-        fit = _fit_once(line_points, side, width_m, slopes_of=fit[0], weights=weights)
+        fit = _fit_once(line_points, side, width_m, slope_centre=fit.centre, weights=weights)
     if fit is None:
         return None
     is_on_line = np.abs(_residual_m(line_points, side, *fit)) < OUTLIER_M
     kept, kept_side = Points(line_points.x_m[is_on_line], line_points.y_m[is_on_line]), side[is_on_line]
-    fit = _fit_once(kept, kept_side, width_m, slopes_of=fit[0])
-    if fit is None or abs(fit[0][1]) > MAX_SLOPE or 2 * abs(fit[0][2]) > MAX_CURVATURE_PER_M:
+    fit = _fit_once(kept, kept_side, width_m, slope_centre=fit.centre)
+    if fit is None:
         return None
     centre, fitted_width_m = fit
+    _, c1, c2 = centre
+    if abs(c1) > MAX_SLOPE or 2 * abs(c2) > MAX_CURVATURE_PER_M:
+        return None
     offset_m = _lateral_offset_m(points, centre)
     outside_m = np.abs(offset_m) - fitted_width_m / 2  # distance beyond the nearer line; negative inside the lane
     line_distance_m = np.abs(outside_m)
@@ -209,18 +218,22 @@ def fit_lane(
 
 
 def has_parallel(points: Points, fit: LaneFit, grid: GroundGrid) -> bool:
-    """Return whether there are two lines a lane's width apart: both of this lane, or one and the next beyond it."""
+    """Return whether two lines a lane's width apart are visible.
+
+    They are both lines of this lane, or one of them and the next line on the other side of it.
+    """
     visible_sides = [
         side for side, share in ((1, fit.left_visible), (-1, fit.right_visible)) if share >= MIN_PARALLEL_VISIBLE
     ]
     if len(visible_sides) != 1:
         return len(visible_sides) == 2
-    distance_m = np.abs(_lateral_offset_m(points, fit.centre) - visible_sides[0] * 1.5 * fit.width_m)
+    (side,) = visible_sides
+    distance_m = np.abs(_lateral_offset_m(points, fit.centre) - side * 1.5 * fit.width_m)
     return _visible_share(points.x_m, distance_m, grid) >= MIN_PARALLEL_VISIBLE
 
 
 def _evaluate_centre(x_m: FloatArray, centre: tuple[float, float, float]) -> tuple[FloatArray, FloatArray]:
-    """Return y of a centre at x, and the factor by which a parallel is farther away along y than across."""
+    """Return y of a centre at x, and the distance to a parallel along y divided by the perpendicular distance."""
     c0, c1, c2 = centre
     slope = c1 + 2 * c2 * x_m
     return c0 + (c1 + c2 * x_m) * x_m, np.sqrt(1 + slope * slope)
@@ -236,20 +249,28 @@ def _residual_m(points: Points, side: Sides, centre: tuple[float, float, float],
     return _lateral_offset_m(points, centre) - side * width_m / 2
 
 
+class _CentreFit(NamedTuple):
+    """A lane's centre c0, c1, c2 and its width."""
+
+    centre: tuple[float, float, float]
+    width_m: float
+
+
 def _fit_once(
     points: Points,
     side: Sides,
     width_m: float,
-    slopes_of: tuple[float, float, float],
+    slope_centre: tuple[float, float, float],
     weights: FloatArray | None = None,
-) -> tuple[tuple[float, float, float], float] | None:
-    """Fit centre and width by least squares; the parallels' slopes are those of an earlier centre."""
+) -> _CentreFit | None:
+    """Fit centre and width by least squares; the slopes of the lines are those of an earlier centre."""
     left = int(np.count_nonzero(side > 0))
     right = len(side) - left
     if max(left, right) < MIN_LINE_POINTS:
         return None
     x, y = points.x_m, points.y_m
-    half_lane = side * _evaluate_centre(x, slopes_of)[1] / 2
+    _, slope_factor = _evaluate_centre(x, slope_centre)
+    half_lane = side * slope_factor / 2
     curve = [np.ones_like(x), x]
     if float(np.ptp(x)) >= LINEAR_BELOW_M:
         curve.append(x * x)
@@ -258,16 +279,18 @@ def _fit_once(
         solved = _solve([*curve, half_lane], y, weight)
         if solved is None:
             return None
-        if LANE_WIDTH_RANGE_M[0] <= solved[-1] <= LANE_WIDTH_RANGE_M[1]:
-            return _centre(solved[:-1]), float(solved[-1])
-    # One line, or two that are not a lane's width apart: use the one with more points.
+        *centre, fitted_width_m = solved
+        narrowest_m, widest_m = LANE_WIDTH_RANGE_M
+        if narrowest_m <= fitted_width_m <= widest_m:
+            return _CentreFit(_centre(centre), float(fitted_width_m))
+    # One line, or two that are not a lane's width apart: use the line with more points.
     majority = side == (1 if left >= right else -1)
     solved = _solve([column[majority] for column in curve], (y - width_m * half_lane)[majority], weight[majority])
-    return None if solved is None else (_centre(solved), width_m)
+    return None if solved is None else _CentreFit(_centre(solved.tolist()), width_m)
 
 
 def _solve(columns: list[FloatArray], y: FloatArray, weight: FloatArray) -> FloatArray | None:
-    """Solve the normal equations for up to four unknowns; None when the points do not determine them."""
+    """Solve the normal equations for up to four unknowns; None if the points do not determine the unknowns."""
     design = np.stack(columns)
     weighted = design * weight
     try:
@@ -276,14 +299,17 @@ def _solve(columns: list[FloatArray], y: FloatArray, weight: FloatArray) -> Floa
         return None
 
 
-def _centre(solved: FloatArray) -> tuple[float, float, float]:
-    return float(solved[0]), float(solved[1]), float(solved[2]) if len(solved) > 2 else 0.0
+def _centre(coefficients: Sequence[float]) -> tuple[float, float, float]:
+    """Return c0, c1, c2; c2 is 0 if it was not fitted."""
+    c0, c1, *c2 = map(float, coefficients)
+    return c0, c1, c2[0] if c2 else 0.0
 
 
 def _visible_share(x_m: FloatArray, distance_m: FloatArray, grid: GroundGrid) -> float:
-    """Return the share of the grid's length within reach of a line's clean paint; broken marks count as solid.
+    """Return the share of the grid's length on which a line is visible; gaps of broken marks are visible, too.
 
-    `distance_m` are the points' distances from the line. Paint is clean where most points near the line are on it.
+    `distance_m` are the points' distances from the line. Only clean paint makes a line visible: paint where most points
+    near the line are on it.
     """
     bins = round((grid.far_m - grid.near_m) / COVER_BIN_M)
     bin_of_point = np.minimum(((x_m - grid.near_m) / COVER_BIN_M).astype(np.int64), bins - 1)
@@ -291,9 +317,9 @@ def _visible_share(x_m: FloatArray, distance_m: FloatArray, grid: GroundGrid) ->
     beside = np.bincount(bin_of_point[distance_m < CORRIDOR_M], minlength=bins)
     clean = (on_line >= MIN_COVER_POINTS) & (on_line >= MIN_CLEAN_SHARE * beside)
     runs = np.convolve(clean, np.ones(COVER_BINS_TOGETHER), mode="full") == COVER_BINS_TOGETHER
-    # `ends` are the last bins of runs: the line is visible over each run and COVER_REACH_M beyond both its ends.
+    # A run is COVER_BINS_TOGETHER clean bins. The line is visible over each run and COVER_REACH_M before and behind it.
     reach = round(COVER_REACH_M / COVER_BIN_M)
-    ends = np.flatnonzero(runs)
+    ends = np.flatnonzero(runs)  # the last bins of runs
     visibility_steps = np.zeros(bins + 1)
     np.add.at(visibility_steps, np.maximum(ends - COVER_BINS_TOGETHER + 1 - reach, 0), 1)
     np.add.at(visibility_steps, np.minimum(ends + reach + 1, bins), -1)

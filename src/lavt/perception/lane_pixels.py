@@ -1,7 +1,7 @@
 """Lane-mark pixels: white or yellow, brighter than the surrounding road, and near vertical edges.
 
-All thresholds are on 8-bit values. None is on absolute brightness, which depends on light and exposure. They were
-chosen on rendered daylight pictures before any drive under delay.
+All thresholds are for 8-bit values. No threshold is an absolute brightness, which depends on light and exposure. The
+thresholds were chosen on rendered daylight pictures before any drive under delay.
 """
 
 from __future__ import annotations
@@ -16,9 +16,10 @@ Mask = NDArray[np.uint8]
 """0 or 255 for each pixel of a picture or crop."""
 
 WHITE_ABOVE_ROAD = 28
-"""White paint is this much brighter than the mean around it, which changes with shadows and exposure as paint does."""
+"""White paint is this much brighter than the mean around it. Shadows and exposure change both in the same way."""
 WHITE_TO_ROAD_RATIO = 1.3
-"""White paint is also this many times as bright: in bright light the grain of asphalt exceeds any fixed difference."""
+"""White paint is also this many times as bright as the mean around it, because in bright light the grain of asphalt
+exceeds any fixed difference."""
 YELLOW_RED_MINUS_BLUE = 55
 """Yellow paint has this much less blue than red."""
 MIN_EDGE_GRADIENT = 48
@@ -27,11 +28,11 @@ SURROUNDINGS_PX = (65, 5)
 """Width and height of the surroundings at a focal length of 320 px: three times as wide as the nearest mark (20 px at 2
 m)."""
 MARK_PX = 21
-"""The width around an edge that may be the inside of a mark, at a focal length of 320 px."""
+"""Width of the area around an edge that can belong to the same mark, at a focal length of 320 px."""
 
 
 def lane_pixels(region: Picture, scale: float = 1.0) -> Mask:
-    """Return a mask of the pixels of `region`, (height, width, 3), that may belong to a lane's marks.
+    """Return a mask of the pixels of `region`, (height, width, 3), that can belong to a lane's marks.
 
     `scale` is the camera's focal length divided by 320 px; marks are wider by this factor.
     """

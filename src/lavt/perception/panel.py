@@ -23,7 +23,7 @@ LEFT, RIGHT, OTHER, CENTRE, EXPECTED = (80, 200, 80), (230, 150, 60), (120, 120,
 """Colours (blue, green, red) of the left and right line's points, other points, the centre, and the expected lines."""
 
 
-def panel(camera: CalibratedCamera, detector: LaneDetector, picture: Picture) -> Picture:
+def draw_panel(camera: CalibratedCamera, detector: LaneDetector, picture: Picture) -> Picture:
     """Detect the lane in the next picture and return a drawing of the steps: 3 rows and 4 columns of tiles."""
     lane = detector.detect(picture)
     trace, bird_eye = detector.trace, detector.bird_eye
@@ -41,7 +41,7 @@ def panel(camera: CalibratedCamera, detector: LaneDetector, picture: Picture) ->
         "1 picture": picture,
         "2 undistorted, with the searched ground": _draw_ground_outline(camera, picture, bird_eye.grid),
         **{label: _mask_in_picture(mask, picture, bird_eye) for label, mask in masks.items()},
-        "7 bird's-eye view, far end at the top": bird_eye.from_above(region),
+        "7 bird's-eye view, far end at the top": bird_eye.view_from_above(region),
         "8 marks in the bird's-eye view": _grey_to_colour(trace.mask),
         "9 points: left, right, other": _draw_points(trace, bird_eye.grid),
         "10 fitted lane": _draw_fit(trace, lane, bird_eye),
@@ -56,11 +56,12 @@ def _make_tile(label: str, tile: Picture) -> Picture:
     """Return a tile with a picture scaled to fit and its label above."""
     width, height = TILE_PX
     factor = min(width / tile.shape[1], height / tile.shape[0])
-    size = (max(round(tile.shape[1] * factor), 1), max(round(tile.shape[0] * factor), 1))
-    shrunk = cv2.resize(tile, size, interpolation=cv2.INTER_AREA if factor < 1 else cv2.INTER_NEAREST)
+    scaled_width, scaled_height = max(round(tile.shape[1] * factor), 1), max(round(tile.shape[0] * factor), 1)
+    interpolation = cv2.INTER_AREA if factor < 1 else cv2.INTER_NEAREST
+    scaled = cv2.resize(tile, (scaled_width, scaled_height), interpolation=interpolation)
     whole = np.full((height + LABEL_PX, width, 3), 30, dtype=np.uint8)
-    left, top = (width - size[0]) // 2, LABEL_PX + (height - size[1]) // 2
-    whole[top : top + size[1], left : left + size[0]] = shrunk
+    left, top = (width - scaled_width) // 2, LABEL_PX + (height - scaled_height) // 2
+    whole[top : top + scaled_height, left : left + scaled_width] = scaled
     cv2.putText(whole, label, (6, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
     return whole
 
@@ -78,19 +79,19 @@ def _mask_in_picture(mask: Picture, picture: Picture, bird_eye: BirdEye) -> Pict
 
 def _draw_ground_outline(camera: CalibratedCamera, picture: Picture, grid: GroundGrid) -> Picture:
     """Return the undistorted picture with an outline of the grid."""
-    straight, coefficients = picture.copy(), np.array(camera.distortion)
+    undistorted, coefficients = picture.copy(), np.array(camera.distortion)
     if camera.distortion:
-        size, undistorted = (camera.width_px, camera.height_px), camera.camera_matrix
-        make = cv2.fisheye.initUndistortRectifyMap if camera.fisheye else cv2.initUndistortRectifyMap
-        maps = make(camera.camera_matrix, coefficients, np.eye(3), undistorted, size, cv2.CV_16SC2)
-        straight = np.asarray(cv2.remap(picture, *maps, cv2.INTER_LINEAR), dtype=np.uint8)
+        size, matrix = (camera.width_px, camera.height_px), camera.camera_matrix
+        make_maps = cv2.fisheye.initUndistortRectifyMap if camera.fisheye else cv2.initUndistortRectifyMap
+        maps = make_maps(matrix, coefficients, np.eye(3), matrix, size, cv2.CV_16SC2)
+        undistorted = np.asarray(cv2.remap(picture, *maps, cv2.INTER_LINEAR), dtype=np.uint8)
     near, far, side = grid.near_m, grid.far_m, grid.half_width_m
     corners = np.array([[near, side], [far, side], [far, -side], [near, -side], [near, side]])
     rim = np.concatenate([np.linspace(a, b, 60) for a, b in pairwise(corners)])
     outline = np.column_stack([rim, np.ones(len(rim))]) @ ground_to_picture(camera).T
     outline = outline[outline[:, 2] > 0.1]
-    _draw_curve(straight, outline[:, :2] / outline[:, 2:], EXPECTED)
-    return straight
+    _draw_curve(undistorted, outline[:, :2] / outline[:, 2:], EXPECTED)
+    return undistorted
 
 
 def _draw_curve(picture: Picture, pixels: FloatArray, colour: tuple[int, int, int], thickness: int = 2) -> None:
@@ -108,10 +109,11 @@ def _cells(points: FloatArray, grid: GroundGrid) -> FloatArray:
 
 def _parallel_line(centre: tuple[float, float, float], offset_m: float, near_m: float, far_m: float) -> FloatArray:
     """Return ground points (n, 2) along the parallel of a centre, `offset_m` to its left."""
+    c0, c1, c2 = centre
     x = np.linspace(near_m, far_m, 60)
-    slope = centre[1] + 2 * centre[2] * x
-    across = np.column_stack([-slope, np.ones_like(slope)]) / np.hypot(slope, 1.0)[:, None]
-    return np.column_stack([x, centre[0] + (centre[1] + centre[2] * x) * x]) + offset_m * across
+    slope = c1 + 2 * c2 * x
+    to_the_left = np.column_stack([-slope, np.ones_like(slope)]) / np.hypot(slope, 1.0)[:, None]
+    return np.column_stack([x, c0 + (c1 + c2 * x) * x]) + offset_m * to_the_left
 
 
 def _draw_points(trace: DetectionTrace, grid: GroundGrid) -> Picture:
@@ -142,7 +144,7 @@ def _draw_points(trace: DetectionTrace, grid: GroundGrid) -> Picture:
 
 
 def _draw_fit(trace: DetectionTrace, lane: Lane, bird_eye: BirdEye) -> Picture:
-    """Return a drawing of this picture's own lane over its marks, with the centre of the average."""
+    """Return a drawing of the marks, the lane fitted to this picture alone, and the centre of the averaged lane."""
     drawn = _grey_to_colour(trace.mask // 2)
     if trace.fit is not None:
         for offset_m, colour in ((trace.fit.width_m / 2, LEFT), (-trace.fit.width_m / 2, RIGHT)):

@@ -1,4 +1,4 @@
-"""The inbox of a node, which has a bounded queue or only the newest message of each channel, and counts losses."""
+"""The inbox of a node: for each channel a bounded queue, or only the newest message. Losses are counted."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from lavt.node import Message
 
 
 class Inbox:
-    """The waiting messages of a node: queued messages come first, in order of arrival, then the newest of the others.
+    """The waiting messages of a node: queued messages come first, in order of arrival, then those of "newest" channels.
 
-    Each channel has its own queue length, so that a flood on one channel loses no message of another.
+    Each channel has its own queue, so that a flood on one channel loses no message of another.
     """
 
     def __init__(self) -> None:
@@ -20,6 +20,7 @@ class Inbox:
         """Number of waiting messages."""
         self._number = 0
         self._queues: defaultdict[str, deque[tuple[int, Message]]] = defaultdict(deque)
+        """By channel, the messages with their numbers in order of arrival."""
         self._newest: dict[str, Message] = {}
 
     def is_empty(self) -> bool:
@@ -28,8 +29,8 @@ class Inbox:
 
     def put(self, message: Message) -> None:
         """Add a message."""
-        row = CHANNELS[message.channel]
-        if row.waiting == "newest":
+        channel = CHANNELS[message.channel]
+        if channel.waiting == "newest":
             if message.channel in self._newest:
                 self.counts[f"{message.channel}_replaced"] += 1
             else:
@@ -37,7 +38,7 @@ class Inbox:
             self._newest[message.channel] = message
             return
         queue = self._queues[message.channel]
-        if len(queue) >= row.length:
+        if len(queue) >= channel.length:
             queue.popleft()
             self.counts[f"{message.channel}_dropped"] += 1
         else:
@@ -50,18 +51,19 @@ class Inbox:
         if not self.waiting:
             return None
         self.waiting -= 1
-        first = None
+        first_queue = None  # the queue whose first message has the lowest number
         for queue in self._queues.values():
-            if queue and (first is None or queue[0][0] < first[0][0]):
-                first = queue
-        if first is not None:
-            return first.popleft()[1]
+            if queue and (first_queue is None or queue[0][0] < first_queue[0][0]):
+                first_queue = queue
+        if first_queue is not None:
+            return first_queue.popleft()[1]
         return self._newest.pop(next(iter(self._newest)))
 
     def take_arrived(self, until_ns: int) -> Message | None:
         """Remove and return a queued message of an inline channel that arrived by `until_ns` (monotonic), or None.
 
-        These messages are processed before a wake. Messages of "newest" channels are not.
+        A runtime processes these messages, but not those of "newest" channels, before a wake that was due at
+        `until_ns`.
         """
         for channel, queue in self._queues.items():
             if CHANNELS[channel].inline and queue and queue[0][1].arrived.mono_ns <= until_ns:

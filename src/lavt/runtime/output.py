@@ -12,7 +12,7 @@ from queue import Empty, SimpleQueue
 from typing import Final, Literal
 
 CAPACITY: Final = 1000
-"""Number of texts that may wait: the JSON lines of three minutes of a drive."""
+"""Largest number of texts that wait: the JSON lines of three minutes of a drive."""
 FINISH_TIMEOUT_S: Final = 1.0
 """How long a program waits at its end for the reader of each stream."""
 
@@ -22,7 +22,7 @@ StreamName = Literal["stdout", "stderr"]
 class QueuedOutput(io.TextIOBase):
     """A text stream whose texts a thread writes to a file descriptor.
 
-    An ordinary write to a pipe or terminal that nobody reads blocks; a signal handler interrupts it only for a moment.
+    If nobody reads a pipe or terminal, an ordinary write blocks, and a signal handler interrupts it only for a moment.
     Here only the thread blocks. If the queue is full, the oldest text is dropped and counted, as are texts that cannot
     be written. Any thread and signal handler may write.
     """
@@ -72,7 +72,7 @@ class QueuedOutput(io.TextIOBase):
 def queue_output(*names: StreamName) -> None:
     """Replace these standard streams by queued ones until the program ends.
 
-    Texts that are queued at exit are written then, after the interpreter has printed the traceback of an error.
+    At exit, the queued texts are written after the interpreter has printed the traceback of an error.
     """
     atexit.unregister(finish_output)
     atexit.register(finish_output)
@@ -80,7 +80,7 @@ def queue_output(*names: StreamName) -> None:
         stream = getattr(sys, name)
         if not isinstance(stream, QueuedOutput):
             stream.flush()
-            descriptor = os.dup(stream.fileno())  # a copy, because the replaced stream closes its own
+            descriptor = os.dup(stream.fileno())  # a copy: the replaced stream closes the original
             setattr(sys, name, QueuedOutput(descriptor))
 
 

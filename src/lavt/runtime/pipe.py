@@ -1,4 +1,4 @@
-"""One end of a pipe between two processes of this machine, whose senders never block."""
+"""One end of a pipe between two processes of this machine. Sending never blocks."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from queue import SimpleQueue
 from typing import Any, Final
 
 CAPACITY: Final = 8192
-"""Number of entries that are queued while the other process does not read: those of some ten seconds of a drive."""
+"""Number of entries that are queued if the other process does not read: about ten seconds of a drive."""
 
 CLOSE_TIMEOUT_S: Final = 1.0
 """How long closing waits for each thread to end."""

@@ -1,4 +1,4 @@
-"""Running of a message through the stages of a pipeline; the end time of each stage is kept."""
+"""Run a message through the stages of a pipeline, and note when each stage ends."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from lavt.node import Message, Send, Stage
 class Timeline(Struct, frozen=True):
     """The end times of the stages of a pipeline, on the host's monotonic clock.
 
-    The first entry is "wait", the time in the inbox, which ends when the first stage begins. `arrived_mono_ns` is the
-    arrival of the message.
+    The first entry of `stages`, "wait", is the time in the inbox; its end is the start of the first stage.
+    `arrived_mono_ns` is the arrival of the message.
     """
 
     node: str
@@ -31,7 +31,7 @@ class PipelineResult(Struct, frozen=True):
     end: Now
     timeline: Timeline | None
     stages_run: int
-    """Number of stages that were called; less than all if one returned None."""
+    """Number of stages that were called; fewer than all if one returned None."""
 
 
 def run_stages(node: str, stages: Sequence[Stage], message: Message, start: Now, ends: Iterator[Now]) -> PipelineResult:

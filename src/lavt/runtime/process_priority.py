@@ -1,4 +1,4 @@
-"""The priority of LAVT's processes, which is raised if the system allows that (to root)."""
+"""The priority of LAVT's processes, which is raised if the system permits this, as it does for root."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ REALTIME_LIMIT_S: Final = 1
 """The kernel ends a real-time process if one of its threads computes for this long without waiting: it hangs."""
 
 SESSION: Final = Path("/proc/self/autogroup")
-"""The niceness of this process's session. With automatic task groups, Linux shares the processors among sessions, and
-the niceness of a process counts only within its session."""
+"""The niceness of this process's session. With automatic task groups, Linux shares the processors among sessions; the
+niceness of a process then has an effect only inside its session."""
 
 
 def raise_priority(niceness: int = NICENESS) -> None:

@@ -175,7 +175,7 @@ class _Worker:
             finally:
                 self._lock.release()
             if self.inbox.is_empty() and not _is_before(self._wake_ns, self._sleeps_until_ns):
-                return
+                return  # the node's thread need not wake earlier than it will
         else:
             with self._inbox_lock:
                 self.inbox.put(message)

@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 
 POLL_PERIOD_S = 0.02
 CLOSE_TIMEOUT_S = 10.0
-"""How long completing a record may take; writing a full queue takes a second on an ordinary disk."""
+"""Longest time for the completion of a record; to write a full queue takes a second on an ordinary disk."""
 
 
 class Recorder(Protocol):
@@ -39,7 +39,7 @@ class RecordFile(Recorder, Protocol):
 
 
 class Recorders:
-    """A recorder that passes each entry to several recorders, none of which may block or raise."""
+    """A recorder that passes each entry to several recorders, which must neither block nor raise."""
 
     def __init__(self, *recorders: Recorder) -> None:
         self._writes = tuple(recorder.write for recorder in recorders)
@@ -51,7 +51,7 @@ class Recorders:
 
 
 def _decoder(kind: type[Any]) -> Callable[[bytes], object]:
-    """Return a function that decodes a message; it returns the beginning and size of unreadable bytes."""
+    """Return a function that decodes a message; for unreadable bytes it returns their beginning and size."""
 
     def decode_or_describe(data: bytes) -> object:
         try:
@@ -136,10 +136,11 @@ def decode_for_record(channel: str, payload: Any) -> Any:
 class QueuedRecorder:
     """A recorder with a bounded queue and its own thread, so that no other thread waits for a disk.
 
-    The thread also decodes network bytes, so that the receiving threads need not. It polls the queue, because waking it
-    a thousand times a second would cost more than the writing.
+    The recorder's thread also decodes network bytes, which saves time in the receiving threads. It polls the queue,
+    because to wake it a thousand times a second would cost more than the writing.
 
-    Entries that do not fit or cannot be written are counted in `overflow`; a run with an overflow is invalid.
+    Entries that do not fit into the queue or cannot be written are counted in `overflow`; a run with an overflow is
+    invalid.
     """
 
     def __init__(self, file: RecordFile, capacity: int = 8192, close_timeout_s: float = CLOSE_TIMEOUT_S) -> None:

@@ -1,7 +1,7 @@
-"""A node in its own process: both ends of the connection to the runtime with the other nodes of its side.
+"""A node in its own process, connected by a pipe to the process with the other nodes of its side.
 
-The node's process runs the node's pipelines and reports the results. The other process has the links, the record and
-the other nodes. Both processes use the same clocks, because they run on one machine.
+The node's process runs the node's pipelines and reports the results. The other process, the main process of the side,
+has the links, the record and the other nodes. Both processes use the same clocks, because they run on one machine.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from lavt.runtime.pipe import Pipe
 from lavt.runtime.realtime import MessageLink, RealRuntime
 
 LATE_NS: Final = 60 * NS_PER_MS
-"""A message that took longer between the processes is late, because one of them did not run meanwhile. Late commands,
+"""A message that took longer between the processes is late: one of the processes did not run meanwhile. Late commands,
 states and replies are dropped."""
 MAX_PENDING_PEERS: Final = 64
-"""Replies can be sent to the peers of this many last messages."""
+"""For a reply, the peer of a message is remembered until this many newer messages with a peer have arrived."""
 CLOSE_TIMEOUT_S: Final = 1.0
 CHECK_PERIOD_S: Final = 0.05
 """Period at which the node's heartbeat is checked. A silence is measured in checks, not in time: if the checking
-process itself was frozen, that counts as a single check."""
+process itself was frozen, only one check is missed."""
 FIRST_HEARTBEAT_CHECKS: Final = 600
-"""Number of checks that may pass until the first heartbeat: 30 s."""
+"""Number of checks after which the first heartbeat must have come: 30 s."""
 SILENT_AFTER_CHECKS: Final = 2
 """Number of checks without a heartbeat after which the node is silent: 0.1 s."""
 FAILED_AFTER_CHECKS: Final = 10
@@ -40,15 +40,16 @@ FAILED_AFTER_CHECKS: Final = 10
 END: Final = ("end",)
 
 Report = tuple[Any, ...]
-"""An entry from the node's process: ("deliver", channel, payload, arrived), ("send", carrier, sends, time), ("record",
-topic, payload, time), ("status", the result of `get_status`), ("failed", reason)."""
+"""An entry from the node's process: ("deliver", channel, payload, arrived), ("send", carrier, sends, now), ("record",
+topic, payload, now), ("status", the result of `get_status`), ("failed", reason)."""
 
 
 class RemoteNodeProxy:
-    """The proxy of a node in another process: it forwards messages to that process and executes its reports.
+    """The proxy, in the main process, of a node in another process.
 
-    `heartbeat` is a topic that the node records all the time. `on_silent` is called when nothing was recorded on it for
-    0.1 s. After 0.5 s the node counts as failed, which ends the run.
+    It forwards messages to the node's process. It delivers, sends and records what that process reports. `heartbeat` is
+    a topic that the node records all the time. After 0.1 s without an entry on this topic, `on_silent` is called; after
+    0.5 s the run fails.
     """
 
     def __init__(
@@ -65,7 +66,7 @@ class RemoteNodeProxy:
         self._pipe = Pipe(connection, self._receive, self._on_closed)
         self._runtime: RealRuntime | None = None
         self._peers: dict[int, Peer] = {}
-        """The peers by the number that is sent instead of them; different threads add and remove them."""
+        """The peers by number; the node's process gets the number. Different threads add and remove entries."""
         self._numbers = itertools.count(1)
         self._replies: SimpleQueue[tuple[Carrier, list[Send]] | None] = SimpleQueue()
         self._replier = threading.Thread(target=self._send_replies, name=f"{name}'s replies", daemon=True)
@@ -96,7 +97,7 @@ class RemoteNodeProxy:
         if self._runtime is not None:
             self._replies.put(None)
             self._replier.join(CLOSE_TIMEOUT_S)
-            counts = {
+            counts = {  # of this end of the pipe; "node" names their origin in the record
                 "node": f"to the {self.name}'s process",
                 "messages_dropped": self._pipe.dropped,
                 "replies_dropped": self._replies_dropped,
@@ -109,12 +110,13 @@ class RemoteNodeProxy:
             return
         kind, *rest = report
         if kind == "record":
-            if rest[0] == self._heartbeat:
+            topic, payload, now = rest
+            if topic == self._heartbeat:
                 self._missed = 0
-            runtime.record(*rest)
+            runtime.record(topic, payload, now)
         elif kind == "send":
             carrier, sends, sent = rest
-            if runtime.now().mono_ns - sent.mono_ns > LATE_NS:  # this process did not run; an old state is useless
+            if runtime.now().mono_ns - sent.mono_ns > LATE_NS:  # one process did not run; an old state is useless
                 return
             self._carry(runtime, carrier, sends)
         elif kind == "deliver":
@@ -122,14 +124,15 @@ class RemoteNodeProxy:
         elif kind == "status":
             (self.status,) = rest
         elif kind == "failed":
-            runtime.fail(WorkError(rest[0]))
+            (reason,) = rest
+            runtime.fail(WorkError(reason))
 
     def _carry(self, runtime: RealRuntime, carrier: Carrier, sends: Sequence[Send]) -> None:
-        """Send messages; replies in a thread of their own, because a frozen router blocks them for seconds in Zenoh."""
-        others = [send for send in sends if send.peer is None]
+        """Send messages. Another thread sends the replies: if a router is frozen, Zenoh blocks replies for seconds."""
+        without_peer = [send for send in sends if send.peer is None]
         replies = [Send(send.channel, send.payload, self._peers.pop(send.peer, None)) for send in sends if send.peer]
-        if others:
-            runtime.carry(carrier, others)
+        if without_peer:
+            runtime.carry(carrier, without_peer)
         if replies and self._replies.qsize() < MAX_PENDING_PEERS:
             self._replies.put((carrier, replies))
         elif replies:
@@ -148,7 +151,7 @@ class RemoteNodeProxy:
         runtime = self._runtime
         if runtime is None:
             return
-        self._missed = missed = self._missed + 1  # a heartbeat may reset it at any time
+        self._missed = missed = self._missed + 1  # the pipe's thread can reset `_missed` at any time
         if missed == SILENT_AFTER_CHECKS:
             self._on_silent(runtime)
         if missed in {0, FAILED_AFTER_CHECKS}:  # 0: the first heartbeat has not come in time
@@ -159,8 +162,11 @@ class RemoteNodeProxy:
             self._runtime.fail(WorkError(f"the process of the {self.name} has ended"))
 
 
-class _OtherProcess:
-    """Recorder, link and other nodes for the node's runtime; it passes everything to the other end of the pipe."""
+class _MainProcess:
+    """The main process as the node's runtime sees it: recorder, links and other nodes.
+
+    Everything that is written, sent or put is passed to the main process through the pipe.
+    """
 
     def __init__(self, pipe: Pipe, clock: Clock, report_status: Callable[[], None]) -> None:
         self._pipe, self._clock, self._report_status = pipe, clock, report_status
@@ -182,8 +188,8 @@ class _OtherProcess:
 class NodeHost:
     """The runtime of a single node in its own process.
 
-    The result of `get_status` is reported before the node sends, if it has changed. `on_disconnect` is called when the
-    other process has ended or requests the end of this one.
+    Before the node sends, the result of `get_status` is reported if it has changed. `on_disconnect` is called when the
+    main process has ended or requests the end of this process.
     """
 
     def __init__(
@@ -201,10 +207,10 @@ class NodeHost:
         self._on_disconnect = on_disconnect
         self._late: Counter[str] = Counter()
         self._pipe = Pipe(connection, self._receive, on_disconnect)
-        other_process = _OtherProcess(self._pipe, clock, self._report_status)
-        receivers = {receiver for row in CHANNELS.values() for receiver in row.receivers} - {node.name}
-        self.runtime = RealRuntime(clock, [node], other_process, lambda: None, dict.fromkeys(receivers, other_process))
-        self._links: dict[str, MessageLink] = {row.carrier: other_process for row in CHANNELS.values()}
+        main_process = _MainProcess(self._pipe, clock, self._report_status)
+        receivers = {receiver for channel in CHANNELS.values() for receiver in channel.receivers} - {node.name}
+        self.runtime = RealRuntime(clock, [node], main_process, lambda: None, dict.fromkeys(receivers, main_process))
+        self._links: dict[str, MessageLink] = {channel.carrier: main_process for channel in CHANNELS.values()}
 
     def start(self) -> None:
         """Start the runtime and the connection."""
@@ -227,6 +233,7 @@ class NodeHost:
         self.runtime.stop()
         if self.runtime.failed is not None:
             self._pipe.send(("failed", f"{self._node.name}: {self.runtime.failed}"))
+        # Whatever the pipe dropped is missing in the record, so it is an overflow of the record.
         counts = {"node": f"{self._node.name}'s process", "record_overflow": self._pipe.dropped, **self._late}
         self._pipe.send(("record", "counts", counts, self._clock.now()))
         self._pipe.close(CLOSE_TIMEOUT_S)

@@ -1,4 +1,4 @@
-"""Failures of threads: a thread that ends with an error fails its process, which would otherwise run on without it."""
+"""Failures of threads: if a thread ends with an error, its whole process fails instead of going on without it."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from lavt.runtime.recorder import UNRECORDED, WIRE_DECODERS, Recorder, record
 from lavt.transport.clock_sync.clock_report import ClockReport
 from lavt.transport.emulation.delay_line import DelayLine
 
-NS_PER_PPB = 1_000_000_000
+ONE_IN_PPB = 1_000_000_000
 
 
 @dataclass
@@ -41,7 +41,7 @@ class HostClock:
     def at(self, true_ns: int) -> Now:
         """Return the reading of both clocks at a true time."""
         drift_ppb = self.drift_ppb
-        elapsed_ns = true_ns + true_ns * drift_ppb // NS_PER_PPB if drift_ppb else true_ns
+        elapsed_ns = true_ns + true_ns * drift_ppb // ONE_IN_PPB if drift_ppb else true_ns
         wall_ns = self.wall_start_ns + self.offset_ns + elapsed_ns
         if self.steps:
             wall_ns += sum(change_ns for at_ns, change_ns in self.steps if at_ns <= true_ns)
@@ -52,8 +52,8 @@ class HostClock:
         elapsed_ns = mono_ns - self.mono_start_ns
         if not self.drift_ppb:
             return elapsed_ns
-        candidate_ns = elapsed_ns * NS_PER_PPB // (NS_PER_PPB + self.drift_ppb)
-        while candidate_ns + candidate_ns * self.drift_ppb // NS_PER_PPB < elapsed_ns:
+        candidate_ns = elapsed_ns * ONE_IN_PPB // (ONE_IN_PPB + self.drift_ppb)
+        while candidate_ns + candidate_ns * self.drift_ppb // ONE_IN_PPB < elapsed_ns:
             candidate_ns += 1
         return candidate_ns
 
@@ -86,16 +86,16 @@ class VirtualHost:
     peer: Peer = None
     """The peer that the other side sees as the sender of this host's messages."""
     left_out: frozenset[str] = frozenset()
-    """Channels that are not recorded."""
+    """Channels that are not recorded, besides those in `UNRECORDED`."""
     runners: dict[str, _NodeRunner] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.unrecorded = UNRECORDED | self.left_out
         self.runners = {node.name: _NodeRunner(self, node) for node in self.nodes}
         self.receivers = {
-            channel: tuple(self.runners[name] for name in row.receivers)
-            for channel, row in CHANNELS.items()
-            if self.runners.keys() >= set(row.receivers)
+            name: tuple(self.runners[receiver] for receiver in channel.receivers)
+            for name, channel in CHANNELS.items()
+            if self.runners.keys() >= set(channel.receivers)
         }
         """The receiving nodes of this host by channel."""
         self._cached_ns = -1
@@ -130,8 +130,9 @@ class _NodeRunner:
         self.scheduled_ns: set[int] = set()
         """Times of all steps in the event heap, so that no time is scheduled twice."""
         self.wake_mono_ns: int | None = None
+        """The node's next wake on its host's monotonic clock."""
         self.wake_ns: int | None = None
-        """The node's next wake, on its host's monotonic clock (above) and in true time."""
+        """The same wake in true time."""
         self.set_wake(node.next_wake_ns())
 
     def set_wake(self, wake_mono_ns: int | None) -> None:
@@ -154,12 +155,13 @@ class VirtualRuntime:
         self.links = dict(links)
         self._other = {side: next(other for other in self.hosts if other != side) for side in self.hosts}
         self._heap: list[tuple[int, int, Callable[..., None], tuple[Any, ...]]] = []
+        """The events: true time, number, action and its arguments. The number keeps the order of events at one time."""
         self._number = 0
         for host in hosts:
             for runner in host.runners.values():
                 self._schedule(runner, 0)
 
-    def at(self, true_ns: int, action: Callable[..., None], *arguments: Any) -> None:
+    def call_at(self, true_ns: int, action: Callable[..., None], *arguments: Any) -> None:
         """Call `action` with `arguments` at a true time."""
         self._number += 1
         heapq.heappush(self._heap, (true_ns, self._number, action, arguments))
@@ -175,7 +177,7 @@ class VirtualRuntime:
         return False
 
     def close(self) -> None:
-        """Record the counts of nodes and inboxes, and those of links that do more than delay."""
+        """Record the counts of nodes, of inboxes, and of links that do more than delay."""
         for host in self.hosts.values():
             now = host.clock.at(self.true_ns)
             for name, runner in host.runners.items():
@@ -213,7 +215,7 @@ class VirtualRuntime:
     def _step(self, runner: _NodeRunner, true_ns: int) -> None:
         runner.scheduled_ns.remove(true_ns)
         if runner.next_step_ns != true_ns:
-            return  # an earlier step has replaced this one
+            return  # an earlier step was scheduled after this one, and has run instead
         runner.next_step_ns = None
         wake_ns = runner.wake_ns
         if wake_ns is not None and wake_ns <= true_ns:
@@ -237,7 +239,7 @@ class VirtualRuntime:
             host.recorder.write("timeline", outcome.timeline, outcome.end)
         if outcome.sends:
             if duration_ns:
-                self.at(free_ns, self._send_all, host, outcome.sends, outcome.end)
+                self.call_at(free_ns, self._send_all, host, outcome.sends, outcome.end)
             else:
                 self._send_all(host, outcome.sends, outcome.end)
         # A node changes its next wake only while it runs a pipeline.
@@ -273,7 +275,7 @@ class VirtualRuntime:
         payload: bytes = send.payload
         due_ns = link.line.push((payload, host.peer), self.true_ns, link.index(payload, link.count), len(payload))
         if due_ns is not None:
-            self.at(due_ns, self._arrive, link, send.channel, self._other[host.side])
+            self.call_at(due_ns, self._arrive, link, send.channel, self._other[host.side])
 
     def _arrive(self, link: VirtualLink, channel: str, side: str) -> None:
         for payload, peer in link.line.pop_due(self.true_ns):

@@ -1,4 +1,4 @@
-"""Arrival times of datagrams from the kernel: a process that reads its socket late does not add to the delay."""
+"""Arrival times of datagrams from the kernel. They do not depend on when the process reads its socket."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ the wall clock."""
 ANCILLARY_BYTES = 64
 """The buffer size for ancillary data in `recvmsg`."""
 MAX_QUEUED_NS = 10 * NS_PER_S
-"""An older kernel timestamp is ignored: the wall clock was stepped in the meantime."""
+"""A kernel timestamp that is older is ignored: the wall clock was stepped after the arrival."""
 
 Ancillary = list[tuple[int, int, bytes]]
 
@@ -29,7 +29,7 @@ def enable_arrival_times(opened: socket.socket) -> None:
 def arrival(ancillary: Ancillary, now: Now) -> Now:
     """Return the time of arrival on both clocks, from the kernel's wall-clock timestamp.
 
-    Without a plausible timestamp this is `now`, the time of reading.
+    Without a plausible timestamp, return `now`, the time of reading.
     """
     for level, kind, data in ancillary:
         if level == socket.SOL_SOCKET and kind == SO_TIMESTAMPNS and len(data) >= 16:

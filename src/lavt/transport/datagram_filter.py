@@ -1,7 +1,7 @@
 """Cheap checks of the datagrams at the vehicle's UDP ports, before anything is queued or recorded.
 
-The active client's datagrams pass; all others pass at a limited rate, so that the record shows them and a flood delays
-nothing. Only the receiving thread uses a filter.
+The active client's datagrams pass. All other datagrams pass at a limited rate: the record shows them, but a flood
+delays nothing. A filter is not thread-safe: only the receiving thread uses it.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from lavt.transport.udp_link import Deliver
 from lavt.transport.video.path_validation import Address, PathServer, client_datagram_number, is_path_datagram
 
 OTHER_DATAGRAMS_PER_S: Final = 200
-"""The limit at the video's port. On a busy AMD EPYC, a stranger's datagram that passes took 15 to 30 us of CPU time,
-and one that does not pass took a quarter to an eighth of that (`benchmarks/stranger_datagrams.py`, medians of three
+"""The limit at the video's port. On a busy AMD EPYC, a stranger's datagram that passed took 15 to 30 us of CPU time. A
+datagram that did not pass took a quarter to an eighth of that (`benchmarks/stranger_datagrams.py`, medians of three
 runs)."""
 PROBES_PER_S: Final = 200
-"""Limits the probes from the active client's host, and separately those from all others. A client sends 2 a second,
-`lavt clock` 20."""
+"""The limit for the probes of the active client's host, and again for the probes of all other hosts together. A client
+sends 2 a second, `lavt clock` 20."""
 
 
 class DatagramFilter(Protocol):
@@ -32,9 +32,9 @@ class DatagramFilter(Protocol):
 
 
 class VideoPortFilter:
-    """A filter that passes packets from the address of the open path, and each authentic hello and answer once.
+    """A filter that passes RTCP from the address of the open path, and each authentic hello and challenge answer once.
 
-    Of all others, including replays, 200 a second pass.
+    Of all other datagrams, including replays, 200 a second pass.
     """
 
     def __init__(self, path: PathServer) -> None:
@@ -46,10 +46,11 @@ class VideoPortFilter:
 
     def passes(self, datagram: bytes, address: Address, now_ns: int) -> bool:
         """Return whether a datagram from `address` is worth processing."""
-        is_expected = self._is_new(datagram) if is_path_datagram(datagram) else self._path.accepts_rtcp_from(address)
+        is_expected = self._admit_new(datagram) if is_path_datagram(datagram) else self._path.accepts_rtcp_from(address)
         return is_expected or self._limiter.take(now_ns)
 
-    def _is_new(self, datagram: bytes) -> bool:
+    def _admit_new(self, datagram: bytes) -> bool:
+        """Note a hello or answer; return whether it is authentic and its number is new."""
         number = client_datagram_number(datagram)
         if number is None:
             return False
@@ -63,12 +64,12 @@ class VideoPortFilter:
 
 
 class ProbePortFilter:
-    """A filter that passes 200 datagrams a second of the host to which the video's path is open, and 200 of others."""
+    """A filter that passes 200 datagrams a second of the host with the open video path, and 200 of all other hosts."""
 
     def __init__(self, path: PathServer) -> None:
         self._path = path
         self._limiters = {True: RateLimiter(PROBES_PER_S), False: RateLimiter(PROBES_PER_S)}
-        """By whether the video's path is open to the sender's host."""
+        """The key is whether the video's path is open to the sender's host."""
 
     def passes(self, _datagram: bytes, address: Address, now_ns: int) -> bool:
         """Return whether a datagram from `address` is worth processing."""

@@ -2,7 +2,7 @@
 
 A message on the wire is `[version, field, field, ..]`, the fields in the order of the class. `decode` raises
 `BadMessage` for data that is too long, not msgpack, of another version or shape, not finite, or out of range. `encode`
-cuts texts that are too long, such as a list of faults, because a state must be readable however long its texts are.
+shortens long texts, such as a list of faults, because the receiver must be able to decode every state.
 """
 
 from __future__ import annotations
@@ -38,13 +38,15 @@ NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_-]{0,31}\Z")
 """A valid name of a vehicle or client: it contains nothing that has a meaning in a Zenoh key."""
 ELLIPSIS = "\N{HORIZONTAL ELLIPSIS}"
 MAX_DELAY_MS = 10_000.0
-"""The longest delay that a client can request of a server; clearing the delay takes as long."""
+"""The longest delay that a client can request of a server. Clearing a delay takes as long, because the delayed packets
+leave first."""
 SPEED_BOUND_MPS = 100.0
 ROAD_WHEEL_BOUND_RAD = 1.0
 CURVATURE_BOUND_PER_M = 1.0
 
 Version = Annotated[int, Meta(ge=VERSION, le=VERSION)]
 U64 = Annotated[int, Meta(ge=0)]
+"""Epochs and instances of processes; msgpack itself limits the number to 64 bits."""
 U63 = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 """Times, and numbers that grow: the non-negative half of a signed 64-bit integer."""
 RoadWheel = Annotated[float, Meta(ge=-ROAD_WHEEL_BOUND_RAD, le=ROAD_WHEEL_BOUND_RAD)]
@@ -55,7 +57,7 @@ Name = Annotated[str, Meta(pattern=NAME.pattern)]
 NameOrEmpty = Annotated[str, Meta(pattern=rf"^\Z|{NAME.pattern}")]
 
 REASON_BYTES = 300
-"""Limits a reason, so that even a message with its longest texts is within `MAX_MESSAGE_BYTES`."""
+"""The longest reason. A message with the longest texts still fits into `MAX_MESSAGE_BYTES`."""
 TEXT_BYTES: dict[type, dict[str, int]] = {
     Command: {},
     State: {"reason": REASON_BYTES, "rejected": REASON_BYTES, "limited": 100},
@@ -64,7 +66,7 @@ TEXT_BYTES: dict[type, dict[str, int]] = {
     NetemRequest: {"condition": 32},
     NetemReply: {"reason": 400},
 }
-"""The longest texts that are sent, in bytes. A receiver accepts as many characters."""
+"""The longest texts that are sent, in bytes. A receiver accepts texts of this many characters."""
 
 
 def _text(kind: type, field: str) -> Any:
@@ -72,7 +74,7 @@ def _text(kind: type, field: str) -> Any:
 
 
 BOUNDS: dict[type, dict[str, float]] = {State: {"speed_mps": SPEED_BOUND_MPS, "steering_rad": ROAD_WHEEL_BOUND_RAD}}
-"""The largest magnitudes of numbers that a vehicle reports. They are sent instead of larger ones, and of NaN."""
+"""The largest magnitudes of numbers that a vehicle reports. The bound is sent instead of a larger number or NaN."""
 
 TYPES: dict[type, dict[str, Any]] = {
     Command: {
@@ -131,7 +133,7 @@ TYPES: dict[type, dict[str, Any]] = {
     },
     NetemReply: {"granted": bool, "reason": _text(NetemReply, "reason")},
 }
-"""The fields of each message in their order, with types and ranges. NaN is in no range."""
+"""The fields of each message in the order on the wire, with types and ranges. NaN is in no range."""
 
 CHECKS: dict[type, dict[str, Callable[[Any], bool]]] = {
     SessionReply: {"token": lambda token: len(token) in {0, 16}},

@@ -27,11 +27,11 @@ class UdpLink:
     """A UDP socket and a thread that receives.
 
     Received datagrams are delivered on `channel`; `name` is the purpose of the port in error messages. Without `remote`
-    the peer of a `Send` is the destination address. A client passes the address of its server as `remote`: all
+    the peer of a `Send` is the destination address. A client passes the address of its server as `remote`. Then all
     datagrams go to that host, and the peer of a `Send` is only a port, which is used if the port of `remote` is 0.
-    Datagrams from any other address than the server's are counted and not delivered. A link that only receives may be
-    restricted to the numeric host `only_from`. Raises `UserError` for a port that cannot be opened and for an unknown
-    host.
+    Datagrams from any other address than the server's are counted and not delivered. For a link that only receives,
+    `only_from` is the numeric address of the only permitted host. Raises `UserError` for a port that cannot be opened
+    and for an unknown host.
     """
 
     def __init__(
@@ -79,7 +79,8 @@ class UdpLink:
         for send in sends:
             address = send.peer
             if self._remote is not None:
-                address = self._server = (self._remote[0], self._remote[1] or send.peer)
+                host, port = self._remote
+                address = self._server = (host, port or send.peer)
             try:
                 self._socket.sendto(send.payload, socket.MSG_DONTWAIT, address)
             except OSError:  # the datagram is lost, as on the network: no frame waits for an earlier one
@@ -121,9 +122,10 @@ class UdpLink:
 
 
 def resolve_host(key: str, host: str) -> str:
-    """Return the numeric address of a host; raise `UserError` that names the config `key` if it is unknown.
+    """Return the numeric address of a host; raise `UserError` that names the config `key` if the host is unknown.
 
-    The host is resolved only once, so that no datagram waits for a name server and senders can be compared by address.
+    Callers resolve a host only once, so that no datagram waits for a name server and senders can be compared by
+    address.
     """
     try:
         return socket.gethostbyname(host)

@@ -1,7 +1,7 @@
 """Commands, states and session requests over Zenoh. Only this module imports `zenoh`.
 
 Each side has a Zenoh session with a router on its own machine, and the routers are linked to each other. Safety does
-not depend on Zenoh. After an outage it may deliver commands that are seconds old, and it reports a lost session only
+not depend on Zenoh: after an outage Zenoh can deliver commands that are seconds old, and it reports a lost session only
 when the lease has expired.
 """
 
@@ -34,31 +34,32 @@ PRIVATE_KEYS = ("transport/link/tls/listen_private_key", "transport/link/tls/con
 ROUTER_READY_S = 5.0
 RETRY_S = 1.0
 PROTOCOLS = ("tcp", "tls", "quic", "udp", "ws")
-"""Protocols of endpoints with a host and a port. Zenoh itself reports an unknown protocol as unreachable."""
+"""Protocols of endpoints with a host and a port. They are checked here, because Zenoh reports an unknown protocol as
+unreachable."""
 PATH_PROTOCOLS = ("unixsock-stream", "unixpipe", "vsock", "serial")
 REPLY_CHANNELS = {"session": "session_reply", "netem": "netem_reply"}
-"""Channels of replies by channel of the query, which is the last part of its key."""
+"""The channel of the replies for each channel of queries. The channel of a query is the last part of its key."""
 QUERY_CHANNELS = {reply: query for query, reply in REPLY_CHANNELS.items()}
 RECEIVE_RING_LENGTH = 256
-"""The number of received messages that can wait; a newer one replaces the oldest. Zenoh's threads write to this ring
-without Python's lock, so that a flood does not queue in sockets."""
+"""The number of received messages that can wait; if there are more, the oldest is dropped. Zenoh's threads write to
+this ring without Python's lock, so that a flood does not queue in sockets."""
 MAX_PENDING_QUERIES = 64
-"""The number of queries per channel that can wait for a reply; a newer one replaces the oldest. Queries that cannot be
-decoded never get a reply."""
+"""The number of queries per channel that can wait for a reply; if there are more, the oldest is dropped. A limit is
+necessary, because queries that cannot be decoded never get a reply."""
 CONTROL: dict[str, Any] = {
     "congestion_control": zenoh.CongestionControl.DROP,
     "priority": zenoh.Priority.REAL_TIME,
     "express": True,
     "reliability": zenoh.Reliability.BEST_EFFORT,
 }
-"""Zenoh's settings for commands: a late command is worthless, so it is never resent, blocked or batched, and it has the
-highest priority."""
+"""Zenoh's settings for commands. A late command is worthless, so a command has the highest priority, is never resent or
+batched, and is dropped if it cannot be sent at once."""
 STATE: dict[str, Any] = {**CONTROL, "priority": zenoh.Priority.INTERACTIVE_HIGH}
 """Zenoh's settings for states."""
 
 
 def quiet_logs() -> None:
-    """Set Zenoh's log, which goes to standard output, to errors only, unless RUST_LOG is set."""
+    """Restrict Zenoh's log, which goes to standard output, to errors, unless RUST_LOG is set."""
     zenoh.init_log_from_env_or("error")
 
 
@@ -100,7 +101,7 @@ def _check_private_keys(config: zenoh.Config) -> None:
 
 
 def _error_text(error: Exception) -> str:
-    """Return an error text of Zenoh in one line, without source locations and type names of Zenoh."""
+    """Return an error text of Zenoh in one line, without Zenoh's source locations and type names."""
     text = " ".join(re.sub(r" at /\S+\.rs:\d+\.?", "", str(error)).split())
     text = re.sub(
         r"(?:Json5Err\()?Message \{ msg: \"(.*)\", location: .*? line: (\d+), column: (\d+) .*", r"\1 (line \2)", text
@@ -170,7 +171,7 @@ class Routers(NamedTuple):
     """The links and versions that a session's router and the routers linked to it report."""
 
     linked: int
-    """The number of other routers that the session's router is linked to."""
+    """The number of other routers to which the session's router is linked."""
     versions: tuple[str, ...]
     """Zenoh's version in every router that reports it, the session's router first."""
 
@@ -243,7 +244,7 @@ class ZenohLink:
     def start(self, deliver: Deliver, *, queries_only: bool = False) -> None:
         """Start to send and to receive; threads of the link call `deliver`.
 
-        With `queries_only` it sends queries and receives their replies, and publishes and subscribes nothing.
+        With `queries_only` the link sends queries and receives replies, but does not publish, subscribe or answer.
         """
         self._deliver = deliver
         if queries_only:
@@ -265,7 +266,7 @@ class ZenohLink:
                 continue
             try:
                 self._declare(session)
-            except BaseException:  # this thread's error fails the process, whose end must not wait for the session
+            except BaseException:  # the error of this thread ends the process, which must not wait for the session
                 self._closing.set()
                 self._close(session)
                 raise
@@ -288,7 +289,7 @@ class ZenohLink:
         self._declared.append(session.liveliness().declare_token(f"{self._base}/alive/{self._who}"))
 
     def send(self, *sends: Send) -> None:
-        """Send messages of this side; one that cannot be sent now is counted and dropped, since a newer one follows."""
+        """Send messages of this side. A message that cannot be sent now is counted and dropped: a newer one follows."""
         for send in sends:
             self._send(send)
 
@@ -307,20 +308,21 @@ class ZenohLink:
 
     def routers(self) -> Routers | None:
         """Query the routers for their links and versions; return None if this session's router does not answer."""
-        own = {str(zid) for zid in self._session.info.routers_zid()}
+        own_routers = {str(zid) for zid in self._session.info.routers_zid()}
         reports = [
             json.loads(reply.ok.payload.to_string())
             for reply in self._session.get("@/*/router", timeout=REPLY_TIMEOUT_S)
             if reply.ok is not None
         ]
-        reports.sort(key=lambda report: report["zid"] not in own)
-        if not reports or reports[0]["zid"] not in own:
+        reports.sort(key=lambda report: report["zid"] not in own_routers)
+        own_report = reports[0] if reports else None
+        if own_report is None or own_report["zid"] not in own_routers:
             return None
-        linked = sum(session["whatami"] == "router" for session in reports[0]["sessions"])
+        linked = sum(session["whatami"] == "router" for session in own_report["sessions"])
         return Routers(linked, tuple(report["version"].partition("-")[0] for report in reports))
 
     def close(self) -> None:
-        """Close the session; without this the process would not end."""
+        """Close the session; a process with an open session would not end."""
         self._closing.set()
         if self._opener is not None:
             self._opener.join()

@@ -98,7 +98,7 @@ def test_lost_packets_are_lost_frames_at_geometry(tmp_path: Path) -> None:
     loop = build_loop(planned("fidelity=geometry"), tmp_path / "run")
     link = loop.runtime.links["rtp"]
     for at_ns, is_open in ((1_500_000_000, False), (1_560_000_000, True)):
-        loop.runtime.at(at_ns, setattr, link, "open", is_open)
+        loop.runtime.call_at(at_ns, setattr, link, "open", is_open)
     drive(loop, limit_ns=3 * NS_PER_S)
     counts = loop.client.receiver.counts
     assert 1 <= counts["packets_lost"] <= 2

@@ -268,7 +268,7 @@ def test_a_lost_vehicle_state_stops_the_car(tmp_path: Path) -> None:
     """If the vehicle's state no longer arrives at the client, the drive soon ends with a safe stop."""
 
     def lose_the_state(loop: VirtualLoop) -> None:
-        loop.runtime.at(8 * NS_PER_S, lambda: setattr(loop.runtime.links["state"], "open", False))
+        loop.runtime.call_at(8 * NS_PER_S, lambda: setattr(loop.runtime.links["state"], "open", False))
 
     out = tmp_path / "run"
     run(out, planned(NO_SCENERY), change=lose_the_state, seconds=60)

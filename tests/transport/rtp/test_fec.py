@@ -32,7 +32,7 @@ def frame(
 
 
 def repair_packets(packets: list[RtpPacket], count: int) -> list[RtpPacket]:
-    datagrams = RepairSender(REPAIR_SSRC, 0).repair([packet.to_bytes() for packet in packets], count)
+    datagrams = RepairSender(REPAIR_SSRC, 0).make_repair_packets([packet.to_bytes() for packet in packets], count)
     return [parse_packet(datagram) for datagram in datagrams]
 
 
@@ -71,7 +71,7 @@ def replace_payload(packet: RtpPacket, payload: bytes) -> RtpPacket:
 def test_bytes_of_a_repair_packet() -> None:
     """A repair packet has the format of docs/wire.md; for a frame of one packet, both parities are its bytes."""
     media = RtpPacket(96, 0xFFFE, 0x05060708, MEDIA_SSRC, marker=True, payload=b"abc")
-    repairs = RepairSender(REPAIR_SSRC, 0xFFFF).repair([media.to_bytes()], 2)
+    repairs = RepairSender(REPAIR_SSRC, 0xFFFF).make_repair_packets([media.to_bytes()], 2)
     header = "01 60 fffe 01020304 0001 00"
     assert repairs == [
         bytes.fromhex("80 61 ffff 05060708 0a0b0c0d" + header + "00 0003") + b"abc",
@@ -106,7 +106,7 @@ def test_order_of_repair_packets() -> None:
 def test_invalid_number_of_repair_packets(count: int) -> None:
     """A number of repair packets other than 0, 1 or 2 is rejected."""
     with pytest.raises(UserError, match="choose"):
-        RepairSender(1, 0).repair([], count)
+        RepairSender(1, 0).make_repair_packets([], count)
 
 
 def test_repair_packets_are_small() -> None:
@@ -401,7 +401,7 @@ def test_access_unit_from_recovered_packets() -> None:
     """A depacketizer that gets the recovered packets returns the access unit that was sent."""
     access_unit = b"\x00\x00\x00\x01\x67\x42\x80" + b"\x00\x00\x00\x01\x65" + bytes(range(1, 256)) * 30
     datagrams = Packetizer(MEDIA_SSRC, 65_533).packetize(access_unit, 9000)
-    repairs = RepairSender(REPAIR_SSRC, 0).repair(datagrams, 2)
+    repairs = RepairSender(REPAIR_SSRC, 0).make_repair_packets(datagrams, 2)
     receiver = RepairReceiver()
     packets = []
     for datagram in [*datagrams[1:-1], *repairs]:

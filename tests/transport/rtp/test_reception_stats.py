@@ -27,7 +27,7 @@ class ReceivedStream:
         """Push a packet from the network."""
         packet = RtpPacket(96, sequence % 2**16, timestamp % 2**32, ssrc, False, b"")
         self.jitter_buffer.push(packet, at_ns)
-        self.reception.received(packet, at_ns)
+        self.reception.note_packet(packet, at_ns)
 
     def recover(self, sequence: int, at_ns: int) -> None:
         """Push a recovered packet."""

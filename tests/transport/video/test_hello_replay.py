@@ -115,7 +115,7 @@ class Path:
             if challenge is not None:
                 self.send(SERVER, source, challenge)
         elif self.server.accepts_rtcp_from(source) and self.server.cipher.unprotect_rtcp(datagram) is not None:
-            self.server.report(source, self.now_ns)
+            self.server.note_report(source, self.now_ns)
 
     def _at_client(self, datagram: bytes) -> None:
         if is_path_datagram(datagram):

@@ -196,7 +196,7 @@ def test_replay_does_not_keep_the_path_open() -> None:
 def test_no_reports() -> None:
     """A path stays open for 2 s after the last receiver report, and is then closed."""
     server = server_with_open_path()
-    server.report(HOME, T0 + REPORT_TIMEOUT_NS)
+    server.note_report(HOME, T0 + REPORT_TIMEOUT_NS)
     assert server.open_address(T0 + 2 * REPORT_TIMEOUT_NS) == HOME
     assert server.open_address(T0 + 2 * REPORT_TIMEOUT_NS + 1) is None
     assert not server.accepts_rtcp_from(HOME)
@@ -206,7 +206,7 @@ def test_report_too_late() -> None:
     """A report does not reopen a closed path; an answer to a new challenge does."""
     server = server_with_open_path()
     late_ns = T0 + REPORT_TIMEOUT_NS + 1
-    server.report(HOME, late_ns)
+    server.note_report(HOME, late_ns)
     assert server.open_address(late_ns) is None
     assert rejections(server) == {"foreign_reports": 1}
     server.receive(answer_for(server, HOME, late_ns, number=2), HOME, late_ns)
@@ -216,7 +216,7 @@ def test_report_too_late() -> None:
 def test_report_from_elsewhere() -> None:
     """Reports from another address do not keep the path open."""
     server = server_with_open_path()
-    server.report(ELSEWHERE, T0 + REPORT_TIMEOUT_NS)
+    server.note_report(ELSEWHERE, T0 + REPORT_TIMEOUT_NS)
     assert server.open_address(T0 + REPORT_TIMEOUT_NS + 1) is None
     assert rejections(server) == {"foreign_reports": 1}
 

@@ -21,7 +21,7 @@ def new_sender(repair_packets: int | None = None) -> StreamSender:
 
 
 def count_repairs(sender: StreamSender, at_ns: int) -> int:
-    return len(sender.packets(UNIT, at(at_ns).wall_ns, at(at_ns)).repair)
+    return len(sender.make_packets(UNIT, at(at_ns).wall_ns, at(at_ns)).repair)
 
 
 def report_loss(sender: StreamSender, highest_sequence: int, lost: int, at_ns: int, ssrc: int = SSRC) -> None:
@@ -87,7 +87,7 @@ def test_a_limit_applies_to_this_stream_and_to_its_payload() -> None:
 
 def test_the_first_frame_has_a_report() -> None:
     """A sender report is due with the first frame, even if the monotonic clock is at 0."""
-    assert len(new_sender().packets(UNIT, 0, Now(0, 0)).report) == 1
+    assert len(new_sender().make_packets(UNIT, 0, Now(0, 0)).report) == 1
 
 
 def test_sender_reports() -> None:
@@ -99,7 +99,7 @@ def test_sender_reports() -> None:
     )
     reports = []
     for at_ns in range(0, 1_300 * NS_PER_MS, 100 * NS_PER_MS):
-        packets = sender.packets(UNIT, at(at_ns).wall_ns, at(at_ns))
+        packets = sender.make_packets(UNIT, at(at_ns).wall_ns, at(at_ns))
         for datagram in packets.report:
             announcement = parse_announcement(datagram)
             (report,) = announcement.reports

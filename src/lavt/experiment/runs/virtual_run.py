@@ -223,6 +223,6 @@ def drive(loop: VirtualLoop, *, limit_ns: int = RUN_LIMIT_NS, progress: Callable
 def _report_every_second(runtime: VirtualRuntime, progress: Callable[[int], None]) -> None:
     def report() -> None:
         progress(runtime.true_ns)
-        runtime.at(runtime.true_ns + NS_PER_S, report)
+        runtime.call_at(runtime.true_ns + NS_PER_S, report)
 
-    runtime.at(NS_PER_S, report)
+    runtime.call_at(NS_PER_S, report)

@@ -43,7 +43,7 @@ class Chronyc(PersistentProcess):
     """chronyc's answer to the unknown command, which follows its answers to all others."""
 
     def encode(self, command: Sequence[str]) -> str:
-        """Return each word as a separate command, followed by a command that chronyc does not know."""
+        """Return the input for chronyc: each word as a separate command, then a command that chronyc does not know."""
         return "".join(f"{word}\n" for word in (*command, self.UNKNOWN_COMMAND))
 
     def parse_answer(self, answer: bytes) -> Completed | None:
@@ -67,8 +67,8 @@ def parse_chrony(host: str, answer: str, before: Now, after: Now) -> ClockReport
     distance: half the root delay plus the root dispersion. The "ntpdata" line of the selected source is used. The
     correction is unknown before chrony has synchronised, and if the lines are not chrony's.
     """
-    asking_ns = after.mono_ns - before.mono_ns
-    middle = before.later(asking_ns // 2)
+    query_ns = after.mono_ns - before.mono_ns
+    middle = before.later(query_ns // 2)
     rows = [line.strip().split(",") for line in answer.splitlines()]
     tracking = next((row for row in rows if len(row) == TRACKING_FIELDS), None)
     if tracking is None:
@@ -76,9 +76,10 @@ def parse_chrony(host: str, answer: str, before: Now, after: Now) -> ClockReport
     reference_s, correction_s, skew_ppm, delay_s, dispersion_s = (
         parse_number(tracking[column]) for column in (3, 4, 9, 10, 11)
     )
+    reference_id, leap_status = tracking[0], tracking[13]
     if (
-        tracking[13] not in SYNCHRONISED
-        or tracking[0] == "00000000"
+        leap_status not in SYNCHRONISED
+        or reference_id == "00000000"
         or correction_s is None
         or not _not_negative(delay_s, dispersion_s)
     ):
@@ -87,7 +88,9 @@ def parse_chrony(host: str, answer: str, before: Now, after: Now) -> ClockReport
     follows = plain_address(tracking[1])
     peer = next((row for row in rows if len(row) == NTPDATA_FIELDS and plain_address(row[0]) == follows != ""), None)
     peer_delay_s, peer_dispersion_s = _parse_numbers(peer, (19, 20))
+    # The field after the logarithm of the polling interval has whole seconds, which are 0 for two polls a second.
     poll_log2 = None if peer is None else parse_number(peer[9])
+    good_samples = "" if peer is None else peer[33]
     return ClockReport(
         middle.mono_ns,
         middle.wall_ns,
@@ -95,22 +98,21 @@ def parse_chrony(host: str, answer: str, before: Now, after: Now) -> ClockReport
         SOURCE,
         correction_s,
         (delay_s or 0.0) / 2 + (dispersion_s or 0.0),
-        asking_s=asking_ns / NS_PER_S,
+        asking_s=query_ns / NS_PER_S,
         follows=follows,
         addresses=host_addresses(),
         skew_ppm=skew_ppm if _not_negative(skew_ppm) else None,
         age_s=age_s,
         peer_delay_s=peer_delay_s,
         peer_dispersion_s=peer_dispersion_s,
-        good_samples=int(peer[33]) if peer and peer[33].isascii() and peer[33].isdigit() else None,
-        # The next field has the interval in whole seconds, which is 0 if chrony polls twice a second.
+        good_samples=int(good_samples) if good_samples.isascii() and good_samples.isdigit() else None,
         poll_s=2.0**poll_log2 if poll_log2 is not None and -7 <= poll_log2 <= 24 else None,
-        status="its own clock is the reference" if tracking[0] == LOCAL_REFERENCE else "",
+        status="its own clock is the reference" if reference_id == LOCAL_REFERENCE else "",
     )
 
 
 def _parse_numbers(row: Sequence[str] | None, columns: Sequence[int]) -> list[float | None]:
-    """Return the numbers in columns that cannot be negative; None for an invalid value, and for all without a row."""
+    """Return the numbers in these columns, which cannot be negative; None for an invalid value or a missing row."""
     numbers = [None if row is None else parse_number(row[column]) for column in columns]
     return [number if _not_negative(number) else None for number in numbers]
 

@@ -27,11 +27,11 @@ class ClockReport(Struct, frozen=True):
     source: str
     """"chrony", "ptp", "external", "probe" (the host relies on the probe), or "model" in virtual time."""
     correction_s: float | None = None
-    """Reference time less the host's wall clock; None: the source does not know it."""
+    """Reference time minus the host's wall clock; None: the source does not know it."""
     bound_s: float | None = None
     """The largest error of the correction; None: unknown."""
     status: str = ""
-    """Why there is no correction, or what is special about it; for people."""
+    """Why there is no correction, or what is special about the correction; for people."""
     asking_s: float = 0.0
     """How long the query took; the clocks were read in its middle."""
     follows: str = ""
@@ -45,7 +45,7 @@ class ClockReport(Struct, frozen=True):
     peer_delay_s: float | None = None
     """Round trip to the source's peer, in its last sample."""
     peer_dispersion_s: float | None = None
-    """Further error of that sample."""
+    """Dispersion of that sample, an error in addition to that of the delay."""
     good_samples: int | None = None
     """How many samples the source has accepted so far."""
     poll_s: float | None = None
@@ -58,7 +58,7 @@ IPV6_ADDRESSES = Path("/proc/net/if_inet6")
 
 
 def kernel_identity() -> str:
-    """Return the identity of the running kernel, or "" without one. Processes on one kernel share its clock."""
+    """Return the identity of the running kernel, or "" if it has none. Processes on one kernel share its clock."""
     return _read_text(BOOT_ID).strip()
 
 
@@ -69,7 +69,11 @@ def host_addresses() -> tuple[str, ...]:
 
 @lru_cache(maxsize=4)  # called every second, and the addresses hardly ever change
 def _addresses(ipv4_routes: str, ipv6_addresses: str) -> tuple[str, ...]:
-    """Parse the kernel's tables: an address is the line before "/32 host LOCAL", or 32 leading hex digits."""
+    """Parse the kernel's tables.
+
+    In the IPv4 table an address is in the line before "/32 host LOCAL". In the IPv6 table it is the 32 hex digits at
+    the beginning of a line.
+    """
     lines = ipv4_routes.splitlines()
     found = {
         before.removeprefix("|--").strip()
@@ -87,7 +91,7 @@ _LOOPBACK = {"127.0.0.1", "::1"}
 
 
 def plain_address(text: str) -> str:
-    """Return an address in canonical form, so that addresses can be compared; "" if it is not one."""
+    """Return an address in canonical form, so that addresses can be compared; "" if the text is no address."""
     try:
         return str(ipaddress.ip_address(text))
     except ValueError:
@@ -95,7 +99,7 @@ def plain_address(text: str) -> str:
 
 
 def parse_number(text: str) -> float | None:
-    """Return the number in a program's output; None if it is not a finite one."""
+    """Return the number in a program's output; None if the text is not a finite number."""
     try:
         number = float(text)
     except ValueError:

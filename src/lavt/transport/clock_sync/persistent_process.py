@@ -1,7 +1,7 @@
-"""A persistent process that answers queries, so that no query makes this process start another one.
+"""A persistent process that answers queries, so that LAVT need not start a process for each query.
 
-Starting a process blocks every thread of this one until the new program is loaded (Python keeps its lock over
-vfork(2)): 10 ms and more on a slow machine, once a second. So a persistent program is queried, or a persistent shell
+While a Python process starts another process, all its threads are blocked until the new program is loaded (Python keeps
+its lock over vfork(2)): for 10 ms and more on a slow machine. So a persistent program is queried, or a persistent shell
 starts the program.
 """
 
@@ -33,11 +33,11 @@ class Completed(NamedTuple):
 
 
 Run = Callable[[Sequence[str], float], Completed | None]
-"""Runs a program for at most this many seconds; None: it did not complete in time."""
+"""Runs a command line for at most a number of seconds, the second argument; None: it did not complete in time."""
 
 
 class PersistentProcess(ABC):
-    """A process that executes one command after the other. The first command starts it; `close` ends it for good."""
+    """A process that executes one command after the other. It starts with the first one; `close` ends it for good."""
 
     program: tuple[str, ...]
     niceness = 0
@@ -50,7 +50,7 @@ class PersistentProcess(ABC):
 
     @abstractmethod
     def encode(self, command: Sequence[str]) -> str:
-        """Return a command in the program's input format, followed by one that marks the end of the answer."""
+        """Return a command in the program's input format, then a second command that marks the end of the answer."""
 
     @abstractmethod
     def parse_answer(self, answer: bytes) -> Completed | None:
@@ -59,7 +59,7 @@ class PersistentProcess(ABC):
     def run(self, command: Sequence[str], timeout_s: float) -> Completed | None:
         """Run a command to completion. Return None if it takes too long, or the process has died or was closed."""
         with self._lock:
-            if self._is_closed:  # a query of another thread may come later than `close`
+            if self._is_closed:  # a query of another thread can come later than `close`
                 return None
             try:
                 return self._query(self.encode(command), timeout_s)
@@ -77,12 +77,12 @@ class PersistentProcess(ABC):
 
     def _query(self, encoded_command: str, timeout_s: float) -> Completed | None:
         if self._process is None:
-            self._process = subprocess.Popen(  # noqa: S603 (the program is one of the two in the code)
+            self._process = subprocess.Popen(  # noqa: S603 (the program is a constant of the class)
                 self.program,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,
-                start_new_session=True,  # Ctrl-C at the terminal must not reach it
+                start_new_session=True,  # Ctrl-C at the terminal must not end it
             )
             if self.niceness:
                 with suppress(OSError):
@@ -109,7 +109,7 @@ class PersistentProcess(ABC):
                 os.killpg(self._process.pid, signal.SIGKILL)  # including its children, in its session
             for pipe in (self._process.stdin, self._process.stdout):
                 if pipe is not None:
-                    pipe.close()  # without reading: a child outside the session may keep the other end open for ever
+                    pipe.close()  # without reading: a child outside the session can keep the other end open for ever
             self._process.wait()
             self._process = None
 
@@ -119,7 +119,7 @@ class Shell(PersistentProcess):
 
     program = ("/bin/sh",)
     niceness = 10
-    """The start of a program must not delay the processes that drive."""
+    """Higher than normal, because the start of a program must not delay the processes that drive."""
     END: Final = "lavt: ended with"
     """Prefix of the line after a program's output."""
 

@@ -5,8 +5,8 @@ A request and its reply are 48 bytes each, so that a server cannot be used for a
     "LC", version, kind (0 request, 1 reply), sequence (32 bits), t1, t2, t3 (64 bits each, nanoseconds of a wall
     clock), correction and bound of the server's own time source (doubles, seconds; NaN: unknown)
 
-in network byte order; a request has zeros where only the server knows the value. t1 is when the client sent the
-request, t2 when the server received it, t3 when the server replied; t4, when the client received the reply, is not
+in network byte order. A request has zeros in the fields that only the server knows. t1 is when the client sent the
+request, t2 when the server received it, t3 when the server replied. t4, when the client received the reply, is not
 sent. (RFC 5905, section 8, has the same four times.)
 """
 
@@ -57,7 +57,7 @@ class ClockProbe(Struct, frozen=True):
 
     @property
     def offset_ns(self) -> float:
-        """The estimate of Delta, the server's clock less the client's: exact if both directions take the same time."""
+        """The estimate of Delta, the server's clock minus the client's; exact if both directions take the same time."""
         forward_ns = self.received_wall_ns - self.sent_wall_ns
         return (forward_ns - (self.arrived_wall_ns - self.answered_wall_ns)) / 2
 
@@ -107,6 +107,7 @@ def _unpack(data: bytes, expected_kind: int) -> tuple[int, int, int, int, float,
     magic, version, kind, sequence, *rest = LAYOUT.unpack(data)
     if (magic, version, kind) != (MAGIC, VERSION, expected_kind):
         raise BadMessage("not a probe of this version and kind")
-    if not all(0 <= time_ns < LATEST_NS for time_ns in rest[:3]):
+    t1_ns, t2_ns, t3_ns, correction_s, bound_s = rest
+    if not all(0 <= time_ns < LATEST_NS for time_ns in (t1_ns, t2_ns, t3_ns)):
         raise BadMessage("a probe with a time out of range")
-    return sequence, rest[0], rest[1], rest[2], rest[3], rest[4]
+    return sequence, t1_ns, t2_ns, t3_ns, correction_s, bound_s

@@ -1,7 +1,8 @@
 """Clock reports from linuxptp: `pmc` queries the running `ptp4l` for its data sets (IEEE 1588-2008, 15.5.3).
 
-The report is about the clock that ptp4l synchronises to its grandmaster. That is the machine's wall clock only with
-software time stamping; where phc2sys copies a network card's clock, configure the source `external` instead.
+The report is about the clock that ptp4l synchronises to its grandmaster. With software time stamping, this is the
+machine's wall clock. If phc2sys sets the wall clock from a network card's clock, configure the source `external`
+instead.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ PMC = ("pmc", "-u", "-b", "0", "GET PORT_DATA_SET", "GET CURRENT_DATA_SET", "GET
 
 ABSENT = "linuxptp is not installed"
 NOT_RUNNING = "ptp4l is not running, or this user may not query it"
-NO_MASTER = "ptp4l is not a master and does not receive one"
+NO_MASTER = "ptp4l is not a master, and receives nothing from a master"
 
 
 def read_ptp(clock: Clock, run: Run) -> ClockReport | None:
@@ -35,11 +36,11 @@ def parse_ptp(host: str, answer: str, before: Now, after: Now) -> ClockReport:
     number of steps to the grandmaster, because an asymmetric path could hide an error of that size. If this host is the
     master, its own clock is the reference: correction and bound are 0.
     """
-    asking_ns = after.mono_ns - before.mono_ns
-    middle = before.later(asking_ns // 2)
-    rows = [line.split() for line in answer.splitlines()]
-    fields = {row[0]: row[1] for row in rows if len(row) == 2}
-    states = [row[1] for row in rows if len(row) == 2 and row[0] == "portState"]
+    query_ns = after.mono_ns - before.mono_ns
+    middle = before.later(query_ns // 2)
+    pairs = [words for line in answer.splitlines() if len(words := line.split()) == 2]
+    fields = dict(pairs)
+    states = [value for name, value in pairs if name == "portState"]
     if "gmIdentity" not in fields:
         return unknown_clock(middle, host, SOURCE, NOT_RUNNING)
     offset_ns, path_ns, steps = (
@@ -56,7 +57,7 @@ def parse_ptp(host: str, answer: str, before: Now, after: Now) -> ClockReport:
         SOURCE,
         -(offset_ns or 0.0) / NS_PER_S,
         (path_ns or 0.0) * max(steps or 0.0, 0.0) / NS_PER_S,
-        asking_s=asking_ns / NS_PER_S,
+        asking_s=query_ns / NS_PER_S,
         follows=fields["gmIdentity"],
         addresses=host_addresses(),
     )

@@ -1,8 +1,8 @@
 """Delays: a `DelayModel` computes the delay of an item, and a `DelayLine` queues items until they are due.
 
-The relay and the virtual runtime both use these. A model draws the jitter of an item by the item's index from a named
-random-number stream, so two runs with one seed get the same jitter, whatever else they draw. A line keeps the order of
-its items; only an `EmulatedLink` may reorder them.
+The relay and the virtual runtime use both. A model draws the jitter of an item by the item's index from a named
+random-number stream. So two runs with one seed get the same jitter, whatever else they draw. A line keeps the order of
+its items, unless it has an `EmulatedLink` that reorders them.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def _jitter_stream(seed: int, name: str) -> IndexedStream:
 
 
 class DelayLine:
-    """A queue that delays each item and keeps order; an `EmulatedLink` may also drop, spread or reorder items."""
+    """A queue that delays items and keeps their order. Its `EmulatedLink` can also drop, spread or reorder items."""
 
     def __init__(self, delay: DelayModel, link: EmulatedLink | None = None) -> None:
         self.delay = delay

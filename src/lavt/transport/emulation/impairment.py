@@ -1,4 +1,4 @@
-"""Impairments of a network and the flows that they apply to. `transport/netem/tc.py` translates them for tc."""
+"""Impairments of a network, and the flows to which they apply. `transport/netem/tc.py` translates both for tc."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lavt.errors import UserError
 
 ORDER_RATE_BPS: Final = 10_000_000_000
 """The rate that netem gets for a flow without a rate limit, because netem keeps packets in order only if it has a rate.
-This one adds 1 us to the delay of each packet."""
+This rate adds 1 us to the delay of each packet."""
 
 Distribution = Literal["normal", "uniform", "pareto", "paretonormal"]
 DISTRIBUTIONS: Final[tuple[Distribution, ...]] = ("normal", "uniform", "pareto", "paretonormal")
@@ -33,7 +33,7 @@ class Impairment(Struct, frozen=True):
     rate_bps: int = 0
     """The largest bit rate; 0: no limit."""
     reorder: float = 0.0
-    """Share of packets that are not delayed and therefore overtake others."""
+    """Share of packets that are not delayed, and therefore overtake earlier packets."""
 
     @property
     def is_transparent(self) -> bool:

@@ -1,11 +1,11 @@
 """An emulated link without input and output: it decides which packets are lost and when the others leave.
 
 The virtual runtime and the relay use it. It emulates netem as `docs/netem.md` describes it, in the kernel's order.
-First it decides whether a packet is lost. Of the other packets it reorders a share: these are not delayed. The rest
-wait in order, first for their delay and then for the rate. Unlike netem, it can also take the delay or the capacity
-from a trace. Each impairment has a random-number stream of its own, from which it draws by packet number or by time
-slot. So an additional impairment does not change the draws of the others, and two runs with one seed get the same
-draws.
+First the link decides whether a packet is lost. A share of the other packets is reordered: these packets are not
+delayed. The rest wait in order, first for their delay and then for the rate. Unlike netem, the link can also take the
+delay or the capacity from a trace. Each impairment draws from its own random-number stream, by packet number or by time
+slot. So an additional impairment does not change the draws of the other impairments, and two runs with one seed get the
+same draws.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class LinkInjection:
 
 
 def check_injection(injected: LinkInjection) -> None:
-    """Raise `UserError` for contradictory values. Jitter may exceed the delay: negative delays are cut off at 0."""
+    """Raise `UserError` for contradictory values. Jitter can be larger than the delay: a negative delay becomes 0."""
     impairment, name = injected.impairment, injected.name
     check_impairment(name, impairment)
     if impairment.reorder and not (
@@ -55,8 +55,8 @@ def check_injection(injected: LinkInjection) -> None:
 class EmulatedLink:
     """One direction of an emulated link; times are on the caller's clock, and a trace begins at `start_ns`.
 
-    Public counters, in packets: `packets` arrived, of which some were `lost` at random, some were `dropped` because the
-    queue was full, and some `overtook` others.
+    Public counters, in packets: `packets` arrived. Of these, `lost` were lost at random, `dropped` were dropped because
+    the queue was full, and `overtook` left before an earlier packet.
     """
 
     def __init__(self, injected: LinkInjection, start_ns: int = 0) -> None:
@@ -133,7 +133,7 @@ class Bottleneck:
         self._departures_ns: deque[int] = deque()
         """Departure times of the packets in the queue."""
         self._free_ns = start_ns
-        """When the rate has sent all packets that have arrived so far."""
+        """When all packets that have arrived so far have been sent at the rate."""
         self._opportunity, self._left_bytes = -1, 0
         """The number of the last opportunity that was used, and the bytes left in it."""
 

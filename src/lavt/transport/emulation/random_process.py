@@ -24,7 +24,7 @@ LARGEST_QUANTILE: Final = 32767 / 8192
 PARETO_SHAPE: Final = 3.0
 
 Draw = Callable[[np.random.Generator, int], NDArray[np.float64]]
-"""Draws this many numbers from a generator."""
+"""Returns a number of draws from a generator; the second argument is that number."""
 
 
 def uniform(generator: np.random.Generator, count: int) -> NDArray[np.float64]:
@@ -58,10 +58,10 @@ class Draws:
 def quantiles(distribution: Distribution) -> tuple[float, ...]:
     """Return one value for each of 4096 equally likely parts of a distribution, in netem's standard deviations.
 
-    The value is the middle of the part; for `pareto` it is the lower end. The values of `uniform` are in units of half
-    of its width. netem's tables end at 4 standard deviations, which cuts off the tails of `pareto` (shape 3) and
-    `paretonormal`. So their true standard deviations are 0.82 and 0.83 instead of 1, and their means are -0.03 instead
-    of 0.
+    The value is the middle of the part; for `pareto` it is the lower end. For `uniform` the unit is half of the
+    distribution's width. netem's tables end at 4 standard deviations, which cuts off the tails of `pareto` (shape 3)
+    and `paretonormal`. So the true standard deviations of these two are 0.82 and 0.83 instead of 1, and their means are
+    -0.03 instead of 0.
     """
     if distribution == "uniform":
         return tuple((2 * part + 1) / QUANTILES - 1 for part in range(QUANTILES))
@@ -107,9 +107,9 @@ class LossProcess:
 
     `bursts` are the probabilities that a burst begins and ends; None: losses are independent, with probability `loss`.
     `name` is the name of the random-number stream of `seed`. With the same stream, a process with a higher loss loses
-    every packet that one with a lower loss loses, and more. This is true if both lose packets independently, or if both
-    have the same mean length of a burst and the lower loss is at most 1 - 1 / that length. (With more loss in such
-    short bursts, a burst is less likely to go on than to begin.)
+    every packet that a process with a lower loss loses, and more. This is true if both lose packets independently, or
+    if both have the same mean length of a burst and the lower loss is at most 1 - 1 / that length. (If the lower loss
+    is higher, a burst is less likely to continue than to begin.)
     """
 
     def __init__(self, seed: int, name: str, loss: float, bursts: BurstProbabilities | None) -> None:

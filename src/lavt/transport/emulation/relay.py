@@ -1,8 +1,8 @@
 """A relay that delays without netem: one thread carries two UDP flows and delays the packets that netem would delay.
 
-Video, from the server to the client: RTP and sender reports are delayed; the challenges in the same flow are not.
+Video, from the server to the client: RTP and sender reports are delayed; path validation in the same flow is not.
 Video, from the client to the server (hellos, RTCP): nothing is delayed. Control: packets from the client's router to
-the server's are delayed; packets in the other direction are delayed only if the state is to be delayed, too.
+the server's router are delayed; packets in the other direction are delayed only if the state has a delay, too.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def is_delayed_video(datagram: bytes) -> bool:
 def video_index(datagram: bytes) -> int:
     """Return the index of a video packet's delay: its RTP timestamp, so that the packets of a frame share one delay.
 
-    A sender report has the timestamp of the frame that it was sent with, and shares that frame's delay.
+    A sender report has the timestamp of the frame with which it was sent, and shares that frame's delay.
     """
     offset = 16 if is_rtcp(datagram) else 4
     return int(struct.unpack_from(">I", datagram, offset)[0]) if len(datagram) >= offset + 4 else 0
@@ -90,7 +90,7 @@ class _DelayedPath:
     delays_ns: deque[int] = field(default_factory=lambda: deque(maxlen=MAX_SAMPLES))
     """How long the last datagrams were delayed, from arrival to departure."""
     lateness_ns: deque[int] = field(default_factory=lambda: deque(maxlen=MAX_SAMPLES))
-    """How long after they were due the last datagrams left."""
+    """How late the last datagrams left, from due to departure."""
 
 
 @dataclass
@@ -140,7 +140,7 @@ class Relay:
         }
 
     def late_ms(self) -> dict[str, float | None]:
-        """Return for each flow and direction the median time from due to departure of its datagrams, or None."""
+        """Return for each flow and direction how late its datagrams left, as a median, or None if there were none."""
         return {
             name: _median_ms([late_ns for path in paths for late_ns in path.lateness_ns])
             for name, paths in self._paths()
@@ -204,7 +204,7 @@ class Relay:
         self._schedule(path)
 
     def _schedule(self, path: _DelayedPath) -> None:
-        """Schedule a path for when its first datagram is due, unless it is already scheduled by then."""
+        """Schedule a path for when its first datagram is due, unless it is scheduled for that time or before."""
         due_ns = path.line.next_due_ns()
         if due_ns is not None and (path.scheduled_ns is None or due_ns < path.scheduled_ns):
             self._entries += 1
@@ -243,7 +243,7 @@ class _ActiveFlow:
         """Packet counters of removed clients, by direction."""
         self._socket = _bound_socket(flow.listen, flow.name)
         self.port = int(self._socket.getsockname()[1])
-        relay.add_socket(self._socket, self._from_clients)
+        relay.add_socket(self._socket, self._forward_from_clients)
 
     def paths(self) -> dict[str, list[_DelayedPath]]:
         clients = self._clients.values()
@@ -254,7 +254,7 @@ class _ActiveFlow:
             self._relay.remove_socket(client.upstream_socket)
         self._relay.remove_socket(self._socket)
 
-    def _from_clients(self) -> None:
+    def _forward_from_clients(self) -> None:
         for datagram, ancillary, address in _drain(self._socket):
             client = self._clients.get(address) or self._new_client(address)
             client.last_received_ns = self._relay.now_ns()
@@ -278,19 +278,19 @@ class _ActiveFlow:
             self._relay.now_ns(),
         )
         self._clients[address] = client
-        self._relay.add_socket(towards_server, lambda: self._from_server(client))
+        self._relay.add_socket(towards_server, lambda: self._forward_from_server(client))
         return client
 
     def _line(self, delay: DelayModel, injected: LinkInjection | None) -> DelayLine:
         return DelayLine(delay, None if injected is None else EmulatedLink(injected, self._relay.start_ns))
 
-    def _from_server(self, client: _Client) -> None:
+    def _forward_from_server(self, client: _Client) -> None:
         for datagram, ancillary, address in _drain(client.upstream_socket):
             if address == self.flow.server:
                 self._relay.forward(client.down, datagram, self._relay.arrived_ns(ancillary))
 
     def _remove_idle_clients(self) -> None:
-        """Remove idle clients and, where there are too many, the client that has been idle for longest."""
+        """Remove idle clients and, if there are too many clients, also the one that has been idle for longest."""
         now_ns = self._relay.now_ns()
         if len(self._clients) >= MAX_CLIENTS:
             self._remove_client(min(self._clients, key=lambda address: self._clients[address].last_received_ns))

@@ -1,6 +1,6 @@
 """Traces: recorded delays or capacities of a link, read from a file and replayed by the time since the start.
 
-There are two formats. A capacity trace in Mahimahi's format has one whole number of milliseconds per line, each an
+There are two formats. A capacity trace in Mahimahi's format has one time per line, in whole milliseconds: an
 opportunity to deliver 1500 bytes. A delay trace is CSV, `time_s,delay_ms`, with linear interpolation between the
 points. Both begin again after their last time.
 """
@@ -31,7 +31,7 @@ class CapacityTrace(Struct, frozen=True):
     times_ns: tuple[int, ...]
 
     def first_at(self, time_ns: int) -> int:
-        """Return the number of the first opportunity at or after a time."""
+        """Return the number of the first opportunity at or after `time_ns`."""
         period_ns = self.times_ns[-1]
         cycle = max(0, time_ns - 1) // period_ns
         return cycle * len(self.times_ns) + bisect_left(self.times_ns, time_ns - cycle * period_ns)
@@ -49,7 +49,7 @@ class DelayTrace(Struct, frozen=True):
     delays_ns: tuple[int, ...]
 
     def delay_ns(self, time_ns: int) -> int:
-        """Return the delay of a packet that arrives at a time."""
+        """Return the delay of a packet that arrives at `time_ns`."""
         elapsed_ns = max(0, time_ns) % self.times_ns[-1]
         after = bisect_right(self.times_ns, elapsed_ns)
         time_before_ns, time_after_ns = self.times_ns[after - 1 : after + 1]
@@ -94,15 +94,15 @@ def parse_delays(text: str, source: str) -> DelayTrace:
     if not rows or [cell.strip() for cell in rows[0]] != CSV_HEADER:
         raise UserError(f"{source} must begin with the header line {','.join(CSV_HEADER)}: add it")
     points = [_parse_point(row, f"{source}, row {number}") for number, row in enumerate(rows[1:], 2)]
-    if len(points) < 2 or points[0][0] != 0:
+    times_ns, delays_ns = [time_ns for time_ns, _ in points], [delay_ns for _, delay_ns in points]
+    if len(points) < 2 or times_ns[0] != 0:
         raise UserError(f"{source} needs at least two rows, the first of them at time_s 0: add them")
-    for before, after in pairwise(points):
-        if after[0] <= before[0]:
+    for before_ns, after_ns in pairwise(times_ns):
+        if after_ns <= before_ns:
             raise UserError(
-                f"{source}: time_s {after[0] / NS_PER_S:g} comes after {before[0] / NS_PER_S:g}: let the times increase"
+                f"{source}: time_s {after_ns / NS_PER_S:g} comes after {before_ns / NS_PER_S:g}: let the times increase"
             )
-    times_ns, delays_ns = zip(*points, strict=True)
-    return DelayTrace(times_ns, delays_ns)
+    return DelayTrace(tuple(times_ns), tuple(delays_ns))
 
 
 def _parse_point(row: Sequence[str], source: str) -> tuple[int, int]:

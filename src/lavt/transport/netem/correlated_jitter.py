@@ -33,13 +33,14 @@ def next_deviation(
 ) -> float:
     """Return the deviation of the delay at step `index`, in standard deviations.
 
-    `previous` is the index and the deviation of an earlier step; None: this is the first step.
+    `previous` is the index and the deviation of the last step; None: this is the first step.
     """
     innovation = float(stream(seed, f"{name} wander", index).standard_normal())
     if previous is None:
         return innovation
-    correlation = impairment.jitter_correlation ** (index - previous[0])
-    return correlation * previous[1] + float((1 - correlation**2) ** 0.5) * innovation
+    last_index, last_deviation = previous
+    correlation = impairment.jitter_correlation ** (index - last_index)
+    return correlation * last_deviation + float((1 - correlation**2) ** 0.5) * innovation
 
 
 class CorrelatedJitter:

@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 
 
 class InjectionOrder(Struct, frozen=True):
-    """An order that puts the impairments of these flows in force and ends all others."""
+    """An order that puts the impairments of these flows in force, and ends the impairments of all other flows."""
 
     number: int
     condition: str
@@ -42,7 +42,7 @@ class InjectionResult(Struct, frozen=True):
     reason: str
     """Why the order is not in force; empty if it is."""
     problems: str
-    """Where the measurement differs from the order."""
+    """How the measurement differs from the order; empty if it does not."""
     measured_ms: tuple[tuple[str, float | None], ...]
     """The median delay of each flow."""
 
@@ -76,7 +76,7 @@ class NetemQueues(Protocol):
 class Injector:
     """A link that executes injection orders one after the other; without `queues` only transparent flows are possible.
 
-    No order may cover a port of `exempt`.
+    Orders for flows that cover a port of `exempt` fail.
     """
 
     def __init__(
@@ -111,7 +111,7 @@ class Injector:
         while (order := self._wait_for_newest()) is not None:
             try:
                 result = self._execute(order)
-            except Exception as error:  # whatever fails, the next order must be executed: it may clear the interface
+            except Exception as error:  # whatever fails, later orders must be executed, such as a clearing
                 log.exception("netem failed")
                 result = InjectionResult(order.number, f"{type(error).__name__}: {error}", "", ())
             self._deliver("injected", result, self._clock.now(), None)
@@ -138,7 +138,7 @@ class Injector:
                 verification = self._queues.verify(flows, exempt=self._exempt, count=MEASURED_PACKETS)
                 if verification.reasons:
                     return InjectionResult(order.number, "; ".join(verification.reasons), "", ())
-            else:  # a repeated order, so the car may drive: no program is started, because that would delay the drive
+            else:  # a repeated order: the car can be driving, and starting a program would delay it
                 measured = self._queues.measure(flows, exempt=self._exempt, count=MEASURED_PACKETS)
                 verification = Verification(self._queues.problems() + judge(flows, self._exempt, measured), measured)
             self._applied_number = order.number

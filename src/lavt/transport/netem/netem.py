@@ -62,7 +62,7 @@ from lavt.transport.netem.tc import (
 TC_TIMEOUT_S: Final = 10.0
 POLL_NS: Final = 10 * NS_PER_MS
 DRAIN_MARGIN_NS: Final = NS_PER_S
-"""A queue gets as long to drain as its longest delay and this margin."""
+"""A queue gets this much time to drain, in addition to its longest delay."""
 
 RunCommand = Callable[[Command], str]
 """Runs a command and returns its standard output; raises `UserError` or `WorkError`."""
@@ -120,7 +120,7 @@ def run_tc(command: Command) -> str:
 
 
 class Verification(Struct, frozen=True):
-    """The result of a verification: `reasons` lists every difference from the request, and is empty without one."""
+    """The result of a verification: `reasons` lists every difference from the request; it is empty if there is none."""
 
     reasons: list[str]
     measured: dict[str, ProbeResult]
@@ -228,7 +228,7 @@ class NetemInterface:
             return commands
 
     def applied(self) -> AppliedState | None:
-        """Return what was applied and by whom, or None if no state is stored."""
+        """Return what was applied and who owns it, or None if no state is stored."""
         return self._files.read(self.interface)
 
     def status(self) -> dict[str, Any]:
@@ -259,13 +259,13 @@ class NetemInterface:
     def measure(
         self, flows: Sequence[ImpairedFlow], *, exempt: Sequence[ExemptPort] = (), count: int = 50
     ) -> dict[str, ProbeResult]:
-        """Measure packets of each flow, and packets that must not be delayed, on their way through the queue."""
+        """Measure, through the queue, packets of each flow and packets that must not be delayed."""
         return measure(self.interface, queue_probes(flows, exempt), count=count)
 
     def verify(
         self, flows: Sequence[ImpairedFlow], *, exempt: Sequence[ExemptPort] = (), count: int = 50
     ) -> Verification:
-        """Verify the request by reading back and by measuring, and report correlated jitter that has stopped."""
+        """Compare the request with what tc reports and with a measurement; also report stopped correlated jitter."""
         reasons = self.read_back(flows)
         measured = self.measure(flows, exempt=exempt, count=count)
         return Verification(reasons + self.problems() + judge(flows, exempt, measured), measured)

@@ -1,10 +1,10 @@
-"""Queue probes: measure an interface's queue on one machine with test packets, captured when they leave the queue.
+"""Queue probes: measure an interface's queue with test packets, which are captured when they leave the queue.
 
 A packet socket puts test packets that look like those of a flow into the interface's queue. Another packet socket
 receives the kernel's copy of each packet after the queue, with the time of departure (packet(7)). The sending time is
 read from the same clock, the wall clock. Nobody receives the test packets: they go to 192.0.2.1 of the documentation
-range (RFC 5737) at the interface's own hardware address, which no switch forwards, with a time to live of 1. Needs
-root.
+range (RFC 5737) at the interface's own hardware address, which no switch forwards, with a time to live of 1. Queue
+probes need root.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ POLL_NS: Final = 10 * NS_PER_MS
 MEDIAN_TOLERANCE_MS: Final = 1.0
 """Largest accepted difference between a median and the requested delay."""
 SHARE_TOLERANCE_SIGMAS: Final = 4.0
-"""Largest accepted difference between a measured and the requested share, in standard deviations of the binomial
-distribution; one packet is added to it."""
+"""Largest accepted difference between a measured count and the count by the requested share, in standard deviations of
+the binomial distribution. A difference of one more packet is accepted, too."""
 OTHER_PORT: Final = 9
-"""Port of the other end of a test packet: that of the discard service."""
+"""Port of the other end of a test packet: the port of the discard service."""
 RTP_FIRST_BYTE: Final = 0x80
 PATH_FIRST_BYTE: Final = ord("L")
 """The first byte of a message of the path validation."""
@@ -63,7 +63,7 @@ _RECEIVE_BUFFER_BYTES: Final = 1 << 20
 
 
 class QueueProbe(Struct, frozen=True):
-    """Test packets of one kind, and the impairment that they should get."""
+    """Test packets of one kind, and the impairment that they should have."""
 
     name: str
     protocol: Literal["udp", "tcp"]
@@ -77,8 +77,8 @@ class ProbeResult(Struct, frozen=True):
     """The measurement of a queue probe: counts of its test packets, and percentiles of their delay in milliseconds.
 
     `reordered` counts packets that left after a later one. netem reorders by sending a share of the packets at once. If
-    such a share is requested, `early` counts them, and the percentiles are those of the delayed packets. These are None
-    if fewer than two delayed packets left the queue.
+    such a share is requested, `early` counts these packets, and the percentiles are those of the delayed packets. The
+    percentiles are None if fewer than two delayed packets left the queue.
     """
 
     sent: int
@@ -171,55 +171,55 @@ def judge(
     ]
 
 
-def _check_delays(probe: QueueProbe, found: ProbeResult | None) -> list[str]:
+def _check_delays(probe: QueueProbe, result: ProbeResult | None) -> list[str]:
     name, impairment = probe.name, probe.impairment
-    if found is None:
+    if result is None:
         return [f"{name}: no packet came through"]
-    if found.median_ms is None or found.p5_ms is None or found.p95_ms is None:
+    if result.median_ms is None or result.p5_ms is None or result.p95_ms is None:
         return (
-            _check_counts(probe, found)
+            _check_counts(probe, result)
             if impairment.loss or impairment.reorder
             else [f"{name}: no packet came through"]
         )
     reasons = []
     if (
         not (impairment.jitter_ms or impairment.rate_bps)
-        and abs(found.median_ms - impairment.delay_ms) > MEDIAN_TOLERANCE_MS
+        and abs(result.median_ms - impairment.delay_ms) > MEDIAN_TOLERANCE_MS
     ):
-        reasons.append(f"{name} was delayed by {found.median_ms:.2f} ms instead of {impairment.delay_ms:g} ms")
+        reasons.append(f"{name} was delayed by {result.median_ms:.2f} ms instead of {impairment.delay_ms:g} ms")
     least_ms = impairment.delay_ms - 4 * impairment.jitter_ms - MEDIAN_TOLERANCE_MS
-    if (impairment.jitter_ms or impairment.rate_bps) and found.p5_ms < least_ms:
-        reasons.append(f"{name} was delayed by {found.p5_ms:.2f} ms (p5); the least is {least_ms:.2f} ms")
+    if (impairment.jitter_ms or impairment.rate_bps) and result.p5_ms < least_ms:
+        reasons.append(f"{name} was delayed by {result.p5_ms:.2f} ms (p5); the least is {least_ms:.2f} ms")
     most_ms = impairment.longest_ms + MEDIAN_TOLERANCE_MS
-    if impairment.jitter_ms and not impairment.rate_bps and found.median_ms > most_ms:
-        reasons.append(f"{name} was delayed by {found.median_ms:.2f} ms (median); the most is {most_ms:.2f} ms")
+    if impairment.jitter_ms and not impairment.rate_bps and result.median_ms > most_ms:
+        reasons.append(f"{name} was delayed by {result.median_ms:.2f} ms (median); the most is {most_ms:.2f} ms")
     if (
         impairment.jitter_ms
         and not impairment.jitter_correlation
-        and found.p95_ms - found.p5_ms < impairment.jitter_ms / 2
+        and result.p95_ms - result.p5_ms < impairment.jitter_ms / 2
     ):
-        spread_ms = found.p95_ms - found.p5_ms
+        spread_ms = result.p95_ms - result.p5_ms
         reasons.append(f"{name} has a jitter of {spread_ms:.2f} ms (p5 to p95) instead of {impairment.jitter_ms:g} ms")
-    return reasons + _check_counts(probe, found)
+    return reasons + _check_counts(probe, result)
 
 
-def _check_counts(probe: QueueProbe, found: ProbeResult) -> list[str]:
+def _check_counts(probe: QueueProbe, result: ProbeResult) -> list[str]:
     name, impairment = probe.name, probe.impairment
     reasons = []
-    if not _is_plausible_share(found.lost, found.sent, impairment.loss, _variance_factor(impairment)):
-        reasons.append(f"{name}: {found.lost} of {found.sent} packets were lost instead of {impairment.loss:.1%}")
-    arrived = found.sent - found.lost
-    if not _is_plausible_share(found.early, arrived, impairment.reorder, 1.0):
+    if not _is_plausible_share(result.lost, result.sent, impairment.loss, _variance_factor(impairment)):
+        reasons.append(f"{name}: {result.lost} of {result.sent} packets were lost instead of {impairment.loss:.1%}")
+    arrived = result.sent - result.lost
+    if not _is_plausible_share(result.early, arrived, impairment.reorder, 1.0):
         reasons.append(
-            f"{name}: {found.early} of {arrived} packets overtook others instead of {impairment.reorder:.1%}"
+            f"{name}: {result.early} of {arrived} packets overtook others instead of {impairment.reorder:.1%}"
         )
-    if found.reordered and not impairment.reorder:
-        reasons.append(f"{name}: {found.reordered} packets were reordered")
+    if result.reordered and not impairment.reorder:
+        reasons.append(f"{name}: {result.reordered} packets were reordered")
     return reasons
 
 
 def _is_plausible_share(count: int, packets: int, share: float, variance_factor: float) -> bool:
-    """Return whether `count` of `packets` is plausible if each packet counts with probability `share`.
+    """Return whether `count` of `packets` is plausible if each packet is counted with the probability `share`.
 
     The variance is that of the binomial distribution times `variance_factor`.
     """

@@ -31,7 +31,7 @@ Owner = tuple[int, int]
 
 
 class AppliedState(Struct, frozen=True):
-    """What was applied to an interface, and the owner."""
+    """What was applied to an interface, and which process owns it."""
 
     interface: str
     namespace: int
@@ -129,6 +129,7 @@ class StateFiles:
 
     @contextmanager
     def _reporting_errors(self) -> Iterator[None]:
+        """Raise `UserError` for an `OSError` in the block."""
         try:
             yield
         except OSError as error:

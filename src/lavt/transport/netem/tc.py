@@ -1,16 +1,17 @@
-"""Make the tc commands for flows, and parse what tc reports. Nothing is run here.
+"""Make the tc commands for flows, and parse what tc reports. This module runs no command.
 
-The root of an interface becomes a `prio` qdisc with six bands. All other traffic uses the first three, as with the
-kernel's default qdisc. Filters send each impaired flow to a band of its own, with a netem of its own:
+The root of an interface becomes a `prio` qdisc with six bands. Filters send each impaired flow to its own band, which
+has its own netem. All other traffic uses the first three bands, as with the kernel's default qdisc:
 
-    root 4c56: prio ── 4c56:1 .. 4c56:3   everything else, untouched
-                    ├─ 4c56:4 netem 4c01: video     RTP and sender reports, not the challenges of its path
+    root 4c56: prio ── 4c56:1 .. 4c56:3             all other traffic, not impaired
+                    ├─ 4c56:4 netem 4c01: video     RTP and sender reports, but not path validation on the same port
                     ├─ 4c56:5 netem 4c02: control
                     └─ 4c56:6 netem 4c03: state
 
-The handles identify LAVT's qdiscs. netem keeps order only with a rate (measured; tc-netem(8) does not mention it): a
-flow without a rate gets 10 Gbit/s, which costs 1 us per packet. So packets overtake others only if `reorder` requests
-it. Neither jitter nor a shorter delay reorders them. The emulated link (`transport/emulation/link.py`) does the same.
+The handles identify LAVT's qdiscs. netem keeps packets in order only if it has a rate (measured; tc-netem(8) does not
+mention it). So a flow without a requested rate gets 10 Gbit/s, which costs 1 us per packet. Then packets overtake
+others only if `reorder` requests it; neither jitter nor a change to a shorter delay reorders packets. The emulated link
+(`transport/emulation/link.py`) does the same.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ PLACES: Final[Mapping[str, FlowPlacement]] = {
 
 
 class U32Match(Struct, frozen=True):
-    """One condition of a u32 filter: `text` is tc's input for it, and tc reports it as offset, bits and mask."""
+    """One match of a u32 filter: `text` is tc's input for the match, which tc reports as offset, bits and mask."""
 
     text: str
     offset: int
@@ -87,8 +88,8 @@ class TcFilter(Struct, frozen=True):
 def filters(flow: ImpairedFlow) -> list[TcFilter]:
     """Return the filters of a flow, for IPv4 and for IPv6.
 
-    They match only packets whose ports are at fixed offsets: unfragmented ones and first fragments, without IPv4
-    options and IPv6 extension headers. On the video's port they match only payloads that begin like RTP and RTCP
+    They match only packets whose ports are at fixed offsets: unfragmented packets and first fragments, without IPv4
+    options or IPv6 extension headers. On the video's port they match only payloads that begin like RTP and RTCP
     (version 2).
     """
     placement = PLACES[flow.name]
@@ -122,10 +123,10 @@ def add_root(interface: str) -> Command:
 def set_impairment(
     interface: str, name: str, impairment: Impairment, *, verb: Literal["add", "change"], tables: str = ""
 ) -> Command:
-    """Return the command that sets a flow's impairment, with all arguments: `change` keeps some that are left out.
+    """Return the command that sets a flow's impairment.
 
-    `tables` is the directory of LAVT's table of the uniform distribution, which tc lacks. Without a table a change
-    would keep the table of the previous distribution.
+    It has all arguments, also those that are 0, because tc's `change` keeps the old value of some missing arguments.
+    tc has no table of the uniform distribution; `tables` is the directory with LAVT's table.
     """
     placement = PLACES[name]
     uniform = (
@@ -136,7 +137,7 @@ def set_impairment(
 
 
 def netem_arguments(impairment: Impairment) -> list[str]:
-    """Return netem's arguments for an impairment without correlated jitter, which `CorrelatedJitter` makes."""
+    """Return netem's arguments for an impairment. They leave out correlated jitter, which `CorrelatedJitter` makes."""
     limit = max(MIN_LIMIT_PACKETS, math.ceil(LIMIT_PACKETS_PER_S * impairment.longest_ms / 1000))
     arguments = ["netem", "limit", str(limit), "delay", f"{_plain(impairment.delay_ms)}ms"]
     if impairment.jitter_ms and not impairment.jitter_correlation:
@@ -242,22 +243,26 @@ class FoundFilter(NamedTuple):
 def parse_filters(text: str) -> list[FoundFilter]:
     """Parse the u32 filters in the output of `tc filter show`; other lines are skipped."""
     found: list[tuple[int, str, str, set[tuple[int, int, int]]]] = []
+    last_matches: set[tuple[int, int, int]] = set()
     for line in text.splitlines():
         if (head := _FILTER.search(line)) is not None:
-            found.append((int(head[2]), head[1], head[3], set()))
-        elif (match := _MATCH.match(line)) is not None and found:
-            found[-1][3].add((int(match[3]), int(match[1], 16), int(match[2], 16)))
+            version, number, band = head.groups()
+            last_matches = set()
+            found.append((int(number), version, band, last_matches))
+        elif (match := _MATCH.match(line)) is not None:
+            bits, mask, offset = match.groups()
+            last_matches.add((int(offset), int(bits, 16), int(mask, 16)))
     return [FoundFilter(number, version, band, frozenset(matches)) for number, version, band, matches in found]
 
 
 def expected_filter(tc_filter: TcFilter) -> FoundFilter:
-    """Return a filter as tc reports it."""
+    """Return the filter that tc should report for `tc_filter`."""
     matches = frozenset(match.read_back for match in tc_filter.matches)
     return FoundFilter(tc_filter.filter_number, tc_filter.version, tc_filter.parent, matches)
 
 
 def parse_impairment(options: Mapping[str, Any]) -> Impairment:
-    """Return the impairment of a netem's options. The distribution, which tc does not report, is normal.
+    """Return the impairment of a netem's options. tc does not report the distribution; the result has the normal one.
 
     Raise `WorkError` for options that are not netem's.
     """
@@ -287,8 +292,8 @@ def difference(flow: ImpairedFlow, qdiscs: Iterable[Qdisc], found: Iterable[Foun
     if netem is None or netem.kind != "netem" or netem.parent != placement.parent:
         return [f"{flow.description} has no netem"]
     actual_impairment = parse_impairment(netem.options)
-    # With correlated jitter, LAVT changes netem's delay in steps (by less than 8 standard deviations), and netem itself
-    # has no jitter.
+    # With correlated jitter, LAVT changes netem's delay in steps, and netem itself has no jitter. The delay stays less
+    # than 8 standard deviations from the requested one.
     is_correlated = bool(requested.jitter_correlation)
     burst_packets = requested.loss_burst_packets * has_loss_bursts(requested)
     delay_tolerance_ms = TC_STEP_MS + 8 * requested.jitter_ms * is_correlated
@@ -319,7 +324,7 @@ def difference(flow: ImpairedFlow, qdiscs: Iterable[Qdisc], found: Iterable[Foun
 
 
 def uniform_table() -> str:
-    """Return tc's table of the uniform distribution; its half width is 8192."""
+    """Return the uniform distribution as a table for tc; half of its width is 8192."""
     return "# uniform, for tc netem\n" + "".join(f"{number}\n" for number in range(-8192, 8193, 16))
 
 

@@ -2,8 +2,8 @@
 
 A frame's packets are divided into n blocks of at most 16 packets. Packet i goes into block i modulo n, so that a burst
 of losses is spread over the blocks. Each block has 0, 1 or 2 repair packets (`parity.py`), which recover as many lost
-packets. They are sent after the frame's last packet, so they delay no media. Wire format: docs/wire.md, "Repair
-packets".
+packets. The repair packets are sent after the frame's last packet, so they delay no media. Wire format: docs/wire.md,
+"Repair packets".
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import struct
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 from msgspec import Struct
 
@@ -23,19 +23,19 @@ from lavt.transport.rtp.rtp import RtpPacket, parse_packet
 
 REPAIR_PAYLOAD_TYPE: Final = 97
 MAX_REPAIR_PACKETS: Final = 2
-"""For one block: the parity symbol P and, as a second one, Q (`parity.py`)."""
+"""For one block: the first has the parity symbol P, the second Q (`parity.py`)."""
 MAX_BLOCK_PACKETS: Final = 16
 MAX_BLOCKS: Final = 255
 """In one frame; a frame of more than 16 * 255 packets gets no repair packets."""
 MAX_SYMBOL_BYTES: Final = 1500
 """Longest payload with its length field: longer than in any Ethernet packet. It limits the memory."""
 MAX_STORED_MEDIA: Final = 4096
-"""Media packets stored to recover lost ones: more than the largest frame has, and as many as some seconds of any stream
-have."""
+"""Number of media packets that are stored to recover lost ones: more than those of the largest frame, and as many as
+those of some seconds of any stream."""
 MAX_OPEN_BLOCKS: Final = 64
-"""Most blocks that wait for more packets: as many as a second of small frames that all lack packets."""
+"""Largest number of blocks that wait for more packets: enough for a second of small frames that all lack packets."""
 BLOCK_TIMEOUT_NS: Final = 500 * NS_PER_MS
-"""Longest wait of a block: packets recovered later would be too late for their frame."""
+"""Longest wait of a block: a packet that is recovered later would be too late for its frame."""
 
 _VERSION: Final = 1
 _HEADER = struct.Struct("!BBHIHBB")
@@ -51,12 +51,12 @@ class RepairSender:
         self.ssrc = ssrc
         self.next_sequence = first_sequence % _SEQUENCES
 
-    def repair(self, datagrams: Sequence[bytes], count: int) -> list[bytes]:
+    def make_repair_packets(self, datagrams: Sequence[bytes], count: int) -> list[bytes]:
         """Return `count` repair packets for each block of a frame, to be sent after it.
 
-        `datagrams` are all RTP packets of the frame, in order, as the `Packetizer` returned them; a frame of more than
-        `MAX_BLOCKS` blocks or with a packet too long for `MAX_SYMBOL_BYTES` gets none. Raises `UserError` for another
-        `count` than 0, 1 or 2.
+        `datagrams` are all RTP packets of the frame, in order, as the `Packetizer` returned them. A frame of more than
+        `MAX_BLOCKS` blocks or with a packet too long for `MAX_SYMBOL_BYTES` gets no repair packets. Raises `UserError`
+        for another `count` than 0, 1 or 2.
         """
         if not 0 <= count <= MAX_REPAIR_PACKETS:
             raise UserError(f"a block cannot have {count} repair packets: choose 0, 1 or {MAX_REPAIR_PACKETS}")
@@ -70,12 +70,12 @@ class RepairSender:
         coded = [compute_parity(symbols[block::blocks], count) for block in range(blocks)]
         repairs = []
         # The second packets of all blocks follow the first ones, so that a burst does not hit both packets of a block.
-        for which in range(count):
+        for parity in range(count):
             for block in range(blocks):
                 header = _HEADER.pack(
-                    _VERSION, first.payload_type, first.sequence, first.ssrc, len(datagrams), block, which
+                    _VERSION, first.payload_type, first.sequence, first.ssrc, len(datagrams), block, parity
                 )
-                repairs.append(self._packet(first.timestamp, header + coded[block][which]))
+                repairs.append(self._packet(first.timestamp, header + coded[block][parity]))
         return repairs
 
     def _packet(self, timestamp: int, payload: bytes) -> bytes:
@@ -85,33 +85,34 @@ class RepairSender:
 
 
 class _BlockHeader(Struct, frozen=True):
-    """The fields that identify the media packets of a block; they are equal in all its repair packets."""
+    """The fields that identify the media packets of a block; all repair packets of the block have the same."""
 
     payload_type: int
     first_sequence: int
     """First sequence number of the frame."""
     ssrc: int
     timestamp: int
-    packets: int
-    """Number of packets of the frame."""
+    frame_packets: int
+    """Number of media packets of the frame."""
     block: int
+    """Number of the block in the frame."""
     symbol_bytes: int
 
     @property
     def sequences(self) -> list[int]:
         """The sequence numbers of the block's packets."""
-        indices = range(self.block, self.packets, _block_count(self.packets))
+        indices = range(self.block, self.frame_packets, _block_count(self.frame_packets))
         return [(self.first_sequence + index) % _SEQUENCES for index in indices]
 
     def packet(self, sequence: int, payload: bytes) -> RtpPacket:
         """Return the packet of the frame with this sequence number."""
-        last = (self.first_sequence + self.packets - 1) % _SEQUENCES
+        last = (self.first_sequence + self.frame_packets - 1) % _SEQUENCES
         return RtpPacket(self.payload_type, sequence, self.timestamp, self.ssrc, sequence == last, payload)
 
 
 @dataclass(slots=True)
 class _Block:
-    """The received part of a block that still lacks packets."""
+    """The received part of a block in which media packets are still missing."""
 
     header: _BlockHeader
     opened_ns: int
@@ -128,10 +129,10 @@ class _Block:
 class RepairReceiver:
     """A receiver that recovers lost media packets from the other packets of their block and its repair packets.
 
-    It never raises and stores at most `MAX_STORED_MEDIA` packets and `MAX_OPEN_BLOCKS` blocks, none with symbols longer
-    than `MAX_SYMBOL_BYTES`. Public counters: `recovered`, recovered media packets, including those that arrive later;
-    `malformed`, repair packets that are invalid, contradict the others of their block or belong to another media
-    stream; `unrepaired`, blocks given up because more was lost than could be recovered.
+    It never raises. It stores at most `MAX_STORED_MEDIA` packets and `MAX_OPEN_BLOCKS` blocks, with symbols of at most
+    `MAX_SYMBOL_BYTES`. Public counters: `recovered`, recovered media packets, including those that arrive later;
+    `malformed`, repair packets that are invalid, contradict another repair packet of their block or belong to another
+    media stream; `unrepaired`, blocks given up because more packets were lost than could be recovered.
     """
 
     def __init__(self) -> None:
@@ -147,7 +148,7 @@ class RepairReceiver:
     def push(self, packet: RtpPacket, now_ns: int) -> list[RtpPacket]:
         """Add a media or repair packet; return the media packets that are recovered by it.
 
-        Each is returned once, with all its fields as sent; `packet` itself is not among them.
+        Each recovered packet is returned once, with all its fields as sent. `packet` itself is not returned.
         """
         if self._open:
             self._expire(now_ns)
@@ -171,7 +172,7 @@ class RepairReceiver:
 
     def _add_repair(self, packet: RtpPacket, now_ns: int) -> list[RtpPacket]:
         """Add a repair packet; raises `BadPacket` for one that is invalid."""
-        header, which, symbol = _parse_repair(packet)
+        header, parity, symbol = _parse_repair(packet)
         if self._ssrc not in {None, header.ssrc}:
             raise BadPacket("repair packet of another stream")
         key = header.ssrc, header.timestamp, header.block
@@ -187,12 +188,12 @@ class RepairReceiver:
                 self._give_up(next(iter(self._open)))
         elif block.header != header:
             raise BadPacket("repair packets of one block contradict each other")
-        if block.symbols.setdefault(which, symbol) != symbol:
+        if block.symbols.setdefault(parity, symbol) != symbol:
             raise BadPacket("duplicate repair packet with different bytes")
         return self._try_recover(key, block)
 
     def _try_recover(self, key: tuple[int, int, int], block: _Block) -> list[RtpPacket]:
-        """Recover the missing packets of a block and close it, if enough of it has arrived."""
+        """Recover the missing packets of a block and close it, if enough of its packets have arrived."""
         lost = sum(packet is None for packet in block.packets.values())
         if lost > len(block.symbols):
             return []
@@ -221,9 +222,9 @@ class RepairReceiver:
         return None
 
     def _is_displaced(self, header: _BlockHeader, sequence: int) -> bool:
-        """Return whether a newer packet is stored in the place of this one.
+        """Return whether a newer packet is stored in the place of the packet `sequence`.
 
-        Then this one is too old, and may have been received or recovered before.
+        Then `sequence` is too old: nobody knows whether it was received or recovered before.
         """
         stored = self._media[sequence % MAX_STORED_MEDIA]
         if stored is None or stored.ssrc != header.ssrc:
@@ -233,8 +234,9 @@ class RepairReceiver:
     def _change_stream(self, ssrc: int) -> None:
         """Begin another media stream and give up the blocks of the previous one."""
         self._ssrc = ssrc
-        for key in [key for key in self._open if key[0] != ssrc]:
-            self._give_up(key)
+        for block_ssrc, timestamp, number in list(self._open):
+            if block_ssrc != ssrc:
+                self._give_up((block_ssrc, timestamp, number))
 
     def _expire(self, now_ns: int) -> None:
         """Give up the blocks that have timed out; `_open` has the oldest block first."""
@@ -251,25 +253,34 @@ class RepairReceiver:
 LOSS_REMEMBERED_NS: Final = 30 * NS_PER_S
 """Loss occurs in clusters: after a loss the stream is protected for this long."""
 HEAVY_LOSS_WINDOW_NS: Final = 5 * NS_PER_S
-"""Some thousand packets at 2 Mb/s: one lost packet is not heavy loss, and heavy loss is detected within seconds."""
+"""Some thousand packets at 2 Mb/s. In such a window one lost packet is not heavy loss, and heavy loss is detected
+within seconds."""
 HEAVY_LOSS_PER_MILLE: Final = 25
 """From this loss rate on, one repair packet leaves more than 2 % of frames damaged (computed: two or more of 8 media
 packets and 1 repair packet are lost)."""
 
 
+class _LossNote(NamedTuple):
+    """Lost and expected media packets since the previous note."""
+
+    noted_ns: int
+    lost: int
+    expected: int
+
+
 class RedundancyController:
-    """A controller of the number of repair packets for each block, by the loss that the receiver reports."""
+    """A controller that sets the number of repair packets for each block by the loss that the receiver reports."""
 
     def __init__(self) -> None:
-        self._notes: deque[tuple[int, int, int]] = deque()
-        """Time, lost packets and expected packets of each note in the window, oldest first."""
+        self._notes: deque[_LossNote] = deque()
+        """The notes in the window, oldest first."""
         self._lost = 0
         self._expected = 0
         self._last_loss_ns: int | None = None
 
     def note_loss(self, lost: int, expected: int, now_ns: int) -> None:
         """Note that `lost` of `expected` media packets, before repair, were lost since the previous note."""
-        self._notes.append((now_ns, lost, expected))
+        self._notes.append(_LossNote(now_ns, lost, expected))
         self._lost += lost
         self._expected += expected
         if lost > 0:
@@ -285,7 +296,7 @@ class RedundancyController:
 
     def _forget(self, now_ns: int) -> None:
         """Remove the notes that are older than the window."""
-        while self._notes and now_ns - self._notes[0][0] >= HEAVY_LOSS_WINDOW_NS:
+        while self._notes and now_ns - self._notes[0].noted_ns >= HEAVY_LOSS_WINDOW_NS:
             _, lost, expected = self._notes.popleft()
             self._lost -= lost
             self._expected -= expected
@@ -297,21 +308,21 @@ def _block_count(packets: int) -> int:
 
 
 def _parse_repair(packet: RtpPacket) -> tuple[_BlockHeader, int, bytes]:
-    """Parse a repair packet: its block, whether it is P or Q, and its parity symbol."""
+    """Parse a repair packet; return its header, whether it has P or Q, and its parity symbol."""
     symbol = packet.payload[_HEADER.size :]
     if not _LENGTH_BYTES < len(symbol) <= MAX_SYMBOL_BYTES:
         raise BadPacket("repair packet cut off, or too long")
-    version, payload_type, first_sequence, ssrc, packets, block, which = _HEADER.unpack_from(packet.payload)
+    version, payload_type, first_sequence, ssrc, frame_packets, block, parity = _HEADER.unpack_from(packet.payload)
     if version != _VERSION or payload_type > 0x7F or payload_type == REPAIR_PAYLOAD_TYPE:
         raise BadPacket("repair packet of another format")
-    if not block < _block_count(packets) <= MAX_BLOCKS or which >= MAX_REPAIR_PACKETS:
+    if not block < _block_count(frame_packets) <= MAX_BLOCKS or parity >= MAX_REPAIR_PACKETS:
         raise BadPacket("block or repair packet number too high for the frame's size")
-    header = _BlockHeader(payload_type, first_sequence, ssrc, packet.timestamp, packets, block, len(symbol))
-    return header, which, symbol
+    header = _BlockHeader(payload_type, first_sequence, ssrc, packet.timestamp, frame_packets, block, len(symbol))
+    return header, parity, symbol
 
 
 def _to_symbol(payload: bytes) -> bytes:
-    """Return a payload with its length in front, since padding hides the length."""
+    """Return a payload with its length in front: the code pads symbols, so the length would be lost."""
     return len(payload).to_bytes(_LENGTH_BYTES, "big") + payload
 
 
@@ -327,7 +338,10 @@ def _recover_packets(block: _Block) -> list[RtpPacket]:
 
 
 def _payload_of(symbol: bytes) -> bytes:
-    """Return the payload of a recovered symbol; raises `BadPacket` if it is empty or not followed by zeros only."""
+    """Return the payload of a recovered symbol.
+
+    Raises `BadPacket` for an empty payload, and for bytes other than zeros after the payload.
+    """
     end = _LENGTH_BYTES + int.from_bytes(symbol[:_LENGTH_BYTES], "big")
     if not _LENGTH_BYTES < end <= len(symbol) or symbol.count(0, end) != len(symbol) - end:
         raise BadPacket("repair packet that gives no valid payload")

@@ -1,9 +1,9 @@
 """Jitter buffer: it restores the order of sequence numbers without delaying packets that arrive in order.
 
-A packet in order leaves immediately. A packet after a gap waits for the missing ones, for at most one hold since the
-gap was detected; then the gap is given up. The first packets of a stream also wait one hold, since the first to arrive
-may not be the first sent. Without this wait, reordering in the first keyframe would cost the whole first group of
-pictures.
+A packet in order leaves immediately. A packet after a gap waits for the missing packets, for at most one hold since the
+gap was detected; then the gap is given up. The first packets of a stream also wait one hold, because the first packet
+to arrive is perhaps not the first that was sent. Without this wait, reordering in the first keyframe would make all
+pictures up to the next keyframe unusable.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ MAX_JUMP: Final = 3000
 """Sequence numbers farther from the newest than this belong to another range. RFC 3550 (A.1) allows only 100 backwards;
 here a delay spike, after which many old packets arrive in a row, must not be taken for a restart of the sender."""
 CAPACITY: Final = 1024
-"""Most packets in the buffer; if there are more, the gap is given up early."""
+"""Largest number of packets in the buffer; if there are more, the gap is given up early."""
 
 Ordered = list[tuple[RtpPacket, bool]]
-"""Packets in order, each with whether packets between it and the previous one are missing."""
+"""Packets in order; the flag of a packet is whether packets between the previous packet and this one are missing."""
 
 
 class JitterBuffer:
@@ -29,8 +29,8 @@ class JitterBuffer:
     `hold_ns` is the longest wait for the packets of a gap; None: it adapts to the recent reordering delays of the
     network. Repair packets have another SSRC and must not be pushed. Public counters, in packets: `late` arrived after
     they had been given up, `duplicate` arrived twice, `lost` were given up (including late ones), `reordered` arrived
-    after later ones but within their hold, `stray` were isolated and far from all others, `recovered` were recovered
-    within their hold.
+    after later ones but within their hold, `stray` were isolated with a sequence number far from all others,
+    `recovered` were recovered within their hold.
     """
 
     def __init__(self, hold_ns: int | None = None) -> None:
@@ -42,8 +42,10 @@ class JitterBuffer:
         self.recovered = 0
         self._adaptive = AdaptiveHold() if hold_ns is None else None
         self._hold_ns = 0 if hold_ns is None else hold_ns
-        self._stray: RtpPacket | None = None
+        self._last_stray: RtpPacket | None = None
+        """The previous packet, if it was a stray."""
         self._after_loss = False
+        """Packets before the next released packet are missing."""
         self._ssrc: int | None = None
         self._next: int | None = None
         self._reset(0)
@@ -57,8 +59,8 @@ class JitterBuffer:
         """Add a packet that arrived at `now_ns`; return the packets that are now in order."""
         number = self._next
         if number is not None and not self._buffered and (packet.sequence, packet.ssrc) == (number % 2**16, self._ssrc):
-            # The usual case: it is the next one, and no packet is waiting.
-            self._highest, self._next, self._stray = number, number + 1, None
+            # The usual case: this is the next packet, and no packet is waiting.
+            self._highest, self._next, self._last_stray = number, number + 1, None
             after_loss, self._after_loss = self._after_loss, False
             return [(packet, after_loss)]
         released: Ordered = []
@@ -66,16 +68,16 @@ class JitterBuffer:
             released = self._begin_stream(packet)
         number = self._extend(packet.sequence)
         if abs(number - self._highest) > MAX_JUMP:
-            stray, self._stray = self._stray, packet
+            stray, self._last_stray = self._last_stray, packet
             if stray is None or packet.sequence != (stray.sequence + 1) % 2**16:
                 self.stray += 1
                 return released
-            # Two consecutive ones: the sequence numbers of the sender have jumped (RFC 3550, A.1).
+            # Two consecutive strays: the sequence numbers of the sender have jumped (RFC 3550, A.1).
             self.stray -= 1
             released += self._begin_stream(stray)
             self._insert(stray, self._highest, now_ns)
             number = self._extend(packet.sequence)
-        self._stray = None
+        self._last_stray = None
         self._insert(packet, number, now_ns)
         return released + self._drain() + self.expire(now_ns)
 
@@ -125,7 +127,7 @@ class JitterBuffer:
         self._after_loss = self._ssrc is not None
         same_stream = first.ssrc == self._ssrc
         self._ssrc = first.ssrc
-        self._stray = None
+        self._last_stray = None
         self._reset(self._highest + (first.sequence - self._highest) % 2**16 if same_stream else first.sequence)
         return released
 
@@ -193,12 +195,12 @@ class JitterBuffer:
         return self._gap_detected_ns() + self._hold_ns
 
     def _note_given_up(self, number: int, now_ns: int) -> None:
-        """Report a packet that arrived, or was recovered, after it was given up, so that the hold can grow."""
+        """Tell the adaptive hold of a packet that arrived or was recovered after it was given up, so that it grows."""
         if self._adaptive is not None and number in self._given_up:
             self._adaptive.note_delay(now_ns - self._given_up[number], now_ns)
 
     def _note_reordered(self, number: int, now_ns: int) -> None:
-        """Report the delay of a packet that arrived, or was recovered, within its hold but after later ones.
+        """Tell the adaptive hold of a packet that arrived or was recovered within its hold, but after later packets.
 
         It was found missing when the first of these later packets arrived.
         """

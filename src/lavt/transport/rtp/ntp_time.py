@@ -11,7 +11,7 @@ from typing import Final
 from lavt.domain import NS_PER_S
 
 MAX_ROUND_TRIP_NS: Final = 60 * NS_PER_S
-"""A longer result means that a clock was stepped, or that the report answers another sender."""
+"""A longer result means that a clock was stepped, or that the answer is for another sender."""
 
 _UNIX_EPOCH_S: Final = 2_208_988_800
 """The year 1970 in seconds since 1900."""
@@ -46,9 +46,9 @@ def round_trip_ns(arrived: int, last: int, delay_ns: int) -> int | None:
     """Return the round-trip time from three times (RFC 3550, section 6.4.1), in steps of 1/65536 s.
 
     `last` is the time that we sent and the peer returned, `delay_ns` how long the peer kept it, and `arrived` when it
-    came back; `arrived` and `last` are in short format, by the same clock. Return None if the peer had no time to
-    return (`last` is 0), or if the result is impossible: negative by more than one step, or longer than
-    `MAX_ROUND_TRIP_NS`.
+    came back; `arrived` and `last` are in short format, by the same clock. Return None if the peer had not yet received
+    a time that it could return (`last` is 0), or if the result is impossible: negative by more than one step, or longer
+    than `MAX_ROUND_TRIP_NS`.
     """
     ticks = (arrived - last - delay_to_short(delay_ns) + 2**31) % 2**32 - 2**31
     trip_ns = short_to_delay_ns(max(ticks, 0))

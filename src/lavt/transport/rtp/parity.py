@@ -1,7 +1,7 @@
 """Erasure code: two parity symbols, P and Q, from which any one or two missing symbols of a block are recovered.
 
 It is the code of RAID 6, byte by byte over the field of 256 elements with the polynomial 0x11d (x^8 + x^4 + x^3 + x^2 +
-1): P is the sum of all symbols, Q the sum of 2^i times symbol i, counted from 0; a sum is an exclusive or. Source:
+1). P is the sum of all symbols, Q the sum of 2^i times symbol i, counted from 0. A sum is an exclusive or. Source:
 H. P. Anvin, "The mathematics of RAID-6" (2004).
 """
 
@@ -19,7 +19,7 @@ from lavt.errors import BadPacket
 P: Final = 0
 Q: Final = 1
 MAX_SYMBOLS: Final = 255
-"""2^255 is 1 again: a further symbol would have the same factor in Q as the first one."""
+"""2^255 is 1 again: one more symbol would have the same factor in Q as the first symbol."""
 
 _DOUBLED: Final = bytes(byte << 1 ^ (byte >> 7) * 0x11D for byte in range(256))
 _TIMES: Final = list(accumulate(repeat(_DOUBLED, MAX_SYMBOLS - 1), bytes.translate, initial=bytes(range(256))))
@@ -42,22 +42,23 @@ def compute_parity(symbols: Sequence[bytes], count: int) -> list[bytes]:
 def recover(symbols: Sequence[bytes | None], parity_symbols: Mapping[int, bytes]) -> list[bytes]:
     """Return the symbols that are None, in order and with their padding of zeros.
 
-    `parity_symbols` are the received parity symbols by `P` and `Q`, at least as many as symbols are missing. Raises
-    `BadPacket` for fewer parity symbols, for more than 255 symbols, and for symbols longer than the parity symbols.
+    `parity_symbols` are the received parity symbols, with the keys `P` and `Q`, at least as many as symbols are
+    missing. Raises `BadPacket` for fewer parity symbols, for more than 255 symbols, and for symbols longer than the
+    parity symbols.
     """
     lost = [index for index, symbol in enumerate(symbols) if symbol is None]
-    used = [which for which in (P, Q) if which in parity_symbols][: len(lost)]
+    used = [parity for parity in (P, Q) if parity in parity_symbols][: len(lost)]
     if len(used) < len(lost) or len(symbols) > MAX_SYMBOLS:
-        raise BadPacket("too few parity symbols, or too many others")
+        raise BadPacket("too few parity symbols, or too many symbols")
     if not used:
         return []
     known = [symbol or b"" for symbol in symbols]
     size = len(parity_symbols[used[0]])
     if len(parity_symbols[used[-1]]) != size or max(map(len, known)) > size:
         raise BadPacket("parity symbols shorter than another symbol")
-    # Missing symbols are zeros here, so adding the known terms to a parity symbol leaves only its missing terms.
+    # Missing symbols are zeros here, so the known terms plus a parity symbol give the sum of the missing terms.
     padded = _pad(known, size)
-    remainders = {which: _sum([*_TERMS[which](padded), parity_symbols[which]]) for which in used}
+    remainders = {parity: _sum([*_TERMS[parity](padded), parity_symbols[parity]]) for parity in used}
     first, last = lost[0], lost[-1]
     if len(lost) == 1:
         return [remainders[P] if P in remainders else remainders[Q].translate(_TIMES[-first])]

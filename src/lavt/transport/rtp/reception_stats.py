@@ -1,4 +1,4 @@
-"""Reception statistics of a video stream: those of RFC 3550 for the sender, and samples for the record.
+"""Reception statistics of a video stream: reports to the sender as in RFC 3550, and samples for the record.
 
 Loss is counted twice. Before repair, a packet is lost if it did not arrive, whether or not it was recovered (RFC 5725,
 section 3); after repair, a packet is lost if the decoder did not get it.
@@ -21,9 +21,10 @@ class ReceptionSample(Struct, frozen=True):
     duration_ns: int
     """Time since the previous sample, or since the stream began; 0 before the first packet."""
     packets: int
-    """Packets that arrived, including duplicates and late ones, without strays and repair packets."""
+    """Packets that arrived, including duplicates and late packets. Repair packets and strays are not counted; a stray
+    is an isolated packet whose sequence number is far from all others."""
     lost_before_repair: int
-    """Expected less arrived packets (RFC 3550, A.3); late packets and duplicates can make it negative."""
+    """Expected packets minus arrived packets (RFC 3550, A.3); late packets and duplicates can make it negative."""
     recovered: int
     """Packets recovered from repair packets within their hold."""
     lost_after_repair: int
@@ -35,10 +36,10 @@ class ReceptionSample(Struct, frozen=True):
     duplicate: int
     """Packets that arrived twice, or after they had been recovered."""
     jitter_us: int
-    """Jitter at the end (RFC 3550, section 6.4.1). It includes the spacing of a frame's packets, which share a
-    timestamp."""
+    """Jitter at the time of the sample (RFC 3550, section 6.4.1). It includes the spacing of a frame's packets, which
+    share a timestamp."""
     round_trip_us: int | None
-    """Last known round-trip time at the end, from a report to the sender and the sender's answer to it."""
+    """Last known round-trip time, from a report to the sender and the sender's answer to this report."""
 
 
 class Reception:
@@ -59,11 +60,13 @@ class Reception:
         self._lost_reported = 0
         self._lost_before_stream = 0
         self._sender_report: tuple[SenderReport, int] | None = None
+        """The last sender report, and when it arrived."""
         self._sampled_ns: int | None = None
-        self._sampled = self._totals()
+        """When the last sample was taken; before that, when the stream began."""
+        self._sampled_totals = self._totals()
 
-    def received(self, packet: RtpPacket, arrived_ns: int) -> None:
-        """Count a packet that arrived from the network, after it was pushed to the jitter buffer.
+    def note_packet(self, packet: RtpPacket, arrived_ns: int) -> None:
+        """Count a packet that arrived from the network. Call it after the jitter buffer's `push`.
 
         Do not call it for recovered packets.
         """
@@ -75,10 +78,10 @@ class Reception:
             self._note_transit(packet.timestamp, arrived_ns)
 
     def note_announcement(self, announcement: Announcement, receiver_ssrc: int | None, arrived_ns: int) -> None:
-        """Note a sender's datagram that arrived at `arrived_ns`, on the clock that this receiver's reports use.
+        """Note the contents of a sender's datagram; `arrived_ns` is on the clock of this receiver's reports.
 
-        An answer to one of these reports gives `round_trip_ns`. The next of these reports returns the time of the last
-        sender report, from which the sender computes the round-trip time, too.
+        An answer to one of this receiver's reports gives `round_trip_ns`. The receiver's next report returns the time
+        of the last sender report, so that the sender can compute the round-trip time, too.
         """
         for report in announcement.reports:
             self._sender_report = report, arrived_ns
@@ -96,9 +99,10 @@ class Reception:
         expected_since = packets - self._packets_reported + lost_since
         self._packets_reported, self._lost_reported = packets, lost
         last, age_ns = 0, 0
-        if self._sender_report is not None and self._sender_report[0].ssrc == self._ssrc:
+        if self._sender_report is not None:
             sender_report, arrived_ns = self._sender_report
-            last, age_ns = ntp_to_short(sender_report.ntp_time), now_ns - arrived_ns
+            if sender_report.ssrc == self._ssrc:
+                last, age_ns = ntp_to_short(sender_report.ntp_time), now_ns - arrived_ns
         return ReceptionReport(
             self._ssrc,
             self._jitter_buffer.highest_sequence,
@@ -110,10 +114,10 @@ class Reception:
         )
 
     def sample(self, now_ns: int) -> ReceptionSample:
-        """Return the sample since the previous one."""
+        """Return the reception since the previous sample."""
         totals = self._totals()
-        since = {name: total - self._sampled[name] for name, total in totals.items()}
-        self._sampled = totals
+        since = {name: total - self._sampled_totals[name] for name, total in totals.items()}
+        self._sampled_totals = totals
         duration_ns = 0
         if self._sampled_ns is not None:
             duration_ns, self._sampled_ns = now_ns - self._sampled_ns, now_ns
@@ -126,7 +130,7 @@ class Reception:
         )
 
     def _begin_stream(self, ssrc: int, arrived_ns: int) -> None:
-        """Begin the statistics of another stream, since a report covers one stream only."""
+        """Begin the statistics of another stream, because a report covers one stream only."""
         self._ssrc = ssrc
         self._transit, self._jitter = None, 0.0
         self._packets_reported = self._arrived() - 1  # the first packet belongs to the first report
@@ -138,7 +142,10 @@ class Reception:
         return self._packets - self._jitter_buffer.stray
 
     def _lost_before_repair(self) -> int:
-        """Return expected less arrived packets, computed so that it continues if the sequence numbers jump."""
+        """Return the number of expected packets minus the number of arrived packets.
+
+        It is computed from counters, so that a jump of the sequence numbers does not change it.
+        """
         counters = self._jitter_buffer
         return counters.lost - counters.late + counters.recovered - counters.duplicate
 
@@ -155,7 +162,7 @@ class Reception:
         }
 
     def _note_transit(self, timestamp: int, arrived_ns: int) -> None:
-        """Update the jitter by a packet, in ticks of the RTP clock (RFC 3550, A.8)."""
+        """Update the jitter, in ticks of the RTP clock, with the transit time of a packet (RFC 3550, A.8)."""
         transit = (arrived_ns * 9 // 100_000 - timestamp) % 2**32
         if self._transit is not None:
             difference = (transit - self._transit + 2**31) % 2**32 - 2**31

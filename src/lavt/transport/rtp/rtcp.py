@@ -1,9 +1,9 @@
 """RTCP: the control messages between the sender and the receiver of a video.
 
-Sender to receiver: sender reports (RFC 3550, section 6.4.1) and, in extended reports (RFC 3611), the answer to the
-receiver's reference time (section 4.5). Receiver to sender: receiver reports (RFC 3550, section 6.4.2), the reference
-time (RFC 3611, section 4.4), picture-loss indications (RFC 4585, section 6.3.1) and the receiver's limit of the bit
-rate (RFC 5104, section 4.2.1). Both ends can compute the round-trip time without a common clock.
+The sender sends sender reports (RFC 3550, section 6.4.1) and, in extended reports (RFC 3611), the answer to the
+receiver's reference time (section 4.5). The receiver sends receiver reports (RFC 3550, section 6.4.2), its reference
+time (RFC 3611, section 4.4), picture-loss indications (RFC 4585, section 6.3.1) and its limit of the bit rate (RFC
+5104, section 4.2.1). Both ends can compute the round-trip time without a common clock.
 
 Every datagram written here begins with a report and a source description (RFC 3550, section 6.1). RTCP shares the port
 with RTP; the second byte of a datagram distinguishes them (RFC 5761).
@@ -53,9 +53,9 @@ _EXTENDED_REPORT: Final = 207
 _CNAME: Final = 1
 """Type of an item in a source description."""
 _MAX_BIT_RATE: Final = 3
-"""Type of a transport feedback, in the place of the count."""
+"""Type of a transport feedback; it stands in the header's field for the count."""
 _PICTURE_LOSS: Final = 1
-"""Type of a payload feedback, in the place of the count."""
+"""Type of a payload feedback; it stands in the header's field for the count."""
 
 _BEFORE_BLOCKS: Final = {_SENDER_REPORT: _SENDER_INFORMATION.size, _RECEIVER_REPORT: _SSRC.size}
 """Bytes of a report's body before its report blocks."""
@@ -66,16 +66,16 @@ _RTCP_HEADER_BYTES: Final = 8
 
 
 class SenderReport(Struct, frozen=True):
-    """The time of a sender's report, and the packets sent until then (RFC 3550, section 6.4.1)."""
+    """The time of a sender's report, and the counts of what was sent until then (RFC 3550, section 6.4.1)."""
 
     ssrc: int
     ntp_time: int
-    """64 bits, by the sender's wall clock."""
+    """NTP timestamp (64 bits) of the report, by the sender's wall clock."""
     rtp_timestamp: int
-    """The RTP timestamp of the same time."""
+    """RTP timestamp of the same moment."""
     packets: int
     octets: int
-    """Payload only."""
+    """Bytes of payload sent, without headers."""
 
 
 class ReceptionReport(Struct, frozen=True):
@@ -110,7 +110,7 @@ class Feedback(Struct, frozen=True):
 
     reports: tuple[ReceptionReport, ...] = ()
     picture_loss: bool = False
-    """The receiver lost a picture, and so requests a keyframe."""
+    """The receiver lost a picture and requests a keyframe."""
     limits: tuple[BitRateLimit, ...] = ()
     reference_times: tuple[ReferenceTime, ...] = ()
 
@@ -134,7 +134,7 @@ def sender_report(
 ) -> bytes:
     """Write a sender report with answers to the reference times of receivers.
 
-    `rtp_timestamp` belongs to the time `wall_ns` (ns since 1970). Counts wrap at 2^32.
+    `rtp_timestamp` and `wall_ns` (ns since 1970) are the same moment. Counts wrap at 2^32.
     """
     information = _SENDER_INFORMATION.pack(ssrc, wall_to_ntp(wall_ns), rtp_timestamp, packets % 2**32, octets % 2**32)
     datagram = _packet(_SENDER_REPORT, 0, information) + _description(ssrc, cname)
@@ -195,7 +195,7 @@ def max_bit_rate(
 
 
 def parse_feedback(datagram: bytes) -> Feedback:
-    """Parse an RTCP datagram as a sender; contents that do not concern it are skipped.
+    """Parse an RTCP datagram as a sender; contents that do not concern a sender are skipped.
 
     Raises `BadPacket` for a datagram that fails the checks of RFC 3550, A.2, or has a part of an impossible length.
     """
@@ -217,7 +217,7 @@ def parse_feedback(datagram: bytes) -> Feedback:
 
 
 def parse_announcement(datagram: bytes) -> Announcement:
-    """Parse an RTCP datagram as a receiver; contents that do not concern it are skipped.
+    """Parse an RTCP datagram as a receiver; contents that do not concern a receiver are skipped.
 
     Raises `BadPacket` for a datagram that fails the checks of RFC 3550, A.2, or has a part of an impossible length.
     """
@@ -239,7 +239,7 @@ def is_rtcp(datagram: bytes) -> bool:
 
 
 def _packet(kind: int, count: int, body: bytes) -> bytes:
-    """Return an RTCP packet with its header; the header's length is in words of four bytes, less one."""
+    """Return an RTCP packet with its header, which has the packet's length in words of four bytes, minus one."""
     return _HEADER.pack(_VERSION_2 | count, kind, len(body) // 4) + body
 
 

@@ -1,8 +1,8 @@
 """Extended reports (RFC 3611) that give the receiver the round-trip time: reference times and their answers.
 
-The sender gets it from ordinary reports (RFC 3550). For this one, the receiver sends the time of its clock (section
-4.4), and the sender returns it with the delay since it arrived (section 4.5). `rtcp.py` puts these bodies into RTCP
-packets of type 207. The header of a block has the layout of an RTCP packet's header (section 3).
+The receiver sends the time of its clock (section 4.4). The sender returns this time with the delay since its arrival
+(section 4.5). The sender itself gets the round-trip time from ordinary reports (RFC 3550). `rtcp.py` puts the bodies
+written here into RTCP packets of type 207. The header of a block has the layout of an RTCP packet's header (section 3).
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ class ReferenceAnswer(Struct, frozen=True):
     time: int
     """In NTP short format, as received."""
     age_ns: int
-    """Time from its arrival to this answer; on the wire in steps of 1/65536 s."""
+    """Time from the arrival of the reference time to this answer; on the wire in steps of 1/65536 s."""
 
 
 def round_trip_of_answer_ns(answer: ReferenceAnswer, arrived_clock_ns: int) -> int | None:
-    """Return the round-trip time from an answer that arrived at `arrived_clock_ns`, or None if it gives none.
+    """Return the round-trip time from an answer that arrived at `arrived_clock_ns`, or None if that is impossible.
 
-    The clock is that of the reference time. The caller checks by `receiver_ssrc` that the answer is for it.
+    The clock is that of the reference time. The caller must check that `receiver_ssrc` is its own SSRC.
     """
     return round_trip_ns(ntp_to_short(elapsed_to_ntp(arrived_clock_ns)), answer.time, answer.age_ns)
 
@@ -62,7 +62,7 @@ def write_answers(ssrc: int, answers: Sequence[ReferenceAnswer]) -> bytes:
 
 
 def read_reference_times(body: bytes) -> list[ReferenceTime]:
-    """Read the reference times; raises `BadPacket` for a block of a length it cannot have."""
+    """Read the reference times; raises `BadPacket` for a block of a wrong length."""
     times = []
     for kind, block in _blocks(body):
         if kind == _REFERENCE_TIME_BLOCK:
@@ -74,7 +74,7 @@ def read_reference_times(body: bytes) -> list[ReferenceTime]:
 
 
 def read_answers(body: bytes) -> list[ReferenceAnswer]:
-    """Read the answers to reference times; raises `BadPacket` for a block of a length it cannot have."""
+    """Read the answers to reference times; raises `BadPacket` for a block of a wrong length."""
     answers: list[ReferenceAnswer] = []
     for kind, block in _blocks(body):
         if kind == _ANSWERS_BLOCK:

@@ -2,8 +2,8 @@
 
 An access unit is one encoded picture: NAL units behind start codes (H.264, annex B). The packetizer uses single NAL
 unit packets, STAP-A for small consecutive units such as the parameter sets, and FU-A fragments of equal size; the
-depacketizer accepts any mix of these. It finishes an access unit when its marker packet arrives, so that no frame waits
-for the next.
+depacketizer accepts any mix of these. It finishes an access unit when the packet with the marker arrives, so that no
+frame waits for the next frame.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from lavt.errors import BadPacket, UserError
 VIDEO_PAYLOAD_TYPE: Final = 96
 MAX_PACKET_BYTES: Final = 1200
 MAX_ACCESS_UNIT_BYTES: Final = 2 * 1024 * 1024
-"""More than any picture needs. It limits the memory for a peer that never ends its access unit."""
+"""More than any picture needs. This limits the memory if a peer never ends its access unit."""
 
 _HEADER = struct.Struct("!BBHII")
 RTP_HEADER_BYTES: Final = _HEADER.size
@@ -103,7 +103,8 @@ def split_nal_units(access_unit: bytes) -> list[bytes]:
 class Packetizer:
     """A packetizer of access units into RTP packets of one stream with consecutive sequence numbers.
 
-    `max_packet_bytes` includes the RTP header but not UDP and IP. Raises `UserError` for a size no stream can use.
+    `max_packet_bytes` includes the RTP header, but not the UDP and IP headers. Raises `UserError` for a size that is
+    not possible.
     """
 
     def __init__(
@@ -132,7 +133,7 @@ class Packetizer:
         return datagrams
 
     def _to_payloads(self, units: list[bytes]) -> list[bytes]:
-        """Pack NAL units in order: small ones share a packet while they fit, large ones are split into fragments."""
+        """Pack NAL units in order: small ones share packets, large ones are split into fragments."""
         payloads: list[bytes] = []
         small_units: list[bytes] = []
         free_bytes = self._max_payload_bytes - 1
@@ -177,11 +178,11 @@ class AccessUnit(Struct, frozen=True):
     """Annex B; b"" if nothing of it can be decoded."""
     timestamp: int
     complete: bool
-    """True if no packet of it is missing, and none directly before it. Packets missing before it do not count if it is
-    a keyframe with parameter sets. Errors of an incomplete picture persist in the pictures predicted from it, so
-    pictures are in doubt from there to the next complete keyframe."""
+    """True if no packet of this access unit and no packet directly before it is missing. For a keyframe with parameter
+    sets, packets before it do not matter. Errors of an incomplete picture persist in the pictures predicted from it, so
+    pictures are in doubt until the next complete keyframe."""
     keyframe: bool
-    """True if it has slices of an IDR picture: decoding can begin here."""
+    """True if it has slices of an IDR picture: decoding can begin with this access unit."""
 
 
 class Depacketizer:
@@ -197,8 +198,8 @@ class Depacketizer:
     def push(self, packet: RtpPacket, lost_before: bool) -> list[AccessUnit]:
         """Add the next packet; return the access units that are finished, oldest first: at most two.
 
-        `lost_before`: packets between this one and the previous one are missing. An access unit whose marker packet is
-        missing is finished when the next one begins.
+        `lost_before`: packets between the previous packet and this one are missing. An access unit whose marker packet
+        is missing is finished when the next access unit begins.
         """
         finished = []
         if self._begun and packet.timestamp != self._timestamp:
@@ -231,8 +232,8 @@ class Depacketizer:
     def _finish(self) -> AccessUnit:
         """Finish the current access unit and return it."""
         damaged = self._damaged or self._open_fragment != _NO_NAL_TYPE
-        # After a loss the first packets of this unit, or a picture that it refers to, may have been lost. A keyframe
-        # that begins with its parameter sets or a delimiter lacks neither.
+        # After a loss, perhaps the first packets of this unit or a picture that it refers to were lost. A keyframe that
+        # begins with its parameter sets or a delimiter has its first packets, and refers to no picture.
         is_self_contained = self._keyframe and self._first_kind in (_PARAMETER_SET, _DELIMITER)
         complete = not damaged and bool(self._data) and (is_self_contained or not self._after_loss)
         unit = AccessUnit(bytes(self._data), self._timestamp, complete, self._keyframe)
@@ -255,13 +256,13 @@ class Depacketizer:
 
     def _add_aggregate(self, payload: bytes) -> bool:
         """Add the NAL units of a STAP-A up to the first malformed one; return whether all are well formed."""
-        at = 1
-        while at < len(payload):
-            begin = at + 2
-            at = begin + int.from_bytes(payload[at:begin], "big")
-            if at > len(payload) or at == begin or not self._begin_nal_unit(payload[begin]):
+        end = 1
+        while end < len(payload):
+            length_begin, begin = end, end + 2
+            end = begin + int.from_bytes(payload[length_begin:begin], "big")
+            if end > len(payload) or end == begin or not self._begin_nal_unit(payload[begin]):
                 return False
-            self._append(payload[begin + 1 : at])
+            self._append(payload[begin + 1 : end])
         return len(payload) > 1
 
     def _add_fragment(self, payload: bytes) -> bool:

@@ -18,8 +18,8 @@ _MULTICAST_HOPS: Final = "/1"
 def session_description(receiver: tuple[str, int], *, rate_hz: float, profile_level_id: str) -> str:
     """Return the SDP file of the stream to `receiver`, an IPv4 address and a port.
 
-    `profile_level_id` is that of the stream's own parameter sets, in hexadecimal. RTCP is on the port of RTP. Raises
-    `UserError` for a port that cannot be listened on. Sources: RFC 8866; RFC 6184, section 8.2.1, for the format;
+    `profile_level_id` is that of the stream's parameter sets, in hexadecimal. RTCP uses the port of RTP. Raises
+    `UserError` for a port that no receiver can open. Sources: RFC 8866; RFC 6184, section 8.2.1, for the format;
     RFC 5761 for RTCP.
     """
     address, port = IPv4Address(receiver[0]), receiver[1]

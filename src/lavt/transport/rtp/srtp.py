@@ -1,13 +1,13 @@
 """SRTP and SRTCP (RFC 3711, AES-GCM of RFC 7714): encryption and authentication of the video's packets.
 
-This is the only module that imports pylibsrtp (libsrtp), of the extra `secure`. The profile is AEAD_AES_128_GCM: 16
-more bytes in an RTP packet, 20 in an RTCP packet. The SSRC is part of the initialisation vector, so media and repair
-packets, which have their own SSRC and sequence numbers, share one key. Each session and each direction needs a fresh
-key: two packets encrypted with the same vector would break GCM.
+This is the only module that imports pylibsrtp (libsrtp), of the extra `secure`. The profile is AEAD_AES_128_GCM: an RTP
+packet becomes 16 bytes longer, an RTCP packet 20. The SSRC is part of the initialisation vector, and media and repair
+packets have different SSRCs, so they can share one key. Each session and each direction needs a fresh key: two packets
+encrypted with the same key and vector would break GCM.
 
 The packet index has 48 bits, of which a packet carries 16; both ends count the rest, from 0 under a new key. So under a
-new key a stream should start at a sequence number below 2^15 (RFC 3711, 3.3.1): if it starts at 65535, a receiver that
-misses the first packet accepts no other. A receiver that misses 2^15 consecutive packets needs a new key.
+new key a stream should start at a sequence number below 2^15 (RFC 3711, 3.3.1). If it starts at 65535, a receiver that
+misses the first packet accepts no later packet. A receiver that misses 2^15 consecutive packets needs a new key.
 
 A packet of 1200 bytes takes 2.5 us to protect, 2.5 us to unprotect, and 2.5 us to reject if a bit is wrong (medians of
 7 times 20 000 consecutive packets; Python 3.11, pylibsrtp 1.0.0, one core of a virtual machine).
@@ -22,12 +22,12 @@ from typing import Any, Final
 from lavt.errors import UserError, WorkError
 
 KEY_BYTES: Final = 28
-"""16 bytes of the master key, then 12 of the master salt."""
+"""The master key, 16 bytes, then the master salt, 12 bytes."""
 MAX_PACKET_BYTES: Final = 1352
-"""Longest packet to protect: with the most that libsrtp adds it must fit into pylibsrtp's buffer of 1500 bytes."""
+"""Longest packet to protect: with everything that libsrtp can add, it fits into pylibsrtp's buffer of 1500 bytes."""
 WINDOW_PACKETS: Final = 4096
 """Replay window: a packet that is fewer than this many packets behind the newest of its SSRC is accepted. At 50 Mb/s in
-packets of 460 bytes or more, it covers 0.3 s."""
+packets of 460 bytes or more, the window covers at least 0.3 s."""
 
 
 class Protector:
@@ -42,8 +42,8 @@ class Protector:
         """Return the SRTP packet of an RTP packet, 16 bytes longer.
 
         Each packet of an SSRC is protected once, in the order of the sequence numbers. Raises `UserError` for a packet
-        longer than `MAX_PACKET_BYTES`, and `WorkError` for bytes that are not an RTP packet or were protected before:
-        two texts encrypted under one index would allow an attacker to forge packets.
+        longer than `MAX_PACKET_BYTES`. Raises `WorkError` for bytes that are not an RTP packet, and for an index that
+        was used before: two texts encrypted under one index would allow an attacker to forge packets.
         """
         return self._protect(self._session.protect, packet)
 
@@ -65,8 +65,9 @@ class Protector:
 class Unprotector:
     """A verifier and decryptor of received packets, of any SSRC under the key; for one thread.
 
-    `replayed` counts packets whose index was received before or is `WINDOW_PACKETS` or more behind (libsrtp checks the
-    index first, so it includes forgeries with an old index); `rejected` counts the others that are not authentic.
+    `replayed` counts packets whose index was received before or is `WINDOW_PACKETS` or more behind the newest. libsrtp
+    checks the index first, so forgeries with an old index are counted there, too. `rejected` counts all other packets
+    that are not authentic.
     """
 
     def __init__(self, key_and_salt: bytes) -> None:

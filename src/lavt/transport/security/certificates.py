@@ -2,7 +2,7 @@
 
 Everything is PEM: certificates, private keys as PKCS 8 without a password, public keys as SubjectPublicKeyInfo.
 Zenoh's access lists match the common name (CN) of a certificate. Only certificates of routers that accept connections
-contain host addresses and the server usage, so a stolen operator key cannot impersonate the vehicle's router.
+contain host addresses and the server usage, so a thief of an operator's key cannot impersonate the vehicle's router.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from lavt.errors import UserError
 from lavt.transport.security.keys import NS_PER_DAY, expiry_line
 
 CLOCK_SKEW_NS: Final = NS_PER_DAY
-"""Certificates are valid from this long before now: the clock of a vehicle that has just started may be behind."""
+"""Certificates are already valid this long before they are made, because the clock of a vehicle that has just started
+can be behind."""
 AUTHORITY: Final = "lavt test authority"
 LOOPBACK: Final = ("127.0.0.1", "localhost")
 _LABEL: Final = r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?"
@@ -53,7 +54,7 @@ class CertificateSummary(Struct, frozen=True):
 
 
 def new_authority(now_wall_ns: int, days: int) -> KeyPair:
-    """Create a self-signed authority, valid for `days`; it can sign certificates, but no other authority."""
+    """Create a self-signed authority, valid for `days`. It can sign certificates, but no other authority."""
     key = generate_private_key(SECP256R1())
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, AUTHORITY)])
     builder = (
@@ -107,7 +108,7 @@ def new_signing_pair(now_wall_ns: int, days: int) -> KeyPair:
 
 
 def summarize(certificate: bytes, where: str) -> CertificateSummary:
-    """Return the summary of a PEM certificate; raise `UserError` that names its place `where` if it is not one."""
+    """Return the summary of a PEM certificate; `where` describes its place in the `UserError` for an invalid one."""
     parsed = _load_certificate(certificate, where)
     usages = _extension(parsed, x509.ExtendedKeyUsage)
     is_server = usages is not None and ExtendedKeyUsageOID.SERVER_AUTH in usages
@@ -121,7 +122,7 @@ def summarize(certificate: bytes, where: str) -> CertificateSummary:
 
 
 def days_left(certificate: bytes, where: str, now_wall_ns: int) -> float:
-    """Return the days until a certificate expires, negative if it has; raise `UserError` as `summarize` does."""
+    """Return the days until a certificate expires, negative after that; raise `UserError` as `summarize` does."""
     return (
         _load_certificate(certificate, where).not_valid_after_utc.timestamp() * NS_PER_S / NS_PER_DAY
         - now_wall_ns / NS_PER_DAY

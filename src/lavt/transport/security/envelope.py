@@ -1,10 +1,10 @@
 """Signed envelopes for the messages that cross Zenoh, with protection against replays. Formats: `docs/wire.md`.
 
-A router's access list sees the neighbour and not the origin of a message, so any process that reaches the operator's
-router could publish. Commands and requests therefore carry the operator's signature (Ed25519), which the vehicle
-verifies. States and replies carry the vehicle's signature, which the operator verifies. Commands, requests and states
-also carry a MAC under the session's token, which is cheaper to verify. No input, output or clock here; callers do the
-locking.
+A router's access list knows the neighbour that passed a message on, but not its origin: any process that reaches the
+operator's router could publish. Commands and requests therefore carry the operator's signature (Ed25519), which the
+vehicle verifies. States and replies carry the vehicle's signature, which the operator verifies. Commands, requests and
+states also carry a MAC under the session's token, which is cheaper to verify. This module has no input, output or
+clock; callers do the locking.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from lavt.transport.security.keys import (
 )
 
 MAC_BYTES: Final = 16
-"""A MAC costs a fiftieth of a signature, so it separates the active operator's messages from a flood."""
+"""Size of a MAC, which costs a fiftieth of a signature: it separates the active operator's messages from a flood."""
 TRAILER_BYTES: Final = MAC_BYTES + SIGNATURE_BYTES
 """MAC and signature, which follow the signed part."""
 REPLAY_COUNTER_BYTES: Final = 16
@@ -47,17 +47,17 @@ REQUESTS: Final[dict[str, type[SessionRequest | NetemRequest]]] = {"session": Se
 
 _NO_MAC: Final = bytes(MAC_BYTES)
 _ANSWER, _RETRY = b"\0", b"\1"
-"""Kind of a reply: an answer, or a demand to send the request again with the replay counter in the reply."""
+"""Kinds of replies: an answer, or a demand to send the request again with the replay counter that is in the reply."""
 _NAME_BYTES: Final = 32
 
 
 def _signing_context(purpose: str, vehicle: str) -> bytes:
-    """Return the prefix of signed data: a signature is valid for one kind of message and one vehicle only."""
+    """Return the prefix of signed data, which makes a signature valid for one kind of message and one vehicle only."""
     return f"LAVT 1 {purpose} {vehicle}\0".encode()
 
 
 class _SessionMacs:
-    """The MACs of one session, whose key only its two ends know; without a session, zeros that never verify."""
+    """The MACs of one session, with a key that only its two ends know; without a session, zeros that never verify."""
 
     def __init__(self, token: bytes = b"") -> None:
         self._key = hmac.digest(token, b"LAVT 1 codes", "sha256") if token else b""
@@ -77,7 +77,7 @@ class _SessionMacs:
 def _signed_part(data: bytes) -> bytes:
     """Return the part before MAC and signature, unverified; empty if the envelope is too short or too long.
 
-    Nobody signs an empty part.
+    An empty part has no valid signature, because nobody signs one.
     """
     return data[:-TRAILER_BYTES] if len(data) <= MAX_ENVELOPE_BYTES else b""
 
@@ -88,19 +88,20 @@ class VerifiedRequest(Struct, frozen=True):
     channel: str
     operator: str
     body: bytes
-    """Empty: the request only asks for the next replay counter."""
+    """The request itself; empty: it requests only the next replay counter."""
     digest: bytes
     """Digest of the request's envelope, which the reply repeats."""
     secret: bytes
-    """The secret shared with the client, which encrypts the reply."""
+    """The secret shared with the client, with which the reply is encrypted."""
     public: bytes
     """The server's public key of the agreement on the secret."""
     is_stale: bool
-    """The replay counter is not the next one, so this may be a replay: the body is ignored and the client may retry."""
+    """The replay counter is not the next one, so this could be a replay: the body is ignored and the client can
+    retry."""
 
 
 class NullVehicleAuthenticator:
-    """The vehicle's authenticator where nothing is signed: it accepts every message and signs none."""
+    """The vehicle's authenticator if nothing is signed: it accepts every message and signs none."""
 
     counts: Mapping[str, int] = {}
 
@@ -109,11 +110,11 @@ class NullVehicleAuthenticator:
         return data
 
     def is_from_active_operator(self, _data: bytes) -> bool:
-        """Return True: without MACs every command may be the active operator's."""
+        """Return True: without MACs every command could come from the active operator."""
         return True
 
     def is_next_of_active_operator(self, _channel: str, _data: bytes) -> bool:
-        """Return False: without MACs no request is known to be the active operator's."""
+        """Return False: without MACs no request is known to come from the active operator."""
         return False
 
     def verify_command(self, data: bytes) -> bytes | None:
@@ -144,7 +145,7 @@ class VehicleAuthenticator(NullVehicleAuthenticator):
         self._instance = secrets.token_bytes(8)
         self._states = 0
         self._accepted_requests: Counter[tuple[str, str]] = Counter()
-        """How many requests had the next replay counter, by channel and operator."""
+        """Number of requests that had the next replay counter, by channel and operator."""
         self._agreements: dict[bytes, tuple[bytes, bytes]] = {}
         """Secret and public key of this end, by the client's public key."""
         self._active_operator = ""
@@ -161,7 +162,7 @@ class VehicleAuthenticator(NullVehicleAuthenticator):
         return self._macs.verify("control", data)
 
     def is_next_of_active_operator(self, channel: str, data: bytes) -> bool:
-        """Return whether a request has the active operator's next replay counter and MAC, which is cheap to check."""
+        """Return whether a request has the active operator's next replay counter and a valid MAC; a cheap check."""
         counter = self._replay_counter(channel, self._active_operator)
         return data.startswith(counter) and self._macs.verify(channel, data)
 
@@ -186,7 +187,7 @@ class VehicleAuthenticator(NullVehicleAuthenticator):
             return False
 
     def verify_request(self, channel: str, data: bytes) -> VerifiedRequest | None:
-        """Return the request if an operator signed it in its own name, otherwise None."""
+        """Return the request if the operator that it names signed it, otherwise None."""
         signed, signature = _signed_part(data), data[-SIGNATURE_BYTES:]
         name_begin = REPLAY_COUNTER_BYTES + PUBLIC_KEY_BYTES
         body_begin = name_begin + _NAME_BYTES
@@ -210,7 +211,7 @@ class VehicleAuthenticator(NullVehicleAuthenticator):
         return VerifiedRequest(channel, operator, body, _digest(data), secret, own_public, is_stale)
 
     def _is_in_own_name(self, channel: str, operator: str, body: bytes) -> bool:
-        """Return whether a request names the operator that signed it; an empty one passes."""
+        """Return whether a request names the operator that signed it; an empty request passes."""
         kind: Any = REQUESTS[channel]
         try:
             return body == b"" or bool(decode(kind, body).who == operator)
@@ -264,18 +265,18 @@ class VehicleAuthenticator(NullVehicleAuthenticator):
 
 
 class VerifiedReply(Struct, frozen=True):
-    """The result of verifying a reply: its body, or the envelope to send as a retry, or neither."""
+    """The result of verifying a reply: its body, or the envelope of the request to send again, or neither."""
 
     body: bytes | None
     retry: bytes | None
 
 
 class VerifiedState(Struct, frozen=True):
-    """The result of verifying a state; `body` is None if the state must not be shown."""
+    """The result of verifying a state; `body` is None if the state must be dropped."""
 
     body: bytes | None
     needs_request: bool
-    """The signature is valid, but this process of the server has not answered a request yet, so it may be a replay."""
+    """The signature is valid, but this process of the server has answered no request yet: it could be a replay."""
 
 
 class OperatorAuthenticator:
@@ -302,7 +303,7 @@ class OperatorAuthenticator:
         return body + self._macs.compute("control", body) + signature
 
     def sign_request(self, channel: str, body: bytes) -> bytes:
-        """Sign a request; an empty one only asks for the next replay counter."""
+        """Sign a request; an empty body requests only the next replay counter."""
         signed = self._replay_counters[channel] + self._agreement.public + self._operator + body
         signature = self._key.sign(_signing_context(channel, self._vehicle) + signed)
         data = signed + self._macs.compute(channel, signed) + signature
@@ -321,10 +322,9 @@ class OperatorAuthenticator:
         body_begin = public_begin + PUBLIC_KEY_BYTES
         counter, public = data[counter_begin:public_begin], data[public_begin:body_begin]
         signed, signature = data[:-SIGNATURE_BYTES], data[-SIGNATURE_BYTES:]
-        pending = self._pending.get(digest)
+        pending_channel, pending_body = self._pending.get(digest, ("", b""))
         if (
-            pending is None
-            or pending[0] != channel
+            pending_channel != channel
             or len(data) > MAX_ENVELOPE_BYTES
             or not self._vehicle_key.verify(signature, _signing_context(f"{channel} reply", self._vehicle) + signed)
         ):
@@ -337,15 +337,15 @@ class OperatorAuthenticator:
         self._drop_pending(channel, digest)
         self._store_replay_counter(channel, counter)
         if kind == _RETRY:
-            return VerifiedReply(None, self.sign_request(channel, pending[1]) if pending[1] else None)
+            return VerifiedReply(None, self.sign_request(channel, pending_body) if pending_body else None)
         if channel == "session":
             self._update_session(body)
         return VerifiedReply(body, None)
 
     def _drop_pending(self, channel: str, answered: bytes) -> None:
-        """Drop an answered request and the earlier ones on its channel, whose replies would be out of date."""
-        for digest in list(self._pending):
-            if self._pending[digest][0] == channel:
+        """Drop an answered request and the earlier requests on its channel: replies to them would be out of date."""
+        for digest, (pending_channel, _) in list(self._pending.items()):
+            if pending_channel == channel:
                 del self._pending[digest]
             if digest == answered:
                 return
@@ -368,14 +368,14 @@ class OperatorAuthenticator:
             self._macs = _SessionMacs(reply.token)
 
     def is_next_state(self, data: bytes) -> bool:
-        """Return whether a state is newer than the last and has a valid MAC, which is cheap to check.
+        """Return whether a state is newer than the last and has a valid MAC, which only the active operator can verify.
 
-        Only the active operator can verify the MAC.
+        This check is cheap.
         """
         return data[:REPLAY_COUNTER_BYTES] > self._newest_state and self._macs.verify("state", data)
 
     def verify_state(self, data: bytes) -> VerifiedState:
-        """Return the state if the vehicle signed it and it is newer than any before."""
+        """Return the state if the vehicle signed it and it is newer than all previous states."""
         signed, signature = _signed_part(data), data[-SIGNATURE_BYTES:]
         counter = signed[:REPLAY_COUNTER_BYTES]
         is_known_instance = counter[:8] == self._newest_state[:8]

@@ -1,7 +1,7 @@
 """Cheap checks that keep a flood of commands away from the vehicle, before anything is queued or recorded.
 
-A command that the vehicle may accept always passes, once. Its length, version, epoch and sequence must be right, and
-its MAC if messages are signed. All others pass at a limited rate, which is enough for a record that gives the reason
+A command that the vehicle could accept always passes, once: its length, version, epoch and sequence are right, and its
+MAC if messages are signed. All other commands pass at a limited rate. That is enough to record why they are rejected,
 and too low to delay anything.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from typing import Final
+from typing import Final, NamedTuple
 
 from lavt.domain import NS_PER_S, Command
 from lavt.errors import BadMessage
@@ -18,7 +18,7 @@ from lavt.transport.messages import decode
 OTHER_COMMANDS_PER_S: Final = 200
 """Enough to record all rejected commands of four clients at 50 Hz; 200 signatures take 3 % of a core."""
 QUERIES_PER_S: Final = 100
-"""Per channel; a client sends one a second."""
+"""The limit for each channel of queries; a client sends one query a second."""
 
 
 class RateLimiter:
@@ -37,6 +37,13 @@ class RateLimiter:
         return self._left >= 0
 
 
+class _CommandHead(NamedTuple):
+    """Epoch and sequence of a command."""
+
+    epoch: int
+    sequence: int
+
+
 class FloodFilter:
     """A filter that decides which commands are worth verifying.
 
@@ -50,19 +57,19 @@ class FloodFilter:
         self.counts: Counter[str] = Counter()
         self._in_force = in_force
         self._is_from_active_operator = is_from_active_operator
-        self._newest = (0, -1)
-        """Epoch and sequence of the newest authentic command. The vehicle may reject it, and then `in_force` does not
-        change, so replays of it must be recognized here."""
+        self._newest = _CommandHead(0, -1)
+        """Of the newest authentic command. If the vehicle rejects this command, `in_force` does not change, so the
+        filter itself must recognize its replays."""
         self._active_operator_limiter = RateLimiter(OTHER_COMMANDS_PER_S)
-        """Separate, so that others cannot crowd out the active operator's commands of an old epoch."""
+        """A separate limit, so that no flood crowds out the active operator's commands of an old epoch."""
         self._other_limiter = RateLimiter(OTHER_COMMANDS_PER_S)
 
     def passes(self, data: bytes, body: bytes, now_ns: int) -> bool:
         """Return whether the command `body`, received in the envelope `data`, passes."""
         from_active_operator = self._is_from_active_operator(data)
         epoch, sequence = self._in_force()
-        if self._newest[0] == epoch:
-            sequence = max(sequence, self._newest[1])
+        if self._newest.epoch == epoch:
+            sequence = max(sequence, self._newest.sequence)
         if from_active_operator and may_be_accepted(body, epoch, sequence):
             return True
         if (self._active_operator_limiter if from_active_operator else self._other_limiter).take(now_ns):
@@ -71,22 +78,23 @@ class FloodFilter:
         return False
 
     def note_authentic(self, body: bytes) -> None:
-        """Note a verified command of the active operator: from now on it and earlier ones are replays."""
+        """Note a verified command of the active operator: from now on this command and earlier ones are replays."""
         head = _head(body)
-        if head is not None and head[0] == self._in_force()[0]:
-            self._newest = max(self._newest, head) if self._newest[0] == head[0] else head
+        epoch, _ = self._in_force()
+        if head is not None and head.epoch == epoch:
+            self._newest = max(self._newest, head) if self._newest.epoch == epoch else head
 
 
 def may_be_accepted(body: bytes, epoch: int, sequence: int) -> bool:
-    """Return whether the head of a command has this epoch and a newer sequence number than `sequence`."""
+    """Return whether a command has this epoch and a higher sequence number than `sequence`."""
     head = _head(body)
-    return head is not None and head[0] == epoch and head[1] > sequence
+    return head is not None and head.epoch == epoch and head.sequence > sequence
 
 
-def _head(body: bytes) -> tuple[int, int] | None:
+def _head(body: bytes) -> _CommandHead | None:
     """Return epoch and sequence of a command; None for anything else."""
     try:
         command = decode(Command, body)
     except BadMessage:
         return None
-    return command.epoch, command.sequence
+    return _CommandHead(command.epoch, command.sequence)

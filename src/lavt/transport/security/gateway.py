@@ -1,7 +1,7 @@
 """Gateways that filter and authenticate messages between Zenoh and the runtime of a side.
 
-A link delivers to its gateway in threads of the link, and the gateway delivers to the runtime. The nodes behind it get
-authentic messages only and need not check who sent them. Times of arrival are the link's.
+A link delivers to its gateway in threads of the link, and the gateway delivers to the runtime. The runtime's nodes get
+authentic messages only, and need not check who sent them. A message keeps the arrival time that the link measured.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ Carry = Callable[..., None]
 REQUEST_PERIOD_NS: Final = NS_PER_S
 MAX_PENDING_QUERIES: Final = 64
 STATES_PER_S: Final = 500
-"""Ten times the rate of a vehicle; as many signatures take 7 % of a core."""
+"""Ten times the rate of a vehicle; to verify this many signatures takes 7 % of a core."""
 
 
 class OpenClientGateway:
-    """The operator's gateway where nothing is signed: it passes everything unchanged."""
+    """The operator's gateway if nothing is signed: it passes everything unchanged."""
 
     counts: Mapping[str, int] = {}
 
@@ -69,7 +69,7 @@ class ServerGateway:
             verify = self._verify_command if channel == "control" else self._verify_request
             body = verify(channel, payload, arrived.mono_ns, peer)
             retry, self._retry = self._retry, None
-        if retry is not None:  # outside the lock: the link may wait for its router, and `send` must not wait for that
+        if retry is not None:  # sent outside the lock: the link can block for its router, which must not block `send`
             self._carry(retry)
         if body is not None:
             self._deliver(channel, body, arrived, peer)
@@ -159,7 +159,7 @@ class ClientGateway:
         return reply.body
 
     def _send_in_thread(self, send: Send) -> None:
-        """Send from a new thread: Zenoh does not allow it in the thread that delivers."""
+        """Send from a new thread: Zenoh does not allow sending in the thread that delivers."""
         threading.Thread(target=self._carry, args=(send,), name="gateway", daemon=True).start()
 
     def send(self, *sends: Send) -> None:

@@ -1,6 +1,7 @@
 """Signing keys (Ed25519), key agreement (X25519, HKDF) and encryption (AES-GCM).
 
-Only this module and `certificates.py` import `cryptography`. It is an extra, so it is imported where it is used.
+Only this module and `certificates.py` import `cryptography`. The package is an extra, so functions import it when they
+need it.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ SECRET_BYTES: Final = 32
 NS_PER_DAY: Final = 86_400 * NS_PER_S
 
 _EXPIRY: Final = b"LAVT signing key 1, expires "
-"""The beginning of the line before a PEM key, where a PEM file may have any text (RFC 7468); 1 is its version."""
+"""The beginning of the line before a PEM key, where a PEM file may have any text (RFC 7468); 1 is the version."""
 _EXPIRY_LINE: Final = re.compile(rb"^%s(\d{1,11}) \(\d{4}-\d\d-\d\d\)$" % _EXPIRY, re.MULTILINE)
 _INSTALL: Final = "signing needs the package cryptography: pip install 'lavt[secure]'"
 
@@ -52,7 +53,7 @@ class PublicKey:
         self._key = key
 
     def verify(self, signature: bytes, data: bytes) -> bool:
-        """Return whether `signature` is a valid signature of `data`; malformed ones are not."""
+        """Return whether `signature` is a valid signature of `data`; a malformed signature is not valid."""
         from cryptography.exceptions import InvalidSignature  # noqa: PLC0415 (an extra)
 
         try:
@@ -63,7 +64,7 @@ class PublicKey:
 
 
 def expiry_line(expires_wall_ns: int) -> bytes:
-    """Return the line before a PEM key that says when the key expires: in seconds of Unix time, and the day in UTC."""
+    """Return the line before a PEM key with the time when the key expires: seconds of Unix time, and the day in UTC."""
     return _EXPIRY + f"{expires_wall_ns // NS_PER_S} ({calendar_time(expires_wall_ns):%Y-%m-%d})\n".encode()
 
 
@@ -166,9 +167,9 @@ class KeyAgreement:
 
 
 def encrypt(secret: bytes, plaintext: bytes, context: bytes) -> bytes:
-    """Encrypt `plaintext` with AES-256-GCM: a nonce of 12 bytes, the ciphertext and a tag of 16 bytes.
+    """Encrypt `plaintext` with AES-256-GCM; return a nonce of 12 bytes, the ciphertext and a tag of 16 bytes.
 
-    `context` is authenticated as well.
+    `context` is authenticated, but not contained in the result.
     """
     from cryptography.hazmat.primitives.ciphers.aead import AESGCM  # noqa: PLC0415 (an extra)
 

@@ -1,8 +1,8 @@
 """Encryption of the video's packets: none, or SRTP with keys that are used for one path only.
 
 The keys are derived from the session token and from the challenge that opened the path. So each time the path is
-opened, each direction gets a new key, and a packet index that starts at 0. The token is a secret of the two ends only
-if messages are signed.
+opened, each direction gets a new key, and a packet index that starts at 0. The token is secret only if messages are
+signed.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _LABELS: Final = {"server": b"LAVT 1 SRTP server to client", "client": b"LAVT 1 
 
 
 class Cipher(Protocol):
-    """Both directions of an open path, seen from one end."""
+    """The encryption of an open path in both directions, at one end."""
 
     def protect(self, packet: bytes) -> bytes:
         """Return the datagram to send for an RTP packet."""

@@ -1,8 +1,8 @@
 """Codecs that stamp a picture, encode it as an access unit and decode it: H.264, and two shortcuts for virtual time.
 
-A shortcut replaces the H.264 data of a picture by one small access unit that depends on no other. The path from the RTP
-sender to the receiver, with its delay, reordering and loss, treats it like video. Its content is text, so it contains
-neither a start code nor a zero byte.
+A shortcut replaces the H.264 data of a picture by one small access unit that depends on no other. RTP sender, network
+and receiver treat it like video, with delay, reordering and loss. It begins like a keyframe of H.264 (`_IDR_PREFIX`).
+The rest is ASCII digits, which never look like a start code and have no zero bytes, which RTP would cut off.
 """
 
 from __future__ import annotations
@@ -22,17 +22,18 @@ from lavt.transport.video.h264 import DecodedPicture, Decoder, Encoder
 from lavt.transport.video.stamp import STAMP_PX, read_stamp, write_stamp, write_stamp_i420
 
 _IDR_PREFIX: Final = b"\x00\x00\x00\x01\x09\xf0\x00\x00\x00\x01\x65"
-"""An access unit delimiter, and the NAL header of an IDR slice (H.264, table 7-1), which refers to no other picture."""
+"""An access unit delimiter, and the header of an IDR slice (H.264, table 7-1): a slice that refers to no other
+picture."""
 _LANE: Final = struct.Struct("!Qq7d")
-"""A lane in an access unit: stamp, time, and seven numbers in the order of `_pack`."""
+"""A lane in an access unit: stamp, `at_ns`, and the seven numbers of the lane in the order of `_pack`."""
 Planes = NDArray[np.uint8]
 """A picture in I420: (height * 3 / 2, width), luma first."""
 MIN_BIT_RATE_BPS: Final = 50_000
-"""Lower limits are raised to this one, because nobody could drive with a worse picture."""
+"""A lower limit of the receiver is raised to this bit rate, because nobody could drive with a worse picture."""
 CHECKSUM_ROW_STEP: Final = 16
 """The checksum of a picture covers every sixteenth row."""
 MAX_STORED_PICTURES: Final = 300
-"""Most pictures in transit: 10 s at 30 Hz, and 280 MB."""
+"""Largest number of pictures in transit: 10 s at 30 Hz, and 280 MB."""
 
 
 class ReceivedPicture(Protocol):
@@ -40,7 +41,7 @@ class ReceivedPicture(Protocol):
 
     @property
     def picture(self) -> FramePayload:
-        """The picture, or the lane in its place, for a detector. A picture may be converted only on access."""
+        """The picture for a detector, or the lane that replaces it. Reading this property can convert the picture."""
         ...
 
     @property
@@ -53,7 +54,7 @@ class PictureSender(Protocol):
     """The codec at the camera's end."""
 
     def prepare(self, picture: FramePayload) -> tuple[FramePayload, int]:
-        """Return the picture to stamp, and a checksum by which unstamped pictures can be told apart."""
+        """Return the picture to stamp, and a checksum of the picture without its stamp."""
         ...
 
     def write_stamp(self, prepared: FramePayload, stamp_ns: int) -> FramePayload:
@@ -65,7 +66,7 @@ class PictureSender(Protocol):
         ...
 
     def limit_bit_rate(self, limit_bps: int | None) -> None:
-        """Limit the bit rate from the next picture on, if the codec has one; None: use the configured one."""
+        """Limit the bit rate from the next picture on, if the codec has a bit rate; None: use the configured rate."""
         ...
 
 
@@ -73,7 +74,7 @@ class PictureReceiver(Protocol):
     """The codec at the driver's end."""
 
     def decode(self, access_unit: bytes) -> ReceivedPicture | None:
-        """Return the picture of an access unit, or None if it gives none."""
+        """Return the picture of an access unit, or None if no picture can be decoded."""
         ...
 
     def read_stamp(self, received: Any) -> int:
@@ -94,7 +95,8 @@ class VideoSender:
     def prepare(self, picture: Picture) -> tuple[Planes, int]:
         """Convert to I420 unless the picture already is I420; the checksum is a CRC-32 of the luma below the stamp.
 
-        It covers every sixteenth row: a live camera's noise changes each row, and a frozen camera's rows never change.
+        The checksum covers every sixteenth row, which is enough to detect a frozen camera: a live camera's noise
+        changes each row.
         """
         planes = picture if picture.ndim == 2 else self._encoder.to_planes(picture)
         return planes, zlib.crc32(planes[STAMP_PX : planes.shape[0] * 2 // 3 : CHECKSUM_ROW_STEP].tobytes())
@@ -118,8 +120,8 @@ class VideoReceiver:
     """An H.264 receiver for pictures of the configured `shape`, (height, width); None: of any shape.
 
     `read` reads the stamp from the luma. It is `read_stamp` for LAVT's own sender, whose RTP timestamps confirm each
-    stamp to within 12 us. For a foreign sender it is `read_clear_stamp`, because its stamps can be checked to within
-    milliseconds only, and a cell that is half old and half new could pass that check.
+    stamp with a tolerance of 12 us. For a foreign sender it is `read_clear_stamp`, because the check of its stamps has
+    a tolerance of milliseconds, and a cell that is half old and half new could pass that check.
     """
 
     def __init__(
@@ -145,7 +147,7 @@ class VideoReceiver:
 
 
 class RenderedPicture(Struct, frozen=True):
-    """A received picture that is exactly the rendered one."""
+    """A received picture that is exactly the rendered picture."""
 
     picture: Picture
     corrupt: bool = False
@@ -154,7 +156,7 @@ class RenderedPicture(Struct, frozen=True):
 class InMemoryFrameCodec:
     """Both ends of a codec that keeps the rendered pictures in memory; the access unit is a key to them.
 
-    Access units arrive in order, so pictures older than the one that arrived were lost and are dropped.
+    Access units arrive in order, so when one has arrived, all older pictures were lost and are dropped.
     """
 
     def __init__(self) -> None:
@@ -162,9 +164,9 @@ class InMemoryFrameCodec:
         self._key = 0
 
     def prepare(self, picture: Picture) -> tuple[Picture, int]:
-        """Return the picture itself, with a CRC-32 of the pixels around the stamp.
+        """Return the picture itself, and a CRC-32 of all pixels outside of the stamp.
 
-        The stamp's pixels are left out because a camera that reuses its buffer delivers it with the previous stamp.
+        A camera that reuses its buffer can deliver a picture with the previous stamp in it.
         """
         crc = zlib.crc32(np.ascontiguousarray(picture[STAMP_PX:]).data)
         return picture, zlib.crc32(np.ascontiguousarray(picture[:STAMP_PX, STAMP_PX:]).data, crc)
@@ -175,7 +177,7 @@ class InMemoryFrameCodec:
         return prepared
 
     def encode(self, stamped: Picture, *, keyframe: bool) -> bytes:  # noqa: ARG002 (every access unit is a keyframe)
-        """Store a copy of the picture, as the camera may reuse its buffer, and return its key."""
+        """Store a copy of the picture, because the camera can reuse its buffer, and return its key."""
         self._key += 1
         self._pictures[self._key] = stamped.copy()
         self._pictures.pop(self._key - MAX_STORED_PICTURES, None)
@@ -185,7 +187,7 @@ class InMemoryFrameCodec:
         """Do nothing: this codec has no bit rate."""
 
     def decode(self, access_unit: bytes) -> RenderedPicture | None:
-        """Return the picture of a key, once."""
+        """Return the picture of the key in an access unit; each picture is returned once."""
         text = access_unit.removeprefix(_IDR_PREFIX)
         key = int(text) if text.isdigit() else 0
         picture = self._pictures.get(key)
@@ -208,12 +210,12 @@ class ReceivedLane(Struct, frozen=True):
 
 
 class LaneSender:
-    """A sender that writes the lane itself, with its stamp and time, into the access unit: no pixels."""
+    """A sender that writes a lane, with stamp and time, into the access unit instead of a picture."""
 
     def prepare(self, picture: SeenLane) -> tuple[SeenLane, int]:
-        """Return the lane, with its time as the checksum.
+        """Return the lane, and its time as the checksum.
 
-        Real pictures differ by their noise even when the car is stationary; lanes differ by their time.
+        The checksum must change with each frame even if the car is stationary: in pictures noise changes it.
         """
         return picture, picture.at_ns & 0xFFFFFFFF
 
@@ -230,10 +232,10 @@ class LaneSender:
 
 
 class LaneReceiver:
-    """A receiver that reads a lane from its access unit."""
+    """A receiver that reads the lane from an access unit of `LaneSender`."""
 
     def decode(self, access_unit: bytes) -> ReceivedLane | None:
-        """Decode a lane; None if the access unit does not contain one."""
+        """Decode a lane; return None if the access unit does not contain a lane."""
         try:
             packed = bytes.fromhex(access_unit.removeprefix(_IDR_PREFIX).decode())
             stamp_ns, at_ns, c0, c1, c2, *rest = _LANE.unpack(packed)

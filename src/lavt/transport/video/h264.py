@@ -25,12 +25,12 @@ from lavt.transport.rtp.rtp import split_nal_units
 
 _MIN_SIDE_PX: Final = 64
 _MAX_DECODED_PX: Final = 4096 * 2304
-"""A forged parameter set cannot make the decoder allocate more memory than pictures of this size need."""
+"""The largest picture that the decoder accepts, so that a forged parameter set cannot make it allocate more memory."""
 _KEYFRAME_NAL_TYPES: Final = {5, 7, 8}
 """An IDR slice, a sequence and a picture parameter set (H.264, table 7-1)."""
 _PRESETS: Final = ("ultrafast", "superfast", "veryfast", "faster", "fast", "medium", "slow", "slower", "veryslow")
 
-# The caller counts damage in the stream, so FFmpeg's messages about it are not needed, nor libx264's final summary.
+# FFmpeg's messages about a damaged stream are not needed, because the caller counts damage. Nor is libx264's summary.
 av.logging.set_level(None)
 # OpenCV's threads wait for more work by spinning: 1.5 ms of CPU time for each picture converted (measured).
 cv2.setNumThreads(1)
@@ -39,9 +39,9 @@ cv2.setNumThreads(1)
 class Encoder:
     """An H.264 encoder of one stream of pictures (libx264); its output is byte-for-byte reproducible.
 
-    In any time of `buffer_s` the stream keeps to `bit_rate_bps`. A keyframe comes every `gop_frames` and on request,
-    each with its parameter sets in band. Each of several `threads` encodes a slice of every picture, so that no picture
-    waits for another. Raises `UserError` for settings that no stream can have.
+    Over any period of `buffer_s` the stream keeps to `bit_rate_bps`. A keyframe comes every `gop_frames` and on
+    request, each with its parameter sets in band. Each of several `threads` encodes a slice of every picture, so that
+    no picture waits for another. Raises `UserError` for settings that are not possible.
     """
 
     def __init__(
@@ -77,8 +77,8 @@ class Encoder:
     def set_bit_rate(self, bit_rate_bps: int) -> None:
         """Change the bit rate from the next picture on, which is a keyframe.
 
-        The codec is reopened, which takes about 2 ms: libx264 cannot exceed the rate it was opened with, nor change
-        its decoder buffer. Raises `UserError` for a rate that no stream can have.
+        The codec is reopened, which takes about 2 ms, because an open libx264 can neither exceed its first rate nor
+        change its decoder buffer. Raises `UserError` for a rate that is not possible.
         """
         _check_rates(float(self._rate), bit_rate_bps, self._gop_frames, self._buffer_s)
         if bit_rate_bps != self.bit_rate_bps:
@@ -96,12 +96,12 @@ class Encoder:
     def encode(self, picture_bgr: Picture, keyframe: bool = False) -> bytes:
         """Encode one picture (height, width, 3) and return its access unit (annex B).
 
-        `keyframe` makes it an IDR picture. Raises `UserError` for a picture of another size.
+        With `keyframe` the picture becomes an IDR picture. Raises `UserError` for a picture of another size.
         """
         return self.encode_planes(self.to_planes(picture_bgr), keyframe)
 
     def encode_planes(self, planes: NDArray[np.uint8], keyframe: bool = False) -> bytes:
-        """Encode one picture in I420, as `to_planes` returns it, without copying or keeping it.
+        """Encode one picture in I420, as `to_planes` returns it. The picture is not copied or kept.
 
         Raises `UserError` for a picture of another size.
         """
@@ -136,7 +136,7 @@ class Encoder:
 
 
 def _check_size(width_px: int, height_px: int) -> None:
-    """Raise `UserError` for a size that libx264 rejects with an unclear message, or that our decoder would reject."""
+    """Raise `UserError` for a size that libx264 rejects with an unclear message, or that `Decoder` would reject."""
     if min(width_px, height_px) < _MIN_SIDE_PX or width_px % 2 or height_px % 2:
         raise UserError(
             f"pictures cannot have {width_px} x {height_px} pixels: choose even sizes of at least {_MIN_SIDE_PX} pixels"
@@ -146,7 +146,7 @@ def _check_size(width_px: int, height_px: int) -> None:
 
 
 def _check_rates(rate_hz: float, bit_rate_bps: int, gop_frames: int, buffer_s: float) -> None:
-    """Raise `UserError` for rates that libx264 rejects with an unclear message or does not keep to."""
+    """Raise `UserError` for rates that libx264 rejects with an unclear message, or accepts but does not keep."""
     if not 1 <= rate_hz <= 1000:
         raise UserError(f"the frame rate cannot be {rate_hz} Hz: choose 1 to 1000 Hz")
     if not 10_000 <= bit_rate_bps <= 1_000_000_000:
@@ -188,16 +188,16 @@ class Decoder:
         self._damaged = False
 
     def decode(self, access_unit: bytes) -> DecodedPicture | None:
-        """Decode one access unit (annex B); return None if it gives no picture. No bytes make it raise.
+        """Decode one access unit (annex B); return None if no picture can be decoded. No bytes make it raise.
 
         After the loss of a whole keyframe, or of two consecutive pictures where the 4-bit frame number wraps, FFmpeg
-        may take the next pictures for older ones. It then returns none until the frame number has caught up (measured:
-        up to 14 pictures), or until the next keyframe.
+        can treat the next pictures as older ones. Then it returns no picture until the frame number has caught up
+        (measured: up to 14 pictures), or until the next keyframe.
         """
         if not access_unit:
-            return None  # FFmpeg takes an empty packet for the end of the stream and returns no more pictures
-        # FFmpeg carries state of a damaged picture over into the next keyframe, which is then visibly wrong without
-        # being marked corrupt. Flushing does not help; a new context does, and takes less than 0.1 ms (measured).
+            return None  # FFmpeg treats an empty packet as the end of the stream, and returns no more pictures after it
+        # FFmpeg keeps state of a damaged picture, which makes the next keyframe visibly wrong but not marked as
+        # corrupt. Flushing does not help. A new context does, and takes less than 0.1 ms (measured).
         if self._damaged and _is_self_contained(access_unit):
             self._context = _open_decoder()
             self._damaged = False
@@ -230,5 +230,5 @@ def _to_i420(frame: VideoFrame) -> VideoFrame:
     """Return a frame in 4:2:0; raises `ValueError` for odd sizes, which the chroma planes cannot represent."""
     if frame.width % 2 or frame.height % 2:
         raise ValueError("odd size")
-    # A foreign sender may use full range or another chroma format.
+    # A foreign sender can use full range or another chroma format.
     return frame if frame.format.name == "yuv420p" else frame.reformat(format="yuv420p")

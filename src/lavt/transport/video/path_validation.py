@@ -15,23 +15,24 @@ four addresses of it, however many hellos arrive.
 
 * Aiming the video at a third party: the third party's address must answer a challenge that was sent only there. Even an
   attacker who has the token cannot answer it.
-* Redirecting the video by a forged hello or answer: needs the token. A hello opens or moves no path, and one without a
-  valid MAC gets no reply. No reply is longer than the datagram it replies to.
-* Replaying a hello: a number below the highest gets no challenge, and the client answers one challenge to each of its
-  hellos. The newest hello gets up to four, to different addresses: a copy that arrives first from elsewhere does not
-  prevent the challenge to the client.
-* Replaying an answer: it is valid only from the address in its cookie, within 2 s, and if its challenge is newer than
-  the one that opened the path. A restart or a new token invalidates all older cookies.
-* Making either end change its keys: the server keeps the key of a path that is open to the answer's address, and the
-  client never drops the key in use.
+* Redirecting the video by a forged hello or answer: the attacker needs the token. A hello opens or moves no path, and a
+  hello without a valid MAC gets no reply. No reply is longer than the datagram that caused it.
+* Replaying a hello: a hello with a lower number than the highest gets no challenge, and the client answers one
+  challenge to each of its hellos. The newest hello gets up to four challenges, to different addresses: a copy that
+  arrives first from elsewhere does not prevent the challenge to the client.
+* Replaying an answer: an answer is valid only from the address in its cookie, for 2 s, and if its challenge is newer
+  than the challenge that opened the path. A restart or a new token invalidates all older cookies.
+* Forcing either end to change its keys: the server does not change the key of a path that is already open to the
+  answer's address, and the client never drops the key in use.
 * Not covered: an attacker who reads each hello and whose copy overtakes it can delay the opening of a path, and can
   make the path lead through the attacker's own address. An attacker who can drop datagrams can drop the video as well.
 
 If the video is encrypted, its keys are derived from the token and the challenge that opened the path, so each opening
-has its own. The client cannot know whether its answer arrives, so it keeps the keys of its last few answers.
+of the path has its own keys. The client cannot know whether an answer arrives, so it keeps the keys of its last few
+answers.
 
-These datagrams begin with b"LAVT"; the first byte distinguishes them from RTP and RTCP, whose first byte begins with
-version 2.
+These datagrams begin with b"LAVT". The first byte distinguishes them from RTP and RTCP: its two highest bits are not
+the version 2.
 """
 
 from __future__ import annotations
@@ -48,10 +49,10 @@ Address = tuple[str, int]
 
 TOKEN_BYTES: Final = 16
 HELLO_INTERVAL_NS: Final = 500 * NS_PER_MS
-"""Period of hellos until the first video arrives, which takes a while under delay."""
+"""Period of hellos until the first video arrives; under delay this takes a while."""
 HELLO_AGAIN_NS: Final = 150 * NS_PER_MS
-"""Time without video, after it had arrived, until the next hello. It is half of a vehicle's command timeout: a client
-whose address changes has its video back before the vehicle is stopped."""
+"""Once video has arrived: time without video until the next hello. It is half of the time after which a vehicle becomes
+degraded: a client whose address changes has its video back before the vehicle is stopped."""
 CHALLENGE_LIFETIME_NS: Final = 2 * NS_PER_S
 REPORT_TIMEOUT_NS: Final = 2 * NS_PER_S
 
@@ -72,9 +73,11 @@ _CHALLENGE_BYTES: Final = _COOKIE.stop + _CHALLENGE_MAC_BYTES
 _CLIENT_SIZES: Final = {_HELLO: _NUMBER.stop + _MAC_BYTES, _ANSWER: _COOKIE.stop + _MAC_BYTES}
 """Sizes in bytes of the datagrams that a client sends, by their head."""
 _MAX_CHALLENGES: Final = 4
-"""Challenges to copies of one hello from different addresses: few, because each copy may have a false address."""
+"""Largest number of challenges to copies of one hello from different addresses. It is low, because each copy can have a
+false address."""
 _MAX_CIPHERS: Final = 16
-"""More than the hellos of two seconds: after that time the server accepts no answer to them."""
+"""Number of ciphers that a client keeps. It is more than the number of hellos in two seconds, and after two seconds the
+server accepts no answer."""
 
 
 def is_path_datagram(datagram: bytes) -> bool:
@@ -118,7 +121,7 @@ class PathClient:
         return hello + _mac(self._token, hello)
 
     def answer(self, challenge: bytes) -> bytes | None:
-        """Return the answer to a challenge; None if it is not the server's first to a hello of this client."""
+        """Return the answer to a challenge; None unless it is the server's first challenge to a hello of this end."""
         body, mac = challenge[:-_CHALLENGE_MAC_BYTES], challenge[-_CHALLENGE_MAC_BYTES:]
         if len(challenge) != _CHALLENGE_BYTES or not challenge.startswith(_CHALLENGE):
             return None
@@ -168,9 +171,9 @@ class PathClient:
         self._next_hello_ns = now_ns + HELLO_AGAIN_NS
 
     def next_hello_ns(self) -> int:
-        """Return when the next hello is due: first at 0, then 500 ms after a hello.
+        """Return when the next hello is due: the first at 0, the next 500 ms after a hello.
 
-        Once video has arrived, it is 150 ms after the last video or hello.
+        Once video has arrived, a hello is due 150 ms after the last video or hello.
         """
         return self._next_hello_ns
 
@@ -181,8 +184,8 @@ class PathServer:
     `new_secret` returns 16 or more unpredictable bytes at each call. All times are of the server's monotonic clock.
     Public counters, in datagrams: `malformed` have another format, `wrong_token` have no valid MAC, `wrong_address`
     answer a challenge that this server did not send to that address, `stale` arrive too late or a second time,
-    `unneeded` answer from the address to which the path is open, `foreign_reports` are reports from an address to which
-    no path is open.
+    `unneeded` are answers from the address to which the path is already open, `foreign_reports` are reports from an
+    address to which no path is open.
     """
 
     def __init__(self, new_secret: Callable[[], bytes], new_cipher: NewCipher = plain_cipher) -> None:
@@ -213,13 +216,13 @@ class PathServer:
         self._hello_number = 0
         """The highest number of a hello."""
         self._challenged_addresses: set[Address] = set()
-        """The addresses from which that hello came."""
+        """The addresses from which the hello with this number came."""
         self._opening_challenge_ns: int | None = None
         """When the challenge was issued whose answer opened the path."""
         self._last_report_ns = 0
 
     def receive(self, datagram: bytes, address: Address, now_ns: int) -> bytes | None:
-        """Handle a datagram from `address`; return the challenge to send there if it is a valid and new hello."""
+        """Handle a datagram from `address`; for a valid and new hello, return the challenge to send to `address`."""
         number = client_datagram_number(datagram)
         if number is None:
             self.malformed += 1
@@ -227,7 +230,7 @@ class PathServer:
             self.wrong_token += 1
         elif datagram.startswith(_ANSWER):
             self._open(datagram, address, now_ns)
-        elif not self._is_new_hello(number, address):
+        elif not self._admit_hello(number, address):
             self.stale += 1
         else:
             return self._challenge(number, address, now_ns)
@@ -239,8 +242,8 @@ class PathServer:
             self._address = None
         return self._address
 
-    def report(self, address: Address, now_ns: int) -> None:
-        """Note a receiver report from `address`; from the address of the path, it keeps the path open."""
+    def note_report(self, address: Address, now_ns: int) -> None:
+        """Note a receiver report from `address`; a report from the address of the path keeps the path open."""
         if self.open_address(now_ns) == address:
             self._last_report_ns = now_ns
         else:
@@ -253,8 +256,8 @@ class PathServer:
         """
         return self._address == address
 
-    def _is_new_hello(self, number: int, address: Address) -> bool:
-        """Return whether an authentic hello gets a challenge."""
+    def _admit_hello(self, number: int, address: Address) -> bool:
+        """Note an authentic hello; return whether it gets a challenge."""
         if number > self._hello_number:
             self._hello_number, self._challenged_addresses = number, set()
         if (
@@ -302,14 +305,14 @@ class PathServer:
         self._last_report_ns = now_ns
 
     def _cookie(self, number_and_time: bytes, address: Address) -> bytes:
-        """Return the cookie that binds a challenge's number and time to the address it is sent to."""
+        """Return the cookie that binds a challenge's number and time to the address to which it is sent."""
         host, port = address
         signed = number_and_time + port.to_bytes(2, "big") + host.encode()
         return hmac.digest(self._secret, signed, "sha256")[: _COOKIE.stop - _COOKIE.start]
 
 
 def _mac(token: bytes, body: bytes) -> bytes:
-    """Return the MAC of `body` under `token`; `body` begins with its kind, so that no MAC is valid for another kind."""
+    """Return the MAC of `body` under `token`. `body` begins with the kind of datagram, which the MAC covers, too."""
     return hmac.digest(token, body, "sha256")
 
 

@@ -2,7 +2,7 @@
 
 The stamp has 64 bits: nanoseconds of the server's wall clock just before encoding. It is 8 x 8 cells of 8 x 8 pixels in
 the top left corner, row by row, most significant bit first, white for 1. The cells lie on the grid of H.264's
-transform, so the stamp survives a low bit rate. A concealed picture may carry a stamp that is readable and wrong; the
+transform, so the stamp survives a low bit rate. A concealed picture can carry a stamp that is readable but wrong. The
 frame's RTP timestamp, which gives the same time in 90 kHz ticks, reveals this.
 """
 
@@ -22,12 +22,12 @@ _CELL_PX = STAMP_PX // _CELLS
 _CENTRE = slice(_CELL_PX // 4, _CELL_PX - _CELL_PX // 4)
 _CENTRE_PIXELS = (_CELL_PX // 2) ** 2
 _THRESHOLD = 128
-_BLACK_BELOW, _WHITE_ABOVE = 64, 192  # a codec leaves the cells of a stamp far from both thresholds
+_BLACK_BELOW, _WHITE_ABOVE = 64, 192  # for `has_stamp`; a codec leaves the pixels of a stamp far from both values
 
 _BLACK, _WHITE, _NEUTRAL = 16, 235, 128  # limited range (ITU-R BT.601), to which OpenCV converts 0 and 255
 _CLEARLY_BLACK, _CLEARLY_WHITE = _BLACK + (_WHITE - _BLACK) // 3, _WHITE - (_WHITE - _BLACK) // 3
 _INNERMOST = (_CELL_PX // 2 - 1, _CELL_PX // 2)
-"""Offset from the corner of a cell, in rows and columns alike, of two of the pixels in its middle."""
+"""Two pixels in the middle of a cell: each number is the offset from the cell's corner both in rows and in columns."""
 _UNCLEAR = b"?"
 _DIGITS = b"0" * (_CLEARLY_BLACK + 1) + _UNCLEAR * (_CLEARLY_WHITE - _CLEARLY_BLACK - 1) + b"1" * (256 - _CLEARLY_WHITE)
 """The digit of a cell for each luma."""
@@ -42,7 +42,7 @@ _RTP_TICKS_PER_100_US = 9
 def write_stamp(picture_bgr: Picture, stamp_ns: int) -> None:
     """Write `stamp_ns` into the top left corner of `picture_bgr`, in place.
 
-    The picture is (height, width, 3) and at least `STAMP_PX` each way, else `UserError`; `stamp_ns` is in [0, 2^64).
+    The picture is (height, width, 3), `stamp_ns` is in [0, 2^64). Raises `UserError` for a picture that is too small.
     """
     _check_room(*picture_bgr.shape[:2])
     stamp_bytes = np.frombuffer(stamp_ns.to_bytes(8, "big"), np.uint8)
@@ -55,8 +55,8 @@ def write_stamp(picture_bgr: Picture, stamp_ns: int) -> None:
 def write_stamp_luma(luma: NDArray[np.uint8], stamp_ns: int) -> None:
     """Write `stamp_ns` into the top left corner of a luma plane (height, width), 16 black and 235 white, in place.
 
-    The chroma there must be 128, or black and white have a colour. Raises `UserError` for a plane smaller than
-    `STAMP_PX` either way; `stamp_ns` is in [0, 2^64).
+    The chroma there must be 128; otherwise black and white get a colour. `stamp_ns` is in [0, 2^64). Raises `UserError`
+    for a plane that is too small.
     """
     _check_room(*luma.shape)
     rows = _LUMA_OF_BYTE[np.frombuffer(stamp_ns.to_bytes(8, "big"), np.uint8)]
@@ -64,7 +64,9 @@ def write_stamp_luma(luma: NDArray[np.uint8], stamp_ns: int) -> None:
 
 
 def write_stamp_i420(planes: NDArray[np.uint8], stamp_ns: int) -> None:
-    """Write `stamp_ns` into the top left corner of an I420 picture, in place, as `write_stamp` and cv2 would.
+    """Write `stamp_ns` into the top left corner of an I420 picture, in place.
+
+    The result is the same as if `write_stamp` had stamped the picture and cv2 had converted it to I420 afterwards.
 
     `planes` is (height * 3 // 2, width) as in OpenCV, with even sides: luma, then the U and the V plane, each
     (height / 2, width / 2) without gaps between its rows. Raises `UserError` for a picture that is too small and
@@ -86,24 +88,27 @@ def _check_room(height: int, width: int) -> None:
 def read_stamp(luma: NDArray[np.uint8]) -> int:
     """Read the stamp from the luma plane (height, width) of a decoded picture.
 
-    If in each cell both innermost pixels are clearly black or both are clearly white, they decide. Otherwise the mean
-    of each cell's centre half decides. The result is not trusted until `stamp_agrees` has confirmed it. Raises
+    If in each cell two pixels in the middle are both clearly black or both clearly white, these pixels decide.
+    Otherwise the mean of each cell's centre half decides. Do not trust the result until `stamp_agrees` has confirmed
+    it. Raises
     `BadPacket` for a picture that is too small for a stamp, and for an array that is not a plane.
     """
     _check_plane(luma)
     # The innermost pixels are nearly always clear; summing the centre half takes five times as long.
-    one, other = (luma[at:STAMP_PX:_CELL_PX, at:STAMP_PX:_CELL_PX].tobytes().translate(_DIGITS) for at in _INNERMOST)
-    if one == other and _UNCLEAR not in one:
-        return int(one, 2)
+    digits, digits_again = (
+        luma[offset:STAMP_PX:_CELL_PX, offset:STAMP_PX:_CELL_PX].tobytes().translate(_DIGITS) for offset in _INNERMOST
+    )
+    if digits == digits_again and _UNCLEAR not in digits:
+        return int(digits, 2)
     return _to_number(_cell_sums(luma) > _THRESHOLD * _CENTRE_PIXELS)
 
 
 def read_clear_stamp(luma: NDArray[np.uint8]) -> int:
     """Read the stamp as `read_stamp` does, but only if each cell is clearly black or clearly white.
 
-    It rejects a cell that is half old and half new. The check of a foreign sender's stamps (`LearnedBase`) needs this,
-    because it tolerates errors of milliseconds, while `stamp_agrees` tolerates microseconds. Raises `BadPacket` also if
-    a cell is in the middle third between black and white.
+    A cell that is half old and half new is rejected. This is necessary for a foreign sender's stamps, because their
+    check (`LearnedBase`) tolerates errors of milliseconds; `stamp_agrees` tolerates microseconds only. Raises
+    `BadPacket` also if a cell is in the middle third between black and white.
     """
     sums = _cell_sums(luma)
     white = sums > _CLEARLY_WHITE * _CENTRE_PIXELS
@@ -145,7 +150,7 @@ def rtp_timestamp(stamp_ns: int) -> int:
 
 
 def stamp_agrees(stamp_ns: int, rtp_timestamp_of_frame: int) -> bool:
-    """Return whether a stamp read from a picture and the RTP timestamp of its packets are the same time.
+    """Return whether a stamp read from a picture is the same time as the RTP timestamp of the picture's packets.
 
     Two different stamps agree with the same timestamp only if they are less than 12 us, or a multiple of 13.3 h, apart.
     """

@@ -1,9 +1,9 @@
 """Check of the stamps of a foreign sender, whose RTP timestamps have an arbitrary base (RFC 3550, section 5.1).
 
-LAVT's sender puts the stamp itself into the RTP timestamp, and `stamp_agrees` compares the two to within 12 us. A
-foreign sender's timestamps start anywhere and give the time of capture, some milliseconds before the stamp. The check
-is that stamps advance as the timestamps do: stamps over timestamps lie on one line, which is learned from the first
-stamps.
+LAVT's sender uses the stamp as the RTP timestamp, and `stamp_agrees` compares both with a tolerance of 12 us. A foreign
+sender's timestamps start anywhere and give the time of capture, some milliseconds before the stamp. So the check is
+that stamps advance as much as the timestamps: plotted over the timestamps, the stamps lie on one line, which is learned
+from the first stamps.
 """
 
 from __future__ import annotations
@@ -13,30 +13,31 @@ from typing import Final
 from lavt.domain import NS_PER_MS, NS_PER_S
 
 TOLERANCE_NS: Final = 5 * NS_PER_MS
-"""Greatest distance of a stamp from the line. It is more than the variation of a sender's delay from capture to stamp,
-and not more than the frame interval at up to 200 Hz, so that the stamp of the previous picture is rejected."""
+"""Largest distance of a stamp from the line. It is more than the variation of a sender's delay from capture to stamp.
+At up to 200 Hz it is not more than the frame interval, so that the stamp of the previous picture is rejected."""
 LEARNED_AFTER: Final = 5
-"""Stamps that must agree with each other before one is accepted."""
+"""Number of stamps that must agree with each other before the first is accepted."""
 RELEARN_AFTER_NS: Final = 12 * NS_PER_S
-"""If the timestamps continue without a jump, stamps replace the line only after they have agreed with each other, and
-none with the line, for this time. If a lost packet has left a cell of an older stamp in the high bits, all stamps are
-wrong by the same amount until the next keyframe: 8.3 s at x264's default of 250 frames and 30 Hz."""
+"""If the timestamps continue without a jump, a new line replaces the old one only if the stamps have agreed with the
+new line, and none with the old one, for this time. It is longer than a lost packet can have an effect: if a cell of an
+older stamp stays in the high bits, all stamps are wrong by the same amount until the next keyframe, for up to 8.3 s at
+x264's default of 250 frames and 30 Hz."""
 JUMP_NS: Final = 60 * NS_PER_S
 """If timestamps went back, or forward by more than this, the sender has restarted: the line is replaced as
 soon as `LEARNED_AFTER` stamps agree with each other."""
 
 _AVERAGED_STAMPS: Final = 16
-"""The line is the mean of this many stamps: at 30 Hz a clock that drifts by 100 ppm is followed with a lag of 53 us."""
+"""The line is the mean of this many stamps: at 30 Hz it follows a clock that drifts by 100 ppm with a lag of 53 us."""
 
 
 class LearnedBase:
     """A check that stamps advance as their RTP timestamps do; it learns the base from the stamps themselves.
 
     No stamp is accepted until `LEARNED_AFTER` stamps agree. When the sender restarts or steps its clock, the base is
-    learned again. An accepted stamp may be wrong by twice `TOLERANCE_NS`; a stamp of 64 random bits is accepted with a
-    probability of 5e-13 (10 ms in 2^64 ns). Concealed pixels are not random: pass only stamps of pictures that are not
-    in doubt, read by `read_clear_stamp`. Stamps of pictures in doubt have been observed to agree with each other on a
-    base that was wrong by 1 s.
+    learned again. An accepted stamp can be wrong by twice `TOLERANCE_NS`. A stamp of 64 random bits is accepted with a
+    probability of 5e-13 (10 ms in 2^64 ns). But concealed pixels are not random: stamps of pictures in doubt have been
+    observed to agree with each other on a base that was wrong by 1 s. So pass only stamps of pictures that are not in
+    doubt, read by `read_clear_stamp`.
     """
 
     def __init__(self) -> None:
@@ -45,7 +46,7 @@ class LearnedBase:
         self._votes = 0
 
     def agrees(self, stamp_ns: int, rtp_timestamp_of_frame: int) -> bool:
-        """Return whether a stamp is newer than the last accepted one, and by as much as its RTP timestamp says."""
+        """Return whether a stamp is newer than the last accepted stamp, by as much as its RTP timestamp is newer."""
         if self._line is not None and self._line.accept(stamp_ns, rtp_timestamp_of_frame):
             self._candidate = None
             return True
@@ -72,7 +73,7 @@ class _StampLine:
         self._accepted = 1
 
     def accept(self, stamp_ns: int, timestamp: int) -> bool:
-        """Extend the line by a stamp if it lies on the line and is newer than the newest; return whether it does."""
+        """Extend the line by a stamp that lies on it and is newer than its newest stamp; return whether this is so."""
         expected_ns = self._mean_ns + _ns_between(self.newest_timestamp, timestamp)
         error_ns = stamp_ns - expected_ns
         if abs(error_ns) > TOLERANCE_NS or stamp_ns <= self.newest_ns:
@@ -83,7 +84,7 @@ class _StampLine:
         return True
 
     def can_replace(self, other: _StampLine) -> bool:
-        """Return whether this line, which began after another one, can replace it."""
+        """Return whether this line can replace the line `other`, which began earlier."""
         continues = 0 <= _ns_between(other.newest_timestamp, self.first_timestamp) <= JUMP_NS
         return not continues or self.newest_ns - self.first_ns >= RELEARN_AFTER_NS
 

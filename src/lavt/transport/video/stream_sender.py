@@ -1,4 +1,4 @@
-"""Sender of a video stream: media packets, repair packets as needed, sender reports, and the receiver's feedback."""
+"""Sender of a video stream: it makes media packets, repair packets as needed, and sender reports; it reads feedback."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ class FramePackets(Struct, frozen=True):
 class StreamSender:
     """A sender that makes the datagrams of one stream and handles its receiver's feedback.
 
-    `repair_packets` is the number for each block of a frame; None: it follows the reported loss. Public:
-    `bit_rate_limit_bps`, the receiver's limit for the encoder, or None.
+    `repair_packets` is the number of repair packets for each block of a frame; None: the number follows the reported
+    loss. Public: `bit_rate_limit_bps`, the receiver's limit for the encoder, or None.
     """
 
     def __init__(self, packetizer: Packetizer, repairs: RepairSender, repair_packets: int | None = None) -> None:
@@ -42,19 +42,19 @@ class StreamSender:
         self.forget_receiver()
 
     def forget_receiver(self) -> None:
-        """Discard the feedback of the previous receiver, since another one begins."""
+        """Discard the feedback of the previous receiver, because the next feedback can come from another one."""
         self.bit_rate_limit_bps: int | None = None
         self._redundancy = RedundancyController()
         self._reported: ReceptionReport | None = None
         self._reference: tuple[ReferenceTime, int] | None = None
-        """The last reference time without an answer, and when it arrived."""
+        """The last reference time of the receiver that was not answered yet, and when it arrived."""
 
-    def packets(self, access_unit: bytes, stamp_ns: int, now: Now) -> FramePackets:
+    def make_packets(self, access_unit: bytes, stamp_ns: int, now: Now) -> FramePackets:
         """Return the datagrams of a frame that was stamped at `stamp_ns` of the wall clock."""
         timestamp = rtp_timestamp(stamp_ns)
         media = self._packetizer.packetize(access_unit, timestamp)
         count = self._redundancy.repair_packets(now.mono_ns) if self._repair_packets is None else self._repair_packets
-        repair = self._repairs.repair(media, count) if count else []
+        repair = self._repairs.make_repair_packets(media, count) if count else []
         self._packets += len(media)
         self._octets += sum(map(len, media)) - RTP_HEADER_BYTES * len(media)
         report = []
@@ -76,7 +76,7 @@ class StreamSender:
             self._reference = feedback.reference_times[-1], now_ns
 
     def _report(self, now: Now) -> bytes:
-        """Write a sender report: the current wall time and the RTP timestamp of it (RFC 3550, section 6.4.1)."""
+        """Write a sender report: the current wall time and its RTP timestamp (RFC 3550, section 6.4.1)."""
         answers = []
         if self._reference is not None:
             reference, arrived_ns = self._reference
@@ -94,7 +94,7 @@ class StreamSender:
         )
 
     def _note_loss(self, report: ReceptionReport, now_ns: int) -> None:
-        """Note the losses between two reports; the first report and reports out of order add none."""
+        """Note the losses since the previous report; the first report and a report out of order give none."""
         previous, self._reported = self._reported, report
         if previous is None:
             return
@@ -102,11 +102,11 @@ class StreamSender:
         if 0 < expected < 2**31:
             lost = min(max(report.cumulative_lost - previous.cumulative_lost, 0), expected)
             self._redundancy.note_loss(lost, expected, now_ns)
-        elif expected:  # out of order: the newer report stays the one to compare with
+        elif expected:  # out of order: the next report is compared with the newer one
             self._reported = previous
 
 
 def _payload_bit_rate_bps(limit: BitRateLimit) -> int:
-    """Return the bit rate of the payload within a limit that counts the headers of each packet."""
+    """Return a limit for the payload alone, from a limit that includes the headers of each packet."""
     payload_bytes = MAX_PACKET_BYTES - RTP_HEADER_BYTES
     return limit.bit_rate_bps * payload_bytes // (payload_bytes + limit.overhead_bytes)
