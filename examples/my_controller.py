@@ -2,7 +2,8 @@
 
 python examples/my_controller.py [DIRECTORY]
 
-A package can register a controller for every `lavt` command, here as `controller.kind: stanley`, with an entry point:
+A package can register a controller with an entry point. Every `lavt` command then accepts, in this example,
+`controller.kind: stanley`:
 
     [project.entry-points."lavt.controllers"]
     stanley = "my_package:Stanley"
@@ -32,13 +33,13 @@ class Stanley:
         self._preset, self._wheelbase_m = preset, wheelbase_m
 
     def decide(self, lane: Lane, speed_mps: float, now_ns: int) -> Decision:
-        """Return wheel angle and pedals for the newest lane (vehicle frame, left positive) and speed."""
+        """Return wheel angle, pedals and path for the newest lane (vehicle frame, left positive) and speed."""
         del now_ns
         c0, c1, c2 = lane.centre
-        # The lane's centre is y = c0 + c1 x + c2 x^2 from the rear axle; both errors are those of the front axle.
-        error_m = c0 + (c1 + c2 * self._wheelbase_m) * self._wheelbase_m
-        heading_rad = math.atan(c1 + 2 * c2 * self._wheelbase_m)
-        steering_rad = heading_rad + math.atan2(self.gain_per_s * error_m, max(speed_mps, 1.0))
+        # The lane's centre is y = c0 + c1 x + c2 x^2, with x = 0 at the rear axle and x = wheelbase at the front axle.
+        lateral_error_m = c0 + (c1 + c2 * self._wheelbase_m) * self._wheelbase_m
+        heading_error_rad = math.atan(c1 + 2 * c2 * self._wheelbase_m)
+        steering_rad = heading_error_rad + math.atan2(self.gain_per_s * lateral_error_m, max(speed_mps, 1.0))
         limit_rad = self._preset.steering_limit_rad
         throttle = 0.0 if lane.confidence < 0.2 else min(max(self._preset.speed_mps - speed_mps, 0.0), 1.0)
         path_per_m = (2 * c2,) * PATH_POINTS  # the vehicle follows this path after a command timeout

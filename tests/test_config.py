@@ -284,6 +284,18 @@ def test_bad_values_are_rejected(kind: type[Section], text: str, reason: str, tm
     assert "my.yaml" in sentence
 
 
+@pytest.mark.parametrize("text", ["1e-2", "2e-5", "1E1"])
+def test_suggested_numbers_are_numbers_in_yaml(text: str, tmp_path: Path) -> None:
+    """For a number that YAML reads as text, the error suggests the same number as YAML reads it."""
+    _, _, suggestion = rejection(f"video: {{buffer_ms: {text}}}", tmp_path).rpartition("write ")
+    assert parse_yaml(suggestion, "the suggestion") == float(text)
+
+
+def test_words_are_not_suggested_as_numbers(tmp_path: Path) -> None:
+    """A word that Python would read as a number that is not finite gives the ordinary error."""
+    assert "YAML reads" not in rejection("video: {buffer_ms: nan}", tmp_path)
+
+
 def test_all_errors_are_reported_together(tmp_path: Path) -> None:
     """All errors of a config are reported in one sentence."""
     sentence = rejection("seed: -1\ncamera: {width: 1, rate_hz: 0}", tmp_path)

@@ -1,4 +1,4 @@
-"""The table of all channels: who sends and receives each, what carries its messages, and how they wait."""
+"""The table of all channels: the sender and the receivers of each, its carrier, and how its messages wait."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 Carrier = Literal["local", "video", "zenoh", "probe", "clock", "netem", "record"]
-"""local: between nodes of one side. video: the UDP flow of the video. zenoh: a key or a query. probe: the UDP flow of
-the clock probes. clock: the host's time source. netem: the host's network queues. record: recorded only, without a
+"""local: between nodes of one side. video: the UDP flow of the video. zenoh: a Zenoh key or query. probe: the UDP flow
+of the clock probes. clock: the host's time source. netem: the host's network queues. record: the record only, no
 receiver."""
 
 Waiting = Literal["queue", "newest"]
@@ -17,9 +17,9 @@ waiting one."""
 QUEUE_LENGTH = 4096
 """More than a second of packets."""
 COMMAND_QUEUE_LENGTH = 64
-"""The commands of a second: older ones would be rejected anyway."""
+"""More than the commands of a second; older commands would be rejected anyway."""
 PROBE_QUEUE_LENGTH = 64
-"""A probe that waits behind more than a few others measures little but its own wait."""
+"""A probe that waits behind many other probes measures mainly its wait in this queue."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,8 +33,8 @@ class Channel:
     length: int = QUEUE_LENGTH
     """Capacity of the queue."""
     inline: bool = False
-    """In real time, the thread that delivers a message runs the receiver's pipeline; this suits short and frequent
-    pipelines."""
+    """Whether the thread that delivers a message in real time also runs the receiver's pipeline; for pipelines that are
+    short and run often."""
 
 
 CHANNELS: dict[str, Channel] = {
@@ -42,8 +42,8 @@ CHANNELS: dict[str, Channel] = {
     "pose": Channel("local", "actuator", ("camera",), "newest", inline=True),
     "frame": Channel("local", "camera", ("actuator",), inline=True),
     "video_token": Channel("local", "actuator", ("camera",)),
-    # Whether the vehicle is stationary, and who has control. It waits in a queue, because queues are served first: a
-    # flood of requests would delay a status that waits as "newest".
+    # Whether the vehicle is stationary, and who has control. These messages wait in a queue, because an inbox serves
+    # its queues first: a flood of requests would delay messages that wait as "newest".
     "rest": Channel("local", "actuator", ("injection",)),
     "server_ends": Channel("local", "operator", ("actuator",)),  # stops the vehicle before a server shutdown
     # client, between its nodes
@@ -54,8 +54,9 @@ CHANNELS: dict[str, Channel] = {
     "path_token": Channel("local", "driver", ("receiver",)),
     "condition_in_force": Channel("local", "injection", ("driver",), "newest"),
     # across the network
-    "rtp": Channel("video", "camera", ("receiver",), inline=True),  # RTP, sender reports, challenges: server to client
-    "feedback": Channel("video", "receiver", ("camera",)),  # RTCP, hellos: client to server
+    # server to client: RTP, sender reports, and challenges, to which the client must answer to prove its address
+    "rtp": Channel("video", "camera", ("receiver",), inline=True),
+    "feedback": Channel("video", "receiver", ("camera",)),  # client to server: RTCP, hellos, answers to challenges
     "control": Channel("zenoh", "driver", ("actuator",), length=COMMAND_QUEUE_LENGTH),
     "state": Channel("zenoh", "actuator", ("driver",), "newest"),
     "session": Channel("zenoh", "driver", ("actuator",), length=COMMAND_QUEUE_LENGTH),

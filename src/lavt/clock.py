@@ -19,14 +19,14 @@ class Clock(Protocol):
 
 
 def _shortest_gap_ns() -> int:
-    """Return the shortest time between two readings on this machine."""
+    """Return the shortest measured time between two readings of a clock on this machine."""
     readings_ns = [time.monotonic_ns() for _ in range(10)]
-    return min(late_ns - early_ns for early_ns, late_ns in pairwise(readings_ns))
+    return min(second_ns - first_ns for first_ns, second_ns in pairwise(readings_ns))
 
 
 SIMULTANEOUS_NS = max(100_000, 3 * _shortest_gap_ns())
-"""Two readings within this time count as simultaneous. It depends on the machine, because a reading takes more than
-50 us on a kernel that runs in user mode."""
+"""Two readings that are at most this far apart are treated as simultaneous. The value depends on the machine: on a
+kernel that runs in user mode, one reading takes more than 50 us."""
 MAX_ATTEMPTS = 4
 
 
@@ -34,7 +34,7 @@ class MachineClock:
     """The clocks of this machine."""
 
     def now(self) -> Now:
-        """Return a simultaneous reading of both clocks; repeat an interrupted one, up to `MAX_ATTEMPTS` in all."""
+        """Return simultaneous readings of both clocks; if interrupted, try again, with at most `MAX_ATTEMPTS` tries."""
         mono_ns = time.monotonic_ns()
         for _ in range(MAX_ATTEMPTS):
             wall_ns = time.time_ns()
@@ -45,8 +45,8 @@ class MachineClock:
 
 
 def suspended_ns() -> int:
-    """Return for how long this machine has been suspended since its start; an interrupted call returns less."""
-    boot_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)  # read first, so that an interruption makes the result less
+    """Return how long this machine has been suspended since its start; an interruption lowers the result."""
+    boot_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)  # read first, so that an interruption cannot raise the result
     return boot_ns - time.monotonic_ns()
 
 
@@ -56,9 +56,9 @@ def pause(duration_ns: int) -> None:
         time.sleep(duration_ns / NS_PER_S)
 
 
-def wall_time_ns(calendar_time: str) -> int:
-    """Return the wall clock time of a date and time in ISO 8601; raise `ValueError` without an offset from UTC."""
-    moment = datetime.fromisoformat(calendar_time)
+def wall_time_ns(iso_text: str) -> int:
+    """Return the wall clock time of a date and time in ISO 8601; raise `ValueError` if it has no offset from UTC."""
+    moment = datetime.fromisoformat(iso_text)
     if moment.tzinfo is None:
         raise ValueError("no offset from UTC")
     return round(moment.timestamp()) * NS_PER_S

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import functools
+import math
 import typing
 from collections.abc import Iterable, Mapping
 from importlib import resources
@@ -27,7 +28,7 @@ Config = TypeVar("Config", bound=Section)
 
 
 def find_file(file: Path) -> Path:
-    """Return the file itself if it exists, otherwise the shipped file of that name."""
+    """Return `file` if it exists, otherwise the shipped file of that name."""
     return file if file.exists() else shipped(str(file))
 
 
@@ -77,7 +78,7 @@ def split_change(change: str) -> tuple[list[str], Any]:
 
 
 def parse_config(kind: type[Config], data: Mapping[str, Any], source: str) -> Config:
-    """Validate `data` against the schema of `kind`; `source` is the origin of the data, which errors name."""
+    """Validate `data` against the schema of `kind`; the message of an error names `source`, the origin of the data."""
     try:
         return kind.model_validate(_with_tuples(kind, data))
     except ValidationError as error:
@@ -86,13 +87,13 @@ def parse_config(kind: type[Config], data: Mapping[str, Any], source: str) -> Co
 
 @functools.cache
 def conditions() -> Mapping[str, Condition]:
-    """Return all conditions of `netem/conditions.yaml`, which is read once."""
+    """Return all network conditions by name, from `netem/conditions.yaml`; the file is read once."""
     path = shipped("netem/conditions.yaml")
     return {name: parse_config(Condition, entry, f"{path}: {name}") for name, entry in read_yaml(path).items()}
 
 
 def condition(name: str) -> Condition:
-    """Return the condition of a name; raise `UserError` with the known names for an unknown one."""
+    """Return the network condition `name`; if it is unknown, raise `UserError` with the known names."""
     known = conditions()
     if name not in known:
         raise UserError(f"unknown condition {name!r}: choose one of {', '.join(known)}")
@@ -134,7 +135,7 @@ def _describe(kind: type[BaseModel], problem: Any) -> str:
     if problem["type"] == "missing":
         return f"{key!r} is missing"
     if problem["type"] == "float_type" and (number := _parse_float(problem["input"])) is not None:
-        return f"{key!r}: YAML reads {problem['input']} as text: write {problem['input']} as {number!r}"
+        return f"{key!r}: YAML reads {problem['input']} as text: write {_yaml_float(number)}"
     # Pydantic puts "Value error, " before the messages of LAVT's validators.
     message = str(problem["msg"]).removeprefix("Value error, ")
     if not key:  # a validator that checks several keys together
@@ -143,11 +144,21 @@ def _describe(kind: type[BaseModel], problem: Any) -> str:
 
 
 def _parse_float(value: Any) -> float | None:
-    """Return the number in a text such as 1e-05, which YAML reads as text unless it has a decimal point."""
+    """Return the finite number in a text such as "1e-05"; None for any other value.
+
+    YAML reads such a number as text, because it has no decimal point.
+    """
     try:
-        return float(value) if isinstance(value, str) else None
+        number = float(value) if isinstance(value, str) else math.nan
     except ValueError:
         return None
+    return number if math.isfinite(number) else None
+
+
+def _yaml_float(number: float) -> str:
+    """Return a number as YAML reads it: with a decimal point."""
+    digits, exponent_sign, exponent = repr(number).partition("e")
+    return digits + ("" if "." in digits else ".0") + exponent_sign + exponent
 
 
 def _keys(kind: type[BaseModel], location: Iterable[str]) -> list[str]:

@@ -16,8 +16,8 @@ Picture = NDArray[np.uint8]
 """An image: (height, width, 3), blue green red, 0 to 255."""
 
 FramePayload = Any
-"""The content of a frame from camera to detector: a `Picture` or, if nothing is rendered, a `SeenLane`. Only camera,
-frame codec and detector look into it."""
+"""The content of a frame on its way from camera to detector: a `Picture` or, if nothing is rendered, a `SeenLane`. Only
+camera, frame codec and detector use this content."""
 
 FloatArray = NDArray[np.float64]
 
@@ -37,7 +37,7 @@ class Now(Struct, frozen=True):
     wall_ns: int
 
     def later(self, duration_ns: int) -> Now:
-        """Return the reading that follows after `duration_ns` if the wall clock is not stepped."""
+        """Return the reading at `duration_ns` after this one, if the wall clock is not stepped in between."""
         return Now(self.mono_ns + duration_ns, self.wall_ns + duration_ns)
 
 
@@ -59,7 +59,7 @@ class Actuation(Struct, frozen=True):
 
 
 class VehicleState(Struct, frozen=True):
-    """The reported state of a vehicle, at its own time `mono_ns` on the server's monotonic clock."""
+    """The state that a vehicle reported for the time `mono_ns` of the server's monotonic clock."""
 
     mono_ns: int
     speed_mps: float
@@ -72,7 +72,7 @@ class VehicleState(Struct, frozen=True):
     is_overridden: bool = False
     """Whether the driver in the car has taken over, so that no command reaches the wheels."""
     is_speed_plausible: bool = True
-    """False: `speed_mps` may be wrong, and the car may move even if it is 0; this is a vehicle fault."""
+    """False is a vehicle fault: `speed_mps` can be wrong, so the car can be moving even if `speed_mps` is 0."""
 
 
 class GroundTruth(Struct, frozen=True):
@@ -132,7 +132,8 @@ class CameraModel(Struct, frozen=True):
 class Lane(Struct, frozen=True):
     """The lane detected in one picture, in the vehicle's frame.
 
-    The centre line is y = c0 + c1 x + c2 x^2, x metres ahead of the rear axle, valid from `near_m` to `far_m`.
+    The centre line is y = c0 + c1 x + c2 x^2 for x between `near_m` and `far_m` ahead of the rear axle; `centre` is
+    (c0, c1, c2).
     """
 
     centre: tuple[float, float, float]
@@ -192,7 +193,7 @@ class Command(Struct, frozen=True):
 
 
 class State(Struct, frozen=True):
-    """The state that the vehicle's side publishes 50 times a second."""
+    """The state that the server publishes 50 times a second."""
 
     sent_wall_ns: int
     state_mono_ns: int
@@ -206,7 +207,7 @@ class State(Struct, frozen=True):
     applied_sequence: int
     """Sequence number of the last accepted command; -1: none in this epoch."""
     rejected: str
-    """Why the last rejected command was rejected, for 1 s after the rejection; otherwise empty."""
+    """Reason for the last rejection of a command, for 1 s after the rejection; then empty."""
     limited: str = ""
     """Names of the limits that changed the last accepted command; empty: no limit changed it."""
     active_operator: str = ""

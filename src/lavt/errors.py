@@ -3,7 +3,7 @@
 LavtError
 ├── UserError            wrong input: a sentence with the error and its remedy; exit code 2
 ├── WorkError            the work failed with valid input; exit code 1
-├── PeerError            an error of the peer or the network: counted and dropped, never fatal
+├── PeerError            invalid bytes from the network: counted and dropped, never fatal
 │   ├── BadMessage       bytes that are not a LAVT message, or a value out of range
 │   └── BadPacket        a datagram that is not RTP, or whose payload cannot be H.264
 └── VehicleError         a failure of the vehicle or its camera; ends the server

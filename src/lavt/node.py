@@ -1,8 +1,8 @@
-"""The interface of a node: pipelines of stages, without input, output or a clock of its own.
+"""The interface of a node: pipelines of stages, which do no I/O and read no clock.
 
-A runtime passes a message with its arrival time through the stages of a pipeline and sends the result of the last one.
-Each stage gets the time at which it starts as `now`. The runtime also wakes the node at the times that it requests. The
-same node objects run in real and in virtual time.
+A runtime passes a message with its arrival time through the stages of a pipeline, and sends the result of the last
+stage. Each stage gets its start time as `now`. The runtime also wakes a node at the times that the node requests. The
+same nodes run in real and in virtual time.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from msgspec import Struct
 from lavt.domain import Now
 
 Peer = Any
-"""The sender of a message, to which a reply can be sent: an address or a query. Only links look into it."""
+"""The sender of a message, to which a reply can be sent: an address or a Zenoh query. Nodes only pass it on."""
 
 WAKE = "wake"
 """The channel on which a runtime wakes a node; the payload is None."""
 
 
 class Message(Struct, frozen=True):
-    """A message to a node: channel, payload, arrival on this host, and sender."""
+    """A message to a node: channel, payload, arrival time on this host, and sender."""
 
     channel: str
     payload: Any
@@ -50,7 +50,7 @@ the list of `Send`s. If a result has an attribute `stamp_ns`, the end times of t
 
 
 class Node(Protocol):
-    """A part of the control loop, run by a runtime."""
+    """A part of the server or the client, run by a runtime."""
 
     @property
     def name(self) -> str:
@@ -59,7 +59,7 @@ class Node(Protocol):
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """Return the node's counts, which are recorded at the end."""
+        """Return the node's counters by name, which are recorded at the end of the run."""
         ...
 
     @property

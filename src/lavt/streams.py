@@ -27,9 +27,9 @@ def stream(seed: int, name: str, index: int = 0) -> np.random.Generator:
 
 
 class IndexedStream:
-    """The stream `name` of `seed` for many entries; it returns what `stream` does, in a tenth of the time.
+    """The stream `name` of `seed`, for reading many entries: `at` takes a tenth of the time of `stream`.
 
-    The generator that `at` returns is valid until the next call.
+    The generator that `at` returns is valid until the next call of `at`.
     """
 
     def __init__(self, seed: int, name: str) -> None:
@@ -39,7 +39,7 @@ class IndexedStream:
         self._generator = np.random.Generator(self._bits)
 
     def at(self, index: int) -> np.random.Generator:
-        """Return the generator of entry `index`."""
+        """Return the same generator as `stream` for entry `index`."""
         self._counter[:] = (0, 0, index & (2**64 - 1), 0)
         self._bits.state = self._initial_state
         return self._generator

@@ -5,7 +5,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from lavt.doctor.clock_checks import HINTS, ClockComparison, check_host, compare
+from lavt.doctor.clock_checks import HINTS, ClockComparison, check_host, compare_with_server
 from lavt.domain import NS_PER_MS
 from lavt.transport.clock_sync.clock_report import ClockReport
 from lavt.transport.clock_sync.probe import ClockProbe, ProbeReply
@@ -48,7 +48,7 @@ def compare_clocks(
 ) -> ClockComparison:
     """Compare the clocks with `GOOD`, changed, as the report both before and after the probing."""
     report = msgspec.structs.replace(GOOD, **changes)
-    return compare(report, report, probes(delta_ms, 5.0, round_trip_ms, 9.0), reply, SERVER)
+    return compare_with_server(report, report, probes(delta_ms, 5.0, round_trip_ms, 9.0), reply, SERVER)
 
 
 def test_a_good_clock() -> None:
@@ -95,7 +95,7 @@ def test_a_client_that_follows_another_host() -> None:
 def test_a_clock_that_is_corrected_during_the_probing() -> None:
     """The estimate uses the correction after the probing; the bound includes its change during the probing."""
     before = msgspec.structs.replace(GOOD, correction_s=0.251)
-    finding = compare(before, GOOD, probes(250.0, 0.3), REPLY, SERVER)
+    finding = compare_with_server(before, GOOD, probes(250.0, 0.3), REPLY, SERVER)
     assert finding.sources is not None
     assert [finding.sources.ms, finding.sources.bound_ms] == pytest.approx([250.0, 1.0 + PATH_BOUND_MS])
 
@@ -103,7 +103,7 @@ def test_a_clock_that_is_corrected_during_the_probing() -> None:
 def test_a_source_without_an_estimate_before_the_probing() -> None:
     """If the time source has no estimate before the probing, Delta is from the probe alone, and a fix is suggested."""
     before = ClockReport(0, 0, "desk", "chrony", status="chrony is not synchronised")
-    finding = compare(before, GOOD, probes(250.0, 0.3), REPLY, SERVER)
+    finding = compare_with_server(before, GOOD, probes(250.0, 0.3), REPLY, SERVER)
     assert (finding.good, finding.sources) == (True, None)
     assert "`lavt clock` again" in finding.says[1]
 
@@ -146,9 +146,9 @@ def test_a_probe_with_a_long_round_trip() -> None:
 def test_a_probe_with_a_clock_step_is_ignored() -> None:
     """A probe with a negative round trip is ignored; without other probes the result is not good."""
     stepped = ClockProbe(9, 0, 250 * NS_PER_MS, 250 * NS_PER_MS, -999 * NS_PER_MS)
-    finding = compare(GOOD, GOOD, [*probes(250.0, 0.3), stepped], REPLY, SERVER)
+    finding = compare_with_server(GOOD, GOOD, [*probes(250.0, 0.3), stepped], REPLY, SERVER)
     assert finding.good
-    assert finding == compare(GOOD, GOOD, probes(250.0, 0.3), REPLY, SERVER)
-    alone = compare(GOOD, GOOD, [stepped], REPLY, SERVER)
+    assert finding == compare_with_server(GOOD, GOOD, probes(250.0, 0.3), REPLY, SERVER)
+    alone = compare_with_server(GOOD, GOOD, [stepped], REPLY, SERVER)
     assert (alone.good, alone.probe) == (False, None)
     assert len(alone.says) == 1

@@ -1,1 +1,1 @@
-"""The construction of objects from configs; the layers below see no config."""
+"""The construction of nodes, links and vehicles from configs; the packages below read no config."""

@@ -1,8 +1,8 @@
-"""The actuator in a process of its own, which stops the vehicle when the server's process is frozen or killed.
+"""The actuator in a separate process, which stops the vehicle when the server's process is frozen or killed.
 
-The server's process renders, encodes and sends pictures. Whatever happens to it, the actuator's process keeps running,
-detects the command timeout, and stops the vehicle. If the actuator's process itself is frozen, it sends no CAN frames,
-and the watchdog of the kit in the vehicle brakes.
+The server's process renders, encodes and sends pictures. If that process fails, the actuator's process keeps running,
+detects the command timeout, and stops the vehicle. If the actuator's process is frozen, no CAN frames are sent, and the
+watchdog of the kit in the vehicle brakes.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ from lavt.vehicle.dbw.vehicle import DbwVehicle
 NAME = "actuator"
 READY_TIMEOUT_S = 30.0
 STOP_TIMEOUT_S = 12.0
-"""How long the vehicle may take to stop and disengage when the server ends. If its speed was implausible, it brakes for
-at least 8 s."""
+"""The maximum time for stopping and disengaging the vehicle when the server ends. A vehicle whose speed is implausible
+brakes for at least 8 s."""
 POLL_PERIOD_S = 0.05
 KILL_AFTER_S = 13
-"""This long after the server's end, the process is killed by its own alarm, even if its node is stuck by then."""
+"""This many seconds after the server's end, an alarm kills the actuator's process, even if its node is stuck."""
 IGNORED_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Signals that all processes of a terminal or service receive. The server's process handles them; this process detects
 that the server's process ends."""
@@ -70,7 +70,7 @@ class ActuatorProcess(RemoteNodeProxy):
         """Stop the vehicle, disengage, and wait for the end of the process."""
         self.close(STOP_TIMEOUT_S + 2)
         self._process.join(1)
-        if self._process.is_alive():  # it is frozen: it sends no CAN frames, and the kit brakes by itself
+        if self._process.is_alive():  # a frozen process: it sends no CAN frames, so the kit brakes by itself
             self._process.kill()
 
 
@@ -84,19 +84,19 @@ def _record_silence(runtime: RealRuntime) -> None:
 def start_actuator(config: ServerConfig, *, host: str, video_port: int) -> ActuatorProcess:
     """Start the process; raise its start-up error, which is a `UserError` for invalid input."""
     context = multiprocessing.get_context("spawn")
-    own_end, actuator_end = context.Pipe()
+    server_end, actuator_end = context.Pipe()
     process = context.Process(target=serve_actuator, args=(actuator_end, config, host, video_port), name=NAME)
     process.start()
     actuator_end.close()
     try:
-        error = own_end.recv() if own_end.poll(READY_TIMEOUT_S) else "it did not become ready in time"
+        error = server_end.recv() if server_end.poll(READY_TIMEOUT_S) else "it did not become ready in time"
     except EOFError:
         error = "it ended"
     except BaseException:  # such as Ctrl-C during the start
         process.kill()
         raise
     if error is None:
-        return ActuatorProcess(process, own_end)
+        return ActuatorProcess(process, server_end)
     process.kill()
     if isinstance(error, UserError):
         raise error
@@ -108,7 +108,7 @@ def serve_actuator(connection: Connection, config: ServerConfig, host: str, vide
     for signal_number in IGNORED_SIGNALS:
         signal.signal(signal_number, signal.SIG_IGN)
     queue_output("stdout", "stderr")
-    os.setsid()  # a session that the kernel schedules apart from the server's
+    os.setsid()  # the kernel schedules this process in a group of its own, apart from the server's
     process_priority.raise_priority(process_priority.VEHICLE_NICENESS)
     if reason := process_priority.request_realtime():
         log.warning("other programs may delay the process of the %s: %s", NAME, reason)
@@ -120,7 +120,7 @@ def serve_actuator(connection: Connection, config: ServerConfig, host: str, vide
         node = build_actuator(
             config, vehicle, MachineEntropy(), start, host=host, video_port=video_port, route=driven_route(config)
         )
-    except Exception as error:  # the server's process reports it, whatever it is
+    except Exception as error:  # the server's process reports every error
         connection.send(error if isinstance(error, UserError) else f"{type(error).__name__}: {error}")
         return
     process_priority.limit_realtime()
@@ -146,5 +146,5 @@ def _wait_until_disengaged(node_host: NodeHost, vehicle: DbwVehicle, clock: Cloc
     never_set = threading.Event()
     while clock.now().mono_ns < end_ns and not node_host.runtime.stopped.is_set():
         never_set.wait(POLL_PERIOD_S)
-        if vehicle.is_silent:  # no commands are sent to the kit: it is released, or a driver overrides it
+        if vehicle.is_silent:  # no commands are sent: the kit is disengaged, or a driver overrides it
             return

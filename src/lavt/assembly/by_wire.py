@@ -54,7 +54,7 @@ def open_by_wire(config: ServerConfig, clock: Clock) -> DbwVehicle:
 
 
 def listen(config: ServerConfig, clock: Clock, duration_ns: int) -> tuple[int, str]:
-    """Listen to the configured bus without sending; return the number of frames, and why driving is inhibited.
+    """Listen to the configured bus without sending; return the number of frames, and the inhibit reason.
 
     Raises `UserError` for an invalid profile and for a bus that cannot be opened.
     """
@@ -64,28 +64,28 @@ def listen(config: ServerConfig, clock: Clock, duration_ns: int) -> tuple[int, s
     now = clock.now()
     reason = inhibit_reason_of(config, profile, now.wall_ns)
     adapter = ByWireAdapter(profile, start_ns=now.mono_ns, inhibit_reason=reason)
-    frames, end_ns = 0, now.mono_ns + duration_ns
+    frame_count, end_ns = 0, now.mono_ns + duration_ns
     try:
         while (now_ns := clock.now().mono_ns) < end_ns:
             for received in port.take(now_ns):
                 adapter.receive(received.frame, now_ns)
-                frames += 1
+                frame_count += 1
             pause(POLL_PERIOD_NS)
     except BusGone as error:
-        return frames, str(error)
+        return frame_count, str(error)
     finally:
         port.close()
-    adapter.frames_due(end_ns)  # none are due; the reports' ages are judged again
-    return frames, adapter.state().inhibit_reason
+    adapter.frames_due(end_ns)  # called to check the ages of the reports again; no frame is due
+    return frame_count, adapter.state().inhibit_reason
 
 
 def is_simulated(config: DbwConfig) -> bool:
-    """Return whether the car must be a software car: it sends ground truth, and its bus stays on this machine."""
+    """Return whether the car is a software car: the address of its ground truth is known, and its bus is virtual."""
     return bool(config.truth) and is_virtual(config.interface, config.channel, config.options)
 
 
 def capabilities_of(profile: Profile, *, simulated: bool, truth: bool) -> Capabilities:
-    """Return the capabilities of a car with a kit, as its profile gives them."""
+    """Return the capabilities of a car with a kit, from the kit's profile."""
     car, limits = profile.car, profile.limits
     return Capabilities(
         simulated=simulated,
@@ -101,7 +101,7 @@ def capabilities_of(profile: Profile, *, simulated: bool, truth: bool) -> Capabi
 
 
 def inhibit_reason_of(server: ServerConfig, profile: Profile, wall_ns: int) -> str:
-    """Return why the vehicle must not be armed with this config at `wall_ns`; empty if it may."""
+    """Return why the vehicle must not be armed with this config at `wall_ns`; empty: arming is allowed."""
     config = server.vehicle.dbw
     is_real = not is_virtual(config.interface, config.channel, config.options)
     if is_real and not server.security.key:

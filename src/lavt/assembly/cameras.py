@@ -45,7 +45,7 @@ CAMERAS: dict[str, Callable[[ServerConfig], Camera | None]] = {SIMULATED: lambda
 
 
 def build_camera(config: ServerConfig) -> Camera | None:
-    """Build the configured camera, or return None for the simulator's own. Raise `UserError` for an unknown source."""
+    """Build the configured camera, or return None for the simulator's; raise `UserError` for an unknown source."""
     source = config.camera.source
     if source in CAMERAS:
         return CAMERAS[source](config)
@@ -56,7 +56,7 @@ def build_camera(config: ServerConfig) -> Camera | None:
     return build(config)
 
 
-def check_own_camera(config: ServerConfig) -> None:
+def check_simulated_camera(config: ServerConfig) -> None:
     """Raise `UserError` if a vehicle that renders its own pictures is configured with another camera."""
     if config.camera.source != SIMULATED:
         raise UserError(
@@ -83,7 +83,7 @@ def camera_model(config: CameraConfig) -> CameraModel:
 def calibrated_camera(config: CalibrationConfig) -> CalibratedCamera:
     """Return the camera of a calibration."""
     centre_px = ((config.width_px - 1) / 2, (config.height_px - 1) / 2)
-    if config.field_of_view_deg is None:  # then the four keys below are set, which the schema checks
+    if config.field_of_view_deg is None:  # the schema ensures that fx_px, fy_px, cx_px and cy_px are then set
         focal_px = (config.fx_px or 0.0, config.fy_px or 0.0)
         centre_px = (config.cx_px or 0.0, config.cy_px or 0.0)
     else:
@@ -118,7 +118,7 @@ def camera_of_file(path: Path) -> CalibratedCamera:
 
 
 def client_camera(config: ClientCameraConfig) -> CalibratedCamera:
-    """Return the camera of a client's config: from the calibration file that it names, otherwise from its keys."""
+    """Return the camera of a client's config: from the calibration file, if the config names one, or from its keys."""
     if not config.calibration:
         return calibrated(camera_model(config))
     path = Path(config.calibration)

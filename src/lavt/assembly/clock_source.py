@@ -1,4 +1,4 @@
-"""The construction of the time source, which is queried once a second for the error of this machine's clock."""
+"""The construction of the time source, which reports the error of this machine's clock once a second."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lavt.transport.clock_sync.ptp import read_ptp
 MS_PER_S = 1000.0
 
 
-def query_process(config: ClockConfig) -> PersistentProcess:
+def build_query_process(config: ClockConfig) -> PersistentProcess:
     """Return the process that runs the commands of the configured time source; the caller closes it."""
     return Chronyc() if config.source == "chrony" else Shell()
 
@@ -22,7 +22,7 @@ def query_process(config: ClockConfig) -> PersistentProcess:
 def clock_source(config: ClockConfig, clock: Clock, run: Run) -> Callable[[], ClockReport | None]:
     """Return a function that queries the configured time source and returns None on timeout.
 
-    `run` is the method `run` of the process that `query_process` returns.
+    `run` is the method `run` of the process that `build_query_process` returns.
     """
 
     def external() -> ClockReport:

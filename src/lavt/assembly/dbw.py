@@ -59,10 +59,10 @@ def shipped_profiles() -> dict[str, Path]:
 
 
 def load_profile(name_or_path: str, dbc: str = "", steering_sign: Literal[1, -1] | None = None) -> Profile:
-    """Load a profile by its name or path, and check it against the file `dbc`, or by default against its own DBC.
+    """Load a profile by its name or path, and check it against the file `dbc`, or by default the DBC that it names.
 
-    The suffix `:remote` or `:user` of the name selects the set of commands. `steering_sign` is only for a profile
-    without a sign. Raises `UserError` for a missing or invalid file, and if profile and DBC do not match.
+    The suffix `:remote` or `:user` of the name selects the command set. `steering_sign` is only for a profile without a
+    sign. Raises `UserError` for a missing or invalid file, and if profile and DBC do not match.
     """
     config, codec = read_profile(name_or_path, dbc)
     sign = _steering_sign(config, steering_sign, name_or_path)
@@ -103,7 +103,7 @@ def _dbc_path(path: Path, config: ProfileConfig, dbc: str) -> Path:
 
 
 def _split_suffix(name_or_path: str) -> tuple[str, CommandSet | None]:
-    """Split a profile's name into the name proper and the set of commands, which is None without a suffix."""
+    """Split off the suffix: return the name or path without it, and the command set (None without a suffix)."""
     name, _, suffix = name_or_path.rpartition(":")
     for command_set in get_args(CommandSet):
         if name and suffix == command_set:
@@ -119,15 +119,15 @@ def _steering_sign(config: ProfileConfig, configured: Literal[1, -1] | None, nam
 
 
 class _ProfileBuilder:
-    """A builder of a profile from its config and DBC; it notes every signal that the profile uses."""
+    """A builder of a profile from its config and DBC, which also collects the signals that the profile uses."""
 
     def __init__(self, config: ProfileConfig, codec: Codec, name: str) -> None:
         self.config, self.codec, self.name = config, codec, name
-        self.is_unverified: dict[str, bool] = {}
-        """For each signal in use (`message.signal`), whether its layout is unverified."""
+        self.used_signals: dict[str, SignalFacts] = {}
+        """The signals that the profile uses, by `message.signal`."""
 
     def build(self) -> Profile:
-        """Return the profile."""
+        """Build the profile."""
         config = self.config
         reports = {
             report.message: self._report(part, report)
@@ -151,8 +151,8 @@ class _ProfileBuilder:
             reports=reports,
             watchdog=self._watchdog(),
             speeds_per_mps=speeds_per_mps,
-            angle_per_deg=self._unit_of(reports, "angle", IN_DEGREES),
-            unverified=tuple(name for name, is_unverified in self.is_unverified.items() if is_unverified),
+            angle_per_deg=self._reported_factor(reports, "angle", IN_DEGREES),
+            unverified=tuple(name for name, signal in self.used_signals.items() if signal.is_unverified),
             codec=self.codec,
         )
 
@@ -160,7 +160,7 @@ class _ProfileBuilder:
         message = self._message(command.message)
         value = self._signal(message, command.value)
         units, limits = (IN_DEGREES if axis == "steering" else IN_FRACTIONS), self.config.limits
-        per_unit = self._unit(value, message, units)
+        per_unit = self._signal_factor(value, message, units)
         limit = limits.steering_wheel_deg if axis == "steering" else getattr(limits, axis)
         for extreme in (limit, -limit if axis == "steering" else 0.0):
             self._check_range(message, value, extreme * per_unit)
@@ -190,10 +190,10 @@ class _ProfileBuilder:
     def _rate(self, message: MessageFacts, command: CommandConfig) -> float:
         """Return the commanded rate: the limit, rounded down to a multiple of the signal's step.
 
-        Raise `UserError` if that is 0, which may select the kit's default rate.
+        Raise `UserError` if this rate is 0, because a kit can treat 0 as a request for its default rate.
         """
         signal = self._signal(message, command.rate)
-        per_degps = self._unit(signal, message, IN_DEGREES_PER_SECOND) / command.rate_unit_degps
+        per_degps = self._signal_factor(signal, message, IN_DEGREES_PER_SECOND) / command.rate_unit_degps
         limit = min(self.config.limits.steering_wheel_rate_degps * per_degps, signal.maximum)
         steps = math.floor(limit / signal.scale + 1e-9)
         if steps < 1:
@@ -296,7 +296,7 @@ class _ProfileBuilder:
         return self.codec.messages[selected]
 
     def _select_set(self, value: Choice | dict[CommandSet, Choice], where: str) -> Choice:
-        """Return the value for the profile's set of commands."""
+        """Return the value for the profile's command set."""
         if not isinstance(value, dict):
             return value
         command_set = self.config.commands
@@ -309,7 +309,7 @@ class _ProfileBuilder:
             raise UserError(
                 f"{self.name}: {message.name} of its DBC has no signal {name!r}: change the profile, or name another"
             )
-        self.is_unverified[f"{message.name}.{name}"] = message.signals[name].is_unverified
+        self.used_signals[f"{message.name}.{name}"] = message.signals[name]
         return message.signals[name]
 
     def _optional_signal(self, message: MessageFacts, name: str) -> str:
@@ -328,7 +328,7 @@ class _ProfileBuilder:
                 )
         return name
 
-    def _unit(self, signal: SignalFacts, message: MessageFacts, units: Mapping[str, float]) -> float:
+    def _signal_factor(self, signal: SignalFacts, message: MessageFacts, units: Mapping[str, float]) -> float:
         """Return the factor that `units` has for the unit of a signal."""
         if signal.unit not in units:
             raise UserError(
@@ -337,20 +337,20 @@ class _ProfileBuilder:
             )
         return units[signal.unit]
 
-    def _unit_of(self, reports: Mapping[str, ReportSpec], value: str, units: Mapping[str, float]) -> float:
+    def _reported_factor(self, reports: Mapping[str, ReportSpec], value: str, units: Mapping[str, float]) -> float:
         """Return the factor that `units` has for the unit of a reported value."""
         name, report = next((name, report) for name, report in reports.items() if value in report.values)
         message = self.codec.messages[name]
-        return self._unit(message.signals[report.values[value]], message, units)
+        return self._signal_factor(message.signals[report.values[value]], message, units)
 
     def _speed_units(self, reports: Mapping[str, ReportSpec]) -> dict[str, float]:
-        """Return the signal value of 1 m/s for each reported speed; the speed of a wheel is converted by its radius."""
+        """Return, for each reported speed, the signal value that means 1 m/s; for wheels, `wheel_radius_m` converts."""
         reported = {value for report in reports.values() for value in report.values}
         radius_m = self.config.vehicle.wheel_radius_m
         return {
-            speed: self._unit_of(reports, speed, IN_RADIANS_PER_SECOND) / radius_m
+            speed: self._reported_factor(reports, speed, IN_RADIANS_PER_SECOND) / radius_m
             if speed in WHEEL_SPEEDS
-            else self._unit_of(reports, speed, IN_METRES_PER_SECOND)
+            else self._reported_factor(reports, speed, IN_METRES_PER_SECOND)
             for speed in SPEEDS
             if speed in reported
         }
@@ -364,15 +364,15 @@ class _ProfileBuilder:
             largest_mps = CONSTANT_WITHIN_MPS if speed == "speed" else STATIONARY_BELOW_MPS
             if step_mps > largest_mps:
                 raise UserError(
-                    f"{self.name}: {signal.name} of {name} has steps of {step_mps:.3g} m/s, too coarse to check the "
-                    f"speed with: name a signal with steps of at most {largest_mps:g} m/s as {speed}"
+                    f"{self.name}: {signal.name} of {name} has steps of {step_mps:.3g} m/s, which is too coarse to "
+                    f"check the speed: name a signal with steps of at most {largest_mps:g} m/s as {speed}"
                 )
 
     def _check_range(self, message: MessageFacts, signal: SignalFacts, value: float) -> None:
         tolerance = abs(signal.scale) / 2
         if not signal.minimum - tolerance <= value <= signal.maximum + tolerance:
             raise UserError(
-                f"{self.name}: {value:g} is out of range for {signal.name} of {message.name}, which is from "
+                f"{self.name}: {value:g} is out of the range of {signal.name} of {message.name}, "
                 f"{signal.minimum:g} to {signal.maximum:g}: change the limit or the code in the profile"
             )
 
@@ -382,9 +382,9 @@ def _join_or(alternatives: Iterable[str]) -> str:
 
 
 def find_dbw(target: str) -> DbwConfig:
-    """Return the section `vehicle.dbw` of a server's config, or a default section with the named profile.
+    """Return the section `vehicle.dbw` of the server's config `target`, or a default section if `target` is a profile.
 
-    Raises `UserError` for a config whose vehicle is not by wire.
+    Raises `UserError` for a config whose vehicle is not of kind `dbw`.
     """
     path = Path(target)
     if path.suffix not in {".yaml", ".yml"}:
@@ -395,5 +395,5 @@ def find_dbw(target: str) -> DbwConfig:
     vehicle = data.get("vehicle")
     section = vehicle.get("dbw") if isinstance(vehicle, dict) and vehicle.get("kind") == "dbw" else None
     if not isinstance(section, dict):
-        raise UserError(f"{path} has no vehicle of kind dbw with a section dbw: name one that has, or a profile")
+        raise UserError(f"{path} has no section vehicle.dbw of a vehicle of kind dbw: name another config or a profile")
     return parse_config(DbwConfig, section, f"{path}: vehicle.dbw")

@@ -1,4 +1,4 @@
-"""The check of a by-wire profile against its DBC: each mismatch is a sentence that begins with a key of the profile."""
+"""The check of a by-wire profile against its DBC: each mismatch becomes one sentence."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def find_mismatches(config: ProfileConfig, codec: Codec) -> list[str]:
         message = codec.messages.get(message_name)
         if message is None:
             hint = _nearest_hint(message_name, codec.messages)
-            mismatches.append(f"{key}: the DBC has no message {message_name or 'of this set of commands'}{hint}")
+            mismatches.append(f"{key}: the DBC has no message {message_name or 'of this command set'}{hint}")
             continue
         if message.length > MAX_FRAME_BYTES:
             mismatches.append(
@@ -63,9 +63,9 @@ def find_mismatches(config: ProfileConfig, codec: Codec) -> list[str]:
 
 
 def real_bus_inhibit_reasons(profile: Profile) -> list[str]:
-    """Return why a vehicle with this profile may not be armed on a bus that may have a real kit.
+    """Return why a vehicle with this profile must not be armed on a bus that can have a real kit.
 
-    The test of the kit's watchdog is another condition, which is not checked here.
+    Arming also requires a watchdog proof, which is not checked here.
     """
     reasons = []
     if profile.unverified:
@@ -79,7 +79,7 @@ def real_bus_inhibit_reasons(profile: Profile) -> list[str]:
 
 
 def _messages(config: ProfileConfig) -> Iterator[tuple[str, str, list[tuple[str, str]]]]:
-    """Yield all messages that are sent or read: the profile's key, the message's name, and its signals by role."""
+    """Yield all messages that are sent or read: the profile's key, the message's name, and its (role, signal) pairs."""
     sent, reports = config.sent, config.reports
     for name in ("steering", "brake", "throttle", "gear", "system"):
         command: CommandConfig | SystemCommandConfig = getattr(sent, name)
@@ -97,12 +97,12 @@ def _messages(config: ProfileConfig) -> Iterator[tuple[str, str, list[tuple[str,
 
 
 def _report_signals(report: ReportConfig) -> Iterator[tuple[str, str]]:
-    """Yield the signals of a report by role."""
+    """Yield the (role, signal) pairs of a report."""
     for value, signal in report.values.items():
         yield f"values.{value}", signal
-    for group in ("override", "trip", "command_error", "fault"):
-        for condition in getattr(report, group):
-            yield f"{group}.{condition}", condition.partition("=")[0]
+    for kind in ("override", "trip", "command_error", "fault"):
+        for signal_condition in getattr(report, kind):
+            yield f"{kind}.{signal_condition}", signal_condition.partition("=")[0]
     for signal in report.needs:
         yield f"needs.{signal}", signal
     for signal in report.reasons:
@@ -114,7 +114,7 @@ def _report_signals(report: ReportConfig) -> Iterator[tuple[str, str]]:
 
 
 def _message_name(message: str | dict[CommandSet, str], config: ProfileConfig) -> str:
-    """Return the name of a message in the profile's set of commands; empty if the set has none."""
+    """Return the name of a message in the profile's command set; empty if the set has no such message."""
     if isinstance(message, str):
         return message
     return message.get(config.commands, "") if config.commands else ""
@@ -158,15 +158,15 @@ def _check_layouts(uses: Sequence[_SignalUse]) -> Iterator[str]:
 
 
 def _check_multiplexing(uses: Sequence[_SignalUse]) -> Iterator[str]:
-    """Check that a command is sent for exactly one value of its multiplexer, together with its other signals."""
+    """Check that the frames of one multiplexer value have a command's value, and that they have its other signals."""
     for value in uses:
         if value.role != "value" or not value.signal.multiplexer:
             continue
         if len(value.signal.branches) != 1:
             values = ", ".join(map(str, sorted(value.signal.branches)))
             yield (
-                f"{value.key}.value: {value.signal.name} is in the frames of several multiplexer values ({values}): "
-                "which to send is ambiguous"
+                f"{value.key}.value: {value.signal.name} is in the frames of several multiplexer values ({values}), so "
+                "the value to send is ambiguous"
             )
         for other in uses:
             shares_multiplexer = other.key == value.key and other.signal.multiplexer == value.signal.multiplexer
@@ -209,12 +209,15 @@ def _check_codes(config: ProfileConfig, uses: Sequence[_SignalUse]) -> Iterator[
         for statement, code, meaning in _expected_codes(config, use):
             signal = use.signal
             if not signal.minimum <= code <= signal.maximum:
-                yield (f"{use.key}.{use.role}: {statement}, but the maximum of {signal.name} is {signal.maximum:g}")
+                yield (
+                    f"{use.key}.{use.role}: {statement}, which is not in the range of {signal.name}, "
+                    f"{signal.minimum:g} to {signal.maximum:g}"
+                )
             elif signal.names and signal.names.get(code, "").upper() != meaning.upper() and meaning:
                 name = f"is named {signal.names[code]!r}" if code in signal.names else "has no name"
                 yield f"{use.key}.{use.role}: {statement}, but in the DBC the value {code} of {signal.name} {name}"
             elif signal.names and code not in signal.names:
-                yield f"{use.key}.{use.role}: {statement}, for which {signal.name} has no name in the DBC"
+                yield f"{use.key}.{use.role}: {statement}, but in the DBC the value {code} of {signal.name} has no name"
 
 
 def _expected_codes(config: ProfileConfig, use: _SignalUse) -> Iterator[tuple[str, int, str]]:

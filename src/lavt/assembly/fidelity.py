@@ -1,4 +1,4 @@
-"""The fidelities of a run's pictures: coded video, rendered pixels, or only the geometry of the lane."""
+"""The fidelities of a run's frames: coded video, rendered pixels, or only the geometry of the lane."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from lavt.transport.video.h264 import Decoder, Encoder
 
 @dataclass(frozen=True, slots=True)
 class FidelityModel:
-    """The functions that build both sides of the picture path for one fidelity."""
+    """The functions that build the vehicle, and both ends of the video, for one fidelity."""
 
     vehicle_setup: Callable[[ServerConfig], VehicleSetup]
     sender: Callable[[ServerConfig], PictureSender]
@@ -76,4 +76,5 @@ FIDELITIES: dict[str, Callable[[], FidelityModel]] = {
     "pixels": _pixels,
     "geometry": _geometry,
 }
-"""The models by the config's `fidelity`. Each run has its own model, because its two sides may share a codec."""
+"""The models by the config's `fidelity`. Each run gets a new model, because with `pixels` its two sides share a
+codec."""

@@ -34,10 +34,10 @@ def netem_flows(
     protocol: Protocol = "udp",
     state_delay: StateDelay = "none",
 ) -> list[ImpairedFlow]:
-    """Return the flows that a machine of this role impairs under a condition.
+    """Return the flows that a machine of this role sends, with their impairments under a condition.
 
-    `control_port` is the port of the server's router, to which the client's router connects with `protocol`. Flows
-    without an impairment are included, so that another condition can be applied later without packet loss.
+    `control_port` is the port of the server's router, to which the client's router connects with `protocol`. The result
+    includes flows without an impairment, so that another condition can be applied later without packet loss.
     """
     flows = [
         ImpairedFlow("video", "udp", video_port, "source", build_netem_impairment(requested.video_ms, requested.video)),
@@ -88,7 +88,7 @@ def injection_node(config: ServerInjectionConfig, *, simulated: bool, video_port
 def injection_client(config: ClientInjectionConfig, who: str, instance: int, start_ns: int) -> InjectionClient:
     """Build the client's injection node; raise `UserError` for a condition that is unknown or cannot be requested."""
     requested = condition(config.condition) if config.condition else NO_CONDITION
-    # A client sends only control, so that the port of the video does not matter.
+    # A client sends only control, so the port of the video is not used.
     [control] = netem_flows(
         requested, "client", video_port=0, control_port=config.control_port, protocol=config.control_protocol
     )

@@ -18,7 +18,7 @@ MAX_TRACE_BYTES: Final = 50_000_000
 
 
 def link_injection(name: str, delay_ms: float, impairment: ImpairmentConfig, seed: int) -> LinkInjection | None:
-    """Return what a link injects into the flow `name`; None if that is only a constant delay, or nothing.
+    """Return the injection of a link into the flow `name`; None if the flow has at most a constant delay.
 
     Raises `UserError` for contradictory values and for a missing or invalid trace.
     """
@@ -46,7 +46,7 @@ def trace_path(name: str) -> Path:
 
 
 def trace_digests(requested: Condition) -> dict[str, str]:
-    """Return the SHA-256 of each trace of a condition by name; runs record it to show if a file was changed later."""
+    """Return the SHA-256 of each trace of a condition by name; runs record it, so that later changes are detected."""
     names = [flow.trace for flow in (requested.video, requested.control) if flow.trace]
     return {name: sha256(trace_path(name).read_bytes()).hexdigest() for name in names}
 

@@ -97,7 +97,7 @@ def limits_of(config: SafetyConfig, *, simulated: bool) -> Limits:
     )
     if exceeds_defaults and not simulated:
         raise UserError(
-            f"only a simulated vehicle may have safety limits beyond {LIMITS.lateral_acceleration_mps2} m/s2, "
+            f"only a simulated vehicle can have safety limits beyond {LIMITS.lateral_acceleration_mps2} m/s2, "
             f"{LIMITS.picture_age_limit_ns // NS_PER_MS} ms and {LIMITS.stopping_distance_limit_m:.0f} m: lower "
             "safety.lateral_acceleration_mps2, safety.picture_age_limit_ms and "
             "safety.stopping_distance_limit_m"
@@ -115,10 +115,10 @@ def build_server(
     fidelity: FidelityModel = VIDEO,
     lazy_physics: bool = False,
 ) -> ServerNodes:
-    """Build the server's nodes; their start time is read after all slow preparations.
+    """Build the server's nodes; the slow preparations come first, then the start time is read.
 
-    With `lazy_physics`, a vehicle whose setup `catches_up` advances only when its state is read. This requires that no
-    wake is late, so it is for virtual time only.
+    With `lazy_physics`, a vehicle whose setup `catches_up` advances only when its state is read. Lazy physics requires
+    that every wake is on time, so it is for virtual time only.
     """
     setup = fidelity.vehicle_setup(config)
     picture_sender = fidelity.sender(config)

@@ -16,7 +16,7 @@ Authenticator = NullVehicleAuthenticator | OperatorAuthenticator | None
 
 
 def build_cipher(config: ServerConfig | ClientConfig) -> NewCipher:
-    """Return the cipher of the video, which is encrypted if the config has a key."""
+    """Return the function that makes the video's cipher: SRTP if the config has a key, otherwise no encryption."""
     if not config.security.key:
         return plain_cipher
     check_srtp()
@@ -25,9 +25,10 @@ def build_cipher(config: ServerConfig | ClientConfig) -> NewCipher:
 
 
 def build_authenticator(config: ServerConfig | ClientConfig, now_wall_ns: int | None = None) -> Authenticator:
-    """Build a side's authenticator, None for a client without a key.
+    """Build a side's authenticator; the result is None for a client without a key.
 
-    Raise `UserError` for a key that is unreadable or has expired by `now_wall_ns`. With None, expiry is not checked.
+    Raise `UserError` for a key that is unreadable or has expired by `now_wall_ns`. Without a time, expiry is not
+    checked.
     """
     if isinstance(config, ServerConfig):
         return build_vehicle_authenticator(config, now_wall_ns)
@@ -55,7 +56,7 @@ def build_vehicle_authenticator(config: ServerConfig, now_wall_ns: int | None = 
 
 
 def build_operator_authenticator(config: ClientConfig, now_wall_ns: int | None = None) -> OperatorAuthenticator | None:
-    """Build the operator's authenticator, None without a key; raise `UserError` for an unreadable or expired key."""
+    """Build the operator's authenticator (None without a key); raise `UserError` for an unreadable or expired key."""
     security = config.security
     if not security.key:
         return None

@@ -1,9 +1,9 @@
 """The composition root, which builds a server or a client.
 
-It does so in this order; each step uses what the steps before it have built:
+The steps, each of which uses the results of the steps before it:
 
 1. Check the output directory and the network interface on which delay is injected; read the keys.
-2. Open the sockets and the Zenoh session; they deliver nothing yet.
+2. Open the sockets and the Zenoh session, which do not deliver messages yet.
 3. Build the nodes. For a by-wire vehicle, start the actuator node in a process of its own.
 4. Open the record, and build the runtime of the nodes.
 5. Build the gateway between the Zenoh session and the runtime, and the injector.
@@ -22,7 +22,7 @@ from typing import Any, Literal
 import yaml
 
 from lavt.assembly.actuator_process import ActuatorProcess, start_actuator
-from lavt.assembly.clock_source import clock_source, query_process
+from lavt.assembly.clock_source import build_query_process, clock_source
 from lavt.assembly.entropy import MachineEntropy
 from lavt.assembly.nodes import build_client, build_server
 from lavt.assembly.rendezvous import open_flow
@@ -97,7 +97,7 @@ class Side:
         self.session = session
         """The client's session; None on a server."""
         self.actuator = actuator
-        """The server's actuator if it runs in a process of its own."""
+        """The server's actuator if it runs in a process of its own, otherwise None."""
         self._links = links
         self._path = path
         """The server's end of the video path, which decides whose datagrams are dropped; None on a client."""
@@ -130,11 +130,11 @@ class Side:
             links.probe.start(filtered(self._deliver, ProbePortFilter(self._path), links.probe.counts))
 
     def send(self, channel: str, payload: Any) -> None:
-        """Deliver a message to a node of this side."""
+        """Send a message of this program to the nodes of its own side that receive `channel`."""
         self._deliver(channel, payload, self.clock.now(), None)
 
     def close(self) -> None:
-        """Stop the runtime, close all parts, and complete the record; all other parts are closed even if one fails."""
+        """Stop the runtime, close all parts, and complete the record; a part that fails does not prevent the others."""
         links = self._links
         with ExitStack() as parts:  # calls the last callback first
             parts.callback(self._close_record)
@@ -204,7 +204,7 @@ def open_server(
             actuator=actuator,
             path=nodes.camera.path,
         )
-        opened.pop_all()  # from here on the side closes what was opened
+        opened.pop_all()  # from now on, `side.close` closes these parts
     with closing(side):
         yield side, ready
 
@@ -252,7 +252,7 @@ def _prepare(
     queues = NetemInterface(config.injection.interface) if config.injection.interface else None
     for message in () if queues is None else queues.check():
         print_message(message)
-    return Prepared(authenticator, queues, opened.enter_context(closing(query_process(config.clock))))
+    return Prepared(authenticator, queues, opened.enter_context(closing(build_query_process(config.clock))))
 
 
 def _open_zenoh(config: ServerConfig | ClientConfig, clock: Clock, print_message: PrintMessage) -> ZenohLink:

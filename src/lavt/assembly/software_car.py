@@ -17,9 +17,9 @@ GENERATIONS: Final[dict[str, Literal[1, 2]]] = {"dataspeed_1": 1, "dataspeed_2":
 
 
 def build_software_car(config: ServerConfig, profile: Profile, road: Road, start_ns: int) -> SoftwareCar:
-    """Build a car with the kind of kit and the set of commands of a profile; the car uses nothing else of the profile.
+    """Build a car with the kind of kit and the command set of a profile; the car uses nothing else of the profile.
 
-    The kit interprets commands as documented, so that an error in a profile shows as a car that does not respond.
+    The kit interprets commands as documented. If the profile has an error, the car therefore does not respond.
     """
     simulator = simulator_of(config, road, start_ns)
     kit = Kit(

@@ -10,7 +10,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from lavt.assembly.by_wire import build_inside, check_by_wire, is_simulated
-from lavt.assembly.cameras import build_camera, camera_model, check_own_camera
+from lavt.assembly.cameras import build_camera, camera_model, check_simulated_camera
 from lavt.assembly.simulators import car_of, simulator_of
 from lavt.config import ServerConfig, VehicleConfig
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
@@ -37,29 +37,29 @@ class VehicleSetup:
 
     camera: Camera
     start: Callable[[Now], Vehicle] | None
-    """Builds the vehicle when the loop starts, after preparations that take seconds; None: the vehicle is in the
-    actuator's own process (`actuator_process.py`)."""
+    """Builds the vehicle; called when the loop starts, after preparations that take seconds. None: the process of the
+    actuator builds the vehicle (`actuator_process.py`)."""
     route: Route | None
     simulated: bool = False
     catches_up: bool = False
-    """Whether the vehicle's `advance` may be called late without loss of accuracy."""
+    """Whether a late call of the vehicle's `advance` loses no accuracy."""
 
 
 def build_simulator(config: ServerConfig) -> VehicleSetup:
     """Build the built-in simulator and its camera."""
-    check_own_camera(config)
+    check_simulated_camera(config)
     road = load_road(config.vehicle.route)
     return _build_simulated(config, road, _build_sim_camera(config, road))
 
 
 def build_dbw(config: ServerConfig) -> VehicleSetup:
-    """Build a by-wire vehicle and its camera, which is the simulator's for a software car that sends ground truth."""
+    """Build a by-wire vehicle and its camera; a software car that sends ground truth has the simulator's camera."""
     check_vehicle(config.vehicle)
     dbw = config.vehicle.dbw
     if dbw.is_inside:
         return build_simulator(config)
     if dbw.truth:
-        check_own_camera(config)
+        check_simulated_camera(config)
         camera = _build_sim_camera(config, load_road(config.vehicle.route))
         return VehicleSetup(camera, start=None, route=None, simulated=is_simulated(dbw))
     device = build_camera(config)
@@ -111,7 +111,7 @@ def build_geometry_setup(config: ServerConfig) -> VehicleSetup:
 
 
 def camera_phase_ns(config: ServerConfig) -> int:
-    """Return the random time of the camera's first frame after the start, within one frame period."""
+    """Return the random time between the start and the camera's first frame, shorter than one frame period."""
     return int(stream(config.seed, "camera phase").integers(round(NS_PER_S / config.camera.rate_hz)))
 
 
@@ -168,7 +168,7 @@ def check_vehicle(config: VehicleConfig) -> None:
 
 
 def physics_sample_times(camera: Camera, start_ns: int) -> list[FrameTimes]:
-    """Return when the vehicle's pose is needed: when the shutter opens and, for a finite exposure, when it closes."""
+    """Return the times when the vehicle's pose is needed: the shutter opens or, after an exposure, closes."""
     opening_times = FrameTimes(start_ns + camera.phase_ns, camera.rate_hz)
     exposure_ns = camera.exposure_ns if isinstance(camera, TimedCamera) else 0
     if not exposure_ns:

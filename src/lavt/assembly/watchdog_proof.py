@@ -18,7 +18,7 @@ from lavt.vehicle.dbw.watchdog_test import BRAKE, BRAKE_WITHIN_NS, LEAST_REPORTS
 
 NS_PER_DAY: Final = 86_400 * NS_PER_S
 CLOCK_TOLERANCE_DAYS: Final = 1
-"""The clock of the machine that made the proof may have been ahead of this machine's clock by this much."""
+"""A proof with a date in the future is accepted up to this difference: the clocks of two machines can differ."""
 RUN_TEST = "run `lavt can test-watchdog`"
 
 
@@ -46,12 +46,12 @@ def new_proof(
 
 
 def proof_rejection(path: str, profile: Profile, config: DbwConfig, wall_ns: int) -> str:
-    """Return why the proof at `path` does not apply at `wall_ns` to this profile and the config's car and bus.
+    """Return why the proof at `path` is not valid at `wall_ns` for this profile and for the config's car and bus.
 
-    The result is empty if the proof applies.
+    The result is empty if the proof is valid.
     """
     if not path:
-        return f"the kit's watchdog has not been tested: {RUN_TEST} and name its file in vehicle.dbw.watchdog_proof"
+        return f"the kit's watchdog has not been tested: {RUN_TEST} and set vehicle.dbw.watchdog_proof to its file"
     try:
         proof = parse_config(WatchdogProof, _read_json_object(path), path)
     except UserError as error:
@@ -73,14 +73,14 @@ def proof_rejection(path: str, profile: Profile, config: DbwConfig, wall_ns: int
     if (age := _age_rejection(proof.at, config.watchdog_proof_days, wall_ns)) != "":
         return f"{path} {age}: {RUN_TEST} again"
     if proof.reports < LEAST_REPORTS:
-        return f"{path} is from {proof.reports} reports of the brake, fewer than {LEAST_REPORTS}: {RUN_TEST} again"
+        return f"{path} is based on {proof.reports} brake reports, fewer than {LEAST_REPORTS}: {RUN_TEST} again"
     if proof.braked_ms * NS_PER_MS > BRAKE_WITHIN_NS:
         return f"in {path} the kit took {proof.braked_ms:g} ms to brake, which is too long: {RUN_TEST} again"
     return ""
 
 
 def _age_rejection(at: str, days: int, wall_ns: int) -> str:
-    """Return why a proof of the date `at` is not accepted at `wall_ns`; empty if it is accepted."""
+    """Return why a proof with the date `at` is not accepted at `wall_ns`; empty: it is accepted."""
     try:
         age_days = (wall_ns - wall_time_ns(at)) / NS_PER_DAY
     except (ValueError, OverflowError):

@@ -25,10 +25,10 @@ Sender = Literal["lavt", "foreign"]
 
 
 class WatchNodes:
-    """A receiver that sends nothing and a watcher; as their recorder, this keeps the statistics of the stream."""
+    """The nodes of `lavt watch`, and their recorder, which keeps the statistics of the stream."""
 
     def __init__(self, sender: Sender, reorder_hold_ms: int | None) -> None:
-        self._reader = _reader(sender)
+        self._reader = _picture_reader(sender)
         hold_ns = None if reorder_hold_ms is None else reorder_hold_ms * NS_PER_MS
         self._receiver = ReceiverNode(JitterBuffer(hold_ns), Depacketizer())
         self.nodes = (self._receiver, WatcherNode(self._reader))
@@ -63,8 +63,8 @@ class WatchNodes:
             datagrams_unreadable=received["packets_unreadable"] + received["challenges_unreadable"],
         )
 
-    def between(self, before: Counter[str], after: Counter[str]) -> dict[str, Any]:
-        """Return the statistics between two totals; without an accepted stamp, latencies are None."""
+    def statistics_between(self, before: Counter[str], after: Counter[str]) -> dict[str, Any]:
+        """Return the statistics of the time between two `totals`; without an accepted stamp, latencies are None."""
         latencies_ms = self._latencies_ms[before["stamps_accepted"] : after["stamps_accepted"]]
         median_ms, p95_ms = np.percentile(latencies_ms, (50, 95)).tolist() if latencies_ms else (None, None)
         return {
@@ -76,10 +76,10 @@ class WatchNodes:
         }
 
 
-def _reader(sender: Sender) -> PictureReader:
+def _picture_reader(sender: Sender) -> PictureReader:
     """Return the reader for a sender's stamps.
 
-    The check of foreign stamps is weak, so that those of frames in doubt are not read.
+    The check of foreign stamps is weak, so the stamps of frames in doubt are not read.
     """
     if sender == "lavt":
         return PictureReader(VideoReceiver(Decoder(), shape=None))

@@ -58,7 +58,7 @@ def boundary(
 
 def _table_lines(result: dict[str, Any]) -> list[str]:
     """Return the lines of a table with the median and interval of each criterion, for each route and preset."""
-    from lavt.experiment.report.boundary_section import ALL_ROUTES, span  # noqa: PLC0415 (slow: matplotlib)
+    from lavt.experiment.report.boundary_section import ALL_ROUTES, format_ends  # noqa: PLC0415 (slow: matplotlib)
     from lavt.experiment.report.table_format import format_number  # noqa: PLC0415 (a part of the slow report)
     from lavt.experiment.statistics.boundary_summary import CRITERIA  # noqa: PLC0415 (slow: scipy)
 
@@ -67,7 +67,7 @@ def _table_lines(result: dict[str, Any]) -> list[str]:
         cells = []
         for name in CRITERIA:
             summary = group[f"{name}_ms"]
-            cells.append(f"{format_number(summary['p50'], 0)} ({span(summary['interval'])})")
+            cells.append(f"{format_number(summary['p50'], 0)} ({format_ends(summary['interval'])})")
         table.append(
             (
                 group["route"] or ALL_ROUTES,

@@ -104,8 +104,9 @@ def check(
 ) -> None:
     """Check a by-wire profile against its DBC file.
 
-    The check needs no car. It lists the mismatches, the unverified signals, and the reasons why the profile may not arm
-    on a real bus. It exits with 0 if profile and DBC match; an unverified signal is not a mismatch.
+    The check needs no car. It lists the mismatches, the unverified signals, and the reasons why a vehicle with this
+    profile must not be armed on a real bus. The command exits with 0 if profile and DBC match; an unverified signal is
+    not a mismatch.
 
     Example: lavt can check dataspeed_gen1
     """
@@ -164,7 +165,7 @@ def _show_batches(
     start_ns = now_ns = first.end_ns
     traffic = BusTraffic(*codec_and_expected, start_ns=start_ns)
     view, shown_s, has_frames = BusView(traffic, drop_counts, as_json), 0, False
-    with view.live():
+    with view.live_table():
         for frames, now_ns in chain([first], batches):
             has_frames = has_frames or bool(frames)
             for frame in frames:

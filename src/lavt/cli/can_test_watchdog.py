@@ -92,7 +92,7 @@ def _load_testable(dbw: DbwConfig) -> tuple[Profile, OwnBrake]:
     own_brake = profile.watchdog
     if own_brake is None:
         raise UserError(f"{dbw.profile} names no signal of the kit's own braking: set watchdog.signal in the profile")
-    if profile.car.steering_sign is None:  # unimportant: the test keeps the angle
+    if profile.car.steering_sign is None:  # the sign has no effect, because the test keeps the steering angle
         profile = dataclasses.replace(profile, car=dataclasses.replace(profile.car, steering_sign=1))
     reasons = []
     if not is_virtual(dbw.interface, dbw.channel, dbw.options):
@@ -100,7 +100,7 @@ def _load_testable(dbw: DbwConfig) -> tuple[Profile, OwnBrake]:
         if not dbw.car:
             reasons.append("the proof must name the car: set vehicle.dbw.car to its serial number or VIN")
     if reasons:
-        raise UserError(f"{dbw.profile} may not be used on {dbw.interface} {dbw.channel}: {'; '.join(reasons)}")
+        raise UserError(f"{dbw.profile} must not be used on {dbw.interface} {dbw.channel}: {'; '.join(reasons)}")
     return profile, own_brake
 
 
@@ -119,7 +119,7 @@ def _run(test: WatchdogTest, port: CanPort) -> None:
     with console.stop_on_signals() as stop:
         while not test.is_done:
             if stop.wait(POLL_PERIOD_S):
-                raise WorkError("stopped without a result; the kit may brake: override it by pressing the brake pedal")
+                raise WorkError("stopped without a result; if the kit brakes, press the brake pedal to override it")
             try:
                 for received in port.take(clock.now().mono_ns):
                     test.receive(received.frame, received.arrived_ns)
@@ -133,7 +133,7 @@ def _run(test: WatchdogTest, port: CanPort) -> None:
 
 
 def _remove_old_proof(file: Path) -> None:
-    """Remove an older proof, so that it does not outlive a failed test; raise `UserError` if `file` is not writable."""
+    """Remove an older proof, because the new test can fail; raise `UserError` if `file` is not writable."""
     try:
         file.touch()
         file.unlink()

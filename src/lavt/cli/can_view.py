@@ -28,7 +28,7 @@ class BusView:
         """Names of the messages that have been printed."""
 
     @contextmanager
-    def live(self) -> Iterator[None]:
+    def live_table(self) -> Iterator[None]:
         """Show a live table inside the `with` block if standard output is a terminal."""
         if self._as_json or not sys.stdout.isatty():
             yield
@@ -38,7 +38,7 @@ class BusView:
         self._live = None
 
     def show_second(self, elapsed_ns: int, now_ns: int) -> None:
-        """Show the messages since the last call; `elapsed_ns` is the time since the start."""
+        """Show the messages since the last call; the output names `elapsed_ns`, the time since the start."""
         messages = self._traffic.take_period(now_ns)
         if self._as_json:
             console.print_json({"second": self._as_data(elapsed_ns, messages)})
@@ -51,7 +51,7 @@ class BusView:
                     console.print_result(f"{elapsed_ns / NS_PER_S:.0f} s  {_message_line(message)}")
 
     def show_summary(self, elapsed_ns: int, now_ns: int) -> None:
-        """Show the messages since the start; `elapsed_ns` is the time since then."""
+        """Show the messages since the start, which was `elapsed_ns` ago."""
         messages = self._traffic.total(now_ns)
         if self._as_json:
             console.print_json({"summary": self._as_data(elapsed_ns, messages)})

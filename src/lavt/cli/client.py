@@ -33,9 +33,8 @@ def client(
 ) -> None:
     """Run the operator's side: acquire control, arm and drive.
 
-    The controller drives the vehicle from the pictures of its video. SIGUSR1 triggers an emergency stop. SIGUSR2 hands
-    the vehicle over to the client that requests control; if no client does, it releases the vehicle. Ctrl-C releases
-    the vehicle and exits.
+    The controller drives the vehicle by the received video. SIGUSR1 triggers an emergency stop. SIGUSR2 releases
+    control: to the client that requests a handover, if there is one. Ctrl-C releases control and exits.
 
     Example: lavt client configs/client.yaml --set video.server=192.0.2.7
     """

@@ -10,12 +10,12 @@ from typing import Annotated, Any, Literal
 import msgspec
 import typer
 
-from lavt.assembly.clock_source import clock_source, query_process
+from lavt.assembly.clock_source import build_query_process, clock_source
 from lavt.cli import console
 from lavt.clock import MachineClock, pause
 from lavt.config import ClockConfig
 from lavt.config_file import parse_config
-from lavt.doctor.clock_checks import check_host, compare
+from lavt.doctor.clock_checks import check_host, compare_with_server
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.errors import BadMessage, WorkError
 from lavt.node import Send
@@ -57,7 +57,7 @@ def clock(
     config = parse_config(ClockConfig, requested, "lavt clock")
     address = None if server is None else resolve_host("--server", server)
     machine = MachineClock()
-    with closing(query_process(config)) as process:
+    with closing(build_query_process(config)) as process:
         read_source = clock_source(config, machine, process.run)
         report = _read_report(read_source, source)
         if address is None:
@@ -67,10 +67,10 @@ def clock(
             if last_reply is None:
                 raise WorkError(
                     f"no answer from {server}:{port} (UDP): is `lavt server` running there, is its "
-                    f"clock.probe_port {port}, and does the firewall let it through?"
+                    f"clock.probe_port {port}, and does the firewall admit this port?"
                 )
             report_before, report = report, _read_report(read_source, source)
-            finding = compare(report_before, report, probes, last_reply, address)
+            finding = compare_with_server(report_before, report, probes, last_reply, address)
     if as_json:
         console.print_json({**msgspec.to_builtins(finding), "clock": msgspec.to_builtins(report)})
     else:

@@ -40,7 +40,7 @@ def print_json(value: Any) -> None:
 
 
 def reserve_stdout() -> None:
-    """Redirect what libraries write to standard output (Zenoh's log) to `sys.stderr`; only results are left there.
+    """Reserve standard output for results: redirect the output of libraries (Zenoh's log) to `sys.stderr`.
 
     The libraries write to a pipe that a thread always reads, so that they never block.
     """
@@ -76,7 +76,7 @@ def run_command(command: Callable[[], None]) -> None:
 def interruptible() -> Iterator[None]:
     """Raise `WorkError` when Ctrl-C, SIGTERM or a closed terminal interrupts long work.
 
-    From here on, no message to standard error blocks the program.
+    From the beginning of the block on, no message to standard error blocks the program.
     """
 
     def interrupt(*_: object) -> None:
@@ -95,7 +95,7 @@ class StopEvent:
 
     A signal handler interrupts the main thread anywhere, even inside another handler: a second signal often follows the
     first immediately. `threading.Event.set` waits for a lock. If the interrupted code owns that lock, the handler waits
-    for ever. The methods of this class wait for no such lock.
+    for ever. The method `set` of this class waits for nothing.
     """
 
     def __init__(self) -> None:
@@ -105,7 +105,7 @@ class StopEvent:
 
     def set(self) -> None:
         """Set the event; setting it again changes nothing."""
-        with suppress(RuntimeError):  # it was already set
+        with suppress(RuntimeError):  # the event was already set
             self._clear_lock.release()
 
     def is_set(self) -> bool:
@@ -128,7 +128,7 @@ class StopEvent:
 def stop_on_signals() -> Iterator[StopEvent]:
     """Yield an event that Ctrl-C, SIGTERM or a closed terminal sets, for programs that run until they are stopped.
 
-    From here on, no output blocks the program.
+    From the beginning of the block on, no output blocks the program.
     """
     queue_output("stdout", "stderr")
     stop = StopEvent()

@@ -25,7 +25,7 @@ from lavt.config import ClientConfig, ServerCameraConfig, ServerConfig
 from lavt.config_file import find_file, load_config, read_yaml, split_change
 from lavt.doctor import checks, measurements
 from lavt.doctor.checks import Check
-from lavt.doctor.clock_checks import compare
+from lavt.doctor.clock_checks import compare_with_server
 from lavt.domain import NS_PER_S
 from lavt.errors import LavtError, UserError
 from lavt.runtime import process_priority
@@ -81,7 +81,7 @@ def doctor(
 
 
 def _load(path: Path, changes: list[str]) -> Settings:
-    """Read a config: a client's if the file or a change has a key that only a client's has, otherwise a server's."""
+    """Read a client's config if the file or a change has a key of clients only, otherwise a server's config."""
     data = read_yaml(path)
     video = data.get("video")
     keys = {*data, *(f"video.{key}" for key in (video if isinstance(video, dict) else {}))}
@@ -132,7 +132,7 @@ def _machine_checks(config: Settings, side: str, clock: MachineClock) -> Iterato
 
 
 def _codec_check(config: Settings, side: str, clock: MachineClock) -> Check:
-    """Time the codec with the config's settings; for a client, settings that only a server has are the defaults."""
+    """Time the codec with the config's settings; for a client, the encoder has its default settings."""
     server = config if isinstance(config, ServerConfig) else _assumed_server(config)
     size = f"{server.camera.width_px}x{server.camera.height_px}"
     try:
@@ -237,7 +237,7 @@ def _probe_check(settings: ClientConfig, report_before: ClockReport | None, cloc
     report = measurements.clock_report(settings.clock, clock)
     if last_reply is None or report is None:
         return checks.check_probe(None, host, port)
-    comparison = compare(report_before or report, report, clock_probes, last_reply, address)
+    comparison = compare_with_server(report_before or report, report, clock_probes, last_reply, address)
     return checks.check_probe(comparison, host, port)
 
 

@@ -31,7 +31,8 @@ PINNED_ROLES: Final[Mapping[str, tuple[str, ...]]] = {
     "monitor": ("vehicle",),
     "cloud": (),
 }
-"""The roles whose signatures each role verifies with their public keys. A cloud router neither verifies nor signs."""
+"""For each role, the roles whose public keys it needs to verify their signatures. A cloud router neither verifies nor
+signs."""
 
 Names = list[str] | None
 
@@ -114,7 +115,7 @@ def _check_arguments(certificates: ModuleType, roles: Mapping[str, list[str]], h
 
 
 def _check_directory(directory: Path, names: Iterable[str]) -> None:
-    """Raise `UserError` for names that have files, an incomplete authority, or a directory that others can read."""
+    """Raise `UserError` for names whose files exist, an incomplete authority, or a directory that others can read."""
     if not directory.exists():
         return
     if not directory.is_dir():

@@ -17,7 +17,7 @@ UPDATES_PER_LINE = 25
 class LiveView:
     """A view of speed, latencies and cross-track error of a drive whose two sides run on one machine.
 
-    The sides share a clock, so that the latencies need no correction for a clock offset.
+    The sides share a clock, so the latencies need no correction for a clock offset.
     """
 
     def __init__(self, title: str) -> None:
@@ -52,7 +52,7 @@ class LiveView:
 def _status_line(server: dict[str, Any], client: dict[str, Any]) -> str:
     if "speed_mps" not in server:
         return "starting"
-    figures = (
+    values = (
         ("", server["speed_mps"] * 3.6, "5.1f", "km/h"),
         ("tau_v", client.get("raw_tau_v_ms"), "6.1f", "ms"),
         ("tau_c", server.get("raw_tau_c_ms"), "6.1f", "ms"),
@@ -60,7 +60,7 @@ def _status_line(server: dict[str, Any], client: dict[str, Any]) -> str:
     )
     shown = (
         f"{name} {value:{number_format}} {unit}".strip()
-        for name, value, number_format, unit in figures
+        for name, value, number_format, unit in values
         if value is not None
     )
     return f"{server.get('safety', ''):<10} " + "  ".join(shown)

@@ -64,16 +64,16 @@ def apply(
     state_delay: Annotated[StateDelay, typer.Option(help="with_video: delay the state like the video.")] = "none",
     hold: Annotated[bool, typer.Option("--hold", help="Run until Ctrl-C, then restore the interface.")] = False,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Only print the commands, those for an interface without delay queues.")
+        bool, typer.Option("--dry-run", help="Only print the commands for an interface without delay queues.")
     ] = False,
     as_json: console.JsonOption = False,
 ) -> None:
     """Apply a network condition to an interface and verify it.
 
-    The condition delays packets that this machine sends, and stays in force after the command. The command reads the
-    queues back and measures the delay. An existing condition is replaced without packet loss. If the verification
-    fails, the command restores the interface. If the change fails on an interface that was already delayed, the command
-    says that some queues may be left on it.
+    The condition delays packets that this machine sends, and stays in force after the end of the command. The command
+    reads the queues back and measures the delay. It replaces an existing condition without packet loss. If the
+    verification fails, the command restores the interface. If the change of an existing condition fails, some queues
+    can remain, and the command says so.
 
     Example: lavt netem apply L4 --role server --interface eth0
     """
@@ -137,7 +137,7 @@ def verify(
 def clear(
     interface: Interface,
     at_once: Annotated[
-        bool, typer.Option("--at-once", help="Drop the packets that are queued instead of waiting for them.")
+        bool, typer.Option("--at-once", help="Drop the queued packets; do not wait until they have left.")
     ] = False,
     as_json: console.JsonOption = False,
 ) -> None:
@@ -159,13 +159,13 @@ def clear(
 
 
 def _restore(netem: NetemInterface, was_delayed: bool) -> None:
-    """Clear an interface after a failed change; if it was already delayed, print how to find the queues left."""
+    """Clear an interface after a failed change; if it `was_delayed` before, print how to find the remaining queues."""
     if not was_delayed:
         netem.clear()
         return
     console.print_message(
-        f"lavt: {netem.interface} was already delayed and is left as it is now: `lavt netem show --interface "
-        f"{netem.interface}` shows its queues, `lavt netem clear --interface {netem.interface}` removes them"
+        f"lavt: {netem.interface} was already delayed, and its queues remain as they are now: `lavt netem show "
+        f"--interface {netem.interface}` shows them, `lavt netem clear --interface {netem.interface}` removes them"
     )
 
 

@@ -21,14 +21,14 @@ from lavt.transport.video.stamp import has_stamp
 
 
 def register(app: typer.Typer) -> None:
-    """Add the group of commands."""
-    group = typer.Typer(help="Inspect lane detection.", no_args_is_help=True, rich_markup_mode=None)
-    group.callback()(_group)
-    group.command("show")(show)
-    app.add_typer(group, name="perception")
+    """Add the command."""
+    perception = typer.Typer(help="Inspect lane detection.", no_args_is_help=True, rich_markup_mode=None)
+    perception.callback()(_callback)  # with a callback, Typer keeps a single command as a subcommand
+    perception.command("show")(show)
+    app.add_typer(perception, name="perception")
 
 
-def _group() -> None:
+def _callback() -> None:
     """Inspect lane detection."""
 
 

@@ -18,7 +18,7 @@ from lavt.transport.video.h264 import Decoder
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg")
 VIDEO_SUFFIXES = (".mp4", ".mkv")
 DEFAULT_RATE_HZ = 30.0
-"""The picture rate of a video whose file states no plausible one."""
+"""The picture rate of a video whose file states no plausible rate."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ def read_pictures(path: Path) -> PictureFile:
         raise UserError(f"{path} does not exist: name a picture, a video or a record")
     if path.suffix == ".mcap":
         return PictureFile(_read_record(path), is_video=True)
-    # Keep OpenCV from logging errors: the errors raised below describe them in one sentence.
+    # Silence OpenCV's log: the messages below describe each error in one sentence.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:

@@ -58,7 +58,7 @@ def relay(
 
 
 def flows(config: RelayConfig) -> list[RelayedFlow]:
-    """Return the flows to relay, video and control; raise `UserError` for invalid addresses, links and traces."""
+    """Return the two flows to relay (video, control); raise `UserError` for invalid addresses, links and traces."""
     seed = config.seed
     video = RelayedFlow(
         "video",

@@ -30,7 +30,7 @@ def rendezvous(
     changes: console.SetOption = None,
     as_json: console.JsonOption = False,
 ) -> None:
-    """Forward video to clients from a vehicle behind NAT.
+    """Forward the video of a vehicle behind NAT to its clients.
 
     The command also forwards the clock probe. It runs in the cloud until Ctrl-C, and the vehicle registers with it.
 
@@ -40,7 +40,7 @@ def rendezvous(
     settings = load_config(RendezvousConfig, config, changes or [])
     forwarders = open_rendezvous(settings, MachineClock())
     ports = {f"{flow}_port": forwarder.port for flow, forwarder in forwarders.items()}
-    printed: dict[FlowName, Address | None] = dict.fromkeys(forwarders)
+    printed_addresses: dict[FlowName, Address | None] = dict.fromkeys(forwarders)
     failures: list[BaseException] = []
 
     def fail(error: BaseException) -> None:
@@ -60,9 +60,9 @@ def rendezvous(
         while not stop.wait(POLL_PERIOD_S):
             for flow, forwarder in forwarders.items():
                 address = forwarder.vehicle_address()
-                if address != printed[flow]:
+                if address != printed_addresses[flow]:
                     _print_address(settings.vehicle_id, flow, address, as_json=as_json)
-                    printed[flow] = address
+                    printed_addresses[flow] = address
     for forwarder in forwarders.values():
         forwarder.close()
     if failures:
@@ -78,4 +78,5 @@ def _print_address(vehicle: str, flow: str, address: Address | None, *, as_json:
     elif address is None:
         console.print_result(f"{flow}: {vehicle} no longer registers")
     else:
-        console.print_result(f"{flow}: {vehicle} is at {address[0]}:{address[1]}")
+        host, port = address
+        console.print_result(f"{flow}: {vehicle} is at {host}:{port}")

@@ -39,26 +39,26 @@ def report(
     from lavt.experiment.report.report import read_failed, write_report  # noqa: PLC0415 (slow: scipy, matplotlib)
 
     boundaries = [_read_boundary(directory) for directory in directories if (directory / BOUNDARY).is_file()]
-    run_dirs = {directory: _find_runs(directory) for directory in directories if not (directory / BOUNDARY).is_file()}
-    if not run_dirs:
+    found_runs = {directory: _find_runs(directory) for directory in directories if not (directory / BOUNDARY).is_file()}
+    if not found_runs:
         raise UserError(f"{directories[0]} has a boundary but no runs: name the directory of a sweep, too")
-    runs = [run for runs in run_dirs.values() for run in runs]
-    results = [_read_result(run / RESULT) for run in runs]  # read all before writing any
+    runs = [run for runs_in_directory in found_runs.values() for run in runs_in_directory]
+    results = [_read_result(run / RESULT) for run in runs]  # all are read before any is written
     for run, result in zip(runs, results, strict=True):
         compute_result(run, result, result.get("digest"))
-    names = _sweep_names(list(run_dirs))
-    sweeps = {run: name for directory, name in names.items() for run in run_dirs[directory]}
+    names = _sweep_names(list(found_runs))
+    sweeps = {run: name for directory, name in names.items() for run in found_runs[directory]}
     make_directory(out)
-    failed = [run for directory in run_dirs for run in read_failed(directory)]
-    base = _base_config(list(run_dirs), names)
+    failed = [run for directory in found_runs for run in read_failed(directory)]
+    base = _base_config(list(found_runs), names)
     page = write_report(out, run_dirs=runs, base=base, sweeps=sweeps, boundaries=boundaries, failed=failed)
     console.print_result(f"the report is {page}")
 
 
 def _base_config(directories: Sequence[Path], names: dict[Path, str]) -> dict[str, Any] | None:
-    """Return the base config by which the report groups its runs; None if there is none.
+    """Return the base config by which the report groups its runs: that of the first sweep; None without a sweep.
 
-    It is that of the first sweep, with its name if there are several (`names`).
+    If there are several sweeps (`names`), the result also contains the name of the first sweep.
     """
     from lavt.experiment.sweep.sweep import recorded_base  # noqa: PLC0415 (slow: scipy, matplotlib)
 
@@ -70,7 +70,7 @@ def _base_config(directories: Sequence[Path], names: dict[Path, str]) -> dict[st
 
 
 def _sweep_names(directories: Sequence[Path]) -> dict[Path, str]:
-    """Return a unique name for each sweep: its directory, with as many parent directories as needed.
+    """Return a unique name for each sweep: the last parts of its directory, as many as needed.
 
     A single sweep gets no name.
     """

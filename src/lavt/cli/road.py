@@ -16,12 +16,12 @@ from lavt.vehicle.sim.road.road import load_road
 def register(app: typer.Typer) -> None:
     """Add the command."""
     road = typer.Typer(no_args_is_help=True, help="Draw roads: shipped ones and your own.")
-    road.callback()(_group)  # with a callback, Typer keeps a single command as a subcommand
+    road.callback()(_callback)  # with a callback, Typer keeps a single command as a subcommand
     road.command("draw")(draw)
     app.add_typer(road, name="road")
 
 
-def _group() -> None:
+def _callback() -> None:
     """Draw roads: shipped ones and your own (docs/roads.md)."""
 
 

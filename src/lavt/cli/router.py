@@ -12,7 +12,7 @@ from lavt.config_file import find_file, split_change
 from lavt.runtime import process_priority
 
 POLL_PERIOD_S = 0.5
-"""How often the main thread wakes to run signal handlers; a signal to one of Zenoh's threads does not wake it."""
+"""How often the main thread wakes to run signal handlers: a signal that a Zenoh thread receives does not wake it."""
 
 
 def register(app: typer.Typer) -> None:

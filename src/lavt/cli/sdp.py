@@ -46,7 +46,7 @@ def sdp(
 
 
 def _choose_receiver(send_to: tuple[str, ...], receiver: str) -> tuple[str, int]:
-    """Return the address of the named receiver, or of the only one."""
+    """Return the address of `receiver` or, if it is empty, of the only receiver."""
     if not send_to:
         raise UserError(
             "video.send_to is empty: name a receiver as for the server, such as --set "
@@ -64,7 +64,7 @@ def _choose_receiver(send_to: tuple[str, ...], receiver: str) -> tuple[str, int]
 
 
 def _profile_level_id(settings: ServerConfig) -> str:
-    """Return the profile and level of the server's encoder: the level depends on size, rates and buffer."""
+    """Encode a picture, and return its profile and level; the level depends on picture size, rates and buffer."""
     picture = np.zeros((settings.camera.height_px, settings.camera.width_px, 3), np.uint8)
     sender = VIDEO.sender(settings)
     planes, _ = sender.prepare(picture)

@@ -10,11 +10,12 @@ from lavt.domain import NS_PER_S, State
 from lavt.nodes.client_session import Phase
 
 REPEAT_NS = NS_PER_S
-"""Rejections are logged at most once in this time. A limit is logged again if it has not applied for this time."""
+"""Rejections are logged at most once in this time. A limit is logged again only if it has changed no command for this
+time."""
 STATE_TIMEOUT_NS = NS_PER_S
 """A client logs that the state is missing after this time; the vehicle sends its state 50 times a second."""
 FIRST_STATE_TIMEOUT_NS = 3 * NS_PER_S
-"""The same before the first state: longer, because the routers need time to find each other."""
+"""The timeout before the first state; it is longer, because the routers need time to find each other."""
 NO_STATE_YET = (
     "no state from the vehicle yet: is its server running, do the routers reach each other, and do the keys match? "
     "Run `lavt doctor CONFIG` to find out"
@@ -28,7 +29,8 @@ PHASES: dict[Phase, str] = {
     "stopped": "control lost: {reason}",
     "watching": "{reason}; this client now only watches",
 }
-"""The line for each phase of the client; the vehicle's state reports driving."""
+"""The log line for each phase of the client; `driving` has none, because the line for the vehicle's state reports
+it."""
 
 
 def phase_line(phase: Phase, reason: str) -> str:
@@ -39,7 +41,7 @@ def phase_line(phase: Phase, reason: str) -> str:
 
 
 def state_lines(before: State | None, after: State, *, operator: str) -> list[str]:
-    """Return one log line for each difference between two vehicle states; without a state before, describe `after`.
+    """Return one log line for each difference between two vehicle states; if `before` is None, describe `after`.
 
     `operator` is the name of this side's client while it has control of the vehicle; empty otherwise.
     """
@@ -67,7 +69,7 @@ def state_lines(before: State | None, after: State, *, operator: str) -> list[st
 
 
 def client_end_line(*, released: bool) -> str:
-    """Return the last line of a client that had control, by whether the vehicle's side confirmed the release."""
+    """Return the last line of a client that had control; `released`: the server has confirmed the release."""
     if released:
         return "the client ends; the vehicle is released"
     return "the client ends; the release was not confirmed: the vehicle stops on command timeout"
@@ -125,13 +127,13 @@ class SessionLog:
         self._logged_phase = line
 
     def set_ending(self, ending: str | None) -> None:
-        """Log how the last drive ended; `ending` is None before a drive ends, and again once the next one has begun."""
+        """Log how the last drive ended; `ending` is None before its end, and again after the start of another drive."""
         if ending is not None and ending != self._logged_ending:
             self._lines.append(f"the drive has ended: {ending}")
         self._logged_ending = ending
 
     def take_lines(self, now_ns: int) -> list[str]:
-        """Return the lines since the last call, with those on rejections and a missing state due at `now_ns`."""
+        """Return the lines since the last call; at `now_ns`, lines on rejections and on a missing state can be due."""
         self._add_rejection_counts(now_ns)
         self._add_missing_state(now_ns)
         lines, self._lines = self._lines, []

@@ -17,19 +17,20 @@ from lavt.safety.state_machine import ACTIVE
 
 STATUS_PERIOD_S = 0.2
 POLL_PERIOD_S = 0.02
-"""How often a side that ends checks whether its vehicle is stationary or released."""
+"""How often a side checks, before it ends, whether the vehicle is stationary (server) or released (client)."""
 RELEASE_TIMEOUT_S = 1.0
-"""How long a client that ends waits for the answer to its release; any network that is good enough for driving delivers
-the answer sooner."""
+"""How long a client waits for the answer to its release, before it ends; any network that is good enough for driving
+delivers the answer sooner."""
 STOP_TIMEOUT_S = 6.0
-"""How long a server that ends waits until the vehicle is stationary; a stop from 40 km/h with 4 m/s2 takes 2.8 s."""
+"""How long a server waits for the vehicle to be stationary, before it ends; a stop from 40 km/h with 4 m/s2 takes 2.8
+s."""
 
 
 def run_side(side: Side, client_name: str, *, once: bool, as_json: bool, ready: Mapping[str, Any]) -> None:
     """Run until Ctrl-C, until a part fails or, with `once`, until the drive has ended; print the session's log.
 
-    `client_name` is empty for a server. With `as_json`, `ready` is printed when the side has started. Before it ends,
-    a client releases the vehicle and a server stops it. A second Ctrl-C ends the process immediately.
+    `client_name` is empty for a server. With `as_json`, `ready` is printed when the side has started. At the end, a
+    client releases the vehicle, and a server stops the vehicle. A second Ctrl-C ends the process immediately.
     """
     log, session, runtime = SessionLog(client_name), side.session, side.runtime
     with console.stop_on_signals() as stop, fail_on_thread_errors(runtime.fail):
@@ -71,7 +72,7 @@ def _print_status(side: Side, log: SessionLog, *, as_json: bool, last_line: str 
 
 
 def _release(side: Side, stop: console.StopEvent, session: ClientSession) -> str:
-    """Release the vehicle before the link closes, so that it stops and has no operator; return the last log line."""
+    """Release the vehicle before the link closes, so that the vehicle stops; return the last log line."""
     if not session.has_control:
         return "the client ends; it had no control"
     side.send("operator", "release")

@@ -33,7 +33,7 @@ from lavt.vehicle.software_car.event_log import KitEvent
 from lavt.vehicle.software_car.runner import SoftwareCarRunner
 
 MAX_LINE_BYTES: Final = 1000
-"""A longer input without a line break is executed as a line, so that the memory for it stays bounded."""
+"""Longer input without a line break is executed as one line, so that the memory for incomplete lines is bounded."""
 INSIDE: Final = "inside"
 
 
@@ -66,7 +66,7 @@ def software_car(
     road = load_road(settings.vehicle.route)
     truth_address = resolved_address("vehicle.dbw.truth", dbw.truth) if dbw.truth else None
     clock = MachineClock()
-    build_software_car(settings, profile, road, start_ns=0)  # reports errors before the bus is opened
+    build_software_car(settings, profile, road, start_ns=0)  # built only to report errors before the bus is opened
     port = CanPort(dbw.interface, dbw.channel, dbw.options, clock=clock)
     try:
         if not is_virtual(dbw.interface, dbw.channel, dbw.options):
@@ -118,7 +118,7 @@ def _run(
 class InputLines:
     """The lines on standard input, until it is closed.
 
-    A background process, which may not read the terminal, gets an error from it that counts as closed input.
+    A background process gets an error when it reads the terminal; its input is then treated as closed.
     """
 
     def __init__(self) -> None:
@@ -127,7 +127,7 @@ class InputLines:
         signal.signal(signal.SIGTTIN, signal.SIG_IGN)
 
     def wait(self, stop: console.StopEvent, timeout_s: float) -> list[str]:
-        """Wait for lines for at most `timeout_s`; return those that arrived."""
+        """Wait at most `timeout_s` for lines, and return the lines that arrived."""
         if not self._is_open:
             stop.wait(timeout_s)
             return []
@@ -175,7 +175,7 @@ def _event_printer(start_ns: int) -> Callable[[KitEvent], None]:
     """Return a function that prints an event with the time since the start."""
 
     def print_event(event: KitEvent) -> None:
-        time = "" if event.kind == "help" else f"{(event.mono_ns - start_ns) / NS_PER_S:9.3f} s  "
-        console.print_result(f"{time}{event.text}")
+        elapsed = "" if event.kind == "help" else f"{(event.mono_ns - start_ns) / NS_PER_S:9.3f} s  "
+        console.print_result(f"{elapsed}{event.text}")
 
     return print_event

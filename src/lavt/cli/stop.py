@@ -23,9 +23,9 @@ from lavt.transport.security.gateway import Carry
 from lavt.transport.zenoh_link import ZenohLink, quiet_logs
 
 RETRY_PERIOD_S = 0.1
-"""How long to wait for a confirmation before the stop is sent again. Repetition is needed in a flood of queries: with
-1000 queries a second, of which the vehicle accepts 100, five of five stops succeeded within 30 tries, but none of six
-with a single query (measured)."""
+"""How long to wait for a confirmation before the stop is sent again. A flood of queries makes repetition necessary.
+Measured with 1000 queries a second, of which the vehicle accepts 100: five of five stops succeeded within 30 tries, but
+none of six stops that were sent only once."""
 TIMEOUT_S = 10.0
 
 
@@ -51,7 +51,7 @@ def stop(
     """
     console.reserve_stdout()
     settings = load_config(ClientConfig, config, changes or [])
-    authenticator = build_authenticator(settings)  # an expired key may stop the vehicle, too
+    authenticator = build_authenticator(settings)  # the vehicle also accepts a stop that an expired key has signed
     quiet_logs()
     clock, replies = MachineClock(), queue.Queue[bytes]()
 
@@ -86,7 +86,7 @@ def _repeat_until_confirmed(
 ) -> None:
     """Send the request until the vehicle confirms the stop; raise `WorkError` after `timeout_s`.
 
-    A single query may be lost or exceed the vehicle's rate limit. Repeated queries with one number count as one stop.
+    A single query can be lost or exceed the vehicle's rate limit. Repeated queries with the same number are one stop.
     """
     until_ns = clock.now().mono_ns + round(timeout_s * NS_PER_S)
     while clock.now().mono_ns < until_ns:

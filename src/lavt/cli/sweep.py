@@ -29,7 +29,7 @@ def sweep(
     resume: Annotated[bool, typer.Option("--resume", help="Continue a stopped sweep in --out.")] = False,
     cluster: Annotated[
         str | None,
-        typer.Option(metavar="ADDRESS|local", help="Run on Dask workers: those of a scheduler, or local ones."),
+        typer.Option(metavar="ADDRESS|local", help="Run on the Dask workers of a scheduler, or on local workers."),
     ] = None,
     as_json: console.JsonOption = False,
 ) -> None:

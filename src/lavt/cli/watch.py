@@ -78,13 +78,13 @@ def watch(
             if runtime.stopped.is_set():
                 break
             previous_totals, totals = totals, nodes.totals()
-            _print_statistics("second", nodes.between(previous_totals, totals), as_json)
+            _print_statistics("second", nodes.statistics_between(previous_totals, totals), as_json)
             if second == HINT_AFTER_S and not totals["packets"]:
                 console.print_message(_no_packet_hint(link, totals))
         runtime.stop()
     if runtime.failed is not None:
         raise WorkError(f"stopped because a part failed: {describe_error(runtime.failed)}")
-    summary = nodes.between(Counter(), nodes.totals())
+    summary = nodes.statistics_between(Counter(), nodes.totals())
     from_strangers = link.counts["datagrams_from_strangers"]
     values = {**summary, "datagrams_from_strangers": from_strangers, "check": CHECKS[sender]}
     _print_statistics("summary", values, as_json)
@@ -95,7 +95,7 @@ def watch(
 
 
 def _seconds(clock: MachineClock, stop: console.StopEvent, limit_s: int | None) -> Iterator[int]:
-    """Yield the number of each second when it has passed, up to the limit or the stop event."""
+    """Yield 1, 2, ... each time a further second has passed, up to `limit_s` or the stop event."""
     start_ns = clock.now().mono_ns
     for number in count(1) if limit_s is None else range(1, limit_s + 1):
         if stop.wait(max(0, start_ns + number * NS_PER_S - clock.now().mono_ns) / NS_PER_S):
@@ -117,7 +117,7 @@ def _no_packet_hint(link: UdpLink, totals: Mapping[str, int]) -> str:
     return (
         f"no RTP packet arrived in {HINT_AFTER_S} s ({totals['datagrams_unreadable']} other datagrams, "
         f"{link.counts['datagrams_from_strangers']} from other hosts): is the stream sent to UDP port {link.port} of "
-        "this machine, and does the firewall let it through?"
+        "this machine, and does the firewall admit this port?"
     )
 
 

@@ -27,7 +27,7 @@ from lavt.transport.clock_sync import probe
 
 
 class VehicleConfig(Section):
-    """The vehicle and its route; all keys except `kind` and `dbw` are for the built-in simulator."""
+    """The vehicle and its route; all keys except `kind` and `dbw` are for the built-in simulator or a software car."""
 
     kind: str = "simulator"
     route: str = "a_key"
@@ -48,22 +48,22 @@ class VehicleConfig(Section):
     time_limit_s: float | None = Field(None, gt=0, le=86_400)
     """The maximum duration of a drive from the first movement; null: the route's time at 10 km/h plus 30 s."""
     dbw: DbwConfig = DbwConfig()
-    """For kind `dbw`: the by-wire kit. The other keys then apply to its software car, if it has one."""
+    """The by-wire kit of a vehicle of kind `dbw`. The other keys then apply to the software car, if there is one."""
 
 
 ReorderHold = Literal["auto"] | Annotated[float, Field(ge=0, le=500)]
-"""How many ms a packet waits for missing earlier packets; auto: 10, or 1.25 times the largest recent reordering if that
-is more."""
+"""How many ms a packet waits for missing earlier packets; auto: 1.25 times the largest recent reordering, at least
+10."""
 
 
 class VideoConfig(Section):
     """The video: H.264 and RTP."""
 
     bit_rate_bps: int = Field(4_000_000, ge=50_000, le=50_000_000)
-    """The bit rate of the H.264 stream, as an upper limit of the mean over any `buffer_ms`. Packet headers and repair
-    packets are sent in addition to it."""
+    """The upper limit of the H.264 stream's bit rate, as a mean over any period of `buffer_ms`. Packet headers and
+    repair packets are not included."""
     gop_frames: int = Field(30, ge=1, le=600)
-    """The longest distance between keyframes; after a loss, the client requests an additional one."""
+    """The longest distance between keyframes; after a loss, the client requests an additional keyframe."""
     buffer_ms: float = Field(100.0, gt=0, le=2000)
     """The decoder's buffer (VBV): no frame is larger than the bit rate times this duration."""
     preset: Literal["ultrafast", "superfast", "veryfast", "faster", "fast", "medium", "slow", "slower", "veryslow"] = (
@@ -85,18 +85,18 @@ class NetworkConfig(Section):
     injection: Literal["relay", "netem", "none"] = "relay"
     state_delay: Literal["none", "with_video"] = "none"
     video: FlowChanges = FlowChanges()
-    """Values that replace those of the condition, so that a sweep can vary them one by one."""
+    """Values that replace those of the condition, so that a sweep can vary a single value."""
     control: FlowChanges = FlowChanges()
 
     def requested(self, condition: Condition) -> Condition:
-        """Return the requested condition: `condition`, which is the one named here, with the changes applied."""
+        """Return `condition`, which is the condition named in this section, with the changes of this section."""
         video_ms, video = self.video.apply_to(condition.video_ms, condition.video)
         control_ms, control = self.control.apply_to(condition.control_ms, condition.control)
         return Condition(video_ms=video_ms, control_ms=control_ms, video=video, control=control)
 
     @property
     def changes(self) -> str | None:
-        """The changes of the condition as text; None if there are none."""
+        """The changes of the condition as text; None without changes."""
         flows = {"video": self.video.replacements, "control": self.control.replacements}
         changes = [f"{flow}.{name} {value}" for flow, values in flows.items() for name, value in values.items()]
         return ", ".join(changes) or None
@@ -108,7 +108,7 @@ class SafetyConfig(Section):
     lateral_acceleration_mps2: float = Field(3.0, gt=0, le=6.0)
     picture_age_limit_ms: float = Field(500.0, gt=0, le=2000)
     stopping_distance_limit_m: float = Field(20.0, gt=0, le=200)
-    """The distance in which the car must be able to stop; above 20 m, it may drive faster than it was tested."""
+    """The distance in which the car must be able to stop; above 20 m, the car can drive faster than it was tested."""
 
 
 class RecordConfig(Section):
@@ -170,12 +170,12 @@ class ClocksConfig(Section):
     @classmethod
     def _check_bound(cls, bound_us: float, info: Any) -> float:
         if bound_us < info.data.get("error_us", 0.0):
-            raise ValueError("must be at least error_us, because the modelled error is within its bound")
+            raise ValueError("must be at least error_us, because the modelled error must not exceed its bound")
         return bound_us
 
 
 class StudyConfig(Section):
-    """The place of a run in a study with human operators; empty for a controller."""
+    """The place of a run in a study with human operators; without values if a controller drives."""
 
     participant: str | None = None
     block: int | None = None
@@ -207,8 +207,8 @@ class RunConfig(Section):
     def left_out(self) -> frozenset[str]:
         """Channels that are not recorded.
 
-        With fidelity `pixels` or `geometry`, access units are not video. `geometry` is for sweeps of thousands of runs.
-        It therefore also leaves out channels whose contents other channels have: commands (in `admission`), states (in
+        With fidelity `pixels` or `geometry`, access units are not video and are left out. `geometry` is for sweeps of
+        thousands of runs, so it also leaves out what other channels contain: commands (in `admission`), states (in
         `truth`) and packets (in `frame` and `picture`).
         """
         channels = {
@@ -226,6 +226,7 @@ class SweepConfig(RunConfig):
     conditions: tuple[str, ...] = ("L0", "L1", "L2", "L3", "L4", "L5")
     repetitions: int = Field(1, ge=1, le=10_000)
     axes: dict[str, list[Any]] = Field(default_factory=dict)
+    """The values of each further axis, by config key, such as `controller.preset`."""
 
 
 class BoundaryConfig(RunConfig):
@@ -235,11 +236,11 @@ class BoundaryConfig(RunConfig):
     presets: tuple[str, ...] = ("designed", "paper_calibrated")
     repetitions: int = Field(10, ge=1, le=10_000)
     longest_delay_ms: float = Field(700.0, gt=0, le=5000)
-    """The longest delay of the video that the search tries; the delay of the loop itself is added to it."""
+    """The longest delay of the video that the search tries; the total delay also includes the loop's own latency."""
     grid_ms: float = Field(100.0, gt=0, le=1000)
     """The search first tries delays that are this far apart."""
     within_ms: float = Field(2.0, ge=0.1, le=100)
-    """The accuracy to which the search then finds each boundary, between two delays of that grid."""
+    """The accuracy to which the search then determines each boundary, between two neighbouring delays of the grid."""
 
 
 class ZenohConfig(Section):
@@ -248,7 +249,7 @@ class ZenohConfig(Section):
     session: str = "zenoh-configs/session.json5"
     """A JSON5 file: a path, or the name of a shipped file."""
     router: str = ""
-    """The endpoint of the router; empty: the endpoint in that file."""
+    """The endpoint of the router; empty: the endpoint in the file `session`."""
 
 
 class ClockConfig(Section):
@@ -261,7 +262,7 @@ class ClockConfig(Section):
     bound_ms: float | None = Field(None, ge=0, le=86_400_000)
     """For source `external`: the largest error of the correction."""
     probe_port: int = Field(probe.DEFAULT_PORT, ge=0, le=65535)
-    """The server's UDP port of the clock probe, whose packets must not be delayed by injection."""
+    """The UDP port of the clock probe on the server. Injection must not delay the probe's packets."""
 
     @model_validator(mode="after")
     def _check_external(self) -> ClockConfig:
@@ -274,7 +275,7 @@ class ClockConfig(Section):
 
 
 class ClientClockConfig(ClockConfig):
-    """The clock of the client, which must know the server's port."""
+    """The clock of the client. Its probe port cannot be 0, because the client must know the server's port."""
 
     probe_port: int = Field(probe.DEFAULT_PORT, ge=1, le=65535)
 
@@ -326,7 +327,7 @@ class ClientVideoConfig(Section):
     port: int = Field(0, ge=0, le=65535)
     """0: the port that the server names in the session."""
     max_bit_rate_bps: int | None = Field(None, ge=50_000, le=50_000_000)
-    """The bit rate that the client requests if the server's own is higher."""
+    """The bit rate that the client requests if the server's bit rate is higher."""
     reorder_hold_ms: ReorderHold = "auto"
 
 
@@ -376,4 +377,6 @@ class Costs(Section):
 
     measured_on: str
     stages_us: dict[str, dict[str, float]]
+    """The time of each stage, by node and stage."""
     links_us: dict[str, float]
+    """The time that each link needs for a message."""

@@ -18,7 +18,7 @@ class CommandConfig(Section):
     """A command: its message, and the names of its signals by role. An empty name: the message has no such signal."""
 
     message: str | dict[CommandSet, str] = ""
-    """The message's name, or one name for each set of commands if the kit has several sets."""
+    """The message's name, or one name for each command set of the kit."""
     value: str = ""
     """The commanded value, in the DBC's unit. If the signal is multiplexed, its multiplexer is set accordingly."""
     enable: str = ""
@@ -30,7 +30,7 @@ class CommandConfig(Section):
     count: str = ""
     """The frame counter, which wraps around."""
     checksum: str = ""
-    """The CRC-8 of SAE J1850 over identifier and data, which must be the last byte."""
+    """The CRC-8 of SAE J1850 over identifier and data; this signal must be the last byte."""
 
 
 class SystemCommandConfig(Section):
@@ -45,7 +45,7 @@ class SystemCommandConfig(Section):
 
 
 class SentConfig(Section):
-    """All commands."""
+    """All commands that LAVT sends to the kit."""
 
     steering: CommandConfig
     brake: CommandConfig
@@ -71,9 +71,9 @@ class ReportConfig(Section):
     values: dict[ReportedValue, str] = Field(default_factory=dict)
     """The signal of each value, in the DBC's unit."""
     override: dict[str, str] = Field(default_factory=dict)
-    """Conditions under which the driver has taken over; CLEAR resets them."""
+    """Conditions under which the driver has taken over; the signal `clear` of a command resets them."""
     trip: dict[str, str] = Field(default_factory=dict)
-    """Conditions under which the kit's watchdog has tripped; CLEAR resets them after a driver has taken over."""
+    """Conditions under which the kit's watchdog has tripped; `clear` resets them after a driver has taken over."""
     command_error: dict[str, str] = Field(default_factory=dict)
     """Errors that the kit found in LAVT's commands; it reports them until the next correct command."""
     fault: dict[str, str] = Field(default_factory=dict)
@@ -83,13 +83,13 @@ class ReportConfig(Section):
     reasons: list[str] = Field(default_factory=list)
     """Signals whose value explains why driving is inhibited; the value is shown by its name in the DBC."""
     count: str = ""
-    """The frame counter; a report that repeats the last one's counter is dropped."""
+    """The frame counter; a report with the same count as the previous report is dropped."""
     checksum: str = ""
     """The checksum, as in a command; a report with a wrong checksum is dropped."""
 
 
 class ReportsConfig(Section):
-    """All reports."""
+    """All reports of the kit that LAVT reads."""
 
     steering: ReportConfig
     brake: ReportConfig
@@ -124,7 +124,7 @@ class ByWireCarConfig(Section):
 
 
 class ByWireLimitsConfig(Section):
-    """The limits of all commands on the bus. The rates of pedals limit how fast a pedal is pressed, not its release."""
+    """The limits of all commands on the bus. The rates of pedals limit only how fast a pedal is pressed."""
 
     steering_wheel_deg: float = Field(gt=0, le=3000)
     steering_wheel_rate_degps: float = Field(gt=0, le=3000)
@@ -144,7 +144,7 @@ class ProfileConfig(Section):
     dbc: str
     """The DBC file, in the directory of the profile."""
     commands: CommandSet | None = None
-    """The set of commands to use; null: the kit has only one."""
+    """The command set to use; null: the kit has only one."""
     vehicle: ByWireCarConfig
     limits: ByWireLimitsConfig
     command_step_deg: float = Field(0.1, gt=0)
@@ -159,11 +159,12 @@ class DbwConfig(Section):
     """A by-wire kit and its bus."""
 
     profile: str = "dataspeed_gen2"
-    """The name of a shipped profile or the path of a profile; the suffix `:user` selects the other set of commands."""
+    """The name of a shipped profile or the path of a profile; the suffix `:user` or `:remote` selects the command
+    set."""
     dbc: str = ""
     """The vendor's DBC file, to use instead of the profile's."""
     interface: str = "socketcan"
-    """The interface by python-can's name, or `inside`: a software car in the server's process."""
+    """The name of an interface of python-can, or `inside`: a software car in the server's process."""
     channel: str = "can0"
     options: dict[str, Any] = Field(default_factory=dict)
     """Further arguments of python-can's `Bus`."""
@@ -174,14 +175,14 @@ class DbwConfig(Section):
     watchdog_proof_days: int = Field(30, ge=1, le=365)
     """For how many days a proof is accepted."""
     car: str = Field("", max_length=64)
-    """The car's serial number or VIN. The proof of a real bus names it, because kits, as far as is known, do not report
-    which car they are in."""
+    """The car's serial number or VIN. The watchdog proof of a real bus contains it, because no kit is known to report
+    which car it is in."""
     steering_sign: Literal[1, -1] | None = None
     """1: left is positive on the bus. Only for a profile without a sign."""
 
     @property
     def is_inside(self) -> bool:
-        """Whether the kit is a software car in the server's process; this works in virtual time, too."""
+        """Whether the kit is a software car in the server's process, which is also possible in virtual time."""
         return self.interface == "inside"
 
     def __hash__(self) -> int:
@@ -195,7 +196,7 @@ class WatchdogProof(Section):
     version: Literal[2] = 2
     car: str
     at: str
-    """The date and time (UTC)."""
+    """The date and time of the test (UTC)."""
     profile: str
     commands: CommandSet | None
     digest: str
@@ -208,10 +209,10 @@ class WatchdogProof(Section):
     brake: float
     """The brake command before the commands stopped."""
     release_ms: float = Field(ge=0)
-    """From the last frame until the kit released the brake: it was reported as not enabled."""
+    """The time between the last command and the first report that the brake was not enabled."""
     braked_ms: float = Field(ge=0)
-    """From the last frame until the kit was reported to brake by itself."""
+    """The time between the last command and the first report that the kit braked by itself."""
     reports: int
     """The number of brake reports after the commands stopped."""
     said: str
-    """The texts of the trips, command errors, faults and reasons that the kit then reported."""
+    """The texts of the trips, command errors, faults and reasons that the kit reported at the end of the test."""

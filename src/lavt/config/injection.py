@@ -10,8 +10,8 @@ from lavt.config.section import Section
 from lavt.transport.emulation.link import QUEUE_PACKETS
 
 MAX_UNDELAYED_SHARE: Final = {"video": 0.0, "control": 0.5}
-"""The largest share of undelayed packets with which at least half of the flow is still delayed. For video it is 0,
-because a single undelayed repair packet can complete its frame early."""
+"""For each flow, the largest share of undelayed packets with which at least half of the flow is still delayed. For
+video the share is 0, because a single undelayed repair packet can complete its frame early."""
 
 
 class InjectionConfig(Section):
@@ -45,7 +45,7 @@ class ImpairmentConfig(Section):
     """The impairments of a flow in addition to a constant delay; see `docs/network.md`."""
 
     jitter_ms: float = Field(0.0, ge=0, le=10_000)
-    """The standard deviation of the delay; for the uniform distribution, its half width."""
+    """The standard deviation of the delay; for the uniform distribution, half of its width."""
     jitter_correlation: float = Field(0.0, ge=0, lt=1)
     """The correlation of the delay with the delay 20 ms earlier."""
     jitter_distribution: Literal["normal", "uniform", "pareto", "paretonormal"] = "normal"
@@ -55,11 +55,12 @@ class ImpairmentConfig(Section):
     rate_bps: int = Field(0, ge=0, le=10_000_000_000)
     """0: no limit."""
     reorder: float = Field(0.0, ge=0, lt=1)
-    """The share of packets that are not delayed, so that they overtake others."""
+    """The share of packets that are not delayed, so that they overtake delayed packets."""
     trace: str = ""
-    """A delay (a name that ends in .csv) or a capacity (Mahimahi) over time: a file of `netem/traces`, or a path."""
+    """A file of `netem/traces`, or a path: the delay over time (a name that ends in .csv), or the capacity over time in
+    Mahimahi's format (any other name)."""
     queue_packets: int = Field(QUEUE_PACKETS, ge=1, le=1_000_000)
-    """The length of the queue for `rate_bps` or a capacity; further packets are dropped."""
+    """The length of the queue before a limit by `rate_bps` or a capacity trace; further packets are dropped."""
 
     @property
     def has_delay_trace(self) -> bool:
@@ -120,10 +121,10 @@ class Condition(Section):
 
     @property
     def least_ms(self) -> dict[str, float]:
-        """A lower bound of each flow's median delay, which jitter and reordering can make less than requested.
+        """A lower bound of each flow's median delay: jitter and reordering can lower the median.
 
-        It is 0 if the reordered share exceeds `MAX_UNDELAYED_SHARE`, otherwise the delay minus four standard deviations
-        of the jitter.
+        The bound is 0 if the reordered share exceeds `MAX_UNDELAYED_SHARE`, otherwise the delay minus four standard
+        deviations of the jitter.
         """
         return {
             name: 0.0

@@ -22,7 +22,7 @@ class RendezvousConfig(Section):
 
     vehicle_id: str = "vehicle-1"
     vehicle_key: str = ""
-    """The file of the vehicle's key (NAME.sign.pub of `lavt keys`); empty: anyone can register under its name."""
+    """The file of the vehicle's key (NAME.sign.pub of `lavt keys`); empty: anyone can register as the vehicle."""
     bind: str = "0.0.0.0"  # noqa: S104 (clients connect from anywhere)
     """The address on which to receive. On a machine with several addresses, set the public one, because a NAT admits
     only replies from the address to which the vehicle sent."""

@@ -1,1 +1,1 @@
-"""The checks of `lavt doctor` and `lavt clock`, and the measurements of a machine that they judge."""
+"""The checks of `lavt doctor` and `lavt clock`, and the measurements of a machine on which the checks are based."""

@@ -24,7 +24,7 @@ UNREADABLE_REASONS: Final = {
     "states_of_another_time": "signed by the vehicle, which does not answer this operator's key",
     "states_forged": "not signed by the vehicle that security.vehicle names",
 }
-"""Why a gateway rejects states, by the name under which it counts them."""
+"""Why a gateway rejects states, by the name of the gateway's counter for them."""
 SHOWN_PACKAGES: Final = (
     "lavt",
     "eclipse-zenoh",
@@ -36,14 +36,15 @@ SHOWN_PACKAGES: Final = (
 )
 """Packages whose versions are shown, so that the user can compare two machines."""
 MIN_PICTURE_RATE_SHARE: Final = 0.9
-"""The required share of the configured picture rate; a lower one means that the exposure exceeds the picture period."""
+"""The required share of the configured picture rate; at a lower rate, the exposure is longer than the picture
+period."""
 RENEWAL_DAYS: Final = 14.0
 """The remaining validity below which a certificate or a key should be renewed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """The result of one check."""
+    """The result of one check; `found` is the finding as a sentence."""
 
     name: str
     verdict: Verdict
@@ -51,27 +52,30 @@ class Check:
     do: str = ""
     """The suggested fix; empty if there is nothing to fix."""
     measured: Mapping[str, Any] = field(default_factory=dict)
+    """The measured values by name."""
 
 
 @dataclass(frozen=True, slots=True)
 class CodecTimes:
-    """The processing times of synthetic pictures: stamping and encoding, and decoding and reading the stamp."""
+    """The processing times of synthetic pictures."""
 
     encode_ns: Sequence[int]
+    """For each picture, the time to stamp and encode it."""
     decode_ns: Sequence[int]
+    """For each picture, the time to decode it and read its stamp."""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraSample:
-    """The arrival times of a camera's pictures, and how many of them have a capture time."""
+    """The arrival times of a camera's pictures, and how many of the pictures have a capture time."""
 
     arrived_ns: Sequence[int]
-    with_capture_time: int
+    capture_time_count: int
 
 
 @dataclass(frozen=True, slots=True)
 class StateSample:
-    """The vehicle states received within `seconds` of the first one, and the number of unreadable states by reason."""
+    """The vehicle states of the `seconds` after the first state, and the number of unreadable states by reason."""
 
     states: Sequence[State] = ()
     unreadable: Mapping[str, int] = field(default_factory=dict)
@@ -104,7 +108,8 @@ def _version_tuple(version: str) -> tuple[int, ...]:
 def check_codec(times: CodecTimes, *, size: str, rate_hz: float, side: str, cores: int) -> Check:
     """Check that the codec is fast enough for the picture rate.
 
-    `side` is "server" for a machine that only encodes, "client" for one that only decodes, and empty for any other.
+    `side` is "server" for a machine that only encodes and "client" for one that only decodes. If it is empty, the
+    machine must do both.
     """
     period_ms = 1000.0 / rate_hz
     times_ns = {"encode": times.encode_ns, "decode": times.decode_ns}
@@ -133,7 +138,9 @@ def check_codec(times: CodecTimes, *, size: str, rate_hz: float, side: str, core
         )
         return Check("processor", "warning", found, do, measured)
     if cores < 2:
-        return Check("processor", "warning", found, "use at least two cores: on one, video delays commands", measured)
+        return Check(
+            "processor", "warning", found, "use at least two cores: on one core, video delays commands", measured
+        )
     return Check("processor", "ok", found, measured=measured)
 
 
@@ -169,9 +176,9 @@ def check_camera(sample: CameraSample | str, *, name: str, size: str, rate_hz: f
         return Check("camera", "problem", sample, do)
     pictures, arrived_ns = len(sample.arrived_ns), sample.arrived_ns
     measured_hz = (pictures - 1) * NS_PER_S / (arrived_ns[-1] - arrived_ns[0]) if pictures > 1 else 0.0
-    capture_times = "have a capture time" if sample.with_capture_time else "have no capture time"
+    capture_times = "have a capture time" if sample.capture_time_count else "have no capture time"
     found = f"{name} delivers {measured_hz:.1f} pictures of {size} a second, which {capture_times}"
-    measured = {"pictures": pictures, "rate_hz": measured_hz, "timed": sample.with_capture_time}
+    measured = {"pictures": pictures, "rate_hz": measured_hz, "timed": sample.capture_time_count}
     if measured_hz < rate_hz * MIN_PICTURE_RATE_SHARE:
         do = f"{rate_hz:g} Hz are configured: add light (in the dark the exposure is longer), or lower camera.rate_hz"
         return Check("camera", "warning", found, do, measured)
@@ -215,9 +222,10 @@ def check_timer(resolution_ns: int, late_ns: Sequence[int]) -> Check:
 
 
 def check_process_priority(niceness: int, session_niceness: int | None) -> Check:
-    """Check that LAVT's processes have a higher priority than ordinary ones.
+    """Check that LAVT's processes have a higher priority than ordinary processes.
 
-    The niceness of the session is None if the kernel does not share the processors among sessions.
+    `session_niceness` is the niceness of the terminal's session; None if the kernel does not share the processors among
+    sessions.
     """
     name, measured = "process priority", {"niceness": niceness, "session_niceness": session_niceness}
     if niceness < 0 and session_niceness is not None and session_niceness >= 0:
@@ -246,7 +254,7 @@ def check_governor(governors: Sequence[str]) -> Check:
 
 
 def check_clock(report: ClockReport | None) -> Check:
-    """Check this machine's time source; without one, driving is possible and latency measurements are less accurate."""
+    """Check this machine's time source. Driving is possible without one, but latency measurements are less accurate."""
     if report is None:
         return Check("clock", "warning", "the time source timed out", "try again when this machine is less busy")
     comparison = check_host(report)
@@ -263,7 +271,7 @@ def check_clock(report: ClockReport | None) -> Check:
 def check_netem(rejection: str, interface: str) -> Check:
     """Check that the kernel can delay packets here, which is required only if the config names an interface."""
     if not rejection:
-        return Check("netem", "ok", "the kernel can delay packets, and this user may use it")
+        return Check("netem", "ok", "the kernel can delay packets, and this user has the required permissions")
     if interface:
         do = "fix this, or leave injection.interface empty: without netem, this side cannot start"
         return Check("netem", "problem", rejection, do, {"interface": interface})
@@ -292,9 +300,9 @@ def check_router(endpoint: str, rejection: str) -> Check:
 
 
 def check_link(routers: Routers | None, *, has_vehicle: bool) -> Check:
-    """Check that this machine's router is linked to another one of the same version.
+    """Check that this machine's router is linked to another router of the same version.
 
-    `has_vehicle`: the vehicle's state arrives, so that no link is needed.
+    If `has_vehicle`, the vehicle's state arrives, and no link is needed.
     """
     name = "link of routers"
     if routers is None:
@@ -344,7 +352,7 @@ def check_vehicle(sample: StateSample, vehicle: str, version: str) -> Check:
 
 
 def check_probe(comparison: ClockComparison | None, host: str, port: int) -> Check:
-    """Check the clocks of both machines against each other by probes; None: no probe was answered."""
+    """Check the comparison of both machines' clocks by probes; None: no probe was answered."""
     measured: dict[str, Any] = {"host": host, "port": port}
     if comparison is None:
         do = (
@@ -363,7 +371,7 @@ def check_probe(comparison: ClockComparison | None, host: str, port: int) -> Che
 
 
 def check_video(host: str, port: int) -> Check:
-    """Return why the video's port cannot be checked before a drive."""
+    """Return a check without a verdict: the port of the video can only be checked by a drive."""
     address = f"UDP {host}:{port}" if port else f"{host}, UDP, the server's video.port (5600 by default)"
     do = "open that port to the vehicle's machine; `lavt client` reports whether pictures arrive"
     found = f"{address}: the server answers only a client with a session token, so only a drive can check the port"

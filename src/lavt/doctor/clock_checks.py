@@ -18,7 +18,7 @@ HINTS = {
     chrony.NOT_SYNCHRONISED: "wait for its first samples, or name a server in chrony.conf (see chronyc sources)",
     ptp.ABSENT: "install linuxptp on both machines, or set clock.source to another source",
     ptp.NOT_RUNNING: "start ptp4l, and run as a user who may write to its socket (root)",
-    ptp.NO_MASTER: "check that one machine is master and the other receives it (see pmc 'GET PORT_DATA_SET')",
+    ptp.NO_MASTER: "check that one machine is master and the other receives its messages (pmc 'GET PORT_DATA_SET')",
 }
 """How to fix a time source, by its status."""
 
@@ -33,7 +33,7 @@ class ClockEstimate:
 
 @dataclass(frozen=True, slots=True)
 class ClockComparison:
-    """The result of a clock check."""
+    """The result of a check of this machine's clock, alone or compared with the server's."""
 
     good: bool
     """Whether the clocks are accurate enough for a run on two machines."""
@@ -63,28 +63,28 @@ def check_host(report: ClockReport) -> ClockComparison:
     return ClockComparison(good, (sentence,) if good else (sentence, _bound_complaint(bound_ms)))
 
 
-def compare(
-    before: ClockReport, report: ClockReport, probes: Sequence[ClockProbe], last_reply: ProbeReply, server: str
+def compare_with_server(
+    before: ClockReport, after: ClockReport, probes: Sequence[ClockProbe], last_reply: ProbeReply, server: str
 ) -> ClockComparison:
-    """Compare this machine's clock with that of the server at the address `server`, which answered these probes.
+    """Compare this machine's clock with the clock of the server at the address `server`, which answered these probes.
 
-    `before` and `report` are the reports of this machine's time source before and after the probing. The estimate uses
-    `report`. The server's report is from a moment in between, so that the change from `before` to `report` is added to
-    the bound.
+    `before` and `after` are the reports of this machine's time source before and after the probing. The estimate uses
+    `after`. The server reported its correction between the two, so the change from `before` to `after` is added to the
+    bound.
     """
     usable = [probe for probe in probes if probe.round_trip_ns >= 0]
     if not usable:
         return ClockComparison(False, ("no answer is usable: a clock was set during each probe, so try again later",))
     best = min(usable, key=lambda probe: probe.round_trip_ns)
     probe = ClockEstimate(best.offset_ns / NS_PER_MS, best.round_trip_ns / 2 / NS_PER_MS)
-    sources = _estimate_from_sources(before, report, last_reply, server)
+    sources = _estimate_from_sources(before, after, last_reply, server)
     round_trip_ms = best.round_trip_ns / NS_PER_MS
-    sentences = [check_host(report).says[0]]
+    sentences = [check_host(after).says[0]]
     complaints: list[str] = []
     if sources is None:
-        if report.correction_s is not None and before.correction_s is None:
+        if after.correction_s is not None and before.correction_s is None:
             sentences.append("this machine's time source had no estimate before the probing: run `lavt clock` again")
-        elif report.correction_s is not None:
+        elif after.correction_s is not None:
             sentences.append("the server's time source has no estimate: run `lavt clock` there")
         sentences.append(
             f"Delta (server minus client) from the probe alone: {probe.ms:+.3f} ms ± {probe.bound_ms:.3f} ms. The "
@@ -92,10 +92,10 @@ def compare(
         )
     else:
         sentences.append(
-            f"Delta (server minus client) from {report.source}: {sources.ms:+.3f} ms ± {sources.bound_ms:.3f} ms"
+            f"Delta (server minus client) from {after.source}: {sources.ms:+.3f} ms ± {sources.bound_ms:.3f} ms"
         )
         sentences.append(f"Delta from the probe: {probe.ms:+.3f} ms ± {probe.bound_ms:.3f} ms")
-        complaints += _path_complaints(report, round_trip_ms, server)
+        complaints += _path_complaints(after, round_trip_ms, server)
         difference_ms, allowed_ms = abs(sources.ms - probe.ms), sources.bound_ms + probe.bound_ms
         if complaints:
             sentences.append(f"the two estimates differ by {difference_ms:.3f} ms")
@@ -115,26 +115,26 @@ def compare(
 
 
 def _estimate_from_sources(
-    before: ClockReport, report: ClockReport, last_reply: ProbeReply, server: str
+    before: ClockReport, after: ClockReport, last_reply: ProbeReply, server: str
 ) -> ClockEstimate | None:
     """Return Delta from the time sources of both machines; None if either has no estimate."""
-    correction_s, bound_s = report.correction_s, report.bound_s
+    correction_s, bound_s = after.correction_s, after.bound_s
     server_correction_s, server_bound_s = last_reply.correction_s, last_reply.bound_s
     if before.correction_s is None or correction_s is None or bound_s is None:
         return None
     if server_correction_s is None or server_bound_s is None:
         return None
-    path = (report.peer_delay_s, report.peer_dispersion_s, report.skew_ppm, report.age_s)
+    path = (after.peer_delay_s, after.peer_dispersion_s, after.skew_ppm, after.age_s)
     delay_s, dispersion_s, skew_ppm, age_s = (math.inf if value is None else value for value in path)
-    # If this machine follows the server, only the path between the two limits the accuracy of Delta.
+    # If this machine follows the server, an error of the server's own clock does not change Delta.
     path_bound_s = delay_s / 2 + dispersion_s + (skew_ppm / 1e6 * age_s if age_s else 0.0)
-    total_bound_s = min(bound_s, path_bound_s) if report.follows == server else bound_s + server_bound_s
+    total_bound_s = min(bound_s, path_bound_s) if after.follows == server else bound_s + server_bound_s
     change_s = abs(correction_s - before.correction_s)
     return ClockEstimate((correction_s - server_correction_s) * 1e3, (total_bound_s + change_s) * 1e3)
 
 
 def _path_complaints(report: ClockReport, round_trip_ms: float, server: str) -> list[str]:
-    """Return a complaint if NTP's round trip is longer than the probe's; empty otherwise."""
+    """Return a complaint if NTP's round trip is clearly longer than the probe's; otherwise no complaint."""
     delay_ms = None if report.peer_delay_s is None else report.peer_delay_s * 1e3
     if report.follows != server or delay_ms is None or delay_ms <= round_trip_ms + PATH_LIMIT_MS:
         return []

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from lavt.assembly.cameras import build_device
-from lavt.assembly.clock_source import clock_source, query_process
+from lavt.assembly.clock_source import build_query_process, clock_source
 from lavt.assembly.fidelity import VIDEO
 from lavt.assembly.security import build_authenticator, build_cipher, build_gateway
 from lavt.clock import MachineClock, pause
@@ -48,7 +48,7 @@ PROCESSORS = Path("/sys/devices/system/cpu")
 
 
 class KeyFile(NamedTuple):
-    """A file that a config's `security` names: the key of the config, such as security.key, and the file's path."""
+    """A file that a config's `security` names, with the config's key for it, such as `security.key`."""
 
     config_key: str
     path: Path
@@ -74,7 +74,7 @@ def _version(name: str) -> str | None:
 
 
 def codec_times(config: ServerConfig, clock: MachineClock) -> CodecTimes:
-    """Time the codec with synthetic pictures, as server and client use it; raise the codec's errors."""
+    """Time the codec with synthetic pictures and the settings of server and client; let the codec's errors through."""
     camera = config.camera
     client_camera = ClientCameraConfig(width_px=camera.width_px, height_px=camera.height_px, rate_hz=camera.rate_hz)
     sender, receiver = VIDEO.sender(config), VIDEO.receiver(ClientConfig(camera=client_camera))
@@ -98,8 +98,8 @@ def codec_times(config: ServerConfig, clock: MachineClock) -> CodecTimes:
 def _pictures(width_px: int, height_px: int) -> Iterator[Picture]:
     """Yield pictures of a moving smooth texture with some noise.
 
-    They are a little harder to encode than the simulator's road: on one machine they took 2.2 ms to encode and 0.8 ms
-    to decode. The road took 2.0 ms and 0.7 ms.
+    These pictures take a little longer than pictures of the simulator's road: measured on one machine, 2.2 ms to encode
+    and 0.8 ms to decode, compared with 2.0 ms and 0.7 ms.
     """
     random = stream(1, "doctor")
     coarse = random.integers(0, 256, (height_px // 16 + 1, width_px // 16 + 1, 3), dtype=np.uint8)
@@ -113,19 +113,19 @@ def _pictures(width_px: int, height_px: int) -> Iterator[Picture]:
 
 
 def sample_camera(config: ServerConfig, clock: MachineClock) -> CameraSample | str:
-    """Take pictures from the configured camera for two seconds; return the reason if it cannot be used."""
+    """Take pictures from the configured camera for two seconds; if the camera cannot be used, return the reason."""
     try:
         camera = build_device(config)
     except UserError as error:
         return str(error)
-    arrived_ns, with_capture_time = [], 0
+    arrived_ns, capture_time_count = [], 0
     with closing(camera):
         end_ns = clock.now().mono_ns + CAMERA_SAMPLE_NS
         while (left_ns := end_ns - clock.now().mono_ns) > 0:
             if camera.wait(left_ns / NS_PER_S) and (frame := camera.capture(0, clock.now().mono_ns, None)):
                 arrived_ns.append(clock.now().mono_ns)
-                with_capture_time += frame.capture_ns is not None
-    return CameraSample(arrived_ns, with_capture_time)
+                capture_time_count += frame.capture_ns is not None
+    return CameraSample(arrived_ns, capture_time_count)
 
 
 def receive_buffer_bytes() -> int:
@@ -174,14 +174,14 @@ def governors() -> list[str]:
 
 def clock_report(config: ClockConfig, clock: MachineClock) -> ClockReport | None:
     """Query this machine's time source; return None if it times out."""
-    with closing(query_process(config)) as process:
+    with closing(build_query_process(config)) as process:
         return clock_source(config, clock, process.run)()
 
 
 def netem_rejection(interface: str) -> str:
-    """Return why no delay can be injected on this machine; empty if it can.
+    """Return why no delay can be injected on this machine; empty: it can.
 
-    The queues are created in a temporary network namespace, so that no existing interface is changed.
+    The check creates its queues in a temporary network namespace, so that no existing interface is changed.
     """
     command = ("unshare", "--net", "--", "tc", "qdisc", "add", "dev", "lo", "root")
     try:
@@ -195,7 +195,7 @@ def netem_rejection(interface: str) -> str:
 
 
 def bind_rejection(host: str, port: int) -> str:
-    """Return why a UDP port cannot be opened; empty if it can."""
+    """Return why a UDP port cannot be opened; empty: it can."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp_socket:
         try:
             udp_socket.bind((host, port))
@@ -205,7 +205,7 @@ def bind_rejection(host: str, port: int) -> str:
 
 
 class StateListener:
-    """A receiver of the vehicle's states: it counts all that arrive and keeps those that the gateway accepts."""
+    """A receiver of the vehicle's states: it counts all states, and keeps the states that a gateway accepts."""
 
     def __init__(self, settings: ServerConfig | ClientConfig) -> None:
         self._accepted: queue.SimpleQueue[bytes] = queue.SimpleQueue()
@@ -294,7 +294,7 @@ def signing_key_days_left(path: Path, now_wall_ns: int) -> float | None:
 
 
 def keys_rejection(settings: ServerConfig | ClientConfig) -> str:
-    """Return why the keys that a config names cannot be used; empty if they can."""
+    """Return why the keys that a config names cannot be used; empty: they can."""
     try:
         build_cipher(settings)
         build_authenticator(settings)

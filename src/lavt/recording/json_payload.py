@@ -26,7 +26,7 @@ to_json = msgspec.json.Encoder(enc_hook=_to_builtin).encode
 
 @functools.cache
 def json_schema(payload_type: type) -> bytes:
-    """Return the JSON Schema of a payload's type; for a dict or a type with NumPy arrays it is any object."""
+    """Return the JSON Schema of a payload's type; for a dict, or for a type with NumPy arrays, it allows any object."""
     if payload_type is dict:
         return b'{"type": "object"}'
     name = payload_type.__name__

@@ -1,4 +1,4 @@
-"""The live status of a running side: its newest figures and the ending of its drive, from the entries of its record."""
+"""The live status of a running side: its newest values and the ending of its drive, from the entries of its record."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ MAX_PENDING = 4096
 """At most this many entries, and this many updates, are kept until they are read: enough for more than ten seconds."""
 
 StatusUpdate = tuple[State | str, Now]
-"""A state of the vehicle or the reason for which a command was rejected, and its time."""
+"""(content, time): the content is a state of the vehicle, or the reason for which a command was rejected."""
 
 
 class LiveStatus:
-    """A recorder that keeps the newest figures for display, even if the record cannot be written.
+    """A recorder that keeps the newest values for display, even if the record cannot be written.
 
     `write` is called by the threads of the runtime and only stores the entry; the other methods process the stored
     entries, and are for one thread.
@@ -56,7 +56,7 @@ class LiveStatus:
         return updates
 
     def status(self) -> dict[str, Any]:
-        """Return a copy of the newest figures."""
+        """Return a copy of the newest values, by name."""
         self._process_entries()
         return dict(self._status)
 
@@ -83,7 +83,7 @@ class LiveStatus:
             self._updates.append((state, now))
 
     def _update_admission(self, admission: Any, now: Now) -> None:
-        if admission.verdict == "accepted":  # any other command may be a stranger's, with a false send time
+        if admission.verdict == "accepted":  # a rejected command can come from a stranger and have a false send time
             self._status["raw_tau_c_ms"] = (admission.received_wall_ns - admission.sent_wall_ns) / NS_PER_MS
         if admission.reason:
             self._status["rejected"] = admission.reason

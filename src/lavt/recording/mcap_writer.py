@@ -1,8 +1,8 @@
 """A fast writer of MCAP files (mcap.dev/spec): a side writes hundreds of messages for each second of a drive.
 
-The writer of the package `mcap` takes 10 us for a message, this one takes 2 us. The package's classes write the other,
-rare records (header, schemas, channels, indexes), and the tests read the files with the package's reader. In this
-module, "record" has MCAP's meaning: one entry of the file, such as a message, a channel or an index.
+The writer of the package `mcap` takes 10 us for a message, this writer takes 2 us. The package's classes write the
+other records (header, schemas, channels, indexes), which are rare, and the tests read the files with the package's
+reader. In this module, "record" has MCAP's meaning: one entry of the file, such as a message, a channel or an index.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from mcap.records import (
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 _MESSAGE: Final = struct.Struct("<BQHIQQ")
-"""Opcode, length of the content that follows, channel, sequence number, log time and publish time; the data follow."""
+"""Opcode, length of the rest, channel, sequence number, log time and publish time of a message; its data follow."""
 _MESSAGE_OPCODE: Final = int(Opcode.MESSAGE)
 _HEAD_BYTES: Final = 9
-"""Opcode of a record, and length of the content that follows."""
+"""Length of the head of a record: its opcode, and the length of the content that follows."""
 _MESSAGE_FIELDS_BYTES: Final = _MESSAGE.size - _HEAD_BYTES
 _MESSAGE_INDEX: Final = struct.Struct("<BQHI")
-"""Opcode, length of the content that follows, channel, and length of the entries (log time and offset) that follow."""
+"""Opcode, length of the rest, channel, and length of the entries of an index; its entries (log time, offset) follow."""
 _MESSAGE_INDEX_FIELDS_BYTES: Final = _MESSAGE_INDEX.size - _HEAD_BYTES
 _FOOTER_BYTES: Final = 20
 """Length of a footer's content: two offsets and a checksum."""
@@ -128,7 +128,7 @@ class McapFile:
         self._parts: list[bytes] = []
         self._size = 0
         self._messages: defaultdict[int, list[int]] = defaultdict(list)
-        """For each channel, the log time and the offset of each message, alternating."""
+        """For each channel, a flat list: log time and offset of the first message, of the second, and so on."""
 
     def _finish_chunk(self) -> None:
         if not self._messages:

@@ -13,7 +13,7 @@ import lavt
 LIBRARIES = ("numpy", "opencv-python-headless", "av", "eclipse-zenoh")
 
 
-@functools.cache  # it is constant, and every run needs it
+@functools.cache  # the result is constant, and every run needs it
 def provenance() -> Mapping[str, Mapping[str, str]]:
     """Return the versions of LAVT and its libraries, and a description of the machine."""
     return {

@@ -1,8 +1,8 @@
-"""Records of runs: one MCAP file per side with all its inputs and outputs, in the order in which they occurred.
+"""Records of runs: one MCAP file per side with all inputs and outputs of that side, in the order of their occurrence.
 
 A message's log time is the host's wall clock, its publish time the host's monotonic clock. Readers keep the order of
 the file, so that a step of the wall clock does not reorder messages. Formats: MCAP (mcap.dev/spec), JSON with JSON
-Schema; the video is `foxglove.CompressedVideo`, which Foxglove and others play.
+Schema. The video is `foxglove.CompressedVideo`, which Foxglove and other programs play.
 """
 
 from __future__ import annotations
@@ -73,8 +73,8 @@ class RecordWriter:
     """A writer of one side's record.
 
     `digest`, if given, is updated with the side, channel, times, length and JSON of every message. Both sides of a run
-    in virtual time share one digest, which therefore also covers the order of messages on different sides. It covers
-    neither annotations nor the channels in `left_out`; these channels are not recorded.
+    in virtual time share one digest, which therefore also covers the order of messages on different sides. The digest
+    does not cover annotations. Channels in `left_out` are neither recorded nor covered by the digest.
     """
 
     def __init__(
@@ -93,7 +93,8 @@ class RecordWriter:
     def write(self, channel: str, payload: Any, now: Now) -> None:
         """Buffer one message for the topic "/" + `channel`; its payload must not change afterwards.
 
-        Raises `TypeError` for values that JSON cannot represent, at the latest in `close`.
+        Values that JSON cannot represent raise `TypeError` when the buffer is written: in this call, in a later one or
+        in `close`.
         """
         self._buffer.append((channel, payload, now))
         if len(self._buffer) >= BUFFERED_MESSAGES:
@@ -146,14 +147,14 @@ def _video_json(payload: Any) -> bytes:
     )
     seconds, nanoseconds = divmod(stamp_ns, NS_PER_S)
     text = base64.b64encode(unit).decode("ascii")
-    # Formatted without `json`, because this is by far the largest message and base64 needs no escaping.
+    # Formatted without the module `json`: video is by far the largest message, and base64 needs no escaping.
     return (
         f'{{"timestamp":{{"sec":{seconds},"nsec":{nanoseconds}}},"frame_id":"camera","data":"{text}","format":"h264"}}'
     ).encode()
 
 
 class _Tables(Mapping[str, Table]):
-    """The tables of a record's channels. Each is parsed on first access, because half of them are never read."""
+    """The tables of a record's channels. A table is parsed on first access, because half of them are never read."""
 
     def __init__(self, messages: Mapping[str, Messages]) -> None:
         self._messages = messages
@@ -194,7 +195,7 @@ class Record:
         return self.tables.get(channel, EMPTY)
 
     def video(self) -> list[tuple[int, bytes]]:
-        """Read the stamp (ns) and the data of each access unit from the file; they are too large to keep in memory."""
+        """Read the (stamp in ns, data) of each access unit from the file; `tables` leaves them out, as too large."""
         units = []
         content = read_mcap(self.path, lambda topic: topic == "/" + VIDEO)
         with evaluating(self.path):
@@ -207,25 +208,25 @@ class Record:
 
 @contextmanager
 def evaluating(path: Path) -> Iterator[None]:
-    """Raise `UserError` if the records at `path`, which others may have written, have unexpected content.
+    """Convert an error of a computation with the records at `path` into a `UserError`.
 
-    Such content is intact (checksums detect damage), but has another type or range than LAVT writes, and may cause any
-    error in a computation with it.
+    Records that another program wrote can have values of a type or range that LAVT does not write, which can cause
+    nearly any error. Damage does not get this far: checksums detect it.
     """
     try:
         yield
     except (ArithmeticError, AttributeError, LookupError, MemoryError, RecursionError, TypeError, ValueError) as error:
         reason = " ".join(describe_error(error).split())
         raise UserError(
-            f"{path} has records that LAVT cannot evaluate ({reason}): name a run that it recorded"
+            f"{path} has records that LAVT cannot evaluate ({reason}): name a run that LAVT recorded"
         ) from error
 
 
 def read_record(path: Path, channels: Container[str] | None = None) -> Record:
-    """Read the record at `path` into tables, without the video; `channels`, if given, limits the channels.
+    """Read the record at `path` into tables, without the video; read only `channels`, if given.
 
-    Of a file that is unfinished after a crash or on a full disk, all whole chunks are read. Raises `WorkError` if there
-    is no file, and `UserError` for a record in another format version.
+    If a crash or a full disk left the file unfinished, all its whole chunks are read. Raises `WorkError` if there is no
+    file, and `UserError` for a record in another format version.
     """
     if not path.is_file():
         raise WorkError(f"there is no record at {path}")
@@ -242,9 +243,9 @@ def read_record(path: Path, channels: Container[str] | None = None) -> Record:
 
 
 def _check_version(path: Path, content: McapContent) -> None:
-    """Raise `UserError` for a record in another format version than `FORMAT_VERSION`.
+    """Raise `UserError` for a record in a format version other than `FORMAT_VERSION`.
 
-    The version is the first entry of a file. A file without it that was cut before its first message is read as empty.
+    The version is the first entry of a file. A file that was cut before this entry is accepted, and is empty.
     """
     version = content.metadata.get(_FORMAT, {}).get("version")
     if version is None and not content.complete and not content.topics:

@@ -16,8 +16,8 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 MISSING = int(np.iinfo(np.int64).min)
-"""Null in a column of integers. Floats cannot be used instead: for wall clock times, which exceed 2^60 ns, their
-resolution is only 256 ns."""
+"""Null in a column of integers. Such a column cannot have floats and NaN instead, because wall clock times exceed
+2^60 ns, where the resolution of floats is 256 ns."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class Table:
         return len(self.mono_ns)
 
     def ints(self, name: str) -> IntArray:
-        """Return a column of integers: `MISSING` for null, for more than 64 bits, and for a missing column."""
+        """Return a column of integers: `MISSING` for null, for a missing column, and for more than 64 bits."""
         column = self.columns.get(name)
         if column is None or column.dtype != np.int64:
             return _ints_of(column, len(self))
@@ -82,7 +82,7 @@ class Table:
         return [None if _is_null(value) else value for value in values]
 
     def where(self, selection: BoolArray | IntArray) -> Table:
-        """Return the rows for which `selection` is true, or those whose indexes are in `selection`, in its order."""
+        """Return the rows for which `selection` is true, or the rows with the indexes in `selection`, in that order."""
         return Table(
             self.mono_ns[selection],
             self.wall_ns[selection],
@@ -110,14 +110,14 @@ EMPTY = Table(np.zeros(0, np.int64), np.zeros(0, np.int64))
 
 
 def table_of(rows: Sequence[Mapping[str, Any]], mono_ns: Sequence[int], wall_ns: Sequence[int]) -> Table:
-    """Return a table of `rows`; a field that is missing in a row is null there."""
+    """Return a table of `rows`; a field that a row does not have is null in that row."""
     names = dict.fromkeys(name for fields in {tuple(row): None for row in rows} for name in fields)
     columns = _Columns(names, lambda name: _column([row.get(name) for row in rows]))
     return Table(np.array(mono_ns, np.int64), np.array(wall_ns, np.int64), columns)
 
 
 class _Columns(Mapping[str, NDArray[Any]]):
-    """Columns, each of which is built on first access, because of most channels only a few are ever read."""
+    """Columns, each of which is built on first access, because most channels have columns that nobody reads."""
 
     def __init__(self, names: Iterable[str], build: Callable[[str], NDArray[Any]]) -> None:
         self._columns: dict[str, NDArray[Any] | None] = dict.fromkeys(names)

@@ -76,7 +76,7 @@ def test_a_missing_time_stays_missing() -> None:
     """A client time is converted to the server's clock with Delta at this time; a missing time stays missing."""
     offset = ClockOffset(TRUE_NS + np.array([0, 100]), np.array([10.0, 30.0]), np.zeros(2), 0.0)
     client_ns = np.array([TRUE_NS, MISSING, TRUE_NS + 100])
-    assert offset.on_server_ns(client_ns).tolist() == [TRUE_NS + 10, MISSING, TRUE_NS + 130]
+    assert offset.to_server_ns(client_ns).tolist() == [TRUE_NS + 10, MISSING, TRUE_NS + 130]
 
 
 def test_a_shared_clock_has_no_offset() -> None:
@@ -339,7 +339,11 @@ def test_evaluation_of_an_exchange() -> None:
     assert exchanges.server_wall_ns.tolist() == [1040]
     assert exchanges.delta_ns.tolist() == [910.0]
     assert exchanges.round_trip_ns.tolist() == [40]
-    assert [len(exchanges.within(*interval)) for interval in ((1040, 1040), (1041, 1050), (1030, 1039))] == [1, 0, 0]
+    assert [len(exchanges.select_interval(*interval)) for interval in ((1040, 1040), (1041, 1050), (1030, 1039))] == [
+        1,
+        0,
+        0,
+    ]
 
 
 @given(st.integers(0, 2**32), st.floats(-240, 240), st.floats(-240, 240))

@@ -21,8 +21,8 @@ from lavt.errors import UserError, WorkError
 from lavt.experiment.boundary import boundary as boundary_module
 from lavt.experiment.boundary.bisection import Bracket, first_bracket, zero_bracket
 from lavt.experiment.boundary.boundary import (
-    departed,
-    not_completed,
+    has_departed,
+    is_not_completed,
     plan_boundary,
     run_search,
     run_searches,
@@ -204,7 +204,7 @@ def test_departure_and_completion() -> None:
         ((), (False, True)),
     ):
         drive = summarize_drive(payloads(*events))
-        assert (departed(drive), not_completed(drive)) == expected
+        assert (has_departed(drive), is_not_completed(drive)) == expected
 
 
 def test_a_drive_that_never_began() -> None:
@@ -213,7 +213,7 @@ def test_a_drive_that_never_began() -> None:
     recorded["event"] = [Event(600 * NS_PER_MS, "lane_invasion", "")]
     drive = summarize_drive(recorded)
     assert (len(drive.time_s), math.isnan(drive.total_delay_ms)) == (0, True)
-    assert (departed(drive), not_completed(drive), growth_per_s(drive)) == (False, True, -math.inf)
+    assert (has_departed(drive), is_not_completed(drive), growth_per_s(drive)) == (False, True, -math.inf)
 
 
 # The summary of many seeds.

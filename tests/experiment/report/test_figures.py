@@ -7,7 +7,7 @@ from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
 from matplotlib.text import Annotation
 
-from lavt.experiment.report.figure_style import clusters_of, condition_colours
+from lavt.experiment.report.figure_style import FigurePoint, clusters_of, condition_colours
 from lavt.experiment.report.latency_figures import degradation_figure, presets_figure
 from lavt.experiment.report.run_figures import cross_track_figure
 from lavt.experiment.statistics.paper_results import paper
@@ -48,10 +48,10 @@ def test_points_with_overlapping_names_form_a_cluster() -> None:
     """Points whose names would overlap form a cluster, with the upper point first; other points are alone."""
     axes = Figure().subplots()
     axes.set(xlim=(0, 420), ylim=(0, 112))
-    points = [("a", 100.0, 50.0, None), ("b", 104.1, 53.4, None), ("c", 100.0, 90.0, None), ("d", 350.0, 50.0, None)]
+    points = [("a", 100.0, 50.0), ("b", 104.1, 53.4), ("c", 100.0, 90.0), ("d", 350.0, 50.0)]
     for shift in range(12):
-        moved = [(name, x + shift, y + shift / 4, None) for name, x, y, _ in points]
-        assert [[point[0] for point in cluster] for cluster in clusters_of(moved, axes)] == [["c"], ["b", "a"], ["d"]]
+        moved = [FigurePoint(name, x + shift, y + shift / 4, None) for name, x, y in points]
+        assert [[point.name for point in cluster] for cluster in clusters_of(moved, axes)] == [["c"], ["b", "a"], ["d"]]
     assert clusters_of([], axes) == []
 
 

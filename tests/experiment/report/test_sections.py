@@ -15,9 +15,9 @@ import pytest
 from lavt.experiment.analysis.results import run_result, write_json
 from lavt.experiment.report import boundary_section
 from lavt.experiment.report.figure_style import condition_colours
-from lavt.experiment.report.groups import axes_of, differing_settings, in_order, is_in_group, title_of
+from lavt.experiment.report.groups import axes_of, differing_settings, is_in_group, sort_groups, title_of
 from lavt.experiment.report.report import write_report
-from lavt.experiment.report.run_figures import drawn_points
+from lavt.experiment.report.run_figures import drawn_indexes
 from lavt.experiment.report.sections import (
     ReportContext,
     axis_parts,
@@ -306,7 +306,7 @@ def test_axes_of_a_sweep_are_drawn(count: int, tmp_path: Path) -> None:
 def test_group_titles_are_as_short_as_possible() -> None:
     """A setting that an axis implies is not in the title of a group, and groups are sorted by their axis values."""
     runs = [run_of("L0", axes={"loss": loss}, changes=f"loss {loss}") for loss in (10.0, 2.0)]
-    groups = in_order(summarize(runs, None)["groups"])
+    groups = sort_groups(summarize(runs, None)["groups"])
     assert differing_settings(groups) == ["loss"]
     assert [title_of(group, ["loss"]) for group in groups] == ["loss 2.0", "loss 10.0"]
     assert [is_in_group(runs[1], group) for group in groups] == [True, False]
@@ -334,9 +334,9 @@ def test_sweeps_without_a_common_condition_are_reported(tmp_path: Path) -> None:
 def test_a_drive_is_drawn_every_half_metre() -> None:
     """The drawn points of a drive are the first, the last, and one for each half metre of progress."""
     progress_m = np.linspace(0.0, 10.0, 1001)
-    indices = drawn_points(progress_m)
-    assert (indices[0], indices[-1], len(indices)) == (0, 1000, 21)
-    assert drawn_points(np.zeros(0)) == []
+    rows = drawn_indexes(progress_m)
+    assert (rows[0], rows[-1], len(rows)) == (0, 1000, 21)
+    assert drawn_indexes(np.zeros(0)) == []
 
 
 def test_a_boundary_that_was_not_found_is_a_dash_with_its_reason() -> None:

@@ -114,7 +114,7 @@ def test_html_escapes_texts() -> None:
 def test_columns_without_values_are_left_out() -> None:
     """A column without a known value is left out; a column with one value remains."""
     columns = [text_column("name"), number_column("known"), share_interval_column("unknown"), probability_column("p")]
-    table = TableData(columns, [["a", None, None, None], ["b", 1.0, None, None]]).without_empty()
+    table = TableData(columns, [["a", None, None, None], ["b", 1.0, None, None]]).without_empty_columns()
     assert [column.title for column in table.columns] == ["name", "known"]
     assert table.rows == [["a", None], ["b", 1.0]]
 

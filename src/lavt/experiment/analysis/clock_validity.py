@@ -1,6 +1,6 @@
-"""The reasons from the clocks for which a run is invalid.
+"""The checks of a run's clocks, which return the reasons why the run is invalid.
 
-Each cause has one reason; the consequences of a cause are not reported in addition.
+Each cause gives one reason; its consequences give no further reasons.
 """
 
 from __future__ import annotations
@@ -15,10 +15,11 @@ from lavt.recording.record import Record
 from lavt.recording.table import MISSING, IntArray, Table
 
 STEP_LIMIT_MS = 5.0
-"""A wall clock that moves more than this relative to the monotonic clock between two samples was set. Steering, however
-fast, moves both clocks (clock_gettime(2)) and is not a step."""
+"""If the wall clock changes by more than this relative to the monotonic clock between two samples, it was set. Fast
+steering is not a step, because it changes both clocks (clock_gettime(2))."""
 POLL_LIMIT_S = 2.5
-"""The longest time between two samples of a clock. Clocks are sampled every second, so one sample may be missing."""
+"""The longest time between two samples of a clock. Clocks are sampled every second, so one missing sample is
+allowed."""
 CLOCK_BOUND_LIMIT_MS = 2.0
 """With a larger bound, the split of the loop latency into tau_v and tau_c is too uncertain."""
 PATH_LIMIT_MS = 1.0
@@ -29,8 +30,8 @@ NO_SAMPLE_ALLOWED_S = 5.0
 """A shorter time without a good sample is accepted at any poll interval, because a busy machine loses some samples."""
 
 Sides = tuple[tuple[str, Table, Table, IntArray], ...]
-"""For each side: its name, its clock samples, the other side's samples, and start and end of the drive on its wall
-clock."""
+"""For each side: its name, its clock samples, the other side's samples, and the drive's start and end on the wall clock
+of the side."""
 
 
 def step_reasons(
@@ -50,19 +51,20 @@ def step_reasons(
 
 
 def _step_ms(samples: Table, drive_ns: tuple[int, int]) -> float | None:
-    """Return the largest step of a side's wall clock near the drive; None where none exceeds `STEP_LIMIT_MS`."""
+    """Return the largest step of a side's wall clock near the drive; None if it is at most `STEP_LIMIT_MS`."""
+    began_ns, ended_ns = drive_ns
     mono_ns, wall_ns = samples.ints("mono_ns"), samples.ints("wall_ns")
     known = (mono_ns != MISSING) & (wall_ns != MISSING)
     mono_ns, wall_ns = mono_ns[known], wall_ns[known]
-    near = (mono_ns[1:] > drive_ns[0] - MARGIN_NS) & (mono_ns[:-1] < drive_ns[1] + MARGIN_NS)
-    jumps_ms = np.diff(wall_ns - mono_ns)[near] / NS_PER_MS
+    near_drive = (mono_ns[1:] > began_ns - MARGIN_NS) & (mono_ns[:-1] < ended_ns + MARGIN_NS)
+    jumps_ms = np.diff(wall_ns - mono_ns)[near_drive] / NS_PER_MS
     if len(jumps_ms) == 0 or np.max(np.abs(jumps_ms)) <= STEP_LIMIT_MS:
         return None
     return float(jumps_ms[np.argmax(np.abs(jumps_ms))])
 
 
 def poll_reasons(server: Record, client: Record, began_ns: int, ended_ns: int) -> list[InvalidReason]:
-    """Return a reason for each side that lacks clock samples between the start and the end of the drive.
+    """Return a reason for each side without enough clock samples between the start and the end of the drive.
 
     Without samples the clock offset is only a guess.
     """
@@ -70,7 +72,7 @@ def poll_reasons(server: Record, client: Record, began_ns: int, ended_ns: int) -
         return []
     server_ns, client_ns = _sampled_ns(server), _sampled_ns(client)
     client_began_ns, client_ended_ns = drive_on_client(server, client, began_ns, ended_ns)
-    longest_ns = {
+    longest_gaps_ns = {
         "server": max(
             *(
                 min(np.abs(server_ns - edge_ns).tolist(), default=ended_ns - began_ns)
@@ -86,7 +88,7 @@ def poll_reasons(server: Record, client: Record, began_ns: int, ended_ns: int) -
             InvalidCode.CLOCK_NOT_SAMPLED,
             f"the clock of the {side} was not sampled for {gap_ns / NS_PER_S:.1f} s (limit {POLL_LIMIT_S} s)",
         )
-        for side, gap_ns in longest_ns.items()
+        for side, gap_ns in longest_gaps_ns.items()
         if gap_ns > limit_ns
     ]
     near_drive_ns = client_ns[(client_ns > client_began_ns - limit_ns) & (client_ns < client_ended_ns + limit_ns)]
@@ -100,7 +102,7 @@ def poll_reasons(server: Record, client: Record, began_ns: int, ended_ns: int) -
 
 
 def _longest_gap_ns(sampled_ns: IntArray, began_ns: int, ended_ns: int) -> int:
-    """Return the longest time between two successive samples, of those times that overlap the drive."""
+    """Return the longest of the gaps between two successive samples that overlap the drive."""
     in_drive = (sampled_ns[1:] > began_ns) & (sampled_ns[:-1] < ended_ns)
     return int(np.max(np.diff(sampled_ns)[in_drive], initial=0))
 
@@ -112,20 +114,20 @@ def _sampled_ns(record: Record) -> IntArray:
 
 
 def offset_reasons(server: Record, client: Record, clocks: RunClocks) -> list[InvalidReason]:
-    """Return the reasons against Delta from the first of these checks that fails.
+    """Check Delta, and return the reasons of the first check that fails.
 
     The checks are, in order: the time sources are usable, they agree with the probe, the bound of Delta is small
     enough, and the probe had an answer.
     """
     if clocks.source == SAME_KERNEL:
         return []
-    of_server, of_client = server.table("clock"), client.table("clock")
+    server_samples, client_samples = server.table("clock"), client.table("clock")
     if clocks.source is None:
-        sides = (("server", of_server), ("client", of_client))
+        sides = (("server", server_samples), ("client", client_samples))
         statuses = ", ".join(f"{side}: {_last_status(samples)}" for side, samples in sides)
         text = f"the offset between the clocks is not known ({statuses}), and the probe had no answer"
         return [InvalidReason(InvalidCode.CLOCK_UNKNOWN, text)]
-    source_reasons = [] if clocks.source == PROBE else _source_reasons(of_server, of_client, clocks)
+    source_reasons = [] if clocks.source == PROBE else _source_reasons(server_samples, client_samples, clocks)
     return source_reasons or _agreement_reasons(clocks) or _bound_reasons(clocks) or _unchecked_reasons(clocks)
 
 
@@ -134,13 +136,13 @@ def _last_status(samples: Table) -> str:
     return statuses[-1] if statuses else "no usable sample"
 
 
-def _source_reasons(of_server: Table, of_client: Table, clocks: RunClocks) -> list[InvalidReason]:
+def _source_reasons(server_samples: Table, client_samples: Table, clocks: RunClocks) -> list[InvalidReason]:
     sides: Sides = (
-        ("client", of_client, of_server, clocks.client_wall_ns),
-        ("server", of_server, of_client, clocks.server_wall_ns),
+        ("client", client_samples, server_samples, clocks.client_wall_ns),
+        ("server", server_samples, client_samples, clocks.server_wall_ns),
     )
     reasons = [*_path_reasons(sides, clocks), *_no_sample_reasons(sides)]
-    masters = {name for samples in (of_server, of_client) for name in _grandmasters(samples)}
+    masters = {name for samples in (server_samples, client_samples) for name in _grandmasters(samples)}
     if len(masters) > 1:
         text = f"the hosts follow different PTP grandmasters: {' and '.join(sorted(masters))}"
         reasons.append(InvalidReason(InvalidCode.PTP_GRANDMASTERS, text))
@@ -153,19 +155,19 @@ def _grandmasters(samples: Table) -> set[str]:
 
 
 def _path_reasons(sides: Sides, clocks: RunClocks) -> list[InvalidReason]:
-    """Return a reason for each side whose NTP had a longer round trip to the other side than the probe had.
+    """Return a reason for each side whose NTP had a longer round trip to the other side than the probe.
 
-    The shortest round trips of the drive are compared, because a busy machine delays only some exchanges, but an
-    injected delay delays all of them.
+    The check compares the shortest round trips of the drive: a busy machine delays only some exchanges, whereas
+    injected delay affects all exchanges.
     """
     reasons = []
-    for side, samples, other, drive_ns in sides:
-        follower_samples = _during(samples.where(follows_peer(samples, other)), drive_ns)
+    for side, samples, other_samples, drive_ns in sides:
+        follower_samples = _samples_in_drive(samples.where(follows_peer(samples, other_samples)), drive_ns)
         delays_ms = follower_samples.floats("peer_delay_s") * 1e3
         delays_ms = delays_ms[np.isfinite(delays_ms)]
-        if len(delays_ms) == 0 or len(clocks.probed) == 0:
+        if len(delays_ms) == 0 or len(clocks.drive_exchanges) == 0:
             continue
-        ntp_ms, probe_ms = float(delays_ms.min()), float(clocks.probed.round_trip_ns.min()) / NS_PER_MS
+        ntp_ms, probe_ms = float(delays_ms.min()), float(clocks.drive_exchanges.round_trip_ns.min()) / NS_PER_MS
         if ntp_ms > probe_ms + PATH_LIMIT_MS:
             text = (
                 f"the NTP of the {side} goes through injected delay: its round trip is {ntp_ms:.2f} ms, the probe's "
@@ -179,9 +181,9 @@ def _no_sample_reasons(sides: Sides) -> list[InvalidReason]:
     """Return a reason for each side whose NTP accepted no sample for too long, in a time that overlaps the drive."""
     reasons = []
     for side, samples, _, drive_ns in sides:
-        longest = _longest_without_sample_s(samples, drive_ns)
-        if longest is not None:
-            longest_s, limit_s = longest
+        time_and_limit = _longest_without_sample_s(samples, drive_ns)
+        if time_and_limit is not None:
+            longest_s, limit_s = time_and_limit
             text = (
                 f"the NTP of the {side} accepted no sample for {longest_s:.1f} s (limit {NO_SAMPLE_LIMIT_POLLS} polls, "
                 f"{limit_s:.1f} s): its path is lost or goes through injected delay, or the machine is too busy"
@@ -191,25 +193,28 @@ def _no_sample_reasons(sides: Sides) -> list[InvalidReason]:
 
 
 def _longest_without_sample_s(samples: Table, drive_ns: IntArray) -> tuple[float, float] | None:
-    """Return the time without a good sample that exceeds its limit most, and this limit; None if none exceeds it."""
+    """Return the time without a good sample that exceeds its limit most, and this limit; None if no time exceeds it."""
+    began_ns, ended_ns = drive_ns
     good_counts = samples.ints("good_samples")
     is_known = (good_counts != MISSING) & np.isfinite(samples.floats("poll_s")) & (samples.ints("wall_ns") != MISSING)
     samples, good_counts = samples.where(is_known), good_counts[is_known]
     if len(good_counts) == 0:
         return None
-    begins = np.flatnonzero(np.diff(good_counts, prepend=-1) != 0)
-    ends = np.append(begins[1:], len(good_counts)) - 1
+    # Each phase without a further good sample is from the row `first` to the row `last`.
+    first = np.flatnonzero(np.diff(good_counts, prepend=-1) != 0)
+    last = np.append(first[1:], len(good_counts)) - 1
     mono_ns, wall_ns = samples.ints("mono_ns"), samples.ints("wall_ns")
-    overlaps_drive = (wall_ns[ends] >= drive_ns[0]) & (wall_ns[begins] <= drive_ns[1])
-    times_s = np.where(overlaps_drive, (mono_ns[ends] - mono_ns[begins]) / NS_PER_S, 0.0)
-    limits_s = np.maximum(NO_SAMPLE_LIMIT_POLLS * samples.floats("poll_s")[begins], NO_SAMPLE_ALLOWED_S)
+    overlaps_drive = (wall_ns[last] >= began_ns) & (wall_ns[first] <= ended_ns)
+    times_s = np.where(overlaps_drive, (mono_ns[last] - mono_ns[first]) / NS_PER_S, 0.0)
+    limits_s = np.maximum(NO_SAMPLE_LIMIT_POLLS * samples.floats("poll_s")[first], NO_SAMPLE_ALLOWED_S)
     worst = int(np.argmax(times_s - limits_s))
     return (float(times_s[worst]), float(limits_s[worst])) if times_s[worst] > limits_s[worst] else None
 
 
-def _during(samples: Table, drive_ns: IntArray) -> Table:
+def _samples_in_drive(samples: Table, drive_ns: IntArray) -> Table:
+    began_ns, ended_ns = drive_ns
     wall_ns = samples.ints("wall_ns")
-    return samples.where((wall_ns >= drive_ns[0]) & (wall_ns <= drive_ns[1]))
+    return samples.where((wall_ns >= began_ns) & (wall_ns <= ended_ns))
 
 
 def _bound_reasons(clocks: RunClocks) -> list[InvalidReason]:

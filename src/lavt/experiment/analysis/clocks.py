@@ -24,7 +24,7 @@ from lavt.recording.table import MISSING, IntArray, Table
 SAME_KERNEL = "same kernel"
 PROBE = "probe"
 MARGIN_NS = 5 * NS_PER_S
-"""Clock data from this long before to this long after the drive are used. At 500 ppm an older sample would add more
+"""Clock data of the drive, and of this time before and after it, are used. At 500 ppm an older sample would add more
 than 2.5 ms to the bound of Delta, but in a valid run the bound is at most 2 ms."""
 
 
@@ -32,14 +32,14 @@ than 2.5 ms to the bound of Delta, but in a valid run the bound is at most 2 ms.
 class RunClocks:
     """Delta of a run with the name of its source, the probe's estimate, and the times of the drive on both wall clocks.
 
-    `offset` is None where Delta is unknown. `probe` is None where the probe had no answer during the drive.
+    `offset` is None if Delta is unknown. `probe` is None if the probe had no answer during the drive.
     """
 
     source: str | None
     offset: ClockOffset | None
     probe: ClockOffset | None
-    probed: ProbeExchanges
-    """Exchanges during the drive."""
+    drive_exchanges: ProbeExchanges
+    """The probe's exchanges during the drive."""
     client_wall_ns: IntArray
     """Start and end of the drive on the client's wall clock, (2,)."""
     server_wall_ns: IntArray
@@ -47,7 +47,7 @@ class RunClocks:
 
     @property
     def bound_ms(self) -> float | None:
-        """The largest error bound of Delta during the drive; None where it is unknown."""
+        """The largest error bound of Delta during the drive; None: unknown."""
         return None if self.offset is None else self._bound_ms(self.offset)
 
     @property
@@ -63,21 +63,22 @@ class RunClocks:
         }
 
     def disagreement_ms(self) -> tuple[float, float, float] | None:
-        """Return Delta, the probe's Delta and the sum of both bounds, in ms, where the two estimates disagree.
+        """Return Delta, the probe's Delta and the sum of both bounds, in ms; None if the two estimates agree.
 
-        None where they agree. Every exchange of the drive is compared with Delta at its own time. The returned values
-        are those of the exchange whose difference exceeds the bounds most.
+        The check compares every exchange of the drive with Delta at the time of the exchange. The returned values
+        belong to the exchange whose difference exceeds the bounds most.
         """
-        if self.offset is None or self.source == PROBE or len(self.probed) == 0:
+        exchanges = self.drive_exchanges
+        if self.offset is None or self.source == PROBE or len(exchanges) == 0:
             return None
-        delta_ns = self.offset.at(self.probed.client_wall_ns)
-        bound_ns = self.offset.bound_at(self.probed.client_wall_ns) + self.probed.round_trip_ns / 2
-        excess_ns = np.abs(delta_ns - self.probed.delta_ns) - bound_ns
+        delta_ns = self.offset.at(exchanges.client_wall_ns)
+        bound_ns = self.offset.bound_at(exchanges.client_wall_ns) + exchanges.round_trip_ns / 2
+        excess_ns = np.abs(delta_ns - exchanges.delta_ns) - bound_ns
         worst = int(np.argmax(np.nan_to_num(excess_ns, nan=-np.inf)))
         if not excess_ns[worst] > 0:
             return None
         delta_ms, probe_ms, bound_ms = (
-            float(values_ns[worst]) / NS_PER_MS for values_ns in (delta_ns, self.probed.delta_ns, bound_ns)
+            float(values_ns[worst]) / NS_PER_MS for values_ns in (delta_ns, exchanges.delta_ns, bound_ns)
         )
         return delta_ms, probe_ms, bound_ms
 
@@ -108,46 +109,49 @@ class RunClocks:
 
 
 def run_clocks(server: Record, client: Record, began_ns: int, ended_ns: int) -> RunClocks:
-    """Return Delta of a run whose drive is an interval of the server's monotonic clock.
+    """Return Delta of a run whose drive is between `began_ns` and `ended_ns` on the server's monotonic clock.
 
-    Hosts that report the same name share a kernel and thus a clock: Delta and its bound are 0. Otherwise the first
-    estimate in this list that is known is used:
+    Hosts that report the same kernel share its clock: Delta and its bound are 0. Otherwise the first known estimate in
+    this list is used:
 
     1. the time sources of both hosts, with a bound throughout the drive;
     2. the probe alone;
     3. the time sources without a bound.
 
-    The time sources are not used where a host is configured to use the probe. Only data from the drive and up to
-    `MARGIN_NS` before and after it are used, because a clock may have been set earlier.
+    The time sources are not used if a host is configured to use the probe. Only data of the drive, and up to
+    `MARGIN_NS` before and after it, are used, because a clock can have been set earlier.
     """
-    on_client_ns = drive_on_client(server, client, began_ns, ended_ns)
-    of_server = _near(server.table("clock"), (began_ns, ended_ns))
-    of_client = _near(client.table("clock"), on_client_ns)
-    server_wall_ns = np.array([wall_ns(server, began_ns), wall_ns(server, max(began_ns, ended_ns))])
-    exchanges = probe_exchanges(_near(client.table("clock_probe"), on_client_ns))
-    probed = exchanges.within(*server_wall_ns.tolist())
-    probe = offset_from_probe(exchanges) if len(probed) else None
-    sources = None if _use_probe_only(of_server, of_client) else offset_from_sources(of_server, of_client)
+    client_drive_ns = drive_on_client(server, client, began_ns, ended_ns)
+    server_samples = _select_near(server.table("clock"), (began_ns, ended_ns))
+    client_samples = _select_near(client.table("clock"), client_drive_ns)
+    server_wall_ns = np.array([wall_ns_at(server, began_ns), wall_ns_at(server, max(began_ns, ended_ns))])
+    exchanges = probe_exchanges(_select_near(client.table("clock_probe"), client_drive_ns))
+    drive_exchanges = exchanges.select_interval(*server_wall_ns.tolist())
+    probe = offset_from_probe(exchanges) if len(drive_exchanges) else None
+    is_probe_only = _is_probe_only(server_samples, client_samples)
+    sources = None if is_probe_only else offset_from_sources(server_samples, client_samples)
     source: str | None
     offset: ClockOffset | None
-    if _share_kernel(of_server, of_client):
+    if _is_same_kernel(server_samples, client_samples):
         source, offset = SAME_KERNEL, NO_OFFSET
     elif sources is not None and (_is_bounded(sources, server_wall_ns) or probe is None):
-        names = {name for samples in (of_server, of_client) for name in known_samples(samples).texts("source")}
+        names = {
+            name for samples in (server_samples, client_samples) for name in known_samples(samples).texts("source")
+        }
         source, offset = " and ".join(sorted(names)), sources
     else:
         source, offset = (None, None) if probe is None else (PROBE, probe)
-    client_wall_ns = server_wall_ns if offset is None else _on_client(offset, server_wall_ns)
-    return RunClocks(source, offset, probe, probed, client_wall_ns, server_wall_ns)
+    client_wall_ns = server_wall_ns if offset is None else _to_client_ns(offset, server_wall_ns)
+    return RunClocks(source, offset, probe, drive_exchanges, client_wall_ns, server_wall_ns)
 
 
 def drive_on_client(server: Record, client: Record, began_ns: int, ended_ns: int) -> tuple[int, int]:
     """Return start and end of the drive on the client's monotonic clock, which cannot be set.
 
-    A received frame has a time on both monotonic clocks: when it was stamped and when its stamp was read. The frame
-    with the shortest latency gives the difference of the clocks, because other frames may have waited for seconds in a
-    full queue. Without any received frame, the whole time in which the client's clocks were sampled is returned,
-    extended to at least the length of the drive.
+    A received frame has two times: when it was stamped, on the server's monotonic clock, and when its stamp was read,
+    on the client's. The frame with the shortest latency gives the difference of the clocks, because other frames can
+    have waited for seconds in a full queue. Without a received frame, the result is the whole time in which the
+    client's clocks were sampled, extended to at least the length of the drive.
     """
     frames, received_frames = frames_within(server.table("frame"), began_ns, ended_ns), client.table("picture")
     stamped_ns = look_up(frames.ints("stamp_ns"), frames.ints("stamped_mono_ns"), received_frames.ints("stamp_ns"))
@@ -160,12 +164,13 @@ def drive_on_client(server: Record, client: Record, began_ns: int, ended_ns: int
     return first_ns, max(last_ns, first_ns + ended_ns - began_ns)
 
 
-def _near(samples: Table, drive_ns: tuple[int, int]) -> Table:
-    """Return the samples taken within `MARGIN_NS` of a drive on the same monotonic clock."""
-    return samples.where((samples.mono_ns >= drive_ns[0] - MARGIN_NS) & (samples.mono_ns <= drive_ns[1] + MARGIN_NS))
+def _select_near(samples: Table, drive_ns: tuple[int, int]) -> Table:
+    """Return the samples of the drive and of `MARGIN_NS` before and after it, on the same monotonic clock."""
+    began_ns, ended_ns = drive_ns
+    return samples.where((samples.mono_ns >= began_ns - MARGIN_NS) & (samples.mono_ns <= ended_ns + MARGIN_NS))
 
 
-def wall_ns(record: Record, mono_ns: int) -> int:
+def wall_ns_at(record: Record, mono_ns: int) -> int:
     """Return the wall time of a record's host at a monotonic time, from the nearest of its clock samples and events."""
     shortest_ns, result_ns = None, mono_ns
     for table in (record.table("clock"), record.table("event")):
@@ -176,22 +181,23 @@ def wall_ns(record: Record, mono_ns: int) -> int:
     return result_ns
 
 
-def _share_kernel(server: Table, client: Table) -> bool:
+def _is_same_kernel(server: Table, client: Table) -> bool:
     hosts = set(server.texts("host")) | set(client.texts("host"))
     return len(server) > 0 and len(client) > 0 and len(hosts) == 1 and "" not in hosts
 
 
-def _use_probe_only(server: Table, client: Table) -> bool:
+def _is_probe_only(server: Table, client: Table) -> bool:
     return PROBE in {*server.texts("source"), *client.texts("source")}
 
 
 def _is_bounded(offset: ClockOffset, server_wall_ns: IntArray) -> bool:
     """Return whether the bound is known at every time of `offset`, and the first time is before the drive."""
     known = np.isfinite(offset.bound_ns)
-    return bool(known.all()) and bool(offset.client_wall_ns[0] <= _on_client(offset, server_wall_ns)[0])
+    client_began_ns, _ = _to_client_ns(offset, server_wall_ns)
+    return bool(known.all()) and bool(offset.client_wall_ns[0] <= client_began_ns)
 
 
-def _on_client(offset: ClockOffset, server_wall_ns: IntArray) -> IntArray:
+def _to_client_ns(offset: ClockOffset, server_wall_ns: IntArray) -> IntArray:
     """Convert wall times of the server to the client's wall clock; Delta must change slowly."""
     guess_ns = server_wall_ns - offset.at(server_wall_ns)
     return np.asarray(server_wall_ns - offset.at(guess_ns), np.int64)

@@ -15,7 +15,7 @@ from lavt.experiment.analysis.metrics import driving_interval
 from lavt.recording.record import Record, evaluating, read_record
 from lavt.recording.table import MISSING, Table
 
-DRAWN = ("mono_ns", "x_m", "y_m", "progress_m", "cross_track_m", "steering_rad")
+DRAWN_COLUMNS = ("mono_ns", "x_m", "y_m", "progress_m", "cross_track_m", "steering_rad")
 """The columns of the ground truth that figures show."""
 
 
@@ -23,8 +23,8 @@ DRAWN = ("mono_ns", "x_m", "y_m", "progress_m", "cross_track_m", "steering_rad")
 class DriveData:
     """One run: its directory, its `result.json`, the ground truth of the driving interval, and the route's centre line.
 
-    `reference_m` is the centre line, (points, 2). `truth` has the columns `DRAWN`; it has no rows if the vehicle is not
-    the simulator's. `began_ns` is the start of the drive on the server's monotonic clock.
+    `reference_m` is the centre line, an array of shape (points, 2). `truth` has the columns `DRAWN_COLUMNS`; it has no
+    rows if the vehicle is not simulated. `began_ns` is the start of the drive on the server's monotonic clock.
     """
 
     directory: Path
@@ -55,14 +55,14 @@ def extract_drive(record: Record, directory: Path, result: Mapping[str, Any]) ->
     truth_ns = truth.ints("mono_ns")
     routes = record.table("route").objects("points")
     reference_m = np.array(routes[0] if routes and routes[0] else np.zeros((0, 2)), np.float64)
-    within = truth.where((truth_ns >= began_ns) & (truth_ns <= ended_ns))
-    columns = {name: within.columns[name] for name in DRAWN if name in within.columns}
-    drawn_truth = Table(within.mono_ns, within.wall_ns, columns)
+    drive_truth = truth.where((truth_ns >= began_ns) & (truth_ns <= ended_ns))
+    columns = {name: drive_truth.columns[name] for name in DRAWN_COLUMNS if name in drive_truth.columns}
+    drawn_truth = Table(drive_truth.mono_ns, drive_truth.wall_ns, columns)
     return DriveData(directory, result, drawn_truth, reference_m, began_ns, record.annotations)
 
 
 def one_of_each_condition(drives: Sequence[DriveData]) -> list[DriveData]:
-    """Return one drive per condition, sorted by condition: the first valid one, or else the first."""
+    """Return one drive per condition, sorted by condition: the first valid drive or, without one, the first drive."""
     chosen: dict[str, DriveData] = {}
     for drive in sorted(drives, key=lambda drive: not drive.result["valid"]):
         chosen.setdefault(drive.condition, drive)
@@ -70,9 +70,9 @@ def one_of_each_condition(drives: Sequence[DriveData]) -> list[DriveData]:
 
 
 def capture_to_stamp_ms(server_record: Path) -> float | None:
-    """Return the median time from the capture of a frame to its stamp, which the loop latency excludes.
+    """Return the median time from the capture of a frame to its stamp; the loop latency does not include this time.
 
-    None where the camera does not report the capture time.
+    The result is None if the camera does not report the capture time.
     """
     server = read_record(server_record, channels=("frame", "event"))
     with evaluating(server_record):

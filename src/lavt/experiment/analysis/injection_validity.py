@@ -1,7 +1,8 @@
-"""Reasons against the delay injection of a run on two machines, from the measurements of their own netem queues.
+"""The checks of the delay injection of a run on two machines, from measurements that the machines made of their queues.
 
-A sample is one measurement of a queue (a row of the channel `injection`). When it was taken, it was compared with the
-request (`judge` in `transport/netem/queue_probe.py`). This module checks the times and the conditions of the samples.
+A sample is one measurement of a netem queue (a row of the channel `injection`). The machine compared the sample with
+the request immediately (`judge` in `transport/netem/queue_probe.py`). This module checks when samples were taken, and
+under which condition.
 """
 
 from __future__ import annotations
@@ -17,11 +18,12 @@ from lavt.experiment.analysis.metrics import driving_interval
 from lavt.recording.record import Record
 from lavt.recording.table import Table
 
-SENT_BY = {"video": "server", "control": "client"}
+SENDING_SIDE = {"video": "server", "control": "client"}
 """For each flow, the side whose queue delays it."""
 
 GAP_LIMIT_S = 20.0
-"""The longest time between two samples. Both sides measure every 5 s, and this takes a second plus the delay."""
+"""The longest time between two samples. Both sides measure every 5 s, and a measurement takes a second plus the
+delay."""
 SMALLEST_LATENCY_SHARE = 0.9
 """The median latency must be at least this share of the injected delay."""
 
@@ -29,19 +31,20 @@ SMALLEST_LATENCY_SHARE = 0.9
 def recorded_reasons(
     server: Record, client: Record, condition: str, requested_ms: Mapping[str, float]
 ) -> list[InvalidReason]:
-    """Return the reasons against the injection of a run; `requested_ms` is the delay of its condition, by flow.
+    """Return the reasons why the injection makes a run invalid; `requested_ms` is the delay of its condition, by flow.
 
-    On the server, the samples from the last one before the drive to the end of the drive are checked. On the client all
-    samples are checked, because the times of the drive on its clock are unknown, and it drives under one condition
-    only. If `condition` is empty, no condition may have been in force on the server, such as that of another client.
+    The server's samples are checked from the last sample before the drive to the end of the drive. All samples of the
+    client are checked, because the times of the drive on the client's clock are unknown, and a client has only one
+    condition. An empty `condition` means that the run requested none; a condition that was nevertheless in force on the
+    server, such as another client's, is then a reason.
     """
     began_ns, ended_ns, _ = driving_interval(server)
     if not condition:
-        names = set(_in_force(server.table("injection"), began_ns, ended_ns).texts("condition")) - {""}
+        names = set(_samples_in_force(server.table("injection"), began_ns, ended_ns).texts("condition")) - {""}
         text = "condition {} was in force on the server, but this run did not request it"
         return [InvalidReason(InvalidCode.INJECTION_NOT_REQUESTED, text.format(name)) for name in names]
     samples = {
-        "server": _in_force(server.table("injection"), began_ns, ended_ns),
+        "server": _samples_in_force(server.table("injection"), began_ns, ended_ns),
         "client": client.table("injection"),
     }
     reasons = []
@@ -59,13 +62,13 @@ def recorded_reasons(
             text = f"condition {condition} was not in force as requested on the {side} all the time{first_deviation}"
             reasons.append(InvalidReason(InvalidCode.INJECTION_NOT_IN_FORCE, text))
     unmeasured = [
-        flow for flow, side in SENT_BY.items() if requested_ms[flow] and not _is_measured(samples[side], flow)
+        flow for flow, side in SENDING_SIDE.items() if requested_ms[flow] and not _is_measured(samples[side], flow)
     ]
     return reasons + [not_measured(flow) for flow in unmeasured]
 
 
-def _in_force(table: Table, began_ns: int, ended_ns: int) -> Table:
-    """Return the samples of an interval and the last one before it; none without a sample before it."""
+def _samples_in_force(table: Table, began_ns: int, ended_ns: int) -> Table:
+    """Return the samples of an interval, and the last sample before it; without the latter, return no samples."""
     mono_ns = table.ints("mono_ns")
     before_ns = mono_ns[mono_ns <= began_ns]
     first_ns = before_ns.max() if len(before_ns) else ended_ns + 1
@@ -75,8 +78,8 @@ def _in_force(table: Table, began_ns: int, ended_ns: int) -> Table:
 def _longest_gap_s(table: Table, ended_ns: int | None) -> float:
     """Return the longest time without a sample.
 
-    `ended_ns` is the end of the drive on the clock of the samples; None where it is unknown. The time from the last
-    sample to this end is included.
+    `ended_ns` is the end of the drive on the clock of the samples; None: unknown. The time between the last sample and
+    this end is included.
     """
     times_ns = np.sort(table.ints("mono_ns"))
     if ended_ns is not None:
@@ -85,11 +88,10 @@ def _longest_gap_s(table: Table, ended_ns: int | None) -> float:
 
 
 def absent_reasons(entry: Mapping[str, Any], requested_ms: Mapping[str, float]) -> list[InvalidReason]:
-    """Return a reason for each flow whose latency is less than the requested delay.
+    """Return a reason for each flow whose latency is clearly smaller than the requested delay.
 
-    The delay was then injected on another path.
-
-    `entry` has `tau_v_ms` and `tau_c_ms` with their bounds, as in `result.json`.
+    The delay was then injected elsewhere than on the network path of the flow. `entry` has `tau_v_ms` and `tau_c_ms`
+    with their bounds, as in `result.json`.
     """
     reasons = []
     for flow, key in (("video", "tau_v_ms"), ("control", "tau_c_ms")):

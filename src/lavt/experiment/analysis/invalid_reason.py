@@ -8,7 +8,7 @@ from msgspec import Struct
 
 
 class InvalidCode(StrEnum):
-    """What makes a run invalid; docs/metrics.md explains each."""
+    """What makes a run invalid; docs/metrics.md explains each code."""
 
     RECORD_INCOMPLETE = "record_incomplete"
     RECORD_OVERFLOW = "record_overflow"

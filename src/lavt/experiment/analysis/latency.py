@@ -1,6 +1,7 @@
 """Latencies of a run, each a pure function of recorded tables. `docs/metrics.md` has the formulas.
 
-All of them cover the driving interval only, `began_ns` to `ended_ns` on the server's monotonic clock.
+All latencies cover the driving interval only: the time between `began_ns` and `ended_ns` on the server's monotonic
+clock.
 
 `frames` are rows of the server's channel `frame`, one for each stamped frame. `received_frames` are rows of the
 client's channel `picture`, one for each frame that the client received and tried to decode. `command_verdicts` are rows
@@ -20,7 +21,10 @@ from lavt.recording.table import MISSING, IntArray, Table
 
 
 def look_up(keys: IntArray, values: IntArray, searched_keys: IntArray) -> IntArray:
-    """Return for each of `searched_keys` the value of the first equal key; `MISSING` where no key is equal."""
+    """Return for each of `searched_keys` the value of the first equal key in `keys`; `MISSING` if no key is equal.
+
+    `values[i]` is the value of `keys[i]`.
+    """
     found = np.full(len(searched_keys), MISSING, np.int64)
     if len(keys) == 0:
         return found
@@ -58,40 +62,40 @@ def received_frames_of(received_frames: Table, frames: Table) -> Table:
 def decoded_frames(received_frames: Table) -> Table:
     """Return the rows of received frames that were decoded to a picture.
 
-    Rows without the field `decoded`, which older records do not have, count as decoded.
+    Older records do not have the field `decoded`; all their rows are returned.
     """
     is_decoded = [decoded is not False for decoded in received_frames.objects("decoded")]
     return received_frames.where(np.array(is_decoded, np.bool_))
 
 
 def video_latency_ns(received_frames: Table, offset: ClockOffset) -> IntArray:
-    """Return tau_v of every received frame with a readable stamp: from stamp written to stamp read.
+    """Return tau_v of every received frame with a readable stamp: the time between writing and reading the stamp.
 
     Both times are on the server's wall clock.
     """
     is_known = received_frames.flags("readable") & (received_frames.ints("read_wall_ns") != MISSING)
     readable = received_frames.where(is_known)
-    return offset.on_server_ns(readable.ints("read_wall_ns")) - readable.ints("stamp_ns")
+    return offset.to_server_ns(readable.ints("read_wall_ns")) - readable.ints("stamp_ns")
 
 
 def control_latency_ns(command_verdicts: Table, offset: ClockOffset, began_ns: int, ended_ns: int) -> IntArray:
-    """Return tau_c of every accepted command: from sent to received, on the server's wall clock.
+    """Return tau_c of every accepted command: the time between sending and reception, on the server's wall clock.
 
-    Only an accepted command is certain to come from the client in control. A rejected one may have any send time.
+    Rejected commands are left out: they can come from anyone and have any send time.
     """
     commands = accepted_commands(command_verdicts)
     received_ns = commands.ints("received_mono_ns")
     known = (commands.ints("sent_wall_ns") != MISSING) & (commands.ints("received_wall_ns") != MISSING)
     within = commands.where(known & (received_ns >= began_ns) & (received_ns <= ended_ns))
-    return within.ints("received_wall_ns") - offset.on_server_ns(within.ints("sent_wall_ns"))
+    return within.ints("received_wall_ns") - offset.to_server_ns(within.ints("sent_wall_ns"))
 
 
 @dataclass(frozen=True, slots=True)
 class FramesWithCommands:
-    """The frames that led to an accepted command.
+    """The frames from which an accepted command was made.
 
-    `commands` has the first such command of each frame (rows of the channel `admission`), in the order of application.
-    The stamps are in the same order.
+    `commands` has the first accepted command of each frame (rows of the channel `admission`), in the order of
+    application. The stamps are in the same order.
     """
 
     stamp_ns: IntArray
@@ -100,17 +104,17 @@ class FramesWithCommands:
 
     @property
     def loop_ns(self) -> IntArray:
-        """The loop latency, from frame stamped to command applied, on the server's monotonic clock."""
+        """The loop latency, from the stamp to the application of the command, on the server's monotonic clock."""
         return self.commands.ints("applied_mono_ns") - self.stamped_mono_ns
 
     @property
     def client_ns(self) -> IntArray:
-        """The client time, from stamp read to command sent, on the client's wall clock."""
+        """The client time, from reading the stamp to sending the command, on the client's wall clock."""
         return self.commands.ints("sent_wall_ns") - self.commands.ints("stamp_received_wall_ns")
 
     @property
     def actuator_ns(self) -> IntArray:
-        """The actuator time, from command received to command applied, on the server's monotonic clock."""
+        """The actuator time, from reception to application of the command, on the server's monotonic clock."""
         return self.commands.ints("applied_mono_ns") - self.commands.ints("received_mono_ns")
 
 
@@ -138,17 +142,17 @@ def frames_with_commands(frames: Table, command_verdicts: Table, ended_ns: int) 
 
 
 def latency_sum_error_ns(received_frames: Table, paired: FramesWithCommands, offset: ClockOffset) -> IntArray:
-    """Return tau_v + client time + tau_c + actuator time - loop latency for every frame that has all of them.
+    """Return tau_v + client time + tau_c + actuator time - loop latency, for every frame for which all are known.
 
-    The clock offset cancels in the sum. Errors from a clock step, or from times of the wrong picture, remain.
+    An error of the clock offset cancels in the sum. Errors from a clock step, or from times of the wrong frame, remain.
     """
     readable = received_frames.where(received_frames.flags("readable"))
     read_wall_ns = look_up(readable.ints("stamp_ns"), readable.ints("read_wall_ns"), paired.stamp_ns)
     commands = paired.commands
     needed = [read_wall_ns, *(commands.ints(name) for name in ("sent_wall_ns", "stamp_received_wall_ns"))]
     known = np.all([times != MISSING for times in needed], axis=0) if len(commands) else np.zeros(0, np.bool_)
-    tau_v_ns = offset.on_server_ns(read_wall_ns) - paired.stamp_ns
-    tau_c_ns = commands.ints("received_wall_ns") - offset.on_server_ns(commands.ints("sent_wall_ns"))
+    tau_v_ns = offset.to_server_ns(read_wall_ns) - paired.stamp_ns
+    tau_c_ns = commands.ints("received_wall_ns") - offset.to_server_ns(commands.ints("sent_wall_ns"))
     total_ns = tau_v_ns + paired.client_ns + tau_c_ns + paired.actuator_ns
     return np.asarray((total_ns - paired.loop_ns)[known], np.int64)
 
@@ -157,7 +161,7 @@ def latency_sum_error_ns(received_frames: Table, paired: FramesWithCommands, off
 class FrameAge:
     """The time-weighted age of the frame from which the command in force was made.
 
-    Both values are None where no command was in force at any time.
+    Both values are None if no command was in force during the drive.
     """
 
     mean_ms: float | None
@@ -168,7 +172,7 @@ def frame_age(frames: Table, command_verdicts: Table, began_ns: int, ended_ns: i
     """Return the mean and the 95th percentile of the frame age during the driving interval.
 
     Both are exact: while a command is in force, the age of its frame grows by 1 s per second. `frames` are all frames
-    of the run, because the first command in force may come from a frame that was stamped before the interval.
+    of the run, because the first command in force can come from a frame that was stamped before the interval.
     """
     commands = accepted_commands(command_verdicts)
     stamped_ns = look_up(frames.ints("stamp_ns"), frames.ints("stamped_mono_ns"), commands.ints("stamp_ns"))
@@ -185,7 +189,7 @@ def frame_age(frames: Table, command_verdicts: Table, began_ns: int, ended_ns: i
 
 
 def ages_at_actuation_ns(frames: Table, command_verdicts: Table, began_ns: int, ended_ns: int) -> IntArray:
-    """Return the frame age at actuation of every accepted command: from its frame's stamp to its application."""
+    """Return the frame age at actuation of every accepted command: from the frame's stamp to the application."""
     commands = accepted_commands(command_verdicts)
     applied_ns = commands.ints("applied_mono_ns")
     stamped_ns = look_up(frames.ints("stamp_ns"), frames.ints("stamped_mono_ns"), commands.ints("stamp_ns"))
@@ -208,7 +212,7 @@ def _ramp_percentile(low: FloatArray, high: FloatArray, share: float) -> float:
 
 
 def percentiles_ms(times_ns: IntArray) -> dict[str, Any]:
-    """Return the percentiles p5, p50, p95 in ms (interpolated linearly) and the count `n`; None without times."""
+    """Return the percentiles p5, p50, p95 in ms (interpolated linearly; None without times) and the count `n`."""
     if len(times_ns) == 0:
         return {"p5": None, "p50": None, "p95": None, "n": 0}
     p5, p50, p95 = np.percentile(times_ns / NS_PER_MS, [5, 50, 95])

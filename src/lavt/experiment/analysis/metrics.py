@@ -41,7 +41,7 @@ class RunMeasurement:
     """The measurements of a run.
 
     `entry` has the keys of `result.json` from `ending` on. `closure_p95_ms` is the closure: the 95th percentile of the
-    absolute difference between the sum of the loop's parts and the loop latency. It is None where it is unknown.
+    absolute difference between the sum of the loop's parts and the loop latency; None: unknown.
     """
 
     entry: Mapping[str, Any]
@@ -72,7 +72,7 @@ def _events(events: Table) -> list[tuple[str, int, str]]:
 def measure(server: Record, client: Record) -> RunMeasurement:
     """Compute every metric of a run.
 
-    Metrics without data (no ground truth, no clock samples or no received frame) are None.
+    Metrics for which the records have no data (ground truth, clock samples or received frames) are None.
     """
     began_ns, ended_ns, ending = driving_interval(server)
     has_begun = began_ns <= ended_ns
@@ -149,7 +149,7 @@ def _with_bound(summary: dict[str, Any], bound_ms: float | None) -> dict[str, An
 
 
 def last_count(record: Record, name: str) -> int | None:
-    """Return the last value of a counter on the channel `counts`; None where it was never recorded."""
+    """Return the last value of a counter on the channel `counts`; None if it was never recorded."""
     values = record.table("counts").ints(name)
     known = values[values != MISSING]
     return int(known[-1]) if len(known) else None

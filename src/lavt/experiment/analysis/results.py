@@ -18,7 +18,7 @@ from lavt.recording.json_payload import to_json
 from lavt.recording.record import Record
 
 FAILED = "failed.json"
-"""In a sweep's directory: the runs that failed, with the reasons; absent or empty where none did."""
+"""The file in a sweep's directory that lists the failed runs with the reasons; absent or empty if no run failed."""
 
 IDENTITY = (
     "run",
@@ -37,10 +37,10 @@ IDENTITY = (
     "repetition",
     "seed",
 )
-"""The keys that identify a run; their values are known before it is driven. A key that does not apply is null."""
+"""The keys that identify a run; their values are known before the run. A key that does not apply is null."""
 
 OPTIONAL_IDENTITY = ("axes", "changes", "injected_ms", "injected_least_ms")
-"""Further keys of the identity, which only some runs have."""
+"""Further keys that only some runs have in their identity."""
 
 
 def run_result(
@@ -53,14 +53,14 @@ def run_result(
 ) -> dict[str, Any]:
     """Compute the run's `result.json`, which is also its entry in `summary.json`, from its records.
 
-    `identity` has the keys `IDENTITY`. It may also have `axes` (the values of a sweep's further axes), `changes` (of
-    the condition), `injected_ms` (the requested delay) and `injected_least_ms` (the least expected delay, where it is
-    less than `injected_ms`); all of them are copied. `reasons` are further reasons for which the run is invalid, which
-    its records do not show.
+    `identity` has the keys `IDENTITY`. It can also have `axes` (the values of a sweep's further axes), `changes` (of
+    the condition), `injected_ms` (the requested delay) and `injected_least_ms` (the smallest expected delay, if it is
+    smaller than `injected_ms`); all of them are copied. `reasons` are further reasons why the run is invalid, which its
+    records do not show.
     """
     measured = measure(server, client)
     all_reasons = [*invalid_reasons(server, client, measured), *reasons]
-    if not all_reasons and "injected_ms" in identity:  # otherwise the latencies may be wrong
+    if not all_reasons and "injected_ms" in identity:  # with another reason, the latencies themselves can be wrong
         all_reasons = absent_reasons(measured.entry, identity.get("injected_least_ms", identity["injected_ms"]))
     return {
         **{key: identity.get(key) for key in IDENTITY},
@@ -82,7 +82,7 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file; raise `WorkError` where it is missing or is not JSON."""
+    """Read a JSON file; raise `WorkError` if it is missing or is not JSON."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

@@ -21,16 +21,16 @@ AFTER_LOOP: frozenset[Stage] = frozenset({("actuator", "report"), TO_WHEEL})
 """The stages after the loop, which ends when the command is applied."""
 
 StageDurations = list[tuple[Stage, IntArray]]
-"""For each stage, in order, its duration for each frame that passed it."""
+"""For each stage, in order, the durations of the frames that passed the stage."""
 
 
 def stage_percentiles(
     server: Record, client: Record, frames: Table, tau_c_ns: IntArray, offset: ClockOffset | None
 ) -> list[dict[str, Any]]:
-    """Return for each stage through which `frames` passed its latency (p50 and p95 in ms) and the count `n`.
+    """Return the latency (p50 and p95 in ms) and the count `n` of each stage that `frames` passed.
 
-    The stages are in the order of the pipeline. The control link is tau_c of every accepted command. Without an
-    `offset` the two network links are left out.
+    The stages are in the order in which a frame passes them. The latency of the control link is tau_c of every accepted
+    command. Without an `offset` the two network links are left out.
     """
     received_frames = received_frames_of(client.table("picture"), frames)
     video_ns = np.zeros(0, np.int64)
@@ -49,7 +49,8 @@ def stage_percentiles(
 
 def _entry(stage: Stage, durations_ns: IntArray) -> dict[str, Any]:
     p50, p95 = np.percentile(durations_ns / NS_PER_MS, [50, 95])
-    return {"node": stage[0], "stage": stage[1], "p50": float(p50), "p95": float(p95), "n": len(durations_ns)}
+    node, name = stage
+    return {"node": node, "stage": name, "p50": float(p50), "p95": float(p95), "n": len(durations_ns)}
 
 
 def camera_stages(server: Record, frames: Table) -> StageDurations:
@@ -72,24 +73,25 @@ def actuator_stages(server: Record, frames: Table) -> StageDurations:
 def wheel_ns(server: Record, frames: Table) -> IntArray:
     """Return the times from the application of a command to the vehicle's report that it steers by this command.
 
-    Empty for a vehicle without such reports.
+    The result is empty for a vehicle without such reports.
     """
     wheel = server.table("wheel")
-    belongs = np.isin(wheel.ints("stamp_ns"), frames.ints("stamp_ns"))
-    return np.asarray((wheel.ints("wheel_mono_ns") - wheel.ints("applied_mono_ns"))[belongs], np.int64)
+    is_from_frames = np.isin(wheel.ints("stamp_ns"), frames.ints("stamp_ns"))
+    return np.asarray((wheel.ints("wheel_mono_ns") - wheel.ints("applied_mono_ns"))[is_from_frames], np.int64)
 
 
 def video_link_ns(timelines: Table, received_frames: Table, frames: Table, offset: ClockOffset) -> IntArray:
     """Return the time of each frame on the video link, in ns.
 
-    It lasts from the moment when the camera sends the frame's last packet to the arrival of the packet that completed
-    the frame. It is computed as tau_v, minus the camera's time after the stamp, minus the client's time from the packet
-    to the reading of the stamp. `timelines` are the server's.
+    This time begins when the camera sends the frame's last packet, and ends when the packet arrives that completes the
+    frame. It is computed as tau_v, minus the camera's time after the stamp, minus the client's time from that packet to
+    the reading of the stamp. `timelines` are the server's.
     """
     camera = timelines.where(np.array([node == "camera" for node in timelines.texts("node")], np.bool_))
-    sent_ns = np.array([stages[-1][1] if stages else MISSING for stages in camera.objects("stages")], np.int64)
+    last_stages = [stages[-1] if stages else ("", MISSING) for stages in camera.objects("stages")]
+    last_ends_ns = np.array([end_ns for _, end_ns in last_stages], np.int64)
     stamps = received_frames.ints("stamp_ns")
-    sent_ns = look_up(camera.ints("stamp_ns"), sent_ns, stamps)
+    sent_ns = look_up(camera.ints("stamp_ns"), last_ends_ns, stamps)
     stamped_ns = look_up(frames.ints("stamp_ns"), frames.ints("stamped_mono_ns"), stamps)
     client_times = (received_frames.ints(name) for name in ("read_wall_ns", "read_mono_ns", "packet_mono_ns"))
     has_times = np.all([times != MISSING for times in (sent_ns, stamped_ns, *client_times)], axis=0)
@@ -103,8 +105,8 @@ def video_link_ns(timelines: Table, received_frames: Table, frames: Table, offse
 def _receiver_ns(timelines: Table, received_frames: Table, frames: Table) -> IntArray:
     """Return the receiver's time for each frame, in ns.
 
-    It lasts from the arrival of the packet that completed the access unit to the access unit's arrival at the driver.
-    Both times come from the driver's entries, because the receiver's own timelines have no stamps.
+    This time begins when the packet arrives that completes the access unit, and ends when the access unit arrives at
+    the driver. Both times come from the driver's entries, because the receiver's own timelines have no stamps.
     """
     inputs = zip(timelines.texts("node"), timelines.texts("channel"), strict=True)
     units = timelines.where(np.array([node_input == ("driver", "access_unit") for node_input in inputs], np.bool_))
@@ -118,14 +120,14 @@ def _receiver_ns(timelines: Table, received_frames: Table, frames: Table) -> Int
 def _node_stages(timelines: Table, node: str, frames: Table, *, from_stamp: bool = False) -> StageDurations:
     """Return the durations of each stage of `node`.
 
-    For each frame and each input channel, only the first timeline counts. With `from_stamp`, time before the stamp does
-    not count, and stages that ended before it are left out.
+    For each frame and each input channel, only the first timeline is used. With `from_stamp`, the stage in which the
+    frame was stamped begins at the stamp, and stages that ended before the stamp are left out.
     """
     timelines = timelines.where(np.array([name == node for name in timelines.texts("node")], np.bool_))
     stamps = timelines.ints("stamp_ns")
     stamped_ns = look_up(frames.ints("stamp_ns"), frames.ints("stamped_mono_ns"), stamps)
     durations_ns: dict[str, list[int]] = {}
-    counted: set[tuple[str, int]] = set()
+    used: set[tuple[str, int]] = set()
     for channel, stamp_ns, stamped_at_ns, arrived_ns, stages in zip(
         timelines.texts("channel"),
         stamps.tolist(),
@@ -134,9 +136,9 @@ def _node_stages(timelines: Table, node: str, frames: Table, *, from_stamp: bool
         timelines.objects("stages"),
         strict=True,
     ):
-        if stamped_at_ns == MISSING or (channel, stamp_ns) in counted:
+        if stamped_at_ns == MISSING or (channel, stamp_ns) in used:
             continue
-        counted.add((channel, stamp_ns))
+        used.add((channel, stamp_ns))
         begin_ns = max(arrived_ns, stamped_at_ns) if from_stamp else arrived_ns
         for name, end_ns in stages or []:
             if end_ns > begin_ns or not from_stamp:

@@ -11,7 +11,7 @@ from lavt.experiment.analysis.tracking import distance_m, per_km, root_mean_squa
 from lavt.recording.table import Table
 
 REVERSAL_DEADBAND_RAD = 0.01
-"""A steering reversal is a turn of the road wheels back by more than this (0.57 degrees)."""
+"""A steering reversal is a turn in the opposite direction by more than this angle of the road wheels (0.57 degrees)."""
 
 MAX_DURATION_S = 24 * 3600
 """A longer time cannot be one drive, and its samples would fill the memory."""
@@ -22,7 +22,7 @@ LOWEST_HZ, HIGHEST_HZ = 0.1, 5.0
 """The limits of the oscillation frequency. Slower steering follows the road, and faster steering is noise; the loop's
 own frequency lies between the limits (`delay_margin.py`)."""
 FEWEST_PERIODS = 3
-"""An oscillation has at least this many periods in the drive. Fewer periods may be bends of the road."""
+"""An oscillation has at least this many periods in the drive. Fewer periods can come from bends of the road."""
 
 
 def steering_metrics(truth: Table) -> dict[str, Any]:
@@ -42,7 +42,7 @@ def steering_metrics(truth: Table) -> dict[str, Any]:
 
 
 def steering_rate_rms_radps(times_s: FloatArray, steering_rad: FloatArray) -> float | None:
-    """Return the time-weighted RMS of the steering rate between rows; None for fewer than two different times."""
+    """Return the time-weighted RMS of the steering rate between samples; None for fewer than two different times."""
     step_s = np.diff(times_s)
     if not (step_s > 0).any():
         return None
@@ -53,9 +53,9 @@ def steering_rate_rms_radps(times_s: FloatArray, steering_rad: FloatArray) -> fl
 def oscillation_hz(times_s: FloatArray, steering_rad: FloatArray) -> float | None:
     """Return the frequency of the strongest steering oscillation.
 
-    It is the highest peak of the periodogram (Hann window, mean and slope removed) between `LOWEST_HZ` and `HIGHEST_HZ`
-    with at least `FEWEST_PERIODS` in the drive. None without such a peak, or where the peak-to-peak amplitude of the
-    corresponding sine is at most `REVERSAL_DEADBAND_RAD`.
+    This is the frequency of the highest peak of the periodogram (Hann window, mean and slope removed) between
+    `LOWEST_HZ` and `HIGHEST_HZ`, with at least `FEWEST_PERIODS` in the drive. The result is None without such a peak,
+    and if the peak-to-peak amplitude of the corresponding sine is at most `REVERSAL_DEADBAND_RAD`.
     """
     duration_s = float(times_s[-1] - times_s[0]) if len(times_s) else 0.0
     if duration_s > MAX_DURATION_S:
@@ -77,9 +77,8 @@ def oscillation_hz(times_s: FloatArray, steering_rad: FloatArray) -> float | Non
 def power_spectrum(sampled_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return frequencies in Hz and the power at each of them, for angles sampled at `SAMPLE_RATE_HZ`.
 
-    The power of a sine is amplitude^2 / 2. The result is equal to that of `scipy.signal.periodogram` with
-    `scaling="spectrum"`. That function is not used, because the import of `scipy.signal` takes longer than a short
-    drive without pixels.
+    The power of a sine is amplitude^2 / 2. `scipy.signal.periodogram` with `scaling="spectrum"` gives the same result,
+    but the import of `scipy.signal` takes longer than a short drive without pixels.
     """
     index = np.arange(len(sampled_rad))
     trend = np.polynomial.Polynomial.fit(index, sampled_rad, 1)(index)
@@ -92,7 +91,7 @@ def power_spectrum(sampled_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def steering_reversals(steering_rad: FloatArray) -> int:
-    """Return how often the steering turned back from its last extreme by more than `REVERSAL_DEADBAND_RAD`."""
+    """Return how often the steering turned back from its last extreme value by more than `REVERSAL_DEADBAND_RAD`."""
     count, direction = 0, 0
     extreme = lowest = highest = steering_rad[0] if len(steering_rad) else 0.0
     for angle in steering_rad.tolist():

@@ -9,19 +9,19 @@ from lavt.recording.table import Table
 
 STEP_M = 0.25
 """The distance between two samples of an error. Errors are sampled by distance and not by time, so that phases in which
-the car drives slowly or is stationary do not count more."""
+the car drives slowly or is stationary do not have a higher weight."""
 
 MAX_DISTANCE_M = 50_000
 """A longer progress cannot be one drive, and would take minutes to evaluate."""
 
 PARTIAL_STEP_M = 10
-"""The result has the error from the start to each multiple of this distance, to compare runs that ended early."""
+"""The result has the error between the start and each multiple of this distance, to compare runs that ended early."""
 
 
 def sampled_by_distance(truth: Table, name: str) -> FloatArray:
     """Return column `name` at every `STEP_M` of new progress along the route, interpolated linearly.
 
-    Where the car moved backwards, the first passage counts.
+    If the car passed a position several times, the first passage is used.
     """
     progress_m = truth.floats("progress_m")
     values = truth.floats(name)
@@ -53,7 +53,7 @@ def cross_track_metrics(truth: Table) -> dict[str, float | None]:
 def p95_by_10m(truth: Table) -> list[float]:
     """Return the 95th percentile of the distance from the lane's centre up to each multiple of 10 m of progress.
 
-    Entry i covers the route from the start of the drive to 10 m x (i + 1). The list is empty for less than 10 m.
+    Entry i covers the first 10 m x (i + 1) of the drive. The list is empty if the drive is shorter than 10 m.
     """
     error_m = np.abs(sampled_by_distance(truth, "cross_track_m"))
     samples = round(PARTIAL_STEP_M / STEP_M)
@@ -83,11 +83,11 @@ def distance_m(truth: Table) -> float | None:
 
 
 def per_km(count: int, driven_m: float | None) -> float | None:
-    """Return a count per kilometre driven; None where no distance was driven."""
+    """Return a count per kilometre driven; None if no distance was driven."""
     return count / (driven_m / 1000) if driven_m else None
 
 
 def route_length_m(route: Table) -> float | None:
-    """Return the recorded distance from the route's start to its goal; None where it was not recorded."""
+    """Return the recorded distance from the route's start to its goal; None if it was not recorded."""
     lengths_m = route.floats("length_m")
     return float(lengths_m[0]) if len(lengths_m) and np.isfinite(lengths_m[0]) else None

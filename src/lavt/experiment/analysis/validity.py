@@ -1,6 +1,6 @@
-"""The validity of a run: the reasons for which it is invalid.
+"""The validity of a run: the reasons why it is invalid.
 
-They concern the infrastructure only, never the driving.
+These reasons concern the infrastructure only, never the driving.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from lavt.recording.record import Record
 CLOSURE_LIMIT_MS = 1.0
 """A larger closure shows that a clock or the times of a command are wrong."""
 LATE_LIMIT = 0.01
-"""The largest share of the drive for which the physics may be late; only delays of over 50 ms are counted."""
+"""The largest allowed share of the drive by which the physics is late in total; delays up to 50 ms are ignored."""
 MISSED_FRAMES_LIMIT = 0.01
-"""The largest share of its frames that the camera may miss."""
+"""The largest allowed share of frames that the camera misses."""
 INJECTION_LIMIT_MS = 1.0
-"""The largest difference between the injected and the requested delay."""
+"""The largest allowed difference between the injected and the requested delay."""
 
 
 def invalid_reasons(server: Record, client: Record, measured: RunMeasurement) -> list[InvalidReason]:
-    """Return the reasons for which a run is invalid; the list is empty for a valid run."""
+    """Return the reasons why a run is invalid; the list is empty for a valid run."""
     return [
         *_record_reasons("server", server),
         *_record_reasons("client", client),
@@ -53,7 +53,7 @@ def _record_reasons(side: str, record: Record) -> list[InvalidReason]:
 def _clock_reasons(server: Record, client: Record, measured: RunMeasurement) -> list[InvalidReason]:
     """Return the reasons from the clocks.
 
-    Where a clock was set, the offset and the closure are wrong in consequence, and are not reported.
+    If a clock was set, offset and closure are wrong as a consequence, and give no further reasons.
     """
     began_ns, ended_ns, _ = driving_interval(server)
     polls = poll_reasons(server, client, began_ns, ended_ns)
@@ -91,16 +91,16 @@ def _simulator_reasons(server: Record) -> list[InvalidReason]:
         text = f"the physics was {sum(late_ms)} ms late in total (limit {LATE_LIMIT:.0%} of the drive)"
         reasons.append(InvalidReason(InvalidCode.PHYSICS_LATE, text))
     frame_numbers = frames_within(server.table("frame"), began_ns, ended_ns).ints("number")
-    due = int(frame_numbers[-1] - frame_numbers[0]) + 1 if len(frame_numbers) else 0
-    missed = due - len(frame_numbers)
-    if missed > MISSED_FRAMES_LIMIT * due:
-        text = f"the camera missed {missed} of {due} frames (limit {MISSED_FRAMES_LIMIT:.0%})"
+    due_count = int(frame_numbers[-1] - frame_numbers[0]) + 1 if len(frame_numbers) else 0
+    missed_count = due_count - len(frame_numbers)
+    if missed_count > MISSED_FRAMES_LIMIT * due_count:
+        text = f"the camera missed {missed_count} of {due_count} frames (limit {MISSED_FRAMES_LIMIT:.0%})"
         reasons.append(InvalidReason(InvalidCode.FRAMES_MISSED, text))
     return reasons
 
 
 def lateness_reasons(late_ms: Mapping[str, float | None]) -> list[InvalidReason]:
-    """Return a reason for each direction in which the relay sent packets too late, or whose lateness is unknown.
+    """Return a reason for each direction in which the relay sent packets too late or too early, or did not measure.
 
     `late_ms` has the median lateness of each direction, relative to the planned send times.
     """

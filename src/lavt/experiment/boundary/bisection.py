@@ -1,6 +1,6 @@
-"""Two searches for a delay: where a criterion is first met, and where a rate rises through zero.
+"""Two searches: for the shortest delay that meets a criterion, and for the delay at which a rate rises through zero.
 
-The first uses a grid and bisection, the second Brent's method.
+The first search uses a grid and bisection, the second one Brent's method.
 """
 
 from __future__ import annotations
@@ -11,29 +11,30 @@ from dataclasses import dataclass
 from scipy.optimize import brentq
 
 GUESS_ERROR_MS = 10.0
-"""The first bracket reaches this far to both sides of a guess."""
+"""The first bracket extends to the guess plus and minus this much."""
 LARGEST_RATE_PER_S = 1.0
-"""Rates are limited to this size. They may be infinite, and their size is irrelevant for the zero crossing."""
+"""Rates are clipped to this size, because they can be infinite. The zero crossing does not depend on their size."""
 
 
 @dataclass(frozen=True, slots=True)
 class Bracket:
-    """The two delays between which a criterion is first met.
+    """The two delays between which the boundary lies.
 
-    `low_ms` is None if the criterion is already met at the shortest delay. `high_ms` is None if it is met at no delay.
+    `low_ms` is None if the boundary is at the shortest delay or below it. `high_ms` is None if no delay is above the
+    boundary.
     """
 
     low_ms: float | None
     high_ms: float | None
     monotone: bool = True
-    """True if the criterion is met at every delay of the grid that is longer than the first at which it is met."""
+    """False if a delay of the grid that is longer than the boundary does not meet the criterion."""
 
 
 def first_bracket(criterion: Callable[[float], bool], grid_ms: Sequence[float], within_ms: float) -> Bracket:
     """Find the first step of the grid in which `criterion` becomes true, and bisect it to a width of `within_ms`.
 
-    `grid_ms` is ascending. If `criterion` becomes true and false again within one step of the grid, this is not found.
-    The criterion was evaluated at both ends of the returned bracket.
+    `grid_ms` is ascending. If the criterion becomes true and false again between two delays of the grid, the search
+    does not find this. The criterion was evaluated at both ends of the returned bracket.
     """
     is_met = [criterion(delay_ms) for delay_ms in grid_ms]
     if not any(is_met):
@@ -53,11 +54,11 @@ def first_bracket(criterion: Callable[[float], bool], grid_ms: Sequence[float], 
 
 
 def zero_bracket(rate: Callable[[float], float], guess_ms: float, longest_ms: float, within_ms: float) -> Bracket:
-    """Find the delay between 0 and `longest_ms` at which `rate` rises through 0, in a bracket of the width `within_ms`.
+    """Find the delay between 0 and `longest_ms` at which `rate` rises through 0; the bracket has the width `within_ms`.
 
-    The search begins with `GUESS_ERROR_MS` to both sides of the guess, and moves outwards until the sign changes.
-    Brent's method (`scipy.optimize.brentq`) then needs few values of a smooth rate. The bracket reaches half of
-    `within_ms` to both sides of the root that it finds, but not beyond the range; `rate` was not evaluated at its ends.
+    The search begins at the guess plus and minus `GUESS_ERROR_MS`, and moves outwards until the sign changes. Brent's
+    method (`scipy.optimize.brentq`) then needs few values of a smooth rate. The returned bracket is the root plus and
+    minus half of `within_ms`, cut at the ends of the range; `rate` was not evaluated at its two ends.
     """
 
     def clipped_rate(delay_ms: float) -> float:

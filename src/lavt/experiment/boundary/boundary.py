@@ -31,8 +31,7 @@ from lavt.experiment.statistics.boundary_summary import CRITERIA, summarize_grou
 from lavt.experiment.sweep.workers import Workers, process_workers
 
 BOUNDARY = "boundary.json"
-FIELDS = ("route", "preset", "seed", "repetition", *(f"{name}_ms" for name in CRITERIA), "theory_ms")
-"""The columns of `boundary.csv`."""
+CSV_COLUMNS = ("route", "preset", "seed", "repetition", *(f"{name}_ms" for name in CRITERIA), "theory_ms")
 SEARCH_KEYS = frozenset({"routes", "presets", "repetition", "repetitions", "longest_delay_ms", "grid_ms", "within_ms"})
 """The keys of a boundary config that are not keys of a run's config."""
 
@@ -44,7 +43,7 @@ TotalDelay = Callable[[float], float]
 
 @dataclass(frozen=True, slots=True)
 class BoundarySearch:
-    """One search: a planned run of one seed, route and preset without added delay, and the delays to search."""
+    """One search: a planned run with one seed, route and preset, without added delay, and the delays to search."""
 
     planned: PlannedRun
     longest_delay_ms: float
@@ -61,9 +60,9 @@ class BoundarySearch:
 def plan_boundary(config: BoundaryConfig) -> list[BoundarySearch]:
     """Plan the searches of every route with every preset, once for each repetition.
 
-    The first repetition of all searches comes before the second one. Raises `UserError` for a run that `plan_run`
-    rejects, for a run in real time or without the simulator, for a config with a video delay, and for missing or
-    duplicate routes or presets.
+    The first repetition of every search comes before the second repetition of any search. Raises `UserError` for a run
+    that `plan_run` rejects, for a run in real time or without the simulator, for a config with a video delay, and for
+    missing or duplicate routes or presets.
     """
     if config.time != "virtual" or config.vehicle.kind != "simulator":
         raise UserError(
@@ -96,17 +95,17 @@ def with_video_delay(config: RunConfig, delay_ms: float) -> RunConfig:
     return config.model_copy(update={"network": config.network.model_copy(update={"video": video})})
 
 
-def began(drive: MonitoredRun) -> bool:
+def has_begun(drive: MonitoredRun) -> bool:
     """Return whether the drive began: a vehicle whose frames are too old is never armed."""
     return len(drive.time_s) > 0
 
 
-def departed(drive: MonitoredRun) -> bool:
+def has_departed(drive: MonitoredRun) -> bool:
     """Return whether the car left its lane (at least one event `lane_invasion`)."""
     return drive.lane_invasions > 0
 
 
-def not_completed(drive: MonitoredRun) -> bool:
+def is_not_completed(drive: MonitoredRun) -> bool:
     """Return whether the drive ended before the end of the route."""
     return drive.ending != "completed"
 
@@ -119,11 +118,11 @@ def run_search(search: BoundarySearch) -> dict[str, Any]:
     def drive(delay_ms: float) -> MonitoredRun:
         return drive_monitored(plan_run(with_video_delay(config, delay_ms), name=search.name))
 
-    without_added_ms: list[float] = []  # the total delay minus the added delay, of each drive on the straight road
+    own_delays_ms: list[float] = []  # for each drive on the straight road, the total delay minus the added delay
 
     def growth(delay_ms: float) -> float:
         measured_ms, growth_per_s = straight_growth(with_video_delay(config, delay_ms))
-        without_added_ms.append(measured_ms - delay_ms)
+        own_delays_ms.append(measured_ms - delay_ms)
         return growth_per_s
 
     grid_ms = _grid(search.longest_delay_ms, search.grid_step_ms)
@@ -140,11 +139,11 @@ def run_search(search: BoundarySearch) -> dict[str, Any]:
     theory_ms = theoretical_ms(config)
     guess_ms = search.longest_delay_ms / 2 if theory_ms is None else theory_ms - first_total_ms
     onset = zero_bracket(functools.cache(growth), guess_ms, search.longest_delay_ms, search.within_ms)
-    begun_grid_ms = [delay_ms for delay_ms in grid_ms if began(drive(delay_ms))]
-    departure = first_bracket(lambda delay_ms: departed(drive(delay_ms)), begun_grid_ms, search.within_ms)
-    completion = first_bracket(lambda delay_ms: not_completed(drive(delay_ms)), grid_ms, search.within_ms)
+    begun_grid_ms = [delay_ms for delay_ms in grid_ms if has_begun(drive(delay_ms))]
+    departure = first_bracket(lambda delay_ms: has_departed(drive(delay_ms)), begun_grid_ms, search.within_ms)
+    completion = first_bracket(lambda delay_ms: is_not_completed(drive(delay_ms)), grid_ms, search.within_ms)
     brackets: dict[str, tuple[Bracket, TotalDelay]] = {
-        "onset": (onset, lambda delay_ms: delay_ms + float(np.nanmedian(without_added_ms))),
+        "onset": (onset, lambda delay_ms: delay_ms + float(np.nanmedian(own_delays_ms))),
         "departure": (departure, total_ms),
         "completion": (completion, total_ms),
     }
@@ -153,7 +152,7 @@ def run_search(search: BoundarySearch) -> dict[str, Any]:
         "preset": identity["preset"],
         "seed": identity["seed"],
         "repetition": identity["repetition"],
-        **{f"{name}_ms": _middle_ms(bracket, total) for name, (bracket, total) in brackets.items()},
+        **{f"{name}_ms": _middle_ms(bracket, total_delay) for name, (bracket, total_delay) in brackets.items()},
         "theory_ms": theory_ms,
         "searched_ms": [first_total_ms, total_ms(grid_ms[-1])],
         "below": [name for name, (bracket, _) in brackets.items() if bracket.low_ms is None],
@@ -162,23 +161,20 @@ def run_search(search: BoundarySearch) -> dict[str, Any]:
 
 
 def _grid(longest_ms: float, step_ms: float) -> list[float]:
-    """Return the delays 0, `step_ms`, 2 x `step_ms` and so on below the longest delay, and the longest delay."""
+    """Return the delays 0, `step_ms`, 2 x `step_ms` and so on up to the longest delay, which is the last one."""
     count = math.ceil(longest_ms / step_ms)
     return [*(number * step_ms for number in range(count)), longest_ms]
 
 
-def _middle_ms(bracket: Bracket, total: TotalDelay) -> float | None:
-    """Return the total delay in the middle of a bracket; None where the boundary is not within the range."""
+def _middle_ms(bracket: Bracket, total_delay: TotalDelay) -> float | None:
+    """Return the total delay in the middle of a bracket; None if the boundary is not in the searched range."""
     if bracket.low_ms is None or bracket.high_ms is None:
         return None
-    return (total(bracket.low_ms) + total(bracket.high_ms)) / 2
+    return (total_delay(bracket.low_ms) + total_delay(bracket.high_ms)) / 2
 
 
 def theoretical_ms(config: RunConfig) -> float | None:
-    """Return the delay margin of the configured loop in ms.
-
-    None if there is no model of the loop, or if its margin is not finite.
-    """
+    """Return the delay margin of the configured loop in ms; None if the loop has no model or no finite margin."""
     loop = configured_loop(config)
     critical_s = math.inf if loop is None else critical_delay_s(loop)
     return critical_s * 1000 if math.isfinite(critical_s) else None
@@ -190,16 +186,15 @@ def run_searches(
     """Run all searches, `jobs` at a time (None: one per core).
 
     Returns the boundaries that were found, in the order of `searches`, the failed searches with their reasons, and
-    whether the call ran to its end. After Ctrl-C it did not: the searches in progress are finished, and no others are
-    started.
+    whether all searches were run. On Ctrl-C, the searches in progress are finished, and no further ones are started.
     """
-    progress, done = _SearchProgress(on_progress), True
+    progress, is_complete = _SearchProgress(on_progress), True
     try:
         _search_in_processes(progress, searches, jobs or os.cpu_count() or 1)
     except KeyboardInterrupt:
-        done = False
+        is_complete = False
     found = [progress.found[search.name] for search in searches if search.name in progress.found]
-    return found, progress.failed, done
+    return found, progress.failed, is_complete
 
 
 class _SearchProgress:
@@ -211,7 +206,7 @@ class _SearchProgress:
         self._on_progress = on_progress
 
     def search(self, workers: Workers, todo: Sequence[BoundarySearch]) -> list[BoundarySearch]:
-        """Run searches, and return those that were not run because a worker's process died, in the order of `todo`."""
+        """Run the searches `todo`; return, in their order, the ones that have no result because a process died."""
         futures = {workers.executor.submit(run_search, search): search for search in todo}
         broken: set[str] = set()
 
@@ -221,7 +216,7 @@ class _SearchProgress:
                 self.found[search.name] = future.result()
             except BrokenExecutor:
                 broken.add(search.name)
-            except Exception as error:  # the other searches continue, whatever this one raised
+            except Exception as error:  # an error of one search does not end the others
                 self.fail(search, describe_error(error))
             else:
                 self._on_progress(f"{search.name}: {_format_boundaries(self.found[search.name])}")
@@ -245,13 +240,13 @@ class _SearchProgress:
 def _search_in_processes(progress: _SearchProgress, todo: Sequence[BoundarySearch], jobs: int) -> None:
     """Run the searches in a pool of processes.
 
-    A process that dies breaks the pool. The searches that it may have begun are then repeated, each in a pool of its
-    own.
+    A process that dies breaks the pool. The searches that were possibly in progress are then repeated, each in a pool
+    of its own.
     """
     while todo:
         with process_workers(jobs) as workers:
             broken = progress.search(workers, todo)
-        for search in broken[:jobs]:  # searches begin in order, so only the first ones can have begun
+        for search in broken[:jobs]:  # searches start in order, so only the first `jobs` of them can have started
             with process_workers(1) as single:
                 if progress.search(single, [search]):
                     progress.fail(search, "the process that searched it died")
@@ -273,9 +268,9 @@ def search_boundary(
 ) -> tuple[dict[str, Any], bool]:
     """Run the searches of `config`, and write `boundary.json`, `.csv`, `.svg` and `.png` into `out`, also after Ctrl-C.
 
-    Returns the content of `boundary.json`, and whether all searches are done.
+    Returns the content of `boundary.json`, and whether all searches were run.
     """
-    runs, failed, done = run_searches(searches, jobs=jobs, on_progress=on_progress)
+    runs, failed, is_complete = run_searches(searches, jobs=jobs, on_progress=on_progress)
     entry = {
         "schema": 1,
         "config": config.model_dump(mode="json"),
@@ -285,9 +280,9 @@ def search_boundary(
     }
     write_json(out / BOUNDARY, entry)
     with (out / "boundary.csv").open("w", newline="", encoding="utf-8") as file:
-        rows = csv.DictWriter(file, FIELDS, extrasaction="ignore")
-        rows.writeheader()
-        rows.writerows(runs)
+        writer = csv.DictWriter(file, CSV_COLUMNS, extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows(runs)
     if runs:
         save_figure(out, "boundary", boundary_figure(entry), "boundaries", "")
-    return entry, done
+    return entry, is_complete

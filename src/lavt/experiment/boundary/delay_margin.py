@@ -1,20 +1,20 @@
 """The theoretical delay margin of the lateral loop, from a sampled-data model of lane keeping by pure pursuit.
 
-The car is the linearised dynamic bicycle on a straight lane (R. Rajamani, Vehicle Dynamics and Control, chapter 2)
-behind a first-order steering lag; the controller is pure pursuit linearised about the lane's centre,
+The car is the linearised dynamic bicycle on a straight lane (R. Rajamani, Vehicle Dynamics and Control, chapter 2) with
+a first-order steering lag. The controller is pure pursuit, linearised about the lane's centre:
 
-    command = -(2 wheelbase / lookahead^2) (lateral error + lookahead x heading error),
+    command = -(2 wheelbase / lookahead^2) (lateral error + lookahead x heading error)
 
-computed once per frame from an exponential moving average of the lane, and constant until the next command takes
-effect. The total delay lasts from the middle of the exposure to the moment when the command is in force. It consists of
-a number of whole frame periods and a fraction of one. So in each frame period the old command acts first and then the
-new one, and the sampled plant has two input matrices (Astrom and Wittenmark, Computer-Controlled Systems, section 3.2).
-The wait for the next frame, half a frame period on average, is the zero-order hold of this model and must not be added
-to the delay again. The dead time of a car's steering is added to the total delay.
+A command is computed once per frame from an exponential moving average of the lane, and is constant until the next
+command takes effect. The total delay begins in the middle of the exposure and ends when the command is in force. It
+consists of a number of whole frame periods and a fraction of a period. In each frame period, the previous command
+therefore acts first and the new command afterwards, and the sampled plant has two input matrices (Astrom and
+Wittenmark, Computer-Controlled Systems, section 3.2). The wait for the next frame, half a frame period on average, is
+the zero-order hold of this model and must not be added to the delay again. The dead time of a car's steering is added
+to the total delay.
 
-Without the lag, the average, the zero-order hold and the tyres, the delay margin is `DELAY_PER_LOOKAHEAD` x lookahead /
-speed (Heredia and Ollero, Advanced Robotics 21, 2007, analyse that case), which is two to three times too large for a
-real car.
+A model without lag, average, zero-order hold and tyres (Heredia and Ollero, Advanced Robotics 21, 2007) has a delay
+margin of `DELAY_PER_LOOKAHEAD` x lookahead / speed. This is two to three times too large for a real car.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ DELAY_PER_LOOKAHEAD = math.acos(math.sqrt(2) - 1) / math.sqrt(2 + 2 * math.sqrt(
 |L(jw)| = 1 at (w / a)^2 = 2 + 2 sqrt(2); the phase margin there, atan(w / a), is acos(sqrt(2) - 1)."""
 
 DEFAULT_CAR = LINCOLN_MKZ
-"""The simulator's car. The model uses only its parameters of the lateral motion at small slip."""
+"""The simulator's car. The model uses only the parameters of its lateral motion at small slip."""
 
 _LONGEST_DELAY_S = 3.0  # the search ends here, beyond every delay of interest
 _SEARCH_STEP_S = 0.005
@@ -60,11 +60,11 @@ class LateralLoop:
     """The weight of the newest frame in the moving average; 1 means no averaging."""
     car: CarParameters = DEFAULT_CAR
     controller_wheelbase_m: float | None = None
-    """The wheelbase that the controller assumes; None for the car's own."""
+    """The wheelbase that the controller assumes; None: the car's wheelbase."""
 
     @property
     def gain(self) -> FloatArray:
-        """The gains of pure pursuit for the lateral error of the rear axle and for the heading error, (2,)."""
+        """The two gains of pure pursuit: for the lateral error of the rear axle, and for the heading error."""
         distance_m = self.lookahead_s * self.speed_mps
         wheelbase_m = self.controller_wheelbase_m or self.car.wheelbase_m
         return -2 * wheelbase_m / distance_m**2 * np.array([1.0, distance_m])
@@ -73,8 +73,8 @@ class LateralLoop:
 def configured_loop(config: RunConfig) -> LateralLoop | None:
     """Return the loop of a run, with the run's controller settings, frame rate and car.
 
-    The lookahead is that at the preset's speed, within the controller's bounds. None if the car or the controller is
-    not LAVT's, because there is no model of it. Raises `UserError` for a preset or car that does not exist.
+    The lookahead is the controller's lookahead at the preset's speed. The result is None if the car or the controller
+    is not LAVT's, because these have no model. Raises `UserError` for a preset or car that does not exist.
     """
     controller, vehicle = config.controller, config.vehicle
     if (controller.kind, vehicle.kind) != ("lane_keeper", "simulator"):
@@ -90,28 +90,28 @@ def configured_loop(config: RunConfig) -> LateralLoop | None:
 
 
 def plant(loop: LateralLoop) -> tuple[FloatArray, FloatArray]:
-    """Return A (5 x 5) and B (5,) of the car in continuous time.
+    """Return the matrices A (5 x 5) and B (5,) of the car's linear model in continuous time.
 
     States: lateral speed of the centre of gravity, yaw rate, lateral error of the rear axle, heading error, wheel
     angle.
     """
     car, speed = loop.car, loop.speed_mps
-    ahead, behind = car.front_axle_to_gravity_m, car.wheelbase_m - car.front_axle_to_gravity_m
+    front_arm, rear_arm = car.front_axle_to_gravity_m, car.wheelbase_m - car.front_axle_to_gravity_m
     front, rear = car.front_stiffness_nprad, car.rear_stiffness_nprad
     mass, inertia = car.mass_kg, car.yaw_inertia_kgm2
-    coupling = rear * behind - front * ahead
+    coupling = rear * rear_arm - front * front_arm
     a = np.zeros((5, 5))
     a[0] = [-(front + rear) / (mass * speed), coupling / (mass * speed) - speed, 0, 0, front / mass]
-    yaw_damping = (front * ahead**2 + rear * behind**2) / (inertia * speed)
-    a[1] = [coupling / (inertia * speed), -yaw_damping, 0, 0, front * ahead / inertia]
-    a[2] = [1, -behind, 0, speed, 0]
+    yaw_damping = (front * front_arm**2 + rear * rear_arm**2) / (inertia * speed)
+    a[1] = [coupling / (inertia * speed), -yaw_damping, 0, 0, front * front_arm / inertia]
+    a[2] = [1, -rear_arm, 0, speed, 0]
     a[3, 1] = 1
     a[4, 4] = -1 / car.steering_lag_s
     return a, np.array([0, 0, 0, 0, 1 / car.steering_lag_s])
 
 
 def _advance(a: FloatArray, b: FloatArray, duration_s: float) -> tuple[FloatArray, FloatArray]:
-    """Return the state transition over `duration_s`, and the state change by a constant command of 1 in it."""
+    """Return the state transition over `duration_s`, and the change of state that a constant command of 1 causes."""
     size = len(b)
     augmented = np.zeros((size + 1, size + 1))
     augmented[:size, :size], augmented[:size, size] = a, b
@@ -121,60 +121,62 @@ def _advance(a: FloatArray, b: FloatArray, duration_s: float) -> tuple[FloatArra
 
 @dataclass(frozen=True, slots=True)
 class _SampledPlant:
-    """The plant sampled once per frame; in each frame period the old command u acts first and then the new one.
+    """The plant, sampled once per frame; x is its state, u a command.
 
-    x[k + 1] = transition x[k] + by_old u[k - frames - 1] + by_new u[k - frames]
+    x[k + 1] = transition x[k] + previous_input u[k - delay_frames - 1] + new_input u[k - delay_frames]
     """
 
     transition: FloatArray
-    by_old: FloatArray
-    by_new: FloatArray
-    frames: int
+    previous_input: FloatArray
+    new_input: FloatArray
+    delay_frames: int
+    """The whole frame periods in the total delay."""
 
 
 def _sampled(loop: LateralLoop, total_delay_s: float) -> _SampledPlant:
     a, b = plant(loop)
     period_s = 1 / loop.frame_rate_hz
     total_delay_s += loop.car.steering_dead_time_s
-    frames = int(total_delay_s / period_s)
-    fraction_s = min(max(total_delay_s - frames * period_s, 0.0), period_s)
+    delay_frames = int(total_delay_s / period_s)
+    fraction_s = min(max(total_delay_s - delay_frames * period_s, 0.0), period_s)
     transition, _ = _advance(a, b, period_s)
-    _, by_old_at_change = _advance(a, b, fraction_s)
-    after_change, by_new = _advance(a, b, period_s - fraction_s)
-    return _SampledPlant(transition, by_old=after_change @ by_old_at_change, by_new=by_new, frames=frames)
+    _, input_until_change = _advance(a, b, fraction_s)
+    transition_after_change, new_input = _advance(a, b, period_s - fraction_s)
+    previous_input = transition_after_change @ input_until_change
+    return _SampledPlant(transition, previous_input, new_input, delay_frames)
 
 
 def closed_loop(loop: LateralLoop, total_delay_s: float) -> FloatArray:
     """Return the state transition matrix of the closed loop over one frame.
 
-    The state consists of the car's five states, and the commands u[k - 1], u[k - 2] .. that still act. The newest of
-    these commands is also the state of the moving average: the command is a linear function of the lane, so the average
-    of the commands is the command for the average of the lanes.
+    The state consists of the car's five states, and the past commands u[k - 1], u[k - 2] .. that are not over yet. The
+    newest of these commands is also the state of the moving average: because the command is a linear function of the
+    lane, the average of the commands is the command for the average of the lanes.
     """
     sampled = _sampled(loop, total_delay_s)
-    size, past = 5, sampled.frames + 1
-    command = np.zeros(size + past)  # u[k] as a row on (x[k], u[k - 1], ..)
+    size, past = 5, sampled.delay_frames + 1
+    command = np.zeros(size + past)  # u[k] is this row times the column (x[k], u[k - 1], ..)
     command[2:4] = loop.smoothing * loop.gain
     command[size] = 1 - loop.smoothing
     step = np.zeros((size + past, size + past))
     step[:size, :size] = sampled.transition
-    step[:size, size + sampled.frames] += sampled.by_old
-    if sampled.frames == 0:
-        step[:size] += np.outer(sampled.by_new, command)
+    step[:size, size + sampled.delay_frames] += sampled.previous_input
+    if sampled.delay_frames == 0:
+        step[:size] += np.outer(sampled.new_input, command)
     else:
-        step[:size, size + sampled.frames - 1] += sampled.by_new
+        step[:size, size + sampled.delay_frames - 1] += sampled.new_input
     step[size] = command
     step[size + 1 :, size:-1] = np.eye(past - 1)
     return step
 
 
 def spectral_radius(loop: LateralLoop, total_delay_s: float) -> float:
-    """Return the factor by which the least damped mode grows per frame; the loop is stable if it is below 1."""
+    """Return the factor by which the least damped mode grows per frame; the loop is stable if this is less than 1."""
     return float(np.max(np.abs(np.linalg.eigvals(closed_loop(loop, total_delay_s)))))
 
 
 def critical_delay_s(loop: LateralLoop) -> float:
-    """Return the delay margin: the smallest total delay in seconds at which `loop` is unstable; infinity above 3 s."""
+    """Return the delay margin: the smallest total delay in seconds at which `loop` is unstable; over 3 s, infinity."""
     for number in range(int(_LONGEST_DELAY_S / _SEARCH_STEP_S)):
         if spectral_radius(loop, number * _SEARCH_STEP_S) >= 1:
             if number == 0:
@@ -188,9 +190,10 @@ def critical_delay_s(loop: LateralLoop) -> float:
 
 
 def _response(loop: LateralLoop, sampled: _SampledPlant, frequencies_radps: FloatArray) -> ComplexArray:
-    """Return the frequency response of the loop, opened at the controller's output, (n,)."""
+    """Return the response of the loop, opened at the controller's output, at each frequency."""
     z = np.exp(1j * frequencies_radps / loop.frame_rate_hz)[:, np.newaxis]
-    delayed = sampled.by_new * z**-sampled.frames + sampled.by_old * z ** -(sampled.frames + 1)
+    delay = sampled.delay_frames
+    delayed = sampled.new_input * z**-delay + sampled.previous_input * z ** -(delay + 1)
     resolvents = z[..., np.newaxis] * np.eye(5) - sampled.transition
     states = np.linalg.solve(resolvents, delayed[..., np.newaxis])[..., 0]
     averages = loop.smoothing / (1 - (1 - loop.smoothing) / z[:, 0])
@@ -200,15 +203,15 @@ def _response(loop: LateralLoop, sampled: _SampledPlant, frequencies_radps: Floa
 def phase_margin_rad(loop: LateralLoop, total_delay_s: float) -> float:
     """Return the phase margin in radians at the highest frequency where the loop gain falls through 1.
 
-    Negative where the loop is unstable; infinite where the gain never reaches 1.
+    The margin is negative if the loop is unstable, and infinite if the gain never reaches 1.
     """
     sampled = _sampled(loop, total_delay_s)
     frequencies = np.geomspace(0.05, math.pi * loop.frame_rate_hz * 0.999, 200)
     responses = _response(loop, sampled, frequencies)
-    above = np.flatnonzero(np.abs(responses) > 1)
-    if len(above) == 0:
+    large = np.flatnonzero(np.abs(responses) > 1)
+    if len(large) == 0:
         return math.inf
-    last = int(above[-1])
+    last = int(large[-1])
     if last + 1 == len(frequencies):
         return -math.inf
     crossover = _crossing(
@@ -216,10 +219,10 @@ def phase_margin_rad(loop: LateralLoop, total_delay_s: float) -> float:
         low=float(frequencies[last]),
         high=float(frequencies[last + 1]),
     )
-    # The phase is unwrapped from low frequencies, where two integrators make it -180 degrees, so that a margin below
-    # -180 degrees remains negative.
-    upwards = np.append(frequencies[: last + 1], crossover)
-    phases = np.unwrap(np.angle(_response(loop, sampled, upwards)))
+    # The phase is unwrapped from low frequencies on, where two integrators make it -180 degrees. So a margin of less
+    # than -180 degrees remains negative.
+    up_to_crossover = np.append(frequencies[: last + 1], crossover)
+    phases = np.unwrap(np.angle(_response(loop, sampled, up_to_crossover)))
     return float(math.pi + phases[-1] - (2 * math.pi if phases[0] > 0 else 0.0))
 
 

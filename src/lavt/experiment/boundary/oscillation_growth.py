@@ -23,17 +23,17 @@ NEAR_CENTRE_START = (0.02, math.radians(0.2))
 oscillation has room to grow."""
 
 SETTLED_SHARE = 0.01
-"""The speed has settled when it differs from the final speed by less than this share and remains so."""
+"""The speed has settled when it differs from the final speed by at most this share until the end of the drive."""
 LINEAR_RANGE_M = 0.2
-"""Within this distance from the centre, the tyres, the steering angle and the commands are far from every limit, and
-the loop is linear."""
+"""If the car is at most this far from the centre, tyres, steering angle and commands are far from every limit, so the
+loop is linear."""
 FEWEST_HALF_PERIODS = 4
 
 
 def half_period_peaks(time_s: FloatArray, cross_track_m: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return times in s and values in m of the largest distance from the centre in each complete half period.
 
-    A half period reaches from one crossing of the centre to the next.
+    A half period is the time between two successive crossings of the centre.
     """
     crossings = np.flatnonzero(np.diff(np.signbit(cross_track_m))) + 1
     distance_m = np.abs(cross_track_m)
@@ -44,10 +44,10 @@ def half_period_peaks(time_s: FloatArray, cross_track_m: FloatArray) -> tuple[Fl
 def growth_per_s(drive: MonitoredRun) -> float:
     """Return the oscillation growth in 1/s: the slope of the logarithm of the amplitude, negative for a decay.
 
-    It is the slope of the least-squares line through the logarithms of the peaks of all half periods. The evaluation
-    begins when the speed has settled. It ends when the distance from the centre exceeds `LINEAR_RANGE_M` or a safety
-    limit changes a command. With fewer than `FEWEST_HALF_PERIODS` the growth is infinite: positive if the evaluation
-    ended in this way, and negative if there was no oscillation or no drive.
+    The slope belongs to the least-squares line through the logarithms of the peaks of all half periods. The evaluation
+    begins when the speed has settled. It ends early if the distance from the centre exceeds `LINEAR_RANGE_M`, or if a
+    safety limit changes a command. With fewer than `FEWEST_HALF_PERIODS` the growth is infinite: positive if the
+    evaluation ended early, and negative if there was no oscillation or no drive.
     """
     if len(drive.time_s) == 0:
         return -math.inf
@@ -57,8 +57,8 @@ def growth_per_s(drive: MonitoredRun) -> float:
     limited_s = drive.limited_s[drive.limited_s >= start_s]
     large_s = drive.time_s[(drive.time_s >= start_s) & (np.abs(drive.cross_track_m) > LINEAR_RANGE_M)]
     end_s = min((float(times[0]) for times in (limited_s, large_s) if len(times)), default=math.inf)
-    within = (drive.time_s >= start_s) & (drive.time_s < end_s)
-    time_s, peak_m = half_period_peaks(drive.time_s[within], drive.cross_track_m[within])
+    evaluated = (drive.time_s >= start_s) & (drive.time_s < end_s)
+    time_s, peak_m = half_period_peaks(drive.time_s[evaluated], drive.cross_track_m[evaluated])
     if len(time_s) < FEWEST_HALF_PERIODS:
         return -math.inf if end_s == math.inf else math.inf
     return float(np.polyfit(time_s, np.log(peak_m), 1)[0])
@@ -67,13 +67,13 @@ def growth_per_s(drive: MonitoredRun) -> float:
 def straight_run(config: RunConfig) -> PlannedRun:
     """Plan the run of `config` on a straight road instead of its route, with a start near the centre.
 
-    A series of seeds is derived from the run's own seed. The run has the first of them whose start is within
-    `NEAR_CENTRE_START`.
+    A series of seeds is derived from the seed of `config`. The planned run gets the first of these seeds with a start
+    near the centre (`NEAR_CENTRE_START`).
     """
     vehicle = config.vehicle.model_copy(update={"route": ROAD})
     planned = plan_run(config.model_copy(update={"vehicle": vehicle}), name=ROAD)
-    own_seed = run_seed(config.seed, config.vehicle.route, config.repetition)
-    return replace(planned, seed=near_centre_seed(own_seed))
+    route_seed = run_seed(config.seed, config.vehicle.route, config.repetition)
+    return replace(planned, seed=near_centre_seed(route_seed))
 
 
 def near_centre_seed(seed: int) -> int:

@@ -29,7 +29,7 @@ STYLES = {"onset": ("#0072b2", "o"), "departure": ("#e69f00", "s"), "completion"
 """Colour (Okabe and Ito) and marker of each criterion."""
 LABELS = {"onset": "oscillation begins to grow", "departure": "first leaves its lane", "completion": "not completed"}
 ROW_OFFSETS = {"onset": 0.26, "departure": 0.0, "completion": -0.26}
-"""Upward offset of each criterion from the middle of its route's row."""
+"""Vertical offset of each criterion from the middle of its route's row; positive is upwards."""
 ALL_ROUTES = "all routes"
 DASHES = (
     f"In the table, {NOTHING} replaces a median, quartile or end of an interval that falls on a seed outside the "
@@ -67,9 +67,9 @@ def boundary_parts(boundaries: Sequence[Boundary], report_dir: Path) -> Parts:
 
 
 def boundary_sentences(groups: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return a sentence for each preset on the onset by theory and the delays found.
+    """Return a sentence for each preset: the onset by theory, and the median delay of each criterion.
 
-    The delays are those of all routes together if there are several routes.
+    If there are several routes, the sentence is about all routes together.
     """
     shown = [group for group in groups if group["route"] is None] or groups
     return [_boundary_sentence(group) for group in shown]
@@ -97,20 +97,21 @@ def _format_median(summary: Mapping[str, Any], seeds: int) -> str:
 def boundary_figure(boundary: Boundary) -> Figure:
     """Return the figure of the total delays at which each criterion is first met.
 
-    It has a panel for each preset, and in it a row for each route. A tick is one seed, the large point the median, the
-    bar the 95 % interval of the median, and the dashed line the onset by theory. The number at the right edge counts
-    the seeds that do not meet a criterion in the searched range, the number at the left edge those that meet it already
-    at the shortest delay. An interval with an end out of range is drawn to the edge of the range.
+    The figure has a panel for each preset, with a row for each route. A tick is one seed, the large point the median,
+    the bar the 95 % interval of the median, and the dashed line the onset by theory. The number at the right edge is
+    the number of seeds that do not meet a criterion in the searched range. The number at the left edge is the number of
+    seeds that already meet it at the shortest delay. If one end of an interval is unknown, the bar reaches to the edge
+    of the searched range.
     """
     presets = list(dict.fromkeys(group["preset"] for group in boundary["groups"]))
-    rows = {preset: [group for group in boundary["groups"] if group["preset"] == preset] for preset in presets}
-    height_in = 1.0 + sum(0.75 + 0.5 * len(groups) for groups in rows.values())
+    groups_of = {preset: [group for group in boundary["groups"] if group["preset"] == preset] for preset in presets}
+    height_in = 1.0 + sum(0.75 + 0.5 * len(groups) for groups in groups_of.values())
     figure = Figure(figsize=(8, height_in), dpi=130, layout="constrained")
     panels = figure.subplots(
-        len(presets), 1, sharex=True, squeeze=False, height_ratios=[len(groups) for groups in rows.values()]
+        len(presets), 1, sharex=True, squeeze=False, height_ratios=[len(groups) for groups in groups_of.values()]
     )
     for axes, preset in zip(panels[:, 0], presets, strict=True):
-        _panel(axes, boundary["runs"], rows[preset])
+        _draw_panel(axes, boundary["runs"], groups_of[preset])
         axes.set_title(preset, loc="left", fontsize=10)
     panels[-1, 0].set_xlabel("total delay, from the middle of the exposure to the command in force (ms)")
     handles = [
@@ -122,11 +123,11 @@ def boundary_figure(boundary: Boundary) -> Figure:
     return figure
 
 
-def _panel(axes: Axes, runs: Sequence[Mapping[str, Any]], groups: Sequence[Mapping[str, Any]]) -> None:
+def _draw_panel(axes: Axes, runs: Sequence[Mapping[str, Any]], groups: Sequence[Mapping[str, Any]]) -> None:
     for row, group in enumerate(reversed(groups)):
         chosen = [run for run in runs if run["preset"] == group["preset"] and group["route"] in (None, run["route"])]
         for name in CRITERIA:
-            _criterion(axes, row + ROW_OFFSETS[name], name, chosen, group)
+            _draw_criterion(axes, row + ROW_OFFSETS[name], name, chosen, group)
     if groups[0]["theory_ms"] is not None:
         axes.axvline(groups[0]["theory_ms"], color="black", linestyle="--", linewidth=1, zorder=1)
     axes.set_yticks(range(len(groups)), [group["route"] or ALL_ROUTES for group in reversed(groups)])
@@ -136,13 +137,10 @@ def _panel(axes: Axes, runs: Sequence[Mapping[str, Any]], groups: Sequence[Mappi
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def _criterion(
+def _draw_criterion(
     axes: Axes, height: float, name: str, runs: Sequence[Mapping[str, Any]], group: Mapping[str, Any]
 ) -> None:
-    """Draw one criterion of one row.
-
-    There is a tick for each seed, the median with its interval, and the number of seeds out of range at each edge.
-    """
+    """Draw one criterion of one row: ticks of the seeds, median and interval, and the numbers of seeds out of range."""
     colour, marker = STYLES[name]
     found_ms = [run[f"{name}_ms"] for run in runs if run[f"{name}_ms"] is not None]
     axes.plot(found_ms, [height] * len(found_ms), "|", color=colour, markersize=7, alpha=0.55)
@@ -155,11 +153,11 @@ def _criterion(
         axes.plot([low_ms, high_ms], [height] * 2, color=colour, linewidth=2.5, solid_capstyle="butt", alpha=0.9)
     if summary["p50"] is not None:
         axes.plot(summary["p50"], height, marker, color=colour, markersize=6, markeredgecolor="white", zorder=3)
-    below = sum(name in run["below"] for run in runs)
-    above = len(runs) - len(found_ms) - below
+    below_count = sum(name in run["below"] for run in runs)
+    above_count = len(runs) - len(found_ms) - below_count
     for count, edge_ms, (offset_points, alignment, arrow) in (
-        (below, lowest_ms, (-4, "right", "\N{LEFTWARDS ARROW}")),
-        (above, highest_ms, (4, "left", "\N{RIGHTWARDS ARROW}")),
+        (below_count, lowest_ms, (-4, "right", "\N{LEFTWARDS ARROW}")),
+        (above_count, highest_ms, (4, "left", "\N{RIGHTWARDS ARROW}")),
     ):
         if count:
             axes.annotate(
@@ -185,8 +183,8 @@ def boundary_table(boundary: Boundary) -> TableData:
     for name in CRITERIA:
         columns += [
             number_column(f"{LABELS[name]}: median (ms)", 0),
-            Column(f"{LABELS[name]}: 95 % interval (ms)", span, LOW_HIGH),
-            Column(f"{LABELS[name]}: quartiles (ms)", span, LOW_HIGH),
+            Column(f"{LABELS[name]}: 95 % interval (ms)", format_ends, LOW_HIGH),
+            Column(f"{LABELS[name]}: quartiles (ms)", format_ends, LOW_HIGH),
             number_column(f"{LABELS[name]}: in range", 0),
         ]
     columns.append(number_column("not monotone", 0))
@@ -201,8 +199,8 @@ def _row(group: Mapping[str, Any]) -> list[Any]:
     return [*cells, sum(group["not_monotone"].values())]
 
 
-def span(ends: Sequence[float | None] | None) -> str:
-    """Return the two ends of a range in whole milliseconds; an end outside the searched range is a dash."""
-    if ends is None or ends[0] is ends[1] is None:
+def format_ends(ends: Sequence[float | None] | None) -> str:
+    """Format the two ends of an interval in whole milliseconds; an end outside the searched range becomes a dash."""
+    if ends is None or all(end is None for end in ends):
         return NOTHING
     return " to ".join(format_number(end, 0) for end in ends).replace(" ", UNBROKEN)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib import colormaps
@@ -18,7 +18,7 @@ Colours = Mapping[str, Any]
 """The colour of each condition."""
 
 KINDS = {"virtual": ("o", "virtual time"), "real": ("s", "real time")}
-"""Marker and label of runs in virtual and in real time. The markers of runs in real time are hollow (`marker`)."""
+"""Marker and label of each kind of time. The markers of runs in real time are hollow (`marker`)."""
 
 COLOURS = ("#0072b2", "#56b4e9", "#009e73", "#e69f00", "#d55e00", "#cc79a7")
 """Colours that people with any colour vision can distinguish (Okabe and Ito, "Color universal design")."""
@@ -32,20 +32,26 @@ HANDLE_CHARACTERS = 5
 SMALL_TEXT_POINTS = 8
 """Size of small text."""
 
-NAME_OFFSETS = {
+NAME_STYLES = {
     "virtual": ((7, -2), "left", "top", "black"),
     "real": ((-7, 2), "right", "bottom", "black"),
     "paper": ((-7, 2), "right", "bottom", "0.45"),
     "group": ((7, 2), "left", "bottom", "black"),
 }
-"""How names are written next to each kind of point: offset in points of text, horizontal and vertical alignment,
-colour."""
+"""The style of the names next to each kind of point: offset (x, y) in typographic points, horizontal and vertical
+alignment, colour."""
 
 NAMES_PER_PANEL = 14
-"""The number of names that fit in a panel, both in its height and in its width."""
+"""The number of names that fit into the height of a panel, and also into its width."""
 
-Point = tuple[str, float, float, Sequence[float] | None]
-"""Name, x and y of a condition, and the interval of y."""
+
+class FigurePoint(NamedTuple):
+    """The point of a condition in a figure, with the interval of y."""
+
+    name: str
+    x: float
+    y: float
+    interval: Sequence[float] | None
 
 
 def condition_colours(names: Iterable[str]) -> dict[str, Any]:
@@ -72,7 +78,7 @@ def tidy(axes: Axes, x_label: str, y_label: str, title: str = "") -> None:
 
 
 def marker(kind: str, colour: Any) -> dict[str, Any]:
-    """Return the style of a point for runs in this kind of time."""
+    """Return the style of a point for runs in a kind of time (`KINDS`)."""
     symbol, label = KINDS[kind]
     face = colour if kind == "virtual" else "white"
     return {"marker": symbol, "markerfacecolor": face, "markeredgecolor": colour, "color": colour, "label": label}
@@ -81,9 +87,9 @@ def marker(kind: str, colour: Any) -> dict[str, Any]:
 def name_style(kind: str) -> dict[str, Any]:
     """Return position and colour of the names of one kind of point.
 
-    The positions differ, so that names of different kinds at one place do not overlap.
+    The positions differ, so that the names of two points of different kinds at the same place do not overlap.
     """
-    offset, horizontal, vertical, colour = NAME_OFFSETS[kind]
+    offset, horizontal, vertical, colour = NAME_STYLES[kind]
     return {
         "xytext": offset,
         "ha": horizontal,
@@ -94,21 +100,21 @@ def name_style(kind: str) -> dict[str, Any]:
     }
 
 
-def clusters_of(points: Sequence[Point], axes: Axes) -> list[list[Point]]:
+def clusters_of(points: Sequence[FigurePoint], axes: Axes) -> list[list[FigurePoint]]:
     """Return clusters of points whose names would overlap in `axes`, the upper points first."""
     reach_x, reach_y = ((high - low) / NAMES_PER_PANEL for low, high in (axes.get_xlim(), axes.get_ylim()))
-    clusters: list[list[Point]] = []
-    for point in sorted(points, key=lambda point: (-point[2], point[0])):
-        near = (
+    clusters: list[list[FigurePoint]] = []
+    for point in sorted(points, key=lambda point: (-point.y, point.name)):
+        near_clusters = (
             cluster
             for cluster in clusters
-            if abs(cluster[-1][1] - point[1]) <= reach_x and abs(cluster[-1][2] - point[2]) <= reach_y
+            if abs(cluster[-1].x - point.x) <= reach_x and abs(cluster[-1].y - point.y) <= reach_y
         )
-        nearest = next(near, None)
-        if nearest is None:
+        near_cluster = next(near_clusters, None)
+        if near_cluster is None:
             clusters.append([point])
         else:
-            nearest.append(point)
+            near_cluster.append(point)
     return clusters
 
 

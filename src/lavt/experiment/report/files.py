@@ -18,7 +18,7 @@ LARGEST_SHOWN_BYTES = 400_000
 """The page shows the PNG of a figure whose SVG is larger, because a phone renders a large SVG slowly."""
 
 SHORT_ROWS = 30
-"""A table with more rows may be split between printed pages; its head is then repeated on each page."""
+"""A table with more rows can be split between printed pages; its head is then repeated on each page."""
 
 _SVG: Any = {"svg.hashsalt": "lavt", "svg.fonttype": "none", "path.simplify_threshold": 0.3}
 """With these settings the SVG of a figure is byte-for-byte reproducible, and its texts are stored as text."""
@@ -27,18 +27,18 @@ _NO_METADATA = {"Date": None, "Creator": None, "Format": None, "Type": None}
 
 
 def save_figure(report_dir: Path, name: str, figure: Figure, alternative: str, caption: str) -> Markup:
-    """Write `name`.png and `name`.svg, and return the HTML of the figure; `alternative` describes it in words."""
+    """Write `name`.png and `name`.svg, and return the figure as HTML; the text `alternative` describes the figure."""
     png, svg = report_dir / f"{name}.png", report_dir / f"{name}.svg"
     with mpl.rc_context(_SVG):
         figure.savefig(png, dpi=RESOLUTION_DPI, metadata={"Software": None})
-        figure.set_layout_engine("none")  # the layout is complete; computing it takes as long as drawing the figure
+        figure.set_layout_engine("none")  # keep the layout: to compute it again takes as long as drawing the figure
         figure.savefig(svg, metadata=_NO_METADATA)
     shown = svg if svg.stat().st_size <= LARGEST_SHOWN_BYTES else png
     return html_page.figure(shown.name, [svg.name, png.name], alternative, caption)
 
 
 def save_table(report_dir: Path, name: str, table: TableData) -> Markup:
-    """Write tables/`name`.csv and .tex, and return the HTML of the table; do nothing if it has no rows."""
+    """Write tables/`name`.csv and .tex, and return the table as HTML; if it has no rows, write and return nothing."""
     return _save_table(report_dir, name, table, html_of(table), is_short=len(table.rows) <= SHORT_ROWS)
 
 

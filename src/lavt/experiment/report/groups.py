@@ -1,6 +1,7 @@
 """Groups of a summary: the settings of each group, and the settings in which groups differ.
 
-A group has the runs in virtual time with the same settings; they differ in route, condition and repetition only.
+A group consists of the runs in virtual time with the same settings. These runs differ in route, condition and
+repetition only.
 """
 
 from __future__ import annotations
@@ -24,12 +25,12 @@ def settings_of(group: Group) -> dict[str, Any]:
 
 
 def axes_of(groups: Sequence[Group]) -> list[str]:
-    """Return the names of the sweep's axes that have more than one value, in their order."""
+    """Return the names of the sweep's axes that have more than one value, in the order of the axes."""
     names = dict.fromkeys(name for group in groups for name in settings_of(group) if name not in COMMON_SETTINGS)
     return [name for name in names if len({str(group.get(name)) for group in groups}) > 1]
 
 
-def in_order(groups: Sequence[Group]) -> list[Group]:
+def sort_groups(groups: Sequence[Group]) -> list[Group]:
     """Return the groups sorted by the values of their axes; groups with equal values keep their order."""
     axes = axes_of(groups)
     return sorted(groups, key=lambda group: [_sort_key(group.get(name)) for name in axes])
@@ -43,16 +44,17 @@ def _sort_key(value: Any) -> tuple[bool, float, str]:
 def differing_settings(groups: Sequence[Group]) -> list[str]:
     """Return the names of settings that together distinguish the groups; axes come first.
 
-    A setting is included only if it distinguishes groups that the settings before it do not.
+    A setting is included only if it distinguishes groups that have the same values of all settings before it.
     """
     names: list[str] = []
     for name in (*axes_of(groups), *COMMON_SETTINGS):
-        if len(_values(groups, [*names, name])) > len(_values(groups, names)):
+        if len(_combinations(groups, [*names, name])) > len(_combinations(groups, names)):
             names.append(name)
     return names
 
 
-def _values(groups: Sequence[Group], names: Sequence[str]) -> set[tuple[str, ...]]:
+def _combinations(groups: Sequence[Group], names: Sequence[str]) -> set[tuple[str, ...]]:
+    """Return the different combinations of values that the settings `names` have in the groups."""
     return {tuple(str(group.get(name)) for name in names) for group in groups}
 
 

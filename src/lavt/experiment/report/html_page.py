@@ -1,6 +1,6 @@
 """The HTML of the report's page and of its parts, rendered from `templates/`.
 
-The page loads nothing from a network. The templates escape every text that a function takes.
+The page loads nothing from a network. The templates escape every text argument of these functions.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _PARTS: Any = _TEMPLATES.get_template("parts.html.j2").module
 def page(title: str, sections: Iterable[Section]) -> str:
     """Return the page, without the sections that have no parts.
 
-    The first section has no heading; the page's title is above it.
+    The first section has no heading, because the page's title is directly above it.
     """
     shown = [
         {"heading": heading, "anchor": slug(heading).lower(), "parts": parts} for heading, parts in sections if parts

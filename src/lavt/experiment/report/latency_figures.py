@@ -1,4 +1,7 @@
-"""Figures of latency: measured by injected latency, its effect on driving, and stages. No function reads a file."""
+"""Figures of latency: measured and injected latency, the effect of latency on driving, and the latency of stages.
+
+No function reads a file.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,7 @@ from lavt.experiment.report.figure_style import (
     SMALL_TEXT_POINTS,
     Colours,
     Conditions,
-    Point,
+    FigurePoint,
     clusters_of,
     kind_handles,
     legend_below,
@@ -31,7 +34,7 @@ OTHER_COLOURS = "Reds"
 PAPER_MARKER: dict[str, Any] = {"marker": "^", "color": "0.55", "label": "the paper", "zorder": 1}
 
 DIAMOND: dict[str, Any] = {"marker": "D", "markersize": 4, "markerfacecolor": "white"}
-"""Marker of the error up to the common distance."""
+"""Marker of the error up to the common distance, which all compared runs reached."""
 
 ERROR_LABEL = "P95 of cross-track error,\nmean of runs (m)"
 
@@ -48,13 +51,13 @@ X_LATENCIES: Mapping[str, LatencyKey] = {
 
 
 def degradation_figure(kinds: Mapping[str, Conditions], paper: Conditions, colours: Colours) -> Figure:
-    """Return the figure of completion and cross-track error by loop latency and, if known, by frame age.
+    """Return the figure of completion and cross-track error over loop latency and, if known, over frame age.
 
-    Each condition is a point. The conditions in `paper` are drawn at the paper's tau_v + tau_c. Diamonds show the error
-    of all runs up to the common distance.
+    Each condition is a point. The loop latency of the conditions in `paper` is the paper's tau_v + tau_c. Diamonds show
+    the error of all runs up to the common distance.
     """
-    x_latencies = {label: latency for label, latency in X_LATENCIES.items() if any(_known(kinds, latency))}
-    named: list[tuple[Axes, str, list[Point]]] = []
+    x_latencies = {label: latency for label, latency in X_LATENCIES.items() if _is_known(kinds, latency)}
+    named_points: list[tuple[Axes, str, list[FigurePoint]]] = []
     figure = new_figure(5.6)
     panels = figure.subplots(2, len(x_latencies), sharex="col", sharey="row", squeeze=False)
     for column, (label, latency) in enumerate(x_latencies.items()):
@@ -66,17 +69,17 @@ def degradation_figure(kinds: Mapping[str, Conditions], paper: Conditions, colou
             }
             for axes, points in shown.items():
                 for point in points:
-                    _draw(axes, point, PAPER_MARKER if kind == "paper" else marker(kind, colours[point[0]]))
-                named.append((axes, kind, points))
+                    _draw(axes, point, PAPER_MARKER if kind == "paper" else marker(kind, colours[point.name]))
+                named_points.append((axes, kind, points))
             for point in _points(conditions, latency, "p95_common_m", "p95_common_interval"):
-                _draw(error, point, {**DIAMOND, "color": colours[point[0]], "zorder": 4})
+                _draw(error, point, {**DIAMOND, "color": colours[point.name], "zorder": 4})
         completion.margins(x=0.16)
         error.margins(x=0.16)
         tidy(completion, "", "runs completed (%)" if column == 0 else "")
         tidy(error, label, ERROR_LABEL if column == 0 else "")
-    panels[0, 0].set_ylim(-9, 112)  # room for the names below and above the points
+    panels[0, 0].set_ylim(-9, 112)  # leaves room for the names below and above the points
     panels[1, 0].set_ylim(bottom=-0.09 * panels[1, 0].get_ylim()[1])
-    for axes, kind, points in named:
+    for axes, kind, points in named_points:
         _write_names(axes, clusters_of(points, axes), kind)
     handles: list[Any] = kind_handles(kinds)
     if any("p95_common_m" in entry for conditions in kinds.values() for entry in conditions.values()):
@@ -88,24 +91,28 @@ def degradation_figure(kinds: Mapping[str, Conditions], paper: Conditions, colou
     return figure
 
 
-def _known(kinds: Mapping[str, Conditions], latency: LatencyKey) -> list[bool]:
+def _is_known(kinds: Mapping[str, Conditions], latency: LatencyKey) -> bool:
+    """Return whether any condition has this latency."""
     key, part = latency
-    return [
+    return any(
         (entry.get(key) or {}).get(part) is not None for conditions in kinds.values() for entry in conditions.values()
-    ]
+    )
 
 
-def _points(conditions: Conditions, latency: LatencyKey, value: str, bounds: str, scale: float = 1.0) -> list[Point]:
-    """Return the points of the conditions that have both the latency and the value.
+def _points(
+    conditions: Conditions, latency: LatencyKey, y_key: str, interval_key: str, scale: float = 1.0
+) -> list[FigurePoint]:
+    """Return the points of the conditions that have both the latency and the value `y_key`.
 
-    `bounds` is the key of the value's interval; value and interval are multiplied by `scale`.
+    The value and its interval are multiplied by `scale`.
     """
     key, part = latency
-    points: list[Point] = []
+    points: list[FigurePoint] = []
     for name, entry in conditions.items():
-        x, y, interval = (entry.get(key) or {}).get(part), entry.get(value), entry.get(bounds)
+        x, y, interval = (entry.get(key) or {}).get(part), entry.get(y_key), entry.get(interval_key)
         if x is not None and y is not None:
-            points.append((name, x, y * scale, [bound * scale for bound in interval] if interval else None))
+            scaled_interval = [bound * scale for bound in interval] if interval else None
+            points.append(FigurePoint(name, x, y * scale, scaled_interval))
     return points
 
 
@@ -114,37 +121,39 @@ def _with_totals(paper: Conditions) -> Conditions:
     return {name: {**entry, "loop_ms": {"p50": entry["tau_v_ms"] + entry["tau_c_ms"]}} for name, entry in paper.items()}
 
 
-def _draw(axes: Axes, point: Point, style: Mapping[str, Any]) -> None:
+def _draw(axes: Axes, point: FigurePoint, style: Mapping[str, Any]) -> None:
     """Draw a point, with its interval if it has one."""
-    _, x, y, interval = point
-    bar_lengths = None if interval is None else [[max(y - interval[0], 0)], [max(interval[1] - y, 0)]]
-    axes.errorbar(x, y, yerr=bar_lengths, capsize=3, linestyle="none", elinewidth=1, **style)
+    bar_lengths = None
+    if point.interval is not None:
+        low, high = point.interval
+        bar_lengths = [[max(point.y - low, 0)], [max(high - point.y, 0)]]
+    axes.errorbar(point.x, point.y, yerr=bar_lengths, capsize=3, linestyle="none", elinewidth=1, **style)
 
 
-def _write_names(axes: Axes, clusters: Sequence[Sequence[Point]], kind: str) -> None:
+def _write_names(axes: Axes, clusters: Sequence[Sequence[FigurePoint]], kind: str) -> None:
     """Write the names of each cluster of points in the vertical order of the points."""
     for cluster in clusters:
-        middle = (sum(x for _, x, _, _ in cluster) / len(cluster), sum(y for _, _, y, _ in cluster) / len(cluster))
-        axes.annotate("\n".join(name for name, _, _, _ in cluster), middle, **name_style(kind))
+        middle = (sum(point.x for point in cluster) / len(cluster), sum(point.y for point in cluster) / len(cluster))
+        axes.annotate("\n".join(point.name for point in cluster), middle, **name_style(kind))
 
 
 def presets_figure(groups: Mapping[str, Conditions], colours: Colours) -> Figure:
-    """Return the figure of completion and error by loop latency: a line for each group, a colour for each condition.
+    """Return the figure of completion and error over loop latency: a line for each group, a colour for each condition.
 
-    The names of conditions are written only where their points overlap.
+    The names of conditions are written only next to points that are close to each other.
     """
     figure = new_figure(3.8)
     completion, error = figure.subplots(1, 2)
-    lines: list[tuple[Axes, list[Point]]] = []
+    lines: list[tuple[Axes, list[FigurePoint]]] = []
     symbols = dict(zip(groups, "osD^vP", strict=False))
     for number, (title, conditions) in enumerate(groups.items()):
-        dashes = (0, (1 + 2 * number, 1)) if number else "solid"  # each group has longer dashes than the one before
+        dashes = (0, (1 + 2 * number, 1)) if number else "solid"  # each group has longer dashes than the last group
         for axes, key, scale in ((completion, "completion_rate", 100.0), (error, "p95_m", 1.0)):
-            points = sorted(_points(conditions, LOOP, key, "", scale), key=lambda point: point[1])
+            points = sorted(_points(conditions, LOOP, key, "", scale), key=lambda point: point.x)
             lines.append((axes, points))
-            axes.plot([x for _, x, _, _ in points], [y for _, _, y, _ in points], color="0.6", linestyle=dashes)
-            for name, x, y, _ in points:
-                axes.plot(x, y, marker=symbols[title], color=colours[name], linestyle="none")
+            axes.plot([point.x for point in points], [point.y for point in points], color="0.6", linestyle=dashes)
+            for point in points:
+                axes.plot(point.x, point.y, marker=symbols[title], color=colours[point.name], linestyle="none")
     tidy(completion, "loop latency, median (ms)", "runs completed (%)", "Completion")
     completion.set_ylim(-5, 112)
     tidy(error, "loop latency, median (ms)", ERROR_LABEL, "Error of completed runs")
@@ -160,32 +169,32 @@ def presets_figure(groups: Mapping[str, Conditions], colours: Colours) -> Figure
 
 
 def injected_figure(kinds: Mapping[str, Conditions], colours: Colours) -> Figure:
-    """Return the figure of measured one-way latency by injected delay, for video and control.
+    """Return the figure of measured one-way latency over injected delay, for video and control.
 
-    The upper panels show medians with bars from p5 to p95, and a line for the expected latency: the median of the
-    condition with the least delay plus the additional injected delay. The lower panels show the deviation of the
-    medians from this line; bars are the bound of the clock error.
+    The upper panels show medians with bars from p5 to p95, and a line for the expected latency. This line begins at the
+    median of the condition with the smallest injected delay, and rises with the injected delay. The lower panels show
+    the deviations of the medians from the line; the bars are the bound of the clock error.
     """
     figure = new_figure(5.2)
     panels = figure.subplots(2, 2, sharex="col", height_ratios=[3, 2])
     for column, (direction, key) in enumerate((("video", "tau_v_ms"), ("control", "tau_c_ms"))):
-        above, below = panels[:, column]
+        latency_axes, deviation_axes = panels[:, column]
         for kind, conditions in kinds.items():
             points = _injected_points(conditions, direction, key)
-            _draw_injected(above, below, points, kind, colours)
+            _draw_injected(latency_axes, deviation_axes, points, kind, colours)
         symbol = "τ video" if direction == "video" else "τ control"
-        tidy(above, "", f"{symbol}, measured (ms)", direction.capitalize())
-        above.set_ylim(bottom=min(0.0, above.get_ylim()[0]))
-        tidy(below, f"injected {direction} delay (ms)", "deviation (ms)")
-        low, high = below.get_ylim()
-        below.set_ylim(min(low, -1.2), max(high, 1.2))
-        below.axhline(0, color="0.6", linewidth=0.8, zorder=0)
+        tidy(latency_axes, "", f"{symbol}, measured (ms)", direction.capitalize())
+        latency_axes.set_ylim(bottom=min(0.0, latency_axes.get_ylim()[0]))
+        tidy(deviation_axes, f"injected {direction} delay (ms)", "deviation (ms)")
+        low, high = deviation_axes.get_ylim()
+        deviation_axes.set_ylim(min(low, -1.2), max(high, 1.2))
+        deviation_axes.axhline(0, color="0.6", linewidth=0.8, zorder=0)
     legend_below(figure, list(kind_handles(kinds)))
     return figure
 
 
 def _injected_points(conditions: Conditions, direction: str, key: str) -> list[tuple[str, float, Mapping[str, Any]]]:
-    """Return the conditions with known injected delay and latency, sorted by injected delay."""
+    """Return (name, injected delay, latency) of the conditions for which both are known, sorted by injected delay."""
     points = [
         (name, float(condition["injected_ms"][direction]), condition[key])
         for name, condition in conditions.items()
@@ -195,28 +204,30 @@ def _injected_points(conditions: Conditions, direction: str, key: str) -> list[t
 
 
 def _draw_injected(
-    above: Axes,
-    below: Axes,
+    latency_axes: Axes,
+    deviation_axes: Axes,
     points: Sequence[tuple[str, float, Mapping[str, Any]]],
     kind: str,
     colours: Colours,
 ) -> None:
     if not points:
         return
-    base_ms = points[0][2]["p50"] - points[0][1]
-    farthest_ms = points[-1][1]
-    above.plot([0, farthest_ms], [base_ms, base_ms + farthest_ms], color="0.6", linewidth=0.8, zorder=0)
+    _, smallest_ms, smallest_latency = points[0]
+    _, largest_ms, _ = points[-1]
+    base_ms = smallest_latency["p50"] - smallest_ms
+    latency_axes.plot([0, largest_ms], [base_ms, base_ms + largest_ms], color="0.6", linewidth=0.8, zorder=0)
     names_by_delay: dict[float, list[str]] = {}
     for name, injected_ms, latency in points:
         names_by_delay.setdefault(injected_ms, []).append(name)
         bar_lengths = [[latency["p50"] - latency["p5"]], [latency["p95"] - latency["p50"]]]
         style = {"capsize": 3, "linestyle": "none", **marker(kind, colours[name])}
-        above.errorbar(injected_ms, latency["p50"], yerr=bar_lengths, **style)
-        below.errorbar(injected_ms, latency["p50"] - injected_ms - base_ms, yerr=latency["bound"] or 0.0, **style)
+        latency_axes.errorbar(injected_ms, latency["p50"], yerr=bar_lengths, **style)
+        deviation_ms = latency["p50"] - injected_ms - base_ms
+        deviation_axes.errorbar(injected_ms, deviation_ms, yerr=latency["bound"] or 0.0, **style)
     medians_ms = {injected_ms: latency["p50"] for _, injected_ms, latency in points}
     for injected_ms, names in names_by_delay.items():
-        above.annotate(", ".join(names), (injected_ms, medians_ms[injected_ms]), **name_style(kind))
-    above.margins(x=0.15)
+        latency_axes.annotate(", ".join(names), (injected_ms, medians_ms[injected_ms]), **name_style(kind))
+    latency_axes.margins(x=0.15)
 
 
 def stages_figure(stages: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
@@ -252,7 +263,7 @@ def _stage_colours(stages: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[tu
     names = list(dict.fromkeys((entry["node"], entry["stage"]) for entries in stages.values() for entry in entries))
     colours = {}
     for node, stage in names:
-        of_node = [name for node_name, name in names if node_name == node]
+        node_stages = [name for node_name, name in names if node_name == node]
         shades = colormaps[NODE_COLOURS.get(node, OTHER_COLOURS)]
-        colours[node, stage] = shades(0.35 + 0.45 * of_node.index(stage) / max(len(of_node) - 1, 1))
+        colours[node, stage] = shades(0.35 + 0.45 * node_stages.index(stage) / max(len(node_stages) - 1, 1))
     return colours

@@ -16,7 +16,7 @@ from lavt.experiment.report.boundary_section import boundary_parts
 from lavt.experiment.report.figure_style import condition_colours
 from lavt.experiment.report.run_sections import (
     DriveSets,
-    captured_ms,
+    capture_to_stamp_medians,
     drawn_runs,
     machine_parts,
     read_drives,
@@ -58,10 +58,10 @@ def write_report(
 
     `run_dirs` are the directories of the runs, by default those under `sweep_dir/runs`. `base` is passed to
     `summary.summarize`. `speed` defaults to the value in the existing summary. `drives` has the data of drives that
-    were already read, by run directory. `sweeps` has the name of the sweep for each run directory if the runs are from
-    several sweeps. `boundaries` are the contents of `boundary.json` files. `failed` are the failed runs, as in
-    `FAILED`; the page lists them, and the runs without a readable result, as left out. Raises `WorkError` if no run is
-    left.
+    were already read, by run directory. If the runs are from several sweeps, `sweeps` has the name of the sweep of each
+    run directory. `boundaries` are the contents of `boundary.json` files. `failed` are the failed runs, as in `FAILED`.
+    The page lists as left out: the failed runs, and the runs without a readable result. Raises `WorkError` if no run
+    has a result.
     """
     if run_dirs is None:
         run_dirs = sorted(path for path in (sweep_dir / "runs").glob("*") if path.is_dir())
@@ -69,7 +69,7 @@ def write_report(
     failed_names = {run["run"] for run in failed}
     left_out = [*failed, *({"run": name, "reason": "no result"} for name in unfinished if name not in failed_names)]
     if not results:
-        raise WorkError(f"there is no finished run in {sweep_dir}: a run leaves a result.json in its directory")
+        raise WorkError(f"there is no finished run in {sweep_dir}: a finished run has a result.json in its directory")
     summary_path = sweep_dir / "summary.json"
     if speed is None and summary_path.is_file():
         speed = read_json(summary_path).get("speed")
@@ -99,7 +99,7 @@ def _sections(
         ("Driving performance over latency", degradation_parts(report)),
         ("Distance driven and endings", survival_parts(report)),
         ("Maximum tolerable latency", boundary_parts(boundaries, report.directory)),
-        ("Latency of each stage", stage_parts(report, captured_ms(sets))),
+        ("Latency of each stage", stage_parts(report, capture_to_stamp_medians(sets))),
         ("Comparison of presets and settings", group_parts(report)),
         ("Axes of the sweep", axis_parts(report)),
         ("Results by route", route_parts(report)),

@@ -26,8 +26,8 @@ EARLY_END_MARKER: dict[str, Any] = {
 }
 
 
-def drawn_points(progress_m: FloatArray) -> list[int]:
-    """Return the indexes of a drive's rows that are drawn: one for each `DRAWN_EVERY_M` of progress, and the last."""
+def drawn_indexes(progress_m: FloatArray) -> list[int]:
+    """Return the indexes of a drive's samples to draw: one for each `DRAWN_EVERY_M` of progress, and the last one."""
     if not len(progress_m):
         return []
     bins = np.floor(progress_m / DRAWN_EVERY_M)
@@ -42,23 +42,23 @@ def trajectories_figure(routes: Mapping[str, Sequence[DriveData]], colours: Colo
     end of a drive that ended early.
     """
     references = {route: max((drive.reference_m for drive in drives), key=len) for route, drives in routes.items()}
-    rotated = {route: _rotation_to_x(reference_m) for route, reference_m in references.items()}
-    extents_m = {route: _extent(rotated[route](reference_m)) for route, reference_m in references.items()}
+    rotations = {route: _rotation_to_x(reference_m) for route, reference_m in references.items()}
+    extents_m = {route: _extent(rotations[route](reference_m)) for route, reference_m in references.items()}
     heights = [min(max(height_m / width_m, 0.12), 0.7) for width_m, height_m in extents_m.values()]
     figure = new_figure(7.2 * sum(heights) + 0.75 * len(heights) + 0.4)
     panels = figure.subplots(len(routes), 1, squeeze=False, height_ratios=heights)[:, 0]
     for axes, (route, drives) in zip(panels, routes.items(), strict=True):
-        rotate, reference_m = rotated[route], rotated[route](references[route])
+        rotate, reference_m = rotations[route], rotations[route](references[route])
         axes.plot(reference_m[:, 0], reference_m[:, 1], color="black", linewidth=3.5, solid_capstyle="butt")
-        ends = []
+        early_ends = []
         for drive in drives:
-            rows = drawn_points(drive.truth.floats("progress_m"))
-            path_m = rotate(np.column_stack([drive.truth.floats("x_m")[rows], drive.truth.floats("y_m")[rows]]))
+            shown = drawn_indexes(drive.truth.floats("progress_m"))
+            path_m = rotate(np.column_stack([drive.truth.floats("x_m")[shown], drive.truth.floats("y_m")[shown]]))
             axes.plot(path_m[:, 0], path_m[:, 1], color=colours[drive.condition], linewidth=0.7)
             if drive.result["ending"] != "completed":
-                ends.append(path_m[-1])
-        if ends:
-            axes.plot(*np.transpose(ends), **EARLY_END_MARKER)
+                early_ends.append(path_m[-1])
+        if early_ends:
+            axes.plot(*np.transpose(early_ends), **EARLY_END_MARKER)
         tidy(axes, "", "m", f"Route {route}, {len(drives)} runs")
         axes.set_aspect("equal", adjustable="datalim")
     panels[-1].set_xlabel("m")
@@ -67,7 +67,7 @@ def trajectories_figure(routes: Mapping[str, Sequence[DriveData]], colours: Colo
 
 
 def _rotation_to_x(reference_m: FloatArray) -> Any:
-    """Return a function that moves and rotates points (n, 2) in m so that the reference lies along x."""
+    """Return a function that moves and rotates points, an array (n, 2) in m, so that the reference lies along x."""
     if len(reference_m) < 2:
         return lambda points_m: points_m
     middle_m = reference_m.mean(axis=0)
@@ -96,15 +96,15 @@ def cross_track_figure(routes: Mapping[str, Sequence[DriveData]], colours: Colou
         axes.axis("off")
     for axes, (route, drives) in zip(panels.flat, routes.items(), strict=False):
         axes.axhline(0, color="black", linewidth=2)
-        ends = []
+        early_ends = []
         for drive in drives:
             progress_m, error_m = drive.truth.floats("progress_m"), drive.truth.floats("cross_track_m")
-            shown = drawn_points(progress_m)
+            shown = drawn_indexes(progress_m)
             axes.plot(progress_m[shown], error_m[shown], color=colours[drive.condition], linewidth=0.7)
             if drive.result["ending"] != "completed":
-                ends.append((progress_m[-1], error_m[-1]))
-        if ends:
-            axes.plot(*np.transpose(ends), **EARLY_END_MARKER)
+                early_ends.append((progress_m[-1], error_m[-1]))
+        if early_ends:
+            axes.plot(*np.transpose(early_ends), **EARLY_END_MARKER)
         tidy(axes, "", "", f"Route {route}")
     for axes in panels.flat[max(len(routes) - columns, 0) : len(routes)]:
         axes.set_xlabel("distance along the route (m)")
@@ -124,15 +124,15 @@ def _legend(figure: Figure, routes: Mapping[str, Sequence[DriveData]], colours: 
 def time_figure(drives: Sequence[DriveData], colours: Colours) -> Figure:
     """Return the figure of steering and cross-track error over time, one row for each drive."""
     figure = new_figure(1.35 * len(drives) + 0.6)
-    rows = figure.subplots(len(drives), 2, sharex=True, sharey="col", squeeze=False)
-    for row, drive in zip(rows, drives, strict=True):
+    panels = figure.subplots(len(drives), 2, sharex=True, sharey="col", squeeze=False)
+    for (steering_axes, error_axes), drive in zip(panels, drives, strict=True):
         time_s = (drive.truth.ints("mono_ns") - drive.began_ns) / NS_PER_S
         colour = colours[drive.condition]
-        row[0].plot(time_s, np.degrees(drive.truth.floats("steering_rad")), color=colour, linewidth=1)
-        row[1].plot(time_s, drive.truth.floats("cross_track_m"), color=colour, linewidth=1)
-        tidy(row[0], "", "steering (°)", f"{drive.condition}, {drive.result['ending']}")
-        tidy(row[1], "", "left (m)")
-    for axes in rows[-1]:
+        steering_axes.plot(time_s, np.degrees(drive.truth.floats("steering_rad")), color=colour, linewidth=1)
+        error_axes.plot(time_s, drive.truth.floats("cross_track_m"), color=colour, linewidth=1)
+        tidy(steering_axes, "", "steering (°)", f"{drive.condition}, {drive.result['ending']}")
+        tidy(error_axes, "", "left (m)")
+    for axes in panels[-1]:
         axes.set_xlabel("time (s)")
     return figure
 

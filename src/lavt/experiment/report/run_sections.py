@@ -20,18 +20,18 @@ from lavt.recording.record import read_record
 SHOWN_FRAMES = 4
 
 DRAWN_GROUPS = 4
-"""With more groups than this, the figures show only the groups whose conditions are those of the sweep's base config,
-or the first group if there are none."""
+"""If there are more groups than this, the figures show only the group of the sweep's base config or, if there is no
+such group, the first group."""
 
 MAX_PANELS = 3
-"""The most routes in one figure of trajectories: the paper has three key parts and three whole routes."""
+"""The maximum number of routes in one figure of trajectories: the paper has three key parts and three whole routes."""
 
 DriveSets = Mapping[tuple[str, str], Sequence[DriveData]]
-"""Drives by kind of time (`virtual` or `real`) and by title of their group (see `groups.py`; "" in real time). Each
-entry has figures of its own."""
+"""Drives by kind of time (`virtual` or `real`) and by title of their group (see `groups.py`; "" in real time). Each set
+of drives is drawn in separate figures."""
 
 Runs = Sequence[tuple[Path, Mapping[str, object]]]
-"""Runs: the directory of each, and its entry in the summary's `runs`."""
+"""For each run, its directory and its entry in the summary's `runs`."""
 
 
 def drawn_runs(report: ReportContext, runs: Runs) -> dict[tuple[str, str], list[tuple[Path, Mapping[str, object]]]]:
@@ -39,18 +39,20 @@ def drawn_runs(report: ReportContext, runs: Runs) -> dict[tuple[str, str], list[
     groups, names = report.groups, differing_settings(report.groups)
     if len(groups) > DRAWN_GROUPS:
         groups = report.base or groups[:1]
-    recorded = [run for run in runs if (run[0] / "server.mcap").is_file()]
-    chosen = {("virtual", title_of(group, names)): group for group in groups}
-    virtual = [run for run in recorded if run[1]["time"] == "virtual"]
-    sets = {key: [run for run in virtual if is_in_group(run[1], group)] for key, group in chosen.items()}
-    sets["real", ""] = [run for run in recorded if run[1]["time"] == "real"]
+    recorded = [(directory, run) for directory, run in runs if (directory / "server.mcap").is_file()]
+    virtual = [(directory, run) for directory, run in recorded if run["time"] == "virtual"]
+    sets = {
+        ("virtual", title_of(group, names)): [(directory, run) for directory, run in virtual if is_in_group(run, group)]
+        for group in groups
+    }
+    sets["real", ""] = [(directory, run) for directory, run in recorded if run["time"] == "real"]
     return {key: members for key, members in sets.items() if members}
 
 
 def read_drives(
     sets: Mapping[tuple[str, str], Runs], already_read: Mapping[Path, DriveData]
 ) -> dict[tuple[str, str], list[DriveData]]:
-    """Return the drives of `sets`, reading those that are not in `already_read`."""
+    """Return the drives of `sets`, and read the ones that are not in `already_read`."""
     return {
         key: [already_read.get(directory) or read_drive(directory, run) for directory, run in members]
         for key, members in sets.items()
@@ -86,7 +88,7 @@ def trajectory_parts(report: ReportContext, sets: DriveSets) -> Parts:
 
 
 def _figures_of(routes: Sequence[str]) -> list[tuple[str, Sequence[str]]]:
-    """Return the name and the routes of each figure: key parts first, at most `MAX_PANELS` routes in each."""
+    """Return the name and the routes of each figure: key parts first, at most `MAX_PANELS` routes in a figure."""
     routes_by_name = {
         "key": [route for route in routes if is_key_part(route)],
         "whole": [route for route in routes if not is_key_part(route)],
@@ -99,7 +101,7 @@ def _figures_of(routes: Sequence[str]) -> list[tuple[str, Sequence[str]]]:
 
 
 def single_run_parts(report: ReportContext, sets: DriveSets) -> Parts:
-    """Return for each kind of time a figure of one run of each condition, and frames that a client received."""
+    """Return for each kind of time a figure with one run of each condition, and a figure of received frames."""
     parts = []
     for kind, drives in _first_sets(sets).items():
         chosen = one_of_each_condition(drives)
@@ -131,8 +133,8 @@ def _first_sets(sets: DriveSets) -> dict[str, Sequence[DriveData]]:
     return first
 
 
-def captured_ms(sets: DriveSets) -> dict[str, dict[str, float | None]]:
-    """Return the time from capture to stamp, from one run, by kind of time and condition."""
+def capture_to_stamp_medians(sets: DriveSets) -> dict[str, dict[str, float | None]]:
+    """Return the median time in ms from capture to stamp of one run, by kind of time and condition."""
     return {
         kind: {
             drive.condition: capture_to_stamp_ms(drive.directory / "server.mcap")
@@ -165,13 +167,13 @@ def machine_parts(report: ReportContext, sets: DriveSets) -> Parts:
     Runs with equal values share a table.
     """
     drives = [drive for members in sets.values() for drive in members]
-    by_html: dict[str, tuple[DriveData, int]] = {}
+    first_and_count: dict[str, tuple[DriveData, int]] = {}  # by the HTML of the table
     for drive in drives:
         html = html_of(machine_table(drive.annotations))
-        first, count = by_html.get(html, (drive, 0))
-        by_html[html] = (first, count + 1)
+        first, count = first_and_count.get(html, (drive, 0))
+        first_and_count[html] = (first, count + 1)
     parts = []
-    for number, (first, count) in enumerate(by_html.values(), start=1):
+    for number, (first, count) in enumerate(first_and_count.values(), start=1):
         text = f"Recorded by {count} of {len(report.summary['runs'])} runs; the first is {first.result['run']}:"
         table = machine_table(first.annotations)
         parts += [html_page.paragraph(text, is_note=True), save_table(report.directory, f"machine_{number}", table)]

@@ -14,7 +14,7 @@ from lavt.experiment.analysis.stage_latency import AFTER_LOOP
 from lavt.experiment.report import html_page
 from lavt.experiment.report.figure_style import Colours, Conditions
 from lavt.experiment.report.files import link_table, save_figure, save_table
-from lavt.experiment.report.groups import Group, axes_of, differing_settings, in_order, short_name, title_of
+from lavt.experiment.report.groups import Group, axes_of, differing_settings, short_name, sort_groups, title_of
 from lavt.experiment.report.latency_figures import degradation_figure, injected_figure, presets_figure, stages_figure
 from lavt.experiment.report.sentences import results_sentences, runs_overview
 from lavt.experiment.report.sweep_figures import axis_figure, incidence_figure, routes_with_survival, survival_figure
@@ -36,8 +36,8 @@ from lavt.experiment.report.tables import (
 
 Parts = list[Markup]
 
-ONE_CLOCK = (None, SAME_KERNEL)
-"""The sources of a clock offset that has no value to show: None if it is unknown, or a clock that both sides share."""
+SOURCES_WITHOUT_OFFSET = (None, SAME_KERNEL)
+"""The sources of a clock offset that the report does not show. None: the offset is unknown. `SAME_KERNEL`: it is 0."""
 
 LATENCIES_NOTE = (
     "Each latency is given in ms as median ± bound of the clock error (p5 to p95). The loop latency, from a frame's "
@@ -46,7 +46,7 @@ LATENCIES_NOTE = (
 PAPER_NOTE = " The paper did not measure the loop latency; the table shows the sum of its median τ video and τ control."
 PAPER_POINTS = (
     " The paper's points are drawn at the sum of its two median one-way latencies. The intervals of its completion "
-    "are computed from its counts. It gives no interval of the error."
+    "are computed from its counts. The paper gives no interval of the error."
 )
 ROUTES_NOTE = " “95 %, these routes” is the exact confidence interval of completion for repeated runs of these routes."
 ROADS_NOTE = (
@@ -69,7 +69,7 @@ SMALLEST_REST_MS = 0.5
 """The part of the loop latency that belongs to no stage is shown as a stage if it is larger than this."""
 
 MAX_COMPARED_GROUPS = 6
-"""If there are more groups, they are shown only in their table and in the figures of their axes."""
+"""If there are more groups, only their table and the figures of their axes show them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +83,7 @@ class ReportContext:
     @property
     def groups(self) -> Sequence[Group]:
         """Return the groups of the runs in virtual time."""
-        return in_order(self.summary.get("groups") or [])
+        return sort_groups(self.summary.get("groups") or [])
 
     @property
     def kinds(self) -> dict[str, Conditions]:
@@ -93,17 +93,17 @@ class ReportContext:
 
     @property
     def base(self) -> list[Group]:
-        """Return the groups whose conditions are those of the base config; none if those are from several groups."""
+        """Return the groups of the base config; none if the runs of the base config are in several groups."""
         return [group for group in self.groups if group["conditions"] == self.summary["conditions"]]
 
     def paper(self, conditions: Conditions) -> Conditions:
-        """Return the paper's conditions that match these."""
+        """Return the paper's conditions that match `conditions`."""
         return matching_paper(conditions, (self.summary.get("paper") or {}).get("conditions") or {})
 
     def setup(self, kind: str) -> str:
         """Return a text on how the runs of a kind of time were made, and their group if there are several groups."""
-        setup = run_setup([run for run in self.summary["runs"] if run["time"] == kind])
-        return f"{setup[0].upper()}{setup[1:]}{self.base_title(kind)}"
+        text = run_setup([run for run in self.summary["runs"] if run["time"] == kind])
+        return f"{text[0].upper()}{text[1:]}{self.base_title(kind)}"
 
     def base_title(self, kind: str = "virtual") -> str:
         """Return the title of the base config's group in brackets; "" for real time or without such a group."""
@@ -137,7 +137,7 @@ def summary_parts(report: ReportContext) -> Parts:
 
 
 def conditions_parts(report: ReportContext) -> Parts:
-    """Return the tables of the conditions for each kind of time, with the paper's values where it has the condition."""
+    """Return the tables of the conditions for each kind of time, with the paper's values of the same conditions."""
     if not report.kinds:
         return [
             html_page.paragraph("No run has the settings of the base config. See the table of groups.", is_note=True)
@@ -197,34 +197,34 @@ def _base_note(report: ReportContext) -> str:
 
 
 def injected_parts(report: ReportContext) -> Parts:
-    """Return the figure of measured latency by injected delay."""
+    """Return the figure of measured latency over injected delay."""
     if not report.kinds:
         return []
     caption = (
-        "Measured one-way latency by injected delay. Points are medians; bars in the upper panels reach from p5 to "
-        "p95. The grey line shows the expected latency: the median of the condition with the least delay, plus the "
+        "Measured one-way latency over injected delay. Points are medians; bars in the upper panels reach from p5 to "
+        "p95. The grey line shows the expected latency: the median of the condition with the smallest delay, plus the "
         "additional injected delay. The lower panels show the deviation of each median from this line, with the "
         f"bound of the clock error as bars.{_base_note(report)}"
     )
     figure = injected_figure(report.kinds, report.colours)
-    return [save_figure(report.directory, "injected", figure, "measured latency by injected delay", caption)]
+    return [save_figure(report.directory, "injected", figure, "measured latency over injected delay", caption)]
 
 
 def degradation_parts(report: ReportContext) -> Parts:
-    """Return the figure of completion and error by latency."""
+    """Return the figure of completion and error over latency."""
     all_entries = [entry for conditions in report.kinds.values() for entry in conditions.values()]
     if all(entry["loop_ms"]["p50"] is None for entry in all_entries):
         return []
     paper = report.paper(report.summary["conditions"])
     caption = (
-        "Completion and error by the median loop latency (from a frame's stamp to the application of its command), and "
-        "by the mean frame age (the age of the frame from which the command in force was made). Bars are 95 % "
+        "Completion and error over the median loop latency (from a frame's stamp to the application of its command), "
+        "and over the mean frame age (the age of the frame from which the command in force was made). Bars are 95 % "
         "intervals. Names above each other are in the vertical order of their points."
         + (PAPER_POINTS if paper else "")
         + _base_note(report)
     )
     figure = degradation_figure(report.kinds, paper, report.colours)
-    return [save_figure(report.directory, "degradation", figure, "completion and error by latency", caption)]
+    return [save_figure(report.directory, "degradation", figure, "completion and error over latency", caption)]
 
 
 def survival_parts(report: ReportContext) -> Parts:
@@ -260,8 +260,8 @@ def survival_parts(report: ReportContext) -> Parts:
     return parts
 
 
-def stage_parts(report: ReportContext, captured_ms: Mapping[str, Mapping[str, float | None]]) -> Parts:
-    """Return the latency of each stage; `captured_ms` is by kind of time and condition."""
+def stage_parts(report: ReportContext, capture_to_stamp_ms: Mapping[str, Mapping[str, float | None]]) -> Parts:
+    """Return the latency of each stage; `capture_to_stamp_ms` is by kind of time and condition."""
     parts = []
     for kind, conditions in report.kinds.items():
         known = {name: entry for name, entry in conditions.items() if entry.get("stages_ms")}
@@ -277,7 +277,7 @@ def stage_parts(report: ReportContext, captured_ms: Mapping[str, Mapping[str, fl
         parts.append(
             save_figure(report.directory, f"stages_{kind}", stages_figure(loops), "latency of each stage", caption)
         )
-        parts.append(save_table(report.directory, f"stages_{kind}", stage_table(stages, captured_ms.get(kind))))
+        parts.append(save_table(report.directory, f"stages_{kind}", stage_table(stages, capture_to_stamp_ms.get(kind))))
         parts.append(html_page.paragraph(STAGES_NOTE, is_note=True))
     return parts
 
@@ -287,9 +287,9 @@ def _is_after_loop(stage: Mapping[str, Any]) -> bool:
 
 
 def _loop_of(entry: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """Return the stages of a condition's loop, and the part of its median loop latency that belongs to no stage.
+    """Return the stages of a condition's loop, and the rest of its median loop latency, which belongs to no stage.
 
-    In this part a repeated command waits until it is due.
+    In the rest of the time, a command that is repeated waits until it is due.
     """
     stages, loop_ms = [stage for stage in entry["stages_ms"] if not _is_after_loop(stage)], entry["loop_ms"]["p50"]
     rest_ms = 0.0 if loop_ms is None else loop_ms - sum(stage["p50"] or 0.0 for stage in stages)
@@ -366,7 +366,9 @@ def clock_parts(report: ReportContext) -> Parts:
     """Return the clock offset of the runs in real time whose sides have separate clocks."""
     runs = report.summary["runs"]
     two_clock_runs = [
-        run for run in runs if run["time"] == "real" and (run.get("delta") or {}).get("source") not in ONE_CLOCK
+        run
+        for run in runs
+        if run["time"] == "real" and (run.get("delta") or {}).get("source") not in SOURCES_WITHOUT_OFFSET
     ]
     if not two_clock_runs:
         return []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import groupby, pairwise, product
-from typing import Any
+from typing import Any, NamedTuple
 
 from lavt.experiment.report.figure_style import Conditions
 
@@ -14,26 +14,31 @@ MAX_LISTED_NAMES = 8
 EQUAL_LOOP_LATENCY_MS = 3.0
 """Median loop latencies that differ by no more than this are treated as equal."""
 
-ConditionPoint = tuple[str, float, float]
-"""Name, median loop latency in ms, and completion of a condition."""
+
+class ConditionPoint(NamedTuple):
+    """A condition with its median loop latency and its completion."""
+
+    name: str
+    loop_ms: float
+    completion_rate: float
 
 
-def _by_latency(conditions: Conditions) -> list[list[ConditionPoint]]:
-    """Return the conditions with known loop latency and completion, in groups of equal latency, the lowest first."""
+def _latency_levels(conditions: Conditions) -> list[list[ConditionPoint]]:
+    """Return the conditions with known loop latency and completion, in levels of equal latency, the lowest first."""
     known = [
-        (name, float(entry["loop_ms"]["p50"]), float(entry["completion_rate"]))
+        ConditionPoint(name, float(entry["loop_ms"]["p50"]), float(entry["completion_rate"]))
         for name, entry in conditions.items()
         if entry["loop_ms"]["p50"] is not None and entry["completion_rate"] is not None
     ]
-    level_begins_ms: list[float] = []
-    for _, loop_ms, _ in sorted(known, key=lambda point: point[1]):
-        if not level_begins_ms or loop_ms - level_begins_ms[-1] > EQUAL_LOOP_LATENCY_MS:
-            level_begins_ms.append(loop_ms)
+    level_starts_ms: list[float] = []
+    for loop_ms in sorted(point.loop_ms for point in known):
+        if not level_starts_ms or loop_ms - level_starts_ms[-1] > EQUAL_LOOP_LATENCY_MS:
+            level_starts_ms.append(loop_ms)
 
     def level(point: ConditionPoint) -> int:
-        return sum(begin_ms <= point[1] for begin_ms in level_begins_ms)
+        return sum(start_ms <= point.loop_ms for start_ms in level_starts_ms)
 
-    return [list(members) for _, members in groupby(sorted(known, key=lambda point: (level(point), point[0])), level)]
+    return [list(members) for _, members in groupby(sorted(known, key=lambda point: (level(point), point.name)), level)]
 
 
 def runs_overview(runs: Sequence[Mapping[str, Any]]) -> str:
@@ -62,9 +67,9 @@ def _listed(word: str, names: Sequence[str]) -> str:
 def results_sentences(name: str, conditions: Conditions) -> str:
     """Return sentences on the results of the runs called `name`; "" without conditions.
 
-    They give the completion, its largest fall between two levels of latency, and P95 of the cross-track error.
+    The sentences give the completion, its largest fall between two levels of latency, and P95 of the cross-track error.
     """
-    levels = _by_latency(conditions)
+    levels = _latency_levels(conditions)
     known = [point for level in levels for point in level]
     if not known:
         return ""
@@ -85,20 +90,21 @@ def results_sentences(name: str, conditions: Conditions) -> str:
 
 
 def _fall_sentences(levels: Sequence[Sequence[ConditionPoint]]) -> list[str]:
-    """Return sentences on the largest fall of completion, and on the latency from which fewer than half complete."""
+    """Return sentences on the largest fall of completion, and on the latency above which fewer than half complete."""
     falls = [pair for lower, higher in pairwise(levels) for pair in product(lower, higher)]
     if not falls:
         return []
-    before, after = max(falls, key=lambda fall: fall[0][2] - fall[1][2])
-    (before_name, before_ms, before_rate), (after_name, after_ms, after_rate) = before, after
-    if before_rate <= after_rate:
+    before, after = max(falls, key=lambda fall: fall[0].completion_rate - fall[1].completion_rate)
+    if before.completion_rate <= after.completion_rate:
         return ["Completion does not fall as latency increases."]
     parts = [
-        f"The largest fall of completion is from {before_rate * 100:.0f} % at {before_name} to "
-        f"{after_rate * 100:.0f} % at {after_name}, between {before_ms:.0f} and {after_ms:.0f} ms of loop latency."
+        f"The largest fall of completion is from {before.completion_rate * 100:.0f} % at {before.name} to "
+        f"{after.completion_rate * 100:.0f} % at {after.name}, between {before.loop_ms:.0f} and {after.loop_ms:.0f} ms "
+        "of loop latency."
     ]
-    last = max((index for index, level in enumerate(levels) if any(rate >= 0.5 for _, _, rate in level)), default=-1)
+    best_rates = [max(point.completion_rate for point in level) for level in levels]
+    last = max((index for index, best_rate in enumerate(best_rates) if best_rate >= 0.5), default=-1)
     if last + 1 < len(levels):
-        begin_ms = min(loop_ms for _, loop_ms, _ in levels[last + 1])
-        parts.append(f"At {begin_ms:.0f} ms and above, fewer than half of the runs are completed.")
+        start_ms = min(point.loop_ms for point in levels[last + 1])
+        parts.append(f"At {start_ms:.0f} ms and above, fewer than half of the runs are completed.")
     return parts

@@ -1,4 +1,4 @@
-"""Figures of many runs: distance driven, endings, and results by an axis of the sweep. No function reads a file."""
+"""Figures of many runs: distance driven, endings, and results over an axis of the sweep. No function reads a file."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ ENDING_DASHES: Mapping[str, Any] = {
 }
 
 PANELS_PER_ROW = 3
-"""The panels of routes in a row of a figure."""
+"""The number of panels in a row of a figure."""
 MAX_BANDS = 2
 """The intervals of survival are drawn for at most this many conditions, because more would overlap."""
 MAX_TICKS = 8
-"""With at most this many values, each value of an axis has a tick of its own."""
+"""If an axis has at most this many values, there is a tick for each value."""
 
 AXIS_ROWS = (
     ("runs completed (%)", "completion_rate", 100.0),
     ("error, mean P95 (m)", "p95_m", 1.0),
     ("frame age (ms)", "picture_age_ms", 1.0),
 )
-"""The rows of panels: label, key of the value in a condition, and the scale by which the value is multiplied."""
+"""The rows of panels: label, key of the value in a condition, and the factor by which the value is multiplied."""
 
 
 def routes_with_survival(conditions: Conditions) -> list[str]:
@@ -41,14 +41,14 @@ def routes_with_survival(conditions: Conditions) -> list[str]:
 
 
 def survival_figure(conditions: Conditions, colours: Colours) -> Figure:
-    """Return the figure of runs still driving at each distance: a panel for each route, a line for each condition.
+    """Return the figure of the runs that still drive at each distance: a panel for each route, a line per condition.
 
     The 95 % intervals are drawn for at most `MAX_BANDS` conditions.
     """
     routes = routes_with_survival(conditions)
-    figure, panels = _panels(len(routes))
+    figure, panels = _new_panels(len(routes))
     for axes, route in zip(panels, routes, strict=True):
-        for (name, entry), width in zip(conditions.items(), _widths(len(conditions)), strict=True):
+        for (name, entry), width in zip(conditions.items(), _line_widths(len(conditions)), strict=True):
             curve = (entry.get("survival") or {}).get(route)
             if not curve or not curve["distance_m"]:
                 continue
@@ -66,15 +66,15 @@ def survival_figure(conditions: Conditions, colours: Colours) -> Figure:
 
 
 def incidence_figure(conditions: Conditions, colours: Colours) -> Figure:
-    """Return the figure of the share of runs that ended in each way, by distance.
+    """Return the figure of the share of runs that ended in each way, over distance.
 
-    It has a panel for each route, a line style for each ending, and a colour for each condition.
+    The figure has a panel for each route, a line style for each ending, and a colour for each condition.
     """
     routes = routes_with_survival(conditions)
-    figure, panels = _panels(len(routes))
+    figure, panels = _new_panels(len(routes))
     dashes: dict[str, Any] = {}
     for axes, route in zip(panels, routes, strict=True):
-        for (name, entry), width in zip(conditions.items(), _widths(len(conditions)), strict=True):
+        for (name, entry), width in zip(conditions.items(), _line_widths(len(conditions)), strict=True):
             curve = (entry.get("survival") or {}).get(route) or {"incidence": {}}
             for ending, incidence in (curve.get("incidence") or {}).items():
                 if any(incidence):
@@ -90,8 +90,8 @@ def incidence_figure(conditions: Conditions, colours: Colours) -> Figure:
     return figure
 
 
-def _widths(count: int) -> list[float]:
-    """Return the width of each line. Earlier lines are wider, so that they remain visible under the later ones."""
+def _line_widths(count: int) -> list[float]:
+    """Return the width of each line: the first lines are wider, so that they are visible under the lines after them."""
     return [float(width) for width in np.linspace(4.0 if count > 1 else 1.2, 1.2, count)]
 
 
@@ -100,44 +100,42 @@ def _label_distance(panels: Sequence[Axes]) -> None:
         axes.set_xlabel("distance driven (m)")
 
 
-def _panels(count: int) -> tuple[Figure, list[Axes]]:
+def _new_panels(count: int) -> tuple[Figure, list[Axes]]:
     """Return a new figure with `count` small panels that share the scale of y, `PANELS_PER_ROW` in a row."""
-    columns = min(PANELS_PER_ROW, count)
-    rows = -(-count // columns)
-    figure = new_figure(2.0 * rows + 0.7)
-    panels = list(figure.subplots(rows, columns, squeeze=False, sharey=True).flat)
+    column_count = min(PANELS_PER_ROW, count)
+    row_count = -(-count // column_count)
+    figure = new_figure(2.0 * row_count + 0.7)
+    panels = list(figure.subplots(row_count, column_count, squeeze=False, sharey=True).flat)
     for axes in panels[count:]:
         axes.axis("off")
     return figure, panels[:count]
 
 
-def axis_figure(groups: Sequence[Group], axes_names: Sequence[str], colours: Colours) -> Figure:
-    """Return the figure of results by one or two axes of a sweep.
+def axis_figure(groups: Sequence[Group], axis_names: Sequence[str], colours: Colours) -> Figure:
+    """Return the figure of results over one or two axes of a sweep.
 
     The first axis is on x, and each value of the second axis has a column of panels. Each line is a condition. The rows
     are completion, error and frame age, if they are known.
     """
-    x_axis, *second = axes_names
+    x_axis = axis_names[0]
+    column_axis = axis_names[1] if len(axis_names) > 1 else None
     positions, labels = _positions([group.get(x_axis) for group in groups])
-    columns = list(dict.fromkeys(str(group.get(second[0])) for group in groups)) if second else [""]
+    columns = list(dict.fromkeys(str(group.get(column_axis)) for group in groups)) if column_axis else [""]
     names = sorted({name for group in groups for name in group["conditions"]})
-    rows = [
-        row
-        for row in AXIS_ROWS
-        if any(_has(entry, row[1]) for group in groups for entry in group["conditions"].values())
-    ]
+    entries = [entry for group in groups for entry in group["conditions"].values()]
+    rows = [(label, key, scale) for label, key, scale in AXIS_ROWS if any(_has_value(entry, key) for entry in entries)]
     figure = new_figure(1.9 * len(rows) + 0.8, width_in=max(5.5, min(2.6 * len(columns) + 0.6, 13)))
     panels = figure.subplots(len(rows), len(columns), squeeze=False, sharex=True, sharey="row")
     for column, value in enumerate(columns):
-        members = [group for group in groups if not second or str(group.get(second[0])) == value]
-        title = f"{short_name(second[0])} {value}" if second else ""
+        members = [group for group in groups if not column_axis or str(group.get(column_axis)) == value]
+        title = f"{short_name(column_axis)} {value}" if column_axis else ""
         for row, (label, key, scale) in enumerate(rows):
             axes = panels[row, column]
-            for name, width in zip(names, _widths(len(names)), strict=True):
+            for name, width in zip(names, _line_widths(len(names)), strict=True):
                 points = sorted(
                     (positions[str(group.get(x_axis))], _value(group["conditions"][name], key) * scale)
                     for group in members
-                    if name in group["conditions"] and _has(group["conditions"][name], key)
+                    if name in group["conditions"] and _has_value(group["conditions"][name], key)
                 )
                 if points:
                     x, y = zip(*points, strict=True)
@@ -154,7 +152,7 @@ def axis_figure(groups: Sequence[Group], axes_names: Sequence[str], colours: Col
     return figure
 
 
-def _has(entry: Mapping[str, Any], key: str) -> bool:
+def _has_value(entry: Mapping[str, Any], key: str) -> bool:
     value = entry.get(key)
     return (value.get("mean") if isinstance(value, Mapping) else value) is not None
 

@@ -27,8 +27,8 @@ PERCENTILES = ("p50", "p5", "p95")
 TITLE_CHARACTERS = 14
 """In LaTeX, a longer column title is broken into lines."""
 
-LINE_CHARACTERS = 66
-"""The characters in a line of LaTeX's article class. A wider table is scaled to the width of the line."""
+TEX_LINE_CHARACTERS = 66
+"""The number of characters in a line of LaTeX's article class. A wider table is scaled to the width of the line."""
 
 LONG_CHARACTERS = 35
 LONG_WIDTH_CM = 6
@@ -59,7 +59,7 @@ class TableData:
     columns: Sequence[Column]
     rows: Sequence[Sequence[Any]]
 
-    def without_empty(self) -> TableData:
+    def without_empty_columns(self) -> TableData:
         """Return the table without the columns that have no known value."""
         known = [
             index
@@ -134,11 +134,12 @@ def format_interval(bounds: Sequence[float] | None, *, scale: float = 1.0, digit
     """Return an interval, multiplied by `scale`, as "low to high" without a line break."""
     if bounds is None:
         return NOTHING
-    return f"{bounds[0] * scale:.{digits}f} to {bounds[1] * scale:.{digits}f}".replace(" ", UNBROKEN)
+    low, high = bounds
+    return f"{low * scale:.{digits}f} to {high * scale:.{digits}f}".replace(" ", UNBROKEN)
 
 
 def format_latency(summary: Mapping[str, Any] | None) -> str:
-    """Return the median, the bound of its clock error (if the summary has one), and the range from p5 to p95."""
+    """Return the median, the bound of its clock error (if the summary has a bound), and the range from p5 to p95."""
     if summary is None or summary["p50"] is None:
         return NOTHING
     median, spread = f"{summary['p50']:.1f}", f"({summary['p5']:.1f} to {summary['p95']:.1f})"
@@ -166,7 +167,7 @@ def html_of(table: TableData) -> Markup:
 def csv_of(table: TableData) -> str:
     """Return a table as CSV.
 
-    Each value is in a column of its own with all its digits, and the cell of an unknown value is empty.
+    Each value has a column of its own and all its digits; the cell of an unknown value is empty.
     """
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
@@ -178,13 +179,13 @@ def csv_of(table: TableData) -> str:
 
 
 def tex_of(table: TableData) -> str:
-    r"""Return a table as a LaTeX `tabular`; it needs `booktabs`, and `graphicx` if it is wide."""
+    r"""Return a table as a LaTeX `tabular`, which needs `booktabs` and, if the table is wide, `graphicx`."""
     shown = _shown_texts(table)
     columns = [_tex_column(column, [row[index] for row in shown]) for index, column in enumerate(table.columns)]
     head, *rows = [" & ".join(cells) + r" \\" for cells in zip(*(cells for _, _, cells in columns), strict=True)]
     packages = [r"% needs \usepackage{booktabs}"]
     begin, end = rf"\begin{{tabular}}{{{''.join(align for align, _, _ in columns)}}}", r"\end{tabular}"
-    if sum(width + 2 for _, width, _ in columns) > LINE_CHARACTERS:
+    if sum(width + 2 for _, width, _ in columns) > TEX_LINE_CHARACTERS:
         packages.append(r"% needs \usepackage{graphicx}")
         begin, end = r"\resizebox{\textwidth}{!}{" + begin, end + "}"
     return "\n".join([*packages, begin, r"\toprule", head, r"\midrule", *rows, r"\bottomrule", end, ""])
@@ -232,7 +233,7 @@ _TEX = {
     "<": r"$<$",
     ">": r"$>$",
     "|": r"$|$",
-    "[": "{[}",  # at the beginning of a row, LaTeX reads these as options of the line break before it
+    "[": "{[}",  # at the beginning of a row, LaTeX would read [ or * as an option of the line break before the row
     "*": "{*}",
     "τ": r"$\tau$",
     "±": r"$\pm$",
@@ -248,5 +249,5 @@ def _tex(text: str) -> str:
 
 
 def _tex_long(text: str) -> str:
-    """Escape a text, and permit line breaks after commas and colons, because a cell may contain JSON without spaces."""
+    """Escape a text, and permit line breaks after commas and colons, because a cell can contain JSON without spaces."""
     return re.sub(r"([,:])(?=[^\s~])", r"\1\\allowbreak{}", _tex(text))

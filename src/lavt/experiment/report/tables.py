@@ -31,10 +31,10 @@ COMPLETED_P95 = "p95 m, completed runs"
 COMMON_P95 = "p95 m, up to common distance"
 
 AFTER_LOOP_SUFFIX = ", after the loop"
-"""In the table of stages, marks a stage that is not part of the loop."""
+"""Marks a stage that is not part of the loop, in the table of stages."""
 
 ENDED_EARLY = "ended early"
-"""The text of a quantile of all runs if a run that was not completed has this rank."""
+"""The text of a quantile over all runs if the run with this rank was not completed."""
 
 FIDELITY_DESCRIPTIONS = {
     "video": "modelled network and clocks, real images, codec and packets",
@@ -66,10 +66,10 @@ def matching_paper(conditions: Conditions, paper: Conditions) -> Conditions:
 def _table(entries: Iterable[Mapping[str, Any]], columns: Sequence[tuple[Column, str]]) -> TableData:
     """Return the table with a row for each entry, without empty columns.
 
-    Each column has the key of its values; a key with dots is a path into nested entries.
+    `columns` has each column with the key of its values in an entry; "a.b" is the key `b` of the nested entry `a`.
     """
     rows = [[_value(entry, key) for _, key in columns] for entry in entries]
-    return TableData([column for column, _ in columns], rows).without_empty()
+    return TableData([column for column, _ in columns], rows).without_empty_columns()
 
 
 def _value(entry: Mapping[str, Any], key: str) -> Any:
@@ -196,7 +196,7 @@ def group_table(groups: Sequence[Group], names: Sequence[str]) -> TableData:
 
     `names` are the settings that distinguish the groups.
     """
-    entries = [  # the keys of the settings are indexes, because a dot in a setting's name would be read as a path
+    entries = [  # the keys of the settings are numbers, because dots in a key mean nested entries
         {**entry, "condition": name, **{str(index): group.get(key) for index, key in enumerate(names)}}
         for group in groups
         for name, entry in group["conditions"].items()
@@ -311,7 +311,7 @@ def run_table(runs: Sequence[Mapping[str, Any]]) -> TableData:
 
 
 def clock_table(runs: Sequence[Mapping[str, Any]]) -> TableData:
-    """Return the table of clock offsets, by their source and by the probe: one row for each run."""
+    """Return the table of clock offsets, from the source in use and from the probe: one row for each run."""
     parts = ("", "bound")
     columns = [
         text_column("run"),
@@ -334,21 +334,21 @@ def clock_table(runs: Sequence[Mapping[str, Any]]) -> TableData:
 
 
 def stage_table(
-    stages: Mapping[str, Sequence[Mapping[str, Any]]], captured_ms: Mapping[str, float | None] | None = None
+    stages: Mapping[str, Sequence[Mapping[str, Any]]], capture_to_stamp_ms: Mapping[str, float | None] | None = None
 ) -> TableData:
     """Return the median latency of each stage in ms: one row for each stage, one column for each condition.
 
-    `captured_ms` is the time from capture to stamp, by condition. It is the first row, because the loop begins later.
+    `capture_to_stamp_ms` is by condition. It becomes the first row, because this time is before the loop.
     """
     names = list(dict.fromkeys((stage["node"], stage["stage"]) for entries in stages.values() for stage in entries))
     medians_ms = [{(stage["node"], stage["stage"]): stage["p50"] for stage in entries} for entries in stages.values()]
-    before_loop: list[Any] = [(captured_ms or {}).get(name) for name in stages]
+    before_loop: list[Any] = [(capture_to_stamp_ms or {}).get(name) for name in stages]
     show = number_column("", 2).show
     columns = [text_column("stage, median ms"), *(Column(name, show) for name in stages)]
     rows = [
         [
             f"{node}: {stage}{AFTER_LOOP_SUFFIX if (node, stage) in AFTER_LOOP else ''}",
-            *(of_condition.get((node, stage)) for of_condition in medians_ms),
+            *(condition_medians_ms.get((node, stage)) for condition_medians_ms in medians_ms),
         ]
         for node, stage in names
     ]

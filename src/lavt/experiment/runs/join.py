@@ -26,8 +26,8 @@ SIDES = ("server", "client")
 def join_sides(server_dir: Path, client_dir: Path, out: Path) -> dict[str, Any]:
     """Create the run directory `out` from the directories of the two sides, and return its result.
 
-    Raises `UserError` where a directory does not have the files of its side, or where the two directories were not
-    written in the same drive.
+    Raises `UserError` if a directory does not have the files of its side, or if the two directories are not from the
+    same drive.
     """
     check_directory(out)
     for side, directory in zip(SIDES, (server_dir, client_dir), strict=True):
@@ -47,7 +47,7 @@ def join_sides(server_dir: Path, client_dir: Path, out: Path) -> dict[str, Any]:
 
 def run_config(server: ServerConfig, client: ClientConfig) -> RunConfig:
     """Return the config that a run of these two sides would have had on one machine."""
-    requested = client.injection
+    injection = client.injection
     return RunConfig(
         vehicle=server.vehicle,
         controller=client.controller,
@@ -57,9 +57,9 @@ def run_config(server: ServerConfig, client: ClientConfig) -> RunConfig:
             | {"reorder_hold_ms": client.video.reorder_hold_ms}  # the client uses its own value
         ),
         network=NetworkConfig(
-            condition=requested.condition or "L0",
-            injection="netem" if requested.condition else "none",
-            state_delay=requested.state_delay,
+            condition=injection.condition or "L0",
+            injection="netem" if injection.condition else "none",
+            state_delay=injection.state_delay,
         ),
         safety=server.safety,
         record=server.record,
@@ -69,7 +69,7 @@ def run_config(server: ServerConfig, client: ClientConfig) -> RunConfig:
 
 
 def _identity(name: str, run: RunConfig, client: ClientConfig) -> dict[str, Any]:
-    requested = condition(run.network.condition)
+    run_condition = condition(run.network.condition)
     return {
         "run": name,
         "time": "real",
@@ -83,7 +83,7 @@ def _identity(name: str, run: RunConfig, client: ClientConfig) -> dict[str, Any]
         "driver": run.controller.kind,
         "repetition": 0,
         "seed": run.seed,
-        **injected_entry(requested),
+        **injected_entry(run_condition),
     }
 
 

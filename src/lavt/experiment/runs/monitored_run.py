@@ -21,7 +21,7 @@ CHANNELS = frozenset({"truth", "event", "frame", "admission"})
 """The channels that are kept in memory."""
 
 NEVER_NS = 2**62
-"""Stands for the start of a drive that did not begin: it is later than all times of a run."""
+"""The start time of a drive that did not begin; it is later than all times of a run."""
 
 
 class InMemoryRecorder:
@@ -31,7 +31,7 @@ class InMemoryRecorder:
         self.payloads: defaultdict[str, list[Any]] = defaultdict(list)
 
     def write(self, topic: str, payload: Any, now: Now) -> None:  # noqa: ARG002 (part of the protocol)
-        """Keep the payload if it is of one of `CHANNELS`."""
+        """Keep the payload if its channel is in `CHANNELS`."""
         if topic in CHANNELS:
             self.payloads[topic].append(payload)
 
@@ -48,7 +48,7 @@ class MonitoredRun:
     total_delay_ms: float
     """The median of the total delays of all frames with an accepted command; NaN without such a frame."""
     time_s: FloatArray
-    """Times since the start of the drive, (n,); `cross_track_m` and `speed_mps` have a value for each."""
+    """Times since the start of the drive; `cross_track_m` and `speed_mps` have a value for each of these times."""
     cross_track_m: FloatArray
     speed_mps: FloatArray
     limited_s: FloatArray
@@ -58,7 +58,7 @@ class MonitoredRun:
 def drive_monitored(planned: PlannedRun, *, limit_s: float = 3600.0) -> MonitoredRun:
     """Drive a run in virtual time without records, and return its monitored quantities.
 
-    The drive is identical to that of `run_once`. Its record files are created in a temporary directory and stay empty.
+    The drive is identical to a drive of `run_once`. Its record files are in a temporary directory and remain empty.
     """
     cv2.setNumThreads(1)
     recorder = InMemoryRecorder()
@@ -96,11 +96,11 @@ def summarize_drive(payloads: dict[str, list[Any]]) -> MonitoredRun:
 
 
 def _total_delay_ms(frames: list[FrameWritten], accepted: list[Admission]) -> float:
-    """Return the median time from the middle of a frame's exposure to its first accepted command."""
+    """Return the median time from the middle of a frame's exposure to the first accepted command made from it."""
     captured_ns = {frame.stamp_ns: frame.capture_ns for frame in frames if frame.capture_ns is not None}
-    first_ns: dict[int, int] = {}
+    applied_ns: dict[int, int] = {}  # when the first command of each frame was applied, by the frame's stamp
     for command in accepted:
         if command.applied_mono_ns is not None:
-            first_ns.setdefault(command.stamp_ns, command.applied_mono_ns)
-    delays_ns = [applied_ns - captured_ns[stamp] for stamp, applied_ns in first_ns.items() if stamp in captured_ns]
+            applied_ns.setdefault(command.stamp_ns, command.applied_mono_ns)
+    delays_ns = [applied_ns[stamp_ns] - captured_ns[stamp_ns] for stamp_ns in applied_ns if stamp_ns in captured_ns]
     return float(np.median(delays_ns)) / NS_PER_MS if delays_ns else float("nan")

@@ -17,7 +17,7 @@ from lavt.transport.netem.netem import NetemInterface
 from lavt.transport.netem.queue_probe import ProbeResult, judge
 
 NETEM = "netem.json"
-"""The file in a run directory that has the flows requested of netem, and the measurements before and after the
+"""The file in a run directory with the flows that netem was asked to impair, and the measurements before and after the
 drive."""
 LOOPBACK = "lo"
 DISCARD_PORT = 9
@@ -27,8 +27,8 @@ DISCARD_PORT = 9
 def check_netem(planned: PlannedRun) -> list[str]:
     """Check that netem is available if the run needs it; return messages on what was restored after an earlier crash.
 
-    The check applies netem to an unused port, because only this shows whether the process is root and whether tc and
-    the kernel's netem exist. Raises `UserError` where netem is unavailable.
+    The check applies netem to an unused port: only this shows whether the process is root, and whether tc and the
+    kernel's netem exist. Raises `UserError` if netem is unavailable.
     """
     if not uses_netem(planned):
         return []
@@ -44,9 +44,9 @@ def uses_netem(planned: PlannedRun) -> bool:
 
 
 class NetemRun:
-    """A context manager that delays the flows of one run on the loopback interface, and restores it at its end.
+    """A context manager that delays the flows of one run on the loopback interface, and restores the interface at exit.
 
-    Entering it raises `UserError` where netem is unavailable, before it changes anything.
+    On entry, it raises `UserError` if netem is unavailable, before anything is changed.
     """
 
     def __init__(self, planned: PlannedRun, netem: NetemInterface | None = None) -> None:
@@ -105,6 +105,6 @@ def netem_reasons(report: Mapping[str, Any]) -> list[InvalidReason]:
         for moment in ("before", "after"):
             measured = msgspec.convert(report[moment], dict[str, ProbeResult])
             texts += [f"{moment} the drive: {text}" for text in judge(flows, (), measured)]
-    except (KeyError, msgspec.ValidationError):  # neither delay was measured
+    except (KeyError, msgspec.ValidationError):  # the report has no measurements
         return injection_reasons({"video": 0.0, "control": 0.0}, {})
     return [InvalidReason(InvalidCode.INJECTION_DIFFERS, text) for text in texts]

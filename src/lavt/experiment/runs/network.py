@@ -19,7 +19,7 @@ VIDEO_LATENCY_STAGES = (
     ("driver", "decode"),
     ("driver", "read_stamp"),
 )
-"""The stages that are part of tau_v. The link's delay in a profile is the profile's tau_v minus these stages."""
+"""The stages that are part of tau_v. The delay of the link in a profile is the profile's tau_v minus these stages."""
 CONTROL_LATENCY_STAGES = (("driver", "command"),)
 """The stages that are part of tau_c."""
 
@@ -46,7 +46,7 @@ INHERENT = {
 class NetworkDelays:
     """The delays of video, state (server to client), control (client to server), and traffic that is never delayed.
 
-    An injected delay that is only constant is included in these four. Any other injected impairment, with its constant
+    These four delays include an injected delay that is only constant. Any other injected impairment, with its constant
     part, is in `video_injected` or `control_injected`.
     """
 
@@ -59,10 +59,10 @@ class NetworkDelays:
 
 
 def injected_network(profile: str, condition: Condition, costs: Costs, seed: int, *, state_delay: str) -> NetworkDelays:
-    """Return the delays to inject on a loopback for `condition` on top of the inherent latency of `profile`.
+    """Return the delays to inject on a loopback interface: the inherent latency of `profile`, and `condition`.
 
-    The profile "loopback" adds nothing to the machine's own latency. Raises `UserError` for a contradictory condition,
-    and for a trace that is missing or invalid.
+    The profile "loopback" has no delay. Raises `UserError` for a contradictory condition, and for a trace that is
+    missing or invalid.
     """
     inherent = INHERENT.get(profile)
     video_ms, jitter, control_ms = 0.0, None, 0.0

@@ -19,15 +19,15 @@ from lavt.errors import UserError
 from lavt.transport.emulation.impairment import check_flows
 
 RESERVED_AXES = {"vehicle.route": "routes", "network.condition": "conditions", "repetition": "repetitions"}
-"""The config values that a sweep varies by keys of its own, each with the name of this key."""
+"""The config keys that cannot be further axes, each with the key of a sweep's config that varies it."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedRun:
     """A run to be driven.
 
-    `identity` is the beginning of its `result.json`. `seed` is the seed of this run alone, derived from the config's
-    seed.
+    `identity` is the beginning of the run's `result.json`. `seed` is the seed of this run alone, derived from the
+    config's seed.
     """
 
     name: str
@@ -35,7 +35,7 @@ class PlannedRun:
     identity: Mapping[str, Any]
     seed: int
     requested: Condition
-    """The requested impairment of the network."""
+    """The requested network condition."""
 
 
 def plan_run(config: RunConfig, *, name: str = "run", axes: Mapping[str, Any] | None = None) -> PlannedRun:
@@ -78,7 +78,7 @@ def plan_run(config: RunConfig, *, name: str = "run", axes: Mapping[str, Any] | 
 
 
 def injected_entry(requested: Condition) -> dict[str, Any]:
-    """Return the entry `injected_ms`, and `injected_least_ms` if the least expected delay differs from it.
+    """Return the key `injected_ms` and, if the smallest expected delay differs from the requested, `injected_least_ms`.
 
     The delay of a trace is None.
     """
@@ -87,7 +87,7 @@ def injected_entry(requested: Condition) -> dict[str, Any]:
 
 
 def _check_injection(config: RunConfig, requested: Condition) -> None:
-    """Raise `UserError` where the chosen kind of injection cannot apply the condition and the inherent latency."""
+    """Raise `UserError` if the chosen kind of injection cannot apply the condition and the inherent latency."""
     network = config.network
     if network.state_delay == "with_video" and requested.video.trace:
         raise UserError(
@@ -97,10 +97,10 @@ def _check_injection(config: RunConfig, requested: Condition) -> None:
     if config.time == "real" and network.injection == "netem":
         if network.inherent != "loopback":
             raise UserError(
-                f"netem cannot do the lognormal part of network.inherent {network.inherent}: choose loopback, or "
+                f"netem cannot inject the lognormal part of network.inherent {network.inherent}: choose loopback, or "
                 "network.injection relay"
             )
-        # Any two ports: the real ones are free ports that are chosen when the run starts.
+        # The check does not depend on the ports, which are chosen when the run starts.
         check_flows(netem_flows(requested, "both", video_port=1, control_port=2, state_delay=network.state_delay))
     else:
         link_injection("video", requested.video_ms, requested.video, seed=0)
@@ -110,11 +110,11 @@ def _check_injection(config: RunConfig, requested: Condition) -> None:
 def plan_sweep(sweep: SweepConfig) -> list[PlannedRun]:
     """Plan all runs of a sweep: all combinations of routes, conditions, repetitions and values of the further axes.
 
-    Raises `UserError` for a run that `plan_run` rejects, for a sweep without runs, and for one with duplicate runs.
+    Raises `UserError` for a run that `plan_run` rejects, for a sweep without runs, and for duplicate runs.
     """
     for key, reserved in itertools.product(sweep.axes, RESERVED_AXES):
         if f"{reserved}.".startswith(f"{key}."):  # an axis of a whole section would also set the reserved value
-            raise UserError(f"the axis {key!r} is not a further one: use {RESERVED_AXES[reserved]!r} for {reserved!r}")
+            raise UserError(f"{key!r} cannot be a further axis: use {RESERVED_AXES[reserved]!r} for {reserved!r}")
     base = sweep.model_dump(mode="json", exclude={"routes", "conditions", "repetition", "repetitions", "axes"})
     runs = []
     for values in itertools.product(*sweep.axes.values()):
@@ -123,7 +123,7 @@ def plan_sweep(sweep: SweepConfig) -> list[PlannedRun]:
         for route, condition_name, repetition in keys:
             changes = {"vehicle.route": route, "network.condition": condition_name, "repetition": repetition, **axes}
             config = parse_config(RunConfig, _with_changes(base, changes), "the sweep")
-            runs.append(plan_run(config, name=_name(route, condition_name, repetition, axes), axes=axes))
+            runs.append(plan_run(config, name=_run_name(route, condition_name, repetition, axes), axes=axes))
     if not runs:
         raise UserError("the sweep has no run: give routes, conditions and axes at least one value each")
     duplicates = [name for name, count in Counter(run.name for run in runs).items() if count > 1]
@@ -132,27 +132,29 @@ def plan_sweep(sweep: SweepConfig) -> list[PlannedRun]:
     return runs
 
 
-def _name(route: str, condition_name: str, repetition: int, axes: Mapping[str, Any]) -> str:
+def _run_name(route: str, condition_name: str, repetition: int, axes: Mapping[str, Any]) -> str:
     parts = [route, condition_name, f"{repetition:02d}", *(f"{key}={value}" for key, value in axes.items())]
     return "_".join(re.sub("[^A-Za-z0-9=._-]", "-", part) for part in parts)
 
 
 def _with_changes(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a copy of nested sections with some values changed; raise `UserError` for a missing section."""
+    """Return a copy of `base` with `changes`, by dotted keys; raise `UserError` for a missing section."""
     result = dict(base)
     for key, value in changes.items():
         _set_value(result, key.split("."), value, key)
     return result
 
 
-def _set_value(section: dict[str, Any], path: Sequence[str], value: Any, key: str) -> None:
-    if len(path) == 1:
-        section[path[0]] = value
+def _set_value(section: dict[str, Any], names: Sequence[str], value: Any, key: str) -> None:
+    """Set the value at the nested `names` of a section; an error names `key`."""
+    first, *others = names
+    if not others:
+        section[first] = value
         return
-    inner = section.get(path[0])
+    inner = section.get(first)
     if not isinstance(inner, Mapping):
         raise UserError(
             f"the axis {key!r} is not a config value: write it as in the config, such as video.bit_rate_bps"
         )
-    section[path[0]] = dict(inner)
-    _set_value(section[path[0]], path[1:], value, key)
+    section[first] = dict(inner)
+    _set_value(section[first], others, value, key)

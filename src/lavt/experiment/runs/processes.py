@@ -1,6 +1,6 @@
-"""Child processes that run LAVT: each prints JSON lines, and is ended with SIGINT when its run ends.
+"""Child processes that run LAVT: each prints JSON lines, and is ended with SIGINT when the run ends.
 
-Processes are left behind only if the parent process is killed with SIGKILL.
+Child processes survive only if the parent process is killed with SIGKILL.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from typing import Any
 from lavt.errors import UserError, WorkError
 
 READY_LIMIT_S = 60.0
-"""The time limit for the first line of a process, which takes 1 to 5 s on a quiet machine to import and prepare."""
+"""The time limit for the first line of a process. On a quiet machine, imports and preparations take 1 to 5 s."""
 END_LIMIT_S = 15.0
 """A process that has not ended this long after SIGINT is killed."""
 USER_ERROR_CODE = 2
 """The exit code of a program whose input was wrong."""
 LAVT = ("-m", "lavt")
-"""Python's arguments for the installed program. Tests replace them by those of programs with deliberate faults."""
+"""Python's arguments that start LAVT. Tests replace them by arguments that start a program with deliberate faults."""
 
 
 class Process:
@@ -54,8 +54,8 @@ class Process:
     def ready(self) -> dict[str, Any]:
         """Wait for the first line, and return it.
 
-        Raises `WorkError` where the process prints nothing in time or ends before, and `UserError` where it ends
-        because of wrong input.
+        Raises `WorkError` if the process prints nothing in time or ends before, and `UserError` if it ends because of
+        wrong input.
         """
         try:
             line = self._first.get(timeout=READY_LIMIT_S)
@@ -69,7 +69,7 @@ class Process:
 
     @property
     def running(self) -> bool:
-        """True while the process has not ended."""
+        """Whether the process has not ended yet."""
         return self.popen.poll() is None
 
     def last_message(self) -> str:
@@ -78,7 +78,7 @@ class Process:
         return lines[-1] if lines else "no message"
 
     def end(self) -> None:
-        """End the process with SIGINT, and kill it where it does not end in time."""
+        """End the process with SIGINT, and kill it if it does not end in time."""
         if self.running:
             self.popen.send_signal(signal.SIGCONT)  # a stopped process would not handle SIGINT
             self.popen.send_signal(signal.SIGINT)
@@ -92,12 +92,12 @@ class Process:
             self.popen.stdout.close()
 
     def last_line(self) -> dict[str, Any]:
-        """Return the last line that the process printed, after its end."""
+        """Wait for the end of the process's output, and return its last line."""
         self._reader.join()
         return self.latest
 
     def _read(self) -> None:
-        """Read lines until the process ends; kill it if reading fails, because its run would wait for lines in vain."""
+        """Read lines until the process ends; kill it if reading fails, so that the run does not wait for its lines."""
         assert self.popen.stdout is not None  # noqa: S101 (it is a pipe)
         try:
             for text in self.popen.stdout:

@@ -34,15 +34,15 @@ from lavt.experiment.runs.virtual_run import read_costs
 from lavt.transport.emulation.delay_line import DelayModel
 
 RELAY = "relay.json"
-"""The file in a run directory that has the delays requested of the relay, and the delays that it measured."""
+"""The file in a run directory with the delays that the relay was asked to inject, and the delays that it measured."""
 DELAYED_DIRECTIONS = {"video": "video downstream", "control": "control upstream"}
 """The delayed direction of each relayed flow, as `relay.json` names it."""
 LOCAL_TCP = "tcp/127.0.0.1:0"
 SERVER_LISTENS = (LOCAL_TCP, "udp/127.0.0.1:0?rel=1;mixed_rel=1")
 BEGIN_LIMIT_S = 40
-"""The time limit for the start of the drive, from the start of all processes."""
+"""The time limit for the start of the drive; the time begins when all processes have started."""
 RUN_LIMIT_S = 900
-"""The time limit for the ending of the drive, from the start of all processes."""
+"""The time limit for the ending of the drive; the time begins when all processes have started."""
 UNIMPAIRED = ImpairmentConfig()
 STATUS_PERIOD_NS = 200 * NS_PER_MS
 
@@ -52,7 +52,7 @@ Progress = Callable[[dict[str, Any], dict[str, Any]], None]
 
 @dataclass(frozen=True, slots=True)
 class LoopProcesses:
-    """The processes of a run. With a relay, the client reaches the server's video and control only through it."""
+    """The processes of a run. With a relay, all video and control between server and client passes through it."""
 
     server_router: Process
     server: Process
@@ -78,10 +78,10 @@ def start_loop(
     server_program: Sequence[str] = LAVT,
     netem: NetemRun | None = None,
 ) -> LoopProcesses:
-    """Start all processes in order, each with the ports of the earlier ones.
+    """Start all processes in order; each gets the ports of the processes before it.
 
-    The sides write their records into `out`, and the configs of the processes are written into `work`. Without `once`
-    the server keeps running after the first drive. `netem` is applied before the client starts.
+    The sides write their records into `out`. The configs of the processes are written into `work`. Without `once`, the
+    server keeps running after the first drive. `netem` is applied before the client starts.
     """
     run = planned.config
     server_router, local, remote = _start_router(processes, "server-router", "router-server.json5", SERVER_LISTENS)
@@ -112,7 +112,7 @@ def start_loop(
 def start_client_router(processes: Processes, dialled: str, listen: str = LOCAL_TCP) -> tuple[Process, str]:
     """Start the client's router, and return it with its endpoint.
 
-    A router that is started with this endpoint as `listen` takes the place of an earlier one.
+    To replace a router that has ended, pass its endpoint as `listen`.
     """
     router, local, _ = _start_router(processes, "client-router", "router-client.json5", [listen], [dialled])
     return router, local
@@ -121,10 +121,10 @@ def start_client_router(processes: Processes, dialled: str, listen: str = LOCAL_
 def drive_real(planned: PlannedRun, out: Path, *, progress: Progress | None = None) -> None:
     """Drive once, and write the two records into `out`, with the requests and measurements of the relay or netem.
 
-    Raises `WorkError` where a process ends early or the drive does not begin; the records up to then stay in `out`.
+    Raises `WorkError` if a process ends early or the drive does not begin; the records up to then stay in `out`.
     """
-    with TemporaryDirectory(prefix="lavt-") as folder:
-        work = Path(folder)
+    with TemporaryDirectory(prefix="lavt-") as work_name:
+        work = Path(work_name)
         try:
             with ExitStack() as stack:
                 netem = stack.enter_context(NetemRun(planned)) if uses_netem(planned) else None
@@ -152,7 +152,7 @@ def _wait_for_ending(processes: Processes, loop: LoopProcesses, progress: Progre
         others = (process for process in processes.started if process is not loop.server)
         ended = next((process for process in others if not process.running), None)
         if ended is not None:
-            code = ended.popen.returncode  # negative: the signal that ended it
+            code = ended.popen.returncode  # a negative code is the number of the signal that ended the process
             raise WorkError(f"{ended.name} ended during the run with exit code {code}: {ended.last_message()}")
         not_begun = status.get("safety") in (None, "disarmed", "arming")
         if elapsed_s > RUN_LIMIT_S or (elapsed_s > BEGIN_LIMIT_S and not_begun):
@@ -165,12 +165,12 @@ def _wait_for_ending(processes: Processes, loop: LoopProcesses, progress: Progre
 
 
 def _requested_ms(planned: PlannedRun) -> dict[str, float | None]:
-    """Return the median delay requested of the relay for each flow, including the inherent latency.
+    """Return the median delay that the relay is asked to inject into each flow, including the inherent latency.
 
-    It is None for a flow with another impairment than a constant delay, because its median depends on the other
+    The value is None for a flow with an impairment other than a constant delay, because its median depends on the
     traffic.
     """
-    delays = _injected(planned)
+    delays = _injected_delays(planned)
     return {
         "video": delays.video.median_ms() if delays.video_injected is None else None,
         "control": delays.control.median_ms() if delays.control_injected is None else None,
@@ -180,8 +180,8 @@ def _requested_ms(planned: PlannedRun) -> dict[str, float | None]:
 def relay_reasons(relay: Mapping[str, Any]) -> list[InvalidReason]:
     """Return a reason for each flow whose delay in the relay differs from the request; `relay` is from `relay.json`.
 
-    For a flow with another impairment than a constant delay, the send times of packets are compared with the planned
-    ones.
+    For a flow with an impairment other than a constant delay, the send times of packets are compared with the planned
+    send times.
     """
     requested_ms = relay.get("requested_ms", {"video": 0.0, "control": 0.0})
     constant_ms = {flow: delay_ms for flow, delay_ms in requested_ms.items() if delay_ms is not None}
@@ -194,7 +194,7 @@ def relay_reasons(relay: Mapping[str, Any]) -> list[InvalidReason]:
     ]
 
 
-def _injected(planned: PlannedRun) -> NetworkDelays:
+def _injected_delays(planned: PlannedRun) -> NetworkDelays:
     network = planned.config.network
     return injected_network(
         network.inherent, planned.requested, read_costs(), planned.seed, state_delay=network.state_delay
@@ -204,7 +204,7 @@ def _injected(planned: PlannedRun) -> NetworkDelays:
 def _start_router(
     processes: Processes, name: str, file: str, listen: Sequence[str], dialled: Sequence[str] = ()
 ) -> tuple[Process, str, str]:
-    """Start a router, and return it with its local endpoint (TCP) and its remote one (UDP, "" for the client's)."""
+    """Start a router, and return it with its TCP endpoint and its UDP endpoint, which is "" for the client's router."""
     endpoints = {"listen": listen, "connect": dialled}
     changes = [part for key, value in endpoints.items() for part in ("--set", f"{key}.endpoints={json.dumps(value)}")]
     router = processes.start(name, "router", f"zenoh-configs/{file}", *changes)
@@ -214,7 +214,7 @@ def _start_router(
 
 
 def _relay_config(planned: PlannedRun, video_port: int, control_port: int) -> RelayConfig:
-    injected, requested = _injected(planned), planned.requested
+    injected, requested = _injected_delays(planned), planned.requested
     return RelayConfig(
         video_server=f"127.0.0.1:{video_port}",
         control_server=f"127.0.0.1:{control_port}",

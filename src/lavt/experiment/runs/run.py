@@ -1,4 +1,4 @@
-"""Driving one planned run, and writing its run directory: config, records, result."""
+"""Drive one planned run, and write its run directory: config, records, result."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from lavt.recording.record import evaluating, read_record
 CONFIG = "config.yaml"
 RESULT = "result.json"
 NETWORK = "network"
-"""The value of `inherent` for a run on two machines, whose inherent latency is that of the network between them."""
+"""The value of `inherent` for a run on two machines: the inherent latency is that of the network between them."""
 
 
 def run_once(planned: PlannedRun, out: Path, *, progress: Progress | None = None) -> dict[str, Any]:
-    """Drive, write everything into `out`, and return the result; raise `WorkError` where the drive did not begin."""
+    """Drive, write everything into `out`, and return the result; raise `WorkError` if the drive did not begin."""
     return dict(drive_once(planned, out, progress=progress).result)
 
 
 def drive_once(planned: PlannedRun, out: Path, *, progress: Progress | None = None) -> DriveData:
-    """Drive as `run_once` does, and return the result with the data for figures, because the records are in memory."""
+    """Drive as `run_once` does, and return the result with the data that figures need."""
     cv2.setNumThreads(1)  # more threads would change the order of summation, and runs would not be reproducible
     check_directory(out)
     digest = None
@@ -63,7 +63,7 @@ def _write_config(planned: PlannedRun, out: Path) -> None:
 def compute_result(out: Path, identity: Mapping[str, Any], digest: str | None) -> dict[str, Any]:
     """Compute and write `result.json` from the files in `out`: the records, and `relay.json` or `netem.json`.
 
-    Raises `UserError` for records whose content LAVT cannot have written.
+    Raises `UserError` for records with content that LAVT does not write.
     """
     with evaluating(out):
         return dict(_compute(out, identity, digest).result)

@@ -32,7 +32,7 @@ from lavt.transport.emulation.relay import video_index
 
 SERVER_MONO_NS = 1_000 * NS_PER_S
 CLIENT_MONO_NS = 7_000 * NS_PER_S
-"""The monotonic clocks at the start of every virtual run. They differ, because those of two machines are unrelated."""
+"""The monotonic clocks at the start of every virtual run. They differ, as the monotonic clocks of two machines do."""
 WALL_NS = 1_790_000_000 * NS_PER_S
 """The true wall time at the start of every virtual run, a day of 2026."""
 CLIENT_ADDRESS = ("198.51.100.2", 40_000)
@@ -117,11 +117,9 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
     make_directory(out)
     digest = hashlib.sha256()
     left_out = config.left_out
-    writers = (
-        RecordWriter(out / "server.mcap", "server", digest, left_out=left_out),
-        RecordWriter(out / "client.mcap", "client", digest, left_out=left_out),
-    )
-    for writer in writers:
+    server_writer = RecordWriter(out / "server.mcap", "server", digest, left_out=left_out)
+    client_writer = RecordWriter(out / "client.mcap", "client", digest, left_out=left_out)
+    for writer in (server_writer, client_writer):
         for name, entries in provenance().items():
             writer.annotate(name, entries)
         writer.annotate(
@@ -144,7 +142,7 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
             "server",
             server_clock,
             server.all,
-            Recorders(observer, writers[0]),
+            Recorders(observer, server_writer),
             costs_ns,
             modelled_clock_source(server_clock, "virtual-server", error_s, bound_s),
             left_out=left_out,
@@ -153,7 +151,7 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
             "client",
             client_clock,
             client.all,
-            writers[1],
+            client_writer,
             costs_ns,
             modelled_clock_source(client_clock, "virtual-client", -error_s, bound_s),
             CLIENT_ADDRESS,
@@ -168,15 +166,15 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
         state_delay=config.network.state_delay,
     )
     runtime = VirtualRuntime(hosts, virtual_links(virtual_network(injected, costs)))
-    return VirtualLoop(runtime, server, client, observer, writers, digest)
+    return VirtualLoop(runtime, server, client, observer, (server_writer, client_writer), digest)
 
 
 def virtual_links(network: NetworkDelays) -> dict[str, VirtualLink]:
     """Return the links of all channels that cross the network.
 
-    In reality, commands and session requests share a path. Here each has a delay line and random-number streams of its
-    own, so that neither affects the other. The random delay of a packet is selected by the packet's number, or for
-    video by its frame.
+    In reality, commands and session requests share a network path. Here each of the two channels has a delay line and
+    random-number streams of its own, so that they do not affect each other. The random delay of a packet depends on the
+    packet's number or, for video, on its frame.
     """
 
     def packet_number(_payload: bytes, number: int) -> int:
@@ -208,10 +206,12 @@ def drive(loop: VirtualLoop, *, limit_ns: int = RUN_LIMIT_NS, progress: Callable
     runtime, observer = loop.runtime, loop.observer
     if progress is not None:
         _report_every_second(runtime, progress)
-    gc.freeze()  # these objects exist until the end, and garbage collections that visit them took over 3 % of the time
+    # Exclude the existing objects from garbage collection: they exist until the end, and visiting them took over 3 % of
+    # the time.
+    gc.freeze()
     try:
-        armed = runtime.run(min(ARMING_LIMIT_NS, limit_ns), lambda: observer.began)
-        if armed and runtime.run(limit_ns, lambda: observer.ending is not None):
+        has_begun = runtime.run(min(ARMING_LIMIT_NS, limit_ns), lambda: observer.began)
+        if has_begun and runtime.run(limit_ns, lambda: observer.ending is not None):
             runtime.run(runtime.true_ns + AFTER_ENDING_NS, lambda: False)
         runtime.close()
     finally:

@@ -16,7 +16,7 @@ Run = Mapping[str, Any]
 
 
 def summarize_groups(runs: Sequence[Run]) -> list[dict[str, Any]]:
-    """Summarize the runs of each route with each preset, and of all routes together where there are several."""
+    """Summarize the runs of each route with each preset and, if there are several routes, of all routes together."""
     presets = list(dict.fromkeys(run["preset"] for run in runs))
     routes: list[str | None] = list(dict.fromkeys(run["route"] for run in runs))
     if len(routes) > 1:
@@ -26,11 +26,11 @@ def summarize_groups(runs: Sequence[Run]) -> list[dict[str, Any]]:
         for route in routes:
             chosen = [run for run in runs if run["preset"] == preset and route in (None, run["route"])]
             if chosen:
-                groups.append({"route": route, "preset": preset, **_group(chosen)})
+                groups.append({"route": route, "preset": preset, **_summarize_group(chosen)})
     return groups
 
 
-def _group(runs: Sequence[Run]) -> dict[str, Any]:
+def _summarize_group(runs: Sequence[Run]) -> dict[str, Any]:
     return {
         "n": len(runs),
         "theory_ms": runs[0]["theory_ms"],  # a property of the loop, equal for all routes
@@ -40,9 +40,9 @@ def _group(runs: Sequence[Run]) -> dict[str, Any]:
 
 
 def ranked_ms(run: Run, name: str) -> float:
-    """Return a run's boundary by a criterion in ms.
+    """Return a run's boundary by the criterion `name` in ms.
 
-    A boundary outside the searched range is infinite: its value is unknown, but not its rank.
+    A boundary outside the searched range is infinite: its value is unknown, but its rank is known.
     """
     value_ms = run[f"{name}_ms"]
     if value_ms is not None:
@@ -53,10 +53,10 @@ def ranked_ms(run: Run, name: str) -> float:
 def summarize_boundaries(values_ms: Sequence[float]) -> dict[str, Any]:
     """Return quartiles, median and the median's confidence interval; values outside the searched range are infinite.
 
-    A quantile that depends on an infinite value is None. The ends of the interval are two order statistics, between
-    which the median of the population lies with a probability of at least 95 %, for any distribution
+    A quantile that depends on an infinite value is None. The ends of the interval are two order statistics. The median
+    of the population lies between them with a probability of at least 95 %, for any distribution
     (`scipy.stats.quantile_test`; W. J. Conover, Practical Nonparametric Statistics, section 3.2). The interval is None
-    for fewer than six values, and one of its ends is None if it is out of range. `n` is the number of values in the
+    for fewer than six values. An end of the interval that is out of range is None. `n` is the number of values in the
     range.
     """
     quartiles = {f"p{share}": _quantile_ms(values_ms, share / 100) for share in (25, 50, 75)}
@@ -64,7 +64,7 @@ def summarize_boundaries(values_ms: Sequence[float]) -> dict[str, Any]:
 
 
 def _quantile_ms(values_ms: Sequence[float], share: float) -> float | None:
-    """Return the quantile, interpolated linearly; None where a value that it depends on is out of range."""
+    """Return the quantile, interpolated linearly; None if it depends on a value that is out of range."""
     ordered = sorted(values_ms)
     position = share * (len(ordered) - 1)
     first, rest = int(position), position - int(position)

@@ -19,7 +19,7 @@ CommonDistances = Mapping[tuple[Any, ...], int]
 """The common distance up to which runs are compared, in units of 10 m, by route, repetition and seed."""
 
 KEY_PART = "_key"
-"""The suffix of a route that is the key part of another route. The two are on the same road."""
+"""The suffix of a route that is the key part of another route. Both routes are on the same road."""
 
 MEANS = (
     "mae_m",
@@ -29,17 +29,16 @@ MEANS = (
     "steering_reversals_per_s",
     "oscillation_hz",
 )
-"""The measures whose mean is in the summary of a condition. The mean is that of the valid runs that have the
-measure."""
+"""The measures of which the summary of a condition has the mean, over all valid runs that have the measure."""
 
 QUARTILES = {"p25": 25, "p50": 50, "p75": 75}
 
 
 def summarize_conditions(runs: Iterable[Run]) -> dict[str, dict[str, Any]]:
     """Summarize runs by condition, sorted by name; all conditions have the same common distances."""
-    members = group_by(runs, "condition")
-    distances = common_distances([run for group in members.values() for run in group])
-    return {name: summarize_condition(members[name], distances) for name in sorted(members)}
+    runs_of = group_by(runs, "condition")
+    distances = common_distances([run for condition_runs in runs_of.values() for run in condition_runs])
+    return {name: summarize_condition(runs_of[name], distances) for name in sorted(runs_of)}
 
 
 def summarize_condition(all_runs: Sequence[Run], distances: CommonDistances) -> dict[str, Any]:
@@ -102,18 +101,18 @@ def _route_name(route: str) -> str:
 
 def road_rates(runs: Sequence[Run]) -> list[float]:
     """Return the completion rate of each road, sorted by road. A route and its key part have the same road."""
-    members: dict[str, list[bool]] = {}
+    completions: dict[str, list[bool]] = {}  # by road
     for run in runs:
-        members.setdefault(road_of(str(run["route"])), []).append(run["ending"] == "completed")
-    return [sum(members[road]) / len(members[road]) for road in sorted(members)]
+        completions.setdefault(road_of(str(run["route"])), []).append(run["ending"] == "completed")
+    return [sum(completions[road]) / len(completions[road]) for road in sorted(completions)]
 
 
 def group_by(runs: Iterable[Run], key: str) -> dict[str, list[Run]]:
-    """Group runs by the text of one of their keys."""
-    members: dict[str, list[Run]] = {}
+    """Return the runs by the text of their value of `key`."""
+    runs_of: dict[str, list[Run]] = {}
     for run in runs:
-        members.setdefault(str(run[key]), []).append(run)
-    return members
+        runs_of.setdefault(str(run[key]), []).append(run)
+    return runs_of
 
 
 def common_distances(runs: Sequence[Run]) -> CommonDistances:
@@ -121,14 +120,15 @@ def common_distances(runs: Sequence[Run]) -> CommonDistances:
     distances: dict[tuple[Any, ...], int] = {}
     for run in runs:
         if run["valid"] and run.get("p95_by_10m") is not None:
-            distances[_start(run)] = min(distances.get(_start(run), len(run["p95_by_10m"])), len(run["p95_by_10m"]))
+            key, distance = _start_key(run), len(run["p95_by_10m"])
+            distances[key] = min(distances.get(key, distance), distance)
     return distances
 
 
 def common_p95_m(runs: Sequence[Run], distances: CommonDistances) -> list[float]:
     """Return the P95 of each run up to its common distance; runs whose common distance is 0 are left out."""
-    with_distance = [(run, distances.get(_start(run), 0)) for run in runs if run.get("p95_by_10m")]
-    return [float(run["p95_by_10m"][distance - 1]) for run, distance in with_distance if distance]
+    runs_and_distances = [(run, distances.get(_start_key(run), 0)) for run in runs if run.get("p95_by_10m")]
+    return [float(run["p95_by_10m"][distance - 1]) for run, distance in runs_and_distances if distance]
 
 
 def worst_rank_m(runs: Sequence[Run]) -> dict[str, float | None]:
@@ -146,8 +146,8 @@ def worst_rank_m(runs: Sequence[Run]) -> dict[str, float | None]:
     return {name: value if np.isfinite(value) else None for name, value in quartiles.items()}
 
 
-def _start(run: Run) -> tuple[Any, ...]:
-    """Return the values that runs with the same start on the same route share, under whatever condition."""
+def _start_key(run: Run) -> tuple[Any, ...]:
+    """Return a key that is equal for runs with the same start on the same route, under any condition."""
     return run["route"], run.get("repetition"), run.get("seed")
 
 
@@ -168,9 +168,9 @@ def _mean(values: Sequence[float]) -> float | None:
 
 
 def _per_km(runs: Sequence[Run], name: str) -> float | None:
-    """Return the number of all events divided by the sum of all distances in km.
+    """Return the number of all events `name` divided by the sum of all distances in km.
 
-    A run thus has a weight in proportion to its distance, and a run of a few metres has almost none.
+    So the weight of a run is proportional to its distance, and a run of a few metres has almost no weight.
     """
     driven = [run for run in runs if run.get("distance_m")]
     return sum(run[name] for run in driven) / (sum(run["distance_m"] for run in driven) / 1000) if driven else None
@@ -183,7 +183,7 @@ def _injected_ms(runs: Sequence[Run]) -> dict[str, Any]:
 
 
 def _latency(entries: Sequence[Mapping[str, Any]], *, bounded: bool = False) -> dict[str, Any]:
-    """Return for each percentile the median of all runs, and with `bounded` the largest bound.
+    """Return for each percentile its median over all runs, and with `bounded` the largest bound.
 
     The bound is None if one of the runs has no bound.
     """
@@ -204,9 +204,9 @@ def _picture_age_ms(runs: Sequence[Run]) -> dict[str, float | None]:
 
 
 def _stages_ms(runs: Sequence[Run]) -> list[dict[str, Any]]:
-    """Return for each stage the median of all runs' median latencies, in the order of the pipeline."""
+    """Return for each stage the median of all runs' median latencies; a frame passes the stages in this order."""
     medians_ms: dict[tuple[str, str], list[float]] = {}
-    most_stages_first = sorted(runs, key=lambda run: -len(run.get("stages_ms") or []))  # the first run gives the order
+    most_stages_first = sorted(runs, key=lambda run: -len(run.get("stages_ms") or []))  # the first run sets the order
     for run in most_stages_first:
         for entry in run.get("stages_ms") or []:
             medians_ms.setdefault((entry["node"], entry["stage"]), []).append(entry["p50"])

@@ -21,8 +21,9 @@ PAIRED_BY = ("route", "repetition", "seed", "participant", "block")
 def paired_contrasts(runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Compare completion between conditions by pairs of runs, with Holm's correction for all returned contrasts.
 
-    A contrast is returned if both its conditions were driven. Invalid runs form no pairs. Nor do two runs of one
-    condition whose `PAIRED_BY` keys are equal, because their partners are ambiguous. `p` is None without pairs.
+    A contrast is returned if both its conditions were driven. Invalid runs are not paired. If several runs of one
+    condition have equal `PAIRED_BY` keys, they are not paired either, because their partner would be ambiguous. `p` is
+    None without pairs.
     """
     driven = {str(run["condition"]) for run in runs}
     completed = {name: _completed(runs, name) for name in driven}
@@ -37,7 +38,7 @@ def paired_contrasts(runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def with_holm(contrasts: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return contrasts that were planned together with the corrected `p_holm` of each."""
+    """Return the contrasts, which were planned together, and add to each the corrected p value `p_holm`."""
     corrected = holm([contrast["p"] for contrast in contrasts])
     return [{**contrast, "p_holm": p} for contrast, p in zip(contrasts, corrected, strict=True)]
 
@@ -45,8 +46,8 @@ def with_holm(contrasts: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 def mcnemar(only_a: int, only_b: int) -> float:
     """Return McNemar's exact two-sided p value.
 
-    `only_a` and `only_b` are the numbers of pairs of which only one run was completed. Under the null hypothesis
-    both kinds of pairs are equally likely.
+    `only_a` and `only_b` are the numbers of pairs of which only the first or only the second run was completed. Under
+    the null hypothesis both kinds of pairs are equally likely.
     """
     differing = only_a + only_b
     return float(binomtest(only_a, differing, 0.5).pvalue) if differing else 1.0

@@ -17,15 +17,15 @@ RESAMPLES = 10_000
 def exact_interval(successes: int, trials: int) -> list[float] | None:
     """Return the 95 % Clopper-Pearson interval of a proportion; None without trials.
 
-    It is valid for the mean of the trials' probabilities even if these differ (Hoeffding, Annals of Mathematical
-    Statistics 27, 1956, theorem 4), so trials on different routes may be counted together.
+    If the trials have different probabilities, the interval is valid for their mean (Hoeffding, Annals of Mathematical
+    Statistics 27, 1956, theorem 4). So trials on different routes can be counted together.
     """
     if trials == 0:
         return None
     return list(_clopper_pearson(successes, trials))
 
 
-@cache  # a sweep needs few different intervals, each of them many times
+@cache  # a sweep needs the same few intervals many times
 def _clopper_pearson(successes: int, trials: int) -> tuple[float, float]:
     interval = binomtest(successes, trials).proportion_ci(confidence_level=0.95, method="exact")
     return float(interval.low), float(interval.high)

@@ -1,8 +1,8 @@
-"""The paper's results, for comparison with ours, and the intervals and tests that can be computed from its counts.
+"""The paper's results, for comparison, and the intervals and tests that can be computed from its counts.
 
-A. Khalil, J. Kwon, "Nonlinear Performance Degradation of Vision-Based Teleoperation under Network Latency", 2026.
-It has six routes and five repetitions, so 30 runs per condition. Its completion in percent is converted to a number of
-these 30 runs.
+A. Khalil, J. Kwon, "Nonlinear Performance Degradation of Vision-Based Teleoperation under Network Latency", 2026. The
+paper has six routes and five repetitions, so 30 runs per condition. It gives completion in percent, which is converted
+to a number of runs here.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ TABLE = {
     "L4": (150, 75, 211, 83, 9, 0.77, 18.80, 4.64),
     "L5": (225, 100, 287, 108, 3, 0.97, 16.83, 13.15),
 }
-"""The injected delays of video and control (ms), the measured medians (ms; tau_c is "about 8 to 10" for L0 to L3), and
-the results."""
+"""The values of `COLUMNS` by condition: the injected delays of video and control (ms), the measured medians (ms; the
+paper's tau_c is "about 8 to 10" for L0 to L3), and the results."""
 
 
 def paper() -> dict[str, Any]:
-    """Return the paper's conditions with our keys and exact intervals, and its planned contrasts.
+    """Return the paper's conditions with the keys of `summary.json` and exact intervals, and its planned contrasts.
 
-    The contrasts use Fisher's test, because the paper publishes only counts, so its runs cannot be paired.
+    The contrasts use Fisher's test: the paper publishes only counts, so its runs cannot be paired.
     """
     conditions = {name: _condition(dict(zip(COLUMNS, row, strict=True))) for name, row in TABLE.items()}
     contrasts = [

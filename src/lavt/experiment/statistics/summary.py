@@ -13,12 +13,12 @@ from lavt.experiment.statistics.paper_results import paper
 SCHEMA = 1
 
 GROUP_KEYS = ("fidelity", "inherent", "changes", "controller", "preset", "driver")
-"""The keys whose values are equal for all runs of a group. The axes of the sweep are further such keys.
+"""The keys whose values are equal for all runs of a group, besides the axes of the sweep.
 
-The runs of a group thus differ only in route, condition, repetition and seed, and in the keys of a study."""
+The runs of a group differ only in route, condition, repetition and seed, and in the keys of a study."""
 
 SWEEP = "sweep"
-"""A further key of a group if several sweeps are reported together: the name of a run's sweep."""
+"""A further key of a group if several sweeps are reported together: the name of the sweep."""
 
 
 def summarize(
@@ -30,20 +30,20 @@ def summarize(
 ) -> dict[str, Any]:
     """Return the content of `summary.json` for the runs of a sweep.
 
-    `base` has keys of a run (or of its `axes`) with their values in the sweep's base config, which is the config
-    without its axes. `conditions` summarizes the runs in virtual time that have all these values, or all runs in
-    virtual time if there is no `base`. `failed` lists the runs without a result (`run`, `reason`).
+    `base` has keys of a run (or of its `axes`) with their values in the sweep's base config, which is the sweep's
+    config without its axes. The entry `conditions` summarizes the runs in virtual time that have all these values or,
+    without `base`, all runs in virtual time. `failed` lists the runs without a result (`run`, `reason`).
     """
     virtual = [run for run in runs if run["time"] == "virtual"]
     base_settings = dict(base or {})
-    of_base = [run for run in virtual if _settings(run, base_settings) == base_settings]
+    base_runs = [run for run in virtual if _settings(run, base_settings) == base_settings]
     return {
         "schema": SCHEMA,
         "speed": dict(speed) if speed else {"simulated_s": None, "wall_s": None, "jobs": None},
         "runs": [dict(run) for run in runs],
         "failed": [dict(run) for run in failed],
-        "conditions": summarize_conditions(of_base),
-        "contrasts": paired_contrasts(of_base),
+        "conditions": summarize_conditions(base_runs),
+        "contrasts": paired_contrasts(base_runs),
         "real": summarize_conditions(run for run in runs if run["time"] == "real"),
         "groups": _summarize_groups(virtual),
         "paper": paper(),
@@ -60,10 +60,10 @@ def _summarize_groups(runs: Sequence[Run]) -> list[dict[str, Any]]:
     axes = list(dict.fromkeys(name for run in runs for name in run.get("axes") or {}))
     sweeps = [SWEEP] if any(SWEEP in run for run in runs) else []
     names = [*GROUP_KEYS, *sweeps, *(name for name in axes if name not in GROUP_KEYS)]
-    members: dict[str, list[Run]] = {}
+    groups: dict[str, list[Run]] = {}  # by the JSON of their settings
     for run in runs:
-        members.setdefault(json.dumps(_settings(run, names), sort_keys=True, default=str), []).append(run)
+        groups.setdefault(json.dumps(_settings(run, names), sort_keys=True, default=str), []).append(run)
     return [
         {**_settings(group[0], names), "conditions": summarize_conditions(group), "contrasts": paired_contrasts(group)}
-        for group in members.values()
+        for group in groups.values()
     ]

@@ -22,12 +22,12 @@ CONNECT_TIMEOUT_S = 10
 def cluster_workers(address: str, jobs: int | None) -> Iterator[Workers]:
     """Yield the workers of the Dask scheduler at `address`, or `jobs` workers on this machine for `LOCAL`.
 
-    Raises `UserError` where `jobs` is given with a scheduler, where Dask, the scheduler or its workers are missing, or
-    where a worker has other versions: digests are only reproducible with equal versions.
+    Raises `UserError` if `jobs` is given with a scheduler, if Dask, the scheduler or its workers are missing, or if a
+    worker has other versions: digests are only reproducible with equal versions.
     """
     if address != LOCAL and jobs is not None:
         raise UserError(f"--jobs is for this machine, and {address} has its own number of workers: omit --jobs")
-    dask = _dask()
+    dask = _import_dask()
     if address == LOCAL:
         jobs = jobs or os.cpu_count() or 1
         with terminal_signals_blocked():
@@ -53,15 +53,15 @@ def cluster_workers(address: str, jobs: int | None) -> Iterator[Workers]:
 
 
 def check_cluster(address: str, jobs: int | None) -> None:
-    """Raise `UserError` where `cluster_workers` would raise it, before any work begins."""
+    """Raise the `UserError` that `cluster_workers` would raise, before any work begins."""
     if address == LOCAL:
-        _dask()
+        _import_dask()
     else:
         with cluster_workers(address, jobs):
             pass
 
 
-def _dask() -> Any:
+def _import_dask() -> Any:
     try:
         return import_module("distributed")  # an optional dependency
     except ImportError as error:
@@ -69,7 +69,7 @@ def _dask() -> Any:
 
 
 def _checked_workers(client: Any, address: str) -> Workers:
-    """Return the workers of a Dask client; raise `UserError` unless each has one thread and the same versions."""
+    """Return the workers of a Dask client; raise `UserError` unless all have one thread and this machine's versions."""
     threads: Mapping[str, int] = client.nthreads()
     if not threads:
         raise UserError(f"the Dask scheduler at {address} has no worker: start some with 'dask worker --nthreads 1'")

@@ -30,7 +30,7 @@ from lavt.experiment.sweep.workers import Workers, process_workers
 from lavt.recording.output_directory import prepare_directory
 
 SWEEP = "sweep.yaml"
-"""The file in the directory of a sweep that has its complete config."""
+"""The file with the complete config of a sweep, in the sweep's directory."""
 
 ProgressCallback = Callable[[str], None]
 """A callback that shows one line of progress."""
@@ -59,9 +59,9 @@ def run_all(
 ) -> tuple[SweepResult, dict[str, Any] | None]:
     """Drive the runs that have no result yet, `jobs` at a time (None: one per core), or one by one in real time.
 
-    With `cluster_address`, the Dask workers of that scheduler drive them. Returns all results, including those of
-    earlier calls, and the entry `speed` of the summary. This entry is for the virtual runs of this call; it is None
-    without such runs.
+    With `cluster_address`, the Dask workers of that scheduler drive the runs. Returns all results, including those of
+    earlier calls, and the entry `speed` of the summary. This entry is about the runs in virtual time of this call; it
+    is None without such runs.
     """
     clock = MachineClock()
     start_ns = clock.now().mono_ns
@@ -89,7 +89,7 @@ def run_all(
 
 
 def is_finished(directory: Path) -> bool:
-    """Return whether the run in `directory` was driven to any ending."""
+    """Return whether the run in `directory` has a result, with any ending."""
     return (directory / RESULT).is_file()
 
 
@@ -103,27 +103,27 @@ class _SweepProgress:
         self._on_progress = on_progress
 
     def drive(self, workers: Workers, todo: Sequence[PlannedRun]) -> list[PlannedRun]:
-        """Drive runs, and return those that were not driven because a worker's process died."""
+        """Drive the runs `todo`; return the ones that have no result because a worker's process died."""
         futures = {workers.submit(run, self.runs_dir / run.name): run for run in todo}
         broken = []
-        # The import of matplotlib and SciPy takes long, so it runs during the drives. It is not in the main thread: the
-        # definition of a dataclass executes a string, and where Ctrl-C interrupts this, `python -m` dies even if the
-        # interrupt is handled.
+        # The import of matplotlib and SciPy takes long, so it is done during the drives. It is not done in the main
+        # thread, because it executes strings (of dataclasses): if Ctrl-C interrupts such an execution, `python -m` dies
+        # even if the program handles the interrupt.
         threading.Thread(target=import_module, args=("lavt.experiment.report.report",)).start()
         try:
             for future in as_completed(list(futures)):
-                planned = futures.pop(future)  # frees the result, which has the files of a remote run
+                planned = futures.pop(future)  # so that the result, which has the files of a remote run, is freed
                 try:
                     drive = workers.collect(future.result(), self.runs_dir / planned.name)
                 except BrokenExecutor:
                     broken.append(planned)
-                except Exception as error:  # the other runs continue, whatever this one raised
+                except Exception as error:  # an error of one run does not end the others
                     self.fail(planned, describe_error(error))
                 else:
                     self.take(planned, drive)
         except KeyboardInterrupt:
             workers.stop()
-            _remove_unfinished(todo, self.runs_dir)  # the files of remote runs may be incomplete
+            _remove_unfinished(todo, self.runs_dir)  # the files of remote runs can be incomplete
             raise
         return broken
 
@@ -141,7 +141,8 @@ class _SweepProgress:
 def _drive_in_processes(progress: _SweepProgress, todo: Sequence[PlannedRun], jobs: int) -> None:
     """Drive the runs in a pool of processes.
 
-    A process that dies breaks the pool. The runs that had begun are then driven again, each in a pool of its own.
+    A process that dies breaks the pool. The runs that were in progress are then driven again, each in a pool of its
+    own.
     """
     while todo:
         with process_workers(jobs) as workers:
@@ -155,18 +156,18 @@ def _drive_in_processes(progress: _SweepProgress, todo: Sequence[PlannedRun], jo
                 continue
             with process_workers(1) as single:
                 if progress.drive(single, [run]):
-                    progress.fail(run, "the process that drove it died, twice")
+                    progress.fail(run, "the process that drove the run died, twice")
         todo = [run for run in broken if run not in begun]
         if todo and not begun:
             for run in todo:
-                progress.fail(run, "its process died before it began")
+                progress.fail(run, "its process died before the run began")
             return
 
 
 def open_sweep(out: Path, *, resume: bool) -> None:
     """Create the directory of a new sweep, or check that the directory of a sweep to resume exists.
 
-    Raises `UserError` where it does not exist, or where it cannot be created.
+    Raises `UserError` if there is no sweep to resume, or if the directory of a new sweep cannot be created.
     """
     if resume and not out.is_dir():
         raise UserError(f"there is nothing to resume in {out}: omit --resume to begin")
@@ -185,8 +186,8 @@ def drive_sweep(
 ) -> tuple[Path, SweepResult]:
     """Drive the missing runs of a sweep into `out`, and write its config, summary and report.
 
-    `planned` are the runs of `config`; `cluster_address` is that of `run_all`. Returns the path of the report's page,
-    and the results. Failed runs are in `out`/failed.json, in the summary and in the report.
+    `planned` are the runs of `config`; `cluster_address` is passed to `run_all`. Returns the path of the report's page,
+    and the results. Failed runs are listed in `out`/failed.json, in the summary and in the report.
     """
     _check_sweep(config, out)
     runs_dir = out / "runs"
@@ -220,7 +221,7 @@ def base_of(config: SweepConfig, planned: Sequence[PlannedRun]) -> dict[str, Any
     base = {key: _value_at(config, key) for key in config.axes}
     for run, key in itertools.product(planned, config.axes):
         if _value_at(run.config, key) == _value_at(config, key):
-            base[key] = run.identity["axes"][key]  # as the axis writes the value: 20 or 20.0, a section or a part of it
+            base[key] = run.identity["axes"][key]  # in the form of the axis: 20 or 20.0, a whole section or a part
     return base
 
 
@@ -237,25 +238,25 @@ def _value_at(config: RunConfig, key: str) -> Any:
 
 
 def _check_sweep(config: SweepConfig, out: Path) -> None:
-    """Raise `UserError` where another sweep was begun in `out`, because a report would mix the runs of both."""
+    """Raise `UserError` if another sweep was begun in `out`, because a report would mix the runs of both sweeps."""
     if not (out / SWEEP).is_file():
         return
     recorded, requested = (sweep.model_dump(mode="json") for sweep in (load_config(SweepConfig, out / SWEEP), config))
     different = [key for key in requested if requested[key] != recorded[key]]
     if different:
         raise UserError(
-            f"{out} was begun with another config ({', '.join(different)}): resume with that one, or name another --out"
+            f"{out} was begun with another config ({', '.join(different)}): use that config, or name another --out"
         )
 
 
 def _check_config(planned: PlannedRun, directory: Path) -> None:
-    """Raise `UserError` where a finished run was driven with another config than the sweep's."""
+    """Raise `UserError` if a finished run was driven with a config that is not the sweep's."""
     if (directory / CONFIG).read_text() != config_text(planned):
-        raise UserError(f"{directory} was driven with another config: resume with that one, or name another --out")
+        raise UserError(f"{directory} was driven with another config: use that config, or name another --out")
 
 
 def _remove_unfinished(planned: Sequence[PlannedRun], runs_dir: Path) -> None:
-    """Remove the directories of killed runs, which have no result, so that these runs are driven again."""
+    """Remove the directories of runs without a result, so that these runs are driven again."""
     for run in planned:
         directory = runs_dir / run.name
         if directory.is_dir() and not is_finished(directory):

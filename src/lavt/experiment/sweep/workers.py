@@ -1,8 +1,8 @@
 """The workers that drive the runs of a sweep: processes of this machine, or Dask workers on one or several machines.
 
-Both are `concurrent.futures` executors (`cluster.py` creates Dask's). Local processes write the files of a run directly
-into its directory. Remote workers need no access to this machine's files: they write into a temporary directory and
-send its files back.
+Both kinds are `concurrent.futures` executors; `cluster.py` creates Dask's. Local processes write the files of a run
+directly into the run's directory. Remote workers need no access to this machine's files: they write into a temporary
+directory and send the files back.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ class Workers:
     remote: bool
 
     def submit(self, planned: PlannedRun, directory: Path) -> Future[Any]:
-        """Start a run; the result of its future is the argument of `collect`."""
+        """Start a run, and return a future whose result is an argument of `collect`."""
         if self.remote:
             return self.executor.submit(drive_remotely, planned)
         return self.executor.submit(drive_once, planned, directory)
 
     def collect(self, result: Any, directory: Path) -> DriveData:
-        """Return the data of a finished run, after writing its files into `directory` if it was remote."""
+        """Return the data of a finished run; if the run was remote, first write its files into `directory`."""
         drive: DriveData = result
         if self.remote:
             drive, files = result
@@ -53,14 +53,14 @@ class Workers:
     def stop(self) -> None:
         """Start no more runs, and wait for the local runs in progress; remote runs in progress are lost."""
         if self.remote:
-            self.executor.shutdown(wait=False)  # Dask's executor then cancels all, and has no cancel_futures
+            self.executor.shutdown(wait=False)  # Dask's executor always cancels all runs; it has no `cancel_futures`
         else:
             self.executor.shutdown(wait=True, cancel_futures=True)
 
 
 @contextmanager
 def process_workers(jobs: int) -> Iterator[Workers]:
-    """Yield processes of this machine, which end with this process, however it ends."""
+    """Yield worker processes on this machine, which end when this process ends or is killed."""
     context = multiprocessing.get_context("spawn")  # a fork would copy locks that are never released
     with terminal_signals_blocked():
         executor = ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin_process)
@@ -73,19 +73,19 @@ def process_workers(jobs: int) -> Iterator[Workers]:
 
 @contextmanager
 def terminal_signals_blocked() -> Iterator[None]:
-    """Block the terminal's signals.
+    """Block the terminal's signals inside the `with` block.
 
-    Processes that are started meanwhile inherit the blocked signals, until they call `ignore_terminal_signals`.
+    In processes that are started in the block, these signals are blocked until they call `ignore_terminal_signals`.
     """
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, TERMINAL_SIGNALS)
+    previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, TERMINAL_SIGNALS)
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, previous_mask)
 
 
 def ignore_terminal_signals() -> None:
-    """Ignore the terminal's signals, which all its processes receive, but only the parent process handles."""
+    """Ignore the terminal's signals: all processes of the terminal receive them, but only the parent handles them."""
     for number in TERMINAL_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, TERMINAL_SIGNALS)
@@ -97,7 +97,7 @@ def _begin_process() -> None:
 
 
 def _end_with_parent() -> None:
-    """Exit when the parent process has ended, so that no process of an old sweep writes into a resumed one."""
+    """Exit when the parent process has ended, so that no process of an old sweep writes into a resumed sweep."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         try:
@@ -115,7 +115,7 @@ def drive_remotely(planned: PlannedRun) -> tuple[DriveData, dict[str, bytes]]:
 
 
 def write_files(files: Mapping[str, bytes], directory: Path) -> None:
-    """Write the files of a run, and the result last, because its existence marks the run as finished."""
+    """Write the files of a run; the result is the last file, because its existence marks the run as finished."""
     prepare_directory(directory)
     for name in sorted(files, key=lambda name: name == RESULT):
         unfinished = directory / f"{name}.part"
