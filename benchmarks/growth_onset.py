@@ -2,8 +2,8 @@
 
     python benchmarks/growth_onset.py [--lookaheads 0.74,1.01,1.3] [--rates 15,30] [--speeds 6,10] [--seeds 1]
 
-The drives use geometry fidelity, the latency of the loopback, and a constant delay of the video. While the oscillation
-is measured, neither steering nor speed reaches a limit. `docs/boundary.md` has the output.
+The drives use geometry fidelity, the inherent latency `loopback`, and a constant delay of the video. As long as the
+oscillation is measured, neither steering nor speed reaches a limit. `docs/boundary.md` has the output.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from lavt.experiment.boundary.boundary import theoretical_ms, with_video_delay
 from lavt.experiment.boundary.oscillation_growth import straight_growth
 
 MAX_DELAY_MS = 1000.0
+"""The longest added delay of the video."""
 PRECISION_MS = 0.5
 
 
@@ -37,17 +38,17 @@ def case(lookahead_s: float, rate_hz: float, speed_mps: float, seed: int) -> Run
 
 def onset_ms(config: RunConfig, theory_ms: float) -> float:
     """Return the total delay at which the oscillation neither grows nor decays."""
-    without_added_ms = []  # the total delay minus the added delay of the video, of each drive
+    other_delays_ms = []  # of each drive: the total delay minus the added delay of the video
 
-    def growth(delay_ms: float) -> float:
-        total_ms, growth_per_s = straight_growth(with_video_delay(config, delay_ms))
-        without_added_ms.append(total_ms - delay_ms)
+    def growth(added_ms: float) -> float:
+        total_ms, growth_per_s = straight_growth(with_video_delay(config, added_ms))
+        other_delays_ms.append(total_ms - added_ms)
         return growth_per_s
 
     bracket = zero_bracket(growth, theory_ms, MAX_DELAY_MS, PRECISION_MS)
     if bracket.low_ms is None or bracket.high_ms is None:
-        raise SystemExit(f"no onset between 0 and {MAX_DELAY_MS} ms")
-    return (bracket.low_ms + bracket.high_ms) / 2 + median(without_added_ms)
+        raise SystemExit(f"no onset with an added delay between 0 and {MAX_DELAY_MS} ms")
+    return (bracket.low_ms + bracket.high_ms) / 2 + median(other_delays_ms)
 
 
 def main() -> None:

@@ -6,7 +6,7 @@ from collections import defaultdict
 
 import numpy as np
 import pytest
-from benchmarks.degraded import MODEL, NO_LANE, blocks, cases
+from benchmarks.degraded import AT_10_M, MODEL, NO_LANE, blocks, cases
 from benchmarks.perception_sheet import UNDECIDED, LaneVerdict, check_case, kinds_table, reliability_table
 
 from lavt.control.lane_watch import LANE_CONFIDENCE
@@ -51,13 +51,13 @@ def test_a_wrong_lane_has_low_confidence(verdicts: VerdictsByKind) -> None:
     """At most 2 % of searched pictures have a wrong lane with enough confidence for driving."""
     searched = [pair[0] for kind, pairs in verdicts.items() if kind != UNDECIDED for pair in pairs]
     assert sum(verdict.wrong for verdict in searched) > 0.15 * len(searched)
-    assert sum(verdict.wrong and verdict.believed for verdict in searched) <= 0.02 * len(searched)
+    assert sum(verdict.wrong and verdict.accepted for verdict in searched) <= 0.02 * len(searched)
 
 
 def test_a_followed_lane_is_not_led_astray(verdicts: VerdictsByKind) -> None:
     """At most 2 % of followed pictures have a wrong lane with enough confidence for driving."""
     followed = [pair[1] for kind, pairs in verdicts.items() if kind != "kerb only" for pair in pairs]
-    assert sum(verdict.wrong and verdict.believed for verdict in followed) <= 0.02 * len(followed)
+    assert sum(verdict.wrong and verdict.accepted for verdict in followed) <= 0.02 * len(followed)
 
 
 @pytest.mark.parametrize("kind", CLEAR_LANE_KINDS)
@@ -65,7 +65,7 @@ def test_a_clear_lane_has_high_confidence(verdicts: VerdictsByKind, kind: str) -
     """With both lines in the picture the confidence is high and the centre is right within 0.2 m at 10 m."""
     for verdict in (verdict for pair in verdicts[kind] for verdict in pair):
         assert verdict.confidence > 0.25
-        assert verdict.error_m[1] < 0.2
+        assert verdict.error_m[AT_10_M] < 0.2
     assert np.median([pair[1].confidence for pair in verdicts[kind]]) > 0.6
 
 
@@ -74,7 +74,7 @@ def test_one_missing_line_halves_the_confidence(verdicts: VerdictsByKind, kind: 
     """With one line missing, a followed lane is right and its confidence is about a half."""
     for _, verdict in verdicts[kind]:
         assert 0.3 < verdict.confidence < 0.6
-        assert verdict.error_m[1] < 0.2
+        assert verdict.error_m[AT_10_M] < 0.2
 
 
 def test_a_search_does_not_start_at_a_single_line(verdicts: VerdictsByKind) -> None:
@@ -95,7 +95,7 @@ def test_other_paint_in_the_lane_lowers_confidence(verdicts: VerdictsByKind, kin
 @pytest.mark.parametrize("kind", sorted(NO_LANE - {"coarse blocks"}))
 def test_pictures_without_a_lane_have_low_confidence(verdicts: VerdictsByKind, kind: str) -> None:
     """No lane is found in noise, darkness, blank or inverted pictures, at a kerb, a crossing line or a crosswalk."""
-    assert all(not searched.believed for searched, _ in verdicts[kind])
+    assert all(not searched.accepted for searched, _ in verdicts[kind])
 
 
 @pytest.mark.parametrize("side_px", [2, 4, 8, 16])
