@@ -27,7 +27,7 @@ from lavt.vehicle.sim.road.road import Road, load_road
 MODEL = CameraModel()
 AHEAD_M = np.array([5.0, 10.0, 15.0])
 """Distances ahead of the rear axle at which the lane's centre is compared."""
-AT_10_M = 1
+AT_10_M = AHEAD_M.tolist().index(10.0)
 """Index of 10 m in `AHEAD_M`."""
 
 RIGHT_LINE_M = -1.75

@@ -26,7 +26,7 @@ hypothesis.settings.load_profile("lavt")
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """Return the number of processors for tests that may run in parallel; 0 runs them in this process."""
+    """Return the number of processors for tests that can run in parallel, or 0: the tests run in this process."""
     directories = [Path(argument.partition("::")[0]).resolve() for argument in config.args]
     if not runs_in_parallel(config.option.markexpr, directories):
         return 0

@@ -17,7 +17,7 @@ TESTS = Path(__file__).resolve().parent
 REPOSITORY = TESTS.parent
 
 SEQUENTIAL_FOLDERS = ("field", "interop", "kernel", "realtime")
-"""Tests in these folders run sequentially and alone, because they judge times or need a network of their own."""
+"""Tests in these folders run sequentially and alone, because they judge times or need a separate network."""
 QUICK = "not full and not realtime"
 """The marker expression of `python -m pytest`."""
 PARALLEL = (QUICK, "full")
@@ -60,7 +60,7 @@ LANES = (
 
 
 def runs_in_parallel(marker_expression: str, arguments: Iterable[Path]) -> bool:
-    """Return whether pytest may run tests in parallel for this marker expression and these paths.
+    """Return whether pytest runs tests in parallel for this marker expression and these paths.
 
     Single files and `SEQUENTIAL_FOLDERS` run sequentially.
     """
@@ -77,7 +77,7 @@ def write(text: str) -> None:
 
 
 def select_lanes(names: Sequence[str]) -> list[LaneSpec]:
-    """Return the named lanes, to run sequentially in this order, or all lanes without names."""
+    """Return the named lanes, to run sequentially in this order, or all lanes if no lane is named."""
     lanes = {lane.name: replace(lane, meanwhile=None) for lane in (*LANES, FULL)}
     return [lanes[name] for name in names] if names else list(LANES)
 

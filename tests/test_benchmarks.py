@@ -11,7 +11,7 @@ from benchmarks.virtual_loop import with_rest
 from lavt.errors import WorkError
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
-BENCHMARK = BENCHMARKS / "virtual_loop.py"
+VIRTUAL_LOOP = BENCHMARKS / "virtual_loop.py"
 
 
 def test_rest_completes_the_stages() -> None:
@@ -27,7 +27,7 @@ def test_rest_completes_the_stages() -> None:
 def test_virtual_loop_benchmark_runs() -> None:
     """`benchmarks/virtual_loop.py` prints the speed relative to real time, the stages and, last, JSON."""
     completed = subprocess.run(
-        [sys.executable, BENCHMARK, "--settings", "geometry", "--repetitions", "1", "--limit-s", "2"],
+        [sys.executable, VIRTUAL_LOOP, "--settings", "geometry", "--repetitions", "1", "--limit-s", "2"],
         capture_output=True,
         text=True,
         check=True,

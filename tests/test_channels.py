@@ -104,6 +104,6 @@ def test_ground_truth_stays_on_the_server() -> None:
 
 
 def test_commands_wait_in_a_bounded_queue() -> None:
-    """Commands wait in a queue of bounded length, because the gate judges each one."""
+    """Commands wait in a queue of bounded length, because the gate judges each command."""
     assert CHANNELS["control"].waiting == "queue"
     assert 0 < QUEUE_LENGTH < 100_000

@@ -21,7 +21,7 @@ class FakeTime:
 
 def test_an_interrupted_reading_is_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
     """A reading of both clocks that was interrupted for 5 ms is repeated."""
-    # Read in turn: monotonic, wall and monotonic clock; then, in the repetition, wall and monotonic clock.
+    # The order of the readings: monotonic, wall, monotonic; then, in the repetition, wall, monotonic.
     mono_ns, wall_ns = iter([0, 5 * NS_PER_MS, 5 * NS_PER_MS + 50]), iter([1000, 1000 + 5 * NS_PER_MS])
     monkeypatch.setattr(clock, "time", FakeTime(mono_ns, wall_ns))
 
@@ -29,7 +29,7 @@ def test_an_interrupted_reading_is_repeated(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_the_last_attempt_is_returned(monkeypatch: pytest.MonkeyPatch) -> None:
-    """If every attempt is interrupted, the last one is returned."""
+    """If every attempt is interrupted, the result of the last attempt is returned."""
     mono_ns, wall_ns = (iter(range(0, 100 * NS_PER_MS, NS_PER_MS)) for _ in range(2))
     monkeypatch.setattr(clock, "time", FakeTime(mono_ns, wall_ns))
 

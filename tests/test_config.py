@@ -75,7 +75,7 @@ def test_shipped_files_have_absolute_paths(name: str) -> None:
 
 
 def test_the_demo_config() -> None:
-    """The demo drives route A key with the gains fitted to the paper and the safety limits that these need."""
+    """The demo drives route A key with the gains fitted to the paper and the safety limits that these gains need."""
     demo = load_config(RunConfig, shipped("configs/demo.yaml"))
     assert (demo.vehicle.route, demo.controller.preset, demo.network.condition) == ("a_key", "paper_calibrated", "L0")
     assert (demo.safety.lateral_acceleration_mps2, demo.safety.picture_age_limit_ms) == (6.0, 2000.0)
@@ -92,7 +92,7 @@ def test_the_paper_config() -> None:
 
 @pytest.mark.parametrize(("name", "count"), [("loss_and_jitter.yaml", 36), ("speed.yaml", 54)])
 def test_sweeps_over_further_axes(name: str, count: int) -> None:
-    """The sweeps over loss and jitter and over speed can be planned, and their axes contain the base values."""
+    """The sweeps over loss and jitter, and over speed, can be planned; each axis contains the base config's value."""
     sweep = load_config(SweepConfig, shipped("configs") / name)
     runs = plan_sweep(sweep)
     assert len(runs) == count
@@ -125,13 +125,13 @@ def test_conditions_have_the_papers_delays() -> None:
 
 
 def test_unknown_condition() -> None:
-    """An unknown condition is rejected, and the error lists the known ones."""
+    """An unknown condition is rejected, and the error lists the known conditions."""
     with pytest.raises(UserError, match=r"'L6'.*L0, L1, L2, L3, L4, L5"):
         condition("L6")
 
 
 def rejection(text: str, tmp_path: Path, kind: type[Section] = RunConfig, changes: tuple[str, ...] = ()) -> str:
-    """Check that a config with this text is rejected; return the sentence."""
+    """Check that a config with this text is rejected in one sentence; return this sentence."""
     path = tmp_path / "my.yaml"
     path.write_text(text)
     with pytest.raises(UserError) as error:
@@ -182,7 +182,7 @@ def test_a_client_must_know_the_port_of_the_probe(tmp_path: Path) -> None:
 
 
 def test_unknown_key_without_a_near_one(tmp_path: Path) -> None:
-    """An unknown key that is similar to no other is rejected with the list of known keys."""
+    """An unknown key that is similar to no known key is rejected with the list of known keys."""
     sentence = rejection("clocks: {xyzzy: 1}", tmp_path)
     assert "'clocks.xyzzy'" in sentence
     assert "bound_us, drift_ppm, error_us, offset_ms" in sentence
@@ -208,7 +208,7 @@ def test_unknown_key_without_a_near_one(tmp_path: Path) -> None:
     ],
 )
 def test_invalid_changes_are_rejected(change: str, reason: str, tmp_path: Path) -> None:
-    """A change by --set is validated like the file, and a malformed change is named."""
+    """A change by --set is validated like the file; the error names the key or the right form of a change."""
     assert reason in rejection("seed: 1", tmp_path, changes=(change,))
 
 
@@ -222,8 +222,8 @@ def test_changes_reach_nested_keys(tmp_path: Path) -> None:
     assert (config.camera.width_px, config.camera.rate_hz) == (320, 20.0)
 
 
-def test_changes_may_be_lists_and_mappings(tmp_path: Path) -> None:
-    """A change may have a list or mapping in YAML, and a value with an equals sign."""
+def test_changes_can_be_lists_and_mappings(tmp_path: Path) -> None:
+    """The value of a change can be a list or a mapping in YAML, and can contain an equals sign."""
     path = tmp_path / "my.yaml"
     path.write_text("")
     changes = ["conditions=[L0, L3]", "axes={video.bit_rate_bps: [1000000, 2000000]}", "study.participant=a=b"]
@@ -365,7 +365,7 @@ def test_configs_are_immutable() -> None:
     ],
 )
 def test_wide_limits_are_for_simulators(safety: SafetyConfig) -> None:
-    """Limits beyond the defaults are valid for a simulated vehicle only; the error for a real one names the keys."""
+    """Limits beyond the defaults are rejected for a real vehicle, with an error that names the keys."""
     with pytest.raises(UserError) as rejected:
         limits_of(safety, simulated=False)
     assert all(f"safety.{key}" in str(rejected.value) for key in SafetyConfig.model_fields)
@@ -397,7 +397,7 @@ def test_nothing_is_delayed_by_default() -> None:
 
 
 def test_every_impairment_can_be_changed_by_a_run() -> None:
-    """A run can replace every impairment of its condition within the same bounds, so that a sweep can vary it."""
+    """A run, and so a sweep, can replace every impairment of its condition within the same bounds."""
     changes = FlowChanges.model_json_schema()["properties"]
     for name, schema in ImpairmentConfig.model_json_schema()["properties"].items():
         bounds = {key: value for key, value in schema.items() if key not in ("title", "default", "description")}

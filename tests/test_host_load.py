@@ -12,7 +12,7 @@ MODULE = [sys.executable, "-m", "tests.support.host_load"]
 
 
 def test_stop_times_follow_from_the_seed() -> None:
-    """The same seed gives the same stop times and another seed others, with the requested mean rate."""
+    """The same seed gives the same stop times, another seed gives other times, and the mean rate is as requested."""
     settings = {"every_s": 20.0, "stop_ms": 300.0, "last_stop_s": 20_000.0}
     stops = stop_times(1, **settings)
     assert stops == stop_times(1, **settings) != stop_times(2, **settings)
@@ -30,7 +30,7 @@ def test_invalid_arguments_are_rejected(arguments: list[str]) -> None:
 
 @pytest.mark.realtime
 def test_load_stops_all_processors_together() -> None:
-    """The command runs while all processors stop together and the load takes a share; its exit code is returned."""
+    """While the command runs, all processors stop together and the load takes its share; the exit code is returned."""
     measured = Stalls.measured()
     try:
         if not all(probe.has_realtime_priority for probe in measured.probes):

@@ -45,7 +45,7 @@ def test_files_can_be_given_by_name(extra: list[str], expected: list[str]) -> No
 
 
 def test_missing_apt_get_is_reported(tmp_path: Path) -> None:
-    """Without apt-get the message names a system that has it."""
+    """Without apt-get the message names systems that have apt-get."""
     assert "use Debian or Ubuntu" in run_rejected(PATH=str(tmp_path), LAVT_KERNEL=str(tmp_path / "kernel"))
 
 
@@ -73,7 +73,7 @@ def test_unwritable_cache_is_reported(tmp_path: Path) -> None:
 def test_writable_directories_of_the_machines(
     has_progress: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The machines may write to `--out` and to the directory of LAVT_PROGRESS, and nowhere else."""
+    """The machines can write to `--out` and to the directory of LAVT_PROGRESS, and nowhere else."""
     progress = tmp_path / "lane" / "progress"
     monkeypatch.delenv("LAVT_PROGRESS", raising=False)
     if has_progress:

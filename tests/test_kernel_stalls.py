@@ -1,4 +1,4 @@
-"""The host's record of stalls inside a machine of the kernel lane, and what it excuses, tested without a machine."""
+"""Test how a machine of the kernel lane reads the host's stalls, and what they excuse; the tests need no machine."""
 
 from __future__ import annotations
 
@@ -36,8 +36,9 @@ def counter(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def answer_with(*stalls: tuple[int, int, int], more: bool = False) -> dict[str, Any]:
     """Return an answer that the host made 1.5 s before `READING`, when its clock read 7 s."""
+    counter, _ = READING
     return {
-        "counter": READING[0] - 3_000_000_000,
+        "counter": counter - 3_000_000_000,
         "mono_ns": 7 * NS_PER_S,
         "stalls": stalls,
         "more": more,
@@ -65,7 +66,7 @@ def serial_line(*answers: dict[str, Any]) -> Iterator[str]:
 
 
 def test_host_times_are_converted() -> None:
-    """A stall that ended 0.5 s before the host's answer, 1.5 s before the machine's reading, ended 2 s before it."""
+    """A stall that ended 0.5 s before the host's answer ended 2 s before a reading 1.5 s after that answer."""
     with serial_line(answer_with(), answer_with((1, 6_400_000_000, 6_500_000_000))) as device:
         probe = HostProbe(device)
         assert probe.report() == (48_500_000_000, [Stall(1, 47_900_000_000, 48_000_000_000)])
@@ -73,12 +74,14 @@ def test_host_times_are_converted() -> None:
 
 
 def test_long_record_needs_several_answers() -> None:
-    """If the host has more stalls than fit into an answer, a report queries until it has all of them."""
+    """If the host has more stalls than fit into an answer, a report repeats the query until it has all stalls."""
     pieces = [answer_with((0, number, number + 1), more=number < 2) for number in range(3)]
     with serial_line(answer_with(), *pieces, answer_with()) as device:
         probe = HostProbe(device)
-        assert len(probe.report()[1]) == 3
-        assert probe.report()[1] == []
+        _, stalls = probe.report()
+        assert len(stalls) == 3
+        _, stalls = probe.report()
+        assert stalls == []
         probe.end()
 
 
@@ -92,7 +95,7 @@ def test_ended_host_probe_is_reported() -> None:
 
 
 def test_processor_times_are_those_of_the_host() -> None:
-    """The processor times are the host's, and the last ones remain available after the record has ended."""
+    """The processor times are the host's, and the last known times remain available after a probe has ended."""
     with serial_line(answer_with(), {"ended": "processor 1"}) as device:
         probe = HostProbe(device)
         with pytest.raises(ProbeEnded):
@@ -102,7 +105,7 @@ def test_processor_times_are_those_of_the_host() -> None:
 
 
 def test_answers_have_a_limited_length() -> None:
-    """An answer has at most 40 stalls and announces more; the next answer has the others, and none twice."""
+    """An answer has at most 40 stalls and announces further stalls; the next answer has only these."""
     recorded = [Stall(0, number, number + 1) for number in range(STALLS_PER_ANSWER + 1)]
     stalls = Stalls([FakeProbe([(0, []), (0, recorded)])], lambda: QUIET)
     first, second = (host_stalls._query(stalls) for _ in range(2))
@@ -121,18 +124,18 @@ def test_answers_have_a_limited_length() -> None:
     ],
 )
 def test_least_stall_for_each_safe_stop(reason: str, least_ms: float) -> None:
-    """A stall of 100 ms explains a stop without commands; without reports, 60 ms less than their timeout is enough."""
+    """To explain a stop, a stall needs 100 ms without commands, or 60 ms less than the timeout of missing reports."""
     assert least_stop_ms(reason) == least_ms
 
 
 def test_full_processor_use_excuses_nothing() -> None:
     """The time that ordinary programs get on a fully used processor excuses neither a stop nor a median."""
     assert STOP_STALL_MS > FAIR_SERVER_MS
-    with_stalls = stalls_of(
+    short_stalls = stalls_of(
         *(Stall(0, at_s * NS_PER_S, at_s * NS_PER_S + FAIR_SERVER_MS * NS_PER_MS) for at_s in range(10))
     )
-    assert isinstance(excuse_slow_machine(AssertionError(), with_stalls, 0, 10 * NS_PER_S), AssertionError)
-    assert stalled_share(with_stalls.recorded, 0, 10 * NS_PER_S) < MEDIAN_SHARE
+    assert isinstance(excuse_slow_machine(AssertionError(), short_stalls, 0, 10 * NS_PER_S), AssertionError)
+    assert stalled_share(short_stalls.recorded, 0, 10 * NS_PER_S) < MEDIAN_SHARE
 
 
 def test_many_short_stalls_excuse_a_drive() -> None:

@@ -29,6 +29,7 @@ from lavt.domain import NS_PER_S
 
 OPTIONS = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["pytest"]["ini_options"]
 PYTEST_LANES = {lane.name: lane.commands[0][3:] for lane in (*LANES, FULL) if "pytest" in lane.commands[0]}
+"""The arguments of pytest in each lane that is a single pytest command."""
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +63,7 @@ def collect_tests(root: Path, arguments: tuple[str, ...]) -> list[str]:
 
 
 def test_every_test_belongs_to_one_lane(collected: dict[str, set[str]]) -> None:
-    """The pytest lanes together run every test exactly once, except the kernel tests, which their own lane runs."""
+    """The pytest lanes together run every test exactly once, except the kernel tests, which the kernel lane runs."""
     tests = [f"tests/{folder}/test_{folder}.py::test_plain" for folder in ("cli", *SEQUENTIAL_FOLDERS)]
     tests += [f"tests/cli/test_cli.py::test_{marker}" for marker in ("full", "realtime")]
     tests += [f"tests/test_root.py::test_{marker}" for marker in ("plain", "full", "realtime")]
@@ -71,7 +72,7 @@ def test_every_test_belongs_to_one_lane(collected: dict[str, set[str]]) -> None:
 
 
 def test_folder_and_marker_select_the_lane(collected: dict[str, set[str]]) -> None:
-    """Lane folders have their own tests, `full` has the marked ones, and the rest are quick tests."""
+    """A test is in the lane of its folder, else in the lane of its marker, else in quick."""
     assert collected["quick"] == {"tests/test_root.py::test_plain", "tests/cli/test_cli.py::test_plain"}
     assert collected["full"] == {"tests/test_root.py::test_full", "tests/cli/test_cli.py::test_full"}
     assert collected["realtime"] == {
@@ -119,7 +120,7 @@ def test_every_lane_is_documented() -> None:
 
 
 def test_lanes_can_be_selected_by_name() -> None:
-    """Without names all lanes run, with `full` in parallel to another; named lanes run in the given order."""
+    """Without names all lanes run, `full` at the same time as `kernel`; named lanes run in the given order."""
     assert select_lanes([]) == list(LANES)
     assert [lane.name for lane in LANES if lane.meanwhile is FULL] == ["kernel"]
     assert [(lane.name, lane.meanwhile) for lane in select_lanes(["full", "kernel"])] == [
@@ -164,7 +165,7 @@ def test_runner_adds_up_the_results_of_the_lanes() -> None:
 
 @pytest.mark.parametrize("meanwhile", [False, True])
 def test_failing_lane_fails_the_run(meanwhile: bool) -> None:
-    """A lane's exit code decides whether it fails; the other lanes still run, and the table shows it."""
+    """A lane with an exit code other than 0 fails the run; all other lanes still run, and the output has the code."""
     bad = LaneSpec("bad", (shell("echo '== 1 passed in 0.10s =='; exit 3"),), 1)
     good = LaneSpec("good", (shell("echo '== 1 passed in 0.10s =='"),), 1, meanwhile=bad if meanwhile else None)
     code, output = run(*([good] if meanwhile else [bad, good]))
@@ -197,7 +198,7 @@ def test_lane_is_interrupted_at_its_time_limit(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_running_test_is_in_the_progress_file(tmp_path: Path) -> None:
-    """LAVT_PROGRESS has the name of the running test, and is empty after the last one."""
+    """LAVT_PROGRESS has the name of the running test, and is empty after the last test."""
     progress_file = tmp_path / "progress"
     (tmp_path / "test_own.py").write_text(
         f"from pathlib import Path\n\ndef test_own(): assert 'test_own' in Path({str(progress_file)!r}).read_text()\n"

@@ -46,11 +46,14 @@ START_NS = 100 * NS_PER_S
 VIDEO_DELAY_MS, CONTROL_DELAY_MS = 75.0, 20.0
 CHALLENGE = bytes(range(16))
 ARMING_FRAMES = 51
-"""Frames with an arming command each, 20 ms apart: slightly more than a second. The frame of the test is the next."""
+"""The frames before the test's frame. Each has an arming command; at 20 ms each, they take just more than a second."""
 
 
 class Gateways:
-    """The gateways of both sides with their keys; what they send waits in `sent`, what they let pass is in `passed`."""
+    """The gateways of both sides with their keys.
+
+    Messages that the gateways sent wait in `sent`; messages that the gateways accepted are in `passed`.
+    """
 
     def __init__(self, gate: SafetyGate) -> None:
         vehicle, operator = (PrivateKey(Ed25519PrivateKey.generate()) for _ in range(2))
@@ -70,7 +73,7 @@ class Gateways:
         self.client._send_in_thread = lambda send: self._carry(send)  # type: ignore[method-assign]
 
     def exchange(self) -> bytes:
-        """Carry what was sent, and what is sent in response; return the last message that passed."""
+        """Deliver the waiting messages and the responses to them; return the last message that passed."""
         while self.sent:
             send = self.sent.pop(0)
             gateway = self.client if send.channel.endswith("_reply") else self.server
@@ -85,7 +88,7 @@ class Gateways:
 
 
 def armed_gate(car: Simulator) -> tuple[SafetyGate, Gateways, SessionReply]:
-    """Acquire control of the car through both gateways, and arm it, which takes a second."""
+    """Acquire control of the car through both gateways, and arm the car, which takes a second."""
     capabilities = car.capabilities
     limiter = Limiter(
         LIMITS,
@@ -129,7 +132,8 @@ def test_life_of_a_frame(tmp_path: Path) -> None:  # noqa: PLR0915 (one frame, f
     car = Simulator(road=road, seed=1, start_mono_ns=START_NS - 2 * NS_PER_S)
     camera = SimCamera(model=model, rate_hz=30.0, phase_ns=0, road=road, seed=1, scenery="none")
     gate, gateways, session = armed_gate(car)
-    ciphers = (SrtpCipher("server", gate.session.token, CHALLENGE), SrtpCipher("client", session.token, CHALLENGE))
+    server_cipher = SrtpCipher("server", gate.session.token, CHALLENGE)
+    client_cipher = SrtpCipher("client", session.token, CHALLENGE)
     now_ns = START_NS
     car.advance(now_ns)
 
@@ -149,12 +153,12 @@ def test_life_of_a_frame(tmp_path: Path) -> None:  # noqa: PLR0915 (one frame, f
     access_unit = encoder.encode(frame.picture)
     assert len(access_unit) < frame.picture.nbytes / 10
 
-    # Frame 4. It is split into RTP packets with the stamp's time, repair packets are added, and all are encrypted.
+    # Frame 4. The access unit is split into RTP packets with the stamp's time, repair packets are added, all encrypted.
     packets = Packetizer(ssrc=7, first_sequence=65_535).packetize(access_unit, rtp_timestamp(stamp_ns))
     assert len(packets) > 3
     assert max(map(len, packets)) <= MAX_PACKET_BYTES
     repairs = RepairSender(ssrc=8, first_sequence=0).repair(packets, 1)
-    datagrams = [ciphers[0].protect(packet) for packet in (*packets, *repairs)]
+    datagrams = [server_cipher.protect(packet) for packet in (*packets, *repairs)]
     assert all(packet[12:] not in datagram for packet, datagram in zip(packets, datagrams, strict=False))
 
     # Frame 5. The packets cross the network: all have the same delay, one is lost, and two are reordered.
@@ -167,18 +171,18 @@ def test_life_of_a_frame(tmp_path: Path) -> None:  # noqa: PLR0915 (one frame, f
     del arrived[1]
     arrived[2], arrived[1] = arrived[1], arrived[2]
 
-    # Frame 6. The packets are decrypted, the lost one is recovered, their order restored, and the unit reassembled.
+    # Frame 6. The packets are decrypted, the lost packet is recovered, the order restored, and the unit reassembled.
     repair_receiver, jitter_buffer, depacketizer = RepairReceiver(), JitterBuffer(), Depacketizer()
     ordered = []
     for datagram in arrived:
-        plain = ciphers[1].unprotect(datagram)
+        plain = client_cipher.unprotect(datagram)
         assert plain is not None
         packet = parse_packet(plain)
         media_packets = [] if packet.ssrc == 8 else [packet]
         for media_packet in (*media_packets, *repair_receiver.push(packet, now_ns)):
             ordered += jitter_buffer.push(media_packet, now_ns)
     assert repair_receiver.recovered == 1
-    now_ns += MIN_HOLD_NS  # the first packets of a stream wait for any that were sent before them
+    now_ns += MIN_HOLD_NS  # the first packets of a stream wait for packets that were sent before them
     ordered += jitter_buffer.expire(now_ns)
     units = [unit for packet, lost_before in ordered for unit in depacketizer.push(packet, lost_before)]
     assert [split_nal_units(unit.data) for unit in units] == [split_nal_units(access_unit)]
@@ -222,7 +226,7 @@ def test_life_of_a_frame(tmp_path: Path) -> None:  # noqa: PLR0915 (one frame, f
         emergency_stop=0,
     )
 
-    # Command 2, 3 and 4. It is encoded, the client's gateway authenticates it, and the link gets it.
+    # Command 2, 3 and 4. The command is encoded; the client's gateway authenticates the message and sends it.
     body = encode(command)
     gateways.client.send(Send("control", body))
     (sent,) = gateways.sent
@@ -235,7 +239,7 @@ def test_life_of_a_frame(tmp_path: Path) -> None:  # noqa: PLR0915 (one frame, f
     now_ns += 20 * NS_PER_MS
     assert control.pop_due(now_ns) == [sent.payload]
 
-    # Command 6. The server's gateway verifies it: it drops a changed copy.
+    # Command 6. The server's gateway verifies the message, and drops a changed copy.
     gateways.sent.insert(0, replace(sent, payload=bytes([sent.payload[0] ^ 1]) + sent.payload[1:]))
     before = len(gateways.passed)
     passed = gateways.exchange()
@@ -246,7 +250,7 @@ def test_life_of_a_frame(tmp_path: Path) -> None:  # noqa: PLR0915 (one frame, f
     received = decode(Command, passed)
     assert received == command
 
-    # Command 8. The gate accepts it: present epoch, newer sequence, and a stamp that this server issued recently.
+    # Command 8. The gate accepts the command: current epoch, newer sequence, and a stamp of this server that is recent.
     picture_age_ns = now_ns - START_NS
     assert picture_age_ns == round(VIDEO_DELAY_MS + CONTROL_DELAY_MS) * NS_PER_MS + MIN_HOLD_NS
     car.advance(now_ns)
@@ -254,7 +258,7 @@ def test_life_of_a_frame(tmp_path: Path) -> None:  # noqa: PLR0915 (one frame, f
     assert verdict.accepted
     assert gate.admit(received, car.state(), now_ns, now_ns).reason == RejectionReason.OLD_SEQUENCE
 
-    # Command 9. It is within the limits and stays as it is; a wheel angle out of range is limited.
+    # Command 9. The command is within the limits and stays unchanged; a wheel angle out of range is limited.
     actuation = gate.watchdog.actuation(car.state(), now_ns)
     assert (actuation.steering_rad, actuation.throttle) == (received.steering_rad, received.throttle)
     assert gate.limiter.applied_limits == ()

@@ -25,7 +25,7 @@ def sites() -> dict[str, list[Site]]:
     return mutation.sites_of(list(MODULES))
 
 
-def mutated(source: str, operator: str) -> list[str]:
+def mutated_sources(source: str, operator: str) -> list[str]:
     """Return every source that an operator's mutations produce."""
     return [
         mutant.apply_to(source) for site in find_sites("a.py", source) for mutant in site if mutant.operator == operator
@@ -67,8 +67,8 @@ def body(*lines: str) -> str:
     ],
 )
 def test_operators(operator: str, line: str, expected: list[str]) -> None:
-    """Each operator replaces exactly one operator, value or statement."""
-    assert mutated(body(line), operator) == [body(expected_line) for expected_line in expected]
+    """Each mutation changes exactly one operator, value or statement of the source."""
+    assert mutated_sources(body(line), operator) == [body(expected_line) for expected_line in expected]
 
 
 @pytest.mark.parametrize(
@@ -88,22 +88,22 @@ def test_excluded_code_has_no_sites(source: str) -> None:
     assert find_sites("a.py", source) == []
 
 
-def test_equivalent_operators_are_not_repeated() -> None:
-    """A condition that another operator negates already, and a returned False, are mutated only once."""
-    assert mutated(body("if a == b: g()", "while True: g()"), "not added") == []
-    assert mutated(body("return False"), "return value") == []
-    assert mutated(body('raise E("a" + f"{b}")'), "arithmetic") == []
+def test_equivalent_mutations_are_left_out() -> None:
+    """There is no mutation with the effect of another mutation or without any effect that a test could see."""
+    assert mutated_sources(body("if a == b: g()", "while True: g()"), "not added") == []
+    assert mutated_sources(body("return False"), "return value") == []
+    assert mutated_sources(body('raise E("a" + f"{b}")'), "arithmetic") == []
 
 
 def test_line_count_is_kept() -> None:
-    """A mutation over several lines keeps the number of lines and everything after it."""
+    """A mutation of several lines keeps the number of lines and all code after the mutation."""
     source = body("a = g(", "    b,", "    c,", ")", "return (", "    a", "    + b", ")")
     for site in find_sites("a.py", source):
         for mutation_of_site in site:
             mutant = mutation_of_site.apply_to(source)
             compile(mutant, "a.py", "exec")
             assert mutant.count("\n") == source.count("\n")
-    assert mutated(source, "statement")[0].split("\n")[1:6] == ["    pass", "", "", "", "    return ("]
+    assert mutated_sources(source, "statement")[0].split("\n")[1:6] == ["    pass", "", "", "", "    return ("]
 
 
 def test_mutation_key_is_stable() -> None:
@@ -128,7 +128,7 @@ def test_every_path_of_the_table_exists() -> None:
 
 
 def test_sample_follows_from_the_seed() -> None:
-    """The same seed gives the same mutants, a smaller count gives the first of them, another seed gives others."""
+    """The same seed gives the same mutants, a smaller count the first of these, and another seed other mutants."""
     sites = mutation.sites_of(["safety/takeover_requests.py", "transport/rtp/adaptive_hold.py"])
     sampled = mutation.sample(sites, 1, 30)
     assert sampled == mutation.sample(sites, 1, 30)
@@ -152,7 +152,7 @@ def make_result(caught_by: str, module: str = "safety/takeover_requests.py") -> 
 
 
 def test_results_are_saved(tmp_path: Path) -> None:
-    """The last result of a mutant counts, and an invalid line is a user error."""
+    """Of several saved results of a mutant the last is read, and an invalid line is a user error."""
     file = tmp_path / "results.jsonl"
     assert results.read_results(file) == {}
     for caught_by in ("", "tests/test_a.py::test_b"):
@@ -189,7 +189,7 @@ def make_entry(mutant: Mutation) -> str:
 
 
 def test_accepted_survivors_match_the_sources(tmp_path: Path, sites: dict[str, list[Site]]) -> None:
-    """An accepted survivor matches a mutation of the sources; one that matches none is an error."""
+    """An accepted survivor matches a mutation of the sources; an entry that matches no mutation is an error."""
     example = {"a.py": find_sites("a.py", body("g(a < b)"))}
     first = example["a.py"][1][0]
     file = tmp_path / "accepted.toml"
@@ -215,7 +215,7 @@ def test_invalid_arguments_are_rejected(arguments: list[str]) -> None:
 
 @pytest.mark.full
 def test_mutants_of_a_small_module_are_run(tmp_path: Path) -> None:
-    """The program runs mutants, saves the results, runs none twice, and runs survivors again on request."""
+    """The program runs mutants, saves the results, runs no mutant twice, and runs survivors again on request."""
     file = tmp_path / "results.jsonl"
     requested = [sys.executable, str(PROGRAM), "--only", "vehicle/dbw/crc8.py", "--out", str(file)]
     first, second = (
@@ -296,7 +296,7 @@ def test_failing_unmutated_tests_end_the_run(
 
 @pytest.mark.full
 def test_mutant_runs_in_a_copy(tmp_path: Path) -> None:
-    """Tests run on a copy whose mutated module is restored; an endless loop is killed and counts as caught."""
+    """Tests run on a copy whose mutated module is restored; a mutant with an endless loop is killed and caught."""
     repository = tmp_path / "repository"
     module = repository / "src" / "lavt" / "a.py"
     for directory in (module.parent, repository / "tests"):

@@ -25,7 +25,7 @@ def test_class_names_are_unique() -> None:
 
 
 def test_folders_are_small() -> None:
-    """No folder has more than 20 modules, except the one with a module per command."""
+    """No folder has more than 20 modules, except the folder with one module per command."""
     folders = {path.parent for path in SOURCES.rglob("*.py")} - COMMAND_FOLDERS
     counts = {str(folder.relative_to(SOURCES)): len(list(folder.glob("[!_]*.py"))) for folder in folders}
     assert {folder: count for folder, count in counts.items() if count > MAX_MODULES} == {}

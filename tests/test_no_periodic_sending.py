@@ -12,10 +12,10 @@ import pytest
 SOURCE = Path(__file__).parent.parent / "src" / "lavt"
 
 PERIODIC = re.compile(
-    r"send_periodic|_send_periodic_internal|\w*Cyclic\w*Task\w*|broadcastmanager|modify_data"  # python-can's
-    r"|\w*BCM\w*|\w*bcm\w*|AF_CAN|PF_CAN|CAN_RAW"  # the kernel's, and sockets that could use it
+    r"send_periodic|_send_periodic_internal|\w*Cyclic\w*Task\w*|broadcastmanager|modify_data"  # names of python-can
+    r"|\w*BCM\w*|\w*bcm\w*|AF_CAN|PF_CAN|CAN_RAW"  # names of the kernel, and of sockets that could use them
 )
-"""Complete names of periodic sending. A string with such a name also counts, because it may look the name up."""
+"""Complete names that belong to periodic sending, also in a string, with which a program could look up the name."""
 
 
 def periodic_sending(source: str) -> list[str]:
@@ -37,7 +37,7 @@ def _names(node: ast.AST) -> Iterator[str]:
 
 @pytest.mark.parametrize("path", sorted(SOURCE.rglob("*.py")), ids=lambda path: str(path.relative_to(SOURCE)))
 def test_no_module_sends_periodically(path: Path) -> None:
-    """No module uses periodic sending of python-can or of the kernel, or opens a CAN socket of its own."""
+    """No module uses periodic sending of python-can or of the kernel, or opens a CAN socket itself."""
     assert periodic_sending(path.read_text("utf-8")) == []
 
 
@@ -61,5 +61,5 @@ def test_planted_periodic_sending_is_found(planted: str) -> None:
 
 
 def test_single_sends_are_allowed() -> None:
-    """Single sends and comments are allowed."""
+    """Single sends are allowed, and so are sentences that mention periodic sending."""
     assert not periodic_sending('"""Never send_periodic here."""\nbus.send(message, timeout=0)\nimport can')

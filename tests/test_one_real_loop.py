@@ -1,4 +1,4 @@
-"""A drive in real time with Zenoh routers, UDP, H.264, the relay and a process per side; being late fails no test."""
+"""A drive in real time with Zenoh routers, UDP, H.264, the relay and a process per side; lateness fails no test."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ def run_tests(folder: Path, required: str | None, tests: str, **variables: str) 
     ],
 )
 def test_missing_requirement_fails(tmp_path: Path, required: str | None, code: int, expected: str) -> None:
-    """A test skips if the machine lacks a requirement, and fails if LAVT_REQUIRE names it."""
+    """A test whose requirement is missing is skipped, or fails if LAVT_REQUIRE names the requirement."""
     file = tmp_path / "test_needy.py"
     file.write_text(TEST_THAT_NEEDS_A_UNICORN)
 
@@ -60,7 +60,7 @@ def test_missing_requirement_fails(tmp_path: Path, required: str | None, code: i
 def test_kernel_lane_skips_on_an_ordinary_machine(
     tmp_path: Path, required: str | None, code: int, expected: str
 ) -> None:
-    """Outside the kernel lane its tests skip and name its command; if LAVT_REQUIRE names the kernel they fail."""
+    """Outside their lane, kernel tests are skipped and name the lane's command, or fail if the kernel is required."""
     exit_code, output = run_tests(tmp_path, required, "tests/kernel/test_lane.py")
 
     assert exit_code == code, output
@@ -72,7 +72,7 @@ def test_kernel_lane_skips_on_an_ordinary_machine(
     [(None, 0, "apt-get install gstreamer1.0-tools"), ("gstreamer", 1, "LAVT_REQUIRE names gstreamer: needs gst")],
 )
 def test_interop_tests_skip_without_their_tools(tmp_path: Path, required: str | None, code: int, expected: str) -> None:
-    """Without GStreamer and ffmpeg their tests skip and name the packages; if these are required they fail."""
+    """Without GStreamer and ffmpeg, interop tests are skipped and name the packages, or fail if required."""
     exit_code, output = run_tests(tmp_path, required, "tests/interop", PATH=str(tmp_path))
 
     assert exit_code == code, output

@@ -89,7 +89,7 @@ def test_the_control_benchmark_runs() -> None:
 
 
 def test_an_installed_carrier_returns_the_echo() -> None:
-    """Pyzmq and CycloneDDS, if installed, return the echo of a command unchanged."""
+    """Pyzmq and CycloneDDS, if installed, return the echo of every command."""
     names = [name for name, carrier in carriers.CARRIERS.items() if carrier.module and not carrier.missing]
     if not names:
         pytest.skip("needs pyzmq or cyclonedds: pip install pyzmq cyclonedds")

@@ -58,20 +58,20 @@ def stalls_of(*recorded: Stall) -> Stalls:
     ("since_ms", "until_ms", "count"),
     [(0, 99, 0), (0, 100, 1), (120, 130, 1), (150, 200, 1), (151, 200, 0), (0, 1000, 2)],
 )
-def test_only_overlapping_stalls_count(since_ms: int, until_ms: int, count: int) -> None:
+def test_only_overlapping_stalls_are_returned(since_ms: int, until_ms: int, count: int) -> None:
     """A stall that ended before an interval, or began after it, does not overlap it."""
     stalls = [Stall(0, 100 * MS, 150 * MS), Stall(1, 600 * MS, 610 * MS)]
     assert len(overlapping(stalls, since_ms * MS, until_ms * MS)) == count
 
 
-def test_short_stalls_do_not_count() -> None:
-    """Only stalls of at least the given length count."""
+def test_short_stalls_are_not_returned() -> None:
+    """Only stalls of at least the given length are returned."""
     stalls = [Stall(0, 0, 29 * MS), Stall(0, 100 * MS, 131 * MS)]
     assert overlapping(stalls, 0, 1000 * MS, at_least_ms=30) == [stalls[1]]
 
 
 def test_stalled_share_is_that_of_the_worst_processor() -> None:
-    """Stalls of one processor within the interval add up; those of other processors are not added."""
+    """The stalled share adds up the stalls of one processor in the interval: the processor that was stalled longest."""
     stalls = [Stall(0, 0, 20 * MS), Stall(0, 50 * MS, 60 * MS), Stall(1, 0, 15 * MS), Stall(0, 90 * MS, 500 * MS)]
     assert stalled_share(stalls, 10 * MS, 100 * MS) == pytest.approx((10 + 10 + 10) / 90)
     assert stalled_share([], 0, 100) == 0
@@ -98,7 +98,7 @@ def test_passing_check_does_not_query_probes() -> None:
     ],
 )
 def test_only_an_overlapping_stall_excuses_a_failure(stall: Stall | None, raised: type[Exception]) -> None:
-    """A late result fails unless a stall of at least 30 ms overlaps the interval; the message has both."""
+    """A late result is a failure, unless a stall of at least 30 ms overlaps the interval."""
     stalls = stalls_of(*([stall] if stall else []))
     with pytest.raises(raised, match="it was late") as caught:
         stalls.require(False, "it was late", 0, 1000 * MS)
@@ -140,12 +140,12 @@ def test_verdict_waits_for_a_complete_record() -> None:
 def test_many_inconclusive_tests_fail_on_an_idle_machine(
     inconclusive: int, tests: int, idle: float, *, expected: bool
 ) -> None:
-    """More than 5 % and more than one inconclusive tests fail a session on a machine that was over half idle."""
+    """A session fails if more than 5 % of its tests, at least two, are inconclusive on a mostly idle machine."""
     assert inconclusive_too_often(inconclusive, tests, idle) is expected
 
 
-def test_low_priority_work_counts_as_idle() -> None:
-    """Idle time, waiting for disks and niceness above zero count as idle; stolen time does not."""
+def test_low_priority_work_is_idle_time() -> None:
+    """The idle share includes waiting for disks and programs with a niceness above zero, but no stolen time."""
     before, after = "cpu  100 100 100 100 100 100 100 100 0 0", "cpu  110 120 110 130 110 100 100 120 0 0"
     assert idle_share(before, after) == pytest.approx((20 + 30 + 10) / 100)
     assert idle_share(before, before) == 0
@@ -384,7 +384,7 @@ print(time.monotonic_ns())
 
 
 def spin(processor: int, priority: str, duration_ms: int) -> tuple[int, int]:
-    """Occupy a processor; return when that began and ended."""
+    """Occupy a processor; return the times (ns) at which the program began and ended."""
     arguments = [sys.executable, "-I", "-S", "-c", SPIN, str(processor), priority, str(duration_ms)]
     began, ended = subprocess.run(arguments, check=True, capture_output=True, text=True).stdout.split()
     return int(began), int(ended)
@@ -415,7 +415,7 @@ def test_stalled_processor_is_recorded() -> None:
 def test_busy_program_is_no_stall() -> None:
     """LAVT's highest process priority does not delay a probe, so a busy LAVT program is never recorded as a stall.
 
-    One of five attempts without a stall is enough, because the host itself may stall the machine.
+    One of five attempts without a stall is enough, because the host itself can stall the machine.
     """
     with measuring_stalls() as stalls:
         attempts_ns = [spin(min(os.sched_getaffinity(0)), "nice", 200) for _ in range(5)]

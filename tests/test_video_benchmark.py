@@ -21,7 +21,7 @@ BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
 
 def test_defaults_measure_every_part() -> None:
-    """By default several pairs, a minute of frames on the impaired link, and all parts are measured."""
+    """By default several pairs, at least a minute of frames on the impaired link, and all parts are measured."""
     requested = video_vs_gstreamer.parse_arguments([])
     assert requested.pairs > 1
     assert requested.frames >= 60 * 30
@@ -75,8 +75,8 @@ def test_the_link_follows_the_case(case: LinkCase) -> None:
     lost = np.array([delay_ns is None for delay_ns in delays_ns])
     assert abs(lost.mean() - case.loss) <= 0.1 * case.loss
     if case.burst_packets:
-        begins = lost[1:] & ~lost[:-1]
-        assert abs(lost.sum() / begins.sum() - case.burst_packets) < 0.3
+        is_burst_start = lost[1:] & ~lost[:-1]
+        assert abs(lost.sum() / is_burst_start.sum() - case.burst_packets) < 0.3
     arrived_ns = [delay_ns for delay_ns in delays_ns if delay_ns is not None]
     assert 0 <= min(arrived_ns) <= max(arrived_ns) <= case.jitter_ms * 1e6
     assert max(arrived_ns) >= 0.99 * case.jitter_ms * 1e6
@@ -124,7 +124,7 @@ def test_latency_is_summarized_for_every_10_s() -> None:
 
 
 def test_growth_is_reported() -> None:
-    """Growing memory, threads and latency are each reported; steady ones are not."""
+    """Growing memory, threads and latency are each reported; steady memory, threads and latency are not."""
     steady = [endurance.ResourceSample(float(at_s), 50_000, 5) for at_s in range(60)]
     growing = [endurance.ResourceSample(float(at_s), 50_000 + 10 * at_s, 5 + at_s // 50) for at_s in range(60)]
     steady_latency_ms, growing_latency_ms = np.full(1200, 4.0), np.linspace(4.0, 8.0, 1200)

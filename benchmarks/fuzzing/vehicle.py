@@ -152,7 +152,7 @@ class VehicleSide:
         self.bench.deliver("control", payload)
 
     def arm(self) -> None:
-        """Arm the vehicle as the operator, without other inputs; the vehicle may first be reserved for a stranger."""
+        """Arm the vehicle as the operator; before, wait for the end of a reservation for a stranger."""
         for _ in range(3000):
             self.bench.advance(20 * NS_PER_MS)
             self.send_command()
@@ -278,7 +278,7 @@ def vehicle_driven(seed: int) -> Target:
         {"control": side.control, "session": side.session},
         feed,
         lambda: _rejected(side),
-        lambda: f"{inputs_while_driving / inputs:.0%} of the inputs while driving",
+        lambda: f"{inputs_while_driving / inputs:.0%} of the inputs in the state driving",
     )
 
 

@@ -153,7 +153,8 @@ class _Finder(ast.NodeVisitor):
         """Return the offsets of the operator between two operands."""
         begin, end = self._offsets(before)[1], self._offsets(after)[0]
         tokens = self._tokens[bisect_left(self._tokens, (begin, "")) : bisect_left(self._tokens, (end, ""))]
-        return tokens[0][0], tokens[-1][0] + len(tokens[-1][1])
+        (first_offset, _), (last_offset, last_text) = tokens[0], tokens[-1]
+        return first_offset, last_offset + len(last_text)
 
     def _text(self, node: ast.expr | ast.stmt) -> str:
         begin, end = self._offsets(node)

@@ -231,7 +231,7 @@ class SessionRequest(Struct, frozen=True):
     instance: int
     """Random number of the client process, which distinguishes it from another client of the same name."""
     number: int
-    """Number of an emergency stop; 0 for other operations."""
+    """Number of the emergency stop that is raised or cleared; 0 for other operations."""
 
 
 class NetemRequest(Struct, frozen=True):

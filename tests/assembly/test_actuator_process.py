@@ -67,5 +67,5 @@ def test_a_stuck_actuator_does_not_outlive_its_server() -> None:
 
 
 def test_the_alarm_leaves_time_to_stop() -> None:
-    """The alarm kills an actuator only after the time that it has to stop and disengage the vehicle."""
+    """The alarm that kills an actuator comes later than the limit for stopping and disengaging the vehicle."""
     assert actuator_process.KILL_AFTER_S > actuator_process.STOP_TIMEOUT_S

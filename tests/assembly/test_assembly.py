@@ -59,13 +59,13 @@ def test_run_seeds_differ() -> None:
 
 
 def test_seeded_entropy() -> None:
-    """Seeded entropy is reproducible by seed and name, and returns numbers and tokens of the requested length."""
-    entropy, equal, of_another_name = (
+    """Seeded entropy depends only on seed and name, and returns numbers and tokens of the requested length."""
+    entropy, equal_entropy, client_entropy = (
         SeededEntropy(seed, name) for seed, name in ((1, "server"), (1, "server"), (1, "client"))
     )
     values = [entropy.number(64), entropy.number(32), entropy.token(16)]
-    assert values == [equal.number(64), equal.number(32), equal.token(16)]
-    assert values[0] != of_another_name.number(64)
+    assert values == [equal_entropy.number(64), equal_entropy.number(32), equal_entropy.token(16)]
+    assert values[0] != client_entropy.number(64)
     assert len(entropy.token(16)) == 16
     assert all(0 <= entropy.number(16) < 2**16 for _ in range(200))
 
@@ -87,7 +87,7 @@ def test_camera_model() -> None:
 
 @given(st.text(max_size=20))
 def test_any_address(text: str) -> None:
-    """Parsing any text as an address raises only UserError."""
+    """Any text either is an address or raises `UserError`."""
     with suppress(UserError):
         host, port = parse_address("video.send_to", text)
         assert host
@@ -136,7 +136,7 @@ def test_configured_lags_replace_those_of_the_car() -> None:
     ],
 )
 def test_unknown_names(vehicle: dict[str, str], controller: dict[str, str], reason: str) -> None:
-    """An unknown vehicle, route, car, controller or preset is rejected, and the error lists the known names."""
+    """An unknown vehicle, route, car, controller or preset is rejected with an error that quotes it."""
     with pytest.raises(UserError, match=reason):
         check_names(VehicleConfig(**vehicle), ControllerConfig(**controller))  # type: ignore[arg-type]
 
@@ -161,7 +161,7 @@ def test_configured_settings_replace_those_of_the_preset() -> None:
 
 
 def test_lazy_physics_advances_for_frames_and_states_only() -> None:
-    """With lazy physics the simulator advances only for frames and states, 30 and 50 a second.
+    """With lazy physics the simulator advances only for the 30 frames and the 50 states of each second.
 
     A vehicle that cannot catch up still advances at every step.
     """
@@ -191,12 +191,13 @@ def test_lazy_physics_advances_for_frames_and_states_only() -> None:
             run_stages("actuator", actuator.pipelines[WAKE], Message(WAKE, None, now), now, repeat(now))
             wakes += 1
         wake_counts.append(wakes)
-    assert wake_counts[0] == wake_counts[2] > 240
-    assert wake_counts[1] <= 82
+    every_step_wakes, lazy_wakes, wakes_without_catching_up = wake_counts
+    assert every_step_wakes == wakes_without_catching_up > 240
+    assert lazy_wakes <= 82
 
 
 def test_a_condition_that_cannot_be_injected_is_rejected_at_the_start() -> None:
-    """A client without an interface rejects a condition that delays control, and any client an unknown condition."""
+    """A client without an interface rejects a condition that delays control; any client rejects an unknown one."""
     with pytest.raises(UserError, match=r"injection\.interface"):
         injection_client(ClientInjectionConfig(condition="L4"), "alice", 7, 0)
     with pytest.raises(UserError, match="'L9'"):
@@ -216,7 +217,7 @@ def test_an_external_time_source_reports_the_configured_values() -> None:
 
 
 def test_the_probe_as_the_only_source() -> None:
-    """With source probe no command is run, and the report has no correction."""
+    """With the time source `probe` no command is run, and the report has no correction."""
     report = clock_source(ClockConfig(source="probe"), MachineClock(), fail)()
     assert report is not None
     assert (report.source, report.correction_s, report.bound_s) == ("probe", None, None)
@@ -240,7 +241,7 @@ def device_config(device: str | int, **camera: Any) -> ServerConfig:
 
 
 def test_camera_device(tmp_path: Path) -> None:
-    """With source device the configured device is opened with the configured geometry; by default there is none."""
+    """With the camera source `device` the configured device is opened; by default there is no camera device."""
     assert build_camera(ServerConfig()) is None
     camera = build_camera(device_config(str(write_video(tmp_path / "video.avi", rate_hz=30.0)), z_m=2.5))
     assert isinstance(camera, VideoDevice)

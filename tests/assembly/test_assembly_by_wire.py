@@ -43,7 +43,7 @@ def reason_for(
 
 
 def test_a_real_bus_without_keys_inhibits_arming(verified_profile: Profile) -> None:
-    """A bus that may have a real car is not driven without signing keys; a virtual bus is."""
+    """Arming needs signing keys on a bus that may have a real car, but not on a virtual bus."""
     assert "security.key" in reason_for(REAL_BUS, verified_profile, ServerSecurityConfig())
     assert "security.key" not in reason_for(REAL_BUS, verified_profile)
     virtual = DbwConfig(interface="udp_multicast", channel="239.74.163.2")
@@ -53,7 +53,7 @@ def test_a_real_bus_without_keys_inhibits_arming(verified_profile: Profile) -> N
 
 
 def test_a_real_bus_without_a_car_inhibits_arming(verified_profile: Profile) -> None:
-    """A bus that may have a real car needs the car's name, which its watchdog proof must have."""
+    """Arming on a bus that may have a real car needs the car's name and a watchdog proof."""
     assert "vehicle.dbw.car" in reason_for(REAL_BUS.model_copy(update={"car": ""}), verified_profile)
     assert "vehicle.dbw.watchdog_proof" in reason_for(REAL_BUS, verified_profile)
 
@@ -76,14 +76,14 @@ def test_a_missing_proof_inhibits_arming(verified_profile: Profile) -> None:
 def test_a_brake_too_weak_for_a_safe_stop_inhibits_arming(
     verified_profile: Profile, limit: float, is_enough: bool
 ) -> None:
-    """A brake limit below the 4 m/s2 of a safe stop, on which all speed limits depend, inhibits arming."""
+    """A brake limit that allows less than the 4 m/s2 of a safe stop inhibits arming."""
     reason = reason_for(REAL_BUS, replace(verified_profile, limits=replace(verified_profile.limits, brake=limit)))
     assert ("limits.brake" in reason) is not is_enough
 
 
 @pytest.mark.parametrize("name", ["dataspeed_gen1", "dataspeed_gen2"])
 def test_a_kit_that_is_off_and_has_no_proof_has_a_readable_state(verified_profile: Profile, name: str) -> None:
-    """The state of a kit that is off and has no watchdog proof can be decoded, with the beginning of its reasons."""
+    """The state of a kit that is off and has no watchdog proof can be decoded; at most its rejection is shortened."""
     profile = load_profile(name, steering_sign=1)
     adapter = ByWireAdapter(profile, start_ns=0, inhibit_reason=reason_for(REAL_BUS, verified_profile))
     adapter.frames_due(NS_PER_S)
@@ -95,7 +95,7 @@ def test_a_kit_that_is_off_and_has_no_proof_has_a_readable_state(verified_profil
 
 
 class CarOnABus:
-    """A port to a bus with a software car, which is silent from a time on."""
+    """A port to a bus with a software car that sends nothing from `silent_ns` on."""
 
     def __init__(self, config: ServerConfig, silent_ns: int) -> None:
         profile = load_profile(config.vehicle.dbw.profile, steering_sign=1)
@@ -103,7 +103,7 @@ class CarOnABus:
         self._runner, self._silent_ns = SoftwareCarRunner(car, self, start_ns=0), silent_ns
         self._sent: list[CanFrame] = []
         self.counts: Counter[str] = Counter()
-        self._is_car = False
+        self._car_is_stepping = False
 
     def send(self, frames: Sequence[CanFrame], _made_ns: int) -> int:
         """Put frames of the car on the bus."""
@@ -112,11 +112,11 @@ class CarOnABus:
 
     def take(self, now_ns: int) -> list[ReceivedCanFrame]:
         """Return the car's frames; the car itself receives none."""
-        if self._is_car or now_ns >= self._silent_ns:
+        if self._car_is_stepping or now_ns >= self._silent_ns:
             return []
-        self._is_car = True
+        self._car_is_stepping = True
         self._runner.step(now_ns)
-        self._is_car = False
+        self._car_is_stepping = False
         frames, self._sent = self._sent, []
         return [ReceivedCanFrame(frame, now_ns) for frame in frames]
 
@@ -129,11 +129,11 @@ class CarOnABus:
 
 @pytest.mark.parametrize("silent_ns", [400 * NS_PER_MS, 2 * NS_PER_S])
 def test_a_bus_that_became_silent_inhibits_driving(monkeypatch: pytest.MonkeyPatch, silent_ns: int) -> None:
-    """Reports that are old at the end of listening count as missing, although they had arrived."""
+    """A report that is too old when listening ends is named as missing, even if it arrived before."""
     dbw = DbwConfig(interface="virtual", channel="test", profile="dataspeed_gen1", steering_sign=1)
     config, clock = ServerConfig(vehicle=VehicleConfig(kind="dbw", dbw=dbw)), ManualClock()
     monkeypatch.setattr(by_wire, "CanPort", lambda *_, **__: CarOnABus(config, silent_ns))
     monkeypatch.setattr(by_wire, "pause", lambda pause_ns: clock.advance(pause_ns / NS_PER_MS))
-    frames, reason = by_wire.listen(config, clock, NS_PER_S)
-    assert frames > 0
+    frame_count, reason = by_wire.listen(config, clock, NS_PER_S)
+    assert frame_count > 0
     assert ("SteeringReport" in reason) == (silent_ns < NS_PER_S), reason

@@ -19,10 +19,10 @@ class PartFailed(Exception):
 @pytest.mark.usefixtures("own_switch_interval")
 def test_a_part_that_cannot_be_closed_keeps_no_other_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """If closing one part fails, all other parts are closed, the record is complete, and the error is raised."""
-    close = Injector.close
+    real_close = Injector.close
 
     def fail(injector: Injector) -> None:
-        close(injector)
+        real_close(injector)
         raise PartFailed
 
     monkeypatch.setattr(Injector, "close", fail)

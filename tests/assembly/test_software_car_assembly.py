@@ -18,7 +18,7 @@ def build(profile: str, config: ServerConfig | None = None) -> SoftwareCar:
 
 
 @pytest.mark.parametrize(
-    ("profile", "accepted"),
+    ("profile", "accepted_sender"),
     [
         ("dataspeed_gen1", "generation 1"),
         ("dataspeed_gen2", "remote"),
@@ -26,8 +26,8 @@ def build(profile: str, config: ServerConfig | None = None) -> SoftwareCar:
         ("dataspeed_gen2:user", "user"),
     ],
 )
-def test_the_kit_obeys_the_commands_of_its_profile(profile: str, accepted: str) -> None:
-    """The kit obeys the commands of the generation and set that the profile is for, and no others."""
+def test_the_kit_accepts_the_commands_of_its_profile(profile: str, accepted_sender: str) -> None:
+    """The kit accepts only commands of the generation and command set that the profile describes."""
     senders: dict[str, Sender1 | Sender2] = {
         "generation 1": Sender1(),
         "remote": Sender2(),
@@ -37,7 +37,7 @@ def test_the_kit_obeys_the_commands_of_its_profile(profile: str, accepted: str) 
         car = build(profile)
         for frame in sender.commands(CommandValues(brake=0.5)):
             car.receive(frame, START_NS)
-        assert (car.kit.state.actuators["brake"].order is not None) == (name == accepted)
+        assert (car.kit.state.actuators["brake"].order is not None) == (name == accepted_sender)
 
 
 def test_the_car_matches_the_config() -> None:

@@ -32,7 +32,7 @@ EXIT_TIMEOUT_S = 60.0
 
 
 def files(directory: Path) -> Mapping[str, bytes | None]:
-    """Return the contents of a directory by path; the content of a directory is None."""
+    """Return the content of each file below a directory, by relative path; for a directory, None."""
     return {
         str(path.relative_to(directory)): path.read_bytes() if path.is_file() else None for path in directory.rglob("*")
     }

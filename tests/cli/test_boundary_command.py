@@ -1,4 +1,4 @@
-"""`lavt boundary` prints its results and writes them to files."""
+"""Test that `lavt boundary` prints its results and writes them to files."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SMALL_SEARCH = [
 
 @pytest.mark.full
 def test_results_are_printed_and_written(run: Run, tmp_path: Path) -> None:
-    """The results are printed as JSON and written as JSON, as CSV with a row per seed, and as two figures."""
+    """The results are printed as JSON, and written as JSON, as CSV with a row for each seed, and as a figure."""
     out = tmp_path / "out"
     changes = [part for change in SMALL_SEARCH for part in ("--set", change)]
     code, printed, messages = run("boundary", BOUNDARY, *changes, "--out", str(out), "--jobs", "1", "--json")

@@ -1,4 +1,4 @@
-"""`lavt can check` reports mismatches between a profile and its DBC, and unverified signals."""
+"""Test that `lavt can check` reports mismatches between a profile and its DBC, and unverified signals."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def run(run: Run) -> Run:
     return lambda *arguments: run("can", "check", *arguments)
 
 
-def edited(folder: Path, name: str, edit: Edit = lambda _: None, dbc_change: tuple[str, str] = ("", "")) -> str:
+def write_profile(folder: Path, name: str, edit: Edit = lambda _: None, dbc_change: tuple[str, str] = ("", "")) -> str:
     """Write a copy of a shipped profile, changed by `edit` and with a text of its DBC replaced; return its path."""
     source = shipped_profiles()[name]
     profile = yaml.safe_load(source.read_text())
@@ -65,7 +65,9 @@ def test_unknown_steering_sign(run: Run, tmp_path: Path) -> None:
     _, out, _ = run("dataspeed_gen1")
     assert "may not arm" in out.splitlines()[-1]
     assert "steering_sign" in out.splitlines()[-1]
-    code, out, _ = run(edited(tmp_path, "dataspeed_gen1", lambda profile: profile["vehicle"].update(steering_sign=1)))
+    code, out, _ = run(
+        write_profile(tmp_path, "dataspeed_gen1", lambda profile: profile["vehicle"].update(steering_sign=1))
+    )
     assert code == 0
     assert "may arm" in out.splitlines()[-1]
     assert "`lavt can test-watchdog`" in out.splitlines()[-1]
@@ -247,14 +249,11 @@ MISMATCHES: list[tuple[str, Edit, tuple[str, str], str, tuple[str, ...]]] = [
 """A shipped profile, an edit of it, a replacement in its DBC, and the key and names in the sentence on the mismatch."""
 
 
-@pytest.mark.parametrize(
-    ("edit", "key", "names"), [pytest.param(case[:3], *case[3:], id=case[3]) for case in MISMATCHES]
-)
-def test_mismatch(
-    run: Run, tmp_path: Path, edit: tuple[str, Edit, tuple[str, str]], key: str, names: tuple[str, ...]
-) -> None:
+@pytest.mark.parametrize("mismatch", MISMATCHES, ids=[key for _, _, _, key, _ in MISMATCHES])
+def test_mismatch(run: Run, tmp_path: Path, mismatch: tuple[str, Edit, tuple[str, str], str, tuple[str, ...]]) -> None:
     """Each mismatch has a sentence that begins with the profile's key and names the signals; the exit code is 2."""
-    code, out, err = run(edited(tmp_path, *edit))
+    profile, edit, dbc_change, key, names = mismatch
+    code, out, err = run(write_profile(tmp_path, profile, edit, dbc_change))
     assert (code, out) == (2, "")
     sentences = [line for line in err.splitlines() if line.startswith(f"{key}: ")]
     assert any(all(name in sentence for name in names) for sentence in sentences), err
@@ -262,7 +261,7 @@ def test_mismatch(
 
 def test_all_mismatches(run: Run, tmp_path: Path) -> None:
     """All mismatches are listed and counted."""
-    path = edited(
+    path = write_profile(
         tmp_path,
         "dataspeed_gen1",
         lambda profile: (edit_steering(count="A")(profile), edit_report("gear", message="B")(profile)),
@@ -277,7 +276,7 @@ def test_all_mismatches(run: Run, tmp_path: Path) -> None:
 def test_mismatch_found_by_loading(run: Run, tmp_path: Path) -> None:
     """An error that is found only when the profile is loaded for driving is reported as a mismatch, too."""
     code, _, err = run(
-        edited(tmp_path, "dataspeed_gen1", lambda profile: profile["sent"]["brake"].update(value="PCMD_TORQUE"))
+        write_profile(tmp_path, "dataspeed_gen1", lambda profile: profile["sent"]["brake"].update(value="PCMD_TORQUE"))
     )
     assert code == 2
     assert "PCMD_TORQUE of BrakeCmd" in err

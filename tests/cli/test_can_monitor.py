@@ -1,4 +1,4 @@
-"""`lavt can monitor` decodes a bus or a log, as text or JSON."""
+"""Test that `lavt can monitor` decodes a bus or a log, and prints text or JSON."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def log(tmp_path: Path) -> Path:
 
 @contextmanager
 def sending(message: can.Message) -> Iterator[None]:
-    """Send a message every 10 ms on the virtual bus `monitored`."""
+    """Send a message every 10 ms on the virtual bus `monitored` until the context ends."""
     is_over = threading.Event()
 
     def send() -> None:

@@ -1,4 +1,4 @@
-"""`lavt can test-watchdog` writes a proof only if the kit's watchdog brakes, and the proof applies only to that kit."""
+"""Test that `lavt can test-watchdog` writes a proof only if the kit's watchdog brakes, and what the proof covers."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def run(run: Run) -> Run:
 
 
 def by_wire_options(profile: str, port: int = 0, **dbw_changes: str) -> list[str]:
-    """Return the options that turn the server's config into one of a by-wire car on a bus of its own."""
+    """Return the options that change the server's config to a by-wire car on a bus of its own."""
     dbw = {
         "profile": profile,
         "interface": "udp_multicast",
@@ -206,7 +206,7 @@ INVALID: list[tuple[dict[str, Any], str]] = [
 
 @pytest.mark.parametrize(("changes", "reason"), INVALID, ids=[next(iter(changes)) for changes, _ in INVALID])
 def test_invalid_proof(tmp_path: Path, changes: dict[str, Any], reason: str) -> None:
-    """A proof for another setup, of braking that was too slow, or with invalid fields is rejected with the reason."""
+    """A proof for another setup, of a car that braked too late, or with an invalid field is rejected with a reason."""
     assert proof_rejection(write_proof(tmp_path), PROFILE, CONFIG, WALL_NS) == ""
     assert reason in proof_rejection(write_proof(tmp_path, **changes), PROFILE, CONFIG, WALL_NS)
 

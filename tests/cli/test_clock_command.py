@@ -20,17 +20,16 @@ from lavt.transport.udp_link import UdpLink
 
 @pytest.fixture
 def port() -> Iterator[int]:
-    """Run a server that answers probes and whose clock needs no correction; return its port."""
+    """Run a server that answers probes with a clock correction of 0; return its port."""
     clock = MachineClock()
     node = ClockSyncNode(0)
-    node.pipelines["clock_report"][0][1](
-        Message("clock_report", ClockReport(0, 0, "here", "chrony", 0.0, 0.0001), clock.now()), clock.now()
-    )
+    ((_, note_report),) = node.pipelines["clock_report"]
+    ((_, answer_request),) = node.pipelines["probe_request"]
+    report = ClockReport(0, 0, "here", "chrony", 0.0, 0.0001)
+    note_report(Message("clock_report", report, clock.now()), clock.now())
 
     def answer(_channel: str, payload: Any, arrived: Now, peer: Any) -> None:
-        for send in node.pipelines["probe_request"][0][1](
-            Message("probe_request", payload, arrived, peer), clock.now()
-        ):
+        for send in answer_request(Message("probe_request", payload, arrived, peer), clock.now()):
             link.send(send)
 
     link = UdpLink(clock, "probe_request", bind=("127.0.0.1", 0), name="probe")
@@ -50,7 +49,7 @@ def test_a_server_is_probed(port: int, run: Run) -> None:
 def test_the_source_is_read_before_and_after_the_probing(
     port: int, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The correction after the probing counts, and its change during the probing is added to the bound."""
+    """The estimate uses the correction after the probing; the bound includes its change during the probing."""
     (tmp_path / "chronyc").write_text(
         "#!/bin/sh\n"
         "correction=0.0\n"

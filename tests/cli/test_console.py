@@ -10,20 +10,20 @@ from lavt.cli import console
 from lavt.errors import WorkError
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_each_termination_signal_sets_the_stop_event(number: signal.Signals) -> None:
+@pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_each_termination_signal_sets_the_stop_event(signal_number: signal.Signals) -> None:
     """Ctrl-C, SIGTERM and a closed terminal set the stop event; afterwards the former handlers are restored."""
     received = list[int]()
-    before = signal.signal(number, lambda *_: received.append(number))
+    former_handler = signal.signal(signal_number, lambda *_: received.append(signal_number))
     try:
         with console.stop_on_signals() as stop:
             assert not stop.is_set()
-            signal.raise_signal(number)
+            signal.raise_signal(signal_number)
             assert (stop.is_set(), received) == (True, [])
-        signal.raise_signal(number)
-        assert received == [number]
+        signal.raise_signal(signal_number)
+        assert received == [signal_number]
     finally:
-        signal.signal(number, before)
+        signal.signal(signal_number, former_handler)
 
 
 SIGNAL_AT_EVERY_LINE = """
@@ -51,21 +51,21 @@ def test_nested_signals_do_not_deadlock() -> None:
 
 
 @pytest.mark.usefixtures("sighup_ends_programs")
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_interrupts_long_work(number: signal.Signals) -> None:
+@pytest.mark.parametrize("signal_number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_interrupts_long_work(signal_number: signal.Signals) -> None:
     """SIGTERM and a closed terminal end long work as Ctrl-C does; afterwards the former handlers are restored."""
-    before = signal.getsignal(number)
+    former_handler = signal.getsignal(signal_number)
     with pytest.raises(WorkError, match="stopped"), console.interruptible():
-        signal.raise_signal(number)
-    assert signal.getsignal(number) == before
+        signal.raise_signal(signal_number)
+    assert signal.getsignal(signal_number) == former_handler
 
 
 def test_an_ignored_hangup_stays_ignored() -> None:
     """Under nohup, a closed terminal ends neither long work nor a program that runs until it is stopped."""
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    former_handler = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         with console.stop_on_signals() as stop, console.interruptible():
             signal.raise_signal(signal.SIGHUP)
             assert not stop.is_set()
     finally:
-        signal.signal(signal.SIGHUP, before)
+        signal.signal(signal.SIGHUP, former_handler)

@@ -72,7 +72,7 @@ def test_units_run_without_root(path: Path) -> None:
 
 
 def test_the_directory_of_the_socket() -> None:
-    """The router's unit alone creates /run/lavt, with its socket for one user, and keeps it when a unit stops."""
+    """Only the router's unit creates /run/lavt; its socket is for one user, and the directory outlives the unit."""
     assert [path.name for path in UNITS if "RuntimeDirectory" in read_unit(path)["Service"]] == ["lavt-router.service"]
     service = read_unit(DEPLOY / "systemd/lavt-router.service")["Service"]
     assert (service["RuntimeDirectory"], service["RuntimeDirectoryMode"]) == ("lavt", "0750")

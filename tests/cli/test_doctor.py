@@ -183,13 +183,13 @@ def test_verdicts(check: Callable[[], Check], verdict: str, part: str) -> None:
 
 
 def test_every_check_has_verdicts() -> None:
-    """Every check is in the table with at least two verdicts, except that of the video, which is never checked."""
+    """Every check is in `VERDICTS` with two verdicts or more, except that of the video, which is never checked."""
     verdicts: dict[str, set[str]] = {}
     for check, verdict, _ in VERDICTS:
         for name in check.__code__.co_names:
             verdicts.setdefault(name, set()).add(verdict)
-    names = {name for name in vars(checks) if name.startswith("check_")} - {"check_host", "check_video"}
-    assert {name for name in names if len(verdicts[name]) < 2} == set()
+    check_names = {name for name in vars(checks) if name.startswith("check_")} - {"check_host", "check_video"}
+    assert {name for name in check_names if len(verdicts[name]) < 2} == set()
 
 
 MACHINE_CHECKS = [
@@ -273,9 +273,9 @@ def test_camera_device(tmp_path: Path, rate_hz: float, size: tuple[int, int], ve
     video = write_video(tmp_path / "video.avi", rate_hz=30.0)
     camera = ["source=device", f"device={video}", f"rate_hz={rate_hz}", f"width_px={size[0]}", f"height_px={size[1]}"]
     changes = [f"camera.{setting}" for setting in camera]
-    checks_by_name = check_config(shipped("configs/server.yaml"), *changes, "zenoh.router=tcp/127.0.0.1:1")
-    assert checks_by_name["camera"].verdict in verdicts
-    assert part in checks_by_name["camera"].found
+    results = check_config(shipped("configs/server.yaml"), *changes, "zenoh.router=tcp/127.0.0.1:1")
+    assert results["camera"].verdict in verdicts
+    assert part in results["camera"].found
 
 
 @pytest.mark.usefixtures("quick")
@@ -284,15 +284,15 @@ def test_a_server_with_a_used_port_and_no_router() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as occupant:
         occupant.bind(("127.0.0.1", 0))
         changes = ["video.bind=127.0.0.1", f"video.port={occupant.getsockname()[1]}", "clock.probe_port=0"]
-        found = check_config(shipped("configs/server.yaml"), *changes, "zenoh.router=tcp/127.0.0.1:1")
-    assert [(name, check.verdict) for name, check in found.items()][2:] == [
+        results = check_config(shipped("configs/server.yaml"), *changes, "zenoh.router=tcp/127.0.0.1:1")
+    assert [(name, check.verdict) for name, check in results.items()][2:] == [
         ("security", "warning"),
         ("video port", "problem"),
         ("probe port", "ok"),
         ("router", "problem"),
     ]
-    assert "Address already in use" in found["video port"].found
-    assert "'tcp/127.0.0.1:1'" in found["router"].found
+    assert "Address already in use" in results["video port"].found
+    assert "'tcp/127.0.0.1:1'" in results["router"].found
 
 
 @pytest.fixture(scope="module")
@@ -308,11 +308,10 @@ def router() -> Iterator[str]:
 def probe_port() -> Iterator[int]:
     """Run a server that answers probes; return its port."""
     clock, node = MachineClock(), ClockSyncNode(0)
+    ((_, answer_request),) = node.pipelines["probe_request"]
 
     def answer(_channel: str, payload: Any, arrived: Now, peer: Any) -> None:
-        for send in node.pipelines["probe_request"][0][1](
-            Message("probe_request", payload, arrived, peer), clock.now()
-        ):
+        for send in answer_request(Message("probe_request", payload, arrived, peer), clock.now()):
             link.send(send)
 
     link = UdpLink(clock, "probe_request", bind=("127.0.0.1", 0), name="probe")
@@ -363,14 +362,14 @@ def check_client(run: Run, router: str, probe_port: int, vehicle: str, payload: 
 @pytest.mark.usefixtures("quick")
 def test_a_pair(run: Run, router: str, probe_port: int) -> None:
     """For a client, router, vehicle state, link of the routers and clocks are checked, but not the video."""
-    found = check_client(run, router, probe_port, "vehicle-1", encode(STATE))
+    results = check_client(run, router, probe_port, "vehicle-1", encode(STATE))
     expected = ["security", "router", "vehicle", "link of routers", "clock probe", "video"]
-    assert [name for name in found if name not in MACHINE_CHECKS] == expected
-    assert "operator-1" in found["vehicle"]["found"]
-    assert found["vehicle"]["measured"]["states"] > 0
-    assert found["link of routers"]["verdict"] == "ok"
-    assert abs(found["clock probe"]["measured"]["offset_ms"]) <= found["clock probe"]["measured"]["bound_ms"]
-    assert found["video"]["verdict"] == "not checked"
+    assert [name for name in results if name not in MACHINE_CHECKS] == expected
+    assert "operator-1" in results["vehicle"]["found"]
+    assert results["vehicle"]["measured"]["states"] > 0
+    assert results["link of routers"]["verdict"] == "ok"
+    assert abs(results["clock probe"]["measured"]["offset_ms"]) <= results["clock probe"]["measured"]["bound_ms"]
+    assert results["video"]["verdict"] == "not checked"
 
 
 @pytest.fixture(scope="module")
@@ -416,10 +415,10 @@ def test_a_pair_with_keys(router: str, keys: Path, operator: str, vehicle: str, 
     changes = [f"security.key={keys / operator}.key", f"security.vehicle={keys / vehicle}.pub"]
     network = [f"zenoh.router={router}", "vehicle_id=vehicle-3", "clock.probe_port=1"]
     with sending(server, lambda: gateway.send(Send("state", encode(STATE))), gateway.receive):
-        found = check_config(shipped("configs/client.yaml"), *changes, *network)
+        results = check_config(shipped("configs/client.yaml"), *changes, *network)
     verdict, part = expected
-    assert (found["vehicle"].verdict, part in found["vehicle"].found) == (verdict, True), found["vehicle"]
-    assert {found[name].verdict for name in ("security", "security.key", "security.vehicle")} == {"ok"}
+    assert (results["vehicle"].verdict, part in results["vehicle"].found) == (verdict, True), results["vehicle"]
+    assert {results[name].verdict for name in ("security", "security.key", "security.vehicle")} == {"ok"}
 
 
 @pytest.mark.usefixtures("quick")
@@ -430,27 +429,27 @@ def test_invalid_keys(tmp_path: Path) -> None:
         (tmp_path / name).write_text("no key")
         (tmp_path / name).chmod(0o600)
     changes = [f"security.key={tmp_path}/key", f"security.vehicle={tmp_path}/pub", "clock.probe_port=1"]
-    found = check_config(shipped("configs/client.yaml"), *changes)
-    assert (found["keys"].verdict, found["router"].verdict) == ("problem", "not checked")
-    assert str(tmp_path) in found["keys"].found
+    results = check_config(shipped("configs/client.yaml"), *changes)
+    assert (results["keys"].verdict, results["router"].verdict) == ("problem", "not checked")
+    assert str(tmp_path) in results["keys"].found
 
 
 @pytest.mark.usefixtures("quick")
 def test_a_peer_of_another_version(run: Run, router: str, probe_port: int) -> None:
     """States of another message version are a problem whose text names the version and the fix."""
     fields = msgpack.unpackb(encode(STATE))
-    found = check_client(run, router, probe_port, "vehicle-2", msgpack.packb([99, *fields[1:]]))
-    assert found["vehicle"]["verdict"] == "problem"
-    assert "another version" in found["vehicle"]["found"]
-    assert "version" in found["vehicle"]["do"]
+    results = check_client(run, router, probe_port, "vehicle-2", msgpack.packb([99, *fields[1:]]))
+    assert results["vehicle"]["verdict"] == "problem"
+    assert "another version" in results["vehicle"]["found"]
+    assert "version" in results["vehicle"]["do"]
 
 
 @pytest.mark.usefixtures("quick")
 def test_a_client_without_a_vehicle(router: str) -> None:
     """Missing states and unanswered probes are problems, and a missing link of the routers is a warning."""
     changes = ["vehicle_id=away", f"zenoh.router={router}", "clock.probe_port=1"]
-    found = check_config(shipped("configs/client.yaml"), *changes)
-    assert {name: found[name].verdict for name in ("vehicle", "link of routers", "clock probe")} == {
+    results = check_config(shipped("configs/client.yaml"), *changes)
+    assert {name: results[name].verdict for name in ("vehicle", "link of routers", "clock probe")} == {
         "vehicle": "problem",
         "link of routers": "warning",
         "clock probe": "problem",
@@ -460,9 +459,9 @@ def test_a_client_without_a_vehicle(router: str) -> None:
 @pytest.mark.usefixtures("quick")
 def test_an_unknown_host(router: str) -> None:
     """An unknown host in video.server is reported as a problem by the check of the clock probe."""
-    found = check_config(shipped("configs/client.yaml"), f"zenoh.router={router}", f"video.server={'a' * 64}")
-    assert found["clock probe"].verdict == "problem"
-    assert "a" * 64 in found["clock probe"].found
+    results = check_config(shipped("configs/client.yaml"), f"zenoh.router={router}", f"video.server={'a' * 64}")
+    assert results["clock probe"].verdict == "problem"
+    assert "a" * 64 in results["clock probe"].found
 
 
 def test_side_of_a_config(tmp_path: Path) -> None:
@@ -548,6 +547,6 @@ def test_an_unknown_bus() -> None:
     """A bus that cannot be opened is a problem, and the other checks are still made."""
     pytest.importorskip("can")
     changes = ("vehicle.kind=dbw", "vehicle.dbw.interface=socketcan", "vehicle.dbw.channel=nothere")
-    found = check_config(shipped("configs/server.yaml"), *changes, "zenoh.router=tcp/127.0.0.1:1")
-    assert (found["by wire"].verdict, "nothere" in found["by wire"].found) == ("problem", True)
-    assert "video port" in found
+    results = check_config(shipped("configs/server.yaml"), *changes, "zenoh.router=tcp/127.0.0.1:1")
+    assert (results["by wire"].verdict, "nothere" in results["by wire"].found) == ("problem", True)
+    assert "video port" in results

@@ -1,4 +1,4 @@
-"""A command fails if one of its threads fails."""
+"""Test that a command fails if one of its threads fails."""
 
 from __future__ import annotations
 

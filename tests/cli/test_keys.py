@@ -182,7 +182,7 @@ def test_nothing_is_overwritten(run: Run, directory: Path) -> None:
 
 
 def test_damaged_authority(run: Run, directory: Path) -> None:
-    """A missing or foreign key and an unreadable certificate are reported, and nothing is signed."""
+    """An authority whose key is missing or another's, or whose files are unreadable, is reported and signs nothing."""
     key = (directory / "authority.key").read_bytes()
     (directory / "authority.key").unlink()
     assert "keys/authority.key" in run("keys", "--operator", "two").rejected()

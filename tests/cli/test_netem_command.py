@@ -14,7 +14,7 @@ from lavt.transport.netem.tc import Command
 
 
 class SimulatedInterface(NetemInterface):
-    """A netem interface with a simulated tc, which records its commands and rejects those for which `rejects` is true.
+    """A netem interface with a simulated tc: commands are recorded, and those for which `rejects` is true fail.
 
     Its verification always succeeds.
     """
@@ -78,10 +78,10 @@ def test_a_failed_apply_removes_its_queues(
     assert not interface.is_delayed
 
 
-def test_a_failed_change_prints_how_to_find_the_queues_left(
+def test_a_failed_change_prints_how_to_find_the_remaining_queues(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """If tc rejects a change on a delayed interface, the message names the command that shows the queues left."""
+    """If tc rejects a change on a delayed interface, the message names the command that shows the remaining queues."""
     interface = SimulatedInterface(tmp_path, is_delayed=True)
     interface.rejects = lambda line: "filter add" in line
     with pytest.raises(LavtError, match="rejected"):

@@ -41,12 +41,12 @@ def test_a_custom_road_is_drawn(run: Run, bend: Path, tmp_path: Path) -> None:
 
 
 def test_a_drawing_has_a_map_the_curvature_and_views() -> None:
-    """The map is to scale with the whole road, the curvature is that of the road, and the views are camera pictures."""
+    """The map is to scale and shows the whole road, the curvature is the road's, and the views are camera pictures."""
     road = load_road("a_key")
     figure = draw_road(road, model=CameraModel(), scenery="none")
-    above, detail, curvature, *views = figure.axes
-    assert above.get_aspect() == detail.get_aspect() == 1.0
-    (low_x, high_x), (low_y, high_y) = above.get_xlim(), above.get_ylim()
+    overview, detail, curvature, *views = figure.axes
+    assert overview.get_aspect() == detail.get_aspect() == 1.0
+    (low_x, high_x), (low_y, high_y) = overview.get_xlim(), overview.get_ylim()
     centre_points = road.point_at(np.linspace(0.0, road.route_length_m, 50), 0.0)
     assert ((centre_points > (low_x, low_y)) & (centre_points < (high_x, high_y))).all()
     (stations_m, curvatures_per_m) = curvature.lines[0].get_data(orig=True)

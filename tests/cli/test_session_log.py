@@ -56,6 +56,7 @@ CHANGES: dict[str, tuple[State | None, State, str, list[tuple[str, ...]]]] = {
     "request expired": (REQUESTED, DRIVING, "operator-1", [("operator-2", "no longer")]),
     "server restarted": (STATE, replace(STATE, instance=8), "", [("server", "restarted")]),
 }
+"""The previous state, the new state, the operator of this side ("" on a server), and parts of each logged line."""
 
 
 @pytest.mark.parametrize("case", CHANGES)
@@ -76,6 +77,7 @@ PHASES: dict[tuple[Phase, str], tuple[str, ...]] = {
     ("stopped", "command timeout"): ("command timeout",),
     ("watching", "released"): ("released", "watches"),
 }
+"""Parts of the line for each phase and reason; without parts there is no line."""
 
 
 @pytest.mark.parametrize(("phase", "reason"), PHASES)
@@ -129,7 +131,7 @@ def test_a_client_logs_the_rejections_in_the_state() -> None:
 
 
 def test_a_limit_is_logged_when_it_comes_into_force() -> None:
-    """A limit is logged once while it applies, even if intermittently, and again after a second without it."""
+    """A limit that applies, even intermittently, is logged once, and again after a second without this limit."""
     log, logged = SessionLog(), []
     log.add_state(STATE, 0)
     log.take_lines(0)
@@ -160,13 +162,13 @@ def test_a_missing_state_is_logged() -> None:
 
 def test_a_client_without_a_first_state_logs_what_to_check() -> None:
     """A client without a state 3 s after its start logs once what to check; a server never does."""
-    log, server = SessionLog("operator-1"), SessionLog()
-    for session_log in (log, server):
+    client_log, server_log = SessionLog("operator-1"), SessionLog()
+    for session_log in (client_log, server_log):
         assert session_log.take_lines(5) == []
         assert session_log.take_lines(5 + FIRST_STATE_TIMEOUT_NS - 1) == []
-    assert log.take_lines(5 + FIRST_STATE_TIMEOUT_NS) == [NO_STATE_YET]
-    assert log.take_lines(5 + 9 * NS_PER_S) == []
-    assert server.take_lines(5 + 9 * NS_PER_S) == []
+    assert client_log.take_lines(5 + FIRST_STATE_TIMEOUT_NS) == [NO_STATE_YET]
+    assert client_log.take_lines(5 + 9 * NS_PER_S) == []
+    assert server_log.take_lines(5 + 9 * NS_PER_S) == []
 
 
 def test_the_last_line_describes_the_vehicle() -> None:

@@ -1,4 +1,4 @@
-"""`lavt software-car` in a process of its own, on a `udp_multicast` bus of python-can."""
+"""Test `lavt software-car` in a process of its own, on a `udp_multicast` bus of python-can."""
 
 from __future__ import annotations
 
@@ -89,9 +89,9 @@ class SoftwareCarProgram:
             pause(NS_PER_MS)
         return received
 
-    def end(self, with_signal: signal.Signals = signal.SIGINT) -> tuple[str, str]:
+    def end(self, signal_number: signal.Signals = signal.SIGINT) -> tuple[str, str]:
         """End the process by a signal; return the rest of its output."""
-        self.process.send_signal(with_signal)
+        self.process.send_signal(signal_number)
         out, err = self.process.communicate(timeout=TIMEOUT_S)
         return out, err
 

@@ -27,7 +27,7 @@ READING_STEP_NS = 100 * NS_PER_MS
 
 
 class Vehicle:
-    """A vehicle that gives one of the `answers` to each query, and then none."""
+    """A vehicle that answers each query with the next of the `answers`; None is no answer."""
 
     def __init__(self, *answers: bytes | None) -> None:
         self.answers = list(answers)
@@ -64,7 +64,7 @@ def test_a_stop_is_repeated_until_it_is_confirmed(confirmation: SessionReply) ->
 
 
 def test_a_clock_behind_the_last_stop_is_no_obstacle() -> None:
-    """If the vehicle knows a higher number, the stop is repeated with the number after it, as often as necessary."""
+    """If the vehicle knows a higher number, the stop is repeated with the next higher number, as often as necessary."""
     vehicle = Vehicle(
         encode(replace(REJECTED, emergency_stop=70)),
         encode(replace(REJECTED, emergency_stop=90)),

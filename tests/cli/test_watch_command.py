@@ -97,7 +97,7 @@ def test_a_stream_of_lavt(run: Run, port: int) -> None:
 
 
 def test_a_foreign_stream(run: Run, port: int) -> None:
-    """All stamps of a foreign sender are accepted, except the first, from which the base of timestamps is learned."""
+    """All stamps of a foreign sender are accepted, except the first four, from which the base is learned."""
     with sending(port, base=123_456_789):
         code, out, _ = run("--port", str(port), "--seconds", "1", "--json", "--sender", "foreign")
     kind, summary = parse_lines(out)[-1]

@@ -52,7 +52,7 @@ def capture(camera: Camera, number: int, at_ns: int) -> CapturedFrame:
 
 @pytest.mark.parametrize("name", sorted(RENDERERS))
 def test_rendered_pictures_are_byte_for_byte_reproducible(name: str) -> None:
-    """Two equal rendering cameras return equal pictures for equal inputs, each in a buffer of its own."""
+    """Two equal rendering cameras return equal pictures for equal inputs; no two pictures share a buffer."""
     camera, other_camera = RENDERERS[name](), RENDERERS[name]()
     other_camera.capture(1, 5, POSE)
     first, other, repeated = capture(camera, 7, 9), capture(other_camera, 7, 9), capture(camera, 7, 9)
@@ -71,7 +71,7 @@ def test_pictures_have_the_models_size(camera: Camera) -> None:
 
 @each_camera
 def test_a_frame_carries_its_number_and_its_capture_time_if_known(camera: Camera, name: str) -> None:
-    """A frame has the requested number; a rendered frame has the requested time, a frame from a file has none."""
+    """A frame has the requested number; only a rendered frame has the requested capture time, others have none."""
     frame = capture(camera, 4, 99)
     assert (frame.number, frame.capture_ns) == (4, 99 if name in RENDERERS else None)
 

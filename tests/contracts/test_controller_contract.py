@@ -26,7 +26,7 @@ every_controller = pytest.mark.parametrize(
 )
 
 
-def new(kind: str, preset: str) -> DriveController:
+def new_controller(kind: str, preset: str) -> DriveController:
     return make_controller(kind, PRESETS[preset], wheelbase_m=2.8448)
 
 
@@ -44,8 +44,8 @@ def test_decisions_are_in_range_and_reproducible(
     kind: str, preset: str, observations: list[tuple[Lane, float]]
 ) -> None:
     """Decisions are within the ranges of a command, and two new controllers decide equally on equal observations."""
-    decisions = decide(new(kind, preset), observations)
-    assert decisions == decide(new(kind, preset), observations)
+    decisions = decide(new_controller(kind, preset), observations)
+    assert decisions == decide(new_controller(kind, preset), observations)
     for decision in decisions:
         assert abs(decision.steering_rad) <= math.pi / 4
         assert 0 <= decision.throttle <= 1
@@ -62,7 +62,7 @@ def test_without_a_lane_there_is_no_throttle(kind: str, preset: str, speed_mps: 
         Lane(centre=(0.0, 0.0, 0.0), width_m=3.5, near_m=3.6, far_m=20.0, confidence=confidence)
         for confidence in (1.0, 0.0)
     )
-    for with_lane in ([], [(detected, speed_mps)]):
-        without_lane = [(undetected, speed_mps)] * 40
-        decisions = decide(new(kind, preset), with_lane + without_lane)[len(with_lane) :]
+    for earlier in ([], [(detected, speed_mps)]):
+        later = [(undetected, speed_mps)] * 40
+        decisions = decide(new_controller(kind, preset), earlier + later)[len(earlier) :]
         assert all(decision.throttle == 0 for decision in decisions)

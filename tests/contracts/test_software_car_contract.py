@@ -1,4 +1,4 @@
-"""The software car and its adapter share nothing but the bus."""
+"""Test that the software car and the by-wire adapter share no code that knows a message layout."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SHARED_MODULES = {
     "lavt.clock",
     "lavt.vehicle.ground_truth_wire",  # not sent over the bus
 }
-"""Modules that both may use. None of them contains the layout of a message."""
+"""Modules that both the software car and the adapter can use. No such module contains a message layout."""
 
 
 def python_files(package: str) -> set[Path]:

@@ -51,7 +51,7 @@ def run(vehicle: Vehicle, start_ns: int, actuation: Actuation, *, should_engage:
 
 @each_vehicle
 def test_state_times_and_wake_times(name: str) -> None:
-    """A state's time never decreases or exceeds the time of `advance`; the next wake time is later than this time."""
+    """A state's time never decreases and never exceeds the time of `advance`; the next wake is after the state."""
     vehicle = VEHICLES[name]()
     vehicle.advance(MONO_NS + 20 * NS_PER_MS)
     before_ns, latest_ms = vehicle.state().mono_ns, 20
@@ -116,7 +116,7 @@ def test_an_engaged_vehicle_follows_commands(name: str) -> None:
     assert (state.is_engaged, state.inhibit_reason, state.is_overridden, state.gear) == (True, "", False, "drive")
     run(vehicle, now_ns, Actuation(0.05, 0.5, 0.0), should_engage=True, seconds=2)
     state = vehicle.state()
-    assert 1.0 < state.speed_mps < 2.0, "1 m/s2 for 2 s, less the lags"
+    assert 1.0 < state.speed_mps < 2.0, "1 m/s2 for 2 s, minus the lags"
     assert state.steering_rad == pytest.approx(0.05, abs=0.002)
     truth = vehicle.ground_truth()
     assert truth is not None
@@ -125,7 +125,7 @@ def test_an_engaged_vehicle_follows_commands(name: str) -> None:
 
 @each_drivable
 def test_a_disengaged_vehicle_stays_stationary(name: str) -> None:
-    """A vehicle that is disengaged while driving, and braked, becomes stationary and stays so."""
+    """A driving vehicle that is disengaged and braked stops, and then remains stationary."""
     vehicle = DRIVABLE[name]()
     now_ns = run(vehicle, MONO_NS, BRAKE, should_engage=False, seconds=0.5)
     now_ns = run(vehicle, now_ns, BRAKE, should_engage=True, seconds=3)

@@ -24,7 +24,7 @@ ROAD = load_road("a_key")
 
 @dataclass
 class LaneKeepingDrive:
-    """The errors, speeds and events of a drive, and the last state of the lane watch."""
+    """The cross-track errors, speeds and events of a drive, and the last state of the lane watch."""
 
     cross_track_m: list[float]
     speeds_mps: list[float]
@@ -32,7 +32,7 @@ class LaneKeepingDrive:
     lane_state: LaneState
 
 
-def keep(picture: Picture) -> Picture:
+def unchanged(picture: Picture) -> Picture:
     return picture
 
 
@@ -51,10 +51,10 @@ def drive(
     *,
     delay_ns: int = 60 * NS_PER_MS,
     seconds: float = 28,
-    change: Callable[[Picture], Picture] = keep,
+    change: Callable[[Picture], Picture] = unchanged,
     change_after_s: float = 1e9,
 ) -> LaneKeepingDrive:
-    """Drive from standstill to an ending; `change` is applied to the pictures after `change_after_s`."""
+    """Drive from standstill for at most `seconds`, with `change` applied to the pictures after `change_after_s`."""
     car = Simulator(road=ROAD, seed=1, start_mono_ns=0)
     detector, watch = LaneDetector(MODEL), LaneWatch()
     controller = make_controller("lane_keeper", PRESETS[preset], wheelbase_m=car.capabilities.wheelbase_m)
@@ -96,7 +96,7 @@ def test_grey_pictures_lead_to_a_stop(renderer: Renderer) -> None:
 
 
 def test_mirrored_pictures_lead_out_of_the_lane(renderer: Renderer) -> None:
-    """With mirrored pictures the car turns the wrong way, which shows that it is steered from its pictures."""
+    """With mirrored pictures the car leaves its lane, because only the pictures steer the car."""
     result = drive(
         renderer,
         "designed",

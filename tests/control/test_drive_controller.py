@@ -58,13 +58,13 @@ def test_designed_limits_lateral_acceleration(speed_mps: float) -> None:
 
 
 def test_paper_calibrated_limits_the_wheel_angle() -> None:
-    """The paper_calibrated preset never exceeds 0.21 rad, which is 5.2 m/s2 at 30 km/h."""
+    """The paper_calibrated preset steers at most 0.21 rad: a lateral acceleration of 5.2 m/s2 at 30 km/h."""
     decision = lane_keeper(PRESETS["paper_calibrated"]).decide(lane(-4.0), SPEED_MPS, 0)
     assert decision.steering_rad == pytest.approx(-0.21)
 
 
-def test_the_first_lane_is_followed() -> None:
-    """The first lane is followed by the first decision."""
+def test_the_first_decision_follows_the_lane() -> None:
+    """The first decision already steers towards the lane and accelerates."""
     decision = lane_keeper().decide(lane(0.3), 0.0, 123)
     assert decision.steering_rad > 0
     assert decision.throttle == 1.0
@@ -137,7 +137,7 @@ def test_a_package_adds_a_controller_by_entry_point(monkeypatch: pytest.MonkeyPa
 
 
 def drive(pi: SpeedPi, seconds: float, speed_mps: float, slope_mps2: float = 0.0) -> list[float]:
-    """Return the speeds of a car with a lag of 0.2 s and a constant deceleration `slope_mps2`."""
+    """Return the speeds of a car whose acceleration lags by 0.2 s, on a slope that decelerates it by `slope_mps2`."""
     speeds, acceleration = [speed_mps], 0.0
     for _ in range(round(seconds * 30)):
         requested = pi.acceleration_mps2(SPEED_MPS, speeds[-1], 1 / 30)
@@ -147,7 +147,7 @@ def drive(pi: SpeedPi, seconds: float, speed_mps: float, slope_mps2: float = 0.0
 
 
 def test_the_target_speed_is_reached_without_overshoot() -> None:
-    """From standstill, the target speed is overshot by less than 0.1 m/s and held."""
+    """From standstill, the car exceeds the target speed by less than 0.1 m/s and then keeps it."""
     speeds = drive(SpeedPi(), 30, 0.0)
     assert max(speeds) < SPEED_MPS + 0.1
     assert speeds[-1] == pytest.approx(SPEED_MPS, abs=0.02)
@@ -168,10 +168,10 @@ def test_a_slope_is_compensated() -> None:
 
 def test_a_pause_is_not_integrated() -> None:
     """After a long pause one call integrates over at most 0.1 s."""
-    rested, fresh = SpeedPi(), SpeedPi()
-    rested.acceleration_mps2(SPEED_MPS, SPEED_MPS - 0.4, 100.0)
-    fresh.acceleration_mps2(SPEED_MPS, SPEED_MPS - 0.4, 0.1)
-    assert rested.acceleration_mps2(1.0, 1.0, 0.0) == fresh.acceleration_mps2(1.0, 1.0, 0.0)
+    after_pause, without_pause = SpeedPi(), SpeedPi()
+    after_pause.acceleration_mps2(SPEED_MPS, SPEED_MPS - 0.4, 100.0)
+    without_pause.acceleration_mps2(SPEED_MPS, SPEED_MPS - 0.4, 0.1)
+    assert after_pause.acceleration_mps2(1.0, 1.0, 0.0) == without_pause.acceleration_mps2(1.0, 1.0, 0.0)
 
 
 def test_slowing_down_is_gentle() -> None:
@@ -184,11 +184,11 @@ def test_slowing_down_is_gentle() -> None:
     [(1.0, (0.5, 0.0)), (5.0, (1.0, 0.0)), (-3.0, (0.0, 0.5)), (-9.0, (0.0, 1.0)), (0, (0, 0))],
 )
 def test_pedals(acceleration_mps2: float, expected: tuple[float, float]) -> None:
-    """Throttle is a share of the full acceleration, brake of the full braking, and one of them is 0."""
+    """Throttle is the share of full acceleration, brake is the share of full braking, and one of the two is 0."""
     assert pedals(acceleration_mps2) == expected
 
 
 @pytest.mark.parametrize(("confidence", "share"), [(1.0, 1.0), (0.5, 1.0), (0.3, 0.6), (0.0, 0.4)])
 def test_lower_confidence_lowers_the_speed(confidence: float, share: float) -> None:
-    """The speed is full down to a confidence of 0.5, lower in proportion below that, and never under 0.4 of it."""
+    """From a confidence of 0.5 the speed is full; at lower confidence it is reduced in proportion, to at least 0.4."""
     assert speed_for_confidence_mps(10.0, confidence) == pytest.approx(10 * share)

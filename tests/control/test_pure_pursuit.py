@@ -23,7 +23,7 @@ def lane(c0: float = 0.0, c1: float = 0.0, c2: float = 0.0) -> Lane:
 
 @pytest.mark.parametrize(("speed_mps", "expected_m"), [(0.0, 4.0), (2.0, 4.0), (8.0, 8.0), (30.0, 20.0)])
 def test_the_lookahead_grows_with_speed(speed_mps: float, expected_m: float) -> None:
-    """The lookahead grows with speed from 4 to 20 m."""
+    """The lookahead distance is proportional to the speed, but between 4 and 20 m."""
     assert lookahead_m(1.0, speed_mps) == expected_m
 
 
@@ -59,7 +59,7 @@ def test_a_lane_beyond_the_lookahead_is_approached_at_the_largest_curvature() ->
 
 
 def test_the_circle_leads_to_the_goal() -> None:
-    """A car that drives the pursuit curvature along its arc reaches the goal."""
+    """A car that drives along the arc of the pursuit curvature reaches the goal point."""
     curved_lane = lane(0.5, 0.1, 0.01)
     curvature = pursuit_curvature_per_m(curved_lane, 8.0)
     half_angle_rad = math.asin(curvature * 8.0 / 2)
@@ -82,7 +82,7 @@ def test_the_path_on_a_curve_has_its_curvature() -> None:
 
 
 def test_the_path_leads_back_to_the_lane() -> None:
-    """The path of a car 1 m off its lane and turned away leads to within 0.3 m of the centre."""
+    """The path of a car that is 1 m off its lane and turned away ends less than 0.3 m from the lane's centre."""
     offset_lane = lane(c0=-1.0, c1=-0.1)
     position, curvature = ORIGIN, pursuit_curvature_per_m(offset_lane, 6.0)
     for next_curvature in pursuit_path_per_m(offset_lane, 6.0, limit_per_m=1.0):
@@ -100,5 +100,5 @@ def test_the_path_keeps_to_the_limit() -> None:
 
 
 def test_move_along_arc() -> None:
-    """A quarter of a circle of 10 m ends 10 m ahead and 10 m to the left, turned by 90 degrees."""
+    """A quarter of a circle with a radius of 10 m ends 10 m ahead and 10 m to the left, turned by 90 degrees."""
     assert move_along_arc(ORIGIN, math.pi / 2 * 10, 0.1) == pytest.approx((10.0, 10.0, math.pi / 2))

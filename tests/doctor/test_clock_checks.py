@@ -46,6 +46,7 @@ def probes(delta_ms: float, *round_trips_ms: float) -> list[ClockProbe]:
 def compare_clocks(
     delta_ms: float = 250.0, *, reply: ProbeReply = REPLY, round_trip_ms: float = 0.3, **changes: Any
 ) -> ClockComparison:
+    """Compare the clocks with `GOOD`, changed, as the report both before and after the probing."""
     report = msgspec.structs.replace(GOOD, **changes)
     return compare(report, report, probes(delta_ms, 5.0, round_trip_ms, 9.0), reply, SERVER)
 
@@ -73,7 +74,7 @@ def test_a_source_without_an_estimate(status: str) -> None:
 
 
 def test_two_estimates_that_agree() -> None:
-    """The probe's estimate is from the shortest round trip; the bound of the source's estimate is that of its path."""
+    """The probe's bound comes from the shortest round trip, the sources' bound from NTP's path to the server."""
     finding = compare_clocks(250.02)
     assert finding.good
     assert finding.sources is not None
@@ -92,7 +93,7 @@ def test_a_client_that_follows_another_host() -> None:
 
 
 def test_a_clock_that_is_corrected_during_the_probing() -> None:
-    """The correction after the probing counts, and its change during the probing is added to the bound."""
+    """The estimate uses the correction after the probing; the bound includes its change during the probing."""
     before = msgspec.structs.replace(GOOD, correction_s=0.251)
     finding = compare(before, GOOD, probes(250.0, 0.3), REPLY, SERVER)
     assert finding.sources is not None
@@ -100,7 +101,7 @@ def test_a_clock_that_is_corrected_during_the_probing() -> None:
 
 
 def test_a_source_without_an_estimate_before_the_probing() -> None:
-    """If the time source has no estimate before the probing, Delta is the probe's, and a fix is suggested."""
+    """If the time source has no estimate before the probing, Delta is from the probe alone, and a fix is suggested."""
     before = ClockReport(0, 0, "desk", "chrony", status="chrony is not synchronised")
     finding = compare(before, GOOD, probes(250.0, 0.3), REPLY, SERVER)
     assert (finding.good, finding.sources) == (True, None)
@@ -108,7 +109,7 @@ def test_a_source_without_an_estimate_before_the_probing() -> None:
 
 
 def test_two_estimates_that_disagree() -> None:
-    """If two estimates differ by more than the sum of their bounds, the result is not good and has the difference."""
+    """If two estimates differ by more than the sum of their bounds, the result is not good and names the difference."""
     finding = compare_clocks(251.0)
     assert not finding.good
     assert "disagree" in finding.says[-1]
@@ -125,7 +126,7 @@ def test_ntp_through_delay() -> None:
 
 @pytest.mark.parametrize("lacking", ["client", "server"])
 def test_the_probe_alone(lacking: str) -> None:
-    """If one side's time source has no estimate, Delta is the probe's alone, and the result describes its bound."""
+    """If one side's time source has no estimate, Delta is from the probe alone, and the result explains its bound."""
     unknown: dict[str, Any] = {"correction_s": None, "bound_s": None, "status": "chrony is not installed"}
     reply = REPLY if lacking == "client" else msgspec.structs.replace(REPLY, correction_s=None, bound_s=None)
     finding = compare_clocks(reply=reply, **(unknown if lacking == "client" else {}))
@@ -136,7 +137,7 @@ def test_the_probe_alone(lacking: str) -> None:
 
 
 def test_a_probe_with_a_long_round_trip() -> None:
-    """From the probe alone, a round trip of 5 ms bounds Delta to 2.5 ms, which is not good enough."""
+    """Without time sources, a shortest round trip of 5 ms gives a bound of 2.5 ms, which is not good enough."""
     finding = compare_clocks(round_trip_ms=5.0, correction_s=None, bound_s=None)
     assert not finding.good
     assert "2.50 ms" in finding.says[-1]

@@ -36,6 +36,7 @@ class SyntheticDrive:
     drift: float = 20e-6
     bound_s: float | None = 0.0002
     corrected: bool = True
+    """False: the client's time source reports a correction of 0, as if the offset were 0."""
     server_host: str = "vehicle"
     client_host: str = "desk"
     ending: str | None = "completed"
@@ -81,7 +82,7 @@ class SyntheticDrive:
         return Now(CLIENT_MONO_NS + elapsed_ns, wall_ns + elapsed_ns + step_ns)
 
     def client_correction_s(self, at_ns: int) -> float:
-        """Return the correction of a perfect time source on the client, which does not notice a step in the drive."""
+        """Return the correction by a perfect time source of the client, except that it misses a step in the drive."""
         step_s = self.step_s if at_ns > self.stepped_s * NS_PER_S and self.stepped_s < 0 else 0.0
         return self.offset_s - step_s + self.drift * at_ns / NS_PER_S if self.corrected else 0.0
 
@@ -161,8 +162,8 @@ def write_frame(writer: RecordWriter, drive: SyntheticDrive, number: int) -> Non
         "keyframe": number % 30 == 0,
     }
     writer.write("frame", frame, now)
-    ends = (("capture", -1), ("stamp", 0), ("encode", 4), ("packetize", 5))
-    stages = [[name, now.mono_ns + milliseconds * NS_PER_MS] for name, milliseconds in ends]
+    stage_ends_ms = (("capture", -1), ("stamp", 0), ("encode", 4), ("packetize", 5))
+    stages = [[name, now.mono_ns + end_ms * NS_PER_MS] for name, end_ms in stage_ends_ms]
     timeline = {
         "node": "camera",
         "stamp_ns": now.wall_ns,
@@ -177,7 +178,7 @@ def write_admission(writer: RecordWriter, drive: SyntheticDrive, sequence: int, 
     sent_ns = read_ns + round(drive.client_ms * NS_PER_MS) + delay_ns
     received_ns = sent_ns + round(drive.tau_c_ms * NS_PER_MS)
     applied_ns = received_ns + round(drive.actuator_ms * NS_PER_MS)
-    rejected = sequence % 100 == 98  # even numbers are repeated commands, without which every loop latency is the same
+    rejected = sequence % 100 == 98  # an even number: a repeated command, so its rejection changes no loop latency
     admission: dict[str, Any] = {
         "epoch": 1,
         "sequence": sequence,
@@ -230,8 +231,8 @@ def write_client(drive: SyntheticDrive, path: Path) -> None:
         }
         writer.write("picture", picture, read_at)
         arrived_ns = read_at.mono_ns - 4 * NS_PER_MS
-        ends = (("reorder", 1), ("decode", 3), ("read_stamp", 4), ("lane", 6), ("control", 7))
-        stages = [[name, arrived_ns + milliseconds * NS_PER_MS] for name, milliseconds in ends]
+        stage_ends_ms = (("reorder", 1), ("decode", 3), ("read_stamp", 4), ("lane", 6), ("control", 7))
+        stages = [[name, arrived_ns + end_ms * NS_PER_MS] for name, end_ms in stage_ends_ms]
         timeline = {"node": "driver", "stamp_ns": stamp_ns, "channel": "access_unit", "arrived_mono_ns": arrived_ns}
         writer.write("timeline", {**timeline, "stages": stages}, read_at)
     writer.close()

@@ -121,6 +121,7 @@ def test_latencies_of_a_drive_are_true(
     assert finished_drive.result["delta"]["drift_ppm"] == pytest.approx(30, abs=5)
     assert finished_drive.measured.closure_p95_ms is not None
     assert finished_drive.measured.closure_p95_ms < 1
+    assert 0 < finished_drive.result["tau_c_ms"]["p50"] < 50, "an offset of 250 ms would show"
     truth.check_drive(finished_drive)
 
 

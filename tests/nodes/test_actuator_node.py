@@ -89,37 +89,38 @@ class Bench:
         self.epoch = reply.epoch or self.epoch
         return reply
 
-    def picture(self) -> int:
+    def report_frame(self) -> int:
         """Report a sent frame to the node, as the camera does, and return its stamp."""
         stamp_ns = at(self.mono_ns).wall_ns
         number = self.mono_ns // NS_PER_MS
         self.deliver("frame", FrameWritten(number, stamp_ns, at(self.mono_ns).mono_ns, None, number, 1))
         return stamp_ns
 
-    def command(self, **changes: Any) -> Admission:
+    def send_command(self, **changes: Any) -> Admission:
         """Send an arm command from a new frame, changed by `changes`, and return the gate's verdict."""
         self.sequence += 1
-        command = replace(ARM, epoch=self.epoch, sequence=self.sequence, stamp_ns=self.picture())
+        command = replace(ARM, epoch=self.epoch, sequence=self.sequence, stamp_ns=self.report_frame())
         (admission,) = payloads(self.deliver("control", encode(replace(command, **changes))), "admission")
         assert isinstance(admission, Admission)
         return admission
 
-    def drive(self, **changes: Any) -> Admission:
-        return self.command(**{"mode": "drive", "throttle": 0.5, "brake": 0.0, **changes})
+    def send_drive_command(self, **changes: Any) -> Admission:
+        return self.send_command(**{"mode": "drive", "throttle": 0.5, "brake": 0.0, **changes})
 
     @property
     def safety(self) -> str:
         return self.gate.state
 
-    def armed(self) -> Bench:
+    def arm(self) -> Bench:
+        """Acquire control, arm the vehicle, and return this bench."""
         self.request("acquire")
         for _ in range(51):
             self.advance(PERIOD_NS)
-            self.command()
+            self.send_command()
         assert self.gate.state == "driving"
         return self
 
-    def events(self, kind: str) -> list[str]:
+    def event_details(self, kind: str) -> list[str]:
         return [event.detail for event in payloads(self.sends, "event") if event.kind == kind]
 
 
@@ -135,8 +136,8 @@ def test_the_state_is_published_50_times_a_second() -> None:
 @pytest.mark.parametrize(("waited_ns", "accepted"), [(0, True), (LIMITS.picture_age_limit_ns, False)])
 def test_the_age_of_a_picture_is_judged_when_its_command_is_applied(waited_ns: int, accepted: bool) -> None:
     """A command that waits in a stalled process until its picture is too old is rejected, though it arrived in time."""
-    bench = Bench().armed()
-    stamp_ns = bench.picture()
+    bench = Bench().arm()
+    stamp_ns = bench.report_frame()
     bench.sequence += 1
     command = replace(DRIVE, epoch=bench.epoch, sequence=bench.sequence, stamp_ns=stamp_ns)
     arrived = at(bench.mono_ns + 200 * NS_PER_MS)
@@ -164,14 +165,14 @@ def test_a_late_node_publishes_one_state_and_reports_late_physics() -> None:
     bench = Bench()
     bench.mono_ns = NS_PER_S
     assert len(payloads(bench.deliver(WAKE, None), "state")) == 1
-    assert bench.events("late") == ["995 ms"], "the first physics step was due after 1/240 s"
+    assert bench.event_details("late") == ["995 ms"], "the first physics step was due after 1/240 s"
     assert bench.node.next_wake_ns() > at(NS_PER_S).mono_ns
 
 
 def test_an_accepted_command_is_recorded_completely() -> None:
     """The record of an accepted command has its content, its times and the limits that changed it."""
-    bench = Bench().armed()
-    admission = bench.drive(steering_rad=0.4)
+    bench = Bench().arm()
+    admission = bench.send_drive_command(steering_rad=0.4)
     now = at(bench.mono_ns)
     assert admission == Admission(
         epoch=bench.epoch,
@@ -196,21 +197,21 @@ def test_an_accepted_command_is_recorded_completely() -> None:
 
 def test_a_rejected_command_is_recorded_and_not_applied() -> None:
     """A rejected command is recorded with its reason, reported in the state and not applied."""
-    bench = Bench().armed()
-    before = len(bench.vehicle.applied)
-    admission = bench.drive(epoch=99)
+    bench = Bench().arm()
+    applied_before = len(bench.vehicle.applied)
+    admission = bench.send_drive_command(epoch=99)
     assert (admission.verdict, admission.reason) == ("rejected", RejectionReason.WRONG_EPOCH)
     assert admission.applied_mono_ns is None
-    assert len(bench.vehicle.applied) == before
+    assert len(bench.vehicle.applied) == applied_before
     (state,) = [decode(State, payload) for payload in payloads(bench.advance(PERIOD_NS), "state")]
     assert state.rejected == RejectionReason.WRONG_EPOCH
 
 
-def test_a_command_is_judged_by_its_arrival() -> None:
-    """The gate checks a command at the time of its arrival on the host; its time in the node's queue does not count."""
-    bench = Bench().armed()
+def test_arrival_and_application_are_recorded() -> None:
+    """The record of a command has the time of its arrival on the host and that of its application."""
+    bench = Bench().arm()
     arrived = at(bench.mono_ns)
-    stamp_ns = bench.picture()
+    stamp_ns = bench.report_frame()
     bench.mono_ns += 10 * NS_PER_MS
     command = replace(DRIVE, epoch=bench.epoch, sequence=999, stamp_ns=stamp_ns)
     (admission,) = payloads(bench.deliver("control", encode(command), arrived=arrived), "admission")
@@ -218,8 +219,8 @@ def test_a_command_is_judged_by_its_arrival() -> None:
 
 
 def test_without_drive_commands_the_vehicle_does_not_move_and_stops() -> None:
-    """Armed without drive commands, the vehicle gets no throttle, degrades at 300 ms and stops at 500 ms."""
-    bench = Bench().armed()
+    """An armed vehicle without drive commands gets no throttle, is degraded after 300 ms and stops after 500 ms."""
+    bench = Bench().arm()
     bench.advance(299 * NS_PER_MS)
     assert bench.safety == "driving"
     bench.advance(NS_PER_MS)
@@ -231,11 +232,11 @@ def test_without_drive_commands_the_vehicle_does_not_move_and_stops() -> None:
 
 def test_a_drive_begins_and_ends_exactly_once() -> None:
     """A drive begins when the vehicle is armed, and ends once: with the first event that ends a drive."""
-    bench = Bench().armed()
-    bench.drive()
+    bench = Bench().arm()
+    bench.send_drive_command()
     bench.vehicle.speed_mps = 8.0
     bench.advance(300 * NS_PER_MS)
-    bench.drive()
+    bench.send_drive_command()
     assert bench.safety == "driving"
     bench.vehicle.next_events = [VehicleEvent(1, "lane_invasion", "left"), VehicleEvent(2, "completed", "")]
     bench.advance(PERIOD_NS)
@@ -243,36 +244,36 @@ def test_a_drive_begins_and_ends_exactly_once() -> None:
     bench.vehicle.next_events = [VehicleEvent(3, "collision", "")]
     bench.vehicle.speed_mps = 0.0
     bench.advance(NS_PER_S)
-    assert (bench.events("drive_began"), bench.events("ending")) == ([""], ["completed"])
-    assert bench.events("lane_invasion") == ["left"]
+    assert (bench.event_details("drive_began"), bench.event_details("ending")) == ([""], ["completed"])
+    assert bench.event_details("lane_invasion") == ["left"]
 
 
 def test_a_safe_stop_ends_the_drive_at_standstill() -> None:
     """A safe stop ends the drive at standstill; arming again begins a new drive."""
-    bench = Bench().armed()
+    bench = Bench().arm()
     bench.vehicle.speed_mps = 8.0
     bench.advance(NS_PER_S)
-    assert bench.events("ending") == []
+    assert bench.event_details("ending") == []
     bench.vehicle.speed_mps = 0.0
     bench.advance(NS_PER_S)
-    assert bench.events("ending") == ["safe_stop"]
-    bench.armed()
-    assert len(bench.events("drive_began")) == 2
+    assert bench.event_details("ending") == ["safe_stop"]
+    bench.arm()
+    assert len(bench.event_details("drive_began")) == 2
 
 
 @pytest.mark.parametrize(("after_collision", "endings"), [("end", ["collision"]), ("continue", ["completed"])])
 def test_whether_a_collision_ends_the_drive_is_a_setting(
     after_collision: Literal["end", "continue"], endings: list[str]
 ) -> None:
-    """With `after_collision: continue`, collisions are reported and the drive ends by a later event."""
-    bench = Bench(after_collision=after_collision).armed()
+    """A collision ends the drive; with `after_collision: continue` it is only reported."""
+    bench = Bench(after_collision=after_collision).arm()
     kinds: tuple[EventKind, ...] = ("collision", "collision", "completed")
     for mono_ns, kind in enumerate(kinds):
-        bench.drive()
+        bench.send_drive_command()
         bench.vehicle.next_events = [VehicleEvent(mono_ns, kind, "")]
         bench.advance(PERIOD_NS)
-    assert bench.events("ending") == endings
-    assert len(bench.events("collision")) == 2
+    assert bench.event_details("ending") == endings
+    assert len(bench.event_details("collision")) == 2
 
 
 def test_an_event_before_the_drive_ends_no_drive() -> None:
@@ -280,12 +281,12 @@ def test_an_event_before_the_drive_ends_no_drive() -> None:
     bench = Bench()
     bench.vehicle.next_events = [VehicleEvent(1, "collision", "hit from behind")]
     bench.advance(PERIOD_NS)
-    assert bench.events("collision") == ["hit from behind"]
-    assert bench.events("ending") == []
+    assert bench.event_details("collision") == ["hit from behind"]
+    assert bench.event_details("ending") == []
 
 
 def test_the_token_goes_to_the_camera_when_it_changes() -> None:
-    """The camera gets a new token once when control is acquired, and none when it is released."""
+    """The camera gets the new token once when control is acquired, and None when control is released."""
     bench = Bench()
     bench.request("acquire")
     bench.request("acquire")
@@ -296,19 +297,19 @@ def test_the_token_goes_to_the_camera_when_it_changes() -> None:
 
 def test_transitions_and_requests_are_events() -> None:
     """Each safety transition and each session request is recorded as an event."""
-    bench = Bench().armed()
+    bench = Bench().arm()
     assert bench.request("emergency_stop", 5).granted
-    assert [detail.split(":")[0] for detail in bench.events("safety")] == [
+    assert [detail.split(":")[0] for detail in bench.event_details("safety")] == [
         "disarmed -> arming",
         "arming -> driving",
         "driving -> emergency_stop",
     ]
-    assert bench.events("session") == ["acquire by alice granted", "emergency_stop by alice granted"]
+    assert bench.event_details("session") == ["acquire by alice granted", "emergency_stop by alice granted"]
 
 
-def test_frozen_pictures_stop_the_vehicle_though_they_change_again() -> None:
+def test_frozen_pictures_stop_the_vehicle_even_if_they_change_again() -> None:
     """Five equal pictures stop the vehicle even if a different one follows before the next wake."""
-    bench = Bench().armed()
+    bench = Bench().arm()
     for number in range(6):
         stamp_ns = at(bench.mono_ns).wall_ns + number
         crc = -1 if number < 5 else 7
@@ -341,7 +342,7 @@ def states(sends: list[Send]) -> list[State]:
 
 def test_the_state_names_operator_and_requester() -> None:
     """The state names the active operator and the client that requests control, until that request expires."""
-    bench = Bench().armed()
+    bench = Bench().arm()
     bench.deliver("session", encode(SessionRequest("request_handover", "bob", 7, 0)), peer="query")
     reported = states(bench.advance(2 * NS_PER_S))
     assert {(state.active_operator, state.requested_by) for state in reported} == {("alice", "bob")}
@@ -350,8 +351,8 @@ def test_the_state_names_operator_and_requester() -> None:
 
 def test_a_rejection_is_reported_for_1_s() -> None:
     """The state contains the last rejection reason for 1 s."""
-    bench = Bench().armed()
-    bench.drive(epoch=99)
+    bench = Bench().arm()
+    bench.send_drive_command(epoch=99)
     assert {state.rejected for state in states(bench.advance(NS_PER_S - PERIOD_NS))} == {RejectionReason.WRONG_EPOCH}
     assert {state.rejected for state in states(bench.advance(3 * PERIOD_NS))[-1:]} == {""}
 
@@ -359,11 +360,11 @@ def test_a_rejection_is_reported_for_1_s() -> None:
 @pytest.mark.parametrize("letter", ["a", "ä"])
 def test_a_state_with_a_long_inhibit_reason_is_readable(letter: str) -> None:
     """However long the inhibit reason is, clients can read the state, which contains the reason's beginning."""
-    bench = Bench().armed()
+    bench = Bench().arm()
     bench.vehicle.inhibit_reason = 300 * letter
     bench.advance(PERIOD_NS)
     bench.request("acquire")
-    bench.command()
+    bench.send_command()
     for state in states(bench.advance(2 * PERIOD_NS)):
         assert state.safety == "safe_stop"
         assert state.reason.endswith(20 * letter + ELLIPSIS)
@@ -376,7 +377,7 @@ def test_a_state_with_a_long_inhibit_reason_is_readable(letter: str) -> None:
 def test_any_vehicle_state_is_readable(speed_mps: float, steering_rad: float) -> None:
     """A state is readable whatever speed and angle the vehicle reports.
 
-    Values within the range of a state are published unchanged, any others as the range's nearest end.
+    A value within the range of a state is published unchanged, any other value as the nearest end of the range.
     """
     bench = Bench()
     bench.vehicle.speed_mps, bench.vehicle.steering_rad = speed_mps, steering_rad
@@ -389,7 +390,7 @@ def test_any_vehicle_state_is_readable(speed_mps: float, steering_rad: float) ->
 @pytest.mark.parametrize("speed_mps", [math.nan, math.inf])
 def test_a_speed_that_is_no_number_stops_and_is_reported(speed_mps: float) -> None:
     """A speed that is not finite leads to a safe stop whose reason is readable, and is not published as standstill."""
-    bench = Bench().armed()
+    bench = Bench().arm()
     bench.vehicle.speed_mps = speed_mps
     state = decode(State, payloads(bench.advance(2 * PERIOD_NS), "state")[-1])
     assert (state.safety, state.speed_mps) == ("safe_stop", 100.0)
@@ -398,7 +399,7 @@ def test_a_speed_that_is_no_number_stops_and_is_reported(speed_mps: float) -> No
 
 def test_a_server_shutdown_stops_the_vehicle_and_ends_the_drive() -> None:
     """A server shutdown stops the vehicle, ends control, closes the video path and ends the drive."""
-    bench = Bench().armed()
+    bench = Bench().arm()
     bench.vehicle.speed_mps = 5.0
     sends = bench.deliver("server_ends", None)
     assert payloads(sends, "video_token") == [None]
@@ -408,7 +409,7 @@ def test_a_server_shutdown_stops_the_vehicle_and_ends_the_drive() -> None:
     assert bench.vehicle.applied[-1].brake > 0
     bench.vehicle.speed_mps = 0.0
     bench.advance(PERIOD_NS)
-    assert bench.events("ending") == ["safe_stop"]
+    assert bench.event_details("ending") == ["safe_stop"]
 
 
 def test_the_vehicle_is_engaged_from_arming_to_standstill() -> None:
@@ -416,8 +417,8 @@ def test_the_vehicle_is_engaged_from_arming_to_standstill() -> None:
     bench = Bench()
     bench.advance(PERIOD_NS)
     assert not bench.vehicle.is_engage_requested
-    bench.armed()
-    bench.drive()
+    bench.arm()
+    bench.send_drive_command()
     assert bench.vehicle.is_engage_requested
     bench.vehicle.speed_mps = 5.0
     bench.advance(NS_PER_S)
@@ -429,14 +430,14 @@ def test_the_vehicle_is_engaged_from_arming_to_standstill() -> None:
 
 def test_commands_that_reached_the_wheels_are_recorded() -> None:
     """Each command that reached the wheels is recorded once, with its sequence number and stamp."""
-    bench = Bench().armed()
-    first, second = bench.drive(), bench.drive(steering_rad=0.1)
+    bench = Bench().arm()
+    first, second = bench.send_drive_command(), bench.send_drive_command(steering_rad=0.1)
     assert first.applied_mono_ns is not None
     bench.advance(PERIOD_NS)
     applied_ns, reached_ns = second.applied_mono_ns or 0, at(bench.mono_ns).mono_ns
     bench.vehicle.reached = [ReachedCommand(applied_ns + 1, reached_ns)]  # no command was applied at this time
     assert payloads(bench.advance(PERIOD_NS), "wheel") == []
-    third = bench.drive()
+    third = bench.send_drive_command()
     bench.vehicle.reached = [ReachedCommand(third.applied_mono_ns or 0, reached_ns)] * 2
     reported = payloads(bench.advance(PERIOD_NS), "wheel")
     assert reported == [AtWheel(third.sequence, third.stamp_ns, third.applied_mono_ns or 0, reached_ns)]

@@ -42,16 +42,16 @@ KEYFRAME_START = b"\x00\x00\x01\x65"
 """The start code and header of a NAL unit that only keyframes contain."""
 
 
-def node_with(camera: Camera | None = None, *, send_to: tuple[tuple[str, int], ...] = ()) -> CameraNode:
+def new_node(camera: Camera | None = None, *, send_to: tuple[tuple[str, int], ...] = ()) -> CameraNode:
     numbers = count()
     model = SMALL_CAMERA if camera is None else camera.model
-    pictures = VideoSender(
+    video_sender = VideoSender(
         Encoder(model.width_px, model.height_px, rate_hz=30, bit_rate_bps=2_000_000, gop_frames=1000)
     )
     path = PathServer(lambda: next(numbers).to_bytes(32, "big"))
     return CameraNode(
         camera or NoiseCamera(),
-        pictures,
+        video_sender,
         StreamSender(Packetizer(2, 0), RepairSender(3, 0)),
         path,
         start_ns=MONO_NS,
@@ -71,7 +71,7 @@ def validate_path(node: CameraNode, address: tuple[str, int] = HOME, mono_ns: in
 
 def test_a_frame_is_sent_reported_and_recorded() -> None:
     """A frame is sent as packets with its RTP timestamp and reported with its stamp and size."""
-    node = node_with(send_to=(HOME,))
+    node = new_node(send_to=(HOME,))
     sends = wake(node, 0, wall_ns=123_456_789)
     (frame,) = payloads(sends, "frame")
     (unit,) = payloads(sends, "video")
@@ -84,7 +84,7 @@ def test_a_frame_is_sent_reported_and_recorded() -> None:
 
 def test_a_frame_is_reported_before_its_first_packet() -> None:
     """A frame is reported to the safety gate before its first packet is sent."""
-    sends = wake(node_with(send_to=(HOME,)), 0)
+    sends = wake(new_node(send_to=(HOME,)), 0)
 
     assert sends[0].channel == "frame"
     assert sends[1].channel == "rtp"
@@ -93,7 +93,7 @@ def test_a_frame_is_reported_before_its_first_packet() -> None:
 def test_a_late_wake_skips_frames_and_counts_them() -> None:
     """A late wake captures the newest due frame at its due time, and counts the skipped ones."""
     camera = NoiseCamera(phase_ns=5)
-    node = node_with(camera)
+    node = new_node(camera)
     assert node.next_wake_ns() == MONO_NS + 5
     wake(node, 5)
     wake(node, 4 * FRAME_NS + 10 * NS_PER_MS)
@@ -108,7 +108,7 @@ def test_a_late_wake_skips_frames_and_counts_them() -> None:
 def test_the_newest_pose_before_the_capture_is_used() -> None:
     """A frame is rendered from the newest pose that is not later than its due time."""
     camera = NoiseCamera()
-    node = node_with(camera)
+    node = new_node(camera)
     poses = [Pose(MONO_NS + offset_ns, 0.0, 0.0, 0.0) for offset_ns in (-5, -1, 0, 1, 7)]
     for pose in poses:
         deliver(node, "pose", pose, at(10))
@@ -119,7 +119,7 @@ def test_the_newest_pose_before_the_capture_is_used() -> None:
 def test_a_later_pose_is_not_used() -> None:
     """Poses later than the due time are not used."""
     camera = NoiseCamera()
-    node = node_with(camera)
+    node = new_node(camera)
     deliver(node, "pose", Pose(MONO_NS + 1, 0.0, 0.0, 0.0), at(2))
     wake(node, 2)
     assert camera.captures[0][2] is None
@@ -127,8 +127,8 @@ def test_a_later_pose_is_not_used() -> None:
 
 @pytest.mark.parametrize("wall_times_ns", [[7] * 6, [7, 7, 8, 7, 8, 9], [1000, 1001, 1002, 1000, 1001, 1002]])
 def test_no_stamp_is_issued_twice(wall_times_ns: list[int]) -> None:
-    """Each frame has its own stamp, also if the wall clock stands still or is stepped back."""
-    node = node_with()
+    """No two frames have the same stamp, even if the wall clock stands still or is set back."""
+    node = new_node()
     stamps = [
         payloads(wake(node, i * 2 * FRAME_NS, wall_ns), "frame")[0].stamp_ns for i, wall_ns in enumerate(wall_times_ns)
     ]
@@ -139,21 +139,21 @@ def test_no_stamp_is_issued_twice(wall_times_ns: list[int]) -> None:
     )
 
 
-@pytest.mark.parametrize(("stuck", "fault"), [(True, True), (False, False)])
-def test_a_repeated_buffer_is_frozen(*, stuck: bool, fault: bool) -> None:
-    """A camera that repeats the same buffer is frozen at the fifth frame."""
-    node = node_with(NoiseCamera(stuck=noise(0) if stuck else None))
+@pytest.mark.parametrize("is_stuck", [True, False])
+def test_a_camera_that_repeats_a_picture_is_frozen(*, is_stuck: bool) -> None:
+    """After five frames, a camera that repeats one picture is recognized as frozen; a working one is not."""
+    node = new_node(NoiseCamera(stuck=noise(0) if is_stuck else None))
     stamps = IssuedStamps(5 * NS_PER_S, 5)
     for number in range(5):
         assert not stamps.is_frozen
         (frame,) = payloads(wake(node, number * FRAME_NS + NS_PER_MS), "frame")
         stamps.add(frame.stamp_ns, frame.number, frame.stamped_mono_ns, frame.pixel_crc)
-    assert stamps.is_frozen == fault
+    assert stamps.is_frozen == is_stuck
 
 
 def test_a_missing_picture_is_counted_and_not_sent() -> None:
     """A frame without a picture is counted and not sent, and the next frame is captured in time."""
-    node = node_with(NoiseCamera(broken=True), send_to=(HOME,))
+    node = new_node(NoiseCamera(broken=True), send_to=(HOME,))
     assert wake(node, 0) == []
     assert node.counts["frames_missing"] == 1
     assert node.next_wake_ns() == MONO_NS + round(NS_PER_S / 30)
@@ -161,7 +161,7 @@ def test_a_missing_picture_is_counted_and_not_sent() -> None:
 
 def test_no_video_without_a_validated_path() -> None:
     """Video is sent only to a validated address, and only while reports arrive from this address."""
-    node = node_with()
+    node = new_node()
     assert payloads(wake(node, 0), "rtp") == []
     assert deliver(node, "feedback", PathClient(TOKEN).hello(0), at(1), HOME) == []
     deliver(node, "video_token", TOKEN, at(1))
@@ -174,7 +174,7 @@ def test_no_video_without_a_validated_path() -> None:
 
 def test_configured_receivers_get_video_without_validation() -> None:
     """`send_to` addresses get every frame, in addition to the validated address."""
-    node = node_with(send_to=(ELSEWHERE,))
+    node = new_node(send_to=(ELSEWHERE,))
     deliver(node, "video_token", TOKEN, at(0))
     validate_path(node)
     assert {send.peer for send in wake(node, 0) if send.channel == "rtp"} == {HOME, ELSEWHERE}
@@ -182,7 +182,7 @@ def test_configured_receivers_get_video_without_validation() -> None:
 
 def test_keyframe_requests_are_rate_limited() -> None:
     """There is at most one requested keyframe in 100 ms."""
-    node = node_with()
+    node = new_node()
     deliver(node, "video_token", TOKEN, at(0))
     validate_path(node)
     are_keyframes = []
@@ -197,7 +197,7 @@ def test_keyframe_requests_are_rate_limited() -> None:
 
 def test_bit_rate_changes_are_rate_limited() -> None:
     """The bit rate changes at most once in 100 ms, because each change restarts the encoder, which sends a keyframe."""
-    node = node_with()
+    node = new_node()
     deliver(node, "video_token", TOKEN, at(0))
     validate_path(node)
     keyframes = 0
@@ -211,7 +211,7 @@ def test_bit_rate_changes_are_rate_limited() -> None:
 
 def test_other_addresses_have_no_effect() -> None:
     """RTCP and hellos from other addresses have no effect."""
-    node = node_with()
+    node = new_node()
     deliver(node, "video_token", TOKEN, at(0))
     validate_path(node)
     wake(node, 0)
@@ -228,7 +228,7 @@ def test_other_addresses_have_no_effect() -> None:
 
 def test_reports_keep_the_path_open_and_garbage_is_counted() -> None:
     """Receiver reports keep the video path open; unreadable RTCP is counted."""
-    node = node_with()
+    node = new_node()
     deliver(node, "video_token", TOKEN, at(0))
     validate_path(node)
     for number in range(10):
@@ -242,14 +242,14 @@ def test_reports_keep_the_path_open_and_garbage_is_counted() -> None:
 
 def report_heavy_loss(node: CameraNode, at_ns: int) -> None:
     """Report to the node that 30 of 100 packets were lost."""
-    for highest, lost in ((1000, 0), (1100, 30)):
-        report = receiver_report(1, ReceptionReport(2, highest, lost / 100, lost, 0), clock_ns=at_ns)
+    for highest_sequence, lost in ((1000, 0), (1100, 30)):
+        report = receiver_report(1, ReceptionReport(2, highest_sequence, lost / 100, lost, 0), clock_ns=at_ns)
         deliver(node, "feedback", report, at(at_ns), HOME)
 
 
 def test_repair_packets_go_to_the_validated_address_only() -> None:
     """Repair packets are sent after reported loss, to the validated address only."""
-    node = node_with(send_to=(ELSEWHERE,))
+    node = new_node(send_to=(ELSEWHERE,))
     deliver(node, "video_token", TOKEN, at(0))
     validate_path(node)
     report_heavy_loss(node, NS_PER_MS)
@@ -265,7 +265,7 @@ def test_repair_packets_go_to_the_validated_address_only() -> None:
 
 def test_a_sender_report_is_sent_every_500_ms() -> None:
     """A sender report every 500 ms maps wall time to RTP timestamps."""
-    node = node_with(send_to=(ELSEWHERE,))
+    node = new_node(send_to=(ELSEWHERE,))
     reports = []
     for number in range(46):
         sends = wake(node, number * (FRAME_NS + 1))
@@ -279,35 +279,35 @@ def test_a_sender_report_is_sent_every_500_ms() -> None:
 
 def test_the_receiver_may_request_a_lower_bit_rate() -> None:
     """A requested lower bit rate is applied; a higher one, or one from another address, is not."""
-    node = node_with()
+    node = new_node()
     deliver(node, "video_token", TOKEN, at(0))
     validate_path(node)
 
-    def mean_bytes(begin: int) -> float:
-        """Return the mean frame size once the rate has settled; REPORT keeps the path open."""
+    def mean_frame_bytes(first_number: int) -> float:
+        """Send 40 frames and return the mean size of the last 30, at a settled rate; REPORT keeps the path open."""
         sizes: list[int] = []
-        for number in range(begin, begin + 40):
+        for number in range(first_number, first_number + 40):
             deliver(node, "feedback", REPORT, at(number * FRAME_NS), HOME)
             sizes += [frame.size_bytes for frame in payloads(wake(node, number * FRAME_NS + NS_PER_MS), "frame")]
         return sum(sizes[10:]) / 30
 
-    configured_rate_bytes = mean_bytes(0)
+    configured_rate_bytes = mean_frame_bytes(0)
     deliver(node, "feedback", max_bit_rate(1, 2, 500_000, overhead_bytes=0), at(41 * FRAME_NS), HOME)
-    assert mean_bytes(42) < 0.5 * configured_rate_bytes
+    assert mean_frame_bytes(42) < 0.5 * configured_rate_bytes
     deliver(node, "feedback", max_bit_rate(1, 2, 9_000_000, overhead_bytes=0), at(90 * FRAME_NS), HOME)
-    assert mean_bytes(91) == pytest.approx(configured_rate_bytes, rel=0.2)
+    assert mean_frame_bytes(91) == pytest.approx(configured_rate_bytes, rel=0.2)
     deliver(node, "feedback", max_bit_rate(1, 2, 500_000, overhead_bytes=0), at(140 * FRAME_NS), ELSEWHERE)
-    assert mean_bytes(141) == pytest.approx(configured_rate_bytes, rel=0.2)
+    assert mean_frame_bytes(141) == pytest.approx(configured_rate_bytes, rel=0.2)
 
 
 def test_pictures_of_a_video_device_are_sent(tmp_path: Path) -> None:
-    """The pictures of a video device are sent once each, with their content and stamp."""
+    """Each picture of a video device is sent at most once, with its content and stamp."""
     path = write_video(tmp_path / "video.avi", rate_hz=30.0)
     receiver = VideoReceiver(Decoder(), (MOVING.height_px, MOVING.width_px))
     numbers = []
     clock = ManualClock(MONO_NS)
     with closing(VideoDevice(str(path), model=MOVING, rate_hz=30.0, clock=clock)) as device:
-        node = node_with(device)
+        node = new_node(device)
         for number in range(4):
             clock.mono_ns = MONO_NS + number * FRAME_NS
             assert device.wait(20.0)
@@ -326,7 +326,7 @@ def test_a_lost_video_device_is_counted(tmp_path: Path) -> None:
     device = VideoDevice(str(path), model=MOVING, rate_hz=30.0, clock=ManualClock(MONO_NS))
     path.unlink()
     with closing(device):
-        node = node_with(device)
+        node = new_node(device)
         (frame,) = payloads(wake(node, 0), "frame")
         end_ns = clock.now().mono_ns + 20 * NS_PER_S
         while not node.counts.get("camera_times_lost") and clock.now().mono_ns < end_ns:

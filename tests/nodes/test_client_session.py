@@ -6,8 +6,10 @@ from msgspec.structs import replace
 from lavt.domain import NS_PER_S, Now, SafetyState, SessionReply, State
 from lavt.nodes.client_session import ClientSession
 
-GRANTED = SessionReply(True, "", 5, bytes(16), 5600, "kernel", 0)
-REJECTED = SessionReply(False, "bob has control", 0, b"", 5600, "kernel", emergency_stop=70)
+GRANTED = SessionReply(
+    granted=True, reason="", epoch=5, token=bytes(16), video_port=5600, host="kernel", emergency_stop=0
+)
+REJECTED = replace(GRANTED, granted=False, reason="bob has control", epoch=0, token=b"", emergency_stop=70)
 
 
 def new_session(*, rearm: bool = False) -> ClientSession:
@@ -33,7 +35,7 @@ def state(safety: SafetyState, speed_mps: float = 0.0) -> State:
     return State(1, 1, speed_mps, 0.0, "drive", safety, "reason", -1, "")
 
 
-def driving(*, rearm: bool = False) -> ClientSession:
+def driving_session(*, rearm: bool = False) -> ClientSession:
     session = new_session(rearm=rearm)
     session.handle_reply(GRANTED, 200)
     session.handle_state(state("driving"), 300)
@@ -63,24 +65,24 @@ def test_a_new_epoch_while_arming() -> None:
     """A new epoch during arming replaces the old one."""
     session = new_session()
     session.handle_reply(GRANTED, 200)
-    session.handle_reply(SessionReply(True, "", 6, bytes(16), 5600, "kernel", 0), 300)
+    session.handle_reply(replace(GRANTED, epoch=6), 300)
     assert session.epoch == 6
 
 
 def test_a_grant_without_an_epoch_changes_nothing() -> None:
     """A granted reply without an epoch, as to an emergency stop, does not change control."""
     session = new_session()
-    session.handle_reply(SessionReply(True, "", 0, b"", 5600, "kernel", 3), 200)
+    session.handle_reply(replace(GRANTED, epoch=0, token=b"", emergency_stop=3), 200)
     assert (session.phase, session.may_command) == ("seeking", False)
-    session = driving()
-    session.handle_reply(SessionReply(True, "", 0, b"", 5600, "kernel", 3), 200)
+    session = driving_session()
+    session.handle_reply(replace(GRANTED, epoch=0, token=b"", emergency_stop=3), 200)
     assert session.epoch == 5
 
 
 @pytest.mark.parametrize("safety", ["disarmed", "safe_stop", "emergency_stop"])
 def test_a_stopped_vehicle_stays_stopped(safety: SafetyState) -> None:
     """After a stop the client sends neither commands nor requests."""
-    session = driving()
+    session = driving_session()
     session.handle_state(state("degraded"), 400)
     assert session.phase == "driving"
     session.handle_state(state(safety), 500)
@@ -91,7 +93,7 @@ def test_a_stopped_vehicle_stays_stopped(safety: SafetyState) -> None:
 
 def test_rearm_requests_control_again_at_standstill() -> None:
     """With `rearm`, control is requested again once the stopped vehicle is stationary."""
-    session = driving(rearm=True)
+    session = driving_session(rearm=True)
     session.handle_state(state("safe_stop", 3.0), 500)
     session.handle_state(state("safe_stop", 2.0), 600)
     assert session.next_wake_ns() is None
@@ -102,8 +104,8 @@ def test_rearm_requests_control_again_at_standstill() -> None:
 
 @pytest.mark.parametrize("stopped", [False, True])
 def test_rearm_respects_a_driver_override(stopped: bool) -> None:
-    """After a driver override, `rearm` does not request control again, even from a restarted server."""
-    session = driving(rearm=True)
+    """After a driver override, `rearm` does not request control again, not even after a restart of the server."""
+    session = driving_session(rearm=True)
     if stopped:
         session.handle_state(state("safe_stop", 3.0), 500)
     session.handle_state(state("disarmed", 3.0), 600)
@@ -115,7 +117,7 @@ def test_rearm_respects_a_driver_override(stopped: bool) -> None:
 @pytest.mark.parametrize("stopped", [False, True])
 def test_rearm_requests_control_from_a_restarted_server(stopped: bool) -> None:
     """With `rearm`, control is requested from a restarted server, whose vehicle is disarmed without an override."""
-    session = driving(rearm=True)
+    session = driving_session(rearm=True)
     if stopped:
         session.handle_state(state("safe_stop", 3.0), 500)
     session.handle_state(replace(state("disarmed"), instance=2), 600)
@@ -136,7 +138,7 @@ def test_an_emergency_stop_has_a_new_number() -> None:
 
 def test_an_emergency_stop_rejected_as_old_is_raised_again() -> None:
     """An emergency stop that was rejected as old is raised again with a higher number."""
-    session = driving()
+    session = driving_session()
     assert session.raise_emergency_stop(Now(0, 60)).number == 60
     session.handle_reply(REJECTED, 300)
     assert session.emergency_stop == 71
@@ -150,18 +152,18 @@ def test_an_emergency_stop_is_repeated_until_answered(released: bool) -> None:
         session.handle_reply(GRANTED, 200)
         session.release(300)
     first = session.raise_emergency_stop(Now(400, 60))
-    earlier_operations = {due(session, 400), due(session, 400 + NS_PER_S - 1)}
+    earlier_operations = {take_operation(session, 400), take_operation(session, 400 + NS_PER_S - 1)}
     assert earlier_operations <= {"acquire", "release", ""}
     assert session.next_wake_ns() == 400 + NS_PER_S
     assert session.take_request(400 + NS_PER_S) == first
     assert session.take_request(400 + 2 * NS_PER_S) == first
     session.handle_reply(replace(REJECTED, emergency_stop=60), 400 + 2 * NS_PER_S)
-    assert "emergency_stop" not in {due(session, number * NS_PER_S) for number in range(3, 10)}
+    assert "emergency_stop" not in {take_operation(session, number * NS_PER_S) for number in range(3, 10)}
 
 
 def test_an_emergency_stop_in_the_state_is_not_repeated() -> None:
     """An emergency stop is not requested again once a state reports it."""
-    session = driving()
+    session = driving_session()
     session.raise_emergency_stop(Now(0, 60))
     session.handle_reply(REJECTED, 300)
     request = session.take_request(300)
@@ -171,16 +173,16 @@ def test_an_emergency_stop_in_the_state_is_not_repeated() -> None:
     assert (session.phase, session.next_wake_ns()) == ("stopped", None)
 
 
-NOTED = SessionReply(True, "", 0, b"", 5600, "kernel", 0)
+NOTED = replace(GRANTED, epoch=0, token=b"")
 """The reply to a handover request or a release."""
 
 
-def state_of(active_operator: str, safety: SafetyState = "driving", instance: int = 7) -> State:
+def state_with_operator(active_operator: str, safety: SafetyState = "driving", instance: int = 7) -> State:
     return replace(state(safety), active_operator=active_operator, active_operator_instance=instance)
 
 
-def due(session: ClientSession, now_ns: int) -> str:
-    """Return the operation that the session requests at this time, or "" if it requests none."""
+def take_operation(session: ClientSession, now_ns: int) -> str:
+    """Take the request that is due at this time, and return its operation; without a request, return ""."""
     request = session.take_request(now_ns)
     return "" if request is None else request.operation
 
@@ -189,9 +191,9 @@ def test_without_take_over_no_handover_is_requested() -> None:
     """Without `take_over`, a rejected client only repeats its request for control."""
     session = new_session()
     for second in range(3):
-        assert due(session, 100 + second * NS_PER_S) == "acquire"
+        assert take_operation(session, 100 + second * NS_PER_S) == "acquire"
         session.handle_reply(REJECTED, 200 + second * NS_PER_S)
-        assert due(session, 300 + second * NS_PER_S) == ""
+        assert take_operation(session, 300 + second * NS_PER_S) == ""
         assert (session.phase, session.reason) == ("seeking", REJECTED.reason)
 
 
@@ -200,34 +202,34 @@ def test_take_over_requests_a_handover() -> None:
     session = ClientSession("alice", 7, rearm=False, start_ns=0, take_over=True)
     for second in range(3):
         begin_ns = second * NS_PER_S
-        assert due(session, begin_ns) == "acquire"
+        assert take_operation(session, begin_ns) == "acquire"
         session.handle_reply(REJECTED, begin_ns)
-        assert due(session, begin_ns) == "request_handover"
+        assert take_operation(session, begin_ns) == "request_handover"
         session.handle_reply(NOTED, begin_ns)
         assert (session.phase, session.reason) == ("seeking", f"{REJECTED.reason}; handover requested")
-        assert due(session, begin_ns + NS_PER_S - 1) == ""
-    assert due(session, 3 * NS_PER_S) == "acquire"
+        assert take_operation(session, begin_ns + NS_PER_S - 1) == ""
+    assert take_operation(session, 3 * NS_PER_S) == "acquire"
     session.handle_reply(GRANTED, 3 * NS_PER_S)
     assert (session.phase, session.reason) == ("arming", "")
-    assert due(session, 4 * NS_PER_S) == "acquire"
+    assert take_operation(session, 4 * NS_PER_S) == "acquire"
 
 
 def test_both_rejection_reasons_are_shown() -> None:
     """The reasons of a rejected acquisition and a rejected handover request are both shown."""
     session = ClientSession("alice", 7, rearm=False, start_ns=0, take_over=True)
-    assert due(session, 0) == "acquire"
+    assert take_operation(session, 0) == "acquire"
     session.handle_reply(REJECTED, 0)
-    assert due(session, 0) == "request_handover"
+    assert take_operation(session, 0) == "request_handover"
     session.handle_reply(replace(REJECTED, reason="carol asks"), 0)
     assert session.reason == f"{REJECTED.reason}; carol asks"
-    assert due(session, NS_PER_S) == "acquire"
+    assert take_operation(session, NS_PER_S) == "acquire"
     session.handle_reply(REJECTED, NS_PER_S)
     assert session.reason == f"{REJECTED.reason}; carol asks"
 
 
 def test_a_release_is_repeated_until_answered() -> None:
     """A release ends commands at once and is repeated every second until it is answered."""
-    session = driving()
+    session = driving_session()
     session.release(1000)
     assert (session.phase, session.reason, session.may_command, session.has_control) == (
         "watching",
@@ -235,47 +237,47 @@ def test_a_release_is_repeated_until_answered() -> None:
         False,
         False,
     )
-    assert due(session, 1000) == "release"
-    assert due(session, 1000 + NS_PER_S - 1) == ""
+    assert take_operation(session, 1000) == "release"
+    assert take_operation(session, 1000 + NS_PER_S - 1) == ""
     session.handle_reply(GRANTED, 2000)  # the reply to an earlier request for control
     assert (session.released, session.phase) == (False, "watching")
-    assert due(session, 1000 + NS_PER_S) == "release"
+    assert take_operation(session, 1000 + NS_PER_S) == "release"
     session.handle_reply(NOTED, 2 * NS_PER_S)
     assert (session.released, session.next_wake_ns()) == (True, None)
-    session.handle_state(state_of("", "safe_stop"), 3 * NS_PER_S)
-    session.handle_state(state_of("bob"), 4 * NS_PER_S)
-    assert (session.phase, session.reason, due(session, 10 * NS_PER_S)) == ("watching", "released", "")
+    session.handle_state(state_with_operator("", "safe_stop"), 3 * NS_PER_S)
+    session.handle_state(state_with_operator("bob"), 4 * NS_PER_S)
+    assert (session.phase, session.reason, take_operation(session, 10 * NS_PER_S)) == ("watching", "released", "")
 
 
 def test_rearm_respects_a_release() -> None:
     """`rearm` does not request control again after a release."""
-    session = driving(rearm=True)
+    session = driving_session(rearm=True)
     session.release(1000)
     session.handle_reply(NOTED, 2000)
     session.handle_state(state("safe_stop", 0.0), 3000)
-    assert (session.phase, due(session, NS_PER_S)) == ("watching", "")
+    assert (session.phase, take_operation(session, NS_PER_S)) == ("watching", "")
 
 
 @pytest.mark.parametrize("safety", ["disarmed", "safe_stop"])
 def test_lost_control_is_not_taken_back(safety: SafetyState) -> None:
-    """A client that lost control to another one at standstill does not take it back."""
+    """Even with `rearm`, a client that lost control to another client at standstill does not request it again."""
     session = new_session(rearm=True)
     session.handle_reply(GRANTED, 200)
-    session.handle_state(state_of("alice", "disarmed"), 300)
-    session.handle_state(state_of("bob", safety), 400)
+    session.handle_state(state_with_operator("alice", "disarmed"), 300)
+    session.handle_state(state_with_operator("bob", safety), 400)
     assert session.phase == "watching"
     assert "bob" in session.reason
-    assert (session.has_control, due(session, 10 * NS_PER_S)) == (False, "")
+    assert (session.has_control, take_operation(session, 10 * NS_PER_S)) == (False, "")
 
 
 def test_another_instance_of_the_same_name_is_another_client() -> None:
     """A client with the same name but another instance is another client."""
     session = new_session(rearm=True)
     session.handle_reply(GRANTED, 200)
-    session.handle_state(state_of("alice", "driving", instance=8), 300)
+    session.handle_state(state_with_operator("alice", "driving", instance=8), 300)
     assert session.phase == "arming"
-    session.handle_state(state_of("alice", "disarmed"), 400)
-    session.handle_state(state_of("alice", "safe_stop", instance=8), 500)
+    session.handle_state(state_with_operator("alice", "disarmed"), 400)
+    session.handle_state(state_with_operator("alice", "safe_stop", instance=8), 500)
     assert (session.phase, session.has_control) == ("watching", False)
 
 
@@ -283,9 +285,9 @@ def test_a_state_from_before_the_grant_has_no_effect() -> None:
     """States from before the grant, which name the previous operator, do not affect the session."""
     session = new_session()
     session.handle_reply(GRANTED, 200)
-    session.handle_state(state_of("bob", "driving"), 300)
-    session.handle_state(state_of("", "safe_stop"), 400)
+    session.handle_state(state_with_operator("bob", "driving"), 300)
+    session.handle_state(state_with_operator("", "safe_stop"), 400)
     assert session.phase == "arming"
-    session.handle_state(state_of("alice", "arming"), 500)
-    session.handle_state(state_of("alice", "driving"), 600)
+    session.handle_state(state_with_operator("alice", "arming"), 500)
+    session.handle_state(state_with_operator("alice", "driving"), 600)
     assert (session.phase, session.has_control) == ("driving", True)

@@ -19,7 +19,7 @@ REPORT = ClockReport(5, 7, "kernel", "chrony", 0.25, 0.001)
 
 
 def test_the_time_source_is_queried_once_a_second() -> None:
-    """The host's time source is queried at the start and every second, without catching up."""
+    """The host's time source is queried at the start and every second; missed queries are skipped."""
     node = ClockSyncNode(MONO_NS)
     assert node.next_wake_ns() == MONO_NS
     assert deliver(node, WAKE, None, at(0)) == [Send("clock_query", None)]

@@ -68,7 +68,7 @@ class FakeController:
 
 
 class Bench:
-    """A driver node, and the messages of the vehicle's side."""
+    """A driver node, with methods that deliver the messages of the vehicle's side."""
 
     def __init__(self, detector: LaneDetector | None = None) -> None:
         self.detector = FakeLaneDetector()
@@ -88,12 +88,11 @@ class Bench:
         self.sends += sends
         return sends
 
-    def view(self, picture: Picture | None = None) -> list[Command]:
+    def deliver_picture(self, picture: Picture | None = None) -> list[Command]:
         """Deliver a decoded picture to perception, and return the commands that the node sends."""
-        shown = noise(1) if picture is None else picture
-        return commands(
-            self.deliver("view", DecodedFrame(WALL_NS + self.mono_ns, WALL_NS + self.mono_ns, RenderedPicture(shown)))
-        )
+        rendered = RenderedPicture(noise(1) if picture is None else picture)
+        frame = DecodedFrame(WALL_NS + self.mono_ns, WALL_NS + self.mono_ns, rendered)
+        return commands(self.deliver("view", frame))
 
     def advance(self, duration_ns: int) -> list[tuple[int, Command]]:
         """Let time pass, wake the node whenever it is due, and return its commands with their times."""
@@ -104,16 +103,19 @@ class Bench:
         self.mono_ns = end_ns
         return timed_commands
 
-    def state(self, safety: str, speed_mps: float = 0.0, *, vehicle_ns: int | None = None, instance: int = 0) -> None:
-        """Deliver a state, whose time on the vehicle's clock is the present time or `vehicle_ns`."""
+    def deliver_state(
+        self, safety: str, speed_mps: float = 0.0, *, vehicle_ns: int | None = None, instance: int = 0
+    ) -> None:
+        """Deliver a state, whose time on the vehicle's clock is `vehicle_ns`, or the present time."""
         mono_ns = at(self.mono_ns).mono_ns if vehicle_ns is None else vehicle_ns
         state = State(1, mono_ns, speed_mps, 0.0, "drive", safety, "", -1, "", instance=instance)  # type: ignore[arg-type]
         self.deliver("state", encode(state))
 
-    def driving(self) -> Bench:
+    def start_driving(self) -> Bench:
+        """Grant control, report that the vehicle drives, and return this bench."""
         self.deliver("session_reply", encode(GRANTED))
-        self.state("driving")
-        assert self.view()
+        self.deliver_state("driving")
+        assert self.deliver_picture()
         return self
 
 
@@ -121,8 +123,8 @@ def commands(sends: list[Send]) -> list[Command]:
     return [decode(Command, payload) for payload in payloads(sends, "control")]
 
 
-def unit_of(picture: Picture, stamp_ns: int, rtp_ns: int | None = None) -> ReceivedUnit:
-    """Return the access unit of a stamped picture; its packets have the RTP timestamp of `rtp_ns`, or of the stamp."""
+def encode_unit(picture: Picture, stamp_ns: int, rtp_ns: int | None = None) -> ReceivedUnit:
+    """Stamp and encode a picture; the access unit's RTP timestamp is that of `rtp_ns`, or of the stamp."""
     height_px, width_px, _ = picture.shape
     encoder = Encoder(width_px, height_px, rate_hz=30, bit_rate_bps=4_000_000, gop_frames=30)
     picture = picture.copy()
@@ -131,29 +133,29 @@ def unit_of(picture: Picture, stamp_ns: int, rtp_ns: int | None = None) -> Recei
     return ReceivedUnit(data, rtp_timestamp(stamp_ns if rtp_ns is None else rtp_ns), True, True, MONO_NS)
 
 
-def read_picture(sends: list[Send]) -> PictureRead:
+def picture_entry(sends: list[Send]) -> PictureRead:
     (picture,) = payloads(sends, "picture")
     assert isinstance(picture, PictureRead)
     return picture
 
 
 def test_a_picture_is_decoded_and_viewed() -> None:
-    """A received access unit is decoded, its stamp read, and its view sent to perception."""
+    """A received access unit is decoded, its stamp is read, and the picture is sent on to perception."""
     bench = Bench()
-    sends = bench.deliver("access_unit", unit_of(noise(1), WALL_NS + 17))
-    assert (read_picture(sends).stamp_ns, read_picture(sends).readable, read_picture(sends).in_doubt) == (
+    sends = bench.deliver("access_unit", encode_unit(noise(1), WALL_NS + 17))
+    assert (picture_entry(sends).stamp_ns, picture_entry(sends).readable, picture_entry(sends).in_doubt) == (
         WALL_NS + 17,
         True,
         False,
     )
     (view,) = payloads(sends, "view")
     assert view.stamp_ns == WALL_NS + 17
-    assert read_picture(sends).decoded
+    assert picture_entry(sends).decoded
     assert bench.node.counts["frames_decoded"] == 1
 
 
-def test_only_the_newest_view_waits() -> None:
-    """Access units queue, because each refers to the one before; of views only the newest waits."""
+def test_only_the_newest_picture_waits_for_perception() -> None:
+    """All access units wait, because each refers to the one before; of the decoded pictures only the newest waits."""
     assert CHANNELS["access_unit"].waiting == "queue"
     assert CHANNELS["view"].waiting == "newest"
 
@@ -161,10 +163,10 @@ def test_only_the_newest_view_waits() -> None:
 def test_a_stamp_that_disagrees_with_its_packets_is_never_used() -> None:
     """A picture whose stamp disagrees with its RTP timestamp is unreadable and not used."""
     bench = Bench()
-    sends = bench.deliver("access_unit", unit_of(noise(1), WALL_NS, rtp_ns=WALL_NS + NS_PER_MS))
-    assert (read_picture(sends).stamp_ns, read_picture(sends).readable) == (None, False)
-    assert read_picture(sends).decoded
-    assert "RTP timestamp" in read_picture(sends).reason
+    sends = bench.deliver("access_unit", encode_unit(noise(1), WALL_NS, rtp_ns=WALL_NS + NS_PER_MS))
+    assert (picture_entry(sends).stamp_ns, picture_entry(sends).readable) == (None, False)
+    assert picture_entry(sends).decoded
+    assert "RTP timestamp" in picture_entry(sends).reason
     assert payloads(sends, "view") == []
     assert bench.node.counts["frames_unreadable"] == 1
 
@@ -172,8 +174,8 @@ def test_a_stamp_that_disagrees_with_its_packets_is_never_used() -> None:
 def test_a_picture_of_another_size_is_counted_and_not_used() -> None:
     """A picture of another size than configured is unreadable and not used."""
     bench = Bench()
-    sends = bench.deliver("access_unit", unit_of(noise(1, CameraModel(160, 128)), WALL_NS))
-    assert "160 x 128" in read_picture(sends).reason
+    sends = bench.deliver("access_unit", encode_unit(noise(1, CameraModel(160, 128)), WALL_NS))
+    assert "160 x 128" in picture_entry(sends).reason
     assert payloads(sends, "view") == []
 
 
@@ -183,23 +185,23 @@ def test_an_access_unit_without_a_picture() -> None:
     unit = ReceivedUnit(b"\x00\x00\x00\x01\x65garbage", 0, False, True, MONO_NS)
     sends = bench.deliver("access_unit", unit)
     assert payloads(sends, "picture_lost") == [None]
-    assert read_picture(sends).in_doubt
-    assert not read_picture(sends).decoded
-    assert not read_picture(bench.deliver("access_unit", unit_of(noise(1), WALL_NS))).in_doubt
+    assert picture_entry(sends).in_doubt
+    assert not picture_entry(sends).decoded
+    assert not picture_entry(bench.deliver("access_unit", encode_unit(noise(1), WALL_NS))).in_doubt
 
 
 def test_request_control_arm_and_drive() -> None:
     """The driver requests control, arms with the brake applied, and drives once the vehicle is driving."""
     bench = Bench()
-    assert bench.view() == []
+    assert bench.deliver_picture() == []
     bench.advance(0)
     assert len(payloads(bench.sends, "session")) == 1
     sends = bench.deliver("session_reply", encode(GRANTED))
     assert payloads(sends, "path_token") == [PathToken(GRANTED.token, 5600)]
-    (arm,) = bench.view()
+    (arm,) = bench.deliver_picture()
     assert (arm.mode, arm.epoch, arm.throttle, arm.brake, arm.steering_rad) == ("arm", 5, 0.0, 1.0, 0.0)
-    bench.state("driving")
-    (drive,) = bench.view()
+    bench.deliver_state("driving")
+    (drive,) = bench.deliver_picture()
     assert (drive.mode, drive.throttle, drive.brake, drive.steering_rad) == ("drive", 0.5, 0.0, 0.125)
     assert drive.sequence > arm.sequence
     assert drive.stamp_ns == WALL_NS
@@ -208,27 +210,27 @@ def test_request_control_arm_and_drive() -> None:
 def test_perception_has_memory_only_while_driving() -> None:
     """Before the drive, each picture is detected without memory of earlier ones."""
     bench = Bench()
-    bench.view()
-    bench.view()
+    bench.deliver_picture()
+    bench.deliver_picture()
     assert bench.detector.forget_calls == 2
-    bench.driving()
-    before = bench.detector.forget_calls
-    bench.view()
-    assert bench.detector.forget_calls == before
+    bench.start_driving()
+    calls_before = bench.detector.forget_calls
+    bench.deliver_picture()
+    assert bench.detector.forget_calls == calls_before
 
 
 def test_a_command_is_sent_every_20_ms_between_pictures() -> None:
     """Between pictures a command is sent every 20 ms, with the stamp of the newest picture."""
-    bench = Bench().driving()
+    bench = Bench().start_driving()
     timed_commands = bench.advance(100 * NS_PER_MS)
     assert [at_ns for at_ns, _ in timed_commands] == [number * 20 * NS_PER_MS for number in range(1, 6)]
     assert len({command.sequence for _, command in timed_commands}) == 5
     assert {command.stamp_ns for _, command in timed_commands} == {WALL_NS}
 
 
-def test_without_pictures_it_brakes_after_300_ms_and_stops_after_2500_ms() -> None:
+def test_without_pictures_the_driver_brakes_after_300_ms_and_stops_after_2500_ms() -> None:
     """Without a new picture the driver brakes after 300 ms and requests a stop after 2.5 s."""
-    bench = Bench().driving()
+    bench = Bench().start_driving()
     timed_commands = bench.advance(2600 * NS_PER_MS)
     for at_ns, command in timed_commands:
         mode = "stop" if at_ns >= 2500 * NS_PER_MS else "drive"
@@ -241,12 +243,12 @@ def test_without_pictures_it_brakes_after_300_ms_and_stops_after_2500_ms() -> No
 @pytest.mark.parametrize(
     ("lost_ms", "mode", "brakes"), [(280, "drive", False), (300, "drive", True), (2500, "stop", True)]
 )
-def test_without_states_it_brakes_and_stops(lost_ms: int, mode: str, *, brakes: bool) -> None:
+def test_without_states_the_driver_brakes_and_stops(lost_ms: int, mode: str, *, brakes: bool) -> None:
     """Without a new state the driver brakes after 300 ms and requests a stop after 2.5 s."""
-    bench = Bench().driving()
+    bench = Bench().start_driving()
     for _ in range(lost_ms // 20):
         bench.mono_ns += 20 * NS_PER_MS
-        (command,) = bench.view()
+        (command,) = bench.deliver_picture()
     assert command.mode == mode
     assert (command.brake >= CLIENT_LIMITS.brake) == brakes
     assert (command.throttle == 0.0) == brakes
@@ -257,65 +259,65 @@ def test_without_states_it_brakes_and_stops(lost_ms: int, mode: str, *, brakes: 
 )
 @pytest.mark.parametrize("going_back_ns", [0, NS_PER_MS])
 def test_a_repeated_state_is_no_newer_state(lost_ms: int, mode: str, going_back_ns: int, *, brakes: bool) -> None:
-    """States whose vehicle time does not grow are as if no state arrived: brake after 300 ms, stop after 2.5 s."""
-    bench = Bench().driving()
+    """States whose vehicle time does not grow are not new: the driver brakes, and requests a stop after 2.5 s."""
+    bench = Bench().start_driving()
     for number in range(lost_ms // 20):
         bench.mono_ns += 20 * NS_PER_MS
-        bench.state("driving", vehicle_ns=MONO_NS - number * going_back_ns)
-        (command,) = bench.view()
+        bench.deliver_state("driving", vehicle_ns=MONO_NS - number * going_back_ns)
+        (command,) = bench.deliver_picture()
     assert command.mode == mode
     assert (command.brake >= CLIENT_LIMITS.brake) == brakes
     assert bench.node.counts["states_not_newer"] == lost_ms // 20
 
 
 def test_a_repeated_state_still_reports_the_safety_state() -> None:
-    """A stop in a state whose vehicle time does not grow ends the drive at the client."""
-    bench = Bench().driving()
-    bench.state("safe_stop", vehicle_ns=MONO_NS)
+    """A stop ends the drive at the client even if the state that reports it is not new."""
+    bench = Bench().start_driving()
+    bench.deliver_state("safe_stop", vehicle_ns=MONO_NS)
     assert bench.session.phase == "stopped"
 
 
 def test_the_time_of_a_restarted_server_begins_anew() -> None:
     """The first state of another server process is new, whatever its vehicle time."""
-    bench = Bench().driving()
+    bench = Bench().start_driving()
     bench.mono_ns += 280 * NS_PER_MS
-    bench.state("driving", vehicle_ns=1, instance=2)
+    bench.deliver_state("driving", vehicle_ns=1, instance=2)
     bench.mono_ns += 280 * NS_PER_MS
-    (command,) = bench.view()
+    (command,) = bench.deliver_picture()
     assert command.brake < CLIENT_LIMITS.brake
 
 
 @pytest.mark.parametrize(
     ("lost_ms", "mode", "brakes"), [(480, "drive", False), (520, "drive", True), (2520, "stop", True)]
 )
-def test_without_a_lane_it_brakes_and_stops(lost_ms: int, mode: str, *, brakes: bool) -> None:
+def test_without_a_lane_the_driver_brakes_and_stops(lost_ms: int, mode: str, *, brakes: bool) -> None:
     """Without a lane the driver brakes after 0.5 s and requests a stop after 2.5 s."""
-    bench = Bench().driving()
+    bench = Bench().start_driving()
     bench.detector.confidence = 0.0
     for _ in range(lost_ms // 20):
         bench.mono_ns += 20 * NS_PER_MS
-        bench.state("driving")
-        (command,) = bench.view()
+        bench.deliver_state("driving")
+        (command,) = bench.deliver_picture()
     assert command.mode == mode
     assert (command.brake >= CLIENT_LIMITS.brake) == brakes
 
 
 def test_grey_pictures_lead_to_a_stop() -> None:
-    """Grey pictures lead to a requested stop after 2.5 s, with the real detector."""
+    """With the real lane detector, grey pictures make the driver request a stop after 2.5 s."""
     bench = Bench(LaneDetector(CameraModel()))
     bench.deliver("session_reply", encode(GRANTED))
-    bench.state("driving")
+    bench.deliver_state("driving")
     grey = np.full((480, 640, 3), 128, np.uint8)
     modes = []
     for _ in range(77):  # 2.57 s
-        modes += [command.mode for command in bench.view(grey)]
+        modes += [command.mode for command in bench.deliver_picture(grey)]
         bench.mono_ns += FRAME_NS
     assert (modes[0], modes[-1]) == ("drive", "stop")
 
 
 def test_garbage_from_the_vehicle_is_counted() -> None:
     """Unreadable states and replies are counted and have no effect."""
-    bench = Bench().driving()
+    bench = Bench().start_driving()
     for data in (b"", b"\xc1", b"\x93\x01\x02\x03", bytes(2000)):
         assert bench.deliver("state", data) == []
         assert bench.deliver("session_reply", data) == []
@@ -326,9 +328,9 @@ def test_garbage_from_the_vehicle_is_counted() -> None:
 
 def test_after_any_reply_an_emergency_stop_is_readable() -> None:
     """After any readable reply, the next emergency stop is a readable message."""
-    for last in (2**62, 2**62 + 1, 2**63 - 1):
-        bench = Bench().driving()
-        bench.deliver("session_reply", encode(replace(GRANTED, emergency_stop=last)))
+    for last_number in (2**62, 2**62 + 1, 2**63 - 1):
+        bench = Bench().start_driving()
+        bench.deliver("session_reply", encode(replace(GRANTED, emergency_stop=last_number)))
         sends = bench.deliver("operator", "emergency_stop")
         assert decode(SessionRequest, payloads(sends, "session")[0]).operation == "emergency_stop"
         assert commands(sends)[0].emergency_stop > 0
@@ -352,10 +354,10 @@ def test_a_grant_without_a_token_opens_no_path() -> None:
 
 def test_the_emergency_stop_is_in_every_command() -> None:
     """After an emergency stop, every command carries its number and no throttle."""
-    bench = Bench().driving()
+    bench = Bench().start_driving()
     number = bench.session.raise_emergency_stop(Now(0, WALL_NS)).number
     bench.mono_ns += NS_PER_MS
-    sent = [*bench.view(), *(command for _, command in bench.advance(200 * NS_PER_MS))]
+    sent = [*bench.deliver_picture(), *(command for _, command in bench.advance(200 * NS_PER_MS))]
     assert len(sent) == 11, "one for the picture, and one every 20 ms"
     assert {(command.emergency_stop, command.mode, command.throttle) for command in sent} == {(number, "stop", 0.0)}
 
@@ -366,25 +368,25 @@ def test_the_emergency_stop_is_in_every_command() -> None:
     ids=["next", "just in time", "after a gap", "clock set back"],
 )
 def test_after_a_gap_the_lane_is_searched_without_memory(since_ns: int, forgets: bool) -> None:
-    """After a gap in the pictures, the lane is searched for without memory."""
-    bench = Bench().driving()
-    bench.view()
-    before = bench.detector.forget_calls
+    """After a gap in the pictures, the lane of earlier pictures is forgotten."""
+    bench = Bench().start_driving()
+    bench.deliver_picture()
+    calls_before = bench.detector.forget_calls
     bench.mono_ns += since_ns
-    bench.view()
-    assert (bench.detector.forget_calls > before) == forgets
+    bench.deliver_picture()
+    assert (bench.detector.forget_calls > calls_before) == forgets
 
 
-def requests(sends: list[Send]) -> list[str]:
+def requested_operations(sends: list[Send]) -> list[str]:
     return [decode(SessionRequest, payload).operation for payload in payloads(sends, "session")]
 
 
 def test_a_release_ends_all_commands() -> None:
     """A release is requested at once and ends all commands."""
-    bench = Bench().driving()
+    bench = Bench().start_driving()
     sends = bench.deliver("operator", "release")
-    assert (requests(sends), commands(sends)) == (["release"], [])
-    assert bench.view() == []
+    assert (requested_operations(sends), commands(sends)) == (["release"], [])
+    assert bench.deliver_picture() == []
     bench.deliver("session_reply", encode(SessionReply(True, "", 0, b"", 5600, "kernel", 0)))
     assert bench.session.released
     assert bench.advance(NS_PER_S) == []

@@ -14,10 +14,26 @@ from lavt.transport.emulation.impairment import ImpairedFlow, Impairment
 from lavt.transport.messages import ELLIPSIS, decode, encode
 from lavt.transport.netem.injector import InjectionOrder, InjectionResult
 
-L4 = NetemRequest("alice", 7, "L4", LEASE_MS, 150.0, 0.0, 0.0, "normal", 0.0, 0.0, 0, 0.0, 0.0)
+L4 = NetemRequest(
+    who="alice",
+    instance=7,
+    condition="L4",
+    lease_ms=LEASE_MS,
+    delay_ms=150.0,
+    jitter_ms=0.0,
+    jitter_correlation=0.0,
+    jitter_distribution="normal",
+    loss=0.0,
+    loss_burst_packets=0.0,
+    rate_bps=0,
+    reorder=0.0,
+    state_delay_ms=0.0,
+)
 VIDEO = ImpairedFlow("video", "udp", 5600, "source", Impairment(150.0))
 STATE = ImpairedFlow("state", "udp", 7448, "source", Impairment())
 CONTROL = ImpairedFlow("control", "udp", 7448, "destination", Impairment(75.0))
+GRANTED = ""
+"""The reason in a reply that grants a request."""
 
 
 def server(*, allowed: bool = True, simulated: bool = True) -> InjectionNode:
@@ -36,9 +52,15 @@ def deliver_result(
     return deliver(node, "injected", InjectionResult(number, reason, "", measured), at(after_ns))
 
 
-def rejections(sends: list[Send]) -> list[str]:
+def deliver_status(node: InjectionNode, status: StationaryStatus) -> list[Send]:
+    """Deliver a status of the vehicle, for which the channel is `rest`."""
+    return deliver(node, "rest", status, at(0))
+
+
+def reply_reasons(sends: list[Send]) -> list[str]:
+    """Return the reason in each reply: why a request was rejected, or `GRANTED`."""
     replies = [decode(NetemReply, payload) for payload in payloads(sends, "netem_reply")]
-    assert all(reply.granted == (reply.reason == "") for reply in replies)
+    assert all(reply.granted == (reply.reason == GRANTED) for reply in replies)
     return [reply.reason for reply in replies]
 
 
@@ -58,7 +80,7 @@ def test_a_condition_is_granted_when_in_force() -> None:
     node = server()
     assert request(node, L4) == [Send("inject", InjectionOrder(1, "L4", (VIDEO, STATE)))]
     sends = deliver_result(node, 1)
-    assert rejections(sends) == [""]
+    assert reply_reasons(sends) == [GRANTED]
     assert [send.peer for send in sends if send.channel == "netem_reply"] == [1]
     assert payloads(sends, "injection") == [
         InjectionSample(at(0).mono_ns, "L4", "video", 150.0, 150.2, ""),
@@ -76,7 +98,7 @@ def test_a_repeated_request_renews_the_lease() -> None:
     """A repeated request for a condition in force is granted at once and renews the lease."""
     node = server_with_condition()
     assert node.next_wake_ns() == at(5 * NS_PER_S).mono_ns
-    assert rejections(request(node, L4, 3 * NS_PER_S)) == [""]
+    assert reply_reasons(request(node, L4, 3 * NS_PER_S)) == [GRANTED]
     deliver(node, WAKE, None, at(5 * NS_PER_S))
     assert node.counts["netem_leases_ended"] == 0
 
@@ -85,7 +107,7 @@ def test_an_expired_lease_clears_the_queues() -> None:
     """An expired lease clears the queues, and another client may request a condition."""
     node = server_with_condition()
     bob = replace(L4, who="bob", instance=8)
-    [reason] = rejections(request(node, bob, NS_PER_S))
+    [reason] = reply_reasons(request(node, bob, NS_PER_S))
     assert "alice" in reason
     assert deliver(node, WAKE, None, at(LEASE_MS * NS_PER_MS)) == [Send("inject", InjectionOrder(2, "", ()))]
     sends = deliver(node, "injected", InjectionResult(2, "", "", ()), at(LEASE_MS * NS_PER_MS + 1))
@@ -124,23 +146,23 @@ def test_a_request_is_rejected_with_a_reason(
 ) -> None:
     """A request is rejected if the config forbids it, a real vehicle drives, or another client has control."""
     node = server(**settings)
-    deliver(node, "rest", status, at(0))
+    deliver_status(node, status)
     sends = request(node, L4)
-    [reason] = rejections(sends)
+    [reason] = reply_reasons(sends)
     assert expected_word in reason
     assert payloads(sends, "inject") == []
 
 
 def test_a_real_vehicle_gets_a_condition_at_standstill_only() -> None:
-    """A real vehicle gets a condition at standstill; while it drives the lease is renewed, but not changed."""
+    """A real vehicle gets a condition only at standstill; while it drives, only the lease can be renewed."""
     node = server(simulated=False)
-    assert rejections(request(node, L4)) != [""]
-    deliver(node, "rest", StationaryStatus(True, ("alice", 7)), at(0))
+    assert reply_reasons(request(node, L4)) != [GRANTED]
+    deliver_status(node, StationaryStatus(True, ("alice", 7)))
     request(node, L4)
     deliver_result(node, 1)
-    deliver(node, "rest", StationaryStatus(False, ("alice", 7)), at(0))
-    assert rejections(request(node, L4, NS_PER_S)) == [""]
-    [reason] = rejections(request(node, replace(L4, delay_ms=0.0), NS_PER_S))
+    deliver_status(node, StationaryStatus(False, ("alice", 7)))
+    assert reply_reasons(request(node, L4, NS_PER_S)) == [GRANTED]
+    [reason] = reply_reasons(request(node, replace(L4, delay_ms=0.0), NS_PER_S))
     assert "stationary" in reason
 
 
@@ -149,7 +171,7 @@ def test_a_deviating_measurement_is_recorded() -> None:
     node = server_with_condition()
     sends = deliver(node, "injected", InjectionResult(1, "", "video was late", (("video", 155.0),)), at(NS_PER_S))
     assert payloads(sends, "injection")[0].reason == "video was late"
-    assert rejections(request(node, L4, NS_PER_S)) == [""]
+    assert reply_reasons(request(node, L4, NS_PER_S)) == [GRANTED]
 
 
 def test_failed_queues_are_cleared_and_end_the_lease() -> None:
@@ -157,7 +179,7 @@ def test_failed_queues_are_cleared_and_end_the_lease() -> None:
     node = server()
     request(node, L4)
     sends = deliver_result(node, 1, reason="there is no tc")
-    assert rejections(sends) == ["there is no tc"]
+    assert reply_reasons(sends) == ["there is no tc"]
     assert {sample.reason for sample in payloads(sends, "injection")} == {"there is no tc"}
     assert payloads(sends, "inject") == [InjectionOrder(2, "", ())]
     assert payloads(request(node, replace(L4, who="bob")), "inject") == [InjectionOrder(3, "L4", (VIDEO, STATE))]
@@ -177,36 +199,34 @@ def test_a_failed_clearing_is_repeated() -> None:
 def test_the_lease_ends_when_another_client_acquires_control() -> None:
     """The lease ends when another client acquires control of the vehicle."""
     node = server_with_condition()
-    assert deliver(node, "rest", StationaryStatus(True, None), at(0)) == []
-    assert deliver(node, "rest", StationaryStatus(True, ("alice", 7)), at(0)) == []
-    assert deliver(node, "rest", StationaryStatus(True, ("bob", 8)), at(0)) == [
-        Send("inject", InjectionOrder(2, "", ()))
-    ]
+    assert deliver_status(node, StationaryStatus(True, None)) == []
+    assert deliver_status(node, StationaryStatus(True, ("alice", 7))) == []
+    assert deliver_status(node, StationaryStatus(True, ("bob", 8))) == [Send("inject", InjectionOrder(2, "", ()))]
 
 
 def test_an_impossible_impairment_is_rejected() -> None:
     """An impairment that netem cannot apply is rejected, and the condition in force stays."""
     node = server_with_condition()
-    [reason] = rejections(request(node, replace(L4, condition="wild", delay_ms=10.0, jitter_ms=20.0)))
+    [reason] = reply_reasons(request(node, replace(L4, condition="wild", delay_ms=10.0, jitter_ms=20.0)))
     assert reason.startswith("video: ")
     assert "20 ms" in reason
-    assert rejections(request(node, L4, NS_PER_S)) == [""]
+    assert reply_reasons(request(node, L4, NS_PER_S)) == [GRANTED]
 
 
 def test_the_result_of_a_replaced_order_is_ignored() -> None:
-    """The result of a replaced order is ignored."""
+    """The result of a replaced order is ignored; the result of the newest order answers all requests."""
     node = server()
     request(node, L4)
     request(node, replace(L4, condition="L5", delay_ms=225.0))
     assert deliver_result(node, 1) == []
-    assert rejections(deliver_result(node, 2)) == ["", ""]
+    assert reply_reasons(deliver_result(node, 2)) == [GRANTED, GRANTED]
 
 
 def test_a_long_reason_is_shortened() -> None:
-    """A reply with a long reason, of letters of any size in UTF-8, can be decoded."""
+    """A long reason is shortened so that the reply can be decoded, also if its letters have two bytes in UTF-8."""
     node = server()
     request(node, L4)
-    (reason,) = rejections(deliver_result(node, 1, 300 * "ä"))
+    (reason,) = reply_reasons(deliver_result(node, 1, 300 * "ä"))
     assert reason.startswith(190 * "ä")
     assert reason.endswith(ELLIPSIS)
 
@@ -239,7 +259,7 @@ def new_client(control: ImpairedFlow = CONTROL) -> InjectionClient:
 
 
 def test_the_client_delays_its_control_first() -> None:
-    """The client delays its control first, and then requests the condition from the server once a second."""
+    """The client first delays the control on its own machine, then requests the condition once a second."""
     client = new_client()
     assert client.next_wake_ns() == at(0).mono_ns
     assert deliver(client, WAKE, None, at(0)) == [Send("inject", InjectionOrder(1, "L4", (CONTROL,)))]
@@ -254,7 +274,7 @@ def test_the_client_delays_its_control_first() -> None:
 
 
 def test_a_failed_order_of_the_client_is_repeated() -> None:
-    """If the client's own queue fails, the driver receives the reason, and the order is repeated after a second."""
+    """If the client's machine cannot delay the control, the driver gets the reason, and the order is repeated."""
     client = new_client()
     deliver(client, WAKE, None, at(0))
     sends = deliver(client, "injected", InjectionResult(1, "no tc", "", ()), at(0))
@@ -274,7 +294,7 @@ def test_a_rejection_is_reported_to_the_driver() -> None:
 
 
 def test_without_a_condition_nothing_is_requested() -> None:
-    """A client without a condition requests no wake."""
+    """A client without a condition never wakes, so it requests nothing."""
     client = InjectionClient(
         "alice", 7, condition="", control=CONTROL, video=Impairment(), state_delay_ms=0.0, start_ns=0
     )

@@ -28,10 +28,10 @@ def new_node(*, token: bool = True) -> ReceiverNode:
     return node
 
 
-def packets(number: int = 3) -> list[list[bytes]]:
-    """Return the packets of each of several frames."""
+def packets_of_frames() -> list[list[bytes]]:
+    """Return the packets of three frames, one list for each frame."""
     packetizer = Packetizer(77, 100)
-    return [packetizer.packetize(UNIT, 3000 * index) for index in range(number)]
+    return [packetizer.packetize(UNIT, 3000 * number) for number in range(3)]
 
 
 def test_without_a_token_nothing_is_sent() -> None:
@@ -68,7 +68,7 @@ def test_the_same_token_again_changes_nothing() -> None:
 def test_packets_become_access_units() -> None:
     """Packets become access units with the arrival time of their last packet."""
     node = new_node()
-    first, second, _ = packets()
+    first, second, _ = packets_of_frames()
     for packet in first:
         deliver(node, "rtp", packet, at(0))
     (unit,) = payloads(deliver(node, WAKE, None, at(10 * NS_PER_MS)), "access_unit")
@@ -82,7 +82,7 @@ def test_packets_become_access_units() -> None:
 def test_a_receiver_report_is_sent_every_500_ms() -> None:
     """A receiver report with the lost fraction is sent every 500 ms from the first packet on."""
     node = new_node()
-    first, second, third = packets()
+    first, second, third = packets_of_frames()
     reports = []
     for at_ms in range(0, 2001, 5):
         if at_ms == 0:
@@ -113,17 +113,17 @@ def test_a_loss_requests_a_keyframe() -> None:
     """A loss or a missing picture requests a keyframe, at most once in 100 ms."""
     node = new_node()
     assert deliver(node, "picture_lost", None, at(0)) == []
-    first, second, _ = packets()
+    first, second, _ = packets_of_frames()
     for packet in [*first, *second[1:]]:
         deliver(node, "rtp", packet, at(0))
     assert requests_keyframe(deliver(node, WAKE, None, at(10 * NS_PER_MS)))
-    times = [ms for ms in range(10, 400) if deliver(node, "picture_lost", None, at(ms * NS_PER_MS))]
-    assert times == [110, 210, 310]
+    requested_at_ms = [ms for ms in range(10, 400) if deliver(node, "picture_lost", None, at(ms * NS_PER_MS))]
+    assert requested_at_ms == [110, 210, 310]
     assert node.counts["picture_loss_requests"] == 4
 
 
 def answer_report(node: ReceiverNode, round_trip_ns: int, begin_ns: int = 0) -> None:
-    """Let the node send a report, and deliver the answer, which the sender sent 30 ms after the report arrived."""
+    """Let the node send a report at `begin_ns`, and deliver the answer of a sender that waits 30 ms to answer."""
     (report,) = rtcp_datagrams(deliver(node, WAKE, None, at(begin_ns)))
     (reference,) = parse_feedback(report).reference_times
     answer = ReferenceAnswer(reference.receiver_ssrc, reference.time, 30 * NS_PER_MS)
@@ -136,15 +136,15 @@ def answer_report(node: ReceiverNode, round_trip_ns: int, begin_ns: int = 0) -> 
 def test_a_keyframe_request_is_repeated_each_round_trip() -> None:
     """With a known round trip, a keyframe request is repeated each round trip until the keyframe arrives."""
     node = new_node()
-    first, second, third = packets()
+    first, second, third = packets_of_frames()
     for packet in first:
         deliver(node, "rtp", packet, at(0))
     answer_report(node, 100 * NS_PER_MS)
     for packet in second[1:]:
         deliver(node, "rtp", packet, at(200 * NS_PER_MS))
-    times = [ms for ms in range(200, 700) if requests_keyframe(deliver(node, WAKE, None, at(ms * NS_PER_MS)))]
-    assert times in ([210, 360, 510, 660], [210, 361, 512, 663]), (
-        "the requests are a round trip of 100 ms (rounded to 1/65536 s) and 50 ms for the keyframe apart"
+    requested_at_ms = [ms for ms in range(200, 700) if requests_keyframe(deliver(node, WAKE, None, at(ms * NS_PER_MS)))]
+    assert requested_at_ms in ([210, 360, 510, 660], [210, 361, 512, 663]), (
+        "the interval is the round trip of 100 ms (rounded to 1/65536 s) plus 50 ms for the keyframe"
     )
     for packet in third:
         deliver(node, "rtp", packet, at(700 * NS_PER_MS))
@@ -153,9 +153,9 @@ def test_a_keyframe_request_is_repeated_each_round_trip() -> None:
 
 
 def test_keyframe_requests_use_the_present_round_trip() -> None:
-    """Repeated requests use the present round trip, not that at the last request."""
+    """The interval of repeated requests follows the present round trip, not the one at the last request."""
     node = new_node()
-    first, second, _ = packets()
+    first, second, _ = packets_of_frames()
     for packet in first:
         deliver(node, "rtp", packet, at(0))
     answer_report(node, 3 * NS_PER_S)
@@ -169,7 +169,7 @@ def test_keyframe_requests_use_the_present_round_trip() -> None:
 def test_a_repaired_loss_requests_no_keyframe() -> None:
     """A packet recovered by a repair packet completes its access unit without a keyframe request."""
     node = new_node()
-    first, second, _ = packets()
+    first, second, _ = packets_of_frames()
     repairs = RepairSender(78, 0).repair(second, 1)
     for packet in first:
         deliver(node, "rtp", packet, at(0))
@@ -188,7 +188,7 @@ def test_a_repaired_loss_requests_no_keyframe() -> None:
 def test_reception_is_recorded_every_second() -> None:
     """Reception statistics are recorded every second."""
     node = new_node()
-    first, second, third = packets()
+    first, second, third = packets_of_frames()
     samples = []
     for at_ms in range(0, 3001, 5):
         for number, frame in enumerate((first, second[1:], third)):
@@ -205,7 +205,7 @@ def test_the_bit_rate_is_requested_with_each_report() -> None:
     """The configured maximum bit rate is sent with every report."""
     node = ReceiverNode(JitterBuffer(), Depacketizer(), 700_000)
     deliver(node, "path_token", PathToken(TOKEN, PORT), at(0))
-    first, *_ = packets()
+    first, *_ = packets_of_frames()
     for packet in first:
         deliver(node, "rtp", packet, at(0))
     for number in range(3):
@@ -221,12 +221,12 @@ def test_any_datagram_is_survived_and_counted(datagram: bytes) -> None:
     node = new_node()
     deliver(node, "rtp", datagram, at(0))
     deliver(node, WAKE, None, at(NS_PER_S))
-    packets, *unreadable = (
+    readable, *unreadable = (
         node.counts.get(name, 0) for name in ("packets", "packets_unreadable", "challenges_unreadable")
     )
-    assert packets + sum(unreadable) <= 1
+    assert readable + sum(unreadable) <= 1
     if len(datagram) < 12:
-        assert (packets, sum(unreadable)) == (0, 1)
+        assert (readable, sum(unreadable)) == (0, 1)
 
 
 def test_a_challenge_without_a_session_is_counted() -> None:

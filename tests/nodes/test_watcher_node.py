@@ -44,16 +44,16 @@ def test_pictures_of_any_size() -> None:
     assert (node.counts["frames_decoded"], node.counts["frames_unreadable"]) == (2, 0)
 
 
-def test_a_view_is_dropped() -> None:
-    """A watcher drops its own views."""
+def test_a_decoded_picture_is_dropped() -> None:
+    """A watcher drops decoded pictures, because it has no perception."""
     node = WatcherNode(PictureReader(VideoReceiver(Decoder(), None)))
-    (view,) = payloads(deliver(node, "access_unit", units(1)[0], at(0)), "view")
-    assert deliver(node, "view", view, at(1)) == []
+    (decoded,) = payloads(deliver(node, "access_unit", units(1)[0], at(0)), "view")
+    assert deliver(node, "view", decoded, at(1)) == []
 
 
 @pytest.mark.parametrize("reads_doubtful", [True, False])
 def test_pictures_in_doubt(reads_doubtful: bool) -> None:
-    """With `reads_doubtful` false, stamps of pictures in doubt are not checked until the next keyframe."""
+    """Only with `reads_doubtful` are stamps of pictures in doubt read; the next keyframe ends the doubt."""
     checked: list[int] = []
 
     def agrees(stamp_ns: int, _timestamp: int) -> bool:

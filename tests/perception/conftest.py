@@ -37,11 +37,11 @@ FOUR_LANES = (Line(8.75), Line(5.25, dash_m=3.0), *BROKEN_LANE, Line(-5.25))
 
 @dataclass(frozen=True)
 class Scene:
-    """A renderer of a straight or circular road, seen by a car beside its centre."""
+    """A renderer of a straight or circular road, seen from a car beside the road's centre."""
 
     model: CameraModel
 
-    def picture(
+    def render(
         self,
         lines: Sequence[Line] = LANE,
         curvature_per_m: float = 0.0,
@@ -51,12 +51,12 @@ class Scene:
         """Return the picture from a car `offset_m` left of the centre and turned left by `heading_rad`."""
         ray_indices, x_m, y_m = rays_on_near_ground(self.model)
         along, across = on_road(x_m, y_m, curvature_per_m, offset_m, heading_rad)
-        colours = bare_ground(self.model).copy()  # of all rays, of which each pixel averages several
-        rays = colours.reshape(-1, 3)
+        colours = bare_ground(self.model).copy()  # one colour per ray; a pixel is the average of several rays
+        ray_colours = colours.reshape(-1, 3)
         for line in lines:
             painted = np.flatnonzero(np.abs(across - line.offset_m) < MARK_WIDTH_M / 2)
             painted = painted[np.mod(along[painted] - line.phase_m, 9.0) < line.dash_m]
-            rays[ray_indices[painted]] = line.colour_bgr
+            ray_colours[ray_indices[painted]] = line.colour_bgr
         picture = cv2.resize(colours, (self.model.width_px, self.model.height_px), interpolation=cv2.INTER_AREA)
         return np.asarray(picture.round(), dtype=np.uint8)
 
@@ -93,7 +93,10 @@ def bare_ground(model: CameraModel) -> NDArray[np.float32]:
 def on_road(
     x_m: FloatArray, y_m: FloatArray, curvature_per_m: float, offset_m: float, heading_rad: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Convert points of the vehicle frame to (along, across) of a road that starts straight ahead."""
+    """Convert points of the vehicle frame to (distance along the road, distance left of its centre).
+
+    The car is `offset_m` left of the road's centre and turned left by `heading_rad`.
+    """
     cosine, sine = np.cos(heading_rad), np.sin(heading_rad)
     x, y = x_m * cosine - y_m * sine, offset_m + x_m * sine + y_m * cosine
     if curvature_per_m == 0:

@@ -9,7 +9,7 @@ from lavt.perception.bird_eye import STAMP_SIDE_PX, GroundGrid, bird_eye
 from lavt.perception.calibration import calibrated, ground_to_picture
 
 FOCAL_PX = 320
-"""The focal length of `CameraModel()`, which is 1.6 m ahead of the rear axle and 1.4 m above the ground."""
+"""The focal length of `CameraModel()`. That camera is 1.6 m ahead of the rear axle and 1.4 m above the ground."""
 
 
 def pixel_of(model: CameraModel, x_m: float, y_m: float) -> tuple[float, float]:
@@ -18,7 +18,7 @@ def pixel_of(model: CameraModel, x_m: float, y_m: float) -> tuple[float, float]:
 
 
 def test_a_point_straight_ahead_is_in_the_middle_column() -> None:
-    """A point on the vehicle's axis is in the middle column, and higher up the farther away it is."""
+    """A point on the vehicle's axis is in the middle column, and a farther point is higher up."""
     model = CameraModel()
     near, far = pixel_of(model, 5.0, 0.0), pixel_of(model, 20.0, 0.0)
     assert near[0] == pytest.approx((model.width_px - 1) / 2)
@@ -33,14 +33,14 @@ def test_a_point_on_the_left_is_left_of_the_middle() -> None:
     assert pixel_of(model, 11.6, 2.0)[0] == pytest.approx((model.width_px - 1) / 2 - FOCAL_PX * 2.0 / (11.6 - 1.6))
 
 
-def test_pitching_down_raises_the_road() -> None:
+def test_a_point_at_the_pitch_angle_is_in_the_middle_row() -> None:
     """A camera pitched down by the angle of a ground point has that point in the middle row."""
     pitch_rad = math.atan2(1.4, 10.0)
     assert pixel_of(CameraModel(pitch_rad=pitch_rad), 11.6, 0.0)[1] == pytest.approx((480 - 1) / 2)
 
 
 def test_a_ground_point_maps_to_its_cell() -> None:
-    """A spot in the picture at a ground point's projection appears in that point's cell."""
+    """A spot in the picture at a ground point's projection appears in the grid cell of that point."""
     model, grid = CameraModel(), GroundGrid()
     mapping = bird_eye(calibrated(model), grid)
     picture = np.zeros((model.height_px, model.width_px), dtype=np.uint8)
@@ -54,16 +54,16 @@ def test_a_ground_point_maps_to_its_cell() -> None:
 @pytest.mark.parametrize(
     "model", [CameraModel(), CameraModel(320, 240), CameraModel(1280, 720), CameraModel(pitch_rad=0.5)]
 )
-def test_the_time_stamp_is_masked(model: CameraModel) -> None:
-    """A picture that is white only in the time stamp has an empty bird's-eye view."""
+def test_the_stamp_is_masked(model: CameraModel) -> None:
+    """A picture that is white only in the stamp has an empty bird's-eye view."""
     mapping = bird_eye(calibrated(model), GroundGrid())
     picture = np.zeros((model.height_px, model.width_px), dtype=np.uint8)
     picture[:STAMP_SIDE_PX, :STAMP_SIDE_PX] = 255
     assert not mapping.from_above(mapping.region(picture)).any()
 
 
-def test_without_a_time_stamp_its_corner_is_used() -> None:
-    """A camera with road in the stamp's corner uses the corner when there is no time stamp."""
+def test_without_a_stamp_its_corner_is_used() -> None:
+    """If pictures have no stamp, the bird's-eye view includes the road in the stamp's corner."""
     camera = calibrated(CameraModel(field_of_view_rad=0.7, pitch_rad=0.3))
     white = np.full((480, 640), 255, dtype=np.uint8)
     with_stamp, without_stamp = (bird_eye(camera, GroundGrid(), stamped=has_stamp) for has_stamp in (True, False))
@@ -76,6 +76,6 @@ def test_without_a_time_stamp_its_corner_is_used() -> None:
     "model", [CameraModel(pitch_rad=-0.8), CameraModel(pitch_rad=1.4), CameraModel(64, 64), CameraModel(x_m=25.0)]
 )
 def test_a_camera_that_does_not_see_the_road_is_rejected(model: CameraModel) -> None:
-    """A camera that does not see the road is a `UserError`, which lists the settings to correct."""
+    """A camera that does not see the road is rejected with a `UserError`."""
     with pytest.raises(UserError, match="does not see the road"):
         bird_eye(calibrated(model), GroundGrid())

@@ -40,7 +40,7 @@ GROUND_POINTS = np.array([[x, y] for x in (4.0, 6.0, 9.0, 13.0, 19.0) for y in (
 
 
 def are_inside(camera: CalibratedCamera, pixels: np.ndarray) -> np.ndarray:
-    """Return for each pixel whether the spots that the tests draw around it are in the picture."""
+    """Return, for each pixel, whether the spot that a test draws around this pixel is inside the picture."""
     with np.errstate(invalid="ignore"):
         inside = (pixels > 17) & (pixels < (camera.width_px - 18, camera.height_px - 18))
     return np.asarray(inside.all(axis=1))
@@ -56,7 +56,7 @@ AT_THE_FOLD = CalibratedCamera(
 @example(AT_THE_FOLD)
 @given(cameras())
 def test_projection_and_inverse_projection_agree(camera: CalibratedCamera) -> None:
-    """The inverse projection of a ground point's pixel is the point within 1 cm, through any lens."""
+    """A ground point that is projected through any lens and back moves by less than 1 cm."""
     pixels = picture_points(camera, GROUND_POINTS)
     visible = are_inside(camera, pixels)
     assert np.abs(ground_points(camera, pixels[visible]) - GROUND_POINTS[visible]).max(initial=0.0) < 0.01
@@ -65,24 +65,26 @@ def test_projection_and_inverse_projection_agree(camera: CalibratedCamera) -> No
 @settings(max_examples=20, derandomize=True)
 @given(cameras())
 def test_a_ground_point_maps_to_its_cell_through_any_lens(camera: CalibratedCamera) -> None:
-    """A spot in the distorted picture at a ground point's projection appears in that point's cell."""
+    """A spot in the distorted picture at a ground point's projection appears in the grid cell of that point."""
     grid = GroundGrid()
     mapping = bird_eye(camera, grid, stamped=False)
     pixels = picture_points(camera, GROUND_POINTS)
     visible = are_inside(camera, pixels)
     for (x_m, y_m), (u, v) in zip(GROUND_POINTS[visible], pixels[visible], strict=True):
         picture = np.zeros((camera.height_px, camera.width_px), dtype=np.uint8)
-        half_width_px = round(60 / x_m)  # some 0.2 m: more than a cell
+        half_width_px = round(60 / x_m)  # about 0.2 m: wider than a cell
         picture[round(v) - 1 : round(v) + 2, round(u) - half_width_px : round(u) + half_width_px + 1] = 255
         # The size of the spot on the ground limits the accuracy of its position.
-        near_end, left_end = ground_points(camera, np.array([[u, v + 2], [u - half_width_px, v]]))
+        ends = np.array([[u, v + 2], [u - half_width_px, v]])
+        (near_x_m, near_y_m), (left_x_m, left_y_m) = ground_points(camera, ends)
         rows, columns = np.nonzero(mapping.from_above(mapping.region(picture)))
         if len(rows) == 0:
-            assert abs(x_m - near_end[0]) < 0.2 or x_m > 12  # three rows of pixels between two rows of cells
+            # The spot's three rows of pixels can lie between two rows of cells.
+            assert abs(x_m - near_x_m) < 0.2 or x_m > 12
             continue
         off_x_m, off_y_m = grid.row_x_m()[rows].mean() - x_m, grid.column_y_m()[columns].mean() - y_m
-        assert abs(off_x_m) < 0.1 + abs(x_m - near_end[0]) + abs(x_m - left_end[0])
-        assert abs(off_y_m) < 0.05 + abs(y_m - left_end[1]) + abs(y_m - near_end[1])
+        assert abs(off_x_m) < 0.1 + abs(x_m - near_x_m) + abs(x_m - left_x_m)
+        assert abs(off_y_m) < 0.05 + abs(y_m - left_y_m) + abs(y_m - near_y_m)
 
 
 def test_yaw_pitch_and_roll_have_their_signs() -> None:
@@ -92,8 +94,8 @@ def test_yaw_pitch_and_roll_have_their_signs() -> None:
     def turned(yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> np.ndarray:
         return axes(CalibratedCamera(640, 480, (320.0, 320.0), (319.5, 239.5), 0.0, 0.0, 1.4, yaw, pitch, roll))
 
-    right, down, deep = axes(level)
-    assert (right.tolist(), down.tolist(), deep.tolist()) == ([0, -1, 0], [0, 0, -1], [1, 0, 0])
+    right, down, forward = axes(level)
+    assert (right.tolist(), down.tolist(), forward.tolist()) == ([0, -1, 0], [0, 0, -1], [1, 0, 0])
     assert turned(yaw=0.1)[2, 1] == pytest.approx(math.sin(0.1))
     assert turned(pitch=0.1)[2, 2] == pytest.approx(-math.sin(0.1))
     assert turned(roll=0.1)[0, 2] == pytest.approx(-math.sin(0.1))

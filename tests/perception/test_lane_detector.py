@@ -42,8 +42,8 @@ def detect(picture: Picture) -> Lane:
 @pytest.mark.parametrize("curvature_per_m", [0.0, 1 / 87, -1 / 87, 1 / 42, -1 / 42])
 @pytest.mark.parametrize("lines", [LANE, BROKEN_LANE, FOUR_LANES], ids=["solid", "broken", "four lanes"])
 def test_the_centre_is_found_on_every_curve(scene: Scene, lines: tuple[Line, ...], curvature_per_m: float) -> None:
-    """In one picture the centre is right within 5 cm from 4 to 18 m, down to a radius of 42 m."""
-    lane = detect(scene.picture(lines, curvature_per_m))
+    """From one picture, the centre between 4 and 18 m ahead is found within 5 cm, down to a radius of 42 m."""
+    lane = detect(scene.render(lines, curvature_per_m))
     for x_m in (4.0, 8.0, 12.0, 18.0):
         assert centre_at(lane, x_m) == pytest.approx(centre_y_m(x_m, curvature_per_m), abs=0.05)
     assert lane.confidence > 0.8
@@ -54,7 +54,7 @@ def test_the_centre_is_found_on_every_curve(scene: Scene, lines: tuple[Line, ...
 )
 def test_the_lane_is_in_the_vehicles_frame(scene: Scene, offset_m: float, heading_rad: float) -> None:
     """For a car left of the centre and turned left, the centre is on the right and leads to the right."""
-    lane = detect(scene.picture(FOUR_LANES, offset_m=offset_m, heading_rad=heading_rad))
+    lane = detect(scene.render(FOUR_LANES, offset_m=offset_m, heading_rad=heading_rad))
     for x_m in (5.0, 9.0):
         assert centre_at(lane, x_m) == pytest.approx(
             -offset_m / np.cos(heading_rad) - x_m * np.tan(heading_rad), abs=0.05
@@ -64,7 +64,7 @@ def test_the_lane_is_in_the_vehicles_frame(scene: Scene, offset_m: float, headin
 
 def test_a_mirrored_picture_has_the_mirrored_lane(scene: Scene) -> None:
     """The lane in a mirrored picture is the mirrored lane."""
-    picture = scene.picture(BROKEN_LANE, 1 / 42, offset_m=0.2)
+    picture = scene.render(BROKEN_LANE, 1 / 42, offset_m=0.2)
     lane, mirrored = detect(picture), detect(np.ascontiguousarray(picture[:, ::-1]))
     assert mirrored.centre == pytest.approx([-value for value in lane.centre], abs=0.01)
 
@@ -73,7 +73,7 @@ def test_a_mirrored_picture_has_the_mirrored_lane(scene: Scene) -> None:
 def test_a_lane_with_aligned_gaps_is_found(scene: Scene, phase_m: float) -> None:
     """A lane whose two broken lines have their gaps side by side is found, wherever the dashes are."""
     lines = [Line(side * 1.75, dash_m=3.0, phase_m=phase_m) for side in (1, -1)]
-    lane = detect(scene.picture(lines, 1 / 87))
+    lane = detect(scene.render(lines, 1 / 87))
     assert centre_at(lane, 8.0) == pytest.approx(centre_y_m(8.0, 1 / 87), abs=0.1)
     assert lane.confidence > 0.5
 
@@ -81,7 +81,7 @@ def test_a_lane_with_aligned_gaps_is_found(scene: Scene, phase_m: float) -> None
 @pytest.mark.parametrize("light", [0.45, 1.1])
 def test_the_lane_does_not_depend_on_the_light(scene: Scene, light: float) -> None:
     """In darker or brighter light the lane is the same and the confidence remains high."""
-    picture = scene.picture(FOUR_LANES, 1 / 87)
+    picture = scene.render(FOUR_LANES, 1 / 87)
     original, relit = detect(picture), detect((picture * light).astype(np.uint8))
     assert relit.centre == pytest.approx(original.centre, abs=0.02)
     assert relit.confidence > 0.8
@@ -90,19 +90,19 @@ def test_the_lane_does_not_depend_on_the_light(scene: Scene, light: float) -> No
 def test_a_yellow_line_is_a_line(scene: Scene) -> None:
     """A lane between a yellow and a white line is found."""
     yellow = (60, 170, 200)
-    assert detect(scene.picture((Line(1.75, yellow), Line(-1.75)))).confidence > 0.9
+    assert detect(scene.render((Line(1.75, yellow), Line(-1.75)))).confidence > 0.9
 
 
 def test_an_empty_picture_has_no_confidence(scene: Scene) -> None:
-    """An empty picture has confidence 0, at the start and after a lane, and keeps the last lane."""
+    """Empty pictures have confidence 0 and keep the last lane, but a lane found after many of them is not averaged."""
     detector = LaneDetector(MODEL)
     assert detector.detect(GREY).confidence == 0
-    last_lane = detector.detect(scene.picture(LANE, 1 / 87))
+    last_lane = detector.detect(scene.render(LANE, 1 / 87))
     for _ in range(FORGET_AFTER_PICTURES + 2):
         empty = detector.detect(GREY)
         assert empty.confidence == 0
         assert empty.centre == last_lane.centre
-    assert detector.detect(scene.picture(LANE, -1 / 42)).centre == detect(scene.picture(LANE, -1 / 42)).centre
+    assert detector.detect(scene.render(LANE, -1 / 42)).centre == detect(scene.render(LANE, -1 / 42)).centre
 
 
 def test_noise_is_not_a_lane() -> None:
@@ -114,17 +114,17 @@ def test_noise_is_not_a_lane() -> None:
 def test_lanes_are_averaged_after_the_first(scene: Scene) -> None:
     """The average starts with the first lane, and each newer lane has the weight `SMOOTHING`."""
     detector = LaneDetector(MODEL)
-    first_picture, second_picture = scene.picture(), scene.picture(offset_m=0.3)
+    first_picture, second_picture = scene.render(), scene.render(offset_m=0.3)
     first, second = detector.detect(first_picture), detector.detect(second_picture)
     assert first.centre == detect(first_picture).centre
     assert second.centre[0] == pytest.approx((1 - SMOOTHING) * first.centre[0] + SMOOTHING * -0.3, abs=0.01)
 
 
 def test_the_lane_is_kept_while_the_car_leaves_it(scene: Scene) -> None:
-    """While a car drifts into the next lane, the detector keeps following the lane from which the car came."""
+    """While a car drifts into the next lane, the detector keeps tracking the lane from which the car came."""
     detector = LaneDetector(MODEL)
     for offset_m in np.arange(0.0, 3.01, 0.3):
-        lane = detector.detect(scene.picture(FOUR_LANES, offset_m=float(offset_m)))
+        lane = detector.detect(scene.render(FOUR_LANES, offset_m=float(offset_m)))
     assert centre_at(lane, 8.0) == pytest.approx(-3.0, abs=0.3)  # the average lags by 0.2 m
 
 
@@ -133,7 +133,7 @@ def test_a_lane_is_dropped_one_width_away(scene: Scene, direction: int) -> None:
     """When a car reaches the middle of the next lane, the detector changes to that lane."""
     detector = LaneDetector(MODEL)
     centres_m = [
-        detector.detect(scene.picture(FOUR_LANES, offset_m=float(offset_m))).centre[0]
+        detector.detect(scene.render(FOUR_LANES, offset_m=float(offset_m))).centre[0]
         for offset_m in np.arange(0.0, direction * 4.2, direction * 0.1)
     ]
     offsets = np.arange(0.0, 4.2, 0.1)
@@ -147,24 +147,24 @@ def test_a_lane_is_dropped_one_width_away(scene: Scene, direction: int) -> None:
     [-3.0, -2.5, -1.0, -0.5, 0.0, 0.5, 1.0, 2.5, 3.0],  # not on a line, where either lane would be right
 )
 @pytest.mark.parametrize("curvature_per_m", [0.0, 1 / 42])
-def test_after_a_gap_the_nearest_lane_is_found(scene: Scene, offset_m: float, curvature_per_m: float) -> None:
-    """After a gap without pictures the detector finds the lane that the car is then in."""
+def test_after_forget_the_cars_lane_is_found(scene: Scene, offset_m: float, curvature_per_m: float) -> None:
+    """After `forget`, the detector finds the lane in which the car is now."""
     six_lanes = (*FOUR_LANES, Line(-8.75, dash_m=3.0))
     detector = LaneDetector(MODEL)
-    detector.detect(scene.picture(six_lanes))
+    detector.detect(scene.render(six_lanes))
     detector.forget()
-    lane = detector.detect(scene.picture(six_lanes, curvature_per_m, offset_m=float(offset_m)))
+    lane = detector.detect(scene.render(six_lanes, curvature_per_m, offset_m=float(offset_m)))
     expected_m = -float(np.remainder(offset_m + 1.75, 3.5) - 1.75)
     assert centre_at(lane, 5.0) == pytest.approx(expected_m + centre_y_m(5.0, curvature_per_m), abs=0.15)
 
 
 def test_the_trace_contains_windows_only_for_a_search(scene: Scene) -> None:
-    """The trace of a searched picture contains windows, that of a followed picture does not."""
+    """The trace of a search contains windows; the trace of a tracked picture contains none."""
     detector = LaneDetector(MODEL)
-    detector.detect(scene.picture())
+    detector.detect(scene.render())
     assert detector.trace is not None
     assert detector.trace.windows
-    detector.detect(scene.picture())
+    detector.detect(scene.render())
     assert not detector.trace.windows
     assert detector.trace.fit is not None
     assert detector.trace.mask.shape == (164, 280)
@@ -180,17 +180,17 @@ def test_the_trace_contains_windows_only_for_a_search(scene: Scene) -> None:
     ids=["barrel", "fisheye", "askew"],
 )
 def test_the_lane_is_found_through_any_lens(lens: dict[str, Any]) -> None:
-    """With a distorting lens or a tilted camera the centre is right within 10 cm."""
+    """With a distorting lens or a tilted camera the centre is found within 10 cm."""
     camera = replace(calibrated(CameraModel(320, 240)), **lens)
-    picture = distorted(camera, 1 / 87, 0.4)
+    picture = picture_through_lens(camera, 1 / 87, 0.4)
     lane = LaneDetector(camera, stamped=False).detect(picture)
     assert lane.confidence > 0.7
     for x_m in (5.0, 10.0, 15.0):
         assert centre_at(lane, x_m) == pytest.approx(centre_y_m(x_m, 1 / 87) - 0.4, abs=0.1)
 
 
-def distorted(camera: CalibratedCamera, curvature_per_m: float, offset_m: float) -> Picture:
-    """Return the picture of a road of four lanes in a calibrated camera, computed per pixel."""
+def picture_through_lens(camera: CalibratedCamera, curvature_per_m: float, offset_m: float) -> Picture:
+    """Return the picture of a road of four lanes, computed for each pixel of a calibrated camera."""
     columns, rows = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
     ground = ground_points(camera, np.stack([columns, rows], axis=-1).reshape(-1, 2).astype(np.float64))
     is_visible = np.isfinite(ground).all(axis=1) & (np.hypot(*np.nan_to_num(ground).T) < 60)
@@ -204,9 +204,9 @@ def distorted(camera: CalibratedCamera, curvature_per_m: float, offset_m: float)
     return shades.reshape(camera.height_px, camera.width_px, 3)
 
 
-def test_the_time_stamp_does_not_affect_the_lane(scene: Scene) -> None:
+def test_the_stamp_does_not_affect_the_lane(scene: Scene) -> None:
     """The lane does not depend on the content of the top left corner."""
-    picture = scene.picture(FOUR_LANES)
+    picture = scene.render(FOUR_LANES)
     stamped = picture.copy()
     stamped[:STAMP_SIDE_PX, :STAMP_SIDE_PX] = np.kron(np.indices((8, 8)).sum(0) % 2, np.ones((8, 8)))[..., None] * 255
     assert detect(stamped) == detect(picture)
@@ -219,20 +219,20 @@ def test_a_picture_of_another_size_is_an_error() -> None:
 
 
 def test_a_small_camera_finds_the_lane() -> None:
-    """At 320 x 240 the centre is right within 10 cm."""
+    """At 320 x 240 pixels the centre is found within 10 cm."""
     model = CameraModel(320, 240)
-    lane = LaneDetector(model).detect(Scene(model).picture(FOUR_LANES, 1 / 87))
+    lane = LaneDetector(model).detect(Scene(model).render(FOUR_LANES, 1 / 87))
     assert centre_at(lane, 8.0) == pytest.approx(centre_y_m(8.0, 1 / 87), abs=0.1)
 
 
 def test_forget_makes_the_detector_take_the_nearest_lane(scene: Scene) -> None:
-    """After a car has slid into the next lane the detector follows the old lane until `forget` is called."""
+    """After a car has slid into the next lane, the detector tracks the old lane until `forget` is called."""
     detector = LaneDetector(MODEL)
     for offset_m in np.arange(0.0, 3.51, 0.25):
-        lane = detector.detect(scene.picture(FOUR_LANES, offset_m=float(offset_m)))
+        lane = detector.detect(scene.render(FOUR_LANES, offset_m=float(offset_m)))
     assert lane.centre[0] == pytest.approx(-3.5, abs=0.3)
     detector.forget()
-    assert detector.detect(scene.picture(FOUR_LANES, offset_m=3.5)).centre[0] == pytest.approx(0.0, abs=0.1)
+    assert detector.detect(scene.render(FOUR_LANES, offset_m=3.5)).centre[0] == pytest.approx(0.0, abs=0.1)
 
 
 def true_lane(offset_m: float, confidence: float = 1.0) -> SeenLane:
@@ -247,7 +247,7 @@ def test_true_lanes_are_averaged_as_by_the_lane_detector() -> None:
 
 
 def test_the_last_lane_is_kept_with_low_confidence() -> None:
-    """A lane of low confidence changes only the confidence; after several, or `forget`, the average restarts."""
+    """A lane of low confidence changes only the confidence; after several, or after `forget`, the average restarts."""
     detector = GroundTruthLaneDetector()
     detector.detect(true_lane(1.0))
     lost = [detector.detect(true_lane(5.0, confidence=0.1)) for _ in range(FORGET_AFTER_PICTURES)]

@@ -40,7 +40,7 @@ def search_and_fit(points: Points, width_m: float = 3.5) -> tuple[Sides, LaneFit
     return sides, fit_lane(points, sides, GRID, width_m)
 
 
-def error_m(fit: LaneFit | None, centre: tuple[float, float, float]) -> float:
+def largest_error_m(fit: LaneFit | None, centre: tuple[float, float, float]) -> float:
     assert fit is not None
     x = np.linspace(4, 19, 16)
     return float(np.max(np.abs(np.polyval(fit.centre[::-1], x) - np.polyval(centre[::-1], x))))
@@ -56,9 +56,9 @@ def test_mask_cells_are_converted_to_ground_points() -> None:
 
 
 def test_a_curved_lane_is_found_and_fitted() -> None:
-    """Windows follow a curve of 42 m radius, and the fit is within 3 cm of its centre."""
+    """Windows follow a curve of 42 m radius, and the fit is within 3 cm of the lane's centre."""
     _, fit = search_and_fit(points_on_parallels(CURVE, (1.75, -1.75)))
-    assert error_m(fit, CURVE) < 0.03
+    assert largest_error_m(fit, CURVE) < 0.03
     assert fit is not None
     assert fit.width_m == pytest.approx(3.5, abs=0.03)
     assert fit.confidence > 0.95
@@ -68,21 +68,21 @@ def test_marks_of_adjacent_lanes_are_ignored() -> None:
     """Of six lines the windows select the two next to the car, even if the car is 0.6 m off the centre."""
     points = points_on_parallels((0.6, 0.0, 0.0), (8.75, 5.25, 1.75, -1.75, -5.25, -8.75))
     sides, fit = search_and_fit(points)
-    assert error_m(fit, (0.6, 0.0, 0.0)) < 0.02
+    assert largest_error_m(fit, (0.6, 0.0, 0.0)) < 0.02
     assert set(np.round(points.y_m[sides > 0] - 0.6, 1)) == {1.7, 1.8}, "the left line, at 1.75 m"
 
 
 def test_points_near_a_known_lane_are_assigned_to_it() -> None:
-    """A point half a metre off an expected line belongs to it, a point a metre off does not."""
+    """A point half a metre from an expected line is assigned to this line; a point one metre away is not."""
     points = Points(np.full(4, 10.0), np.array([2.25, 2.75, -1.3, -0.75]))
     assert sides_near(points, (0.0, 0.0, 0.0), 3.5).tolist() == [1, 0, -1, 0]
 
 
 def test_one_line_is_enough() -> None:
-    """With one line the centre is half the expected width beside it, and the confidence is about half."""
+    """With one line, the centre is half the expected width beside this line, and the confidence is about 0.5."""
     points = points_on_parallels(CURVE, (-1.75,))
     fit = fit_lane(points, sides_near(points, CURVE, 3.5), GRID, 3.5)
-    assert error_m(fit, CURVE) < 0.03
+    assert largest_error_m(fit, CURVE) < 0.03
     assert fit is not None
     assert fit.left_visible == 0
     assert fit.confidence == pytest.approx(0.5, abs=0.05)
@@ -97,11 +97,11 @@ def test_an_implausible_width_is_not_used() -> None:
     points = Points(np.concatenate([long_line.x_m, short_line.x_m]), np.concatenate([long_line.y_m, short_line.y_m]))
     sides = np.concatenate([np.full(len(long_line.x_m), 1), np.full(len(short_line.x_m), -1)]).astype(np.int8)
     fit = fit_lane(points, sides, GRID, 3.5)
-    assert error_m(fit, (0.0, 0.0, 0.0)) < 0.02
+    assert largest_error_m(fit, (0.0, 0.0, 0.0)) < 0.02
 
 
 def test_a_short_stretch_is_fitted_straight() -> None:
-    """Less than 6 m of visible lane is fitted without curvature."""
+    """A visible lane shorter than 6 m is fitted without curvature."""
     points = points_on_parallels(CURVE, (1.75, -1.75), np.arange(5.0, 10.0, 0.1))
     fit = fit_lane(points, sides_near(points, CURVE, 3.5), GRID, 3.5)
     assert fit is not None
@@ -109,12 +109,12 @@ def test_a_short_stretch_is_fitted_straight() -> None:
 
 
 def test_a_patch_beside_the_line_does_not_bend_the_fit() -> None:
-    """Spots half a metre off a line do not bend the fit, but lower the share of paint on the lines."""
+    """Spots half a metre from a line do not bend the fit; they lower the share of paint that is on the lines."""
     clean = points_on_parallels(CURVE, (1.75, -1.75))
     spots = points_on_parallels(CURVE, (1.2,), np.arange(12.0, 14.0, 0.1))
     points = Points(np.concatenate([clean.x_m, spots.x_m]), np.concatenate([clean.y_m, spots.y_m]))
     fit = fit_lane(points, sides_near(points, CURVE, 3.5), GRID, 3.5)
-    assert error_m(fit, CURVE) < 0.04
+    assert largest_error_m(fit, CURVE) < 0.04
     assert fit is not None
     assert fit.on_line_share < 0.97
 

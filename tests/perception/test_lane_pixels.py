@@ -10,7 +10,7 @@ def road() -> Mask:
 
 
 def test_only_the_white_mark_is_found() -> None:
-    """A white stripe across the rows is found without the road beside it."""
+    """A white stripe that crosses the rows is found, and the road beside the stripe is not."""
     picture = road()
     picture[:, 300:308] = 220
     mask = lane_pixels(picture)
@@ -28,7 +28,7 @@ def test_a_yellow_mark_is_found() -> None:
 
 
 def test_grain_in_bright_light_is_not_paint() -> None:
-    """A stripe that is 40 levels brighter than a bright road, which is only a fifth, is not paint."""
+    """A stripe that is only a fifth (40 grey levels) brighter than a bright road is not paint."""
     picture = road() + np.uint8(115)
     picture[:, 300:308] += np.uint8(40)
     assert not lane_pixels(picture).any()

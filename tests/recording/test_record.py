@@ -85,7 +85,7 @@ def test_large_integers_are_never_rounded(tmp_path: Path) -> None:
 
 
 def test_a_float_beyond_64_bits_is_missing_as_an_integer(tmp_path: Path) -> None:
-    """A float that no 64-bit integer can represent is missing in a column of integers, without a warning."""
+    """In a column of integers a float beyond 64 bits is read as `MISSING`, without a warning."""
     writer = RecordWriter(tmp_path / "a.mcap", "server")
     for index, number in enumerate((1e308, -(2.0**63), 5.0)):
         writer.write("counts", {"number": number}, now(index))
@@ -166,7 +166,7 @@ def test_a_missing_record_is_an_error(tmp_path: Path) -> None:
 @pytest.mark.parametrize("version", [None, "1", "3"])
 @pytest.mark.parametrize("complete", [True, False])
 def test_another_format_version_is_an_error(tmp_path: Path, version: str | None, complete: bool) -> None:
-    """A record of another format version, or without one, is an error of one sentence that names the readable one."""
+    """A record of another format version, or without one, is an error of one sentence that names both versions."""
     path = tmp_path / "server.mcap"
     file = McapFile(path, library="lavt server", chunk_bytes=0)
     if version is not None:

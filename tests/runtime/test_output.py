@@ -14,7 +14,6 @@ import pytest
 
 from lavt.runtime.output import QueuedOutput
 
-PIPE_BYTES = 65_536
 LINES = 10_000
 END_LIMIT_S = 30
 
@@ -86,9 +85,9 @@ console.run_command(run)
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_a_program_whose_output_is_not_read(number: signal.Signals) -> None:
-    """A program whose output fills two pipes that nobody reads continues, and Ctrl-C and SIGTERM end it."""
+@pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_program_whose_output_is_not_read(signal_number: signal.Signals) -> None:
+    """A program continues although its output pipes are full and nobody reads them; Ctrl-C and SIGTERM end it."""
     progress_read_end, progress_write_end = os.pipe()
     program = PRINTS_UNTIL_STOPPED.format(descriptor=progress_write_end)
     command = [sys.executable, "-c", program]
@@ -97,10 +96,10 @@ def test_a_signal_ends_a_program_whose_output_is_not_read(number: signal.Signals
     ) as process:
         try:
             received = 0
-            while received < 100:  # ten times what fits into a pipe
+            while received < 100:  # 1 MB of output for each pipe, which holds 64 KiB
                 assert select.select([progress_read_end], [], [], END_LIMIT_S)[0]
                 received += len(os.read(progress_read_end, 100))
-            process.send_signal(number)
+            process.send_signal(signal_number)
             assert process.wait(END_LIMIT_S) == 1
         finally:
             process.kill()

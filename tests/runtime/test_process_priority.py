@@ -1,4 +1,4 @@
-"""The priority of processes and of their sessions."""
+"""Test the priority of processes and of their sessions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ print(os.getpriority(os.PRIO_PROCESS, 0), session_niceness())
 
 @pytest.mark.parametrize("leads_a_session", [True, False])
 def test_only_the_leader_of_a_session_changes_its_priority(leads_a_session: bool) -> None:
-    """A process that leads a session changes the session's priority, too; any other process only its own."""
+    """A process that leads a session also changes the session's priority; other processes change only their own."""
     before = session_niceness()
     command = [sys.executable, "-c", CHANGES_ITS_PRIORITY]
     completed = subprocess.run(

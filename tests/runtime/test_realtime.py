@@ -18,7 +18,7 @@ pytestmark = [pytest.mark.realtime, pytest.mark.usefixtures("own_switch_interval
 
 
 class ListRecorder:
-    """A recorder and link that stores its entries and messages."""
+    """A recorder and a link in one; it stores what is recorded and sent."""
 
     def __init__(self) -> None:
         self.entries: list[tuple[str, Any]] = []
@@ -74,7 +74,7 @@ def start() -> tuple[RealRuntime, PeriodicNode, ListRecorder]:
 
 @pytest.mark.judges_times
 def test_nodes_are_woken_in_time_and_messages_delivered() -> None:
-    """A node wakes within 20 ms in the median, gets messages and sends over its link; stop ends its thread."""
+    """A node wakes less than 20 ms late in the median, receives and sends messages, and `stop` ends its thread."""
     runtime, node, recorded = start()
     pause(NS_PER_S // 3)
     runtime.deliver("state", b"hello", runtime.now())
@@ -109,7 +109,7 @@ class FailingWake(PeriodicNode):
 
 
 def test_a_node_that_fails_between_messages_ends_the_run() -> None:
-    """A node that fails between messages ends the run."""
+    """A node whose `next_wake_ns` fails ends the run."""
     clock = MachineClock()
     runtime = RealRuntime(clock, [FailingWake(0)], ListRecorder(), lambda: None)
     runtime.start({})

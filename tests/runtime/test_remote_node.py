@@ -1,4 +1,4 @@
-"""A node in its own process; the tests run both ends in one process."""
+"""Test a node that runs in a process of its own; the tests run both ends in one process."""
 
 # ruff: noqa: D102 (test helpers with short methods)
 
@@ -45,7 +45,7 @@ def wait_until(condition: Callable[[], bool]) -> None:
 
 
 class FakeOutputs:
-    """A recorder and link that stores its entries and messages."""
+    """A recorder and a link in one; it stores what is recorded and sent."""
 
     def __init__(self) -> None:
         self.written: list[tuple[str, Any]] = []
@@ -57,13 +57,13 @@ class FakeOutputs:
     def send(self, *sends: Send) -> None:
         self.sent += sends
 
-    def of(self, topic: str) -> list[Any]:
+    def recorded(self, topic: str) -> list[Any]:
         return [payload for channel, payload in self.written if channel == topic]
 
 
 @dataclass
 class FakeActuator:
-    """A node with the actuator's name, which returns requests as replies and sends to its neighbours."""
+    """A node with the actuator's name: it answers a request with the request's payload, and sends to its neighbours."""
 
     name: str = "actuator"
     counts: Counter[str] = field(default_factory=Counter)
@@ -103,58 +103,58 @@ class Neighbour:
 
 
 @dataclass
-class Rig:
-    """Both ends in one process."""
+class ConnectedEnds:
+    """A node and its host at one end, and the server's runtime with the node's proxy at the other."""
 
     node: FakeActuator
     neighbour: Neighbour
     outputs: FakeOutputs
     proxy: RemoteNodeProxy
-    main: RealRuntime
+    server: RealRuntime
     host: NodeHost
     disconnected: threading.Event
     status: list[int]
     """The status of the node, as its only element."""
     silences: list[RealRuntime]
-    """The arguments of `on_silent`."""
+    """The argument of each call of `on_silent`."""
 
 
 @contextmanager
-def rig() -> Iterator[Rig]:
+def connect() -> Iterator[ConnectedEnds]:
     server_end, node_end = multiprocessing.Pipe()
     node, neighbour, outputs, disconnected, status = FakeActuator(), Neighbour(), FakeOutputs(), threading.Event(), [0]
     silences: list[RealRuntime] = []
     proxy = RemoteNodeProxy("actuator", server_end, heartbeat="state", on_silent=silences.append)
-    main = RealRuntime(CLOCK, [neighbour], outputs, lambda: None, {"actuator": proxy})
+    server = RealRuntime(CLOCK, [neighbour], outputs, lambda: None, {"actuator": proxy})
     host = NodeHost(node_end, CLOCK, node, get_status=lambda: status[0], on_disconnect=disconnected.set)
-    main.start({"zenoh": outputs})
-    proxy.start(main)
+    server.start({"zenoh": outputs})
+    proxy.start(server)
     host.start()
-    ends = Rig(node, neighbour, outputs, proxy, main, host, disconnected, status, silences)
+    ends = ConnectedEnds(node, neighbour, outputs, proxy, server, host, disconnected, status, silences)
     try:
         yield ends
     finally:
         host.close()
         proxy.close(5)
-        main.stop()
+        server.stop()
 
 
 @pytest.mark.realtime
 @pytest.mark.judges_times
 def test_a_remote_node_receives_and_sends() -> None:
     """Messages reach the remote node with their arrival time; its sends reach nodes, links and the record."""
-    with rig() as ends:
+    with connect() as ends:
         arrived = CLOCK.now()
-        ends.main.deliver("control", b"drive", arrived)
+        ends.server.deliver("control", b"drive", arrived)
         wait_until(lambda: bool(ends.neighbour.received))
         assert [(message.payload, message.arrived) for message in ends.node.received] == [(b"drive", arrived)]
         assert ends.neighbour.received == [StationaryStatus(at_rest=True, active_operator=None)]
-        assert ends.outputs.of("control") == [b"drive"], "recorded once, in the process with the links"
-        wait_until(lambda: ends.outputs.of("event") == ["received"])
+        assert ends.outputs.recorded("control") == [b"drive"], "recorded once, in the process with the links"
+        wait_until(lambda: ends.outputs.recorded("event") == ["received"])
 
 
 def test_threads_that_forward_requests_do_not_disturb_each_other() -> None:
-    """Threads that forward requests at the same time, none of which is answered, cause no error.
+    """Threads that forward unanswered requests at the same time cause no error.
 
     To provoke errors, each thread lets the others run whenever a built-in function returns.
     """
@@ -185,17 +185,17 @@ def test_threads_that_forward_requests_do_not_disturb_each_other() -> None:
 
 def test_a_reply_goes_to_its_peer() -> None:
     """A reply of the remote node goes to the peer of its request."""
-    with rig() as ends:
+    with connect() as ends:
         alice, bob = object(), object()
-        ends.main.deliver("session", b"of alice", CLOCK.now(), alice)
-        ends.main.deliver("session", b"of bob", CLOCK.now(), bob)
+        ends.server.deliver("session", b"of alice", CLOCK.now(), alice)
+        ends.server.deliver("session", b"of bob", CLOCK.now(), bob)
         wait_until(lambda: len(ends.outputs.sent) == 2)
         assert [(send.payload, send.peer) for send in ends.outputs.sent] == [(b"of alice", alice), (b"of bob", bob)]
 
 
 def test_a_blocked_reply_delays_neither_heartbeats_nor_messages(monkeypatch: pytest.MonkeyPatch) -> None:
     """While a link blocks on a reply, heartbeats, messages and other nodes' messages are processed."""
-    with rig() as ends:
+    with connect() as ends:
         blocked, resumed = threading.Event(), threading.Event()
         send = ends.outputs.send
 
@@ -207,43 +207,43 @@ def test_a_blocked_reply_delays_neither_heartbeats_nor_messages(monkeypatch: pyt
 
         monkeypatch.setattr(ends.outputs, "send", block_replies)
         for _ in range(2 * MAX_PENDING_PEERS):
-            ends.main.deliver("session", b"?", CLOCK.now(), "alice")
+            ends.server.deliver("session", b"?", CLOCK.now(), "alice")
         assert blocked.wait(10)
         beat(ends)
         ends.host.runtime.links["zenoh"].send(Send("state", b"a state"))
         wait_until(lambda: Send("state", b"a state") in ends.outputs.sent)
-        ends.main.deliver("control", b"drive", CLOCK.now())
+        ends.server.deliver("control", b"drive", CLOCK.now())
         wait_until(lambda: bool(ends.neighbour.received))
         assert ends.proxy._replies.qsize() <= MAX_PENDING_PEERS
-        assert ends.main.failed is None
+        assert ends.server.failed is None
         resumed.set()
 
 
 def test_the_status_is_reported_before_messages() -> None:
     """The remote node's status is reported before its messages are sent."""
-    with rig() as ends:
+    with connect() as ends:
         ends.status[0] = 7
-        ends.main.deliver("session", b"?", CLOCK.now(), object())
+        ends.server.deliver("session", b"?", CLOCK.now(), object())
         wait_until(lambda: bool(ends.outputs.sent))
         assert ends.proxy.status == 7
 
 
 @pytest.mark.realtime
 def test_a_late_command_between_the_processes_is_dropped() -> None:
-    """A command delayed by more than 60 ms between the processes is dropped and counted; a request is not."""
-    with rig() as ends:
+    """Messages delayed by more than 60 ms between the processes are counted; commands are dropped, requests are not."""
+    with connect() as ends:
         long_ago = CLOCK.now().later(-LATE_NS - NS_PER_MS)
-        ends.main.deliver("control", b"stale", long_ago)
-        ends.main.deliver("session", b"late", long_ago, "alice")
+        ends.server.deliver("control", b"stale", long_ago)
+        ends.server.deliver("session", b"late", long_ago, "alice")
         wait_until(lambda: bool(ends.outputs.sent))
         assert ends.node.received == []
-    (counts,) = [entry for entry in ends.outputs.of("counts") if entry["node"] == "actuator's process"]
+    (counts,) = [entry for entry in ends.outputs.recorded("counts") if entry["node"] == "actuator's process"]
     assert (counts["control_late"], counts["session_late"], counts["record_overflow"]) == (1, 1, 0)
 
 
 def test_the_end_of_the_other_process_is_noticed() -> None:
     """The node's process is notified when the server's process closes the pipe."""
-    with rig() as ends:
+    with connect() as ends:
         ends.proxy._pipe.close(1)
         assert ends.disconnected.wait(10)
 
@@ -252,80 +252,80 @@ def test_the_end_of_the_other_process_is_noticed() -> None:
 @pytest.mark.judges_times
 def test_a_failing_remote_node_ends_the_run() -> None:
     """An error of the remote node ends the server's run with that error."""
-    with rig() as ends:
-        ends.main.deliver("control", b"break", CLOCK.now())
+    with connect() as ends:
+        ends.server.deliver("control", b"break", CLOCK.now())
         wait_until(lambda: ends.host.runtime.failed is not None)
         ends.host.close()
-        wait_until(lambda: ends.main.failed is not None)
-        assert "failed on purpose" in str(ends.main.failed)
+        wait_until(lambda: ends.server.failed is not None)
+        assert "failed on purpose" in str(ends.server.failed)
 
 
 def test_the_end_of_the_nodes_process_ends_the_run() -> None:
     """The end of the node's process ends the server's run with an error."""
-    with rig() as ends:
+    with connect() as ends:
         ends.host._pipe.close(1)
-        wait_until(lambda: ends.main.failed is not None)
-        assert isinstance(ends.main.failed, WorkError)
-        assert "ended" in str(ends.main.failed)
+        wait_until(lambda: ends.server.failed is not None)
+        assert isinstance(ends.server.failed, WorkError)
+        assert "ended" in str(ends.server.failed)
 
 
 @pytest.fixture
 def no_checker(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Only the test checks heartbeats."""
+    """Disable the proxy's own checks, so that only the test checks heartbeats."""
     monkeypatch.setattr(RemoteNodeProxy, "_check_heartbeats", lambda _: None)
 
 
-def beat(ends: Rig) -> None:
+def beat(ends: ConnectedEnds) -> None:
     """Let the remote node record a state, and wait until the proxy has received it."""
-    count = len(ends.outputs.of("state"))
+    count = len(ends.outputs.recorded("state"))
     ends.host.runtime.record("state", b"", CLOCK.now())
-    wait_until(lambda: len(ends.outputs.of("state")) > count)
+    wait_until(lambda: len(ends.outputs.recorded("state")) > count)
 
 
 @pytest.mark.usefixtures("no_checker")
 def test_a_remote_node_without_a_heartbeat_fails_the_run() -> None:
-    """Without a heartbeat a silence is reported once, and then the run fails; a heartbeat in between prevents that."""
-    with rig() as ends:
+    """Without heartbeats, first the silence is reported, then the run fails; a heartbeat in between prevents this."""
+    with connect() as ends:
         for _ in range(3):
             beat(ends)
             for _ in range(FAILED_AFTER_CHECKS - 1):
                 ends.proxy.check_heartbeat()
-        assert ends.silences == [ends.main] * 3
-        assert ends.main.failed is None
+        assert ends.silences == [ends.server] * 3
+        assert ends.server.failed is None
         ends.host.runtime.record("event", "alive, but without a state", CLOCK.now())
-        wait_until(lambda: bool(ends.outputs.of("event")))
+        wait_until(lambda: bool(ends.outputs.recorded("event")))
         ends.proxy.check_heartbeat()
-        assert isinstance(ends.main.failed, WorkError)
+        assert isinstance(ends.server.failed, WorkError)
 
 
 @pytest.mark.usefixtures("no_checker")
 def test_a_heartbeat_while_the_silence_is_reported_prevents_the_failure() -> None:
     """A node whose heartbeat arrives while its silence is reported has not failed."""
-    with rig() as ends:
+    with connect() as ends:
         beat(ends)
         ends.proxy._on_silent = lambda _: beat(ends)
         for _ in range(SILENT_AFTER_CHECKS):
             ends.proxy.check_heartbeat()
-        assert ends.main.failed is None
+        assert ends.server.failed is None
 
 
 @pytest.mark.usefixtures("no_checker")
 def test_the_first_heartbeat_may_take_longer() -> None:
     """Before the first heartbeat a node has 30 s; then the run fails."""
-    with rig() as ends:
+    with connect() as ends:
         for _ in range(FIRST_HEARTBEAT_CHECKS - 1):
             ends.proxy.check_heartbeat()
-        assert (ends.silences, ends.main.failed) == ([], None)
+        assert (ends.silences, ends.server.failed) == ([], None)
         ends.proxy.check_heartbeat()
-        assert isinstance(ends.main.failed, WorkError)
+        assert isinstance(ends.server.failed, WorkError)
 
 
 def test_heartbeats_are_checked() -> None:
     """A proxy checks heartbeats by itself from its start on."""
-    with rig() as ends:
+    with connect() as ends:
         beat(ends)
-        wait_until(lambda: ends.main.failed is not None)
-        assert ends.silences == [ends.main]
+        wait_until(lambda: ends.server.failed is not None)
+        assert ends.silences == [ends.server]
 
 
 @pytest.mark.parametrize("failing_step", ["send", "read", "receive"])
@@ -350,8 +350,8 @@ def test_an_error_in_one_direction_closes_the_pipe(failing_step: str) -> None:
     server_pipe.close(1)
 
 
-def test_a_server_that_never_started_ends_the_nodes_process() -> None:
-    """A server that fails before its start ends the node's process."""
+def test_the_end_of_a_server_that_never_started_is_noticed() -> None:
+    """The node's process is notified if the server closes its end without having started."""
     server_end, node_end = multiprocessing.Pipe()
     disconnected = threading.Event()
     proxy = RemoteNodeProxy("actuator", server_end, heartbeat="state", on_silent=lambda _: None)
@@ -364,7 +364,7 @@ def test_a_server_that_never_started_ends_the_nodes_process() -> None:
 
 @pytest.mark.realtime
 def test_sending_without_a_reader_does_not_block() -> None:
-    """Without a reader, sending does not block, and entries that do not fit are counted."""
+    """If nothing reads from a pipe, sending does not block, and entries that do not fit are counted."""
     server_end, _node_end = multiprocessing.Pipe()
     pipe = Pipe(server_end, lambda _entry: None, lambda: None)
     pipe.start()

@@ -46,7 +46,7 @@ class ListRecorder:
 
 
 def test_queued_messages_come_first() -> None:
-    """Queued messages come first and in order, then the newest of the other channels."""
+    """Messages of channels with a queue come first and in order, then the newest message of each other channel."""
     inbox = Inbox()
     for channel, payload in (("state", 1), ("access_unit", 2), ("view", 3), ("access_unit", 4), ("state", 5)):
         inbox.put(message(channel, payload))
@@ -67,7 +67,7 @@ def test_packets_that_arrived_before_a_wake_come_first() -> None:
 
 
 def test_a_full_queue_drops_its_oldest_message() -> None:
-    """A full queue drops and counts its oldest message, and loses nothing of other channels."""
+    """A full queue drops and counts its oldest messages, and other channels lose nothing."""
     inbox = Inbox()
     inbox.put(message("session", "first"))
     length = CHANNELS["control"].length
@@ -141,11 +141,11 @@ def test_unreadable_bytes_are_recorded(channel: str, data: bytes) -> None:
 
 def test_every_network_channel_has_a_decoder() -> None:
     """Each network channel has a decoder for the record."""
-    assert {name for name, row in CHANNELS.items() if row.carrier in ("video", "zenoh")} == set(WIRE_DECODERS)
+    assert {name for name, channel in CHANNELS.items() if channel.carrier in ("video", "zenoh")} == set(WIRE_DECODERS)
 
 
 def test_a_full_disk_ends_the_record_only() -> None:
-    """An entry that cannot be written ends the record; it and all later ones are counted as lost."""
+    """An entry that cannot be written ends the record; this entry and all later ones are counted as lost."""
 
     class FullDisk(ListRecorder):
         def write(self, topic: str, payload: Any, now: Now) -> None:
@@ -175,7 +175,7 @@ def test_a_record_is_complete_after_close() -> None:
 
 @pytest.mark.parametrize("is_blocked", [False, True])
 def test_the_live_status_does_not_depend_on_the_record(is_blocked: bool) -> None:
-    """While the disk is full or does not answer, the ending and the figures are shown, and the record can be closed."""
+    """The live status works, and the record can be closed, even if the disk is full or does not respond."""
     unblock = threading.Event()
 
     class Disk(ListRecorder):

@@ -1,4 +1,4 @@
-"""A thread that ends with an error fails its process."""
+"""Test that a thread that ends with an error ends the runtime, and so its process."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ CLOCK = MachineClock()
 
 
 class BrokenError(Exception):
-    """The error that the tests put into threads."""
+    """The error that the tests raise in threads."""
 
 
-def broken(*_: Any) -> Any:
-    """Fail, in place of any function."""
+def raise_broken(*_: Any) -> Any:
+    """Raise `BrokenError`, as a stand-in for any function."""
     raise BrokenError
 
 
 class NullRecorder:
-    """A recorder that keeps nothing."""
+    """A recorder that discards its entries."""
 
     def write(self, topic: str, payload: Any, now: Any) -> None:
         """Discard one entry."""
@@ -46,42 +46,42 @@ class NullRecorder:
 
 @pytest.fixture
 def runtime() -> Iterator[RealRuntime]:
-    runtime = RealRuntime(CLOCK, [], NullRecorder(), broken)
+    runtime = RealRuntime(CLOCK, [], NullRecorder(), raise_broken)
     with fail_on_thread_errors(runtime.fail):
         yield runtime
 
 
 def break_udp(stack: ExitStack) -> None:
-    """A received datagram cannot be processed."""
+    """Make a thread fail at processing a datagram."""
     link = stack.enter_context(closing(UdpLink(CLOCK, "rtp", bind=(LOOPBACK, 0))))
-    link.start(broken)
+    link.start(raise_broken)
     sender = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
     sender.sendto(b"x", (LOOPBACK, link.port))
 
 
 def break_closed_socket(stack: ExitStack) -> None:
-    """The socket is not open any more, though nobody has closed the link."""
+    """Make a thread fail because its socket is closed, although its link is open."""
     link = stack.enter_context(closing(UdpLink(CLOCK, "rtp", bind=(LOOPBACK, 0))))
     link._socket.close()
     link.start(lambda *_: None)
 
 
 def break_registration(stack: ExitStack) -> None:
-    """A registration cannot be made."""
-    link = RendezvousLink(CLOCK, "rtp", bind=(LOOPBACK, 0), rendezvous=(LOOPBACK, 9), registration=broken)
+    """Make a thread fail at registering with a rendezvous."""
+    link = RendezvousLink(CLOCK, "rtp", bind=(LOOPBACK, 0), rendezvous=(LOOPBACK, 9), registration=raise_broken)
     stack.enter_context(closing(link)).start(lambda *_: None)
 
 
 def break_injector(stack: ExitStack) -> None:
-    """The result of an order cannot be delivered."""
-    injector = stack.enter_context(closing(Injector(CLOCK, broken, None)))
+    """Make a thread fail at delivering the result of an order."""
+    injector = stack.enter_context(closing(Injector(CLOCK, raise_broken, None)))
     injector.send(Send("inject", InjectionOrder(1, "L0", ())))
 
 
 def break_gateway(_stack: ExitStack) -> None:
-    """A query cannot be sent again."""
+    """Make a thread fail at sending a query."""
     authenticator: Any = OperatorAuthenticator
-    ClientGateway(broken, broken, authenticator)._send_in_thread(Send("session", b""))
+    ClientGateway(raise_broken, raise_broken, authenticator)._send_in_thread(Send("session", b""))
 
 
 BREAKS = [break_udp, break_closed_socket, break_registration, break_injector, break_gateway]
@@ -109,13 +109,13 @@ def test_an_error_of_a_camera_device_ends_the_runtime(
     """An error in the thread that reads a camera device ends the runtime."""
     file = write_video(tmp_path / "camera.avi", rate_hz=30)
     with closing(video_device.VideoDevice(str(file), model=MODEL, rate_hz=30, clock=CLOCK)):
-        monkeypatch.setattr(video_device, "_read_picture", broken)
+        monkeypatch.setattr(video_device, "_read_picture", raise_broken)
         assert runtime.stopped.wait(WAIT_S)
     assert isinstance(runtime.failed, BrokenError)
 
 
 def test_an_exit_of_a_thread_ends_the_runtime(runtime: RealRuntime) -> None:
-    """A thread that calls `sys.exit` ends the runtime, although Python by itself ignores that."""
+    """A thread that raises `SystemExit` ends the runtime, although Python itself would ignore this."""
 
     def leave() -> None:
         raise SystemExit
@@ -129,7 +129,7 @@ def test_the_former_handler_is_restored() -> None:
     """After the context is left, errors in threads are handled as before."""
     previous_hook, errors = threading.excepthook, queue.Queue[BaseException]()
     with fail_on_thread_errors(errors.put):
-        thread = threading.Thread(target=broken)
+        thread = threading.Thread(target=raise_broken)
         thread.start()
         thread.join()
     assert isinstance(errors.get_nowait(), BrokenError)

@@ -23,6 +23,7 @@ class PeriodicSender:
     def __init__(self, name: str, sends: str, receives: str, *, start_ns: int, period_ns: int | None) -> None:
         self.name, self.counts = name, Counter[str]()
         self.received: list[tuple[Any, int, int]] = []
+        """Payload, time of arrival and time when its stage began, of each message."""
         self._sends, self._next, self._period_ns = sends, start_ns, period_ns
         self._number = 0
         self.pipelines: Mapping[str, Sequence[Stage]] = {
@@ -68,7 +69,7 @@ def new_runtime(
 
 @given(st.integers(0, 10**13), st.integers(0, 10**13), st.integers(-500_000, 500_000), st.integers(-(10**9), 10**9))
 def test_a_hosts_clock_is_inverted_exactly(start_ns: int, mono_ns: int, drift_ppb: int, step_ns: int) -> None:
-    """`true_ns` is the first true time at which the clock shows a value, for any drift and steps."""
+    """`true_ns` is the first true time at which the clock has reached a value, for any drift and steps."""
     clock = HostClock(start_ns, 0, drift_ppb=drift_ppb, steps=[(5 * NS_PER_S, step_ns)])
     true_ns = clock.true_ns(start_ns + mono_ns)
     assert clock.at(true_ns).mono_ns >= start_ns + mono_ns
@@ -85,7 +86,7 @@ def test_offset_drift_and_steps() -> None:
 
 
 def test_links_delay_exactly_and_keep_order() -> None:
-    """A constant link delays exactly; a link with jitter keeps the order."""
+    """A link with a constant delay delays exactly; a link with jitter keeps the order."""
     runtime, actuator = new_runtime(DelayModel(75.0))
     runtime.run(NS_PER_S, lambda: False)
     assert [arrived for _, arrived, _ in actuator.received] == [(20 * i + 75) * MS for i in range(47)]
@@ -99,7 +100,7 @@ def test_links_delay_exactly_and_keep_order() -> None:
 
 
 def test_a_busy_node_queues_messages() -> None:
-    """A node that is slower than its messages queues them, each with its own arrival time."""
+    """If a node takes longer than the interval of its messages, messages wait, each with its time of arrival."""
     runtime, actuator = new_runtime(
         DelayModel(0.0), costs_ns={("actuator", "receive"): 30 * MS, ("driver", "send"): 3 * MS}
     )
@@ -120,7 +121,7 @@ def test_a_closed_link_loses_messages() -> None:
 
 
 def test_two_runs_are_equal() -> None:
-    """Two runs with the same seed have equal times to the nanosecond; another seed has other times."""
+    """Two runs with the same seed have the same times, to the nanosecond; another seed gives other times."""
 
     def received(seed: int) -> list[tuple[Any, int, int]]:
         runtime, actuator = new_runtime(DelayModel(5.0, Lognormal(12.0, 0.6), seed, "jitter"))

@@ -8,7 +8,7 @@ from lavt.runtime.wakeup import WakeEvent
 
 
 def test_setting_twice_wakes_once() -> None:
-    """Setting an event once or twice ends one wait only. After that wait, or after `clear`, the event is not set."""
+    """However often an event is set, it ends one wait. After that wait, or after `clear`, it is not set."""
     event = WakeEvent()
     event.set()
     event.set()
@@ -35,18 +35,18 @@ def test_a_wait_times_out(pause_s: float) -> None:
 
 
 def test_no_wake_is_lost() -> None:
-    """Two threads that set each other's event in turns both finish."""
-    here, there = WakeEvent(), WakeEvent()
+    """Two threads that wake each other 2000 times in turns both finish."""
+    wakes_main, wakes_thread = WakeEvent(), WakeEvent()
 
     def answer() -> None:
         for _ in range(2000):
-            there.wait(10)
-            here.set()
+            wakes_thread.wait(10)
+            wakes_main.set()
 
     thread = threading.Thread(target=answer, daemon=True)
     thread.start()
     for _ in range(2000):
-        there.set()
-        here.wait(10)
+        wakes_thread.set()
+        wakes_main.wait(10)
     thread.join(10)
     assert not thread.is_alive()

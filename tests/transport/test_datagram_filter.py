@@ -39,7 +39,7 @@ def open_path(path: PathServer, client: PathClient, address: tuple[str, int] = H
 def count_passed(
     port_filter: VideoPortFilter | ProbePortFilter, datagram: bytes, address: tuple[str, int], copies: int
 ) -> int:
-    """Return how many of `copies` equal datagrams within one second pass."""
+    """Send `copies` equal datagrams within one second; return how many the filter passes."""
     return sum(port_filter.passes(datagram, address, T0 + number * NS_PER_MS // 10) for number in range(copies))
 
 
@@ -49,7 +49,7 @@ def exhaust(port_filter: VideoPortFilter) -> None:
 
 
 def test_strangers_datagrams_pass_at_a_limited_rate() -> None:
-    """Of the datagrams of all senders without an open path together, 200 a second pass."""
+    """All senders without an open path share one limit of 200 datagrams a second."""
     path, client = new_path(), PathClient(TOKEN)
     video = VideoPortFilter(path)
     forged = PathClient(bytes(16)).hello(T0)
@@ -79,7 +79,7 @@ def test_a_flood_does_not_keep_the_client_out() -> None:
 
 
 def test_replays_with_the_clients_address_pass_at_a_limited_rate() -> None:
-    """Replayed hellos and answers count as a stranger's, also from the address to which the path is open."""
+    """Replayed hellos and answers are limited like a stranger's, even from the address of the open path."""
     path, client = new_path(), PathClient(TOKEN)
     video = VideoPortFilter(path)
     hello = client.hello(T0)
@@ -103,7 +103,7 @@ def test_hellos_with_a_new_token_pass() -> None:
 
 
 def test_strangers_probes_do_not_crowd_out_the_clients() -> None:
-    """The host with the open path has a rate limit of its own for probes, directly or through the rendezvous."""
+    """Probes of the host with the open path have a separate rate limit, directly and through the rendezvous."""
     request = encode_request(1, 1)
     for address in (HOME, VIA_RENDEZVOUS):
         path = new_path()
@@ -112,7 +112,7 @@ def test_strangers_probes_do_not_crowd_out_the_clients() -> None:
         assert count_passed(probe, request, ELSEWHERE, 1000) == PROBES_PER_S
         assert probe.passes(request, (address[0], 40000), T0)
         assert not probe.passes(request, ELSEWHERE, T0)
-        assert count_passed(probe, request, address, 1000) == PROBES_PER_S - 1, "one of this host has passed already"
+        assert count_passed(probe, request, address, 1000) == PROBES_PER_S - 1, "this host has sent one already"
 
 
 def test_datagrams_that_do_not_pass_are_counted_and_not_delivered() -> None:
@@ -132,7 +132,7 @@ def test_datagrams_that_do_not_pass_are_counted_and_not_delivered() -> None:
 
 @given(st.binary(max_size=80), st.sampled_from([b"", b"LAVT\x01\x03", b"LAVT\x03\x03"]))
 def test_any_bytes(data: bytes, head: bytes) -> None:
-    """Arbitrary bytes raise nothing and do not pass beyond the rate limit."""
+    """Arbitrary bytes raise nothing and do not pass once the rate limit is used up."""
     video = VideoPortFilter(new_path())
     exhaust(video)
     assert not video.passes(head + data, ELSEWHERE, T0)

@@ -158,7 +158,7 @@ def test_longest_texts_fit(letter: str) -> None:
     )
     assert decode(State, encode(message)) == message
     with pytest.raises(BadMessage):
-        decode(State, wire(replace(message, reason=letter * (REASON_BYTES + 1))))
+        decode(State, pack_unchecked(replace(message, reason=letter * (REASON_BYTES + 1))))
 
 
 ANY_TEXT = st.one_of(st.text(st.characters(categories=["L", "Cs", "So"]), max_size=2000), st.text())
@@ -197,7 +197,7 @@ def test_random_bytes(kind: type[Any]) -> None:
 
 @pytest.mark.parametrize("kind", MESSAGES)
 def test_damaged_messages(kind: type[Any]) -> None:
-    """A message with a changed byte is decoded to values in range or raises BadMessage; a truncated one raises it."""
+    """A message with a changed byte is decoded or raises BadMessage; a truncated message always raises BadMessage."""
     whole = encode(MESSAGES[kind])
     generator = stream(2, f"damaged {kind.__name__}")
     rejected = 0
@@ -296,7 +296,8 @@ OUT_OF_RANGE: dict[type, dict[str, list[Any]]] = {
 }
 
 
-def wire(message: AnyMessage, **changed: Any) -> bytes:
+def pack_unchecked(message: AnyMessage, **changed: Any) -> bytes:
+    """Pack a message with changed values, which may be invalid."""
     values = [changed.get(name, getattr(message, name)) for name in message.__struct_fields__]
     packed: bytes = msgpack.packb([VERSION, *values])
     return packed
@@ -307,7 +308,7 @@ def test_every_field_is_checked(kind: type[Any], name: str) -> None:
     """A message is rejected if a field has a wrong type, is not finite or is out of range; booleans are not numbers."""
     for bad in OUT_OF_RANGE[kind][name]:
         with pytest.raises(BadMessage, match=f"{kind.__name__}.{name}"):
-            decode(kind, wire(MESSAGES[kind], **{name: bad}))
+            decode(kind, pack_unchecked(MESSAGES[kind], **{name: bad}))
 
 
 @pytest.mark.parametrize("kind", MESSAGES)
@@ -321,7 +322,7 @@ def test_other_versions(kind: type[Any], version: Any) -> None:
 
 @pytest.mark.parametrize("kind", MESSAGES)
 def test_other_shapes(kind: type[Any]) -> None:
-    """A message with too many or too few fields, of another class, or that is not an array, is rejected."""
+    """A message is rejected if it has too many or too few fields, is of another class or is not an array."""
     values = msgpack.unpackb(encode(MESSAGES[kind]))
     shapes = [[*values, 0], values[:-1], [], {1: values}, values[0], None, "x", [values]]
     shapes += [msgpack.unpackb(encode(other)) for other_kind, other in MESSAGES.items() if other_kind is not kind]

@@ -5,7 +5,7 @@ import socket
 import threading
 from collections.abc import Iterator
 from contextlib import closing
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 from tests.support.clocks import ShiftedClock
@@ -21,17 +21,26 @@ ARRIVES_S = 5.0
 ANY_PORT = ("127.0.0.1", 0)
 
 
+class Delivered(NamedTuple):
+    """One message that a link delivered."""
+
+    channel: str
+    payload: Any
+    arrived: Now
+    peer: Any
+
+
 class Received:
     """The messages that a link delivered."""
 
     def __init__(self) -> None:
-        self.messages: queue.Queue[tuple[str, Any, Now, Any]] = queue.Queue()
+        self.messages: queue.Queue[Delivered] = queue.Queue()
 
     def __call__(self, channel: str, payload: Any, arrived: Now, peer: Any) -> None:
         """Store a message."""
-        self.messages.put((channel, payload, arrived, peer))
+        self.messages.put(Delivered(channel, payload, arrived, peer))
 
-    def next(self) -> tuple[str, Any, Now, Any]:
+    def next(self) -> Delivered:
         """Wait for the next message."""
         return self.messages.get(timeout=ARRIVES_S)
 
@@ -55,8 +64,8 @@ def test_delivers(sender: socket.socket) -> None:
     with closing(open_link()) as link:
         link.start(received)
         sender.sendto(b"packet", ("127.0.0.1", link.port))
-        channel, payload, _, peer = received.next()
-    assert (channel, payload, peer) == ("rtp", b"packet", sender.getsockname())
+        message = received.next()
+    assert (message.channel, message.payload, message.peer) == ("rtp", b"packet", sender.getsockname())
 
 
 def test_time_of_arrival(sender: socket.socket) -> None:
@@ -67,7 +76,7 @@ def test_time_of_arrival(sender: socket.socket) -> None:
         sender.sendto(b"early", ("127.0.0.1", link.port))
         sent = MachineClock().now()
         link.start(received)
-        arrived = received.next()[2]
+        arrived = received.next().arrived
     assert before.wall_ns <= arrived.wall_ns <= sent.wall_ns + NS_PER_S // 100
     assert before.mono_ns - NS_PER_S // 1000 <= arrived.mono_ns <= MachineClock().now().mono_ns
 
@@ -80,7 +89,7 @@ def test_arrival_on_both_clocks(sender: socket.socket) -> None:
         before = MachineClock().now()
         link.start(received)
         sender.sendto(b"packet", ("127.0.0.1", link.port))
-        arrived = received.next()[2]
+        arrived = received.next().arrived
         after = MachineClock().now()
     assert before.wall_ns <= arrived.wall_ns <= after.wall_ns
     mono_ns = arrived.mono_ns - 10**15 + 5 * NS_PER_S
@@ -90,13 +99,13 @@ def test_arrival_on_both_clocks(sender: socket.socket) -> None:
 @pytest.mark.parametrize("wall_s", [-5.0, 3600.0])
 def test_stepped_clock(sender: socket.socket, wall_s: float) -> None:
     """A kernel timestamp in the future or an hour old is ignored, and the time of reading is used."""
-    # For a link whose wall clock is ahead of the kernel's by `wall_s`, a timestamp of now is that old.
+    # The link's wall clock is ahead of the kernel's by `wall_s`, so the timestamp of a new datagram is that old.
     received, clock = Received(), ShiftedClock(mono_ns=10**15, wall_ns=round(wall_s * NS_PER_S))
     with closing(open_link(clock)) as link:
         before = clock.now()
         link.start(received)
         sender.sendto(b"packet", ("127.0.0.1", link.port))
-        arrived = received.next()[2]
+        arrived = received.next().arrived
         after = clock.now()
     assert before.wall_ns <= arrived.wall_ns <= after.wall_ns
     assert before.mono_ns <= arrived.mono_ns <= after.mono_ns
@@ -111,7 +120,7 @@ def test_garbage(sender: socket.socket) -> None:
         link.start(received)
         for datagram in datagrams:
             sender.sendto(datagram, ("127.0.0.1", link.port))
-            assert received.next()[1] == datagram
+            assert received.next().payload == datagram
 
 
 def test_send_to_a_peer(sender: socket.socket) -> None:
@@ -183,5 +192,5 @@ def test_only_from_one_host(sender: socket.socket) -> None:
         link.start(received)
         sender.sendto(b"stranger", ("127.0.0.1", link.port))
         permitted.sendto(b"permitted", ("127.0.0.1", link.port))
-        assert received.next()[1] == b"permitted"
+        assert received.next().payload == b"permitted"
         assert link.counts["datagrams_from_strangers"] == 1

@@ -59,7 +59,7 @@ class Received:
         raise AssertionError(f"did not receive {expected}")
 
 
-def local(router: Router) -> str:
+def loopback_endpoint(router: Router) -> str:
     """Return the loopback endpoint of a router."""
     return next(locator for locator in router.locators() if locator.startswith("tcp/"))
 
@@ -78,10 +78,10 @@ def routers() -> Iterator[tuple[str, str]]:
             {"listen/endpoints": [LOCAL], "connect/endpoints": [f"udp/127.0.0.1:{port}?rel=1;mixed_rel=1"]},
         )
         stack.callback(client.close)
-        yield local(server), local(client)
+        yield loopback_endpoint(server), loopback_endpoint(client)
 
 
-def link(
+def open_link(
     side: Literal["server", "client"],
     router: str,
     *,
@@ -104,8 +104,8 @@ class Pair:
 
     def __init__(self, routers: tuple[str, str], vehicle: str) -> None:
         self.server_received, self.client_received = Received(), Received()
-        self.server = link("server", routers[0], vehicle=vehicle)
-        self.client = link("client", routers[1], vehicle=vehicle)
+        self.server = open_link("server", routers[0], vehicle=vehicle)
+        self.client = open_link("client", routers[1], vehicle=vehicle)
         self.server.start(self.server_received)
         self.client.start(self.client_received)
 
@@ -133,7 +133,7 @@ def test_control(pair: Pair) -> None:
 @pytest.mark.realtime
 @pytest.mark.judges_times(share=0.05)  # a slow host may bring the query before most of the commands
 def test_the_newest_commands_are_kept_while_the_server_is_busy(routers: tuple[str, str]) -> None:
-    """While a command is being processed the newest of the others are kept, and a query is delivered at once."""
+    """While a command is processed, the newest waiting commands are kept, and a query is delivered at once."""
     with closing(Pair(routers, "vehicle-busy")) as pair:
         blocked, resume = threading.Event(), threading.Event()
         received = pair.server_received
@@ -180,21 +180,21 @@ def test_queries(pair: Pair, channel: str, reply: str) -> None:
 
 
 def test_reply_without_a_query(pair: Pair) -> None:
-    """A reply without a pending query, or to one that has been answered, is not sent."""
+    """A reply is not sent if no query is pending, or if the query has been answered."""
     query = Send("session", b"number")
     _, peer = pair.server_received.next(("session", b"number"), lambda: pair.client.send(query))
     pair.server.send(Send("session_reply", b"no query", 10**9), Send("netem_reply", b"no query", peer))
     pair.server.send(Send("session_reply", b"first", peer), Send("session_reply", b"second", peer))
     pair.client_received.next(("session_reply", b"first"))
-    _, following = pair.server_received.next(("session", b"number"), lambda: pair.client.send(query))
-    pair.server.send(Send("session_reply", b"following", following))
+    _, next_peer = pair.server_received.next(("session", b"number"), lambda: pair.client.send(query))
+    pair.server.send(Send("session_reply", b"following", next_peer))
     pair.client_received.next(("session_reply", b"following"))
     assert not {b"no query", b"second"} & set(pair.client_received.payloads)
     assert not [name for name in pair.server.counts if name.endswith("_reply_not_sent")]
 
 
 def test_vehicles_do_not_mix(pair: Pair, routers: tuple[str, str]) -> None:
-    """A message for one vehicle does not reach another at the same router."""
+    """A message for one vehicle does not reach another vehicle at the same router."""
     with closing(Pair(routers, "vehicle-2")) as other:
         other.server_received.next(("control", b"for two"), lambda: other.client.send(Send("control", b"for two")))
         pair.server_received.next(("control", b"for one"), lambda: pair.client.send(Send("control", b"for one")))
@@ -204,7 +204,7 @@ def test_vehicles_do_not_mix(pair: Pair, routers: tuple[str, str]) -> None:
 
 @pytest.mark.parametrize("channel", ["control", "session", "session_reply"])
 def test_an_error_in_a_receiving_thread_is_not_lost(routers: tuple[str, str], channel: str) -> None:
-    """An error in the delivery of a message counts as the error of a thread, which fails the process."""
+    """An error in the delivery of a message is reported as a thread's error, which ends the process."""
     failed: queue.Queue[BaseException] = queue.Queue()
 
     def deliver(received: str, _payload: Any, _arrived: Now, peer: Any) -> None:
@@ -224,7 +224,7 @@ def test_an_error_in_a_receiving_thread_is_not_lost(routers: tuple[str, str], ch
 
 
 def test_the_end_of_a_subscription_is_not_lost(routers: tuple[str, str]) -> None:
-    """A subscription that ends while the link is open counts as the error of a thread; closing the link still works."""
+    """The end of a subscription of an open link is reported as a thread's error; closing the link still works."""
     failed: queue.Queue[BaseException] = queue.Queue()
     with fail_on_thread_errors(failed.put), closing(Pair(routers, "ended")) as pair:
         pair.server._declared[0].undeclare()
@@ -246,7 +246,7 @@ def test_liveliness(routers: tuple[str, str]) -> None:
         )
         present = {changes.get(timeout=ARRIVES_S) for _ in range(2)}
         assert present == {(f"lavt/vehicle-1/alive/{who}", True) for who in ("server-1", "client-1")}
-        visitor = link("client", routers[1], who="visitor")
+        visitor = open_link("client", routers[1], who="visitor")
         visitor.start(Received())
         assert changes.get(timeout=ARRIVES_S) == ("lavt/vehicle-1/alive/visitor", True)
         visitor.close()
@@ -257,7 +257,7 @@ def test_liveliness(routers: tuple[str, str]) -> None:
 def test_query_without_a_server(routers: tuple[str, str]) -> None:
     """A query without a reply is not an error, and the link can be closed."""
     received = Received()
-    with closing(link("client", routers[1], vehicle="nobody")) as alone:
+    with closing(open_link("client", routers[1], vehicle="nobody")) as alone:
         alone.start(received)
         alone.send(Send("session", b"query"))
         alone.send(Send("control", b"command"))
@@ -266,7 +266,7 @@ def test_query_without_a_server(routers: tuple[str, str]) -> None:
 
 def test_send_after_close(routers: tuple[str, str]) -> None:
     """A message that is sent after the session was closed is counted and raises nothing."""
-    closed = link("client", routers[1], vehicle="closed")
+    closed = open_link("client", routers[1], vehicle="closed")
     closed.start(Received())
     closed.close()
     for channel in ("session", "control"):
@@ -297,22 +297,22 @@ def is_one_plain_line(error: pytest.ExceptionInfo[UserError]) -> bool:
     return "\n" not in text and ".rs" not in text and "Location" not in text and len(text) < 1000
 
 
-def unanswered() -> str:
+def unanswered_endpoint() -> str:
     """Return an endpoint at which no router answers."""
     return f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
 
 
 def test_no_router() -> None:
     """Without a router, the error names the endpoint and the command that starts a router."""
-    endpoint = unanswered()
+    endpoint = unanswered_endpoint()
     with pytest.raises(UserError, match=rf"{endpoint}.*lavt router") as error:
-        link("server", endpoint)
+        open_link("server", endpoint)
     assert is_one_plain_line(error)
 
 
 def test_waiting_for_a_router() -> None:
     """A waiting link reports the reason once, counts unsent messages, and sends as soon as a router answers."""
-    endpoint, reasons, received = unanswered(), list[str](), Received()
+    endpoint, reasons, received = unanswered_endpoint(), list[str](), Received()
     with ExitStack() as stack:
         waiting = ZenohLink(
             MachineClock(),
@@ -329,7 +329,7 @@ def test_waiting_for_a_router() -> None:
         waiting.send(Send("control", b"too early"), Send("session", b"too early"))
         assert waiting.counts["control_not_sent"] == waiting.counts["session_not_sent"] == 1
         stack.callback(Router(CONFIGS / "router-server.json5", {"listen/endpoints": [endpoint]}).close)
-        server = link("server", endpoint, vehicle="late")
+        server = open_link("server", endpoint, vehicle="late")
         stack.callback(server.close)
         server.start(received)
         received.next(("control", b"now"), lambda: waiting.send(Send("control", b"now")))
@@ -392,7 +392,7 @@ def test_closing_while_waiting_for_a_router() -> None:
             MachineClock(),
             side="server",
             path=SESSION,
-            router=unanswered(),
+            router=unanswered_endpoint(),
             vehicle="late",
             who="server",
             waiting=lambda _: None,
@@ -405,7 +405,7 @@ def test_closing_while_waiting_for_a_router() -> None:
 def test_bad_endpoint(endpoint: str) -> None:
     """An invalid endpoint raises a UserError that names it."""
     with pytest.raises(UserError, match=endpoint) as error:
-        link("server", endpoint)
+        open_link("server", endpoint)
     assert is_one_plain_line(error)
 
 
@@ -455,7 +455,7 @@ def test_binary_router_config(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["nothing.json5", "."])
 def test_missing_file(name: str, tmp_path: Path) -> None:
-    """A missing config file raises a UserError that names the directory of the shipped ones."""
+    """A missing config file raises a UserError that names the directory of the shipped configs."""
     with pytest.raises(UserError, match=r"there is no Zenoh config .*zenoh-configs/"):
         Router(tmp_path / name, {})
 
@@ -524,8 +524,8 @@ def test_shipped_configs(
     if isinstance(endpoints, str):
         endpoint = endpoints.format(tmp_path)
         with closing(Router(CONFIGS / "router-server.json5", {"listen/endpoints": [endpoint]})) as router:
-            connect = local(router) if endpoint == LOCAL else endpoint
-            link("server", connect, vehicle="shipped", path=CONFIGS / name).close()
+            connect = loopback_endpoint(router) if endpoint == LOCAL else endpoint
+            open_link("server", connect, vehicle="shipped", path=CONFIGS / name).close()
         return
     if "-tls" in name:
         monkeypatch.chdir(request.getfixturevalue("keys").parent)
@@ -560,9 +560,9 @@ def test_one_side_dials(dialling: str, dialled: str) -> None:
         for direction in ("listen", "connect")
     }
     assert endpoints[dialled, "connect"] == []
-    (dials,) = endpoints[dialling, "connect"]
-    listens = next(endpoint for endpoint in endpoints[dialled, "listen"] if endpoint.startswith("udp/"))
-    for endpoint in (dials, listens):
+    (dialled_endpoint,) = endpoints[dialling, "connect"]
+    listen_endpoint = next(endpoint for endpoint in endpoints[dialled, "listen"] if endpoint.startswith("udp/"))
+    for endpoint in (dialled_endpoint, listen_endpoint):
         assert set(endpoint.partition("?")[2].split(";")) == {"rel=1", "mixed_rel=1"}
     assert all(endpoint.startswith("tcp/127.0.0.1:") for endpoint in endpoints[dialling, "listen"])
 
@@ -593,7 +593,7 @@ def test_plain_configs_say_so(name: str) -> None:
 
 
 def test_both_dial_a_router_in_the_cloud() -> None:
-    """With a router in the cloud that both sides' routers dial, a command reaches the server over one link per side."""
+    """A command reaches the server through a router in the cloud, to which each side's router has one link."""
     with ExitStack() as stack:
 
         def router(name: str, changes: dict[str, Any]) -> Router:
@@ -605,7 +605,8 @@ def test_both_dial_a_router_in_the_cloud() -> None:
         port = cloud.locators()[0].partition("?")[0].rpartition(":")[2]
         dials = {"listen/endpoints": [LOCAL], "connect/endpoints": [f"udp/127.0.0.1:{port}?rel=1;mixed_rel=1"]}
         sides = [router(name, dials) for name in ("router-server-to-cloud.json5", "router-client.json5")]
-        pair = stack.enter_context(closing(Pair((local(sides[0]), local(sides[1])), "vehicle-1")))
+        server_endpoint, client_endpoint = (loopback_endpoint(side) for side in sides)
+        pair = stack.enter_context(closing(Pair((server_endpoint, client_endpoint), "vehicle-1")))
         pair.server_received.next(("control", b"far"), lambda: pair.client.send(Send("control", b"far")))
         routers = pair.client.routers()
         assert routers is not None

@@ -11,10 +11,11 @@ from lavt.domain import CameraModel, Picture
 
 MODEL = CameraModel(width_px=320, height_px=240)
 BAR_PX = 10
-BARS = MODEL.width_px // BAR_PX
+PICTURE_COUNT = MODEL.width_px // BAR_PX
+"""The number of positions of the bar, and so of different pictures."""
 
 
-def write_video(path: Path, *, rate_hz: float, pictures: int = BARS, model: CameraModel = MODEL) -> Path:
+def write_video(path: Path, *, rate_hz: float, pictures: int = PICTURE_COUNT, model: CameraModel = MODEL) -> Path:
     """Write pictures 0, 1, ..., with the bar further to the right in each."""
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), rate_hz, (model.width_px, model.height_px))
     assert writer.isOpened()

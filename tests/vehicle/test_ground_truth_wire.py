@@ -50,7 +50,7 @@ def test_an_event_is_repeated_and_returned_once() -> None:
 
 
 def test_events_keep_their_order() -> None:
-    """Events of lost datagrams are returned from the next one, in order and once."""
+    """Events of lost datagrams are returned from the next datagram, in order and once."""
     sender, receiver = TruthSender(START_NS), TruthReceiver()
     sender.make_datagram(truth_at(1), [event("1")])
     sender.make_datagram(truth_at(2), [event("2"), event("3")])
@@ -59,7 +59,7 @@ def test_events_keep_their_order() -> None:
 
 
 def test_many_events_wait_for_the_next_datagram() -> None:
-    """A datagram has at most 16 events; further ones are in the next datagrams, and none is lost."""
+    """A datagram has at most 16 events; further events are in the next datagrams, and no event is lost."""
     sender, receiver = TruthSender(START_NS), TruthReceiver()
     events = [event(str(index)) for index in range(3 * MAX_EVENTS)]
     received = receiver.receive(sender.make_datagram(truth_at(1), events))
@@ -78,7 +78,7 @@ def test_a_restarted_car() -> None:
 
 
 def test_an_old_truth_is_not_the_newest() -> None:
-    """A truth older than the newest is counted and does not replace it; its events are returned."""
+    """A truth older than the newest truth is counted and does not replace the newest; its events are returned."""
     receiver = TruthReceiver()
     receiver.receive(encode_truth(truth_at(START_NS), []))
     assert receiver.receive(encode_truth(truth_at(START_NS - 1), [(1, event("left"))])) == [event("left")]
@@ -139,7 +139,7 @@ def with_event(*fields: object) -> tuple[object, ...]:
     ],
 )
 def test_invalid_datagrams(wrong: object) -> None:
-    """A datagram with any error is counted and dropped entirely, and the next valid one is received."""
+    """A datagram with any error is counted and dropped entirely, and the next valid datagram is received."""
     receiver = TruthReceiver()
     assert receiver.receive(bytes(msgpack.packb(wrong))) == []
     assert (receiver.newest, receiver.counts) == (None, {"garbage": 1})
@@ -147,7 +147,7 @@ def test_invalid_datagrams(wrong: object) -> None:
 
 
 def test_a_datagram_that_is_too_long() -> None:
-    """A datagram longer than any valid one is dropped without decoding."""
+    """A datagram longer than any valid datagram is dropped without decoding."""
     receiver = TruthReceiver()
     receiver.receive(bytes(msgpack.packb(GOOD)).ljust(MAX_BYTES + 1, b"\0"))
     assert receiver.counts == {"garbage": 1}

@@ -9,7 +9,7 @@ from statistics import median
 
 import numpy as np
 import pytest
-from tests.vehicle.moving_video import BARS, MODEL, number_of, write_video
+from tests.vehicle.moving_video import MODEL, PICTURE_COUNT, number_of, write_video
 
 from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S, CameraModel
@@ -18,7 +18,7 @@ from lavt.vehicle import video_device
 from lavt.vehicle.camera import CapturedFrame, FrameTimes
 from lavt.vehicle.video_device import RETRY_S, VideoDevice, buffer_time_ns
 
-LONG_S = 20.0
+TIMEOUT_S = 20.0
 """Timeout of every wait."""
 OpenCamera = Callable[..., VideoDevice]
 
@@ -44,10 +44,10 @@ def now_ns() -> int:
 
 
 def next_frame(camera: VideoDevice) -> CapturedFrame:
-    """Return the next frame that is not too old; on a busy machine some are."""
-    end_ns = now_ns() + round(LONG_S * NS_PER_S)
+    """Return the next frame that is not too old; on a busy machine some frames are too old."""
+    end_ns = now_ns() + round(TIMEOUT_S * NS_PER_S)
     while now_ns() < end_ns:
-        assert camera.wait(LONG_S)
+        assert camera.wait(TIMEOUT_S)
         frame = camera.capture(0, now_ns(), None)
         if frame is not None:
             return frame
@@ -55,8 +55,8 @@ def next_frame(camera: VideoDevice) -> CapturedFrame:
 
 
 def wait_until(camera: VideoDevice, name: str, count: int) -> None:
-    """Wait until a counter reaches a value, capturing frames meanwhile."""
-    end_ns = now_ns() + round(LONG_S * NS_PER_S)
+    """Capture frames until a counter reaches a value."""
+    end_ns = now_ns() + round(TIMEOUT_S * NS_PER_S)
     while camera.counts.get(name, 0) < count and now_ns() < end_ns:
         if camera.wait(0.02):
             camera.capture(0, now_ns(), None)
@@ -64,7 +64,7 @@ def wait_until(camera: VideoDevice, name: str, count: int) -> None:
 
 
 def test_a_picture_is_returned_once(tmp_path: Path, open_camera: OpenCamera) -> None:
-    """The first picture is available at once; a second request before the next picture arrives returns none."""
+    """The first picture is available immediately; a request before the next picture arrives returns no frame."""
     camera = open_camera(write_video(tmp_path / "slow.avi", rate_hz=0.5), rate_hz=0.5)
 
     first = camera.capture(7, now_ns(), None)
@@ -76,7 +76,7 @@ def test_a_picture_is_returned_once(tmp_path: Path, open_camera: OpenCamera) -> 
 @pytest.mark.realtime
 @pytest.mark.judges_times
 def test_a_slightly_late_picture_is_waited_for(tmp_path: Path, open_camera: OpenCamera) -> None:
-    """Each request waits up to a quarter of the period, so several in a row receive the next picture."""
+    """Each request waits up to a quarter of the period, so one of several in a row receives the next picture."""
     camera = open_camera(write_video(tmp_path / "slow.avi", rate_hz=2.0), rate_hz=2.0)
 
     assert number_of(next_frame(camera).picture) == 0
@@ -88,11 +88,11 @@ def test_a_slightly_late_picture_is_waited_for(tmp_path: Path, open_camera: Open
 @pytest.mark.realtime
 @pytest.mark.judges_times(share=0.05)
 def test_pictures_that_arrive_just_when_requested_are_not_missed(tmp_path: Path, open_camera: OpenCamera) -> None:
-    """Requests at the camera's rate, at the moment its pictures arrive, nearly all receive one."""
+    """If each request is made just when a picture arrives, nearly every request receives a picture."""
     camera = open_camera(write_video(tmp_path / "fast.avi", rate_hz=50.0), rate_hz=50.0)
 
     next_frame(camera)
-    assert camera.wait(LONG_S)
+    assert camera.wait(TIMEOUT_S)
     due = FrameTimes(now_ns(), 50.0)
     frames = 0
     for number in range(150):
@@ -104,31 +104,34 @@ def test_pictures_that_arrive_just_when_requested_are_not_missed(tmp_path: Path,
 @pytest.mark.realtime
 @pytest.mark.judges_times
 def test_the_newest_picture_is_returned(tmp_path: Path, open_camera: OpenCamera) -> None:
-    """A request after a while returns the last picture; those between are counted as replaced."""
+    """After several pictures a request returns the newest; the pictures before the newest are counted as replaced."""
     camera = open_camera(write_video(tmp_path / "fast.avi", rate_hz=60.0), rate_hz=60.0)
 
     assert number_of(next_frame(camera).picture) == 0
     second = number_of(next_frame(camera).picture)
-    end_ns = now_ns() + round(LONG_S * NS_PER_S)
+    end_ns = now_ns() + round(TIMEOUT_S * NS_PER_S)
     while camera.counts["pictures_read"] < second + 4 and now_ns() < end_ns:
         threading.Event().wait(0.005)
     newest = number_of(next_frame(camera).picture)
     counts = camera.counts
     assert newest >= second + 3
-    assert counts["pictures_read"] - counts["pictures_replaced"] in {3, 4}  # the three, and perhaps one that waits
+    assert counts["pictures_read"] - counts["pictures_replaced"] in {
+        3,
+        4,
+    }  # the three returned pictures, and perhaps one that waits
 
 
 @pytest.mark.realtime
 @pytest.mark.judges_times
 def test_a_file_is_played_at_its_own_rate_in_a_loop(tmp_path: Path, open_camera: OpenCamera) -> None:
-    """A file's pictures are one period apart (median), the first follows the last, and none is lost."""
+    """A file's pictures are one period apart (median), the first follows the last, and the file is never lost."""
     camera = open_camera(write_video(tmp_path / "fast.avi", rate_hz=50.0), rate_hz=50.0)
 
     arrivals = []
-    for _ in range(2 * BARS):
+    for _ in range(2 * PICTURE_COUNT):
         frame = next_frame(camera)
         arrivals.append((now_ns(), number_of(frame.picture)))
-    periods_ms = [(after[0] - before[0]) / NS_PER_MS for before, after in pairwise(arrivals)]
+    periods_ms = [(after_ns - before_ns) / NS_PER_MS for (before_ns, _), (after_ns, _) in pairwise(arrivals)]
     assert 18 < median(periods_ms) < 22
     assert [number for _, number in arrivals].count(0) >= 2
     assert camera.counts["times_opened_again"] >= 1
@@ -179,8 +182,8 @@ def test_an_old_picture_is_not_returned(tmp_path: Path, open_camera: OpenCamera)
     assert number_of(next_frame(camera).picture) >= 1
 
 
-def test_each_picture_has_a_buffer_of_its_own(tmp_path: Path, open_camera: OpenCamera) -> None:
-    """Two pictures share no memory, because the encoder writes its stamp into them."""
+def test_pictures_share_no_memory(tmp_path: Path, open_camera: OpenCamera) -> None:
+    """Two pictures share no memory and are writeable, because each gets a stamp of its own in its pixels."""
     camera = open_camera(write_video(tmp_path / "fast.avi", rate_hz=60.0), rate_hz=60.0)
 
     first, second = next_frame(camera).picture, next_frame(camera).picture
@@ -196,23 +199,23 @@ def test_each_picture_has_a_buffer_of_its_own(tmp_path: Path, open_camera: OpenC
 def test_another_size_or_rate_is_rejected(
     tmp_path: Path, open_camera: OpenCamera, requested: CameraModel, rate_hz: float
 ) -> None:
-    """A device without the requested size and rate is rejected; the error names both."""
+    """A device without the requested size and rate is rejected; the error has the device's and the requested size."""
     path = write_video(tmp_path / "video.avi", rate_hz=30.0)
     with pytest.raises(UserError, match=f"320x240 at 30 Hz.*{requested.width_px}x{requested.height_px}"):
         open_camera(path, model=requested, rate_hz=rate_hz)
 
 
 def test_another_format_is_rejected(tmp_path: Path, open_camera: OpenCamera) -> None:
-    """A device that does not have the requested format is rejected; one that has it is accepted."""
+    """A device without the requested format is rejected; a device with this format is accepted."""
     path = write_video(tmp_path / "video.avi", rate_hz=30.0)
-    assert open_camera(path, pixel_format="MJPG").wait(LONG_S)
+    assert open_camera(path, pixel_format="MJPG").wait(TIMEOUT_S)
     with pytest.raises(UserError, match="YUYV"):
         open_camera(path, pixel_format="YUYV")
 
 
 def test_a_rate_within_a_thousandth_is_accepted(tmp_path: Path, open_camera: OpenCamera) -> None:
     """A camera of 29.97 Hz is accepted where 30 Hz are requested."""
-    assert open_camera(write_video(tmp_path / "video.avi", rate_hz=30000 / 1001)).wait(LONG_S)
+    assert open_camera(write_video(tmp_path / "video.avi", rate_hz=30000 / 1001)).wait(TIMEOUT_S)
 
 
 @pytest.mark.parametrize("device", ["/dev/video97", "97", "/dev/null", "nowhere.avi", "no_video.avi"])
@@ -246,7 +249,7 @@ def test_a_video_without_pictures_is_rejected(tmp_path: Path, open_camera: OpenC
 
 
 def test_a_lost_file_is_reopened(tmp_path: Path, open_camera: OpenCamera, caplog: pytest.LogCaptureFixture) -> None:
-    """While its file is missing a camera has no pictures, logs it once and retries each second until it is back."""
+    """A camera whose file is missing has no pictures, logs the loss once, and retries until the file is back."""
     path = write_video(tmp_path / "short.avi", rate_hz=50.0, pictures=5)
     camera = open_camera(path, rate_hz=50.0)
     hidden = path.rename(tmp_path / "elsewhere.avi")
@@ -258,7 +261,7 @@ def test_a_lost_file_is_reopened(tmp_path: Path, open_camera: OpenCamera, caplog
     assert camera.capture(0, now_ns(), None) is None
     assert (camera.counts["times_lost"], camera.counts["times_back"]) == (1, 0)
     hidden.rename(path)
-    assert camera.wait(LONG_S)
+    assert camera.wait(TIMEOUT_S)
     assert (camera.counts["times_lost"], camera.counts["times_back"]) == (1, 1)
     camera.close()
     assert [("no more" in record.getMessage(), "again" in record.getMessage()) for record in caplog.records] == [
@@ -268,7 +271,7 @@ def test_a_lost_file_is_reopened(tmp_path: Path, open_camera: OpenCamera, caplog
 
 
 def test_a_broken_stream_is_reconnected(tmp_path: Path, open_camera: OpenCamera) -> None:
-    """When the connection to a network camera ends, the camera counts as lost until it answers again."""
+    """When the connection to a network camera ends, the camera is counted as lost until it answers again."""
     video = write_video(tmp_path / "video.avi", rate_hz=30.0).read_bytes()
     with socket.create_server(("127.0.0.1", 0)) as server:
 
@@ -282,9 +285,9 @@ def test_a_broken_stream_is_reconnected(tmp_path: Path, open_camera: OpenCamera)
         sender.start()
         camera = open_camera(f"tcp://127.0.0.1:{server.getsockname()[1]}")
         wait_until(camera, "times_back", 1)
-        sender.join(LONG_S)
+        sender.join(TIMEOUT_S)
     wait_until(camera, "times_lost", 2)
-    assert camera.counts["pictures_read"] == 2 * BARS
+    assert camera.counts["pictures_read"] == 2 * PICTURE_COUNT
     assert camera.counts["times_back"] == 1
 
 

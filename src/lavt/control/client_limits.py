@@ -24,8 +24,8 @@ class ClientLimits:
     """Without a lane for this long: brake. At 30 km/h the car has driven 4 m by then, of the 16 m of lane that it saw
     last."""
     no_lane_stop_ns: int = 2500 * NS_PER_MS
-    """Without a lane for this long: request a safe stop. By then 2 s of braking have slowed the car from 8 m/s (30
-    km/h) to about 2 m/s, and it is near the end of the last path."""
+    """Without a lane for this long: request a safe stop. By then, 2 s of braking have slowed the simulator's car from
+    30 km/h to 0.9 m/s, 14 m beyond the place where it saw the last lane. The last path has 20 m."""
     command_period_ns: int = 20 * NS_PER_MS
     """Longest interval between commands."""
     brake: float = 0.67

@@ -25,7 +25,7 @@ from lavt.experiment.analysis.clock_offset import (
 from lavt.recording.table import MISSING, Table, table_of
 
 TRUE_NS = 1_790_000_000 * NS_PER_S
-"""The true time at the start, from which all other times count."""
+"""The true time at the start; all other true times count from the start."""
 ClockError = Callable[[int], int]
 """A function from the true time since the start to the error of a host's wall clock, both in ns."""
 
@@ -41,7 +41,7 @@ def samples(ahead: ClockError, *, begin_ms: int = 0, seconds: int = 30, **fields
 
 
 def errors_ns(offset: ClockOffset, client: ClockError, server: ClockError, *, seconds: int = 29) -> tuple[Any, Any]:
-    """Return the absolute error of Delta every 10 ms, and its bound."""
+    """Return the absolute error of Delta every 10 ms, and the bound of Delta at the same times."""
     true_ns = np.arange(NS_PER_S, seconds * NS_PER_S, 10 * NS_PER_MS)
     client_wall_ns = np.array([TRUE_NS + at + client(at) for at in true_ns.tolist()])
     truth_ns = np.array([server(at) - client(at) for at in true_ns.tolist()])
@@ -53,7 +53,7 @@ def drifting(offset_ms: float, ppm: float) -> ClockError:
 
 
 def steered_clock(offset_ms: float, ppm: float, from_s: float, until_s: float) -> ClockError:
-    """Return a clock that is steered at a rate between two times."""
+    """Return the error of a clock that is steered by `ppm` between two times."""
     return lambda at_ns: round(
         offset_ms * NS_PER_MS + (np.clip(at_ns / NS_PER_S, from_s, until_s) - from_s) * ppm * 1000
     )
@@ -64,7 +64,7 @@ def as_table(rows: list[dict[str, Any]]) -> Table:
 
 
 def test_interpolation_of_an_offset() -> None:
-    """Delta is interpolated linearly, and constant outside its times; its bound is linear too, and grows outside."""
+    """Delta and its bound are linear between samples; outside, Delta is constant and the bound grows."""
     times_ns = np.array([0, 100, 200])
     offset = ClockOffset(TRUE_NS + times_ns, np.array([10.0, 30.0, 20.0]), np.array([4.0, 8.0, 6.0]), 0.5)
     at_ns = TRUE_NS + np.array([-20, 0, 3, 50, 99, 100, 200, 260])
@@ -73,7 +73,7 @@ def test_interpolation_of_an_offset() -> None:
 
 
 def test_a_missing_time_stays_missing() -> None:
-    """Client times are converted to the server's clock with Delta at their own times; a missing time stays missing."""
+    """A client time is converted to the server's clock with Delta at this time; a missing time stays missing."""
     offset = ClockOffset(TRUE_NS + np.array([0, 100]), np.array([10.0, 30.0]), np.zeros(2), 0.0)
     client_ns = np.array([TRUE_NS, MISSING, TRUE_NS + 100])
     assert offset.on_server_ns(client_ns).tolist() == [TRUE_NS + 10, MISSING, TRUE_NS + 130]
@@ -161,11 +161,11 @@ def test_the_bound_of_a_host_that_follows_the_other(follower: str, path: dict[st
 
     If no host follows the other, both root distances add up.
     """
-    own = {"follows": "10.9.0.1", "skew_ppm": 0.0, "age_s": 0.0, "bound_s": 0.002, **path}
+    follower_fields = {"follows": "10.9.0.1", "skew_ppm": 0.0, "age_s": 0.0, "bound_s": 0.002, **path}
     tables = {
         "client": samples(drifting(0, 0), bound_s=0.003, addresses=["10.9.0.1"]),
         "server": samples(drifting(0, 0), bound_s=0.003, addresses=["10.9.0.1"]),
-        follower: samples(drifting(0, 0), addresses=None, **own),
+        follower: samples(drifting(0, 0), addresses=None, **follower_fields),
     }
     offset = offset_from_sources(tables["server"], tables["client"])
     assert offset is not None
@@ -173,7 +173,7 @@ def test_the_bound_of_a_host_that_follows_the_other(follower: str, path: dict[st
 
 
 def test_a_host_follows_any_address_of_the_other() -> None:
-    """A host follows the other if its source has any recorded address of the other, from any sample."""
+    """A host follows the other host if its source has an address from any sample of the other host."""
     followed_host = as_table([{"addresses": None}, {"addresses": ["10.0.0.1", "10.0.0.2"]}, {"addresses": ["fe80::1"]}])
     sources = ["10.0.0.2", "10.0.0.3", "fe80::1", "", None]
     is_followed = follows_peer(as_table([{"follows": source} for source in sources]), followed_host)
@@ -194,7 +194,7 @@ def test_steering_for_a_second_is_in_the_bound_around_it() -> None:
 
 
 def test_steering_in_the_last_interval_is_in_the_bound() -> None:
-    """A clock steered by 1 % in the last second has a bound of 10 ms in this second and in the one before."""
+    """A clock steered by 1 % in the last second has a bound of 10 ms in this second and in the second before."""
     offset = offset_from_sources(samples(steered_clock(0, 10_000, 28, 40)), samples(drifting(0, 0)))
     assert offset is not None
     expected_ms = [0.002, 10.002, 10.002, 10.002]
@@ -211,7 +211,7 @@ def samples_with_rates(ppm: list[float]) -> list[dict[str, Any]]:
 
 
 def test_each_second_has_the_bound_of_its_own_steering() -> None:
-    """The bound at a time is that of the second which begins there, including the first and the last second."""
+    """The bound at a sample is the bound of the second after it, including the first and the last second."""
     server = as_table(samples_with_rates([15_000, 20_000, 0, 20_000, 15_000]))
     offset = offset_from_sources(server, samples(drifting(0, 0), seconds=6, bound_s=0.0))
     assert offset is not None
@@ -241,9 +241,9 @@ def test_steering_is_detected_from_three_samples_on() -> None:
 
 
 def test_delta_covers_the_time_that_both_hosts_know() -> None:
-    """Delta is known at both hosts' sample times, from the later of their first to the earlier of their last samples.
+    """Delta is known at the sample times of both hosts, in the interval in which both hosts have samples.
 
-    Without a time at which both hosts are known, Delta is unknown.
+    Without such an interval, Delta is unknown.
     """
     offset = offset_from_sources(samples(drifting(0, 0), seconds=20), samples(drifting(0, 0), begin_ms=5500))
     assert offset is not None
@@ -275,10 +275,7 @@ def test_samples_without_a_correction_are_ignored() -> None:
     ("first_ppm", "middle_ppm", "last_ppm"), [(10.0, 50.0, 0.0), (0.0, 50.0, 10.0), (-10.0, 0.0, 5.0), (5.0, 0.0, -10)]
 )
 def test_the_bound_grows_outside_the_samples(first_ppm: float, middle_ppm: float, last_ppm: float) -> None:
-    """Outside the samples, the bound grows at twice the rate of Delta in the first or the last second.
-
-    The faster of the two rates counts.
-    """
+    """Outside the samples, the bound grows at twice the larger of Delta's rates in the first and the last second."""
     rows = samples_with_rates([first_ppm, middle_ppm, middle_ppm, last_ppm])
     values_ns = [row["correction_s"] * NS_PER_S for row in rows]
     for table in (rows, rows[::-1]):
@@ -289,7 +286,7 @@ def test_the_bound_grows_outside_the_samples(first_ppm: float, middle_ppm: float
 
 
 def test_one_sample_allows_for_any_drift() -> None:
-    """With one sample the bound grows by the largest drift; with two it grows by the measured drift."""
+    """With one sample the bound grows by the largest possible drift, with two samples by twice the measured drift."""
     server = drifting(0, 10)
     for seconds, expected in ((1, DRIFT_ALLOWANCE), (2, 20e-6)):
         offset = offset_from_sources(samples(server, seconds=seconds), samples(drifting(0, 0), seconds=seconds))
@@ -305,7 +302,7 @@ def test_one_sample_allows_for_any_drift() -> None:
 def test_samples_are_used_from_the_first_known_one_on(
     known_flags: str, first_used: int | None, lacking: dict[str, Any]
 ) -> None:
-    """Samples are used from the first known one on; if a later one is unknown, none is used."""
+    """Samples are used from the first known sample on; if a later sample is unknown, no sample is used."""
     rows = [
         {"wall_ns": index, "correction_s": 0.5, **({} if flag == "1" else lacking)}
         for index, flag in enumerate(known_flags)
@@ -317,7 +314,7 @@ def test_samples_are_used_from_the_first_known_one_on(
 def simulated_exchanges(
     client: ClockError, server: ClockError, delays_ms: Callable[[int], tuple[float, float]], *, seconds: int = 30
 ) -> ProbeExchanges:
-    """Return two exchanges per second with given times in each direction."""
+    """Return two exchanges per second; `delays_ms` returns the delays (there, back) of an exchange by its number."""
     rows = []
     for number in range(2 * seconds):
         there_ms, back_ms = delays_ms(number)
@@ -360,7 +357,7 @@ def test_delta_from_the_probe_is_within_its_bound(seed: int, client_ppm: float, 
 
 
 def test_the_exchange_with_the_smallest_bound_is_used() -> None:
-    """One short round trip among long, asymmetric ones determines Delta, with a bound that grows by the drift."""
+    """One short round trip among long, asymmetric round trips determines Delta, with a bound that grows with time."""
     client, server = drifting(0, 0), drifting(250, 0)
     offset = offset_from_probe(
         simulated_exchanges(client, server, lambda number: (0.1, 0.1) if number == 20 else (0.1, 8.1))
@@ -375,7 +372,7 @@ def test_the_exchange_with_the_smallest_bound_is_used() -> None:
 
 
 def test_the_bound_grows_after_the_last_exchange() -> None:
-    """At 20 s after the last exchange, the bound has grown by the possible drift in that time."""
+    """In the 20 s after the last exchange, the bound grows by the largest possible drift."""
     exchanges = simulated_exchanges(drifting(0, 0), drifting(250, 0), lambda _: (0.1, 0.1), seconds=10)
     offset = offset_from_probe(exchanges)
     assert offset is not None

@@ -57,14 +57,14 @@ def test_exchanges_are_sorted_and_checked() -> None:
 def test_exchanges_of_an_interval() -> None:
     """An interval of the server's clock includes the exchanges from its first to its last nanosecond."""
     exchanges = probe_exchanges(as_table([exchange(1000 * number, 10, 50_000) for number in range(1, 6)]))
-    within = exchanges.within(52_000, 54_000)
-    assert within.client_wall_ns.tolist() == [2000, 3000, 4000]
-    assert len(within) == 3
+    included = exchanges.within(52_000, 54_000)
+    assert included.client_wall_ns.tolist() == [2000, 3000, 4000]
+    assert len(included) == 3
     assert len(exchanges.within(52_001, 53_999)) == 1
 
 
 def test_the_shortest_exchange_determines_delta() -> None:
-    """The shortest exchange is also used at other times, where its bound has grown by 500 ppm of the time between.
+    """The shortest exchange is also used at other times, where its bound has grown by 500 ppm of the difference.
 
     In addition, each bound contains 500 ppm of half the longer of the two adjacent gaps.
     """

@@ -1,7 +1,7 @@
 """Tests of a run's metrics, mostly from the synthetic drive of `conftest.py`.
 
-By default its tau_v is 62 ms, its client time 3 ms, its tau_c 9 ms and its actuator time 2 ms: together a loop latency
-of 76 ms.
+By default the drive has a tau_v of 62 ms, a client time of 3 ms, a tau_c of 9 ms and an actuator time of 2 ms: together
+a loop latency of 76 ms.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def test_duration_of_an_empty_drive() -> None:
 
 
 def test_the_last_recorded_count_is_returned() -> None:
-    """The last recorded value of a counter is returned, and None without one."""
+    """The last recorded value of a counter is returned, or None if there is no value."""
     record = record_of(counts=[{"late": 1}, {"late": 5}, {"other": 9}])
     assert [last_count(record, name) for name in ("late", "other", "neither")] == [5, 9, None]
     assert last_count(record_of(), "late") is None
@@ -138,7 +138,7 @@ def test_hosts_that_share_a_kernel_share_a_clock(make_run: MakeRun, tmp_path: Pa
     assert same_host.clocks.bound_ms == 0.0
 
 
-def test_hosts_without_a_name_are_not_taken_for_one(make_run: MakeRun, tmp_path: Path) -> None:
+def test_hosts_without_a_name_are_not_taken_for_one_host(make_run: MakeRun, tmp_path: Path) -> None:
     """Two sides that do not report their host do not get a bound of 0."""
     run = measured(make_run, tmp_path, server_host="", client_host="", bound_s=None, probes=False)
     assert run.clocks.bound_ms is None
@@ -154,7 +154,7 @@ def test_the_parts_of_the_loop_add_up(make_run: MakeRun, tmp_path: Path) -> None
 
 
 def test_the_closure_is_absolute(make_run: MakeRun, tmp_path: Path) -> None:
-    """With a client clock that loses 1 %, the closure is 30 us of the client time of 3000 us, without a sign."""
+    """With a client clock that loses 1 %, the closure is 1 % of the client time of 3 ms, and not negative."""
     closure_ms = measured(make_run, tmp_path, drift=0.01, spread_ms=0.0).closure_p95_ms
     assert closure_ms == pytest.approx(0.03, abs=0.002)
 
@@ -203,7 +203,7 @@ def test_an_undecoded_access_unit_is_not_a_picture(make_run: MakeRun, tmp_path: 
 
 
 def test_pictures_without_the_field_decoded_are_decoded(make_run: MakeRun, tmp_path: Path) -> None:
-    """Pictures without the field `decoded` count as decoded."""
+    """Pictures without the field `decoded` are counted as decoded."""
     entry = measured(make_run, tmp_path, undecoded=None).entry
     assert (entry["frames_decoded"], entry["frames_unreadable"]) == (361, 7)
 
@@ -216,7 +216,7 @@ def test_frame_age_is_the_loop_latency_plus_half_a_frame(make_run: MakeRun, tmp_
 
 
 def test_frame_age_of_three_commands() -> None:
-    """For ages from 10 to 20, from 10 to 30 and from 5 to 15 ms the mean is 16.25 ms and the 95th percentile 28 ms."""
+    """If the age grows from 10 to 20, from 10 to 30 and from 5 to 15 ms, its mean is 16.25 ms and its P95 is 28 ms."""
     millisecond = 1_000_000
     frames = table(
         [{"stamp_ns": n, "stamped_mono_ns": stamped * millisecond} for n, stamped in ((1, 0), (2, 10), (3, 35))]
@@ -234,7 +234,7 @@ def test_frame_age_of_three_commands() -> None:
 
 
 def test_rejected_commands_do_not_change_the_control_latency() -> None:
-    """Only accepted commands have a control latency: a stranger's rejected command may have any send time."""
+    """Only accepted commands have a control latency: a stranger's rejected command can have any send time."""
     millisecond = 1_000_000
     rows = [
         {
@@ -263,7 +263,7 @@ def test_missing_data_are_null_not_zero(make_run: MakeRun, tmp_path: Path) -> No
 
 
 def test_tracking_of_a_sine(make_run: MakeRun, tmp_path: Path) -> None:
-    """A sinusoidal path has a mean error of 2/pi, an RMS of 1/sqrt(2) and a maximum of 1 of its amplitude."""
+    """The errors of a sinusoidal path, divided by its amplitude: mean 2/pi, RMS 1/sqrt(2), maximum 1."""
     entry = measured(make_run, tmp_path, seconds=12 * np.pi).entry
     assert entry["mae_m"] == pytest.approx(0.5 * 2 / np.pi, abs=0.005)
     assert entry["rms_m"] == pytest.approx(0.5 / np.sqrt(2), abs=0.005)
@@ -276,7 +276,7 @@ def test_tracking_of_a_sine(make_run: MakeRun, tmp_path: Path) -> None:
 
 
 def test_samples_begin_at_the_first_row() -> None:
-    """Errors are interpolated every 0.25 m from the first row on, at any position of the route."""
+    """Errors are interpolated every 0.25 m from the first row on, wherever on the route this row is."""
     rows = [{"progress_m": 2.0, "cross_track_m": 4.0}, {"progress_m": 3.0, "cross_track_m": 8.0}]
     assert sampled_by_distance(table(rows), "cross_track_m").tolist() == [4.0, 5.0, 6.0, 7.0, 8.0]
 
@@ -308,7 +308,7 @@ def test_the_first_passage_counts() -> None:
 
 
 def test_p95_up_to_every_ten_metres() -> None:
-    """With an error of 1 m for 10 m and then 3 m, P95 is 1 m up to 10 m and 3 m up to 20 m; a partial 10 m has none."""
+    """If the error is 1 m for 10 m and then 3 m, P95 is 1 m up to 10 m and 3 m up to 20 m; a partial 10 m has none."""
     rows = [{"progress_m": 5.0 + index * 0.25, "cross_track_m": -1.0 if index <= 40 else 3.0} for index in range(101)]
     assert p95_by_10m(table(rows)) == [1.0, 3.0]
     assert p95_by_10m(table(rows[:41])) == [1.0]
@@ -341,7 +341,7 @@ def test_rates_by_distance() -> None:
 
 
 def test_the_route_length_is_recorded(make_run: MakeRun, tmp_path: Path) -> None:
-    """The route length is that of the recorded route, and null without one."""
+    """The route length is the length of the recorded route, and null without a recorded route."""
     entry = measured(make_run, tmp_path, seconds=6.0).entry
     assert entry["route_length_m"] == 100.0
     assert entry["lane_invasions_per_km"] == pytest.approx(1 / 0.048)
@@ -354,7 +354,7 @@ def test_the_route_length_is_recorded(make_run: MakeRun, tmp_path: Path) -> None
     [([], 0), ([0.0], 0), ([0.0, 0.2, 0.1], 1), ([0.0, 0.2, 0.195, 0.3], 0), ([0.0, -0.1, 0.1, -0.1, 0.1], 3)],
 )
 def test_reversals_within_the_deadband_are_ignored(angles: list[float], reversals: int) -> None:
-    """A change of steering direction counts as a reversal if it is at least 0.01 rad."""
+    """A change of steering direction is counted as a reversal if it is at least 0.01 rad."""
     assert steering_reversals(np.array(angles)) == reversals
 
 

@@ -43,7 +43,7 @@ def reasons(
 
 
 def test_a_condition_in_force_throughout_the_drive_is_valid() -> None:
-    """A run is valid if the queues are as requested from before the drive to its end; later changes are irrelevant."""
+    """A run is valid if the queues are as requested from before the drive to its end, whatever happens later."""
     assert reasons(VIDEO, CONTROL) == []
     assert reasons([(2, "", "", 0.0, None, ""), *VIDEO, (21, "", "", 0.0, None, "")], CONTROL) == []
 
@@ -88,7 +88,7 @@ def test_a_long_gap_between_measurements_is_a_reason() -> None:
 
 
 def test_another_clients_condition_invalidates_a_run_without_one() -> None:
-    """A run without a condition is invalid if another client's condition was in force."""
+    """A run without a condition is invalid if another client's condition was in force during the drive."""
     (reason,) = recorded_reasons(record(VIDEO, with_drive=True), record([]), "", REQUESTED_MS)
     assert reason.code is InvalidCode.INJECTION_NOT_REQUESTED
     assert "L4" in reason.text
@@ -103,7 +103,7 @@ def test_another_clients_condition_invalidates_a_run_without_one() -> None:
 def test_latencies_below_the_injected_delay_are_a_reason(
     tau_v_ms: float | None, tau_c_ms: float | None, flows: list[str]
 ) -> None:
-    """A run whose video or control latency is below the injected delay is invalid: the delay was on another path."""
+    """A run is invalid if its video or control latency is far less than injected: the delay was on another path."""
     entry = {"tau_v_ms": {"p50": tau_v_ms, "bound": 0.2}, "tau_c_ms": {"p50": tau_c_ms, "bound": None}}
     found = absent_reasons(entry, REQUESTED_MS)
     assert {reason.code for reason in found} <= {InvalidCode.INJECTION_NOT_ON_PATH}

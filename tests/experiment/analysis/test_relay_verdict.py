@@ -40,6 +40,7 @@ def _inherent_ms() -> float:
 def reasons(
     median_ms: tuple[float | None, float | None], lateness_ms: tuple[float | None, float | None], **requested: Any
 ) -> list[InvalidReason]:
+    """Return the reasons from the relay's measurements (video, control)."""
     directions = ("video downstream", "control upstream")
     return relay_reasons(
         {
@@ -61,7 +62,7 @@ def test_a_constant_delay_is_judged_by_its_median() -> None:
 
 
 def test_a_variable_delay_is_judged_by_its_lateness() -> None:
-    """With more than a constant delay, only packets that are sent over 1 ms late are a reason."""
+    """A variable delay makes a run invalid only if packets are sent more than 1 ms late, or if it is not measured."""
     assert reasons((500.0, 0.1), (0.3, 0.1), video=None, control=0.0) == []
     (reason,) = reasons((75.0, 0.1), (1.5, 0.1), video=None, control=0.0)
     assert reason.code is InvalidCode.INJECTION_DIFFERS
@@ -71,7 +72,7 @@ def test_a_variable_delay_is_judged_by_its_lateness() -> None:
 
 
 def test_a_relay_without_measurements_is_a_reason() -> None:
-    """Without the relay's measurements, the injected delay of each flow is unknown."""
+    """Without the relay's measurements, a run is invalid because no flow's delay was measured."""
     for reason, flow in zip(relay_reasons({}), ("video", "control"), strict=True):
         assert reason == not_measured(flow)
 

@@ -11,7 +11,7 @@ import pytest
 from lavt.experiment.analysis.clock_validity import step_reasons
 from lavt.experiment.analysis.invalid_reason import InvalidCode, InvalidReason, not_measured
 from lavt.experiment.analysis.metrics import measure
-from lavt.experiment.analysis.results import IDENTITY, run_result, write_json
+from lavt.experiment.analysis.results import IDENTITY, OPTIONAL_IDENTITY, run_result, write_json
 from lavt.experiment.analysis.validity import injection_reasons, invalid_reasons
 from lavt.recording.record import read_record
 
@@ -117,18 +117,18 @@ def test_without_path_data_the_bound_is_the_root_distance(make_run: MakeRun, tmp
 
 
 def test_a_slow_last_sample_does_not_widen_the_bound(make_run: MakeRun, tmp_path: Path) -> None:
-    """If the last sample took long, the root distance is used, which comes from the better samples before."""
+    """If the last sample took long, the bound is the root distance, because earlier, better samples determine it."""
     slow = following(peer_delay_s=lambda second: 0.0006 if second % 3 == 0 else 0.02)
     assert reasons(make_run, tmp_path, bound_s=0.0005, **slow) == []
 
 
 CLOCK_FAULTS = {
-    "delay on NTP's path before it synchronised": (
+    "delay on NTP's path before NTP synchronised": (
         {**following(peer_delay_s=0.0756, correction_s=lambda second: 0.2875 + 20e-6 * second)},
         InvalidCode.NTP_THROUGH_DELAY,
         ("client", "75.60 ms", "0.60 ms"),
     ),
-    "delay on NTP's path after it synchronised": (
+    "delay on NTP's path after NTP synchronised": (
         {**following(good_samples=lambda second: min(20 + second, 23))},
         InvalidCode.NTP_NO_SAMPLE,
         ("client", "10.0 s", "5 polls", "5.0 s"),
@@ -146,7 +146,7 @@ CLOCK_FAULTS = {
         InvalidCode.CLOCK_DISAGREEMENT,
         ("chrony", "0.00 and "),
     ),
-    "both use their own clock as the reference": (
+    "each side uses its own clock as the reference": (
         {"corrected": False, "bound_s": 0.0},
         InvalidCode.CLOCK_DISAGREEMENT,
         ("chrony", "0.00 and "),
@@ -203,7 +203,7 @@ CLOCK_FAULTS = {
         ("client", "+1000.0 ms"),
     ),
 }
-"""For each fault the settings of the drive, and the code and facts of the only reason."""
+"""By fault: the settings of the drive, the code of the only reason, and the facts in its text."""
 
 
 @pytest.mark.parametrize("case", CLOCK_FAULTS)
@@ -227,9 +227,11 @@ def test_a_step_of_a_shared_clock_has_one_reason(make_run: MakeRun, tmp_path: Pa
 def test_a_clock_step_long_before_the_drive_is_accepted(
     make_run: MakeRun, tmp_path: Path, step_s: float, source: str
 ) -> None:
-    """A step of the client's clock 20 s before the drive is no reason, and Delta is that after the step."""
-    by_probe = {"client_clock": lambda _second: {"source": "probe", "correction_s": None}} if source == "probe" else {}
-    make_run(tmp_path, step_s=step_s, stepped_s=-20.0, sampled_before_s=40, drift=0.0, **by_probe)
+    """If the client's clock stepped 20 s before the drive, the run is valid, and Delta has its value after the step."""
+    probe_only = (
+        {"client_clock": lambda _second: {"source": "probe", "correction_s": None}} if source == "probe" else {}
+    )
+    make_run(tmp_path, step_s=step_s, stepped_s=-20.0, sampled_before_s=40, drift=0.0, **probe_only)
     server, client = read_record(tmp_path / "server.mcap"), read_record(tmp_path / "client.mcap")
     measured = measure(server, client)
     assert invalid_reasons(server, client, measured) == []
@@ -239,13 +241,13 @@ def test_a_clock_step_long_before_the_drive_is_accepted(
 
 @pytest.mark.parametrize("stepped_s", [-3.0, 0.5, 11.5, 12.5])
 def test_a_clock_step_near_the_drive_makes_the_run_invalid(make_run: MakeRun, tmp_path: Path, stepped_s: float) -> None:
-    """A clock step in the drive or within 5 s of it is a reason, even after a long wait before the drive."""
+    """A clock step in the drive, or at most 5 s before or after the drive, makes a run invalid."""
     run_reasons = reasons(make_run, tmp_path, step_s=-1.0, stepped_s=stepped_s, sampled_before_s=40)
     require_one(run_reasons, InvalidCode.CLOCK_STEP, "client", "-1000.0 ms")
 
 
 def test_clock_samples_are_required_during_the_drive_only(make_run: MakeRun, tmp_path: Path) -> None:
-    """Clock samples may be missing before the drive, but not at its end."""
+    """A run is valid if clock samples are missing long before the drive, but not if they are missing at its end."""
     assert reasons(make_run, tmp_path / "before", client_unsampled_s=(-30, -20), sampled_before_s=40) == []
     found = reasons(make_run, tmp_path / "end", client_unsampled_s=(8, 15), sampled_before_s=40)
     require_one(found, InvalidCode.CLOCK_NOT_SAMPLED, "client", "9.0 s", "12.0 s")
@@ -265,7 +267,7 @@ def test_some_long_ntp_round_trips_are_tolerated(make_run: MakeRun, tmp_path: Pa
 
 @pytest.mark.parametrize("side_without_chrony", ["server_clock", "client_clock"])
 def test_without_chrony_the_probe_is_used(make_run: MakeRun, tmp_path: Path, side_without_chrony: str) -> None:
-    """If one side's chrony has no correction, Delta is the probe's, with a bound of over half the round trip."""
+    """If one side's chrony has no correction, Delta comes from the probe, bounded by just over half the round trip."""
     unknown = {"correction_s": None, "bound_s": None, "status": "chrony is not installed"}
     make_run(tmp_path, **{side_without_chrony: lambda _second: unknown})
     server, client = read_record(tmp_path / "server.mcap"), read_record(tmp_path / "client.mcap")
@@ -281,7 +283,7 @@ def test_without_chrony_the_probe_is_used(make_run: MakeRun, tmp_path: Path, sid
 
 
 def test_chrony_must_be_synchronised_before_the_drive(make_run: MakeRun, tmp_path: Path) -> None:
-    """A chrony is used only if it had a correction before the drive and during the whole drive."""
+    """The time source chrony is used only if it had a correction before and during the whole drive."""
 
     def client(from_second: int) -> dict[str, Any]:
         return {"client_clock": lambda second: {"correction_s": None} if second < from_second else {}}
@@ -316,7 +318,7 @@ def test_an_incomplete_record_makes_the_run_invalid(make_run: MakeRun, tmp_path:
 
 
 def test_the_injected_delay_is_compared_with_the_request() -> None:
-    """A measured delay that differs by over 1 ms from the request, or is missing, is a reason."""
+    """A measured delay that is missing, or differs by more than 1 ms from the request, makes a run invalid."""
     assert injection_reasons({"video": 75.0, "control": 0.0}, {"video": 75.6, "control": 0.2}) == []
     found = injection_reasons({"video": 75.0}, {"video": 60.0})
     require_one(found, InvalidCode.INJECTION_DIFFERS, "video", "60.0 ms")
@@ -347,7 +349,14 @@ def test_every_metric_is_defined_in_the_documentation(make_run: MakeRun, tmp_pat
     make_run(tmp_path)
     page = (Path(__file__).parents[3] / "docs" / "metrics.md").read_text()
     entry = measure(read_record(tmp_path / "server.mcap"), read_record(tmp_path / "client.mcap")).entry
-    assert [key for key in entry if f"`{key}`" not in page] == []
+    assert [key for key in (*entry, *entry["delta"]) if f"`{key}`" not in page] == []
+
+
+def test_every_key_of_the_identity_is_defined_in_the_documentation() -> None:
+    """`docs/metrics.md` has each key of a run's identity, in the section on it."""
+    page = (Path(__file__).parents[3] / "docs" / "metrics.md").read_text()
+    section = page.partition("\n## Identity of a run")[2].partition("\n## ")[0]
+    assert [key for key in (*IDENTITY, *OPTIONAL_IDENTITY, "digest") if f"`{key}`" not in section] == []
 
 
 def test_the_page_explains_every_code() -> None:

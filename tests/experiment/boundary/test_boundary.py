@@ -1,4 +1,4 @@
-"""Tests of the search for boundaries: its parts on simple cases, and one real search."""
+"""Tests of the search for boundaries: parts of the search on simple cases, and real searches."""
 
 from __future__ import annotations
 
@@ -42,6 +42,7 @@ GRID_MS = [0.0, 100.0, 200.0, 300.0]
 
 
 def record_calls(function: Callable[[float], Any]) -> tuple[Callable[[float], Any], list[float]]:
+    """Return the function with a recording of its arguments, and the list of these arguments."""
     calls: list[float] = []
 
     def recorded(delay_ms: float) -> Any:
@@ -55,7 +56,7 @@ def record_calls(function: Callable[[float], Any]) -> tuple[Callable[[float], An
 
 
 def test_bisection_brackets_the_first_crossing() -> None:
-    """A crossing at 137 ms is bracketed to 2 ms: the grid is evaluated first, then six bisections of 100 ms."""
+    """To bracket a crossing within 2 ms, the grid is evaluated first, and then 100 ms are bisected six times."""
     criterion, calls = record_calls(lambda delay_ms: delay_ms >= 137)
     found = first_bracket(criterion, GRID_MS, 2.0)
     assert found == Bracket(135.9375, 137.5, monotone=True)
@@ -96,7 +97,7 @@ def test_the_zero_of_a_rate_is_bracketed(guess_ms: float) -> None:
 
 @pytest.mark.parametrize("zero_ms", [7.1, 12.0, 18.3, 23.2, 137.0])
 def test_the_zero_of_a_step_is_bracketed(zero_ms: float) -> None:
-    """If a rate has only a sign (it is infinite), its zero is still within the bracket."""
+    """If a rate is infinite everywhere, the bracket contains the delay at which its sign changes."""
     found = zero_bracket(lambda delay_ms: math.copysign(math.inf, delay_ms - zero_ms), 100.0, 200.0, 2.0)
     assert found.low_ms is not None
     assert found.high_ms is not None
@@ -105,7 +106,7 @@ def test_the_zero_of_a_step_is_bracketed(zero_ms: float) -> None:
 
 @pytest.mark.parametrize("zero_ms", [0.3, 199.8])
 def test_a_bracket_is_within_the_range(zero_ms: float) -> None:
-    """For a zero near an end of the range, the bracket ends there."""
+    """If the zero is near an end of the range, the bracket ends at the end of the range."""
     found = zero_bracket(lambda delay_ms: (delay_ms - zero_ms) / 500, 100.0, 200.0, 2.0)
     assert found.low_ms is not None
     assert found.high_ms is not None
@@ -114,7 +115,7 @@ def test_a_bracket_is_within_the_range(zero_ms: float) -> None:
 
 
 def test_a_rate_without_a_zero_is_out_of_range() -> None:
-    """The zero of a rate is below the range if the rate is always positive, and above it if always negative."""
+    """An always positive rate has its zero below the range; an always negative rate has its zero above the range."""
     assert zero_bracket(lambda _: 0.1, 137.0, 400.0, 2.0) == Bracket(None, 0.0)
     assert zero_bracket(lambda _: -math.inf, 137.0, 400.0, 2.0) == Bracket(400.0, None)
 
@@ -162,7 +163,7 @@ def payloads(*events: Event) -> dict[str, list[Any]]:
         "truth": [truth(number * 20 * NS_PER_MS) for number in range(100)],
         "event": [Event(100 * NS_PER_MS, "drive_began", ""), *events],
         "frame": [frame(number) for number in range(60)],
-        # For each frame a rejected command, one that is applied after 80 ms, and its repetition.
+        # For each frame: a rejected command, a command applied 80 ms after capture, and a repetition of that command.
         "admission": [
             command
             for number in range(10, 50)
@@ -178,7 +179,7 @@ def payloads(*events: Event) -> dict[str, list[Any]]:
 
 
 def test_a_monitored_run_covers_the_drive_only() -> None:
-    """Rows and events outside the drive are excluded, and times count from its start."""
+    """Samples and events outside the drive are excluded, and times count from the start of the drive."""
     drive = summarize_drive(
         payloads(
             Event(50 * NS_PER_MS, "lane_invasion", ""),
@@ -193,7 +194,7 @@ def test_a_monitored_run_covers_the_drive_only() -> None:
 
 
 def test_departure_and_completion() -> None:
-    """A lane invasion is a departure; any ending but `completed`, and a missing ending, is no completion."""
+    """A drive with a lane invasion departed; a drive without the ending `completed` was not completed."""
     invasion = Event(600 * NS_PER_MS, "lane_invasion", "")
     for events, expected in (
         ((Event(900 * NS_PER_MS, "ending", "completed"),), (False, False)),
@@ -207,7 +208,7 @@ def test_departure_and_completion() -> None:
 
 
 def test_a_drive_that_never_began() -> None:
-    """A drive that never began has no rows, no delay, no departure, no completion and no oscillation."""
+    """A drive that never began has no samples, no delay, no departure, no completion and no oscillation."""
     recorded = payloads()
     recorded["event"] = [Event(600 * NS_PER_MS, "lane_invasion", "")]
     drive = summarize_drive(recorded)
@@ -219,13 +220,13 @@ def test_a_drive_that_never_began() -> None:
 
 
 def test_values_out_of_range_are_ranked_last() -> None:
-    """With two of six seeds out of range, quartiles and interval are null where they fall among these."""
+    """With two of six boundaries out of range, the upper quartile and the upper end of the interval are null."""
     found = summarize_boundaries([300.0, 310.0, 320.0, 330.0, math.inf, math.inf])
     assert found == {"p25": 312.5, "p50": 325.0, "p75": None, "interval": [300.0, None], "n": 4}
 
 
 def test_the_interval_consists_of_order_statistics() -> None:
-    """The median's interval of ten seeds reaches from the second to the ninth (98 %); five seeds have none."""
+    """The median of ten values has an interval from the second to the ninth value; the median of five has none."""
     assert summarize_boundaries([float(value) for value in range(10)])["interval"] == [1.0, 8.0]
     assert summarize_boundaries([1.0, 2.0, 3.0, 4.0, 5.0])["interval"] is None
 
@@ -265,7 +266,7 @@ def test_groups_are_of_each_route_and_of_all() -> None:
 
 
 def test_figure_and_table_show_every_group() -> None:
-    """The figure has a panel for each preset and a row for each route; the table has a row for each group."""
+    """The figure has a panel for each preset; figure and table have a row for each group."""
     found = {"runs": RUNS, "groups": summarize_groups(RUNS)}
     (axes,) = boundary_figure(found).axes
     assert [label.get_text() for label in axes.get_yticklabels()] == ["all routes", "b", "a"]
@@ -343,7 +344,7 @@ def test_one_real_search() -> None:
 
 @pytest.mark.full
 def test_the_frame_age_limit_ends_completion() -> None:
-    """With a frame age limit of 100 ms the vehicle is not armed at a longer delay, so completion ends there."""
+    """With a frame age limit of 100 ms the vehicle is not armed at longer delays, so no longer delay is completed."""
     (search,) = plan_boundary(small_search("grid_ms=200", "within_ms=100", "safety.picture_age_limit_ms=100"))
     found = run_search(search)
     assert (found["onset_ms"], found["departure_ms"]) == (None, None)
@@ -352,7 +353,7 @@ def test_the_frame_age_limit_ends_completion() -> None:
 
 
 def test_departure_is_searched_where_drives_begin(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Departure is searched only at delays at which drives begin; drives that never begin do not affect it."""
+    """Departure is searched only at delays at which drives begin."""
 
     def fake(planned: PlannedRun) -> MonitoredRun:
         delay_ms = planned.config.network.video.delay_ms or 0.0
@@ -382,7 +383,7 @@ def test_departure_is_searched_where_drives_begin(monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_failed_search_does_not_stop_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A failed search is listed with its reason, and the others are completed."""
+    """A failed search is listed with its reason, and all other searches are completed."""
 
     def fake(search: boundary_module.BoundarySearch) -> dict[str, Any]:
         if search.name.endswith("01"):
@@ -400,10 +401,10 @@ def test_a_failed_search_does_not_stop_the_others(monkeypatch: pytest.MonkeyPatc
     assert "a_key paper_calibrated 01: failed: the vehicle was never armed" in lines
 
 
-def kill_process_in_repetition_1(search: boundary_module.BoundarySearch) -> dict[str, Any]:
-    """Kill the process in repetition 1, and once in repetition 2; return an entry otherwise.
+def kill_process_in_repetitions_1_and_2(search: boundary_module.BoundarySearch) -> dict[str, Any]:
+    """Kill the process always in repetition 1 and once in repetition 2; in all other cases return an entry.
 
-    The name of the participant is the directory of a file that marks a killed repetition.
+    A file in the directory `study.participant` marks each repetition that was killed.
     """
     repetition = int(search.name[-2:])
     marker_file = Path(search.planned.config.study.participant or "") / str(repetition)
@@ -415,8 +416,8 @@ def kill_process_in_repetition_1(search: boundary_module.BoundarySearch) -> dict
 
 @pytest.mark.full
 def test_searches_of_a_dead_process_are_repeated(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Searches of a process that died are repeated alone; only one that kills its process again has failed."""
-    monkeypatch.setattr(boundary_module, "run_search", kill_process_in_repetition_1)
+    """Searches of a dead process are repeated, each alone; only a search that kills its process again has failed."""
+    monkeypatch.setattr(boundary_module, "run_search", kill_process_in_repetitions_1_and_2)
     searches = plan_boundary(small_search("repetitions=5", f"study.participant={tmp_path}"))
     results, failed, completed = run_searches(searches, jobs=2, on_progress=lambda _: None)
     assert [run["repetition"] for run in results] == [0, 2, 3, 4]
@@ -425,7 +426,7 @@ def test_searches_of_a_dead_process_are_repeated(monkeypatch: pytest.MonkeyPatch
 
 
 def test_ctrl_c_keeps_the_found_boundaries(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """After Ctrl-C the searches in progress are finished, no others are started, and the files have all results."""
+    """After Ctrl-C, started searches are finished, no search is started, and the files have all results."""
     monkeypatch.setattr(boundary_module, "run_search", lambda search: run_entry("a_key", int(search.name[-2:])))
     monkeypatch.setattr(boundary_module, "process_workers", in_this_process)
     monkeypatch.setattr(_InThisProcess, "max_calls", 3)

@@ -34,7 +34,7 @@ INDEPENDENT_RESULTS = [  # lookahead s, steering lag s, delay margin ms: an inde
 def test_delay_margins_match_an_independent_computation(
     lookahead_s: float, steering_lag_s: float, critical_ms: float
 ) -> None:
-    """The delay margins are those of an independent computation, within 3 ms."""
+    """The delay margins agree with an independent computation within 3 ms."""
     loop = LateralLoop(lookahead_s, car=replace(LINCOLN_MKZ, steering_lag_s=steering_lag_s))
     assert 1e3 * critical_delay_s(loop) == pytest.approx(critical_ms, abs=3)
 
@@ -46,7 +46,7 @@ def test_the_simplified_loop_has_the_textbook_delay_margin() -> None:
     )
     bound_s = DELAY_PER_LOOKAHEAD * 2.0
     assert pytest.approx(0.52049, abs=1e-5) == DELAY_PER_LOOKAHEAD
-    # The rest, up to 3 %, is due to 1 ms of lag, half a frame of hold and the 7 ms relaxation of the tyres at 1 m/s.
+    # The difference, up to 3 %, is due to 1 ms of lag, half a frame of hold and 7 ms of tyre relaxation at 1 m/s.
     assert spectral_radius(simplified, 0.97 * bound_s) < 1 < spectral_radius(simplified, bound_s)
 
 
@@ -54,8 +54,9 @@ def test_the_plant_is_kinematic_at_low_speed() -> None:
     """At 1 m/s the yaw rate settles at speed x wheel angle / wheelbase, independent of the tyres."""
     loop = LateralLoop(1.0, speed_mps=1.0)
     a, _ = plant(loop)
-    steady_state = np.linalg.solve(a[:2, :2], -a[:2, 4])  # lateral speed and yaw rate for a wheel angle of 1 rad
-    assert steady_state[1] == pytest.approx(1.0 / loop.car.wheelbase_m, rel=0.01)
+    # The steady state for a wheel angle of 1 rad.
+    _lateral_mps, yaw_rate_radps = np.linalg.solve(a[:2, :2], -a[:2, 4])
+    assert yaw_rate_radps == pytest.approx(1.0 / loop.car.wheelbase_m, rel=0.01)
 
 
 def test_the_phase_margin_is_zero_at_the_delay_margin() -> None:
@@ -68,21 +69,21 @@ def test_the_phase_margin_is_zero_at_the_delay_margin() -> None:
 
 
 def test_the_phase_margin_is_continuous_in_the_delay() -> None:
-    """The phase margin is continuous in the delay where a fraction of a frame becomes a whole frame."""
+    """The phase margin does not jump where the delay passes a whole number of frames."""
     loop = LateralLoop(1.0)
     before, after = (phase_margin_rad(loop, 3 / 30 + shift) for shift in (-1e-7, 1e-7))
     assert before == pytest.approx(after, abs=1e-5)
 
 
 def test_the_smallest_lookahead_has_the_requested_margin() -> None:
-    """The smallest lookahead has exactly the requested phase margin, and a shorter one has less."""
+    """The smallest lookahead has exactly the requested phase margin; a shorter lookahead has a smaller margin."""
     lookahead_s = smallest_lookahead_s(math.radians(30), total_delay_s=0.081)
     assert math.degrees(phase_margin_rad(LateralLoop(lookahead_s), 0.081)) == pytest.approx(30, abs=0.01)
     assert math.degrees(phase_margin_rad(LateralLoop(lookahead_s - 0.05), 0.081)) < 30
 
 
 @pytest.mark.parametrize(
-    ("slower", "faster"),
+    ("smaller_margin", "larger_margin"),
     [
         (LateralLoop(0.74, speed_mps=50 / 3.6), LateralLoop(0.74, speed_mps=20 / 3.6)),
         (LateralLoop(0.74, frame_rate_hz=15), LateralLoop(0.74, frame_rate_hz=60)),
@@ -93,9 +94,9 @@ def test_the_smallest_lookahead_has_the_requested_margin() -> None:
         ),
     ],
 )
-def test_a_slower_loop_has_a_smaller_delay_margin(slower: LateralLoop, faster: LateralLoop) -> None:
+def test_four_changes_reduce_the_margin(smaller_margin: LateralLoop, larger_margin: LateralLoop) -> None:
     """A higher speed, a lower frame rate, more averaging and a longer steering lag each reduce the delay margin."""
-    assert critical_delay_s(slower) < critical_delay_s(faster)
+    assert critical_delay_s(smaller_margin) < critical_delay_s(larger_margin)
 
 
 def test_too_short_a_lookahead_is_unstable_without_delay() -> None:
@@ -152,8 +153,8 @@ def test_other_controllers_and_vehicles_have_no_model(change: str) -> None:
 
 def test_steering_dead_time_reduces_the_delay_margin() -> None:
     """A steering dead time of 60 ms reduces the delay margin by 60 ms."""
-    late = LateralLoop(1.01, car=replace(LINCOLN_MKZ, steering_dead_time_s=0.06))
-    assert critical_delay_s(late) == pytest.approx(critical_delay_s(LateralLoop(1.01)) - 0.06, abs=1e-6)
+    with_dead_time = LateralLoop(1.01, car=replace(LINCOLN_MKZ, steering_dead_time_s=0.06))
+    assert critical_delay_s(with_dead_time) == pytest.approx(critical_delay_s(LateralLoop(1.01)) - 0.06, abs=1e-6)
 
 
 def test_too_long_a_controller_wheelbase_reduces_the_delay_margin() -> None:

@@ -32,7 +32,7 @@ QUICK_CASE = (1.01, 30, 6.0)
 def oscillating_drive(
     rate_per_s: float, *, amplitude_m: float = 0.01, limited_s: tuple[float, ...] = ()
 ) -> MonitoredRun:
-    """Return a drive with an oscillation of period 2 s, at full speed after 5 s."""
+    """Return a drive that oscillates with a period of 2 s and has full speed from 5 s on."""
     time_s = np.arange(0, 40, 0.02)
     return MonitoredRun(
         ending=None,
@@ -46,7 +46,7 @@ def oscillating_drive(
 
 
 def test_a_half_period_reaches_from_crossing_to_crossing() -> None:
-    """The peak of each half period is the largest distance between two crossings of the centre."""
+    """The peak of a half period is the largest distance from the centre between two crossings of the centre."""
     time_s = np.arange(9.0)
     times_s, peaks_m = half_period_peaks(time_s, np.array([5.0, -1.0, -3.0, -2.0, 1.0, 4.0, -2.0, -1.0, 9.0]))
     assert times_s.tolist() == [2.0, 5.0, 6.0]
@@ -79,13 +79,14 @@ def test_an_approach_without_crossing_is_no_oscillation() -> None:
 
 
 def test_a_straight_drive_starts_near_the_centre() -> None:
-    """For any seed of a run, the straight drive starts near the centre, with a different seed for each run."""
+    """For any seed of a run, the straight drive starts near the centre; different runs have different drives."""
     seeds = [near_centre_seed(seed) for seed in range(5)]
     assert len(set(seeds)) == 5
+    offset_limit_m, heading_limit_rad = NEAR_CENTRE_START
     for seed in seeds:
         _, offset_m, heading_rad = start_offset(seed)
-        assert abs(offset_m) <= NEAR_CENTRE_START[0]
-        assert abs(heading_rad) <= NEAR_CENTRE_START[1]
+        assert abs(offset_m) <= offset_limit_m
+        assert abs(heading_rad) <= heading_limit_rad
 
 
 def loop_config(lookahead_s: float, rate_hz: float, speed_mps: float, *changes: str) -> RunConfig:
@@ -94,14 +95,14 @@ def loop_config(lookahead_s: float, rate_hz: float, speed_mps: float, *changes: 
         f"controller.lookahead_s={lookahead_s}",
         f"controller.speed_mps={speed_mps}",
         f"camera.rate_hz={rate_hz}",
-        "safety.stopping_distance_limit_m=200",  # at 10 m/s the default slows the car above 0.27 s of delay
+        "safety.stopping_distance_limit_m=200",  # the default slows a car of 10 m/s if the delay exceeds 0.27 s
         *changes,
     ]
     return load_config(RunConfig, shipped("configs/demo.yaml"), changed)
 
 
 def check_onset(config: RunConfig) -> None:
-    """Check that the oscillation decays at 9.5 ms below the theoretical delay, and grows at 9.5 ms above it."""
+    """Check that the oscillation decays about 9.5 ms below the theoretical delay and grows about 9.5 ms above it."""
     theory_ms = theoretical_ms(config)
     assert theory_ms is not None
     for sign in (-1, 1):
@@ -122,5 +123,5 @@ def test_the_onset_matches_theory(lookahead_s: float, rate_hz: float, speed_mps:
 
 @pytest.mark.full
 def test_the_onset_with_steering_dead_time_matches_theory() -> None:
-    """With 60 ms of dead time and another lag, the onset is within 10 ms of the theory for that car."""
+    """With 60 ms of dead time and 200 ms of lag, the onset is within 10 ms of the theory for that car."""
     check_onset(loop_config(1.01, 30, 30 / 3.6, "vehicle.steering_dead_time_ms=60", "vehicle.steering_lag_ms=200"))

@@ -45,7 +45,7 @@ def error_bars(axes: Axes) -> list[list[float]]:
 
 
 def test_points_with_overlapping_names_form_a_cluster() -> None:
-    """Points nearer than the size of a name form a cluster, the upper first; other points are alone."""
+    """Points whose names would overlap form a cluster, with the upper point first; other points are alone."""
     axes = Figure().subplots()
     axes.set(xlim=(0, 420), ylim=(0, 112))
     points = [("a", 100.0, 50.0, None), ("b", 104.1, 53.4, None), ("c", 100.0, 90.0, None), ("d", 350.0, 50.0, None)]
@@ -56,7 +56,7 @@ def test_points_with_overlapping_names_form_a_cluster() -> None:
 
 
 def test_the_degradation_figure_has_all_intervals_and_names() -> None:
-    """Circles, diamonds and the paper's completion have intervals, and all points have names."""
+    """LAVT's points and the paper's completion have intervals, and all points have names."""
     paper_conditions = {name: condition for name, condition in paper()["conditions"].items() if name in CONDITIONS}
     completion, error = degradation_figure({"virtual": CONDITIONS}, paper_conditions, COLOURS).axes
     paper_intervals = [

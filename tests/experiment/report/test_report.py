@@ -132,9 +132,9 @@ def test_the_page_links_to_its_sections_in_order(sweep: Path) -> None:
 
 
 def test_a_report_is_byte_for_byte_reproducible(sweep: Path) -> None:
-    """A second report of the same runs, with drives that are already read, has the same bytes in each file.
+    """A second report of the same runs, from drives that are already read, has the same bytes in each file.
 
-    Its summary is the same, including the speed of the sweep.
+    The second summary has the same bytes, too, including the speed of the sweep.
     """
     before, summary = files_of(sweep), (sweep / "summary.json").read_bytes()
     assert len(before) > 40
@@ -150,7 +150,7 @@ def files_of(sweep: Path) -> dict[str, bytes]:
 
 
 def test_csv_files_have_exact_numbers(sweep: Path) -> None:
-    """The CSV of a table has each number with all digits, an interval in two columns, and an unknown value empty."""
+    """The CSV of a table has all digits of each number, two columns for an interval, and no text for unknown values."""
     summary = json.loads((sweep / "summary.json").read_text())
     with (sweep / "report" / "tables" / "conditions_virtual_driving.csv").open(newline="") as file:
         rows = {row["condition"]: row for row in csv.DictReader(file)}
@@ -182,12 +182,14 @@ def test_the_page_has_the_clock_offset_of_two_machines(sweep: Path) -> None:
     )
     rows = re.findall(r"<tr><td.*?</tr>", clock_section.replace("\n", ""))
     cells = [[re.sub("<[^>]*>|\xa0", "", cell) for cell in re.findall(r"<td[^>]*>(.*?)</td>", row)] for row in rows]
-    assert [row[:2] for row in cells] == [["3", "chrony"], ["5", "probe"]]
-    assert cells[0][2:4] == ["250.030±6.000", "20.00"]
-    assert [cell.partition("±")[0] for cell in (cells[0][4], cells[1][2], cells[1][4])] == ["250.030"] * 3
+    run_with_chrony, run_with_probe = cells  # columns: run, source, offset, drift, the probe's offset
+    assert run_with_chrony[:4] == ["3", "chrony", "250.030±6.000", "20.00"]
+    assert run_with_probe[:2] == ["5", "probe"]
+    offsets = (run_with_chrony[4], run_with_probe[2], run_with_probe[4])
+    assert [offset.partition("±")[0] for offset in offsets] == ["250.030"] * 3
     assert "half the round trip" in clock_section
-    first, *_ = (sweep / "report" / "tables" / "clocks.csv").read_text().splitlines()
-    assert first.split(",")[2:4] == ["clock offset ms", "clock offset ms bound"]
+    header, *_ = (sweep / "report" / "tables" / "clocks.csv").read_text().splitlines()
+    assert header.split(",")[2:4] == ["clock offset ms", "clock offset ms bound"]
 
 
 def test_texts_of_users_are_escaped(sweep: Path) -> None:
@@ -229,7 +231,7 @@ def test_unfinished_runs_are_left_out_and_named(sweep: Path) -> None:
 
 
 def test_the_table_of_stages_begins_with_capture_to_stamp(make_run: MakeRun, tmp_path: Path, sweep: Path) -> None:
-    """The first row of the table of stages is the time from capture to stamp, or a dash if it is unknown."""
+    """The first row of the table of stages has the time from capture to stamp, or a dash if this time is unknown."""
     make_run(tmp_path, seconds=3.0, capture_ms=7.5)
     assert capture_to_stamp_ms(tmp_path / "server.mcap") == 7.5
     assert capture_to_stamp_ms(sweep / "runs" / "0" / "server.mcap") is None
@@ -239,7 +241,7 @@ def test_the_table_of_stages_begins_with_capture_to_stamp(make_run: MakeRun, tmp
 
 
 def test_received_pictures_are_decoded(tmp_path: Path) -> None:
-    """Four evenly spaced pictures are decoded from the recorded video; a record without video gives none."""
+    """Four evenly spaced pictures are decoded from the recorded video; a record without video gives no picture."""
     h264 = pytest.importorskip("lavt.transport.video.h264")
     writer = RecordWriter(tmp_path / "client.mcap", "client")
     writer.close()

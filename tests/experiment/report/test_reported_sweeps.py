@@ -45,7 +45,7 @@ def sweeps(make_run: MakeRun, tmp_path: Path) -> tuple[Path, Path]:
 
 
 def test_two_sweeps_in_one_report_are_separate_groups(sweeps: tuple[Path, Path], tmp_path: Path) -> None:
-    """Each run has the name of its sweep, each sweep is a group, and `conditions` has the runs of the first only."""
+    """Each run names its sweep, each sweep is a group, and `conditions` has only the runs of the first sweep."""
     report(list(sweeps), tmp_path / "both")
     summary = json.loads((tmp_path / "both" / "summary.json").read_text())
     assert [(run["run"], run["sweep"], run["preset"]) for run in summary["runs"]] == [

@@ -63,7 +63,7 @@ NEW_CONDITION_KEYS = (
 
 
 def run_of(condition: str, route: str = "a", repetition: int = 0, **changes: Any) -> dict[str, Any]:
-    """Return a hand-made entry of a run: L0 to L2 are completed, the others collide halfway."""
+    """Return a hand-made entry of a run: runs under L0 to L2 are completed, runs under L3 to L5 collide halfway."""
     video, control = INJECTED[condition]
     completed = video + control < 200
     percentiles = {"p5": 1.0, "p50": 62.0 + video, "p95": 90.0 + video, "bound": 0.2, "n": 100}
@@ -140,7 +140,7 @@ SECTIONS: dict[str, Callable[[ReportContext], Sequence[str]]] = {
 
 
 def parts_of(report: ReportContext, *names: str) -> dict[str, str]:
-    """Return the HTML of the named sections, or of all; drawing the figures of a section takes up to a second."""
+    """Return the HTML of the named sections by name, or of all sections if none is named (up to a second for each)."""
     return {name: "\n".join(SECTIONS[name](report)) for name in names or SECTIONS}
 
 
@@ -218,7 +218,7 @@ def test_failed_runs_are_in_the_summary(tmp_path: Path) -> None:
 
 
 def test_other_conditions_are_not_compared_with_the_paper(tmp_path: Path) -> None:
-    """Conditions with other names or other injected delays are reported without the paper."""
+    """Conditions whose name or injected delay is not the paper's are not compared with the paper."""
     runs = [{**run_of("L0"), "condition": "mine"}, {**run_of("L1"), "condition": "L0"}]
     parts = parts_of(report_of(summarize(runs, None), tmp_path))
     assert "the paper" not in text_of("".join(parts.values())).lower()
@@ -226,7 +226,7 @@ def test_other_conditions_are_not_compared_with_the_paper(tmp_path: Path) -> Non
 
 
 def test_a_summary_of_an_older_version_is_reported(tmp_path: Path) -> None:
-    """Parts that need keys of a newer version are left out; the others are shown."""
+    """Sections that need keys of a newer version are left out; all other sections are shown."""
     summary = copy.deepcopy(summarize(campaign(), None))
     for key in ("contrasts", "paper"):
         del summary[key]
@@ -253,7 +253,7 @@ def test_a_summary_of_an_older_version_is_reported(tmp_path: Path) -> None:
 
 
 def test_two_presets_are_separate_groups(tmp_path: Path) -> None:
-    """Two sweeps with equal run names are two groups, `conditions` has the first, and tables name their group."""
+    """Two sweeps with equal run names are two groups; `conditions` has the first sweep; tables name their group."""
     runs = [
         *campaign(sweep="calibrated"),
         *campaign(sweep="other", preset="designed", ending="completed", collisions=0),
@@ -285,7 +285,7 @@ def test_sweeps_with_equal_settings_are_separate_groups() -> None:
 
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_axes_of_a_sweep_are_drawn(count: int, tmp_path: Path) -> None:
-    """One axis gives one column of panels, two give a column for each value of the second; three give no figure."""
+    """One axis gives one column of panels, two axes a column for each value of the second; three give no figure."""
     axes = {"controller.speed_mps": (10.0, 6.0, 8.0), "network.video.loss": (0.0, 0.1), "camera.rate_hz": (30.0, 15.0)}
     runs = campaign()
     for name in list(axes)[:count]:
@@ -330,10 +330,10 @@ def test_sweeps_without_a_common_condition_are_reported(tmp_path: Path) -> None:
 
 
 def test_a_drive_is_drawn_every_half_metre() -> None:
-    """The drawn rows of a drive are the first, the last, and one for each half metre of progress."""
+    """The drawn points of a drive are the first, the last, and one for each half metre of progress."""
     progress_m = np.linspace(0.0, 10.0, 1001)
-    rows = drawn_points(progress_m)
-    assert (rows[0], rows[-1], len(rows)) == (0, 1000, 21)
+    indices = drawn_points(progress_m)
+    assert (indices[0], indices[-1], len(indices)) == (0, 1000, 21)
     assert drawn_points(np.zeros(0)) == []
 
 

@@ -33,7 +33,7 @@ def test_the_results_name_the_largest_fall_of_completion() -> None:
 
 
 def test_no_fall_is_reported_if_there_is_none() -> None:
-    """Constant completion is reported as such; with one condition no fall is named, and without conditions no text."""
+    """Constant completion has a sentence; with one condition no fall is named; without conditions there is no text."""
     assert "Completion does not fall" in results_sentences("It", conditions(1.0, 1.0, 1.0))
     assert "fall" not in results_sentences("It", conditions(1.0))
     assert results_sentences("It", {}) == ""
@@ -41,7 +41,7 @@ def test_no_fall_is_reported_if_there_is_none() -> None:
 
 
 def test_many_routes_and_conditions_are_counted() -> None:
-    """A few names are listed, many are counted, and the number of invalid runs is given."""
+    """A few names are listed, many names are only counted, and the number of invalid runs is given."""
     runs = [{"time": "virtual", "route": f"r{index}", "condition": "L0", "valid": index > 0} for index in range(20)]
     text = runs_overview(runs)
     assert all(part in text for part in ("20 runs in virtual time", "20 routes", "L0", "1 run is invalid"))
@@ -49,9 +49,9 @@ def test_many_routes_and_conditions_are_counted() -> None:
 
 
 def test_conditions_with_equal_loop_latency_are_sorted_by_name() -> None:
-    """Conditions whose loop latencies differ by at most 3 ms count as equally slow.
+    """Conditions whose loop latencies differ by at most 3 ms are treated as equally slow.
 
-    This also holds for the sentence "At ... ms and above, fewer than half".
+    This rule also applies to the sentence "At ... ms and above, fewer than half".
     """
     rates = {"L2": (222.5, 0.9), "L3": (297.6, 0.53), "L4": (297.4, 0.47), "L5": (397.3, 0.1)}
     conditions = {

@@ -73,7 +73,7 @@ def test_latex_escapes_special_characters() -> None:
 
 
 def test_latex_reads_no_cell_as_an_option() -> None:
-    """A row that begins with a bracket or a star is not an option of the line break before it."""
+    """A bracket or star at the beginning of a row is escaped, so that it is no option of the preceding line break."""
     lines = tex_of(TableData([text_column("name")], [["[1 m]"], ["*"]])).splitlines()
     assert lines[5:7] == [r"{[}1 m] \\", r"{*} \\"]
 

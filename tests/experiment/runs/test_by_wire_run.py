@@ -45,7 +45,7 @@ def result_of(out: Path, kind: str, profile: str = GENERATIONS[0], route: str = 
 
 @pytest.mark.parametrize("profile", [pytest.param(GENERATIONS[0], marks=pytest.mark.full), GENERATIONS[1]])
 def test_a_route_is_driven_through_the_kit(profile: str, tmp_path: Path, speed_faults: list[SpeedFault]) -> None:
-    """A route is driven about as well through the kit as without it, and the latency to the wheel is measured."""
+    """A route is driven about as well with the kit as without the kit, and the latency to the wheel is measured."""
     result, without_kit = result_of(tmp_path / "by-wire", "dbw", profile), result_of(tmp_path / "without", "simulator")
     assert (result["ending"], result["valid"]) == ("completed", True)
     assert result["p95_m"] <= 0.22
@@ -55,7 +55,7 @@ def test_a_route_is_driven_through_the_kit(profile: str, tmp_path: Path, speed_f
     ]
     assert wheel["n"] > 100
     assert speed_faults == []
-    assert 0 < wheel["p50"] < wheel["p95"] < 20, "a frame's time on the bus, the kit's report, and half its period"
+    assert 0 < wheel["p50"] < wheel["p95"] < 20, "the frame's time on the bus, and the wait for the kit's next report"
 
 
 @pytest.mark.full
@@ -64,7 +64,7 @@ def test_a_route_is_driven_through_the_kit(profile: str, tmp_path: Path, speed_f
 def test_no_drive_has_an_implausible_speed(
     profile: str, route: str, tmp_path: Path, speed_faults: list[SpeedFault]
 ) -> None:
-    """The other routes are driven without a false alarm on the speed."""
+    """The routes b_key and c_key are driven without a false alarm on the speed, too."""
     assert result_of(tmp_path, "dbw", profile, route)["ending"] == "completed"
     assert speed_faults == []
 

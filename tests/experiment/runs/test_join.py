@@ -64,7 +64,7 @@ def test_the_joined_config_has_the_clients_hold(make_run: MakeRun, tmp_path: Pat
 
 
 def test_a_client_of_a_later_drive_is_rejected(make_run: MakeRun, tmp_path: Path) -> None:
-    """A client that received only frames after the server's first drive is rejected."""
+    """A client that received no frame of the server's first drive is rejected."""
     server, client = write_sides(make_run, tmp_path)
     received = read_record(client / "client.mcap").table("picture").ints("stamp_ns").tolist()
     writer = RecordWriter(server / "server.mcap", "server")
@@ -78,8 +78,8 @@ def test_a_client_of_a_later_drive_is_rejected(make_run: MakeRun, tmp_path: Path
     assert not (tmp_path / "run").exists()
 
 
-def test_a_directory_of_the_other_side_is_rejected(make_run: MakeRun, tmp_path: Path) -> None:
-    """A directory without the record or the config of its side is rejected, with the directory to name instead."""
+def test_swapped_directories_are_rejected(make_run: MakeRun, tmp_path: Path) -> None:
+    """If the directories of server and client are swapped, the error says which directory to name."""
     server, client = write_sides(make_run, tmp_path)
     with pytest.raises(UserError, match="--out of `lavt server`"):
         join_sides(client, server, tmp_path / "run")

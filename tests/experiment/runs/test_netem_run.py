@@ -47,7 +47,7 @@ class FakeNetemInterface(NetemInterface):
     def measure(
         self, flows: Sequence[ImpairedFlow], *, exempt: Sequence[ExemptPort] = (), count: int = 50
     ) -> dict[str, ProbeResult]:
-        """Return results as requested, plus `added_ms`."""
+        """Return the requested delays plus `added_ms`."""
         return {
             probe.name: ProbeResult(count, 0, 0, 0, *[probe.impairment.delay_ms + self.added_ms] * 3)
             for probe in queue_probes(flows, exempt)
@@ -69,7 +69,7 @@ def netem_run(interface: NetemInterface, condition: str) -> NetemRun:
 
 
 def test_a_run_delays_its_own_ports_and_cleans_up(tmp_path: Path) -> None:
-    """The flows of L4 are delayed at the ports of the run, measured before and after, and deleted at the end."""
+    """A run delays the flows of L4 at its ports, measures them before and after the drive, and deletes its queue."""
     interface = FakeNetemInterface(tmp_path)
     with netem_run(interface, "L4") as netem:
         netem.apply(video_port=40_001, control_port=40_002)
@@ -83,8 +83,8 @@ def test_a_run_delays_its_own_ports_and_cleans_up(tmp_path: Path) -> None:
     assert netem_reasons(report) == []
 
 
-def test_a_failed_run_cleans_up(tmp_path: Path) -> None:
-    """The queue of a run is deleted, however the run ends."""
+def test_an_interrupted_run_cleans_up(tmp_path: Path) -> None:
+    """The queue of a run is deleted even if the run is interrupted."""
     interface = FakeNetemInterface(tmp_path)
 
     def interrupted_run() -> None:
@@ -109,9 +109,9 @@ def test_a_rejected_run_keeps_the_queue_of_another_program(tmp_path: Path) -> No
 
 
 def test_a_delay_that_differs_from_the_request_is_a_reason(tmp_path: Path) -> None:
-    """A delay that is 3 ms longer after the drive is a reason for each flow, with the time of measurement.
+    """A delay that is 3 ms longer than requested makes a run invalid; the reason says that it was so after the drive.
 
-    A part of netem that has stopped and a missing queue are reasons, too.
+    A part of netem that has stopped and a missing queue make a run invalid, too.
     """
     interface = FakeNetemInterface(tmp_path)
     with netem_run(interface, "L1") as netem:
@@ -127,14 +127,14 @@ def test_a_delay_that_differs_from_the_request_is_a_reason(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("report", [{}, {"flows": 3}, {"flows": [], "read_back": [], "before": {"video": {}}}])
-def test_an_invalid_netem_report_counts_as_unmeasured(report: dict[str, Any]) -> None:
-    """With an invalid `netem.json`, the injected delay of each flow counts as not measured."""
+def test_delays_of_an_invalid_netem_report_are_not_measured(report: dict[str, Any]) -> None:
+    """With an invalid `netem.json`, a run is invalid because the injected delay of each flow was not measured."""
     for reason, flow in zip(netem_reasons(report), ("video", "control"), strict=True):
         assert reason == not_measured(flow)
 
 
 def test_a_flow_without_a_measurement_is_a_reason() -> None:
-    """A flow of the report without a measurement is a reason."""
+    """A flow of the report without a measurement makes a run invalid."""
     flow = ImpairedFlow("video", "udp", 5600, "source", Impairment(75))
     report = {"flows": msgspec.to_builtins([flow]), "read_back": [], "before": {}, "after": {}}
     assert "before the drive: video: no packet came through" in {reason.text for reason in netem_reasons(report)}

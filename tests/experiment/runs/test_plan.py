@@ -34,7 +34,7 @@ def test_a_sweep_has_every_combination() -> None:
 
 @pytest.mark.usefixtures("any_route")
 def test_seeds_are_paired() -> None:
-    """A repetition on a route has the same seed under every condition; others have other seeds."""
+    """A repetition on a route has one seed under all conditions, which no other repetition or route has."""
     runs = planned(routes=["a_key", "b_key"], conditions=["L0", "L3", "L5"], repetitions=4, seed=9)
     seeds: dict[tuple[str, int], set[int]] = {}
     for run in runs:
@@ -52,7 +52,7 @@ def test_seeds_are_paired_over_axes() -> None:
 
 
 def test_seed_of_a_single_run() -> None:
-    """A single run has the seed of the first repetition in a sweep, and another base seed changes it."""
+    """A single run has the seed of the first repetition in a sweep; another `seed` in the config changes this seed."""
     single_run = plan_run(RunConfig(seed=5))
     assert single_run.seed == planned(conditions=["L0"], seed=5)[0].seed
     assert single_run.seed != plan_run(RunConfig(seed=6)).seed

@@ -21,9 +21,9 @@ from lavt.streams import stream
 
 SIDES = ("server", "client")
 Rows = list[tuple[int, int, bytes]]
-"""The log time, the publish time and the data of each message of a topic."""
+"""The messages of a topic: (log time, publish time, data)."""
 Topics = dict[str, dict[str, Rows]]
-"""The topics of each side."""
+"""The messages by side and topic."""
 VALUES: list[Any] = [None, "", "x", -1, 0, 1, 2**31, 2**63 - 1, -(2**63), 2**63, 10**30, 1e308, -1e308, 0.5, True]
 VALUES += [False, [], {}, [[]], [1, 2], [["a", 1]], [[1, "a"]], [[None, None]], [[1e308, 1]], [["a", 10**30]], {"a": 1}]
 TEXTS = [
@@ -64,14 +64,18 @@ def write(directory: Path, side: str, topics: list[tuple[str, Rows]]) -> None:
     file.close()
 
 
-def mutated(rows: Rows, generator: Any) -> Rows:
-    """Return messages of which some, or all, have another value, content or time, lack a field, or are left out."""
+def mutate(rows: Rows, generator: Any) -> Rows:
+    """Return the messages with one kind of random change to some or all of them.
+
+    A changed message has another value, content or time, lacks a field, or is left out.
+    """
 
     def any_of(values: list[Any]) -> Any:
         return values[generator.integers(len(values))]
 
-    kind = any_of(["value", "value", "value", "missing", "text", "time", "none"])
-    names, value, text = list(json.loads(rows[0][2])), any_of(VALUES), any_of(TEXTS)
+    kind = any_of(["value", "value", "value", "missing", "text", "time", "left out"])
+    _, _, first_data = rows[0]
+    names, value, text = list(json.loads(first_data)), any_of(VALUES), any_of(TEXTS)
     name, time_ns, share = any_of(names), any_of(TIMES_NS), any_of([0.01, 0.5, 1.0])
     changed = []
     for log_ns, publish_ns, data in rows:
@@ -90,7 +94,7 @@ def mutated(rows: Rows, generator: Any) -> Rows:
 
 
 def rejection(directory: Path, injection: str) -> str:
-    """Evaluate a run as `lavt report` does; return the sentence of its rejection, empty if it is evaluated."""
+    """Evaluate a run as `lavt report` does; return the sentence of the rejection, or "" if the run is not rejected."""
     identity = {**dict.fromkeys(IDENTITY), "injection": injection, "inherent": "network", "condition": "L0"}
     identity["injected_ms"] = {"video": 0.0, "control": 0.0}
     try:
@@ -113,7 +117,7 @@ def check_mutations(topics: Topics, directory: Path, seed: int, count: int) -> i
             for _ in range(generator.integers(3)):
                 index = int(generator.integers(len(written)))
                 topic, rows = written[index]
-                rows = mutated(topics[side][topic], generator)
+                rows = mutate(topics[side][topic], generator)
                 written[index] = (topic if generator.random() > 0.1 else written[index - 1][0]), rows
             write(directory, side, written)
         sentence = rejection(directory, str(generator.choice(["none", "netem", "relay"])))
@@ -129,7 +133,7 @@ def test_rewritten_records_are_evaluated_or_rejected(topics: Topics, tmp_path: P
 
 @pytest.mark.full
 def test_many_rewritten_records_are_evaluated_or_rejected(topics: Topics, tmp_path: Path) -> None:
-    """The same for many records."""
+    """Each of many random records is evaluated, or rejected with one sentence."""
     assert check_mutations(topics, tmp_path, seed=2, count=1000) > 100
 
 
@@ -145,7 +149,7 @@ def test_many_rewritten_records_are_evaluated_or_rejected(topics: Topics, tmp_pa
     ],
 )
 def test_a_wrong_message_is_evaluated_or_rejected(topics: Topics, tmp_path: Path, topic: str, data: bytes) -> None:
-    """One message of another kind at the end of its channel is evaluated or rejected, within little memory."""
+    """A record with a wrong message at the end of a channel is evaluated, or rejected with one sentence."""
     for side in SIDES:
         rows = topics[side].get(topic, [])
         last = [(*rows[-1][:2], data)] if rows else []

@@ -41,12 +41,12 @@ def drive_with(
 
 
 def errors_ms(measured: RunMeasurement, offset: ClockOffset | None, server: HostClock) -> tuple[Any, Any]:
-    """Return the absolute error of Delta every 10 ms of the drive, and its bound."""
+    """Return the absolute error of Delta every 10 ms of the drive, and the bound of Delta at the same times."""
     assert offset is not None
     began_ns, ended_ns = measured.clocks.client_wall_ns.tolist()
     client_wall_ns = np.arange(began_ns, ended_ns, 10 * NS_PER_MS)
     true_ns = client_wall_ns - server.wall_start_ns
-    truth_ns = np.array([server.at(true).wall_ns for true in true_ns.tolist()]) - client_wall_ns
+    truth_ns = np.array([server.at(at_ns).wall_ns for at_ns in true_ns.tolist()]) - client_wall_ns
     delta_error_ns = np.abs(offset.at(client_wall_ns) - truth_ns)
     return delta_error_ns / NS_PER_MS, offset.bound_at(client_wall_ns) / NS_PER_MS
 
@@ -79,7 +79,7 @@ def test_both_estimates_are_within_their_bounds(tmp_path: Path) -> None:
 
 
 def test_the_probe_alone_with_injected_delay(tmp_path: Path) -> None:
-    """Without time sources and with 100 ms on control, the probe's Delta is within its bound, and tau is correct."""
+    """Without time sources and under L5, the probe's Delta is within its bound, and tau_v and tau_c are correct."""
     _, with_sources, _ = drive_with(tmp_path / "sources", "network.condition=L5")
     measured, result, server = drive_with(tmp_path / "probe", "network.condition=L5", change=remove_time_sources)
     delta_error_ms, bound_ms = errors_ms(measured, measured.clocks.offset, server)
@@ -94,7 +94,7 @@ def test_the_probe_alone_with_injected_delay(tmp_path: Path) -> None:
 def test_a_wrong_time_source_is_contradicted_by_the_probe(tmp_path: Path) -> None:
     """A time source that is wrong by 37.5 ms contradicts the probe, and the run is invalid.
 
-    Such an error comes from NTP through 75 ms of delay in one direction.
+    NTP makes such an error if one direction is delayed by 75 ms.
     """
 
     def use_wrong_source(loop: VirtualLoop) -> None:
@@ -122,7 +122,7 @@ def test_a_probe_without_answers_makes_the_run_invalid(tmp_path: Path) -> None:
 @pytest.mark.parametrize("has_time_sources", [True, False])
 @pytest.mark.parametrize("side", ["client", "server"])
 def test_a_clock_step_has_one_reason(tmp_path: Path, side: str, has_time_sources: bool) -> None:
-    """A wall clock set by 1 s during the drive is the only reason of the invalid run, with and without time sources."""
+    """If a wall clock steps by 1 s during the drive, the step is the only reason why the run is invalid."""
 
     def step(loop: VirtualLoop) -> None:
         if not has_time_sources:

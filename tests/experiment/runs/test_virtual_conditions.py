@@ -32,7 +32,7 @@ def drive_run(out: Path, *further_changes: str) -> dict[str, Any]:
 
 
 def link_counts(side: Path) -> dict[str, dict[str, int]]:
-    """Return the recorded counters of a side's links, by name."""
+    """Return the recorded counters of a side, by link and by counter."""
     table = read_record(side).table("counts")
     names = ("packets", "lost", "dropped", "overtook")
     columns = {name: table.ints(f"link_{name}") for name in names}
@@ -62,7 +62,7 @@ def test_every_condition_is_driven_reproducibly(name: str, tmp_path: Path) -> No
 
 
 def test_lost_packets_are_counted_and_missing(tmp_path: Path) -> None:
-    """The sender's record has the number of lost packets, and the receiver's record lacks as many."""
+    """The sender's record has the number of lost packets, and so many packets are missing in the receiver's record."""
     drive_run(tmp_path / "run", "fidelity=pixels", "vehicle.time_limit_s=10", "network.condition=loss")
     server, client = (read_record(tmp_path / f"run/{side}.mcap") for side in ("server", "client"))
     video = link_counts(tmp_path / "run/server.mcap")["link rtp"]
@@ -72,12 +72,12 @@ def test_lost_packets_are_counted_and_missing(tmp_path: Path) -> None:
     for sender, receiver, topic, counts in ((server, client, "rtp", video), (client, server, "control", control)):
         sent, received = len(sender.table(topic)), len(receiver.table(topic))
         assert sent == counts["packets"]
-        assert 0 <= sent - counts["lost"] - received <= 10  # the others were in transit at the end
+        assert 0 <= sent - counts["lost"] - received <= 10  # up to 10 were in transit at the end
 
 
 @pytest.mark.parametrize("name", all_but_one_full(IMPAIRED_CONDITIONS, "reorder"))
 def test_video_under_every_condition(name: str, tmp_path: Path) -> None:
-    """Real video passes a link under every condition, and the link's counters show its impairment."""
+    """Real video passes a link under every condition, and the link's counters show the impairment of the condition."""
     changes = ("vehicle.scenery=none", "record.video=false", f"network.condition={name}")
     planned = plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), changes))
     loop = build_loop(planned, tmp_path / "run")
@@ -106,7 +106,7 @@ def test_a_trace_has_no_constant_delay_and_a_recorded_digest(tmp_path: Path) -> 
 
 
 def test_a_slow_link_ends_the_drive_in_a_valid_run(tmp_path: Path) -> None:
-    """A queue of several seconds ends the drive by its frame age, and the run is valid."""
+    """If frames wait for seconds in a slow link's queue, the drive ends with a safe stop, and the run is valid."""
     result = drive_run(tmp_path / "run", "network.condition=rate")
     assert (result["ending"], result["valid"], result["invalid_reasons"]) == ("safe_stop", True, [])
     assert result["loop_ms"]["p50"] > 1000
@@ -131,10 +131,13 @@ AXES: list[tuple[str, list[Any], str]] = [
 
 @pytest.mark.parametrize(
     ("key", "values", "fidelity"),
-    [pytest.param(*axis, id=axis[0], marks=() if axis[2] == "geometry" else pytest.mark.full) for axis in AXES],
+    [
+        pytest.param(key, values, fidelity, id=key, marks=() if fidelity == "geometry" else pytest.mark.full)
+        for key, values, fidelity in AXES
+    ],
 )
 def test_config_values_as_axes(key: str, values: list[Any], fidelity: str, tmp_path: Path) -> None:
-    """Each of these config values works as an axis: its runs share their seed, have its value, and differ."""
+    """Each of these config keys works as an axis: the runs have one seed, the axis's values, and different digests."""
     sweep = {
         "fidelity": fidelity,
         "conditions": ["L1"],

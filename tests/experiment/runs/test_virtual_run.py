@@ -39,10 +39,10 @@ def planned(*changes: str) -> PlannedRun:
 
 
 def run(
-    out: Path, run: PlannedRun, *, change: Change = lambda _: None, seconds: float = 600.0, **keys: Any
+    out: Path, planned_run: PlannedRun, *, change: Change = lambda _: None, seconds: float = 600.0, **keys: Any
 ) -> VirtualLoop:
     out.mkdir()
-    loop = build_loop(run, out, **keys)
+    loop = build_loop(planned_run, out, **keys)
     change(loop)
     drive(loop, limit_ns=round(seconds * NS_PER_S))
     return loop
@@ -53,7 +53,7 @@ def records(out: Path) -> tuple[Record, Record]:
 
 
 def changing_pictures(change: Callable[[int, Picture], Picture]) -> Change:
-    """Change the camera's pictures by a function of (frame number, picture)."""
+    """Return a change of the loop that applies a function of (frame number, picture) to the camera's pictures."""
 
     def install(loop: VirtualLoop) -> None:
         node = loop.server.camera
@@ -107,7 +107,7 @@ def test_latencies_are_correct_within_their_bound(l0: Path) -> None:
 
 
 def test_ignoring_the_clock_offset_makes_latencies_wrong(tmp_path: Path) -> None:
-    """Time sources that ignore the clock offset make tau_v and tau_c wrong by it, so the test above can fail."""
+    """If time sources ignore the clock offset, tau_v and tau_c are wrong by the offset: the test above can fail."""
 
     def ignore_offset(loop: VirtualLoop) -> None:
         for side, host in loop.runtime.hosts.items():
@@ -166,8 +166,8 @@ print(loop.digest.hexdigest())
 
 
 def digest(out: Path, *changes: str, change: Change = lambda _: None) -> str:
-    digest: str = run(out, planned(NO_SCENERY, *changes), change=change, seconds=3).digest.hexdigest()
-    return digest
+    hexadecimal: str = run(out, planned(NO_SCENERY, *changes), change=change, seconds=3).digest.hexdigest()
+    return hexadecimal
 
 
 def flip_a_pixel(number: int, picture: Picture) -> Picture:
@@ -190,7 +190,7 @@ def flip_a_bit_of_a_command(loop: VirtualLoop) -> None:
 
 
 def test_the_digest_is_reproducible_and_sensitive(tmp_path: Path) -> None:
-    """Equal runs have equal digests; another seed, one other pixel or one other bit of a command gives another."""
+    """Equal runs have equal digests; another seed, one changed pixel or one changed bit of a command changes it."""
     digests = [
         digest(tmp_path / "first"),
         digest(tmp_path / "seed", "seed=2"),
@@ -251,7 +251,8 @@ def test_grey_pictures_stop_the_car(tmp_path: Path, change: Callable[[int, Pictu
     ]
     assert stops
     assert 0 < stops[0] - grey_ns <= 3 * NS_PER_S
-    assert driving_interval(server)[2] == "safe_stop"
+    _, _, ending = driving_interval(server)
+    assert ending == "safe_stop"
 
 
 def test_mirrored_pictures_make_the_car_leave_its_lane(tmp_path: Path) -> None:
@@ -264,7 +265,7 @@ def test_mirrored_pictures_make_the_car_leave_its_lane(tmp_path: Path) -> None:
 
 
 def test_a_lost_vehicle_state_stops_the_car(tmp_path: Path) -> None:
-    """If the vehicle's state no longer arrives, the client does not use its old speed: it brakes and stops."""
+    """If the vehicle's state no longer arrives at the client, the drive soon ends with a safe stop."""
 
     def lose_the_state(loop: VirtualLoop) -> None:
         loop.runtime.at(8 * NS_PER_S, lambda: setattr(loop.runtime.links["state"], "open", False))
@@ -282,17 +283,17 @@ def test_a_lost_vehicle_state_stops_the_car(tmp_path: Path) -> None:
 @pytest.mark.parametrize("step_s", [1, -1])
 @pytest.mark.parametrize("side", [0, 1])
 def test_a_step_of_the_wall_clock_changes_no_safety_state(tmp_path: Path, side: int, step_s: int) -> None:
-    """A wall clock step of a second, either way, on either host, changes no safety state; the run is invalid."""
+    """If either host's wall clock steps by 1 s in either direction, no safety state changes; the run is invalid."""
     config = planned("fidelity=geometry")
     clocks = host_clocks(config.config)
     clocks[side].steps = [(8 * NS_PER_S, step_s * NS_PER_S)]
     out = tmp_path / "run"
 
-    def follow(loop: VirtualLoop) -> None:
+    def add_time_sources(loop: VirtualLoop) -> None:
         for host in loop.runtime.hosts.values():
             host.clock_source = modelled_clock_source(host.clock, host.side, 0.0, 0.0001)
 
-    run(out, config, change=follow, clocks=clocks)
+    run(out, config, change=add_time_sources, clocks=clocks)
     server, client = records(out)
     safety_changes = [
         detail

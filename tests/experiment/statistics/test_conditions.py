@@ -14,7 +14,7 @@ def run_with_ending(ending: str, p95_m: float | None) -> dict[str, Any]:
 
 
 def test_runs_are_compared_over_their_common_distance() -> None:
-    """For valid runs of 30 and 20 m and an invalid one of 10 m, P95 up to 20 m is used."""
+    """For valid runs of 30 and 20 m and an invalid run of 10 m, the P95 up to 20 m is used."""
     long_run, short_run, invalid_run = run([0.1, 0.2, 9.0]), run([0.5, 0.6]), run([0.0], valid=False)
     distances = common_distances([long_run, short_run, invalid_run])
     assert common_p95_m([long_run], distances) == [0.2]
@@ -35,7 +35,7 @@ def test_repetitions_with_under_ten_metres_are_left_out() -> None:
 
 
 def test_runs_not_completed_rank_last() -> None:
-    """With three of five runs completed, the quartiles are the second, the third, and null."""
+    """With three of five runs completed, the quartiles are the second error, the third error, and null."""
     runs = [run_with_ending("completed", error_m) for error_m in (3.0, 1.0, 2.0)]
     runs += [run_with_ending("collision", 0.1), run_with_ending("timeout", 0.1)]
     assert worst_rank_m(runs) == {"p25": 2.0, "p50": 3.0, "p75": None}

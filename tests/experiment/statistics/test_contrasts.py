@@ -26,7 +26,7 @@ def runs(condition: str, endings: str, **changes: Any) -> list[dict[str, Any]]:
 
 
 def test_mcnemars_p_value() -> None:
-    """If 5 pairs differ in the same way, p is 2 / 2^5; for 3 against 1 it is 10 / 16, and for no such pair 1."""
+    """If 5 pairs differ in one direction, p is 2 / 2^5; for 3 against 1 pairs p is 10 / 16, and for no pairs 1."""
     assert mcnemar(5, 0) == pytest.approx(0.0625)
     assert mcnemar(3, 1) == pytest.approx(0.625)
     assert mcnemar(0, 0) == 1.0
@@ -38,7 +38,7 @@ def test_fishers_p_value() -> None:
 
 
 def test_a_contrast_pairs_runs_of_one_route_repetition_and_seed() -> None:
-    """Runs of one route, repetition and seed are paired in any order, and differing pairs are counted by condition."""
+    """Runs of one route, repetition and seed are paired in any order; a pair that differs has a completed condition."""
     contrasts = paired_contrasts([*runs("L0", "ccccccx"), *reversed(runs("L1", "cxxxxxc"))])
     p_of_5_against_1 = 14 / 64
     assert contrasts == [
@@ -64,17 +64,17 @@ def test_holms_correction_is_over_all_contrasts() -> None:
 
 
 def test_runs_without_a_partner_are_ignored() -> None:
-    """Invalid runs, other seeds, and runs with equal keys form no pairs; without pairs, p is null."""
+    """Invalid runs, runs with other seeds and duplicate runs form no pairs; without pairs, p is null."""
     invalid = paired_contrasts([*runs("L0", "cc"), *runs("L1", "xx", valid=False)])
     other_seeds = paired_contrasts([*runs("L0", "cc"), *runs("L1", "xx", seed=1)])
-    equal_keys = paired_contrasts([*runs("L0", "cc"), *runs("L0", "xx"), *runs("L1", "xx")])
-    for contrasts in (invalid, other_seeds, equal_keys):
+    duplicates = paired_contrasts([*runs("L0", "cc"), *runs("L0", "xx"), *runs("L1", "xx")])
+    for contrasts in (invalid, other_seeds, duplicates):
         assert [(contrast["pairs"], contrast["p"], contrast["p_holm"]) for contrast in contrasts] == [(0, None, None)]
     assert paired_contrasts([]) == []
 
 
 def test_contrasts_of_the_papers_counts() -> None:
-    """By Fisher's test, L1 and L2 differ; L3 and L4, of equal total delay, do not, nor do L2 and L3."""
+    """By Fisher's test the paper's L1 and L2 differ; L2, L3 and L4 do not differ from each other."""
     contrasts = {(contrast["a"], contrast["b"]): contrast for contrast in paper()["contrasts"]}
     assert len(contrasts) == 6
     assert contrasts["L1", "L2"]["p"] == pytest.approx(0.00037, abs=5e-6)

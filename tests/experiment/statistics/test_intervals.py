@@ -14,12 +14,15 @@ from lavt.experiment.statistics.intervals import bootstrap_interval, exact_inter
     ("successes", "low", "high"), [(30, 0.025 ** (1 / 30), 1.0), (15, 0.3130, 0.6870), (0, 0.0, 1 - 0.025 ** (1 / 30))]
 )
 def test_the_interval_of_thirty_runs_is_exact(successes: int, low: float, high: float) -> None:
-    """For 30 and 0 of 30 runs the interval has Clopper and Pearson's closed form; for 15 it is the published one."""
+    """For 0 and 30 of 30 runs the interval is Clopper and Pearson's closed form; for 15 of 30 it is as published."""
     assert exact_interval(successes, 30) == pytest.approx([low, high], abs=5e-5)
 
 
 def completion_distribution(probabilities: Sequence[float], runs: Sequence[int]) -> np.ndarray:
-    """Return the probability of each total number of completed runs; each route has a probability and a count."""
+    """Return the probability of each total number of completed runs.
+
+    `probabilities` and `runs` have, for each route, the probability of completion and the number of runs.
+    """
     distribution = np.ones(1)
     for probability, count in zip(probabilities, runs, strict=True):
         distribution = np.convolve(distribution, binom.pmf(np.arange(count + 1), count, probability))
@@ -40,7 +43,7 @@ ROUTE_PROBABILITIES = [
 @pytest.mark.parametrize("probabilities", ROUTE_PROBABILITIES)
 @pytest.mark.parametrize("runs", [(5,) * 6, (1,) * 6, (5, 5, 4, 5, 3, 5), (2, 20, 1, 1, 1, 5)])
 def test_the_pooled_interval_covers_the_mean_over_routes(probabilities: Sequence[float], runs: Sequence[int]) -> None:
-    """For any routes, the interval includes the runs' mean probability in at least 95 % of experiments."""
+    """For any routes, the interval includes the mean probability over all runs in at least 95 % of experiments."""
     mean = float(np.dot(probabilities, runs)) / sum(runs)
     covered = 0.0
     for count, chance in enumerate(completion_distribution(probabilities, runs)):
@@ -50,7 +53,7 @@ def test_the_pooled_interval_covers_the_mean_over_routes(probabilities: Sequence
 
 
 def test_the_pooled_interval_covers_any_three_routes() -> None:
-    """For all probabilities of three routes on a grid, with five runs each, the coverage is at least 95 %."""
+    """For three routes with five runs each and any probabilities on a grid, the coverage is at least 95 %."""
     grid = np.linspace(0, 1, 21)
     intervals = [exact_interval(count, 15) or [1.0, 0.0] for count in range(16)]
     for probabilities in itertools.combinations_with_replacement(grid.tolist(), 3):
@@ -72,27 +75,28 @@ def test_intervals_of_too_few_values_are_null() -> None:
 
 
 def test_the_bootstrap_is_reproducible_and_accurate() -> None:
-    """The interval is reproducible; for 100 evenly spaced values it is the mean +- 1.96 standard errors within 10 %."""
+    """The interval is reproducible; for 100 evenly spaced values it is about the mean +- 1.96 standard errors."""
     values = [index / 99 for index in range(100)]
     interval = bootstrap_interval(values)
     assert interval == bootstrap_interval(values)
     assert interval is not None
+    low, high = interval
     mean, standard_error = 0.5, 0.0291
-    assert interval[0] == pytest.approx(mean - 1.96 * standard_error, abs=0.006)
-    assert interval[1] == pytest.approx(mean + 1.96 * standard_error, abs=0.006)
+    assert low == pytest.approx(mean - 1.96 * standard_error, abs=0.006)
+    assert high == pytest.approx(mean + 1.96 * standard_error, abs=0.006)
 
 
 def test_the_bootstrap_of_three_is_their_range() -> None:
     """The 95 % interval of three values is their range.
 
-    More than 2.5 % of the resamples, 1 in 27, consist of the smallest value three times, and as many of the largest.
+    Of 27 resamples, one has only the smallest value and one only the largest, and 1/27 is more than 2.5 %.
     """
     assert bootstrap_interval([0.2, 1.0, 0.6]) == pytest.approx([0.2, 1.0])
     assert bootstrap_interval([1.0, 1.0, 1.0]) == [1.0, 1.0]
 
 
 def test_holms_correction() -> None:
-    """The smallest p value is multiplied by 3, the next by 2 and the largest by 1; none is below the one before it."""
+    """The smallest p value is multiplied by 3, the next by 2, the largest by 1; each is at least the smaller ones."""
     assert holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
 
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -91,11 +92,8 @@ def campaign(*, condition: str = "L0", bad_route: str | None = None, **changes: 
     ]
 
 
-def test_completion_by_route_and_for_such_roads() -> None:
-    """If one of six routes is never completed, its interval is 0 to 52 %, and that for such roads 50 to 100 %.
-
-    The interval for such roads is for the completion on other roads of the same kind.
-    """
+def test_completion_by_route_and_by_road() -> None:
+    """If one of six routes is never completed, its interval is 0 to 52 %, and the range over roads is 50 to 100 %."""
     condition = summarize(campaign(bad_route="b"), SPEED)["conditions"]["L0"]
     assert condition["endings"] == {"completed": 25, "safe_stop": 5}
     assert condition["completion_interval"] == exact_interval(25, 30)
@@ -115,13 +113,13 @@ def test_completion_by_route_and_for_such_roads() -> None:
 
 @pytest.mark.parametrize("suffix", ["", ".yaml", ".yml"])
 def test_a_route_and_its_key_route_are_one_road(suffix: str) -> None:
-    """Two routes whose names differ by the suffix _key are one road, for names and for paths."""
+    """Two routes whose names or paths differ only by `_key` are one road."""
     runs = [run(route=f"roads/my{suffix}"), run(route=f"roads/my_key{suffix}", ending="collision"), run(route="b")]
     assert road_rates(runs) == [1.0, 0.5]
 
 
-def test_one_road_has_no_interval_for_such_roads() -> None:
-    """A route and its key route are one road, and from one road nothing follows for other roads."""
+def test_one_road_has_no_range_over_roads() -> None:
+    """Runs on a single road (a route and its key part) have no range over roads."""
     runs = [entry for entry in campaign() if entry["route"] in {"a", "a_key"}]
     assert summarize(runs, SPEED)["conditions"]["L0"]["completion_such_roads"] is None
 
@@ -161,7 +159,7 @@ def test_missing_values_are_left_out() -> None:
 
 
 def test_the_three_summaries_of_tracking_error() -> None:
-    """P95 is given over completed runs, over the common distance, and with incomplete runs ranking last."""
+    """P95 is given for completed runs, for the common distance, and for all runs with incomplete runs ranked last."""
     runs = [
         *campaign(p95_m=2.0, p95_by_10m=[0.1, 0.2, 0.3]),
         *campaign(condition="L1", bad_route="b", p95_m=4.0, p95_by_10m=[0.5, 0.6]),
@@ -174,8 +172,8 @@ def test_the_three_summaries_of_tracking_error() -> None:
     assert conditions["L1"]["p95_worst_rank_m"] == {"p25": 4.0, "p50": 4.0, "p75": 4.0}
 
 
-def test_groups_have_contrasts_of_their_own() -> None:
-    """Runs are paired within a group only; the base config's contrasts are those of its group."""
+def test_each_group_has_contrasts() -> None:
+    """Runs are paired only within a group; the summary's contrasts are those of the base config's group."""
     runs = [
         entry
         for speed, bad_route in ((20, None), (30, "b"))
@@ -191,7 +189,7 @@ def test_groups_have_contrasts_of_their_own() -> None:
 
 
 def test_results_of_an_older_version_are_summarised() -> None:
-    """Keys that an older result lacks are null or empty, and its other keys are summarized."""
+    """Keys that an older result lacks are null or empty in the summary; all other keys are summarized."""
     condition = summarize([run()], SPEED)["conditions"]["L0"]
     assert condition["completion_rate"] == 1.0
     assert (condition["p95_common_m"], condition["mae_m"], condition["stages_ms"]) == (None, None, [])
@@ -200,15 +198,23 @@ def test_results_of_an_older_version_are_summarised() -> None:
 
 
 def test_a_summary_without_runs() -> None:
-    """Without runs, the summary has no conditions and no contrasts, but the paper's results."""
+    """Without runs, the summary has no conditions and no contrasts, but has the paper's results."""
     summary = summarize([], None)
     assert (summary["conditions"], summary["contrasts"], summary["groups"]) == ({}, [], [])
     assert list(summary["paper"]["conditions"]) == ["L0", "L1", "L2", "L3", "L4", "L5"]
 
 
 def test_the_bound_of_a_condition_is_the_largest() -> None:
-    """The bound of a condition's latency is the largest of its runs, and null if one run has none."""
+    """The bound of a condition's latency is the largest bound of its runs, and null if one run has no bound."""
     latency = run()["tau_v_ms"]
     runs = [run(), run(tau_v_ms={**latency, "bound": 0.8}), run(tau_c_ms={**latency, "bound": None})]
     condition = summarize(runs, SPEED)["conditions"]["L0"]
     assert (condition["tau_v_ms"]["bound"], condition["tau_c_ms"]["bound"]) == (0.8, None)
+
+
+def test_every_value_is_defined_in_the_documentation() -> None:
+    """`docs/metrics.md` has each key of the summary, of a condition and of a contrast."""
+    page = (Path(__file__).parents[3] / "docs" / "metrics.md").read_text()
+    summary = summarize([run(), run(condition="L1")], SPEED)
+    keys = {*summary, *summary["conditions"]["L0"], *summary["contrasts"][0], *summary["groups"][0]} - {"a", "b"}
+    assert {key for key in keys if f"`{key}`" not in page and f"    {key} " not in page} == set()

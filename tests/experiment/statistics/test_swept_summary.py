@@ -1,4 +1,4 @@
-"""Tests of the summary of a small driven sweep: its keys, on which the report and users rely, and their consistency."""
+"""Tests of the summary of a small driven sweep: the keys on which the report and users rely, and consistent values."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def test_stage_latencies_add_up_to_the_loop_latency(summary: Any) -> None:
 
 
 def test_a_completed_run_has_all_partial_errors(summary: Any) -> None:
-    """A completed run has a P95 for every full 10 m of its route, except the few metres before the first row."""
+    """A completed run has a P95 for every full 10 m driven, and its distance is the route's length within 5 m."""
     for run in summary["runs"]:
         assert run["ending"] == "completed"
         assert len(run["p95_by_10m"]) == int(run["distance_m"] // 10)

@@ -77,7 +77,7 @@ def resumed(sweep_folder: Path) -> ResumedSweep:
     before = read_json(sweep_folder / "summary.json")
     first, second = (sweep_folder / "runs" / run.name / RESULT for run in two_runs())
     before_ns = second.stat().st_mtime_ns
-    first.unlink()  # as if it had been killed while driving
+    first.unlink()  # as if the sweep had been killed during this run
     drive_sweep(sweep_config(), two_runs(), sweep_folder, jobs=1, on_progress=lambda _: None)
     return ResumedSweep(before, read_json(sweep_folder / "summary.json"), second.stat().st_mtime_ns == before_ns)
 
@@ -90,7 +90,7 @@ def test_resuming_drives_only_missing_runs(resumed: ResumedSweep) -> None:
 
 
 def test_the_speed_is_that_of_the_last_drives(sweep_folder: Path, resumed: ResumedSweep) -> None:
-    """Runs from before do not count in a resumed sweep's speed; if no run is driven, the speed is kept."""
+    """A resumed sweep's speed includes only the runs that it drove; if it drove no run, the speed is kept."""
     speed = resumed.after["speed"]
     assert speed["simulated_s"] == read_json(sweep_folder / "runs" / two_runs()[0].name / RESULT)["duration_s"]
     drive_sweep(sweep_config(), two_runs(), sweep_folder, jobs=2, on_progress=lambda _: None)
@@ -98,7 +98,7 @@ def test_the_speed_is_that_of_the_last_drives(sweep_folder: Path, resumed: Resum
 
 
 def test_an_error_of_one_run_does_not_stop_the_others(tmp_path: Path) -> None:
-    """An unexpected error of one run is reported with its type and text, and the others are driven."""
+    """An unexpected error of one run is reported with its type and text, and all other runs are driven."""
     good, bad = two_runs()
     lines: list[str] = []
     driven, speed = run_all([replace(bad, seed=-1), good], tmp_path, jobs=1, on_progress=lines.append)
@@ -111,7 +111,7 @@ def test_an_error_of_one_run_does_not_stop_the_others(tmp_path: Path) -> None:
 
 
 def test_the_config_of_a_run_reproduces_it(sweep_folder: Path, tmp_path: Path) -> None:
-    """The config in a run directory, driven by itself, reproduces the digest of the run."""
+    """A new run with the config of a run directory has the digest of the run in that directory."""
     directory = sweep_folder / "runs" / two_runs()[0].name
     again = run_once(plan_run(load_config(RunConfig, directory / "config.yaml")), tmp_path / "again")
     assert again["digest"] == json.loads((directory / "result.json").read_text())["digest"]
@@ -129,7 +129,7 @@ def test_resuming_with_another_config_is_rejected(sweep_folder: Path) -> None:
     ("key", "value"), [("conditions", "[L1]"), ("repetitions", "2"), ("axes", "{study.block: [1]}")]
 )
 def test_resuming_a_sweep_of_other_runs_is_rejected(sweep_folder: Path, key: str, value: str) -> None:
-    """A sweep with other or fewer runs is not resumed."""
+    """A sweep is not resumed with a config that has other runs."""
     changed, before = sweep_config(f"{key}={value}"), (sweep_folder / "sweep.yaml").read_bytes()
     with pytest.raises(UserError, match=rf"another config \({key}\)"):
         drive_sweep(changed, plan_sweep(changed), sweep_folder, jobs=1, on_progress=lambda _: None)
@@ -153,7 +153,7 @@ BASES: list[tuple[tuple[str, ...], dict[str, Any]]] = [
 
 @pytest.mark.parametrize(("changes", "base"), BASES, ids=str)
 def test_the_base_config_is_the_sweeps_own(changes: tuple[str, ...], base: dict[str, Any], tmp_path: Path) -> None:
-    """The base of a sweep is the value of its own config at each axis, wherever that value is in the axis."""
+    """The base of a sweep has, for each axis, the value of the sweep's config, in the axis or not."""
     config = sweep_config(*changes)
     assert base_of(config, plan_sweep(config)) == base
     assert recorded_base(tmp_path) is None
@@ -200,7 +200,7 @@ def test_a_stopped_sweep_keeps_what_is_finished(signal_number: int, options: tup
 
 
 def test_ctrl_c_leaves_no_partial_remote_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """If Ctrl-C interrupts writing the files of a remote run, none of them remain."""
+    """If Ctrl-C interrupts writing the files of a remote run, no file of this run remains."""
 
     def write_one_and_stop(_files: Mapping[str, bytes], directory: Path) -> None:
         directory.mkdir()
@@ -238,7 +238,7 @@ sys.meta_path.insert(0, Finder())
 
 @pytest.mark.full
 def test_ctrl_c_in_an_import_keeps_the_exit_code(tmp_path: Path) -> None:
-    """Ctrl-C during the import of the report, which executes a string, ends a sweep with its own exit code."""
+    """Ctrl-C during the import of the report, which executes a string, ends a sweep with exit code 1."""
     (tmp_path / "sitecustomize.py").write_text(SLOW_IMPORT)
     path = os.pathsep.join(filter(None, (str(tmp_path), os.environ.get("PYTHONPATH"))))
     process = subprocess.Popen(
@@ -321,7 +321,7 @@ def test_files_of_remote_runs_are_freed(tmp_path: Path, monkeypatch: pytest.Monk
 
 @pytest.mark.full
 def test_a_missing_scheduler_is_an_error(tmp_path: Path) -> None:
-    """An address without a Dask scheduler is a user error before anything is driven."""
+    """An address without a Dask scheduler, or `--jobs` beside an address, is a user error before anything is driven."""
     pytest.importorskip("distributed")
     _, planned = geometry_sweep()
     with pytest.raises(UserError, match="no Dask scheduler answers at"):
@@ -332,7 +332,7 @@ def test_a_missing_scheduler_is_an_error(tmp_path: Path) -> None:
 
 
 def kill_a_worker(remaining: list[int]) -> None:
-    """Kill the first child process, `remaining[0]` times."""
+    """Kill the first child process if `remaining[0]` is not 0, and decrement `remaining[0]`."""
     children = multiprocessing.active_children()
     if remaining[0] and children:
         remaining[0] -= 1
@@ -363,7 +363,7 @@ def test_runs_of_a_killed_process_are_repeated(tmp_path: Path) -> None:
 
 
 class BrokenAfterRunExecutor(Executor):
-    """An executor that drives inline and then fails like one whose process died after the run, which is rare."""
+    """An executor that drives inline and then fails as if its process had died after the run."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Drive, and return a future with `BrokenExecutor`."""
@@ -388,7 +388,7 @@ def test_a_run_whose_process_dies_after_it_is_kept(tmp_path: Path, monkeypatch: 
 
 @pytest.mark.full
 def test_a_killed_sweep_resumes_to_the_same_summary(tmp_path: Path) -> None:
-    """A sweep that was killed (SIGKILL) and resumed has the summary of an undisturbed one."""
+    """A sweep that was killed (SIGKILL) and resumed has the summary of an undisturbed sweep."""
     set_options = [part for change in ("fidelity=geometry", "conditions=[L0, L3, L5]") for part in ("--set", change)]
     command = [sys.executable, "-m", "lavt", "sweep", str(shipped("configs/sweep.yaml")), *set_options, "--out"]
     undisturbed, killed = tmp_path / "whole", tmp_path / "killed"

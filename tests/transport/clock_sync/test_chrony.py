@@ -27,18 +27,18 @@ NTPDATA = (
     "18,17,17,16"
 )
 """Output of chronyc 4.3 as root, between two kernels, with the local clock 250 ms behind."""
-WITHOUT_ROOT = TRACKING + "\n501 Not authorised\n"
-BEFORE_SYNC = (
+OUTPUT_WITHOUT_ROOT = TRACKING + "\n501 Not authorised\n"
+OUTPUT_BEFORE_SYNC = (
     "00000000,,0,0.000000000,0.000000000,0.000000000,0.000000000,0.000,0.000,0.000,1.000000000,1.000000000,0.0,"
     "Not synchronised\n"
     "10.9.0.1,0A090001,123,[UNSPEC],00000000,Normal,0,Invalid,0,0,1,0,1.000000000,0.000000,0.000000,00000000,,"
     "0.000000000,0.000000000,0.000000000,0.000000000,0.000000000,0.00,000,000,0000,No,No,Invalid,Invalid,1,0,0,0\n"
 )
-OWN_CLOCK = (
+OUTPUT_OF_THE_SERVER = (
     "7F7F0101,,8,1795292419.031279233,0.000000000,0.000000000,0.000000000,0.000,0.000,0.000,0.0,0.0,0.0,Normal\n"
 )
 """Output on the server of this pair, which has no source and serves its own clock."""
-BEFORE, AFTER = Now(0, 1795292432 * NS_PER_S), Now(20_000_000, 1795292432 * NS_PER_S + 20_000_000)
+QUERY_BEGIN, QUERY_END = Now(0, 1795292432 * NS_PER_S), Now(20_000_000, 1795292432 * NS_PER_S + 20_000_000)
 
 
 def run_that_returns(completed: Completed | None) -> Run:
@@ -46,10 +46,10 @@ def run_that_returns(completed: Completed | None) -> Run:
 
 
 def parse(answer: str) -> ClockReport:
-    return parse_chrony("host", answer, BEFORE, AFTER)
+    return parse_chrony("host", answer, QUERY_BEGIN, QUERY_END)
 
 
-def with_fields(line: str, **fields: str) -> str:
+def replace_fields(line: str, **fields: str) -> str:
     """Return one of chronyc's lines with other values; `field0` is the first one."""
     parts = line.strip().split(",")
     for name, value in fields.items():
@@ -67,7 +67,7 @@ def test_correction_and_bound_of_a_slow_clock() -> None:
 
 def test_fast_clock_has_a_negative_correction() -> None:
     """A fast clock has a negative correction."""
-    assert parse(with_fields(TRACKING, field4="-0.000012000")).correction_s == -0.000012
+    assert parse(replace_fields(TRACKING, field4="-0.000012000")).correction_s == -0.000012
 
 
 def test_peer_data_is_reported() -> None:
@@ -80,44 +80,44 @@ def test_peer_data_is_reported() -> None:
 def test_report_time_and_age() -> None:
     """A report is for the middle of the query; its age is measured on the corrected clock."""
     report = parse(TRACKING)
-    assert (report.mono_ns, report.wall_ns - BEFORE.wall_ns, report.asking_s) == (10_000_000, 10_000_000, 0.02)
+    assert (report.mono_ns, report.wall_ns - QUERY_BEGIN.wall_ns, report.asking_s) == (10_000_000, 10_000_000, 0.02)
     assert report.age_s == pytest.approx(1795292432.01 + 0.249678716 - 1795292431.937353491, abs=1e-6)
 
 
 def test_without_root_peer_data_is_unknown() -> None:
-    """Without root the peer data is unknown, and all else is as for root."""
-    report = parse(WITHOUT_ROOT)
+    """Without root the peer data is unknown, but the correction is known."""
+    report = parse(OUTPUT_WITHOUT_ROOT)
     assert report.correction_s == 0.249678716
     assert (report.peer_delay_s, report.peer_dispersion_s, report.good_samples, report.poll_s) == (None,) * 4
 
 
 def test_data_of_other_sources_is_ignored() -> None:
     """The peer data is that of the selected source, not of another source."""
-    other = with_fields(NTPDATA, field0="10.9.0.7", field19="0.5")
+    other = replace_fields(NTPDATA, field0="10.9.0.7", field19="0.5")
     assert parse(f"{TRACKING}\n{other}\n{NTPDATA}").peer_delay_s == 0.000245972
     assert parse(f"{TRACKING}\n{other}").peer_delay_s is None
 
 
 def test_local_reference_has_zero_correction() -> None:
     """A chronyd without a source that serves its own clock has correction 0 with bound 0, and a status."""
-    report = parse(OWN_CLOCK)
+    report = parse(OUTPUT_OF_THE_SERVER)
     assert (report.correction_s, report.bound_s, report.follows) == (0.0, 0.0, "")
     assert report.status == "its own clock is the reference"
 
 
 UNSYNCHRONISED = {
-    "before the first sample": BEFORE_SYNC,
-    "leap status not normal": with_fields(TRACKING, field13="Not synchronised"),
-    "no reference": with_fields(TRACKING, field0="00000000"),
-    "text for the correction": with_fields(TRACKING, field4="slow"),
-    "nothing for the correction": with_fields(TRACKING, field4=""),
-    "nan for the correction": with_fields(TRACKING, field4="nan"),
-    "an infinite correction": with_fields(TRACKING, field4="inf"),
-    "text for the root delay": with_fields(TRACKING, field10="?"),
-    "nan for the root delay": with_fields(TRACKING, field10="nan"),
-    "a negative root delay": with_fields(TRACKING, field10="-1.0"),
-    "a negative dispersion": with_fields(TRACKING, field11="-0.1"),
-    "an infinite dispersion": with_fields(TRACKING, field11="inf"),
+    "before the first sample": OUTPUT_BEFORE_SYNC,
+    "leap status not normal": replace_fields(TRACKING, field13="Not synchronised"),
+    "no reference": replace_fields(TRACKING, field0="00000000"),
+    "text for the correction": replace_fields(TRACKING, field4="slow"),
+    "nothing for the correction": replace_fields(TRACKING, field4=""),
+    "nan for the correction": replace_fields(TRACKING, field4="nan"),
+    "an infinite correction": replace_fields(TRACKING, field4="inf"),
+    "text for the root delay": replace_fields(TRACKING, field10="?"),
+    "nan for the root delay": replace_fields(TRACKING, field10="nan"),
+    "a negative root delay": replace_fields(TRACKING, field10="-1.0"),
+    "a negative dispersion": replace_fields(TRACKING, field11="-0.1"),
+    "an infinite dispersion": replace_fields(TRACKING, field11="inf"),
 }
 NOT_CHRONY = {
     "empty": "",
@@ -130,7 +130,7 @@ NOT_CHRONY = {
 
 @pytest.mark.parametrize("case", UNSYNCHRONISED)
 def test_unsynchronised_chrony_has_no_correction(case: str) -> None:
-    """An unsynchronised clock, or invalid values, give a report without correction and with that status."""
+    """An unsynchronised clock or an invalid value is reported as not synchronised, without a correction."""
     report = parse(UNSYNCHRONISED[case])
     assert (report.correction_s, report.bound_s, report.status) == (None, None, NOT_SYNCHRONISED)
 
@@ -144,7 +144,7 @@ def test_chrony_not_running(case: str) -> None:
 
 def test_polling_interval_below_a_second() -> None:
     """The polling interval is 2 to the power that chrony reports, because its field in whole seconds would be 0."""
-    report = parse(TRACKING + "\n" + with_fields(NTPDATA, field9="-1", field10="0"))
+    report = parse(TRACKING + "\n" + replace_fields(NTPDATA, field9="-1", field10="0"))
     assert report.poll_s == 0.5
 
 
@@ -152,7 +152,7 @@ def test_polling_interval_below_a_second() -> None:
 @pytest.mark.parametrize("value", ["", "?", "nan", "-8", "inf"])
 def test_invalid_peer_data_is_unknown(field: int, value: str) -> None:
     """An invalid or negative value of the peer data is unknown; the other values are kept."""
-    report = parse(TRACKING + "\n" + with_fields(NTPDATA, **{f"field{field}": value}))
+    report = parse(TRACKING + "\n" + replace_fields(NTPDATA, **{f"field{field}": value}))
     peer_data = (report.peer_delay_s, report.peer_dispersion_s, report.poll_s, report.good_samples)
     assert sum(value is None for value in peer_data) == 1
     assert report.correction_s == 0.249678716
@@ -169,7 +169,7 @@ FIELDS = st.text(max_size=8)
     )
 )
 def test_any_answer_is_parsed(answer: str) -> None:
-    """No answer raises; values are finite and, except for the correction, not negative."""
+    """Any answer is parsed without an error; values are finite and, except for the correction, not negative."""
     report = parse(answer)
     assert report.correction_s is None or math.isfinite(report.correction_s)
     for value in (report.bound_s, report.age_s, report.peer_delay_s, report.peer_dispersion_s, report.poll_s):
@@ -177,7 +177,7 @@ def test_any_answer_is_parsed(answer: str) -> None:
 
 
 def test_one_chronyc_answers_all_queries(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One process answers every query with its output up to the unknown command."""
+    """One process answers every query; an answer ends where the unknown command `lavt` fails."""
     (tmp_path / "chronyc").write_text(
         "#!/bin/sh\n"
         "while read -r command; do\n"
@@ -215,7 +215,7 @@ class JumpingClock:
 
 @pytest.mark.parametrize("read", [read_chrony, read_ptp])
 def test_late_answer_is_a_missed_poll(read: Callable[[Clock, Run], ClockReport | None]) -> None:
-    """If a busy machine takes 3 s from query to answer, the poll is missed, since the answer's time is unknown."""
+    """An answer that takes 3 s on a busy machine is a missed poll, because its time is not known well enough."""
     assert read(JumpingClock(), run_that_returns(Completed(0, TRACKING))) is None
 
 

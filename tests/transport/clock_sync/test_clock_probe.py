@@ -23,7 +23,7 @@ CORRECTIONS = st.tuples(st.floats(-1e9, 1e9), st.floats(0, 1e9))
 
 
 def test_layout_of_a_request() -> None:
-    """A request is 48 bytes: magic, version, kind, sequence, t1, and zeros for the server's values."""
+    """A request is 48 bytes: magic, version, kind, sequence, time of sending, and zeros for the server's values."""
     assert encode_request(258, 3) == b"LC\x01\x00" + b"\0\0\x01\x02" + (3).to_bytes(8, "big") + bytes(32)
 
 
@@ -63,8 +63,8 @@ BAD = {
     "another magic": b"XY" + GOOD[2:],
     "another version": GOOD[:2] + b"\x02" + GOOD[3:],
     "another kind": GOOD[:3] + b"\x07" + GOOD[4:],
-    "t1 before 1970": LAYOUT.pack(b"LC", 1, 1, 1, -1, 3, 4, 0.0, 0.0),
-    "t2 out of range": LAYOUT.pack(b"LC", 1, 1, 1, 2, LATEST_NS, LATEST_NS, 0.0, 0.0),
+    "sent before 1970": LAYOUT.pack(b"LC", 1, 1, 1, -1, 3, 4, 0.0, 0.0),
+    "received too late for the format": LAYOUT.pack(b"LC", 1, 1, 1, 2, LATEST_NS, LATEST_NS, 0.0, 0.0),
     "answered before it was received": LAYOUT.pack(b"LC", 1, 1, 1, 2, 4, 3, 0.0, 0.0),
 }
 
@@ -80,7 +80,7 @@ def test_invalid_replies_are_rejected(case: str) -> None:
     "correction", [(math.nan, 0.1), (math.inf, 0.1), (0.1, math.nan), (0.1, -1.0), (0.1, math.inf)]
 )
 def test_invalid_correction_is_unknown(correction: tuple[float, float]) -> None:
-    """A correction or bound that is not finite, or a negative bound, makes both unknown and keeps the times."""
+    """A correction or bound that is not finite, or a negative bound, makes both unknown; the times are kept."""
     reply = decode_reply(LAYOUT.pack(b"LC", 1, 1, 1, 2, 3, 4, *correction))
     assert reply == ProbeReply(1, 2, 3, 4, None, None)
 

@@ -99,7 +99,7 @@ def test_host_addresses_of_both_families(tmp_path: Path, monkeypatch: pytest.Mon
 def test_without_kernel_tables_there_are_no_addresses(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str
 ) -> None:
-    """Without these files, or with other contents, there are no addresses."""
+    """If the kernel's tables are missing or cannot be parsed, there are no addresses."""
     monkeypatch.setattr(clock_report, "IPV4_ROUTES", tmp_path / "none")
     monkeypatch.setattr(clock_report, "IPV6_ADDRESSES", tmp_path / "none")
     assert host_addresses() == ()

@@ -29,7 +29,7 @@ def test_one_shell_runs_all_programs(shell: Shell) -> None:
 
 
 def test_a_closed_shell_starts_no_process() -> None:
-    """After `close`, a late command has no result and starts no process, which nobody would end."""
+    """After `close`, a late command has no result and starts no process, because nothing would end it."""
     shell = Shell()
     with closing(shell):
         assert shell.run(["echo", "one"], 10) == Completed(0, "one\n")
@@ -51,7 +51,7 @@ def test_arguments_are_quoted(shell: Shell) -> None:
 
 
 def test_timeout_does_not_disturb_the_next_program(shell: Shell) -> None:
-    """A program that exceeds its timeout has no result, and its output is not taken for the next program's."""
+    """A program that exceeds its timeout has no result, and the next result has nothing of its output."""
     assert shell.run(["sh", "-c", "sleep 10; echo late"], 0.05) is None
     assert shell.run(["echo", "next"], 10) == Completed(0, "next\n")
 
@@ -68,7 +68,7 @@ def test_program_is_killed_at_the_timeout(shell: Shell, tmp_path: Path) -> None:
 
 
 def test_killed_shell_is_replaced(shell: Shell) -> None:
-    """If the shell has died one command has no result, and the next command starts a new shell."""
+    """If the shell has been killed, one command has no result, and the next one starts a new shell."""
     completed = shell.run(["sh", "-c", "echo $PPID"], 10)
     assert completed is not None
     os.kill(int(completed.output), signal.SIGKILL)

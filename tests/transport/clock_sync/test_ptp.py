@@ -36,7 +36,7 @@ sending: GET TIME_STATUS_NP
 \t\tgmPresent                  true
 \t\tgmIdentity                 a6bb40.fffe.382888
 """
-"""Output of pmc 3.1.1 for a ptp4l with software time stamps that receives a master."""
+"""Output of pmc 3.1.1 for a ptp4l that receives a master, with software timestamps."""
 MASTER = """\ta6bb40.fffe.382888-1 seq 0 RESPONSE MANAGEMENT PORT_DATA_SET
 \t\tportIdentity            a6bb40.fffe.382888-1
 \t\tportState               MASTER
@@ -51,7 +51,7 @@ MASTER = """\ta6bb40.fffe.382888-1 seq 0 RESPONSE MANAGEMENT PORT_DATA_SET
 """
 """Output of pmc for that ptp4l's master."""
 NO_PTP4L = "sending: GET PORT_DATA_SET\nsending: GET CURRENT_DATA_SET\nsending: GET TIME_STATUS_NP\n"
-"""Output without a ptp4l; pmc exits with 0 even so."""
+"""Output of pmc without a ptp4l; pmc still exits with 0."""
 
 
 def parse(answer: str) -> ClockReport:
@@ -96,9 +96,9 @@ def test_ptp4l_not_running(answer: str) -> None:
 
 
 @given(st.lists(st.tuples(st.sampled_from(SLAVE.split()), st.text(max_size=8)), max_size=20))
-def test_any_answer_is_parsed(rows: list[tuple[str, str]]) -> None:
-    """No answer raises, and a bound is finite and not negative."""
-    report = parse("\n".join(f"{name} {value}" for name, value in rows) + "\ngmIdentity x\ngmPresent true\n")
+def test_any_answer_is_parsed(lines: list[tuple[str, str]]) -> None:
+    """Any answer is parsed without an error, and a bound is finite and not negative."""
+    report = parse("\n".join(f"{name} {value}" for name, value in lines) + "\ngmIdentity x\ngmPresent true\n")
     assert report.correction_s is None or math.isfinite(report.correction_s)
     assert report.bound_s is None or 0 <= report.bound_s < math.inf
 

@@ -28,11 +28,11 @@ def test_lognormal_jitter_has_its_median_and_p95() -> None:
 
 
 def test_delay_depends_only_on_the_index() -> None:
-    """The delay of an index depends neither on earlier calls nor on the object."""
-    forwards = [DelayModel(0.0, WIFI, 5, "video").delay_ns(index) for index in range(1000)]
+    """The delay of an index depends neither on earlier calls nor on the `DelayModel` object."""
+    ascending = [DelayModel(0.0, WIFI, 5, "video").delay_ns(index) for index in range(1000)]
     delay = DelayModel(0.0, WIFI, 5, "video")
-    backwards = [delay.delay_ns(index) for index in reversed(range(1000))]
-    assert forwards == backwards[::-1]
+    descending = [delay.delay_ns(index) for index in reversed(range(1000))]
+    assert ascending == descending[::-1]
 
 
 @pytest.mark.parametrize("other", [DelayModel(0.0, WIFI, 2, "video"), DelayModel(0.0, WIFI, 1, "control")])
@@ -51,9 +51,9 @@ def test_consecutive_indices_are_independent() -> None:
 
 
 def test_constant_does_not_change_the_jitter() -> None:
-    """Under another condition the constant changes and the jitter stays the same, so that runs are paired."""
-    without, delayed = DelayModel(0.0, WIFI, 1, "video"), DelayModel(75.0, WIFI, 1, "video")
-    differences_ns = {delayed.delay_ns(index) - without.delay_ns(index) for index in range(200)}
+    """The jitter does not depend on the constant delay, so that runs under two conditions can be paired."""
+    undelayed, delayed = DelayModel(0.0, WIFI, 1, "video"), DelayModel(75.0, WIFI, 1, "video")
+    differences_ns = {delayed.delay_ns(index) - undelayed.delay_ns(index) for index in range(200)}
     assert max(abs(difference_ns - 75 * NS_PER_MS) for difference_ns in differences_ns) <= 1
 
 

@@ -43,8 +43,8 @@ class UdpEnd:
         datagram, address = self.socket.recvfrom(65_535)
         return datagram, address
 
-    def received(self) -> list[bytes]:
-        """Return the datagrams received so far: those before a marker that this end sends to itself."""
+    def receive_all(self) -> list[bytes]:
+        """Return all datagrams that have arrived: those before a marker that this end sends to itself."""
         self.send(END_MARKER, self.address)
         datagrams = []
         while (datagram := self.receive()[0]) != END_MARKER:
@@ -52,8 +52,8 @@ class UdpEnd:
         return datagrams
 
     def receives_nothing(self) -> bool:
-        """Return whether no datagram has arrived since the last call of `received`."""
-        return not self.received()
+        """Return whether no datagram has arrived; drop those that have."""
+        return not self.receive_all()
 
 
 class RelayNetwork:
@@ -61,7 +61,7 @@ class RelayNetwork:
 
     def __init__(self, **delays: Any) -> None:
         self.udp_ends: list[UdpEnd] = []
-        self.server = {"video": self.end(), "control": self.end()}
+        self.server = {"video": self.open_end(), "control": self.open_end()}
         self.clock = ManualClock(1_000 * NS_PER_S)
         config = RelayConfig(
             video_server=f"127.0.0.1:{self.server['video'].address[1]}",
@@ -71,8 +71,8 @@ class RelayNetwork:
         self.relay = Relay(self.clock, flows(config))
         self.relay_addresses = {name: ("127.0.0.1", port) for name, port in self.relay.ports().items()}
 
-    def end(self) -> UdpEnd:
-        """Open a socket that the net closes."""
+    def open_end(self) -> UdpEnd:
+        """Open a socket, which `close` closes."""
         self.udp_ends.append(UdpEnd())
         return self.udp_ends[-1]
 
@@ -86,8 +86,8 @@ class RelayNetwork:
         self.relay.step(0)
 
     def connect(self, flow: str) -> tuple[UdpEnd, tuple[str, int]]:
-        """Open a client of a flow; return it and its address at the server."""
-        client = self.end()
+        """Open a client of a flow; return the client and the relay's address at which the server sees it."""
+        client = self.open_end()
         client.send(b"hello", self.relay_addresses[flow])
         self.step()
         if flow == "control":
@@ -105,7 +105,7 @@ class RelayNetwork:
 
 @pytest.fixture
 def net() -> Iterator[RelayNetwork]:
-    """A relay that delays video by 75 ms and control by 40 ms, and not the state."""
+    """Open a relay that delays the video by 75 ms and the control by 40 ms, but not the state."""
     with closing(RelayNetwork()) as network:
         yield network
 
@@ -120,7 +120,7 @@ def sender_report() -> bytes:
 
 @pytest.mark.parametrize("datagram", [rtp(9000), sender_report()], ids=["RTP", "sender report"])
 def test_video_is_delayed(net: RelayNetwork, datagram: bytes) -> None:
-    """RTP and sender reports to the client are sent exactly when their delay has passed."""
+    """RTP and sender reports reach the client exactly when their delay has passed."""
     client, address_at_server = net.connect("video")
     net.server["video"].send(datagram, address_at_server)
     net.step()
@@ -132,7 +132,7 @@ def test_video_is_delayed(net: RelayNetwork, datagram: bytes) -> None:
 
 
 def test_challenges_are_not_delayed(net: RelayNetwork) -> None:
-    """A challenge of path validation passes inline and overtakes delayed video."""
+    """A challenge of the path validation is forwarded without delay and overtakes delayed video."""
     client, address_at_server = net.connect("video")
     for datagram in (rtp(9000), CHALLENGE):
         net.server["video"].send(datagram, address_at_server)
@@ -145,7 +145,7 @@ def test_challenges_are_not_delayed(net: RelayNetwork) -> None:
 
 @pytest.mark.parametrize("datagram", [b"L hello", struct.pack(">BBHI", 0x81, 201, 1, 1), rtp(1), b"\xff"])
 def test_video_upstream_is_not_delayed(net: RelayNetwork, datagram: bytes) -> None:
-    """Hellos, RTCP and all else that the client sends on the video's flow pass inline."""
+    """Whatever the client sends on the video flow is forwarded without delay."""
     client, _ = net.connect("video")
     client.send(datagram, net.relay_addresses["video"])
     net.step()
@@ -164,7 +164,7 @@ def test_control_is_delayed(net: RelayNetwork) -> None:
 
 
 def test_state_is_not_delayed(net: RelayNetwork) -> None:
-    """Datagrams from the server's router pass inline."""
+    """Datagrams from the server's router are forwarded without delay."""
     client, address_at_server = net.connect("control")
     net.server["control"].send(b"state", address_at_server)
     net.step()
@@ -172,7 +172,7 @@ def test_state_is_not_delayed(net: RelayNetwork) -> None:
 
 
 def test_state_is_delayed_where_configured() -> None:
-    """If the state has its own delay, it is delayed by this and not by the control delay."""
+    """A delay that is configured for the state applies to the state instead of the control delay."""
     with closing(RelayNetwork(state=DelayConfig(constant_ms=VIDEO_MS))) as net:
         client, address_at_server = net.connect("control")
         net.server["control"].send(b"state", address_at_server)
@@ -198,7 +198,8 @@ def test_each_client_has_its_own_address(net: RelayNetwork) -> None:
 def test_datagrams_not_from_the_server_are_ignored(net: RelayNetwork) -> None:
     """A datagram to a client's upstream socket is ignored unless it comes from the server."""
     client, address_at_server = net.connect("video")
-    for sender, datagram in ((net.end(), b"stolen"), (net.server["control"], b"wrong"), (net.server["video"], b"true")):
+    stranger = net.open_end()
+    for sender, datagram in ((stranger, b"stolen"), (net.server["control"], b"wrong"), (net.server["video"], b"true")):
         sender.send(datagram, address_at_server)
         net.step()
     assert client.receive()[0] == b"true"
@@ -217,7 +218,7 @@ def test_packets_of_a_frame_share_a_delay() -> None:
         batches = []
         for _ in range(3_000):
             net.advance(0.1)
-            if batch := client.received():
+            if batch := client.receive_all():
                 batches.append(batch)
     assert [datagram for batch in batches for datagram in batch] == sent
     assert len(batches) > 3
@@ -228,8 +229,8 @@ def test_any_bytes_pass_unchanged(net: RelayNetwork) -> None:
     """Datagrams of any bytes and length pass unchanged; only their first bits decide whether they are delayed."""
     client, address_at_server = net.connect("video")
     generator = stream(1, "garbage")
-    up = [b"", b"\x80", bytes(65_000), *(generator.bytes(int(generator.integers(1, 60))) for _ in range(300))]
-    for datagram in up:
+    datagrams = [b"", b"\x80", bytes(65_000), *(generator.bytes(int(generator.integers(1, 60))) for _ in range(300))]
+    for datagram in datagrams:
         client.send(datagram, net.relay_addresses["video"])
         net.step()
         assert net.server["video"].receive()[0] == datagram
@@ -259,9 +260,9 @@ def test_relay_reports_the_measured_delays(net: RelayNetwork) -> None:
 
 
 def send_through(net: RelayNetwork, impairments: LinkConfig, count: int, period_ms: float) -> list[tuple[int, float]]:
-    """Send numbered packets through a net at a period; return the number and the time (ms) of each that arrived.
+    """Send numbered video packets through the relay; return the number and the arrival time (ms) of each that arrived.
 
-    The relay is stepped every half millisecond.
+    The relay sends what is due every half millisecond.
     """
     client, address_at_server = net.connect("video")
     arrived, begin_ns = [], net.clock.mono_ns
@@ -273,7 +274,7 @@ def send_through(net: RelayNetwork, impairments: LinkConfig, count: int, period_
             net.step()
         arrived += [
             (int.from_bytes(datagram[2:4], "big"), (net.clock.mono_ns - begin_ns) / NS_PER_MS)
-            for datagram in client.received()
+            for datagram in client.receive_all()
         ]
         net.advance(0.5)
     return arrived
@@ -319,13 +320,13 @@ def test_relay_follows_the_link_model(name: str) -> None:
 
 
 def test_control_loss_has_the_configured_share() -> None:
-    """Upstream control loses about the configured share of its datagrams, and the counters agree."""
+    """About the configured share of the control datagrams is lost, as the counters say."""
     with closing(RelayNetwork(control=DelayConfig(link=LinkConfig(loss=0.5)))) as net:
-        client = net.end()
+        client = net.open_end()
         for number in range(200):
             client.send(bytes([number]), net.relay_addresses["control"])
             net.step()
-        arrived = net.server["control"].received()
+        arrived = net.server["control"].receive_all()
         counts = net.relay.counts()["control upstream"]
     assert counts["packets"] == 200
     assert len(arrived) == 200 - counts["lost"]
@@ -334,14 +335,14 @@ def test_control_loss_has_the_configured_share() -> None:
 
 
 def test_each_client_has_its_own_link() -> None:
-    """The losses of one client do not depend on what other clients are sent."""
+    """Each client has a link of its own: of the same packets, two clients get the same ones."""
     with closing(RelayNetwork(video=DelayConfig(link=LinkConfig(loss=0.3)))) as net:
         clients = [net.connect("video") for _ in range(2)]
         for number in range(100):
             for _, address_at_server in clients:
                 net.server["video"].send(rtp(1, number), address_at_server)
                 net.step()
-        one, two = (client.received() for client, _ in clients)
+        one, two = (client.receive_all() for client, _ in clients)
     assert one == two
     assert 50 < len(one) < 90
 
@@ -365,19 +366,19 @@ def test_counters_include_former_clients() -> None:
     """The counters of a flow include clients that the relay has removed."""
     with closing(RelayNetwork(control=DelayConfig(link=LinkConfig(loss=0.5)))) as net:
         for _ in range(2):
-            client = net.end()
+            client = net.open_end()
             for number in range(40):
                 client.send(bytes([number]), net.relay_addresses["control"])
                 net.step()
             net.advance(31_000)
-        arrived = len(net.server["control"].received())
+        arrived = len(net.server["control"].receive_all())
         counts = net.relay.counts()["control upstream"]
     assert counts["packets"] == 80
     assert counts["lost"] == 80 - arrived > 0
 
 
 def test_idle_client_is_removed(net: RelayNetwork) -> None:
-    """A client idle for half a minute loses its socket when another connects, and gets a new one when it sends."""
+    """A client that is idle for half a minute is removed when another connects, and is new if it sends again."""
     client, address_at_server = net.connect("video")
     net.advance(31_000)
     net.connect("video")

@@ -17,7 +17,7 @@ MS = NS_PER_MS
 
 
 def test_capacity_repeats() -> None:
-    """A capacity trace repeats after its last time; `first_at` returns the number of the first entry from a time on."""
+    """A capacity trace repeats after its last time; `first_at` finds the first entry at or after a time."""
     trace = parse_mahimahi("1\n5\n5\n10\n", "t")
     assert [trace.time_ns(number) // MS for number in range(10)] == [1, 5, 5, 10, 11, 15, 15, 20, 21, 25]
     first_opportunities = {0: 0, 1: 0, 2: 1, 5: 1, 6: 3, 10: 3, 11: 4, 15: 5, 16: 7, 20: 7, 21: 8}
@@ -26,7 +26,7 @@ def test_capacity_repeats() -> None:
 
 @given(st.lists(st.integers(0, 30), min_size=1, max_size=8), st.integers(0, 200 * MS))
 def test_first_opportunity_is_the_earliest(times_ms: list[int], time_ns: int) -> None:
-    """For any trace and time, no earlier opportunity is at or after that time."""
+    """For any trace and time, `first_at` returns the earliest opportunity at or after that time."""
     trace = CapacityTrace(tuple(time_ms * MS for time_ms in (*sorted(times_ms), 31)))
     first = trace.first_at(time_ns)
     assert trace.time_ns(first) >= time_ns
@@ -34,7 +34,7 @@ def test_first_opportunity_is_the_earliest(times_ms: list[int], time_ns: int) ->
 
 
 def test_delays_are_interpolated_linearly() -> None:
-    """Between two points of a trace the delay is interpolated linearly; after the last point it repeats."""
+    """Between two points of a trace the delay is interpolated linearly; after the last point the trace repeats."""
     trace = parse_delays("time_s,delay_ms\n0,10\n2,30\n3,0\n", "t")
     at_ms = {0: 10, 1000: 20, 1500: 25, 2000: 30, 2500: 15, 2999: 0.03, 3000: 10, 4000: 20, 303_500: 15}
     assert {time_ms: trace.delay_ns(time_ms * MS) / MS for time_ms in at_ms} == at_ms

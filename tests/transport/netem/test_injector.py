@@ -17,7 +17,7 @@ from lavt.transport.netem.queue_probe import ProbeResult
 VIDEO = ImpairedFlow("video", "udp", 5600, "source", Impairment(150.0))
 UNIMPAIRED = ImpairedFlow("video", "udp", 5600, "source", Impairment())
 PROBE = ExemptPort("udp", 5602, "the clock probe")
-MEASURED = {"video": ProbeResult(10, 0, 0, 0, 150.0, 150.1, 150.2)}
+MEASURED = {"video": ProbeResult(sent=10, lost=0, reordered=0, early=0, p5_ms=150.0, median_ms=150.1, p95_ms=150.2)}
 TIMEOUT_S = 10.0
 
 
@@ -26,15 +26,15 @@ class FakeQueues:
 
     def __init__(self, failure: Exception | None = None, problems: tuple[str, ...] = ()) -> None:
         self.calls: list[Any] = []
-        self.applying, self.may_apply = threading.Event(), threading.Event()
-        self.may_apply.set()
+        self.apply_called, self.apply_allowed = threading.Event(), threading.Event()
+        self.apply_allowed.set()
         self._failure = failure
         self._problems = problems
 
     def apply(self, flows: Sequence[ImpairedFlow], *, exempt: Sequence[ExemptPort], condition: str) -> None:
         """Record the call when the test allows it, or fail."""
-        self.applying.set()
-        self.may_apply.wait(TIMEOUT_S)
+        self.apply_called.set()
+        self.apply_allowed.wait(TIMEOUT_S)
         if self._failure:
             raise self._failure
         self.calls.append((condition, tuple(flows), tuple(exempt)))
@@ -79,13 +79,13 @@ class InjectorHarness:
 def execute(queues: FakeQueues | None, *orders: InjectionOrder) -> list[InjectionResult]:
     """Return an injector's results for orders sent one after the other; close the injector."""
     harness = InjectorHarness(queues)
-    answers = [harness.order(order) for order in orders]
+    results = [harness.order(order) for order in orders]
     harness.injector.close()
-    return answers
+    return results
 
 
 def test_repeated_order_is_measured_only() -> None:
-    """An order is applied once, then only measured. An order without flows, and closing, clear the queues."""
+    """A repeated order is measured, but not applied again. An order without flows and closing clear the queues."""
     queues = FakeQueues()
     results = execute(
         queues, InjectionOrder(1, "L2", (VIDEO,)), InjectionOrder(1, "L2", (VIDEO,)), InjectionOrder(2, "", ())
@@ -106,7 +106,7 @@ def test_repeated_order_is_measured_only() -> None:
 
 
 def test_failure_is_reported_and_the_next_order_executed() -> None:
-    """A failure of the queues is reported as their message or the exception, and the next order is executed."""
+    """A failed order's result has the message of the exception, and the next order is executed."""
     queues = FakeQueues(UserError("there is no tc"))
     assert execute(queues, InjectionOrder(1, "L2", (VIDEO,))) == [InjectionResult(1, "there is no tc", "", ())]
     broken = FakeQueues(OSError("the interface went down"))
@@ -116,23 +116,23 @@ def test_failure_is_reported_and_the_next_order_executed() -> None:
 
 
 def test_failed_verification_fails_the_order() -> None:
-    """If the verification finds a difference, the order has failed, and the differences are reported."""
+    """An order fails if its verification finds differences, and its result lists them."""
     assert execute(FakeQueues(problems=("video was late", "no filter")), InjectionOrder(1, "L2", (VIDEO,))) == [
         InjectionResult(1, "video was late; no filter", "", ())
     ]
 
 
 def test_only_the_newest_queued_order_is_executed() -> None:
-    """Of the orders that arrive during another's execution only the newest is executed."""
+    """Of the orders that arrive while an order is executed, only the newest is executed next."""
     queues = FakeQueues()
-    queues.may_apply.clear()
+    queues.apply_allowed.clear()
     harness = InjectorHarness(queues)
     harness.injector.send(Send("inject", InjectionOrder(1, "L2", (VIDEO,))))
-    assert queues.applying.wait(TIMEOUT_S)
+    assert queues.apply_called.wait(TIMEOUT_S)
     for number in range(2, 100):
         harness.injector.send(Send("inject", InjectionOrder(number, "L2", (VIDEO,))))
     harness.injector.send(Send("inject", InjectionOrder(100, "", ())))
-    queues.may_apply.set()
+    queues.apply_allowed.set()
     assert [harness.results.get(timeout=TIMEOUT_S).number for _ in range(2)] == [1, 100]
     harness.injector.close()
     assert queues.calls[-2:] == ["clear", "clear"]

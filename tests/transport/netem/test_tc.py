@@ -134,7 +134,7 @@ def test_commands_of_a_condition() -> None:
     ],
 )
 def test_netem_arguments_of_an_impairment(impairment: Impairment, arguments: str) -> None:
-    """Each impairment has these arguments, always with limit, delay and rate, because a change keeps omitted ones."""
+    """The arguments always include limit, delay and rate, because tc keeps the old value of an omitted argument."""
     assert " ".join(netem_arguments(impairment)) == f"netem limit 10000 {arguments}"
 
 
@@ -144,8 +144,8 @@ def test_queue_limit_grows_with_the_delay() -> None:
     assert netem_arguments(Impairment(4_900))[:3] == ["netem", "limit", "10000"]
 
 
-def test_uniform_jitter_uses_the_table_of_lavt() -> None:
-    """Uniform jitter uses LAVT's table: without a table a change would keep the previous one."""
+def test_uniform_jitter_uses_the_distribution_of_lavt() -> None:
+    """Uniform jitter uses a distribution from LAVT: without one, a change would keep the previous distribution."""
     command = set_impairment(
         "lo", "video", Impairment(75, 10, jitter_distribution="uniform"), verb="change", tables="/run/lavt"
     )
@@ -154,7 +154,7 @@ def test_uniform_jitter_uses_the_table_of_lavt() -> None:
 
 
 def tc_options(arguments: list[str]) -> dict[str, Any]:
-    """Return the options that tc reports for a netem with these arguments, as a small model of tc does."""
+    """Return the options that tc would report for a netem with these arguments."""
     text = " ".join(arguments[3:])
     numbers = [float(word.rstrip("%gmbits")) for word in arguments if word[0].isdigit()]
     options: dict[str, Any] = {"limit": int(arguments[2]), "gap": 0}
@@ -230,7 +230,7 @@ def test_differences_are_reported(change: dict[str, Any], message: str) -> None:
 
 @given(st.text())
 def test_garbage_from_tc_raises_work_errors(text: str) -> None:
-    """Output that is not JSON raises `WorkError`, and text without filters has none."""
+    """Arbitrary text has no qdiscs and no filters; parsing it raises nothing but `WorkError`."""
     try:
         qdiscs = parse_qdiscs(text)
     except WorkError:
@@ -287,13 +287,13 @@ def test_impossible_impairments_are_rejected(impairment: Impairment, message: st
     ],
 )
 def test_flows_on_exempt_ports_are_rejected(flows: list[ImpairedFlow], message: str) -> None:
-    """A flow at either end on a port of NTP, ssh or the clock probe is rejected, as are two with the same packets."""
+    """A flow from or to a port of NTP, ssh or the clock probe is rejected. So are two flows with the same packets."""
     with pytest.raises(UserError, match=message):
         check_flows(flows, [ExemptPort("udp", 5602, "the clock probe")])
 
 
 class FakeTc:
-    """A tc that reports what a test defines and records its commands."""
+    """A simulated tc, which reports the qdiscs and filters that a test sets, and records its commands."""
 
     def __init__(self, qdiscs: str = NO_QDISC, filters: str = "") -> None:
         self.qdiscs, self.filters, self.commands = qdiscs, filters, list[str]()
@@ -310,7 +310,7 @@ class FakeTc:
 
 
 def test_change_runs_only_the_necessary_commands(tmp_path: Path) -> None:
-    """A new delay is one change without filters; the filters of a flow that is not requested any more are deleted."""
+    """A new delay takes one command and no filters; the filters of a flow that is no longer requested are deleted."""
     tc = FakeTc(QDISCS, FILTERS)
     netem = NetemInterface("eth0", directory=tmp_path, run=tc, persistent=True)
     netem.apply([ImpairedFlow("video", "udp", 5600, "source", Impairment(30))])
@@ -331,7 +331,7 @@ def test_change_runs_only_the_necessary_commands(tmp_path: Path) -> None:
 
 
 def test_failed_first_application_is_undone(tmp_path: Path) -> None:
-    """If adding a filter fails on a free interface, the root is deleted again and no state is stored."""
+    """If the first application to an interface fails at a filter, the root qdisc is deleted and no state is stored."""
     tc = FakeTc()
     tc.rejects = lambda command: "filter" in command
     netem = NetemInterface("eth0", directory=tmp_path, run=tc)
@@ -372,13 +372,13 @@ def test_impairment_of_another_owner_is_cleared_only_on_demand(tmp_path: Path, o
     tc, files = FakeTc(QDISCS, FILTERS), StateFiles(tmp_path)
     if owner is not None:
         files.write(AppliedState("eth0", network_namespace(), boot_id(), owner, "L3", (VIDEO,)))
-    reported = files.read("eth0")
+    stored_before = files.read("eth0")
     with pytest.raises(UserError, match="eth0"), NetemInterface("eth0", directory=tmp_path, run=tc) as netem:
         netem.check()
 
     assert netem.clear() == []
     assert tc.commands == []
-    assert files.read("eth0") == reported
+    assert files.read("eth0") == stored_before
     assert netem.clear(at_once=True, any_owner=True) == [["tc", "qdisc", "del", "dev", "eth0", "root"]]
     assert files.read("eth0") is None
 
@@ -402,10 +402,9 @@ def test_abandoned_impairment_is_cleared(tmp_path: Path, abandoned: dict[str, An
     StateFiles(tmp_path).write(
         AppliedState("eth0", network_namespace(), fields["boot"], fields["owner"], "L3", (VIDEO,))
     )
-    message = NetemInterface("eth1", directory=tmp_path, run=tc).restore()
+    (message,) = NetemInterface("eth1", directory=tmp_path, run=tc).restore()
 
-    assert len(message) == 1
-    assert "found L3 on eth0" in message[0]
+    assert "found L3 on eth0" in message
     assert tc.commands == ["tc qdisc del dev eth0 root"]
     assert StateFiles(tmp_path).read("eth0") is None
 
@@ -421,21 +420,20 @@ def test_abandoned_impairment_is_cleared(tmp_path: Path, abandoned: dict[str, An
 def test_failed_restoration_is_reported_and_kept(
     tmp_path: Path, interface: str, qdiscs: str, outcome: str, is_kept: bool
 ) -> None:
-    """A failed restoration is reported with its reason and tried again; a missing interface is dropped."""
+    """A failed restoration is reported with its reason, and the state is kept unless the interface is missing."""
     abandoned = AppliedState(interface, network_namespace(), "an earlier boot", current_process(), "L3", (VIDEO,))
     StateFiles(tmp_path).write(abandoned)
-    message = NetemInterface("eth1", directory=tmp_path, run=FakeTc(qdiscs)).restore()
+    (message,) = NetemInterface("eth1", directory=tmp_path, run=FakeTc(qdiscs)).restore()
 
-    assert len(message) == 1
-    assert f"found L3 on {interface}, " in message[0]
-    assert f"process {os.getpid()}" in message[0]
-    assert outcome in message[0]
+    assert f"found L3 on {interface}, " in message
+    assert f"process {os.getpid()}" in message
+    assert outcome in message
     assert (StateFiles(tmp_path).read(interface) is not None) == is_kept
 
 
 @pytest.mark.parametrize("name", ["state", "table"])
 def test_unwritable_directory_is_reported_before_tc_runs(tmp_path: Path, name: str) -> None:
-    """If a file cannot be written, this is reported before tc runs, and existing impairments stay."""
+    """A file that cannot be written is reported before tc runs, so existing impairments stay."""
     tc = FakeTc(QDISCS, FILTERS)
     file = {"state": f"netem-{network_namespace()}-eth0.json", "table": "uniform.dist"}[name]
     (tmp_path / f"{file}.part").mkdir()
@@ -451,7 +449,7 @@ def test_unwritable_directory_is_reported_before_tc_runs(tmp_path: Path, name: s
     "text", ["", "{}", "[]", "null", '{"interface": 3, "owner": 7}', '{"owner": [1, 2], "flows": [{}]}']
 )
 def test_broken_state_file_is_ignored(tmp_path: Path, text: str) -> None:
-    """A broken state file counts as none, and is replaced."""
+    """A broken state file is treated as missing, and is replaced."""
     (tmp_path / f"netem-{network_namespace()}-eth0.json").write_text(text)
     netem = NetemInterface("eth0", directory=tmp_path, run=FakeTc())
     assert netem.applied() is None
@@ -474,7 +472,7 @@ def test_invalid_interface_name_is_rejected(name: str) -> None:
 
 
 def test_correlated_jitter_needs_a_running_program(tmp_path: Path) -> None:
-    """Correlated jitter without a running program is rejected with the alternative."""
+    """Correlated jitter that no running program would step is rejected, and the message suggests `--hold`."""
     with pytest.raises(UserError, match="--hold"):
         NetemInterface("eth0", directory=tmp_path, run=FakeTc(), persistent=True).apply(
             [ImpairedFlow("video", "udp", 5600, "source", Impairment(75, 5, 0.9))]
@@ -484,22 +482,22 @@ def test_correlated_jitter_needs_a_running_program(tmp_path: Path) -> None:
 def test_correlated_jitter_has_its_correlation_and_repeats() -> None:
     """The steps have standard deviation 1 and correlation 0.9, and the same seed gives the same steps."""
 
-    def walk(seed: int) -> list[float]:
+    def steps(seed: int) -> list[float]:
         values, previous = [], None
         for index in range(4000):
             values.append(next_deviation(Impairment(75, 10, 0.9), seed, "video", index, previous))
             previous = index, values[-1]
         return values
 
-    values = walk(3)
+    values = steps(3)
     correlation = sum(earlier * later for earlier, later in pairwise(values)) / sum(value**2 for value in values)
     assert abs(correlation - 0.9) < 0.03
     assert 0.8 < sum(value**2 for value in values) / 4000 < 1.2
-    assert walk(3) == values
-    assert walk(4) != values
+    assert steps(3) == values
+    assert steps(4) != values
 
 
-CORRELATED = ImpairedFlow("video", "udp", 5600, "source", Impairment(75, 10, 0.9))
+CORRELATED = ImpairedFlow("video", "udp", 5600, "source", Impairment(75, 10, jitter_correlation=0.9))
 
 
 def fake_tc_environment(script: str, folder: Path) -> dict[str, str]:
@@ -511,7 +509,7 @@ def fake_tc_environment(script: str, folder: Path) -> dict[str, str]:
 
 
 def test_tc_of_correlated_jitter_has_its_own_session(tmp_path: Path) -> None:
-    """Ctrl-C at the terminal, which is sent to a process group, does not reach tc: it leads its own session."""
+    """Ctrl-C at the terminal, which is sent to a process group, does not reach tc, which leads a session of its own."""
     message = tmp_path / "message"
     script = "cat > /dev/null; read pid name state parent group session rest < /proc/self/stat"
     script += f"; echo $pid $session > {message}"
@@ -522,13 +520,13 @@ def test_tc_of_correlated_jitter_has_its_own_session(tmp_path: Path) -> None:
 
 
 def test_stopped_jitter_is_reported_and_can_be_cleared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """If the tc that steps a delay has ended, the flow has a problem, and clearing still works."""
+    """If the tc process that steps the delay of a flow has ended, this is a problem, and clearing still works."""
     monkeypatch.setenv("PATH", fake_tc_environment("exit 1", tmp_path)["PATH"])
     tc = FakeTc()
     netem = NetemInterface("eth0", directory=tmp_path, run=tc)
     netem.apply([CORRELATED, CONTROL])
-    limit_ns = MachineClock().now().mono_ns + 10 * NS_PER_S
-    while not netem.problems() and MachineClock().now().mono_ns < limit_ns:
+    deadline_ns = MachineClock().now().mono_ns + 10 * NS_PER_S
+    while not netem.problems() and MachineClock().now().mono_ns < deadline_ns:
         pause(NS_PER_MS)
     problems, tc.qdiscs = netem.problems(), QDISCS.replace('"qlen": 7', '"qlen": 0')
 
@@ -565,7 +563,7 @@ def test_verification_reports_stopped_jitter(tmp_path: Path, monkeypatch: pytest
 
 
 def test_queue_probes_of_a_condition() -> None:
-    """The queue probes for L4 are its flows, the challenges, the other directions, NTP, ssh and the clock probe."""
+    """The queue probes for L4 cover its flows, the challenges, the other directions, NTP, ssh and the clock probe."""
     requested = queue_probes([VIDEO, CONTROL], [ExemptPort("udp", 5602, "the clock probe")])
     assert [(probe.name, probe.source, probe.destination, probe.impairment.delay_ms) for probe in requested] == [
         ("video", 5600, 9, 150),
@@ -580,7 +578,7 @@ def test_queue_probes_of_a_condition() -> None:
 
 
 def test_measured_packets_are_summarized() -> None:
-    """Lost, reordered and early test packets are counted, and the delays are those of the delayed packets."""
+    """Lost, reordered and early test packets are counted; the percentiles are those of the delayed packets."""
     delays = [(0, 75.0), (1, 75.2), (3, 75.1), (2, 75.3), (9, 0.1), (4, 75.0), (5, 75.0), (6, 75.0), (7, 75.0)]
     result = summarize(Impairment(75, reorder=0.25), 10, delays)
 
@@ -596,6 +594,10 @@ AS_REQUESTED = {
     )
     for probe in queue_probes([VIDEO])
 }
+"""For each queue probe, the result of queues that do what was requested.
+
+The fields of a `ProbeResult` are sent, lost, reordered, early, and the delay's 5th percentile, median and 95th.
+"""
 
 
 @pytest.mark.parametrize(
@@ -648,7 +650,7 @@ AS_REQUESTED = {
 def test_each_measured_difference_is_reported(
     impairment: Impairment, name: str, measured: ProbeResult, message: str
 ) -> None:
-    """Each quantity that differs from the request is reported once, and the others are not."""
+    """If one quantity differs from the request, there is one message, about this quantity."""
     flow = ImpairedFlow("video", "udp", 5600, "source", impairment)
     good = ProbeResult(
         50,
@@ -690,16 +692,16 @@ def test_missing_interface_is_reported() -> None:
 
 @pytest.mark.parametrize("call", ["setsockopt", "bind", "getsockname", "sendto", "recvmsg"])
 def test_measuring_an_interface_that_goes_down_fails(monkeypatch: pytest.MonkeyPatch, call: str) -> None:
-    """A failing call of the packet socket, because the interface went down, raises one `UserError`."""
+    """A call of the packet socket that fails because the interface went down raises one `UserError`."""
 
-    def down(*_: object) -> None:
+    def fail(*_: object) -> None:
         raise OSError(errno.ENETDOWN, "Network is down")
 
     opened = MagicMock()
     opened.return_value.__enter__.return_value = opened.return_value
     opened.return_value.getsockname.return_value = ("eth0", 0, 0, 1, bytes(6))
     opened.return_value.recvmsg.side_effect = BlockingIOError
-    getattr(opened.return_value, call).side_effect = down
+    getattr(opened.return_value, call).side_effect = fail
     monkeypatch.setattr(socket, "socket", opened)
     with pytest.raises(UserError, match=r"eth0 \(Network is down\)"):
         measure("eth0", queue_probes([VIDEO]), count=1)

@@ -58,11 +58,12 @@ def send_hello(forwarder: Forwarder, client: Address = CLIENT, now_ns: int = NOW
 
 
 def send_answer(forwarder: Forwarder, client: Address = CLIENT, now_ns: int = NOW_NS) -> tuple[bytes, Address] | None:
+    """Send something from the vehicle to a client: a client is answered from then on."""
     return forwarder.receive(wrap(client, b"answer"), VEHICLE, now_ns)
 
 
 def flood(forwarder: Forwarder, count: int) -> int:
-    """Send hellos, each from its own host, at the limit for unanswered clients; return the time of the last one."""
+    """Send hellos at the rate limit for unanswered clients, each from another host; return the time of the last."""
     now_ns = NOW_NS
     for number in range(count):
         now_ns = NOW_NS + number * NS_PER_S // UPSTREAM_PER_S
@@ -97,8 +98,8 @@ def test_datagrams_are_forwarded_both_ways() -> None:
     assert forwarder.counts == {"registrations": 1, "to_vehicle": 2, "to_clients": 1}
 
 
-def test_each_flow_accepts_its_own_datagrams() -> None:
-    """From clients the video flow accepts hellos, answers and RTCP, and the probe flow requests; others are counted."""
+def test_each_flow_accepts_only_its_own_datagrams() -> None:
+    """Datagrams that no client sends on a flow are counted as malformed and not forwarded."""
     video, probe = registered_forwarder(), registered_forwarder("probe")
     request = encode_request(1, 2)
     reply = encode_reply(ProbeReply(1, 2, 3, 4, None, None))
@@ -118,7 +119,7 @@ PREFIXES = [b"", b"LAVR", b"LAVR\x01\x01", b"LAVR\x01\x02", b"LAVT", b"LC\x01\x0
 
 @given(st.binary(max_size=200), st.sampled_from(PREFIXES), st.sampled_from([VEHICLE, OTHER_ADDRESS, CLIENT]))
 def test_arbitrary_datagrams_are_counted(rest: bytes, prefix: bytes, sender: Address) -> None:
-    """An arbitrary datagram is counted and raises nothing; at most it reaches the vehicle, which stays registered."""
+    """An arbitrary datagram is counted and is forwarded to the vehicle or dropped; the vehicle stays registered."""
     forwarder = registered_forwarder()
     forwarded = forwarder.receive(prefix + rest, sender, NOW_NS)
     assert forwarded is None or (forwarded[1] == VEHICLE and sender != VEHICLE)
@@ -140,7 +141,7 @@ def test_the_vehicle_can_only_send_to_recent_clients() -> None:
 
 
 def test_only_the_vehicle_can_send_to_clients() -> None:
-    """A wrapped datagram from any other address than the registered vehicle's is dropped."""
+    """A wrapped datagram from any address but the registered vehicle's is dropped."""
     forwarder = registered_forwarder()
     send_hello(forwarder)
     for other in (OTHER_ADDRESS, CLIENT, (VEHICLE[0], VEHICLE[1] + 1)):
@@ -200,7 +201,7 @@ def test_replayed_registration_is_rejected(key: PrivateKey) -> None:
 
 
 def test_a_vehicle_moves_and_expires() -> None:
-    """A newer registration from another address takes effect at once; after 10 s without one the vehicle is gone."""
+    """A newer registration from another address takes effect at once; a registration expires after 10 s."""
     forwarder = registered_forwarder()
     send_hello(forwarder)
     forwarder.receive(encode_registration("vehicle-1", "video", 2, None), OTHER_ADDRESS, NOW_NS + 1)
@@ -210,12 +211,13 @@ def test_a_vehicle_moves_and_expires() -> None:
     assert forwarder.vehicle_address(expired_ns - 1) == OTHER_ADDRESS
     assert send_hello(forwarder, now_ns=expired_ns) is None
     assert forwarder.receive(wrap(CLIENT, b"late"), OTHER_ADDRESS, expired_ns) is None
-    forwarder.receive(encode_registration("vehicle-1", "video", 1, None), VEHICLE, expired_ns)
-    assert forwarder.vehicle_address(expired_ns) == VEHICLE, "its clock may have been set back in the meantime"
+    older_registration = encode_registration("vehicle-1", "video", 1, None)
+    forwarder.receive(older_registration, VEHICLE, expired_ns)
+    assert forwarder.vehicle_address(expired_ns) == VEHICLE, "its clock may have been set back"
 
 
 def test_unanswered_clients_displace_no_answered_ones() -> None:
-    """Clients that the vehicle has answered and others are remembered in tables of their own, of limited size."""
+    """Unanswered clients displace no answered client; of either kind only a limited number is remembered."""
     forwarder = registered_forwarder()
     send_hello(forwarder)
     send_answer(forwarder)
@@ -228,20 +230,20 @@ def test_unanswered_clients_displace_no_answered_ones() -> None:
 
 
 def test_datagrams_to_the_vehicle_are_rate_limited() -> None:
-    """Datagrams to the vehicle are limited per second, separately for clients that it has answered and for others."""
+    """Answered clients share one limit of datagrams per second to the vehicle, and unanswered clients another."""
     forwarder = registered_forwarder()
     send_hello(forwarder, SECOND_CLIENT)
     send_answer(forwarder, SECOND_CLIENT)
     hosts = [f"203.0.113.{number % 100}" for number in range(2 * UPSTREAM_PER_S)]
     unanswered = [send_hello(forwarder, (host, 9)) is not None for host in hosts]
-    assert sum(unanswered) == UPSTREAM_PER_S - 1, "the first was the second client's"
+    assert sum(unanswered) == UPSTREAM_PER_S - 1, "the hello of SECOND_CLIENT was one of the allowed ones"
     answered = [send_hello(forwarder, SECOND_CLIENT) is not None for _ in range(2 * UPSTREAM_PER_S)]
     assert sum(answered) == UPSTREAM_PER_S
     assert send_hello(forwarder, now_ns=NOW_NS + NS_PER_S) is not None
 
 
-def test_a_strangers_flood_does_not_keep_a_new_client_out() -> None:
-    """While one host sends more than the common limit, from many ports, every hello of a new client is forwarded."""
+def test_a_flood_from_one_host_does_not_keep_a_new_client_out() -> None:
+    """If one host floods the rendezvous from many ports, the hellos and reports of a new client are still forwarded."""
     forwarder = registered_forwarder()
     for now_ns in range(NOW_NS, NOW_NS + 5 * NS_PER_S, NS_PER_S // 2):
         for port in range(1, 2 * UPSTREAM_PER_S):
@@ -252,8 +254,8 @@ def test_a_strangers_flood_does_not_keep_a_new_client_out() -> None:
     assert send_answer(forwarder, now_ns=now_ns) is not None
 
 
-def test_strangers_do_not_displace_a_client_before_its_challenge() -> None:
-    """A flood from many addresses after a client's hello does not prevent the vehicle's answer for 5 s."""
+def test_a_flood_does_not_displace_a_client_before_the_vehicle_answers() -> None:
+    """If a flood from many addresses follows a client's hello, the vehicle's answer 4 s later still reaches it."""
     forwarder = registered_forwarder()
     send_hello(forwarder)
     last_ns = NOW_NS + 4 * NS_PER_S
@@ -265,20 +267,20 @@ def test_strangers_do_not_displace_a_client_before_its_challenge() -> None:
 
 
 def test_a_flood_of_false_addresses_uses_little_memory_and_spares_answered_clients() -> None:
-    """Of more hosts than the common limit, only those that passed are remembered, and answered clients still pass."""
+    """In a flood from many hosts only those within the rate limit are remembered, and answered clients still pass."""
     forwarder = registered_forwarder()
     send_hello(forwarder)
     send_answer(forwarder)
     for number in range(10 * UPSTREAM_PER_S):
         send_hello(forwarder, (socket.inet_ntoa((number + 1).to_bytes(4, "big")), 9))
-    assert len(forwarder._clients._unanswered) == UPSTREAM_PER_S - 1, "the first was the client's"
+    assert len(forwarder._clients._unanswered) == UPSTREAM_PER_S - 1, "the hello of CLIENT was one of the allowed ones"
     assert all(len(limiter._passed) <= UPSTREAM_PER_S for limiter in forwarder._unanswered_limiters.values())
     assert send_hello(forwarder) is not None
     assert forwarder.receive(REPORT, CLIENT, NOW_NS) is not None
 
 
 def test_replayed_hellos_do_not_crowd_out_reports() -> None:
-    """Replays of a client's hello, with its own address, do not use up the limit of its reports."""
+    """Replays of a client's hello from the client's address do not use up the rate limit of its reports."""
     forwarder = registered_forwarder()
     send_hello(forwarder)
     send_answer(forwarder)
@@ -289,27 +291,27 @@ def test_replayed_hellos_do_not_crowd_out_reports() -> None:
 
 
 def test_replayed_hellos_from_many_addresses_do_not_displace_the_client() -> None:
-    """The vehicle challenges few copies of a hello, so the rendezvous still forwards its video to the client."""
+    """The vehicle answers only a few copies of a hello, so the copies do not displace the client."""
     forwarder, path, client = registered_forwarder(), PathServer(lambda: bytes(16)), PathClient(b"t" * 16)
     path.set_token(b"t" * 16)
 
-    def through(datagram: bytes, sender: Address) -> bytes:
-        """Return what the sender gets back from the vehicle."""
+    def exchange(datagram: bytes, sender: Address) -> bytes:
+        """Send a datagram to the vehicle through the forwarder; return the reply that the sender gets, or nothing."""
         forwarded = forwarder.receive(datagram, sender, NOW_NS)
         reply = None if forwarded is None else path.receive(datagram, sender, NOW_NS)
         back = None if reply is None else forwarder.receive(wrap(sender, reply), VEHICLE, NOW_NS)
         return b"" if back is None else back[0]
 
     newest = client.hello(0)
-    through(client.answer(through(newest, CLIENT)) or b"", CLIENT)
+    exchange(client.answer(exchange(newest, CLIENT)) or b"", CLIENT)
     assert path.open_address(NOW_NS) == CLIENT
     for port in range(UPSTREAM_PER_S):
-        through(newest, ("198.51.100.99", port + 1))
+        exchange(newest, ("198.51.100.99", port + 1))
     assert forwarder.receive(wrap(CLIENT, b"video"), VEHICLE, NOW_NS) is not None
 
 
 def test_forged_registrations_are_rate_limited(key: PrivateKey) -> None:
-    """During a flood of forged registrations few signatures are verified, and the vehicle's next one is accepted."""
+    """In a flood of forged registrations few signatures are verified, and a registration of the vehicle is accepted."""
     forwarder = Forwarder("vehicle-1", "video", key.public)
     forwarder.receive(encode_registration("vehicle-1", "video", 5, key), VEHICLE, NOW_NS)
     forged = encode_registration("vehicle-1", "video", 6, None)

@@ -64,19 +64,20 @@ def client() -> Iterator[socket.socket]:
 
 
 def connect(setup: VehicleBehindRendezvous, client: socket.socket) -> Any:
-    """Start both ends and send hellos until one arrives; return the client as the vehicle's link names it."""
+    """Start both ends and send hellos until one arrives; return the client's peer address at the vehicle's link."""
     setup.rendezvous.start()
     setup.start()
     while True:
         client.sendto(HELLO, ("127.0.0.1", setup.rendezvous.port))
         try:
-            return setup.received.get(timeout=0.1)[3]
+            _channel, _payload, _arrived, peer = setup.received.get(timeout=0.1)
         except queue.Empty:  # the vehicle has not registered yet
             continue
+        return peer
 
 
 def test_datagrams_pass_the_rendezvous_both_ways(setup: VehicleBehindRendezvous, client: socket.socket) -> None:
-    """A client's datagram arrives with its address and a prefix, and a datagram to this peer reaches the client."""
+    """The vehicle receives a client's datagram with the client's address as its peer, and can send to this peer."""
     peer = connect(setup, client)
     assert peer == ("rendezvous:127.0.0.1", client.getsockname()[1])
     setup.vehicle.send(Send("rtp", b"challenge", peer))
@@ -97,7 +98,7 @@ def test_clients_reach_the_vehicle_directly(setup: VehicleBehindRendezvous, clie
     assert client.recvfrom(100) == (b"challenge", ("127.0.0.1", setup.vehicle.port))
 
 
-def test_unwrapped_datagrams_from_the_rendezvous_are_counted(client: socket.socket) -> None:
+def test_datagrams_without_wrapping_are_counted(client: socket.socket) -> None:
     """A datagram from the rendezvous that is not wrapped is counted and not delivered."""
     received: queue.Queue[Any] = queue.Queue()
     link = RendezvousLink(
@@ -118,7 +119,7 @@ def test_unwrapped_datagrams_from_the_rendezvous_are_counted(client: socket.sock
 
 @pytest.mark.realtime
 def test_each_registration_is_newer(client: socket.socket) -> None:
-    """The link registers at once and then every second, with a later time even if the wall clock goes back."""
+    """Each registration has a later time than the last one, even if the wall clock goes back."""
     backward_clock = ShiftedClock(wall_step_ns=-2 * NS_PER_S)
     link = RendezvousLink(
         backward_clock,

@@ -34,10 +34,10 @@ def test_a_delay_is_forgotten_after_30_to_60_s() -> None:
 
 
 @given(st.lists(st.tuples(st.integers(0, 60 * NS_PER_S), st.integers(0, 2 * NS_PER_S))))
-def test_the_hold_is_within_bounds(notes: list[tuple[int, int]]) -> None:
-    """The hold is from 10 to 300 ms for any reordering delays."""
+def test_the_hold_is_within_bounds(pauses_and_delays: list[tuple[int, int]]) -> None:
+    """The hold is between 10 and 300 ms for any reordering delays."""
     hold, now_ns = AdaptiveHold(), 0
-    for pause_ns, reordered_ns in notes:
+    for pause_ns, reordered_ns in pauses_and_delays:
         now_ns += pause_ns
         hold.note_delay(reordered_ns, now_ns)
         assert MIN_HOLD_NS <= hold.hold_ns(now_ns) <= MAX_HOLD_NS

@@ -31,7 +31,7 @@ def frame(
     ]
 
 
-def repairs_of(packets: list[RtpPacket], count: int) -> list[RtpPacket]:
+def repair_packets(packets: list[RtpPacket], count: int) -> list[RtpPacket]:
     datagrams = RepairSender(REPAIR_SSRC, 0).repair([packet.to_bytes() for packet in packets], count)
     return [parse_packet(datagram) for datagram in datagrams]
 
@@ -53,23 +53,23 @@ def counters(receiver: RepairReceiver) -> Counters:
 
 
 EIGHT_PACKETS = frame(bytes([index]) * (20 + index) for index in range(8))
-REPAIRS = repairs_of(EIGHT_PACKETS, 2)
+REPAIRS = repair_packets(EIGHT_PACKETS, 2)
 
 
-def with_bytes(packet: RtpPacket, changed_bytes: Mapping[int, int]) -> RtpPacket:
+def replace_bytes(packet: RtpPacket, changed_bytes: Mapping[int, int]) -> RtpPacket:
     """Return the repair packet with other bytes at these positions of its payload."""
     payload = bytearray(packet.payload)
     for position, byte in changed_bytes.items():
         payload[position] = byte
-    return with_payload(packet, bytes(payload))
+    return replace_payload(packet, bytes(payload))
 
 
-def with_payload(packet: RtpPacket, payload: bytes) -> RtpPacket:
+def replace_payload(packet: RtpPacket, payload: bytes) -> RtpPacket:
     return RtpPacket(packet.payload_type, packet.sequence, packet.timestamp, packet.ssrc, packet.marker, payload)
 
 
 def test_bytes_of_a_repair_packet() -> None:
-    """A repair packet has the format of docs/wire.md; if a frame has one packet, P and Q are its bytes."""
+    """A repair packet has the format of docs/wire.md; for a frame of one packet, both parities are its bytes."""
     media = RtpPacket(96, 0xFFFE, 0x05060708, MEDIA_SSRC, marker=True, payload=b"abc")
     repairs = RepairSender(REPAIR_SSRC, 0xFFFF).repair([media.to_bytes()], 2)
     header = "01 60 fffe 01020304 0001 00"
@@ -80,8 +80,8 @@ def test_bytes_of_a_repair_packet() -> None:
 
 
 def test_bytes_of_p_and_q() -> None:
-    """The repair packets of the example frame in docs/wire.md are its P and Q."""
-    repairs = repairs_of(frame([b"\x61\x62\x63", b"\xc4"]), 2)
+    """The repair packets of the example frame in docs/wire.md have its parities P and Q."""
+    repairs = repair_packets(frame([b"\x61\x62\x63", b"\xc4"]), 2)
     assert [repair.payload[12:].hex(" ") for repair in repairs] == ["00 02 a5 62 63", "00 01 f4 62 63"]
 
 
@@ -92,12 +92,12 @@ def test_number_of_blocks(packets: int, blocks: int) -> None:
     """A frame is split into as few blocks of up to 16 packets as possible; above 255 blocks there is no repair."""
     media = frame([b"x"] * packets)
     for count in (0, 1, 2):
-        assert len(repairs_of(media, count)) == blocks * count
+        assert len(repair_packets(media, count)) == blocks * count
 
 
 def test_order_of_repair_packets() -> None:
-    """The second repair packets of all blocks follow the first ones."""
-    repairs = repairs_of(frame([b"x"] * 33), 2)
+    """The first repair packet of every block is sent before the second one of any block."""
+    repairs = repair_packets(frame([b"x"] * 33), 2)
     assert [tuple(repair.payload[10:12]) for repair in repairs] == [(0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (2, 1)]
     assert [repair.sequence for repair in repairs] == [0, 1, 2, 3, 4, 5]
 
@@ -112,26 +112,26 @@ def test_invalid_number_of_repair_packets(count: int) -> None:
 def test_repair_packets_are_small() -> None:
     """A repair packet is 14 bytes longer than the packets of 1200 bytes that it protects."""
     media = frame([b"x" * 1188] * 8)
-    assert [len(repair.to_bytes()) for repair in repairs_of(media, 2)] == [1214, 1214]
+    assert [len(repair.to_bytes()) for repair in repair_packets(media, 2)] == [1214, 1214]
 
 
 @pytest.mark.parametrize(("payload_bytes", "repairs"), [(1498, 2), (1499, 0)])
 def test_long_packets_get_no_repair(payload_bytes: int, repairs: int) -> None:
     """A frame with a payload of more than 1498 bytes gets no repair packets; one with 1498 bytes does."""
     media = frame([b"short", b"x" * payload_bytes])
-    assert len(repairs_of(media, 2)) == repairs
+    assert len(repair_packets(media, 2)) == repairs
     receiver = RepairReceiver()
-    assert push_all(receiver, [media[0], *repairs_of(media, 2)]) == media[1:][:repairs]
+    assert push_all(receiver, [media[0], *repair_packets(media, 2)]) == media[1:][:repairs]
 
 
 def test_the_largest_frame() -> None:
     """Packets of a frame of 255 blocks are recovered, and repair packets of a larger one are malformed."""
     media = frame([b"x"] * 4080)
-    repairs = repairs_of(media, 1)
+    repairs = repair_packets(media, 1)
     receiver = RepairReceiver()
     assert push_all(receiver, [*media[:4079], repairs[254]]) == [media[4079]]
     # 4081 packets are 256 blocks.
-    assert push_all(receiver, [with_bytes(repairs[0], {8: 0x0F, 9: 0xF1})]) == []
+    assert push_all(receiver, [replace_bytes(repairs[0], {8: 0x0F, 9: 0xF1})]) == []
     assert counters(receiver) == Counters(recovered=1, malformed=1)
 
 
@@ -145,14 +145,14 @@ def test_burst_is_recovered() -> None:
     """A burst of as many packets as there are blocks is recovered from one repair packet for each block."""
     media = frame(bytes([index]) * 5 for index in range(40))
     receiver = RepairReceiver()
-    arrived = [*media[:11], *media[14:], *repairs_of(media, 1)]
+    arrived = [*media[:11], *media[14:], *repair_packets(media, 1)]
     assert sorted(push_all(receiver, arrived), key=lambda packet: packet.sequence) == media[11:14]
     assert counters(receiver) == Counters(recovered=3)
 
 
 @pytest.mark.parametrize("lost", list(itertools.combinations(range(8), 2)))
 def test_any_two_lost_packets_are_recovered(lost: tuple[int, int]) -> None:
-    """Any two packets of a block are recovered from two repair packets, equal to those sent, in order and once."""
+    """Any two lost packets of a block are recovered from two repair packets: unchanged, in order and once."""
     receiver = RepairReceiver()
     arrived = [packet for index, packet in enumerate(EIGHT_PACKETS) if index not in lost]
     assert push_all(receiver, arrived) == []
@@ -208,9 +208,9 @@ FRAMES = st.lists(st.binary(min_size=1, max_size=60), min_size=1, max_size=60)
 def test_any_loss_within_the_repair_is_recovered(
     payloads: list[bytes], next_payloads: list[bytes], count: int, first: int, data: st.DataObject
 ) -> None:
-    """A block with no more losses than repair packets is recovered, for any order, duplicates and sequence numbers."""
+    """A block is recovered if at least as many repair packets arrive as packets were lost, in any order."""
     frames = [frame(payloads, first), frame(next_payloads, first + len(payloads), 12_000)]
-    sent = [packet for media in frames for packet in media + repairs_of(media, count)]
+    sent = [packet for media in frames for packet in media + repair_packets(media, count)]
     lost = data.draw(st.sets(st.integers(0, len(sent) - 1), max_size=12))
     twice = data.draw(st.lists(st.integers(0, len(sent) - 1), max_size=6))
     arrived = [packet for index, packet in enumerate(sent) if index not in lost]
@@ -221,7 +221,7 @@ def test_any_loss_within_the_repair_is_recovered(
     expected = set()
     for media in frames:
         blocks = -(-len(media) // 16)
-        repairs = repairs_of(media, count)
+        repairs = repair_packets(media, count)
         for block in range(blocks):
             missing = [packet for packet in media[block::blocks] if packet not in arrived]
             if len(missing) <= sum(repair in arrived for repair in repairs[block::blocks]):
@@ -234,19 +234,19 @@ def test_any_loss_within_the_repair_is_recovered(
 
 
 MALFORMED_HEADERS = [
-    with_payload(REPAIRS[0], b""),
-    with_payload(REPAIRS[0], REPAIRS[0].payload[:12]),  # no symbol
-    with_payload(REPAIRS[0], REPAIRS[0].payload[:14]),  # a symbol without payload
-    with_payload(REPAIRS[0], REPAIRS[0].payload.ljust(12 + MAX_SYMBOL_BYTES + 1, b"\x00")),
-    with_bytes(REPAIRS[0], {0: 2}),  # version
-    with_bytes(REPAIRS[0], {1: 0x80}),  # payload type of the media
-    with_bytes(REPAIRS[0], {1: 0xE0}),
-    with_bytes(REPAIRS[0], {1: REPAIR_PAYLOAD_TYPE}),
-    with_bytes(REPAIRS[0], {7: 5}),  # SSRC of the media
-    with_bytes(REPAIRS[0], {8: 0, 9: 0}),  # number of the frame's packets
-    with_bytes(REPAIRS[0], {8: 0xFF, 9: 0xFF}),
-    with_bytes(REPAIRS[0], {10: 1}),  # number of the block
-    with_bytes(REPAIRS[0], {11: 2}),  # neither P nor Q
+    replace_payload(REPAIRS[0], b""),
+    replace_payload(REPAIRS[0], REPAIRS[0].payload[:12]),  # no symbol
+    replace_payload(REPAIRS[0], REPAIRS[0].payload[:14]),  # a symbol without payload
+    replace_payload(REPAIRS[0], REPAIRS[0].payload.ljust(12 + MAX_SYMBOL_BYTES + 1, b"\x00")),
+    replace_bytes(REPAIRS[0], {0: 2}),  # version
+    replace_bytes(REPAIRS[0], {1: 0x80}),  # payload type of the media
+    replace_bytes(REPAIRS[0], {1: 0xE0}),
+    replace_bytes(REPAIRS[0], {1: REPAIR_PAYLOAD_TYPE}),
+    replace_bytes(REPAIRS[0], {7: 5}),  # SSRC of the media
+    replace_bytes(REPAIRS[0], {8: 0, 9: 0}),  # number of the frame's packets
+    replace_bytes(REPAIRS[0], {8: 0xFF, 9: 0xFF}),
+    replace_bytes(REPAIRS[0], {10: 1}),  # number of the block
+    replace_bytes(REPAIRS[0], {11: 2}),  # neither P nor Q
 ]
 """Repair packets with an invalid field of the header, which is described in docs/wire.md."""
 
@@ -264,11 +264,11 @@ def test_malformed_header(repair: RtpPacket) -> None:
     [
         *MALFORMED_HEADERS,
         # Cut off: shorter than the media of its block.
-        with_payload(REPAIRS[0], REPAIRS[0].payload[:-1]),
+        replace_payload(REPAIRS[0], REPAIRS[0].payload[:-1]),
         # The recovered payload would be longer than the packet, have bytes after its end, or be empty.
-        with_bytes(REPAIRS[0], {12: REPAIRS[0].payload[12] ^ 1}),
-        with_bytes(REPAIRS[0], {40: REPAIRS[0].payload[40] ^ 1}),
-        repairs_of([*EIGHT_PACKETS[:3], with_payload(EIGHT_PACKETS[3], b""), *EIGHT_PACKETS[4:]], 1)[0],
+        replace_bytes(REPAIRS[0], {12: REPAIRS[0].payload[12] ^ 1}),
+        replace_bytes(REPAIRS[0], {40: REPAIRS[0].payload[40] ^ 1}),
+        repair_packets([*EIGHT_PACKETS[:3], replace_payload(EIGHT_PACKETS[3], b""), *EIGHT_PACKETS[4:]], 1)[0],
     ],
 )
 def test_malformed(repair: RtpPacket) -> None:
@@ -283,11 +283,11 @@ def test_malformed(repair: RtpPacket) -> None:
 @pytest.mark.parametrize(
     "repair",
     [
-        with_bytes(REPAIRS[1], {1: 98}),  # payload type of the media
-        with_bytes(REPAIRS[1], {3: 101}),  # first sequence number
-        with_bytes(REPAIRS[1], {9: 9}),  # number of the frame's packets
-        with_payload(REPAIRS[1], REPAIRS[1].payload + b"\x00"),
-        with_bytes(REPAIRS[0], {20: REPAIRS[0].payload[20] ^ 1}),  # another P
+        replace_bytes(REPAIRS[1], {1: 98}),  # payload type of the media
+        replace_bytes(REPAIRS[1], {3: 101}),  # first sequence number
+        replace_bytes(REPAIRS[1], {9: 9}),  # number of the frame's packets
+        replace_payload(REPAIRS[1], REPAIRS[1].payload + b"\x00"),
+        replace_bytes(REPAIRS[0], {20: REPAIRS[0].payload[20] ^ 1}),  # another P
     ],
 )
 def test_contradicting_repair_packets(repair: RtpPacket) -> None:
@@ -298,7 +298,7 @@ def test_contradicting_repair_packets(repair: RtpPacket) -> None:
     assert receiver.push(REPAIRS[1], 0) == EIGHT_PACKETS[6:]
 
 
-HEADERS = st.tuples(
+REPAIR_LIKE_PAYLOADS = st.tuples(
     st.sampled_from([b"\x01", b"\x00"]),
     st.sampled_from([b"\x60", b"\x61", b"\xff"]),
     st.integers(98, 110).map(lambda sequence: sequence.to_bytes(2, "big")),
@@ -308,10 +308,10 @@ HEADERS = st.tuples(
     st.integers(0, 2).map(lambda which: bytes([which])),
     st.binary(max_size=40),
 ).map(b"".join)
-"""Payloads that resemble those of repair packets for the packets of EIGHT_PACKETS."""
+"""Payloads that resemble those of repair packets for EIGHT_PACKETS."""
 
 
-@given(st.lists(st.one_of(st.binary(max_size=60), HEADERS, st.sampled_from(EIGHT_PACKETS)), max_size=30))
+@given(st.lists(st.one_of(st.binary(max_size=60), REPAIR_LIKE_PAYLOADS, st.sampled_from(EIGHT_PACKETS)), max_size=30))
 def test_any_bytes(pushed: list[bytes | RtpPacket]) -> None:
     """No repair payload raises an error, and invalid ones are counted as malformed."""
     receiver = RepairReceiver()
@@ -333,7 +333,7 @@ def test_bounded_memory() -> None:
     receiver = RepairReceiver()
     for number in range(3 * MAX_OPEN_BLOCKS):
         media = frame([b"m"] * 4, first=4 * number, timestamp=number)
-        push_all(receiver, [media[0], *repairs_of(media, 2)])
+        push_all(receiver, [media[0], *repair_packets(media, 2)])
     assert len(receiver._open) == MAX_OPEN_BLOCKS
     assert counters(receiver) == Counters(unrepaired=2 * MAX_OPEN_BLOCKS)
     newest = frame([b"m"] * 4, first=4 * (3 * MAX_OPEN_BLOCKS - 1), timestamp=3 * MAX_OPEN_BLOCKS - 1)
@@ -355,7 +355,7 @@ def test_repair_packet_from_long_ago() -> None:
     """A repair packet that is repeated when its media packets are no longer stored recovers nothing."""
     receiver = RepairReceiver()
     single_packet = frame([b"alone"])
-    repair = repairs_of(single_packet, 1)[0]
+    repair = repair_packets(single_packet, 1)[0]
     assert receiver.push(repair, 0) == single_packet
     push_all(receiver, (RtpPacket(96, 101 + number, 7, MEDIA_SSRC, False, b"") for number in range(MAX_STORED_MEDIA)))
     assert receiver.push(repair, 0) == []
@@ -371,11 +371,11 @@ def test_new_stream_gives_up_old_blocks() -> None:
     assert push_all(receiver, [*other[:6], other[7]]) == []
     assert receiver.push(REPAIRS[1], 0) == []
     assert counters(receiver) == Counters(malformed=1, unrepaired=1)
-    assert receiver.push(repairs_of(other, 1)[0], 0) == [other[6]]
+    assert receiver.push(repair_packets(other, 1)[0], 0) == [other[6]]
 
 
 def test_same_numbers_of_another_frame() -> None:
-    """Media packets with the sequence numbers of a block but another timestamp do not belong to it."""
+    """Media packets with the sequence numbers of a block but another timestamp do not belong to that block."""
     receiver = RepairReceiver()
     stale = frame((b"stale" for _ in range(8)), timestamp=1)
     later = frame((b"later" for _ in range(8)), timestamp=2)
@@ -384,7 +384,7 @@ def test_same_numbers_of_another_frame() -> None:
 
 
 def test_same_numbers_of_another_stream() -> None:
-    """Media packets of another SSRC with a block's sequence numbers and timestamp do not belong to it."""
+    """Media packets of another SSRC with a block's sequence numbers and timestamp do not belong to that block."""
     receiver = RepairReceiver()
     other = frame((b"other" for _ in range(8)), ssrc=9)
     assert push_all(receiver, [*other, *EIGHT_PACKETS[:6], EIGHT_PACKETS[7], REPAIRS[0]]) == [EIGHT_PACKETS[6]]
@@ -438,7 +438,7 @@ def test_access_unit_from_recovered_packets() -> None:
     ],
 )
 def test_redundancy_controller(notes: list[tuple[int, int, float]], now_s: float, count: int) -> None:
-    """A block gets no repair packet before a loss, one for 30 s after it, two while 2.5 % were lost in the last 5 s."""
+    """A block gets one repair packet for 30 s after a loss, and two while 2.5 % were lost in the last 5 s."""
     controller = RedundancyController()
     for lost, expected, at_s in notes:
         controller.note_loss(lost, expected, int(at_s * NS_PER_S))
@@ -446,7 +446,7 @@ def test_redundancy_controller(notes: list[tuple[int, int, float]], now_s: float
 
 
 def test_redundancy_controller_forgets() -> None:
-    """The controller keeps only the notes within its window."""
+    """The controller keeps only the notes of the last 5 s."""
     controller = RedundancyController()
     for number in range(1000):
         controller.note_loss(0, 10, number * 100 * NS_PER_MS)

@@ -23,11 +23,11 @@ def packet(sequence: int, ssrc: int = 7) -> RtpPacket:
 
 
 def numbers(ordered: Ordered) -> list[int]:
-    """Return the sequence numbers."""
+    """Return the sequence numbers of all packets."""
     return [ordered_packet.sequence for ordered_packet, _ in ordered]
 
 
-def gaps(ordered: Ordered) -> list[int]:
+def numbers_after_gaps(ordered: Ordered) -> list[int]:
     """Return the sequence numbers of the packets that follow a gap."""
     return [ordered_packet.sequence for ordered_packet, lost_before in ordered if lost_before]
 
@@ -52,7 +52,7 @@ def test_first_packets_wait_one_hold() -> None:
     assert buffer.expire(100 + HOLD_NS - 1) == []
     ordered = buffer.expire(100 + HOLD_NS)
     assert numbers(ordered) == [10, 11, 12]
-    assert gaps(ordered) == []
+    assert numbers_after_gaps(ordered) == []
     assert buffer.next_wake_ns() is None
     buffer.push(packet(10), 100 + HOLD_NS)
     buffer.push(packet(9), 100 + HOLD_NS)
@@ -73,7 +73,7 @@ def test_gap_that_closes() -> None:
     assert buffer.push(packet(2), STARTED_NS) == []
     ordered = buffer.push(packet(1), STARTED_NS + HOLD_NS - 1)
     assert numbers(ordered) == [1, 2, 3]
-    assert gaps(ordered) == []
+    assert numbers_after_gaps(ordered) == []
     assert (buffer.reordered, buffer.lost) == (2, 0)
 
 
@@ -85,7 +85,7 @@ def test_gap_that_stays() -> None:
     assert buffer.next_wake_ns() == STARTED_NS + HOLD_NS
     ordered = buffer.expire(STARTED_NS + HOLD_NS)
     assert numbers(ordered) == [3, 4]
-    assert gaps(ordered) == [3]
+    assert numbers_after_gaps(ordered) == [3]
     assert buffer.lost == 2
 
 
@@ -96,7 +96,7 @@ def test_each_gap_has_its_own_hold() -> None:
     buffer.push(packet(4), STARTED_NS + 3)
     assert numbers(buffer.expire(STARTED_NS + HOLD_NS)) == [2]
     assert buffer.next_wake_ns() == STARTED_NS + HOLD_NS + 3
-    assert gaps(buffer.expire(STARTED_NS + HOLD_NS + 3)) == [4]
+    assert numbers_after_gaps(buffer.expire(STARTED_NS + HOLD_NS + 3)) == [4]
 
 
 def test_packet_after_an_expired_hold_closes_its_gap() -> None:
@@ -125,7 +125,7 @@ def test_late_and_duplicate_packets_are_dropped() -> None:
 
 
 def test_new_ssrc_begins_a_new_stream() -> None:
-    """A new SSRC releases all buffered packets and begins a new stream, whose first packet is marked as after a gap."""
+    """A new SSRC releases the buffered packets and begins a new stream, whose first packet is marked as after a gap."""
     buffer = started_buffer(50_000)
     buffer.push(packet(50_002), STARTED_NS)
     assert numbers(buffer.push(packet(40_000, ssrc=8), STARTED_NS)) == [50_002]
@@ -135,7 +135,7 @@ def test_new_ssrc_begins_a_new_stream() -> None:
 
 
 def test_stray_packet_is_dropped() -> None:
-    """A single packet far from all others is dropped and counted, and the stream continues."""
+    """A stray packet, which is alone and far from all others, is dropped and counted, and the stream continues."""
     buffer = started_buffer()
     assert buffer.push(packet(MAX_JUMP + 1), STARTED_NS) == []
     assert buffer.push(packet(-MAX_JUMP - 1), STARTED_NS) == []
@@ -171,7 +171,7 @@ def test_two_consecutive_packets_move_the_stream(first: int, second: int) -> Non
     assert buffer.push(packet(second), STARTED_NS) == []
     ordered = buffer.expire(STARTED_NS + HOLD_NS)
     assert numbers(ordered) == [first, second]
-    assert gaps(ordered) == [first]
+    assert numbers_after_gaps(ordered) == [first]
     assert (buffer.stray, buffer.lost) == (0, 0)
 
 
@@ -185,7 +185,7 @@ def test_a_jump_keeps_the_wraps() -> None:
 
 
 def test_old_packets_after_a_delay_spike_are_late() -> None:
-    """Many consecutive old packets are late packets and not a restart of the sender."""
+    """Many consecutive old packets are taken for late packets and not for a restart of the sender."""
     buffer = started_buffer()
     buffer.push(packet(1500), STARTED_NS)
     buffer.expire(STARTED_NS + HOLD_NS)
@@ -203,7 +203,7 @@ def test_bounded_memory() -> None:
 
 
 def test_bounded_memory_of_losses() -> None:
-    """The number of remembered losses is limited, and the newest lost packets still count as late."""
+    """The number of remembered losses is limited, and lost packets that arrive are still counted as late."""
     buffer = started_buffer()
     for number in range(2, 5 * MAX_JUMP):
         buffer.push(packet(2 * number), STARTED_NS)
@@ -215,7 +215,7 @@ def test_bounded_memory_of_losses() -> None:
 
 @given(st.integers(0, 2**16 - 1), st.permutations(range(30)), st.integers(0, 2**32))
 def test_any_order_within_a_hold_is_restored(first: int, order: list[int], start_ns: int) -> None:
-    """Packets that arrive within one hold in any order leave in the order sent, none missing."""
+    """All packets that arrive within one hold, in any order, leave in the order in which they were sent."""
     buffer = JitterBuffer(HOLD_NS)
     ordered = [
         ordered_packet
@@ -224,7 +224,7 @@ def test_any_order_within_a_hold_is_restored(first: int, order: list[int], start
     ]
     ordered += buffer.expire(start_ns + HOLD_NS)
     assert numbers(ordered) == [(first + number) % 2**16 for number in range(30)]
-    assert gaps(ordered) == []
+    assert numbers_after_gaps(ordered) == []
     assert (buffer.lost, buffer.late, buffer.duplicate) == (0, 0, 0)
 
 
@@ -246,7 +246,8 @@ def test_any_arrivals(first: int, arrivals: list[tuple[int, int]]) -> None:
     assert buffer.next_wake_ns() is None
     sent = [(number - first) % 2**16 for number in numbers(ordered)]
     assert sent == sorted(set(sent))
-    assert gaps(ordered) == [(first + after) % 2**16 for before, after in pairwise(sent) if after != before + 1]
+    after_gaps = [after for before, after in pairwise(sent) if after != before + 1]
+    assert numbers_after_gaps(ordered) == [(first + number) % 2**16 for number in after_gaps]
     assert buffer.lost == sent[-1] - sent[0] + 1 - len(sent)
     assert len(ordered) + buffer.late + buffer.duplicate == len(arrivals)
 
@@ -266,11 +267,11 @@ def test_regular_stream_passes_after_any_packets(arrivals: list[tuple[int, int, 
 
 @pytest.mark.parametrize("first", [0, 40_000])
 def test_recovered_packet_closes_its_gap(first: int) -> None:
-    """A recovered packet closes its gap like one that arrived, and counts as recovered only."""
+    """A recovered packet closes its gap as a received packet does, and changes only the counter `recovered`."""
     buffer = started_buffer(first)
     assert buffer.push(packet(first + 2), STARTED_NS) == []
     ordered = buffer.push_recovered(packet(first + 1), STARTED_NS + 1)
-    assert (numbers(ordered), gaps(ordered)) == ([first + 1, first + 2], [])
+    assert (numbers(ordered), numbers_after_gaps(ordered)) == ([first + 1, first + 2], [])
     assert numbers(buffer.push_recovered(packet(first + 3), STARTED_NS + 2)) == [first + 3]
     assert buffer.highest_sequence == first + 3
     assert (buffer.recovered, buffer.reordered, buffer.lost, buffer.late, buffer.duplicate) == (2, 0, 0, 0, 0)
@@ -313,7 +314,7 @@ def test_the_hold_follows_the_network() -> None:
 
 
 def test_the_hold_follows_packets_within_their_hold() -> None:
-    """A packet that arrives 9 ms late, within the hold of 10 ms, extends the hold like a late one."""
+    """A reordering delay of 9 ms extends the hold, although the packet arrives within the hold of 10 ms."""
     buffer = started_buffer(hold_ns=None)
     buffer.push(packet(2), STARTED_NS)
     assert numbers(buffer.push(packet(1), STARTED_NS + 9 * NS_PER_MS)) == [1, 2]
@@ -329,7 +330,7 @@ def test_the_hold_follows_repairs() -> None:
 
 
 def test_the_hold_of_an_open_gap_grows() -> None:
-    """A packet after an open gap with a reordering delay of 9 ms extends the hold of that gap, too."""
+    """A packet with a reordering delay of 9 ms also extends the hold of an earlier gap that is still open."""
     buffer = started_buffer(hold_ns=None)
     for number, after_ns in ((2, 0), (4, 0), (3, 9 * NS_PER_MS)):
         assert buffer.push(packet(number), STARTED_NS + after_ns) == []
@@ -367,7 +368,7 @@ def test_an_open_gap_does_not_lengthen_the_delay_of_later_packets() -> None:
 
 
 def test_the_hold_stays_long_enough_for_repairs() -> None:
-    """While packets are recovered within 20 ms, the hold stays longer than that."""
+    """While packets are recovered 20 ms after their gap, the hold stays longer than 20 ms."""
     buffer = started_buffer(hold_ns=None)
     measure_hold(buffer, 1, STARTED_NS)
     buffer.push_recovered(packet(1), STARTED_NS + 20 * NS_PER_MS)

@@ -1,4 +1,4 @@
-"""Test what `complete` means, with frames from encoder to stamp reader over a link that loses and reorders packets."""
+"""Test when an access unit is `complete`, from encoder to stamp reader, with lost and reordered packets."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ START_NS = 1_790_000_000_000_000_000
 FRAME_NS = 33_333_333
 
 
-def stamp_of(number: int) -> int:
+def frame_stamp_ns(number: int) -> int:
     return START_NS + number * FRAME_NS
 
 
@@ -39,12 +39,12 @@ class SentFrames:
         self.pictures: dict[int, Picture] = {}
         for number in range(FRAMES):
             picture = texture[:, number : number + 160].copy()
-            write_stamp(picture, stamp_of(number))
+            write_stamp(picture, frame_stamp_ns(number))
             access_unit = encoder.encode(picture)
-            self.datagrams.append(packetizer.packetize(access_unit, rtp_timestamp(stamp_of(number))))
+            self.datagrams.append(packetizer.packetize(access_unit, rtp_timestamp(frame_stamp_ns(number))))
             decoded = decoder.decode(access_unit)
             assert decoded is not None
-            self.pictures[rtp_timestamp(stamp_of(number))] = decoded.picture
+            self.pictures[rtp_timestamp(frame_stamp_ns(number))] = decoded.picture
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def sent() -> SentFrames:
 
 
 def test_frames_survive_reordering(sent: SentFrames) -> None:
-    """Over a link that reorders within the hold every frame arrives complete and with its stamp."""
+    """If packets are reordered within the hold, every frame arrives complete and with its stamp."""
     generator = stream(1, "delay")
     arrivals = []
     for number, datagrams in enumerate(sent.datagrams):
@@ -75,7 +75,7 @@ def test_frames_survive_reordering(sent: SentFrames) -> None:
             assert decoded is not None
             stamps.append(read_stamp(decoded.luma))
             assert stamp_agrees(stamps[-1], unit.timestamp)
-    assert stamps == [stamp_of(number) for number in range(FRAMES)]
+    assert stamps == [frame_stamp_ns(number) for number in range(FRAMES)]
     assert buffer.reordered > 0
 
 
@@ -104,10 +104,10 @@ def test_only_pictures_before_a_loss_are_trusted(sent: SentFrames, lost: set[int
                 trusted.append(unit.timestamp)
         lost_before = False
     assert depacketizer.malformed == 0
-    timestamps = [rtp_timestamp(stamp_of(number)) for number in range(FRAMES)]
-    groups = [timestamps[begin : begin + GOP_FRAMES] for begin in range(0, FRAMES, GOP_FRAMES)]
+    timestamps = [rtp_timestamp(frame_stamp_ns(number)) for number in range(FRAMES)]
+    groups_of_pictures = [timestamps[first : first + GOP_FRAMES] for first in range(0, FRAMES, GOP_FRAMES)]
     assert trusted == [
         timestamp
-        for group in groups
-        for timestamp in itertools.takewhile(lambda timestamp: timestamp not in damaged, group)
+        for pictures in groups_of_pictures
+        for timestamp in itertools.takewhile(lambda timestamp: timestamp not in damaged, pictures)
     ]

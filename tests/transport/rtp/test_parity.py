@@ -42,11 +42,12 @@ def random_symbols(count: int, size: int) -> list[bytes]:
     return [random_bytes[index * size :][:size] for index in range(count)]
 
 
-def without(symbols: Sequence[bytes], *indices: int) -> list[bytes | None]:
+def remove_symbols(symbols: Sequence[bytes], *indices: int) -> list[bytes | None]:
+    """Return the symbols, with None in place of those at `indices`."""
     return [None if index in indices else symbol for index, symbol in enumerate(symbols)]
 
 
-BY_HAND = [bytes.fromhex("01 80"), bytes.fromhex("80 ff"), bytes.fromhex("c0")]
+SYMBOLS_BY_HAND = [bytes.fromhex("01 80"), bytes.fromhex("80 ff"), bytes.fromhex("c0")]
 P_BY_HAND = bytes.fromhex("41 7f")
 """01 + 80 + c0 and 80 + ff + 00."""
 Q_BY_HAND = bytes.fromhex("3b 63")
@@ -56,9 +57,9 @@ Q_BY_HAND = bytes.fromhex("3b 63")
 
 def test_parity_by_hand() -> None:
     """P is the sum of all symbols i, and Q the sum of 2^i times symbol i, in the field with the polynomial 0x11d."""
-    assert compute_parity(BY_HAND, 2) == [P_BY_HAND, Q_BY_HAND]
-    assert compute_parity(BY_HAND, 1) == [P_BY_HAND]
-    assert compute_parity(BY_HAND, 0) == []
+    assert compute_parity(SYMBOLS_BY_HAND, 2) == [P_BY_HAND, Q_BY_HAND]
+    assert compute_parity(SYMBOLS_BY_HAND, 1) == [P_BY_HAND]
+    assert compute_parity(SYMBOLS_BY_HAND, 0) == []
 
 
 @pytest.mark.parametrize(
@@ -73,8 +74,8 @@ def test_parity_by_hand() -> None:
 )
 def test_recovery_by_hand(indices: list[int], parities: Mapping[int, bytes]) -> None:
     """Missing symbols are recovered in order, padded with zeros to the length of the parity symbols."""
-    padded = [*BY_HAND[:2], bytes.fromhex("c0 00")]
-    assert recover(without(BY_HAND, *indices), parities) == [padded[index] for index in indices]
+    padded = [*SYMBOLS_BY_HAND[:2], bytes.fromhex("c0 00")]
+    assert recover(remove_symbols(SYMBOLS_BY_HAND, *indices), parities) == [padded[index] for index in indices]
 
 
 @given(st.lists(st.binary(max_size=40), min_size=1, max_size=40), st.data())
@@ -85,7 +86,7 @@ def test_any_missing_symbols_are_recovered(symbols: list[bytes], data: st.DataOb
     lost = sorted(data.draw(st.sets(st.integers(0, len(symbols) - 1), min_size=1, max_size=2)))
     received = data.draw(st.sampled_from([[P, Q]] if len(lost) == 2 else [[P], [Q], [P, Q]]))
     padded = [symbol.ljust(len(parities[P]), b"\x00") for symbol in symbols]
-    recovered = recover(without(symbols, *lost), {parity: parities[parity] for parity in received})
+    recovered = recover(remove_symbols(symbols, *lost), {parity: parities[parity] for parity in received})
     assert recovered == [padded[index] for index in lost]
 
 
@@ -97,11 +98,11 @@ def test_every_number_of_symbols(size: int) -> None:
         p, q = compute_parity(symbols, 2)
         assert [p, q] == parity_by_definition(symbols)
         for index in {0, count // 2, count - 1}:
-            assert recover(without(symbols, index), {P: p}) == [symbols[index]]
-            assert recover(without(symbols, index), {Q: q}) == [symbols[index]]
+            assert recover(remove_symbols(symbols, index), {P: p}) == [symbols[index]]
+            assert recover(remove_symbols(symbols, index), {Q: q}) == [symbols[index]]
         for first, second in {(0, count - 1), (0, 1), (count // 2, count - 1), (count - 2, count - 1)}:
             if 0 <= first < second < count:
-                lost = without(symbols, first, second)
+                lost = remove_symbols(symbols, first, second)
                 assert recover(lost, {P: p, Q: q}) == [symbols[first], symbols[second]]
 
 
@@ -110,11 +111,11 @@ def test_every_index() -> None:
     symbols = random_symbols(255, 2)
     p, q = compute_parity(symbols, 2)
     for index in range(255):
-        assert recover(without(symbols, index), {Q: q}) == [symbols[index]]
-    for apart in range(1, 255):
-        first = apart * 7 % (255 - apart)
-        lost = without(symbols, first, first + apart)
-        assert recover(lost, {P: p, Q: q}) == [symbols[first], symbols[first + apart]]
+        assert recover(remove_symbols(symbols, index), {Q: q}) == [symbols[index]]
+    for distance in range(1, 255):
+        first = distance * 7 % (255 - distance)
+        lost = remove_symbols(symbols, first, first + distance)
+        assert recover(lost, {P: p, Q: q}) == [symbols[first], symbols[first + distance]]
 
 
 def test_empty_symbols() -> None:
@@ -150,7 +151,7 @@ def test_invalid_numbers_are_rejected(symbols: int, count: int) -> None:
     ],
 )
 def test_invalid_symbols(symbols: list[bytes | None], parities: Mapping[int, bytes]) -> None:
-    """Too few parity symbols, symbols longer than these and more than 255 symbols raise `BadPacket`."""
+    """Too few parity symbols, symbols longer than the parity symbols and over 255 symbols raise `BadPacket`."""
     with pytest.raises(BadPacket):
         recover(symbols, parities)
 

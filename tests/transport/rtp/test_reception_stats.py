@@ -84,7 +84,7 @@ def test_loss_without_repair() -> None:
 
 
 def test_a_recovered_packet_is_lost_before_repair_only() -> None:
-    """A recovered packet counts as lost in the report and before repair, but not after repair."""
+    """A recovered packet is among the losses in the report and before repair, but not among those after repair."""
     stream = ReceivedStream()
     stream.start(0, 2)
     stream.arrive(3, 20 * NS_PER_MS)
@@ -119,7 +119,7 @@ def test_useless_recovery_is_not_counted() -> None:
 
 
 def test_reordered_late_and_duplicate() -> None:
-    """A late packet counts as lost after repair although it arrived; a reordered one does not count as lost."""
+    """A late packet is among the losses after repair, although it arrived; a reordered packet is not."""
     stream = ReceivedStream()
     stream.start(0, 2)
     stream.arrive(3, 20 * NS_PER_MS)
@@ -146,10 +146,10 @@ PACKET_FATES = {
     "recovered after arrival": [("arrive", 3), ("recover", 6)],
 }
 """What can happen to a packet: its events, each with its delay in ms."""
-PERIOD = st.lists(st.sampled_from(sorted(PACKET_FATES)), max_size=20).map(lambda fates: [*fates, "arrives"])
+PERIOD_FATES = st.lists(st.sampled_from(sorted(PACKET_FATES)), max_size=20).map(lambda fates: [*fates, "arrives"])
 
 
-@given(st.integers(0, 2**16 - 1), st.lists(PERIOD, min_size=1, max_size=4))
+@given(st.integers(0, 2**16 - 1), st.lists(PERIOD_FATES, min_size=1, max_size=4))
 def test_losses_match_the_rfc(first: int, periods: list[list[str]]) -> None:
     """For any events the report has the values that the program of RFC 3550, A.3, computes."""
     stream = ReceivedStream()
@@ -177,7 +177,7 @@ def test_losses_match_the_rfc(first: int, periods: list[list[str]]) -> None:
 
 
 def test_jitter_by_hand() -> None:
-    """Jitter changes by a sixteenth of each change of transit time, over all packets, including those of one frame."""
+    """Each packet, also within a frame, moves the jitter by a sixteenth towards the change of transit time."""
     stream = ReceivedStream()
     stream.arrive(1, 0, timestamp=0)
     stream.arrive(2, 1_100_000, timestamp=0)  # 99 units of 1/90000 s later, in the same frame
@@ -279,7 +279,7 @@ def test_another_stream_begins_new_reports() -> None:
 
 
 def test_a_stray_packet_is_not_counted() -> None:
-    """A stray packet counts neither as received nor in the jitter; two consecutive ones belong to the stream."""
+    """A stray packet is not counted; when a consecutive packet follows it, both packets are counted."""
     stream = ReceivedStream()
     stream.start(0, 2)
     stream.arrive(30_000, 20 * NS_PER_MS, timestamp=10**9)

@@ -61,7 +61,7 @@ EXAMPLE_SENDER_REPORT = sender_report(
     answered=[ReferenceAnswer(1, 0x8000, 2**20)],
 )
 
-# Written by hand from the figures of the RFCs.
+# Written by hand from the diagrams in the RFCs.
 REPORT_BLOCK = "00000002 40 000005 00000003 00000006 b44db705 00054000"
 RECEIVER_REPORT = "81 c9 0007 00000001" + REPORT_BLOCK  # RFC 3550, section 6.4.2
 EMPTY_REPORT = "80 c9 0001 00000001"
@@ -125,7 +125,7 @@ def test_overhead_beyond_its_field() -> None:
 
 @given(UINT32, UINT32, st.integers(0, 2**80), st.integers(0, 511))
 def test_max_bit_rate_round_trip(ssrc: int, media_ssrc: int, bit_rate_bps: int, overhead_bytes: int) -> None:
-    """A limit is parsed as at most one part in 2^16 below the requested one, and never above it."""
+    """A parsed limit is never higher than the requested one, and lower by at most one part in 2^16."""
     datagram = max_bit_rate(ssrc, media_ssrc, bit_rate_bps, overhead_bytes=overhead_bytes)
     (limit,) = parse_feedback(datagram).limits
     assert (limit.media_ssrc, limit.overhead_bytes) == (media_ssrc, overhead_bytes)
@@ -173,22 +173,22 @@ def test_any_cname(cname: str) -> None:
 
 def test_values_beyond_their_fields() -> None:
     """Values that do not fit their field are clamped, and the sequence number wraps."""
-    beyond = ReceptionReport(2, 2**32 + 9, 1.0, 2**30, 2**40, 1, 2**60)
-    (report,) = parse_feedback(receiver_report(1, beyond, clock_ns=0)).reports
+    too_high = ReceptionReport(2, 2**32 + 9, 1.0, 2**30, 2**40, 1, 2**60)
+    (report,) = parse_feedback(receiver_report(1, too_high, clock_ns=0)).reports
     assert report == ReceptionReport(2, 9, 255 / 256, 2**23 - 1, 2**32 - 1, 1, short_to_delay_ns(2**32 - 1))
-    below = ReceptionReport(2, 9, -1.0, -(2**30), 0, 1, -1)
-    (report,) = parse_feedback(receiver_report(1, below, clock_ns=0)).reports
+    too_low = ReceptionReport(2, 9, -1.0, -(2**30), 0, 1, -1)
+    (report,) = parse_feedback(receiver_report(1, too_low, clock_ns=0)).reports
     assert report == ReceptionReport(2, 9, 0.0, -(2**23), 0, 1, 0)
 
 
 def test_compound_datagrams_are_parsed() -> None:
     """Report blocks of sender reports are parsed, too, and unknown packets, formats and blocks are skipped."""
-    with_block = "81 c8 000c 00000009" + "00" * 20 + REPORT_BLOCK
+    sender_report_with_block = "81 c8 000c 00000009" + "00" * 20 + REPORT_BLOCK
     unknown = (
         "80 d0 0000" + "8f ce 0002 00000001 00000002" + "81 cd 0003 00000001 00000002 00010000" + "81 cb 0001 00000001"
     )
     extended = "80 cf 0006 00000001 07 00 0001 00000000 04 00 0002 00000000 80000000"
-    feedback = parse_feedback(bytes.fromhex(with_block + DESCRIPTION + unknown + extended + PICTURE_LOSS))
+    feedback = parse_feedback(bytes.fromhex(sender_report_with_block + DESCRIPTION + unknown + extended + PICTURE_LOSS))
     assert feedback == Feedback((REPORT,), picture_loss=True, reference_times=(ReferenceTime(1, 0x8000),))
     announcement = parse_announcement(bytes.fromhex(SENDER_REPORT + unknown + extended + ANSWER))
     answer = ReferenceAnswer(1, 0x8000, short_to_delay_ns(0x45))
@@ -227,20 +227,20 @@ INVALID_AT_THE_SENDER = (
     "81ce000100000001",  # a picture-loss indication without the SSRC of the media
     "81ce0003000000010000000200000000",  # a picture-loss indication that is too long
     "83cd0002 00000001 00000000",  # a bit rate limit without an entry
-    "83cd0003 00000001 00000000 00000002",  # with half an entry
-    "83cd0001 00000001",  # without the SSRC of the media
+    "83cd0003 00000001 00000000 00000002",  # a bit rate limit with half an entry
+    "83cd0001 00000001",  # a bit rate limit without the SSRC of the media
     "80cf0000",  # an extended report without an SSRC
     "80cf0002 00000001 04000001",  # a reference time without content
-    "80cf0003 00000001 04000001 00000000",  # of one word instead of two
-    "80cf0005 00000001 04000003 00000000 00000000 00000000",  # of three words
+    "80cf0003 00000001 04000001 00000000",  # a reference time of one word instead of two
+    "80cf0005 00000001 04000003 00000000 00000000 00000000",  # a reference time of three words
 )
 INVALID_AT_THE_RECEIVER = (
     "80c8000500000009" + "00" * 16,  # a sender report that is too short
     "81c8000600000009" + "00" * 20,  # a sender report without its report block
     "80cf0000",  # an extended report without an SSRC
     "80cf0002 00000009 05000003",  # an answer without content
-    "80cf0003 00000009 05000001 00000001",  # of one word instead of three
-    "80cf0006 00000009 05000004" + "00" * 16,  # of four words
+    "80cf0003 00000009 05000001 00000001",  # an answer of one word instead of three
+    "80cf0006 00000009 05000004" + "00" * 16,  # an answer of four words
 )
 
 
@@ -291,7 +291,7 @@ def test_any_bytes(data: bytes) -> None:
 
 
 def test_ntp_times() -> None:
-    """An NTP timestamp counts from 1900 for the wall clock, and from the clock's own epoch for any other."""
+    """An NTP timestamp counts from 1900 for the wall clock, and from the clock's own epoch for any other clock."""
     wall_ns = 1_500_000_000_500_000_000
     assert wall_to_ntp(wall_ns) == (1_500_000_000 + 2_208_988_800) << 32 | 2**31
     assert elapsed_to_ntp(wall_ns) == 1_500_000_000 << 32 | 2**31
@@ -317,15 +317,14 @@ STEP_NS = -(-NS_PER_S // 65_536)
 
 @given(CLOCK_NS, st.integers(0, 59 * NS_PER_S), st.integers(0, 65_000 * NS_PER_S))
 def test_both_sides_know_the_round_trip_time(sent_ns: int, trip_ns: int, answer_delay_ns: int) -> None:
-    """Each side computes the round-trip time to two steps of 1/65536 s, also across the wrap of the short format."""
+    """Each side's round-trip time is wrong by at most two steps of 1/65536 s, also when the short format wraps."""
     arrived_ns = sent_ns + trip_ns + answer_delay_ns
-    # The sender's computation from a receiver report.
-    last = ntp_to_short(wall_to_ntp(sent_ns))
-    trips = [(last, round_trip_ns(ntp_to_short(wall_to_ntp(arrived_ns)), last, answer_delay_ns))]
-    last = ntp_to_short(elapsed_to_ntp(sent_ns))
-    trips.append((last, round_trip_of_answer_ns(ReferenceAnswer(1, last, answer_delay_ns), arrived_ns)))
-    for last, computed_ns in trips:
-        if last == 0:
+    by_wall_clock, by_receiver_clock = ntp_to_short(wall_to_ntp(sent_ns)), ntp_to_short(elapsed_to_ntp(sent_ns))
+    sender_result_ns = round_trip_ns(ntp_to_short(wall_to_ntp(arrived_ns)), by_wall_clock, answer_delay_ns)
+    answer = ReferenceAnswer(1, by_receiver_clock, answer_delay_ns)
+    receiver_result_ns = round_trip_of_answer_ns(answer, arrived_ns)
+    for sent_short, computed_ns in ((by_wall_clock, sender_result_ns), (by_receiver_clock, receiver_result_ns)):
+        if sent_short == 0:
             assert computed_ns is None
         else:
             assert computed_ns is not None
@@ -333,7 +332,7 @@ def test_both_sides_know_the_round_trip_time(sent_ns: int, trip_ns: int, answer_
 
 
 def test_impossible_round_trips() -> None:
-    """There is no round-trip time before the first report, below zero by more than a step, or above 60 s."""
+    """There is no round-trip time before the first report, and none above 60 s or negative by over a step."""
     assert round_trip_ns(2**31, 0, 0) is None
     assert round_trip_ns(100, 100, 2 * STEP_NS) is None
     assert round_trip_ns(100, 100, STEP_NS) == 0

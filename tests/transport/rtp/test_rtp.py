@@ -37,7 +37,7 @@ def byte_stream(*units: bytes) -> bytes:
     return b"".join(START + unit for unit in units)
 
 
-def packets_of(access_unit: bytes, timestamp: int = 1, max_packet_bytes: int = 1200) -> list[RtpPacket]:
+def packetize(access_unit: bytes, timestamp: int = 1, max_packet_bytes: int = 1200) -> list[RtpPacket]:
     packetizer = Packetizer(ssrc=7, first_sequence=0, max_packet_bytes=max_packet_bytes)
     return [parse_packet(datagram) for datagram in packetizer.packetize(access_unit, timestamp)]
 
@@ -65,8 +65,8 @@ def test_header_as_in_the_rfc() -> None:
     """The header has the format of RFC 3550."""
     sent = RtpPacket(96, 0x0102, 0x03040506, 0x0708090A, marker=True, payload=b"x")
     assert sent.to_bytes() == bytes.fromhex("80 e0 0102 03040506 0708090a") + b"x"
-    of_type_0 = parse_packet(bytes.fromhex("80 80 0102 03040506 0708090a"))
-    assert (of_type_0.payload_type, of_type_0.marker) == (0, True)
+    parsed = parse_packet(bytes.fromhex("80 80 0102 03040506 0708090a"))
+    assert (parsed.payload_type, parsed.marker) == (0, True)
 
 
 def test_optional_parts_of_a_packet() -> None:
@@ -124,7 +124,7 @@ def test_nal_units_are_split() -> None:
 def test_access_unit_round_trip(units: list[bytes], max_packet_bytes: int, timestamp: int) -> None:
     """Any access unit is reassembled byte for byte and complete with its last packet."""
     data = byte_stream(*units)
-    packets = packets_of(data, timestamp, max_packet_bytes)
+    packets = packetize(data, timestamp, max_packet_bytes)
     depacketizer = Depacketizer()
     assert push_all(depacketizer, packets[:-1]) == []
     keyframe = any(unit[0] & 0x1F == 5 for unit in units)
@@ -150,27 +150,27 @@ def test_size_and_numbers_of_packets(units: list[bytes], max_packet_bytes: int) 
 
 
 def test_packet_types() -> None:
-    """Small units share a STAP-A, a single unit is sent unchanged, and a large unit is split into equal FU-A."""
-    packets = packets_of(KEYFRAME)
+    """Small units share a STAP-A, a single small unit is sent unchanged, and a large one is split into equal FU-As."""
+    packets = packetize(KEYFRAME)
     assert packets[0].payload == bytes([0x78]) + b"\x00\x04" + SPS + b"\x00\x04" + PPS
     fragments = packets[1:]
     assert [sent_packet.payload[0] for sent_packet in fragments] == [0x7C] * 5
     assert [sent_packet.payload[1] for sent_packet in fragments] == [0x85, 0x05, 0x05, 0x05, 0x45]
     sizes = [len(sent_packet.payload) for sent_packet in fragments]
     assert max(sizes) - min(sizes) <= 1
-    assert [sent_packet.payload for sent_packet in packets_of(START + SLICE + b"small")] == [SLICE + b"small"]
+    assert [sent_packet.payload for sent_packet in packetize(START + SLICE + b"small")] == [SLICE + b"small"]
 
 
 @pytest.mark.parametrize("units", [(b"\x06sei", b"\x41slice"), (b"\x41slice", b"\x06sei")])
 def test_nal_ref_idc_of_a_stap_a(units: tuple[bytes, bytes]) -> None:
     """A STAP-A has the highest NRI of its units (RFC 6184, section 5.7.1)."""
-    (shared,) = packets_of(byte_stream(*units))
+    (shared,) = packetize(byte_stream(*units))
     assert shared.payload[0] == 0x58
 
 
 def test_headers_of_fragments() -> None:
     """Each fragment has the NRI and type of its unit, the first also the start bit and the last the end bit."""
-    payloads = [sent_packet.payload for sent_packet in packets_of(START + b"\x46" + b"s" * 5000)]
+    payloads = [sent_packet.payload for sent_packet in packetize(START + b"\x46" + b"s" * 5000)]
     assert [payload[:2].hex() for payload in payloads] == ["5c86", "5c06", "5c06", "5c06", "5c46"]
 
 
@@ -179,8 +179,8 @@ def test_headers_of_fragments() -> None:
     [([1188], [1]), ([1189], [28, 28]), ([1000, 183], [24]), ([1000, 184], [1, 1]), ([100, 1189, 100], [1, 28, 28, 1])],
 )
 def test_capacity_of_a_packet(unit_bytes: list[int], types: list[int]) -> None:
-    """A packet of 1200 bytes holds a unit of 1188 bytes, or several whose type and size fields fit into these, too."""
-    packets = packets_of(byte_stream(*(SLICE + b"p" * (size - 1) for size in unit_bytes)))
+    """A packet of 1200 bytes has room for one unit of 1188 bytes, or for several units and their size fields."""
+    packets = packetize(byte_stream(*(SLICE + b"p" * (size - 1) for size in unit_bytes)))
     assert [sent_packet.payload[0] & 0x1F for sent_packet in packets] == types
 
 
@@ -207,16 +207,16 @@ def test_smallest_and_largest_packet_size(size: int) -> None:
     """Packets may have 64 to 65 507 bytes, the most that a datagram has room for."""
     sizes = [
         len(sent_packet.to_bytes())
-        for sent_packet in packets_of(START + SLICE + b"p" * (size - 13), max_packet_bytes=size)
+        for sent_packet in packetize(START + SLICE + b"p" * (size - 13), max_packet_bytes=size)
     ]
     assert sizes == [size]
 
 
 @pytest.mark.parametrize("missing", range(6))
 def test_a_packet_is_lost(missing: int) -> None:
-    """If any packet of a keyframe is lost, its access unit is returned once, incomplete, and the next one complete."""
+    """If any packet of a keyframe is lost, the keyframe is returned once, incomplete; the next one is complete."""
     depacketizer = Depacketizer()
-    first, second = packets_of(KEYFRAME, 1), packets_of(KEYFRAME, 2)
+    first, second = packetize(KEYFRAME, 1), packetize(KEYFRAME, 2)
     units = push_all(depacketizer, first[:missing])
     units += push_all(depacketizer, first[missing + 1 :] + second[:1], lost_before=True)
     units += push_all(depacketizer, second[1:])
@@ -227,8 +227,8 @@ def test_a_packet_is_lost(missing: int) -> None:
 
 
 def test_fragments_before_a_gap_are_kept() -> None:
-    """Of a NAL unit with a lost fragment, the fragments before the gap are kept and those after it dropped."""
-    packets = packets_of(KEYFRAME)
+    """If a fragment of a NAL unit is lost, the earlier fragments are kept and the later ones are dropped."""
+    packets = packetize(KEYFRAME)
     depacketizer = Depacketizer()
     push_all(depacketizer, packets[:3])
     (unit,) = push_all(depacketizer, packets[4:], lost_before=True)
@@ -241,17 +241,17 @@ def test_fragments_before_a_gap_are_kept() -> None:
 def test_a_whole_access_unit_is_lost() -> None:
     """A picture directly after a lost one is incomplete, unless it is a keyframe with parameter sets."""
     depacketizer = Depacketizer()
-    units = push_all(depacketizer, packets_of(PICTURE, 1), lost_before=True)
-    units += push_all(depacketizer, packets_of(PICTURE, 2))
-    units += push_all(depacketizer, packets_of(KEYFRAME, 3), lost_before=True)
-    units += push_all(depacketizer, packets_of(START + IDR + b"alone", 4), lost_before=True)
+    units = push_all(depacketizer, packetize(PICTURE, 1), lost_before=True)
+    units += push_all(depacketizer, packetize(PICTURE, 2))
+    units += push_all(depacketizer, packetize(KEYFRAME, 3), lost_before=True)
+    units += push_all(depacketizer, packetize(START + IDR + b"alone", 4), lost_before=True)
     assert [unit.complete for unit in units] == [False, True, True, False]
 
 
 def test_only_a_keyframe_is_complete_after_a_loss() -> None:
     """After a loss an access unit that is not a keyframe is incomplete, even if it begins with a delimiter."""
     for head in (b"\x09\x10", SPS):
-        (unit,) = push_all(Depacketizer(), packets_of(byte_stream(head, SLICE + b"p"), 1), lost_before=True)
+        (unit,) = push_all(Depacketizer(), packetize(byte_stream(head, SLICE + b"p"), 1), lost_before=True)
         assert not unit.complete
 
 
@@ -260,7 +260,7 @@ def test_only_a_keyframe_is_complete_after_a_loss() -> None:
 )
 def test_a_keyframe_after_a_loss(head: bytes, *, complete: bool) -> None:
     """After a loss a keyframe is complete only if it begins with a delimiter or a sequence parameter set."""
-    packets = packets_of(byte_stream(head, IDR + b"k"))
+    packets = packetize(byte_stream(head, IDR + b"k"))
     assert [unit.complete for unit in push_all(Depacketizer(), packets, lost_before=True)] == [complete]
 
 
@@ -283,7 +283,7 @@ def test_a_slice_is_lost(missing: int) -> None:
 
 def test_access_unit_of_useless_fragments() -> None:
     """An access unit of which only useless fragments arrived is returned empty and incomplete."""
-    (unit,) = push_all(Depacketizer(), packets_of(PICTURE)[1:], lost_before=True)
+    (unit,) = push_all(Depacketizer(), packetize(PICTURE)[1:], lost_before=True)
     assert unit == AccessUnit(b"", 1, complete=False, keyframe=False)
 
 
@@ -291,8 +291,8 @@ def test_next_packet_replaces_a_lost_marker() -> None:
     """If the marker packet is lost, the access unit is returned with the first packet of the next one."""
     depacketizer = Depacketizer()
     small = byte_stream(SPS, PPS, IDR + b"s")
-    assert push_all(depacketizer, packets_of(PICTURE, 1)[:-1]) == []
-    units = push_all(depacketizer, packets_of(small, 2), lost_before=True)
+    assert push_all(depacketizer, packetize(PICTURE, 1)[:-1]) == []
+    units = push_all(depacketizer, packetize(small, 2), lost_before=True)
     assert [(unit.timestamp, unit.complete) for unit in units] == [(1, False), (2, True)]
 
 
@@ -338,8 +338,8 @@ def test_malformed_payload_is_counted(payload: bytes) -> None:
     assert depacketizer.malformed == 1
     assert not unit.complete
     assert unit.data.startswith(byte_stream(SLICE + b"good"))
-    (after,) = depacketizer.push(packet(SLICE + b"next", 2, marker=True), False)
-    assert after.complete
+    (next_unit,) = depacketizer.push(packet(SLICE + b"next", 2, marker=True), False)
+    assert next_unit.complete
 
 
 @pytest.mark.parametrize(
@@ -399,7 +399,7 @@ PAYLOADS = st.builds(lambda head, tail: head + tail, HEADS, st.binary(max_size=2
 
 @given(st.lists(st.tuples(PAYLOADS, st.integers(0, 2), st.booleans(), st.booleans()), max_size=30))
 def test_any_payloads(steps: list[tuple[bytes, int, bool, bool]]) -> None:
-    """No payloads make the depacketizer raise or affect later access units, and a push returns two units at most."""
+    """Arbitrary payloads raise nothing and do not affect later access units; a push returns at most two units."""
     depacketizer = Depacketizer()
     for payload, timestamp, marker, lost_before in steps:
         units = depacketizer.push(packet(payload, timestamp, marker), lost_before)

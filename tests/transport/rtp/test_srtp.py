@@ -34,7 +34,7 @@ def counters(unprotector: Unprotector) -> tuple[int, int]:
     key=st.binary(min_size=28, max_size=28),
 )
 def test_round_trip(payload: bytes, first: int, key: bytes) -> None:
-    """A protected packet is unprotected unchanged for any payload, key and first sequence number."""
+    """A packet is the same after it was protected and unprotected, for any payload, key and first number."""
     plain = packet(first, payload)
     protected = Protector(key).protect(plain)
     assert len(protected) == len(plain) + 16
@@ -48,7 +48,7 @@ def test_payload_is_not_readable() -> None:
 
 
 def test_sequence_numbers_wrap() -> None:
-    """Every packet is unprotected while the sequence numbers wrap twice."""
+    """Every packet is accepted while the sequence numbers wrap twice."""
     protector, unprotector = Protector(KEY), Unprotector(KEY)
     packets = [packet(sequence) for sequence in range(32000, 2 * 65536 + 100, 3)]
     assert [unprotector.unprotect(protector.protect(plain)) for plain in packets] == packets
@@ -57,7 +57,7 @@ def test_sequence_numbers_wrap() -> None:
 
 @given(st.permutations(range(65500, 65572)))
 def test_reordered_at_the_wrap(order: list[int]) -> None:
-    """Packets around the wrap are unprotected in any order of arrival, once the stream is known."""
+    """Packets around the wrap are accepted in any order of arrival, once the stream is known."""
     protector, unprotector = Protector(KEY), Unprotector(KEY)
     for sequence in (32000, 64000):
         assert unprotector.unprotect(protector.protect(packet(sequence)))
@@ -74,7 +74,7 @@ def test_next_packet_after_many_missed_ones_is_accepted() -> None:
 
 
 def test_first_packet_of_65535_missed() -> None:
-    """If a stream begins at 65535 and that packet is lost, no other is accepted: streams must begin below 2^15."""
+    """If a stream begins at 65535 and that packet is lost, no later one is accepted: streams must begin below 2^15."""
     protector, unprotector = Protector(KEY), Unprotector(KEY)
     protected = [protector.protect(packet(sequence)) for sequence in range(65535, 65535 + 100)]
     assert [unprotector.unprotect(datagram) for datagram in protected[1:]] == [None] * 99
@@ -128,7 +128,7 @@ def test_packet_under_another_key_is_rejected() -> None:
 
 
 def test_plain_packets_are_rejected() -> None:
-    """Unprotected packets are rejected."""
+    """Packets that were not protected are rejected."""
     unprotector = Unprotector(KEY)
     assert unprotector.unprotect(packet(1, bytes(100))) is None
     assert unprotector.unprotect_rtcp(RTCP_REPORT) is None

@@ -14,8 +14,8 @@ NOW_NS = 1_800_000_000 * NS_PER_S
 def test_expired_authority() -> None:
     """An authority signs certificates until the second it expires, and is rejected afterwards."""
     authority = certificates.new_authority(NOW_NS, 10)
-    last = NOW_NS + 10 * certificates.NS_PER_DAY
-    for now_ns in (NOW_NS, last - NS_PER_S):
+    expiry_ns = NOW_NS + 10 * certificates.NS_PER_DAY
+    for now_ns in (NOW_NS, expiry_ns - NS_PER_S):
         pair = certificates.new_certificate(
             authority, "one", "operator", server_hosts=None, now_wall_ns=now_ns, days=30
         )
@@ -23,7 +23,7 @@ def test_expired_authority() -> None:
             "one", "operator", (), "2027-01-25"
         )
     with pytest.raises(UserError, match="2027-01-25"):
-        certificates.new_certificate(authority, "one", "operator", server_hosts=None, now_wall_ns=last, days=30)
+        certificates.new_certificate(authority, "one", "operator", server_hosts=None, now_wall_ns=expiry_ns, days=30)
 
 
 @pytest.mark.parametrize(

@@ -36,8 +36,8 @@ from lavt.transport.security.envelope import (
 from lavt.transport.security.keys import PrivateKey
 
 MAX_ENTRIES, MAX_ENVELOPE_BYTES = 8, 1280
-"""The limits of the design: pending requests or key agreements, and the size of an envelope. They are repeated here so
-that a change in the code fails a test."""
+"""The design's limits on pending requests, on key agreements and on the size of an envelope, repeated here: a change of
+the code's limits must change these, too."""
 COMMAND = Command(77, 3, 1, 2, 3, 0.1, 0.2, 0.0, (0.0,) * PATH_POINTS, "drive", 0)
 TOKEN = bytes(range(16))
 GRANTED = SessionReply(True, "", 77, TOKEN, 5600, "kernel", 0)
@@ -89,7 +89,7 @@ def pair() -> Pair:
 
 
 def test_the_first_request_must_be_retried(pair: Pair) -> None:
-    """A server that has just started accepts a request only with its own replay counter, which its reply contains."""
+    """A server that has just started rejects the first request; its reply has the replay counter for the retry."""
     request = pair.vehicle.verify_request("session", pair.signed_request())
     assert request is not None
     assert request.is_stale
@@ -130,7 +130,7 @@ def test_without_a_session_no_mac_is_valid(pair: Pair) -> None:
 
 
 def test_after_a_release_commands_are_rejected(pair: Pair) -> None:
-    """After the active operator has released the vehicle, its commands are rejected."""
+    """After the active operator has released the vehicle, this operator's commands are rejected."""
     pair.acquire_control()
     pair.exchange(pair.signed_request("release"), SessionReply(True, "", 0, b"", 5600, "kernel", 0))
     assert not pair.vehicle.is_from_active_operator(pair.signed_command())
@@ -141,16 +141,16 @@ def test_an_altered_command_is_rejected(pair: Pair) -> None:
     """A command with one altered byte fails its MAC check, its signature check, or both."""
     pair.acquire_control()
     signed = pair.signed_command()
-    for at in range(len(signed)):
-        altered = signed[:at] + bytes([signed[at] ^ 1]) + signed[at + 1 :]
-        before_signature = at < len(signed) - 64
+    for position in range(len(signed)):
+        altered = signed[:position] + bytes([signed[position] ^ 1]) + signed[position + 1 :]
+        before_signature = position < len(signed) - 64
         assert not (before_signature and pair.vehicle.is_from_active_operator(altered))
-        in_mac = len(signed) - TRAILER_BYTES <= at < len(signed) - 64
+        in_mac = len(signed) - TRAILER_BYTES <= position < len(signed) - 64
         assert (pair.vehicle.verify_command(altered) is None) != in_mac
 
 
 def test_a_mac_is_valid_for_one_channel_and_one_message(pair: Pair) -> None:
-    """The cheap checks reject a message on another channel, and a request or state that was accepted before."""
+    """A MAC is not valid on another channel, nor for a request or a state that was accepted before."""
     pair.acquire_control()
     request = pair.signed_request()
     assert pair.vehicle.is_next_of_active_operator("session", request)
@@ -273,10 +273,9 @@ def test_a_reply_is_accepted_once(pair: Pair) -> None:
     request = pair.vehicle.verify_request("session", data)
     assert request is not None
     signed = pair.vehicle.sign_reply(request, encode(GRANTED))
-    for at in range(len(signed)):
-        assert (
-            pair.operator.verify_reply("session", signed[:at] + bytes([signed[at] ^ 1]) + signed[at + 1 :]).body is None
-        )
+    for position in range(len(signed)):
+        altered = signed[:position] + bytes([signed[position] ^ 1]) + signed[position + 1 :]
+        assert pair.operator.verify_reply("session", altered).body is None
     other = VehicleAuthenticator("car", MALLORY, OPERATORS)
     other_request = other.verify_request("session", data)
     assert other_request is not None
@@ -337,7 +336,7 @@ def test_after_a_reply_old_states_are_still_replays(pair: Pair) -> None:
 
 
 def test_states_of_a_restarted_server_are_accepted_after_its_first_reply(pair: Pair) -> None:
-    """A state of a server process that has not answered yet needs a request; after the reply states are accepted."""
+    """States of a restarted server are rejected until it has answered a request."""
     pair.acquire_control()
     restarted = VehicleAuthenticator("car", VEHICLE, OPERATORS)
     state = pair.operator.verify_state(restarted.sign_state(b"new"))

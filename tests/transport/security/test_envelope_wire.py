@@ -15,6 +15,7 @@ from lavt.transport.security.envelope import MAX_ENVELOPE_BYTES, OperatorAuthent
 pytest.importorskip("cryptography", reason="an extra: pip install 'lavt[secure]'")
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PublicKey
 
 from lavt.transport.security.keys import KeyAgreement, PrivateKey, decrypt
 
@@ -75,7 +76,7 @@ def test_bytes_of_commands_states_and_requests(session: Session) -> None:
 @pytest.mark.parametrize("stale", [False, True])
 def test_bytes_of_a_reply(session: Session, *, stale: bool) -> None:
     """A reply carries a signature and no MAC, as `docs/wire.md` describes."""
-    client = session.operator._agreement = KeyAgreement()
+    client_agreement = session.operator._agreement = KeyAgreement()
     data = session.operator.sign_request("session", ACQUIRE)
     request = session.vehicle.verify_request("session", data)
     assert request is not None
@@ -84,9 +85,11 @@ def test_bytes_of_a_reply(session: Session, *, stale: bool) -> None:
     digest = hashlib.sha256(data).digest()[:16]
     counter = session.vehicle.sign_state(b"")[:8] + bytes(7) + b"\2"
     assert (signed[:16], signed[16:17], signed[17:33]) == (digest, b"\1" if stale else b"\0", counter)
-    server = signed[33:65]
-    secret = client.derive_secret(server, b"LAVT 1 secret car\0" + client.public + server)
-    assert secret is not None
+    server_public = signed[33:65]
+    shared = client_agreement._key.exchange(X25519PublicKey.from_public_bytes(server_public))
+    extracted = hmac.digest(bytes(32), shared, "sha256")  # RFC 5869 with 32 zeros as salt
+    context = b"LAVT 1 secret car\0" + client_agreement.public + server_public
+    secret = hmac.digest(extracted, context + b"\1", "sha256")
     assert decrypt(secret, signed[65:], digest) == GRANTED
 
 

@@ -19,12 +19,12 @@ FLOOD_PER_S = 10_000
 
 
 def new_filter() -> FloodFilter:
-    """Make a filter to which every envelope that ends with a zero byte is from the active operator."""
+    """Make a filter that takes an envelope for the active operator's if its last byte is zero."""
     return FloodFilter(lambda: (EPOCH, SEQUENCE), lambda data: data.endswith(b"\0"))
 
 
 def count_passed(flood_filter: FloodFilter, bodies: list[bytes], *, from_active_operator: bool = True) -> int:
-    """Return how many of `bodies`, which arrive within one second, pass."""
+    """Send `bodies` within one second; return how many of them the filter passes."""
     end = b"\0" if from_active_operator else b"\1"
     return sum(
         flood_filter.passes(body + end, body, number * NS_PER_S // len(bodies)) for number, body in enumerate(bodies)
@@ -40,10 +40,10 @@ def test_acceptable_commands_always_pass() -> None:
 
 
 def test_unacceptable_commands_are_rate_limited() -> None:
-    """Of 10000 unacceptable commands a second 200 pass, and the others are counted."""
-    chance = stream(1, "flood")
+    """Of 10000 unacceptable commands in a second, 200 pass, and the others are counted."""
+    generator = stream(1, "flood")
     floods = {
-        "garbage": [chance.bytes(200) for _ in range(FLOOD_PER_S)],
+        "garbage": [generator.bytes(200) for _ in range(FLOOD_PER_S)],
         "another epoch": [encode(replace(COMMAND, epoch=number)) for number in range(FLOOD_PER_S)],
         "replayed": [encode(replace(COMMAND, sequence=SEQUENCE))] * FLOOD_PER_S,
         "too long": [bytes(5000)] * FLOOD_PER_S,
@@ -63,7 +63,7 @@ def always_passes(flood_filter: FloodFilter, command: Command) -> bool:
 
 @pytest.mark.parametrize("authentic", [[5], [3, 5], [5, 3]])
 def test_commands_up_to_the_newest_authentic_one_are_replays(authentic: list[int]) -> None:
-    """Commands up to the newest authentic one are rate-limited, in whatever order the authentic ones came."""
+    """Commands up to the newest authentic one are rate-limited, in whatever order the authentic commands came."""
     for replayed, always in ((4, False), (5, False), (6, True)):
         flood_filter = new_filter()
         for number in authentic:
@@ -98,20 +98,20 @@ def test_a_flood_by_others_does_not_displace_the_active_operator() -> None:
 def test_a_rate_limit_counts_per_second() -> None:
     """A rate limiter permits its number of messages in a second, and as many again in the next."""
     limiter = RateLimiter(3)
-    assert [limiter.take(at) for at in (5, 6, 7, 8, 9)] == [True, True, True, False, False]
-    assert [limiter.take(at) for at in (NS_PER_S - 1, NS_PER_S, NS_PER_S + 1)] == [False, True, True]
+    assert [limiter.take(now_ns) for now_ns in (5, 6, 7, 8, 9)] == [True, True, True, False, False]
+    assert [limiter.take(now_ns) for now_ns in (NS_PER_S - 1, NS_PER_S, NS_PER_S + 1)] == [False, True, True]
     assert [limiter.take(2 * NS_PER_S - 1) for _ in range(2)] == [True, False]
-    assert [limiter.take(2 * NS_PER_S + at) for at in (0, 1, 2, 3)] == [True, True, True, False]
+    assert [limiter.take(2 * NS_PER_S + after_ns) for after_ns in (0, 1, 2, 3)] == [True, True, True, False]
 
 
 @given(st.binary(max_size=300))
-def test_arbitrary_bytes_may_not_be_accepted(data: bytes) -> None:
+def test_arbitrary_bytes_are_no_command(data: bytes) -> None:
     """Arbitrary bytes are not mistaken for a command and raise nothing."""
     assert not may_be_accepted(data, EPOCH, SEQUENCE)
 
 
 @pytest.mark.parametrize(
-    "head",
+    "first_fields",
     [
         [VERSION + 1, EPOCH, SEQUENCE + 1],
         [float(VERSION), EPOCH, SEQUENCE + 1],
@@ -120,16 +120,16 @@ def test_arbitrary_bytes_may_not_be_accepted(data: bytes) -> None:
         [VERSION, EPOCH],
     ],
 )
-def test_a_malformed_head_may_not_be_accepted(head: list[object]) -> None:
+def test_a_message_with_malformed_first_fields_is_no_command(first_fields: list[object]) -> None:
     """A message of another version, or without integers at its beginning, is not mistaken for a command."""
     _, _, _, *rest = msgpack.unpackb(encode(COMMAND))
     assert may_be_accepted(msgpack.packb([VERSION, EPOCH, SEQUENCE + 1, *rest]), EPOCH, SEQUENCE)
-    assert not may_be_accepted(msgpack.packb([*head, *rest]), EPOCH, SEQUENCE)
+    assert not may_be_accepted(msgpack.packb([*first_fields, *rest]), EPOCH, SEQUENCE)
 
 
 @given(st.integers(0, 2**64 - 1), st.integers(0, 2**63 - 1))
-def test_the_head_of_any_command_is_read(epoch: int, sequence: int) -> None:
-    """Epoch and sequence of any size are read from the head of a command."""
+def test_epoch_and_sequence_of_any_command_are_read(epoch: int, sequence: int) -> None:
+    """Epoch and sequence of any size are read from the first fields of a command."""
     body = encode(replace(COMMAND, epoch=epoch, sequence=sequence))
     assert may_be_accepted(body, epoch, sequence - 1)
     assert not may_be_accepted(body, epoch, sequence)

@@ -20,7 +20,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from lavt.transport.security.keys import PrivateKey
 
 OTHER_COMMANDS_PER_S, QUERIES_PER_S, STATES_PER_S, MAX_PENDING_QUERIES = 200, 100, 500, 64
-"""The design's limits, repeated here so that a change in the code fails a test."""
+"""The design's limits, repeated here: a change of the code's limits must change these, too."""
 ACQUIRE = encode(SessionRequest("acquire", "alice", 5, 0))
 GRANTED = encode(SessionReply(True, "", 7, bytes(range(16)), 5600, "kernel", 0))
 COMMAND = encode(Command(7, 3, 1, 2, 3, 0.1, 0.2, 0.0, (0.0,) * PATH_POINTS, "drive", 0))
@@ -120,7 +120,7 @@ def test_replays_of_a_rejected_command_are_rate_limited(pair: GatewayPair) -> No
 
 
 def test_another_operators_emergency_stop_does_not_displace_the_active_operators_commands(pair: GatewayPair) -> None:
-    """After another operator's stop with the highest sequence, commands still pass during a flood of replays."""
+    """Another operator's emergency stop with the highest sequence makes no command of the active operator a replay."""
     pair.client.send(Send("control", COMMAND))
     recorded = pair.in_flight.pop().payload
     stop = encode(Command(7, 2**63 - 1, 1, 2, 3, 0.1, 0.2, 0.0, (0.0,) * PATH_POINTS, "drive", 1))
@@ -134,7 +134,7 @@ def test_another_operators_emergency_stop_does_not_displace_the_active_operators
 
 
 def test_a_forged_signature_does_not_displace_the_true_command(pair: GatewayPair) -> None:
-    """A copy of a command with its MAC but a broken signature does not make the true command a replay."""
+    """A copy of a command with a valid MAC but a broken signature does not make the true command a replay."""
     for command in (COMMAND, NEXT_COMMAND):
         pair.client.send(Send("control", command))
     first, following = (pair.in_flight.pop(0).payload for _ in range(2))
@@ -148,25 +148,25 @@ def test_a_forged_signature_does_not_displace_the_true_command(pair: GatewayPair
 
 
 def test_states_of_a_restarted_server_cause_one_request_a_second(pair: GatewayPair) -> None:
-    """States of a restarted server are rejected until it has answered a request, which is sent once a second."""
+    """States of a restarted server are rejected until the server has answered a request, sent once a second."""
     # The first client now talks to a second server, which gets the keys of the first one as if it had restarted.
     restarted = GatewayPair()
     restarted.client, pair.client = pair.client, restarted.client
     restarted_vehicle, vehicle = vars(restarted.server._authenticator), vars(pair.server._authenticator)
     for name in ("_key", "_operators"):
         restarted_vehicle[name] = vehicle[name]
-    requested, times = [], []
+    requests, state_numbers = [], []
     for number in range(100):
         restarted.server.send(Send("state", b"state"))
         state = restarted.in_flight.pop()
         pair.in_flight.clear()
         restarted.client.receive("state", state.payload, Now(number * NS_PER_S // 50, 0), None)
-        requested += pair.in_flight
-        times += [number] * len(pair.in_flight)
-    assert [send.channel for send in requested] == ["session", "session"]
-    assert times == [0, 50]
+        requests += pair.in_flight
+        state_numbers += [number] * len(pair.in_flight)
+    assert [send.channel for send in requests] == ["session", "session"]
+    assert state_numbers == [0, 50], "there are 50 states a second"
     assert ("state", b"state") not in pair.client_received
-    restarted.server.receive("session", requested[-1].payload, Now(0, 0), "query")
+    restarted.server.receive("session", requests[-1].payload, Now(0, 0), "query")
     restarted.client.receive("session_reply", restarted.in_flight.pop().payload, Now(0, 0), None)
     restarted.server.send(Send("state", b"state"))
     restarted.client.receive("state", restarted.in_flight.pop().payload, Now(0, 0), None)
@@ -183,7 +183,7 @@ def test_states_of_a_known_server_cause_no_query(pair: GatewayPair) -> None:
 
 @pytest.mark.parametrize("signed", [True, False])
 def test_queries_are_rate_limited(pair: GatewayPair, signed: bool) -> None:
-    """Of 10000 queries in a second 100 are verified and the others are counted."""
+    """Of 10000 queries in a second, 100 pass the limit and the others are counted."""
     received: list[bytes] = []
     gateway = (
         pair.server
@@ -202,7 +202,7 @@ def test_queries_are_rate_limited(pair: GatewayPair, signed: bool) -> None:
 
 
 def test_the_gateway_is_unlocked_while_the_link_sends(pair: GatewayPair) -> None:
-    """A gateway does not hold its lock while the link sends, not even for the reply to a stale request."""
+    """A gateway's lock is free while the link sends, also while it sends the reply to a stale request."""
     unlocked: list[bool] = []
 
     def carry(*sends: Send) -> None:
@@ -218,7 +218,7 @@ def test_the_gateway_is_unlocked_while_the_link_sends(pair: GatewayPair) -> None
 
 
 def test_a_retry_is_sent_in_another_thread() -> None:
-    """The retry of a request is sent from a daemon thread, because Zenoh sends nothing in the thread that delivers."""
+    """The retry of a request is sent from a daemon thread, because Zenoh cannot send in the delivering thread."""
     pair = GatewayPair()
     del pair.client._send_in_thread
     pair.client.send(Send("session", ACQUIRE))
@@ -233,7 +233,7 @@ def test_a_retry_is_sent_in_another_thread() -> None:
 
 
 def test_states_are_rate_limited(pair: GatewayPair) -> None:
-    """Of 10000 forged states in a second 500 are verified and the others are counted."""
+    """Of 10000 forged states in a second, 500 are verified, and the others are counted."""
     for _ in range(10_000):
         pair.client.receive("state", bytes(200), Now(2 * NS_PER_S, 0), None)
     assert pair.client.counts["states_screened_out"] == 10_000 - STATES_PER_S
@@ -281,7 +281,7 @@ def test_pending_requests_are_bounded() -> None:
 
 
 def test_an_open_gateway_changes_nothing() -> None:
-    """Where nothing is signed, the operator's gateway passes messages unchanged."""
+    """Without keys, the operator's gateway passes messages unchanged."""
     delivered: list[Any] = []
     sent: list[Send] = []
     gateway = OpenClientGateway(lambda *message: delivered.append(message), lambda *sends: sent.extend(sends))

@@ -55,7 +55,7 @@ def test_a_public_key_verifies_the_signatures_of_its_private_key(tmp_path: Path)
 
 
 def test_a_signing_key_expires(tmp_path: Path) -> None:
-    """A pair is valid until the given number of days has passed, and `load` without a time accepts it afterwards."""
+    """A pair expires after the given number of days; loading it without a time checks no expiry."""
     pair = new_signing_pair(NOW_NS, 30)
     for data, load in ((pair.private, load_private), (pair.public, load_public)):
         path = tmp_path / "key"
@@ -69,7 +69,7 @@ def test_a_signing_key_expires(tmp_path: Path) -> None:
 
 
 def test_a_key_without_expiry_is_valid_at_any_time(tmp_path: Path) -> None:
-    """A key that another program has made has no expiry."""
+    """A key without expiry, as other programs make it, is valid at any time."""
     private, public = write_pair(tmp_path, Ed25519PrivateKey.generate())
     load_private(private, 2**62)
     load_public(public, 2**62)
@@ -127,7 +127,7 @@ def test_two_ends_agree_on_a_secret() -> None:
 
 
 def test_encrypted_text_needs_its_secret_and_context() -> None:
-    """Encryption adds a fresh nonce of 12 bytes and a tag of 16 bytes; altered or truncated data is rejected."""
+    """Encryption adds a fresh nonce and a tag; another secret or context, or altered data, is rejected."""
     secret = bytes(range(32))
     data = encrypt(secret, b"text", b"context")
     assert len(data) == 12 + len(b"text") + 16

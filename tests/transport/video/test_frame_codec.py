@@ -10,11 +10,11 @@ from lavt.transport.rtp.jitter_buffer import JitterBuffer
 from lavt.transport.rtp.rtp import AccessUnit, Depacketizer, Packetizer, parse_packet
 from lavt.transport.video.frame_codec import MAX_STORED_PICTURES, InMemoryFrameCodec, LaneReceiver, LaneSender
 
-numbers = st.floats(allow_nan=False)
+NUMBERS = st.floats(allow_nan=False)
 STAMP_NS = 1_790_000_000_123_456_789
 
 
-def through_rtp(access_units: list[bytes], lost: int | None = None) -> list[AccessUnit]:
+def send_over_rtp(access_units: list[bytes], lost: int | None = None) -> list[AccessUnit]:
     """Send access units as packets, of which one may be lost, and return the access units that arrive."""
     packetizer, jitter_buffer, depacketizer = Packetizer(7, 65_530), JitterBuffer(), Depacketizer()
     packets = [packet for number, unit in enumerate(access_units) for packet in packetizer.packetize(unit, number)]
@@ -33,13 +33,13 @@ def picture(number: int) -> Picture:
     return np.random.default_rng(number).integers(0, 256, (96, 128, 3), dtype=np.uint8)
 
 
-@given(st.integers(0, 2**63 - 1), st.integers(0, 2**63 - 1), st.lists(numbers, min_size=7, max_size=7))
+@given(st.integers(0, 2**63 - 1), st.integers(0, 2**63 - 1), st.lists(NUMBERS, min_size=7, max_size=7))
 def test_a_lane_arrives_as_it_was_sent(stamp_ns: int, at_ns: int, values: list[float]) -> None:
     """A lane and its stamp arrive through RTP bit for bit."""
     c0, c1, c2, *rest = values
     sender, receiver = LaneSender(), LaneReceiver()
     stamped = sender.write_stamp(SeenLane(0, at_ns, Lane((c0, c1, c2), *rest)), stamp_ns)
-    (unit,) = through_rtp([sender.encode(stamped, keyframe=False)])
+    (unit,) = send_over_rtp([sender.encode(stamped, keyframe=False)])
     received = receiver.decode(unit.data)
     assert received is not None
     assert received.picture == stamped
@@ -65,7 +65,7 @@ def test_pixels_arrive_as_they_were_rendered() -> None:
     """A received picture has the pixels and the stamp that it had when it was encoded, and can be decoded once."""
     codec = InMemoryFrameCodec()
     stamped = codec.write_stamp(picture(1), STAMP_NS)
-    (unit,) = through_rtp([codec.encode(stamped, keyframe=False)])
+    (unit,) = send_over_rtp([codec.encode(stamped, keyframe=False)])
     expected = stamped.copy()
     stamped[:] = 0  # the camera reuses its buffer
     received = codec.decode(unit.data)
@@ -78,7 +78,7 @@ def test_pixels_arrive_as_they_were_rendered() -> None:
 def test_a_lost_picture_damages_no_other() -> None:
     """Access units are independent: after a loss the next one is complete, and the lost picture is dropped."""
     codec = InMemoryFrameCodec()
-    units = through_rtp([codec.encode(picture(number), keyframe=False) for number in range(4)], lost=1)
+    units = send_over_rtp([codec.encode(picture(number), keyframe=False) for number in range(4)], lost=1)
     assert [unit.complete for unit in units] == [True, True, True]
     received = [codec.decode(unit.data) for unit in units]
     assert [

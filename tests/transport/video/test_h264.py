@@ -29,9 +29,9 @@ def moving_pictures(count: int) -> list[Picture]:
     return pictures
 
 
-def encoder(**changes: float) -> Encoder:
-    settings_of_encoder = {"rate_hz": 30, "bit_rate_bps": 1_000_000, "gop_frames": GOP_FRAMES} | changes
-    return Encoder(WIDTH, HEIGHT, **settings_of_encoder)  # type: ignore[arg-type]
+def new_encoder(**changes: float) -> Encoder:
+    encoder_settings = {"rate_hz": 30, "bit_rate_bps": 1_000_000, "gop_frames": GOP_FRAMES} | changes
+    return Encoder(WIDTH, HEIGHT, **encoder_settings)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def pictures() -> list[Picture]:
 
 @pytest.fixture(scope="module")
 def access_units(pictures: list[Picture]) -> list[bytes]:
-    encode = encoder().encode
+    encode = new_encoder().encode
     return [encode(picture) for picture in pictures]
 
 
@@ -51,7 +51,7 @@ def nal_types(access_unit: bytes) -> list[int]:
 
 def test_each_picture_is_decoded_without_delay(pictures: list[Picture]) -> None:
     """Each picture gives one access unit, which decodes to that picture with its stamp, without a frame of delay."""
-    sender, receiver = encoder(), Decoder()
+    sender, receiver = new_encoder(), Decoder()
     for number, picture in enumerate(pictures):
         access_unit = sender.encode(picture)
         assert sum(nal_type in {1, 5} for nal_type in nal_types(access_unit)) == 1
@@ -72,7 +72,7 @@ def test_decoded_picture_resembles_the_original(pictures: list[Picture], access_
     plain[:] = 200, 100, 50
     plain[:STAMP_PX, :STAMP_PX] = 255
     plain[-STAMP_PX:, -STAMP_PX:] = 0
-    decoded_plain = Decoder().decode(encoder().encode(plain))
+    decoded_plain = Decoder().decode(new_encoder().encode(plain))
     assert decoded_plain is not None
     assert np.abs(decoded_plain.picture[120, 160].astype(int) - (200, 100, 50)).max() < 4
     assert abs(int(decoded_plain.luma[20, 20]) - 235) < 3
@@ -81,13 +81,13 @@ def test_decoded_picture_resembles_the_original(pictures: list[Picture], access_
 
 def test_encoding_is_reproducible(pictures: list[Picture], access_units: list[bytes]) -> None:
     """Encoding is byte-for-byte reproducible by another encoder."""
-    encode = encoder().encode
+    encode = new_encoder().encode
     assert [encode(picture) for picture in pictures] == access_units
 
 
 def test_decoded_pictures_are_not_overwritten(pictures: list[Picture]) -> None:
     """A decoded picture is not overwritten when later pictures are encoded and decoded."""
-    sender, receiver = encoder(), Decoder()
+    sender, receiver = new_encoder(), Decoder()
     first = receiver.decode(sender.encode(pictures[0]))
     assert first is not None
     copies = first.luma.copy(), first.picture.copy()
@@ -105,7 +105,7 @@ def test_keyframes(access_units: list[bytes]) -> None:
 
 def test_keyframe_on_request(pictures: list[Picture]) -> None:
     """A keyframe is sent with the frame for which it was requested, and decoding can begin with it."""
-    sender = encoder(gop_frames=300)
+    sender = new_encoder(gop_frames=300)
     units = [sender.encode(picture, keyframe=number == 7) for number, picture in enumerate(pictures[:10])]
     assert [number for number, unit in enumerate(units) if 5 in nal_types(unit)] == [0, 7]
     assert nal_types(units[7])[:2] == [7, 8]
@@ -117,10 +117,10 @@ def test_keyframe_on_request(pictures: list[Picture]) -> None:
 
 
 def test_bit_rate(pictures: list[Picture], access_units: list[bytes]) -> None:
-    """The stream keeps to its bit rate, and a smaller decoder buffer gives a smaller largest frame."""
+    """The stream has about the requested bit rate; with a smaller decoder buffer the largest frame is smaller."""
     bits = 8 * sum(len(unit) for unit in access_units)
     assert 0.5e6 < bits / (len(access_units) / 30) < 1.3e6
-    encode = encoder(buffer_s=1 / 30).encode
+    encode = new_encoder(buffer_s=1 / 30).encode
     assert max(len(encode(picture)) for picture in pictures) < max(len(unit) for unit in access_units)
 
 
@@ -141,7 +141,7 @@ def test_no_picture_before_a_keyframe(access_units: list[bytes]) -> None:
 
 
 def test_truncated_access_unit(access_units: list[bytes]) -> None:
-    """A truncated access unit gives a concealed picture that is marked corrupt."""
+    """A truncated access unit gives a picture with concealed damage, marked as corrupt."""
     receiver = Decoder()
     receiver.decode(access_units[0])
     decoded = receiver.decode(access_units[1][: len(access_units[1]) // 2])
@@ -163,7 +163,7 @@ def test_keyframe_after_damage(access_units: list[bytes]) -> None:
 
 
 def test_lost_access_units(access_units: list[bytes]) -> None:
-    """After two consecutive losses each access unit gives a picture; the next keyframe decodes to its own picture."""
+    """After two lost access units each later one gives a picture, and the next keyframe gives the picture sent."""
     receiver = Decoder()
     receiver.decode(access_units[0])
     for number in range(3, GOP_FRAMES):
@@ -187,7 +187,7 @@ def test_sender_restarts_with_another_size(access_units: list[bytes]) -> None:
 @settings(max_examples=60)
 @given(st.binary(max_size=200), st.booleans())
 def test_any_bytes(access_units: list[bytes], data: bytes, start_code: bool) -> None:
-    """No bytes make the decoder raise or prevent it from decoding the next keyframe."""
+    """Arbitrary bytes raise nothing and do not prevent the decoder from decoding the next keyframe."""
     receiver = Decoder()
     receiver.decode(access_units[0])
     receiver.decode(b"\x00\x00\x00\x01" * start_code + data)
@@ -201,8 +201,8 @@ def test_any_bytes(access_units: list[bytes], data: bytes, start_code: bool) -> 
 def test_damage_is_deterministic(access_units: list[bytes], damage: list[tuple[int, int, int]]) -> None:
     """Decoding a damaged stream is reproducible: concealment does not depend on uninitialized memory."""
     units = [bytearray(unit) for unit in access_units[:GOP_FRAMES]]
-    for number, at, flip in damage:
-        units[number][at % len(units[number])] ^= flip
+    for number, position, flipped_bits in damage:
+        units[number][position % len(units[number])] ^= flipped_bits
     first, second = Decoder(), Decoder()
     for unit in units:
         one, other = first.decode(bytes(unit)), second.decode(bytes(unit))
@@ -214,7 +214,7 @@ def test_damage_is_deterministic(access_units: list[bytes], damage: list[tuple[i
 
 @pytest.mark.parametrize("size", [(321, 240), (320, 241), (62, 240), (320, 62), (8192, 8192)])
 def test_invalid_sizes_are_rejected(size: tuple[int, int]) -> None:
-    """Odd sizes, sizes smaller than the stamp and sizes beyond the decoder's limit are rejected."""
+    """Sizes that are odd, smaller than the stamp or larger than the decoder's limit are rejected."""
     with pytest.raises(UserError, match="choose"):
         Encoder(*size, rate_hz=30, bit_rate_bps=1_000_000, gop_frames=15)
 
@@ -226,7 +226,7 @@ def test_invalid_sizes_are_rejected(size: tuple[int, int]) -> None:
 def test_invalid_rates_are_rejected(change: dict[str, float]) -> None:
     """Rates, keyframe intervals and buffers of zero are rejected."""
     with pytest.raises(UserError, match="choose"):
-        encoder(**change)
+        new_encoder(**change)
 
 
 def test_unknown_preset_is_rejected() -> None:
@@ -238,7 +238,7 @@ def test_unknown_preset_is_rejected() -> None:
 def test_picture_of_another_size_is_rejected() -> None:
     """A picture of another size than the encoder's is rejected."""
     with pytest.raises(UserError, match="shape"):
-        encoder().encode(np.zeros((WIDTH, HEIGHT, 3), np.uint8))
+        new_encoder().encode(np.zeros((WIDTH, HEIGHT, 3), np.uint8))
 
 
 def test_nothing_is_printed(
@@ -248,7 +248,7 @@ def test_nothing_is_printed(
     receiver = Decoder()
     receiver.decode(access_units[1])
     receiver.decode(access_units[0][:500])
-    sender = encoder()
+    sender = new_encoder()
     sender.encode(np.zeros((HEIGHT, WIDTH, 3), np.uint8))
     del sender
     assert capfd.readouterr() == ("", "")

@@ -1,4 +1,4 @@
-"""A video path in virtual time, with an attacker who has overheard hellos and sends with any source address."""
+"""Test a video path in virtual time, with an attacker who overhears hellos and sends with any source address."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Path:
         """The datagrams of the client's path validation."""
         self.challenges: list[bytes] = []
         """The challenges that arrived at the client's address."""
-        self.at_attacker: Callable[[bytes], None] = lambda _datagram: None
+        self.receive_at_attacker: Callable[[bytes], None] = lambda _datagram: None
         self.fate: Callable[[Address, bytes], tuple[int, ...]] = lambda _source, _datagram: (one_way_ns,)
         self.arrivals: list[tuple[int, bool]] = []
         """For each video packet at the client, when it arrived, and whether the client could decrypt it."""
@@ -65,20 +65,20 @@ class Path:
         self._events: list[tuple[int, int, Callable[[], None]]] = []
         self._order = count()
         for period_ns, action in ((FRAME_NS, self._frame), (POLL_NS, self._poll), (REPORT_NS, self._report)):
-            self.every(period_ns, action)
+            self.schedule_every(period_ns, action)
 
-    def at(self, time_ns: int, action: Callable[[], None]) -> None:
+    def schedule(self, time_ns: int, action: Callable[[], None]) -> None:
         """Call `action` at a time."""
         heapq.heappush(self._events, (time_ns, next(self._order), action))
 
-    def every(self, period_ns: int, action: Callable[[], None], since_ns: int = 0) -> None:
-        """Call `action` in each period."""
+    def schedule_every(self, period_ns: int, action: Callable[[], None], since_ns: int = 0) -> None:
+        """Call `action` once in each period, from `since_ns` on."""
 
         def repeat() -> None:
             action()
-            self.at(self.now_ns + period_ns, repeat)
+            self.schedule(self.now_ns + period_ns, repeat)
 
-        self.at(since_ns, repeat)
+        self.schedule(since_ns, repeat)
 
     def run(self, until_ns: int = ATTACK_END_NS) -> None:
         """Run until a time."""
@@ -89,10 +89,10 @@ class Path:
     def send(self, source: Address, target: Address, datagram: bytes) -> None:
         """Send a datagram from any source address."""
         for delay_ns in self.fate(source, datagram):
-            self.at(self.now_ns + delay_ns, lambda: self._arrive(source, target, datagram))
+            self.schedule(self.now_ns + delay_ns, lambda: self._arrive(source, target, datagram))
 
-    def readable(self, begin_ns: int = ATTACK_START_NS, end_ns: int = ATTACK_END_NS) -> list[bool]:
-        """Return for each packet that arrived in this time whether the client could decrypt it."""
+    def were_readable(self, begin_ns: int = ATTACK_START_NS, end_ns: int = ATTACK_END_NS) -> list[bool]:
+        """Return for each packet that arrived in this interval whether the client could decrypt it."""
         return [readable for at_ns, readable in self.arrivals if begin_ns <= at_ns < end_ns]
 
     def longest_gap_ns(self, begin_ns: int = ATTACK_START_NS, end_ns: int = ATTACK_END_NS) -> int:
@@ -105,7 +105,7 @@ class Path:
         if target == SERVER:
             self._at_server(source, datagram)
         elif target == ATTACKER:
-            self.at_attacker(datagram)
+            self.receive_at_attacker(datagram)
         elif target == self.address:
             self._at_client(datagram)
 
@@ -153,7 +153,7 @@ class Path:
 
 def replay_hello(path: Path, source: Address, rate_hz: int) -> None:
     """Replay the first hello from `source` during the attack."""
-    path.every(NS_PER_S // rate_hz, lambda: path.send(source, SERVER, path.overheard[0]), ATTACK_START_NS)
+    path.schedule_every(NS_PER_S // rate_hz, lambda: path.send(source, SERVER, path.overheard[0]), ATTACK_START_NS)
 
 
 def hellos(path: Path) -> list[bytes]:
@@ -166,8 +166,8 @@ def test_replayed_hellos_from_the_clients_address_leave_the_video_readable(rate_
     path = Path(one_way_ms * NS_PER_MS)
     replay_hello(path, HOME, rate_hz)
     path.run()
-    assert len(path.readable()) > 800
-    assert all(path.readable())
+    assert len(path.were_readable()) > 800
+    assert all(path.were_readable())
     assert path.longest_gap_ns() < 2 * FRAME_NS
 
 
@@ -175,16 +175,16 @@ def test_challenges_that_an_attacker_obtained_leave_the_video_readable() -> None
     """Challenges to replays of a hello, forwarded with the server's source address, make no packet unreadable."""
     path = Path(25 * NS_PER_MS)
     replay_hello(path, ATTACKER, 480)
-    path.at_attacker = lambda challenge: path.send(SERVER, HOME, challenge)
+    path.receive_at_attacker = lambda challenge: path.send(SERVER, HOME, challenge)
     path.run()
-    assert len(path.readable()) > 800
-    assert all(path.readable())
+    assert len(path.were_readable()) > 800
+    assert all(path.were_readable())
     assert path.server.open_address(path.now_ns) == HOME
 
 
 @pytest.mark.parametrize("source", [HOME, ATTACKER])
 def test_a_replayed_hello_neither_moves_nor_stops_the_video(source: Address) -> None:
-    """Every packet goes to the client while all its datagrams are replayed from its own or another address."""
+    """Every packet goes to the client although all the client's datagrams are replayed."""
     path = Path(25 * NS_PER_MS)
 
     def replay_everything() -> None:
@@ -192,17 +192,17 @@ def test_a_replayed_hello_neither_moves_nor_stops_the_video(source: Address) -> 
             path.send(source, SERVER, datagram)
             path.send(SERVER, HOME, datagram)
 
-    path.every(10 * NS_PER_MS, replay_everything, ATTACK_START_NS)
-    path.at_attacker = lambda challenge: path.send(SERVER, HOME, challenge)
+    path.schedule_every(10 * NS_PER_MS, replay_everything, ATTACK_START_NS)
+    path.receive_at_attacker = lambda challenge: path.send(SERVER, HOME, challenge)
     path.run(ATTACK_END_NS + NS_PER_S)
     assert path.server.open_address(path.now_ns) == HOME
-    # At most the packets of 3 s are missing; those of the last second arrive after the time that `readable` covers.
-    assert sum(path.readable(0)) >= path.sent - 3 * 30 * PACKETS_PER_FRAME
+    # At most the packets of 3 s are missing; those of the last second arrive after ATTACK_END_NS.
+    assert sum(path.were_readable(0)) >= path.sent - 3 * 30 * PACKETS_PER_FRAME
     assert path.longest_gap_ns() < 2 * FRAME_NS
 
 
 def test_a_client_behind_a_nat_that_changes_keeps_its_video_under_attack() -> None:
-    """After a change of the client's address, video arrives there again within 0.4 s, while hellos are replayed."""
+    """After a change of the client's address, video arrives there within 0.4 s, although hellos are replayed."""
     path = Path(25 * NS_PER_MS)
     for source in (HOME, ATTACKER):
         replay_hello(path, source, 400)
@@ -210,11 +210,11 @@ def test_a_client_behind_a_nat_that_changes_keeps_its_video_under_attack() -> No
     def move() -> None:
         path.address = MOVED
 
-    path.at(4 * NS_PER_S, move)
+    path.schedule(4 * NS_PER_S, move)
     path.run()
     assert path.server.open_address(path.now_ns) == MOVED
     assert path.longest_gap_ns() < 400 * NS_PER_MS
-    assert all(path.readable())
+    assert all(path.were_readable())
 
 
 @pytest.mark.parametrize("kind", [1, 2, 3])
@@ -236,10 +236,10 @@ def test_a_lost_datagram_of_the_validation_delays_the_video_by_one_hello(kind: i
 
     path.fate = lose_first
     if moves:
-        path.at(change_ns, move)
+        path.schedule(change_ns, move)
     path.run()
     assert len(lost) == 1
-    assert all(path.readable(0))
+    assert all(path.were_readable(0))
     assert path.longest_gap_ns(change_ns) < (600 if moves else 800) * NS_PER_MS
     assert path.server.open_address(path.now_ns) == path.address
 
@@ -258,9 +258,9 @@ def test_duplicated_and_reordered_datagrams_leave_the_video_readable() -> None:
         path.address = MOVED
 
     path.fate = shuffled
-    path.at(4 * NS_PER_S, move)
+    path.schedule(4 * NS_PER_S, move)
     path.run()
-    assert all(path.readable(0))
+    assert all(path.were_readable(0))
     assert path.server.open_address(path.now_ns) == MOVED
     assert path.longest_gap_ns() < NS_PER_S
 
@@ -279,7 +279,7 @@ def test_an_outage_changes_no_key_while_reports_arrive() -> None:
     path.run()
     assert path.server.cipher is cipher
     assert path.server.unneeded > 3
-    assert all(path.readable())
+    assert all(path.were_readable())
 
 
 @pytest.mark.parametrize("token", [OTHER_TOKEN, None])
@@ -297,44 +297,48 @@ def test_a_client_that_restarts_opens_the_path_with_its_own_token(token: bytes |
             path.send(HOME, SERVER, datagram)
             path.send(ATTACKER, SERVER, datagram)
 
-    path.at(ATTACK_START_NS, restart)
+    path.schedule(ATTACK_START_NS, restart)
     path.run(ATTACK_START_NS)
     previous_datagrams = list(path.overheard)
-    path.every(20 * NS_PER_MS, replay_the_previous_client, ATTACK_START_NS)
+    path.schedule_every(20 * NS_PER_MS, replay_the_previous_client, ATTACK_START_NS)
     path.run()
     late_ns = ATTACK_START_NS + NS_PER_S
     assert path.server.open_address(path.now_ns) == (HOME if token else None)
-    assert all(path.readable(late_ns))
-    assert (len(path.readable(late_ns)) > 700) == (token is not None)
+    assert all(path.were_readable(late_ns))
+    assert (len(path.were_readable(late_ns)) > 700) == (token is not None)
 
 
 def test_a_second_client_with_another_token_has_no_effect() -> None:
     """The hellos of a client without control, from any address, leave the first client's video as it is."""
     path = Path(25 * NS_PER_MS)
     second = PathClient(OTHER_TOKEN, partial(SrtpCipher, "client"))
+
+    def send_second_hello(source: Address) -> None:
+        path.send(source, SERVER, second.hello(0))
+
     for source in (ATTACKER, MOVED, HOME):
-        path.every(20 * NS_PER_MS, lambda source=source: path.send(source, SERVER, second.hello(0)), ATTACK_START_NS)  # type: ignore[misc]
+        path.schedule_every(20 * NS_PER_MS, partial(send_second_hello, source), ATTACK_START_NS)
     path.run()
     assert path.server.wrong_token > 800
-    assert all(path.readable())
+    assert all(path.were_readable())
     assert path.longest_gap_ns() < 2 * FRAME_NS
 
 
 @pytest.mark.parametrize("one_way_ms", [1, 60])
 def test_a_copied_hello_that_arrives_first_does_not_prevent_the_opening(one_way_ms: int) -> None:
-    """An attacker near the server whose copies overtake all hellos gets challenges, but does not stop the client's."""
+    """An attacker whose copies overtake all hellos gets challenges, but the client gets challenges, too."""
     path = Path(one_way_ms * NS_PER_MS)
     path.fate = lambda source, _datagram: (0,) if source == ATTACKER else (one_way_ms * NS_PER_MS,)
-    sent = 0
+    copied = 0
 
     def copy_new() -> None:
-        nonlocal sent
-        for hello in hellos(path)[sent:]:
+        nonlocal copied
+        for hello in hellos(path)[copied:]:
             path.send(ATTACKER, SERVER, hello)
-        sent = len(hellos(path))
+        copied = len(hellos(path))
 
-    path.every(NS_PER_MS // 2, copy_new)
+    path.schedule_every(NS_PER_MS // 2, copy_new)
     path.run()
     assert path.server.open_address(path.now_ns) == HOME
-    assert all(path.readable(0))
-    assert len(path.readable()) > 800
+    assert all(path.were_readable(0))
+    assert len(path.were_readable()) > 800

@@ -30,19 +30,19 @@ OTHER_PORT = ("192.0.2.1", 5005)
 T0 = 5 * NS_PER_S
 
 
-def secrets() -> Callable[[], bytes]:
+def new_secrets() -> Callable[[], bytes]:
     numbers = count()
     return lambda: next(numbers).to_bytes(16, "big")
 
 
 def new_server(token: bytes | None = TOKEN) -> PathServer:
-    server = PathServer(secrets())
+    server = PathServer(new_secrets())
     server.set_token(token)
     return server
 
 
 def answer_for(server: PathServer, address: tuple[str, int], now_ns: int = T0, *, number: int = 1) -> bytes:
-    """Return the client's answer to the challenge that its hello with this number gets, sent from `address`."""
+    """Send a client's hello with this number from `address`; return the client's answer to the challenge."""
     client = PathClient(TOKEN)
     hellos = [client.hello(now_ns) for _ in range(number)]
     challenge = server.receive(hellos[-1], address, now_ns)
@@ -82,7 +82,7 @@ def test_opening() -> None:
 
 
 def test_no_amplification() -> None:
-    """The server's reply to an unvalidated address is not longer than the datagram it replies to."""
+    """The server's reply to an address that is not validated is not longer than the hello."""
     server, client = new_server(), PathClient(TOKEN)
     hello = client.hello(T0)
     challenge = server.receive(hello, HOME, T0)
@@ -137,7 +137,7 @@ def test_answer_from_another_address(address: tuple[str, int]) -> None:
 
 
 def test_third_party() -> None:
-    """A peer that has the token cannot open the path to another address by answering a challenge to its own."""
+    """A peer that has the token cannot open the path to another address by answering a challenge to its own address."""
     server = new_server()
     answer = answer_for(server, ELSEWHERE)
     server.receive(answer, HOME, T0)
@@ -222,7 +222,7 @@ def test_report_from_elsewhere() -> None:
 
 
 def test_forged_and_old_challenges_are_not_answered() -> None:
-    """The client answers a challenge only if its MAC is valid and it has answered none to this hello or a later one."""
+    """The client answers no forged challenge, no second one to the same hello, and none to an earlier hello."""
     server, client = new_server(), PathClient(TOKEN)
     challenge = server.receive(client.hello(T0), HOME, T0)
     hello = client.hello(T0 + 1)
@@ -230,8 +230,9 @@ def test_forged_and_old_challenges_are_not_answered() -> None:
     assert challenge is not None
     assert copied is not None
     assert newer is not None
-    for at in range(len(challenge)):
-        assert client.answer(challenge[:at] + bytes([challenge[at] ^ 1]) + challenge[at + 1 :]) is None
+    for position in range(len(challenge)):
+        forged = challenge[:position] + bytes([challenge[position] ^ 1]) + challenge[position + 1 :]
+        assert client.answer(forged) is None
     assert client.answer(newer) is not None
     assert client.answer(newer) is None
     assert client.answer(copied) is None
@@ -284,9 +285,9 @@ def test_an_open_path_keeps_its_cipher() -> None:
     assert server.cipher is not cipher
 
 
-def encrypted() -> tuple[PathServer, PathClient]:
+def encrypted_pair() -> tuple[PathServer, PathClient]:
     pytest.importorskip("pylibsrtp", reason="an extra: pip install 'lavt[secure]'")
-    server = PathServer(secrets(), partial(SrtpCipher, "server"))
+    server = PathServer(new_secrets(), partial(SrtpCipher, "server"))
     server.set_token(TOKEN)
     return server, PathClient(TOKEN, partial(SrtpCipher, "client"))
 
@@ -304,7 +305,7 @@ RTCP = bytes.fromhex("80c900010000000b")
 
 def test_an_encrypted_path_carries_video_down_and_reports_up() -> None:
     """Each end unprotects the packets that the other protects, and their payload is encrypted."""
-    server, client = encrypted()
+    server, client = encrypted_pair()
     open_path(server, client, HOME, T0)
     protected = server.cipher.protect(RTP)
     assert b"a picture" not in protected
@@ -318,7 +319,7 @@ def test_an_encrypted_path_carries_video_down_and_reports_up() -> None:
 
 def test_each_opening_has_keys_of_its_own() -> None:
     """At a new address the keys are new, and the client still unprotects packets under the previous keys."""
-    server, client = encrypted()
+    server, client = encrypted_pair()
     open_path(server, client, HOME, T0)
     before = server.cipher.protect(RTP)
     late = server.cipher.protect(RTP.replace(b"\x00\x01", b"\x00\x02", 1))
@@ -334,7 +335,7 @@ def test_each_opening_has_keys_of_its_own() -> None:
 
 def test_lost_answers_do_no_harm() -> None:
     """A client whose newer answers are lost, however many, unprotects and protects packets under the keys in use."""
-    server, client = encrypted()
+    server, client = encrypted_pair()
     open_path(server, client, HOME, T0)
     assert client.unprotect(server.cipher.protect(RTP)) == RTP
     for later_ns in range(1, 100):
@@ -365,7 +366,7 @@ def test_bad_token() -> None:
 
 
 def test_a_lost_path_is_requested_long_before_the_command_timeout() -> None:
-    """A hello follows a lost video within half of the 300 ms command timeout after which a vehicle is degraded."""
+    """If the video is lost, a hello follows within half of the 300 ms after which a vehicle is degraded."""
     assert HELLO_AGAIN_NS <= 300_000_000 // 2
 
 
@@ -392,11 +393,11 @@ def test_any_bytes(data: bytes, head: bytes) -> None:
 
 
 @given(st.integers(0, 69), st.integers(1, 255))
-def test_any_change(at: int, flip: int) -> None:
+def test_any_change(position: int, flipped_bits: int) -> None:
     """An answer with any byte changed does not open the path."""
     server = new_server()
     answer = bytearray(answer_for(server, HOME))
-    answer[at] ^= flip
+    answer[position] ^= flipped_bits
     server.receive(bytes(answer), HOME, T0)
     assert server.open_address(T0) is None
     assert sum(rejections(server).values()) == 1

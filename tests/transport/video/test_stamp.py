@@ -67,7 +67,7 @@ def test_part_of_a_larger_array() -> None:
 
 
 def test_centre_of_the_cells() -> None:
-    """Only the centre half of each cell is read, so changes of the edges by a filter do not matter."""
+    """Only the central 4 x 4 pixels of each cell are read, so a filter that changes the edges does no harm."""
     picture = np.zeros((64, 64, 3), np.uint8)
     write_stamp(picture, 0x0123_4567_89AB_CDEF)
     luma = picture[..., 0].copy()
@@ -141,13 +141,13 @@ def test_any_shape(shape: list[int]) -> None:
 
 
 def test_clear_stamp() -> None:
-    """A stamp is clear if each cell is in the outer thirds between black and white; else reading raises `BadPacket`."""
+    """A clear stamp has only cells in the darkest or the brightest third; reading any other raises `BadPacket`."""
     luma = np.zeros((64, 80), np.uint8)
     write_stamp_luma(luma, 0x0123_4567_89AB_CDEF)
     assert read_clear_stamp(luma) == 0x0123_4567_89AB_CDEF
-    for grey, cell in ((88, 0x0123_4567_89AB_CDEF), (163, 0x0123_4567_89AB_CDEF | 1 << 63)):
+    for grey, expected_ns in ((88, 0x0123_4567_89AB_CDEF), (163, 0x0123_4567_89AB_CDEF | 1 << 63)):
         luma[:8, :8] = grey
-        assert read_clear_stamp(luma) == cell
+        assert read_clear_stamp(luma) == expected_ns
     for grey in (89, 128, 162):
         luma[:8, :8] = grey
         with pytest.raises(BadPacket, match="neither"):
@@ -164,38 +164,38 @@ def test_rtp_timestamp() -> None:
 
 @given(STAMPS, st.integers(min_value=0, max_value=63))
 def test_agreement(stamp_ns: int, bit: int) -> None:
-    """A stamp agrees with its own timestamp, and does not with a wrong bit above the lowest 14."""
+    """A stamp agrees with its own timestamp, but not if a bit above the lowest 14 is wrong."""
     assert stamp_agrees(stamp_ns, rtp_timestamp(stamp_ns))
     if bit > 13:
         assert not stamp_agrees(stamp_ns ^ 1 << bit, rtp_timestamp(stamp_ns))
 
 
-def off_ns(read_ns: int, true_ns: int) -> float:
+def stamp_error_ns(read_ns: int, true_ns: int) -> float:
     """Return the error of a stamp, modulo the wrap of the RTP timestamp (after 2^32 units of 1/90000 s, 13.3 h)."""
     ninths = abs(read_ns - true_ns) * 9 % (2**32 * 100_000)
     return min(ninths, 2**32 * 100_000 - ninths) / 9
 
 
 @given(st.binary(min_size=64, max_size=64), st.integers(min_value=0, max_value=100), st.integers(-60_000, 60_000))
-def test_any_picture(greys: bytes, seed: int, away_ns: int) -> None:
-    """For any pixels and any sent stamp, an accepted stamp is within 12 us of the one sent."""
+def test_any_picture(greys: bytes, seed: int, offset_ns: int) -> None:
+    """For any pixels and any sent stamp, an accepted stamp differs from the sent stamp by less than 12 us."""
     cells = np.frombuffer(greys, np.uint8).reshape(8, 8).repeat(8, axis=0).repeat(8, axis=1)
     noise = stream(seed, "noise").integers(0, 256, cells.shape, dtype=np.uint8)
     for luma in (cells, noise, cells // 2 + noise // 2):
         read_ns = read_stamp(luma)
-        for sent_ns in (abs(read_ns + away_ns), int.from_bytes(greys[:8], "big")):
-            assert not stamp_agrees(read_ns, rtp_timestamp(sent_ns)) or off_ns(read_ns, sent_ns) < 12_000
+        for sent_ns in (abs(read_ns + offset_ns), int.from_bytes(greys[:8], "big")):
+            assert not stamp_agrees(read_ns, rtp_timestamp(sent_ns)) or stamp_error_ns(read_ns, sent_ns) < 12_000
 
 
 @given(STAMPS, st.lists(st.integers(min_value=0, max_value=63), max_size=4), st.integers(min_value=0, max_value=2**14))
 def test_any_damage(stamp_ns: int, wrong_bits: list[int], low_bits: int) -> None:
-    """Whichever cells of a stamp are damaged, an accepted stamp is within 12 us of the one sent."""
+    """Whichever cells of a stamp are damaged, an accepted stamp differs from the sent one by less than 12 us."""
     damaged_ns = stamp_ns ^ low_bits
     for bit in wrong_bits:
         damaged_ns ^= 1 << bit
     luma = np.full((STAMP_PX, STAMP_PX), 90, np.uint8)
     write_stamp_luma(luma, damaged_ns)
-    assert not stamp_agrees(read_stamp(luma), rtp_timestamp(stamp_ns)) or off_ns(damaged_ns, stamp_ns) < 12_000
+    assert not stamp_agrees(read_stamp(luma), rtp_timestamp(stamp_ns)) or stamp_error_ns(damaged_ns, stamp_ns) < 12_000
 
 
 @given(STAMPS, st.integers(min_value=0, max_value=2**32 - 1))

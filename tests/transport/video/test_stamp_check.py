@@ -1,4 +1,4 @@
-"""Test how the stamps of a foreign sender are checked, whose RTP timestamps begin at an unknown value (the base)."""
+"""Test the check of a foreign sender's stamps; its RTP timestamps begin at an unknown value, the base."""
 
 from __future__ import annotations
 
@@ -66,13 +66,13 @@ def test_garbage(stamp_ns: int, timestamp: int) -> None:
 @given(
     st.integers(min_value=1, max_value=RELEARN_AFTER_NS // 2), st.integers(min_value=-12_000_000, max_value=12_000_000)
 )
-def test_near_the_line(ahead_ns: int, off_ns: int) -> None:
-    """A stamp within 5 ms of the line is accepted and one beyond is not, after a gap of any length."""
+def test_near_the_expected_time(ahead_ns: int, off_ns: int) -> None:
+    """After a gap of any length, a stamp is accepted only if it is within 5 ms of its timestamp's time."""
     check, last_ns, last_timestamp = learned_check(77)
     timestamp = (last_timestamp + ahead_ns * 9 // 100_000) % 2**32
     stamp_ns = last_ns + ahead_ns + off_ns
-    on_line_ns = last_ns + ahead_ns * 9 // 100_000 * 100_000 // 9
-    assert check.agrees(stamp_ns, timestamp) == (abs(stamp_ns - on_line_ns) <= TOLERANCE_NS and stamp_ns > last_ns)
+    expected_ns = last_ns + ahead_ns * 9 // 100_000 * 100_000 // 9
+    assert check.agrees(stamp_ns, timestamp) == (abs(stamp_ns - expected_ns) <= TOLERANCE_NS and stamp_ns > last_ns)
 
 
 def test_random_stamps() -> None:
@@ -133,7 +133,7 @@ def test_drift(drift: float) -> None:
 
 
 def test_a_sender_that_restarts() -> None:
-    """After a restart with another base, stamps are accepted from the fifth on, and none by the old base."""
+    """After a restart with another base, stamps are accepted from the fifth on, and none that fits the old base."""
     check, last_ns, last_timestamp = learned_check(1000)
     later_ns = last_ns + 2 * NS_PER_S
     pairs = sent_pairs(20, 3_000_000_000, later_ns)
@@ -151,7 +151,7 @@ def test_a_sender_that_paused() -> None:
 
 
 def test_a_wrong_high_bit_that_stays() -> None:
-    """Stamps that agree with each other but not with the base, while timestamps continue, are rejected for 12 s."""
+    """Stamps with the same wrong bit, which agree with each other but not with the base, are rejected for 12 s."""
     check, _, _ = learned_check(1000)
     frames = RELEARN_AFTER_NS // FRAME_NS
     pairs = sent_pairs(frames + 100, 1000)[LEARNED_AFTER:]
@@ -173,7 +173,7 @@ def test_a_step_of_the_senders_clock() -> None:
 
 @given(st.lists(st.tuples(STAMPS, TIMESTAMPS), max_size=30))
 def test_any_stamps(pairs: list[tuple[int, int]]) -> None:
-    """No stamps and timestamps raise an error, and none is accepted before the fifth stamp."""
+    """Arbitrary stamps and timestamps raise nothing, and no stamp before the fifth is accepted."""
     check = LearnedBase()
     accepted = [number for number, pair in enumerate(pairs) if check.agrees(*pair)]
     assert all(number >= LEARNED_AFTER - 1 for number in accepted)

@@ -24,8 +24,8 @@ def count_repairs(sender: StreamSender, at_ns: int) -> int:
     return len(sender.packets(UNIT, at(at_ns).wall_ns, at(at_ns)).repair)
 
 
-def report_loss(sender: StreamSender, highest: int, lost: int, at_ns: int, ssrc: int = SSRC) -> None:
-    sender.receive_feedback(Feedback((ReceptionReport(ssrc, highest, 0.0, lost, 0),)), at(at_ns).mono_ns)
+def report_loss(sender: StreamSender, highest_sequence: int, lost: int, at_ns: int, ssrc: int = SSRC) -> None:
+    sender.receive_feedback(Feedback((ReceptionReport(ssrc, highest_sequence, 0.0, lost, 0),)), at(at_ns).mono_ns)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
@@ -64,7 +64,7 @@ def test_losses_are_those_between_two_reports() -> None:
 
 
 def test_forget_receiver_resets_the_feedback() -> None:
-    """Losses and the bit rate limit of a receiver are discarded when another one begins."""
+    """Losses and the bit rate limit of the previous receiver are discarded when another receiver begins."""
     sender = new_sender()
     report_loss(sender, 100, 0, 0)
     report_loss(sender, 200, 50, 1)

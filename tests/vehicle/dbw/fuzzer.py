@@ -55,7 +55,7 @@ KINDS: tuple[Kind, ...] = ("lose", "flip", "forge", "repeat", "garbage", "comman
 
 
 def settled_states(state: State, now: Situation) -> list[tuple[State, str]]:
-    """Return the states of one instant; none may be entered twice, and no further transition may be possible."""
+    """Return the states entered at one instant; check that none is entered twice and that the last one is final."""
     path = states_after(state, now)
     reached = [entered for entered, _ in path]
     assert len({state, *reached}) == 1 + len(reached), (state, path)
@@ -70,7 +70,7 @@ def is_drawn(chance: Chance, probability: float) -> bool:
 
 
 class HostilePort:
-    """A bus port that may write only a part of a set of frames, or be gone."""
+    """A bus port that sometimes writes only a part of a set of frames, or is gone."""
 
     def __init__(self, chance: Chance, on_written: Callable[[Sequence[CanFrame], int], None]) -> None:
         self.counts: Counter[str] = Counter()
@@ -110,6 +110,7 @@ class CommandCheck:
         """Number of sets by state and number of enabled axes."""
         self._counts: dict[str, float] = {}
         self._last: dict[Axis, tuple[float, int]] = dict.fromkeys(AXES, (0.0, START_NS))
+        """The newest command to each axis: (amount, time)."""
 
     def check_set(self, frames: Sequence[CanFrame], made_ns: int) -> None:
         """Check the written frames of a set."""
@@ -230,7 +231,7 @@ class Fuzzer:
         self.states[adapter._state] += 1
 
     def _begin_episode(self) -> None:
-        """Repair the car, and choose what happens to it in the next seconds."""
+        """Repair the car, and choose what will happen in the next seconds."""
         chance, kit = self._chance, self._kit
         self._speed_mps, self._turned_rad = 0.0, None
         kit.state.setpoint_rad = 0.0
@@ -249,7 +250,7 @@ class Fuzzer:
         kit.driver_brakes(0.0, self._now_ns)
         self._unwanted_ns = self._hostile_ns = self._now_ns
         self._episode_end_ns = self._now_ns + EPISODE_NS
-        for _ in range(30):  # not wanted, and honest: the adapter becomes idle
+        for _ in range(30):  # driving is not wanted and the bus is honest, so that the adapter becomes idle
             self._run_car(20 * NS_PER_MS, is_hostile=False)
             self._vehicle.engage(False, self._now_ns)
             self._vehicle.apply(Actuation(0.0, 0.0, 1.0), self._now_ns)

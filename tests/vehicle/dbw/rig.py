@@ -44,15 +44,15 @@ class Moment:
     at_ns: int
     wheels: Actuation
     is_enabled: bool
-    """An axis is enabled, so that commands reach the wheels."""
+    """True if an axis is enabled, so that commands reach the wheels."""
     state: str
 
 
 class AdapterRig:
     """An adapter that drives a software car and gets `actuation` every `tick_ns`.
 
-    `spoil` may change a frame to the car, or drop it (None); `lose_report` drops frames from the car; `is_cut` drops
-    both.
+    `spoil` returns what reaches the car instead of a frame (None: nothing). `lose_report` returns whether a frame from
+    the car is lost. If `is_cut`, all frames in both directions are lost.
     """
 
     def __init__(self, generation: int, *, start_frames: bool = True, **keys: Any) -> None:
@@ -79,12 +79,12 @@ class AdapterRig:
             self.run_ms(400)
 
     def copy(self) -> AdapterRig:
-        """Return a rig in the same state that shares only immutable objects with this one."""
+        """Return a rig in the same state that shares only immutable objects with this rig."""
         shared = (self.profile, self.profile.codec, road(), *self.moments)
         return deepcopy(self, {id(shared_object): shared_object for shared_object in shared})
 
     def run_ms(self, duration_ms: int, *, step_ms: int = 1) -> None:
-        """Run for a time, in coarser steps where nothing is measured."""
+        """Run for a time, in steps of `step_ms`."""
         end_ns = self.now_ns + duration_ms * NS_PER_MS
         while self.now_ns < end_ns:
             self.now_ns = min(self.now_ns + step_ms * NS_PER_MS, end_ns)
@@ -99,7 +99,7 @@ class AdapterRig:
         raise AssertionError(f"not in {limit_ms} ms: {self.adapter.state()}")
 
     def stall_ms(self, duration_ms: int) -> None:
-        """Let the car run for a time in which the adapter does not; then it gets the reports, with their times."""
+        """Let only the car run for a time; then give the adapter the reports, with their times of arrival."""
         waiting = []
         for _ in range(duration_ms):
             self.now_ns += NS_PER_MS
@@ -147,7 +147,7 @@ class AdapterRig:
         self.adapter.engage(True, self.now_ns)
         self.run_until(lambda rig: rig.state == "engaged")
 
-    def release_ms(self, since_ns: int, limit_ms: int = 1000) -> int:
+    def run_until_released_ms(self, since_ns: int, limit_ms: int = 1000) -> int:
         """Run until no axis is enabled, and return the time since `since_ns` in ms."""
         self.run_until(lambda rig: not rig.enabled(), limit_ms)
         return (self.now_ns - since_ns) // NS_PER_MS

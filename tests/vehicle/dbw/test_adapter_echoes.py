@@ -1,4 +1,4 @@
-"""Steering commands that the adapter counts as reached, for reported commands that each test chooses.
+"""Tests of the steering commands that the adapter returns as reached, for reported commands that each test chooses.
 
 The reports are those of generation 1: a command in bytes 2 and 3, in steps of 0.1 degrees.
 """
@@ -19,7 +19,7 @@ UNSENT_COMMAND = bytes([0x77, 0x01])
 
 
 class ChosenReports:
-    """A car whose steering reports contain the newest argument of `choose`, at first the command before the test."""
+    """A car whose steering reports contain the command chosen last; at first, the command before the test."""
 
     def __init__(self, rig: AdapterRig) -> None:
         self.rig = rig
@@ -46,14 +46,14 @@ class ChosenReports:
         return CanFrame(REPORT, self._data[:2] + self._command + self._data[4:])
 
     def steer(self, steering_rad: float) -> tuple[int, bytes]:
-        """Request an angle, and return the time of the tick and the angle on the bus."""
+        """Request an angle; return the time of the tick and the angle as encoded on the bus."""
         self.rig.actuation = replace(self.rig.actuation, steering_rad=steering_rad)
         self.rig.run_until(lambda rig: rig.adapter._requested == rig.actuation)
         return self.rig.now_ns, next(
             frame.data[:2] for _, frame in reversed(self.rig.sent) if frame.identifier == COMMAND
         )
 
-    def choose(self, command: bytes) -> list[ReachedCommand]:
+    def report_command(self, command: bytes) -> list[ReachedCommand]:
         """Report a command and return the reached commands; the same report again reaches none."""
         self._command = command
         self.rig.adapter.receive(self._report(), self.rig.now_ns)
@@ -65,22 +65,22 @@ class ChosenReports:
 
 @pytest.mark.parametrize(("age_ms", "is_known"), [(0, True), (180, True), (200, True), (220, False), (500, False)])
 def test_a_command_that_is_not_reported_is_forgotten(age_ms: int, is_known: bool) -> None:
-    """A command is reached if it is reported within 200 ms; later reports are ignored, although it is still sent."""
+    """A command is reached if it is reported at most 200 ms after its tick; later reports of it are ignored."""
     car = ChosenReports(driving_rig(1))
     requested_ns, command = car.steer(FIRST_RAD)
     car.rig.run_ms(age_ms)
-    assert car.choose(command) == [ReachedCommand(requested_ns, car.rig.now_ns)] * is_known
+    assert car.report_command(command) == [ReachedCommand(requested_ns, car.rig.now_ns)] * is_known
 
 
 def test_only_old_commands_are_forgotten() -> None:
-    """Discarding an expired command keeps the later ones."""
+    """When an expired command is discarded, later commands are kept."""
     car = ChosenReports(driving_rig(1))
     _, first = car.steer(FIRST_RAD)
     car.rig.run_ms(100)
     requested_ns, second = car.steer(SECOND_RAD)
     car.rig.run_ms(120)
-    assert car.choose(first) == []
-    assert car.choose(second) == [ReachedCommand(requested_ns, car.rig.now_ns)]
+    assert car.report_command(first) == []
+    assert car.report_command(second) == [ReachedCommand(requested_ns, car.rig.now_ns)]
 
 
 def test_all_old_commands_are_forgotten() -> None:
@@ -94,35 +94,35 @@ def test_all_old_commands_are_forgotten() -> None:
     car.rig.is_ticking = True
     car.rig.run_ms(1)
     assert car.rig.state == "engaged"
-    assert car.choose(second) == []
+    assert car.report_command(second) == []
 
 
 def test_a_repeated_angle_is_reached_again() -> None:
-    """Each of three commands is reached at its own report, even if the last one equals the first."""
+    """Each of three commands is reached at its own report, even if the last command equals the first."""
     car = ChosenReports(driving_rig(1))
     requested = [car.steer(angle_rad) for angle_rad in (FIRST_RAD, SECOND_RAD, FIRST_RAD)]
     for requested_ns, command in requested:
         car.rig.run_ms(5)
-        assert car.choose(command) == [ReachedCommand(requested_ns, car.rig.now_ns)]
+        assert car.report_command(command) == [ReachedCommand(requested_ns, car.rig.now_ns)]
 
 
 def test_superseded_commands_are_not_reached() -> None:
-    """A report of a command discards the earlier ones; later ones are still awaited."""
+    """A report of a command discards all earlier commands; later commands are still awaited."""
     car = ChosenReports(driving_rig(1))
     (_, first), (second_ns, second), (third_ns, _) = [
         car.steer(angle_rad) for angle_rad in (FIRST_RAD, SECOND_RAD, FIRST_RAD)
     ]
-    assert car.choose(second) == [ReachedCommand(second_ns, car.rig.now_ns)]
-    assert car.choose(first) == [ReachedCommand(third_ns, car.rig.now_ns)]
-    assert car.choose(second) == []
+    assert car.report_command(second) == [ReachedCommand(second_ns, car.rig.now_ns)]
+    assert car.report_command(first) == [ReachedCommand(third_ns, car.rig.now_ns)]
+    assert car.report_command(second) == []
 
 
 def test_a_command_that_was_not_sent_is_ignored() -> None:
     """A report of a command that was not sent reaches nothing, and commands that were sent are still awaited."""
     car = ChosenReports(driving_rig(1))
     requested_ns, command = car.steer(FIRST_RAD)
-    assert car.choose(UNSENT_COMMAND) == []
-    assert car.choose(command) == [ReachedCommand(requested_ns, car.rig.now_ns)]
+    assert car.report_command(UNSENT_COMMAND) == []
+    assert car.report_command(command) == [ReachedCommand(requested_ns, car.rig.now_ns)]
 
 
 def test_a_repeated_command_is_reached_once() -> None:
@@ -130,11 +130,11 @@ def test_a_repeated_command_is_reached_once() -> None:
     car = ChosenReports(driving_rig(1))
     requested_ns, command = car.steer(FIRST_RAD)
     car.rig.run_ms(100)
-    assert [reached.applied_ns for reached in car.choose(command)] == [requested_ns]
+    assert [reached.applied_ns for reached in car.report_command(command)] == [requested_ns]
     car.rig.run_ms(100)
-    assert car.choose(car.initial_command) == []
+    assert car.report_command(car.initial_command) == []
     car.rig.run_ms(100)
-    assert car.choose(command) == []
+    assert car.report_command(command) == []
 
 
 def test_an_override_discards_awaited_commands() -> None:
@@ -144,8 +144,8 @@ def test_an_override_discards_awaited_commands() -> None:
     car.rig.kit.driver_brakes(0.3, car.rig.now_ns)
     car.rig.run_until(lambda rig: rig.state == "overridden")
     car.rig.run_ms(20)
-    assert car.choose(command) == []
-    assert car.choose(car.wheel) == []
+    assert car.report_command(command) == []
+    assert car.report_command(car.wheel) == []
 
 
 def enable(car: ChosenReports) -> None:
@@ -159,10 +159,10 @@ def test_the_first_command_is_awaited_if_it_differs() -> None:
     """The first command, which has the reported angle, is awaited only if the kit reports another command."""
     car = ChosenReports(stationary_rig(1))
     enable(car)
-    assert car.choose(UNSENT_COMMAND) == []
-    assert car.choose(car.initial_command) == []
+    assert car.report_command(UNSENT_COMMAND) == []
+    assert car.report_command(car.initial_command) == []
     car.rig.adapter.engage(False, car.rig.now_ns)
     car.rig.run_until(lambda rig: rig.state == "idle")
-    assert car.choose(UNSENT_COMMAND) == []
+    assert car.report_command(UNSENT_COMMAND) == []
     enable(car)
-    assert len(car.choose(car.initial_command)) == 1
+    assert len(car.report_command(car.initial_command)) == 1

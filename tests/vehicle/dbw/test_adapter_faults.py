@@ -55,12 +55,12 @@ def stop_and_disengage(rig: AdapterRig) -> None:
 
 @both_generations
 def test_commands_lost(generation: int) -> None:
-    """Without commands the kit disengages 100 ms after the last one, and the watchdog brakes."""
+    """Without commands the kit disengages 100 ms after the last command, and the watchdog brakes."""
     rig = driving_rig(generation)
     rig.run_until(lambda rig: bool(rig.sent) and last_sent_ns(rig) == rig.now_ns)
     cut_ns = rig.now_ns
     rig.spoil = lambda _: None
-    assert rig.release_ms(cut_ns) == 100
+    assert rig.run_until_released_ms(cut_ns) == 100
     assert rig.kit.state.brake == WATCHDOG_BRAKE
     assert rig.run_until(is_lost) <= 20
     rig.run_ms(150, step_ms=COARSE_MS)
@@ -73,7 +73,7 @@ def test_commands_lost(generation: int) -> None:
 
 @both_generations
 def test_counter_stuck(generation: int) -> None:
-    """A counter that does not change makes the kit release all axes with that frame and brake."""
+    """At the first frame that repeats a counter, the kit releases all axes and brakes."""
     rig = driving_rig(generation)
     stuck: list[int] = []
 
@@ -87,7 +87,7 @@ def test_counter_stuck(generation: int) -> None:
 
     rig.spoil = spoil
     rig.run_until(lambda _: len(stuck) == 2)
-    assert rig.release_ms(rig.now_ns) == 0
+    assert rig.run_until_released_ms(rig.now_ns) == 0
     assert rig.kit.state.brake == WATCHDOG_BRAKE
     assert rig.run_until(is_lost) <= 20
     assert not rig.adapter.state().is_engaged
@@ -106,7 +106,7 @@ def with_crc(identifier: int, data: bytes) -> CanFrame:
 
 @pytest.mark.parametrize("part", [0, 1, 2])
 def test_wrong_checksum_of_a_command(part: int) -> None:
-    """A wrong checksum on any axis makes a kit of generation 2 release all axes with that frame and brake."""
+    """At the first command with a wrong checksum, a kit of generation 2 releases all axes and brakes."""
     rig = driving_rig(2)
     spoiled: list[int] = []
 
@@ -118,7 +118,7 @@ def test_wrong_checksum_of_a_command(part: int) -> None:
 
     rig.spoil = spoil
     rig.run_until(lambda _: bool(spoiled))
-    assert rig.release_ms(spoiled[0]) == 0
+    assert rig.run_until_released_ms(spoiled[0]) == 0
     assert rig.run_until(is_lost) <= 20
     rig.run_ms(100)
     assert "SystemReport: crc" in rig.adapter._reports.texts("reason")
@@ -131,7 +131,7 @@ def test_without_ticks_nothing_is_sent(generation: int) -> None:
     rig = driving_rig(generation)
     rig.run_until(lambda rig: rig.adapter._requested_ns == rig.now_ns)
     stopped_ns, rig.is_ticking = rig.now_ns, False
-    took_ms = rig.release_ms(stopped_ns)
+    took_ms = rig.run_until_released_ms(stopped_ns)
     sent_ms = (last_sent_ns(rig) - stopped_ns) // NS_PER_MS
     assert 40 < sent_ms <= 60
     assert took_ms == sent_ms + 100
@@ -153,7 +153,7 @@ def test_a_resumed_server_enables_nothing(generation: int) -> None:
     waiting = rig.car.advance(rig.now_ns)[:30]
     assert not rig.enabled()
     rig.sent.clear()
-    for frame in waiting:  # the oldest ones
+    for frame in waiting:  # the oldest frames
         rig.adapter.receive(frame, rig.now_ns)
         rig.adapter.set_actuation(rig.actuation, rig.now_ns)
         for sent in rig.adapter.frames_due(rig.now_ns):
@@ -170,13 +170,13 @@ FOREIGN_COMMANDS = {
     1: [CanFrame(0x064, bytes(8)), CanFrame(0x060, bytes(4)), CanFrame(0x066, bytes(1))],
     2: [CanFrame(0x201, bytes(8)), CanFrame(0x203, bytes(4)), CanFrame(0x216, bytes(2))],
 }
-"""Commands to an axis, of another length or to a gear, and to the system or a gear; their data does not matter."""
+"""Commands to an axis, to the gearbox or to the system, some of unusual length; their data does not matter."""
 
 
 @both_generations
 @pytest.mark.parametrize("command_index", [0, 1, 2])
 def test_foreign_commands_prevent_engaging(generation: int, command_index: int) -> None:
-    """A kit is not engaged until 1 s after the last command of another sender: a server may still be stopping it."""
+    """A kit is not engaged until 1 s after the last command of another sender, which may still be stopping the car."""
     rig = stationary_rig(generation)
     rig.adapter.receive(FOREIGN_COMMANDS[generation][command_index], rig.now_ns)
     rig.adapter.engage(True, rig.now_ns)
@@ -228,13 +228,13 @@ PERIOD_MS = {"steering": 10, "brake": 20, "throttle": 20, "gear": 100}
 @both_generations
 @pytest.mark.parametrize("part", OVERRIDES)
 def test_override(generation: int, part: str) -> None:
-    """An override releases all axes: at once in generation 2, and when it is reported in generation 1."""
+    """An override releases all axes: in generation 2 immediately, in generation 1 when the override is reported."""
     rig = driving_rig(generation)
     override_ns = rig.now_ns
     OVERRIDES[part](rig)
     if part in AXES:
         assert part not in rig.enabled()
-    took_ms = rig.release_ms(override_ns)
+    took_ms = rig.run_until_released_ms(override_ns)
     assert took_ms == 0 if generation == 2 else took_ms <= PERIOD_MS[part]
     rig.run_until(lambda rig: rig.state == "overridden", PERIOD_MS[part] + 1)
     rig.run_ms(PERIOD_MS[part])
@@ -248,7 +248,7 @@ def test_override(generation: int, part: str) -> None:
 @both_generations
 @pytest.mark.parametrize("part", OVERRIDES)
 def test_override_is_latched(generation: int, part: str) -> None:
-    """The adapter's override lasts until the stationary car is disengaged, the kit's until the CLEAR that follows."""
+    """The adapter's override lasts until the stationary car is disengaged, the kit's until the car is engaged again."""
     rig = driving_rig(generation)
     OVERRIDES[part](rig)
     rig.run_until(lambda rig: rig.state == "overridden")
@@ -300,10 +300,10 @@ FAULTS = [(1, name) for name in FAULTS_1] + [(2, f"{part}.fault") for part in (*
 
 @pytest.mark.parametrize(("generation", "name"), FAULTS)
 def test_fault(generation: int, name: str) -> None:
-    """A fault makes the kit release all axes at once and brake; the next report names the part."""
+    """A fault makes the kit immediately release all axes and brake; the next report names the part."""
     rig = driving_rig(generation)
     rig.kit.set_fault(name, rig.now_ns)
-    assert rig.release_ms(rig.now_ns) == 0
+    assert rig.run_until_released_ms(rig.now_ns) == 0
     assert rig.kit.state.brake == WATCHDOG_BRAKE
     assert rig.run_until(is_lost) <= 20
     rig.run_ms(100)
@@ -412,7 +412,7 @@ def test_bus_off(generation: int) -> None:
     rig.run_until(lambda rig: bool(rig.sent) and last_sent_ns(rig) == rig.now_ns)
     rig.kit.set_bus_off(rig.now_ns)
     cut_ns = rig.now_ns
-    assert rig.release_ms(cut_ns) == 100
+    assert rig.run_until_released_ms(cut_ns) == 100
     rig.run_until(is_lost)
     shortest_ms = min(report.timeout_ns for report in rig.profile.reports.values()) // NS_PER_MS
     assert shortest_ms - 10 <= (rig.now_ns - cut_ns) // NS_PER_MS <= shortest_ms
@@ -426,14 +426,14 @@ def test_bus_off(generation: int) -> None:
 
 @both_generations
 def test_bus_gone(generation: int) -> None:
-    """A bus that is gone ends driving at once; the kit disengages 100 ms after the last command."""
+    """A bus that is gone ends driving immediately; the kit disengages 100 ms after the last command."""
     rig = driving_rig(generation)
     rig.run_until(lambda rig: bool(rig.sent) and last_sent_ns(rig) == rig.now_ns)
     cut_ns, rig.is_cut = rig.now_ns, True
     rig.adapter.on_bus_gone("can0 is down", rig.now_ns)
     state = rig.adapter.state()
     assert (state.is_engaged, state.inhibit_reason) == (False, "can0 is down")
-    assert rig.release_ms(cut_ns) == 100
+    assert rig.run_until_released_ms(cut_ns) == 100
     assert last_sent_ns(rig) == cut_ns
     rig.is_cut = False
     rig.run_ms(500, step_ms=COARSE_MS)
@@ -476,7 +476,7 @@ def test_report_missing(generation: int, message: str) -> None:
 @both_generations
 @pytest.mark.parametrize("name", ["angle", "speed"])
 def test_value_unknown(generation: int, name: str) -> None:
-    """An unknown speed or angle counts as a missing report; the last speed is kept with its own time."""
+    """An unknown speed or angle is treated as a missing report; the last known speed is kept with its time."""
     rig = driving_rig(generation)
     known_ns = rig.adapter.state().mono_ns
     speed_mps = rig.adapter.state().speed_mps
@@ -508,17 +508,17 @@ def test_wrong_checksum_of_a_report() -> None:
 
 @pytest.mark.parametrize(("position", "name"), [(0, "e stop"), (1, "pause")])
 def test_remote_switch(position: int, name: str) -> None:
-    """The remote's switch at stop or pause makes the kit release all axes at once; the next report says so."""
+    """If the remote is switched to stop or pause, the kit releases all axes immediately; the next report says so."""
     rig = driving_rig(2)
     rig.kit.switch_remote(position, rig.now_ns)
-    assert rig.release_ms(rig.now_ns) == 0
+    assert rig.run_until_released_ms(rig.now_ns) == 0
     rig.run_until(is_lost, 101)
     rig.run_ms(100)
     assert f"RemoteReport has STATE {name}" in rig.adapter.state().inhibit_reason
 
 
 def test_remote_switch_of_the_other_commands() -> None:
-    """The remote's switch at control allowed, which the kit ignores, causes throttle 0 and the requested brake."""
+    """If the remote is switched to control allowed, which the kit ignores, the adapter requests throttle 0."""
     rig = driving_rig(2)
     rig.kit.switch_remote(3, rig.now_ns)
     switched_ns = rig.now_ns
@@ -535,10 +535,10 @@ def test_remote_switch_of_the_other_commands() -> None:
     [("seat belt", "a seat belt is open"), ("door", "a door is open"), ("speed", "the kit is locked out by speed")],
 )
 def test_kit_not_ready(name: str, text: str) -> None:
-    """A kit of generation 2 that is not ready releases all axes at once, and reports the reason."""
+    """A kit of generation 2 that is not ready releases all axes immediately, and reports the reason."""
     rig = driving_rig(2)
     rig.kit.inhibit(name, rig.now_ns)
-    assert rig.release_ms(rig.now_ns) == 0
+    assert rig.run_until_released_ms(rig.now_ns) == 0
     rig.run_until(is_lost)
     rig.run_ms(100)
     assert text in rig.adapter.state().inhibit_reason
@@ -584,7 +584,7 @@ def test_a_shift_in_progress_is_awaited() -> None:
 
 
 def test_park_rejected() -> None:
-    """If PARK is rejected the car is kept stationary by its brake, and the reason is reported."""
+    """If PARK is rejected, the brake keeps the car stationary, and the reason is reported."""
     rig = driving_rig(1)
     rig.kit.set_fault("gear.FLTBUS", rig.now_ns)
     rig.actuation = Actuation(0.0, 0.0, 0.5)
@@ -600,7 +600,7 @@ def test_park_rejected() -> None:
     assert "GearReport: fault" in reason
 
 
-def without_park() -> AdapterRig:
+def rig_without_park() -> AdapterRig:
     """Return a stationary car whose kit rejects the number that the profile has for PARK."""
     base_profile = profile("dataspeed_gen1")
     rig = AdapterRig(
@@ -611,8 +611,8 @@ def without_park() -> AdapterRig:
 
 
 def test_park_must_be_reported_within_3_s() -> None:
-    """A stationary car that is not in PARK 3 s after driving ended has an inhibit reason, and none before."""
-    rig = without_park()
+    """A stationary car that is not in PARK has an inhibit reason from 3 s after the end of driving on."""
+    rig = rig_without_park()
     rig.adapter.engage(False, rig.now_ns)
     rig.run_ms(2999)
     assert (rig.state, rig.adapter.state().inhibit_reason) == ("parking", "")
@@ -622,8 +622,8 @@ def test_park_must_be_reported_within_3_s() -> None:
 
 
 def test_a_moving_car_need_not_park() -> None:
-    """A car that still moves 3 s after driving ended has no inhibit reason and is not shifted to PARK."""
-    rig = without_park()
+    """A car that still moves 3 s after the end of driving has no inhibit reason and is not shifted to PARK."""
+    rig = rig_without_park()
 
     for source in SPEED_SOURCES[1]:
         rig.kit.stick_speed(source, 2.8)

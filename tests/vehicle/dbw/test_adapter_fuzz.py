@@ -11,13 +11,15 @@ from tests.vehicle.dbw.fuzzer import run_ticks
 
 from lavt.vehicle.dbw.states import State
 
-SEEDS, TICKS = (4, 25), 1500
-"""Of each generation in the quick lane and in the full one. A thousand ticks take about half a second."""
+QUICK_SEEDS, FULL_SEEDS = 4, 25
+"""The number of runs of each generation in the quick lane and in the full lane."""
+TICKS = 1500
+"""The number of ticks of a run. A thousand ticks take about half a second."""
 MAX_NEW_OBJECTS = 300
 
 
 @pytest.mark.parametrize("generation", [1, 2])
-@pytest.mark.parametrize("seeds", [SEEDS[0], pytest.param(SEEDS[1], marks=pytest.mark.full)])
+@pytest.mark.parametrize("seeds", [QUICK_SEEDS, pytest.param(FULL_SEEDS, marks=pytest.mark.full)])
 def test_the_vehicle_keeps_its_invariants(generation: Literal[1, 2], seeds: int) -> None:
     """Whatever happens, nothing raises, no state is reached twice at one instant, and every command is within limits.
 
@@ -38,4 +40,5 @@ def test_nothing_grows(generation: Literal[1, 2]) -> None:
         gc.collect()
         counts.append(len(gc.get_objects()))
         del fuzzer
-    assert counts[1] - counts[0] < MAX_NEW_OBJECTS
+    after_few_ticks, after_many_ticks = counts
+    assert after_many_ticks - after_few_ticks < MAX_NEW_OBJECTS

@@ -39,7 +39,7 @@ STEERING = {1: 0x064, 2: 0x200}
 
 
 def angles_deg(rig: AdapterRig) -> list[tuple[int, float]]:
-    """Return the times and steering angles that were sent, decoded from bytes 0 and 1."""
+    """Return (time, steering angle) of each steering command that was sent, decoded from bytes 0 and 1."""
     identifier = STEERING[rig.generation]
     return [
         (at_ns, int.from_bytes(frame.data[:2], "little", signed=True) / 10)
@@ -63,14 +63,15 @@ def test_angle(generation: int) -> None:
 
 @both_generations
 def test_rate(generation: int) -> None:
-    """The commanded steering rate stays within the limit, which is sent to the kit, rounded down to a step."""
+    """The commanded steering angle changes no faster than the limit."""
     rig = driving_rig(generation, profile=with_limits(generation, steering_wheel_rate_degps=100.0))
     rig.actuation = Actuation(0.2, 0.0, 0.0)
     rig.run_ms(400)
     requested = angles_deg(rig)
     for (before_ns, before_deg), (after_ns, after_deg) in pairwise(requested):
         assert abs(after_deg - before_deg) <= 100.0 * (after_ns - before_ns) / NS_PER_S + 0.1
-    assert requested[-1][1] > 30
+    _, last_deg = requested[-1]
+    assert last_deg > 30
 
 
 @both_generations
@@ -120,7 +121,7 @@ def test_rate_of_the_kit() -> None:
 
 @both_generations
 def test_pedals(generation: int) -> None:
-    """Pedals are pressed no further and no faster than the limits, and released at once."""
+    """Pedals are pressed no further and no faster than the limits, and released immediately."""
     limited_profile = with_limits(generation, throttle=0.4, brake=0.5, throttle_rate_per_s=1.0, brake_rate_per_s=2.0)
     rig = driving_rig(generation, profile=limited_profile)
     rig.actuation = Actuation(0.0, 1.0, 0.0)
@@ -140,7 +141,7 @@ def test_pedals(generation: int) -> None:
 
 @both_generations
 def test_steering_starts_at_the_reported_angle(generation: int) -> None:
-    """The first angle after enabling differs from the reported one by at most the turn allowed in one set of frames."""
+    """The first angle after enabling differs from the reported angle by at most the turn allowed in 60 ms."""
     rig = driving_rig(generation)
     rig.actuation = Actuation(0.2, 0.0, 1.0)
     rig.run_until(lambda rig: rig.speed_mps == 0.0, step_ms=COARSE_MS)
@@ -153,7 +154,7 @@ def test_steering_starts_at_the_reported_angle(generation: int) -> None:
     rig.run_until(lambda rig: rig.state == "enabling")
     assert rig.adapter._sender.last_set_ns == rig.now_ns
     rig.sent = [(at_ns, frame) for at_ns, frame in rig.sent if at_ns == rig.now_ns]
-    first_deg = angles_deg(rig)[0][1]
+    (_, first_deg), *_ = angles_deg(rig)
     wheel_deg = math.degrees(0.2 * 14.8)
     assert abs(first_deg - wheel_deg) <= 452 * 0.06 + 0.1, "60 ms at 452 deg/s, and a step of 0.1 deg"
 
@@ -166,7 +167,7 @@ any_wheel = st.builds(DriveCommand, st.floats(-3276, 3276), st.floats(0, 0.6), s
 
 @given(requested, any_wheel, st.integers(0, 10 * NS_PER_S))
 def test_limits_hold_for_any_request(command: DriveCommand, before: DriveCommand, passed_ns: int) -> None:
-    """For any request and any wheel the limited command is in range, and from there no faster than the rates."""
+    """For any request and any wheel angle, the limited command is in range and changes no faster than the limits."""
     limited = apply_limits(LIMITS, command, before, passed_ns)
     passed_s = min(passed_ns, TICK_LIMIT_NS) / NS_PER_S
     assert abs(limited.wheel_deg) <= 400.0
@@ -211,7 +212,7 @@ def test_limits_are_the_simulators(name: str) -> None:
 @both_generations
 @pytest.mark.parametrize("wheel_deg", [435.5, -540.0, 600.0])
 def test_a_wheel_beyond_the_limit_inhibits(generation: int, wheel_deg: float) -> None:
-    """A stationary car whose wheel is beyond the limit is not engaged; turned back, it is."""
+    """A stationary car whose wheel is beyond the limit is not engaged until the wheel is turned back."""
     rig = stationary_rig(generation)
     turn_wheel(rig, wheel_deg)
     rig.adapter.engage(True, rig.now_ns)
@@ -226,7 +227,7 @@ def test_a_wheel_beyond_the_limit_inhibits(generation: int, wheel_deg: float) ->
 @both_generations
 @pytest.mark.parametrize("wheel_deg", [-540.0, 600.0])
 def test_a_wheel_beyond_the_limit_is_never_commanded(generation: int, wheel_deg: float) -> None:
-    """A wheel that is turned too far while the kit is engaged is commanded to no angle beyond the limit."""
+    """A wheel that is turned too far while the kit is being engaged is never commanded to an angle beyond the limit."""
     rig = stationary_rig(generation)
     rig.adapter.engage(True, rig.now_ns)
     rig.run_until(lambda rig: rig.state == "clearing")
@@ -238,7 +239,7 @@ def test_a_wheel_beyond_the_limit_is_never_commanded(generation: int, wheel_deg:
 
 
 def turn_wheel(rig: AdapterRig, wheel_deg: float) -> None:
-    """Forge the steering reports: they have another angle."""
+    """Forge the steering reports, so that they have this angle."""
     tenths = round(wheel_deg * 10)
 
     def forge(frame: CanFrame) -> bool:

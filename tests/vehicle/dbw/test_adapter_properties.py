@@ -19,7 +19,7 @@ from lavt.vehicle.software_car import generation_1, generation_2
 from lavt.vehicle.software_car.mechanics import Mechanics
 from lavt.vehicle.software_car.state import AxisOrder
 
-names = pytest.mark.parametrize("name", ["dataspeed_gen1", "dataspeed_gen2", "dataspeed_gen2:user"])
+each_profile = pytest.mark.parametrize("name", ["dataspeed_gen1", "dataspeed_gen2", "dataspeed_gen2:user"])
 
 
 def order_of(name: str, frame: CanFrame) -> AxisOrder:
@@ -30,10 +30,10 @@ def order_of(name: str, frame: CanFrame) -> AxisOrder:
     return order
 
 
-@names
+@each_profile
 @given(data=st.data())
 def test_all_commands_are_understood(name: str, data: st.DataObject) -> None:
-    """The kit parses every command within the limits as it was sent, to half a step, valid and enabling."""
+    """The kit parses every command within the limits as valid and enabling, with its value within half a step."""
     base_profile, sender = profile(name), FrameSender(profile(name), START_NS)
     axis = data.draw(st.sampled_from(AXES))
     sender._frame_counts[base_profile.axes[axis].message] = data.draw(st.integers(0, 1000))
@@ -56,10 +56,10 @@ def test_all_commands_are_understood(name: str, data: st.DataObject) -> None:
     )
 
 
-@names
+@each_profile
 @given(data=st.data())
 def test_all_reports_are_understood(name: str, data: st.DataObject) -> None:
-    """The adapter reads every angle and speed that a report can hold, to half a step."""
+    """The adapter reads every angle that a report can contain."""
     base_profile = profile(name)
     adapter = ByWireAdapter(base_profile, start_ns=START_NS)
     angle = data.draw(st.integers(-5500, 5500))
@@ -90,7 +90,7 @@ any_frame = st.builds(
 histories = st.lists(st.tuples(any_frame, st.integers(0, 200 * NS_PER_MS), st.integers(0, 3)), max_size=60)
 
 
-@names
+@each_profile
 @given(histories)
 @settings(max_examples=150)
 def test_any_frames_raise_nothing(name: str, history: list[tuple[CanFrame, int, int]]) -> None:
@@ -130,7 +130,7 @@ def reports_of(generation: int) -> tuple[CanFrame, ...]:
 @given(st.lists(st.tuples(any_frame, st.integers(0, 30)), min_size=1, max_size=20))
 @settings(max_examples=25)
 def test_garbage_between_reports(generation: int, garbage: list[tuple[CanFrame, int]]) -> None:
-    """Garbage between the reports of a stationary car never engages it while driving is not wanted."""
+    """Garbage between reports never engages a stationary car while driving is not wanted."""
     rig = stationary_rig(generation)
     for frame, wait_ms in garbage:
         rig.adapter.receive(frame, rig.now_ns)

@@ -1,4 +1,4 @@
-"""Wrong speeds while driving: the car stops whatever is reported, and is not parked before it does."""
+"""Wrong speeds while driving: the car stops, whatever is reported, and is not parked before it is stationary."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ GEAR_COMMAND = {1: 0x066, 2: 0x203}
 SPEED_REPORT = {1: 0x065, 2: 0x107}
 
 
-def fast(generation: int) -> tuple[AdapterRig, SafetyGate]:
+def fast_rig(generation: int) -> tuple[AdapterRig, SafetyGate]:
     """Return a car that drives at 8.3 m/s, and a gate in the state `driving`."""
     rig = driving_rig(generation)
     rig.simulator._car.motion.speed_mps = 8.3
@@ -38,7 +38,7 @@ def fast(generation: int) -> tuple[AdapterRig, SafetyGate]:
 
 
 def run(rig: AdapterRig, gate: SafetyGate, duration_ns: int) -> None:
-    """Let the gate decide for a time, as the actuator node does; check that PARK is not requested while moving."""
+    """Let the gate decide for a time, as the actuator node does; check that no moving car is requested to park."""
     for _ in range(duration_ns // (COARSE_MS * NS_PER_MS)):
         decide(rig, gate)
         rig.run_ms(COARSE_MS, step_ms=COARSE_MS)
@@ -52,7 +52,7 @@ def test_a_stuck_speed_stops_the_car(generation: int, stuck_mps: float) -> None:
     """A speed stuck at 0 or at 3 m/s while the car drives at 8.3 m/s is a fault: full brake, and no PARK before
     every speed is 0.
     """
-    rig, gate = fast(generation)
+    rig, gate = fast_rig(generation)
     rig.kit.stick_speed("speed", stuck_mps)
     run(rig, gate, NS_PER_S)
     state = rig.adapter.state()
@@ -76,7 +76,7 @@ def test_a_stuck_speed_stops_the_car(generation: int, stuck_mps: float) -> None:
 @both_generations
 def test_all_speeds_stuck_at_zero(generation: int) -> None:
     """Even if all speeds drop to 0, the car brakes fully for long enough to stop before it is parked."""
-    rig, gate = fast(generation)
+    rig, gate = fast_rig(generation)
     for source in SPEED_SOURCES[generation]:
         rig.kit.stick_speed(source, 0.0)
     run(rig, gate, FULL_BRAKE_NS)
@@ -166,7 +166,7 @@ def test_a_stuck_speed_under_throttle(generation: int, speed_mps: float) -> None
 
 @both_generations
 def test_a_stuck_speed_of_a_kit_with_one_speed(generation: int) -> None:
-    """Without another speed, one stuck at 3 m/s under throttle still ends the drive."""
+    """If the kit reports only one speed, this speed, stuck at 3 m/s under throttle, still ends the drive."""
     rig = AdapterRig(generation, profile=with_one_speed(generation))
     rig.engage()
     rig.actuation = Actuation(0.0, 0.5, 0.0)
@@ -179,8 +179,8 @@ def test_a_stuck_speed_of_a_kit_with_one_speed(generation: int) -> None:
 
 @both_generations
 def test_a_scaled_speed_stops_the_car(generation: int) -> None:
-    """A speed that becomes half the real one is a fault."""
-    rig, gate = fast(generation)
+    """A reported speed that becomes half the real speed is a fault."""
+    rig, gate = fast_rig(generation)
     rig.kit.scale_speed("speed", 0.5)
     run(rig, gate, NS_PER_S)
     assert (gate.state, rig.adapter.state().is_speed_plausible) == ("safe_stop", False)
@@ -190,7 +190,7 @@ def test_a_scaled_speed_stops_the_car(generation: int) -> None:
 @pytest.mark.parametrize("source", ["speed", "wheel_speed"])
 def test_a_missing_speed_stops_the_car(generation: int, source: str) -> None:
     """A speed or wheel speeds that are no longer reported stop the car."""
-    rig, gate = fast(generation)
+    rig, gate = fast_rig(generation)
     rig.kit.drop_speed(source)
     run(rig, gate, 4 * NS_PER_S)
     assert gate.state == "safe_stop"
@@ -201,8 +201,8 @@ def test_a_missing_speed_stops_the_car(generation: int, source: str) -> None:
 
 @both_generations
 def test_unknown_wheel_speeds_stop_the_car(generation: int) -> None:
-    """Wheel speeds that are reported as unknown count as missing."""
-    rig, gate = fast(generation)
+    """Wheel speeds that are reported as unknown stop the car, like missing wheel speeds."""
+    rig, gate = fast_rig(generation)
     rig.kit.set_unknown("wheel_speed")
     run(rig, gate, 4 * NS_PER_S)
     assert (gate.state, rig.speed_mps) == ("safe_stop", 0.0)
@@ -211,7 +211,7 @@ def test_unknown_wheel_speeds_stop_the_car(generation: int) -> None:
 @both_generations
 def test_a_safe_stop_with_weak_brakes_brakes_fully(generation: int) -> None:
     """If the brake has half its force, a safe stop presses it fully, and the speed is no fault."""
-    rig, gate = fast(generation)
+    rig, gate = fast_rig(generation)
     rig.kit.weaken_brake(0.5)
     gate.machine.trigger("stop requested")
     run(rig, gate, 2 * NS_PER_S)
@@ -224,7 +224,7 @@ def test_a_safe_stop_with_weak_brakes_brakes_fully(generation: int) -> None:
 @both_generations
 def test_a_safe_stop_with_good_brakes_leaves_grip_for_steering(generation: int) -> None:
     """A safe stop that decelerates as wanted does not press the brake further, and raises no fault."""
-    rig, gate = fast(generation)
+    rig, gate = fast_rig(generation)
     gate.machine.trigger("stop requested")
     brakes = []
     while rig.speed_mps > 0.0:
@@ -235,7 +235,7 @@ def test_a_safe_stop_with_good_brakes_leaves_grip_for_steering(generation: int) 
 
 
 def test_a_repeated_report_is_no_report() -> None:
-    """Reports of generation 2 whose counter does not change count as missing."""
+    """Reports of generation 2 whose counter does not change are treated as missing."""
     rig = driving_rig(2)
     first: list[CanFrame] = []
 

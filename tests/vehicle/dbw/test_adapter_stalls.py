@@ -36,7 +36,7 @@ def test_a_stall_while_parking_ends(generation: int) -> None:
 
 
 def forge_enabled(rig: AdapterRig, axis: Axis, *, is_enabled: bool) -> None:
-    """Forge the axis's reports: they say whether it is enabled."""
+    """Forge the axis's reports, so that they say whether the axis is enabled."""
     codec = rig.profile.codec
     message, spec = next((name, spec) for name, spec in rig.profile.reports.items() if spec.part == axis)
     identifier = codec.messages[message].identifier
@@ -59,7 +59,7 @@ def forge_enabled(rig: AdapterRig, axis: Axis, *, is_enabled: bool) -> None:
 @pytest.mark.parametrize("axis", AXES)
 @pytest.mark.parametrize("is_wanted", [True, False])
 def test_the_car_brakes_without_an_axis(generation: int, axis: Axis, is_wanted: bool) -> None:
-    """If one axis is reported as released, driving or parking, the kit's watchdog brakes the car to a standstill."""
+    """If one axis is reported as released while driving or parking, the kit's watchdog stops the car."""
     rig = driving_rig(generation)
     rig.actuation = Actuation(0.01, 0.0, 0.4)
     rig.adapter.engage(is_wanted, rig.now_ns)
@@ -93,7 +93,7 @@ def test_a_released_axis_is_not_enabled_again() -> None:
 @both_generations
 @pytest.mark.parametrize("dropped", [1, 2, 3, 4])
 def test_dropped_frames_leave_no_gap_in_the_counters(generation: int, dropped: int) -> None:
-    """If the last frames of a set, or all, are not written, the next ones get their counter values; driving goes on."""
+    """If the last frames of a set, or all, are not written, the next ones get their counters, and driving continues."""
     rig = driving_rig(generation)
     rig.run_until(lambda rig: bool(rig.sent) and rig.sent[-1][0] == rig.now_ns)
     for _ in range(5):
@@ -118,7 +118,7 @@ def test_dropped_frames_leave_no_gap_in_the_counters(generation: int, dropped: i
 
 @both_generations
 def test_sets_that_are_never_written_are_no_commands(generation: int) -> None:
-    """If no frame is written for 100 ms this ends driving, as if none had been due."""
+    """If no frame is written for 100 ms, driving ends as if no frame had been due."""
     rig = driving_rig(generation)
     rig.run_until(lambda rig: bool(rig.sent) and rig.sent[-1][0] == rig.now_ns)
     rig.dropped_frames = 9
@@ -132,7 +132,7 @@ def test_sets_that_are_never_written_are_no_commands(generation: int) -> None:
 @both_generations
 @pytest.mark.parametrize("dropped", [1, 2, 9])
 def test_frames_that_were_not_written_are_due_at_the_next_tick(generation: int, dropped: int) -> None:
-    """A set that was not written completely is not repeated before the next call, and is due again then."""
+    """A set that was not written completely is due again at the next call, and not earlier."""
     rig = driving_rig(generation)
     rig.run_until(lambda rig: bool(rig.sent) and rig.sent[-1][0] == rig.now_ns)
     rig.dropped_frames = dropped

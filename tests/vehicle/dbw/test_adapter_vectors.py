@@ -1,4 +1,4 @@
-"""The adapter's frames equal, byte for byte, those worked out by hand from the published sources."""
+"""Test that the adapter's frames equal the vectors: frames worked out by hand from the published sources."""
 
 from __future__ import annotations
 
@@ -44,7 +44,10 @@ def adapter_frame(name: str, vector: dict[str, Any]) -> CanFrame | None:
 
 
 def axis_command(base_profile: Profile, axis: Axis, signals: dict[str, Any]) -> CanFrame | None:
-    """Return an axis's command of the profile's type; signals that the adapter never changes become constants."""
+    """Return an axis's command, or None if the vector has a type that the profile does not use.
+
+    Signals that the adapter never changes become constants of the profile.
+    """
     command = base_profile.axes[axis]
     kind, number = next(iter(command.constants.items()))
     if command.value not in signals or signals.get(kind, 0) != number:

@@ -131,7 +131,7 @@ def test_two_processes(open_port: Callable[..., CanPort]) -> None:
 def test_udp_multicast_stays_on_this_machine(
     open_port: Callable[..., CanPort], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Frames of `udp_multicast`, which counts as virtual, stay on the machine unless the user sets `hop_limit`."""
+    """Frames of `udp_multicast`, which LAVT treats as virtual, stay on the machine unless the user sets `hop_limit`."""
     requested: list[dict[str, Any]] = []
     open_bus = can.Bus
 
@@ -147,7 +147,7 @@ def test_udp_multicast_stays_on_this_machine(
 
 
 def test_arrival(open_port: Callable[..., CanPort]) -> None:
-    """A frame's arrival time is the kernel's, on the monotonic clock, however late it is taken."""
+    """A frame's arrival time is the kernel's, on the monotonic clock, however late the frame is taken."""
     number = free_port()
     port, other = open_port("udp_multicast", GROUP, port=number), open_port("udp_multicast", GROUP, port=number)
     before_ns = now_ns()
@@ -213,7 +213,7 @@ def test_other_frames(open_port: Callable[..., CanPort], raw_bus: can.BusABC) ->
 def test_queue_is_bounded(
     open_port: Callable[..., CanPort], raw_bus: can.BusABC, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A full queue keeps the newest frames and counts the dropped ones."""
+    """A full queue keeps the newest frames and counts the dropped frames."""
     monkeypatch.setattr(bus_module, "QUEUE_FRAMES", 4)
     port = open_port()
     for number in range(10):
@@ -222,7 +222,7 @@ def test_queue_is_bounded(
     assert [received.frame.identifier for received in port.take(0)] == [6, 7, 8, 9]
 
 
-def test_queue_holds_two_seconds_of_a_full_bus() -> None:
+def test_queue_has_room_for_two_seconds_of_a_full_bus() -> None:
     """The queue has room for 8192 frames: two seconds of a full 500 kbit/s bus."""
     assert bus_module.QUEUE_FRAMES == 8192
 
@@ -340,7 +340,7 @@ def test_bus_gone_and_back(open_port: Callable[..., CanPort], device: Device) ->
 
 @pytest.mark.timeout(10)
 def test_a_slow_opening_blocks_nobody(open_port: Callable[..., CanPort], device: Device) -> None:
-    """While a driver is opening a lost bus, reading and writing raise an error at once, and the port can be closed."""
+    """While a lost bus is being opened, reading and writing raise an error immediately, and the port can be closed."""
     port = open_port("breakable", "stick", clock=ManualClock(0))
     device.may_open.clear()
     device.incoming.append(OSError(errno.ENODEV, "gone"))
@@ -411,7 +411,7 @@ def test_a_failed_write_loses_the_bus(open_port: Callable[..., CanPort], device:
 
 
 def test_a_suspended_machine(open_port: Callable[..., CanPort], device: Device) -> None:
-    """A suspension of 100 ms or more counts as a loss of the bus: nothing is written until the bus is reopened."""
+    """A suspension of 100 ms or more is treated as a loss of the bus: nothing is written until the bus is reopened."""
     suspended_ms = [5000]
     port = open_port("breakable", "stick", clock=ManualClock(0), suspended=lambda: suspended_ms[0] * NS_PER_MS)
     for step_ms, is_lost in ((99, False), (-80, False), (100, False), (100, True)):
@@ -439,15 +439,17 @@ def test_suspended_time_of_this_machine() -> None:
 
 
 @pytest.fixture
-def stamped(open_port: Callable[..., CanPort], device: Device, monkeypatch: pytest.MonkeyPatch) -> StampedFrames:
+def timestamped(
+    open_port: Callable[..., CanPort], device: Device, monkeypatch: pytest.MonkeyPatch
+) -> TimestampedFrames:
     monkeypatch.setitem(can.interfaces.BACKENDS, "udp_multicast", (__name__, "BreakableBus"))
     clock = ManualClock(10 * NS_PER_S, wall_ahead_ns=1_790_000_000 * NS_PER_S)
-    return StampedFrames(open_port("udp_multicast", "stick", clock=clock), device, clock)
+    return TimestampedFrames(open_port("udp_multicast", "stick", clock=clock), device, clock)
 
 
 @dataclass
-class StampedFrames:
-    """A port whose frames have wall-clock stamps of a clock that a test sets."""
+class TimestampedFrames:
+    """A port whose frames have wall-clock timestamps of a clock that a test sets."""
 
     port: CanPort
     device: Device
@@ -466,8 +468,8 @@ class StampedFrames:
             clock.wall_ahead_ns += step_ms * NS_PER_MS
 
         self.device.on_receive = wait
-        stamp_s = arrived.wall_ns / NS_PER_S
-        self.device.put(can.Message(arbitration_id=7, is_extended_id=False, timestamp=stamp_s))
+        timestamp_s = arrived.wall_ns / NS_PER_S
+        self.device.put(can.Message(arbitration_id=7, is_extended_id=False, timestamp=timestamp_s))
         until(lambda: not self.device.incoming)
         taken: list[ReceivedCanFrame] = []
 
@@ -480,24 +482,26 @@ class StampedFrames:
 
 
 @pytest.mark.parametrize("step_ms", [-3_600_000, -50, 0, 50, 150, 300, 3_600_000])
-def test_a_step_of_the_wall_clock_changes_no_age(stamped: StampedFrames, step_ms: int) -> None:
+def test_a_step_of_the_wall_clock_changes_no_age(timestamped: TimestampedFrames, step_ms: int) -> None:
     """A step of the wall clock between the arrival of a frame and its reading does not change the frame's age."""
     for _ in range(3):
-        error_ms = stamped.receive(waits_ms=5, step_ms=step_ms)
+        error_ms = timestamped.receive(waits_ms=5, step_ms=step_ms)
         assert error_ms is not None
         assert abs(error_ms) < 0.001
 
 
 @pytest.mark.parametrize(("waits_ms", "is_received"), [(1000, True), (1001, False)])
-def test_a_frame_that_waited_too_long_is_dropped(stamped: StampedFrames, waits_ms: int, is_received: bool) -> None:
+def test_a_frame_that_waited_too_long_is_dropped(
+    timestamped: TimestampedFrames, waits_ms: int, is_received: bool
+) -> None:
     """A frame that has waited in the kernel for more than a second is counted and dropped."""
-    assert (stamped.receive(waits_ms=waits_ms) is not None) == is_received
+    assert (timestamped.receive(waits_ms=waits_ms) is not None) == is_received
 
 
 @pytest.mark.timeout(20)
 @pytest.mark.parametrize("interface", ["virtual", "udp_multicast"])
 def test_a_port_closes_whatever_the_wall_clock_does(monkeypatch: pytest.MonkeyPatch, interface: str) -> None:
-    """A wall clock that is set back does not delay the closing of a silent bus beyond its limit."""
+    """A wall clock that is set back does not delay the closing of a silent bus by more than 5 s."""
     hours_back = [0]
     monkeypatch.setattr(can.bus, "time", lambda: MachineClock().now().wall_ns / NS_PER_S - 3600 * hours_back[0])
     options = {} if interface == "virtual" else {"port": free_port()}
@@ -609,7 +613,7 @@ def test_is_virtual(
 
 
 def test_a_forwarded_bus_is_not_virtual(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A vcan that a gateway rule names is not virtual, nor is one whose rules cannot be read."""
+    """A vcan is not virtual if a gateway rule names it, or if the gateway rules cannot be read."""
 
     def unreadable() -> frozenset[int]:
         raise OSError

@@ -47,7 +47,7 @@ def test_rules() -> None:
 
 
 def test_an_error() -> None:
-    """An error, and a datagram that is cut off, are errors: the rules are not known."""
+    """An error message and a truncated datagram raise an error, because the rules are not known."""
     with pytest.raises(PermissionError):
         parse_rules(message(NLMSG_ERROR, struct.pack("=i", -errno.EPERM)))
     with pytest.raises(OSError, match=f"Errno {errno.EBADMSG}"):

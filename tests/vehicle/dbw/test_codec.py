@@ -60,20 +60,21 @@ def awkward(tmp_path: Path) -> Codec:
 
 @pytest.mark.parametrize(("codec", "vector"), VECTORS)
 def test_vectors(codec: Codec, vector: dict[str, Any]) -> None:
-    """A frame worked out by hand is the encoding of its values, except for its CRC, and is decoded to them."""
+    """A vector's values are encoded to its frame, except for the CRC, and the frame is decoded to the values."""
     data = bytes.fromhex(vector["data"])
     encoded = codec.encode(vector["message"], vector["signals"], length=len(data))
     has_crc = "CRC" in codec.messages[vector["message"]].signals
     assert encoded[: len(data) - has_crc] == data[: len(data) - has_crc]
     decoded = codec.decode(CanFrame(vector["id"], data), short=True)
     assert decoded is not None
-    assert decoded[0] == vector["message"]
-    for name, signal in codec.messages[decoded[0]].signals.items():
+    message, decoded_values = decoded
+    assert message == vector["message"]
+    for name, signal in codec.messages[message].signals.items():
         value = vector["signals"].get(name)
         if value in signal.no_value:
-            assert decoded[1][name] is None, name
+            assert decoded_values[name] is None, name
         elif value is not None and name != "CRC":
-            assert decoded[1][name] == pytest.approx(value, abs=abs(signal.scale) / 2 + 1e-9), name
+            assert decoded_values[name] == pytest.approx(value, abs=abs(signal.scale) / 2 + 1e-9), name
 
 
 @given(data=st.binary(max_size=8), identifier=st.one_of(st.integers(0, 0x1FFFFFFF), st.sampled_from([0x65, 0x200])))
@@ -116,10 +117,12 @@ def test_named_values() -> None:
     """A named value is decoded as a number, and as None if its name means "no value"."""
     report = GENERATION_1.decode(CanFrame(0x065, bytes.fromhex("00 80 00 00 00 80 80 00")))
     assert report is not None
-    assert [report[1][name] for name in ("ANGLE", "VEH_VEL", "TORQUE", "CMD")] == [None, None, None, 0]
+    _, report_values = report
+    assert [report_values[name] for name in ("ANGLE", "VEH_VEL", "TORQUE", "CMD")] == [None, None, None, 0]
     gear = GENERATION_1.decode(CanFrame(0x067, bytes([4, 0])))
     assert gear is not None
-    assert gear[1]["STATE"] == 4
+    _, gear_values = gear
+    assert gear_values["STATE"] == 4
     assert GENERATION_1.messages["GearReport"].signals["STATE"].names[4] == "DRIVE"
 
 
@@ -204,7 +207,7 @@ def test_no_dbc(tmp_path: Path) -> None:
 
 
 def test_a_message_that_takes_too_long_to_load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A DBC with a longer message than any of J1939 is rejected before it is loaded; the longest one is loaded."""
+    """A DBC with a message longer than the longest of J1939 (1785 bytes) is rejected before it is loaded."""
     for length in (1785, 1786, 99_999, 10**30):
         text = AWKWARD.replace("Unlimited: 8", f"Unlimited: {length}")
         (tmp_path / "long.dbc").write_text(text)

@@ -1,4 +1,4 @@
-"""The design's limits of driving by wire, repeated here: a change in the code must be repeated as well."""
+"""The design's limits of driving by wire, repeated here, so that nobody changes a limit by mistake."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ LIMITS_MS = [
     ("gears are requested every 100 ms", sending.GEAR_PERIOD_NS, 100),
     ("enabling takes at most 3 s", states.ENABLING_LIMIT_NS, 3000),
     ("clearing takes at least 120 ms", states.PAUSE_NS, 120),
-    ("a shift may be reported 1 s late", adapter.SHIFT_REPORT_LIMIT_NS, 1000),
+    ("a shift is reported at most 1 s late", adapter.SHIFT_REPORT_LIMIT_NS, 1000),
     ("the car is stationary 300 ms before PARK", adapter.STATIONARY_BEFORE_PARK_NS, 300),
     ("the adapter is called every 100 ms", adapter.IDLE_PERIOD_NS, 100),
     ("an echo is awaited for 200 ms", adapter.ECHO_LIMIT_NS, 200),
-    ("another sender counts for 1 s", reports.OTHER_COMMANDER_NS, 1000),
+    ("another sender inhibits for 1 s", reports.OTHER_COMMANDER_NS, 1000),
     ("the watchdog test has ticks every 20 ms", watchdog_test.TICK_NS, 20),
     ("the watchdog test observes the kit for 500 ms", watchdog_test.OBSERVE_NS, 500),
     ("the watchdog test waits 3 s for reports", watchdog_test.REPORT_LIMIT_NS, 3000),
@@ -32,7 +32,9 @@ LIMITS_MS = [
 ]
 
 
-@pytest.mark.parametrize(("limit_ns", "limit_ms"), [row[1:] for row in LIMITS_MS], ids=[row[0] for row in LIMITS_MS])
+@pytest.mark.parametrize(
+    ("limit_ns", "limit_ms"), [pytest.param(limit_ns, limit_ms, id=text) for text, limit_ns, limit_ms in LIMITS_MS]
+)
 def test_times(limit_ns: int, limit_ms: int) -> None:
     """Each time limit of driving by wire is the design's number of milliseconds, as an integer."""
     assert type(limit_ns) is int
@@ -40,7 +42,7 @@ def test_times(limit_ns: int, limit_ms: int) -> None:
 
 
 def test_other_limits() -> None:
-    """Standstill is below 0.1 m/s, the watchdog test brakes with 0.3, and values may exceed ranges by 1e-6 steps."""
+    """Standstill is below 0.1 m/s, the watchdog test brakes with 0.3, and values can exceed ranges by 1e-6 steps."""
     assert (states.STATIONARY_BELOW_MPS, watchdog_test.BRAKE, codec.RANGE_SLACK_STEPS) == (0.1, 0.3, 1e-6)
 
 

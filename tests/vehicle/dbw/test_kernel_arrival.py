@@ -1,4 +1,4 @@
-"""Arrival times of frames from the kernel's wall-clock stamps."""
+"""Arrival times of frames from the kernel's wall-clock timestamps."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ WALL_AHEAD_NS = 1_790_000_000 * NS_PER_S
 
 
 def at(mono_ms: float, stepped_ms: float = 0) -> Now:
-    """Return a reading of clocks, of which the wall clock was stepped."""
+    """Return a reading of both clocks, after the wall clock was stepped by `stepped_ms`."""
     return Now(round(mono_ms * NS_PER_MS), WALL_AHEAD_NS + round((mono_ms + stepped_ms) * NS_PER_MS))
 
 
 @pytest.mark.parametrize("read_ms", [101, 150, 4000])
 def test_without_a_step(read_ms: int) -> None:
-    """A stamp gives the time of arrival, however late the frame is read."""
+    """A timestamp gives the time of arrival, however late the frame is read."""
     arrivals = ArrivalTimes(at(90))
     assert arrivals.arrived_ns(at(100).wall_ns, at(read_ms)) == 100 * NS_PER_MS
 
 
 @pytest.mark.parametrize("step_ms", [-3_600_000, -50, 50, 3_600_000])
-@pytest.mark.parametrize("stepped_before", [True, False], ids=["stamped after the step", "stamped before it"])
+@pytest.mark.parametrize("stepped_before", [True, False], ids=["arrived after the step", "arrived before it"])
 def test_a_step_shortly_before_the_reading(step_ms: int, stepped_before: bool) -> None:
-    """Whether a frame was stamped before or after the step, it has its true time of arrival."""
+    """Whether a frame arrived before or after the step, it has its true time of arrival."""
     arrivals = ArrivalTimes(at(90))
-    stamp_ns = at(100, step_ms if stepped_before else 0).wall_ns
-    assert arrivals.arrived_ns(stamp_ns, at(101, step_ms)) == 100 * NS_PER_MS
+    timestamp_ns = at(100, step_ms if stepped_before else 0).wall_ns
+    assert arrivals.arrived_ns(timestamp_ns, at(101, step_ms)) == 100 * NS_PER_MS
 
 
 @pytest.mark.parametrize("step_ms", [-3_600_000, -50, 50, 3_600_000])
 def test_a_step_while_many_frames_wait(step_ms: int) -> None:
-    """If the reader did not run during a step, a frame counts as older by the step at most, and never as newer."""
+    """If the reader did not run during a step, a frame's time is at most the step too early, and never too late."""
     arrivals = ArrivalTimes(at(0))
     times_ns = [
         arrivals.arrived_ns(at(arrived_ms, step_ms if arrived_ms > 250 else 0).wall_ns, at(500, step_ms))

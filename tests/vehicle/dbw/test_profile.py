@@ -1,4 +1,4 @@
-"""Profiles: the shipped ones, and the errors that are found before anything is sent."""
+"""Tests of the shipped profiles, and of the errors in profiles that are found before anything is sent."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NAMES = ("dataspeed_gen1", "dataspeed_gen2", "dataspeed_gen2:user", "dataspeed_g
 
 
 def write_changed_profile(folder: Path, name: str, **changes: Any) -> Path:
-    """Write a profile with other values; a key is a path with __ between its parts, and None removes it."""
+    """Write a profile with other values; a key is a path with `__` between its parts."""
     shipped = shipped_profiles()[name]
     data = yaml.safe_load(shipped.read_text())
     data["dbc"] = str(shipped.with_suffix(".dbc"))
@@ -69,7 +69,7 @@ def test_angles_in_radians(tmp_path: Path) -> None:
 
 
 def test_unverified() -> None:
-    """Generation 1 uses no unverified signal; generation 2 uses almost only unverified ones, of the chosen set."""
+    """Generation 1 uses no unverified signal; generation 2 uses many, the same ones in both command sets."""
     assert load_profile("dataspeed_gen1").unverified == ()
     remote, user = (load_profile(f"dataspeed_gen2:{name}").unverified for name in ("remote", "user"))
     assert len(remote) == len(user)
@@ -81,7 +81,7 @@ def test_unverified() -> None:
 
 
 def test_steering_sign() -> None:
-    """Generation 1's profile has no steering sign, so the config's counts; it must not contradict a profile's sign."""
+    """The config's steering sign is used if the profile has none, and must not contradict the profile's sign."""
     assert load_profile("dataspeed_gen1").car.steering_sign is None
     assert load_profile("dataspeed_gen1", steering_sign=-1).car.steering_sign == -1
     assert load_profile("dataspeed_gen2").car.steering_sign == 1
@@ -104,12 +104,12 @@ def test_no_such_profile(name: str) -> None:
 
 
 def test_a_single_set_of_commands() -> None:
-    """A set of commands cannot be chosen if the profile has only one."""
+    """A command set cannot be chosen if the profile has only one."""
     assert ":user" in rejection_message("dataspeed_gen1:user")
 
 
 def test_own_file(tmp_path: Path) -> None:
-    """A path to a file is a profile, and a set of commands can be chosen with it."""
+    """A profile can be named by the path of its file, with or without a command set."""
     path = write_changed_profile(tmp_path, "dataspeed_gen2", limits__steering_wheel_deg=100.0)
     assert load_profile(str(path)).limits.steering_wheel_deg == 100.0
     assert load_profile(f"{path}:user").commands == "user"
@@ -129,7 +129,7 @@ def test_other_dbc(tmp_path: Path) -> None:
 
 
 def test_a_pedal_without_its_scale(tmp_path: Path) -> None:
-    """A DBC with a pedal's raw number is rejected: a full brake of 1 would hardly brake."""
+    """A DBC without a pedal's scale is rejected, because a full brake would be the raw number 1: hardly any brake."""
     text = shipped_profiles()["dataspeed_gen1"].with_suffix(".dbc").read_text()
     bare = tmp_path / "bare.dbc"
     bare.write_text(text.replace("m2 : 0|16@1+ (0.000015259021896696421,0) [0|1]", "m2 : 0|16@1+ (1,0) [0|65535]"))
@@ -159,8 +159,8 @@ SPEED_SIGNALS = {
     ],
 )
 def test_the_step_of_a_speed(tmp_path: Path, speed: str, step: float, is_fine_enough: bool) -> None:
-    """A speed with steps over 0.005 m/s is rejected, because it would seem frozen in normal driving; a speed to compare
-    it with may have steps of 0.1 m/s.
+    """A speed with steps over 0.005 m/s is rejected, because it would seem frozen in normal driving. A second speed,
+    which is only compared with the first, can have steps of 0.1 m/s.
     """
     name, signal, signal_name = SPEED_SIGNALS[speed]
     text = shipped_profiles()[name].with_suffix(".dbc").read_text()

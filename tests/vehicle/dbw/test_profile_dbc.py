@@ -64,7 +64,7 @@ def is_unverified(signal: Signal) -> bool:
 
 
 def with_all_signals(message: Message, values: dict[str, float]) -> dict[str, float]:
-    """Return the values of all signals of a frame: `values`, and 0 for the others."""
+    """Return the values of all signals of a frame: `values`, and 0 for all other signals."""
     multiplexer = selector_of(message)
     selector = int(values.get(multiplexer.name, 0)) if multiplexer else 0
     return {signal.name: 0 for signal in selected(message, selector)} | values
@@ -80,7 +80,7 @@ def encoded(message: Message, signals: dict[str, float]) -> bytes:
 
 @pytest.mark.parametrize(("message", "vector"), CASES)
 def test_encoded(message: Message, vector: dict[str, Any]) -> None:
-    """A command or report is encoded to the bytes worked out by hand; a short frame is the start of the full one."""
+    """A command or report is encoded to the bytes worked out by hand; a short frame is the start of the full frame."""
     data = bytes.fromhex(vector["data"])
     assert message.frame_id == vector["id"]
     assert not message.is_extended_frame
@@ -90,7 +90,7 @@ def test_encoded(message: Message, vector: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize(("message", "vector"), CASES)
 def test_decoded(message: Message, vector: dict[str, Any]) -> None:
-    """The bytes worked out by hand are decoded to their values, to half a step."""
+    """The bytes worked out by hand are decoded to the vector's values within half a step."""
     data = bytes.fromhex(vector["data"])
     decoded = message.decode(data, decode_choices=False, allow_truncated=True)
     assert isinstance(decoded, dict)
@@ -144,7 +144,7 @@ def test_round_trip(message: Message, data: st.DataObject) -> None:
 
 
 def raw_of(signal: Signal) -> st.SearchStrategy[int]:
-    """Return raw numbers within the signal's range, or of all its bits if it has none."""
+    """Return raw numbers within the signal's range, or of all its bits if it has no range."""
     if signal.minimum is None or signal.maximum is None:
         half = 1 << (signal.length - 1)
         return st.integers(-half, half - 1) if signal.is_signed else st.integers(0, 2 * half - 1)
@@ -205,7 +205,7 @@ def test_limits(limit: dict[str, Any]) -> None:
             encode({**selector, signal.name: end + beyond * signal.conversion.scale})
 
 
-TIMES = {  # period, timeout, ms
+TIMES = {  # (period, timeout) in ms
     "dataspeed_gen1": dict.fromkeys(("BrakeCmd", "ThrottleCmd", "SteeringCmd"), (20, 100)),
     "dataspeed_gen2": {
         **{f"{source}{name}Cmd": (None, 100) for source in ("Remote", "User", "Ulc") for name in ("Brake", "Thrtl")},
@@ -232,7 +232,7 @@ TIMES = {  # period, timeout, ms
 
 @pytest.mark.parametrize("profile", PROFILES)
 def test_times(profile: str) -> None:
-    """Periods and timeouts are the published ones, and there are no others."""
+    """The DBC files have exactly the published periods and timeouts."""
     times_by_message = {}
     for message in DATABASES[profile].messages:
         assert message.dbc is not None

@@ -32,7 +32,7 @@ def test_units(angle_unit: str, wheel_deg: float, speed_unit: str, speed_mps: fl
 
 
 def test_deadline() -> None:
-    """The next deadline is when a report becomes 200 ms old; reports that are older already do not count."""
+    """The next deadline is when a report becomes 200 ms old; reports that are already older have no deadline."""
     reports = NewestReports(profile("dataspeed_gen1"), START_NS)
     assert reports.deadline_ns(START_NS) is None
     reports.receive(ANGLE_AND_SPEED, START_NS)
@@ -45,17 +45,17 @@ def test_deadline() -> None:
 
 
 def test_missing() -> None:
-    """A report is missing until it has arrived with all its values, and again once it is 200 ms old."""
+    """A report is missing until it has arrived with all its values, and again when it is 200 ms old."""
     reports = NewestReports(profile("dataspeed_gen1"), START_NS)
-    missing = len(reports.missing(START_NS))
-    assert missing == len(profile("dataspeed_gen1").reports)
+    all_reports = len(reports.missing(START_NS))
+    assert all_reports == len(profile("dataspeed_gen1").reports)
     reports.receive(ANGLE_AND_SPEED, START_NS)
-    assert len(reports.missing(START_NS + 200 * NS_PER_MS - 1)) == missing - 1
-    assert len(reports.missing(START_NS + 200 * NS_PER_MS)) == missing
+    assert len(reports.missing(START_NS + 200 * NS_PER_MS - 1)) == all_reports - 1
+    assert len(reports.missing(START_NS + 200 * NS_PER_MS)) == all_reports
 
 
 def test_foreign_commands() -> None:
-    """Another sender counts as present for one second after its last command."""
+    """Another sender is reported for one second after its last command."""
     reports = NewestReports(profile("dataspeed_gen1"), START_NS)
     assert reports.other_commander(START_NS) == ""
     reports.receive(CanFrame(0x064, b""), START_NS)

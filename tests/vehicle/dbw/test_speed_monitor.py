@@ -1,4 +1,4 @@
-"""The plausibility of reported speeds: faults are found in time, and normal driving raises none."""
+"""The plausibility of reported speeds: faults are found in time, and normal driving raises no fault."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class MonitorRig:
     def run(
         self, duration_s: float, pedals: Pedals, speed: Course, *wheels: Course, second: Course | None = None
     ) -> MonitorRig:
-        """Report courses for a time, each from its own 0 s."""
+        """Report the courses for a time, each course from its beginning (0 s) on."""
         began_ns = self.now_ns
         while self.now_ns < began_ns + round(duration_s * NS_PER_S):
             self.now_ns += PERIOD_NS
@@ -71,7 +71,7 @@ def noisy(course: Course, amplitude_mps: float = 0.05) -> Course:
 
 
 def test_a_speed_that_drops_to_zero_is_a_fall() -> None:
-    """A speed that becomes 0 at 8.3 m/s is implausible with its first report, and the car is not stationary."""
+    """A speed that drops from 8.3 m/s to 0 is implausible from the first report of 0 on."""
     rig = MonitorRig().run(1.0, NO_PEDAL, noisy(constant(8.3)))
     rig.run(0.01, NO_PEDAL, constant(0.0))
     assert rig.faults == [SpeedFault.FALL]
@@ -90,7 +90,7 @@ def test_the_fault_lasts_until_all_speeds_agree_on_standstill() -> None:
 
 
 def test_a_fault_of_the_only_source_lasts_as_long_as_the_car_may_need() -> None:
-    """Without another speed, the fault lasts until any speed within the limits is braked away."""
+    """Without another speed, the fault lasts until the brake has stopped a car of any speed within the limits."""
     rig = MonitorRig().run(1.0, NO_PEDAL, noisy(constant(5.0)))
     rig.run(FULL_BRAKE_NS / NS_PER_S - 0.02, FULL_BRAKE, constant(0.0))
     assert rig.monitor.fault is SpeedFault.FALL
@@ -109,7 +109,7 @@ def test_a_stuck_speed_disagrees(other: str, stuck_mps: float) -> None:
 
 
 def test_a_scaled_speed_disagrees() -> None:
-    """A speed of half that of the wheels is implausible."""
+    """A speed that is half the wheel speeds is implausible."""
     rig = MonitorRig().run(4.0, THROTTLE, ramp(0.0, 1.0), *[ramp(0.0, 2.0)] * 4)
     assert rig.faults == [SpeedFault.DISAGREEMENT]
 
@@ -164,7 +164,7 @@ def test_a_speed_that_answers_the_throttle_is_believed() -> None:
 
 @pytest.mark.parametrize("speed_mps", [1.5, 2.4])
 def test_locked_wheels_on_ice_are_no_standstill(speed_mps: float) -> None:
-    """A car whose wheels lock is not stationary for as long as it may slide at 1 m/s2."""
+    """A car whose wheels lock is not stationary for as long as it can slide with a deceleration of 1 m/s2."""
     rig = MonitorRig().run(1.0, NO_PEDAL, *[noisy(constant(speed_mps), 0.01)] * 5)
     rig.run(speed_mps - 0.1, FULL_BRAKE, *[constant(0.0)] * 5)
     assert not rig.monitor.is_stationary
@@ -174,7 +174,7 @@ def test_locked_wheels_on_ice_are_no_standstill(speed_mps: float) -> None:
 
 
 def test_wheels_that_lock_in_a_stop_may_have_slipped_before() -> None:
-    """If wheels lock at the end of hard braking, the car may be as fast as if it had slid from the beginning."""
+    """If wheels lock at the end of hard braking, the car can be as fast as if it had slid from the beginning."""
     rig = MonitorRig().run(1.0, NO_PEDAL, *[noisy(constant(8.0), 0.01)] * 5)
     rig.run(0.6, FULL_BRAKE, *[ramp(8.0, -10.0)] * 5)
     rig.run(7.2, FULL_BRAKE, *[constant(0.0)] * 5)
@@ -264,7 +264,7 @@ def test_normal_driving_raises_no_fault(situation: str) -> None:
 
 
 def test_any_moving_source_means_not_stationary() -> None:
-    """A car is stationary only if every source says so; until then, the largest speed counts."""
+    """A car is stationary only if every source says so; until then, the largest speed is the car's speed."""
     rig = MonitorRig().run(0.1, NO_PEDAL, constant(0.0), *[constant(0.0)] * 3, constant(0.4))
     assert not rig.monitor.is_stationary
     assert rig.monitor.speed_mps == pytest.approx(0.4, abs=0.01)
@@ -274,7 +274,7 @@ def test_any_moving_source_means_not_stationary() -> None:
 
 
 def test_an_old_report_is_not_compared() -> None:
-    """A source whose reports are missing does not disagree; that they are missing is a fault by itself."""
+    """A source that sends no new reports is not compared with other sources."""
     monitor = SpeedMonitor(max_acceleration_mps2=2.0, max_braking_mps2=6.0)
     wheel = SpeedReport(8.0, START_NS)
     for index in range(300):

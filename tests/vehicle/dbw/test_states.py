@@ -42,7 +42,7 @@ STAYS: dict[State, Situation] = {
     "overridden": replace(GOOD, enabled=NO_AXES),
     "lost": GOOD,
 }
-"""For each state a situation in which it does not change."""
+"""For each state a situation in which the state does not change."""
 
 
 def target(state: State, **changes: Any) -> State:
@@ -61,7 +61,7 @@ def test_a_state_without_a_cause_does_not_change(state: State) -> None:
 
 Cause = tuple[str, dict[str, Any], dict[State, State]]
 """The cause's name, its change of the situation, and the target of each state that it ends."""
-WITHOUT: list[Cause] = [(f"without {axis}", {"enabled": ALL_AXES - {axis}}, {"engaged": "lost"}) for axis in AXES]
+MISSING_AXES: list[Cause] = [(f"without {axis}", {"enabled": ALL_AXES - {axis}}, {"engaged": "lost"}) for axis in AXES]
 CAUSES: list[Cause] = [
     ("override", {"overrides": "o"}, dict.fromkeys(("enabling", "engaged", "parking", "lost"), "overridden")),
     ("report missing", {"missing_reports": "u"}, dict.fromkeys(("clearing", "enabling", "engaged", "parking"), "lost")),
@@ -76,7 +76,7 @@ CAUSES: list[Cause] = [
     ("gear unknown", {"gear": None}, {"engaged": "lost"}),
     ("reverse", {"gear": "reverse"}, {"engaged": "lost"}),
     ("park", {"gear": "park"}, {"engaged": "lost"}),
-    *WITHOUT,
+    *MISSING_AXES,
 ]
 
 
@@ -145,7 +145,7 @@ ROWS: list[tuple[State, dict[str, Any], State]] = [
 
 @pytest.mark.parametrize(("state", "changes", "follows"), ROWS)
 def test_a_row_needs_all_of_its_conditions(state: State, changes: dict[str, Any], follows: State) -> None:
-    """A row applies only if all its conditions are met; one with a minimum duration applies exactly from then on."""
+    """A row applies only if all its conditions are met; a minimum duration is met exactly from its end on."""
     assert target(state, **changes) == follows
 
 
@@ -187,7 +187,12 @@ CASES: list[tuple[State, dict[str, Any]]] = [
 
 @pytest.mark.parametrize(
     ("state", "cause", "detail"),
-    [(*case, detail) for case in CASES for detail in DETAILS if (case[0], detail) != ("enabling", "trips")],
+    [
+        (state, cause, detail)
+        for state, cause in CASES
+        for detail in DETAILS
+        if (state, detail) != ("enabling", "trips")
+    ],
 )  # a trip ends enabling immediately
 def test_other_reported_problems_are_in_the_reason(state: State, cause: dict[str, Any], detail: str) -> None:
     """A reason contains the trips, command errors and reasons that the kit reports, and no empty part without them."""
@@ -196,14 +201,14 @@ def test_other_reported_problems_are_in_the_reason(state: State, cause: dict[str
     assert cause.get("overrides", "") in text
     assert SEPARATOR + "REASON" in reason(state, **{**cause, "command_errors": "ERROR", "reasons": "REASON"})
     for reason_text in (text, reason(state, **cause)):
-        assert "()" not in text
+        assert "()" not in reason_text
         assert "; ;" not in reason_text
         assert not reason_text.endswith(("; ", " "))
 
 
 @pytest.mark.parametrize("axis", AXES)
 def test_axes_that_are_not_enabled_are_named(axis: Axis) -> None:
-    """A reason names exactly the axes that the kit released or did not enable; clearing names none."""
+    """A reason names exactly the axes that the kit released or did not enable; in `clearing` it names no axis."""
     others = {"enabled": ALL_AXES - {axis}}
     for text in (reason("engaged", **others), reason("enabling", **others, in_state_ns=LIMIT_NS)):
         assert {name for name in AXES if name in text} == {axis}

@@ -66,7 +66,7 @@ def test_total() -> None:
 
 
 def test_checksum_and_counter() -> None:
-    """Wrong checksums and counters that do not count are errors with their number."""
+    """Wrong checksums and repeated counters are errors, each with the number of times."""
     traffic = new_traffic()
     for count, damage in ((1, 0), (1, 0), (2, 4), (2, 0), (3, 0)):
         traffic.receive(ReceivedCanFrame(report(7, count, damage=damage), 0))
@@ -99,7 +99,7 @@ def test_a_missing_report_is_an_error() -> None:
 
 
 def test_lengths() -> None:
-    """A frame of a wrong length is an error, unless it is one that clears an override."""
+    """A frame of a wrong length is an error, unless the frame clears an override."""
     traffic = BusTraffic(GENERATION_1.codec, expected_traffic(GENERATION_1), start_ns=0)
     traffic.receive(ReceivedCanFrame(CanFrame(0x064, bytes([0, 0, 2, 0])), 0))
     assert summary_of(traffic, 0, "SteeringCmd").values["CLEAR"] == 1
@@ -112,7 +112,7 @@ def test_lengths() -> None:
 
 
 def test_unknown() -> None:
-    """Unknown frames are counted by identifier, and those beyond the limit of identifiers together."""
+    """Unknown frames are counted by identifier; beyond a number of identifiers, all others are counted together."""
     traffic = new_traffic()
     for identifier in range(0x10000, 0x10000 + MAX_UNKNOWN + 5):
         traffic.receive(ReceivedCanFrame(CanFrame(identifier, b"", is_extended=True), 0))
@@ -125,7 +125,7 @@ def test_unknown() -> None:
 
 @given(st.lists(st.tuples(st.sampled_from([0x100, 0x106, 0x200, 0x201, 0x216, 0x333]), st.binary(max_size=8))))
 def test_random_bus(frames: list[tuple[int, bytes]]) -> None:
-    """Any frames are counted exactly once and raise nothing."""
+    """Each of any frames is counted exactly once and raises no error."""
     traffic = new_traffic()
     for identifier, data in frames:
         traffic.receive(ReceivedCanFrame(CanFrame(identifier, data), 0))
@@ -133,7 +133,7 @@ def test_random_bus(frames: list[tuple[int, bytes]]) -> None:
 
 
 def test_without_a_profile() -> None:
-    """Without a profile no message is expected, and received ones are summarized."""
+    """Without a profile no message is expected, and received messages are summarized."""
     traffic = BusTraffic(GENERATION_2.codec, ExpectedMessages(), start_ns=0)
     assert traffic.take_period(0) == []
     traffic.receive(ReceivedCanFrame(report(7, 1, damage=1), 0))

@@ -20,7 +20,7 @@ SPEED = CanFrame(0x065, bytes([0, 0, 0, 0, 100, 0, 0, 0]))
 
 
 class StandInPort:
-    """A port that returns frames from a test and records the sent ones."""
+    """A port that returns frames from a test and records the sent frames."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter(overflowed=3)
@@ -104,7 +104,7 @@ def test_truth_and_events(port: StandInPort) -> None:
 
 @pytest.mark.parametrize(("arrived_ns", "counted_ns"), [(-7, -7), (0, 0), (1, 0)])
 def test_arrival(port: StandInPort, arrived_ns: int, counted_ns: int) -> None:
-    """A frame counts from its arrival, but never from later than now."""
+    """A report has the time of its arrival, but never a time later than now."""
     vehicle = new_vehicle(port)
     now_ns = START_NS + NS_PER_MS
     port.waiting = [ReceivedCanFrame(SPEED, now_ns + arrived_ns)]
@@ -176,7 +176,7 @@ def test_write_fails(port: StandInPort, monkeypatch: pytest.MonkeyPatch) -> None
 def test_frames_that_were_not_written(
     port: StandInPort, monkeypatch: pytest.MonkeyPatch, written: int, is_gone: bool
 ) -> None:
-    """The adapter gets the frames back that the port did not write, also if the bus is gone meanwhile."""
+    """The adapter gets back the frames that the port did not write, even if the bus was lost during the write."""
     vehicle = new_vehicle(port)
     frames = [CanFrame(number, bytes(8)) for number in range(3)]
     dropped: list[CanFrame] = []

@@ -58,7 +58,7 @@ class Attempt:
 
 @both_generations
 def test_passed(generation: int) -> None:
-    """The test passes for a kit that disengages 100 ms after the last frame and brakes; it leaves the gear in park."""
+    """The test passes for a kit that disengages and brakes 100 ms after the last frame; the test leaves it in PARK."""
     attempt = Attempt(generation)
     test = attempt.run()
     assert test.failure == ""
@@ -85,7 +85,7 @@ def test_enabled_for_half_a_second(generation: int) -> None:
     attempt.meddle = record
     attempt.run()
     assert max(pedals) == (0.0, 0.3)
-    last_ns = attempt.sent[-1][0]
+    last_ns, _ = attempt.sent[-1]
     assert last_ns - enabled[0] > 480 * NS_PER_MS
     assert enabled[-1] - last_ns <= 100 * NS_PER_MS
     assert attempt.now_ns - last_ns == NS_PER_S
@@ -103,7 +103,7 @@ def test_ticks(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(attempt.test._adapter, "set_actuation", record)
     attempt.run()
-    began_ns, last_ns = attempt.sent[0][0], attempt.sent[-1][0]
+    (began_ns, _), *_, (last_ns, _) = attempt.sent
     sending_ns = [tick_ns for tick_ns in ticks_ns if tick_ns >= began_ns]
     assert {after - before for before, after in pairwise(sending_ns)} == {20 * NS_PER_MS}
     assert sending_ns[-1] - last_ns < 20 * NS_PER_MS
@@ -136,7 +136,7 @@ def delayed(attempt: Attempt, by_ms: int) -> Callable[[CanFrame], CanFrame | Non
 
 @pytest.mark.parametrize(("by_ms", "is_passed"), [(360, True), (420, False)])
 def test_late(by_ms: int, is_passed: bool) -> None:
-    """The test fails if the kit brakes later than 500 ms after the last frame."""
+    """The test fails if the kit brakes more than 500 ms after the last frame."""
     attempt = Attempt(1)
     attempt.spoil = delayed(attempt, by_ms)
     test = attempt.run()
@@ -182,7 +182,7 @@ def test_driver_brakes(generation: int) -> None:
 def test_brakes_already() -> None:
     """The test fails without sending anything if the kit already brakes."""
     attempt = Attempt(2)
-    attempt.kit.driver_brakes(0.02, START_NS)  # too little to count as an override
+    attempt.kit.driver_brakes(0.02, START_NS)  # too little for an override
     assert "brakes before anything was sent" in attempt.run().failure
     assert attempt.sent == []
 
@@ -203,7 +203,7 @@ INHIBITED: list[tuple[Callable[[Attempt], object], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("inhibit", "failure"), INHIBITED, ids=[case[1][:40] for case in INHIBITED])
+@pytest.mark.parametrize(("inhibit", "failure"), INHIBITED, ids=[failure[:40] for _, failure in INHIBITED])
 def test_inhibited(inhibit: Callable[[Attempt], object], failure: str) -> None:
     """The test fails without sending anything, and with the reason, if the kit may not be enabled at standstill."""
     attempt = Attempt(2)
@@ -248,7 +248,7 @@ def test_still_enabled() -> None:
 
 
 def test_signal_of_the_profile() -> None:
-    """The profile's signal counts: the test fails if it is never set."""
+    """The test fails if the signal that the profile names is never set."""
     attempt = Attempt(1)
     attempt.test = WatchdogTest(attempt.profile, OwnBrake("BrakeReport", "BC", 0.0), start_ns=START_NS)
     assert "did not brake" in attempt.run().failure

@@ -18,7 +18,7 @@ def camera_on(road: Road, *, seed: int = 1, model: CameraModel = MODEL, **keys: 
 
 
 def pose_at(road: Road, s_m: float, lateral_m: float = 0.0, turned_rad: float = 0.0, *, mono_ns: int = 0) -> Pose:
-    """Return the pose at a station, with an offset from the lane's centre and a turn from its heading."""
+    """Return the pose at a station, with an offset from the lane's centre and a turn from the lane's heading."""
     x_m, y_m = road.point_at(s_m, lateral_m).tolist()
     return Pose(mono_ns, x_m, y_m, float(road.centre_at(s_m).heading_rad) + turned_rad)
 

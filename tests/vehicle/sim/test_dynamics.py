@@ -100,7 +100,7 @@ def test_tyre_forces_are_limited_by_friction() -> None:
 
 
 def test_steering_follows_with_its_lag() -> None:
-    """One time constant after a small step the steering has covered 63 % of it."""
+    """One time constant after a small step of the command, the steering has covered 63 % of the step."""
     car = car_at()
     drive(car, Actuation(0.05, 0.0, 1.0), CAR.steering_lag_s)
     assert car.motion.steering_rad == pytest.approx(0.05 * (1 - math.exp(-1)), rel=0.02)
@@ -120,14 +120,14 @@ def test_steering_rate_and_angle_are_limited() -> None:
 
 
 def test_pedals_follow_with_their_lag() -> None:
-    """One time constant after full throttle the pedal has covered 63 % of it."""
+    """One time constant after the command of full throttle, the throttle is 63 %."""
     car = car_at()
     drive(car, Actuation(0.0, 1.0, 0.0), CAR.throttle_lag_s)
     assert car.motion.throttle == pytest.approx(1 - math.exp(-1), rel=0.02)
 
 
 def test_full_braking_distance_matches_theory() -> None:
-    """From 30 km/h the car stops after v^2 / 2a + v T - a T^2 / 2, if its deceleration a has a lag T, and stays."""
+    """From 30 km/h, a car whose deceleration a has a lag T stops after v^2 / 2a + v T - a T^2 / 2, and stays there."""
     speed_mps = 30 / 3.6
     car = car_at(speed_mps)
     drive(car, Actuation(0.0, 0.0, 1.0), 3.0)
@@ -176,7 +176,7 @@ def energy_j(car: CarDynamics) -> float:
 @settings(max_examples=60)
 @given(st.floats(4.0, 30.0), st.lists(st.floats(-0.5, 0.5), min_size=3, max_size=12), st.floats(0.0, 1.0))
 def test_a_car_without_throttle_gains_no_energy(speed_mps: float, wheel_rad: list[float], brake: float) -> None:
-    """A car that rolls or brakes loses energy however it is steered, also when it slides."""
+    """A car that rolls or brakes loses energy, however it is steered and even if it slides."""
     car = car_at(speed_mps)
     for steering_rad in wheel_rad:
         for _ in range(48):
@@ -201,12 +201,12 @@ def test_a_rail_stops_motion_into_it_and_adds_no_energy(
     motion = car.motion
     assert (motion.x_m, motion.y_m) == pytest.approx((0.02 * math.cos(out_rad), 0.02 * math.sin(out_rad)))
     assert energy_j(car) <= before_j + 1e-6
-    outward = (math.cos(out_rad - 0.3), math.sin(out_rad - 0.3))
+    out_ahead, out_left = math.cos(out_rad - 0.3), math.sin(out_rad - 0.3)
     from_gravity_m = ahead_m - (CAR.wheelbase_m - CAR.front_axle_to_gravity_m)
-    outwards_mps = (motion.speed_mps - motion.yaw_rate_radps * left_m) * outward[0]
-    outwards_mps += (motion.side_speed_mps + motion.yaw_rate_radps * from_gravity_m) * outward[1]
+    separation_mps = (motion.speed_mps - motion.yaw_rate_radps * left_m) * out_ahead
+    separation_mps += (motion.side_speed_mps + motion.yaw_rate_radps * from_gravity_m) * out_left
     if motion.speed_mps > 0.0:  # a car is not pushed backwards: its remaining speed is removed instead
-        assert outwards_mps >= -1e-9
+        assert separation_mps >= -1e-9
 
 
 def test_a_car_along_a_rail_is_slowed_by_friction() -> None:

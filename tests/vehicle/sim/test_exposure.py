@@ -47,7 +47,7 @@ def node_of(camera: SimCamera) -> CameraNode:
 
 @pytest.mark.parametrize(("exposure_ns", "delay_ns"), [(0, 0), (10_000_000, 0), (8_333_333, 41_000_001), (0, 5_000)])
 def test_a_frame_is_available_after_exposure_and_delay(road: Road, exposure_ns: int, delay_ns: int) -> None:
-    """The node wakes when the exposure and the sensor delay are over; the capture time is the exposure's middle."""
+    """The node wakes after the exposure and the sensor delay; the capture time is the middle of the exposure."""
     camera = camera_on(road, scenery="none", exposure_ns=exposure_ns, sensor_delay_ns=delay_ns)
     node = node_of(camera)
     deliver(node, "pose", pose_at(road, 0.0, mono_ns=MONO_NS - 1), at(0))
@@ -59,7 +59,7 @@ def test_a_frame_is_available_after_exposure_and_delay(road: Road, exposure_ns: 
         assert frame.stamped_mono_ns - frame.capture_ns == exposure_ns - exposure_ns // 2 + delay_ns
 
 
-def latencies_us(out: Path, *changes: str) -> list[int]:
+def capture_to_stamp_us(out: Path, *changes: str) -> list[int]:
     """Drive two virtual seconds and return the time from capture to stamp of every frame, in microseconds."""
     changes = ("vehicle.scenery=none", "record.video=false", *changes)
     loop = build_loop(plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), changes)), out)
@@ -72,7 +72,7 @@ def latencies_us(out: Path, *changes: str) -> list[int]:
 def test_time_from_capture_to_stamp_in_virtual_time(tmp_path: Path) -> None:
     """In a virtual run a frame is stamped half the exposure, the delay and the stages' costs after its capture."""
     (tmp_path / "run").mkdir()
-    measured_us = latencies_us(tmp_path / "run", "camera.exposure_ms=12.0", "camera.sensor_delay_ms=25.5")
+    measured_us = capture_to_stamp_us(tmp_path / "run", "camera.exposure_ms=12.0", "camera.sensor_delay_ms=25.5")
     costs_us = read_costs().stages_us["camera"]
     half_exposure_us, delay_us = 6_000, 25_500
     expected_us = round(half_exposure_us + delay_us + costs_us["capture"] + costs_us["check"])
@@ -103,7 +103,7 @@ def test_a_moving_car_has_motion_blur_and_a_stationary_one_has_none(road: Road) 
 
 
 def test_an_exposure_of_zero_shows_the_newest_pose(road: Road) -> None:
-    """With an exposure of 0 a frame is byte for byte that of the newest pose at or before its time."""
+    """With an exposure of 0, a frame shows the newest pose that is not later than the frame's time."""
     poses = [pose_at(road, 0.1 * step, mono_ns=step * STEP_NS) for step in range(6)]
     camera = camera_on(road)
     frame = camera.expose(9, 3 * STEP_NS + 1, poses)
@@ -114,7 +114,7 @@ def test_an_exposure_of_zero_shows_the_newest_pose(road: Road) -> None:
 
 
 def test_poses_are_interpolated_and_extrapolated() -> None:
-    """A pose is interpolated between two poses, extrapolated for 20 ms beyond the last, and None before the first."""
+    """A pose is interpolated between two poses, extrapolated for 20 ms after them, and None before the first pose."""
     poses = [Pose(0, 0.0, 0.0, 3.1), Pose(4_000_000, 4.0, 2.0, -3.1)]
     assert interpolate_pose(poses, -1) is None
     assert interpolate_pose(poses[:1], 9) == poses[0]

@@ -89,9 +89,9 @@ def test_the_start_is_no_lane_invasion(road: Road) -> None:
 
 @pytest.mark.parametrize(("lateral_m", "kind"), [(-8.25, "rail"), (11.35, "barrier")])
 def test_a_corner_at_a_rail_is_one_collision(road: Road, lateral_m: float, kind: str) -> None:
-    """A body whose side reaches the rail or the barrier has one collision, which names the obstacle."""
-    clear_of_it_m = lateral_m - math.copysign(0.1, lateral_m)
-    assert "collision" not in kinds(events_along(road, [(5.0, clear_of_it_m)]))
+    """A body whose side reaches the rail or the barrier has one collision, and the event names the obstacle."""
+    clear_m = lateral_m - math.copysign(0.1, lateral_m)
+    assert "collision" not in kinds(events_along(road, [(5.0, clear_m)]))
     events = [event for event in events_along(road, [(5.0, lateral_m), (5.0, lateral_m)]) if event.kind == "collision"]
     assert len(events) == 1
     assert kind in events[0].detail
@@ -142,7 +142,7 @@ def test_an_edge_exactly_on_a_line_is_still_in_its_lane() -> None:
 
 
 def test_both_edges_can_leave_their_lanes_in_one_step(road: Road) -> None:
-    """A car turned across the road has two lane invasions in one step, that of the left edge first."""
+    """A car turned across the road has two lane invasions in one step, the invasion by the left edge first."""
     events = events_along(road, [(5.0, 0.0), (5.0, 0.0)])
     assert events == []
     monitor = RouteMonitor(road, CAR, near_s_m=5.0)
@@ -161,12 +161,15 @@ def test_a_spin_is_evaluated_at_the_outermost_points(road: Road) -> None:
     for index in range(181):
         events += monitor.update(motion_at(road, 5.0, 0.0, math.radians(index)), index)
     sides = [event.detail.split()[0] for event in events if event.kind == "lane_invasion"]
-    assert sides == ["left", "left"]  # the front goes out and comes back; the rear, 1.4 m from the axle, stays in
+    assert sides == [
+        "left",
+        "left",
+    ]  # the front leaves the lane and returns; the rear, 1.4 m from the axle, does not leave it
     assert set(kinds(events)) == {"lane_invasion"}
 
 
 def test_driving_backwards_does_not_complete_a_route(road: Road) -> None:
-    """A car that drives backwards from the start has negative progress and only exceeds its time limit."""
+    """A car that drives backwards from the start has negative progress, and no event but the timeout."""
     places = [(1.0 - index / 4, 0.0) for index in range(100)]
     monitor = RouteMonitor(road, CAR, near_s_m=1.0, limit_s=1e-6)
     events = []
@@ -210,14 +213,14 @@ def test_asphalt_is_limited_to_its_stations() -> None:
 
 
 def test_a_car_behind_a_rail_does_not_touch_it() -> None:
-    """A body entirely behind a rail passes its beginning; a body that meets its front has a collision."""
+    """A body entirely behind a rail passes the rail's beginning; a body that meets the beginning has a collision."""
     road = parse_road(OPEN_RAIL, source="x")
     assert "collision" not in kinds(events_along(road, [(30.0 + s_m, -7.5) for s_m in range(20)]))
     assert "collision" in kinds(events_along(road, [(30.0 + s_m, -6.2) for s_m in range(20)]))
 
 
 def test_one_contact_is_one_collision(road: Road) -> None:
-    """Contacts within half a second are one collision; a later contact is another one."""
+    """Contacts less than half a second apart are one collision; a contact after a longer pause is another collision."""
     monitor = RouteMonitor(road, CAR, near_s_m=5.0)
     at_rail, off_rail = motion_at(road, 5.0, -8.25), motion_at(road, 5.0, -8.0)
     collisions = []
@@ -229,7 +232,7 @@ def test_one_contact_is_one_collision(road: Road) -> None:
 
 
 def test_a_lasting_contact_is_one_collision(road: Road) -> None:
-    """A car pressed against a rail for seconds has one collision, also when it moves deeper."""
+    """A car pressed against a rail for seconds has one collision, even if it moves deeper into the rail."""
     monitor = RouteMonitor(road, CAR, near_s_m=5.0)
     events = [event for at_s in range(4) for event in monitor.update(motion_at(road, 5.0, -8.5), at_s * NS_PER_S // 3)]
     events += monitor.update(motion_at(road, 5.0, -8.8), 4 * NS_PER_S // 3)
@@ -268,7 +271,7 @@ STEPS = st.tuples(st.floats(-0.3, 0.6), st.floats(-0.3, 0.3), st.floats(-0.1, 0.
 def test_skipping_checks_changes_no_events(
     road: Road, steps: list[tuple[float, float, float]], s_m: float, lateral_m: float
 ) -> None:
-    """A monitor that skips checks within its margin reports the same events as one that checks every step."""
+    """A monitor that skips checks within its margin reports the same events as a monitor that checks every step."""
     skipping, always_checking = RouteMonitor(road, CAR, near_s_m=s_m), RouteMonitor(road, CAR, near_s_m=s_m)
     turned_rad = 0.0
     for index, (ahead_m, beside_m, turn_rad) in enumerate(steps):

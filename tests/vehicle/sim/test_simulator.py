@@ -59,7 +59,7 @@ def test_the_car_is_stationary_until_the_first_command(road: Road) -> None:
 
 
 def test_one_long_advance_equals_many_short_ones(road: Road) -> None:
-    """One long advance has the same events and final state as many short ones."""
+    """One long advance has the same events and final state as many short advances."""
     one, many = simulator_on(road), simulator_on(road)
     end_ns = START_NS + 4 * NS_PER_S
     for simulator in (one, many):
@@ -98,7 +98,7 @@ def test_a_command_takes_effect_at_the_next_grid_point(road: Road) -> None:
 
 
 def test_the_seed_draws_the_start_within_bounds(road: Road) -> None:
-    """Starts of many seeds fill 2 m ahead, 0.25 m and 1.5 degrees to both sides; one seed has one start."""
+    """The starts of many seeds fill 0 to 2 m ahead, 0.25 m and 1.5 degrees to both sides; one seed has one start."""
     truths = [simulator_on(road, seed=seed).ground_truth() for seed in range(60)]
     assert truths[7] == simulator_on(road, seed=7).ground_truth()
     for values, low, high in (
@@ -169,19 +169,19 @@ def test_steering_and_pedals_have_separate_dead_times(road: Road) -> None:
     car = replace(LINCOLN_MKZ, steering_dead_time_s=0.15, pedal_dead_time_s=0.05)
     simulator = Simulator(road=road, seed=1, start_mono_ns=0, parameters=car)
     simulator.apply(Actuation(0.02, 1.0, 0.0), 0)
-    steering_and_throttle = {}
+    motion_at_ms = {}
     for at_ms in (49, 60, 149, 160, 150 + 120):
         simulator.advance(at_ms * NS_PER_MS)
-        steering_and_throttle[at_ms] = (simulator._car.motion.steering_rad, simulator._car.motion.throttle)
-    assert steering_and_throttle[49] == (0.0, 0.0)
-    assert steering_and_throttle[60][1] > 0.0
-    assert steering_and_throttle[149][0] == 0.0
-    assert steering_and_throttle[160][0] > 0.0
-    assert steering_and_throttle[270][0] == pytest.approx(0.02 * (1 - math.exp(-1)), rel=0.05)
+        motion_at_ms[at_ms] = replace(simulator._car.motion)
+    assert (motion_at_ms[49].steering_rad, motion_at_ms[49].throttle) == (0.0, 0.0)
+    assert motion_at_ms[60].throttle > 0.0
+    assert motion_at_ms[149].steering_rad == 0.0
+    assert motion_at_ms[160].steering_rad > 0.0
+    assert motion_at_ms[270].steering_rad == pytest.approx(0.02 * (1 - math.exp(-1)), rel=0.05)
 
 
 def test_dead_time_only_shifts_commands(road: Road) -> None:
-    """With a dead time, the steering makes exactly the same motion as without one, but later."""
+    """With a dead time, the steering makes exactly the same motion as without a dead time, but later."""
     late_ns = 250 * NS_PER_MS  # a whole number of steps
     plain = Simulator(road=road, seed=1, start_mono_ns=0)
     delayed = Simulator(
@@ -227,7 +227,7 @@ def drive_into_the_rail(steering_rad: float, duration_s: float) -> tuple[Simulat
 
 @pytest.mark.parametrize(("steering_rad", "name"), [(0.03, "barrier"), (-0.03, "rail")])
 def test_a_car_that_continues_after_a_collision_slides_along(steering_rad: float, name: str) -> None:
-    """A car steered into a rail has one collision, enters it by less than 2 cm, aligns with it, and drives on."""
+    """A car steered into a rail has one collision, enters the rail by less than 2 cm, aligns with it, and drives on."""
     simulator, events, deepest_m = drive_into_the_rail(steering_rad, 16.0)
     hits = [event.detail for event in events if event.kind == "collision"]
     assert len(hits) == 1

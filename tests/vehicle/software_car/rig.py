@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -15,7 +15,7 @@ from lavt.vehicle.software_car.kit import Kit
 START_NS = 77_000_000_123
 AXES = ("steering", "brake", "throttle")
 STEERING_RATIO = 14.8
-"""Angle of the steering wheel divided by that of the road wheels."""
+"""Angle of the steering wheel divided by the angle of the road wheels."""
 DEGREES_PER_RAD = 57.29577951308232
 
 
@@ -45,6 +45,19 @@ class CommandValues:
     clear: bool = False
     ignore: bool = False
     rate: int = 0
+
+
+class WheelActuation(NamedTuple):
+    """What the kit makes the car do: the angle of the steering wheel, and the pedals between 0 and 1."""
+
+    steering_wheel_deg: float
+    throttle: float
+    brake: float
+
+    @property
+    def pedals(self) -> tuple[float, float]:
+        """Throttle and brake."""
+        return self.throttle, self.brake
 
 
 class Sender1:
@@ -166,10 +179,10 @@ class KitRig:
         """Return the enabled axes."""
         return {axis for axis, actuator in self.kit.state.actuators.items() if actuator.is_enabled}
 
-    def wheels(self) -> tuple[float, float, float]:
-        """Return the actuation of the wheels: steering wheel in degrees, throttle, brake."""
+    def wheels(self) -> WheelActuation:
+        """Return the actuation that reaches the wheels now."""
         actuation = self.kit.actuation(self.now_ns)
-        return (
+        return WheelActuation(
             round(actuation.steering_rad * STEERING_RATIO * DEGREES_PER_RAD, 6),
             round(actuation.throttle, 4),
             round(actuation.brake, 4),

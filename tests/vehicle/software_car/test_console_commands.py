@@ -70,17 +70,17 @@ def test_a_command_has_its_effect(line: str, has_effect: Callable[[Kit], bool]) 
     ],
 )
 def test_an_inverse_command_restores_the_kit(command: str, inverse: str) -> None:
-    """A command and its inverse leave the kit as it was."""
+    """A command and then its inverse leave the kit's faults and reports unchanged."""
     rig = KitRig(2)
-    before = condition_of(rig)
+    before = faults_and_frames_in_a_second(rig)
     execute(rig.kit, command, rig.now_ns)
-    assert condition_of(rig) != before
+    assert faults_and_frames_in_a_second(rig) != before
     execute(rig.kit, inverse, rig.now_ns)
-    assert condition_of(rig) == before
+    assert faults_and_frames_in_a_second(rig) == before
 
 
-def condition_of(rig: KitRig) -> tuple[object, ...]:
-    """Return a kit's faults, and its number of frames in a second."""
+def faults_and_frames_in_a_second(rig: KitRig) -> tuple[object, ...]:
+    """Let a second pass; return a kit's faults and the number of its frames in this second."""
     rig.now_ns += NS_PER_S
     state, frame_count = rig.kit.state, len(rig.kit.frames_due(rig.now_ns))
     faults = [sorted(actuator.faults) for actuator in state.actuators.values()]
@@ -90,12 +90,12 @@ def condition_of(rig: KitRig) -> tuple[object, ...]:
 
 @pytest.mark.parametrize(("lines", "brake"), [([], 0.5), (["no_watchdog"], 0.0), (["no_watchdog", "watchdog"], 0.5)])
 def test_the_watchdog_can_be_disabled(lines: list[str], brake: float) -> None:
-    """After a command timeout a kit brakes with its watchdog and coasts without it."""
+    """After a command timeout a kit with a watchdog brakes, and a kit without a watchdog coasts."""
     rig = driving_rig(2)
     for line in lines:
         execute(rig.kit, line, rig.now_ns)
     rig.wait_ms(200)
-    assert rig.wheels()[2] == brake
+    assert rig.wheels().brake == brake
 
 
 @pytest.mark.parametrize(
@@ -142,7 +142,7 @@ def test_any_line_is_executed_or_rejected(line: str) -> None:
 
 
 def test_every_action_has_a_command() -> None:
-    """Every method of a kit that acts on it from outside has a command."""
+    """Every public method of a kit has a command, except the methods that need no command."""
     methods = {name for name, _ in inspect.getmembers(Kit, inspect.isfunction) if not name.startswith("_")}
     called = {name for command in COMMANDS.values() for name in command.execute.__code__.co_names}
     assert methods - INTERNAL_METHODS <= called

@@ -10,7 +10,7 @@ from lavt.vehicle.software_car.state import Gear, GearRejection, ReleaseReason
 @both_generations
 @pytest.mark.parametrize("axis", AXES)
 def test_override(generation: int, axis: str) -> None:
-    """An override releases its axis, or all in generation 2, trips no watchdog, and stays until it is cleared."""
+    """An override releases its axis (in generation 2 all axes), trips no watchdog, and remains until it is cleared."""
     rig = driving_rig(generation)
     act = {"steering": rig.kit.driver_steers, "brake": rig.kit.driver_brakes, "throttle": rig.kit.driver_throttles}[
         axis
@@ -44,7 +44,7 @@ def test_an_active_override_is_not_cleared(generation: int) -> None:
 
 @both_generations
 def test_small_inputs_do_not_override(generation: int) -> None:
-    """Less than 2 Nm on the wheel or a twentieth of a pedal is no override."""
+    """A torque of less than 2 Nm on the wheel, or less than a twentieth of a pedal's travel, is no override."""
     rig = driving_rig(generation)
     rig.kit.driver_steers(1.9, rig.now_ns)
     rig.kit.driver_brakes(0.04, rig.now_ns)
@@ -64,7 +64,7 @@ def test_ignore_prevents_an_override(generation: int) -> None:
 
 
 def test_clearing_frames_have_no_counter() -> None:
-    """In generation 1 a frame of 4 bytes neither trips the watchdog, nor enables, nor prevents a timeout."""
+    """In generation 1 a clearing frame (4 bytes) trips no watchdog, enables nothing and prevents no timeout."""
     rig = driving_rig(1)
     for _ in range(4):
         rig.wait_ms(25)
@@ -121,20 +121,20 @@ def test_reasons_for_rejected_gears(generation: int) -> None:
 
 @both_generations
 def test_out_of_gear_the_throttle_has_no_effect(generation: int) -> None:
-    """In park the car brakes, and in neutral the throttle has no effect, whether of the kit or of the driver."""
+    """In park the car brakes; in park and in neutral, neither the kit's nor the driver's throttle has an effect."""
     rig = KitRig(generation)
     rig.enable(in_drive=False)
     rig.command(throttle=0.5)
     rig.kit.driver_throttles(0.02, rig.now_ns)
-    assert rig.wheels()[1:] == (0.0, 1.0)
+    assert rig.wheels().pedals == (0.0, 1.0)
     rig.command(brake=0.5)
     rig.send(rig.sender.gear(3))
     rig.command(throttle=0.5)
-    assert rig.wheels()[1:] == (0.0, 0.0)
+    assert rig.wheels().pedals == (0.0, 0.0)
 
 
 def test_override_by_the_shifter() -> None:
-    """Moving the shifter disengages generation 2; generation 1 reports it, and the sender has to disengage."""
+    """Moving the shifter disengages generation 2; generation 1 only reports it, and the sender has to disengage."""
     rig = driving_rig(2)
     rig.kit.driver_shifts(Gear.NEUTRAL, rig.now_ns)
     assert (rig.enabled(), rig.kit.state.disengage_reason, rig.kit.state.watchdog_reason) == (
@@ -152,7 +152,7 @@ def test_override_by_the_shifter() -> None:
 
 @both_generations
 def test_the_driver_prevents_enabling(generation: int) -> None:
-    """A command to enable while the driver brakes is an override that stays after the pedal was released."""
+    """A command to enable while the driver brakes is an override, which remains after the pedal is released."""
     rig = KitRig(generation)
     rig.kit.driver_brakes(0.5, rig.now_ns)
     rig.command()

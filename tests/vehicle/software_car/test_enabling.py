@@ -18,7 +18,7 @@ from lavt.vehicle.software_car.state import ReleaseReason, SystemState
 
 
 def test_generation_1_enables_each_axis_by_its_own_bit() -> None:
-    """In generation 1 each axis is enabled by its own command with EN, independently of the others."""
+    """In generation 1 each axis is enabled by its own command with EN, independently of the other axes."""
     rig = KitRig(1)
     steering, _, _ = rig.sender.commands(CommandValues(angle_deg=10.0))
     assert rig.enabled() == set()
@@ -78,7 +78,7 @@ def test_generation_2_needs_a_new_request() -> None:
 
 
 def test_only_the_chosen_set_is_accepted() -> None:
-    """A kit accepts commands of its own set only, remote or user."""
+    """A kit accepts only commands of its command set: the remote commands or the user commands."""
     rig = KitRig(2)
     rig.sender = Sender2(0x210)
     rig.command()
@@ -100,16 +100,16 @@ def test_commands_reach_the_wheels(generation: int) -> None:
 
 @both_generations
 def test_steering_rate(generation: int) -> None:
-    """At 25 steps, 100 deg/s, the wheel turns 10 degrees in 100 ms; without a rate it turns at 17.5 rad/s."""
+    """At rate 25 (100 deg/s) the steering wheel turns 10 degrees in 100 ms; without a rate it turns at 17.5 rad/s."""
     rig = driving_rig(generation)
     for _ in range(5):
         rig.command(angle_deg=90.0, rate=25)
         rig.wait_ms(20)
-    assert rig.wheels()[0] == 10.0
+    assert rig.wheels().steering_wheel_deg == 10.0
     quick = driving_rig(generation)
     quick.command(angle_deg=300.0)
     quick.wait_ms(20)
-    assert quick.wheels()[0] == pytest.approx(0.02 * 17.5 * DEGREES_PER_RAD)
+    assert quick.wheels().steering_wheel_deg == pytest.approx(0.02 * 17.5 * DEGREES_PER_RAD)
 
 
 @both_generations
@@ -118,12 +118,12 @@ def test_steering_starts_at_the_current_angle(generation: int) -> None:
     rig = KitRig(generation)
     rig.set_motion(0.0, steering_rad=0.2)
     rig.enable()
-    assert rig.wheels()[0] == pytest.approx(0.2 * STEERING_RATIO * DEGREES_PER_RAD)
+    assert rig.wheels().steering_wheel_deg == pytest.approx(0.2 * STEERING_RATIO * DEGREES_PER_RAD)
 
 
 @both_generations
 def test_an_unknown_command_type_enables_nothing(generation: int) -> None:
-    """A command of an unknown type counts as a command without its enable bit."""
+    """A command of an unknown type is treated as a command without the enable bit."""
     rig = KitRig(generation)
     rig.request_system()
     rig.command(angle_deg=1.0)
@@ -154,11 +154,11 @@ def test_generation_1_types_of_brake_command(kind: int, raw: float, fraction: fl
     data = bytearray(brake.data)
     data[2] = kind << 4
     rig.send(CanFrame(brake.identifier, bytes(data)))
-    assert rig.wheels()[2] == pytest.approx(fraction, abs=2e-4)
+    assert rig.wheels().brake == pytest.approx(fraction, abs=2e-4)
 
 
 def test_a_repeated_counter_invalidates_a_request() -> None:
-    """Generation 2 ignores a request to the system with the counter of the previous one."""
+    """Generation 2 ignores a request to the system with the counter of the previous request."""
     rig = KitRig(2)
     rig.enable()
     rig.request_system()

@@ -23,7 +23,7 @@ def test_a_fault_disengages_and_brakes(generation: int, name: str) -> None:
     """A fault while driving makes the kit release all axes and brake."""
     rig = driving_rig(generation)
     rig.kit.set_fault(name, rig.now_ns)
-    assert (rig.enabled(), rig.kit.state.watchdog_reason, rig.wheels()[2]) == (
+    assert (rig.enabled(), rig.kit.state.watchdog_reason, rig.wheels().brake) == (
         set(),
         ReleaseReason.FAULT,
         WATCHDOG_BRAKE,
@@ -32,7 +32,7 @@ def test_a_fault_disengages_and_brakes(generation: int, name: str) -> None:
 
 @pytest.mark.parametrize(("generation", "name"), FAULTS)
 def test_a_faulty_axis_is_not_enabled(generation: int, name: str) -> None:
-    """An axis with a fault is not enabled, and in generation 2 no axis is; clearing the fault allows it again."""
+    """A fault prevents enabling of its axis (in generation 2, of all axes) until it is cleared."""
     rig = KitRig(generation)
     rig.kit.set_fault(name, rig.now_ns)
     rig.command()
@@ -54,7 +54,7 @@ def test_a_faulty_axis_is_not_enabled(generation: int, name: str) -> None:
     ],
 )
 def test_an_inhibit_reason_of_generation_2_disengages(name: str, reason: ReleaseReason) -> None:
-    """Belt, door and lockouts keep generation 2 in manual, with the reason; while driving it disengages and brakes."""
+    """Belt, door and lockouts keep generation 2 in manual, with the reason; an enabled kit disengages and brakes."""
     rig = KitRig(2)
     rig.kit.inhibit(name, rig.now_ns)
     rig.command()
@@ -68,10 +68,10 @@ def test_an_inhibit_reason_of_generation_2_disengages(name: str, reason: Release
 
 @pytest.mark.parametrize("remote_state", [0, 1])
 def test_the_remotes_switch(remote_state: int) -> None:
-    """At emergency stop or pause generation 2 disengages and brakes, and is not ready."""
+    """If the remote is switched to emergency stop or pause, a kit of generation 2 disengages and brakes."""
     rig = driving_rig(2)
     rig.kit.switch_remote(remote_state, rig.now_ns)
-    assert (rig.enabled(), rig.wheels()[2], rig.kit.state.watchdog_reason) == (
+    assert (rig.enabled(), rig.wheels().brake, rig.kit.state.watchdog_reason) == (
         set(),
         WATCHDOG_BRAKE,
         ReleaseReason.REMOTE,
@@ -95,7 +95,7 @@ def test_bus_off(generation: int) -> None:
 
 @both_generations
 def test_unknown_names_are_rejected(generation: int) -> None:
-    """An unknown fault, inhibit reason, value or gear is rejected with the known ones."""
+    """An unknown fault, inhibit reason, value or gear is rejected with an error that quotes it."""
     kit = KitRig(generation).kit
     with pytest.raises(UserError, match=r"no fault 'brake\.smoke': the known ones are brake"):
         kit.set_fault("brake.smoke", 10**12)

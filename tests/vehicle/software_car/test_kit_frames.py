@@ -17,8 +17,8 @@ from lavt.vehicle.software_car.generation_2_layouts import REPORT_LAYOUTS, UNVER
 from lavt.vehicle.software_car.kit import Kit
 
 LETTERS = b"0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz"
-COMMANDS = (0x060, 0x062, 0x064, 0x066, 0x200, 0x201, 0x202, 0x203, 0x210, 0x211, 0x212, 0x213, 0x216)
-identifiers = st.sampled_from(COMMANDS) | st.integers(0, 0x7FF)
+COMMAND_IDENTIFIERS = (0x060, 0x062, 0x064, 0x066, 0x200, 0x201, 0x202, 0x203, 0x210, 0x211, 0x212, 0x213, 0x216)
+identifiers = st.sampled_from(COMMAND_IDENTIFIERS) | st.integers(0, 0x7FF)
 
 
 @pytest.mark.parametrize(("data", "crc"), [(b"", 0x00), (b"0", 0x71), (b"01", 0x28), (b"012", 0x24), (LETTERS, 0xA3)])
@@ -28,7 +28,7 @@ def test_the_crc_matches_the_published_values(data: bytes, crc: int) -> None:
 
 
 def test_the_checksum_begins_with_the_identifier() -> None:
-    """The checksum covers the identifier: that of identifier 0 without data is 0xBE, and 0x59 if it is extended."""
+    """The checksum covers the identifier: for identifier 0 without data it is 0xBE, or 0x59 if 0 is extended."""
     assert (checksum(0, b""), checksum(0, b"", is_extended=True)) == (0xBE, 0x59)
 
 
@@ -60,7 +60,7 @@ def test_values_out_of_range_are_clamped() -> None:
 
 
 def test_fields_do_not_overlap() -> None:
-    """In every report no two fields overlap, and none overlaps the checksum."""
+    """In every report no two fields overlap, and no field overlaps the checksum."""
     for identifier, layout in REPORT_LAYOUTS.items():
         bits = [bit for field in layout.fields for bit in range(field.bit, field.bit + field.width)]
         assert len(bits) == len(set(bits))
@@ -73,7 +73,7 @@ def test_fields_do_not_overlap() -> None:
     frames=st.lists(st.tuples(identifiers, st.binary(max_size=8), st.booleans(), st.integers(0, 30)), max_size=40),
 )
 def test_random_frames_enable_nothing(generation: int, frames: list[tuple[int, bytes, bool, int]]) -> None:
-    """Any frames raise nothing, and enable nothing without a right checksum or an enable bit."""
+    """Random frames without a valid checksum or without an enable bit raise no error and enable nothing."""
     kit = Kit(1 if generation == 1 else 2, start_ns=START_NS)
     now_ns = START_NS
     for identifier, data, is_extended, wait_ms in frames:
@@ -96,7 +96,7 @@ def test_random_frames_enable_nothing(generation: int, frames: list[tuple[int, b
     frames=st.lists(st.tuples(identifiers, st.binary(min_size=1, max_size=8), st.integers(0, 60)), max_size=60),
 )
 def test_valid_but_senseless_frames_raise_nothing(generation: int, frames: list[tuple[int, bytes, int]]) -> None:
-    """Frames with right checksums and any contents raise nothing, and the actuation stays in range."""
+    """Frames with valid checksums and random contents raise no error, and the actuation stays in range."""
     kit = Kit(1 if generation == 1 else 2, start_ns=START_NS)
     now_ns = START_NS
     for identifier, data, wait_ms in frames:
@@ -110,8 +110,8 @@ def test_valid_but_senseless_frames_raise_nothing(generation: int, frames: list[
         assert all(len(frame.data) <= 8 for frame in kit.frames_due(now_ns))
 
 
-def test_it_shares_no_codec() -> None:
-    """The software car imports nothing of the adapter, of python-can and of cantools."""
+def test_the_software_car_shares_no_codec() -> None:
+    """The software car imports neither the adapter nor python-can nor cantools."""
     for path in Path(package.__file__).parent.glob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []

@@ -22,8 +22,8 @@ PERIODS_MS = {
 }
 
 
-def reports(rig: KitRig) -> dict[int, bytes]:
-    """Return the newest reports after all periods have passed."""
+def collect_reports(rig: KitRig) -> dict[int, bytes]:
+    """Let the longest period pass; return the newest report of each identifier."""
     rig.last.clear()
     for _ in range(10):
         rig.wait_ms(10)
@@ -46,7 +46,7 @@ def test_reports_have_their_periods(generation: int) -> None:
 
 @both_generations
 def test_a_late_call_returns_each_report_once(generation: int) -> None:
-    """A call that is one second late returns each report once, and the next ones at their regular times."""
+    """A call that is one second late returns each report once, and the next reports keep their regular times."""
     kit = KitRig(generation).kit
     late_ns = START_NS + 1_003 * NS_PER_MS
     assert sorted(frame.identifier for frame in kit.frames_due(late_ns)) == sorted(PERIODS_MS[generation])
@@ -60,7 +60,7 @@ def test_generation_1_reports_of_a_drive() -> None:
     rig.command(angle_deg=-45.0)
     rig.set_motion(10.0, steering_rad=math.radians(10.0))
     rig.kit.driver_steers(-1.5, rig.now_ns)
-    found = reports(rig)
+    found = collect_reports(rig)
     # Angle and command in 0.1 degrees at the steering wheel, speed in 1/360 m/s, torque in 1/16 Nm, flags.
     assert found[0x065] == struct.pack("<hHhbB", 1480, -450 & 0x7FFF, 3600, -24, 0b00000001)
     assert found[0x061] == struct.pack("<HHHBB", 0, 8192, 8192, 0, 0b00000001)
@@ -70,12 +70,12 @@ def test_generation_1_reports_of_a_drive() -> None:
 
 
 def test_generation_2_reports_of_a_drive() -> None:
-    """In generation 2 the reports contain the same, with the state active, a counter and a checksum."""
+    """In generation 2 the reports contain the same values, with the state active, a counter and a checksum."""
     rig = driving_rig(2)
     rig.command(angle_deg=-45.0)
     rig.set_motion(10.0, steering_rad=math.radians(10.0))
     rig.kit.driver_steers(-1.5, rig.now_ns)
-    found = reports(rig)
+    found = collect_reports(rig)
     flags = 0b10_0000_0011
     assert found[0x100][:6] == struct.pack("<HHBB", 1480, -450 & 0x3FFF, -24 & 0xFF, flags & 0xFF)
     assert found[0x100][6] & 0x0F == flags >> 8
@@ -109,10 +109,10 @@ def test_generation_1_reports_an_override() -> None:
     """OVERRIDE remains after the driver has released the pedal; DRIVER and the input follow the pedal."""
     rig = driving_rig(1)
     rig.kit.driver_brakes(1.0, rig.now_ns)
-    found = reports(rig)
+    found = collect_reports(rig)
     assert (found[0x061][7], found[0x061][:2]) == (0b00000110, b"\xff\xff")
     rig.kit.driver_brakes(0.0, rig.now_ns)
-    found = reports(rig)
+    found = collect_reports(rig)
     assert (found[0x061][7], found[0x061][:2]) == (0b00000010, b"\x00\x00")
 
 
@@ -139,9 +139,10 @@ def test_generation_1_reports_an_override() -> None:
 def test_faults_have_their_bits(name: str, identifier: int, byte: int, bit: int) -> None:
     """A fault sets exactly its own bit."""
     rig = KitRig(1 if identifier < 0x100 else 2)
-    before = dict(reports(rig))[identifier]
+    before = dict(collect_reports(rig))[identifier]
     rig.kit.set_fault(name, rig.now_ns)
-    changed = [index ^ after for index, after in zip(before, dict(reports(rig))[identifier], strict=True)]
+    after = dict(collect_reports(rig))[identifier]
+    changed = [old ^ new for old, new in zip(before, after, strict=True)]
     ready = 1 if identifier >= 0x100 else 0
     expected = [0] * len(before)
     expected[byte] = 1 << bit | ready
@@ -179,10 +180,10 @@ def test_generation_2_reports_why_it_disengaged() -> None:
 
 
 def test_generation_2_reports_an_override_of_another_axis() -> None:
-    """In generation 2 each axis reports that another one is overridden."""
+    """In generation 2 each axis reports that another axis is overridden."""
     rig = driving_rig(2)
     rig.kit.driver_brakes(0.5, rig.now_ns)
-    found = reports(rig)
+    found = collect_reports(rig)
     other, latched = 1 << 7, 1
     assert (found[0x100][5] & other, found[0x102][5] & other, found[0x101][5] & other) == (other, other, 0)
     assert (found[0x100][6] & latched, found[0x101][6] & latched) == (0, latched)
@@ -193,17 +194,17 @@ def test_unknown_values() -> None:
     rig = KitRig(1)
     for name in ("angle", "speed", "wheel_speed"):
         rig.kit.set_unknown(name)
-    found = reports(rig)
+    found = collect_reports(rig)
     assert (found[0x065][0:2], found[0x065][4:6], found[0x06A]) == (b"\x00\x80", b"\x00\x80", b"\x00\x80" * 4)
     rig.kit.set_unknown("speed", is_unknown=False)
-    assert reports(rig)[0x065][4:6] == b"\x00\x00"
+    assert collect_reports(rig)[0x065][4:6] == b"\x00\x00"
     second = KitRig(2)
     second.kit.set_unknown("speed")
-    assert reports(second)[0x107][:4] == b"\x00\x80\x00\x80"
+    assert collect_reports(second)[0x107][:4] == b"\x00\x80\x00\x80"
 
 
 def test_a_rejected_gear_is_reported() -> None:
     """Generation 1 reports the reason of a rejected gear: 5, press the brake."""
     rig = KitRig(1)
     rig.send(rig.sender.gear(4))
-    assert reports(rig)[0x067] == bytes([1 | 4 << 4, 5 | 0x80])
+    assert collect_reports(rig)[0x067] == bytes([1 | 4 << 4, 5 | 0x80])

@@ -86,8 +86,8 @@ class RunnerRig:
             self.step_ms(20)
 
 
-def test_reports_carry_their_own_times() -> None:
-    """However late a step is, each frame is sent with the time at which it was due."""
+def test_reports_have_the_times_at_which_they_were_due() -> None:
+    """However late a step is, each frame is sent with the time at which the frame was due."""
     rig = RunnerRig()
     rig.step_ms(35)
     due = [(frame.identifier, (made_ns - START_NS) / NS_PER_MS) for frame, made_ns in rig.bus.sent]
@@ -100,7 +100,7 @@ def test_reports_carry_their_own_times() -> None:
 
 
 def test_the_car_catches_up() -> None:
-    """After a delay of 0.3 s the car has taken all its steps, and its timeouts have their own times."""
+    """After a delay of 0.3 s the car has taken all its steps, and a timeout has the time at which it was due."""
     rig = RunnerRig()
     rig.enable()
     rig.drive_ms(1_000, throttle=0.3)
@@ -128,7 +128,7 @@ def test_frames_are_processed_at_their_arrival_times() -> None:
 
 @pytest.mark.parametrize(("at_ms", "taken_ms"), [(-1000, 20), (1000, 40)])
 def test_invalid_arrival_times(at_ms: int, taken_ms: int) -> None:
-    """An arrival time before the car's current time or in the future is clamped to the current step."""
+    """An arrival time before the previous step or after the current step is clamped to the nearer of these steps."""
     rig = RunnerRig()
     rig.step_ms(20)
     rig.deliver(*rig.sender.commands(CommandValues(brake=0.5)), at_ns=START_NS + at_ms * NS_PER_MS)
@@ -161,7 +161,7 @@ def test_events_of_a_drive() -> None:
 
 
 def test_events_of_the_watchdog() -> None:
-    """A wrong checksum while driving and the watchdog's reaction are events until an override and CLEAR."""
+    """A wrong checksum in a drive, the watchdog's reaction, the override that ends it, and CLEAR are events."""
     rig = RunnerRig()
     rig.enable()
     rig.drive_ms(1_000, throttle=0.3)
@@ -231,7 +231,7 @@ def test_a_command_is_executed_after_earlier_frames() -> None:
 
 
 def test_truth_datagrams() -> None:
-    """There is one datagram with the newest truth after each advance of the simulator, and none in between."""
+    """There is one datagram with the newest truth after each advance of the simulator, and no datagram in between."""
     rig, receiver = RunnerRig(), TruthReceiver()
     assert rig.runner.make_truth_datagram() is not None
     assert rig.runner.make_truth_datagram() is None

@@ -85,7 +85,7 @@ def test_the_wheels_reach_the_commanded_angle(generation: int) -> None:
 
 @both_generations
 def test_a_command_timeout_stops_the_car(generation: int) -> None:
-    """Without commands the watchdog brakes the car to a standstill, from 5 m/s within 2.5 s."""
+    """Without commands the watchdog stops a car from 5 m/s in at most 2.5 s."""
     drive = DrivenCar(generation)
     drive.keep_speed_ms(5_000, speed_mps=5.0)
     drive.wait_ms(100)
@@ -96,7 +96,7 @@ def test_a_command_timeout_stops_the_car(generation: int) -> None:
 
 @both_generations
 def test_a_command_takes_effect_in_the_next_step(generation: int) -> None:
-    """A command between two steps of 1/240 s takes effect from the next one on."""
+    """A command between two steps of 1/240 s takes effect from the next step on."""
     drive = DrivenCar(generation)
     drive.wait_ms(20)
     drive.command(angle_deg=100.0)

@@ -26,9 +26,9 @@ def test_commands_time_out_after_100_ms(generation: int) -> None:
     rig = driving_rig(generation)
     rig.command(throttle=0.5)
     rig.wait_ms(99.999)
-    assert (rig.enabled(), rig.wheels()[1:]) == (ALL_AXES, (0.5, 0.0))
+    assert (rig.enabled(), rig.wheels().pedals) == (ALL_AXES, (0.5, 0.0))
     rig.wait_ms(0.001)
-    assert (rig.enabled(), rig.wheels()[1:]) == (set(), (0.0, WATCHDOG_BRAKE))
+    assert (rig.enabled(), rig.wheels().pedals) == (set(), (0.0, WATCHDOG_BRAKE))
     assert all(actuator.has_timed_out for actuator in rig.kit.state.actuators.values())
     assert rig.kit.state.watchdog_reason == ReleaseReason.TIMEOUT
 
@@ -61,7 +61,7 @@ def test_a_timeout_of_one_axis_trips_the_watchdog(generation: int, axis_index: i
 
 
 def test_without_a_watchdog_only_one_axis_is_released() -> None:
-    """In generation 1 without watchdog a single axis times out, the kit does not brake, and new commands enable it."""
+    """In generation 1 without watchdog only the axis that timed out is released, until commands enable it again."""
     rig = driving_rig(1, has_watchdog=False)
     for _ in range(5):
         rig.wait_ms(20)
@@ -80,7 +80,7 @@ def test_a_repeated_counter_trips_the_watchdog(generation: int) -> None:
     assert rig.enabled() == ALL_AXES
     rig.wait_ms(20)
     rig.send(frames[2])
-    assert (rig.enabled(), rig.kit.state.watchdog_reason, rig.wheels()[1:]) == (
+    assert (rig.enabled(), rig.kit.state.watchdog_reason, rig.wheels().pedals) == (
         set(),
         ReleaseReason.COUNTER,
         (0.0, WATCHDOG_BRAKE),
@@ -91,7 +91,7 @@ def test_a_repeated_counter_trips_the_watchdog(generation: int) -> None:
     ("generation", "step", "is_right"), [(1, 1, True), (1, 2, False), (1, 255, False), (2, 5, True)]
 )
 def test_counter_rules(generation: int, step: int, is_right: bool) -> None:
-    """Generation 1's counter must increase by one; generation 2's must only differ."""
+    """The counter must increase by one in generation 1, and must only differ from the previous one in generation 2."""
     rig = driving_rig(generation)
     rig.sender.count += step - 1
     rig.command()
@@ -120,7 +120,7 @@ def test_a_wrong_checksum_trips_the_watchdog() -> None:
         assert [rig.kit.state.actuators[axis].is_crc_bad for axis in ("steering", "brake", "throttle")] == [
             index == axis_index for index in range(3)
         ]
-        assert rig.wheels()[1:] == (0.0, WATCHDOG_BRAKE)
+        assert rig.wheels().pedals == (0.0, WATCHDOG_BRAKE)
 
 
 def test_orders_with_wrong_checksums_are_ignored() -> None:
@@ -147,19 +147,19 @@ def test_generation_1_disabled_in_gear_or_moving_trips() -> None:
 
 @both_generations
 def test_the_watchdog_brakes_until_an_override(generation: int) -> None:
-    """The watchdog brakes, whatever is commanded, until the driver overrides; after CLEAR the kit can be enabled."""
+    """Whatever is commanded, the watchdog brakes until the driver overrides; after CLEAR the kit can be enabled."""
     rig = driving_rig(generation)
     rig.wait_ms(100)
     for _ in range(10):
         rig.command(throttle=1.0, clear=True)
         rig.request_system()
         rig.wait_ms(20)
-        assert (rig.enabled(), rig.wheels()[1:]) == (set(), (0.0, WATCHDOG_BRAKE))
+        assert (rig.enabled(), rig.wheels().pedals) == (set(), (0.0, WATCHDOG_BRAKE))
     rig.wait_ms(100)
     rig.kit.driver_brakes(0.8, rig.now_ns)
-    assert rig.wheels()[2] == 0.8
+    assert rig.wheels().brake == 0.8
     rig.kit.driver_brakes(0.0, rig.now_ns)
-    assert rig.wheels()[2] == 0.0
+    assert rig.wheels().brake == 0.0
     rig.command()
     rig.request_system()
     assert rig.enabled() == set()
@@ -171,12 +171,12 @@ def test_the_watchdog_brakes_until_an_override(generation: int) -> None:
 
 @both_generations
 def test_a_released_wheel_keeps_its_angle(generation: int) -> None:
-    """When the kit disengages, the steering wheel keeps its actual angle, not the commanded one."""
+    """When the kit disengages, the steering wheel keeps its actual angle, not the commanded angle."""
     rig = driving_rig(generation)
     rig.command(angle_deg=90.0)
     rig.wait_ms(50)
     rig.set_motion(10.0, steering_rad=0.05)
     rig.wait_ms(50)
-    assert rig.wheels()[0] == pytest.approx(0.05 * STEERING_RATIO * DEGREES_PER_RAD)
+    assert rig.wheels().steering_wheel_deg == pytest.approx(0.05 * STEERING_RATIO * DEGREES_PER_RAD)
     rig.wait_ms(1000)
-    assert rig.wheels()[0] == pytest.approx(0.05 * STEERING_RATIO * DEGREES_PER_RAD)
+    assert rig.wheels().steering_wheel_deg == pytest.approx(0.05 * STEERING_RATIO * DEGREES_PER_RAD)

@@ -30,7 +30,7 @@ def brightness(road: Road, s_m: FloatArray, offset_m: float, level: int) -> Floa
 
 
 def test_a_long_dash_bends_with_the_road() -> None:
-    """A dash of 60 m in a bend of 50 m radius follows the mark along its whole length."""
+    """A dash of 60 m in a bend of 50 m radius is painted at the mark's offset along its whole length."""
     road = parse_road(BEND.replace("WIDTH", "0.3"), source="x")
     s_m = np.arange(2.0, 58.0, 0.5)
     painted, bare = brightness(road, s_m, 2.0, 1), brightness(road, s_m, 0.0, 1)

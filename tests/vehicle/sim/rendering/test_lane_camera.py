@@ -32,9 +32,9 @@ def y_at(lane: Lane, x_m: float) -> float:
 @pytest.mark.parametrize("turned_rad", [0.0, 0.1, -0.1])
 @pytest.mark.parametrize("lateral_m", [0.0, 0.5, -1.0])
 def test_the_lane_follows_the_road(lateral_m: float, turned_rad: float) -> None:
-    """The fitted centre is within 2 cm of the true one on a straight, and within 15 cm elsewhere.
+    """The fitted centre is within 2 cm of the true centre on a straight, and within 15 cm elsewhere.
 
-    Where a straight changes to a radius of 42 m, no parabola fits better than to 15 cm, also not one fitted to pixels.
+    Where a straight changes to a radius of 42 m, no parabola fits better than 15 cm, not even a parabola from pixels.
     """
     lane_camera = camera()
     for s_m in range(0, int(ROAD.route_length_m) - 25, 3):
@@ -51,14 +51,15 @@ def test_the_lane_follows_the_road(lateral_m: float, turned_rad: float) -> None:
 
 
 def test_confidence_is_the_visible_share_of_the_lane() -> None:
-    """The confidence falls from 1 in the lane to 0 beyond the detector's 7 m or turned away."""
+    """The confidence falls from 1 in the lane to 0 more than 7 m beside the lane, or if the car is turned away."""
     beside = [camera().observe_lane(pose_at(S_M, lateral_m)).confidence for lateral_m in (0.0, 2.0, 4.0, 6.0, 10.0)]
     turned = [camera().observe_lane(pose_at(S_M, 0.0, math.radians(deg))).confidence for deg in (0, 20, 40, 90, 180)]
     for confidences in (beside, turned):
         assert confidences[0] > 0.95
         assert confidences == sorted(confidences, reverse=True)
         assert confidences[-1] == 0.0
-    assert 0.3 < beside[3] < 0.5, "from 6 m beside the centre, one line is visible and the other is beyond 7 m"
+    _, _, _, at_6_m, _ = beside
+    assert 0.3 < at_6_m < 0.5, "from 6 m beside the centre, one line is visible and the other is beyond 7 m"
 
 
 @pytest.mark.parametrize(
@@ -74,7 +75,7 @@ def test_confidence_is_the_visible_share_of_the_lane() -> None:
     ],
 )
 def test_a_camera_turned_aside_has_less_confidence(yaw_deg: float, y_m: float, confidence: float) -> None:
-    """A camera turned by 46 degrees sees half of the lane's lines, and one turned backwards sees none."""
+    """A camera turned by 46 degrees sees half of the lane's lines; a camera turned backwards sees no line."""
     model = CameraModel(yaw_rad=math.radians(yaw_deg), y_m=y_m)
     lane = camera(model=model).observe_lane(pose_at(S_M))
     assert lane.confidence == pytest.approx(confidence, abs=0.1)
@@ -87,7 +88,7 @@ def test_there_is_no_picture_without_a_pose() -> None:
 
 
 def test_an_exposed_lane_is_that_of_the_middle_of_the_exposure() -> None:
-    """With an exposure the lane and the capture time are those of its middle."""
+    """With an exposure, the lane and the capture time are those of the middle of the exposure."""
     poses = [pose_at(S_M, at_ns=0), pose_at(S_M, 0.4, at_ns=10_000_000), pose_at(S_M, 9.0, at_ns=20_000_000)]
     frame = camera(exposure_ns=10_000_000).expose(3, 0, poses)
     expected = camera().capture(3, 5_000_000, pose_at(S_M, 0.2))

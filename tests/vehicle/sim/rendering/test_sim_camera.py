@@ -34,14 +34,14 @@ def test_there_is_no_picture_without_a_pose(road: Road) -> None:
 
 @pytest.mark.parametrize("scenery", ["full", "light", "none"])
 def test_frames_do_not_depend_on_history(road: Road, scenery: SceneryKind) -> None:
-    """A prepared camera and a fresh one give equal bytes for equal poses in any order."""
+    """A prepared camera and a fresh camera give equal bytes for equal poses in any order."""
     prepared, fresh = camera_on(road, scenery=scenery), camera_on(road, scenery=scenery)
     prepared.prepare()
     poses = [pose_at(road, s_m, 0.4, -0.1) for s_m in (90.0, 12.0, 55.0, 12.0)]
     first = [digest(picture_of(prepared, pose, number)) for number, pose in enumerate(poses)]
     second = [digest(picture_of(fresh, pose, number)) for number, pose in reversed(list(enumerate(poses)))]
     assert first == second[::-1]
-    assert first[1] != first[3]  # the same place, but another frame: other noise
+    assert first[1] != first[3]  # the same pose, but the noise of a frame with another number
 
 
 def test_the_seed_changes_only_the_sensor_noise(road: Road) -> None:
@@ -54,7 +54,7 @@ def test_the_seed_changes_only_the_sensor_noise(road: Road) -> None:
 
 
 def marks_in_view(road: Road, pose: Pose, model: CameraModel, offset_m: float, stations: FloatArray) -> FloatArray:
-    """Return the projections (n, 3) of a mark's points at these stations, of those that are in the picture."""
+    """Return the projections (n, 3) of those points of a mark at `stations` that are in the picture."""
     ground = road.point_at(stations, offset_m)
     points = place_camera(model, pose).project(np.column_stack([ground, np.zeros(len(ground))]))
     inside = (points[:, 0] > 4) & (points[:, 0] < model.width_px - 5) & (points[:, 1] < model.height_px - 2)
@@ -72,17 +72,17 @@ def test_marks_are_at_their_projection(road: Road, turned_rad: float, pitch_rad:
     stations = np.arange(30.0, 43.0, 1.5)
     for u_px, v_px, _ in marks_in_view(road, pose, model, -5.25, stations):
         row, column = round(v_px), round(u_px)
-        # The mark's projection is exact at v_px; the row is up to half a pixel away, so follow the mark to the row.
-        near = marks_in_view(road, pose, model, -5.25, np.arange(25.0, 50.0, 0.02))
-        at_row = near[np.argmin(np.abs(near[:, 1] - row)), 0]
+        # The row is v_px rounded, so the expected column is that of the mark's point nearest to the row.
+        mark_points = marks_in_view(road, pose, model, -5.25, np.arange(25.0, 50.0, 0.02))
+        expected_column = mark_points[np.argmin(np.abs(mark_points[:, 1] - row)), 0]
         near_columns = np.arange(max(column - 14, 0), min(column + 15, model.width_px))
         bright = np.clip(picture[row, near_columns] - np.median(picture[row, near_columns]) - 18.0, 0.0, None)
         assert bright.sum() > 20
-        assert (bright * near_columns).sum() / bright.sum() == pytest.approx(at_row, abs=1.0)
+        assert (bright * near_columns).sum() / bright.sum() == pytest.approx(expected_column, abs=1.0)
 
 
 def test_dashes_are_bright_and_gaps_are_not(road: Road) -> None:
-    """On a broken line the middle of a dash is over 60 grey levels above its surroundings, that of a gap is not."""
+    """On a broken line the middle of a dash is much brighter than its surroundings, and the middle of a gap is not."""
     pose = pose_at(road, 0.0)
     picture = picture_of(camera_on(road, scenery="none"), pose).astype(float).mean(axis=2)
     dash_middle_m = 9.0 + DASH_M / 2
@@ -133,13 +133,13 @@ def test_rails_are_drawn_only_with_scenery(road: Road) -> None:
     }
     point = np.append(road.point_at(84.0, 12.25), 0.5)
     u_px, v_px, _ = place_camera(MODEL, pose).project(point)
-    place = np.s_[round(v_px) - 1 : round(v_px) + 2, round(u_px) - 3 : round(u_px) + 4]
-    assert np.abs(pictures["light"][place].mean() - pictures["none"][place].mean()) > 25
-    assert pictures["full"][place].mean() == pytest.approx(pictures["light"][place].mean(), abs=3)
+    area = np.s_[round(v_px) - 1 : round(v_px) + 2, round(u_px) - 3 : round(u_px) + 4]
+    assert np.abs(pictures["light"][area].mean() - pictures["none"][area].mean()) > 25
+    assert pictures["full"][area].mean() == pytest.approx(pictures["light"][area].mean(), abs=3)
 
 
 def test_another_camera_model_is_drawn(road: Road) -> None:
-    """A small, wide, high and pitched camera has a picture of its own size without empty rows."""
+    """The picture of a small, wide-angle, high and pitched camera has the camera's size and no empty rows."""
     model = CameraModel(width_px=320, height_px=200, field_of_view_rad=2.0, z_m=2.0, pitch_rad=0.15)
     picture = picture_of(camera_on(road, model=model), pose_at(road, 40.0))
     assert picture.shape == (200, 320, 3)
@@ -158,7 +158,7 @@ def test_the_homography_inverts_the_projection_for_every_pose() -> None:
 
 
 def test_yaw_offset_and_roll_have_their_signs() -> None:
-    """A camera turned or moved left sees the road ahead on the right; rolled right, its right horizon is higher."""
+    """A camera turned or moved left sees the road on the right; for a camera rolled right the horizon rises there."""
     pose, ahead = Pose(0, 0.0, 0.0, 0.0), np.array([40.0, 0.0, 1.4])
     for model in (CameraModel(yaw_rad=0.1), CameraModel(y_m=0.5)):
         assert place_camera(model, pose).project(ahead)[0] > MODEL.width_px / 2
@@ -174,19 +174,19 @@ def test_a_turned_camera_has_marks_at_their_projection(road: Road, scenery: Scen
     picture = picture_of(camera_on(road, scenery=scenery, model=TURNED), pose).astype(float).mean(axis=2)
     for u_px, v_px, _ in marks_in_view(road, pose, TURNED, -1.75, np.arange(4.0, 9.0, 0.5)):
         row, column = round(v_px), round(u_px)
-        near = marks_in_view(road, pose, TURNED, -1.75, np.arange(3.0, 10.0, 0.005))
-        at_row = near[np.argmin(np.abs(near[:, 1] - row)), 0]
+        mark_points = marks_in_view(road, pose, TURNED, -1.75, np.arange(3.0, 10.0, 0.005))
+        expected_column = mark_points[np.argmin(np.abs(mark_points[:, 1] - row)), 0]
         near_columns = np.arange(max(column - 30, 0), min(column + 31, TURNED.width_px))
         bright = np.clip(picture[row, near_columns] - np.median(picture[row, near_columns]) - 40.0, 0.0, None)
-        assert (bright * near_columns).sum() / bright.sum() == pytest.approx(at_row, abs=1.5)
+        assert (bright * near_columns).sum() / bright.sum() == pytest.approx(expected_column, abs=1.5)
 
 
 def test_far_dashes_do_not_flicker(road: Road) -> None:
-    """A car that moves by 0.1 m changes no pixel of a broken line beyond 40 m by 12 grey levels or more."""
+    """If a car moves by 0.1 m, each pixel of a broken line farther than 40 m changes by less than 12 grey levels."""
     camera = camera_on(road, scenery="none")
     rows = np.arange(round(horizon_row(MODEL)) + 4, row_of_depth(MODEL, 40.0))
-    beside_px = 1.75 / MODEL.z_m * (rows - horizon_row(MODEL))
-    columns = np.rint((MODEL.width_px - 1) / 2 + np.array([[-1.0], [1.0]]) * beside_px).astype(int)
+    offset_px = 1.75 / MODEL.z_m * (rows - horizon_row(MODEL))
+    columns = np.rint((MODEL.width_px - 1) / 2 + np.array([[-1.0], [1.0]]) * offset_px).astype(int)
     brightness = []
     for number in range(30):
         picture = picture_of(camera, pose_at(road, 90.0 + 0.1 * number), number).astype(float).mean(axis=2)
@@ -196,7 +196,7 @@ def test_far_dashes_do_not_flicker(road: Road) -> None:
 
 @pytest.mark.parametrize("route", ["a_key", pytest.param("b", marks=pytest.mark.full)])
 def test_a_prepared_camera_paints_few_tiles_while_driving(monkeypatch: pytest.MonkeyPatch, route: str) -> None:
-    """A car that swerves by 6 m and 0.6 rad needs no new coarse tiles, and at most 10 fine ones per frame."""
+    """A car that swerves by 6 m and 0.6 rad needs no new coarse tiles, and at most 10 new fine tiles per frame."""
     whole_road = load_road(route)
     camera = camera_on(whole_road)
     camera.prepare()

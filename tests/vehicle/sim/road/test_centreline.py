@@ -27,7 +27,7 @@ def line_of(segments: list[Segment]) -> Centreline:
 def test_projection_inverts_station_and_offset(
     segments: list[Segment], share: float, offset_m: float, window_shift_m: float
 ) -> None:
-    """A point constructed from a station and an offset is projected back to them, for any segments."""
+    """A point constructed from a station and an offset is projected back to this station and offset."""
     line = line_of(segments)
     s_m = FIRST_M + share * (line.last_m - FIRST_M)
     x_m, y_m, heading_rad, _ = (float(value) for value in line.sample(s_m))
@@ -65,7 +65,7 @@ def test_a_clothoid_is_the_fresnel_integral() -> None:
 @settings(max_examples=100)
 @given(SEGMENTS)
 def test_a_centreline_is_continuous(segments: list[Segment]) -> None:
-    """Position and heading are continuous at every joint, and on both sides of it the curvature is the segment's."""
+    """Position and heading are continuous at every joint, where the curvature changes from segment to segment."""
     line = line_of(segments)
     joint_m = FIRST_M
     for before, after in itertools.pairwise(segments):
@@ -77,7 +77,7 @@ def test_a_centreline_is_continuous(segments: list[Segment]) -> None:
 
 
 def test_a_centreline_is_straight_beyond_both_ends() -> None:
-    """The line is straight before the first segment and after the last one."""
+    """The line is straight before the first segment and after the last segment."""
     line = line_of([Segment(30.0, 0.02, 0.02)])
     _, _, heading_rad, curvature = line.sample([-60.0, -11.0, 20.1, 70.0])
     assert heading_rad[0] == heading_rad[1]

@@ -15,7 +15,7 @@ ROUTES = {
     "c": (292.56, -90.17, 134.96, 216.68, 367.69, -0.43),
     "c_key": (163.68, -61.57, 134.96, 231.83, 367.64, 0.30),
 }
-"""Properties of the driven lane of the six routes, from the map that they come from."""
+"""Properties of the driven lane of the six routes in the map from which the routes come."""
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def test_a_route_has_the_lanes_of_the_map(name: str) -> None:
 
 @pytest.mark.parametrize("name", ROUTES)
 def test_a_road_extends_beyond_its_route(name: str) -> None:
-    """A road has at least 20 m before the start and 60 m beyond the end of its route, and is straight beyond them."""
+    """A road begins 20 m or more before its route, ends 60 m or more after it, and continues straight at both ends."""
     road = load_road(name)
     assert road.first_m <= -20.0
     assert road.last_m > road.route_length_m + 60.0
@@ -91,7 +91,7 @@ def test_a_key_part_is_the_same_road_with_other_stations(key: str, whole: str, f
 
 
 def test_a_broken_mark_has_whole_dashes_within_its_range(road: Road) -> None:
-    """A broken mark has a whole dash in each period and none that exceeds its ends."""
+    """A broken mark has a whole dash in each period, and no dash exceeds an end of the mark."""
     mark = next(mark for mark in road.marks if mark.kind == "broken" and math.isfinite(mark.from_m))
     begin_m = mark.dash_begins_m(road.first_m, 100.0)
     assert (np.diff(begin_m) == mark.dash_m + mark.gap_m).all()
@@ -101,9 +101,10 @@ def test_a_broken_mark_has_whole_dashes_within_its_range(road: Road) -> None:
 
 
 def test_projection_searches_only_near_the_last_station(road: Road) -> None:
-    """A projection from a distant station stays within its window."""
+    """A projection finds no station farther than 15 m from the last station."""
     x_m, y_m = road.point_at(100.0, 0.0).tolist()
-    assert road.project(x_m, y_m, 20.0)[0] <= 35.0
+    s_m, *_ = road.project(x_m, y_m, 20.0)
+    assert s_m <= 35.0
 
 
 def test_an_unknown_road_is_rejected() -> None:

@@ -1,3 +1,4 @@
+import dataclasses
 import itertools
 import re
 from pathlib import Path
@@ -6,6 +7,7 @@ import numpy as np
 import pytest
 
 from lavt.errors import UserError
+from lavt.vehicle.sim.dynamics import LINCOLN_MKZ
 from lavt.vehicle.sim.road.road import load_road, parse_road
 
 SHORT = "title: x\nsegments: [{length_m: 100}]\n"
@@ -25,8 +27,18 @@ def test_the_documented_example_is_a_valid_road() -> None:
     assert float(np.abs(road.centre_at(np.arange(0.0, 250.0)).curvature_per_m).max()) == pytest.approx(0.02)
 
 
+def test_the_parameters_of_the_car_are_documented() -> None:
+    """docs/roads.md has each parameter of the car with its value, and the extent of its body."""
+    page = DOCS.read_text()
+    rows = re.findall(r"^\| `(\w+)` \| ([\d.]+) \|", page.partition("## The car")[2], re.MULTILINE)
+    assert {name: float(value) for name, value in rows} == dataclasses.asdict(LINCOLN_MKZ)
+    car = LINCOLN_MKZ
+    extent = f"{-car.rear_axle_to_rear_m} m to {car.rear_axle_to_front_m} m along the car, and {car.body_width_m / 2} m"
+    assert extent in page
+
+
 def test_a_title_and_a_segment_make_a_road() -> None:
-    """Every other key has a default: one lane of 3.5 m with marks and shoulders, from the origin along x."""
+    """A road file needs only a title and a segment: by default there is one lane, from the origin along x."""
     road = parse_road(SHORT, source="x.yaml")
     assert road.start == (0.0, 0.0, 0.0)
     assert road.route_length_m == 100.0
@@ -35,7 +47,7 @@ def test_a_title_and_a_segment_make_a_road() -> None:
 
 
 def test_a_road_is_loaded_from_its_path(tmp_path: Path) -> None:
-    """A path ending in .yaml is loaded as a road, and `part_of` is relative to its directory."""
+    """A path that ends in .yaml is loaded as a road, and `part_of` is relative to its directory."""
     (tmp_path / "whole.yaml").write_text(SHORT)
     (tmp_path / "part.yaml").write_text("title: y\npart_of: whole.yaml\nfrom_m: 40\nlength_m: 50\n")
     part = load_road(str(tmp_path / "part.yaml"))
@@ -118,7 +130,7 @@ def test_an_invalid_road_file_is_rejected(name: str) -> None:
 
 @pytest.mark.parametrize(("name", "content"), [("missing.yaml", None), ("bytes.yaml", b"\xff\xfe"), ("dir.yaml", "")])
 def test_an_unreadable_file_is_rejected(name: str, content: bytes | str | None, tmp_path: Path) -> None:
-    """A path that does not exist, is a directory or is not text is rejected with an error that names it."""
+    """A path that does not exist, is a directory or is not text is rejected with an error that names the path."""
     path = tmp_path / name
     if isinstance(content, bytes):
         path.write_bytes(content)
