@@ -41,8 +41,8 @@ class Simulator:
     """A simulated `lavt.vehicle.vehicle.Vehicle`. Until the first command it is stationary with full brake.
 
     Physics is lazy: `advance` makes all steps since its last call, however late it is called. The steps lie on a grid
-    of 1/240 s of the monotonic clock. The first one is at or after `start_mono_ns`. After a collision the car stays
-    where it is or, with `continue_after_collision`, slides along the obstacle.
+    of 1/240 s of the monotonic clock, and begin at the first grid point at or after `start_mono_ns`. After a collision
+    the car stays where it is or, with `continue_after_collision`, slides along the obstacle.
     """
 
     def __init__(

@@ -81,11 +81,14 @@ class Scenery:
     def _pole_drawings(self, placement: CameraPlacement) -> Iterable[Drawing]:
         ahead = _depth_m(self._objects.poles[:, :2], placement)
         visible = (ahead > 1.0) & (ahead < FAR_M)
-        poles, depth = self._objects.poles[visible], ahead[visible]
-        ends = placement.project(np.stack([poles[:, :3], poles[:, [0, 1, 3]]], axis=1))
-        inside = (ends[:, 0, 0] > -20) & (ends[:, 0, 0] < placement.model.width_px + 20)
+        depth = ahead[visible]
+        x_m, y_m, foot_heights_m, top_heights_m, widths_m = self._objects.poles[visible].T
+        feet_m, tops_m = np.column_stack([x_m, y_m, foot_heights_m]), np.column_stack([x_m, y_m, top_heights_m])
+        ends = placement.project(np.stack([feet_m, tops_m], axis=1))
+        feet_u_px = ends[:, 0, 0]
+        inside = (feet_u_px > -20) & (feet_u_px < placement.model.width_px + 20)
         depth = depth[inside]
-        widths = np.clip(np.rint(poles[inside, 4] * placement.model.focal_px / depth), 1, 40).astype(int).tolist()
+        widths = np.clip(np.rint(widths_m[inside] * placement.model.focal_px / depth), 1, 40).astype(int).tolist()
         shades = self._add_haze(np.broadcast_to(self._pole_colour, (len(depth), 3)), depth).tolist()
         styles = zip(shades, widths, strict=True)
         # 0.3 m is added to the depth of a pole, so that the face that it carries is drawn over it.
@@ -94,12 +97,13 @@ class Scenery:
     def _tree_drawings(self, placement: CameraPlacement) -> Iterable[Drawing]:
         ahead = _depth_m(self._trees[:, :2], placement)
         trees = self._trees[(ahead > 3.0) & (ahead < FAR_M)]
-        feet = placement.project(np.column_stack([trees[:, :2], np.zeros(len(trees))]))
-        heights = trees[:, 2] * placement.model.focal_px / feet[:, 2]
-        reach = heights * (TREE_WIDTH / 2)
-        inside = (heights >= 3) & (feet[:, 0] > -reach) & (feet[:, 0] < placement.model.width_px + reach)
-        shapes = np.column_stack([feet[:, :2], heights, trees[:, 3:]])[inside].tolist()
-        depth = feet[inside, 2]
+        x_m, y_m, heights_m, kinds, mirrored = trees.T
+        u_px, v_px, all_depths_m = placement.project(np.column_stack([x_m, y_m, np.zeros(len(trees))])).T
+        heights_px = heights_m * placement.model.focal_px / all_depths_m
+        reach_px = heights_px * (TREE_WIDTH / 2)
+        inside = (heights_px >= 3) & (u_px > -reach_px) & (u_px < placement.model.width_px + reach_px)
+        shapes = np.column_stack([u_px, v_px, heights_px, kinds, mirrored])[inside].tolist()
+        depth = all_depths_m[inside]
         haze = (1.0 - np.exp(-depth / HAZE_M)).tolist()
         return zip(depth.tolist(), repeat(self._sprites.draw), shapes, haze)
 

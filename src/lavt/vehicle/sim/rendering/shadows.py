@@ -31,11 +31,13 @@ class Shadows:
             [_face_shadows(objects, self._shadow_m), _pole_shadows(objects.poles, self._shadow_m)]
         )
         self._trees = objects.trees
-        ends = objects.trees[:, :2] + objects.trees[:, 2:3] * self._shadow_m
-        reach = objects.trees[:, 2:3] * TREE_WIDTH / 2 + _MARGIN_M
+        feet_m, heights_m = objects.trees[:, :2], objects.trees[:, 2:3]
+        shadow_ends_m = feet_m + heights_m * self._shadow_m
+        reach_m = heights_m * TREE_WIDTH / 2 + _MARGIN_M
         self._tree_boxes = np.concatenate(
-            [np.minimum(objects.trees[:, :2], ends) - reach, np.maximum(objects.trees[:, :2], ends) + reach], axis=1
+            [np.minimum(feet_m, shadow_ends_m) - reach_m, np.maximum(feet_m, shadow_ends_m) + reach_m], axis=1
         )
+        """The bounding boxes of the trees' shadows, (n, 4): low x, low y, high x, high y."""
         self._clouds = _clouds() if clouds else None
 
     def mask(self, square: Square) -> Grey | None:
@@ -73,8 +75,9 @@ def _face_shadows(objects: RoadsideObjects, shadow_m: FloatArray) -> Strips:
 
 
 def _pole_shadows(poles: FloatArray, shadow_m: FloatArray) -> Strips:
-    side = np.array([-shadow_m[1], shadow_m[0]]) / np.hypot(*shadow_m) * poles[:, 4:] / 2
-    foot, top = poles[:, :2] + poles[:, 2:3] * shadow_m, poles[:, :2] + poles[:, 3:4] * shadow_m
+    places_m, foot_heights_m, top_heights_m, widths_m = poles[:, :2], poles[:, 2:3], poles[:, 3:4], poles[:, 4:]
+    side = np.array([-shadow_m[1], shadow_m[0]]) / np.hypot(*shadow_m) * widths_m / 2
+    foot, top = places_m + foot_heights_m * shadow_m, places_m + top_heights_m * shadow_m
     return make_strips(np.stack([foot - side, foot + side, top + side, top - side], axis=1))
 
 

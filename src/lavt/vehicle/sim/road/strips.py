@@ -54,9 +54,9 @@ class Strips:
 
     def fill(self, mask: Grey, square: Square, value: int) -> bool:
         """Paint `value` into the mask of a square where strips are; return False if no strip is near the square."""
-        boxes = self.boxes_m
-        overlapping = (boxes[:, 0] <= square.left_m + square.edge_m) & (boxes[:, 2] >= square.left_m)
-        overlapping &= (boxes[:, 1] <= square.low_m + square.edge_m) & (boxes[:, 3] >= square.low_m)
+        low_x_m, low_y_m, high_x_m, high_y_m = self.boxes_m.T
+        overlapping = (low_x_m <= square.left_m + square.edge_m) & (high_x_m >= square.left_m)
+        overlapping &= (low_y_m <= square.low_m + square.edge_m) & (high_y_m >= square.low_m)
         near = self.corners_m[overlapping]
         corners_px = (near - np.array([square.left_m, square.low_m])) / square.scale_m - 0.5
         for polygon in np.rint(corners_px * (1 << _SUBPIXEL_BITS)).astype(np.int32):
