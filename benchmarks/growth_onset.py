@@ -17,6 +17,7 @@ from lavt.config_file import load_config, shipped
 from lavt.experiment.boundary.bisection import zero_bracket
 from lavt.experiment.boundary.boundary import theoretical_ms, with_video_delay
 from lavt.experiment.boundary.oscillation_growth import straight_growth
+from lavt.experiment.report.table_format import NOTHING
 
 MAX_DELAY_MS = 1000.0
 """The longest added delay of the video."""
@@ -36,8 +37,8 @@ def case(lookahead_s: float, rate_hz: float, speed_mps: float, seed: int) -> Run
     return load_config(RunConfig, shipped("configs/demo.yaml"), changes)
 
 
-def onset_ms(config: RunConfig, theory_ms: float) -> float:
-    """Return the total delay at which the oscillation neither grows nor decays."""
+def onset_ms(config: RunConfig, theory_ms: float | None) -> float | None:
+    """Return the total delay at which the oscillation neither grows nor decays; None if no such delay was found."""
     other_delays_ms = []  # of each drive: the total delay minus the added delay of the video
 
     def growth(added_ms: float) -> float:
@@ -45,14 +46,29 @@ def onset_ms(config: RunConfig, theory_ms: float) -> float:
         other_delays_ms.append(total_ms - added_ms)
         return growth_per_s
 
-    bracket = zero_bracket(growth, theory_ms, MAX_DELAY_MS, PRECISION_MS)
+    bracket = zero_bracket(growth, theory_ms or 0.0, MAX_DELAY_MS, PRECISION_MS)
     if bracket.low_ms is None or bracket.high_ms is None:
-        raise SystemExit(f"no onset with an added delay between 0 and {MAX_DELAY_MS} ms")
+        return None
     return (bracket.low_ms + bracket.high_ms) / 2 + median(other_delays_ms)
 
 
+def table_row(
+    lookahead_s: float, rate_hz: float, speed_mps: float, theory_ms: float | None, measured_ms: float | None
+) -> str:
+    """Return the table's row of one case, with a dash for each value that does not exist."""
+    difference_ms = None if theory_ms is None or measured_ms is None else measured_ms - theory_ms
+    values = ((theory_ms, ".1f"), (measured_ms, ".1f"), (difference_ms, "+.1f"))
+    cells = [
+        f"{lookahead_s:g} s",
+        f"{rate_hz:g} Hz",
+        f"{speed_mps:g} m/s",
+        *(NOTHING if value_ms is None else f"{value_ms:{form}} ms" for value_ms, form in values),
+    ]
+    return f"| {' | '.join(cells)} |"
+
+
 def main() -> None:
-    """Print all cases as a Markdown table."""
+    """Print all cases as a Markdown table, and the reason for its dashes."""
     parser = argparse.ArgumentParser(description=__doc__)
     for name, default in (("lookaheads", "0.74,1.01,1.3"), ("rates", "15,30"), ("speeds", "6,10")):
         parser.add_argument(f"--{name}", type=lambda text: [float(item) for item in text.split(",")], default=default)
@@ -60,16 +76,16 @@ def main() -> None:
     options = parser.parse_args()
     print("| lookahead | frame rate | speed | theory | measured | difference |")
     print("|---" * 6 + "|")
-    cases = itertools.product(options.lookaheads, options.rates, options.speeds, options.seeds)
-    for lookahead_s, rate_hz, speed_mps, seed in cases:
+    rows = []
+    for lookahead_s, rate_hz, speed_mps, seed in itertools.product(
+        options.lookaheads, options.rates, options.speeds, options.seeds
+    ):
         config = case(lookahead_s, rate_hz, speed_mps, seed)
-        theory_ms = theoretical_ms(config) or 0.0
-        measured_ms = onset_ms(config, theory_ms)
-        print(
-            f"| {lookahead_s:g} s | {rate_hz:g} Hz | {speed_mps:g} m/s | {theory_ms:.1f} ms | {measured_ms:.1f} ms | "
-            f"{measured_ms - theory_ms:+.1f} ms |",
-            flush=True,
-        )
+        theory_ms = theoretical_ms(config)
+        rows.append(table_row(lookahead_s, rate_hz, speed_mps, theory_ms, onset_ms(config, theory_ms)))
+        print(rows[-1], flush=True)
+    if any(NOTHING in row for row in rows):
+        print(f"\n{NOTHING}: no growing oscillation by theory, or none measured with 0 to {MAX_DELAY_MS:g} ms added")
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from benchmarks.growth_onset import table_row
 from benchmarks.virtual_loop import with_rest
 
 from lavt.errors import WorkError
@@ -38,6 +39,13 @@ def test_virtual_loop_benchmark_runs() -> None:
     assert result["geometry_x"] > 0
     for stage in ("render", "perception", "control", "rest"):
         assert f"{stage} " in completed.stdout
+
+
+def test_a_growth_onset_that_was_not_found_is_a_dash() -> None:
+    """A case without an onset, by theory or measured, has a dash in its table row."""
+    assert table_row(1.3, 15.0, 6.0, 461.9, None) == "| 1.3 s | 15 Hz | 6 m/s | 461.9 ms | – | – |"
+    assert table_row(1.3, 15.0, 6.0, None, 462.7) == "| 1.3 s | 15 Hz | 6 m/s | – | 462.7 ms | – |"
+    assert table_row(1.3, 15.0, 6.0, 461.9, 460.0).endswith("| 461.9 ms | 460.0 ms | -1.9 ms |")
 
 
 @pytest.mark.full

@@ -124,7 +124,7 @@ def test_answers_have_a_limited_length() -> None:
     ],
 )
 def test_least_stall_for_each_safe_stop(reason: str, least_ms: float) -> None:
-    """To explain a stop, a stall needs 100 ms without commands, or 60 ms less than the timeout of missing reports."""
+    """A stall of 100 ms explains a stop without commands; for missing reports, their timeout minus 60 ms is enough."""
     assert least_stop_ms(reason) == least_ms
 
 

@@ -85,7 +85,7 @@ def test_folder_and_marker_select_the_lane(collected: dict[str, set[str]]) -> No
 
 
 def test_tests_in_lane_folders_have_no_lane_marker() -> None:
-    """A test in a lane's folder has no lane marker, because it would then be in two lanes, or in none."""
+    """A test in a lane's folder has no lane marker, because it would then be in two lanes or in no lane."""
     marked = [
         path.relative_to(TESTS)
         for folder in SEQUENTIAL_FOLDERS

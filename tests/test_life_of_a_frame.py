@@ -45,6 +45,7 @@ WALL_NS = 1_790_000_000 * NS_PER_S
 START_NS = 100 * NS_PER_S
 VIDEO_DELAY_MS, CONTROL_DELAY_MS = 75.0, 20.0
 CHALLENGE = bytes(range(16))
+"""Random bytes of the server, which decide the keys of one video path together with the session's token."""
 ARMING_FRAMES = 51
 """The frames before the test's frame. Each has an arming command; at 20 ms each, they take just more than a second."""
 
@@ -94,6 +95,7 @@ def armed_gate(car: Simulator) -> tuple[SafetyGate, Gateways, SessionReply]:
         LIMITS,
         wheelbase_m=capabilities.wheelbase_m,
         max_steering_rad=capabilities.max_steering_rad,
+        max_acceleration_mps2=capabilities.max_acceleration_mps2,
         max_braking_mps2=capabilities.max_braking_mps2,
     )
     numbers = count(1)
@@ -153,7 +155,7 @@ def test_life_of_a_frame(tmp_path: Path) -> None:  # noqa: PLR0915 (one frame, f
     access_unit = encoder.encode(frame.picture)
     assert len(access_unit) < frame.picture.nbytes / 10
 
-    # Frame 4. The access unit is split into RTP packets with the stamp's time, repair packets are added, all encrypted.
+    # Frame 4. The unit is split into RTP packets with the stamp's time, repair packets are added, all are encrypted.
     packets = Packetizer(ssrc=7, first_sequence=65_535).packetize(access_unit, rtp_timestamp(stamp_ns))
     assert len(packets) > 3
     assert max(map(len, packets)) <= MAX_PACKET_BYTES
@@ -250,7 +252,7 @@ def test_life_of_a_frame(tmp_path: Path) -> None:  # noqa: PLR0915 (one frame, f
     received = decode(Command, passed)
     assert received == command
 
-    # Command 8. The gate accepts the command: current epoch, newer sequence, and a stamp of this server that is recent.
+    # Command 8. The gate accepts the command: current epoch, newer sequence, and a recent stamp of this server.
     picture_age_ns = now_ns - START_NS
     assert picture_age_ns == round(VIDEO_DELAY_MS + CONTROL_DELAY_MS) * NS_PER_MS + MIN_HOLD_NS
     car.advance(now_ns)

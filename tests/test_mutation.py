@@ -128,7 +128,7 @@ def test_every_path_of_the_table_exists() -> None:
 
 
 def test_sample_follows_from_the_seed() -> None:
-    """The same seed gives the same mutants, a smaller count the first of these, and another seed other mutants."""
+    """The seed decides the mutants and their order; a smaller count gives the first of these mutants."""
     sites = mutation.sites_of(["safety/takeover_requests.py", "transport/rtp/adaptive_hold.py"])
     sampled = mutation.sample(sites, 1, 30)
     assert sampled == mutation.sample(sites, 1, 30)

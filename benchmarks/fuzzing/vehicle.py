@@ -10,7 +10,6 @@ from msgspec.structs import replace
 
 from lavt.assembly.entropy import SeededEntropy
 from lavt.domain import (
-    LARGEST_STORED_STOP,
     NS_PER_MS,
     NS_PER_S,
     Actuation,
@@ -98,7 +97,9 @@ class VehicleSide:
 
     def __init__(self, seed: int) -> None:
         entropy = SeededEntropy(seed, "vehicle")
-        limiter = Limiter(LIMITS, wheelbase_m=2.8448, max_steering_rad=0.513, max_braking_mps2=6.0)
+        limiter = Limiter(
+            LIMITS, wheelbase_m=2.8448, max_steering_rad=0.513, max_acceleration_mps2=2.0, max_braking_mps2=6.0
+        )
         self.gate = SafetyGate(
             LIMITS, limiter, new_epoch=lambda: entropy.number(64), new_token=lambda: entropy.token(16), video_port=5600
         )
@@ -240,13 +241,10 @@ def vehicle_driven(seed: int) -> Target:
     """Make a target for a driven vehicle. Invariant: no command of a stranger and no replayed command is accepted.
 
     Anybody can stop the vehicle. Without signatures anybody can also take control of it after an emergency stop, and
-    clear the stop. The operator then takes control again and arms the vehicle. To make such stops rare, the first
-    emergency stop has the largest number that is stored. Most later emergency stops have a smaller number. So the gate
-    regards them as old, and they have no effect.
+    clear the stop. The operator then takes control again and arms the vehicle.
     """
     side = VehicleSide(seed)
     side.request("acquire")
-    side.request("emergency_stop", LARGEST_STORED_STOP)
     side.arm()
     inputs = inputs_while_driving = 0
 

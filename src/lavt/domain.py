@@ -6,7 +6,7 @@ origin on the ground under the middle of the rear axle. `mono_ns` is a host's mo
 
 from __future__ import annotations
 
-from typing import Any, Final, Literal
+from typing import Any, Literal
 
 import numpy as np
 from msgspec import Struct
@@ -166,10 +166,6 @@ class Decision(Struct, frozen=True):
 
 
 Mode = Literal["arm", "drive", "stop"]
-LARGEST_STORED_STOP: Final = 2**62
-"""The number of an emergency stop is its time in nanoseconds; this number is a time in the year 2116. The vehicle does
-not remember a higher one, so it executes such a stop only from a request or command that cannot be a replay."""
-
 Operation = Literal["acquire", "request_handover", "release", "emergency_stop", "clear_emergency_stop"]
 """acquire, release: control of the vehicle. request_handover: ask the active operator to release control."""
 SafetyState = Literal["disarmed", "arming", "driving", "degraded", "safe_stop", "emergency_stop"]
@@ -192,7 +188,7 @@ class Command(Struct, frozen=True):
     path_curvature_per_m: tuple[float, ...]
     mode: Mode
     emergency_stop: int
-    """0: no emergency stop. Otherwise its number; a later emergency stop has a higher one."""
+    """0: no emergency stop. Otherwise its number; another emergency stop has another one."""
 
 
 class State(Struct, frozen=True):
@@ -275,4 +271,4 @@ class SessionReply(Struct, frozen=True):
     host: str
     """Identity of the server's kernel: processes on the same kernel share its clocks."""
     emergency_stop: int
-    """Highest number of an emergency stop that the server has received."""
+    """Number of the last emergency stop; 0: none. In the reply to an emergency stop: the number in the request."""

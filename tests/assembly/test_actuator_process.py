@@ -7,6 +7,7 @@ import signal
 import threading
 from collections import Counter
 from multiprocessing.connection import Connection
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,6 +16,7 @@ import pytest
 from lavt.assembly import actuator_process
 from lavt.node import WAKE
 from lavt.runtime import process_priority
+from lavt.runtime.resident_memory import lift_lock_limit
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -62,6 +64,21 @@ def test_a_stuck_actuator_does_not_outlive_its_server() -> None:
         own_end.close()
         process.join(60)
         assert process.exitcode == -signal.SIGALRM
+    finally:
+        process.kill()
+
+
+def test_the_actuator_locks_its_memory() -> None:
+    """Before it drives, the actuator's process has locked its memory, if its user may do so."""
+    context = multiprocessing.get_context("spawn")
+    own_end, actuator_end = context.Pipe()
+    process = context.Process(target=serve_stuck, args=(actuator_end,))
+    process.start()
+    try:
+        assert own_end.recv() is None
+        status = Path(f"/proc/{process.pid}/status").read_text()
+        locked_kib = next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmLck"))
+        assert (locked_kib > 1000) == (lift_lock_limit() == "")
     finally:
         process.kill()
 

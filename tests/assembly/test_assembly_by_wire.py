@@ -43,7 +43,7 @@ def reason_for(
 
 
 def test_a_real_bus_without_keys_inhibits_arming(verified_profile: Profile) -> None:
-    """Arming needs signing keys on a bus that may have a real car, but not on a virtual bus."""
+    """Arming needs signing keys on a bus that can have a real car, but not on a virtual bus."""
     assert "security.key" in reason_for(REAL_BUS, verified_profile, ServerSecurityConfig())
     assert "security.key" not in reason_for(REAL_BUS, verified_profile)
     virtual = DbwConfig(interface="udp_multicast", channel="239.74.163.2")
@@ -53,7 +53,7 @@ def test_a_real_bus_without_keys_inhibits_arming(verified_profile: Profile) -> N
 
 
 def test_a_real_bus_without_a_car_inhibits_arming(verified_profile: Profile) -> None:
-    """Arming on a bus that may have a real car needs the car's name and a watchdog proof."""
+    """Arming on a bus that can have a real car needs the car's name and a watchdog proof."""
     assert "vehicle.dbw.car" in reason_for(REAL_BUS.model_copy(update={"car": ""}), verified_profile)
     assert "vehicle.dbw.watchdog_proof" in reason_for(REAL_BUS, verified_profile)
 

@@ -71,6 +71,12 @@ def test_units_run_without_root(path: Path) -> None:
     assert service["LimitNICE"] == str(requested)
 
 
+def test_only_the_server_may_lock_its_memory() -> None:
+    """The server's unit allows the actuator's process to lock all its memory; the other units need no permission."""
+    limits = {path.name: read_unit(path)["Service"].get("LimitMEMLOCK") for path in UNITS}
+    assert {name: limit for name, limit in limits.items() if limit} == {"lavt-server.service": "infinity"}
+
+
 def test_the_directory_of_the_socket() -> None:
     """Only the router's unit creates /run/lavt; its socket is for one user, and the directory outlives the unit."""
     assert [path.name for path in UNITS if "RuntimeDirectory" in read_unit(path)["Service"]] == ["lavt-router.service"]

@@ -53,7 +53,9 @@ class Bench:
         after_collision: Literal["end", "continue"] = "end",
     ) -> None:
         numbers = count(1)
-        limiter = Limiter(LIMITS, wheelbase_m=2.8448, max_steering_rad=0.513, max_braking_mps2=6.0)
+        limiter = Limiter(
+            LIMITS, wheelbase_m=2.8448, max_steering_rad=0.513, max_acceleration_mps2=2.0, max_braking_mps2=6.0
+        )
         self.vehicle = FakeVehicle()
         self.gate = SafetyGate(LIMITS, limiter, new_epoch=lambda: next(numbers), new_token=lambda: bytes(16))
         self.node = ActuatorNode(

@@ -20,12 +20,17 @@ START_NS = 1_000 * NS_PER_S
 WALL_NS = 1_790_000_000 * NS_PER_S
 WHEELBASE_M = 2.8448
 MAX_STEERING_RAD = 0.513
+MAX_ACCELERATION_MPS2 = 2.0
 MAX_BRAKING_MPS2 = 6.0
 
 
 def new_limiter(limits: Limits = LIMITS) -> Limiter:
     return Limiter(
-        limits, wheelbase_m=WHEELBASE_M, max_steering_rad=MAX_STEERING_RAD, max_braking_mps2=MAX_BRAKING_MPS2
+        limits,
+        wheelbase_m=WHEELBASE_M,
+        max_steering_rad=MAX_STEERING_RAD,
+        max_acceleration_mps2=MAX_ACCELERATION_MPS2,
+        max_braking_mps2=MAX_BRAKING_MPS2,
     )
 
 

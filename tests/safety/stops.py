@@ -16,9 +16,13 @@ from itertools import groupby, repeat
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
+from unittest.mock import patch
+
+import numpy as np
 
 from lavt.config import RunConfig
 from lavt.config_file import parse_config
+from lavt.control import drive_controller
 from lavt.domain import NS_PER_S, Now
 from lavt.experiment.runs.plan import plan_run
 from lavt.experiment.runs.virtual_run import VirtualLoop, build_loop
@@ -123,6 +127,53 @@ def stops(route: str, condition: str = "L0") -> Iterator[StopPair]:
                 node_without_path = _copied(node)
                 node_without_path.gate.watchdog._path.clear_path()  # disables path following
                 yield StopPair(curve, _stopped(node), _stopped(node_without_path))
+        for writer in loop.writers:
+            writer.close()
+
+
+@dataclass(frozen=True, slots=True)
+class FullThrottleStop:
+    """A safe stop after a last command with full throttle."""
+
+    stop: Stop
+    throttle: float
+    """Throttle of the car, which follows the pedal with a lag, at the last command."""
+    since_picture_m: float
+    """Distance from the place of the last command's picture to standstill."""
+
+
+def full_throttle_stops(delay_ms: float, start_mps: float, duration_s: float = 5.0) -> Iterator[FullThrottleStop]:
+    """Drive a straight road with full throttle in every command, and yield the stop after every third command.
+
+    The car starts at `start_mps`. `delay_ms` is added to the video.
+    """
+    config = {
+        "vehicle": {"route": "straight"},
+        "network": {"inherent": "paper_wifi5", "condition": "L0", "video": {"delay_ms": delay_ms}},
+        "controller": {"lookahead_s": 2.4},  # stable at any of the delays
+        "safety": {"picture_age_limit_ms": 2000.0},
+        "fidelity": "geometry",
+    }
+    with TemporaryDirectory() as directory, patch.object(drive_controller, "pedals", lambda *_: (1.0, 0.0)):
+        loop = build_loop(plan_run(parse_config(RunConfig, config, "the stops")), Path(directory) / "run")
+        node, car = actuator_of(loop), actuator_of(loop).vehicle
+        gate, watchdog = node.gate, node.gate.watchdog
+        assert isinstance(car, Simulator)
+        motion = car._car.motion
+        assert loop.runtime.run(10 * NS_PER_S, lambda: gate.state == "driving" and gate.epoch.command is not None)
+        motion.speed_mps, motion.brake = start_mps, 0.0
+        end_ns, captured_ns, passed = loop.runtime.true_ns + round(duration_s * NS_PER_S), watchdog._captured_ns, []
+
+        def has_new_command() -> bool:
+            nonlocal captured_ns
+            passed.append((car.ground_truth().mono_ns, motion.x_m))
+            before_ns, captured_ns = captured_ns, watchdog._captured_ns
+            return captured_ns != before_ns
+
+        while all(loop.runtime.run(end_ns, has_new_command) for _ in range(3)):
+            since_picture_m = motion.x_m - np.interp(captured_ns, *np.transpose(passed))
+            throttle, stop = motion.throttle, _stopped(_copied(node))
+            yield FullThrottleStop(stop, throttle, since_picture_m + stop.covered_m)
         for writer in loop.writers:
             writer.close()
 

@@ -11,7 +11,16 @@ from __future__ import annotations
 from functools import cache
 
 import pytest
-from tests.safety.stops import ALLOWED_BEYOND_M, ROUTES, SPEED_MPS, StopPair, curves, metres, stops
+from tests.safety.stops import (
+    ALLOWED_BEYOND_M,
+    ROUTES,
+    SPEED_MPS,
+    StopPair,
+    curves,
+    full_throttle_stops,
+    metres,
+    stops,
+)
 
 from lavt.config import RunConfig
 from lavt.config_file import parse_config
@@ -20,6 +29,7 @@ from lavt.experiment.runs.monitored_run import drive_monitored
 from lavt.experiment.runs.plan import plan_run
 from lavt.safety.limiter import stopping_speed_limit_mps
 from lavt.safety.limits import LIMITS
+from lavt.vehicle.sim.dynamics import LINCOLN_MKZ
 from lavt.vehicle.sim.road.road import load_road
 
 pytestmark = pytest.mark.full
@@ -97,7 +107,21 @@ def test_with_old_pictures_the_car_drives_slower() -> None:
     }
     run = drive_monitored(plan_run(parse_config(RunConfig, config, "the test")), limit_s=25)
     speeds_mps = run.speed_mps[run.time_s > 10]
-    allowed_mps = stopping_speed_limit_mps(run.total_delay_ms / 1000, LIMITS)
-    assert allowed_mps < SPEED_MPS - 0.2
+    allowed_mps = stopping_speed_limit_mps(run.total_delay_ms / 1000, LIMITS, LINCOLN_MKZ.max_acceleration_mps2)
+    assert allowed_mps < SPEED_MPS - 0.8
     assert max(abs(speeds_mps - allowed_mps)) < 0.1
     assert len(run.limited_s[run.limited_s > 10]) > 100
+
+
+@pytest.mark.parametrize(("delay_ms", "start_mps"), [(0.0, 8.6), (300.0, 7.4), (800.0, 6.4), (1700.0, 4.6)])
+def test_a_car_at_full_throttle_stops_on_its_path(delay_ms: float, start_mps: float) -> None:
+    """If commands with full throttle stop, the car is stationary within the 20 m of path from its last picture.
+
+    It reaches its speed limit meanwhile: some stops begin below it, at full throttle, and some at it, with little.
+    """
+    found = list(full_throttle_stops(delay_ms, start_mps))
+    assert len(found) > 20
+    assert min(stop.throttle for stop in found) < 0.5
+    assert max(stop.throttle for stop in found) > 0.9
+    assert {stop.stop.ended for stop in found} == {"safe_stop"}
+    assert max(stop.since_picture_m for stop in found) < PATH_STEP_M * PATH_POINTS - 1.5

@@ -183,7 +183,7 @@ def test_an_old_picture_is_not_returned(tmp_path: Path, open_camera: OpenCamera)
 
 
 def test_pictures_share_no_memory(tmp_path: Path, open_camera: OpenCamera) -> None:
-    """Two pictures share no memory and are writeable, because each gets a stamp of its own in its pixels."""
+    """Two pictures share no memory and are writeable, because a stamp is written into each picture."""
     camera = open_camera(write_video(tmp_path / "fast.avi", rate_hz=60.0), rate_hz=60.0)
 
     first, second = next_frame(camera).picture, next_frame(camera).picture
@@ -307,7 +307,7 @@ def test_pictures_of_another_size_are_dropped(tmp_path: Path, open_camera: OpenC
 def test_closing_a_camera_ends_its_thread(
     tmp_path: Path, open_camera: OpenCamera, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Closing a camera ends its thread, also while it waits to reopen the device."""
+    """Closing a camera ends its thread, even while the thread waits to reopen the device."""
     monkeypatch.setattr(video_device, "RETRY_S", 1000.0)
     path = write_video(tmp_path / "short.avi", rate_hz=50.0, pictures=2)
     camera = open_camera(path, rate_hz=50.0)

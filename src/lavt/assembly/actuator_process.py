@@ -28,6 +28,7 @@ from lavt.runtime import process_priority
 from lavt.runtime.output import queue_output
 from lavt.runtime.realtime import RealRuntime
 from lavt.runtime.remote_node import NodeHost, RemoteNodeProxy
+from lavt.runtime.resident_memory import lock_memory
 from lavt.runtime.thread_failures import fail_on_thread_errors
 from lavt.vehicle.dbw.vehicle import DbwVehicle
 
@@ -109,6 +110,8 @@ def serve_actuator(connection: Connection, config: ServerConfig, host: str, vide
     queue_output("stdout", "stderr")
     os.setsid()  # a session that the kernel schedules apart from the server's
     process_priority.raise_priority(process_priority.VEHICLE_NICENESS)
+    if reason := lock_memory():
+        log.warning("the process of the %s may have to wait for the disk when memory is scarce: %s", NAME, reason)
     clock = MachineClock()
     try:
         vehicle, start = open_by_wire(config, clock), clock.now()

@@ -173,6 +173,7 @@ def build_actuator(
         limits,
         wheelbase_m=capabilities.wheelbase_m,
         max_steering_rad=capabilities.max_steering_rad,
+        max_acceleration_mps2=capabilities.max_acceleration_mps2,
         max_braking_mps2=capabilities.max_braking_mps2,
     )
     gate = SafetyGate(

@@ -29,6 +29,7 @@ from lavt.doctor.clock_checks import compare
 from lavt.domain import NS_PER_S
 from lavt.errors import LavtError, UserError
 from lavt.runtime import process_priority
+from lavt.runtime.resident_memory import lift_lock_limit
 from lavt.transport.clock_sync.clock_report import ClockReport
 from lavt.transport.udp_link import resolve_host
 from lavt.transport.zenoh_link import ZenohLink, quiet_logs
@@ -105,6 +106,7 @@ def _checks(settings: Settings | None, clock: MachineClock) -> Iterator[Check]:
             yield _camera_check(settings, clock)
         if settings.vehicle.kind == "dbw" and not settings.vehicle.dbw.is_inside:
             yield _by_wire_check(settings, clock)
+            yield checks.check_memory_lock(lift_lock_limit())
         yield from _port_checks(settings, clock)
         yield from _zenoh_checks(settings, clock)
     else:

@@ -146,6 +146,14 @@ def check_by_wire(frames: int, inhibit_reason: str, *, name: str) -> Check:
     return Check("by wire", "ok", f"{found}, including every report of the profile", measured={"frames": frames})
 
 
+def check_memory_lock(reason: str) -> Check:
+    """Check that the actuator of a by-wire car may lock its memory; `reason` says why not."""
+    if reason:
+        do = "run the server as root, or with LimitMEMLOCK=infinity as in deploy/systemd/"
+        return Check("memory", "warning", f"the actuator may have to wait for the disk: {reason}", do)
+    return Check("memory", "ok", "the actuator can keep its memory in RAM")
+
+
 def check_camera(sample: CameraSample | str, *, name: str, size: str, rate_hz: float) -> Check:
     """Check that a camera delivers pictures at the configured rate; a string is the reason why it delivers none."""
     if isinstance(sample, str):

@@ -63,7 +63,8 @@ class ClientSession:
         self._request_ns = start_ns
         self._stop_ns: int | None = None
         """When the emergency stop is requested again; None: the vehicle knows of it."""
-        self._highest_emergency_stop = 0
+        self._last_stop = 0
+        """Number of the vehicle's last emergency stop, by its last reply."""
 
     @property
     def may_command(self) -> bool:
@@ -93,7 +94,7 @@ class ClientSession:
         if self.phase == "watching":
             return SessionRequest("release", self._who, self._instance, 0)
         if self._clear_stop and self.phase == "arming" and self.safety == "emergency_stop":
-            return SessionRequest("clear_emergency_stop", self._who, self._instance, self._highest_emergency_stop)
+            return SessionRequest("clear_emergency_stop", self._who, self._instance, self._last_stop)
         self._last_operation, self._next_operation = self._next_operation, "acquire"
         return SessionRequest(self._last_operation, self._who, self._instance, 0)
 
@@ -110,12 +111,8 @@ class ClientSession:
     def handle_reply(self, reply: SessionReply, now_ns: int) -> None:
         """Process the server's reply to a request."""
         self._update_reason(reply)
-        self._highest_emergency_stop = max(self._highest_emergency_stop, reply.emergency_stop)
-        if self.emergency_stop and reply.emergency_stop > self.emergency_stop:
-            # The vehicle takes the stop for an old one, because this client's wall clock is behind: raise a newer one.
-            self.emergency_stop = self._highest_emergency_stop = reply.emergency_stop + 1
-            self._stop_ns = None if self._stop_ns is None else now_ns
-        elif self.emergency_stop == reply.emergency_stop:
+        self._last_stop = reply.emergency_stop
+        if reply.emergency_stop == self.emergency_stop:
             self._stop_ns = None
         if reply.granted and reply.token:
             self.host = reply.host
@@ -166,9 +163,9 @@ class ClientSession:
         """Raise an emergency stop and return its request; every later command carries its number.
 
         The request is repeated until the vehicle answers it or reports the stop, because a client that does not drive
-        sends no commands. The number is the wall clock time or, if a higher number is known, one more than that number.
-        So it grows even if the client is restarted.
+        sends no commands. The number is the wall clock time, at least one more than that of this client's last stop, so
+        no other stop has it.
         """
-        self.emergency_stop = self._highest_emergency_stop = max(self._highest_emergency_stop + 1, now.wall_ns)
+        self.emergency_stop = max(self.emergency_stop + 1, now.wall_ns)
         self._stop_ns = now.mono_ns + REQUEST_PERIOD_NS
         return SessionRequest("emergency_stop", self._who, self._instance, self.emergency_stop)

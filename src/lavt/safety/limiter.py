@@ -10,35 +10,45 @@ from lavt.errors import UserError
 from lavt.safety.limits import Limits
 
 COMMAND_PERIOD_S = CLIENT_LIMITS.command_period_ns / NS_PER_S
-"""A steering change that the rate limit allows within this time is not reported as limited."""
+"""A steering change that the rate limit allows in this time is not reported as limited."""
 
 
 class Limiter:
-    """A limiter that keeps each requested actuation within the limits and names the limits that changed it.
+    """A limiter that keeps each requested actuation within the limits, and names the limits that changed the request.
 
-    `wheelbase_m`, `max_steering_rad` and `max_braking_mps2` are properties of the vehicle. Raises `UserError` unless
-    they are positive and finite.
+    All numbers are properties of the vehicle, the accelerations those at full pedals. Raises `UserError` unless they
+    are positive and finite.
     """
 
-    def __init__(self, limits: Limits, *, wheelbase_m: float, max_steering_rad: float, max_braking_mps2: float) -> None:
-        if not all(0 < number < math.inf for number in (wheelbase_m, max_steering_rad, max_braking_mps2)):
-            raise UserError("wheelbase, largest steering angle and deceleration of a vehicle must be positive numbers")
+    def __init__(
+        self,
+        limits: Limits,
+        *,
+        wheelbase_m: float,
+        max_steering_rad: float,
+        max_acceleration_mps2: float,
+        max_braking_mps2: float,
+    ) -> None:
+        properties = (wheelbase_m, max_steering_rad, max_acceleration_mps2, max_braking_mps2)
+        if not all(0 < number < math.inf for number in properties):
+            raise UserError("wheelbase, largest steering angle and accelerations of a vehicle must be positive numbers")
         self.limits = limits
         self.max_braking_mps2 = max_braking_mps2
         self.applied_limits: tuple[str, ...] = ()
         """Names of the limits that changed the last request."""
         self.wheelbase_m = wheelbase_m
+        self._max_acceleration_mps2 = max_acceleration_mps2
         self._max_steering_rad = max_steering_rad
         self._steering_rad: float | None = None
         self._at_ns = 0
 
     def reset(self, steering_rad: float, now_ns: int) -> None:
-        """Take the wheel's present angle as the last steering target; ignore an angle that is not finite."""
+        """Take the present angle of the wheels as the last steering target; ignore an angle that is not finite."""
         if math.isfinite(steering_rad):
             self._steering_rad, self._at_ns = steering_rad, now_ns
 
     def target_rad(self, vehicle: VehicleState) -> float:
-        """Return the last steering target; before the first one, the wheel's angle, or 0 if it is not finite."""
+        """Return the last steering target; before the first target, the wheels' angle, or 0 if that is not finite."""
         if self._steering_rad is not None:
             return self._steering_rad
         return vehicle.steering_rad if math.isfinite(vehicle.steering_rad) else 0.0
@@ -48,7 +58,7 @@ class Limiter:
     ) -> Actuation:
         """Return `requested` within the limits at the vehicle's present speed; all values are finite.
 
-        `picture_age_ns` is the age of the picture that `requested` was made from; None: it was not made from a picture.
+        `picture_age_ns` is the age of the picture from which `requested` was made; None without a picture.
         """
         before_rad = self.target_rad(vehicle)
         step_rad = self.limits.steering_rate_radps * max(0, now_ns - self._at_ns) / NS_PER_S
@@ -79,7 +89,9 @@ class Limiter:
             changed.append("speed")
         brake = requested.brake
         if picture_age_ns is not None and is_speed_known:
-            excess_mps = vehicle.speed_mps - stopping_speed_limit_mps(picture_age_ns / NS_PER_S, self.limits)
+            picture_age_s = picture_age_ns / NS_PER_S
+            limit_mps = stopping_speed_limit_mps(picture_age_s, self.limits, self._max_acceleration_mps2)
+            excess_mps = vehicle.speed_mps - limit_mps
             minimum_brake = self._stopping_distance_brake(excess_mps)
             if excess_mps > 0 and (throttle > 0 or brake < minimum_brake):
                 throttle, brake = 0.0, max(brake, minimum_brake)
@@ -89,7 +101,7 @@ class Limiter:
         return Actuation(rate_limited_rad, throttle, brake)
 
     def _stopping_distance_brake(self, excess_mps: float) -> float:
-        """Return the pedal that removes the excess speed in the settling time, at most that of a safe stop."""
+        """Return the pedal that removes the excess speed in the settling time, at most the pedal of a safe stop."""
         deceleration_mps2 = min(excess_mps / self.limits.stopping_brake_settling_s, self.limits.stop_deceleration_mps2)
         return min(1.0, deceleration_mps2 / self.max_braking_mps2)
 
@@ -106,15 +118,17 @@ class Limiter:
         return math.atan(self.wheelbase_m * self.limits.lateral_acceleration_mps2 / (speed_mps * speed_mps))
 
 
-def stopping_speed_limit_mps(picture_age_s: float, limits: Limits) -> float:
+def stopping_speed_limit_mps(picture_age_s: float, limits: Limits, max_acceleration_mps2: float) -> float:
     """Return the highest speed from which the car stops on the path of its last command, if no other command follows.
 
     Since the picture was taken, the car has driven for the picture's age. It drives on for `stop_after` until the safe
-    stop begins, and then brakes. So the speed v solves v (age + `stop_after`) + v^2 / (2 `stop_deceleration`) =
-    `stopping_distance_limit`; the older the picture, the lower it is.
+    stop begins, and then brakes. The last command may give full throttle until the vehicle is degraded, so the speed v
+    counts as w = v + `max_acceleration` x `degraded_after`. w solves w (age + `stop_after`) + w^2 / (2
+    `stop_deceleration`) = `stopping_distance_limit`; the older the picture, the lower it is.
     """
     unguided_s = picture_age_s + limits.stop_after_ns / NS_PER_S
     braking_mps2 = limits.stop_deceleration_mps2
-    return braking_mps2 * (
+    highest_mps = braking_mps2 * (
         math.sqrt(unguided_s * unguided_s + 2 * limits.stopping_distance_limit_m / braking_mps2) - unguided_s
     )
+    return max(0.0, highest_mps - max_acceleration_mps2 * limits.degraded_after_ns / NS_PER_S)

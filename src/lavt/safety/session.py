@@ -4,23 +4,26 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from typing import ClassVar
+from typing import ClassVar, Final
 
-from lavt.domain import LARGEST_STORED_STOP, Command, Operation, SessionReply, SessionRequest, VehicleState
+from lavt.domain import Command, Operation, SessionReply, SessionRequest, VehicleState
 from lavt.safety.limits import Limits
 from lavt.safety.state_machine import SafetyStateMachine
 from lavt.safety.takeover_requests import TakeoverRequests
 
+REMEMBERED_STOPS: Final = 1000
+"""How many emergency stops are remembered by their numbers, so that none of them is executed a second time."""
+
 
 class CommandEpoch:
-    """The present epoch with the commands accepted in it. Commands of an earlier epoch are never accepted again."""
+    """The present epoch, and the last command accepted in it. Commands of an earlier epoch are never accepted again."""
 
     def __init__(self, new_number: Callable[[], int]) -> None:
         self.number = new_number()
         self.sequence = -1
-        """Sequence number of the last accepted command; -1: none in this epoch."""
+        """Sequence number of the last accepted command; -1 if no command was accepted in this epoch."""
         self.command: Command | None = None
-        """The last accepted drive command; None: none in this epoch, or none since arming began."""
+        """The last accepted drive command in this epoch and since arming began; None if there is none."""
         self._new_number = new_number
 
     def renew(self) -> None:
@@ -31,7 +34,7 @@ class CommandEpoch:
 
 
 class VehicleSession:
-    """The vehicle's side of the session: at most one client has control; every client can stop the vehicle."""
+    """The vehicle's side of the session. At most one client has control, but every client can stop the vehicle."""
 
     def __init__(
         self,
@@ -57,7 +60,8 @@ class VehicleSession:
         self._new_token = new_token
         self._host = host
         self._video_port = video_port
-        self._emergency_stop_number = 0
+        self._executed_stops: dict[int, None] = {}
+        """Numbers of the emergency stops, in the order of their execution."""
         self._is_closed = False
 
     def answer(self, request: SessionRequest, vehicle: VehicleState, now_ns: int) -> SessionReply:
@@ -74,7 +78,7 @@ class VehicleSession:
             self.token if has_control else b"",
             self._video_port,
             self._host,
-            self._emergency_stop_number,
+            request.number if request.operation == "emergency_stop" else self._last_stop,
         )
 
     def close(self) -> None:
@@ -84,14 +88,23 @@ class VehicleSession:
         self._end_control()
 
     def raise_emergency_stop(self, number: int) -> bool:
-        """Stop the vehicle and return True; return False for a number that is not higher than all before."""
-        if number <= self._emergency_stop_number:
+        """Stop the vehicle and return True. If `number` is that of a remembered stop, do nothing and return False.
+
+        The order of numbers does not matter: if a stop needed a higher number than the last stop, a stop with a very
+        high number would prevent all later ones.
+        """
+        if number in self._executed_stops:
             self._counts["emergency stop with an old number"] += self._machine.state != "emergency_stop"
             return False
-        if number <= LARGEST_STORED_STOP:  # a higher one is not stored: it would leave no number for the next stop
-            self._emergency_stop_number = number
+        self._executed_stops[number] = None
+        if len(self._executed_stops) > REMEMBERED_STOPS:
+            self._executed_stops.pop(next(iter(self._executed_stops)))
         self._machine.trigger("emergency stop")
         return True
+
+    @property
+    def _last_stop(self) -> int:
+        return next(reversed(self._executed_stops), 0)
 
     def _has_control(self, request: SessionRequest) -> bool:
         return (request.who, request.instance) == self.active_operator
@@ -133,15 +146,16 @@ class VehicleSession:
         self._epoch.renew()
 
     def _emergency_stop(self, request: SessionRequest, _vehicle: VehicleState, _now_ns: int) -> str:
-        if not self.raise_emergency_stop(request.number):
-            return "the number of this emergency stop is not a new one"
-        self._machine.reason = f"emergency stop by {request.who}"
-        return ""
+        if self.raise_emergency_stop(request.number):
+            self._machine.reason = f"emergency stop by {request.who}"
+        return (
+            ""  # also for a stop that was executed already, because its client repeats the request until it is granted
+        )
 
     def _clear_emergency_stop(self, request: SessionRequest, vehicle: VehicleState, _now_ns: int) -> str:
         if not self._has_control(request):
             return "only the client that has control can clear the emergency stop"
-        if request.number != self._emergency_stop_number:  # a late or repeated request must not clear a newer stop
+        if request.number != self._last_stop:  # a late or repeated request must not clear a newer stop
             return "this is not the number of the last emergency stop"
         if not self._limits.is_stationary(vehicle):
             return "the vehicle is not stationary yet"
@@ -155,4 +169,4 @@ class VehicleSession:
         "emergency_stop": _emergency_stop,
         "clear_emergency_stop": _clear_emergency_stop,
     }
-    """Each operation returns why it is rejected; empty: it is granted."""
+    """For each operation, a function that executes it and returns why it is rejected; empty if it is granted."""

@@ -19,7 +19,6 @@ import msgspec
 from msgspec import Meta
 
 from lavt.domain import (
-    LARGEST_STORED_STOP,
     PATH_POINTS,
     Command,
     Mode,
@@ -113,8 +112,7 @@ TYPES: dict[type, dict[str, Any]] = {
         "token": bytes,
         "video_port": Annotated[int, Meta(ge=0, le=65535)],
         "host": _text(SessionReply, "host"),
-        # lower than the highest `U63`, so that the operator can send a higher number
-        "emergency_stop": Annotated[int, Meta(ge=0, le=LARGEST_STORED_STOP)],
+        "emergency_stop": U63,
     },
     NetemRequest: {
         "who": Name,

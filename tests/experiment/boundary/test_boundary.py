@@ -83,7 +83,7 @@ def test_a_crossing_below_the_range_has_no_lower_end() -> None:
 
 @pytest.mark.parametrize("guess_ms", [0.0, 130.0, 137.0, 300.0, 1000.0])
 def test_the_zero_of_a_rate_is_bracketed(guess_ms: float) -> None:
-    """For any guess, the zero of a smooth rate is bracketed to 2 ms, also if the rate is infinite elsewhere."""
+    """For any guess, the zero of a smooth rate is bracketed to 2 ms, even if the rate is infinite elsewhere."""
 
     def rate(delay_ms: float) -> float:
         return math.inf if delay_ms > 200 else (delay_ms - 137) / 500

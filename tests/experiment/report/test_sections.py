@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from lavt.experiment.analysis.results import run_result, write_json
+from lavt.experiment.report import boundary_section
 from lavt.experiment.report.figure_style import condition_colours
 from lavt.experiment.report.groups import axes_of, differing_settings, in_order, is_in_group, title_of
 from lavt.experiment.report.report import write_report
@@ -32,6 +33,7 @@ from lavt.experiment.report.sections import (
     survival_parts,
 )
 from lavt.experiment.report.sweep_figures import axis_figure
+from lavt.experiment.report.table_format import NOTHING
 from lavt.experiment.statistics.summary import summarize
 from lavt.recording.record import read_record
 
@@ -337,6 +339,18 @@ def test_a_drive_is_drawn_every_half_metre() -> None:
     assert drawn_points(np.zeros(0)) == []
 
 
+def test_a_boundary_that_was_not_found_is_a_dash_with_its_reason() -> None:
+    """Where no median was found, table and sentence have a dash, and the sentence says how many seeds are in range."""
+    summary = {"p25": 300.0, "p50": None, "p75": None, "interval": None, "n": 1}
+    criteria = {f"{name}_ms": summary for name in ("onset", "departure", "completion")}
+    group = {"route": "a", "preset": "own", "n": 4, "theory_ms": None, **criteria, "not_monotone": {"onset": 0}}
+    [sentence] = boundary_section.boundary_sentences([group])
+    assert f"oscillation begins to grow: {NOTHING} (in the searched range for only 1 of 4);" in sentence
+    table = boundary_section.boundary_table({"groups": [group]})
+    shown = {column.title: column.show(cell) for column, cell in zip(table.columns, table.rows[0], strict=True)}
+    assert shown["onset by theory (ms)"] == shown["oscillation begins to grow: median (ms)"] == NOTHING
+
+
 def test_the_report_has_the_maximum_tolerable_latency(make_run: MakeRun, tmp_path: Path) -> None:
     """The result of `lavt boundary` is a section of the page with a figure and a table in each format."""
     directory = make_run(tmp_path / "runs" / "0", seconds=2.0)
@@ -361,4 +375,5 @@ def test_the_report_has_the_maximum_tolerable_latency(make_run: MakeRun, tmp_pat
     assert 'href="boundary.svg"' in html
     assert "designed, route a: theory predicts growing oscillation from a total delay of 204 ms" in html
     assert "210" in (tmp_path / "report" / "tables" / "boundary.csv").read_text()
+    assert boundary_section.DASHES in html
     assert json.loads((tmp_path / "summary.json").read_text())["schema"] == 1

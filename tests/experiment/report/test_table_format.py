@@ -38,7 +38,7 @@ TABLE = TableData(
 
 
 def test_csv_keeps_all_values_exactly() -> None:
-    """The CSV has each text and number unchanged in its own column; an unknown value is empty."""
+    """The CSV has each text and number unchanged in a separate column; an unknown value is empty."""
     head, first, second = csv.reader(io.StringIO(csv_of(TABLE)))
     parts = ["loop ms p50", "loop ms p5", "loop ms p95"]
     assert head == [
@@ -93,7 +93,7 @@ def test_a_wide_latex_table_is_scaled_to_the_line() -> None:
 
 
 def test_latex_breaks_long_texts() -> None:
-    """A column with a long text has line breaks, also inside JSON."""
+    """A column with a long text has line breaks, even inside JSON."""
     text = 'said: {"of_one":"word","of_two":"words, or more"}'
     for column in (text_column("endings"), text_column("endings", is_long=True)):
         lines = tex_of(TableData([column], [[text]])).splitlines()

@@ -34,7 +34,7 @@ def test_a_sweep_has_every_combination() -> None:
 
 @pytest.mark.usefixtures("any_route")
 def test_seeds_are_paired() -> None:
-    """A repetition on a route has one seed under all conditions, which no other repetition or route has."""
+    """A repetition on a route has the same seed under all conditions; no two repetitions or routes share a seed."""
     runs = planned(routes=["a_key", "b_key"], conditions=["L0", "L3", "L5"], repetitions=4, seed=9)
     seeds: dict[tuple[str, int], set[int]] = {}
     for run in runs:

@@ -22,7 +22,7 @@ def test_runs_are_compared_over_their_common_distance() -> None:
 
 
 def test_each_repetition_has_its_own_common_distance() -> None:
-    """A run that ended early shortens the common distance of its own repetition only."""
+    """A run that ended early shortens the common distance of the same repetition only."""
     runs = [run([0.1, 0.2]), run([0.3]), run([0.4, 0.5], repetition=1, seed=2)]
     assert common_p95_m(runs, common_distances(runs)) == [0.1, 0.3, 0.5]
 

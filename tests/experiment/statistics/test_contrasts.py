@@ -26,7 +26,7 @@ def runs(condition: str, endings: str, **changes: Any) -> list[dict[str, Any]]:
 
 
 def test_mcnemars_p_value() -> None:
-    """If 5 pairs differ in one direction, p is 2 / 2^5; for 3 against 1 pairs p is 10 / 16, and for no pairs 1."""
+    """If 5 pairs differ in one direction, p is 2 / 2^5; if 3 differ in one and 1 in the other, 10 / 16; if none, 1."""
     assert mcnemar(5, 0) == pytest.approx(0.0625)
     assert mcnemar(3, 1) == pytest.approx(0.625)
     assert mcnemar(0, 0) == 1.0
@@ -38,7 +38,7 @@ def test_fishers_p_value() -> None:
 
 
 def test_a_contrast_pairs_runs_of_one_route_repetition_and_seed() -> None:
-    """Runs of one route, repetition and seed are paired in any order; a pair that differs has a completed condition."""
+    """Runs of equal route, repetition and seed are paired in any order; pairs that differ are counted by condition."""
     contrasts = paired_contrasts([*runs("L0", "ccccccx"), *reversed(runs("L1", "cxxxxxc"))])
     p_of_5_against_1 = 14 / 64
     assert contrasts == [

@@ -96,7 +96,7 @@ def test_the_bootstrap_of_three_is_their_range() -> None:
 
 
 def test_holms_correction() -> None:
-    """The smallest p value is multiplied by 3, the next by 2, the largest by 1; each is at least the smaller ones."""
+    """The smallest p value is multiplied by 3, the next by 2, the largest by 1; the results never decrease."""
     assert holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
 
 

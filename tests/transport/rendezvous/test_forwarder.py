@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from lavt.domain import NS_PER_S
 from lavt.transport.clock_sync.probe import ProbeReply, encode_reply, encode_request
 from lavt.transport.rendezvous.forwarder import (
+    ANSWERED_HOST_PER_S,
     CLIENT_TIMEOUT_NS,
     MAX_CLIENTS,
     MAX_UNANSWERED,
@@ -238,7 +239,36 @@ def test_datagrams_to_the_vehicle_are_rate_limited() -> None:
     unanswered = [send_hello(forwarder, (host, 9)) is not None for host in hosts]
     assert sum(unanswered) == UPSTREAM_PER_S - 1, "the hello of SECOND_CLIENT was one of the allowed ones"
     answered = [send_hello(forwarder, SECOND_CLIENT) is not None for _ in range(2 * UPSTREAM_PER_S)]
-    assert sum(answered) == UPSTREAM_PER_S
+    assert sum(answered) == ANSWERED_HOST_PER_S
+    assert send_hello(forwarder, now_ns=NOW_NS + NS_PER_S) is not None
+
+
+@pytest.mark.parametrize(("flow", "datagram"), [("video", HELLO), ("video", REPORT), ("probe", encode_request(1, 1))])
+def test_a_flood_with_the_address_of_an_answered_client_spares_the_others(flow: str, datagram: bytes) -> None:
+    """However much arrives with the address of one answered client, another answered client's datagrams pass."""
+    forwarder = registered_forwarder(flow)
+    for client in (CLIENT, SECOND_CLIENT):
+        assert forwarder.receive(datagram, client, NOW_NS) is not None
+        send_answer(forwarder, client)
+    for _ in range(2 * UPSTREAM_PER_S):
+        forwarder.receive(datagram, SECOND_CLIENT, NOW_NS)
+    assert forwarder.receive(datagram, CLIENT, NOW_NS) is not None
+
+
+def test_a_flood_with_a_clients_address_keeps_it_out_until_it_is_answered() -> None:
+    """A flood with the host of a new client keeps the client out; once the vehicle has answered it, it does not.
+
+    The datagrams of the flood come from another port: one with the client's own port counts as the client's.
+    """
+    forwarder = registered_forwarder()
+    false_address = (CLIENT[0], CLIENT[1] + 1)
+    for _ in range(2 * UPSTREAM_PER_S):
+        send_hello(forwarder, false_address)
+    assert send_hello(forwarder) is None
+    assert send_hello(forwarder, now_ns=NOW_NS + NS_PER_S) is not None, "it was the first of this second"
+    assert send_answer(forwarder, now_ns=NOW_NS + NS_PER_S) is not None
+    for _ in range(2 * UPSTREAM_PER_S):
+        send_hello(forwarder, false_address, NOW_NS + NS_PER_S)
     assert send_hello(forwarder, now_ns=NOW_NS + NS_PER_S) is not None
 
 

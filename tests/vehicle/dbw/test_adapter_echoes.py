@@ -98,7 +98,7 @@ def test_all_old_commands_are_forgotten() -> None:
 
 
 def test_a_repeated_angle_is_reached_again() -> None:
-    """Each of three commands is reached at its own report, even if the last command equals the first."""
+    """Each of three commands is reached at the report of this command, even if the last command equals the first."""
     car = ChosenReports(driving_rig(1))
     requested = [car.steer(angle_rad) for angle_rad in (FIRST_RAD, SECOND_RAD, FIRST_RAD)]
     for requested_ns, command in requested:

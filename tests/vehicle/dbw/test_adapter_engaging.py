@@ -116,7 +116,7 @@ def test_clearing_frames_of_generation_1() -> None:
 
 @both_generations
 def test_counters(generation: int) -> None:
-    """Counters increase by one with each frame, also across a pause."""
+    """Counters increase by one with each frame, even across a pause."""
     rig = driving_rig(generation)
     rig.adapter.engage(False, rig.now_ns)
     rig.run_until(lambda rig: rig.state == "idle", 20_000, step_ms=COARSE_MS)

@@ -93,7 +93,7 @@ def test_a_released_axis_is_not_enabled_again() -> None:
 @both_generations
 @pytest.mark.parametrize("dropped", [1, 2, 3, 4])
 def test_dropped_frames_leave_no_gap_in_the_counters(generation: int, dropped: int) -> None:
-    """If the last frames of a set, or all, are not written, the next ones get their counters, and driving continues."""
+    """If the last frames of a set are not written, the next frames get their counters, and driving continues."""
     rig = driving_rig(generation)
     rig.run_until(lambda rig: bool(rig.sent) and rig.sent[-1][0] == rig.now_ns)
     for _ in range(5):

@@ -394,7 +394,7 @@ def test_a_full_buffer_is_no_loss(open_port: Callable[..., CanPort], device: Dev
     ],
 )
 def test_a_failed_write_loses_the_bus(open_port: Callable[..., CanPort], device: Device, error: Exception) -> None:
-    """A failed write for another reason raises an error at once, and the bus is reopened."""
+    """A write that fails for another reason raises an error immediately, and the bus is reopened."""
     port = open_port("breakable", "stick", clock=ManualClock(0))
     device.may_open.clear()
     device.send_error = error

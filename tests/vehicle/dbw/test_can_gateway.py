@@ -55,7 +55,7 @@ def test_an_error() -> None:
 
 
 def test_this_kernel_answers() -> None:
-    """The kernel answers the request in its own format; this machine has no rule."""
+    """The kernel's answer can be parsed; this machine has no rule."""
     try:
         assert gateway_interfaces() == frozenset()
     except OSError as error:

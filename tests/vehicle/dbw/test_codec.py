@@ -163,7 +163,7 @@ def test_description_of_a_message() -> None:
 
 
 def test_range_of_bits() -> None:
-    """A signal without a range in the DBC has the range of its bits, also with a negative step."""
+    """A signal without a range in the DBC has the range of its bits, even with a negative step."""
     lateral = GENERATION_1.messages["Accel"].signals["LATERAL"]
     assert (lateral.minimum, lateral.maximum) == (-327.67, 327.68)
     assert GENERATION_1.encode("Accel", {"LATERAL": 327.68})[:2] == bytes([0x00, 0x80])

@@ -69,7 +69,7 @@ def test_angles_in_radians(tmp_path: Path) -> None:
 
 
 def test_unverified() -> None:
-    """Generation 1 uses no unverified signal; generation 2 uses many, the same ones in both command sets."""
+    """Generation 1 uses no unverified signal; generation 2 uses many, and equally many in both command sets."""
     assert load_profile("dataspeed_gen1").unverified == ()
     remote, user = (load_profile(f"dataspeed_gen2:{name}").unverified for name in ("remote", "user"))
     assert len(remote) == len(user)

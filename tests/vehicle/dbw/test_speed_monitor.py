@@ -142,7 +142,7 @@ def test_pulses_of_throttle_add_up() -> None:
 
 
 def test_a_car_that_did_not_answer_the_throttle_is_not_stationary() -> None:
-    """After throttle without an answer the car may move, until a brake on ice would have stopped it."""
+    """After throttle without an answer the car is not stationary, until a brake on ice would have stopped it."""
     rig = MonitorRig().run(2.0, Pedals(0.5, 0.0), *[constant(0.0)] * 5)
     assert not rig.monitor.is_stationary
     rig.run(1.0, NO_PEDAL, *[constant(0.0)] * 5)

@@ -46,11 +46,13 @@ STAYS: dict[State, Situation] = {
 
 
 def target(state: State, **changes: Any) -> State:
-    return next_state(state, replace(STAYS[state], **changes))[0]
+    new_state, _ = next_state(state, replace(STAYS[state], **changes))
+    return new_state
 
 
 def reason(state: State, **changes: Any) -> str:
-    return next_state(state, replace(STAYS[state], **changes))[1]
+    _, reason_text = next_state(state, replace(STAYS[state], **changes))
+    return reason_text
 
 
 @pytest.mark.parametrize("state", STAYS)
@@ -150,7 +152,7 @@ def test_a_row_needs_all_of_its_conditions(state: State, changes: dict[str, Any]
 
 
 TEXTS = ("overrides", "missing_reports", "faults", "trips", "command_errors")
-"""Causes with texts of their own, in order of priority."""
+"""Causes that have texts, in order of priority."""
 
 
 @pytest.mark.parametrize("first", TEXTS)

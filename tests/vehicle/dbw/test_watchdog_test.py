@@ -205,7 +205,7 @@ INHIBITED: list[tuple[Callable[[Attempt], object], str]] = [
 
 @pytest.mark.parametrize(("inhibit", "failure"), INHIBITED, ids=[failure[:40] for _, failure in INHIBITED])
 def test_inhibited(inhibit: Callable[[Attempt], object], failure: str) -> None:
-    """The test fails without sending anything, and with the reason, if the kit may not be enabled at standstill."""
+    """If the kit must not be enabled at standstill, the test fails with the reason and without sending anything."""
     attempt = Attempt(2)
     inhibit(attempt)
     test = attempt.run()

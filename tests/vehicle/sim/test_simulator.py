@@ -36,7 +36,7 @@ def test_the_simulator_reports_its_capabilities(road: Road) -> None:
 
 
 def test_the_grid_does_not_drift(road: Road) -> None:
-    """Grid points are at n / 240 s of the monotonic clock, rounded down, also after years."""
+    """Grid points are at n / 240 s of the monotonic clock, rounded down, even after years."""
     assert [grid_ns(index) for index in (0, 1, 2, 3, 240)] == [0, 4_166_666, 8_333_333, 12_500_000, NS_PER_S]
     assert grid_ns(240 * 10**9) == 10**9 * NS_PER_S
     simulator = simulator_on(road)
@@ -74,7 +74,7 @@ def test_one_long_advance_equals_many_short_ones(road: Road) -> None:
 
 
 def test_a_command_takes_effect_at_the_next_grid_point(road: Road) -> None:
-    """A command takes effect at the first grid point after it, also if `advance` is called much later."""
+    """A command takes effect at the first grid point after it, even if `advance` is called much later."""
     late, punctual = simulator_on(road), simulator_on(road)
     first_ns, second_ns, end_ns = START_NS + 100 * NS_PER_MS, START_NS + 900 * NS_PER_MS, START_NS + 2 * NS_PER_S
     stop = Actuation(0.1, 0.0, 1.0)

@@ -18,7 +18,7 @@ from lavt.vehicle.software_car.state import ReleaseReason, SystemState
 
 
 def test_generation_1_enables_each_axis_by_its_own_bit() -> None:
-    """In generation 1 each axis is enabled by its own command with EN, independently of the other axes."""
+    """In generation 1 a command with EN enables only the axis to which it is sent."""
     rig = KitRig(1)
     steering, _, _ = rig.sender.commands(CommandValues(angle_deg=10.0))
     assert rig.enabled() == set()

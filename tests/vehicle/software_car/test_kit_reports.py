@@ -137,7 +137,7 @@ def test_generation_1_reports_an_override() -> None:
     ],
 )
 def test_faults_have_their_bits(name: str, identifier: int, byte: int, bit: int) -> None:
-    """A fault sets exactly its own bit."""
+    """A fault sets exactly the bit of this fault."""
     rig = KitRig(1 if identifier < 0x100 else 2)
     before = dict(collect_reports(rig))[identifier]
     rig.kit.set_fault(name, rig.now_ns)

@@ -222,7 +222,7 @@ def test_unknown_commands_are_rejected() -> None:
 
 
 def test_a_command_is_executed_after_earlier_frames() -> None:
-    """A command is executed at its own time, after the frames received before it."""
+    """A command is executed at the given time, after the frames that were received before this time."""
     rig = RunnerRig()
     rig.deliver(*rig.sender.commands(CommandValues(brake=0.5)), rig.sender.system(1), rig.sender.gear(4))
     rig.runner.execute("driver_shifts PARK", rig.now_ns + NS_PER_MS)

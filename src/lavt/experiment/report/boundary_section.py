@@ -31,6 +31,10 @@ LABELS = {"onset": "oscillation begins to grow", "departure": "first leaves its 
 ROW_OFFSETS = {"onset": 0.26, "departure": 0.0, "completion": -0.26}
 """Upward offset of each criterion from the middle of its route's row."""
 ALL_ROUTES = "all routes"
+DASHES = (
+    f"In the table, {NOTHING} replaces a median, quartile or end of an interval that falls on a seed outside the "
+    "searched range, an interval of fewer than six seeds, and the onset of a loop for which theory gives none."
+)
 
 Boundary = Mapping[str, Any]
 """The contents of `boundary.json`."""
@@ -54,7 +58,8 @@ def boundary_parts(boundaries: Sequence[Boundary], report_dir: Path) -> Parts:
     if parts:
         parts.append(
             html_page.paragraph(
-                "Completion does not measure stability: a run can be completed although its oscillation grows.",
+                "Completion does not measure stability: a run can be completed although its oscillation grows. "
+                + DASHES,
                 is_note=True,
             )
         )
@@ -71,10 +76,7 @@ def boundary_sentences(groups: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _boundary_sentence(group: Mapping[str, Any]) -> str:
-    onset, departure, completion = (
-        "not in the searched range" if delay_ms is None else f"{delay_ms:.0f} ms"
-        for delay_ms in (group[f"{name}_ms"]["p50"] for name in ("onset", "departure", "completion"))
-    )
+    onset, departure, completion = (_format_median(group[f"{name}_ms"], group["n"]) for name in CRITERIA)
     route = ALL_ROUTES if group["route"] is None else f"route {group['route']}"
     theory = "theory gives no onset of oscillation"
     if group["theory_ms"] is not None:
@@ -84,6 +86,12 @@ def _boundary_sentence(group: Mapping[str, Any]) -> str:
         f"oscillation begins to grow: {onset}; the vehicle first leaves its lane: {departure}; "
         f"the route is no longer completed: {completion}."
     )
+
+
+def _format_median(summary: Mapping[str, Any], seeds: int) -> str:
+    if summary["p50"] is None:
+        return f"{NOTHING} (in the searched range for only {summary['n']} of {seeds})"
+    return f"{summary['p50']:.0f} ms"
 
 
 def boundary_figure(boundary: Boundary) -> Figure:

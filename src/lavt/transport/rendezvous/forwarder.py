@@ -20,10 +20,11 @@ path. Threats:
   differs only by the wrapping. A registration gets no reply.
 * Flooding the vehicle: only datagrams in a format of the flow pass, at a limited rate. Clients that the vehicle has
   answered have a rate limit of their own, so that others cannot crowd them out. Hellos and answers also have a rate
-  limit of their own, so that replays with a client's address do not crowd out its reports.
-* Keeping new clients out: each host that the vehicle has not answered has a rate limit of its own within the common
-  one. A dropped datagram displaces no client. A flood from 20 hosts or more, or with that many false addresses, still
-  uses up the common limit, and then keeps new clients out while it lasts.
+  limit of their own, so that replays with a client's address do not crowd out its reports. In each group every host has
+  a limit of its own, so that a flood from one host, or with one false address, crowds out no client at another.
+* Keeping new clients out: a dropped datagram displaces no client. A flood from 20 hosts or more, or with that many
+  false addresses, still uses up the common limit, and then keeps new clients out while it lasts. So does, for the
+  clients at one address, a flood with that address: `docs/security.md`.
 * Not covered: an attacker on the path to the rendezvous can forward a registration from another address before the
   original arrives, and so divert the flow for a second. It could as well drop the datagrams themselves.
 
@@ -65,6 +66,9 @@ path validation or not. A client sends 2.5 reports a second (measured)."""
 HOST_PER_S: Final = 10
 """Limits the datagrams of each host, within each of the two groups from clients that the vehicle has not answered. Such
 a client sends 2 hellos a second, or 7 if the video has ended, until the vehicle answers one."""
+ANSWERED_HOST_PER_S: Final = 50
+"""The same for clients that the vehicle has answered. Such a client sends at most 7 hellos, 7 answers, 2.5 reports and
+2 probes a second, and `lavt clock` 20 probes."""
 MAX_UNANSWERED: Final = 10 * UPSTREAM_PER_S
 """Limits the number of clients that the vehicle has not answered. So many need 5 s to arrive at the rate limit, and an
 answer takes less than that."""
@@ -137,9 +141,9 @@ class Forwarder:
         self._clients = _Clients()
         self._signature_limiters = {True: RateLimiter(REGISTRATIONS_PER_S), False: RateLimiter(REGISTRATIONS_PER_S)}
         """By whether the registration comes from the vehicle's address."""
-        self._answered_limiters = {True: RateLimiter(UPSTREAM_PER_S), False: RateLimiter(UPSTREAM_PER_S)}
+        self._answered_limiters = {True: _HostLimiter(ANSWERED_HOST_PER_S), False: _HostLimiter(ANSWERED_HOST_PER_S)}
         """For clients that the vehicle has answered, by whether the datagram belongs to the path validation."""
-        self._unanswered_limiters = {True: _HostLimiter(), False: _HostLimiter()}
+        self._unanswered_limiters = {True: _HostLimiter(HOST_PER_S), False: _HostLimiter(HOST_PER_S)}
         """The same for clients that the vehicle has not answered."""
 
     def vehicle_address(self, now_ns: int) -> Address | None:
@@ -203,10 +207,8 @@ class Forwarder:
     def _is_within_limit(self, datagram: bytes, sender: Address, now_ns: int) -> bool:
         """Return whether a client's datagram is within the rate limits; if so, count it and note the client."""
         is_validation = is_path_datagram(datagram)
-        if self._clients.is_answered(sender):
-            is_within_limit = self._answered_limiters[is_validation].take(now_ns)
-        else:
-            is_within_limit = self._unanswered_limiters[is_validation].take(sender[0], now_ns)
+        limiters = self._answered_limiters if self._clients.is_answered(sender) else self._unanswered_limiters
+        is_within_limit = limiters[is_validation].take(sender[0], now_ns)
         if is_within_limit:
             self._clients.note_datagram(sender, now_ns)
         return is_within_limit
@@ -215,7 +217,8 @@ class Forwarder:
 class _HostLimiter:
     """A limit on the datagrams per second, and a lower one on those of each host, counted in windows of one second."""
 
-    def __init__(self) -> None:
+    def __init__(self, host_per_s: int) -> None:
+        self._host_per_s = host_per_s
         self._since_ns = 0
         self._left = UPSTREAM_PER_S
         self._passed: Counter[str] = Counter()
@@ -226,7 +229,7 @@ class _HostLimiter:
         if now_ns - self._since_ns >= NS_PER_S:
             self._since_ns, self._left = now_ns, UPSTREAM_PER_S
             self._passed.clear()
-        if self._left == 0 or self._passed[host] >= HOST_PER_S:
+        if self._left == 0 or self._passed[host] >= self._host_per_s:
             return False
         self._left -= 1
         self._passed[host] += 1

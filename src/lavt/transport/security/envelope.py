@@ -18,7 +18,7 @@ from typing import Any, Final
 
 from msgspec import Struct
 
-from lavt.domain import LARGEST_STORED_STOP, Command, NetemRequest, SessionReply, SessionRequest
+from lavt.domain import Command, NetemRequest, SessionReply, SessionRequest
 from lavt.errors import BadMessage
 from lavt.transport.messages import MAX_MESSAGE_BYTES, decode
 from lavt.transport.security.keys import (
@@ -203,8 +203,8 @@ class VehicleAuthenticator(NullVehicleAuthenticator):
             return None
         is_next = counter == self._replay_counter(channel, operator)
         self._accepted_requests[channel, operator] += is_next
-        # An emergency stop has a number of its own and cannot wait for a second request.
-        is_stale = body == b"" or not (is_next or _has_stored_number(channel, body))
+        # The vehicle executes an emergency stop of a number once, and the stop cannot wait for a second request.
+        is_stale = body == b"" or not (is_next or _is_emergency_stop(channel, body))
         self._counts[f"{channel}_requests_of_another_time"] += is_stale and body != b""
         secret, own_public = agreed
         return VerifiedRequest(channel, operator, body, _digest(data), secret, own_public, is_stale)
@@ -396,9 +396,5 @@ def _digest(data: bytes) -> bytes:
     return hashlib.sha256(data).digest()[:DIGEST_BYTES]
 
 
-def _has_stored_number(channel: str, body: bytes) -> bool:
-    """Return whether a request is an emergency stop whose number the vehicle stores, so that it recognizes a replay."""
-    if channel != "session" or body == b"":
-        return False
-    request = decode(SessionRequest, body)
-    return request.operation == "emergency_stop" and request.number <= LARGEST_STORED_STOP
+def _is_emergency_stop(channel: str, body: bytes) -> bool:
+    return channel == "session" and decode(SessionRequest, body).operation == "emergency_stop"

@@ -19,7 +19,7 @@ from lavt.vehicle.dbw.profile import COMMAND_TIMEOUT_NS
 from lavt.vehicle.dbw.states import STATIONARY_BELOW_MPS
 
 MAX_FALL_MPS2: Final = 12.0
-"""No car brakes harder than 1.2 g: road tyres on dry asphalt reach 1.0 to 1.1 g."""
+"""No car brakes harder than this, 1.22 g: road tyres on dry asphalt reach 1.0 to 1.1 g."""
 MAX_DROP_MPS: Final = 2.5
 """A speed may be this much below what `MAX_FALL_MPS2` allows: below about 2 m/s anti-lock brakes let wheels lock, and
 wheels that spun regain grip within a report."""

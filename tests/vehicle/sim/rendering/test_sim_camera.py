@@ -110,7 +110,7 @@ def test_marks_have_their_colours(road: Road) -> None:
 
 
 def test_the_row_of_a_depth_is_the_projection_of_its_ground() -> None:
-    """The row of a depth contains the projection of the ground at that depth, also for a pitched camera."""
+    """The row of a depth contains the projection of the ground at that depth, even for a pitched camera."""
     for pitch_rad in (0.0, 0.2):
         model = msgspec.structs.replace(MODEL, pitch_rad=pitch_rad)
         placement = place_camera(model, Pose(0, 0.0, 0.0, 0.0))
@@ -158,7 +158,7 @@ def test_the_homography_inverts_the_projection_for_every_pose() -> None:
 
 
 def test_yaw_offset_and_roll_have_their_signs() -> None:
-    """A camera turned or moved left sees the road on the right; for a camera rolled right the horizon rises there."""
+    """A camera turned or moved left sees the road on the right; a camera rolled right has a higher right horizon."""
     pose, ahead = Pose(0, 0.0, 0.0, 0.0), np.array([40.0, 0.0, 1.4])
     for model in (CameraModel(yaw_rad=0.1), CameraModel(y_m=0.5)):
         assert place_camera(model, pose).project(ahead)[0] > MODEL.width_px / 2

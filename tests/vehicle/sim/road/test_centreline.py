@@ -65,7 +65,7 @@ def test_a_clothoid_is_the_fresnel_integral() -> None:
 @settings(max_examples=100)
 @given(SEGMENTS)
 def test_a_centreline_is_continuous(segments: list[Segment]) -> None:
-    """Position and heading are continuous at every joint, where the curvature changes from segment to segment."""
+    """At every joint position and heading are continuous, and the curvature changes to that of the next segment."""
     line = line_of(segments)
     joint_m = FIRST_M
     for before, after in itertools.pairwise(segments):
