@@ -108,7 +108,7 @@ class Limiter:
     def _lateral_limit_rad(self, speed_mps: float, is_known: bool) -> float:
         """Return the road wheel angle at which the lateral acceleration v^2 tan(angle) / wheelbase is at its limit.
 
-        A speed that is not known counts as at least the speed limit.
+        An unknown speed is assumed to be the speed limit, or the reported speed if this is higher.
         """
         if not is_known:
             reported_mps = abs(speed_mps) if math.isfinite(speed_mps) else 0.0
@@ -121,10 +121,11 @@ class Limiter:
 def stopping_speed_limit_mps(picture_age_s: float, limits: Limits, max_acceleration_mps2: float) -> float:
     """Return the highest speed from which the car stops on the path of its last command, if no other command follows.
 
-    Since the picture was taken, the car has driven for the picture's age. It drives on for `stop_after` until the safe
-    stop begins, and then brakes. The last command may give full throttle until the vehicle is degraded, so the speed v
-    counts as w = v + `max_acceleration` x `degraded_after`. w solves w (age + `stop_after`) + w^2 / (2
-    `stop_deceleration`) = `stopping_distance_limit`; the older the picture, the lower it is.
+    The path begins where the picture was taken. From there the car has driven for the picture's age. It drives on for
+    `stop_after` until the safe stop begins, and then brakes. Until the vehicle is degraded, the last command can give
+    full throttle. So the speed v at the command can become w = v + `max_acceleration` x `degraded_after`. The car stops
+    on the path if w (age + `stop_after`) + w^2 / (2 `stop_deceleration`) is at most `stopping_distance_limit`. The older
+    the picture, the lower is the returned speed.
     """
     unguided_s = picture_age_s + limits.stop_after_ns / NS_PER_S
     braking_mps2 = limits.stop_deceleration_mps2

@@ -88,7 +88,7 @@ class VehicleSession:
         self._end_control()
 
     def raise_emergency_stop(self, number: int) -> bool:
-        """Stop the vehicle and return True. If `number` is that of a remembered stop, do nothing and return False.
+        """Stop the vehicle and return True; for the number of a remembered stop, return False and do not stop again.
 
         The order of numbers does not matter: if a stop needed a higher number than the last stop, a stop with a very
         high number would prevent all later ones.
@@ -148,9 +148,7 @@ class VehicleSession:
     def _emergency_stop(self, request: SessionRequest, _vehicle: VehicleState, _now_ns: int) -> str:
         if self.raise_emergency_stop(request.number):
             self._machine.reason = f"emergency stop by {request.who}"
-        return (
-            ""  # also for a stop that was executed already, because its client repeats the request until it is granted
-        )
+        return ""  # also for a stop that was executed already: its client repeats the request until it is granted
 
     def _clear_emergency_stop(self, request: SessionRequest, vehicle: VehicleState, _now_ns: int) -> str:
         if not self._has_control(request):
