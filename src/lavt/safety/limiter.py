@@ -124,8 +124,8 @@ def stopping_speed_limit_mps(picture_age_s: float, limits: Limits, max_accelerat
     The path begins where the picture was taken. From there the car has driven for the picture's age. It drives on for
     `stop_after` until the safe stop begins, and then brakes. Until the vehicle is degraded, the last command can give
     full throttle. So the speed v at the command can become w = v + `max_acceleration` x `degraded_after`. The car stops
-    on the path if w (age + `stop_after`) + w^2 / (2 `stop_deceleration`) is at most `stopping_distance_limit`. The older
-    the picture, the lower is the returned speed.
+    on the path if w (age + `stop_after`) + w^2 / (2 `stop_deceleration`) is at most `stopping_distance_limit`. For an
+    older picture the returned speed is lower.
     """
     unguided_s = picture_age_s + limits.stop_after_ns / NS_PER_S
     braking_mps2 = limits.stop_deceleration_mps2
