@@ -1,4 +1,4 @@
-"""Draw one sheet of the simulator's pictures: each of the three routes at two places in every light.
+"""Draw one sheet of the simulator's pictures: two places on each of the routes a, b and c, in every light.
 
 python benchmarks/contact_sheet.py [--out docs/pictures/frames.jpg]
 """
@@ -18,9 +18,10 @@ from lavt.vehicle.sim.road.road import Road, load_road
 
 MODEL = CameraModel()
 PLACES = (("a", 30.0), ("a", 205.0), ("b", 175.0), ("b", 470.0), ("c", 60.0), ("c", 230.0))
-"""Roads and stations (m) on them; the key parts are on the same roads."""
+"""Routes, and stations (m) on them."""
 
-CELL_PX = (480, 360)
+FRAME_PX = (480, 360)
+"""Width and height of a picture on the sheet."""
 LABEL_HEIGHT_PX = 22
 JPEG_QUALITY = 80
 
@@ -32,26 +33,29 @@ def render_frame(road: Road, s_m: float, light: LightName) -> Picture:
     return renderer.render(Pose(0, x_m, y_m, heading_rad), round(s_m))
 
 
-def label_cell(picture: Picture, text: str) -> Picture:
-    """Return a cell of the sheet, labelled in its corner."""
-    cell = np.asarray(cv2.resize(picture, CELL_PX, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-    cell[:LABEL_HEIGHT_PX] = cell[:LABEL_HEIGHT_PX] // 3
-    cv2.putText(cell, text, (6, LABEL_HEIGHT_PX - 6), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
-    return cell
+def reduce_and_label(picture: Picture, text: str) -> Picture:
+    """Return a picture in the size for the sheet, with a label in its upper left corner."""
+    reduced = np.asarray(cv2.resize(picture, FRAME_PX, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    reduced[:LABEL_HEIGHT_PX] = reduced[:LABEL_HEIGHT_PX] // 3
+    origin = (6, LABEL_HEIGHT_PX - 6)
+    cv2.putText(reduced, text, origin, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
+    return reduced
 
 
 def main() -> None:
-    """Write the sheet and print its size."""
+    """Write the sheet and print the size of the file."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--out", type=Path, default=Path("docs/pictures/frames.jpg"))
     out: Path = parser.parse_args().out
-    rows = []
-    for name, s_m in PLACES:
-        road = load_road(name)
-        cells = [label_cell(render_frame(road, s_m, light), f"{road.title}, {s_m:.0f} m, {light}") for light in LIGHTS]
-        rows.append(np.hstack(cells))
+    strips = []
+    for route, s_m in PLACES:
+        road = load_road(route)
+        pictures = [
+            reduce_and_label(render_frame(road, s_m, light), f"{road.title}, {s_m:.0f} m, {light}") for light in LIGHTS
+        ]
+        strips.append(np.hstack(pictures))
     out.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(out), np.vstack(rows), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    cv2.imwrite(str(out), np.vstack(strips), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     print(f"{out}: {out.stat().st_size / 1000:.0f} kB")
 
 

@@ -1,11 +1,11 @@
 """Measure the round trip of a command through two Zenoh routers, compared with raw UDP, pyzmq and CycloneDDS.
 
-The message is an encoded command. One process sends it, another one echoes it, and the first one measures the time.
-Zenoh is set up as in LAVT: with a router for each side (`lavt router` with the files of `zenoh-configs/`, linked by
+The message is an encoded command. One process sends it, a second process echoes it, and the first process measures the
+time until the echo arrives. A carrier is what carries the message: Zenoh, or one of the three compared with it. Zenoh
+is set up as in LAVT: with a router for each side (`lavt router` with the files of `zenoh-configs/`, linked by
 `udp?rel=1;mixed_rel=1`), with the quality of service of commands, and with a listening thread that passes messages to
-the node's thread. The other carriers are two sockets, or two participants, that communicate directly. All processes run
-on one machine and use its loopback, so the benchmark compares processing, not networks. All carriers take turns in each
-round.
+the node's thread. The other carriers connect the two processes directly. All processes run on one machine and use its
+loopback, so the benchmark compares processing, not networks. In each round every carrier is measured once.
 
 pyzmq and CycloneDDS are measured if they are installed: pip install pyzmq cyclonedds. LAVT does not need them.
 
@@ -39,7 +39,7 @@ from lavt.errors import LavtError, UserError, WorkError
 from lavt.experiment.runs.processes import Processes
 from lavt.runtime import process_priority
 
-FOLDER = Path(__file__).parents[1]
+REPOSITORY = Path(__file__).parents[1]
 PACE_LABELS = {"at_50_hz": "50 Hz", "back_to_back": "back to back"}
 PERCENTILES = (50, 95, 99)
 SESSION_ENDPOINT = "tcp/127.0.0.1:0"
@@ -47,14 +47,17 @@ ROUTER_LINK = "udp/127.0.0.1:{port}?rel=1;mixed_rel=1"
 MAX_OVERHEAD_S = 30.0
 """The time limit for start, discovery and end, in addition to the time of the measurement."""
 MAX_MEAN_ROUND_TRIP_S = 0.01
-"""The time limit for a message that is sent back to back."""
+"""The time limit for each message that is sent back to back, on average."""
 
 PaceResults = dict[str, dict[str, float]]
 """For each pace, the percentiles of the round trip in microseconds, and the number of lost echoes."""
 
 
 def start_routers(processes: Processes) -> tuple[str, str]:
-    """Start the vehicle's router, and the operator's, which connects to it; return their endpoints for sessions."""
+    """Start the vehicle's router, then the operator's, which connects to the vehicle's.
+
+    Returns the endpoints for sessions, the vehicle's first.
+    """
     endpoints = []
     remote_endpoint = ""
     for side, listen in (("server", [SESSION_ENDPOINT, ROUTER_LINK.format(port=0)]), ("client", [SESSION_ENDPOINT])):
@@ -71,12 +74,12 @@ def start_routers(processes: Processes) -> tuple[str, str]:
 
 def start_process(*words: str) -> subprocess.Popen[str]:
     """Start a process of `round_trip/process.py`."""
-    paths = os.pathsep.join([str(FOLDER), str(Path(lavt.__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
+    paths = os.pathsep.join([str(REPOSITORY), str(Path(lavt.__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
     return subprocess.Popen(
         [sys.executable, "-m", "benchmarks.round_trip.process", *words],
         stdout=subprocess.PIPE,
         text=True,
-        cwd=FOLDER,
+        cwd=REPOSITORY,
         env={**os.environ, "PYTHONPATH": paths},
     )
 
@@ -102,11 +105,14 @@ def run(carrier: str, routers: tuple[str, str], seconds: float, messages: int) -
     finally:
         echo.kill()
         echo.communicate()
-    return {pace: percentiles(carrier, times) for pace, times in json.loads(output).items()}
+    return {pace: percentiles(carrier, times_ns) for pace, times_ns in json.loads(output).items()}
 
 
 def percentiles(carrier: str, times_ns: Sequence[int | None]) -> dict[str, float]:
-    """Return percentiles in microseconds and the number of lost echoes; raise `WorkError` if all were lost."""
+    """Return percentiles of the round trip in microseconds and the number of lost echoes, which are None in `times_ns`.
+
+    Raise `WorkError` if all echoes were lost.
+    """
     received_ns = [time_ns for time_ns in times_ns if time_ns is not None]
     if not received_ns:
         raise WorkError(f"{carrier} lost every echo")
@@ -116,17 +122,18 @@ def percentiles(carrier: str, times_ns: Sequence[int | None]) -> dict[str, float
 
 
 def summary(rounds: Mapping[str, Sequence[PaceResults]]) -> dict[str, Any]:
-    """Return medians over the rounds by carrier and pace, with ratios to raw UDP if that was measured."""
+    """Return medians over the rounds by carrier and pace, with ratios to raw UDP if raw UDP was measured."""
     medians: dict[str, Any] = {}
-    for carrier, measured in rounds.items():
+    for carrier, carrier_rounds in rounds.items():
         medians[carrier] = {}
         for pace in PACE_LABELS:
             values = {
-                name: float(np.median([of_round[pace][name] for of_round in measured])) for name in measured[0][pace]
+                name: float(np.median([results[pace][name] for results in carrier_rounds]))
+                for name in carrier_rounds[0][pace]
             }
-            baseline = values if carrier == "udp" else medians.get("udp", {}).get(pace)
-            names = [f"p{rank}" for rank in PERCENTILES] if baseline else []
-            ratios = {f"{name}_ratio": round(values[f"{name}_us"] / baseline[f"{name}_us"], 2) for name in names}
+            udp_values = values if carrier == "udp" else medians.get("udp", {}).get(pace)
+            names = [f"p{rank}" for rank in PERCENTILES] if udp_values else []
+            ratios = {f"{name}_ratio": round(values[f"{name}_us"] / udp_values[f"{name}_us"], 2) for name in names}
             medians[carrier][pace] = {**values, **ratios}
     return medians
 
@@ -150,24 +157,24 @@ def _cell(values: Mapping[str, float]) -> str:
 
 
 def measure(carriers: Sequence[str], rounds: int, seconds: float, messages: int) -> dict[str, Any]:
-    """Measure all carriers in turns, in reverse order in every second round."""
-    measured: dict[str, list[PaceResults]] = {carrier: [] for carrier in carriers}
+    """Measure every carrier once in each round, and return the summary; every second round is in reverse order."""
+    rounds_by_carrier: dict[str, list[PaceResults]] = {carrier: [] for carrier in carriers}
     with tempfile.TemporaryDirectory() as folder, Processes(Path(folder)) as processes:
         routers = start_routers(processes)
         for number in range(rounds):
             for carrier in carriers if number % 2 == 0 else reversed(carriers):
-                times = run(carrier, routers, seconds, messages)
-                measured[carrier].append(times)
-                cells = "; ".join(f"{label} {_cell(times[pace])}" for pace, label in PACE_LABELS.items())
+                results = run(carrier, routers, seconds, messages)
+                rounds_by_carrier[carrier].append(results)
+                cells = "; ".join(f"{label} {_cell(results[pace])}" for pace, label in PACE_LABELS.items())
                 print(f"{number + 1} {carrier}: {cells}", flush=True)
-    return summary(measured)
+    return summary(rounds_by_carrier)
 
 
 def arguments(words: list[str] | None = None) -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--seconds", type=float, default=10.0, help="time at 50 Hz in each run")
+    parser.add_argument("--seconds", type=float, default=10.0, help="duration of the part at 50 Hz of each run")
     parser.add_argument("--messages", type=int, default=2000, help="number of messages back to back in each run")
     parser.add_argument("--only", action="append", choices=CARRIERS, help="a carrier; repeatable")
     options = parser.parse_args(words)
@@ -177,9 +184,9 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
 
 
 def main() -> int:
-    """Measure the selected carriers that are installed, and return the exit code: 2 if none is."""
+    """Measure the selected carriers that are installed, and return the exit code: 2 if none is installed."""
     options = arguments()
-    process_priority.raise_priority()  # as the server and the client do; the routers and both processes inherit it
+    process_priority.raise_priority()  # as the server and the client do; routers and measuring processes inherit it
     missing = [name for name, carrier in CARRIERS.items() if carrier.missing and name in (options.only or CARRIERS)]
     for name in missing:
         print(f"{name} is not measured: it is not installed (pip install {CARRIERS[name].package})", file=sys.stderr)

@@ -1,9 +1,9 @@
 """Degraded pictures with ground truth, for which perception was not designed.
 
-A picture is rendered from a place on a road. Its kind has one change: other marks on the road (`ROADS`), paint on the
-ground (`PAINT`), or a degraded picture (`DEGRADED`). Only `kerb only`, `diagonal only` and `crosswalk only` have two
-changes: paint on a road without marks. The true position of the lane's centre is computed from the road, in the
-vehicle's frame.
+A picture is rendered from a place on a road. Its kind tells what is changed: the marks on the road (`ROADS`), paint on
+the ground (`PAINT`), or the rendered picture (`DEGRADED`). Only `kerb only`, `diagonal only` and `crosswalk only` have
+two changes: paint on a road without marks. The true position of the lane's centre is computed from the road, in the
+vehicle's coordinates.
 """
 
 from __future__ import annotations
@@ -27,6 +27,8 @@ from lavt.vehicle.sim.road.road import Road, load_road
 MODEL = CameraModel()
 AHEAD_M = np.array([5.0, 10.0, 15.0])
 """Distances ahead of the rear axle at which the lane's centre is compared."""
+AT_10_M = AHEAD_M.tolist().index(10.0)
+"""Index of 10 m in `AHEAD_M`."""
 
 RIGHT_LINE_M = -1.75
 """Offset of the driven lane's right line from the lane's centre."""
@@ -49,14 +51,14 @@ class DegradedCase:
 
     kind: str
     before: Picture
-    """An earlier picture from the same place: the unchanged road."""
+    """A picture of the unchanged road from the same place."""
     picture: Picture
     centre_m: FloatArray | None
-    """y of the lane's centre at `AHEAD_M`; None if no lane is visible."""
+    """y of the lane's centre at the distances `AHEAD_M`; None if the picture has no lane."""
     lane_width_m: float
 
 
-# Changed markings on the road itself.
+# Changed marks on the road.
 
 
 def _with_marks(change: Callable[[RoadMark], RoadMark | None]) -> Callable[[Road], Road]:
@@ -84,13 +86,13 @@ NO_LANE = {
     "grey",
     "blackout",
 }
-"""Kinds of pictures in which the lane cannot be recognised."""
+"""Kinds of pictures in which no lane can be recognised."""
 
 
 # Paint on the ground.
 
 SUBPIXEL_BITS = 4
-"""OpenCV draws at integer coordinates, which have this number of fractional bits."""
+"""Number of fractional bits in the integer coordinates that are passed to OpenCV."""
 
 
 def _strip(picture: Picture, line: list[tuple[float, float]], width_m: float, colour: tuple[int, int, int]) -> None:
@@ -122,7 +124,7 @@ def old_yellow_line(picture: Picture, generator: np.random.Generator) -> Picture
 
 
 def yellow_diversion(picture: Picture, generator: np.random.Generator) -> Picture:
-    """Paint two yellow roadworks lines 3 m apart, like an ambiguous second lane that crosses the lane."""
+    """Paint two yellow roadworks lines, 3 m apart; they look like a second lane that crosses the true one."""
     y, slope = generator.uniform(-2, 2), generator.uniform(0.1, 0.25) * generator.choice([-1, 1])
     for offset in (0.0, 3.0):
         _strip(picture, [(3, y + offset), (25, y + offset + 22 * slope)], 0.12, YELLOW)
@@ -137,7 +139,7 @@ def old_white_line(picture: Picture, generator: np.random.Generator) -> Picture:
 
 
 def diagonal(picture: Picture, generator: np.random.Generator) -> Picture:
-    """Paint a bright line at 30 degrees across everything."""
+    """Paint a bright line across the road, at 30 degrees to it."""
     x, side = generator.uniform(4, 8), generator.choice([-1, 1])
     _strip(picture, [(x, -4.0 * side), (x + 14, 4.0 * side)], 0.15, WHITE)
     return picture
@@ -250,8 +252,8 @@ def _low_rate(picture: Picture, _generator: np.random.Generator) -> Picture:
     """Return the tenth frame of H.264 at 200 kbit/s, which has block artefacts."""
     encoder = Encoder(640, 480, rate_hz=30.0, bit_rate_bps=200_000, gop_frames=300)
     decoder, shown = Decoder(), picture
-    for shift in range(10):  # the picture moves like a road, because the codec would make a still one sharp
-        moved = np.roll(picture, (9 - shift) * 3, axis=0)
+    for number in range(10):  # the picture moves like a road, because the codec would make a still one sharp
+        moved = np.roll(picture, (9 - number) * 3, axis=0)
         decoded = decoder.decode(encoder.encode(moved))
         shown = decoded.picture if decoded is not None else shown
     return shown
@@ -297,7 +299,10 @@ def _renderer(route: str, marks: str) -> tuple[Road, Renderer]:
 
 
 def _truth(road: Road, s_m: float, offset_m: float, turned_rad: float) -> FloatArray:
-    """Return y of the lane's centre at `AHEAD_M` for a car at a station, with an offset from the centre and a turn."""
+    """Return y of the lane's centre at the distances `AHEAD_M`, in the car's coordinates.
+
+    The car is at the station `s_m`, `offset_m` left of the lane's centre, and turned left by `turned_rad`.
+    """
     x_m, y_m, heading_rad, _ = (float(value) for value in road.centre_at(s_m))
     heading = heading_rad + turned_rad
     place = np.array([x_m - offset_m * np.sin(heading_rad), y_m + offset_m * np.cos(heading_rad)])
@@ -310,7 +315,7 @@ def _truth(road: Road, s_m: float, offset_m: float, turned_rad: float) -> FloatA
 
 
 def cases(count: int, seed: int = 1, routes: tuple[str, ...] = ("a_key",)) -> Iterator[DegradedCase]:
-    """Yield `count` pictures of every kind from random places of random routes, reproducible by the seed."""
+    """Yield `count` pictures of every kind from random places of random routes; the seed determines all of them."""
     kinds: list[tuple[str, str, Degradation | None]] = [(kind, kind, None) for kind in ROADS]
     kinds += [(kind, "as it is", paint) for kind, paint in PAINT.items()]
     kinds += [(f"{paint.__name__} only", "all marks missing", paint) for paint in (kerb, diagonal, crosswalk)]
@@ -329,6 +334,5 @@ def cases(count: int, seed: int = 1, routes: tuple[str, ...] = ("a_key",)) -> It
             picture = before.copy() if marks == "as it is" else renderer.render(pose, number)
             if degrade is not None:
                 picture = degrade(picture, generator)
-            has_no_lane = kind in NO_LANE
-            centre_m = None if has_no_lane else _truth(road, s_m, offset_m, turned_rad)
+            centre_m = None if kind in NO_LANE else _truth(road, s_m, offset_m, turned_rad)
             yield DegradedCase(kind, before, picture, centre_m, road.lanes.widths_m[road.lanes.driven])

@@ -1,7 +1,7 @@
 """Send video over loopback for minutes and check that memory, threads and latency do not grow.
 
-The two processes are those of LAVT in `video_vs_gstreamer.py`. Memory is the resident set of each process,
-sampled twice a second. Its growth is the slope of a straight line through the samples after the first quarter.
+LAVT's two processes of `video_vs_gstreamer.py` send and receive. Memory is the resident set of each process, sampled
+twice a second. The growth of memory is the slope of a straight line through the samples after the first quarter.
 
     python benchmarks/endurance.py [--minutes 2]
 """
@@ -31,9 +31,9 @@ from lavt.runtime import process_priority
 SAMPLE_PERIOD_S = 0.5
 MEDIAN_INTERVAL_S = 10
 MAX_GROWTH_KB_PER_MINUTE = 100.0
-"""Growth up to this is the normal variation of an allocator; more would be visible after 30 minutes."""
+"""Growth up to this limit is the normal variation of an allocator."""
 MAX_GROWTH_MS = 0.5
-"""Latency has grown if it has increased by more than this and by more than a quarter."""
+"""Latency has grown if it has increased by more than this limit and by more than a quarter."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class ResourceSample:
 
 
 def sample_process(process_id: int, at_s: float) -> ResourceSample:
-    """Return a sample of a process."""
+    """Return the resources that a process uses now, with the given time."""
     lines = Path(f"/proc/{process_id}/status").read_text().splitlines()
     status = dict(line.split(":", 1) for line in lines if ":" in line)
     return ResourceSample(at_s, int(status["VmRSS"].split()[0]), int(status["Threads"]))
@@ -64,7 +64,7 @@ def growth_kb_per_minute(samples: Sequence[ResourceSample]) -> float:
 
 
 def medians_ms(latency_ms: NDArray[np.float64]) -> list[float]:
-    """Return the medians of intervals of 10 s; a shorter interval at the end is ignored unless it is the only one."""
+    """Return the median of each 10 s. A shorter rest at the end is ignored, unless the whole run is shorter."""
     frames = min(MEDIAN_INTERVAL_S * RATE_HZ, len(latency_ms))
     return [
         float(np.median(latency_ms[begin : begin + frames])) for begin in range(0, len(latency_ms) - frames + 1, frames)
@@ -78,7 +78,7 @@ def quarter_medians_ms(latency_ms: NDArray[np.float64]) -> tuple[float, float]:
 
 
 class ResourceSampler:
-    """A sampler of both processes of a run, in a thread of its own."""
+    """A thread that samples the resources of both processes of a run."""
 
     def __init__(self, seconds: float) -> None:
         self.samples: dict[str, list[ResourceSample]] = {}
@@ -120,12 +120,13 @@ def main() -> int:
     if not 0 < options.minutes <= 60:
         parser.error("--minutes must be above zero and at most 60")
     process_priority.raise_priority()  # as the server and the client do
-    sampler = ResourceSampler(options.minutes * 60)  # the run is longer than this by its warm-up
-    with tempfile.TemporaryDirectory() as name:
-        run = describe_clean_run(Path(name), SIZES[0], options.minutes * 60)
+    sampler = ResourceSampler(options.minutes * 60)  # the run takes longer, because of its warm-up
+    with tempfile.TemporaryDirectory() as folder:
+        run = describe_clean_run(Path(folder), SIZES[0], options.minutes * 60)
         render_loop(run.loop, run.width_px, run.height_px)
         outcome = measure("ours", run, when_started=sampler.start)
-    print("| process | memory MB, beginning | end | kB/min | threads, beginning | end |\n|---|---|---|---|---|---|")
+    print("| process | memory MB: after a quarter | at the end | kB/min | threads: after a quarter | at the end |")
+    print("|---|---|---|---|---|---|")
     for name, samples in sampler.samples.items():
         later_samples = without_first_quarter(samples)
         print(

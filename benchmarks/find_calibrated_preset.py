@@ -1,12 +1,12 @@
-"""Measure how the completion of drives depends on lookahead and steering limit, and compare it with the paper's.
+"""Measure how many drives are completed with each lookahead and steering limit, and compare that with the paper.
 
     python benchmarks/find_calibrated_preset.py [--repetitions 2] [--jobs N]
 
-The paper gives no gains, only how many of 30 drives were completed under each condition. For each pair of settings all
-six routes are driven in geometry fidelity, and a logistic curve is fitted to completion over injected delay. The output
-has the delay at which half of the drives are completed, the shares of completed drives, and the deviance of the
-paper's counts from these shares. The preset need not be the pair with the smallest deviance. It only has to make
-completion fall at the same delay as in the paper.
+The paper gives no gains, only how many of 30 drives were completed under each condition. For each pair of a lookahead
+and a steering limit, the program drives all six routes in geometry fidelity. It fits a logistic curve to the share of
+completed drives over the injected delay. The output has the delay at which half of the drives are completed, the shares
+of completed drives, and the deviance of the paper's counts from these shares. The preset need not be the pair with the
+smallest deviance. It only has to make the share fall at the same delay as in the paper.
 """
 
 from __future__ import annotations
@@ -56,24 +56,25 @@ def threshold_ms(counts: Counts) -> float:
 
 
 def deviance(counts: Counts) -> float:
-    """Return the deviance of the paper's counts from our shares.
+    """Return the deviance of the paper's counts from our shares; `counts` are ours.
 
-    It is twice the log-likelihood that the paper's counts lose if the paper's own shares are replaced by ours. Half a
-    completed and half a failed drive are added to ours, so that no share is 0 or 1.
+    The deviance is twice the difference between the log-likelihoods of the paper's counts with the paper's shares and
+    with our shares. Half a completed and half a failed drive are added to our counts, so that no share of ours is 0
+    or 1.
     """
     total = 0.0
     for name, paper_completed in PAPER_COMPLETED.items():
         completed, runs = counts[name]
         our_share, paper_share = (completed + 0.5) / (runs + 1), paper_completed / PAPER_RUNS
-        completed_terms = (paper_completed, paper_share, our_share)
-        failed_terms = (PAPER_RUNS - paper_completed, 1 - paper_share, 1 - our_share)
-        for number, paper_term, our_term in (completed_terms, failed_terms):
-            total += 2 * number * (math.log(paper_term) - math.log(our_term)) if number else 0.0
+        completed_drives = (paper_completed, paper_share, our_share)
+        failed_drives = (PAPER_RUNS - paper_completed, 1 - paper_share, 1 - our_share)
+        for paper_count, in_paper, in_ours in (completed_drives, failed_drives):
+            total += 2 * paper_count * (math.log(in_paper) - math.log(in_ours)) if paper_count else 0.0
     return total
 
 
 def run_grid(repetitions: int, jobs: int | None) -> dict[tuple[float, float], Counts]:
-    """Drive with all pairs of lookahead (s) and steering limit (rad), and return the counts of each pair."""
+    """Drive with all pairs of lookahead (s) and steering limit (rad), and return the counts by pair."""
     base = load_config(SweepConfig, shipped("configs/paper.yaml")).model_dump(mode="json")
     axes = {"controller.lookahead_s": list(LOOKAHEADS_S), "controller.steering_limit_rad": list(STEERING_LIMITS_RAD)}
     config = {**base, "fidelity": "geometry", "repetitions": repetitions, "axes": axes}

@@ -2,7 +2,7 @@
 
     python benchmarks/find_designed_preset.py
 
-The program makes no drives; it uses only the model of `lavt.experiment.boundary.delay_margin`.
+The program drives nothing. It only evaluates the model in `lavt.experiment.boundary.delay_margin`.
 """
 
 from __future__ import annotations
@@ -12,14 +12,18 @@ import math
 from lavt.experiment.boundary.delay_margin import LateralLoop, critical_delay_s, phase_margin_rad, smallest_lookahead_s
 
 MARGIN_RAD = math.radians(30)
-VIDEO_S = 0.062  # median with paper_wifi5, from writing a stamp to reading it
-CONTROL_S = 0.009  # median with paper_wifi5
-PROCESSING_S = 0.010  # perception, control and the way to the wheel; the model itself contains the wait for a frame
-CALIBRATED_LOOKAHEAD_S = 0.74  # of the preset `paper_calibrated`, for comparison
+VIDEO_S = 0.062
+"""Median latency of the video with `paper_wifi5`: the time between writing a stamp and reading it."""
+CONTROL_S = 0.009
+"""Median latency of the control with `paper_wifi5`."""
+PROCESSING_S = 0.010
+"""Time for perception, control and applying the command. The wait for the next frame is not in it, but in the model."""
+CALIBRATED_LOOKAHEAD_S = 0.74
+"""Lookahead of the preset `paper_calibrated`, for comparison."""
 
 
 def main() -> None:
-    """Print the lookahead, and the margins with it and with the calibrated preset."""
+    """Print the lookahead, and the margins of both presets."""
     delay_s = VIDEO_S + CONTROL_S + PROCESSING_S
     smallest_s = smallest_lookahead_s(MARGIN_RAD, delay_s)
     rounded_s = math.ceil(smallest_s * 100) / 100

@@ -3,12 +3,12 @@
     python benchmarks/fuzz.py [--inputs 10000000] [--seed 1] [--jobs 2] [--only vehicle_driven]
 
 Inputs are random noise, and valid messages and datagrams that are truncated, spliced, replayed, or changed in single
-bits or fields. They are determined by the seed. Each target is the real node with simulated time, in a process of its
-own, and gets its share of the inputs. Needs the extra `secure` (pip install 'lavt[secure]').
+bits or fields. The seed determines the inputs. A target is a real node or parser with simulated time, in a process of
+its own. Each target gets a share of the inputs. Needs the extra `secure` (pip install 'lavt[secure]').
 
-After each input the target checks its invariants: no command of a stranger is accepted, no video is sent without a
-request, no unsigned message is accepted, and every sent message can be decoded by the other side. Memory growth is the
-resident memory at the end compared with that after the first fifth of the inputs.
+After each input the target checks its invariants, for example: no command of a stranger is accepted, no video is sent
+to an address that was not validated, no unsigned message is accepted, and the other side can decode every sent message.
+Memory growth is the resident memory at the end minus the resident memory after the first fifth of the inputs.
 
 Exits with 1 if a target broke or its memory grew; the output contains the input that broke it.
 """
@@ -61,7 +61,7 @@ WARM_UP_SHARE = 0.2
 """The share of the inputs after which buffers have reached their final size."""
 
 MAX_GROWTH_KB = 4096
-"""Memory has grown if it has increased by more than this; an allocator takes and returns some pages at any time."""
+"""Memory has grown if it has increased by more than this limit. Allocators cause smaller changes at any time."""
 
 
 @dataclass(frozen=True)
@@ -74,9 +74,9 @@ class Outcome:
     rejected: int
     grown_kb: int
     summary: str
-    """The target's own summary of the run; may be empty."""
+    """The summary that the target returned; empty if it returned none."""
     failure: str
-    """The input and the error that broke the target; empty if it did not break."""
+    """The input that broke the target, and the error; empty if the target did not break."""
 
     @property
     def line(self) -> str:
@@ -105,7 +105,7 @@ def cpu_s() -> float:
 
 
 def fuzz(name: str, inputs: int, seed: int) -> Outcome:
-    """Feed inputs to one target, until all are fed or until one of them breaks the target."""
+    """Feed inputs to one target until one of them breaks it, or until `inputs` have been fed."""
     target = TARGETS[name][0](seed)
     chance = Chance(seed, name)
     channels = tuple(target.corpora)
@@ -119,7 +119,7 @@ def fuzz(name: str, inputs: int, seed: int) -> Outcome:
             data = next_input(target.corpora[channel], chance)
             target.feed(channel, data, chance)
         summary = target.finish()
-    except Exception:  # any error is a finding
+    except Exception:  # any error is reported
         failure = f"{name} broke at input {number} of seed {seed}, on {channel}: {data.hex()}\n{traceback.format_exc()}"
     took_s = cpu_s() - begin_s
     grown_kb = memory_kb() - memory_after_warm_up_kb
@@ -127,7 +127,7 @@ def fuzz(name: str, inputs: int, seed: int) -> Outcome:
 
 
 def fuzz_all(names: list[str], inputs: int, seed: int, jobs: int) -> list[Outcome]:
-    """Fuzz the named targets, each in a process of its own, and print each line as soon as it is available."""
+    """Fuzz the named targets, each in a process of its own, and print a line for each target, in the given order."""
     shares = sum(TARGETS[name][1] for name in names)
     outcomes = []
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), max_tasks_per_child=1) as pool:
@@ -154,7 +154,7 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
 
 
 def main() -> int:
-    """Fuzz, and return the exit code: 1 if a target broke or grew, 2 if a module is missing."""
+    """Fuzz, and return the exit code: 1 if a target broke or its memory grew, 2 if a Python module is missing."""
     options = arguments()
     try:
         outcomes = fuzz_all(options.only or list(TARGETS), options.inputs, options.seed, options.jobs)

@@ -2,8 +2,8 @@
 
     python benchmarks/growth_onset.py [--lookaheads 0.74,1.01,1.3] [--rates 15,30] [--speeds 6,10] [--seeds 1]
 
-The drives use geometry fidelity, the latency of the loopback, and a constant delay of the video. While the oscillation
-is measured, neither steering nor speed reaches a limit. `docs/boundary.md` has the output.
+The drives use geometry fidelity, the inherent latency `loopback`, and a constant delay of the video. As long as the
+oscillation is measured, neither steering nor speed reaches a limit. `docs/boundary.md` has the output.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from lavt.experiment.boundary.oscillation_growth import straight_growth
 from lavt.experiment.report.table_format import NOTHING
 
 MAX_DELAY_MS = 1000.0
+"""The longest added delay of the video."""
 PRECISION_MS = 0.5
 
 
@@ -37,18 +38,18 @@ def case(lookahead_s: float, rate_hz: float, speed_mps: float, seed: int) -> Run
 
 
 def onset_ms(config: RunConfig, theory_ms: float | None) -> float | None:
-    """Return the total delay at which the oscillation neither grows nor decays; None: none was found."""
-    without_added_ms = []  # the total delay minus the added delay of the video, of each drive
+    """Return the total delay at which the oscillation neither grows nor decays; None if no such delay was found."""
+    other_delays_ms = []  # of each drive: the total delay minus the added delay of the video
 
-    def growth(delay_ms: float) -> float:
-        total_ms, growth_per_s = straight_growth(with_video_delay(config, delay_ms))
-        without_added_ms.append(total_ms - delay_ms)
+    def growth(added_ms: float) -> float:
+        total_ms, growth_per_s = straight_growth(with_video_delay(config, added_ms))
+        other_delays_ms.append(total_ms - added_ms)
         return growth_per_s
 
     bracket = zero_bracket(growth, theory_ms or 0.0, MAX_DELAY_MS, PRECISION_MS)
     if bracket.low_ms is None or bracket.high_ms is None:
         return None
-    return (bracket.low_ms + bracket.high_ms) / 2 + median(without_added_ms)
+    return (bracket.low_ms + bracket.high_ms) / 2 + median(other_delays_ms)
 
 
 def table_row(

@@ -1,9 +1,10 @@
 """Measure the durations of the loop's stages and links, and write them to `configs/costs.yaml` for virtual time.
 
-The program makes real drives over the loopback without injection, with all processes, and takes medians from their
-records. The duration of each stage is in the timelines. Waking a node takes the time from a message's arrival to the
-beginning of its first stage. A link takes the time from the end of the sender's pipeline to the arrival at the
-receiver; both times are of the same clock, because all processes are on one machine.
+The program makes drives in real time over the loopback, without injection, and takes medians from their records. A
+timeline in a record has the times at which a message arrived at a node and at which each stage ended. A wait is the
+time between the arrival of a message and the beginning of the first stage. The delay of a link is the time between the
+end of the sender's pipeline and the arrival at the receiver. Both are times of the same clock, because all processes
+run on one machine.
 
     python benchmarks/measure_costs.py [--drives 3] [--out configs/costs.yaml]
 """
@@ -31,11 +32,15 @@ from lavt.recording.record import Record, read_record
 
 NS_PER_US = 1000.0
 StageSamples = dict[tuple[str, str], list[float]]
-"""Microseconds by node and stage."""
+"""Durations in microseconds by node and stage."""
 
 
 def timelines(record: Record) -> list[tuple[str, str, int, int, list[tuple[str, int]]]]:
-    """Return node, channel, stamp, arrival and stages of every timeline of a record."""
+    """Return node, channel, stamp, arrival and stage ends of every timeline of a record.
+
+    The stage ends are pairs of stage and time. The first pair is not a stage: its time is the beginning of the first
+    stage.
+    """
     table = record.table("timeline")
     columns = (
         table.texts("node"),
@@ -48,20 +53,21 @@ def timelines(record: Record) -> list[tuple[str, str, int, int, list[tuple[str, 
 
 
 def add_stages(record: Record, stages: StageSamples) -> None:
-    """Add the duration of every stage, and the time of waking a node for every message."""
+    """Add the duration of every stage, and the wait of every message."""
     for node, channel, _stamp_ns, arrived_ns, ends in timelines(record):
-        if channel != "wake":  # the first entry of `ends` is the beginning of the first stage
-            stages[node, f"wait_{channel}"].append((ends[0][1] - arrived_ns) / NS_PER_US)
+        _, first_begin_ns = ends[0]
+        if channel != "wake":
+            stages[node, f"wait_{channel}"].append((first_begin_ns - arrived_ns) / NS_PER_US)
         for (_, begin_ns), (name, end_ns) in pairwise(ends):
             stages[node, name].append((end_ns - begin_ns) / NS_PER_US)
 
 
 def add_links(server: Record, client: Record, links: dict[str, list[float]]) -> None:
-    """Add the delays of the links; frames are matched by their stamps, commands and states contain their send times."""
-    sent = {stamp_ns: ends[-1][1] for node, _, stamp_ns, _, ends in timelines(server) if node == "camera"}
+    """Add the delays of the links. Frames are matched by their stamps; commands and states contain their send times."""
+    sent_ns_by_stamp = {stamp_ns: ends[-1][1] for node, _, stamp_ns, _, ends in timelines(server) if node == "camera"}
     for node, channel, stamp_ns, arrived_ns, _ in timelines(client):
-        if node == "driver" and channel == "access_unit" and stamp_ns in sent:
-            links["video"].append((arrived_ns - sent[stamp_ns]) / NS_PER_US)
+        if node == "driver" and channel == "access_unit" and stamp_ns in sent_ns_by_stamp:
+            links["video"].append((arrived_ns - sent_ns_by_stamp[stamp_ns]) / NS_PER_US)
     admission = server.table("admission")
     links["control"] += ((admission.ints("received_wall_ns") - admission.ints("sent_wall_ns")) / NS_PER_US).tolist()
     state = client.table("state")
@@ -69,7 +75,7 @@ def add_links(server: Record, client: Record, links: dict[str, list[float]]) -> 
 
 
 def measure_costs(drives: int) -> dict[str, Any]:
-    """Make `drives` drives, and return the contents of the file of costs."""
+    """Make `drives` drives, and return the content of `configs/costs.yaml`."""
     stages: StageSamples = defaultdict(list)
     links: dict[str, list[float]] = defaultdict(list)
     loads = []
@@ -85,16 +91,16 @@ def measure_costs(drives: int) -> dict[str, Any]:
             add_stages(client, stages)
             add_links(server, client, links)
             loads.append(os.getloadavg()[0])
-    table: dict[str, dict[str, float]] = defaultdict(dict)
+    stage_us: dict[str, dict[str, float]] = defaultdict(dict)
     for (node, stage), samples in sorted(stages.items()):
-        table[node][stage] = round(median(samples), 1)
+        stage_us[node][stage] = round(median(samples), 1)
     link_us = {name: round(float(np.median(samples)), 1) for name, samples in sorted(links.items())}
     # A command's send time is read before the driver's stage `command`, so the measured delay contains this stage.
-    link_us["control"] = round(link_us["control"] - table["driver"]["command"], 1)
+    link_us["control"] = round(link_us["control"] - stage_us["driver"]["command"], 1)
     machine = f"{os.cpu_count()} cores, {platform.machine()}, load {max(loads):.1f}, {drives} drives"
     return {
         "measured_on": machine,
-        "stages_us": {node: dict(of_node) for node, of_node in table.items()},
+        "stages_us": {node: dict(durations_us) for node, durations_us in stage_us.items()},
         "links_us": link_us,
     }
 

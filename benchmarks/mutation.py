@@ -1,15 +1,15 @@
-"""Mutate the important modules, and measure the share of mutants that the quick tests catch.
+"""Mutate the most important modules, and measure the share of mutants that the quick tests catch.
 
     python benchmarks/mutation.py [--seed 16] [--count 320] [--jobs 1] [--only safety/gate.py] [--out results.jsonl]
 
-A mutant has one small change in one place, for example another comparison, another number, or a removed statement
-(`mutating/sites.py`). The places are sampled from all places of the modules in `mutating/modules.py`; the sample is
-determined by the seed and the sources. For each mutant the tests of its module run in a copy of the sources and, if
-they pass, the quick tests of its area. A mutant is caught if a test fails or if the tests take ten times as long as
-without the mutation.
+A mutant is the sources with one small change, for example another comparison, another number, or a removed statement. A
+site is a place in a source where such a change can be made (`mutating/sites.py`). The sites are sampled from all sites
+of the modules in `mutating/modules.py`. Seed and sources determine the sample. For each mutant, the tests of the
+changed module run in a copy of the sources. If they pass, the other quick tests of the module's area run. A mutant is
+caught if a test fails, or if the tests take ten times as long as without the mutation. Otherwise it survives.
 
-With --out each result is saved in a file as a line of JSON, and a later run with the same file skips mutants that are
-in it; --rerun-survivors runs its survivors again. Survivors that are equivalent or accepted are listed with their
+With --out each result is saved as a line of JSON in a file. A later run with the same file skips the mutants in the
+file. --rerun-survivors runs only the survivors in the file again. Survivors that need no test are listed with their
 reasons in `mutating/accepted.toml` and counted separately. Progress goes to standard error, the report to standard
 output.
 """
@@ -46,20 +46,20 @@ from lavt.errors import UserError
 from lavt.streams import stream
 
 MIN_LIMIT_S = 30.0
-"""The smallest time limit; other work on the machine may delay short tests by more than the factor allows."""
+"""The shortest time limit. Other work on the machine can delay short tests by more than `--timeout-factor` allows."""
 UNMUTATED_LIMIT_S = 3600.0
 """The time limit of the tests without a mutation."""
 
 
 def sites_of(modules: Sequence[str]) -> dict[str, list[Site]]:
-    """Return the current sites of the modules."""
+    """Return the sites in the current sources, by module."""
     return {module: find_sites(module, (REPOSITORY / SOURCES / module).read_text()) for module in modules}
 
 
 def sample(sites: Mapping[str, Sequence[Site]], seed: int, count: int) -> list[Mutation]:
-    """Return mutations of `count` random sites, each site equally likely.
+    """Return one mutation of each of `count` random sites, each site equally likely.
 
-    With a smaller count and the same seed, the result is the beginning of that with a larger one.
+    With the same seed, a smaller count gives the beginning of the list that a larger count gives.
     """
     all_sites = [site for module_sites in sites.values() for site in module_sites]
     order = stream(seed, "mutation sites").permutation(len(all_sites))
@@ -68,7 +68,7 @@ def sample(sites: Mapping[str, Sequence[Site]], seed: int, count: int) -> list[M
 
 
 class MutantRunner:
-    """A runner of mutants in several trees in parallel."""
+    """A runner that tests mutants in parallel, each in a tree of its own: a copy of the repository."""
 
     def __init__(self, directory: Path, jobs: int, factor: float) -> None:
         self._first = WorkTree(directory / "0", REPOSITORY)
@@ -79,7 +79,7 @@ class MutantRunner:
         self._lock = Lock()
 
     def limit_s(self, tests: tuple[str, ...], tree: WorkTree) -> float:
-        """Return the time limit of the tests with a mutant. Raise `UserError` if they fail without a mutant."""
+        """Return the time limit of the tests on a mutant. Raise `UserError` if the tests fail without a mutation."""
         with self._lock:
             if tests not in self._limits_s:
                 trial = tree.run(tests, UNMUTATED_LIMIT_S, unchanged=True)
@@ -89,7 +89,7 @@ class MutantRunner:
             return self._limits_s[tests]
 
     def run(self, mutations: Sequence[Mutation]) -> Iterator[Result]:
-        """Run all mutations, and yield each result when it is available."""
+        """Run the tests on the mutant of each mutation, and yield each result when it is available."""
         for module in sorted({mutation.module for mutation in mutations}):
             self.limit_s(own_tests(module), self._first)  # checks the tests before the first mutant
         trees: SimpleQueue[WorkTree] = SimpleQueue()
@@ -114,8 +114,9 @@ class MutantRunner:
     def _run_mutation(self, mutation: Mutation, tree: WorkTree) -> Result:
         took_s = 0.0
         own, area = own_tests(mutation.module), area_of(mutation.module)
-        for tests, timed_tests in ((own, own), (rest_of_area(mutation.module), area)):
-            trial = tree.run_mutated(mutation, tests, self.limit_s(timed_tests, tree))
+        # The limit for the rest of the area is that of the whole area, which modules of the area share.
+        for tests, limiting_tests in ((own, own), (rest_of_area(mutation.module), area)):
+            trial = tree.run_mutated(mutation, tests, self.limit_s(limiting_tests, tree))
             took_s += trial.took_s
             if not trial.passed:
                 return make_result(mutation, trial.failed_test, took_s)
@@ -127,11 +128,11 @@ def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--count", type=int, default=320, help="number of mutants")
-    parser.add_argument("--jobs", type=int, default=1, help="mutants to run in parallel")
+    parser.add_argument("--jobs", type=int, default=1, help="number of mutants that are tested in parallel")
     parser.add_argument("--only", action="append", choices=MODULES, metavar="MODULE", help="can be repeated")
-    parser.add_argument("--timeout-factor", type=float, default=10.0, help="multiple of the time without a mutation")
+    parser.add_argument("--timeout-factor", type=float, default=10.0, help="time limit / time without a mutation")
     parser.add_argument("--out", type=Path, help="file of results; mutants in it are not run again")
-    parser.add_argument("--list", action="store_true", help="print the mutants without running them")
+    parser.add_argument("--list", action="store_true", help="print the mutants without running their tests")
     parser.add_argument("--rerun-survivors", action="store_true", help="only run the survivors in --out again")
     options = parser.parse_args(argv)
     if options.count < 1 or options.jobs < 1 or not options.timeout_factor >= 1:
@@ -171,8 +172,8 @@ def measure(options: argparse.Namespace, log: Callable[[str], None]) -> str:
                 append_result(options.out, result)
             outcome_text = f"caught by {result.by}" if result.caught else "SURVIVED"
             log(f"{number} of {len(todo)}, {result.took_s:.1f} s: {describe(result)}: {outcome_text}")
-    counted = results if options.rerun_survivors else [mutation.key for mutation in selected]
-    return report([results[key] for key in counted], accepted)
+    reported_keys = results if options.rerun_survivors else [mutation.key for mutation in selected]
+    return report([results[key] for key in reported_keys], accepted)
 
 
 def main() -> int:

@@ -1,10 +1,11 @@
-"""Measure how reliable perception's confidence is and what a picture costs: the figures of docs/perception.md.
+"""Print the tables of docs/perception.md: how reliable the detected confidence is, and the CPU time of a picture.
 
     python -m benchmarks.perception_sheet [--count 25] [--picture docs/pictures/perception.jpg]
 
-The output has two tables over degraded pictures (`benchmarks/degraded.py`), one by kind of picture and one by
-confidence, and then the cost of a picture. Each picture is shown to two detectors: to a searching one, which has seen
-no picture before, and to a tracking one, which has seen the unchanged road from the same place before.
+The pictures are degraded (`benchmarks/degraded.py`). One table has a row for each kind of picture. Two more tables, one
+for each detector, have a row for each range of confidence. Each picture is shown to two detectors: to a searching one,
+which has seen no picture before, and to a tracking one, which has seen the unchanged road from the same place.
+With `--picture` the program also draws the steps of the detection.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from benchmarks.degraded import AHEAD_M, MODEL, NO_LANE, DegradedCase, cases
+from benchmarks.degraded import AHEAD_M, AT_10_M, MODEL, NO_LANE, DegradedCase, cases
 
 from lavt.control.lane_watch import LANE_CONFIDENCE
 from lavt.domain import FloatArray, Lane, Picture
@@ -33,6 +34,7 @@ CONFIDENCE_BINS = (0.0, 0.05, 0.2, 0.3, 0.4, 0.6, 0.8, 1.001)
 UNDECIDED = "yellow diversion"
 """The kind of picture whose true lane is ambiguous; it is excluded from the table by confidence."""
 PICTURED_KINDS = ("as it is", "h264 200 kbit/s", "tree shadows", "old yellow line", "glare", "coarse blocks")
+"""The kinds of pictures on the drawn sheet."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,16 +44,16 @@ class LaneVerdict:
     kind: str
     confidence: float
     error_m: FloatArray
-    """Errors of the centre at `AHEAD_M`; infinite if no lane is visible."""
+    """Errors of the lane's centre at the distances `AHEAD_M`; infinite if the picture has no lane."""
 
     @property
     def wrong(self) -> bool:
-        """Whether the lane is too far off to be followed."""
-        return bool(self.error_m[1] > ERROR_LIMIT_M)
+        """Whether the lane's centre is too far off."""
+        return bool(self.error_m[AT_10_M] > ERROR_LIMIT_M)
 
     @property
-    def believed(self) -> bool:
-        """Whether the controller would accept the lane and follow it."""
+    def accepted(self) -> bool:
+        """Whether the controller would follow the lane."""
         return self.confidence >= LANE_CONFIDENCE
 
 
@@ -63,17 +65,20 @@ def check_lane(case: DegradedCase, lane: Lane) -> LaneVerdict:
 
 
 def check_case(case: DegradedCase) -> tuple[LaneVerdict, LaneVerdict]:
-    """Return the verdicts on a picture for a searching and a tracking detector."""
+    """Show a picture to two detectors, and return the verdicts on the searching one and on the tracking one."""
     searching, tracking = LaneDetector(MODEL), LaneDetector(MODEL)
     tracking.detect(case.before)
     return check_lane(case, searching.detect(case.picture)), check_lane(case, tracking.detect(case.picture))
 
 
 def kinds_table(verdicts: Iterable[tuple[LaneVerdict, LaneVerdict]]) -> str:
-    """Return the table by kind: confidence, error, and the numbers of wrong accepted and right rejected lanes."""
+    """Return the table by kind of picture: confidence, error, and how often the acceptance of a lane was a mistake.
+
+    Each item of `verdicts` has the searching and the tracking detector's verdict on one picture.
+    """
     by_kind = defaultdict(list)
-    for pair in verdicts:
-        by_kind[pair[0].kind].append(pair)
+    for searching, tracking in verdicts:
+        by_kind[searching.kind].append((searching, tracking))
     lines = [
         "| picture | searching: confidence p5, median | searching: error at 10 m, p95 of accepted "
         "| searching: wrong and accepted | searching: right and not accepted | tracking: confidence p5, median "
@@ -82,41 +87,43 @@ def kinds_table(verdicts: Iterable[tuple[LaneVerdict, LaneVerdict]]) -> str:
     ]
     for kind, pairs in by_kind.items():
         cells = [kind + (" (no lane there)" if kind in NO_LANE else "")]
-        for is_tracking, of_detector in enumerate(zip(*pairs, strict=True)):
-            confidences = [verdict.confidence for verdict in of_detector]
-            errors_m = [verdict.error_m[1] for verdict in of_detector if verdict.believed]
+        searching_verdicts, tracking_verdicts = zip(*pairs, strict=True)
+        for detector_verdicts in (searching_verdicts, tracking_verdicts):
+            confidences = [verdict.confidence for verdict in detector_verdicts]
+            errors_m = [verdict.error_m[AT_10_M] for verdict in detector_verdicts if verdict.accepted]
             errors_m = [error_m for error_m in errors_m if np.isfinite(error_m)]
             cells.append(f"{np.percentile(confidences, 5):.2f}, {np.median(confidences):.2f}")
             cells.append(f"{np.percentile(errors_m, 95):.2f} m" if errors_m else "")
-            cells.append(str(sum(verdict.wrong and verdict.believed for verdict in of_detector)))
-            if not is_tracking:
-                cells.append(str(sum(not verdict.wrong and not verdict.believed for verdict in of_detector)))
+            cells.append(str(sum(verdict.wrong and verdict.accepted for verdict in detector_verdicts)))
+            if detector_verdicts is searching_verdicts:
+                cells.append(str(sum(not verdict.wrong and not verdict.accepted for verdict in detector_verdicts)))
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
 def reliability_table(verdicts: Iterable[LaneVerdict]) -> str:
     """Return the table by confidence: share of wrong lanes, and median and P95 of the error at each distance."""
-    decided = [verdict for verdict in verdicts if verdict.kind != UNDECIDED]
+    unambiguous = [verdict for verdict in verdicts if verdict.kind != UNDECIDED]
     heads = " | ".join(f"{ahead:.0f} m: median, p95" for ahead in AHEAD_M)
     lines = [f"| confidence | pictures | wrong | {heads} |", "|---|---|---|" + "---|" * len(AHEAD_M)]
     for low, high in pairwise(CONFIDENCE_BINS):
-        within = [verdict for verdict in decided if low <= verdict.confidence < high]
-        if not within:
+        in_bin = [verdict for verdict in unambiguous if low <= verdict.confidence < high]
+        if not in_bin:
             continue
-        errors = np.array([verdict.error_m for verdict in within])
+        errors_m = np.array([verdict.error_m for verdict in in_bin])
         cells = []
-        for column in errors.T:
-            median, p95 = np.median(column), np.percentile(column, 95, method="nearest")
-            cells.append(", ".join(f"{m:.2f} m" if np.isfinite(m) else "no lane there" for m in (median, p95)))
-        wrong = sum(verdict.wrong for verdict in within)
+        for errors_at_distance_m in errors_m.T:
+            median_m = np.median(errors_at_distance_m)
+            p95_m = np.percentile(errors_at_distance_m, 95, method="nearest")
+            cells.append(", ".join(f"{m:.2f} m" if np.isfinite(m) else "no lane there" for m in (median_m, p95_m)))
+        wrong = sum(verdict.wrong for verdict in in_bin)
         label = f"{low:.2f} to {min(high, 1):.2f}"
-        lines.append(f"| {label} | {len(within)} | {100 * wrong / len(within):.1f} % | " + " | ".join(cells) + " |")
+        lines.append(f"| {label} | {len(in_bin)} | {100 * wrong / len(in_bin):.1f} % | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
 def cost_ms(pictures: Iterable[Picture]) -> tuple[float, float]:
-    """Return the median CPU time of a picture in milliseconds, for tracking and for searching."""
+    """Return the median CPU times of a picture in milliseconds: of the tracking and of the searching detector."""
     detector = LaneDetector(MODEL)
     tracking_s: list[float] = []
     searching_s: list[float] = []
@@ -130,15 +137,15 @@ def cost_ms(pictures: Iterable[Picture]) -> tuple[float, float]:
 
 
 def draw_sheet(sheet_cases: Iterable[DegradedCase]) -> Picture:
-    """Draw the steps of the detection in a picture of each kind, one below the other with titles."""
-    rows = []
+    """Draw the steps of the detection in each picture, one picture below the other, with titles."""
+    parts = []
     for case in sheet_cases:
         detector = LaneDetector(MODEL)
         drawn = draw_panel(calibrated(MODEL), detector, case.picture)
         title = np.full((34, drawn.shape[1], 3), 90, dtype=np.uint8)
         cv2.putText(title, case.kind, (10, 25), cv2.FONT_HERSHEY_SIMPLEX, 0.8, (255, 255, 255), 2, cv2.LINE_AA)
-        rows += [title, drawn]
-    return np.vstack(rows)
+        parts += [title, drawn]
+    return np.vstack(parts)
 
 
 def main() -> None:
@@ -146,24 +153,23 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=25, help="pictures of each kind")
     parser.add_argument("--routes", nargs="+", default=["a_key"])
-    parser.add_argument("--picture", type=Path, default=None)
+    parser.add_argument("--picture", type=Path, default=None, help="file for the drawn steps of the detection")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
-    verdicts, undamaged = [], []
+    verdicts, undegraded = [], []
     first_cases: dict[str, DegradedCase] = {}
     for case in cases(arguments.count, routes=tuple(arguments.routes)):
         verdicts.append(check_case(case))
         first_cases.setdefault(case.kind, case)
         if case.kind in {"as it is", "solid lines"}:
-            undamaged.append(case.picture)
+            undegraded.append(case.picture)
     print(kinds_table(verdicts))
-    for name, number in (("searching", 0), ("tracking", 1)):
-        of_detector = [pair[number] for pair in verdicts]
-        decided_verdicts = [verdict for verdict in of_detector if verdict.kind != UNDECIDED]
-        harmful = sum(verdict.wrong and verdict.believed for verdict in decided_verdicts)
-        print(f"\n{name}: {harmful} of {len(decided_verdicts)} pictures are wrong and accepted")
-        print(f"\n{reliability_table(of_detector)}")
-    tracking_ms, searching_ms = cost_ms(undamaged)
+    for detector, detector_verdicts in zip(("searching", "tracking"), zip(*verdicts, strict=True), strict=True):
+        unambiguous = [verdict for verdict in detector_verdicts if verdict.kind != UNDECIDED]
+        harmful = sum(verdict.wrong and verdict.accepted for verdict in unambiguous)
+        print(f"\n{detector}: in {harmful} of {len(unambiguous)} pictures the lane is wrong and accepted")
+        print(f"\n{reliability_table(detector_verdicts)}")
+    tracking_ms, searching_ms = cost_ms(undegraded)
     print(f"\ncost of a picture: tracking {tracking_ms:.2f} ms, searching {searching_ms:.2f} ms of CPU time (medians)")
     if arguments.picture is not None:
         arguments.picture.parent.mkdir(parents=True, exist_ok=True)

@@ -1,7 +1,7 @@
-"""Measure the cost of rendering: CPU time of frames over whole drives, in the lane and swerving, and memory.
+"""Measure the cost of rendering: CPU time of each frame of whole drives, in the lane or swerving, and memory.
 
-A swerving car leaves its lane by 6 m to both sides and turns by 0.6 rad. The memory is the largest that the process has
-used so far, because all cases run in one process.
+A swerving car moves up to 6 m to both sides of its lane's centre and turns by up to 0.6 rad. All cases run in one
+process. So the memory of a case is the largest that this process has used until then.
 
     python benchmarks/render_times.py [--route b] [--drives 3]
 """
@@ -34,12 +34,12 @@ CASES: tuple[tuple[CameraModel, SceneryKind, LightName, bool], ...] = (
     (HD, "full", "noon", False),
     (HD, "full", "low_sun", True),
 )
-"""Camera, scenery and light, and whether the car swerves."""
+"""Camera, scenery, light, and whether the car swerves."""
 
 
 def measure_drive(road: Road, scene_renderer: Renderer, *, swerving: bool) -> FloatArray:
     """Return the CPU time of every frame of a drive at 30 km/h and 30 Hz, in milliseconds."""
-    times = []
+    times_ms = []
     for number, s_m in enumerate(np.arange(0.0, road.route_length_m, METRES_PER_FRAME)):
         phase = 2 * np.pi * s_m / SWERVE_PERIOD_M if swerving else 0.0
         x_m, y_m = road.point_at(s_m, SWERVE_M * np.sin(phase)).tolist()
@@ -47,12 +47,12 @@ def measure_drive(road: Road, scene_renderer: Renderer, *, swerving: bool) -> Fl
         pose = Pose(0, x_m, y_m, float(road.centre_at(s_m).heading_rad) + turned_rad)
         begin_s = time.process_time()
         scene_renderer.render(pose, number)
-        times.append((time.process_time() - begin_s) * 1000)
-    return np.array(times)
+        times_ms.append((time.process_time() - begin_s) * 1000)
+    return np.array(times_ms)
 
 
 def main() -> None:
-    """Print a table of medians over the drives, so that a disturbance of one drive has no effect."""
+    """Print a table. Each value is a median over the drives, so that a disturbance of one drive has no effect."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--route", default="b")
     parser.add_argument("--drives", type=int, default=3)
@@ -67,9 +67,9 @@ def main() -> None:
             scene_renderer = Renderer(road, model, seed=1, scenery=scenery, light=light)
             scene_renderer.prepare()
             prepare_s = time.process_time() - begin_s
-            times = measure_drive(road, scene_renderer, swerving=swerving)
+            times_ms = measure_drive(road, scene_renderer, swerving=swerving)
             measurements.append(
-                (prepare_s, float(np.median(times)), float(np.percentile(times, 99)), float(times.max()))
+                (prepare_s, float(np.median(times_ms)), float(np.percentile(times_ms, 99)), float(times_ms.max()))
             )
         prepare_s, median_ms, p99_ms, longest_ms = (median(column) for column in zip(*measurements, strict=True))
         peak_memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000

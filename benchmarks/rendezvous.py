@@ -1,11 +1,11 @@
-"""Measure the latency that `lavt rendezvous` adds to video packets, on the loopback of one machine.
+"""Measure the latency that `lavt rendezvous` adds to video packets on the loopback.
 
     python benchmarks/rendezvous.py [--seconds 20]
 
 A socket that has registered as the vehicle sends frames to a client's socket, 30 a second, each of 14 packets of 1216
-bytes (4 Mbit/s). Every second frame goes through the rendezvous, the others directly. The latency of a packet is the
-time from its sending to the kernel's timestamp of its arrival, so the difference between the two ways is the time that
-the rendezvous itself takes, without any network. Prints a row for each way and finally a line of JSON.
+bytes (4 Mbit/s). Every second frame goes through the rendezvous, the other frames go directly. The latency of a packet
+is the time between its sending and the kernel's timestamp of its arrival. The difference between the two ways is the
+time that the rendezvous itself takes, without any network. Prints a row for each way and finally a line of JSON.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def main() -> None:
         meter = LatencyMeter(vehicle, client, (LOOPBACK, port))
         for number in range(frames):
             meter.refresh()
-            way = ("straight", "through")[number % 2]
+            way = "straight" if number % 2 == 0 else "through"
             latencies_ns[way] += meter.send_frame(through=way == "through")
             pause(NS_PER_S // RATE_HZ - NS_PER_MS)
     latencies_us = {

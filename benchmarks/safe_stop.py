@@ -10,50 +10,53 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from itertools import groupby
-from operator import itemgetter
+from operator import attrgetter
 
 from matplotlib.figure import Figure
 from tests.safety.stops import ALLOWED_BEYOND_M, ROUTES, Curve, Stop, StopPair, stops
 
 from lavt.experiment.report.figure_style import COLOURS, new_figure
 
-CurveStops = list[StopPair]
-FOLLOWING, HOLDING = "along the path", "wheel held"
+FOLLOWED, HELD = "along the path", "wheel held"
+"""Labels of the two kinds of stops: the vehicle follows the last command's path, or keeps the steering angle."""
 
 
-def count_beyond(curve_stops: Sequence[Stop]) -> int:
+def count_beyond(stops_of_kind: Sequence[Stop]) -> int:
     """Return how many stops left the lane by more than the allowed distance."""
-    return sum(stop.beyond_m > ALLOWED_BEYOND_M for stop in curve_stops)
+    return sum(stop.beyond_m > ALLOWED_BEYOND_M for stop in stops_of_kind)
 
 
 def format_worst(stops_of_kind: Sequence[Stop]) -> str:
-    """Format how far a corner of the body got beyond the lane, and where the last command was."""
-    stop = max(stops_of_kind, key=lambda stop: stop.beyond_m)
-    return f"{stop.beyond_m:+.2f} m, at {stop.at_m:.0f} m"
+    """Format the worst stop: how far a corner of the body got beyond the lane, and where the last command came."""
+    worst = max(stops_of_kind, key=lambda stop: stop.beyond_m)
+    return f"{worst.beyond_m:+.2f} m, at {worst.at_m:.0f} m"
 
 
-def format_row(curve: Curve, curve_stops: CurveStops) -> str:
+def format_row(curve: Curve, pairs: Sequence[StopPair]) -> str:
     """Format a table row: a curve and the worst of its stops."""
     side = "left" if curve.radius_m > 0 else "right"
-    following, holding = [stop for _, stop, _ in curve_stops], [stop for _, _, stop in curve_stops]
+    followed, held = [pair.followed for pair in pairs], [pair.held for pair in pairs]
     return (
         f"| {curve.route} | {curve.from_m:.0f} to {curve.to_m:.0f} m | {side}, {abs(curve.radius_m):.0f} m "
-        f"| {len(curve_stops)} | {format_worst(following)} | {format_worst(holding)} | {count_beyond(holding)} |"
+        f"| {len(pairs)} | {format_worst(followed)} | {format_worst(held)} | {count_beyond(held)} |"
     )
 
 
-def draw(curve_stops: CurveStops) -> Figure:
-    """Plot how far each stop got beyond the lane over the position of its last command, with a panel per route."""
+def draw(pairs: Sequence[StopPair]) -> Figure:
+    """Plot for each stop how far the car got beyond the lane, over the position of its last command.
+
+    The figure has a panel for each route.
+    """
     figure = new_figure(5.0)
     axes = figure.subplots(3, 2, sharey=True).ravel()
     for axis, route in zip(axes, ROUTES, strict=True):
-        of_route = (of_curve for of_curve in curve_stops if of_curve[0].route == route)
-        for curve, of_curve in groupby(of_route, key=itemgetter(0)):
-            _, following, holding = zip(*of_curve, strict=True)
+        pairs_on_route = (pair for pair in pairs if pair.curve.route == route)
+        for curve, pairs_in_curve in groupby(pairs_on_route, key=attrgetter("curve")):
+            _, followed, held = zip(*pairs_in_curve, strict=True)
             axis.axvspan(curve.from_m, curve.to_m, color="0.92")
-            for group, name, colour in ((following, FOLLOWING, COLOURS[0]), (holding, HOLDING, COLOURS[4])):
-                at_m, beyond_m = [stop.at_m for stop in group], [stop.beyond_m for stop in group]
-                axis.plot(at_m, beyond_m, color=colour, label=name)
+            for stops_of_kind, label, colour in ((followed, FOLLOWED, COLOURS[0]), (held, HELD, COLOURS[4])):
+                at_m, beyond_m = [stop.at_m for stop in stops_of_kind], [stop.beyond_m for stop in stops_of_kind]
+                axis.plot(at_m, beyond_m, color=colour, label=label)
         axis.axhline(0.0, color="0.5", linewidth=0.8)
         axis.axhline(ALLOWED_BEYOND_M, color="black", linewidth=0.8, linestyle="--")
         axis.set_title(f"route {route}", fontsize="medium")
@@ -67,25 +70,25 @@ def draw(curve_stops: CurveStops) -> Figure:
 
 def main() -> None:
     """Compute all stops, print the tables, and draw the picture if a file is named."""
-    curve_stops = [curve_stop for route in ROUTES for curve_stop in stops(route)]
+    pairs = [pair for route in ROUTES for pair in stops(route)]
     print(
         "| route | curve | bend, radius | stops | worst along the path | worst with a constant angle | of these out |"
     )
     print("| --- | --- | --- | --- | --- | --- | --- |")
-    for curve, of_curve in groupby(curve_stops, key=itemgetter(0)):
-        print(format_row(curve, list(of_curve)))
-    following = [stop for _, stop, _ in curve_stops]
-    speeds_kmh = [stop.speed_mps * 3.6 for stop in following]
+    for curve, pairs_in_curve in groupby(pairs, key=attrgetter("curve")):
+        print(format_row(curve, list(pairs_in_curve)))
+    speeds_kmh = [pair.followed.speed_mps * 3.6 for pair in pairs]
+    covered_m = [pair.followed.covered_m for pair in pairs]
     print(f"\nlast command at {min(speeds_kmh):.1f} to {max(speeds_kmh):.1f} km/h")
-    print(f"distance from the last command to standstill: at most {max(stop.covered_m for stop in following):.1f} m")
+    print(f"distance between the last command and standstill: at most {max(covered_m):.1f} m")
     print("\n| condition | stops | worst along the path | worst with a constant angle | of these out |")
     print("| --- | --- | --- | --- | --- |")
     for condition in ("L1", "L3", "L5"):
-        _, delayed, holding = zip(*stops("a", condition), strict=True)
-        worst = f"{format_worst(delayed)} | {format_worst(holding)}"
-        print(f"| {condition} | {len(holding)} | {worst} | {count_beyond(holding)} |")
+        _, followed, held = zip(*stops("a", condition), strict=True)
+        worst = f"{format_worst(followed)} | {format_worst(held)}"
+        print(f"| {condition} | {len(held)} | {worst} | {count_beyond(held)} |")
     for picture in sys.argv[1:]:
-        draw(curve_stops).savefig(picture, dpi=110)
+        draw(pairs).savefig(picture, dpi=110)
 
 
 if __name__ == "__main__":

@@ -2,8 +2,8 @@
 
     python benchmarks/sensitivity.py [--routes a_key,b_key,c_key] [--repetitions 3] [--jobs N]
 
-The drives use geometry fidelity: the lane's true centre replaces the detector, and everything else is the whole loop.
-The latency is that of `paper_wifi5`, and the seeds are the same in every column. `docs/controllers.md` has the output.
+The drives use geometry fidelity: the lane's true centre replaces the detector, and all else is as in the whole loop.
+The inherent latency is `paper_wifi5`, and the seeds are the same in every column. `docs/controllers.md` has the output.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from lavt.experiment.runs.plan import plan_sweep
 from lavt.experiment.sweep.sweep import run_all
 
 DELAY_S = 0.081
-"""Delay at L0 with `paper_wifi5`: 62 + 9 ms, and 10 ms from frame to steering command; see find_designed_preset."""
+"""Delay at L0 with `paper_wifi5`: 62 ms of video, 9 ms of control, 10 ms of processing; see find_designed_preset.py."""
 CONDITIONS = ("L0", "L1", "L2", "L3", "L5")
-"""L4 has the same total delay as L3."""
+"""Without L4, which has the same total delay as L3."""
 
 SettingValues = Sequence[float]
 
 
 def variations(preset: Preset) -> dict[str, SettingValues]:
-    """Return the values for each setting, including the preset's own."""
+    """Return the values of each varied setting, by config key; they include the preset's value."""
     limits: dict[str, SettingValues] = (
         {"controller.lateral_limit_mps2": (2.0, 3.0, 4.5)}
         if math.isfinite(preset.lateral_limit_mps2)
@@ -47,7 +47,7 @@ def variations(preset: Preset) -> dict[str, SettingValues]:
 
 
 def loop_with(preset: Preset, key: str, value: float) -> LateralLoop:
-    """Return the theoretical loop with one setting changed; the theory does not contain limits."""
+    """Return the theoretical loop with one setting changed. A changed limit has no effect: the theory has no limits."""
     settings = {"controller.lookahead_s": preset.lookahead_s, "controller.speed_mps": preset.speed_mps, key: value}
     return LateralLoop(
         lookahead_s=settings["controller.lookahead_s"],
@@ -57,7 +57,7 @@ def loop_with(preset: Preset, key: str, value: float) -> LateralLoop:
 
 
 def run_drives(preset: str, key: str, values: SettingValues, options: argparse.Namespace) -> list[Mapping[str, Any]]:
-    """Run every value under every condition, and return the results."""
+    """Drive with every value of the setting under every condition, and return the results."""
     base = load_config(SweepConfig, shipped("configs/paper.yaml")).model_dump(mode="json")
     base["controller"]["preset"] = preset
     config = {
@@ -77,7 +77,7 @@ def run_drives(preset: str, key: str, values: SettingValues, options: argparse.N
 
 
 def format_cell(results: Sequence[Mapping[str, Any]]) -> str:
-    """Format the share of completed drives and the median of their P95."""
+    """Format the share of completed drives and the median of their P95 cross-track errors."""
     p95_m = [result["p95_m"] for result in results if result["ending"] == "completed"]
     share = f"{len(p95_m)}/{len(results)}"
     return f"{share}, {median(p95_m):.2f} m" if p95_m else share

@@ -1,17 +1,18 @@
-"""Measure how many stamps can be read from decoded pictures: at four sizes and nine bit rates, with and without loss.
+"""Measure how many stamps can be read from decoded pictures, for four sizes and nine bit rates, with and without loss.
 
     python benchmarks/stamp_reading.py [--sizes 640x480 1920x1080] [--rates-kbps 460 3200] [--frames 300] [--json]
 
-The pictures are the simulator's at 30 Hz, with its sensor noise (2.2 LSB). They show a drive of 2 s, forward and back,
-repeatedly. Encoder, packetizer, jitter buffer, depacketizer, decoder and stamp reader are LAVT's own. Packets are lost
-independently. Pictures are in doubt from a loss to the next complete keyframe. During this time a keyframe is requested
-every 100 ms, and each request is answered two frames later (a round trip of 40 ms). A frame is intact if all its
-packets arrived or were recovered.
+The simulator makes the pictures, at 30 Hz and with its sensor noise (2.2 LSB). They show a drive of 2 s, forward and
+back, repeatedly. Encoder, packetizer, jitter buffer, depacketizer, decoder and stamp reader are LAVT's. Packets are
+lost independently. After a loss, pictures are in doubt until the next complete keyframe. As long as they are, the
+receiver requests a keyframe every 100 ms. The sender makes the keyframe two frames later (a round trip of 40 ms). A
+frame is intact if all its packets arrived or were recovered.
 
-Each stamp is checked in two ways. The first is the check of LAVT's own stamps, by the RTP timestamp. The second is the
-check of a foreign sender's stamps: the timestamps have a base of their own and give the time of capture, which is up to
-4 ms before the stamp. This second check is made three times: with all pictures, with those whose stamp has only clear
-cells (clearly black or white, see `read_clear_stamp`), and with those that also are not in doubt.
+Each stamp is checked in two ways. The check "own" is for stamps of LAVT's sender: it compares the stamp with the RTP
+timestamp. The check "foreign" is for stamps of another sender, whose RTP timestamps begin at an unknown base and tell
+the time of capture, up to 4 ms before the stamp. The check "foreign" is made three times: for all pictures; for
+pictures whose stamp has only clear cells (clearly black or white, see `read_clear_stamp`); and for pictures whose stamp
+has only clear cells and that are not in doubt.
 """
 
 from __future__ import annotations
@@ -53,18 +54,18 @@ BUFFER_S = 0.1
 ROUTE, FIRST_STATION_M, SPEED_MPS, SCENE_FRAMES = "b", 150.0, 8.33, 60
 
 LINKS = ((0.0, 0), (0.01, 0), (0.01, 1), (0.05, 0), (0.05, 1), (0.05, 2))
-"""Share of packets lost, and number of repair packets for each block of a frame."""
+"""For each link, the share of packets that are lost and the number of repair packets for each block of a frame."""
 ROUND_TRIP_FRAMES = 2
 REQUEST_PAUSE_FRAMES = 3
-"""The shortest interval between two keyframe requests, as in `nodes/receiver.py`, and between two keyframes made on
-request, as in `nodes/camera.py`."""
+"""The shortest interval between two keyframe requests, as in `nodes/receiver.py`. Also the shortest interval between
+two keyframes that are made on request, as in `nodes/camera.py`."""
 
 FRAME_NS = NS_PER_S // RATE_HZ
 START_NS = 1_760_000_000_123_456_789
 STAMP_JITTER_NS = 3 * NS_PER_MS
 """The largest random delay of a stamp."""
 FOREIGN_BASE = 4_294_000_000
-"""The base of the foreign sender's RTP timestamps; they soon wrap at 2^32."""
+"""The base of the foreign sender's RTP timestamps, chosen so that they soon wrap at 2^32."""
 FOREIGN_JITTER_NS = 4 * NS_PER_MS
 """The longest time from a foreign sender's capture to its stamp."""
 
@@ -75,7 +76,7 @@ Planes = NDArray[np.uint8]
 class AcceptedStamps:
     """Statistics of the stamps that a check accepted: their number, how many were wrong, and the largest error.
 
-    A stamp is wrong if it is not exactly the one that was sent.
+    A stamp that was read is wrong if it differs from the stamp that was sent.
     """
 
     accepted: int = 0
@@ -96,6 +97,7 @@ class AcceptedStamps:
 
 
 CHECKS = ("own", "own, not in doubt", "foreign", "foreign, clear cells", "foreign, clear cells, not in doubt")
+"""The checks, each with the pictures for which it is made; without a restriction it is made for all pictures."""
 
 
 @dataclass
@@ -105,7 +107,9 @@ class LinkResult:
     size: str
     rate_kbps: int
     loss: float
+    """Share of packets that were lost."""
     repair: int
+    """Number of repair packets for each block of a frame."""
     counts: Counter[str] = field(default_factory=Counter)
     checks: dict[str, AcceptedStamps] = field(default_factory=lambda: {name: AcceptedStamps() for name in CHECKS})
 
@@ -128,7 +132,7 @@ class LinkResult:
 
 @lru_cache(maxsize=1)
 def render_scene(size: str) -> list[Planes]:
-    """Return the pictures of the drive, forward and back, in I420."""
+    """Return the pictures of the drive in I420, first forward and then back."""
     width, height = map(int, size.split("x"))
     road = load_road(ROUTE)
     renderer = Renderer(road, CameraModel(width, height), seed=1, scenery="full", light="low_sun")
@@ -143,7 +147,7 @@ def render_scene(size: str) -> list[Planes]:
 
 
 class StampedFrameSender:
-    """A sender that makes datagrams of frames, and keyframes on request."""
+    """A sender that encodes frames, makes datagrams of them, and makes keyframes on request."""
 
     def __init__(self, result: LinkResult) -> None:
         width, height = map(int, result.size.split("x"))
@@ -162,15 +166,15 @@ class StampedFrameSender:
         self.last_requested_keyframe = self.last_request = -REQUEST_PAUSE_FRAMES
 
     def request_keyframe(self, number: int) -> None:
-        """Request a keyframe after frame `number`; the request arrives after a round trip."""
+        """Request a keyframe after frame `number`. The request takes effect a round trip later."""
         if number - self.last_request >= REQUEST_PAUSE_FRAMES:
             self.last_request = number
             self.keyframe_due = number + ROUND_TRIP_FRAMES
 
     def send(self, number: int, planes: Planes, stamp_ns: int) -> list[bytes]:
         """Stamp a frame and return its datagrams."""
-        may_answer = number >= self.last_requested_keyframe + REQUEST_PAUSE_FRAMES
-        keyframe = self.keyframe_due is not None and self.keyframe_due <= number and may_answer
+        is_pause_over = number >= self.last_requested_keyframe + REQUEST_PAUSE_FRAMES
+        keyframe = self.keyframe_due is not None and self.keyframe_due <= number and is_pause_over
         if keyframe:
             self.keyframe_due, self.last_requested_keyframe = None, number
         write_stamp_i420(planes, stamp_ns)
@@ -186,10 +190,11 @@ class AccessUnitReceiver:
         self.depacketizer = Depacketizer()
 
     def receive(self, datagrams: Sequence[bytes], now_ns: int) -> tuple[int, list[AccessUnit]]:
-        """Receive the datagrams of a frame that arrived.
+        """Receive those datagrams of a frame that were not lost.
 
-        Returns the number of media packets that arrived or were recovered, and the access units that are complete or
-        given up after the hold of the jitter buffer, which is shorter than a frame.
+        Returns the number of media packets that arrived or were recovered, and the access units that are now ready: the
+        complete ones, and incomplete ones for which the jitter buffer's hold is over. The hold is shorter than the
+        interval of frames.
         """
         media_packets = 0
         ordered: Ordered = []
@@ -205,9 +210,9 @@ class AccessUnitReceiver:
 
 
 class StampStudyReader:
-    """A reader that decodes access units, reads their stamps, and compares them with the stamps that were sent.
+    """A reader that decodes access units, reads their stamps, and compares these with the stamps that were sent.
 
-    Its dictionaries have an entry for each frame, whose key is the RTP timestamp.
+    The keys of `sent_ns`, `foreign_timestamp` and `missing_packets` are the RTP timestamps of the frames.
     """
 
     def __init__(self, result: LinkResult) -> None:
@@ -220,7 +225,7 @@ class StampStudyReader:
         self.in_doubt = True
 
     def read(self, unit: AccessUnit) -> None:
-        """Decode an access unit and check its stamp in all ways."""
+        """Decode an access unit and make all checks of its stamp."""
         picture = self.decoder.decode(unit.data)
         is_undamaged = unit.complete and picture is not None and not picture.corrupt
         self.in_doubt = not is_undamaged or (self.in_doubt and not unit.keyframe)
@@ -287,24 +292,25 @@ def study_all(sizes: Sequence[str], rates_kbps: Sequence[int], frames: int, proc
     largest_first = sorted(sizes, key=lambda size: -CameraModel(*map(int, size.split("x"))).width_px)
     cases = [(size, rate, frames) for size in largest_first for rate in rates_kbps]
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-        results = [result for of_case in pool.map(study_rate, *zip(*cases, strict=True)) for result in of_case]
+        results_by_case = pool.map(study_rate, *zip(*cases, strict=True))
+        results = [result for case_results in results_by_case for result in case_results]
     return sorted(results, key=lambda result: (sizes.index(result.size), result.rate_kbps))
 
 
 def percent(share: float) -> str:
-    """Format a share with one decimal, which is the precision of a few hundred frames."""
+    """Format a share in percent, with one decimal: a few hundred frames give no higher precision."""
     return f"{100 * share:.1f} %"
 
 
 def tables(results: Sequence[LinkResult]) -> Iterator[str]:
-    """Yield the lines of a table for each picture size, and of a table of the checks over all results."""
+    """Yield the lines of one table for each picture size, and then of a table with a row for each check."""
     headers = [f"{loss:.0%} lost" + (f", {repair} repair" if repair else "") for loss, repair in LINKS[1:]]
-    for size, of_size in groupby(results, key=lambda result: result.size):
+    for size, size_results in groupby(results, key=lambda result: result.size):
         yield f"\n{size}: unread stamps without loss; with loss, intact frames that are accepted and not in doubt"
         yield "| kb/s | bit/px | unread | " + " | ".join(headers) + " |"
         yield "|---" * (3 + len(headers)) + "|"
-        for rate, of_rate in groupby(of_size, key=lambda result: result.rate_kbps):
-            loss_free, *lossy = of_rate
+        for rate, rate_results in groupby(size_results, key=lambda result: result.rate_kbps):
+            loss_free, *lossy = rate_results
             shares = " | ".join(percent(result.good_of_intact) for result in lossy)
             yield f"| {rate} | {loss_free.bit_per_px:.3f} | {percent(loss_free.unread_share)} | {shares} |"
     yield "\n| check | accepted | of these wrong | largest error |"
@@ -324,7 +330,7 @@ def totals(results: Sequence[LinkResult]) -> dict[str, AcceptedStamps]:
 
 def to_json_line(results: Sequence[LinkResult]) -> str:
     """Return all results as one line of JSON."""
-    cells = [
+    entries = [
         {
             "size": result.size, "rate_kbps": result.rate_kbps, "loss": result.loss, "repair": result.repair,
             "bit_per_px": round(result.bit_per_px, 4), "unread_share": round(result.unread_share, 4),
@@ -333,7 +339,7 @@ def to_json_line(results: Sequence[LinkResult]) -> str:
         }
         for result in results
     ]  # fmt: skip
-    return json.dumps({"cells": cells, "checks": {name: asdict(stamps) for name, stamps in totals(results).items()}})
+    return json.dumps({"cells": entries, "checks": {name: asdict(stamps) for name, stamps in totals(results).items()}})
 
 
 def main() -> None:
@@ -341,7 +347,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sizes", nargs="+", choices=SIZES, default=list(SIZES))
     parser.add_argument("--rates-kbps", nargs="+", type=int, default=list(RATES_KBPS))
-    parser.add_argument("--frames", type=int, default=300)
+    parser.add_argument("--frames", type=int, default=300, help="for each size, bit rate and link")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--json", action="store_true", help="also print all results as JSON, in the last line")
     requested = parser.parse_args()

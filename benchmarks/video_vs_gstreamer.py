@@ -1,9 +1,9 @@
-"""Compare LAVT's video path with GStreamer: latency and CPU time on a clean link, damaged pictures on an impaired link.
+"""Compare LAVT's video with GStreamer's: latency and CPU time on a clean link, undamaged frames on an impaired link.
 
-The two programs, LAVT ("ours") and GStreamer, take turns: each sends the same pictures with stamps from one process to
-another. Latency is the time from writing the stamp, just before encoding, until it has been read from the decoded luma.
-GStreamer is measured with its best settings, and in one run with its usual ones. Tables are printed as the measurement
-proceeds and, at the end, one line of JSON.
+The two programs, LAVT ("ours") and GStreamer, take turns. Each sends the same pictures with stamps from one process to
+another. Latency is the time between writing the stamp, just before encoding, and reading the stamp from the decoded
+luma. GStreamer is measured with its best settings and, in one run for each picture size, with its usual settings.
+Prints tables during the measurement, and finally one line of JSON.
 
     python benchmarks/video_vs_gstreamer.py [--pairs 5] [--seconds 15] [--frames 1800] [--quick] [--only 480p]
 """
@@ -32,7 +32,7 @@ QUICK = {"pairs": 1, "seconds": 4.0, "frames": 120}
 
 
 def parts(requested: argparse.Namespace, folder: Path) -> dict[str, Callable[[], dict[str, float]]]:
-    """Return the measurements by their names in the last line."""
+    """Return the parts of the benchmark as functions, by their names in the line of JSON."""
     clean: dict[str, Callable[[], dict[str, float]]] = {
         size.name: partial(run_clean_part, folder, size, pairs=requested.pairs, seconds=requested.seconds)
         for size in SIZES
@@ -46,7 +46,7 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--pairs", type=int, default=5, help="runs of each program on the clean link")
     parser.add_argument("--seconds", type=float, default=15.0, help="length of each run, after a warm-up of 3 s")
     parser.add_argument("--frames", type=int, default=1800, help="frames of each run on the impaired link")
-    parser.add_argument("--only", action="append", help="name of a part in the last line; may be repeated")
+    parser.add_argument("--only", action="append", help="name of a part in the line of JSON; repeatable")
     parser.add_argument("--quick", action="store_true", help="make everything as short as possible, for a trial")
     requested = parser.parse_args(arguments)
     if requested.quick:
@@ -58,19 +58,19 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
 
 
 def main() -> int:
-    """Measure the requested parts; return 2 if GStreamer is missing."""
+    """Measure the requested parts; return 2 for a user error, for example without GStreamer, 1 for another error."""
     requested = parse_arguments()
-    process_priority.raise_priority()  # as server and client do; the child processes inherit it
+    process_priority.raise_priority()  # as server and client do; the child processes inherit the priority
     try:
         load_gstreamer()
-        with tempfile.TemporaryDirectory() as name:
-            all_parts = parts(requested, Path(name))
+        with tempfile.TemporaryDirectory() as folder:
+            all_parts = parts(requested, Path(folder))
             unknown = set(requested.only or ()) - all_parts.keys()
             if unknown:
                 raise UserError(f"unknown part {', '.join(sorted(unknown))}: choose from {', '.join(all_parts)}")
             for size in SIZES:
                 print(f"rendering the pictures of {size.name}", file=sys.stderr)
-                render_loop(Path(name) / f"{size.width_px}x{size.height_px}", size.width_px, size.height_px)
+                render_loop(Path(folder) / f"{size.width_px}x{size.height_px}", size.width_px, size.height_px)
             results = {part: measure() for part, measure in all_parts.items() if part in (requested.only or all_parts)}
     except LavtError as error:
         print(error, file=sys.stderr)

@@ -2,14 +2,14 @@
 
     python benchmarks/virtual_loop.py [--settings full bare geometry] [--routes a_key] [--repetitions 5] [--limit-s 600]
 
-The program drives like `lavt run` (`plan_run`, `build_loop`, `drive`), at L0, with everything recorded. It compares the
-CPU time of this process and its children, as the operating system counts it, with the virtual time of the drive, and
-takes medians over the repetitions. Building the loop (reading the road, painting the ground, opening the codec) is not
-part of a drive and has a figure of its own; imports are not measured. The stages are timed one by one in another drive.
-Together they must not take longer than that drive.
+The program drives like `lavt run` (`plan_run`, `build_loop`, `drive`), at L0, with everything recorded. It divides the
+virtual time of the drive by the CPU time of this process and its children. It prints medians over the repetitions.
+Building the loop (reading the road, painting the ground, opening the codec) is not part of a drive and is printed
+separately. Imports are not measured. One more drive has a timer around each stage. The stages together must not take
+longer than this drive.
 
-The last line is JSON: the speed of each setting relative to real time, and two stages of the setting `full`; null where
-nothing was measured.
+The last line is JSON: the speed of each setting relative to real time, and the time of two stages with the setting
+`full`. Values that were not measured are null.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ SETTINGS = {
     "bare": ("vehicle.scenery=none", "fidelity=pixels"),
     "geometry": ("fidelity=geometry",),
 }
-"""Settings by their names, which the JSON has with `_x`: the whole loop; without scenery and codec; without pixels."""
+"""Changes of the config by setting: the whole loop; without scenery and codec; without pixels."""
 
 PARTS = {
     "render": (("camera", "capture"),),
@@ -52,10 +52,10 @@ PARTS = {
     "perception": (("driver", "perceive"),),
     "control": (("driver", "decide"), ("driver", "command")),
 }
-"""Stages of the nodes for each part; the "rest" is the simulator, packets, links, safety, records and the runtime."""
+"""Node and stage of each timed part; the rest is the simulator, packets, links, safety, records and the runtime."""
 
 JSON_KEYS = ("full_x", "bare_x", "geometry_x", "perception_ms", "render_ms")
-"""Keys of the JSON in the last line."""
+"""Keys of the JSON in the last line; `_x` means times faster than real time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +69,7 @@ class DriveCost:
 
 
 def cpu_s() -> float:
-    """Return the CPU time of this process and its ended children, user and system."""
+    """Return the user and system CPU time of this process and of its ended children."""
     process, children = resource.getrusage(resource.RUSAGE_SELF), resource.getrusage(resource.RUSAGE_CHILDREN)
     return process.ru_utime + process.ru_stime + children.ru_utime + children.ru_stime
 
@@ -77,7 +77,7 @@ def cpu_s() -> float:
 def drive_once(
     changes: Iterable[str], limit_s: float, instrument: Callable[[VirtualLoop], None] | None = None
 ) -> DriveCost:
-    """Drive one run of `configs/demo.yaml` with changes, after `instrument` has changed the loop, and measure it."""
+    """Drive one run of `configs/demo.yaml` with changes, and return its cost; `instrument` can change the loop."""
     planned = plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), changes))
     with TemporaryDirectory() as folder:
         begin_s = cpu_s()
@@ -92,9 +92,9 @@ def drive_once(
 
 
 def stages_ms(changes: Iterable[str], limit_s: float) -> dict[str, float]:
-    """Drive again with a timer around each stage; return CPU milliseconds per frame for each part and the rest.
+    """Drive with a timer around each stage; return the CPU milliseconds per frame of each part and of the rest.
 
-    Raise `WorkError` if a stage took no time, or if all stages together took longer than the drive.
+    Raise `WorkError` if a part took no time, or if all parts together took longer than the drive.
     """
     spent_s: defaultdict[tuple[str, str], float] = defaultdict(float)
 
@@ -111,27 +111,29 @@ def stages_ms(changes: Iterable[str], limit_s: float) -> dict[str, float]:
         for host in loop.runtime.hosts.values():
             for runner in host.runners.values():  # the runtime has looked up the pipelines already
                 runner.pipelines = {
-                    channel: (tuple(timed(runner.node, name, stage) for name, stage in stages), ends_ns)
+                    channel: (tuple(timed(runner.node, name, function) for name, function in stages), ends_ns)
                     for channel, (stages, ends_ns) in runner.pipelines.items()
                 }
 
     drive_cost = drive_once(changes, limit_s, instrument_stages)
-    parts = {part: 1e3 * sum(spent_s[stage] for stage in stages) / drive_cost.frames for part, stages in PARTS.items()}
-    return with_rest(parts, 1e3 * drive_cost.drive_cpu_s / drive_cost.frames)
+    parts_ms = {
+        part: 1e3 * sum(spent_s[stage] for stage in stages) / drive_cost.frames for part, stages in PARTS.items()
+    }
+    return with_rest(parts_ms, 1e3 * drive_cost.drive_cpu_s / drive_cost.frames)
 
 
-def with_rest(stages: Mapping[str, float], whole: float) -> dict[str, float]:
-    """Return the stages and the rest of the whole, all in one unit.
+def with_rest(parts_ms: Mapping[str, float], whole_ms: float) -> dict[str, float]:
+    """Return the times of the parts, and of the rest: the time of the whole minus that of all parts.
 
-    Raise `WorkError` if a stage took no time, so that it was not measured, or if all stages took more than the whole.
+    Raise `WorkError` if a part took no time, because then it was not measured, or if the rest is negative.
     """
-    unmeasured = [stage for stage, duration in stages.items() if duration <= 0]
+    unmeasured = [part for part, duration_ms in parts_ms.items() if duration_ms <= 0]
     if unmeasured:
         raise WorkError(f"{', '.join(unmeasured)} took no time: the timer is not where the work is done")
-    rest = whole - sum(stages.values())
-    if rest < 0:
-        raise WorkError(f"the stages took {sum(stages.values()):.3f} ms of a frame's {whole:.3f} ms")
-    return {**stages, "rest": rest}
+    rest_ms = whole_ms - sum(parts_ms.values())
+    if rest_ms < 0:
+        raise WorkError(f"the stages took {sum(parts_ms.values()):.3f} ms of a frame's {whole_ms:.3f} ms")
+    return {**parts_ms, "rest": rest_ms}
 
 
 def measure(names: Iterable[str], routes: Sequence[str], repetitions: int, limit_s: float) -> dict[str, float | None]:
@@ -146,20 +148,21 @@ def measure(names: Iterable[str], routes: Sequence[str], repetitions: int, limit
             speed_with_building = median(cost.simulated_s / (cost.drive_cpu_s + cost.build_cpu_s) for cost in drives)
             building_s = median(cost.build_cpu_s for cost in drives)
             frame_ms = median(1e3 * cost.drive_cpu_s / cost.frames for cost in drives)
-            stages = stages_ms(changes, limit_s)
+            parts_ms = stages_ms(changes, limit_s)
             samples[f"{name}_x"].append(speed)
             if name == "full":
-                samples["perception_ms"].append(stages["perception"])
-                samples["render_ms"].append(stages["render"])
+                samples["perception_ms"].append(parts_ms["perception"])
+                samples["render_ms"].append(parts_ms["render"])
             print(f"{name}, {route}: {drives[0].simulated_s:.1f} s simulated, {repetitions} drives")
             print(f"  {speed:.2f} times real time; with {building_s:.2f} s to build the loop {speed_with_building:.2f}")
-            parts = ", ".join(f"{stage} {ms:.3f}" for stage, ms in stages.items())
-            print(f"  a frame {frame_ms:.3f} ms; with a timer around each stage {sum(stages.values()):.3f} ms: {parts}")
+            parts = ", ".join(f"{part} {ms:.3f}" for part, ms in parts_ms.items())
+            timed_ms = sum(parts_ms.values())
+            print(f"  a frame {frame_ms:.3f} ms; with a timer around each stage {timed_ms:.3f} ms: {parts}")
     return {name: round(median(samples[name]), 3) if samples[name] else None for name in JSON_KEYS}
 
 
 def machine() -> str:
-    """Return a description of the machine and the Python build, on which the figures depend."""
+    """Return a description of the machine and the Python build, on which the results depend."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
     cpu = next((line.partition(":")[2].strip() for line in lines if "model name" in line), platform.machine())

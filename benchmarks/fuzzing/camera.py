@@ -1,4 +1,4 @@
-"""Fuzz the UDP inputs of the vehicle: RTCP feedback, path validation, and clock probes."""
+"""Make the targets for the UDP inputs of the vehicle: RTCP feedback, path validation, and clock probes."""
 
 from __future__ import annotations
 
@@ -35,15 +35,15 @@ INPUTS_PER_REPORT = 500
 """After this number of inputs the true client sends a report, so that its path stays open."""
 
 PATH_FIELDS = ((4, 1), (5, 1), (6, 8), (14, 8), (22, 16))
-"""Offset and length of the fields after the magic number in a datagram of the path validation."""
+"""Offset and length (bytes) of each field after the magic number in a datagram of the path validation."""
 RTCP_FIELDS = ((0, 1), (1, 1), (2, 2), *((offset, 4) for offset in range(4, 64, 4)))
-"""Offset and length of the fields of the RTCP header and of the 32-bit words after it."""
+"""Offset and length (bytes) of each field of the RTCP header, and of the 32-bit words after the header."""
 PROBE_FIELDS = ((0, 2), (2, 1), (3, 1), (4, 4), (8, 8), (16, 8), (24, 8), (32, 8), (40, 8))
-"""Offset and length of the fields of a clock probe (`LAYOUT`)."""
+"""Offset and length (bytes) of each field of a clock probe (`LAYOUT`)."""
 
 
 class FakeCamera:
-    """A camera and a codec for which a picture is its number."""
+    """A camera and a codec whose pictures are the frame numbers."""
 
     model = CameraModel(width_px=64, height_px=64)
     rate_hz = 30.0
@@ -53,11 +53,11 @@ class FakeCamera:
         self.limit_bps: int | None = None
 
     def capture(self, number: int, at_ns: int, _pose: Pose | None) -> CapturedFrame:
-        """Return the number as a picture."""
+        """Return a frame whose picture is its number."""
         return CapturedFrame(number, at_ns, number)
 
     def prepare(self, picture: int) -> tuple[int, int]:
-        """Return the picture unchanged, and a hash."""
+        """Return the picture unchanged, and a hash of it."""
         return picture, picture & 0xFFFFFFFF
 
     def write_stamp(self, prepared: int, _stamp_ns: int) -> int:
@@ -65,7 +65,7 @@ class FakeCamera:
         return prepared
 
     def encode(self, _stamped: int, *, keyframe: bool) -> bytes:
-        """Return an access unit of three packets, or a larger one for a keyframe."""
+        """Return an access unit of 3005 bytes, or of 6005 bytes for a keyframe."""
         return b"\x00\x00\x00\x01\x65" + bytes([7] * (6000 if keyframe else 3000))
 
     def limit_bit_rate(self, limit_bps: int | None) -> None:
@@ -82,10 +82,11 @@ STRANGERS: Sequence[tuple[str, int]] = (
     ("198.51.100.2", 4001),
     ("::1", 65_535),
 )
+"""Addresses that are not the client's."""
 
 
-def rtcp_reports() -> list[bytes]:
-    """Return RTCP datagrams of a receiver of the stream with SSRC 2."""
+def rtcp_datagrams() -> list[bytes]:
+    """Return the RTCP datagrams that a receiver of the stream with SSRC 2 sends; the first one is a report."""
     report = ReceptionReport(
         media_ssrc=2,
         highest_sequence=500,
@@ -100,8 +101,11 @@ def rtcp_reports() -> list[bytes]:
     return [*reports, picture_loss(1, 2), max_bit_rate(1, 2, 2_000_000), reports[0] + picture_loss(1, 2)]
 
 
-def old_path() -> list[bytes]:
-    """Return a hello, an answer and a challenge of an earlier session."""
+def old_path_datagrams() -> list[bytes]:
+    """Return a hello, an answer and a challenge of an earlier session.
+
+    The server answers a client's hello with a challenge, and the client's answer to the challenge opens the video path.
+    """
     client, server = PathClient(bytes(16)), PathServer(lambda: bytes(32))
     server.set_token(bytes(16))
     challenge = server.receive(client.hello(0), STRANGERS[0], START.mono_ns) or b""
@@ -109,7 +113,10 @@ def old_path() -> list[bytes]:
 
 
 def feedback(seed: int) -> Target:
-    """Make a target for the video port: video goes to the validated address only, and no reply exceeds its request."""
+    """Make a target for the vehicle's video port.
+
+    Invariants: video goes to the validated address only, and no reply is longer than its request.
+    """
     entropy, camera = SeededEntropy(seed, "feedback"), FakeCamera()
     stream = StreamSender(Packetizer(2, 0), RepairSender(3, 0))
     node = CameraNode(camera, camera, stream, PathServer(lambda: entropy.token(32)), start_ns=START.mono_ns)
@@ -118,13 +125,14 @@ def feedback(seed: int) -> Target:
     def on_send(send: Send) -> None:
         nonlocal frames, misdirected
         frames += send.channel == "frame"
-        is_video = send.channel == "rtp" and not is_path_datagram(send.payload)  # a challenge may go to any address
+        # Other datagrams on the channel `rtp` are challenges, which the node is allowed to send to any address.
+        is_video = send.channel == "rtp" and not is_path_datagram(send.payload)
         misdirected += is_video and send.peer != CLIENT_ADDRESS
 
     bench = NodeBench(node, on_send)
-    token, reports = entropy.token(16), rtcp_reports()
-    path = Corpus(old_path(), fields=PATH_FIELDS)
-    rtcp = Corpus(reports, fields=RTCP_FIELDS)
+    token, rtcp_entries = entropy.token(16), rtcp_datagrams()
+    path = Corpus(old_path_datagrams(), fields=PATH_FIELDS)
+    rtcp = Corpus(rtcp_entries, fields=RTCP_FIELDS)
     bench.deliver("video_token", token)
     inputs = 0
 
@@ -149,7 +157,7 @@ def feedback(seed: int) -> Target:
         expect(is_rtcp(data) or not sends or data in path.replays, "a stranger's hello was answered")
         bench.advance(STEP_NS)
         if inputs % INPUTS_PER_REPORT == 0:
-            bench.deliver("feedback", reports[0], CLIENT_ADDRESS)
+            bench.deliver("feedback", rtcp_entries[0], CLIENT_ADDRESS)
         expect(misdirected == 0, "video went to an address that was not validated")
 
     def rejected() -> int:
@@ -163,7 +171,7 @@ def feedback(seed: int) -> Target:
 
 
 def probe_at_vehicle(seed: int) -> Target:  # noqa: ARG001 (it uses no random numbers)
-    """Make a target for the clock probe of the vehicle: a reply is as long as its request."""
+    """Make a target for the clock probe of the vehicle. Invariant: a reply is as long as its request."""
     node = ClockSyncNode(START.mono_ns)
     bench = NodeBench(node)
     sequence = count()
@@ -183,7 +191,7 @@ def probe_at_vehicle(seed: int) -> Target:  # noqa: ARG001 (it uses no random nu
         bench.advance(STEP_NS)
 
     def finish() -> str:
-        expect(answered + node.counts["probes_rejected"] == inputs, "probes were lost")
+        expect(answered + node.counts["probes_rejected"] == inputs, "probes were neither answered nor rejected")
         return f"{answered} answered"
 
     return Target({"probe_request": corpus}, feed, lambda: node.counts["probes_rejected"], finish)

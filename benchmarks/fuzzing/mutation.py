@@ -1,4 +1,4 @@
-"""Make nearly valid inputs: valid ones with mutations that depend only on a seed."""
+"""Make inputs by mutations of valid inputs; the seed determines all of them."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ BOMBS: Final = (
     b"\xd8\xff",
     b"",
 )
-"""Prefixes that announce more data than follows, or that nest deeper than any message."""
+"""Prefixes of msgpack that are invalid, announce more data than follows, or nest deeper than any message."""
 
 Item = TypeVar("Item")
 
@@ -94,7 +94,7 @@ Item = TypeVar("Item")
 class Chance:
     """Random numbers of a named random-number stream.
 
-    They are drawn by the thousand, because drawing each one alone would take longer than parsing an input.
+    Thousands of numbers are drawn at once, because drawing each one alone would take longer than parsing an input.
     """
 
     def __init__(self, seed: int, name: str) -> None:
@@ -121,23 +121,23 @@ def _numbers(generator: np.random.Generator) -> Iterator[int]:
 
 @dataclass
 class Corpus:
-    """The valid inputs of one channel.
-
-    `fields` are the offsets and lengths (bytes) of the fields of a binary layout. `packed` inputs are msgpack arrays,
-    in which single values are replaced. `replays` are inputs that are repeated without changes.
-    """
+    """The valid inputs of one channel, from which inputs are made."""
 
     entries: Sequence[bytes]
+    """Valid inputs, which are mutated."""
     fields: Sequence[tuple[int, int]] = ()
+    """Offset and length (bytes) of each field, if the inputs have a binary layout."""
     packed: bool = False
+    """Whether the inputs are msgpack arrays, in which single values are replaced."""
     replays: deque[bytes] = field(default_factory=lambda: deque(maxlen=64))
+    """Earlier true inputs, which are repeated without changes."""
 
 
 Mutation = Callable[[bytes, Corpus, Chance], bytes]
 
 
 def next_input(corpus: Corpus, chance: Chance) -> bytes:
-    """Return the next input: noise (1 of 16 inputs), a replay (2 of 16), or a valid one with up to three mutations."""
+    """Return the next input: noise (1 of 16), a replay (2 of 16), or a valid input with up to three mutations."""
     kind = chance.below(16)
     if kind == 0:
         return chance.bytes(chance.below(MAX_NOISE_BYTES))
@@ -185,7 +185,7 @@ def _remove(data: bytes, _corpus: Corpus, chance: Chance) -> bytes:
 
 
 def _change_field(data: bytes, corpus: Corpus, chance: Chance) -> bytes:
-    """Replace the value of a field by one that is near to or far from it."""
+    """Replace the value of a field by a near or a far value."""
     offset, length = chance.choice(corpus.fields)
     if offset + length > len(data):
         return data
@@ -196,7 +196,7 @@ def _change_field(data: bytes, corpus: Corpus, chance: Chance) -> bytes:
 
 
 def _change_value(data: bytes, _corpus: Corpus, chance: Chance) -> bytes:
-    """Replace single values of a message, whose shape stays valid."""
+    """Replace one or two values of a message, without changing their number."""
     try:
         values = msgpack.unpackb(data)
         for _ in range(1 + chance.below(2)):

@@ -1,4 +1,4 @@
-"""Fuzz the inputs of the operator's side: states, replies, video datagrams, clock-probe replies and pictures."""
+"""Make the targets for the inputs of the client: states, replies, video datagrams, clock-probe replies and pictures."""
 
 from __future__ import annotations
 
@@ -63,9 +63,9 @@ STEP_NS = NS_PER_MS
 INPUTS_PER_FRAME = FRAME_NS // STEP_NS
 """After this number of inputs a true frame arrives."""
 INPUTS_PER_RESTART = 2000
-"""The client is restarted after this number of inputs, because it may have lost control."""
+"""After this number of inputs the client is restarted, so that a client that lost control is replaced."""
 FEWEST_INPUTS = 1000
-"""With fewer inputs, a target need not have sent a command or shown a picture."""
+"""After fewer inputs than this, a target need not have sent a command or shown a picture."""
 WIDTH_PX, HEIGHT_PX = 128, 96
 TOKEN = bytes(range(16))
 
@@ -93,11 +93,12 @@ def new_driver() -> DriverNode:
 
 
 def driver(seed: int, *, stops_after: int | None = None) -> Target:  # noqa: ARG001 (it uses no random numbers)
-    """Make a target for states and replies: the vehicle can decode every command and request that the driver sends.
+    """Make a target for states and replies.
 
-    With `stops_after` a person stops the vehicle after that many inputs. Without it the client is restarted repeatedly.
+    Invariant: the vehicle can decode every command and request that the driver node sends. With `stops_after` a person
+    stops the vehicle after that many inputs. Without `stops_after` the client is restarted repeatedly.
     """
-    commands = drive_commands = rejected_before_restart = 0
+    commands = drive_commands = rejected_before_restarts = 0
 
     def on_send(send: Send) -> None:
         nonlocal commands, drive_commands
@@ -126,10 +127,10 @@ def driver(seed: int, *, stops_after: int | None = None) -> Target:  # noqa: ARG
     inputs = 0
 
     def feed(channel: str, data: bytes, _chance: Chance) -> None:
-        nonlocal inputs, rejected_before_restart
+        nonlocal inputs, rejected_before_restarts
         inputs += 1
         if stops_after is None and inputs % INPUTS_PER_RESTART == 0:
-            rejected_before_restart = rejected()
+            rejected_before_restarts = rejected()
             bench.node = new_driver()
         bench.deliver(channel, data)
         bench.advance(STEP_NS)
@@ -140,7 +141,7 @@ def driver(seed: int, *, stops_after: int | None = None) -> Target:  # noqa: ARG
 
     def rejected() -> int:
         rejected_since = total(bench.node.counts, "states_unreadable", "session_replies_unreadable")
-        return rejected_before_restart + rejected_since
+        return rejected_before_restarts + rejected_since
 
     def finish() -> str:
         expect(inputs < FEWEST_INPUTS or commands > 0, "the driver sent no commands")
@@ -150,7 +151,7 @@ def driver(seed: int, *, stops_after: int | None = None) -> Target:  # noqa: ARG
 
 
 def condition_at_operator(seed: int) -> Target:  # noqa: ARG001 (it uses no random numbers)
-    """Make a target for replies to requests of a network condition: each one is reported to the driver."""
+    """Make a target for replies to requests of a network condition. Invariant: each readable reply is reported once."""
     node = InjectionClient(
         "alice",
         7,
@@ -175,7 +176,7 @@ def condition_at_operator(seed: int) -> Target:  # noqa: ARG001 (it uses no rand
         return node.counts["netem_replies_unreadable"]
 
     def finish() -> str:
-        expect(reported + rejected() == inputs, "replies were lost")
+        expect(reported + rejected() == inputs, "replies were neither reported nor rejected")
         return f"{reported} reported to the driver"
 
     corpus = Corpus([encode(NetemReply(True, "")), encode(NetemReply(False, "bob has control"))], packed=True)
@@ -183,7 +184,7 @@ def condition_at_operator(seed: int) -> Target:  # noqa: ARG001 (it uses no rand
 
 
 def units(seed: int, number: int) -> list[tuple[int, bytes]]:
-    """Return the stamps and access units of `number` small pictures of noise; every tenth is a keyframe."""
+    """Return the stamps and access units of `number` small pictures of noise; every tenth access unit is a keyframe."""
     encoder = Encoder(WIDTH_PX, HEIGHT_PX, rate_hz=30, bit_rate_bps=1_000_000, gop_frames=10)
     generator = stream(seed, "fuzz pictures")
     stamped_units = []
@@ -196,11 +197,14 @@ def units(seed: int, number: int) -> list[tuple[int, bytes]]:
 
 
 RTP_FIELDS = ((0, 1), (1, 1), (2, 2), (4, 4), (8, 4), (12, 1), (13, 1), (14, 2))
-"""Offset and length of the fields of the RTP header and of the beginning of the payload."""
+"""Offset and length (bytes) of each field of the RTP header and of the beginning of the payload."""
 
 
 def video_corpora(encoded: Sequence[bytes]) -> dict[str, Corpus]:
-    """Return media, repair and RTCP datagrams of two foreign RTP streams, one of which has the SSRC of the true one."""
+    """Return corpora of media, repair and RTCP datagrams.
+
+    The media and repair datagrams are those of two foreign RTP streams. One of these has the SSRC of the true stream.
+    """
     media, repair = [], []
     for foreign in (Packetizer(99, 5), Packetizer(77, 65_100)):
         frames = [foreign.packetize(unit, 3000 * frame) for frame, unit in enumerate(encoded)]
@@ -224,7 +228,10 @@ def video_corpora(encoded: Sequence[bytes]) -> dict[str, Corpus]:
 
 
 def video(seed: int) -> Target:
-    """Make a target for the client's video port, which also gets a true stream: the sender can decode all feedback."""
+    """Make a target for the client's video port, which also gets a true stream.
+
+    Invariant: the vehicle can decode all feedback that the client sends.
+    """
     node = ReceiverNode(JitterBuffer(), Depacketizer(), 2_000_000)
     units_sent = complete_units = inputs = frame = 0
 
@@ -243,7 +250,7 @@ def video(seed: int) -> Target:
     corpora = video_corpora(encoded[:10])
 
     def deliver_true_frame() -> None:
-        """Deliver the next frame of the true stream; every second one loses its first packet."""
+        """Deliver the next frame of the true stream; every second frame loses its first packet."""
         nonlocal frame
         datagrams = packetizer.packetize(encoded[frame % len(encoded)], frame * 3000 % 2**32)
         repair_packets = repairs.make_repair_packets(datagrams, frame % 3)
@@ -273,7 +280,7 @@ def video(seed: int) -> Target:
 
 
 def pictures(seed: int) -> Target:
-    """Make a target for the decoder: no picture is shown whose stamp contradicts the timestamp of its packets."""
+    """Make a target for the decoder. Invariant: no picture is shown if its stamp contradicts its RTP timestamp."""
     node = new_driver()
     bench = NodeBench(node)
     true_units = units(seed, 40)
@@ -303,7 +310,7 @@ def pictures(seed: int) -> Target:
 
 
 def probe_at_operator(seed: int) -> Target:  # noqa: ARG001 (it uses no random numbers)
-    """Make a target for clock-probe replies: at most one reply is accepted for each request."""
+    """Make a target for clock-probe replies. Invariant: at most one reply to each request is accepted."""
     node = ProbingClockSyncNode(START.mono_ns)
     corpus = Corpus(
         [
@@ -334,14 +341,14 @@ def probe_at_operator(seed: int) -> Target:  # noqa: ARG001 (it uses no random n
 
     def finish() -> str:
         expect(accepted <= requested, "two replies to one request were accepted")
-        expect(accepted + node.counts["probes_rejected"] == inputs, "replies were lost")
+        expect(accepted + node.counts["probes_rejected"] == inputs, "replies were neither accepted nor rejected")
         return f"{accepted} of {requested} probes answered"
 
     return Target({"probe_reply": corpus}, feed, lambda: node.counts["probes_rejected"], finish)
 
 
 def stamps(seed: int) -> Target:
-    """Make a target for stamps in luma planes of any shape: a stamp that is read has at most 64 bits."""
+    """Make a target for stamps in luma planes of any shape. Invariant: a stamp that is read has at most 64 bits."""
     generator = stream(seed, "fuzz planes")
     planes = []
     for number in range(16):

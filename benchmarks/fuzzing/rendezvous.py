@@ -1,10 +1,10 @@
-"""Fuzz the UDP inputs of the rendezvous: registrations, wrapped datagrams, and datagrams of clients."""
+"""Make the target for the UDP inputs of the rendezvous: registrations, wrapped datagrams, and datagrams of clients."""
 
 from __future__ import annotations
 
 import hmac
 
-from benchmarks.fuzzing.camera import CLIENT_ADDRESS, STRANGERS, old_path, rtcp_reports
+from benchmarks.fuzzing.camera import CLIENT_ADDRESS, STRANGERS, old_path_datagrams, rtcp_datagrams
 from benchmarks.fuzzing.mutation import Chance, Corpus
 from benchmarks.fuzzing.target import START, Target, expect, total
 
@@ -23,7 +23,7 @@ VEHICLE = ("203.0.113.2", 5600)
 
 
 class MacKey(PublicKey):
-    """A stand-in for the vehicle's key that uses a MAC, which is about 100 times faster and as hard to forge."""
+    """A stand-in for the vehicle's key. Its signature is a MAC, about 100 times faster and as hard to forge."""
 
     def __init__(self) -> None:
         pass
@@ -38,7 +38,11 @@ class MacKey(PublicKey):
 
 
 def rendezvous(_seed: int) -> Target:
-    """Make a target for the rendezvous: it sends only to the vehicle and to clients, and no stranger can register."""
+    """Make a target for the rendezvous.
+
+    Invariants: the rendezvous sends only to the vehicle and to addresses that have sent something, and no stranger can
+    register.
+    """
     key = MacKey()
     forwarder = Forwarder("vehicle-1", "video", key)
     now_ns, registered_ns = START.mono_ns, 0
@@ -52,7 +56,7 @@ def rendezvous(_seed: int) -> Target:
     wrapped = Corpus(
         [wrap(address, b"video") for address in (CLIENT_ADDRESS, VEHICLE)], fields=((4, 1), (5, 1), (6, 4), (10, 2))
     )
-    client = Corpus([*old_path(), *rtcp_reports()], fields=((0, 1), (1, 1), (4, 1), (5, 1), (6, 8)))
+    client = Corpus([*old_path_datagrams(), *rtcp_datagrams()], fields=((0, 1), (1, 1), (4, 1), (5, 1), (6, 8)))
 
     def feed(channel: str, data: bytes, chance: Chance) -> None:
         nonlocal now_ns, registered_ns
@@ -66,12 +70,14 @@ def rendezvous(_seed: int) -> Target:
             VEHICLE if channel == "wrapped" and chance.below(2) else chance.choice((CLIENT_ADDRESS, *STRANGERS[:3]))
         )
         forwarded = forwarder.receive(data, sender, now_ns)
-        if forwarded is not None and sender != VEHICLE:
-            expect(forwarded[1] == VEHICLE, "a stranger's datagram went to a third party")
-            expect(unwrap(forwarded[0]) == (sender, data), "the vehicle got another datagram than was sent")
-            clients_seen.add(sender)
-        elif forwarded is not None:
-            expect(forwarded[1] in clients_seen, "a datagram went to an address that never sent one")
+        if forwarded is not None:
+            datagram, receiver = forwarded
+            if sender == VEHICLE:
+                expect(receiver in clients_seen, "a datagram went to an address that never sent one")
+            else:
+                expect(receiver == VEHICLE, "a stranger's datagram went to a third party")
+                expect(unwrap(datagram) == (sender, data), "the vehicle got another datagram than was sent")
+                clients_seen.add(sender)
         expect(forwarder.vehicle_address(now_ns) == VEHICLE, "a stranger has registered as the vehicle")
         clients = forwarder._clients
         expect(max(len(clients._answered), len(clients._unanswered)) <= MAX_CLIENTS, "clients are never forgotten")

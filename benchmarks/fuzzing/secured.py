@@ -1,7 +1,7 @@
-"""Fuzz the gateways of signed messages and the ciphers of the video.
+"""Make the targets for the gateways of signed messages and for the ciphers of the video.
 
-The authentic messages are known here, so any other accepted message is an error. Needs the extra `secure`. Keys follow
-from the seed, but nonces and key agreements do not, so the inputs are not byte-for-byte reproducible.
+Each target knows all authentic messages, so any other accepted message is an error. Needs the extra `secure`. The seed
+determines the keys, but not nonces and key agreements. So the inputs are not byte-for-byte reproducible.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections import deque
 from functools import partial
 from typing import Any
 
-from benchmarks.fuzzing.camera import CLIENT_ADDRESS, INPUTS_PER_REPORT, FakeCamera, rtcp_reports
+from benchmarks.fuzzing.camera import CLIENT_ADDRESS, INPUTS_PER_REPORT, FakeCamera, rtcp_datagrams
 from benchmarks.fuzzing.mutation import Chance, Corpus
 from benchmarks.fuzzing.operator_side import INPUTS_PER_FRAME, STEP_NS, TOKEN, units, video_corpora
 from benchmarks.fuzzing.target import START, NodeBench, Target, expect, total
@@ -35,12 +35,12 @@ from lavt.transport.video.path_validation import PathClient, PathServer, is_path
 from lavt.transport.video.stream_sender import StreamSender
 
 GATEWAY_STEP_NS = 4 * NS_PER_MS
-"""Time between two inputs; with less, the rate limiters would reject most inputs unread."""
+"""Time between two inputs; with a shorter time, the rate limiters would reject most inputs unread."""
 INPUTS_PER_MESSAGE = 20
 """After this number of inputs the operator sends a true command, or the vehicle a true state."""
 EPOCH = 2**63 + 7
 EVERY_THIRD_BYTE = tuple((offset, 1) for offset in range(0, 400, 3))
-"""Fields to mutate (offset, length). A third of the bytes is enough, because a signature covers all bytes alike."""
+"""Offset and length of the mutated fields. Every third byte is enough, because a signature covers all bytes alike."""
 ACQUIRE = encode(SessionRequest("acquire", "alice", 5, 0))
 GRANTED = encode(SessionReply(True, "", EPOCH, TOKEN, 5600, "kernel", 0))
 
@@ -55,9 +55,11 @@ def keys(seed: int) -> tuple[PrivateKey, PrivateKey]:
 
 
 def gateway_of_vehicle(seed: int) -> Target:
-    """Make a target for the vehicle's gateway: it accepts only commands that the operator signed, and no old request.
+    """Make a target for the vehicle's gateway.
 
-    A repeated command passes the gateway, and only the command gate, which is not part of this target, rejects it.
+    Invariants: the gateway accepts only commands that the operator signed, and no request. (A stranger's request is
+    unsigned, forged or replayed.) The gateway accepts a replayed command, too: only the command gate rejects it, and
+    that is not part of this target.
     """
     vehicle_key, operator_key = keys(seed)
     delivered: list[tuple[str, bytes]] = []
@@ -97,9 +99,8 @@ def gateway_of_vehicle(seed: int) -> Target:
         "session": Corpus([exchange(ACQUIRE, GRANTED), exchange(ACQUIRE, GRANTED)], fields=EVERY_THIRD_BYTE),
         "control": Corpus([command() for _ in range(4)], fields=EVERY_THIRD_BYTE),
     }
-    corpus_bodies = frozenset(
-        signed_bodies
-    )  # always replayable; of later commands, only the newest (`signed_bodies`) are
+    # The corpus's commands can come at any time. Of later commands, only the newest 256 are kept in `signed_bodies`.
+    corpus_bodies = frozenset(signed_bodies)
     inputs = 0
 
     def feed(channel: str, data: bytes, _chance: Chance) -> None:
@@ -124,7 +125,10 @@ def gateway_of_vehicle(seed: int) -> Target:
 
 
 def gateway_of_operator(seed: int) -> Target:
-    """Make a target for the operator's gateway: it accepts the vehicle's states and replies only, and each once."""
+    """Make a target for the operator's gateway.
+
+    Invariant: the gateway accepts only states and replies of the vehicle, and each of them once.
+    """
     vehicle_key, operator_key = keys(seed)
     vehicle = VehicleAuthenticator("car", vehicle_key, {"alice": operator_key.public})
     delivered: list[bytes] = []
@@ -185,7 +189,7 @@ def gateway_of_operator(seed: int) -> Target:
 
 
 def encrypted_video(seed: int) -> Target:
-    """Make a target for SRTP at the client's video port: only packets that the server has sent are accepted."""
+    """Make a target for SRTP at the client's video port. Invariant: only packets that the server sent are accepted."""
     node = ReceiverNode(JitterBuffer(), Depacketizer(), 2_000_000, partial(SrtpCipher, "client"))
     server = PathServer(lambda: bytes(32), partial(SrtpCipher, "server"))
     server.set_token(TOKEN)
@@ -247,7 +251,10 @@ def encrypted_video(seed: int) -> Target:
 
 
 def encrypted_feedback(seed: int) -> Target:
-    """Make a target for SRTCP from the client's address at the vehicle's video port: only true reports count."""
+    """Make a target for SRTCP at the vehicle's video port, where all inputs come from the client's address.
+
+    Invariant: no keyframe is made without a true request.
+    """
     entropy, camera = SeededEntropy(seed, "feedback"), FakeCamera()
     path = PathServer(lambda: entropy.token(32), partial(SrtpCipher, "server"))
     node = CameraNode(camera, camera, StreamSender(Packetizer(2, 0), RepairSender(3, 0)), path, start_ns=START.mono_ns)
@@ -259,7 +266,7 @@ def encrypted_feedback(seed: int) -> Target:
     [packet] = Packetizer(77, 0).packetize(b"\0\0\1\x65", 0)
     # The first packet shows the client which of its candidate keys the server uses.
     client.unprotect(path.cipher.protect(packet))
-    report, keyframe_request = rtcp_reports()[0], picture_loss(1, 2)
+    report, keyframe_request = rtcp_datagrams()[0], picture_loss(1, 2)
     corpus = Corpus(
         [client.protect_rtcp(plain) for plain in (report, keyframe_request, report)],
         fields=tuple((offset, 1) for offset in range(96)),

@@ -1,4 +1,4 @@
-"""Fuzz targets, and a bench that runs a node in simulated time and checks invariants."""
+"""The form of a fuzz target, and a bench that runs a node in simulated time."""
 
 from __future__ import annotations
 
@@ -17,18 +17,17 @@ START = Now(1_000 * NS_PER_S, 1_790_000_000 * NS_PER_S)
 
 
 class InvariantViolation(Exception):
-    """An input led to something that no input may lead to."""
+    """An input broke an invariant: a condition that must be true after every input."""
 
 
 @dataclass
 class Target:
-    """A parser, or a node with its parsers, and its corpora by channel.
-
-    `feed` takes one input and raises `InvariantViolation`; any other error is the parser's.
-    """
+    """A parser, or a node with its parsers, and the corpora from which its inputs are made."""
 
     corpora: Mapping[str, Corpus]
+    """The corpora by channel."""
     feed: Callable[[str, bytes, Chance], None]
+    """Delivers one input on a channel, and checks the invariants; any error but `InvariantViolation` is a parser's."""
     rejected: Callable[[], int]
     """Returns the number of rejected inputs."""
     finish: Callable[[], str] = field(default=lambda: "")
@@ -36,7 +35,7 @@ class Target:
 
 
 class NodeBench:
-    """A node with both clocks of its host; `on_send` is called with each message that the node sends."""
+    """A node in simulated time; `on_send` is called with each message that the node sends."""
 
     def __init__(self, node: Node, on_send: Callable[[Send], None] = lambda _send: None) -> None:
         self.node = node
@@ -44,7 +43,7 @@ class NodeBench:
         self._on_send = on_send
 
     def deliver(self, channel: str, payload: Any, peer: Any = None) -> list[Send]:
-        """Run a message through the node and return the messages that it sends."""
+        """Deliver a message to the node and return the messages that the node sends."""
         message = Message(channel, payload, self.now, peer)
         stages = self.node.pipelines[channel]
         sends = run_stages(self.node.name, stages, message, self.now, repeat(self.now)).sends
@@ -70,10 +69,10 @@ def expect(condition: bool, violation: str) -> None:
 
 
 def payloads_on(sends: Iterable[Send], channel: str) -> list[Any]:
-    """Return the payloads on one channel."""
+    """Return the payloads that were sent on a channel."""
     return [send.payload for send in sends if send.channel == channel]
 
 
 def total(counts: Mapping[str, int], *prefixes: str) -> int:
-    """Return the sum of the counters whose names have one of the prefixes."""
+    """Return the sum of the counters whose names begin with one of the prefixes."""
     return sum(count for name, count in counts.items() if name.startswith(prefixes))

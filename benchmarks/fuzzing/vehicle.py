@@ -1,4 +1,4 @@
-"""Fuzz the inputs of the vehicle's side: commands, session requests and netem requests."""
+"""Make the targets for the messages to the vehicle: commands, session requests and netem requests."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ STEP_NS = NS_PER_MS
 INPUTS_PER_FRAME = NS_PER_S // 30 // STEP_NS
 """After this number of inputs the camera writes a frame, if nobody drives the vehicle."""
 INPUTS_PER_COMMAND = 20
-"""After this number of inputs the true operator sends a command made from a new frame."""
+"""After this number of inputs the operator, who is not a stranger, sends a command made from a new frame."""
 STRAIGHT = (0.0,) * 10
 CAPABILITIES = Capabilities(
     simulated=True,
@@ -108,7 +108,7 @@ class VehicleSide:
         self.bench = NodeBench(self.node)
         self._epoch = self._sequence = self._frame = self.stamp_ns = 0
         self.control = Corpus(old_commands(), packed=True)
-        self.session = Corpus(requests(), packed=True)
+        self.session = Corpus(strangers_requests(), packed=True)
 
     def write_frame(self) -> None:
         """Write the stamp of a new frame, as the camera does."""
@@ -126,7 +126,7 @@ class VehicleSide:
         return reply
 
     def send_command(self) -> None:
-        """Send the operator's next command, which others may replay."""
+        """Send the operator's next command, and add it to the replays of the corpus."""
         self.write_frame()
         if self.gate.state not in ("arming", "driving", "degraded"):
             reply = self.request("acquire")
@@ -153,7 +153,7 @@ class VehicleSide:
         self.bench.deliver("control", payload)
 
     def arm(self) -> None:
-        """Arm the vehicle without other inputs; repeat the request while the vehicle is reserved for somebody else."""
+        """Arm the vehicle as the operator; before, wait for the end of a reservation for a stranger."""
         for _ in range(3000):
             self.bench.advance(20 * NS_PER_MS)
             self.send_command()
@@ -174,7 +174,7 @@ def old_commands() -> list[bytes]:
     ]
 
 
-def requests() -> list[bytes]:
+def strangers_requests() -> list[bytes]:
     """Return session requests of a stranger."""
     start_ns = START.wall_ns
     return [
@@ -190,7 +190,7 @@ def requests() -> list[bytes]:
 
 
 def _feed(side: VehicleSide, channel: str, data: bytes) -> list[Send]:
-    """Deliver a stranger's input; check that no command is accepted and that replies can be decoded."""
+    """Deliver a stranger's input; check that no command is accepted and that the replies can be decoded."""
     sends = side.bench.deliver(channel, data, 2)
     for admission in payloads_on(sends, "admission"):
         expect(admission.verdict == "rejected", "a stranger's command was accepted")
@@ -204,8 +204,8 @@ def _check_counts(side: VehicleSide, delivered: dict[str, int]) -> None:
     counts = side.node.counts
     commands = counts.get("commands_unreadable", 0) + total(counts, "rejected: ")
     expect(commands == delivered["control"], f"{delivered['control']} commands were delivered, {commands} counted")
-    queries = counts.get("session_requests_unreadable", 0) + total(counts, "session ")
-    expect(queries == delivered["session"], f"{delivered['session']} queries were delivered, {queries} counted")
+    requests = counts.get("session_requests_unreadable", 0) + total(counts, "session ")
+    expect(requests == delivered["session"], f"{delivered['session']} requests were delivered, {requests} counted")
 
 
 def _rejected(side: VehicleSide) -> int:
@@ -216,7 +216,7 @@ def _rejected(side: VehicleSide) -> int:
 
 
 def vehicle_at_rest(seed: int) -> Target:
-    """Make a target for a vehicle without an operator: it brakes and is never armed by strangers."""
+    """Make a target for a vehicle without an operator. Invariants: the vehicle brakes, and strangers cannot arm it."""
     side = VehicleSide(seed)
     delivered = {"control": 0, "session": 0}
 
@@ -238,9 +238,9 @@ def vehicle_at_rest(seed: int) -> Target:
 
 
 def vehicle_driven(seed: int) -> Target:
-    """Make a target for a driven vehicle: no command of a stranger, nor a replayed one, is accepted.
+    """Make a target for a driven vehicle. Invariant: no command of a stranger and no replayed command is accepted.
 
-    Anybody may stop the vehicle. Without signatures anybody may also take control of it after an emergency stop and
+    Anybody can stop the vehicle. Without signatures anybody can also take control of it after an emergency stop, and
     clear the stop. The operator then takes control again and arms the vehicle.
     """
     side = VehicleSide(seed)
@@ -276,12 +276,12 @@ def vehicle_driven(seed: int) -> Target:
         {"control": side.control, "session": side.session},
         feed,
         lambda: _rejected(side),
-        lambda: f"{inputs_while_driving / inputs:.0%} of the inputs while driving",
+        lambda: f"{inputs_while_driving / inputs:.0%} of the inputs in the state driving",
     )
 
 
 def condition_at_vehicle(seed: int) -> Target:  # noqa: ARG001 (it uses no random numbers)
-    """Make a target for requests of a network condition: only conditions that netem supports are granted."""
+    """Make a target for requests of a network condition. Invariant: netem supports each condition that is injected."""
     node = InjectionNode(allowed=True, simulated=True, video_port=5600, control=("udp", 7448))
     newest = 0
 
@@ -307,7 +307,7 @@ def condition_at_vehicle(seed: int) -> Target:  # noqa: ARG001 (it uses no rando
         inputs += 1
         bench.deliver(channel, data, inputs)
         bench.advance(STEP_NS * chance.below(20))
-        if inputs % 500 == 0:  # netem is slow: until then a request for another condition gets no reply
+        if inputs % 500 == 0:  # netem is slow: before its result, a request for another condition gets no reply
             reason = "" if chance.below(4) else "there is no such interface"
             bench.deliver("injected", InjectionResult(newest, reason, "", (("video", 150.2),)))
 
@@ -316,7 +316,7 @@ def condition_at_vehicle(seed: int) -> Target:  # noqa: ARG001 (it uses no rando
 
     def finish() -> str:
         answered = rejected() + node.counts["netem granted"]
-        expect(answered == inputs, f"{inputs} queries were delivered, {answered} counted")
+        expect(answered == inputs, f"{inputs} requests were delivered, {answered} counted")
         return f"{node.counts['netem granted']} granted"
 
     return Target({"netem": corpus}, feed, rejected, finish)

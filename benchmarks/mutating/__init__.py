@@ -1,1 +1,1 @@
-"""The parts of `benchmarks/mutation.py`: the sites of mutations, the trials of mutants, and the report."""
+"""The parts of `benchmarks/mutation.py`: sites where sources can be mutated, trials of mutants, and the report."""

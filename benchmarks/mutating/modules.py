@@ -1,4 +1,4 @@
-"""The modules to mutate, and their tests."""
+"""The modules that are mutated, and their tests."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ MODULES: Final[dict[str, tuple[str, ...]]] = {
     f"{_DBW}/traffic.py": (f"{_DBW}/test_traffic.py",),
     f"{_DBW}/vehicle.py": (f"{_DBW}/test_vehicle.py", *_ADAPTER, "assembly/test_assembly_by_wire.py"),
 }
-"""The test files of each module, the most specific ones first; paths are below `src/lavt` and `tests`."""
+"""For each module, its own tests, the most specific ones first; relative paths in `src/lavt` and in `tests`."""
 
 AREAS: Final[dict[str, tuple[str, ...]]] = {
     "safety": ("safety", "nodes", "test_life_of_a_frame.py"),
@@ -113,24 +113,24 @@ AREAS: Final[dict[str, tuple[str, ...]]] = {
         "experiment/report",
         "experiment/runs/test_join.py",
         "experiment/runs/test_plan.py",
-    ),  # these tests analyse records; the others make drives
+    ),  # these tests analyse records; the other tests of `experiment` make drives
     _DBW: (_DBW, "assembly/test_assembly_by_wire.py"),
 }
-"""The tests of each folder of modules, which run if the tests of the mutated module pass; paths are below `tests`."""
+"""For each area (a folder of modules), the tests that run if a mutated module's own tests pass; paths in `tests`."""
 
 
 def own_tests(module: str) -> tuple[str, ...]:
-    """Return the paths of a module's own tests, from the repository's top."""
+    """Return the paths of a module's own tests, relative to the repository."""
     return tuple(f"tests/{path}" for path in MODULES[module])
 
 
 def area_of(module: str) -> tuple[str, ...]:
-    """Return the paths of the tests of a module's area, from the repository's top."""
+    """Return the paths of the tests of a module's area, relative to the repository."""
     folder = next(folder for folder in sorted(AREAS, key=len, reverse=True) if module.startswith(f"{folder}/"))
     return tuple(f"tests/{path}" for path in AREAS[folder])
 
 
 def rest_of_area(module: str) -> tuple[str, ...]:
-    """Return pytest's arguments for the tests of the area without the module's own."""
+    """Return pytest's arguments for the tests of the module's area without the module's own tests."""
     own = own_tests(module)
     return *(path for path in area_of(module) if path not in own), *(f"--ignore={path}" for path in own)

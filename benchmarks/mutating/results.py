@@ -30,12 +30,12 @@ _FIELD_TYPES: Final[dict[str, type | tuple[type, ...]]] = {
 }
 
 Place = tuple[str, str, str, str]
-"""Module, function, line and mutated line."""
+"""Module, function, line and mutated line; the same line can occur more than once in a function."""
 
 
 @dataclass(frozen=True)
 class Result:
-    """The result of one mutant."""
+    """The result of one mutant; the first seven fields are those of its `Mutation`."""
 
     module: str
     function: str
@@ -46,7 +46,7 @@ class Result:
     operator: str
     caught: bool
     by: str
-    """The first test that failed, `timeout`, or pytest's exit status; empty if no test caught the mutant."""
+    """What caught the mutant: the first test that failed, `timeout`, or pytest's exit status; empty if it survived."""
     took_s: float
 
     @property
@@ -61,14 +61,14 @@ class Result:
 
 
 def make_result(mutation: Mutation, by: str, took_s: float) -> Result:
-    """Return the result of a mutation; `by` is empty if no test caught it."""
+    """Return the result of a mutation; `by` is what caught the mutant, or empty."""
     return Result(
         *mutation.key, mutation.line_number, mutation.operator, caught=bool(by), by=by, took_s=round(took_s, 2)
     )
 
 
 def describe(mutant: Mutation | Result) -> str:
-    """Return one line: file and line number, the source line before and after, and the operator."""
+    """Describe a mutant in one line: file and line number, the source line before and after, and the operator."""
     location = f"{SOURCES}/{mutant.module}:{mutant.line_number}"
     return f"{location}: `{mutant.line}` -> `{mutant.mutated}` ({mutant.operator})"
 
@@ -118,14 +118,15 @@ def load_accepted(path: Path, sites: Mapping[str, Iterable[Site]]) -> dict[Place
         place = (entry["module"], entry["function"], entry["line"], entry["mutated"])
         if place not in places:
             raise UserError(
-                f"{path}: entry {number} ({place[0]}, `{place[2]}`) matches no mutation; correct or remove it"
+                f"{path}: entry {number} ({entry['module']}, `{entry['line']}`) matches no mutation; "
+                "correct or remove the entry"
             )
         accepted[place] = entry["reason"]
     return accepted
 
 
 def report(results: Collection[Result], accepted: Mapping[Place, str]) -> str:
-    """Return the survivors line by line, and a table of the modules."""
+    """Return a line for each survivor, a table with a row for each module, and the share of caught mutants."""
     survivors = sorted(
         (result for result in results if not result.caught), key=lambda result: (result.module, result.line_number)
     )
@@ -134,7 +135,7 @@ def report(results: Collection[Result], accepted: Mapping[Place, str]) -> str:
     lines = [f"survived: {describe(result)}" for result in new_survivors]
     lines += [f"accepted: {describe(result)}: {accepted[result.place]}" for result in accepted_survivors]
     lines += ["", "| module | mutants | caught | survived | accepted |", "|---|---|---|---|---|"]
-    for module in (*sorted({result.module for result in results}), ""):
+    for module in (*sorted({result.module for result in results}), ""):  # "" is the row of all modules
         mutants, survived, accepted_count = (
             sum(module in (result.module, "") for result in counted_results)
             for counted_results in (results, new_survivors, accepted_survivors)

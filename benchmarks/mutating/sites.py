@@ -1,8 +1,8 @@
-"""Find the sites of a module where it can be mutated, and the replacements for each site.
+"""Find the sites of a module, which are the places where it can be mutated, and the replacements for each site.
 
-A mutation replaces the text of one node or operator. The rest of the file and the number of lines stay the same.
-Annotations, decorators, type aliases, `__all__`, `__slots__`, `TYPE_CHECKING` blocks, log calls and strings are left
-out, because they have no behaviour of their own, or only text.
+A mutation replaces the text of one syntax node or operator. The rest of the file and the number of lines stay the same.
+Annotations, decorators, type aliases, `__all__`, `__slots__`, `TYPE_CHECKING` blocks, log calls and strings have no
+sites, because they have no effect, or an effect on text only.
 """
 
 from __future__ import annotations
@@ -52,11 +52,11 @@ NEGATED_BY_OPERATOR: Final = (ast.Eq, ast.NotEq, ast.Is, ast.IsNot, ast.In, ast.
 class Mutation:
     """One replacement at one site.
 
-    Module, function, line, mutated line and occurrence identify it, even after other lines of the file have changed.
+    Module, function, line, mutated line and occurrence identify a mutation, even after other lines of the file changed.
     """
 
     module: str
-    """Path below `src/lavt`."""
+    """Path relative to `src/lavt`."""
     function: str
     """Qualified name of the enclosing function or class; empty at module level."""
     line_number: int
@@ -66,14 +66,16 @@ class Mutation:
     mutated: str
     """The same line after the replacement."""
     occurrence: int
-    """Index of this mutation among those of the function with the same line before and after."""
+    """Index of this mutation among the function's mutations with the same `line` and `mutated`."""
     begin: int
+    """Offset in the source of the first replaced character."""
     end: int
+    """Offset in the source after the last replaced character."""
     replacement: str
 
     @property
     def key(self) -> tuple[str, str, str, str, int]:
-        """The identity of the mutation."""
+        """The fields that identify the mutation."""
         return self.module, self.function, self.line, self.mutated, self.occurrence
 
     def apply_to(self, source: str) -> str:
@@ -82,11 +84,11 @@ class Mutation:
 
 
 Site = tuple[Mutation, ...]
-"""The replacements at one place."""
+"""The mutations at one place."""
 
 
 def replace_text(source: str, begin: int, end: int, text: str) -> str:
-    """Replace the text between two offsets, and keep the number of lines."""
+    """Replace the source between two offsets by a text; line breaks are added to keep the number of lines."""
     removed_lines = source.count("\n", begin, end) - text.count("\n")
     return source[:begin] + text + "\n" * removed_lines + source[end:]
 
@@ -98,24 +100,29 @@ def find_sites(module: str, source: str) -> list[Site]:
     occurrences: Counter[tuple[str, str, str]] = Counter()
     sites = []
     for begin, end, operator, function, replacements in sorted(finder.sites):
-        number = source.count("\n", 0, begin) + 1
-        first, last = source.rfind("\n", 0, begin) + 1, source.find("\n", end)
-        line = source[first:].partition("\n")[0].strip()
+        line_number = source.count("\n", 0, begin) + 1
+        # Offsets of the whole lines that contain the replaced text: from the first character to the last line break.
+        lines_begin, lines_end = source.rfind("\n", 0, begin) + 1, source.find("\n", end)
+        line = source[lines_begin:].partition("\n")[0].strip()
         mutations = []
         for text in replacements:
-            mutated = replace_text(source[first:last], begin - first, end - first, text).partition("\n")[0].strip()
+            mutated_lines = replace_text(source[lines_begin:lines_end], begin - lines_begin, end - lines_begin, text)
+            mutated = mutated_lines.partition("\n")[0].strip()
             occurrence = occurrences[function, line, mutated]
             occurrences[function, line, mutated] += 1
-            mutations.append(Mutation(module, function, number, operator, line, mutated, occurrence, begin, end, text))
+            mutations.append(
+                Mutation(module, function, line_number, operator, line, mutated, occurrence, begin, end, text)
+            )
         sites.append(tuple(mutations))
     return sites
 
 
 class _Finder(ast.NodeVisitor):
-    """A visitor that collects begin, end, operator, function and replacements of each site."""
+    """A visitor that collects the sites of a module."""
 
     def __init__(self, source: str) -> None:
         self.sites: list[tuple[int, int, str, str, tuple[str, ...]]] = []
+        """Begin, end, operator, function and replacements of each site."""
         self._source = source
         self._lines = source.split("\n")
         self._line_offsets = [0]
@@ -139,13 +146,15 @@ class _Finder(ast.NodeVisitor):
         return self._offset(node.lineno, node.col_offset), self._offset(node.end_lineno, node.end_col_offset)
 
     def _offset(self, line_number: int, column_bytes: int) -> int:
+        """Return the offset in characters of a position that `ast` gives."""
         return self._line_offsets[line_number - 1] + len(self._lines[line_number - 1].encode()[:column_bytes].decode())
 
     def _between(self, before: ast.expr, after: ast.expr) -> tuple[int, int]:
         """Return the offsets of the operator between two operands."""
         begin, end = self._offsets(before)[1], self._offsets(after)[0]
         tokens = self._tokens[bisect_left(self._tokens, (begin, "")) : bisect_left(self._tokens, (end, ""))]
-        return tokens[0][0], tokens[-1][0] + len(tokens[-1][1])
+        (first_offset, _), (last_offset, last_text) = tokens[0], tokens[-1]
+        return first_offset, last_offset + len(last_text)
 
     def _text(self, node: ast.expr | ast.stmt) -> str:
         begin, end = self._offsets(node)
@@ -176,7 +185,7 @@ class _Finder(ast.NodeVisitor):
         self._names.pop()
 
     def visit_If(self, node: ast.If) -> None:
-        """Skip code for type checkers, and negate the condition."""
+        """Negate the condition; skip code for type checkers."""
         if isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
             for statement in node.orelse:
                 self.visit(statement)
@@ -201,7 +210,7 @@ class _Finder(ast.NodeVisitor):
         self.generic_visit(node)
 
     def _condition(self, test: ast.expr) -> None:
-        """Add a `not` around a condition, unless another operator makes the same mutation."""
+        """Add the negation of a condition, unless another operator negates it, too, or it is a constant."""
         negated = isinstance(test, ast.UnaryOp) and isinstance(test.op, ast.Not)
         compared = isinstance(test, ast.Compare) and len(test.ops) == 1 and isinstance(test.ops[0], NEGATED_BY_OPERATOR)
         if not (negated or compared or isinstance(test, ast.Constant)):
@@ -217,25 +226,25 @@ class _Finder(ast.NodeVisitor):
         self.generic_visit(node)
 
     def visit_Compare(self, node: ast.Compare) -> None:
-        """Replace each comparison by similar ones."""
+        """Replace each comparison operator by similar ones."""
         for (before, after), operator in zip(pairwise([node.left, *node.comparators]), node.ops, strict=True):
             self._add(*self._between(before, after), "comparison", *COMPARISONS[type(operator)])
         self.generic_visit(node)
 
     def visit_BoolOp(self, node: ast.BoolOp) -> None:
-        """Swap each `and` and `or`."""
+        """Replace each `and` by `or`, and each `or` by `and`."""
         for before, after in pairwise(node.values):
             self._add(*self._between(before, after), "and/or", "or" if isinstance(node.op, ast.And) else "and")
         self.generic_visit(node)
 
     def visit_BinOp(self, node: ast.BinOp) -> None:
-        """Swap the operator, unless it joins or formats text."""
+        """Replace the operator, unless it joins or formats text."""
         if not (_is_text(node.left) or _is_text(node.right)):
             self._add(*self._between(node.left, node.right), "arithmetic", ARITHMETIC[type(node.op)])
         self.generic_visit(node)
 
     def visit_AugAssign(self, node: ast.AugAssign) -> None:
-        """Swap the operator, and remove the statement."""
+        """Replace the operator, and remove the statement."""
         if not _is_text(node.value):
             self._add(*self._between(node.target, node.value), "arithmetic", ARITHMETIC[type(node.op)] + "=")
         self._statement(node)
@@ -256,7 +265,7 @@ class _Finder(ast.NodeVisitor):
             )
 
     def visit_Call(self, node: ast.Call) -> None:
-        """Swap `min` and `max`; skip log calls and the types of casts."""
+        """Replace `min` by `max` and `max` by `min`; skip log calls and the types of casts."""
         if _is_log_call(node):
             return
         name = node.func.id if isinstance(node.func, ast.Name) else getattr(node.func, "attr", "")
@@ -268,13 +277,13 @@ class _Finder(ast.NodeVisitor):
         self.generic_visit(node)
 
     def visit_Expr(self, node: ast.Expr) -> None:
-        """Remove a call; a string alone is a docstring."""
+        """Remove a call statement, unless it is a log call."""
         if isinstance(node.value, (ast.Call, ast.Await)) and not _is_log_call(node.value):
             self._statement(node)
         self.generic_visit(node)
 
     def visit_Assign(self, node: ast.Assign) -> None:
-        """Remove an assignment in a function; skip type aliases and name lists."""
+        """Remove an assignment in a function; skip type aliases, `__all__` and `__slots__`."""
         target = node.targets[0]
         name = target.id if isinstance(target, ast.Name) else ""
         if not self._in_function[-1] and (name in ("__all__", "__slots__") or _is_type_name(name)):
@@ -289,12 +298,12 @@ class _Finder(ast.NodeVisitor):
             self.visit(node.value)
 
     def _statement(self, node: ast.stmt) -> None:
-        """Remove a statement of a function; modules and classes would not work without any of theirs."""
+        """Remove a statement of a function. Modules and classes would not work without any of their statements."""
         if self._in_function[-1]:
             self._add(*self._offsets(node), "statement", "pass")
 
     def visit_Return(self, node: ast.Return) -> None:
-        """Replace the returned value by None; False is left to the operator for booleans."""
+        """Replace the returned value by None, unless it is None, or False, which `visit_Constant` flips."""
         if node.value is not None:
             if not (isinstance(node.value, ast.Constant) and (node.value.value is None or node.value.value is False)):
                 self._add(*self._offsets(node.value), "return value", "None")

@@ -22,7 +22,8 @@ from lavt.clock import MachineClock
 from lavt.domain import NS_PER_S
 
 COPIED: Final = ("src", "tests", "benchmarks")
-"""The other files of the repository are linked, because tests only read them."""
+"""The folders of the repository that are copied to a tree. All other entries are linked, because tests only read them,
+or excluded."""
 EXCLUDED: Final = (
     ".git",
     ".hypothesis",
@@ -36,7 +37,7 @@ EXCLUDED: Final = (
     "temporary",
 )
 MEMORY_BYTES: Final = 8 * 2**30
-"""Address-space limit of a process, for mutants that allocate memory endlessly."""
+"""Limit of a process's address space, which ends mutants that allocate memory endlessly."""
 OPTIONS: Final = (
     "-x",
     "--timeout=120",
@@ -60,12 +61,12 @@ class Trial:
 
     passed: bool
     failed_test: str
-    """The first test that failed, or pytest's exit status."""
+    """The first test that failed, `timeout`, or pytest's exit status; empty if all tests passed."""
     took_s: float
 
 
 class WorkTree:
-    """A copy of a repository's sources and tests."""
+    """A copy of a repository's sources and tests, with links to the repository's other files."""
 
     def __init__(self, directory: Path, repository: Path) -> None:
         self.directory = directory
@@ -81,7 +82,7 @@ class WorkTree:
         return self.directory / SOURCES / module
 
     def run(self, tests: Sequence[str], limit_s: float, *, unchanged: bool = False) -> Trial:
-        """Run the tests on the tree; the compiled files of an `unchanged` tree are kept for later runs."""
+        """Run the tests in the tree. With `unchanged`, the compiled files are kept for later runs."""
         with (self.directory / "output.txt").open("w+") as output:
             begin_ns = _CLOCK.now().mono_ns
             process = subprocess.Popen(
@@ -99,8 +100,8 @@ class WorkTree:
             except subprocess.TimeoutExpired:
                 status = None
             finally:
-                with suppress(ProcessLookupError):  # including its children
-                    os.killpg(process.pid, signal.SIGKILL)
+                with suppress(ProcessLookupError):
+                    os.killpg(process.pid, signal.SIGKILL)  # also kills the children
                 process.wait()
             took_s = (_CLOCK.now().mono_ns - begin_ns) / NS_PER_S
             output.seek(0)
@@ -112,7 +113,7 @@ class WorkTree:
         path = self.source(mutation.module)
         source = path.read_text()
         cached = path.parent / "__pycache__" / f"{path.stem}.{sys.implementation.cache_tag}.pyc"
-        # Without this, a mutant of the same length that is written in the same second would not be compiled again.
+        # Otherwise Python would not compile a mutant of the same length that is written in the same second.
         cached.unlink(missing_ok=True)
         try:
             path.write_text(mutation.apply_to(source))

@@ -1,1 +1,1 @@
-"""The processes of `control_round_trip.py`, and the carriers of messages between them."""
+"""The two measuring processes of `control_round_trip.py`, and the carriers of messages between the two."""

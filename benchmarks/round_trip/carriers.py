@@ -1,8 +1,8 @@
 """The carriers of messages to another process and back: raw UDP, Zenoh through routers, pyzmq, CycloneDDS.
 
-Each carrier has two ends: one in the process that echoes and one in the process that asks. The echoing end is created
-first, with an empty address; its own `address` is then passed to the asking end. pyzmq and CycloneDDS are imported only
-when they are used, because LAVT does not need them.
+Each carrier has two ends: the asking end, which sends commands, and the echoing end, which sends them back. The echoing
+end is created first, with an empty address. The asking end is then created with the echoing end's `address`. pyzmq and
+CycloneDDS are imported only when they are used, because LAVT does not need them.
 """
 
 from __future__ import annotations
@@ -28,19 +28,20 @@ MAX_DATAGRAM_BYTES: Final = 65_507
 LOOPBACK: Final = "127.0.0.1"
 Routers = tuple[str, str]
 """Endpoints of the vehicle's router, to which the echoing end connects, and of the operator's, for the asking end."""
+
 DDS_CONFIG: Final = (
     "<CycloneDDS><Domain><General><Interfaces><NetworkInterface name='lo' multicast='false'/></Interfaces>"
     "<AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex>"
     f"<Peers><Peer address='{LOOPBACK}'/></Peers></Discovery></Domain></CycloneDDS>"
 )
-"""Only this machine: without multicast, on the loopback."""
+"""Restricts CycloneDDS to this machine: to the loopback, without multicast."""
 
 
 class CarrierEnd(Protocol):
     """One end of a carrier."""
 
     address: str
-    """The address that the other end needs."""
+    """The address of this end, which the other end needs."""
 
     def send(self, data: bytes) -> None:
         """Send a message."""
@@ -56,7 +57,7 @@ class CarrierEnd(Protocol):
 
 
 class UdpCarrier:
-    """A UDP socket, which sends to the address that it last received from."""
+    """A UDP socket, which sends to the address from which it received last."""
 
     def __init__(self, address: str, _routers: Routers) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -88,8 +89,9 @@ class ZenohCarrier:
 
     def __init__(self, address: str, routers: Routers) -> None:
         is_asking = address != ""
+        vehicle_router, operator_router = routers
         config = zenoh.Config.from_file(str(shipped("zenoh-configs/session.json5")))
-        config.insert_json5("connect/endpoints", json.dumps([routers[is_asking]]))
+        config.insert_json5("connect/endpoints", json.dumps([operator_router if is_asking else vehicle_router]))
         self.address = "zenoh"
         self._session = zenoh.open(config)
         self._received: queue.SimpleQueue[bytes] = queue.SimpleQueue()
@@ -118,40 +120,42 @@ class ZenohCarrier:
         return None
 
     def close(self) -> None:
-        """Undeclare the subscriber and close the session; otherwise the process would not end."""
+        """Undeclare the subscriber and close the session, without which the process would not end."""
         self._subscriber.undeclare()
         self._listener.join()
         self._session.close()
 
 
 class PyzmqCarrier:
-    """Two pairs of PUB and SUB over TCP, without a broker."""
+    """A PUB and a SUB socket in each process, over TCP, without a broker."""
 
     def __init__(self, address: str, _routers: Routers) -> None:
         zmq: Any = importlib.import_module("zmq")
         self._context = zmq.Context()
-        self._out, self._in = self._context.socket(zmq.PUB), self._context.socket(zmq.SUB)
-        self._in.setsockopt(zmq.SUBSCRIBE, b"")
-        for zmq_socket in (self._out, self._in):
+        self._publisher, self._subscriber = self._context.socket(zmq.PUB), self._context.socket(zmq.SUB)
+        self._subscriber.setsockopt(zmq.SUBSCRIBE, b"")
+        for zmq_socket in (self._publisher, self._subscriber):
             zmq_socket.setsockopt(zmq.LINGER, 0)
         self.address = address
         if address:
-            to_port, from_port = json.loads(address)
-            self._out.connect(f"tcp://{LOOPBACK}:{to_port}")
-            self._in.connect(f"tcp://{LOOPBACK}:{from_port}")
+            echo_subscriber_port, echo_publisher_port = json.loads(address)
+            self._publisher.connect(f"tcp://{LOOPBACK}:{echo_subscriber_port}")
+            self._subscriber.connect(f"tcp://{LOOPBACK}:{echo_publisher_port}")
         else:
-            ports = [zmq_socket.bind_to_random_port(f"tcp://{LOOPBACK}") for zmq_socket in (self._in, self._out)]
-            self.address = json.dumps(ports)
+            zmq_sockets = (self._subscriber, self._publisher)
+            self.address = json.dumps(
+                [zmq_socket.bind_to_random_port(f"tcp://{LOOPBACK}") for zmq_socket in zmq_sockets]
+            )
 
     def send(self, data: bytes) -> None:
         """Publish a message."""
-        self._out.send(data)
+        self._publisher.send(data)
 
     def receive(self, timeout_s: float) -> bytes | None:
         """Wait for a message."""
-        if not self._in.poll(round(timeout_s * 1000)):
+        if not self._subscriber.poll(round(timeout_s * 1000)):
             return None
-        data: bytes = self._in.recv()
+        data: bytes = self._subscriber.recv()
         return data
 
     def close(self) -> None:
@@ -197,24 +201,25 @@ class DdsCarrier:
         return None
 
     def close(self) -> None:
-        """Do nothing: the participant ends with the process."""
+        """Do nothing, because the participant ends with the process."""
 
 
 @dataclass(frozen=True)
 class Carrier:
-    """A carrier in the table of results."""
+    """A carrier that can be measured."""
 
     label: str
+    """The carrier's name in the printed table."""
     end: Callable[[str, Routers], CarrierEnd]
     """Creates an end from the address of the other end (empty for the echoing end) and the routers."""
     module: str = ""
-    """The module that it needs besides LAVT's dependencies; empty if none."""
+    """The Python module that the carrier needs besides LAVT's dependencies; empty if none."""
     package: str = ""
     """The package that has the module."""
 
     @property
     def missing(self) -> bool:
-        """Whether its module is not installed."""
+        """Whether the module is not installed."""
         return self.module != "" and find_spec(self.module) is None
 
 

@@ -1,4 +1,4 @@
-"""One of the two processes of a round trip: the one that asks (sends commands), or the one that echoes them.
+"""One of the two processes of a round trip: the asking one, which sends commands, or the one that echoes them.
 
 The arguments are `echo CARRIER ROUTERS`, or `ask CARRIER ROUTERS ADDRESS SECONDS MESSAGES`.
 """
@@ -16,7 +16,7 @@ from lavt.transport.messages import encode
 
 PERIOD_NS = NS_PER_S // 50
 ECHO_TIMEOUT_S = 1.0
-"""An echo that takes longer counts as lost."""
+"""An echo that takes longer is lost."""
 FIRST_ECHO_TIMEOUT_S = 20.0
 """The first echo takes longer, because routers and participants have to find each other."""
 END_MESSAGE = b"end"
@@ -31,7 +31,7 @@ def command(sequence: int) -> bytes:
 
 
 def echo(end: CarrierEnd) -> None:
-    """Send back every message until the end message arrives, or none for a minute."""
+    """Send back every message, until the end message arrives or no message has arrived for a minute."""
     while (data := end.receive(60.0)) is not None and data != END_MESSAGE:
         end.send(data)
 
@@ -48,7 +48,7 @@ def round_trip_ns(end: CarrierEnd, sequence: int, timeout_s: float) -> int | Non
 
 
 def warm_up(end: CarrierEnd) -> None:
-    """Send commands until the first echo arrives, and then some more; raise `SystemExit` if there is no echo."""
+    """Send commands until the first echo arrives, and then 50 more; raise `SystemExit` if no echo arrives."""
     until_ns = time.monotonic_ns() + round(FIRST_ECHO_TIMEOUT_S * NS_PER_S)
     while round_trip_ns(end, 0, 0.1) is None:
         if time.monotonic_ns() > until_ns:
@@ -58,7 +58,10 @@ def warm_up(end: CarrierEnd) -> None:
 
 
 def ask(end: CarrierEnd, seconds: float, messages: int) -> dict[str, list[int | None]]:
-    """Return round trips in ns, for `seconds` at 50 Hz and for `messages` back to back; None for a lost echo."""
+    """Return round trips in nanoseconds by pace: for `seconds` at 50 Hz, and for `messages` back to back.
+
+    A lost echo is None.
+    """
     warm_up(end)
     paced: list[int | None] = []
     begin_ns = time.monotonic_ns()
@@ -73,15 +76,16 @@ def ask(end: CarrierEnd, seconds: float, messages: int) -> dict[str, list[int | 
 
 def main() -> None:
     """Ask or echo."""
-    role, carrier, routers, *more = sys.argv[1:]
-    address = more[0] if role == "ask" else ""
+    role, carrier, routers, *asking_arguments = sys.argv[1:]
+    address = asking_arguments[0] if role == "ask" else ""
     end = CARRIERS[carrier].end(address, json.loads(routers))
     try:
         if role == "echo":
             print(json.dumps({"address": end.address}), flush=True)
             echo(end)
         else:
-            print(json.dumps(ask(end, float(more[1]), int(more[2]))), flush=True)
+            _, seconds, messages = asking_arguments
+            print(json.dumps(ask(end, float(seconds), int(messages))), flush=True)
             end.send(END_MESSAGE)
     finally:
         end.close()

@@ -1,4 +1,4 @@
-"""The part on a clean link: both programs in turns on the loopback, and between them the latency of the codec alone."""
+"""The parts on a clean link: runs of LAVT and of GStreamer on the loopback, and the latency of the codec alone."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SIZES = (Size("480p", 640, 480, 2_000_000), Size("720p", 1280, 720, 4_000_000))
 
 @dataclass(frozen=True)
 class ComparisonPair:
-    """A run of LAVT, a run of tuned GStreamer, and the codec's floor, measured one after the other."""
+    """A run of LAVT, a run of tuned GStreamer, and between the two a measurement of the codec's floor."""
 
     ours: RunOutcome
     tuned: RunOutcome
@@ -54,17 +54,17 @@ class ComparisonPair:
 
     @property
     def over_floor_ms(self) -> float:
-        """Our median latency minus that of encoding and decoding alone."""
+        """Our median latency minus the codec's floor."""
         return self.ours.median_ms - self.floor_ms
 
 
 def describe_clean_run(folder: Path, size: Size, seconds: float) -> Run:
-    """Return the description of a run with a picture size."""
+    """Return the description of a run that lasts `seconds` after the warm-up."""
     return Run(str(folder), size.width_px, size.height_px, size.bit_rate_bps, frames_of(seconds))
 
 
 def measure_pairs(run: Run, pairs: int) -> Iterator[ComparisonPair]:
-    """Yield `pairs` measured pairs; every second one begins with GStreamer."""
+    """Measure and yield `pairs` pairs; every second pair begins with GStreamer."""
     for number in range(pairs):
         order: tuple[Program, Program] = ("ours", "gstreamer") if number % 2 == 0 else ("gstreamer", "ours")
         first, floor_ms, second = measure(order[0], run), _measure_floor_ms(run), measure(order[1], run)
@@ -82,7 +82,7 @@ def _measure_floor_ms(run: Run) -> float:
 
 
 def measure_usual(run: Run) -> RunOutcome:
-    """Measure GStreamer as usually configured: with a jitter buffer, and each picture shown when it is due."""
+    """Measure GStreamer with its usual settings: with a jitter buffer, and showing each picture when it is due."""
     return measure("gstreamer", replace(run, jitter_buffer_ms=USUAL_JITTER_BUFFER_MS, synchronous=True))
 
 
@@ -95,7 +95,7 @@ def format_row(name: str, outcome: RunOutcome) -> str:
 
 
 def run_clean_part(folder: Path, size: Size, *, pairs: int, seconds: float) -> dict[str, float]:
-    """Measure a picture size, print its table, and return its values for the last line."""
+    """Measure a picture size, print its table, and return its values for the line of JSON."""
     run = describe_clean_run(folder, size, seconds)
     print(f"\n## {size.name}, {size.bit_rate_bps / 1e6:g} Mb/s, {pairs} pairs of {seconds:g} s\n")
     print("| run | median ms | p95 ms | CPU sender ms/frame | CPU receiver ms/frame | frames shown |")

@@ -1,4 +1,4 @@
-"""The lower bound of the latency: encoding and decoding alone, in one process, with PyAV, at the same frame rate."""
+"""The floor: the latency of encoding and decoding alone, in one process, with PyAV, at the frame rate of the runs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,17 @@ from av.codec.context import ThreadType
 from av.video.codeccontext import VideoCodecContext
 from av.video.frame import VideoFrame
 from benchmarks.video.pictures import picture_of, planes_loop
-from benchmarks.video.run import GOP_FRAMES, RATE_HZ, VBV_MS, Pace, Run, freeze, print_json, requested_run, wall_ns
+from benchmarks.video.run import (
+    GOP_FRAMES,
+    RATE_HZ,
+    VBV_MS,
+    Pace,
+    Run,
+    exclude_objects_from_gc,
+    print_json,
+    requested_run,
+    wall_ns,
+)
 
 from lavt.transport.video.stamp import write_stamp_i420
 
@@ -22,7 +32,7 @@ def main() -> None:
     encoder, decoder = _open_encoder(run), open_decoder()
     planes = np.empty_like(loop[0])
     took_ns = []
-    freeze()
+    exclude_objects_from_gc()
     pace = Pace()
     for number in range(run.frames):
         pace.wait_for(number)

@@ -26,15 +26,15 @@ ELEMENTS = (
     "udpsink",
 )
 BUFFER_BYTES = 4 * 1024 * 1024
-"""The size of the receiving socket's buffer, which is that of LAVT's socket."""
+"""The size of the receiving socket's buffer, the same as in LAVT."""
 
 
 def load_gstreamer() -> Any:
-    """Import and initialize GStreamer from Debian's folder; raises `UserError` that names what is missing."""
+    """Import and initialize GStreamer from Debian's folder; raise `UserError` if a part of it is missing."""
     if DEBIAN_PACKAGES not in sys.path:
         sys.path.append(DEBIAN_PACKAGES)
     try:
-        import gi  # noqa: PLC0415 (only now it can be found)
+        import gi  # noqa: PLC0415 (it can be found only now)
 
         gi.require_version("Gst", "1.0")
         gi.require_version("GstApp", "1.0")
@@ -49,7 +49,7 @@ def load_gstreamer() -> Any:
 
 
 def sender_pipeline(run: Run) -> str:
-    """Return the sender's pipeline: no look-ahead, one thread, the same rate, decoder buffer and GOP as ours."""
+    """Return the sender's pipeline: no look-ahead, one thread, and our bit rate, decoder buffer and GOP."""
     kept = "! tee name=units units. ! appsink name=kept sync=false units. " if run.keep else ""
     return (
         "appsrc name=source is-live=true format=time max-bytes=0 "

@@ -1,4 +1,4 @@
-"""GStreamer's receiving process: it pulls pictures from `appsink` and reads their stamps in place."""
+"""GStreamer's receiving process, which pulls pictures from `appsink` and reads their stamps without copying them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from benchmarks.video.gstreamer import load_gstreamer, receiver_pipeline
 from benchmarks.video.picture_log import PictureLog
-from benchmarks.video.run import Run, freeze, print_json, requested_run, wait_for_line, wall_ns
+from benchmarks.video.run import Run, exclude_objects_from_gc, print_json, requested_run, wait_for_line, wall_ns
 
 from lavt.transport.video.stamp import read_stamp
 
@@ -23,7 +23,7 @@ def main() -> None:
     pipeline.get_state(5 * gst.SECOND)
     log = PictureLog(run)
     ended = threading.Event()
-    freeze()
+    exclude_objects_from_gc()
     print_json({"port": pipeline.get_by_name("socket").get_property("port")})
     threading.Thread(target=_wait_for_end, args=(ended,), daemon=True).start()
     _receive(gst, run, pipeline.get_by_name("pictures"), log, ended)

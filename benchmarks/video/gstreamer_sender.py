@@ -1,4 +1,4 @@
-"""GStreamer's sending process: it pushes a frame into `appsrc` whenever one is due."""
+"""GStreamer's sending process, which pushes each frame into `appsrc` when the frame is due."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ import numpy as np
 from benchmarks.video.gstreamer import load_gstreamer, sender_pipeline
 from benchmarks.video.pictures import picture_of, planes_loop
 from benchmarks.video.run import (
+    NUMBER_COLUMN,
     RATE_HZ,
+    STAMP_COLUMN,
     Pace,
     Run,
     cpu_ns,
-    freeze,
+    exclude_objects_from_gc,
     print_json,
     requested_run,
     save_units,
@@ -34,18 +36,19 @@ def main() -> None:
     loop = planes_loop(run.loop)
     print_json({})
     wait_for_line()
-    cpu = _send(gst, run, pipeline.get_by_name("source"), loop)
+    frame_cpu_ns = _send(gst, run, pipeline.get_by_name("source"), loop)
     pipeline.get_by_name("source").end_of_stream()
     pipeline.get_bus().timed_pop_filtered(5 * gst.SECOND, gst.MessageType.EOS | gst.MessageType.ERROR)
     save_units(run, _pull_units(gst, pipeline) if run.keep else [])
     pipeline.set_state(gst.State.NULL)
-    print_json({"cpu_ns": cpu})
+    print_json({"cpu_ns": frame_cpu_ns})
 
 
 def _send(gst: Any, run: Run, source: Any, loop: NDArray[np.uint8]) -> list[int]:
+    """Send all frames, and return the process's CPU time after each frame."""
     table = run.table()
-    cpu = []
-    freeze()
+    frame_cpu_ns = []
+    exclude_objects_from_gc()
     pace = Pace()
     for number in range(run.frames):
         pace.wait_for(number)
@@ -58,11 +61,11 @@ def _send(gst: Any, run: Run, source: Any, loop: NDArray[np.uint8]) -> list[int]
         buffer.unmap(mapped)
         buffer.pts = buffer.dts = number * NS_PER_S // RATE_HZ
         buffer.duration = NS_PER_S // RATE_HZ
-        table[number, 1] = number
-        table[number, 0] = stamp_ns
+        table[number, NUMBER_COLUMN] = number
+        table[number, STAMP_COLUMN] = stamp_ns
         source.push_buffer(buffer)
-        cpu.append(cpu_ns())
-    return cpu
+        frame_cpu_ns.append(cpu_ns())
+    return frame_cpu_ns
 
 
 def _pull_units(gst: Any, pipeline: Any) -> list[bytes]:

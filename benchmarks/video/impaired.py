@@ -1,4 +1,4 @@
-"""The part on an impaired link, which delays, reorders and loses packets: shares of shown and of undamaged frames."""
+"""The parts on an impaired link, which delays, reorders or loses packets: shares of shown and of undamaged frames."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from benchmarks.video.floor import open_decoder
 from benchmarks.video.pictures import picture_of, planes_loop, squared_error
 from benchmarks.video.processes import WARM_UP_FRAMES, Program, RunOutcome, measure
 from benchmarks.video.relay import LinkCase
-from benchmarks.video.run import Run, load_units
+from benchmarks.video.run import NUMBER_COLUMN, Run, load_units
 
 from lavt.errors import WorkError
 
@@ -27,7 +27,7 @@ CASES = (
     LinkCase("burst5", loss=0.05, burst_packets=3),
 )
 GSTREAMER_JITTER_BUFFERS_MS = {"reorder": (30,), "loss1": (0, 30), "loss5": (0, 30), "burst1": (30,), "burst5": (30,)}
-"""The lengths of GStreamer's jitter buffer that are measured in each case; the best result counts."""
+"""The lengths of GStreamer's jitter buffer with which each case is measured. The line of JSON has the best result."""
 DAMAGED_DB = 2.0
 """A picture is damaged if its PSNR is lower than that of the loss-free picture by more than this."""
 
@@ -42,7 +42,7 @@ class AssessedRun:
 
     @property
     def overhead(self) -> float:
-        """Bytes of repair packets divided by those of the video."""
+        """Bytes of repair packets divided by bytes of media packets."""
         relayed = self.outcome.relayed
         return float(relayed.get("repair_bytes", 0) / relayed["media_bytes"])
 
@@ -60,8 +60,8 @@ def psnr_db(mean_squared_error: float) -> float:
 
 
 def loss_free_errors(run: Run) -> list[float]:
-    """Decode the complete sent stream; return the mean squared error of each frame's luma to the source picture."""
-    decoder, source, numbers = open_decoder(), planes_loop(run.loop), run.table()[:, 1]
+    """Decode the stream as it was sent; return the mean squared error of each frame's luma to the source picture."""
+    decoder, source, numbers = open_decoder(), planes_loop(run.loop), run.table()[:, NUMBER_COLUMN]
     errors = []
     for index, unit in enumerate(load_units(run)):
         frames = decoder.decode(av.Packet(unit))
@@ -76,9 +76,9 @@ def loss_free_errors(run: Run) -> list[float]:
 
 
 def undamaged_share(received: dict[int, float], loss_free: Sequence[float]) -> float:
-    """Return the share of frames after the warm-up that were received undamaged.
+    """Return which share of the frames after the warm-up was received undamaged.
 
-    The arguments are the mean squared errors of the received and of the loss-free pictures, by frame.
+    The arguments are the mean squared errors by frame: of the shown pictures, and of the pictures without loss.
     """
     good = sum(
         frame in received and psnr_db(received[frame]) >= psnr_db(loss_free[frame]) - DAMAGED_DB
@@ -88,7 +88,7 @@ def undamaged_share(received: dict[int, float], loss_free: Sequence[float]) -> f
 
 
 def run_impaired_part(folder: Path, case: LinkCase, *, frames: int) -> dict[str, float]:
-    """Measure a case, print its rows, and return its values for the last line (none for bursts)."""
+    """Measure a case, print its table, and return its values for the line of JSON (none for bursts)."""
     size = SIZES[0]
     run = Run(str(folder), size.width_px, size.height_px, size.bit_rate_bps, WARM_UP_FRAMES + frames, keep=True)
     impairment = f"loss {case.loss:.0%}" if case.loss else f"U(0, {case.jitter_ms:g}) ms, reordering"

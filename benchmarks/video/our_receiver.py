@@ -1,4 +1,4 @@
-"""Our receiving process: the receiver node and the watcher node in their runtime."""
+"""LAVT's receiving process: the receiver node and the watcher node in the real-time runtime."""
 
 from __future__ import annotations
 

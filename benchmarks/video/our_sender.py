@@ -1,4 +1,4 @@
-"""Our sending process: the camera node in its runtime."""
+"""LAVT's sending process: the camera node in the real-time runtime."""
 
 from __future__ import annotations
 
@@ -7,7 +7,18 @@ from typing import Any
 
 import numpy as np
 from benchmarks.video.product import ProcessRuntime, build_sender_nodes
-from benchmarks.video.run import TOKEN, Run, Table, cpu_ns, print_json, requested_run, save_units, wait_for_line
+from benchmarks.video.run import (
+    NUMBER_COLUMN,
+    STAMP_COLUMN,
+    TOKEN,
+    Run,
+    Table,
+    cpu_ns,
+    print_json,
+    requested_run,
+    save_units,
+    wait_for_line,
+)
 
 from lavt.domain import Now
 
@@ -16,28 +27,29 @@ class SentFrameRecorder:
     """A recorder that writes the table of sent frames and keeps access units."""
 
     def __init__(self, run: Run) -> None:
-        self.done = threading.Event()
+        self.all_sent = threading.Event()
         self.cpu_ns = np.full(run.frames, -1, np.int64)
+        """The process's CPU time after each frame."""
         self.sent = 0
         self.units: list[bytes] = []
         self._table: Table = run.table()
         self._run = run
 
     def write(self, topic: str, payload: Any, now: Now) -> None:  # noqa: ARG002 (part of the protocol)
-        """Note a sent frame."""
+        """Note a frame's number and stamp and then, after encoding, its access unit and the CPU time."""
         sent = self.sent
         if sent >= self._run.frames:
             return
         if topic == "frame":
-            self._table[sent, 1] = payload.number
-            self._table[sent, 0] = payload.stamp_ns
+            self._table[sent, NUMBER_COLUMN] = payload.number
+            self._table[sent, STAMP_COLUMN] = payload.stamp_ns
         elif topic == "video":
             if self._run.keep:
                 self.units.append(payload.data)
             self.cpu_ns[sent] = cpu_ns()
             self.sent = sent + 1
             if sent + 1 == self._run.frames:
-                self.done.set()
+                self.all_sent.set()
 
 
 def main() -> None:
@@ -49,7 +61,7 @@ def main() -> None:
     wait_for_line()
     runtime = process.start(build_sender_nodes(run, process.clock, process.port))
     runtime.deliver("video_token", TOKEN, process.clock.now())
-    while not recorder.done.wait(0.5) and not runtime.stopped.is_set():
+    while not recorder.all_sent.wait(0.5) and not runtime.stopped.is_set():
         pass
     process.close()
     save_units(run, recorder.units)

@@ -1,4 +1,4 @@
-"""The log of received pictures, which the receiving processes of both programs write."""
+"""The log of received pictures; both LAVT's and GStreamer's receiving processes write one."""
 
 from __future__ import annotations
 
@@ -6,24 +6,24 @@ from pathlib import Path
 
 import numpy as np
 from benchmarks.video.pictures import picture_of, planes_loop, squared_error
-from benchmarks.video.run import MAX_FRAMES, Run, cpu_ns
+from benchmarks.video.run import MAX_FRAMES, NUMBER_COLUMN, STAMP_COLUMN, Run, cpu_ns
 from numpy.typing import NDArray
 
 
 class PictureLog:
-    """A log of pictures: stamp, time of reading, CPU time until then and, if requested, the error."""
+    """A log of pictures: stamp, time when the stamp was read, CPU time until then and, if `run.keep`, the error."""
 
     def __init__(self, run: Run) -> None:
-        # Allocated in advance, so that the log does not look like a memory leak.
+        # Allocated in advance, because a growing log would look like a memory leak.
         self._rows = np.full((MAX_FRAMES, 3), -1, np.int64)
         self._errors = np.full(MAX_FRAMES, -1.0)
         self._noted = 0
         self._table = run.table()
-        self._numbers: dict[int, int] = {}
+        self._number_by_stamp: dict[int, int] = {}
         self._source = planes_loop(run.loop) if run.keep else None
 
     def note(self, stamp_ns: int, read_ns: int, luma: NDArray[np.uint8] | None) -> None:
-        """Note a picture; if errors are requested, pictures with a stamp that was not sent are ignored."""
+        """Note a picture. If errors are requested, ignore a picture whose stamp was not sent."""
         error = -1.0
         if self._source is not None and luma is not None:
             number = self._number_of(stamp_ns)
@@ -36,11 +36,11 @@ class PictureLog:
             self._noted += 1
 
     def save(self, path: Path) -> None:
-        """Write the log: int64 rows of stamp, time of reading and CPU time, and an array of the errors."""
+        """Write the log as two arrays: rows of stamp, reading time and CPU time, and the errors (-1: not requested)."""
         np.savez(path, rows=self._rows[: self._noted], errors=self._errors[: self._noted])
 
     def _number_of(self, stamp_ns: int) -> int | None:
-        """Return the number of the frame that was sent with a stamp; None if no frame was."""
-        while sent_ns := int(self._table[len(self._numbers), 0]):
-            self._numbers[sent_ns] = int(self._table[len(self._numbers), 1])
-        return self._numbers.get(stamp_ns)
+        """Return the number of the frame that was sent with a stamp; None if no frame was sent with it."""
+        while sent_ns := int(self._table[len(self._number_by_stamp), STAMP_COLUMN]):  # add the frames sent since then
+            self._number_by_stamp[sent_ns] = int(self._table[len(self._number_by_stamp), NUMBER_COLUMN])
+        return self._number_by_stamp.get(stamp_ns)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from benchmarks.video.run import RATE_HZ, Run, create_table, to_json
+from benchmarks.video.run import RATE_HZ, STAMP_COLUMN, Run, create_table, to_json
 from numpy.typing import NDArray
 
 import lavt
@@ -27,21 +27,23 @@ WARM_UP_FRAMES = 3 * RATE_HZ
 """Frames that are sent first and not counted."""
 DRAIN_S = 0.5
 """Time for the last packets to arrive."""
-FOLDER = Path(__file__).parents[2]
+REPOSITORY = Path(__file__).parents[2]
 
 
 class BenchmarkProcess:
     """A process of a run, which is controlled by lines on its stdin and prints lines of JSON."""
 
-    def __init__(self, name: str, run: Run, *more: str) -> None:
-        paths = os.pathsep.join([str(FOLDER), str(Path(lavt.__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
-        self.name = name
+    def __init__(self, module: str, run: Run, *arguments: str) -> None:
+        paths = os.pathsep.join(
+            [str(REPOSITORY), str(Path(lavt.__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
+        )
+        self.name = module
         self._process = subprocess.Popen(
-            [sys.executable, "-m", f"benchmarks.video.{name}", to_json(run), *more],
+            [sys.executable, "-m", f"benchmarks.video.{module}", to_json(run), *arguments],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
-            cwd=FOLDER,
+            cwd=REPOSITORY,
             env={**os.environ, "PYTHONPATH": paths},
         )
 
@@ -51,7 +53,7 @@ class BenchmarkProcess:
         return self._process.pid
 
     def read_line(self) -> dict[str, Any]:
-        """Wait for the process's next line of JSON; raise `WorkError` if it ends without one."""
+        """Wait for the process's next line of JSON; raise `WorkError` if the process ends first."""
         assert self._process.stdout is not None
         line = self._process.stdout.readline()
         if not line:
@@ -60,13 +62,13 @@ class BenchmarkProcess:
         return entries
 
     def send_line(self) -> None:
-        """Send a line, which tells the process to begin or to end."""
+        """Send a line, with which the process begins or ends its work."""
         assert self._process.stdin is not None
         self._process.stdin.write("\n")
         self._process.stdin.flush()
 
     def close(self) -> None:
-        """Wait for the end of the process; kill it after 5 s."""
+        """Close the process's stdin and wait for its end; kill the process after 5 s."""
         assert self._process.stdin is not None
         self._process.stdin.close()
         try:
@@ -81,14 +83,15 @@ class RunOutcome:
     """The results of a run for the frames after the warm-up."""
 
     sent: int
+    """Number of frames."""
     latency_ms: NDArray[np.float64]
-    """Latency of each frame whose picture was shown with its stamp."""
+    """Latency of each shown frame: a frame is shown if its picture was decoded and the stamp that was read is right."""
     sender_cpu_ms: float
-    """CPU time per frame."""
+    """CPU time of the sending process per sent frame."""
     receiver_cpu_ms: float
-    """CPU time per frame."""
+    """CPU time of the receiving process per shown frame."""
     errors: dict[int, float]
-    """Mean squared error of each shown picture by its row in the table; -1 if errors were not requested."""
+    """Mean squared error of each shown picture by row of the table of sent frames; -1 if errors were not requested."""
     relayed: dict[str, Any]
     """The counters of the relay; empty without a relay."""
     counts: dict[str, int]
@@ -96,7 +99,7 @@ class RunOutcome:
 
     @property
     def shown(self) -> float:
-        """Share of frames whose picture was shown with its stamp."""
+        """Share of frames that were shown."""
         return len(self.latency_ms) / self.sent
 
     @property
@@ -111,7 +114,7 @@ class RunOutcome:
 
     @property
     def cpu_ms(self) -> float:
-        """CPU time of both processes for a frame."""
+        """CPU time of both processes per frame."""
         return self.sender_cpu_ms + self.receiver_cpu_ms
 
 
@@ -122,20 +125,26 @@ def measure(
     *,
     when_started: Callable[[Sequence[BenchmarkProcess]], None] = lambda _processes: None,
 ) -> RunOutcome:
-    """Run a program; `relay` are the arguments of the relay, if there is one. `when_started` gets the processes."""
+    """Measure a program in a run.
+
+    `relay` has the arguments of the relay; without arguments there is no relay. `when_started` is called with the
+    processes before the first frame is sent.
+    """
     create_table(Path(run.folder))
-    order = {"ours": ("our_sender", "our_receiver"), "gstreamer": ("gstreamer_receiver", "gstreamer_sender")}[program]
+    first, last = {"ours": ("our_sender", "our_receiver"), "gstreamer": ("gstreamer_receiver", "gstreamer_sender")}[
+        program
+    ]
     processes: list[BenchmarkProcess] = []
 
-    def start(name: str, port: int, *more: str) -> dict[str, Any]:
-        processes.append(BenchmarkProcess(name, replace(run, port=port), *more))
+    def start(module: str, port: int, *arguments: str) -> dict[str, Any]:
+        processes.append(BenchmarkProcess(module, replace(run, port=port), *arguments))
         return processes[-1].read_line()
 
     try:
-        port = start(order[0], 0)["port"]
+        port = start(first, 0)["port"]
         if relay:
             port = start("relay", port, program, *relay)["port"]
-        start(order[1], port)
+        start(last, port)
         sender, receiver = (processes[0], processes[-1]) if program == "ours" else (processes[-1], processes[0])
         when_started(processes)
         sender.send_line()
@@ -153,31 +162,38 @@ def measure(
     return _evaluate(run, sent["cpu_ns"], received["counts"], relayed)
 
 
-def _evaluate(run: Run, sender_cpu_ns: list[int], counts: dict[str, int], relayed: dict[str, Any]) -> RunOutcome:
-    stamps = run.table()[WARM_UP_FRAMES : run.frames, 0].tolist()
-    rows = {stamp_ns: row for row, stamp_ns in enumerate(stamps, WARM_UP_FRAMES)}
-    latency_ms, errors, cpu_ns = [], {}, []
+def _evaluate(run: Run, sent_cpu_ns: list[int], counts: dict[str, int], relayed: dict[str, Any]) -> RunOutcome:
+    """Match the log of received pictures with the table of sent frames; `sent_cpu_ns` is the CPU time after each."""
+    sent_stamps_ns = run.table()[WARM_UP_FRAMES : run.frames, STAMP_COLUMN].tolist()
+    row_by_stamp = {stamp_ns: row for row, stamp_ns in enumerate(sent_stamps_ns, WARM_UP_FRAMES)}
+    latency_ms, errors, shown_cpu_ns = [], {}, []
     with np.load(Path(run.folder) / "read.npz") as log:
-        for (stamp_ns, read_ns, at_cpu_ns), error in zip(log["rows"].tolist(), log["errors"].tolist(), strict=True):
-            row = rows.pop(stamp_ns, None)
+        for (stamp_ns, read_ns, cpu_ns), error in zip(log["rows"].tolist(), log["errors"].tolist(), strict=True):
+            row = row_by_stamp.pop(stamp_ns, None)
             if row is not None:
                 latency_ms.append((read_ns - stamp_ns) / NS_PER_MS)
-                cpu_ns.append(at_cpu_ns)
+                shown_cpu_ns.append(cpu_ns)
                 errors[row] = error
-    counted_cpu_ns = sender_cpu_ns[WARM_UP_FRAMES:]  # after each frame
     return RunOutcome(
-        len(stamps),
+        len(sent_stamps_ns),
         np.array(latency_ms),
-        (counted_cpu_ns[-1] - counted_cpu_ns[0]) / (len(counted_cpu_ns) - 1) / NS_PER_MS,
-        (cpu_ns[-1] - cpu_ns[0]) / (len(cpu_ns) - 1) / NS_PER_MS if len(cpu_ns) > 1 else float("nan"),
+        _cpu_ms_per_frame(sent_cpu_ns[WARM_UP_FRAMES:]),
+        _cpu_ms_per_frame(shown_cpu_ns),
         errors,
         relayed,
         counts,
     )
 
 
+def _cpu_ms_per_frame(frame_cpu_ns: list[int]) -> float:
+    """Return the mean CPU time of a frame from a process's CPU time after each frame; nan for fewer than two."""
+    if len(frame_cpu_ns) < 2:
+        return float("nan")
+    return (frame_cpu_ns[-1] - frame_cpu_ns[0]) / (len(frame_cpu_ns) - 1) / NS_PER_MS
+
+
 def measure_floor_ms(run: Run) -> float:
-    """Measure the median time of encoding and decoding alone."""
+    """Return the median time of encoding and decoding alone."""
     process = BenchmarkProcess("floor", run)
     try:
         took_ns = process.read_line()["took_ns"]
@@ -187,5 +203,5 @@ def measure_floor_ms(run: Run) -> float:
 
 
 def frames_of(seconds: float) -> int:
-    """Return the number of frames of a run of `seconds`, including the warm-up."""
+    """Return the number of frames of a run that lasts `seconds` after the warm-up, including the warm-up's frames."""
     return WARM_UP_FRAMES + max(2, round(seconds * RATE_HZ))

@@ -1,4 +1,4 @@
-"""LAVT's server and client as its commands build them, without the parts that do not concern the video."""
+"""Nodes and runtime of the video, as `lavt server` and `lavt client` build them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ LOOPBACK = "127.0.0.1"
 
 
 class LoopCamera:
-    """A camera that copies the loop's pictures into its own buffer, in I420, as GStreamer's sender does."""
+    """A camera that copies each picture of the loop, in I420, into a buffer, as GStreamer's sender does."""
 
     rate_hz = float(RATE_HZ)
     phase_ns = 0
@@ -45,19 +45,19 @@ class LoopCamera:
 
 
 class SinkNode:
-    """A node that discards the messages of some channels."""
+    """A node that discards all messages on the given channels."""
 
     counts: Mapping[str, int] = {}
 
     def __init__(self, name: str, *channels: str) -> None:
         self.name = name
-        self.pipelines: Mapping[str, Sequence[Stage]] = dict.fromkeys(channels, (("forget", _forget),))
+        self.pipelines: Mapping[str, Sequence[Stage]] = dict.fromkeys(channels, (("discard", _discard),))
 
     def next_wake_ns(self) -> None:
         """Return None: the node is never woken."""
 
 
-def _forget(_message: Message, _now: Now) -> None: ...
+def _discard(_message: Message, _now: Now) -> None: ...
 
 
 class NullLink:
@@ -68,7 +68,7 @@ class NullLink:
 
 
 class MessageRecorder(Protocol):
-    """A recorder of the messages that a run's record would contain."""
+    """A recorder, which gets every message that a run's record would contain."""
 
     def write(self, topic: str, payload: Any, now: Now) -> None:
         """Record a message."""
@@ -97,7 +97,7 @@ class ProcessRuntime:
         return self.runtime
 
     def close(self) -> None:
-        """Stop the runtime and close the socket; raises the error that stopped a node."""
+        """Stop the runtime and close the socket; raise the error that stopped a node, if there is one."""
         if self.runtime is not None:
             self.runtime.stop()
         self._link.close()
@@ -127,7 +127,7 @@ def build_sender_nodes(run: Run, clock: MachineClock, port: int) -> Sequence[Nod
 
 
 class LastPictureReceiver:
-    """The client's decoder, which keeps its last picture."""
+    """The client's decoder, which keeps the picture whose stamp was read last."""
 
     def __init__(self, pictures: PictureReceiver) -> None:
         self.last: Any = None
@@ -141,7 +141,7 @@ class LastPictureReceiver:
 
 
 def build_receiver_nodes(run: Run, clock: MachineClock) -> tuple[Sequence[Node], LastPictureReceiver]:
-    """Build the client's receiver node and a watcher node; return them with the decoder of the pictures."""
+    """Build the client's receiver node and a watcher node; return both nodes, and the decoder of the pictures."""
     size = {"width_px": run.width_px, "height_px": run.height_px}
     config = ClientConfig.model_validate({"camera": {**size, "rate_hz": RATE_HZ}})
     pictures = LastPictureReceiver(VIDEO.receiver(config))

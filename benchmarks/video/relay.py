@@ -1,7 +1,7 @@
-"""The impaired link between the two processes of a run: it delays every datagram and loses some.
+"""The impaired link between the two processes of a run, which delays every datagram and loses some.
 
-Delay and loss of the sender's packets depend on the packet's number, so that LAVT and GStreamer get the same
-impairment. Datagrams of the reverse direction get only the constant delay, and so do those of the path validation.
+Jitter and loss of a video packet depend only on its number, so that LAVT and GStreamer get the same impairment.
+Datagrams from the receiving process, and those of the path validation, get only the constant delay.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 from benchmarks.video.processes import WARM_UP_FRAMES
-from benchmarks.video.run import freeze, print_json, requested_run
+from benchmarks.video.run import exclude_objects_from_gc, print_json, requested_run
 
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.transport.emulation.impairment import Impairment, gilbert
@@ -30,9 +30,9 @@ BUFFER_BYTES = 4 * 1024 * 1024
 MAX_DATAGRAM_BYTES = 65_535
 SEED = 6
 MEDIA, REPAIR = 96, 97
-"""Payload types of RTP."""
+"""Payload types of RTP packets."""
 MARKER = 0x80
-"""Bit in the byte of the payload type; it is set in the last packet of a frame."""
+"""A bit in the byte of the payload type, which is set in the last packet of a frame."""
 
 Address = tuple[str, int]
 
@@ -43,8 +43,9 @@ class LinkCase:
 
     name: str
     jitter_ms: float = 0.0
-    """A further delay, uniform from 0 to this, independent for each packet, so that packets are reordered."""
+    """The longest further delay. The delays of packets are independent and uniform, so that packets are reordered."""
     loss: float = 0.0
+    """Share of packets that are lost."""
     burst_packets: float = 0.0
     """Mean number of packets in a burst of losses; 0 if packets are lost independently."""
 
@@ -72,21 +73,21 @@ class PacketImpairment:
 
 
 class TrafficCounter:
-    """Counters of the sender's traffic after the warm-up."""
+    """Counters of the video's packets after the warm-up, and the lateness of all datagrams."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
         self.late_ms: list[float] = []
         """For each datagram, how much later than due it was forwarded: an error of this machine, not the impairment."""
-        self._frames = 0
+        self._complete_frames = 0
 
     def note(self, datagram: bytes, *, lost: bool) -> None:
-        """Count a datagram by its payload type."""
-        kind = datagram[1] & ~MARKER
-        self._frames += kind == MEDIA and bool(datagram[1] & MARKER)
-        if self._frames < WARM_UP_FRAMES or kind not in (MEDIA, REPAIR):
+        """Count an RTP packet by its payload type; ignore RTCP."""
+        payload_type = datagram[1] & ~MARKER
+        self._complete_frames += payload_type == MEDIA and bool(datagram[1] & MARKER)
+        if self._complete_frames < WARM_UP_FRAMES or payload_type not in (MEDIA, REPAIR):
             return
-        name = "media" if kind == MEDIA else "repair"
+        name = "media" if payload_type == MEDIA else "repair"
         self.counts[f"{name}_bytes"] += len(datagram)
         self.counts[f"{name}_packets"] += 1
         self.counts[f"{name}_lost"] += lost
@@ -95,16 +96,19 @@ class TrafficCounter:
 def relay(
     near: socket.socket, far: socket.socket, far_peer: Address, case: LinkCase, *, near_sends: bool
 ) -> TrafficCounter:
-    """Relay datagrams between `far_peer` and the peer that sends to `near` until a line arrives on stdin.
+    """Relay datagrams between two peers until a line arrives on stdin.
 
-    With `near_sends` the video comes from the near peer, otherwise from the far one.
+    The socket `near` is for the near peer, whose address is known from its first datagram, and `far` is for `far_peer`.
+    With `near_sends` the video comes from the near peer, otherwise from the far peer.
     """
     impairment, traffic = PacketImpairment(case), TrafficCounter()
     waiting: list[tuple[int, int, bytes, socket.socket, Address]] = []
+    """A heap of due time, number, datagram, sending socket and receiving peer."""
     near_peer: Address | None = None
     number = 0
     while True:
-        pause_s = 1.0 if not waiting else max(0.0, (waiting[0][0] - time.monotonic_ns()) / NS_PER_S)
+        next_due_ns = waiting[0][0] if waiting else time.monotonic_ns() + NS_PER_S
+        pause_s = max(0.0, (next_due_ns - time.monotonic_ns()) / NS_PER_S)
         ready, _, _ = select.select((near, far, sys.stdin), (), (), pause_s)
         if sys.stdin in ready:
             return traffic
@@ -115,7 +119,8 @@ def relay(
             due_ns = time.monotonic_ns() + ONE_WAY_MS * NS_PER_MS
             near_peer = address if receiver is near else near_peer
             is_rtp = datagram[0] >> 6 == 2  # the version of RTP and RTCP; other datagrams belong to the path validation
-            if (receiver is near) is near_sends and is_rtp:
+            comes_from_sender = (receiver is near) is near_sends
+            if comes_from_sender and is_rtp:
                 delay_ns = impairment.next_delay_ns()
                 traffic.note(datagram, lost=delay_ns is None)
                 if delay_ns is None:
@@ -138,8 +143,8 @@ def main() -> None:
     for endpoint in (near, far):
         endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
         endpoint.bind(("127.0.0.1", 0))
-    freeze()
-    with suppress(OSError):  # the relay stands for the network, so it gets priority over both processes if permitted
+    exclude_objects_from_gc()
+    with suppress(OSError):  # the relay replaces the network, so it gets priority over both processes if permitted
         os.setpriority(os.PRIO_PROCESS, 0, -20)
     print_json({"port": near.getsockname()[1]})
     traffic = relay(near, far, ("127.0.0.1", run.port), case, near_sends=program == "gstreamer")

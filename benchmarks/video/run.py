@@ -1,4 +1,4 @@
-"""The description of a run, and the exchange with its processes: arguments, lines of JSON and shared files."""
+"""The description of a run, and what its processes exchange: arguments, lines of JSON, and shared files."""
 
 from __future__ import annotations
 
@@ -20,12 +20,14 @@ VBV_MS = 100
 """The decoder buffer (VBV) that the encoder's rate control assumes."""
 GOP_FRAMES = 30
 TOKEN = bytes(16)
-"""Token of our video path; in a drive it comes with the session."""
+"""Token that opens LAVT's video path; in a drive the client gets it with the session."""
 MAX_FRAMES = 1 << 17
 """Capacity of the table of sent frames: more than an hour."""
 
 Table = NDArray[np.int64]
-"""A row (stamp_ns, number) for each frame; zeros until the frame is sent. Both processes map the table into memory."""
+"""The table of sent frames: a row for each frame, with zeros until the frame is sent. Both processes map the table."""
+STAMP_COLUMN, NUMBER_COLUMN = 0, 1
+"""Columns of the table: the frame's stamp (ns) and its number."""
 
 
 @dataclass(frozen=True)
@@ -39,17 +41,17 @@ class Run:
     frames: int
     """Number of frames to send, including the warm-up."""
     port: int = 0
-    """Port of the process that was started first."""
+    """Port to which a process that is started later sends."""
     keep: bool = False
-    """Save the access units and the error of each received picture."""
+    """Whether to save the access units and the error of each received picture."""
     jitter_buffer_ms: int = 0
     """The length of GStreamer's jitter buffer."""
     synchronous: bool = False
-    """GStreamer shows each picture when it is due, instead of immediately."""
+    """Whether GStreamer shows each picture when it is due, instead of immediately."""
 
     @property
     def loop(self) -> Path:
-        """Path of the pictures of this size, without suffix."""
+        """Path of the file of pictures, without suffix."""
         return Path(self.folder) / f"{self.width_px}x{self.height_px}"
 
     def table(self) -> Table:
@@ -63,7 +65,7 @@ def create_table(folder: Path) -> None:
 
 
 def save_units(run: Run, units: Sequence[bytes]) -> None:
-    """Save the access units of a run, in the order of its table."""
+    """Save the access units of a run, in the order of the table of sent frames."""
     sizes = np.array([len(unit) for unit in units], np.int64)
     np.savez(Path(run.folder) / "units.npz", data=np.frombuffer(b"".join(units), np.uint8), sizes=sizes)
 
@@ -92,28 +94,28 @@ def print_json(entries: Mapping[str, object]) -> None:
 
 
 def wait_for_line() -> None:
-    """Wait for a line from the program that started this process, or for its end."""
+    """Wait until the program that started this process sends a line or ends."""
     sys.stdin.readline()
 
 
-def freeze() -> None:
-    """Exclude existing objects from garbage collection, as `RealRuntime` does."""
+def exclude_objects_from_gc() -> None:
+    """Exclude all existing objects from later garbage collections, as `RealRuntime` does."""
     gc.collect()
     gc.freeze()
 
 
 def cpu_ns() -> int:
-    """Return the CPU time of this process."""
+    """Return the CPU time that this process has used."""
     return time.process_time_ns()
 
 
 def wall_ns() -> int:
-    """Return the wall clock, which stamps use."""
+    """Return the time of the wall clock, which stamps contain."""
     return time.time_ns()
 
 
 class Pace:
-    """A pace of frames, whose due times are computed from the frame number."""
+    """The times at which frames are due, counted from the creation of this object."""
 
     def __init__(self) -> None:
         self._begin_ns = time.monotonic_ns()

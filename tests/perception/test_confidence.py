@@ -6,7 +6,7 @@ from collections import defaultdict
 
 import numpy as np
 import pytest
-from benchmarks.degraded import AHEAD_M, MODEL, NO_LANE, blocks, cases
+from benchmarks.degraded import AT_10_M, MODEL, NO_LANE, blocks, cases
 from benchmarks.perception_sheet import UNDECIDED, LaneVerdict, check_case, kinds_table, reliability_table
 
 from lavt.control.lane_watch import LANE_CONFIDENCE
@@ -25,7 +25,6 @@ CLEAR_LANE_KINDS = (
     "noise 15",
     "h264 200 kbit/s",
 )
-AT_10_M = AHEAD_M.tolist().index(10.0)
 ONE_LINE_KINDS = ("left line missing", "right line missing")
 OTHER_PAINT_KINDS = ("old yellow line", "old white line", "diagonal", "arrow")
 VerdictsByKind = dict[str, list[tuple[LaneVerdict, LaneVerdict]]]
@@ -52,13 +51,13 @@ def test_a_wrong_lane_has_low_confidence(verdicts: VerdictsByKind) -> None:
     """More than 15 % of searches find a wrong lane, but at most 2 % find one with enough confidence for driving."""
     searched = [pair[0] for kind, pairs in verdicts.items() if kind != UNDECIDED for pair in pairs]
     assert sum(verdict.wrong for verdict in searched) > 0.15 * len(searched)
-    assert sum(verdict.wrong and verdict.believed for verdict in searched) <= 0.02 * len(searched)
+    assert sum(verdict.wrong and verdict.accepted for verdict in searched) <= 0.02 * len(searched)
 
 
 def test_a_tracked_lane_is_not_led_astray(verdicts: VerdictsByKind) -> None:
     """At most 2 % of tracked pictures have a wrong lane with enough confidence for driving."""
     tracked = [pair[1] for kind, pairs in verdicts.items() if kind != "kerb only" for pair in pairs]
-    assert sum(verdict.wrong and verdict.believed for verdict in tracked) <= 0.02 * len(tracked)
+    assert sum(verdict.wrong and verdict.accepted for verdict in tracked) <= 0.02 * len(tracked)
 
 
 @pytest.mark.parametrize("kind", CLEAR_LANE_KINDS)
@@ -96,7 +95,7 @@ def test_other_paint_in_the_lane_lowers_confidence(verdicts: VerdictsByKind, kin
 @pytest.mark.parametrize("kind", sorted(NO_LANE - {"coarse blocks"}))
 def test_pictures_without_a_lane_have_low_confidence(verdicts: VerdictsByKind, kind: str) -> None:
     """No search in a picture without a lane has enough confidence for driving."""
-    assert all(not searched.believed for searched, _ in verdicts[kind])
+    assert all(not searched.accepted for searched, _ in verdicts[kind])
 
 
 @pytest.mark.parametrize("side_px", [2, 4, 8, 16])

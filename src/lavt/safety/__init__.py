@@ -1,1 +1,1 @@
-"""Safety on the vehicle: sessions, limits, the command gate, the watchdog and the path followed without commands."""
+"""Safety on the vehicle: sessions, limits, the command gate, the watchdog, and path following without commands."""

@@ -1,4 +1,4 @@
-"""The command gate on the vehicle: which commands are accepted, and why the others are rejected.
+"""The command gate on the vehicle: which commands are accepted, and why all others are rejected.
 
 The gate reads no clock and does no input or output: the actuator node passes times of the server's monotonic clock. The
 gate relies on no guarantee of the message layer.
@@ -22,7 +22,7 @@ from lavt.safety.watchdog import Watchdog
 
 
 class RejectionReason(StrEnum):
-    """Why a command is rejected, in the order of the checks. The values are the messages shown."""
+    """Why a command is rejected, in the order of the checks. The values are the shown messages."""
 
     WRONG_EPOCH = "not the present epoch"
     OLD_SEQUENCE = "not newer than the last command"
@@ -38,11 +38,12 @@ class RejectionReason(StrEnum):
 
 
 INTERRUPTS_ARMING = (RejectionReason.NOT_ARMED, RejectionReason.NOT_STATIONARY, RejectionReason.INHIBITED)
-"""A command rejected for one of these reasons interrupts arming: the input or the vehicle was not at rest."""
+"""A command that is rejected for one of these reasons interrupts arming, because the driver's input or the vehicle was
+not at rest."""
 
 
 class CommandVerdict(Struct, frozen=True):
-    """The decision on a command; `reason` is None for an accepted one."""
+    """The decision on a command; `reason` is None for an accepted command."""
 
     reason: RejectionReason | None = None
     detail: str = ""
@@ -99,17 +100,17 @@ class SafetyGate:
         return self.machine.state
 
     def in_force(self) -> tuple[int, int]:
-        """Return the present epoch and the sequence number last accepted in it; safe to call from any thread."""
+        """Return the present epoch and the sequence number last accepted in it; callable from any thread."""
         return self.epoch.number, self.epoch.sequence
 
     def admit(self, command: Command, vehicle: VehicleState, arrived_ns: int, now_ns: int) -> CommandVerdict:
-        """Accept or reject a command that arrived at `arrived_ns` and is applied at `now_ns` if it is accepted.
+        """Accept or reject a command that arrived at `arrived_ns`; an accepted command is applied at `now_ns`.
 
-        The command timeout counts from its arrival. The age of its picture is judged at its application, which is later
-        if the node or its process was stalled.
+        The command timeout counts from the arrival of the last fresh command. The age of the command's picture is that
+        at its application, which is later than the arrival if the node or its process was stalled.
         """
         self.watchdog.check_vehicle(vehicle)
-        self.watchdog.check_timeouts(arrived_ns)  # before the command: one that arrives at the timeout is too late
+        self.watchdog.check_timeouts(arrived_ns)  # first, because a command that arrives at the timeout is too late
         if command.emergency_stop:
             self.session.raise_emergency_stop(command.emergency_stop)
         reason = self.rejection_reason(command, vehicle, now_ns)
@@ -131,7 +132,7 @@ class SafetyGate:
         return ACCEPTED
 
     def rejection_reason(self, command: Command, vehicle: VehicleState, now_ns: int) -> RejectionReason | None:
-        """Return why a command is not applied at `now_ns`; None: it is accepted. The cheap checks come first."""
+        """Return why a command is not applied at `now_ns`; None if it is accepted. The cheap checks come first."""
         state = self.machine.state
         if self.session.active_operator is None or command.epoch != self.epoch.number:
             return RejectionReason.WRONG_EPOCH
@@ -166,7 +167,7 @@ class SafetyGate:
         return verdict
 
     def _is_fresh(self, command: Command) -> bool:
-        """Return whether a command was made from a newer picture than all before; its stamp must be known."""
+        """Return whether a command was made from a newer picture than all earlier ones; its stamp must be known."""
         return self.issued_stamps.frame_number(command.stamp_ns) > self._newest_frame
 
     def _arm(self, command: Command, vehicle: VehicleState, now_ns: int) -> None:

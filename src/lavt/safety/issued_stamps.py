@@ -15,8 +15,8 @@ class _IssuedFrame(NamedTuple):
 class IssuedStamps:
     """A memory of the issued stamps, each with its frame number, time of issue and capture time.
 
-    Times are on the server's monotonic clock. A newer frame has a higher frame number: stamps are wall clock times, and
-    the wall clock may be stepped.
+    Times are on the server's monotonic clock. Frame numbers tell which of two frames is newer. Stamps do not, because
+    they are times of the wall clock, which can be stepped.
     """
 
     def __init__(self, memory_ns: int, frozen_frames: int) -> None:
@@ -29,14 +29,14 @@ class IssuedStamps:
         self._last_crc: int | None = None
         self._last_captured_ns = 0
         self._equal_frames = 0
-        """Number of frames in a row, up to the last one, that have equal pixels."""
+        """Number of the last frames in a row that have equal pixels."""
 
     def add(self, stamp_ns: int, number: int, mono_ns: int, pixel_crc: int, captured_ns: int | None = None) -> None:
         """Store the stamp of a frame that was stamped at `mono_ns`; forget stamps older than the memory.
 
         `pixel_crc` is a checksum of the pixels without the stamp. `captured_ns` is the capture time that the camera
-        reports, or None. If it is None or later than `mono_ns`, `mono_ns` is stored as the capture time. A frame whose
-        pixels equal those of the frame before it has that frame's capture time.
+        reports, or None. If it is None or later than `mono_ns`, `mono_ns` is stored as the capture time. For a frame
+        whose pixels equal those of the previous frame, the capture time of the previous frame is stored.
         """
         if pixel_crc == self._last_crc:
             self._equal_frames += 1
@@ -46,14 +46,18 @@ class IssuedStamps:
         self._last_crc = pixel_crc
         self._issued[stamp_ns] = _IssuedFrame(number, mono_ns, self._last_captured_ns)
         self._order.append((mono_ns, stamp_ns))
-        while self._order and self._order[0][0] < mono_ns - self._memory_ns:
-            old_ns, old_stamp_ns = self._order.popleft()
-            old_frame = self._issued.get(old_stamp_ns)
-            if old_frame is not None and old_frame.issued_ns == old_ns:  # else the stamp was issued again later
-                del self._issued[old_stamp_ns]
+        while self._order:
+            oldest_issued_ns, oldest_stamp_ns = self._order[0]
+            if oldest_issued_ns >= mono_ns - self._memory_ns:
+                break
+            self._order.popleft()
+            oldest_frame = self._issued.get(oldest_stamp_ns)
+            # The same stamp can have been issued again later, after a step of the wall clock.
+            if oldest_frame is not None and oldest_frame.issued_ns == oldest_issued_ns:
+                del self._issued[oldest_stamp_ns]
 
     def issued_ns(self, stamp_ns: int, now_ns: int) -> int | None:
-        """Return when `stamp_ns` was issued; None: this server did not issue it, or longer ago than its memory."""
+        """Return when `stamp_ns` was issued; None if this server did not issue it in the time of its memory."""
         frame = self._issued.get(stamp_ns)
         return frame.issued_ns if frame is not None and now_ns - frame.issued_ns <= self._memory_ns else None
 

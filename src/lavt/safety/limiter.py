@@ -10,11 +10,11 @@ from lavt.errors import UserError
 from lavt.safety.limits import Limits
 
 COMMAND_PERIOD_S = CLIENT_LIMITS.command_period_ns / NS_PER_S
-"""A steering change that the rate limit allows within this time is not reported as limited."""
+"""A steering change that the rate limit allows in this time is not reported as limited."""
 
 
 class Limiter:
-    """A limiter that keeps each requested actuation within the limits and names the limits that changed it.
+    """A limiter that keeps each requested actuation within the limits, and names the limits that changed the request.
 
     All numbers are properties of the vehicle, the accelerations those at full pedals. Raises `UserError` unless they
     are positive and finite.
@@ -43,12 +43,12 @@ class Limiter:
         self._at_ns = 0
 
     def reset(self, steering_rad: float, now_ns: int) -> None:
-        """Take the wheel's present angle as the last steering target; ignore an angle that is not finite."""
+        """Take the present angle of the wheels as the last steering target; ignore an angle that is not finite."""
         if math.isfinite(steering_rad):
             self._steering_rad, self._at_ns = steering_rad, now_ns
 
     def target_rad(self, vehicle: VehicleState) -> float:
-        """Return the last steering target; before the first one, the wheel's angle, or 0 if it is not finite."""
+        """Return the last steering target; before the first target, the wheels' angle, or 0 if that is not finite."""
         if self._steering_rad is not None:
             return self._steering_rad
         return vehicle.steering_rad if math.isfinite(vehicle.steering_rad) else 0.0
@@ -58,7 +58,7 @@ class Limiter:
     ) -> Actuation:
         """Return `requested` within the limits at the vehicle's present speed; all values are finite.
 
-        `picture_age_ns` is the age of the picture that `requested` was made from; None: it was not made from a picture.
+        `picture_age_ns` is the age of the picture from which `requested` was made; None without a picture.
         """
         before_rad = self.target_rad(vehicle)
         step_rad = self.limits.steering_rate_radps * max(0, now_ns - self._at_ns) / NS_PER_S
@@ -101,14 +101,14 @@ class Limiter:
         return Actuation(rate_limited_rad, throttle, brake)
 
     def _stopping_distance_brake(self, excess_mps: float) -> float:
-        """Return the pedal that removes the excess speed in the settling time, at most that of a safe stop."""
+        """Return the pedal that removes the excess speed in the settling time, at most the pedal of a safe stop."""
         deceleration_mps2 = min(excess_mps / self.limits.stopping_brake_settling_s, self.limits.stop_deceleration_mps2)
         return min(1.0, deceleration_mps2 / self.max_braking_mps2)
 
     def _lateral_limit_rad(self, speed_mps: float, is_known: bool) -> float:
         """Return the road wheel angle at which the lateral acceleration v^2 tan(angle) / wheelbase is at its limit.
 
-        A speed that is not known counts as at least the speed limit.
+        An unknown speed is assumed to be the speed limit, or the reported speed if this is higher.
         """
         if not is_known:
             reported_mps = abs(speed_mps) if math.isfinite(speed_mps) else 0.0
@@ -121,10 +121,11 @@ class Limiter:
 def stopping_speed_limit_mps(picture_age_s: float, limits: Limits, max_acceleration_mps2: float) -> float:
     """Return the highest speed from which the car stops on the path of its last command, if no other command follows.
 
-    Since the picture was taken, the car has driven for the picture's age. It drives on for `stop_after` until the safe
-    stop begins, and then brakes. The last command may give full throttle until the vehicle is degraded, so the speed v
-    counts as w = v + `max_acceleration` x `degraded_after`. w solves w (age + `stop_after`) + w^2 / (2
-    `stop_deceleration`) = `stopping_distance_limit`; the older the picture, the lower it is.
+    The path begins where the picture was taken. From there the car has driven for the picture's age. It drives on for
+    `stop_after` until the safe stop begins, and then brakes. Until the vehicle is degraded, the last command can give
+    full throttle. So the speed v at the command can become w = v + `max_acceleration` x `degraded_after`. The car stops
+    on the path if w (age + `stop_after`) + w^2 / (2 `stop_deceleration`) is at most `stopping_distance_limit`. For an
+    older picture the returned speed is lower.
     """
     unguided_s = picture_age_s + limits.stop_after_ns / NS_PER_S
     braking_mps2 = limits.stop_deceleration_mps2

@@ -9,41 +9,41 @@ from lavt.domain import NS_PER_MS, NS_PER_S, PATH_POINTS, PATH_STEP_M, VehicleSt
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """The limits that the vehicle enforces, whatever is commanded."""
+    """The limits that the vehicle enforces for all commands."""
 
     degraded_after_ns: int = 300 * NS_PER_MS
-    """Without a command from a newer picture for this long: degraded. These are nine frames at 30 Hz; the watchdogs of
-    similar systems wait 100 to 500 ms."""
+    """Without a command from a newer picture for this long: degraded. This is the time of nine frames at 30 Hz; the
+    watchdogs of similar systems wait 100 to 500 ms."""
     stop_after_ns: int = 500 * NS_PER_MS
     """Without a command from a newer picture for this long: safe stop. At 30 km/h the car has then gone 4 m without
     guidance."""
     degraded_deceleration_mps2: float = 1.0
-    """Deceleration while degraded. It is gentle, because most command timeouts end by themselves."""
+    """Deceleration in the state degraded. It is gentle, because most command timeouts end before a safe stop."""
     stop_deceleration_mps2: float = 4.0
-    """Deceleration of a safe stop: from 30 km/h to standstill in 2.1 s and 9 m. It leaves grip for steering."""
+    """Deceleration of a safe stop: it stops a car from 30 km/h in 2.1 s and 9 m, and leaves grip for steering."""
     stop_settling_ns: int = 500 * NS_PER_MS
-    """Time from the beginning of a safe stop until the speed must fall: the brake's lag is 0.2 s, and reports are up to
-    0.1 s old."""
+    """Time after the beginning of a safe stop when the planned speed begins to fall: the brake's lag is 0.2 s, and
+    reports are up to 0.1 s old."""
     stop_excess_mps: float = 0.5
-    """If the vehicle in a safe stop is faster than planned by this much, it brakes fully. If it is faster by half as
-    much, its brake is halfway between that of `stop_deceleration_mps2` and full."""
+    """In a safe stop, a vehicle that is faster than planned by this much brakes fully. If it is faster by half as much,
+    its brake is halfway between the pedal for `stop_deceleration_mps2` and the full pedal."""
     stopping_distance_limit_m: float = PATH_STEP_M * PATH_POINTS
-    """The vehicle must be able to stop within this distance, which is the length of the path in a command
-    (`stopping_speed_limit_mps`). Only a simulated vehicle may be configured beyond it, to study higher speeds and
-    delays."""
+    """The vehicle must be able to stop in this distance, which is the length of the path in a command
+    (`stopping_speed_limit_mps`). For a simulated vehicle the config can set a larger distance, to study higher speeds
+    and delays."""
     stopping_brake_settling_s: float = 0.25
-    """Time within which the brake removes speed above `stopping_speed_limit_mps`. With a shorter time the speed would
-    oscillate, because the brake's lag is 0.2 s. An excess of 1 m/s is braked like a safe stop, which is the maximum."""
+    """Time in which the brake removes speed above `stopping_speed_limit_mps`. With a shorter time the speed would
+    oscillate, because the brake's lag is 0.2 s. With an excess of 1 m/s or more, the brake is that of a safe stop."""
     picture_age_limit_ns: int = 500 * NS_PER_MS
-    """A command from an older picture is rejected. The age counts from the capture, or from the stamp if the camera
-    reports no capture time, until the command is applied. Only a simulated vehicle may be configured up to 2 s."""
+    """A command from an older picture is rejected. The age is the time between the capture (the stamp, if the camera
+    reports no capture time) and the application of the command. For a simulated vehicle the config can set up to
+    2 s."""
     stamp_memory_ns: int = 5 * NS_PER_S
     """The server remembers the stamps that it issued for this long."""
     lateral_acceleration_mps2: float = 3.0
-    """The limit is that of openpilot (ISO 11270). A simulated vehicle may be configured up to 6 m/s2."""
+    """The limit of openpilot (ISO 11270). For a simulated vehicle the config can set up to 6 m/s2."""
     steering_rate_radps: float = 0.8
-    """Rate of the road wheels' angle. It is above the 0.53 rad/s of the cars we know, so that it limits only faulty
-    commands."""
+    """Rate of the road wheels' angle. The cars we know reach 0.53 rad/s, so only faulty commands exceed this limit."""
     speed_limit_mps: float = 40 / 3.6
     """Above this speed there is no throttle. The controllers drive 30 km/h."""
     arming_hold_ns: int = NS_PER_S
@@ -51,14 +51,14 @@ class Limits:
     handover_request_timeout_ns: int = 3 * NS_PER_S
     """A handover request is repeated each second; after three missing repetitions it expires."""
     reservation_ns: int = 5 * NS_PER_S
-    """A released vehicle is reserved for the client that requested it for this long. That client tries each second to
-    acquire control, and replies may be lost."""
+    """After a release, the vehicle is reserved for this long for the client that requested it. This client tries each
+    second to acquire control, and replies can be lost."""
     arming_brake: float = 0.3
-    """From this pedal position on, the brake counts as applied for arming."""
+    """The smallest brake with which the vehicle can be armed."""
     arming_steering_rad: float = 0.1
-    """Up to this angle, the steering input counts as neutral for arming."""
+    """The largest commanded steering angle with which the vehicle can be armed."""
     standstill_mps: float = 0.05
-    """Below this speed the vehicle is stationary."""
+    """The vehicle is stationary if it is slower than this."""
     frozen_frames: int = 5
     """This many equal pictures in a row are a camera fault."""
 

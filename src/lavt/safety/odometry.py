@@ -14,20 +14,21 @@ from lavt.domain import NS_PER_S, VehicleState
 
 MAX_SPEED_MPS = 100.0
 MAX_CURVATURE_PER_M = 1.0
-"""Reports beyond these are clamped, so that one bad report cannot ruin the sum."""
+"""Larger values in reports are clamped, so that one bad report cannot ruin the computed pose."""
 
 
 class PoseFix(Struct, frozen=True):
-    """The pose of the rear axle at a time, in the frame of the first fix, with its speed and curvature."""
+    """The pose of the rear axle at a time, with its speed and curvature. The first fix is the origin of the poses."""
 
     mono_ns: int
     travelled_m: float
+    """Distance since the first fix."""
     pose: PlanarPose
     speed_mps: float
     curvature_per_m: float
 
     def extrapolate(self, mono_ns: int) -> PoseFix:
-        """Return the pose at a later time with this speed and curvature; an earlier time returns this pose."""
+        """Return the fix at a later time with this speed and curvature; for an earlier time, return this pose."""
         step_m = self.speed_mps * max(0, mono_ns - self.mono_ns) / NS_PER_S
         pose = move_along_arc(self.pose, step_m, self.curvature_per_m)
         return PoseFix(mono_ns, self.travelled_m + step_m, pose, self.speed_mps, self.curvature_per_m)
@@ -36,8 +37,8 @@ class PoseFix(Struct, frozen=True):
 class Odometry:
     """Dead reckoning from the vehicle's reports, with a memory of the last `memory_ns`.
 
-    The model is the kinematic bicycle, which rolls without slip. Between two reports it has the mean of both speeds and
-    of both curvatures, so that the result hardly depends on the rate of the reports.
+    The model is the kinematic bicycle, which rolls without slip. Between two reports it has the mean of the two speeds
+    and of the two curvatures, so that the result hardly depends on the rate of the reports.
     """
 
     def __init__(self, wheelbase_m: float, memory_ns: int) -> None:
@@ -46,9 +47,9 @@ class Odometry:
         self._fixes: deque[PoseFix] = deque()
 
     def update(self, vehicle: VehicleState) -> None:
-        """Add a report of the vehicle; ignore one that is not newer than the last.
+        """Add a report of the vehicle; ignore a report that is not newer than the last one.
 
-        A speed or angle that is not finite is replaced by the one before it.
+        A speed or angle that is not finite is replaced by the previous speed or angle.
         """
         last = self._fixes[-1] if self._fixes else PoseFix(vehicle.mono_ns, 0.0, ORIGIN, 0.0, 0.0)
         if self._fixes and vehicle.mono_ns <= last.mono_ns:
@@ -65,9 +66,9 @@ class Odometry:
             self._fixes.popleft()
 
     def at(self, mono_ns: int) -> PoseFix:
-        """Return the pose at a time, extrapolated from the last report before it.
+        """Return the fix at a time, extrapolated from the last report before this time.
 
-        A time before the memory returns the oldest pose in it.
+        For a time before the memory, return the oldest pose in the memory.
         """
         if not self._fixes:
             return PoseFix(mono_ns, 0.0, ORIGIN, 0.0, 0.0)

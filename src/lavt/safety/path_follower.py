@@ -1,7 +1,7 @@
 """Steering without commands: along the planned path of the last command, by the vehicle's own odometry.
 
-Each command contains the planned path, which begins where its picture was taken. When commands stop, odometry measures
-how far the car has come along that path and how far it is beside it, and pure pursuit of the path steers the car.
+Each command contains the planned path, which begins where the command's picture was taken. When commands stop, odometry
+measures the car's position relative to this path, and pure pursuit steers the car along the path.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from lavt.safety.odometry import Odometry
 LOOKAHEAD_S = 0.5
 """Lookahead on the path, in seconds of driving.
 
-The lookahead compensates the wheel's lag. The gain crossover of pure pursuit is at 2.2 / lookahead, with a phase margin
-of 65 degrees (`experiment/boundary/delay_margin.py`). At 0.5 s, a steering lag of 0.12 s costs 28 degrees and a
-sampling period of at most 33 ms costs 4, which leaves 33. A preset counts as designed from 30 degrees on; a shorter
-lookahead would leave less.
+The lookahead makes up for the lag of the wheels. The gain crossover of pure pursuit is at 2.2 / lookahead, with a phase
+margin of 65 degrees (`experiment/boundary/delay_margin.py`). With 0.5 s, a steering lag of 0.12 s reduces the margin by
+28 degrees, and a sampling period of at most 33 ms by 4 degrees. This leaves 33 degrees. The preset `designed` has 30
+degrees; a shorter lookahead would leave a smaller margin.
 """
 
 
@@ -33,7 +33,7 @@ class PathFollower:
         self._wheelbase_m = wheelbase_m
         self._odometry = Odometry(wheelbase_m, memory_ns)
         self._curvatures_per_m: tuple[float, ...] = ()
-        """Curvature at the start of the path and at each of its points; empty: there is no path."""
+        """Curvature at the start of the path and at each of its points; empty if there is no path."""
         self._start = self._odometry.at(0)
 
     def update_odometry(self, vehicle: VehicleState) -> None:
@@ -50,9 +50,9 @@ class PathFollower:
         self._curvatures_per_m = ()
 
     def steering_rad(self, now_ns: int) -> float | None:
-        """Return the road wheel angle that follows the path; None: there is no path.
+        """Return the road wheel angle that follows the path; None if there is no path.
 
-        Beyond its last point, the path continues with the curvature there.
+        Beyond its last point, the path continues with the curvature of this point.
         """
         if not self._curvatures_per_m:
             return None
@@ -61,18 +61,19 @@ class PathFollower:
         along_m = car.travelled_m - self._start.travelled_m + distance_m
         goal_x_m, goal_y_m, _ = pose_along_path(self._start.pose, self._curvatures_per_m, along_m)
         x_m, y_m, heading_rad = car.pose
-        # On a path that bends back on itself the goal may be very near; the limiter bounds the angle anyway.
+        # On a path that bends back the goal can be very near; the limiter limits the angle anyway.
         goal_distance_m = max(math.hypot(goal_x_m - x_m, goal_y_m - y_m), distance_m / 2)
         bearing_rad = math.atan2(goal_y_m - y_m, goal_x_m - x_m) - heading_rad
         return steering_rad(2 * math.sin(bearing_rad) / goal_distance_m, self._wheelbase_m)
 
 
 def pose_along_path(start: PlanarPose, curvatures_per_m: tuple[float, ...], along_m: float) -> PlanarPose:
-    """Return the pose after `along_m` on a path from `start`, whose curvatures are `PATH_STEP_M` apart."""
+    """Return the pose after `along_m` on a path from `start`, given its curvatures at points `PATH_STEP_M` apart."""
     pose = start
-    for from_per_m, to_per_m in pairwise(curvatures_per_m):
+    for curvature_before_per_m, curvature_after_per_m in pairwise(curvatures_per_m):
+        mean_per_m = (curvature_before_per_m + curvature_after_per_m) / 2
         if along_m <= PATH_STEP_M:
-            return move_along_arc(pose, along_m, (from_per_m + to_per_m) / 2)
-        pose = move_along_arc(pose, PATH_STEP_M, (from_per_m + to_per_m) / 2)
+            return move_along_arc(pose, along_m, mean_per_m)
+        pose = move_along_arc(pose, PATH_STEP_M, mean_per_m)
         along_m -= PATH_STEP_M
     return move_along_arc(pose, along_m, curvatures_per_m[-1])

@@ -1,7 +1,7 @@
-"""Generates the states, limits and rejection reasons in `docs/safety.md` from the code.
+"""Generate the states, limits and rejection reasons in `docs/safety.md` from the code.
 
-The page has marked blocks, `<!-- drawn: NAME -->` to `<!-- drawn until here -->`; `draw_page` fills each of them.
-`docs/draw_safety.py` rewrites the page.
+The page has marked blocks, each between `<!-- drawn: NAME -->` and `<!-- drawn until here -->`. `draw_page` fills the
+blocks, and `docs/draw_safety.py` writes the page.
 """
 
 from __future__ import annotations
@@ -33,11 +33,12 @@ UNITS: Final[dict[str, str]] = {
     "_frames": "frames",
     "brake": "of the pedal",
 }
-"""Units by the ending of a limit's name; the first match counts. Times in nanoseconds are shown in ms or s."""
+"""Units by the ending of a limit's name; the first ending that matches decides. Times in nanoseconds are shown in ms or
+s."""
 
 
 def draw_page(page: str) -> str:
-    """Return the page with every marked block generated anew; raise `UserError` for an unknown block."""
+    """Return the page with every marked block generated again; raise `UserError` for an unknown block."""
 
     def block(found: re.Match[str]) -> str:
         draw = DRAWINGS.get(found["name"])
@@ -49,7 +50,7 @@ def draw_page(page: str) -> str:
 
 
 def draw_states() -> str:
-    """Return states and transitions as a Mermaid diagram, with one arrow for each pair of states."""
+    """Return states and transitions as a Mermaid diagram, with one arrow from each state to each next state."""
     arrows: dict[tuple[str, str], list[str]] = {}
     for (before, trigger), after in TRANSITIONS.items():
         arrows.setdefault((before, after), []).append(trigger)
@@ -90,11 +91,11 @@ DRAWINGS: Final[dict[str, Callable[[], str]]] = {
     "limits of the client": draw_client_limits,
     "rejections": draw_rejections,
 }
-"""The function for each block."""
+"""For each block, the function that generates it."""
 
 
 def value_with_unit(name: str, value: float) -> str:
-    """Return a limit's value with the unit that its name ends with."""
+    """Return the value of a limit, with the unit that follows from the ending of the limit's name."""
     if name.endswith("_ns"):
         return f"{value / NS_PER_S:g} s" if value >= NS_PER_S else f"{value / NS_PER_MS:g} ms"
     unit = next((unit for end, unit in UNITS.items() if name.endswith(end)), "")

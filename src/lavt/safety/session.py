@@ -12,18 +12,18 @@ from lavt.safety.state_machine import SafetyStateMachine
 from lavt.safety.takeover_requests import TakeoverRequests
 
 REMEMBERED_STOPS: Final = 1000
-"""The numbers of so many emergency stops are remembered, the last ones, so that none is executed a second time."""
+"""How many emergency stops are remembered by their numbers, so that none of them is executed a second time."""
 
 
 class CommandEpoch:
-    """The present epoch with the commands accepted in it. Commands of an earlier epoch are never accepted again."""
+    """The present epoch, and the last command accepted in it. Commands of an earlier epoch are never accepted again."""
 
     def __init__(self, new_number: Callable[[], int]) -> None:
         self.number = new_number()
         self.sequence = -1
-        """Sequence number of the last accepted command; -1: none in this epoch."""
+        """Sequence number of the last accepted command; -1 if no command was accepted in this epoch."""
         self.command: Command | None = None
-        """The last accepted drive command; None: none in this epoch, or none since arming began."""
+        """The last accepted drive command in this epoch and since arming began; None if there is none."""
         self._new_number = new_number
 
     def renew(self) -> None:
@@ -34,7 +34,7 @@ class CommandEpoch:
 
 
 class VehicleSession:
-    """The vehicle's side of the session: at most one client has control; every client can stop the vehicle."""
+    """The vehicle's side of the session. At most one client has control, but every client can stop the vehicle."""
 
     def __init__(
         self,
@@ -88,9 +88,10 @@ class VehicleSession:
         self._end_control()
 
     def raise_emergency_stop(self, number: int) -> bool:
-        """Stop the vehicle and return True; return False for the number of an earlier stop, which is not repeated.
+        """Stop the vehicle and return True; for the number of a remembered stop, return False and do not stop again.
 
-        Numbers have no order: if a stop needed a higher number than the last, one stop could prevent later ones.
+        The order of numbers does not matter: if a stop needed a higher number than the last stop, a stop with a very
+        high number would prevent all later ones.
         """
         if number in self._executed_stops:
             self._counts["emergency stop with an old number"] += self._machine.state != "emergency_stop"
@@ -166,4 +167,4 @@ class VehicleSession:
         "emergency_stop": _emergency_stop,
         "clear_emergency_stop": _clear_emergency_stop,
     }
-    """Each operation returns why it is rejected; empty: it is granted."""
+    """For each operation, a function that executes it and returns why it is rejected; empty if it is granted."""

@@ -68,7 +68,7 @@ TRANSITIONS: dict[tuple[SafetyState, Trigger], SafetyState] = {
     ("safe_stop", "emergency stop"): "emergency_stop",
     ("emergency_stop", "emergency stop cleared"): "disarmed",
 }
-"""The next state for each state and trigger. A pair that is not in the table changes nothing."""
+"""The next state by state and trigger. A trigger in a state without an entry changes nothing."""
 
 TRIGGER_MESSAGES: dict[Trigger, str] = {
     "arming begins": "all arming conditions are met",
@@ -87,14 +87,13 @@ TRIGGER_MESSAGES: dict[Trigger, str] = {
     "drive over": "the drive is over",
     "server shutdown": "the server is shutting down",
 }
-"""The message for each trigger, as states and records contain it."""
+"""The message of each trigger, for the vehicle's state and for records."""
 
 
 class SafetyStateMachine:
-    """The safety state and its reason, changed by `TRANSITIONS` only.
+    """The safety state and its reason, which only the transitions in `TRANSITIONS` change.
 
-    `end_epoch` is called with each safe stop, emergency stop and driver override, so that earlier commands are
-    rejected.
+    `end_epoch` is called at each safe stop, emergency stop and driver override, so that earlier commands are rejected.
     """
 
     def __init__(self, limits: Limits, end_epoch: Callable[[], None]) -> None:
@@ -105,7 +104,7 @@ class SafetyStateMachine:
         self._transitions: list[tuple[SafetyState, SafetyState, str]] = []
 
     def trigger(self, trigger: Trigger, detail: str = "") -> None:
-        """Make the transition of a trigger, if the table has one from the present state."""
+        """Make the transition of a trigger, if `TRANSITIONS` has one from the present state."""
         next_state = TRANSITIONS.get((self.state, trigger))
         if next_state is None:
             return
@@ -117,7 +116,7 @@ class SafetyStateMachine:
             self._end_epoch()
 
     def take_transitions(self) -> list[tuple[SafetyState, SafetyState, str]]:
-        """Return the transitions since the last call: from, to, reason."""
+        """Return the transitions since the last call: each as the state before, the state after, and the reason."""
         transitions, self._transitions = self._transitions, []
         return transitions
 

@@ -15,8 +15,8 @@ class StopBrake:
     """A controller of the brake pedal in safe stops.
 
     The more the vehicle exceeds the planned speed of the stop, the harder it brakes. The planned speed falls at
-    `stop_deceleration_mps2`, starting `stop_settling_ns` after the beginning of the stop. Within a stop the pedal is
-    never released. `max_braking_mps2` is the vehicle's deceleration at full pedal.
+    `stop_deceleration_mps2`, beginning `stop_settling_ns` after the beginning of the stop. During a stop the pedal is
+    never eased. `max_braking_mps2` is the vehicle's deceleration at full pedal.
     """
 
     def __init__(self, limits: Limits, max_braking_mps2: float) -> None:
@@ -31,7 +31,7 @@ class StopBrake:
         self._began = None
 
     def pedal(self, vehicle: VehicleState, now_ns: int) -> float:
-        """Return the pedal now; the first call after `reset` begins a stop."""
+        """Return the brake pedal for now; the first call after `reset` begins a stop."""
         limits = self._limits
         if self._began is None:
             self._began, self._pedal = (now_ns, abs(vehicle.speed_mps)), self._least_pedal

@@ -1,4 +1,4 @@
-"""Requests of other clients for a controlled vehicle, and its reservation for the requester after a release."""
+"""Requests of other clients for a controlled vehicle, and the reservation of the vehicle for the requester."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class TakeoverRequests:
         return ""
 
     def requested_by(self, now_ns: int) -> str:
-        """Return the name of the client whose request is pending; empty: there is none."""
+        """Return the name of the client whose request is pending; empty if there is none."""
         return self._request.client_name if self._request is not None and now_ns < self._request.until_ns else ""
 
     def reserve(self, now_ns: int) -> None:
@@ -48,12 +48,12 @@ class TakeoverRequests:
         self._request = None
 
     def reserved_for(self, request: SessionRequest, now_ns: int) -> str:
-        """Return the name of another client that has a reservation; empty: this requester may acquire control."""
+        """Return the name of another client for which the vehicle is reserved; empty if there is none."""
         reservation = self._reservation
         if reservation is None or now_ns >= reservation.until_ns or reservation.is_from(request):
             return ""
         return reservation.client_name
 
     def clear(self) -> None:
-        """Drop request and reservation: a client has acquired control."""
+        """Drop request and reservation, because a client has acquired control."""
         self._request = self._reservation = None

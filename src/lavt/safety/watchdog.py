@@ -17,7 +17,8 @@ from lavt.safety.stop_brake import StopBrake
 class Watchdog:
     """A watchdog that stops the vehicle after a command timeout or a fault, and computes every actuation.
 
-    A fresh command is one from a newer picture than all before; only fresh commands reset the timeout.
+    A command is fresh if it was made from a newer picture than all earlier commands. Only fresh commands reset the
+    command timeout.
     """
 
     def __init__(
@@ -38,7 +39,7 @@ class Watchdog:
         self._fresh_command_ns = 0
         self._captured_ns = 0
         """Capture time of the picture of `CommandEpoch.command`."""
-        self._engages = False
+        self._was_engaged = False
         """The last result of `should_engage`."""
 
     def reset_timeout(self, now_ns: int) -> None:
@@ -61,14 +62,14 @@ class Watchdog:
             self._machine.trigger("command-timeout stop")
 
     def next_wake_ns(self) -> int | None:
-        """Return when `check_timeouts` is due if no fresh command arrives; None: no timeout is running."""
+        """Return when `check_timeouts` is due if no fresh command arrives; None if no timeout is running."""
         if not self._machine.is_active():
             return None
         is_degraded = self._machine.state == "degraded"
         return self._fresh_command_ns + (self._limits.stop_after_ns if is_degraded else self._limits.degraded_after_ns)
 
     def check_vehicle(self, vehicle: VehicleState) -> None:
-        """Trigger the transitions of a driver override, a vehicle fault, and of motion while arming."""
+        """Trigger the transition of a driver override, of a vehicle fault, or of motion during arming."""
         if vehicle.is_overridden:
             self._machine.trigger("driver override")
         elif vehicle.inhibit_reason:
@@ -83,17 +84,18 @@ class Watchdog:
             self._machine.trigger("arming interrupted")
 
     def should_engage(self, vehicle: VehicleState) -> bool:
-        """Return whether the vehicle must be engaged: it is driven or about to be, or it has not stopped yet.
+        """Return whether the vehicle must be engaged: it is driven or about to be driven, or it has not stopped yet.
 
-        Call this after each physics step. Once the vehicle was stationary or disarmed, only arming engages it again: a
-        driver in the car may move it while a stop is latched.
+        Call this after each physics step. After the vehicle was stationary or disarmed, only arming engages it again,
+        because the driver in the car is allowed to move it after a stop.
         """
-        is_stopping = self._engages and self._machine.state != "disarmed" and not self._limits.is_stationary(vehicle)
-        self._engages = self._machine.is_active() or is_stopping
-        return self._engages
+        is_disarmed = self._machine.state == "disarmed"
+        is_stopping = self._was_engaged and not is_disarmed and not self._limits.is_stationary(vehicle)
+        self._was_engaged = self._machine.is_active() or is_stopping
+        return self._was_engaged
 
     def start_at_rest(self, vehicle: VehicleState, now_ns: int) -> None:
-        """Drop the last command and its path, and take the wheel's present angle as the first steering target."""
+        """Drop the last command and its path, and take the present angle of the wheels as the first steering target."""
         self._epoch.command = None
         self._path.clear_path()
         self._limiter.reset(vehicle.steering_rad, now_ns)
@@ -106,7 +108,7 @@ class Watchdog:
         self._path.set_path(command.steering_rad, command.path_curvature_per_m, self._captured_ns)
 
     def actuation(self, vehicle: VehicleState, now_ns: int) -> Actuation:
-        """Return the actuation for now, within all limits: the last command, or the stop of the present state.
+        """Return the actuation for now: that of the last command or of the present state's stop, within all limits.
 
         Call this after each physics step: it updates the odometry.
         """
@@ -128,11 +130,14 @@ class Watchdog:
         return self._limiter.limit(target, vehicle, now_ns, picture_age_ns)
 
     def _steering_target_rad(self, vehicle: VehicleState, now_ns: int) -> float:
-        """Return the commanded angle; without a command, that of the last path; without a path, the last target."""
+        """Return the commanded angle. In states without commands, return the angle that follows the last path.
+
+        Without a path, and in all other states, return the last target.
+        """
         if self._machine.state == "driving" and self._epoch.command is not None:
             return self._epoch.command.steering_rad
         if self._machine.state in UNCOMMANDED:
-            if self._limits.is_stationary(vehicle):  # a driver may move the car from here: the path does not apply
+            if self._limits.is_stationary(vehicle):  # the driver can move the car from here, off the path
                 self._path.clear_path()
             path_steering_rad = self._path.steering_rad(now_ns)
             if path_steering_rad is not None:

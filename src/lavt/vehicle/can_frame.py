@@ -43,18 +43,21 @@ class BusPort(Protocol):
         ...
 
     def send(self, frames: Sequence[CanFrame], made_ns: int) -> int:
-        """Send frames made at `made_ns`, in order and without blocking; return how many. Raises `BusGone`.
+        """Send frames made at `made_ns`, in order and without blocking; return how many were sent. Raises `BusGone`.
 
-        If a frame cannot be sent, the ones after it are not sent either.
+        If a frame cannot be sent, the frames after it are not sent either.
         """
         ...
 
     def take(self, now_ns: int) -> list[ReceivedCanFrame]:
-        """Return the frames received since the last call, in order, without own frames. Raises `BusGone`."""
+        """Return the frames received since the last call, in order. Raises `BusGone`.
+
+        The frames that this port sent are not among them.
+        """
         ...
 
     def next_wake_ns(self) -> int | None:
-        """Return a time by which `take` will have a frame to return, or None if no such time is known."""
+        """Return a time at which `take` will have a frame to return, or None if no such time is known."""
         ...
 
     def close(self) -> None:

@@ -40,7 +40,7 @@ class TruthSocket:
         return self._receiver.counts
 
     def take(self, _now_ns: int) -> tuple[GroundTruth | None, list[VehicleEvent]]:
-        """Return the newest truth, or None before the first one, and the events since the last call."""
+        """Return the newest ground truth, or None before the first one, and the events since the last call."""
         events: list[VehicleEvent] = []
         for _ in range(MAX_DATAGRAMS):
             try:

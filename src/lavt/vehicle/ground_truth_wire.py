@@ -1,8 +1,8 @@
 """Datagrams that carry a software car's ground truth and events to the server on the same machine.
 
 A datagram is a msgpack array `[version, truth, events]`: `truth` has the fields of a `GroundTruth` in order,
-`events` is a list of `[number, mono_ns, kind, detail]`. Event numbers increase, and each event is repeated in the
-following datagrams, so that a lost datagram loses no event. All times are of the monotonic clock of this machine.
+`events` is a list of `[number, mono_ns, kind, detail]`. Event numbers increase. Each event is repeated in the
+following datagrams, so that no event is lost with a datagram. All times are of the monotonic clock of this machine.
 """
 
 from __future__ import annotations
@@ -21,10 +21,11 @@ VERSION: Final = 1
 REPEATS: Final = 20
 """An event is sent in this many datagrams."""
 MAX_EVENTS: Final = 16
-"""Events per datagram; further events wait for the next one."""
+"""Largest number of events in a datagram; further events wait for the next datagram."""
 MAX_DETAIL: Final = 200
-"""Characters of an event's detail; a longer detail is cut."""
+"""Largest number of characters of an event's detail; a longer detail is cut."""
 MAX_BYTES: Final = 16_384
+"""Largest length of a datagram."""
 
 Time = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Finite = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]
@@ -38,10 +39,11 @@ _ENCODER = msgspec.msgpack.Encoder()
 _DECODER: msgspec.msgpack.Decoder[Datagram] = msgspec.msgpack.Decoder(Datagram)
 
 NumberedEvent = tuple[int, VehicleEvent]
+"""The number of an event, and the event."""
 
 
 def encode_truth(truth: GroundTruth, events: Sequence[NumberedEvent]) -> bytes:
-    """Return a datagram with the truth and numbered events, at most `MAX_EVENTS`."""
+    """Return a datagram with the ground truth and at most `MAX_EVENTS` numbered events."""
     encoded = [(number, event.mono_ns, event.kind, event.detail[:MAX_DETAIL]) for number, event in events]
     return _ENCODER.encode((VERSION, msgspec.structs.astuple(truth), encoded))
 
@@ -58,18 +60,18 @@ def decode_truth(datagram: bytes) -> tuple[GroundTruth, list[NumberedEvent]] | N
 
 
 class TruthSender:
-    """An encoder that numbers events and repeats each in `REPEATS` datagrams.
+    """An encoder that numbers events and sends each event in `REPEATS` datagrams.
 
-    Numbering begins with the start time, so that the numbers of a restarted car exceed all earlier ones.
+    The first number follows `start_ns`, so that the numbers of a restarted car exceed all earlier numbers.
     """
 
     def __init__(self, start_ns: int) -> None:
         self._number = start_ns
         self._pending: deque[tuple[int, NumberedEvent]] = deque()
-        """The events still to be sent, each with its remaining number of repetitions."""
+        """The events that are still to be sent, each after the number of datagrams in which it is still to be sent."""
 
     def make_datagram(self, truth: GroundTruth, new_events: Sequence[VehicleEvent]) -> bytes:
-        """Return the next datagram; `new_events` are the events since the last one."""
+        """Return the next datagram; `new_events` are the events since the last datagram."""
         for event in new_events:
             self._number += 1
             self._pending.append((REPEATS, (self._number, event)))
@@ -79,16 +81,17 @@ class TruthSender:
 
 
 class TruthReceiver:
-    """A decoder for untrusted datagrams; anything but a valid truth is counted and dropped."""
+    """A decoder for untrusted datagrams; anything but a valid ground truth is counted and dropped."""
 
     def __init__(self) -> None:
         self.newest: GroundTruth | None = None
         self.counts: Counter[str] = Counter()
-        """`truths`, `garbage`, and `old` (older than the newest)."""
-        self._number = -1
+        """Datagrams by kind: `truths`, `garbage`, and `old` (older than the newest truth)."""
+        self._last_number = -1
+        """The number of the last returned event."""
 
     def receive(self, datagram: bytes) -> list[VehicleEvent]:
-        """Update `newest` from a datagram and return its events that were not returned before."""
+        """Update `newest` from a datagram, and return the datagram's events that were not returned before."""
         decoded = decode_truth(datagram)
         if decoded is None:
             self.counts["garbage"] += 1
@@ -99,6 +102,6 @@ class TruthReceiver:
         else:
             self.counts["truths"] += 1
             self.newest = truth
-        new_events = [(number, event) for number, event in events if number > self._number]
-        self._number = max([self._number, *(number for number, _ in new_events)])
+        new_events = [(number, event) for number, event in events if number > self._last_number]
+        self._last_number = max([self._last_number, *(number for number, _ in new_events)])
         return [event for _, event in new_events]

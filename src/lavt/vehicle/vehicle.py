@@ -12,9 +12,10 @@ from lavt.domain import Actuation, GroundTruth, VehicleEvent, VehicleState
 
 
 class ReachedCommand(Struct, frozen=True):
-    """A command whose steering has reached the wheels: the vehicle reported that it steers with it."""
+    """A command that the vehicle reported as reached: it steers with the command."""
 
     applied_ns: int
+    """Time when the command was applied."""
     reached_ns: int
     """Time of the report."""
 
@@ -25,9 +26,11 @@ class Capabilities:
 
     simulated: bool
     virtual_time: bool
-    """The vehicle can be driven in virtual time."""
+    """Whether the vehicle can be driven in virtual time."""
     ground_truth: bool
+    """Whether the vehicle has a ground truth."""
     reset: bool
+    """Not used yet."""
     wheelbase_m: float
     max_steering_rad: float
     max_steering_rate_radps: float
@@ -50,7 +53,7 @@ class Vehicle(Protocol):
         ...
 
     def apply(self, actuation: Actuation, now_ns: int) -> None:
-        """Apply `actuation` from `now_ns` on, until the next call."""
+        """Apply `actuation` from `now_ns` on, until the next call of this method."""
         ...
 
     def engage(self, wanted: bool, now_ns: int) -> None:
@@ -80,9 +83,9 @@ class Vehicle(Protocol):
 
 @runtime_checkable
 class CountingVehicle(Vehicle, Protocol):
-    """A vehicle with error counters of its own; optional."""
+    """A vehicle that counts errors."""
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """Counters so far, for the record."""
+        """The counters so far, for the record."""
         ...

@@ -26,23 +26,25 @@ log = logging.getLogger(__name__)
 RETRY_S: Final = 1.0
 """The interval at which a camera without pictures is reopened."""
 MAX_CREDIBLE_RATE_HZ: Final = 1000.0
-"""A higher rate is ignored: streams without a frame rate report that of their timestamps (90 kHz)."""
+"""A higher reported rate is ignored: streams without a frame rate report the rate of their timestamps (90 kHz)."""
 RATE_TOLERANCE: Final = 0.01
-"""Relative: 30 and 29.97 Hz count as equal."""
+"""The relative difference up to which two rates are equal, such as 30 and 29.97 Hz."""
 MAX_BUFFER_AGE_NS: Final = NS_PER_S
-"""A buffer time that is further in the past must be of another clock: V4L2 drivers queue only a few pictures."""
+"""A buffer time that is further in the past must be of another clock, because V4L2 drivers queue only a few pictures.
+"""
 WAIT_PERIODS: Final = 0.25
 """The longest wait of `capture` for a picture, in frame periods.
 
-A camera has a clock of its own. Where pictures arrive just when they are requested, jitter would make `capture` miss
-many of them. The wait exceeds the jitter, so a picture is missed only when the clocks have drifted apart by a period.
+The camera's clock and the server's clock drift apart. If pictures arrive at about the time when they are requested,
+`capture` would miss many of them because of jitter. The wait is longer than the jitter. So `capture` misses a picture
+only when the clocks have drifted apart by a period.
 """
 MAX_AGE_PERIODS: Final = 2
-"""If the camera and the requests have the same rate, a picture waits at most one period to be requested. If the newest
-picture is older than two periods, the camera has stopped."""
+"""If the newest picture is older than this, in frame periods, the camera has stopped. A picture of a camera that runs
+is requested at most one period after its arrival."""
 COUNTER_NAMES: Final = (
     "pictures_read",
-    "pictures_replaced",  # by a newer one, before a request
+    "pictures_replaced",  # by a newer picture, before they were requested
     "pictures_too_old",
     "pictures_without_a_time",
     "pictures_of_another_size",
@@ -59,11 +61,12 @@ cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 
 class DeviceFormat(Struct, frozen=True):
-    """The size of a device's pictures, and the rate it reports; None if it reports none."""
+    """The size and rate of a device's pictures."""
 
     width_px: int
     height_px: int
     rate_hz: float | None
+    """None if the device reports no rate."""
 
     def __str__(self) -> str:
         """Return the size and rate as text."""
@@ -78,12 +81,12 @@ class _BufferedPicture(Struct, frozen=True):
 
 
 class VideoDevice:
-    """A `Camera` that returns the newest picture received since its last frame.
+    """A `Camera` whose `capture` returns the newest picture received since the last call.
 
     `device` is a V4L2 device (its path or number), or a file or address that OpenCV opens with FFmpeg. A file is played
-    at its own rate in a loop. `pixel_format` is V4L2's name of a format (four characters, such as MJPG); if it is empty
-    the driver chooses. A `UserError` is raised if the device cannot be opened or has another size or rate than
-    requested. If the device disappears later, it is reopened each second; meanwhile there are no pictures.
+    at its frame rate in a loop. `pixel_format` is V4L2's name of a format (four characters, such as MJPG); with an
+    empty name the driver chooses. Raises `UserError` if the device cannot be opened or has another size or rate than
+    requested. If the device disappears later, it is reopened each second, and there are no pictures until it is back.
     """
 
     phase_ns = 0
@@ -102,7 +105,7 @@ class VideoDevice:
         self._newest: _BufferedPicture | None = None
         self._changed = threading.Condition()
         self._stopped = threading.Event()
-        capture, picture = self._first_picture()
+        capture, picture = self._open_and_check()
         self._due_ns = clock.now().mono_ns
         self._store(capture, picture)
         self._thread = threading.Thread(target=self._run, args=(capture,), name="camera device", daemon=True)
@@ -116,9 +119,9 @@ class VideoDevice:
             return dict(self._counts)
 
     def capture(self, number: int, at_ns: int, pose: Pose | None) -> CapturedFrame | None:  # noqa: ARG002 (Camera's)
-        """Return the newest picture not returned before, after a short wait if there is none yet.
+        """Return the newest picture that was not returned before; wait for it for a short time if there is none yet.
 
-        None without a picture, or when the newest picture is too old.
+        Returns None if no picture arrived, or if the newest picture is too old.
         """
         with self._changed:
             self._changed.wait_for(self._has_picture, WAIT_PERIODS / self.rate_hz)
@@ -131,7 +134,7 @@ class VideoDevice:
             return CapturedFrame(number, newest.capture_ns, newest.picture)
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait until a picture is available and return whether one is."""
+        """Wait until a picture is available; return False if none is available after the timeout."""
         with self._changed:
             return self._changed.wait_for(self._has_picture, timeout_s)
 
@@ -144,7 +147,7 @@ class VideoDevice:
     def _has_picture(self) -> bool:
         return self._newest is not None
 
-    def _first_picture(self) -> tuple[cv2.VideoCapture, Picture]:
+    def _open_and_check(self) -> tuple[cv2.VideoCapture, Picture]:
         """Open the device and read one picture; raise `UserError` unless it has the requested format."""
         capture = self._open()
         picture = _read_picture(capture)
@@ -169,7 +172,7 @@ class VideoDevice:
         return capture, picture
 
     def _open(self) -> cv2.VideoCapture:
-        """Open the device; if that fails, reading from the result fails."""
+        """Open the device; if it cannot be opened, reading from the result fails."""
         if not self._is_v4l2:
             limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _TIMEOUT_MS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _TIMEOUT_MS]
             one_thread = [cv2.CAP_PROP_N_THREADS, 1]  # each further FFmpeg thread adds a frame of delay
@@ -184,7 +187,10 @@ class VideoDevice:
         return capture
 
     def _run(self, capture: cv2.VideoCapture) -> None:
-        """Read until closed; when the source ends, reopen a file at once and anything else after `RETRY_S`."""
+        """Read until the camera is closed.
+
+        When the source ends, reopen a file that had pictures at once, and anything else after `RETRY_S`.
+        """
         while True:
             pictures = self._read_until_end(capture)
             capture.release()
@@ -198,7 +204,7 @@ class VideoDevice:
                 self._counts["times_opened_again"] += 1
 
     def _read_until_end(self, capture: cv2.VideoCapture) -> int:
-        """Read pictures until the source ends or the camera is closed; return how many there were."""
+        """Read pictures until the source ends or the camera is closed; return the number of pictures."""
         pictures = 0
         while not self._stopped.wait(self._wait_s()):
             picture = _read_picture(capture)
@@ -209,7 +215,7 @@ class VideoDevice:
         return pictures
 
     def _wait_s(self) -> float:
-        """Return how long until the next picture of a file is due; 0 for a device, whose read blocks."""
+        """Return how long until the next picture of a file is due; 0 for other sources, because reading them blocks."""
         return max(0.0, (self._due_ns - self._clock.now().mono_ns) / NS_PER_S) if self._is_file else 0.0
 
     def _store(self, capture: cv2.VideoCapture, picture: Picture) -> None:
@@ -241,8 +247,8 @@ class VideoDevice:
 def buffer_time_ns(position_ms: float, arrived_ns: int) -> int | None:
     """Return a V4L2 buffer's time, which OpenCV reports as the position; None if it is not of the monotonic clock.
 
-    The driver chooses the clock of a buffer's time, and OpenCV does not report it. The time is therefore accepted only
-    within the second before the picture arrived. See Linux, Documentation/userspace-api/media/v4l/buffer.rst.
+    The driver chooses the clock of a buffer's time, and OpenCV does not report the choice. So the time is accepted only
+    if it lies in the second before the picture arrived. See Linux, Documentation/userspace-api/media/v4l/buffer.rst.
     """
     if not math.isfinite(position_ms):
         return None
@@ -255,24 +261,24 @@ def _fourcc(pixel_format: str) -> int:
 
 
 def _read_picture(capture: cv2.VideoCapture) -> Picture | None:
-    """Read one picture; None if there is none or it does not have three bytes per pixel."""
+    """Read one picture; return None if there is none, or if it does not have three bytes per pixel."""
     try:
-        good, picture = capture.read()
+        is_read, picture = capture.read()
     except cv2.error:  # raised by some devices for a picture that cannot be decoded
         return None
-    return cast("Picture", picture) if good and picture.ndim == 3 and picture.dtype == np.uint8 else None
+    return cast("Picture", picture) if is_read and picture.ndim == 3 and picture.dtype == np.uint8 else None
 
 
 def _matches_request(reported: DeviceFormat, model: CameraModel, rate_hz: float) -> bool:
     """Return whether a device has the requested size and rate; an unreported rate is accepted."""
-    is_of_size = (reported.width_px, reported.height_px) == (model.width_px, model.height_px)
-    return is_of_size and (reported.rate_hz is None or math.isclose(reported.rate_hz, rate_hz, rel_tol=RATE_TOLERANCE))
+    has_size = (reported.width_px, reported.height_px) == (model.width_px, model.height_px)
+    return has_size and (reported.rate_hz is None or math.isclose(reported.rate_hz, rate_hz, rel_tol=RATE_TOLERANCE))
 
 
 def _no_picture_message(device: str, *, is_open: bool) -> str:
     if is_open:
         return f"{device} opens, but has no pictures: check that no other program uses it and that it is a camera"
     return (
-        f"{device} cannot be opened as a camera: check that it exists (`ls -l /dev/v4l/by-id`) and that this user may "
-        "read it (group video)"
+        f"{device} cannot be opened as a camera: check that it exists (`ls -l /dev/v4l/by-id`) and that this user is "
+        "allowed to read it (group video)"
     )

@@ -47,7 +47,7 @@ def test_the_checksum_detects_a_flipped_bit(identifier: int, data: bytes) -> Non
 def test_unpack_inverts_pack(data: st.DataObject) -> None:
     """Values in range are unchanged by packing and unpacking, for every report's layout."""
     layout = data.draw(st.sampled_from([BRAKE_REPORT, STEERING_REPORT, *REPORT_LAYOUTS.values()]))
-    values = {field.name: data.draw(st.integers(field.least, field.most)) for field in layout.fields}
+    values = {field.name: data.draw(st.integers(field.lowest_value, field.highest_value)) for field in layout.fields}
     assert unpack(layout, pack(layout, values)) == values
 
 

@@ -1,9 +1,9 @@
 """Vehicle dynamics: a dynamic bicycle model with saturating tyres and with lags and limits in its actuators.
 
-At `CarParameters.kinematic_below_mps` and above, side forces follow from tyre slip. Slip is undefined at rest, so below
-that speed lateral speed and yaw rate approach those of a car that rolls without slip. Their time constant is that of
-the tyres at the speed where the models meet, so the transition is smooth. State is plain floats, because a step is
-taken 240 times a second.
+At `CarParameters.kinematic_below_mps` and above, side forces follow from tyre slip. Slip is undefined at rest. So at
+lower speeds another model applies: lateral speed and yaw rate approach those of a car that rolls without slip. The time
+constant of this approach is that of the tyres at the speed where the two models meet, so the transition is smooth.
+The state consists of plain floats, because there are 240 steps a second.
 """
 
 from __future__ import annotations
@@ -41,21 +41,25 @@ class CarParameters:
     rear_stiffness_nprad: float
     """Side force of an axle per radian of slip."""
     friction: float
+    """Friction coefficient between tyres and road."""
     max_steering_rad: float
     max_steering_rate_radps: float
     steering_dead_time_s: float
-    """Time from a command until the wheels begin to follow it; `pedal_dead_time_s` is that of the pedals."""
+    """Time until the wheels begin to follow a command."""
     steering_lag_s: float
     """Time constant of the wheels' first-order lag."""
     pedal_dead_time_s: float
+    """Time until throttle and brake begin to follow a command."""
     throttle_lag_s: float
     brake_lag_s: float
+    """Time constants of the first-order lags of throttle and brake."""
     max_acceleration_mps2: float
     max_braking_mps2: float
     rolling_resistance_mps2: float
     drag_per_m: float
     """Deceleration by air resistance per (m/s) squared."""
     kinematic_below_mps: float
+    """Below this speed the model of a car that rolls without slip applies."""
 
 
 LINCOLN_MKZ = CarParameters(
@@ -91,7 +95,7 @@ CARS = {"lincoln_mkz": LINCOLN_MKZ}
 
 
 def named_car(name: str) -> CarParameters:
-    """Return the car with this name; raise a `UserError` that lists the known cars if there is none."""
+    """Return the car with this name. If there is none, raise a `UserError` that lists the known cars."""
     if name not in CARS:
         raise UserError(f"there is no car {name!r}: the known ones are {', '.join(CARS)}")
     return CARS[name]
@@ -99,19 +103,20 @@ def named_car(name: str) -> CarParameters:
 
 @dataclass(frozen=True, slots=True)
 class Contact:
-    """A contact point: a point of the body that has entered a rigid obstacle."""
+    """A contact: a point of the body that has entered a rigid obstacle."""
 
     ahead_m: float
     left_m: float
-    """Position relative to the rear axle, in the car's frame."""
+    """Position of the point relative to the rear axle, in the car's frame."""
     depth_m: float
+    """Distance that the point has to move to leave the obstacle."""
     out_rad: float
     """Direction out of the obstacle, in the world frame."""
 
 
 @dataclass(slots=True)
 class CarMotion:
-    """The state of a car: the rear axle's pose in the world frame, the body's speeds, and the actuators' positions."""
+    """The state of a car: the rear axle's pose in the world frame, the body's speeds, and the actuator positions."""
 
     x_m: float
     y_m: float
@@ -127,7 +132,7 @@ class CarMotion:
 
 
 class CarDynamics:
-    """A car with parameters and state, advanced in fixed time steps."""
+    """A car with parameters and a state, which advances in fixed time steps."""
 
     def __init__(self, parameters: CarParameters, motion: CarMotion, step_s: float) -> None:
         self.parameters, self.motion = parameters, motion
@@ -142,7 +147,7 @@ class CarDynamics:
         self._brake_factor = _lag_factor(step_s, parameters.brake_lag_s)
         self._steering_factor = _lag_factor(step_s, parameters.steering_lag_s)
         self._max_steering_change_rad = parameters.max_steering_rate_radps * step_s
-        # The rate at which the tyres make the car roll without slip, at the speed where the models meet.
+        # The inverse of the tyres' time constant at the speed where the two models meet.
         stiffness_nprad = parameters.front_stiffness_nprad + parameters.rear_stiffness_nprad
         settling_per_s = stiffness_nprad / (parameters.mass_kg * parameters.kinematic_below_mps)
         self._rolling_factor = 1.0 - math.exp(-step_s * settling_per_s)
@@ -207,10 +212,10 @@ class CarDynamics:
         motion.speed_mps = motion.side_speed_mps = motion.yaw_rate_radps = 0.0
 
     def resolve_contact(self, contact: Contact) -> None:
-        """Move the car out of an obstacle and remove its motion into the obstacle, with friction along it.
+        """Move the car out of an obstacle, stop its motion into the obstacle, and apply friction along the obstacle.
 
-        The impulses are inelastic and planar, on a rigid body at the contact point: first Coulomb friction, then the
-        normal impulse that stops the remaining motion into the obstacle.
+        The impulses act on a rigid body in the plane, at the contact point: first the impulse of Coulomb friction, then
+        the impulse that stops the remaining motion into the obstacle. The car does not bounce back.
         """
         motion = self.motion
         motion.x_m += contact.depth_m * math.cos(contact.out_rad)
@@ -227,23 +232,32 @@ class CarDynamics:
         motion.speed_mps = max(0.0, motion.speed_mps)
 
     def _stopping_impulse(self, point: tuple[float, float], direction: tuple[float, float]) -> float:
-        """Return the impulse (N s) that stops a point of the body in a direction; both are in the car's frame."""
+        """Return the impulse (N s) that stops the motion of a point of the body in a direction.
+
+        Point (m from the centre of gravity) and direction (unit vector) are given ahead and to the left, in the car's
+        frame.
+        """
         motion, parameters = self.motion, self.parameters
-        forward_mps = motion.speed_mps - motion.yaw_rate_radps * point[1]
-        sideways_mps = motion.side_speed_mps + motion.yaw_rate_radps * point[0]
-        lever_m = point[0] * direction[1] - point[1] * direction[0]
+        (ahead_m, left_m), (ahead_share, left_share) = point, direction
+        forward_mps = motion.speed_mps - motion.yaw_rate_radps * left_m
+        sideways_mps = motion.side_speed_mps + motion.yaw_rate_radps * ahead_m
+        lever_m = ahead_m * left_share - left_m * ahead_share
         inverse_mass = 1.0 / parameters.mass_kg + lever_m * lever_m / parameters.yaw_inertia_kgm2
-        return -(forward_mps * direction[0] + sideways_mps * direction[1]) / inverse_mass
+        return -(forward_mps * ahead_share + sideways_mps * left_share) / inverse_mass
 
     def _apply_impulse(self, point: tuple[float, float], direction: tuple[float, float], impulse: float) -> None:
         motion, parameters = self.motion, self.parameters
-        forward, sideways = impulse * direction[0], impulse * direction[1]
+        (ahead_m, left_m), (ahead_share, left_share) = point, direction
+        forward, sideways = impulse * ahead_share, impulse * left_share
         motion.speed_mps += forward / parameters.mass_kg
         motion.side_speed_mps += sideways / parameters.mass_kg
-        motion.yaw_rate_radps += (point[0] * sideways - point[1] * forward) / parameters.yaw_inertia_kgm2
+        motion.yaw_rate_radps += (ahead_m * sideways - left_m * forward) / parameters.yaw_inertia_kgm2
 
     def _tyre_accelerations(self) -> tuple[float, float, float]:
-        """Return the lateral and yaw acceleration by tyre side forces, and the deceleration by steered front tyres."""
+        """Return the effect of the tyres' side forces: lateral acceleration, yaw acceleration, and deceleration.
+
+        The deceleration is that by the steered front tyres.
+        """
         parameters, motion, to_rear_m = self.parameters, self.motion, self._to_rear_m
         to_front_m, front_grip_n, rear_grip_n = (
             parameters.front_axle_to_gravity_m,
@@ -266,5 +280,5 @@ class CarDynamics:
 
 
 def _lag_factor(step_s: float, lag_s: float) -> float:
-    """Return the share of the remaining distance that a first-order lag covers in a step; 1 without a lag."""
+    """Return the share of the remaining change that a first-order lag makes in a step; 1 without a lag."""
     return 1.0 - math.exp(-step_s / lag_s) if lag_s > 0.0 else 1.0

@@ -26,11 +26,11 @@ MOVING_MPS = 0.1
 """A drive's time counts from the moment the car first exceeds this speed."""
 
 CONTACT_GAP_NS = NS_PER_S // 2
-"""A contact that occurs later than this after the last one counts as another collision."""
+"""A contact more than this time after the last contact is another collision."""
 
 MAX_UNCHECKED_M = PROJECTION_WINDOW_M / 3
-"""The distance that the body may move between checks. It is limited because projections search only around the last
-known station."""
+"""The longest movement of the body without a check. After a longer one, a projection could fail, because it searches
+only around the last known station."""
 
 RoadPosition = tuple[float, float, float]
 """Station (m) and lateral offset (m) of a point of the body, and the road's heading (rad) there."""
@@ -52,7 +52,7 @@ def time_limit_s(route_length_m: float) -> float:
 class RouteMonitor:
     """A monitor of one drive, which begins near the station `near_s_m`.
 
-    The events `timeout`, `off_road` and `completed` are reported once, lane invasions and collisions each time.
+    Each of the events `timeout`, `off_road` and `completed` is reported once, each lane invasion and collision anew.
     """
 
     def __init__(self, road: Road, parameters: CarParameters, near_s_m: float, *, limit_s: float | None = None) -> None:
@@ -80,8 +80,8 @@ class RouteMonitor:
         return TrackingError(lateral_m, math.remainder(motion.heading_rad - heading_rad, 2 * math.pi), s_m)
 
     def update(self, motion: CarMotion, at_ns: int) -> list[VehicleEvent]:
-        """Return the events since the last call; it must be called at every step."""
-        # While the body touches a rail, check every step: the contact may deepen or end.
+        """Return the events since the last call; this method must be called at every step."""
+        # As long as the body touches a rail, check every step: the contact can become deeper or end.
         can_skip = not self.contacts and self._event_margin.covers(motion)
         events = [] if can_skip else self._check_body(motion, at_ns)
         if self._began_ns is None:
@@ -96,7 +96,7 @@ class RouteMonitor:
         progress_m, lateral_m, heading_rad = self._road.project(motion.x_m, motion.y_m, self._near_s_m)
         self._near_s_m = progress_m
         *corners, middle = self._project_points(motion, (*self._corners, self._middle))
-        offsets_m = [position[1] for position in corners]
+        offsets_m = [corner_lateral_m for _, corner_lateral_m, _ in corners]
         events = self._lane_events(max(offsets_m), min(offsets_m), at_ns)
         self.contacts, touched_rail = self._find_contacts(corners)
         if touched_rail is not None:
@@ -119,7 +119,7 @@ class RouteMonitor:
         return [VehicleEvent(at_ns, kind, detail)]
 
     def _project_points(self, motion: CarMotion, points: Iterable[tuple[float, float]]) -> list[RoadPosition]:
-        """Return the road positions of body points, which are given ahead and to the left of the rear axle."""
+        """Return the road positions of points of the body, given as metres ahead and to the left of the rear axle."""
         cosine, sine = math.cos(motion.heading_rad), math.sin(motion.heading_rad)
         project, near_s_m = self._road.project, self._near_s_m
         return [
@@ -128,9 +128,9 @@ class RouteMonitor:
         ]
 
     def _lane_events(self, left_m: float, right_m: float, at_ns: int) -> list[VehicleEvent]:
-        """Return an event for each edge of the body that has changed lanes; lanes count from the right.
+        """Return an event for each edge of the body that has changed lanes; the rightmost lane has number 1.
 
-        An edge that is exactly on a line is still in the body's lane.
+        An edge that is exactly on a line has not crossed the line.
         """
         edges_m = self._road.lanes.edges_m
         lanes = (bisect_left(edges_m, left_m), bisect_right(edges_m, right_m))
@@ -144,7 +144,7 @@ class RouteMonitor:
         ]
 
     def _find_contacts(self, corners: Sequence[RoadPosition]) -> tuple[tuple[Contact, ...], Rail | None]:
-        """Return the contacts of corners with rails, and the first rail touched; None without a contact."""
+        """Return the contacts of corners with rails, and the first touched rail (None without a contact)."""
         contacts, touched_rail = [], None
         offsets_m = [lateral_m for _, lateral_m, _ in corners]
         leftmost_m, rightmost_m = max(offsets_m), min(offsets_m)
@@ -175,15 +175,15 @@ class RouteMonitor:
 
 
 class _EventMargin:
-    """The distance that the body may move before an event is possible, that is, before it may have reached a boundary.
+    """The distance by which the body can move before it can reach a boundary, and so before an event is possible.
 
     Boundaries are the edges of lanes and asphalt, the rails, the stations where asphalt and rails begin and end, and
-    the end of the route. While the body is between the rails, it cannot reach their ends.
+    the end of the route. As long as the body is between the rails, it cannot reach the ends of rails.
 
     When a point of the body moves by d, its station changes by at most d / `_station_scale`, because on the inside of a
-    curve a metre covers more than a metre of stations. Its lateral offset changes by at most the sum of two distances:
-    its movement across the direction that the road had at the last check, and the distance by which the road may have
-    bent away from that direction since then.
+    curve a metre covers more than a metre of stations. The point's lateral offset changes by at most the sum of two
+    distances: the point's movement across the direction that the road had at the last check, and the distance by which
+    the road bends away from that direction along the movement.
     """
 
     def __init__(self, road: Road, body_reach_m: float) -> None:
@@ -212,9 +212,9 @@ class _EventMargin:
     def restart(self, motion: CarMotion, positions: Sequence[RoadPosition]) -> None:
         """Store a checked pose and its distance from the boundaries; the first position is the rear axle's."""
         if self._station_scale <= 0.0:
-            return  # the bound does not hold on this road: check every step
+            return  # no margin can be given on this road: check every step
         self._reference_pose = (motion.x_m, motion.y_m, motion.heading_rad)
-        road_rad = positions[0][2]
+        (_, _, road_rad), *_ = positions
         self._across_direction = (-math.sin(road_rad), math.cos(road_rad))
         self._heading_spread_rad = max([abs(heading_rad - road_rad) for _, _, heading_rad in positions])
         offsets_m = self._offsets_m
@@ -226,7 +226,7 @@ class _EventMargin:
         self._along_margin_m = min(along_m * self._station_scale, MAX_UNCHECKED_M)
 
     def covers(self, motion: CarMotion) -> bool:
-        """Return whether no point of the body can have reached a boundary since the last check."""
+        """Return True if no point of the body can have reached a boundary since the last check."""
         x_m, y_m, heading_rad = self._reference_pose
         dx_m, dy_m = motion.x_m - x_m, motion.y_m - y_m
         moved_m = math.hypot(dx_m, dy_m)
@@ -243,7 +243,7 @@ class _EventMargin:
 
 
 def _distance_m(boundaries_m: Sequence[float], at_m: float) -> float:
-    """Return the distance from a coordinate to the nearest of the sorted boundaries."""
+    """Return the distance between a coordinate and the nearest of the sorted boundaries."""
     index = bisect_left(boundaries_m, at_m)
     above_m = boundaries_m[index] - at_m if index < len(boundaries_m) else math.inf
     below_m = at_m - boundaries_m[index - 1] if index else math.inf

@@ -17,14 +17,14 @@ STEPS_PER_S = 240
 MAX_START_LATERAL_M = 0.25
 MAX_START_TURN_RAD = math.radians(1.5)
 MAX_START_AHEAD_M = 2.0
-"""A run starts at most this far beside the route's start (to both sides), turned from it, and ahead of it. The values
-are drawn from the seed."""
+"""The largest differences between a run's start and the route's start: to either side, in heading, and ahead. The
+actual differences are drawn from the seed."""
 
 INITIAL_ACTUATION = Actuation(steering_rad=0.0, throttle=0.0, brake=1.0)
 
 
 def grid_ns(index: int) -> int:
-    """Return the time of a grid point, computed from its index so that no error accumulates."""
+    """Return the time of a grid point. It is computed from the index, so that no error accumulates."""
     return index * NS_PER_S // STEPS_PER_S
 
 
@@ -38,11 +38,11 @@ def start_offset(seed: int) -> tuple[float, float, float]:
 
 
 class Simulator:
-    """A simulated `lavt.vehicle.vehicle.Vehicle`, stationary at the start with its brake on until a command arrives.
+    """A simulated `lavt.vehicle.vehicle.Vehicle`. Until the first command it is stationary with full brake.
 
-    Physics is lazy: `advance` makes up for all steps since its last call, however late it is called. The steps lie on a
-    grid of 1/240 s on the monotonic clock, which begins with the first grid point at or after `start_mono_ns`. After a
-    collision the car stays where it is or, with `continue_after_collision`, slides along the obstacle.
+    Physics is lazy: `advance` makes all steps since its last call, however late it is called. The steps lie on a grid
+    of 1/240 s of the monotonic clock, and begin at the first grid point at or after `start_mono_ns`. After a collision
+    the car stays where it is or, with `continue_after_collision`, slides along the obstacle.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class Simulator:
 
     @property
     def capabilities(self) -> Capabilities:
-        """The vehicle's capabilities and limits."""
+        """The properties of this vehicle."""
         parameters = self._parameters
         return Capabilities(
             simulated=True,
@@ -92,7 +92,7 @@ class Simulator:
         )
 
     def advance(self, to_ns: int) -> list[VehicleEvent]:
-        """Take every step up to `to_ns` and return the events on the way, in order."""
+        """Make every step up to `to_ns` and return the events of these steps, in order."""
         events: list[VehicleEvent] = []
         car, monitor = self._car, self._route_monitor
         steering, pedals = self._steering_commands, self._pedal_commands
@@ -117,9 +117,9 @@ class Simulator:
         return events
 
     def apply(self, actuation: Actuation, now_ns: int) -> None:
-        """Put `actuation` into effect at the first grid point at or after `now_ns` plus the dead times.
+        """Put `actuation` into effect at the first grid point at or after `now_ns` plus the dead time.
 
-        Calls must have increasing times.
+        Steering and pedals have a dead time each. `now_ns` must not decrease.
         """
         self._steering_commands.append((now_ns + self._steering_dead_ns, actuation.steering_rad))
         self._pedal_commands.append((now_ns + self._pedal_dead_ns, actuation.throttle, actuation.brake))
@@ -132,7 +132,7 @@ class Simulator:
         return []
 
     def _apply_due_commands(self, at_ns: int) -> None:
-        """Put the commands into effect whose dead time has passed."""
+        """Put into effect the commands whose dead time has passed."""
         steering_rad, throttle, brake = self._actuation.steering_rad, self._actuation.throttle, self._actuation.brake
         while self._steering_commands and self._steering_commands[0][0] <= at_ns:
             _, steering_rad = self._steering_commands.popleft()

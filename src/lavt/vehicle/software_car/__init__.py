@@ -1,5 +1,5 @@
-"""The software car: an emulator of a by-wire kit whose wheels are the built-in simulator's.
+"""The software car: an emulated by-wire kit that moves the car of the built-in simulator.
 
-It shares no code with the adapter that drives it. Its frames are packed independently, from the published sources
-(docs/can.md) alone, so that a misreading in either of the two shows.
+It shares no code with the by-wire adapter, which drives it. Both were written from the published sources (docs/can.md)
+alone, so that a misreading in one of them becomes visible.
 """

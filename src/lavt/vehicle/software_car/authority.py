@@ -1,4 +1,4 @@
-"""Authority over the axes: which of them are enabled, why the kit releases them, and the watchdog that then brakes."""
+"""Authority over the axes: which axes are enabled, why the kit releases them, and when the watchdog brakes."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from lavt.vehicle.software_car.generations import Generation
 from lavt.vehicle.software_car.state import AXES, Axis, KitState, ReleaseReason, SystemOrder, SystemState
 
 COMMAND_TIMEOUT_NS: Final = 100 * NS_PER_MS
-"""This long after its last valid order an actuator is disabled; a request to enable expires after the same time."""
+"""The time after its last valid order when an axis is released. A request to enable expires after the same time."""
 WATCHDOG_BRAKE: Final = 0.5
-"""Our choice: the watchdog's brake, as a fraction."""
+"""Our choice: how hard the watchdog brakes, as a fraction of the full brake."""
 ENABLE, DISABLE = 1, 2
 """Requests of a `SystemOrder`; 0 requests nothing."""
 PAUSED, REMOTE, CONTROL_ALLOWED = 1, 2, 3
@@ -21,19 +21,21 @@ PAUSED, REMOTE, CONTROL_ALLOWED = 1, 2, 3
 class Authority:
     """The logic that enables and releases the axes. Call `update` after every change of the kit's state.
 
-    Without `has_watchdog` the kit never brakes by itself.
+    Without `has_watchdog` the kit never brakes on its own.
     """
 
     def __init__(self, state: KitState, generation: Generation, *, has_watchdog: bool) -> None:
         self._state, self._generation, self.has_watchdog = state, generation, has_watchdog
         self.inhibit_reason = ReleaseReason.NONE
-        """Why generation 2 is not ready, if the state contains no other reason."""
+        """Why a kit of generation 2 is not ready, if its state contains no other reason."""
         self._system_count: int | None = None
         self._requested_ns: int | None = None
-        """Time of the newest request to enable; None once it has expired."""
-        self._is_enable_pending, self._is_enable_used = False, False
-        """Whether the system is to become active, and whether the current series of requests has enabled it already. In
-        the second case, the series must stop before a new request counts."""
+        """Time of the newest request to enable; None after it has expired."""
+        self._is_enable_pending = False
+        """Whether the system is to become active as soon as it is ready."""
+        self._is_enable_used = False
+        """Whether the system was released during the current series of requests to enable. The series then has no more
+        effect; it must stop before a new request can enable the system."""
 
     def receive_system_order(self, order: SystemOrder, now_ns: int) -> None:
         """Process generation 2's order to the system."""
@@ -53,7 +55,7 @@ class Authority:
             self._requested_ns, self._is_enable_pending, self._is_enable_used = None, False, False
 
     def update(self) -> None:
-        """Release axes that may no longer be enabled, enable those that may be, and set the pedals."""
+        """Release axes that are no longer allowed to be enabled, enable axes that are ready, and set the pedals."""
         state = self._state
         for axis in AXES:
             if not state.actuators[axis].may_be_enabled:
@@ -93,7 +95,10 @@ class Authority:
             self._state.actuators[axis].is_enabled = True
 
     def release(self, axis: Axis, reason: ReleaseReason) -> None:
-        """Release an enabled axis. The watchdog brakes unless the release was commanded or a driver overrides."""
+        """Release an axis if it is enabled.
+
+        The watchdog then brakes, unless the release was commanded or the driver overrides.
+        """
         state = self._state
         if not state.actuators[axis].is_enabled:
             return
@@ -112,22 +117,25 @@ class Authority:
                 self._state.setpoint_rad = state.wheel_rad
 
     def override(self, axis: Axis) -> None:
-        """Release an axis because of the driver, and latch the override."""
+        """Release an axis because the driver acts on it, and latch the override."""
         self.release(axis, ReleaseReason.OVERRIDE)
         self._state.actuators[axis].is_overridden = True
 
     def clear(self, axis: Axis) -> None:
-        """Clear overrides if the driver no longer acts, and the watchdog if a driver has ended its braking."""
+        """Clear the override of an axis if the driver no longer acts on it, and the watchdog if it no longer brakes.
+
+        Generation 2 clears the overrides of all axes.
+        """
         state = self._state
         for cleared_axis in AXES if self._generation.is_one_system else (axis,):
             state.actuators[cleared_axis].is_overridden &= state.actuators[cleared_axis].driver_acts
-        if self._generation.is_one_system:  # its gear command has no CLEAR
+        if self._generation.is_one_system:  # the gear command of generation 2 has no CLEAR
             state.is_gear_overridden = False
         if not state.watchdog_brakes:
             state.watchdog_reason, state.watchdog_axis = ReleaseReason.NONE, None
 
     def _pedals(self) -> tuple[float, float]:
-        """Return throttle and brake, each the maximum of kit and driver; out of gear the throttle has no effect."""
+        """Return throttle and brake, the larger of the kit's and the driver's each. Out of gear the throttle is 0."""
         state, requested = self._state, dict.fromkeys(AXES, 0.0)
         for axis, actuator in state.actuators.items():
             if actuator.is_enabled and actuator.order is not None:

@@ -9,9 +9,9 @@ from lavt.vehicle.software_car.kit import Kit
 
 
 class SoftwareCar:
-    """A by-wire kit whose wheels are the simulator's.
+    """A by-wire kit connected to a simulated car.
 
-    At each of the simulator's steps of 1/240 s the kit reads the car's state and sets its actuation.
+    At each of the simulator's steps of 1/240 s the kit reads the car's state and sets the car's actuation.
     """
 
     def __init__(self, kit: Kit, simulator: Simulator) -> None:
@@ -21,7 +21,7 @@ class SoftwareCar:
         self._applied: Actuation | None = None
 
     def advance(self, to_ns: int) -> list[CanFrame]:
-        """Advance to `to_ns` and return the frames sent until then, in order and without their times."""
+        """Advance to `to_ns` and return the frames sent until then, in order but without their times."""
         frames: list[CanFrame] = []
         while (wake_ns := self.next_wake_ns()) <= to_ns:
             self.events += self.simulator.advance(wake_ns)
@@ -40,5 +40,5 @@ class SoftwareCar:
         return sent
 
     def next_wake_ns(self) -> int:
-        """Return the latest time for the next call of `advance`."""
+        """Return the time by which `advance` should be called next."""
         return min(self.kit.next_wake_ns(), self.simulator.next_wake_ns())

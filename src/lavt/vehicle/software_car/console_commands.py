@@ -1,4 +1,4 @@
-"""Console commands that act on a software car: as its driver, or as a fault."""
+"""Console commands for a software car: actions of its driver, and faults."""
 
 from __future__ import annotations
 
@@ -17,16 +17,18 @@ REMOTE_STATES: Final = {"emergency_stop": 0, "pause": 1, "remote": 2, "control_a
 """States of the remote's switch."""
 HELP: Final = "help"
 MAX_QUOTED = 40
-"""Characters of the input that an error quotes."""
+"""The largest number of characters of the input that an error quotes."""
 
 
 class ConsoleCommand(Struct, frozen=True):
-    """A console command: its argument, its meaning and its effect on a kit."""
+    """A console command."""
 
     argument: str
     """Name of the argument in the help text; empty if the command takes none."""
     meaning: str
+    """What the command does, for the help text."""
     execute: Callable[[Kit, str, int], None]
+    """Executes the command on a kit, given the argument's text and the time in ns."""
 
 
 def parse_number(text: str) -> float:
@@ -57,7 +59,7 @@ def parse_source(text: str) -> tuple[str, float | None]:
 
 
 def scale_speed(kit: Kit, text: str, _: int) -> None:
-    """Scale the source in `SOURCE=FACTOR`. Raises `UserError`."""
+    """Scale the speed of a source, for the text `SOURCE=FACTOR`. Raises `UserError`."""
     source, factor = parse_source(text)
     if factor is None:
         raise UserError(f"scale_speed needs a factor: write {source[:MAX_QUOTED]}=0.5")
@@ -107,7 +109,7 @@ COMMANDS: Final[dict[str, ConsoleCommand]] = {
     ),
     "stick_speed": ConsoleCommand(
         "SOURCE[=M/S]",
-        "report a fixed speed, else the present one: speed, second_speed (generation 2) or wheel_speed",
+        "keep reporting this speed, by default the present one; speed, second_speed (generation 2) or wheel_speed",
         lambda kit, text, _: kit.stick_speed(*parse_source(text)),
     ),
     "scale_speed": ConsoleCommand("SOURCE=FACTOR", "report a multiple of the speed", scale_speed),
@@ -173,7 +175,7 @@ def help_lines() -> list[str]:
 
 
 def execute(kit: Kit, line: str, now_ns: int) -> None:
-    """Execute a command line. Raises `UserError` for an invalid one and changes nothing then."""
+    """Execute a command line. If it is invalid, raises `UserError` and changes nothing."""
     name, _, rest = line.strip().partition(" ")
     text = rest.strip()
     if name not in COMMANDS:

@@ -1,4 +1,4 @@
-"""Events of a software car, with their texts."""
+"""The events of a software car, and their texts."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ class KitEvent(Struct, frozen=True):
 
     mono_ns: int
     kind: str
-    """A key of `OBSERVED`, `event` (of the simulator), `bus`, or the result of a console command: `done`, `rejected`,
-    `help`."""
+    """A key of `OBSERVED`; `event` for an event of the simulator; `bus` for a loss or return of the bus; or the result
+    of a console command: `done`, `rejected` or `help`."""
     text: str
 
 
@@ -45,26 +45,26 @@ GEAR_REJECTIONS: Final = {
 }
 
 
-def enabled(state: KitState) -> tuple[str, ...]:
+def enabled_axes(state: KitState) -> tuple[str, ...]:
     """Return the enabled axes."""
     return tuple(axis for axis in AXES if state.actuators[axis].is_enabled)
 
 
-def overridden(state: KitState) -> tuple[str, ...]:
-    """Return the axes that the driver overrides, and `gear` for the shifter."""
+def overridden_parts(state: KitState) -> tuple[str, ...]:
+    """Return the axes that the driver overrides, and `gear` if the driver overrides the gear."""
     axes = [axis for axis in AXES if state.actuators[axis].is_overridden]
     return (*axes, "gear") if state.is_gear_overridden else tuple(axes)
 
 
 def _enabled_text(state: KitState, previous_axes: Any) -> str:
-    axes = enabled(state)
+    axes = enabled_axes(state)
     if set(axes) > set(previous_axes):
         return f"enabled: {', '.join(axes)}"
     return f"released: {RELEASE_REASONS[state.disengage_reason]}" + (f"; remaining: {', '.join(axes)}" if axes else "")
 
 
 def _overridden_text(state: KitState, _: Any) -> str:
-    parts = overridden(state)
+    parts = overridden_parts(state)
     return f"override by the driver: {', '.join(parts)}" if parts else "override cleared"
 
 
@@ -92,19 +92,19 @@ def _readiness_text(state: KitState, _: Any) -> str:
 
 
 OBSERVED: Final[dict[str, tuple[Callable[[KitState], Hashable], Callable[[KitState, Any], str]]]] = {
-    "enabled": (enabled, _enabled_text),
-    "overridden": (overridden, _overridden_text),
+    "enabled": (enabled_axes, _enabled_text),
+    "overridden": (overridden_parts, _overridden_text),
     "gear": (lambda state: state.gear, _gear_text),
     "rejected": (lambda state: (state.gear_reject, state.gear_order if state.gear_reject else 0), _rejection_text),
     "watchdog": (lambda state: (state.watchdog_reason, state.watchdog_brakes), _watchdog_text),
     "readiness": (lambda state: state.not_ready_reason, _readiness_text),
 }
-"""By kind: a function that returns the observed value of a state, and one that returns the text for its change, given
-the new state and the previous value."""
+"""For each kind of event, two functions. The first one returns the observed value of a state. The second one returns
+the text for a change of this value, given the new state and the previous value."""
 
 
 class StateObserver:
-    """An observer that compares successive states of a kit and returns events for the changes."""
+    """An observer that compares successive states of a kit and makes events of the changes."""
 
     def __init__(self, state: KitState) -> None:
         self._values = [value_of(state) for value_of, _ in OBSERVED.values()]

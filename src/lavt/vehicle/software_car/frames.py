@@ -8,21 +8,22 @@ from lavt.vehicle.can_frame import CanFrame
 
 
 class BitField(Struct, frozen=True):
-    """A bit field of a message; `bit` is its lowest bit, with the message as one little-endian number."""
+    """A bit field of a message."""
 
     name: str
     bit: int
+    """The field's lowest bit, counted in the message as one little-endian number."""
     width: int
     is_signed: bool = False
 
     @property
-    def least(self) -> int:
-        """The smallest value of the field."""
+    def lowest_value(self) -> int:
+        """The lowest value of the field."""
         return -(1 << self.width - 1) if self.is_signed else 0
 
     @property
-    def most(self) -> int:
-        """The largest value of the field."""
+    def highest_value(self) -> int:
+        """The highest value of the field."""
         return (1 << self.width - 1) - 1 if self.is_signed else (1 << self.width) - 1
 
 
@@ -41,7 +42,7 @@ def pack(layout: Layout, values: dict[str, int]) -> bytes:
     """
     remaining, number = dict(values), 0
     for field in layout.fields:
-        clamped = min(max(remaining.pop(field.name, 0), field.least), field.most)
+        clamped = min(max(remaining.pop(field.name, 0), field.lowest_value), field.highest_value)
         number |= (clamped & (1 << field.width) - 1) << field.bit
     if remaining:
         raise KeyError(", ".join(remaining))
@@ -49,12 +50,12 @@ def pack(layout: Layout, values: dict[str, int]) -> bytes:
 
 
 def unpack(layout: Layout, data: bytes) -> dict[str, int]:
-    """Decode a message of the layout's length."""
+    """Decode a message, whose length must be that of the layout."""
     number = int.from_bytes(data, "little")
     values: dict[str, int] = {}
     for field in layout.fields:
         bits = number >> field.bit & (1 << field.width) - 1
-        values[field.name] = bits - (1 << field.width) if field.is_signed and bits > field.most else bits
+        values[field.name] = bits - (1 << field.width) if field.is_signed and bits > field.highest_value else bits
     return values
 
 
@@ -69,12 +70,15 @@ def crc8(data: bytes) -> int:
 
 
 def checksum(identifier: int, data: bytes, *, is_extended: bool = False) -> int:
-    """Return the CRC-8 over an identifier, high byte first (2 bytes, 4 if extended), and the data before the CRC."""
+    """Return the CRC-8 over an identifier and `data`, the bytes before the checksum.
+
+    The identifier has 2 bytes, or 4 if it is extended, the high byte first.
+    """
     return crc8(identifier.to_bytes(4 if is_extended else 2, "big") + data)
 
 
 def with_crc(identifier: int, data: bytes) -> bytes:
-    """Write the checksum into the last byte of a message with an 11-bit identifier."""
+    """Return a message with an 11-bit identifier whose last byte is replaced by the checksum."""
     return data[:-1] + bytes([checksum(identifier, data[:-1])])
 
 

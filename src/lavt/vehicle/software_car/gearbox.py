@@ -1,4 +1,4 @@
-"""The gearbox: it executes gear orders or rejects them with a reason."""
+"""The gearbox, which executes gear orders or rejects them with a reason."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Final
 from lavt.vehicle.software_car.state import OVERRIDE_PEDAL, Gear, GearOrder, GearRejection, KitState
 
 GEARS: Final = {Gear.PARK, Gear.NEUTRAL, Gear.DRIVE}
-"""Our choice: the simulator's car has no reverse and no low gear."""
+"""The gears of the car. Our choice: the simulator's car has no reverse and no low gear."""
 
 
 def shift(state: KitState, order: GearOrder) -> None:
@@ -16,13 +16,13 @@ def shift(state: KitState, order: GearOrder) -> None:
         return
     if order.is_clearing:
         state.is_gear_overridden = False
-    state.gear_order, state.gear_reject = order.gear, rejection(state, order.gear)
+    state.gear_order, state.gear_reject = order.gear, rejection_reason(state, order.gear)
     if order.gear != Gear.NONE and state.gear_reject == GearRejection.NONE:
         state.gear = Gear(order.gear)
 
 
-def rejection(state: KitState, gear: int) -> GearRejection:
-    """Return why a gear cannot be engaged now."""
+def rejection_reason(state: KitState, gear: int) -> GearRejection:
+    """Return why a gear cannot be engaged now; `GearRejection.NONE` if it can."""
     if gear in {Gear.NONE, state.gear}:
         return GearRejection.NONE
     if state.gear_faults:

@@ -1,4 +1,4 @@
-"""The messages of Dataspeed's generation 1, from the kit's side."""
+"""The messages of Dataspeed's kits of generation 1: decoding of commands, and encoding of reports."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.software_car.frames import BitField, Layout, pack, unpack
 from lavt.vehicle.software_car.mechanics import (
     Mechanics,
+    clamp,
+    commanded_wheel_rad,
     hundredths_of_kmh,
     tenths_of_degree,
-    wheel_angle,
-    within,
 )
 from lavt.vehicle.software_car.state import AXES, Axis, AxisOrder, GearOrder, KitState, ReleaseReason, SystemOrder
 
@@ -21,7 +21,7 @@ FULL_TORQUE_NM = 3412
 UNKNOWN: Final = -0x8000
 """Value of a 16-bit field whose quantity is unknown."""
 CLEARING_LENGTH = 4
-"""A command of this length in bytes has no counter and only clears: an override, and the watchdog."""
+"""Length in bytes of a command without a counter, which can only clear an override and the watchdog."""
 
 PEDAL_COMMAND = (
     BitField("command", 0, 16),
@@ -101,10 +101,11 @@ FAULTS: dict[str, tuple[str, ...]] = {
     "throttle": ("FLT1", "FLT2", "FLTPWR"),
     "gear": ("FLTBUS",),
 }
-"""For each part, the bits that report its faults. FLTWDC is not among them: the watchdog sets it."""
+"""For each part, the bits that report its faults. FLTWDC is not among them, because the watchdog sets it."""
 
 PEDAL_TRAVEL = {"brake": (0.15, 0.50), "throttle": (0.15, 0.80)}
-"""Start and end of a pedal's travel, as fractions of the full command (CMD_TYPE 1)."""
+"""For commands of type 1 (CMD_TYPE), the fractions of the full command at which a pedal is released and fully pressed.
+"""
 
 WATCHDOG_SOURCES: dict[tuple[Axis, ReleaseReason], int] = {
     (axis, reason): 1 + 4 * axis_index + reason_index
@@ -113,21 +114,21 @@ WATCHDOG_SOURCES: dict[tuple[Axis, ReleaseReason], int] = {
         (ReleaseReason.COUNTER, ReleaseReason.DISABLED, ReleaseReason.TIMEOUT, ReleaseReason.FAULT)
     )
 }
-"""Codes for why the watchdog tripped (WDCSRC). That there are codes from 1 to 15, and which kinds of reasons they are
-for, is published; which code is for which axis and reason is our choice."""
+"""The code that reports why the watchdog tripped (WDCSRC), for each axis and reason. It is published that the codes are
+1 to 15, and for which kinds of reasons they are. Which code stands for which axis and reason is our choice."""
 
 
 def pedal_fraction(axis: Axis, command_type: int, command: int, mechanics: Mechanics) -> float | None:
-    """Return the requested fraction of a pedal, or None for a command type that the kit does not have."""
+    """Return the requested fraction of a pedal, or None for a command type that the kit does not know."""
     if command_type == 1:
         released, full = PEDAL_TRAVEL[axis]
-        return within((command / FULL_PEDAL - released) / (full - released), 0.0, 1.0)
+        return clamp((command / FULL_PEDAL - released) / (full - released), 0.0, 1.0)
     if command_type == 2:
         return command / FULL_PEDAL
     if axis == "brake" and command_type == 3:
-        return within(command / FULL_TORQUE_NM, 0.0, 1.0)
+        return clamp(command / FULL_TORQUE_NM, 0.0, 1.0)
     if axis == "brake" and command_type == 6:
-        return within(min(command * 0.001, 10.0) / mechanics.max_braking_mps2, 0.0, 1.0)
+        return clamp(min(command * 0.001, 10.0) / mechanics.max_braking_mps2, 0.0, 1.0)
     return None
 
 
@@ -149,7 +150,7 @@ def parse_order(frame: CanFrame, mechanics: Mechanics, _: bool) -> AxisOrder | G
     requested = unpack(layout, frame.data)
     target: float | None
     if axis == "steering":
-        target = wheel_angle(requested["command"]) if requested["type"] == 0 else None
+        target = commanded_wheel_rad(requested["command"]) if requested["type"] == 0 else None
     else:
         target = pedal_fraction(axis, requested["type"], requested["command"], mechanics)
     return AxisOrder(
@@ -202,13 +203,13 @@ def throttle_report(state: KitState, _: Mechanics) -> bytes:
 
 
 def steering_report(state: KitState, _: Mechanics) -> bytes:
-    """Return the steering report, which has the car's speed as well."""
+    """Return the steering report, which also has the car's speed."""
     order = state.actuators["steering"].order
     values = {
         "angle": UNKNOWN if "angle" in state.invalid else tenths_of_degree(state.wheel_rad),
         "command": tenths_of_degree(order.target) if order else 0,
         "speed": UNKNOWN if "speed" in state.invalid else hundredths_of_kmh(state.reported_mps("speed")),
-        "torque": round(within(state.driver_torque_nm / 0.0625, -127, 127)),
+        "torque": round(clamp(state.driver_torque_nm / 0.0625, -127, 127)),
         **flag_fields(state, "steering"),
     }
     return pack(STEERING_REPORT, values)
@@ -228,7 +229,7 @@ def gear_report(state: KitState, _: Mechanics) -> bytes:
 
 
 def wheel_speeds(state: KitState, mechanics: Mechanics) -> bytes:
-    """Return the wheel speeds, which are all equal."""
+    """Return the report of the wheel speeds, which are all equal."""
     speed = (
         UNKNOWN
         if "wheel_speed" in state.invalid
@@ -238,7 +239,7 @@ def wheel_speeds(state: KitState, mechanics: Mechanics) -> bytes:
 
 
 SPEED_MESSAGES: Final = {"speed": 0x065, "wheel_speed": 0x06A}
-"""The message of each source of speed."""
+"""For each source of speed, the identifier of the message that reports it."""
 
 REPORTS: dict[int, tuple[int, Callable[[KitState, Mechanics], bytes]]] = {
     0x061: (20, brake_report),
@@ -248,4 +249,4 @@ REPORTS: dict[int, tuple[int, Callable[[KitState, Mechanics], bytes]]] = {
     0x06A: (10, wheel_speeds),
 }
 """By identifier: the period in milliseconds, and the function that encodes the report. The periods are those of
-generation 2, because none are published for generation 1."""
+generation 2, because no periods are published for generation 1."""

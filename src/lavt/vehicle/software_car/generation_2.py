@@ -1,4 +1,4 @@
-"""The messages of Dataspeed's generation 2, from the kit's side."""
+"""The messages of Dataspeed's kits of generation 2: decoding of commands, and encoding of reports."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from lavt.vehicle.software_car.generation_2_layouts import (
 )
 from lavt.vehicle.software_car.mechanics import (
     Mechanics,
+    clamp,
+    commanded_wheel_rad,
     hundredths_of_kmh,
     tenths_of_degree,
-    wheel_angle,
-    within,
 )
 from lavt.vehicle.software_car.state import (
     AXES,
@@ -33,20 +33,21 @@ from lavt.vehicle.software_car.state import (
 )
 
 USER_SET, REMOTE_SET = 0x210, 0x200
+"""The first identifier of each command set."""
 PARTS: Final[tuple[Axis | None, ...]] = ("steering", "brake", "throttle", None)
-"""The parts that a set's commands are for, by the offset from the set's identifier; the last is the gearbox."""
+"""The parts to which the successive identifiers of a command set belong; None is the gearbox."""
 SYSTEM_COMMAND_ID = 0x216
 UNKNOWN: Final = -0x8000
 """Value of a 16-bit field whose quantity is unknown."""
 UNKNOWN_ANGLE: Final = -0x2000
-"""Value of the 14-bit field of an unknown steering wheel angle."""
+"""Value of the 14-bit field of the steering wheel's angle if the angle is unknown."""
 
 ALL_OR_NONE = 2
 """Code of the third published mode of synchronisation; the code is our choice."""
 ANGLE, PERCENT = 2, 14
-"""The command types that the kit accepts; more are published."""
+"""The command types that the kit accepts; more types are published."""
 FULL_PEDAL = {"brake": 10_000, "throttle": 4_000}
-"""A full pedal in steps of percent commands: 0.01 % and 0.025 %."""
+"""The value of a percent command for a full pedal; a step is 0.01 % of the brake and 0.025 % of the throttle."""
 
 FAULTS: dict[str, tuple[str, ...]] = {
     "steering": ("fault",),
@@ -57,7 +58,7 @@ FAULTS: dict[str, tuple[str, ...]] = {
 
 
 def parse_order(frame: CanFrame, mechanics: Mechanics, is_remote: bool) -> AxisOrder | GearOrder | SystemOrder | None:
-    """Parse an order, or return None for a frame that is not for the kit or belongs to the other set."""
+    """Parse an order, or return None for a frame that is not for the kit or belongs to the other command set."""
     if frame.is_extended:
         return None
     if frame.identifier == SYSTEM_COMMAND_ID and len(frame.data) == SYSTEM_COMMAND.length:
@@ -74,9 +75,9 @@ def parse_order(frame: CanFrame, mechanics: Mechanics, is_remote: bool) -> AxisO
     if axis is None:
         return GearOrder(has_valid_crc(frame), requested["command"])
     if axis == "steering":
-        is_known, target = requested["type"] == ANGLE, wheel_angle(requested["command"])
+        is_known, target = requested["type"] == ANGLE, commanded_wheel_rad(requested["command"])
     else:
-        is_known, target = requested["type"] == PERCENT, within(requested["command"] / FULL_PEDAL[axis], 0.0, 1.0)
+        is_known, target = requested["type"] == PERCENT, clamp(requested["command"] / FULL_PEDAL[axis], 0.0, 1.0)
     return AxisOrder(
         axis,
         is_valid=has_valid_crc(frame),
@@ -166,7 +167,7 @@ def velocity_report(state: KitState, _: Mechanics) -> dict[str, int]:
 
 
 def wheel_speeds(state: KitState, mechanics: Mechanics) -> dict[str, int]:
-    """Return the wheel speeds, which are all equal."""
+    """Return the fields of the report of wheel speeds, which are all equal."""
     speed = (
         UNKNOWN
         if "wheel_speed" in state.invalid
@@ -176,31 +177,31 @@ def wheel_speeds(state: KitState, mechanics: Mechanics) -> dict[str, int]:
 
 
 def remote_report(state: KitState, _: Mechanics) -> dict[str, int]:
-    """Return the fields of the remote report: the remote's switch decides who may command."""
+    """Return the fields of the remote report: the state of the remote's switch."""
     return {"state": state.remote_state}
 
 
 def report_encoder(
-    identifier: int, values: Callable[[KitState, Mechanics], dict[str, int]]
+    identifier: int, make_fields: Callable[[KitState, Mechanics], dict[str, int]]
 ) -> Callable[[KitState, Mechanics], bytes]:
-    """Return a function that encodes a report, with counter and checksum if there is room."""
+    """Return a function that encodes a report, with a counter and a checksum if there is room."""
     layout = REPORT_LAYOUTS[identifier]
     if layout == WHEEL_SPEEDS:  # no room: the four speeds take all 8 bytes
-        return lambda state, mechanics: pack(layout, values(state, mechanics))
+        return lambda state, mechanics: pack(layout, make_fields(state, mechanics))
 
     def report(state: KitState, mechanics: Mechanics) -> bytes:
         count = {"count": state.sent.get(identifier, 0) % 16}
-        return with_crc(identifier, pack(layout, values(state, mechanics) | count))
+        return with_crc(identifier, pack(layout, make_fields(state, mechanics) | count))
 
     return report
 
 
 SPEED_MESSAGES: Final = {"speed": 0x107, "second_speed": 0x107, "wheel_speed": 0x2A4}
-"""The message of each source of speed."""
+"""For each source of speed, the identifier of the message that reports it."""
 
 REPORTS: dict[int, tuple[int, Callable[[KitState, Mechanics], bytes]]] = {
-    identifier: (period_ms, report_encoder(identifier, values))
-    for identifier, (period_ms, values) in {
+    identifier: (period_ms, report_encoder(identifier, make_fields))
+    for identifier, (period_ms, make_fields) in {
         0x100: (10, steering_report),
         0x101: (20, lambda state, _: pedal_report("brake", state, state.driver_brake, state.brake)),
         0x102: (20, lambda state, _: pedal_report("throttle", state, state.driver_throttle, state.throttle)),

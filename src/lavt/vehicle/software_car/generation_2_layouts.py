@@ -1,8 +1,8 @@
 """Message layouts of generation 2.
 
-The published sources (docs/can.md) give the fields of every command in order, most of them with widths. Of reports they
-give only the contents. Positions of our own choice are listed in `UNVERIFIED`: they were never compared with a real
-kit. Reports have a counter and a checksum where there is room, which is our choice, too.
+The published sources (docs/can.md) give the fields of every command in order, and most widths. Of reports they give
+only the contents. `UNVERIFIED` lists the positions that we chose: they were never compared with a real kit. It is also
+our choice that reports have a counter and a checksum if there is room.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ UNVERIFIED: Final = {
     0x2A4: "same layout as in generation 1",
     0x2D8: "our choice: all positions",
 }
-"""Assumptions and choices of our own, by identifier."""
+"""Our assumptions and choices, by identifier of the message."""
 
 COMMAND_FIELDS = (
     BitField("type", 16, 4),

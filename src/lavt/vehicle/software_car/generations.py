@@ -1,4 +1,4 @@
-"""The differences between the kit's two generations."""
+"""The differences between the two generations of the kit."""
 
 from __future__ import annotations
 
@@ -17,15 +17,17 @@ class Generation(Struct, frozen=True):
     """The messages and rules of one generation of the kit."""
 
     parse_order: Callable[[CanFrame, Mechanics, bool], AxisOrder | GearOrder | SystemOrder | None]
+    """Parses an order; the last argument is whether the remote command set is accepted, not the user set."""
     reports: dict[int, tuple[int, Callable[[KitState, Mechanics], bytes]]]
     """By identifier: the period in milliseconds, and the function that encodes the report."""
     faults: dict[str, tuple[str, ...]]
+    """For each part, the names of its faults."""
     speed_messages: dict[str, int]
-    """The identifier of the message of each source of speed."""
+    """For each source of speed, the identifier of the message that reports it."""
     follows: Callable[[int, int], bool]
-    """Whether the second counter is a valid successor of the first."""
+    """Returns whether the second counter is a valid successor of the first."""
     is_one_system: bool
-    """All axes are enabled and released together, and enabled only after an order to the system."""
+    """Whether all axes are enabled and released together, and enabled only after an order to the system."""
 
 
 GENERATIONS: Final = {

@@ -1,4 +1,4 @@
-"""A bus within the process to a software car, for virtual time."""
+"""A CAN bus to a software car in the same process, for virtual time."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from lavt.vehicle.can_frame import BusGone, CanFrame, ReceivedCanFrame
 from lavt.vehicle.software_car.car import SoftwareCar
 
 FRAME_NS: Final = 250 * NS_PER_US
-"""Transmission time of a frame of 8 data bytes at 500 kbit/s. Such a frame has 111 to 135 bits, depending on its stuff
-bits; assumed are 125."""
+"""Transmission time of a frame of 8 data bytes at 500 kbit/s. Depending on its stuff bits such a frame has between 111
+and 135 bits; 125 are assumed."""
 
 
 class BusDirection:
-    """One direction of a bus. Frames are transmitted one at a time and take `delay_ns` each."""
+    """One direction of a bus. Frames are transmitted one at a time, each in `delay_ns`."""
 
     def __init__(self, delay_ns: int) -> None:
         self._delay_ns, self._free_ns = delay_ns, 0
@@ -49,10 +49,10 @@ class BusDirection:
 
 
 class InProcessPort:
-    """A `BusPort` to a software car in the same process, which advances lazily when the port is used.
+    """A `BusPort` to a software car in the same process. The car advances lazily, when the port is used.
 
-    It reads no clock: the same calls give the same frames at the same times, and the frequency of calls does not affect
-    the car. Times must not decrease.
+    The port reads no clock: the same calls give the same frames at the same times, and the frequency of calls does not
+    affect the car. Times must not decrease.
     """
 
     def __init__(self, car: SoftwareCar, *, delay_ns: int = FRAME_NS) -> None:
@@ -63,21 +63,22 @@ class InProcessPort:
         self._returned_events = 0
         """Number of the car's events that were returned."""
         self._cut_reason = ""
+        """Why the bus is cut; empty if it is not."""
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """Empty: no frame gets lost."""
+        """Empty, because no frame gets lost."""
         return {}
 
     def send(self, frames: Sequence[CanFrame], made_ns: int) -> int:
-        """Send frames made at `made_ns` and return their number. Raises `BusGone` while the bus is cut."""
+        """Send frames made at `made_ns` and return their number. Raises `BusGone` if the bus is cut."""
         if self._cut_reason:
             raise BusGone(self._cut_reason)
         self._to_car.put(frames, max(made_ns, self._now_ns))
         return len(frames)
 
     def take(self, now_ns: int) -> list[ReceivedCanFrame]:
-        """Advance the car and return the frames received from it. Raises `BusGone` while the bus is cut."""
+        """Advance the car and return the frames received from it. Raises `BusGone` if the bus is cut."""
         self._advance(now_ns)
         if self._cut_reason:
             raise BusGone(self._cut_reason)
@@ -89,7 +90,7 @@ class InProcessPort:
         return self.car.kit.next_wake_ns() if last_ns is None else last_ns
 
     def close(self) -> None:
-        """Do nothing: there is no connection to close."""
+        """Do nothing, because there is no connection to close."""
 
     def truth(self, now_ns: int) -> tuple[GroundTruth, list[VehicleEvent]]:
         """Advance the car, and return its ground truth and its events since the last call."""
@@ -98,13 +99,13 @@ class InProcessPort:
         return self.car.simulator.ground_truth(), self.car.events[start:]
 
     def cut(self, reason: str) -> None:
-        """Cut the bus and drop all frames in transit; with an empty reason, restore it."""
+        """Cut the bus, or restore it if `reason` is empty; in both cases drop all frames in transit."""
         self._cut_reason = reason
         self._to_car.clear()
         self._from_car.clear()
 
     def _advance(self, now_ns: int) -> None:
-        """Advance the car from wake time to wake time, so that each frame is sent at its own time."""
+        """Advance the car from wake time to wake time, so that each frame is sent when it is due."""
         while True:
             arrival_ns, wake_ns = self._to_car.next_arrival_ns(), self.car.next_wake_ns()
             at_ns = wake_ns if arrival_ns is None else min(arrival_ns, wake_ns)

@@ -1,7 +1,7 @@
-"""A by-wire kit, sans-IO: it takes frames and times, and returns frames and the actuation of the wheels.
+"""A by-wire kit without I/O: it takes frames and times, and returns frames and the actuation of the wheels.
 
-It behaves as the published sources (docs/can.md) describe kits. Where they say nothing, it behaves so that an adapter's
-mistakes show best; such behaviour is marked as our choice.
+The kit behaves as the published sources (docs/can.md) describe. If they say nothing, it behaves so that mistakes of an
+adapter are easy to notice; such behaviour is marked as our choice.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.software_car.authority import COMMAND_TIMEOUT_NS, CONTROL_ALLOWED, REMOTE, Authority
 from lavt.vehicle.software_car.gearbox import GEARS, shift
 from lavt.vehicle.software_car.generations import GENERATIONS
-from lavt.vehicle.software_car.mechanics import Mechanics, within
+from lavt.vehicle.software_car.mechanics import Mechanics, clamp
 from lavt.vehicle.software_car.state import (
     AXES,
     OVERRIDE_PEDAL,
@@ -28,7 +28,7 @@ from lavt.vehicle.software_car.state import (
 )
 
 OVERRIDE_TORQUE_NM: Final = 2.0
-"""Our choice: a torque of the driver on the steering wheel of at least this value is an override."""
+"""Our choice: the smallest torque of the driver on the steering wheel that is an override."""
 INHIBIT_REASONS: Final = {
     "seat belt": ReleaseReason.SEAT_BELT,
     "door": ReleaseReason.DOOR,
@@ -49,8 +49,8 @@ def check_known(name: str, names: set[str], kind: str) -> str:
 class Kit:
     """A by-wire kit. `now_ns` is a time of any monotonic clock and must not decrease.
 
-    `commands` selects the set of commands that generation 2 accepts. Without `has_watchdog` the kit never brakes by
-    itself, and generation 1 does not check counters.
+    `commands` selects the command set that generation 2 accepts. Without `has_watchdog` the kit never brakes on its
+    own, and generation 1 does not check counters.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class Kit:
     # Frames from the bus.
 
     def receive(self, frame: CanFrame, now_ns: int) -> None:
-        """Process a frame from the bus; drop it if it is not for the kit."""
+        """Process a frame from the bus, or ignore it if it is not for the kit."""
         self._advance(now_ns)
         if self._is_bus_off:
             return
@@ -90,7 +90,7 @@ class Kit:
         self._authority.update()
 
     def _receive_axis_order(self, order: AxisOrder) -> None:
-        """Process an axis's order if its checksum and counter are right."""
+        """Process an order to an axis; release the axis if the order's checksum or counter is wrong."""
         actuator = self.state.actuators[order.axis]
         if not order.is_valid:
             actuator.is_crc_bad = True
@@ -118,7 +118,7 @@ class Kit:
     # Time.
 
     def _advance(self, now_ns: int) -> None:
-        """Advance to `now_ns`: let orders time out, and turn the steering wheel."""
+        """Advance to `now_ns`: release axes whose orders time out, and turn the steering wheel."""
         state = self.state
         for deadline_ns, axis in sorted(deadline for deadline in self._deadlines() if deadline[0] <= now_ns):
             actuator = state.actuators[axis]
@@ -131,17 +131,17 @@ class Kit:
         self._turn(now_ns)
 
     def _deadlines(self) -> list[tuple[int, Axis]]:
-        """Return when each axis's order times out, with the axis."""
+        """Return for each axis with an order when this order times out, and the axis."""
         actuators = self.state.actuators
         return [(actuators[axis].received_ns + COMMAND_TIMEOUT_NS, axis) for axis in AXES if actuators[axis].order]
 
     def _turn(self, to_ns: int) -> None:
-        """Turn the steering wheel towards its target, at most at the ordered rate."""
+        """Turn the setpoint of the steering wheel towards the ordered angle, at most at the ordered rate."""
         steering, passed_s = self.state.actuators["steering"], (to_ns - self._now_ns) / NS_PER_S
         self._now_ns = to_ns
         if steering.is_enabled and steering.order is not None:
             limit_rad = steering.order.rate_radps * passed_s
-            self.state.setpoint_rad += within(steering.order.target - self.state.setpoint_rad, -limit_rad, limit_rad)
+            self.state.setpoint_rad += clamp(steering.order.target - self.state.setpoint_rad, -limit_rad, limit_rad)
 
     def next_wake_ns(self) -> int:
         """Return the time of the next report or timeout."""
@@ -150,7 +150,7 @@ class Kit:
     # Outputs.
 
     def frames_due(self, now_ns: int) -> list[CanFrame]:
-        """Return the reports that are due. If the call is late by several periods, a report is returned only once."""
+        """Return the reports that are due. If the call is several periods late, each report is returned only once."""
         self._advance(now_ns)
         if now_ns < self._next_due_ns:
             return []
@@ -169,7 +169,7 @@ class Kit:
         return [] if self._is_bus_off else frames
 
     def actuation(self, now_ns: int) -> Actuation:
-        """Return the actuation of the wheels. While steering is not enabled, the wheel keeps its angle (our choice)."""
+        """Return the actuation of the wheels. If steering is not enabled, they keep their angle (our choice)."""
         self._advance(now_ns)
         brake = 1.0 if self.state.gear == Gear.PARK else self.state.brake * self.state.brake_share
         return Actuation(self.state.setpoint_rad / self._mechanics.steering_ratio, self.state.throttle, brake)
@@ -191,13 +191,13 @@ class Kit:
     def driver_brakes(self, fraction: float, now_ns: int) -> None:
         """Set the driver's brake pedal."""
         self._advance(now_ns)
-        self.state.driver_brake = within(fraction, 0.0, 1.0)
+        self.state.driver_brake = clamp(fraction, 0.0, 1.0)
         self._set_driver_acts("brake", fraction >= OVERRIDE_PEDAL)
 
     def driver_throttles(self, fraction: float, now_ns: int) -> None:
         """Set the driver's throttle pedal."""
         self._advance(now_ns)
-        self.state.driver_throttle = within(fraction, 0.0, 1.0)
+        self.state.driver_throttle = clamp(fraction, 0.0, 1.0)
         self._set_driver_acts("throttle", fraction >= OVERRIDE_PEDAL)
 
     def _set_driver_acts(self, axis: Axis, acts: bool) -> None:
@@ -228,9 +228,9 @@ class Kit:
         check_known(name, {f"{part}.{bit}" for part, bits in faults for bit in bits}, "fault")
         self._advance(now_ns)
         part, bit = name.split(".")
-        faults_of: dict[str, set[str]] = {"gear": self.state.gear_faults}
-        faults_of |= {axis: actuator.faults for axis, actuator in self.state.actuators.items()}
-        (faults_of[part].add if is_set else faults_of[part].discard)(bit)
+        faults_by_part: dict[str, set[str]] = {"gear": self.state.gear_faults}
+        faults_by_part |= {axis: actuator.faults for axis, actuator in self.state.actuators.items()}
+        (faults_by_part[part].add if is_set else faults_by_part[part].discard)(bit)
         self._authority.update()
 
     def set_unknown(self, name: str, *, is_unknown: bool = True) -> None:
@@ -239,13 +239,16 @@ class Kit:
         (self.state.invalid.add if is_unknown else self.state.invalid.discard)(name)
 
     def stick_speed(self, source: str, speed_mps: float | None = None) -> None:
-        """Report a fixed speed, or the present one. Raises `UserError` with the known sources."""
+        """Let a source report the same speed all the time, by default the present one.
+
+        Raises `UserError` with the known sources.
+        """
         faults = self.state.sensor_faults
         self._check_source(source)
         faults.stuck_mps[source] = self.state.reported_mps(source) if speed_mps is None else speed_mps
 
     def scale_speed(self, source: str, factor: float) -> None:
-        """Report a multiple of the speed. Raises `UserError` with the known sources."""
+        """Let a source report a multiple of the speed. Raises `UserError` with the known sources."""
         self._check_source(source)
         self.state.sensor_faults.factors[source] = factor
 
@@ -261,7 +264,7 @@ class Kit:
 
     def weaken_brake(self, share: float) -> None:
         """Let only a share of the brake's force reach the wheels; 1 removes the fault."""
-        self.state.brake_share = within(share, 0.0, 1.0)
+        self.state.brake_share = clamp(share, 0.0, 1.0)
 
     def _check_source(self, source: str) -> None:
         check_known(source, set(self._generation.speed_messages), "source of speed of this kit")
@@ -276,7 +279,7 @@ class Kit:
         self._authority.update()
 
     def switch_remote(self, remote_state: int, now_ns: int) -> None:
-        """Set the remote's switch: 0 emergency stop, 1 pause, 2 remote, 3 control allowed."""
+        """Set the switch of the remote: 0 emergency stop, 1 pause, 2 remote, 3 control allowed."""
         self._advance(now_ns)
         self.state.remote_state = remote_state
         self._authority.update()

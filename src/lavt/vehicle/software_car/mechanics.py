@@ -17,14 +17,17 @@ class Mechanics(Struct, frozen=True):
     steering_ratio: float = 14.8
     """Steering wheel angle divided by road wheel angle."""
     max_braking_mps2: float = 6.0
-    """Deceleration at full brake: the simulator's."""
+    """Deceleration at full brake, that of the simulator's car."""
     tyre_radius_m: float = 0.33
-    """Our choice: not published."""
+    """Our choice, because it is not published."""
     steering_rate_step_deg: float = 4.0
-    """Step of generation 1's steering rate, in deg/s; 2 with old firmware."""
+    """Step of the steering rate of generation 1, in deg/s; 2 with old firmware."""
 
     def rate_radps(self, steps: int, step_deg: float) -> float:
-        """Return a command's rate of the steering wheel; 0 means the maximum (our choice: the kit's default)."""
+        """Return the rate of the steering wheel that a command requests in steps; 0 steps mean the largest rate.
+
+        That 0 steps, the kit's default, mean the largest rate is our choice.
+        """
         return min(math.radians(steps * step_deg), MAX_WHEEL_RATE_RADPS) if steps else MAX_WHEEL_RATE_RADPS
 
     def tyre_radps(self, speed_mps: float) -> float:
@@ -32,21 +35,21 @@ class Mechanics(Struct, frozen=True):
         return speed_mps / self.tyre_radius_m
 
 
-def within(number: float, least: float, most: float) -> float:
-    """Clamp a number to a range."""
-    return min(max(number, least), most)
+def clamp(number: float, lowest: float, highest: float) -> float:
+    """Return the number of a range that is nearest to `number`."""
+    return min(max(number, lowest), highest)
 
 
-def wheel_angle(tenths_of_degree: int) -> float:
-    """Return a commanded steering wheel angle in rad, within the limit."""
-    return within(math.radians(tenths_of_degree / 10), -MAX_WHEEL_RAD, MAX_WHEEL_RAD)
+def commanded_wheel_rad(command: int) -> float:
+    """Return the steering wheel angle of a command in tenths of a degree, limited to `MAX_WHEEL_RAD`."""
+    return clamp(math.radians(command / 10), -MAX_WHEEL_RAD, MAX_WHEEL_RAD)
 
 
 def tenths_of_degree(angle_rad: float) -> int:
-    """Return an angle in the reports' unit."""
+    """Return an angle in the unit of reports."""
     return round(math.degrees(angle_rad) * 10)
 
 
 def hundredths_of_kmh(speed_mps: float) -> int:
-    """Return a speed in the reports' unit."""
+    """Return a speed in the unit of reports."""
     return round(speed_mps * 360)

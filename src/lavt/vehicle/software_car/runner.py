@@ -1,4 +1,4 @@
-"""A software car in real time, sans-IO: the caller owns the bus, the console and the clock."""
+"""A software car in real time, without I/O: the caller opens the bus and the console, and reads the clock."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from lavt.vehicle.software_car.event_log import KitEvent, StateObserver
 
 
 class SoftwareCarRunner:
-    """A loop that advances a software car and connects it to a bus port.
+    """A runner that advances a software car and connects it to a bus port.
 
-    Call `step` at each `next_wake_ns`, or later: however late the call is, the car takes each of its steps at the time
-    of that step. A received frame is processed at its arrival time. A frame to send is given to the port with the time
-    at which it was due, so that the port can reject it if it is too old.
+    Call `step` at each `next_wake_ns`, or later: a late call makes all steps since the last call, each with its due
+    time. A received frame is processed at its arrival time. A frame that the car sends is given to the port with the
+    time at which it was due, so that the port can reject a frame that is too old.
     """
 
     def __init__(self, car: SoftwareCar, port: BusPort, *, start_ns: int) -> None:
         self._car, self._port = car, port
         self._now_ns = self._truth_ns = start_ns
         self._logged_events = self._sent_events = 0
-        """Number of the car's events that are in the log, and in the truth datagrams."""
+        """Number of the car's events that are in the log, and number of those that are in truth datagrams."""
         self._sender = TruthSender(start_ns)
         self._observer = StateObserver(car.kit.state)
         self._is_lost, self._lost_ns = False, 0
@@ -47,7 +47,7 @@ class SoftwareCarRunner:
         self._advance(now_ns)
 
     def next_wake_ns(self) -> int:
-        """Return the latest time for the next call of `step`."""
+        """Return the time by which `step` should be called next."""
         return self._car.next_wake_ns()
 
     def execute(self, line: str, now_ns: int) -> None:
@@ -68,7 +68,7 @@ class SoftwareCarRunner:
         self._log_changes(now_ns)
 
     def make_truth_datagram(self) -> bytes | None:
-        """Return a datagram with the ground truth for the server, or None if it has not changed."""
+        """Return a datagram with the ground truth for the server, or None if the ground truth has not changed."""
         truth = self._car.simulator.ground_truth()
         if truth.mono_ns <= self._truth_ns:
             return None
@@ -82,7 +82,7 @@ class SoftwareCarRunner:
         return events
 
     def _advance(self, to_ns: int) -> None:
-        """Advance from wake time to wake time, so that each frame is sent with its own time."""
+        """Advance from wake time to wake time, so that each frame is sent with the time at which it was due."""
         while (wake_ns := self._car.next_wake_ns()) <= to_ns:
             frames = self._car.advance(wake_ns)
             if frames:
@@ -91,7 +91,7 @@ class SoftwareCarRunner:
         self._now_ns = to_ns
 
     def _log_changes(self, now_ns: int) -> None:
-        """Add events for the changes since the last call."""
+        """Add an event for each change since the last call."""
         self._events += self._observer.observe(self._car.kit.state, now_ns)
         for event in self._car.events[self._logged_events :]:
             self._events.append(KitEvent(event.mono_ns, "event", f"{event.kind}: {event.detail}"))

@@ -1,6 +1,7 @@
-"""The state of a by-wire kit: the commands that it received (here called orders), its actuators, the driver, the car.
+"""The state of a by-wire kit: its actuators, its gearbox, the driver, and the car.
 
-Angles and torques are those of the steering wheel, left positive; pedals are fractions, 0 to 1.
+An order is a command that the kit received. Angles and torques are those of the steering wheel, left positive; pedals
+are fractions, 0 to 1.
 """
 
 from __future__ import annotations
@@ -17,10 +18,9 @@ Axis = Literal["steering", "brake", "throttle"]
 AXES: Final[tuple[Axis, ...]] = ("steering", "brake", "throttle")
 
 STATIONARY_BELOW_MPS = 0.1
-"""Our choice: below this speed the car is stationary."""
+"""Our choice: the car is stationary if it is slower than this."""
 OVERRIDE_PEDAL: Final = 0.05
-"""Our choice: a pedal pressed at least this far, as a fraction, is an override. To shift, the brake must be pressed
-this far, too."""
+"""Our choice: the smallest fraction of a pedal that is an override, and the smallest brake that allows shifting."""
 
 
 class Gear(IntEnum):
@@ -46,7 +46,7 @@ class GearRejection(IntEnum):
 
 
 class SystemState(IntEnum):
-    """State of the system in generation 2."""
+    """The state of a kit of generation 2 as a whole."""
 
     MANUAL = 0
     READY = 1
@@ -57,9 +57,9 @@ class SystemState(IntEnum):
 class ReleaseReason(IntEnum):
     """Why a kit released its axes, or is not ready.
 
-    For the reasons up to the lockouts, the names are published but not the codes; here the codes follow the order of
+    The names of the reasons up to the lockouts are published, but not their codes; here the codes follow the order of
     the names. The reasons after the lockouts are internal to the kit and not reported. Code 10 is missing: the tenth
-    published reason, a delay before engaging again, is not simulated, because the length of the delay is not published.
+    published reason is a delay before engaging again, which is not simulated, because its length is not published.
     """
 
     NONE = 0
@@ -85,16 +85,19 @@ class AxisOrder(Struct, frozen=True):
 
     axis: Axis
     is_valid: bool
-    """The checksum is right, or there is none."""
+    """Whether the checksum is right; True without a checksum."""
     target: float = 0.0
     """Steering wheel angle in rad, or a pedal as a fraction."""
     is_enabling: bool = False
+    """Whether the order has the enable bit and a known type."""
     is_clearing: bool = False
+    """Whether the order clears an override, and the watchdog."""
     ignores_driver: bool = False
+    """Whether actions of the driver are no override."""
     rate_radps: float = 0.0
     """The largest rate of the steering wheel."""
     count: int | None = None
-    """None: the frame has no counter and only clears: an override, and the watchdog."""
+    """The counter; None for a frame without one, which can only clear."""
 
 
 class GearOrder(Struct, frozen=True):
@@ -119,14 +122,16 @@ class Actuator:
     """The state of an axis."""
 
     order: AxisOrder | None = None
-    """The newest valid order, until it times out."""
+    """The newest valid order; None before the first one, and after it has timed out."""
     received_ns: int = 0
+    """Time of the newest valid order."""
     count: int | None = None
     """The counter of the newest frame with a right checksum."""
     is_enabled: bool = False
     driver_acts: bool = False
+    """Whether the driver acts on the axis now."""
     is_overridden: bool = False
-    """Latched until it is cleared."""
+    """Whether the driver has overridden the axis; True until the override is cleared."""
     has_timed_out: bool = False
     is_crc_bad: bool = False
     is_count_bad: bool = False
@@ -134,7 +139,7 @@ class Actuator:
 
     @property
     def may_be_enabled(self) -> bool:
-        """Whether the axis's order and state allow it to be enabled."""
+        """Whether order and state allow the axis to be enabled."""
         order = self.order
         return order is not None and order.is_enabling and not self.is_overridden and not self.faults
 
@@ -152,7 +157,7 @@ class KitState:
     """Values reported as unknown: `angle`, `speed`, `wheel_speed`."""
     sensor_faults: SensorFaults = field(default_factory=SensorFaults)
     brake_share: float = 1.0
-    """Share of the brake's force that reaches the wheels; no report shows it."""
+    """Share of the brake's force that reaches the wheels; it is in no report."""
     # The driver.
     driver_torque_nm: float = 0.0
     driver_brake: float = 0.0
@@ -173,7 +178,7 @@ class KitState:
     disengage_reason: ReleaseReason = ReleaseReason.NONE
     not_ready_reason: ReleaseReason = ReleaseReason.NONE
     watchdog_reason: ReleaseReason = ReleaseReason.NONE
-    """Why the watchdog tripped; latched until it is cleared after an override by the driver."""
+    """Why the watchdog tripped; kept until the watchdog is cleared, after the driver has ended its braking."""
     watchdog_axis: Axis | None = None
     watchdog_brakes: bool = False
     remote_state: int = 2
@@ -187,7 +192,7 @@ class KitState:
         return abs(self.speed_mps) < STATIONARY_BELOW_MPS
 
     def reported_mps(self, source: str) -> float:
-        """Return the speed that a source reports, one of `SPEED_SOURCES`."""
+        """Return the speed that `source`, one of `SPEED_SOURCES`, reports."""
         return self.sensor_faults.reported_mps(source, self.speed_mps)
 
     @property

@@ -12,14 +12,15 @@ from lavt.vehicle.sim.rendering.renderer import Renderer, SceneryKind
 from lavt.vehicle.sim.road.road import Road
 
 MAX_EXTRAPOLATION_NS = 20 * NS_PER_MS
-"""The longest extrapolation beyond the newest pose. It is longer than a step because the physics may lag a little."""
+"""The longest extrapolation beyond the newest pose. It is longer than a step of the physics, which can be late."""
 
 
 class SimCamera:
-    """A `lavt.vehicle.camera.TimedCamera` that renders.
+    """A `lavt.vehicle.camera.TimedCamera` that renders its pictures.
 
-    With an exposure of 0 a frame shows the newest pose at or before its time. With a longer exposure it is the mean of
-    the views between the pose when the shutter opens and the pose when it closes, both interpolated.
+    With an exposure of 0 a frame shows the view from the newest pose at or before the frame's time. With a longer
+    exposure a frame is the mean of the views from several poses, between the pose when the shutter opens and the pose
+    when it closes. Both poses are interpolated.
     """
 
     def __init__(
@@ -53,7 +54,7 @@ class SimCamera:
         return CapturedFrame(number, at_ns, self._renderer.render(pose, number))
 
     def expose(self, number: int, begin_ns: int, poses: Sequence[Pose]) -> CapturedFrame | None:
-        """Render frame `number` with motion blur; None when no pose is as old as the opening of the shutter."""
+        """Render frame `number` with motion blur; None if all poses are later than the opening of the shutter."""
         if self.exposure_ns == 0:
             return self.capture(number, begin_ns, newest_pose(poses, begin_ns))
         begin, end = interpolate_pose(poses, begin_ns), interpolate_pose(poses, begin_ns + self.exposure_ns)
@@ -64,11 +65,11 @@ class SimCamera:
 
 
 def interpolate_pose(poses: Sequence[Pose], at_ns: int) -> Pose | None:
-    """Return the pose at a time, interpolated between poses sorted by time; None when all are later.
+    """Return the pose at a time, interpolated between poses sorted by time; None if all poses are later.
 
     Beyond the newest pose, the motion between the last two poses is extrapolated for at most `MAX_EXTRAPOLATION_NS`.
-    This is necessary because the physics reports a pose after its time, so the newest pose is a step old when the
-    shutter closes.
+    This is necessary because the physics reports each pose after its time: when the shutter closes, the newest reported
+    pose is a step old.
     """
     before = newest_pose(poses, at_ns)
     if before is None or before.mono_ns == at_ns or len(poses) < 2:

@@ -1,4 +1,4 @@
-"""A figure of a road: a plan to scale, and views from the driver's seat."""
+"""A drawing of a road: a plan to scale, and views from the driver's seat."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from lavt.vehicle.sim.road.cross_section import PavedArea, Rail, RoadElement, Ro
 from lavt.vehicle.sim.road.road import Road
 
 VIEWS = 4
-"""The number of views from the driver's seat: at the start, at the end, and evenly spaced between."""
+"""The number of views from the driver's seat, at evenly spaced stations between the route's start and its end."""
 
 DETAIL_M = 40.0
-"""The length of road in the detail plot, which shows single marks."""
+"""The length of road in the detail, which shows single marks."""
 
 _SAMPLE_SPACING_M = 1.0
 _LABEL_SPACINGS_M = (10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0, 2000.0)
 _MAX_LABELS = 12
-"""The stations of the plan are labelled at the smallest of these spacings that gives no more labels than this."""
+"""The plan's stations are labelled at the smallest spacing of `_LABEL_SPACINGS_M` with at most `_MAX_LABELS` labels."""
 
 _LABEL_DISTANCE_PT = 24.0
 """The distance of a station's label from the edge of the asphalt."""
@@ -39,14 +39,14 @@ def draw_road(road: Road, *, model: CameraModel, scenery: SceneryKind = "full") 
     """Draw a plan of `road`, a detail of its start, its curvature, and views of the camera `model`."""
     figure = Figure(figsize=(14.0, 11.5), dpi=110, layout="constrained")
     figure.suptitle(f"{road.title}: {road.route_length_m:.1f} m", fontsize=14, fontweight="bold")
-    rows = figure.add_gridspec(3, VIEWS, height_ratios=[3.4, 0.8, 1.6])
-    _draw_plan(figure.add_subplot(rows[0, :3]), road)
-    _draw_detail(figure.add_subplot(rows[0, 3]), road)
-    _draw_curvature(figure.add_subplot(rows[1, :]), road)
+    grid = figure.add_gridspec(3, VIEWS, height_ratios=[3.4, 0.8, 1.6])
+    _draw_plan(figure.add_subplot(grid[0, :3]), road)
+    _draw_detail(figure.add_subplot(grid[0, 3]), road)
+    _draw_curvature(figure.add_subplot(grid[1, :]), road)
     renderer = Renderer(road, model, seed=1, scenery=scenery)
     for column, s_m in enumerate(np.linspace(0.0, road.route_length_m, VIEWS).tolist()):
         x_m, y_m, heading_rad, _ = (float(value) for value in road.centre_at(s_m))
-        axes = figure.add_subplot(rows[2, column])
+        axes = figure.add_subplot(grid[2, column])
         axes.imshow(renderer.render(Pose(0, x_m, y_m, heading_rad), column)[..., ::-1])
         axes.set_title(f"from the driver's seat at {s_m:.0f} m", fontsize=9, loc="left")
         axes.set_axis_off()
@@ -57,9 +57,9 @@ def _draw_plan(axes: Axes, road: Road) -> None:
     """Draw the road from above, to scale, with labelled stations."""
     first_m, last_m = max(road.first_m, -60.0), min(road.last_m, road.route_length_m + 120.0)
     _draw_ground(axes, road, first_m, last_m)
-    fitting_m = (spacing_m for spacing_m in _LABEL_SPACINGS_M if road.route_length_m / spacing_m <= _MAX_LABELS)
+    spacings_m = (spacing_m for spacing_m in _LABEL_SPACINGS_M if road.route_length_m / spacing_m <= _MAX_LABELS)
     right_edge_m = min(strip.right_m for strip in road.paved)
-    for s_m in np.arange(0.0, road.route_length_m, next(fitting_m, _LABEL_SPACINGS_M[-1])).tolist():
+    for s_m in np.arange(0.0, road.route_length_m, next(spacings_m, _LABEL_SPACINGS_M[-1])).tolist():
         edge, beyond = road.point_at(s_m, [right_edge_m, right_edge_m - 1.0])
         label: dict[str, Any] = {"textcoords": "offset points", "fontsize": 8, "ha": "center", "va": "center"}
         line = {"arrowstyle": "-", "linewidth": 0.8, "shrinkB": 0.0}
@@ -75,7 +75,7 @@ def _draw_plan(axes: Axes, road: Road) -> None:
 
 
 def _draw_detail(axes: Axes, road: Road) -> None:
-    """Draw the first metres of the road as if it were straight, with stations upwards and left offsets on the left."""
+    """Draw the first metres of the road as if it were straight; stations increase upwards, and offsets to the left."""
     last_m = min(DETAIL_M, road.route_length_m)
     for strip in _overlapping(road.paved, 0.0, last_m):
         axes.fill_between(

@@ -1,6 +1,6 @@
-"""The ground from above, painted in square tiles on a world grid, at five scales, with its light and shadows.
+"""The ground from above, painted in square tiles on a world grid, at five scales, with light and shadows.
 
-A tile depends on its position alone, so pictures do not depend on the car's history.
+A tile depends on its position alone, so pictures do not depend on what the car did before.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ TILE_M = (8.0, 16.0, 32.0, 32.0, 64.0)
 """The length of a tile's edge at each scale."""
 
 _MAX_TILES = (40, 60, 160, 400, 400)
-"""The number of cached tiles of each scale. The two finest scales are painted during the drive, a few tiles at a time;
-the tiles of the others along a whole road fit into the cache."""
+"""The number of cached tiles of each scale. Tiles of the two finest scales are painted during the drive, a few at a
+time. For the other scales, all tiles along a road fit into the cache."""
 
 _GRAVEL_WIDTH_M = 1.6
 _PAINT = {"white": (212, 218, 216), "yellow": (62, 172, 208)}
 _TRACK_PROFILE = ((1.1, 4), (0.8, 8), (0.5, 12))
-"""Wheel tracks, which are darker than the rest of a lane: width (m) and grey levels, widest first."""
+"""Wheel tracks, which are darker than the rest of a lane: width (m) and darkening (grey levels), widest first."""
 _OIL = (0.7, 6)
-"""The darker middle of a lane: width (m) and grey levels."""
+"""The middle of a lane, which oil makes darker: width (m) and darkening (grey levels)."""
 
 
 class Ground:
@@ -51,7 +51,7 @@ class Ground:
 
     def __init__(self, road: Road, light: Light, shadows: Shadows | None) -> None:
         self._tiles: tuple[OrderedDict[tuple[int, int], Picture], ...] = tuple(OrderedDict() for _ in SCALES_M)
-        # Both in 255ths: the light on a surface in the sun, and the share of it that is missing in full shadow.
+        # Both in 255ths: the light on a surface in the sun, and the share of this light that is missing in full shadow.
         self._sunlight = _bytes(np.array(light.lit))
         self._missing_in_shadow = _bytes(1.0 - np.array(light.shade) / np.array(light.lit))
         self._shadows = shadows
@@ -71,9 +71,9 @@ class Ground:
     def assemble(self, level: int, first_tile: tuple[int, int], count: int) -> Picture:
         """Return a picture of `count` x `count` tiles, the first of which has the index `first_tile` (x, y).
 
-        Row 0 has the lowest y and column 0 the lowest x; the middle of texel i is (i + 0.5) * scale from the corner.
-        The picture has an unused fourth channel, because OpenCV warps four bytes per texel in less than half the time
-        of three.
+        Row 0 has the lowest y and column 0 the lowest x. The middle of texel i is at (i + 0.5) * scale from the corner.
+        The picture has an unused fourth channel, because OpenCV warps texels of four bytes in less than half the time
+        that texels of three bytes take.
         """
         pixels = round(TILE_M[level] / SCALES_M[level])
         assembled = np.empty((count * pixels, count * pixels, 4), dtype=np.uint8)
@@ -85,11 +85,11 @@ class Ground:
         return assembled
 
     def has_room(self, level: int) -> bool:
-        """Return whether one more tile of a scale fits the cache without evicting another."""
+        """Return whether the cache can take one more tile of a scale without removing another."""
         return len(self._tiles[level]) < _MAX_TILES[level]
 
     def tile(self, level: int, column: int, row: int) -> Picture:
-        """Return one tile, painting it unless it is cached."""
+        """Return one tile; paint it unless it is cached."""
         tiles = self._tiles[level]
         tile = tiles.get((column, row))
         if tile is None:
@@ -126,13 +126,13 @@ class Ground:
     def _paint_asphalt(self, level: int, square: Square) -> Picture:
         textures, scale_m = all_textures()[level], SCALES_M[level]
         darkening = np.zeros((square.pixels, square.pixels), dtype=np.uint8)
-        for strips, grey in self._tracks:
-            strips.fill(darkening, square, grey)
+        for strips, grey_levels in self._tracks:
+            strips.fill(darkening, square, grey_levels)
         for wear in self._wear:
-            # Strips thinner than a texel are still drawn about one texel wide: reduce their strength accordingly.
-            grey = round(wear.darkening * min(1.0, wear.width_m / scale_m))
-            if grey:
-                wear.strips.fill(darkening, square, grey)
+            # Strips that are thinner than a texel are drawn about one texel wide, so reduce their darkening.
+            grey_levels = round(wear.darkening * min(1.0, wear.width_m / scale_m))
+            if grey_levels:
+                wear.strips.fill(darkening, square, grey_levels)
         worn = np.asarray(cv2.subtract(_crop_texture(textures.asphalt, square), darkening), dtype=np.uint8)
         picture = np.asarray(cv2.merge((worn, worn, worn - 2)), dtype=np.uint8)
         for colour, width_m, strips in self._marks:
@@ -159,14 +159,17 @@ def _multiply_colour(picture: MatLike, colour: tuple[int, ...]) -> Picture:
 
 @lru_cache(maxsize=32)
 def _uniform_picture(pixels: int, colour: tuple[int, ...]) -> Picture:
-    """Return a square of one colour; OpenCV multiplies by a picture much faster than by a colour or a table."""
+    """Return a square picture of one colour. OpenCV multiplies by a picture much faster than by a colour."""
     flat = np.empty((pixels, pixels, 3), dtype=np.uint8)
     flat[:] = colour
     return flat
 
 
 def _crop_texture(texture: NDArray[np.uint8], square: Square) -> NDArray[np.uint8]:
-    """Return a square's part of a texture; its period is a whole multiple of a tile's edge, or the reverse."""
+    """Return a square's part of a texture.
+
+    The texture's period is a whole multiple of the square's edge, or the edge is a whole multiple of the period.
+    """
     pixels, period = square.pixels, len(texture)
     if pixels > period:
         count = pixels // period
@@ -177,19 +180,22 @@ def _crop_texture(texture: NDArray[np.uint8], square: Square) -> NDArray[np.uint
 
 
 def _tracks(road: Road) -> list[tuple[Strips, int]]:
-    """Return the strips of wheel tracks and oil in every lane of the driven direction, with their grey levels."""
+    """Return the strips of wheel tracks and oil in every lane of the driven direction, with their darkening."""
     edges = np.array(road.lanes.edges_m)
     centres = (edges[1:] + edges[:-1]) / 2
     wheels = [centre + from_centre_m for centre in centres for from_centre_m in (-0.85, 0.85)]
-    bands = [(centres, *_OIL)] + [(wheels, width_m, grey) for width_m, grey in _TRACK_PROFILE]
+    tracks = [(centres, *_OIL)] + [(wheels, width_m, darkening) for width_m, darkening in _TRACK_PROFILE]
     return [
-        (join_strips([strip_along(road, middle_m + width_m / 2, middle_m - width_m / 2) for middle_m in offsets]), grey)
-        for offsets, width_m, grey in bands
+        (
+            join_strips([strip_along(road, offset_m + width_m / 2, offset_m - width_m / 2) for offset_m in offsets_m]),
+            darkening,
+        )
+        for offsets_m, width_m, darkening in tracks
     ]
 
 
 def _mark_styles(road: Road) -> list[tuple[str, float]]:
-    """Return the colours and widths (m) of marks, white first."""
+    """Return the combinations of colour and width (m) of the road's marks, white ones first."""
     return [
         (colour, width_m)
         for colour in _PAINT
@@ -208,7 +214,7 @@ def _marks(road: Road, colour: str, width_m: float) -> Strips:
             parts.append(strip_along(road, left_m, right_m, mark.from_m, mark.to_m))
             continue
         dash_begins_m = mark.dash_begins_m(road.first_m, road.last_m)
-        # At least two pieces per dash, so that it bends with the road.
+        # A dash has at least two pieces, so that it bends with the road.
         count = max(2, math.ceil(mark.dash_m / MAX_PIECE_M))
         begins_m = (dash_begins_m + np.arange(count)[:, None] * (mark.dash_m / count)).ravel()
         parts.append(strip_pieces(road, left_m, right_m, begins_m, begins_m + mark.dash_m / count + OVERLAP_M))
@@ -216,7 +222,7 @@ def _marks(road: Road, colour: str, width_m: float) -> Strips:
 
 
 def _blend(under: Picture, over: Picture, alpha: Grey) -> Picture:
-    """Blend a picture over another."""
+    """Lay the picture `over` on the picture `under`; `alpha` is the opacity of `over`, 0 to 255."""
     cover = cv2.merge((alpha, alpha, alpha))
     kept = cv2.multiply(under, cv2.bitwise_not(cover), scale=1 / 255)
     return np.asarray(cv2.add(cv2.multiply(over, cover, scale=1 / 255), kept), dtype=np.uint8)

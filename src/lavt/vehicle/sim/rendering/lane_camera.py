@@ -1,4 +1,4 @@
-"""A camera that delivers the lane itself, as a perfect detector would find it in the picture from a pose."""
+"""A camera that delivers the lane itself, as a perfect detector would find it in the picture."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ from lavt.vehicle.camera import CapturedFrame, newest_pose
 from lavt.vehicle.sim.road.road import Road
 
 LINEAR_BELOW_M = 6.0
-"""If the visible part of the lane is shorter than this, no curvature is fitted, as in `lane_fit`."""
+"""If the visible part of the lane is shorter than this length, no curvature is fitted, as in `lane_fit`."""
 
 MIN_POINTS = 3
-"""With fewer visible points of the centre no lane is fitted."""
+"""If fewer points of the centre are visible, no lane is fitted."""
 
 _ABEAM_RAD = math.radians(89.9)
-"""The edges of the field of view are limited to this angle, because beyond it there is no ground ahead."""
+"""The largest angle between straight ahead and an edge of the field of view, because ground at a larger angle is not
+ahead."""
 
 STATION_SPACING_M = 1.0
 """The spacing of the sampled points on the lane's lines."""
@@ -27,10 +28,10 @@ STATION_SPACING_M = 1.0
 class LaneCamera:
     """A `lavt.vehicle.camera.Camera` without pixels: its pictures are `SeenLane`, fitted to the road's true centre.
 
-    It covers the detector's ground: `near_m` to `far_m` ahead of the rear axle and `half_width_m` to both sides, within
-    the camera's field of view. The camera's position, yaw and horizontal angle matter; pitch and roll do not.
-    Confidence is the share of the lane's two lines within that ground. A car turned by more than 90 degrees sees no
-    lane.
+    The lane is visible on the detector's ground: between `near_m` and `far_m` ahead of the rear axle, up to
+    `half_width_m` to both sides, and in the camera's field of view. The camera's position, yaw and horizontal angle
+    matter; pitch and roll do not. Confidence is the share of the lane's two lines that is visible. A car that is turned
+    by more than 90 degrees sees no lane.
     """
 
     def __init__(
@@ -62,8 +63,9 @@ class LaneCamera:
         stations_m = np.arange(road.route_length_m / STATION_SPACING_M + 2 * self._count_ahead) * STATION_SPACING_M
         lines = [road.point_at(stations_m, offset_m) for offset_m in (0.0, self._width_m / 2, -self._width_m / 2)]
         self._line_points: list[list[float]] = np.concatenate(lines, axis=1).tolist()
-        """One row for each station: world x and y of the lane's centre, of its left line, and of its right line."""
+        """For each station, world x and y of the lane's centre, of its left line, and of its right line."""
         self._near_s_m = 0.0
+        """The station of the car at the last call."""
 
     def capture(self, number: int, at_ns: int, pose: Pose | None) -> CapturedFrame | None:
         """Return the lane visible from `pose`; None without a pose."""
@@ -72,7 +74,7 @@ class LaneCamera:
         return CapturedFrame(number, at_ns, SeenLane(0, at_ns, self.observe_lane(pose)))
 
     def expose(self, number: int, begin_ns: int, poses: Sequence[Pose]) -> CapturedFrame | None:
-        """Return the lane visible half-way between the poses when the shutter opens and when it closes."""
+        """Return the lane visible from the middle between the poses when the shutter opens and when it closes."""
         first, last = newest_pose(poses, begin_ns), newest_pose(poses, begin_ns + self.exposure_ns)
         if first is None or last is None:
             return None
@@ -82,7 +84,7 @@ class LaneCamera:
         return self.capture(number, middle_ns, Pose(middle_ns, x_m, y_m, first.heading_rad + turn_rad / 2))
 
     def observe_lane(self, pose: Pose) -> Lane:
-        """Fit the driven lane's centre where its lines are in view; the confidence is 0 if none is."""
+        """Fit the driven lane's centre where one of its lines is visible; the confidence is 0 if no lane is fitted."""
         self._near_s_m = self._road.project(pose.x_m, pose.y_m, self._near_s_m)[0]
         first = max(math.ceil(self._near_s_m / STATION_SPACING_M), 0)
         cosine, sine = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
@@ -91,7 +93,7 @@ class LaneCamera:
         left_slope, right_slope = self._left_slope, self._right_slope
         lens_x_m, lens_y_m = self.model.x_m, self.model.y_m
         centre, visible_line_points = [], 0
-        # The two lines are written out: a loop over them would take half of this function's time.
+        # The same code for the left and the right line; a loop over the two would take half of this function's time.
         for centre_x, centre_y, left_x, left_y, right_x, right_y in self._line_points[
             first : first + self._count_ahead
         ]:
@@ -124,9 +126,10 @@ class LaneCamera:
 
 
 def _fit_centre(points: list[tuple[float, float]], curved: bool) -> tuple[float, float, float]:
-    """Fit c0, c1 and, if `curved`, c2 by least squares; for two dozen points plain floats are faster than arrays.
+    """Fit y = c0 + c1 x and, if `curved`, + c2 x^2 to points (x, y) by least squares.
 
-    x is centred on its mean, so that the normal equations are well conditioned.
+    x is counted from its mean, so that the normal equations are well conditioned. For two dozen points plain floats are
+    faster than arrays.
     """
     n = len(points)
     mean = sum(x for x, _ in points) / n

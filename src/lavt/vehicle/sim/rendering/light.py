@@ -1,8 +1,8 @@
 """The lighting of a road: the sun's position, and the colours of sunlight, shade, sky and haze.
 
-Surfaces are defined by their colours in the noon sun. A light multiplies these by one factor in the sun and another in
-the shade. The factors include a camera's exposure control, so an overcast day is not much darker than a sunny one. All
-values are our choice.
+Surfaces are defined by their colours in the noon sun. A light multiplies these colours by one factor in the sun and by
+another factor in the shade. The factors contain the effect of a camera's exposure control, so an overcast day is not
+much darker than a sunny day. All values are our choice.
 """
 
 from __future__ import annotations
@@ -18,20 +18,23 @@ from lavt.domain import FloatArray
 LightName = Literal["noon", "low_sun", "overcast"]
 
 Colour = tuple[float, float, float]
-"""Blue, green, red: 0 to 255 for a visible colour, a factor for light."""
+"""Blue, green, red: values between 0 and 255 for a visible colour, factors for light."""
 
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """One light; the angles are the sun's in the world frame, `azimuth_rad` from x towards y."""
+    """One light."""
 
     azimuth_rad: float
+    """The sun's azimuth in the world frame, from the x axis towards the y axis."""
     elevation_rad: float
+    """The sun's elevation."""
     lit: Colour
     """The factor for level ground in the sun."""
     shade: Colour
     """The factor for level ground in the shade."""
     zenith: Colour
+    """The colour of the sky at the zenith."""
     haze: Colour
     """The colour of the sky at the horizon and of everything far away."""
     glow: Colour
@@ -40,8 +43,9 @@ class Light:
     cloud_cover: float
     """The approximate share of the sky that clouds cover."""
     shadows: bool
+    """Whether the sun casts shadows."""
     clouds_shade: bool
-    """True if clouds cast shadows on the ground around the road."""
+    """Whether clouds cast shadows on the ground around the road."""
 
     @property
     def towards_sun(self) -> FloatArray:
@@ -53,7 +57,7 @@ class Light:
 
     @property
     def shadow_m(self) -> FloatArray:
-        """The offset (x, y) from the foot of a point 1 m above the ground to its shadow."""
+        """The shadow (x, y) of the top of a pole of 1 m, relative to the foot of the pole."""
         towards = self.towards_sun
         return np.asarray(-towards[:2] / towards[2])
 
@@ -65,8 +69,9 @@ class Light:
         lit, shade = np.array(self.lit), np.array(self.shade)
         if not self.shadows:
             return np.broadcast_to(lit, (len(normals), 3))
-        # `lit` applies to the ground, lit with the sine of the elevation; a face is lit with the cosine of its angle to
-        # the sun. A camera's response curve flattens the ratio, so a face gets at most 1.5 times the ground's sunlight.
+        # Sunlight on a face is proportional to the cosine of the angle between its normal and the sun, and sunlight on
+        # the ground to the sine of the sun's elevation. `facing` is the ratio of the two. It is limited, because a
+        # camera's response curve makes bright surfaces less different.
         facing = np.clip(normals @ self.towards_sun[:2], 0.0, None) / max(math.sin(self.elevation_rad), 0.5)
         return np.asarray(shade + (lit - shade) * np.minimum(facing + 0.15, 1.5)[:, None])
 

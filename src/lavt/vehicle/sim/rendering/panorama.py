@@ -23,13 +23,13 @@ _RIDGES = (
     (0.062, ((0.022, 3, 0.0), (0.015, 7, 1.0)), (186.0, 172.0, 150.0), 0.62),
     (0.036, ((0.012, 5, 2.0), (0.008, 13, 0.0)), (152.0, 152.0, 128.0), 0.42),
 )
-"""Hills: mean height, waves (height, number around the horizon, phase), colour at noon, share of haze. Heights are
-shares of the focal length."""
+"""Rows of hills: mean height, waves (height, number around the horizon, phase), colour at noon, share of haze. Heights
+are shares of the focal length."""
 _WOOD_COLOUR = (112.0, 122.0, 104.0)
 
 
 class Panorama:
-    """The panorama for one camera model; a picture's background is a selection of its columns."""
+    """The panorama for one camera model; a picture's background consists of columns of the panorama."""
 
     def __init__(self, model: CameraModel, rows: int, light: Light, *, plain: bool) -> None:
         self._texels = _paint(rows, horizon_row(model), model.focal_px, light, plain=plain)
@@ -45,7 +45,7 @@ class Panorama:
 
 @lru_cache(maxsize=6)
 def _paint(rows: int, horizon: float, focal_px: float, light: Light, *, plain: bool) -> NDArray[np.uint32]:
-    """Return the panorama (rows, columns); a texel is a 32-bit word of blue, green, red and an unused byte."""
+    """Return the panorama (rows, columns); each texel is a 32-bit word of blue, green, red and an unused byte."""
     # The height of each row above the horizon, as a share of the focal length.
     height = np.asarray((horizon - np.arange(rows)) / focal_px, dtype=np.float64)[:, None]
     # A column shows the azimuth -turn: azimuths increase to the left, and columns to the right.
@@ -69,7 +69,7 @@ def _paint(rows: int, horizon: float, focal_px: float, light: Light, *, plain: b
 
 
 def _angle_to_sun_rad(light: Light, elevation_rad: FloatArray, azimuth_rad: FloatArray) -> FloatArray:
-    """Return the angle between the sun and each direction of the picture."""
+    """Return the angle between the sun and each direction, given by elevation and azimuth."""
     cosine = np.sin(elevation_rad) * math.sin(light.elevation_rad)
     cosine = cosine + np.cos(elevation_rad) * math.cos(light.elevation_rad) * np.cos(azimuth_rad - light.azimuth_rad)
     angle_rad: FloatArray = np.arccos(np.clip(cosine, -1.0, 1.0))
@@ -77,7 +77,7 @@ def _angle_to_sun_rad(light: Light, elevation_rad: FloatArray, azimuth_rad: Floa
 
 
 def _hazed_colour(colour: Colour, light: Light, haze: float) -> FloatArray:
-    """Return the colour, with haze, of a distant object whose colour at noon is given."""
+    """Return the colour in this light of a distant object; `colour` is that at noon, and `haze` the share of haze."""
     near, far = np.array(colour) * np.array(light.lit), np.array(light.haze) * 0.85
     return np.asarray(near * (1 - haze) + far * haze)
 
@@ -98,7 +98,7 @@ def _add_ridge(picture: FloatArray, height: FloatArray, ridge: FloatArray, colou
 def _add_clouds(picture: FloatArray, height: FloatArray, light: Light) -> None:
     octaves = ((14, 1.0), (30, 0.6), (70, 0.4), (160, 0.22), (330, 0.12))
     noise = sum((share * seamless_noise("clouds", 1024, cells) for cells, share in octaves), np.zeros((1024, 1024)))
-    # Clouds are a flat layer: a point of the sky shows the layer where the line of sight intersects it.
+    # Clouds are a flat layer: a point of the sky shows the place where the line of sight intersects the layer.
     distance = np.minimum(1.0 / np.maximum(height, 0.02), 14.0) * 62.0
     turn = np.arange(_COLUMNS)[None, :] / _COLUMNS * 2 * math.pi
     rows = np.rint(512 + distance * np.sin(turn)).astype(np.intp) % 1024
@@ -108,13 +108,13 @@ def _add_clouds(picture: FloatArray, height: FloatArray, light: Light) -> None:
     fading = np.clip((height - 0.04) / 0.12, 0.0, 1.0)
     cover = (0.92 * (1.0 - np.exp(-2.2 * thickness)) * fading)[..., None]
     picture *= 1 - cover
-    # Thick clouds are uneven, and darker than their edges.
+    # The thick parts of a cloud are uneven, and darker than its edges.
     lumps = 0.05 * noise[(rows + 37) % 1024, (columns + 91) % 1024]
     picture += cover * np.array(light.cloud) * np.clip(1.0 - 0.13 * thickness + lumps, 0.7, 1.06)[..., None]
 
 
 def _wood_outline() -> FloatArray:
-    """Return the outline of a distant wood, one value per column."""
+    """Return the outline of a distant wood: a value for each column."""
     steps = stream(_WORLD_SEED, "wood").standard_normal(_COLUMNS)
     kernel = np.hanning(9)
     smooth = np.convolve(np.concatenate([steps[-8:], steps, steps[:8]]), kernel / kernel.sum(), mode="same")

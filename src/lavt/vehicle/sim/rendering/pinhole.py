@@ -1,4 +1,4 @@
-"""The pinhole projection of the world into the picture, and from rows of the picture to the ground.
+"""The pinhole projections of the world to the picture, and of the picture to the ground.
 
 Pixel coordinates are those of OpenCV: the middle of the top left pixel is (0, 0), so the principal point is
 ((width - 1) / 2, (height - 1) / 2). The world's ground is the plane z = 0.
@@ -17,7 +17,7 @@ from lavt.domain import CameraModel, FloatArray, Pose
 
 @dataclass(frozen=True, slots=True)
 class CameraPlacement:
-    """A placed camera: its position (m) and heading (rad) in the world frame, `model.z_m` above the ground."""
+    """A camera at its place in the world: position (m) and heading (rad), at `model.z_m` above the ground."""
 
     model: CameraModel
     x_m: float
@@ -25,7 +25,10 @@ class CameraPlacement:
     heading_rad: float
 
     def project(self, points_m: FloatArray) -> FloatArray:
-        """Return picture coordinates and depth (u px, v px, m) of world points (..., 3); the depth may be negative."""
+        """Return picture coordinates and depth (u px, v px, m) of world points (..., 3).
+
+        The depth of a point behind the camera is negative.
+        """
         model = self.model
         cosine, sine = math.cos(self.heading_rad), math.sin(self.heading_rad)
         pitch_cosine, pitch_sine = math.cos(model.pitch_rad), math.sin(model.pitch_rad)
@@ -46,7 +49,10 @@ class CameraPlacement:
         return np.asarray(points)
 
     def ground_from_picture(self) -> FloatArray:
-        """Return the 3 x 3 homography from picture (u, v, 1) below the horizon to the world's ground (x, y, 1)."""
+        """Return the 3 x 3 homography from the picture (u, v, 1) to the world's ground (x, y, 1).
+
+        It is valid for pixels that show ground: those lower than the horizon.
+        """
         model = self.model
         focal_px, pitch_cosine, pitch_sine = model.focal_px, math.cos(model.pitch_rad), math.sin(model.pitch_rad)
         # A pixel's ray: ahead, left and down per metre of depth; the ground is z_m below the camera.
@@ -77,13 +83,16 @@ def place_camera(model: CameraModel, pose: Pose) -> CameraPlacement:
 
 
 def roll_matrix(roll_rad: float) -> FloatArray:
-    """Return the matrix from a level camera's picture coordinates (right, down) to a camera's rolled by `roll_rad`."""
+    """Return the 2 x 2 matrix from a level camera's picture coordinates to those of a camera rolled by `roll_rad`.
+
+    The coordinates are those to the right and down from the principal point.
+    """
     cosine, sine = math.cos(roll_rad), math.sin(roll_rad)
     return np.array([[cosine, sine], [-sine, cosine]])
 
 
 def level_model(model: CameraModel) -> CameraModel:
-    """Return a camera without roll, of the same focal length, whose picture contains everything that `model` sees."""
+    """Return a camera without roll, of the same focal length, whose picture shows everything that `model` shows."""
     if model.roll_rad == 0.0:
         return model
     cosine, sine = abs(math.cos(model.roll_rad)), abs(math.sin(model.roll_rad))
@@ -104,7 +113,7 @@ def horizon_row(model: CameraModel) -> float:
 
 
 def row_of_depth(model: CameraModel, ahead_m: float) -> int:
-    """Return the first row whose ground is at most `ahead_m` ahead, within the picture, for a camera without roll."""
+    """Return the first picture row whose ground is at most `ahead_m` ahead, for a camera without roll."""
     angle_rad = math.atan2(model.z_m, ahead_m) - model.pitch_rad
     row = math.ceil(principal_point(model)[1] + model.focal_px * math.tan(angle_rad))
     return min(max(row, 0), model.height_px)

@@ -2,8 +2,8 @@
 
 The ground is warped from top-view tiles, in five bands of picture rows; nearer bands use finer scales (a clipmap). Sky
 and hills are cropped from a panorama, upright objects are drawn from far to near, and sensor noise is added. A frame
-depends only on the poses, its number and the seed. It is byte-for-byte reproducible for equal versions and processor
-features.
+depends only on the poses, the frame number and the seed. With the same versions of the libraries and the same processor
+features it is byte-for-byte reproducible.
 """
 
 from __future__ import annotations
@@ -39,37 +39,38 @@ SceneryKind = Literal["full", "light", "none"]
 """full: everything; light: without trees, lamp posts, buildings and clouds; none: also without rails and shadows."""
 
 MAX_PARTS, MAX_INSTANTS = 8, 16
-"""The maximum number of parts of an exposure, and of instants per part at which the near ground is drawn."""
+"""The largest number of parts of an exposure, and of instants in a part at which the near ground is drawn."""
 
 BAND_FAR_M = (5.0, 11.0, 26.0, 60.0, 160.0)
 """The distance ahead of the camera that each scale of the ground reaches."""
 
 _MAX_LINES = 6
 _TEXELS_PER_LINE = 2.5
-"""A picture row is drawn as the mean of at most `_MAX_LINES` lines, each of which covers about this many texels."""
+"""A picture row is drawn as the mean of up to `_MAX_LINES` lines, each of which covers about `_TEXELS_PER_LINE` texels.
+"""
 
 _MAX_STEP_PX = 3.0
-"""The distance that the picture may move between two instants of an exposure."""
+"""The picture moves at most this far between two instants of an exposure, unless their largest number is reached."""
 
 _NEAR_BANDS = 2
-"""The number of bands that motion blur treats as near ground."""
+"""The number of bands that are near ground, which is drawn at several instants for motion blur."""
 
 _NOISE_DEVIATION = 2.2
 _NOISE_MARGIN_PX = 64
-_HAZE_FROM_M = 11.0
-_PREPARED_FROM_LEVEL = 2
-"""`prepare` paints this scale and the coarser ones; the finer ones are painted during the drive."""
+_HAZE_BEGIN_M = 11.0
+_FINEST_PREPARED_LEVEL = 2
+"""`prepare` paints this scale and the coarser scales; the finer scales are painted during the drive."""
 
 _PREPARED_SWERVE_M = 6.0
 _PREPARED_SWERVE_RAD = 0.6
-"""`prepare` paints the ground that is visible to a car this far beside the route, turned by this angle."""
+"""`prepare` paints the ground visible to cars on the route and this far beside it, without and with this turn."""
 
 
 class Band:
-    """The rows of a level camera's picture that one scale covers, and the square of tiles visible in them.
+    """The rows of a level camera's picture that show ground of one scale, and the square of tiles visible in them.
 
-    A distant row covers a long piece of ground. It is drawn as the mean of `lines` finer rows, so that dashes do not
-    flicker.
+    A distant row covers a long piece of ground. Such a row is drawn as the mean of `lines` finer rows, so that dashes
+    of marks do not flicker.
     """
 
     def __init__(self, model: CameraModel, level: int) -> None:
@@ -95,7 +96,7 @@ class Band:
 
     @property
     def picture_from_lines(self) -> FloatArray:
-        """The 3 x 3 matrix from (column, line, 1) of the band to picture coordinates."""
+        """The 3 x 3 matrix from (column, line, 1) of the band to picture coordinates (u, v, 1)."""
         first = self.first_row + 0.5 / self.lines - 0.5
         return np.array([[1.0, 0.0, 0.0], [0.0, 1.0 / self.lines, first], [0.0, 0.0, 1.0]])
 
@@ -107,11 +108,11 @@ class Band:
 
     def texel_from_ground(self, first_tile: tuple[int, int]) -> FloatArray:
         """Return the 3 x 3 matrix from the world's ground to texels of the square of tiles."""
-        scale_m = SCALES_M[self.level]
+        scale_m, (first_x, first_y) = SCALES_M[self.level], first_tile
         return np.array(
             [
-                [1 / scale_m, 0.0, -first_tile[0] * self._tile_m / scale_m - 0.5],
-                [0.0, 1 / scale_m, -first_tile[1] * self._tile_m / scale_m - 0.5],
+                [1 / scale_m, 0.0, -first_x * self._tile_m / scale_m - 0.5],
+                [0.0, 1 / scale_m, -first_y * self._tile_m / scale_m - 0.5],
                 [0.0, 0.0, 1.0],
             ]
         )
@@ -123,20 +124,20 @@ class Renderer:
     def __init__(
         self, road: Road, model: CameraModel, *, seed: int, scenery: SceneryKind, light: LightName = "noon"
     ) -> None:
-        cv2.setNumThreads(1)  # with more threads the division of work, and so the last bit, may vary
+        cv2.setNumThreads(1)  # with more threads the division of work, and so the last bit, could vary
         self._road, self._model, self._seed = road, model, seed
         self._level_model = level_model(model)
         self._ground, self._scenery = world(road, scenery, light)
         self._bands = tuple(Band(self._level_model, level) for level in range(len(SCALES_M)))
         self._panorama = Panorama(self._level_model, self._bands[-1].first_row, LIGHTS[light], plain=scenery != "full")
-        self._windows: list[tuple[tuple[int, int], Picture] | None] = [None] * len(self._bands)
-        """The square of tiles that each band used last: the index of its first tile, and its texels."""
+        self._last_squares: list[tuple[tuple[int, int], Picture] | None] = [None] * len(self._bands)
+        """The square of tiles that each band used last: the index of the square's first tile, and its texels."""
         self._canvas = np.empty((self._level_model.height_px, self._level_model.width_px, 4), dtype=np.uint8)
         self._haze_factor, self._haze = _haze(self._level_model, self._bands, LIGHTS[light].haze)
-        self._noise = _noise(model)
+        self._positive_noise, self._negative_noise = _noise(model)
 
     def prepare(self) -> None:
-        """Fill the caches whose first use would delay a frame: coarse ground along the route, sprites, textures."""
+        """Fill the caches whose first use would delay a frame: coarse ground along the route, textures and sprites."""
         for s_m in np.arange(0.0, self._road.route_length_m + 16.0, 16.0):
             heading_rad = float(self._road.centre_at(s_m).heading_rad)
             for lateral_m in (-_PREPARED_SWERVE_M, 0.0, _PREPARED_SWERVE_M):
@@ -154,10 +155,10 @@ class Renderer:
         return picture
 
     def render_exposed(self, begin: Pose, end: Pose, number: int) -> Picture:
-        """Return frame `number` for a vehicle that moves from `begin` to `end` while the shutter is open.
+        """Return frame `number` for a vehicle that moves from `begin` to `end` during the exposure.
 
-        The exposure is divided into parts so short that only the near ground moves much within one; the near ground is
-        drawn at several instants per part.
+        The exposure is divided into parts. A part is so short that only the near ground moves much during it. So the
+        near ground is drawn at several instants of each part.
         """
         parts = _part_count(self._motion_px(begin, end, self._bands[_NEAR_BANDS].end_row), MAX_PARTS)
         instants = _part_count(self._motion_px(begin, end, self._level_model.height_px - 1) / parts, MAX_INSTANTS)
@@ -171,7 +172,10 @@ class Renderer:
         return picture
 
     def _draw_world(self, pose: Pose, near_poses: Sequence[Pose] = ()) -> Picture:
-        """Return the world seen from `pose`, without noise; with several `near_poses` the near ground is the mean."""
+        """Return the world seen from `pose`, without noise.
+
+        With several `near_poses` the near ground is the mean of the views from them.
+        """
         placement = place_camera(self._level_model, pose)
         self._panorama.crop(placement.heading_rad, self._canvas[: self._bands[-1].first_row])
         blurred = len(near_poses) > 1
@@ -193,24 +197,28 @@ class Renderer:
         first_tile = band.first_tile(placement)
         matrix = band.texel_from_ground(first_tile) @ homography @ band.picture_from_lines
         flags, size = cv2.WARP_INVERSE_MAP | cv2.INTER_LINEAR, (rows.shape[1], rows.shape[0] * band.lines)
-        window = self._window(band, first_tile)
+        texels = self._square_of_tiles(band, first_tile)
         if band.lines == 1:
-            cv2.warpPerspective(window, matrix, size, rows, flags, cv2.BORDER_REPLICATE)
+            cv2.warpPerspective(texels, matrix, size, rows, flags, cv2.BORDER_REPLICATE)
             return
-        lines = cv2.warpPerspective(window, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
-        # NumPy, because OpenCV's reduction by area takes longer than the warp.
+        lines = cv2.warpPerspective(texels, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        # The mean is taken by NumPy, because OpenCV's reduction by area takes longer than the warp.
         total = np.add.reduce(lines.reshape(len(rows), band.lines, -1), axis=1, dtype=np.uint16)
         rows.reshape(len(rows), -1)[:] = (total + band.lines // 2) // band.lines
 
-    def _window(self, band: Band, first_tile: tuple[int, int]) -> Picture:
-        cached = self._windows[band.level]
-        if cached is None or cached[0] != first_tile:
-            cached = (first_tile, self._ground.assemble(band.level, first_tile, band.tiles))
-            self._windows[band.level] = cached
-        return cached[1]
+    def _square_of_tiles(self, band: Band, first_tile: tuple[int, int]) -> Picture:
+        """Return the texels of a band's square of tiles, from the cache if the square is the last one."""
+        last = self._last_squares[band.level]
+        if last is not None:
+            last_first_tile, texels = last
+            if last_first_tile == first_tile:
+                return texels
+        texels = self._ground.assemble(band.level, first_tile, band.tiles)
+        self._last_squares[band.level] = (first_tile, texels)
+        return texels
 
     def _prepare_ground(self, placement: CameraPlacement) -> None:
-        for band in self._bands[_PREPARED_FROM_LEVEL:]:
+        for band in self._bands[_FINEST_PREPARED_LEVEL:]:
             first_x, first_y = band.first_tile(placement)
             for index in range(band.tiles**2 if self._ground.has_room(band.level) else 0):
                 self._ground.tile(band.level, first_x + index % band.tiles, first_y + index // band.tiles)
@@ -243,7 +251,7 @@ class Renderer:
         rows[:] = (total + len(placements) // 2) // len(placements)
 
     def _motion_px(self, begin: Pose, end: Pose, row: int) -> float:
-        """Return how far the ends of a row move in the picture, or how far the horizon moves if that is more."""
+        """Return the movement in the picture of the ends of a row, or that of the horizon if it is larger."""
         model = self._level_model
         first, last = place_camera(model, begin), place_camera(model, end)
         pixels = np.array([[0.0, row, 1.0], [model.width_px - 1.0, row, 1.0]])
@@ -257,8 +265,8 @@ class Renderer:
     def _add_noise(self, picture: Picture, number: int) -> None:
         down, right = stream(self._seed, "sensor noise", number).integers(0, _NOISE_MARGIN_PX, 2).tolist()
         part = np.s_[down : down + self._model.height_px, right : right + self._model.width_px]
-        cv2.add(picture, self._noise[0][part], picture)
-        cv2.subtract(picture, self._noise[1][part], picture)
+        cv2.add(picture, self._positive_noise[part], picture)
+        cv2.subtract(picture, self._negative_noise[part], picture)
 
 
 @lru_cache(maxsize=1)  # the tiles of one road take up to 221 MB
@@ -287,19 +295,20 @@ def _interpolate_pose(begin: Pose, end: Pose, share: float) -> Pose:
 
 
 def _haze(model: CameraModel, bands: tuple[Band, ...], colour: tuple[float, ...]) -> tuple[Picture, Picture]:
-    """Return the transmittance of haze for the far rows (255ths), and its added colour: (rows, columns, 4) each."""
+    """Return the haze of the far rows: factor of colours (255ths) and added colour, (rows, columns, 4) each."""
     rows = np.arange(bands[-1].first_row, bands[1].first_row)
     angle_rad = np.arctan((rows - (model.height_px - 1) / 2) / model.focal_px) + model.pitch_rad
     depth_m = model.z_m / np.maximum(np.tan(angle_rad), 1e-6)
     share = np.broadcast_to(
-        (1.0 - np.exp(-np.maximum(depth_m - _HAZE_FROM_M, 0.0) / HAZE_M))[:, None, None], (len(rows), model.width_px, 4)
+        (1.0 - np.exp(-np.maximum(depth_m - _HAZE_BEGIN_M, 0.0) / HAZE_M))[:, None, None],
+        (len(rows), model.width_px, 4),
     )
     added = share * np.array([*colour, 0.0])
     return np.rint(255.0 * (1 - share)).astype(np.uint8), np.rint(added).astype(np.uint8)
 
 
 def _noise(model: CameraModel) -> tuple[Picture, Picture]:
-    """Return the positive and negative sensor noise, larger than a picture; each frame uses a random part."""
+    """Return positive and negative sensor noise, both larger than a picture. Each frame uses a random part of them."""
     size = (model.height_px + _NOISE_MARGIN_PX, model.width_px + _NOISE_MARGIN_PX, 3)
     noise = np.rint(stream(0, "sensor noise bank").standard_normal(size) * _NOISE_DEVIATION)
     return np.clip(noise, 0, 255).astype(np.uint8), np.clip(-noise, 0, 255).astype(np.uint8)

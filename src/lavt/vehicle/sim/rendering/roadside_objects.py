@@ -1,6 +1,6 @@
 """Roadside objects: rails and barriers, lamp posts, trees and buildings.
 
-Their positions and shapes are the same in every run and every light.
+The positions and shapes of the objects are the same in every run and every light.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _POST_SPACING_M = 4.0
 _LAMP_SPACING_M = 36.0
 _STOREY_M = 3.2
 _SCENERY_WIDTH_M = 110.0
-"""Trees and buildings stand up to this far from the asphalt."""
+"""Trees and buildings are at most this far from the asphalt."""
 
 _GROUND_PER_TREE_M2 = 480.0
 _GROUND_PER_BUILDING_M2 = 6200.0
@@ -43,32 +43,37 @@ _RAIL_FACES: dict[str, tuple[tuple[float, float, tuple[int, int, int], float], .
         (0.62, 0.76, (178, 176, 170), _DETAIL_VISIBLE_TO_M),
     ),
 }
-"""The faces of a rail in painting order: lower and upper height (m), blue, green, red, and visible distance (m)."""
+"""The faces of each kind of rail in painting order: lower height (m), upper height (m), colour (blue, green, red), and
+the distance (m) up to which the face is visible."""
 
 _FACADES = ((158, 172, 190), (176, 182, 184), (120, 140, 168), (186, 200, 206))
 
 
 @dataclass(frozen=True, slots=True)
 class Faces:
-    """Upright quadrilaterals: corners (n, 4, 3) in m (begin low, end low, end high, begin high), colours (n, 3).
-
-    `normals` (n, 2) are horizontal unit vectors towards the road, `visible_to_m` (n,) the distances of visibility.
-    """
+    """Upright quadrilaterals."""
 
     corners_m: FloatArray
+    """(n, 4, 3): low at the beginning, low at the end, high at the end, high at the beginning."""
     colours: FloatArray
+    """(n, 3)."""
     normals: FloatArray
+    """Horizontal unit vectors towards the road, (n, 2)."""
     visible_to_m: FloatArray
+    """The distances up to which the faces are visible, (n,)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Walls:
-    """Walls of buildings: outlines (n, 4, 3) as in `Faces`, colours, outward normals, and the windows of each wall."""
+    """Walls of buildings."""
 
     outlines_m: FloatArray
+    """(n, 4, 3), in the order of `Faces.corners_m`."""
     colours: FloatArray
     normals: FloatArray
+    """Horizontal unit vectors away from the building, (n, 2)."""
     windows_m: tuple[FloatArray, ...]
+    """The outlines of each wall's windows."""
 
 
 _NO_WALLS = Walls(np.empty((0, 4, 3)), np.empty((0, 3)), np.empty((0, 2)), ())
@@ -76,16 +81,15 @@ _NO_WALLS = Walls(np.empty((0, 4, 3)), np.empty((0, 3)), np.empty((0, 2)), ())
 
 @dataclass(frozen=True, slots=True)
 class RoadsideObjects:
-    """The objects along one road.
-
-    `poles` are (n, 5): x, y, foot, top, width in metres. `trees` are (n, 4): x, y, height (m), kind. `tree_road_rad`
-    (n,) are the headings of the road beside the trees.
-    """
+    """The objects along one road."""
 
     faces: Faces
     poles: FloatArray
+    """(n, 5), in metres: x, y, height of the foot, height of the top, width."""
     trees: FloatArray
+    """(n, 4): x (m), y (m), height (m), kind."""
     tree_road_rad: FloatArray
+    """The heading of the road beside each tree, (n,)."""
     walls: Walls
 
 
@@ -116,7 +120,7 @@ def _rail_faces(road: Road, sampled_rails: Sequence[tuple[Rail, FloatArray]]) ->
     faces = []
     for rail, stations in sampled_rails:
         line = road.point_at(stations, rail.offset_m)
-        # Vary the tone of the pieces, so that their motion is visible.
+        # Vary the tone of the pieces, so that the motion of a rail in the picture is visible.
         tone = stream(_WORLD_SEED, "rail").uniform(-6, 6, len(line) - 1)[:, None]
         normals = _left_normals(line[:-1], line[1:]) * (-1.0 if rail.offset_m > 0 else 1.0)
         for low_m, high_m, colour, visible_to_m in _RAIL_FACES[rail.kind]:
@@ -139,7 +143,7 @@ def _lamp_faces(road: Road, sampled_rails: Sequence[tuple[Rail, FloatArray]]) ->
 
 
 def _left_normals(begin: FloatArray, end: FloatArray) -> FloatArray:
-    """Return horizontal unit vectors (n, 2) to the left of the direction from `begin` to `end`."""
+    """Return unit vectors (n, 2) to the left, as seen in the direction from `begin` to `end`."""
     along = end - begin
     left = np.column_stack([-along[:, 1], along[:, 0]])
     return np.asarray(left / np.maximum(np.hypot(left[:, :1], left[:, 1:]), 1e-9))
@@ -161,7 +165,7 @@ def _join_faces(parts: Sequence[Faces]) -> Faces:
 
 
 def _place_poles(road: Road, sampled_rails: Sequence[tuple[Rail, FloatArray]], *, lamps: bool) -> FloatArray:
-    """Place posts of rails and lamp posts on barriers."""
+    """Place the posts of rails, and with `lamps` also lamp posts on barriers."""
     poles = [np.empty((0, 5))]
     for rail, stations in sampled_rails:
         if rail.kind == "rail":
@@ -175,7 +179,7 @@ def _place_poles(road: Road, sampled_rails: Sequence[tuple[Rail, FloatArray]], *
 
 
 def _road_middle(road: Road) -> tuple[FloatArray, FloatArray, float]:
-    """Return points (n, 2) along the middle of the asphalt, the heading (n,) there, and half the asphalt's width."""
+    """Return points (n, 2) along the asphalt's middle, the road's heading there (n,), and half the asphalt's width."""
     left_m = max(strip.left_m for strip in road.paved)
     right_m = min(strip.right_m for strip in road.paved)
     stations = np.arange(road.first_m - 40.0, road.last_m + 40.0, 4.0)
@@ -189,7 +193,7 @@ def _road_heading(road: Road, places: FloatArray) -> FloatArray:
 
 
 def _free_places(road: Road, name: str, ground_per_object_m2: float, clearance_m: float) -> FloatArray:
-    """Return random positions around the road, none closer than `clearance_m` to its asphalt."""
+    """Return random positions around the road, none closer than `clearance_m` to the asphalt."""
     middle, _, half_width_m = _road_middle(road)
     low, high = middle.min(axis=0) - _SCENERY_WIDTH_M, middle.max(axis=0) + _SCENERY_WIDTH_M
     places = stream(_WORLD_SEED, name).uniform(low, high, (round(float(np.prod(high - low)) / ground_per_object_m2), 2))
@@ -243,12 +247,17 @@ def _panels(
     shares: tuple[FloatArray, FloatArray],
     heights_m: tuple[FloatArray, FloatArray],
 ) -> FloatArray:
-    """Return rectangles (n, 4, 3) on a wall: each (first, last) share of its length with each (low, high) height."""
-    left = begin + shares[0][:, None] * (end - begin)
-    right = begin + shares[1][:, None] * (end - begin)
+    """Return rectangles (n, 4, 3) on a wall, in columns and rows.
+
+    The wall goes from `begin` to `end`. `shares` are where columns begin and end, as shares of the wall's length.
+    `heights_m` are the low and high edges of the rows.
+    """
+    begin_shares, end_shares = shares
+    column_begins = begin + begin_shares[:, None] * (end - begin)
+    column_ends = begin + end_shares[:, None] * (end - begin)
     panels = [
-        [[*near, low], [*far, low], [*far, high], [*near, high]]
+        [[*column_begin, low], [*column_end, low], [*column_end, high], [*column_begin, high]]
         for low, high in zip(*heights_m, strict=True)
-        for near, far in zip(left, right, strict=True)
+        for column_begin, column_end in zip(column_begins, column_ends, strict=True)
     ]
     return np.array(panels)

@@ -1,4 +1,4 @@
-"""The scenery: drawing of roadside objects from far to near, in one light."""
+"""The scenery: draw roadside objects from far to near, in one light."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ HAZE_M = 240.0
 """At this distance 63 % of an object's colour is haze."""
 
 _NEAR_M = 0.4
-"""Faces are cut off at this distance in front of the camera."""
+"""Parts of faces that are closer to the camera than this distance are not drawn."""
 
 _SUBPIXEL_BITS = 4
 _MAX_COORDINATE_PX = 4000.0
@@ -43,14 +43,14 @@ class Scenery:
         self._pole_colour = _POLE_GREY * light.upright_factors(np.zeros((1, 2)))
         self._wall_colours = walls.colours * light.upright_factors(walls.normals)
         self._glass = np.array(_GLASS_COLOUR) * light.upright_factors(walls.normals)
-        # Sprites show trees with the sun on the left: they are mirrored where the sun is to the right of the road.
+        # Sprites show trees with the sun on the left. So a sprite is mirrored if the sun is to the right of the road.
         mirrored = np.sin(light.azimuth_rad - objects.tree_road_rad) < 0
         self._trees = np.column_stack([objects.trees, mirrored])
         self._haze = np.array(light.haze)
         self._sprites = Trees(light)
 
     def prepare(self) -> None:
-        """Fill the slow caches beforehand."""
+        """Fill the caches whose first use is slow."""
         self._sprites.prepare()
 
     def draw(self, placement: CameraPlacement, picture: Picture) -> None:
@@ -69,37 +69,41 @@ class Scenery:
         faces = self._objects.faces
         corners = faces.corners_m
         ahead = _depth_m(corners[:, :2, :2], placement)
-        near = np.flatnonzero((ahead.max(axis=1) > _NEAR_M) & (ahead.min(axis=1) < faces.visible_to_m))
-        ahead = ahead[near]
-        points = placement.project(_clip(corners[near], ahead))
+        in_range = np.flatnonzero((ahead.max(axis=1) > _NEAR_M) & (ahead.min(axis=1) < faces.visible_to_m))
+        ahead = ahead[in_range]
+        points = placement.project(_clip(corners[in_range], ahead))
         inside = (points[..., 0].max(axis=1) > 0) & (points[..., 0].min(axis=1) < placement.model.width_px)
-        # All faces of one piece have the same depth.
+        # All faces of one piece of a rail have the same depth.
         depth = np.maximum(ahead[inside], _NEAR_M).mean(axis=1)
-        shades = self._add_haze(self._colours[near[inside]], depth)
+        shades = self._add_haze(self._colours[in_range[inside]], depth)
         return zip(depth.tolist(), repeat(_polygon), _subpixels(points[inside]), shades.tolist())
 
     def _pole_drawings(self, placement: CameraPlacement) -> Iterable[Drawing]:
         ahead = _depth_m(self._objects.poles[:, :2], placement)
         visible = (ahead > 1.0) & (ahead < FAR_M)
-        poles, depth = self._objects.poles[visible], ahead[visible]
-        ends = placement.project(np.stack([poles[:, :3], poles[:, [0, 1, 3]]], axis=1))
-        inside = (ends[:, 0, 0] > -20) & (ends[:, 0, 0] < placement.model.width_px + 20)
+        depth = ahead[visible]
+        x_m, y_m, foot_heights_m, top_heights_m, widths_m = self._objects.poles[visible].T
+        feet_m, tops_m = np.column_stack([x_m, y_m, foot_heights_m]), np.column_stack([x_m, y_m, top_heights_m])
+        ends = placement.project(np.stack([feet_m, tops_m], axis=1))
+        feet_u_px = ends[:, 0, 0]
+        inside = (feet_u_px > -20) & (feet_u_px < placement.model.width_px + 20)
         depth = depth[inside]
-        widths = np.clip(np.rint(poles[inside, 4] * placement.model.focal_px / depth), 1, 40).astype(int).tolist()
+        widths = np.clip(np.rint(widths_m[inside] * placement.model.focal_px / depth), 1, 40).astype(int).tolist()
         shades = self._add_haze(np.broadcast_to(self._pole_colour, (len(depth), 3)), depth).tolist()
         styles = zip(shades, widths, strict=True)
-        # A pole counts as 0.3 m behind the face that it carries.
+        # 0.3 m is added to the depth of a pole, so that the face that it carries is drawn over it.
         return zip((depth + 0.3).tolist(), repeat(_line), _subpixels(ends[inside]).tolist(), styles)
 
     def _tree_drawings(self, placement: CameraPlacement) -> Iterable[Drawing]:
         ahead = _depth_m(self._trees[:, :2], placement)
         trees = self._trees[(ahead > 3.0) & (ahead < FAR_M)]
-        feet = placement.project(np.column_stack([trees[:, :2], np.zeros(len(trees))]))
-        heights = trees[:, 2] * placement.model.focal_px / feet[:, 2]
-        reach = heights * (TREE_WIDTH / 2)
-        inside = (heights >= 3) & (feet[:, 0] > -reach) & (feet[:, 0] < placement.model.width_px + reach)
-        shapes = np.column_stack([feet[:, :2], heights, trees[:, 3:]])[inside].tolist()
-        depth = feet[inside, 2]
+        x_m, y_m, heights_m, kinds, mirrored = trees.T
+        u_px, v_px, all_depths_m = placement.project(np.column_stack([x_m, y_m, np.zeros(len(trees))])).T
+        heights_px = heights_m * placement.model.focal_px / all_depths_m
+        reach_px = heights_px * (TREE_WIDTH / 2)
+        inside = (heights_px >= 3) & (u_px > -reach_px) & (u_px < placement.model.width_px + reach_px)
+        shapes = np.column_stack([u_px, v_px, heights_px, kinds, mirrored])[inside].tolist()
+        depth = all_depths_m[inside]
         haze = (1.0 - np.exp(-depth / HAZE_M)).tolist()
         return zip(depth.tolist(), repeat(self._sprites.draw), shapes, haze)
 
@@ -107,7 +111,7 @@ class Scenery:
         walls = self._objects.walls
         outlines = walls.outlines_m
         begin, end = outlines[:, 0, :2], outlines[:, 1, :2]
-        # Seen from outside, a wall begins on the left and ends on the right.
+        # A wall is visible from outside only. Seen from there, its beginning is on the left.
         along = end - begin
         in_view = (placement.x_m - begin[:, 0]) * along[:, 1] > (placement.y_m - begin[:, 1]) * along[:, 0]
         ahead = _depth_m(outlines[:, :2, :2], placement)
@@ -133,7 +137,8 @@ def _polygon(picture: Picture, polygon: NDArray[np.int32], colour: list[float]) 
 
 
 def _line(picture: Picture, ends: list[list[int]], style: tuple[list[float], int]) -> None:
-    cv2.line(picture, ends[0], ends[1], style[0], style[1], cv2.LINE_AA, _SUBPIXEL_BITS)
+    (begin, end), (colour, width_px) = ends, style
+    cv2.line(picture, begin, end, colour, width_px, cv2.LINE_AA, _SUBPIXEL_BITS)
 
 
 def _facade(
@@ -141,24 +146,25 @@ def _facade(
     shape: tuple[NDArray[np.int32], list[NDArray[np.int32]]],
     colours: tuple[list[float], list[float]],
 ) -> None:
-    cv2.fillConvexPoly(picture, shape[0], colours[0], cv2.LINE_AA, _SUBPIXEL_BITS)
-    cv2.fillPoly(picture, shape[1], colours[1], cv2.LINE_AA, _SUBPIXEL_BITS)
+    (outline, windows), (wall_colour, glass_colour) = shape, colours
+    cv2.fillConvexPoly(picture, outline, wall_colour, cv2.LINE_AA, _SUBPIXEL_BITS)
+    cv2.fillPoly(picture, windows, glass_colour, cv2.LINE_AA, _SUBPIXEL_BITS)
 
 
 def _depth_m(points_m: FloatArray, placement: CameraPlacement) -> FloatArray:
-    """Return how far ahead of the camera points (..., 2) are."""
+    """Return the distances of points (..., 2) ahead of the camera."""
     along = (points_m[..., 0] - placement.x_m) * math.cos(placement.heading_rad)
     return np.asarray(along + (points_m[..., 1] - placement.y_m) * math.sin(placement.heading_rad))
 
 
 def _clip(corners_m: FloatArray, ahead: FloatArray) -> FloatArray:
-    """Clip faces to the part in front of the camera; `ahead` (n, 2) are the depths of their two ends."""
-    for near, far in ((0, 1), (1, 0)):
+    """Cut off the parts of faces that are too close to the camera; `ahead` (n, 2) are the depths of the faces' ends."""
+    for near, far in ((0, 1), (1, 0)):  # the end that may be too close, and the other end
         cut = ahead[:, near] < _NEAR_M
         if cut.any():
             share = ((_NEAR_M - ahead[cut, near]) / (ahead[cut, far] - ahead[cut, near]))[:, None]
-            for here, there in ((near, far), (3 - near, 3 - far)):
-                corners_m[cut, here] += share * (corners_m[cut, there] - corners_m[cut, here])
+            for near_corner, far_corner in ((near, far), (3 - near, 3 - far)):  # the low corners, and the high ones
+                corners_m[cut, near_corner] += share * (corners_m[cut, far_corner] - corners_m[cut, near_corner])
     return corners_m
 
 

@@ -17,7 +17,7 @@ from lavt.vehicle.sim.road.strips import Grey, Square, Strips, join_strips, make
 _CLOUD_TEXELS = 128
 _CLOUD_TEXEL_M = 6.0
 _DARKEST_CLOUD_SHADOW = 150.0
-"""The largest value of a cloud's shadow. It is less than 255, because some light passes through and around a cloud."""
+"""The largest value of a cloud's shadow in a mask. It is not 255, because some light passes clouds."""
 
 _MARGIN_M = 1.0
 
@@ -31,15 +31,17 @@ class Shadows:
             [_face_shadows(objects, self._shadow_m), _pole_shadows(objects.poles, self._shadow_m)]
         )
         self._trees = objects.trees
-        ends = objects.trees[:, :2] + objects.trees[:, 2:3] * self._shadow_m
-        reach = objects.trees[:, 2:3] * TREE_WIDTH / 2 + _MARGIN_M
+        feet_m, heights_m = objects.trees[:, :2], objects.trees[:, 2:3]
+        shadow_ends_m = feet_m + heights_m * self._shadow_m
+        reach_m = heights_m * TREE_WIDTH / 2 + _MARGIN_M
         self._tree_boxes = np.concatenate(
-            [np.minimum(objects.trees[:, :2], ends) - reach, np.maximum(objects.trees[:, :2], ends) + reach], axis=1
+            [np.minimum(feet_m, shadow_ends_m) - reach_m, np.maximum(feet_m, shadow_ends_m) + reach_m], axis=1
         )
+        """The bounding boxes of the trees' shadows, (n, 4): low x, low y, high x, high y."""
         self._clouds = _clouds() if clouds else None
 
     def mask(self, square: Square) -> Grey | None:
-        """Return the share of sunlight missing in each texel of a square, 0 to 255; None without any shadow."""
+        """Return the share of sunlight that each texel of a square lacks, 0 to 255; None without any shadow."""
         mask = np.zeros((square.pixels, square.pixels), dtype=np.uint8)
         if self._clouds is not None:
             _draw_clouds(self._clouds, square, mask)
@@ -55,7 +57,7 @@ class Shadows:
         for x_m, y_m, height_m, kind in self._trees[overlapping]:
             shape = tree_shape(int(kind))
             rows, columns = shape.shape
-            # Rows of the shape run down the tree: the last row is its foot, the first is the shadow of its top.
+            # The last row of the shape is the tree's foot; the first row is the shadow of its top.
             right = across * (height_m * TREE_WIDTH / columns)
             down = -self._shadow_m * (height_m / rows)
             foot = np.array([x_m, y_m])
@@ -73,8 +75,9 @@ def _face_shadows(objects: RoadsideObjects, shadow_m: FloatArray) -> Strips:
 
 
 def _pole_shadows(poles: FloatArray, shadow_m: FloatArray) -> Strips:
-    side = np.array([-shadow_m[1], shadow_m[0]]) / np.hypot(*shadow_m) * poles[:, 4:] / 2
-    foot, top = poles[:, :2] + poles[:, 2:3] * shadow_m, poles[:, :2] + poles[:, 3:4] * shadow_m
+    places_m, foot_heights_m, top_heights_m, widths_m = poles[:, :2], poles[:, 2:3], poles[:, 3:4], poles[:, 4:]
+    side = np.array([-shadow_m[1], shadow_m[0]]) / np.hypot(*shadow_m) * widths_m / 2
+    foot, top = places_m + foot_heights_m * shadow_m, places_m + top_heights_m * shadow_m
     return make_strips(np.stack([foot - side, foot + side, top + side, top - side], axis=1))
 
 
@@ -94,7 +97,7 @@ def _draw_clouds(clouds: Grey, square: Square, mask: Grey) -> None:
             [0.0, texel, square.low_m / _CLOUD_TEXEL_M + texel / 2],
         ]
     )
-    # Reduce the offset to one period: `warpAffine` wraps the pattern, but loses precision far from the origin.
+    # Reduce the offset to one period: `warpAffine` repeats the pattern, but loses precision far from the origin.
     matrix[:, 2] %= len(clouds)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     cv2.warpAffine(clouds, matrix, mask.shape, mask, flags, cv2.BORDER_WRAP)

@@ -1,4 +1,4 @@
-"""Sprites of trees and a bush, painted once per light and scaled to their size in the picture."""
+"""Sprites of trees and a bush, painted once for each light and scaled to the size that they have in the picture."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lavt.vehicle.sim.rendering.light import Light
 from lavt.vehicle.sim.rendering.textures import Grey
 
 TREE_KINDS = 5
-"""Three broad-leaved trees, a conifer, and a bush as the last kind."""
+"""The number of kinds: three broad-leaved trees, a conifer, and a bush as the last kind."""
 
 _WORLD_SEED = 0
 _HEIGHT_PX = 256
@@ -32,10 +32,12 @@ _HAZE_STEPS = 24
 
 @dataclass(frozen=True, slots=True)
 class Sprite:
-    """A tree's premultiplied colour and the transmittance of the background, 0 to 255, (rows, columns, 3) each."""
+    """A picture of a tree for drawing over a background, in two arrays (rows, columns, 3)."""
 
     colour: Picture
+    """The tree's colour, multiplied by its opacity."""
     transmittance: Picture
+    """The share of the background that remains visible, 0 to 255."""
 
 
 class Trees:
@@ -52,9 +54,10 @@ class Trees:
                 _lit_tree(self._light, kind, mirrored)
 
     def draw(self, picture: Picture, shape: Sequence[float], haze: float) -> None:
-        """Draw a tree into `picture`; `haze` is the share of haze in its colour.
+        """Draw a tree into `picture`; `haze` is the share of haze in the tree's colour.
 
-        `shape` is the position of its foot (u, v), its height in pixels, its kind, and whether it is mirrored.
+        `shape` has the position (u, v) of the tree's foot, the height in pixels, the kind, and whether the sprite is
+        mirrored.
         """
         foot_u, foot_v, height_px, kind, mirrored = shape
         variant = (int(kind), mirrored != 0, round(haze * _HAZE_STEPS))
@@ -75,7 +78,7 @@ class Trees:
         key = (kind, mirrored, haze_step, rows)
         sprite = self._cache.get(key)
         if sprite is None:
-            full_size = _full_size_sprite(self._light, kind, mirrored, haze_step, 0)
+            full_size = _halved_sprite(self._light, kind, mirrored, haze_step, 0)
             size = (max(2, round(rows * TREE_WIDTH)), rows)
             sprite = Sprite(_resize(full_size.colour, size), _resize(full_size.transmittance, size))
             if len(self._cache) >= _MAX_CACHED_SPRITES:
@@ -86,16 +89,16 @@ class Trees:
     def _draw_large(
         self, picture: Picture, variant: tuple[int, bool, int], height_px: float, foot_px: tuple[float, float]
     ) -> None:
-        """Draw only the visible part of a large tree, scaled with subpixels, without which large trees would jump."""
-        width_px = height_px * TREE_WIDTH
-        left, top = foot_px[0] - width_px / 2, foot_px[1] - height_px
+        """Draw the visible part of a large tree, scaled with subpixels: with whole pixels, large trees would jump."""
+        (foot_u, foot_v), width_px = foot_px, height_px * TREE_WIDTH
+        left, top = foot_u - width_px / 2, foot_v - height_px
         low_u, high_u = max(round(left), 0), min(round(left + width_px), picture.shape[1])
         low_v, high_v = max(round(top), 0), min(round(top + height_px), picture.shape[0])
         if low_u >= high_u or low_v >= high_v:
             return
         kind, mirrored, haze_step = variant
-        full_size = _full_size_sprite(self._light, kind, mirrored, haze_step, 1 if height_px < _HEIGHT_PX * 0.6 else 0)
-        scale = full_size.colour.shape[0] / height_px
+        sprite = _halved_sprite(self._light, kind, mirrored, haze_step, 1 if height_px < _HEIGHT_PX * 0.6 else 0)
+        scale = sprite.colour.shape[0] / height_px
         matrix = np.array(
             [
                 [scale, 0.0, (low_u - left + 0.5) * scale - 0.5],
@@ -103,10 +106,10 @@ class Trees:
             ]
         )
         size, flags = (high_u - low_u, high_v - low_v), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        colour = cv2.warpAffine(full_size.colour, matrix, size, flags=flags, borderMode=cv2.BORDER_CONSTANT)
+        colour = cv2.warpAffine(sprite.colour, matrix, size, flags=flags, borderMode=cv2.BORDER_CONSTANT)
         border = (255.0, 255.0, 255.0)
         transmittance = cv2.warpAffine(
-            full_size.transmittance, matrix, size, flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=border
+            sprite.transmittance, matrix, size, flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=border
         )
         _blend(picture[low_v:high_v, low_u:high_u], np.asarray(colour, np.uint8), np.asarray(transmittance, np.uint8))
 
@@ -121,10 +124,10 @@ def _resize(image: Picture, size: tuple[int, int]) -> Picture:
 
 
 @lru_cache(maxsize=240)
-def _full_size_sprite(light: Light, kind: int, mirrored: bool, haze_step: int, halvings: int) -> Sprite:
-    """Return a tree's sprite, from full size halved `halvings` times."""
+def _halved_sprite(light: Light, kind: int, mirrored: bool, haze_step: int, halvings: int) -> Sprite:
+    """Return a tree's sprite, whose full size is halved `halvings` times."""
     if halvings:
-        larger = _full_size_sprite(light, kind, mirrored, haze_step, halvings - 1)
+        larger = _halved_sprite(light, kind, mirrored, haze_step, halvings - 1)
         size = (_WIDTH_PX >> halvings, _HEIGHT_PX >> halvings)
         return Sprite(_resize(larger.colour, size), _resize(larger.transmittance, size))
     clear, hazed, transmittance = _lit_tree(light, kind, mirrored)
@@ -138,7 +141,7 @@ def _lit_tree(light: Light, kind: int, mirrored: bool) -> tuple[Picture, Picture
     colour, alpha = _paint_tree(kind)
     if mirrored:
         colour, alpha = colour[:, ::-1], alpha[:, ::-1]
-    # The painted tree is in the noon sun: its dark side takes the colour of shade, its bright side that of the sun.
+    # The tree is painted in the noon sun. Its dark parts get the factor of the shade, its bright parts that of the sun.
     brightness = np.clip(colour.mean(axis=2, keepdims=True) / 75.0, 0.0, 1.0)
     if light.shadows:
         factor = np.array(light.shade) * 1.7 * (1 - brightness) + np.array(light.lit) * brightness
@@ -156,7 +159,7 @@ def _lit_tree(light: Light, kind: int, mirrored: bool) -> tuple[Picture, Picture
 
 @lru_cache(maxsize=TREE_KINDS)
 def tree_shape(kind: int) -> Grey:
-    """Return a tree's silhouette for its shadow, 0 to 255; it is small, so that the shadow's edge is soft."""
+    """Return a tree's silhouette for its shadow, 0 to 255; it is reduced, so that the shadow's edge is soft."""
     _, alpha = _paint_tree(kind)
     size = (_WIDTH_PX // _SHADOW_REDUCTION, _HEIGHT_PX // _SHADOW_REDUCTION)
     return np.asarray(cv2.resize(alpha, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
@@ -192,7 +195,7 @@ def _paint_trunk(colour: Picture, alpha: Grey, middle: int, random: np.random.Ge
 
 
 def _leaf_tufts(kind: int, random: np.random.Generator) -> FloatArray:
-    """Return tufts of leaves, back to front, (n, 4): u, v, radius in pixels, brightness."""
+    """Return tufts of leaves (n, 4), the farthest first: u, v, radius (all in pixels) and brightness."""
     count = 3200
     middle = _WIDTH_PX / 2
     if kind == 3:  # a conifer: a cone of tiers

@@ -1,7 +1,4 @@
-"""Road-surface wear: patches, seams, cracks and sealed cracks.
-
-Their positions on a road are the same in every run.
-"""
+"""Road-surface wear: patches, seams, cracks and sealed cracks. It is the same in every run."""
 
 from __future__ import annotations
 
@@ -26,11 +23,12 @@ _PAVER_WIDTH_M = 3.5
 
 @dataclass(frozen=True, slots=True)
 class SurfaceWear:
-    """Strips of one kind of wear, their width (m), and by how many grey levels they darken the asphalt."""
+    """Strips of one kind of wear."""
 
     strips: Strips
     width_m: float
     darkening: int
+    """By how many grey levels the strips darken the asphalt."""
 
 
 def surface_wear(road: Road) -> list[SurfaceWear]:
@@ -42,7 +40,7 @@ def surface_wear(road: Road) -> list[SurfaceWear]:
         for offset_m in np.arange(strip.right_m + _PAVER_WIDTH_M, strip.left_m - 1.0, _PAVER_WIDTH_M)
     ]
     return [
-        *(SurfaceWear(join_strips(strips), 2.0, grey) for grey, strips in patches.items()),
+        *(SurfaceWear(join_strips(strips), 2.0, darkening) for darkening, strips in patches.items()),
         SurfaceWear(join_strips(seams), _SEAM_WIDTH_M, 12),
         SurfaceWear(patch_seams, _PATCH_SEAM_WIDTH_M, 30),
         SurfaceWear(_cracks(road, "cracks", 0.018), 0.018, 34),
@@ -51,9 +49,9 @@ def surface_wear(road: Road) -> list[SurfaceWear]:
 
 
 def _patches(road: Road) -> tuple[dict[int, list[Strips]], Strips]:
-    """Return rectangular patches of newer asphalt by how much darker they are, and the seams around them."""
+    """Return rectangular patches of newer asphalt, by darkening (grey levels), and the seams around the patches."""
     random = stream(_WORLD_SEED, "repairs")
-    by_grey: dict[int, list[Strips]] = {7: [], 12: [], 17: []}
+    by_darkening: dict[int, list[Strips]] = {7: [], 12: [], 17: []}
     half_seam_m = _PATCH_SEAM_WIDTH_M / 2
     seams = []
     count = int((road.last_m - road.first_m) / _PATCH_SPACING_M * len(road.paved))
@@ -64,20 +62,19 @@ def _patches(road: Road) -> tuple[dict[int, list[Strips]], Strips]:
         end_m = min(begin_m + random.uniform(2.0, 16.0), last_m)
         right_m = random.uniform(strip.right_m, max(strip.left_m - 2.0, strip.right_m))
         left_m = min(right_m + random.uniform(1.0, 3.4), strip.left_m)
-        by_grey[sorted(by_grey)[int(random.integers(len(by_grey)))]].append(
-            strip_along(road, left_m, right_m, begin_m, end_m)
-        )
+        darkening = sorted(by_darkening)[int(random.integers(len(by_darkening)))]
+        by_darkening[darkening].append(strip_along(road, left_m, right_m, begin_m, end_m))
         seams += [
             strip_along(road, edge_m + half_seam_m, edge_m - half_seam_m, begin_m, end_m)
             for edge_m in (left_m, right_m)
         ]
         ends_m = np.array([begin_m, end_m])
         seams.append(strip_pieces(road, left_m, right_m, ends_m - half_seam_m, ends_m + half_seam_m))
-    return by_grey, join_strips(seams)
+    return by_darkening, join_strips(seams)
 
 
 def _cracks(road: Road, name: str, width_m: float) -> Strips:
-    """Return random polylines along or across the road, in steps of about a third of a metre."""
+    """Return cracks: random polylines along or across the road, with steps of about a third of a metre."""
     random = stream(_WORLD_SEED, name)
     cracks = []
     for _ in range(int((road.last_m - road.first_m) / _CRACK_SPACING_M * len(road.paved))):

@@ -1,7 +1,7 @@
 """Textures of the simulated world: seamless patterns of asphalt, grass, gravel and worn paint.
 
-A pattern repeats every `PERIOD_M` and is anchored to the world frame. It is generated once at the finest scale; each
-coarser scale is the mean of the finer one, so the brightness is equal in all bands of the picture.
+A pattern repeats every `PERIOD_M` and is anchored to the world frame. It is generated once at the finest scale. Texels
+of a coarser scale are means of texels of the next finer scale, so the brightness is equal in all bands of the picture.
 """
 
 from __future__ import annotations
@@ -24,22 +24,23 @@ Grey = NDArray[np.uint8]
 Field = NDArray[np.float32]
 
 _WORLD_SEED = 0
-"""The world is the same in every run; of the pictures, a run's seed changes only the sensor noise."""
+"""The world is the same in every run. A run's seed changes only the sensor noise of its pictures."""
 
 
 @dataclass(frozen=True, slots=True)
 class Textures:
-    """One period of each pattern at one scale; `wear` is the remaining share of paint, 0 to 255."""
+    """One period of each pattern at one scale."""
 
     asphalt: Grey
     grass: Picture
     gravel: Picture
     wear: Grey
+    """The share of a mark's paint that wear has left, 0 to 255."""
 
 
 @lru_cache(maxsize=1)
 def all_textures() -> tuple[Textures, ...]:
-    """Return the patterns, one set per scale of `SCALES_M`; the first call takes about half a second."""
+    """Return the patterns at each scale of `SCALES_M`; the first call takes about half a second."""
     finest = _make_finest()
     levels = [finest]
     for scale_m in SCALES_M[1:]:
@@ -55,12 +56,15 @@ def _reduce(image: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
 
 
 def seamless_noise(name: str, size: int, cells: int) -> Field:
-    """Return a smooth periodic random field (size x size, mean 0, deviation 1) of `cells` x `cells` bumps."""
+    """Return a smooth periodic random field (size x size, mean 0, deviation 1) with `cells` x `cells` random values.
+
+    The values between them are interpolated.
+    """
     coarse = stream(_WORLD_SEED, name, cells).standard_normal((cells, cells))
     border = 4
     padded = np.pad(coarse, border, mode="wrap").astype(np.float32)
     scale = size / cells
-    # The coordinates of cv2.resize, with a border of whole coarse cells: texel i samples (i + 0.5) / scale - 0.5.
+    # As in cv2.resize, texel i is interpolated at (i + 0.5) / scale - 0.5 of the coarse field, here behind the border.
     index = ((np.arange(size) + 0.5) / scale - 0.5 + border).astype(np.float32)
     columns, rows = np.meshgrid(index, index)
     field = np.asarray(cv2.remap(padded, columns, rows, cv2.INTER_CUBIC), dtype=np.float32)

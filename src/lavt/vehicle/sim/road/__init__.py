@@ -1,1 +1,1 @@
-"""Roads: files, centrelines, cross-sections and marks."""
+"""Roads: files, centrelines, cross-sections, and strips on the ground."""

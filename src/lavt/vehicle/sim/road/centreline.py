@@ -1,8 +1,8 @@
 """The centreline of a road: straight segments, arcs and clothoids joined end to end with continuous heading.
 
-A station `s_m` is a distance along the line. Positions on lines and arcs are computed in closed form. Positions on
-clothoids are integrated with the Gauss-Legendre rule over pieces that turn by at most a radian, which is exact to a
-nanometre.
+A station `s_m` is a distance along the centreline. Positions on straight segments and arcs are computed in closed form.
+Positions on clothoids are integrated by the Gauss-Legendre rule, over pieces that turn by at most a radian. The error
+is less than a nanometre.
 """
 
 from __future__ import annotations
@@ -28,26 +28,29 @@ _NODE_SHARES_AND_WEIGHTS = tuple(zip(_NODE_SHARES.tolist(), (_WEIGHTS / 2).tolis
 """The node shares and their weights, whose sum is 1, as plain numbers."""
 
 _MAX_PIECE_TURN_RAD = 1.0
-"""A clothoid is split into pieces that turn by this much at most, so that the integration rule is exact for each."""
+"""A clothoid is split into pieces that turn by at most this angle, so that the integration rule is exact enough."""
 
 _STRAIGHT_PER_M = 1e-12
-"""Less curvature counts as straight: over 20 km it amounts to 0.2 mm, and its inverse is too large to compute with."""
+"""A line with a smaller curvature is treated as straight. Over 20 km the difference is 0.2 mm, and the radius of such a
+line is too large for the computations."""
 
 _FOOT_TOLERANCE_M = 1e-9
 _MAX_FOOT_STEPS = 12
-"""The search for a foot on a clothoid ends with a step shorter than the tolerance, or after this number of steps."""
+"""The foot of a point on a line is the nearest point of the line. The search for a foot on a clothoid ends with a step
+shorter than the tolerance, or after `_MAX_FOOT_STEPS` steps."""
 
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """A line, arc or clothoid: its curvature (left positive) is linear in the arc length."""
+    """A straight segment, arc or clothoid, whose curvature (left positive) is linear in the arc length."""
 
     length_m: float
     curvature_per_m: float
+    """The curvature at the beginning."""
     end_curvature_per_m: float
 
     def split(self) -> list[Segment]:
-        """Split a clothoid into pieces that turn by a radian at most; lines and arcs stay whole."""
+        """Split a clothoid into pieces that turn by at most a radian; other segments stay whole."""
         if self.end_curvature_per_m == self.curvature_per_m:
             return [self]
         max_curvature_per_m = max(abs(self.curvature_per_m), abs(self.end_curvature_per_m))
@@ -57,7 +60,7 @@ class Segment:
 
 
 class CentrelinePoints(NamedTuple):
-    """Points of a centreline: arrays of the shape of the stations that were asked for."""
+    """Points of a centreline; each array has the shape of the array of stations."""
 
     x_m: FloatArray
     y_m: FloatArray
@@ -67,21 +70,23 @@ class CentrelinePoints(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _Piece:
-    """A placed segment: its first station, x, y, heading and curvature there, and the curvature's rate (1/m2)."""
+    """A segment, or a part of a clothoid, at its place on the centreline."""
 
     s_m: float
+    """The station of the beginning. The next four values are those at the beginning, too."""
     x_m: float
     y_m: float
     heading_rad: float
     curvature_per_m: float
     rate_per_m2: float
+    """The change of curvature per metre."""
 
     def turn_rad(self, along_m: float) -> float:
-        """Return the change of heading over the first `along_m` of the piece."""
+        """Return the change of heading over the first `along_m` metres of the piece."""
         return along_m * (self.curvature_per_m + self.rate_per_m2 * along_m / 2)
 
     def displacement(self, along_m: float) -> tuple[float, float]:
-        """Return the position `along_m` into the piece, ahead and to the left of its beginning."""
+        """Return the position at `along_m` metres of the piece, as metres ahead and to the left of its beginning."""
         if self.rate_per_m2 == 0.0:
             half_rad = self.curvature_per_m * along_m / 2
             chord_m = along_m if abs(half_rad) < 1e-9 else along_m * math.sin(half_rad) / half_rad
@@ -95,21 +100,22 @@ class _Piece:
 
 
 _SearchRow = tuple[float, float, float, float, float, float, float, float, float, "_Piece | None"]
-"""The first and last station of the search; the piece's station, x, y, heading and curvature at its beginning; cosine
-and sine of the heading; and the piece itself if it is a clothoid. A plain tuple is unpacked faster than a named one."""
+"""The stations between which a piece is searched; station, x, y, heading and curvature at the piece's beginning; cosine
+and sine of this heading; and the piece itself if it is a clothoid. A plain tuple is unpacked faster than a named one.
+"""
 
 
 class Centreline:
-    """Segments joined end to end, the first one at station `first_m` and at `pose` (x, y in m, heading in rad).
+    """Segments joined end to end. The first one begins at station `first_m` with `pose` (x, y in m, heading in rad).
 
-    Beyond both ends the line continues straight.
+    Before the first and after the last segment the centreline is straight.
     """
 
     def __init__(self, first_m: float, pose: tuple[float, float, float], segments: Sequence[Segment]) -> None:
         x_m, y_m, heading_rad = pose
         self._pieces: list[_Piece] = []
         s_m = first_m
-        # The straight extensions beyond both ends are pieces of length 0, which the searches extend to infinity.
+        # The straight parts beyond both ends are pieces of length 0; `sample` and `project` extend them to infinity.
         extension = Segment(0.0, 0.0, 0.0)
         for segment in (extension, *(part for whole in segments for part in whole.split()), extension):
             length_m, curvature_per_m = segment.length_m, segment.curvature_per_m
@@ -150,13 +156,13 @@ class Centreline:
         )
 
     def project(self, x_m: float, y_m: float, first_m: float, last_m: float) -> tuple[float, float, float, float]:
-        """Project a position onto the line between the stations `first_m` and `last_m`.
+        """Project a position onto the centreline between the stations `first_m` and `last_m`.
 
-        Returns the nearest point's station (m), the position's lateral offset (m, left positive), and the line's
-        heading (rad) and curvature (1/m) at the point.
+        Returns the station (m) of the nearest point on the centreline, the position's lateral offset (m, left
+        positive), and the centreline's heading (rad) and curvature (1/m) at the nearest point.
         """
-        best = (first_m, math.inf, 0.0, 0.0)
-        best_m = math.inf
+        nearest = (first_m, math.inf, 0.0, 0.0)
+        nearest_m = math.inf
         search_table = self._search_table
         for index in range(bisect_right(self._begin_stations_m, first_m) - 1, len(search_table)):
             begin_m, end_m, s_m, x0_m, y0_m, heading_rad, curvature_per_m, cosine, sine, piece = search_table[index]
@@ -187,10 +193,10 @@ class Centreline:
                     left_m * turned_cosine - ahead_m * turned_sine,
                 )
             distance_m = math.hypot(ahead_m, left_m)
-            if distance_m < best_m:
-                best_m = distance_m
-                best = (s_m + along_m, left_m, heading_rad + turn_rad, curvature_per_m)
-        return best
+            if distance_m < nearest_m:
+                nearest_m = distance_m
+                nearest = (s_m + along_m, left_m, heading_rad + turn_rad, curvature_per_m)
+        return nearest
 
     @cached_property
     def _search_table(self) -> list[_SearchRow]:
@@ -206,7 +212,7 @@ class Centreline:
 
     @cached_property
     def _piece_table(self) -> FloatArray:
-        """The fields of each piece, (n, 6)."""
+        """A row of the six fields for each piece, (n, 6)."""
         return np.array(
             [
                 (piece.s_m, piece.x_m, piece.y_m, piece.heading_rad, piece.curvature_per_m, piece.rate_per_m2)
@@ -216,13 +222,13 @@ class Centreline:
 
 
 def _foot_m(piece: _Piece, ahead_m: float, left_m: float, low_m: float, high_m: float) -> float:
-    """Return the arc length, from `low_m` to `high_m`, at which a clothoid is nearest to a point.
+    """Return the arc length between `low_m` and `high_m` at which a clothoid is nearest to a point.
 
-    The point is given in the frame of the clothoid's beginning.
+    The point is given ahead and to the left of the clothoid's beginning.
     """
     along_m = (low_m + high_m) / 2
     for _ in range(_MAX_FOOT_STEPS):
-        # Step to the foot on the clothoid's osculating circle; the error shrinks with the step's cube.
+        # Step to the foot on the clothoid's osculating circle at `along_m`; the error falls with the step's cube.
         reached_ahead_m, reached_left_m = piece.displacement(along_m)
         offset = _rotate(ahead_m - reached_ahead_m, left_m - reached_left_m, piece.turn_rad(along_m))
         step_m = _arc_foot_m(*offset, piece.curvature_per_m + piece.rate_per_m2 * along_m, 0.0)
@@ -233,9 +239,10 @@ def _foot_m(piece: _Piece, ahead_m: float, left_m: float, low_m: float, high_m: 
 
 
 def _arc_foot_m(ahead_m: float, left_m: float, curvature_per_m: float, middle_m: float) -> float:
-    """Return the arc length at which a circle is nearest to a point: of all turns, on the one nearest `middle_m`.
+    """Return the arc length at which a circle is nearest to a point.
 
-    The point is given in the frame of the arc's beginning.
+    The point is given ahead and to the left of the arc's beginning. A further turn of the circle gives another arc
+    length for the same place; the arc length nearest to `middle_m` is returned.
     """
     if abs(curvature_per_m) < _STRAIGHT_PER_M:
         return ahead_m
@@ -246,6 +253,6 @@ def _arc_foot_m(ahead_m: float, left_m: float, curvature_per_m: float, middle_m:
 
 
 def _rotate(ahead_m: float, left_m: float, turn_rad: float) -> tuple[float, float]:
-    """Return a vector's components in a frame that is turned to the left by `turn_rad`."""
+    """Return the components of a vector in a frame that is turned to the left by `turn_rad`."""
     cosine, sine = math.cos(turn_rad), math.sin(turn_rad)
     return ahead_m * cosine + left_m * sine, left_m * cosine - ahead_m * sine

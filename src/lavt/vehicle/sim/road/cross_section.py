@@ -1,7 +1,7 @@
 """The cross-section of a road: lanes, asphalt, marks, rails and barriers.
 
-Offsets are lateral distances from the centre of the driven lane, left positive. Stations are distances along it, 0 at
-the route's start.
+Offsets are lateral distances from the centre of the driven lane, left positive. Stations are distances along this
+centre, 0 at the route's start.
 """
 
 from __future__ import annotations
@@ -21,19 +21,21 @@ DASH_M, GAP_M = 3.0, 6.0
 
 @dataclass(frozen=True)
 class Lanes:
-    """The lanes of the driven direction, from the left; `driven` is the index of the driven lane."""
+    """The lanes of the driven direction."""
 
     widths_m: tuple[float, ...]
+    """The widths of the lanes, the leftmost first."""
     driven: int
+    """The index of the driven lane."""
 
     @property
     def left_edge_m(self) -> float:
-        """The lateral offset of the leftmost lane edge."""
+        """The lateral offset of the leftmost lane's left edge."""
         return sum(self.widths_m[: self.driven]) + self.widths_m[self.driven] / 2
 
     @cached_property
     def edges_m(self) -> tuple[float, ...]:
-        """The lateral offsets of all lane edges, from right to left."""
+        """The lateral offsets of all lane edges, the rightmost first."""
         edges = [self.left_edge_m]
         for width_m in self.widths_m:
             edges.append(edges[-1] - width_m)
@@ -66,14 +68,14 @@ class RoadMark:
     """A station where a dash begins, which fixes all other dashes."""
 
     def dash_begins_m(self, first_m: float, last_m: float) -> FloatArray:
-        """Return where the dashes begin (stations), for the dashes wholly between two stations and within the mark."""
+        """Return the stations where dashes begin, for dashes that lie wholly in the mark and between two stations."""
         first_m, last_m = max(self.from_m, first_m), min(self.to_m, last_m)
         period_m = self.dash_m + self.gap_m
-        counts = np.arange(
+        indices = np.arange(
             math.floor((first_m - self.dash_at_m) / period_m), math.ceil((last_m - self.dash_at_m) / period_m) + 1
         )
-        begin = self.dash_at_m + counts * period_m
-        return np.asarray(begin[(begin >= first_m) & (begin + self.dash_m <= last_m)], dtype=np.float64)
+        begin_m = self.dash_at_m + indices * period_m
+        return np.asarray(begin_m[(begin_m >= first_m) & (begin_m + self.dash_m <= last_m)], dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,5 +92,5 @@ RoadElement = TypeVar("RoadElement", PavedArea, RoadMark, Rail)
 
 
 def shift_stations(element: RoadElement, by_m: float) -> RoadElement:
-    """Return `element` with its stations counted from a point `by_m` further on."""
+    """Return `element` with stations that are counted from the station `by_m` instead of 0."""
     return replace(element, from_m=element.from_m - by_m, to_m=element.to_m - by_m)

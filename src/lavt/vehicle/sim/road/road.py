@@ -1,7 +1,7 @@
 """A road as data: the centre of the driven lane as lines, arcs and clothoids, and the cross-section.
 
-The reference line is the centre of the driven lane. A station `s_m` is a distance along it, 0 at the route's start; a
-lateral offset is across it, left positive. Roads are flat. `docs/roads.md` describes their files.
+A station `s_m` is a distance along the centre of the driven lane, 0 at the route's start. A lateral offset is a
+distance from this centre, left positive. Roads are flat. `docs/roads.md` describes road files.
 """
 
 from __future__ import annotations
@@ -22,16 +22,17 @@ from lavt.vehicle.sim.road.cross_section import Lanes, PavedArea, Rail, RoadMark
 from lavt.vehicle.sim.road.road_file import RoadFile, read_road_file
 
 PROJECTION_WINDOW_M = 15.0
-"""Range of a projection around the last known station; searching the whole road could find another part of it."""
+"""A projection searches this far before and behind the last known station. A search of the whole road could find
+another part of the road."""
 
 
 @dataclass(frozen=True)
 class Road:
     """A road and the route on it.
 
-    The route goes from station 0 to station `route_length_m`. The segments begin before its start, at station `first_m`
-    with the pose `origin` (x, y in m, heading in rad, world frame), and end beyond its end. Outside them the road is
-    straight.
+    The route goes from station 0 to station `route_length_m`. The first segment begins before the route's start, at
+    station `first_m`, where the pose is `origin` (x, y in m, heading in rad, world frame). The last segment ends beyond
+    the route's end. Before the first and after the last segment the road is straight.
     """
 
     title: str
@@ -68,14 +69,15 @@ class Road:
     def project(self, x_m: float, y_m: float, near_s_m: float) -> tuple[float, float, float]:
         """Project a position onto the lane's centre.
 
-        The search covers the stations within `PROJECTION_WINDOW_M` of `near_s_m`. Returns the nearest point's station
-        (m), the position's lateral offset (m, left positive) and the lane's heading (rad) at the point.
+        The search covers the stations up to `PROJECTION_WINDOW_M` before and behind `near_s_m`. Returns the station (m)
+        of the nearest point on the centre, the position's lateral offset (m, left positive), and the lane's heading
+        (rad) at the nearest point.
         """
         window_m = PROJECTION_WINDOW_M
         return self._centreline.project(x_m, y_m, near_s_m - window_m, near_s_m + window_m)[:3]
 
     def sub_route(self, title: str, from_m: float, route_length_m: float) -> Road:
-        """Return the same road with a route that begins at station `from_m`; nothing on the ground changes."""
+        """Return the same road with another route, which begins at station `from_m`."""
         return replace(
             self,
             title=title,
@@ -110,8 +112,8 @@ def load_road(name: str) -> Road:
 def parse_road(text: str, source: str) -> Road:
     """Parse a road from YAML text.
 
-    Raises `UserError`, which names `source` and the key, if a key or a value is invalid. `part_of` names a road that
-    comes with LAVT, or a file relative to the directory of `source`.
+    Raises `UserError`, which names `source` and the key, if a key or a value is invalid. The key `part_of` names a road
+    that comes with LAVT, or a file relative to the directory of `source`.
     """
     road_file = read_road_file(text, source)
     if isinstance(road_file, RoadFile):
@@ -126,7 +128,7 @@ def parse_road(text: str, source: str) -> Road:
     part_of, from_m = road_file.part_of, road_file.from_m
     available_m = whole.last_m - from_m
     if available_m <= 0.0:
-        raise UserError(f"{source}: {part_of} ends at {whole.last_m:.1f} m: from_m must be less")
+        raise UserError(f"{source}: {part_of} ends at {whole.last_m:.1f} m: from_m must be less than this")
     if road_file.length_m > available_m:
         raise UserError(f"{source}: {part_of} has only {available_m:.1f} m from {from_m} m on: shorten length_m")
     return whole.sub_route(road_file.title, from_m, road_file.length_m)
@@ -153,7 +155,7 @@ def _make_road(road_file: RoadFile) -> Road:
 
 
 def _read_text(name: str) -> tuple[str, str]:
-    """Read a road's file and return its text and its display name."""
+    """Read a road file and return its text and its name for messages."""
     if name in road_names():
         file = resources.files("lavt") / "data" / "roads" / f"{name}.yaml"
         return file.read_text(encoding="utf-8"), f"{name}.yaml"

@@ -1,4 +1,4 @@
-"""The schema of road files: their keys, defaults and checks. `docs/roads.md` is the users' description."""
+"""The schema of road files: keys, defaults and checks. `docs/roads.md` describes road files for users."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ MAX_CURVATURE_PER_M = 0.2
 """The largest curvature, which a car with a turning radius of 5 m can just follow."""
 
 MIN_ROUTE_M = 10.0
-"""The shortest route; cars start up to 2 m into it."""
+"""The shortest route; a car starts at a station between 0 and 2 m."""
 
 MIN_DASH_M = 0.1
-"""The shortest dash and gap. Hundreds of thousands of shorter ones would be invisible and take minutes to draw."""
+"""The shortest dash and gap. Shorter dashes would be invisible, and drawing hundreds of thousands takes minutes."""
 
 MIN_INNER_SHARE = 0.1
-"""In a curve, the inner edge of the road must be at least this share as long as the centre of the driven lane."""
+"""In a curve, the length of the road's inner edge must be at least this share of the length of the lane's centre."""
 
 Coordinate = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-100_000, le=100_000)]
 Offset = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-200, le=200)]
@@ -102,7 +102,7 @@ class _RailKeys(_RangeKeys):
 
 
 class PartFile(_Keys):
-    """A file whose route lies on another file's road and begins at that road's station `from_m`."""
+    """A file whose route lies on the road of another file, and begins at the station `from_m` of that road."""
 
     title: Title
     part_of: Annotated[str, Field(strict=True, min_length=1)]
@@ -137,12 +137,12 @@ class RoadFile(_Keys):
 
     @property
     def route_length_m(self) -> float:
-        """The length of the route, by default that of all segments."""
+        """The length of the route, by default the total length of the segments."""
         return self.segments_length_m if self.length_m is None else self.length_m
 
     @property
     def all_segments(self) -> tuple[Segment, ...]:
-        """The segments with the straight run-in before and the straight run-out after them."""
+        """The straight run-in, the segments, and the straight run-out."""
         run_in, run_out = Segment(self.run_in_m, 0.0, 0.0), Segment(self.run_out_m, 0.0, 0.0)
         return run_in, *(segment.to_segment() for segment in self.segments), run_out
 
@@ -178,7 +178,7 @@ class RoadFile(_Keys):
 
 @functools.lru_cache(maxsize=32)  # a sweep loads the same roads repeatedly, and parsing YAML takes 7 ms
 def read_road_file(text: str, source: str) -> RoadFile | PartFile:
-    """Parse a road file; raise a `UserError` that names `source` and the problems."""
+    """Parse a road file. If it is invalid, raise a `UserError` that names `source` and the problems."""
     try:
         data = yaml.safe_load(text)
     except (yaml.YAMLError, ValueError, AttributeError, RecursionError) as error:
@@ -229,7 +229,7 @@ def _find_problems(road: RoadFile) -> Iterable[str]:
 
 
 def _named_ranges(road: RoadFile) -> Iterable[tuple[str, _RangeKeys]]:
-    """Yield each entry that has `from_m` and `to_m`, with its name in messages."""
+    """Yield each entry that has `from_m` and `to_m`, after its name for messages."""
     for section, entries in (("paved", road.paved), ("marks", road.marks), ("rails", road.rail_keys)):
         for index, keys in enumerate(entries or ()):
             yield f"{section}.{index}", keys
@@ -289,7 +289,7 @@ def _describe_error(kind: type[BaseModel], problem: Mapping[str, Any]) -> str:
 
 
 def _format_value(value: Any) -> str:
-    """Return a value as text, or only its type: lists may contain themselves, and integers may be huge."""
+    """Return a value as text, or only its type: lists can contain themselves, and integers can be huge."""
     if not isinstance(value, str | int | float | None) or (isinstance(value, int) and value.bit_length() > 64):
         return f"this {type(value).__name__}"
     shown = repr(value)

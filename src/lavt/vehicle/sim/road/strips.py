@@ -1,4 +1,4 @@
-"""Quadrilaterals on the ground, along a road or elsewhere, and their rasterisation into a tile."""
+"""Quadrilaterals on the ground, along a road or elsewhere, and their rasterisation in a square of ground."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Grey = NDArray[np.uint8]
 """Grey levels or the values of a mask, 0 to 255, (rows, columns)."""
 
 OVERLAP_M = 0.03
-"""The length by which a piece overlaps the next one, so that no gap is visible."""
+"""The length by which a piece overlaps the next piece, so that no gap is visible."""
 
 MAX_PIECE_M = 2.0
 """The longest straight piece of a strip that follows the road."""
@@ -26,12 +26,16 @@ _SUBPIXEL_BITS = 4
 
 @dataclass(frozen=True, slots=True)
 class Square:
-    """A square of ground: x of its left and y of its lower edge (world frame), length of an edge, metres per texel."""
+    """A square of ground."""
 
     left_m: float
+    """x of the left edge, in the world frame."""
     low_m: float
+    """y of the lower edge, in the world frame."""
     edge_m: float
+    """Length of an edge."""
     scale_m: float
+    """Metres per texel."""
 
     @property
     def pixels(self) -> int:
@@ -41,16 +45,18 @@ class Square:
 
 @dataclass(frozen=True, slots=True)
 class Strips:
-    """Convex quadrilaterals (n, 4, 2) in metres, with bounding boxes (n, 4): low x, low y, high x, high y."""
+    """Convex quadrilaterals on the ground."""
 
     corners_m: FloatArray
+    """The corners in the world frame, (n, 4, 2)."""
     boxes_m: FloatArray
+    """The bounding boxes, (n, 4): low x, low y, high x, high y."""
 
     def fill(self, mask: Grey, square: Square, value: int) -> bool:
-        """Paint `value` into the mask of a square where the strips are; return whether any was near the square."""
-        boxes = self.boxes_m
-        overlapping = (boxes[:, 0] <= square.left_m + square.edge_m) & (boxes[:, 2] >= square.left_m)
-        overlapping &= (boxes[:, 1] <= square.low_m + square.edge_m) & (boxes[:, 3] >= square.low_m)
+        """Paint `value` into the mask of a square where strips are; return False if no strip is near the square."""
+        low_x_m, low_y_m, high_x_m, high_y_m = self.boxes_m.T
+        overlapping = (low_x_m <= square.left_m + square.edge_m) & (high_x_m >= square.left_m)
+        overlapping &= (low_y_m <= square.low_m + square.edge_m) & (high_y_m >= square.low_m)
         near = self.corners_m[overlapping]
         corners_px = (near - np.array([square.left_m, square.low_m])) / square.scale_m - 0.5
         for polygon in np.rint(corners_px * (1 << _SUBPIXEL_BITS)).astype(np.int32):
@@ -58,7 +64,7 @@ class Strips:
         return len(near) > 0
 
     def mask(self, square: Square) -> Grey | None:
-        """Return a mask of the strips in a square; None when there are none."""
+        """Return a mask of the strips in a square; None if there are none."""
         mask = np.zeros((square.pixels, square.pixels), dtype=np.uint8)
         return mask if self.fill(mask, square, 255) and mask.any() else None
 
@@ -69,7 +75,7 @@ def make_strips(corners_m: FloatArray) -> Strips:
 
 
 def join_strips(parts: Sequence[Strips]) -> Strips:
-    """Concatenate strips."""
+    """Return all strips together."""
     return make_strips(np.concatenate([np.empty((0, 4, 2)), *(part.corners_m for part in parts)]))
 
 
@@ -81,6 +87,6 @@ def strip_along(road: Road, left_m: float, right_m: float, from_m: float = -np.i
 
 
 def strip_pieces(road: Road, left_m: ArrayLike, right_m: ArrayLike, begin_m: FloatArray, end_m: FloatArray) -> Strips:
-    """Create the quadrilaterals between the stations `begin_m` and `end_m` (n,) and two lateral offsets."""
+    """Create n quadrilaterals between two lateral offsets, from the stations `begin_m` (n,) to `end_m` (n,)."""
     corners = [(begin_m, left_m), (begin_m, right_m), (end_m, right_m), (end_m, left_m)]
     return make_strips(np.stack([road.point_at(station_m, offset_m) for station_m, offset_m in corners], axis=1))
