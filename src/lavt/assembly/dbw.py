@@ -395,5 +395,5 @@ def find_dbw(target: str) -> DbwConfig:
     vehicle = data.get("vehicle")
     section = vehicle.get("dbw") if isinstance(vehicle, dict) and vehicle.get("kind") == "dbw" else None
     if not isinstance(section, dict):
-        raise UserError(f"{path} has no section vehicle.dbw of a vehicle of kind dbw: name another config or a profile")
+        raise UserError(f"{path} has no vehicle of kind dbw with vehicle.dbw: name another config or a profile")
     return parse_config(DbwConfig, section, f"{path}: vehicle.dbw")

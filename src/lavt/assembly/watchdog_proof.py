@@ -51,7 +51,7 @@ def proof_rejection(path: str, profile: Profile, config: DbwConfig, wall_ns: int
     The result is empty if the proof is valid.
     """
     if not path:
-        return f"the kit's watchdog has not been tested: {RUN_TEST} and set vehicle.dbw.watchdog_proof to its file"
+        return f"the kit's watchdog has not been tested: {RUN_TEST} and name its proof in vehicle.dbw.watchdog_proof"
     try:
         proof = parse_config(WatchdogProof, _read_json_object(path), path)
     except UserError as error:
@@ -73,7 +73,7 @@ def proof_rejection(path: str, profile: Profile, config: DbwConfig, wall_ns: int
     if (age := _age_rejection(proof.at, config.watchdog_proof_days, wall_ns)) != "":
         return f"{path} {age}: {RUN_TEST} again"
     if proof.reports < LEAST_REPORTS:
-        return f"{path} is based on {proof.reports} brake reports, fewer than {LEAST_REPORTS}: {RUN_TEST} again"
+        return f"{path} is based on {proof.reports} reports of the brake, fewer than {LEAST_REPORTS}: {RUN_TEST} again"
     if proof.braked_ms * NS_PER_MS > BRAKE_WITHIN_NS:
         return f"in {path} the kit took {proof.braked_ms:g} ms to brake, which is too long: {RUN_TEST} again"
     return ""
