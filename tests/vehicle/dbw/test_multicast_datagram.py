@@ -54,7 +54,7 @@ def test_a_missing_key_is_malformed(key: str) -> None:
 
 
 def test_other_datagrams_are_malformed() -> None:
-    """Nested, truncated, extended and long datagrams, and datagrams that name a length beyond their end, are malformed."""
+    """Nested, truncated, extended and long datagrams, and datagrams with a length beyond their end, are malformed."""
     whole = pack_message(MESSAGES[0])
     others = [whole[:length] for length in range(len(whole))]
     others += [code + b"\xff\xff\xff\xff" for code in (b"\xc6", b"\xc9", b"\xdb", b"\xdd", b"\xdf")]
