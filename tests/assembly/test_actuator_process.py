@@ -69,7 +69,7 @@ def test_a_stuck_actuator_does_not_outlive_its_server() -> None:
 
 
 def test_the_actuator_locks_its_memory() -> None:
-    """Before it drives, the actuator's process has locked its memory, if its user may do so."""
+    """Before it drives, the actuator's process has locked its memory, if its user has the right to lock memory."""
     context = multiprocessing.get_context("spawn")
     own_end, actuator_end = context.Pipe()
     process = context.Process(target=serve_stuck, args=(actuator_end,))

@@ -36,7 +36,7 @@ def test_the_first_picture_starts_the_timer() -> None:
 
 
 def test_the_car_has_nearly_stopped_when_the_watch_stops_it() -> None:
-    """At the stop, the simulator's car has slowed from 30 km/h to 0.9 m/s, as `no_lane_stop_ns` says."""
+    """When the watch stops the simulator's car, the car has slowed from 30 km/h to 0.9 m/s in 14 m."""
     speed_mps = 30 / 3.6
     braking_m = speed_mps * BRAKE_AFTER_NS / NS_PER_S
     car = CarDynamics(LINCOLN_MKZ, CarMotion(braking_m, 0.0, 0.0, speed_mps=speed_mps), 1 / STEPS_PER_S)

@@ -353,7 +353,7 @@ def test_every_metric_is_defined_in_the_documentation(make_run: MakeRun, tmp_pat
 
 
 def test_every_key_of_the_identity_is_defined_in_the_documentation() -> None:
-    """`docs/metrics.md` has each key of a run's identity, in the section on it."""
+    """The section of `docs/metrics.md` on the identity of a run has each key of the identity."""
     page = (Path(__file__).parents[3] / "docs" / "metrics.md").read_text()
     section = page.partition("\n## Identity of a run")[2].partition("\n## ")[0]
     assert [key for key in (*IDENTITY, *OPTIONAL_IDENTITY, "digest") if f"`{key}`" not in section] == []

@@ -212,7 +212,7 @@ def test_a_datagram_allocates_no_more_than_its_size(open_port: Callable[..., Can
 
 def test_messages_of_a_stranger_on_a_multicast_bus(open_port: Callable[..., CanPort]) -> None:
     """On a multicast bus, error, remote and CAN FD frames, and messages whose values contradict each other, are counted
-    and dropped. None of them is a loss of the bus, not even one that says bus-off.
+    and dropped. No such message is a loss of the bus, not even an error frame with bus-off.
     """
     number = free_port()
     port = open_port("udp_multicast", GROUP, port=number)
@@ -434,7 +434,7 @@ def test_a_slow_opening_blocks_nobody(open_port: Callable[..., CanPort], device:
 
 
 def test_frames_before_the_loss_are_dropped(open_port: Callable[..., CanPort], device: Device) -> None:
-    """Frames received before the bus was lost are not returned, neither before nor after it is open again."""
+    """Frames received before the bus was lost are never returned, not even after the bus is open again."""
     port = open_port("breakable", "stick", clock=ManualClock(0))
     device.incoming.extend([can.Message(arbitration_id=7, is_extended_id=False), OSError(errno.ENODEV, "gone")])
     until(lambda: device.shut_down == 1)
@@ -446,8 +446,8 @@ def test_frames_before_the_loss_are_dropped(open_port: Callable[..., CanPort], d
 
 
 def test_frames_before_a_suspension_are_dropped(open_port: Callable[..., CanPort], device: Device) -> None:
-    """Frames queued before a suspension, and one that is being read while it is noticed, are never returned: the
-    monotonic clock, by which their age is known, stood still.
+    """Frames queued before a suspension, or being read when the suspension is noticed, are never returned: the
+    monotonic clock stood still, so their age is unknown.
     """
     suspended = [0]
     port = open_port("breakable", "stick", clock=ManualClock(0), suspended=lambda: suspended[0])
@@ -473,7 +473,7 @@ def test_frames_before_a_suspension_are_dropped(open_port: Callable[..., CanPort
 
 
 def test_a_bus_opened_during_a_suspension_is_opened_again(open_port: Callable[..., CanPort], device: Device) -> None:
-    """A bus that was being reopened when the machine was suspended may have frames from before it: it is not used."""
+    """A bus that was being reopened when the machine was suspended is not used: it can have frames from before."""
     suspended = [0]
     port = open_port("breakable", "stick", clock=ManualClock(0), suspended=lambda: suspended[0])
     device.may_open.clear()
@@ -489,7 +489,7 @@ def test_a_bus_opened_during_a_suspension_is_opened_again(open_port: Callable[..
 
 
 def test_the_port_survives_any_error_of_opening(open_port: Callable[..., CanPort], device: Device) -> None:
-    """If reopening fails with an error of the system, such as too many open files, it is tried again."""
+    """If reopening fails with an error of the system, such as too many open files, reopening is tried again."""
     port = open_port("breakable", "stick", clock=ManualClock(0))
     failures = [OSError(errno.EMFILE, "Too many open files"), OSError(), MemoryError()]
 
@@ -512,7 +512,7 @@ def test_a_frame_that_arrives_while_the_bus_opens_is_not_newer(
     """A frame that arrived before the port first read the bus has its true time of arrival."""
     monkeypatch.setitem(can.interfaces.BACKENDS, "udp_multicast", (__name__, "BreakableBus"))
     clock = ManualClock(10 * NS_PER_S, wall_ahead_ns=1_790_000_000 * NS_PER_S)
-    stamp_s = clock.now().wall_ns / NS_PER_S
+    timestamp_s = clock.now().wall_ns / NS_PER_S
     open_bus = bus_module._open_bus
 
     def open_slowly(*keys: Any) -> can.BusABC:
@@ -521,7 +521,7 @@ def test_a_frame_that_arrives_while_the_bus_opens_is_not_newer(
         return bus
 
     monkeypatch.setattr(bus_module, "_open_bus", open_slowly)
-    device.put(can.Message(arbitration_id=7, is_extended_id=False, timestamp=stamp_s))
+    device.put(can.Message(arbitration_id=7, is_extended_id=False, timestamp=timestamp_s))
     port = open_port("udp_multicast", "stick", clock=clock)
     taken: list[ReceivedCanFrame] = []
 

@@ -44,8 +44,8 @@ def test_a_step_while_many_frames_wait(step_ms: int) -> None:
         assert -min(abs(step_ms), 500) * NS_PER_MS <= arrived_ns - arrived_ms * NS_PER_MS <= 0
 
 
-def test_impossible_stamps() -> None:
-    """A stamp that fits no reading gives the earliest possible time: that of the previous frame or the empty queue."""
+def test_impossible_timestamps() -> None:
+    """A timestamp that fits no reading gives the earliest possible time: of the previous frame or the empty queue."""
     arrivals = ArrivalTimes(at(90))
     assert arrivals.arrived_ns(0, at(101)) == 90 * NS_PER_MS
     assert arrivals.arrived_ns(at(95).wall_ns, at(102)) == 95 * NS_PER_MS
@@ -58,23 +58,26 @@ STEPS_MS = (-200, -60, -50, -40, -30, -1, 1, 30, 40, 50, 60, 200)
 
 
 @pytest.mark.parametrize("step_ms", STEPS_MS)
-@pytest.mark.parametrize("stepped_before", [True, False], ids=["stamped after the step", "stamped before it"])
+@pytest.mark.parametrize("stepped_before", [True, False], ids=["arrived after the step", "arrived before it"])
 def test_a_step_smaller_than_the_wait(step_ms: int, stepped_before: bool) -> None:
-    """A frame for which the reader has waited longer than the size of a step counts as older by this size if the clock
-    was set back before the frame arrived, or forward after that; otherwise, it has its true time of arrival.
+    """A frame's time is too early by the size of a step if two conditions are met; otherwise the time is true.
+
+    The queue was found empty at least the size of the step before the arrival, and the clock was set back before the
+    arrival or forward after it.
     """
     arrivals = ArrivalTimes(at(50))
-    stamp_ns = at(100, step_ms if stepped_before else 0).wall_ns
-    is_older = abs(step_ms) <= 50 and (step_ms < 0) == stepped_before
-    error_ns = arrivals.arrived_ns(stamp_ns, at(110, step_ms)) - 100 * NS_PER_MS
-    assert error_ns == (-abs(step_ms) * NS_PER_MS if is_older else 0)
+    timestamp_ns = at(100, step_ms if stepped_before else 0).wall_ns
+    is_too_early = abs(step_ms) <= 50 and (step_ms < 0) == stepped_before
+    error_ns = arrivals.arrived_ns(timestamp_ns, at(110, step_ms)) - 100 * NS_PER_MS
+    assert error_ns == (-abs(step_ms) * NS_PER_MS if is_too_early else 0)
 
 
 @pytest.mark.parametrize("first_ms", STEPS_MS)
 @pytest.mark.parametrize("second_ms", STEPS_MS)
 def test_two_steps_during_one_wait(first_ms: int, second_ms: int) -> None:
-    """Of a frame that arrives between two steps during one wait, the time is wrong by at most the wait; it is later
-    than the true one by at most one of the steps, and only if it was read so much later.
+    """If a frame arrives between two steps, its time is not before the last empty queue and not after the reading.
+
+    The time is too late by at most the larger step. After two steps larger than 51 ms it is the earliest possible.
     """
     arrivals = ArrivalTimes(at(50))
     error_ns = arrivals.arrived_ns(at(100, first_ms).wall_ns, at(150, first_ms + second_ms)) - 100 * NS_PER_MS

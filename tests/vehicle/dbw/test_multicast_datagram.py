@@ -54,7 +54,7 @@ def test_a_missing_key_is_malformed(key: str) -> None:
 
 
 def test_other_datagrams_are_malformed() -> None:
-    """Nested, truncated, extended and long datagrams, and lengths that are longer than the datagram, are malformed."""
+    """Nested, truncated, extended and long datagrams, and datagrams with a length beyond their end, are malformed."""
     whole = pack_message(MESSAGES[0])
     others = [whole[:length] for length in range(len(whole))]
     others += [code + b"\xff\xff\xff\xff" for code in (b"\xc6", b"\xc9", b"\xdb", b"\xdd", b"\xdf")]
@@ -77,7 +77,7 @@ def ends() -> Iterator[tuple[socket.socket, socket.socket]]:
 
 
 def test_only_a_malformed_datagram_is_dropped(ends: tuple[socket.socket, socket.socket]) -> None:
-    """A malformed datagram is dropped as a whole, and a well-formed one waits unchanged."""
+    """A malformed datagram is dropped as a whole, and a well-formed datagram remains in the socket unchanged."""
     receiver, sender = ends
     check = DatagramCheck(receiver.fileno())
     good = pack_message(MESSAGES[0])
