@@ -1,7 +1,9 @@
 """A fuzzer of the whole by-wire vehicle in virtual time: a hostile bus, a hostile car, and stalls of the process.
 
 A kit of the software car makes valid reports, so that every state is reached; then reports are lost, damaged, forged
-and repeated, frames are not written, the driver acts, and time jumps.
+and repeated, speeds are stuck, scaled or missing, brakes are weak, frames are not written, the driver acts, and time
+jumps. PARK must never be requested while the car moves, unless a fault that the adapter cannot see hides the motion:
+see `Fuzzer.is_motion_hidden`.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ from typing import Literal
 import pytest
 from benchmarks.fuzzing.mutation import Chance
 from msgspec.structs import replace
-from tests.vehicle.dbw.rig import START_NS, profile
+from tests.vehicle.dbw.rig import SPEED_SOURCES, START_NS, profile
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation, VehicleState
 from lavt.vehicle.can_frame import BusGone, CanFrame, ReceivedCanFrame
@@ -22,6 +24,7 @@ from lavt.vehicle.dbw import adapter as adapter_module
 from lavt.vehicle.dbw.adapter import ByWireAdapter
 from lavt.vehicle.dbw.crc8 import frame_crc8
 from lavt.vehicle.dbw.profile import AXES, COMMAND_TIMEOUT_NS, TICK_LIMIT_NS, Axis
+from lavt.vehicle.dbw.speed_monitor import ROLLING_RESISTANCE_MPS2, SpeedMonitor
 from lavt.vehicle.dbw.states import Situation, State, next_state, states_after
 from lavt.vehicle.dbw.vehicle import DbwVehicle
 from lavt.vehicle.software_car.kit import Kit
@@ -41,9 +44,15 @@ CAPABILITIES = Capabilities(
 )
 KIT_STEP_NS = 5 * NS_PER_MS
 EPISODE_NS = 4 * NS_PER_S
+STUCK_EPISODE_NS = 14 * NS_PER_S
+"""Enough to stop with a weak brake."""
 IDLE_NS = 300 * NS_PER_MS
 """An episode ends early if the adapter is idle this long after driving is no longer wanted."""
 MAX_AWAITED = 64
+PARK_BELOW_MPS = 0.2
+"""A slower car may be parked: reports are up to 20 ms old, and less than 0.1 m/s counts as standstill."""
+BRAKE_SHARES = (1.0, 0.5, 0.3)
+"""Shares of the brake's force that reach the wheels. Weaker brakes than a quarter are not seen by the adapter."""
 DRAWS = 1_000_000
 """Resolution of the probabilities."""
 STEPS_MS = (1, 4, 4, 5, 10, 10, 20, 20)
@@ -52,6 +61,11 @@ STALLS_MS = (*range(57, 64), *range(95, 106), 130, 250, 400, 1000)
 Kind = Literal["lose", "flip", "forge", "repeat", "garbage", "command"]
 KINDS: tuple[Kind, ...] = ("lose", "flip", "forge", "repeat", "garbage", "command")
 """What can happen to a report; `command` adds a command of another sender."""
+SpeedPlan = Literal["none", "one", "all from standstill", "all from driving"]
+SPEED_PLANS: tuple[SpeedPlan, ...] = ("none", "none", "none", "one", "all from standstill", "all from driving")
+"""Which sources of speed are wrong in an episode: one stuck, scaled or missing, or all stuck at 0 from some time on."""
+SEEN_FALL_MPS = 1.0
+"""Speeds become stuck at 0 only at this speed or above. A fall from less than 0.5 m/s is not seen by the adapter."""
 
 
 def settled_states(state: State, now: Situation) -> list[tuple[State, str]]:
@@ -106,20 +120,26 @@ class CommandCheck:
 
     def __init__(self, adapter: ByWireAdapter) -> None:
         self.adapter, self.profile = adapter, adapter._profile
+        self.parks = 0
+        """Number of requests for PARK."""
         self.enabled_sets: Counter[str] = Counter()
         """Number of sets by state and number of enabled axes."""
         self._counts: dict[str, float] = {}
         self._last: dict[Axis, tuple[float, int]] = dict.fromkeys(AXES, (0.0, START_NS))
         """The newest command to each axis: (amount, time)."""
 
-    def check_set(self, frames: Sequence[CanFrame], made_ns: int) -> None:
-        """Check the written frames of a set."""
+    def check_set(self, frames: Sequence[CanFrame], made_ns: int, visible_mps: float) -> None:
+        """Check the written frames of a set. `visible_mps` is the car's speed, or 0 if a fault hides it."""
         if not frames:
             return
         assert self.adapter.tick_ns is not None
         assert made_ns - self.adapter.tick_ns <= TICK_LIMIT_NS
         values = dict(decoded for frame in frames if (decoded := self.profile.codec.decode(frame, short=True)))
         self._check_counts(values)
+        gear = self.profile.gear
+        if values.get(gear.message, {}).get(gear.value) == gear.codes["park"]:
+            self.parks += 1
+            assert visible_mps < PARK_BELOW_MPS, visible_mps
         amounts = {axis: self._check_axis(axis, values, made_ns) for axis in AXES}
         assert not (amounts["throttle"] and amounts["brake"])
         enabled = {axis for axis, amount in amounts.items() if amount is not None}
@@ -169,6 +189,7 @@ class Fuzzer:
         self._chance = Chance(seed, "by wire")
         self._profile = profile(f"dataspeed_gen{generation}")
         self._now_ns = START_NS
+        self._generation = generation
         self._kit = Kit(generation, start_ns=START_NS, has_watchdog=is_drawn(self._chance, 0.8))
         self._speed_mps = 0.0
         self._adapter = ByWireAdapter(self._profile, start_ns=START_NS)
@@ -178,12 +199,17 @@ class Fuzzer:
         self._old_frames: deque[CanFrame] = deque(maxlen=50)
         self._kinds: list[Kind] = []
         self._hostility = self._wire_loss = self._stall_probability = self._action_probability = 0.0
+        self._speed_plan: SpeedPlan = "none"
+        self._is_stuck = self.is_motion_hidden = False
+        """All speeds are stuck at 0, and the driver has pressed the throttle since: the adapter cannot see this."""
         self._turned_rad: float | None = None
         """The angle to which the driver has turned the road wheels, if any."""
         self._lost_identifier = 0
         self._hostile_ns = self._unwanted_ns = self._episode_end_ns = START_NS
         """When the bus becomes hostile, when driving is no longer wanted, and when the episode ends."""
         self._actuation = Actuation(0.0, 0.0, 1.0)
+        self._stop_brake = 1.0
+        """The requested brake while the kit is not engaged."""
         messages = self._profile.codec.messages
         self._used_bits = {
             messages[name].identifier: [messages[name].signals[signal].start for signal in spec.values.values()]
@@ -222,6 +248,8 @@ class Fuzzer:
         adapter = self._adapter
         state = self._vehicle.state()
         assert math.isfinite(state.speed_mps + state.steering_rad)
+        if adapter._wanted and adapter._state in {"idle", "lost", "overridden"}:
+            assert state.inhibit_reason
         assert self._vehicle.next_wake_ns() > self._adapter._now_ns - COMMAND_TIMEOUT_NS
         assert len(adapter._awaited_echoes) <= MAX_AWAITED
         self._vehicle.advance(self._now_ns)
@@ -233,9 +261,9 @@ class Fuzzer:
     def _begin_episode(self) -> None:
         """Repair the car, and choose what will happen in the next seconds."""
         chance, kit = self._chance, self._kit
-        self._speed_mps, self._turned_rad = 0.0, None
+        self._turned_rad = None
         kit.state.setpoint_rad = 0.0
-        self._set_speed()
+        self._repair_speeds()
         self._port.failure_rate = self._hostility = self._wire_loss = 0.0
         for fault in {f"{part}.{bit}" for part, bits in kit._generation.faults.items() for bit in bits}:
             kit.set_fault(fault, self._now_ns, is_set=False)
@@ -262,8 +290,47 @@ class Fuzzer:
         self._wire_loss = chance.choice((0.0, 0.0, 0.02, 0.5))
         self._stall_probability = chance.choice((0.0, 0.01, 0.05))
         self._action_probability = chance.choice((0.0, 0.01, 0.1))
+        self._stop_brake = chance.choice((1.0, 1.0, 0.0))
         self._port.failure_rate = chance.choice((0.0, 0.0, 0.02, 0.3))
         self._lost_identifier = chance.choice((0, chance.choice([0, *self._kit._generation.reports])))
+        self._plan_speeds()
+
+    def _repair_speeds(self) -> None:
+        """Stop the car, repair its speeds and its brake, and let the adapter forget faults of the speed."""
+        self._speed_plan, self._is_stuck, self.is_motion_hidden = "none", False, False
+        for source in SPEED_SOURCES[self._generation]:
+            self._kit.restore_speed(source)
+        self._kit.weaken_brake(1.0)
+        self._speed_mps = 0.0
+        self._set_speed()
+        car = self._profile.car
+        self._adapter._speed = SpeedMonitor(
+            max_acceleration_mps2=car.max_acceleration_mps2, max_braking_mps2=car.max_braking_mps2
+        )
+
+    def _plan_speeds(self) -> None:
+        """Choose how strong the brake is, and which speeds will be wrong."""
+        chance = self._chance
+        self._kit.weaken_brake(chance.choice(BRAKE_SHARES))
+        self._speed_plan = chance.choice(SPEED_PLANS)
+        if self._speed_plan == "one":
+            source = chance.choice(SPEED_SOURCES[self._generation])
+            stick, scale = self._kit.stick_speed, self._kit.scale_speed
+            chance.choice(
+                (lambda: stick(source, 0.0), lambda: scale(source, 0.5), lambda: self._kit.drop_speed(source))
+            )()
+        if self._speed_plan == "all from standstill":
+            self._stick_speeds()
+        if self._speed_plan.startswith("all"):
+            self._kinds = ["lose"] * self._chance.below(2)  # others change speeds, which then seem to answer
+            self._episode_end_ns = self._now_ns + STUCK_EPISODE_NS
+            if chance.below(2):
+                self._hostile_ns = self._episode_end_ns
+
+    def _stick_speeds(self) -> None:
+        self._is_stuck = True
+        for source in SPEED_SOURCES[self._generation]:
+            self._kit.stick_speed(source, 0.0)
 
     def _run_car(self, duration_ns: int, is_hostile: bool) -> None:
         """Let the kit and the car run, and queue their reports with their times."""
@@ -272,11 +339,15 @@ class Fuzzer:
             self._now_ns = min(self._now_ns + KIT_STEP_NS, end_ns)
             wheels = self._kit.actuation(self._now_ns)
             if self._kit.state.gear == Gear.DRIVE:
-                acceleration_mps2 = 2.0 * wheels.throttle - 6.0 * wheels.brake
+                acceleration_mps2 = 2.0 * wheels.throttle - 6.0 * wheels.brake - ROLLING_RESISTANCE_MPS2
                 self._speed_mps = min(20.0, max(0.0, self._speed_mps + acceleration_mps2 * KIT_STEP_NS / NS_PER_S))
             else:
                 self._speed_mps = max(0.0, self._speed_mps - 0.01)
             self._set_speed(wheels.steering_rad)
+            may_stick = self._speed_plan == "all from driving" and not self._is_stuck
+            if may_stick and self._speed_mps >= SEEN_FALL_MPS and is_drawn(self._chance, 0.01):
+                self._stick_speeds()
+            self.is_motion_hidden |= self._is_stuck and self._kit.state.driver_throttle > 0
             for frame in self._kit.frames_due(self._now_ns):
                 self._old_frames.append(frame)
                 frames = self._spoil(frame) if is_hostile else [frame]
@@ -321,7 +392,7 @@ class Fuzzer:
 
     def _write(self, frames: Sequence[CanFrame], made_ns: int) -> None:
         """Check the written frames, and let those that the wire does not lose reach the kit."""
-        self.check.check_set(frames, made_ns)
+        self.check.check_set(frames, made_ns, 0.0 if self.is_motion_hidden else self._speed_mps)
         is_hostile = self._now_ns >= self._hostile_ns
         for frame in frames:
             if not is_hostile or not is_drawn(self._chance, self._wire_loss):
@@ -349,7 +420,7 @@ class Fuzzer:
         """Return an actuation: a random walk, the safe stop after driving, and impossible values."""
         chance, wanted = self._chance, self._now_ns < self._unwanted_ns
         if not self._vehicle.state().is_engaged:
-            self._actuation = Actuation(0.0, 0.0, 0.0 if wanted and is_drawn(chance, 0.1) else 1.0)
+            self._actuation = Actuation(0.0, 0.0, 0.0 if wanted and is_drawn(chance, 0.1) else self._stop_brake)
         elif is_drawn(chance, 0.2):
             brake = chance.choice((0.0, 0.0, 0.3, 1.0, 5.0))
             self._actuation = Actuation(

@@ -622,7 +622,7 @@ def test_park_must_be_reported_within_3_s() -> None:
 
 
 def test_a_moving_car_need_not_park() -> None:
-    """A car that still moves 3 s after the end of driving has no inhibit reason and is not shifted to PARK."""
+    """A car that still moves 3 s after driving ended is not shifted to PARK, and the inhibit reason says so."""
     rig = rig_without_park()
 
     for source in SPEED_SOURCES[1]:
@@ -632,7 +632,7 @@ def test_a_moving_car_need_not_park() -> None:
     rig.adapter.engage(False, rig.now_ns)
     rig.run_ms(4000, step_ms=COARSE_MS)
     assert rig.adapter.state().speed_mps > 1.0
-    assert (rig.state, rig.adapter.state().inhibit_reason) == ("parking", "")
+    assert (rig.state, rig.adapter.state().inhibit_reason) == ("parking", "the car moves, or may move")
 
 
 @pytest.mark.parametrize("state", ["idle", "engaged", "lost", "overridden"])
@@ -650,6 +650,22 @@ def test_park_is_required_only_after_driving(state: str) -> None:
     before = rig.adapter.state().inhibit_reason
     rig.run_ms(3500, step_ms=COARSE_MS)
     assert (rig.state, rig.adapter.state().inhibit_reason) == (state, before)
+
+
+@both_generations
+def test_a_car_that_moves_in_idle_says_why_it_cannot_be_engaged(generation: int) -> None:
+    """While the car moves or may move, driving cannot begin, and the inhibit reason says so until it is stationary."""
+    rig = stationary_rig(generation)
+    rig.kit.driver_shifts(Gear.DRIVE, rig.now_ns)
+    rig.kit.driver_throttles(0.2, rig.now_ns)
+    rig.run_until(lambda rig: rig.speed_mps > 1.0, step_ms=COARSE_MS)
+    for wanted in (False, True):
+        rig.adapter.engage(wanted, rig.now_ns)
+        assert (rig.state, rig.adapter.state().inhibit_reason) == ("idle", "the car moves, or may move")
+    rig.kit.driver_throttles(0.0, rig.now_ns)
+    rig.kit.driver_brakes(0.5, rig.now_ns)
+    rig.run_until(lambda rig: rig.state != "idle", step_ms=COARSE_MS)
+    assert rig.adapter.state().inhibit_reason == ""
 
 
 @both_generations

@@ -116,19 +116,39 @@ def test_all_speeds_stuck_at_zero_since_standstill(generation: int, throttle: fl
 
 
 @both_generations
-@pytest.mark.parametrize("coasting_ms", [0, 2000])
-def test_a_stop_before_stuck_speeds_are_found(generation: int, coasting_ms: int) -> None:
-    """If all speeds stay 0 and the drive ends before this is found, the car is not parked before it is stationary."""
+@pytest.mark.parametrize(("brake_share", "coasting_ms"), [(1.0, 0), (1.0, 2000), (0.5, 0), (0.5, 2000), (0.3, 0)])
+def test_a_stop_before_stuck_speeds_are_found(generation: int, brake_share: float, coasting_ms: int) -> None:
+    """If all speeds stay 0 and the drive ends before this is found, the car is not parked before it is stationary, not
+    even with weak brakes.
+    """
     rig, gate = with_speeds_stuck_at_zero(generation)
+    rig.kit.weaken_brake(brake_share)
     rig.actuation = Actuation(0.0, 0.45, 0.0)
     rig.run_ms(2500, step_ms=COARSE_MS)
     rig.actuation = Actuation(0.0, 0.0, 0.0)
     rig.run_ms(coasting_ms, step_ms=COARSE_MS)
     assert rig.speed_mps > 1.4
     gate.machine.trigger("stop requested")
-    run(rig, gate, 4 * NS_PER_S)
+    run(rig, gate, 6 * NS_PER_S)
     assert (rig.speed_mps, rig.kit.state.gear) == (0.0, Gear.PARK)
     assert not any(name.startswith("speed_") for name in rig.adapter.counts)
+
+
+@both_generations
+@pytest.mark.parametrize(("brake_share", "speed_mps"), [(0.5, 2.5), (0.25, 2.2)])
+def test_a_parked_car_with_weak_brakes_and_stuck_speeds(generation: int, brake_share: float, speed_mps: float) -> None:
+    """If all speeds stay 0 and driving is no longer wanted, even a car that the holding brake slows by a quarter of
+    what the profile says is not parked before it is stationary.
+    """
+    rig, _ = with_speeds_stuck_at_zero(generation)
+    rig.kit.weaken_brake(brake_share)
+    rig.actuation = Actuation(0.0, 1.0, 0.0)
+    rig.run_ms(1370, step_ms=COARSE_MS)
+    rig.simulator._car.motion.speed_mps = speed_mps  # as of a drive train that answers without delay
+    rig.actuation = Actuation(0.0, 0.0, 0.0)
+    rig.adapter.engage(False, rig.now_ns)
+    rig.run_until(lambda rig: GEAR_COMMAND[generation] in {frame.identifier for _, frame in rig.sent}, 10_000)
+    assert rig.speed_mps == 0.0
 
 
 @both_generations

@@ -32,6 +32,8 @@ def test_a_stall_while_parking_ends(generation: int) -> None:
                 assert (rig.state, rig.enabled(), rig.kit.state.watchdog_reason) == ("parking", set(AXES), 0), moment_ms
             if duration_ms > 100:
                 assert (rig.state, rig.kit.state.brake) == ("idle", WATCHDOG_BRAKE), (moment_ms, duration_ms)
+                assert rig.events, (moment_ms, duration_ms)
+                assert rig.adapter.state().inhibit_reason
             assert len(rig.events) == len({event.detail for event in rig.events})
 
 
@@ -53,6 +55,27 @@ def forge_enabled(rig: AdapterRig, axis: Axis, *, is_enabled: bool) -> None:
         return True
 
     rig.lose_report = forge
+
+
+@both_generations
+@pytest.mark.parametrize("is_wanted", [False, True])
+def test_axes_released_while_parking_are_a_reason(generation: int, is_wanted: bool) -> None:
+    """If the kit releases all axes before PARK, there is an event with the reason. The state is then `lost` while
+    driving is wanted again, and otherwise `idle`; in both, the inhibit reason says why the car cannot be engaged.
+    """
+    rig = driving_rig(generation)
+    rig.adapter.engage(False, rig.now_ns)
+    rig.run_ms(50)
+    rig.adapter.engage(is_wanted, rig.now_ns)
+    forges = []
+    for axis in AXES:
+        forge_enabled(rig, axis, is_enabled=False)
+        forges.append(rig.lose_report)
+    rig.lose_report = lambda frame: any(forge(frame) for forge in forges)
+    rig.run_ms(90)
+    assert "the kit released all axes before the car was parked" in {event.detail for event in rig.events}
+    assert rig.state == ("lost" if is_wanted else "idle")
+    assert rig.adapter.state().inhibit_reason
 
 
 @both_generations

@@ -142,16 +142,57 @@ def test_pulses_of_throttle_add_up() -> None:
 
 
 def test_a_car_that_did_not_answer_the_throttle_is_not_stationary() -> None:
-    """After throttle without an answer the car is not stationary, until a brake on ice would have stopped it."""
+    """After throttle without an answer the car may move, until braking as on ice would have stopped it.
+
+    Rolling without a brake does not count.
+    """
     rig = MonitorRig().run(2.0, Pedals(0.5, 0.0), *[constant(0.0)] * 5)
     assert not rig.monitor.is_stationary
     rig.run(1.0, NO_PEDAL, *[constant(0.0)] * 5)
     assert not rig.monitor.is_stationary
-    rig.run(1.4, FULL_BRAKE, *[constant(0.0)] * 5)
+    rig.run(1.6, FULL_BRAKE, *[constant(0.0)] * 5)
     assert not rig.monitor.is_stationary
-    rig.run(0.3, FULL_BRAKE, *[constant(0.0)] * 5)
+    rig.run(0.2, FULL_BRAKE, *[constant(0.0)] * 5)
     assert rig.monitor.is_stationary
     assert rig.faults == []
+
+
+WEAK_BRAKE = Pedals(0.0, 0.3)
+"""A quarter of it decelerates by 0.45 m/s2."""
+
+
+def test_only_sure_braking_counts() -> None:
+    """A brake counts with a quarter of its configured deceleration; a car whose kit has released the brake rolls."""
+    rig = MonitorRig().run(1.0, Pedals(0.5, 0.0), *[constant(0.0)] * 5)
+    rig.run(1.7, WEAK_BRAKE, *[constant(0.0)] * 5)
+    assert not rig.monitor.is_stationary
+    rig.run(0.4, WEAK_BRAKE, *[constant(0.0)] * 5)
+    assert rig.monitor.is_stationary
+    rig.run(1.0, Pedals(0.5, 0.0), *[constant(0.0)] * 5)
+    rig.run(7.9, Pedals(0.0, 0.0, is_brake_released=True), *[constant(0.0)] * 5)
+    assert not rig.monitor.is_stationary
+    rig.run(1.2, Pedals(0.0, 0.0, is_brake_released=True), *[constant(0.0)] * 5)
+    assert rig.monitor.is_stationary
+
+
+def test_a_car_that_is_not_braked_does_not_stop_sliding() -> None:
+    """If all speeds drop to 0 without a brake, the car counts as moving until it was braked for long enough."""
+    rig = MonitorRig().run(1.0, NO_PEDAL, *[noisy(constant(2.0), 0.01)] * 5)
+    rig.run(5.0, NO_PEDAL, *[constant(0.0)] * 5)
+    assert not rig.monitor.is_stationary
+    rig.run(4.3, WEAK_BRAKE, *[constant(0.0)] * 5)
+    assert not rig.monitor.is_stationary
+    rig.run(0.3, WEAK_BRAKE, *[constant(0.0)] * 5)
+    assert rig.monitor.is_stationary
+    assert rig.faults == []
+
+
+def test_wheels_that_roll_again_end_the_doubt() -> None:
+    """After anti-lock brakes, wheels that are not braked show the speed; a later stop is believed at once."""
+    rig = MonitorRig().run(1.0, NO_PEDAL, *[noisy(constant(2.4), 0.01)] * 5)
+    rig.run(0.1, FULL_BRAKE, *[constant(0.0)] * 5).run(0.5, NO_PEDAL, *[constant(1.8)] * 5)
+    rig.run(2.0, WEAK_BRAKE, *[ramp(1.8, -1.5)] * 5)
+    assert rig.monitor.is_stationary
 
 
 def test_a_speed_that_answers_the_throttle_is_believed() -> None:

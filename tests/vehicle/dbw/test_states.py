@@ -32,6 +32,7 @@ GOOD = Situation(
     enabled=ALL_AXES,
     gear="drive",
     in_state_ns=0,
+    must_stay_enabled=False,
 )
 STAYS: dict[State, Situation] = {
     "idle": replace(GOOD, wanted=False, enabled=NO_AXES, gear="park"),
@@ -122,6 +123,9 @@ ROWS: list[tuple[State, dict[str, Any], State]] = [
     ("parking", {**RELEASED, "in_state_ns": PAUSE_NS - 1}, "parking"),
     ("parking", {**RELEASED, "in_state_ns": PAUSE_NS}, "idle"),
     ("parking", {**RELEASED, "wanted": True, "in_state_ns": PAUSE_NS}, "idle"),
+    ("parking", {**RELEASED, "must_stay_enabled": True, "in_state_ns": PAUSE_NS - 1}, "parking"),
+    ("parking", {**RELEASED, "must_stay_enabled": True, "in_state_ns": PAUSE_NS}, "lost"),
+    ("parking", {"must_stay_enabled": True, "in_state_ns": LIMIT_NS}, "parking"),
     *(("parking", {"enabled": frozenset({axis}), "in_state_ns": LIMIT_NS}, "parking") for axis in AXES),
     ("lost", {"enabled": NO_AXES, "in_state_ns": LIMIT_NS}, "lost"),
     ("lost", NOT_WANTED, "parking"),
@@ -184,6 +188,7 @@ CASES: list[tuple[State, dict[str, Any]]] = [
     ("engaged", {"enabled": NO_AXES}),
     ("clearing", {"in_state_ns": LIMIT_NS, "overrides": "OVERRIDE"}),
     ("enabling", {"in_state_ns": LIMIT_NS}),
+    ("parking", {"enabled": NO_AXES, "must_stay_enabled": True, "in_state_ns": PAUSE_NS}),
 ]
 
 
@@ -240,6 +245,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "enabled": tuple(AXIS_SETS),
     "gear": ("drive", "park"),
     "in_state_ns": (0, PAUSE_NS, LIMIT_NS),
+    "must_stay_enabled": (False, True),
 }
 """Inputs on either side of every condition in the table."""
 

@@ -39,6 +39,7 @@ ECHO_LIMIT_NS: Final = 200 * NS_PER_MS
 """A command that the kit has not reported after this time counts as superseded by another."""
 SEPARATOR: Final = "; "
 """Between the texts of a reason."""
+MAY_MOVE: Final = "the car moves, or may move"
 NO_AXES: Final[frozenset[Axis]] = frozenset()
 
 
@@ -64,6 +65,8 @@ class ByWireAdapter:
         self._wanted, self._bus_error = False, ""
         self._still_enabled: frozenset[Axis] = NO_AXES
         """Axes that were enabled when driving ended and still are."""
+        self._must_stay_enabled = False
+        """An axis was enabled when driving ended, and no command to disable it was sent since."""
         self._needed_axes = frozenset({"brake"}) if profile.system is None else frozenset(AXES)
         """If one of these axes is released, no command is sent any more. A kit that is enabled as a whole needs all:
         after a command to disable any axis, it would release the brake as well, and not brake by itself."""
@@ -141,7 +144,8 @@ class ByWireAdapter:
                 if not self._known_problems.issuperset(reason.split(SEPARATOR)):
                     self._events.append(VehicleEvent(now_ns, "fault", reason))
             self._state, self._entered_ns = state, now_ns
-            self._situation = replace(self._situation, in_state_ns=0)
+            self._must_stay_enabled = state == "parking" and bool(enabled)
+            self._situation = replace(self._situation, in_state_ns=0, must_stay_enabled=self._must_stay_enabled)
 
     def _is_stationary(self) -> bool:
         return self._speed.is_stationary and self._speed.fault is None
@@ -150,7 +154,11 @@ class ByWireAdapter:
         """Compare the reported speeds with the pedals that the kit applies: the last ones sent, on enabled axes."""
         has_timed_out = now_ns - self._sender.last_set_ns >= COMMAND_TIMEOUT_NS
         sent, enabled = self._sender.last_command, NO_AXES if has_timed_out else self._reports.enabled
-        pedals = Pedals(sent.throttle if "throttle" in enabled else 0.0, sent.brake if "brake" in enabled else 0.0)
+        pedals = Pedals(
+            throttle=sent.throttle if "throttle" in enabled else 0.0,
+            brake=sent.brake if "brake" in enabled else 0.0,
+            is_brake_released="brake" not in enabled,
+        )
         if (fault := self._speed.update(self._reports.speeds, pedals, now_ns)) is not None:
             self._counts[fault.code] += 1
 
@@ -176,6 +184,7 @@ class ByWireAdapter:
             enabled=reports.enabled,
             gear=reports.gear,
             in_state_ns=now_ns - self._entered_ns,
+            must_stay_enabled=self._must_stay_enabled,
         )
 
     def _turned_too_far(self) -> str:
@@ -213,6 +222,7 @@ class ByWireAdapter:
             return []
         self._last_commands = commands
         self._is_shifting |= commands.gear == "drive"
+        self._must_stay_enabled &= bool(commands.enabled)
         frames = self._sender.frames(commands, requested, self._reports.wheel_deg, now_ns)
         self._expect_echo(commands)
         return frames
@@ -324,8 +334,11 @@ class ByWireAdapter:
     def _inhibit_reason(self) -> str:
         situation = self._situation
         reasons = [self._stop_reason if self._state in {"lost", "overridden"} else "", situation.inhibit_reason]
-        if self._state == "parking" and situation.is_stationary and situation.in_state_ns >= ENABLING_LIMIT_NS:
-            reasons.append(_join(["the car is stationary but not in park", situation.reasons]))
+        if self._state == "idle" and not situation.is_stationary:
+            reasons.append(MAY_MOVE)
+        if self._state == "parking" and situation.in_state_ns >= ENABLING_LIMIT_NS:
+            reasons.append("the car is stationary but not in park" if situation.is_stationary else MAY_MOVE)
+            reasons.append(situation.reasons)
         return _join(reasons)
 
     def next_wake_ns(self) -> int:

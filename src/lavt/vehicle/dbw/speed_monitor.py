@@ -26,7 +26,10 @@ wheels that spun regain grip within a report."""
 LOCKED_DROP_MPS: Final = 0.5
 """A speed this much below what `MAX_FALL_MPS2` allows is that of locked wheels, or wrong."""
 ICE_BRAKING_MPS2: Final = 1.0
-"""A braked car on ice loses at least this. While a car whose wheels have locked may slide, no speed counts as
+"""A braked car on ice loses at least this."""
+SURE_BRAKE_SHARE: Final = 0.25
+"""Our choice: a brake reaches at least this share of its configured deceleration. While a car that has driven off or
+slides unnoticed may not have stopped, with no more than this share and not more than on ice, no speed counts as
 standstill."""
 DISAGREEMENT_MPS: Final = 1.0
 DISAGREEMENT_SHARE: Final = 0.2
@@ -56,7 +59,8 @@ simulator)."""
 FROZEN_NS: Final = 2 * NS_PER_S
 """On a slope the throttle may balance weight and drag, but a real car's speed is never constant for so long."""
 ROLLING_RESISTANCE_MPS2: Final = 0.1
-"""Deceleration of a rolling car on a level road, 1 % of its weight."""
+"""Deceleration of a rolling car on a level road, 1 % of its weight. It counts against the throttle, and while the kit
+has released the brake."""
 UNANSWERED_MPS: Final = 2.7
 """A car that does not move, although throttle for this speed was applied, does not start: the slope is too steep, a
 wheel is blocked, or it moves and its speed is wrong. Each of these ends the drive. A car that reaches 2 m/s2 has 1.4 s
@@ -95,6 +99,8 @@ class Pedals(Struct, frozen=True):
 
     throttle: float
     brake: float
+    is_brake_released: bool = False
+    """The kit has released the brake: whether its own watchdog or a driver brakes is not known."""
 
 
 class SpeedMonitor:
@@ -116,9 +122,9 @@ class SpeedMonitor:
         self._moved_ns = -STANDSTILL_NS
         """Time of the last update at which the car may have moved."""
         self._sliding_mps = 0.0
-        """The speed that the car has now if it slides on ice since its highest speed."""
-        self._slides_until_ns = 0
-        """Until then, the car may slide with locked wheels."""
+        """The speed that the car has now if its wheels have slipped since they were last braked."""
+        self._may_slide = False
+        """The speed fell as that of locked wheels, and the car may not have stopped since."""
         self._unanswered_mps = 0.0
         """The speed that the throttle may have given a car on a level road since the reported speed last changed."""
         self._answer_mps = 0.0
@@ -151,7 +157,8 @@ class SpeedMonitor:
         self._speeds, self._now_ns = speeds, now_ns
         self._update_unanswered(pedals, passed_ns / NS_PER_S)
         has_fallen = self._has_fallen(speeds["speed"])
-        may_move = now_ns < self._slides_until_ns or self._unanswered_mps >= STATIONARY_BELOW_MPS
+        self._update_sliding(pedals, passed_ns / NS_PER_S)
+        may_move = self._may_slide or self._unanswered_mps >= STATIONARY_BELOW_MPS
         if may_move or any(abs(report.mps) >= STATIONARY_BELOW_MPS for report in speeds.values()):
             self._moved_ns = now_ns
         checks = (
@@ -178,9 +185,7 @@ class SpeedMonitor:
             return False
         least_mps = self._least_mps - MAX_FALL_MPS2 * passed_s
         self._least_mps = max(abs(speed.mps), least_mps)
-        self._sliding_mps = max(abs(speed.mps), self._sliding_mps - ICE_BRAKING_MPS2 * passed_s)
-        if abs(speed.mps) < least_mps - LOCKED_DROP_MPS:
-            self._slides_until_ns = speed.mono_ns + round(self._sliding_mps / ICE_BRAKING_MPS2 * NS_PER_S)
+        self._may_slide |= abs(speed.mps) < least_mps - LOCKED_DROP_MPS
         return abs(speed.mps) < least_mps - MAX_DROP_MPS
 
     def _disagrees(self, now_ns: int) -> bool:
@@ -233,9 +238,21 @@ class SpeedMonitor:
         if speed_mps > MOVING_ABOVE_MPS or abs(speed_mps - self._answer_mps) > CONSTANT_WITHIN_MPS:
             self._answer_mps, self._unanswered_mps = speed_mps, 0.0
             return
-        braking_mps2 = min(pedals.brake * self._max_braking_mps2, ICE_BRAKING_MPS2) + ROLLING_RESISTANCE_MPS2
-        acceleration_mps2 = pedals.throttle * self._max_acceleration_mps2 - braking_mps2
-        self._unanswered_mps = max(0.0, self._unanswered_mps + acceleration_mps2 * passed_s)
+        acceleration_mps2 = max(0.0, pedals.throttle * self._max_acceleration_mps2 - ROLLING_RESISTANCE_MPS2)
+        braking_mps2 = ROLLING_RESISTANCE_MPS2 if pedals.is_brake_released else self._sure_braking_mps2(pedals)
+        self._unanswered_mps = max(0.0, self._unanswered_mps + (acceleration_mps2 - braking_mps2) * passed_s)
+
+    def _update_sliding(self, pedals: Pedals, passed_s: float) -> None:
+        speed_mps = abs(self._speeds["speed"].mps)
+        if pedals.brake == 0 and not pedals.is_brake_released and speed_mps >= STATIONARY_BELOW_MPS:
+            self._sliding_mps = speed_mps  # wheels that roll
+        braking_mps2 = ICE_BRAKING_MPS2 if pedals.is_brake_released else self._sure_braking_mps2(pedals)
+        self._sliding_mps = max(speed_mps, self._sliding_mps - braking_mps2 * passed_s)
+        self._may_slide &= self._sliding_mps > speed_mps
+
+    def _sure_braking_mps2(self, pedals: Pedals) -> float:
+        """Return the deceleration that even a weak brake and ice give."""
+        return min(SURE_BRAKE_SHARE * pedals.brake * self._max_braking_mps2, ICE_BRAKING_MPS2)
 
 
 def _is_outside(speed_mps: float, others_mps: Iterable[float]) -> bool:

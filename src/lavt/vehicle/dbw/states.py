@@ -61,6 +61,8 @@ class Situation(Struct, frozen=True):
     gear: Gear | None
     in_state_ns: int
     """Time in the current state."""
+    must_stay_enabled: bool
+    """In `parking`: an axis was enabled when driving ended, and the kit was not commanded to disable it since."""
 
 
 class TransitionRow(Struct, frozen=True):
@@ -79,6 +81,10 @@ def _released_axes(situation: Situation) -> str:
     """Return a text that names the axes that are not enabled."""
     axes = [axis for axis in AXES if axis not in situation.enabled]
     return f"the kit released {' and '.join(axes)}{_details(situation)}" if axes else ""
+
+
+def _released_before_park(situation: Situation) -> str:
+    return f"the kit released all axes before the car was parked{_details(situation)}"
 
 
 def _out_of_gear(situation: Situation) -> str:
@@ -175,6 +181,16 @@ TABLE: Final[tuple[TransitionRow, ...]] = (
         "engaged",
     ),
     TransitionRow(("enabling",), "3 s have passed", _timed_out("enable"), "lost"),
+    TransitionRow(
+        ("parking",),
+        "the kit released all axes before it was commanded to, after at least 120 ms",
+        lambda situation: (
+            _released_before_park(situation)
+            if situation.must_stay_enabled and situation.in_state_ns >= PAUSE_NS and not situation.enabled
+            else ""
+        ),
+        "lost",
+    ),
     TransitionRow(
         ("parking",),
         "no axis is reported enabled, after at least 120 ms",
