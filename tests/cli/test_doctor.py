@@ -23,7 +23,7 @@ from lavt.cli import doctor
 from lavt.clock import MachineClock
 from lavt.config import Section, ServerConfig
 from lavt.config_file import load_config, parse_config, shipped
-from lavt.doctor import checks, measurements
+from lavt.doctor import checks, key_checks, measurements
 from lavt.doctor.checks import CameraSample, Check, CodecTimes, StateSample, Verdict
 from lavt.doctor.clock_checks import ClockComparison, ClockEstimate
 from lavt.domain import NS_PER_MS, NS_PER_S, Now, State
@@ -61,7 +61,9 @@ def check_port(rejection: str, is_served: bool) -> Check:
 
 
 def check_key_file(rejection: str = "", mode: int = 0o600, is_private: bool = True) -> Check:
-    return checks.check_key_file("security.key", Path("a.key"), rejection=rejection, mode=mode, is_private=is_private)
+    return key_checks.check_key_file(
+        "security.key", Path("a.key"), rejection=rejection, mode=mode, is_private=is_private
+    )
 
 
 def check_camera(sample: CameraSample | str) -> Check:
@@ -161,19 +163,19 @@ VERDICTS: list[tuple[Callable[[], Check], str, str]] = [
     (lambda: checks.check_probe(None, "car", 5602), "problem", "UDP car:5602"),
     (lambda: checks.check_video("car", 0), "not checked", "video.port (5600 by default)"),
     (lambda: checks.check_video("car", 5601), "not checked", "UDP car:5601"),
-    (lambda: checks.check_keys_configured(True), "ok", "messages are signed"),
-    (lambda: checks.check_keys_configured(False), "warning", "router"),
+    (lambda: key_checks.check_keys_configured(True), "ok", "messages are signed"),
+    (lambda: key_checks.check_keys_configured(False), "warning", "router"),
     (lambda: check_key_file(), "ok", "a.key is readable"),
     (lambda: check_key_file(mode=0o640), "problem", "mode 640"),
     (lambda: check_key_file(mode=0o644, is_private=False), "ok", "a.key is readable"),
     (lambda: check_key_file("No such file or directory"), "problem", "cannot be read: No such file"),
-    (lambda: checks.check_certificate(Path("a.pem"), 100.0), "ok", "valid for 100 days"),
-    (lambda: checks.check_certificate(Path("a.pem"), 13.0), "warning", "valid for 13 days"),
-    (lambda: checks.check_certificate(Path("a.pem"), -1.0), "problem", "expired 1 days ago"),
-    (lambda: checks.check_signing_key(Path("a.sign.key"), 100.0), "ok", "valid for 100 days"),
-    (lambda: checks.check_signing_key(Path("a.sign.key"), 13.0), "warning", "valid for 13 days"),
-    (lambda: checks.check_signing_key(Path("a.sign.key"), -1.0), "problem", "expired 1 days ago"),
-    (lambda: checks.check_signing_key(Path("a.sign.key"), None), "warning", "never expires"),
+    (lambda: key_checks.check_certificate(Path("a.pem"), 100.0), "ok", "valid for 100 days"),
+    (lambda: key_checks.check_certificate(Path("a.pem"), 13.0), "warning", "valid for 13 days"),
+    (lambda: key_checks.check_certificate(Path("a.pem"), -1.0), "problem", "expired 1 days ago"),
+    (lambda: key_checks.check_signing_key(Path("a.sign.key"), 100.0), "ok", "valid for 100 days"),
+    (lambda: key_checks.check_signing_key(Path("a.sign.key"), 13.0), "warning", "valid for 13 days"),
+    (lambda: key_checks.check_signing_key(Path("a.sign.key"), -1.0), "problem", "expired 1 days ago"),
+    (lambda: key_checks.check_signing_key(Path("a.sign.key"), None), "warning", "never expires"),
 ]
 """A check, its verdict, and a part of its text."""
 

@@ -23,7 +23,7 @@ from lavt.cli.clock import probe
 from lavt.clock import MachineClock
 from lavt.config import ClientConfig, ServerCameraConfig, ServerConfig
 from lavt.config_file import find_file, load_config, read_yaml, split_change
-from lavt.doctor import checks, measurements
+from lavt.doctor import checks, key_checks, measurements
 from lavt.doctor.checks import Check
 from lavt.doctor.clock_checks import compare_with_server
 from lavt.domain import NS_PER_S
@@ -170,12 +170,12 @@ def _assumed_server(config: ClientConfig) -> ServerConfig:
 
 def _security_checks(settings: Settings, clock: MachineClock) -> Iterator[Check]:
     files = measurements.key_files(settings.security)
-    yield checks.check_keys_configured(bool(files))
+    yield key_checks.check_keys_configured(bool(files))
     for key, path, is_private in files:
         rejection, mode = measurements.file_state(path)
-        yield checks.check_key_file(key, path, rejection=rejection, mode=mode, is_private=is_private)
+        yield key_checks.check_key_file(key, path, rejection=rejection, mode=mode, is_private=is_private)
         if not rejection:
-            yield checks.check_signing_key(path, measurements.signing_key_days_left(path, clock.now().wall_ns))
+            yield key_checks.check_signing_key(path, measurements.signing_key_days_left(path, clock.now().wall_ns))
     rejection = measurements.keys_rejection(settings)
     if rejection:
         yield Check(
@@ -183,7 +183,7 @@ def _security_checks(settings: Settings, clock: MachineClock) -> Iterator[Check]
         )
     for folder in sorted({path.parent for _, path, _ in files}):
         for path, days_left in measurements.certificates(folder, clock.now().wall_ns):
-            yield checks.check_certificate(path, days_left)
+            yield key_checks.check_certificate(path, days_left)
 
 
 def _port_checks(settings: ServerConfig, clock: MachineClock) -> Iterator[Check]:

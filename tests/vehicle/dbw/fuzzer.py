@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Literal
 
 import pytest
@@ -315,10 +316,9 @@ class Fuzzer:
         self._speed_plan = chance.choice(SPEED_PLANS)
         if self._speed_plan == "one":
             source = chance.choice(SPEED_SOURCES[self._generation])
-            stick, scale = self._kit.stick_speed, self._kit.scale_speed
-            chance.choice(
-                (lambda: stick(source, 0.0), lambda: scale(source, 0.5), lambda: self._kit.drop_speed(source))
-            )()
+            kit = self._kit
+            faults = (partial(kit.stick_speed, source, 0.0), partial(kit.scale_speed, source, 0.5))
+            chance.choice((*faults, partial(kit.drop_speed, source)))()
         if self._speed_plan == "all from standstill":
             self._stick_speeds()
         if self._speed_plan.startswith("all"):
