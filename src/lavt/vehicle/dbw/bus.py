@@ -39,17 +39,18 @@ QUEUE_FRAMES: Final = 8192
 POLL_S: Final = 0.1
 """Period at which the port's thread checks whether the port was closed."""
 CLOSE_TIMEOUT_S: Final = 1.0
-"""Closing the port waits this long for its thread. If a driver blocks the thread for longer, both are left running."""
+"""`close` waits at most this long for the port's thread. A thread that a driver blocks for longer keeps running."""
 MAX_DIRECT_READS: Final = 256
-"""The most frames that `take` itself reads: 60 ms of a full 500 kbit/s bus. The port's thread reads the others."""
+"""The largest number of frames that a call of `take` reads from the bus: 60 ms of a full 500 kbit/s bus. The port's
+thread reads all other frames."""
 LATEST_READ_NS: Final = NS_PER_S
-"""A frame that has waited longer to be read is dropped: this process was frozen."""
+"""A frame that is read later than this after its arrival is dropped, because this process was frozen."""
 
-logging.getLogger("can").addHandler(logging.NullHandler())  # the errors raised here contain its messages
+logging.getLogger("can").addHandler(logging.NullHandler())  # errors raised here contain what python-can would log
 
 STAMPED_BY_KERNEL: Final = frozenset({"socketcan", "udp_multicast"})
-"""Interfaces whose frames carry the kernel's wall time of arrival, and whose descriptor is readable if and only if a
-frame is waiting. The times of other interfaces are those of their devices' clocks."""
+"""Interfaces whose frames have the kernel's wall time of arrival, and whose descriptor is readable if and only if a
+frame is waiting. Frames of other interfaces have times of their devices' clocks."""
 BUS_OFF_BIT: Final = 0x40
 """Bit in the identifier of an error frame of SocketCAN (linux/can/error.h, CAN_ERR_BUSOFF)."""
 FULL_BUFFER_TEXT: Final = "Transmit buffer full"
@@ -57,7 +58,7 @@ FULL_BUFFER_TEXT: Final = "Transmit buffer full"
 
 
 class OpenBus(NamedTuple):
-    """An open bus. The frames received from it are dropped with it: after a loss, their age may not be known."""
+    """An open bus. If the bus is lost, the frames received from it are dropped, because their age can be unknown."""
 
     driver: BusABC
     received: deque[ReceivedCanFrame]
@@ -135,10 +136,10 @@ class CanPort:
         return len(frames)
 
     def take(self, now_ns: int) -> list[ReceivedCanFrame]:  # noqa: ARG002 (other ports need it)
-        """Return the frames received since the last call, in order, without own frames.
+        """Return the frames received since the last call, in order. Raises `BusGone` if the bus is lost.
 
-        Frames that the port's thread has not read yet, because it waits for a processor, are included if the kernel
-        stamped them. Raises `BusGone` while the bus is lost.
+        The frames that this port sent are not among them. Frames with the kernel's time of arrival are also returned if
+        the port's thread has not read them yet, because it waits for a processor.
         """
         self._check_suspension()
         if (bus := self._bus) is not None and self._interface in STAMPED_BY_KERNEL:
