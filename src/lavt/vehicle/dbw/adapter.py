@@ -1,4 +1,4 @@
-"""The by-wire adapter, sans-IO: it takes frames and times and returns frames. `states.py` has its state machine."""
+"""The by-wire adapter, without I/O: it takes frames and times, and returns frames. Its states are in `states.py`."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ from lavt.vehicle.dbw.states import ENABLING_LIMIT_NS, Situation, State, states_
 from lavt.vehicle.vehicle import ReachedCommand
 
 SHIFT_REPORT_LIMIT_NS: Final = NS_PER_S
-"""Our choice: a shift may be reported this long after it began."""
+"""Our choice: a shift to DRIVE is reported at most this long after it was requested."""
 STATIONARY_BEFORE_PARK_NS: Final = 300 * NS_PER_MS
-"""Our choice: PARK is requested after the car was reported stationary for this long. A single report may be wrong, or
-come from locked wheels; at 4 m/s2 a car that still slides is 1.2 m/s slower by then."""
+"""Our choice: PARK is requested after the car was reported stationary for this long. A single report can be wrong, or
+come from locked wheels. A car that slides becomes 1.2 m/s slower during this time, at 4 m/s2."""
 IDLE_PERIOD_NS: Final = 100 * NS_PER_MS
-"""Call period of the adapter when nothing else is due."""
+"""Period at which `frames_due` should be called if nothing is due earlier."""
 ECHO_LIMIT_NS: Final = 200 * NS_PER_MS
-"""A command that the kit has not reported after this time counts as superseded by another."""
+"""A command that the kit has not reported after this time is regarded as superseded by another command."""
 SEPARATOR: Final = "; "
-"""Between the texts of a reason."""
+"""What separates the texts of a reason."""
 MAY_MOVE: Final = "the car moves, or may move"
 NO_AXES: Final[frozenset[Axis]] = frozenset()
 
@@ -46,8 +46,8 @@ NO_AXES: Final[frozenset[Axis]] = frozenset()
 class ByWireAdapter:
     """A controller for the by-wire kit that a profile describes.
 
-    Each call of `set_actuation` is a tick; frames are sent only while the newest tick is at most 60 ms old.
-    `inhibit_reason` is a property of the installation: unless it is empty, the kit is never engaged.
+    Each call of `set_actuation` is a tick. Frames are sent only if the newest tick is at most 60 ms old.
+    `inhibit_reason` is a property of the installation: if it is not empty, the kit is never engaged.
     """
 
     def __init__(self, profile: Profile, *, start_ns: int, inhibit_reason: str = "") -> None:
@@ -64,27 +64,27 @@ class ByWireAdapter:
         """Reason for the state `lost` or `overridden`."""
         self._wanted, self._bus_error = False, ""
         self._still_enabled: frozenset[Axis] = NO_AXES
-        """Axes that were enabled when driving ended and still are."""
+        """Axes that were enabled when driving ended and have been enabled since then."""
         self._must_stay_enabled = False
-        """An axis was enabled when driving ended, and no command to disable it was sent since."""
+        """Whether an axis was enabled when driving ended, and no command to disable it has been sent since then."""
         self._needed_axes = frozenset({"brake"}) if profile.system is None else frozenset(AXES)
-        """If one of these axes is released, no command is sent any more. A kit that is enabled as a whole needs all:
-        after a command to disable any axis, it would release the brake as well, and not brake by itself."""
+        """If one of these axes is released, no command is sent any more. For a kit that is enabled as a whole these are
+        all axes: after a command to disable one, it would release the brake, too, and its watchdog would not brake."""
         self._moved_ns = start_ns
         """Time of the last report that the car moves."""
         self._is_shifting = False
-        """DRIVE was requested and is not reported yet, so that a report of PARK is not reliable."""
+        """Whether DRIVE was requested and is not reported yet. A report of PARK is then unreliable."""
         self._requested = Actuation(0.0, 0.0, 0.0)
         self._requested_ns: int | None = None
         self._last_commands: KitCommands | None = None
-        """Commands of the last set of frames; None: nothing is being sent, or the set was not written completely."""
+        """Commands of the last set of frames; None if nothing is being sent, or if not all of the set was written."""
         self._is_late = False
         self._known_problems: frozenset[str] = frozenset()
         self._events: list[VehicleEvent] = []
         self._awaited_echoes: deque[tuple[int, int]] = deque()
-        """Steering commands sent and not yet reported, in steps of the kit, with the times of their request."""
+        """Steering commands sent and not yet reported: each in steps of the kit, with the time of its tick."""
         self._last_steering: int | None = None
-        """The steering command of the last set of frames, in steps of the kit; None if it had none."""
+        """The steering command of the last set of frames, in steps of the kit; None if steering was not enabled."""
         self._reached: list[ReachedCommand] = []
         self._counts: Counter[str] = Counter()
         self._situation = self._current_situation(start_ns)
@@ -107,12 +107,12 @@ class ByWireAdapter:
         self._update_state(now_ns)
 
     def on_bus_gone(self, reason: str, now_ns: int) -> None:
-        """Note that the bus is gone; the next received frame ends this condition."""
+        """Note that the bus is gone; it is back with the next received frame."""
         self._bus_error = reason
         self._update_state(now_ns)
 
     def set_actuation(self, actuation: Actuation, now_ns: int) -> None:
-        """Set the requested actuation: a tick. Non-finite values are dropped and counted, and are no tick."""
+        """Set the requested actuation; each call is a tick. A call with a value that is not finite is only counted."""
         if not all(map(math.isfinite, (actuation.steering_rad, actuation.throttle, actuation.brake))):
             self._counts["actuations_rejected"] += 1
             return
@@ -151,7 +151,7 @@ class ByWireAdapter:
         return self._speed.is_stationary and self._speed.fault is None
 
     def _check_speed(self, now_ns: int) -> None:
-        """Compare the reported speeds with the pedals that the kit applies: the last ones sent, on enabled axes."""
+        """Check the reported speeds, given the pedals that the kit applies: those sent last, on enabled axes."""
         has_timed_out = now_ns - self._sender.last_set_ns >= COMMAND_TIMEOUT_NS
         sent, enabled = self._sender.last_command, NO_AXES if has_timed_out else self._reports.enabled
         pedals = Pedals(
@@ -188,7 +188,7 @@ class ByWireAdapter:
         )
 
     def _turned_too_far(self) -> str:
-        """Return a text if the wheel is beyond its limit before driving; while driving, the kit turns it back."""
+        """Return a text if the steering wheel is beyond its limit, except when engaged: then commands turn it back."""
         limit_deg, wheel_deg = self._profile.limits.steering_wheel_deg, self._reports.wheel_deg
         if self._state == "engaged" or abs(wheel_deg) <= limit_deg:
             return ""
@@ -228,9 +228,9 @@ class ByWireAdapter:
         return frames
 
     def on_dropped(self, frames: Sequence[CanFrame]) -> None:
-        """Note that `frames`, which are the last ones of those that were due, were not written.
+        """Note that `frames` were not written; they are the last ones of the frames that were due.
 
-        A complete set is due at the next tick.
+        A complete set is then due at the next tick.
         """
         if frames:
             self._sender.take_back(frames)
@@ -240,7 +240,7 @@ class ByWireAdapter:
         return self._requested_ns is not None and now_ns - self._requested_ns <= TICK_LIMIT_NS
 
     def _due_ns(self, requested: DriveCommand) -> int:
-        """Return when the next set of frames is due: earlier if the command has changed."""
+        """Return when the next set of frames is due; it is due earlier if the drive command has changed."""
         if self._state == "clearing":
             return self._sender.last_set_ns + CLEARING_PERIOD_NS
         return self._sender.last_set_ns + (REPEAT_PERIOD_NS if requested == self._sender.last_command else LEAST_GAP_NS)
@@ -262,7 +262,10 @@ class ByWireAdapter:
         return KitCommands(NO_AXES) if self._state == "overridden" else None
 
     def _parking_commands(self) -> KitCommands | None:
-        """Return the commands to brake, then shift to PARK, then disengage: disengaging in gear trips the watchdog."""
+        """Return the commands to brake, then to shift to PARK, and then to disengage.
+
+        Disengaging in another gear would trip the watchdog.
+        """
         is_shifting = self._is_shifting and self._now_ns - self._entered_ns < SHIFT_REPORT_LIMIT_NS
         if self._reports.gear == "park" and not is_shifting:
             return KitCommands(NO_AXES, system="disable")
@@ -272,7 +275,7 @@ class ByWireAdapter:
     def _remaining_commands(self, gear: Gear | None = None) -> KitCommands | None:
         """Return the commands to the axes that are still enabled.
 
-        Return None without the axes needed to brake: without commands, the kit's watchdog brakes.
+        Return None if an axis that is needed to brake is released. Without commands the kit's watchdog brakes.
         """
         if not self._needed_axes <= self._still_enabled:
             return None
@@ -293,7 +296,7 @@ class ByWireAdapter:
     # Commands that reached the wheels.
 
     def _expect_echo(self, commands: KitCommands) -> None:
-        """Expect the kit to report the steering command just sent, if it differs from the one before."""
+        """Expect the kit to report the steering command just sent, if it differs from the previous one."""
         if "steering" not in commands.enabled or self._requested_ns is None:
             self._awaited_echoes.clear()
             self._last_steering = None
@@ -306,7 +309,7 @@ class ByWireAdapter:
         self._last_steering = steps
 
     def _match_echo(self, now_ns: int) -> None:
-        """Match the newest reported command with those sent; the ones sent before the match were superseded."""
+        """Match the newest reported command with a sent command; commands sent earlier were superseded."""
         if not any(steps == self._reports.command for steps, _ in self._awaited_echoes):
             return
         while self._awaited_echoes:
@@ -318,7 +321,7 @@ class ByWireAdapter:
     # Outputs.
 
     def state(self) -> VehicleState:
-        """Return the newest state; its time is that of the newest speed."""
+        """Return the newest state; its time is that of the newest report of `speed`."""
         reports = self._reports
         return VehicleState(
             mono_ns=reports.speeds["speed"].mono_ns,
@@ -342,7 +345,7 @@ class ByWireAdapter:
         return _join(reasons)
 
     def next_wake_ns(self) -> int:
-        """Return the latest time for the next call of `frames_due`."""
+        """Return the time by which `frames_due` should be called next."""
         wake_ns = self._now_ns + IDLE_PERIOD_NS
         if self._last_commands is not None and self._is_fresh(self._now_ns):
             wake_ns = min(wake_ns, max(self._due_ns(self._drive_command()), self._now_ns + 1))
@@ -361,17 +364,17 @@ class ByWireAdapter:
 
     @property
     def tick_ns(self) -> int | None:
-        """Time of the newest tick; no frame is sent later than 60 ms after it."""
+        """Time of the newest tick; no frame is sent more than 60 ms after it."""
         return self._requested_ns
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """Counters of dropped, rejected, limited and late inputs and frames."""
+        """Counters of inputs and frames that were dropped, rejected, limited or late."""
         return {**self._profile.codec.counts, **self._reports.counts, **self._sender.counts, **self._counts}
 
 
 def _join(texts: Iterable[str]) -> str:
-    """Join texts, each of which may consist of several parts already joined; keep each part once."""
+    """Join texts and keep each part once; a text can consist of parts that were joined already."""
     present = [text for text in texts if text]
     if not present:  # nearly always
         return ""

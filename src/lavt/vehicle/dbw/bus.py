@@ -33,31 +33,32 @@ if TYPE_CHECKING:
     from can import BusABC, Message
 
 REOPEN_NS: Final = NS_PER_S
-"""Pause before each attempt to reopen a lost bus. After it, all reports from before the loss are too old to be used."""
+"""Pause before each attempt to reopen a lost bus. After it, reports from before the loss are too old to be used."""
 QUEUE_FRAMES: Final = 8192
 """Capacity of the receive queue: two seconds of a full 500 kbit/s bus. If it is full, the oldest frames are dropped."""
 POLL_S: Final = 0.1
 """Period at which the port's thread checks whether the port was closed."""
 CLOSE_TIMEOUT_S: Final = 1.0
-"""Closing the port waits this long for its thread. If a driver blocks the thread for longer, both are left running."""
+"""`close` waits at most this long for the port's thread. A thread that a driver blocks for longer keeps running."""
 MAX_DIRECT_READS: Final = 256
-"""The most frames that `take` itself reads: 60 ms of a full 500 kbit/s bus. The port's thread reads the others."""
+"""The largest number of frames that a call of `take` reads from the bus: 60 ms of a full 500 kbit/s bus. The port's
+thread reads all other frames."""
 LATEST_READ_NS: Final = NS_PER_S
-"""A frame that has waited longer to be read is dropped: this process was frozen."""
+"""A frame that is read later than this after its arrival is dropped, because this process was frozen."""
 
-logging.getLogger("can").addHandler(logging.NullHandler())  # the errors raised here contain its messages
+logging.getLogger("can").addHandler(logging.NullHandler())  # errors raised here contain what python-can would log
 
 STAMPED_BY_KERNEL: Final = frozenset({"socketcan", "udp_multicast"})
-"""Interfaces whose frames carry the kernel's wall time of arrival, and whose descriptor is readable if and only if a
-frame is waiting. The times of other interfaces are those of their devices' clocks."""
+"""Interfaces whose frames have the kernel's wall time of arrival, and whose descriptor is readable if and only if a
+frame is waiting. Frames of other interfaces have times of their devices' clocks."""
 BUS_OFF_BIT: Final = 0x40
-"""In the identifier of an error frame of SocketCAN (linux/can/error.h, CAN_ERR_BUSOFF)."""
+"""Bit in the identifier of an error frame of SocketCAN (linux/can/error.h, CAN_ERR_BUSOFF)."""
 FULL_BUFFER_TEXT: Final = "Transmit buffer full"
-"""Error of python-can's SocketCAN interface, which has no number."""
+"""Text of an error of python-can's SocketCAN interface that has no error number."""
 
 
 class OpenBus(NamedTuple):
-    """An open bus. The frames received from it are dropped with it: after a loss, their age may not be known."""
+    """An open bus. If the bus is lost, the frames received from it are dropped, because their age can be unknown."""
 
     driver: BusABC
     received: deque[ReceivedCanFrame]
@@ -77,11 +78,11 @@ class OpenBus(NamedTuple):
 class CanPort:
     """A `BusPort` on a CAN bus. `send` and `take` are for one thread and never block.
 
-    A thread of the port reads, and reopens a lost bus, which takes some drivers a second.
+    The port has a thread, which reads frames and reopens a lost bus; reopening takes some drivers a second.
 
-    `counts`: `frames_too_old` and `buffer_full` were not sent; `error_frames`, `remote_frames`, `fd_frames`,
-    `unreadable`, `read_too_late` and `own_frames` were received and dropped; `overflowed` were dropped from a full
-    queue. `suspended` returns for how long the machine was suspended since its start, in ns.
+    `counts` has numbers of frames: `frames_too_old` and `buffer_full` were not sent; `error_frames`, `remote_frames`,
+    `fd_frames`, `unreadable`, `read_too_late` and `own_frames` were received and dropped; `overflowed` were dropped
+    from a full queue. The argument `suspended` returns for how long the machine was suspended since its start, in ns.
 
     Raises `UserError` if python-can is missing or the bus cannot be opened.
     """
@@ -104,15 +105,16 @@ class CanPort:
         self.counts: Counter[str] = Counter()
         bus = self._open()
         self._bus: OpenBus | None = bus
-        """The open bus; None: it is lost. Whoever sets it to None lets the thread shut that bus down."""
+        """The open bus; None if it is lost. After this attribute was set to None, the thread shuts the bus down."""
         self._thread = threading.Thread(target=self._run, args=(bus,), name="can", daemon=True)
         self._thread.start()
 
     def send(self, frames: Sequence[CanFrame], made_ns: int) -> int:
-        """Write frames made at `made_ns`, in order and without blocking, but none older than `TICK_LIMIT_NS`.
+        """Write frames made at `made_ns`, in order and without blocking; return how many were written.
 
-        Return how many were written: fewer if the transmit buffer is full, which is no loss of the bus. The age is
-        checked right before each write. Raises `BusGone` without writing the remaining frames.
+        The remaining frames are not written if their age exceeds `TICK_LIMIT_NS` (checked before each write), or if the
+        transmit buffer is full, which is no loss of the bus. If the bus is lost, they are not written, and `BusGone` is
+        raised.
         """
         for written, frame in enumerate(frames):
             message = self._message(frame)
@@ -134,10 +136,10 @@ class CanPort:
         return len(frames)
 
     def take(self, now_ns: int) -> list[ReceivedCanFrame]:  # noqa: ARG002 (other ports need it)
-        """Return the frames received since the last call, in order, without own frames.
+        """Return the frames received since the last call, in order. Raises `BusGone` if the bus is lost.
 
-        Frames that the port's thread has not read yet, because it waits for a processor, are included if the kernel
-        stamped them. Raises `BusGone` while the bus is lost.
+        The frames that this port sent are not among them. Frames with the kernel's time of arrival are also returned if
+        the port's thread has not read them yet, because it waits for a processor.
         """
         self._check_suspension()
         if (bus := self._bus) is not None and self._interface in STAMPED_BY_KERNEL:
@@ -148,7 +150,7 @@ class CanPort:
         return [bus.received.popleft() for _ in range(len(bus.received))]
 
     def next_wake_ns(self) -> int | None:
-        """Return None: the arrival of frames cannot be predicted."""
+        """Return None, because the arrival of frames cannot be predicted."""
         return None
 
     def close(self) -> None:
@@ -158,7 +160,7 @@ class CanPort:
         self._thread.join(CLOSE_TIMEOUT_S)
 
     def _check_suspension(self) -> None:
-        """Lose the bus if the machine was suspended: the monotonic clock stood still, so every age is too small."""
+        """Lose the bus if the machine was suspended: the monotonic clock stood still, so all ages are too small."""
         before_ns, self._suspended_ns = self._suspended_ns, max(self._suspended(), self._suspended_ns)
         if self._suspended_ns - before_ns >= COMMAND_TIMEOUT_NS:
             self._lose("the machine was suspended")
@@ -180,12 +182,12 @@ class CanPort:
         return OpenBus(driver, deque(maxlen=QUEUE_FRAMES), ArrivalTimes(opened), check, threading.Lock())
 
     def _reopen(self) -> OpenBus | None:
-        """Try to open the bus until that succeeds; return None once the port is closed."""
+        """Try to open the bus until it is open; return None if the port is closed before."""
         while not self._closing.wait(REOPEN_NS / NS_PER_S):
             suspended_ns = self._suspended()
             try:
                 bus = self._open()
-            except Exception as error:  # the system's, too: there may be no descriptor left
+            except Exception as error:  # of the driver or of the system, which can be out of descriptors
                 self._gone_reason = _error_text(error)
             else:
                 if self._suspended() - suspended_ns < COMMAND_TIMEOUT_NS:
@@ -240,25 +242,25 @@ class CanPort:
         except Exception as error:
             if bus.check is None or error.__cause__ is None or isinstance(error.__cause__, OSError):
                 raise
-            self.counts["unreadable"] += 1  # its values contradict each other
+            self.counts["unreadable"] += 1  # the values of the message contradict each other
             return
         if message is not None:
             self._receive(message, self._clock.now(), bus)
 
     def _is_readable(self, bus: OpenBus) -> bool:
-        """Wait for a frame for at most `POLL_S`, by the monotonic clock; python-can's timeouts use the wall clock."""
-        now, ends = self._clock.now(), [bus.driver.fileno()]
-        if select.select(ends, [], [], 0)[0]:
+        """Wait for a frame for at most `POLL_S` of the monotonic clock; python-can's timeouts use the wall clock."""
+        now, descriptors = self._clock.now(), [bus.driver.fileno()]
+        if select.select(descriptors, [], [], 0)[0]:
             return True
         bus.arrivals.note_empty(now)
-        return bool(select.select(ends, [], [], POLL_S)[0])
+        return bool(select.select(descriptors, [], [], POLL_S)[0])
 
     def _receive(self, message: Message, now: Now, bus: OpenBus) -> None:
         if self._mark is not None and message.channel == self._mark:
             self.counts["own_frames"] += 1
             return
-        is_error_of_controller = message.is_error_frame and self._interface not in VIRTUAL_INTERFACES
-        if is_error_of_controller and message.arbitration_id & BUS_OFF_BIT:
+        is_controller_error = message.is_error_frame and self._interface not in VIRTUAL_INTERFACES
+        if is_controller_error and message.arbitration_id & BUS_OFF_BIT:
             raise BusGone("the controller is bus-off")
         frame = _data_frame(message, self.counts)
         if frame is None:
@@ -280,9 +282,9 @@ class CanPort:
 
 
 def read_log(path: Path) -> Iterator[ReceivedCanFrame]:
-    """Yield the frames of a log (candump's `.log`, or another format of python-can) with the log's own times.
+    """Yield the frames of a log (candump's `.log`, or another format of python-can), with the times in the log.
 
-    Raises `UserError` if it cannot be read.
+    Raises `UserError` if the log cannot be read.
     """
     counts: Counter[str] = Counter()
     count = 0
@@ -324,9 +326,9 @@ def _open_bus(interface: str, channel: str, options: Mapping[str, Any]) -> BusAB
     if options.get("receive_own_messages"):
         raise UserError("a port does not receive its own frames: leave out receive_own_messages")
     if interface == "socketcan" and channel not in (name for _, name in socket.if_nameindex()):
-        # python-can would report this as well, but leave a socket open
+        # python-can would report this error, too, but leave a socket open
         raise UserError(f"socketcan {channel} cannot be opened (no such device): {REMEDIES[errno.ENODEV]}")
-    # The bus counts as virtual by default, so no gateway on another machine may receive it.
+    # A multicast is virtual by default, so by default its datagrams must not leave this machine.
     defaults = {"hop_limit": 0} if interface == RECEIVES_OWN_FRAMES else {}
     try:
         bus: BusABC = library.Bus(channel=channel, interface=interface, ignore_config=True, **{**defaults, **options})
@@ -377,6 +379,6 @@ def _is_buffer_full(error: Exception) -> bool:
 
 
 def _error_text(error: Exception) -> str:
-    """Return the first lines of an error's and its cause's messages."""
+    """Return the first line of an error's message, and that of its cause."""
     lines = [str(candidate).partition("\n")[0] for candidate in (error, error.__cause__) if candidate is not None]
     return ": ".join(dict.fromkeys(line for line in lines if line)) or type(error).__name__

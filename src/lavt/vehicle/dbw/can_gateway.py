@@ -1,6 +1,6 @@
 """The kernel's CAN gateway rules (`cangw -L`), which forward frames between interfaces, read through netlink.
 
-Layout: linux/can/gw.h and linux/netlink.h. A kernel without the gateway answers with rules of other families, or none.
+Layout: linux/can/gw.h and linux/netlink.h. A kernel without the gateway sends only rules of other families, or none.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ NLMSG_ERROR, NLMSG_DONE = 2, 3
 DUMP_REQUEST: Final = 0x301
 """NLM_F_REQUEST and NLM_F_DUMP."""
 CAN_FAMILY, GATEWAY_CAN_TO_CAN = 29, 1
-"""PF_CAN and CGW_TYPE_CAN_CAN, the family and the type of the rules; no CAN socket is opened here."""
+"""PF_CAN and CGW_TYPE_CAN_CAN, the family and the type of the rules."""
 SOURCE, DESTINATION = 9, 10
 """CGW_SRC_IF and CGW_DST_IF."""
 HEADER, RULE, ATTRIBUTE = struct.Struct("=IHHII"), struct.Struct("=BBH"), struct.Struct("=HH")
@@ -48,7 +48,7 @@ def gateway_interfaces() -> frozenset[int]:
 
 
 def parse_rules(data: bytes) -> tuple[set[int], bool]:
-    """Return the interfaces in a datagram of rules, and whether it is the last one.
+    """Return the indices of the interfaces in a datagram of rules, and whether it is the last datagram.
 
     Raises `OSError` if the datagram reports an error.
     """
@@ -70,7 +70,7 @@ def parse_rules(data: bytes) -> tuple[set[int], bool]:
 
 
 def _pieces(data: bytes, header: struct.Struct) -> Iterator[tuple[int, bytes]]:
-    """Yield type and body of netlink's messages or attributes, which begin with length and type on multiples of 4."""
+    """Yield type and body of netlink messages or attributes. Each begins at a multiple of 4, with length and type."""
     while len(data) >= header.size:
         length, kind = header.unpack_from(data)[:2]
         if not header.size <= length <= len(data):

@@ -1,7 +1,7 @@
-"""A codec for the messages of a DBC file, with the file's description of them. The only module that uses cantools.
+"""A codec for the messages of a DBC file. Only this module uses cantools, which comes with the extra `can`.
 
-cantools comes with the extra `can`. Values are physical, in the DBC's units. A value with a name in the DBC stays a
-number (`SignalFacts.names` has the name). A value whose name means "none" (`NO_VALUE`), or that is not finite, is None.
+Values are physical, in the DBC's units. A value with a name in the DBC stays a number (`SignalFacts.names` has the
+name). A value is None if its name is in `NO_VALUE`, or if it is not finite.
 
 Decoding a frame of 8 bytes and 15 signals takes 4 us, and encoding one of 9 signals takes 10 us. These are medians of 7
 series of 20 000 calls with Python 3.11 and cantools 45.1 on one core of a virtual machine.
@@ -28,11 +28,12 @@ if TYPE_CHECKING:
 NO_VALUE: Final = frozenset({"INVALID", "UNKNOWN"})
 """Names that a DBC gives to numbers that mean "no value"."""
 MAX_MESSAGE_BYTES: Final = 1785
-"""The longest message of J1939, in several frames. cantools loads it in 0.1 s; a message of 20 000 bytes takes 38 s."""
+"""The longest message of J1939, in several frames. cantools loads such a message in 0.1 s, and one of 20 000 bytes in
+38 s."""
 MESSAGE_LENGTH: Final = re.compile(rb"\bBO_\s+\d+\s+\w+\s*:\s*(\d{1,20})")
 """Finds the length of each message in the text of a DBC file."""
 RANGE_SLACK_STEPS: Final = 1e-6
-"""Tolerance of the range check, in steps of the signal: a step is rarely representable exactly as a float."""
+"""Tolerance of the range check, in steps of the signal. It is needed because floats represent few steps exactly."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,16 +49,16 @@ class SignalFacts:
     scale: float
     offset: float
     minimum: float
-    """Physical; the range of the bits if the DBC gives none."""
     maximum: float
+    """The smallest and the largest physical value; if the DBC gives none, those that the bits can represent."""
     unit: str
     names: Mapping[int, str]
     """Names of values, by raw number."""
     is_unverified: bool
-    """Its position is an assumption (`docs/can.md`)."""
+    """Whether the signal's position is an assumption (`docs/can.md`)."""
     is_multiplexer: bool
     multiplexer: str
-    """The signal that selects whether this one is in the frame; empty: it always is."""
+    """The signal that selects whether this signal is in the frame; empty if this signal is in every frame."""
     branches: frozenset[int]
     """Raw numbers of the multiplexer for which this signal is in the frame."""
     no_value: frozenset[float]
@@ -76,21 +77,21 @@ class MessageFacts:
     identifier: int
     is_extended: bool
     length: int
-    """Bytes."""
+    """In bytes."""
     signals: Mapping[str, SignalFacts]
     timeout_ns: int | None
-    """Attribute `TimeoutMs`: a receiver ignores the last message after this time."""
+    """The DBC's attribute `TimeoutMs`: after this time a receiver ignores the last message."""
     period_ns: int | None
-    """Attribute `GenMsgCycleTime`."""
+    """The DBC's attribute `GenMsgCycleTime`."""
     senders: tuple[str, ...]
 
 
 class Codec:
     """The messages of one DBC file.
 
-    `counts` has the frames that `decode` rejected: `unknown_identifier`, `wrong_length`, `unknown_multiplexer`.
+    `counts` counts the frames that `decode` rejected: `unknown_identifier`, `wrong_length`, `unknown_multiplexer`.
 
-    Raises `UserError` if cantools or the file is missing, or the file is not a DBC.
+    Raises `UserError` if cantools or the file is missing, or if the file is not a DBC file.
     """
 
     def __init__(self, dbc: Path) -> None:
@@ -123,9 +124,9 @@ class Codec:
             _check_value(facts, name, value)
         full = {**self._zeros[message], **values}
         absent = [signal.name for signal in facts.signals.values() if not _is_included(signal, full, facts)]
-        if strays := [name for name in absent if name in values]:
-            raise ValueError(f"{strays[0]} of {message} is not in a frame with this multiplexer")
         for name in absent:
+            if name in values:
+                raise ValueError(f"{name} of {message} is not in a frame with this multiplexer")
             del full[name]
         data = bytes(self._messages[message].encode(full, strict=False))
         return data if length is None else data[:length]
@@ -133,8 +134,8 @@ class Codec:
     def decode(self, frame: CanFrame, *, short: bool = False) -> tuple[str, dict[str, float | None]] | None:
         """Return a frame's message name and physical values, or None (counted) if the DBC does not describe it.
 
-        A frame must have the message's length. With `short` it may be shorter; only the signals that are complete in it
-        are returned. Never raises.
+        A frame must have the message's length. With `short` a shorter frame is accepted; the signals that it contains
+        completely are returned. Never raises.
         """
         message = self._decoders.get((frame.identifier, frame.is_extended))
         if message is None:
@@ -168,7 +169,7 @@ def _check_value(facts: MessageFacts, name: str, value: float) -> None:
 
 
 def _is_included(signal: SignalFacts, values: Mapping[str, float], facts: MessageFacts) -> bool:
-    """Return whether the multiplexers, with these values, include a signal in the frame."""
+    """Return whether a signal is in a frame with these values of the multiplexers."""
     if not signal.multiplexer:
         return True
     selector = facts.signals[signal.multiplexer]
@@ -243,7 +244,7 @@ def _signal_facts(signal: Signal) -> SignalFacts:
 
 
 def _number_range(signal: Signal) -> tuple[float, float]:
-    """Return the range of raw numbers."""
+    """Return the smallest and the largest raw number."""
     if signal.conversion.is_float:
         return -math.inf, math.inf
     if signal.is_signed:
@@ -257,5 +258,5 @@ def _attribute(owner: Message | Signal, name: str) -> Any:
 
 
 def _from_milliseconds(count: Any) -> int | None:
-    """Convert to nanoseconds; None for 0, which means "none" in a DBC."""
+    """Convert to nanoseconds; return None for 0, which means "none" in a DBC, and for None."""
     return int(count) * NS_PER_MS if count else None

@@ -1,4 +1,4 @@
-"""The CRC of Dataspeed's second generation: SAE J1850, over a frame's identifier and then its data.
+"""The CRC of Dataspeed's second generation: the CRC-8 of SAE J1850, over a frame's identifier and then its data.
 
 Polynomial 0x1D (x^8 + x^4 + x^3 + x^2 + 1), initial value 0xFF, inverted at the end. Sources and test vectors:
 `docs/can.md`.
@@ -27,7 +27,7 @@ def crc8(data: bytes) -> int:
 def frame_crc8(identifier: int, data: bytes, *, extended: bool = False) -> int:
     """Return the CRC of a frame, 0 to 255, where `data` is the data before the CRC.
 
-    `extended` means a 29-bit identifier. Raises OverflowError for an identifier that does not fit into its bytes.
+    With `extended` the identifier has 29 bits. Raises OverflowError for an identifier that does not fit into its bytes.
     """
     length = _EXTENDED_BYTES if extended else _STANDARD_BYTES
     return crc8(identifier.to_bytes(length, "big") + data)

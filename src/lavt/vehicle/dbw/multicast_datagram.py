@@ -1,7 +1,7 @@
 """Datagrams of python-can's interface `udp_multicast`: each is a CAN message as a msgpack map.
 
-Anyone who can reach the group can send one, and python-can unpacks whatever arrives: a number as `data` makes it
-allocate as many bytes. So the port checks each waiting datagram before python-can reads it.
+Anyone who can reach the multicast group can send a datagram, and python-can unpacks all of them. If `data` is a number,
+python-can allocates this number of bytes. So the port checks each waiting datagram before python-can reads it.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class DatagramCheck:
         self._socket = socket.socket(fileno=os.dup(descriptor))
 
     def drop_malformed(self) -> bool:
-        """Drop the first waiting datagram if it is malformed; return whether it was.
+        """Drop the first waiting datagram if it is malformed; return whether it was dropped.
 
         Raises `BlockingIOError` if no datagram waits.
         """

@@ -1,7 +1,7 @@
 """A profile describes how to control one kind of by-wire kit. `lavt.assembly.dbw` has checked it against its DBC.
 
-This module converts units and signs. The bus has the steering wheel's angle; LAVT has the road wheels' angle, left
-positive. Pedals are fractions.
+This module also converts angles: on the bus there is the angle of the steering wheel, and in LAVT the angle of the road
+wheels, left positive. Pedals are fractions.
 """
 
 from __future__ import annotations
@@ -21,26 +21,28 @@ Gear = Literal["park", "reverse", "neutral", "drive"]
 VEHICLE_SPEEDS = ("speed", "second_speed")
 WHEEL_SPEEDS = ("wheel_1", "wheel_2", "wheel_3", "wheel_4")
 SPEEDS = (*VEHICLE_SPEEDS, *WHEEL_SPEEDS)
-"""Names of the reported speeds. Only `speed` is used to drive; the others are compared with it."""
+"""Names of the reported speeds. Only `speed` is used to drive; the other speeds are compared with it."""
 
 LEAST_GAP_NS = 5 * NS_PER_MS
-"""Shortest time between two sets of frames; it applies when the commands change."""
+"""Shortest time between two sets of frames, if the second set has another drive command."""
 REPEAT_PERIOD_NS = 20 * NS_PER_MS
-"""Unchanged commands are repeated with this period: 50 Hz, as in the vendor's demo. The kit needs one within 100 ms."""
+"""Period at which an unchanged drive command is repeated: 50 Hz, as in the vendor's demo. A kit needs a command every
+100 ms."""
 CLEARING_PERIOD_NS = 50 * NS_PER_MS
 """Period of the frames that clear overrides: 20 Hz, as in the published sources (docs/can.md)."""
 COMMAND_TIMEOUT_NS = 100 * NS_PER_MS
-"""A kit disengages this long after its last command."""
+"""The time after the last command when a kit disengages."""
 TICK_LIMIT_NS = 60 * NS_PER_MS
-"""The adapter does not send a command that was requested longer ago, and the bus's port does not write it: the program
-may have been frozen since."""
+"""The largest age of a command. The adapter does not send an older command, and the port does not write an older frame,
+because the program was possibly frozen."""
 
 IN_DEGREES = {"deg": 1.0, "rad": math.radians(1.0)}
 IN_FRACTIONS = {"": 1.0, "%": 100.0}
 IN_METRES_PER_SECOND = {"m/s": 1.0, "km/h": 3.6}
 IN_RADIANS_PER_SECOND = {"rad/s": 1.0, "deg/s": math.degrees(1.0)}
 IN_DEGREES_PER_SECOND = {"": 1.0, "deg/s": 1.0, "rad/s": math.radians(1.0)}
-"""For each table: one unit of LAVT in the units that a DBC may have. Other units are rejected."""
+"""In each of these tables: the value of one degree, fraction, m/s, rad/s or deg/s in each unit that a DBC is allowed to
+have. Other units are rejected."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +71,7 @@ class GearCommand:
     value: str
     clear: str
     codes: Mapping[Gear, int]
-    """The value of the signal for each gear."""
+    """The value of the signal `value` for each gear."""
     checksum: str
 
 
@@ -88,7 +90,7 @@ class SystemCommand:
 
 @dataclass(frozen=True, slots=True)
 class SignalCondition:
-    """A condition on a signal: it equals `number`, or is not 0 if `number` is None."""
+    """A condition on a signal: the signal equals `number` or, if `number` is None, is not 0."""
 
     signal: str
     number: int | None
@@ -104,26 +106,29 @@ class ReportSpec:
     """The part of the kit that the report describes."""
     timeout_ns: int
     values: Mapping[str, str]
-    """Signal names by value name."""
+    """The names of signals, by name of the value that the signal has (`speed`, `angle`, ...)."""
     no_value: Mapping[str, float]
-    """By value name: the number that means "not known", in the DBC's unit. It is the lowest number of a signed signal;
-    for generation 2 this is our assumption."""
+    """By name of the value: the number that means "not known", in the DBC's unit. It is the lowest number of a signed
+    signal; for generation 2 this is our assumption."""
     override: tuple[SignalCondition, ...]
-    """The conditions that mean an override by the driver; the next three fields are of the same kind."""
+    """The conditions that mean an override by the driver."""
     trip: tuple[SignalCondition, ...]
+    """The conditions that mean that the kit's watchdog has tripped."""
     command_error: tuple[SignalCondition, ...]
+    """The conditions that mean a late or invalid command."""
     fault: tuple[SignalCondition, ...]
+    """The conditions that mean a fault."""
     needs: Mapping[str, frozenset[int]]
-    """By signal: the values that it must have; any other value is a fault."""
+    """By name of the signal: the values that the signal must have; any other value is a fault."""
     reasons: tuple[str, ...]
-    """Signals with the reason for a rejection; 0 means no reason."""
+    """Names of the signals with the reason for a rejection; 0 means no reason."""
     count: str
     checksum: str
 
 
 @dataclass(frozen=True, slots=True)
 class OwnBrake:
-    """Evidence that the kit brakes by itself: `signal` is more than `above` while the brake is not enabled."""
+    """The sign that the kit brakes on its own: `signal` is greater than `above` although the brake is not enabled."""
 
     message: str
     signal: str
@@ -137,7 +142,7 @@ class ByWireCar:
     wheelbase_m: float
     steering_ratio: float
     steering_sign: Literal[1, -1] | None
-    """1: left is positive on the bus; None: unknown."""
+    """1 if left is positive on the bus, -1 if right is; None if unknown."""
     wheel_radius_m: float
     max_acceleration_mps2: float
     max_braking_mps2: float
@@ -145,7 +150,7 @@ class ByWireCar:
 
 @dataclass(frozen=True, slots=True)
 class ByWireLimits:
-    """Limits on everything sent to the bus; pedal rates limit pressing, not releasing."""
+    """Limits on everything that is sent to the bus. The rates of pedals limit pressing, not releasing."""
 
     steering_wheel_deg: float
     steering_wheel_rate_degps: float
@@ -154,7 +159,7 @@ class ByWireLimits:
     throttle_rate_per_s: float
     brake_rate_per_s: float
     holding_brake: float
-    """The least brake while the kit is enabled before driving, and while the car is parked after driving."""
+    """The smallest brake when the kit is enabled before driving, and when the car is parked after driving."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,13 +178,13 @@ class Profile:
     gear: GearCommand
     system: SystemCommand | None
     clearing_bytes: int | None
-    """Length of the frames that clear overrides; None: as long as other commands."""
+    """Length of the frames that clear overrides; None if they are as long as other commands."""
     reports: Mapping[str, ReportSpec]
-    """By message name."""
+    """The reports by message name."""
     watchdog: OwnBrake | None
     """How to detect that the kit's watchdog brakes; None if that is not possible."""
     speeds_per_mps: Mapping[str, float]
-    """By value name, one of `SPEEDS`: converts m/s into the unit of a reported speed. A kit has at least `speed`."""
+    """By name of the speed, one of `SPEEDS`: 1 m/s in the unit of the reported speed. A kit has at least `speed`."""
     angle_per_deg: float
     """One degree in the unit of the reported angle."""
     unverified: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""The newest reports of a kit: values with their times, and texts about what inhibits driving."""
+"""The newest reports of a kit: values with their times, and texts about overrides, trips, errors and faults."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from lavt.vehicle.dbw.speed_monitor import SpeedReport
 
 Values = Mapping[str, float | None]
 Kind = Literal["override", "trip", "command_error", "fault", "reason"]
-"""The kinds of texts; a profile maps report signals to them."""
+"""The kinds of texts; a profile maps signals of reports to them."""
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 OTHER_COMMANDER_NS: Final = NS_PER_S
-"""Our choice: another sender counts as present for this long after its last command."""
+"""Our choice: another sender is assumed to be present for this long after its last command."""
 
 
 class NewestReports:
     """The newest report of each message in a profile.
 
-    `counts` has the reports that could not be used (`wrong_checksum`, `repeated_counter`, `value_unknown`; the codec
-    counts frames that it cannot decode), and `foreign_commands`, commands that another sender sent to the kit.
+    `counts` counts the reports that could not be used (`wrong_checksum`, `repeated_counter`, `value_unknown`), and the
+    commands that another sender sent to the kit (`foreign_commands`). The codec counts frames that it cannot decode.
     """
 
     def __init__(self, profile: Profile, start_ns: int) -> None:
@@ -32,7 +32,7 @@ class NewestReports:
         self._texts_by_message: dict[str, dict[Kind, list[str]]] = {}
         """Texts of the newest report of each message, by kind."""
         self._texts: dict[Kind, list[str]] = {kind: [] for kind in KINDS}
-        """Texts of all newest reports; recomputed only when one changes."""
+        """Texts of all newest reports, by kind; computed again only when a text changes."""
         self._received_ns: dict[str, int] = {}
         """Time of the last report of each message in which all values were known."""
         self._commands = _commands(profile)
@@ -41,15 +41,16 @@ class NewestReports:
         self._gears = {code: gear for gear, code in profile.gear.codes.items()}
         self.counts: Counter[str] = Counter()
         self.speeds: dict[str, SpeedReport] = {"speed": SpeedReport(0.0, start_ns)}
-        """The newest speed by name (`profile.SPEEDS`); before its first report, `speed` is 0 and the others missing."""
+        """The newest speeds by name (`profile.SPEEDS`). Before its first report, `speed` is 0, and another speed is
+        missing."""
         self._report_counts: dict[str, float | None] = {}
-        """Counter of the newest report of each message that has one."""
+        """Counter of the newest report of each message with a counter."""
         self.wheel_deg = 0.0
-        """The steering wheel's angle, with the bus's sign."""
+        """The steering wheel's angle, with the sign that it has on the bus."""
         self.command: int | None = None
-        """The steering command that the kit reports, in its own steps."""
+        """The steering command that the kit reports, in the kit's steps."""
         self.gear: Gear | None = None
-        """None: unknown."""
+        """The reported gear; None if unknown."""
         self.enabled: frozenset[Axis] = frozenset()
 
     @property
@@ -59,7 +60,7 @@ class NewestReports:
 
     def receive(self, frame: CanFrame, now_ns: int) -> None:
         """Process any frame from the bus."""
-        # A command of another sender counts whatever its length.
+        # A command is one of another sender, whatever its length.
         if (command := self._commands.get((frame.identifier, frame.is_extended))) is not None:
             self.counts["foreign_commands"] += 1
             self._foreign_command = command, now_ns
@@ -111,7 +112,7 @@ class NewestReports:
             self.enabled = self.enabled | {axis} if known["enabled"] else self.enabled - {axis}
 
     def missing(self, now_ns: int) -> list[str]:
-        """Return a text for each report that is missing, or too old to drive with."""
+        """Return a text for each report that is missing: it never came, or the last one is too old."""
         return [
             f"no {message} for {report.timeout_ns // NS_PER_MS} ms"
             if message in self._received_ns
@@ -127,7 +128,7 @@ class NewestReports:
         return f"another sender on the bus commands the kit ({self._foreign_command[0]})"
 
     def deadline_ns(self, now_ns: int) -> int | None:
-        """Return when the next report will be too old, or None if none will."""
+        """Return the next time when a report becomes too old, or None if there is no such time."""
         reports = self._profile.reports
         deadlines = (received_ns + reports[message].timeout_ns for message, received_ns in self._received_ns.items())
         return min((deadline_ns for deadline_ns in deadlines if deadline_ns > now_ns), default=None)
@@ -157,15 +158,15 @@ class NewestReports:
         }
 
     def _value_name(self, message: str, signal: str, number: float | None) -> str:
-        """Return the DBC's name of a number."""
+        """Return the DBC's name of a signal's number, or the number itself."""
         names = self._profile.codec.messages[message].signals[signal].names
         return "no value" if number is None else names.get(round(number), f"{number:g}").lower().replace("_", " ")
 
 
 def _commands(profile: Profile) -> dict[tuple[int, bool], str]:
-    """Return the names of the profile's commands by identifier.
+    """Return the names of the profile's commands, by identifier and whether it has 29 bits.
 
-    If one of them is received, another sender has sent it, because a bus does not return own frames.
+    A received command was sent by another sender, because a port does not return the frames that it sent.
     """
     names = [*(command.message for command in profile.axes.values()), profile.gear.message]
     names += [] if profile.system is None else [profile.system.message]

@@ -1,4 +1,4 @@
-"""Frames for the kit: limits, encoding, counters and checksums. The limits are the last stage before the bus."""
+"""Frames for the kit: limits, encoding, counters and checksums. No code changes a command after these limits."""
 
 from __future__ import annotations
 
@@ -15,22 +15,24 @@ from lavt.vehicle.dbw.crc8 import frame_crc8
 from lavt.vehicle.dbw.profile import AXES, TICK_LIMIT_NS, Axis, AxisCommand, ByWireLimits, Gear, Profile, SystemCommand
 
 GEAR_PERIOD_NS = 100 * NS_PER_MS
-"""Our choice: period at which a gear is requested until it is reported; the kit may still be shifting."""
+"""Our choice: period at which a gear is requested until the kit reports it."""
 
 
 class KitCommands(Struct, frozen=True):
     """Commands to the kit other than the actuation."""
 
     enabled: frozenset[Axis]
-    """Axes to enable; the others are disabled."""
+    """Axes to enable; all other axes are disabled."""
     is_clearing: bool = False
+    """Whether overrides are cleared."""
     gear: Gear | None = None
-    """The requested gear."""
+    """The requested gear; None if no gear is requested."""
     system: Literal["", "enable", "disable"] = ""
+    """The request to the kit as a whole; empty if there is none."""
 
 
 class DriveCommand(Struct, frozen=True):
-    """The requested actuation: the steering wheel's angle with the bus's sign, and pedals as fractions."""
+    """A requested actuation: the steering wheel's angle, with its sign on the bus, and pedals as fractions."""
 
     wheel_deg: float
     throttle: float
@@ -38,24 +40,24 @@ class DriveCommand(Struct, frozen=True):
 
 
 def apply_limits(limits: ByWireLimits, requested: DriveCommand, before: DriveCommand, passed_ns: int) -> DriveCommand:
-    """Limit `requested`, which is sent `passed_ns` after the command `before`; a brake request zeroes the throttle.
+    """Limit `requested`, which is sent `passed_ns` after the command `before`. With a brake the throttle becomes 0.
 
-    The limit of the angle has priority over that of the rate: even if the wheel was turned beyond the limit of the
-    angle, no angle beyond it is commanded.
+    The limit of the angle has priority over the limit of its rate: if the driver has turned the wheel beyond the limit
+    of the angle, the next command has the limit, whatever the rate.
     """
     passed_s = min(passed_ns, TICK_LIMIT_NS) / NS_PER_S
     turn_deg = limits.steering_wheel_rate_degps * passed_s
-    wheel_deg = _within(requested.wheel_deg, before.wheel_deg - turn_deg, before.wheel_deg + turn_deg)
+    wheel_deg = _clamp(requested.wheel_deg, before.wheel_deg - turn_deg, before.wheel_deg + turn_deg)
     throttle = 0.0 if requested.brake > 0 else requested.throttle
     return DriveCommand(
-        _within(wheel_deg, -limits.steering_wheel_deg, limits.steering_wheel_deg),
-        _within(throttle, 0.0, min(limits.throttle, before.throttle + limits.throttle_rate_per_s * passed_s)),
-        _within(requested.brake, 0.0, min(limits.brake, before.brake + limits.brake_rate_per_s * passed_s)),
+        _clamp(wheel_deg, -limits.steering_wheel_deg, limits.steering_wheel_deg),
+        _clamp(throttle, 0.0, min(limits.throttle, before.throttle + limits.throttle_rate_per_s * passed_s)),
+        _clamp(requested.brake, 0.0, min(limits.brake, before.brake + limits.brake_rate_per_s * passed_s)),
     )
 
 
 def _choose(axes: AbstractSet[Axis], chosen: DriveCommand, other: DriveCommand) -> DriveCommand:
-    """Return a command with the values of `chosen` for `axes`, and of `other` for the remaining ones."""
+    """Return a command with the values of `chosen` for `axes`, and the values of `other` for the remaining axes."""
     return DriveCommand(
         (chosen if "steering" in axes else other).wheel_deg,
         (chosen if "throttle" in axes else other).throttle,
@@ -63,23 +65,23 @@ def _choose(axes: AbstractSet[Axis], chosen: DriveCommand, other: DriveCommand) 
     )
 
 
-def _within(number: float, least: float, most: float) -> float:
-    return min(max(number, least), most)
+def _clamp(number: float, lowest: float, highest: float) -> float:
+    return min(max(number, lowest), highest)
 
 
 class FrameSender:
-    """An encoder for sets of frames. A set has one frame for each axis, and sometimes others."""
+    """An encoder for sets of frames."""
 
     def __init__(self, profile: Profile, start_ns: int) -> None:
         self._profile = profile
         self.last_command = DriveCommand(0.0, 0.0, 0.0)
-        """The drive command of the last set; a disabled axis has the reported angle or a released pedal."""
+        """The drive command of the last set; for a disabled axis, the reported angle or a released pedal."""
         self.last_set_ns = start_ns
-        """Time of the last set; before it, the time of the start."""
+        """Time of the last set; before the first set, the time of the start."""
         self.counts: Counter[str] = Counter()
         """`sets`, and how often each limit took effect: `limited_wheel_deg`, `limited_throttle`, ..."""
         self._frame_counts: Counter[str] = Counter()
-        """Number of frames per message, for its counter."""
+        """Number of frames of each message, from which the counters in the frames follow."""
         self._gear_ns: int | None = None
         """Time of the last request for a gear; None: no gear is requested."""
         self._before: tuple[DriveCommand, int, int | None] = self.last_command, start_ns, None
@@ -87,7 +89,7 @@ class FrameSender:
         self._messages = {(facts.identifier, facts.is_extended): facts for facts in profile.codec.messages.values()}
 
     def frames(self, commands: KitCommands, requested: DriveCommand, wheel_deg: float, now_ns: int) -> list[CanFrame]:
-        """Return a set of frames. Steering starts from the reported angle `wheel_deg` once it is enabled."""
+        """Return a set of frames. The first command to enabled steering starts from the reported angle `wheel_deg`."""
         profile, passed_ns = self._profile, now_ns - self.last_set_ns
         self._before = self.last_command, self.last_set_ns, self._gear_ns
         self.last_set_ns = now_ns
@@ -119,14 +121,14 @@ class FrameSender:
         for frame in dropped:
             facts = self._messages[frame.identifier, frame.is_extended]
             axes -= {axis for axis in AXES if self._profile.axes[axis].message == facts.name}
-            if len(frame.data) == facts.length:  # shorter ones have no counter
+            if len(frame.data) == facts.length:  # shorter frames have no counter
                 self._frame_counts[facts.name] -= 1
         self.last_command = _choose(axes, self.last_command, earlier_command)
         if not axes:
             self.last_set_ns = earlier_set_ns
 
     def axis_frame(self, axis: Axis, number: float, *, is_enabled: bool) -> CanFrame:
-        """Return an axis's command; `number` is in degrees of the steering wheel, or the fraction of a pedal."""
+        """Return the command to an axis; `number` is in degrees of the steering wheel, or the fraction of a pedal."""
         command = self._profile.axes[axis]
         values = {command.value: number * command.per_unit if is_enabled else 0.0, command.enable: int(is_enabled)}
         return self._frame(
@@ -139,7 +141,7 @@ class FrameSender:
         return self._frame(command.message, {command.value: command.codes[gear]}, command.checksum)
 
     def _clearing_frames(self) -> list[CanFrame]:
-        """Return the frames that clear overrides, of the length that the kit requires."""
+        """Return the frames that clear overrides; they have the length that the kit requires."""
         profile, frames = self._profile, []
         for axis in AXES:
             command = profile.axes[axis]
@@ -169,7 +171,7 @@ class FrameSender:
     def _frame(self, message: str, values: Mapping[str, float], checksum: str, length: int | None = None) -> CanFrame:
         codec = self._profile.codec
         facts, data = codec.messages[message], codec.encode(message, values, length=length)
-        if checksum:  # always the last byte: the profile's check ensures it
+        if checksum:  # it is the last byte, which the check of the profile ensures
             data = data[:-1] + bytes([frame_crc8(facts.identifier, data[:-1], extended=facts.is_extended)])
         return CanFrame(facts.identifier, data, facts.is_extended)
 

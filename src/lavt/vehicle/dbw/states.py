@@ -14,13 +14,13 @@ from lavt.vehicle.dbw.profile import AXES, COMMAND_TIMEOUT_NS, Axis, Gear
 State = Literal["idle", "clearing", "enabling", "engaged", "parking", "overridden", "lost"]
 
 STATIONARY_BELOW_MPS: Final = 0.1
-"""Our choice: below this speed the car is stationary."""
+"""Our choice: the car is stationary if it is slower than this."""
 ENABLING_LIMIT_NS: Final = 3 * NS_PER_S
-"""Our choice: clearing and enabling fail if they take longer."""
+"""Our choice: clearing fails if it takes longer than this, and so does enabling."""
 PAUSE_NS: Final = 120 * NS_PER_MS
-"""Minimum duration of `clearing` and `parking`, and of `enabling` if it is cancelled. In `clearing` no request to
+"""Shortest duration of `clearing` and `parking`, and of `enabling` if it is cancelled. In `clearing` no request to
 enable is sent, because a kit that has disengaged ignores such requests until none came for 100 ms. In `parking` a kit
-counts as disengaged only after it was commanded to disable for this long. In `enabling` a kit needs this long to report
+is surely disengaged only after it was commanded to disable for this long. In `enabling` a kit needs this long to report
 which axes it has enabled."""
 
 SENT_IN_STATE: Final[dict[State, str]] = {
@@ -40,45 +40,49 @@ SENT_IN_STATE: Final[dict[State, str]] = {
 
 
 class Situation(Struct, frozen=True):
-    """Inputs of the state machine."""
+    """The inputs of the state machine. A text is empty if there is nothing to say."""
 
     wanted: bool
-    """Driving is wanted."""
+    """Whether driving is wanted."""
     is_stationary: bool
     inhibit_reason: str
-    """Why driving cannot begin; empty: it can."""
+    """Why driving cannot begin; empty if it can."""
     missing_reports: str
     """Reports that are missing, or why the bus is gone."""
     since_sent_ns: int
     """Time since the last set of frames was sent."""
     faults: str
+    """Faults that the kit reports, an implausible speed, and another sender of commands."""
     overrides: str
+    """What the driver overrides, as the kit reports it."""
     trips: str
+    """That the kit's watchdog has tripped, as the kit reports it."""
     command_errors: str
+    """What the kit reports about late or invalid commands."""
     reasons: str
-    """Reasons that the kit reports."""
+    """The kit's reasons for a rejection."""
     enabled: frozenset[Axis]
     gear: Gear | None
     in_state_ns: int
     """Time in the current state."""
     must_stay_enabled: bool
-    """In `parking`: an axis was enabled when driving ended, and the kit was not commanded to disable it since."""
+    """Whether an axis was enabled when `parking` began, and no command to disable it has been sent since then."""
 
 
 class TransitionRow(Struct, frozen=True):
-    """A transition from any of its sources to its target; the first matching row counts.
-
-    `condition` returns whether the row matches, or the reason as a text that is empty if it does not.
-    """
+    """A row of the table of transitions. The first row whose condition is met applies."""
 
     sources: tuple[State, ...]
+    """The states in which the row applies."""
     description: str
     condition: Callable[[Situation], str | bool]
+    """Returns whether the condition is met, or why it is met (an empty text if it is not)."""
     target: State
+    """The next state."""
 
 
 def _released_axes(situation: Situation) -> str:
-    """Return a text that names the axes that are not enabled."""
+    """Return a text with the axes that are not enabled; empty if all are enabled."""
     axes = [axis for axis in AXES if axis not in situation.enabled]
     return f"the kit released {' and '.join(axes)}{_details(situation)}" if axes else ""
 
@@ -228,7 +232,7 @@ TABLE: Final[tuple[TransitionRow, ...]] = (
 
 
 def next_state(state: State, situation: Situation) -> tuple[State, str]:
-    """Return the next state and the reason; the same state and no reason if no row matches."""
+    """Return the next state and the reason; the same state and an empty reason if no row applies."""
     for row in TABLE:
         if state in row.sources and (reason := row.condition(situation)):
             return row.target, reason if isinstance(reason, str) else row.description
@@ -236,7 +240,7 @@ def next_state(state: State, situation: Situation) -> tuple[State, str]:
 
 
 def states_after(state: State, situation: Situation) -> list[tuple[State, str]]:
-    """Return the states that follow from `state` at one instant, in order, with their reasons: no state twice."""
+    """Return the states that follow `state` at this instant, in order, with their reasons; no state comes twice."""
     found: list[tuple[State, str]] = []
     visited = {state}
     while True:

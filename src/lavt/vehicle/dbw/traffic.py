@@ -1,6 +1,6 @@
 """Statistics of the traffic on a bus: each message's rate, values, changes and errors.
 
-Sans-IO and passive: it takes received frames and times and returns summaries.
+The module does no I/O and sends nothing: it takes received frames and times, and returns summaries.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from lavt.vehicle.dbw.profile import Profile
 Values = Mapping[str, float | None]
 
 MAX_UNKNOWN = 1000
-"""Unknown identifiers that are counted separately."""
+"""Largest number of unknown identifiers that are counted separately."""
 OTHER_IDENTIFIERS = (-1, False)
-"""The key under which all further unknown identifiers are counted."""
+"""The key under which frames with further unknown identifiers are counted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,15 +33,15 @@ class ExpectedMessages:
     counters: AbstractSet[str] = frozenset()
     """Names of counter signals."""
     timeouts_ns: Mapping[str, int] = field(default_factory=dict)
-    """By message name, for messages that must be received."""
+    """For the messages that must be received, the timeouts by message name."""
     short_lengths: AbstractSet[int] = frozenset()
-    """Lengths that a frame may have although its message is longer."""
+    """Lengths of frames that are right although their messages are longer."""
 
 
 def expected_traffic(profile: Profile) -> ExpectedMessages:
     """Return the messages that a profile expects on its bus.
 
-    Checksums and counters are known by the names of their signals, so they are also expected in messages that the
+    Checksums and counters are recognised by the names of their signals. So they are also expected in messages that the
     profile does not use.
     """
     axes = profile.axes.values()
@@ -60,7 +60,9 @@ class MessageSummary:
 
     facts: MessageFacts
     frames: int
+    """Number of frames since the start."""
     rate_hz: float
+    """Frames per second in the period of the summary."""
     values: Values
     """The newest values; None for a missing value."""
     changed: tuple[str, ...]
@@ -70,10 +72,11 @@ class MessageSummary:
 
 
 class BusTraffic:
-    """Statistics of a bus; `unknown` counts frames of unknown messages, by identifier and whether it has 29 bits."""
+    """Statistics of a bus."""
 
     def __init__(self, codec: Codec, expected: ExpectedMessages, *, start_ns: int) -> None:
         self.unknown: Counter[tuple[int, bool]] = Counter()
+        """Number of frames of unknown messages, by identifier and whether the identifier has 29 bits."""
         self._codec, self._expected = codec, expected
         self._start_ns = self._period_start_ns = start_ns
         self._names = {(facts.identifier, facts.is_extended): name for name, facts in codec.messages.items()}
@@ -97,10 +100,11 @@ class BusTraffic:
         if decoded is None:
             wrong.append("cannot be decoded")
         else:
-            wrong += self._counter_errors(message, decoded[1])
+            _, values = decoded
+            wrong += self._counter_errors(message, values)
             for tally in tallies:
-                tally.changed |= self._changes(message.values, decoded[1])
-            message.values = decoded[1]
+                tally.changed |= self._changes(message.values, values)
+            message.values = values
         for tally in tallies:
             tally.frames += 1
             tally.wrong.update(wrong)
@@ -155,7 +159,7 @@ class BusTraffic:
         return []
 
     def _counter_errors(self, message: _ReceivedMessage, values: Values) -> list[str]:
-        """Return an error if a frame's counter equals the one before."""
+        """Return an error if a frame's counter equals that of the frame before."""
         for name in self._expected.counters & values.keys():
             before, message.count = message.count, values[name]
             if before == message.count:
@@ -168,7 +172,7 @@ class BusTraffic:
 
 @dataclass(slots=True)
 class _Tally:
-    """Counts of a message in a period."""
+    """Statistics of a message in a period."""
 
     frames: int = 0
     longest_gap_ns: int = 0
@@ -188,7 +192,7 @@ class _ReceivedMessage:
 
 
 def signal_text(signal: SignalFacts, value: float | None) -> str:
-    """Format a signal's value; empty for a flag that is not set. `?` marks an unverified signal."""
+    """Format a signal's name and value; empty for a flag that is not set. `?` marks an unverified signal."""
     name = signal.name + "?" * signal.is_unverified
     if value is None:
         return f"{name} -"

@@ -1,4 +1,4 @@
-"""A car with a by-wire kit as a `Vehicle`: an adapter, a bus port, and a source of ground truth for a software car."""
+"""A car with a by-wire kit as a `Vehicle`: an adapter, a bus port and, for a software car, a source of ground truth."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from lavt.vehicle.can_frame import BusGone, BusPort, CanFrame
 from lavt.vehicle.vehicle import Capabilities, ReachedCommand
 
 POLL_PERIOD_NS = 10 * NS_PER_MS
-"""Period at which the bus is read; it is the period of a kit's most frequent report."""
+"""Period at which the bus is read, which is the period of a kit's most frequent report."""
 
 
 class KitAdapter(Protocol):
-    """A sans-IO controller for one kind of kit: it takes frames and times and returns frames."""
+    """A controller for one kind of kit, without I/O: it takes frames and times, and returns frames."""
 
     @property
     def counts(self) -> Mapping[str, int]:
@@ -23,7 +23,7 @@ class KitAdapter(Protocol):
 
     @property
     def is_silent(self) -> bool:
-        """Whether no commands are sent: the kit is released, or a driver overrides it."""
+        """Whether nothing is requested of the kit: it is released, or a driver overrides it."""
         ...
 
     def receive(self, frame: CanFrame, now_ns: int) -> None:
@@ -35,7 +35,7 @@ class KitAdapter(Protocol):
         ...
 
     def set_actuation(self, actuation: Actuation, now_ns: int) -> None:
-        """Set the actuation to request from now on: a tick."""
+        """Set the actuation that is requested from now on; each call is a tick."""
         ...
 
     def engage(self, wanted: bool, now_ns: int) -> None:
@@ -47,11 +47,11 @@ class KitAdapter(Protocol):
         ...
 
     def on_dropped(self, frames: Sequence[CanFrame]) -> None:
-        """Note that `frames`, which are the last ones of those that were due, were not written."""
+        """Note that `frames` were not written; they are the last ones of the frames that were due."""
         ...
 
     def next_wake_ns(self) -> int:
-        """Return the latest time for the next call: frames are due then, or a report counts as missing."""
+        """Return the time by which `frames_due` should be called next: frames are due then, or a report is missing."""
         ...
 
     def state(self) -> VehicleState:
@@ -72,7 +72,7 @@ TruthSource = Callable[[int], tuple[GroundTruth | None, list[VehicleEvent]]]
 
 
 class DbwVehicle:
-    """A `lavt.vehicle.vehicle.Vehicle` with a by-wire kit. Frames are sent only in `apply`, for its tick."""
+    """A `lavt.vehicle.vehicle.Vehicle` with a by-wire kit. Only `apply` sends frames."""
 
     def __init__(
         self,
@@ -100,7 +100,7 @@ class DbwVehicle:
 
     @property
     def is_silent(self) -> bool:
-        """Whether no commands are sent: the kit is released, or a driver overrides it."""
+        """Whether nothing is requested of the kit: it is released, or a driver overrides it."""
         return self._adapter.is_silent
 
     def advance(self, to_ns: int) -> list[VehicleEvent]:
@@ -149,7 +149,7 @@ class DbwVehicle:
         return self._newest_truth
 
     def next_wake_ns(self) -> int:
-        """Return the latest time for the next call: frames are due to be sent then, or expected from the bus."""
+        """Return the time by which `advance` should be called next."""
         port_ns = self._port.next_wake_ns()
         return min(self._adapter.next_wake_ns(), self._polled_ns + POLL_PERIOD_NS if port_ns is None else port_ns)
 

@@ -11,16 +11,18 @@ from typing import Any, Final
 from lavt.vehicle.dbw.can_gateway import gateway_interfaces
 
 VIRTUAL_INTERFACES: Final = frozenset({"inside", "virtual", "udp_multicast"})
+"""Interfaces that exist in software only."""
 RECEIVES_OWN_FRAMES: Final = "udp_multicast"
-"""This interface's socket is a member of the multicast group that it sends to. Own frames are marked, so that they can
-be recognised and dropped."""
+"""The interface whose socket receives the frames that it sends, because it is a member of its multicast group. Sent
+frames are marked, so that they can be recognised and dropped when they are received."""
 IP_TIMEOUT_S: Final = 2
+"""Time limit of the program `ip`."""
 
 
 def is_virtual(interface: str, channel: str, options: Mapping[str, Any]) -> bool:
-    """Return whether a bus exists in software only, so that no real kit can be on it; False if that is not known.
+    """Return whether a bus exists in software only, so that no real kit can be on it; False if this is not known.
 
-    A vcan that a gateway rule of the kernel names is not virtual, nor is a multicast that leaves this machine.
+    A vcan in a gateway rule of the kernel is not virtual. A multicast that leaves this machine is not virtual, either.
     """
     if interface == RECEIVES_OWN_FRAMES:
         return bool(options.get("hop_limit", 0) == 0)
@@ -38,7 +40,7 @@ def _is_forwarded(channel: str) -> bool:
 
 
 def _link_kind(channel: str) -> str:
-    """Return the kernel's name of a network interface's kind, empty if it is not known."""
+    """Return the kernel's name for the kind of a network interface; empty if the kind is not known."""
     try:
         output = subprocess.run(  # noqa: S603 (the arguments go through no shell)
             ["ip", "-details", "-json", "link", "show", "dev", channel],  # noqa: S607 (wherever the system has it)

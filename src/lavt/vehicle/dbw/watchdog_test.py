@@ -1,8 +1,8 @@
 """A test that a kit's watchdog brakes: enable the kit at standstill, stop sending, and check that it brakes.
 
-Sans-IO, like the adapter that it uses. The gear is not changed: the adapter's gear commands are left out. The kit
-passes if it reports that the brake is no longer enabled and that it brakes nevertheless, within `BRAKE_WITHIN_NS` of
-the last frame and in every report from then on.
+The test does no I/O. It commands the kit through an adapter, but leaves out the adapter's gear commands, so the gear
+does not change. The kit passes if it reports, at most `BRAKE_WITHIN_NS` after the last frame, that the brake is no
+longer enabled and that the kit brakes nevertheless. All later reports must say the same.
 """
 
 from __future__ import annotations
@@ -21,19 +21,21 @@ from lavt.vehicle.dbw.reports import Kind, NewestReports
 from lavt.vehicle.dbw.states import STATIONARY_BELOW_MPS
 
 BRAKE: Final = 0.3
-"""Requested brake while the kit is enabled."""
+"""Brake that is requested as long as the kit is enabled."""
 TICK_NS: Final = 20 * NS_PER_MS
+"""Period of the adapter's ticks."""
 OBSERVE_NS: Final = 500 * NS_PER_MS
-"""The kit is observed for this long before anything is sent: it must not brake by itself already."""
+"""The kit is observed for this long before anything is sent. During this time it must not brake on its own."""
 REPORT_LIMIT_NS: Final = 3 * NS_PER_S
-"""All reports must arrive within this time."""
+"""All reports must arrive before this time has passed."""
 ENABLED_NS: Final = 500 * NS_PER_MS
 """The kit stays enabled for this long before sending stops."""
 BRAKE_WITHIN_NS: Final = 500 * NS_PER_MS
+"""The longest time between the last frame and the first report that the kit brakes on its own."""
 MONITOR_NS: Final = NS_PER_S
 """The kit is monitored for this long after the last frame."""
 LEAST_REPORTS: Final = 10
-"""The kit must report the brake at least this often within `MONITOR_NS`; generation 2 does so 50 times."""
+"""The smallest number of brake reports during `MONITOR_NS`; generation 2 sends 50."""
 OBSERVED_KINDS: Final[tuple[Kind, ...]] = ("trip", "command_error", "fault", "reason")
 """The kinds of texts that are part of the observation."""
 
@@ -41,12 +43,12 @@ Phase = Literal["observing", "enabling", "monitoring", "done"]
 
 
 class WatchdogObservation(Struct, frozen=True):
-    """The kit's behaviour after sending stopped; times in ns after the last frame."""
+    """The kit's behaviour after sending stopped. Times are counted from the last frame."""
 
     released_ns: int
-    """The brake was reported as not enabled."""
+    """When the brake was first reported as not enabled."""
     braked_ns: int
-    """The kit was reported to brake by itself."""
+    """When the kit was first reported to brake on its own."""
     reports: int
     """Number of brake reports after the last frame."""
     kit_messages: str
@@ -54,9 +56,9 @@ class WatchdogObservation(Struct, frozen=True):
 
 
 class WatchdogTest:
-    """One run of the test. Call `receive` for each frame and `frames_due` every few milliseconds until it `is_done`.
+    """One test of a kit. Call `receive` for each frame, and `frames_due` every few milliseconds, until `is_done`.
 
-    Then `failure` is the reason why the test failed, or `observation` is the kit's behaviour.
+    If the test failed, `failure` then has the reason. Otherwise `observation` has the kit's behaviour.
     """
 
     def __init__(self, profile: Profile, watchdog: OwnBrake, *, start_ns: int) -> None:
@@ -117,7 +119,7 @@ class WatchdogTest:
         return phases[self._phase](now_ns)
 
     def _observe(self, now_ns: int) -> list[CanFrame]:
-        """Wait for all reports, and check that the kit may be enabled."""
+        """Wait for all reports, and check that the kit can be enabled."""
         passed_ns, missing = now_ns - self._phase_start_ns, self._reports.missing(now_ns)
         if missing:
             if passed_ns >= REPORT_LIMIT_NS:
@@ -194,14 +196,16 @@ class WatchdogTest:
             self._fail(f"the kit released the brake again after {(now_ns - self._braked_ns) // NS_PER_MS} ms")
 
     def _is_self_braking(self, frame: CanFrame) -> bool | None:
-        """Return whether a brake report shows that the kit brakes by itself; None for any other frame."""
+        """Return whether a brake report shows that the kit brakes on its own; None for any other frame."""
         decoded = self._profile.codec.decode(frame)
-        if decoded is None or decoded[0] != self._watchdog.message:
+        if decoded is None:
             return None
-        report = self._profile.reports[decoded[0]]
-        if report.checksum and not has_valid_checksum(frame):
+        message, values = decoded
+        if message != self._watchdog.message:
             return None
-        amount = decoded[1][self._watchdog.signal]
+        if self._profile.reports[message].checksum and not has_valid_checksum(frame):
+            return None
+        amount = values[self._watchdog.signal]
         return amount is not None and amount > self._watchdog.above
 
     def _actuation(self) -> Actuation:
