@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Literal
 
 import pytest
@@ -140,7 +139,7 @@ class CommandCheck:
         gear = self.profile.gear
         if values.get(gear.message, {}).get(gear.value) == gear.codes["park"]:
             self.parks += 1
-            assert visible_mps < PARK_BELOW_MPS, visible_mps
+            assert visible_mps < PARK_BELOW_MPS, f"PARK was requested at {visible_mps:.2f} m/s"
         amounts = {axis: self._check_axis(axis, values, made_ns) for axis in AXES}
         assert not (amounts["throttle"] and amounts["brake"])
         enabled = {axis for axis, amount in amounts.items() if amount is not None}
@@ -209,6 +208,8 @@ class Fuzzer:
         self._hostile_ns = self._unwanted_ns = self._episode_end_ns = START_NS
         """When the bus becomes hostile, when driving is no longer wanted, and when the episode ends."""
         self._actuation = Actuation(0.0, 0.0, 1.0)
+        self._stuck_throttle = 0.0
+        """The requested throttle in an episode in which all speeds become stuck."""
         self._stop_brake = 1.0
         """The requested brake while the kit is not engaged."""
         messages = self._profile.codec.messages
@@ -316,14 +317,18 @@ class Fuzzer:
         self._speed_plan = chance.choice(SPEED_PLANS)
         if self._speed_plan == "one":
             source = chance.choice(SPEED_SOURCES[self._generation])
-            kit = self._kit
-            faults = (partial(kit.stick_speed, source, 0.0), partial(kit.scale_speed, source, 0.5))
-            chance.choice((*faults, partial(kit.drop_speed, source)))()
+            faults: tuple[Callable[[], None], ...] = (
+                lambda: self._kit.stick_speed(source, 0.0),
+                lambda: self._kit.scale_speed(source, 0.5),
+                lambda: self._kit.drop_speed(source),
+            )
+            chance.choice(faults)()
         if self._speed_plan == "all from standstill":
             self._stick_speeds()
         if self._speed_plan.startswith("all"):
             self._kinds = ["lose"] * self._chance.below(2)  # others change speeds, which then seem to answer
             self._episode_end_ns = self._now_ns + STUCK_EPISODE_NS
+            self._stuck_throttle = chance.choice((0.3, 0.5, 1.0))
             if chance.below(2):
                 self._hostile_ns = self._episode_end_ns
 
@@ -421,6 +426,8 @@ class Fuzzer:
         chance, wanted = self._chance, self._now_ns < self._unwanted_ns
         if not self._vehicle.state().is_engaged:
             self._actuation = Actuation(0.0, 0.0, 0.0 if wanted and is_drawn(chance, 0.1) else self._stop_brake)
+        elif self._speed_plan.startswith("all"):
+            self._actuation = Actuation(0.0, self._stuck_throttle, 0.0)
         elif is_drawn(chance, 0.2):
             brake = chance.choice((0.0, 0.0, 0.3, 1.0, 5.0))
             self._actuation = Actuation(

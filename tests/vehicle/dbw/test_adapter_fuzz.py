@@ -9,6 +9,7 @@ from typing import Literal, get_args
 import pytest
 from tests.vehicle.dbw.fuzzer import run_ticks
 
+from lavt.vehicle.dbw import speed_monitor
 from lavt.vehicle.dbw.states import State
 
 QUICK_SEEDS, FULL_SEEDS = 4, 25
@@ -29,6 +30,13 @@ def test_the_vehicle_keeps_its_invariants(generation: Literal[1, 2], seeds: int)
     for seed in range(seeds):
         states += run_ticks(generation, seed, TICKS).states
     assert set(states) == set(get_args(State))
+
+
+def test_a_request_for_park_while_the_car_moves_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """If a weak brake counted as a strong one, the fuzzer would find that PARK is requested while the car moves."""
+    monkeypatch.setattr(speed_monitor, "SURE_BRAKE_SHARE", 1.0)
+    with pytest.raises(AssertionError, match="PARK was requested at 0"):
+        run_ticks(1, 102, 3000)
 
 
 @pytest.mark.parametrize("generation", [1, 2])
