@@ -43,7 +43,7 @@ def stalls(request: pytest.FixtureRequest) -> Stalls:
         host = HostProbe(SERIAL_LINE)
         measured = Stalls([host, ProbeProcess(0, "of the first machine")], host.processor_times)
     else:
-        measured = Stalls.measured()
+        measured = Stalls.start_probes()
     request.config.stash[SESSION].stalls = measured
     return measured
 

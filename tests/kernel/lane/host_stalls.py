@@ -31,7 +31,7 @@ it any more."""
 
 def serve() -> None:
     """Answer each byte on standard input with one line, until the end of input."""
-    stalls = Stalls.measured()
+    stalls = Stalls.start_probes()
     try:
         while os.read(0, 1):
             sys.stdout.write(json.dumps(_query(stalls)) + "\n")
