@@ -126,13 +126,13 @@ class Arrivals:
         return [packet.delay_ms for packet in self.arrived]
 
     @property
-    def in_order_of_sending_ms(self) -> list[float]:
+    def delays_in_sending_order_ms(self) -> list[float]:
         """Delays in the order of sending."""
         return [packet.delay_ms for packet in sorted(self.arrived)]
 
     @property
     def inversions(self) -> int:
-        """How many packets arrived directly after a packet that was sent later."""
+        """The number of packets that arrived directly after a packet that was sent later."""
         return sum(later < earlier for earlier, later in zip(self.numbers, self.numbers[1:], strict=False))
 
 
@@ -211,7 +211,7 @@ class _FlowSockets:
 def _bound(family: int, kind: int, address: str, port: int) -> socket.socket:
     sock = socket.socket(family, kind)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    if kind == socket.SOCK_STREAM:  # close without TIME_WAIT: the ports are used again
+    if kind == socket.SOCK_STREAM:  # close without TIME_WAIT, because the next flow may use the same port
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
     sock.bind((address, port))
     return sock

@@ -17,7 +17,7 @@ CALIBRATION_S = 0.2
 ADJ_FREQUENCY, ADJ_STATUS, ADJ_SETOFFSET, ADJ_NANO, ADJ_TICK = 0x2, 0x10, 0x100, 0x2000, 0x4000
 STA_UNSYNC = 0x40
 TICK_US = 10_000
-"""The kernel's default tick: the clock runs at its nominal rate."""
+"""The kernel's default tick, with which the clock runs at its nominal rate."""
 UNITS_PER_PPM = 65_536
 """The kernel's unit of frequency is 2^-16 ppm."""
 
@@ -126,7 +126,7 @@ def _adjtimex(change: Timex) -> None:
 
 @cache
 def _rdtsc() -> tuple[mmap.mmap, Callable[[], int]]:
-    """Put the instructions into executable memory; the memory must live as long as the function."""
+    """Put `RDTSC` into executable memory; return the memory, which must stay alive, and the function."""
     memory = mmap.mmap(-1, mmap.PAGESIZE, prot=mmap.PROT_READ | mmap.PROT_WRITE | mmap.PROT_EXEC)
     memory.write(RDTSC)
     address = ctypes.addressof(ctypes.c_char.from_buffer(memory))
