@@ -4,13 +4,13 @@ Without NAT both ends have public addresses:
 
     vehicle 203.0.113.2 ── internet ── 198.51.100.2 operator
 
-With NAT there is a home router at each end. The internet has no route to the networks behind them. They let through
-only connections from inside and the ports that a test forwards:
+With NAT there is a home router at each end. The internet has no route to the networks behind the home routers. These
+let through only connections from inside and the ports that a test forwards:
 
     vehicle 192.168.1.2 ── vehicle-nat 203.0.113.2 ── internet ── 198.51.100.2 operator-nat ── 192.168.2.2 operator
 
 All are network namespaces of one kernel, and so have one clock. Their names contain the process id of the test. If a
-test was killed, the next test finds its namespaces by this id and removes them.
+test was killed, the next test finds the namespaces that it left by this id and removes them.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def programs_missing() -> bool:
 
 
 def kernel_lacks_namespaces() -> bool:
-    """Return whether this process may not make network namespaces, or they have no NAT (not checked without nft)."""
+    """Return whether network namespaces cannot be made here, or have no NAT (not checked if nft is missing)."""
     if os.geteuid() != 0 or not _works("unshare", "--net", "true"):
         return True
     return shutil.which("nft") is not None and not _works("unshare", "--net", "nft", "; ".join(NAT_RULES[:3]))
@@ -145,7 +145,7 @@ class Field:
         self.run(part, "ip", "route", "add", "default", "via", router)
 
     def _join(self, end: End, router: End) -> None:
-        """Link two namespaces; the second is the default route of the first."""
+        """Link two namespaces; `router` is the default route of `end`."""
         devices = [f"{link_end.device} netns {self.name(link_end.part)}" for link_end in (end, router)]
         command(f"ip link add {devices[0]} type veth peer name {devices[1]}")
         for link_end in (end, router):

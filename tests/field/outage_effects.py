@@ -1,10 +1,12 @@
 """Measure the effects of outages from the records of the server and of the observer (`command_observer.py`).
 
 A command is stale if, since the command or its picture was sent, the vehicle has begun a safe stop or its server was
-restarted. A command that was sent more than 500 ms before it arrived is also stale. The observer reads send times and
-stamps, and knows when a command arrived at the vehicle's machine; all processes read the clocks of one kernel. The
-server's records say when the vehicle stopped and which commands it accepted. A busy router may drop a command for one
-of its subscribers, so the few accepted commands that the observer missed are judged by the server's record of them.
+restarted. A command that was sent more than 500 ms before it arrived is also stale.
+
+The observer records each command's send time, stamp and arrival at the vehicle's machine; all processes read the
+clocks of one kernel. The server's records say when the vehicle stopped and which commands were accepted. A busy router
+can drop a command for one of its subscribers. So the observer misses a few accepted commands; for these, the server's
+record gives send time, stamp and arrival.
 """
 
 from __future__ import annotations
@@ -50,7 +52,7 @@ class ReceivedCommand:
 
 @dataclass(frozen=True)
 class AcceptedCommand:
-    """A command that the server accepted; it is fresh if its picture is newer than those of all earlier commands."""
+    """A command that the server accepted; `fresh`: its picture is newer than the pictures of all earlier commands."""
 
     command: ReceivedCommand
     fresh: bool
@@ -84,8 +86,8 @@ class OutageEffects:
 def measure(drive: Drive) -> list[OutageEffects]:
     """Measure the effects of all outages of a drive that has ended."""
     evidence = _Evidence(drive)
-    begins_ns = [outage.begin.mono_ns for outage in drive.outages] + [END_OF_TIME_NS]
-    return [evidence.measure(outage, until) for outage, until in zip(drive.outages, begins_ns[1:], strict=True)]
+    ends_ns = [outage.begin.mono_ns for outage in drive.outages[1:]] + [END_OF_TIME_NS]
+    return [evidence.measure(outage, until_ns) for outage, until_ns in zip(drive.outages, ends_ns, strict=True)]
 
 
 class _Evidence:
@@ -187,12 +189,12 @@ def _since(begin_ns: int, transition: Transition | None) -> float | None:
     return None if transition is None else (transition.at.mono_ns - begin_ns) / NS_PER_S
 
 
-def effects_table(rows: Sequence[OutageEffects]) -> str:
+def effects_table(effects: Sequence[OutageEffects]) -> str:
     """Return the effects of outages as a Markdown table; times in seconds."""
     lines = [f"| {' | '.join(COLUMNS)} |", "|---" * len(COLUMNS) + "|"]
-    for row in rows:
-        times = (row.to_degraded_s, row.to_safe_stop_s, row.to_standstill_s, row.to_driving_s)
-        counts = (row.observed, row.stale_observed, row.accepted, row.stale_accepted)
-        cells = [row.outage.name, *("–" if time is None else f"{time:.2f}" for time in times), *map(str, counts)]
+    for effect in effects:
+        times = (effect.to_degraded_s, effect.to_safe_stop_s, effect.to_standstill_s, effect.to_driving_s)
+        counts = (effect.observed, effect.stale_observed, effect.accepted, effect.stale_accepted)
+        cells = [effect.outage.name, *("–" if time is None else f"{time:.2f}" for time in times), *map(str, counts)]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)

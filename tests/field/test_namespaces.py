@@ -54,7 +54,7 @@ def test_an_outage_has_a_direction() -> None:
 
 
 def test_namespaces_of_a_killed_test_are_removed() -> None:
-    """The namespaces of a test whose process has ended are removed with their processes, and no others."""
+    """The namespaces of a test whose process has ended are removed with their processes; other namespaces remain."""
     ended_test = subprocess.Popen(["true"])
     ended_test.wait()
     stale_field = Field(ended_test.pid)
