@@ -35,7 +35,7 @@ END_LIMIT_S = 5.0
 
 COMMAND = Command(1, 2**40, 0, 0, 0, 0.1, 1.0, 0.0, (0.0,) * PATH_POINTS, "drive", 0)
 PREFIXES = (b"", b"\x80\x60", b"\x80\xc9\x00\x01", b"\x81\xce\x00\x02", b"LAVT\x01\x03")
-"""Nothing, and the first bytes of RTP, a receiver report, a picture-loss indication and a hello."""
+"""First bytes of datagrams: none, or those of RTP, a receiver report, a picture-loss indication or a hello."""
 REQUEST = SessionRequest("acquire", "stranger", 7, 0)
 
 
@@ -174,7 +174,7 @@ def total_count(record: Record, name: str) -> int:
 def test_a_drive_continues_under_attack(attacked: SimpleNamespace, stalls: Stalls) -> None:
     """During 6000 random datagrams per port and garbage at 200 Hz on all keys, the drive continues.
 
-    At least half of the pictures lead to a command, which leaves room for other load on the machine.
+    Only half of the pictures must lead to a command, which leaves room for other load on the machine.
     """
     admissions = attacked.server.table("admission")
     accepted = admissions.where(np.array(admissions.texts("verdict")) == "accepted")
@@ -203,7 +203,7 @@ def test_no_message_of_a_stranger_is_accepted(attacked: SimpleNamespace) -> None
 
 
 def test_strangers_do_not_damage_pictures(attacked: SimpleNamespace, stalls: Stalls) -> None:
-    """Datagrams of strangers at the client's video port cause no lost or doubtful pictures."""
+    """Under attack more than 99 % of the pictures are readable, and fewer than 5 % are in doubt."""
     pictures = attacked.client.table("picture")
     at_ns = pictures.ints("read_mono_ns")
     during_attack = pictures.where((at_ns > attacked.began_ns) & (at_ns < attacked.ended_ns))
@@ -218,13 +218,15 @@ def test_rejected_messages_are_counted_in_the_record(attacked: SimpleNamespace, 
     server, client = attacked.server, attacked.client
     node_counters = ("feedback_from_strangers", "path_malformed", "path_wrong_token", "probes_rejected")
     at_server = sum(total_count(server, name) for name in (*node_counters, "datagrams_screened_out"))
-    netem = total_count(server, "netem_requests_unreadable") + total_count(server, "netem_requests_screened_out")
+    rejected_netem_requests = total_count(server, "netem_requests_unreadable") + total_count(
+        server, "netem_requests_screened_out"
+    )
     with stalls.excusing_failures(attacked.began_ns, attacked.ended_ns):  # the sockets of a stalled side overflow
         assert at_server > 0.9 * 2 * DATAGRAMS
         assert total_count(client, "datagrams_from_strangers") > 0.9 * 2 * DATAGRAMS
         assert total_count(server, "commands_unreadable") > 0.3 * ROUNDS * GARBAGE_PER_ROUND
         assert total_count(server, "session_requests_unreadable") > 0.3 * ROUNDS * GARBAGE_PER_ROUND
-        assert netem > 0.9 * ROUNDS * GARBAGE_PER_ROUND
+        assert rejected_netem_requests > 0.9 * ROUNDS * GARBAGE_PER_ROUND
 
 
 def test_no_stranger_gets_video(attacked: SimpleNamespace) -> None:

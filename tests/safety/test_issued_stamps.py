@@ -72,7 +72,7 @@ def test_only_the_last_5_s_are_kept(frames: list[tuple[int, int]]) -> None:
 
 
 def test_five_equal_pictures_are_frozen() -> None:
-    """The camera is frozen from the fifth equal picture in a row until a different one, and never while they alternate."""
+    """From the fifth equal picture in a row until a different one, pictures are frozen; alternating ones never are."""
     stamps = IssuedStamps(MEMORY_NS, 5)
     frozen = []
     for number, crc in enumerate([7, 7, 7, 7, 7, 7, 8, 8, 7, 8, 7, 8, 7]):
