@@ -173,7 +173,7 @@ class SoftwareCarProcess:
         return self.stalls.verdict(message, since_ns, until_ns, stall_ms=self.stall_ms)
 
     def wait_for_watchdog_ms(self, since_ns: int, *, tolerance_ms: float = TOLERANCE_MS) -> float:
-        """Wait until the watchdog brakes, check that it is in time, and return the time since `since_ns` in ms."""
+        """Wait until the watchdog brakes, check that it brakes in time, and return the time since `since_ns` in ms."""
         at_ns = self.wait("watchdog", "watchdog brakes: no command in time", since_ns=since_ns)
         took_ms, limit_ms = ms_since(at_ns, since_ns), KIT_TIMEOUT_MS + tolerance_ms
         if took_ms >= limit_ms:

@@ -34,7 +34,7 @@ COMMAND_TIMEOUT_MS = 500
 """The server stops the car this long after the last command."""
 STATIONARY_MPS = 0.05
 BUSY_S = 0.8
-"""An actuator that spins uses more processor time in a second; one that waits uses a fifth of this."""
+"""An actuator that spins uses more processor time than this in a second; one that waits uses a fifth of this."""
 PARKING_STALL_MS = 135
 """Time for which the actuator is suspended while it parks the car."""
 PARKING_LIMIT_MS = 6000

@@ -41,10 +41,10 @@ SHORT_S = 0.3
 LONG_S = (1.0, 3.0)
 """Shorter and longer than the routers' lease of 2 s."""
 RESTART_AFTER_S = 3.0
-"""Time from the end of a process to its restart, and the duration of a suspension."""
+"""Time from the end of a process to its restart, and the time for which the client is frozen."""
 SPEED_MPS = 5.0
 LOAD_MARGIN_S = 0.15
-"""The delay that other programs may add to a single measured time."""
+"""The delay that other programs can add to a single measured time."""
 MEDIAN_MARGIN_S = 0.03
 STALL_LOOKBACK_S = 0.5
 """If the vehicle is degraded when an outage begins, a stall in this time before the outage explains it."""
@@ -202,7 +202,7 @@ def test_most_outages_of_300_ms_cause_no_stop(all_outages: OutageDriveResult, st
 
 @pytest.mark.parametrize("outage", [*STOPPING_OUTAGES, SERVER_KILLED])
 def test_the_drive_recovers_by_itself(all_outages: OutageDriveResult, stalls: Stalls, outage: str) -> None:
-    """After an outage a client that may arm again drives again within 10 s."""
+    """After an outage a client with the permission to arm again drives the vehicle again within 10 s."""
     effect = all_outages.effects[outage]
 
     assert effect.to_driving_s is not None
@@ -213,7 +213,7 @@ def test_the_drive_recovers_by_itself(all_outages: OutageDriveResult, stalls: St
 
 
 def test_the_median_recovery_is_short(all_outages: OutageDriveResult, stalls: Stalls) -> None:
-    """In the median the vehicle is driven again within 3 s of an outage's end, of which arming takes one."""
+    """In the median the vehicle is driven again within 3 s of an outage's end; arming takes 1 s of this."""
     effects = [all_outages.effects[outage] for outage in (*STOPPING_OUTAGES, SERVER_KILLED)]
 
     with stalls.excusing_failures(begin_ns(effects[0]), begin_ns(effects[-1], RECOVERY_S), share=BUSY_SHARE):

@@ -1,4 +1,4 @@
-"""A vehicle and an operator, each behind a NAT of its own, and a router in the cloud that both dial.
+"""A vehicle and an operator, each behind a NAT of its own, and a router in the cloud that both ends dial.
 
 Commands, states and session requests go through the cloud. Video and clock probe take one of two paths: directly, with
 two UDP ports that the vehicle's NAT forwards (the client sends first, so its own NAT needs no setting); or, without
@@ -80,7 +80,7 @@ class AddressChangeDrive:
     server: Record
     client: Record
     sent_to_old_until_change: int
-    """Video packets to the old address until it changed."""
+    """Video packets to the old address until the change."""
     sent_to_old_after_3_s: int
     """Video packets to the old address until 3 s after the change."""
     sent_to_old: int

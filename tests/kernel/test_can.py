@@ -268,7 +268,7 @@ def test_lost_bus_stops_the_car(lab: CanLab, report_measurement: ReportMeasureme
 
 
 def test_silent_kit_stops_the_drive(lab: CanLab, report_measurement: ReportMeasurement) -> None:
-    """A kit in bus-off brakes by its watchdog, and the server, without reports, makes a safe stop with the reason."""
+    """A kit in bus-off brakes by its watchdog, and the server makes a safe stop; then the kit stays disengaged."""
     with lab.driving("dataspeed_gen1") as active_drive:
         since_ns = active_drive.car.execute("bus_off")
         took_ms = active_drive.car.wait_for_watchdog_ms(since_ns)

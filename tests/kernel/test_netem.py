@@ -115,7 +115,7 @@ def qdiscs(side: str) -> Any:
 def test_each_condition_delays_only_video_and_control(
     baseline: dict[str, float], sides: dict[str, NetemInterface]
 ) -> None:
-    """Under L0 to L5 the medians of video and control shift by the requested delay, and no others, within 1 ms."""
+    """Under L0 to L5 the medians of only video and control shift, by the requested delay, within 1 ms."""
     shifts_ms = {}
     for name in CONDITIONS:
         apply_condition(sides, name)

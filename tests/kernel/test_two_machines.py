@@ -164,7 +164,7 @@ def test_each_condition_shifts_latencies_by_its_delay(
 def test_delta_is_true_while_the_server_clock_is_slewed(
     drive: DriveOnce, truth: TrueOffsetSamples, server_machine: Machine, client_machine: Machine
 ) -> None:
-    """While chrony slews the server's clock towards a third one, Delta is within its bound and 1 ms of the truth."""
+    """While chrony slews the server's clock towards a third clock, Delta is within its bound and 1 ms of the truth."""
     server_machine.start_python(
         "tests.kernel.lane.ntp_server", "127.0.0.1", str(NTP_PORT), str(400 * NS_PER_MS), "20"
     ).first_line()

@@ -70,7 +70,7 @@ class Rig:
         self.gate.watchdog.check_timeouts(end_ns)
 
     def take_picture(self, crc: int | None = None, *, captured_ns: int | None = None) -> int:
-        """Issue the stamp of a new picture and return it; the camera reports `captured_ns`."""
+        """Issue the stamp of a new picture and return the stamp; the camera reports `captured_ns`."""
         self.frame += 1
         self.stamp_ns = WALL_NS + self.now_ns + self.wall_step_ns
         crc = self.frame if crc is None else crc
@@ -79,6 +79,7 @@ class Rig:
         return self.stamp_ns
 
     def request(self, operation: Operation, who: str = "alice", instance: int = 1, number: int = 0) -> SessionReply:
+        """Send a session request; an epoch that alice gets is that of later commands."""
         reply = self.gate.session.answer(SessionRequest(operation, who, instance, number), self.vehicle, self.now_ns)
         if who == "alice" and reply.epoch:
             self.epoch = reply.epoch

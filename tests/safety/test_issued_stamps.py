@@ -43,7 +43,7 @@ def test_a_stamp_issued_twice_belongs_to_the_newer_frame() -> None:
 def test_capture_time() -> None:
     """The capture time is the camera's, but never later than the issue; equal pictures have the first one's.
 
-    If the camera reports no capture time, it is the time of issue.
+    If the camera reports no capture time, the time of issue is used.
     """
     stamps = IssuedStamps(MEMORY_NS, 5)
     # Stamp, time of issue, checksum, capture time.

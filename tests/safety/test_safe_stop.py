@@ -101,7 +101,7 @@ def test_a_safe_stop_under_delay_stays_in_the_lane() -> None:
 
 
 def test_with_old_pictures_the_car_drives_slower() -> None:
-    """At 0.9 s of delay the car drives at its stopping speed limit within 0.1 m/s, more slowly than 30 km/h."""
+    """At 0.9 s of delay the car drives at its stopping speed limit, which is lower than 30 km/h, within 0.1 m/s."""
     config = {
         "vehicle": {"route": "straight"},
         "network": {"inherent": "paper_wifi5", "condition": "L0", "video": {"delay_ms": 900.0}},

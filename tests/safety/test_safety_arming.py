@@ -321,7 +321,7 @@ def test_a_repeated_emergency_stop_is_not_counted_as_a_replay() -> None:
 
 
 def test_only_the_active_operator_clears_an_emergency_stop() -> None:
-    """Only the active operator clears an emergency stop, at standstill and by its number."""
+    """Only the active operator can clear an emergency stop, and only at standstill and with the number of that stop."""
     rig = Rig().start_driving()
     rig.request("emergency_stop", "bob", 2, number=8)
     rig.vehicle = vehicle_at(1.0)
@@ -338,7 +338,7 @@ def test_only_the_active_operator_clears_an_emergency_stop() -> None:
 
 
 def test_an_emergency_stop_must_be_cleared_before_arming() -> None:
-    """An emergency stop must be cleared before arming, and arming takes its second afterwards."""
+    """An emergency stop must be cleared before arming, and arming takes a full second after that."""
     rig = Rig().start_driving()
     rig.request("emergency_stop", number=8)
     rig.request("acquire")

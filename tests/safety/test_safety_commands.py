@@ -32,7 +32,7 @@ def test_a_valid_command_is_accepted_unchanged() -> None:
 
 
 def test_a_rejected_command_has_a_reason_and_is_counted() -> None:
-    """A rejected command has a reason, is counted under it, and does not replace the last command."""
+    """A rejected command has a reason, is counted under that reason, and does not replace the last command."""
     rig = Rig().start_driving(throttle=0.25)
     now_ns = rig.now_ns
     newest_stamp_ns = rig.stamp_ns
@@ -188,7 +188,7 @@ def test_a_step_of_the_wall_clock_changes_nothing(step_ns: int) -> None:
 
 
 def test_degraded_removes_the_throttle_and_brakes_gently() -> None:
-    """Degraded means no throttle and 1 m/s2 of braking; a fresh command ends it."""
+    """A degraded vehicle has no throttle and brakes with 1 m/s2; a fresh command ends this state."""
     rig = Rig().start_driving(steering_rad=0.0, throttle=1.0)
     rig.vehicle = vehicle_at(8.0)
     rig.pass_time(DEGRADED_NS)
@@ -230,7 +230,7 @@ def test_degraded_accepts_no_command_from_a_picture_already_used() -> None:
 
 
 def test_safe_stop_is_latched_under_a_new_epoch() -> None:
-    """A safe stop brakes with 4 m/s2 under a new epoch; only arming ends it."""
+    """A safe stop brakes with 4 m/s2 under a new epoch; only arming ends the stop."""
     rig = Rig().start_driving()
     rig.vehicle = vehicle_at(8.0)
     rig.pass_time(STOP_NS)
@@ -254,7 +254,7 @@ def test_safe_stop_is_latched_under_a_new_epoch() -> None:
 
 
 def test_nothing_queued_in_an_outage_is_accepted_after_it() -> None:
-    """The commands that were sent in an outage of 3 s, and arrive in one burst after it, are all rejected."""
+    """The commands that were sent in an outage of 3 s, and arrive in one burst after the outage, are all rejected."""
     rig = Rig().start_driving()
     queued = []
     for _ in range(150):

@@ -23,7 +23,7 @@ def function_names(path: Path) -> set[str]:
 
 
 def test_the_page_is_up_to_date() -> None:
-    """docs/safety.md is as `python docs/draw_safety.py` generates it, and has all generated blocks."""
+    """docs/safety.md is what `python docs/draw_safety.py` generates, and has all generated blocks."""
     assert draw_page(PAGE) == PAGE, "docs/safety.md is outdated: run `python docs/draw_safety.py`"
     assert set(re.findall(r"<!-- drawn: ([a-z ]+) -->", PAGE)) == set(DRAWINGS)
 

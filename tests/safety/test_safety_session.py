@@ -59,7 +59,7 @@ def test_acquiring_control_again_changes_nothing() -> None:
 
 @pytest.mark.parametrize("other", [("bob", 1), ("alice", 2)])
 def test_a_second_client_is_rejected_while_the_vehicle_is_armed_or_moves(other: tuple[str, int]) -> None:
-    """While the vehicle is active or moves, no other client or instance acquires control."""
+    """While the vehicle is arming, driven or moving, no other client or instance acquires control."""
     rig = Rig().acquire()
 
     def is_rejected() -> bool:
@@ -193,7 +193,7 @@ def test_with_consent_the_vehicle_stops_and_is_reserved_for_the_requester() -> N
 
 
 def test_a_new_active_operator_arms_at_standstill() -> None:
-    """A client that took over a moving vehicle arms it only at standstill, in 1 s."""
+    """A client that took over a moving vehicle can arm it only at standstill, which takes 1 s."""
     rig = Rig().start_driving()
     rig.vehicle = vehicle_at(5.0)
     rig.request("request_handover", "bob", 7)

@@ -1,4 +1,4 @@
-"""The record of times when the host stalled this machine, and verdicts on timing that use it.
+"""The record of times when the host stalled this machine, and verdicts on timing that use this record.
 
 A test of real time can fail because a program is too slow, or because the host (the hypervisor) did not run this
 machine. One probe for each processor (`lateness_probe.py`) distinguishes the two cases. No program of LAVT can delay a
@@ -31,7 +31,7 @@ PROBE = Path(__file__).with_name("lateness_probe.py")
 STALL_MS = 30.0
 """The shortest stall that excuses a failure, unless an assertion names another length."""
 LONG_STALL_MS = 100.0
-"""A stall this long can make a drive leave its lane or lose its driver: commands time out after 300 ms."""
+"""A stall this long can make the car leave its lane, or can cause a command timeout, which comes after 300 ms."""
 BUSY_SHARE = 0.05
 """If this share of a drive or more is stalled, the medians of the drive's latencies change."""
 SLOW_SHARE = 0.15
@@ -316,7 +316,7 @@ class SharedResult(Generic[Result]):
         self._attempts_left, self._excused = MAX_ATTEMPTS, 0
 
     def get(self) -> Result:
-        """Return the result; make it first, or again if a failure was excused since it was made.
+        """Return the result; make it if there is none yet, or if a failure was excused since the last one was made.
 
         If `make` fails and no stall explains this, the failure is raised for every test.
         """

@@ -152,7 +152,7 @@ def local_machine(name: str, address: str) -> Machine:
 
 
 def remote_machine(name: str, address: str, management_address: str, key: bytes) -> Machine:
-    """Return the machine whose agent listens at the management address; the machine may still be booting."""
+    """Return the machine whose agent listens at the management address; wait while the machine is still booting."""
     connections: list[Connection] = []
 
     def is_reachable() -> bool:

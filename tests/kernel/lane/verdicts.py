@@ -24,7 +24,7 @@ from lavt.experiment.analysis.invalid_reason import InvalidCode
 from lavt.experiment.analysis.metrics import driving_interval
 
 MARGIN_MS = 60
-"""A stall may be this much shorter than the timeout that it causes: one period of the kit's commands or reports, and
+"""A stall can be this much shorter than the timeout that it causes: one period of the kit's commands or reports, and
 two more periods on a slow machine."""
 KIT_STALL_MS = KIT_TIMEOUT_MS - MARGIN_MS
 UNSAMPLED_STALL_MS = 1500
