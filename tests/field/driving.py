@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from tests.field.namespaces import INTERNET, VEHICLE, Direction, Field
+from tests.field.namespaces import INTERNET, VEHICLE, Direction, FieldNetworks
 
 from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
@@ -108,7 +108,7 @@ class Outage:
 class Drive:
     """The processes of a loop, and the outages that the test has caused; test and processes read the same clocks."""
 
-    networks: Field
+    networks: FieldNetworks
     processes: Processes
     work: Path
     links: Links = MIXED
@@ -205,7 +205,7 @@ class Drive:
 
 @contextmanager
 def running_loop(
-    networks: Field, work: Path, links: Links = MIXED, server_program: tuple[str, ...] = LAVT
+    networks: FieldNetworks, work: Path, links: Links = MIXED, server_program: tuple[str, ...] = LAVT
 ) -> Iterator[Drive]:
     """Run a loop in these networks."""
     with Processes(work) as processes:

@@ -84,7 +84,7 @@ class End:
 
 
 @dataclass(frozen=True)
-class Field:
+class FieldNetworks:
     """The network namespaces of a test process; `part` is a name in the drawing above."""
 
     owner_pid: int
@@ -171,7 +171,7 @@ OPERATOR_UPLINK_ROUTER = End("internet", "operator", INTERNET)
 
 
 @contextmanager
-def plain_field() -> Iterator[Field]:
+def plain_field() -> Iterator[FieldNetworks]:
     """Make the networks without NAT."""
     with _field("vehicle", "internet", "operator") as field:
         field._join(End("vehicle", "internet", VEHICLE), VEHICLE_UPLINK_ROUTER)
@@ -180,7 +180,7 @@ def plain_field() -> Iterator[Field]:
 
 
 @contextmanager
-def nat_field() -> Iterator[Field]:
+def nat_field() -> Iterator[FieldNetworks]:
     """Make the networks with NAT at both ends."""
     with _field("vehicle", "vehicle-nat", "internet", "operator-nat", "operator") as field:
         field._join(End("vehicle-nat", "internet", VEHICLE), VEHICLE_UPLINK_ROUTER)
@@ -193,9 +193,9 @@ def nat_field() -> Iterator[Field]:
 
 
 @contextmanager
-def _field(*parts: str) -> Iterator[Field]:
+def _field(*parts: str) -> Iterator[FieldNetworks]:
     remove_stale_namespaces()
-    field = Field(os.getpid())
+    field = FieldNetworks(os.getpid())
     try:
         field._make(*parts)
         field.run("internet", "nft", "; ".join(INTERNET_RULES))

@@ -96,11 +96,11 @@ class _Evidence:
     def __init__(self, drive: Drive) -> None:
         records = drive.records("server")
         self.transitions = [transition for record in records for transition in transitions(record)]
-        self.accepted = [command for record in records for command in _accepted(record)]
+        self.accepted = [command for record in records for command in _accepted_commands(record)]
         truths = [record.table("truth") for record in records]
         self.truth_ns: IntArray = np.concatenate([truth.ints("mono_ns") for truth in truths])
         self.speed_mps: FloatArray = np.concatenate([truth.floats("speed_mps") for truth in truths])
-        self.observed = {command.command_id: command for command in map(_observed, drive.observed_commands())}
+        self.observed = {command.command_id: command for command in map(_parse_observed, drive.observed_commands())}
         stops = [transition.at for transition in self.transitions if transition.after == "safe_stop"]
         restarts = [_first_time(record) for record in records[1:]]
         self.stops = sorted([*stops, *restarts], key=lambda stop: stop.mono_ns)
@@ -119,10 +119,10 @@ class _Evidence:
         ]
         return OutageEffects(
             outage,
-            _since(begin_ns, degraded),
-            _since(begin_ns, stop),
+            _delay_s(begin_ns, degraded),
+            _delay_s(begin_ns, stop),
             None if stationary_since_ns is None else (stationary_since_ns - begin_ns) / NS_PER_S,
-            _since(outage.end.mono_ns, driving),
+            _delay_s(outage.end.mono_ns, driving),
             None if left_driving is None else self._since_fresh_command_s(left_driving),
             None if stop is None else self._since_fresh_command_s(stop),
             None if stop is None or stationary_since_ns is None else (stationary_since_ns - stop.at.mono_ns) / NS_PER_S,
@@ -162,7 +162,7 @@ def transitions(record: Record) -> Iterator[Transition]:
             yield Transition(Now(int(mono_ns), int(wall_ns)), before, after)
 
 
-def _accepted(record: Record) -> Iterator[AcceptedCommand]:
+def _accepted_commands(record: Record) -> Iterator[AcceptedCommand]:
     admissions = record.table("admission")
     commands = admissions.where(np.array(admissions.texts("verdict")) == "accepted")
     stamps_ns = commands.ints("stamp_ns")
@@ -175,7 +175,7 @@ def _accepted(record: Record) -> Iterator[AcceptedCommand]:
         yield AcceptedCommand(command, bool(is_fresh))
 
 
-def _observed(line: Mapping[str, Any]) -> ReceivedCommand:
+def _parse_observed(line: Mapping[str, Any]) -> ReceivedCommand:
     at = Now(line["mono_ns"], line["wall_ns"])
     return ReceivedCommand((line["epoch"], line["sequence"]), line["sent_wall_ns"], line["stamp_ns"], at)
 
@@ -185,7 +185,7 @@ def _first_time(record: Record) -> Now:
     return Now(int(truth.mono_ns[0]), int(truth.wall_ns[0]))
 
 
-def _since(begin_ns: int, transition: Transition | None) -> float | None:
+def _delay_s(begin_ns: int, transition: Transition | None) -> float | None:
     return None if transition is None else (transition.at.mono_ns - begin_ns) / NS_PER_S
 
 

@@ -155,7 +155,7 @@ def cloud_site(keys: Path) -> Iterator[Site]:
 
 @pytest.fixture(params=["direct_site", "cloud_site"])
 def site(request: pytest.FixtureRequest) -> Site:
-    """Return each kind of site in turn, without the messages of earlier tests."""
+    """Return each kind of site in turn; the messages of earlier tests are forgotten."""
     site: Site = request.getfixturevalue(request.param)
     for messages in (
         site.vehicle.commands,

@@ -15,7 +15,7 @@ from statistics import median
 import numpy as np
 import pytest
 from tests.field.driving import TCP, Drive, running_loop
-from tests.field.namespaces import Direction, Field, plain_field
+from tests.field.namespaces import Direction, FieldNetworks, plain_field
 from tests.field.outage_effects import OutageEffects, effects_table, measure
 from tests.support.stalls import BUSY_SHARE, LONG_STALL_MS, Stalls
 
@@ -88,7 +88,7 @@ def begin_ns(effect: OutageEffects, after_s: float = 0.0) -> int:
 
 
 @pytest.fixture(scope="module")
-def field(namespaces: None) -> Iterator[Field]:  # noqa: ARG001 (skips)
+def field(namespaces: None) -> Iterator[FieldNetworks]:  # noqa: ARG001 (skips)
     with plain_field() as field:
         yield field
 
@@ -109,7 +109,9 @@ def measure_and_print(drive: Drive, work: Path, print_report: PrintReport, title
 
 
 @pytest.fixture(scope="module")
-def all_outages(field: Field, tmp_path_factory: pytest.TempPathFactory, print_report: PrintReport) -> OutageDriveResult:
+def all_outages(
+    field: FieldNetworks, tmp_path_factory: pytest.TempPathFactory, print_report: PrintReport
+) -> OutageDriveResult:
     """Drive through all outages in turn, the killed server last."""
     work = tmp_path_factory.mktemp("outages")
     with running_loop(field, work) as drive:
@@ -126,7 +128,7 @@ def all_outages(field: Field, tmp_path_factory: pytest.TempPathFactory, print_re
 
 
 def drive_with_buffering_link(
-    field: Field, work: Path, print_report: PrintReport, title: str, program: tuple[str, ...]
+    field: FieldNetworks, work: Path, print_report: PrintReport, title: str, program: tuple[str, ...]
 ) -> OutageDriveResult:
     with running_loop(field, work, TCP, program) as drive:
         cause_network_outages(drive, BUFFERED_OUTAGES)
@@ -135,14 +137,16 @@ def drive_with_buffering_link(
 
 
 @pytest.fixture(scope="module")
-def buffered(field: Field, tmp_path_factory: pytest.TempPathFactory, print_report: PrintReport) -> OutageDriveResult:
+def buffered(
+    field: FieldNetworks, tmp_path_factory: pytest.TempPathFactory, print_report: PrintReport
+) -> OutageDriveResult:
     """Drive with routers linked by TCP with a lease of 10 s."""
     return drive_with_buffering_link(field, tmp_path_factory.mktemp("buffered"), print_report, "TCP, lease 10 s", LAVT)
 
 
 @pytest.fixture(scope="module")
 def buffered_unguarded(
-    field: Field, tmp_path_factory: pytest.TempPathFactory, print_report: PrintReport
+    field: FieldNetworks, tmp_path_factory: pytest.TempPathFactory, print_report: PrintReport
 ) -> OutageDriveResult:
     """Drive with the same routers and a server that accepts every command."""
     work = tmp_path_factory.mktemp("unguarded")

@@ -27,6 +27,8 @@ ATTACK_NS = 4 * NS_PER_S
 RATE_HZ = 1000
 """Replays a second: twice the 480 that made all video unreadable before hellos were numbered."""
 ETH_P_IP = 0x0800
+PROTOCOL_AT, SOURCE_AT, SOURCE_PORT_AT = 9, 12, 20
+"""Offsets of fields in the IP header (20 bytes) and the UDP header after it."""
 HEADERS_BYTES = 20 + 8
 """Size of the IP and the UDP header."""
 HELLO = b"LAVT\x01"
@@ -43,9 +45,9 @@ def overhear(listener: socket.socket) -> tuple[tuple[str, int], bytes]:
     """Return the source (address, port) and the payload of the next hello."""
     while True:
         packet = listener.recv(2048)
-        if packet[9] == socket.IPPROTO_UDP and packet[HEADERS_BYTES:].startswith(HELLO):
-            (port,) = struct.unpack_from(">H", packet, 20)
-            return (socket.inet_ntoa(packet[12:16]), port), packet[HEADERS_BYTES:]
+        if packet[PROTOCOL_AT] == socket.IPPROTO_UDP and packet[HEADERS_BYTES:].startswith(HELLO):
+            (port,) = struct.unpack_from(">H", packet, SOURCE_PORT_AT)
+            return (socket.inet_ntoa(packet[SOURCE_AT : SOURCE_AT + 4]), port), packet[HEADERS_BYTES:]
 
 
 def total_count(record: Record, name: str) -> int:

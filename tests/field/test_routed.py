@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.field.driving import CLOUD, Links, running_loop, through_rendezvous
-from tests.field.namespaces import INTERNET, NEXT_OPERATOR, OPERATOR, VEHICLE, Field, nat_field
+from tests.field.namespaces import INTERNET, NEXT_OPERATOR, OPERATOR, VEHICLE, FieldNetworks, nat_field
 from tests.field.outage_effects import transitions
 from tests.field.secured_routers import make_keys
 from tests.support.stalls import Stalls
@@ -53,7 +53,7 @@ def video_path(request: pytest.FixtureRequest) -> str:
 
 
 @pytest.fixture(scope="module")
-def field(namespaces: None, video_path: str) -> Iterator[Field]:  # noqa: ARG001 (skips)
+def field(namespaces: None, video_path: str) -> Iterator[FieldNetworks]:  # noqa: ARG001 (skips)
     with nat_field() as field:
         if video_path == "forwarded ports":
             field.forward_ports((VIDEO_PORT, PROBE_PORT))
@@ -104,7 +104,7 @@ class AddressChangeDrive:
 
 @pytest.fixture(scope="module")
 def address_change(
-    field: Field,
+    field: FieldNetworks,
     links: Links,
     video_path: str,
     tmp_path_factory: pytest.TempPathFactory,
@@ -166,7 +166,7 @@ def per_second(table: Table) -> float:
     return len(table) / WINDOW_S
 
 
-def test_nat_drops_unsolicited_datagrams(field: Field, video_path: str) -> None:
+def test_nat_drops_unsolicited_datagrams(field: FieldNetworks, video_path: str) -> None:
     """The vehicle's NAT passes datagrams to a forwarded port, from the operator's public address, and drops others."""
     forwarded, closed = (
         field.inside("vehicle", lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2)
@@ -264,7 +264,7 @@ def test_a_drive_continues_after_a_change_of_address(address_change: AddressChan
 
 @pytest.mark.parametrize("video_path", ["rendezvous"], indirect=True)
 def test_a_vehicle_whose_address_changes_keeps_its_video(
-    field: Field, links: Links, tmp_path: Path, print_report: Callable[[str], None], stalls: Stalls
+    field: FieldNetworks, links: Links, tmp_path: Path, print_report: Callable[[str], None], stalls: Stalls
 ) -> None:
     """After a change of the vehicle's address, pictures arrive again within 3 s at their full rate."""
     with running_loop(field, tmp_path, links) as drive:

@@ -50,25 +50,28 @@ def stalls(request: pytest.FixtureRequest) -> Stalls:
 
 @pytest.fixture(scope="session")
 def machines() -> tuple[Machine, Machine]:
-    """Return both machines with equal wall clocks; tests use `server_machine` and `client_machine`."""
+    """Return the server's and the client's machine, with equal wall clocks, for the two fixtures below."""
     if LANE != "pair":
         pytest.skip("needs two machines: run tests/kernel/run without --native")
     key = os.environ["LAVT_KERNEL_KEY"].encode()
-    pair = local_machine("server", "10.9.0.1"), remote_machine("client", "10.9.0.2", "10.9.1.2", key)
-    pair[1].call(clocks.step, offset_ns(*pair))
-    return pair
+    server = local_machine("server", "10.9.0.1")
+    client = remote_machine("client", "10.9.0.2", "10.9.1.2", key)
+    client.call(clocks.step, offset_ns(server, client))
+    return server, client
 
 
 @pytest.fixture
 def server_machine(machines: tuple[Machine, Machine]) -> Iterator[Machine]:
     """Return the vehicle's machine, which runs the tests."""
-    yield from restoring_machine(machines[0])
+    server, _ = machines
+    yield from restoring_machine(server)
 
 
 @pytest.fixture
 def client_machine(machines: tuple[Machine, Machine]) -> Iterator[Machine]:
-    """Return the remote machine."""
-    yield from restoring_machine(machines[1])
+    """Return the client's machine, which tests control from the server's."""
+    _, client = machines
+    yield from restoring_machine(client)
 
 
 def restoring_machine(machine: Machine) -> Iterator[Machine]:

@@ -234,14 +234,16 @@ def _receive(captures: dict[str, socket.socket], names: dict[bytes, str], arriva
                 frame, ancillary, _flags, address = capture.recvmsg(2048, 64)
             except BlockingIOError:
                 break
-            if address[2] == socket.PACKET_OUTGOING:
+            _device, _protocol, packet_type, *_ = address
+            if packet_type == socket.PACKET_OUTGOING:
                 continue
             match = next(((mark, frame.index(mark)) for mark in names if mark in frame), None)
             if match is None:
                 continue
-            _, number, sent_ns = PACKET_HEADER.unpack_from(frame, match[1])
+            mark, header_at = match
+            _, number, sent_ns = PACKET_HEADER.unpack_from(frame, header_at)
             seconds, nanoseconds = struct.unpack_from("qq", ancillary[0][2])
             received_ns = seconds * NS_PER_S + nanoseconds
-            arrivals[names[match[0]]].arrived.append(
+            arrivals[names[mark]].arrived.append(
                 ArrivedPacket(number, (received_ns - sent_ns) / NS_PER_MS, received_ns)
             )

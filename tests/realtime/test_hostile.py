@@ -50,7 +50,7 @@ def udp_ports(process: Process) -> set[int]:
 
 
 class Attacker:
-    """An attacker that can reach all UDP ports and the client's router, and that records commands for replays."""
+    """An attacker that reaches all UDP ports and the client's router, and records commands to replay them."""
 
     def __init__(self, router: str, ports: set[int]) -> None:
         self._chance = stream(1, "hostile")
@@ -87,14 +87,14 @@ class Attacker:
         self._session.close()
 
     def _datagram(self) -> bytes:
-        """Return random bytes that begin like RTP, RTCP, a hello, or nothing known."""
+        """Return random bytes, most of which begin like RTP, RTCP or a hello."""
         prefix = PREFIXES[self._chance.integers(len(PREFIXES))]
         return prefix + self._chance.bytes(int(self._chance.choice([0, 8, 32, 200, 1200])))
 
     def _garbage(self, message: Command | SessionRequest) -> bytes:
         """Return random bytes, a truncated message, one with a flipped bit, or a replayed command.
 
-        The last byte is never flipped: that would be a valid emergency stop.
+        No bit of the last byte is flipped, because that would make a valid emergency stop.
         """
         data = bytearray(encode(message))
         at = int(self._chance.integers(1, len(data) - 1))
@@ -172,7 +172,7 @@ def total_count(record: Record, name: str) -> int:
 
 
 def test_a_drive_continues_under_attack(attacked: SimpleNamespace, stalls: Stalls) -> None:
-    """During 6000 random datagrams per port and garbage at 200 Hz on all keys, the drive continues.
+    """The drive continues under 6000 random datagrams per port, and garbage at 200 Hz on all keys.
 
     Only half of the pictures must lead to a command, which leaves room for other load on the machine.
     """

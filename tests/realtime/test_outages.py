@@ -48,7 +48,7 @@ ACCEPTS_EVERYTHING = Path(__file__).with_name("server_that_accepts_everything.py
 
 @dataclass
 class LoopWithOutages:
-    """A running loop, and the times at which outages began; server and test read the same clocks."""
+    """A running loop, and the times at which its outages began; server and test read the same clocks."""
 
     processes: Processes
     work: Path

@@ -45,9 +45,9 @@ def has_printed(process: Process, *words: str) -> bool:
 
 @dataclass
 class Session:
-    """A server and clients, with their reports and the times at which they ended.
+    """A server and clients, with their reports, exit codes and times.
 
-    They start in the worst order: a client, the server, and only then the routers.
+    The processes start in the worst order: a client, the server, and only then the routers.
     """
 
     processes: Processes
@@ -178,7 +178,7 @@ def event_ns(record: Record, *words: str) -> int:
 
 
 def test_a_client_started_before_its_router_and_server_drives(session: Session, server: Record) -> None:
-    """A client that starts before the server and the routers reports once that it waits, and then drives."""
+    """A client that starts before the server and the routers reports that it waits, and drives later."""
     assert "no router answers" in session.observations["first without a router"]
     assert "waiting" in session.observations["first without a router"]
     assert event_ns(server, "arming -> driving")
@@ -198,7 +198,7 @@ def test_a_second_client_learns_who_has_control(session: Session) -> None:
 
 
 def test_the_active_operator_hands_over_on_request(session: Session, server: Record, stalls: Stalls) -> None:
-    """After a request and SIGUSR2 the active operator releases the vehicle, which stops; the requester drives it."""
+    """After a request and SIGUSR2 the active operator releases the vehicle, which stops; then the requester drives."""
     requested = session.observations["requested"]
     assert (requested["active_operator"], requested["requested_by"]) == ("operator-1", "operator-2")
     assert session.observations["handed over"]["active_operator"] == "operator-2"
@@ -213,7 +213,7 @@ def test_the_active_operator_hands_over_on_request(session: Session, server: Rec
 
 
 def test_ctrl_c_of_the_active_operator_releases_the_vehicle(session: Session, server: Record, stalls: Stalls) -> None:
-    """Within a second after Ctrl-C the vehicle is released; the client reports it and ends with exit code 0."""
+    """Within a second after Ctrl-C the client releases the vehicle, reports the release and ends with exit code 0."""
     released_ns = event_ns(server, "release", "operator-2", "granted")
     interrupted_ns = session.at_ns["second interrupted"]
     assert interrupted_ns < released_ns
