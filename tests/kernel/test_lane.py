@@ -25,7 +25,7 @@ CLOCK = MachineClock()
 JUDGES_TIMES = pytest.mark.judges_times(share=MEDIAN_SHARE)
 
 
-def least_round_trip_ms(machine: Machine, to: Machine) -> float:
+def shortest_round_trip_ms(machine: Machine, to: Machine) -> float:
     output = machine.run(["ping", "-c", "11", "-i", "0.05", "-q", to.address])
     return float(output.rpartition(" = ")[2].split("/")[0])
 
@@ -36,15 +36,15 @@ def delta_ns(server: Machine, client: Machine) -> float:
 
 @JUDGES_TIMES
 def test_delay_of_one_machine_is_in_the_round_trip(server_machine: Machine, client_machine: Machine) -> None:
-    """Netem on one machine delays its own egress only, and the delay is gone afterwards."""
+    """A netem delay of 50 ms on either machine adds 50 ms to the round trip, and is gone afterwards."""
     for machine in (server_machine, client_machine):
         with netem_on_all(machine, "delay", "50ms"):
-            assert 49.5 < least_round_trip_ms(server_machine, client_machine) < 53
-    assert least_round_trip_ms(server_machine, client_machine) < 5
+            assert 49.5 < shortest_round_trip_ms(server_machine, client_machine) < 53
+    assert shortest_round_trip_ms(server_machine, client_machine) < 5
 
 
 def test_remote_failure_is_raised_here(client_machine: Machine) -> None:
-    """A program or function that fails on the client's machine raises here with its error."""
+    """If a program or a function fails on the client's machine, the call raises its error here."""
     with pytest.raises(MachineError, match=r"ended with 2: .*no-such-file"):
         client_machine.run(["ls", "/no-such-file"])
     with pytest.raises(MachineError, match="No such file"):
@@ -69,7 +69,7 @@ def test_started_program_is_stopped_after_the_test(client_machine: Machine) -> N
 
 @JUDGES_TIMES
 def test_host_stalls_have_the_time_of_this_machine(server_machine: Machine, stalls: Stalls) -> None:
-    """A report of the host's probes has this machine's time, within the 5 ms of a query, even on a slewed clock."""
+    """Reports of the host's probes have this machine's time, to within 5 ms, even if this machine's clock is slewed."""
     server_machine.call(clocks.set_drift, 500)
     pause(2 * NS_PER_S)
     round_trips_ns = []
@@ -109,7 +109,7 @@ def test_true_offset_agrees_with_ntp_exchanges(
 
 @JUDGES_TIMES
 def test_clock_drift_is_the_rate_of_the_true_offset(server_machine: Machine, true_offset_ns: TrueOffset) -> None:
-    """A server's clock that runs 30 ppm fast gains 30 us per second on the client's within 5 us."""
+    """If the server's clock runs 30 ppm fast, the true offset grows by 30 us per second, within 5 us."""
     begin_raw_ns, begin_ns = clocks.read_raw_clock_ns(), true_offset_ns()
     server_machine.call(clocks.set_drift, 30)
     pause(4 * NS_PER_S)
@@ -122,7 +122,7 @@ def test_clock_drift_is_the_rate_of_the_true_offset(server_machine: Machine, tru
 def test_chrony_measures_the_offset(
     server_machine: Machine, client_machine: Machine, true_offset_ns: TrueOffset
 ) -> None:
-    """A chronyd that follows the server without adjusting the clock measures a server 250 ms ahead within 1 ms."""
+    """The client's chronyd, which does not adjust the clock, measures that the server is 250 ms ahead, within 1 ms."""
     server_machine.call(clocks.step, 250 * NS_PER_MS)
     start_chronyd(server_machine, *SERVE_OWN_CLOCK)
     start_chronyd(client_machine, follow_server(server_machine.address))
