@@ -4,6 +4,7 @@ import queue
 import socket
 
 import pytest
+from msgspec.structs import replace
 from tests.support.clocks import ManualClock
 from tests.support.command_line import Run
 from tests.support.ports import free_port
@@ -59,6 +60,13 @@ def test_a_stop_is_repeated_until_it_is_confirmed() -> None:
     vehicle = Vehicle(None, b"garbage", encode(REJECTED), None, encode(ACCEPTED))
     repeat(vehicle)
     assert vehicle.numbers == [60] * 5
+
+
+def test_a_stop_that_was_cleared_is_made_again() -> None:
+    """If the stop was executed and cleared before a confirmation arrived, it is made again, with a new number."""
+    vehicle = Vehicle(None, encode(replace(REJECTED, emergency_stop=60)), None, encode(ACCEPTED))
+    repeat(vehicle)
+    assert vehicle.numbers == [60, 60, 61, 61]
 
 
 @pytest.mark.parametrize("timeout_s", [1.0, 10.0])

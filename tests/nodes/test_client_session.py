@@ -156,16 +156,66 @@ def test_an_emergency_stop_is_repeated_until_answered(released: bool) -> None:
     assert "emergency_stop" not in {take_operation(session, number * NS_PER_S) for number in range(3, 10)}
 
 
-def test_an_emergency_stop_in_the_state_is_not_repeated() -> None:
-    """An emergency stop is not requested again once a state reports it."""
+def test_a_state_does_not_end_the_repetition_of_a_stop() -> None:
+    """An emergency stop is repeated although a state reports one, which may be an earlier one."""
     session = driving_session()
-    session.raise_emergency_stop(Now(0, 60))
-    session.handle_reply(REJECTED, 300)
+    first = session.raise_emergency_stop(Now(0, 60))
+    session.handle_state(state("emergency_stop"), 400)
+    assert session.take_request(NS_PER_S) == first
+    session.handle_reply(replace(GRANTED, emergency_stop=60), NS_PER_S)
+    assert (session.phase, session.next_wake_ns()) == ("stopped", None)
+
+
+STOPPED = replace(GRANTED, emergency_stop=70)
+"""The first reply, while the vehicle's last emergency stop is number 70."""
+
+
+def clearing_session() -> ClientSession:
+    """Return a session that is to clear the emergency stop 70, and has control."""
+    session = ClientSession("alice", 7, rearm=True, start_ns=100, clear_stop=True)
+    session.handle_reply(STOPPED, 200)
+    session.handle_state(state("emergency_stop"), 300)
+    return session
+
+
+def test_the_emergency_stop_of_the_first_reply_is_cleared() -> None:
+    """With `clear_stop`, the emergency stop of the first reply is cleared, also if its client has no control yet."""
+    session = ClientSession("alice", 7, rearm=False, start_ns=100, clear_stop=True)
+    session.handle_reply(REJECTED, 200)
+    session.handle_reply(STOPPED, 300)
+    session.handle_state(state("emergency_stop"), 300)
     request = session.take_request(NS_PER_S)
     assert request is not None
-    assert (request.operation, request.number) == ("emergency_stop", 60)
-    session.handle_state(state("emergency_stop"), 400)
-    assert (session.phase, session.next_wake_ns()) == ("stopped", None)
+    assert (request.operation, request.number) == ("clear_emergency_stop", 70)
+
+
+def test_another_emergency_stop_is_not_cleared() -> None:
+    """A client with `clear_stop` clears no later stop: neither somebody's, nor one while it waits, nor its own."""
+    later = clearing_session()
+    later.handle_reply(replace(REJECTED, emergency_stop=71), 400)
+    while_waiting = ClientSession("alice", 7, rearm=False, start_ns=100, clear_stop=True)
+    while_waiting.handle_reply(REJECTED, 200)
+    while_waiting.handle_reply(replace(GRANTED, emergency_stop=71), 300)
+    while_waiting.handle_state(state("emergency_stop"), 400)
+    own = clearing_session()
+    stop = own.raise_emergency_stop(Now(400, 60))
+    own.handle_reply(replace(GRANTED, emergency_stop=stop.number), 500)
+    after_driving = clearing_session()
+    after_driving.handle_state(state("driving"), 400)
+    after_driving.handle_state(state("emergency_stop"), 500)
+    for session in (later, while_waiting, own, after_driving):
+        operations = {take_operation(session, number * NS_PER_S) for number in range(1, 10)}
+        assert "clear_emergency_stop" not in operations
+
+
+@pytest.mark.parametrize("restarted", [False, True])
+def test_rearm_does_not_follow_an_emergency_stop(restarted: bool) -> None:
+    """After an emergency stop, `rearm` requests no control, even if the stop is cleared or the server restarted."""
+    session = driving_session(rearm=True)
+    session.handle_state(state("emergency_stop", 3.0), 500)
+    session.handle_state(state("emergency_stop"), 600)
+    session.handle_state(replace(state("disarmed"), instance=2 if restarted else 0), 700)
+    assert (session.phase, session.take_request(10 * NS_PER_S)) == ("stopped", None)
 
 
 NOTED = replace(GRANTED, epoch=0, token=b"")

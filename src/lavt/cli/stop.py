@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from msgspec.structs import replace
 
 from lavt.assembly.entropy import MachineEntropy
 from lavt.assembly.security import build_authenticator, build_gateway
@@ -87,13 +88,17 @@ def _repeat_until_confirmed(
     """Send the request until the vehicle confirms the stop; raise `WorkError` after `timeout_s`.
 
     A single query can be lost or exceed the vehicle's rate limit. Repeated queries with the same number are one stop.
+    If somebody has cleared this stop before its confirmation arrived, it gets a new number.
     """
     until_ns = clock.now().mono_ns + round(timeout_s * NS_PER_S)
     while clock.now().mono_ns < until_ns:
         send(Send("session", encode(request)))
         with suppress(queue.Empty, BadMessage):
-            if decode(SessionReply, replies.get(timeout=RETRY_PERIOD_S)).granted:
+            reply = decode(SessionReply, replies.get(timeout=RETRY_PERIOD_S))
+            if reply.granted:
                 return
+            if reply.emergency_stop == request.number:
+                request = replace(request, number=request.number + 1)
     raise WorkError(
         f"the emergency stop was NOT confirmed within {timeout_s:g} s, and the vehicle may still be moving: stop it by "
         "other means and repeat this command. Is its server running, is vehicle_id correct, and do the keys match? "

@@ -138,9 +138,11 @@ class ControllerConfig(Section):
     wheelbase_m: float = Field(2.8448, gt=0.5, lt=10)
     """The wheelbase of the driven vehicle; by default the built-in car's."""
     rearm: bool = False
-    """Arm automatically after a safe stop, and after a restart of the server (docs/session.md)."""
+    """Arm automatically after a safe stop, and after a restart of the server, but not after an emergency stop
+    (docs/session.md)."""
     clear_emergency_stop: bool = False
-    """Clear an existing emergency stop; set this only after its cause has been removed."""
+    """Clear the emergency stop that exists when the client starts, and no later one; set this only after its cause has
+    been removed."""
 
     @property
     def changes(self) -> dict[str, Any]:

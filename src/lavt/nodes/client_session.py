@@ -18,10 +18,10 @@ REQUEST_PERIOD_NS = NS_PER_S
 class ClientSession:
     """A client session that requests control until it is granted and the vehicle armed; repeated requests are harmless.
 
-    With `rearm`, it requests control again after a safe stop and from a restarted server, but not after a driver
-    override, which disarms the vehicle. With `clear_stop`, it clears an emergency stop that exists at the start. With
-    `waits_for_condition`, it arms the vehicle only when the network condition is in force. With `take_over`, it
-    requests a handover from the active operator.
+    With `rearm`, it requests control again after a safe stop and from a restarted server, but neither after an
+    emergency stop nor after a driver override, which disarms the vehicle. With `clear_stop`, it clears the emergency
+    stop that the first reply reports, and no other one. With `waits_for_condition`, it arms the vehicle only when the
+    network condition is in force. With `take_over`, it requests a handover from the active operator.
     """
 
     def __init__(
@@ -47,7 +47,10 @@ class ClientSession:
         self._who = who
         self._instance = instance
         self._rearm = rearm
-        self._clear_stop = clear_stop
+        self._looks_for_stop = clear_stop
+        """The first reply reports the emergency stop that is to be cleared."""
+        self._stop_to_clear: int | None = None
+        """Number of the emergency stop that this client clears; None: none."""
         self._wait_reason = "the network condition is not in force yet" if waits_for_condition else ""
         """Why this client must not arm the vehicle yet; empty: it can."""
         self._take_over = take_over
@@ -60,13 +63,11 @@ class ClientSession:
         """A state has named this client as the active operator."""
         self._server = 0
         """Instance of the server process that sent the last state."""
-        self._was_disarmed = False
-        """Since this client drove, the same server process has disarmed the vehicle."""
+        self._awaits_person = False
+        """Since this client drove, there was an emergency stop, or the same server process has disarmed the vehicle."""
         self._request_ns = start_ns
         self._stop_ns: int | None = None
-        """When the request of the emergency stop is repeated; None: there is no stop, or the vehicle knows of it."""
-        self._last_stop = 0
-        """Number of the vehicle's last emergency stop, by its last reply."""
+        """When the request of the emergency stop is repeated; None: there is no stop, or the vehicle has answered."""
 
     @property
     def may_command(self) -> bool:
@@ -95,8 +96,8 @@ class ClientSession:
         self._request_ns = now_ns + REQUEST_PERIOD_NS
         if self.phase == "watching":
             return SessionRequest("release", self._who, self._instance, 0)
-        if self._clear_stop and self.phase == "arming" and self.safety == "emergency_stop":
-            return SessionRequest("clear_emergency_stop", self._who, self._instance, self._last_stop)
+        if self._stop_to_clear is not None and self.phase == "arming" and self.safety == "emergency_stop":
+            return SessionRequest("clear_emergency_stop", self._who, self._instance, self._stop_to_clear)
         self._last_operation, self._next_operation = self._next_operation, "acquire"
         return SessionRequest(self._last_operation, self._who, self._instance, 0)
 
@@ -113,7 +114,10 @@ class ClientSession:
     def handle_reply(self, reply: SessionReply, now_ns: int) -> None:
         """Process the server's reply to a request."""
         self._update_reason(reply)
-        self._last_stop = reply.emergency_stop
+        if self._looks_for_stop:
+            self._looks_for_stop, self._stop_to_clear = False, reply.emergency_stop
+        elif reply.emergency_stop != self._stop_to_clear:  # there was another stop since: a person must decide again
+            self._stop_to_clear = None
         if reply.emergency_stop == self.emergency_stop:
             self._stop_ns = None
         if reply.granted and reply.token:
@@ -137,22 +141,22 @@ class ClientSession:
 
     def handle_state(self, state: State, now_ns: int) -> None:
         """Process a state of the vehicle."""
-        if self.phase in ("driving", "stopped") and self.safety != "disarmed" and state.instance == self._server:
-            self._was_disarmed |= state.safety == "disarmed"
+        if self.phase in ("driving", "stopped"):
+            is_same_server = state.instance == self._server
+            is_disarmed_now = is_same_server and self.safety != "disarmed" and state.safety == "disarmed"
+            self._awaits_person |= is_disarmed_now or state.safety == "emergency_stop"
         self.safety, self._server = state.safety, state.instance
-        if state.safety == "emergency_stop":
-            self._stop_ns = None
         names_this_client = (state.active_operator, state.active_operator_instance) == (self._who, self._instance)
         names_other_client = state.active_operator != "" and not names_this_client
         if self.phase == "arming" and state.safety == "driving" and not names_other_client:
-            self.phase = "driving"
+            self.phase, self._stop_to_clear = "driving", None
         elif self.phase == "driving" and state.safety in ("disarmed", "safe_stop", "emergency_stop"):
             self.phase, self.reason = "stopped", state.reason
         elif (
             self.phase == "stopped"
             and self._rearm
             and abs(state.speed_mps) < LIMITS.standstill_mps
-            and not self._was_disarmed
+            and not self._awaits_person
         ):
             self.phase, self._request_ns = "seeking", now_ns
         if names_other_client and self._was_active_operator and self.phase not in ("seeking", "watching"):
@@ -164,10 +168,11 @@ class ClientSession:
     def raise_emergency_stop(self, now: Now) -> SessionRequest:
         """Raise an emergency stop and return its request; every later command carries its number.
 
-        The request is repeated until the vehicle answers it or reports the stop, because a client that does not drive
-        sends no commands. The number is the wall clock time, at least one more than that of this client's last stop, so
-        no other stop has it.
+        The request is repeated until the vehicle answers it, because a client that does not drive sends no commands.
+        This client clears no stop any more. The number is the wall clock time, at least one more than that of this
+        client's last stop, so no other stop has it.
         """
         self.emergency_stop = max(self.emergency_stop + 1, now.wall_ns)
         self._stop_ns = now.mono_ns + REQUEST_PERIOD_NS
+        self._looks_for_stop, self._stop_to_clear = False, None
         return SessionRequest("emergency_stop", self._who, self._instance, self.emergency_stop)

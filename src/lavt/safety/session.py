@@ -148,6 +148,8 @@ class VehicleSession:
     def _emergency_stop(self, request: SessionRequest, _vehicle: VehicleState, _now_ns: int) -> str:
         if self.raise_emergency_stop(request.number):
             self._machine.reason = f"emergency stop by {request.who}"
+        elif self._machine.state != "emergency_stop":
+            return "this emergency stop was executed before, and has been cleared since"
         return ""  # also for a stop that was executed already: its client repeats the request until it is granted
 
     def _clear_emergency_stop(self, request: SessionRequest, vehicle: VehicleState, _now_ns: int) -> str:
