@@ -182,6 +182,44 @@ def test_frames_that_the_ports_thread_has_not_read(
     assert receive(other, 2) == [STEERING, BRAKE]
 
 
+def test_a_frame_that_waited_is_not_newer_if_take_reads_it(
+    open_port: Callable[..., CanPort], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The port's thread, which runs while `take` reads a frame, does not make the frame's arrival later."""
+    is_readable = CanPort._is_readable
+    resumed, parked = threading.Event(), threading.Event()
+    resumed.set()
+
+    def wait_first(port: CanPort, bus: bus_module.OpenBus) -> bool:
+        parked.set()
+        resumed.wait(DEADLINE_S)
+        return is_readable(port, bus)
+
+    monkeypatch.setattr(CanPort, "_is_readable", wait_first)
+    options = {"interface": "udp_multicast", "channel": GROUP, "port": free_port()}
+    port, other = open_port(**options), open_port(**options)
+    assert port._bus is not None
+    driver = port._bus.driver
+    read = driver.recv
+
+    def read_slowly(timeout_s: float | None = None) -> can.Message | None:
+        message = read(timeout_s)
+        resumed.set()
+        pause(20 * NS_PER_MS)
+        return message
+
+    monkeypatch.setattr(driver, "recv", read_slowly)
+    resumed.clear()
+    parked.clear()
+    until(parked.is_set)
+    pause(150 * NS_PER_MS)  # both threads have left their waits for a frame
+    sent_ns = now_ns()
+    other.send([STEERING], sent_ns)
+    pause(150 * NS_PER_MS)
+    [received] = port.take(0)
+    assert received.arrived_ns - sent_ns < 100 * NS_PER_MS
+
+
 def test_garbage_datagrams(open_port: Callable[..., CanPort]) -> None:
     """Datagrams of the group that are not frames are counted, and the next frame is received."""
     number = free_port()

@@ -249,10 +249,12 @@ class CanPort:
 
     def _is_readable(self, bus: OpenBus) -> bool:
         """Wait for a frame for at most `POLL_S` of the monotonic clock; python-can's timeouts use the wall clock."""
-        now, descriptors = self._clock.now(), [bus.driver.fileno()]
-        if select.select(descriptors, [], [], 0)[0]:
-            return True
-        bus.arrivals.note_empty(now)
+        descriptors = [bus.driver.fileno()]
+        with bus.reading:  # while `take` reads a frame, the queue can be empty although that frame is not noted yet
+            now = self._clock.now()
+            if select.select(descriptors, [], [], 0)[0]:
+                return True
+            bus.arrivals.note_empty(now)
         return bool(select.select(descriptors, [], [], POLL_S)[0])
 
     def _receive(self, message: Message, now: Now, bus: OpenBus) -> None:
