@@ -28,8 +28,7 @@ def run(
 ) -> Run:
     """Return a function that runs `lavt` in this process, from an empty working directory."""
     monkeypatch.setattr(console, "reserve_stdout", lambda: None)  # would redirect pytest's output
-    for name in ("raise_priority", "request_realtime", "limit_realtime"):  # they would affect all tests
-        monkeypatch.setattr(process_priority, name, lambda *_: "")
+    monkeypatch.setattr(process_priority, "raise_priority", lambda *_: None)  # would affect all tests
     monkeypatch.chdir(tmp_path)
 
     def run_here(*arguments: str) -> CommandResult:

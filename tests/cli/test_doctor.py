@@ -100,8 +100,6 @@ VERDICTS: list[tuple[Callable[[], Check], str, str]] = [
     (lambda: check_camera(CameraSample([5], 0)), "warning", " 0.0 pictures"),
     (lambda: check_camera("/dev/video0 cannot be opened"), "problem", "/dev/video0"),
     (lambda: checks.check_by_wire(300, "", name="socketcan can0"), "ok", "300 frames"),
-    (lambda: checks.check_realtime(""), "ok", "all ordinary programs"),
-    (lambda: checks.check_realtime("this user may not"), "warning", "may delay the actuator"),
     (lambda: checks.check_memory_lock(""), "ok", "RAM"),
     (lambda: checks.check_memory_lock("this user may lock only 64 KiB"), "warning", "wait for the disk"),
     (

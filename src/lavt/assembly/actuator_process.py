@@ -110,8 +110,6 @@ def serve_actuator(connection: Connection, config: ServerConfig, host: str, vide
     queue_output("stdout", "stderr")
     os.setsid()  # the kernel schedules this process in a group of its own, apart from the server's
     process_priority.raise_priority(process_priority.VEHICLE_NICENESS)
-    if reason := process_priority.request_realtime():
-        log.warning("other programs may delay the process of the %s: %s", NAME, reason)
     if reason := lock_memory():
         log.warning("the process of the %s may have to wait for the disk when memory is scarce: %s", NAME, reason)
     clock = MachineClock()
@@ -123,7 +121,6 @@ def serve_actuator(connection: Connection, config: ServerConfig, host: str, vide
     except Exception as error:  # the server's process reports every error
         connection.send(error if isinstance(error, UserError) else f"{type(error).__name__}: {error}")
         return
-    process_priority.limit_realtime()
     connection.send(None)
     disconnected = threading.Event()
     node_host = NodeHost(connection, clock, node, get_status=node.gate.in_force, on_disconnect=disconnected.set)

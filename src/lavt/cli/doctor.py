@@ -106,7 +106,6 @@ def _checks(settings: Settings | None, clock: MachineClock) -> Iterator[Check]:
             yield _camera_check(settings, clock)
         if settings.vehicle.kind == "dbw" and not settings.vehicle.dbw.is_inside:
             yield _by_wire_check(settings, clock)
-            yield checks.check_realtime(process_priority.realtime_rejection())
             yield checks.check_memory_lock(lift_lock_limit())
         yield from _port_checks(settings, clock)
         yield from _zenoh_checks(settings, clock)

@@ -55,7 +55,6 @@ def software_car(
     Example: lavt software-car configs/server-by-wire.yaml --set vehicle.dbw.channel=vcan0
     """
     process_priority.raise_priority(process_priority.VEHICLE_NICENESS)
-    process_priority.request_realtime()  # no program delays a real kit
     settings = load_config(ServerConfig, config, changes or [])
     dbw = settings.vehicle.dbw
     if dbw.interface == INSIDE:
@@ -74,7 +73,6 @@ def software_car(
         start_ns = clock.now().mono_ns
         runner = SoftwareCarRunner(build_software_car(settings, profile, road, start_ns), port, start_ns=start_ns)
         print_event = _print_event_json if as_json else _event_printer(start_ns)
-        process_priority.limit_realtime()
         with console.stop_on_signals() as stop, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             sender.setblocking(False)
             _print_ready(profile, dbw, as_json=as_json)

@@ -150,14 +150,6 @@ def check_by_wire(frames: int, inhibit_reason: str, *, name: str) -> Check:
     return Check("by wire", "ok", f"{found}, including every report of the profile", measured={"frames": frames})
 
 
-def check_realtime(reason: str) -> Check:
-    """Check that the actuator of a by-wire car may have real-time priority; `reason` says why not."""
-    if reason:
-        do = "run the server as root, or with LimitRTPRIO=1 as in deploy/systemd/"
-        return Check("real time", "warning", f"other programs may delay the actuator: {reason}", do)
-    return Check("real time", "ok", "the actuator can have priority over all ordinary programs")
-
-
 def check_memory_lock(reason: str) -> Check:
     """Check that the actuator of a by-wire car may lock its memory; `reason` says why not."""
     if reason:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import resource
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
@@ -12,11 +11,6 @@ NICENESS: Final = -10
 """Default priority: above ordinary programs, without starving the system (0 is normal, -20 is the highest)."""
 VEHICLE_NICENESS: Final = -15
 """Priority of the actuator's process and of a software car: above that of the server."""
-
-REALTIME_PRIORITY: Final = 1
-"""The lowest real-time priority, which is still above that of every ordinary program."""
-REALTIME_LIMIT_S: Final = 1
-"""The kernel ends a real-time process if one of its threads computes for this long without waiting: it hangs."""
 
 SESSION: Final = Path("/proc/self/autogroup")
 """The niceness of this process's session. With automatic task groups, Linux shares the processors among sessions; the
@@ -34,30 +28,6 @@ def raise_priority(niceness: int = NICENESS) -> None:
     if os.getsid(0) == os.getpid():
         with suppress(OSError):
             SESSION.write_text(str(niceness))
-
-
-def request_realtime() -> str:
-    """Schedule this thread, and the threads that it starts, before all ordinary programs; return why not, or ""."""
-    try:
-        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(REALTIME_PRIORITY))
-    except OSError as error:
-        return f"this user may not have real-time priority ({error.strerror})"
-    return ""
-
-
-def limit_realtime() -> None:
-    """Let the kernel end this process if a real-time thread of it hangs, which would starve other programs."""
-    limit_us = REALTIME_LIMIT_S * 1_000_000
-    resource.setrlimit(resource.RLIMIT_RTTIME, (limit_us, 2 * limit_us))  # SIGXCPU, then SIGKILL
-
-
-def realtime_rejection() -> str:
-    """Return why this thread may not have real-time priority, or "", and leave its priority as it was."""
-    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
-    reason = request_realtime()
-    if not reason:
-        os.sched_setscheduler(0, policy, parameters)
-    return reason
 
 
 def session_niceness() -> int | None:
