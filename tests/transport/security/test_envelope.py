@@ -399,7 +399,7 @@ def test_envelopes_have_a_maximum_size(pair: Pair, more_bytes: int, *, accepted:
     request = pair.vehicle.verify_request("netem", pair.operator.sign_request("netem", b""))
     assert request is not None
     reply = bytes(MAX_ENVELOPE_BYTES - len(pair.vehicle.sign_reply(request, b"")) + more_bytes)
-    fresh = replace(request, is_stale=False)
+    fresh = replace(request, must_retry=False)
     assert pair.operator.verify_reply("netem", pair.vehicle.sign_reply(fresh, reply)).body == (
         reply if accepted else None
     )
