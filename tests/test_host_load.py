@@ -31,7 +31,7 @@ def test_invalid_arguments_are_rejected(arguments: list[str]) -> None:
 @pytest.mark.realtime
 def test_load_stops_all_processors_together() -> None:
     """While the command runs, all processors stop together and the load takes its share; the exit code is returned."""
-    measured = Stalls.measured()
+    measured = Stalls.start_probes()
     try:
         if not all(probe.has_realtime_priority for probe in measured.probes):
             pytest.skip("needs the right to real-time priority")

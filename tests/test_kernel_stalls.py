@@ -13,7 +13,7 @@ import pytest
 from tests.field.by_wire import STOP_STALL_MS
 from tests.kernel.lane import clocks, host_stalls
 from tests.kernel.lane.host_stalls import STALLS_PER_ANSWER, HostProbe
-from tests.kernel.lane.verdicts import MEDIAN_SHARE, least_stop_ms
+from tests.kernel.lane.verdicts import MEDIAN_SHARE, shortest_stall_ms
 from tests.support.stalls import HostStalled, ProbeEnded, Stall, Stalls, excuse_slow_machine, stalled_share
 from tests.test_stalls import QUIET, FakeProbe, stalls_of
 
@@ -108,7 +108,7 @@ def test_answers_have_a_limited_length() -> None:
     """An answer has at most 40 stalls and announces further stalls; the next answer has only these."""
     recorded = [Stall(0, number, number + 1) for number in range(STALLS_PER_ANSWER + 1)]
     stalls = Stalls([FakeProbe([(0, []), (0, recorded)])], lambda: QUIET)
-    first, second = (host_stalls._query(stalls) for _ in range(2))
+    first, second = (host_stalls._answer(stalls) for _ in range(2))
     assert (len(first["stalls"]), first["more"]) == (STALLS_PER_ANSWER, True)
     assert (len(second["stalls"]), second["more"]) == (1, False)
     longest = answer_with(*((1, 10**18, 10**18) for _ in range(STALLS_PER_ANSWER)))
@@ -125,7 +125,7 @@ def test_answers_have_a_limited_length() -> None:
 )
 def test_least_stall_for_each_safe_stop(reason: str, least_ms: float) -> None:
     """A stall of 100 ms explains a stop without commands; for missing reports, their timeout minus 60 ms is enough."""
-    assert least_stop_ms(reason) == least_ms
+    assert shortest_stall_ms(reason) == least_ms
 
 
 def test_full_processor_use_excuses_nothing() -> None:

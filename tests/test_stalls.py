@@ -392,7 +392,7 @@ def spin(processor: int, priority: str, duration_ms: int) -> tuple[int, int]:
 
 @contextmanager
 def measuring_stalls() -> Iterator[Stalls]:
-    measured = Stalls.measured()
+    measured = Stalls.start_probes()
     try:
         if not all(probe.has_realtime_priority for probe in measured.probes):
             pytest.skip("needs the right to real-time priority")
@@ -441,7 +441,7 @@ def processor_time_s(pid: int) -> float:
 PARENT = """
 import signal, sys, time
 from tests.support.stalls import Stalls
-measured = Stalls.measured()
+measured = Stalls.start_probes()
 print(*(probe.pid for probe in measured.probes), flush=True)
 time.sleep(60)
 """

@@ -12,7 +12,7 @@ from benchmarks import endurance, video_vs_gstreamer
 from benchmarks.video.impaired import CASES, psnr_db, undamaged_share
 from benchmarks.video.processes import WARM_UP_FRAMES, frames_of
 from benchmarks.video.relay import LinkCase, PacketImpairment, TrafficCounter
-from tests.interop.tools import missing
+from tests.interop.tools import missing_tools
 from tests.require import need
 
 from lavt.runtime import process_priority
@@ -144,7 +144,7 @@ def test_the_video_benchmark_runs() -> None:
         check=False,
         timeout=300,
     )
-    if completed.returncode == 2 and not missing():
+    if completed.returncode == 2 and not missing_tools():
         pytest.skip(f"Debian's GStreamer modules do not support this Python: {completed.stderr}")
     if completed.returncode == 2:
         need("gstreamer", completed.stderr)

@@ -1,7 +1,7 @@
 """A drive with the secure configs, and an attacker at the operator's router that records, replays, alters and floods.
 
-The permissions of the router's socket should prevent the attacker's session. The tests assume that they have failed,
-so that only the signatures protect the drive.
+The permissions of the router's socket should prevent the attacker's session. The tests assume that these permissions
+have failed, so that only the signatures protect the drive.
 """
 
 from __future__ import annotations
@@ -11,7 +11,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tests.field.secured_routers import BASE, QUIC, direct, open_session, quic_endpoint, start_router, tls_changes
+from tests.field.secured_routers import (
+    BASE,
+    QUIC,
+    direct_handler,
+    open_session,
+    quic_endpoint,
+    start_router,
+    tls_changes,
+)
 
 from lavt.clock import MachineClock, pause
 from lavt.config_file import shipped
@@ -32,10 +40,12 @@ MAC_BYTES, SIGNATURE_BYTES = 16, 64
 
 @dataclass
 class AttackedDrive:
-    """The records of a drive, and for each attack the number of messages and when it began and ended (ns)."""
+    """The records of a drive under one attack after the other."""
 
     phases: dict[str, tuple[int, int]]
+    """Begin and end (ns) of each attack, and of the time without an attack, "quiet"."""
     sent_counts: dict[str, int]
+    """Number of commands that each attack sent."""
     states_at_operator: list[bytes]
     server: Record
     client: Record
@@ -53,12 +63,12 @@ class Insider:
         self.sent_counts: dict[str, int] = {}
         self._chance = stream(1, "insider")
         self.session.declare_subscriber(
-            f"{BASE}/control", direct(lambda sample: self.commands.append(bytes(sample.payload)))
+            f"{BASE}/control", direct_handler(lambda sample: self.commands.append(bytes(sample.payload)))
         )
         self.session.declare_subscriber(
-            f"{BASE}/state", direct(lambda sample: self.states.append(bytes(sample.payload)))
+            f"{BASE}/state", direct_handler(lambda sample: self.states.append(bytes(sample.payload)))
         )
-        self.session.declare_queryable(f"{BASE}/session", direct(self._forge))
+        self.session.declare_queryable(f"{BASE}/session", direct_handler(self._forge))
         self._control = self.session.declare_publisher(f"{BASE}/control", **{**CONTROL, "express": False})
         self._state = self.session.declare_publisher(f"{BASE}/state", **CONTROL)
 
@@ -68,13 +78,13 @@ class Insider:
             query.reply(f"{BASE}/session", self.queries[-1])
 
     def replay(self) -> None:
-        """Replay the commands of the last second, states, and the operator's queries."""
+        """Replay the last 50 commands (of one second), the last 10 states, and the last 3 queries of the operator."""
         for data in self.commands[-50:]:
             self._put("replayed", data)
         for data in self.states[-10:]:
             self._state.put(data)
         for data in self.queries[-3:]:
-            self.session.get(f"{BASE}/session", direct(lambda _reply: None), payload=data, timeout=1.0)
+            self.session.get(f"{BASE}/session", direct_handler(lambda _reply: None), payload=data, timeout=1.0)
 
     def alter(self) -> None:
         """Send the newest command and state with one bit flipped, and the command with a random signature."""
@@ -219,5 +229,5 @@ def wait_until(clock: MachineClock, condition: Callable[[], bool], limit_s: floa
     """Wait until a condition is true."""
     limit_ns = clock.now().mono_ns + round(limit_s * NS_PER_S)
     while not condition():
-        assert clock.now().mono_ns < limit_ns, f"not within {limit_s:g} s"
+        assert clock.now().mono_ns < limit_ns, f"the condition is not true within {limit_s:g} s"
         pause(50 * NS_PER_MS)

@@ -28,7 +28,7 @@ from lavt.experiment.runs.processes import LAVT, Processes
 from lavt.experiment.runs.real_run import LoopProcesses, start_loop
 from lavt.experiment.runs.side_configs import server_config
 
-GROUP = "239.74.163.2"
+MULTICAST_GROUP = "239.74.163.2"
 """A UDP multicast group that serves as a CAN bus between processes where the kernel has none."""
 CLOCK = MachineClock()
 MAX_WAIT_NS = 60 * NS_PER_S
@@ -38,18 +38,20 @@ TOLERANCE_MS = 60
 """Tolerance for a busy machine, added to the design's limits."""
 KIT_LOOKBACK_MS = 200
 """A stall of the host excuses a kit that disengages at most this long after the end of the stall."""
-STOP_LOOKBACK_MS, STOP_STALL_MS = 1500, 100
-"""The same for a safe stop, which begins 500 ms after the last command and is reported within 200 ms; and the shortest
-stall that can cause a safe stop."""
+STOP_LOOKBACK_MS = 1500
+"""A stall of the host excuses a safe stop that is noticed at most this long after the end of the stall. The stop begins
+500 ms after the last command and is reported within 200 ms."""
+STOP_STALL_MS = 100
+"""The shortest stall that can cause a safe stop."""
 SLOW_MACHINE_LOOKBACK_MS = 3000
-"""Many short stalls in this time before a stop may be its cause together."""
+"""Many short stalls in this time before a stop can cause the stop together."""
 TIMING_FAILURES = ("reports are missing", "did not stay enabled", "did not brake within")
 """The failures of `lavt can test-watchdog` that depend on timing."""
 GENERATIONS = ("dataspeed_gen1", "dataspeed_gen2")
 
 
 def pass_watchdog_test(profile: str, work: Path, stalls: Stalls) -> RunConfig:
-    """Return a run of a software car on a bus of its own, after its kit has passed the watchdog test."""
+    """Return a run of a software car on a bus of its own, after the car's kit has passed the watchdog test."""
     run = run_config(profile, work / f"{profile}.json")
     config = write_config(run, work / f"{profile}.yaml")
     with software_car(config) as car:
@@ -57,13 +59,13 @@ def pass_watchdog_test(profile: str, work: Path, stalls: Stalls) -> RunConfig:
         since_ns = CLOCK.now().mono_ns
         completed = subprocess.run(command, capture_output=True, text=True, check=False)
         message = f"{completed.stderr}, {car.events}"
-        assert completed.returncode == 0 or is_late(completed.stderr), message
+        assert completed.returncode == 0 or depends_on_timing(completed.stderr), message
         stalls.require(completed.returncode == 0, message, since_ns, CLOCK.now().mono_ns)
     return run
 
 
-def is_late(message: str) -> bool:
-    """Return whether the watchdog test failed in a way that a stalled host can cause."""
+def depends_on_timing(message: str) -> bool:
+    """Return whether the message of a failed watchdog test names a failure that a stalled host can cause."""
     return any(part in message for part in TIMING_FAILURES)
 
 
@@ -78,7 +80,7 @@ def run_config(profile: str, proof: Path) -> RunConfig:
     dbw = {
         "profile": profile,
         "interface": "udp_multicast",
-        "channel": GROUP,
+        "channel": MULTICAST_GROUP,
         "options": {"port": free_port()},
         "truth": f"127.0.0.1:{free_port()}",
         "steering_sign": 1,
@@ -102,7 +104,7 @@ def ms_since(at_ns: int, since_ns: int) -> float:
 class SoftwareCarProcess:
     """`lavt software-car` as a process, with the events that it printed.
 
-    A late reaction is excused by stalls of the host at that time, if they are recorded.
+    If `stalls` is given, a stall of the host at the time of a late reaction excuses the reaction.
     """
 
     process: subprocess.Popen[str]
@@ -143,7 +145,7 @@ class SoftwareCarProcess:
     def wait(self, kind: str, text: str, *, since_ns: int = 0, within_ns: int = MAX_WAIT_NS) -> int:
         """Wait for an event and return its time; raise if the watchdog brakes first.
 
-        An event that never comes is a failure, whatever the host did.
+        If the event never comes, the test fails even if the host stalled.
         """
         end_ns = CLOCK.now().mono_ns + within_ns
         braked_ns = None
@@ -171,7 +173,7 @@ class SoftwareCarProcess:
         return self.stalls.verdict(message, since_ns, until_ns, stall_ms=self.stall_ms)
 
     def wait_for_watchdog_ms(self, since_ns: int, *, tolerance_ms: float = TOLERANCE_MS) -> float:
-        """Wait until the watchdog brakes, check that it is in time, and return the time since `since_ns` in ms."""
+        """Wait until the watchdog brakes, check that it brakes in time, and return the time since `since_ns` in ms."""
         at_ns = self.wait("watchdog", "watchdog brakes: no command in time", since_ns=since_ns)
         took_ms, limit_ms = ms_since(at_ns, since_ns), KIT_TIMEOUT_MS + tolerance_ms
         if took_ms >= limit_ms:
@@ -185,7 +187,7 @@ class SoftwareCarProcess:
         self.wait("enabled", "released: ", since_ns=since_ns)
         braked_ns = self.braked_ns()
         if braked_ns is not None:
-            raise self.unexpected_release(braked_ns, f"the watchdog stopped it: {self.events}")
+            raise self.unexpected_release(braked_ns, f"the watchdog stopped the car: {self.events}")
         return ms_since(at_ns, since_ns)
 
     def end(self) -> None:
@@ -202,7 +204,7 @@ class SoftwareCarProcess:
 def software_car(
     config: str | Path, *changes: str, stalls: Stalls | None = None, stall_ms: float = STALL_MS
 ) -> Iterator[SoftwareCarProcess]:
-    """Run a software car with a server's config."""
+    """Run `lavt software-car` with a server's config; end it afterwards."""
     process = subprocess.Popen(
         [sys.executable, "-m", "lavt", "software-car", str(config), *changes, "--json"],
         stdin=subprocess.PIPE,
@@ -239,17 +241,17 @@ class RunningDrive:
 
     def reach_speed(self) -> None:
         """Wait until the car drives at more than 5 m/s; an earlier stop is a failure, unless the host stalled."""
-        self.wait(lambda status: status.get("speed_mps", 0.0) > 5.0 or self.stopped(), "it does not drive")
-        if self.stopped():
+        self.wait(lambda status: status.get("speed_mps", 0.0) > 5.0 or self.has_stopped(), "the car does not drive")
+        if self.has_stopped():
             raise self.unexpected_stop()
 
-    def stopped(self) -> bool:
+    def has_stopped(self) -> bool:
         """Return whether the watchdog has braked or the server has stopped the car."""
         return self.status().get("safety") == "safe_stop" or self.car.braked_ns() is not None
 
     def unexpected_stop(self) -> Exception:
         """Return the exception for a stop that the test did not cause; call it soon after the stop."""
-        message, braked_ns = f"it stopped: {self.loop.server.latest}, {self.car.events}", self.car.braked_ns()
+        message, braked_ns = f"the car stopped: {self.loop.server.latest}, {self.car.events}", self.car.braked_ns()
         now_ns = CLOCK.now().mono_ns
         if braked_ns is not None:
             failure = self.car.unexpected_release(braked_ns, message)
@@ -259,13 +261,13 @@ class RunningDrive:
         return excuse_slow_machine(failure, self.stalls, now_ns - SLOW_MACHINE_LOOKBACK_MS * NS_PER_MS, now_ns)
 
     def require_within(self, took_ms: float, limit_ms: float, since_ns: int, what: str) -> None:
-        """Require that something took less than a limit; only stalls until the limit excuse a delay."""
+        """Require that something took less than a limit; only a stall before the limit excuses a delay."""
         until_ns = since_ns + round(limit_ms * NS_PER_MS)
         message = f"{what} only after {took_ms:.0f} ms: {self.car.events}"
         self.stalls.require(took_ms < limit_ms, message, since_ns, until_ns, stall_ms=STOP_STALL_MS)
 
     def wait(self, condition: Callable[[dict[str, Any]], bool], failure: str) -> None:
-        """Wait for a condition on the server's status; if it is never true the test fails, whatever the host did."""
+        """Wait for a condition on the server's status; if it is never true, the test fails even if the host stalled."""
         end_ns = CLOCK.now().mono_ns + MAX_WAIT_NS
         while not condition(self.status()):
             assert CLOCK.now().mono_ns < end_ns, f"{failure}: {self.loop.server.latest}, {self.car.events}"
@@ -293,5 +295,5 @@ def running_drive(
             yield drive
         finally:
             for pid in drive.pids:
-                with suppress(ProcessLookupError):  # a stopped process cannot end, and would keep its ports
+                with suppress(ProcessLookupError):  # a suspended process cannot end, and would keep its ports
                     os.kill(pid, signal.SIGCONT)

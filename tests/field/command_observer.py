@@ -1,8 +1,8 @@
 """Record every command at the vehicle's router, in a process that is independent of the server.
 
 The observer has a session of its own with the vehicle's router, and shares only that router and the kernel's clocks
-with the server. It writes one line per command: when the observer received the command, its send time, and the stamp
-of its frame.
+with the server. It writes one line per command, with the time of reception, the command's send time and the stamp of
+its frame, among others.
 
     python tests/field/command_observer.py FILE
 """
@@ -27,7 +27,7 @@ KEY = "lavt/vehicle-1/control"
 WRITE_PERIOD_NS = 50 * NS_PER_MS
 
 
-def line_of(payload: bytes, arrived: Now) -> str:
+def format_line(payload: bytes, arrived: Now) -> str:
     """Return a line of JSON: fields of a command and its arrival time, or the size of an invalid message."""
     try:
         command = decode(Command, payload)
@@ -41,7 +41,7 @@ def line_of(payload: bytes, arrived: Now) -> str:
 def main(out: Path) -> None:
     clock = MachineClock()
     received: deque[tuple[bytes, Now]] = deque()
-    # Called in the thread that receives, and quick, so that no command is dropped or timestamped late.
+    # The callback runs in Zenoh's receiving thread and is quick, so that no command is dropped or timestamped late.
     listener: Any = zenoh.handlers.Callback(
         lambda sample: received.append((sample.payload.to_bytes(), clock.now())), indirect=False
     )
@@ -54,7 +54,7 @@ def main(out: Path) -> None:
             while True:
                 pause(WRITE_PERIOD_NS)
                 while received:
-                    file.write(line_of(*received.popleft()) + "\n")
+                    file.write(format_line(*received.popleft()) + "\n")
                 file.flush()
     except KeyboardInterrupt:
         pass

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from tests.field.namespaces import INTERNET, VEHICLE, Direction, Field
+from tests.field.namespaces import INTERNET, VEHICLE, Direction, FieldNetworks
 
 from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
@@ -106,9 +106,9 @@ class Outage:
 
 @dataclass
 class Drive:
-    """The processes of a loop, and the outages caused in it; the test reads the same clocks as the processes."""
+    """The processes of a loop, and the outages that the test has caused; test and processes read the same clocks."""
 
-    networks: Field
+    networks: FieldNetworks
     processes: Processes
     work: Path
     links: Links = MIXED
@@ -163,7 +163,7 @@ class Drive:
         wait_until(f"the vehicle is driven at {speed_mps} m/s", is_reached)
 
     def block_network(self, name: str, directions: Sequence[Direction], duration_s: float) -> None:
-        """Block the network in these directions for a while."""
+        """Block the network in these directions for a while; `name` is the outage's name."""
         self.networks.block(directions)
         begin = self.clock.now()
         pause(round(duration_s * NS_PER_S))
@@ -171,15 +171,15 @@ class Drive:
         self._note_outage(name, begin)
 
     def kill_and_restart(self, name: str, role: str, after_s: float) -> None:
-        """Kill a process and restart it; the outage ends when it is ready."""
+        """Kill a process and restart it; the outage ends when the new process is ready."""
         begin = self.clock.now()
         self.running[role].popen.kill()
         pause(round(after_s * NS_PER_S))
         self.start_process(role)
         self._note_outage(name, begin)
 
-    def freeze(self, name: str, role: str, duration_s: float) -> None:
-        """Suspend a process for a while."""
+    def freeze_process(self, name: str, role: str, duration_s: float) -> None:
+        """Freeze a process with SIGSTOP for a while; `name` is the outage's name."""
         begin = self.clock.now()
         self.running[role].popen.send_signal(signal.SIGSTOP)
         pause(round(duration_s * NS_PER_S))
@@ -205,7 +205,7 @@ class Drive:
 
 @contextmanager
 def running_loop(
-    networks: Field, work: Path, links: Links = MIXED, server_program: tuple[str, ...] = LAVT
+    networks: FieldNetworks, work: Path, links: Links = MIXED, server_program: tuple[str, ...] = LAVT
 ) -> Iterator[Drive]:
     """Run a loop in these networks."""
     with Processes(work) as processes:

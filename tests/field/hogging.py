@@ -1,8 +1,8 @@
-"""Run `lavt` with a thread that blocks the interpreter for three seconds as soon as a file exists.
+"""Run `lavt` with a thread that blocks the Python interpreter for three seconds as soon as a file exists.
 
 The environment variable `LAVT_HOG` names the directory of the file. The file is `hog_server` for the server's process
-and `hog_actuator` for the actuator's. The server starts the actuator's process by multiprocessing's `spawn`, which
-imports this file there, too, under another `__name__`.
+and `hog_actuator` for the actuator's. The server starts the actuator's process by multiprocessing's `spawn`. So the
+actuator's process imports this file, too, under another `__name__`.
 """
 
 from __future__ import annotations

@@ -4,13 +4,13 @@ Without NAT both ends have public addresses:
 
     vehicle 203.0.113.2 ── internet ── 198.51.100.2 operator
 
-With NAT there is a home router at each end. The internet has no route to the networks behind them. They let through
-only connections from inside and the ports that a test forwards:
+With NAT there is a home router at each end. The internet has no route to the networks behind the home routers. These
+let through only connections from inside and the ports that a test forwards:
 
     vehicle 192.168.1.2 ── vehicle-nat 203.0.113.2 ── internet ── 198.51.100.2 operator-nat ── 192.168.2.2 operator
 
 All are network namespaces of one kernel, and so have one clock. Their names contain the process id of the test. If a
-test was killed, the next test finds its namespaces by this id and removes them.
+test was killed, the next test finds the namespaces that it left by this id and removes them.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def programs_missing() -> bool:
 
 
 def kernel_lacks_namespaces() -> bool:
-    """Return whether this process may not make network namespaces, or they have no NAT (not checked without nft)."""
+    """Return whether network namespaces cannot be made here, or have no NAT (not checked if nft is missing)."""
     if os.geteuid() != 0 or not _works("unshare", "--net", "true"):
         return True
     return shutil.which("nft") is not None and not _works("unshare", "--net", "nft", "; ".join(NAT_RULES[:3]))
@@ -84,7 +84,7 @@ class End:
 
 
 @dataclass(frozen=True)
-class Field:
+class FieldNetworks:
     """The network namespaces of a test process; `part` is a name in the drawing above."""
 
     owner_pid: int
@@ -145,7 +145,7 @@ class Field:
         self.run(part, "ip", "route", "add", "default", "via", router)
 
     def _join(self, end: End, router: End) -> None:
-        """Link two namespaces; the second is the default route of the first."""
+        """Link two namespaces; `router` is the default route of `end`."""
         devices = [f"{link_end.device} netns {self.name(link_end.part)}" for link_end in (end, router)]
         command(f"ip link add {devices[0]} type veth peer name {devices[1]}")
         for link_end in (end, router):
@@ -171,7 +171,7 @@ OPERATOR_UPLINK_ROUTER = End("internet", "operator", INTERNET)
 
 
 @contextmanager
-def plain_field() -> Iterator[Field]:
+def plain_field() -> Iterator[FieldNetworks]:
     """Make the networks without NAT."""
     with _field("vehicle", "internet", "operator") as field:
         field._join(End("vehicle", "internet", VEHICLE), VEHICLE_UPLINK_ROUTER)
@@ -180,7 +180,7 @@ def plain_field() -> Iterator[Field]:
 
 
 @contextmanager
-def nat_field() -> Iterator[Field]:
+def nat_field() -> Iterator[FieldNetworks]:
     """Make the networks with NAT at both ends."""
     with _field("vehicle", "vehicle-nat", "internet", "operator-nat", "operator") as field:
         field._join(End("vehicle-nat", "internet", VEHICLE), VEHICLE_UPLINK_ROUTER)
@@ -193,9 +193,9 @@ def nat_field() -> Iterator[Field]:
 
 
 @contextmanager
-def _field(*parts: str) -> Iterator[Field]:
+def _field(*parts: str) -> Iterator[FieldNetworks]:
     remove_stale_namespaces()
-    field = Field(os.getpid())
+    field = FieldNetworks(os.getpid())
     try:
         field._make(*parts)
         field.run("internet", "nft", "; ".join(INTERNET_RULES))

@@ -1,10 +1,12 @@
 """Measure the effects of outages from the records of the server and of the observer (`command_observer.py`).
 
 A command is stale if, since the command or its picture was sent, the vehicle has begun a safe stop or its server was
-restarted. A command that was sent more than 500 ms before it arrived is also stale. The observer reads send times and
-stamps, and knows when a command arrived at the vehicle's machine; all processes read the clocks of one kernel. The
-server's records say when the vehicle stopped and which commands it accepted. A busy router may drop a command for one
-of its subscribers, so the few accepted commands that the observer missed are judged by the server's record of them.
+restarted. A command that was sent more than 500 ms before it arrived is also stale.
+
+The observer records each command's send time, stamp and arrival at the vehicle's machine; all processes read the
+clocks of one kernel. The server's records say when the vehicle stopped and which commands were accepted. A busy router
+can drop a command for one of its subscribers. So the observer misses a few accepted commands; for these, the server's
+record gives send time, stamp and arrival.
 """
 
 from __future__ import annotations
@@ -50,7 +52,7 @@ class ReceivedCommand:
 
 @dataclass(frozen=True)
 class AcceptedCommand:
-    """A command that the server accepted; it is fresh if its picture is newer than those of all earlier commands."""
+    """A command that the server accepted; `fresh`: its picture is newer than the pictures of all earlier commands."""
 
     command: ReceivedCommand
     fresh: bool
@@ -84,8 +86,8 @@ class OutageEffects:
 def measure(drive: Drive) -> list[OutageEffects]:
     """Measure the effects of all outages of a drive that has ended."""
     evidence = _Evidence(drive)
-    begins_ns = [outage.begin.mono_ns for outage in drive.outages] + [END_OF_TIME_NS]
-    return [evidence.measure(outage, until) for outage, until in zip(drive.outages, begins_ns[1:], strict=True)]
+    ends_ns = [outage.begin.mono_ns for outage in drive.outages[1:]] + [END_OF_TIME_NS]
+    return [evidence.measure(outage, until_ns) for outage, until_ns in zip(drive.outages, ends_ns, strict=True)]
 
 
 class _Evidence:
@@ -94,11 +96,11 @@ class _Evidence:
     def __init__(self, drive: Drive) -> None:
         records = drive.records("server")
         self.transitions = [transition for record in records for transition in transitions(record)]
-        self.accepted = [command for record in records for command in _accepted(record)]
+        self.accepted = [command for record in records for command in _accepted_commands(record)]
         truths = [record.table("truth") for record in records]
         self.truth_ns: IntArray = np.concatenate([truth.ints("mono_ns") for truth in truths])
         self.speed_mps: FloatArray = np.concatenate([truth.floats("speed_mps") for truth in truths])
-        self.observed = {command.command_id: command for command in map(_observed, drive.observed_commands())}
+        self.observed = {command.command_id: command for command in map(_parse_observed, drive.observed_commands())}
         stops = [transition.at for transition in self.transitions if transition.after == "safe_stop"]
         restarts = [_first_time(record) for record in records[1:]]
         self.stops = sorted([*stops, *restarts], key=lambda stop: stop.mono_ns)
@@ -117,10 +119,10 @@ class _Evidence:
         ]
         return OutageEffects(
             outage,
-            _since(begin_ns, degraded),
-            _since(begin_ns, stop),
+            _delay_s(begin_ns, degraded),
+            _delay_s(begin_ns, stop),
             None if stationary_since_ns is None else (stationary_since_ns - begin_ns) / NS_PER_S,
-            _since(outage.end.mono_ns, driving),
+            _delay_s(outage.end.mono_ns, driving),
             None if left_driving is None else self._since_fresh_command_s(left_driving),
             None if stop is None else self._since_fresh_command_s(stop),
             None if stop is None or stationary_since_ns is None else (stationary_since_ns - stop.at.mono_ns) / NS_PER_S,
@@ -160,7 +162,7 @@ def transitions(record: Record) -> Iterator[Transition]:
             yield Transition(Now(int(mono_ns), int(wall_ns)), before, after)
 
 
-def _accepted(record: Record) -> Iterator[AcceptedCommand]:
+def _accepted_commands(record: Record) -> Iterator[AcceptedCommand]:
     admissions = record.table("admission")
     commands = admissions.where(np.array(admissions.texts("verdict")) == "accepted")
     stamps_ns = commands.ints("stamp_ns")
@@ -173,7 +175,7 @@ def _accepted(record: Record) -> Iterator[AcceptedCommand]:
         yield AcceptedCommand(command, bool(is_fresh))
 
 
-def _observed(line: Mapping[str, Any]) -> ReceivedCommand:
+def _parse_observed(line: Mapping[str, Any]) -> ReceivedCommand:
     at = Now(line["mono_ns"], line["wall_ns"])
     return ReceivedCommand((line["epoch"], line["sequence"]), line["sent_wall_ns"], line["stamp_ns"], at)
 
@@ -183,16 +185,16 @@ def _first_time(record: Record) -> Now:
     return Now(int(truth.mono_ns[0]), int(truth.wall_ns[0]))
 
 
-def _since(begin_ns: int, transition: Transition | None) -> float | None:
+def _delay_s(begin_ns: int, transition: Transition | None) -> float | None:
     return None if transition is None else (transition.at.mono_ns - begin_ns) / NS_PER_S
 
 
-def effects_table(rows: Sequence[OutageEffects]) -> str:
+def effects_table(effects: Sequence[OutageEffects]) -> str:
     """Return the effects of outages as a Markdown table; times in seconds."""
     lines = [f"| {' | '.join(COLUMNS)} |", "|---" * len(COLUMNS) + "|"]
-    for row in rows:
-        times = (row.to_degraded_s, row.to_safe_stop_s, row.to_standstill_s, row.to_driving_s)
-        counts = (row.observed, row.stale_observed, row.accepted, row.stale_accepted)
-        cells = [row.outage.name, *("–" if time is None else f"{time:.2f}" for time in times), *map(str, counts)]
+    for effect in effects:
+        times = (effect.to_degraded_s, effect.to_safe_stop_s, effect.to_standstill_s, effect.to_driving_s)
+        counts = (effect.observed, effect.stale_observed, effect.accepted, effect.stale_accepted)
+        cells = [effect.outage.name, *("–" if time is None else f"{time:.2f}" for time in times), *map(str, counts)]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)

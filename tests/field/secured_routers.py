@@ -26,7 +26,7 @@ BASE = "lavt/vehicle-1"
 QUIC = "quic/127.0.0.1:0?mixed_rel=1"
 ROUND_NS = 20 * NS_PER_MS
 ROUNDS = 25
-"""Messages are exchanged until so many commands, states and replies have arrived."""
+"""Messages are exchanged until this many commands, states and replies have arrived."""
 LIMIT_S = 15.0
 """Time limit of an attack."""
 LONG_COMMAND_BYTES = 5000
@@ -38,7 +38,7 @@ def make_keys(directory: Path, *arguments: str) -> None:
 
 
 def tls_changes(keys: Path, name: str, action: str) -> tuple[str, ...]:
-    """Return the config changes for the keys of a router; `action` ("listen" or "connect") is what the router does."""
+    """Return the config changes for the keys of a router; `action` is "listen" or "connect"."""
     base = "transport.link.tls"
     return (
         f"{base}.root_ca_certificate={keys}/authority.pem",
@@ -58,7 +58,7 @@ def quic_endpoint(router: Process) -> str:
     return str(next(locator for locator in router.ready()["locators"] if locator.startswith("quic/")))
 
 
-def port(endpoint: str) -> int:
+def udp_port(endpoint: str) -> int:
     """Return the UDP port of an endpoint."""
     return int(endpoint.partition("?")[0].rpartition(":")[2])
 
@@ -86,7 +86,7 @@ def open_session(endpoint: str, mode: str = "client", *, authority: Path | None 
     return zenoh.open(config)
 
 
-def direct(callback: Callable[[Any], None]) -> Any:
+def direct_handler(callback: Callable[[Any], None]) -> Any:
     """Return a handler that is called in Zenoh's own thread."""
     return zenoh.handlers.Callback(callback, indirect=False)
 
@@ -100,9 +100,9 @@ class VehicleStandIn:
         self.queries: list[bytes] = []
         self.session = open_session(endpoint)
         self._state = self.session.declare_publisher(f"{BASE}/state", **STATE)
-        self.session.declare_subscriber(f"{BASE}/control", direct(self._on_command))
+        self.session.declare_subscriber(f"{BASE}/control", direct_handler(self._on_command))
         for key in (f"{BASE}/session", f"{BASE}/netem"):
-            self.session.declare_queryable(key, direct(self._on_query))
+            self.session.declare_queryable(key, direct_handler(self._on_query))
         self._alive = self.session.liveliness().declare_token(f"{BASE}/alive/server-1")
 
     def publish_state(self) -> None:
@@ -137,15 +137,15 @@ class ClientStandIn:
     def subscribe(self, key: str) -> None:
         """Store the payloads that are published on a key."""
         payloads = self.received.setdefault(key, [])
-        self.session.declare_subscriber(key, direct(lambda sample: payloads.append(sample.payload.to_bytes())))
+        self.session.declare_subscriber(key, direct_handler(lambda sample: payloads.append(sample.payload.to_bytes())))
 
-    def command(self) -> None:
+    def send_command(self) -> None:
         """Send a command."""
         self._control.put(self.name)
 
-    def query(self, key: str) -> None:
+    def send_query(self, key: str) -> None:
         """Send a query and store the replies."""
-        self.session.get(key, direct(self._on_reply), payload=self.name, timeout=1.0)
+        self.session.get(key, direct_handler(self._on_reply), payload=self.name, timeout=1.0)
 
     def _on_reply(self, reply: Any) -> None:
         if reply.ok is not None and self._own_id not in str(reply.ok.key_expr):  # a session also answers itself
@@ -154,7 +154,7 @@ class ClientStandIn:
 
 @dataclass
 class Site:
-    """A vehicle and its operator at linked routers of their own."""
+    """A vehicle and its operator, each at its own router; the routers are linked."""
 
     keys: Path
     endpoint: str
@@ -183,7 +183,7 @@ class Site:
             assert self.clock.now().mono_ns < limit_ns, f"only {rounds} rounds arrived in {LIMIT_S:g} s"
 
     def attack(self, intruder: Intruder, aims: set[str]) -> set[str]:
-        """Let an intruder attack until it has achieved `aims` or the time is over; return what it has achieved."""
+        """Let an intruder attack until it has achieved the effects `aims` or the time is over; return its effects."""
         limit_ns = self._limit_ns()
         while True:
             self._round(intruder.attempt)
@@ -196,10 +196,10 @@ class Site:
 
     def _round(self, action: Callable[[], None]) -> None:
         action()
-        self.operator.command()
+        self.operator.send_command()
         self.vehicle.publish_state()
         for channel in ("session", "netem"):
-            self.operator.query(f"{BASE}/{channel}")
+            self.operator.send_query(f"{BASE}/{channel}")
         pause(ROUND_NS)
 
     def _arrived(self) -> tuple[list[bytes], list[bytes], list[bytes]]:
@@ -219,25 +219,25 @@ class Intruder(ClientStandIn):
             self.subscribe(key)
         self.alive: list[str] = []
         session.liveliness().declare_subscriber(
-            f"{BASE}/alive/*", direct(lambda sample: self.alive.append(str(sample.key_expr))), history=True
+            f"{BASE}/alive/*", direct_handler(lambda sample: self.alive.append(str(sample.key_expr))), history=True
         )
         for key in (f"{BASE}/session", f"{BASE}/netem", "lavt/**"):
-            session.declare_queryable(key, direct(self._forge), complete=True)
+            session.declare_queryable(key, direct_handler(self._forge), complete=True)
 
     def attempt(self) -> None:
         """Send one message of each kind."""
-        self.command()
+        self.send_command()
         for key in ("**", "lavt/**", "lavt/*/control", f"{BASE}/*"):
             self.session.put(key, b"wildcard")
         self.session.delete(f"{BASE}/control")
         self.session.put(f"{BASE}/control", b"long" * (LONG_COMMAND_BYTES // 4))
         self.session.put(f"{BASE}/state", b"forged")
         for key in (f"{BASE}/session", f"{BASE}/netem", "lavt/**", "@/**"):
-            self.query(key)
+            self.send_query(key)
 
     def achieved(self, site: Site) -> set[str]:
         """Return the effects on vehicle and operator, and the kinds of messages that were received."""
-        others_messages = [
+        payloads_on_other_keys = [
             payload for key, payloads in self.received.items() for payload in payloads if key != f"{BASE}/state"
         ]
         replies = set(self.replies) - {b"forged"}
@@ -253,7 +253,7 @@ class Intruder(ClientStandIn):
             "forged state": any(state != b"state" for state in site.operator.received[f"{BASE}/state"]),
             "forged replies": b"forged" in site.operator.replies,
             "state": b"state" in self.received[f"{BASE}/state"],
-            "others' commands": site.operator.name in others_messages,
+            "others' commands": site.operator.name in payloads_on_other_keys,
             "alive": f"{BASE}/alive/server-1" in self.alive,
         }
         return {effect for effect, occurred in effects.items() if occurred}

@@ -25,10 +25,10 @@ from tests.field.secured_routers import (
     VehicleStandIn,
     make_keys,
     open_session,
-    port,
     quic_endpoint,
     start_router,
     tls_changes,
+    udp_port,
 )
 from tests.require import need
 from tests.support.stalls import BUSY_SHARE, LONG_STALL_MS, SharedResult, Stalls
@@ -56,7 +56,7 @@ ALL_EFFECTS = OPERATOR_EFFECTS | {
 MONITOR_EFFECTS = {"state", "alive"}
 EFFECTS_BY_NAME = [("operator-1", OPERATOR_EFFECTS), ("operator-2", set()), ("monitor-1", MONITOR_EFFECTS)]
 """The effects that a session can achieve, by the name in its certificate. operator-2 has a certificate, but is in no
-list."""
+access list."""
 MAX_OPEN_SITES = 3
 """The maximum number of attacked sites without access lists."""
 NOBODY = 65534
@@ -76,7 +76,7 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def others_keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make keys with the same names from another authority of the same name."""
+    """Make keys with the same names, signed by another authority of the same name."""
     directory = tmp_path_factory.mktemp("other") / "keys"
     make_keys(directory, "--vehicle=vehicle-1", "--operator=operator-1")
     return directory
@@ -155,7 +155,7 @@ def cloud_site(keys: Path) -> Iterator[Site]:
 
 @pytest.fixture(params=["direct_site", "cloud_site"])
 def site(request: pytest.FixtureRequest) -> Site:
-    """Return each kind of site in turn, without the messages of earlier tests."""
+    """Return each kind of site in turn; the messages of earlier tests are forgotten."""
     site: Site = request.getfixturevalue(request.param)
     for messages in (
         site.vehicle.commands,
@@ -181,10 +181,10 @@ def test_access_depends_on_the_certificates_name(site: Site, name: str, effects:
 
 
 def test_without_access_lists_every_attack_succeeds(keys: Path) -> None:
-    """Without access lists and a size limit all attacks succeed, so the other tests would detect a success.
+    """Without access lists and a size limit all attacks succeed, so the other tests would detect success.
 
-    Without the lists all traffic may stop for good (docs/security.md, "What is not protected"). Then the attacks that
-    have not succeeded are repeated at another site.
+    Without the lists an attack can stop all traffic for good (docs/security.md, "What is not protected"). Then the
+    attacks that have not succeeded yet are tried at a new site.
     """
     achieved: set[str] = set()
     for _ in range(MAX_OPEN_SITES):
@@ -222,7 +222,7 @@ def test_session_without_certificate_gets_no_link(site: Site, keys: Path) -> Non
 def test_operator_rejects_a_false_vehicle(
     keys: Path, keys_fixture: str, name: str, request: pytest.FixtureRequest, tmp_path: Path
 ) -> None:
-    """An operator links neither to a router with keys of another authority nor to one with a stolen operator's key."""
+    """An operator does not link to a router with another authority's keys, nor to one with an operator's key."""
     false_keys = request.getfixturevalue(keys_fixture)
     with Processes(tmp_path) as processes:
         false_vehicle = start_router(
@@ -244,7 +244,7 @@ def test_garbage_at_the_port_does_not_stop_messages(site: Site) -> None:
         def garbage() -> None:
             for prefix in (b"", b"\xc0\x00\x00\x00\x01\x08", b"\x40"):
                 for length in (0, 20, 1200, 1400):
-                    stranger.sendto(prefix + chance.bytes(length), ("127.0.0.1", port(site.endpoint)))
+                    stranger.sendto(prefix + chance.bytes(length), ("127.0.0.1", udp_port(site.endpoint)))
 
         site.exchange_messages(garbage)
     assert set(site.vehicle.commands) == {b"operator"}
@@ -281,7 +281,7 @@ def test_local_process_with_permission_can_publish_commands(direct_site: Site) -
         assert "commands" in intruder.achieved(direct_site)
 
 
-# A drive with an attacker at the operator's router, whom the permissions of the socket file should keep out.
+# The tests below judge a drive with an attacker at the operator's router, whose socket file should keep attackers out.
 
 
 @pytest.fixture(scope="module")
@@ -352,7 +352,7 @@ def test_forged_messages_are_counted(attacked_drive: attacks.AttackedDrive, stal
 
 
 def test_only_the_vehicles_states_are_accepted(attacked_drive: attacks.AttackedDrive, stalls: Stalls) -> None:
-    """Every state that reached the client's driver is one that the server sent; others are counted."""
+    """Every state that reached the client's driver is one that the server sent; all other states are counted."""
     names = ("sent_wall_ns", "state_mono_ns", "speed_mps", "safety", "applied_sequence")
     sent_states, received_states = (
         list(zip(*(record.table("state").objects(name) for name in names), strict=True))
@@ -379,7 +379,7 @@ def test_the_drive_continues_under_every_attack(attacked_drive: attacks.Attacked
 
 
 def test_a_flood_does_not_delay_the_operator(attacked_drive: attacks.AttackedDrive, stalls: Stalls) -> None:
-    """Ten thousand forged commands a second delay the operator's by at most one command period in the median."""
+    """Ten thousand forged commands a second delay the operator's commands by less than 20 ms in the median."""
     sent_ns = dict(
         zip(
             command_rows(attacked_drive.client.table("control"), "sequence"),

@@ -1,5 +1,5 @@
-"""Faults of processes in a drive over CAN, observed from the car: how and when it reacts, and that no old command is
-executed.
+"""Faults of processes in a drive over CAN, observed from the car: how and when the car reacts, and that no old command
+is executed.
 """
 
 from __future__ import annotations
@@ -34,15 +34,16 @@ COMMAND_TIMEOUT_MS = 500
 """The server stops the car this long after the last command."""
 STATIONARY_MPS = 0.05
 BUSY_S = 0.8
-"""An actuator that spins uses more than this of a second of processor time; one that waits uses a fifth of it."""
+"""An actuator that spins uses more processor time than this in a second; one that waits uses a fifth of this."""
 PARKING_STALL_MS = 135
+"""Time for which the actuator is suspended while it parks the car."""
 PARKING_LIMIT_MS = 6000
 """A car that drives at 5 m/s or more is stationary and in park within this time."""
 
 
 @pytest.fixture(scope="module")
 def tested_run(tmp_path_factory: pytest.TempPathFactory, stalls: Stalls) -> TestedRun:
-    """Return a function that returns the run with a profile; it tests the kit's watchdog at the first call."""
+    """Return a function that returns the run with a profile; its first call for a profile tests the kit's watchdog."""
     return cache(lambda profile: by_wire.pass_watchdog_test(profile, tmp_path_factory.mktemp("proof"), stalls))
 
 
@@ -78,7 +79,7 @@ def test_a_stalled_server_stops_the_car(
             server.send_signal(signal.SIGCONT)
             pause(NS_PER_S)
             assert drive_in_progress.car.event_ns("enabled", "enabled: ", since_ns=since_ns) is None, (
-                "no old command is accepted"
+                "the kit accepted an old command"
             )
             drive_in_progress.wait(
                 lambda status: status.get("safety") == "safe_stop", "the server does not report its stop"
@@ -92,7 +93,7 @@ def test_a_stalled_server_stops_the_car(
 def test_a_stalled_actuator_leaves_a_braking_car(
     fault: str, profile: str, tmp_path: Path, print_report: PrintReport, drive: DriveWithProfile
 ) -> None:
-    """If the actuator's process does not run, no frame is sent; the kit disengages after 100 ms and brakes."""
+    """If the actuator's process does not run, the kit disengages and brakes after 100 ms, and stays disengaged."""
     with drive(profile, LAVT_WITH_HOG) as drive_in_progress:
         since_ns = CLOCK.now().mono_ns
         if fault == "busy":
@@ -112,7 +113,7 @@ def test_a_stalled_actuator_leaves_a_braking_car(
                 lambda status: status.get("safety") == "safe_stop", "the server does not report its stop"
             )
         assert drive_in_progress.car.event_ns("enabled", "enabled: ", since_ns=since_ns) is None, (
-            "no old command is accepted"
+            "the kit accepted an old command"
         )
 
 
@@ -143,7 +144,7 @@ def test_a_stall_while_parking_ends(print_report: PrintReport, drive: DriveWithP
             f"suspended for {PARKING_STALL_MS} ms while parking: the actuator uses {used_s:.2f} s of the next second"
         )
         assert used_s < BUSY_S
-        assert server.poll() is None, "the actuator reports its state"
+        assert server.poll() is None, "the server ended, so the actuator did not report its state"
         server.send_signal(signal.SIGINT)
         assert server.wait(20) == 0
         assert not Path(f"/proc/{drive_in_progress.actuator_pid}").exists()
@@ -160,7 +161,7 @@ def used_cpu_s(pid: int) -> float:
 def test_a_stalled_machine_leaves_a_braking_car(
     fault: signal.Signals, print_report: PrintReport, drive: DriveWithProfile
 ) -> None:
-    """If both processes are frozen or killed, the kit disengages after 100 ms and brakes, and it stays disengaged."""
+    """If both processes are frozen or killed, the kit disengages and brakes after 100 ms, and stays disengaged."""
     with drive("dataspeed_gen2") as drive_in_progress:
         since_ns = CLOCK.now().mono_ns
         for pid in drive_in_progress.pids:

@@ -8,7 +8,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from tests.field.namespaces import OPERATOR, VEHICLE, Direction, Field, plain_field, remove_stale_namespaces
+from tests.field.namespaces import OPERATOR, VEHICLE, Direction, FieldNetworks, plain_field, remove_stale_namespaces
 
 pytestmark = pytest.mark.usefixtures("namespaces")
 
@@ -54,10 +54,10 @@ def test_an_outage_has_a_direction() -> None:
 
 
 def test_namespaces_of_a_killed_test_are_removed() -> None:
-    """The namespaces of a test whose process has ended are removed with their processes, and no others."""
+    """The namespaces of a test whose process has ended are removed with their processes; other namespaces remain."""
     ended_test = subprocess.Popen(["true"])
     ended_test.wait()
-    stale_field = Field(ended_test.pid)
+    stale_field = FieldNetworks(ended_test.pid)
     stale_field._make("vehicle")
     left_behind = stale_field.inside("vehicle", lambda: subprocess.Popen(["sleep", "600"]))
     with plain_field() as own_field:

@@ -15,7 +15,7 @@ from statistics import median
 import numpy as np
 import pytest
 from tests.field.driving import TCP, Drive, running_loop
-from tests.field.namespaces import Direction, Field, plain_field
+from tests.field.namespaces import Direction, FieldNetworks, plain_field
 from tests.field.outage_effects import OutageEffects, effects_table, measure
 from tests.support.stalls import BUSY_SHARE, LONG_STALL_MS, Stalls
 
@@ -25,7 +25,7 @@ from lavt.experiment.runs.processes import LAVT
 from lavt.recording.record import read_record
 
 pytestmark = [pytest.mark.timeout(900), pytest.mark.usefixtures("namespaces")]
-"""The drive of the fixture takes two minutes on a quiet machine."""
+"""The drive of the fixture `all_outages` takes two minutes on a quiet machine."""
 
 DEGRADED_AFTER_S = 0.3
 STOP_AFTER_S = 0.5
@@ -41,15 +41,15 @@ SHORT_S = 0.3
 LONG_S = (1.0, 3.0)
 """Shorter and longer than the routers' lease of 2 s."""
 RESTART_AFTER_S = 3.0
-"""Time from the end of a process to its restart, and the duration of a suspension."""
+"""Time from the end of a process to its restart, and the time for which the client is frozen."""
 SPEED_MPS = 5.0
 LOAD_MARGIN_S = 0.15
-"""The delay that other programs may add to a single measured time."""
+"""The delay that other programs can add to a single measured time."""
 MEDIAN_MARGIN_S = 0.03
 STALL_LOOKBACK_S = 0.5
 """If the vehicle is degraded when an outage begins, a stall in this time before the outage explains it."""
 MAX_UNOBSERVED = 0.05
-"""The largest share of accepted commands that may have been dropped on their way to the observer."""
+"""The largest allowed share of accepted commands that the observer missed."""
 BRAKE_DELAY_S = 0.5
 """Time for the brake pressure to build up."""
 CONTINUES_WITHIN_S = 0.5
@@ -59,13 +59,13 @@ RECOVERY_S = 10.0
 RECOVERY_NS = round(RECOVERY_S * NS_PER_S)
 MEDIAN_RECOVERY_S = 3.0
 
-SHORT = tuple(f"{name} {SHORT_S:g} s{again}" for again in ("", ", again") for name in DIRECTIONS)
-LONG = (*(f"{name} {duration_s:g} s" for duration_s in LONG_S for name in DIRECTIONS), "both ways 10 s")
+SHORT_OUTAGES = tuple(f"{name} {SHORT_S:g} s{again}" for again in ("", ", again") for name in DIRECTIONS)
+LONG_OUTAGES = (*(f"{name} {duration_s:g} s" for duration_s in LONG_S for name in DIRECTIONS), "both ways 10 s")
 PROCESS_KILLED = ("vehicle's router killed", "operator's router killed", "client killed")
 CLIENT_FROZEN = "client frozen"
-STOPPING_OUTAGES = (*LONG, *PROCESS_KILLED, CLIENT_FROZEN)
+STOPPING_OUTAGES = (*LONG_OUTAGES, *PROCESS_KILLED, CLIENT_FROZEN)
 SERVER_KILLED = "server killed"
-ALL_OUTAGES = (*SHORT, *STOPPING_OUTAGES, SERVER_KILLED)
+ALL_OUTAGES = (*SHORT_OUTAGES, *STOPPING_OUTAGES, SERVER_KILLED)
 
 BUFFERED_OUTAGES = ("both ways 1 s", "both ways 3 s")
 """Outages of the link that buffers messages."""
@@ -88,7 +88,7 @@ def begin_ns(effect: OutageEffects, after_s: float = 0.0) -> int:
 
 
 @pytest.fixture(scope="module")
-def field(namespaces: None) -> Iterator[Field]:  # noqa: ARG001 (skips)
+def field(namespaces: None) -> Iterator[FieldNetworks]:  # noqa: ARG001 (skips)
     with plain_field() as field:
         yield field
 
@@ -109,16 +109,18 @@ def measure_and_print(drive: Drive, work: Path, print_report: PrintReport, title
 
 
 @pytest.fixture(scope="module")
-def all_outages(field: Field, tmp_path_factory: pytest.TempPathFactory, print_report: PrintReport) -> OutageDriveResult:
+def all_outages(
+    field: FieldNetworks, tmp_path_factory: pytest.TempPathFactory, print_report: PrintReport
+) -> OutageDriveResult:
     """Drive through all outages in turn, the killed server last."""
     work = tmp_path_factory.mktemp("outages")
     with running_loop(field, work) as drive:
-        cause_network_outages(drive, (*SHORT, *LONG))
+        cause_network_outages(drive, (*SHORT_OUTAGES, *LONG_OUTAGES))
         for name, role in zip(PROCESS_KILLED, ("vehicle-router", "operator-router", "client"), strict=True):
             drive.reach_speed(SPEED_MPS)
             drive.kill_and_restart(name, role, RESTART_AFTER_S)
         drive.reach_speed(SPEED_MPS)
-        drive.freeze(CLIENT_FROZEN, "client", RESTART_AFTER_S)
+        drive.freeze_process(CLIENT_FROZEN, "client", RESTART_AFTER_S)
         drive.reach_speed(SPEED_MPS)
         drive.kill_and_restart(SERVER_KILLED, "server", RESTART_AFTER_S)
         drive.reach_speed(SPEED_MPS)
@@ -126,7 +128,7 @@ def all_outages(field: Field, tmp_path_factory: pytest.TempPathFactory, print_re
 
 
 def drive_with_buffering_link(
-    field: Field, work: Path, print_report: PrintReport, title: str, program: tuple[str, ...]
+    field: FieldNetworks, work: Path, print_report: PrintReport, title: str, program: tuple[str, ...]
 ) -> OutageDriveResult:
     with running_loop(field, work, TCP, program) as drive:
         cause_network_outages(drive, BUFFERED_OUTAGES)
@@ -135,14 +137,16 @@ def drive_with_buffering_link(
 
 
 @pytest.fixture(scope="module")
-def buffered(field: Field, tmp_path_factory: pytest.TempPathFactory, print_report: PrintReport) -> OutageDriveResult:
+def buffered(
+    field: FieldNetworks, tmp_path_factory: pytest.TempPathFactory, print_report: PrintReport
+) -> OutageDriveResult:
     """Drive with routers linked by TCP with a lease of 10 s."""
     return drive_with_buffering_link(field, tmp_path_factory.mktemp("buffered"), print_report, "TCP, lease 10 s", LAVT)
 
 
 @pytest.fixture(scope="module")
 def buffered_unguarded(
-    field: Field, tmp_path_factory: pytest.TempPathFactory, print_report: PrintReport
+    field: FieldNetworks, tmp_path_factory: pytest.TempPathFactory, print_report: PrintReport
 ) -> OutageDriveResult:
     """Drive with the same routers and a server that accepts every command."""
     work = tmp_path_factory.mktemp("unguarded")
@@ -187,21 +191,22 @@ def test_the_vehicle_is_stationary_in_time(all_outages: OutageDriveResult, outag
 
 
 def test_most_outages_of_300_ms_cause_no_stop(all_outages: OutageDriveResult, stalls: Stalls) -> None:
-    """Most outages of 0.3 s at most degrade the vehicle, and the drive continues at once.
+    """Most outages of 0.3 s cause no safe stop, and the vehicle is driven again within 0.5 s.
 
-    After lost commands QUIC, on which the routers' link is based, may delay the next ones until it has probed.
+    The others cause a stop because QUIC, on which the routers' link is based, can delay commands after a loss until it
+    has probed the link.
     """
-    effects = [all_outages.effects[name] for name in SHORT]
+    effects = [all_outages.effects[name] for name in SHORT_OUTAGES]
     without_stop = [effect for effect in effects if effect.to_safe_stop_s is None]
 
     with stalls.excusing_failures(begin_ns(effects[0]), begin_ns(effects[-1], RECOVERY_S)):
-        assert len(without_stop) >= len(SHORT) / 2
+        assert len(without_stop) >= len(SHORT_OUTAGES) / 2
         assert all((effect.to_driving_s or 0.0) < CONTINUES_WITHIN_S for effect in without_stop)
 
 
 @pytest.mark.parametrize("outage", [*STOPPING_OUTAGES, SERVER_KILLED])
 def test_the_drive_recovers_by_itself(all_outages: OutageDriveResult, stalls: Stalls, outage: str) -> None:
-    """After an outage a client that may arm again drives again within 10 s."""
+    """After an outage a client with the permission to arm again drives the vehicle again within 10 s."""
     effect = all_outages.effects[outage]
 
     assert effect.to_driving_s is not None
@@ -212,7 +217,7 @@ def test_the_drive_recovers_by_itself(all_outages: OutageDriveResult, stalls: St
 
 
 def test_the_median_recovery_is_short(all_outages: OutageDriveResult, stalls: Stalls) -> None:
-    """In the median the vehicle is driven again within 3 s of an outage's end, of which arming takes one."""
+    """In the median the vehicle is driven again within 3 s of an outage's end; arming takes 1 s of this."""
     effects = [all_outages.effects[outage] for outage in (*STOPPING_OUTAGES, SERVER_KILLED)]
 
     with stalls.excusing_failures(begin_ns(effects[0]), begin_ns(effects[-1], RECOVERY_S), share=BUSY_SHARE):
@@ -221,7 +226,7 @@ def test_the_median_recovery_is_short(all_outages: OutageDriveResult, stalls: St
 
 @pytest.mark.parametrize("outage", ALL_OUTAGES)
 def test_nothing_stale_is_accepted(all_outages: OutageDriveResult, stalls: Stalls, outage: str) -> None:
-    """No command that the observer knows to be stale is accepted, and the observer recorded the accepted commands."""
+    """No stale command is accepted, and the observer recorded at least 95 % of the accepted commands."""
     effect = all_outages.effects[outage]
 
     assert effect.stale_accepted == 0

@@ -27,6 +27,8 @@ ATTACK_NS = 4 * NS_PER_S
 RATE_HZ = 1000
 """Replays a second: twice the 480 that made all video unreadable before hellos were numbered."""
 ETH_P_IP = 0x0800
+PROTOCOL_AT, SOURCE_AT, SOURCE_PORT_AT = 9, 12, 20
+"""Offsets of fields in the IP header (20 bytes) and the UDP header after it."""
 HEADERS_BYTES = 20 + 8
 """Size of the IP and the UDP header."""
 HELLO = b"LAVT\x01"
@@ -40,12 +42,12 @@ def spoofed(source: tuple[str, int], target: tuple[str, int], payload: bytes) ->
 
 
 def overhear(listener: socket.socket) -> tuple[tuple[str, int], bytes]:
-    """Return source and payload of the next hello."""
+    """Return the source (address, port) and the payload of the next hello."""
     while True:
         packet = listener.recv(2048)
-        if packet[9] == socket.IPPROTO_UDP and packet[HEADERS_BYTES:].startswith(HELLO):
-            (port,) = struct.unpack_from(">H", packet, 20)
-            return (socket.inet_ntoa(packet[12:16]), port), packet[HEADERS_BYTES:]
+        if packet[PROTOCOL_AT] == socket.IPPROTO_UDP and packet[HEADERS_BYTES:].startswith(HELLO):
+            (port,) = struct.unpack_from(">H", packet, SOURCE_PORT_AT)
+            return (socket.inet_ntoa(packet[SOURCE_AT : SOURCE_AT + 4]), port), packet[HEADERS_BYTES:]
 
 
 def total_count(record: Record, name: str) -> int:
@@ -56,7 +58,7 @@ def total_count(record: Record, name: str) -> int:
 def test_a_replayed_hello_leaves_encrypted_video_readable(tmp_path: Path, print_report: Callable[[str], None]) -> None:
     """A hello, replayed from the client's and from the attacker's address, makes no packet of the video unreadable.
 
-    The attacker also forwards the challenges that it gets to the client, with the vehicle's address.
+    The server sends challenges to the attacker. The attacker forwards these to the client, with the vehicle's address.
     """
     keys = tmp_path / "keys"
     make_keys(keys, "--vehicle", "vehicle-1", "--operator", "operator-1", "--host", VEHICLE)
@@ -100,13 +102,14 @@ def test_a_replayed_hello_leaves_encrypted_video_readable(tmp_path: Path, print_
             pause(NS_PER_S)
         (server_record,), (client_record,) = drive.records("server"), drive.records("client")
     packets, unreadable = total_count(client_record, "packets"), total_count(client_record, "packets_forged")
-    at_server = total_count(server_record, "path_stale"), total_count(server_record, "datagrams_screened_out")
+    stale_hellos = total_count(server_record, "path_stale")
+    screened_out = total_count(server_record, "datagrams_screened_out")
     pictures_ns = client_record.table("picture").mono_ns
     pictures_during_attack = int(((pictures_ns > begin_ns) & (pictures_ns < end_ns)).sum())
     print_report(
         f"{2 * sent} replays, {forwarded} challenges to the attacker: {unreadable} packets unreadable, {packets} "
         f"readable, {pictures_during_attack} pictures in {(end_ns - begin_ns) / NS_PER_S:.1f} s; "
-        f"at the server {at_server}"
+        f"at the server {stale_hellos} stale hellos, {screened_out} datagrams screened out"
     )
 
     assert sent > 0.5 * RATE_HZ * ATTACK_NS / NS_PER_S

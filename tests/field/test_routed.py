@@ -1,4 +1,4 @@
-"""A vehicle and an operator, each behind a NAT of its own, and a router in the cloud that both dial.
+"""A vehicle and an operator, each behind a NAT of its own, and a router in the cloud that both ends dial.
 
 Commands, states and session requests go through the cloud. Video and clock probe take one of two paths: directly, with
 two UDP ports that the vehicle's NAT forwards (the client sends first, so its own NAT needs no setting); or, without
@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.field.driving import CLOUD, Links, running_loop, through_rendezvous
-from tests.field.namespaces import INTERNET, NEXT_OPERATOR, OPERATOR, VEHICLE, Field, nat_field
+from tests.field.namespaces import INTERNET, NEXT_OPERATOR, OPERATOR, VEHICLE, FieldNetworks, nat_field
 from tests.field.outage_effects import transitions
 from tests.field.secured_routers import make_keys
 from tests.support.stalls import Stalls
@@ -34,12 +34,13 @@ VIDEO_PORT, PROBE_PORT = 5600, 5602
 HELLO_BYTES, CHALLENGE_BYTES, ANSWER_BYTES = 46, 46, 70
 """Sizes of the datagrams that validate the video's path. RTCP datagrams have other sizes: multiples of 4 bytes."""
 UNSOLICITED_S = 1.0
-"""Time to wait for a datagram that may not pass; within one kernel one that passes arrives at once."""
+"""Time to wait for a datagram that the NAT must drop. Within one kernel, a datagram that passes arrives at once."""
 SPEED_MPS = 5.0
 WINDOW_S = 3.0
+"""Time over which rates are measured: before the change of address, and again at the end of the drive."""
 WINDOW_NS = round(WINDOW_S * NS_PER_S)
 NEW_PATH_S = 3.0
-"""Limit from a change of address to video at the new one; the client sends a hello 0.15 s after the last packet."""
+"""Limit from a change of address to video at the new address. The client sends a hello 0.15 s after the last packet."""
 STALL_MS = 100
 RECOVERY_S = 10.0
 """Limit from a change of address until a vehicle that has stopped is driven again."""
@@ -52,7 +53,7 @@ def video_path(request: pytest.FixtureRequest) -> str:
 
 
 @pytest.fixture(scope="module")
-def field(namespaces: None, video_path: str) -> Iterator[Field]:  # noqa: ARG001 (skips)
+def field(namespaces: None, video_path: str) -> Iterator[FieldNetworks]:  # noqa: ARG001 (skips)
     with nat_field() as field:
         if video_path == "forwarded ports":
             field.forward_ports((VIDEO_PORT, PROBE_PORT))
@@ -78,21 +79,21 @@ class AddressChangeDrive:
     ended: Now
     server: Record
     client: Record
-    to_old_until_change: int
-    """Video packets to the old address until it changed."""
-    to_old_after_3_s: int
+    sent_to_old_until_change: int
+    """Video packets to the old address until the change."""
+    sent_to_old_after_3_s: int
     """Video packets to the old address until 3 s after the change."""
-    to_old: int
+    sent_to_old: int
     """Video packets to the old address until the end."""
-    to_new: int
+    sent_to_new: int
     """Video packets to the new address until the end."""
 
-    def before(self, record: Record, channel: str) -> Table:
+    def rows_before(self, record: Record, channel: str) -> Table:
         """Return the rows of a channel from the last seconds before the change."""
         table = record.table(channel)
         return table.where((table.mono_ns > self.changed.mono_ns - WINDOW_S * NS_PER_S) & self._until_change(table))
 
-    def after(self, record: Record, channel: str) -> Table:
+    def rows_after(self, record: Record, channel: str) -> Table:
         """Return the rows of a channel from the change on."""
         table = record.table(channel)
         return table.where(~self._until_change(table) & (table.mono_ns < self.ended.mono_ns))
@@ -103,7 +104,7 @@ class AddressChangeDrive:
 
 @pytest.fixture(scope="module")
 def address_change(
-    field: Field,
+    field: FieldNetworks,
     links: Links,
     video_path: str,
     tmp_path_factory: pytest.TempPathFactory,
@@ -111,20 +112,25 @@ def address_change(
 ) -> AddressChangeDrive:
     """Drive while the operator's address changes."""
     work: Path = tmp_path_factory.mktemp("routed")
-    field.count_packets("to_old", f"ip daddr {OPERATOR} udp sport {VIDEO_PORT}")
-    field.count_packets("to_new", f"ip daddr {NEXT_OPERATOR} udp sport {VIDEO_PORT}")
+    field.count_packets("sent_to_old", f"ip daddr {OPERATOR} udp sport {VIDEO_PORT}")
+    field.count_packets("sent_to_new", f"ip daddr {NEXT_OPERATOR} udp sport {VIDEO_PORT}")
     with running_loop(field, work, links) as drive:
         drive.reach_speed(SPEED_MPS)
         pause(round(WINDOW_S * NS_PER_S))
-        to_old_until_change = field.packet_count("to_old")
+        sent_to_old_until_change = field.packet_count("sent_to_old")
         changed = drive.clock.now()
         field.change_operator_address()
         pause(round(NEW_PATH_S * NS_PER_S))
-        to_old_after_3_s = field.packet_count("to_old")
+        sent_to_old_after_3_s = field.packet_count("sent_to_old")
         drive.reach_speed(SPEED_MPS)
         pause(round(WINDOW_S * NS_PER_S))
         ended = drive.clock.now()
-        counts = to_old_until_change, to_old_after_3_s, field.packet_count("to_old"), field.packet_count("to_new")
+        counts = (
+            sent_to_old_until_change,
+            sent_to_old_after_3_s,
+            field.packet_count("sent_to_old"),
+            field.packet_count("sent_to_new"),
+        )
     (server,), (client,) = drive.records("server"), drive.records("client")
     address_change = AddressChangeDrive(changed, ended, server, client, *counts)
     pictures_s, states_s = (longest_gap_s(address_change, channel) for channel in ("picture", "state"))
@@ -151,7 +157,7 @@ def first_ns(datagrams: Table, size_bytes: int) -> int:
 
 
 def had_picture_gap(address_change: AddressChangeDrive, at_ns: int) -> bool:
-    """Return whether the client's pictures had a gap in the second before `at_ns`, which causes a re-validation."""
+    """Return whether the client's pictures had a gap, which causes a re-validation, in the second before `at_ns`."""
     return gap_s(address_change.client.table("picture"), at_ns - NS_PER_S, at_ns) * NS_PER_S > HELLO_AGAIN_NS / 2
 
 
@@ -160,8 +166,8 @@ def per_second(table: Table) -> float:
     return len(table) / WINDOW_S
 
 
-def test_nat_drops_unsolicited_datagrams(field: Field, video_path: str) -> None:
-    """The vehicle's NAT passes datagrams to a forwarded port, with the operator's public address, and drops others."""
+def test_nat_drops_unsolicited_datagrams(field: FieldNetworks, video_path: str) -> None:
+    """The vehicle's NAT passes datagrams to a forwarded port, from the operator's public address, and drops others."""
     forwarded, closed = (
         field.inside("vehicle", lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2)
     )
@@ -186,15 +192,15 @@ def test_nat_drops_unsolicited_datagrams(field: Field, video_path: str) -> None:
 
 def test_everything_passes_two_nats_and_a_cloud(address_change: AddressChangeDrive, stalls: Stalls) -> None:
     """Video, commands, states, clock probe and session work at their rates through two NATs and a cloud."""
-    admissions = address_change.before(address_change.server, "admission")
+    admissions = address_change.rows_before(address_change.server, "admission")
 
     with stalls.excusing_failures(
         address_change.changed.later(-WINDOW_NS).mono_ns, address_change.changed.mono_ns, stall_ms=STALL_MS
     ):
-        assert per_second(address_change.before(address_change.client, "picture")) >= 25
+        assert per_second(address_change.rows_before(address_change.client, "picture")) >= 25
         assert admissions.texts("verdict").count("accepted") / WINDOW_S >= 45
-        assert per_second(address_change.before(address_change.client, "state")) >= 45
-        assert per_second(address_change.before(address_change.client, "clock_probe")) >= 1.5
+        assert per_second(address_change.rows_before(address_change.client, "state")) >= 45
+        assert per_second(address_change.rows_before(address_change.client, "clock_probe")) >= 1.5
     assert len(address_change.client.table("session_reply")) > 0
     states = [
         transition.after
@@ -207,15 +213,15 @@ def test_everything_passes_two_nats_and_a_cloud(address_change: AddressChangeDri
 
 def test_a_client_whose_address_changes_keeps_its_video(address_change: AddressChangeDrive, stalls: Stalls) -> None:
     """Within 3 s the video goes to the client's new address at its full rate, and no longer to the old one."""
-    pictures = address_change.after(address_change.client, "picture")
+    pictures = address_change.rows_after(address_change.client, "picture")
     last_pictures = pictures.where(pictures.mono_ns > address_change.ended.mono_ns - WINDOW_S * NS_PER_S)
 
     with stalls.excusing_failures(address_change.changed.mono_ns, address_change.ended.mono_ns, stall_ms=STALL_MS):
         assert longest_gap_s(address_change, "picture") <= NEW_PATH_S
         assert per_second(last_pictures) >= 25
-    assert address_change.to_old_until_change > 0
-    assert address_change.to_old == address_change.to_old_after_3_s
-    assert address_change.to_new > 100
+    assert address_change.sent_to_old_until_change > 0
+    assert address_change.sent_to_old == address_change.sent_to_old_after_3_s
+    assert address_change.sent_to_new > 100
 
 
 def test_only_a_new_validation_moves_the_video(address_change: AddressChangeDrive) -> None:
@@ -224,14 +230,14 @@ def test_only_a_new_validation_moves_the_video(address_change: AddressChangeDriv
     Before the change of address a re-validation occurs only after frame loss.
     """
     received, sent = (
-        address_change.after(address_change.server, "feedback"),
-        address_change.after(address_change.server, "rtp"),
+        address_change.rows_after(address_change.server, "feedback"),
+        address_change.rows_after(address_change.server, "rtp"),
     )
     hello_ns = first_ns(received, HELLO_BYTES)
     challenge_ns = first_ns(sent, CHALLENGE_BYTES)
     answer_ns = first_ns(received, ANSWER_BYTES)
-    pictures_ns = address_change.after(address_change.client, "picture").mono_ns
-    before = address_change.before(address_change.server, "feedback")
+    pictures_ns = address_change.rows_after(address_change.client, "picture").mono_ns
+    before = address_change.rows_before(address_change.server, "feedback")
     validations_before_ns = before.mono_ns[np.isin(before.ints("size_bytes"), [HELLO_BYTES, ANSWER_BYTES])]
 
     assert all(had_picture_gap(address_change, at_ns) for at_ns in validations_before_ns)
@@ -253,12 +259,12 @@ def test_a_drive_continues_after_a_change_of_address(address_change: AddressChan
         assert longest_gap_s(address_change, "clock_probe") <= RECOVERY_S
         assert not changes or changes[-1].after == "driving"
         assert not changes or changes[-1].at.mono_ns - address_change.changed.mono_ns <= RECOVERY_S * NS_PER_S
-    assert "accepted" in address_change.after(address_change.server, "admission").texts("verdict")[-20:]
+    assert "accepted" in address_change.rows_after(address_change.server, "admission").texts("verdict")[-20:]
 
 
 @pytest.mark.parametrize("video_path", ["rendezvous"], indirect=True)
 def test_a_vehicle_whose_address_changes_keeps_its_video(
-    field: Field, links: Links, tmp_path: Path, print_report: Callable[[str], None], stalls: Stalls
+    field: FieldNetworks, links: Links, tmp_path: Path, print_report: Callable[[str], None], stalls: Stalls
 ) -> None:
     """After a change of the vehicle's address, pictures arrive again within 3 s at their full rate."""
     with running_loop(field, tmp_path, links) as drive:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import pytest
-from tests.interop.tools import PACKAGES, missing
+from tests.interop.tools import PACKAGES, missing_tools
 from tests.require import need
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup() -> None:
-    if absent := missing():
+    if absent := missing_tools():
         need("gstreamer", f"needs {', '.join(absent)}: apt-get install {' '.join(PACKAGES)}")
 
 

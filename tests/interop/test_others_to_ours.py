@@ -56,7 +56,7 @@ class GStreamerCase:
 
     encoder: str
     packets: tuple[str, ...]
-    """Packet types that must occur; the first one must be the most frequent."""
+    """Packet types that must occur; the first type must be the most frequent."""
     aggregate: str = "none"
     profile: str = "constrained-baseline"
     slices: int = 1
@@ -78,7 +78,7 @@ CASES = {
 
 @pytest.fixture(scope="module")
 def raw(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Write stamped pictures with motion as raw I420."""
+    """Write stamped pictures with motion to a file as raw I420, and return its path."""
     texture = stream(1, "texture").integers(40, 216, (HEIGHT_PX, WIDTH_PX, 3), dtype=np.uint8)
     smooth_texture = cv2.GaussianBlur(texture, (0, 0), 4.0)
     path = tmp_path_factory.mktemp("raw") / "frames.i420"
@@ -135,7 +135,7 @@ def check_each_picture(units: Sequence[AccessUnit]) -> None:
     pictures = [decoder.decode(unit.data) for unit in units]
     assert not any(picture is None or picture.corrupt for picture in pictures)
     assert [read_stamp(picture.luma) for picture in pictures if picture is not None] == STAMPS_NS
-    # The sender's RTP clock begins anywhere and then runs like the stamps, within 1/90000 s, because both are rounded.
+    # The sender's RTP clock begins at a random value and then runs like the stamps, within 1/90000 s: both are rounded.
     differences = [rtp_timestamp(stamp_ns) - unit.timestamp for stamp_ns, unit in zip(STAMPS_NS, units, strict=True)]
     assert {(difference - differences[0] + 1) % 2**32 for difference in differences} <= {0, 1, 2}
 
@@ -145,7 +145,10 @@ def count_slices(unit: AccessUnit) -> int:
 
 
 def profile_and_cabac(keyframe: AccessUnit) -> tuple[int, bool]:
-    """Return profile_idc and, after two numbers of one bit, entropy_coding_mode_flag (H.264, 7.3.2.1 and 7.3.2.2)."""
+    """Return profile_idc and entropy_coding_mode_flag (H.264, 7.3.2.1 and 7.3.2.2).
+
+    Two numbers of one bit each precede the flag.
+    """
     nal_units = {nal[0] & 0x1F: nal for nal in split_nal_units(keyframe.data)}
     sequence_parameters, picture_parameters = nal_units[7], nal_units[8]
     return sequence_parameters[1], bool(picture_parameters[1] & 0x20)
@@ -176,7 +179,7 @@ def test_ffmpeg_is_received(raw: Path, tmp_path: Path) -> None:
 
 
 def test_watch_accepts_the_stamps_of_gstreamer(raw: Path, tmp_path: Path) -> None:
-    """`lavt watch` accepts the stamps of all pictures that GStreamer sends, except the first from which it learns."""
+    """`lavt watch` accepts the stamps of all pictures from GStreamer, except the first ones, from which it learns."""
     options = ["--bind", "127.0.0.1", "--port", "0", "--sender", "foreign", "--json"]
     program = [sys.executable, "-m", "lavt", "watch", *options]
     with running(program, tmp_path / "watched", output=True) as watching:

@@ -61,7 +61,7 @@ class AbsentClientLink:
 
 
 def config_changes(port: int) -> list[str]:
-    """Return the changes of the shipped config: the receiver, small pictures, a keyframe every 0.5 s."""
+    """Return changes of the shipped config: send the video to `port`, as small pictures with a keyframe every 0.5 s."""
     return [
         f"video.send_to=['127.0.0.1:{port}']",
         f"camera.width_px={WIDTH_PX}",
@@ -115,7 +115,7 @@ def test_gstreamer_receives_each_frame(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("flags", ["", "-fflags nobuffer -flags low_delay"])
 def test_ffmpeg_receives_each_frame_with_our_sdp(flags: str, tmp_path: Path) -> None:
-    """With the output of `lavt sdp` ffmpeg receives and decodes our stream, and each picture has its stamp."""
+    """With the output of `lavt sdp`, ffmpeg receives and decodes our stream; each picture has the frame's stamp."""
     port, sdp = free_port_pair(), tmp_path / "lavt.sdp"
     settings = [part for change in config_changes(port) for part in ("--set", change)]
     with sdp.open("wb") as file:

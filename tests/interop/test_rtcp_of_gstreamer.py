@@ -92,7 +92,7 @@ class GStreamerSession:
         self._process.stdin.flush()
 
     def read(self, kind: str) -> Any:
-        """Wait for its next message of a kind and return the content."""
+        """Wait for GStreamer's next message of a kind and return the content."""
         assert self._process.stdout is not None
         for line in self._process.stdout:
             message_kind, content = json.loads(line)
@@ -130,7 +130,7 @@ def read_report_with_age(session: GStreamerSession, highest_sequence: int) -> Re
 
 @pytest.mark.timeout(60)
 def test_gstreamer_reads_our_sender_reports() -> None:
-    """GStreamer's receiver parses all fields of our sender report and returns its time in short format."""
+    """GStreamer's receiver parses all fields of our sender report and returns the report's time in short format."""
     with gstreamer() as session:
         for number in range(65_530, 65_540):
             session.push("rtp", packet(number, OUR_SSRC))

@@ -1,4 +1,4 @@
-"""GStreamer and ffmpeg: checks that they are installed, and running them so that none outlives its test."""
+"""Check that GStreamer and ffmpeg are installed, and run them so that no tool outlives its test."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ LIMIT_S = 60.0
 
 
 @functools.cache
-def missing() -> tuple[str, ...]:
+def missing_tools() -> tuple[str, ...]:
     """Return the missing programs, Python modules and GStreamer elements."""
     if absent := tuple(program for program in PROGRAMS if shutil.which(program) is None):
         return absent
@@ -80,7 +80,7 @@ def running(command: list[str], log: Path, *, output: bool = False) -> Iterator[
 
 
 def read_frames(output: IO[bytes], frame_bytes: int, count: int) -> Iterator[bytes]:
-    """Yield up to `count` raw frames that a tool writes; fewer if the tool ends before."""
+    """Yield up to `count` raw frames that a tool writes; fewer if the tool ends earlier."""
     for _ in range(count):
         frame = output.read(frame_bytes)
         if len(frame) < frame_bytes:

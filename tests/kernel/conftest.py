@@ -36,39 +36,42 @@ def pytest_runtest_setup() -> None:
 def stalls(request: pytest.FixtureRequest) -> Stalls:
     """Return the record of stalls; inside a machine, the record of the host's own probes and of one in this machine.
 
-    The host's probes do not show when this machine's kernel waits for the host's files, which it does with its only
-    processor.
+    While this machine's kernel waits for the host's files, its only processor runs nothing else. The host's probes do
+    not show these times.
     """
     if LANE == "pair":
         host = HostProbe(SERIAL_LINE)
-        measured = Stalls([host, ProbeProcess(0, "of the first machine")], host.processor_times)
+        record = Stalls([host, ProbeProcess(0, "of the first machine")], host.processor_times)
     else:
-        measured = Stalls.measured()
-    request.config.stash[SESSION].stalls = measured
-    return measured
+        record = Stalls.start_probes()
+    request.config.stash[SESSION].stalls = record
+    return record
 
 
 @pytest.fixture(scope="session")
 def machines() -> tuple[Machine, Machine]:
-    """Return both machines with equal wall clocks; tests use `server_machine` and `client_machine`."""
+    """Return the server's and the client's machine, with equal wall clocks, for the two fixtures below."""
     if LANE != "pair":
         pytest.skip("needs two machines: run tests/kernel/run without --native")
     key = os.environ["LAVT_KERNEL_KEY"].encode()
-    pair = local_machine("server", "10.9.0.1"), remote_machine("client", "10.9.0.2", "10.9.1.2", key)
-    pair[1].call(clocks.step, offset_ns(*pair))
-    return pair
+    server = local_machine("server", "10.9.0.1")
+    client = remote_machine("client", "10.9.0.2", "10.9.1.2", key)
+    client.call(clocks.step, offset_ns(server, client))
+    return server, client
 
 
 @pytest.fixture
 def server_machine(machines: tuple[Machine, Machine]) -> Iterator[Machine]:
     """Return the vehicle's machine, which runs the tests."""
-    yield from restoring_machine(machines[0])
+    server, _ = machines
+    yield from restoring_machine(server)
 
 
 @pytest.fixture
 def client_machine(machines: tuple[Machine, Machine]) -> Iterator[Machine]:
-    """Return the remote machine."""
-    yield from restoring_machine(machines[1])
+    """Return the client's machine, which tests control from the server's."""
+    _, client = machines
+    yield from restoring_machine(client)
 
 
 def restoring_machine(machine: Machine) -> Iterator[Machine]:
@@ -81,23 +84,23 @@ def restoring_machine(machine: Machine) -> Iterator[Machine]:
 
 
 @pytest.fixture
-def report_figure(request: pytest.FixtureRequest) -> Callable[[str], None]:
-    """Return a function that prints a measured figure into the lane's output, whether or not the test passes."""
+def report_measurement(request: pytest.FixtureRequest) -> Callable[[str], None]:
+    """Return a function that prints a measurement into the lane's output, whether or not the test passes."""
     plugins = request.config.pluginmanager
     reporter, capture = plugins.getplugin("terminalreporter"), plugins.getplugin("capturemanager")
     assert reporter is not None
     assert capture is not None
 
-    def write_line(figure: str) -> None:
+    def write_line(measurement: str) -> None:
         with capture.global_and_fixture_disabled():
-            reporter.write_line(f"\n{request.node.name}: {figure}")
+            reporter.write_line(f"\n{request.node.name}: {measurement}")
 
     return write_line
 
 
 @pytest.fixture
 def true_offset_ns(server_machine: Machine, client_machine: Machine) -> Callable[[], int]:
-    """Return a function that measures the server's wall clock minus the client's, by the counter that both read."""
+    """Return a function that measures the server's wall clock minus the client's, with the counter that both read."""
     return lambda: offset_ns(server_machine, client_machine)
 
 

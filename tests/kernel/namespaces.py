@@ -126,13 +126,13 @@ class Arrivals:
         return [packet.delay_ms for packet in self.arrived]
 
     @property
-    def in_order_of_sending_ms(self) -> list[float]:
+    def delays_in_sending_order_ms(self) -> list[float]:
         """Delays in the order of sending."""
         return [packet.delay_ms for packet in sorted(self.arrived)]
 
     @property
     def inversions(self) -> int:
-        """How many packets arrived directly after a packet that was sent later."""
+        """The number of packets that arrived directly after a packet that was sent later."""
         return sum(later < earlier for earlier, later in zip(self.numbers, self.numbers[1:], strict=False))
 
 
@@ -211,7 +211,7 @@ class _FlowSockets:
 def _bound(family: int, kind: int, address: str, port: int) -> socket.socket:
     sock = socket.socket(family, kind)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    if kind == socket.SOCK_STREAM:  # close without TIME_WAIT: the ports are used again
+    if kind == socket.SOCK_STREAM:  # close without TIME_WAIT, because the next flow may use the same port
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
     sock.bind((address, port))
     return sock
@@ -234,14 +234,16 @@ def _receive(captures: dict[str, socket.socket], names: dict[bytes, str], arriva
                 frame, ancillary, _flags, address = capture.recvmsg(2048, 64)
             except BlockingIOError:
                 break
-            if address[2] == socket.PACKET_OUTGOING:
+            _device, _protocol, packet_type, *_ = address
+            if packet_type == socket.PACKET_OUTGOING:
                 continue
             match = next(((mark, frame.index(mark)) for mark in names if mark in frame), None)
             if match is None:
                 continue
-            _, number, sent_ns = PACKET_HEADER.unpack_from(frame, match[1])
+            mark, header_at = match
+            _, number, sent_ns = PACKET_HEADER.unpack_from(frame, header_at)
             seconds, nanoseconds = struct.unpack_from("qq", ancillary[0][2])
             received_ns = seconds * NS_PER_S + nanoseconds
-            arrivals[names[match[0]]].arrived.append(
+            arrivals[names[mark]].arrived.append(
                 ArrivedPacket(number, (received_ns - sent_ns) / NS_PER_MS, received_ns)
             )

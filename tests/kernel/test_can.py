@@ -24,7 +24,7 @@ from tests.field.by_wire import (
     KIT_TIMEOUT_MS,
     TOLERANCE_MS,
     SoftwareCarProcess,
-    is_late,
+    depends_on_timing,
     ms_since,
     software_car,
 )
@@ -33,10 +33,10 @@ from tests.kernel.lane.driving import BY_WIRE, LoopPrograms, collect, start_by_w
 from tests.kernel.lane.machine import Machine, MachineError, wait_until
 from tests.kernel.lane.verdicts import (
     KIT_STALL_MS,
-    least_stop_ms,
     require_completed,
     require_valid,
     safety_changes,
+    shortest_stall_ms,
 )
 from tests.support.stalls import Stalls, excuse_slow_machine
 
@@ -46,15 +46,15 @@ from lavt.vehicle.dbw.bus import CanPort
 
 pytestmark = [pytest.mark.timeout(900), pytest.mark.usefixtures("vcan")]
 
-ReportFigure = Callable[[str], None]
+ReportMeasurement = Callable[[str], None]
 
-SMALL_LOAD = ("camera.width_px=320", "camera.height_px=240", "camera.rate_hz=15")
-"""A load that a user-mode kernel, with one processor and slow system calls, can process in time."""
+SMALL_PICTURES = ("camera.width_px=320", "camera.height_px=240", "camera.rate_hz=15")
+"""Pictures that a user-mode kernel, with one processor and slow system calls, can process in time."""
 MAX_P95_M = 0.22
 COMMAND_IDENTIFIERS = {0x200, 0x201, 0x202}
 """Steering, brake and throttle in generation 2's set `remote`."""
 LATE_FRAME_MS = 20
-"""A frame that was sent before the process was frozen may arrive this much later."""
+"""A frame that was sent before the process was frozen is allowed to arrive this much later."""
 SIOCSIFFLAGS = 0x8914
 """linux/sockios.h"""
 PARKING_LIMIT_MS = 6000
@@ -82,7 +82,7 @@ def ip(*arguments: str) -> None:
 
 
 def by_wire_changes(profile: str, work: Path) -> tuple[str, ...]:
-    """Return changes of the server's config, which also apply to the software car."""
+    """Return the changes of the server's config, which the software car gets, too."""
     return (
         f"vehicle.dbw.profile={profile}",
         "vehicle.dbw.steering_sign=1",
@@ -90,7 +90,7 @@ def by_wire_changes(profile: str, work: Path) -> tuple[str, ...]:
         "clock.source=probe",
         "video.bit_rate_bps=1000000",
         "record.video=false",
-        *SMALL_LOAD,
+        *SMALL_PICTURES,
     )
 
 
@@ -108,7 +108,7 @@ def run_watchdog_test(machine: Machine, changes: tuple[str, ...], stalls: Stalls
             )
         except MachineError as failure:
             message = f"{failure}, {car.events}"
-            assert is_late(message), message
+            assert depends_on_timing(message), message
             raise stalls.verdict(message, since_ns, CLOCK.now().mono_ns, stall_ms=KIT_STALL_MS) from None
 
 
@@ -142,8 +142,8 @@ class ActiveDrive:
         if braked_ns is not None:
             failure = self.car.unexpected_release(braked_ns, message)
         else:
-            least_ms = least_stop_ms(str(status["reason"]))
-            failure = self.stalls.verdict(message, since_ns, now_ns, stall_ms=least_ms)
+            stall_ms = shortest_stall_ms(str(status["reason"]))
+            failure = self.stalls.verdict(message, since_ns, now_ns, stall_ms=stall_ms)
         return excuse_slow_machine(failure, self.stalls, since_ns, now_ns)
 
     def reason(self) -> str:
@@ -177,7 +177,7 @@ class CanLab:
             run_watchdog_test(self.server, changes, self.stalls)
         out = self.work / "drive"
         with software_car(BY_WIRE, *set_arguments(changes), stalls=self.stalls, stall_ms=KIT_STALL_MS) as car:
-            client = ("clock.source=probe", *SMALL_LOAD)
+            client = ("clock.source=probe", *SMALL_PICTURES)
             loop = start_by_wire(self.server, self.client, out, server_changes=changes, client_changes=client)
             try:
                 active_drive = ActiveDrive(
@@ -215,18 +215,18 @@ def last_command_ns(port: CanPort) -> int:
 
 
 @pytest.mark.parametrize("profile", GENERATIONS)
-def test_drive_over_can_completes(profile: str, lab: CanLab, report_figure: ReportFigure) -> None:
+def test_drive_over_can_completes(profile: str, lab: CanLab, report_measurement: ReportMeasurement) -> None:
     """Route A key at L0 is completed over SocketCAN, and the record has the times from command to wheel."""
     with lab.driving(profile) as active_drive:
         since_ns = CLOCK.now().mono_ns
         wait_for_end(active_drive.loop, lambda _: None)
         drive = collect(active_drive.loop, lab.client, active_drive.out)
         braked_ns = active_drive.car.braked_ns()
-    figures = f"{profile}: {describe_result(drive.result)}; {'; '.join(safety_changes(drive))}"
-    report_figure(figures)
+    measurements = f"{profile}: {describe_result(drive.result)}; {'; '.join(safety_changes(drive))}"
+    report_measurement(measurements)
     if drive.result["ending"] != "completed" and braked_ns is not None:
         raise excuse_slow_machine(
-            active_drive.car.unexpected_release(braked_ns, figures), lab.stalls, since_ns, braked_ns
+            active_drive.car.unexpected_release(braked_ns, measurements), lab.stalls, since_ns, braked_ns
         )
     require_completed(drive, lab.stalls)
     require_valid(drive, lab.stalls)
@@ -252,37 +252,37 @@ def describe_result(result: dict[str, Any]) -> str:
     )
 
 
-def test_lost_bus_stops_the_car(lab: CanLab, report_figure: ReportFigure) -> None:
-    """With the interface down the kit brakes and the server stops, and nothing is accepted after it is up again."""
+def test_lost_bus_stops_the_car(lab: CanLab, report_measurement: ReportMeasurement) -> None:
+    """If the interface goes down, kit and server stop the car; when it is up again, the kit stays disengaged."""
     with lab.driving("dataspeed_gen2") as active_drive:
         since_ns = CLOCK.now().mono_ns
         set_interface_down("vcan0")
         down_ms = ms_since(CLOCK.now().mono_ns, since_ns)
         took_ms = active_drive.car.wait_for_watchdog_ms(since_ns, tolerance_ms=down_ms + TOLERANCE_MS)
         active_drive.wait_until_stopped()
-        report_figure(f"the interface was down after {down_ms:.0f} ms, the kit brakes after {took_ms:.0f} ms")
-        report_figure(active_drive.reason())
+        report_measurement(f"the interface was down after {down_ms:.0f} ms, the kit brakes after {took_ms:.0f} ms")
+        report_measurement(active_drive.reason())
         ip("link", "set", "vcan0", "up")
         pause(NS_PER_S)
         assert active_drive.car.event_ns("enabled", "enabled: ", since_ns=since_ns) is None
 
 
-def test_silent_kit_stops_the_drive(lab: CanLab, report_figure: ReportFigure) -> None:
-    """A kit in bus-off brakes by its watchdog, and the server, without reports, makes a safe stop with the reason."""
+def test_silent_kit_stops_the_drive(lab: CanLab, report_measurement: ReportMeasurement) -> None:
+    """A kit in bus-off brakes by its watchdog, and the server makes a safe stop; then the kit stays disengaged."""
     with lab.driving("dataspeed_gen1") as active_drive:
         since_ns = active_drive.car.execute("bus_off")
         took_ms = active_drive.car.wait_for_watchdog_ms(since_ns)
         active_drive.wait_until_stopped()
-        report_figure(f"the kit brakes after {took_ms:.0f} ms, {active_drive.reason()}")
+        report_measurement(f"the kit brakes after {took_ms:.0f} ms, {active_drive.reason()}")
         active_drive.car.execute("bus_on")
         pause(NS_PER_S)
         assert active_drive.car.event_ns("enabled", "enabled: ", since_ns=since_ns) is None
 
 
-def test_frozen_actuator_sends_no_frames(lab: CanLab, report_figure: ReportFigure) -> None:
-    """A frozen actuator process sends no frames, and after it is resumed it sends none of the earlier ones."""
+def test_frozen_actuator_sends_no_frames(lab: CanLab, report_measurement: ReportMeasurement) -> None:
+    """A frozen actuator process sends no frames, and the kit stays disengaged after the process is resumed."""
     with lab.driving("dataspeed_gen2") as active_drive, open_port() as port:
-        pause(2 * KIT_TIMEOUT_MS * NS_PER_MS)  # the kit is being commanded by then, and the port receives it
+        pause(2 * KIT_TIMEOUT_MS * NS_PER_MS)  # by then the kit gets commands, and the port receives them
         since_ns = CLOCK.now().mono_ns
         os.kill(active_drive.actuator_pid, signal.SIGSTOP)
         frozen_ns = CLOCK.now().mono_ns
@@ -292,17 +292,17 @@ def test_frozen_actuator_sends_no_frames(lab: CanLab, report_figure: ReportFigur
             last_ns = last_command_ns(port)
         finally:
             os.kill(active_drive.actuator_pid, signal.SIGCONT)
-        pause(2 * NS_PER_S)  # the server has ended already, because it got no state of the actuator for 0.5 s
-        report_figure(f"last command {ms_since(last_ns, since_ns):.0f} ms, the kit brakes after {took_ms:.0f} ms")
+        pause(2 * NS_PER_S)  # the server has ended by then, because it got no state from the actuator for 0.5 s
+        report_measurement(f"last command {ms_since(last_ns, since_ns):.0f} ms, the kit brakes after {took_ms:.0f} ms")
         assert last_ns < frozen_ns + LATE_FRAME_MS * NS_PER_MS
         assert active_drive.car.event_ns("enabled", "enabled: ", since_ns=since_ns) is None
 
 
-def test_killed_server_leaves_a_parked_car(lab: CanLab, report_figure: ReportFigure) -> None:
+def test_killed_server_leaves_a_parked_car(lab: CanLab, report_measurement: ReportMeasurement) -> None:
     """After the server's process is killed, the actuator's process stops the car, parks it and disengages."""
     with lab.driving("dataspeed_gen1") as active_drive:
         since_ns = CLOCK.now().mono_ns
         lab.server.call(processes.send_signal, active_drive.loop.server.number, signal.SIGKILL)
         took_ms = active_drive.car.wait_for_park_ms(since_ns)
-        report_figure(f"in park after {took_ms:.0f} ms")
+        report_measurement(f"in park after {took_ms:.0f} ms")
         assert took_ms < PARKING_LIMIT_MS

@@ -50,12 +50,12 @@ def now_ns() -> int:
 def wait_until(condition: Callable[[], bool]) -> None:
     end_ns = now_ns() + DEADLINE_S * NS_PER_S
     while not condition():
-        assert now_ns() < end_ns, "it did not happen"
+        assert now_ns() < end_ns, f"the condition is not true within {DEADLINE_S} s"
         pause(NS_PER_MS)
 
 
 def is_received(sender: CanPort, receiver: CanPort) -> bool:
-    """Send a frame and return whether it arrives; a lost bus carries none."""
+    """Send a frame and return whether it arrives; return False if the bus is lost."""
     try:
         sender.take(now_ns())
         sender.send([STEERING], now_ns())
@@ -65,8 +65,8 @@ def is_received(sender: CanPort, receiver: CanPort) -> bool:
         return False
 
 
-def reason_gone(port: CanPort) -> str:
-    """Wait until a port reports the lost bus on reading and writing, and return the reason."""
+def wait_for_lost_bus(port: CanPort) -> str:
+    """Wait until reading from a port reports the lost bus, require the same of writing, and return the reason."""
     reasons: list[str] = []
 
     def is_gone() -> bool:
@@ -118,8 +118,8 @@ def test_lost_interface_is_reported_and_recovers(
     wait_until(lambda: is_received(one, other))
     for command in disable:
         ip(*command)
-    assert "socketcan vcan7" in reason_gone(one)
-    reason_gone(other)
+    assert "socketcan vcan7" in wait_for_lost_bus(one)
+    wait_for_lost_bus(other)
     for command in enable:
         ip(*command)
     wait_until(lambda: is_received(one, other))

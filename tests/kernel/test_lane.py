@@ -25,7 +25,7 @@ CLOCK = MachineClock()
 JUDGES_TIMES = pytest.mark.judges_times(share=MEDIAN_SHARE)
 
 
-def least_round_trip_ms(machine: Machine, to: Machine) -> float:
+def shortest_round_trip_ms(machine: Machine, to: Machine) -> float:
     output = machine.run(["ping", "-c", "11", "-i", "0.05", "-q", to.address])
     return float(output.rpartition(" = ")[2].split("/")[0])
 
@@ -37,15 +37,15 @@ def delta_ns(server: Machine, client: Machine) -> float:
 
 @JUDGES_TIMES
 def test_delay_of_one_machine_is_in_the_round_trip(server_machine: Machine, client_machine: Machine) -> None:
-    """Netem on one machine delays its own egress only, and the delay is gone afterwards."""
+    """A netem delay of 50 ms on either machine adds 50 ms to the round trip, and is gone afterwards."""
     for machine in (server_machine, client_machine):
         with netem_on_all(machine, "delay", "50ms"):
-            assert 49.5 < least_round_trip_ms(server_machine, client_machine) < 53
-    assert least_round_trip_ms(server_machine, client_machine) < 5
+            assert 49.5 < shortest_round_trip_ms(server_machine, client_machine) < 53
+    assert shortest_round_trip_ms(server_machine, client_machine) < 5
 
 
 def test_remote_failure_is_raised_here(client_machine: Machine) -> None:
-    """A program or function that fails on the client's machine raises here with its error."""
+    """If a program or a function fails on the client's machine, the call raises its error here."""
     with pytest.raises(MachineError, match=r"ended with 2: .*no-such-file"):
         client_machine.run(["ls", "/no-such-file"])
     with pytest.raises(MachineError, match="No such file"):
@@ -123,7 +123,7 @@ def test_clock_drift_is_the_rate_of_the_true_offset(server_machine: Machine, tru
 def test_chrony_measures_the_offset(
     server_machine: Machine, client_machine: Machine, true_offset_ns: TrueOffset
 ) -> None:
-    """A chronyd that follows the server without adjusting the clock measures a server 250 ms ahead within 1 ms."""
+    """The client's chronyd, which does not adjust the clock, measures that the server is 250 ms ahead, within 1 ms."""
     server_machine.call(clocks.step, 250 * NS_PER_MS)
     start_chronyd(server_machine, *SERVE_OWN_CLOCK)
     start_chronyd(client_machine, follow_server(server_machine.address))

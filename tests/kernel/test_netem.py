@@ -44,29 +44,30 @@ from lavt.transport.emulation.impairment import ExemptPort, ImpairedFlow, Impair
 from lavt.transport.netem.netem import NetemInterface
 
 CLOCK = MachineClock()
-VIDEO, CONTROL, PROBE = 5600, 7448, 5602
-ALWAYS_EXEMPT = [ExemptPort("udp", PROBE, "the clock probe")]
+VIDEO_PORT, CONTROL_PORT, PROBE_PORT = 5600, 7448, 5602
+ALWAYS_EXEMPT = [ExemptPort("udp", PROBE_PORT, "the clock probe")]
 CONDITIONS = ("L0", "L1", "L2", "L3", "L4", "L5")
 JUDGES_MEDIANS = pytest.mark.judges_times(share=MEDIAN_SHARE)
 """For tests whose assertions are about medians or other quantiles of delays."""
 
+VIDEO_FLOW = ProbeFlow("video", "server", "udp", VIDEO_PORT, 40_000)
 DELAYED_FLOWS = [
-    ProbeFlow("video", "server", "udp", VIDEO, 40_000),
-    ProbeFlow("video over IPv6", "server", "udp", VIDEO, 40_001, version=6),
-    ProbeFlow("control", "client", "udp", 40_002, CONTROL),
-    ProbeFlow("control over IPv6", "client", "udp", 40_003, CONTROL, version=6),
+    VIDEO_FLOW,
+    ProbeFlow("video over IPv6", "server", "udp", VIDEO_PORT, 40_001, version=6),
+    ProbeFlow("control", "client", "udp", 40_002, CONTROL_PORT),
+    ProbeFlow("control over IPv6", "client", "udp", 40_003, CONTROL_PORT, version=6),
 ]
 UNDELAYED_FLOWS = [
-    ProbeFlow("challenges of the video's path", "server", "udp", VIDEO, 40_010, first_byte=ord("L")),
-    ProbeFlow("RTCP and hellos upstream", "client", "udp", 40_011, VIDEO),
-    ProbeFlow("state", "server", "udp", CONTROL, 40_012),
+    ProbeFlow("challenges of the video's path", "server", "udp", VIDEO_PORT, 40_010, first_byte=ord("L")),
+    ProbeFlow("RTCP and hellos upstream", "client", "udp", 40_011, VIDEO_PORT),
+    ProbeFlow("state", "server", "udp", CONTROL_PORT, 40_012),
     ProbeFlow("NTP down", "server", "udp", 123, 123),
     ProbeFlow("NTP up", "client", "udp", 124, 123),
     ProbeFlow("ssh down", "server", "tcp", 22, 40_013),
     ProbeFlow("ssh up", "client", "tcp", 40_014, 22),
-    ProbeFlow("clock probe down", "server", "udp", PROBE, 40_015),
-    ProbeFlow("clock probe up", "client", "udp", 40_016, PROBE),
-    ProbeFlow("tcp to the control's port", "client", "tcp", 40_017, CONTROL),
+    ProbeFlow("clock probe down", "server", "udp", PROBE_PORT, 40_015),
+    ProbeFlow("clock probe up", "client", "udp", 40_016, PROBE_PORT),
+    ProbeFlow("tcp to the control's port", "client", "tcp", 40_017, CONTROL_PORT),
     ProbeFlow("udp to the client's control port", "server", "udp", 40_018, 40_019),
 ]
 
@@ -97,13 +98,13 @@ def apply_condition(sides: dict[str, NetemInterface], name: str) -> None:
     """Apply each side's part of a condition."""
     roles: Sequence[Role] = ("server", "client")
     for role in roles:
-        flows = netem_flows(condition(name), role, video_port=VIDEO, control_port=CONTROL)
+        flows = netem_flows(condition(name), role, video_port=VIDEO_PORT, control_port=CONTROL_PORT)
         inside(role, lambda role=role, flows=flows: sides[role].apply(flows, exempt=ALWAYS_EXEMPT, condition=name))  # type: ignore[misc]
 
 
 def apply_to_video(sides: dict[str, NetemInterface], impairment: Impairment) -> None:
     """Apply an impairment to the server's video."""
-    inside("server", lambda: sides["server"].apply([ImpairedFlow("video", "udp", VIDEO, "source", impairment)]))
+    inside("server", lambda: sides["server"].apply([ImpairedFlow("video", "udp", VIDEO_PORT, "source", impairment)]))
 
 
 def qdiscs(side: str) -> Any:
@@ -114,7 +115,7 @@ def qdiscs(side: str) -> Any:
 def test_each_condition_delays_only_video_and_control(
     baseline: dict[str, float], sides: dict[str, NetemInterface]
 ) -> None:
-    """Under L0 to L5 the medians of video and control shift as requested within 1 ms, the others by less than 1 ms."""
+    """Under L0 to L5 the medians of only video and control shift, by the requested delay, within 1 ms."""
     shifts_ms = {}
     for name in CONDITIONS:
         apply_condition(sides, name)
@@ -130,20 +131,20 @@ def test_each_condition_delays_only_video_and_control(
 
 @JUDGES_MEDIANS
 def test_state_is_delayed_where_requested(baseline: dict[str, float], sides: dict[str, NetemInterface]) -> None:
-    """With state_delay with_video, packets from the server's router get the video's delay, over TCP and over UDP."""
+    """With `state_delay: with_video`, packets from the server's router get the video's delay, over TCP and over UDP."""
     transports: tuple[Literal["udp", "tcp"], ...] = ("udp", "tcp")
     for transport in transports:
         flows = netem_flows(
             condition("L1"),
             "server",
-            video_port=VIDEO,
-            control_port=CONTROL,
+            video_port=VIDEO_PORT,
+            control_port=CONTROL_PORT,
             state_delay="with_video",
             protocol=transport,
         )
         inside("server", lambda flows=flows: sides["server"].apply(flows))  # type: ignore[misc]
-        state_flow = ProbeFlow("state now", "server", transport, CONTROL, 40_020)
-        control_flow = ProbeFlow("control now", "client", "udp", 40_021, CONTROL)
+        state_flow = ProbeFlow("state now", "server", transport, CONTROL_PORT, 40_020)
+        control_flow = ProbeFlow("control now", "client", "udp", 40_021, CONTROL_PORT)
         arrivals = send_flows([state_flow, control_flow], 20, 10)
         assert abs(median(arrivals["state now"].delays_ms) - baseline["state"] - 75) < 1
         assert median(arrivals["control now"].delays_ms) < 1
@@ -152,9 +153,12 @@ def test_state_is_delayed_where_requested(baseline: dict[str, float], sides: dic
 @JUDGES_MEDIANS
 def test_control_over_tcp_is_delayed(sides: dict[str, NetemInterface]) -> None:
     """With routers over TCP, control to the server's router over TCP is delayed, and UDP to that port is not."""
-    flows = netem_flows(condition("L4"), "client", video_port=VIDEO, control_port=CONTROL, protocol="tcp")
+    flows = netem_flows(condition("L4"), "client", video_port=VIDEO_PORT, control_port=CONTROL_PORT, protocol="tcp")
     inside("client", lambda: sides["client"].apply(flows))
-    sent = [ProbeFlow("tcp", "client", "tcp", 40_030, CONTROL), ProbeFlow("udp", "client", "udp", 40_031, CONTROL)]
+    sent = [
+        ProbeFlow("tcp", "client", "tcp", 40_030, CONTROL_PORT),
+        ProbeFlow("udp", "client", "udp", 40_031, CONTROL_PORT),
+    ]
     arrivals = send_flows(sent, 20, 20)
 
     assert abs(median(arrivals["tcp"].delays_ms) - 75) < 1
@@ -162,7 +166,7 @@ def test_control_over_tcp_is_delayed(sides: dict[str, NetemInterface]) -> None:
 
 
 def test_change_neither_loses_nor_reorders_packets(sides: dict[str, NetemInterface]) -> None:
-    """While the delay changes 0-150-30-225 ms and is cleared, at 200 packets/s, all packets arrive in order."""
+    """At 200 packets/s all packets arrive in order while the delay becomes 150, 30 and 225 ms and is then cleared."""
     apply_to_video(sides, Impairment())
 
     def change() -> None:
@@ -171,7 +175,7 @@ def test_change_neither_loses_nor_reorders_packets(sides: dict[str, NetemInterfa
             pause(400 * NS_PER_MS)
         inside("server", sides["server"].clear)
 
-    arrivals = send_flows([DELAYED_FLOWS[0]], 100, 5, at={50: change})["video"]
+    arrivals = send_flows([VIDEO_FLOW], 100, 5, at={50: change})["video"]
 
     assert arrivals.numbers == list(range(arrivals.sent))
     assert max(arrivals.delays_ms) > 224
@@ -204,7 +208,7 @@ pause(60_000_000_000)
 
 
 def test_delay_of_a_killed_owner_is_cleared_at_the_next_start(sides: dict[str, NetemInterface], tmp_path: Path) -> None:
-    """SIGKILL of the owner leaves the delay; the next use of netem there restores the qdiscs and reports it."""
+    """SIGKILL of the owner leaves the delay; the next check reports the owner and restores the qdiscs."""
     before = qdiscs("server")
     start = lambda: subprocess.Popen(  # noqa: E731
         [sys.executable, "-B", "-c", OWNER, str(tmp_path)], stdout=subprocess.PIPE, text=True
@@ -250,9 +254,9 @@ def test_jitter_spreads_delays_in_order(
     """Under 10 ms of jitter the delays' interquartile range is that of the distribution, and no packet is reordered."""
     apply_to_video(
         sides, Impairment(75, jitter_ms=5, jitter_distribution="pareto")
-    )  # its distribution must be replaced
+    )  # the next call must replace this distribution
     apply_to_video(sides, Impairment(75, jitter_ms=10, jitter_distribution=distribution))
-    arrivals = send_flows([DELAYED_FLOWS[0]], 100, 30)["video"]
+    arrivals = send_flows([VIDEO_FLOW], 100, 30)["video"]
     p5, p25, p75, p95 = (quantiles(arrivals.delays_ms, n=20)[index] for index in (0, 4, 14, 18))
 
     assert len(arrivals.arrived) == 100
@@ -266,7 +270,7 @@ def test_jitter_spreads_delays_in_order(
 def test_jitter_in_order_increases_the_median(sides: dict[str, NetemInterface]) -> None:
     """At 300 packets/s, 10 ms of normal jitter in order add 3 to 9 ms to the median: late packets delay others."""
     apply_to_video(sides, Impairment(75, jitter_ms=10))
-    arrivals = send_flows([DELAYED_FLOWS[0]], 400, 1000 / 300)["video"]
+    arrivals = send_flows([VIDEO_FLOW], 400, 1000 / 300)["video"]
 
     assert arrivals.inversions == 0
     assert 3 < median(arrivals.delays_ms) - 75 < 9
@@ -276,8 +280,8 @@ def test_jitter_in_order_increases_the_median(sides: dict[str, NetemInterface]) 
 def test_correlated_jitter_is_correlated(sides: dict[str, NetemInterface]) -> None:
     """With a correlation of 0.9, delays 20 ms apart have a correlation of 0.6 to 0.97, in order."""
     apply_to_video(sides, Impairment(75, jitter_ms=10, jitter_correlation=0.9))
-    arrivals = send_flows([DELAYED_FLOWS[0]], 400, 20)["video"]
-    delays_ms = arrivals.in_order_of_sending_ms
+    arrivals = send_flows([VIDEO_FLOW], 400, 20)["video"]
+    delays_ms = arrivals.delays_in_sending_order_ms
     # The correlation of ranks counts a stall of the machine as one sample.
     rank_correlation = float(spearmanr(delays_ms[:-1], delays_ms[1:]).statistic)
 
@@ -296,7 +300,7 @@ def burst_lengths(arrivals: Arrivals) -> list[int]:
 def test_loss_has_the_requested_share(sides: dict[str, NetemInterface]) -> None:
     """Of 1000 packets a tenth are lost, independently of each other, within four standard deviations."""
     apply_to_video(sides, Impairment(75, loss=0.1))
-    arrivals = send_flows([DELAYED_FLOWS[0]], 1000, 2)["video"]
+    arrivals = send_flows([VIDEO_FLOW], 1000, 2)["video"]
     lost = 1000 - len(arrivals.arrived)
 
     assert abs(lost - 100) < 4 * math.sqrt(1000 * 0.1 * 0.9)
@@ -306,7 +310,7 @@ def test_loss_has_the_requested_share(sides: dict[str, NetemInterface]) -> None:
 def test_burst_loss_has_the_requested_length(sides: dict[str, NetemInterface]) -> None:
     """With 10 % loss in bursts of 5, 5 to 16 % of 3000 packets are lost, in bursts of 3.3 to 7.5 on average."""
     apply_to_video(sides, Impairment(10, loss=0.1, loss_burst_packets=5))
-    arrivals = send_flows([DELAYED_FLOWS[0]], 3000, 1)["video"]
+    arrivals = send_flows([VIDEO_FLOW], 3000, 1)["video"]
     lost = 3000 - len(arrivals.arrived)
 
     assert 3.3 < fmean(burst_lengths(arrivals)) < 7.5
@@ -317,7 +321,7 @@ def test_burst_loss_has_the_requested_length(sides: dict[str, NetemInterface]) -
 def test_rate_limit_spaces_packets(sides: dict[str, NetemInterface]) -> None:
     """At 2 Mbit/s packets of 1042 bytes, sent 1 ms apart, leave 4.17 ms apart in the median."""
     apply_to_video(sides, Impairment(20, rate_bps=2_000_000))
-    arrivals = send_flows([ProbeFlow("video", "server", "udp", VIDEO, 40_000, packet_bytes=1000)], 60, 1)["video"]
+    arrivals = send_flows([ProbeFlow("video", "server", "udp", VIDEO_PORT, 40_000, packet_bytes=1000)], 60, 1)["video"]
     received_ns = [packet.received_ns for packet in arrivals.arrived]
     spacing_ms = median(after - before for before, after in pairwise(received_ns)) / NS_PER_MS
 
@@ -330,7 +334,7 @@ def test_rate_limit_spaces_packets(sides: dict[str, NetemInterface]) -> None:
 def test_reordering_has_the_requested_share(sides: dict[str, NetemInterface]) -> None:
     """A quarter of 400 packets are not delayed, within four standard deviations, and only these overtake others."""
     apply_to_video(sides, Impairment(75, jitter_ms=5, reorder=0.25))
-    arrivals = send_flows([DELAYED_FLOWS[0]], 400, 5)["video"]
+    arrivals = send_flows([VIDEO_FLOW], 400, 5)["video"]
     undelayed_numbers = [packet.number for packet in arrivals.arrived if packet.delay_ms < 30]
     delayed_numbers = [packet.number for packet in arrivals.arrived if packet.delay_ms >= 30]
 
@@ -349,7 +353,7 @@ SCRIPTS_OF_ROLES: list[tuple[str, Role, str, str]] = [
 def test_scripts_and_command_have_the_same_effect(
     sides: dict[str, NetemInterface], script: str, side: Role, device: str, name: str
 ) -> None:
-    """Tc reports the same after a script of `netem/` and after the command's code, and clear.sh clears it."""
+    """The scripts of `netem/` and `NetemInterface` make the same qdiscs and filters, and clear.sh deletes them."""
     folder = shipped("netem/conditions.yaml").parent
 
     def tc_output() -> tuple[Any, str]:
@@ -395,9 +399,9 @@ def test_command_applies_verifies_and_clears(lavt: Callable[..., CommandResult])
     assert applied.code == 0, applied.err
     assert "tc qdisc add dev lo root handle 4c56: prio bands 6" in applied.out
     assert "\nverified: " in applied.out
-    answer = json.loads(verified.out)
-    assert (verified.code, answer["condition"], answer["reasons"]) == (0, "L4", [])
-    assert abs(answer["measured"]["video"]["median_ms"] - 150) < 1
+    verification = json.loads(verified.out)
+    assert (verified.code, verification["condition"], verification["reasons"]) == (0, "L4", [])
+    assert abs(verification["measured"]["video"]["median_ms"] - 150) < 1
     assert "video: delay_ms 150\n" in status.out
     assert changed.code == 1
     assert "delay_ms is 100 instead of 150" in changed.err
@@ -407,7 +411,7 @@ def test_command_applies_verifies_and_clears(lavt: Callable[..., CommandResult])
 
 
 def test_apply_restores_the_interface_if_verification_fails(lavt: Callable[..., CommandResult]) -> None:
-    """An apply that cannot measure, because the interface is down, exits with 2 and restores the qdisc."""
+    """If `lavt netem apply` cannot measure because the interface is down, it exits with 2 and restores the qdisc."""
     command("ip link add idle type dummy")
     before = command("tc -j qdisc show dev idle")
     applied = lavt("netem", "apply", "L1", "--role", "server", "--interface", "idle")
@@ -424,7 +428,7 @@ def test_apply_restores_the_interface_if_verification_fails(lavt: Callable[..., 
 def test_held_impairment_ends_with_its_command(
     lavt: Callable[..., CommandResult], stalls: Stalls, name: str, with_signal: signal.Signals
 ) -> None:
-    """`lavt netem apply --hold` rejects other programs, and restores the interface when its process group is ended."""
+    """`lavt netem apply --hold` excludes other programs; a signal that ends the command restores the interface."""
     before = command("tc -j qdisc show dev lo")
     since_ns = CLOCK.now().mono_ns
     arguments = ["netem", "apply", name, "--role", "server", "--interface", "lo", "--hold", "--json"]
@@ -432,7 +436,7 @@ def test_held_impairment_ends_with_its_command(
         [sys.executable, "-B", "-m", "lavt", *arguments], stdout=subprocess.PIPE, text=True, start_new_session=True
     ) as holder:
         assert holder.stdout is not None
-        answer = json.loads(holder.stdout.readline())
+        verification = json.loads(holder.stdout.readline())
         measured_ns = CLOCK.now().mono_ns
         rejected = lavt("netem", "apply", "L2", "--role", "server", "--interface", "lo")
         with_delay = command("tc -j qdisc show dev lo")
@@ -440,7 +444,7 @@ def test_held_impairment_ends_with_its_command(
         holder.wait(30)
 
     with stalls.excusing_failures(since_ns, measured_ns, share=MEDIAN_SHARE):
-        assert answer["reasons"] == []
+        assert verification["reasons"] == []
     assert with_delay != before
     assert rejected.code == 2
     assert f"process {holder.pid}" in rejected.err
@@ -456,7 +460,7 @@ def planned(*changes: str) -> PlannedRun:
 @JUDGES_MEDIANS
 @pytest.mark.parametrize("name", ["L4", "jitter", "jitter_correlated", "loss", "loss_burst", "rate", "reorder"])
 def test_each_condition_of_a_run_is_verified(name: str, tmp_path: Path) -> None:
-    """Each condition on a run's ports on lo is verified before and after, and lo is restored."""
+    """Each condition is verified on lo before and after a run, on the run's ports, and lo is restored."""
     before = command("tc -j qdisc show dev lo")
     with NetemRun(planned(f"network.condition={name}"), NetemInterface("lo", directory=tmp_path)) as run:
         run.apply(video_port=40_100, control_port=40_101)
@@ -470,7 +474,7 @@ def test_each_condition_of_a_run_is_verified(name: str, tmp_path: Path) -> None:
 def test_drive_with_netem_measures_the_injected_delay(
     lavt: Callable[..., CommandResult], tmp_path: Path, stalls: Stalls
 ) -> None:
-    """A short drive under L4 on lo measures 150 and 75 ms before and after, and restores lo."""
+    """A short drive under L4 on lo measures 150 and 75 ms before and after the drive, and restores lo."""
     before = command("tc -j qdisc show dev lo")
     changes = [
         "time=real",
@@ -496,10 +500,10 @@ def test_drive_with_netem_measures_the_injected_delay(
         for when in ("before", "after")
         for flow, requested_ms in (("video", 150), ("control", 75))
     ]
-    delayed = [reason for reason in result["invalid_reasons"] if reason["code"] == "injection_differs"]
+    injection_reasons = [reason for reason in result["invalid_reasons"] if reason["code"] == "injection_differs"]
     with stalls.excusing_failures(since_ns, share=MEDIAN_SHARE):
-        assert max(map(abs, errors_ms)) < 1, f"{errors_ms}, {delayed}"
-        assert not delayed
+        assert max(map(abs, errors_ms)) < 1, f"{errors_ms}, {injection_reasons}"
+        assert not injection_reasons
     assert result["injection"] == "netem"
     assert command("tc -j qdisc show dev lo") == before
 

@@ -1,4 +1,4 @@
-"""`lavt server` and `lavt client` on two machines with separate clocks: their measurements compared with the truth."""
+"""Compare the measurements of `lavt server` and `lavt client`, on two machines with separate clocks, with the truth."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ pytestmark = pytest.mark.timeout(1800)
 
 DriveOnce = Callable[..., DriveResult]
 TrueOffset = Callable[[], int]
-ReportFigure = Callable[[str], None]
+ReportMeasurement = Callable[[str], None]
 NTP_PORT = 11123
 CLOCK = MachineClock()
 CLIENT_NTP_CODES = (InvalidCode.NTP_THROUGH_DELAY, InvalidCode.NTP_NO_SAMPLE)
 SHIFT_LIMIT_MS = 2
 PAPER_CONDITIONS = ("L0", "L1", "L2", "L3", "L4", "L5")
-SMALL_LOAD = ("camera.width_px=320", "camera.height_px=240", "camera.rate_hz=15")
-"""A user-mode kernel has one processor and slow system calls. Its times vary less with a lower load."""
+SMALL_PICTURES = ("camera.width_px=320", "camera.height_px=240", "camera.rate_hz=15")
+"""A user-mode kernel has one processor and slow system calls. Its times vary less if pictures are small."""
 SHORT_DRIVE = (
     f"vehicle.route={REPOSITORY / 'tests/kernel/roads/straight.yaml'}",
     "video.bit_rate_bps=500000",
-    *SMALL_LOAD,
+    *SMALL_PICTURES,
 )
 SERVER_INJECTION = ("injection.interface=vec0", "injection.remote=true", "safety.picture_age_limit_ms=2000")
 
 
 def client_changes_for(condition: str) -> tuple[str, ...]:
-    return (*SMALL_LOAD, "injection.interface=vec0", f"injection.condition={condition}")
+    return (*SMALL_PICTURES, "injection.interface=vec0", f"injection.condition={condition}")
 
 
 @dataclass
@@ -52,7 +52,7 @@ class TrueOffsetSamples:
 
     true_offset_ns: TrueOffset
     client: Machine
-    report_figure: ReportFigure
+    report_measurement: ReportMeasurement
     client_wall_ns: list[int] = field(default_factory=list)
     offsets_ns: list[int] = field(default_factory=list)
 
@@ -62,16 +62,16 @@ class TrueOffsetSamples:
         self.client_wall_ns.append(self.client.call(clocks.read_wall_clock)[1])
 
     def check_drive(self, drive: DriveResult) -> None:
-        """Require that each Delta is within its bound and 1 ms of the truth, and that the bound is at most 2 ms."""
+        """Require that each Delta is wrong by less than 1 ms and at most its bound, which is at most 2 ms."""
         drive_clocks = drive.measured.clocks
         assert drive_clocks.offset is not None
         sampled_ns, truth_ns = np.array(self.client_wall_ns), np.array(self.offsets_ns)
         began_ns, ended_ns = drive_clocks.client_wall_ns
-        within = (sampled_ns >= began_ns) & (sampled_ns <= ended_ns)
-        assert within.sum() >= 5, "there are too few samples of the truth"
-        error_ns = np.abs(drive_clocks.offset.at(sampled_ns[within]) - truth_ns[within])
-        bound_ns = drive_clocks.offset.bound_at(sampled_ns[within])
-        self.report_figure(
+        is_in_drive = (sampled_ns >= began_ns) & (sampled_ns <= ended_ns)
+        assert is_in_drive.sum() >= 5, "there are too few samples of the truth"
+        error_ns = np.abs(drive_clocks.offset.at(sampled_ns[is_in_drive]) - truth_ns[is_in_drive])
+        bound_ns = drive_clocks.offset.bound_at(sampled_ns[is_in_drive])
+        self.report_measurement(
             f"Delta by {drive_clocks.source}: largest error {error_ns.max() / 1e3:.0f} us, "
             f"bound {drive_clocks.bound_ms:.3f} ms"
         )
@@ -82,8 +82,10 @@ class TrueOffsetSamples:
 
 
 @pytest.fixture
-def truth(true_offset_ns: TrueOffset, client_machine: Machine, report_figure: ReportFigure) -> TrueOffsetSamples:
-    return TrueOffsetSamples(true_offset_ns, client_machine, report_figure)
+def truth(
+    true_offset_ns: TrueOffset, client_machine: Machine, report_measurement: ReportMeasurement
+) -> TrueOffsetSamples:
+    return TrueOffsetSamples(true_offset_ns, client_machine, report_measurement)
 
 
 @pytest.fixture
@@ -109,13 +111,13 @@ def describe_drive(drive: DriveResult) -> str:
 
 @pytest.mark.usefixtures("chrony")
 def test_latencies_of_a_drive_are_true(
-    drive: DriveOnce, truth: TrueOffsetSamples, report_figure: ReportFigure, stalls: Stalls
+    drive: DriveOnce, truth: TrueOffsetSamples, report_measurement: ReportMeasurement, stalls: Stalls
 ) -> None:
     """Over two machines route A key is completed, Delta is within its bound, and the loop's parts add up."""
     finished_drive = drive(
         "route", server=("vehicle.route=a_key", "video.bit_rate_bps=1000000"), meanwhile=truth.sample
     )
-    report_figure(describe_drive(finished_drive))
+    report_measurement(describe_drive(finished_drive))
     require_completed(finished_drive, stalls)
     assert finished_drive.result["delta"]["source"] == "chrony"
     assert finished_drive.result["delta"]["drift_ppm"] == pytest.approx(30, abs=5)
@@ -132,7 +134,7 @@ def test_each_condition_shifts_latencies_by_its_delay(
     server_machine: Machine,
     client_machine: Machine,
     *,
-    report_figure: ReportFigure,
+    report_measurement: ReportMeasurement,
     stalls: Stalls,
 ) -> None:
     """Under L0 to L5 the medians of tau_v and tau_c are those of L0 plus the injected delay within 2 ms."""
@@ -142,7 +144,7 @@ def test_each_condition_shifts_latencies_by_its_delay(
         finished_drive = drive(
             name, server=(*SHORT_DRIVE, *SERVER_INJECTION), client=client_changes_for(name), meanwhile=truth.sample
         )
-        report_figure(describe_drive(finished_drive))
+        report_measurement(describe_drive(finished_drive))
         assert finished_drive.measured.closure_p95_ms is not None
         assert finished_drive.measured.closure_p95_ms < 1, name
         truth.check_drive(finished_drive)
@@ -162,45 +164,45 @@ def test_each_condition_shifts_latencies_by_its_delay(
 def test_delta_is_true_while_the_server_clock_is_slewed(
     drive: DriveOnce, truth: TrueOffsetSamples, server_machine: Machine, client_machine: Machine
 ) -> None:
-    """While chrony slews the server's clock towards a third one, Delta is within its bound and 1 ms of the truth."""
+    """While chrony slews the server's clock towards a third clock, Delta is within its bound and 1 ms of the truth."""
     server_machine.start_python(
         "tests.kernel.lane.ntp_server", "127.0.0.1", str(NTP_PORT), str(400 * NS_PER_MS), "20"
     ).first_line()
-    # The drive delays the third clock's answers by much more than they varied before; by default chrony rejects such.
+    # During the drive the third clock's answers are delayed much more than before. By default chrony would reject them.
     third_clock = f"{follow_server('127.0.0.1', NTP_PORT)} maxdelaydevratio 1000"
     start_chronyd(server_machine, third_clock, "maxslewrate 500", "allow", adjusts_clock=True)
     wait_synchronised(server_machine, updates=4)
     start_chronyd(client_machine, follow_server(server_machine.address))
     wait_synchronised(client_machine, updates=10)
-    finished_drive = drive("slewed", server=SHORT_DRIVE, client=SMALL_LOAD, meanwhile=truth.sample)
+    finished_drive = drive("slewed", server=SHORT_DRIVE, client=SMALL_PICTURES, meanwhile=truth.sample)
     assert abs(correction_s(server_machine)) > 0.005, "the clock is no longer slewed"
     truth.check_drive(finished_drive)
 
 
 def test_ntp_through_delay_from_the_start_invalidates_the_run(
-    drive: DriveOnce, server_machine: Machine, client_machine: Machine, report_figure: ReportFigure
+    drive: DriveOnce, server_machine: Machine, client_machine: Machine, report_measurement: ReportMeasurement
 ) -> None:
-    """If NTP went through 75 ms in one direction from the start, the run is invalid, and the reason names the path."""
+    """If NTP is delayed in one direction from the start, the run is invalid, and the reason names the client."""
     start_chronyd(server_machine, *SERVE_OWN_CLOCK)
     with netem_on_ntp(client_machine):
         start_chronyd(client_machine, follow_server(server_machine.address))
         wait_synchronised(client_machine, updates=10)
-        finished_drive = drive("before", server=SHORT_DRIVE, client=SMALL_LOAD, expected_codes=CLIENT_NTP_CODES)
+        finished_drive = drive("before", server=SHORT_DRIVE, client=SMALL_PICTURES, expected_codes=CLIENT_NTP_CODES)
     [reason] = invalid_reasons(finished_drive)
-    report_figure(reason.text)
+    report_measurement(reason.text)
     assert reason.code is InvalidCode.NTP_THROUGH_DELAY
     assert "client" in reason.text
 
 
 @pytest.mark.usefixtures("chrony")
 def test_ntp_through_delay_after_synchronisation_invalidates_the_run(
-    drive: DriveOnce, client_machine: Machine, report_figure: ReportFigure
+    drive: DriveOnce, client_machine: Machine, report_measurement: ReportMeasurement
 ) -> None:
-    """If NTP goes through delay after it synchronised, the run is invalid, because chrony accepts no more samples."""
+    """If NTP is delayed after chrony has synchronised, the run is invalid, because chrony accepts no more samples."""
     with netem_on_ntp(client_machine):
-        finished_drive = drive("after", server=SHORT_DRIVE, client=SMALL_LOAD, expected_codes=CLIENT_NTP_CODES)
+        finished_drive = drive("after", server=SHORT_DRIVE, client=SMALL_PICTURES, expected_codes=CLIENT_NTP_CODES)
     reasons = invalid_reasons(finished_drive)
-    report_figure("; ".join(reason.text for reason in reasons))
+    report_measurement("; ".join(reason.text for reason in reasons))
     assert InvalidCode.NTP_NO_SAMPLE in {reason.code for reason in reasons}
     assert all("the NTP of the client " in reason.text for reason in reasons)
 
@@ -221,7 +223,7 @@ def test_wall_clock_step_changes_no_safety_state(
     finished_drive = drive(
         "stepped",
         server=SHORT_DRIVE,
-        client=SMALL_LOAD,
+        client=SMALL_PICTURES,
         expected_codes=(InvalidCode.CLOCK_STEP,),
         meanwhile=step,
     )
@@ -241,7 +243,7 @@ def test_wall_clock_step_changes_no_safety_state(
 def test_probe_alone_is_true_under_control_delay(
     drive: DriveOnce, truth: TrueOffsetSamples, server_machine: Machine
 ) -> None:
-    """Without chrony, Delta is within the probe's bound under 100 ms of control delay: the probe is not delayed."""
+    """Without chrony, Delta is within the probe's bound under L5, because L5 does not delay the probe."""
     server_machine.call(clocks.step, 250 * NS_PER_MS)
     finished_drive = drive(
         "probe", server=(*SHORT_DRIVE, *SERVER_INJECTION), client=client_changes_for("L5"), meanwhile=truth.sample

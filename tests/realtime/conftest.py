@@ -1,4 +1,4 @@
-"""Fixtures of the real-time tests: their marks, waiting with a time limit, and the drives of the demo."""
+"""Marks and fixtures of the real-time tests: waiting with a time limit, and the drives of the demo."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from lavt.recording.record import read_record
 HERE = Path(__file__).parent
 POLL_NS = 50 * NS_PER_MS
 TIMEOUT_S = 900
-"""A test may have to drive several times on a busy host."""
+"""On a busy host a test can need several drives."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -113,7 +113,7 @@ def run_at_a_terminal(arguments: list[str]) -> tuple[int, str]:
     while True:
         try:
             piece = os.read(terminal, 65536)
-        except OSError:  # on Linux: the program has closed the terminal
+        except OSError:  # Linux reports so that the program has closed the terminal
             break
         if not piece:
             break
@@ -137,5 +137,5 @@ def demos(tmp_path_factory: pytest.TempPathFactory, stalls: Stalls) -> SharedRes
 
 @pytest.fixture
 def demo(demos: SharedResult[Demo]) -> Demo:
-    """Return the demo, run once per session unless the host stalled it."""
+    """Return the demo, which runs once for all tests, and again only if the host stalled it."""
     return demos.get()

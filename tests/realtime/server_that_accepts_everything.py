@@ -14,8 +14,9 @@ def accept(*_: object) -> None:
 
 
 def number_if_known(issued_stamps: IssuedStamps, stamp_ns: int) -> int:
-    """Return the frame number of a known stamp; -1, older than all, for others."""
-    return issued_stamps._issued.get(stamp_ns, (-1, 0))[0]
+    """Return the frame number of a known stamp; for another stamp -1, which is older than all frames."""
+    frame = issued_stamps._issued.get(stamp_ns)
+    return -1 if frame is None else frame.number
 
 
 with (

@@ -6,7 +6,7 @@ from tests.support.stalls import BUSY_SHARE, LONG_STALL_MS, Stalls
 from lavt.recording.record import read_record
 
 VIDEO_MS, CONTROL_MS = 225.0, 100.0
-"""What L5 injects (netem/conditions.yaml); L0 injects nothing."""
+"""The delays that L5 injects (netem/conditions.yaml); L0 injects nothing."""
 
 
 def test_the_injected_delay_is_measured(demo: Demo, stalls: Stalls) -> None:

@@ -32,7 +32,7 @@ OUTAGE_S = 3.0
 STALL_S = 1.2
 """Shorter than the routers' lease of 2 s: messages sent in the meantime are buffered and arrive in a burst."""
 SLOW_MPS = 2.5
-"""Low enough to stop within the straight at the beginning of the road."""
+"""Low enough for a stop on the straight at the beginning of the road."""
 FAST_MPS = 8.0
 """Nearly the 30 km/h that the controller keeps."""
 MOVING_MPS = 0.5
@@ -42,13 +42,13 @@ BRAKE_DELAY_S = 0.5
 """Time for the brake pressure to build up."""
 LOW_LOAD = ("vehicle.scenery=none", "controller.preset=designed")
 LATE_STATE = ("network.condition=L1", "network.state_delay=with_video")
-"""The client learns 75 ms late that the vehicle has stopped, and sends commands of the old epoch until then."""
+"""The client learns 75 ms late that the vehicle has stopped. Until then it sends commands of the old epoch."""
 ACCEPTS_EVERYTHING = Path(__file__).with_name("server_that_accepts_everything.py")
 
 
 @dataclass
 class LoopWithOutages:
-    """A running loop, and the times at which outages began; server and test read the same clocks."""
+    """A running loop, and the times at which its outages began; server and test read the same clocks."""
 
     processes: Processes
     work: Path
@@ -195,7 +195,7 @@ def accepted_commands(record: Record) -> Table:
     return admissions.where(np.array(admissions.texts("verdict")) == "accepted")
 
 
-def transition(record: Record, into: str, after_ns: int) -> Now:
+def first_transition(record: Record, into: str, after_ns: int) -> Now:
     """Return the first transition into a safety state after a time, on both clocks."""
     events = record.table("event")
     for kind, detail, mono_ns, wall_ns in zip(
@@ -207,7 +207,7 @@ def transition(record: Record, into: str, after_ns: int) -> Now:
 
 
 def last_fresh_ns(record: Record, before_ns: int) -> int:
-    """Return when the last command from a newer picture than any before was received."""
+    """Return when the last command before a time was received whose picture was newer than all earlier ones."""
     commands = accepted_commands(record)
     commands = commands.where(commands.ints("received_mono_ns") < before_ns)
     stamps_ns = commands.ints("stamp_ns")
@@ -216,7 +216,7 @@ def last_fresh_ns(record: Record, before_ns: int) -> int:
 
 
 def count_stale(record: Record, stop: Now) -> int:
-    """Count the commands accepted after `stop` whose epoch, send time or picture is from before it."""
+    """Count the commands accepted after a stop whose epoch, send time or picture is from before the stop."""
     commands = accepted_commands(record)
     before = commands.ints("received_mono_ns") <= stop.mono_ns
     old_epochs = set(commands.where(before).objects("epoch"))
@@ -234,7 +234,7 @@ def test_the_vehicle_stops_within_the_limits(
     drive: LoopWithOutages, server: Record, stalls: Stalls, outage: str
 ) -> None:
     """The safe stop begins 500 ms after the last fresh command and decelerates with 4 m/s2: 2.6 s from 30 km/h."""
-    stop = transition(server, "safe_stop", drive.outage_began[outage].mono_ns)
+    stop = first_transition(server, "safe_stop", drive.outage_began[outage].mono_ns)
     truth = server.table("truth")
     at_ns, speed_mps = truth.ints("mono_ns"), truth.floats("speed_mps")
     since_command_ns = stop.mono_ns - last_fresh_ns(server, stop.mono_ns)
@@ -253,8 +253,8 @@ def test_the_vehicle_stays_stationary_until_it_is_armed_again(
     drive: LoopWithOutages, server: Record, outage: str
 ) -> None:
     """After a safe stop the vehicle does not accelerate until it is armed again."""
-    stop = transition(server, "safe_stop", drive.outage_began[outage].mono_ns)
-    armed = transition(server, "driving", stop.mono_ns)
+    stop = first_transition(server, "safe_stop", drive.outage_began[outage].mono_ns)
+    armed = first_transition(server, "driving", stop.mono_ns)
     truth = server.table("truth")
     at_ns = truth.ints("mono_ns")
     speeds_mps = truth.where((at_ns > stop.mono_ns + 200 * NS_PER_MS) & (at_ns < armed.mono_ns)).floats("speed_mps")
@@ -266,8 +266,8 @@ def test_the_vehicle_stays_stationary_until_it_is_armed_again(
 @pytest.mark.parametrize("outage", OUTAGES)
 def test_nothing_from_before_a_stop_is_accepted_after_it(drive: LoopWithOutages, server: Record, outage: str) -> None:
     """After a safe stop no command with an epoch, send time or picture from before the stop is accepted."""
-    stop = transition(server, "safe_stop", drive.outage_began[outage].mono_ns)
-    armed = transition(server, "driving", stop.mono_ns)
+    stop = first_transition(server, "safe_stop", drive.outage_began[outage].mono_ns)
+    armed = first_transition(server, "driving", stop.mono_ns)
 
     assert count_stale(server, stop) == 0
     assert np.sum(accepted_commands(server).ints("received_mono_ns") > armed.mono_ns) > 20
@@ -281,7 +281,7 @@ def test_a_server_without_checks_accepts_stale_commands(
 
     A suspended client is not tested here: whether it learns of the stop before its next command is a race.
     """
-    stop = transition(unguarded_server, "safe_stop", unguarded.outage_began[outage].mono_ns)
+    stop = first_transition(unguarded_server, "safe_stop", unguarded.outage_began[outage].mono_ns)
 
     assert count_stale(unguarded_server, stop) > 0
 

@@ -12,12 +12,12 @@ CONDITIONS = ("L0", "L5")
 INJECTED_FLOWS = {"tau_v_ms": ("video",), "tau_c_ms": ("control",), "loop_ms": ("video", "control")}
 """For each latency, the flows whose injected delay it contains."""
 COMPUTATION = ("encode", "decode", "perceive")
-"""The stages that depend most on the machine's speed. Virtual time takes them from `configs/costs.yaml`, which was
-measured on one machine, while the car was in its lane."""
+"""The stages whose durations depend most on the machine's speed. In virtual time the durations are those of
+`configs/costs.yaml`, which were measured on one machine, with the car in its lane."""
 
 
 def pair(demo: Demo, condition: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the results in real and in virtual time."""
+    """Return the results under a condition: in real time, in virtual time."""
     results = {run["time"]: run for run in demo.summary["runs"] if run["condition"] == condition}
     return results["real"], results["virtual"]
 
@@ -39,7 +39,7 @@ def computation_ms(result: dict[str, Any]) -> float:
 def test_latencies_agree_in_real_and_virtual_time(demo: Demo, stalls: Stalls, condition: str, latency: str) -> None:
     """The medians of video, control and loop latency in real and in virtual time are within 5 ms.
 
-    What is not injected is first scaled to the speed that the machine had in the real drive.
+    The part of the virtual latency that is not injected is first scaled to the machine's speed in the real drive.
     """
     real, virtual = pair(demo, condition)
     injected_ms = sum(virtual["injected_ms"][flow] for flow in INJECTED_FLOWS[latency])
@@ -50,7 +50,7 @@ def test_latencies_agree_in_real_and_virtual_time(demo: Demo, stalls: Stalls, co
 
 
 def test_lane_keeping_agrees_in_real_and_virtual_time(demo: Demo, stalls: Stalls) -> None:
-    """Without delay a drive ends the same way, and its P95 cross-track error is within 30 % of that in real time."""
+    """Without delay, both drives have the same ending, and P95 cross-track errors that differ by less than 30 %."""
     real, virtual = pair(demo, "L0")
     with stalls.excusing_failures(demo.since_ns, demo.until_ns, stall_ms=LONG_STALL_MS):
         assert real["ending"] == virtual["ending"]

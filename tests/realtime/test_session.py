@@ -45,9 +45,9 @@ def has_printed(process: Process, *words: str) -> bool:
 
 @dataclass
 class Session:
-    """A server and clients, with their reports and the times at which they ended.
+    """A server and clients, with their reports, exit codes and times.
 
-    They start in the worst order: a client, the server, and only then the routers.
+    The processes start in the worst order: a client, the server, and only then the routers.
     """
 
     processes: Processes
@@ -55,7 +55,9 @@ class Session:
     wait_until: Wait
     planned: PlannedRun
     observations: dict[str, Any] = field(default_factory=dict)
+    """What a process reported at a moment, by the name of the moment."""
     at_ns: dict[str, int] = field(default_factory=dict)
+    """The times of events of the session, by the event's name."""
     codes: dict[str, int | None] = field(default_factory=dict)
     clock: MachineClock = field(default_factory=MachineClock)
 
@@ -65,7 +67,7 @@ class Session:
         self.link_of_routers = f"udp/127.0.0.1:{free_port(udp)}?rel=1;mixed_rel=1"
         self.probe_port = free_port(udp)
 
-    def client(self, name: str, operator: str, *options: str) -> Process:
+    def start_client(self, name: str, operator: str, *options: str) -> Process:
         run = self.planned.config
         config = client_config(run, router=self.client_endpoint, probe_port=self.probe_port)
         path = self.write(name, config.model_copy(update={"who": operator}))
@@ -73,7 +75,7 @@ class Session:
         process.ready()
         return process
 
-    def server(self) -> Process:
+    def start_server(self) -> Process:
         config = server_config(self.planned.config, self.planned.seed, router=self.server_endpoint)
         clock = config.clock.model_copy(update={"probe_port": self.probe_port})
         path = self.write("server", config.model_copy(update={"clock": clock}))
@@ -81,7 +83,7 @@ class Session:
         process.ready()
         return process
 
-    def routers(self) -> None:
+    def start_routers(self) -> None:
         listen = f"listen.endpoints={json.dumps([self.server_endpoint, self.link_of_routers])}"
         self.processes.start("server-router", "router", "zenoh-configs/router-server.json5", "--set", listen).ready()
         start_client_router(self.processes, self.link_of_routers, self.client_endpoint)
@@ -119,34 +121,39 @@ def sessions(
     def run() -> Session:
         work = tmp_path_factory.mktemp("session")
         with Processes(work) as processes:
-            drive = Session(processes, work, wait_until, planned("vehicle.scenery=none", "controller.preset=designed"))
-            first = drive.client("first", "operator-1")
-            drive.observations["first without a router"] = first.last_message()
-            server = drive.server()
-            drive.routers()
-            drive.reach(server, first, 2.0)
+            session = Session(
+                processes, work, wait_until, planned("vehicle.scenery=none", "controller.preset=designed")
+            )
+            first = session.start_client("first", "operator-1")
+            session.observations["first without a router"] = first.last_message()
+            server = session.start_server()
+            session.start_routers()
+            session.reach(server, first, 2.0)
 
-            waiting = drive.client("waiting", "operator-2")
+            waiting = session.start_client("waiting", "operator-2")
             wait_until("a rejection", lambda: "operator-1" in status(waiting).get("session", ""), START_LIMIT_S)
-            drive.observations["waiting"], drive.observations["server while it waits"] = status(waiting), status(server)
-            drive.end(waiting)
+            session.observations["waiting"], session.observations["server while it waits"] = (
+                status(waiting),
+                status(server),
+            )
+            session.end(waiting)
 
-            second = drive.client("second", "operator-2", "--take-over")
+            second = session.start_client("second", "operator-2", "--take-over")
             wait_until("a request at the client", lambda: has_printed(first, "operator-2", "SIGUSR2"), START_LIMIT_S)
             wait_until("a request", lambda: status(server).get("requested_by") == "operator-2", START_LIMIT_S)
-            drive.observations["requested"] = status(server)
+            session.observations["requested"] = status(server)
             first.popen.send_signal(signal.SIGUSR2)
-            drive.reach(server, second, 1.0)
-            drive.observations["handed over"], drive.observations["first after handover"] = (
+            session.reach(server, second, 1.0)
+            session.observations["handed over"], session.observations["first after handover"] = (
                 status(server),
                 status(first),
             )
 
-            drive.end(second)
+            session.end(second)
             wait_until("a release", lambda: status(server).get("active_operator") == "", START_LIMIT_S)
-            drive.end(server)
-            drive.end(first)
-        return drive
+            session.end(server)
+            session.end(first)
+        return session
 
     return SharedResult(stalls, run)
 
@@ -171,7 +178,7 @@ def event_ns(record: Record, *words: str) -> int:
 
 
 def test_a_client_started_before_its_router_and_server_drives(session: Session, server: Record) -> None:
-    """A client that starts before the server and the routers reports once that it waits, and then drives."""
+    """A client that starts before the server and the routers reports that it waits, and drives later."""
     assert "no router answers" in session.observations["first without a router"]
     assert "waiting" in session.observations["first without a router"]
     assert event_ns(server, "arming -> driving")
@@ -191,7 +198,7 @@ def test_a_second_client_learns_who_has_control(session: Session) -> None:
 
 
 def test_the_active_operator_hands_over_on_request(session: Session, server: Record, stalls: Stalls) -> None:
-    """After a request and SIGUSR2 the active operator releases the vehicle, which stops; the requester drives it."""
+    """After a request and SIGUSR2 the active operator releases the vehicle, which stops; then the requester drives."""
     requested = session.observations["requested"]
     assert (requested["active_operator"], requested["requested_by"]) == ("operator-1", "operator-2")
     assert session.observations["handed over"]["active_operator"] == "operator-2"
@@ -206,7 +213,7 @@ def test_the_active_operator_hands_over_on_request(session: Session, server: Rec
 
 
 def test_ctrl_c_of_the_active_operator_releases_the_vehicle(session: Session, server: Record, stalls: Stalls) -> None:
-    """Within a second after Ctrl-C the vehicle is released; the client reports it and ends with exit code 0."""
+    """Within a second after Ctrl-C the client releases the vehicle, reports the release and ends with exit code 0."""
     released_ns = event_ns(server, "release", "operator-2", "granted")
     interrupted_ns = session.at_ns["second interrupted"]
     assert interrupted_ns < released_ns
@@ -225,7 +232,7 @@ def test_a_server_ends_with_its_vehicle_stopped(session: Session, server: Record
 
 
 def test_a_client_without_control_ends_soon(session: Session, stalls: Stalls) -> None:
-    """Ctrl-C ends a client without control, whose server has ended, within 3 s and with exit code 0."""
+    """Ctrl-C ends a client that has no control and whose server has ended within 3 s, with exit code 0."""
     assert session.codes["first"] == 0
     interrupted_ns, ended_ns = session.at_ns["first interrupted"], session.at_ns["first ended"]
     with stalls.excusing_failures(interrupted_ns, ended_ns, stall_ms=LONG_STALL_MS):

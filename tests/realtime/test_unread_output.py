@@ -29,7 +29,7 @@ PIPE_BYTES = 4096
 
 
 @contextmanager
-def unread(program: str, config: BaseModel, work: Path) -> Iterator[subprocess.Popen[bytes]]:
+def start_unread(program: str, config: BaseModel, work: Path) -> Iterator[subprocess.Popen[bytes]]:
     """Yield a running program whose standard output and error are small pipes; end it afterwards."""
     path = work / f"{program}.yaml"
     path.write_text(yaml.safe_dump(config.model_dump(mode="json")))
@@ -65,17 +65,19 @@ def test_signals_end_a_client_and_a_server_whose_output_is_not_read(
     planned: Callable[..., PlannedRun],
     wait_until: Callable[[str, Callable[[], bool], float], None],
 ) -> None:
-    """With full pipes, a client releases the vehicle and ends on a signal, and a server stops it and ends."""
+    """SIGTERM ends a client and a server whose output pipes are full; the client releases the vehicle first."""
     run = planned("vehicle.scenery=none")
     with Processes(tmp_path) as processes, ExitStack() as stack:
         router = processes.start(
             "router", "router", "zenoh-configs/router-server.json5", "--set", 'listen.endpoints=["tcp/127.0.0.1:0"]'
         )
         (local,) = router.ready()["locators"]
-        server = stack.enter_context(unread("server", server_config(run.config, run.seed, router=local), tmp_path))
+        server = stack.enter_context(
+            start_unread("server", server_config(run.config, run.seed, router=local), tmp_path)
+        )
         ready = first_line(server.stdout)["ready"]
         ports = {key: ready[key] for key in ("video_port", "probe_port")}
-        client = stack.enter_context(unread("client", client_config(run.config, router=local, **ports), tmp_path))
+        client = stack.enter_context(start_unread("client", client_config(run.config, router=local, **ports), tmp_path))
         wait_until("the car drives", lambda: is_driving(tmp_path / "server" / "server.mcap"), DRIVING_WITHIN_S)
         pause(UNREAD_S * NS_PER_S)
         client.send_signal(signal.SIGTERM)

@@ -15,7 +15,7 @@ from lavt.safety.limiter import Limiter
 from lavt.safety.limits import LIMITS, Limits
 
 COMMAND_PERIOD_NS = 20 * NS_PER_MS
-"""Period of the client's commands and pictures in the tests."""
+"""Period of the client's commands and of the camera's pictures in the tests."""
 START_NS = 1_000 * NS_PER_S
 WALL_NS = 1_790_000_000 * NS_PER_S
 WHEELBASE_M = 2.8448
@@ -39,7 +39,7 @@ def vehicle_at(speed_mps: float = 0.0, steering_rad: float = 0.0) -> VehicleStat
 
 
 class Rig:
-    """A safety gate with its surroundings; `now_ns` is the server's monotonic clock and is advanced by `go` only."""
+    """A safety gate with its surroundings; `now_ns` is the server's monotonic clock, which `pass_time` advances."""
 
     def __init__(self, limits: Limits = LIMITS) -> None:
         epochs, tokens = count(1000), count(1)
@@ -59,18 +59,18 @@ class Rig:
         self.stamp_ns = 0
         self.wall_step_ns = 0
 
-    def go(self, duration_ns: int) -> None:
-        """Let time pass, and call `check_timeouts` whenever it is due."""
+    def pass_time(self, duration_ns: int) -> None:
+        """Let time pass, and call `check_timeouts` at each wake that the watchdog requests."""
         end_ns = self.now_ns + duration_ns
         while (wake_ns := self.gate.watchdog.next_wake_ns()) is not None and wake_ns <= end_ns:
             self.now_ns = max(self.now_ns, wake_ns)
             self.gate.watchdog.check_timeouts(self.now_ns)
-            assert self.gate.watchdog.next_wake_ns() != wake_ns, "the gate requests the same wake repeatedly"
+            assert self.gate.watchdog.next_wake_ns() != wake_ns, "the watchdog requests the same wake again and again"
         self.now_ns = end_ns
         self.gate.watchdog.check_timeouts(end_ns)
 
-    def picture(self, crc: int | None = None, *, captured_ns: int | None = None) -> int:
-        """Issue the stamp of a new picture and return it; the camera reports `captured_ns`."""
+    def take_picture(self, crc: int | None = None, *, captured_ns: int | None = None) -> int:
+        """Issue the stamp of a new picture and return the stamp; the camera reports `captured_ns`."""
         self.frame += 1
         self.stamp_ns = WALL_NS + self.now_ns + self.wall_step_ns
         crc = self.frame if crc is None else crc
@@ -79,13 +79,14 @@ class Rig:
         return self.stamp_ns
 
     def request(self, operation: Operation, who: str = "alice", instance: int = 1, number: int = 0) -> SessionReply:
+        """Send a session request; an epoch that alice gets is that of later commands."""
         reply = self.gate.session.answer(SessionRequest(operation, who, instance, number), self.vehicle, self.now_ns)
         if who == "alice" and reply.epoch:
             self.epoch = reply.epoch
         return reply
 
     def command(self, **changes: Any) -> Command:
-        """Return a valid command from the newest picture: "arm" with the brake applied, changed by `changes`."""
+        """Return an arm command from the newest picture, with full brake; `changes` replaces some of its fields."""
         self.sequence += 1
         command = Command(
             self.epoch, self.sequence, self.now_ns, self.stamp_ns, self.now_ns, 0.0, 0.0, 1.0, (0.0,) * 10, "arm", 0
@@ -95,7 +96,7 @@ class Rig:
     def send(self, **changes: Any) -> CommandVerdict:
         return self.gate.admit(self.command(**changes), self.vehicle, self.now_ns, self.now_ns)
 
-    def drive(self, **changes: Any) -> CommandVerdict:
+    def send_drive(self, **changes: Any) -> CommandVerdict:
         return self.send(**{"mode": "drive", "throttle": 0.5, "brake": 0.0, **changes})
 
     def acquire(self) -> Rig:
@@ -104,28 +105,28 @@ class Rig:
 
     def arm_for(self, duration_ns: int) -> None:
         """Send an arm command from a new picture in each period, the last one at the end of `duration_ns`."""
-        self.picture()
+        self.take_picture()
         self.send()
         for _ in range(duration_ns // COMMAND_PERIOD_NS):
-            self.go(COMMAND_PERIOD_NS)
-            self.picture()
+            self.pass_time(COMMAND_PERIOD_NS)
+            self.take_picture()
             self.send()
 
-    def armed(self) -> Rig:
+    def arm(self) -> Rig:
         """Acquire control and arm the vehicle."""
         self.acquire()
         self.arm_for(NS_PER_S)
         assert self.gate.state == "driving"
         return self
 
-    def driving(self, **changes: Any) -> Rig:
+    def start_driving(self, **changes: Any) -> Rig:
         """Arm the vehicle and send one drive command, now."""
-        self.armed()
-        self.picture()
-        assert self.drive(**changes).accepted
+        self.arm()
+        self.take_picture()
+        assert self.send_drive(**changes).accepted
         return self
 
-    def clear(self, who: str = "alice", instance: int = 1, number: int | None = None) -> SessionReply:
+    def clear_emergency_stop(self, who: str = "alice", instance: int = 1, number: int | None = None) -> SessionReply:
         """Request to clear the last emergency stop that the vehicle reported, or the one with `number`."""
         last = self.request("acquire", who, instance).emergency_stop
         return self.request("clear_emergency_stop", who, instance, last if number is None else number)

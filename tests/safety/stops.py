@@ -2,8 +2,9 @@
 
 A route is driven once in virtual time at L0. The car starts at 30 km/h, because the curves of the key routes come
 before it could reach that speed. Pictures are rendered and the lane is detected in them (`fidelity: pixels`), so that
-the paths in the commands have realistic errors; leaving out the codec halves the time. At each metre the vehicle's side
-is copied, with its car, and continues without commands until it is stationary.
+the paths in the commands have realistic errors; leaving out the codec halves the time. At each metre the actuator node
+and its car are copied. The copy continues without commands until the car is stationary. A station is a distance along
+the route, in metres.
 """
 
 from __future__ import annotations
@@ -35,11 +36,11 @@ from lavt.vehicle.sim.simulator import Simulator
 ROUTES = ("a", "a_key", "b", "b_key", "c", "c_key")
 SPEED_MPS = 30 / 3.6
 LEAD_M = 16.0
-"""The first stop of a curve begins this far before it. As the car covers 14 m after its last command, the stop ends at
-the curve."""
+"""The first stop of a curve begins this far before the curve. The car covers 14 m after its last command, so that this
+stop ends near the curve's beginning."""
 FIRST_STOP_M = 5.0
-"""No stop begins before this station: a drive begins up to 2 m into its route, and its first command from a picture
-that was taken at 30 km/h comes 3 m later."""
+"""No stop begins before this station. A drive begins up to 2 m into its route, and the first command from a picture
+that was taken at 30 km/h is accepted 3 m later."""
 ALLOWED_BEYOND_M = 0.3
 """Allowed distance of a corner of the body beyond the lane's edge."""
 
@@ -68,7 +69,7 @@ class Stop:
     beyond_m: float
     """Largest distance of a corner of the body beyond the lane's edge; negative inside the lane."""
     covered_m: float
-    ended: str
+    final_state: str
     """Safety state at standstill."""
 
 
@@ -85,18 +86,20 @@ class StopPair(NamedTuple):
 def curves(route: str, road: Road) -> list[Curve]:
     """Return the curves of a route: its segments that are not straight, joined if they bend to the same side."""
     found: list[Curve] = []
-    s_m, before_m = road.first_m, FIRST_STOP_M
+    station_m, first_allowed_m = road.first_m, FIRST_STOP_M
     for bend, pieces in groupby(
         road.segments, key=lambda segment: (segment.curvature_per_m > 0) - (segment.curvature_per_m < 0)
     ):
         segments = list(pieces)
-        end_m = s_m + sum(segment.length_m for segment in segments)
-        if bend and s_m < road.route_length_m and end_m > 0:
+        end_m = station_m + sum(segment.length_m for segment in segments)
+        if bend and station_m < road.route_length_m and end_m > 0:
             tightest = max((segment.curvature_per_m for segment in segments), key=abs)
             end_m = min(end_m, road.route_length_m)
-            found.append(Curve(route, max(s_m, 0.0), end_m, 1 / tightest, max(s_m - LEAD_M, before_m)))
-            before_m = end_m
-        s_m = end_m
+            found.append(
+                Curve(route, max(station_m, 0.0), end_m, 1 / tightest, max(station_m - LEAD_M, first_allowed_m))
+            )
+            first_allowed_m = end_m
+        station_m = end_m
     return found
 
 
@@ -123,10 +126,10 @@ def stops(route: str, condition: str = "L0") -> Iterator[StopPair]:
         for curve in curves(route, car._route_monitor._road):
             for metre in metres(curve):
                 _drive_to(loop, car, metre)
-                node = _copied(actuator_of(loop))
-                node_without_path = _copied(node)
+                node = _copy(actuator_of(loop))
+                node_without_path = _copy(node)
                 node_without_path.gate.watchdog._path.clear_path()  # disables path following
-                yield StopPair(curve, _stopped(node), _stopped(node_without_path))
+                yield StopPair(curve, _stop(node), _stop(node_without_path))
         for writer in loop.writers:
             writer.close()
 
@@ -139,11 +142,11 @@ class FullThrottleStop:
     throttle: float
     """Throttle of the car, which follows the pedal with a lag, at the last command."""
     since_picture_m: float
-    """Distance from the place of the last command's picture to standstill."""
+    """Distance from the place where the last command's picture was taken to standstill."""
 
 
 def full_throttle_stops(delay_ms: float, start_mps: float, duration_s: float = 5.0) -> Iterator[FullThrottleStop]:
-    """Drive a straight road with full throttle in every command, and yield the stop after every third command.
+    """Drive a straight road with full throttle in every command, and yield a safe stop after every third command.
 
     The car starts at `start_mps`. `delay_ms` is added to the video.
     """
@@ -172,7 +175,7 @@ def full_throttle_stops(delay_ms: float, start_mps: float, duration_s: float = 5
 
         while all(loop.runtime.run(end_ns, has_new_command) for _ in range(3)):
             since_picture_m = motion.x_m - np.interp(captured_ns, *np.transpose(passed))
-            throttle, stop = motion.throttle, _stopped(_copied(node))
+            throttle, stop = motion.throttle, _stop(_copy(node))
             yield FullThrottleStop(stop, throttle, since_picture_m + stop.covered_m)
         for writer in loop.writers:
             writer.close()
@@ -195,21 +198,21 @@ def _drive_to(loop: VirtualLoop, car: Simulator, metre: int) -> None:
     assert loop.runtime.run(loop.runtime.true_ns + 20 * NS_PER_S, accepted_there)
 
 
-def _copied(node: ActuatorNode) -> ActuatorNode:
-    """Return a copy of gate, odometry and car; the road, which never changes, is shared."""
+def _copy(node: ActuatorNode) -> ActuatorNode:
+    """Return a copy of a node with its gate, odometry and car; the road, which never changes, is shared."""
     assert isinstance(node.vehicle, Simulator)
     road, fixes = node.vehicle._route_monitor._road, node.gate.watchdog._path._odometry._fixes
-    other = copy.deepcopy(node, {id(road): road, id(fixes): fixes.copy()})
-    other._endings = {}  # the end of the route does not end the drive
-    return other
+    node_copy = copy.deepcopy(node, {id(road): road, id(fixes): fixes.copy()})
+    node_copy._endings = {}  # the end of the route does not end the drive
+    return node_copy
 
 
-def _stopped(node: ActuatorNode) -> Stop:
-    """Run the vehicle's side, woken when due and without messages, until the car is stationary."""
+def _stop(node: ActuatorNode) -> Stop:
+    """Run an actuator node until its car is stationary; it gets the wakes that it requests, and no messages."""
     car = node.vehicle
     assert isinstance(car, Simulator)
     monitor, motion = car._route_monitor, car._car.motion
-    begin, half_m = car.ground_truth(), monitor._road.lanes.widths_m[monitor._road.lanes.driven] / 2
+    begin, half_lane_m = car.ground_truth(), monitor._road.lanes.widths_m[monitor._road.lanes.driven] / 2
     beyond_m, covered_m = -math.inf, 0.0
     while motion.speed_mps > 0:
         now = Now(node.next_wake_ns(), 0)
@@ -217,6 +220,7 @@ def _stopped(node: ActuatorNode) -> Stop:
         run_stages(node.name, node.pipelines[WAKE], Message(WAKE, None, now), now, repeat(now))
         covered_m += math.dist(before, (motion.x_m, motion.y_m))
         beyond_m = max(
-            beyond_m, *(abs(place[1]) - half_m for place in monitor._project_points(motion, monitor._corners))
+            beyond_m,
+            *(abs(offset_m) - half_lane_m for _, offset_m, _ in monitor._project_points(motion, monitor._corners)),
         )
     return Stop(begin.progress_m, begin.speed_mps, beyond_m, covered_m, node.gate.state)

@@ -21,7 +21,7 @@ def test_an_issued_stamp_is_known() -> None:
 
 @pytest.mark.parametrize(("age_ns", "known"), [(MEMORY_NS, True), (MEMORY_NS + 1, False)])
 def test_a_stamp_expires_exactly(age_ns: int, *, known: bool) -> None:
-    """A stamp is known for the length of the memory and no nanosecond longer, whether or not another one is issued."""
+    """A stamp is known for 5 s after its issue and no nanosecond longer, whether or not another stamp is issued."""
     for is_another_issued in (False, True):
         stamps = IssuedStamps(MEMORY_NS, 5)
         stamps.add(777, 3, 100, 1)
@@ -30,8 +30,8 @@ def test_a_stamp_expires_exactly(age_ns: int, *, known: bool) -> None:
         assert (stamps.issued_ns(777, 100 + age_ns) is not None) == known
 
 
-def test_a_stamp_issued_twice_counts_as_the_newer_frame() -> None:
-    """A stamp issued twice, after a step of the clock, lives as long as its newer frame."""
+def test_a_stamp_issued_twice_belongs_to_the_newer_frame() -> None:
+    """A stamp that is issued twice, after a step of the clock, belongs to the newer frame and expires with it."""
     stamps = IssuedStamps(MEMORY_NS, 5)
     stamps.add(777, 1, 0, 1)
     stamps.add(777, 9, 3 * NS_PER_S, 2)
@@ -41,7 +41,10 @@ def test_a_stamp_issued_twice_counts_as_the_newer_frame() -> None:
 
 
 def test_capture_time() -> None:
-    """The capture time is the camera's, at most the time of issue; equal pictures have that of the first one."""
+    """The capture time is the camera's, but never later than the issue; equal pictures have the first one's.
+
+    If the camera reports no capture time, the time of issue is used.
+    """
     stamps = IssuedStamps(MEMORY_NS, 5)
     # Stamp, time of issue, checksum, capture time.
     added = ((1, 100, 7, 90), (2, 200, 8, None), (3, 300, 8, 290), (4, 400, 9, 390), (5, 500, 10, 501))
@@ -59,13 +62,17 @@ def test_only_the_last_5_s_are_kept(frames: list[tuple[int, int]]) -> None:
         now_ns += passed_ns
         stamps.add(stamp_ns, number, now_ns, number)
         last[stamp_ns] = (number, now_ns, now_ns)
-    alive = {stamp_ns: frame for stamp_ns, frame in last.items() if now_ns - frame[1] <= MEMORY_NS}
+    alive = {
+        stamp_ns: (number, issued_ns, captured_ns)
+        for stamp_ns, (number, issued_ns, captured_ns) in last.items()
+        if now_ns - issued_ns <= MEMORY_NS
+    }
     assert stamps._issued == alive
     assert all(stamps.issued_ns(stamp_ns, now_ns) == at_ns for stamp_ns, (_, at_ns, _) in alive.items())
 
 
 def test_five_equal_pictures_are_frozen() -> None:
-    """Five equal pictures in a row are frozen; a different picture ends it, and alternating ones never are."""
+    """From the fifth equal picture in a row until a different one, pictures are frozen; alternating ones never are."""
     stamps = IssuedStamps(MEMORY_NS, 5)
     frozen = []
     for number, crc in enumerate([7, 7, 7, 7, 7, 7, 8, 8, 7, 8, 7, 8, 7]):

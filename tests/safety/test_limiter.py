@@ -24,10 +24,13 @@ from lavt.safety.limits import LIMITS
 LONG_NS = 3600 * NS_PER_S
 SPEED_MPS = 30 / 3.6
 LATERAL_RAD = math.atan(WHEELBASE_M * LIMITS.lateral_acceleration_mps2 / SPEED_MPS**2)
+"""The largest wheel angle that the limit of the lateral acceleration allows at `SPEED_MPS`."""
 
 
-def limited(requested: Actuation, speed_mps: float, *, after_ns: int = LONG_NS) -> tuple[Actuation, tuple[str, ...]]:
-    """Return the limited request, `after_ns` after the wheel was straight."""
+def limit_request(
+    requested: Actuation, speed_mps: float, *, after_ns: int = LONG_NS
+) -> tuple[Actuation, tuple[str, ...]]:
+    """Limit a request `after_ns` after the wheel was straight; return the result and the applied limits' names."""
     limiter = new_limiter()
     limiter.reset(0.0, 0)
     return limiter.limit(requested, vehicle_at(speed_mps), after_ns), limiter.applied_limits
@@ -36,17 +39,17 @@ def limited(requested: Actuation, speed_mps: float, *, after_ns: int = LONG_NS) 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_lateral_acceleration_is_limited(sign: int) -> None:
     """At 30 km/h the wheel angle is limited to a lateral acceleration of 3 m/s2, to either side."""
-    actuation, changed = limited(Actuation(sign * 0.4, 0.0, 0.0), SPEED_MPS)
+    actuation, applied_limits = limit_request(Actuation(sign * 0.4, 0.0, 0.0), SPEED_MPS)
     assert actuation.steering_rad == pytest.approx(sign * LATERAL_RAD)
     assert SPEED_MPS**2 * math.tan(abs(actuation.steering_rad)) / WHEELBASE_M == pytest.approx(3.0)
-    assert changed == ("lateral acceleration",)
+    assert applied_limits == ("lateral acceleration",)
 
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_steering_angle_is_limited(sign: int) -> None:
-    """At standstill the limit is the vehicle's own largest angle, to either side."""
-    actuation, changed = limited(Actuation(sign * 1.0, 0.0, 0.0), 0.0)
-    assert (actuation.steering_rad, changed) == (sign * MAX_STEERING_RAD, ("steering angle",))
+    """At standstill the wheel angle is limited to the largest angle of the vehicle, to either side."""
+    actuation, applied_limits = limit_request(Actuation(sign * 1.0, 0.0, 0.0), 0.0)
+    assert (actuation.steering_rad, applied_limits) == (sign * MAX_STEERING_RAD, ("steering angle",))
 
 
 @pytest.mark.parametrize("sign", [1, -1])
@@ -54,32 +57,32 @@ def test_an_angle_at_a_limit_is_not_changed(sign: int) -> None:
     """An angle exactly at the steering limit or at the lateral acceleration limit is not changed."""
     for bound_rad, speed_mps in ((MAX_STEERING_RAD, 0.0), (LATERAL_RAD, SPEED_MPS)):
         requested = Actuation(sign * bound_rad, 0.0, 0.0)
-        assert limited(requested, speed_mps) == (requested, ())
+        assert limit_request(requested, speed_mps) == (requested, ())
 
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_steering_rate_is_limited(sign: int) -> None:
-    """In 10 ms the target moves by at most 8 mrad, and it reaches the request later; to either side."""
+    """The steering target moves by at most 8 mrad in 10 ms and by 100 mrad in 125 ms, to either side."""
     requested = Actuation(sign * 0.1, 0.0, 0.0)
-    actuation, changed = limited(requested, SPEED_MPS, after_ns=10 * NS_PER_MS)
+    actuation, applied_limits = limit_request(requested, SPEED_MPS, after_ns=10 * NS_PER_MS)
     assert actuation.steering_rad == pytest.approx(sign * 0.008)
-    assert changed == ("steering rate",)
-    assert limited(requested, SPEED_MPS, after_ns=125 * NS_PER_MS) == (requested, ())
+    assert applied_limits == ("steering rate",)
+    assert limit_request(requested, SPEED_MPS, after_ns=125 * NS_PER_MS) == (requested, ())
 
 
 def test_a_change_reached_within_a_command_period_is_not_reported() -> None:
-    """A target that the rate limit allows within 20 ms is not reported as limited."""
+    """The limit of the steering rate is reported only if the target needs more than 20 ms to reach the request."""
     period_rad = LIMITS.steering_rate_radps * COMMAND_PERIOD_S
     for from_rad in (0.0, 0.1, -0.1):
-        for turn_rad, named in ((period_rad - 1e-4, ()), (period_rad + 1e-4, ("steering rate",))):
+        for turn_rad, reported_limits in ((period_rad - 1e-4, ()), (period_rad + 1e-4, ("steering rate",))):
             for sign in (1, -1):
                 limiter = new_limiter()
                 limiter.reset(from_rad, 0)
                 requested = Actuation(from_rad + sign * turn_rad, 0.0, 0.0)
                 actuation = limiter.limit(requested, vehicle_at(0.0), 4 * NS_PER_MS)
                 assert actuation.steering_rad == pytest.approx(from_rad + sign * LIMITS.steering_rate_radps * 0.004)
-                assert limiter.applied_limits == named
-    assert limited(Actuation(period_rad, 0.0, 0.0), 0.0, after_ns=4 * NS_PER_MS)[1] == ()
+                assert limiter.applied_limits == reported_limits
+    assert limit_request(Actuation(period_rad, 0.0, 0.0), 0.0, after_ns=4 * NS_PER_MS)[1] == ()
 
 
 def test_time_that_goes_back_allows_no_extra_steering() -> None:
@@ -93,26 +96,26 @@ def test_time_that_goes_back_allows_no_extra_steering() -> None:
 
 
 def test_no_throttle_above_the_speed_limit() -> None:
-    """Above 40 km/h the throttle is removed; at 40 km/h it is kept, and the brake always is."""
+    """Above 40 km/h the throttle is removed and the brake is kept; at 40 km/h the throttle is kept."""
     limit_mps = LIMITS.speed_limit_mps
-    assert limited(Actuation(0.0, 1.0, 0.0), limit_mps) == (Actuation(0.0, 1.0, 0.0), ())
-    assert limited(Actuation(0.0, 1.0, 0.0), limit_mps + 0.01) == (Actuation(0.0, 0.0, 0.0), ("speed",))
-    assert limited(Actuation(0.0, 0.0, 0.7), limit_mps + 9) == (Actuation(0.0, 0.0, 0.7), ())
+    assert limit_request(Actuation(0.0, 1.0, 0.0), limit_mps) == (Actuation(0.0, 1.0, 0.0), ())
+    assert limit_request(Actuation(0.0, 1.0, 0.0), limit_mps + 0.01) == (Actuation(0.0, 0.0, 0.0), ("speed",))
+    assert limit_request(Actuation(0.0, 0.0, 0.7), limit_mps + 9) == (Actuation(0.0, 0.0, 0.7), ())
 
 
 @pytest.mark.parametrize("speed_mps", [math.nan, math.inf, -math.inf])
 def test_a_speed_that_is_not_finite_lifts_no_limit(speed_mps: float) -> None:
     """A speed that is not finite limits the wheel as at the speed limit, and removes the throttle."""
-    actuation, changed = limited(Actuation(0.5, 0.0, 0.0), speed_mps)
-    top_rad = math.atan(WHEELBASE_M * LIMITS.lateral_acceleration_mps2 / LIMITS.speed_limit_mps**2)
-    assert actuation.steering_rad == pytest.approx(top_rad)
-    assert "lateral acceleration" in changed
-    assert limited(Actuation(0.0, 1.0, 0.0), speed_mps)[0].throttle == 0.0
+    actuation, applied_limits = limit_request(Actuation(0.5, 0.0, 0.0), speed_mps)
+    at_speed_limit_rad = math.atan(WHEELBASE_M * LIMITS.lateral_acceleration_mps2 / LIMITS.speed_limit_mps**2)
+    assert actuation.steering_rad == pytest.approx(at_speed_limit_rad)
+    assert "lateral acceleration" in applied_limits
+    assert limit_request(Actuation(0.0, 1.0, 0.0), speed_mps)[0].throttle == 0.0
 
 
 def test_the_highest_speed_leaves_no_steering() -> None:
     """The highest finite speed, whose square is not finite, limits the wheel to the middle and removes the throttle."""
-    actuation, _ = limited(Actuation(0.5, 1.0, 0.0), sys.float_info.max)
+    actuation, _ = limit_request(Actuation(0.5, 1.0, 0.0), sys.float_info.max)
     assert actuation == Actuation(0.0, 0.0, 0.0)
 
 
@@ -136,16 +139,17 @@ def test_before_the_first_target_the_wheel_keeps_its_angle() -> None:
 
 def test_all_applied_limits_are_named() -> None:
     """All limits that changed a request are named, and none if nothing was changed."""
-    _, changed = limited(Actuation(1.0, 1.0, 0.0), 20.0, after_ns=1)
-    assert changed == ("steering angle", "lateral acceleration", "steering rate", "speed")
-    assert limited(Actuation(0.01, 0.5, 0.0), SPEED_MPS)[1] == ()
+    _, applied_limits = limit_request(Actuation(1.0, 1.0, 0.0), 20.0, after_ns=1)
+    assert applied_limits == ("steering angle", "lateral acceleration", "steering rate", "speed")
+    assert limit_request(Actuation(0.01, 0.5, 0.0), SPEED_MPS)[1] == ()
 
 
 @pytest.mark.parametrize("age_s", [0.0, 0.08, 0.5, 0.86, 2.0])
 def test_the_speed_limit_stops_on_the_path(age_s: float) -> None:
-    """From the speed limit the car stops in the path's 20 m: picture age, 0.5 s, then braking with 4 m/s2.
+    """A car at the stopping speed limit stops on the path's 20 m.
 
-    In all of them it counts as faster by what full throttle adds in 0.3 s.
+    It drives on for the picture age and 0.5 s, and then brakes with 4 m/s2. All the way, its speed is taken to be
+    higher than the limit by what full throttle adds in 0.3 s.
     """
     speed_mps = stopping_speed_limit_mps(age_s, LIMITS, MAX_ACCELERATION_MPS2) + 0.3 * MAX_ACCELERATION_MPS2
     assert speed_mps * (age_s + 0.5) + speed_mps**2 / 8 == pytest.approx(20)
@@ -157,15 +161,15 @@ def test_a_car_too_strong_for_the_path_may_not_move() -> None:
 
 
 def test_30_kmh_is_allowed_up_to_a_picture_age_of_620_ms() -> None:
-    """The simulator's car may drive 30 km/h by pictures of up to 0.62 s, and not by older ones."""
+    """The stopping speed limit of the simulator's car falls below 30 km/h between picture ages of 0.61 s and 0.63 s."""
     at_610_ms, at_630_ms = (stopping_speed_limit_mps(age_s, LIMITS, MAX_ACCELERATION_MPS2) for age_s in (0.61, 0.63))
     assert at_610_ms > SPEED_MPS > at_630_ms
 
 
-def limited_at_excess(
+def limit_at_excess_speed(
     requested: Actuation, excess_mps: float, age_ns: int = NS_PER_S
 ) -> tuple[Actuation, tuple[str, ...]]:
-    """Return the limited request at a speed of `excess_mps` above the stopping speed limit."""
+    """Limit a request at a speed of `excess_mps` above the stopping speed limit; see `limit_request`."""
     limiter = new_limiter()
     limiter.reset(0.0, 0)
     speed_mps = stopping_speed_limit_mps(age_ns / NS_PER_S, LIMITS, MAX_ACCELERATION_MPS2) + excess_mps
@@ -173,29 +177,35 @@ def limited_at_excess(
 
 
 def test_excess_speed_is_braked_away() -> None:
-    """Above the limit the throttle is removed, and the brake gives 4 m/s2 per m/s of excess, at most a safe stop's."""
+    """Above the stopping speed limit the throttle is removed, and the car brakes.
+
+    It brakes with 4 m/s2 for each m/s of excess speed, but not harder than a safe stop.
+    """
     safe_stop_brake = LIMITS.stop_deceleration_mps2 / MAX_BRAKING_MPS2
     for excess_mps, brake in ((0.25, safe_stop_brake / 4), (1.0, safe_stop_brake), (3.0, safe_stop_brake)):
-        actuation, changed = limited_at_excess(Actuation(0.0, 0.8, 0.0), excess_mps)
-        assert (actuation.throttle, changed) == (0.0, ("stopping distance",))
+        actuation, applied_limits = limit_at_excess_speed(Actuation(0.0, 0.8, 0.0), excess_mps)
+        assert (actuation.throttle, applied_limits) == (0.0, ("stopping distance",))
         assert actuation.brake == pytest.approx(brake)
 
 
 def test_excess_speed_changes_either_pedal_alone() -> None:
-    """Above the limit a throttle is removed also under a harder brake, and the brake is applied without one."""
+    """Above the limit the throttle is removed even if the requested brake is harder, and a light brake is raised."""
     safe_stop_brake = LIMITS.stop_deceleration_mps2 / MAX_BRAKING_MPS2
-    assert limited_at_excess(Actuation(0.0, 0.8, 0.9), 1.0) == (Actuation(0.0, 0.0, 0.9), ("stopping distance",))
-    actuation, changed = limited_at_excess(Actuation(0.0, 0.0, 0.1), 1.0)
-    assert (actuation.throttle, changed) == (0.0, ("stopping distance",))
+    assert limit_at_excess_speed(Actuation(0.0, 0.8, 0.9), 1.0) == (Actuation(0.0, 0.0, 0.9), ("stopping distance",))
+    actuation, applied_limits = limit_at_excess_speed(Actuation(0.0, 0.0, 0.1), 1.0)
+    assert (actuation.throttle, applied_limits) == (0.0, ("stopping distance",))
     assert actuation.brake == pytest.approx(safe_stop_brake)
 
 
 def test_the_stopping_distance_limit_releases_no_brake() -> None:
-    """A harder brake, a speed within the limit and a request from no picture are not changed."""
-    assert limited_at_excess(Actuation(0.0, 0.0, 0.9), 5.0) == (Actuation(0.0, 0.0, 0.9), ())
-    assert limited_at_excess(Actuation(0.0, 0.8, 0.0), -0.01) == (Actuation(0.0, 0.8, 0.0), ())
-    assert limited_at_excess(Actuation(0.0, 0.8, 0.0), 0.0) == (Actuation(0.0, 0.8, 0.0), ())
-    assert limited(Actuation(0.0, 0.8, 0.0), 11.0) == (Actuation(0.0, 0.8, 0.0), ())
+    """A request with a harder brake, at a speed up to the limit, or without a picture is not changed.
+
+    A speed that is not a number does not release the brake.
+    """
+    assert limit_at_excess_speed(Actuation(0.0, 0.0, 0.9), 5.0) == (Actuation(0.0, 0.0, 0.9), ())
+    assert limit_at_excess_speed(Actuation(0.0, 0.8, 0.0), -0.01) == (Actuation(0.0, 0.8, 0.0), ())
+    assert limit_at_excess_speed(Actuation(0.0, 0.8, 0.0), 0.0) == (Actuation(0.0, 0.8, 0.0), ())
+    assert limit_request(Actuation(0.0, 0.8, 0.0), 11.0) == (Actuation(0.0, 0.8, 0.0), ())
     limiter = new_limiter()
     assert limiter.limit(Actuation(0.0, 0.0, 0.2), vehicle_at(math.nan), 0, 2 * NS_PER_S).brake == 0.2
 
@@ -207,10 +217,10 @@ def test_the_stopping_distance_limit_releases_no_brake() -> None:
     )
 )
 def test_the_limits_hold_for_any_request(requested: list[tuple[float, float, float, float, int]]) -> None:
-    """For any request, angle and rate are always within limits, lateral acceleration as soon as the rate allows."""
+    """Angle and rate are always within their limits, lateral acceleration as soon as the steering rate allows."""
     limiter = new_limiter()
     limiter.reset(0.0, 0)
-    before_rad, now_ns = 0.0, 0
+    previous_rad, now_ns = 0.0, 0
     for steering_rad, throttle, brake, speed_mps, passed_ns in requested:
         now_ns += passed_ns
         actuation = limiter.limit(Actuation(steering_rad, throttle, brake), vehicle_at(speed_mps), now_ns)
@@ -219,11 +229,11 @@ def test_the_limits_hold_for_any_request(requested: list[tuple[float, float, flo
         if abs(speed_mps) >= 0.1:
             bound_rad = math.atan(WHEELBASE_M * LIMITS.lateral_acceleration_mps2 / speed_mps**2)
         assert abs(actuation.steering_rad) <= MAX_STEERING_RAD
-        assert abs(actuation.steering_rad - before_rad) <= step_rad + 1e-12
-        assert abs(actuation.steering_rad) <= max(bound_rad, abs(before_rad) - step_rad) + 1e-12
+        assert abs(actuation.steering_rad - previous_rad) <= step_rad + 1e-12
+        assert abs(actuation.steering_rad) <= max(bound_rad, abs(previous_rad) - step_rad) + 1e-12
         assert actuation.throttle in (0.0, throttle)
         assert actuation.brake == brake
-        before_rad = actuation.steering_rad
+        previous_rad = actuation.steering_rad
 
 
 NUMBERS = st.floats(allow_nan=True, allow_infinity=True)
@@ -236,7 +246,7 @@ NUMBERS = st.floats(allow_nan=True, allow_infinity=True)
 def test_whatever_a_vehicle_reports_the_output_is_finite(
     requested: tuple[float, float, float], reports: list[tuple[float, float, bool, bool]]
 ) -> None:
-    """No speed, angle or request, finite or not, raises or reaches the output as a number that is not finite."""
+    """For any speed, angle and request, finite or not, the limiter raises no exception and its output is finite."""
     limiter = new_limiter()
     for index, (speed_mps, steering_rad, is_plausible, is_reset) in enumerate(reports):
         vehicle = replace(vehicle_at(speed_mps, steering_rad), is_speed_plausible=is_plausible)
@@ -248,15 +258,15 @@ def test_whatever_a_vehicle_reports_the_output_is_finite(
 
 def test_a_request_that_is_not_finite_brakes() -> None:
     """A request with a value that is not finite becomes the last steering target and a full brake."""
-    actuation, changed = limited(Actuation(math.nan, 1.0, 0.0), SPEED_MPS)
-    assert (actuation.throttle, actuation.brake) == (0.0, 1.0)
-    assert changed == ("not finite",)
+    actuation, applied_limits = limit_request(Actuation(math.nan, 1.0, 0.0), SPEED_MPS)
+    assert actuation == Actuation(0.0, 0.0, 1.0)
+    assert applied_limits == ("not finite",)
 
 
 @pytest.mark.parametrize("speed_mps", [1e155, -1e300])
 def test_a_huge_speed_does_not_overflow(speed_mps: float) -> None:
     """A finite speed whose square is not finite limits the wheel to 0."""
-    assert limited(Actuation(0.5, 0.0, 0.0), speed_mps)[0].steering_rad == 0.0
+    assert limit_request(Actuation(0.5, 0.0, 0.0), speed_mps)[0].steering_rad == 0.0
 
 
 def test_an_implausible_speed_gives_no_throttle_and_the_least_steering() -> None:
@@ -265,15 +275,15 @@ def test_an_implausible_speed_gives_no_throttle_and_the_least_steering() -> None
     limiter.reset(0.0, 0)
     vehicle = replace(vehicle_at(0.0), is_speed_plausible=False)
     actuation = limiter.limit(Actuation(0.5, 1.0, 0.0), vehicle, LONG_NS)
-    top_rad = math.atan(WHEELBASE_M * LIMITS.lateral_acceleration_mps2 / LIMITS.speed_limit_mps**2)
-    assert actuation.steering_rad == pytest.approx(top_rad)
+    at_speed_limit_rad = math.atan(WHEELBASE_M * LIMITS.lateral_acceleration_mps2 / LIMITS.speed_limit_mps**2)
+    assert actuation.steering_rad == pytest.approx(at_speed_limit_rad)
     assert actuation.throttle == 0.0
 
 
 @pytest.mark.parametrize("name", ["wheelbase_m", "max_steering_rad", "max_acceleration_mps2", "max_braking_mps2"])
 @pytest.mark.parametrize("number", [math.nan, math.inf, 0.0, -1.0])
 def test_properties_of_the_vehicle_are_positive_numbers(name: str, number: float) -> None:
-    """A vehicle whose wheelbase, steering, acceleration or braking is no positive number is rejected."""
+    """A wheelbase, steering angle, acceleration or braking that is not positive and finite is rejected."""
     properties = {"wheelbase_m": 2.8, "max_steering_rad": 0.5, "max_acceleration_mps2": 2.0, "max_braking_mps2": 6.0}
     with pytest.raises(UserError):
         Limiter(LIMITS, **{**properties, name: number})

@@ -26,7 +26,7 @@ def new_odometry() -> Odometry:
 
 
 def test_a_circle() -> None:
-    """At constant speed and angle the pose is on the circle of the kinematic car, at any time."""
+    """At constant speed and wheel angle the pose is on the kinematic car's circle, between and after the reports."""
     odometry = new_odometry()
     for passed_ns in range(0, NS_PER_S + 1, 50 * NS_PER_MS):
         odometry.update(report_at(passed_ns, 8.0, steering_rad(0.02, WHEELBASE_M)))
@@ -37,16 +37,16 @@ def test_a_circle() -> None:
 
 
 def test_the_rate_of_reports_does_not_matter() -> None:
-    """A stop on a tightening bend is the same within 2 cm for reports at 240 Hz and every 33 ms."""
+    """The pose after a stop in a tightening bend is the same within 2 cm for reports at 240 Hz and at 30 Hz."""
 
-    def stop(every: int) -> tuple[float, float, float]:
+    def pose_after_stop(steps_per_report: int) -> tuple[float, float, float]:
         odometry = new_odometry()
-        for step in range(0, 2 * 240 + 1, every):
+        for step in range(0, 2 * 240 + 1, steps_per_report):
             passed_s = step / 240
             odometry.update(report_at(step * STEP_NS, 8.0 - 4.0 * passed_s, 0.1 * math.sin(passed_s)))
         return odometry.at(START_NS + 480 * STEP_NS).pose
 
-    assert stop(8) == pytest.approx(stop(1), abs=0.02)
+    assert pose_after_stop(8) == pytest.approx(pose_after_stop(1), abs=0.02)
 
 
 def test_a_report_that_is_not_newer_changes_nothing() -> None:
@@ -61,7 +61,7 @@ def test_a_report_that_is_not_newer_changes_nothing() -> None:
 
 
 def test_memory_is_bounded() -> None:
-    """Poses of the last 5 s are known exactly; for an older time the oldest pose kept is returned."""
+    """Poses of the last 5 s are known exactly; for an older time the oldest known pose is returned."""
     odometry = new_odometry()
     for step in range(60 * 240):
         odometry.update(report_at(step * STEP_NS, 8.0))
@@ -82,7 +82,7 @@ NUMBERS = st.one_of(st.floats(), st.sampled_from([math.nan, math.inf, -math.inf,
 
 @given(st.lists(st.tuples(NUMBERS, NUMBERS, st.integers(-NS_PER_S, 60 * NS_PER_S)), max_size=20))
 def test_the_pose_is_always_finite(reports: list[tuple[float, float, int]]) -> None:
-    """The pose is finite for any reported speed and angle, and valid reports add up again afterwards."""
+    """The pose is finite for any reported speeds and angles, and later valid reports add their distances to it."""
     odometry, passed_ns = new_odometry(), 0
     for speed_mps, angle_rad, later_ns in reports:
         passed_ns += later_ns

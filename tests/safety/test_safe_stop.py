@@ -1,9 +1,9 @@
 """Safe stops without commands stay in the lane, wherever the last command arrives.
 
-"In the lane plus 0.3 m" means that from the last command until standstill, no corner of the body is more than 0.3 m
-beyond the edge of the lane, which is the middle of its line. The corners are those of `sim/route_monitor.py`: 3.89 m
-ahead of the rear axle or 1.04 m behind it, 0.93 m to each side. This is stricter than a limit for the rear axle,
-because the front swings out.
+"In the lane plus 0.3 m" means: between the last command and standstill, no corner of the body is more than 0.3 m beyond
+the lane's edge. The edge is the middle of the lane's line. The corners are those of `sim/route_monitor.py`: 3.89 m
+ahead of the rear axle or 1.04 m behind it, 0.93 m to each side. A limit for the corners is stricter than one for the
+rear axle, because the front swings out.
 """
 
 from __future__ import annotations
@@ -48,6 +48,7 @@ def test_all_curves_of_the_six_routes_are_tested() -> None:
         for route in ROUTES
         for curve in curves(route, load_road(route))
     ]
+    # Route, stations of the curve's beginning and end (m), and smallest radius (m).
     assert found == [
         ("a", 26, 92, -42),
         ("a_key", 14, 80, -42),
@@ -64,7 +65,7 @@ def test_all_curves_of_the_six_routes_are_tested() -> None:
 
 @pytest.mark.parametrize("route", ROUTES)
 def test_the_stops_begin_at_every_metre(route: str) -> None:
-    """The stops begin a metre apart, from 16 m before each curve to its end, at 30 km/h +- 1 km/h."""
+    """The stops begin a metre apart, from at most 16 m before each curve to its end, at 30 km/h +- 1 km/h."""
     pairs = stops_of(route)
     expected = [metre for curve in curves(route, load_road(route)) for metre in metres(curve)]
     assert [int(pair.followed.at_m) for pair in pairs] == expected
@@ -75,7 +76,7 @@ def test_the_stops_begin_at_every_metre(route: str) -> None:
 def test_a_safe_stop_stays_in_the_lane(route: str) -> None:
     """A safe stop from 30 km/h anywhere in a curve stays in the lane plus 0.3 m."""
     followed = [pair.followed for pair in stops_of(route)]
-    assert {stop.ended for stop in followed} == {"safe_stop"}
+    assert {stop.final_state for stop in followed} == {"safe_stop"}
     assert max(stop.beyond_m for stop in followed) <= ALLOWED_BEYOND_M
     assert max(stop.covered_m for stop in followed) < PATH_STEP_M * PATH_POINTS
 
@@ -84,20 +85,23 @@ def test_a_safe_stop_stays_in_the_lane(route: str) -> None:
 def test_a_stop_with_the_wheel_held_leaves_the_lane(route: str) -> None:
     """With the wheel held, stops in tight bends leave the lane plus 0.3 m, so path following is needed."""
     held = [pair.held for pair in stops_of(route)]
-    assert {stop.ended for stop in held} == {"safe_stop"}
+    assert {stop.final_state for stop in held} == {"safe_stop"}
     assert max(stop.beyond_m for stop in held) > ALLOWED_BEYOND_M
 
 
 def test_a_safe_stop_under_delay_stays_in_the_lane() -> None:
-    """At L3, 2.5 m beyond its last picture, the car stops 0.1 m inside its lane; with the wheel held, 1 m outside."""
+    """At L3 the body stays 0.1 m inside the lane; with the wheel held, it goes more than 1 m beyond the lane's edge.
+
+    The last picture was taken 2.5 m before the stop begins.
+    """
     _, followed, held = zip(*stops("a", "L3"), strict=True)
-    # If the path began where its command arrived, this would be + 0.02 m.
+    # If the path began where its command arrived, the largest distance would be +0.02 m.
     assert max(stop.beyond_m for stop in followed) < -0.1
     assert max(stop.beyond_m for stop in held) > 1.0
 
 
 def test_with_old_pictures_the_car_drives_slower() -> None:
-    """At 0.9 s of delay the car keeps the stopping speed limit, below 30 km/h, within 0.1 m/s."""
+    """At 0.9 s of delay the car drives at its stopping speed limit, which is lower than 30 km/h, within 0.1 m/s."""
     config = {
         "vehicle": {"route": "straight"},
         "network": {"inherent": "paper_wifi5", "condition": "L0", "video": {"delay_ms": 900.0}},
@@ -115,13 +119,14 @@ def test_with_old_pictures_the_car_drives_slower() -> None:
 
 @pytest.mark.parametrize(("delay_ms", "start_mps"), [(0.0, 8.6), (300.0, 7.4), (800.0, 6.4), (1700.0, 4.6)])
 def test_a_car_at_full_throttle_stops_on_its_path(delay_ms: float, start_mps: float) -> None:
-    """If commands with full throttle stop, the car is stationary within the 20 m of path from its last picture.
+    """When commands with full throttle cease, the car stops on the 20 m of path that begin at its last picture.
 
-    It reaches its speed limit meanwhile: some stops begin below it, at full throttle, and some at it, with little.
+    During the drive the car reaches its stopping speed limit. Some stops begin before that, with full throttle; others
+    begin at the limit, with little throttle.
     """
     found = list(full_throttle_stops(delay_ms, start_mps))
     assert len(found) > 20
     assert min(stop.throttle for stop in found) < 0.5
     assert max(stop.throttle for stop in found) > 0.9
-    assert {stop.stop.ended for stop in found} == {"safe_stop"}
+    assert {stop.stop.final_state for stop in found} == {"safe_stop"}
     assert max(stop.since_picture_m for stop in found) < PATH_STEP_M * PATH_POINTS - 1.5

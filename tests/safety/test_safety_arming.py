@@ -15,50 +15,50 @@ from lavt.safety.session import REMEMBERED_STOPS
 
 
 def test_arming_takes_a_full_second() -> None:
-    """The vehicle is armed when all conditions were met for 1 s, and not a nanosecond earlier."""
+    """The vehicle is armed when all arming conditions were met for 1 s, and not a nanosecond earlier."""
     rig = Rig().acquire()
-    rig.picture()
+    rig.take_picture()
     rig.send()
     began_ns = rig.now_ns
     assert rig.state == "arming"
     for _ in range(49):
-        rig.go(COMMAND_PERIOD_NS)
-        rig.picture()
+        rig.pass_time(COMMAND_PERIOD_NS)
+        rig.take_picture()
         rig.send()
-    rig.go(began_ns + NS_PER_S - 1 - rig.now_ns)
-    rig.picture()
+    rig.pass_time(began_ns + NS_PER_S - 1 - rig.now_ns)
+    rig.take_picture()
     rig.send()
     assert rig.state == "arming"
-    rig.go(1)
+    rig.pass_time(1)
     rig.send()
     assert rig.state == "driving"
 
 
-def rolls(rig: Rig) -> None:
+def roll(rig: Rig) -> None:
     rig.vehicle = vehicle_at(LIMITS.standstill_mps)
     rig.send()
     rig.vehicle = vehicle_at()
 
 
-def rolls_back(rig: Rig) -> None:
+def roll_back(rig: Rig) -> None:
     rig.vehicle = vehicle_at(-LIMITS.standstill_mps)
     rig.send()
     rig.vehicle = vehicle_at()
 
 
-def freezes(rig: Rig) -> None:
+def freeze_pictures(rig: Rig) -> None:
     for _ in range(5):
-        rig.picture(crc=-1)
+        rig.take_picture(crc=-1)
     rig.send()
 
 
-def no_new_pictures(rig: Rig) -> None:
+def send_without_new_pictures(rig: Rig) -> None:
     for _ in range(300 // 20):
-        rig.go(COMMAND_PERIOD_NS)
+        rig.pass_time(COMMAND_PERIOD_NS)
         rig.send()
 
 
-def rolls_between_commands(rig: Rig) -> None:
+def roll_between_commands(rig: Rig) -> None:
     rig.vehicle = vehicle_at(0.05)
     rig.actuation()
     rig.vehicle = vehicle_at()
@@ -69,22 +69,22 @@ ARMING_VIOLATIONS: dict[str, Callable[[Rig], object]] = {
     "brake eased": lambda rig: rig.send(brake=0.29),
     "steering to the left": lambda rig: rig.send(steering_rad=0.11),
     "steering to the right": lambda rig: rig.send(steering_rad=-0.11),
-    "a drive command": lambda rig: rig.drive(),
+    "a drive command": lambda rig: rig.send_drive(),
     "a stop command": lambda rig: rig.send(mode="stop"),
-    "rolling": rolls,
-    "rolling back": rolls_back,
-    "rolling between two commands": rolls_between_commands,
-    "frozen pictures": freezes,
-    "no newer pictures": no_new_pictures,
-    "no commands": lambda rig: rig.go(300 * NS_PER_MS),
+    "rolling": roll,
+    "rolling back": roll_back,
+    "rolling between two commands": roll_between_commands,
+    "frozen pictures": freeze_pictures,
+    "no newer pictures": send_without_new_pictures,
+    "no commands": lambda rig: rig.pass_time(300 * NS_PER_MS),
     "release": lambda rig: (rig.request("release"), rig.acquire()),
-    "emergency stop": lambda rig: (rig.request("emergency_stop", "bob", 3, number=1), rig.clear()),
+    "emergency stop": lambda rig: (rig.request("emergency_stop", "bob", 3, number=1), rig.clear_emergency_stop()),
 }
 
 
 @pytest.mark.parametrize("name", sorted(ARMING_VIOLATIONS))
 def test_an_unmet_condition_restarts_arming(name: str) -> None:
-    """A condition that fails 0.6 s into arming restarts the second."""
+    """If an arming condition fails after 0.6 s of arming, the full second begins again."""
     rig = Rig().acquire()
     rig.arm_for(600 * NS_PER_MS)
     assert rig.state == "arming"
@@ -98,9 +98,9 @@ def test_an_unmet_condition_restarts_arming(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["throttle", "brake eased", "steering to the left", "frozen pictures"])
 def test_arming_does_not_begin_with_an_unmet_condition(name: str) -> None:
-    """An arm command with an unmet condition leaves the vehicle disarmed."""
+    """A command that does not meet an arming condition leaves the vehicle disarmed."""
     rig = Rig().acquire()
-    rig.picture()
+    rig.take_picture()
     ARMING_VIOLATIONS[name](rig)
     assert rig.state == "disarmed"
 
@@ -116,54 +116,54 @@ def test_arming_does_not_begin_with_an_unmet_condition(name: str) -> None:
     ids=str,
 )
 def test_arming_begins_at_the_bounds_of_its_conditions(changes: dict[str, Any]) -> None:
-    """Arming begins with the lightest allowed brake, the largest neutral steering input and the first sequence."""
+    """Arming begins with the lightest allowed brake, with the largest neutral steering angle, and with sequence 0."""
     rig = Rig().acquire()
-    rig.picture()
+    rig.take_picture()
     assert rig.send(**changes).accepted
     assert rig.state == "arming"
 
 
 def test_arming_begins_from_the_first_picture() -> None:
-    """A picture with frame number 0 is fresh if it is the first."""
+    """Arming begins with a command from the first picture, whose frame number is 0."""
     rig = Rig().acquire()
     rig.frame = -1
-    rig.picture()
+    rig.take_picture()
     rig.send()
     assert rig.state == "arming"
 
 
 def test_arming_does_not_begin_with_a_picture_already_used() -> None:
-    """A picture used 300 ms ago is not fresh enough to begin arming, though its command is accepted."""
+    """A command from a picture that was already used 300 ms ago is accepted, but does not begin arming."""
     rig = Rig().acquire()
-    rig.picture()
+    rig.take_picture()
     rig.send()
-    rig.go(300 * NS_PER_MS)
+    rig.pass_time(300 * NS_PER_MS)
     assert rig.state == "disarmed"
     assert rig.send().accepted
     assert rig.state == "disarmed"
 
 
 def test_the_vehicle_does_not_move_before_the_first_drive_command() -> None:
-    """Armed without a drive command, the vehicle stays braked with its wheel still, and stops at the timeout."""
+    """An armed vehicle without a drive command stays braked with its wheel still until the command timeout stops it."""
     rig = Rig()
     rig.vehicle = vehicle_at(0.0, steering_rad=0.2)
-    rig.armed()
+    rig.arm()
     for _ in range(299):
-        rig.go(NS_PER_MS)
+        rig.pass_time(NS_PER_MS)
         actuation = rig.actuation()
         assert (actuation.steering_rad, actuation.throttle) == (0.2, 0.0)
         assert actuation.brake >= LIMITS.arming_brake
-    rig.go(NS_PER_MS)
+    rig.pass_time(NS_PER_MS)
     assert rig.state == "degraded"
     assert (rig.actuation().throttle, rig.actuation().brake) == (0.0, LIMITS.arming_brake)
-    rig.go(200 * NS_PER_MS)
+    rig.pass_time(200 * NS_PER_MS)
     assert rig.state == "safe_stop"
 
 
 def test_arming_again_drops_the_last_command() -> None:
-    """Armed again after a stop, the vehicle ignores the command of the drive before."""
-    rig = Rig().driving(steering_rad=0.05)
-    rig.go(LIMITS.stop_after_ns)
+    """A vehicle that is armed again after a stop ignores the last command of the previous drive."""
+    rig = Rig().start_driving(steering_rad=0.05)
+    rig.pass_time(LIMITS.stop_after_ns)
     assert rig.state == "safe_stop"
     rig.request("acquire")
     rig.arm_for(NS_PER_S)
@@ -174,15 +174,15 @@ def test_arming_again_drops_the_last_command() -> None:
 
 
 def test_the_first_steering_target_is_the_present_angle() -> None:
-    """From arming on, the wheel turns from its present angle, at most at the allowed rate."""
+    """The first drive command turns the wheel from its present angle, at most at the allowed rate."""
     rig = Rig()
     rig.vehicle = vehicle_at(0.0, steering_rad=0.0)
     rig.actuation()
     rig.vehicle = vehicle_at(0.0, steering_rad=0.2)  # the wheel was turned since
-    rig.armed()
-    rig.go(10 * NS_PER_MS)
-    rig.picture()
-    assert rig.drive(steering_rad=-0.3).accepted
+    rig.arm()
+    rig.pass_time(10 * NS_PER_MS)
+    rig.take_picture()
+    assert rig.send_drive(steering_rad=-0.3).accepted
     assert rig.actuation().steering_rad == pytest.approx(0.2 - 0.01 * LIMITS.steering_rate_radps)
 
 
@@ -193,16 +193,16 @@ def test_an_emergency_stop_works_in_every_state(start: str) -> None:
     if start == "arming":
         rig.arm_for(NS_PER_S // 2)
     elif start != "disarmed":
-        rig.armed()
-        rig.go({"driving": 0, "degraded": 300, "safe_stop": 500}[start] * NS_PER_MS)
+        rig.arm()
+        rig.pass_time({"driving": 0, "degraded": 300, "safe_stop": 500}[start] * NS_PER_MS)
     assert rig.state == start
     rig.vehicle = vehicle_at(5.0)
     assert rig.request("emergency_stop", "bob", 4, number=17).granted
     assert rig.state == "emergency_stop"
     assert (rig.actuation().throttle, rig.actuation().brake) == (0.0, 1.0)
-    rig.picture()
-    assert rig.drive().reason == RejectionReason.WRONG_EPOCH
-    rig.go(NS_PER_S)
+    rig.take_picture()
+    assert rig.send_drive().reason == RejectionReason.WRONG_EPOCH
+    rig.pass_time(NS_PER_S)
     assert rig.state == "emergency_stop"
 
 
@@ -212,9 +212,9 @@ def test_an_emergency_stop_works_in_every_state(start: str) -> None:
     ids=str,
 )
 def test_an_emergency_stop_in_any_command_is_executed(changes: dict[str, Any]) -> None:
-    """An emergency stop in a command is executed whatever else the command has, and the command rejected."""
-    rig = Rig().driving()
-    assert not rig.drive(emergency_stop=1, **changes).accepted
+    """An emergency stop in a command is executed whatever else the command has, and the command is rejected."""
+    rig = Rig().start_driving()
+    assert not rig.send_drive(emergency_stop=1, **changes).accepted
     assert rig.state == "emergency_stop"
 
 
@@ -230,18 +230,20 @@ def test_an_emergency_stop_without_an_operator() -> None:
 
 def test_an_emergency_stop_is_executed_once() -> None:
     """An emergency stop that was executed and cleared does not stop the vehicle again, and is counted as a replay."""
-    rig = Rig().armed()
+    rig = Rig().arm()
     for number in (39, 40):
         assert rig.request("emergency_stop", number=number).granted
-        assert rig.clear().granted
+        assert rig.clear_emergency_stop().granted
     rig.request("acquire")
     rig.arm_for(NS_PER_S)
     assert rig.state == "driving"
     for number in (40, 39):
         reply = rig.request("emergency_stop", "bob", 2, number=number)
-        assert (reply.granted, reply.emergency_stop) == (True, number), "its client must not repeat it for ever"
-    rig.picture()
-    assert rig.drive(emergency_stop=40).reason == RejectionReason.EMERGENCY_STOP
+        assert (reply.granted, reply.emergency_stop) == (True, number), (
+            "without confirmation a client repeats its emergency stop for ever"
+        )
+    rig.take_picture()
+    assert rig.send_drive(emergency_stop=40).reason == RejectionReason.EMERGENCY_STOP
     assert rig.state == "driving"
     assert rig.gate.counts["emergency stop with an old number"] == 3
     assert rig.request("emergency_stop", "bob", 2, number=41).granted
@@ -251,25 +253,25 @@ def test_an_emergency_stop_is_executed_once() -> None:
 @pytest.mark.parametrize("number", [0, 1, 39, 2**62 - 1, 2**62 + 1, 2**63 - 2])
 @pytest.mark.parametrize("earlier", [40, 2**62, 2**63 - 1])
 def test_no_emergency_stop_prevents_a_later_one(earlier: int, number: int) -> None:
-    """After an emergency stop with any number, one with any other number stops the vehicle, and both can be cleared."""
-    rig = Rig().armed()
+    """After an emergency stop with any number, a stop with any other number works, and both can be cleared."""
+    rig = Rig().arm()
     rig.request("emergency_stop", "bob", 2, number=earlier)
-    assert rig.clear().granted
+    assert rig.clear_emergency_stop().granted
     assert rig.state == "disarmed"
     reply = rig.request("emergency_stop", "carol", 3, number=number)
     assert (reply.granted, rig.state) == (True, "emergency_stop")
-    assert rig.clear().granted
+    assert rig.clear_emergency_stop().granted
     assert rig.state == "disarmed"
     rig.send(epoch=5, emergency_stop=number + 1)
     assert (number + 1 == earlier) != (rig.state == "emergency_stop")
 
 
 def test_the_last_emergency_stops_are_remembered() -> None:
-    """The vehicle remembers a bounded number of emergency stops and forgets the oldest, which can stop it once more."""
+    """The vehicle remembers a bounded number of emergency stops; the oldest, once forgotten, can stop it again."""
     rig = Rig().acquire()
     for number in range(REMEMBERED_STOPS + 1):
         rig.request("emergency_stop", "bob", 2, number=number)
-    assert rig.clear().granted
+    assert rig.clear_emergency_stop().granted
     for number, state in ((1, "disarmed"), (REMEMBERED_STOPS, "disarmed"), (0, "emergency_stop")):
         rig.request("emergency_stop", "bob", 2, number=number)
         assert rig.state == state
@@ -277,17 +279,17 @@ def test_the_last_emergency_stops_are_remembered() -> None:
 
 
 def test_recorded_emergency_stops_do_not_block_the_operator_forever() -> None:
-    """After a restart, each recorded emergency stop stops the vehicle at most once, and later ones still stop it."""
+    """After a restart, each recorded emergency stop stops the vehicle at most once, and a new one still stops it."""
     rig = Rig().acquire()
     recorded = [rig.command(epoch=5, emergency_stop=number) for number in (10, 20, 30)]
     for stop in recorded:
         rig.gate.admit(stop, rig.vehicle, rig.now_ns, rig.now_ns)
         assert rig.state == "emergency_stop"
-        assert rig.clear().granted
+        assert rig.clear_emergency_stop().granted
     rig.request("acquire")
     for _ in range(60):
-        rig.go(COMMAND_PERIOD_NS)
-        rig.picture()
+        rig.pass_time(COMMAND_PERIOD_NS)
+        rig.take_picture()
         for stop in recorded:
             rig.gate.admit(stop, rig.vehicle, rig.now_ns, rig.now_ns)
             rig.request("emergency_stop", "bob", 2, number=stop.emergency_stop)
@@ -301,57 +303,57 @@ def test_a_command_with_an_emergency_stop_never_moves_the_vehicle() -> None:
     """After clearing, a client whose commands still carry the old emergency stop can neither arm nor drive."""
     rig = Rig().acquire()
     rig.request("emergency_stop", number=3)
-    rig.clear()
+    rig.clear_emergency_stop()
     rig.request("acquire")
     for _ in range(100):
-        rig.go(COMMAND_PERIOD_NS)
-        rig.picture()
+        rig.pass_time(COMMAND_PERIOD_NS)
+        rig.take_picture()
         assert not rig.send(emergency_stop=3).accepted
     assert rig.state == "disarmed"
 
 
 def test_a_repeated_emergency_stop_is_not_counted_as_a_replay() -> None:
     """The same number in command after command is not counted as a replay while the stop is latched."""
-    rig = Rig().driving()
+    rig = Rig().start_driving()
     for _ in range(10):
-        rig.drive(emergency_stop=9)
+        rig.send_drive(emergency_stop=9)
     assert rig.gate.counts["emergency stop with an old number"] == 0
 
 
 def test_only_the_active_operator_clears_an_emergency_stop() -> None:
-    """Only the active operator clears an emergency stop, at standstill and by its number."""
-    rig = Rig().driving()
+    """Only the active operator can clear an emergency stop, and only at standstill and with the number of that stop."""
+    rig = Rig().start_driving()
     rig.request("emergency_stop", "bob", 2, number=8)
     rig.vehicle = vehicle_at(1.0)
-    assert "stationary" in rig.clear().reason
+    assert "stationary" in rig.clear_emergency_stop().reason
     rig.vehicle = vehicle_at()
     assert not rig.request("clear_emergency_stop", "bob", 2, number=8).granted
     rig.request("emergency_stop", "bob", 2, number=9)
-    late = rig.clear(number=8)
+    late = rig.clear_emergency_stop(number=8)
     assert not late.granted
     assert "number" in late.reason
     assert rig.state == "emergency_stop"
-    assert rig.clear(number=9).granted
+    assert rig.clear_emergency_stop(number=9).granted
     assert rig.state == "disarmed"
 
 
 def test_an_emergency_stop_must_be_cleared_before_arming() -> None:
-    """An emergency stop must be cleared before arming, and arming takes its second afterwards."""
-    rig = Rig().driving()
+    """An emergency stop must be cleared before arming, and arming takes a full second after that."""
+    rig = Rig().start_driving()
     rig.request("emergency_stop", number=8)
     rig.request("acquire")
-    rig.picture()
+    rig.take_picture()
     assert rig.send().reason == RejectionReason.EMERGENCY_STOP_LATCHED
-    assert rig.clear().granted
-    assert rig.drive().reason == RejectionReason.NOT_ARMED
+    assert rig.clear_emergency_stop().granted
+    assert rig.send_drive().reason == RejectionReason.NOT_ARMED
     rig.arm_for(NS_PER_S)
     assert rig.state == "driving"
 
 
 def test_transitions_are_reported_with_reasons() -> None:
     """Each transition is reported once, with both states and a reason."""
-    rig = Rig().driving()
-    rig.go(500 * NS_PER_MS)
+    rig = Rig().start_driving()
+    rig.pass_time(500 * NS_PER_MS)
     transitions = rig.gate.machine.take_transitions()
     assert [(before, after) for before, after, _ in transitions] == [
         ("disarmed", "arming"),

@@ -35,17 +35,16 @@ SPEEDS = st.one_of(st.just(0.0), st.floats(-5, 40), st.just(math.nan))
 
 
 class GateMachine(RuleBasedStateMachine):
-    """A state machine that gives the gate any inputs and tracks since when all arming conditions were met."""
+    """A state machine that gives the gate random inputs and tracks since when all arming conditions have been met."""
 
     def __init__(self) -> None:
         super().__init__()
         self.rig = Rig().acquire()
         self.met_since_ns: int | None = None
-        self.used_ns = -NS_PER_S
-        self.newest_used = 0
-        self.last_rad = 0.0
-        self.last_ns = self.rig.now_ns
-        self.before: SafetyState = "disarmed"
+        self.newest_used_ns = -NS_PER_S
+        self.newest_used_frame = 0
+        self.last_actuation_ns = self.rig.now_ns
+        self.previous_state: SafetyState = "disarmed"
 
     def send(self, **changes: Any) -> None:
         """Send a command to the gate, and track whether it met all arming conditions."""
@@ -53,9 +52,9 @@ class GateMachine(RuleBasedStateMachine):
         command = rig.command(**changes)
         is_valid = command.epoch == rig.gate.epoch.number and not command.emergency_stop
         verdict = rig.gate.admit(command, rig.vehicle, rig.now_ns, rig.now_ns)
-        if verdict.accepted and command.stamp_ns == rig.stamp_ns and rig.frame > self.newest_used:
-            self.newest_used, self.used_ns = rig.frame, rig.now_ns
-        is_fresh = rig.now_ns - self.used_ns < LIMITS.degraded_after_ns
+        if verdict.accepted and command.stamp_ns == rig.stamp_ns and rig.frame > self.newest_used_frame:
+            self.newest_used_frame, self.newest_used_ns = rig.frame, rig.now_ns
+        is_fresh = rig.now_ns - self.newest_used_ns < LIMITS.degraded_after_ns
         is_neutral = command.throttle == 0 and abs(command.steering_rad) <= LIMITS.arming_steering_rad
         is_braked = command.brake >= LIMITS.arming_brake
         is_stationary = abs(rig.vehicle.speed_mps) < LIMITS.standstill_mps
@@ -68,21 +67,21 @@ class GateMachine(RuleBasedStateMachine):
             self.met_since_ns = rig.now_ns
 
     @rule()
-    def arm_well(self) -> None:
-        self.rig.picture()
+    def send_valid_arm_command(self) -> None:
+        self.rig.take_picture()
         self.send()
 
     @rule(seconds=st.sampled_from([0.4, 0.8, 1.0]))
-    def arm_well_for_a_while(self, seconds: float) -> None:
+    def send_valid_arm_commands(self, seconds: float) -> None:
         self.rig.request("acquire")
         self.rig.vehicle = vehicle_at(0.0, self.rig.vehicle.steering_rad)
         for _ in range(round(seconds * 50)):
             self.pass_time(COMMAND_PERIOD_NS)
-            self.rig.picture()
+            self.rig.take_picture()
             self.send()
 
     @rule(changes=st.fixed_dictionaries({}, optional=COMMAND_VALUES))
-    def any_command(self, changes: dict[str, Any]) -> None:
+    def send_any_command(self, changes: dict[str, Any]) -> None:
         self.send(**changes)
 
     @rule(
@@ -93,30 +92,30 @@ class GateMachine(RuleBasedStateMachine):
             },
         )
     )
-    def drive(self, changes: dict[str, Any]) -> None:
-        self.rig.picture()
+    def send_drive_command(self, changes: dict[str, Any]) -> None:
+        self.rig.take_picture()
         self.send(mode="drive", **changes)
 
     @rule(crc=st.sampled_from([None, None, -1]))
-    def picture(self, crc: int | None) -> None:
-        self.rig.picture(crc)
+    def take_picture(self, crc: int | None) -> None:
+        self.rig.take_picture(crc)
 
     @rule()
-    def frozen_pictures(self) -> None:
+    def freeze_pictures(self) -> None:
         for _ in range(LIMITS.frozen_frames):
-            self.rig.picture(-1)
+            self.rig.take_picture(-1)
         self.met_since_ns = None
 
     @rule(duration_ns=st.sampled_from([0, 1, NS_PER_MS, COMMAND_PERIOD_NS, 200 * NS_PER_MS, 300 * NS_PER_MS, NS_PER_S]))
     def pass_time(self, duration_ns: int) -> None:
-        self.rig.go(duration_ns)
-        if self.rig.now_ns - self.used_ns >= LIMITS.degraded_after_ns:
+        self.rig.pass_time(duration_ns)
+        if self.rig.now_ns - self.newest_used_ns >= LIMITS.degraded_after_ns:
             self.met_since_ns = None
 
     @rule(duration_ns=st.integers(0, NS_PER_S))
     def pass_time_without_wakes(self, duration_ns: int) -> None:
         self.rig.now_ns += duration_ns
-        if self.rig.now_ns - self.used_ns >= LIMITS.degraded_after_ns:
+        if self.rig.now_ns - self.newest_used_ns >= LIMITS.degraded_after_ns:
             self.met_since_ns = None
 
     @rule(
@@ -132,11 +131,11 @@ class GateMachine(RuleBasedStateMachine):
             assert self.rig.gate.session.active_operator == (who, 1)
 
     @rule(speed_mps=SPEEDS, steering_rad=st.floats(-MAX_STEERING_RAD, MAX_STEERING_RAD))
-    def vehicle_is(self, speed_mps: float, steering_rad: float) -> None:
+    def set_vehicle_motion(self, speed_mps: float, steering_rad: float) -> None:
         self.rig.vehicle = replace(vehicle_at(speed_mps, steering_rad), mono_ns=self.rig.now_ns)
 
     @rule(inhibit_reason=st.sampled_from(["", "fault"]), engaged=st.booleans(), overridden=st.booleans())
-    def vehicle_accepts_or_not(self, inhibit_reason: str, *, engaged: bool, overridden: bool) -> None:
+    def set_vehicle_readiness(self, inhibit_reason: str, *, engaged: bool, overridden: bool) -> None:
         self.rig.vehicle = replace(
             self.rig.vehicle, inhibit_reason=inhibit_reason, is_engaged=engaged, is_overridden=overridden
         )
@@ -149,15 +148,15 @@ class GateMachine(RuleBasedStateMachine):
     @invariant()
     def transitions_follow_the_table(self) -> None:
         for before, after, _ in self.rig.gate.machine.take_transitions():
-            assert before == self.before
+            assert before == self.previous_state
             assert (before, after) in TABLE_TRANSITIONS
             if (before, after) == ("arming", "driving"):
                 assert self.met_since_ns is not None
                 assert self.rig.now_ns - self.met_since_ns >= LIMITS.arming_hold_ns
             if after != "arming" and (before == "arming" or after == "emergency_stop"):
                 self.met_since_ns = None
-            self.before = after
-        assert self.rig.state == self.before
+            self.previous_state = after
+        assert self.rig.state == self.previous_state
 
     @invariant()
     def actuation_is_within_all_limits(self) -> None:
@@ -168,9 +167,9 @@ class GateMachine(RuleBasedStateMachine):
         assert 0 <= actuation.throttle <= 1
         assert 0 <= actuation.brake <= 1
         assert abs(actuation.steering_rad) <= MAX_STEERING_RAD
-        step_rad = LIMITS.steering_rate_radps * (rig.now_ns - self.last_ns) / NS_PER_S
+        step_rad = LIMITS.steering_rate_radps * (rig.now_ns - self.last_actuation_ns) / NS_PER_S
         assert abs(actuation.steering_rad - before_rad) <= step_rad + 1e-12
-        self.last_ns = rig.now_ns
+        self.last_actuation_ns = rig.now_ns
         if rig.state != "driving":
             assert actuation.throttle == 0
             assert actuation.brake > 0

@@ -15,15 +15,15 @@ from lavt.safety.state_machine import TRANSITIONS
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs/safety.md").read_text()
-TEST = re.compile(r"`(?P<file>tests/[\w/]+\.py)(?:::(?P<name>\w+))?`")
+TEST_REFERENCE = re.compile(r"`(?P<file>tests/[\w/]+\.py)(?:::(?P<name>\w+))?`")
 
 
-def functions(path: Path) -> set[str]:
+def function_names(path: Path) -> set[str]:
     return {node.name for node in ast.parse(path.read_text()).body if isinstance(node, ast.FunctionDef)}
 
 
 def test_the_page_is_up_to_date() -> None:
-    """docs/safety.md is as `python docs/draw_safety.py` generates it, and has all blocks."""
+    """docs/safety.md is what `python docs/draw_safety.py` generates, and has all generated blocks."""
     assert draw_page(PAGE) == PAGE, "docs/safety.md is outdated: run `python docs/draw_safety.py`"
     assert set(re.findall(r"<!-- drawn: ([a-z ]+) -->", PAGE)) == set(DRAWINGS)
 
@@ -68,26 +68,26 @@ def test_a_limit_is_shown_with_its_unit(name: str, value: float, shown: str) -> 
 
 
 def test_an_unknown_block_is_rejected() -> None:
-    """An unknown block is an error that names the known ones."""
+    """An unknown block is an error, whose message names the known blocks."""
     with pytest.raises(UserError, match="'cats': choose one of states, transitions"):
         draw_page("<!-- drawn: cats -->\n<!-- drawn until here -->")
 
 
 def test_every_test_that_the_page_names_exists() -> None:
     """Each test and test file that the page names exists."""
-    named = [(found["file"], found["name"]) for found in TEST.finditer(PAGE)]
+    named = [(found["file"], found["name"]) for found in TEST_REFERENCE.finditer(PAGE)]
     assert len(named) > 40
     assert len(named) == PAGE.count("`tests/")
-    existing = {file: functions(ROOT / file) for file, _ in named if (ROOT / file).exists()}
+    existing = {file: function_names(ROOT / file) for file, _ in named if (ROOT / file).exists()}
     missing = [f"{file}::{name}" for file, name in named if name and name not in existing.get(file, set())]
     missing += [file for file, name in named if not name and file not in existing]
     assert missing == []
 
 
-def test_every_hazard_has_an_answer() -> None:
-    """Each hazard has an answer and a test, or says that nothing answers it."""
+def test_every_hazard_has_a_mitigation() -> None:
+    """Each hazard has a mitigation with a test, or the page says that nothing mitigates it."""
     table = PAGE.partition("## Hazards")[2].partition("\n## ")[0]
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines() if line.startswith("| ")]
-    for hazard, answer, shown in rows[1:]:
-        assert answer, hazard
-        assert shown or answer.startswith("Nothing"), f"the answer to this hazard has no test: {hazard}"
+    for hazard, mitigation, tests in rows[1:]:
+        assert mitigation, hazard
+        assert tests or mitigation.startswith("Nothing"), f"the mitigation of this hazard has no test: {hazard}"

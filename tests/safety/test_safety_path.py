@@ -28,7 +28,7 @@ class MovingRig(Rig):
         """Let time pass with an actuation every `COMMAND_PERIOD_NS`, and return the last actuation."""
         requested = self.step(speed_mps)
         for _ in range(duration_ns // COMMAND_PERIOD_NS):
-            self.go(COMMAND_PERIOD_NS)
+            self.pass_time(COMMAND_PERIOD_NS)
             requested = self.step(speed_mps)
         return requested
 
@@ -39,10 +39,10 @@ class MovingRig(Rig):
 
     def drive_on(self, path: tuple[float, ...], angle_rad: float = 0.0) -> MovingRig:
         """Drive at 8 m/s with one command whose path is `path`."""
-        self.armed()
+        self.arm()
         self.roll(COMMAND_PERIOD_NS)
-        self.picture()
-        assert self.drive(steering_rad=angle_rad, path_curvature_per_m=path).accepted
+        self.take_picture()
+        assert self.send_drive(steering_rad=angle_rad, path_curvature_per_m=path).accepted
         return self
 
 
@@ -53,7 +53,7 @@ def test_before_the_timeout_the_command_steers() -> None:
 
 @pytest.mark.parametrize(("since_command_ns", "state"), [(400 * NS_PER_MS, "degraded"), (600 * NS_PER_MS, "safe_stop")])
 def test_a_command_timeout_steers_along_the_path(since_command_ns: int, state: str) -> None:
-    """Degraded and in the safe stop, the vehicle steers along the last command's path."""
+    """In the degraded state and in the safe stop, the vehicle steers along the last command's path."""
     rig = MovingRig().drive_on(LEFT)
     requested = rig.roll(since_command_ns)
     assert rig.state == state
@@ -93,10 +93,10 @@ def test_every_stop_follows_the_path(stop: str) -> None:
 
 
 def test_without_a_path_the_wheel_is_held() -> None:
-    """Armed and moved before any drive command, the vehicle stops with its wheel still."""
+    """An armed vehicle that moves before any drive command stops with its wheel still."""
     rig = MovingRig()
     rig.vehicle = vehicle_at(0.0, 0.05)
-    rig.armed()
+    rig.arm()
     assert rig.roll(NS_PER_S).steering_rad == 0.05
     assert rig.state == "safe_stop"
 
@@ -123,23 +123,24 @@ def test_a_new_drive_never_uses_an_old_path() -> None:
 
 def test_the_path_of_a_command_begins_where_its_picture_was_taken() -> None:
     """A path begins where its picture was taken, not where its command arrived."""
-    steering = []
+    steering_rad_by_age = []
     for age_ns in (0, NS_PER_S):
         rig = MovingRig(replace(LIMITS, picture_age_limit_ns=2 * NS_PER_S, degraded_after_ns=2 * NS_PER_S))
-        rig.armed()
+        rig.arm()
         rig.roll(COMMAND_PERIOD_NS)
-        stamp_ns = rig.picture()
+        stamp_ns = rig.take_picture()
         rig.roll(age_ns)
-        assert rig.drive(stamp_ns=stamp_ns, steering_rad=0.0, path_curvature_per_m=LATER_LEFT).accepted
-        rig.picture()
+        assert rig.send_drive(stamp_ns=stamp_ns, steering_rad=0.0, path_curvature_per_m=LATER_LEFT).accepted
+        rig.take_picture()
         assert rig.send(mode="stop").accepted
-        steering.append(rig.roll(200 * NS_PER_MS).steering_rad)
-    assert abs(steering[0]) < 0.002
-    assert steering[1] > 0.01
+        steering_rad_by_age.append(rig.roll(200 * NS_PER_MS).steering_rad)
+    from_new_picture_rad, from_old_picture_rad = steering_rad_by_age
+    assert abs(from_new_picture_rad) < 0.002
+    assert from_old_picture_rad > 0.01
 
 
 def test_an_old_picture_slows_the_vehicle() -> None:
-    """At 9.4 m/s, a command keeps its throttle up to a picture age of 0.25 s and is braked after that."""
+    """At 9.4 m/s a command keeps its throttle at a picture age of 0.24 s; at 0.28 s the vehicle brakes instead."""
     rig = MovingRig().drive_on((0.0,) * 10)
     assert rig.roll(240 * NS_PER_MS, 9.4).throttle == 0.5
     requested = rig.roll(40 * NS_PER_MS, 9.4)

@@ -20,7 +20,7 @@ def test_an_inhibited_vehicle_is_not_armed() -> None:
     """While the vehicle has an inhibit reason, arming is rejected with that reason."""
     rig = Rig().acquire()
     rig.vehicle = replace(vehicle_at(), inhibit_reason="no report of the speed for 100 ms", is_engaged=False)
-    rig.picture()
+    rig.take_picture()
     verdict = rig.send()
     assert verdict.reason is RejectionReason.INHIBITED
     assert verdict.message.endswith(": no report of the speed for 100 ms")
@@ -43,11 +43,11 @@ def test_arming_waits_until_the_vehicle_is_engaged() -> None:
 
 def test_engaging_does_not_turn_the_wheel() -> None:
     """When arming begins, the steering target is the wheel's present angle."""
-    rig = Rig().driving(steering_rad=0.2)
+    rig = Rig().start_driving(steering_rad=0.2)
     rig.request("release")
     rig.acquire()
     rig.vehicle = vehicle_at(steering_rad=-0.1)
-    rig.picture()
+    rig.take_picture()
     rig.send()
     assert rig.state == "arming"
     assert rig.actuation().steering_rad == -0.1
@@ -56,9 +56,9 @@ def test_engaging_does_not_turn_the_wheel() -> None:
 @pytest.mark.parametrize("state", ["driving", "degraded"])
 def test_a_vehicle_fault_stops_the_vehicle(state: str) -> None:
     """A fault while driving leads to a braked safe stop that reports the inhibit reason."""
-    rig = Rig().driving()
+    rig = Rig().start_driving()
     if state == "degraded":
-        rig.go(400 * NS_PER_MS)
+        rig.pass_time(400 * NS_PER_MS)
     assert rig.state == state
     rig.vehicle = replace(vehicle_at(8.0), **FAULT)
     requested = rig.actuation()
@@ -69,7 +69,7 @@ def test_a_vehicle_fault_stops_the_vehicle(state: str) -> None:
 
 def test_a_vehicle_that_disengages_without_a_reason_is_stopped() -> None:
     """A vehicle that disengages without a reason while driving is stopped."""
-    rig = Rig().driving()
+    rig = Rig().start_driving()
     rig.vehicle = replace(vehicle_at(8.0), is_engaged=False)
     rig.actuation()
     assert rig.state == "safe_stop"
@@ -78,25 +78,25 @@ def test_a_vehicle_that_disengages_without_a_reason_is_stopped() -> None:
 @pytest.mark.parametrize("state", ["arming", "driving", "degraded", "safe_stop"])
 def test_a_driver_override_disarms(state: str) -> None:
     """A driver override disarms the vehicle under a new epoch."""
-    rig = Rig().driving() if state != "arming" else Rig().acquire()
+    rig = Rig().start_driving() if state != "arming" else Rig().acquire()
     if state == "arming":
-        rig.picture()
+        rig.take_picture()
         rig.send()
     else:
-        rig.go({"driving": 0, "degraded": 400 * NS_PER_MS, "safe_stop": 600 * NS_PER_MS}[state])
+        rig.pass_time({"driving": 0, "degraded": 400 * NS_PER_MS, "safe_stop": 600 * NS_PER_MS}[state])
     assert rig.state == state
     rig.vehicle = replace(vehicle_at(8.0), **OVERRIDE)
     epoch = rig.epoch
     rig.actuation()
     assert rig.state == "disarmed"
     assert "taken over" in rig.gate.machine.reason
-    rig.picture()
-    assert rig.drive(epoch=epoch).reason == RejectionReason.WRONG_EPOCH
+    rig.take_picture()
+    assert rig.send_drive(epoch=epoch).reason == RejectionReason.WRONG_EPOCH
 
 
 def test_a_driver_override_keeps_an_emergency_stop() -> None:
     """A driver override does not clear an emergency stop."""
-    rig = Rig().driving()
+    rig = Rig().start_driving()
     rig.request("emergency_stop", number=7)
     rig.vehicle = replace(vehicle_at(8.0), **OVERRIDE)
     rig.actuation()
@@ -105,21 +105,21 @@ def test_a_driver_override_keeps_an_emergency_stop() -> None:
 
 def test_a_command_that_arrives_with_a_fault_is_rejected() -> None:
     """A command that arrives together with a fault is rejected."""
-    rig = Rig().driving()
+    rig = Rig().start_driving()
     rig.vehicle = replace(vehicle_at(8.0), **FAULT)
-    rig.picture()
-    assert not rig.drive().accepted
+    rig.take_picture()
+    assert not rig.send_drive().accepted
     assert rig.state == "safe_stop"
 
 
 def test_the_vehicle_is_engaged_until_it_is_stationary() -> None:
-    """The vehicle must be engaged while active, and after a stop until standstill."""
+    """The vehicle is engaged while it is armed or driven, and after a stop until standstill."""
     rig = Rig()
     assert not rig.gate.watchdog.should_engage(vehicle_at())
     assert not rig.gate.watchdog.should_engage(vehicle_at(8.0)), "a driver moves a vehicle that was never armed"
-    rig.driving()
+    rig.start_driving()
     assert rig.gate.watchdog.should_engage(vehicle_at())
-    rig.go(600 * NS_PER_MS)
+    rig.pass_time(600 * NS_PER_MS)
     assert rig.gate.watchdog.should_engage(vehicle_at(8.0))
     assert not rig.gate.watchdog.should_engage(vehicle_at())
 
@@ -127,12 +127,12 @@ def test_the_vehicle_is_engaged_until_it_is_stationary() -> None:
 @pytest.mark.parametrize("stop", ["safe_stop", "emergency_stop"])
 def test_after_a_stop_only_arming_engages_the_vehicle_again(stop: str) -> None:
     """Once stationary after a stop, the vehicle is engaged again by arming only, though the stop is latched."""
-    rig = Rig().driving()
+    rig = Rig().start_driving()
     assert rig.gate.watchdog.should_engage(vehicle_at(8.0))
     if stop == "emergency_stop":
         rig.request("emergency_stop", number=7)
     else:
-        rig.go(600 * NS_PER_MS)
+        rig.pass_time(600 * NS_PER_MS)
     assert rig.state == stop
     assert rig.gate.watchdog.should_engage(vehicle_at(8.0))
     assert not rig.gate.watchdog.should_engage(vehicle_at())
@@ -152,7 +152,7 @@ def test_an_emergency_stop_does_not_engage_a_disarmed_vehicle() -> None:
 @pytest.mark.parametrize("changes", [{"speed_mps": math.nan}, {"steering_rad": math.inf}])
 def test_a_state_that_is_not_finite_is_a_vehicle_fault(changes: dict[str, Any]) -> None:
     """A speed or an angle that is not finite stops the vehicle."""
-    rig = Rig().driving()
+    rig = Rig().start_driving()
     rig.vehicle = replace(vehicle_at(5.0), **changes)
     actuation = rig.actuation()
     assert rig.state == "safe_stop"
@@ -163,14 +163,14 @@ def test_a_state_that_is_not_finite_is_a_vehicle_fault(changes: dict[str, Any]) 
 @pytest.mark.parametrize("state", ["arming", "driving", "degraded"])
 @pytest.mark.parametrize("speed_mps", [0.0, 11.0])
 def test_an_implausible_speed_is_a_vehicle_fault(state: str, speed_mps: float) -> None:
-    """A vehicle that says that its speed may be wrong is stopped with full brake, even without an inhibit reason."""
+    """A report that the speed is implausible causes full brake, even without an inhibit reason."""
     rig = Rig().acquire()
-    rig.picture()
+    rig.take_picture()
     rig.send()
     if state != "arming":
-        rig = Rig().driving()
+        rig = Rig().start_driving()
     if state == "degraded":
-        rig.go(400 * NS_PER_MS)
+        rig.pass_time(400 * NS_PER_MS)
     assert rig.state == state
     rig.vehicle = replace(vehicle_at(speed_mps), is_speed_plausible=False)
     actuation = rig.actuation()

@@ -16,7 +16,7 @@ PLANNED_PEDAL = LIMITS.stop_deceleration_mps2 / MAX_BRAKING_MPS2
 
 
 def pedals(deceleration_mps2: float, lag_s: float = 0.2) -> list[float]:
-    """Return the pedal every 20 ms of a stop from 8 m/s that decelerates by a fixed amount after a lag."""
+    """Return the pedal every 20 ms of a stop from 8 m/s, whose deceleration is constant after a lag."""
     brake = StopBrake(LIMITS, MAX_BRAKING_MPS2)
     times_s = [index / 50 for index in range(150)]
     speeds_mps = [max(0.0, 8.0 - deceleration_mps2 * max(0.0, time_s - lag_s)) for time_s in times_s]
@@ -42,7 +42,7 @@ def test_a_stop_that_decelerates_too_little_brakes_fully(deceleration_mps2: floa
 
 @pytest.mark.parametrize("speed_mps", [math.nan, math.inf, -math.inf, 1e200])
 def test_a_stop_at_a_speed_that_is_no_speed(speed_mps: float) -> None:
-    """The pedal is full, or rises to full, for a speed that is not finite or huge."""
+    """At a speed that is huge or not finite, the pedal stays as planned or is full; it is full if the speed is NaN."""
     brake = StopBrake(LIMITS, MAX_BRAKING_MPS2)
     brake.pedal(vehicle_at(speed_mps), START_NS)
     assert brake.pedal(vehicle_at(speed_mps), START_NS + 3 * NS_PER_S) in {PLANNED_PEDAL, 1.0}
@@ -50,13 +50,13 @@ def test_a_stop_at_a_speed_that_is_no_speed(speed_mps: float) -> None:
 
 
 def test_an_implausible_speed_brakes_fully_and_is_not_standstill() -> None:
-    """A safe stop at an implausible speed of 0 brakes fully at once, stays engaged, and the vehicle is not at rest."""
-    rig = Rig().driving()
+    """A safe stop at an implausible speed of 0 brakes fully at once; the vehicle stays engaged and is not at rest."""
+    rig = Rig().start_driving()
     rig.vehicle = replace(vehicle_at(0.0), is_speed_plausible=False, inhibit_reason="speed", is_engaged=False)
     rig.gate.watchdog.should_engage(rig.vehicle)
     assert rig.actuation().brake == 1.0
     assert rig.state == "safe_stop"
-    rig.go(10 * NS_PER_S)
+    rig.pass_time(10 * NS_PER_S)
     assert rig.gate.watchdog.should_engage(rig.vehicle)
     assert not rig.gate.machine.is_at_rest(rig.vehicle)
     assert not rig.request("acquire", "bob").granted
@@ -65,8 +65,8 @@ def test_an_implausible_speed_brakes_fully_and_is_not_standstill() -> None:
     assert rig.gate.machine.is_at_rest(rig.vehicle)
 
 
-def test_the_next_stop_begins_at_its_own_speed() -> None:
-    """A pedal that was raised in one stop is the usual one at the beginning of the next."""
+def test_the_next_stop_begins_with_the_planned_pedal() -> None:
+    """After a stop in which the pedal was raised, the next stop begins with the planned pedal."""
     brake = StopBrake(LIMITS, MAX_BRAKING_MPS2)
     brake.pedal(vehicle_at(8.0), START_NS)
     assert brake.pedal(vehicle_at(8.0), START_NS + 900 * NS_PER_MS) == 1.0

@@ -13,7 +13,7 @@ class ManualClock:
         self.mono_ns, self.wall_ahead_ns, self.step_ns = mono_ns, wall_ahead_ns, step_ns
 
     def now(self) -> Now:
-        """Return both clocks; the wall clock is always `wall_ahead_ns` ahead."""
+        """Return both clocks; the wall clock is `wall_ahead_ns` ahead of the monotonic one."""
         self.mono_ns += self.step_ns
         return Now(self.mono_ns, self.mono_ns + self.wall_ahead_ns)
 
@@ -23,7 +23,7 @@ class ManualClock:
 
 
 class ShiftedClock:
-    """This machine's clocks, `mono_ns` and `wall_ns` ahead; the wall clock gains `wall_step_ns` at each reading."""
+    """This machine's clocks, ahead by `mono_ns` and `wall_ns`; the wall clock gains `wall_step_ns` at each reading."""
 
     def __init__(self, *, mono_ns: int = 0, wall_ns: int = 0, wall_step_ns: int = 0) -> None:
         self._mono_ns, self._wall_ns, self._wall_step_ns = mono_ns, wall_ns, wall_step_ns

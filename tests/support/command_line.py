@@ -20,7 +20,7 @@ class CommandResult(NamedTuple):
         return self.sentence()
 
     def sentence(self) -> str:
-        """Check that standard error has one sentence of LAVT and nothing else; return it."""
+        """Check that standard error has one sentence of LAVT and nothing else; return the sentence."""
         assert self.err.startswith("lavt: "), self
         assert self.err.count("\n") == 1, self
         assert "Traceback" not in self.err

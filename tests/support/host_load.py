@@ -3,9 +3,9 @@
     python -m tests.support.host_load --share 0.3 --stop-ms 300 --stops-every-s 20 --seed 1 -- COMMAND...
 
 Processes of the highest real-time priority, one on each processor, occupy a share of every 10 ms. At random times they
-also occupy all processors for a while (a "stop"). Meanwhile no other program runs, whatever its priority, as under a
-hypervisor that gives the processors to other machines. The load ends with the command, and returns its exit code. Needs
-root.
+also occupy all processors for a while (a "stop"). During a stop no other program runs, whatever its priority, as under
+a hypervisor that gives the processors to other machines. The load ends with the command, and this program then returns
+the command's exit code. It needs root.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ MAX_SHARE = 0.95
 
 
 def stop_times(seed: int, every_s: float, stop_ms: float, last_stop_s: float = LAST_STOP_S) -> list[tuple[int, int]]:
-    """Return when each stop begins and ends, in ns from the start; the intervals between stops are exponential."""
+    """Return the begin and end of each stop, in ns from the start; the times between stops are exponential."""
     from lavt.streams import stream
 
     generator, stops, at_s = stream(seed, "host load"), [], 0.0
@@ -41,7 +41,7 @@ def stop_times(seed: int, every_s: float, stop_ms: float, last_stop_s: float = L
 
 
 def spin_until(end_ns: int) -> int:
-    """Occupy the processor until a time of CLOCK_MONOTONIC; return the duration."""
+    """Occupy the processor until a time of CLOCK_MONOTONIC; return how long that took."""
     begin_ns = now_ns = time.monotonic_ns()
     while now_ns < end_ns:
         now_ns = time.monotonic_ns()
@@ -49,10 +49,10 @@ def spin_until(end_ns: int) -> int:
 
 
 def spin(processor: int) -> None:
-    """Occupy a processor as standard input says, until standard input ends.
+    """Occupy a processor as the first line of standard input says, until standard input ends.
 
-    Print the requested CPU time, the actual CPU time, and the time since the start, in ns. The first two differ if the
-    kernel did not give the processor to this program.
+    At the end print the requested CPU time, the actual CPU time, and the time since the start, in ns. The actual time
+    is shorter if the kernel did not give the processor to this program.
     """
     os.sched_setaffinity(0, {processor})
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
@@ -63,7 +63,8 @@ def spin(processor: int) -> None:
     while True:
         now_ns = time.monotonic_ns()
         if stops and now_ns >= begin_ns + stops[0][0]:
-            spun_ns += spin_until(begin_ns + stops.pop(0)[1])
+            _, stop_end_ns = stops.pop(0)
+            spun_ns += spin_until(begin_ns + stop_end_ns)
             now_ns = time.monotonic_ns()
         next_ns = now_ns - (now_ns - begin_ns) % PERIOD_NS + PERIOD_NS
         spun_ns += spin_until(now_ns + round(share * (next_ns - now_ns)))
@@ -92,8 +93,8 @@ def run_under_load(command: list[str], share: float, stops: list[tuple[int, int]
             spinner.stdin.flush()
         code = subprocess.run(command, check=False).returncode
     finally:
-        answers = [spinner.communicate()[0] for spinner in spinners]
-    for number, line in enumerate(answers):
+        reports = [spinner.communicate()[0] for spinner in spinners]
+    for number, line in enumerate(reports):
         spun_ns, used_ns, lasted_ns = json.loads(line)
         stop_count = sum(begin < lasted_ns for begin, _ in stops)
         sys.stderr.write(
@@ -119,7 +120,9 @@ def main() -> int:
     if not options.command:
         parser.error("give the command after --")
     if options.share + options.stop_ms / 1e3 >= MAX_SHARE:
-        parser.error(f"the kernel limits real-time programs to {MAX_SHARE:.0%} of a second: take less")
+        parser.error(
+            f"the kernel limits real-time programs to {MAX_SHARE:.0%} of a second: take less, or make shorter stops"
+        )
     stops = stop_times(options.seed, options.stops_every_s, options.stop_ms)
     return run_under_load(options.command, options.share, stops)
 

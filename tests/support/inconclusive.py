@@ -1,10 +1,10 @@
-"""Pytest hooks: a test that the host stalled is run again, at most twice; if its last run stalls, it is inconclusive.
+"""Pytest hooks: a test that the host stalled is run again, at most twice, and is then inconclusive.
 
 `tests/conftest.py` loads this plugin. A test that judges times uses the fixture `stalls`, directly or through another
 one. A test whose assertions are all about times has the marker `judges_times` instead, with the arguments of
 `Stalls.excusing_failures`. Tests of both kinds are run again only after `HostStalled`: any other exception fails the
-test, even one that was raised while a `HostStalled` was handled. A session fails if too many tests were inconclusive on
-an idle machine, or if a probe ended early.
+test, even one that was raised while a `HostStalled` was handled. A pytest session fails if too many tests were
+inconclusive on an idle machine, or if a probe ended early.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ JUDGES_TIMES = "judges_times"
 
 @dataclass
 class SessionState:
-    """What the hooks keep during a session."""
+    """The data that the hooks keep during a pytest session."""
 
     stalls: Stalls | None = None
     tests: set[str] = field(default_factory=set)
@@ -38,9 +38,9 @@ SESSION = pytest.StashKey[SessionState]()
 @pytest.fixture(scope="session")
 def stalls(request: pytest.FixtureRequest) -> Stalls:
     """Return the record of the host's stalls; the probes end with the session."""
-    measured = Stalls.measured()
-    request.config.stash[SESSION].stalls = measured
-    return measured
+    record = Stalls.start_probes()
+    request.config.stash[SESSION].stalls = record
+    return record
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -49,7 +49,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark tests that use the fixture for reruns; tests with `judges_times` use it."""
+    """Mark each test that uses the fixture `stalls` for reruns; a test with `judges_times` gets that fixture."""
     for item in items:
         names: list[str] = getattr(item, "fixturenames", [])
         if item.get_closest_marker(JUDGES_TIMES) and "stalls" not in names:
@@ -60,13 +60,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item: pytest.Item) -> Generator[None, None, None]:
-    """Excuse an assertion of a test with `judges_times` if the host stalled while it ran."""
+    """Excuse a failed assertion of a test with `judges_times` if the host stalled while the test ran."""
     marker = item.get_closest_marker(JUDGES_TIMES)
     if marker is None:
         return (yield)
-    measured = item.config.stash[SESSION].stalls
-    assert measured is not None
-    with measured.excusing_failures(measured.clock.now().mono_ns, **marker.kwargs):
+    record = item.config.stash[SESSION].stalls
+    assert record is not None
+    with record.excusing_failures(record.clock.now().mono_ns, **marker.kwargs):
         return (yield)
 
 
@@ -74,7 +74,7 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None, None, None]:
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None]
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Record in the report whether the host stalled, because a report from another process has no exception."""
+    """Record in the report whether the host stalled the test: a report from another process contains no exception."""
     report = yield
     vars(report)["host_stalled"] = call.excinfo is not None and isinstance(call.excinfo.value, HostStalled)
     if report.when == "call":
@@ -84,7 +84,7 @@ def pytest_runtest_makereport(
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_logreport(report: pytest.TestReport) -> Generator[None, object, object]:
-    """Before a test is counted as failed: if the host stalled its last attempt, make its outcome inconclusive."""
+    """If the host stalled the last attempt of a failed test, make the outcome inconclusive before pytest counts it."""
     if report.failed and getattr(report, "host_stalled", False):
         vars(report)["outcome"] = INCONCLUSIVE
     return (yield)

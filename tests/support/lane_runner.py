@@ -30,7 +30,7 @@ Write = Callable[[str], None]
 
 
 def parse_counts(output: str) -> Counter[str]:
-    """Return the numbers of passed tests, failed tests etc. from the closing lines of pytest in an output."""
+    """Return the numbers of passed, failed and other tests from pytest's closing lines in an output."""
     counts: Counter[str] = Counter()
     for line in SUMMARY.findall(COLOURS.sub("", output)):
         for number, word in re.findall(r"(\d+) (\w+)", line):
@@ -46,7 +46,7 @@ class LaneOutcome:
     took_s: float
     counts: Counter[str]
     failures: list[str] = field(default_factory=list)
-    """The reasons for its failure; empty if it passed."""
+    """The reasons why the lane failed; empty if it passed."""
 
 
 class RunningLane:
@@ -135,7 +135,7 @@ class RunningLane:
 def run_lanes(lanes: Sequence[LaneSpec], *, write: Write) -> int:
     """Run lanes in their order; return 0 if all passed, else 1.
 
-    The output of a lane that runs at the same time (`meanwhile`) is written after that of the main lane.
+    A lane that runs at the same time as another (`meanwhile`) has its output written after the other's output.
     """
     outcomes: list[LaneOutcome] = []
     began_ns = MachineClock().now().mono_ns

@@ -3,9 +3,9 @@
     python lateness_probe.py PROCESSOR
 
 The process sleeps for 8 ms at a time and records each late wake, with the time when it was due and the time when it
-occurred (CLOCK_MONOTONIC, ns). Its first line says whether it has real-time priority (SCHED_FIFO), which is above any
-niceness. It answers each byte on standard input with one line: the present time, and the late wakes since the last
-answer. It ends with standard input or with its parent process. It imports nothing of LAVT, so that it starts fast.
+occurred (CLOCK_MONOTONIC, ns). Its first line says whether the process has real-time priority (SCHED_FIFO), which is
+above any niceness. It answers each byte on standard input with one line: the present time, and the late wakes since the
+last answer. It ends with standard input or with its parent process. It imports nothing of LAVT, so that it starts fast.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import time  # noqa: TID251 (a program that measures the machine itself)
 PRIORITY = 10
 """Above all programs without real-time priority, whatever their niceness; below the load of `host_load.py`."""
 PERIOD_MS = 8
-"""A shorter period costs more than 1 % of a processor. A stall is recorded at most this much too short."""
+"""A shorter period costs more than 1 % of a processor. The recorded length of a stall lacks at most one period."""
 LATE_NS = 1_000_000
 """Shorter delays are not recorded. A quiet machine wakes the probe within 0.1 ms."""
 PR_SET_PDEATHSIG = 1
@@ -43,8 +43,8 @@ def take_priority() -> bool:
     return True
 
 
-def answer(value: object) -> None:
-    """Write one line."""
+def write_line(value: object) -> None:
+    """Write a value to standard output as one line of JSON."""
     os.write(1, json.dumps(value).encode() + b"\n")
 
 
@@ -55,7 +55,7 @@ def main() -> None:
     if os.getppid() != parent:
         return
     os.sched_setaffinity(0, {int(sys.argv[1])})
-    answer(take_priority())
+    write_line(take_priority())
     limit_ns = LATE_NS + 2 * round(time.clock_getres(time.CLOCK_MONOTONIC) * 1e9)
     late_wakes: list[tuple[int, int]] = []
     poller = select.poll()
@@ -69,7 +69,7 @@ def main() -> None:
         if ready:
             if not os.read(0, 4096):
                 return
-            answer([now_ns, late_wakes])
+            write_line([now_ns, late_wakes])
             late_wakes.clear()
         due_ns = time.monotonic_ns() + PERIOD_MS * 1_000_000
 

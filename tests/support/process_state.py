@@ -1,7 +1,7 @@
 """Pytest hooks and fixtures that check that no test changes the pytest process.
 
-`tests/conftest.py` loads this plugin. A test that changed the process, such as its priority, signal handlers or
-directory, would affect the tests after it.
+`tests/conftest.py` loads this plugin. A test that changed the priority, the signal handlers or the directory of the
+process, for example, would affect later tests.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ PYTEST_PREFIX = "PYTEST_"
 
 
 def pytest_configure() -> None:
-    """Let Ctrl-C end the tests and their programs, even if a shell without job control ignores it."""
+    """Let Ctrl-C end the tests and their programs, even if a shell without job control made pytest ignore it."""
     if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -34,7 +34,7 @@ def process_state() -> dict[str, Any]:
         "scheduler": os.sched_getscheduler(0),
         "processors": os.sched_getaffinity(0),
         "switch interval": sys.getswitchinterval(),
-        "directory": os.getcwd(),  # noqa: PTH109 (ten times as fast)
+        "directory": os.getcwd(),  # noqa: PTH109 (ten times as fast as Path.cwd)
         **{f"${key}": value for key, value in os.environ.items() if not key.startswith(PYTEST_PREFIX)},
         "signal mask": signal.pthread_sigmask(signal.SIG_BLOCK, ()),
         **{number.name: signal.getsignal(number) for number in SIGNALS},

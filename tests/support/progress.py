@@ -15,7 +15,7 @@ def write_running() -> None:
 
 
 def pytest_runtest_logstart(nodeid: str) -> None:
-    """Record that a test begins; with parallel tests this is called for those of every worker."""
+    """Record that a test begins; if tests run in parallel, pytest calls this for the tests of every worker."""
     RUNNING[nodeid] = None
     write_running()
 

@@ -1,13 +1,15 @@
-"""The record of times when the host stalled this machine, and verdicts on timing that use it.
+"""The record of times when the host stalled this machine, and verdicts on timing that use this record.
 
 A test of real time can fail because a program is too slow, or because the host (the hypervisor) did not run this
-machine. One probe for each processor (`lateness_probe.py`) distinguishes the two. The probe has real-time priority, so
-no program of LAVT can delay it: their niceness is -15 or more. A failed timing assertion is excused (`HostStalled`)
-only if a probe was late at the relevant time. Then pytest runs the test again, at most twice, and calls it inconclusive
-if the host stalls its last run, too (`inconclusive.py`). Assertions on safety are plain `assert`s and never excused.
+machine. One probe for each processor (`lateness_probe.py`) distinguishes the two cases. No program of LAVT can delay a
+probe, because the probe's real-time priority is higher than theirs. A failed timing assertion is excused
+(`HostStalled`) only if a probe was late at the relevant time. Then pytest runs the test again, at most twice. If the
+host stalls the last run, too, the test is inconclusive (`inconclusive.py`). Assertions on safety are plain `assert`s
+and never excused.
 
 Without the right to real-time priority the probes are ordinary processes. They are still used, because LAVT's programs
-then have no priority either; but programs may cause a stall, and the summary says so.
+have no raised priority then, either. But then programs can delay a probe, which looks like a stall; the summary says
+so.
 """
 
 from __future__ import annotations
@@ -27,23 +29,23 @@ from lavt.domain import NS_PER_MS, NS_PER_S
 
 PROBE = Path(__file__).with_name("lateness_probe.py")
 STALL_MS = 30.0
-"""The default length from which a stall matters."""
+"""The shortest stall that excuses a failure, unless an assertion names another length."""
 LONG_STALL_MS = 100.0
-"""A stall this long can make a drive leave its lane or lose its driver: commands time out after 300 ms."""
+"""A stall this long can make the car leave its lane, or can cause a command timeout, which comes after 300 ms."""
 BUSY_SHARE = 0.05
-"""A host that takes this share of a drive changes the medians of its latencies."""
+"""If this share of a drive or more is stalled, the medians of the drive's latencies change."""
 SLOW_SHARE = 0.15
-"""Share of a by-wire drive that must be stalled to explain a too slow machine. Without 15 ms of each 100 ms it still
-drives as usual (`docs/by_wire.md`)."""
+"""The share of a by-wire drive that must be stalled before many short stalls explain a failure. A drive that lacks
+15 ms of each 100 ms still works as usual (`docs/by_wire.md`)."""
 COUNTED_MS = 10.0
-"""The session's summary counts stalls from this length."""
+"""The summary at the end counts only stalls of this length or more."""
 MAX_DESCRIBED = 4
-"""A description names this many stalls."""
+"""A description names at most this many stalls."""
 MAX_ATTEMPTS = 3
 MAX_INCONCLUSIVE = 0.05
 """The largest share of inconclusive tests with which a lane passes on a machine that is not busy."""
 BUSY_BELOW = 0.5
-"""A machine that is idle for a smaller share is busy, and may leave any number of tests inconclusive."""
+"""A machine whose idle share is smaller is busy. Then any number of tests is allowed to be inconclusive."""
 
 Result = TypeVar("Result")
 
@@ -57,7 +59,7 @@ class HostStalledEachTime(HostStalled):
 
 
 class ProbeEnded(Exception):
-    """A lateness probe ended before the session did, so nothing can be excused any more."""
+    """A lateness probe ended before pytest did, so nothing can be excused any more."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,7 @@ class Stall:
 
 
 def overlapping(stalls: Iterable[Stall], since_ns: int, until_ns: int, *, at_least_ms: float = 0.0) -> list[Stall]:
-    """Return the stalls of at least a length that overlap an interval."""
+    """Return the stalls that overlap an interval and last `at_least_ms` or longer."""
     return [
         stall
         for stall in stalls
@@ -84,11 +86,11 @@ def overlapping(stalls: Iterable[Stall], since_ns: int, until_ns: int, *, at_lea
 
 
 def stalled_share(stalls: Iterable[Stall], since_ns: int, until_ns: int) -> float:
-    """Return the share of an interval in which the processor with most stalls was stalled."""
+    """Return the stalled share of an interval, on the processor that was stalled for the longest time."""
     total_ns: dict[int | str, int] = {}
     for stall in overlapping(stalls, since_ns, until_ns):
-        within_ns = min(stall.end_ns, until_ns) - max(stall.begin_ns, since_ns)
-        total_ns[stall.processor] = total_ns.get(stall.processor, 0) + within_ns
+        overlap_ns = min(stall.end_ns, until_ns) - max(stall.begin_ns, since_ns)
+        total_ns[stall.processor] = total_ns.get(stall.processor, 0) + overlap_ns
     return max(total_ns.values(), default=0) / max(until_ns - since_ns, 1)
 
 
@@ -108,7 +110,7 @@ def describe(stalls: Sequence[Stall], since_ns: int) -> str:
 def inconclusive_too_often(inconclusive: int, tests: int, idle_share: float) -> bool:
     """Return whether more tests were inconclusive than the machine's load explains.
 
-    That is more than 5 % and more than one, if the machine was idle for more than half of the time.
+    Too many are more than 5 % and more than one test, if the machine was idle for more than half of the time.
     """
     return idle_share > BUSY_BELOW and inconclusive > max(1, MAX_INCONCLUSIVE * tests)
 
@@ -120,7 +122,7 @@ def idle_share(before: str, after: str) -> float:
     """
     before_ticks, after_ticks = ([int(number) for number in line.split()[1:9]] for line in (before, after))
     _user, nice, _system, idle, wait, *_others = differences = [
-        now - then for now, then in zip(after_ticks, before_ticks, strict=True)
+        after_count - before_count for after_count, before_count in zip(after_ticks, before_ticks, strict=True)
     ]
     return (nice + idle + wait) / max(sum(differences), 1)
 
@@ -191,7 +193,7 @@ def read_processor_times() -> str:
 
 @dataclass
 class Stalls:
-    """The record of all probes, and verdicts that use it."""
+    """The record of all probes, and verdicts that use the record."""
 
     probes: Sequence[Probe]
     processor_times: Callable[[], str] = read_processor_times
@@ -206,7 +208,7 @@ class Stalls:
         self._reported_ns = self._began_ns
 
     @classmethod
-    def measured(cls) -> Stalls:
+    def start_probes(cls) -> Stalls:
         """Start one probe on each processor that this process may use."""
         return cls([ProbeProcess(processor) for processor in sorted(os.sched_getaffinity(0))])
 
@@ -231,7 +233,7 @@ class Stalls:
     ) -> None:
         """Unless `condition` is true, raise `HostStalled` if a stall overlaps the interval, or else AssertionError.
 
-        The interval ends at the test's time limit at the latest, because what is late or missing was due before the
+        The interval must end at the test's time limit or earlier, because a late or missing event was due before that
         limit.
         """
         if not condition:
@@ -248,7 +250,7 @@ class Stalls:
     def share_verdict(self, message: str, since_ns: int, until_ns: int, *, share: float) -> Exception:
         """Return the exception for a wrong rate or median: `HostStalled` if the stalled share of the time is large.
 
-        A single stall does not excuse it. The share is that of the processor with most stalls.
+        A single stall does not excuse such a failure. The share is that of `stalled_share`.
         """
         stalls = self.during(since_ns, until_ns)
         stalled = stalled_share(stalls, since_ns, until_ns)
@@ -263,7 +265,7 @@ class Stalls:
     ) -> Iterator[None]:
         """Excuse a failed assertion about times in this context, by one stall or, with `share`, by a stalled share.
 
-        Without `until_ns` the interval ends now. Assertions on safety must be outside.
+        Without `until_ns` the interval ends when the assertion fails. Assertions on safety must be outside.
         """
         try:
             yield
@@ -305,7 +307,7 @@ class Stalls:
 
 
 class SharedResult(Generic[Result]):
-    """A result that several tests judge, such as a drive. After a stall the drive is repeated, at most twice."""
+    """A result that several tests judge, such as a drive. After a stall the result is made again, at most twice."""
 
     def __init__(self, stalls: Stalls, make: Callable[[], Result]) -> None:
         self._stalls, self._make = stalls, make
@@ -314,9 +316,9 @@ class SharedResult(Generic[Result]):
         self._attempts_left, self._excused = MAX_ATTEMPTS, 0
 
     def get(self) -> Result:
-        """Return the last result; repeat what makes it if the record has excused a failure since then.
+        """Return the result; make it if there is none yet, or if a failure was excused since the last one was made.
 
-        If making it fails and no stall explains this, the failure is raised for every test.
+        If `make` fails and no stall explains this, the failure is raised for every test.
         """
         if (
             self._failure is None
@@ -335,7 +337,7 @@ class SharedResult(Generic[Result]):
         if self._failure is not None:
             raise self._failure
         if not self._results:
-            raise HostStalledEachTime("the host stalled each attempt to make what this test judges")
+            raise HostStalledEachTime("the host stalled each attempt to make the result that this test judges")
         return self._results[0]
 
 

@@ -1,4 +1,4 @@
-"""A machine's agent, which calls functions of the lane for tests that run on the other machine."""
+"""The agent of the client's machine, which calls functions there for tests that run on the server's machine."""
 
 from __future__ import annotations
 

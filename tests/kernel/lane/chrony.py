@@ -7,8 +7,8 @@ import os
 from tests.kernel.lane.machine import Machine, MachineError, StartedProgram, wait_until
 
 FOLDER = "/run/chrony"
-"""The directory that chronyc uses by default. chronyd makes its command socket only in a directory that others cannot
-read."""
+"""The directory that chronyc uses by default. chronyd makes its command socket only in a directory that other users
+cannot read."""
 FILES = (f"bindcmdaddress {FOLDER}/chronyd.sock", f"pidfile {FOLDER}/chronyd.pid")
 SERVE_OWN_CLOCK = ("local stratum 8", "allow")
 """Serve the machine's own clock to every client."""
@@ -16,7 +16,7 @@ SYNCHRONISATION_TIMEOUT_S = 60
 
 
 def follow_server(address: str, port: int = 123) -> str:
-    """Return the directive to follow a server closely: two polls a second, with true send times (interleaved mode)."""
+    """Return the directive that makes chrony poll a server twice a second, with true send times (interleaved mode)."""
     return f"server {address} port {port} iburst minpoll -1 maxpoll -1 xleave"
 
 
@@ -57,6 +57,6 @@ def wait_synchronised(machine: Machine, *, updates: int = 1) -> None:
 
 
 def _count_good_answers(machine: Machine) -> int:
-    """Return the good answers of the best source; 99 if chrony has none because it serves its own clock."""
+    """Return how many good answers the best source gave; 99 without a source (chrony serves its own clock)."""
     answers = [line.split(",") for line in machine.run(["chronyc", "-n", "-c", "ntpdata"]).splitlines()]
     return max((int(fields[-1]) for fields in answers if len(fields) > 30), default=99)

@@ -17,7 +17,7 @@ CALIBRATION_S = 0.2
 ADJ_FREQUENCY, ADJ_STATUS, ADJ_SETOFFSET, ADJ_NANO, ADJ_TICK = 0x2, 0x10, 0x100, 0x2000, 0x4000
 STA_UNSYNC = 0x40
 TICK_US = 10_000
-"""The kernel's default tick: the clock runs at its nominal rate."""
+"""The kernel's default tick, with which the clock runs at its nominal rate."""
 UNITS_PER_PPM = 65_536
 """The kernel's unit of frequency is 2^-16 ppm."""
 
@@ -63,23 +63,25 @@ def read_wall_clock(attempts: int = 60) -> tuple[int, int]:
 def read_monotonic_clock(attempts: int = 10) -> tuple[int, int]:
     """Return counter and CLOCK_MONOTONIC (ns), read together in the attempt with the least interruption."""
     readings = [(read_counter(), time.monotonic_ns(), read_counter()) for _ in range(attempts)]
-    before, mono_ns, after = min(readings, key=lambda reading: reading[2] - reading[0])
+    before, mono_ns, after = min(readings, key=_reading_took)
     return (before + after) // 2, mono_ns
 
 
 def offset_ns(reading: tuple[int, int], reference: tuple[int, int]) -> int:
     """Return a clock minus a reference clock (ns), from a reading (counter, ns) of each."""
-    elapsed_ns = (reading[0] - reference[0]) / counter_hz() * NS_PER_S
-    return reading[1] - reference[1] - round(elapsed_ns)
+    counter, clock_ns = reading
+    reference_counter, reference_ns = reference
+    elapsed_ns = (counter - reference_counter) / counter_hz() * NS_PER_S
+    return clock_ns - reference_ns - round(elapsed_ns)
 
 
 @cache
 def counter_hz() -> float:
     """Return the counter's frequency, measured with a clock that is never adjusted."""
-    begin = _counter_and_raw()
+    begin_counter, begin_ns = _counter_and_raw()
     time.sleep(CALIBRATION_S)
-    end = _counter_and_raw()
-    return (end[0] - begin[0]) / (end[1] - begin[1]) * NS_PER_S
+    end_counter, end_ns = _counter_and_raw()
+    return (end_counter - begin_counter) / (end_ns - begin_ns) * NS_PER_S
 
 
 def read_raw_clock_ns() -> int:
@@ -90,7 +92,7 @@ def read_raw_clock_ns() -> int:
 def wall_minus_raw_ns() -> int:
     """Return the wall clock minus the raw clock (ns)."""
     readings = [(read_raw_clock_ns(), time.time_ns(), read_raw_clock_ns()) for _ in range(60)]
-    before_ns, wall_ns, after_ns = min(readings, key=lambda reading: reading[2] - reading[0])
+    before_ns, wall_ns, after_ns = min(readings, key=_reading_took)
     return wall_ns - (before_ns + after_ns) // 2
 
 
@@ -112,9 +114,15 @@ def restore(difference_ns: int) -> None:
     step(difference_ns - wall_minus_raw_ns())
 
 
+def _reading_took(reading: tuple[int, int, int]) -> int:
+    """Return the time between the first and last number of a reading; the middle number was read between these."""
+    before, _, after = reading
+    return after - before
+
+
 def _counter_and_raw() -> tuple[int, int]:
     readings = [(read_counter(), read_raw_clock_ns(), read_counter()) for _ in range(60)]
-    before, raw, after = min(readings, key=lambda reading: reading[2] - reading[0])
+    before, raw, after = min(readings, key=_reading_took)
     return (before + after) // 2, raw
 
 
@@ -126,7 +134,7 @@ def _adjtimex(change: Timex) -> None:
 
 @cache
 def _rdtsc() -> tuple[mmap.mmap, Callable[[], int]]:
-    """Put the instructions into executable memory; the memory must live as long as the function."""
+    """Put `RDTSC` into executable memory; return the memory, which must stay alive, and the function."""
     memory = mmap.mmap(-1, mmap.PAGESIZE, prot=mmap.PROT_READ | mmap.PROT_WRITE | mmap.PROT_EXEC)
     memory.write(RDTSC)
     address = ctypes.addressof(ctypes.c_char.from_buffer(memory))

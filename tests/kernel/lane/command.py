@@ -1,4 +1,4 @@
-"""`tests/kernel/run`: starts two machines, runs pytest on the first, and passes its result through."""
+"""`tests/kernel/run`: start two machines, run pytest on the first, and return pytest's exit code."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from tests.kernel.lane.unavailable import LaneUnavailable
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 HERE = REPOSITORY / "tests" / "kernel"
-SERVER = {"vec0": "10.9.0.1", "vec1": "10.9.1.1"}
+SERVER_ADDRESSES = {"vec0": "10.9.0.1", "vec1": "10.9.1.1"}
 """Addresses of the first machine, which runs pytest: vec0 is the network under test, vec1 is for management."""
-CLIENT = {"vec0": "10.9.0.2", "vec1": "10.9.1.2"}
+CLIENT_ADDRESSES = {"vec0": "10.9.0.2", "vec1": "10.9.1.2"}
 EPILOG = """Other options go to pytest, which runs in the repository's top directory; a test file of this directory can
 be given by its name alone. Environment variables are passed through. LAVT_KERNEL is the directory for downloads, by
 default .kernel/ of the repository. Example: tests/kernel/run test_lane.py -x"""
@@ -40,7 +40,7 @@ def main(arguments: Sequence[str]) -> int:
         allow_abbrev=False,
     )
     parser.add_argument("--native", action="store_true", help="run on this machine's own kernel (needs root and netem)")
-    parser.add_argument("--out", type=Path, help="directory that tests may write to, also by options of pytest")
+    parser.add_argument("--out", type=Path, help="directory that the tests, and options of pytest, can write to")
     options, extra = parser.parse_known_args(arguments)
     for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
         signal.signal(number, _stop)
@@ -50,7 +50,7 @@ def main(arguments: Sequence[str]) -> int:
         python = find_interpreter()
         compileall.compile_dir(REPOSITORY / "src", quiet=2)  # the slow machines start LAVT a hundred times
         pytest_command = [python, "-B", "-m", "pytest", "-p", "no:cacheprovider", *pytest_arguments(extra)]
-        return _native(pytest_command) if options.native else _pair(python, pytest_command, out)
+        return _run_natively(pytest_command) if options.native else _run_on_two_machines(python, pytest_command, out)
     except LaneUnavailable as error:
         print(f"tests/kernel/run: {error}", file=sys.stderr)
         return 2
@@ -108,7 +108,7 @@ _ABSOLUTE_PYTHON_PATH = [
 ]
 
 
-def _native(pytest_command: Sequence[str]) -> int:
+def _run_natively(pytest_command: Sequence[str]) -> int:
     """Run the tests on this kernel, in a network namespace of their own."""
     netem_trial = "ip link set lo up && tc qdisc add dev lo root netem delay 1ms"
     in_own_network = ["unshare", "--net", "sh", "-c"]
@@ -127,27 +127,27 @@ def _native(pytest_command: Sequence[str]) -> int:
         process.wait()
 
 
-def _pair(python: str, pytest_command: Sequence[str], writable_directories: Sequence[Path]) -> int:
+def _run_on_two_machines(python: str, pytest_command: Sequence[str], writable_directories: Sequence[Path]) -> int:
     """Run the tests on the first of two machines."""
     tools = fetch_packages(Path(os.environ.get("LAVT_KERNEL") or REPOSITORY / ".kernel").absolute())
     environment = {**_environment(), "LAVT_KERNEL_LANE": "pair", "LAVT_KERNEL_KEY": secrets.token_hex(16)}
     environment.setdefault("COLUMNS", str(shutil.get_terminal_size().columns))
     if sys.stdout.isatty():
         environment.setdefault("FORCE_COLOR", "1")  # pytest writes to a pipe
-    agent = [python, "-B", "-m", "tests.kernel.lane.agent", CLIENT["vec1"]]
+    agent = [python, "-B", "-m", "tests.kernel.lane.agent", CLIENT_ADDRESSES["vec1"]]
     processors = sorted(os.sched_getaffinity(0))
     guests: list[Guest] = []
     with TemporaryDirectory(prefix="lavt-kernel-") as folder, _host_stalls(python) as stall_line:
         scratch = Path(folder)
         prepare(tools, scratch)
-        links = {device: socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM) for device in SERVER}
+        links = {device: socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM) for device in SERVER_ADDRESSES}
         output, output_writer = os.pipe()
         agent_output = os.open(scratch / "client.output", os.O_WRONLY | os.O_CREAT)
         try:
             for index, (name, command, addresses, guest_output, guest_line) in enumerate(
                 [
-                    ("server", pytest_command, SERVER, output_writer, stall_line),
-                    ("client", agent, CLIENT, agent_output, None),
+                    ("server", pytest_command, SERVER_ADDRESSES, output_writer, stall_line),
+                    ("client", agent, CLIENT_ADDRESSES, agent_output, None),
                 ]
             ):
                 ends = {device: (pair[index].fileno(), addresses[device]) for device, pair in links.items()}

@@ -18,8 +18,8 @@ from lavt.recording.record import Record, read_record
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 SHORT_ROAD = REPOSITORY / "tests/kernel/roads/short.yaml"
-LOW_LOAD = ("vehicle.scenery=none",)
-"""A load that a user-mode kernel, with one processor and slow system calls, can render in time."""
+NO_SCENERY = ("vehicle.scenery=none",)
+"""Without scenery, a user-mode kernel with one processor and slow system calls can render in time."""
 BY_WIRE = "configs/server-by-wire.yaml"
 ROUTER_PORT = 7448
 SESSION_PORT = 7447
@@ -65,7 +65,7 @@ def start_loop(
         _start(client, "router", "zenoh-configs/router-client.json5", changes=[f"connect.endpoints={endpoints}"]),
     )
     _wait_ready(*routers)
-    changes = [f"vehicle.route={SHORT_ROAD}", *LOW_LOAD, *server_changes]
+    changes = [f"vehicle.route={SHORT_ROAD}", *NO_SCENERY, *server_changes]
     loop = LoopPrograms(
         routers,
         _start_server(server, "configs/server.yaml", out, changes),
@@ -87,7 +87,7 @@ def start_by_wire(
     endpoints = json.dumps([f"tcp/0.0.0.0:{SESSION_PORT}"])
     router = _start(client, "router", "zenoh-configs/router-server.json5", changes=[f"listen.endpoints={endpoints}"])
     _wait_ready(router)
-    changes = [f"zenoh.router=tcp/{client.address}:{SESSION_PORT}", *LOW_LOAD, *server_changes]
+    changes = [f"zenoh.router=tcp/{client.address}:{SESSION_PORT}", *NO_SCENERY, *server_changes]
     client_changes = [f"zenoh.router=tcp/127.0.0.1:{SESSION_PORT}", *client_changes]
     loop = LoopPrograms(
         (router,), _start_server(server, BY_WIRE, out, changes), _start_client(client, server, out, client_changes)
@@ -116,7 +116,7 @@ def wait_for_end(loop: LoopPrograms, meanwhile: Callable[[LoopPrograms], None]) 
     `meanwhile` is called twice a second.
     """
 
-    def ended() -> bool:
+    def has_ended() -> bool:
         meanwhile(loop)
         if not loop.server.running:
             return True
@@ -125,7 +125,7 @@ def wait_for_end(loop: LoopPrograms, meanwhile: Callable[[LoopPrograms], None]) 
                 raise MachineError(f"{' '.join(program.command)} ended during the drive: {program.errors}")
         return False
 
-    wait_until(f"the drive has ended: {loop.server.command}", ended, DRIVE_TIMEOUT_S, every_ns=500_000_000)
+    wait_until(f"the drive has ended: {loop.server.command}", has_ended, DRIVE_TIMEOUT_S, every_ns=500_000_000)
 
 
 def collect(loop: LoopPrograms, client: Machine, out: Path) -> DriveResult:

@@ -28,7 +28,7 @@ KEEP_MEMORY = {
     "MALLOC_TRIM_THRESHOLD_": str(2**32),
     "MALLOC_TOP_PAD_": str(2**26),
 }
-"""Environment that makes programs keep their memory: the first access to a page costs 50 us and more."""
+"""Environment that makes programs keep freed memory, because the first access to a page costs 50 us and more."""
 
 SERIAL_LINE = "/run/line"
 """Device of a serial line: the second console, for a machine that gets one."""
@@ -75,13 +75,13 @@ class Guest:
     scratch: Path
 
     def exit_code(self) -> int | None:
-        """Return the exit code of its command; None if the command has not ended, or the machine died."""
+        """Return the exit code of the machine's command; None if the command has not ended, or the machine died."""
         with suppress(OSError, ValueError):
             return int((self.scratch / f"{self.name}.code").read_text())
         return None
 
     def console(self) -> str:
-        """Return the last lines of its kernel's console."""
+        """Return the last lines of the console of the machine's kernel."""
         return "\n".join((self.scratch / f"{self.name}.console").read_text(errors="replace").splitlines()[-8:])
 
     def stop(self) -> None:
@@ -104,7 +104,9 @@ def prepare(tools: Path, scratch: Path) -> None:
         (scratch / KERNEL).symlink_to(program(tools, "linux.uml"))
         (scratch / LIBRARY_FOLDER).mkdir()
     (scratch / "modprobe.d").mkdir()
-    (scratch / "modprobe.d" / "modprobe").symlink_to(program(tools, "kmod"))  # kmod acts by the name it is called by
+    (scratch / "modprobe.d" / "modprobe").symlink_to(
+        program(tools, "kmod")
+    )  # kmod does what the name says by which it is called
     text = MODPROBE.format(
         busybox=program(tools, "busybox"), libraries=search_path(tools, LIBRARIES), scratch=shlex.quote(str(scratch))
     )
@@ -129,7 +131,7 @@ def start_guest(
     `links` maps each network device to its socket and address. `writable` lists the directories of the host that the
     machine may write to. The command's output goes to the descriptor `output`, and `serial_line` has the descriptors
     that SERIAL_LINE reads from and writes to. The machine runs on one of the host's processors, because each system
-    call of the guest is two switches between processes, which took four times as long between two processors.
+    call of the guest is two switches between processes. A switch between two processors took four times as long.
     """
     busybox = program(tools, "busybox")
     setup = ["ip link set lo up"]
@@ -164,7 +166,7 @@ def start_guest(
             stdout=console,
             stderr=subprocess.STDOUT,
             pass_fds=[output, *(serial_line or ()), *(descriptor for descriptor, _ in links.values())],
-            start_new_session=True,  # Ctrl-C must reach only the program that started it, which stops it
+            start_new_session=True,  # Ctrl-C must reach only the parent, which then stops the machine
             preexec_fn=partial(_configure_process, processor),  # noqa: PLW1509 (there are no threads here)
             env={
                 "PATH": os.environ.get("PATH", os.defpath),
@@ -189,7 +191,7 @@ def _guest_environment(environment: Mapping[str, str], tools: Path) -> list[str]
 
 
 def _memory_directory(scratch: Path) -> str:
-    """Return the directory for the file that is the guest's memory: in memory if there is room."""
+    """Return the directory for the file with the guest's memory: /dev/shm if it has room, or else `scratch`."""
     with suppress(OSError):
         shared = os.statvfs("/dev/shm")
         if shared.f_bavail * shared.f_frsize > 2 * MEMORY_MB * 2**20:

@@ -3,9 +3,9 @@
     python -m tests.kernel.lane.host_stalls < QUESTIONS > ANSWERS
 
 A probe inside a machine cannot run while the host stalls that machine. So this program runs on the host, starts one
-lateness probe for each processor, and answers through pipes that the first machine sees as a serial line. Every machine
-has clocks of its own: each answer has the host's time together with the processor's counter, which all of them read,
-and `HostProbe` converts it to the machine's time.
+lateness probe for each processor, and answers through pipes that the first machine sees as a serial line. The clocks of
+host and machines differ, but all read the same counter of the processor. So each answer contains the host's time
+together with the counter, and `HostProbe` converts the times to those of its machine.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ from tests.kernel.lane import clocks
 from tests.support.stalls import ProbeEnded, Stall, Stalls
 
 POLL_S = 0.5
-"""Polling period. A clock may be slewed by 500 ppm, which in this time makes an error of 0.3 ms."""
+"""Polling period. If a clock is slewed by 500 ppm, the error in this time is 0.3 ms."""
 STALLS_PER_ANSWER = 40
-"""Maximum number of stalls in an answer. A user-mode kernel whose serial line was full once (4 KB) receives nothing on
-it any more."""
+"""Maximum number of stalls in an answer. After its serial line was full once (4 KB), a user-mode kernel receives
+nothing more on that line."""
 
 
 def serve() -> None:
     """Answer each byte on standard input with one line, until the end of input."""
-    stalls = Stalls.measured()
+    stalls = Stalls.start_probes()
     try:
         while os.read(0, 1):
-            sys.stdout.write(json.dumps(_query(stalls)) + "\n")
+            sys.stdout.write(json.dumps(_answer(stalls)) + "\n")
             sys.stdout.flush()
     finally:
         stalls.end()
 
 
-def _query(stalls: Stalls) -> dict[str, Any]:
+def _answer(stalls: Stalls) -> dict[str, Any]:
     """Return the present time, and the oldest stalls that were in no earlier answer."""
     counter, mono_ns = clocks.read_monotonic_clock()
     try:
@@ -86,7 +86,7 @@ class HostProbe:
         return reported_ns, recorded
 
     def processor_times(self) -> str:
-        """Return the host's first line of /proc/stat from the last answer, even after the record has ended."""
+        """Return the first line of the host's /proc/stat from the last answer, even after the record has ended."""
         return self._processor_times
 
     def end(self) -> None:
@@ -101,10 +101,10 @@ class HostProbe:
                 with self._lock:
                     self._query_all()
             except ProbeEnded:
-                return  # the next report raises it again
+                return  # the next report raises `ProbeEnded` again
 
     def _query_all(self) -> dict[str, Any]:
-        """Query until there is no more, keep the stalls, and return the last answer in this machine's time."""
+        """Query until the host has no more stalls, keep them, and return the last answer in this machine's time."""
         answer = self._query()
         while answer["more"]:
             answer = self._query()
@@ -134,5 +134,5 @@ class HostProbe:
 
 
 if __name__ == "__main__":
-    with suppress(BrokenPipeError):  # the machine has ended
+    with suppress(BrokenPipeError):  # the first machine has ended
         serve()

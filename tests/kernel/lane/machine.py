@@ -22,7 +22,7 @@ from lavt.domain import NS_PER_MS, NS_PER_S
 P = ParamSpec("P")
 R = TypeVar("R")
 RemoteCall = Callable[..., Any]
-"""(function, *arguments, **keywords) -> its return value on that machine."""
+"""Call `function(*arguments, **keywords)` on a machine and return the function's value."""
 POLL_NS = 50 * NS_PER_MS
 
 
@@ -132,9 +132,9 @@ class StartedProgram:
         return lines[0]
 
     def latest(self) -> dict[str, Any]:
-        """Return the newest line of JSON."""
-        tail = self.machine.call(processes.tail, self.number)
-        return json.loads(tail) if tail else {}
+        """Return the newest line of JSON, or an empty dict."""
+        line = self.machine.call(processes.newest_line, self.number)
+        return json.loads(line) if line else {}
 
 
 def wait_until(description: str, condition: Callable[[], bool], timeout_s: float, every_ns: int = POLL_NS) -> None:
@@ -152,7 +152,7 @@ def local_machine(name: str, address: str) -> Machine:
 
 
 def remote_machine(name: str, address: str, management_address: str, key: bytes) -> Machine:
-    """Return the machine whose agent listens at the management address; the machine may still be booting."""
+    """Return the machine whose agent listens at the management address; wait while the machine is still booting."""
     connections: list[Connection] = []
 
     def is_reachable() -> bool:

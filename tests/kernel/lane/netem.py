@@ -1,4 +1,4 @@
-"""netem without LAVT: delay the packets that a machine sends to the other one."""
+"""Delay the packets that a machine sends, by `tc netem` and without LAVT."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""Fetch and install the user-mode kernel of Debian's next release, if there is one: it is faster than the host's.
+"""Fetch and install the user-mode kernel of Debian's next release, if it is available.
 
-Since 6.16 the kernel does not need ptrace (`seccomp=auto`). A system call then takes 9 instead of 19 us, the first
-access to a page 21 instead of 92 us, a fork of a Python program 9 instead of 26 ms (7.2 compared with 6.1, on one
-processor of a virtual machine). The kernel needs the C library that it was built with, which is also newer than the
-host's.
+It is faster than the kernel of the host's release: since 6.16 no ptrace is needed (`seccomp=auto`). A system call takes
+9 instead of 19 us, the first access to a page 21 instead of 92 us, a fork of a Python program 9 instead of 26 ms (7.2
+compared with 6.1, on one processor of a virtual machine). The kernel needs the C library that it was built with. That
+library, too, is newer than the host's.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Apt = Callable[..., subprocess.CompletedProcess[str]]
 
 
 def fetch(folder: Path, apt: Apt, options: Sequence[str]) -> str:
-    """Unpack the newer kernel into `folder`; return why if that fails. `options` name apt's own directories."""
+    """Unpack the newer kernel into `folder`; return the reason if that fails. `options` set apt's directories."""
     folder.mkdir()
     archive = _archive(folder, apt, options)
     if not archive:
@@ -61,7 +61,7 @@ def _archive(folder: Path, apt: Apt, options: Sequence[str]) -> str:
         output = apt(folder, "apt-get", *options, *query).stdout
     for line in output.splitlines():
         origin, codename, address = line.split(" ", 2)
-        if origin == "Debian" and "-" not in codename:  # codenames with a hyphen have updates only
+        if origin == "Debian" and "-" not in codename:  # a codename with a hyphen is an archive of updates only
             return address
     return ""
 
@@ -69,17 +69,17 @@ def _archive(folder: Path, apt: Apt, options: Sequence[str]) -> str:
 def install(tools: Path, kernel: Path, libraries: Path) -> bool:
     """Install the newer kernel and its C library; return False if they were not fetched.
 
-    The library has its own loader. The kernel's program header names the host's loader, so it is changed in a copy of
-    the kernel to name the library's. (To start the kernel as `LOADER KERNEL` instead does not work: the kernel would
-    take the loader's memory for its own.)
+    The library has its own loader, but the kernel's program header names the host's. So the kernel is copied, and the
+    header of the copy names the library's loader. (To start the kernel as `LOADER KERNEL` instead does not work: the
+    kernel would take the loader's memory for its own.)
     """
     kernel_file, loader = tools / FOLDER / KERNEL, tools / FOLDER / LOADER
     if not kernel_file.is_file() or not loader.exists():
         return False
     program, loader_name = bytearray(kernel_file.read_bytes()), bytes(loader.resolve()) + b"\0"
-    (first,) = struct.unpack_from("<Q", program, FIRST_HEADER_AT)
+    (first_header_at,) = struct.unpack_from("<Q", program, FIRST_HEADER_AT)
     (count,) = struct.unpack_from("<H", program, COUNT_AT)
-    for offset in range(first, first + HEADER.size * count, HEADER.size):
+    for offset in range(first_header_at, first_header_at + HEADER.size * count, HEADER.size):
         kind, flags, _, virtual, physical, _, _, alignment = HEADER.unpack_from(program, offset)
         if kind == PT_INTERP:
             size = len(loader_name)

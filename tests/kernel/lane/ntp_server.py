@@ -2,8 +2,8 @@
 
     python -m tests.kernel.lane.ntp_server ADDRESS PORT [OFFSET_NS DRIFT_PPM]
 
-With an offset, its clock starts that far ahead of the machine's wall clock, runs fast by the drift, and is independent
-of the wall clock from then on. Without an offset, it serves the machine's wall clock.
+With an offset, the server's clock starts that far ahead of the machine's wall clock and runs fast by the drift. Later
+changes of the wall clock do not affect it. Without an offset, the server serves the machine's wall clock.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def serve(address: str, port: int, clock: Clock) -> None:
         while True:
             request, client = server.recvfrom(2048)
             received = to_ntp(clock())
-            if len(request) < HEADER.size or request[0] & 7 != FROM_CLIENT & 7:  # not of a client's mode
+            if len(request) < HEADER.size or request[0] & 7 != FROM_CLIENT & 7:  # not a client's request
                 continue
             _, _, poll, *_, sent = HEADER.unpack(request[: HEADER.size])
             answer = HEADER.pack(FROM_SERVER, 1, poll, -20, 0, 0, b"TEST", received, sent, received, to_ntp(clock()))

@@ -28,7 +28,7 @@ PACKAGES = (
 PACKAGE_LIST = "".join(
     f"{package}\n" for package in (*PACKAGES, *(f"{newer_package}/{newer.SUITE}" for newer_package in newer.PACKAGES))
 )
-"""The packages that a directory was unpacked from."""
+"""The content of the file that names the packages from which a directory was unpacked."""
 PROGRAMS = ("usr/bin", "usr/sbin", "bin", "sbin")
 LIBRARIES = ("usr/lib/x86_64-linux-gnu", "lib/x86_64-linux-gnu")
 

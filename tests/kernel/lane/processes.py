@@ -1,4 +1,4 @@
-"""Programs of one machine: the functions that `Machine` calls there."""
+"""Run and stop programs on one machine: the functions that `Machine` calls on that machine."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def run(command: list[str], timeout_s: float) -> tuple[int, str, str]:
 
 
 def start(command: list[str], environment: dict[str, str]) -> int:
-    """Start a program with its output in files; return its number."""
+    """Start a program with its output in files; return the number by which the other functions know it."""
     folder = Path(tempfile.mkdtemp(prefix="started-"))
     with (folder / "out").open("wb") as out, (folder / "err").open("wb") as err:
         process = subprocess.Popen(
@@ -66,7 +66,7 @@ def output(number: int, name: str) -> str:
     return (_started[number][1] / name).read_text(errors="replace")
 
 
-def tail(number: int) -> str:
+def newest_line(number: int) -> str:
     """Return the newest complete line of standard output, or an empty string."""
     with (_started[number][1] / "out").open("rb") as file:
         file.seek(max(0, file.seek(0, os.SEEK_END) - 65536))

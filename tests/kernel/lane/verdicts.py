@@ -1,10 +1,12 @@
 """Verdicts on failed drives: which stalls of the host explain a failure.
 
-A failed drive is a fault, unless a long enough stall was recorded at the relevant time. If a machine uses its processor
-fully, ordinary programs of the host get 50 to 60 ms of each second (the kernel's fair server). This time is recorded as
-a stall of the machine, too. Such stalls make the kit of a busy machine disengage, because commands are 20 ms apart
-and programs wait for each other. A fault that occupies the processor all the time would be excused by such a stall only
-if all three attempts failed within 200 ms of one. A machine by itself never causes longer stalls, or shares above 6 %.
+A failed drive is a fault, unless a long enough stall was recorded at the relevant time.
+
+If a machine uses its processor fully, ordinary programs of the host still get 50 to 60 ms of each second (the fair
+server of the host's kernel). This time is recorded as a stall of the machine, too. Such stalls make the kit of a busy
+machine disengage, because commands are 20 ms apart and programs wait for each other. So a fault of LAVT that occupies
+the processor all the time also causes stalls. They would excuse this fault only if all three attempts failed within
+200 ms of a stall. A busy machine by itself causes no longer stalls, and no stalled share above 6 %.
 """
 
 from __future__ import annotations
@@ -22,21 +24,22 @@ from lavt.experiment.analysis.invalid_reason import InvalidCode
 from lavt.experiment.analysis.metrics import driving_interval
 
 MARGIN_MS = 60
-"""A stall may be this much shorter than the timeout that it causes: one period of the kit's commands or reports, and
+"""A stall can be this much shorter than the timeout that it causes: one period of the kit's commands or reports, and
 two more periods on a slow machine."""
 KIT_STALL_MS = KIT_TIMEOUT_MS - MARGIN_MS
 UNSAMPLED_STALL_MS = 1500
 """Clocks are sampled once a second, and a gap of up to 2.5 s is valid."""
-STALL_MS = {InvalidCode.CLOCK_NOT_SAMPLED: UNSAMPLED_STALL_MS}
+STALL_MS_BY_CODE = {InvalidCode.CLOCK_NOT_SAMPLED: UNSAMPLED_STALL_MS}
 """The shortest stall that explains why a drive is invalid, by the code of the reason.
 
-No stall explains other reasons: incomplete records, lost messages and stepped clocks do not depend on timing, and the
-time sources and the sum of the loop's parts are judged by shortest round trips or by 95 of 100 samples.
+No stall explains other reasons. Incomplete records, lost messages and stepped clocks do not depend on timing. The time
+sources and the sum of the loop's parts are judged by the shortest round trips or by 95 of 100 samples, which a stall
+does not change.
 """
 MEDIAN_SHARE = 0.07
-"""Share of a drive that must be stalled to explain too large medians: more than a machine loses when it uses its
-processor fully."""
-REPORTS = re.compile(r"Report\w* for (\d+) ms")
+"""Share of a drive that must be stalled to explain medians that are too large. It is more than a machine loses when it
+uses its processor fully."""
+REPORT_TIMEOUT = re.compile(r"Report\w* for (\d+) ms")
 
 
 def require_valid(drive: DriveResult, stalls: Stalls, expected_codes: Collection[InvalidCode] = ()) -> None:
@@ -44,14 +47,14 @@ def require_valid(drive: DriveResult, stalls: Stalls, expected_codes: Collection
     reasons = [reason for reason in invalid_reasons(drive) if reason.code not in expected_codes]
     if reasons:
         began_ns, ended_ns, _ = driving_interval(drive.server)
-        least_ms = max(STALL_MS.get(reason.code, math.inf) for reason in reasons)
+        required_stall_ms = max(STALL_MS_BY_CODE.get(reason.code, math.inf) for reason in reasons)
         raise stalls.verdict(
-            "; ".join(reason.text for reason in reasons), min(began_ns, ended_ns), ended_ns, stall_ms=least_ms
+            "; ".join(reason.text for reason in reasons), min(began_ns, ended_ns), ended_ns, stall_ms=required_stall_ms
         )
 
 
 def require_completed(drive: DriveResult, stalls: Stalls) -> None:
-    """Require that the route was driven to its end; a stall can explain only an earlier safe stop."""
+    """Require that the route was driven to its end; a stall can explain only a safe stop before that."""
     if drive.result["ending"] != "completed":
         raise explain_state(drive, stalls, "safe_stop", f"{drive.result['ending']}: {safety_changes(drive)}")
 
@@ -68,16 +71,16 @@ def explain_state(drive: DriveResult, stalls: Stalls, state: str, message: str) 
     if not changes:
         return AssertionError(message)
     at_ns, reason = changes[0]
-    return stalls.verdict(message, at_ns - STOP_LOOKBACK_MS * NS_PER_MS, at_ns, stall_ms=least_stop_ms(reason))
+    return stalls.verdict(message, at_ns - STOP_LOOKBACK_MS * NS_PER_MS, at_ns, stall_ms=shortest_stall_ms(reason))
 
 
-def least_stop_ms(reason: str) -> float:
+def shortest_stall_ms(reason: str) -> float:
     """Return the length of the shortest stall that explains a safety state, by the server's reason.
 
     Without commands the state is degraded after 300 ms, and a safe stop follows after 500 ms; frames come every 67 ms.
     The kit's reports may be missing for as long as the reason says.
     """
-    limits_ms = [int(limit_ms) for limit_ms in REPORTS.findall(reason)]
+    limits_ms = [int(limit_ms) for limit_ms in REPORT_TIMEOUT.findall(reason)]
     return min(limits_ms) - MARGIN_MS if limits_ms else STOP_STALL_MS
 
 
