@@ -92,7 +92,7 @@ BAD_RUNS = {
         ["--set", "network.video.loss=0.1", "--set", "time=real", "--set", "network.injection=none"],
         "network.injection",
     ),
-    "a profile that netem does not support": (
+    "netem, with an inherent latency": (
         ["--set", "network.injection=netem", "--set", "time=real", "--set", "network.inherent=paper_wifi5"],
         "network.injection relay",
     ),

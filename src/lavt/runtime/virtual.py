@@ -216,7 +216,7 @@ class VirtualRuntime:
     def _step(self, runner: _NodeRunner, true_ns: int) -> None:
         runner.scheduled_ns.remove(true_ns)
         if runner.next_step_ns != true_ns:
-            return  # an earlier step was scheduled after this one, and has run instead
+            return  # after this step was scheduled, one at an earlier time replaced it and has already run
         runner.next_step_ns = None
         wake_ns = runner.wake_ns
         if wake_ns is not None and wake_ns <= true_ns:

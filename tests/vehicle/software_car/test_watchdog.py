@@ -35,7 +35,7 @@ def test_commands_time_out_after_100_ms(generation: int) -> None:
 
 @both_generations
 def test_late_calls_give_the_same_state(generation: int) -> None:
-    """A kit advanced each millisecond or once after a second is in the same state."""
+    """A kit that is advanced once after a second reaches the same state as a kit that is advanced each millisecond."""
     often, late = driving_rig(generation), driving_rig(generation)
     for rig in (often, late):
         rig.command(angle_deg=90.0, throttle=0.5, rate=25)

@@ -277,7 +277,8 @@ class VerifiedState(Struct, frozen=True):
 
     body: bytes | None
     needs_request: bool
-    """The signature is valid, but this process of the server has answered no request yet: it could be a replay."""
+    """The state has a valid signature, but is from a process of the server that has not yet answered a request of this
+    client, so it could be a replay. The client must send a request."""
 
 
 class OperatorAuthenticator:
