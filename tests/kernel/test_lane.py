@@ -23,7 +23,7 @@ TrueOffset = Callable[[], int]
 NTP_PORT = 11123
 CLOCK = MachineClock()
 JUDGES_TIMES = pytest.mark.judges_times(share=MEDIAN_SHARE)
-"""A failure is also excused if the host stalled for a share of `MEDIAN_SHARE` of the test or more."""
+"""A failure is excused only if the host stalled for at least `MEDIAN_SHARE` of the duration of the test."""
 
 
 def shortest_round_trip_ms(machine: Machine, to: Machine) -> float:
