@@ -72,7 +72,8 @@ def main() -> None:
     """Compute all stops, print the tables, and draw the picture if a file is named."""
     pairs = [pair for route in ROUTES for pair in stops(route)]
     print(
-        "| route | curve | bend, radius | stops | worst along the path | worst with a constant angle | of these out |"
+        "| route | curve | bend, radius | stops | worst along the path | worst with a constant angle "
+        "| constant angle: over 0.3 m |"
     )
     print("| --- | --- | --- | --- | --- | --- | --- |")
     for curve, pairs_in_curve in groupby(pairs, key=attrgetter("curve")):
@@ -81,7 +82,7 @@ def main() -> None:
     covered_m = [pair.followed.covered_m for pair in pairs]
     print(f"\nlast command at {min(speeds_kmh):.1f} to {max(speeds_kmh):.1f} km/h")
     print(f"distance between the last command and standstill: at most {max(covered_m):.1f} m")
-    print("\n| condition | stops | worst along the path | worst with a constant angle | of these out |")
+    print("\n| condition | stops | worst along the path | worst with a constant angle | constant angle: over 0.3 m |")
     print("| --- | --- | --- | --- | --- |")
     for condition in ("L1", "L3", "L5"):
         _, followed, held = zip(*stops("a", condition), strict=True)

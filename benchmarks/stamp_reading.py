@@ -120,8 +120,8 @@ class LinkResult:
         return self.rate_kbps * 1000 / (width * height * RATE_HZ)
 
     @property
-    def unread_share(self) -> float:
-        """Share of frames whose stamp was not accepted."""
+    def rejected_share(self) -> float:
+        """Share of frames whose stamp was not accepted by the check "own"."""
         return 1 - self.counts["accepted"] / self.counts["frames"]
 
     @property
@@ -306,13 +306,13 @@ def tables(results: Sequence[LinkResult]) -> Iterator[str]:
     """Yield the lines of one table for each picture size, and then of a table with a row for each check."""
     headers = [f"{loss:.0%} lost" + (f", {repair} repair" if repair else "") for loss, repair in LINKS[1:]]
     for size, size_results in groupby(results, key=lambda result: result.size):
-        yield f"\n{size}: unread stamps without loss; with loss, intact frames that are accepted and not in doubt"
-        yield "| kb/s | bit/px | unread | " + " | ".join(headers) + " |"
+        yield f"\n{size}: stamps not accepted without loss; with loss, intact frames that are accepted and not in doubt"
+        yield "| kb/s | bit/px | not accepted | " + " | ".join(headers) + " |"
         yield "|---" * (3 + len(headers)) + "|"
         for rate, rate_results in groupby(size_results, key=lambda result: result.rate_kbps):
             loss_free, *lossy = rate_results
             shares = " | ".join(percent(result.good_of_intact) for result in lossy)
-            yield f"| {rate} | {loss_free.bit_per_px:.3f} | {percent(loss_free.unread_share)} | {shares} |"
+            yield f"| {rate} | {loss_free.bit_per_px:.3f} | {percent(loss_free.rejected_share)} | {shares} |"
     yield "\n| check | accepted | of these wrong | largest error |"
     yield "|---" * 4 + "|"
     for name, stamps in totals(results).items():
@@ -329,17 +329,17 @@ def totals(results: Sequence[LinkResult]) -> dict[str, AcceptedStamps]:
 
 
 def to_json_line(results: Sequence[LinkResult]) -> str:
-    """Return all results as one line of JSON."""
+    """Return one line of JSON: `links` has an entry for each link at each size and bit rate, `checks` the totals."""
     entries = [
         {
             "size": result.size, "rate_kbps": result.rate_kbps, "loss": result.loss, "repair": result.repair,
-            "bit_per_px": round(result.bit_per_px, 4), "unread_share": round(result.unread_share, 4),
+            "bit_per_px": round(result.bit_per_px, 4), "rejected_share": round(result.rejected_share, 4),
             "good_of_intact": round(result.good_of_intact, 4), **result.counts,
             "checks": {name: asdict(stamps) for name, stamps in result.checks.items()},
         }
         for result in results
     ]  # fmt: skip
-    return json.dumps({"cells": entries, "checks": {name: asdict(stamps) for name, stamps in totals(results).items()}})
+    return json.dumps({"links": entries, "checks": {name: asdict(stamps) for name, stamps in totals(results).items()}})
 
 
 def main() -> None:

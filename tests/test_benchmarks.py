@@ -81,11 +81,11 @@ def test_stamp_reading_study_runs() -> None:
     lines = completed.stdout.splitlines()
     assert lines[4].startswith("| 460 | ")
     result = json.loads(lines[-1])
-    cells = [(cell["loss"], cell["repair"]) for cell in result["cells"]]
-    assert cells == [(0.0, 0), (0.01, 0), (0.01, 1), (0.05, 0), (0.05, 1), (0.05, 2)]
-    loss_free = result["cells"][0]
+    links = [(link["loss"], link["repair"]) for link in result["links"]]
+    assert links == [(0.0, 0), (0.01, 0), (0.01, 1), (0.05, 0), (0.05, 1), (0.05, 2)]
+    loss_free = result["links"][0]
     assert loss_free["accepted"] == loss_free["frames"] == loss_free["intact"] == loss_free["intact_good"] == 40
-    assert (loss_free["unread_share"], loss_free["good_of_intact"]) == (0.0, 1.0)
+    assert (loss_free["rejected_share"], loss_free["good_of_intact"]) == (0.0, 1.0)
 
 
 @pytest.mark.full

@@ -149,7 +149,7 @@ def gateway_of_operator(seed: int) -> Target:
         """
         request = vehicle.verify_request("session", sent.pop().payload)
         assert request is not None
-        reply = vehicle.sign_reply(request, b"" if request.is_stale else body)
+        reply = vehicle.sign_reply(request, b"" if request.must_retry else body)
         gateway.receive("session_reply", reply, now, None)
         return reply
 

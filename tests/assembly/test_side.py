@@ -16,8 +16,8 @@ class PartFailed(Exception):
     """A part of a side cannot be closed."""
 
 
-@pytest.mark.usefixtures("own_switch_interval")
-def test_a_part_that_cannot_be_closed_keeps_no_other_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("own_switch_interval")  # the side's runtime sets the switch interval of threads
+def test_a_failing_close_of_one_part_leaves_no_other_part_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """If closing one part fails, all other parts are closed, the record is complete, and the error is raised."""
     real_close = Injector.close
 

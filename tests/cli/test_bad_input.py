@@ -84,7 +84,7 @@ BAD_RUNS = {
         ["--set", "network.condition=rate_short_queue", *NETEM_OPTIONS],
         "queue_packets 50",
     ),
-    "jitter beyond the delay by netem": (
+    "netem, with a jitter larger than the delay": (
         ["--set", "network.video.jitter_ms=5", *NETEM_OPTIONS],
         "a jitter of 5 ms",
     ),
@@ -92,7 +92,7 @@ BAD_RUNS = {
         ["--set", "network.video.loss=0.1", "--set", "time=real", "--set", "network.injection=none"],
         "network.injection",
     ),
-    "a profile that netem does not support": (
+    "netem, with an inherent latency": (
         ["--set", "network.injection=netem", "--set", "time=real", "--set", "network.inherent=paper_wifi5"],
         "network.injection relay",
     ),
@@ -150,7 +150,7 @@ BAD_NETEM = {
         "the clock probe (port ",
     ),
     "the port of NTP": (["apply", "L4", *LOOPBACK_SERVER, "--video-port", "123"], "NTP"),
-    "no interface's name": (["apply", "L4", "--role", "client", "--interface", "a/b"], "'a/b'"),
+    "an invalid name of an interface": (["apply", "L4", "--role", "client", "--interface", "a/b"], "'a/b'"),
     "no such interface": (["show", "--interface", "nowhere0"], "nowhere0"),
     "nothing to verify": (["verify", "--interface", "nowhere0"], "nowhere0"),
 }

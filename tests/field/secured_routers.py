@@ -170,8 +170,8 @@ class Site:
         own = self.keys / f"{name}.pem"
         return Intruder(open_session(self.endpoint, mode, authority=self.keys / "authority.pem", own=own))
 
-    def drive(self, action: Callable[[], None] = lambda: None) -> None:
-        """Exchange messages until `ROUNDS` of each kind have arrived; call `action` in each round."""
+    def exchange_messages(self, action: Callable[[], None] = lambda: None) -> None:
+        """Send messages in rounds until `ROUNDS` of each kind have arrived; call `action` in each round."""
         commands, states, replies = (len(messages) for messages in self._arrived())
         limit_ns = self._limit_ns()
         while True:

@@ -23,6 +23,7 @@ TrueOffset = Callable[[], int]
 NTP_PORT = 11123
 CLOCK = MachineClock()
 JUDGES_TIMES = pytest.mark.judges_times(share=MEDIAN_SHARE)
+"""A failure is excused only if the host stalled for at least `MEDIAN_SHARE` of the duration of the test."""
 
 
 def shortest_round_trip_ms(machine: Machine, to: Machine) -> float:
@@ -31,6 +32,7 @@ def shortest_round_trip_ms(machine: Machine, to: Machine) -> float:
 
 
 def delta_ns(server: Machine, client: Machine) -> float:
+    """Return the clock offset Delta between the machines, from the corrections that chrony reports."""
     return (correction_s(client) - correction_s(server)) * NS_PER_S
 
 
@@ -69,7 +71,7 @@ def test_started_program_is_stopped_after_the_test(client_machine: Machine) -> N
 
 @JUDGES_TIMES
 def test_host_stalls_have_the_time_of_this_machine(server_machine: Machine, stalls: Stalls) -> None:
-    """Reports of the host's probes have this machine's time, to within 5 ms, even if this machine's clock is slewed."""
+    """A report of the host's stall probes has this machine's time of the query, also if this machine's clock drifts."""
     server_machine.call(clocks.set_drift, 500)
     pause(2 * NS_PER_S)
     round_trips_ns = []
@@ -84,7 +86,7 @@ def test_host_stalls_have_the_time_of_this_machine(server_machine: Machine, stal
 
 @JUDGES_TIMES
 def test_clock_step_changes_the_true_offset(server_machine: Machine, true_offset_ns: TrueOffset) -> None:
-    """Stepping the server's clock by 250 ms changes the offset between the machines by 250 ms within 50 us."""
+    """Stepping the server's clock by 250 ms changes the offset between the machines by 250 ms, plus or minus 50 us."""
     before_ns = true_offset_ns()
     assert abs(before_ns) < 5 * NS_PER_MS
 
@@ -109,7 +111,7 @@ def test_true_offset_agrees_with_ntp_exchanges(
 
 @JUDGES_TIMES
 def test_clock_drift_is_the_rate_of_the_true_offset(server_machine: Machine, true_offset_ns: TrueOffset) -> None:
-    """If the server's clock runs 30 ppm fast, the true offset grows by 30 us per second, within 5 us."""
+    """If the server's clock runs 30 ppm fast, it gains 25 to 35 us a second on the client's clock."""
     begin_raw_ns, begin_ns = clocks.read_raw_clock_ns(), true_offset_ns()
     server_machine.call(clocks.set_drift, 30)
     pause(4 * NS_PER_S)

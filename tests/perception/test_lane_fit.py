@@ -10,7 +10,7 @@ from lavt.perception.lane_fit import (
     mark_points,
     sides_by_windows,
     sides_near,
-    start_line,
+    start_centre,
 )
 from lavt.streams import stream
 
@@ -34,7 +34,7 @@ def points_on_parallels(
 
 
 def search_and_fit(points: Points, width_m: float = 3.5) -> tuple[Sides, LaneFit | None]:
-    start = start_line(points, GRID, width_m)
+    start = start_centre(points, GRID, width_m)
     assert start is not None
     sides, _ = sides_by_windows(points, GRID, start, width_m)
     return sides, fit_lane(points, sides, GRID, width_m)
@@ -122,7 +122,7 @@ def test_a_patch_beside_the_line_does_not_bend_the_fit() -> None:
 def test_too_few_points_are_no_lane() -> None:
     """No points, or a handful of points, have no fit and raise no error."""
     nothing = Points(np.empty(0), np.empty(0))
-    assert start_line(nothing, GRID, 3.5) is None
+    assert start_centre(nothing, GRID, 3.5) is None
     assert fit_lane(nothing, np.empty(0, dtype=np.int8), GRID, 3.5) is None
     few = points_on_parallels((0.0, 0.0, 0.0), (1.75, -1.75), np.arange(5.0, 5.5, 0.1))
     assert fit_lane(few, sides_near(few, (0.0, 0.0, 0.0), 3.5), GRID, 3.5) is None

@@ -59,11 +59,11 @@ class RunningLane:
         self._command = ""
         self._process: subprocess.Popen[bytes] | None = None
         self._output = folder / f"{lane.name}.output"
-        # The kernel lane's machines can write to this folder, so it contains nothing else.
+        # This folder has only the progress file, because the kernel lane's machines can write to the folder.
         self._progress = folder / lane.name / "progress"
         self._progress.parent.mkdir()
         self._output.touch()
-        self._written_bytes = 0
+        self._returned_bytes = 0
         self._began_ns = self._ended_ns = MachineClock().now().mono_ns
         self.failures: list[str] = []
         self.running = True
@@ -107,22 +107,23 @@ class RunningLane:
         self._waiting_commands.clear()
         if self._process is None:
             return
-        group, clock = self._process.pid, MachineClock()
+        leader, clock = self._process.pid, MachineClock()
+        whole_group = -leader  # for `os.kill`, the negative number of a group's leader means all its processes
         with suppress(ProcessLookupError):
-            for number, process in ((signal.SIGINT, group), (signal.SIGTERM, -group)):
-                os.kill(process, number)
+            for signal_number, target in ((signal.SIGINT, leader), (signal.SIGTERM, whole_group)):
+                os.kill(target, signal_number)
                 limit_ns = clock.now().mono_ns + GRACE_NS
                 while self._process.poll() is None and clock.now().mono_ns < limit_ns:
                     pause(POLL_NS)
-            os.killpg(group, signal.SIGKILL)
+            os.kill(whole_group, signal.SIGKILL)
         self._process.wait()
 
     def new_output(self) -> str:
         """Return the output since the last call."""
         with self._output.open("rb") as output:
-            output.seek(self._written_bytes)
+            output.seek(self._returned_bytes)
             chunk = output.read()
-        self._written_bytes += len(chunk)
+        self._returned_bytes += len(chunk)
         return chunk.decode(errors="replace")
 
     def outcome(self) -> LaneOutcome:

@@ -18,7 +18,7 @@ MAX_TRACE_BYTES: Final = 50_000_000
 
 
 def link_injection(name: str, delay_ms: float, impairment: ImpairmentConfig, seed: int) -> LinkInjection | None:
-    """Return the injection of a link into the flow `name`; None if the flow has at most a constant delay.
+    """Return what an emulated link injects into the flow `name`; None if no more than a constant delay is requested.
 
     Raises `UserError` for contradictory values and for a missing or invalid trace.
     """

@@ -20,7 +20,7 @@ PHYSICS_STEP_NS: Final = NS_PER_S // 240
 COMMAND_PERIOD_NS: Final = 20 * NS_PER_MS
 STATE_RATE_HZ: Final = 50.0
 UNREADABLE_REASONS: Final = {
-    "states_of_another_time": "signed by the vehicle, which does not answer this operator's key",
+    "states_of_unknown_process": "signed by the vehicle, which does not answer this operator's key",
     "states_forged": "not signed by the vehicle that security.vehicle names",
 }
 """Why a gateway rejects states, by the name of the gateway's counter for them."""

@@ -21,7 +21,7 @@ from lavt.perception.lane_fit import (
     mark_points,
     sides_by_windows,
     sides_near,
-    start_line,
+    start_centre,
 )
 from lavt.perception.lane_pixels import Mask, lane_pixels
 
@@ -32,16 +32,18 @@ GRID = GroundGrid()
 LANE_WIDTH_M = 3.5
 """The lane's width until it has been measured."""
 TRACK_CONFIDENCE = 0.2
-"""A fit with less confidence is not followed. One line that is visible over 40 % of the length gives 0.2."""
+"""A lane with less confidence is not tracked. One line that is visible over 40 % of the length gives 0.2."""
 REFINEMENTS = 2
-"""How often a lane that was found is fitted again. Each time the curve reaches points that are farther away."""
+"""How often a lane that a search found is fitted again: each fit brings the curve nearer to the far paint, so that the
+next fit uses more of this paint."""
 FORGET_AFTER_PICTURES = 3
 """After this many pictures without a lane, a tenth of a second, the search restarts."""
 LONGEST_GAP_NS = 350 * NS_PER_MS
-"""The longest gap between pictures over which a lane is followed; after a longer one the caller calls `forget`.
+"""The longest gap between pictures over which a lane is tracked; after a longer one the caller calls `forget`.
 
 In this time a car drives 2.9 m at 30 km/h. If it drives straight and the lane has a radius of 42 m, the lane 10 m ahead
-of the car moves sideways by `CORRIDOR_M`. After a longer gap another line could be at the old position.
+of the car moves sideways by 0.7 m, the tracking range (`CORRIDOR_M` in `lane_fit.py`). After a longer gap another line
+could be at the old position.
 """
 DROP_LANE_AT_WIDTHS = 1.0
 """A lane is dropped when the car is this many lane widths off its centre: the car is then in the middle of the next
@@ -57,16 +59,17 @@ class DetectionTrace:
     points: Points
     sides: Sides
     expected: tuple[float, float, float] | None
-    """The lane's centre near which the lines were searched; None without a start line."""
+    """The centre near which the lines were looked for: of the previous lane, or in a search the first guess of
+    `start_centre`; None if it found no paint."""
     expected_width_m: float
     windows: tuple[tuple[float, float], ...]
-    """The sliding windows of a search, as `sides_by_windows` returns them; empty if the lane was followed."""
+    """The sliding windows of a search, as `sides_by_windows` returns them; empty if the lane was tracked."""
     fit: LaneFit | None
     """The lane in this picture alone; None if there is none."""
 
 
 class LaneDetector:
-    """A lane detector that searches with sliding windows at first, then follows the lane, and averages over pictures.
+    """A lane detector that searches with sliding windows at first, then tracks the lane, and averages over pictures.
 
     Confidence is (visible share of the left line + visible share of the right line) / 2 x (share of the paint in and
     beside the lane that is on its lines, scaled to 0 for speckle and 1 for clean lines). A line is visible where it has
@@ -92,7 +95,7 @@ class LaneDetector:
         self._misses = FORGET_AFTER_PICTURES
 
     def forget(self) -> None:
-        """Search the nearest lane in the next picture, instead of following the last one."""
+        """Search the next picture for the lane that contains the car, instead of tracking the last lane."""
         self._misses = FORGET_AFTER_PICTURES
 
     def detect(self, picture_bgr: Picture) -> Lane:
@@ -102,7 +105,7 @@ class LaneDetector:
         mask = self.bird_eye.view_from_above(lane_pixels(self.bird_eye.region(picture_bgr), self._scale))
         points = mark_points(mask, self.bird_eye.grid)
         tracked = self._misses < FORGET_AFTER_PICTURES
-        self.trace = self._follow(mask, points) if tracked else self._search(mask, points)
+        self.trace = self._track(mask, points) if tracked else self._search(mask, points)
         fit = self.trace.fit
         if fit is None or fit.confidence < TRACK_CONFIDENCE:
             self._misses += 1
@@ -114,21 +117,21 @@ class LaneDetector:
                 self.forget()
         return self._lane
 
-    def _follow(self, mask: Mask, points: Points) -> DetectionTrace:
+    def _track(self, mask: Mask, points: Points) -> DetectionTrace:
         sides = sides_near(points, self._lane.centre, self._lane.width_m)
         fit = fit_lane(points, sides, self.bird_eye.grid, self._lane.width_m, self._lane.centre)
         return DetectionTrace(mask, points, sides, self._lane.centre, self._lane.width_m, (), fit)
 
     def _search(self, mask: Mask, points: Points) -> DetectionTrace:
         grid = self.bird_eye.grid
-        start = start_line(points, grid, self._lane_width_m)
+        start = start_centre(points, grid, self._lane_width_m)
         if start is None:
             return DetectionTrace(
                 mask, points, np.zeros(len(points.x_m), dtype=np.int8), None, self._lane_width_m, (), None
             )
         sides, windows = sides_by_windows(points, grid, start, self._lane_width_m)
-        # The windows follow any curve, also a line that leads away from the lane. The start line is rough, but is based
-        # on all paint. So both are fitted, and the fit with more confidence wins.
+        # The windows follow any curve, also a line that leads away from the lane. The first guess is rough, but uses
+        # all paint. So both are fitted, and the fit with more confidence wins.
         fits = (
             self._refine(points, fit_lane(points, sides, grid, self._lane_width_m)),
             self._refine(points, self._fit_near(points, start, self._lane_width_m)),

@@ -44,13 +44,13 @@ MAX_SLOPE = 0.5
 MAX_CURVATURE_PER_M = 1 / 15
 """Largest curvature of a lane: a car at walking pace could just follow it."""
 COLUMN_BIN_M = 0.1
-"""Width of the bins in which the search for the start line counts paint."""
+"""Width of the bins in which `start_centre` counts paint."""
 START_LENGTH_M = 12.0
-"""Length over which the start line is searched: more than one period of broken marks."""
+"""Length of the paint that `start_centre` uses: more than one period of broken marks."""
 START_SLOPES = (0.0, 0.05, -0.05, 0.1, -0.1, 0.15, -0.15, 0.2, -0.2, 0.25, -0.25)
-"""Slopes that are tried for the start line. Straight ahead is the first, so that it wins a tie."""
+"""Slopes that `start_centre` tries. Straight ahead is the first, so that it wins a tie."""
 START_BENDS_PER_M = (0.0, 0.006, -0.006, 0.012, -0.012)
-"""Values of c2, which is half the curvature, that are tried for the start line: down to a radius of 42 m."""
+"""Values of c2, which is half the curvature, that `start_centre` tries: down to a radius of 42 m."""
 WINDOW_M = (1.0, 0.6)
 """Length of a sliding window along x, and half its width."""
 MIN_WINDOW_POINTS = 6
@@ -116,7 +116,7 @@ def sides_near(points: Points, centre: tuple[float, float, float], width_m: floa
     return np.where(np.abs(np.abs(offset) - line) < CORRIDOR_M, sides, 0).astype(np.int8)
 
 
-def start_line(points: Points, grid: GroundGrid, width_m: float) -> tuple[float, float, float] | None:
+def start_centre(points: Points, grid: GroundGrid, width_m: float) -> tuple[float, float, float] | None:
     """Estimate the centre c0, c1, c2 of the lane that contains the car; None without paint.
 
     For several slopes and bends the paint is straightened and counted along y modulo the lane's width. The lines of the

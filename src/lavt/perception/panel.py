@@ -179,7 +179,7 @@ def _confidence_text(trace: DetectionTrace, lane: Lane) -> Picture:
     has_lane = lane.confidence >= TRACK_CONFIDENCE
     lines = [f"confidence {lane.confidence:.2f}: " + ("a lane" if has_lane else f"no lane (below {TRACK_CONFIDENCE})")]
     searched = trace.windows or trace.expected is None
-    lines.append("searched with windows" if searched else "followed from the last picture")
+    lines.append("searched with windows" if searched else "tracked from the last picture")
     if trace.fit is None:
         lines.append("no two parallel lines, or an impossible lane")
     else:

@@ -62,8 +62,8 @@ class Inbox:
     def take_arrived(self, until_ns: int) -> Message | None:
         """Remove and return a queued message of an inline channel that arrived by `until_ns` (monotonic), or None.
 
-        A runtime processes these messages, but not those of "newest" channels, before a wake that was due at
-        `until_ns`.
+        If the pipeline of an inline channel cannot run in the thread that delivers a message, the message is queued. A
+        runtime processes such messages before a wake that was due at `until_ns`, but not those of "newest" channels.
         """
         for channel, queue in self._queues.items():
             if CHANNELS[channel].inline and queue and queue[0][1].arrived.mono_ns <= until_ns:

@@ -122,8 +122,8 @@ class _NodeRunner:
             )
             for channel, stages in node.pipelines.items()
         }
-        """Each pipeline with the times from its start to the start of the first stage and to the end of each stage."""
-        self.next_wake_ns = node.next_wake_ns
+        """By channel: the stages of the pipeline; and when the first stage begins and each stage ends, counted from the
+        beginning of the pipeline run."""
         self.free_ns = 0
         """When the last pipeline run ends."""
         self.next_step_ns: int | None = None
@@ -184,8 +184,9 @@ class VirtualRuntime:
                 counts: dict[str, Any] = {**runner.node.counts, **runner.inbox.counts}
                 host.recorder.write("counts", {"node": name, **counts}, now)
             for channel, link in self.links.items():
-                if link.line.link is not None and CHANNELS[channel].sender in host.runners:
-                    counts = {f"link_{name}": number for name, number in link.line.link.counts.items()}
+                emulated = link.line.link
+                if emulated is not None and CHANNELS[channel].sender in host.runners:
+                    counts = {f"link_{name}": number for name, number in emulated.counts.items()}
                     host.recorder.write("counts", {"node": f"link {channel}", **counts}, now)
 
     def deliver(self, side: str, channel: str, payload: Any, peer: Peer = None) -> None:
@@ -215,7 +216,7 @@ class VirtualRuntime:
     def _step(self, runner: _NodeRunner, true_ns: int) -> None:
         runner.scheduled_ns.remove(true_ns)
         if runner.next_step_ns != true_ns:
-            return  # an earlier step was scheduled after this one, and has run instead
+            return  # after this step was scheduled, one at an earlier time replaced it and has already run
         runner.next_step_ns = None
         wake_ns = runner.wake_ns
         if wake_ns is not None and wake_ns <= true_ns:
@@ -229,9 +230,10 @@ class VirtualRuntime:
     def _run_pipeline(self, runner: _NodeRunner, message: Message, now: Now) -> None:
         host, true_ns = runner.host, self.true_ns
         stages, ends_ns = runner.pipelines[message.channel]
-        times: Iterator[Now] = repeat(now)
+        # `times` yields the start of the first stage, then the end of each stage.
+        times: Iterator[Now] = repeat(now)  # if no stage takes time, they are all the same
         if ends_ns[-1]:
-            times = map(host.clock.at, map(true_ns.__add__, ends_ns))
+            times = map(host.clock.at, [true_ns + end_ns for end_ns in ends_ns])
         outcome = run_stages(runner.node.name, stages, message, next(times), times)
         duration_ns = ends_ns[outcome.stages_run]
         runner.free_ns = free_ns = true_ns + duration_ns
@@ -243,7 +245,7 @@ class VirtualRuntime:
             else:
                 self._send_all(host, outcome.sends, outcome.end)
         # A node changes its next wake only while it runs a pipeline.
-        wake_mono_ns = runner.next_wake_ns()
+        wake_mono_ns = runner.node.next_wake_ns()
         if wake_mono_ns != runner.wake_mono_ns:
             runner.set_wake(wake_mono_ns)
         if runner.inbox.waiting:

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from lavt.experiment.analysis.injection_validity import absent_reasons, recorded_reasons
+from lavt.experiment.analysis.injection_validity import missing_delay_reasons, recorded_reasons
 from lavt.experiment.analysis.invalid_reason import InvalidCode, InvalidReason
 from lavt.recording.record import Record
 from lavt.recording.table import Table, table_of
@@ -14,7 +14,8 @@ from lavt.recording.table import Table, table_of
 REQUESTED_MS = {"video": 150.0, "control": 75.0}
 BEGAN_S, ENDED_S = 10, 20
 Sample = tuple[float, str, str, float, float | None, str]
-"""Time (s), condition, flow, requested and measured delay (ms), and the reason against the measurement, or ""."""
+"""Time (s), condition, flow, requested delay (ms), measured delay (ms), and how the measurement deviates;
+"": it does not."""
 VIDEO: list[Sample] = [(5, "L4", "video", 150.0, 150.2, ""), (15, "L4", "video", 150.0, 150.4, "")]
 CONTROL: list[Sample] = [(1, "L4", "control", 75.0, 75.1, "")]
 
@@ -61,10 +62,10 @@ def test_a_condition_in_force_throughout_the_drive_is_valid() -> None:
         (VIDEO, [(1, "L4", "control", 75.0, None, "")], InvalidCode.INJECTION_NOT_MEASURED, "control"),
     ],
 )
-def test_a_condition_that_was_not_in_force_is_a_reason(
+def test_a_condition_that_was_not_in_force_makes_the_run_invalid(
     video: list[Sample], control: list[Sample], code: InvalidCode, fact: str
 ) -> None:
-    """A side without a report before the drive, with another condition, a failure or a doubt makes the run invalid."""
+    """A run is invalid if a side has no sample before the drive, or a sample with another condition or a deviation."""
     assert [reason for reason in reasons(video, control) if reason.code is code and fact in reason.text]
 
 
@@ -73,8 +74,8 @@ def test_an_unrequested_delay_need_not_be_measured() -> None:
     assert reasons(VIDEO, [(1, "L4", "", 0.0, None, "")], {"video": 150.0, "control": 0.0}) == []
 
 
-def test_a_long_gap_between_measurements_is_a_reason() -> None:
-    """A run is invalid if a queue was not measured for more than 20 s of the drive."""
+def test_a_long_gap_between_measurements_makes_the_run_invalid() -> None:
+    """A run is invalid if the server took no sample for 20 s until the drive's end, or the client none between two."""
     before_drive = [(-15, "L4", "video", 150.0, 150.2, "")]
     (reason,) = reasons(before_drive, CONTROL)
     assert reason.code is InvalidCode.INJECTION_NOT_MEASURED
@@ -100,11 +101,11 @@ def test_another_clients_condition_invalidates_a_run_without_one() -> None:
     ("tau_v_ms", "tau_c_ms", "flows"),
     [(151.0, 76.0, []), (140.0, 70.0, []), (30.0, 76.0, ["video"]), (151.0, 5.0, ["control"]), (None, None, [])],
 )
-def test_latencies_below_the_injected_delay_are_a_reason(
+def test_latencies_below_the_injected_delay_make_the_run_invalid(
     tau_v_ms: float | None, tau_c_ms: float | None, flows: list[str]
 ) -> None:
     """A run is invalid if its video or control latency is far less than injected: the delay was on another path."""
     entry = {"tau_v_ms": {"p50": tau_v_ms, "bound": 0.2}, "tau_c_ms": {"p50": tau_c_ms, "bound": None}}
-    found = absent_reasons(entry, REQUESTED_MS)
+    found = missing_delay_reasons(entry, REQUESTED_MS)
     assert {reason.code for reason in found} <= {InvalidCode.INJECTION_NOT_ON_PATH}
     assert [reason.text.split()[1] for reason in found] == flows

@@ -15,7 +15,7 @@ MakeRun = Callable[..., Path]
 
 
 def test_stage_latencies_in_pipeline_order(make_run: MakeRun, tmp_path: Path) -> None:
-    """Stages have their recorded durations; a link has tau minus the nodes' times, at any clock offset."""
+    """A stage has its recorded duration; the video link has tau_v minus the times in the camera and the client."""
     make_run(tmp_path)
     entry = measure(read_record(tmp_path / "server.mcap"), read_record(tmp_path / "client.mcap")).entry
     stages = {(stage["node"], stage["stage"]): stage for stage in entry["stages_ms"]}

@@ -164,15 +164,15 @@ def test_control_is_delayed(net: RelayNetwork) -> None:
 
 
 def test_state_is_not_delayed(net: RelayNetwork) -> None:
-    """Datagrams from the server's router are forwarded without delay."""
+    """Without a delay for the state, datagrams from the server's router are forwarded without delay."""
     client, address_at_server = net.connect("control")
     net.server["control"].send(b"state", address_at_server)
     net.step()
     assert client.receive() == (b"state", net.relay_addresses["control"])
 
 
-def test_state_is_delayed_where_configured() -> None:
-    """A delay that is configured for the state applies to the state instead of the control delay."""
+def test_state_with_a_delay_of_its_own_is_delayed() -> None:
+    """If a delay is configured for the state, datagrams from the server's router are delayed by it."""
     with closing(RelayNetwork(state=DelayConfig(constant_ms=VIDEO_MS))) as net:
         client, address_at_server = net.connect("control")
         net.server["control"].send(b"state", address_at_server)
@@ -334,8 +334,8 @@ def test_control_loss_has_the_configured_share() -> None:
     assert arrived == sorted(arrived)
 
 
-def test_each_client_has_its_own_link() -> None:
-    """Each client has a link of its own: of the same packets, two clients get the same ones."""
+def test_the_packets_of_one_client_do_not_change_the_losses_of_another() -> None:
+    """Each client has a link of its own with the same seed: of equal packets, two clients lose the same ones."""
     with closing(RelayNetwork(video=DelayConfig(link=LinkConfig(loss=0.3)))) as net:
         clients = [net.connect("video") for _ in range(2)]
         for number in range(100):

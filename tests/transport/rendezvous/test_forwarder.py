@@ -19,6 +19,7 @@ from lavt.transport.rendezvous.forwarder import (
     UPSTREAM_PER_S,
     VEHICLE_TIMEOUT_NS,
     Address,
+    FlowName,
     Forwarder,
     encode_registration,
     unwrap,
@@ -45,10 +46,10 @@ def key() -> PrivateKey:
     return PrivateKey(Ed25519PrivateKey.generate())
 
 
-def registered_forwarder(flow: str = "video") -> Forwarder:
+def registered_forwarder(flow: FlowName = "video") -> Forwarder:
     """Return a forwarder without a key, at which the vehicle has registered."""
-    forwarder = Forwarder("vehicle-1", "probe" if flow == "probe" else "video", None)
-    registration = encode_registration("vehicle-1", "probe" if flow == "probe" else "video", 1, None)
+    forwarder = Forwarder("vehicle-1", flow, None)
+    registration = encode_registration("vehicle-1", flow, 1, None)
     assert forwarder.receive(registration, VEHICLE, NOW_NS) is None
     assert forwarder.vehicle_address(NOW_NS) == VEHICLE
     return forwarder
@@ -181,10 +182,10 @@ def test_without_a_key_every_registration_is_accepted(key: PrivateKey) -> None:
 
 
 @pytest.mark.parametrize(("vehicle", "flow"), [("vehicle-2", "video"), ("vehicle-1", "probe")])
-def test_registration_of_another_vehicle_or_flow_is_rejected(vehicle: str, flow: str, key: PrivateKey) -> None:
+def test_registration_of_another_vehicle_or_flow_is_rejected(vehicle: str, flow: FlowName, key: PrivateKey) -> None:
     """A registration of another vehicle or flow is rejected, even if it is signed with the right key."""
     forwarder = Forwarder("vehicle-1", "video", key.public)
-    registration = encode_registration(vehicle, "probe" if flow == "probe" else "video", 1, key)
+    registration = encode_registration(vehicle, flow, 1, key)
     forwarder.receive(registration, VEHICLE, NOW_NS)
     assert forwarder.counts == {"registrations_of_others": 1}
     assert forwarder.vehicle_address(NOW_NS) is None
@@ -244,7 +245,7 @@ def test_datagrams_to_the_vehicle_are_rate_limited() -> None:
 
 
 @pytest.mark.parametrize(("flow", "datagram"), [("video", HELLO), ("video", REPORT), ("probe", encode_request(1, 1))])
-def test_a_flood_with_the_address_of_an_answered_client_spares_the_others(flow: str, datagram: bytes) -> None:
+def test_a_flood_with_the_address_of_an_answered_client_spares_the_others(flow: FlowName, datagram: bytes) -> None:
     """However much arrives with the address of one answered client, another answered client's datagrams pass."""
     forwarder = registered_forwarder(flow)
     for client in (CLIENT, SECOND_CLIENT):
@@ -256,9 +257,9 @@ def test_a_flood_with_the_address_of_an_answered_client_spares_the_others(flow: 
 
 
 def test_a_flood_with_a_clients_address_keeps_it_out_until_it_is_answered() -> None:
-    """A flood with the host of a new client keeps the client out; once the vehicle has answered it, it does not.
+    """A flood from a new client's host keeps the client out, but no longer once the vehicle has answered the client.
 
-    The datagrams of the flood come from another port: one with the client's own port counts as the client's.
+    The flood comes from another port of that host: a datagram from the client's own port counts as the client's.
     """
     forwarder = registered_forwarder()
     false_address = (CLIENT[0], CLIENT[1] + 1)

@@ -68,9 +68,9 @@ class Pair:
         """Deliver a request and its reply; return the reply's envelope, and its body or the retry."""
         request = self.vehicle.verify_request("session", data)
         assert request is not None
-        signed = self.vehicle.sign_reply(request, b"" if request.is_stale else encode(reply))
+        signed = self.vehicle.sign_reply(request, b"" if request.must_retry else encode(reply))
         verified = self.operator.verify_reply("session", signed)
-        return signed, verified.retry if request.is_stale else verified.body
+        return signed, verified.retry if request.must_retry else verified.body
 
     def acquire_control(self) -> None:
         _, retry = self.exchange(self.signed_request())
@@ -91,7 +91,7 @@ def test_the_first_request_must_be_retried(pair: Pair) -> None:
     """A server that has just started rejects the first request; its reply has the replay counter for the retry."""
     request = pair.vehicle.verify_request("session", pair.signed_request())
     assert request is not None
-    assert request.is_stale
+    assert request.must_retry
     pair.acquire_control()
 
 
@@ -170,15 +170,15 @@ def test_a_command_for_another_vehicle_is_rejected(pair: Pair) -> None:
     assert pair.vehicle.verify_command(truck_operator.sign_command(encode(COMMAND))) is None
 
 
-def test_a_replayed_request_is_stale(pair: Pair) -> None:
-    """A request that is sent a second time is stale and is counted."""
+def test_a_replayed_request_is_not_executed(pair: Pair) -> None:
+    """A request that is sent a second time must be sent again with the next replay counter, and is counted."""
     pair.acquire_control()
     data = pair.signed_request("release")
     pair.exchange(data)
     replayed = pair.vehicle.verify_request("session", data)
     assert replayed is not None
-    assert replayed.is_stale
-    assert pair.vehicle.counts["session_requests_of_another_time"] == 2
+    assert replayed.must_retry
+    assert pair.vehicle.counts["session_requests_with_wrong_counter"] == 2
 
 
 def test_a_request_to_an_earlier_process_of_the_server_is_stale(pair: Pair) -> None:
@@ -187,7 +187,7 @@ def test_a_request_to_an_earlier_process_of_the_server_is_stale(pair: Pair) -> N
     data = pair.signed_request("acquire")
     request = VehicleAuthenticator("car", VEHICLE, OPERATORS).verify_request("session", data)
     assert request is not None
-    assert request.is_stale
+    assert request.must_retry
 
 
 @pytest.mark.parametrize("number", [0, 7, 2**63 - 1])
@@ -195,17 +195,17 @@ def test_an_emergency_stop_needs_no_retry(pair: Pair, number: int) -> None:
     """A request for an emergency stop is never stale, whatever its number."""
     request = pair.vehicle.verify_request("session", pair.signed_request("emergency_stop", number))
     assert request is not None
-    assert not request.is_stale
+    assert not request.must_retry
 
 
 def test_an_empty_request_only_asks_for_the_replay_counter(pair: Pair) -> None:
     """An empty request is stale even with the next replay counter, and is not counted as a replay."""
     pair.acquire_control()
-    before = pair.vehicle.counts["session_requests_of_another_time"]
+    before = pair.vehicle.counts["session_requests_with_wrong_counter"]
     request = pair.vehicle.verify_request("session", pair.operator.sign_request("session", b""))
     assert request is not None
-    assert request.is_stale
-    assert pair.vehicle.counts["session_requests_of_another_time"] == before
+    assert request.must_retry
+    assert pair.vehicle.counts["session_requests_with_wrong_counter"] == before
 
 
 def test_a_request_with_an_impossible_key_is_rejected(pair: Pair) -> None:
@@ -289,7 +289,7 @@ def test_a_reply_to_an_earlier_request_is_rejected(pair: Pair) -> None:
     for number in range(2):
         request = pair.vehicle.verify_request("session", pair.signed_request("acquire", number))
         assert request is not None
-        replies.append(pair.vehicle.sign_reply(request, b"" if request.is_stale else encode(GRANTED)))
+        replies.append(pair.vehicle.sign_reply(request, b"" if request.must_retry else encode(GRANTED)))
     assert pair.operator.verify_reply("session", replies[1]).retry is not None
     assert pair.operator.verify_reply("session", replies[0]) == VerifiedReply(None, None)
     assert pair.operator.verify_reply("session", replies[1]) == VerifiedReply(None, None)
@@ -328,7 +328,7 @@ def test_states_of_a_restarted_server_are_accepted_after_its_first_reply(pair: P
     state = pair.operator.verify_state(restarted.sign_state(b"new"))
     assert state.body is None
     assert state.needs_request
-    assert pair.operator.counts["states_of_another_time"] == 1
+    assert pair.operator.counts["states_of_unknown_process"] == 1
     pair.vehicle = restarted
     pair.exchange(pair.operator.sign_request("session", b""))
     assert pair.operator.verify_state(restarted.sign_state(b"newer")).body == b"newer"
@@ -349,7 +349,7 @@ def test_each_channel_has_its_own_replay_counter(pair: Pair) -> None:
     assert decode(NetemReply, reply.body or b"").granted
     request = pair.vehicle.verify_request("session", session)
     assert request is not None
-    assert not request.is_stale
+    assert not request.must_retry
 
 
 def test_pending_requests_are_bounded(pair: Pair) -> None:
@@ -399,7 +399,7 @@ def test_envelopes_have_a_maximum_size(pair: Pair, more_bytes: int, *, accepted:
     request = pair.vehicle.verify_request("netem", pair.operator.sign_request("netem", b""))
     assert request is not None
     reply = bytes(MAX_ENVELOPE_BYTES - len(pair.vehicle.sign_reply(request, b"")) + more_bytes)
-    fresh = replace(request, is_stale=False)
+    fresh = replace(request, must_retry=False)
     assert pair.operator.verify_reply("netem", pair.vehicle.sign_reply(fresh, reply)).body == (
         reply if accepted else None
     )

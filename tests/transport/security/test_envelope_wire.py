@@ -73,18 +73,18 @@ def test_bytes_of_commands_states_and_requests(session: Session) -> None:
         assert request[-80:-64] == expected_mac(channel.encode(), signed)
 
 
-@pytest.mark.parametrize("stale", [False, True])
-def test_bytes_of_a_reply(session: Session, *, stale: bool) -> None:
+@pytest.mark.parametrize("must_retry", [False, True])
+def test_bytes_of_a_reply(session: Session, *, must_retry: bool) -> None:
     """A reply carries a signature and no MAC, as `docs/wire.md` describes."""
     client_agreement = session.operator._agreement = KeyAgreement()
     data = session.operator.sign_request("session", ACQUIRE)
     request = session.vehicle.verify_request("session", data)
     assert request is not None
-    reply = session.vehicle.sign_reply(replace(request, is_stale=stale), GRANTED)
+    reply = session.vehicle.sign_reply(replace(request, must_retry=must_retry), GRANTED)
     signed = signed_part(VEHICLE, "session reply", reply, 64)
     digest = hashlib.sha256(data).digest()[:16]
     counter = session.vehicle.sign_state(b"")[:8] + bytes(7) + b"\2"
-    assert (signed[:16], signed[16:17], signed[17:33]) == (digest, b"\1" if stale else b"\0", counter)
+    assert (signed[:16], signed[16:17], signed[17:33]) == (digest, b"\1" if must_retry else b"\0", counter)
     server_public = signed[33:65]
     shared = client_agreement._key.exchange(X25519PublicKey.from_public_bytes(server_public))
     extracted = hmac.digest(bytes(32), shared, "sha256")  # RFC 5869 with 32 zeros as salt

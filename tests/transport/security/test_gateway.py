@@ -100,7 +100,7 @@ def test_replayed_requests_replies_and_states_are_rejected(pair: GatewayPair) ->
     ]  # the gate rejects its sequence
     assert pair.client_received == client_received
     # The first request, before its retry, and the replayed one.
-    assert pair.server.counts["session_requests_of_another_time"] == 2
+    assert pair.server.counts["session_requests_with_wrong_counter"] == 2
     assert pair.client.counts["states_replayed"] == 1
 
 

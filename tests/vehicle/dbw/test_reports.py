@@ -22,9 +22,10 @@ ANGLE_AND_SPEED = CanFrame(STEERING, bytes.fromhex("64 00 00 00 E8 03 00 00"))
 @pytest.mark.parametrize(("speed_unit", "speed_mps"), [("m/s", 10.0), ("km/h", 10.0 / 3.6)])
 def test_units(angle_unit: str, wheel_deg: float, speed_unit: str, speed_mps: float) -> None:
     """A wheel angle in degrees or radians and a speed in m/s or km/h are converted to degrees and m/s."""
+    # One degree in `angle_unit`, and 1 m/s in `speed_unit`.
     angle_per_deg, speed_per_mps = IN_DEGREES[angle_unit], IN_METRES_PER_SECOND[speed_unit]
-    in_units = replace(profile("dataspeed_gen1"), angle_per_deg=angle_per_deg, speeds_per_mps={"speed": speed_per_mps})
-    reports = NewestReports(in_units, START_NS)
+    kit = replace(profile("dataspeed_gen1"), angle_per_deg=angle_per_deg, speeds_per_mps={"speed": speed_per_mps})
+    reports = NewestReports(kit, START_NS)
     reports.receive(ANGLE_AND_SPEED, START_NS + 1)
     assert reports.wheel_deg == pytest.approx(wheel_deg)
     assert reports.speed_mps == pytest.approx(speed_mps)

@@ -10,11 +10,13 @@ from lavt.vehicle.sim.rendering.camera import SimCamera
 from lavt.vehicle.sim.road.road import Road
 
 MODEL = CameraModel()
+PHASE_NS = 5
+"""When the first exposure begins, after the camera's start."""
 
 
 def camera_on(road: Road, *, seed: int = 1, model: CameraModel = MODEL, **keys: Any) -> SimCamera:
     """Create a camera of 30 Hz."""
-    return SimCamera(model=model, rate_hz=30.0, phase_ns=5, road=road, seed=seed, **keys)
+    return SimCamera(model=model, rate_hz=30.0, phase_ns=PHASE_NS, road=road, seed=seed, **keys)
 
 
 def pose_at(road: Road, s_m: float, lateral_m: float = 0.0, turned_rad: float = 0.0, *, mono_ns: int = 0) -> Pose:

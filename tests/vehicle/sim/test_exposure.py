@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.nodes.stand_ins import MONO_NS, at, deliver, payloads
-from tests.vehicle.sim.rig import MODEL, camera_on, digest, picture_of, pose_at
+from tests.vehicle.sim.rig import MODEL, PHASE_NS, camera_on, digest, picture_of, pose_at
 
 from lavt.config import RunConfig
 from lavt.config_file import load_config, shipped
@@ -52,10 +52,10 @@ def test_a_frame_is_available_after_exposure_and_delay(road: Road, exposure_ns: 
     node = node_of(camera)
     deliver(node, "pose", pose_at(road, 0.0, mono_ns=MONO_NS - 1), at(0))
     for number in range(3):
-        opens_ns = MONO_NS + 5 + round(number * NS_PER_S / 30)
-        assert node.next_wake_ns() == opens_ns + exposure_ns + delay_ns
+        exposure_begin_ns = MONO_NS + PHASE_NS + round(number * NS_PER_S / 30)
+        assert node.next_wake_ns() == exposure_begin_ns + exposure_ns + delay_ns
         (frame,) = payloads(deliver(node, WAKE, None, at(node.next_wake_ns() - MONO_NS)), "frame")
-        assert frame.capture_ns == opens_ns + exposure_ns // 2
+        assert frame.capture_ns == exposure_begin_ns + exposure_ns // 2
         assert frame.stamped_mono_ns - frame.capture_ns == exposure_ns - exposure_ns // 2 + delay_ns
 
 

@@ -47,7 +47,7 @@ class CommandValues:
     rate: int = 0
 
 
-class WheelActuation(NamedTuple):
+class ExecutedActuation(NamedTuple):
     """What the kit makes the car do: the angle of the steering wheel, and the pedals between 0 and 1."""
 
     steering_wheel_deg: float
@@ -55,8 +55,8 @@ class WheelActuation(NamedTuple):
     brake: float
 
     @property
-    def pedals(self) -> tuple[float, float]:
-        """Throttle and brake."""
+    def throttle_and_brake(self) -> tuple[float, float]:
+        """The positions of both pedals."""
         return self.throttle, self.brake
 
 
@@ -179,10 +179,10 @@ class KitRig:
         """Return the enabled axes."""
         return {axis for axis, actuator in self.kit.state.actuators.items() if actuator.is_enabled}
 
-    def wheels(self) -> WheelActuation:
-        """Return the actuation that reaches the wheels now."""
+    def executed(self) -> ExecutedActuation:
+        """Return what the kit makes the car do now."""
         actuation = self.kit.actuation(self.now_ns)
-        return WheelActuation(
+        return ExecutedActuation(
             round(actuation.steering_rad * STEERING_RATIO * DEGREES_PER_RAD, 6),
             round(actuation.throttle, 4),
             round(actuation.brake, 4),

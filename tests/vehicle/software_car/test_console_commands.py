@@ -95,7 +95,7 @@ def test_the_watchdog_can_be_disabled(lines: list[str], brake: float) -> None:
     for line in lines:
         execute(rig.kit, line, rig.now_ns)
     rig.wait_ms(200)
-    assert rig.wheels().brake == brake
+    assert rig.executed().brake == brake
 
 
 @pytest.mark.parametrize(

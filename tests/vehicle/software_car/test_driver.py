@@ -126,11 +126,11 @@ def test_out_of_gear_the_throttle_has_no_effect(generation: int) -> None:
     rig.enable(in_drive=False)
     rig.command(throttle=0.5)
     rig.kit.driver_throttles(0.02, rig.now_ns)
-    assert rig.wheels().pedals == (0.0, 1.0)
+    assert rig.executed().throttle_and_brake == (0.0, 1.0)
     rig.command(brake=0.5)
     rig.send(rig.sender.gear(3))
     rig.command(throttle=0.5)
-    assert rig.wheels().pedals == (0.0, 0.0)
+    assert rig.executed().throttle_and_brake == (0.0, 0.0)
 
 
 def test_override_by_the_shifter() -> None:

@@ -95,7 +95,7 @@ def test_commands_reach_the_wheels(generation: int) -> None:
     """Angle, throttle and brake of a command reach the wheels unchanged."""
     rig = driving_rig(generation)
     rig.drive_ms(1000, angle_deg=-123.4, throttle=0.3, brake=0.2)
-    assert rig.wheels() == (-123.4, 0.3, 0.2)
+    assert rig.executed() == (-123.4, 0.3, 0.2)
 
 
 @both_generations
@@ -105,11 +105,11 @@ def test_steering_rate(generation: int) -> None:
     for _ in range(5):
         rig.command(angle_deg=90.0, rate=25)
         rig.wait_ms(20)
-    assert rig.wheels().steering_wheel_deg == 10.0
+    assert rig.executed().steering_wheel_deg == 10.0
     quick = driving_rig(generation)
     quick.command(angle_deg=300.0)
     quick.wait_ms(20)
-    assert quick.wheels().steering_wheel_deg == pytest.approx(0.02 * 17.5 * DEGREES_PER_RAD)
+    assert quick.executed().steering_wheel_deg == pytest.approx(0.02 * 17.5 * DEGREES_PER_RAD)
 
 
 @both_generations
@@ -118,7 +118,7 @@ def test_steering_starts_at_the_current_angle(generation: int) -> None:
     rig = KitRig(generation)
     rig.set_motion(0.0, steering_rad=0.2)
     rig.enable()
-    assert rig.wheels().steering_wheel_deg == pytest.approx(0.2 * STEERING_RATIO * DEGREES_PER_RAD)
+    assert rig.executed().steering_wheel_deg == pytest.approx(0.2 * STEERING_RATIO * DEGREES_PER_RAD)
 
 
 @both_generations
@@ -154,7 +154,7 @@ def test_generation_1_types_of_brake_command(kind: int, raw: float, fraction: fl
     data = bytearray(brake.data)
     data[2] = kind << 4
     rig.send(CanFrame(brake.identifier, bytes(data)))
-    assert rig.wheels().brake == pytest.approx(fraction, abs=2e-4)
+    assert rig.executed().brake == pytest.approx(fraction, abs=2e-4)
 
 
 def test_a_repeated_counter_invalidates_a_request() -> None:

@@ -23,7 +23,7 @@ def test_a_fault_disengages_and_brakes(generation: int, name: str) -> None:
     """A fault while driving makes the kit release all axes and brake."""
     rig = driving_rig(generation)
     rig.kit.set_fault(name, rig.now_ns)
-    assert (rig.enabled(), rig.kit.state.watchdog_reason, rig.wheels().brake) == (
+    assert (rig.enabled(), rig.kit.state.watchdog_reason, rig.executed().brake) == (
         set(),
         ReleaseReason.FAULT,
         WATCHDOG_BRAKE,
@@ -71,7 +71,7 @@ def test_the_remotes_switch(remote_state: int) -> None:
     """If the remote is switched to emergency stop or pause, a kit of generation 2 disengages and brakes."""
     rig = driving_rig(2)
     rig.kit.switch_remote(remote_state, rig.now_ns)
-    assert (rig.enabled(), rig.wheels().brake, rig.kit.state.watchdog_reason) == (
+    assert (rig.enabled(), rig.executed().brake, rig.kit.state.watchdog_reason) == (
         set(),
         WATCHDOG_BRAKE,
         ReleaseReason.REMOTE,

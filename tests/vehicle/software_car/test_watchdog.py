@@ -26,16 +26,16 @@ def test_commands_time_out_after_100_ms(generation: int) -> None:
     rig = driving_rig(generation)
     rig.command(throttle=0.5)
     rig.wait_ms(99.999)
-    assert (rig.enabled(), rig.wheels().pedals) == (ALL_AXES, (0.5, 0.0))
+    assert (rig.enabled(), rig.executed().throttle_and_brake) == (ALL_AXES, (0.5, 0.0))
     rig.wait_ms(0.001)
-    assert (rig.enabled(), rig.wheels().pedals) == (set(), (0.0, WATCHDOG_BRAKE))
+    assert (rig.enabled(), rig.executed().throttle_and_brake) == (set(), (0.0, WATCHDOG_BRAKE))
     assert all(actuator.has_timed_out for actuator in rig.kit.state.actuators.values())
     assert rig.kit.state.watchdog_reason == ReleaseReason.TIMEOUT
 
 
 @both_generations
 def test_late_calls_give_the_same_state(generation: int) -> None:
-    """A kit advanced each millisecond or once after a second is in the same state."""
+    """A kit that is advanced once after a second reaches the same state as a kit that is advanced each millisecond."""
     often, late = driving_rig(generation), driving_rig(generation)
     for rig in (often, late):
         rig.command(angle_deg=90.0, throttle=0.5, rate=25)
@@ -44,7 +44,7 @@ def test_late_calls_give_the_same_state(generation: int) -> None:
     late.wait_ms(1000)
     often.kit.state.sent = late.kit.state.sent
     assert often.kit.state == late.kit.state
-    assert often.wheels() == late.wheels()
+    assert often.executed() == late.executed()
 
 
 @both_generations
@@ -80,7 +80,7 @@ def test_a_repeated_counter_trips_the_watchdog(generation: int) -> None:
     assert rig.enabled() == ALL_AXES
     rig.wait_ms(20)
     rig.send(frames[2])
-    assert (rig.enabled(), rig.kit.state.watchdog_reason, rig.wheels().pedals) == (
+    assert (rig.enabled(), rig.kit.state.watchdog_reason, rig.executed().throttle_and_brake) == (
         set(),
         ReleaseReason.COUNTER,
         (0.0, WATCHDOG_BRAKE),
@@ -120,11 +120,11 @@ def test_a_wrong_checksum_trips_the_watchdog() -> None:
         assert [rig.kit.state.actuators[axis].is_crc_bad for axis in ("steering", "brake", "throttle")] == [
             index == axis_index for index in range(3)
         ]
-        assert rig.wheels().pedals == (0.0, WATCHDOG_BRAKE)
+        assert rig.executed().throttle_and_brake == (0.0, WATCHDOG_BRAKE)
 
 
-def test_orders_with_wrong_checksums_are_ignored() -> None:
-    """A request to the system or a shift with a wrong checksum has no effect."""
+def test_system_and_gear_requests_with_wrong_checksums_are_ignored() -> None:
+    """In generation 2, requests to enable the system and to shift have no effect if the checksum is wrong."""
     rig = KitRig(2)
     rig.command(brake=0.5)
     assert isinstance(rig.sender, Sender2)
@@ -135,7 +135,7 @@ def test_orders_with_wrong_checksums_are_ignored() -> None:
     assert rig.kit.state.gear == Gear.PARK
 
 
-def test_generation_1_disabled_in_gear_or_moving_trips() -> None:
+def test_disabling_in_gear_or_while_moving_trips_the_watchdog_of_generation_1() -> None:
     """In generation 1, disabling an actuator in gear or while the car moves trips the watchdog."""
     for in_gear, speed_mps in product((False, True), (0.0, 10.0)):
         rig = KitRig(1)
@@ -154,12 +154,12 @@ def test_the_watchdog_brakes_until_an_override(generation: int) -> None:
         rig.command(throttle=1.0, clear=True)
         rig.request_system()
         rig.wait_ms(20)
-        assert (rig.enabled(), rig.wheels().pedals) == (set(), (0.0, WATCHDOG_BRAKE))
+        assert (rig.enabled(), rig.executed().throttle_and_brake) == (set(), (0.0, WATCHDOG_BRAKE))
     rig.wait_ms(100)
     rig.kit.driver_brakes(0.8, rig.now_ns)
-    assert rig.wheels().brake == 0.8
+    assert rig.executed().brake == 0.8
     rig.kit.driver_brakes(0.0, rig.now_ns)
-    assert rig.wheels().brake == 0.0
+    assert rig.executed().brake == 0.0
     rig.command()
     rig.request_system()
     assert rig.enabled() == set()
@@ -177,6 +177,6 @@ def test_a_released_wheel_keeps_its_angle(generation: int) -> None:
     rig.wait_ms(50)
     rig.set_motion(10.0, steering_rad=0.05)
     rig.wait_ms(50)
-    assert rig.wheels().steering_wheel_deg == pytest.approx(0.05 * STEERING_RATIO * DEGREES_PER_RAD)
+    assert rig.executed().steering_wheel_deg == pytest.approx(0.05 * STEERING_RATIO * DEGREES_PER_RAD)
     rig.wait_ms(1000)
-    assert rig.wheels().steering_wheel_deg == pytest.approx(0.05 * STEERING_RATIO * DEGREES_PER_RAD)
+    assert rig.executed().steering_wheel_deg == pytest.approx(0.05 * STEERING_RATIO * DEGREES_PER_RAD)

@@ -87,7 +87,7 @@ def _longest_gap_s(table: Table, ended_ns: int | None) -> float:
     return float(np.max(np.diff(times_ns), initial=0)) / NS_PER_S
 
 
-def absent_reasons(entry: Mapping[str, Any], requested_ms: Mapping[str, float]) -> list[InvalidReason]:
+def missing_delay_reasons(entry: Mapping[str, Any], requested_ms: Mapping[str, float]) -> list[InvalidReason]:
     """Return a reason for each flow whose latency is clearly smaller than the requested delay.
 
     The delay was then injected elsewhere than on the network path of the flow. `entry` has `tau_v_ms` and `tau_c_ms`

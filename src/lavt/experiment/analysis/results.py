@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from lavt.errors import WorkError
-from lavt.experiment.analysis.injection_validity import absent_reasons
+from lavt.experiment.analysis.injection_validity import missing_delay_reasons
 from lavt.experiment.analysis.invalid_reason import InvalidReason
 from lavt.experiment.analysis.metrics import measure
 from lavt.experiment.analysis.validity import invalid_reasons
@@ -61,7 +61,7 @@ def run_result(
     measured = measure(server, client)
     all_reasons = [*invalid_reasons(server, client, measured), *reasons]
     if not all_reasons and "injected_ms" in identity:  # with another reason, the latencies themselves can be wrong
-        all_reasons = absent_reasons(measured.entry, identity.get("injected_least_ms", identity["injected_ms"]))
+        all_reasons = missing_delay_reasons(measured.entry, identity.get("injected_least_ms", identity["injected_ms"]))
     return {
         **{key: identity.get(key) for key in IDENTITY},
         **{key: identity[key] for key in OPTIONAL_IDENTITY if key in identity},

@@ -11,11 +11,12 @@ from scipy.stats import binomtest, fisher_exact
 from lavt.experiment.statistics.intervals import holm
 
 PLANNED = (("L0", "L1"), ("L1", "L2"), ("L2", "L3"), ("L2", "L4"), ("L3", "L4"), ("L3", "L5"))
-"""The contrasts, chosen before any run was driven: each step of the injected delay, and L3 with L4, whose total delays
-are equal."""
+"""The contrasts, chosen before any run was driven: each step of the injected delay, and L3 with L4, whose sums of
+video and control delay are equal."""
 
 PAIRED_BY = ("route", "repetition", "seed", "participant", "block")
-"""The keys that are equal in the two runs of a pair; only the condition differs."""
+"""The keys that are equal in the two runs of a pair; only the condition differs. `participant` and `block` are
+keys of the config's section `study`."""
 
 
 def paired_contrasts(runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

@@ -95,9 +95,9 @@ class VerifiedRequest(Struct, frozen=True):
     """The secret shared with the client, with which the reply is encrypted."""
     public: bytes
     """The server's public key of the agreement on the secret."""
-    is_stale: bool
-    """The replay counter is not the next one, so this could be a replay: the body is ignored and the client can
-    retry."""
+    must_retry: bool
+    """The body is ignored, and the reply demands the request again, with the replay counter in that reply. The request
+    had a wrong counter, so it could be a replay, or it was empty."""
 
 
 class NullVehicleAuthenticator:
@@ -114,7 +114,7 @@ class NullVehicleAuthenticator:
         return True
 
     def is_next_of_active_operator(self, _channel: str, _data: bytes) -> bool:
-        """Return False: without MACs no request is known to come from the active operator."""
+        """Return False: without MACs nothing shows that a request comes from the active operator."""
         return False
 
     def verify_command(self, data: bytes) -> bytes | None:
@@ -123,7 +123,7 @@ class NullVehicleAuthenticator:
 
     def verify_request(self, channel: str, data: bytes) -> VerifiedRequest | None:
         """Return the request."""
-        return VerifiedRequest(channel, "", data, b"", b"", b"", is_stale=False)
+        return VerifiedRequest(channel, "", data, b"", b"", b"", must_retry=False)
 
     def sign_state(self, body: bytes) -> bytes:
         """Return the state unchanged."""
@@ -204,11 +204,12 @@ class VehicleAuthenticator(NullVehicleAuthenticator):
             return None
         is_next = counter == self._replay_counter(channel, operator)
         self._accepted_requests[channel, operator] += is_next
-        # The vehicle executes an emergency stop of a number once, and the stop cannot wait for a second request.
-        is_stale = body == b"" or not (is_next or _is_emergency_stop(channel, body))
-        self._counts[f"{channel}_requests_of_another_time"] += is_stale and body != b""
+        # An emergency stop cannot wait for a second request. A replay does no harm: a stop has a number, and the
+        # vehicle executes the stop of one number only once.
+        must_retry = body == b"" or not (is_next or _is_emergency_stop(channel, body))
+        self._counts[f"{channel}_requests_with_wrong_counter"] += must_retry and body != b""
         secret, own_public = agreed
-        return VerifiedRequest(channel, operator, body, _digest(data), secret, own_public, is_stale)
+        return VerifiedRequest(channel, operator, body, _digest(data), secret, own_public, must_retry)
 
     def _is_in_own_name(self, channel: str, operator: str, body: bytes) -> bool:
         """Return whether a request names the operator that signed it; an empty request passes."""
@@ -245,12 +246,12 @@ class VehicleAuthenticator(NullVehicleAuthenticator):
         return signed + self._macs.compute("state", signed) + signature
 
     def sign_reply(self, request: VerifiedRequest, body: bytes) -> bytes:
-        """Encrypt and sign the reply to `request`; `body` is empty if the request is stale."""
-        if not request.is_stale:
+        """Encrypt and sign the reply to `request`; `body` is empty if the reply demands the request again."""
+        if not request.must_retry:
             self._update_session(request, body)
         counter = self._replay_counter(request.channel, request.operator)
         encrypted = encrypt(request.secret, body, request.digest)
-        signed = request.digest + (_RETRY if request.is_stale else _ANSWER) + counter + request.public + encrypted
+        signed = request.digest + (_RETRY if request.must_retry else _ANSWER) + counter + request.public + encrypted
         return signed + self._key.sign(_signing_context(f"{request.channel} reply", self._vehicle) + signed)
 
     def _update_session(self, request: VerifiedRequest, body: bytes) -> None:
@@ -276,7 +277,8 @@ class VerifiedState(Struct, frozen=True):
 
     body: bytes | None
     needs_request: bool
-    """The signature is valid, but this process of the server has answered no request yet: it could be a replay."""
+    """The state has a valid signature, but is from a process of the server that has not yet answered a request of this
+    client, so it could be a replay. The client must send a request."""
 
 
 class OperatorAuthenticator:
@@ -293,7 +295,8 @@ class OperatorAuthenticator:
         self._pending: dict[bytes, tuple[str, bytes]] = {}
         """Channel and body of the requests without a reply, by digest, oldest first."""
         self._macs = _SessionMacs()
-        self._newest_state = bytes(REPLAY_COUNTER_BYTES)
+        self._newest_state_number = bytes(REPLAY_COUNTER_BYTES)
+        """The random number of the server's process and the number of its newest state, 8 bytes each."""
 
     # Sent messages.
 
@@ -356,8 +359,8 @@ class OperatorAuthenticator:
 
     def _store_replay_counter(self, channel: str, counter: bytes) -> None:
         self._replay_counters[channel] = counter
-        if counter[:8] != self._newest_state[:8]:  # another process of the server: its states start from 0
-            self._newest_state = counter[:8] + bytes(8)
+        if counter[:8] != self._newest_state_number[:8]:  # another process of the server: its first state has number 1
+            self._newest_state_number = counter[:8] + bytes(8)
 
     def _update_session(self, body: bytes) -> None:
         try:
@@ -368,27 +371,27 @@ class OperatorAuthenticator:
             self._macs = _SessionMacs(reply.token)
 
     def is_next_state(self, data: bytes) -> bool:
-        """Return whether a state is newer than the last and has a valid MAC, which only the active operator can verify.
+        """Return whether a state is newer than the last and has a valid MAC; a cheap check.
 
-        This check is cheap.
+        Only the active operator has the token that it needs.
         """
-        return data[:REPLAY_COUNTER_BYTES] > self._newest_state and self._macs.verify("state", data)
+        return data[:REPLAY_COUNTER_BYTES] > self._newest_state_number and self._macs.verify("state", data)
 
     def verify_state(self, data: bytes) -> VerifiedState:
         """Return the state if the vehicle signed it and it is newer than all previous states."""
         signed, signature = _signed_part(data), data[-SIGNATURE_BYTES:]
-        counter = signed[:REPLAY_COUNTER_BYTES]
-        is_known_instance = counter[:8] == self._newest_state[:8]
-        if is_known_instance and counter <= self._newest_state:
+        number = signed[:REPLAY_COUNTER_BYTES]
+        is_known_instance = number[:8] == self._newest_state_number[:8]
+        if is_known_instance and number <= self._newest_state_number:
             self.counts["states_replayed"] += 1
             return VerifiedState(None, needs_request=False)
         if not self._vehicle_key.verify(signature, _signing_context("state", self._vehicle) + signed):
             self.counts["states_forged"] += 1
             return VerifiedState(None, needs_request=False)
         if not is_known_instance:
-            self.counts["states_of_another_time"] += 1
+            self.counts["states_of_unknown_process"] += 1
             return VerifiedState(None, needs_request=True)
-        self._newest_state = counter
+        self._newest_state_number = number
         return VerifiedState(signed[REPLAY_COUNTER_BYTES:], needs_request=False)
 
 

@@ -54,7 +54,7 @@ class ServerGateway:
         self._query_limiters = {channel: RateLimiter(QUERIES_PER_S) for channel in REQUESTS}
         self._requests: dict[tuple[str, Peer], VerifiedRequest] = {}
         self._retry: Send | None = None
-        """The reply to a stale request, sent as soon as the lock is free."""
+        """A reply that demands the request again, sent as soon as the lock is free."""
         self._counts: Counter[str] = Counter()
         self._lock = threading.Lock()
 
@@ -93,7 +93,7 @@ class ServerGateway:
         request = self._authenticator.verify_request(channel, payload)
         if request is None:
             return None
-        if request.is_stale:
+        if request.must_retry:
             self._retry = Send(f"{channel}_reply", self._authenticator.sign_reply(request, b""), peer)
             return None
         self._requests[channel, peer] = request

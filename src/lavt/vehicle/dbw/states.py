@@ -26,15 +26,15 @@ which axes it has enabled."""
 SENT_IN_STATE: Final[dict[State, str]] = {
     "idle": "nothing",
     "clearing": "CLEAR every 50 ms; no axis enabled",
-    "enabling": "all axes enabled, with throttle 0 and at least the holding brake; DRIVE once all axes are reported "
-    "enabled, if driving is still wanted",
+    "enabling": "all axes enabled, throttle 0, at least the holding brake. When all axes are reported enabled and "
+    "driving is still wanted: DRIVE",
     "engaged": "the requested actuation",
-    "parking": "the requested steering, the requested brake but at least the holding brake, and throttle 0. PARK "
-    "once the car was stationary for 300 ms; once PARK is reported, no axis enabled. Nothing, if before "
-    "PARK the brake, or any axis of generation 2, is released",
+    "parking": "steering as requested, brake as requested but at least the holding brake, throttle 0. When the car has "
+    "been stationary for 300 ms: PARK. When PARK is reported: no axis enabled. If before PARK the brake or, in "
+    "generation 2, any axis is released: nothing",
     "overridden": "no axis enabled",
-    "lost": "the requested steering, the requested brake and throttle 0, on the axes that are still enabled. "
-    "Nothing, if the brake, or any axis of generation 2, is released",
+    "lost": "steering and brake as requested and throttle 0, on the axes that are still enabled. If the brake or, in "
+    "generation 2, any axis is released: nothing",
 }
 """Frames sent in each state."""
 

@@ -67,9 +67,9 @@ def test_a_rails_shadow_falls_away_from_the_sun(road: Road) -> None:
     camera = camera_on(road, light="low_sun", scenery="light")
     picture = picture_of(camera, pose_at(road, 80.0))
     station_m = 88.0
-    ahead, left = road.point_at(station_m, [0.0, 1.0])
-    reach_m = RAIL_HEIGHT_M * float(LIGHTS["low_sun"].shadow_m @ (left - ahead))
-    assert reach_m > 3.0  # the sun is to the right here
+    centre, left_of_centre = road.point_at(station_m, [0.0, 1.0])  # 1 m apart
+    reach_m = RAIL_HEIGHT_M * float(LIGHTS["low_sun"].shadow_m @ (left_of_centre - centre))
+    assert reach_m > 3.0  # to the left: the sun is to the right here
     shaded_grey = grey_at(picture, road, station_m, RAIL_OFFSET_M + 0.85 * reach_m, 80.0)
     sunny_grey = grey_at(picture, road, station_m, RAIL_OFFSET_M + 1.5 * reach_m, 80.0)
     assert shaded_grey < 0.7 * sunny_grey
