@@ -187,6 +187,17 @@ def test_a_car_that_is_not_braked_does_not_stop_sliding() -> None:
     assert rig.faults == []
 
 
+def test_throttle_adds_to_the_speed_at_which_a_speed_was_lost() -> None:
+    """If all speeds drop to 0 and throttle is applied after that, the car may be faster than before the drop."""
+    rig = MonitorRig().run(1.0, NO_PEDAL, *[noisy(constant(2.0), 0.01)] * 5)
+    rig.run(1.0, Pedals(0.5, 0.0), *[constant(0.0)] * 5)
+    rig.run(6.2, WEAK_BRAKE, *[constant(0.0)] * 5)
+    assert not rig.monitor.is_stationary
+    rig.run(0.5, WEAK_BRAKE, *[constant(0.0)] * 5)
+    assert rig.monitor.is_stationary
+    assert rig.faults == []
+
+
 def test_wheels_that_roll_again_end_the_doubt() -> None:
     """After anti-lock brakes, wheels that are not braked show the speed; a later stop is believed at once."""
     rig = MonitorRig().run(1.0, NO_PEDAL, *[noisy(constant(2.4), 0.01)] * 5)
