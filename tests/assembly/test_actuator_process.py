@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import multiprocessing
+import os
+import re
 import signal
 import threading
 from collections import Counter
@@ -54,11 +55,7 @@ def serve_stuck(connection: Connection) -> None:
 
 def test_a_stuck_actuator_does_not_outlive_its_server() -> None:
     """An actuator whose node never returns is killed soon after its server has ended."""
-    context = multiprocessing.get_context("spawn")
-    own_end, actuator_end = context.Pipe()
-    process = context.Process(target=serve_stuck, args=(actuator_end,))
-    process.start()
-    actuator_end.close()
+    process, own_end = actuator_process.spawn(serve_stuck)
     try:
         assert own_end.recv() is None
         own_end.close()
@@ -68,17 +65,20 @@ def test_a_stuck_actuator_does_not_outlive_its_server() -> None:
         process.kill()
 
 
-def test_the_actuator_locks_its_memory() -> None:
-    """Before it drives, the actuator's process has locked its memory, if its user has the right to lock memory."""
-    context = multiprocessing.get_context("spawn")
-    own_end, actuator_end = context.Pipe()
-    process = context.Process(target=serve_stuck, args=(actuator_end,))
-    process.start()
+def test_the_actuator_locks_its_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before it drives, the actuator's process has locked its memory, if its user has the right to lock memory.
+
+    It has no threads and buffers of libraries for further processors, and small stacks, so it keeps little in RAM.
+    """
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    process, own_end = actuator_process.spawn(serve_stuck)
     try:
         assert own_end.recv() is None
         status = Path(f"/proc/{process.pid}/status").read_text()
-        locked_kib = next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmLck"))
-        assert (locked_kib > 1000) == (lift_lock_limit() == "")
+        kib = {name: int(value.split()[0]) for name, value in re.findall(r"(VmLck|RssAnon|Threads):\s*(.*)", status)}
+        assert (kib["VmLck"] > 1000) == (lift_lock_limit() == "")
+        assert kib["RssAnon"] < 150 * 1024
+        assert "OPENBLAS_NUM_THREADS" not in os.environ
     finally:
         process.kill()
 

@@ -12,6 +12,7 @@ import multiprocessing
 import os
 import signal
 import threading
+from collections.abc import Callable
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 
@@ -43,6 +44,12 @@ KILL_AFTER_S = 13
 IGNORED_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Signals that all processes of a terminal or service receive. The server's process handles them; this process detects
 that the server's process ends."""
+THREAD_STACK_BYTES = 2 << 20
+"""Size of the stacks of the actuator's threads, which are locked whole. By default it is 8 MiB. At Python's recursion
+limit, a recursion through C functions uses more than 1 MiB and less than 2 MiB (measured)."""
+ONE_BLAS_THREAD = {"OPENBLAS_NUM_THREADS": "1"}
+"""Environment of the actuator's process. By default, the two copies of OpenBLAS (of NumPy and OpenCV) map a stack and
+buffers for each processor, which would be locked: 176 MiB more with two processors (measured)."""
 
 log = logging.getLogger(__name__)
 
@@ -83,11 +90,7 @@ def _record_silence(runtime: RealRuntime) -> None:
 
 def start_actuator(config: ServerConfig, *, host: str, video_port: int) -> ActuatorProcess:
     """Start the process; raise its start-up error, which is a `UserError` for invalid input."""
-    context = multiprocessing.get_context("spawn")
-    server_end, actuator_end = context.Pipe()
-    process = context.Process(target=serve_actuator, args=(actuator_end, config, host, video_port), name=NAME)
-    process.start()
-    actuator_end.close()
+    process, server_end = spawn(serve_actuator, config, host, video_port)
     try:
         error = server_end.recv() if server_end.poll(READY_TIMEOUT_S) else "it did not become ready in time"
     except EOFError:
@@ -103,10 +106,31 @@ def start_actuator(config: ServerConfig, *, host: str, video_port: int) -> Actua
     raise WorkError(f"the process of the {NAME} failed to start: {error}")
 
 
+def spawn(serve: Callable[..., None], *arguments: object) -> tuple[BaseProcess, Connection]:
+    """Start a process that calls `serve` with a connection and `arguments`; return it and this end of the connection.
+
+    The libraries read the environment when they are loaded, so it must be set when the process starts.
+    """
+    context = multiprocessing.get_context("spawn")
+    own_end, other_end = context.Pipe()
+    process = context.Process(target=serve, args=(other_end, *arguments), name=NAME)
+    environment = dict(os.environ)
+    os.environ.update(ONE_BLAS_THREAD)
+    try:
+        process.start()
+    finally:
+        for name in ONE_BLAS_THREAD:
+            del os.environ[name]
+        os.environ.update(environment)
+    other_end.close()
+    return process, own_end
+
+
 def serve_actuator(connection: Connection, config: ServerConfig, host: str, video_port: int) -> None:
     """Run the actuator's process: drive until the server's process ends or requests the end, then stop the vehicle."""
     for signal_number in IGNORED_SIGNALS:
         signal.signal(signal_number, signal.SIG_IGN)
+    threading.stack_size(THREAD_STACK_BYTES)
     queue_output("stdout", "stderr")
     os.setsid()  # the kernel schedules this process in a group of its own, apart from the server's
     process_priority.raise_priority(process_priority.VEHICLE_NICENESS)

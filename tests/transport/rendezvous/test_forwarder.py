@@ -341,6 +341,34 @@ def test_replayed_hellos_from_many_addresses_do_not_displace_the_client() -> Non
     assert forwarder.receive(wrap(CLIENT, b"video"), VEHICLE, NOW_NS) is not None
 
 
+def test_floods_from_answered_addresses_spare_the_client_that_gets_the_video() -> None:
+    """Floods from many addresses that got a challenge, also at the client's host, displace nothing of the client."""
+    forwarder = registered_forwarder()
+    others = [(f"203.0.113.{number}", 9) for number in range(1, 10)] + [(CLIENT[0], CLIENT[1] + 1)]
+    for client in (CLIENT, *others):
+        send_hello(forwarder, client)
+        assert forwarder.receive(wrap(client, b"LAVT challenge"), VEHICLE, NOW_NS) is not None
+    assert forwarder.receive(wrap(CLIENT, b"video"), VEHICLE, NOW_NS) == (b"video", CLIENT)
+    for other in others * UPSTREAM_PER_S:
+        forwarder.receive(REPORT, other, NOW_NS)
+        send_hello(forwarder, other)
+    assert forwarder.receive(REPORT, CLIENT, NOW_NS) is not None
+    assert send_hello(forwarder) is not None
+
+
+@pytest.mark.parametrize(("flow", "payload"), [("video", b"LAVT challenge"), ("probe", b"reply")])
+def test_an_answer_other_than_video_gives_no_limit_of_its_own(flow: FlowName, payload: bytes) -> None:
+    """Clients that got only a challenge or the reply to a probe share one limit, and so have at most that many."""
+    forwarder = registered_forwarder(flow)
+    datagram = REPORT if flow == "video" else encode_request(1, 1)
+    clients = [(f"203.0.113.{number}", 9) for number in range(1, 10)]
+    for client in clients:
+        forwarder.receive(datagram, client, NOW_NS)
+        forwarder.receive(wrap(client, payload), VEHICLE, NOW_NS)
+    passed = sum(forwarder.receive(datagram, client, NOW_NS) is not None for client in clients * UPSTREAM_PER_S)
+    assert passed == UPSTREAM_PER_S
+
+
 def test_forged_registrations_are_rate_limited(key: PrivateKey) -> None:
     """In a flood of forged registrations few signatures are verified, and a registration of the vehicle is accepted."""
     forwarder = Forwarder("vehicle-1", "video", key.public)

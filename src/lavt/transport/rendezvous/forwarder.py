@@ -18,13 +18,15 @@ path. Threats:
 * Reflection to a third party: the rendezvous sends datagrams of clients to the registered vehicle, and datagrams of the
   vehicle to clients that sent something in the last 30 s. For each received datagram it sends at most one, whose length
   differs only by the wrapping. A registration gets no reply.
-* Flooding the vehicle: only datagrams in a format of the flow pass, at a limited rate. Clients that the vehicle has
-  answered have a rate limit of their own, so that others cannot crowd them out. Hellos and answers also have a rate
+* Flooding the vehicle: only datagrams in a format of the flow pass, at a limited rate. The client that gets the video
+  has a rate limit of its own: it has answered a challenge with the session's token, so no other client can use up that
+  limit. Other clients that the vehicle has answered have one, too. Hellos and answers also have a rate
   limit of their own, so that replays with a client's address do not crowd out its reports. In each group every host has
   a limit of its own, so that a flood from one host, or with one false address, crowds out no client at another.
 * Keeping new clients out: a dropped datagram displaces no client. A flood from 20 hosts or more, or with that many
   false addresses, still uses up the common limit, and then keeps new clients out while it lasts. So does, for the
-  clients at one address, a flood with that address: `docs/security.md`.
+  clients at one address, a flood with that address, and, until a client gets the video, copies of its hellos, which
+  the vehicle answers: `docs/security.md`.
 * Not covered: an attacker on the path to the rendezvous can forward a registration from another address before the
   original arrives, and so divert the flow for a second. It could as well drop the datagrams themselves.
 
@@ -62,13 +64,14 @@ REGISTRATIONS_PER_S: Final = 50
 """Limits the registrations from the vehicle's address that are verified, and separately those from other addresses."""
 UPSTREAM_PER_S: Final = 200
 """Limits each of four groups of datagrams: from clients that the vehicle has answered or from other clients, and of the
-path validation or not. A client sends 2.5 reports a second (measured)."""
+path validation or not. The client that gets the video is in none of them. A client sends 2.5 reports a second
+(measured)."""
 HOST_PER_S: Final = 10
 """Limits the datagrams of each host, within each of the two groups from clients that the vehicle has not answered. Such
 a client sends 2 hellos a second, or 7 if the video has ended, until the vehicle answers one."""
 ANSWERED_HOST_PER_S: Final = 50
-"""The same for clients that the vehicle has answered. Such a client sends at most 7 hellos, 7 answers, 2.5 reports and
-2 probes a second, and `lavt clock` 20 probes."""
+"""The same for clients that the vehicle has answered, and the only limit of the client that gets the video. Such a
+client sends at most 7 hellos, 7 answers, 2.5 reports and 2 probes a second, and `lavt clock` 20 probes."""
 MAX_UNANSWERED: Final = 10 * UPSTREAM_PER_S
 """Limits the number of clients that the vehicle has not answered. So many need 5 s to arrive at the rate limit, and an
 answer takes less than that."""
@@ -139,10 +142,14 @@ class Forwarder:
         self._registered_ns = 0
         self._registration_wall_ns = 0
         self._clients = _Clients()
+        self._video_client: Address | None = None
+        """The client to which the vehicle last sent anything but a challenge, in the video's flow."""
         self._signature_limiters = {True: RateLimiter(REGISTRATIONS_PER_S), False: RateLimiter(REGISTRATIONS_PER_S)}
         """By whether the registration comes from the vehicle's address."""
+        self._video_limiters = {True: _HostLimiter(ANSWERED_HOST_PER_S), False: _HostLimiter(ANSWERED_HOST_PER_S)}
+        """For the client that gets the video, by whether the datagram belongs to the path validation."""
         self._answered_limiters = {True: _HostLimiter(ANSWERED_HOST_PER_S), False: _HostLimiter(ANSWERED_HOST_PER_S)}
-        """For clients that the vehicle has answered, by whether the datagram belongs to the path validation."""
+        """The same for other clients that the vehicle has answered."""
         self._unanswered_limiters = {True: _HostLimiter(HOST_PER_S), False: _HostLimiter(HOST_PER_S)}
         """The same for clients that the vehicle has not answered."""
 
@@ -188,7 +195,10 @@ class Forwarder:
             self.counts["to_nobody"] += 1
         else:
             self.counts["to_clients"] += 1
-            return unwrapped[1], unwrapped[0]
+            client, payload = unwrapped
+            if self._flow == "video" and not is_path_datagram(payload):
+                self._video_client = client
+            return payload, client
         return None
 
     def _from_client(self, datagram: bytes, sender: Address, now_ns: int) -> tuple[bytes, Address] | None:
@@ -207,11 +217,16 @@ class Forwarder:
     def _is_within_limit(self, datagram: bytes, sender: Address, now_ns: int) -> bool:
         """Return whether a client's datagram is within the rate limits; if so, count it and note the client."""
         is_validation = is_path_datagram(datagram)
-        limiters = self._answered_limiters if self._clients.is_answered(sender) else self._unanswered_limiters
-        is_within_limit = limiters[is_validation].take(sender[0], now_ns)
+        is_within_limit = self._limiters(sender)[is_validation].take(sender[0], now_ns)
         if is_within_limit:
             self._clients.note_datagram(sender, now_ns)
         return is_within_limit
+
+    def _limiters(self, client: Address) -> dict[bool, _HostLimiter]:
+        """Return the rate limits of a client, by whether a datagram belongs to the path validation."""
+        if client == self._video_client:
+            return self._video_limiters
+        return self._answered_limiters if self._clients.is_answered(client) else self._unanswered_limiters
 
 
 class _HostLimiter:
