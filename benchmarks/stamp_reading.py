@@ -125,9 +125,9 @@ class LinkResult:
         return 1 - self.counts["accepted"] / self.counts["frames"]
 
     @property
-    def good_of_intact(self) -> float:
+    def usable_share_of_intact(self) -> float:
         """Share of the intact frames whose stamp was accepted and which were not in doubt."""
-        return self.counts["intact_good"] / max(1, self.counts["intact"])
+        return self.counts["intact_usable"] / max(1, self.counts["intact"])
 
 
 @lru_cache(maxsize=1)
@@ -232,7 +232,7 @@ class StampStudyReader:
         if picture is not None:
             accepted = self._check_as_own(picture, unit.timestamp)
             intact = self.missing_packets[unit.timestamp] == 0
-            self.result.counts.update(accepted=accepted, intact_good=accepted and intact and not self.in_doubt)
+            self.result.counts.update(accepted=accepted, intact_usable=accepted and intact and not self.in_doubt)
             self._check_as_foreign(picture, unit.timestamp)
 
     def _check_as_own(self, picture: DecodedPicture, timestamp: int) -> bool:
@@ -311,7 +311,7 @@ def tables(results: Sequence[LinkResult]) -> Iterator[str]:
         yield "|---" * (3 + len(headers)) + "|"
         for rate, rate_results in groupby(size_results, key=lambda result: result.rate_kbps):
             loss_free, *lossy = rate_results
-            shares = " | ".join(percent(result.good_of_intact) for result in lossy)
+            shares = " | ".join(percent(result.usable_share_of_intact) for result in lossy)
             yield f"| {rate} | {loss_free.bit_per_px:.3f} | {percent(loss_free.rejected_share)} | {shares} |"
     yield "\n| check | accepted | of these wrong | largest error |"
     yield "|---" * 4 + "|"
@@ -334,7 +334,7 @@ def to_json_line(results: Sequence[LinkResult]) -> str:
         {
             "size": result.size, "rate_kbps": result.rate_kbps, "loss": result.loss, "repair": result.repair,
             "bit_per_px": round(result.bit_per_px, 4), "rejected_share": round(result.rejected_share, 4),
-            "good_of_intact": round(result.good_of_intact, 4), **result.counts,
+            "usable_share_of_intact": round(result.usable_share_of_intact, 4), **result.counts,
             "checks": {name: asdict(stamps) for name, stamps in result.checks.items()},
         }
         for result in results

@@ -54,8 +54,8 @@ PARTS = {
 }
 """Node and stage of each timed part; the rest is the simulator, packets, links, safety, records and the runtime."""
 
-JSON_KEYS = ("full_x", "bare_x", "geometry_x", "perception_ms", "render_ms")
-"""Keys of the JSON in the last line; `_x` means times faster than real time."""
+JSON_KEYS = ("full_speedup", "bare_speedup", "geometry_speedup", "perception_ms", "render_ms")
+"""Keys of the JSON in the last line; a speedup is the speed of a setting relative to real time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +149,7 @@ def measure(names: Iterable[str], routes: Sequence[str], repetitions: int, limit
             building_s = median(cost.build_cpu_s for cost in drives)
             frame_ms = median(1e3 * cost.drive_cpu_s / cost.frames for cost in drives)
             parts_ms = stages_ms(changes, limit_s)
-            samples[f"{name}_x"].append(speed)
+            samples[f"{name}_speedup"].append(speed)
             if name == "full":
                 samples["perception_ms"].append(parts_ms["perception"])
                 samples["render_ms"].append(parts_ms["render"])

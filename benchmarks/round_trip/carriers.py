@@ -41,7 +41,7 @@ class CarrierEnd(Protocol):
     """One end of a carrier."""
 
     address: str
-    """The address of this end, which the other end needs."""
+    """The address of this end, which the other end needs. It is not empty, even if the carrier has no addresses."""
 
     def send(self, data: bytes) -> None:
         """Send a message."""
@@ -92,7 +92,7 @@ class ZenohCarrier:
         vehicle_router, operator_router = routers
         config = zenoh.Config.from_file(str(shipped("zenoh-configs/session.json5")))
         config.insert_json5("connect/endpoints", json.dumps([operator_router if is_asking else vehicle_router]))
-        self.address = "zenoh"
+        self.address = "zenoh"  # any text but the empty one: the ends find each other by their keys
         self._session = zenoh.open(config)
         self._received: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         sent_key, received_key = ("ask", "echo") if is_asking else ("echo", "ask")
@@ -120,7 +120,7 @@ class ZenohCarrier:
         return None
 
     def close(self) -> None:
-        """Undeclare the subscriber and close the session, without which the process would not end."""
+        """Undeclare the subscriber, which ends the listening thread, and close the session."""
         self._subscriber.undeclare()
         self._listener.join()
         self._session.close()
@@ -176,7 +176,7 @@ class DdsCarrier:
             "LavtRoundTrip", [("data", types.sequence[types.uint8])], bases=(idl.IdlStruct,)
         )
         qos = core.Qos(core.Policy.Reliability.BestEffort, core.Policy.History.KeepLast(1))
-        self.address = "dds"
+        self.address = "dds"  # any text but the empty one: the ends find each other by their topics
         participant = domain.DomainParticipant()
         names = ("ask", "echo") if address else ("echo", "ask")
         sent, received = (topics.Topic(participant, f"lavt_round_trip_{name}", self._sample) for name in names)

@@ -1,4 +1,4 @@
-"""The parts on a clean link: runs of LAVT and of GStreamer on the loopback, and the latency of the codec alone."""
+"""Benchmarks without impairments: LAVT and GStreamer on the loopback, and the floor (the codec alone)."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from benchmarks.video.processes import Program, RunOutcome, frames_of, measure, 
 from benchmarks.video.run import Run
 
 MAX_FLOOR_RUN_S = 6.0
+"""The longest measurement of the codec's floor, in seconds of video; the runs beside it can be longer."""
 USUAL_JITTER_BUFFER_MS = 200
 
 

@@ -34,7 +34,7 @@ def main() -> None:
     run = requested_run()
     log = PictureLog(run)
     recorder = PictureRecorder(log)
-    process = ProcessRuntime("rtp", recorder, remote=(LOOPBACK, run.port))
+    process = ProcessRuntime(channel="rtp", recorder=recorder, remote=(LOOPBACK, run.port))
     nodes, recorder.pictures = build_receiver_nodes(run, process.clock)
     runtime = process.start(nodes)
     runtime.deliver("path_token", PathToken(TOKEN, run.port), process.clock.now())

@@ -56,7 +56,7 @@ def main() -> None:
     """Send the requested number of frames after a line arrives on stdin."""
     run = requested_run()
     recorder = SentFrameRecorder(run)
-    process = ProcessRuntime("feedback", recorder)
+    process = ProcessRuntime(channel="feedback", recorder=recorder)
     print_json({"port": process.port})
     wait_for_line()
     runtime = process.start(build_sender_nodes(run, process.clock, process.port))

@@ -142,6 +142,10 @@ class SoftwareCarProcess:
         matching = (event for event in self.events if event["kind"] == kind and text in event["text"])
         return next((event["mono_ns"] for event in matching if event["mono_ns"] >= since_ns), None)
 
+    def was_enabled(self, since_ns: int = 0) -> bool:
+        """Return whether the kit has enabled an axis since a time."""
+        return self.event_ns("enabled", "enabled: ", since_ns=since_ns) is not None
+
     def wait(self, kind: str, text: str, *, since_ns: int = 0, within_ns: int = MAX_WAIT_NS) -> int:
         """Wait for an event and return its time; raise if the watchdog brakes first.
 
@@ -150,7 +154,7 @@ class SoftwareCarProcess:
         end_ns = CLOCK.now().mono_ns + within_ns
         braked_ns = None
         while braked_ns is None and CLOCK.now().mono_ns < end_ns:
-            braked_ns = self.braked_ns()
+            braked_ns = self.watchdog_braked_ns()
             at_ns = self.event_ns(kind, text, since_ns=since_ns)
             if at_ns is not None:
                 return at_ns
@@ -158,7 +162,7 @@ class SoftwareCarProcess:
         message = f"the car had no event {kind!r} with {text!r}: {self.events}"
         raise AssertionError(message) if braked_ns is None else self.unexpected_release(braked_ns, message)
 
-    def braked_ns(self) -> int | None:
+    def watchdog_braked_ns(self) -> int | None:
         """Return the time at which the watchdog braked first, or None."""
         return self.event_ns("watchdog", "watchdog brakes")
 
@@ -185,7 +189,7 @@ class SoftwareCarProcess:
         """Wait until the car is in park and released, and return the time from `since_ns` to park in ms."""
         at_ns = self.wait("gear", "gear PARK", since_ns=since_ns)
         self.wait("enabled", "released: ", since_ns=since_ns)
-        braked_ns = self.braked_ns()
+        braked_ns = self.watchdog_braked_ns()
         if braked_ns is not None:
             raise self.unexpected_release(braked_ns, f"the watchdog stopped the car: {self.events}")
         return ms_since(at_ns, since_ns)
@@ -247,11 +251,14 @@ class RunningDrive:
 
     def has_stopped(self) -> bool:
         """Return whether the watchdog has braked or the server has stopped the car."""
-        return self.status().get("safety") == "safe_stop" or self.car.braked_ns() is not None
+        return self.status().get("safety") == "safe_stop" or self.car.watchdog_braked_ns() is not None
 
     def unexpected_stop(self) -> Exception:
         """Return the exception for a stop that the test did not cause; call it soon after the stop."""
-        message, braked_ns = f"the car stopped: {self.loop.server.latest}, {self.car.events}", self.car.braked_ns()
+        message, braked_ns = (
+            f"the car stopped: {self.loop.server.latest}, {self.car.events}",
+            self.car.watchdog_braked_ns(),
+        )
         now_ns = CLOCK.now().mono_ns
         if braked_ns is not None:
             failure = self.car.unexpected_release(braked_ns, message)

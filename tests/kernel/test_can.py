@@ -127,7 +127,7 @@ class ActiveDrive:
 
         def is_driving() -> bool:
             status = self.loop.server.latest().get("status", {})
-            braked_ns = self.car.braked_ns()
+            braked_ns = self.car.watchdog_braked_ns()
             if braked_ns is not None or status.get("safety") == "safe_stop":
                 raise self.explain_stop(status, braked_ns)
             return bool(status.get("speed_mps", 0.0) >= DRIVING_MPS)
@@ -221,7 +221,7 @@ def test_drive_over_can_completes(profile: str, lab: CanLab, report_measurement:
         since_ns = CLOCK.now().mono_ns
         wait_for_end(active_drive.loop, lambda _: None)
         drive = collect(active_drive.loop, lab.client, active_drive.out)
-        braked_ns = active_drive.car.braked_ns()
+        braked_ns = active_drive.car.watchdog_braked_ns()
     measurements = f"{profile}: {describe_result(drive.result)}; {'; '.join(safety_changes(drive))}"
     report_measurement(measurements)
     if drive.result["ending"] != "completed" and braked_ns is not None:

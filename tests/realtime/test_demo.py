@@ -71,7 +71,7 @@ CONDITION_KEYS = {
     "tau_v_ms",
     "tau_c_ms",
     "loop_ms",
-    "completion_such_roads",
+    "completion_interval_over_roads",
     "endings",
     "routes",
     "p95_common_m",

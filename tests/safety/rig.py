@@ -17,7 +17,8 @@ from lavt.safety.limits import LIMITS, Limits
 COMMAND_PERIOD_NS = 20 * NS_PER_MS
 """Period of the client's commands and of the camera's pictures in the tests."""
 START_NS = 1_000 * NS_PER_S
-WALL_NS = 1_790_000_000 * NS_PER_S
+WALL_AHEAD_NS = 1_790_000_000 * NS_PER_S
+"""The server's wall clock minus its monotonic clock."""
 WHEELBASE_M = 2.8448
 MAX_STEERING_RAD = 0.513
 MAX_ACCELERATION_MPS2 = 2.0
@@ -72,14 +73,14 @@ class Rig:
     def take_picture(self, crc: int | None = None, *, captured_ns: int | None = None) -> int:
         """Issue the stamp of a new picture and return the stamp; the camera reports `captured_ns`."""
         self.frame += 1
-        self.stamp_ns = WALL_NS + self.now_ns + self.wall_step_ns
+        self.stamp_ns = WALL_AHEAD_NS + self.now_ns + self.wall_step_ns
         crc = self.frame if crc is None else crc
         self.gate.issued_stamps.add(self.stamp_ns, self.frame, self.now_ns, crc, captured_ns)
         self.gate.watchdog.check_timeouts(self.now_ns)
         return self.stamp_ns
 
     def request(self, operation: Operation, who: str = "alice", instance: int = 1, number: int = 0) -> SessionReply:
-        """Send a session request; an epoch that alice gets is that of later commands."""
+        """Send a session request. If alice gets an epoch, her later commands have this epoch."""
         reply = self.gate.session.answer(SessionRequest(operation, who, instance, number), self.vehicle, self.now_ns)
         if who == "alice" and reply.epoch:
             self.epoch = reply.epoch

@@ -17,7 +17,7 @@ from lavt.node import Send
 from lavt.streams import stream
 from lavt.transport.udp_link import UdpLink
 
-ARRIVES_S = 5.0
+ARRIVAL_TIMEOUT_S = 5.0
 ANY_PORT = ("127.0.0.1", 0)
 
 
@@ -42,7 +42,7 @@ class Received:
 
     def next(self) -> Delivered:
         """Wait for the next message."""
-        return self.messages.get(timeout=ARRIVES_S)
+        return self.messages.get(timeout=ARRIVAL_TIMEOUT_S)
 
 
 def open_link(clock: Clock | None = None, remote: tuple[str, int] | None = None) -> UdpLink:
@@ -54,7 +54,7 @@ def sender() -> Iterator[socket.socket]:
     """Open a socket on the loopback that belongs to no link."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened_socket:
         opened_socket.bind(ANY_PORT)
-        opened_socket.settimeout(ARRIVES_S)
+        opened_socket.settimeout(ARRIVAL_TIMEOUT_S)
         yield opened_socket
 
 

@@ -23,7 +23,7 @@ from lavt.runtime.thread_failures import fail_on_thread_errors
 from lavt.transport.messages import MAX_MESSAGE_BYTES
 from lavt.transport.zenoh_link import RECEIVE_RING_LENGTH, Router, ZenohLink, quiet_logs
 
-ARRIVES_S = 10.0
+ARRIVAL_TIMEOUT_S = 10.0
 CONFIGS = shipped("zenoh-configs")
 SESSION = CONFIGS / "session.json5"
 LOCAL = "tcp/127.0.0.1:0"
@@ -51,7 +51,7 @@ class Received:
             if send is not None:
                 send()
             try:
-                channel, payload, arrived, peer = self.messages.get(timeout=ARRIVES_S / 100)
+                channel, payload, arrived, peer = self.messages.get(timeout=ARRIVAL_TIMEOUT_S / 100)
             except queue.Empty:
                 continue
             if (channel, payload) == expected:
@@ -142,11 +142,11 @@ def test_the_newest_commands_are_kept_while_the_server_is_busy(routers: tuple[st
             received(channel, payload, arrived, peer)
             if payload == b"block":
                 blocked.set()
-                resume.wait(ARRIVES_S)
+                resume.wait(ARRIVAL_TIMEOUT_S)
 
         pair.server._deliver = block
         received.next(("control", b"block"), lambda: pair.client.send(Send("control", b"block")))
-        assert blocked.wait(ARRIVES_S)
+        assert blocked.wait(ARRIVAL_TIMEOUT_S)
         received.payloads.clear()
         for number in range(10 * RECEIVE_RING_LENGTH):
             pair.client.send(Send("control", b"%d" % number))
@@ -155,7 +155,7 @@ def test_the_newest_commands_are_kept_while_the_server_is_busy(routers: tuple[st
         resume.set()
         for _ in range(100):
             pair.client.send(Send("control", b"last"))
-            pause(round(ARRIVES_S * NS_PER_S / 100))
+            pause(round(ARRIVAL_TIMEOUT_S * NS_PER_S / 100))
             if b"last" in received.payloads:
                 break
         numbers = [int(payload) for payload in received.payloads if payload.isdigit()]
@@ -218,7 +218,7 @@ def test_an_error_in_a_receiving_thread_is_not_lost(routers: tuple[str, str], ch
         for _ in range(100):
             links.client.send(Send(channel.removesuffix("_reply"), b"x"))
             with suppress(queue.Empty):
-                assert isinstance(failed.get(timeout=ARRIVES_S / 100), BrokenPipeError)
+                assert isinstance(failed.get(timeout=ARRIVAL_TIMEOUT_S / 100), BrokenPipeError)
                 return
     pytest.fail("the error was lost")
 
@@ -228,7 +228,7 @@ def test_the_end_of_a_subscription_is_not_lost(routers: tuple[str, str]) -> None
     failed: queue.Queue[BaseException] = queue.Queue()
     with fail_on_thread_errors(failed.put), closing(Pair(routers, "ended")) as pair:
         pair.server._declared[0].undeclare()
-        assert isinstance(failed.get(timeout=ARRIVES_S), zenoh.ZError)
+        assert isinstance(failed.get(timeout=ARRIVAL_TIMEOUT_S), zenoh.ZError)
     assert failed.empty()
 
 
@@ -244,13 +244,13 @@ def test_liveliness(routers: tuple[str, str]) -> None:
             lambda sample: changes.put((str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)),
             history=True,
         )
-        present = {changes.get(timeout=ARRIVES_S) for _ in range(2)}
+        present = {changes.get(timeout=ARRIVAL_TIMEOUT_S) for _ in range(2)}
         assert present == {(f"lavt/vehicle-1/alive/{who}", True) for who in ("server-1", "client-1")}
         visitor = open_link("client", routers[1], who="visitor")
         visitor.start(Received())
-        assert changes.get(timeout=ARRIVES_S) == ("lavt/vehicle-1/alive/visitor", True)
+        assert changes.get(timeout=ARRIVAL_TIMEOUT_S) == ("lavt/vehicle-1/alive/visitor", True)
         visitor.close()
-        assert changes.get(timeout=ARRIVES_S) == ("lavt/vehicle-1/alive/visitor", False)
+        assert changes.get(timeout=ARRIVAL_TIMEOUT_S) == ("lavt/vehicle-1/alive/visitor", False)
         watch.undeclare()
 
 
@@ -378,7 +378,7 @@ def test_a_failed_declaration_in_the_background_is_not_silent(
     )
     with fail_on_thread_errors(failed.put), closing(waiting):
         waiting.start(Received())
-        assert isinstance(failed.get(timeout=ARRIVES_S), zenoh.ZError)
+        assert isinstance(failed.get(timeout=ARRIVAL_TIMEOUT_S), zenoh.ZError)
         waiting.send(Send("state", b"x"))
     assert waiting.counts["state_not_sent"] == 1
     assert [session.session.is_closed() for session in opened] == [True]

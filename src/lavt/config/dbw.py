@@ -9,6 +9,7 @@ from pydantic import Field
 from lavt.config.section import Section
 
 CommandSet = Literal["remote", "user"]
+"""The sets of command messages of a generation 2 kit; the state of its remote control determines which it accepts."""
 ReportedValue = Literal[
     "enabled", "angle", "command", "gear", "speed", "second_speed", "wheel_1", "wheel_2", "wheel_3", "wheel_4"
 ]
@@ -23,6 +24,7 @@ class CommandConfig(Section):
     """The commanded value, in the DBC's unit. If the signal is multiplexed, its multiplexer is set accordingly."""
     enable: str = ""
     clear: str = ""
+    """The signal that resets the conditions that the kit has latched, such as an override."""
     rate: str = ""
     """The maximum rate of the steering wheel."""
     rate_unit_degps: float = Field(1.0, gt=0)
@@ -99,6 +101,7 @@ class ReportsConfig(Section):
     wheels: ReportConfig = ReportConfig()
     system: ReportConfig = ReportConfig()
     remote: ReportConfig = ReportConfig()
+    """The report of the kit's remote control."""
 
 
 class OwnBrakeConfig(Section):
@@ -148,7 +151,7 @@ class ProfileConfig(Section):
     vehicle: ByWireCarConfig
     limits: ByWireLimitsConfig
     command_step_deg: float = Field(0.1, gt=0)
-    """The step of the steering's reported `command`."""
+    """The resolution of the steering command that the kit reports. LAVT recognizes its own commands by it."""
     sent: SentConfig
     reports: ReportsConfig
     watchdog: OwnBrakeConfig = OwnBrakeConfig()

@@ -1,4 +1,4 @@
-"""The schema of keys on both sides."""
+"""The schema of the config section `security`: the signing keys of the vehicle and of its operators."""
 
 from __future__ import annotations
 

@@ -16,8 +16,8 @@ class Inbox:
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
-        self.waiting = 0
-        """Number of waiting messages."""
+        self.message_count = 0
+        """Number of messages in the inbox."""
         self._number = 0
         self._queues: defaultdict[str, deque[tuple[int, Message]]] = defaultdict(deque)
         """By channel, the messages with their numbers in order of arrival."""
@@ -25,7 +25,7 @@ class Inbox:
 
     def is_empty(self) -> bool:
         """Return whether no message waits."""
-        return self.waiting == 0
+        return self.message_count == 0
 
     def put(self, message: Message) -> None:
         """Add a message."""
@@ -34,7 +34,7 @@ class Inbox:
             if message.channel in self._newest:
                 self.counts[f"{message.channel}_replaced"] += 1
             else:
-                self.waiting += 1
+                self.message_count += 1
             self._newest[message.channel] = message
             return
         queue = self._queues[message.channel]
@@ -42,15 +42,15 @@ class Inbox:
             queue.popleft()
             self.counts[f"{message.channel}_dropped"] += 1
         else:
-            self.waiting += 1
+            self.message_count += 1
         self._number += 1
         queue.append((self._number, message))
 
     def take(self) -> Message | None:
         """Remove and return the next message; None: no message waits."""
-        if not self.waiting:
+        if not self.message_count:
             return None
-        self.waiting -= 1
+        self.message_count -= 1
         first_queue = None  # the queue whose first message has the lowest number
         for queue in self._queues.values():
             if queue and (first_queue is None or queue[0][0] < first_queue[0][0]):
@@ -62,11 +62,11 @@ class Inbox:
     def take_arrived(self, until_ns: int) -> Message | None:
         """Remove and return a queued message of an inline channel that arrived by `until_ns` (monotonic), or None.
 
-        If the pipeline of an inline channel cannot run in the thread that delivers a message, the message is queued. A
-        runtime processes such messages before a wake that was due at `until_ns`, but not those of "newest" channels.
+        A message of an inline channel is queued only if its pipeline could not run in the thread that delivered it. A
+        runtime processes these messages before a wake that was due at `until_ns`.
         """
         for channel, queue in self._queues.items():
             if CHANNELS[channel].inline and queue and queue[0][1].arrived.mono_ns <= until_ns:
-                self.waiting -= 1
+                self.message_count -= 1
                 return queue.popleft()[1]
         return None

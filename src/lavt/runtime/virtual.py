@@ -248,7 +248,7 @@ class VirtualRuntime:
         wake_mono_ns = runner.node.next_wake_ns()
         if wake_mono_ns != runner.wake_mono_ns:
             runner.set_wake(wake_mono_ns)
-        if runner.inbox.waiting:
+        if runner.inbox.message_count:
             self._schedule(runner, free_ns)
         elif (wake_ns := runner.wake_ns) is not None:
             self._schedule(runner, max(wake_ns, free_ns))

@@ -46,9 +46,9 @@ CURVATURE_BOUND_PER_M = 1.0
 
 Version = Annotated[int, Meta(ge=VERSION, le=VERSION)]
 U64 = Annotated[int, Meta(ge=0)]
-"""Epochs and instances of processes; msgpack itself limits the number to 64 bits."""
+"""An epoch, or the instance of a process. The type has no upper bound, because msgpack has no larger integers."""
 U63 = Annotated[int, Meta(ge=0, le=2**63 - 1)]
-"""Times, and numbers that grow: the non-negative half of a signed 64-bit integer."""
+"""Times, and numbers that grow, such as that of an emergency stop: the non-negative signed 64-bit integers."""
 RoadWheel = Annotated[float, Meta(ge=-ROAD_WHEEL_BOUND_RAD, le=ROAD_WHEEL_BOUND_RAD)]
 Curvature = Annotated[float, Meta(ge=-CURVATURE_BOUND_PER_M, le=CURVATURE_BOUND_PER_M)]
 ZeroToOne = Annotated[float, Meta(ge=0.0, le=1.0)]
@@ -66,7 +66,7 @@ TEXT_BYTES: dict[type, dict[str, int]] = {
     NetemRequest: {"condition": 32},
     NetemReply: {"reason": 400},
 }
-"""The longest texts that are sent, in bytes. A receiver accepts texts of this many characters."""
+"""The maximum length of each text: in bytes for the sender, in characters for the receiver."""
 
 
 def _text(kind: type, field: str) -> Any:

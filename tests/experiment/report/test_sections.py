@@ -42,7 +42,7 @@ MakeRun = Callable[..., Path]
 INJECTED = {"L0": (0, 0), "L1": (75, 0), "L2": (150, 0), "L3": (225, 0), "L4": (150, 75), "L5": (225, 100)}
 
 NEW_CONDITION_KEYS = (
-    "completion_such_roads",
+    "completion_interval_over_roads",
     "endings",
     "routes",
     "p95_common_m",

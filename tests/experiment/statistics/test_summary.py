@@ -97,7 +97,7 @@ def test_completion_by_route_and_by_road() -> None:
     condition = summarize(campaign(bad_route="b"), SPEED)["conditions"]["L0"]
     assert condition["endings"] == {"completed": 25, "safe_stop": 5}
     assert condition["completion_interval"] == exact_interval(25, 30)
-    assert condition["completion_such_roads"] == [0.5, 1.0]
+    assert condition["completion_interval_over_roads"] == [0.5, 1.0]
     assert {name: route["completed"] for name, route in condition["routes"].items()} == {
         "a": 5,
         "a_key": 5,
@@ -121,7 +121,7 @@ def test_a_route_and_its_key_route_are_one_road(suffix: str) -> None:
 def test_one_road_has_no_range_over_roads() -> None:
     """Runs on a single road (a route and its key part) have no range over roads."""
     runs = [entry for entry in campaign() if entry["route"] in {"a", "a_key"}]
-    assert summarize(runs, SPEED)["conditions"]["L0"]["completion_such_roads"] is None
+    assert summarize(runs, SPEED)["conditions"]["L0"]["completion_interval_over_roads"] is None
 
 
 def test_rates_by_distance_are_of_all_kilometres() -> None:

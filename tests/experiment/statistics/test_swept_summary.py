@@ -36,7 +36,7 @@ CONDITION_KEYS = {
     "completed",
     "completion_rate",
     "completion_interval",
-    "completion_such_roads",
+    "completion_interval_over_roads",
     "endings",
     "routes",
     "collisions_per_run",

@@ -124,7 +124,9 @@ class StartedProgram:
     def first_line(self, timeout_s: float = 60) -> dict[str, Any]:
         """Wait for the first line of JSON and return it. Raise `MachineError` if the program ends without one."""
         wait_until(
-            f"{' '.join(self.command)} prints a line", lambda: "\n" in self.output or not self.running, timeout_s
+            f"{' '.join(self.command)} prints a line or ends",
+            lambda: "\n" in self.output or not self.running,
+            timeout_s,
         )
         lines = self.lines()
         if not lines:
@@ -138,12 +140,12 @@ class StartedProgram:
 
 
 def wait_until(description: str, condition: Callable[[], bool], timeout_s: float, every_ns: int = POLL_NS) -> None:
-    """Wait until a condition is true. Raise `MachineError` after `timeout_s`."""
+    """Wait until a condition is true. Raise `MachineError` after `timeout_s`; `description` states the condition."""
     for _ in range(max(1, round(timeout_s * NS_PER_S / every_ns))):
         if condition():
             return
         pause(every_ns)
-    raise MachineError(f"timed out after {timeout_s:g} s: {description}")
+    raise MachineError(f"not true within {timeout_s:g} s: {description}")
 
 
 def local_machine(name: str, address: str) -> Machine:
@@ -160,7 +162,7 @@ def remote_machine(name: str, address: str, management_address: str, key: bytes)
             connections.append(Client((management_address, PORT), authkey=key))
         return bool(connections)
 
-    wait_until(f"the {name}'s machine has booted", is_reachable, 120)
+    wait_until(f"the machine '{name}' has booted", is_reachable, 120)
     lock = threading.Lock()
 
     def call(function: Callable[..., Any], *arguments: Any, **keywords: Any) -> Any:

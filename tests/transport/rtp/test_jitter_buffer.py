@@ -156,7 +156,7 @@ def test_the_farthest_packet_of_a_stream() -> None:
 
 
 def test_stray_packets_that_are_not_consecutive() -> None:
-    """Two stray packets that are not consecutive in number or arrival do not move the stream."""
+    """Stray packets move the stream only if two arrive directly after each other with consecutive numbers."""
     buffer = started_buffer()
     for number, released in ((20_000, []), (20_002, []), (1, [1]), (20_003, []), (2, [2])):
         assert numbers(buffer.push(packet(number), STARTED_NS)) == released
@@ -175,8 +175,8 @@ def test_two_consecutive_packets_move_the_stream(first: int, second: int) -> Non
     assert (buffer.stray, buffer.lost) == (0, 0)
 
 
-def test_a_jump_keeps_the_wraps() -> None:
-    """The extended sequence number increases when the stream jumps to another range."""
+def test_the_extended_sequence_number_grows_at_a_jump() -> None:
+    """When the stream jumps to another range, `highest_sequence` increases, by a wrap if necessary."""
     buffer = started_buffer(65_000)
     for number in (65_000 + MAX_JUMP + 1, 65_000 + MAX_JUMP + 2, 50_000, 50_001):
         buffer.push(packet(number), STARTED_NS)
@@ -337,8 +337,8 @@ def test_the_hold_of_an_open_gap_grows() -> None:
     assert buffer.next_wake_ns() == STARTED_NS + 9 * NS_PER_MS * 5 // 4
 
 
-def test_packets_that_were_not_given_up_change_no_hold() -> None:
-    """A packet from before the start, or a recovered one that had left already, does not change the hold."""
+def test_packets_of_no_gap_change_no_hold() -> None:
+    """A packet from before the start does not change the hold, nor does a recovered packet that had already left."""
     buffer = started_buffer(10, hold_ns=None)
     assert buffer.push(packet(9), STARTED_NS + 50 * NS_PER_MS) == []
     assert buffer.push_recovered(packet(10), STARTED_NS + 50 * NS_PER_MS) == []
@@ -354,8 +354,8 @@ def test_too_long_delays_change_no_hold() -> None:
     assert measure_hold(buffer, 3, STARTED_NS + MAX_HOLD_NS + 1) == MIN_HOLD_NS
 
 
-def test_an_open_gap_does_not_lengthen_the_delay_of_later_packets() -> None:
-    """Packets that are swapped after an open gap extend the hold by their own reordering delay only."""
+def test_swapped_packets_after_an_open_gap() -> None:
+    """The reordering delay of swapped packets is measured from their own gap, not from an earlier gap that is open."""
     buffer = started_buffer(hold_ns=None)
     now_ns = STARTED_NS
     for number in range(2, 2000, 2):

@@ -67,8 +67,8 @@ def test_an_inhibit_reason_of_generation_2_disengages(name: str, reason: Release
 
 
 @pytest.mark.parametrize("remote_state", [0, 1])
-def test_the_remotes_switch(remote_state: int) -> None:
-    """If the remote is switched to emergency stop or pause, a kit of generation 2 disengages and brakes."""
+def test_the_remote_control_stops_the_car(remote_state: int) -> None:
+    """If the remote control is switched to emergency stop or pause, a kit of generation 2 disengages and brakes."""
     rig = driving_rig(2)
     rig.kit.switch_remote(remote_state, rig.now_ns)
     assert (rig.enabled(), rig.executed().brake, rig.kit.state.watchdog_reason) == (
@@ -101,7 +101,7 @@ def test_unknown_names_are_rejected(generation: int) -> None:
         kit.set_fault("brake.smoke", 10**12)
     with pytest.raises(UserError, match=r"'rain': the known ones are acceleration"):
         kit.inhibit("rain", 10**12)
-    with pytest.raises(UserError, match="no value that can be unknown 'mood'"):
+    with pytest.raises(UserError, match="no reported value 'mood'"):
         kit.set_unknown("mood")
-    with pytest.raises(UserError, match="no gear of this car 'REVERSE'"):
+    with pytest.raises(UserError, match="no available gear 'REVERSE'"):
         kit.driver_shifts(Gear.REVERSE, 10**12)

@@ -70,7 +70,7 @@ def test_generation_1_reports_of_a_drive() -> None:
 
 
 def test_generation_2_reports_of_a_drive() -> None:
-    """In generation 2 the reports contain the same values, with the state active, a counter and a checksum."""
+    """In generation 2 the reports contain the same values, and also the state "active", a counter and a checksum."""
     rig = driving_rig(2)
     rig.command(angle_deg=-45.0)
     rig.set_motion(10.0, steering_rad=math.radians(10.0))
@@ -137,7 +137,7 @@ def test_generation_1_reports_an_override() -> None:
     ],
 )
 def test_faults_have_their_bits(name: str, identifier: int, byte: int, bit: int) -> None:
-    """A fault sets exactly the bit of this fault."""
+    """A fault changes only its own bit and the bit "ready"."""
     rig = KitRig(1 if identifier < 0x100 else 2)
     before = dict(collect_reports(rig))[identifier]
     rig.kit.set_fault(name, rig.now_ns)
@@ -147,7 +147,7 @@ def test_faults_have_their_bits(name: str, identifier: int, byte: int, bit: int)
     expected = [0] * len(before)
     expected[byte] = 1 << bit | ready
     if identifier == 0x067:
-        expected[1] = 0x80  # not ready
+        expected[1] = 0x80  # the bit "ready" of generation 1's gear report
     assert changed[:6] == expected[:6]
     if identifier < 0x100:
         assert changed == expected
@@ -170,12 +170,12 @@ def test_generation_2_reports_why_it_disengaged() -> None:
         state = 0 if name == "override" else 7
         assert rig.last[0x106][:3] == bytes([state | 2 << 4, reason, reason])
         found[name] = rig.last[0x100][5] | (rig.last[0x100][6] & 0x0F) << 8
-    ready, timeout, bad_crc, bad_rc, active, latched = 1, 1 << 3, 1 << 4, 1 << 5, 1 << 6, 1 << 8
+    ready, timeout, bad_crc, bad_count, override_active, override_latched = 1, 1 << 3, 1 << 4, 1 << 5, 1 << 6, 1 << 8
     assert found == {
         "timeout": ready | timeout,
         "crc": ready | timeout | bad_crc,
-        "counter": ready | timeout | bad_rc,
-        "override": timeout | active | latched,
+        "counter": ready | timeout | bad_count,
+        "override": timeout | override_active | override_latched,
     }
 
 

@@ -15,9 +15,9 @@ from lavt.recording.record import Record
 from lavt.recording.table import MISSING, IntArray, Table
 
 STEP_LIMIT_MS = 5.0
-"""If the wall clock changes by more than this relative to the monotonic clock between two samples, it was set. Fast
-steering is not a step, because it changes both clocks (clock_gettime(2))."""
-POLL_LIMIT_S = 2.5
+"""If the wall clock changes by more than this relative to the monotonic clock between two samples, it was set.
+Slewing is not a step, however fast, because it changes both clocks (clock_gettime(2))."""
+SAMPLE_GAP_LIMIT_S = 2.5
 """The longest time between two samples of a clock. Clocks are sampled every second, so one missing sample is
 allowed."""
 CLOCK_BOUND_LIMIT_MS = 2.0
@@ -25,9 +25,9 @@ CLOCK_BOUND_LIMIT_MS = 2.0
 PATH_LIMIT_MS = 1.0
 """If NTP's round trip is longer than the probe's by more than this, NTP does not take the probe's path."""
 NO_SAMPLE_LIMIT_POLLS = 5
-"""After this many polls without a good sample, chrony only extrapolates."""
+"""The longest time without a good sample, in poll intervals; after it, chrony only extrapolates."""
 NO_SAMPLE_ALLOWED_S = 5.0
-"""A shorter time without a good sample is accepted at any poll interval, because a busy machine loses some samples."""
+"""The limit is at least this time, however short the poll interval is, because a busy machine loses some samples."""
 
 Sides = tuple[tuple[str, Table, Table, IntArray], ...]
 """For each side: its name, its clock samples, the other side's samples, and the drive's start and end on the wall clock
@@ -63,7 +63,7 @@ def _step_ms(samples: Table, drive_ns: tuple[int, int]) -> float | None:
     return float(jumps_ms[np.argmax(np.abs(jumps_ms))])
 
 
-def poll_reasons(server: Record, client: Record, began_ns: int, ended_ns: int) -> list[InvalidReason]:
+def sampling_reasons(server: Record, client: Record, began_ns: int, ended_ns: int) -> list[InvalidReason]:
     """Return a reason for each side without enough clock samples between the start and the end of the drive.
 
     Without samples the clock offset is only a guess.
@@ -74,19 +74,17 @@ def poll_reasons(server: Record, client: Record, began_ns: int, ended_ns: int) -
     client_began_ns, client_ended_ns = drive_on_client(server, client, began_ns, ended_ns)
     longest_gaps_ns = {
         "server": max(
-            *(
-                min(np.abs(server_ns - edge_ns).tolist(), default=ended_ns - began_ns)
-                for edge_ns in (began_ns, ended_ns)
-            ),
+            _nearest_sample_ns(server_ns, began_ns, if_none=ended_ns - began_ns),
+            _nearest_sample_ns(server_ns, ended_ns, if_none=ended_ns - began_ns),
             _longest_gap_ns(server_ns, began_ns, ended_ns),
         ),
         "client": _longest_gap_ns(client_ns, client_began_ns, client_ended_ns),
     }
-    limit_ns = POLL_LIMIT_S * NS_PER_S
+    limit_ns = SAMPLE_GAP_LIMIT_S * NS_PER_S
     reasons = [
         InvalidReason(
             InvalidCode.CLOCK_NOT_SAMPLED,
-            f"the clock of the {side} was not sampled for {gap_ns / NS_PER_S:.1f} s (limit {POLL_LIMIT_S} s)",
+            f"the clock of the {side} was not sampled for {gap_ns / NS_PER_S:.1f} s (limit {SAMPLE_GAP_LIMIT_S} s)",
         )
         for side, gap_ns in longest_gaps_ns.items()
         if gap_ns > limit_ns
@@ -99,6 +97,11 @@ def poll_reasons(server: Record, client: Record, began_ns: int, ended_ns: int) -
         text = f"the clock samples of the client cover {covered_s:.1f} s of a drive of {drive_s:.1f} s"
         reasons.append(InvalidReason(InvalidCode.CLOCK_NOT_SAMPLED, text))
     return reasons
+
+
+def _nearest_sample_ns(sampled_ns: IntArray, at_ns: int, *, if_none: int) -> int:
+    """Return the time between `at_ns` and the nearest sample; `if_none` without samples."""
+    return int(np.min(np.abs(sampled_ns - at_ns))) if len(sampled_ns) else if_none
 
 
 def _longest_gap_ns(sampled_ns: IntArray, began_ns: int, ended_ns: int) -> int:
@@ -178,7 +181,7 @@ def _path_reasons(sides: Sides, clocks: RunClocks) -> list[InvalidReason]:
 
 
 def _no_sample_reasons(sides: Sides) -> list[InvalidReason]:
-    """Return a reason for each side whose NTP accepted no sample for too long, in a time that overlaps the drive."""
+    """Return a reason for each side whose NTP accepted no sample for too long; the time must overlap the drive."""
     reasons = []
     for side, samples, _, drive_ns in sides:
         time_and_limit = _longest_without_sample_s(samples, drive_ns)
@@ -193,7 +196,7 @@ def _no_sample_reasons(sides: Sides) -> list[InvalidReason]:
 
 
 def _longest_without_sample_s(samples: Table, drive_ns: IntArray) -> tuple[float, float] | None:
-    """Return the time without a good sample that exceeds its limit most, and this limit; None if no time exceeds it."""
+    """Return the time without a good sample and its limit, where it exceeds this limit most; None if it never does."""
     began_ns, ended_ns = drive_ns
     good_counts = samples.ints("good_samples")
     is_known = (good_counts != MISSING) & np.isfinite(samples.floats("poll_s")) & (samples.ints("wall_ns") != MISSING)

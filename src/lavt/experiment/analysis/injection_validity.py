@@ -40,11 +40,11 @@ def recorded_reasons(
     """
     began_ns, ended_ns, _ = driving_interval(server)
     if not condition:
-        names = set(_samples_in_force(server.table("injection"), began_ns, ended_ns).texts("condition")) - {""}
+        names = set(_samples_covering(server.table("injection"), began_ns, ended_ns).texts("condition")) - {""}
         text = "condition {} was in force on the server, but this run did not request it"
         return [InvalidReason(InvalidCode.INJECTION_NOT_REQUESTED, text.format(name)) for name in names]
     samples = {
-        "server": _samples_in_force(server.table("injection"), began_ns, ended_ns),
+        "server": _samples_covering(server.table("injection"), began_ns, ended_ns),
         "client": client.table("injection"),
     }
     reasons = []
@@ -67,8 +67,11 @@ def recorded_reasons(
     return reasons + [not_measured(flow) for flow in unmeasured]
 
 
-def _samples_in_force(table: Table, began_ns: int, ended_ns: int) -> Table:
-    """Return the samples of an interval, and the last sample before it; without the latter, return no samples."""
+def _samples_covering(table: Table, began_ns: int, ended_ns: int) -> Table:
+    """Return the samples of an interval and the last sample before it; none if there is no sample before it.
+
+    The sample before the interval shows which condition was in force at its beginning.
+    """
     mono_ns = table.ints("mono_ns")
     before_ns = mono_ns[mono_ns <= began_ns]
     first_ns = before_ns.max() if len(before_ns) else ended_ns + 1

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from lavt.domain import NS_PER_MS
-from lavt.experiment.analysis.clock_validity import offset_reasons, poll_reasons, step_reasons
+from lavt.experiment.analysis.clock_validity import offset_reasons, sampling_reasons, step_reasons
 from lavt.experiment.analysis.invalid_reason import InvalidCode, InvalidReason, not_measured
 from lavt.experiment.analysis.latency import frames_within
 from lavt.experiment.analysis.metrics import RunMeasurement, driving_interval, last_count
@@ -56,7 +56,7 @@ def _clock_reasons(server: Record, client: Record, measured: RunMeasurement) -> 
     If a clock was set, offset and closure are wrong as a consequence, and give no further reasons.
     """
     began_ns, ended_ns, _ = driving_interval(server)
-    polls = poll_reasons(server, client, began_ns, ended_ns)
+    polls = sampling_reasons(server, client, began_ns, ended_ns)
     steps = step_reasons(server, client, measured.clocks, began_ns, ended_ns)
     if steps:
         return [*steps, *polls]

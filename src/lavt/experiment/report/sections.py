@@ -149,7 +149,9 @@ def conditions_parts(report: ReportContext) -> Parts:
         for name, make in (("driving", driving_table), ("latency", latency_table), ("error", error_table)):
             parts.append(save_table(report.directory, f"conditions_{kind}_{name}", make(conditions, paper)))
     has_roads = any(
-        entry.get("completion_such_roads") for conditions in report.kinds.values() for entry in conditions.values()
+        entry.get("completion_interval_over_roads")
+        for conditions in report.kinds.values()
+        for entry in conditions.values()
     )
     has_paper = any(report.paper(conditions) for conditions in report.kinds.values())
     return [

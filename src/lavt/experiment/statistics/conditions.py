@@ -49,7 +49,7 @@ def summarize_condition(all_runs: Sequence[Run], distances: CommonDistances) -> 
     curves = {name: survival(routes[name]) for name in sorted(routes)}
     return {
         **completion(runs),
-        "completion_such_roads": bootstrap_interval(road_rates(runs)),
+        "completion_interval_over_roads": bootstrap_interval(road_rates(runs)),
         "endings": dict(sorted(Counter(str(run["ending"]) for run in runs).items())),
         "routes": {name: _summarize_route(routes[name], distances) for name in sorted(routes)},
         "collisions_per_run": _mean([run["collisions"] for run in runs]),
@@ -118,7 +118,7 @@ def group_by(runs: Iterable[Run], key: str) -> dict[str, list[Run]]:
 def common_distances(runs: Sequence[Run]) -> CommonDistances:
     """Return for each route, repetition and seed the distance, in units of 10 m, that all its valid runs reached."""
     distances: dict[tuple[Any, ...], int] = {}
-    for run in runs:
+    for run in runs:  # `p95_by_10m` has an entry for each 10 m of the run
         if run["valid"] and run.get("p95_by_10m") is not None:
             key, distance = _start_key(run), len(run["p95_by_10m"])
             distances[key] = min(distances.get(key, distance), distance)
@@ -126,7 +126,7 @@ def common_distances(runs: Sequence[Run]) -> CommonDistances:
 
 
 def common_p95_m(runs: Sequence[Run], distances: CommonDistances) -> list[float]:
-    """Return the P95 of each run up to its common distance; runs whose common distance is 0 are left out."""
+    """Return the P95 error of each run up to its common distance; runs whose common distance is 0 are left out."""
     runs_and_distances = [(run, distances.get(_start_key(run), 0)) for run in runs if run.get("p95_by_10m")]
     return [float(run["p95_by_10m"][distance - 1]) for run, distance in runs_and_distances if distance]
 

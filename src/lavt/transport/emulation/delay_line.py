@@ -56,7 +56,7 @@ def _jitter_stream(seed: int, name: str) -> IndexedStream:
 
 
 class DelayLine:
-    """A queue that delays items and keeps their order. Its `EmulatedLink` can also drop, spread or reorder items."""
+    """A queue that delays items and keeps their order. Its `EmulatedLink` can also drop, reorder or pace items."""
 
     def __init__(self, delay: DelayModel, link: EmulatedLink | None = None) -> None:
         self.delay = delay

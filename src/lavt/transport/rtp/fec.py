@@ -256,8 +256,8 @@ HEAVY_LOSS_WINDOW_NS: Final = 5 * NS_PER_S
 """Some thousand packets at 2 Mb/s. In such a window one lost packet is not heavy loss, and heavy loss is detected
 within seconds."""
 HEAVY_LOSS_PER_MILLE: Final = 25
-"""From this loss rate on, one repair packet leaves more than 2 % of frames damaged (computed: two or more of 8 media
-packets and 1 repair packet are lost)."""
+"""The smallest loss rate that counts as heavy. From it on, one repair packet a block is not enough: more than 2 % of
+frames remain damaged (computed: of 8 media packets and 1 repair packet, two or more are lost)."""
 
 
 class _LossNote(NamedTuple):
@@ -322,7 +322,7 @@ def _parse_repair(packet: RtpPacket) -> tuple[_BlockHeader, int, bytes]:
 
 
 def _to_symbol(payload: bytes) -> bytes:
-    """Return a payload with its length in front: the code pads symbols, so the length would be lost."""
+    """Return a payload with its length in front, because the erasure code pads symbols to the same length."""
     return len(payload).to_bytes(_LENGTH_BYTES, "big") + payload
 
 

@@ -10,16 +10,19 @@ The number counts the client's hellos; challenge and answer repeat it. MAC is HM
 before it. The cookie is an address-validation cookie (compare RFC 9000, section 8.1): HMAC-SHA256, cut to 16 bytes,
 over number, time and the address *from which the server received the hello*, under a secret that never leaves the
 server and changes with each token. Behind a NAT or a relay the client cannot know that address, so it returns the
-cookie, and the server accepts the cookie only from that address. The server keeps only the highest number and up to
-four addresses of it, however many hellos arrive.
+cookie, and the server accepts the cookie only from that address. However many hellos arrive,
+the server stores only the highest number and the first four addresses from which the hello with this number came.
+
+These are the possible attacks, and why they fail:
 
 * Aiming the video at a third party: the third party's address must answer a challenge that was sent only there. Even an
   attacker who has the token cannot answer it.
-* Redirecting the video by a forged hello or answer: the attacker needs the token. A hello opens or moves no path, and a
-  hello without a valid MAC gets no reply. No reply is longer than the datagram that caused it.
-* Replaying a hello: a hello with a lower number than the highest gets no challenge, and the client answers one
-  challenge to each of its hellos. The newest hello gets up to four challenges, to different addresses: a copy that
-  arrives first from elsewhere does not prevent the challenge to the client.
+* Redirecting the video by a forged hello or answer: the attacker needs the token. A hello alone neither opens nor
+  moves a path: only the answer does. A hello without a valid MAC gets no reply. No reply is longer than the datagram
+  that caused it.
+* Replaying a hello: a hello with a lower number than the highest gets no challenge. Copies of the newest hello from
+  different addresses get up to four challenges, so a copy that arrives first does not prevent the challenge to the
+  client. The client answers only the first challenge to each of its hellos.
 * Replaying an answer: an answer is valid only from the address in its cookie, for 2 s, and if its challenge is newer
   than the challenge that opened the path. A restart or a new token invalidates all older cookies.
 * Forcing either end to change its keys: the server does not change the key of a path that is already open to the
@@ -54,7 +57,9 @@ HELLO_AGAIN_NS: Final = 150 * NS_PER_MS
 """Once video has arrived: time without video until the next hello. It is half of the time after which a vehicle becomes
 degraded: a client whose address changes has its video back before the vehicle is stopped."""
 CHALLENGE_LIFETIME_NS: Final = 2 * NS_PER_S
+"""A challenge must be answered within this time."""
 REPORT_TIMEOUT_NS: Final = 2 * NS_PER_S
+"""The path closes if no receiver report arrives from its address for longer than this."""
 
 _MAGIC: Final = b"LAVT"
 _VERSION: Final = 3
@@ -250,9 +255,10 @@ class PathServer:
             self.foreign_reports += 1
 
     def accepts_rtcp_from(self, address: Address) -> bool:
-        """Return whether RTCP from `address` is accepted: the path was open to it at the last check.
+        """Return whether RTCP from `address` is accepted, that is, whether the path is open to it.
 
-        It is safe to call this from any thread.
+        A path that has timed out counts as open until the next call of `open_address`. It is safe to call this from any
+        thread.
         """
         return self._address == address
 
@@ -270,7 +276,7 @@ class PathServer:
         return True
 
     def is_open_to_host(self, host: str) -> bool:
-        """Return whether the path was open to any port of `host` at the last check; safe to call from any thread."""
+        """Return whether the path is open to any port of `host`; see `accepts_rtcp_from` for time-out and threads."""
         address = self._address
         return address is not None and address[0] == host
 

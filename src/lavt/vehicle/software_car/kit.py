@@ -211,7 +211,7 @@ class Kit:
 
     def driver_shifts(self, gear: Gear, now_ns: int) -> None:
         """Move the shifter as the driver. Raises `UserError` for a gear that the car does not have."""
-        check_known(gear.name, {known_gear.name for known_gear in GEARS}, "gear of this car")
+        check_known(gear.name, {known_gear.name for known_gear in GEARS}, "available gear")
         self._advance(now_ns)
         state = self.state
         state.gear = gear
@@ -235,7 +235,7 @@ class Kit:
 
     def set_unknown(self, name: str, *, is_unknown: bool = True) -> None:
         """Report `angle`, `speed` or `wheel_speed` as unknown, or as known again."""
-        check_known(name, REPORTED_VALUES, "value that can be unknown")
+        check_known(name, REPORTED_VALUES, "reported value")
         (self.state.invalid.add if is_unknown else self.state.invalid.discard)(name)
 
     def stick_speed(self, source: str, speed_mps: float | None = None) -> None:
