@@ -166,57 +166,27 @@ def test_arrival(open_port: Callable[..., CanPort]) -> None:
     assert before_ns - NS_PER_MS < taken[0].arrived_ns < now_ns()
 
 
-def test_frames_that_the_ports_thread_has_not_read(
-    open_port: Callable[..., CanPort], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_take_reads_the_frames_that_wait(open_port: Callable[..., CanPort], monkeypatch: pytest.MonkeyPatch) -> None:
     """`take` returns frames that have arrived even if the port's thread has not run since, which may wait its turn."""
-
-    def never_readable(*_: object) -> bool:
-        pause(10 * NS_PER_MS)
-        return False
-
-    monkeypatch.setattr(CanPort, "_is_readable", never_readable)
+    monkeypatch.setattr(bus_module, "READ_PERIOD_S", DEADLINE_S)
     options = {"interface": "udp_multicast", "channel": GROUP, "port": free_port()}
     one, other = open_port(**options), open_port(**options)
+    pause(50 * NS_PER_MS)  # both threads have begun their pauses
     one.send([STEERING, BRAKE], now_ns())
-    assert receive(other, 2) == [STEERING, BRAKE]
+    assert [received.frame for received in other.take(0)] == [STEERING, BRAKE]
 
 
-def test_a_frame_that_waited_is_not_newer_if_take_reads_it(
-    open_port: Callable[..., CanPort], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The port's thread, which runs while `take` reads a frame, does not make the frame's arrival later."""
-    is_readable = CanPort._is_readable
-    resumed, parked = threading.Event(), threading.Event()
-    resumed.set()
-
-    def wait_first(port: CanPort, bus: bus_module.OpenBus) -> bool:
-        parked.set()
-        resumed.wait(DEADLINE_S)
-        return is_readable(port, bus)
-
-    monkeypatch.setattr(CanPort, "_is_readable", wait_first)
+def test_the_ports_thread_reads_frames_that_nobody_takes(open_port: Callable[..., CanPort]) -> None:
+    """The kernel's buffer is emptied even if `take` is not called, and the frames keep their times of arrival."""
     options = {"interface": "udp_multicast", "channel": GROUP, "port": free_port()}
-    port, other = open_port(**options), open_port(**options)
-    assert port._bus is not None
-    driver = port._bus.driver
-    read = driver.recv
-
-    def read_slowly(timeout_s: float | None = None) -> can.Message | None:
-        message = read(timeout_s)
-        resumed.set()
-        pause(20 * NS_PER_MS)
-        return message
-
-    monkeypatch.setattr(driver, "recv", read_slowly)
-    resumed.clear()
-    parked.clear()
-    until(parked.is_set)
-    pause(150 * NS_PER_MS)  # both threads have left their waits for a frame
+    one, other = open_port(**options), open_port(**options)
     sent_ns = now_ns()
-    other.send([STEERING], sent_ns)
-    pause(150 * NS_PER_MS)
-    [received] = port.take(0)
+    one.send([STEERING], sent_ns)
+    bus = other._bus
+    assert bus is not None
+    until(lambda: len(bus.received) == 1)
+    pause(200 * NS_PER_MS)
+    [received] = other.take(0)
     assert received.arrived_ns - sent_ns < 100 * NS_PER_MS
 
 

@@ -40,9 +40,12 @@ POLL_S: Final = 0.1
 """Period at which the port's thread checks whether the port was closed."""
 CLOSE_TIMEOUT_S: Final = 1.0
 """`close` waits at most this long for the port's thread. A thread that a driver blocks for longer keeps running."""
-MAX_DIRECT_READS: Final = 256
-"""The largest number of frames that a call of `take` reads from the bus: 60 ms of a full 500 kbit/s bus. The port's
-thread reads all other frames."""
+READ_PERIOD_S: Final = 0.05
+"""Period at which the port's thread reads frames with the kernel's time of arrival, if `take` is not called meanwhile:
+the kernel keeps some 250 frames, a twentieth of a second of a full bus. A read of each frame as it arrives would use a
+fifth of a slow processor."""
+MAX_READS: Final = 256
+"""The most frames that are read at a time, so that a flood does not delay the caller of `take`."""
 LATEST_READ_NS: Final = NS_PER_S
 """A frame that is read later than this after its arrival is dropped, because this process was frozen."""
 
@@ -138,12 +141,17 @@ class CanPort:
     def take(self, now_ns: int) -> list[ReceivedCanFrame]:  # noqa: ARG002 (other ports need it)
         """Return the frames received since the last call, in order. Raises `BusGone` if the bus is lost.
 
-        The frames that this port sent are not among them. Frames with the kernel's time of arrival are also returned if
-        the port's thread has not read them yet, because it waits for a processor.
+        The frames that this port sent are not among them.
         """
         self._check_suspension()
-        if (bus := self._bus) is not None and self._interface in STAMPED_BY_KERNEL:
-            self._read_waiting(bus)
+        bus = self._bus
+        if bus is not None and self._interface in STAMPED_BY_KERNEL and bus.reading.acquire(blocking=False):
+            try:
+                self._read_waiting(bus)
+            except Exception as error:  # of any driver
+                self._lose_broken(bus, error)
+            finally:
+                bus.reading.release()
         bus = self._bus
         if bus is None:
             raise BusGone(self._gone_reason)
@@ -202,9 +210,10 @@ class CanPort:
             while self._bus is bus and not self._closing.is_set():
                 if self._interface not in STAMPED_BY_KERNEL:
                     self._read_frame(bus, POLL_S)
-                elif self._is_readable(bus):
-                    with bus.reading:
-                        self._read_frame(bus, 0)
+                    continue
+                with bus.reading:
+                    self._read_waiting(bus)
+                self._closing.wait(READ_PERIOD_S)
         except Exception as error:  # of any driver
             self._lose_broken(bus, error)
         finally:
@@ -213,18 +222,13 @@ class CanPort:
             bus.shut_down()
 
     def _read_waiting(self, bus: OpenBus) -> None:
-        """Read the frames that wait, unless the port's thread is reading one."""
-        if not bus.reading.acquire(blocking=False):
-            return
-        try:
-            for _ in range(MAX_DIRECT_READS):
-                if not select.select([bus.driver.fileno()], [], [], 0)[0]:
-                    break
-                self._read_frame(bus, 0)
-        except Exception as error:  # of any driver
-            self._lose_broken(bus, error)
-        finally:
-            bus.reading.release()
+        """Read the frames that wait; the caller holds `bus.reading`."""
+        for _ in range(MAX_READS):
+            now = self._clock.now()
+            if not select.select([bus.driver.fileno()], [], [], 0)[0]:
+                bus.arrivals.note_empty(now)
+                return
+            self._read_frame(bus, 0)
 
     def _lose_broken(self, bus: OpenBus, error: Exception) -> None:
         if self._bus is bus:
@@ -246,16 +250,6 @@ class CanPort:
             return
         if message is not None:
             self._receive(message, self._clock.now(), bus)
-
-    def _is_readable(self, bus: OpenBus) -> bool:
-        """Wait for a frame for at most `POLL_S` of the monotonic clock; python-can's timeouts use the wall clock."""
-        descriptors = [bus.driver.fileno()]
-        with bus.reading:  # while `take` reads a frame, the queue can be empty although that frame is not noted yet
-            now = self._clock.now()
-            if select.select(descriptors, [], [], 0)[0]:
-                return True
-            bus.arrivals.note_empty(now)
-        return bool(select.select(descriptors, [], [], POLL_S)[0])
 
     def _receive(self, message: Message, now: Now, bus: OpenBus) -> None:
         if self._mark is not None and message.channel == self._mark:
