@@ -31,10 +31,12 @@ from tests.field.by_wire import (
 from tests.kernel.lane import processes
 from tests.kernel.lane.driving import BY_WIRE, LoopPrograms, collect, start_by_wire, wait_for_end
 from tests.kernel.lane.machine import Machine, MachineError, wait_until
+from tests.kernel.lane.processor_use import ProcessorUse, measured_processor
 from tests.kernel.lane.verdicts import (
     KIT_STALL_MS,
-    require_completed,
+    explain_state,
     require_valid,
+    safe_stop_ns,
     safety_changes,
     shortest_stall_ms,
 )
@@ -121,6 +123,7 @@ class ActiveDrive:
     out: Path
     actuator_pid: int
     stalls: Stalls
+    processor: ProcessorUse
 
     def wait_until_driving(self) -> None:
         """Wait until the vehicle drives at speed; an earlier stop is a fault, unless the host stalled."""
@@ -144,7 +147,8 @@ class ActiveDrive:
         else:
             stall_ms = shortest_stall_ms(str(status["reason"]))
             failure = self.stalls.verdict(message, since_ns, now_ns, stall_ms=stall_ms)
-        return excuse_slow_machine(failure, self.stalls, since_ns, now_ns)
+        failure = excuse_slow_machine(failure, self.stalls, since_ns, now_ns)
+        return self.processor.verdict(failure, now_ns if braked_ns is None else braked_ns)
 
     def reason(self) -> str:
         """Return the server's reason for the stop."""
@@ -176,12 +180,16 @@ class CanLab:
         if not (self.proof_folder / f"{profile}.json").exists():
             run_watchdog_test(self.server, changes, self.stalls)
         out = self.work / "drive"
-        with software_car(BY_WIRE, *set_arguments(changes), stalls=self.stalls, stall_ms=KIT_STALL_MS) as car:
+        car_settings = set_arguments(changes)
+        with (
+            measured_processor() as processor,
+            software_car(BY_WIRE, *car_settings, stalls=self.stalls, stall_ms=KIT_STALL_MS) as car,
+        ):
             client = ("clock.source=probe", *SMALL_PICTURES)
             loop = start_by_wire(self.server, self.client, out, server_changes=changes, client_changes=client)
             try:
                 active_drive = ActiveDrive(
-                    car, loop, out, loop.server.first_line()["ready"]["actuator_pid"], self.stalls
+                    car, loop, out, loop.server.first_line()["ready"]["actuator_pid"], self.stalls, processor
                 )
                 active_drive.wait_until_driving()
                 yield active_drive
@@ -224,11 +232,13 @@ def test_drive_over_can_completes(profile: str, lab: CanLab, report_measurement:
         braked_ns = active_drive.car.watchdog_braked_ns()
     measurements = f"{profile}: {describe_result(drive.result)}; {'; '.join(safety_changes(drive))}"
     report_measurement(measurements)
-    if drive.result["ending"] != "completed" and braked_ns is not None:
-        raise excuse_slow_machine(
-            active_drive.car.unexpected_release(braked_ns, measurements), lab.stalls, since_ns, braked_ns
-        )
-    require_completed(drive, lab.stalls)
+    if drive.result["ending"] != "completed":
+        stopped_ns = safe_stop_ns(drive) if braked_ns is None else braked_ns
+        failure = explain_state(drive, lab.stalls, "safe_stop", measurements)
+        if braked_ns is not None:
+            failure = active_drive.car.unexpected_release(braked_ns, measurements)
+        failure = excuse_slow_machine(failure, lab.stalls, since_ns, stopped_ns)
+        raise active_drive.processor.verdict(failure, stopped_ns)
     require_valid(drive, lab.stalls)
     assert drive.result["p95_m"] <= MAX_P95_M
     wheel = command_to_wheel_stage(drive.result)

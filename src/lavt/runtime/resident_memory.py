@@ -11,6 +11,10 @@ from typing import Final
 MCL_CURRENT: Final = 1
 MCL_FUTURE: Final = 2
 """Flags of mlockall(2) on x86 and ARM."""
+M_TOP_PAD: Final = -2
+HEAP_STEP_BYTES: Final = 64 * 1024
+"""The heap grows by this much at a time (mallopt(3)). Locked memory is loaded when the heap grows, so a large step
+would stop the caller for a while."""
 CAP_IPC_LOCK: Final = 14
 """With this capability, the limit on locked memory does not apply (capabilities(7))."""
 
@@ -24,7 +28,10 @@ def lock_memory() -> str:
     reason = lift_lock_limit()
     if reason:
         return reason
-    if ctypes.CDLL(None, use_errno=True).mlockall(MCL_CURRENT | MCL_FUTURE) != 0:
+    library = ctypes.CDLL(None, use_errno=True)
+    if hasattr(library, "mallopt"):  # glibc
+        library.mallopt(M_TOP_PAD, HEAP_STEP_BYTES)
+    if library.mlockall(MCL_CURRENT | MCL_FUTURE) != 0:
         return f"mlockall failed: {os.strerror(ctypes.get_errno())}"
     return ""
 

@@ -84,6 +84,12 @@ def shortest_stall_ms(reason: str) -> float:
     return min(limits_ms) - MARGIN_MS if limits_ms else STOP_STALL_MS
 
 
+def safe_stop_ns(drive: DriveResult) -> int:
+    """Return when the first safe stop began, or the end of the record if there was none."""
+    at_ns = next((at_ns for at_ns, detail in _safety(drive) if "-> safe_stop" in detail), None)
+    return max(driving_interval(drive.server)[:2]) if at_ns is None else at_ns
+
+
 def safety_changes(drive: DriveResult) -> list[str]:
     """Return the changes of the safety state in order."""
     return [detail for _, detail in _safety(drive)]
