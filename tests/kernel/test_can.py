@@ -53,7 +53,7 @@ pytestmark = [
     pytest.mark.flaky(reruns=UNEXPLAINED_RERUNS, rerun_except="^(?!HostStalled:|UnexplainedStop:)"),
 ]
 """A drive that stops early is repeated: on some hosts a program of the first machine waits up to 0.15 s for its
-processor, more often than the probes explain. A fault that stops every drive, or most of them, still fails the tests."""
+processor, more often than the probes explain. A fault that stops every drive, or most of them, fails the tests."""
 
 ReportMeasurement = Callable[[str], None]
 

@@ -41,9 +41,8 @@ POLL_S: Final = 0.1
 CLOSE_TIMEOUT_S: Final = 1.0
 """`close` waits at most this long for the port's thread. A thread that a driver blocks for longer keeps running."""
 READ_PERIOD_S: Final = 0.05
-"""Period at which the port's thread reads frames with the kernel's time of arrival, if `take` is not called meanwhile:
-the kernel keeps some 250 frames, a twentieth of a second of a full bus. A read of each frame as it arrives would use a
-fifth of a slow processor."""
+"""Period at which the port's thread reads frames with the kernel's time of arrival, if `take` is not called meanwhile.
+In between, the kernel keeps them."""
 MAX_READS: Final = 256
 """The most frames that are read at a time, so that a flood does not delay the caller of `take`."""
 LATEST_READ_NS: Final = NS_PER_S
