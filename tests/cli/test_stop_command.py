@@ -62,8 +62,8 @@ def test_a_stop_is_repeated_until_it_is_confirmed() -> None:
     assert vehicle.numbers == [60] * 5
 
 
-def test_a_stop_that_was_cleared_is_made_again() -> None:
-    """If the stop was executed and cleared before a confirmation arrived, it is made again, with a new number."""
+def test_a_stop_that_was_cleared_gets_a_new_number() -> None:
+    """If the stop was executed and cleared before a confirmation arrived, it is sent with a new number."""
     vehicle = Vehicle(None, encode(replace(REJECTED, emergency_stop=60)), None, encode(ACCEPTED))
     repeat(vehicle)
     assert vehicle.numbers == [60, 60, 61, 61]

@@ -203,7 +203,10 @@ def test_another_emergency_stop_is_not_cleared() -> None:
     after_driving = clearing_session()
     after_driving.handle_state(state("driving"), 400)
     after_driving.handle_state(state("emergency_stop"), 500)
-    for session in (later, while_waiting, own, after_driving):
+    none_at_first = ClientSession("alice", 7, rearm=False, start_ns=100, clear_stop=True)
+    none_at_first.handle_reply(GRANTED, 200)
+    none_at_first.handle_state(state("emergency_stop"), 300)  # of number 0, which stands for no stop in replies
+    for session in (later, while_waiting, own, after_driving, none_at_first):
         operations = {take_operation(session, number * NS_PER_S) for number in range(1, 10)}
         assert "clear_emergency_stop" not in operations
 

@@ -307,7 +307,7 @@ class Stalls:
 
 
 class SharedResult(Generic[Result]):
-    """A result that several tests judge, such as a drive. After a stall the result is made again, at most twice."""
+    """A result that several tests judge, such as a drive. After a stall it is computed again, at most twice."""
 
     def __init__(self, stalls: Stalls, make: Callable[[], Result]) -> None:
         self._stalls, self._make = stalls, make

@@ -115,7 +115,7 @@ class ClientSession:
         """Process the server's reply to a request."""
         self._update_reason(reply)
         if self._looks_for_stop:
-            self._looks_for_stop, self._stop_to_clear = False, reply.emergency_stop
+            self._looks_for_stop, self._stop_to_clear = False, reply.emergency_stop or None
         elif reply.emergency_stop != self._stop_to_clear:  # there was another stop since: a person must decide again
             self._stop_to_clear = None
         if reply.emergency_stop == self.emergency_stop:

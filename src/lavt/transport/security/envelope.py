@@ -75,10 +75,7 @@ class _SessionMacs:
 
 
 def _signed_part(data: bytes) -> bytes:
-    """Return the part before MAC and signature, unverified; empty if the envelope is too short or too long.
-
-    An empty part has no valid signature, because nobody signs one.
-    """
+    """Return the part before MAC and signature, unverified; empty, which nobody signs, if the size is wrong."""
     return data[:-TRAILER_BYTES] if len(data) <= MAX_ENVELOPE_BYTES else b""
 
 
@@ -204,8 +201,7 @@ class VehicleAuthenticator(NullVehicleAuthenticator):
             return None
         is_next = counter == self._replay_counter(channel, operator)
         self._accepted_requests[channel, operator] += is_next
-        # An emergency stop cannot wait for a second request. A replay does no harm: a stop has a number, and the
-        # vehicle executes the stop of one number only once.
+        # An emergency stop cannot wait for a second request; the vehicle executes each number once, also in replays.
         must_retry = body == b"" or not (is_next or _is_emergency_stop(channel, body))
         self._counts[f"{channel}_requests_with_wrong_counter"] += must_retry and body != b""
         secret, own_public = agreed
@@ -277,8 +273,8 @@ class VerifiedState(Struct, frozen=True):
 
     body: bytes | None
     needs_request: bool
-    """The state has a valid signature, but is from a process of the server that has not yet answered a request of this
-    client, so it could be a replay. The client must send a request."""
+    """The client must send a request: the server's process that signed the state has answered none of its requests yet,
+    so the state could be a replay."""
 
 
 class OperatorAuthenticator:
