@@ -31,7 +31,8 @@ NTP_PORT = 11123
 CLOCK = MachineClock()
 CLIENT_NTP_CODES = (InvalidCode.NTP_THROUGH_DELAY, InvalidCode.NTP_NO_SAMPLE)
 SHIFT_LIMIT_MS = 2
-PAPER_CONDITIONS = ("L0", "L1", "L2", "L3", "L4", "L5")
+BASE_CONDITION = "L0"
+DELAYED_CONDITIONS = ("L2", "L5")
 SMALL_PICTURES = ("camera.width_px=320", "camera.height_px=240", "camera.rate_hz=15")
 """A user-mode kernel has one processor and slow system calls. Its times vary less if pictures are small."""
 SHORT_DRIVE = (
@@ -128,7 +129,7 @@ def test_latencies_of_a_drive_are_true(
 
 
 @pytest.mark.usefixtures("chrony")
-def test_each_condition_shifts_latencies_by_its_delay(
+def test_conditions_shift_latencies_by_their_delay(
     drive: DriveOnce,
     truth: TrueOffsetSamples,
     server_machine: Machine,
@@ -137,7 +138,7 @@ def test_each_condition_shifts_latencies_by_its_delay(
     report_measurement: ReportMeasurement,
     stalls: Stalls,
 ) -> None:
-    """Under L0 to L5 the medians of tau_v and tau_c are those of L0 plus the injected delay within 2 ms."""
+    """Under L2 and L5 the medians of tau_v and tau_c are those of L0 plus the injected delay within 2 ms."""
     qdiscs = [machine.run(["tc", "qdisc", "show", "dev", "vec0"]) for machine in (server_machine, client_machine)]
 
     def median_ms(name: str) -> FloatArray:
@@ -151,8 +152,8 @@ def test_each_condition_shifts_latencies_by_its_delay(
         return np.array([finished_drive.result["tau_v_ms"]["p50"], finished_drive.result["tau_c_ms"]["p50"]])
 
     since_ns = CLOCK.now().mono_ns
-    base_ms = median_ms("L0")
-    for name in PAPER_CONDITIONS[1:]:
+    base_ms = median_ms(BASE_CONDITION)
+    for name in DELAYED_CONDITIONS:
         requested = conditions()[name]
         error_ms = median_ms(name) - base_ms - np.array([requested.video_ms, requested.control_ms])
         with stalls.excusing_failures(since_ns, share=MEDIAN_SHARE):
@@ -208,17 +209,14 @@ def test_ntp_through_delay_after_synchronisation_invalidates_the_run(
 
 
 @pytest.mark.usefixtures("chrony")
-@pytest.mark.parametrize("step_s", [1, -1])
-def test_wall_clock_step_changes_no_safety_state(
-    drive: DriveOnce, server_machine: Machine, step_s: int, stalls: Stalls
-) -> None:
-    """A step of the server's wall clock by 1 s during a drive changes no safety state, and the drive is invalid."""
+def test_wall_clock_step_changes_no_safety_state(drive: DriveOnce, server_machine: Machine, stalls: Stalls) -> None:
+    """If the server's wall clock steps back by 1 s during a drive, the drive is invalid but no safety state changes."""
     stepped_loops: list[LoopPrograms] = []
 
     def step(loop: LoopPrograms) -> None:
         if loop not in stepped_loops and loop.server.latest().get("status", {}).get("progress_m", 0) > 30:
             stepped_loops.append(loop)
-            server_machine.call(clocks.step, step_s * NS_PER_S)
+            server_machine.call(clocks.step, -NS_PER_S)
 
     finished_drive = drive(
         "stepped",
@@ -236,8 +234,7 @@ def test_wall_clock_step_changes_no_safety_state(
     assert changes[-1].endswith("the drive is over")
     reasons = invalid_reasons(finished_drive)
     assert [reason.code for reason in reasons] == [InvalidCode.CLOCK_STEP]
-    without_last_two_digits = f"{step_s * 1000:+d}"[:-2]
-    assert f"the wall clock of the server stepped by {without_last_two_digits}" in reasons[0].text
+    assert "the wall clock of the server stepped by -" in reasons[0].text
 
 
 def test_probe_alone_is_true_under_control_delay(
