@@ -78,7 +78,8 @@ def drive(
     return result
 
 
-@pytest.mark.parametrize("preset", ["designed", pytest.param("paper_calibrated", marks=pytest.mark.full)])
+@pytest.mark.full
+@pytest.mark.parametrize("preset", ["designed", "paper_calibrated"])
 def test_every_preset_drives_the_turn_at_60_ms(renderer: Renderer, preset: str) -> None:
     """Each preset completes the 90 degree turn and is within 0.2 m of the centre in 95 % of the frames."""
     result = drive(renderer, preset)

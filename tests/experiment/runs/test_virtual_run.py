@@ -235,7 +235,8 @@ def mirror(_number: int, picture: Picture) -> Picture:
     return np.ascontiguousarray(picture[:, ::-1])
 
 
-@pytest.mark.parametrize("change", [pytest.param(noisy_grey, marks=pytest.mark.full), grey])
+@pytest.mark.full
+@pytest.mark.parametrize("change", [noisy_grey, grey])
 def test_grey_pictures_stop_the_car(tmp_path: Path, change: Callable[[int, Picture], Picture]) -> None:
     """Grey pictures, noisy or constant, lead to a safe stop within 3 s."""
     out = tmp_path / "run"
@@ -255,6 +256,7 @@ def test_grey_pictures_stop_the_car(tmp_path: Path, change: Callable[[int, Pictu
     assert ending == "safe_stop"
 
 
+@pytest.mark.full
 def test_mirrored_pictures_make_the_car_leave_its_lane(tmp_path: Path) -> None:
     """Mirrored pictures make the car leave its lane: the controller depends on the pictures."""
     out = tmp_path / "run"
