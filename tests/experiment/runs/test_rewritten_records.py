@@ -134,7 +134,7 @@ def test_rewritten_records_are_evaluated_or_rejected(topics: Topics, tmp_path: P
 @pytest.mark.full
 def test_many_rewritten_records_are_evaluated_or_rejected(topics: Topics, tmp_path: Path) -> None:
     """Each of many random records is evaluated, or rejected with one sentence."""
-    assert check_mutations(topics, tmp_path, seed=2, count=1000) > 100
+    assert check_mutations(topics, tmp_path, seed=2, count=500) > 50
 
 
 @pytest.mark.parametrize(
