@@ -25,6 +25,10 @@ NS_PER_S = 1_000_000_000
 NS_PER_MS = 1_000_000
 NS_PER_US = 1_000
 
+MAX_REPORTED_MPS = 100.0
+MAX_ROAD_WHEEL_RAD = 1.0
+"""No vehicle is as fast, or turns its wheels as far. A vehicle that reports more has a fault."""
+
 PATH_STEP_M = 2.0
 PATH_POINTS = 10
 """A command contains the curvature of its planned path at 2, 4, ..., 20 m ahead of the rear axle."""

@@ -221,6 +221,29 @@ def test_rearm_does_not_follow_an_emergency_stop(restarted: bool) -> None:
     assert (session.phase, session.take_request(10 * NS_PER_S)) == ("stopped", None)
 
 
+@pytest.mark.parametrize("rearm", [False, True])
+@pytest.mark.parametrize("has_control", [False, True])
+@pytest.mark.parametrize("restarted", [False, True])
+def test_a_waiting_client_does_not_arm_after_an_emergency_stop(rearm: bool, has_control: bool, restarted: bool) -> None:
+    """After an emergency stop, a client that waits or arms does not drive, even if the server restarts."""
+    session = new_session(rearm=rearm)
+    session.handle_reply(GRANTED if has_control else replace(REJECTED, emergency_stop=0), 200)
+    session.handle_state(state("emergency_stop"), 300)
+    session.handle_state(replace(state("disarmed"), instance=2 if restarted else 0), 400)
+    assert (session.phase, session.may_command, session.take_request(10 * NS_PER_S)) == ("stopped", False, None)
+
+
+def test_an_emergency_stop_that_no_state_reported_is_noticed() -> None:
+    """A reply with another number than before tells of an emergency stop, which may have been cleared since."""
+    session = driving_session(rearm=True)
+    session.handle_state(state("safe_stop"), 400)
+    session.handle_state(state("safe_stop"), 410)
+    assert session.phase == "seeking"
+    session.handle_reply(replace(REJECTED, emergency_stop=71), 500)
+    session.handle_state(state("disarmed"), 600)
+    assert (session.phase, session.take_request(10 * NS_PER_S)) == ("stopped", None)
+
+
 NOTED = replace(GRANTED, epoch=0, token=b"")
 """The reply to a handover request or a release."""
 

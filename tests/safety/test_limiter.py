@@ -243,17 +243,26 @@ NUMBERS = st.floats(allow_nan=True, allow_infinity=True)
     st.tuples(NUMBERS, NUMBERS, NUMBERS),
     st.lists(st.tuples(NUMBERS, NUMBERS, st.booleans(), st.booleans()), min_size=1, max_size=5),
 )
-def test_whatever_a_vehicle_reports_the_output_is_finite(
+def test_whatever_a_vehicle_reports_the_output_is_within_limits(
     requested: tuple[float, float, float], reports: list[tuple[float, float, bool, bool]]
 ) -> None:
-    """For any speed, angle and request, finite or not, the limiter raises no exception and its output is finite."""
+    """For any speed, angle and request, finite or not, the output is finite, and its angle within the vehicle's."""
     limiter = new_limiter()
     for index, (speed_mps, steering_rad, is_plausible, is_reset) in enumerate(reports):
         vehicle = replace(vehicle_at(speed_mps, steering_rad), is_speed_plausible=is_plausible)
         if is_reset:
             limiter.reset(steering_rad, index * LONG_NS)
         actuation = limiter.limit(Actuation(*requested), vehicle, index * LONG_NS, index * NS_PER_MS)
-        assert all(map(math.isfinite, (actuation.steering_rad, actuation.throttle, actuation.brake)))
+        assert all(map(math.isfinite, (actuation.throttle, actuation.brake)))
+        assert abs(actuation.steering_rad) <= MAX_STEERING_RAD
+
+
+@pytest.mark.parametrize("speed_mps", [LIMITS.speed_limit_mps + 1, -LIMITS.speed_limit_mps - 1])
+def test_a_car_that_is_too_fast_gets_no_throttle(speed_mps: float) -> None:
+    """Above the speed limit, forward or backward, the throttle is removed."""
+    actuation, applied_limits = limit_request(Actuation(0.0, 1.0, 0.0), speed_mps)
+    assert actuation.throttle == 0.0
+    assert applied_limits == ("speed",)
 
 
 def test_a_request_that_is_not_finite_brakes() -> None:

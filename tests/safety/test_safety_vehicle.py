@@ -149,9 +149,11 @@ def test_an_emergency_stop_does_not_engage_a_disarmed_vehicle() -> None:
     assert not rig.gate.watchdog.should_engage(rig.vehicle)
 
 
-@pytest.mark.parametrize("changes", [{"speed_mps": math.nan}, {"steering_rad": math.inf}])
-def test_a_state_that_is_not_finite_is_a_vehicle_fault(changes: dict[str, Any]) -> None:
-    """A speed or an angle that is not finite stops the vehicle."""
+@pytest.mark.parametrize("field", ["speed_mps", "steering_rad"])
+@pytest.mark.parametrize("reported", [math.nan, math.inf, 101.0, -1e300])
+def test_an_impossible_state_is_a_vehicle_fault(field: str, reported: float) -> None:
+    """A speed or an angle that is not finite, or larger than any vehicle's, stops the vehicle."""
+    changes = {field: reported}
     rig = Rig().start_driving()
     rig.vehicle = replace(vehicle_at(5.0), **changes)
     actuation = rig.actuation()

@@ -26,7 +26,7 @@ PHASES: dict[Phase, str] = {
     "seeking": "waiting for the vehicle: {reason}",
     "arming": "control granted: arming the vehicle{but_reason}",
     "driving": "",
-    "stopped": "control lost: {reason}",
+    "stopped": "stopped: {reason}",
     "watching": "{reason}; this client now only watches",
 }
 """The log line for each phase of the client; `driving` has none, because the line for the vehicle's state reports

@@ -93,14 +93,24 @@ def _repeat_until_confirmed(
     until_ns = clock.now().mono_ns + round(timeout_s * NS_PER_S)
     while clock.now().mono_ns < until_ns:
         send(Send("session", encode(request)))
-        with suppress(queue.Empty, BadMessage):
-            reply = decode(SessionReply, replies.get(timeout=RETRY_PERIOD_S))
-            if reply.granted:
-                return
-            if reply.emergency_stop == request.number:
-                request = replace(request, number=request.number + 1)
+        reply = _reply_to(request, replies, clock)
+        if reply is not None and reply.granted:
+            return
+        if reply is not None:
+            request = replace(request, number=request.number + 1)
     raise WorkError(
         f"the emergency stop was NOT confirmed within {timeout_s:g} s, and the vehicle may still be moving: stop it by "
         "other means and repeat this command. Is its server running, is vehicle_id correct, and do the keys match? "
         "Run `lavt doctor CONFIG` to find out"
     )
+
+
+def _reply_to(request: SessionRequest, replies: queue.Queue[bytes], clock: Clock) -> SessionReply | None:
+    """Return the first reply with the number of the request; None if there is none within `RETRY_PERIOD_S`."""
+    until_ns = clock.now().mono_ns + round(RETRY_PERIOD_S * NS_PER_S)
+    while (wait_ns := until_ns - clock.now().mono_ns) > 0:
+        with suppress(queue.Empty, BadMessage):
+            reply = decode(SessionReply, replies.get(timeout=wait_ns / NS_PER_S))
+            if reply.emergency_stop == request.number:
+                return reply
+    return None

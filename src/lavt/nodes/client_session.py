@@ -18,10 +18,12 @@ REQUEST_PERIOD_NS = NS_PER_S
 class ClientSession:
     """A client session that requests control until it is granted and the vehicle armed; repeated requests are harmless.
 
-    With `rearm`, it requests control again after a safe stop and from a restarted server, but neither after an
-    emergency stop nor after a driver override, which disarms the vehicle. With `clear_stop`, it clears the emergency
-    stop that the first reply reports, and no other one. With `waits_for_condition`, it arms the vehicle only when the
-    network condition is in force. With `take_over`, it requests a handover from the active operator.
+    With `rearm`, it requests control again after a safe stop and from a restarted server, but not after a driver
+    override, which disarms the vehicle. With `clear_stop`, it clears the emergency stop that the first reply reports,
+    and no other one. After any other emergency stop it never arms the vehicle again, not even if it has not driven yet,
+    if somebody clears the stop, or if the server restarts and has forgotten the stop. With `waits_for_condition`, it
+    arms the vehicle only when the network condition is in force. With `take_over`, it requests a handover from the
+    active operator.
     """
 
     def __init__(
@@ -51,6 +53,8 @@ class ClientSession:
         """The first reply reports the emergency stop that is to be cleared."""
         self._stop_to_clear: int | None = None
         """Number of the emergency stop that this client clears; None: none."""
+        self._last_stop: int | None = None
+        """Number of the vehicle's last emergency stop, as replies report it; None: no reply yet. 0: none."""
         self._wait_reason = "the network condition is not in force yet" if waits_for_condition else ""
         """Why this client must not arm the vehicle yet; empty: it can."""
         self._take_over = take_over
@@ -64,7 +68,7 @@ class ClientSession:
         self._server = 0
         """Instance of the server process that sent the last state."""
         self._awaits_person = False
-        """Since this client drove, there was an emergency stop, or the same server process has disarmed the vehicle."""
+        """There was an emergency stop, or the same server process has disarmed the vehicle since this client drove."""
         self._request_ns = start_ns
         self._stop_ns: int | None = None
         """When the request of the emergency stop is repeated; None: there is no stop, or the vehicle has answered."""
@@ -114,10 +118,15 @@ class ClientSession:
     def handle_reply(self, reply: SessionReply, now_ns: int) -> None:
         """Process the server's reply to a request."""
         self._update_reason(reply)
+        is_new_stop = reply.emergency_stop not in (0, self._last_stop) and self._last_stop is not None
+        if reply.emergency_stop or self._last_stop is None:
+            self._last_stop = reply.emergency_stop
         if self._looks_for_stop:
             self._looks_for_stop, self._stop_to_clear = False, reply.emergency_stop or None
         elif reply.emergency_stop != self._stop_to_clear:  # there was another stop since: a person must decide again
             self._stop_to_clear = None
+        if is_new_stop:  # the states that reported this stop may have been lost
+            self._await_person("there was an emergency stop")
         if reply.emergency_stop == self.emergency_stop:
             self._stop_ns = None
         if reply.granted and reply.token:
@@ -143,8 +152,9 @@ class ClientSession:
         """Process a state of the vehicle."""
         if self.phase in ("driving", "stopped"):
             is_same_server = state.instance == self._server
-            is_disarmed_now = is_same_server and self.safety != "disarmed" and state.safety == "disarmed"
-            self._awaits_person |= is_disarmed_now or state.safety == "emergency_stop"
+            self._awaits_person |= is_same_server and self.safety != "disarmed" and state.safety == "disarmed"
+        if state.safety == "emergency_stop" and not self._looks_for_stop and self._stop_to_clear is None:
+            self._await_person(state.reason)
         self.safety, self._server = state.safety, state.instance
         names_this_client = (state.active_operator, state.active_operator_instance) == (self._who, self._instance)
         names_other_client = state.active_operator != "" and not names_this_client
@@ -164,6 +174,12 @@ class ClientSession:
             self.phase, self.released = "watching", True
             self.reason = f"{state.active_operator} has taken control"
         self._was_active_operator |= names_this_client
+
+    def _await_person(self, reason: str) -> None:
+        """Do not arm the vehicle from now on: only a person decides what follows an emergency stop."""
+        self._awaits_person = True
+        if self.phase in ("seeking", "arming"):
+            self.phase, self.reason = "stopped", f"{reason}; restart this client to drive"
 
     def raise_emergency_stop(self, now: Now) -> SessionRequest:
         """Raise an emergency stop and return its request; every later command carries its number.

@@ -84,21 +84,23 @@ class Limiter:
             if abs(steering_rad - before_rad) > self.limits.steering_rate_radps * COMMAND_PERIOD_S:
                 changed.append("steering rate")
         throttle = requested.throttle
-        if throttle > 0 and not (is_speed_known and vehicle.speed_mps <= self.limits.speed_limit_mps):
+        if throttle > 0 and not (is_speed_known and abs(vehicle.speed_mps) <= self.limits.speed_limit_mps):
             throttle = 0.0
             changed.append("speed")
         brake = requested.brake
         if picture_age_ns is not None and is_speed_known:
             picture_age_s = picture_age_ns / NS_PER_S
             limit_mps = stopping_speed_limit_mps(picture_age_s, self.limits, self._max_acceleration_mps2)
-            excess_mps = vehicle.speed_mps - limit_mps
+            excess_mps = abs(vehicle.speed_mps) - limit_mps
             minimum_brake = self._stopping_distance_brake(excess_mps)
             if excess_mps > 0 and (throttle > 0 or brake < minimum_brake):
                 throttle, brake = 0.0, max(brake, minimum_brake)
                 changed.append("stopping distance")
-        self._steering_rad, self._at_ns = rate_limited_rad, max(now_ns, self._at_ns)
+        # The wheels can be beyond the vehicle's limit when the first command arrives.
+        target_rad = min(max(rate_limited_rad, -self._max_steering_rad), self._max_steering_rad)
+        self._steering_rad, self._at_ns = target_rad, max(now_ns, self._at_ns)
         self.applied_limits = tuple(changed)
-        return Actuation(rate_limited_rad, throttle, brake)
+        return Actuation(target_rad, throttle, brake)
 
     def _stopping_distance_brake(self, excess_mps: float) -> float:
         """Return the pedal that removes the excess speed in the settling time, at most the pedal of a safe stop."""

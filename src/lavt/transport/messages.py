@@ -19,6 +19,8 @@ import msgspec
 from msgspec import Meta
 
 from lavt.domain import (
+    MAX_REPORTED_MPS,
+    MAX_ROAD_WHEEL_RAD,
     PATH_POINTS,
     Command,
     Mode,
@@ -40,8 +42,6 @@ ELLIPSIS = "\N{HORIZONTAL ELLIPSIS}"
 MAX_DELAY_MS = 10_000.0
 """The longest delay that a client can request of a server. Clearing a delay takes as long, because the delayed packets
 leave first."""
-SPEED_BOUND_MPS = 100.0
-ROAD_WHEEL_BOUND_RAD = 1.0
 CURVATURE_BOUND_PER_M = 1.0
 
 Version = Annotated[int, Meta(ge=VERSION, le=VERSION)]
@@ -49,7 +49,7 @@ U64 = Annotated[int, Meta(ge=0)]
 """An epoch, or the instance of a process. The type has no upper bound, because msgpack has no larger integers."""
 U63 = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 """Times, and numbers that grow, such as that of an emergency stop: the non-negative signed 64-bit integers."""
-RoadWheel = Annotated[float, Meta(ge=-ROAD_WHEEL_BOUND_RAD, le=ROAD_WHEEL_BOUND_RAD)]
+RoadWheel = Annotated[float, Meta(ge=-MAX_ROAD_WHEEL_RAD, le=MAX_ROAD_WHEEL_RAD)]
 Curvature = Annotated[float, Meta(ge=-CURVATURE_BOUND_PER_M, le=CURVATURE_BOUND_PER_M)]
 ZeroToOne = Annotated[float, Meta(ge=0.0, le=1.0)]
 Delay = Annotated[float, Meta(ge=0.0, le=MAX_DELAY_MS)]
@@ -73,7 +73,7 @@ def _text(kind: type, field: str) -> Any:
     return Annotated[str, Meta(max_length=TEXT_BYTES[kind][field])]
 
 
-BOUNDS: dict[type, dict[str, float]] = {State: {"speed_mps": SPEED_BOUND_MPS, "steering_rad": ROAD_WHEEL_BOUND_RAD}}
+BOUNDS: dict[type, dict[str, float]] = {State: {"speed_mps": MAX_REPORTED_MPS, "steering_rad": MAX_ROAD_WHEEL_RAD}}
 """The largest magnitudes of numbers that a vehicle reports. The bound is sent instead of a larger number or NaN."""
 
 TYPES: dict[type, dict[str, Any]] = {
@@ -93,7 +93,7 @@ TYPES: dict[type, dict[str, Any]] = {
     State: {
         "sent_wall_ns": U63,
         "state_mono_ns": U63,
-        "speed_mps": Annotated[float, Meta(ge=-SPEED_BOUND_MPS, le=SPEED_BOUND_MPS)],
+        "speed_mps": Annotated[float, Meta(ge=-MAX_REPORTED_MPS, le=MAX_REPORTED_MPS)],
         "steering_rad": RoadWheel,
         "gear": Literal["park", "reverse", "neutral", "drive"],
         "safety": SafetyState,
