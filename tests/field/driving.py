@@ -148,7 +148,7 @@ class Drive:
         }
         part, arguments, program = starts[role]
         process = self.networks.inside(part, lambda: self.processes.start(name, *arguments, program=program))
-        process.ready()
+        process.wait_ready()
         self.running[role] = process
         return process
 

@@ -104,7 +104,7 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
     fidelity = FIDELITIES[config.fidelity]()
     server = build_server(
         server_config(config, seed),
-        lambda: server_clock.at(0),
+        lambda: server_clock.now_at(0),
         SeededEntropy(seed, "server"),
         host="virtual-server",
         video_port=SERVER_VIDEO_PORT,
@@ -112,7 +112,7 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
         lazy_physics=True,
     )
     client = build_client(
-        client_config(config), lambda: client_clock.at(0), SeededEntropy(seed, "client"), fidelity=fidelity
+        client_config(config), lambda: client_clock.now_at(0), SeededEntropy(seed, "client"), fidelity=fidelity
     )
     make_directory(out)
     digest = hashlib.sha256()
