@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
 from lavt.transport.emulation.delay_line import DelayLine, DelayModel
-from lavt.transport.emulation.impairment import DISTRIBUTIONS, Distribution, Impairment, gilbert
+from lavt.transport.emulation.impairment import DISTRIBUTIONS, Distribution, Impairment, burst_probabilities
 from lavt.transport.emulation.link import HEADER_BYTES, EmulatedLink, LinkInjection, check_injection
 from lavt.transport.emulation.random_process import LARGEST_QUANTILE, LossProcess, quantiles
 from lavt.transport.emulation.trace import Trace, parse_delays, parse_mahimahi
@@ -341,7 +341,7 @@ def test_higher_loss_includes_any_lower_loss_up_to_a_limit(
     lower = share * (1 - 1 / burst)
     higher = min(lower * factor, burst / (burst + 1))
     processes = [
-        LossProcess(seed, "x", loss, gilbert(Impairment(loss=loss, loss_burst_packets=burst)))
+        LossProcess(seed, "x", loss, burst_probabilities(Impairment(loss=loss, loss_burst_packets=burst)))
         for loss in (lower, higher)
     ]
     lost_at_lower, lost_at_higher = ([process.is_lost(index) for index in range(300)] for process in processes)

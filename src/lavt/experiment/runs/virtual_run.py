@@ -28,7 +28,7 @@ from lavt.runtime.recorder import Recorders
 from lavt.runtime.virtual import HostClock, VirtualHost, VirtualLink, VirtualRuntime, modelled_clock_source
 from lavt.transport.emulation.delay_line import DelayLine, DelayModel
 from lavt.transport.emulation.link import EmulatedLink, LinkInjection
-from lavt.transport.emulation.relay import video_index
+from lavt.transport.emulation.relay import video_delay_index
 
 SERVER_MONO_NS = 1_000 * NS_PER_S
 CLIENT_MONO_NS = 7_000 * NS_PER_S
@@ -187,7 +187,7 @@ def virtual_links(network: NetworkDelays) -> dict[str, VirtualLink]:
 
     session = None if network.control_injected is None else replace(network.control_injected, name="session")
     return {
-        "rtp": link(network.video, network.video_injected, lambda payload, _number: video_index(payload)),
+        "rtp": link(network.video, network.video_injected, lambda payload, _number: video_delay_index(payload)),
         "control": link(network.control, network.control_injected),
         "state": link(network.state),
         "feedback": link(network.never_delayed),
