@@ -26,13 +26,13 @@ GOOD = Situation(
     since_sent_ns=0,
     faults="",
     overrides="",
-    trips="",
+    watchdog_trips="",
     command_errors="",
-    reasons="",
+    kit_reasons="",
     enabled=ALL_AXES,
     gear="drive",
     in_state_ns=0,
-    must_stay_enabled=False,
+    is_release_unexpected=False,
 )
 STAYS: dict[State, Situation] = {
     "idle": replace(GOOD, wanted=False, enabled=NO_AXES, gear="park"),
@@ -123,9 +123,9 @@ ROWS: list[tuple[State, dict[str, Any], State]] = [
     ("parking", {**RELEASED, "in_state_ns": PAUSE_NS - 1}, "parking"),
     ("parking", {**RELEASED, "in_state_ns": PAUSE_NS}, "idle"),
     ("parking", {**RELEASED, "wanted": True, "in_state_ns": PAUSE_NS}, "idle"),
-    ("parking", {**RELEASED, "must_stay_enabled": True, "in_state_ns": PAUSE_NS - 1}, "parking"),
-    ("parking", {**RELEASED, "must_stay_enabled": True, "in_state_ns": PAUSE_NS}, "lost"),
-    ("parking", {"must_stay_enabled": True, "in_state_ns": LIMIT_NS}, "parking"),
+    ("parking", {**RELEASED, "is_release_unexpected": True, "in_state_ns": PAUSE_NS - 1}, "parking"),
+    ("parking", {**RELEASED, "is_release_unexpected": True, "in_state_ns": PAUSE_NS}, "lost"),
+    ("parking", {"is_release_unexpected": True, "in_state_ns": LIMIT_NS}, "parking"),
     *(("parking", {"enabled": frozenset({axis}), "in_state_ns": LIMIT_NS}, "parking") for axis in AXES),
     ("lost", {"enabled": NO_AXES, "in_state_ns": LIMIT_NS}, "lost"),
     ("lost", NOT_WANTED, "parking"),
@@ -188,7 +188,7 @@ CASES: list[tuple[State, dict[str, Any]]] = [
     ("engaged", {"enabled": NO_AXES}),
     ("clearing", {"in_state_ns": LIMIT_NS, "overrides": "OVERRIDE"}),
     ("enabling", {"in_state_ns": LIMIT_NS}),
-    ("parking", {"enabled": NO_AXES, "must_stay_enabled": True, "in_state_ns": PAUSE_NS}),
+    ("parking", {"enabled": NO_AXES, "is_release_unexpected": True, "in_state_ns": PAUSE_NS}),
 ]
 
 
@@ -220,14 +220,14 @@ def test_axes_that_are_not_enabled_are_named(axis: Axis) -> None:
     for text in (reason("engaged", **others), reason("enabling", **others, in_state_ns=LIMIT_NS)):
         assert {name for name in AXES if name in text} == {axis}
     assert reason("engaged", enabled=NO_AXES).endswith(AXES[-1])
-    assert not any(name in reason("clearing", in_state_ns=LIMIT_NS, trips="TRIP") for name in AXES)
+    assert not any(name in reason("clearing", in_state_ns=LIMIT_NS, watchdog_trips="TRIP") for name in AXES)
 
 
 def test_a_gear_that_was_not_reached_is_named() -> None:
     """If DRIVE was not reached in time the reason names the gear; in DRIVE it names only the missing axes."""
     assert "park" in reason("enabling", enabled=ALL_AXES, in_state_ns=LIMIT_NS)
     assert "gear" not in reason("enabling", gear="drive", in_state_ns=LIMIT_NS)
-    assert "gear" not in reason("clearing", in_state_ns=LIMIT_NS, trips="TRIP")
+    assert "gear" not in reason("clearing", in_state_ns=LIMIT_NS, watchdog_trips="TRIP")
 
 
 AXIS_SETS = [frozenset(axes) for axes in chain.from_iterable(combinations(AXES, size) for size in range(4))]
@@ -245,7 +245,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "enabled": tuple(AXIS_SETS),
     "gear": ("drive", "park"),
     "in_state_ns": (0, PAUSE_NS, LIMIT_NS),
-    "must_stay_enabled": (False, True),
+    "is_release_unexpected": (False, True),
 }
 """Inputs on either side of every condition in the table."""
 
