@@ -104,7 +104,7 @@ def run_impaired_part(folder: Path, case: LinkCase, *, frames: int) -> dict[str,
     print("| run | median ms | p95 ms | shown | undamaged | overhead | lost | relay late by, p99 / longest ms |")
     print("|---|---|---|---|---|---|---|---|")
     ours = _measure_quality("ours", run, case)
-    _print_row("ours", ours)
+    _print_row("LAVT", ours)
     gstreamer = []
     for jitter_buffer_ms in GSTREAMER_JITTER_BUFFERS_MS[case.name]:
         gstreamer.append(_measure_quality("gstreamer", replace(run, jitter_buffer_ms=jitter_buffer_ms), case))
