@@ -367,8 +367,8 @@ def test_delay_line_follows_its_link() -> None:
 
 
 CONTRADICTIONS: list[tuple[Impairment, str | None, str]] = [
-    (Impairment(loss=1.0), None, "shares below 1"),
-    (Impairment(loss=0.9, loss_burst_packets=2), None, "leaves no room"),
+    (Impairment(loss=1.0), None, "must be below 1"),
+    (Impairment(loss=0.9, loss_burst_packets=2), None, "gaps of less than one packet"),
     (
         Impairment(delay_ms=9, jitter_ms=1, jitter_correlation=0.5, jitter_distribution="pareto"),
         None,
