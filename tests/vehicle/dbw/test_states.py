@@ -71,9 +71,9 @@ CAUSES: list[Cause] = [
     ("commands late", {"since_sent_ns": TIMEOUT_NS}, dict.fromkeys(("enabling", "engaged", "parking"), "lost")),
     ("commands in time", {"since_sent_ns": TIMEOUT_NS - 1}, {}),
     ("fault", {"faults": "f"}, dict.fromkeys(("clearing", "enabling", "engaged"), "lost")),
-    ("trip", {"trips": "t"}, dict.fromkeys(("enabling", "engaged"), "lost")),
+    ("trip", {"watchdog_trips": "t"}, dict.fromkeys(("enabling", "engaged"), "lost")),
     ("command error", {"command_errors": "c"}, {"engaged": "lost"}),
-    ("reason only", {"reasons": "r"}, {}),
+    ("reason only", {"kit_reasons": "r"}, {}),
     ("inhibit reason only", {"inhibit_reason": "i"}, {}),
     ("car moves", {"is_stationary": False}, {}),
     ("gear unknown", {"gear": None}, {"engaged": "lost"}),
@@ -104,11 +104,11 @@ ROWS: list[tuple[State, dict[str, Any], State]] = [
     ("clearing", {"in_state_ns": PAUSE_NS - 1}, "clearing"),
     ("clearing", {"in_state_ns": PAUSE_NS}, "enabling"),
     ("clearing", {"in_state_ns": PAUSE_NS, "overrides": "o"}, "clearing"),
-    ("clearing", {"in_state_ns": PAUSE_NS, "trips": "t"}, "clearing"),
+    ("clearing", {"in_state_ns": PAUSE_NS, "watchdog_trips": "t"}, "clearing"),
     ("clearing", {"in_state_ns": LIMIT_NS}, "enabling"),
     ("clearing", {"in_state_ns": LIMIT_NS - 1, "overrides": "o"}, "clearing"),
     ("clearing", {"in_state_ns": LIMIT_NS, "overrides": "o"}, "lost"),
-    ("clearing", {"in_state_ns": LIMIT_NS, "trips": "t"}, "lost"),
+    ("clearing", {"in_state_ns": LIMIT_NS, "watchdog_trips": "t"}, "lost"),
     ("clearing", NOT_WANTED, "parking"),
     ("enabling", READY, "engaged"),
     ("enabling", {**READY, "gear": "neutral"}, "enabling"),
@@ -155,7 +155,7 @@ def test_a_row_needs_all_of_its_conditions(state: State, changes: dict[str, Any]
     assert target(state, **changes) == follows
 
 
-TEXTS = ("overrides", "missing_reports", "faults", "trips", "command_errors")
+TEXTS = ("overrides", "missing_reports", "faults", "watchdog_trips", "command_errors")
 """Causes that have texts, in order of priority."""
 
 
@@ -182,9 +182,9 @@ def test_a_gear_is_named() -> None:
     assert "unknown" in reason("engaged", gear=None)
 
 
-DETAILS = {"trips": "TRIP", "command_errors": "ERROR", "reasons": "REASON"}
+DETAILS = {"watchdog_trips": "TRIP", "command_errors": "ERROR", "kit_reasons": "REASON"}
 CASES: list[tuple[State, dict[str, Any]]] = [
-    ("engaged", {"trips": "TRIP"}),
+    ("engaged", {"watchdog_trips": "TRIP"}),
     ("engaged", {"enabled": NO_AXES}),
     ("clearing", {"in_state_ns": LIMIT_NS, "overrides": "OVERRIDE"}),
     ("enabling", {"in_state_ns": LIMIT_NS}),
@@ -198,7 +198,7 @@ CASES: list[tuple[State, dict[str, Any]]] = [
         (state, cause, detail)
         for state, cause in CASES
         for detail in DETAILS
-        if (state, detail) != ("enabling", "trips")
+        if (state, detail) != ("enabling", "watchdog_trips")
     ],
 )  # a trip ends enabling immediately
 def test_other_reported_problems_are_in_the_reason(state: State, cause: dict[str, Any], detail: str) -> None:
@@ -206,7 +206,7 @@ def test_other_reported_problems_are_in_the_reason(state: State, cause: dict[str
     text = reason(state, **{**cause, detail: DETAILS[detail]})
     assert DETAILS[detail] in text
     assert cause.get("overrides", "") in text
-    assert SEPARATOR + "REASON" in reason(state, **{**cause, "command_errors": "ERROR", "reasons": "REASON"})
+    assert SEPARATOR + "REASON" in reason(state, **{**cause, "command_errors": "ERROR", "kit_reasons": "REASON"})
     for reason_text in (text, reason(state, **cause)):
         assert "()" not in reason_text
         assert "; ;" not in reason_text
@@ -239,9 +239,9 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "since_sent_ns": (TIMEOUT_NS - 1, TIMEOUT_NS),
     "faults": ("", "f"),
     "overrides": ("", "o"),
-    "trips": ("", "t"),
+    "watchdog_trips": ("", "t"),
     "command_errors": ("", "c"),
-    "reasons": ("",),
+    "kit_reasons": ("",),
     "enabled": tuple(AXIS_SETS),
     "gear": ("drive", "park"),
     "in_state_ns": (0, PAUSE_NS, LIMIT_NS),
