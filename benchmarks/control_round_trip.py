@@ -65,7 +65,7 @@ def start_routers(processes: Processes) -> tuple[str, str]:
         changes = [f"listen.endpoints={json.dumps(listen)}", f"connect.endpoints={json.dumps(connect)}"]
         words = [word for change in changes for word in ("--set", change)]
         router = processes.start(f"{side}-router", "router", f"zenoh-configs/router-{side}.json5", *words)
-        locators = router.ready()["locators"]
+        locators = router.wait_ready()["locators"]
         endpoints.append(next(locator for locator in locators if locator.startswith("tcp/")))
         remote = next((locator for locator in locators if locator.startswith("udp/")), "")
         remote_endpoint = ROUTER_LINK.format(port=remote.partition("?")[0].rpartition(":")[2])

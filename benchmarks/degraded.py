@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from lavt.domain import CameraModel, FloatArray, Picture, Pose
-from lavt.perception.calibration import calibrated, picture_points
+from lavt.perception.calibration import calibrated_pinhole_camera, picture_points
 from lavt.streams import stream
 from lavt.transport.video.h264 import Decoder, Encoder
 from lavt.vehicle.sim.rendering.renderer import Renderer
@@ -104,7 +104,7 @@ def _strip(picture: Picture, line: list[tuple[float, float]], width_m: float, co
     outline = np.concatenate([dense + across * width_m / 2, (dense - across * width_m / 2)[::-1]])
     outline = outline[outline[:, 0] > MODEL.x_m + 0.6]  # points behind the camera have no place in the picture
     if len(outline) > 2:
-        pixels = picture_points(calibrated(MODEL), outline) * 2**SUBPIXEL_BITS
+        pixels = picture_points(calibrated_pinhole_camera(MODEL), outline) * 2**SUBPIXEL_BITS
         cv2.fillPoly(picture, [np.round(pixels).astype(np.int32)], colour, cv2.LINE_AA, SUBPIXEL_BITS)
 
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 sys.path.insert(0, str(Path(__file__).parents[1]))  # for the package `benchmarks`
 
 from benchmarks.video.clean import SIZES, describe_clean_run
-from benchmarks.video.pictures import render_loop
+from benchmarks.video.pictures import render_pictures
 from benchmarks.video.processes import BenchmarkProcess, measure
 from benchmarks.video.run import RATE_HZ
 
@@ -123,7 +123,7 @@ def main() -> int:
     sampler = ResourceSampler(options.minutes * 60)  # the run takes longer, because of its warm-up
     with tempfile.TemporaryDirectory() as folder:
         run = describe_clean_run(Path(folder), SIZES[0], options.minutes * 60)
-        render_loop(run.loop, run.width_px, run.height_px)
+        render_pictures(run.pictures_stem, run.width_px, run.height_px)
         outcome = measure("ours", run, when_started=sampler.start)
     print("| process | memory MB: after a quarter | at the end | kB/min | threads: after a quarter | at the end |")
     print("|---|---|---|---|---|---|")

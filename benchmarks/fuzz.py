@@ -123,7 +123,7 @@ def fuzz(name: str, inputs: int, seed: int) -> Outcome:
         failure = f"{name} broke at input {number} of seed {seed}, on {channel}: {data.hex()}\n{traceback.format_exc()}"
     took_s = cpu_s() - begin_s
     grown_kb = memory_kb() - memory_after_warm_up_kb
-    return Outcome(name, number + 1, took_s, target.rejected(), grown_kb, summary, failure)
+    return Outcome(name, number + 1, took_s, target.rejected_count(), grown_kb, summary, failure)
 
 
 def fuzz_all(names: list[str], inputs: int, seed: int, jobs: int) -> list[Outcome]:

@@ -24,7 +24,7 @@ from benchmarks.degraded import AHEAD_M, AT_10_M, MODEL, NO_LANE, DegradedCase, 
 
 from lavt.control.lane_watch import LANE_CONFIDENCE
 from lavt.domain import FloatArray, Lane, Picture
-from lavt.perception.calibration import calibrated
+from lavt.perception.calibration import calibrated_pinhole_camera
 from lavt.perception.lane_detector import LaneDetector
 from lavt.perception.panel import draw_panel
 
@@ -141,7 +141,7 @@ def draw_sheet(sheet_cases: Iterable[DegradedCase]) -> Picture:
     parts = []
     for case in sheet_cases:
         detector = LaneDetector(MODEL)
-        drawn = draw_panel(calibrated(MODEL), detector, case.picture)
+        drawn = draw_panel(calibrated_pinhole_camera(MODEL), detector, case.picture)
         title = np.full((34, drawn.shape[1], 3), 90, dtype=np.uint8)
         cv2.putText(title, case.kind, (10, 25), cv2.FONT_HERSHEY_SIMPLEX, 0.8, (255, 255, 255), 2, cv2.LINE_AA)
         parts += [title, drawn]

@@ -86,7 +86,7 @@ def main() -> None:
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client,
     ):
-        port = processes.start("rendezvous", "rendezvous", str(config), *options).ready()["ready"]["video_port"]
+        port = processes.start("rendezvous", "rendezvous", str(config), *options).wait_ready()["ready"]["video_port"]
         meter = LatencyMeter(vehicle, client, (LOOPBACK, port))
         for number in range(frames):
             meter.refresh()

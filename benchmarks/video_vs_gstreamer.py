@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # for the package `benchmark
 from benchmarks.video.clean import SIZES, run_clean_part
 from benchmarks.video.gstreamer import load_gstreamer
 from benchmarks.video.impaired import CASES, run_impaired_part
-from benchmarks.video.pictures import render_loop
+from benchmarks.video.pictures import render_pictures
 
 from lavt.errors import LavtError, UserError
 from lavt.runtime import process_priority
@@ -70,7 +70,7 @@ def main() -> int:
                 raise UserError(f"unknown part {', '.join(sorted(unknown))}: choose from {', '.join(all_parts)}")
             for size in SIZES:
                 print(f"rendering the pictures of {size.name}", file=sys.stderr)
-                render_loop(Path(folder) / f"{size.width_px}x{size.height_px}", size.width_px, size.height_px)
+                render_pictures(Path(folder) / f"{size.width_px}x{size.height_px}", size.width_px, size.height_px)
             results = {part: measure() for part, measure in all_parts.items() if part in (requested.only or all_parts)}
     except LavtError as error:
         print(error, file=sys.stderr)

@@ -38,7 +38,7 @@ def nodes() -> Sequence[Node]:
 
 
 NODE_OF_MODULE = {"picture_reader": "driver"}
-"""The node of each module that has another name than its node."""
+"""The nodes of the modules that are not named after their node."""
 
 
 def sent_channels() -> set[tuple[str, str]]:
@@ -74,9 +74,9 @@ def test_nodes_send_on_the_channels_of_the_table(nodes: Sequence[Node]) -> None:
     """Nodes send on channels of the table only, and the table names them as senders."""
     sent = sent_channels()
     assert {channel for _, channel in sent} <= CHANNELS.keys()
-    not_recorded = {(node, channel) for node, channel in sent if CHANNELS[channel].carrier != "record"}
+    not_only_recorded = {(node, channel) for node, channel in sent if CHANNELS[channel].carrier != "record"}
     names = {node.name for node in nodes}
-    assert not_recorded == {
+    assert not_only_recorded == {
         (row.sender, name) for name, row in CHANNELS.items() if row.sender in names and row.carrier != "record"
     }
 
@@ -88,8 +88,8 @@ def test_senders_and_receivers_exist(nodes: Sequence[Node]) -> None:
     assert set(chain.from_iterable(row.receivers for row in CHANNELS.values())) == names
 
 
-def test_only_records_queries_and_orders_have_no_receiver() -> None:
-    """Every channel has a receiver, except for records, clock queries and injection orders."""
+def test_channels_without_receivers() -> None:
+    """Every channel has a receiver, except for those that are only recorded, `clock_query` and `inject`."""
     without_receivers = {name for name, row in CHANNELS.items() if not row.receivers}
     assert without_receivers == {name for name, row in CHANNELS.items() if row.carrier == "record"} | {
         "clock_query",

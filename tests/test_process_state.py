@@ -1,4 +1,4 @@
-"""The checks that no test changes the pytest process for later tests."""
+"""Tests of the plugin that fails a test which changes the pytest process for later tests."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ CHANGES: dict[str, Callable[[pytest.MonkeyPatch], object]] = {
 
 
 @pytest.fixture
-def _restore(own_switch_interval: None) -> Iterator[None]:  # noqa: ARG001 (restored by its fixture)
+def _restore(own_switch_interval: None) -> Iterator[None]:  # noqa: ARG001 (it restores the switch interval)
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, ())
     yield
@@ -39,7 +39,7 @@ def _restore(own_switch_interval: None) -> Iterator[None]:  # noqa: ARG001 (rest
 
 @pytest.mark.usefixtures("_restore")
 @pytest.mark.parametrize("name", CHANGES)
-def test_test_that_changes_the_process_fails(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_change_of_the_process_fails_the_test(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A test that leaves a process-wide setting changed fails, and the message names only that setting."""
     with pytest.raises(pytest.fail.Exception) as failure, process_unchanged():
         CHANGES[name](monkeypatch)

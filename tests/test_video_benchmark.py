@@ -21,7 +21,7 @@ BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
 
 def test_defaults_measure_every_part() -> None:
-    """By default several pairs, at least a minute of frames on the impaired link, and all parts are measured."""
+    """By default all parts are measured: several pairs of runs (LAVT, GStreamer), and a minute on impaired links."""
     requested = video_vs_gstreamer.parse_arguments([])
     assert requested.pairs > 1
     assert requested.frames >= 60 * 30
@@ -82,7 +82,7 @@ def test_the_link_follows_the_case(case: LinkCase) -> None:
     assert max(arrived_ns) >= 0.99 * case.jitter_ms * 1e6
 
 
-def test_traffic_is_counted_after_the_warm_up_by_payload_type() -> None:
+def test_traffic_is_counted_by_payload_type_from_the_last_warm_up_packet_on() -> None:
     """Bytes and losses are counted from the last packet of the warm-up on, by payload type; RTCP is not counted."""
     traffic = TrafficCounter()
     media_type, repair_type, rtcp_type, marker = 96, 97, 200, 0x80
@@ -113,7 +113,7 @@ def test_warm_up_frames_are_additional() -> None:
 
 def test_growth_is_the_slope_of_memory() -> None:
     """Memory that grows by 2 kB/s grows by 120 kB/min, independent of its size at the start."""
-    samples = [endurance.ResourceSample(at_s, 50_000 + 2 * at_s, 5) for at_s in range(60)]
+    samples = [endurance.ResourceSample(at_s, memory_kb=50_000 + 2 * at_s, threads=5) for at_s in range(60)]
     assert endurance.growth_kb_per_minute(samples) == pytest.approx(120)
 
 
@@ -125,8 +125,11 @@ def test_latency_is_summarized_for_every_10_s() -> None:
 
 def test_growth_is_reported() -> None:
     """Growing memory, threads and latency are each reported; steady memory, threads and latency are not."""
-    steady = [endurance.ResourceSample(float(at_s), 50_000, 5) for at_s in range(60)]
-    growing = [endurance.ResourceSample(float(at_s), 50_000 + 10 * at_s, 5 + at_s // 50) for at_s in range(60)]
+    steady = [endurance.ResourceSample(float(at_s), memory_kb=50_000, threads=5) for at_s in range(60)]
+    growing = [
+        endurance.ResourceSample(float(at_s), memory_kb=50_000 + 10 * at_s, threads=5 + at_s // 50)
+        for at_s in range(60)
+    ]
     steady_latency_ms, growing_latency_ms = np.full(1200, 4.0), np.linspace(4.0, 8.0, 1200)
     assert endurance.describe_growth({"sender": steady}, steady_latency_ms) == []
     messages = endurance.describe_growth({"sender": growing}, growing_latency_ms)
@@ -151,12 +154,12 @@ def test_the_video_benchmark_runs() -> None:
     assert completed.returncode == 0, completed.stderr
     result = json.loads(completed.stdout.splitlines()[-1])
     assert list(result) == ["480p", "loss1"]
-    assert list(result["480p"]) == ["median_ratio", "cpu_ratio", "over_floor_ms"]
+    assert list(result["480p"]) == ["median_ratio", "cpu_ratio", "over_floor_ms"]  # the floor is the codec alone
     assert list(result["loss1"]) == ["undamaged", "overhead", "gstreamer_undamaged"]
     assert result["480p"]["median_ratio"] > 0
     assert 0 < result["loss1"]["undamaged"] <= 1
-    assert "| ours 1 | " in completed.stdout
-    assert "| GStreamer, usual | " in completed.stdout
+    assert "| LAVT 1 | " in completed.stdout
+    assert "| GStreamer, usual settings | " in completed.stdout
 
 
 @pytest.mark.full

@@ -160,14 +160,14 @@ def feedback(seed: int) -> Target:
             bench.deliver("feedback", rtcp_entries[0], CLIENT_ADDRESS)
         expect(misdirected == 0, "video went to an address that was not validated")
 
-    def rejected() -> int:
+    def rejected_count() -> int:
         return total(node.counts, "path_", "feedback_")
 
     def finish() -> str:
         expect(node.counts.get("frames_sent", 0) == frames, "frames were lost")
         return f"{frames} frames sent, {node.counts.get('keyframes_on_request', 0)} keyframes"
 
-    return Target({"path": path, "rtcp": rtcp}, feed, rejected, finish)
+    return Target({"path": path, "rtcp": rtcp}, feed, rejected_count, finish)
 
 
 def probe_at_vehicle(seed: int) -> Target:  # noqa: ARG001 (it uses no random numbers)

@@ -130,7 +130,7 @@ def driver(seed: int, *, stops_after: int | None = None) -> Target:  # noqa: ARG
         nonlocal inputs, rejected_before_restarts
         inputs += 1
         if stops_after is None and inputs % INPUTS_PER_RESTART == 0:
-            rejected_before_restarts = rejected()
+            rejected_before_restarts = rejected_count()
             bench.node = new_driver()
         bench.deliver(channel, data)
         bench.advance(STEP_NS)
@@ -139,7 +139,7 @@ def driver(seed: int, *, stops_after: int | None = None) -> Target:  # noqa: ARG
         if inputs == stops_after:
             bench.deliver("operator", "emergency_stop")
 
-    def rejected() -> int:
+    def rejected_count() -> int:
         rejected_since = total(bench.node.counts, "states_unreadable", "session_replies_unreadable")
         return rejected_before_restarts + rejected_since
 
@@ -147,7 +147,7 @@ def driver(seed: int, *, stops_after: int | None = None) -> Target:  # noqa: ARG
         expect(inputs < FEWEST_INPUTS or commands > 0, "the driver sent no commands")
         return f"{commands} commands, {drive_commands} of them in mode drive"
 
-    return Target({"state": states, "session_reply": replies}, feed, rejected, finish)
+    return Target({"state": states, "session_reply": replies}, feed, rejected_count, finish)
 
 
 def condition_at_operator(seed: int) -> Target:  # noqa: ARG001 (it uses no random numbers)
@@ -172,15 +172,15 @@ def condition_at_operator(seed: int) -> Target:  # noqa: ARG001 (it uses no rand
         if inputs % 500 == 0:
             bench.deliver("injected", InjectionResult(1, "", "", (("control", 75.1),)))
 
-    def rejected() -> int:
+    def rejected_count() -> int:
         return node.counts["netem_replies_unreadable"]
 
     def finish() -> str:
-        expect(reported + rejected() == inputs, "replies were neither reported nor rejected")
+        expect(reported + rejected_count() == inputs, "replies were neither reported nor rejected")
         return f"{reported} reported to the driver"
 
     corpus = Corpus([encode(NetemReply(True, "")), encode(NetemReply(False, "bob has control"))], packed=True)
-    return Target({"netem_reply": corpus}, feed, rejected, finish)
+    return Target({"netem_reply": corpus}, feed, rejected_count, finish)
 
 
 def units(seed: int, number: int) -> list[tuple[int, bytes]]:
@@ -268,7 +268,7 @@ def video(seed: int) -> Target:
         if inputs % INPUTS_PER_FRAME == 0:
             deliver_true_frame()
 
-    def rejected() -> int:
+    def rejected_count() -> int:
         unreadable = total(node.counts, "packets_unreadable", "challenges_unreadable")
         return unreadable + total(node.counts, "repair_malformed", "payloads_malformed")
 
@@ -276,7 +276,7 @@ def video(seed: int) -> Target:
         recovered = node.counts["packets_recovered"]
         return f"{units_sent} access units, {complete_units} complete, {recovered} packets recovered"
 
-    return Target(corpora, feed, rejected, finish)
+    return Target(corpora, feed, rejected_count, finish)
 
 
 def pictures(seed: int) -> Target:

@@ -82,10 +82,10 @@ def rendezvous(_seed: int) -> Target:
         clients = forwarder._clients
         expect(max(len(clients._answered), len(clients._unanswered)) <= MAX_CLIENTS, "clients are never forgotten")
 
-    def rejected() -> int:
+    def rejected_count() -> int:
         counts = forwarder.counts
         return total(counts, "") - counts["registrations"] - total(counts, "to_clients", "to_vehicle")
 
     expect(len(key.sign(b"")) == SIGNATURE_BYTES, "the MAC is not as long as a signature")
     corpora = {"registration": registrations, "wrapped": wrapped, "client": client}
-    return Target(corpora, feed, rejected, lambda: f"{forwarder.counts['to_clients']} forwarded to clients")
+    return Target(corpora, feed, rejected_count, lambda: f"{forwarder.counts['to_clients']} forwarded to clients")

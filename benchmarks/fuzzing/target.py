@@ -28,7 +28,7 @@ class Target:
     """The corpora by channel."""
     feed: Callable[[str, bytes, Chance], None]
     """Delivers one input on a channel, and checks the invariants; any error but `InvariantViolation` is a parser's."""
-    rejected: Callable[[], int]
+    rejected_count: Callable[[], int]
     """Returns the number of rejected inputs."""
     finish: Callable[[], str] = field(default=lambda: "")
     """Checks the final invariants and returns a summary of the run."""

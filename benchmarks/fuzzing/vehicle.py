@@ -208,7 +208,7 @@ def _check_counts(side: VehicleSide, delivered: dict[str, int]) -> None:
     expect(requests == delivered["session"], f"{delivered['session']} requests were delivered, {requests} counted")
 
 
-def _rejected(side: VehicleSide) -> int:
+def _rejected_count(side: VehicleSide) -> int:
     counts = side.node.counts
     rejections = sum(number for name, number in counts.items() if name.startswith("session ") and "rejected" in name)
     unreadable = counts.get("commands_unreadable", 0) + counts.get("session_requests_unreadable", 0)
@@ -234,7 +234,7 @@ def vehicle_at_rest(seed: int) -> Target:
         _check_counts(side, delivered)
         return f"ended {side.gate.state}"
 
-    return Target({"control": side.control, "session": side.session}, feed, lambda: _rejected(side), finish)
+    return Target({"control": side.control, "session": side.session}, feed, lambda: _rejected_count(side), finish)
 
 
 def vehicle_driven(seed: int) -> Target:
@@ -275,7 +275,7 @@ def vehicle_driven(seed: int) -> Target:
     return Target(
         {"control": side.control, "session": side.session},
         feed,
-        lambda: _rejected(side),
+        lambda: _rejected_count(side),
         lambda: f"{inputs_while_driving / inputs:.0%} of the inputs in the state driving",
     )
 
@@ -311,12 +311,12 @@ def condition_at_vehicle(seed: int) -> Target:  # noqa: ARG001 (it uses no rando
             reason = "" if chance.below(4) else "there is no such interface"
             bench.deliver("injected", InjectionResult(newest, reason, "", (("video", 150.2),)))
 
-    def rejected() -> int:
+    def rejected_count() -> int:
         return node.counts["netem_requests_unreadable"] + node.counts["netem rejected"]
 
     def finish() -> str:
-        answered = rejected() + node.counts["netem granted"]
+        answered = rejected_count() + node.counts["netem granted"]
         expect(answered == inputs, f"{inputs} requests were delivered, {answered} counted")
         return f"{node.counts['netem granted']} granted"
 
-    return Target({"netem": corpus}, feed, rejected, finish)
+    return Target({"netem": corpus}, feed, rejected_count, finish)

@@ -72,7 +72,7 @@ def measure_pairs(run: Run, pairs: int) -> Iterator[ComparisonPair]:
         ours, tuned = (first, second) if order[0] == "ours" else (second, first)
         pair = ComparisonPair(ours, tuned, floor_ms)
         print(
-            f"  pair {number + 1}: ours {ours.median_ms:.2f}, GStreamer {tuned.median_ms:.2f}, floor {floor_ms:.2f} ms",
+            f"  pair {number + 1}: LAVT {ours.median_ms:.2f}, GStreamer {tuned.median_ms:.2f}, floor {floor_ms:.2f} ms",
             file=sys.stderr,
         )
         yield pair
@@ -104,10 +104,10 @@ def run_clean_part(folder: Path, size: Size, *, pairs: int, seconds: float) -> d
     measured_pairs = []
     for pair in measure_pairs(run, pairs):
         measured_pairs.append(pair)
-        print(format_row(f"ours {len(measured_pairs)}", pair.ours))
+        print(format_row(f"LAVT {len(measured_pairs)}", pair.ours))
         print(format_row(f"GStreamer, tuned {len(measured_pairs)}", pair.tuned))
         print(f"| floor {len(measured_pairs)} | {pair.floor_ms:.2f} | | | | |", flush=True)
-    print(format_row("GStreamer, usual", measure_usual(run)))
+    print(format_row("GStreamer, usual settings", measure_usual(run)))
     ratios = {
         "median_ratio": median(pair.median_ratio for pair in measured_pairs),
         "cpu_ratio": median(pair.cpu_ratio for pair in measured_pairs),
@@ -115,8 +115,8 @@ def run_clean_part(folder: Path, size: Size, *, pairs: int, seconds: float) -> d
     }
     p95 = median(pair.p95_ratio for pair in measured_pairs)
     print(
-        f"\nOurs / tuned GStreamer, median over pairs: median {ratios['median_ratio']:.2f}, p95 {p95:.2f}, "
-        f"CPU {ratios['cpu_ratio']:.2f}; ours is {ratios['over_floor_ms']:.2f} ms above the codec's floor.",
+        f"\nLAVT / tuned GStreamer, median over pairs: median {ratios['median_ratio']:.2f}, p95 {p95:.2f}, "
+        f"CPU {ratios['cpu_ratio']:.2f}; LAVT is {ratios['over_floor_ms']:.2f} ms above the codec's floor.",
         flush=True,
     )
     return {name: round(value, 3) for name, value in ratios.items()}

@@ -9,7 +9,7 @@ import numpy as np
 from av.codec.context import ThreadType
 from av.video.codeccontext import VideoCodecContext
 from av.video.frame import VideoFrame
-from benchmarks.video.pictures import picture_of, planes_loop
+from benchmarks.video.pictures import map_pictures, picture_of
 from benchmarks.video.run import (
     GOP_FRAMES,
     RATE_HZ,
@@ -28,15 +28,15 @@ from lavt.transport.video.stamp import write_stamp_i420
 def main() -> None:
     """Measure the requested number of frames."""
     run = requested_run()
-    loop = planes_loop(run.loop)
+    pictures = map_pictures(run.pictures_stem)
     encoder, decoder = _open_encoder(run), open_decoder()
-    planes = np.empty_like(loop[0])
+    planes = np.empty_like(pictures[0])
     took_ns = []
     exclude_objects_from_gc()
     pace = Pace()
     for number in range(run.frames):
         pace.wait_for(number)
-        planes[:] = picture_of(loop, number)
+        planes[:] = picture_of(pictures, number)
         begin_ns = wall_ns()
         write_stamp_i420(planes, begin_ns)
         frame = VideoFrame.from_numpy_buffer(planes, format="yuv420p")

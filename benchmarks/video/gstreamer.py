@@ -49,15 +49,20 @@ def load_gstreamer() -> Any:
 
 
 def sender_pipeline(run: Run) -> str:
-    """Return the sender's pipeline: no look-ahead, one thread, and our bit rate, decoder buffer and GOP."""
-    kept = "! tee name=units units. ! appsink name=kept sync=false units. " if run.keep else ""
+    """Return the sender's pipeline: no look-ahead, one thread, and LAVT's bit rate, VBV size and GOP.
+
+    If the run saves access units, the pipeline also sends a copy of each to an appsink.
+    """
+    copy_to_appsink = ""
+    if run.saves_units_and_errors:
+        copy_to_appsink = "! tee name=copies copies. ! appsink name=units sync=false copies. "
     return (
         "appsrc name=source is-live=true format=time max-bytes=0 "
         f"caps=video/x-raw,format=I420,width={run.width_px},height={run.height_px},framerate={RATE_HZ}/1 "
         f"! x264enc tune=zerolatency speed-preset=ultrafast threads=1 bitrate={run.bit_rate_bps // 1000} "
         f"vbv-buf-capacity={VBV_MS} key-int-max={GOP_FRAMES} aud=false "
         "! video/x-h264,profile=constrained-baseline,stream-format=byte-stream,alignment=au "
-        f"{kept}"
+        f"{copy_to_appsink}"
         "! rtph264pay mtu=1200 config-interval=-1 pt=96 aggregate-mode=zero-latency "
         f"! udpsink host=127.0.0.1 port={run.port} sync=false async=false"
     )

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 from benchmarks.video.gstreamer import load_gstreamer, sender_pipeline
-from benchmarks.video.pictures import picture_of, planes_loop
+from benchmarks.video.pictures import map_pictures, picture_of
 from benchmarks.video.run import (
     NUMBER_COLUMN,
     RATE_HZ,
@@ -33,44 +33,45 @@ def main() -> None:
     gst = load_gstreamer()
     pipeline = gst.parse_launch(sender_pipeline(run))
     pipeline.set_state(gst.State.PLAYING)
-    loop = planes_loop(run.loop)
+    pictures = map_pictures(run.pictures_stem)
     print_json({})
     wait_for_line()
-    frame_cpu_ns = _send(gst, run, pipeline.get_by_name("source"), loop)
+    cpu_after_frames_ns = _send(gst, run, pipeline.get_by_name("source"), pictures)
     pipeline.get_by_name("source").end_of_stream()
     pipeline.get_bus().timed_pop_filtered(5 * gst.SECOND, gst.MessageType.EOS | gst.MessageType.ERROR)
-    save_units(run, _pull_units(gst, pipeline) if run.keep else [])
+    save_units(run, _pull_units(gst, pipeline) if run.saves_units_and_errors else [])
     pipeline.set_state(gst.State.NULL)
-    print_json({"cpu_ns": frame_cpu_ns})
+    print_json({"cpu_ns": cpu_after_frames_ns})
 
 
-def _send(gst: Any, run: Run, source: Any, loop: NDArray[np.uint8]) -> list[int]:
-    """Send all frames, and return the process's CPU time after each frame."""
-    table = run.table()
-    frame_cpu_ns = []
+def _send(gst: Any, run: Run, source: Any, pictures: NDArray[np.uint8]) -> list[int]:
+    """Send all frames; return the process's total CPU time at the end of each frame."""
+    sent_table = run.map_sent_table()
+    cpu_after_frames_ns = []
     exclude_objects_from_gc()
     pace = Pace()
     for number in range(run.frames):
         pace.wait_for(number)
-        buffer = gst.Buffer.new_allocate(None, loop[0].size, None)
+        buffer = gst.Buffer.new_allocate(None, pictures[0].size, None)
         _, mapped = buffer.map(gst.MapFlags.WRITE)
-        planes = np.frombuffer(mapped.data, np.uint8).reshape(loop[0].shape)
-        planes[:] = picture_of(loop, number)
+        planes = np.frombuffer(mapped.data, np.uint8).reshape(pictures[0].shape)
+        planes[:] = picture_of(pictures, number)
         stamp_ns = wall_ns()
         write_stamp_i420(planes, stamp_ns)
         buffer.unmap(mapped)
         buffer.pts = buffer.dts = number * NS_PER_S // RATE_HZ
         buffer.duration = NS_PER_S // RATE_HZ
-        table[number, NUMBER_COLUMN] = number
-        table[number, STAMP_COLUMN] = stamp_ns
+        sent_table[number, NUMBER_COLUMN] = number
+        sent_table[number, STAMP_COLUMN] = stamp_ns
         source.push_buffer(buffer)
-        frame_cpu_ns.append(cpu_ns())
-    return frame_cpu_ns
+        cpu_after_frames_ns.append(cpu_ns())
+    return cpu_after_frames_ns
 
 
 def _pull_units(gst: Any, pipeline: Any) -> list[bytes]:
+    """Return the access units that the pipeline's appsink `units` has queued."""
     units = []
-    while (sample := pipeline.get_by_name("kept").try_pull_sample(0)) is not None:
+    while (sample := pipeline.get_by_name("units").try_pull_sample(0)) is not None:
         buffer = sample.get_buffer()
         _, mapped = buffer.map(gst.MapFlags.READ)
         units.append(bytes(mapped.data))

@@ -12,7 +12,7 @@ import av
 import numpy as np
 from benchmarks.video.clean import SIZES
 from benchmarks.video.floor import open_decoder
-from benchmarks.video.pictures import picture_of, planes_loop, squared_error
+from benchmarks.video.pictures import map_pictures, picture_of, squared_error
 from benchmarks.video.processes import WARM_UP_FRAMES, Program, RunOutcome, measure
 from benchmarks.video.relay import LinkCase
 from benchmarks.video.run import NUMBER_COLUMN, Run, load_units
@@ -61,7 +61,7 @@ def psnr_db(mean_squared_error: float) -> float:
 
 def loss_free_errors(run: Run) -> list[float]:
     """Decode the stream as it was sent; return the mean squared error of each frame's luma to the source picture."""
-    decoder, source, numbers = open_decoder(), planes_loop(run.loop), run.table()[:, NUMBER_COLUMN]
+    decoder, source, numbers = open_decoder(), map_pictures(run.pictures_stem), run.map_sent_table()[:, NUMBER_COLUMN]
     errors = []
     for index, unit in enumerate(load_units(run)):
         frames = decoder.decode(av.Packet(unit))
@@ -90,14 +90,21 @@ def undamaged_share(received: dict[int, float], loss_free: Sequence[float]) -> f
 def run_impaired_part(folder: Path, case: LinkCase, *, frames: int) -> dict[str, float]:
     """Measure a case, print its table, and return its values for the line of JSON (none for bursts)."""
     size = SIZES[0]
-    run = Run(str(folder), size.width_px, size.height_px, size.bit_rate_bps, WARM_UP_FRAMES + frames, keep=True)
+    run = Run(
+        str(folder),
+        size.width_px,
+        size.height_px,
+        size.bit_rate_bps,
+        WARM_UP_FRAMES + frames,
+        saves_units_and_errors=True,
+    )
     impairment = f"loss {case.loss:.0%}" if case.loss else f"U(0, {case.jitter_ms:g}) ms, reordering"
     bursts = f", bursts of {case.burst_packets:g} packets" if case.burst_packets else ""
     print(f"\n## {case.name}: {size.name}, 20 ms each way, {impairment}{bursts}, {frames} frames\n")
     print("| run | median ms | p95 ms | shown | undamaged | overhead | lost | relay late by, p99 / longest ms |")
     print("|---|---|---|---|---|---|---|---|")
     ours = _measure_quality("ours", run, case)
-    _print_row("ours", ours)
+    _print_row("LAVT", ours)
     gstreamer = []
     for jitter_buffer_ms in GSTREAMER_JITTER_BUFFERS_MS[case.name]:
         gstreamer.append(_measure_quality("gstreamer", replace(run, jitter_buffer_ms=jitter_buffer_ms), case))

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.video.picture_log import PictureLog
-from benchmarks.video.product import LOOPBACK, LastPictureReceiver, ProcessRuntime, build_receiver_nodes
+from benchmarks.video.product import LOOPBACK, LastPictureDecoder, ProcessRuntime, build_receiver_nodes
 from benchmarks.video.run import TOKEN, print_json, requested_run, wait_for_line
 
 from lavt.domain import Now
@@ -18,13 +18,13 @@ class PictureRecorder:
 
     def __init__(self, log: PictureLog) -> None:
         self.counts: dict[str, int] = {}
-        self.pictures: LastPictureReceiver | None = None
+        self.decoder: LastPictureDecoder | None = None
         self._log = log
 
     def write(self, topic: str, payload: Any, now: Now) -> None:  # noqa: ARG002 (part of the protocol)
         """Note a picture whose stamp was read, and finally the nodes' counts."""
-        if topic == "picture" and payload.readable and self.pictures is not None:
-            self._log.note(payload.stamp_ns, payload.read_wall_ns, self.pictures.last.luma)
+        if topic == "picture" and payload.readable and self.decoder is not None:
+            self._log.note(payload.stamp_ns, payload.read_wall_ns, self.decoder.last.luma)
         elif topic == "counts":
             self.counts |= {name: count for name, count in payload.items() if name != "node" and count}
 
@@ -35,7 +35,7 @@ def main() -> None:
     log = PictureLog(run)
     recorder = PictureRecorder(log)
     process = ProcessRuntime(channel="rtp", recorder=recorder, remote=(LOOPBACK, run.port))
-    nodes, recorder.pictures = build_receiver_nodes(run, process.clock)
+    nodes, recorder.decoder = build_receiver_nodes(run, process.clock)
     runtime = process.start(nodes)
     runtime.deliver("path_token", PathToken(TOKEN, run.port), process.clock.now())
     print_json({"port": process.port})

@@ -32,7 +32,7 @@ class SentFrameRecorder:
         """The process's CPU time after each frame."""
         self.sent = 0
         self.units: list[bytes] = []
-        self._table: Table = run.table()
+        self._table: Table = run.map_sent_table()
         self._run = run
 
     def write(self, topic: str, payload: Any, now: Now) -> None:  # noqa: ARG002 (part of the protocol)
@@ -44,7 +44,7 @@ class SentFrameRecorder:
             self._table[sent, NUMBER_COLUMN] = payload.number
             self._table[sent, STAMP_COLUMN] = payload.stamp_ns
         elif topic == "video":
-            if self._run.keep:
+            if self._run.saves_units_and_errors:
                 self.units.append(payload.data)
             self.cpu_ns[sent] = cpu_ns()
             self.sent = sent + 1

@@ -5,22 +5,25 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from benchmarks.video.pictures import picture_of, planes_loop, squared_error
+from benchmarks.video.pictures import map_pictures, picture_of, squared_error
 from benchmarks.video.run import MAX_FRAMES, NUMBER_COLUMN, STAMP_COLUMN, Run, cpu_ns
 from numpy.typing import NDArray
 
 
 class PictureLog:
-    """A log of pictures: stamp, time when the stamp was read, CPU time until then and, if `run.keep`, the error."""
+    """A log of pictures: stamp, time when the stamp was read, CPU time until then and, on request, the error.
+
+    `run.saves_units_and_errors` requests the errors.
+    """
 
     def __init__(self, run: Run) -> None:
         # Allocated in advance, because a growing log would look like a memory leak.
         self._rows = np.full((MAX_FRAMES, 3), -1, np.int64)
         self._errors = np.full(MAX_FRAMES, -1.0)
         self._noted = 0
-        self._table = run.table()
+        self._table = run.map_sent_table()
         self._number_by_stamp: dict[int, int] = {}
-        self._source = planes_loop(run.loop) if run.keep else None
+        self._source = map_pictures(run.pictures_stem) if run.saves_units_and_errors else None
 
     def note(self, stamp_ns: int, read_ns: int, luma: NDArray[np.uint8] | None) -> None:
         """Note a picture. If errors are requested, ignore a picture whose stamp was not sent."""

@@ -22,7 +22,7 @@ Planes = NDArray[np.uint8]
 """A picture in I420, (height * 3 / 2, width)."""
 
 
-def render_loop(stem: Path, width_px: int, height_px: int) -> None:
+def render_pictures(stem: Path, width_px: int, height_px: int) -> None:
     """Write the pictures of a drive at 30 km/h to the file `stem`.npy.
 
     The car drives forward and then back. The noise of each picture is different.
@@ -38,11 +38,11 @@ def render_loop(stem: Path, width_px: int, height_px: int) -> None:
         cv2.cvtColor(picture, cv2.COLOR_BGR2YUV_I420, dst=planes[number])
 
 
-def planes_loop(stem: Path) -> NDArray[np.uint8]:
-    """Map the loop of pictures, in I420, into memory; what this process writes to it is not saved."""
-    loop: NDArray[np.uint8] = np.load(stem.with_suffix(".npy"), mmap_mode="c")
-    loop.reshape(-1)[::4096].sum()  # maps all pages now, so that no frame is delayed by it
-    return loop
+def map_pictures(stem: Path) -> NDArray[np.uint8]:
+    """Map the pictures, in I420, into memory as an array (n, height * 3 / 2, width); changes of it are not saved."""
+    pictures: NDArray[np.uint8] = np.load(stem.with_suffix(".npy"), mmap_mode="c")
+    pictures.reshape(-1)[::4096].sum()  # maps all pages now, so that no frame is delayed by it
+    return pictures
 
 
 def squared_error(luma: NDArray[np.uint8], source: Planes) -> float:
@@ -54,7 +54,7 @@ def squared_error(luma: NDArray[np.uint8], source: Planes) -> float:
     return error
 
 
-def picture_of(loop: NDArray[np.uint8], number: int) -> Picture:
-    """Return the picture of a frame."""
-    picture: Picture = loop[number % LOOP_FRAMES]
+def picture_of(pictures: NDArray[np.uint8], number: int) -> Picture:
+    """Return the picture of a frame; after the last picture, the first one is used again."""
+    picture: Picture = pictures[number % LOOP_FRAMES]
     return picture

@@ -164,7 +164,7 @@ def measure(
 
 def _evaluate(run: Run, sent_cpu_ns: list[int], counts: dict[str, int], relayed: dict[str, Any]) -> RunOutcome:
     """Match the log of received pictures with the table of sent frames; `sent_cpu_ns` is the CPU time after each."""
-    sent_stamps_ns = run.table()[WARM_UP_FRAMES : run.frames, STAMP_COLUMN].tolist()
+    sent_stamps_ns = run.map_sent_table()[WARM_UP_FRAMES : run.frames, STAMP_COLUMN].tolist()
     row_by_stamp = {stamp_ns: row for row, stamp_ns in enumerate(sent_stamps_ns, WARM_UP_FRAMES)}
     latency_ms, errors, shown_cpu_ns = [], {}, []
     with np.load(Path(run.folder) / "read.npz") as log:
@@ -185,11 +185,11 @@ def _evaluate(run: Run, sent_cpu_ns: list[int], counts: dict[str, int], relayed:
     )
 
 
-def _cpu_ms_per_frame(frame_cpu_ns: list[int]) -> float:
+def _cpu_ms_per_frame(cpu_after_frames_ns: list[int]) -> float:
     """Return the mean CPU time of a frame from a process's CPU time after each frame; nan for fewer than two."""
-    if len(frame_cpu_ns) < 2:
+    if len(cpu_after_frames_ns) < 2:
         return float("nan")
-    return (frame_cpu_ns[-1] - frame_cpu_ns[0]) / (len(frame_cpu_ns) - 1) / NS_PER_MS
+    return (cpu_after_frames_ns[-1] - cpu_after_frames_ns[0]) / (len(cpu_after_frames_ns) - 1) / NS_PER_MS
 
 
 def measure_floor_ms(run: Run) -> float:

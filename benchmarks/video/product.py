@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Protocol
 
-from benchmarks.video.pictures import picture_of, planes_loop
+from benchmarks.video.pictures import map_pictures, picture_of
 from benchmarks.video.run import GOP_FRAMES, RATE_HZ, VBV_MS, Run
 
 from lavt.assembly.entropy import MachineEntropy
@@ -27,29 +27,29 @@ from lavt.vehicle.camera import CapturedFrame
 LOOPBACK = "127.0.0.1"
 
 
-class LoopCamera:
-    """A camera that copies each picture of the loop, in I420, into a buffer, as GStreamer's sender does."""
+class RepeatingCamera:
+    """A camera that repeats the run's pictures. It copies each, in I420, into a buffer, as GStreamer's sender does."""
 
     rate_hz = float(RATE_HZ)
     phase_ns = 0
 
     def __init__(self, run: Run) -> None:
         self.model = CameraModel(run.width_px, run.height_px)
-        self._loop = planes_loop(run.loop)
-        self._planes = self._loop[0].copy()
+        self._pictures = map_pictures(run.pictures_stem)
+        self._planes = self._pictures[0].copy()
 
     def capture(self, number: int, at_ns: int, pose: Pose | None) -> CapturedFrame:  # noqa: ARG002 (nothing moves)
-        """Return a frame of the loop."""
-        self._planes[:] = picture_of(self._loop, number)
+        """Return frame `number`."""
+        self._planes[:] = picture_of(self._pictures, number)
         return CapturedFrame(number, at_ns, self._planes)
 
 
-class SinkNode:
+class DiscardingNode:
     """A node that discards all messages on the given channels."""
 
     counts: Mapping[str, int] = {}
 
-    def __init__(self, name: str, *channels: str) -> None:
+    def __init__(self, name: str, *, channels: Sequence[str]) -> None:
         self.name = name
         self.pipelines: Mapping[str, Sequence[Stage]] = dict.fromkeys(channels, (("discard", _discard),))
 
@@ -110,7 +110,7 @@ class ProcessRuntime:
 
 
 def build_sender_nodes(run: Run, clock: MachineClock, port: int) -> Sequence[Node]:
-    """Build the server's camera node with a loop of pictures."""
+    """Build the server's camera node with a `RepeatingCamera`, and a node that discards the actuator's messages."""
     config = ServerConfig.model_validate(
         {
             "camera": {"width_px": run.width_px, "height_px": run.height_px, "rate_hz": RATE_HZ},
@@ -119,20 +119,20 @@ def build_sender_nodes(run: Run, clock: MachineClock, port: int) -> Sequence[Nod
     )
 
     def vehicle_setup(config: ServerConfig) -> VehicleSetup:
-        return replace(build_geometry_setup(config), camera=LoopCamera(run))
+        return replace(build_geometry_setup(config), camera=RepeatingCamera(run))
 
     fidelity = replace(VIDEO, vehicle_setup=vehicle_setup)
     nodes = build_server(config, clock.now, MachineEntropy(), host="", video_port=port, fidelity=fidelity)
-    return [nodes.camera, SinkNode("actuator", "frame")]
+    return [nodes.camera, DiscardingNode(name="actuator", channels=("frame",))]
 
 
-class LastPictureReceiver:
-    """The client's decoder, which keeps the picture whose stamp was read last."""
+class LastPictureDecoder:
+    """A `PictureReceiver`, the client's decoder, that keeps the picture whose stamp was read last."""
 
-    def __init__(self, pictures: PictureReceiver) -> None:
+    def __init__(self, decoder: PictureReceiver) -> None:
         self.last: Any = None
-        self.decode = pictures.decode
-        self._read_stamp = pictures.read_stamp
+        self.decode = decoder.decode
+        self._read_stamp = decoder.read_stamp
 
     def read_stamp(self, received: Any) -> int:
         """Read the stamp and keep the picture."""
@@ -140,9 +140,10 @@ class LastPictureReceiver:
         return self._read_stamp(received)
 
 
-def build_receiver_nodes(run: Run, clock: MachineClock) -> tuple[Sequence[Node], LastPictureReceiver]:
-    """Build the client's receiver node and a watcher node; return both nodes, and the decoder of the pictures."""
+def build_receiver_nodes(run: Run, clock: MachineClock) -> tuple[Sequence[Node], LastPictureDecoder]:
+    """Build the client's receiver node and a watcher node; return both nodes, and the watcher's decoder."""
     size = {"width_px": run.width_px, "height_px": run.height_px}
     config = ClientConfig.model_validate({"camera": {**size, "rate_hz": RATE_HZ}})
-    pictures = LastPictureReceiver(VIDEO.receiver(config))
-    return [build_client(config, clock.now, MachineEntropy()).receiver, WatcherNode(PictureReader(pictures))], pictures
+    decoder = LastPictureDecoder(VIDEO.receiver(config))
+    receiver_node = build_client(config, clock.now, MachineEntropy()).receiver
+    return [receiver_node, WatcherNode(PictureReader(decoder))], decoder

@@ -22,7 +22,7 @@ from benchmarks.video.processes import WARM_UP_FRAMES
 from benchmarks.video.run import exclude_objects_from_gc, print_json, requested_run
 
 from lavt.domain import NS_PER_MS, NS_PER_S
-from lavt.transport.emulation.impairment import Impairment, gilbert
+from lavt.transport.emulation.impairment import Impairment, burst_probabilities
 from lavt.transport.emulation.random_process import Draws, LossProcess
 
 ONE_WAY_MS = 20
@@ -59,7 +59,8 @@ class PacketImpairment:
 
     def __init__(self, case: LinkCase) -> None:
         impairment = Impairment(loss=case.loss, loss_burst_packets=case.burst_packets)
-        self._losses = LossProcess(SEED, "loss", case.loss, gilbert(impairment) if case.burst_packets else None)
+        bursts = burst_probabilities(impairment) if case.burst_packets else None
+        self._losses = LossProcess(SEED, "loss", case.loss, bursts)
         self._jitter = Draws(SEED, "jitter")
         self._jitter_ns = case.jitter_ms * NS_PER_MS
         self._number = 0

@@ -42,7 +42,7 @@ class Run:
     """Number of frames to send, including the warm-up."""
     port: int = 0
     """Port to which a process that is started later sends."""
-    keep: bool = False
+    saves_units_and_errors: bool = False
     """Whether to save the access units and the error of each received picture."""
     jitter_buffer_ms: int = 0
     """The length of GStreamer's jitter buffer."""
@@ -50,11 +50,11 @@ class Run:
     """Whether GStreamer shows each picture when it is due, instead of immediately."""
 
     @property
-    def loop(self) -> Path:
+    def pictures_stem(self) -> Path:
         """Path of the file of pictures, without suffix."""
         return Path(self.folder) / f"{self.width_px}x{self.height_px}"
 
-    def table(self) -> Table:
+    def map_sent_table(self) -> Table:
         """Map the table of sent frames into memory."""
         return np.asarray(np.load(Path(self.folder) / "sent.npy", mmap_mode="r+"))
 

@@ -39,7 +39,7 @@ class StuckNode:
 
 def serve_stuck(connection: Connection) -> None:
     """Serve a stuck node, with shorter limits."""
-    vehicle = SimpleNamespace(is_silent=False, close=lambda: None)
+    vehicle = SimpleNamespace(is_idle_or_overridden=False, close=lambda: None)
     for name, replacement in {
         "open_by_wire": lambda *_: vehicle,
         "build_actuator": lambda *_, **__: StuckNode(),

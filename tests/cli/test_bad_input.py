@@ -108,7 +108,7 @@ def test_bad_runs(command: str, case: str, run: Run, tmp_path: Path) -> None:
         changes = [re.sub(r"network\.condition=(\w+)", r"conditions=[\1]", change) for change in changes]
         changes = [change.replace("vehicle.route=nowhere", "routes=[nowhere]") for change in changes]
     result = run(command, SWEEP if command == "sweep" else DEMO, *changes, "--out", "mine")
-    assert reason in result.rejected()
+    assert reason in result.rejection()
     assert files(tmp_path) == {}
 
 
@@ -128,7 +128,7 @@ def test_bad_boundaries(case: str, run: Run, tmp_path: Path) -> None:
     """An invalid boundary search is rejected in one sentence, and no directory is created."""
     changes, reason = BAD_BOUNDARIES[case]
     options = [part for change in changes for part in ("--set", change)]
-    assert reason in run("boundary", BOUNDARY, *options, "--out", "mine").rejected()
+    assert reason in run("boundary", BOUNDARY, *options, "--out", "mine").rejection()
     assert files(tmp_path) == {}
 
 
@@ -160,7 +160,7 @@ BAD_NETEM = {
 def test_bad_netem(case: str, run: Run) -> None:
     """Invalid arguments of `lavt netem` are rejected in one sentence before anything is changed."""
     arguments, reason = BAD_NETEM[case]
-    rejected = run("netem", *arguments).rejected()
+    rejected = run("netem", *arguments).rejection()
     assert reason in rejected or "no tc" in rejected  # on a machine without tc
 
 
@@ -192,7 +192,7 @@ MISSING_FILES = {
 @pytest.mark.parametrize("command", MISSING_FILES)
 def test_missing_file(command: str, run: Run, tmp_path: Path) -> None:
     """A missing file or directory is named in one sentence, and nothing is created."""
-    assert "nothing" in run(*MISSING_FILES[command]).rejected()
+    assert "nothing" in run(*MISSING_FILES[command]).rejection()
     assert files(tmp_path) == {}
 
 
@@ -210,7 +210,7 @@ CONFIGS_OF_OTHER_COMMANDS = {
 @pytest.mark.parametrize("command", CONFIGS_OF_OTHER_COMMANDS)
 def test_config_of_another_command(command: str, run: Run) -> None:
     """A config of another command is rejected in one sentence."""
-    run(*CONFIGS_OF_OTHER_COMMANDS[command]).rejected()
+    run(*CONFIGS_OF_OTHER_COMMANDS[command]).rejection()
 
 
 COMMANDS_WITH_OUT = {
@@ -234,7 +234,7 @@ def test_nothing_is_overwritten(command: str, occupied: str, run: Run, tmp_path:
     else:
         mine.write_bytes(b"weeks of work")
     before = files(tmp_path)
-    assert "mine" in run(*COMMANDS_WITH_OUT[command], "mine").rejected()
+    assert "mine" in run(*COMMANDS_WITH_OUT[command], "mine").rejection()
     assert files(tmp_path) == before
 
 
@@ -242,16 +242,16 @@ def test_out_in_a_file(run: Run, tmp_path: Path) -> None:
     """An output directory that cannot be created is rejected in one sentence."""
     (tmp_path / "file").write_bytes(b"")
     for arguments in (["demo"], ["sweep", SWEEP]):
-        assert "file/inside" in run(*arguments, "--out", "file/inside").rejected()
+        assert "file/inside" in run(*arguments, "--out", "file/inside").rejection()
 
 
 def test_report_of_nothing(run: Run, tmp_path: Path) -> None:
     """A report of a directory without runs is rejected, and nothing is written."""
     (tmp_path / "empty").mkdir()
-    assert "empty" in run("report", "empty").rejected()
-    assert "empty" in run("report", "empty", "--out", "elsewhere").rejected()
+    assert "empty" in run("report", "empty").rejection()
+    assert "empty" in run("report", "empty", "--out", "elsewhere").rejection()
     (tmp_path / "file").write_bytes(b"x")
-    assert "file" in run("report", "empty", "--out", "file").rejected()
+    assert "file" in run("report", "empty", "--out", "file").rejection()
     assert files(tmp_path) == {"empty": None, "file": b"x"}
 
 
@@ -287,7 +287,7 @@ def test_report_of_a_boundary_without_runs(run: Run, tmp_path: Path) -> None:
     """A boundary.json without runs is rejected, and an invalid one ends the report with exit code 1."""
     (tmp_path / "found").mkdir()
     (tmp_path / "found" / "boundary.json").write_text('{"runs": [{}], "groups": [{}]}')
-    assert "found" in run("report", "found").rejected()
+    assert "found" in run("report", "found").rejection()
     (tmp_path / "found" / "boundary.json").write_text('{"runs": [], "groups": 3}')
     result = run("report", "found")
     assert (result.code, result.out) == (1, "")
@@ -297,7 +297,7 @@ def test_report_of_a_boundary_without_runs(run: Run, tmp_path: Path) -> None:
 
 def test_nothing_to_resume(run: Run, tmp_path: Path) -> None:
     """A sweep that was never started cannot be resumed."""
-    assert "never" in run("sweep", SWEEP, "--resume", "--out", "never").rejected()
+    assert "never" in run("sweep", SWEEP, "--resume", "--out", "never").rejection()
     assert files(tmp_path) == {}
 
 
@@ -332,7 +332,7 @@ def test_a_router_whose_private_key_others_may_read(direction: str, run: Run, tm
     key.touch(0o644)
     key.chmod(0o644)
     change = f"transport.link.tls.{direction}_private_key={key}"
-    assert str(key) in run("router", ROUTER, "--set", change, "--set", "listen.endpoints=[tcp/127.0.0.1:0]").rejected()
+    assert str(key) in run("router", ROUTER, "--set", change, "--set", "listen.endpoints=[tcp/127.0.0.1:0]").rejection()
 
 
 @pytest.mark.parametrize(("side", "config"), [("server", SERVER), ("client", CLIENT)])
@@ -345,7 +345,7 @@ def test_an_expired_signing_key(side: str, config: str, run: Run, tmp_path: Path
     private.chmod(0o600)
     public.write_bytes(pair.public)
     peer_key = f"security.operators={{a: {public}}}" if side == "server" else f"security.vehicle={public}"
-    sentence = run(side, config, "--set", f"security.key={private}", "--set", peer_key, "--out", "mine").rejected()
+    sentence = run(side, config, "--set", f"security.key={private}", "--set", peer_key, "--out", "mine").rejection()
     assert str(private) in sentence or str(public) in sentence
     assert "1970-01-02" in sentence
     assert not (tmp_path / "mine").exists()
@@ -356,7 +356,7 @@ def test_bad_sides(case: str, run: Run, tmp_path: Path) -> None:
     """An invalid config of a server, client, router or relay is rejected in one sentence, and nothing is created."""
     arguments, reason = BAD_SIDES[case]
     out = ["--out", "mine"] if arguments[0] in {"server", "client"} else []
-    assert reason in run(*arguments, *out).rejected()
+    assert reason in run(*arguments, *out).rejection()
     assert files(tmp_path) == {}
 
 
@@ -401,7 +401,7 @@ def test_list_of_commands(run: Run) -> None:
 
 def test_join_of_nothing(run: Run, tmp_path: Path) -> None:
     """Directories without the output of a side are rejected, and no run is created."""
-    rejected = run("join", "one", "two", "--out", "joined").rejected()
+    rejected = run("join", "one", "two", "--out", "joined").rejection()
     assert "one" in rejected
     assert "config.yaml" in rejected
     assert not (tmp_path / "joined").exists()
@@ -446,14 +446,14 @@ def used_port() -> Iterator[int]:
 
 def test_relay_port_in_use(used_port: int, run: Run) -> None:
     """A relay's port that is in use is rejected in one sentence."""
-    rejected = run("relay", RELAY, "--set", f"video_listen=127.0.0.1:{used_port}").rejected()
+    rejected = run("relay", RELAY, "--set", f"video_listen=127.0.0.1:{used_port}").rejection()
     assert f"127.0.0.1:{used_port}" in rejected
 
 
 def test_rendezvous_port_in_use(used_port: int, run: Run) -> None:
     """A rendezvous port that is in use is rejected in one sentence."""
     changes = ("--set", "bind=127.0.0.1", "--set", "video_port=0", "--set", f"probe_port={used_port}")
-    assert f"127.0.0.1:{used_port}" in run("rendezvous", RENDEZVOUS, *changes).rejected()
+    assert f"127.0.0.1:{used_port}" in run("rendezvous", RENDEZVOUS, *changes).rejection()
 
 
 BAD_WATCHES = {
@@ -467,33 +467,33 @@ BAD_WATCHES = {
 def test_bad_watch(case: str, run: Run) -> None:
     """An unknown host, or an address of another machine, is rejected in one sentence."""
     arguments, reason = BAD_WATCHES[case]
-    assert reason in run("watch", *arguments).rejected()
+    assert reason in run("watch", *arguments).rejection()
 
 
 def test_watched_port_in_use(used_port: int, run: Run) -> None:
     """A watched port that is in use is rejected in one sentence."""
-    rejected = run("watch", "--bind", "127.0.0.1", "--port", str(used_port)).rejected()
+    rejected = run("watch", "--bind", "127.0.0.1", "--port", str(used_port)).rejection()
     assert f"127.0.0.1:{used_port}" in rejected
 
 
 def test_server_with_an_unknown_route(router: str, run: Run, tmp_path: Path) -> None:
     """An unknown road is rejected in one sentence, after the server's links are open, and nothing is created."""
     changes = ("--set", "vehicle.route=nowhere", "--set", "video.port=0", "--set", f"zenoh.router={router}")
-    assert "'nowhere'" in run("server", SERVER, *changes, "--out", "mine").rejected()
+    assert "'nowhere'" in run("server", SERVER, *changes, "--out", "mine").rejection()
     assert files(tmp_path) == {}
 
 
 def test_server_with_an_unknown_rendezvous(router: str, run: Run, tmp_path: Path) -> None:
     """An unknown host of the rendezvous is rejected in one sentence, and nothing is created."""
     changes = ("--set", f"rendezvous.host={'a' * 64}", "--set", f"zenoh.router={router}")
-    assert "rendezvous.host" in run("server", SERVER, *changes, "--out", "mine").rejected()
+    assert "rendezvous.host" in run("server", SERVER, *changes, "--out", "mine").rejection()
     assert files(tmp_path) == {}
 
 
 def test_client_with_an_unknown_server(router: str, run: Run, tmp_path: Path) -> None:
     """An unknown host of the server is rejected in one sentence, and nothing is created."""
     changes = ("--set", f"video.server={'a' * 64}", "--set", f"zenoh.router={router}")
-    assert "video.server" in run("client", CLIENT, *changes, "--out", "mine").rejected()
+    assert "video.server" in run("client", CLIENT, *changes, "--out", "mine").rejection()
     assert files(tmp_path) == {}
 
 
@@ -501,13 +501,13 @@ def test_server_port_in_use(router: str, used_port: int, run: Run, tmp_path: Pat
     """A server's video port that is in use is rejected in one sentence, and nothing is created."""
     changes = (f"video.port={used_port}", "video.bind=127.0.0.1", f"zenoh.router={router}")
     options = [part for change in changes for part in ("--set", change)]
-    assert f"127.0.0.1:{used_port}" in run("server", SERVER, "--json", *options, "--out", "mine").rejected()
+    assert f"127.0.0.1:{used_port}" in run("server", SERVER, "--json", *options, "--out", "mine").rejection()
     assert files(tmp_path) == {}
 
 
 def test_client_with_an_unknown_protocol(run: Run, tmp_path: Path) -> None:
     """A router endpoint with an unknown protocol is rejected in one sentence, and nothing is created."""
-    rejected = run("client", CLIENT, "--json", "--set", "zenoh.router=foo/127.0.0.1:1", "--out", "mine").rejected()
+    rejected = run("client", CLIENT, "--json", "--set", "zenoh.router=foo/127.0.0.1:1", "--out", "mine").rejection()
     assert "zenoh.router" in rejected
     assert "'foo/127.0.0.1:1'" in rejected
     assert files(tmp_path) == {}
@@ -515,14 +515,14 @@ def test_client_with_an_unknown_protocol(run: Run, tmp_path: Path) -> None:
 
 def test_stop_without_a_router(run: Run) -> None:
     """Without a router, `lavt stop` fails with one sentence that names the command that starts a router."""
-    assert "`lavt router" in run("stop", CLIENT, "--set", "zenoh.router=tcp/127.0.0.1:1").rejected()
+    assert "`lavt router" in run("stop", CLIENT, "--set", "zenoh.router=tcp/127.0.0.1:1").rejection()
 
 
 def test_bad_input_of_a_process(used_port: int) -> None:
     """With invalid input, `python -m lavt` prints one sentence and no log of Zenoh, and exits with code 2."""
     process = start_lavt("router", ROUTER, "--json", "--set", f"listen.endpoints=[tcp/127.0.0.1:{used_port}]")
     out, err = process.communicate(timeout=EXIT_TIMEOUT_S)
-    assert f"tcp/127.0.0.1:{used_port}" in CommandResult(process.returncode, out, err).rejected()
+    assert f"tcp/127.0.0.1:{used_port}" in CommandResult(process.returncode, out, err).rejection()
 
 
 @pytest.mark.parametrize("command", [["client", CLIENT], ["server", SERVER, "--set", "video.port=0"]])

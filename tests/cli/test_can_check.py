@@ -291,4 +291,4 @@ def test_bad_input(run: Run, tmp_path: Path) -> None:
         (["dataspeed_gen1", "--dbc", "nosuch.dbc"], "nosuch.dbc"),
         (["dataspeed_gen1:user"], ":user"),
     ):
-        assert reason in run(*arguments).rejected()
+        assert reason in run(*arguments).rejection()

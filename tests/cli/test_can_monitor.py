@@ -126,7 +126,7 @@ REJECTED = [
 @pytest.mark.parametrize(("arguments", "reason"), REJECTED)
 def test_rejected(run: Run, arguments: list[str], reason: str) -> None:
     """Invalid input is rejected in one sentence."""
-    assert reason in run("monitor", *arguments).rejected()
+    assert reason in run("monitor", *arguments).rejection()
 
 
 def test_find_dbw(tmp_path: Path) -> None:

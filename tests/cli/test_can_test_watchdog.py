@@ -166,7 +166,7 @@ def test_rejected(run: Run, monkeypatch: pytest.MonkeyPatch, arguments: list[str
     Nothing has been sent by then.
     """
     monkeypatch.setattr(sys, "stdin", io.StringIO("yes\n"))
-    assert reason in run(*arguments).rejected()
+    assert reason in run(*arguments).rejection()
 
 
 CONFIG = DbwConfig(profile="dataspeed_gen2", interface="udp_multicast", channel=MULTICAST_GROUP)

@@ -246,7 +246,7 @@ def test_output_as_text(run: Run, monkeypatch: pytest.MonkeyPatch, verdict: Verd
 )
 def test_bad_input(run: Run, arguments: tuple[str, ...], reason: str) -> None:
     """An invalid config is rejected in one sentence, with exit code 2, before any check."""
-    assert reason in run("doctor", *arguments).rejected()
+    assert reason in run("doctor", *arguments).rejection()
 
 
 @pytest.fixture

@@ -185,14 +185,14 @@ def test_damaged_authority(run: Run, directory: Path) -> None:
     """An authority whose key is missing or another's, or whose files are unreadable, is reported and signs nothing."""
     key = (directory / "authority.key").read_bytes()
     (directory / "authority.key").unlink()
-    assert "keys/authority.key" in run("keys", "--operator", "two").rejected()
+    assert "keys/authority.key" in run("keys", "--operator", "two").rejection()
     shutil.copy(directory / "vehicle-1.key", directory / "authority.key")
-    assert "certificate" in run("keys", "--operator", "two").rejected()
+    assert "certificate" in run("keys", "--operator", "two").rejection()
     (directory / "authority.key").write_bytes(b"nonsense")
-    assert "PEM" in run("keys", "--operator", "two").rejected()
+    assert "PEM" in run("keys", "--operator", "two").rejection()
     (directory / "authority.key").write_bytes(key)
     (directory / "authority.pem").write_bytes(b"nonsense")
-    assert "PEM" in run("keys", "--operator", "two").rejected()
+    assert "PEM" in run("keys", "--operator", "two").rejection()
     assert not list(directory.glob("two*"))
 
 
@@ -200,8 +200,8 @@ def test_directory_of_others(run: Run) -> None:
     """A directory that other users can read, or a file in its place, is rejected."""
     Path("open").mkdir(mode=0o755)
     Path("file").touch()
-    assert "chmod 700 open" in run("open", "--vehicle", "one").rejected()
-    assert "file" in run("file", "--vehicle", "one").rejected()
+    assert "chmod 700 open" in run("open", "--vehicle", "one").rejection()
+    assert "file" in run("file", "--vehicle", "one").rejection()
 
 
 def test_without_the_library(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -211,4 +211,4 @@ def test_without_the_library(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     import lavt.transport.security
 
     monkeypatch.delattr(lavt.transport.security, "certificates", raising=False)
-    assert "pip install 'lavt[secure]'" in run("keys", "--vehicle", "one").rejected()
+    assert "pip install 'lavt[secure]'" in run("keys", "--vehicle", "one").rejection()

@@ -17,7 +17,7 @@ from lavt.config import ClientConfig
 from lavt.config_file import parse_config, shipped
 from lavt.domain import CameraModel
 from lavt.errors import UserError
-from lavt.perception.calibration import calibrated
+from lavt.perception.calibration import calibrated_pinhole_camera
 from lavt.perception.lane_detector import LaneDetector
 
 CALIBRATION = """
@@ -66,7 +66,7 @@ def test_a_config_is_a_calibration(show: Show, name: str) -> None:
     """The camera of a config file, even with default values, can be used as a calibration."""
     show("road.png", "--out", "steps.jpg", camera=str(shipped(f"configs/{name}")))
     assert Path("steps.jpg").is_file()
-    assert camera_of_file(shipped(f"configs/{name}")) == calibrated(CameraModel())
+    assert camera_of_file(shipped(f"configs/{name}")) == calibrated_pinhole_camera(CameraModel())
 
 
 def test_the_steps_of_a_video_are_a_video(show: Show) -> None:

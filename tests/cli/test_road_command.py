@@ -58,7 +58,7 @@ def test_a_drawing_has_a_map_the_curvature_and_views() -> None:
 @pytest.mark.parametrize(("arguments", "reason"), [(["nowhere"], "'nowhere'"), (["a_key", "--out", "x.jpg"], ".png")])
 def test_bad_input(run: Run, arguments: list[str], reason: str) -> None:
     """An unknown road, or an output file that is not a PNG, is rejected."""
-    assert reason in run("road", "draw", *arguments).rejected()
+    assert reason in run("road", "draw", *arguments).rejection()
 
 
 def test_a_run_accepts_the_path_of_a_road(bend: Path) -> None:

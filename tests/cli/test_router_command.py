@@ -22,7 +22,7 @@ def test_signal_to_another_thread(tmp_path: Path) -> None:
     with Processes(tmp_path) as processes:
         file = str(shipped("zenoh-configs/router-server.json5"))
         router = processes.start("router", "router", file, "--set", 'listen.endpoints=["tcp/127.0.0.1:0"]')
-        router.ready()
+        router.wait_ready()
         pid = router.popen.pid
         thread = max(int(task.name) for task in Path(f"/proc/{pid}/task").iterdir())
         assert thread != pid

@@ -48,4 +48,4 @@ REJECTED = {
 def test_rejected(case: str, run: Run) -> None:
     """A missing, unknown or invalid receiver is rejected in one sentence with exit code 2."""
     arguments, reason = REJECTED[case]
-    assert reason in run("sdp", SERVER, *arguments).rejected()
+    assert reason in run("sdp", SERVER, *arguments).rejection()

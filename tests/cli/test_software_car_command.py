@@ -255,10 +255,10 @@ def test_bad_input(case: str, run: Run) -> None:
     """An invalid setting of the bus is rejected in one sentence with exit code 2."""
     changes, reason = BAD_SETTINGS[case]
     arguments = [part for change in changes for part in ("--set", f"vehicle.dbw.{change}")]
-    assert reason in run("software-car", SERVER, *arguments).rejected()
+    assert reason in run("software-car", SERVER, *arguments).rejection()
 
 
 @pytest.mark.parametrize(("change", "reason"), [("route=nowhere", "'nowhere'"), ("car=bike", "'bike'")])
 def test_unknown_road_or_car(change: str, reason: str, run: Run) -> None:
     """An unknown road or car is rejected before the bus, which does not exist here, is opened."""
-    assert reason in run("software-car", SERVER, "--set", f"vehicle.{change}").rejected()
+    assert reason in run("software-car", SERVER, "--set", f"vehicle.{change}").rejection()

@@ -87,7 +87,7 @@ def test_a_stop_without_confirmation_fails_after_the_timeout(timeout_s: float) -
 def test_without_a_router_the_stop_is_reported_as_not_sent(run: Run) -> None:
     """Without a router the command fails at once and says that the stop was not sent."""
     endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
-    sentence = run("stop", CONFIG, "--set", f"zenoh.router={endpoint}").rejected()
+    sentence = run("stop", CONFIG, "--set", f"zenoh.router={endpoint}").rejection()
     assert "NOT sent" in sentence
     assert endpoint in sentence
 

@@ -178,7 +178,7 @@ def start_secure_loop(processes: Processes, work: Path, keys: Path) -> tuple[Ins
         f'listen.endpoints=["{sockets["operator"]}"]',
         f'connect.endpoints=["{quic_endpoint(vehicle)}"]',
         *tls_changes(keys, "operator-1", "connect"),
-    ).ready()
+    ).wait_ready()
     insider = Insider(sockets["operator"])
     server = processes.start(
         "server",
@@ -198,7 +198,7 @@ def start_secure_loop(processes: Processes, work: Path, keys: Path) -> tuple[Ins
             "vehicle.route=a",
         ),
     )
-    ports = server.ready()["ready"]
+    ports = server.wait_ready()["ready"]
     client = processes.start(
         "client",
         "client",
@@ -216,7 +216,7 @@ def start_secure_loop(processes: Processes, work: Path, keys: Path) -> tuple[Ins
             "controller.rearm=true",
         ),
     )
-    client.ready()
+    client.wait_ready()
     return insider, server, client
 
 

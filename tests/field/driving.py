@@ -1,4 +1,4 @@
-"""Run a loop whose ends are in network namespaces of their own, and cause outages in it."""
+"""Run a loop whose two sides are in network namespaces of their own, and cause outages in it."""
 
 from __future__ import annotations
 
@@ -40,18 +40,16 @@ def _udp_endpoint(host: str) -> str:
 
 @dataclass(frozen=True)
 class Links:
-    """The configs of the routers, the rendezvous and both sides, each with its changes."""
+    """The config of each router and of the rendezvous, followed by its changes; of both sides only the changes."""
 
-    vehicle: tuple[str, ...] = ("router-server.json5",)
-    operator: tuple[str, ...] = ("router-client.json5", f'connect.endpoints=["{_udp_endpoint(VEHICLE)}"]')
-    cloud: tuple[str, ...] = ()
+    vehicle_router: tuple[str, ...] = ("router-server.json5",)
+    operator_router: tuple[str, ...] = ("router-client.json5", f'connect.endpoints=["{_udp_endpoint(VEHICLE)}"]')
+    cloud_router: tuple[str, ...] = ()
     """Empty without a router in the cloud: the operator's router then dials the vehicle's."""
     rendezvous: tuple[str, ...] = ()
     """Empty without a rendezvous: the client then reaches the vehicle directly."""
-    server: tuple[str, ...] = ()
-    """Only changes of the config."""
-    client: tuple[str, ...] = ()
-    """Only changes of the config."""
+    server_changes: tuple[str, ...] = ()
+    client_changes: tuple[str, ...] = ()
 
 
 MIXED = Links()
@@ -74,7 +72,7 @@ CLOUD = Links(
     ("router-client.json5", f'connect.endpoints=["{_udp_endpoint(INTERNET)}"]'),
     ("router-server.json5", f'listen.endpoints=["{_udp_endpoint("0.0.0.0")}"]'),
 )
-"""Both sides' routers dial a router in the cloud."""
+"""Both sides' routers dial a router in the cloud, so both use the config of the router that dials."""
 
 
 def through_rendezvous(keys: Path) -> Links:
@@ -82,12 +80,12 @@ def through_rendezvous(keys: Path) -> Links:
     return replace(
         CLOUD,
         rendezvous=("rendezvous.yaml", f"bind={INTERNET}", f"vehicle_key={keys}/vehicle-1.sign.pub"),
-        server=(
+        server_changes=(
             f"rendezvous.host={INTERNET}",
             f"security.key={keys}/vehicle-1.sign.key",
             f"security.operators={{operator-1: {keys}/operator-1.sign.pub}}",
         ),
-        client=(
+        client_changes=(
             f"video.server={INTERNET}",
             f"security.key={keys}/operator-1.sign.key",
             f"security.vehicle={keys}/vehicle-1.sign.pub",
@@ -120,7 +118,7 @@ class Drive:
 
     def start(self) -> None:
         """Start all processes in order."""
-        if self.links.cloud:
+        if self.links.cloud_router:
             self.start_process("cloud-router")
         if self.links.rendezvous:
             self.start_process("rendezvous")
@@ -136,19 +134,24 @@ class Drive:
         name = f"{role}-{self.start_counts[role]}"
         out = str(self.work / name)
         links = self.links
+        server, client = (*SERVER, *links.server_changes), (*CLIENT, *links.client_changes)
         # For each role: the part of the network in which it runs, its arguments, and its program.
         starts: dict[str, tuple[str, list[str], tuple[str, ...]]] = {
-            "vehicle-router": ("vehicle", _network_arguments("router", *links.vehicle), LAVT),
-            "operator-router": ("operator", _network_arguments("router", *links.operator), LAVT),
-            "cloud-router": ("internet", _network_arguments("router", *links.cloud), LAVT),
+            "vehicle-router": ("vehicle", _network_arguments("router", *links.vehicle_router), LAVT),
+            "operator-router": ("operator", _network_arguments("router", *links.operator_router), LAVT),
+            "cloud-router": ("internet", _network_arguments("router", *links.cloud_router), LAVT),
             "rendezvous": ("internet", _network_arguments("rendezvous", *links.rendezvous), LAVT),
-            "server": ("vehicle", _side_arguments("server", (*SERVER, *links.server), out), self.server_program),
-            "client": ("operator", _side_arguments("client", (*CLIENT, *links.client), out), LAVT),
+            "server": (
+                "vehicle",
+                _side_arguments("server", server, out),
+                self.server_program,
+            ),
+            "client": ("operator", _side_arguments("client", client, out), LAVT),
             "observer": ("vehicle", [out], (str(OBSERVER),)),
         }
         part, arguments, program = starts[role]
         process = self.networks.inside(part, lambda: self.processes.start(name, *arguments, program=program))
-        process.ready()
+        process.wait_ready()
         self.running[role] = process
         return process
 

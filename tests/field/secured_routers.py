@@ -55,7 +55,7 @@ def start_router(processes: Processes, name: str, file: str, *changes: str) -> P
 
 def quic_endpoint(router: Process) -> str:
     """Return the QUIC endpoint that other routers dial."""
-    return str(next(locator for locator in router.ready()["locators"] if locator.startswith("quic/")))
+    return str(next(locator for locator in router.wait_ready()["locators"] if locator.startswith("quic/")))
 
 
 def udp_port(endpoint: str) -> int:

@@ -111,7 +111,7 @@ def start_site(stack: ExitStack, keys: Path, *changes: str, cloud: bool) -> Site
             f'connect.endpoints=["{endpoint}"]',
             *tls_changes(keys, "vehicle-1", "connect"),
         )
-        vehicle.ready()
+        vehicle.wait_ready()
     else:
         vehicle = start_router(
             processes,
@@ -129,7 +129,7 @@ def start_site(stack: ExitStack, keys: Path, *changes: str, cloud: bool) -> Site
         f'listen.endpoints=["{local["operator"]}"]',
         f'connect.endpoints=["{endpoint}"]',
         *tls_changes(keys, "operator-1", "connect"),
-    ).ready()
+    ).wait_ready()
     car = VehicleStandIn(local["vehicle"])
     stack.callback(car.session.close)
     operator = ClientStandIn(open_session(local["operator"]), b"operator")

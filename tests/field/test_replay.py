@@ -64,11 +64,11 @@ def test_a_replayed_hello_leaves_encrypted_video_readable(tmp_path: Path, print_
     make_keys(keys, "--vehicle", "vehicle-1", "--operator", "operator-1", "--host", VEHICLE)
     links = replace(
         MIXED,
-        server=(
+        server_changes=(
             f"security.key={keys}/vehicle-1.sign.key",
             f"security.operators={{operator-1: {keys}/operator-1.sign.pub}}",
         ),
-        client=(f"security.key={keys}/operator-1.sign.key", f"security.vehicle={keys}/vehicle-1.sign.pub"),
+        client_changes=(f"security.key={keys}/operator-1.sign.key", f"security.vehicle={keys}/vehicle-1.sign.pub"),
     )
     clock = MachineClock()
     with plain_field() as field:

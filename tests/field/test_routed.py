@@ -53,7 +53,7 @@ def video_path(request: pytest.FixtureRequest) -> str:
 
 
 @pytest.fixture(scope="module")
-def field(namespaces: None, video_path: str) -> Iterator[FieldNetworks]:  # noqa: ARG001 (skips)
+def field(namespaces: None, video_path: str) -> Iterator[FieldNetworks]:  # noqa: ARG001 (it skips the test if there are no namespaces)
     with nat_field() as field:
         if video_path == "forwarded ports":
             field.forward_ports((VIDEO_PORT, PROBE_PORT))
@@ -167,27 +167,27 @@ def per_second(table: Table) -> float:
 
 
 def test_nat_drops_unsolicited_datagrams(field: FieldNetworks, video_path: str) -> None:
-    """The vehicle's NAT passes datagrams to a forwarded port, from the operator's public address, and drops others."""
-    forwarded, closed = (
+    """The vehicle's NAT drops unsolicited datagrams, except those to a forwarded port; their source address is kept."""
+    video_socket, closed_port_socket = (
         field.inside("vehicle", lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2)
     )
     operator = field.inside("operator", lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-    with forwarded, closed, operator:
-        forwarded.bind(("", VIDEO_PORT))
-        closed.bind(("", VIDEO_PORT + 1))
-        for receiver in (forwarded, closed):
+    with video_socket, closed_port_socket, operator:
+        video_socket.bind(("", VIDEO_PORT))
+        closed_port_socket.bind(("", VIDEO_PORT + 1))
+        for receiver in (video_socket, closed_port_socket):
             receiver.settimeout(UNSOLICITED_S)
-        operator.sendto(b"unsolicited", (VEHICLE, VIDEO_PORT + 1))
-        operator.sendto(b"expected", (VEHICLE, VIDEO_PORT))
+        operator.sendto(b"to a closed port", (VEHICLE, VIDEO_PORT + 1))
+        operator.sendto(b"to the video port", (VEHICLE, VIDEO_PORT))
 
         if video_path == "forwarded ports":
-            datagram, (sender_address, _port) = forwarded.recvfrom(100)
-            assert (datagram, sender_address) == (b"expected", OPERATOR)
+            datagram, (sender_address, _port) = video_socket.recvfrom(100)
+            assert (datagram, sender_address) == (b"to the video port", OPERATOR)
         else:
             with pytest.raises(TimeoutError):
-                forwarded.recvfrom(100)
+                video_socket.recvfrom(100)
         with pytest.raises(TimeoutError):
-            closed.recvfrom(100)
+            closed_port_socket.recvfrom(100)
 
 
 def test_everything_passes_two_nats_and_a_cloud(address_change: AddressChangeDrive, stalls: Stalls) -> None:

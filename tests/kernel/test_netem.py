@@ -38,7 +38,7 @@ from lavt.config import RunConfig
 from lavt.config_file import condition, load_config, shipped
 from lavt.domain import NS_PER_MS
 from lavt.errors import UserError
-from lavt.experiment.runs.netem_run import NetemRun, netem_reasons
+from lavt.experiment.runs.netem_run import NetemRun, netem_invalid_reasons
 from lavt.experiment.runs.plan import PlannedRun, plan_run
 from lavt.transport.emulation.impairment import ExemptPort, ImpairedFlow, Impairment
 from lavt.transport.netem.netem import NetemInterface
@@ -466,7 +466,7 @@ def test_each_condition_of_a_run_is_verified(name: str, tmp_path: Path) -> None:
         run.apply(video_port=40_100, control_port=40_101)
         report = json.loads(json.dumps(run.report()))
 
-    assert netem_reasons(report) == []
+    assert netem_invalid_reasons(report) == []
     assert abs(report["after"]["NTP"]["median_ms"]) < 1
     assert command("tc -j qdisc show dev lo") == before
 

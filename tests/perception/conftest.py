@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lavt.domain import CameraModel, FloatArray, Picture
-from lavt.perception.calibration import calibrated, ground_to_picture
+from lavt.perception.calibration import calibrated_pinhole_camera, ground_to_picture
 
 ROAD_GREY, SKY_GREY = 85, 190
 MARK_WIDTH_M = 0.125
@@ -66,7 +66,7 @@ def ground_of_rays(model: CameraModel) -> tuple[FloatArray, FloatArray]:
     """Return x and y of the ground point that each ray hits; infinite above the horizon."""
     u = (np.arange(model.width_px * RAYS_PER_PIXEL_SIDE) + 0.5) / RAYS_PER_PIXEL_SIDE - 0.5
     v = (np.arange(model.height_px * RAYS_PER_PIXEL_SIDE) + 0.5) / RAYS_PER_PIXEL_SIDE - 0.5
-    inverse = np.linalg.inv(ground_to_picture(calibrated(model)))
+    inverse = np.linalg.inv(ground_to_picture(calibrated_pinhole_camera(model)))
     rays = np.stack([*np.meshgrid(u, v), np.ones((len(v), len(u)))], axis=-1) @ inverse.T
     below = rays[..., 2] > 1e-9  # the inverse's third component is 1 / depth: positive below the horizon
     scale = np.where(below, rays[..., 2], 1.0)

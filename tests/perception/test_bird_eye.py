@@ -6,14 +6,14 @@ import pytest
 from lavt.domain import CameraModel
 from lavt.errors import UserError
 from lavt.perception.bird_eye import STAMP_SIDE_PX, GroundGrid, make_bird_eye
-from lavt.perception.calibration import calibrated, ground_to_picture
+from lavt.perception.calibration import calibrated_pinhole_camera, ground_to_picture
 
 FOCAL_PX = 320
 """The focal length of `CameraModel()`. That camera is 1.6 m ahead of the rear axle and 1.4 m above the ground."""
 
 
 def pixel_of(model: CameraModel, x_m: float, y_m: float) -> tuple[float, float]:
-    u, v, depth = ground_to_picture(calibrated(model)) @ np.array([x_m, y_m, 1.0])
+    u, v, depth = ground_to_picture(calibrated_pinhole_camera(model)) @ np.array([x_m, y_m, 1.0])
     return u / depth, v / depth
 
 
@@ -42,7 +42,7 @@ def test_a_point_at_the_pitch_angle_is_in_the_middle_row() -> None:
 def test_a_ground_point_maps_to_its_cell() -> None:
     """A spot in the picture at a ground point's projection appears in the grid cell of that point."""
     model, grid = CameraModel(), GroundGrid()
-    mapping = make_bird_eye(calibrated(model), grid)
+    mapping = make_bird_eye(calibrated_pinhole_camera(model), grid)
     picture = np.zeros((model.height_px, model.width_px), dtype=np.uint8)
     u, v = pixel_of(model, 8.0, -1.5)
     picture[round(v) - 1 : round(v) + 2, round(u) - 1 : round(u) + 2] = 255
@@ -56,7 +56,7 @@ def test_a_ground_point_maps_to_its_cell() -> None:
 )
 def test_the_stamp_is_masked(model: CameraModel) -> None:
     """A picture that is white only in the stamp has an empty bird's-eye view."""
-    mapping = make_bird_eye(calibrated(model), GroundGrid())
+    mapping = make_bird_eye(calibrated_pinhole_camera(model), GroundGrid())
     picture = np.zeros((model.height_px, model.width_px), dtype=np.uint8)
     picture[:STAMP_SIDE_PX, :STAMP_SIDE_PX] = 255
     assert not mapping.view_from_above(mapping.region(picture)).any()
@@ -64,7 +64,7 @@ def test_the_stamp_is_masked(model: CameraModel) -> None:
 
 def test_without_a_stamp_its_corner_is_used() -> None:
     """If pictures have no stamp, the bird's-eye view includes the road in the stamp's corner."""
-    camera = calibrated(CameraModel(field_of_view_rad=0.7, pitch_rad=0.3))
+    camera = calibrated_pinhole_camera(CameraModel(field_of_view_rad=0.7, pitch_rad=0.3))
     white = np.full((480, 640), 255, dtype=np.uint8)
     with_stamp, without_stamp = (make_bird_eye(camera, GroundGrid(), stamped=has_stamp) for has_stamp in (True, False))
     assert np.count_nonzero(with_stamp.view_from_above(with_stamp.region(white))) < np.count_nonzero(
@@ -78,4 +78,4 @@ def test_without_a_stamp_its_corner_is_used() -> None:
 def test_a_camera_that_does_not_see_the_road_is_rejected(model: CameraModel) -> None:
     """A camera that does not see the road is rejected with a `UserError`."""
     with pytest.raises(UserError, match="does not see the road"):
-        make_bird_eye(calibrated(model), GroundGrid())
+        make_bird_eye(calibrated_pinhole_camera(model), GroundGrid())

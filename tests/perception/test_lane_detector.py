@@ -18,7 +18,7 @@ from tests.perception.lens import ground_points
 
 from lavt.domain import CameraModel, Lane, Picture, SeenLane
 from lavt.perception.bird_eye import STAMP_SIDE_PX
-from lavt.perception.calibration import CalibratedCamera, calibrated
+from lavt.perception.calibration import CalibratedCamera, calibrated_pinhole_camera
 from lavt.perception.lane_detector import (
     FORGET_AFTER_PICTURES,
     SMOOTHING,
@@ -181,7 +181,7 @@ def test_the_trace_contains_windows_only_for_a_search(scene: Scene) -> None:
 )
 def test_the_lane_is_found_through_any_lens(lens: dict[str, Any]) -> None:
     """With a distorting lens or a tilted camera the centre is found within 10 cm."""
-    camera = replace(calibrated(CameraModel(320, 240)), **lens)
+    camera = replace(calibrated_pinhole_camera(CameraModel(320, 240)), **lens)
     picture = picture_through_lens(camera, 1 / 87, 0.4)
     lane = LaneDetector(camera, stamped=False).detect(picture)
     assert lane.confidence > 0.7

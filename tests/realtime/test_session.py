@@ -72,7 +72,7 @@ class Session:
         config = client_config(run, router=self.client_endpoint, probe_port=self.probe_port)
         path = self.write(name, config.model_copy(update={"who": operator}))
         process = self.processes.start(name, "client", path, "--out", str(self.work / name), *options)
-        process.ready()
+        process.wait_ready()
         return process
 
     def start_server(self) -> Process:
@@ -80,12 +80,14 @@ class Session:
         clock = config.clock.model_copy(update={"probe_port": self.probe_port})
         path = self.write("server", config.model_copy(update={"clock": clock}))
         process = self.processes.start("server", "server", path, "--out", str(self.work / "server"))
-        process.ready()
+        process.wait_ready()
         return process
 
     def start_routers(self) -> None:
         listen = f"listen.endpoints={json.dumps([self.server_endpoint, self.link_of_routers])}"
-        self.processes.start("server-router", "router", "zenoh-configs/router-server.json5", "--set", listen).ready()
+        self.processes.start(
+            "server-router", "router", "zenoh-configs/router-server.json5", "--set", listen
+        ).wait_ready()
         start_client_router(self.processes, self.link_of_routers, self.client_endpoint)
 
     def write(self, name: str, config: BaseModel) -> str:

@@ -71,7 +71,7 @@ def test_signals_end_a_client_and_a_server_whose_output_is_not_read(
         router = processes.start(
             "router", "router", "zenoh-configs/router-server.json5", "--set", 'listen.endpoints=["tcp/127.0.0.1:0"]'
         )
-        (local,) = router.ready()["locators"]
+        (local,) = router.wait_ready()["locators"]
         server = stack.enter_context(
             start_unread("server", server_config(run.config, run.seed, router=local), tmp_path)
         )

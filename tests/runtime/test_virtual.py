@@ -72,16 +72,16 @@ def test_a_hosts_clock_is_inverted_exactly(start_ns: int, mono_ns: int, drift_pp
     """`true_ns` is the first true time at which the clock has reached a value, for any drift and steps."""
     clock = HostClock(start_ns, 0, drift_ppb=drift_ppb, steps=[(5 * NS_PER_S, step_ns)])
     true_ns = clock.true_ns(start_ns + mono_ns)
-    assert clock.at(true_ns).mono_ns >= start_ns + mono_ns
-    assert clock.at(true_ns - 1).mono_ns < start_ns + mono_ns
+    assert clock.now_at(true_ns).mono_ns >= start_ns + mono_ns
+    assert clock.now_at(true_ns - 1).mono_ns < start_ns + mono_ns
 
 
 def test_offset_drift_and_steps() -> None:
     """The wall clock has an offset and steps, and both clocks drift."""
     clock = HostClock(7, 100, offset_ns=50, drift_ppb=1000, steps=[(2 * NS_PER_S, -30)])
-    assert clock.at(0) == Now(7, 150)
-    assert clock.at(NS_PER_S) == Now(NS_PER_S + 1007, NS_PER_S + 1150)
-    assert clock.at(2 * NS_PER_S) == Now(2 * NS_PER_S + 2007, 2 * NS_PER_S + 2120)
+    assert clock.now_at(0) == Now(7, 150)
+    assert clock.now_at(NS_PER_S) == Now(NS_PER_S + 1007, NS_PER_S + 1150)
+    assert clock.now_at(2 * NS_PER_S) == Now(2 * NS_PER_S + 2007, 2 * NS_PER_S + 2120)
     assert modelled_clock_source(clock, "host", 1e-6, 2e-6)(NS_PER_S).correction_s == pytest.approx(-1050e-9 + 1e-6)
 
 

@@ -79,8 +79,11 @@ class Rig:
         self.gate.watchdog.check_timeouts(self.now_ns)
         return self.stamp_ns
 
-    def request(self, operation: Operation, who: str = "alice", instance: int = 1, number: int = 0) -> SessionReply:
-        """Send a session request. If alice gets an epoch, her later commands have this epoch."""
+    def request(self, operation: Operation, who: str = "alice", *, instance: int = 1, number: int = 0) -> SessionReply:
+        """Send a session request from one instance of the client `who`; `number` is that of an emergency stop.
+
+        If alice gets an epoch, her later commands have this epoch.
+        """
         reply = self.gate.session.answer(SessionRequest(operation, who, instance, number), self.vehicle, self.now_ns)
         if who == "alice" and reply.epoch:
             self.epoch = reply.epoch
@@ -127,10 +130,11 @@ class Rig:
         assert self.send_drive(**changes).accepted
         return self
 
-    def clear_emergency_stop(self, who: str = "alice", instance: int = 1, number: int | None = None) -> SessionReply:
+    def clear_emergency_stop(self, who: str = "alice", *, instance: int = 1, number: int | None = None) -> SessionReply:
         """Request to clear the last emergency stop that the vehicle reported, or the one with `number`."""
-        last = self.request("acquire", who, instance).emergency_stop
-        return self.request("clear_emergency_stop", who, instance, last if number is None else number)
+        last = self.request("acquire", who, instance=instance).emergency_stop
+        number = last if number is None else number
+        return self.request("clear_emergency_stop", who, instance=instance, number=number)
 
     def actuation(self) -> Actuation:
         return self.gate.watchdog.actuation(self.vehicle, self.now_ns)

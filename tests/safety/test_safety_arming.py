@@ -13,6 +13,9 @@ from lavt.safety.gate import RejectionReason
 from lavt.safety.limits import LIMITS
 from lavt.safety.session import REMEMBERED_STOPS
 
+STOP_NUMBER = 1
+"""The number of an emergency stop. A command with the number 0 requests no emergency stop."""
+
 
 def test_arming_takes_a_full_second() -> None:
     """The vehicle is armed when all arming conditions were met for 1 s, and not a nanosecond earlier."""
@@ -59,7 +62,7 @@ def send_without_new_pictures(rig: Rig) -> None:
 
 
 def roll_between_commands(rig: Rig) -> None:
-    rig.vehicle = vehicle_at(0.05)
+    rig.vehicle = vehicle_at(LIMITS.standstill_mps)
     rig.actuation()
     rig.vehicle = vehicle_at()
 
@@ -78,7 +81,10 @@ ARMING_VIOLATIONS: dict[str, Callable[[Rig], object]] = {
     "no newer pictures": send_without_new_pictures,
     "no commands": lambda rig: rig.pass_time(300 * NS_PER_MS),
     "release": lambda rig: (rig.request("release"), rig.acquire()),
-    "emergency stop": lambda rig: (rig.request("emergency_stop", "bob", 3, number=1), rig.clear_emergency_stop()),
+    "emergency stop": lambda rig: (
+        rig.request("emergency_stop", "bob", instance=3, number=1),
+        rig.clear_emergency_stop(),
+    ),
 }
 
 
@@ -144,7 +150,7 @@ def test_arming_does_not_begin_with_a_picture_already_used() -> None:
 
 
 def test_the_vehicle_does_not_move_before_the_first_drive_command() -> None:
-    """An armed vehicle without a drive command stays braked with its wheel still until the command timeout stops it."""
+    """An armed vehicle without a drive command stays braked and does not steer, until the command timeout stops it."""
     rig = Rig()
     rig.vehicle = vehicle_at(0.0, steering_rad=0.2)
     rig.arm()
@@ -173,7 +179,7 @@ def test_arming_again_drops_the_last_command() -> None:
     assert actuation.brake >= LIMITS.arming_brake
 
 
-def test_the_first_steering_target_is_the_present_angle() -> None:
+def test_steering_begins_at_the_present_angle() -> None:
     """The first drive command turns the wheel from its present angle, at most at the allowed rate."""
     rig = Rig()
     rig.vehicle = vehicle_at(0.0, steering_rad=0.0)
@@ -197,7 +203,7 @@ def test_an_emergency_stop_works_in_every_state(start: str) -> None:
         rig.pass_time({"driving": 0, "degraded": 300, "safe_stop": 500}[start] * NS_PER_MS)
     assert rig.state == start
     rig.vehicle = vehicle_at(5.0)
-    assert rig.request("emergency_stop", "bob", 4, number=17).granted
+    assert rig.request("emergency_stop", "bob", instance=4, number=17).granted
     assert rig.state == "emergency_stop"
     assert (rig.actuation().throttle, rig.actuation().brake) == (0.0, 1.0)
     rig.take_picture()
@@ -214,14 +220,14 @@ def test_an_emergency_stop_works_in_every_state(start: str) -> None:
 def test_an_emergency_stop_in_any_command_is_executed(changes: dict[str, Any]) -> None:
     """An emergency stop in a command is executed whatever else the command has, and the command is rejected."""
     rig = Rig().start_driving()
-    assert not rig.send_drive(emergency_stop=1, **changes).accepted
+    assert not rig.send_drive(emergency_stop=STOP_NUMBER, **changes).accepted
     assert rig.state == "emergency_stop"
 
 
 def test_an_emergency_stop_without_an_operator() -> None:
     """An emergency stop in a command stops a vehicle without an operator, and must be cleared before arming."""
     rig = Rig()
-    rig.send(emergency_stop=1)
+    rig.send(emergency_stop=STOP_NUMBER)
     assert rig.state == "emergency_stop"
     rig.acquire().arm_for(NS_PER_S)
     assert rig.state == "emergency_stop"
@@ -229,7 +235,7 @@ def test_an_emergency_stop_without_an_operator() -> None:
 
 
 def test_an_emergency_stop_is_executed_once() -> None:
-    """An emergency stop that was executed and cleared is rejected and counted as a replay; the vehicle drives on."""
+    """The repetition of a cleared emergency stop is rejected and counted as a replay; the vehicle drives on."""
     rig = Rig().arm()
     for number in (39, 40):
         assert rig.request("emergency_stop", number=number).granted
@@ -238,14 +244,14 @@ def test_an_emergency_stop_is_executed_once() -> None:
     rig.arm_for(NS_PER_S)
     assert rig.state == "driving"
     for number in (40, 39):
-        reply = rig.request("emergency_stop", "bob", 2, number=number)
-        assert reply.emergency_stop == number, "without its number a client repeats its emergency stop for ever"
+        reply = rig.request("emergency_stop", "bob", instance=2, number=number)
+        assert reply.emergency_stop == number, "without this number the client repeats its stop for ever"
         assert not reply.granted, "the vehicle drives, so it must not confirm a stop"
     rig.take_picture()
     assert rig.send_drive(emergency_stop=40).reason == RejectionReason.EMERGENCY_STOP
     assert rig.state == "driving"
     assert rig.gate.counts["emergency stop with an old number"] == 3
-    assert rig.request("emergency_stop", "bob", 2, number=41).granted
+    assert rig.request("emergency_stop", "bob", instance=2, number=41).granted
     assert rig.state == "emergency_stop"
 
 
@@ -254,34 +260,35 @@ def test_an_emergency_stop_is_executed_once() -> None:
 def test_no_emergency_stop_prevents_a_later_one(earlier: int, number: int) -> None:
     """After an emergency stop with any number, a stop with any other number works, and both can be cleared."""
     rig = Rig().arm()
-    rig.request("emergency_stop", "bob", 2, number=earlier)
+    rig.request("emergency_stop", "bob", instance=2, number=earlier)
     assert rig.clear_emergency_stop().granted
     assert rig.state == "disarmed"
-    reply = rig.request("emergency_stop", "carol", 3, number=number)
+    reply = rig.request("emergency_stop", "carol", instance=3, number=number)
     assert (reply.granted, rig.state) == (True, "emergency_stop")
     assert rig.clear_emergency_stop().granted
     assert rig.state == "disarmed"
     rig.send(epoch=5, emergency_stop=number + 1)
-    assert (number + 1 == earlier) != (rig.state == "emergency_stop")
+    is_repetition = number + 1 == earlier
+    assert (rig.state == "emergency_stop") == (not is_repetition)
 
 
 def test_the_last_emergency_stops_are_remembered() -> None:
     """The vehicle remembers a bounded number of emergency stops; the oldest, once forgotten, can stop it again."""
     rig = Rig().acquire()
     for number in range(REMEMBERED_STOPS + 1):
-        rig.request("emergency_stop", "bob", 2, number=number)
+        rig.request("emergency_stop", "bob", instance=2, number=number)
     assert rig.clear_emergency_stop().granted
     for number, state in ((1, "disarmed"), (REMEMBERED_STOPS, "disarmed"), (0, "emergency_stop")):
-        rig.request("emergency_stop", "bob", 2, number=number)
+        rig.request("emergency_stop", "bob", instance=2, number=number)
         assert rig.state == state
     assert len(rig.gate.session._executed_stops) == REMEMBERED_STOPS
 
 
-def test_recorded_emergency_stops_do_not_block_the_operator_forever() -> None:
-    """After a restart, each recorded emergency stop stops the vehicle at most once, and a new one still stops it."""
+def test_replayed_emergency_stops_do_not_block_the_operator_forever() -> None:
+    """After a restart, each captured emergency stop works at most once when it is replayed; a new one still works."""
     rig = Rig().acquire()
-    recorded = [rig.command(epoch=5, emergency_stop=number) for number in (10, 20, 30)]
-    for stop in recorded:
+    captured = [rig.command(epoch=5, emergency_stop=number) for number in (10, 20, 30)]
+    for stop in captured:
         rig.gate.admit(stop, rig.vehicle, rig.now_ns, rig.now_ns)
         assert rig.state == "emergency_stop"
         assert rig.clear_emergency_stop().granted
@@ -289,12 +296,12 @@ def test_recorded_emergency_stops_do_not_block_the_operator_forever() -> None:
     for _ in range(60):
         rig.pass_time(COMMAND_PERIOD_NS)
         rig.take_picture()
-        for stop in recorded:
+        for stop in captured:
             rig.gate.admit(stop, rig.vehicle, rig.now_ns, rig.now_ns)
-            rig.request("emergency_stop", "bob", 2, number=stop.emergency_stop)
+            rig.request("emergency_stop", "bob", instance=2, number=stop.emergency_stop)
         rig.send()
     assert rig.state == "driving"
-    assert rig.request("emergency_stop", "bob", 2, number=9).granted
+    assert rig.request("emergency_stop", "bob", instance=2, number=9).granted
     assert rig.state == "emergency_stop"
 
 
@@ -322,12 +329,12 @@ def test_a_repeated_emergency_stop_is_not_counted_as_a_replay() -> None:
 def test_only_the_active_operator_clears_an_emergency_stop() -> None:
     """Only the active operator can clear an emergency stop, and only at standstill and with the number of that stop."""
     rig = Rig().start_driving()
-    rig.request("emergency_stop", "bob", 2, number=8)
+    rig.request("emergency_stop", "bob", instance=2, number=8)
     rig.vehicle = vehicle_at(1.0)
     assert "stationary" in rig.clear_emergency_stop().reason
     rig.vehicle = vehicle_at()
-    assert not rig.request("clear_emergency_stop", "bob", 2, number=8).granted
-    rig.request("emergency_stop", "bob", 2, number=9)
+    assert not rig.request("clear_emergency_stop", "bob", instance=2, number=8).granted
+    rig.request("emergency_stop", "bob", instance=2, number=9)
     late = rig.clear_emergency_stop(number=8)
     assert not late.granted
     assert "number" in late.reason

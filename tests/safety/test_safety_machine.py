@@ -124,7 +124,7 @@ class GateMachine(RuleBasedStateMachine):
         number=st.integers(0, 5),
     )
     def request(self, operation: Operation, who: str, number: int) -> None:
-        reply = self.rig.request(operation, who, 1, number)
+        reply = self.rig.request(operation, who, number=number)
         if operation == "release" and reply.granted:
             self.met_since_ns = None
         if reply.epoch:

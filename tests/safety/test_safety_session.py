@@ -87,7 +87,7 @@ def test_a_takeover_at_standstill_renews_the_epoch() -> None:
     """At standstill and disarmed, another client acquires control under a new epoch and token."""
     rig = Rig()
     first = rig.request("acquire")
-    second = rig.request("acquire", "bob", 7)
+    second = rig.request("acquire", "bob", instance=7)
     assert second.granted
     assert second.epoch != first.epoch
     assert second.token != first.token
@@ -105,7 +105,7 @@ def test_a_release_stops_and_frees_the_vehicle() -> None:
     assert rig.state == "safe_stop"
     rig.take_picture()
     assert rig.send_drive().reason == RejectionReason.WRONG_EPOCH
-    assert rig.request("acquire", "bob", 1).granted
+    assert rig.request("acquire", "bob", instance=1).granted
 
 
 def test_the_reply_to_a_release_has_no_epoch() -> None:
@@ -123,7 +123,7 @@ def test_only_the_active_operator_changes_the_session(operation: Operation) -> N
     """Release and clearing are rejected from other clients, and from another instance of the same name."""
     rig = Rig().arm()
     for who, instance in (("bob", 1), ("alice", 2)):
-        reply = rig.request(operation, who, instance)
+        reply = rig.request(operation, who, instance=instance)
         assert not reply.granted
         assert isinstance(reply.reason, str)
         assert reply.reason != ""
@@ -134,7 +134,7 @@ def test_only_the_active_operator_changes_the_session(operation: Operation) -> N
 def test_an_emergency_stop_grants_no_control() -> None:
     """The reply to another client's emergency stop has neither epoch nor token."""
     rig = Rig().start_driving()
-    reply = rig.request("emergency_stop", "bob", 9, number=5)
+    reply = rig.request("emergency_stop", "bob", instance=9, number=5)
     assert reply.granted
     assert (reply.epoch, reply.token) == (0, b"")
 
@@ -142,7 +142,7 @@ def test_an_emergency_stop_grants_no_control() -> None:
 def test_session_requests_are_counted() -> None:
     """Granted and rejected requests are counted separately."""
     rig = Rig().arm()
-    rig.request("acquire", "bob", 1)
+    rig.request("acquire", "bob", instance=1)
     counts = rig.gate.counts
     assert (counts["session acquire granted"], counts["session acquire rejected"]) == (1, 1)
 
@@ -154,7 +154,7 @@ def requested_by(rig: Rig) -> str:
 def test_a_handover_request_is_reported_and_changes_nothing_else() -> None:
     """A handover request is granted without epoch or token, is reported, and leaves the drive unchanged."""
     rig = Rig().start_driving()
-    reply = rig.request("request_handover", "bob", 7)
+    reply = rig.request("request_handover", "bob", instance=7)
     assert (reply.granted, reply.epoch, reply.token) == (True, 0, b"")
     assert requested_by(rig) == "bob"
     rig.take_picture()
@@ -166,8 +166,8 @@ def test_without_consent_a_driven_vehicle_is_not_handed_over() -> None:
     """Handover requests alone never transfer control of a driven vehicle."""
     rig = Rig().start_driving()
     for _ in range(5):
-        rig.request("request_handover", "bob", 7)
-        reply = rig.request("acquire", "bob", 7)
+        rig.request("request_handover", "bob", instance=7)
+        reply = rig.request("acquire", "bob", instance=7)
         assert not reply.granted
         assert "alice has control" in reply.reason
         for _ in range(50):
@@ -180,14 +180,14 @@ def test_with_consent_the_vehicle_stops_and_is_reserved_for_the_requester() -> N
     """A release during a handover request stops the vehicle and reserves it for the requester."""
     rig = Rig().start_driving()
     rig.vehicle = vehicle_at(5.0)
-    rig.request("request_handover", "bob", 7)
+    rig.request("request_handover", "bob", instance=7)
     assert rig.request("release").granted
     assert (rig.state, rig.gate.session.active_operator, requested_by(rig)) == ("safe_stop", None, "")
     for who, instance in (("carol", 1), ("alice", 1), ("bob", 8)):
-        reply = rig.request("acquire", who, instance)
+        reply = rig.request("acquire", who, instance=instance)
         assert not reply.granted
         assert "reserved for bob" in reply.reason
-    assert rig.request("acquire", "bob", 7).epoch != 0
+    assert rig.request("acquire", "bob", instance=7).epoch != 0
     rig.vehicle = vehicle_at(0.0)
     assert rig.request("acquire", "carol").granted
 
@@ -196,9 +196,9 @@ def test_a_new_active_operator_arms_at_standstill() -> None:
     """A client that took over a moving vehicle can arm it only at standstill, which takes 1 s."""
     rig = Rig().start_driving()
     rig.vehicle = vehicle_at(5.0)
-    rig.request("request_handover", "bob", 7)
+    rig.request("request_handover", "bob", instance=7)
     rig.request("release")
-    rig.epoch = rig.request("acquire", "bob", 7).epoch
+    rig.epoch = rig.request("acquire", "bob", instance=7).epoch
     rig.take_picture()
     assert rig.send().reason == RejectionReason.NOT_STATIONARY
     rig.vehicle = vehicle_at(0.0)
@@ -211,7 +211,7 @@ def test_a_new_active_operator_arms_at_standstill() -> None:
 def test_a_reservation_expires() -> None:
     """The reservation for a requester ends after 5 s."""
     rig = Rig().start_driving()
-    rig.request("request_handover", "bob", 7)
+    rig.request("request_handover", "bob", instance=7)
     rig.request("release")
     rig.pass_time(LIMITS.reservation_ns - 1)
     assert not rig.request("acquire", "carol").granted
@@ -223,10 +223,10 @@ def test_a_reservation_expires() -> None:
 def test_a_handover_request_expires() -> None:
     """A handover request that is not renewed expires after 3 s, and a release then reserves nothing."""
     rig = Rig().start_driving()
-    rig.request("request_handover", "bob", 7)
+    rig.request("request_handover", "bob", instance=7)
     rig.pass_time(LIMITS.handover_request_timeout_ns - 1)
     assert requested_by(rig) == "bob"
-    rig.request("request_handover", "bob", 7)
+    rig.request("request_handover", "bob", instance=7)
     rig.pass_time(LIMITS.handover_request_timeout_ns - 1)
     assert requested_by(rig) == "bob"
     rig.pass_time(1)
@@ -239,9 +239,9 @@ def test_a_handover_request_expires() -> None:
 def test_the_first_handover_request_has_priority() -> None:
     """A second handover request is rejected until the first has expired."""
     rig = Rig().start_driving()
-    rig.request("request_handover", "bob", 7)
+    rig.request("request_handover", "bob", instance=7)
     for who, instance in (("carol", 1), ("bob", 8)):
-        reply = rig.request("request_handover", who, instance)
+        reply = rig.request("request_handover", who, instance=instance)
         assert not reply.granted
         assert "bob" in reply.reason
     rig.pass_time(LIMITS.handover_request_timeout_ns)
@@ -264,7 +264,7 @@ def test_a_handover_request_needs_another_active_operator() -> None:
 def test_at_rest_no_consent_is_needed() -> None:
     """At standstill and disarmed, a third client acquires control in spite of a pending handover request."""
     rig = Rig().acquire()
-    rig.request("request_handover", "bob", 7)
+    rig.request("request_handover", "bob", instance=7)
     assert rig.request("acquire", "carol").granted
     assert requested_by(rig) == ""
 
@@ -272,11 +272,11 @@ def test_at_rest_no_consent_is_needed() -> None:
 def test_an_emergency_stop_by_another_client_keeps_the_session() -> None:
     """Another client's emergency stop is reported with its name and leaves the session unchanged."""
     rig = Rig().start_driving()
-    rig.request("request_handover", "bob", 7)
-    assert rig.request("emergency_stop", "bob", 7, number=5).granted
+    rig.request("request_handover", "bob", instance=7)
+    assert rig.request("emergency_stop", "bob", instance=7, number=5).granted
     assert (rig.state, rig.gate.machine.reason) == ("emergency_stop", "emergency stop by bob")
     assert (rig.gate.session.active_operator, requested_by(rig)) == (("alice", 1), "bob")
-    rig.request("emergency_stop", "carol", 1, number=5)
+    rig.request("emergency_stop", "carol", instance=1, number=5)
     assert rig.gate.machine.reason == "emergency stop by bob"
 
 

@@ -13,7 +13,7 @@ class CommandResult(NamedTuple):
     out: str
     err: str
 
-    def rejected(self) -> str:
+    def rejection(self) -> str:
         """Check that the command rejected its input with exit code 2 and one sentence; return the sentence."""
         assert self.code == 2, self
         assert self.out == ""

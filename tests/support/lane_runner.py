@@ -59,7 +59,7 @@ class RunningLane:
         self._command = ""
         self._process: subprocess.Popen[bytes] | None = None
         self._output = folder / f"{lane.name}.output"
-        # This folder has only the progress file, because the kernel lane's machines can write to the folder.
+        # The progress file has a folder of its own, because the kernel lane's machines can write to this folder.
         self._progress = folder / lane.name / "progress"
         self._progress.parent.mkdir()
         self._output.touch()
@@ -160,7 +160,7 @@ def _run_together(running: Sequence[RunningLane], write: Write) -> None:
         for lane in running:
             lane.poll()
         unfinished = next((lane for lane in running if lane.running), None)
-        for lane in running:  # earlier lanes have ended, so their output is complete
+        for lane in running:  # the lanes before `unfinished` have ended, so their output is complete
             write(lane.new_output())
             if lane is unfinished:
                 break

@@ -167,5 +167,5 @@ def _wait_until_disengaged(node_host: NodeHost, vehicle: DbwVehicle, clock: Cloc
     never_set = threading.Event()
     while clock.now().mono_ns < end_ns and not node_host.runtime.stopped.is_set():
         never_set.wait(POLL_PERIOD_S)
-        if vehicle.is_silent:  # no commands are sent: the kit is disengaged, or a driver overrides it
+        if vehicle.is_idle_or_overridden:
             return

@@ -20,7 +20,7 @@ from lavt.config import (
 from lavt.config_file import parse_config, read_yaml
 from lavt.domain import CameraModel
 from lavt.errors import UserError
-from lavt.perception.calibration import CalibratedCamera, calibrated
+from lavt.perception.calibration import CalibratedCamera, calibrated_pinhole_camera
 from lavt.vehicle.camera import Camera
 from lavt.vehicle.video_device import VideoDevice
 
@@ -120,7 +120,7 @@ def camera_of_file(path: Path) -> CalibratedCamera:
 def client_camera(config: ClientCameraConfig) -> CalibratedCamera:
     """Return the camera of a client's config: from the calibration file, if the config names one, or from its keys."""
     if not config.calibration:
-        return calibrated(camera_model(config))
+        return calibrated_pinhole_camera(camera_model(config))
     path = Path(config.calibration)
     redundant = config.model_fields_set - {"calibration", "rate_hz", "width_px", "height_px"}
     if redundant:

@@ -18,7 +18,7 @@ from lavt.runtime import process_priority
 from lavt.transport.emulation.delay_line import DelayModel, Lognormal
 from lavt.transport.emulation.impairment import Impairment
 from lavt.transport.emulation.link import LinkInjection
-from lavt.transport.emulation.relay import NO_DELAY, Relay, RelayedFlow, is_delayed_video, video_index
+from lavt.transport.emulation.relay import NO_DELAY, Relay, RelayedFlow, is_delayed_video_datagram, video_delay_index
 
 
 def register(app: typer.Typer) -> None:
@@ -65,26 +65,27 @@ def flows(config: RelayConfig) -> list[RelayedFlow]:
         _resolve("video_listen", config.video_listen),
         _resolve("video_server", config.video_server),
         upstream=NO_DELAY,
-        downstream=_delay_model(config.video, seed, "video inherent"),
-        is_delayed_downstream=is_delayed_video,
-        index_downstream=video_index,
+        downstream=_delay_model(config.video, seed, stream_name="video inherent"),
+        downstream_delay_filter=is_delayed_video_datagram,
+        downstream_index_function=video_delay_index,
         downstream_injected=_link_injection("video", config.video, seed),
     )
     control = RelayedFlow(
         "control",
         _resolve("control_listen", config.control_listen),
         _resolve("control_server", config.control_server),
-        upstream=_delay_model(config.control, seed, "control inherent"),
-        downstream=_delay_model(config.state, seed, "state inherent"),
+        upstream=_delay_model(config.control, seed, stream_name="control inherent"),
+        downstream=_delay_model(config.state, seed, stream_name="state inherent"),
         upstream_injected=_link_injection("control", config.control, seed),
         downstream_injected=_link_injection("state", config.state, seed),
     )
     return [video, control]
 
 
-def _delay_model(config: DelayConfig, seed: int, name: str) -> DelayModel:
+def _delay_model(config: DelayConfig, seed: int, *, stream_name: str) -> DelayModel:
+    """Return the config's constant delay plus jitter, drawn from the random-number stream `stream_name` of `seed`."""
     jitter = Lognormal(config.jitter_median_ms, config.jitter_sigma) if config.jitter_median_ms > 0 else None
-    return DelayModel(config.constant_ms, jitter, seed, name)
+    return DelayModel(config.constant_ms, jitter, seed, stream_name)
 
 
 def _link_injection(name: str, config: DelayConfig, seed: int) -> LinkInjection | None:
@@ -92,10 +93,9 @@ def _link_injection(name: str, config: DelayConfig, seed: int) -> LinkInjection 
     if config.link == LinkConfig():
         return None
     impairment = ImpairmentConfig(**config.link.model_dump(exclude={"delay_ms"}))
-    injection = link_injection(name, config.link.delay_ms, impairment, seed)
-    if injection is None:  # the link has only a constant delay
+    if impairment == ImpairmentConfig():  # the link only delays
         return LinkInjection(Impairment(delay_ms=config.link.delay_ms), seed, name)
-    return injection
+    return link_injection(name, config.link.delay_ms, impairment, seed)
 
 
 def _resolve(key: str, text: str) -> tuple[str, int]:

@@ -62,8 +62,8 @@ class CalibratedCamera:
         return self.focal_px[0] / REFERENCE_FOCAL_PX
 
 
-def calibrated(model: CameraModel) -> CalibratedCamera:
-    """Return a config's pinhole camera as a calibrated one: square pixels, central axis, no distortion."""
+def calibrated_pinhole_camera(model: CameraModel) -> CalibratedCamera:
+    """Return the pinhole camera of a config as a calibrated camera: square pixels, central axis, no distortion."""
     return CalibratedCamera(
         width_px=model.width_px,
         height_px=model.height_px,

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from lavt.domain import NS_PER_MS, CameraModel, Lane, Picture, SeenLane
 from lavt.perception.bird_eye import GroundGrid, make_bird_eye
-from lavt.perception.calibration import CalibratedCamera, calibrated
+from lavt.perception.calibration import CalibratedCamera, calibrated_pinhole_camera
 from lavt.perception.lane_fit import (
     OUTLIER_M,
     LaneFit,
@@ -85,7 +85,7 @@ class LaneDetector:
         *,
         stamped: bool = True,
     ) -> None:
-        calibration = calibrated(camera) if isinstance(camera, CameraModel) else camera
+        calibration = calibrated_pinhole_camera(camera) if isinstance(camera, CameraModel) else camera
         self._shape = (calibration.height_px, calibration.width_px, 3)
         self._scale = calibration.scale
         self.bird_eye = make_bird_eye(calibration, grid, stamped=stamped)

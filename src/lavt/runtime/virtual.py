@@ -38,7 +38,7 @@ class HostClock:
     drift_ppb: int = 0
     steps: Sequence[tuple[int, int]] = ()
 
-    def at(self, true_ns: int) -> Now:
+    def now_at(self, true_ns: int) -> Now:
         """Return the reading of both clocks at a true time."""
         drift_ppb = self.drift_ppb
         elapsed_ns = true_ns + true_ns * drift_ppb // ONE_IN_PPB if drift_ppb else true_ns
@@ -104,7 +104,7 @@ class VirtualHost:
     def now(self, true_ns: int) -> Now:
         """Return a reading of both clocks; the last reading is cached, because many events share a time."""
         if true_ns != self._cached_ns:
-            self._cached_ns, self._cached_now = true_ns, self.clock.at(true_ns)
+            self._cached_ns, self._cached_now = true_ns, self.clock.now_at(true_ns)
         return self._cached_now
 
 
@@ -179,7 +179,7 @@ class VirtualRuntime:
     def close(self) -> None:
         """Record the counts of nodes, of inboxes, and of links that do more than delay."""
         for host in self.hosts.values():
-            now = host.clock.at(self.true_ns)
+            now = host.clock.now_at(self.true_ns)
             for name, runner in host.runners.items():
                 counts: dict[str, Any] = {**runner.node.counts, **runner.inbox.counts}
                 host.recorder.write("counts", {"node": name, **counts}, now)
@@ -233,7 +233,7 @@ class VirtualRuntime:
         # `times` yields the start of the first stage, then the end of each stage.
         times: Iterator[Now] = repeat(now)  # if no stage takes time, they are all the same
         if ends_ns[-1]:
-            times = map(host.clock.at, [true_ns + end_ns for end_ns in ends_ns])
+            times = map(host.clock.now_at, [true_ns + end_ns for end_ns in ends_ns])
         outcome = run_stages(runner.node.name, stages, message, next(times), times)
         duration_ns = ends_ns[outcome.stages_run]
         runner.free_ns = free_ns = true_ns + duration_ns
@@ -288,7 +288,7 @@ def modelled_clock_source(clock: HostClock, host: str, error_s: float, bound_s: 
     """Return a model of chrony on a virtual host: its correction has the error `error_s` and the bound `bound_s`."""
 
     def report(true_ns: int) -> ClockReport:
-        now = clock.at(true_ns)
+        now = clock.now_at(true_ns)
         ahead_ns = now.wall_ns - (clock.wall_start_ns + true_ns)
         return ClockReport(now.mono_ns, now.wall_ns, host, "model", -ahead_ns / NS_PER_S + error_s, bound_s)
 

@@ -23,7 +23,7 @@ class CapturedFrame(Struct, frozen=True):
 
 
 class FrameTimes(Struct, frozen=True):
-    """The times at which a camera's shutter opens (or closes) for each frame, on the server's monotonic clock."""
+    """The times of one event for each frame, the opening or the closing of the shutter (server's monotonic clock)."""
 
     first_ns: int
     rate_hz: float

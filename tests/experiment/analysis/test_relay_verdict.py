@@ -71,7 +71,7 @@ def test_a_variable_delay_is_judged_by_its_lateness() -> None:
     assert reason == not_measured("video")
 
 
-def test_a_relay_without_measurements_is_a_reason() -> None:
+def test_a_relay_without_measurements_makes_the_run_invalid() -> None:
     """Without the relay's measurements, a run is invalid because no flow's delay was measured."""
     for reason, flow in zip(relay_reasons({}), ("video", "control"), strict=True):
         assert reason == not_measured(flow)

@@ -13,7 +13,7 @@ from lavt.config import RunConfig
 from lavt.config_file import load_config, shipped
 from lavt.errors import UserError
 from lavt.experiment.analysis.invalid_reason import not_measured
-from lavt.experiment.runs.netem_run import NetemRun, netem_reasons
+from lavt.experiment.runs.netem_run import NetemRun, netem_invalid_reasons
 from lavt.experiment.runs.plan import plan_run
 from lavt.transport.emulation.impairment import ExemptPort, ImpairedFlow, Impairment
 from lavt.transport.netem.netem import NetemInterface
@@ -29,7 +29,7 @@ class FakeNetemInterface(NetemInterface):
         super().__init__("lo", directory=directory, run=self.record)
         self.commands: list[str] = []
         self.added_ms = 0.0
-        self.stopped: list[str] = []
+        self.stopped_jitter: list[str] = []
 
     def record(self, command: Command) -> str:
         """Record a command; the interface has no root queue of ours until one is added."""
@@ -49,13 +49,17 @@ class FakeNetemInterface(NetemInterface):
     ) -> dict[str, ProbeResult]:
         """Return the requested delays plus `added_ms`."""
         return {
-            probe.name: ProbeResult(count, 0, 0, 0, *[probe.impairment.delay_ms + self.added_ms] * 3)
+            probe.name: self._probe_result(count, probe.impairment.delay_ms + self.added_ms)
             for probe in queue_probes(flows, exempt)
         }
 
+    def _probe_result(self, count: int, delay_ms: float) -> ProbeResult:
+        percentiles = {"p5_ms": delay_ms, "median_ms": delay_ms, "p95_ms": delay_ms}
+        return ProbeResult(sent=count, lost=0, reordered=0, early=0, **percentiles)
+
     def problems(self) -> list[str]:
-        """Return the parts that have stopped."""
-        return self.stopped
+        """Return the messages about correlated jitter that has stopped."""
+        return self.stopped_jitter
 
     def read_back(self, flows: Sequence[ImpairedFlow]) -> list[str]:
         """Return no differences."""
@@ -80,7 +84,7 @@ def test_a_run_delays_its_own_ports_and_cleans_up(tmp_path: Path) -> None:
     assert "match ip dport 40002 0xffff" in commands
     assert interface.commands[-1] == "tc qdisc del dev lo root"
     assert (report["before"]["video"]["median_ms"], report["after"]["control"]["median_ms"]) == (150, 75)
-    assert netem_reasons(report) == []
+    assert netem_invalid_reasons(report) == []
 
 
 def test_an_interrupted_run_cleans_up(tmp_path: Path) -> None:
@@ -97,8 +101,8 @@ def test_an_interrupted_run_cleans_up(tmp_path: Path) -> None:
     assert interface.commands[-1] == "tc qdisc del dev lo root"
 
 
-def test_a_rejected_run_keeps_the_queue_of_another_program(tmp_path: Path) -> None:
-    """If another program uses the loopback, the run is rejected, and that program's queue remains."""
+def test_a_rejected_run_keeps_the_queue_of_another_owner(tmp_path: Path) -> None:
+    """If another program has already added a queue to the loopback, the run is rejected, and this queue remains."""
     interface = FakeNetemInterface(tmp_path)
     interface.commands = ["tc qdisc add dev lo root"]
     owner = os.getppid(), start_ticks(os.getppid())
@@ -108,10 +112,10 @@ def test_a_rejected_run_keeps_the_queue_of_another_program(tmp_path: Path) -> No
     assert interface.commands == ["tc qdisc add dev lo root"]
 
 
-def test_a_delay_that_differs_from_the_request_is_a_reason(tmp_path: Path) -> None:
-    """A delay that is 3 ms longer than requested makes a run invalid; the reason says that it was so after the drive.
+def test_a_delay_that_differs_from_the_request_makes_the_run_invalid(tmp_path: Path) -> None:
+    """A delay that is 3 ms too long after the drive makes the run invalid; the reason names this time.
 
-    A part of netem that has stopped and a missing queue make a run invalid, too.
+    Correlated jitter that has stopped and a missing queue make a run invalid, too.
     """
     interface = FakeNetemInterface(tmp_path)
     with netem_run(interface, "L1") as netem:
@@ -119,22 +123,26 @@ def test_a_delay_that_differs_from_the_request_is_a_reason(tmp_path: Path) -> No
         interface.added_ms = 3.0
         report = netem.report()
 
-    assert all(reason.text.startswith("after the drive: ") for reason in netem_reasons(report))
-    assert any("video was delayed by 78.00 ms" in reason.text for reason in netem_reasons(report))
-    interface.stopped = ["video: its correlated jitter has stopped"]
-    assert netem_reasons(netem.report())[0].text.startswith("video: ")
-    assert netem_reasons({**report, "read_back": ["lo has no queue of ours"]})[0].text == "lo has no queue of ours"
+    assert all(reason.text.startswith("after the drive: ") for reason in netem_invalid_reasons(report))
+    assert any("video was delayed by 78.00 ms" in reason.text for reason in netem_invalid_reasons(report))
+    interface.stopped_jitter = ["video: its correlated jitter has stopped"]
+    assert netem_invalid_reasons(netem.report())[0].text.startswith("video: ")
+    assert (
+        netem_invalid_reasons({**report, "read_back": ["lo has no queue of ours"]})[0].text == "lo has no queue of ours"
+    )
 
 
 @pytest.mark.parametrize("report", [{}, {"flows": 3}, {"flows": [], "read_back": [], "before": {"video": {}}}])
 def test_delays_of_an_invalid_netem_report_are_not_measured(report: dict[str, Any]) -> None:
     """With an invalid `netem.json`, a run is invalid because the injected delay of each flow was not measured."""
-    for reason, flow in zip(netem_reasons(report), ("video", "control"), strict=True):
+    for reason, flow in zip(netem_invalid_reasons(report), ("video", "control"), strict=True):
         assert reason == not_measured(flow)
 
 
-def test_a_flow_without_a_measurement_is_a_reason() -> None:
+def test_a_flow_without_a_measurement_makes_the_run_invalid() -> None:
     """A flow of the report without a measurement makes a run invalid."""
-    flow = ImpairedFlow("video", "udp", 5600, "source", Impairment(75))
+    flow = ImpairedFlow("video", "udp", 5600, "source", Impairment(delay_ms=75))
     report = {"flows": msgspec.to_builtins([flow]), "read_back": [], "before": {}, "after": {}}
-    assert "before the drive: video: no packet came through" in {reason.text for reason in netem_reasons(report)}
+    assert "before the drive: video: no packet came through" in {
+        reason.text for reason in netem_invalid_reasons(report)
+    }

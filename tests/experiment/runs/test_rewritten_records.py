@@ -67,13 +67,13 @@ def write(directory: Path, side: str, topics: list[tuple[str, Rows]]) -> None:
 def mutate(rows: Rows, generator: Any) -> Rows:
     """Return the messages with one kind of random change to some or all of them.
 
-    A changed message has another value, content or time, lacks a field, or is left out.
+    A changed message has another value, null and an additional field, another content or time, or is left out.
     """
 
     def any_of(values: list[Any]) -> Any:
         return values[generator.integers(len(values))]
 
-    kind = any_of(["value", "value", "value", "missing", "text", "time", "left out"])
+    kind = any_of(["value", "value", "value", "null", "text", "time", "left out"])
     _, _, first_data = rows[0]
     names, value, text = list(json.loads(first_data)), any_of(VALUES), any_of(TEXTS)
     name, time_ns, share = any_of(names), any_of(TIMES_NS), any_of([0.01, 0.5, 1.0])
@@ -84,8 +84,8 @@ def mutate(rows: Rows, generator: Any) -> Rows:
             changed.append((log_ns, publish_ns, data))
         elif kind == "value":
             changed.append((log_ns, publish_ns, json.dumps({**fields, name: value}).encode()))
-        elif kind == "missing":
-            changed.append((log_ns, publish_ns, json.dumps({**fields, name: None, "else": 1}).encode()))
+        elif kind == "null":
+            changed.append((log_ns, publish_ns, json.dumps({**fields, name: None, "additional": 1}).encode()))
         elif kind == "text":
             changed.append((log_ns, publish_ns, text))
         elif kind == "time":
@@ -118,7 +118,9 @@ def check_mutations(topics: Topics, directory: Path, seed: int, count: int) -> i
                 index = int(generator.integers(len(written)))
                 topic, rows = written[index]
                 rows = mutate(topics[side][topic], generator)
-                written[index] = (topic if generator.random() > 0.1 else written[index - 1][0]), rows
+                if generator.random() <= 0.1:
+                    topic = written[index - 1][0]  # the messages come on a topic of other messages
+                written[index] = topic, rows
             write(directory, side, written)
         sentence = rejection(directory, str(generator.choice(["none", "netem", "relay"])))
         assert "\n" not in sentence

@@ -46,7 +46,7 @@ def errors_ms(measured: RunMeasurement, offset: ClockOffset | None, server: Host
     began_ns, ended_ns = measured.clocks.client_wall_ns.tolist()
     client_wall_ns = np.arange(began_ns, ended_ns, 10 * NS_PER_MS)
     true_ns = client_wall_ns - server.wall_start_ns
-    truth_ns = np.array([server.at(at_ns).wall_ns for at_ns in true_ns.tolist()]) - client_wall_ns
+    truth_ns = np.array([server.now_at(at_ns).wall_ns for at_ns in true_ns.tolist()]) - client_wall_ns
     delta_error_ns = np.abs(offset.at(client_wall_ns) - truth_ns)
     return delta_error_ns / NS_PER_MS, offset.bound_at(client_wall_ns) / NS_PER_MS
 
@@ -54,7 +54,7 @@ def errors_ms(measured: RunMeasurement, offset: ClockOffset | None, server: Host
 def remove_time_sources(loop: VirtualLoop) -> None:
     def install(host: VirtualHost) -> None:
         def unknown(true_ns: int) -> ClockReport:
-            return unknown_clock(host.clock.at(true_ns), host.side, "chrony", "chrony is not installed")
+            return unknown_clock(host.clock.now_at(true_ns), host.side, "chrony", "chrony is not installed")
 
         host.clock_source = unknown
 

@@ -113,7 +113,7 @@ def test_ignoring_the_clock_offset_makes_latencies_wrong(tmp_path: Path) -> None
         for side, host in loop.runtime.hosts.items():
             host.clock_source = partial(
                 lambda name, clock, true_ns: ClockReport(
-                    clock.at(true_ns).mono_ns, clock.at(true_ns).wall_ns, name, "wrong", 0.0, 0.0001
+                    clock.now_at(true_ns).mono_ns, clock.now_at(true_ns).wall_ns, name, "wrong", 0.0, 0.0001
                 ),
                 side,
                 host.clock,

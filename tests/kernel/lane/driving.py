@@ -21,8 +21,8 @@ SHORT_ROAD = REPOSITORY / "tests/kernel/roads/short.yaml"
 NO_SCENERY = ("vehicle.scenery=none",)
 """Without scenery, a user-mode kernel with one processor and slow system calls can render in time."""
 BY_WIRE = "configs/server-by-wire.yaml"
-ROUTER_PORT = 7448
-SESSION_PORT = 7447
+ROUTER_TO_ROUTER_PORT = 7448
+PROGRAM_TO_ROUTER_PORT = 7447
 DRIVE_TIMEOUT_S = 240
 
 
@@ -59,7 +59,7 @@ def start_loop(
     client_changes: Sequence[str] = (),
 ) -> LoopPrograms:
     """Start the four programs; `out` is a new directory on both machines."""
-    endpoints = json.dumps([f"udp/{server.address}:{ROUTER_PORT}?rel=1;mixed_rel=1"])
+    endpoints = json.dumps([f"udp/{server.address}:{ROUTER_TO_ROUTER_PORT}?rel=1;mixed_rel=1"])
     routers = (
         _start(server, "router", "zenoh-configs/router-server.json5"),
         _start(client, "router", "zenoh-configs/router-client.json5", changes=[f"connect.endpoints={endpoints}"]),
@@ -84,11 +84,11 @@ def start_by_wire(
     client_changes: Sequence[str] = (),
 ) -> LoopPrograms:
     """Start a by-wire drive. It has one router, on the client's machine, to relieve the server's machine."""
-    endpoints = json.dumps([f"tcp/0.0.0.0:{SESSION_PORT}"])
+    endpoints = json.dumps([f"tcp/0.0.0.0:{PROGRAM_TO_ROUTER_PORT}"])
     router = _start(client, "router", "zenoh-configs/router-server.json5", changes=[f"listen.endpoints={endpoints}"])
     _wait_ready(router)
-    changes = [f"zenoh.router=tcp/{client.address}:{SESSION_PORT}", *NO_SCENERY, *server_changes]
-    client_changes = [f"zenoh.router=tcp/127.0.0.1:{SESSION_PORT}", *client_changes]
+    changes = [f"zenoh.router=tcp/{client.address}:{PROGRAM_TO_ROUTER_PORT}", *NO_SCENERY, *server_changes]
+    client_changes = [f"zenoh.router=tcp/127.0.0.1:{PROGRAM_TO_ROUTER_PORT}", *client_changes]
     loop = LoopPrograms(
         (router,), _start_server(server, BY_WIRE, out, changes), _start_client(client, server, out, client_changes)
     )

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
 from lavt.transport.emulation.delay_line import DelayLine, DelayModel
-from lavt.transport.emulation.impairment import DISTRIBUTIONS, Distribution, Impairment, gilbert
+from lavt.transport.emulation.impairment import DISTRIBUTIONS, Distribution, Impairment, burst_probabilities
 from lavt.transport.emulation.link import HEADER_BYTES, EmulatedLink, LinkInjection, check_injection
 from lavt.transport.emulation.random_process import LARGEST_QUANTILE, LossProcess, quantiles
 from lavt.transport.emulation.trace import Trace, parse_delays, parse_mahimahi
@@ -341,7 +341,7 @@ def test_higher_loss_includes_any_lower_loss_up_to_a_limit(
     lower = share * (1 - 1 / burst)
     higher = min(lower * factor, burst / (burst + 1))
     processes = [
-        LossProcess(seed, "x", loss, gilbert(Impairment(loss=loss, loss_burst_packets=burst)))
+        LossProcess(seed, "x", loss, burst_probabilities(Impairment(loss=loss, loss_burst_packets=burst)))
         for loss in (lower, higher)
     ]
     lost_at_lower, lost_at_higher = ([process.is_lost(index) for index in range(300)] for process in processes)
@@ -367,8 +367,8 @@ def test_delay_line_follows_its_link() -> None:
 
 
 CONTRADICTIONS: list[tuple[Impairment, str | None, str]] = [
-    (Impairment(loss=1.0), None, "shares below 1"),
-    (Impairment(loss=0.9, loss_burst_packets=2), None, "leaves no room"),
+    (Impairment(loss=1.0), None, "must be below 1"),
+    (Impairment(loss=0.9, loss_burst_packets=2), None, "gaps of less than one packet"),
     (
         Impairment(delay_ms=9, jitter_ms=1, jitter_correlation=0.5, jitter_distribution="pareto"),
         None,

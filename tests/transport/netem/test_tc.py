@@ -258,7 +258,7 @@ def test_unexpected_options_from_tc_raise_a_work_error(options: dict[str, Any]) 
     [
         (Impairment(-1), "not negative"),
         (Impairment(float("nan")), "finite"),
-        (Impairment(5, loss=1), "shares below 1"),
+        (Impairment(5, loss=1), "must be below 1"),
         (Impairment(5, jitter_ms=6), "negative delays"),
         (Impairment(0, reorder=0.1), "needs a delay"),
         (Impairment(5, loss=0.9, loss_burst_packets=2), "longer bursts or less loss"),

@@ -68,10 +68,12 @@ def open_port() -> Iterator[Callable[..., CanPort]]:
         interface: str = "virtual",
         channel: str = "test",
         clock: Clock | None = None,
-        suspended: Callable[[], int] = lambda: 0,
+        read_suspended_ns: Callable[[], int] = lambda: 0,
         **options: Any,
     ) -> CanPort:
-        ports.append(CanPort(interface, channel, options, clock=clock or MachineClock(), suspended=suspended))
+        ports.append(
+            CanPort(interface, channel, options, clock=clock or MachineClock(), read_suspended_ns=read_suspended_ns)
+        )
         return ports[-1]
 
     yield open_new_port
@@ -458,7 +460,7 @@ def test_frames_before_a_suspension_are_dropped(open_port: Callable[..., CanPort
     monotonic clock stood still, so their age is unknown.
     """
     suspended = [0]
-    port = open_port("breakable", "stick", clock=ManualClock(0), suspended=lambda: suspended[0])
+    port = open_port("breakable", "stick", clock=ManualClock(0), read_suspended_ns=lambda: suspended[0])
     is_reading, may_read = threading.Event(), threading.Event()
     device.incoming.append(can.Message(arbitration_id=6, is_extended_id=False))
     until(lambda: not device.incoming)
@@ -483,7 +485,7 @@ def test_frames_before_a_suspension_are_dropped(open_port: Callable[..., CanPort
 def test_a_bus_opened_during_a_suspension_is_opened_again(open_port: Callable[..., CanPort], device: Device) -> None:
     """A bus that was being reopened when the machine was suspended is not used: it can have frames from before."""
     suspended = [0]
-    port = open_port("breakable", "stick", clock=ManualClock(0), suspended=lambda: suspended[0])
+    port = open_port("breakable", "stick", clock=ManualClock(0), read_suspended_ns=lambda: suspended[0])
     device.may_open.clear()
     device.incoming.append(OSError(errno.ENODEV, "gone"))
     until(lambda: device.shut_down == 1)
@@ -591,7 +593,7 @@ def test_a_failed_write_loses_the_bus(open_port: Callable[..., CanPort], device:
 def test_a_suspended_machine(open_port: Callable[..., CanPort], device: Device) -> None:
     """A suspension of 100 ms or more is treated as a loss of the bus: nothing is written until the bus is reopened."""
     suspended_ms = [5000]
-    port = open_port("breakable", "stick", clock=ManualClock(0), suspended=lambda: suspended_ms[0] * NS_PER_MS)
+    port = open_port("breakable", "stick", clock=ManualClock(0), read_suspended_ns=lambda: suspended_ms[0] * NS_PER_MS)
     for step_ms, is_lost in ((99, False), (-80, False), (100, False), (100, True)):
         suspended_ms[0] += step_ms
         device.may_open.clear()

@@ -16,7 +16,7 @@ LIMITS_MS = [
     ("a lost bus is reopened every second", bus.REOPEN_NS, 1000),
     ("a frame read later than 1 s is dropped", bus.LATEST_READ_NS, 1000),
     ("gears are requested every 100 ms", sending.GEAR_PERIOD_NS, 100),
-    ("enabling takes at most 3 s", states.ENABLING_LIMIT_NS, 3000),
+    ("enabling takes at most 3 s", states.KIT_RESPONSE_LIMIT_NS, 3000),
     ("clearing takes at least 120 ms", states.PAUSE_NS, 120),
     ("a shift is reported at most 1 s late", adapter.SHIFT_REPORT_LIMIT_NS, 1000),
     ("the car is stationary 300 ms before PARK", adapter.STATIONARY_BEFORE_PARK_NS, 300),

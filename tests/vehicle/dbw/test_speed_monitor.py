@@ -169,9 +169,9 @@ def test_only_sure_braking_counts() -> None:
     rig.run(0.4, WEAK_BRAKE, *[constant(0.0)] * 5)
     assert rig.monitor.is_stationary
     rig.run(1.0, Pedals(0.5, 0.0), *[constant(0.0)] * 5)
-    rig.run(7.9, Pedals(0.0, 0.0, is_brake_released=True), *[constant(0.0)] * 5)
+    rig.run(7.9, Pedals(0.0, 0.0, is_brake_axis_released=True), *[constant(0.0)] * 5)
     assert not rig.monitor.is_stationary
-    rig.run(1.2, Pedals(0.0, 0.0, is_brake_released=True), *[constant(0.0)] * 5)
+    rig.run(1.2, Pedals(0.0, 0.0, is_brake_axis_released=True), *[constant(0.0)] * 5)
     assert rig.monitor.is_stationary
 
 

@@ -26,13 +26,13 @@ GOOD = Situation(
     since_sent_ns=0,
     faults="",
     overrides="",
-    trips="",
+    watchdog_trips="",
     command_errors="",
-    reasons="",
+    kit_reasons="",
     enabled=ALL_AXES,
     gear="drive",
     in_state_ns=0,
-    must_stay_enabled=False,
+    is_release_unexpected=False,
 )
 STAYS: dict[State, Situation] = {
     "idle": replace(GOOD, wanted=False, enabled=NO_AXES, gear="park"),
@@ -71,9 +71,9 @@ CAUSES: list[Cause] = [
     ("commands late", {"since_sent_ns": TIMEOUT_NS}, dict.fromkeys(("enabling", "engaged", "parking"), "lost")),
     ("commands in time", {"since_sent_ns": TIMEOUT_NS - 1}, {}),
     ("fault", {"faults": "f"}, dict.fromkeys(("clearing", "enabling", "engaged"), "lost")),
-    ("trip", {"trips": "t"}, dict.fromkeys(("enabling", "engaged"), "lost")),
+    ("trip", {"watchdog_trips": "t"}, dict.fromkeys(("enabling", "engaged"), "lost")),
     ("command error", {"command_errors": "c"}, {"engaged": "lost"}),
-    ("reason only", {"reasons": "r"}, {}),
+    ("reason only", {"kit_reasons": "r"}, {}),
     ("inhibit reason only", {"inhibit_reason": "i"}, {}),
     ("car moves", {"is_stationary": False}, {}),
     ("gear unknown", {"gear": None}, {"engaged": "lost"}),
@@ -104,11 +104,11 @@ ROWS: list[tuple[State, dict[str, Any], State]] = [
     ("clearing", {"in_state_ns": PAUSE_NS - 1}, "clearing"),
     ("clearing", {"in_state_ns": PAUSE_NS}, "enabling"),
     ("clearing", {"in_state_ns": PAUSE_NS, "overrides": "o"}, "clearing"),
-    ("clearing", {"in_state_ns": PAUSE_NS, "trips": "t"}, "clearing"),
+    ("clearing", {"in_state_ns": PAUSE_NS, "watchdog_trips": "t"}, "clearing"),
     ("clearing", {"in_state_ns": LIMIT_NS}, "enabling"),
     ("clearing", {"in_state_ns": LIMIT_NS - 1, "overrides": "o"}, "clearing"),
     ("clearing", {"in_state_ns": LIMIT_NS, "overrides": "o"}, "lost"),
-    ("clearing", {"in_state_ns": LIMIT_NS, "trips": "t"}, "lost"),
+    ("clearing", {"in_state_ns": LIMIT_NS, "watchdog_trips": "t"}, "lost"),
     ("clearing", NOT_WANTED, "parking"),
     ("enabling", READY, "engaged"),
     ("enabling", {**READY, "gear": "neutral"}, "enabling"),
@@ -123,9 +123,9 @@ ROWS: list[tuple[State, dict[str, Any], State]] = [
     ("parking", {**RELEASED, "in_state_ns": PAUSE_NS - 1}, "parking"),
     ("parking", {**RELEASED, "in_state_ns": PAUSE_NS}, "idle"),
     ("parking", {**RELEASED, "wanted": True, "in_state_ns": PAUSE_NS}, "idle"),
-    ("parking", {**RELEASED, "must_stay_enabled": True, "in_state_ns": PAUSE_NS - 1}, "parking"),
-    ("parking", {**RELEASED, "must_stay_enabled": True, "in_state_ns": PAUSE_NS}, "lost"),
-    ("parking", {"must_stay_enabled": True, "in_state_ns": LIMIT_NS}, "parking"),
+    ("parking", {**RELEASED, "is_release_unexpected": True, "in_state_ns": PAUSE_NS - 1}, "parking"),
+    ("parking", {**RELEASED, "is_release_unexpected": True, "in_state_ns": PAUSE_NS}, "lost"),
+    ("parking", {"is_release_unexpected": True, "in_state_ns": LIMIT_NS}, "parking"),
     *(("parking", {"enabled": frozenset({axis}), "in_state_ns": LIMIT_NS}, "parking") for axis in AXES),
     ("lost", {"enabled": NO_AXES, "in_state_ns": LIMIT_NS}, "lost"),
     ("lost", NOT_WANTED, "parking"),
@@ -155,7 +155,7 @@ def test_a_row_needs_all_of_its_conditions(state: State, changes: dict[str, Any]
     assert target(state, **changes) == follows
 
 
-TEXTS = ("overrides", "missing_reports", "faults", "trips", "command_errors")
+TEXTS = ("overrides", "missing_reports", "faults", "watchdog_trips", "command_errors")
 """Causes that have texts, in order of priority."""
 
 
@@ -182,13 +182,13 @@ def test_a_gear_is_named() -> None:
     assert "unknown" in reason("engaged", gear=None)
 
 
-DETAILS = {"trips": "TRIP", "command_errors": "ERROR", "reasons": "REASON"}
+DETAILS = {"watchdog_trips": "TRIP", "command_errors": "ERROR", "kit_reasons": "REASON"}
 CASES: list[tuple[State, dict[str, Any]]] = [
-    ("engaged", {"trips": "TRIP"}),
+    ("engaged", {"watchdog_trips": "TRIP"}),
     ("engaged", {"enabled": NO_AXES}),
     ("clearing", {"in_state_ns": LIMIT_NS, "overrides": "OVERRIDE"}),
     ("enabling", {"in_state_ns": LIMIT_NS}),
-    ("parking", {"enabled": NO_AXES, "must_stay_enabled": True, "in_state_ns": PAUSE_NS}),
+    ("parking", {"enabled": NO_AXES, "is_release_unexpected": True, "in_state_ns": PAUSE_NS}),
 ]
 
 
@@ -198,7 +198,7 @@ CASES: list[tuple[State, dict[str, Any]]] = [
         (state, cause, detail)
         for state, cause in CASES
         for detail in DETAILS
-        if (state, detail) != ("enabling", "trips")
+        if (state, detail) != ("enabling", "watchdog_trips")
     ],
 )  # a trip ends enabling immediately
 def test_other_reported_problems_are_in_the_reason(state: State, cause: dict[str, Any], detail: str) -> None:
@@ -206,7 +206,7 @@ def test_other_reported_problems_are_in_the_reason(state: State, cause: dict[str
     text = reason(state, **{**cause, detail: DETAILS[detail]})
     assert DETAILS[detail] in text
     assert cause.get("overrides", "") in text
-    assert SEPARATOR + "REASON" in reason(state, **{**cause, "command_errors": "ERROR", "reasons": "REASON"})
+    assert SEPARATOR + "REASON" in reason(state, **{**cause, "command_errors": "ERROR", "kit_reasons": "REASON"})
     for reason_text in (text, reason(state, **cause)):
         assert "()" not in reason_text
         assert "; ;" not in reason_text
@@ -220,14 +220,14 @@ def test_axes_that_are_not_enabled_are_named(axis: Axis) -> None:
     for text in (reason("engaged", **others), reason("enabling", **others, in_state_ns=LIMIT_NS)):
         assert {name for name in AXES if name in text} == {axis}
     assert reason("engaged", enabled=NO_AXES).endswith(AXES[-1])
-    assert not any(name in reason("clearing", in_state_ns=LIMIT_NS, trips="TRIP") for name in AXES)
+    assert not any(name in reason("clearing", in_state_ns=LIMIT_NS, watchdog_trips="TRIP") for name in AXES)
 
 
 def test_a_gear_that_was_not_reached_is_named() -> None:
     """If DRIVE was not reached in time the reason names the gear; in DRIVE it names only the missing axes."""
     assert "park" in reason("enabling", enabled=ALL_AXES, in_state_ns=LIMIT_NS)
     assert "gear" not in reason("enabling", gear="drive", in_state_ns=LIMIT_NS)
-    assert "gear" not in reason("clearing", in_state_ns=LIMIT_NS, trips="TRIP")
+    assert "gear" not in reason("clearing", in_state_ns=LIMIT_NS, watchdog_trips="TRIP")
 
 
 AXIS_SETS = [frozenset(axes) for axes in chain.from_iterable(combinations(AXES, size) for size in range(4))]
@@ -239,13 +239,13 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "since_sent_ns": (TIMEOUT_NS - 1, TIMEOUT_NS),
     "faults": ("", "f"),
     "overrides": ("", "o"),
-    "trips": ("", "t"),
+    "watchdog_trips": ("", "t"),
     "command_errors": ("", "c"),
-    "reasons": ("",),
+    "kit_reasons": ("",),
     "enabled": tuple(AXIS_SETS),
     "gear": ("drive", "park"),
     "in_state_ns": (0, PAUSE_NS, LIMIT_NS),
-    "must_stay_enabled": (False, True),
+    "is_release_unexpected": (False, True),
 }
 """Inputs on either side of every condition in the table."""
 

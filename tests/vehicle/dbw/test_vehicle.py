@@ -202,6 +202,6 @@ def test_delegation(port: StandInPort) -> None:
     vehicle.advance(START_NS + 1)
     assert vehicle.capabilities == CAPABILITIES
     assert (vehicle.counts["unknown_identifier"] - before, vehicle.counts["overflowed"]) == (1, 3)
-    assert vehicle.is_silent
+    assert vehicle.is_idle_or_overridden
     vehicle.close()
     assert port.is_closed

@@ -29,7 +29,7 @@ def motion_at(
 
 def events_along(road: Road, places: list[tuple[float, float]], turned_rad: float = 0.0) -> list[VehicleEvent]:
     """Return the events of a car that is placed at positions (station, lateral offset) one after the other."""
-    monitor = RouteMonitor(road, CAR, near_s_m=places[0][0])
+    monitor = RouteMonitor(road, CAR, near_station_m=places[0][0])
     events = []
     for index, (s_m, lateral_m) in enumerate(places):
         events += monitor.update(motion_at(road, s_m, lateral_m, turned_rad), index * 1000)
@@ -40,7 +40,7 @@ def kinds(events: list[VehicleEvent]) -> list[EventKind]:
     return [event.kind for event in events]
 
 
-def test_a_drive_along_the_lane_only_completes(road: Road) -> None:
+def test_a_drive_along_the_lane_has_no_event_but_completion(road: Road) -> None:
     """A car on its lane's centre completes the route once, without other events."""
     events = events_along(road, [(s_m / 2, 0.0) for s_m in range(270)])
     assert kinds(events) == ["completed"]
@@ -51,7 +51,7 @@ def test_a_drive_along_the_lane_only_completes(road: Road) -> None:
 def test_tracking_error_is_measured_at_the_rear_axle(road: Road, lateral_m: float, turned_rad: float) -> None:
     """Cross-track error, heading error and progress are the rear axle's, left positive, also in a curve."""
     for s_m in (5.0, 50.0, 110.0):
-        error = RouteMonitor(road, CAR, near_s_m=s_m).track(motion_at(road, s_m, lateral_m, turned_rad))
+        error = RouteMonitor(road, CAR, near_station_m=s_m).track(motion_at(road, s_m, lateral_m, turned_rad))
         assert (error.cross_track_m, error.heading_error_rad, error.progress_m) == pytest.approx(
             (lateral_m, turned_rad, s_m), abs=1e-6
         )
@@ -59,7 +59,7 @@ def test_tracking_error_is_measured_at_the_rear_axle(road: Road, lateral_m: floa
 
 def test_heading_error_is_wrapped(road: Road) -> None:
     """A heading beyond a full turn has the same small error."""
-    error = RouteMonitor(road, CAR, near_s_m=5.0).track(motion_at(road, 5.0, 0.0, 2 * math.pi + 0.1))
+    error = RouteMonitor(road, CAR, near_station_m=5.0).track(motion_at(road, 5.0, 0.0, 2 * math.pi + 0.1))
     assert error.heading_error_rad == pytest.approx(0.1)
 
 
@@ -68,7 +68,7 @@ def test_each_edge_that_changes_lanes_is_an_invasion(road: Road) -> None:
     away = [(5.0, 0.0), (5.1, 0.80), (5.2, 0.83)]
     events = events_along(road, [*away, (5.3, 0.0)])
     assert kinds(events) == ["lane_invasion", "lane_invasion"]
-    assert [event.detail for event in events] == [
+    assert [event.detail for event in events] == [  # the lanes are numbered from the right
         "left edge from lane 2 to 3 from the right",
         "left edge from lane 3 to 2 from the right",
     ]
@@ -111,14 +111,14 @@ def test_leaving_the_asphalt_without_a_rail_is_off_road(road: Road) -> None:
 
 
 def test_the_time_limit_counts_from_the_first_movement(road: Road) -> None:
-    """The time limit, the route at 10 km/h plus 30 s, starts when the car first exceeds 0.1 m/s."""
-    monitor = RouteMonitor(road, CAR, near_s_m=0.0)
+    """The default time limit, 30 s more than the route takes at 10 km/h, starts when the car first exceeds 0.1 m/s."""
+    monitor = RouteMonitor(road, CAR, near_station_m=0.0)
     stationary, moving = motion_at(road, 1.0), motion_at(road, 1.0, speed_mps=0.2)
     began_ns = 500 * NS_PER_S
     assert monitor.update(stationary, 0) == []
     assert monitor.update(stationary, began_ns - 1) == []
     assert monitor.update(moving, began_ns) == []
-    limit_ns = round((road.route_length_m / (30 / 3.6 / 3) + 30) * NS_PER_S)
+    limit_ns = round((road.route_length_m / (10 / 3.6) + 30) * NS_PER_S)
     assert monitor.update(stationary, began_ns + limit_ns) == []
     assert kinds(monitor.update(stationary, began_ns + limit_ns + 1)) == ["timeout"]
     assert monitor.update(stationary, began_ns + limit_ns + 2) == []
@@ -126,7 +126,7 @@ def test_the_time_limit_counts_from_the_first_movement(road: Road) -> None:
 
 def test_the_time_limit_can_be_set(road: Road) -> None:
     """A drive with a time limit of 2 s times out once it has lasted longer."""
-    monitor = RouteMonitor(road, CAR, near_s_m=0.0, limit_s=2.0)
+    monitor = RouteMonitor(road, CAR, near_station_m=0.0, limit_s=2.0)
     moving = motion_at(road, 1.0, speed_mps=0.2)
     assert [kinds(monitor.update(moving, at_s * NS_PER_S)) for at_s in (5, 7, 8)] == [[], [], ["timeout"]]
 
@@ -136,7 +136,7 @@ def test_an_edge_exactly_on_a_line_is_still_in_its_lane() -> None:
     straight = parse_road("title: x\nsegments: [{length_m: 100}]\nlanes: {widths_m: [3.0]}", source="x")
     wide = replace(CAR, body_width_m=2.0)  # half a metre to either side, without rounding
     for lateral_m, invasions in ((0.5, 0), (-0.5, 0), (0.501, 1), (-0.501, 1)):
-        monitor = RouteMonitor(straight, wide, near_s_m=5.0)
+        monitor = RouteMonitor(straight, wide, near_station_m=5.0)
         monitor.update(motion_at(straight, 5.0), 0)
         assert kinds(monitor.update(motion_at(straight, 5.0, lateral_m), 1)) == ["lane_invasion"] * invasions
 
@@ -145,7 +145,7 @@ def test_both_edges_can_leave_their_lanes_in_one_step(road: Road) -> None:
     """A car turned across the road has two lane invasions in one step, the invasion by the left edge first."""
     events = events_along(road, [(5.0, 0.0), (5.0, 0.0)])
     assert events == []
-    monitor = RouteMonitor(road, CAR, near_s_m=5.0)
+    monitor = RouteMonitor(road, CAR, near_station_m=5.0)
     monitor.update(motion_at(road, 5.0), 0)
     events = monitor.update(motion_at(road, 5.0, -1.4, math.pi / 2), 1000)
     assert [event.detail for event in events] == [
@@ -156,7 +156,7 @@ def test_both_edges_can_leave_their_lanes_in_one_step(road: Road) -> None:
 
 def test_a_spin_is_evaluated_at_the_outermost_points(road: Road) -> None:
     """A car that turns around in its lane invades the next lane and returns."""
-    monitor = RouteMonitor(road, CAR, near_s_m=5.0)
+    monitor = RouteMonitor(road, CAR, near_station_m=5.0)
     events = []
     for index in range(181):
         events += monitor.update(motion_at(road, 5.0, 0.0, math.radians(index)), index)
@@ -171,7 +171,7 @@ def test_a_spin_is_evaluated_at_the_outermost_points(road: Road) -> None:
 def test_driving_backwards_does_not_complete_a_route(road: Road) -> None:
     """A car that drives backwards from the start has negative progress, and no event but the timeout."""
     places = [(1.0 - index / 4, 0.0) for index in range(100)]
-    monitor = RouteMonitor(road, CAR, near_s_m=1.0, limit_s=1e-6)
+    monitor = RouteMonitor(road, CAR, near_station_m=1.0, limit_s=1e-6)
     events = []
     for index, (s_m, lateral_m) in enumerate(places):
         events += monitor.update(motion_at(road, s_m, lateral_m, math.pi, speed_mps=5.0), index * 1000)
@@ -212,8 +212,8 @@ def test_asphalt_is_limited_to_its_stations() -> None:
         assert ("off_road" in kinds(events_along(road, [(s_m, -4.0)]))) == is_off_road
 
 
-def test_a_car_behind_a_rail_does_not_touch_it() -> None:
-    """A body entirely behind a rail passes the rail's beginning; a body that meets the beginning has a collision."""
+def test_a_car_on_the_far_side_of_a_rail_does_not_touch_it() -> None:
+    """A body entirely on the far side of a rail passes its beginning; a body in line with the rail collides with it."""
     road = parse_road(OPEN_RAIL, source="x")
     assert "collision" not in kinds(events_along(road, [(30.0 + s_m, -7.5) for s_m in range(20)]))
     assert "collision" in kinds(events_along(road, [(30.0 + s_m, -6.2) for s_m in range(20)]))
@@ -221,7 +221,7 @@ def test_a_car_behind_a_rail_does_not_touch_it() -> None:
 
 def test_one_contact_is_one_collision(road: Road) -> None:
     """Contacts less than half a second apart are one collision; a contact after a longer pause is another collision."""
-    monitor = RouteMonitor(road, CAR, near_s_m=5.0)
+    monitor = RouteMonitor(road, CAR, near_station_m=5.0)
     at_rail, off_rail = motion_at(road, 5.0, -8.25), motion_at(road, 5.0, -8.0)
     collisions = []
     for at_ms in (0, 10, 20, 500, 1021, 1500):
@@ -232,16 +232,17 @@ def test_one_contact_is_one_collision(road: Road) -> None:
 
 
 def test_a_lasting_contact_is_one_collision(road: Road) -> None:
-    """A car pressed against a rail for seconds has one collision, even if it moves deeper into the rail."""
-    monitor = RouteMonitor(road, CAR, near_s_m=5.0)
-    events = [event for at_s in range(4) for event in monitor.update(motion_at(road, 5.0, -8.5), at_s * NS_PER_S // 3)]
-    events += monitor.update(motion_at(road, 5.0, -8.8), 4 * NS_PER_S // 3)
+    """A car pressed against a rail for more than a second has one collision, even if it moves deeper into the rail."""
+    monitor = RouteMonitor(road, CAR, near_station_m=5.0)
+    events = []
+    for thirds_of_a_second, lateral_m in enumerate((-8.5, -8.5, -8.5, -8.5, -8.8)):
+        events += monitor.update(motion_at(road, 5.0, lateral_m), thirds_of_a_second * NS_PER_S // 3)
     assert kinds(events).count("collision") == 1
 
 
 def test_a_contact_has_its_corner_depth_and_direction(road: Road) -> None:
     """A contact has the position of its corner on the body, its depth, and the direction out of the rail."""
-    monitor = RouteMonitor(road, CAR, near_s_m=5.0)
+    monitor = RouteMonitor(road, CAR, near_station_m=5.0)
     monitor.update(motion_at(road, 5.0, -6.5, -0.5), 0)
     (contact,) = monitor.contacts
     assert (contact.ahead_m, contact.left_m) == (CAR.rear_axle_to_front_m, -CAR.body_width_m / 2)
@@ -272,7 +273,7 @@ def test_skipping_checks_changes_no_events(
     road: Road, steps: list[tuple[float, float, float]], s_m: float, lateral_m: float
 ) -> None:
     """A monitor that skips checks within its margin reports the same events as a monitor that checks every step."""
-    skipping, always_checking = RouteMonitor(road, CAR, near_s_m=s_m), RouteMonitor(road, CAR, near_s_m=s_m)
+    skipping, always_checking = RouteMonitor(road, CAR, near_station_m=s_m), RouteMonitor(road, CAR, near_station_m=s_m)
     turned_rad = 0.0
     for index, (ahead_m, beside_m, turn_rad) in enumerate(steps):
         s_m, lateral_m, turned_rad = s_m + ahead_m, lateral_m + beside_m, turned_rad + turn_rad

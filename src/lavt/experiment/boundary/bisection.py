@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from scipy.optimize import brentq
 
 GUESS_ERROR_MS = 10.0
-"""The first bracket extends to the guess plus and minus this much."""
+"""`zero_bracket` begins its search at its guess plus and minus this much."""
 LARGEST_RATE_PER_S = 1.0
 """Rates are clipped to this size, because they can be infinite. The zero crossing does not depend on their size."""
 
@@ -20,8 +20,8 @@ LARGEST_RATE_PER_S = 1.0
 class Bracket:
     """The two delays between which the boundary lies.
 
-    `low_ms` is None if the boundary is at the shortest delay or below it. `high_ms` is None if no delay is above the
-    boundary.
+    `low_ms` is None if the boundary is at the shortest delay or below it. `high_ms` is None if the
+    boundary is above the longest delay of the search.
     """
 
     low_ms: float | None
@@ -58,7 +58,7 @@ def zero_bracket(rate: Callable[[float], float], guess_ms: float, longest_ms: fl
 
     The search begins at the guess plus and minus `GUESS_ERROR_MS`, and moves outwards until the sign changes. Brent's
     method (`scipy.optimize.brentq`) then needs few values of a smooth rate. The returned bracket is the root plus and
-    minus half of `within_ms`, cut at the ends of the range; `rate` was not evaluated at its two ends.
+    minus half of `within_ms`, cut at 0 and `longest_ms`; `rate` was not evaluated at the bracket's two ends.
     """
 
     def clipped_rate(delay_ms: float) -> float:

@@ -97,7 +97,7 @@ class NetemRun:
         return dict(msgspec.to_builtins(self._netem.measure(self._flows)))
 
 
-def netem_reasons(report: Mapping[str, Any]) -> list[InvalidReason]:
+def netem_invalid_reasons(report: Mapping[str, Any]) -> list[InvalidReason]:
     """Return a reason for each difference between request and measurement; `report` is the content of `netem.json`."""
     try:
         flows = msgspec.convert(report["flows"], tuple[ImpairedFlow, ...])

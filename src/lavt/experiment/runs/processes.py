@@ -51,7 +51,7 @@ class Process:
         self._reader = threading.Thread(target=self._read, name=f"{name} lines", daemon=True)
         self._reader.start()
 
-    def ready(self) -> dict[str, Any]:
+    def wait_ready(self) -> dict[str, Any]:
         """Wait for the first line, and return it.
 
         Raises `WorkError` if the process prints nothing in time or ends before, and `UserError` if it ends because of

@@ -88,7 +88,7 @@ def start_loop(
     server_yaml = _write(work, "server", server_config(run, planned.seed, router=local))
     arguments = ("server", server_yaml, *(["--once"] if once else []), "--out", str(out / "server"))
     server = processes.start("server", *arguments, program=server_program)
-    ready = server.ready()["ready"]
+    ready = server.wait_ready()["ready"]
     video_port, probe_port = ready["video_port"], ready["probe_port"]
     relay = None
     control_port = int(remote.partition("?")[0].rpartition(":")[2])
@@ -96,7 +96,7 @@ def start_loop(
         relay = processes.start(
             "relay", "relay", _write(work, "relay", _relay_config(planned, video_port, control_port))
         )
-        ports = relay.ready()["ports"]
+        ports = relay.wait_ready()["ports"]
         video_port, control_port = ports["video"], ports["control"]
     elif netem is not None:
         netem.apply(video_port=video_port, control_port=control_port)
@@ -105,7 +105,7 @@ def start_loop(
     config = client_config(run, router=local, video_port=video_port, probe_port=probe_port)
     config = config.model_copy(update={"controller": config.controller.model_copy(update={"rearm": rearm})})
     client = processes.start("client", "client", _write(work, "client", config), "--out", str(out / "client"))
-    client.ready()
+    client.wait_ready()
     return LoopProcesses(server_router, server, relay, client_router, client, local, dialled, ready)
 
 
@@ -208,7 +208,7 @@ def _start_router(
     endpoints = {"listen": listen, "connect": dialled}
     changes = [part for key, value in endpoints.items() for part in ("--set", f"{key}.endpoints={json.dumps(value)}")]
     router = processes.start(name, "router", f"zenoh-configs/{file}", *changes)
-    locators = router.ready()["locators"]
+    locators = router.wait_ready()["locators"]
     local = next(locator for locator in locators if locator.startswith("tcp/"))
     return router, local, next((locator for locator in locators if locator.startswith("udp/")), "")
 

@@ -14,7 +14,7 @@ from lavt.experiment.analysis.drive_data import DriveData, extract_drive
 from lavt.experiment.analysis.injection_validity import recorded_reasons
 from lavt.experiment.analysis.invalid_reason import InvalidReason
 from lavt.experiment.analysis.results import read_json, run_result, write_json
-from lavt.experiment.runs.netem_run import NETEM, netem_reasons
+from lavt.experiment.runs.netem_run import NETEM, netem_invalid_reasons
 from lavt.experiment.runs.plan import PlannedRun
 from lavt.experiment.runs.real_run import RELAY, Progress, drive_real, relay_reasons
 from lavt.experiment.runs.virtual_run import build_loop, drive
@@ -79,7 +79,7 @@ def _compute(out: Path, identity: Mapping[str, Any], digest: str | None) -> Driv
         requested = identity["condition"] if identity["injection"] == "netem" else ""
         reasons = recorded_reasons(server, client, requested, identity["injected_ms"])
     elif identity["injection"] == "netem":
-        reasons = netem_reasons(read_json(out / NETEM) if (out / NETEM).is_file() else {})
+        reasons = netem_invalid_reasons(read_json(out / NETEM) if (out / NETEM).is_file() else {})
     result = run_result(identity, server, client, digest=digest, reasons=reasons)
     write_json(out / RESULT, result)
     return extract_drive(server, out, result)

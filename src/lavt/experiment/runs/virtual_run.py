@@ -28,7 +28,7 @@ from lavt.runtime.recorder import Recorders
 from lavt.runtime.virtual import HostClock, VirtualHost, VirtualLink, VirtualRuntime, modelled_clock_source
 from lavt.transport.emulation.delay_line import DelayLine, DelayModel
 from lavt.transport.emulation.link import EmulatedLink, LinkInjection
-from lavt.transport.emulation.relay import video_index
+from lavt.transport.emulation.relay import video_delay_index
 
 SERVER_MONO_NS = 1_000 * NS_PER_S
 CLIENT_MONO_NS = 7_000 * NS_PER_S
@@ -104,7 +104,7 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
     fidelity = FIDELITIES[config.fidelity]()
     server = build_server(
         server_config(config, seed),
-        lambda: server_clock.at(0),
+        lambda: server_clock.now_at(0),
         SeededEntropy(seed, "server"),
         host="virtual-server",
         video_port=SERVER_VIDEO_PORT,
@@ -112,7 +112,7 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
         lazy_physics=True,
     )
     client = build_client(
-        client_config(config), lambda: client_clock.at(0), SeededEntropy(seed, "client"), fidelity=fidelity
+        client_config(config), lambda: client_clock.now_at(0), SeededEntropy(seed, "client"), fidelity=fidelity
     )
     make_directory(out)
     digest = hashlib.sha256()
@@ -187,7 +187,7 @@ def virtual_links(network: NetworkDelays) -> dict[str, VirtualLink]:
 
     session = None if network.control_injected is None else replace(network.control_injected, name="session")
     return {
-        "rtp": link(network.video, network.video_injected, lambda payload, _number: video_index(payload)),
+        "rtp": link(network.video, network.video_injected, lambda payload, _number: video_delay_index(payload)),
         "control": link(network.control, network.control_injected),
         "state": link(network.state),
         "feedback": link(network.never_delayed),

@@ -77,17 +77,17 @@ def check_impairment(name: str, impairment: Impairment) -> None:
     """Raise `UserError` for values that are out of range or contradict each other."""
     numbers = [getattr(impairment, field) for field in Impairment.__struct_fields__ if field != "jitter_distribution"]
     if not all(math.isfinite(number) and number >= 0 for number in numbers):
-        raise UserError(f"{name}: the values of an impairment are finite and not negative: correct {impairment}")
+        raise UserError(f"{name}: all values must be finite and not negative, unlike in {impairment}")
     if max(impairment.loss, impairment.reorder, impairment.jitter_correlation) >= 1:
-        raise UserError(f"{name}: loss, reorder and jitter_correlation are shares below 1: correct {impairment}")
+        raise UserError(f"{name}: loss, reorder and jitter_correlation must be below 1, unlike in {impairment}")
     if impairment.jitter_distribution not in DISTRIBUTIONS:
         raise UserError(f"{name}: jitter_distribution is one of {', '.join(DISTRIBUTIONS)}")
     if impairment.jitter_correlation and impairment.jitter_distribution != "normal":
         raise UserError(f"{name}: correlated jitter is normal: give jitter_distribution normal, or no correlation")
-    if impairment.loss_burst_packets > 1 and gilbert(impairment).begin > 1:
+    if impairment.loss_burst_packets > 1 and burst_probabilities(impairment).begin > 1:
         raise UserError(
-            f"{name}: a loss of {impairment.loss:g} in bursts of {impairment.loss_burst_packets:g} packets leaves "
-            "no room between them: give longer bursts or less loss"
+            f"{name}: a loss of {impairment.loss:g} in bursts of {impairment.loss_burst_packets:g} packets would "
+            "need gaps of less than one packet between the bursts: give longer bursts or less loss"
         )
     if impairment.rate_bps and not 8 <= impairment.rate_bps <= ORDER_RATE_BPS:
         raise UserError(
@@ -145,7 +145,7 @@ class BurstProbabilities(NamedTuple):
     end: float
 
 
-def gilbert(impairment: Impairment) -> BurstProbabilities:
-    """Return the probabilities that give the impairment's loss and mean length of a burst."""
+def burst_probabilities(impairment: Impairment) -> BurstProbabilities:
+    """Return the probabilities that result in the impairment's loss and mean burst length."""
     end = 1 / impairment.loss_burst_packets
     return BurstProbabilities(impairment.loss * end / (1 - impairment.loss), end)

@@ -16,7 +16,7 @@ from typing import Final
 
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
-from lavt.transport.emulation.impairment import Impairment, check_impairment, gilbert, has_loss_bursts
+from lavt.transport.emulation.impairment import Impairment, burst_probabilities, check_impairment, has_loss_bursts
 from lavt.transport.emulation.random_process import QUANTILES, CorrelatedProcess, Draws, LossProcess, quantiles
 from lavt.transport.emulation.trace import OPPORTUNITY_BYTES, CapacityTrace, DelayTrace, Trace
 
@@ -63,9 +63,8 @@ class EmulatedLink:
         impairment, seed, name = injected.impairment, injected.seed, injected.name
         self.lost = self.dropped = self.overtook = self.packets = 0
         self._impairment, self._start_ns = impairment, start_ns
-        self._losses = LossProcess(
-            seed, f"{name} loss", impairment.loss, gilbert(impairment) if has_loss_bursts(impairment) else None
-        )
+        bursts = burst_probabilities(impairment) if has_loss_bursts(impairment) else None
+        self._losses = LossProcess(seed, f"{name} loss", impairment.loss, bursts)
         self._reorder_draws = Draws(seed, f"{name} reorder")
         self._jitter_draws = Draws(seed, f"{name} jitter")
         self._correlated_jitter = CorrelatedProcess(seed, f"{name} wander", impairment.jitter_correlation)

@@ -1,7 +1,8 @@
-"""Random processes of a link: numbers by index from named random-number streams, and netem's distributions of jitter.
+"""Random processes of a link: jitter with netem's distributions, and losses.
 
-Numbers are drawn in blocks, because making a generator for each packet would take 20 us. A distribution is a table of
-4096 quantiles in standard deviations, like netem's tables (tc's `normal.dist`, `pareto.dist` and `paretonormal.dist`).
+Random numbers are drawn in blocks, because making a generator for each packet would take 20 us. A distribution is a
+table of 4096 quantiles in standard deviations, like netem's tables (tc's `normal.dist`, `pareto.dist` and
+`paretonormal.dist`).
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ LARGEST_QUANTILE: Final = 32767 / 8192
 PARETO_SHAPE: Final = 3.0
 
 Draw = Callable[[np.random.Generator, int], NDArray[np.float64]]
-"""Returns a number of draws from a generator; the second argument is that number."""
+"""A function `draw(generator, count)` that returns an array of `count` random numbers."""
 
 
 def uniform(generator: np.random.Generator, count: int) -> NDArray[np.float64]:
@@ -94,7 +95,7 @@ class CorrelatedProcess:
         self._value = self._draws.at(0)
 
     def at(self, step: int) -> float:
-        """Return the deviation at a step in standard deviations; for a past step, return the current deviation."""
+        """Return the deviation at `step` in standard deviations; for a past step, that of the newest step."""
         while self._step < step:
             self._step += 1
             innovation = self._innovation_gain * self._draws.at(self._step)
@@ -106,10 +107,10 @@ class LossProcess:
     """Losses of packets: independent, or in bursts (Gilbert-Elliott model).
 
     `bursts` are the probabilities that a burst begins and ends; None: losses are independent, with probability `loss`.
-    `name` is the name of the random-number stream of `seed`. With the same stream, a process with a higher loss loses
-    every packet that a process with a lower loss loses, and more. This is true if both lose packets independently, or
-    if both have the same mean length of a burst and the lower loss is at most 1 - 1 / that length. (If the lower loss
-    is higher, a burst is less likely to continue than to begin.)
+    `name` is the name of the random-number stream of `seed`. Of two processes with the same stream, the one with
+    the higher loss loses every packet that the other loses, and more. This is true if both lose packets independently,
+    or if both have the same mean burst length and the lower loss is at most 1 - 1 / that length. (With a lower loss
+    above this limit, a burst is less likely to continue than to begin.)
     """
 
     def __init__(self, seed: int, name: str, loss: float, bursts: BurstProbabilities | None) -> None:

@@ -42,12 +42,12 @@ Address = tuple[str, int]
 NO_DELAY = DelayModel(0.0)
 
 
-def is_delayed_video(datagram: bytes) -> bool:
+def is_delayed_video_datagram(datagram: bytes) -> bool:
     """Return whether a datagram from the server is RTP or RTCP (version 2), and not part of path validation."""
     return len(datagram) >= 2 and datagram[0] >> 6 == 2
 
 
-def video_index(datagram: bytes) -> int:
+def video_delay_index(datagram: bytes) -> int:
     """Return the index of a video packet's delay: its RTP timestamp, so that the packets of a frame share one delay.
 
     A sender report has the timestamp of the frame with which it was sent, and shares that frame's delay.
@@ -65,9 +65,9 @@ class RelayedFlow:
     server: Address
     upstream: DelayModel
     downstream: DelayModel
-    is_delayed_downstream: Callable[[bytes], bool] = lambda _datagram: True
+    downstream_delay_filter: Callable[[bytes], bool] = lambda _datagram: True
     """Returns whether a datagram from the server is delayed; by default all are."""
-    index_downstream: Callable[[bytes], int] | None = None
+    downstream_index_function: Callable[[bytes], int] | None = None
     """Maps a datagram from the server to the index of its delay; None: the index is the datagram's number."""
     upstream_injected: LinkInjection | None = None
     downstream_injected: LinkInjection | None = None
@@ -80,9 +80,9 @@ class _DelayedPath:
 
     line: DelayLine
     send: Callable[[bytes], object]
-    delay_index: Callable[[bytes], int] | None
+    index_function: Callable[[bytes], int] | None
     """Maps a datagram to the index of its delay; None: the index is `count`."""
-    is_delayed: Callable[[bytes], bool]
+    delay_filter: Callable[[bytes], bool]
     count: int = 0
     """How many datagrams were delayed."""
     scheduled_ns: int | None = None
@@ -195,11 +195,11 @@ class Relay:
 
     def forward(self, path: _DelayedPath, datagram: bytes, arrived_ns: int) -> None:
         """Send a datagram inline if it is not delayed, otherwise when its delay since its arrival has passed."""
-        if not path.is_delayed(datagram):
+        if not path.delay_filter(datagram):
             self._send(path, datagram)
             return
         path.count += 1
-        index = path.count if path.delay_index is None else path.delay_index(datagram)
+        index = path.count if path.index_function is None else path.index_function(datagram)
         path.line.push((datagram, arrived_ns), arrived_ns, index, len(datagram))
         self._schedule(path)
 
@@ -272,8 +272,8 @@ class _ActiveFlow:
             _DelayedPath(
                 downstream,
                 lambda data: self._socket.sendto(data, address),
-                flow.index_downstream,
-                flow.is_delayed_downstream,
+                flow.downstream_index_function,
+                flow.downstream_delay_filter,
             ),
             self._relay.now_ns(),
         )

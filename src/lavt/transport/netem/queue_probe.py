@@ -29,7 +29,7 @@ from lavt.transport.emulation.impairment import (
     ExemptPort,
     ImpairedFlow,
     Impairment,
-    gilbert,
+    burst_probabilities,
     has_loss_bursts,
 )
 
@@ -233,7 +233,7 @@ def _variance_factor(impairment: Impairment) -> float:
     """Return how much bursts increase the variance of a loss count: (1 + r) / (1 - r) for a correlation r."""
     if not has_loss_bursts(impairment):
         return 1.0
-    correlation = 1 - sum(gilbert(impairment))
+    correlation = 1 - sum(burst_probabilities(impairment))
     return (1 + correlation) / (1 - correlation)
 
 

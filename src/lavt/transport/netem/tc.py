@@ -26,7 +26,13 @@ from typing import Any, Final, Literal, NamedTuple
 from msgspec import Struct
 
 from lavt.errors import WorkError
-from lavt.transport.emulation.impairment import ORDER_RATE_BPS, ImpairedFlow, Impairment, gilbert, has_loss_bursts
+from lavt.transport.emulation.impairment import (
+    ORDER_RATE_BPS,
+    ImpairedFlow,
+    Impairment,
+    burst_probabilities,
+    has_loss_bursts,
+)
 
 Command = list[str]
 """A command and its arguments."""
@@ -143,7 +149,7 @@ def netem_arguments(impairment: Impairment) -> list[str]:
     if impairment.jitter_ms and not impairment.jitter_correlation:
         arguments += [f"{_plain(impairment.jitter_ms)}ms", "distribution", impairment.jitter_distribution]
     if impairment.loss and impairment.loss_burst_packets > 1:
-        arguments += ["loss", "gemodel", *(f"{_plain(100 * share)}%" for share in gilbert(impairment))]
+        arguments += ["loss", "gemodel", *(f"{_plain(100 * share)}%" for share in burst_probabilities(impairment))]
     elif impairment.loss:
         arguments += ["loss", "random", f"{_plain(100 * impairment.loss)}%"]
     if impairment.reorder:

@@ -25,20 +25,20 @@ from lavt.vehicle.dbw.profile import (
 from lavt.vehicle.dbw.reports import NewestReports
 from lavt.vehicle.dbw.sending import DriveCommand, FrameSender, KitCommands
 from lavt.vehicle.dbw.speed_monitor import Pedals, SpeedMonitor
-from lavt.vehicle.dbw.states import ENABLING_LIMIT_NS, Situation, State, states_after
+from lavt.vehicle.dbw.states import KIT_RESPONSE_LIMIT_NS, Situation, State, states_after
 from lavt.vehicle.vehicle import ReachedCommand
 
 SHIFT_REPORT_LIMIT_NS: Final = NS_PER_S
-"""Our choice: a shift to DRIVE is reported at most this long after it was requested."""
+"""Our choice: the kit reports a shift to DRIVE at most this long after the request."""
 STATIONARY_BEFORE_PARK_NS: Final = 300 * NS_PER_MS
 """Our choice: PARK is requested after the car was reported stationary for this long. A single report can be wrong, or
-come from locked wheels. A car that slides becomes 1.2 m/s slower during this time, at 4 m/s2."""
+come from locked wheels. A car that slides at 4 m/s2 loses 1.2 m/s in this time."""
 IDLE_PERIOD_NS: Final = 100 * NS_PER_MS
 """Period at which `frames_due` should be called if nothing is due earlier."""
 ECHO_LIMIT_NS: Final = 200 * NS_PER_MS
-"""A command that the kit has not reported after this time is regarded as superseded by another command."""
+"""A command that the kit has not echoed after this time is regarded as superseded by another command."""
 SEPARATOR: Final = "; "
-"""What separates the texts of a reason."""
+"""Separates the texts that `_join` joins."""
 MAY_MOVE: Final = "the car moves, or may move"
 NO_AXES: Final[frozenset[Axis]] = frozenset()
 
@@ -47,7 +47,7 @@ class ByWireAdapter:
     """A controller for the by-wire kit that a profile describes.
 
     Each call of `set_actuation` is a tick. Frames are sent only if the newest tick is at most 60 ms old.
-    `inhibit_reason` is a property of the installation: if it is not empty, the kit is never engaged.
+    The kit is never engaged if `inhibit_reason`, which does not change, is not empty.
     """
 
     def __init__(self, profile: Profile, *, start_ns: int, inhibit_reason: str = "") -> None:
@@ -57,19 +57,19 @@ class ByWireAdapter:
             max_acceleration_mps2=profile.car.max_acceleration_mps2, max_braking_mps2=profile.car.max_braking_mps2
         )
         unknown_sign = "the steering's sign is not known: set vehicle.dbw.steering_sign"
-        self._installation = _join([inhibit_reason, unknown_sign if profile.car.steering_sign is None else ""])
+        self._permanent_inhibit = _join([inhibit_reason, unknown_sign if profile.car.steering_sign is None else ""])
         self._state: State = "idle"
         self._entered_ns = self._now_ns = start_ns
         self._stop_reason = ""
         """Reason for the state `lost` or `overridden`."""
         self._wanted, self._bus_error = False, ""
         self._still_enabled: frozenset[Axis] = NO_AXES
-        """Axes that were enabled when driving ended and have been enabled since then."""
-        self._must_stay_enabled = False
-        """Whether an axis was enabled when driving ended, and no command to disable it has been sent since then."""
+        """In `lost` and `parking` the axes enabled ever since driving ended; otherwise all enabled axes."""
+        self._is_release_unexpected = False
+        """Whether an axis was enabled when `parking` began, and no command to disable it has been sent since then."""
         self._needed_axes = frozenset({"brake"}) if profile.system is None else frozenset(AXES)
-        """If one of these axes is released, no command is sent any more. For a kit that is enabled as a whole these are
-        all axes: after a command to disable one, it would release the brake, too, and its watchdog would not brake."""
+        """If the kit releases one of these axes, no command is sent any more. A kit that is enabled as a whole needs
+        all axes: a command to disable one would also release the brake, and the kit's watchdog would not brake."""
         self._moved_ns = start_ns
         """Time of the last report that the car moves."""
         self._is_shifting = False
@@ -78,21 +78,21 @@ class ByWireAdapter:
         self._requested_ns: int | None = None
         self._last_commands: KitCommands | None = None
         """Commands of the last set of frames; None if nothing is being sent, or if not all of the set was written."""
-        self._is_late = False
+        self._is_tick_late = False
         self._known_problems: frozenset[str] = frozenset()
         self._events: list[VehicleEvent] = []
         self._awaited_echoes: deque[tuple[int, int]] = deque()
-        """Steering commands sent and not yet reported: each in steps of the kit, with the time of its tick."""
-        self._last_steering: int | None = None
-        """The steering command of the last set of frames, in steps of the kit; None if steering was not enabled."""
+        """Steering commands sent and not yet echoed: each in steps of the kit's resolution, with its tick's time."""
+        self._last_steering_steps: int | None = None
+        """The steering command of the last set of frames, in such steps; None if steering was not enabled."""
         self._reached: list[ReachedCommand] = []
         self._counts: Counter[str] = Counter()
         self._situation = self._current_situation(start_ns)
         """The last input of the state machine."""
 
     @property
-    def is_silent(self) -> bool:
-        """Whether nothing is requested of the kit: it is released, or a driver overrides it."""
+    def is_idle_or_overridden(self) -> bool:
+        """Whether no actuation is requested of the kit."""
         return self._state in {"idle", "overridden"}
 
     # Inputs.
@@ -100,14 +100,14 @@ class ByWireAdapter:
     def receive(self, frame: CanFrame, now_ns: int) -> None:
         """Process any frame from the bus."""
         self._bus_error = ""
-        before = self._reports.command
+        before = self._reports.steering_echo
         self._reports.receive(frame, now_ns)
-        if self._reports.command != before:
+        if self._reports.steering_echo != before:
             self._match_echo(now_ns)
         self._update_state(now_ns)
 
     def on_bus_gone(self, reason: str, now_ns: int) -> None:
-        """Note that the bus is gone; it is back with the next received frame."""
+        """Handle the loss of the bus, which lasts until the next received frame."""
         self._bus_error = reason
         self._update_state(now_ns)
 
@@ -119,7 +119,7 @@ class ByWireAdapter:
         self._requested, self._requested_ns = actuation, now_ns
 
     def engage(self, wanted: bool, now_ns: int) -> None:
-        """Note whether driving is wanted."""
+        """Set whether driving is wanted."""
         if wanted != self._wanted:
             self._wanted = wanted
             self._update_state(now_ns)
@@ -130,8 +130,7 @@ class ByWireAdapter:
         """Apply the transitions of this instant."""
         self._now_ns = now_ns
         self._check_speed(now_ns)
-        has_timed_out = now_ns - self._sender.last_set_ns >= COMMAND_TIMEOUT_NS
-        enabled = NO_AXES if has_timed_out else self._reports.enabled  # the reports may be old, after a stall
+        enabled = self._surely_enabled(now_ns)
         self._still_enabled = enabled & self._still_enabled if self._state in {"lost", "parking"} else enabled
         self._is_shifting &= self._reports.gear != "drive"
         if not self._is_stationary():
@@ -144,20 +143,24 @@ class ByWireAdapter:
                 if not self._known_problems.issuperset(reason.split(SEPARATOR)):
                     self._events.append(VehicleEvent(now_ns, "fault", reason))
             self._state, self._entered_ns = state, now_ns
-            self._must_stay_enabled = state == "parking" and bool(enabled)
-            self._situation = replace(self._situation, in_state_ns=0, must_stay_enabled=self._must_stay_enabled)
+            self._is_release_unexpected = state == "parking" and bool(enabled)
+            self._situation = replace(self._situation, in_state_ns=0, is_release_unexpected=self._is_release_unexpected)
+
+    def _surely_enabled(self, now_ns: int) -> frozenset[Axis]:
+        """Return the enabled axes; none if the kit's watchdog may have tripped since the last report."""
+        is_watchdog_due = now_ns - self._sender.last_set_ns >= COMMAND_TIMEOUT_NS
+        return NO_AXES if is_watchdog_due else self._reports.enabled
 
     def _is_stationary(self) -> bool:
         return self._speed.is_stationary and self._speed.fault is None
 
     def _check_speed(self, now_ns: int) -> None:
         """Check the reported speeds, given the pedals that the kit applies: those sent last, on enabled axes."""
-        has_timed_out = now_ns - self._sender.last_set_ns >= COMMAND_TIMEOUT_NS
-        sent, enabled = self._sender.last_command, NO_AXES if has_timed_out else self._reports.enabled
+        sent, enabled = self._sender.last_command, self._surely_enabled(now_ns)
         pedals = Pedals(
             throttle=sent.throttle if "throttle" in enabled else 0.0,
             brake=sent.brake if "brake" in enabled else 0.0,
-            is_brake_released="brake" not in enabled,
+            is_brake_axis_released="brake" not in enabled,
         )
         if (fault := self._speed.update(self._reports.speeds, pedals, now_ns)) is not None:
             self._counts[fault.code] += 1
@@ -173,21 +176,21 @@ class ByWireAdapter:
         return Situation(
             wanted=self._wanted,
             is_stationary=self._is_stationary(),
-            inhibit_reason=_join([self._installation, missing_reports, faults, self._turned_too_far()]),
+            inhibit_reason=_join([self._permanent_inhibit, missing_reports, faults, self._wheel_limit_text()]),
             missing_reports=missing_reports,
             since_sent_ns=now_ns - self._sender.last_set_ns,
             faults=faults,
             overrides=_join(reports.texts("override")),
-            trips=_join(reports.texts("trip")),
+            watchdog_trips=_join(reports.texts("trip")),
             command_errors=_join(reports.texts("command_error")),
-            reasons=_join(reports.texts("reason")),
+            kit_reasons=_join(reports.texts("reason")),
             enabled=reports.enabled,
             gear=reports.gear,
             in_state_ns=now_ns - self._entered_ns,
-            must_stay_enabled=self._must_stay_enabled,
+            is_release_unexpected=self._is_release_unexpected,
         )
 
-    def _turned_too_far(self) -> str:
+    def _wheel_limit_text(self) -> str:
         """Return a text if the steering wheel is beyond its limit, except when engaged: then commands turn it back."""
         limit_deg, wheel_deg = self._profile.limits.steering_wheel_deg, self._reports.wheel_deg
         if self._state == "engaged" or abs(wheel_deg) <= limit_deg:
@@ -212,23 +215,23 @@ class ByWireAdapter:
             self._last_commands = None
             return []
         if not self._is_fresh(now_ns):
-            if not self._is_late:
+            if not self._is_tick_late:
                 self._counts["ticks_missed"] += 1
-            self._is_late = True
+            self._is_tick_late = True
             return []
-        self._is_late = False
+        self._is_tick_late = False
         requested = self._drive_command()
         if commands == self._last_commands and now_ns < self._due_ns(requested):
             return []
         self._last_commands = commands
         self._is_shifting |= commands.gear == "drive"
-        self._must_stay_enabled &= bool(commands.enabled)
+        self._is_release_unexpected &= bool(commands.enabled)
         frames = self._sender.frames(commands, requested, self._reports.wheel_deg, now_ns)
         self._expect_echo(commands)
         return frames
 
     def on_dropped(self, frames: Sequence[CanFrame]) -> None:
-        """Note that `frames` were not written; they are the last ones of the frames that were due.
+        """Take back `frames`, the last ones of the frames that were due, because they were not written.
 
         A complete set is then due at the next tick.
         """
@@ -256,7 +259,7 @@ class ByWireAdapter:
         if self._state == "engaged":
             return KitCommands(all_axes, system="enable")
         if self._state == "lost":
-            return self._remaining_commands()
+            return self._commands_to_still_enabled_axes()
         if self._state == "parking":
             return self._parking_commands()
         return KitCommands(NO_AXES) if self._state == "overridden" else None
@@ -270,9 +273,9 @@ class ByWireAdapter:
         if self._reports.gear == "park" and not is_shifting:
             return KitCommands(NO_AXES, system="disable")
         may_park = self._now_ns - self._moved_ns >= STATIONARY_BEFORE_PARK_NS
-        return self._remaining_commands("park" if may_park else None)
+        return self._commands_to_still_enabled_axes("park" if may_park else None)
 
-    def _remaining_commands(self, gear: Gear | None = None) -> KitCommands | None:
+    def _commands_to_still_enabled_axes(self, gear: Gear | None = None) -> KitCommands | None:
         """Return the commands to the axes that are still enabled.
 
         Return None if an axis that is needed to brake is released. Without commands the kit's watchdog brakes.
@@ -293,28 +296,28 @@ class ByWireAdapter:
         brake = max(requested.brake, limits.holding_brake) if needs_brake else requested.brake
         return DriveCommand(wheel_deg, 0.0, brake)
 
-    # Commands that reached the wheels.
+    # Echoes of the steering commands.
 
     def _expect_echo(self, commands: KitCommands) -> None:
-        """Expect the kit to report the steering command just sent, if it differs from the previous one."""
+        """Expect the kit to echo the steering command just sent, if it differs from the previous one."""
         if "steering" not in commands.enabled or self._requested_ns is None:
             self._awaited_echoes.clear()
-            self._last_steering = None
+            self._last_steering_steps = None
             return
         while self._awaited_echoes and self._requested_ns - self._awaited_echoes[0][1] > ECHO_LIMIT_NS:
             self._awaited_echoes.popleft()
         steps = round(self._sender.last_command.wheel_deg / self._profile.command_step_deg)
-        if steps != (self._reports.command if self._last_steering is None else self._last_steering):
+        if steps != (self._reports.steering_echo if self._last_steering_steps is None else self._last_steering_steps):
             self._awaited_echoes.append((steps, self._requested_ns))
-        self._last_steering = steps
+        self._last_steering_steps = steps
 
     def _match_echo(self, now_ns: int) -> None:
-        """Match the newest reported command with a sent command; commands sent earlier were superseded."""
-        if not any(steps == self._reports.command for steps, _ in self._awaited_echoes):
+        """Match the newest echo with a sent command; commands sent before that one were superseded."""
+        if not any(steps == self._reports.steering_echo for steps, _ in self._awaited_echoes):
             return
         while self._awaited_echoes:
             steps, requested_ns = self._awaited_echoes.popleft()
-            if steps == self._reports.command:
+            if steps == self._reports.steering_echo:
                 self._reached.append(ReachedCommand(requested_ns, now_ns))
                 return
 
@@ -339,9 +342,9 @@ class ByWireAdapter:
         reasons = [self._stop_reason if self._state in {"lost", "overridden"} else "", situation.inhibit_reason]
         if self._state == "idle" and not situation.is_stationary:
             reasons.append(MAY_MOVE)
-        if self._state == "parking" and situation.in_state_ns >= ENABLING_LIMIT_NS:
+        if self._state == "parking" and situation.in_state_ns >= KIT_RESPONSE_LIMIT_NS:
             reasons.append("the car is stationary but not in park" if situation.is_stationary else MAY_MOVE)
-            reasons.append(situation.reasons)
+            reasons.append(situation.kit_reasons)
         return _join(reasons)
 
     def next_wake_ns(self) -> int:

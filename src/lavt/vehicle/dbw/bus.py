@@ -27,7 +27,7 @@ from lavt.vehicle.can_frame import BusGone, CanFrame, ReceivedCanFrame
 from lavt.vehicle.dbw.kernel_arrival import ArrivalTimes
 from lavt.vehicle.dbw.multicast_datagram import DatagramCheck
 from lavt.vehicle.dbw.profile import COMMAND_TIMEOUT_NS, TICK_LIMIT_NS
-from lavt.vehicle.dbw.virtual_bus import RECEIVES_OWN_FRAMES, VIRTUAL_INTERFACES
+from lavt.vehicle.dbw.virtual_bus import SELF_RECEIVING_INTERFACE, VIRTUAL_INTERFACES
 
 if TYPE_CHECKING:
     from can import BusABC, Message
@@ -41,8 +41,8 @@ POLL_S: Final = 0.1
 CLOSE_TIMEOUT_S: Final = 1.0
 """`close` waits at most this long for the port's thread. A thread that a driver blocks for longer keeps running."""
 READ_PERIOD_S: Final = 0.05
-"""Period at which the port's thread reads frames with the kernel's time of arrival, if `take` is not called meanwhile.
-In between, the kernel keeps them."""
+"""Period at which the port's thread reads frames of `STAMPED_BY_KERNEL` interfaces, even if `take` is not called. In
+between, the kernel queues them."""
 MAX_READS: Final = 256
 """The most frames that are read at a time, so that a flood does not delay the caller of `take`."""
 LATEST_READ_NS: Final = NS_PER_S
@@ -65,14 +65,14 @@ class OpenBus(NamedTuple):
     driver: BusABC
     received: deque[ReceivedCanFrame]
     arrivals: ArrivalTimes
-    check: DatagramCheck | None
-    reading: threading.Lock
+    datagram_check: DatagramCheck | None
+    read_lock: threading.Lock
     """Held by the thread that reads a frame."""
 
     def shut_down(self) -> None:
         """Close the driver's bus, which may be broken already."""
-        if self.check is not None:
-            self.check.close()
+        if self.datagram_check is not None:
+            self.datagram_check.close()
         with suppress(Exception):
             self.driver.shutdown()
 
@@ -84,7 +84,7 @@ class CanPort:
 
     `counts` has numbers of frames: `frames_too_old` and `buffer_full` were not sent; `error_frames`, `remote_frames`,
     `fd_frames`, `unreadable`, `read_too_late` and `own_frames` were received and dropped; `overflowed` were dropped
-    from a full queue. The argument `suspended` returns for how long the machine was suspended since its start, in ns.
+    from a full queue. The argument `read_suspended_ns` returns for how long the machine was suspended since its start.
 
     Raises `UserError` if python-can is missing or the bus cannot be opened.
     """
@@ -96,13 +96,14 @@ class CanPort:
         options: Mapping[str, Any],
         *,
         clock: Clock,
-        suspended: Callable[[], int] = suspended_ns,
+        read_suspended_ns: Callable[[], int] = suspended_ns,
     ) -> None:
         self._interface, self._channel, self._options = interface, channel, dict(options)
-        self._clock, self._suspended = clock, suspended
-        self._mark = secrets.token_hex(8) if interface == RECEIVES_OWN_FRAMES else None
+        self._clock, self._read_suspended_ns = clock, read_suspended_ns
+        self._own_mark = secrets.token_hex(8) if interface == SELF_RECEIVING_INTERFACE else None
+        """Marks the frames that this port sends, so that it can drop them; None if it does not receive them."""
         self._gone_reason = ""
-        self._suspended_ns = suspended()
+        self._suspended_ns = read_suspended_ns()
         self._closing = threading.Event()
         self.counts: Counter[str] = Counter()
         bus = self._open()
@@ -133,7 +134,7 @@ class CanPort:
                 if _is_buffer_full(error):
                     self.counts["buffer_full"] += len(frames) - written
                     return written
-                self._lose(f"{self._interface} {self._channel} cannot be written to ({_error_text(error)})")
+                self._declare_lost(f"{self._interface} {self._channel} cannot be written to ({_error_text(error)})")
                 raise BusGone(self._gone_reason, written) from error
         return len(frames)
 
@@ -144,13 +145,13 @@ class CanPort:
         """
         self._check_suspension()
         bus = self._bus
-        if bus is not None and self._interface in STAMPED_BY_KERNEL and bus.reading.acquire(blocking=False):
+        if bus is not None and self._interface in STAMPED_BY_KERNEL and bus.read_lock.acquire(blocking=False):
             try:
                 self._read_waiting(bus)
             except Exception as error:  # of any driver
-                self._lose_broken(bus, error)
+                self._declare_unreadable(bus, error)
             finally:
-                bus.reading.release()
+                bus.read_lock.release()
         bus = self._bus
         if bus is None:
             raise BusGone(self._gone_reason)
@@ -163,16 +164,16 @@ class CanPort:
     def close(self) -> None:
         """Close the bus, and wait for the port's thread for at most `CLOSE_TIMEOUT_S`."""
         self._closing.set()
-        self._lose("the port is closed")
+        self._declare_lost("the port is closed")
         self._thread.join(CLOSE_TIMEOUT_S)
 
     def _check_suspension(self) -> None:
-        """Lose the bus if the machine was suspended: the monotonic clock stood still, so all ages are too small."""
-        before_ns, self._suspended_ns = self._suspended_ns, max(self._suspended(), self._suspended_ns)
+        """Declare the bus lost if the machine was suspended: the monotonic clock stood still, so ages are too small."""
+        before_ns, self._suspended_ns = self._suspended_ns, max(self._read_suspended_ns(), self._suspended_ns)
         if self._suspended_ns - before_ns >= COMMAND_TIMEOUT_NS:
-            self._lose("the machine was suspended")
+            self._declare_lost("the machine was suspended")
 
-    def _lose(self, reason: str) -> None:
+    def _declare_lost(self, reason: str) -> None:
         self._gone_reason = reason
         self._bus = None
 
@@ -185,19 +186,19 @@ class CanPort:
     def _open(self) -> OpenBus:
         opened = self._clock.now()  # before the first frame can arrive
         driver = _open_bus(self._interface, self._channel, self._options)
-        check = DatagramCheck(driver.fileno()) if self._interface == RECEIVES_OWN_FRAMES else None
-        return OpenBus(driver, deque(maxlen=QUEUE_FRAMES), ArrivalTimes(opened), check, threading.Lock())
+        datagram_check = DatagramCheck(driver.fileno()) if self._interface == SELF_RECEIVING_INTERFACE else None
+        return OpenBus(driver, deque(maxlen=QUEUE_FRAMES), ArrivalTimes(opened), datagram_check, threading.Lock())
 
     def _reopen(self) -> OpenBus | None:
         """Try to open the bus until it is open; return None if the port is closed before."""
         while not self._closing.wait(REOPEN_NS / NS_PER_S):
-            suspended_ns = self._suspended()
+            suspended_ns = self._read_suspended_ns()
             try:
                 bus = self._open()
             except Exception as error:  # of the driver or of the system, which can be out of descriptors
                 self._gone_reason = _error_text(error)
             else:
-                if self._suspended() - suspended_ns < COMMAND_TIMEOUT_NS:
+                if self._read_suspended_ns() - suspended_ns < COMMAND_TIMEOUT_NS:
                     self._bus = bus
                     return bus
                 bus.shut_down()
@@ -210,18 +211,18 @@ class CanPort:
                 if self._interface not in STAMPED_BY_KERNEL:
                     self._read_frame(bus, POLL_S)
                     continue
-                with bus.reading:
+                with bus.read_lock:
                     self._read_waiting(bus)
                 self._closing.wait(READ_PERIOD_S)
         except Exception as error:  # of any driver
-            self._lose_broken(bus, error)
+            self._declare_unreadable(bus, error)
         finally:
             if self._bus is bus:
-                self._lose("the port is closed")
+                self._declare_lost("the port is closed")
             bus.shut_down()
 
     def _read_waiting(self, bus: OpenBus) -> None:
-        """Read the frames that wait; the caller holds `bus.reading`."""
+        """Read the frames that wait; the caller holds `bus.read_lock`."""
         for _ in range(MAX_READS):
             now = self._clock.now()
             if not select.select([bus.driver.fileno()], [], [], 0)[0]:
@@ -229,29 +230,31 @@ class CanPort:
                 return
             self._read_frame(bus, 0)
 
-    def _lose_broken(self, bus: OpenBus, error: Exception) -> None:
+    def _declare_unreadable(self, bus: OpenBus, error: Exception) -> None:
+        """Declare a bus lost whose driver raised `error`, unless it is lost already."""
         if self._bus is bus:
-            self._lose(f"{self._interface} {self._channel} cannot be read ({_error_text(error)})")
+            self._declare_lost(f"{self._interface} {self._channel} cannot be read ({_error_text(error)})")
 
     def _read_frame(self, bus: OpenBus, timeout_s: float) -> None:
         """Wait for a frame for at most `timeout_s`, and read it."""
         try:
-            if bus.check is not None and bus.check.drop_malformed():
+            if bus.datagram_check is not None and bus.datagram_check.drop_malformed():
                 self.counts["unreadable"] += 1
                 return
             message = bus.driver.recv(timeout_s)
-        except BlockingIOError:  # none waits, or the announced datagram was dropped for its wrong checksum
+        except BlockingIOError:  # no frame waits; the kernel can drop an announced datagram for its wrong checksum
             return
         except Exception as error:
-            if bus.check is None or error.__cause__ is None or isinstance(error.__cause__, OSError):
+            is_unpacking_error = error.__cause__ is not None and not isinstance(error.__cause__, OSError)
+            if bus.datagram_check is None or not is_unpacking_error:
                 raise
-            self.counts["unreadable"] += 1  # the values of the message contradict each other
+            self.counts["unreadable"] += 1  # the values of the datagram contradict each other
             return
         if message is not None:
             self._receive(message, self._clock.now(), bus)
 
     def _receive(self, message: Message, now: Now, bus: OpenBus) -> None:
-        if self._mark is not None and message.channel == self._mark:
+        if self._own_mark is not None and message.channel == self._own_mark:
             self.counts["own_frames"] += 1
             return
         is_controller_error = message.is_error_frame and self._interface not in VIRTUAL_INTERFACES
@@ -271,7 +274,7 @@ class CanPort:
 
     def _message(self, frame: CanFrame) -> Message:
         message: Message = _library().Message(
-            arbitration_id=frame.identifier, is_extended_id=frame.is_extended, data=frame.data, channel=self._mark
+            arbitration_id=frame.identifier, is_extended_id=frame.is_extended, data=frame.data, channel=self._own_mark
         )
         return message
 
@@ -323,8 +326,8 @@ def _open_bus(interface: str, channel: str, options: Mapping[str, Any]) -> BusAB
     if interface == "socketcan" and channel not in (name for _, name in socket.if_nameindex()):
         # python-can would report this error, too, but leave a socket open
         raise UserError(f"socketcan {channel} cannot be opened (no such device): {REMEDIES[errno.ENODEV]}")
-    # A multicast is virtual by default, so by default its datagrams must not leave this machine.
-    defaults = {"hop_limit": 0} if interface == RECEIVES_OWN_FRAMES else {}
+    # By default a multicast bus counts as virtual (`is_virtual`), so its datagrams must not leave this machine.
+    defaults = {"hop_limit": 0} if interface == SELF_RECEIVING_INTERFACE else {}
     try:
         bus: BusABC = library.Bus(channel=channel, interface=interface, ignore_config=True, **{**defaults, **options})
     except Exception as error:  # of any driver

@@ -47,8 +47,8 @@ class NewestReports:
         """Counter of the newest report of each message with a counter."""
         self.wheel_deg = 0.0
         """The steering wheel's angle, with the sign that it has on the bus."""
-        self.command: int | None = None
-        """The steering command that the kit reports, in the kit's steps."""
+        self.steering_echo: int | None = None
+        """The steering command that the kit reports, in steps of the kit's resolution; None before the first report."""
         self.gear: Gear | None = None
         """The reported gear; None if unknown."""
         self.enabled: frozenset[Axis] = frozenset()
@@ -104,7 +104,7 @@ class NewestReports:
         if "angle" in known:
             self.wheel_deg = known["angle"] / self._profile.angle_per_deg
         if "command" in known:
-            self.command = round(known["command"])
+            self.steering_echo = round(known["command"])
         if "gear" in known:
             self.gear = self._gears.get(round(known["gear"]))
         if "enabled" in known:

@@ -104,8 +104,8 @@ class Pedals(Struct, frozen=True):
 
     throttle: float
     brake: float
-    is_brake_released: bool = False
-    """Whether the kit has released the brake. It is then unknown whether the kit's watchdog or a driver brakes."""
+    is_brake_axis_released: bool = False
+    """Whether the kit has disabled the brake axis. It is then unknown whether the kit's watchdog or a driver brakes."""
 
 
 class SpeedMonitor:
@@ -244,15 +244,15 @@ class SpeedMonitor:
         if speed_mps > MOVING_ABOVE_MPS or abs(speed_mps - self._changed_mps) > CONSTANT_WITHIN_MPS:
             self._changed_mps, self._throttled_mps = speed_mps, 0.0
             return
-        braking_mps2 = ROLLING_RESISTANCE_MPS2 if pedals.is_brake_released else self._sure_braking_mps2(pedals)
+        braking_mps2 = ROLLING_RESISTANCE_MPS2 if pedals.is_brake_axis_released else self._sure_braking_mps2(pedals)
         change_mps = (self._acceleration_mps2(pedals) - braking_mps2) * passed_s
         self._throttled_mps = max(0.0, self._throttled_mps + change_mps)
 
     def _update_sliding(self, pedals: Pedals, passed_s: float) -> None:
         speed_mps = abs(self._speeds["speed"].mps)
-        if pedals.brake == 0 and not pedals.is_brake_released and speed_mps >= STATIONARY_BELOW_MPS:
+        if pedals.brake == 0 and not pedals.is_brake_axis_released and speed_mps >= STATIONARY_BELOW_MPS:
             self._sliding_mps = speed_mps  # wheels that roll
-        braking_mps2 = ICE_BRAKING_MPS2 if pedals.is_brake_released else self._sure_braking_mps2(pedals)
+        braking_mps2 = ICE_BRAKING_MPS2 if pedals.is_brake_axis_released else self._sure_braking_mps2(pedals)
         acceleration_mps2 = self._acceleration_mps2(pedals) if self._may_slide else 0.0  # else the speed shows it
         self._sliding_mps = max(speed_mps, self._sliding_mps + (acceleration_mps2 - braking_mps2) * passed_s)
         self._may_slide &= self._sliding_mps > speed_mps

@@ -15,8 +15,8 @@ State = Literal["idle", "clearing", "enabling", "engaged", "parking", "overridde
 
 STATIONARY_BELOW_MPS: Final = 0.1
 """Our choice: the car is stationary if it is slower than this."""
-ENABLING_LIMIT_NS: Final = 3 * NS_PER_S
-"""Our choice: clearing fails if it takes longer than this, and so does enabling."""
+KIT_RESPONSE_LIMIT_NS: Final = 3 * NS_PER_S
+"""Our choice: clearing fails if it takes longer than this, and so does enabling. Parking goes on, but is reported."""
 PAUSE_NS: Final = 120 * NS_PER_MS
 """Shortest duration of `clearing` and `parking`, and of `enabling` if it is cancelled. In `clearing` no request to
 enable is sent, because a kit that has disengaged ignores such requests until none came for 100 ms. In `parking` a kit
@@ -55,17 +55,17 @@ class Situation(Struct, frozen=True):
     """Faults that the kit reports, an implausible speed, and another sender of commands."""
     overrides: str
     """What the driver overrides, as the kit reports it."""
-    trips: str
+    watchdog_trips: str
     """That the kit's watchdog has tripped, as the kit reports it."""
     command_errors: str
     """What the kit reports about late or invalid commands."""
-    reasons: str
-    """The kit's reasons for a rejection."""
+    kit_reasons: str
+    """Reasons that the kit reports for its behaviour."""
     enabled: frozenset[Axis]
     gear: Gear | None
     in_state_ns: int
     """Time in the current state."""
-    must_stay_enabled: bool
+    is_release_unexpected: bool
     """Whether an axis was enabled when `parking` began, and no command to disable it has been sent since then."""
 
 
@@ -97,20 +97,20 @@ def _out_of_gear(situation: Situation) -> str:
 
 def _timed_out(action: str) -> Callable[[Situation], str]:
     def condition(situation: Situation) -> str:
-        if situation.in_state_ns < ENABLING_LIMIT_NS:
+        if situation.in_state_ns < KIT_RESPONSE_LIMIT_NS:
             return ""
-        causes = [situation.overrides, situation.trips, situation.command_errors]
+        causes = [situation.overrides, situation.watchdog_trips, situation.command_errors]
         if action == "enable":
             causes += [f"not enabled: {axis}" for axis in AXES if axis not in situation.enabled]
             causes += [_out_of_gear(situation)]
-        text = "; ".join(filter(None, [*causes, situation.reasons]))
-        return f"the kit did not {action} within {ENABLING_LIMIT_NS // NS_PER_S} s: {text}"
+        text = "; ".join(filter(None, [*causes, situation.kit_reasons]))
+        return f"the kit did not {action} within {KIT_RESPONSE_LIMIT_NS // NS_PER_S} s: {text}"
 
     return condition
 
 
 def _details(situation: Situation) -> str:
-    text = "; ".join(filter(None, [situation.trips, situation.command_errors, situation.reasons]))
+    text = "; ".join(filter(None, [situation.watchdog_trips, situation.command_errors, situation.kit_reasons]))
     return f" ({text})" if text else ""
 
 
@@ -148,7 +148,7 @@ TABLE: Final[tuple[TransitionRow, ...]] = (
     TransitionRow(
         ("enabling", "engaged"),
         "the kit's watchdog has tripped",
-        lambda situation: situation.trips and situation.trips + _details(situation),
+        lambda situation: situation.watchdog_trips and situation.watchdog_trips + _details(situation),
         "lost",
     ),
     TransitionRow(("engaged",), "the kit released an axis", _released_axes, "lost"),
@@ -174,7 +174,7 @@ TABLE: Final[tuple[TransitionRow, ...]] = (
     TransitionRow(
         ("clearing",),
         "no override and no trip is reported, after at least 120 ms",
-        lambda situation: situation.in_state_ns >= PAUSE_NS and not situation.overrides and not situation.trips,
+        lambda situation: situation.in_state_ns >= PAUSE_NS and not (situation.overrides or situation.watchdog_trips),
         "enabling",
     ),
     TransitionRow(("clearing",), "3 s have passed", _timed_out("clear"), "lost"),
@@ -190,7 +190,7 @@ TABLE: Final[tuple[TransitionRow, ...]] = (
         "the kit released all axes before it was commanded to, after at least 120 ms",
         lambda situation: (
             _released_before_park(situation)
-            if situation.must_stay_enabled and situation.in_state_ns >= PAUSE_NS and not situation.enabled
+            if situation.is_release_unexpected and situation.in_state_ns >= PAUSE_NS and not situation.enabled
             else ""
         ),
         "lost",

@@ -22,8 +22,8 @@ class KitAdapter(Protocol):
         ...
 
     @property
-    def is_silent(self) -> bool:
-        """Whether nothing is requested of the kit: it is released, or a driver overrides it."""
+    def is_idle_or_overridden(self) -> bool:
+        """Whether no actuation is requested of the kit: the adapter is idle, or a driver overrides the kit."""
         ...
 
     def receive(self, frame: CanFrame, now_ns: int) -> None:
@@ -99,9 +99,9 @@ class DbwVehicle:
         return {**self._adapter.counts, **self._port.counts}
 
     @property
-    def is_silent(self) -> bool:
-        """Whether nothing is requested of the kit: it is released, or a driver overrides it."""
-        return self._adapter.is_silent
+    def is_idle_or_overridden(self) -> bool:
+        """Whether no actuation is requested of the kit: the adapter is idle, or a driver overrides the kit."""
+        return self._adapter.is_idle_or_overridden
 
     def advance(self, to_ns: int) -> list[VehicleEvent]:
         """Process received frames and return the events since the last call, in order."""

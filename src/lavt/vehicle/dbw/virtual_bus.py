@@ -12,7 +12,7 @@ from lavt.vehicle.dbw.can_gateway import gateway_interfaces
 
 VIRTUAL_INTERFACES: Final = frozenset({"inside", "virtual", "udp_multicast"})
 """Interfaces that exist in software only."""
-RECEIVES_OWN_FRAMES: Final = "udp_multicast"
+SELF_RECEIVING_INTERFACE: Final = "udp_multicast"
 """The interface whose socket receives the frames that it sends, because it is a member of its multicast group. Sent
 frames are marked, so that they can be recognised and dropped when they are received."""
 IP_TIMEOUT_S: Final = 2
@@ -24,7 +24,7 @@ def is_virtual(interface: str, channel: str, options: Mapping[str, Any]) -> bool
 
     A vcan in a gateway rule of the kernel is not virtual. A multicast that leaves this machine is not virtual, either.
     """
-    if interface == RECEIVES_OWN_FRAMES:
+    if interface == SELF_RECEIVING_INTERFACE:
         return bool(options.get("hop_limit", 0) == 0)
     if interface in VIRTUAL_INTERFACES:
         return True

@@ -50,12 +50,14 @@ def time_limit_s(route_length_m: float) -> float:
 
 
 class RouteMonitor:
-    """A monitor of one drive, which begins near the station `near_s_m`.
+    """A monitor of one drive, which begins near the station `near_station_m`.
 
     Each of the events `timeout`, `off_road` and `completed` is reported once, each lane invasion and collision anew.
     """
 
-    def __init__(self, road: Road, parameters: CarParameters, near_s_m: float, *, limit_s: float | None = None) -> None:
+    def __init__(
+        self, road: Road, parameters: CarParameters, near_station_m: float, *, limit_s: float | None = None
+    ) -> None:
         self._road = road
         half_width_m = parameters.body_width_m / 2
         front_m, rear_m = parameters.rear_axle_to_front_m, -parameters.rear_axle_to_rear_m
@@ -66,7 +68,7 @@ class RouteMonitor:
         self._lanes: tuple[int, int] | None = None
         """The lanes of the body's left and right edge at the last check."""
         self._reported: set[EventKind] = set()
-        self._near_s_m = near_s_m
+        self._near_station_m = near_station_m
         self._last_contact_ns: int | None = None
         self._signed_rails = tuple((rail, math.copysign(1.0, rail.offset_m)) for rail in road.rails)
         """Each rail with its side of the driven lane: 1 is left, -1 is right."""
@@ -76,7 +78,7 @@ class RouteMonitor:
 
     def track(self, motion: CarMotion) -> TrackingError:
         """Return the rear axle's position and heading relative to the lane's centre."""
-        s_m, lateral_m, heading_rad = self._road.project(motion.x_m, motion.y_m, self._near_s_m)
+        s_m, lateral_m, heading_rad = self._road.project(motion.x_m, motion.y_m, self._near_station_m)
         return TrackingError(lateral_m, math.remainder(motion.heading_rad - heading_rad, 2 * math.pi), s_m)
 
     def update(self, motion: CarMotion, at_ns: int) -> list[VehicleEvent]:
@@ -93,8 +95,8 @@ class RouteMonitor:
 
     def _check_body(self, motion: CarMotion, at_ns: int) -> list[VehicleEvent]:
         """Project the whole body onto the road and return the events that follow."""
-        progress_m, lateral_m, heading_rad = self._road.project(motion.x_m, motion.y_m, self._near_s_m)
-        self._near_s_m = progress_m
+        progress_m, lateral_m, heading_rad = self._road.project(motion.x_m, motion.y_m, self._near_station_m)
+        self._near_station_m = progress_m
         *corners, middle = self._project_points(motion, (*self._corners, self._middle))
         offsets_m = [corner_lateral_m for _, corner_lateral_m, _ in corners]
         events = self._lane_events(max(offsets_m), min(offsets_m), at_ns)
@@ -121,9 +123,9 @@ class RouteMonitor:
     def _project_points(self, motion: CarMotion, points: Iterable[tuple[float, float]]) -> list[RoadPosition]:
         """Return the road positions of points of the body, given as metres ahead and to the left of the rear axle."""
         cosine, sine = math.cos(motion.heading_rad), math.sin(motion.heading_rad)
-        project, near_s_m = self._road.project, self._near_s_m
+        project, near_m = self._road.project, self._near_station_m
         return [
-            project(motion.x_m + ahead * cosine - left * sine, motion.y_m + ahead * sine + left * cosine, near_s_m)
+            project(motion.x_m + ahead * cosine - left * sine, motion.y_m + ahead * sine + left * cosine, near_m)
             for ahead, left in points
         ]
 

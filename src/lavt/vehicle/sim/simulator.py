@@ -64,7 +64,7 @@ class Simulator:
         x_m, y_m = road.point_at(ahead_m, lateral_m).tolist()
         motion = CarMotion(x_m, y_m, float(road.centre_at(ahead_m).heading_rad) + turned_rad)
         self._car = CarDynamics(parameters, motion, 1.0 / STEPS_PER_S)
-        self._route_monitor = RouteMonitor(road, parameters, near_s_m=ahead_m, limit_s=limit_s)
+        self._route_monitor = RouteMonitor(road, parameters, near_station_m=ahead_m, limit_s=limit_s)
         self._route_monitor.update(motion, grid_ns(self._index))
         self._actuation = INITIAL_ACTUATION
         self._steering_commands: deque[tuple[int, float]] = deque()

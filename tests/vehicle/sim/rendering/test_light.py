@@ -54,9 +54,9 @@ def test_only_the_sun_casts_shadows() -> None:
     assert clouds.min() > 0.8 * np.median(clouds)
 
 
-def grey_at(picture: Picture, road: Road, station_m: float, lateral_m: float, camera_s_m: float) -> float:
-    """Return the brightness of a point of the ground in a picture that was taken at the station `camera_s_m`."""
-    u_px, v_px, _ = place_camera(MODEL, pose_at(road, camera_s_m)).project(
+def grey_at(picture: Picture, road: Road, *, station_m: float, lateral_m: float, camera_station_m: float) -> float:
+    """Return the brightness of a point of the ground in a picture that was taken at `camera_station_m`."""
+    u_px, v_px, _ = place_camera(MODEL, pose_at(road, camera_station_m)).project(
         np.append(road.point_at(station_m, lateral_m), 0.0)
     )
     return float(picture[round(v_px) - 1 : round(v_px) + 2, round(u_px) - 2 : round(u_px) + 3].mean())
@@ -65,21 +65,28 @@ def grey_at(picture: Picture, road: Road, station_m: float, lateral_m: float, ca
 def test_a_rails_shadow_falls_away_from_the_sun(road: Road) -> None:
     """The ground beside the right rail is dark up to the shadow of the rail's top, and bright beyond."""
     camera = camera_on(road, light="low_sun", scenery="light")
-    picture = picture_of(camera, pose_at(road, 80.0))
-    station_m = 88.0
+    camera_station_m, station_m = 80.0, 88.0
+    picture = picture_of(camera, pose_at(road, camera_station_m))
     centre, left_of_centre = road.point_at(station_m, [0.0, 1.0])  # 1 m apart
-    reach_m = RAIL_HEIGHT_M * float(LIGHTS["low_sun"].shadow_m @ (left_of_centre - centre))
+    left = left_of_centre - centre
+    reach_m = RAIL_HEIGHT_M * float(LIGHTS["low_sun"].shadow_vector_m @ left)
     assert reach_m > 3.0  # to the left: the sun is to the right here
-    shaded_grey = grey_at(picture, road, station_m, RAIL_OFFSET_M + 0.85 * reach_m, 80.0)
-    sunny_grey = grey_at(picture, road, station_m, RAIL_OFFSET_M + 1.5 * reach_m, 80.0)
-    assert shaded_grey < 0.7 * sunny_grey
+
+    def grey_beside_rail(distance_m: float) -> float:
+        lateral_m = RAIL_OFFSET_M + distance_m
+        return grey_at(picture, road, station_m=station_m, lateral_m=lateral_m, camera_station_m=camera_station_m)
+
+    assert grey_beside_rail(0.85 * reach_m) < 0.7 * grey_beside_rail(1.5 * reach_m)
 
 
 @pytest.mark.parametrize("light", LIGHT_NAMES)
 def test_marks_stand_out_in_every_light(road: Road, light: LightName) -> None:
     """In every light a solid mark is at least 1.5 times as bright as the asphalt beside it."""
     picture = picture_of(camera_on(road, light=light), pose_at(road, 0.0)).astype(np.uint8)
-    assert grey_at(picture, road, 7.0, -1.75, 0.0) > 1.5 * grey_at(picture, road, 7.0, -1.2, 0.0)
+    mark_grey, asphalt_grey = (
+        grey_at(picture, road, station_m=7.0, lateral_m=lateral_m, camera_station_m=0.0) for lateral_m in (-1.75, -1.2)
+    )
+    assert mark_grey > 1.5 * asphalt_grey
 
 
 DIGEST = """

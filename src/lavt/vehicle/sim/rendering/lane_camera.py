@@ -64,7 +64,7 @@ class LaneCamera:
         lines = [road.point_at(stations_m, offset_m) for offset_m in (0.0, self._width_m / 2, -self._width_m / 2)]
         self._line_points: list[list[float]] = np.concatenate(lines, axis=1).tolist()
         """For each station, world x and y of the lane's centre, of its left line, and of its right line."""
-        self._near_s_m = 0.0
+        self._near_station_m = 0.0
         """The station of the car at the last call."""
 
     def capture(self, number: int, at_ns: int, pose: Pose | None) -> CapturedFrame | None:
@@ -85,8 +85,8 @@ class LaneCamera:
 
     def observe_lane(self, pose: Pose) -> Lane:
         """Fit the driven lane's centre where one of its lines is visible; the confidence is 0 if no lane is fitted."""
-        self._near_s_m = self._road.project(pose.x_m, pose.y_m, self._near_s_m)[0]
-        first = max(math.ceil(self._near_s_m / STATION_SPACING_M), 0)
+        self._near_station_m = self._road.project(pose.x_m, pose.y_m, self._near_station_m)[0]
+        first = max(math.ceil(self._near_station_m / STATION_SPACING_M), 0)
         cosine, sine = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
         x_m, y_m = pose.x_m, pose.y_m
         near_m, far_m, half_width_m = self._near_m, self._far_m, self._half_width_m

@@ -56,7 +56,7 @@ class Light:
         )
 
     @property
-    def shadow_m(self) -> FloatArray:
+    def shadow_vector_m(self) -> FloatArray:
         """The shadow (x, y) of the top of a pole of 1 m, relative to the foot of the pole."""
         towards = self.towards_sun
         return np.asarray(-towards[:2] / towards[2])

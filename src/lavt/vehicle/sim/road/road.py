@@ -66,15 +66,15 @@ class Road:
         offset = np.asarray(offset_m, dtype=np.float64)
         return np.stack([x_m - offset * np.sin(heading_rad), y_m + offset * np.cos(heading_rad)], axis=-1)
 
-    def project(self, x_m: float, y_m: float, near_s_m: float) -> tuple[float, float, float]:
+    def project(self, x_m: float, y_m: float, near_station_m: float) -> tuple[float, float, float]:
         """Project a position onto the lane's centre.
 
-        The search covers the stations up to `PROJECTION_WINDOW_M` before and behind `near_s_m`. Returns the station (m)
-        of the nearest point on the centre, the position's lateral offset (m, left positive), and the lane's heading
-        (rad) at the nearest point.
+        The search covers the stations up to `PROJECTION_WINDOW_M` before and behind `near_station_m`. Returns the
+        station (m) of the nearest point on the centre, the position's lateral offset (m, left positive), and the lane's
+        heading (rad) at the nearest point.
         """
         window_m = PROJECTION_WINDOW_M
-        return self._centreline.project(x_m, y_m, near_s_m - window_m, near_s_m + window_m)[:3]
+        return self._centreline.project(x_m, y_m, near_station_m - window_m, near_station_m + window_m)[:3]
 
     def sub_route(self, title: str, from_m: float, route_length_m: float) -> Road:
         """Return the same road with another route, which begins at station `from_m`."""
