@@ -168,7 +168,10 @@ class SoftwareCarProcess:
 
     def unexpected_release(self, braked_ns: int, message: str) -> Exception:
         """Return the exception for a kit that got no command in time although the test had caused no fault."""
-        return self.verdict(message, braked_ns - KIT_LOOKBACK_MS * NS_PER_MS, braked_ns)
+        failure = self.verdict(message, braked_ns - KIT_LOOKBACK_MS * NS_PER_MS, braked_ns)
+        if self.stalls is None:
+            return failure
+        return excuse_slow_machine(failure, self.stalls, braked_ns - SLOW_MACHINE_LOOKBACK_MS * NS_PER_MS, braked_ns)
 
     def verdict(self, message: str, since_ns: int, until_ns: int) -> Exception:
         """Return the exception for a late reaction: `HostStalled` if the host stalled between the times."""
@@ -261,10 +264,9 @@ class RunningDrive:
         )
         now_ns = CLOCK.now().mono_ns
         if braked_ns is not None:
-            failure = self.car.unexpected_release(braked_ns, message)
-        else:
-            since_ns = now_ns - STOP_LOOKBACK_MS * NS_PER_MS
-            failure = self.stalls.verdict(message, since_ns, now_ns, stall_ms=STOP_STALL_MS)
+            return self.car.unexpected_release(braked_ns, message)
+        since_ns = now_ns - STOP_LOOKBACK_MS * NS_PER_MS
+        failure = self.stalls.verdict(message, since_ns, now_ns, stall_ms=STOP_STALL_MS)
         return excuse_slow_machine(failure, self.stalls, now_ns - SLOW_MACHINE_LOOKBACK_MS * NS_PER_MS, now_ns)
 
     def require_within(self, took_ms: float, limit_ms: float, since_ns: int, what: str) -> None:
