@@ -427,17 +427,19 @@ def test_a_pair_with_keys(router: str, keys: Path, operator: str, vehicle: str, 
     assert {results[name].verdict for name in ("security", "security.key", "security.vehicle")} == {"ok"}
 
 
+@pytest.mark.parametrize("content", ["", "no key"])
 @pytest.mark.usefixtures("quick")
-def test_invalid_keys(tmp_path: Path) -> None:
-    """A file without a key is a problem, and the router is not checked with it."""
+def test_invalid_keys(content: str, tmp_path: Path) -> None:
+    """A file without a key is a problem; it is not said to never expire, and the router is not checked with it."""
     pytest.importorskip("lavt.transport.security.certificates")
     for name in ("key", "pub"):
-        (tmp_path / name).write_text("no key")
+        (tmp_path / name).write_text(content)
         (tmp_path / name).chmod(0o600)
     changes = [f"security.key={tmp_path}/key", f"security.vehicle={tmp_path}/pub", "clock.probe_port=1"]
     results = check_config(shipped("configs/client.yaml"), *changes)
     assert (results["keys"].verdict, results["router"].verdict) == ("problem", "not checked")
     assert str(tmp_path) in results["keys"].found
+    assert not {"key", "pub"} & results.keys()
 
 
 @pytest.mark.usefixtures("quick")

@@ -8,7 +8,7 @@ import shutil
 import sys
 import textwrap
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -173,8 +173,9 @@ def _security_checks(settings: Settings, clock: MachineClock) -> Iterator[Check]
     for key, path, is_private in files:
         rejection, mode = measurements.file_state(path)
         yield key_checks.check_key_file(key, path, rejection=rejection, mode=mode, is_private=is_private)
-        if not rejection:
-            yield key_checks.check_signing_key(path, measurements.signing_key_days_left(path, clock.now().wall_ns))
+        with suppress(UserError):  # `keys_rejection` reports an invalid key
+            days_left = measurements.signing_key_days_left(path, clock.now().wall_ns, is_private=is_private)
+            yield key_checks.check_signing_key(path, days_left)
     rejection = measurements.keys_rejection(settings)
     if rejection:
         yield Check(

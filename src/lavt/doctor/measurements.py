@@ -31,7 +31,7 @@ from lavt.transport.arrival import ANCILLARY_BYTES, SO_TIMESTAMPNS, enable_arriv
 from lavt.transport.clock_sync.clock_report import ClockReport
 from lavt.transport.messages import decode
 from lavt.transport.netem.netem import NetemInterface, run_tc
-from lavt.transport.security.keys import NS_PER_DAY, key_expiry_ns
+from lavt.transport.security.keys import NS_PER_DAY, key_expiry_ns, load_private, load_public
 from lavt.transport.udp_link import RECEIVE_BUFFER_BYTES
 from lavt.transport.zenoh_link import ZenohLink
 
@@ -285,12 +285,11 @@ def certificates(folder: Path, now_wall_ns: int) -> list[tuple[Path, float]]:
     return found
 
 
-def signing_key_days_left(path: Path, now_wall_ns: int) -> float | None:
-    """Return the days until a signing key expires; None for one that has no expiry or cannot be read."""
-    with suppress(OSError, UserError):  # loading the keys reports an invalid file
-        expires_ns = key_expiry_ns(path.read_bytes(), path)
-        return None if expires_ns is None else (expires_ns - now_wall_ns) / NS_PER_DAY
-    return None
+def signing_key_days_left(path: Path, now_wall_ns: int, *, is_private: bool) -> float | None:
+    """Return the days until a signing key expires; None if it never expires. Raise `UserError` for an invalid key."""
+    (load_private if is_private else load_public)(path)
+    expires_ns = key_expiry_ns(path.read_bytes(), path)
+    return None if expires_ns is None else (expires_ns - now_wall_ns) / NS_PER_DAY
 
 
 def keys_rejection(settings: ServerConfig | ClientConfig) -> str:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import ctypes
+import mmap
 import os
 import resource
-from pathlib import Path
 from typing import Final
 
 MCL_CURRENT: Final = 1
@@ -15,8 +15,6 @@ M_TOP_PAD: Final = -2
 HEAP_STEP_BYTES: Final = 64 * 1024
 """The heap grows by this much at a time (mallopt(3)). Locked memory is loaded when the heap grows, so a large step
 would stop the caller for a while."""
-CAP_IPC_LOCK: Final = 14
-"""With this capability, the limit on locked memory does not apply (capabilities(7))."""
 
 
 def lock_memory() -> str:
@@ -41,16 +39,27 @@ def lift_lock_limit() -> str:
 
     Under a limit, memory is better not locked: each allocation beyond it would fail.
     """
-    limit_bytes, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    limit_bytes, hard_limit_bytes = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     try:
         resource.setrlimit(resource.RLIMIT_MEMLOCK, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
     except (ValueError, OSError):
-        if not _has_capability(CAP_IPC_LOCK):
+        resource.setrlimit(resource.RLIMIT_MEMLOCK, (0, hard_limit_bytes))
+        try:
+            is_exempt = _can_lock_page()
+        finally:
+            resource.setrlimit(resource.RLIMIT_MEMLOCK, (limit_bytes, hard_limit_bytes))
+        if not is_exempt:
             return f"this user may lock only {limit_bytes // 1024} KiB (RLIMIT_MEMLOCK)"
     return ""
 
 
-def _has_capability(capability: int) -> bool:
-    status = Path("/proc/self/status").read_text()
-    effective = next((line.split()[1] for line in status.splitlines() if line.startswith("CapEff:")), "0")
-    return bool(int(effective, 16) >> capability & 1)
+def _can_lock_page() -> bool:
+    """Return whether a page can be locked.
+
+    With a limit of 0 this needs the capability CAP_IPC_LOCK (mlock(2)). The capabilities that /proc shows do not tell:
+    those of root in a user namespace do not count.
+    """
+    with mmap.mmap(-1, mmap.PAGESIZE) as page:
+        address = ctypes.addressof(ctypes.c_char.from_buffer(page))
+        is_locked: bool = ctypes.CDLL(None).mlock(ctypes.c_void_p(address), ctypes.c_size_t(1)) == 0
+        return is_locked

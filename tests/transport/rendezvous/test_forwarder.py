@@ -8,14 +8,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lavt.domain import NS_PER_S
+from lavt.streams import stream
 from lavt.transport.clock_sync.probe import ProbeReply, encode_reply, encode_request
 from lavt.transport.rendezvous.forwarder import (
     ANSWERED_HOST_PER_S,
     CLIENT_TIMEOUT_NS,
+    HOST_PER_S,
     MAX_CLIENTS,
     MAX_UNANSWERED,
     MAX_UPSTREAM_BYTES,
-    REGISTRATIONS_PER_S,
+    REGISTER_EVERY_NS,
     UPSTREAM_PER_S,
     VEHICLE_TIMEOUT_NS,
     Address,
@@ -34,6 +36,8 @@ CLIENT, SECOND_CLIENT = ("198.51.100.2", 50_000), ("198.51.100.7", 50_001)
 HELLO = PathClient(b"t" * 16).hello(0)
 REPORT = struct.pack(">BBHI", 0x80, 201, 1, 7)
 NOW_NS = 100 * NS_PER_S
+LATER_NS = NOW_NS + 2 * NS_PER_S
+"""After this time all rate limits have been reset."""
 UNSIGNED_BYTES = 4 + 1 + 1 + 8 + 32 + 8
 """Length of a registration before its signature; the fields are in docs/wire.md."""
 
@@ -241,7 +245,7 @@ def test_datagrams_to_the_vehicle_are_rate_limited() -> None:
     assert sum(unanswered) == UPSTREAM_PER_S - 1, "the hello of SECOND_CLIENT was one of the allowed ones"
     answered = [send_hello(forwarder, SECOND_CLIENT) is not None for _ in range(2 * UPSTREAM_PER_S)]
     assert sum(answered) == ANSWERED_HOST_PER_S
-    assert send_hello(forwarder, now_ns=NOW_NS + NS_PER_S) is not None
+    assert send_hello(forwarder, now_ns=LATER_NS) is not None
 
 
 @pytest.mark.parametrize(("flow", "datagram"), [("video", HELLO), ("video", REPORT), ("probe", encode_request(1, 1))])
@@ -266,11 +270,11 @@ def test_a_flood_with_a_clients_address_keeps_it_out_until_it_is_answered() -> N
     for _ in range(2 * UPSTREAM_PER_S):
         send_hello(forwarder, false_address)
     assert send_hello(forwarder) is None
-    assert send_hello(forwarder, now_ns=NOW_NS + NS_PER_S) is not None, "it was the first of this second"
-    assert send_answer(forwarder, now_ns=NOW_NS + NS_PER_S) is not None
+    assert send_hello(forwarder, now_ns=LATER_NS) is not None, "it was the first since the limit was reset"
+    assert send_answer(forwarder, now_ns=LATER_NS) is not None
     for _ in range(2 * UPSTREAM_PER_S):
-        send_hello(forwarder, false_address, NOW_NS + NS_PER_S)
-    assert send_hello(forwarder, now_ns=NOW_NS + NS_PER_S) is not None
+        send_hello(forwarder, false_address, LATER_NS)
+    assert send_hello(forwarder, now_ns=LATER_NS) is not None
 
 
 def test_a_flood_from_one_host_does_not_keep_a_new_client_out() -> None:
@@ -369,16 +373,54 @@ def test_an_answer_other_than_video_gives_no_limit_of_its_own(flow: FlowName, pa
     assert passed == UPSTREAM_PER_S
 
 
-def test_forged_registrations_are_rate_limited(key: PrivateKey) -> None:
-    """In a flood of forged registrations few signatures are verified, and a registration of the vehicle is accepted."""
+@pytest.mark.parametrize("first", [None, OTHER_ADDRESS])
+def test_forged_registrations_from_one_host_do_not_keep_the_vehicle_out(first: Address | None, key: PrivateKey) -> None:
+    """In a flood of forged registrations from one host, the vehicle registers at once, also from another address."""
+    forwarder = Forwarder("vehicle-1", "video", key.public)
+    if first is not None:
+        forwarder.receive(encode_registration("vehicle-1", "video", 5, key), first, NOW_NS)
+    forged = encode_registration("vehicle-1", "video", 6, None)
+    for port in range(1, 2 * UPSTREAM_PER_S):
+        forwarder.receive(forged, ("203.0.113.99", port), NOW_NS)
+    assert forwarder.counts["registrations_forged"] == HOST_PER_S
+    forwarder.receive(encode_registration("vehicle-1", "video", 7, key), VEHICLE, NOW_NS)
+    assert forwarder.vehicle_address(NOW_NS) == VEHICLE
+
+
+@pytest.mark.parametrize("now_ns", [LATER_NS, LATER_NS + VEHICLE_TIMEOUT_NS])
+def test_forged_registrations_from_many_hosts_are_rate_limited(now_ns: int, key: PrivateKey) -> None:
+    """In a flood from many hosts few signatures are verified, and the vehicle registers at once from its last address.
+
+    This also holds if its registration has expired.
+    """
     forwarder = Forwarder("vehicle-1", "video", key.public)
     forwarder.receive(encode_registration("vehicle-1", "video", 5, key), VEHICLE, NOW_NS)
     forged = encode_registration("vehicle-1", "video", 6, None)
-    for _ in range(2 * REGISTRATIONS_PER_S):
-        forwarder.receive(forged, OTHER_ADDRESS, NOW_NS + NS_PER_S)
-    assert forwarder.counts["registrations_forged"] == REGISTRATIONS_PER_S
-    forwarder.receive(encode_registration("vehicle-1", "video", 7, key), VEHICLE, NOW_NS + NS_PER_S)
+    for number in range(2 * UPSTREAM_PER_S):
+        forwarder.receive(forged, (f"198.51.100.{number % 200}", 9), now_ns)
+    assert forwarder.counts["registrations_forged"] == UPSTREAM_PER_S
+    forwarder.receive(encode_registration("vehicle-1", "video", 7, key), VEHICLE, now_ns)
     assert forwarder.counts["registrations"] == 2
+
+
+@pytest.mark.parametrize("burst", [1, 500])
+@pytest.mark.parametrize("phase", [0.0, 0.2, 0.4, 0.6, 0.8])
+def test_forged_registrations_from_many_hosts_only_delay_the_vehicle(phase: float, burst: int, key: PrivateKey) -> None:
+    """500 forged registrations a second from many hosts, evenly spaced or at once, delay the first one by at most 20 s.
+
+    This holds for any phase between the flood and the vehicle, which registers every second.
+    """
+    chance = stream(1, f"windows {phase}")
+    forwarder = Forwarder("vehicle-1", "video", key.public, random_below=lambda limit: int(chance.integers(limit)))
+    forged = encode_registration("vehicle-1", "video", 10**18, None)
+    start_ns = next_ns = NOW_NS + round(phase * NS_PER_S)
+    for number in range(20 * 500):
+        now_ns = start_ns + number // burst * burst * NS_PER_S // 500
+        forwarder.receive(forged, (f"198.51.100.{number % 200}", 9), now_ns)
+        while next_ns < now_ns:
+            forwarder.receive(encode_registration("vehicle-1", "video", next_ns, key), VEHICLE, next_ns)
+            next_ns += REGISTER_EVERY_NS
+    assert forwarder.counts["registrations"] > 0
 
 
 def test_the_longest_packet_fits_the_minimum_mtu() -> None:

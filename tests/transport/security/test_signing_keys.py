@@ -76,9 +76,22 @@ def test_a_key_without_expiry_is_valid_at_any_time(tmp_path: Path) -> None:
     assert key_expiry_ns(public.read_bytes(), public) is None
 
 
-@pytest.mark.parametrize("damage", [(b"key 1", b"key 2"), (b"expires ", b"expires"), (b"1798", b"x798")])
+@pytest.mark.parametrize(
+    "damage",
+    [
+        (b"key 1", b"key 2"),
+        (b"expires ", b"expires"),
+        (b"1798", b"x798"),
+        (b"LAVT signing", b"LAVT  signing"),
+        (b"LAVT", b"lavt"),
+        (b"LAVT", b"#LAVT"),
+        (b"(2026", b"(2036"),
+        (b")\n", b")\nLAVT signing key 1, expires 4070908800 (2099-01-01)\n"),
+    ],
+)
 def test_an_unreadable_expiry_is_rejected(tmp_path: Path, damage: tuple[bytes, bytes]) -> None:
-    """A damaged expiry, or one of another version, does not make a key valid for ever."""
+    """A damaged expiry, one of another version or a second one does not make a key valid for longer or for ever."""
+    assert damage[0] in new_signing_pair(NOW_NS, 30).public
     path = tmp_path / "key"
     path.write_bytes(new_signing_pair(NOW_NS, 30).public.replace(*damage, 1))
     with pytest.raises(UserError, match="expiry"):

@@ -141,6 +141,18 @@ def test_pulses_of_throttle_add_up() -> None:
     assert rig.faults == [SpeedFault.NO_START]
 
 
+def test_a_report_that_is_processed_late_does_not_reduce_the_unanswered_speed() -> None:
+    """After reports with earlier times, a speed that stays 0 is found after as much throttle as without them."""
+    rig = MonitorRig().run(0.1, NO_PEDAL, constant(0.0)).run(1.3, Pedals(1.0, 0.0), constant(0.0))
+    for late_ns in (900 * NS_PER_MS, 50 * NS_PER_MS):
+        report_ns = rig.now_ns - late_ns
+        rig.monitor.update({"speed": SpeedReport(0.0, report_ns)}, Pedals(1.0, 0.0), report_ns)
+    rig.run(0.1, Pedals(1.0, 0.0), constant(0.0))
+    assert rig.faults == []
+    rig.run(0.05, Pedals(1.0, 0.0), constant(0.0))
+    assert rig.faults == [SpeedFault.NO_START]
+
+
 def test_a_car_that_did_not_answer_the_throttle_is_not_stationary() -> None:
     """After throttle without an answer the car may move, until braking as on ice would have stopped it.
 
@@ -233,6 +245,14 @@ def test_wheels_that_lock_in_a_stop_may_have_slipped_before() -> None:
     assert not rig.monitor.is_stationary
     rig.run(0.4, FULL_BRAKE, *[constant(0.0)] * 5)
     assert rig.monitor.is_stationary
+
+
+@pytest.mark.parametrize(("speed_mps", "is_noticed"), [(0.61, False), (0.65, True)])
+def test_slow_wheels_lock_unnoticed(speed_mps: float, is_noticed: bool) -> None:
+    """With reports every 10 ms, wheels that lock are noticed at more than 0.62 m/s: 0.5 m/s and 12 m/s2 for 10 ms."""
+    rig = MonitorRig().run(1.0, NO_PEDAL, constant(speed_mps))
+    rig.run(0.05, FULL_BRAKE, constant(0.0))
+    assert rig.monitor.is_stationary != is_noticed
 
 
 def test_the_fault_of_a_fast_car_lasts_as_long_as_it_may_slide() -> None:

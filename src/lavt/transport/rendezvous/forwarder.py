@@ -23,6 +23,9 @@ path. Threats:
   limit. Other clients that the vehicle has answered have one, too. Hellos and answers also have a rate
   limit of their own, so that replays with a client's address do not crowd out its reports. In each group every host has
   a limit of its own, so that a flood from one host, or with one false address, crowds out no client at another.
+* Keeping the vehicle out: registrations whose signature is verified have the same limits, and those from the vehicle's
+  last address one of their own. So forged registrations from one host keep the vehicle out only if it shares that
+  host's address. Those from 20 hosts or more delay it: `docs/security.md`.
 * Keeping new clients out: a dropped datagram displaces no client. A flood from 20 hosts or more, or with that many
   false addresses, still uses up the common limit, and then keeps new clients out while it lasts. So does, for the
   clients at one address, a flood with that address, and, until a client gets the video, copies of its hellos, which
@@ -35,17 +38,18 @@ No input, output or clock here: `link.py` has the sockets. A `Forwarder` serves 
 
 from __future__ import annotations
 
+import secrets
 import socket
 import struct
 from collections import Counter
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Final, Literal
 
 from lavt.domain import NS_PER_S
 from lavt.errors import BadMessage
 from lavt.transport.clock_sync.probe import decode_request
 from lavt.transport.rtp.rtcp import is_rtcp
-from lavt.transport.security.flood_filter import RateLimiter
 from lavt.transport.security.keys import SIGNATURE_BYTES, PrivateKey, PublicKey
 from lavt.transport.video.path_validation import client_datagram_number, is_path_datagram
 
@@ -60,18 +64,18 @@ CLIENT_TIMEOUT_NS: Final = 30 * NS_PER_S
 """A client gets nothing if it has sent nothing for this time."""
 MAX_CLIENTS: Final = 64
 """Limits the number of clients that the vehicle has answered."""
-REGISTRATIONS_PER_S: Final = 50
-"""Limits the registrations from the vehicle's address that are verified, and separately those from other addresses."""
 UPSTREAM_PER_S: Final = 200
 """Limits each of four groups of datagrams: from clients that the vehicle has answered or from other clients, and of the
-path validation or not. The client that gets the video is in none of them. A client sends 2.5 reports a second
-(measured)."""
+path validation or not. The client that gets the video is in none of them. Also limits each of the two groups of
+registrations. A client sends 2.5 reports a second (measured)."""
 HOST_PER_S: Final = 10
-"""Limits the datagrams of each host, within each of the two groups from clients that the vehicle has not answered. Such
-a client sends 2 hellos a second, or 7 if the video has ended, until the vehicle answers one."""
+"""Limits the datagrams of each host, within each of the two groups from clients that the vehicle has not answered, and
+within the registrations from another address than the vehicle's. Such a client sends 2 hellos a second, or 7 if the
+video has ended, until the vehicle answers one."""
 ANSWERED_HOST_PER_S: Final = 50
-"""The same for clients that the vehicle has answered, and the only limit of the client that gets the video. Such a
-client sends at most 7 hellos, 7 answers, 2.5 reports and 2 probes a second, and `lavt clock` 20 probes."""
+"""The same for clients that the vehicle has answered and for registrations from the vehicle's address, and the only
+limit of the client that gets the video. Such a client sends at most 7 hellos, 7 answers, 2.5 reports and 2 probes a
+second, and `lavt clock` 20 probes."""
 MAX_UNANSWERED: Final = 10 * UPSTREAM_PER_S
 """Limits the number of clients that the vehicle has not answered. So many need 5 s to arrive at the rate limit, and an
 answer takes less than that."""
@@ -130,10 +134,18 @@ class Forwarder:
     """A forwarder that knows the addresses of one vehicle and its clients, and routes the datagrams of one flow.
 
     `key` is the vehicle's public key; without it, anyone who knows the vehicle's name can register. All times are of
-    one monotonic clock. `counts` has the numbers of datagrams by result.
+    one monotonic clock. `random_below` returns a random number from 0 to less than its argument. `counts` has the
+    numbers of datagrams by result.
     """
 
-    def __init__(self, vehicle: str, flow: FlowName, key: PublicKey | None) -> None:
+    def __init__(
+        self,
+        vehicle: str,
+        flow: FlowName,
+        key: PublicKey | None,
+        *,
+        random_below: Callable[[int], int] = secrets.randbelow,
+    ) -> None:
         self.counts: Counter[str] = Counter()
         self._vehicle = vehicle
         self._flow: FlowName = flow
@@ -144,13 +156,15 @@ class Forwarder:
         self._clients = _Clients()
         self._video_client: Address | None = None
         """The client to which the vehicle last sent anything but a challenge, in the video's flow."""
-        self._signature_limiters = {True: RateLimiter(REGISTRATIONS_PER_S), False: RateLimiter(REGISTRATIONS_PER_S)}
-        """By whether the registration comes from the vehicle's address."""
-        self._video_limiters = {True: _HostLimiter(ANSWERED_HOST_PER_S), False: _HostLimiter(ANSWERED_HOST_PER_S)}
+        few = partial(_HostLimiter, HOST_PER_S, random_below)
+        many = partial(_HostLimiter, ANSWERED_HOST_PER_S, random_below)
+        self._signature_limiters = {True: many(), False: few()}
+        """By whether the registration comes from the vehicle's last address."""
+        self._video_limiters = {True: many(), False: many()}
         """For the client that gets the video, by whether the datagram belongs to the path validation."""
-        self._answered_limiters = {True: _HostLimiter(ANSWERED_HOST_PER_S), False: _HostLimiter(ANSWERED_HOST_PER_S)}
+        self._answered_limiters = {True: many(), False: many()}
         """The same for other clients that the vehicle has answered."""
-        self._unanswered_limiters = {True: _HostLimiter(HOST_PER_S), False: _HostLimiter(HOST_PER_S)}
+        self._unanswered_limiters = {True: few(), False: few()}
         """The same for clients that the vehicle has not answered."""
 
     def vehicle_address(self, now_ns: int) -> Address | None:
@@ -178,7 +192,7 @@ class Forwarder:
         if address is not None and wall_ns <= self._registration_wall_ns:
             return "registrations_stale"
         if self._key is not None:
-            if not self._signature_limiters[sender == address].take(now_ns):
+            if not self._signature_limiters[sender == self._vehicle_address].take(sender[0], now_ns):
                 return "registrations_too_many"
             if not self._key.verify(signature, _signing_context(self._vehicle) + registration):
                 return "registrations_forged"
@@ -230,19 +244,25 @@ class Forwarder:
 
 
 class _HostLimiter:
-    """A limit on the datagrams per second, and a lower one on those of each host, counted in windows of one second."""
+    """A limit on the datagrams per second, and a lower one on those of each host.
 
-    def __init__(self, host_per_s: int) -> None:
+    They are counted in windows of 1 to 1.5 s. The length of each window is random, so that whoever sends once a second
+    does not arrive each time when a flood has used up the limits already.
+    """
+
+    def __init__(self, host_per_s: int, random_below: Callable[[int], int]) -> None:
         self._host_per_s = host_per_s
-        self._since_ns = 0
+        self._random_below = random_below
+        self._until_ns = 0
         self._left = UPSTREAM_PER_S
         self._passed: Counter[str] = Counter()
         """The datagrams that passed in this window, by host: at most `UPSTREAM_PER_S` entries."""
 
     def take(self, host: str, now_ns: int) -> bool:
         """Return whether one more datagram of `host` is within both limits; if so, count it."""
-        if now_ns - self._since_ns >= NS_PER_S:
-            self._since_ns, self._left = now_ns, UPSTREAM_PER_S
+        if now_ns >= self._until_ns:
+            self._until_ns = now_ns + NS_PER_S + self._random_below(NS_PER_S // 2)
+            self._left = UPSTREAM_PER_S
             self._passed.clear()
         if self._left == 0 or self._passed[host] >= self._host_per_s:
             return False

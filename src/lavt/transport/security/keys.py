@@ -26,7 +26,8 @@ NS_PER_DAY: Final = 86_400 * NS_PER_S
 
 _EXPIRY: Final = b"LAVT signing key 1, expires "
 """The beginning of the line before a PEM key, where a PEM file may have any text (RFC 7468); 1 is the version."""
-_EXPIRY_LINE: Final = re.compile(rb"^%s(\d{1,11}) \(\d{4}-\d\d-\d\d\)$" % _EXPIRY, re.MULTILINE)
+_EXPIRY_LINE: Final = re.compile(rb"%s(\d{1,11}) " % _EXPIRY)
+_PEM_BLOCK: Final = re.compile(rb"-----BEGIN .*?-----END [^\n]*", re.DOTALL)
 _INSTALL: Final = "signing needs the package cryptography: pip install 'lavt[secure]'"
 
 
@@ -71,14 +72,20 @@ def expiry_line(expires_wall_ns: int) -> bytes:
 def key_expiry_ns(data: bytes, path: Path) -> int | None:
     """Return the wall clock time at which a key expires; None for a key without an expiry.
 
-    `data` is the content of the file `path`. Raise `UserError` for an expiry that cannot be read.
+    `data` is the content of the file `path`. Raise `UserError` for text outside of the key that is not an expiry,
+    because it may be one with a typo.
     """
-    found = _EXPIRY_LINE.search(data)
-    if found is not None:
-        return int(found[1]) * NS_PER_S
-    if b"LAVT signing key" in data:
-        raise UserError(f"the expiry of the key {path} cannot be read: copy the file again, or make new keys")
-    return None
+    text = _PEM_BLOCK.sub(b"", data).strip()
+    if not text:
+        return None
+    found = _EXPIRY_LINE.match(text)
+    expires_ns = int(found[1]) * NS_PER_S if found is not None else 0
+    if text != expiry_line(expires_ns).strip():
+        raise UserError(
+            f"the text outside of the key in {path} is not an expiry: copy the file again, or make new keys; remove "
+            "the text only if another program has written it"
+        )
+    return expires_ns
 
 
 def _check_expiry(data: bytes, path: Path, now_wall_ns: int | None) -> None:

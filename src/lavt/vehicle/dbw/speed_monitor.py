@@ -2,8 +2,8 @@
 
 A kit reports `speed`, which is used to drive, and possibly other speeds to compare it with: a second speed and the
 speeds of the wheels. If all of them come from one control unit, they can be wrong together; the checks against the
-pedals detect this. An implausible speed is a fault until two conditions are met: the car has been braked fully for
-`FULL_BRAKE_NS`, and all reported speeds have been those of a stationary car for `STANDSTILL_NS`.
+pedals detect this. An implausible speed is a fault until two conditions are met: the fault has lasted for
+`FULL_BRAKE_NS`, and the car has been stationary for `STANDSTILL_NS`.
 """
 
 from __future__ import annotations
@@ -71,10 +71,10 @@ UNANSWERED_MPS: Final = 2.7
 slope is too steep, a wheel is blocked, or the car moves and the reported speed is wrong. Each of these ends the drive.
 A car that reaches 2 m/s2 has 1.4 s to start at full throttle, and 3 s at half throttle."""
 FULL_BRAKE_NS: Final = 8 * NS_PER_S
-"""After an implausible speed, the car is braked fully for at least this long. A deceleration of 1.4 m/s2, a quarter of
+"""A fault lasts for at least this long. Meanwhile the adapter brakes fully. A deceleration of 1.4 m/s2, a quarter of
 what the brakes should reach, stops a car from 40 km/h in this time."""
 STANDSTILL_NS: Final = NS_PER_S
-"""All speeds must be those of a stationary car for this long."""
+"""The car must be stationary for this long."""
 
 
 class SpeedFault(StrEnum):
@@ -109,9 +109,10 @@ class Pedals(Struct, frozen=True):
 
 
 class SpeedMonitor:
-    """A monitor of the reported speeds. Call `update` after each report and regularly; times must not decrease.
+    """A monitor of the reported speeds. Call `update` after each report and regularly.
 
-    The accelerations are the car's at full pedals.
+    A report can be processed after an update for a later time; then the later time counts. The accelerations are the
+    car's at full pedals.
     """
 
     def __init__(self, *, max_acceleration_mps2: float, max_braking_mps2: float) -> None:
@@ -159,6 +160,7 @@ class SpeedMonitor:
 
     def update(self, speeds: Mapping[str, SpeedReport], pedals: Pedals, now_ns: int) -> SpeedFault | None:
         """Process the newest speeds (by name) and the pedals; return a fault that begins now, or None."""
+        now_ns = max(now_ns, self._now_ns)
         passed_ns = min(now_ns - self._now_ns, COMMAND_TIMEOUT_NS)  # a kit releases the throttle after this time
         self._speeds, self._now_ns = speeds, now_ns
         self._update_throttled(pedals, passed_ns / NS_PER_S)
