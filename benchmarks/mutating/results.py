@@ -30,7 +30,8 @@ _FIELD_TYPES: Final[dict[str, type | tuple[type, ...]]] = {
 }
 
 Place = tuple[str, str, str, str]
-"""Module, function, line and mutated line; the same line can occur more than once in a function."""
+"""Module, function, line and mutated line, without the occurrence: if a line occurs several times in a function, an accepted
+survivor applies to each occurrence."""
 
 
 @dataclass(frozen=True)
