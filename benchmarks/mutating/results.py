@@ -30,8 +30,8 @@ _FIELD_TYPES: Final[dict[str, type | tuple[type, ...]]] = {
 }
 
 Place = tuple[str, str, str, str]
-"""Module, function, line and mutated line, without the occurrence: if a line occurs several times in a function, an accepted
-survivor applies to each occurrence."""
+"""Module, function, line and mutated line, but not the occurrence: an accepted survivor covers each occurrence of its
+line in the function."""
 
 
 @dataclass(frozen=True)

@@ -110,7 +110,7 @@ class ProcessRuntime:
 
 
 def build_sender_nodes(run: Run, clock: MachineClock, port: int) -> Sequence[Node]:
-    """Build the server's camera node with a `RepeatingCamera`, and a node that discards the messages to the actuator."""
+    """Build the server's camera node with a `RepeatingCamera`, and a node that discards messages to the actuator."""
     config = ServerConfig.model_validate(
         {
             "camera": {"width_px": run.width_px, "height_px": run.height_px, "rate_hz": RATE_HZ},
