@@ -26,7 +26,7 @@ def test_the_injected_delay_is_measured(demo: Demo, stalls: Stalls) -> None:
 def test_the_relay_delays_as_requested(demo: Demo, stalls: Stalls) -> None:
     """The relay measures median delays of video and control within 1 ms of the requested delays."""
     with stalls.excusing_failures(demo.since_ns, demo.until_ns, share=BUSY_SHARE):
-        assert [drive.relay_reasons for drive in demo.drives_by_condition.values()] == [[], []]
+        assert [drive.relay_invalid_reasons for drive in demo.drives_by_condition.values()] == [[], []]
 
 
 def test_both_records_of_a_drive_are_complete(demo: Demo) -> None:

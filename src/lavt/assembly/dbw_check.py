@@ -158,7 +158,7 @@ def _check_layouts(uses: Sequence[_SignalUse]) -> Iterator[str]:
 
 
 def _check_multiplexing(uses: Sequence[_SignalUse]) -> Iterator[str]:
-    """Check that a command's value is in the frames of one multiplexer value, and its other signals in the same frames."""
+    """Check that a command's value is in the frames of one multiplexer value, with the command's other signals."""
     for use in uses:
         if use.role != "value" or not use.signal.multiplexer:
             continue

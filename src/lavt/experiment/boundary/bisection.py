@@ -57,8 +57,8 @@ def zero_bracket(rate: Callable[[float], float], guess_ms: float, longest_ms: fl
     """Find the delay between 0 and `longest_ms` at which `rate` rises through 0; the bracket has the width `within_ms`.
 
     The search begins at the guess plus and minus `GUESS_ERROR_MS`, and moves outwards until the sign changes. Brent's
-    method (`scipy.optimize.brentq`) then evaluates a smooth rate at few delays only. The returned bracket is the root plus
-    and minus half of `within_ms`, cut at 0 and `longest_ms`; `rate` was not evaluated at its ends.
+    method (`scipy.optimize.brentq`) then evaluates a smooth rate at few delays only. The returned bracket is the root
+    plus and minus half of `within_ms`, cut at 0 and `longest_ms`; `rate` was not evaluated at its ends.
     """
 
     def clipped_rate(delay_ms: float) -> float:

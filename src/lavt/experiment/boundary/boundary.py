@@ -187,7 +187,7 @@ def run_searches(
     """Run all searches, `jobs` at a time (None: one per core).
 
     Returns the entries of the finished searches, in the order of `searches`; the failed searches with their reasons;
-    and whether all searches were run. On Ctrl-C, the searches in progress are finished, and no further ones are started.
+    and whether all searches were run. On Ctrl-C, the searches in progress are finished, and no others are started.
     """
     progress, is_complete = _SearchProgress(on_progress), True
     try:

@@ -205,11 +205,10 @@ def _picture_age_ms(runs: Sequence[Run]) -> dict[str, float | None]:
 
 
 def _stages_ms(runs: Sequence[Run]) -> list[dict[str, Any]]:
-    """Return the stages in the order in which a frame passes them, each with the median of all runs' median latencies."""
+    """Return the stages in the order in which a frame passes them, with the median of the runs' median latencies."""
     medians_ms: dict[tuple[str, str], list[float]] = {}
-    most_stages_first = sorted(
-        runs, key=lambda run: -len(run.get("stages_ms") or [])
-    )  # the run with the most stages sets the order
+    # The order is that of the run with the most stages.
+    most_stages_first = sorted(runs, key=lambda run: -len(run.get("stages_ms") or []))
     for run in most_stages_first:
         for entry in run.get("stages_ms") or []:
             medians_ms.setdefault((entry["node"], entry["stage"]), []).append(entry["p50"])
