@@ -254,8 +254,8 @@ def test_life_of_a_frame(tmp_path: Path) -> None:  # noqa: PLR0915 (one frame, f
     received = decode(Command, passed)
     assert received == command
 
-    # Command 8. The gate accepts the command: current epoch, newer sequence, and a recent stamp of this server. The gate
-    # rejects a repetition of the command.
+    # Command 8. The gate accepts the command: current epoch, newer sequence, and a recent stamp of this server.
+    # The gate rejects a repetition of the command.
     picture_age_ns = now_ns - START_NS
     assert picture_age_ns == round(VIDEO_DELAY_MS + CONTROL_DELAY_MS) * NS_PER_MS + MIN_HOLD_NS
     car.advance(now_ns)
