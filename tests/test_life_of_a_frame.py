@@ -161,7 +161,7 @@ def test_life_of_a_frame(tmp_path: Path) -> None:  # noqa: PLR0915 (one frame, f
     packets = Packetizer(ssrc=MEDIA_SSRC, first_sequence=65_535).packetize(access_unit, rtp_timestamp(stamp_ns))
     assert len(packets) > 3
     assert max(map(len, packets)) <= MAX_PACKET_BYTES
-    repairs = RepairSender(ssrc=REPAIR_SSRC, first_sequence=0).make_repair_packets(packets, 1)
+    repairs = RepairSender(ssrc=REPAIR_SSRC, first_sequence=0).make_repair_packets(packets, count=1)
     datagrams = [server_cipher.protect(packet) for packet in (*packets, *repairs)]
     assert all(packet[12:] not in datagram for packet, datagram in zip(packets, datagrams, strict=False))
 

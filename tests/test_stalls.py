@@ -326,7 +326,7 @@ def run_session(
     return pytester.runpytest_inprocess("-p", "no:xdist", "-p", "no:cacheprovider", "-p", "no:randomly")
 
 
-def test_test_stalled_each_time_is_inconclusive(pytester: pytest.Pytester) -> None:
+def test_a_test_that_is_stalled_each_time_is_inconclusive(pytester: pytest.Pytester) -> None:
     """After two more attempts a stalled test is listed as inconclusive; it neither passes nor fails."""
     result = run_session(pytester, STALLED_TESTS)
     assert result.parseoutcomes() == {"passed": 3, "rerun": 5, "inconclusive": 3}

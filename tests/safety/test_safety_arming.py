@@ -335,9 +335,9 @@ def test_only_the_active_operator_clears_an_emergency_stop() -> None:
     rig.vehicle = vehicle_at()
     assert not rig.request("clear_emergency_stop", "bob", instance=2, number=8).granted
     rig.request("emergency_stop", "bob", instance=2, number=9)
-    late = rig.clear_emergency_stop(number=8)
-    assert not late.granted
-    assert "number" in late.reason
+    reply_to_old_number = rig.clear_emergency_stop(number=8)
+    assert not reply_to_old_number.granted
+    assert "number" in reply_to_old_number.reason
     assert rig.state == "emergency_stop"
     assert rig.clear_emergency_stop(number=9).granted
     assert rig.state == "disarmed"

@@ -22,6 +22,8 @@ from lavt.vehicle.dbw.traffic import (
 
 GENERATION_1, GENERATION_2 = load_profile("dataspeed_gen1"), load_profile("dataspeed_gen2")
 EXPECTED = expected_traffic(GENERATION_2)
+STEERING_COMMAND_ID, GEAR_REPORT_ID = 0x064, 0x067
+"""Identifiers of generation 1's messages SteeringCmd and GearReport."""
 
 
 def new_traffic() -> BusTraffic:
@@ -106,13 +108,13 @@ def test_a_missing_report_is_an_error() -> None:
 def test_lengths() -> None:
     """A frame of a wrong length is an error, unless the frame clears an override."""
     traffic = BusTraffic(GENERATION_1.codec, expected_traffic(GENERATION_1), start_ns=0)
-    traffic.receive(ReceivedCanFrame(CanFrame(0x064, bytes([0, 0, 2, 0])), 0))
+    traffic.receive(ReceivedCanFrame(CanFrame(STEERING_COMMAND_ID, bytes([0, 0, 2, 0])), 0))
     assert summary_of(traffic, 0, "SteeringCmd").values["CLEAR"] == 1
     assert summary_of(traffic, 0, "SteeringCmd").wrong == ()
-    traffic.receive(ReceivedCanFrame(CanFrame(0x064, bytes(5)), 0))
-    traffic.receive(ReceivedCanFrame(CanFrame(0x067, bytes(3)), 0))
+    traffic.receive(ReceivedCanFrame(CanFrame(STEERING_COMMAND_ID, bytes(5)), 0))
+    traffic.receive(ReceivedCanFrame(CanFrame(GEAR_REPORT_ID, bytes(3)), 0))
     assert summary_of(traffic, 0, "SteeringCmd").wrong == ("has 5 bytes, not 8",)
-    traffic.receive(ReceivedCanFrame(CanFrame(0x067, bytes(3)), 0))
+    traffic.receive(ReceivedCanFrame(CanFrame(GEAR_REPORT_ID, bytes(3)), 0))
     assert summary_of(traffic, 0, "GearReport").wrong == ("has 3 bytes, not 2", "cannot be decoded")
 
 

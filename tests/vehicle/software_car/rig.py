@@ -17,6 +17,12 @@ AXES = ("steering", "brake", "throttle")
 STEERING_RATIO = 14.8
 """Angle of the steering wheel divided by the angle of the road wheels."""
 DEGREES_PER_RAD = 57.29577951308232
+DRIVE = 4
+"""The number of the gear."""
+STEERING_1, BRAKE_1, THROTTLE_1, GEAR_1 = 0x064, 0x060, 0x062, 0x066
+"""The identifiers of generation 1's commands."""
+PERCENT_OF_GENERATION_1, PERCENT_OF_GENERATION_2, ANGLE_OF_GENERATION_2 = 2, 14, 2
+"""The command types (CMD_TYPE) of a pedal's percentage and of the steering wheel's angle."""
 
 
 def crc_by_division(identifier: int, data: bytes) -> int:
@@ -72,26 +78,25 @@ class Sender1:
         """Return the commands for steering, brake and throttle, with the next counter."""
         self.count = (self.count + 1) % 256
         bits = values.enable | values.clear << 1 | values.ignore_override << 2
-        return [
-            CanFrame(
-                0x064,
-                struct.pack("<hBBBBBB", round(values.angle_deg * 10), bits, values.rate, 0, 0, 0, self.count),
-            ),
-            CanFrame(0x060, struct.pack("<HBBBBBB", round(values.brake * 65535), 2 << 4, bits, 0, 0, 0, self.count)),
-            CanFrame(0x062, struct.pack("<HBBBBBB", round(values.throttle * 65535), 2 << 4, bits, 0, 0, 0, self.count)),
-        ]
+        angle, pedal_type = round(values.angle_deg * 10), PERCENT_OF_GENERATION_1 << 4
+        steering = struct.pack("<hBBBBBB", angle, bits, values.rate, 0, 0, 0, self.count)
+        brake, throttle = (
+            struct.pack("<HBBBBBB", round(fraction * 65535), pedal_type, bits, 0, 0, 0, self.count)
+            for fraction in (values.brake, values.throttle)
+        )
+        return [CanFrame(STEERING_1, steering), CanFrame(BRAKE_1, brake), CanFrame(THROTTLE_1, throttle)]
 
     def clearing(self) -> list[CanFrame]:
         """Return the frames that clear overrides."""
         return [
-            CanFrame(0x064, bytes([0, 0, 2, 0])),
-            CanFrame(0x060, bytes([0, 0, 0, 2])),
-            CanFrame(0x062, bytes([0, 0, 0, 2])),
+            CanFrame(STEERING_1, bytes([0, 0, 2, 0])),
+            CanFrame(BRAKE_1, bytes([0, 0, 0, 2])),
+            CanFrame(THROTTLE_1, bytes([0, 0, 0, 2])),
         ]
 
     def gear(self, gear: int, clear: bool = False) -> CanFrame:
         """Return the command for a gear."""
-        return CanFrame(0x066, bytes([gear | clear << 7]))
+        return CanFrame(GEAR_1, bytes([gear | clear << 7]))
 
 
 class Sender2:
@@ -104,13 +109,14 @@ class Sender2:
         """Return the commands for steering, brake and throttle, with the next counter."""
         self.count = (self.count + 1) % 16
         bits = values.enable << 4 | values.clear << 5 | values.ignore_override << 6
-        tail = (0, 0, self.count)
-        steering = struct.pack("<hBBBBB", round(values.angle_deg * 10), 2 | bits, values.rate, *tail)
+        angle, tail = round(values.angle_deg * 10), (0, 0, self.count)
+        steering = struct.pack("<hBBBBB", angle, ANGLE_OF_GENERATION_2 | bits, values.rate, *tail)
+        pedal_type = PERCENT_OF_GENERATION_2 | bits
         pedals = [(1, round(values.brake * 10_000)), (2, round(values.throttle * 4_000))]
         return [
             with_crc(self.first_identifier, steering),
             *(
-                with_crc(self.first_identifier + part, struct.pack("<HBBBBB", raw, 14 | bits, 0, *tail))
+                with_crc(self.first_identifier + part, struct.pack("<HBBBBB", raw, pedal_type, 0, *tail))
                 for part, raw in pedals
             ),
         ]
@@ -166,8 +172,8 @@ class KitRig:
         self.request_system()
         assert self.enabled() == set(AXES)
         if in_drive:
-            self.send(self.sender.gear(4))
-            assert self.kit.state.gear == 4
+            self.send(self.sender.gear(DRIVE))
+            assert self.kit.state.gear == DRIVE
 
     def wait_ms(self, duration_ms: float) -> None:
         """Let time pass, and note the kit's reports in `newest_reports`."""
