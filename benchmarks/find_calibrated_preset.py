@@ -48,7 +48,8 @@ def threshold_ms(counts: Counts) -> float:
     completed, runs = np.array(list(counts.values()), dtype=np.float64).T
 
     def cost(parameters: np.ndarray) -> float:
-        share = expit((parameters[0] - delay_ms) / (MIN_WIDTH_MS + math.exp(parameters[1])))
+        centre_ms, log_width = parameters
+        share = expit((centre_ms - delay_ms) / (MIN_WIDTH_MS + math.exp(log_width)))
         share = np.clip(share, 1e-9, 1 - 1e-9)
         return float(-np.sum(completed * np.log(share) + (runs - completed) * np.log(1 - share)))
 

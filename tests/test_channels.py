@@ -1,3 +1,5 @@
+"""Tests of `CHANNELS`, the table of all channels."""
+
 from __future__ import annotations
 
 import ast
@@ -16,6 +18,7 @@ from lavt.domain import Now
 from lavt.node import WAKE, Node
 
 EXTERNAL_SENDERS = {"clock_source", "injector", "operator", "runtime"}
+"""The senders in the table that are no nodes."""
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from tests.kernel.lane import clocks, host_stalls
 from tests.kernel.lane.host_stalls import STALLS_PER_ANSWER, HostProbe
 from tests.kernel.lane.verdicts import MEDIAN_SHARE, shortest_stall_ms
 from tests.support.stalls import HostStalled, ProbeEnded, Stall, Stalls, excuse_slow_machine, stalled_share
-from tests.test_stalls import QUIET, FakeProbe, stalls_of
+from tests.test_stalls import QUIET, FakeLatenessProbe, stalls_of
 
 from lavt.domain import NS_PER_MS, NS_PER_S
 
@@ -107,7 +107,7 @@ def test_processor_times_are_those_of_the_host() -> None:
 def test_answers_have_a_limited_length() -> None:
     """An answer has at most 40 stalls and announces further stalls; the next answer has only these."""
     recorded = [Stall(0, number, number + 1) for number in range(STALLS_PER_ANSWER + 1)]
-    stalls = Stalls([FakeProbe([(0, []), (0, recorded)])], lambda: QUIET)
+    stalls = Stalls([FakeLatenessProbe([(0, []), (0, recorded)])], lambda: QUIET)
     first, second = (host_stalls._answer(stalls) for _ in range(2))
     assert (len(first["stalls"]), first["more"]) == (STALLS_PER_ANSWER, True)
     assert (len(second["stalls"]), second["more"]) == (1, False)

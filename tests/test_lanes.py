@@ -28,14 +28,14 @@ from tests.support.lane_runner import LaneOutcome, closing_line, parse_counts, r
 
 from lavt.domain import NS_PER_S
 
-OPTIONS = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["pytest"]["ini_options"]
+PYTEST_OPTIONS = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["pytest"]["ini_options"]
 PYTEST_LANES = {lane.name: lane.commands[0][3:] for lane in (*LANES, FULL) if "pytest" in lane.commands[0]}
 """The arguments of pytest in each lane that is a single pytest command."""
 
 
 @pytest.fixture(scope="module")
 def collected(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
-    """Return the tests that each lane's command collects in a small project with these options."""
+    """Return the tests that each lane's command collects in a small project with LAVT's pytest options."""
     root = tmp_path_factory.mktemp("project")
     plain = "import pytest\n\ndef test_plain(): pass\n"
     marked = "".join(f"\n@pytest.mark.{marker}\ndef test_{marker}(): pass\n" for marker in ("full", "realtime"))
@@ -48,7 +48,7 @@ def collected(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
     mark = "import pytest\n\ndef pytest_collection_modifyitems(items):\n    for item in items:\n"
     mark += "        if 'realtime' in item.path.parts: item.add_marker(pytest.mark.realtime)\n"
     (root / "tests" / "realtime" / "conftest.py").write_text(mark)
-    options = {**OPTIONS, "addopts": OPTIONS["addopts"].replace("-n auto", "-n 0")}
+    options = {**PYTEST_OPTIONS, "addopts": PYTEST_OPTIONS["addopts"].replace("-n auto", "-n 0")}
     lines = [f"{key} = {value!r}" for key, value in options.items()]
     (root / "pyproject.toml").write_text("\n".join(["[tool.pytest.ini_options]", *lines, ""]))
     return {
@@ -98,7 +98,7 @@ def test_tests_in_lane_folders_have_no_lane_marker() -> None:
 
 def test_only_untimed_lanes_run_in_parallel() -> None:
     """The quick and the full tests use all processors; single files and other lanes run sequentially."""
-    assert shlex.split(OPTIONS["addopts"])[-1] == QUICK
+    assert shlex.split(PYTEST_OPTIONS["addopts"])[-1] == QUICK
     assert runs_in_parallel(QUICK, [])
     assert runs_in_parallel("full", [TESTS, TESTS / "cli"])
     assert not runs_in_parallel("realtime", [TESTS])
@@ -237,7 +237,7 @@ def test_table_lists_lanes_and_failures() -> None:
 
 
 def test_the_programs_in_the_ci_script_run() -> None:
-    """The lines of Python in `.ci/run` find the names that they import, which no linter checks."""
+    """The Python programs in `.ci/run` can import all names that they use; no linter checks these programs."""
     programs = re.findall(r"python -c '([^']*)'", (REPOSITORY / ".ci" / "run").read_text())
     assert len(programs) == 3
     for program in programs:

@@ -1,4 +1,4 @@
-"""The first test to read: a frame and its command through all steps of ARCHITECTURE.md, without nodes and runtime."""
+"""The first test to read: a frame and its command through all stages of ARCHITECTURE.md, without nodes and runtime."""
 
 from __future__ import annotations
 
@@ -48,6 +48,8 @@ CHALLENGE = bytes(range(16))
 """Random bytes of the server, which decide the keys of one video path together with the session's token."""
 ARMING_FRAMES = 51
 """The frames before the test's frame. Each has an arming command; at 20 ms each, they take just more than a second."""
+MEDIA_SSRC, REPAIR_SSRC = 7, 8
+"""The numbers (SSRC) of the RTP streams of video packets and of repair packets."""
 
 
 class Gateways:
@@ -101,7 +103,7 @@ def armed_gate(car: Simulator) -> tuple[SafetyGate, Gateways, SessionReply]:
     numbers = count(1)
     gate = SafetyGate(LIMITS, limiter, new_epoch=lambda: next(numbers), new_token=lambda: bytes(16))
     gateways = Gateways(gate)
-    gateways.client.send(Send("session", encode(SessionRequest("acquire", "operator-1", 1, 0))))
+    gateways.client.send(Send("session", encode(SessionRequest("acquire", "operator-1", instance=1, number=0))))
     request = decode(SessionRequest, gateways.exchange())
     answer = gate.session.answer(request, car.state(), START_NS)
     gateways.server.send(Send("session_reply", encode(answer), "query"))
@@ -147,7 +149,7 @@ def test_life_of_a_frame(tmp_path: Path) -> None:  # noqa: PLR0915 (one frame, f
     # Frame 2. The stamp, which is the send time, is written into the pixels, and the server remembers it.
     stamp_ns = WALL_NS + now_ns
     write_stamp(frame.picture, stamp_ns)
-    gate.issued_stamps.add(stamp_ns, frame.number, now_ns, pixel_crc=51)
+    gate.issued_stamps.add(stamp_ns, frame.number, now_ns, pixel_crc=frame.number)
     assert set(frame.picture[:64, :64].ravel().tolist()) == {0, 255}
 
     # Frame 3. The frame is encoded as H.264.
@@ -156,10 +158,10 @@ def test_life_of_a_frame(tmp_path: Path) -> None:  # noqa: PLR0915 (one frame, f
     assert len(access_unit) < frame.picture.nbytes / 10
 
     # Frame 4. The unit is split into RTP packets with the stamp's time, repair packets are added, all are encrypted.
-    packets = Packetizer(ssrc=7, first_sequence=65_535).packetize(access_unit, rtp_timestamp(stamp_ns))
+    packets = Packetizer(ssrc=MEDIA_SSRC, first_sequence=65_535).packetize(access_unit, rtp_timestamp(stamp_ns))
     assert len(packets) > 3
     assert max(map(len, packets)) <= MAX_PACKET_BYTES
-    repairs = RepairSender(ssrc=8, first_sequence=0).make_repair_packets(packets, 1)
+    repairs = RepairSender(ssrc=REPAIR_SSRC, first_sequence=0).make_repair_packets(packets, count=1)
     datagrams = [server_cipher.protect(packet) for packet in (*packets, *repairs)]
     assert all(packet[12:] not in datagram for packet, datagram in zip(packets, datagrams, strict=False))
 
@@ -180,7 +182,7 @@ def test_life_of_a_frame(tmp_path: Path) -> None:  # noqa: PLR0915 (one frame, f
         plain = client_cipher.unprotect(datagram)
         assert plain is not None
         packet = parse_packet(plain)
-        media_packets = [] if packet.ssrc == 8 else [packet]
+        media_packets = [] if packet.ssrc == REPAIR_SSRC else [packet]
         for media_packet in (*media_packets, *repair_receiver.push(packet, now_ns)):
             ordered += jitter_buffer.push(media_packet, now_ns)
     assert repair_receiver.recovered == 1
@@ -253,6 +255,7 @@ def test_life_of_a_frame(tmp_path: Path) -> None:  # noqa: PLR0915 (one frame, f
     assert received == command
 
     # Command 8. The gate accepts the command: current epoch, newer sequence, and a recent stamp of this server.
+    # The gate rejects a repetition of the command.
     picture_age_ns = now_ns - START_NS
     assert picture_age_ns == round(VIDEO_DELAY_MS + CONTROL_DELAY_MS) * NS_PER_MS + MIN_HOLD_NS
     car.advance(now_ns)
@@ -260,7 +263,8 @@ def test_life_of_a_frame(tmp_path: Path) -> None:  # noqa: PLR0915 (one frame, f
     assert verdict.accepted
     assert gate.admit(received, car.state(), now_ns, now_ns).reason == RejectionReason.OLD_SEQUENCE
 
-    # Command 9. The command is within the limits and stays unchanged; a wheel angle out of range is limited.
+    # Command 9. The command is within the limits and stays unchanged. An excessive wheel angle is limited, here to the
+    # present angle, because no time has passed in which the wheel could turn.
     actuation = gate.watchdog.actuation(car.state(), now_ns)
     assert (actuation.steering_rad, actuation.throttle) == (received.steering_rad, received.throttle)
     assert gate.limiter.applied_limits == ()
@@ -293,7 +297,14 @@ def test_life_of_a_frame(tmp_path: Path) -> None:  # noqa: PLR0915 (one frame, f
         brake=received.brake,
     )
     with closing(RecordWriter(tmp_path / "server.mcap", "server")) as writer:
-        stamped = FrameWritten(frame.number, stamp_ns, START_NS, frame.capture_ns, 51, len(access_unit))
+        stamped = FrameWritten(
+            number=frame.number,
+            stamp_ns=stamp_ns,
+            stamped_mono_ns=START_NS,
+            capture_ns=frame.capture_ns,
+            pixel_crc=frame.number,
+            size_bytes=len(access_unit),
+        )
         writer.write("frame", stamped, Now(START_NS, WALL_NS + START_NS))
         writer.write("admission", admission, Now(now_ns, WALL_NS + now_ns))
     record = read_record(tmp_path / "server.mcap")

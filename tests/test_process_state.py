@@ -1,4 +1,4 @@
-"""Tests of the plugin that fails a test which changes the pytest process for later tests."""
+"""Tests of a pytest plugin: a test fails if it changes the pytest process for later tests."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ def test_a_change_of_the_process_fails_the_test(name: str, monkeypatch: pytest.M
 
 
 @pytest.mark.usefixtures("_restore")
-def test_background_tests_react_to_ctrl_c() -> None:
-    """Tests in a background job, for which the shell ignores SIGINT, still react to Ctrl-C."""
+def test_pytest_reacts_to_sigint_in_a_background_job() -> None:
+    """A shell lets its background jobs ignore SIGINT (Ctrl-C); pytest reacts to it nevertheless."""
     ignore_signal(signal.SIGINT)
     pytest_configure()
     assert signal.getsignal(signal.SIGINT) == signal.default_int_handler

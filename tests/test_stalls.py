@@ -32,11 +32,12 @@ pytest_plugins = ["pytester"]
 
 MS = NS_PER_MS
 QUIET, BUSY = "cpu 0 0 0 0 0 0 0 0 0 0", "cpu 90 0 0 10 0 0 0 0 0 0"
+"""The first line of /proc/stat at the start, and after a time in which the machine was busy for 90 of 100 ticks."""
 
 
 @dataclass
-class FakeProbe:
-    """A fake probe that returns given reports in order."""
+class FakeLatenessProbe:
+    """A fake lateness probe, which returns the given reports in order, and then reports without stalls."""
 
     reports: list[tuple[int, list[Stall]]] = field(default_factory=list)
     has_realtime_priority: bool = True
@@ -51,7 +52,7 @@ class FakeProbe:
 
 
 def stalls_of(*recorded: Stall) -> Stalls:
-    return Stalls([FakeProbe()], lambda: QUIET, list(recorded))
+    return Stalls([FakeLatenessProbe()], lambda: QUIET, list(recorded))
 
 
 @pytest.mark.parametrize(
@@ -70,7 +71,7 @@ def test_short_stalls_are_not_returned() -> None:
     assert overlapping(stalls, 0, 1000 * MS, at_least_ms=30) == [stalls[1]]
 
 
-def test_stalled_share_is_that_of_the_worst_processor() -> None:
+def test_stalled_share_is_that_of_the_longest_stalled_processor() -> None:
     """The stalled share adds up the stalls of one processor in the interval: the processor that was stalled longest."""
     stalls = [Stall(0, 0, 20 * MS), Stall(0, 50 * MS, 60 * MS), Stall(1, 0, 15 * MS), Stall(0, 90 * MS, 500 * MS)]
     assert stalled_share(stalls, 10 * MS, 100 * MS) == pytest.approx((10 + 10 + 10) / 90)
@@ -118,7 +119,7 @@ def test_stalled_share_excuses_a_rate(share: float, raised: type[Exception]) -> 
 def test_verdict_waits_for_a_complete_record() -> None:
     """Probes are queried until each has reported beyond the end of the interval."""
     late = Stall(0, 50 * MS, 90 * MS)
-    slow_probe = FakeProbe([(0, []), (80 * MS, []), (99 * MS, [late]), (101 * MS, [])])
+    slow_probe = FakeLatenessProbe([(0, []), (80 * MS, []), (99 * MS, [late]), (101 * MS, [])])
     assert Stalls([slow_probe], lambda: QUIET).during(0, 100 * MS) == [late]
     assert slow_probe.reports == []
 
@@ -308,8 +309,8 @@ def test_tries():
 """
 
 
-class EndedProbe(FakeProbe):
-    """A fake probe that ends after its first report."""
+class EndedProbe(FakeLatenessProbe):
+    """A fake lateness probe that ends after its first report."""
 
     def report(self) -> tuple[int, list[Stall]]:  # noqa: D102 (of `Probe`)
         if self.report_count:
@@ -318,14 +319,14 @@ class EndedProbe(FakeProbe):
 
 
 def run_session(
-    pytester: pytest.Pytester, tests: str, *, after: str = BUSY, probe: type[FakeProbe] = FakeProbe
+    pytester: pytest.Pytester, tests: str, *, after: str = BUSY, probe: type[FakeLatenessProbe] = FakeLatenessProbe
 ) -> pytest.RunResult:
     pytester.makeconftest(CONFTEST.format(before=QUIET, after=after, probe=probe.__name__))
     pytester.makepyfile(tests)
     return pytester.runpytest_inprocess("-p", "no:xdist", "-p", "no:cacheprovider", "-p", "no:randomly")
 
 
-def test_test_stalled_each_time_is_inconclusive(pytester: pytest.Pytester) -> None:
+def test_a_test_that_is_stalled_each_time_is_inconclusive(pytester: pytest.Pytester) -> None:
     """After two more attempts a stalled test is listed as inconclusive; it neither passes nor fails."""
     result = run_session(pytester, STALLED_TESTS)
     assert result.parseoutcomes() == {"passed": 3, "rerun": 5, "inconclusive": 3}

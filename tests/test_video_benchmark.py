@@ -63,8 +63,8 @@ def test_a_frame_is_damaged_if_it_is_2_db_worse_or_not_shown() -> None:
 def test_two_links_of_a_case_are_identical() -> None:
     """Delay and loss of a packet depend only on its number, so two links of one case agree on every packet."""
     for case in CASES:
-        one, other = PacketImpairment(case), PacketImpairment(case)
-        assert [one.next_delay_ns() for _ in range(2000)] == [other.next_delay_ns() for _ in range(2000)]
+        one_link, other_link = PacketImpairment(case), PacketImpairment(case)
+        assert [one_link.next_delay_ns() for _ in range(2000)] == [other_link.next_delay_ns() for _ in range(2000)]
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
@@ -77,9 +77,9 @@ def test_the_link_follows_the_case(case: LinkCase) -> None:
     if case.burst_packets:
         is_burst_start = lost[1:] & ~lost[:-1]
         assert abs(lost.sum() / is_burst_start.sum() - case.burst_packets) < 0.3
-    arrived_ns = [delay_ns for delay_ns in delays_ns if delay_ns is not None]
-    assert 0 <= min(arrived_ns) <= max(arrived_ns) <= case.jitter_ms * 1e6
-    assert max(arrived_ns) >= 0.99 * case.jitter_ms * 1e6
+    delays_of_arrived_ns = [delay_ns for delay_ns in delays_ns if delay_ns is not None]
+    assert 0 <= min(delays_of_arrived_ns) <= max(delays_of_arrived_ns) <= case.jitter_ms * 1e6
+    assert max(delays_of_arrived_ns) >= 0.99 * case.jitter_ms * 1e6
 
 
 def test_traffic_is_counted_by_payload_type_from_the_last_warm_up_packet_on() -> None:

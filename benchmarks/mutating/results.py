@@ -30,7 +30,8 @@ _FIELD_TYPES: Final[dict[str, type | tuple[type, ...]]] = {
 }
 
 Place = tuple[str, str, str, str]
-"""Module, function, line and mutated line; the same line can occur more than once in a function."""
+"""Module, function, line and mutated line, but not the occurrence: an accepted survivor covers each occurrence of its
+line in the function."""
 
 
 @dataclass(frozen=True)

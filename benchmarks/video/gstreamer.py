@@ -54,7 +54,7 @@ def sender_pipeline(run: Run) -> str:
     If the run saves access units, the pipeline also sends a copy of each to an appsink.
     """
     copy_to_appsink = ""
-    if run.saves_units_and_errors:
+    if run.saves_units_and_picture_errors:
         copy_to_appsink = "! tee name=copies copies. ! appsink name=units sync=false copies. "
     return (
         "appsrc name=source is-live=true format=time max-bytes=0 "

@@ -36,18 +36,18 @@ def main() -> None:
     pictures = map_pictures(run.pictures_stem)
     print_json({})
     wait_for_line()
-    cpu_after_frames_ns = _send(gst, run, pipeline.get_by_name("source"), pictures)
+    cpu_after_each_frame_ns = _send(gst, run, pipeline.get_by_name("source"), pictures)
     pipeline.get_by_name("source").end_of_stream()
     pipeline.get_bus().timed_pop_filtered(5 * gst.SECOND, gst.MessageType.EOS | gst.MessageType.ERROR)
-    save_units(run, _pull_units(gst, pipeline) if run.saves_units_and_errors else [])
+    save_units(run, _pull_units(gst, pipeline) if run.saves_units_and_picture_errors else [])
     pipeline.set_state(gst.State.NULL)
-    print_json({"cpu_ns": cpu_after_frames_ns})
+    print_json({"cpu_ns": cpu_after_each_frame_ns})
 
 
 def _send(gst: Any, run: Run, source: Any, pictures: NDArray[np.uint8]) -> list[int]:
     """Send all frames; return the process's total CPU time at the end of each frame."""
     sent_table = run.map_sent_table()
-    cpu_after_frames_ns = []
+    cpu_after_each_frame_ns = []
     exclude_objects_from_gc()
     pace = Pace()
     for number in range(run.frames):
@@ -64,8 +64,8 @@ def _send(gst: Any, run: Run, source: Any, pictures: NDArray[np.uint8]) -> list[
         sent_table[number, NUMBER_COLUMN] = number
         sent_table[number, STAMP_COLUMN] = stamp_ns
         source.push_buffer(buffer)
-        cpu_after_frames_ns.append(cpu_ns())
-    return cpu_after_frames_ns
+        cpu_after_each_frame_ns.append(cpu_ns())
+    return cpu_after_each_frame_ns
 
 
 def _pull_units(gst: Any, pipeline: Any) -> list[bytes]:

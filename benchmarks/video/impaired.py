@@ -96,7 +96,7 @@ def run_impaired_part(folder: Path, case: LinkCase, *, frames: int) -> dict[str,
         size.height_px,
         size.bit_rate_bps,
         WARM_UP_FRAMES + frames,
-        saves_units_and_errors=True,
+        saves_units_and_picture_errors=True,
     )
     impairment = f"loss {case.loss:.0%}" if case.loss else f"U(0, {case.jitter_ms:g}) ms, reordering"
     bursts = f", bursts of {case.burst_packets:g} packets" if case.burst_packets else ""

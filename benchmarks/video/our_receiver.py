@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from benchmarks.video.our_nodes import LOOPBACK, LastPictureDecoder, ProcessRuntime, build_receiver_nodes
 from benchmarks.video.picture_log import PictureLog
-from benchmarks.video.product import LOOPBACK, LastPictureDecoder, ProcessRuntime, build_receiver_nodes
 from benchmarks.video.run import TOKEN, print_json, requested_run, wait_for_line
 
 from lavt.domain import Now

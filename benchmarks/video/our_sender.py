@@ -6,7 +6,7 @@ import threading
 from typing import Any
 
 import numpy as np
-from benchmarks.video.product import ProcessRuntime, build_sender_nodes
+from benchmarks.video.our_nodes import ProcessRuntime, build_sender_nodes
 from benchmarks.video.run import (
     NUMBER_COLUMN,
     STAMP_COLUMN,
@@ -44,7 +44,7 @@ class SentFrameRecorder:
             self._table[sent, NUMBER_COLUMN] = payload.number
             self._table[sent, STAMP_COLUMN] = payload.stamp_ns
         elif topic == "video":
-            if self._run.saves_units_and_errors:
+            if self._run.saves_units_and_picture_errors:
                 self.units.append(payload.data)
             self.cpu_ns[sent] = cpu_ns()
             self.sent = sent + 1

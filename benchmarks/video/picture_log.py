@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 class PictureLog:
     """A log of pictures: stamp, time when the stamp was read, CPU time until then and, on request, the error.
 
-    `run.saves_units_and_errors` requests the errors.
+    `run.saves_units_and_picture_errors` requests the errors.
     """
 
     def __init__(self, run: Run) -> None:
@@ -23,7 +23,7 @@ class PictureLog:
         self._noted = 0
         self._table = run.map_sent_table()
         self._number_by_stamp: dict[int, int] = {}
-        self._source = map_pictures(run.pictures_stem) if run.saves_units_and_errors else None
+        self._source = map_pictures(run.pictures_stem) if run.saves_units_and_picture_errors else None
 
     def note(self, stamp_ns: int, read_ns: int, luma: NDArray[np.uint8] | None) -> None:
         """Note a picture. If errors are requested, ignore a picture whose stamp was not sent."""

@@ -185,11 +185,11 @@ def _evaluate(run: Run, sent_cpu_ns: list[int], counts: dict[str, int], relayed:
     )
 
 
-def _cpu_ms_per_frame(cpu_after_frames_ns: list[int]) -> float:
+def _cpu_ms_per_frame(cpu_after_each_frame_ns: list[int]) -> float:
     """Return the mean CPU time of a frame from a process's CPU time after each frame; nan for fewer than two."""
-    if len(cpu_after_frames_ns) < 2:
+    if len(cpu_after_each_frame_ns) < 2:
         return float("nan")
-    return (cpu_after_frames_ns[-1] - cpu_after_frames_ns[0]) / (len(cpu_after_frames_ns) - 1) / NS_PER_MS
+    return (cpu_after_each_frame_ns[-1] - cpu_after_each_frame_ns[0]) / (len(cpu_after_each_frame_ns) - 1) / NS_PER_MS
 
 
 def measure_floor_ms(run: Run) -> float:

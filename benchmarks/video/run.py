@@ -42,8 +42,8 @@ class Run:
     """Number of frames to send, including the warm-up."""
     port: int = 0
     """Port to which a process that is started later sends."""
-    saves_units_and_errors: bool = False
-    """Whether to save the access units and the error of each received picture."""
+    saves_units_and_picture_errors: bool = False
+    """Whether to save each sent access unit, and the squared error of each received picture."""
     jitter_buffer_ms: int = 0
     """The length of GStreamer's jitter buffer."""
     synchronous: bool = False

@@ -31,7 +31,7 @@ def test_the_kit_accepts_the_commands_of_its_profile(profile: str, accepted_send
     senders: dict[str, Sender1 | Sender2] = {
         "generation 1": Sender1(),
         "remote": Sender2(),
-        "user": Sender2(first=0x210),
+        "user": Sender2(first_identifier=0x210),
     }
     for name, sender in senders.items():
         car = build(profile)

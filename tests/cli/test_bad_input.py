@@ -113,7 +113,7 @@ def test_bad_runs(command: str, case: str, run: Run, tmp_path: Path) -> None:
 
 
 BAD_BOUNDARIES = {
-    "a fixed value of the searched delay": (["network.video.delay_ms=5"], "network.video.delay_ms"),
+    "a fixed value of the delay that is searched": (["network.video.delay_ms=5"], "network.video.delay_ms"),
     "unknown road": (["routes=[nowhere]"], "'nowhere'"),
     "unknown preset": (["presets=[swift]"], "'swift'"),
     "a route twice": (["routes=[a, a]"], "routes"),
@@ -133,7 +133,7 @@ def test_bad_boundaries(case: str, run: Run, tmp_path: Path) -> None:
 
 
 def test_settings_that_the_encoder_rejects(run: Run, tmp_path: Path) -> None:
-    """Settings that only the encoder rejects are rejected after the car is built, and no directory is created."""
+    """Settings that only the encoder can reject are rejected in one sentence, and no directory is created."""
     result = run("run", DEMO, "--set", "video.buffer_ms=0.5", "--set", "vehicle.scenery=none", "--out", "mine")
     assert (result.code, result.out) == (2, "")
     assert result.err.splitlines()[-1].startswith("lavt: ")
@@ -145,7 +145,7 @@ LOOPBACK_SERVER = ("--interface", "lo", "--role", "server")
 BAD_NETEM = {
     "unknown condition": (["apply", "L9", *LOOPBACK_SERVER], "L0, L1, L2, L3, L4, L5"),
     "the clock probe's port": (["apply", "L4", *LOOPBACK_SERVER, "--video-port", "5602"], "the clock probe (port "),
-    "the probe moved onto the video": (
+    "the clock probe on the video port": (
         ["apply", "L4", *LOOPBACK_SERVER, "--probe-port", "5600"],
         "the clock probe (port ",
     ),
@@ -283,8 +283,8 @@ def test_report_of_an_invalid_result(case: str, run: Run, tmp_path: Path) -> Non
     assert files(tmp_path) == before
 
 
-def test_report_of_a_boundary_without_runs(run: Run, tmp_path: Path) -> None:
-    """A boundary.json without runs is rejected, and an invalid one ends the report with exit code 1."""
+def test_report_of_a_boundary_without_a_sweep(run: Run, tmp_path: Path) -> None:
+    """A boundary.json without a sweep's runs is rejected; an invalid boundary.json ends the report with exit code 1."""
     (tmp_path / "found").mkdir()
     (tmp_path / "found" / "boundary.json").write_text('{"runs": [{}], "groups": [{}]}')
     assert "found" in run("report", "found").rejection()

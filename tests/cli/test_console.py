@@ -50,10 +50,10 @@ def test_nested_signals_do_not_deadlock() -> None:
     subprocess.run([sys.executable, "-c", SIGNAL_AT_EVERY_LINE], check=True, timeout=60)
 
 
-@pytest.mark.usefixtures("sighup_ends_programs")
+@pytest.mark.usefixtures("default_sighup_action")
 @pytest.mark.parametrize("signal_number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_interrupts_long_work(signal_number: signal.Signals) -> None:
-    """SIGTERM and a closed terminal end long work as Ctrl-C does; afterwards the former handlers are restored."""
+    """SIGTERM and SIGHUP (closed terminal) end long work like Ctrl-C; afterwards the former handlers are restored."""
     former_handler = signal.getsignal(signal_number)
     with pytest.raises(WorkError, match="stopped"), console.interruptible():
         signal.raise_signal(signal_number)

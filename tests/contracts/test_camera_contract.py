@@ -23,18 +23,18 @@ X_M, Y_M, HEADING_RAD = ROAD.start
 POSE = Pose(0, X_M, Y_M, HEADING_RAD)
 MODEL = CameraModel(320, 240)
 TIMEOUT_S = 20.0
-RENDERERS: dict[str, Callable[[], Camera]] = {
+RENDERING_CAMERAS: dict[str, Callable[[], Camera]] = {
     "simulated": lambda: SimCamera(model=MODEL, rate_hz=30.0, phase_ns=3, road=ROAD, seed=1, scenery="none"),
     "stand-in of the node tests": lambda: NoiseCamera(MODEL),
 }
 """Cameras that render a picture for any frame number, time and pose."""
-each_camera = pytest.mark.parametrize("name", [*sorted(RENDERERS), "device"])
+each_camera = pytest.mark.parametrize("name", [*sorted(RENDERING_CAMERAS), "device"])
 
 
 @pytest.fixture
 def camera(name: str, tmp_path: Path) -> Iterator[Camera]:
-    if name in RENDERERS:
-        yield RENDERERS[name]()
+    if name in RENDERING_CAMERAS:
+        yield RENDERING_CAMERAS[name]()
         return
     path = write_video(tmp_path / "video.avi", rate_hz=30.0)
     device = VideoDevice(str(path), model=MODEL_OF_THE_VIDEO, rate_hz=30.0, clock=MachineClock())
@@ -50,10 +50,10 @@ def capture(camera: Camera, number: int, at_ns: int) -> CapturedFrame:
     return frame
 
 
-@pytest.mark.parametrize("name", sorted(RENDERERS))
+@pytest.mark.parametrize("name", sorted(RENDERING_CAMERAS))
 def test_rendered_pictures_are_byte_for_byte_reproducible(name: str) -> None:
     """Two equal rendering cameras return equal pictures for equal inputs; no two pictures share a buffer."""
-    camera, other_camera = RENDERERS[name](), RENDERERS[name]()
+    camera, other_camera = RENDERING_CAMERAS[name](), RENDERING_CAMERAS[name]()
     other_camera.capture(1, 5, POSE)
     first, other, repeated = capture(camera, 7, 9), capture(other_camera, 7, 9), capture(camera, 7, 9)
     assert first.picture.tobytes() == other.picture.tobytes() == repeated.picture.tobytes()
@@ -73,7 +73,7 @@ def test_pictures_have_the_models_size(camera: Camera) -> None:
 def test_a_frame_carries_its_number_and_its_capture_time_if_known(camera: Camera, name: str) -> None:
     """A frame has the requested number; only a rendered frame has the requested capture time, others have none."""
     frame = capture(camera, 4, 99)
-    assert (frame.number, frame.capture_ns) == (4, 99 if name in RENDERERS else None)
+    assert (frame.number, frame.capture_ns) == (4, 99 if name in RENDERING_CAMERAS else None)
 
 
 @each_camera

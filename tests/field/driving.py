@@ -1,4 +1,4 @@
-"""Run a loop whose two sides are in network namespaces of their own, and cause outages in it."""
+"""Run a control loop whose server and client are in different network namespaces, and cause outages in the loop."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from lavt.recording.record import Record, read_record
 
 SERVER = ("configs/server.yaml", "vehicle.route=straight", "vehicle.scenery=none", "vehicle.time_limit_s=3600")
 CLIENT = ("configs/client.yaml", f"video.server={VEHICLE}", "controller.rearm=true")
-BOTH_SIDES = ("record.video=false",)
+CHANGES_OF_BOTH_SIDES = ("record.video=false",)
 OBSERVER = Path(__file__).with_name("command_observer.py")
 POLL_NS = 20 * NS_PER_MS
 DRIVING_WITHIN_S = 90.0
-"""Routers find each other, the client gets control, arms and speeds up: about 8 s on a quiet machine."""
+"""In this time routers find each other, and the client gets control, arms and speeds up; usual are 8 s."""
 
 
 def wait_until(expectation: str, condition: Callable[[], bool], limit_s: float = DRIVING_WITHIN_S) -> None:
@@ -40,7 +40,7 @@ def _udp_endpoint(host: str) -> str:
 
 @dataclass(frozen=True)
 class Links:
-    """The config of each router and of the rendezvous, followed by its changes; of both sides only the changes."""
+    """For each router and the rendezvous: its config, then changes of it. For server and client: changes only."""
 
     vehicle_router: tuple[str, ...] = ("router-server.json5",)
     operator_router: tuple[str, ...] = ("router-client.json5", f'connect.endpoints=["{_udp_endpoint(VEHICLE)}"]')
@@ -72,11 +72,11 @@ CLOUD = Links(
     ("router-client.json5", f'connect.endpoints=["{_udp_endpoint(INTERNET)}"]'),
     ("router-server.json5", f'listen.endpoints=["{_udp_endpoint("0.0.0.0")}"]'),
 )
-"""Both sides' routers dial a router in the cloud, so both use the config of the router that dials."""
+"""The routers of vehicle and operator dial a router in the cloud, so both use the config of a router that dials."""
 
 
 def through_rendezvous(keys: Path) -> Links:
-    """Return links with everything through the cloud, signed and encrypted with keys of `lavt keys`."""
+    """Return links on which everything goes through the cloud, signed and encrypted with keys of `lavt keys`."""
     return replace(
         CLOUD,
         rendezvous=("rendezvous.yaml", f"bind={INTERNET}", f"vehicle_key={keys}/vehicle-1.sign.pub"),
@@ -104,7 +104,7 @@ class Outage:
 
 @dataclass
 class Drive:
-    """The processes of a loop, and the outages that the test has caused; test and processes read the same clocks."""
+    """The processes of a control loop, and the outages that the test has caused. All of them read the same clocks."""
 
     networks: FieldNetworks
     processes: Processes
@@ -210,7 +210,7 @@ class Drive:
 def running_loop(
     networks: FieldNetworks, work: Path, links: Links = MIXED, server_program: tuple[str, ...] = LAVT
 ) -> Iterator[Drive]:
-    """Run a loop in these networks."""
+    """Run a control loop in these networks."""
     with Processes(work) as processes:
         drive = Drive(networks, processes, work, links, server_program)
         drive.start()
@@ -224,7 +224,7 @@ def _network_arguments(command: str, *file_and_changes: str) -> list[str]:
 
 def _side_arguments(side: str, config_and_changes: tuple[str, ...], out: str) -> list[str]:
     config, *changes = config_and_changes
-    return [side, config, *_set_arguments([*changes, *BOTH_SIDES]), "--out", out]
+    return [side, config, *_set_arguments([*changes, *CHANGES_OF_BOTH_SIDES]), "--out", out]
 
 
 def _set_arguments(changes: Sequence[str]) -> list[str]:

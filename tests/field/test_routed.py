@@ -42,6 +42,7 @@ WINDOW_NS = round(WINDOW_S * NS_PER_S)
 NEW_PATH_S = 3.0
 """Limit from a change of address to video at the new address. The client sends a hello 0.15 s after the last packet."""
 STALL_MS = 100
+"""A stall of this length or more excuses a failed assertion on times."""
 RECOVERY_S = 10.0
 """Limit from a change of address until a vehicle that has stopped is driven again."""
 

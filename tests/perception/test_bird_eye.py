@@ -8,8 +8,8 @@ from lavt.errors import UserError
 from lavt.perception.bird_eye import STAMP_SIDE_PX, GroundGrid, make_bird_eye
 from lavt.perception.calibration import calibrated_pinhole_camera, ground_to_picture
 
-FOCAL_PX = 320
-"""The focal length of `CameraModel()`. That camera is 1.6 m ahead of the rear axle and 1.4 m above the ground."""
+FOCAL_PX, CAMERA_AHEAD_M, CAMERA_HEIGHT_M = 320, 1.6, 1.4
+"""Focal length of `CameraModel()`, and its position: ahead of the rear axle, above the ground."""
 
 
 def pixel_of(model: CameraModel, x_m: float, y_m: float) -> tuple[float, float]:
@@ -23,20 +23,22 @@ def test_a_point_straight_ahead_is_in_the_middle_column() -> None:
     near, far = pixel_of(model, 5.0, 0.0), pixel_of(model, 20.0, 0.0)
     assert near[0] == pytest.approx((model.width_px - 1) / 2)
     assert far[0] == pytest.approx((model.width_px - 1) / 2)
-    assert near[1] == pytest.approx((model.height_px - 1) / 2 + FOCAL_PX * 1.4 / (5.0 - 1.6))
+    assert near[1] == pytest.approx((model.height_px - 1) / 2 + FOCAL_PX * CAMERA_HEIGHT_M / (5.0 - CAMERA_AHEAD_M))
     assert far[1] < near[1]
 
 
 def test_a_point_on_the_left_is_left_of_the_middle() -> None:
     """A point left of the axis is left of the middle column by focal length x offset / depth."""
-    model = CameraModel()
-    assert pixel_of(model, 11.6, 2.0)[0] == pytest.approx((model.width_px - 1) / 2 - FOCAL_PX * 2.0 / (11.6 - 1.6))
+    model, depth_m, left_m = CameraModel(), 10.0, 2.0
+    column, _ = pixel_of(model, CAMERA_AHEAD_M + depth_m, left_m)
+    assert column == pytest.approx((model.width_px - 1) / 2 - FOCAL_PX * left_m / depth_m)
 
 
 def test_a_point_at_the_pitch_angle_is_in_the_middle_row() -> None:
     """A camera pitched down by the angle of a ground point has that point in the middle row."""
-    pitch_rad = math.atan2(1.4, 10.0)
-    assert pixel_of(CameraModel(pitch_rad=pitch_rad), 11.6, 0.0)[1] == pytest.approx((480 - 1) / 2)
+    model = CameraModel(pitch_rad=math.atan2(CAMERA_HEIGHT_M, 10.0))
+    _, row = pixel_of(model, CAMERA_AHEAD_M + 10.0, 0.0)
+    assert row == pytest.approx((model.height_px - 1) / 2)
 
 
 def test_a_ground_point_maps_to_its_cell() -> None:

@@ -23,7 +23,7 @@ from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.experiment.analysis.invalid_reason import InvalidReason
 from lavt.experiment.analysis.metrics import measure
 from lavt.experiment.runs.plan import PlannedRun, plan_run
-from lavt.experiment.runs.real_run import relay_reasons
+from lavt.experiment.runs.real_run import relay_invalid_reasons
 from lavt.recording.record import read_record
 
 HERE = Path(__file__).parent
@@ -64,16 +64,16 @@ def planned() -> Callable[..., PlannedRun]:
 
 @dataclass(frozen=True)
 class RealDrive:
-    """One drive in real time: its directory, its result, the relay's invalid reasons, and the closure error."""
+    """One drive in real time: its directory, its result, why the relay makes it invalid, and the closure error."""
 
     out: Path
     result: dict[str, Any]
-    relay_reasons: list[InvalidReason]
+    relay_invalid_reasons: list[InvalidReason]
     closure_p95_ms: float | None
 
 
 def read_drive(out: Path, result: dict[str, Any]) -> RealDrive:
-    reasons = relay_reasons(json.loads((out / "relay.json").read_text()))
+    reasons = relay_invalid_reasons(json.loads((out / "relay.json").read_text()))
     server, client = read_record(out / "server.mcap"), read_record(out / "client.mcap")
     return RealDrive(out, result, reasons, measure(server, client).closure_p95_ms)
 

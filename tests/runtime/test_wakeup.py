@@ -25,11 +25,11 @@ def test_setting_twice_wakes_once() -> None:
     assert not sleeper.is_alive()
 
 
-@pytest.mark.parametrize("pause_s", [-1.0, 0.0, 0.001])
-def test_a_wait_times_out(pause_s: float) -> None:
-    """A wait ends after its pause; with a pause of 0 or less it returns at once."""
+@pytest.mark.parametrize("timeout_s", [-1.0, 0.0, 0.001])
+def test_a_wait_times_out(timeout_s: float) -> None:
+    """A wait ends after its timeout, even if the event is not set; with a timeout of 0 or less it returns at once."""
     event = WakeEvent()
-    event.wait(pause_s)
+    event.wait(timeout_s)
     event.set()
     event.wait(None)
 

@@ -18,7 +18,7 @@ STOP_NUMBER = 1
 
 
 def test_arming_takes_a_full_second() -> None:
-    """The vehicle is armed when all arming conditions were met for 1 s, and not a nanosecond earlier."""
+    """The vehicle is armed when all arming conditions have been met for 1 s, and not a nanosecond earlier."""
     rig = Rig().acquire()
     rig.take_picture()
     rig.send()
@@ -257,8 +257,8 @@ def test_an_emergency_stop_is_executed_once() -> None:
 
 @pytest.mark.parametrize("number", [0, 1, 39, 2**62 - 1, 2**62 + 1, 2**63 - 2])
 @pytest.mark.parametrize("earlier", [40, 2**62, 2**63 - 1])
-def test_no_emergency_stop_prevents_a_later_one(earlier: int, number: int) -> None:
-    """After an emergency stop with any number, a stop with any other number works, and both can be cleared."""
+def test_an_emergency_stop_never_prevents_a_later_one(earlier: int, number: int) -> None:
+    """After an emergency stop with any number, a stop with any different number works; both can be cleared."""
     rig = Rig().arm()
     rig.request("emergency_stop", "bob", instance=2, number=earlier)
     assert rig.clear_emergency_stop().granted
@@ -285,8 +285,8 @@ def test_the_last_emergency_stops_are_remembered() -> None:
 
 
 def test_replayed_emergency_stops_do_not_block_the_operator_forever() -> None:
-    """After a restart, each captured emergency stop works at most once when it is replayed; a new one still works."""
-    rig = Rig().acquire()
+    """After a restart of the server, each captured stop works at most once when replayed; a new stop still works."""
+    rig = Rig().acquire()  # the restarted server, which does not remember any emergency stop
     captured = [rig.command(epoch=5, emergency_stop=number) for number in (10, 20, 30)]
     for stop in captured:
         rig.gate.admit(stop, rig.vehicle, rig.now_ns, rig.now_ns)
@@ -335,9 +335,9 @@ def test_only_the_active_operator_clears_an_emergency_stop() -> None:
     rig.vehicle = vehicle_at()
     assert not rig.request("clear_emergency_stop", "bob", instance=2, number=8).granted
     rig.request("emergency_stop", "bob", instance=2, number=9)
-    late = rig.clear_emergency_stop(number=8)
-    assert not late.granted
-    assert "number" in late.reason
+    reply_to_old_number = rig.clear_emergency_stop(number=8)
+    assert not reply_to_old_number.granted
+    assert "number" in reply_to_old_number.reason
     assert rig.state == "emergency_stop"
     assert rig.clear_emergency_stop(number=9).granted
     assert rig.state == "disarmed"

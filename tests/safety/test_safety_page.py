@@ -36,7 +36,7 @@ def test_a_changed_table_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "| emergency stop cleared | driving | arming |" in changed
 
 
-def test_every_transition_limit_and_rejection_is_drawn() -> None:
+def test_all_transitions_limits_and_rejections_are_drawn() -> None:
     """The page shows each transition, each limit with its reason, and the rejection reasons in checking order."""
     arrows = re.findall(r"(\w+) --> \w+: (.+)", DRAWINGS["states"]())
     assert {(before, trigger) for before, triggers in arrows for trigger in triggers.split(", ")} == set(TRANSITIONS)

@@ -59,7 +59,7 @@ class RunningLane:
         self._command = ""
         self._process: subprocess.Popen[bytes] | None = None
         self._output = folder / f"{lane.name}.output"
-        # The progress file has a folder of its own, because the kernel lane's machines can write to this folder.
+        # The kernel lane's machines can write to the folder of the progress file, so this folder has no other files.
         self._progress = folder / lane.name / "progress"
         self._progress.parent.mkdir()
         self._output.touch()

@@ -22,7 +22,7 @@ PYTEST_PREFIX = "PYTEST_"
 
 
 def pytest_configure() -> None:
-    """Let Ctrl-C end the tests and their programs, even if a shell without job control made pytest ignore it."""
+    """Let Ctrl-C end the tests and their programs, even if a shell without job control made pytest ignore SIGINT."""
     if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -79,7 +79,7 @@ def restored_environment() -> Iterator[None]:
 
 
 @pytest.fixture
-def sighup_ends_programs() -> Iterator[None]:
+def default_sighup_action() -> Iterator[None]:
     """Let SIGHUP end a program that the test starts, even if the tests run under `nohup`."""
     previous = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     yield

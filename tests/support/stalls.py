@@ -64,7 +64,7 @@ class ProbeEnded(Exception):
 
 @dataclass(frozen=True)
 class Stall:
-    """An interval in which one processor did not run its probe (CLOCK_MONOTONIC)."""
+    """An interval in which one processor did not run its lateness probe (CLOCK_MONOTONIC)."""
 
     processor: int | str
     begin_ns: int
@@ -128,7 +128,7 @@ def idle_share(before: str, after: str) -> float:
 
 
 class Probe(Protocol):
-    """The interface of a probe."""
+    """The interface of a lateness probe, which records when its processor was stalled."""
 
     has_realtime_priority: bool
     """Whether no program without real-time priority can delay the probe."""

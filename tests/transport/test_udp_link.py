@@ -19,6 +19,7 @@ from lavt.transport.udp_link import UdpLink
 
 ARRIVAL_TIMEOUT_S = 5.0
 ANY_PORT = ("127.0.0.1", 0)
+CLOSED_PORT = 9
 
 
 class Delivered(NamedTuple):
@@ -134,15 +135,16 @@ def test_send_to_a_peer(sender: socket.socket) -> None:
 def test_send_to_the_remote(sender: socket.socket, port_configured: bool) -> None:
     """A client's link sends to its server, at the configured port or else at the port of the session's reply."""
     port = sender.getsockname()[1]
-    with closing(open_link(remote=("localhost", port if port_configured else 0))) as link:
-        link.send(Send("feedback", b"hello", 9 if port_configured else port))
+    configured_port, port_in_reply = (port, CLOSED_PORT) if port_configured else (0, port)
+    with closing(open_link(remote=("localhost", configured_port))) as link:
+        link.send(Send("feedback", b"hello", port_in_reply))
         assert sender.recv(100) == b"hello"
 
 
 def test_unsendable_datagrams_are_counted() -> None:
     """A datagram that the system rejects is counted and raises nothing."""
     with closing(open_link()) as link:
-        for payload, address in ((bytes(70_000), ANY_PORT), (b"x", ("255.255.255.255", 9)), (b"x", ANY_PORT)):
+        for payload, address in ((bytes(70_000), ANY_PORT), (b"x", ("255.255.255.255", CLOSED_PORT)), (b"x", ANY_PORT)):
             link.send(Send("rtp", payload, address))
         assert link.counts == {"datagrams_not_sent": 3}
 

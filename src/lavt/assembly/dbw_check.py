@@ -14,7 +14,7 @@ from lavt.vehicle.dbw.profile import AXES, REPEAT_PERIOD_NS, Profile
 
 MAX_FRAME_BYTES: Final = 8
 MIN_PERIODS_PER_TIMEOUT: Final = 2
-"""So that a timeout tolerates one lost message."""
+"""A timeout of fewer periods would not tolerate one lost message."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,9 +123,9 @@ def _message_name(message: str | dict[CommandSet, str], config: ProfileConfig) -
 def _check_identifiers(codec: Codec) -> Iterator[str]:
     owners: dict[tuple[int, bool], str] = {}
     for message in codec.messages.values():
-        first = owners.setdefault((message.identifier, message.is_extended), message.name)
-        if first != message.name:
-            yield f"the DBC has two messages of identifier 0x{message.identifier:03X}: {first} and {message.name}"
+        owner = owners.setdefault((message.identifier, message.is_extended), message.name)
+        if owner != message.name:
+            yield f"the DBC has two messages of identifier 0x{message.identifier:03X}: {owner} and {message.name}"
 
 
 def _is_switch(use: _SignalUse) -> bool:
@@ -158,20 +158,20 @@ def _check_layouts(uses: Sequence[_SignalUse]) -> Iterator[str]:
 
 
 def _check_multiplexing(uses: Sequence[_SignalUse]) -> Iterator[str]:
-    """Check that the frames of one multiplexer value have a command's value, and that they have its other signals."""
-    for value in uses:
-        if value.role != "value" or not value.signal.multiplexer:
+    """Check that a command's value is in the frames of one multiplexer value, with the command's other signals."""
+    for use in uses:
+        if use.role != "value" or not use.signal.multiplexer:
             continue
-        if len(value.signal.branches) != 1:
-            values = ", ".join(map(str, sorted(value.signal.branches)))
+        if len(use.signal.branches) != 1:
+            multiplexer_values = ", ".join(map(str, sorted(use.signal.branches)))
             yield (
-                f"{value.key}.value: {value.signal.name} is in the frames of several multiplexer values ({values}), so "
-                "the value to send is ambiguous"
+                f"{use.key}.value: {use.signal.name} is in the frames of several multiplexer values "
+                f"({multiplexer_values}), so the value to send is ambiguous"
             )
         for other in uses:
-            shares_multiplexer = other.key == value.key and other.signal.multiplexer == value.signal.multiplexer
-            if shares_multiplexer and not value.signal.branches & other.signal.branches:
-                yield f"{other.key}.{other.role}: {other.signal.name} shares no frame with {value.signal.name}"
+            shares_multiplexer = other.key == use.key and other.signal.multiplexer == use.signal.multiplexer
+            if shares_multiplexer and not use.signal.branches & other.signal.branches:
+                yield f"{other.key}.{other.role}: {other.signal.name} shares no frame with {use.signal.name}"
 
 
 def _check_duplicates(uses: Sequence[_SignalUse]) -> Iterator[str]:
@@ -179,9 +179,9 @@ def _check_duplicates(uses: Sequence[_SignalUse]) -> Iterator[str]:
     roles: dict[tuple[str, str], str] = {}
     for use in uses:
         if use.key.startswith("sent."):
-            first = roles.setdefault((use.key, use.signal.name), use.role)
-            if first != use.role:
-                yield f"{use.key}: {use.signal.name} is both {first} and {use.role}"
+            earlier_role = roles.setdefault((use.key, use.signal.name), use.role)
+            if earlier_role != use.role:
+                yield f"{use.key}: {use.signal.name} is both {earlier_role} and {use.role}"
 
 
 def _check_limits(config: ProfileConfig, uses: Sequence[_SignalUse]) -> Iterator[str]:
@@ -252,7 +252,7 @@ def _check_clearing(config: ProfileConfig, uses: Sequence[_SignalUse]) -> Iterat
 
 
 def _check_timeouts(config: ProfileConfig, codec: Codec) -> Iterator[str]:
-    """Check that timeouts are no longer than the DBC's and tolerate one lost message."""
+    """Check that each timeout tolerates one lost message, and that no timeout is longer than the DBC's."""
     for key, name, _ in _messages(config):
         message = codec.messages.get(name)
         if message is None:

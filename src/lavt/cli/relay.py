@@ -83,7 +83,11 @@ def flows(config: RelayConfig) -> list[RelayedFlow]:
 
 
 def _delay_model(config: DelayConfig, seed: int, *, stream_name: str) -> DelayModel:
-    """Return the config's constant delay plus jitter, drawn from the random-number stream `stream_name` of `seed`."""
+    """Return the config's constant delay plus jitter.
+
+    The jitter is drawn from the random-number stream `stream_name` of `seed`. The streams are named "inherent", because
+    only the inherent latency has this jitter; the constant delay can be inherent, injected or both.
+    """
     jitter = Lognormal(config.jitter_median_ms, config.jitter_sigma) if config.jitter_median_ms > 0 else None
     return DelayModel(config.constant_ms, jitter, seed, stream_name)
 

@@ -8,7 +8,7 @@ from lavt.config.section import Section
 
 
 class ServerSecurityConfig(Section):
-    """The operators who may drive; without keys, anyone who can reach the router can drive."""
+    """The vehicle's key, and the operators who may drive. Without keys, anyone who can reach the router can drive."""
 
     key: str = ""
     """The file of the vehicle's signing key (NAME.sign.key of `lavt keys`)."""

@@ -23,7 +23,7 @@ class CapturedFrame(Struct, frozen=True):
 
 
 class FrameTimes(Struct, frozen=True):
-    """The times of one event for each frame, the opening or the closing of the shutter (server's monotonic clock)."""
+    """The times at which the shutter opens for each frame, or those at which it closes (server's monotonic clock)."""
 
     first_ns: int
     rate_hz: float

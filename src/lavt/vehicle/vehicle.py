@@ -28,9 +28,9 @@ class Capabilities:
     virtual_time: bool
     """Whether the vehicle can be driven in virtual time."""
     ground_truth: bool
-    """Whether the vehicle has a ground truth."""
+    """Whether the vehicle knows its true position, as a simulated one does."""
     reset: bool
-    """Not used yet."""
+    """Whether the vehicle can return to its start; not used yet."""
     wheelbase_m: float
     max_steering_rad: float
     max_steering_rate_radps: float

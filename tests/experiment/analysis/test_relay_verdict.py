@@ -12,7 +12,7 @@ from lavt.config import Condition, ImpairmentConfig, RunConfig
 from lavt.config_file import conditions, parse_config
 from lavt.experiment.analysis.invalid_reason import InvalidCode, InvalidReason, not_measured
 from lavt.experiment.runs.plan import PlannedRun, injected_entry, plan_run
-from lavt.experiment.runs.real_run import _relay_config, _requested_ms, relay_reasons
+from lavt.experiment.runs.real_run import _relay_config, _requested_ms, relay_invalid_reasons
 
 
 def planned(condition: str, **network: Any) -> PlannedRun:
@@ -42,7 +42,7 @@ def reasons(
 ) -> list[InvalidReason]:
     """Return the reasons from the relay's measurements (video, control)."""
     directions = ("video downstream", "control upstream")
-    return relay_reasons(
+    return relay_invalid_reasons(
         {
             "requested_ms": requested,
             "held_ms": dict(zip(directions, median_ms, strict=True)),
@@ -73,7 +73,7 @@ def test_a_variable_delay_is_judged_by_its_lateness() -> None:
 
 def test_a_relay_without_measurements_makes_the_run_invalid() -> None:
     """Without the relay's measurements, a run is invalid because no flow's delay was measured."""
-    for reason, flow in zip(relay_reasons({}), ("video", "control"), strict=True):
+    for reason, flow in zip(relay_invalid_reasons({}), ("video", "control"), strict=True):
         assert reason == not_measured(flow)
 
 

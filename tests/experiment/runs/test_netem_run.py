@@ -113,7 +113,7 @@ def test_a_rejected_run_keeps_the_queue_of_another_owner(tmp_path: Path) -> None
 
 
 def test_a_delay_that_differs_from_the_request_makes_the_run_invalid(tmp_path: Path) -> None:
-    """A delay that is 3 ms too long after the drive makes the run invalid; the reason names this time.
+    """A delay that is 3 ms too long after the drive makes the run invalid; the reason begins with "after the drive".
 
     Correlated jitter that has stopped and a missing queue make a run invalid, too.
     """

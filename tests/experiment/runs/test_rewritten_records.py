@@ -1,4 +1,4 @@
-"""Tests of records that another program has rewritten: files and checksums are valid, but messages have any content."""
+"""Tests of records that another program has rewritten: file and checksums are valid, but messages are not LAVT's."""
 
 from __future__ import annotations
 
@@ -67,13 +67,14 @@ def write(directory: Path, side: str, topics: list[tuple[str, Rows]]) -> None:
 def mutate(rows: Rows, generator: Any) -> Rows:
     """Return the messages with one kind of random change to some or all of them.
 
-    A changed message has another value, null and an additional field, another content or time, or is left out.
+    The kinds: a field gets another value; a field becomes null, and another field is added; the whole content is
+    replaced; both times are replaced; the message is left out.
     """
 
     def any_of(values: list[Any]) -> Any:
         return values[generator.integers(len(values))]
 
-    kind = any_of(["value", "value", "value", "null", "text", "time", "left out"])
+    kind = any_of(["value", "value", "value", "null", "content", "times", "left out"])
     _, _, first_data = rows[0]
     names, value, text = list(json.loads(first_data)), any_of(VALUES), any_of(TEXTS)
     name, time_ns, share = any_of(names), any_of(TIMES_NS), any_of([0.01, 0.5, 1.0])
@@ -86,9 +87,9 @@ def mutate(rows: Rows, generator: Any) -> Rows:
             changed.append((log_ns, publish_ns, json.dumps({**fields, name: value}).encode()))
         elif kind == "null":
             changed.append((log_ns, publish_ns, json.dumps({**fields, name: None, "additional": 1}).encode()))
-        elif kind == "text":
+        elif kind == "content":
             changed.append((log_ns, publish_ns, text))
-        elif kind == "time":
+        elif kind == "times":
             changed.append((time_ns, time_ns, data))
     return changed
 

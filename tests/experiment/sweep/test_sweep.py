@@ -165,7 +165,7 @@ def test_the_base_config_is_the_sweeps_own(changes: tuple[str, ...], base: dict[
 @pytest.mark.parametrize(
     ("signal_number", "options"), [(signal.SIGINT, ()), (signal.SIGHUP, ()), (signal.SIGINT, ("--cluster", "local"))]
 )
-@pytest.mark.usefixtures("sighup_ends_programs")
+@pytest.mark.usefixtures("default_sighup_action")
 def test_a_stopped_sweep_keeps_what_is_finished(signal_number: int, options: tuple[str, ...], tmp_path: Path) -> None:
     """Ctrl-C or a closed terminal ends a sweep with a message, exit code 1 and no traceback.
 

@@ -28,7 +28,7 @@ DRIVE_TIMEOUT_S = 240
 
 @dataclass(frozen=True)
 class LoopPrograms:
-    """The programs of a drive."""
+    """The programs of a control loop, which make a drive."""
 
     routers: tuple[StartedProgram, ...]
     server: StartedProgram
@@ -58,7 +58,7 @@ def start_loop(
     server_changes: Sequence[str] = (),
     client_changes: Sequence[str] = (),
 ) -> LoopPrograms:
-    """Start the four programs; `out` is a new directory on both machines."""
+    """Start two routers, server and client; `out` is a new directory on both machines."""
     endpoints = json.dumps([f"udp/{server.address}:{ROUTER_TO_ROUTER_PORT}?rel=1;mixed_rel=1"])
     routers = (
         _start(server, "router", "zenoh-configs/router-server.json5"),

@@ -18,8 +18,10 @@ from tests.kernel.lane.clocks import NS_PER_S, read_raw_clock_ns, wall_minus_raw
 from lavt.clock import MachineClock
 
 HEADER = struct.Struct("!BBbbII4sQQQQ")
-"""Leap, version and mode; stratum; poll; precision; root delay; root dispersion; reference; four time stamps."""
+"""Leap, version and mode; stratum; poll; precision; root delay; root dispersion; reference;
+time stamps: reference, origin, receive and transmit."""
 FROM_CLIENT, FROM_SERVER = 0x23, 0x24
+"""Leap 0 and version 4, with the mode of a client (3) or of a server (4)."""
 EPOCH_S = 2_208_988_800
 """Seconds from 1900 to 1970."""
 
@@ -59,7 +61,7 @@ def serve(address: str, port: int, clock: Clock) -> None:
 
 
 def query_offset(address: str, port: int, exchanges: int = 50) -> tuple[int, int]:
-    """Return the server's clock minus this machine's, and the round trip (ns), of the fastest exchange."""
+    """Return the server's clock minus this machine's and the round trip, both in ns, of the fastest exchange."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
         client.settimeout(2)
         client.connect((address, port))
@@ -67,15 +69,15 @@ def query_offset(address: str, port: int, exchanges: int = 50) -> tuple[int, int
 
 
 def _exchange(client: socket.socket) -> tuple[int, int]:
-    """Return the server's clock minus this machine's, and the round trip (ns)."""
+    """Return the server's clock minus this machine's and the round trip, both in ns, of one exchange."""
     sent_ns = machine_wall_ns()
     client.send(HEADER.pack(FROM_CLIENT, 0, 0, 0, 0, 0, b"", 0, 0, 0, to_ntp(sent_ns)))
     answer = client.recv(2048)
     returned_ns = machine_wall_ns()
     received_ns, replied_ns = (from_ntp(stamp) for stamp in HEADER.unpack(answer[: HEADER.size])[-2:])
-    return ((received_ns - sent_ns) + (replied_ns - returned_ns)) // 2, (returned_ns - sent_ns) - (
-        replied_ns - received_ns
-    )
+    offset_ns = ((received_ns - sent_ns) + (replied_ns - returned_ns)) // 2
+    round_trip_ns = (returned_ns - sent_ns) - (replied_ns - received_ns)
+    return offset_ns, round_trip_ns
 
 
 def to_ntp(wall_ns: int) -> int:

@@ -56,7 +56,7 @@ def test_kernel_identity_is_the_boot_id(tmp_path: Path, monkeypatch: pytest.Monk
     assert kernel_identity() == "5b1c"
 
 
-class SteppedClock:
+class AdvancingClock:
     """A clock that advances by the same time between two readings."""
 
     def __init__(self, step_ns: int) -> None:
@@ -81,7 +81,7 @@ def test_answer_within_two_seconds_counts(took_ns: int, *, in_time: bool) -> Non
     def parse(host: str, output: str, before: Now, after: Now) -> ClockReport:
         return ClockReport(before.mono_ns, after.mono_ns, host, output)
 
-    report = query_clock(("tool",), SteppedClock(took_ns), run, source="chrony", absent="absent", parse=parse)
+    report = query_clock(("tool",), AdvancingClock(took_ns), run, source="chrony", absent="absent", parse=parse)
     assert queries == [(("tool",), 2.0)]
     assert report == (ClockReport(took_ns, 2 * took_ns, kernel_identity(), "answer") if in_time else None)
 

@@ -124,7 +124,7 @@ def test_without_a_session_no_mac_is_valid(pair: Pair) -> None:
     """Before a session starts MACs are zeros, and zeros are not a valid MAC."""
     assert pair.signed_command()[-TRAILER_BYTES:-64] == bytes(16)
     assert not pair.vehicle.is_from_active_operator(pair.signed_command())
-    assert not pair.vehicle.is_next_of_active_operator("session", pair.signed_request())
+    assert not pair.vehicle.is_active_operators_next_request("session", pair.signed_request())
     assert not pair.operator.is_next_state(pair.vehicle.sign_state(b"state"))
 
 
@@ -152,11 +152,11 @@ def test_a_mac_is_valid_for_one_channel_and_one_message(pair: Pair) -> None:
     """A MAC is not valid on another channel, nor for a request or a state that was accepted before."""
     pair.acquire_control()
     request = pair.signed_request()
-    assert pair.vehicle.is_next_of_active_operator("session", request)
-    assert not pair.vehicle.is_next_of_active_operator("netem", request)
+    assert pair.vehicle.is_active_operators_next_request("session", request)
+    assert not pair.vehicle.is_active_operators_next_request("netem", request)
     assert not pair.vehicle.is_from_active_operator(request)
     pair.exchange(request)
-    assert not pair.vehicle.is_next_of_active_operator("session", request)
+    assert not pair.vehicle.is_active_operators_next_request("session", request)
     state = pair.vehicle.sign_state(b"state")
     assert pair.operator.is_next_state(state)
     assert pair.operator.verify_state(state).body == b"state"
@@ -301,12 +301,12 @@ def test_replayed_and_forged_states_are_rejected(pair: Pair) -> None:
     first, second = pair.vehicle.sign_state(b"first"), pair.vehicle.sign_state(b"second")
     assert pair.operator.verify_state(second).body == b"second"
     for old in (second, first):
-        assert pair.operator.verify_state(old) == VerifiedState(None, needs_request=False)
+        assert pair.operator.verify_state(old) == VerifiedState(None, client_must_request=False)
     assert pair.operator.counts["states_replayed"] == 2
     forged = VehicleAuthenticator("car", MALLORY, OPERATORS)
     forged._instance = pair.vehicle._instance
     forged._states = 100
-    assert pair.operator.verify_state(forged.sign_state(b"forged")) == VerifiedState(None, needs_request=False)
+    assert pair.operator.verify_state(forged.sign_state(b"forged")) == VerifiedState(None, client_must_request=False)
     assert pair.operator.counts["states_forged"] == 1
 
 
@@ -317,7 +317,7 @@ def test_after_a_reply_old_states_are_still_replays(pair: Pair) -> None:
     assert pair.operator.verify_state(state).body == b"state"
     pair.exchange(pair.signed_request())
     assert not pair.operator.is_next_state(state)
-    assert pair.operator.verify_state(state) == VerifiedState(None, needs_request=False)
+    assert pair.operator.verify_state(state) == VerifiedState(None, client_must_request=False)
     assert pair.operator.counts["states_replayed"] == 1
 
 
@@ -327,7 +327,7 @@ def test_states_of_a_restarted_server_are_accepted_after_its_first_reply(pair: P
     restarted = VehicleAuthenticator("car", VEHICLE, OPERATORS)
     state = pair.operator.verify_state(restarted.sign_state(b"new"))
     assert state.body is None
-    assert state.needs_request
+    assert state.client_must_request
     assert pair.operator.counts["states_of_unknown_process"] == 1
     pair.vehicle = restarted
     pair.exchange(pair.operator.sign_request("session", b""))
@@ -417,7 +417,7 @@ def test_arbitrary_bytes_are_rejected(data: bytes) -> None:
     assert pair.vehicle.verify_request("session", data) is None
     assert pair.vehicle.verify_request("netem", data) is None
     assert pair.operator.verify_reply("session", data).body is None
-    assert pair.operator.verify_state(data) == VerifiedState(None, needs_request=False)
+    assert pair.operator.verify_state(data) == VerifiedState(None, client_must_request=False)
 
 
 def test_without_keys_messages_are_unchanged() -> None:

@@ -11,7 +11,7 @@ from lavt.streams import stream
 from lavt.transport.messages import VERSION, encode
 from lavt.transport.security.flood_filter import FloodFilter, RateLimiter, may_be_accepted
 
-OTHER_COMMANDS_PER_S = 200
+UNACCEPTABLE_COMMANDS_PER_S = 200
 """The limit that docs/wire.md states."""
 EPOCH, SEQUENCE = 2**63 + 5, 1000
 COMMAND = Command(EPOCH, SEQUENCE + 1, 1, 2, 3, 0.1, 0.2, 0.0, (0.0,) * PATH_POINTS, "drive", 0)
@@ -51,14 +51,14 @@ def test_unacceptable_commands_are_rate_limited() -> None:
     }
     for name, flood in floods.items():
         flood_filter = new_filter()
-        assert (name, count_passed(flood_filter, flood)) == (name, OTHER_COMMANDS_PER_S)
-        assert flood_filter.counts["commands_screened_out"] == FLOOD_PER_S - OTHER_COMMANDS_PER_S
+        assert (name, count_passed(flood_filter, flood)) == (name, UNACCEPTABLE_COMMANDS_PER_S)
+        assert flood_filter.counts["commands_screened_out"] == FLOOD_PER_S - UNACCEPTABLE_COMMANDS_PER_S
 
 
 def always_passes(flood_filter: FloodFilter, command: Command) -> bool:
     """Return whether a command passes more often than the rate limit for unacceptable commands permits."""
     body = encode(command)
-    return count_passed(flood_filter, [body] * (OTHER_COMMANDS_PER_S + 1)) == OTHER_COMMANDS_PER_S + 1
+    return count_passed(flood_filter, [body] * (UNACCEPTABLE_COMMANDS_PER_S + 1)) == UNACCEPTABLE_COMMANDS_PER_S + 1
 
 
 @pytest.mark.parametrize("authentic", [[5], [3, 5], [5, 3]])
@@ -91,7 +91,7 @@ def test_a_flood_by_others_does_not_displace_the_active_operator() -> None:
     """During a flood by others that copy epoch and sequence, the active operator's commands of an old epoch pass."""
     flood_filter = new_filter()
     flood = [encode(replace(COMMAND, sequence=SEQUENCE + number)) for number in range(FLOOD_PER_S)]
-    assert count_passed(flood_filter, flood, from_active_operator=False) == OTHER_COMMANDS_PER_S
+    assert count_passed(flood_filter, flood, from_active_operator=False) == UNACCEPTABLE_COMMANDS_PER_S
     assert count_passed(flood_filter, [encode(replace(COMMAND, epoch=7))] * 50) == 50
 
 

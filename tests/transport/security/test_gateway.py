@@ -19,12 +19,43 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from lavt.transport.security.keys import PrivateKey
 
-OTHER_COMMANDS_PER_S, QUERIES_PER_S, STATES_PER_S, MAX_PENDING_QUERIES = 200, 100, 500, 64
+UNACCEPTABLE_COMMANDS_PER_S, REQUESTS_PER_S, STATES_PER_S, MAX_UNANSWERED_REQUESTS = 200, 100, 500, 64
 """The design's limits, repeated here: a change of the code's limits must change these, too."""
-ACQUIRE = encode(SessionRequest("acquire", "alice", 5, 0))
-GRANTED = encode(SessionReply(True, "", 7, bytes(range(16)), 5600, "kernel", 0))
-COMMAND = encode(Command(7, 3, 1, 2, 3, 0.1, 0.2, 0.0, (0.0,) * PATH_POINTS, "drive", 0))
-NEXT_COMMAND = encode(Command(7, 4, 1, 2, 3, 0.1, 0.2, 0.0, (0.0,) * PATH_POINTS, "drive", 0))
+EPOCH, LAST_ACCEPTED_SEQUENCE = 7, 2
+HIGHEST_SEQUENCE = 2**63 - 1
+
+
+def encoded_command(sequence: int, *, emergency_stop: int = 0) -> bytes:
+    return encode(
+        Command(
+            epoch=EPOCH,
+            sequence=sequence,
+            sent_wall_ns=1,
+            stamp_ns=2,
+            stamp_received_wall_ns=3,
+            steering_rad=0.1,
+            throttle=0.2,
+            brake=0.0,
+            path_curvature_per_m=(0.0,) * PATH_POINTS,
+            mode="drive",
+            emergency_stop=emergency_stop,
+        )
+    )
+
+
+ACQUIRE = encode(SessionRequest("acquire", "alice", instance=5, number=0))
+GRANTED = encode(
+    SessionReply(
+        granted=True,
+        reason="",
+        epoch=EPOCH,
+        token=bytes(range(16)),
+        video_port=5600,
+        host="kernel",
+        emergency_stop=0,
+    )
+)
+COMMAND, NEXT_COMMAND = (encoded_command(LAST_ACCEPTED_SEQUENCE + number) for number in (1, 2))
 
 
 class GatewayPair:
@@ -39,7 +70,7 @@ class GatewayPair:
         self.server = ServerGateway(
             lambda channel, payload, _arrived, peer: self.server_received.append((channel, payload, peer)),
             lambda *sends: self.in_flight.extend(sends),
-            lambda: (7, 2),
+            lambda: (EPOCH, LAST_ACCEPTED_SEQUENCE),
             VehicleAuthenticator("car", vehicle, {"alice": alice.public, "bob": bob.public}),
         )
         self.client = ClientGateway(
@@ -95,11 +126,10 @@ def test_replayed_requests_replies_and_states_are_rejected(pair: GatewayPair) ->
     server_received, client_received = list(pair.server_received), list(pair.client_received)
     pair.in_flight = list(recorded)
     pair.deliver_all()
-    assert pair.server_received[len(server_received) :] == [
-        ("control", COMMAND, "query")
-    ]  # the gate rejects its sequence
+    delivered_again = pair.server_received[len(server_received) :]
+    assert delivered_again == [("control", COMMAND, "query")], "the gate rejects it, because its sequence is old"
     assert pair.client_received == client_received
-    # The first request, before its retry, and the replayed one.
+    # Two requests had a wrong counter: the replayed one, and the client's first one, which it then sent again.
     assert pair.server.counts["session_requests_with_wrong_counter"] == 2
     assert pair.client.counts["states_replayed"] == 1
 
@@ -107,26 +137,26 @@ def test_replayed_requests_replies_and_states_are_rejected(pair: GatewayPair) ->
 def test_replays_of_a_rejected_command_are_rate_limited(pair: GatewayPair) -> None:
     """Ten thousand replays of a command that the vehicle rejected are rate-limited, and the next command passes.
 
-    The sequence of a rejected command stays newer than that of the last accepted one.
+    The replays cannot be recognized by the last accepted command, because its sequence stays below theirs.
     """
     pair.client.send(Send("control", COMMAND))
     rejected, before = pair.in_flight.pop().payload, len(pair.server_received)
     for _ in range(10_000):
         pair.server.receive("control", rejected, Now(2 * NS_PER_S, 0), None)
-    assert len(pair.server_received) - before == 1 + OTHER_COMMANDS_PER_S
+    assert len(pair.server_received) - before == 1 + UNACCEPTABLE_COMMANDS_PER_S
     pair.client.send(Send("control", NEXT_COMMAND))
     pair.deliver_all(2 * NS_PER_S)
     assert pair.server_received[-1] == ("control", NEXT_COMMAND, "query")
 
 
 def test_another_operators_emergency_stop_does_not_displace_the_active_operators_commands(pair: GatewayPair) -> None:
-    """Another operator's emergency stop with the highest sequence makes no command of the active operator a replay."""
+    """After another operator's emergency stop with the highest sequence, the active operator's next command passes."""
     pair.client.send(Send("control", COMMAND))
     recorded = pair.in_flight.pop().payload
-    stop = encode(Command(7, 2**63 - 1, 1, 2, 3, 0.1, 0.2, 0.0, (0.0,) * PATH_POINTS, "drive", 1))
+    stop = encoded_command(HIGHEST_SEQUENCE, emergency_stop=1)
     pair.server.receive("control", pair.bob.sign_command(stop), Now(2 * NS_PER_S, 0), None)
     assert [body for _, body, _ in pair.server_received[-1:]] == [stop]
-    for _ in range(2 * OTHER_COMMANDS_PER_S):
+    for _ in range(2 * UNACCEPTABLE_COMMANDS_PER_S):
         pair.server.receive("control", recorded, Now(2 * NS_PER_S, 0), None)
     pair.client.send(Send("control", NEXT_COMMAND))
     pair.deliver_all(2 * NS_PER_S)
@@ -143,7 +173,7 @@ def test_a_forged_signature_does_not_displace_the_true_command(pair: GatewayPair
     for _ in range(1000):  # exhaust the rate limit for replays
         pair.server.receive("control", first, Now(0, 0), None)
     pair.server.receive("control", following, Now(0, 0), None)
-    assert len(pair.server_received) - before == 1 + OTHER_COMMANDS_PER_S + 1
+    assert len(pair.server_received) - before == 1 + UNACCEPTABLE_COMMANDS_PER_S + 1
     assert pair.server_received[-1] == ("control", NEXT_COMMAND, None)
 
 
@@ -173,8 +203,8 @@ def test_states_of_a_restarted_server_cause_one_request_a_second(pair: GatewayPa
     assert pair.client_received[-1] == ("state", b"state")
 
 
-def test_states_of_a_known_server_cause_no_query(pair: GatewayPair) -> None:
-    """A state of a server process that has answered before is delivered and causes no query."""
+def test_states_of_a_known_server_cause_no_request(pair: GatewayPair) -> None:
+    """A state of a server process that has answered before is delivered and causes no request."""
     pair.server.send(Send("state", b"state"))
     pair.client.receive("state", pair.in_flight.pop().payload, Now(0, 0), None)
     assert pair.client_received[-1] == ("state", b"state")
@@ -182,8 +212,8 @@ def test_states_of_a_known_server_cause_no_query(pair: GatewayPair) -> None:
 
 
 @pytest.mark.parametrize("signed", [True, False])
-def test_queries_are_rate_limited(pair: GatewayPair, signed: bool) -> None:
-    """Of 10000 queries in a second, 100 pass the limit and the others are counted."""
+def test_requests_are_rate_limited(pair: GatewayPair, signed: bool) -> None:
+    """Of 10000 requests in a second, 100 pass the limit and the others are counted."""
     received: list[bytes] = []
     gateway = (
         pair.server
@@ -191,18 +221,18 @@ def test_queries_are_rate_limited(pair: GatewayPair, signed: bool) -> None:
         else ServerGateway(
             lambda _channel, payload, _arrived, _peer: received.append(payload),
             lambda *_: None,
-            lambda: (7, 2),
+            lambda: (EPOCH, LAST_ACCEPTED_SEQUENCE),
             NullVehicleAuthenticator(),
         )
     )
     for number in range(10_000):
         gateway.receive("session", b"garbage", Now(2 * NS_PER_S, 0), number)
-    assert gateway.counts["session_requests_screened_out"] == 10_000 - QUERIES_PER_S
-    assert len(received) == (0 if signed else QUERIES_PER_S)
+    assert gateway.counts["session_requests_screened_out"] == 10_000 - REQUESTS_PER_S
+    assert len(received) == (0 if signed else REQUESTS_PER_S)
 
 
 def test_the_gateway_is_unlocked_while_the_link_sends(pair: GatewayPair) -> None:
-    """A gateway's lock is free while the link sends, also while it sends the reply to a stale request."""
+    """A gateway's lock is free while the link sends, also while it sends the reply to a request with an old counter."""
     unlocked: list[bool] = []
 
     def carry(*sends: Send) -> None:
@@ -242,16 +272,16 @@ def test_states_are_rate_limited(pair: GatewayPair) -> None:
 
 
 def test_a_flood_does_not_displace_authentic_messages(pair: GatewayPair) -> None:
-    """During a flood of forged and replayed states and queries, the next authentic state and query are delivered."""
+    """During a flood of forged and replayed states and requests, the next authentic state and request are delivered."""
     now = Now(2 * NS_PER_S, 0)
     pair.server.send(Send("state", b"old"))
     pair.client.send(Send("session", ACQUIRE))
-    state, query = pair.in_flight
+    state, request = pair.in_flight
     pair.deliver_all()
     pair.server.send(Send("session_reply", GRANTED, "query"))
     pair.deliver_all()
     for flooded in (pair.client, pair.server):
-        channel, authentic = ("state", state.payload) if flooded is pair.client else ("session", query.payload)
+        channel, authentic = ("state", state.payload) if flooded is pair.client else ("session", request.payload)
         for number in range(2_000):
             flooded.receive(channel, authentic if number % 2 else authentic[:-80] + bytes(80), now, number)
     pair.in_flight.clear()
@@ -266,18 +296,22 @@ def test_a_flood_does_not_displace_authentic_messages(pair: GatewayPair) -> None
     assert pair.client.counts["states_screened_out"] > 1_000
 
 
-def test_pending_requests_are_bounded() -> None:
-    """The gateway keeps as many pending requests as the link keeps queries, and each gets one reply."""
+def test_unanswered_requests_are_bounded() -> None:
+    """The gateway keeps as many unanswered requests as the link keeps queries of Zenoh, and each gets one reply."""
     carried: list[Send] = []
     gateway = ServerGateway(
-        lambda *_: None, lambda *sends: carried.extend(sends), lambda: (7, 2), NullVehicleAuthenticator()
+        lambda *_: None,
+        lambda *sends: carried.extend(sends),
+        lambda: (EPOCH, LAST_ACCEPTED_SEQUENCE),
+        NullVehicleAuthenticator(),
     )
     for number in range(1000):
         gateway.receive("session", b"request", Now(number * NS_PER_S, 0), number)
     for _ in range(2):
         gateway.send(*(Send("session_reply", b"reply", number) for number in range(1000)))
-    assert zenoh_link.MAX_PENDING_QUERIES == MAX_PENDING_QUERIES
-    assert carried == [Send("session_reply", b"reply", number) for number in range(1000 - MAX_PENDING_QUERIES, 1000)]
+    assert zenoh_link.MAX_PENDING_QUERIES == MAX_UNANSWERED_REQUESTS
+    last_requests = range(1000 - MAX_UNANSWERED_REQUESTS, 1000)
+    assert carried == [Send("session_reply", b"reply", number) for number in last_requests]
 
 
 def test_an_open_gateway_changes_nothing() -> None:

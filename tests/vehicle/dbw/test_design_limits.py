@@ -14,7 +14,7 @@ LIMITS_MS = [
     ("a kit disengages after 100 ms", profile.COMMAND_TIMEOUT_NS, 100),
     ("nothing older than 60 ms is sent or written", profile.TICK_LIMIT_NS, 60),
     ("a lost bus is reopened every second", bus.REOPEN_NS, 1000),
-    ("a frame read later than 1 s is dropped", bus.LATEST_READ_NS, 1000),
+    ("a frame read later than 1 s is dropped", bus.READ_AGE_LIMIT_NS, 1000),
     ("gears are requested every 100 ms", sending.GEAR_PERIOD_NS, 100),
     ("enabling takes at most 3 s", states.KIT_RESPONSE_LIMIT_NS, 3000),
     ("clearing takes at least 120 ms", states.PAUSE_NS, 120),

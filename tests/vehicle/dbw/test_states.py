@@ -32,7 +32,7 @@ GOOD = Situation(
     enabled=ALL_AXES,
     gear="drive",
     in_state_ns=0,
-    is_release_unexpected=False,
+    expects_no_release=False,
 )
 STAYS: dict[State, Situation] = {
     "idle": replace(GOOD, wanted=False, enabled=NO_AXES, gear="park"),
@@ -123,9 +123,9 @@ ROWS: list[tuple[State, dict[str, Any], State]] = [
     ("parking", {**RELEASED, "in_state_ns": PAUSE_NS - 1}, "parking"),
     ("parking", {**RELEASED, "in_state_ns": PAUSE_NS}, "idle"),
     ("parking", {**RELEASED, "wanted": True, "in_state_ns": PAUSE_NS}, "idle"),
-    ("parking", {**RELEASED, "is_release_unexpected": True, "in_state_ns": PAUSE_NS - 1}, "parking"),
-    ("parking", {**RELEASED, "is_release_unexpected": True, "in_state_ns": PAUSE_NS}, "lost"),
-    ("parking", {"is_release_unexpected": True, "in_state_ns": LIMIT_NS}, "parking"),
+    ("parking", {**RELEASED, "expects_no_release": True, "in_state_ns": PAUSE_NS - 1}, "parking"),
+    ("parking", {**RELEASED, "expects_no_release": True, "in_state_ns": PAUSE_NS}, "lost"),
+    ("parking", {"expects_no_release": True, "in_state_ns": LIMIT_NS}, "parking"),
     *(("parking", {"enabled": frozenset({axis}), "in_state_ns": LIMIT_NS}, "parking") for axis in AXES),
     ("lost", {"enabled": NO_AXES, "in_state_ns": LIMIT_NS}, "lost"),
     ("lost", NOT_WANTED, "parking"),
@@ -188,7 +188,7 @@ CASES: list[tuple[State, dict[str, Any]]] = [
     ("engaged", {"enabled": NO_AXES}),
     ("clearing", {"in_state_ns": LIMIT_NS, "overrides": "OVERRIDE"}),
     ("enabling", {"in_state_ns": LIMIT_NS}),
-    ("parking", {"enabled": NO_AXES, "is_release_unexpected": True, "in_state_ns": PAUSE_NS}),
+    ("parking", {"enabled": NO_AXES, "expects_no_release": True, "in_state_ns": PAUSE_NS}),
 ]
 
 
@@ -245,7 +245,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "enabled": tuple(AXIS_SETS),
     "gear": ("drive", "park"),
     "in_state_ns": (0, PAUSE_NS, LIMIT_NS),
-    "is_release_unexpected": (False, True),
+    "expects_no_release": (False, True),
 }
 """Inputs on either side of every condition in the table."""
 

@@ -1,4 +1,4 @@
-"""Statistics of the traffic on a bus: rate, values, changes and errors of each message."""
+"""Tests of the statistics of a bus: rate, values, changes and errors of each message."""
 
 from __future__ import annotations
 
@@ -22,6 +22,8 @@ from lavt.vehicle.dbw.traffic import (
 
 GENERATION_1, GENERATION_2 = load_profile("dataspeed_gen1"), load_profile("dataspeed_gen2")
 EXPECTED = expected_traffic(GENERATION_2)
+STEERING_COMMAND_ID, GEAR_REPORT_ID = 0x064, 0x067
+"""Identifiers of generation 1's messages SteeringCmd and GearReport."""
 
 
 def new_traffic() -> BusTraffic:
@@ -29,9 +31,9 @@ def new_traffic() -> BusTraffic:
     return BusTraffic(GENERATION_2.codec, EXPECTED, start_ns=0)
 
 
-def report(angle: int, count: int, *, damage: int = 0) -> CanFrame:
-    """Return a SteerReport1 with its checksum."""
-    data = bytes([angle, 0, 0, 0, 0, 0, count << 4])
+def report(tenths_deg: int, count: int, *, damage: int = 0) -> CanFrame:
+    """Return a SteerReport1: ANGLE (0.1 deg), counter and checksum; `damage` inverts bits of the checksum."""
+    data = bytes([tenths_deg, 0, 0, 0, 0, 0, count << 4])
     return CanFrame(0x100, data + bytes([frame_crc8(0x100, data) ^ damage]))
 
 
@@ -40,16 +42,19 @@ def summary_of(traffic: BusTraffic, now_ns: int, name: str = "SteerReport1") -> 
 
 
 def test_rate_and_changes() -> None:
-    """A summary has a message's rate and changes in the period, and its newest values."""
+    """A summary has all frames of a message so far, its newest values, and the rate and the changes in the period."""
     traffic = new_traffic()
     for number in range(100):
-        traffic.receive(ReceivedCanFrame(report(7 if number < 50 else 9, number % 16), number * 10 * NS_PER_MS))
-    first = summary_of(traffic, NS_PER_S)
-    assert (first.frames, first.rate_hz, first.changed, first.wrong) == (100, 100.0, ("ANGLE",), ())
-    assert first.values["ANGLE"] == pytest.approx(0.9)
+        tenths_deg = 7 if number < 50 else 9
+        traffic.receive(ReceivedCanFrame(report(tenths_deg, number % 16), number * 10 * NS_PER_MS))
+    full_second = summary_of(traffic, NS_PER_S)
+    assert (full_second.frames, full_second.rate_hz) == (100, 100.0)
+    assert (full_second.changed, full_second.wrong) == (("ANGLE",), ())
+    assert full_second.values["ANGLE"] == pytest.approx(0.9)
     traffic.receive(ReceivedCanFrame(report(9, 4), NS_PER_S))
-    second = summary_of(traffic, NS_PER_S + 50 * NS_PER_MS)
-    assert (second.frames, second.rate_hz, second.changed, second.wrong) == (101, 20.0, (), ())
+    next_50_ms = summary_of(traffic, NS_PER_S + 50 * NS_PER_MS)
+    assert (next_50_ms.frames, next_50_ms.rate_hz) == (101, 1 / 0.05)
+    assert (next_50_ms.changed, next_50_ms.wrong) == ((), ())
 
 
 def test_total() -> None:
@@ -103,13 +108,13 @@ def test_a_missing_report_is_an_error() -> None:
 def test_lengths() -> None:
     """A frame of a wrong length is an error, unless the frame clears an override."""
     traffic = BusTraffic(GENERATION_1.codec, expected_traffic(GENERATION_1), start_ns=0)
-    traffic.receive(ReceivedCanFrame(CanFrame(0x064, bytes([0, 0, 2, 0])), 0))
+    traffic.receive(ReceivedCanFrame(CanFrame(STEERING_COMMAND_ID, bytes([0, 0, 2, 0])), 0))
     assert summary_of(traffic, 0, "SteeringCmd").values["CLEAR"] == 1
     assert summary_of(traffic, 0, "SteeringCmd").wrong == ()
-    traffic.receive(ReceivedCanFrame(CanFrame(0x064, bytes(5)), 0))
-    traffic.receive(ReceivedCanFrame(CanFrame(0x067, bytes(3)), 0))
+    traffic.receive(ReceivedCanFrame(CanFrame(STEERING_COMMAND_ID, bytes(5)), 0))
+    traffic.receive(ReceivedCanFrame(CanFrame(GEAR_REPORT_ID, bytes(3)), 0))
     assert summary_of(traffic, 0, "SteeringCmd").wrong == ("has 5 bytes, not 8",)
-    traffic.receive(ReceivedCanFrame(CanFrame(0x067, bytes(3)), 0))
+    traffic.receive(ReceivedCanFrame(CanFrame(GEAR_REPORT_ID, bytes(3)), 0))
     assert summary_of(traffic, 0, "GearReport").wrong == ("has 3 bytes, not 2", "cannot be decoded")
 
 

@@ -28,7 +28,7 @@ def motion_at(
 
 
 def events_along(road: Road, places: list[tuple[float, float]], turned_rad: float = 0.0) -> list[VehicleEvent]:
-    """Return the events of a car that is placed at positions (station, lateral offset) one after the other."""
+    """Return the events of a car that is at each of these positions (station, lateral offset) in turn, 1 us apart."""
     monitor = RouteMonitor(road, CAR, near_station_m=places[0][0])
     events = []
     for index, (s_m, lateral_m) in enumerate(places):
@@ -42,7 +42,7 @@ def kinds(events: list[VehicleEvent]) -> list[EventKind]:
 
 def test_a_drive_along_the_lane_has_no_event_but_completion(road: Road) -> None:
     """A car on its lane's centre completes the route once, without other events."""
-    events = events_along(road, [(s_m / 2, 0.0) for s_m in range(270)])
+    events = events_along(road, [(half_metres / 2, 0.0) for half_metres in range(270)])
     assert kinds(events) == ["completed"]
     assert events[0].mono_ns == 246 * 1000  # 123.0 m is the first position beyond 122.933 m
 
@@ -63,10 +63,9 @@ def test_heading_error_is_wrapped(road: Road) -> None:
     assert error.heading_error_rad == pytest.approx(0.1)
 
 
-def test_each_edge_that_changes_lanes_is_an_invasion(road: Road) -> None:
-    """Each edge of the body that changes lanes is one lane invasion, in order of time."""
-    away = [(5.0, 0.0), (5.1, 0.80), (5.2, 0.83)]
-    events = events_along(road, [*away, (5.3, 0.0)])
+def test_each_lane_change_of_an_edge_is_an_invasion(road: Road) -> None:
+    """Each time an edge of the body changes lanes, there is one lane invasion."""
+    events = events_along(road, [(5.0, 0.0), (5.1, 0.80), (5.2, 0.83), (5.3, 0.0)])
     assert kinds(events) == ["lane_invasion", "lane_invasion"]
     assert [event.detail for event in events] == [  # the lanes are numbered from the right
         "left edge from lane 2 to 3 from the right",
@@ -88,7 +87,7 @@ def test_the_start_is_no_lane_invasion(road: Road) -> None:
 
 
 @pytest.mark.parametrize(("lateral_m", "kind"), [(-8.25, "rail"), (11.35, "barrier")])
-def test_a_corner_at_a_rail_is_one_collision(road: Road, lateral_m: float, kind: str) -> None:
+def test_a_body_that_reaches_a_rail_has_one_collision(road: Road, lateral_m: float, kind: str) -> None:
     """A body whose side reaches the rail or the barrier has one collision, and the event names the obstacle."""
     clear_m = lateral_m - math.copysign(0.1, lateral_m)
     assert "collision" not in kinds(events_along(road, [(5.0, clear_m)]))
@@ -154,17 +153,14 @@ def test_both_edges_can_leave_their_lanes_in_one_step(road: Road) -> None:
     ]
 
 
-def test_a_spin_is_evaluated_at_the_outermost_points(road: Road) -> None:
-    """A car that turns around in its lane invades the next lane and returns."""
+def test_a_spinning_car_invades_the_next_lane_with_its_front(road: Road) -> None:
+    """A car that turns around in its lane invades the next lane with its front, and then leaves that lane again."""
     monitor = RouteMonitor(road, CAR, near_station_m=5.0)
     events = []
     for index in range(181):
         events += monitor.update(motion_at(road, 5.0, 0.0, math.radians(index)), index)
     sides = [event.detail.split()[0] for event in events if event.kind == "lane_invasion"]
-    assert sides == [
-        "left",
-        "left",
-    ]  # the front leaves the lane and returns; the rear, 1.4 m from the axle, does not leave it
+    assert sides == ["left", "left"], "only the front leaves its lane and returns: the rear is 1.4 m from the axle"
     assert set(kinds(events)) == {"lane_invasion"}
 
 
@@ -213,7 +209,7 @@ def test_asphalt_is_limited_to_its_stations() -> None:
 
 
 def test_a_car_on_the_far_side_of_a_rail_does_not_touch_it() -> None:
-    """A body entirely on the far side of a rail passes its beginning; a body in line with the rail collides with it."""
+    """A car beyond the line of a rail passes it without a collision; a car on this line hits the rail's beginning."""
     road = parse_road(OPEN_RAIL, source="x")
     assert "collision" not in kinds(events_along(road, [(30.0 + s_m, -7.5) for s_m in range(20)]))
     assert "collision" in kinds(events_along(road, [(30.0 + s_m, -6.2) for s_m in range(20)]))
@@ -240,8 +236,8 @@ def test_a_lasting_contact_is_one_collision(road: Road) -> None:
     assert kinds(events).count("collision") == 1
 
 
-def test_a_contact_has_its_corner_depth_and_direction(road: Road) -> None:
-    """A contact has the position of its corner on the body, its depth, and the direction out of the rail."""
+def test_a_contact_has_position_depth_and_direction(road: Road) -> None:
+    """A contact has the position of the touching corner on the body, its depth, and the direction out of the rail."""
     monitor = RouteMonitor(road, CAR, near_station_m=5.0)
     monitor.update(motion_at(road, 5.0, -6.5, -0.5), 0)
     (contact,) = monitor.contacts

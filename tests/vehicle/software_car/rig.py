@@ -17,6 +17,12 @@ AXES = ("steering", "brake", "throttle")
 STEERING_RATIO = 14.8
 """Angle of the steering wheel divided by the angle of the road wheels."""
 DEGREES_PER_RAD = 57.29577951308232
+DRIVE = 4
+"""The number of the gear."""
+STEERING_1, BRAKE_1, THROTTLE_1, GEAR_1 = 0x064, 0x060, 0x062, 0x066
+"""The identifiers of generation 1's commands."""
+PERCENT_OF_GENERATION_1, PERCENT_OF_GENERATION_2, ANGLE_OF_GENERATION_2 = 2, 14, 2
+"""The command types (CMD_TYPE) of a pedal's percentage and of the steering wheel's angle."""
 
 
 def crc_by_division(identifier: int, data: bytes) -> int:
@@ -43,8 +49,10 @@ class CommandValues:
     brake: float = 0.0
     enable: bool = True
     clear: bool = False
-    ignore: bool = False
+    ignore_override: bool = False
+    """Bit IGNORE: the driver's acts do not release the axes."""
     rate: int = 0
+    """The limit of the steering rate, in the units of the command; 0: the car's own limit."""
 
 
 class ExecutedActuation(NamedTuple):
@@ -69,45 +77,48 @@ class Sender1:
     def commands(self, values: CommandValues) -> list[CanFrame]:
         """Return the commands for steering, brake and throttle, with the next counter."""
         self.count = (self.count + 1) % 256
-        bits = values.enable | values.clear << 1 | values.ignore << 2
-        return [
-            CanFrame(
-                0x064,
-                struct.pack("<hBBBBBB", round(values.angle_deg * 10), bits, values.rate, 0, 0, 0, self.count),
-            ),
-            CanFrame(0x060, struct.pack("<HBBBBBB", round(values.brake * 65535), 2 << 4, bits, 0, 0, 0, self.count)),
-            CanFrame(0x062, struct.pack("<HBBBBBB", round(values.throttle * 65535), 2 << 4, bits, 0, 0, 0, self.count)),
-        ]
+        bits = values.enable | values.clear << 1 | values.ignore_override << 2
+        angle, pedal_type = round(values.angle_deg * 10), PERCENT_OF_GENERATION_1 << 4
+        steering = struct.pack("<hBBBBBB", angle, bits, values.rate, 0, 0, 0, self.count)
+        brake, throttle = (
+            struct.pack("<HBBBBBB", round(fraction * 65535), pedal_type, bits, 0, 0, 0, self.count)
+            for fraction in (values.brake, values.throttle)
+        )
+        return [CanFrame(STEERING_1, steering), CanFrame(BRAKE_1, brake), CanFrame(THROTTLE_1, throttle)]
 
     def clearing(self) -> list[CanFrame]:
         """Return the frames that clear overrides."""
         return [
-            CanFrame(0x064, bytes([0, 0, 2, 0])),
-            CanFrame(0x060, bytes([0, 0, 0, 2])),
-            CanFrame(0x062, bytes([0, 0, 0, 2])),
+            CanFrame(STEERING_1, bytes([0, 0, 2, 0])),
+            CanFrame(BRAKE_1, bytes([0, 0, 0, 2])),
+            CanFrame(THROTTLE_1, bytes([0, 0, 0, 2])),
         ]
 
     def gear(self, gear: int, clear: bool = False) -> CanFrame:
         """Return the command for a gear."""
-        return CanFrame(0x066, bytes([gear | clear << 7]))
+        return CanFrame(GEAR_1, bytes([gear | clear << 7]))
 
 
 class Sender2:
-    """An encoder for generation 2's commands, of the remote set or the user set."""
+    """An encoder for generation 2's commands, by default of the remote set; the user set begins at identifier 0x210."""
 
-    def __init__(self, first: int = 0x200) -> None:
-        self.count, self.first = 0, first
+    def __init__(self, first_identifier: int = 0x200) -> None:
+        self.count, self.first_identifier = 0, first_identifier
 
     def commands(self, values: CommandValues) -> list[CanFrame]:
         """Return the commands for steering, brake and throttle, with the next counter."""
         self.count = (self.count + 1) % 16
-        bits = values.enable << 4 | values.clear << 5 | values.ignore << 6
-        tail = (0, 0, self.count)
-        steering = struct.pack("<hBBBBB", round(values.angle_deg * 10), 2 | bits, values.rate, *tail)
+        bits = values.enable << 4 | values.clear << 5 | values.ignore_override << 6
+        angle, tail = round(values.angle_deg * 10), (0, 0, self.count)
+        steering = struct.pack("<hBBBBB", angle, ANGLE_OF_GENERATION_2 | bits, values.rate, *tail)
+        pedal_type = PERCENT_OF_GENERATION_2 | bits
         pedals = [(1, round(values.brake * 10_000)), (2, round(values.throttle * 4_000))]
         return [
-            with_crc(self.first, steering),
-            *(with_crc(self.first + part, struct.pack("<HBBBBB", raw, 14 | bits, 0, *tail)) for part, raw in pedals),
+            with_crc(self.first_identifier, steering),
+            *(
+                with_crc(self.first_identifier + part, struct.pack("<HBBBBB", raw, pedal_type, 0, *tail))
+                for part, raw in pedals
+            ),
         ]
 
     def clearing(self) -> list[CanFrame]:
@@ -117,7 +128,7 @@ class Sender2:
     def gear(self, gear: int, clear: bool = False) -> CanFrame:
         """Return the command for a gear."""
         assert not clear
-        return with_crc(self.first + 3, bytes([gear, 0, 0]))
+        return with_crc(self.first_identifier + 3, bytes([gear, 0, 0]))
 
     def system(self, request: int) -> CanFrame:
         """Return a request to the system: 0 none, 1 enable, 2 disable."""
@@ -126,14 +137,15 @@ class Sender2:
 
 
 class KitRig:
-    """A kit, a sender of commands, and a clock."""
+    """A kit, a sender of commands, and a clock. `keys` are those of `Kit`."""
 
     def __init__(self, generation: int, *, speed_mps: float = 0.0, **keys: Any) -> None:
         self.generation = generation
         self.now_ns = START_NS
         self.sender: Sender1 | Sender2 = Sender1() if generation == 1 else Sender2()
         self.kit = Kit(1 if generation == 1 else 2, start_ns=START_NS, **keys)
-        self.last: dict[int, bytes] = {}
+        self.newest_reports: dict[int, bytes] = {}
+        """The newest report of each identifier."""
         self.set_motion(speed_mps)
 
     def set_motion(self, speed_mps: float, steering_rad: float = 0.0) -> None:
@@ -160,14 +172,14 @@ class KitRig:
         self.request_system()
         assert self.enabled() == set(AXES)
         if in_drive:
-            self.send(self.sender.gear(4))
-            assert self.kit.state.gear == 4
+            self.send(self.sender.gear(DRIVE))
+            assert self.kit.state.gear == DRIVE
 
     def wait_ms(self, duration_ms: float) -> None:
-        """Let time pass, and record the newest report of each identifier in `last`."""
+        """Let time pass, and note the kit's reports in `newest_reports`."""
         self.now_ns += round(duration_ms * NS_PER_MS)
         for frame in self.kit.frames_due(self.now_ns):
-            self.last[frame.identifier] = frame.data
+            self.newest_reports[frame.identifier] = frame.data
 
     def drive_ms(self, duration_ms: int, **keys: Any) -> None:
         """Send commands every 20 ms."""

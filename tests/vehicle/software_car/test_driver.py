@@ -56,10 +56,10 @@ def test_small_inputs_do_not_override(generation: int) -> None:
 def test_ignore_prevents_an_override(generation: int) -> None:
     """With the ignore bit the driver cannot override."""
     rig = driving_rig(generation)
-    rig.command(ignore=True)
+    rig.command(ignore_override=True)
     rig.kit.driver_steers(8.0, rig.now_ns)
     rig.kit.driver_brakes(1.0, rig.now_ns)
-    rig.command(ignore=True)
+    rig.command(ignore_override=True)
     assert rig.enabled() == ALL_AXES
 
 
@@ -90,7 +90,7 @@ def test_a_shift_needs_the_brake(generation: int) -> None:
     rig.enable(in_drive=False)
     rig.command(brake=0.0)
     rig.send(rig.sender.gear(4))
-    assert (rig.kit.state.gear, rig.kit.state.gear_reject) == (Gear.PARK, GearRejection.VEHICLE)
+    assert (rig.kit.state.gear, rig.kit.state.gear_reject) == (Gear.PARK, GearRejection.BRAKE_OR_MOTION)
     rig.command(brake=0.5)
     rig.send(rig.sender.gear(4))
     assert (rig.kit.state.gear, rig.kit.state.gear_reject) == (Gear.DRIVE, GearRejection.NONE)
@@ -107,7 +107,7 @@ def test_reasons_for_rejected_gears(generation: int) -> None:
         return rig.kit.state.gear_reject
 
     assert [rejection(gear) for gear in (1, 2, 5, 0)] == [
-        GearRejection.VEHICLE,
+        GearRejection.BRAKE_OR_MOTION,
         GearRejection.UNSUPPORTED,
         GearRejection.UNSUPPORTED,
         GearRejection.NONE,

@@ -80,12 +80,12 @@ def test_generation_2_needs_a_new_request() -> None:
 def test_only_the_chosen_set_is_accepted() -> None:
     """A kit accepts only commands of its command set: the remote commands or the user commands."""
     rig = KitRig(2)
-    rig.sender = Sender2(0x210)
+    rig.sender = Sender2(first_identifier=0x210)
     rig.command()
     rig.request_system()
     assert rig.enabled() == set()
     user = KitRig(2, commands="user")
-    user.sender = Sender2(0x210)
+    user.sender = Sender2(first_identifier=0x210)
     user.enable()
     assert user.enabled() == ALL_AXES
 

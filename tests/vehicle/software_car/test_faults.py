@@ -84,13 +84,13 @@ def test_bus_off(generation: int) -> None:
     rig = driving_rig(generation)
     rig.wait_ms(20)
     rig.kit.set_bus_off(rig.now_ns)
-    rig.last.clear()
+    rig.newest_reports.clear()
     rig.drive_ms(80, throttle=0.5)
-    assert rig.last == {}
+    assert rig.newest_reports == {}
     assert (rig.enabled(), rig.kit.state.watchdog_reason) == (set(), ReleaseReason.TIMEOUT)
     rig.kit.set_bus_off(rig.now_ns, is_off=False)
     rig.wait_ms(100)
-    assert len(rig.last) == (5 if generation == 1 else 8)
+    assert len(rig.newest_reports) == (5 if generation == 1 else 8)
 
 
 @both_generations

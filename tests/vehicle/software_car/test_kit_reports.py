@@ -24,12 +24,12 @@ PERIODS_MS = {
 
 def collect_reports(rig: KitRig) -> dict[int, bytes]:
     """Let the longest period pass; return the newest report of each identifier."""
-    rig.last.clear()
+    rig.newest_reports.clear()
     for _ in range(10):
         rig.wait_ms(10)
         if rig.kit.state.actuators["steering"].is_enabled:
             rig.command(angle_deg=-45.0, throttle=0.25, brake=0.125)
-    return rig.last
+    return rig.newest_reports
 
 
 @both_generations
@@ -90,19 +90,23 @@ def test_generation_2_reports_of_a_drive() -> None:
         assert found[identifier][7] == crc_by_division(identifier, found[identifier][:7])
     before = found[0x100][6] >> 4
     rig.wait_ms(10)
-    assert rig.last[0x100][6] >> 4 == (before + 1) % 16
+    assert rig.newest_reports[0x100][6] >> 4 == (before + 1) % 16
 
 
 def test_generation_1_reports_a_timeout() -> None:
     """After a timeout every axis reports TMOUT and FLTWDC, not ENABLED, and the brake reports the watchdog."""
     rig = driving_rig(1)
-    rig.last.clear()
+    rig.newest_reports.clear()
     for _ in range(20):
         rig.wait_ms(10)
-    assert (rig.last[0x061][7], rig.last[0x063][7], rig.last[0x065][7]) == (0b10001000, 0b10001000, 0b10001000)
-    assert rig.last[0x061][6] & 0b1000
-    assert rig.last[0x061][6] >> 4 == rig.last[0x063][6] >> 4 != 0
-    assert struct.unpack_from("<H", rig.last[0x061], 4) == (32768,)
+    assert (rig.newest_reports[0x061][7], rig.newest_reports[0x063][7], rig.newest_reports[0x065][7]) == (
+        0b10001000,
+        0b10001000,
+        0b10001000,
+    )
+    assert rig.newest_reports[0x061][6] & 0b1000
+    assert rig.newest_reports[0x061][6] >> 4 == rig.newest_reports[0x063][6] >> 4 != 0
+    assert struct.unpack_from("<H", rig.newest_reports[0x061], 4) == (32768,)
 
 
 def test_generation_1_reports_an_override() -> None:
@@ -168,8 +172,8 @@ def test_generation_2_reports_why_it_disengaged() -> None:
         for _ in range(20):
             rig.wait_ms(10)
         state = 0 if name == "override" else 7
-        assert rig.last[0x106][:3] == bytes([state | 2 << 4, reason, reason])
-        found[name] = rig.last[0x100][5] | (rig.last[0x100][6] & 0x0F) << 8
+        assert rig.newest_reports[0x106][:3] == bytes([state | 2 << 4, reason, reason])
+        found[name] = rig.newest_reports[0x100][5] | (rig.newest_reports[0x100][6] & 0x0F) << 8
     ready, timeout, bad_crc, bad_count, override_active, override_latched = 1, 1 << 3, 1 << 4, 1 << 5, 1 << 6, 1 << 8
     assert found == {
         "timeout": ready | timeout,

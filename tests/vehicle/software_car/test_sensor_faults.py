@@ -15,16 +15,16 @@ both_generations = pytest.mark.parametrize("generation", [1, 2])
 def reported_mps(rig: KitRig) -> tuple[float, float]:
     """Return the speed and the speed of a wheel in the newest reports."""
     identifier, place = SPEED[rig.generation]
-    (speed,) = struct.unpack_from("<h", rig.last[identifier], place)
-    (wheel,) = struct.unpack_from("<h", rig.last[WHEELS[rig.generation]], 0)
+    (speed,) = struct.unpack_from("<h", rig.newest_reports[identifier], place)
+    (wheel,) = struct.unpack_from("<h", rig.newest_reports[WHEELS[rig.generation]], 0)
     return speed / 360, wheel / 100 * 0.33
 
 
 def collect_identifiers(rig: KitRig) -> set[int]:
     """Wait 200 ms, and return the identifiers that were sent."""
-    rig.last.clear()
+    rig.newest_reports.clear()
     rig.wait_ms(200)
-    return set(rig.last)
+    return set(rig.newest_reports)
 
 
 @both_generations

@@ -19,8 +19,8 @@ MAX_DURATION_S = 24 * 3600
 SAMPLE_RATE_HZ = 20.0
 """The steering is resampled at this rate for its spectrum. No road wheel oscillates at half this rate or faster."""
 LOWEST_HZ, HIGHEST_HZ = 0.1, 5.0
-"""The limits of the oscillation frequency. Slower steering follows the road, and faster steering is noise; the loop's
-own frequency lies between the limits (`delay_margin.py`)."""
+"""The limits of the oscillation frequency. Slower steering follows the road, and faster steering is noise. The
+control loop's own frequency lies between the limits (`delay_margin.py`)."""
 FEWEST_PERIODS = 3
 """An oscillation has at least this many periods in the drive. Fewer periods can come from bends of the road."""
 
@@ -83,7 +83,7 @@ def power_spectrum(sampled_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
     index = np.arange(len(sampled_rad))
     trend = np.polynomial.Polynomial.fit(index, sampled_rad, 1)(index)
     window = np.hanning(len(sampled_rad) + 1)[:-1]
-    # Zero padding resolves the peak more finely than one period per drive.
+    # Without zero padding, the frequencies would be one period per drive apart, too far to locate a peak.
     padded_length = 1 << (8 * len(sampled_rad) - 1).bit_length()
     amplitudes = np.abs(np.fft.rfft((sampled_rad - trend) * window, padded_length)) / window.sum()
     hertz = np.fft.rfftfreq(padded_length, 1 / SAMPLE_RATE_HZ)

@@ -31,10 +31,10 @@ class Bracket:
 
 
 def first_bracket(criterion: Callable[[float], bool], grid_ms: Sequence[float], within_ms: float) -> Bracket:
-    """Find the first step of the grid in which `criterion` becomes true, and bisect it to a width of `within_ms`.
+    """Find the first interval of the grid in which `criterion` becomes true, and bisect it to a width of `within_ms`.
 
     `grid_ms` is ascending. If the criterion becomes true and false again between two delays of the grid, the search
-    does not find this. The criterion was evaluated at both ends of the returned bracket.
+    does not find this. The returned bracket begins and ends at delays for which the criterion was evaluated.
     """
     is_met = [criterion(delay_ms) for delay_ms in grid_ms]
     if not any(is_met):
@@ -57,8 +57,8 @@ def zero_bracket(rate: Callable[[float], float], guess_ms: float, longest_ms: fl
     """Find the delay between 0 and `longest_ms` at which `rate` rises through 0; the bracket has the width `within_ms`.
 
     The search begins at the guess plus and minus `GUESS_ERROR_MS`, and moves outwards until the sign changes. Brent's
-    method (`scipy.optimize.brentq`) then needs few values of a smooth rate. The returned bracket is the root plus and
-    minus half of `within_ms`, cut at 0 and `longest_ms`; `rate` was not evaluated at the bracket's two ends.
+    method (`scipy.optimize.brentq`) then evaluates a smooth rate at few delays only. The returned bracket is the root
+    plus and minus half of `within_ms`, cut at 0 and `longest_ms`; `rate` was not evaluated at its ends.
     """
 
     def clipped_rate(delay_ms: float) -> float:

@@ -111,7 +111,7 @@ def is_not_completed(drive: MonitoredRun) -> bool:
 
 
 def run_search(search: BoundarySearch) -> dict[str, Any]:
-    """Find the boundaries of one search, and return its entry of `boundary.json`."""
+    """Find the boundaries of one search, and return its entry of `runs` in `boundary.json`."""
     config, identity = search.planned.config, search.planned.identity
 
     @functools.cache
@@ -155,6 +155,7 @@ def run_search(search: BoundarySearch) -> dict[str, Any]:
         **{f"{name}_ms": _middle_ms(bracket, total_delay) for name, (bracket, total_delay) in brackets.items()},
         "theory_ms": theory_ms,
         "searched_ms": [first_total_ms, total_ms(grid_ms[-1])],
+        # Boundaries below the searched range: the criterion is met even without added delay.
         "below": [name for name, (bracket, _) in brackets.items() if bracket.low_ms is None],
         "not_monotone": [name for name, (bracket, _) in brackets.items() if not bracket.monotone],
     }
@@ -185,8 +186,8 @@ def run_searches(
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]], bool]:
     """Run all searches, `jobs` at a time (None: one per core).
 
-    Returns the boundaries that were found, in the order of `searches`, the failed searches with their reasons, and
-    whether all searches were run. On Ctrl-C, the searches in progress are finished, and no further ones are started.
+    Returns the entries of the finished searches, in the order of `searches`; the failed searches with their reasons;
+    and whether all searches were run. On Ctrl-C, the searches in progress are finished, and no others are started.
     """
     progress, is_complete = _SearchProgress(on_progress), True
     try:
@@ -253,8 +254,11 @@ def _search_in_processes(progress: _SearchProgress, todo: Sequence[BoundarySearc
         todo = broken[jobs:]
 
 
-def _format_boundaries(run: Mapping[str, Any]) -> str:
-    parts = [f"{name} {'-' if run[f'{name}_ms'] is None else format(run[f'{name}_ms'], '.0f')}" for name in CRITERIA]
+def _format_boundaries(found: Mapping[str, Any]) -> str:
+    """Return the boundaries in an entry of `runs` in `boundary.json`."""
+    parts = [
+        f"{name} {'-' if found[f'{name}_ms'] is None else format(found[f'{name}_ms'], '.0f')}" for name in CRITERIA
+    ]
     return ", ".join(parts) + " ms"
 
 
@@ -270,19 +274,19 @@ def search_boundary(
 
     Returns the content of `boundary.json`, and whether all searches were run.
     """
-    runs, failed, is_complete = run_searches(searches, jobs=jobs, on_progress=on_progress)
+    found, failed, is_complete = run_searches(searches, jobs=jobs, on_progress=on_progress)
     entry = {
         "schema": 1,
         "config": config.model_dump(mode="json"),
-        "runs": runs,
-        "groups": summarize_groups(runs),
+        "runs": found,
+        "groups": summarize_groups(found),
         "failed": failed,
     }
     write_json(out / BOUNDARY, entry)
     with (out / "boundary.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, CSV_COLUMNS, extrasaction="ignore")
         writer.writeheader()
-        writer.writerows(runs)
-    if runs:
+        writer.writerows(found)
+    if found:
         save_figure(out, "boundary", boundary_figure(entry), "boundaries", "")
     return entry, is_complete

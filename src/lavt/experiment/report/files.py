@@ -15,12 +15,12 @@ from lavt.experiment.report.table_format import TableData, csv_of, html_of, tex_
 RESOLUTION_DPI = 120
 
 LARGEST_SHOWN_BYTES = 400_000
-"""The page shows the PNG of a figure whose SVG is larger, because a phone renders a large SVG slowly."""
+"""If the SVG of a figure is larger than this, the page shows the PNG, because a phone renders a large SVG slowly."""
 
 SHORT_ROWS = 30
 """A table with more rows can be split between printed pages; its head is then repeated on each page."""
 
-_SVG: Any = {"svg.hashsalt": "lavt", "svg.fonttype": "none", "path.simplify_threshold": 0.3}
+_SVG_SETTINGS: Any = {"svg.hashsalt": "lavt", "svg.fonttype": "none", "path.simplify_threshold": 0.3}
 """With these settings the SVG of a figure is byte-for-byte reproducible, and its texts are stored as text."""
 
 _NO_METADATA = {"Date": None, "Creator": None, "Format": None, "Type": None}
@@ -29,7 +29,7 @@ _NO_METADATA = {"Date": None, "Creator": None, "Format": None, "Type": None}
 def save_figure(report_dir: Path, name: str, figure: Figure, alternative: str, caption: str) -> Markup:
     """Write `name`.png and `name`.svg, and return the figure as HTML; the text `alternative` describes the figure."""
     png, svg = report_dir / f"{name}.png", report_dir / f"{name}.svg"
-    with mpl.rc_context(_SVG):
+    with mpl.rc_context(_SVG_SETTINGS):
         figure.savefig(png, dpi=RESOLUTION_DPI, metadata={"Software": None})
         figure.set_layout_engine("none")  # keep the layout: to compute it again takes as long as drawing the figure
         figure.savefig(svg, metadata=_NO_METADATA)

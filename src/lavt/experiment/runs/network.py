@@ -19,7 +19,8 @@ VIDEO_LATENCY_STAGES = (
     ("driver", "decode"),
     ("driver", "read_stamp"),
 )
-"""The stages that are part of tau_v. The delay of the link in a profile is the profile's tau_v minus these stages."""
+"""The stages that are part of tau_v. A profile gives the complete tau_v, so the delay of its network is tau_v minus the
+times of these stages."""
 CONTROL_LATENCY_STAGES = (("driver", "command"),)
 """The stages that are part of tau_c."""
 
@@ -38,7 +39,7 @@ class BaselineLatency:
 
 INHERENT = {
     # The paper's WiFi 5: tau_v with median 62 and 95th percentile 86 ms, tau_c of 8 to 10 ms.
-    "paper_wifi5": BaselineLatency(50.0, Lognormal(12.0, 0.668), 9.0),
+    "paper_wifi5": BaselineLatency(video_ms=50.0, video_jitter=Lognormal(median_ms=12.0, sigma=0.668), control_ms=9.0),
 }
 
 
@@ -46,8 +47,9 @@ INHERENT = {
 class NetworkDelays:
     """The delays of video, state (server to client), control (client to server), and traffic that is never delayed.
 
-    These four delays include an injected delay that is only constant. Any other injected impairment, with its constant
-    part, is in `video_injected` or `control_injected`.
+    `state` includes the delay injected into the state. If only a constant delay is injected into the video, `video`
+    includes it; any other injection into the video, with its constant part, is in `video_injected` instead. The same
+    holds for `control` and `control_injected`.
     """
 
     video: DelayModel
@@ -73,15 +75,17 @@ def injected_network(profile: str, condition: Condition, costs: Costs, seed: int
             inherent.control_ms - costs.links_us["control"] / US_PER_MS - _stages_ms(costs, CONTROL_LATENCY_STAGES)
         )
     state_ms = condition.video_ms if state_delay == "with_video" else 0.0
-    video = link_injection("video", condition.video_ms, condition.video, seed)
-    control = link_injection("control", condition.control_ms, condition.control, seed)
+    video_injected = link_injection("video", condition.video_ms, condition.video, seed)
+    control_injected = link_injection("control", condition.control_ms, condition.control, seed)
+    constant_video_ms = max(0.0, video_ms) + (condition.video_ms if video_injected is None else 0.0)
+    constant_control_ms = max(0.0, control_ms) + (condition.control_ms if control_injected is None else 0.0)
     return NetworkDelays(
-        DelayModel(max(0.0, video_ms) + (condition.video_ms if video is None else 0.0), jitter, seed, "video inherent"),
-        DelayModel(max(0.0, control_ms) + (condition.control_ms if control is None else 0.0)),
-        DelayModel(max(0.0, control_ms) + state_ms),
-        DelayModel(0.0),
-        video,
-        control,
+        video=DelayModel(constant_video_ms, jitter, seed, name="video inherent"),
+        control=DelayModel(constant_control_ms),
+        state=DelayModel(max(0.0, control_ms) + state_ms),
+        never_delayed=DelayModel(0.0),
+        video_injected=video_injected,
+        control_injected=control_injected,
     )
 
 

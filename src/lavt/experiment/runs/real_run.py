@@ -177,7 +177,7 @@ def _requested_ms(planned: PlannedRun) -> dict[str, float | None]:
     }
 
 
-def relay_reasons(relay: Mapping[str, Any]) -> list[InvalidReason]:
+def relay_invalid_reasons(relay: Mapping[str, Any]) -> list[InvalidReason]:
     """Return a reason for each flow whose delay in the relay differs from the request; `relay` is from `relay.json`.
 
     For a flow with an impairment other than a constant delay, the send times of packets are compared with the planned

@@ -16,7 +16,7 @@ from lavt.experiment.analysis.invalid_reason import InvalidReason
 from lavt.experiment.analysis.results import read_json, run_result, write_json
 from lavt.experiment.runs.netem_run import NETEM, netem_invalid_reasons
 from lavt.experiment.runs.plan import PlannedRun
-from lavt.experiment.runs.real_run import RELAY, Progress, drive_real, relay_reasons
+from lavt.experiment.runs.real_run import RELAY, Progress, drive_real, relay_invalid_reasons
 from lavt.experiment.runs.virtual_run import build_loop, drive
 from lavt.recording.output_directory import check_directory, prepare_directory
 from lavt.recording.record import evaluating, read_record
@@ -74,7 +74,7 @@ def _compute(out: Path, identity: Mapping[str, Any], digest: str | None) -> Driv
     reasons: list[InvalidReason] = []
     if identity["injection"] == "relay":
         relay = read_json(out / RELAY) if (out / RELAY).is_file() else {}
-        reasons = relay_reasons(relay)
+        reasons = relay_invalid_reasons(relay)
     elif identity["inherent"] == NETWORK:
         requested = identity["condition"] if identity["injection"] == "netem" else ""
         reasons = recorded_reasons(server, client, requested, identity["injected_ms"])

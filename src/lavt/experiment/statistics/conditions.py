@@ -132,10 +132,11 @@ def common_p95_m(runs: Sequence[Run], distances: CommonDistances) -> list[float]
 
 
 def worst_rank_m(runs: Sequence[Run]) -> dict[str, float | None]:
-    """Return the quartiles of P95 of all runs; a run that was not completed ranks after all completed runs.
+    """Return the quartiles of P95 of all runs, with the worst rank for each run that was not completed.
 
-    A quartile is the smallest P95 of any run such that at least 25, 50 or 75 % of the runs have no larger P95. It is
-    None if the run with this P95 was not completed. A completed run whose error is unknown is left out.
+    Such a run ranks after all completed runs. A quartile is the smallest P95 of any run such that at least 25, 50 or
+    75 % of the runs have no larger P95. It is None if the run with this P95 was not completed. A completed run whose
+    error is unknown is left out.
     """
     errors_m = [run["p95_m"] if run["ending"] == "completed" else np.inf for run in runs]
     known = [value for value in errors_m if value is not None]
@@ -204,9 +205,10 @@ def _picture_age_ms(runs: Sequence[Run]) -> dict[str, float | None]:
 
 
 def _stages_ms(runs: Sequence[Run]) -> list[dict[str, Any]]:
-    """Return for each stage the median of all runs' median latencies; a frame passes the stages in this order."""
+    """Return the stages in the order in which a frame passes them, with the median of the runs' median latencies."""
     medians_ms: dict[tuple[str, str], list[float]] = {}
-    most_stages_first = sorted(runs, key=lambda run: -len(run.get("stages_ms") or []))  # the first run sets the order
+    # The order is that of the run with the most stages.
+    most_stages_first = sorted(runs, key=lambda run: -len(run.get("stages_ms") or []))
     for run in most_stages_first:
         for entry in run.get("stages_ms") or []:
             medians_ms.setdefault((entry["node"], entry["stage"]), []).append(entry["p50"])

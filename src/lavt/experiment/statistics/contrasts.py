@@ -11,7 +11,7 @@ from scipy.stats import binomtest, fisher_exact
 from lavt.experiment.statistics.intervals import holm
 
 PLANNED = (("L0", "L1"), ("L1", "L2"), ("L2", "L3"), ("L2", "L4"), ("L3", "L4"), ("L3", "L5"))
-"""The contrasts, chosen before any run was driven: each step of the injected delay, and L3 with L4, whose sums of
+"""The contrasts, chosen before any run was driven: each next larger injected delay, and L3 with L4, whose sums of
 video and control delay are equal."""
 
 PAIRED_BY = ("route", "repetition", "seed", "participant", "block")

@@ -107,10 +107,10 @@ class LossProcess:
     """Losses of packets: independent, or in bursts (Gilbert-Elliott model).
 
     `bursts` are the probabilities that a burst begins and ends; None: losses are independent, with probability `loss`.
-    `name` is the name of the random-number stream of `seed`. Of two processes with the same stream, the one with
-    the higher loss loses every packet that the other loses, and more. This is true if both lose packets independently,
-    or if both have the same mean burst length and the lower loss is at most 1 - 1 / that length. (With a lower loss
-    above this limit, a burst is less likely to continue than to begin.)
+    `name` is the name of the random-number stream of `seed`. Take two processes with the same stream and different
+    loss. If both lose packets independently, the lossier process loses every packet that the other one loses, and more.
+    The same holds for two processes with the same mean burst length b if the smaller loss is at most 1 - 1 / b. (If the
+    smaller loss exceeds this limit, its bursts are less likely to continue than to begin.)
     """
 
     def __init__(self, seed: int, name: str, loss: float, bursts: BurstProbabilities | None) -> None:

@@ -110,7 +110,7 @@ class NullVehicleAuthenticator:
         """Return True: without MACs every command could come from the active operator."""
         return True
 
-    def is_next_of_active_operator(self, _channel: str, _data: bytes) -> bool:
+    def is_active_operators_next_request(self, _channel: str, _data: bytes) -> bool:
         """Return False: without MACs nothing shows that a request comes from the active operator."""
         return False
 
@@ -158,7 +158,7 @@ class VehicleAuthenticator(NullVehicleAuthenticator):
         """Return whether the MAC of a command is valid, which is cheap to check."""
         return self._macs.verify("control", data)
 
-    def is_next_of_active_operator(self, channel: str, data: bytes) -> bool:
+    def is_active_operators_next_request(self, channel: str, data: bytes) -> bool:
         """Return whether a request has the active operator's next replay counter and a valid MAC; a cheap check."""
         counter = self._replay_counter(channel, self._active_operator)
         return data.startswith(counter) and self._macs.verify(channel, data)
@@ -272,9 +272,9 @@ class VerifiedState(Struct, frozen=True):
     """The result of verifying a state; `body` is None if the state must be dropped."""
 
     body: bytes | None
-    needs_request: bool
-    """The client must send a request: the server's process that signed the state has answered none of its requests yet,
-    so the state could be a replay."""
+    client_must_request: bool
+    """Whether the client must send a request: the server's process that signed the state has not answered a request of
+    this client yet, so the state could be a replay."""
 
 
 class OperatorAuthenticator:
@@ -380,15 +380,15 @@ class OperatorAuthenticator:
         is_known_instance = number[:8] == self._newest_state_number[:8]
         if is_known_instance and number <= self._newest_state_number:
             self.counts["states_replayed"] += 1
-            return VerifiedState(None, needs_request=False)
+            return VerifiedState(None, client_must_request=False)
         if not self._vehicle_key.verify(signature, _signing_context("state", self._vehicle) + signed):
             self.counts["states_forged"] += 1
-            return VerifiedState(None, needs_request=False)
+            return VerifiedState(None, client_must_request=False)
         if not is_known_instance:
             self.counts["states_of_unknown_process"] += 1
-            return VerifiedState(None, needs_request=True)
+            return VerifiedState(None, client_must_request=True)
         self._newest_state_number = number
-        return VerifiedState(signed[REPLAY_COUNTER_BYTES:], needs_request=False)
+        return VerifiedState(signed[REPLAY_COUNTER_BYTES:], client_must_request=False)
 
 
 def _digest(data: bytes) -> bytes:

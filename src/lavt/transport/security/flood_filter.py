@@ -1,8 +1,8 @@
 """Cheap checks that keep a flood of commands away from the vehicle, before anything is queued or recorded.
 
-A command that the vehicle could accept always passes, once: its length, version, epoch and sequence are right, and its
-MAC if messages are signed. All other commands pass at a limited rate. That is enough to record why they are rejected,
-and too low to delay anything.
+A command is acceptable if its length, version, epoch and sequence are right, and its MAC if messages are signed. An
+acceptable command always passes, once. Unacceptable commands pass at a limited rate, which is enough to record why they
+are rejected, and too low to delay anything.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from lavt.domain import NS_PER_S, Command
 from lavt.errors import BadMessage
 from lavt.transport.messages import decode
 
-OTHER_COMMANDS_PER_S: Final = 200
+UNACCEPTABLE_COMMANDS_PER_S: Final = 200
 """Enough to record all rejected commands of four clients at 50 Hz; 200 signatures take 3 % of a core."""
-QUERIES_PER_S: Final = 100
-"""The limit for each channel of queries; a client sends one query a second."""
+REQUESTS_PER_S: Final = 100
+"""The limit for each channel of requests; a client sends one request a second."""
 
 
 class RateLimiter:
@@ -60,9 +60,9 @@ class FloodFilter:
         self._newest = _CommandHead(0, -1)
         """Of the newest authentic command. If the vehicle rejects this command, `in_force` does not change, so the
         filter itself must recognize its replays."""
-        self._active_operator_limiter = RateLimiter(OTHER_COMMANDS_PER_S)
+        self._active_operator_limiter = RateLimiter(UNACCEPTABLE_COMMANDS_PER_S)
         """A separate limit, so that no flood crowds out the active operator's commands of an old epoch."""
-        self._other_limiter = RateLimiter(OTHER_COMMANDS_PER_S)
+        self._other_limiter = RateLimiter(UNACCEPTABLE_COMMANDS_PER_S)
 
     def passes(self, data: bytes, body: bytes, now_ns: int) -> bool:
         """Return whether the command `body`, received in the envelope `data`, passes."""

@@ -1,7 +1,7 @@
 """Gateways that filter and authenticate messages between Zenoh and the runtime of a side.
 
-A link delivers to its gateway in threads of the link, and the gateway delivers to the runtime. The runtime's nodes get
-authentic messages only, and need not check who sent them. A message keeps the arrival time that the link measured.
+A link delivers to its gateway in threads of the link, and the gateway delivers to the runtime. So the runtime's nodes
+get authentic messages only, and need not check who sent them. A message keeps the arrival time that the link measured.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any, Final
 from lavt.domain import NS_PER_S, Now
 from lavt.node import Peer, Send
 from lavt.transport.security.envelope import REQUESTS, NullVehicleAuthenticator, OperatorAuthenticator, VerifiedRequest
-from lavt.transport.security.flood_filter import QUERIES_PER_S, FloodFilter, RateLimiter
+from lavt.transport.security.flood_filter import REQUESTS_PER_S, FloodFilter, RateLimiter
 
 Deliver = Callable[[str, Any, Now, Peer], None]
 """Takes (channel, payload, arrived, peer) of each authentic message."""
@@ -22,9 +22,9 @@ Carry = Callable[..., None]
 """Takes `Send`s and passes them to the link."""
 
 REQUEST_PERIOD_NS: Final = NS_PER_S
-MAX_PENDING_QUERIES: Final = 64
+MAX_UNANSWERED_REQUESTS: Final = 64
 STATES_PER_S: Final = 500
-"""Ten times the rate of a vehicle; to verify this many signatures takes 7 % of a core."""
+"""Ten times as many as a vehicle sends; to verify this many signatures takes 7 % of a core."""
 
 
 class OpenClientGateway:
@@ -51,7 +51,7 @@ class ServerGateway:
         self._carry = carry
         self._authenticator = authenticator
         self._flood_filter = FloodFilter(in_force, authenticator.is_from_active_operator)
-        self._query_limiters = {channel: RateLimiter(QUERIES_PER_S) for channel in REQUESTS}
+        self._request_limiters = {channel: RateLimiter(REQUESTS_PER_S) for channel in REQUESTS}
         self._requests: dict[tuple[str, Peer], VerifiedRequest] = {}
         self._retry: Send | None = None
         """A reply that demands the request again, sent as soon as the lock is free."""
@@ -85,8 +85,8 @@ class ServerGateway:
 
     def _verify_request(self, channel: str, payload: bytes, now_ns: int, peer: Peer) -> bytes | None:
         if not (
-            self._authenticator.is_next_of_active_operator(channel, payload)
-            or self._query_limiters[channel].take(now_ns)
+            self._authenticator.is_active_operators_next_request(channel, payload)
+            or self._request_limiters[channel].take(now_ns)
         ):
             self._counts[f"{channel}_requests_screened_out"] += 1
             return None
@@ -97,7 +97,7 @@ class ServerGateway:
             self._retry = Send(f"{channel}_reply", self._authenticator.sign_reply(request, b""), peer)
             return None
         self._requests[channel, peer] = request
-        if len(self._requests) > MAX_PENDING_QUERIES:
+        if len(self._requests) > MAX_UNANSWERED_REQUESTS:
             self._requests.pop(next(iter(self._requests)))
         return request.body
 
@@ -146,16 +146,18 @@ class ClientGateway:
             self._counts["states_screened_out"] += 1
             return None
         state = self._authenticator.verify_state(payload)
-        if state.needs_request and (self._requested_ns is None or now_ns - self._requested_ns >= REQUEST_PERIOD_NS):
+        if state.client_must_request and (
+            self._requested_ns is None or now_ns - self._requested_ns >= REQUEST_PERIOD_NS
+        ):
             self._requested_ns = now_ns
             self._send_in_thread(Send("session", self._authenticator.sign_request("session", b"")))
         return state.body
 
     def _verify_reply(self, channel: str, payload: bytes, _now_ns: int) -> bytes | None:
-        query = channel.removesuffix("_reply")
-        reply = self._authenticator.verify_reply(query, payload)
+        request_channel = channel.removesuffix("_reply")
+        reply = self._authenticator.verify_reply(request_channel, payload)
         if reply.retry is not None:
-            self._send_in_thread(Send(query, reply.retry))
+            self._send_in_thread(Send(request_channel, reply.retry))
         return reply.body
 
     def _send_in_thread(self, send: Send) -> None:

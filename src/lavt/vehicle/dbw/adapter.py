@@ -29,10 +29,10 @@ from lavt.vehicle.dbw.states import KIT_RESPONSE_LIMIT_NS, Situation, State, sta
 from lavt.vehicle.vehicle import ReachedCommand
 
 SHIFT_REPORT_LIMIT_NS: Final = NS_PER_S
-"""Our choice: the kit reports a shift to DRIVE at most this long after the request."""
+"""Our assumption: a kit needs at most this long to report a requested shift to DRIVE."""
 STATIONARY_BEFORE_PARK_NS: Final = 300 * NS_PER_MS
-"""Our choice: PARK is requested after the car was reported stationary for this long. A single report can be wrong, or
-come from locked wheels. A car that slides at 4 m/s2 loses 1.2 m/s in this time."""
+"""Our choice: PARK is requested when the car has been reported stationary for this long. A single report can be wrong,
+or come from locked wheels. A car that slides at 4 m/s2 loses 1.2 m/s in this time."""
 IDLE_PERIOD_NS: Final = 100 * NS_PER_MS
 """Period at which `frames_due` should be called if nothing is due earlier."""
 ECHO_LIMIT_NS: Final = 200 * NS_PER_MS
@@ -65,11 +65,13 @@ class ByWireAdapter:
         self._wanted, self._bus_error = False, ""
         self._still_enabled: frozenset[Axis] = NO_AXES
         """In `lost` and `parking` the axes enabled ever since driving ended; otherwise all enabled axes."""
-        self._is_release_unexpected = False
-        """Whether an axis was enabled when `parking` began, and no command to disable it has been sent since then."""
+        self._expects_no_release = False
+        """Whether a release of all axes would be unexpected: an axis was enabled when `parking` began, and no command
+        to disable it has been sent since then."""
         self._needed_axes = frozenset({"brake"}) if profile.system is None else frozenset(AXES)
-        """If the kit releases one of these axes, no command is sent any more. A kit that is enabled as a whole needs
-        all axes: a command to disable one would also release the brake, and the kit's watchdog would not brake."""
+        """If the kit releases one of these axes, no command is sent any more. A kit with a system command disables all
+        axes together, so it needs all of them: a command that disables one axis would also release the brake, and the
+        kit's watchdog would not brake."""
         self._moved_ns = start_ns
         """Time of the last report that the car moves."""
         self._is_shifting = False
@@ -82,9 +84,9 @@ class ByWireAdapter:
         self._known_problems: frozenset[str] = frozenset()
         self._events: list[VehicleEvent] = []
         self._awaited_echoes: deque[tuple[int, int]] = deque()
-        """Steering commands sent and not yet echoed: each in steps of the kit's resolution, with its tick's time."""
-        self._last_steering_steps: int | None = None
-        """The steering command of the last set of frames, in such steps; None if steering was not enabled."""
+        """Steering commands sent and not yet echoed: angle in units of the kit's resolution, and time of the tick."""
+        self._last_steering_units: int | None = None
+        """The steering command of the last set of frames, in the same unit; None if steering was not enabled."""
         self._reached: list[ReachedCommand] = []
         self._counts: Counter[str] = Counter()
         self._situation = self._current_situation(start_ns)
@@ -143,8 +145,8 @@ class ByWireAdapter:
                 if not self._known_problems.issuperset(reason.split(SEPARATOR)):
                     self._events.append(VehicleEvent(now_ns, "fault", reason))
             self._state, self._entered_ns = state, now_ns
-            self._is_release_unexpected = state == "parking" and bool(enabled)
-            self._situation = replace(self._situation, in_state_ns=0, is_release_unexpected=self._is_release_unexpected)
+            self._expects_no_release = state == "parking" and bool(enabled)
+            self._situation = replace(self._situation, in_state_ns=0, expects_no_release=self._expects_no_release)
 
     def _surely_enabled(self, now_ns: int) -> frozenset[Axis]:
         """Return the enabled axes; none if the kit's watchdog may have tripped since the last report."""
@@ -187,7 +189,7 @@ class ByWireAdapter:
             enabled=reports.enabled,
             gear=reports.gear,
             in_state_ns=now_ns - self._entered_ns,
-            is_release_unexpected=self._is_release_unexpected,
+            expects_no_release=self._expects_no_release,
         )
 
     def _wheel_limit_text(self) -> str:
@@ -225,15 +227,15 @@ class ByWireAdapter:
             return []
         self._last_commands = commands
         self._is_shifting |= commands.gear == "drive"
-        self._is_release_unexpected &= bool(commands.enabled)
+        self._expects_no_release &= bool(commands.enabled)
         frames = self._sender.frames(commands, requested, self._reports.wheel_deg, now_ns)
         self._expect_echo(commands)
         return frames
 
     def on_dropped(self, frames: Sequence[CanFrame]) -> None:
-        """Take back `frames`, the last ones of the frames that were due, because they were not written.
+        """Note that `frames`, the last ones of those that `frames_due` returned, were not written.
 
-        A complete set is then due at the next tick.
+        A complete set of frames is then due at the next tick.
         """
         if frames:
             self._sender.take_back(frames)
@@ -302,22 +304,22 @@ class ByWireAdapter:
         """Expect the kit to echo the steering command just sent, if it differs from the previous one."""
         if "steering" not in commands.enabled or self._requested_ns is None:
             self._awaited_echoes.clear()
-            self._last_steering_steps = None
+            self._last_steering_units = None
             return
         while self._awaited_echoes and self._requested_ns - self._awaited_echoes[0][1] > ECHO_LIMIT_NS:
             self._awaited_echoes.popleft()
-        steps = round(self._sender.last_command.wheel_deg / self._profile.command_step_deg)
-        if steps != (self._reports.steering_echo if self._last_steering_steps is None else self._last_steering_steps):
-            self._awaited_echoes.append((steps, self._requested_ns))
-        self._last_steering_steps = steps
+        units = round(self._sender.last_command.wheel_deg / self._profile.command_step_deg)
+        if units != (self._reports.steering_echo if self._last_steering_units is None else self._last_steering_units):
+            self._awaited_echoes.append((units, self._requested_ns))
+        self._last_steering_units = units
 
     def _match_echo(self, now_ns: int) -> None:
-        """Match the newest echo with a sent command; commands sent before that one were superseded."""
-        if not any(steps == self._reports.steering_echo for steps, _ in self._awaited_echoes):
+        """Match the newest echo with a sent command; the commands sent before it were superseded."""
+        if not any(units == self._reports.steering_echo for units, _ in self._awaited_echoes):
             return
         while self._awaited_echoes:
-            steps, requested_ns = self._awaited_echoes.popleft()
-            if steps == self._reports.steering_echo:
+            units, requested_ns = self._awaited_echoes.popleft()
+            if units == self._reports.steering_echo:
                 self._reached.append(ReachedCommand(requested_ns, now_ns))
                 return
 

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from can import BusABC, Message
 
 REOPEN_NS: Final = NS_PER_S
-"""Pause before each attempt to reopen a lost bus. After it, reports from before the loss are too old to be used."""
+"""Pause before each attempt to reopen a lost bus. After the pause, reports from before the loss are too old."""
 QUEUE_FRAMES: Final = 8192
 """Capacity of the receive queue: two seconds of a full 500 kbit/s bus. If it is full, the oldest frames are dropped."""
 POLL_S: Final = 0.1
@@ -45,8 +45,8 @@ READ_PERIOD_S: Final = 0.05
 between, the kernel queues them."""
 MAX_READS: Final = 256
 """The most frames that are read at a time, so that a flood does not delay the caller of `take`."""
-LATEST_READ_NS: Final = NS_PER_S
-"""A frame that is read later than this after its arrival is dropped, because this process was frozen."""
+READ_AGE_LIMIT_NS: Final = NS_PER_S
+"""A frame that arrived longer ago than this when it is read is dropped, because this process was frozen."""
 
 logging.getLogger("can").addHandler(logging.NullHandler())  # errors raised here contain what python-can would log
 
@@ -78,7 +78,7 @@ class OpenBus(NamedTuple):
 
 
 class CanPort:
-    """A `BusPort` on a CAN bus. `send` and `take` are for one thread and never block.
+    """A `BusPort` on a CAN bus. Only one thread may call `send` and `take`, which never block.
 
     The port has a thread, which reads frames and reopens a lost bus; reopening takes some drivers a second.
 
@@ -108,7 +108,7 @@ class CanPort:
         self.counts: Counter[str] = Counter()
         bus = self._open()
         self._bus: OpenBus | None = bus
-        """The open bus; None if it is lost. After this attribute was set to None, the thread shuts the bus down."""
+        """The open bus; None if it is lost. The port's thread shuts a lost bus down."""
         self._thread = threading.Thread(target=self._run, args=(bus,), name="can", daemon=True)
         self._thread.start()
 
@@ -190,7 +190,7 @@ class CanPort:
         return OpenBus(driver, deque(maxlen=QUEUE_FRAMES), ArrivalTimes(opened), datagram_check, threading.Lock())
 
     def _reopen(self) -> OpenBus | None:
-        """Try to open the bus until it is open; return None if the port is closed before."""
+        """Try to open the bus until it is open; return None if the port is closed first."""
         while not self._closing.wait(REOPEN_NS / NS_PER_S):
             suspended_ns = self._read_suspended_ns()
             try:
@@ -242,7 +242,7 @@ class CanPort:
                 self.counts["unreadable"] += 1
                 return
             message = bus.driver.recv(timeout_s)
-        except BlockingIOError:  # no frame waits; the kernel can drop an announced datagram for its wrong checksum
+        except BlockingIOError:  # `select` reported a datagram, but the kernel then dropped it for a wrong checksum
             return
         except Exception as error:
             is_unpacking_error = error.__cause__ is not None and not isinstance(error.__cause__, OSError)
@@ -266,7 +266,7 @@ class CanPort:
         arrived_ns = now.mono_ns
         if self._interface in STAMPED_BY_KERNEL:
             arrived_ns = bus.arrivals.arrived_ns(round(message.timestamp * NS_PER_S), now)
-            if now.mono_ns - arrived_ns > LATEST_READ_NS:
+            if now.mono_ns - arrived_ns > READ_AGE_LIMIT_NS:
                 self.counts["read_too_late"] += 1
                 return
         self.counts["overflowed"] += len(bus.received) == QUEUE_FRAMES
@@ -371,7 +371,7 @@ def _error_number(error: Exception) -> int | None:
 
 
 def _is_buffer_full(error: Exception) -> bool:
-    """Return whether a write failed because a buffer is full; a new socket would not help."""
+    """Return whether a write failed because the transmit buffer is full, which is no loss of the bus."""
     has_no_room = isinstance(error, _library().CanTimeoutError) or str(error) == FULL_BUFFER_TEXT
     return has_no_room or _error_number(error) in {errno.ENOBUFS, errno.EAGAIN}
 

@@ -65,8 +65,9 @@ class Situation(Struct, frozen=True):
     gear: Gear | None
     in_state_ns: int
     """Time in the current state."""
-    is_release_unexpected: bool
-    """Whether an axis was enabled when `parking` began, and no command to disable it has been sent since then."""
+    expects_no_release: bool
+    """Whether a release of all axes would be unexpected: an axis was enabled when `parking` began, and no command to
+    disable it has been sent since then."""
 
 
 class TransitionRow(Struct, frozen=True):
@@ -190,7 +191,7 @@ TABLE: Final[tuple[TransitionRow, ...]] = (
         "the kit released all axes before it was commanded to, after at least 120 ms",
         lambda situation: (
             _released_before_park(situation)
-            if situation.is_release_unexpected and situation.in_state_ns >= PAUSE_NS and not situation.enabled
+            if situation.expects_no_release and situation.in_state_ns >= PAUSE_NS and not situation.enabled
             else ""
         ),
         "lost",

@@ -109,18 +109,19 @@ COMMANDS: Final[dict[str, ConsoleCommand]] = {
     ),
     "stick_speed": ConsoleCommand(
         "SOURCE[=M/S]",
-        "keep reporting this speed, by default the present one; speed, second_speed (generation 2) or wheel_speed",
+        "keep reporting this speed, by default the present one. "
+        "SOURCE is speed, wheel_speed or second_speed (generation 2 only)",
         lambda kit, text, _: kit.stick_speed(*parse_source(text)),
     ),
     "scale_speed": ConsoleCommand("SOURCE=FACTOR", "report a multiple of the speed", scale_speed),
     "drop_speed": ConsoleCommand(
         "SOURCE",
-        "do not send the message of the source",
+        "do not send the message that reports this speed",
         lambda kit, text, _: kit.drop_speed(text),
     ),
     "restore_speed": ConsoleCommand(
         "SOURCE",
-        "remove the faults of the source",
+        "report this speed correctly again",
         lambda kit, text, _: kit.restore_speed(text),
     ),
     "weaken_brake": ConsoleCommand(

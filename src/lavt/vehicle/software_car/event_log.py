@@ -39,7 +39,7 @@ RELEASE_REASONS: Final = {
 GEAR_REJECTIONS: Final = {
     GearRejection.IN_PROGRESS: "shift in progress",
     GearRejection.OVERRIDE: "override by the driver",
-    GearRejection.VEHICLE: "the brake is not pressed, or the car moves",
+    GearRejection.BRAKE_OR_MOTION: "the brake is not pressed, or the car moves",
     GearRejection.UNSUPPORTED: "unsupported gear",
     GearRejection.FAULT: "a fault",
 }

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Final
 
-from lavt.vehicle.software_car.state import OVERRIDE_PEDAL, Gear, GearOrder, GearRejection, KitState
+from lavt.vehicle.software_car.state import MIN_PRESSED_PEDAL, Gear, GearOrder, GearRejection, KitState
 
 GEARS: Final = {Gear.PARK, Gear.NEUTRAL, Gear.DRIVE}
-"""The gears of the car. Our choice: the simulator's car has no reverse and no low gear."""
+"""The gears of the car. The simulator does not have reverse and low."""
 
 
 def shift(state: KitState, order: GearOrder) -> None:
@@ -31,6 +31,6 @@ def rejection_reason(state: KitState, gear: int) -> GearRejection:
         return GearRejection.OVERRIDE
     if gear not in GEARS:
         return GearRejection.UNSUPPORTED
-    if state.brake < OVERRIDE_PEDAL or (gear == Gear.PARK and not state.is_stationary):
-        return GearRejection.VEHICLE
+    if state.brake < MIN_PRESSED_PEDAL or (gear == Gear.PARK and not state.is_stationary):
+        return GearRejection.BRAKE_OR_MOTION
     return GearRejection.NONE

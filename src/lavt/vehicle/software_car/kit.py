@@ -17,7 +17,7 @@ from lavt.vehicle.software_car.generations import GENERATIONS
 from lavt.vehicle.software_car.mechanics import Mechanics, clamp
 from lavt.vehicle.software_car.state import (
     AXES,
-    OVERRIDE_PEDAL,
+    MIN_PRESSED_PEDAL,
     Axis,
     AxisOrder,
     Gear,
@@ -192,13 +192,13 @@ class Kit:
         """Set the driver's brake pedal."""
         self._advance(now_ns)
         self.state.driver_brake = clamp(fraction, 0.0, 1.0)
-        self._set_driver_acts("brake", fraction >= OVERRIDE_PEDAL)
+        self._set_driver_acts("brake", fraction >= MIN_PRESSED_PEDAL)
 
     def driver_throttles(self, fraction: float, now_ns: int) -> None:
         """Set the driver's throttle pedal."""
         self._advance(now_ns)
         self.state.driver_throttle = clamp(fraction, 0.0, 1.0)
-        self._set_driver_acts("throttle", fraction >= OVERRIDE_PEDAL)
+        self._set_driver_acts("throttle", fraction >= MIN_PRESSED_PEDAL)
 
     def _set_driver_acts(self, axis: Axis, acts: bool) -> None:
         actuator = self.state.actuators[axis]

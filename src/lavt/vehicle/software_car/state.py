@@ -19,8 +19,9 @@ AXES: Final[tuple[Axis, ...]] = ("steering", "brake", "throttle")
 
 STATIONARY_BELOW_MPS = 0.1
 """Our choice: the car is stationary if it is slower than this."""
-OVERRIDE_PEDAL: Final = 0.05
-"""Our choice: the smallest fraction of a pedal that is an override, and the smallest brake that allows shifting."""
+MIN_PRESSED_PEDAL: Final = 0.05
+"""Our choice: the smallest fraction at which a pedal counts as pressed. A pedal that the driver presses is an override.
+The gearbox shifts only while the brake is pressed."""
 
 
 class Gear(IntEnum):
@@ -40,7 +41,8 @@ class GearRejection(IntEnum):
     NONE = 0
     IN_PROGRESS = 1
     OVERRIDE = 2
-    VEHICLE = 5
+    BRAKE_OR_MOTION = 5
+    """The brake is not pressed, or the car moves."""
     UNSUPPORTED = 6
     FAULT = 7
 

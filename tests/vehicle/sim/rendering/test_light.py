@@ -1,4 +1,4 @@
-"""Test pictures in the three lights: noon, low sun and overcast."""
+"""Tests of pictures in the three lights: noon, low sun and overcast."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def road() -> Road:
 
 @cache
 def asphalt(light: LightName) -> FloatArray:
-    """Return the mean colour of the driven lane just ahead of the car, for n places of the car, as an array (n, 3)."""
+    """Return the mean colour (n, 3) of the driven lane just ahead of the car, for n positions of the car."""
     road = load_road("a_key")
     camera = camera_on(road, light=light)
     pictures = [picture_of(camera, pose_at(road, s_m)) for s_m in np.arange(2.0, road.route_length_m, 12.0)]
@@ -64,12 +64,12 @@ def grey_at(picture: Picture, road: Road, *, station_m: float, lateral_m: float,
 
 def test_a_rails_shadow_falls_away_from_the_sun(road: Road) -> None:
     """The ground beside the right rail is dark up to the shadow of the rail's top, and bright beyond."""
-    camera = camera_on(road, light="low_sun", scenery="light")
+    camera = camera_on(road, light="low_sun", scenery="light")  # little scenery: neither trees nor buildings
     camera_station_m, station_m = 80.0, 88.0
     picture = picture_of(camera, pose_at(road, camera_station_m))
-    centre, left_of_centre = road.point_at(station_m, [0.0, 1.0])  # 1 m apart
-    left = left_of_centre - centre
-    reach_m = RAIL_HEIGHT_M * float(LIGHTS["low_sun"].shadow_vector_m @ left)
+    centre, left_of_centre = road.point_at(station_m, [0.0, 1.0])
+    left = left_of_centre - centre  # a unit vector, because the points are 1 m apart
+    reach_m = RAIL_HEIGHT_M * float(LIGHTS["low_sun"].shadow_per_height @ left)
     assert reach_m > 3.0  # to the left: the sun is to the right here
 
     def grey_beside_rail(distance_m: float) -> float:

@@ -23,7 +23,7 @@ Colour = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """One light."""
+    """The light of one weather and time of day."""
 
     azimuth_rad: float
     """The sun's azimuth in the world frame, from the x axis towards the y axis."""
@@ -56,8 +56,8 @@ class Light:
         )
 
     @property
-    def shadow_vector_m(self) -> FloatArray:
-        """The shadow (x, y) of the top of a pole of 1 m, relative to the foot of the pole."""
+    def shadow_per_height(self) -> FloatArray:
+        """The vector (2,) from the foot of a pole to the shadow of its top, divided by the height of the pole."""
         towards = self.towards_sun
         return np.asarray(-towards[:2] / towards[2])
 

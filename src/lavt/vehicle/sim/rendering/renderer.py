@@ -275,7 +275,7 @@ def world(road: Road, scenery: SceneryKind, light_name: LightName) -> tuple[Grou
     light = LIGHTS[light_name]
     if scenery == "none":
         return Ground(road, light, None), None
-    objects = place_roadside_objects(road, trees=scenery == "full")
+    objects = place_roadside_objects(road, full_scenery=scenery == "full")
     shadows = Shadows(objects, light, clouds=scenery == "full" and light.clouds_shade) if light.shadows else None
     return Ground(road, light, shadows), Scenery(objects, light)
 

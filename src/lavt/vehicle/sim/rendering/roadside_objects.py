@@ -93,16 +93,18 @@ class RoadsideObjects:
     walls: Walls
 
 
-def place_roadside_objects(road: Road, *, trees: bool) -> RoadsideObjects:
-    """Place the objects along a road: rails and barriers, and with `trees` also trees, lamp posts and buildings."""
+def place_roadside_objects(road: Road, *, full_scenery: bool) -> RoadsideObjects:
+    """Place the objects along a road: rails, barriers and, in full scenery, also trees, lamp posts and buildings."""
     sampled_rails = [_rail_stations(road, rail) for rail in road.rails]
-    placed_trees = _place_trees(road) if trees else np.empty((0, 4))
+    placed_trees = _place_trees(road) if full_scenery else np.empty((0, 4))
     return RoadsideObjects(
-        faces=_join_faces([*_rail_faces(road, sampled_rails), *_lamp_faces(road, sampled_rails if trees else [])]),
-        poles=_place_poles(road, sampled_rails, lamps=trees),
+        faces=_join_faces(
+            [*_rail_faces(road, sampled_rails), *_lamp_faces(road, sampled_rails if full_scenery else [])]
+        ),
+        poles=_place_poles(road, sampled_rails, lamps=full_scenery),
         trees=placed_trees,
         tree_road_rad=_road_heading(road, placed_trees[:, :2]),
-        walls=_place_buildings(road) if trees else _NO_WALLS,
+        walls=_place_buildings(road) if full_scenery else _NO_WALLS,
     )
 
 
@@ -225,9 +227,11 @@ def _place_buildings(road: Road) -> Walls:
         corners = np.array([forward - left, forward + left, -forward + left, -forward - left]) + place
         for begin, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
             columns = max(2, round(float(np.hypot(*(end - begin))) / 3.0))
-            first = (np.arange(columns) + 0.25) / columns
+            left_edge = (np.arange(columns) + 0.25) / columns
             sill = np.linspace(1.0, 1.0 + _STOREY_M * (storeys - 1), storeys)
-            windows.append(_panels(begin, end, shares=(first, first + 0.5 / columns), heights_m=(sill, sill + 1.5)))
+            windows.append(
+                _panels(begin, end, shares=(left_edge, left_edge + 0.5 / columns), heights_m=(sill, sill + 1.5))
+            )
             whole, height_m = (np.zeros(1), np.ones(1)), (np.zeros(1), np.full(1, _STOREY_M * storeys + 0.5))
             outlines.append(_panels(begin, end, shares=whole, heights_m=height_m)[0])
             normals.append(-_left_normals(begin[None], end[None])[0])

@@ -26,13 +26,13 @@ class Shadows:
     """The shadows on one road in one light."""
 
     def __init__(self, objects: RoadsideObjects, light: Light, *, clouds: bool) -> None:
-        self._shadow_vector_m = light.shadow_vector_m
+        self._shadow_per_height = light.shadow_per_height
         self._upright = join_strips(
-            [_face_shadows(objects, self._shadow_vector_m), _pole_shadows(objects.poles, self._shadow_vector_m)]
+            [_face_shadows(objects, self._shadow_per_height), _pole_shadows(objects.poles, self._shadow_per_height)]
         )
         self._trees = objects.trees
         feet_m, heights_m = objects.trees[:, :2], objects.trees[:, 2:3]
-        shadow_ends_m = feet_m + heights_m * self._shadow_vector_m
+        shadow_ends_m = feet_m + heights_m * self._shadow_per_height
         reach_m = heights_m * TREE_WIDTH / 2 + _MARGIN_M
         self._tree_boxes = np.concatenate(
             [np.minimum(feet_m, shadow_ends_m) - reach_m, np.maximum(feet_m, shadow_ends_m) + reach_m], axis=1
@@ -53,13 +53,15 @@ class Shadows:
         low = np.array([square.left_m, square.low_m])
         boxes = self._tree_boxes
         overlapping = (boxes[:, :2] <= low + square.edge_m).all(axis=1) & (boxes[:, 2:] >= low).all(axis=1)
-        across = np.array([-self._shadow_vector_m[1], self._shadow_vector_m[0]]) / np.hypot(*self._shadow_vector_m)
+        across = np.array([-self._shadow_per_height[1], self._shadow_per_height[0]]) / np.hypot(
+            *self._shadow_per_height
+        )
         for x_m, y_m, height_m, kind in self._trees[overlapping]:
             shape = tree_shape(int(kind))
             rows, columns = shape.shape
             # The last row of the shape is the tree's foot; the first row is the shadow of its top.
             right = across * (height_m * TREE_WIDTH / columns)
-            down = -self._shadow_vector_m * (height_m / rows)
+            down = -self._shadow_per_height * (height_m / rows)
             foot = np.array([x_m, y_m])
             origin = foot - right * (columns - 1) / 2 - down * (rows - 1)
             ground_from_shape = np.column_stack([right, down, origin - low]) / square.scale_m
@@ -68,16 +70,16 @@ class Shadows:
             cv2.max(mask, cv2.warpAffine(shape, ground_from_shape, size, flags=cv2.INTER_LINEAR), mask)
 
 
-def _face_shadows(objects: RoadsideObjects, shadow_vector_m: FloatArray) -> Strips:
+def _face_shadows(objects: RoadsideObjects, shadow_per_height: FloatArray) -> Strips:
     """Return the shadows of rails, barriers, lamp arms and walls."""
     corners = np.concatenate([objects.faces.corners_m, objects.walls.outlines_m])
-    return make_strips(corners[..., :2] + corners[..., 2:] * shadow_vector_m)
+    return make_strips(corners[..., :2] + corners[..., 2:] * shadow_per_height)
 
 
-def _pole_shadows(poles: FloatArray, shadow_vector_m: FloatArray) -> Strips:
+def _pole_shadows(poles: FloatArray, shadow_per_height: FloatArray) -> Strips:
     places_m, foot_heights_m, top_heights_m, widths_m = poles[:, :2], poles[:, 2:3], poles[:, 3:4], poles[:, 4:]
-    side = np.array([-shadow_vector_m[1], shadow_vector_m[0]]) / np.hypot(*shadow_vector_m) * widths_m / 2
-    foot, top = places_m + foot_heights_m * shadow_vector_m, places_m + top_heights_m * shadow_vector_m
+    side = np.array([-shadow_per_height[1], shadow_per_height[0]]) / np.hypot(*shadow_per_height) * widths_m / 2
+    foot, top = places_m + foot_heights_m * shadow_per_height, places_m + top_heights_m * shadow_per_height
     return make_strips(np.stack([foot - side, foot + side, top + side, top - side], axis=1))
 
 

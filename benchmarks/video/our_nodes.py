@@ -1,4 +1,4 @@
-"""Nodes and runtime of the video, as `lavt server` and `lavt client` build them."""
+"""LAVT's half of the benchmark: video nodes and their runtime, as `lavt server` and `lavt client` build them."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ class ProcessRuntime:
 
 
 def build_sender_nodes(run: Run, clock: MachineClock, port: int) -> Sequence[Node]:
-    """Build the server's camera node with a `RepeatingCamera`, and a node that discards the actuator's messages."""
+    """Build the server's camera node with a `RepeatingCamera`, and a node that discards messages to the actuator."""
     config = ServerConfig.model_validate(
         {
             "camera": {"width_px": run.width_px, "height_px": run.height_px, "rate_hz": RATE_HZ},
@@ -127,7 +127,7 @@ def build_sender_nodes(run: Run, clock: MachineClock, port: int) -> Sequence[Nod
 
 
 class LastPictureDecoder:
-    """A `PictureReceiver`, the client's decoder, that keeps the picture whose stamp was read last."""
+    """A `PictureReceiver`, the client's decoder, which keeps the picture whose stamp was read last."""
 
     def __init__(self, decoder: PictureReceiver) -> None:
         self.last: Any = None
