@@ -48,7 +48,7 @@ def test_a_change_of_the_process_fails_the_test(name: str, monkeypatch: pytest.M
 
 @pytest.mark.usefixtures("_restore")
 def test_pytest_reacts_to_sigint_in_a_background_job() -> None:
-    """A shell lets its background jobs ignore SIGINT (Ctrl-C); pytest reacts to it nevertheless."""
+    """A shell starts background jobs with SIGINT (Ctrl-C) ignored; pytest reacts to it nevertheless."""
     ignore_signal(signal.SIGINT)
     pytest_configure()
     assert signal.getsignal(signal.SIGINT) == signal.default_int_handler

@@ -104,7 +104,7 @@ class Outage:
 
 @dataclass
 class Drive:
-    """The processes of a control loop, and the outages that the test has caused. All of them read the same clocks."""
+    """The processes of a control loop, which read the same clocks as the test, and the outages that the test caused."""
 
     networks: FieldNetworks
     processes: Processes

@@ -227,7 +227,7 @@ def test_a_client_whose_address_changes_keeps_its_video(address_change: AddressC
 
 
 def test_only_a_new_validation_moves_the_video(address_change: AddressChangeDrive) -> None:
-    """Pictures go to the new address only after the client has answered a challenge from there.
+    """Pictures go to the new address only after the client has answered a challenge, and its answer came from there.
 
     Before the change of address a re-validation occurs only after frame loss.
     """

@@ -194,7 +194,7 @@ def test_steering_begins_at_the_present_angle() -> None:
 
 @pytest.mark.parametrize("start", ["disarmed", "arming", "driving", "degraded", "safe_stop"])
 def test_an_emergency_stop_works_in_every_state(start: str) -> None:
-    """In every state an emergency stop latches full brake under a new epoch, and no command is accepted."""
+    """In every state an emergency stop latches full brake and begins a new epoch, and no command is accepted."""
     rig = Rig().acquire()
     if start == "arming":
         rig.arm_for(NS_PER_S // 2)

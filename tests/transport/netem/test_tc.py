@@ -263,7 +263,7 @@ def test_unexpected_options_from_tc_raise_a_work_error(options: dict[str, Any]) 
         (Impairment(0, reorder=0.1), "needs a delay"),
         (Impairment(5, loss=0.9, loss_burst_packets=2), "longer bursts or less loss"),
         (Impairment(5, rate_bps=4), "rate_bps"),
-        (Impairment(5, 1, 0.5, "pareto"), "correlated jitter is normal"),
+        (Impairment(5, 1, 0.5, "pareto"), "must have the jitter_distribution normal"),
         (Impairment(5, 1, 0, "poisson"), "one of normal, uniform"),  # type: ignore[arg-type]
     ],
 )

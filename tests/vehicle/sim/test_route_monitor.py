@@ -133,7 +133,7 @@ def test_the_time_limit_can_be_set(road: Road) -> None:
 def test_an_edge_exactly_on_a_line_is_still_in_its_lane() -> None:
     """An edge exactly on a line is in the body's lane; 1 mm further is a lane invasion."""
     straight = parse_road("title: x\nsegments: [{length_m: 100}]\nlanes: {widths_m: [3.0]}", source="x")
-    wide = replace(CAR, body_width_m=2.0)  # half a metre to either side, without rounding
+    wide = replace(CAR, body_width_m=2.0)  # in a lane of 3 m half a metre is free on either side
     for lateral_m, invasions in ((0.5, 0), (-0.5, 0), (0.501, 1), (-0.501, 1)):
         monitor = RouteMonitor(straight, wide, near_station_m=5.0)
         monitor.update(motion_at(straight, 5.0), 0)
@@ -209,7 +209,7 @@ def test_asphalt_is_limited_to_its_stations() -> None:
 
 
 def test_a_car_on_the_far_side_of_a_rail_does_not_touch_it() -> None:
-    """A car beyond the line of a rail passes it without a collision; a car on this line hits the rail's beginning."""
+    """A car that drives behind a rail passes it without a collision; a car in line with the rail hits its beginning."""
     road = parse_road(OPEN_RAIL, source="x")
     assert "collision" not in kinds(events_along(road, [(30.0 + s_m, -7.5) for s_m in range(20)]))
     assert "collision" in kinds(events_along(road, [(30.0 + s_m, -6.2) for s_m in range(20)]))

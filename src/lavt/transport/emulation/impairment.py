@@ -83,7 +83,7 @@ def check_impairment(name: str, impairment: Impairment) -> None:
     if impairment.jitter_distribution not in DISTRIBUTIONS:
         raise UserError(f"{name}: jitter_distribution is one of {', '.join(DISTRIBUTIONS)}")
     if impairment.jitter_correlation and impairment.jitter_distribution != "normal":
-        raise UserError(f"{name}: correlated jitter is normal: give jitter_distribution normal, or no correlation")
+        raise UserError(f"{name}: jitter with a correlation must have the jitter_distribution normal")
     if impairment.loss_burst_packets > 1 and burst_probabilities(impairment).begin > 1:
         raise UserError(
             f"{name}: a loss of {impairment.loss:g} in bursts of {impairment.loss_burst_packets:g} packets would "

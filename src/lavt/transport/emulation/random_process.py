@@ -109,8 +109,9 @@ class LossProcess:
     `bursts` are the probabilities that a burst begins and ends; None: losses are independent, with probability `loss`.
     `name` is the name of the random-number stream of `seed`. Take two processes with the same stream and different
     loss. If both lose packets independently, the lossier process loses every packet that the other one loses, and more.
-    The same holds for two processes with the same mean burst length b if the smaller loss is at most 1 - 1 / b. (If the
-    smaller loss exceeds this limit, its bursts are less likely to continue than to begin.)
+    The same holds for two processes with the same mean burst length b if the smaller loss is at most 1 - 1 / b. Above
+    this limit a burst is less likely to continue than to begin, so that a draw can lose a packet outside of a burst
+    only.
     """
 
     def __init__(self, seed: int, name: str, loss: float, bursts: BurstProbabilities | None) -> None:

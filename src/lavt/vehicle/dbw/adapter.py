@@ -66,12 +66,12 @@ class ByWireAdapter:
         self._still_enabled: frozenset[Axis] = NO_AXES
         """In `lost` and `parking` the axes enabled ever since driving ended; otherwise all enabled axes."""
         self._expects_no_release = False
-        """Whether a release of all axes would be unexpected: an axis was enabled when `parking` began, and no command
-        to disable it has been sent since then."""
+        """Whether the kit has no reason to release its axes: an axis was enabled when `parking` began, and no
+        command to disable it has been sent since then."""
         self._needed_axes = frozenset({"brake"}) if profile.system is None else frozenset(AXES)
-        """If the kit releases one of these axes, no command is sent any more. A kit with a system command disables all
-        axes together, so it needs all of them: a command that disables one axis would also release the brake, and the
-        kit's watchdog would not brake."""
+        """If the kit releases one of these axes, no command is sent any more, so that its watchdog brakes. With a
+        system command these are all axes: a command that leaves the released axis disabled would disable the brake,
+        too, and keep the watchdog from braking."""
         self._moved_ns = start_ns
         """Time of the last report that the car moves."""
         self._is_shifting = False
@@ -233,7 +233,7 @@ class ByWireAdapter:
         return frames
 
     def on_dropped(self, frames: Sequence[CanFrame]) -> None:
-        """Note that `frames`, the last ones of those that `frames_due` returned, were not written.
+        """Record that `frames`, the last ones of those that `frames_due` returned, were not written.
 
         A complete set of frames is then due at the next tick.
         """

@@ -326,7 +326,7 @@ def _open_bus(interface: str, channel: str, options: Mapping[str, Any]) -> BusAB
     if interface == "socketcan" and channel not in (name for _, name in socket.if_nameindex()):
         # python-can would report this error, too, but leave a socket open
         raise UserError(f"socketcan {channel} cannot be opened (no such device): {REMEDIES[errno.ENODEV]}")
-    # By default a multicast bus counts as virtual (`is_virtual`), so its datagrams must not leave this machine.
+    # LAVT treats a multicast bus as virtual (`is_virtual`) unless the config has a hop limit.
     defaults = {"hop_limit": 0} if interface == SELF_RECEIVING_INTERFACE else {}
     try:
         bus: BusABC = library.Bus(channel=channel, interface=interface, ignore_config=True, **{**defaults, **options})
