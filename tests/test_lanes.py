@@ -96,8 +96,8 @@ def test_tests_in_lane_folders_have_no_lane_marker() -> None:
     assert marked == []
 
 
-def test_only_untimed_lanes_run_in_parallel() -> None:
-    """The quick and the full tests use all processors; single files and other lanes run sequentially."""
+def test_only_the_quick_and_the_full_lane_run_in_parallel() -> None:
+    """The quick and the full lane run in parallel, unless single files are named; the other lanes run sequentially."""
     assert shlex.split(PYTEST_OPTIONS["addopts"])[-1] == QUICK
     assert runs_in_parallel(QUICK, [])
     assert runs_in_parallel("full", [TESTS, TESTS / "cli"])
@@ -199,7 +199,7 @@ def test_lane_is_interrupted_at_its_time_limit(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_running_test_is_in_the_progress_file(tmp_path: Path) -> None:
-    """LAVT_PROGRESS has the name of the running test, and is empty after the last test."""
+    """The file that LAVT_PROGRESS names contains the name of the running test; after the last test it is empty."""
     progress_file = tmp_path / "progress"
     (tmp_path / "test_own.py").write_text(
         f"from pathlib import Path\n\ndef test_own(): assert 'test_own' in Path({str(progress_file)!r}).read_text()\n"

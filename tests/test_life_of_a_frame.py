@@ -41,7 +41,8 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from lavt.transport.security.keys import PrivateKey
 
-WALL_NS = 1_790_000_000 * NS_PER_S
+WALL_MINUS_MONO_NS = 1_790_000_000 * NS_PER_S
+"""The wall clock minus the monotonic clock."""
 START_NS = 100 * NS_PER_S
 VIDEO_DELAY_MS, CONTROL_DELAY_MS = 75.0, 20.0
 CHALLENGE = bytes(range(16))
@@ -80,7 +81,7 @@ class Gateways:
         while self.sent:
             send = self.sent.pop(0)
             gateway = self.client if send.channel.endswith("_reply") else self.server
-            gateway.receive(send.channel, send.payload, Now(START_NS, WALL_NS), "query")
+            gateway.receive(send.channel, send.payload, Now(START_NS, WALL_MINUS_MONO_NS), peer="query")
         return self.passed[-1]
 
     def _deliver(self, _channel: str, payload: bytes, _arrived: Now, _peer: object) -> None:
@@ -106,16 +107,16 @@ def armed_gate(car: Simulator) -> tuple[SafetyGate, Gateways, SessionReply]:
     gateways.client.send(Send("session", encode(SessionRequest("acquire", "operator-1", instance=1, number=0))))
     request = decode(SessionRequest, gateways.exchange())
     answer = gate.session.answer(request, car.state(), START_NS)
-    gateways.server.send(Send("session_reply", encode(answer), "query"))
+    gateways.server.send(Send("session_reply", encode(answer), peer="query"))
     reply = decode(SessionReply, gateways.exchange())
     for number in range(ARMING_FRAMES):
         at_ns = START_NS - (ARMING_FRAMES - number) * 20 * NS_PER_MS
-        gate.issued_stamps.add(WALL_NS + at_ns, number, at_ns, pixel_crc=number)
+        gate.issued_stamps.add(WALL_MINUS_MONO_NS + at_ns, number, at_ns, pixel_crc=number)
         arm = Command(
             epoch=reply.epoch,
             sequence=number,
             sent_wall_ns=0,
-            stamp_ns=WALL_NS + at_ns,
+            stamp_ns=WALL_MINUS_MONO_NS + at_ns,
             stamp_received_wall_ns=0,
             steering_rad=0.0,
             throttle=0.0,
@@ -147,7 +148,7 @@ def test_life_of_a_frame(tmp_path: Path) -> None:  # noqa: PLR0915 (one frame, f
     assert (frame.capture_ns, frame.picture.shape) == (START_NS, (480, 640, 3))
 
     # Frame 2. The stamp, which is the send time, is written into the pixels, and the server remembers it.
-    stamp_ns = WALL_NS + now_ns
+    stamp_ns = WALL_MINUS_MONO_NS + now_ns
     write_stamp(frame.picture, stamp_ns)
     gate.issued_stamps.add(stamp_ns, frame.number, now_ns, pixel_crc=frame.number)
     assert set(frame.picture[:64, :64].ravel().tolist()) == {0, 255}
@@ -219,9 +220,9 @@ def test_life_of_a_frame(tmp_path: Path) -> None:  # noqa: PLR0915 (one frame, f
     command = Command(
         epoch=session.epoch,
         sequence=100,
-        sent_wall_ns=WALL_NS + now_ns,
+        sent_wall_ns=WALL_MINUS_MONO_NS + now_ns,
         stamp_ns=read_ns,
-        stamp_received_wall_ns=WALL_NS + now_ns,
+        stamp_received_wall_ns=WALL_MINUS_MONO_NS + now_ns,
         steering_rad=decision.steering_rad,
         throttle=decision.throttle,
         brake=decision.brake,
@@ -286,7 +287,7 @@ def test_life_of_a_frame(tmp_path: Path) -> None:  # noqa: PLR0915 (one frame, f
         sent_wall_ns=received.sent_wall_ns,
         stamp_received_wall_ns=received.stamp_received_wall_ns,
         received_mono_ns=now_ns,
-        received_wall_ns=WALL_NS + now_ns,
+        received_wall_ns=WALL_MINUS_MONO_NS + now_ns,
         applied_mono_ns=now_ns,
         verdict="accepted",
         reason=verdict.message,
@@ -305,8 +306,8 @@ def test_life_of_a_frame(tmp_path: Path) -> None:  # noqa: PLR0915 (one frame, f
             pixel_crc=frame.number,
             size_bytes=len(access_unit),
         )
-        writer.write("frame", stamped, Now(START_NS, WALL_NS + START_NS))
-        writer.write("admission", admission, Now(now_ns, WALL_NS + now_ns))
+        writer.write("frame", stamped, Now(START_NS, WALL_MINUS_MONO_NS + START_NS))
+        writer.write("admission", admission, Now(now_ns, WALL_MINUS_MONO_NS + now_ns))
     record = read_record(tmp_path / "server.mcap")
     paired = frames_with_commands(record.table("frame"), record.table("admission"), now_ns)
     assert paired.loop_ns.tolist() == [picture_age_ns]

@@ -37,17 +37,17 @@ QUIET, BUSY = "cpu 0 0 0 0 0 0 0 0 0 0", "cpu 90 0 0 10 0 0 0 0 0 0"
 
 @dataclass
 class FakeLatenessProbe:
-    """A fake lateness probe, which returns the given reports in order, and then reports without stalls."""
+    """A fake `Probe`: it returns the given reports of stalls in order, and then reports without stalls."""
 
     reports: list[tuple[int, list[Stall]]] = field(default_factory=list)
     has_realtime_priority: bool = True
     report_count: int = 0
 
-    def report(self) -> tuple[int, list[Stall]]:  # noqa: D102 (of `Probe`)
+    def report(self) -> tuple[int, list[Stall]]:  # noqa: D102 (documented in `Probe`)
         self.report_count += 1
         return self.reports.pop(0) if self.reports else (2**62, [])
 
-    def end(self) -> None:  # noqa: D102 (of `Probe`)
+    def end(self) -> None:  # noqa: D102 (documented in `Probe`)
         pass
 
 
@@ -108,16 +108,16 @@ def test_only_an_overlapping_stall_excuses_a_failure(stall: Stall | None, raised
 
 
 @pytest.mark.parametrize(("share", "raised"), [(0.05, HostStalled), (0.2, AssertionError)])
-def test_stalled_share_excuses_a_rate(share: float, raised: type[Exception]) -> None:
-    """A wrong rate fails unless a processor was stalled for the given share of the interval."""
+def test_stalled_share_excuses_a_failure(share: float, raised: type[Exception]) -> None:
+    """A failed assertion is excused if a processor was stalled for at least the given share of the interval."""
     stalls = stalls_of(*(Stall(0, at * 100 * MS, (at * 100 + 10) * MS) for at in range(10)))
     with pytest.raises(raised, match="slow") as caught, stalls.excusing_failures(0, 1000 * MS, share=share):
         raise AssertionError("slow")
     assert caught.type is raised
 
 
-def test_verdict_waits_for_a_complete_record() -> None:
-    """Probes are queried until each has reported beyond the end of the interval."""
+def test_probes_are_queried_until_the_interval_is_covered() -> None:
+    """`Stalls.during` queries each probe until the time of its report is after the end of the interval."""
     late = Stall(0, 50 * MS, 90 * MS)
     slow_probe = FakeLatenessProbe([(0, []), (80 * MS, []), (99 * MS, [late]), (101 * MS, [])])
     assert Stalls([slow_probe], lambda: QUIET).during(0, 100 * MS) == [late]
@@ -146,7 +146,7 @@ def test_many_inconclusive_tests_fail_on_an_idle_machine(
 
 
 def test_low_priority_work_is_idle_time() -> None:
-    """The idle share includes waiting for disks and programs with a niceness above zero, but no stolen time."""
+    """Waiting for disks and running programs with a niceness above 0 count as idle time; stolen time does not."""
     before, after = "cpu  100 100 100 100 100 100 100 100 0 0", "cpu  110 120 110 130 110 100 100 120 0 0"
     assert idle_share(before, after) == pytest.approx((20 + 30 + 10) / 100)
     assert idle_share(before, before) == 0
@@ -222,8 +222,8 @@ def pytest_configure(config):
 
 @pytest.fixture(scope="session")
 def stalls(request):
-    times = iter([{before!r}, {after!r}])
-    stalls = request.config.stash[SESSION].stalls = Stalls([{probe}()], lambda: next(times))
+    processor_times = iter([{before!r}, {after!r}])  # as in /proc/stat
+    stalls = request.config.stash[SESSION].stalls = Stalls([{probe}()], lambda: next(processor_times))
     return stalls
 
 @pytest.fixture
@@ -312,7 +312,7 @@ def test_tries():
 class EndedProbe(FakeLatenessProbe):
     """A fake lateness probe that ends after its first report."""
 
-    def report(self) -> tuple[int, list[Stall]]:  # noqa: D102 (of `Probe`)
+    def report(self) -> tuple[int, list[Stall]]:  # noqa: D102 (documented in `Probe`)
         if self.report_count:
             raise ProbeEnded("the lateness probe of processor 7 ended with -9")
         return super().report()

@@ -79,7 +79,7 @@ def gateway_of_vehicle(seed: int) -> Target:
         request = operator.sign_request("session", body)
         gateway.receive("session", request, now, "query")
         if not delivered:
-            retry = operator.verify_reply("session", sent.pop().payload).retry
+            retry = operator.verify_reply("session", sent.pop().payload).repeated_request
             expect(retry is not None, "the operator got no retry")
             request = retry or b""
             gateway.receive("session", request, now, "query")

@@ -15,7 +15,8 @@ from benchmarks.mutating.sites import Mutation, Site
 from lavt.errors import UserError
 
 ACCEPTED_FILE: Final = Path(__file__).with_name("accepted.toml")
-KEYS: Final = ("module", "function", "line", "mutated")
+ENTRY_KEYS: Final = ("module", "function", "line", "mutated")
+"""The keys that an entry of `accepted.toml` must have, in addition to `reason`."""
 _FIELD_TYPES: Final[dict[str, type | tuple[type, ...]]] = {
     "module": str,
     "function": str,
@@ -57,7 +58,7 @@ class Result:
 
     @property
     def place(self) -> Place:
-        """The key of an accepted survivor."""
+        """The place of the mutation, by which the accepted survivors are looked up."""
         return self.module, self.function, self.line, self.mutated
 
 
@@ -114,8 +115,8 @@ def load_accepted(path: Path, sites: Mapping[str, Iterable[Site]]) -> dict[Place
     except (OSError, tomllib.TOMLDecodeError) as error:
         raise UserError(f"{path}: {error}; correct the file") from error
     for number, entry in enumerate(entries, start=1):
-        if set(entry) != {*KEYS, "reason"} or not all(isinstance(value, str) for value in entry.values()):
-            raise UserError(f"{path}: entry {number} needs {', '.join(KEYS)} and reason, each as text")
+        if set(entry) != {*ENTRY_KEYS, "reason"} or not all(isinstance(value, str) for value in entry.values()):
+            raise UserError(f"{path}: entry {number} needs {', '.join(ENTRY_KEYS)} and reason, each as text")
         place = (entry["module"], entry["function"], entry["line"], entry["mutated"])
         if place not in places:
             raise UserError(
@@ -144,9 +145,9 @@ def report(results: Collection[Result], accepted: Mapping[Place, str]) -> str:
         lines.append(
             f"| {module or 'all'} | {mutants} | {mutants - survived - accepted_count} | {survived} | {accepted_count} |"
         )
-    counted = len(results) - len(accepted_survivors)
-    if counted:
-        caught = counted - len(new_survivors)
-        share = caught / counted
-        lines += ["", f"caught: {caught} of {counted} mutants that are not accepted, {share:.1%}"]
+    not_accepted = len(results) - len(accepted_survivors)
+    if not_accepted:
+        caught = not_accepted - len(new_survivors)
+        share = caught / not_accepted
+        lines += ["", f"caught: {caught} of {not_accepted} mutants that are not accepted, {share:.1%}"]
     return "\n".join(lines)

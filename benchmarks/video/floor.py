@@ -9,7 +9,7 @@ import numpy as np
 from av.codec.context import ThreadType
 from av.video.codeccontext import VideoCodecContext
 from av.video.frame import VideoFrame
-from benchmarks.video.pictures import map_pictures, picture_of
+from benchmarks.video.pictures import memory_map_pictures, picture_of
 from benchmarks.video.run import (
     GOP_FRAMES,
     RATE_HZ,
@@ -28,7 +28,7 @@ from lavt.transport.video.stamp import write_stamp_i420
 def main() -> None:
     """Measure the requested number of frames."""
     run = requested_run()
-    pictures = map_pictures(run.pictures_stem)
+    pictures = memory_map_pictures(run.pictures_stem)
     encoder, decoder = _open_encoder(run), open_decoder()
     planes = np.empty_like(pictures[0])
     took_ns = []

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 from benchmarks.video.gstreamer import load_gstreamer, sender_pipeline
-from benchmarks.video.pictures import map_pictures, picture_of
+from benchmarks.video.pictures import memory_map_pictures, picture_of
 from benchmarks.video.run import (
     NUMBER_COLUMN,
     RATE_HZ,
@@ -33,7 +33,7 @@ def main() -> None:
     gst = load_gstreamer()
     pipeline = gst.parse_launch(sender_pipeline(run))
     pipeline.set_state(gst.State.PLAYING)
-    pictures = map_pictures(run.pictures_stem)
+    pictures = memory_map_pictures(run.pictures_stem)
     print_json({})
     wait_for_line()
     cpu_after_each_frame_ns = _send(gst, run, pipeline.get_by_name("source"), pictures)

@@ -12,7 +12,7 @@ import av
 import numpy as np
 from benchmarks.video.clean import SIZES
 from benchmarks.video.floor import open_decoder
-from benchmarks.video.pictures import map_pictures, picture_of, squared_error
+from benchmarks.video.pictures import memory_map_pictures, picture_of, squared_error
 from benchmarks.video.processes import WARM_UP_FRAMES, Program, RunOutcome, measure
 from benchmarks.video.relay import LinkCase
 from benchmarks.video.run import NUMBER_COLUMN, Run, load_units
@@ -61,7 +61,11 @@ def psnr_db(mean_squared_error: float) -> float:
 
 def loss_free_errors(run: Run) -> list[float]:
     """Decode the stream as it was sent; return the mean squared error of each frame's luma to the source picture."""
-    decoder, source, numbers = open_decoder(), map_pictures(run.pictures_stem), run.map_sent_table()[:, NUMBER_COLUMN]
+    decoder, source, numbers = (
+        open_decoder(),
+        memory_map_pictures(run.pictures_stem),
+        run.map_sent_table()[:, NUMBER_COLUMN],
+    )
     errors = []
     for index, unit in enumerate(load_units(run)):
         frames = decoder.decode(av.Packet(unit))

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Protocol
 
-from benchmarks.video.pictures import map_pictures, picture_of
+from benchmarks.video.pictures import memory_map_pictures, picture_of
 from benchmarks.video.run import GOP_FRAMES, RATE_HZ, VBV_MS, Run
 
 from lavt.assembly.entropy import MachineEntropy
@@ -35,7 +35,7 @@ class RepeatingCamera:
 
     def __init__(self, run: Run) -> None:
         self.model = CameraModel(run.width_px, run.height_px)
-        self._pictures = map_pictures(run.pictures_stem)
+        self._pictures = memory_map_pictures(run.pictures_stem)
         self._planes = self._pictures[0].copy()
 
     def capture(self, number: int, at_ns: int, pose: Pose | None) -> CapturedFrame:  # noqa: ARG002 (nothing moves)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from benchmarks.video.pictures import map_pictures, picture_of, squared_error
+from benchmarks.video.pictures import memory_map_pictures, picture_of, squared_error
 from benchmarks.video.run import MAX_FRAMES, NUMBER_COLUMN, STAMP_COLUMN, Run, cpu_ns
 from numpy.typing import NDArray
 
@@ -23,7 +23,7 @@ class PictureLog:
         self._noted = 0
         self._table = run.map_sent_table()
         self._number_by_stamp: dict[int, int] = {}
-        self._source = map_pictures(run.pictures_stem) if run.saves_units_and_picture_errors else None
+        self._source = memory_map_pictures(run.pictures_stem) if run.saves_units_and_picture_errors else None
 
     def note(self, stamp_ns: int, read_ns: int, luma: NDArray[np.uint8] | None) -> None:
         """Note a picture. If errors are requested, ignore a picture whose stamp was not sent."""

@@ -38,7 +38,7 @@ def render_pictures(stem: Path, width_px: int, height_px: int) -> None:
         cv2.cvtColor(picture, cv2.COLOR_BGR2YUV_I420, dst=planes[number])
 
 
-def map_pictures(stem: Path) -> NDArray[np.uint8]:
+def memory_map_pictures(stem: Path) -> NDArray[np.uint8]:
     """Map the pictures, in I420, into memory as an array (n, height * 3 / 2, width); changes of it are not saved."""
     pictures: NDArray[np.uint8] = np.load(stem.with_suffix(".npy"), mmap_mode="c")
     pictures.reshape(-1)[::4096].sum()  # maps all pages now, so that no frame is delayed by it

@@ -17,7 +17,7 @@ from tests.support.command_line import CommandResult, Run
 import lavt
 from lavt.cli.main import app
 from lavt.config_file import shipped
-from lavt.experiment.analysis.results import IDENTITY
+from lavt.experiment.analysis.results import IDENTITY_KEYS
 from lavt.transport.zenoh_link import Router, quiet_logs
 
 DEMO = str(shipped("configs/demo.yaml"))
@@ -66,7 +66,7 @@ BAD_RUNS = {
     "unknown trace in real time": (["--set", "network.video.trace=nowhere", "--set", "time=real"], "'nowhere'"),
     "a trace that is a directory": (["--set", "network.video.trace=."], "trace '.'"),
     "a trace with a long name": (["--set", f"network.video.trace={'a' * 300}"], "trace 'aaa"),
-    "a trace for the state": (
+    "a state delay with the trace of the video": (
         ["--set", "network.condition=handover", "--set", "network.state_delay=with_video"],
         "'handover.csv'",
     ),
@@ -255,14 +255,14 @@ def test_report_of_nothing(run: Run, tmp_path: Path) -> None:
     assert files(tmp_path) == {"empty": None, "file": b"x"}
 
 
-COMPLETE_RESULT = dict.fromkeys(IDENTITY)
+COMPLETE_RESULT = dict.fromkeys(IDENTITY_KEYS)
 INVALID_RESULTS = {
     "empty file": ("", "b/result.json"),
     "truncated file": ('{"run": "a', "b/result.json"),
     "list": ("[]", "JSON object"),
     "number": ("7", "JSON object"),
     "empty object": ("{}", "run, time"),
-    "without a seed": (json.dumps({key: None for key in IDENTITY if key != "seed"}), "seed"),
+    "without a seed": (json.dumps({key: None for key in IDENTITY_KEYS if key != "seed"}), "seed"),
     "invalid axes": (json.dumps({**COMPLETE_RESULT, "axes": [1]}), "'axes'"),
     "invalid injection": (json.dumps({**COMPLETE_RESULT, "injected_ms": 5}), "'injected_ms'"),
 }
@@ -284,7 +284,7 @@ def test_report_of_an_invalid_result(case: str, run: Run, tmp_path: Path) -> Non
 
 
 def test_report_of_a_boundary_without_a_sweep(run: Run, tmp_path: Path) -> None:
-    """A boundary.json without a sweep's runs is rejected; an invalid boundary.json ends the report with exit code 1."""
+    """A directory with a boundary.json but no runs is rejected; an invalid boundary.json leads to exit code 1."""
     (tmp_path / "found").mkdir()
     (tmp_path / "found" / "boundary.json").write_text('{"runs": [{}], "groups": [{}]}')
     assert "found" in run("report", "found").rejection()
@@ -301,7 +301,7 @@ def test_nothing_to_resume(run: Run, tmp_path: Path) -> None:
     assert files(tmp_path) == {}
 
 
-BAD_SIDES = {
+BAD_COMMANDS = {
     "vehicle with a slash": (["server", SERVER, "--set", "vehicle_id=a/b"], "the vehicle 'a/b'"),
     "vehicle with wildcards": (["client", CLIENT, "--set", "vehicle_id='**'"], "the vehicle '**'"),
     "client without a name": (["client", CLIENT, "--set", "who=''"], "the client ''"),
@@ -321,7 +321,7 @@ BAD_SIDES = {
     "router without endpoints": (["router", ROUTER, "--set", "listen.endpoints=[]"], ROUTER),
     "router's change without a value": (["router", ROUTER, "--set", "listen"], "a.b=value"),
     "router's change that is not YAML": (["router", ROUTER, "--set", "listen.endpoints=["], "not YAML"),
-    "router's change that is a date": (["router", ROUTER, "--set", "mode=2026-01-01"], "mode"),
+    "router's value that YAML reads as a date": (["router", ROUTER, "--set", "mode=2026-01-01"], "mode"),
 }
 
 
@@ -351,10 +351,10 @@ def test_an_expired_signing_key(side: str, config: str, run: Run, tmp_path: Path
     assert not (tmp_path / "mine").exists()
 
 
-@pytest.mark.parametrize("case", BAD_SIDES)
-def test_bad_sides(case: str, run: Run, tmp_path: Path) -> None:
+@pytest.mark.parametrize("case", BAD_COMMANDS)
+def test_bad_commands(case: str, run: Run, tmp_path: Path) -> None:
     """An invalid config of a server, client, router or relay is rejected in one sentence, and nothing is created."""
-    arguments, reason = BAD_SIDES[case]
+    arguments, reason = BAD_COMMANDS[case]
     out = ["--out", "mine"] if arguments[0] in {"server", "client"} else []
     assert reason in run(*arguments, *out).rejection()
     assert files(tmp_path) == {}

@@ -10,7 +10,7 @@ from lavt.control.drive_controller import (
     PRESETS,
     LaneKeeper,
     Preset,
-    SpeedPi,
+    SpeedPiController,
     find_preset,
     make_controller,
     pedals,
@@ -91,7 +91,7 @@ def test_a_lost_lane_is_followed_from_memory() -> None:
 
 
 def test_a_lost_lane_with_an_offset_is_reached() -> None:
-    """If the lane is lost beside its centre, dead reckoning leads the car to the centre, and the wheel straightens."""
+    """If the lane is lost while the car is beside its centre, the car steers to the remembered centre."""
     controller = lane_keeper()
     first = controller.decide(lane(0.8), SPEED_MPS, 0).steering_rad
     for now_ns in range(FRAME_NS, 2 * NS_PER_S, FRAME_NS):
@@ -135,11 +135,11 @@ def test_a_package_adds_a_controller_by_entry_point(monkeypatch: pytest.MonkeyPa
     assert getattr(controller, "arguments", None) == ("designed", WHEELBASE_M)
 
 
-def drive(pi: SpeedPi, seconds: float, speed_mps: float, slope_mps2: float = 0.0) -> list[float]:
+def drive(controller: SpeedPiController, seconds: float, speed_mps: float, slope_mps2: float = 0.0) -> list[float]:
     """Return the speeds of a car whose acceleration lags by 0.2 s, on a slope that decelerates it by `slope_mps2`."""
     speeds, acceleration = [speed_mps], 0.0
     for _ in range(round(seconds * 30)):
-        requested = pi.acceleration_mps2(SPEED_MPS, speeds[-1], 1 / 30)
+        requested = controller.acceleration_mps2(SPEED_MPS, speeds[-1], 1 / 30)
         acceleration += (requested - acceleration) / (0.2 * 30)
         speeds.append(speeds[-1] + (acceleration - slope_mps2) / 30)
     return speeds
@@ -147,27 +147,27 @@ def drive(pi: SpeedPi, seconds: float, speed_mps: float, slope_mps2: float = 0.0
 
 def test_the_target_speed_is_reached_without_overshoot() -> None:
     """From standstill, the car exceeds the target speed by less than 0.1 m/s and then keeps it."""
-    speeds = drive(SpeedPi(), 30, 0.0)
+    speeds = drive(SpeedPiController(), 30, 0.0)
     assert max(speeds) < SPEED_MPS + 0.1
     assert speeds[-1] == pytest.approx(SPEED_MPS, abs=0.02)
 
 
 def test_anti_windup() -> None:
     """After a minute of saturated throttle the overshoot is less than 0.1 m/s (anti-windup)."""
-    pi = SpeedPi()
+    controller = SpeedPiController()
     for _ in range(1800):
-        assert pi.acceleration_mps2(SPEED_MPS, 1.0, 1 / 30) == 2.0
-    assert max(drive(pi, 30, 1.0)) < SPEED_MPS + 0.1
+        assert controller.acceleration_mps2(SPEED_MPS, 1.0, 1 / 30) == 2.0
+    assert max(drive(controller, 30, 1.0)) < SPEED_MPS + 0.1
 
 
 def test_a_slope_is_compensated() -> None:
     """The integral term compensates a constant slope."""
-    assert drive(SpeedPi(), 60, SPEED_MPS, slope_mps2=0.3)[-1] == pytest.approx(SPEED_MPS, abs=0.03)
+    assert drive(SpeedPiController(), 60, SPEED_MPS, slope_mps2=0.3)[-1] == pytest.approx(SPEED_MPS, abs=0.03)
 
 
 def test_a_pause_is_not_integrated() -> None:
     """After a long pause one call integrates over at most 0.1 s."""
-    after_pause, without_pause = SpeedPi(), SpeedPi()
+    after_pause, without_pause = SpeedPiController(), SpeedPiController()
     after_pause.acceleration_mps2(SPEED_MPS, SPEED_MPS - 0.4, 100.0)
     without_pause.acceleration_mps2(SPEED_MPS, SPEED_MPS - 0.4, 0.1)
     assert after_pause.acceleration_mps2(1.0, 1.0, 0.0) == without_pause.acceleration_mps2(1.0, 1.0, 0.0)
@@ -175,7 +175,7 @@ def test_a_pause_is_not_integrated() -> None:
 
 def test_slowing_down_is_gentle() -> None:
     """Speed control brakes gently, for any excess speed."""
-    assert SpeedPi().acceleration_mps2(0.0, 10.0, 1 / 30) == -GENTLE_BRAKING_MPS2
+    assert SpeedPiController().acceleration_mps2(0.0, 10.0, 1 / 30) == -GENTLE_BRAKING_MPS2
 
 
 @pytest.mark.parametrize(
@@ -189,5 +189,5 @@ def test_pedals(acceleration_mps2: float, expected: tuple[float, float]) -> None
 
 @pytest.mark.parametrize(("confidence", "share"), [(1.0, 1.0), (0.5, 1.0), (0.3, 0.6), (0.0, 0.4)])
 def test_lower_confidence_lowers_the_speed(confidence: float, share: float) -> None:
-    """From a confidence of 0.5 the speed is full; at lower confidence it is reduced in proportion, to at least 0.4."""
+    """A confidence of 0.5 or more gives full speed; a lower one reduces it in proportion, to 0.4 of it at least."""
     assert speed_for_confidence_mps(10.0, confidence) == pytest.approx(10 * share)

@@ -10,7 +10,7 @@ import pytest
 from lavt.errors import UserError
 from lavt.safety.gate import RejectionReason, SafetyGate
 from lavt.safety.limits import LIMITS
-from lavt.safety.safety_page import DRAWINGS, draw_page, value_with_unit
+from lavt.safety.safety_page import GENERATED_BLOCKS, draw_page, value_with_unit
 from lavt.safety.state_machine import TRANSITIONS
 
 ROOT = Path(__file__).parents[2]
@@ -25,7 +25,7 @@ def function_names(path: Path) -> set[str]:
 def test_the_page_is_up_to_date() -> None:
     """docs/safety.md is what `python docs/draw_safety.py` generates, and has all generated blocks."""
     assert draw_page(PAGE) == PAGE, "docs/safety.md is outdated: run `python docs/draw_safety.py`"
-    assert set(re.findall(r"<!-- drawn: ([a-z ]+) -->", PAGE)) == set(DRAWINGS)
+    assert set(re.findall(r"<!-- drawn: ([a-z ]+) -->", PAGE)) == set(GENERATED_BLOCKS)
 
 
 def test_a_changed_table_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -38,12 +38,12 @@ def test_a_changed_table_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_all_transitions_limits_and_rejections_are_drawn() -> None:
     """The page shows each transition, each limit with its reason, and the rejection reasons in checking order."""
-    arrows = re.findall(r"(\w+) --> \w+: (.+)", DRAWINGS["states"]())
+    arrows = re.findall(r"(\w+) --> \w+: (.+)", GENERATED_BLOCKS["states"]())
     assert {(before, trigger) for before, triggers in arrows for trigger in triggers.split(", ")} == set(TRANSITIONS)
-    rows = DRAWINGS["limits of the vehicle"]().splitlines()[2:]
+    rows = GENERATED_BLOCKS["limits of the vehicle"]().splitlines()[2:]
     assert len(rows) == len(LIMITS.__slots__)
     assert all(len(row.split(" | ")[2]) > 10 for row in rows)
-    rejections = [line.partition(". ")[2] for line in DRAWINGS["rejections"]().splitlines()]
+    rejections = [line.partition(". ")[2] for line in GENERATED_BLOCKS["rejections"]().splitlines()]
     checked = re.findall(r"return RejectionReason\.(\w+)", inspect.getsource(SafetyGate.rejection_reason))
     assert rejections == [RejectionReason[name].value for name in checked] == list(RejectionReason)
 

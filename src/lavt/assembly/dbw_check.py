@@ -33,8 +33,8 @@ def find_mismatches(config: ProfileConfig, codec: Codec) -> list[str]:
     """Return all mismatches between a profile and its DBC.
 
     The check covers: the existence of messages and signals, identifiers and lengths; the positions and sizes of
-    switches, counters and checksums; the multiplexer values of multiplexed commands; the ranges of limits; the ranges
-    and names of the codes that the profile expects in signals; and timeouts compared with periods.
+    single-bit signals, counters and checksums; the multiplexer values of multiplexed commands; the ranges of limits;
+    the ranges and names of the codes that the profile expects in signals; and timeouts compared with periods.
     """
     mismatches = [*_check_identifiers(codec)]
     uses: list[_SignalUse] = []
@@ -128,7 +128,7 @@ def _check_identifiers(codec: Codec) -> Iterator[str]:
             yield f"the DBC has two messages of identifier 0x{message.identifier:03X}: {owner} and {message.name}"
 
 
-def _is_switch(use: _SignalUse) -> bool:
+def _is_single_bit(use: _SignalUse) -> bool:
     return use.signal.bits == 1
 
 
@@ -141,9 +141,9 @@ def _is_counter(use: _SignalUse) -> bool:
 
 
 LAYOUTS: Final[Mapping[str, tuple[Callable[[_SignalUse], bool], str]]] = {
-    "enable": (_is_switch, "is not a single bit, as a switch must be"),
-    "clear": (_is_switch, "is not a single bit, as a switch must be"),
-    "values.enabled": (_is_switch, "is not a single bit, as a switch must be"),
+    "enable": (_is_single_bit, "is not a single bit, as a switch must be"),
+    "clear": (_is_single_bit, "is not a single bit, as a switch must be"),
+    "values.enabled": (_is_single_bit, "is not a single bit, as a switch must be"),
     "count": (_is_counter, "is not an unsigned number of several bits, as a counter must be"),
     "checksum": (_is_last_byte, "is not the last byte, as a checksum must be here"),
 }
@@ -158,7 +158,7 @@ def _check_layouts(uses: Sequence[_SignalUse]) -> Iterator[str]:
 
 
 def _check_multiplexing(uses: Sequence[_SignalUse]) -> Iterator[str]:
-    """Check that a command's value is in the frames of one multiplexer value, with the command's other signals."""
+    """Check that the signals of a multiplexed command are in the same frames, those of a single multiplexer value."""
     for use in uses:
         if use.role != "value" or not use.signal.multiplexer:
             continue
@@ -194,7 +194,7 @@ def _check_limits(config: ProfileConfig, uses: Sequence[_SignalUse]) -> Iterator
     for use in uses:
         if use.role == "value" and use.key in limits:
             low, high, units = limits[use.key]
-            per_unit = units.get(use.signal.unit, 0.0)  # loading the profile reports an unknown unit
+            per_unit = units.get(use.signal.unit, 0.0)  # an unknown unit is reported when the profile is loaded
             for limit in (low * per_unit, high * per_unit):
                 if not use.signal.minimum - 1e-9 <= limit <= use.signal.maximum + 1e-9:
                     yield (
@@ -206,14 +206,14 @@ def _check_limits(config: ProfileConfig, uses: Sequence[_SignalUse]) -> Iterator
 def _check_codes(config: ProfileConfig, uses: Sequence[_SignalUse]) -> Iterator[str]:
     """Check that the profile's codes are in the ranges of their signals and have the same names in the DBC."""
     for use in uses:
-        for statement, code, meaning in _expected_codes(config, use):
+        for statement, code, expected_name in _expected_codes(config, use):
             signal = use.signal
             if not signal.minimum <= code <= signal.maximum:
                 yield (
                     f"{use.key}.{use.role}: {statement}, which is not in the range of {signal.name}, "
                     f"{signal.minimum:g} to {signal.maximum:g}"
                 )
-            elif signal.names and signal.names.get(code, "").upper() != meaning.upper() and meaning:
+            elif signal.names and signal.names.get(code, "").upper() != expected_name.upper() and expected_name:
                 name = f"is named {signal.names[code]!r}" if code in signal.names else "has no name"
                 yield f"{use.key}.{use.role}: {statement}, but in the DBC the value {code} of {signal.name} {name}"
             elif signal.names and code not in signal.names:

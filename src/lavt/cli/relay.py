@@ -18,7 +18,7 @@ from lavt.runtime import process_priority
 from lavt.transport.emulation.delay_line import DelayModel, Lognormal
 from lavt.transport.emulation.impairment import Impairment
 from lavt.transport.emulation.link import LinkInjection
-from lavt.transport.emulation.relay import NO_DELAY, Relay, RelayedFlow, is_delayed_video_datagram, video_delay_index
+from lavt.transport.emulation.relay import NO_DELAY, Relay, RelayedFlow, must_delay_video_datagram, video_delay_index
 
 
 def register(app: typer.Typer) -> None:
@@ -52,7 +52,11 @@ def relay(
             forwarder.step()
     if as_json:
         console.print_json(
-            {"held_ms": forwarder.held_ms(), "late_ms": forwarder.late_ms(), "counts": forwarder.counts()}
+            {
+                "held_ms": forwarder.median_delays_ms(),
+                "late_ms": forwarder.median_lateness_ms(),
+                "counts": forwarder.counts(),
+            }
         )
     forwarder.close()
 
@@ -66,8 +70,8 @@ def flows(config: RelayConfig) -> list[RelayedFlow]:
         _resolve("video_server", config.video_server),
         upstream=NO_DELAY,
         downstream=_delay_model(config.video, seed, stream_name="video inherent"),
-        downstream_delay_filter=is_delayed_video_datagram,
-        downstream_index_function=video_delay_index,
+        downstream_delay_filter=must_delay_video_datagram,
+        downstream_delay_index_function=video_delay_index,
         downstream_injected=_link_injection("video", config.video, seed),
     )
     control = RelayedFlow(

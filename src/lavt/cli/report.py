@@ -11,7 +11,7 @@ import typer
 
 from lavt.cli import console
 from lavt.errors import UserError, WorkError
-from lavt.experiment.analysis.results import IDENTITY, read_json
+from lavt.experiment.analysis.results import IDENTITY_KEYS, read_json
 from lavt.experiment.runs.run import RESULT, compute_result
 from lavt.recording.output_directory import make_directory
 
@@ -107,7 +107,7 @@ def _read_result(path: Path) -> dict[str, Any]:
     result = read_json(path)
     if not isinstance(result, dict):
         raise WorkError(f"{path} is not the result of a run: it is not a JSON object")
-    missing = [key for key in IDENTITY if key not in result]
+    missing = [key for key in IDENTITY_KEYS if key not in result]
     if missing:
         raise WorkError(f"{path} is not the result of a run: it lacks {', '.join(missing)}")
     for key in ("axes", "injected_ms", "injected_least_ms"):

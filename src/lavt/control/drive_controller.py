@@ -89,7 +89,7 @@ too little for a designed controller. The preset is valid for the simulator's de
 PRESETS = {preset.name: preset for preset in (DESIGNED, PAPER_CALIBRATED)}
 
 
-class SpeedPi:
+class SpeedPiController:
     """A PI speed controller; its only state is the integral term."""
 
     def __init__(self) -> None:
@@ -135,7 +135,7 @@ class LaneKeeper:
     def __init__(self, preset: Preset, *, wheelbase_m: float) -> None:
         self._preset = preset
         self._wheelbase_m = wheelbase_m
-        self._speed_pi = SpeedPi()
+        self._speed_controller = SpeedPiController()
         self._lane = Lane((0.0, 0.0, 0.0), 0.0, 0.0, 0.0, 0.0)
         self._pose = ORIGIN
         self._curvature_per_m = 0.0
@@ -165,7 +165,7 @@ class LaneKeeper:
         if confidence < LANE_CONFIDENCE:
             return 0.0  # no throttle without a lane; no brake either, or the car would jolt at each failed picture
         target_mps = speed_for_confidence_mps(self._preset.speed_mps, confidence)
-        return self._speed_pi.acceleration_mps2(target_mps, speed_mps, step_s)
+        return self._speed_controller.acceleration_mps2(target_mps, speed_mps, step_s)
 
     def _curvature_limit_per_m(self, speed_mps: float) -> float:
         """Return the smaller of the steering limit and the lateral acceleration limit at this speed, as a curvature."""

@@ -78,9 +78,10 @@ class CameraNode:
         self._capture_now = camera.capture
         self._counting_camera = camera if isinstance(camera, CountingCamera) else None
         self._pictures = pictures
-        self._ready_after_ns, self._expose = 0, self._expose_inline
+        self._ready_after_ns, self._capture_after_exposure = 0, self._capture_inline
         if isinstance(camera, TimedCamera):
-            self._ready_after_ns, self._expose = camera.exposure_ns + camera.sensor_delay_ns, camera.expose
+            self._ready_after_ns = camera.exposure_ns + camera.sensor_delay_ns
+            self._capture_after_exposure = camera.capture_after_exposure
         self._stream = stream
         self.path = path
         """The server's end of the video path."""
@@ -135,12 +136,12 @@ class CameraNode:
         self._counts["frames_skipped"] += number - self._next_frame
         self._next_frame, self._wake_ns = number + 1, next_ns
         due_ns = self._shutter_times.due_ns(number)
-        frame = self._expose(number, due_ns, self._poses)
+        frame = self._capture_after_exposure(number, due_ns, self._poses)
         if frame is None:
             self._counts["frames_missing"] += 1
         return frame
 
-    def _expose_inline(self, number: int, begin_ns: int, poses: Sequence[Pose]) -> CapturedFrame | None:
+    def _capture_inline(self, number: int, begin_ns: int, poses: Sequence[Pose]) -> CapturedFrame | None:
         """Capture a frame with a camera that has no exposure time and no sensor delay."""
         return self._capture_now(number, begin_ns, newest_pose(poses, begin_ns))
 

@@ -41,9 +41,9 @@ def draw_page(page: str) -> str:
     """Return the page with every marked block generated again; raise `UserError` for an unknown block."""
 
     def block(found: re.Match[str]) -> str:
-        draw = DRAWINGS.get(found["name"])
+        draw = GENERATED_BLOCKS.get(found["name"])
         if draw is None:
-            raise UserError(f"the page has a block {found['name']!r}: choose one of {', '.join(DRAWINGS)}")
+            raise UserError(f"the page has a block {found['name']!r}: choose one of {', '.join(GENERATED_BLOCKS)}")
         return f"<!-- drawn: {found['name']} -->\n\n{draw()}\n\n<!-- drawn until here -->"
 
     return _BLOCK.sub(block, page)
@@ -84,7 +84,7 @@ def draw_rejections() -> str:
     return "\n".join(f"{number}. {reason}" for number, reason in enumerate(RejectionReason, 1))
 
 
-DRAWINGS: Final[dict[str, Callable[[], str]]] = {
+GENERATED_BLOCKS: Final[dict[str, Callable[[], str]]] = {
     "states": draw_states,
     "transitions": draw_transitions,
     "limits of the vehicle": draw_vehicle_limits,

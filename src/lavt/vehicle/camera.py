@@ -78,7 +78,7 @@ class TimedCamera(Camera, Protocol):
         """The time between the end of the exposure and the moment when the picture is available."""
         ...
 
-    def expose(self, number: int, begin_ns: int, poses: Sequence[Pose]) -> CapturedFrame | None:
+    def capture_after_exposure(self, number: int, begin_ns: int, poses: Sequence[Pose]) -> CapturedFrame | None:
         """Return frame `number`, whose shutter opened at `begin_ns`; None if there is no picture.
 
         Call this method when the picture is available. `poses` are the poses known by then, oldest first; only a

@@ -11,7 +11,7 @@ import pytest
 from lavt.experiment.analysis.clock_validity import step_reasons
 from lavt.experiment.analysis.invalid_reason import InvalidCode, InvalidReason, not_measured
 from lavt.experiment.analysis.metrics import measure
-from lavt.experiment.analysis.results import IDENTITY, OPTIONAL_IDENTITY, run_result, write_json
+from lavt.experiment.analysis.results import IDENTITY_KEYS, OPTIONAL_IDENTITY_KEYS, run_result, write_json
 from lavt.experiment.analysis.validity import injection_reasons, invalid_reasons
 from lavt.recording.record import read_record
 
@@ -334,8 +334,8 @@ def test_a_result_has_every_key(make_run: MakeRun, tmp_path: Path) -> None:
     write_json(tmp_path / "result.json", {**result, "mae_m": float("nan")})
     read = json.loads((tmp_path / "result.json").read_text())
     metrics = measure(server, client).entry
-    assert list(read)[: len(IDENTITY)] == list(IDENTITY)
-    assert read.keys() == {*IDENTITY, "digest", "valid", "invalid_reasons", *metrics}
+    assert list(read)[: len(IDENTITY_KEYS)] == list(IDENTITY_KEYS)
+    assert read.keys() == {*IDENTITY_KEYS, "digest", "valid", "invalid_reasons", *metrics}
     assert read["participant"] is None
     assert read["mae_m"] is None
     assert (read["valid"], read["invalid_reasons"]) == (
@@ -356,7 +356,7 @@ def test_every_key_of_the_identity_is_defined_in_the_documentation() -> None:
     """The section of `docs/metrics.md` on the identity of a run has each key of the identity."""
     page = (Path(__file__).parents[3] / "docs" / "metrics.md").read_text()
     section = page.partition("\n## Identity of a run")[2].partition("\n## ")[0]
-    assert [key for key in (*IDENTITY, *OPTIONAL_IDENTITY, "digest") if f"`{key}`" not in section] == []
+    assert [key for key in (*IDENTITY_KEYS, *OPTIONAL_IDENTITY_KEYS, "digest") if f"`{key}`" not in section] == []
 
 
 def test_the_page_explains_every_code() -> None:

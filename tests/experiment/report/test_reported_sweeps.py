@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from lavt.cli.report import report
-from lavt.experiment.analysis.results import IDENTITY, run_result, write_json
+from lavt.experiment.analysis.results import IDENTITY_KEYS, run_result, write_json
 from lavt.recording.record import read_record
 
 MakeRun = Callable[..., Path]
@@ -17,7 +17,7 @@ MakeRun = Callable[..., Path]
 def add_run(make_run: MakeRun, sweep: Path, name: str, *, preset: str, condition: str = "L0") -> None:
     directory = make_run(sweep / "runs" / name, seconds=2.0)
     identity = {
-        **dict.fromkeys(IDENTITY),
+        **dict.fromkeys(IDENTITY_KEYS),
         "run": name,
         "time": "virtual",
         "fidelity": "geometry",

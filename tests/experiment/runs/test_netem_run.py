@@ -29,7 +29,7 @@ class FakeNetemInterface(NetemInterface):
         super().__init__("lo", directory=directory, run=self.record)
         self.commands: list[str] = []
         self.added_ms = 0.0
-        self.stopped_jitter: list[str] = []
+        self.stopped_jitter_messages: list[str] = []
 
     def record(self, command: Command) -> str:
         """Record a command; the interface has no root queue of ours until one is added."""
@@ -55,11 +55,12 @@ class FakeNetemInterface(NetemInterface):
 
     def _probe_result(self, count: int, delay_ms: float) -> ProbeResult:
         percentiles = {"p5_ms": delay_ms, "median_ms": delay_ms, "p95_ms": delay_ms}
-        return ProbeResult(sent=count, lost=0, reordered=0, early=0, **percentiles)
+        no_reordering = {"reordered": 0, "early": 0}  # `early`: packets that netem sent at once, to reorder them
+        return ProbeResult(sent=count, lost=0, **no_reordering, **percentiles)
 
     def problems(self) -> list[str]:
         """Return the messages about correlated jitter that has stopped."""
-        return self.stopped_jitter
+        return self.stopped_jitter_messages
 
     def read_back(self, flows: Sequence[ImpairedFlow]) -> list[str]:
         """Return no differences."""
@@ -125,7 +126,7 @@ def test_a_delay_that_differs_from_the_request_makes_the_run_invalid(tmp_path: P
 
     assert all(reason.text.startswith("after the drive: ") for reason in netem_invalid_reasons(report))
     assert any("video was delayed by 78.00 ms" in reason.text for reason in netem_invalid_reasons(report))
-    interface.stopped_jitter = ["video: its correlated jitter has stopped"]
+    interface.stopped_jitter_messages = ["video: its correlated jitter has stopped"]
     assert netem_invalid_reasons(netem.report())[0].text.startswith("video: ")
     assert (
         netem_invalid_reasons({**report, "read_back": ["lo has no queue of ours"]})[0].text == "lo has no queue of ours"

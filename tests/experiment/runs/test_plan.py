@@ -9,7 +9,7 @@ import pytest
 from lavt.config import RunConfig, StudyConfig, SweepConfig
 from lavt.config_file import parse_config
 from lavt.errors import UserError
-from lavt.experiment.analysis.results import IDENTITY
+from lavt.experiment.analysis.results import IDENTITY_KEYS
 from lavt.experiment.runs import plan
 from lavt.experiment.runs.plan import PlannedRun, plan_run, plan_sweep
 
@@ -147,8 +147,8 @@ def test_identity_has_every_key(time: str) -> None:
         "test",
     )
     identity = plan_run(config, name="this").identity
-    assert set(IDENTITY) <= identity.keys()
-    assert {name: identity[name] for name in IDENTITY if name != "seed"} == {
+    assert set(IDENTITY_KEYS) <= identity.keys()
+    assert {name: identity[name] for name in IDENTITY_KEYS if name != "seed"} == {
         "run": "this",
         "time": time,
         "fidelity": "video",

@@ -12,7 +12,7 @@ import pytest
 
 from lavt.errors import UserError
 from lavt.experiment.analysis.drive_data import capture_to_stamp_ms, read_drive
-from lavt.experiment.analysis.results import IDENTITY
+from lavt.experiment.analysis.results import IDENTITY_KEYS
 from lavt.experiment.runs.run import compute_result
 from lavt.recording.mcap_reader import read_mcap
 from lavt.recording.mcap_writer import McapFile
@@ -96,7 +96,7 @@ def mutate(rows: Rows, generator: Any) -> Rows:
 
 def rejection(directory: Path, injection: str) -> str:
     """Evaluate a run as `lavt report` does; return the sentence of the rejection, or "" if the run is not rejected."""
-    identity = {**dict.fromkeys(IDENTITY), "injection": injection, "inherent": "network", "condition": "L0"}
+    identity = {**dict.fromkeys(IDENTITY_KEYS), "injection": injection, "inherent": "network", "condition": "L0"}
     identity["injected_ms"] = {"video": 0.0, "control": 0.0}
     try:
         with warnings.catch_warnings():

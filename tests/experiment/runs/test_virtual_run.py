@@ -57,13 +57,13 @@ def changing_pictures(change: Callable[[int, Picture], Picture]) -> Change:
 
     def install(loop: VirtualLoop) -> None:
         node = loop.server.camera
-        original_expose = node._expose
+        original_capture = node._capture_after_exposure
 
-        def expose(number: int, begin_ns: int, poses: Sequence[Pose]) -> CapturedFrame | None:
-            frame = original_expose(number, begin_ns, poses)
+        def capture_after_exposure(number: int, begin_ns: int, poses: Sequence[Pose]) -> CapturedFrame | None:
+            frame = original_capture(number, begin_ns, poses)
             return None if frame is None else replace(frame, picture=change(number, frame.picture))
 
-        node._expose = expose
+        node._capture_after_exposure = capture_after_exposure
 
     return install
 

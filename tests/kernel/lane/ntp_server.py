@@ -18,8 +18,8 @@ from tests.kernel.lane.clocks import NS_PER_S, read_raw_clock_ns, wall_minus_raw
 from lavt.clock import MachineClock
 
 HEADER = struct.Struct("!BBbbII4sQQQQ")
-"""Leap, version and mode; stratum; poll; precision; root delay; root dispersion; reference;
-time stamps: reference, origin, receive and transmit."""
+"""The header of an NTP packet: one byte with leap indicator, version and mode; stratum; poll interval; precision; root
+delay; root dispersion; reference identifier; the time stamps reference, origin, receive and transmit."""
 FROM_CLIENT, FROM_SERVER = 0x23, 0x24
 """Leap 0 and version 4, with the mode of a client (3) or of a server (4)."""
 EPOCH_S = 2_208_988_800

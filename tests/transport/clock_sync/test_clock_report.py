@@ -81,7 +81,9 @@ def test_answer_within_two_seconds_counts(took_ns: int, *, in_time: bool) -> Non
     def parse(host: str, output: str, before: Now, after: Now) -> ClockReport:
         return ClockReport(before.mono_ns, after.mono_ns, host, output)
 
-    report = query_clock(("tool",), AdvancingClock(took_ns), run, source="chrony", absent="absent", parse=parse)
+    report = query_clock(
+        ("tool",), AdvancingClock(took_ns), run, source="chrony", absent="tool is not installed", parse=parse
+    )
     assert queries == [(("tool",), 2.0)]
     assert report == (ClockReport(took_ns, 2 * took_ns, kernel_identity(), "answer") if in_time else None)
 
@@ -113,8 +115,8 @@ def test_addresses_have_a_canonical_form() -> None:
     assert plain_address("gps") == plain_address("") == ""
 
 
-def test_unknown_clock_has_a_reason_and_no_correction() -> None:
-    """The report of an unknown clock has the clock readings and the reason, and neither correction nor bound."""
+def test_unknown_correction_has_a_reason() -> None:
+    """If the correction is unknown, the report has the clock readings and a reason, but no correction or bound."""
     report = unknown_clock(Now(1, 2), "kernel", "chrony", "chrony is not installed")
     assert (report.mono_ns, report.wall_ns, report.status) == (1, 2, "chrony is not installed")
     assert (report.correction_s, report.bound_s) == (None, None)

@@ -244,14 +244,14 @@ def test_any_bytes_pass_unchanged(net: RelayNetwork) -> None:
 
 def test_relay_reports_the_measured_delays(net: RelayNetwork) -> None:
     """The relay reports the measured median delay of each flow and direction, None where nothing passed."""
-    assert set(net.relay.held_ms().values()) == {None}
+    assert set(net.relay.median_delays_ms().values()) == {None}
     client, address_at_server = net.connect("video")
     for late_ms in (2.0, 7.0, 30.0):
         net.server["video"].send(rtp(1), address_at_server)
         net.step()
         net.advance(VIDEO_MS + late_ms)
         client.receive()
-    assert net.relay.held_ms() == {
+    assert net.relay.median_delays_ms() == {
         "video upstream": 0.0,
         "video downstream": VIDEO_MS + 7.0,
         "control upstream": None,
@@ -304,7 +304,7 @@ def test_relay_follows_the_link_model(name: str) -> None:
         model = EmulatedLink(requested)
         arrived = send_through(net, impairments, count := 60, 10.0)
         counts = net.relay.counts()
-        late_ms = net.relay.late_ms()["video downstream"]
+        late_ms = net.relay.median_lateness_ms()["video downstream"]
     departures_ns = [model.departure_ns(round(10 * NS_PER_MS * number), 0, len(rtp(0))) for number in range(count)]
     expected = sorted(
         (departed_ns, number) for number, departed_ns in enumerate(departures_ns) if departed_ns is not None

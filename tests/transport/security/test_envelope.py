@@ -70,7 +70,7 @@ class Pair:
         assert request is not None
         signed = self.vehicle.sign_reply(request, b"" if request.must_retry else encode(reply))
         verified = self.operator.verify_reply("session", signed)
-        return signed, verified.retry if request.must_retry else verified.body
+        return signed, verified.repeated_request if request.must_retry else verified.body
 
     def acquire_control(self) -> None:
         _, retry = self.exchange(self.signed_request())
@@ -265,7 +265,7 @@ def test_a_reply_is_accepted_once(pair: Pair) -> None:
     other = VehicleAuthenticator("car", MALLORY, OPERATORS)
     other_request = other.verify_request("session", data)
     assert other_request is not None
-    assert pair.operator.verify_reply("session", other.sign_reply(other_request, b"")).retry is None
+    assert pair.operator.verify_reply("session", other.sign_reply(other_request, b"")).repeated_request is None
     assert pair.operator.verify_reply("netem", signed).body is None
     assert pair.operator.verify_reply("session", signed).body == encode(GRANTED)
 
@@ -290,7 +290,7 @@ def test_a_reply_to_an_earlier_request_is_rejected(pair: Pair) -> None:
         request = pair.vehicle.verify_request("session", pair.signed_request("acquire", number))
         assert request is not None
         replies.append(pair.vehicle.sign_reply(request, b"" if request.must_retry else encode(GRANTED)))
-    assert pair.operator.verify_reply("session", replies[1]).retry is not None
+    assert pair.operator.verify_reply("session", replies[1]).repeated_request is not None
     assert pair.operator.verify_reply("session", replies[0]) == VerifiedReply(None, None)
     assert pair.operator.verify_reply("session", replies[1]) == VerifiedReply(None, None)
 
@@ -341,7 +341,7 @@ def test_each_channel_has_its_own_replay_counter(pair: Pair) -> None:
     netem = encode(NetemRequest("alice", 5, "L4", 0, 0.0, 0.0, 0.0, "uniform", 0.0, 1.0, 0, 0.0, 0.0))
     request = pair.vehicle.verify_request("netem", pair.operator.sign_request("netem", netem))
     assert request is not None
-    retry = pair.operator.verify_reply("netem", pair.vehicle.sign_reply(request, b"")).retry
+    retry = pair.operator.verify_reply("netem", pair.vehicle.sign_reply(request, b"")).repeated_request
     assert retry is not None
     request = pair.vehicle.verify_request("netem", retry)
     assert request is not None

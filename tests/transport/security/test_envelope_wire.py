@@ -35,7 +35,7 @@ class Session:
         for body in (b"", GRANTED):
             request = self.vehicle.verify_request("session", data)
             assert request is not None
-            data = self.operator.verify_reply("session", self.vehicle.sign_reply(request, body)).retry or b""
+            data = self.operator.verify_reply("session", self.vehicle.sign_reply(request, body)).repeated_request or b""
 
 
 @pytest.fixture

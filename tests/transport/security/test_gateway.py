@@ -19,8 +19,11 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from lavt.transport.security.keys import PrivateKey
 
-UNACCEPTABLE_COMMANDS_PER_S, REQUESTS_PER_S, STATES_PER_S, MAX_UNANSWERED_REQUESTS = 200, 100, 500, 64
-"""The design's limits, repeated here: a change of the code's limits must change these, too."""
+# The expected values of the code's limits. They are not imported, so that a changed limit makes a test fail.
+UNACCEPTABLE_COMMANDS_PER_S = 200
+REQUESTS_PER_S = 100
+STATES_PER_S = 500
+MAX_UNANSWERED_REQUESTS = 64
 EPOCH, LAST_ACCEPTED_SEQUENCE = 7, 2
 HIGHEST_SEQUENCE = 2**63 - 1
 
@@ -137,7 +140,7 @@ def test_replayed_requests_replies_and_states_are_rejected(pair: GatewayPair) ->
 def test_replays_of_a_rejected_command_are_rate_limited(pair: GatewayPair) -> None:
     """Ten thousand replays of a command that the vehicle rejected are rate-limited, and the next command passes.
 
-    The replays cannot be recognized by the last accepted command, because its sequence stays below theirs.
+    Their sequence is newer than that of the last accepted command, so the filter cannot recognize them as replays.
     """
     pair.client.send(Send("control", COMMAND))
     rejected, before = pair.in_flight.pop().payload, len(pair.server_received)
@@ -178,7 +181,7 @@ def test_a_forged_signature_does_not_displace_the_true_command(pair: GatewayPair
 
 
 def test_states_of_a_restarted_server_cause_one_request_a_second(pair: GatewayPair) -> None:
-    """States of a restarted server are rejected until the server has answered a request, sent once a second."""
+    """A client rejects a restarted server's states, and sends it one request a second, until the server answers one."""
     # The first client now talks to a second server, which gets the keys of the first one as if it had restarted.
     restarted = GatewayPair()
     restarted.client, pair.client = pair.client, restarted.client

@@ -42,7 +42,7 @@ def summary_of(traffic: BusTraffic, now_ns: int, name: str = "SteerReport1") -> 
 
 
 def test_rate_and_changes() -> None:
-    """A summary has all frames of a message so far, its newest values, and the rate and the changes in the period."""
+    """A summary has the count of all frames so far, the newest values, and the period's rate and changed signals."""
     traffic = new_traffic()
     for number in range(100):
         tenths_deg = 7 if number < 50 else 9

@@ -92,12 +92,12 @@ def test_a_moving_car_has_motion_blur_and_a_stationary_one_has_none(road: Road) 
     sharpness_by_exposure = []
     for exposure_ms in (0, 4, 16):
         camera = camera_on(road, scenery="none", exposure_ns=exposure_ms * NS_PER_MS)
-        frame = camera.expose(3, grid_ns(3), moving)
+        frame = camera.capture_after_exposure(3, grid_ns(3), moving)
         assert frame is not None
         sharpness_by_exposure.append(sharpness(frame.picture))
     assert all(longer < 0.85 * shorter for shorter, longer in pairwise(sharpness_by_exposure))
     stationary = [pose_at(road, 5.0, mono_ns=grid_ns(step)) for step in range(10)]
-    frame = camera.expose(3, grid_ns(3), stationary)
+    frame = camera.capture_after_exposure(3, grid_ns(3), stationary)
     assert frame is not None
     assert digest(frame.picture) == digest(picture_of(camera_on(road, scenery="none"), stationary[0], 3))
 
@@ -106,11 +106,11 @@ def test_an_exposure_of_zero_shows_the_newest_pose(road: Road) -> None:
     """With an exposure of 0, a frame shows the newest pose that is not later than the frame's time."""
     poses = [pose_at(road, 0.1 * step, mono_ns=step * STEP_NS) for step in range(6)]
     camera = camera_on(road)
-    frame = camera.expose(9, 3 * STEP_NS + 1, poses)
+    frame = camera.capture_after_exposure(9, 3 * STEP_NS + 1, poses)
     assert frame is not None
     assert frame.capture_ns == 3 * STEP_NS + 1
     assert digest(frame.picture) == digest(picture_of(camera_on(road), poses[3], 9))
-    assert camera.expose(9, -1, poses) is None
+    assert camera.capture_after_exposure(9, -1, poses) is None
 
 
 def test_poses_are_interpolated_and_extrapolated() -> None:

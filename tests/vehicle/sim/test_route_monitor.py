@@ -268,7 +268,7 @@ STEPS = st.tuples(st.floats(-0.3, 0.6), st.floats(-0.3, 0.3), st.floats(-0.1, 0.
 def test_skipping_checks_changes_no_events(
     road: Road, steps: list[tuple[float, float, float]], s_m: float, lateral_m: float
 ) -> None:
-    """A monitor that skips checks within its margin reports the same events as a monitor that checks every step."""
+    """A monitor that skips checks while no event is in reach reports the same events as one that checks every step."""
     skipping, always_checking = RouteMonitor(road, CAR, near_station_m=s_m), RouteMonitor(road, CAR, near_station_m=s_m)
     turned_rad = 0.0
     for index, (ahead_m, beside_m, turn_rad) in enumerate(steps):

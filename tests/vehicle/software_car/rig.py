@@ -1,4 +1,4 @@
-"""Encoders of commands that share no code with the kit, and a kit that receives their commands."""
+"""A software car's kit under test, and senders that encode commands for it without the kit's code."""
 
 from __future__ import annotations
 
@@ -21,8 +21,11 @@ DRIVE = 4
 """The number of the gear."""
 STEERING_1, BRAKE_1, THROTTLE_1, GEAR_1 = 0x064, 0x060, 0x062, 0x066
 """The identifiers of generation 1's commands."""
-PERCENT_OF_GENERATION_1, PERCENT_OF_GENERATION_2, ANGLE_OF_GENERATION_2 = 2, 14, 2
-"""The command types (CMD_TYPE) of a pedal's percentage and of the steering wheel's angle."""
+PERCENT_OF_GENERATION_1 = 2
+PERCENT_OF_GENERATION_2 = 14
+"""The command type (CMD_TYPE) of a pedal's percentage."""
+ANGLE_OF_GENERATION_2 = 2
+"""The command type of the steering wheel's angle."""
 
 
 def crc_by_division(identifier: int, data: bytes) -> int:
@@ -137,13 +140,13 @@ class Sender2:
 
 
 class KitRig:
-    """A kit, a sender of commands, and a clock. `keys` are those of `Kit`."""
+    """A kit, a sender of commands, and a clock. `kit_arguments` are passed to `Kit`."""
 
-    def __init__(self, generation: int, *, speed_mps: float = 0.0, **keys: Any) -> None:
+    def __init__(self, generation: int, *, speed_mps: float = 0.0, **kit_arguments: Any) -> None:
         self.generation = generation
         self.now_ns = START_NS
         self.sender: Sender1 | Sender2 = Sender1() if generation == 1 else Sender2()
-        self.kit = Kit(1 if generation == 1 else 2, start_ns=START_NS, **keys)
+        self.kit = Kit(1 if generation == 1 else 2, start_ns=START_NS, **kit_arguments)
         self.newest_reports: dict[int, bytes] = {}
         """The newest report of each identifier."""
         self.set_motion(speed_mps)
@@ -157,9 +160,9 @@ class KitRig:
         for frame in frames:
             self.kit.receive(frame, self.now_ns)
 
-    def command(self, **keys: Any) -> None:
-        """Command all three axes; keys are those of `CommandValues`."""
-        self.send(*self.sender.commands(CommandValues(**keys)))
+    def command(self, **values: Any) -> None:
+        """Command all three axes; `values` are fields of `CommandValues`."""
+        self.send(*self.sender.commands(CommandValues(**values)))
 
     def request_system(self, request: int = 1) -> None:
         """Request generation 2's system to enable (1) or disable (2); 0 requests nothing."""
@@ -181,10 +184,10 @@ class KitRig:
         for frame in self.kit.frames_due(self.now_ns):
             self.newest_reports[frame.identifier] = frame.data
 
-    def drive_ms(self, duration_ms: int, **keys: Any) -> None:
+    def drive_ms(self, duration_ms: int, **values: Any) -> None:
         """Send commands every 20 ms."""
         for _ in range(duration_ms // 20):
-            self.command(**keys)
+            self.command(**values)
             self.wait_ms(20)
 
     def enabled(self) -> set[str]:
@@ -209,9 +212,9 @@ ALL_AXES = set(AXES)
 both_generations = pytest.mark.parametrize("generation", [1, 2])
 
 
-def driving_rig(generation: int, **keys: Any) -> KitRig:
+def driving_rig(generation: int, **rig_arguments: Any) -> KitRig:
     """Return a kit that is enabled, in drive and moving."""
-    rig = KitRig(generation, **keys)
+    rig = KitRig(generation, **rig_arguments)
     rig.enable()
     rig.set_motion(10.0)
     return rig

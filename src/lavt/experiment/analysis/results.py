@@ -20,7 +20,7 @@ from lavt.recording.record import Record
 FAILED = "failed.json"
 """The file in a sweep's directory that lists the failed runs with the reasons; absent or empty if no run failed."""
 
-IDENTITY = (
+IDENTITY_KEYS = (
     "run",
     "time",
     "fidelity",
@@ -39,7 +39,7 @@ IDENTITY = (
 )
 """The keys that identify a run; their values are known before the run. A key that does not apply is null."""
 
-OPTIONAL_IDENTITY = ("axes", "changes", "injected_ms", "injected_least_ms")
+OPTIONAL_IDENTITY_KEYS = ("axes", "changes", "injected_ms", "injected_least_ms")
 """Further keys that only some runs have in their identity."""
 
 
@@ -53,18 +53,18 @@ def run_result(
 ) -> dict[str, Any]:
     """Compute the run's `result.json`, which is also its entry in `summary.json`, from its records.
 
-    `identity` has the keys `IDENTITY`. It can also have `axes` (the values of a sweep's further axes), `changes` (of
-    the condition), `injected_ms` (the requested delay) and `injected_least_ms` (the smallest expected delay, if it is
-    smaller than `injected_ms`); all of them are copied. `reasons` are further reasons why the run is invalid, which its
-    records do not show.
+    `identity` has the keys `IDENTITY_KEYS`. It can also have `axes` (the values of a sweep's further axes), `changes`
+    (of the condition), `injected_ms` (the requested delay) and `injected_least_ms` (the smallest expected delay, if it
+    is smaller than `injected_ms`); all of them are copied. `reasons` are further reasons why the run is invalid, which
+    its records do not show.
     """
     measured = measure(server, client)
     all_reasons = [*invalid_reasons(server, client, measured), *reasons]
     if not all_reasons and "injected_ms" in identity:  # with another reason, the latencies themselves can be wrong
         all_reasons = missing_delay_reasons(measured.entry, identity.get("injected_least_ms", identity["injected_ms"]))
     return {
-        **{key: identity.get(key) for key in IDENTITY},
-        **{key: identity[key] for key in OPTIONAL_IDENTITY if key in identity},
+        **{key: identity.get(key) for key in IDENTITY_KEYS},
+        **{key: identity[key] for key in OPTIONAL_IDENTITY_KEYS if key in identity},
         "digest": digest,
         "ending": measured.entry["ending"],
         "valid": not all_reasons,

@@ -83,7 +83,8 @@ def power_spectrum(sampled_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
     index = np.arange(len(sampled_rad))
     trend = np.polynomial.Polynomial.fit(index, sampled_rad, 1)(index)
     window = np.hanning(len(sampled_rad) + 1)[:-1]
-    # Without zero padding, the frequencies would be one period per drive apart, too far to locate a peak.
+    # Without zero padding, neighbouring frequencies would differ by 1 / (duration of the drive), too much to locate a
+    # peak.
     padded_length = 1 << (8 * len(sampled_rad) - 1).bit_length()
     amplitudes = np.abs(np.fft.rfft((sampled_rad - trend) * window, padded_length)) / window.sum()
     hertz = np.fft.rfftfreq(padded_length, 1 / SAMPLE_RATE_HZ)

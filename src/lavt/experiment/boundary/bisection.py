@@ -1,4 +1,4 @@
-"""Two searches: for the shortest delay that meets a criterion, and for the delay at which a rate rises through zero.
+"""Searches for the shortest delay that meets a criterion, and for the delay at which a growth rate rises through zero.
 
 The first search uses a grid and bisection, the second one Brent's method.
 """
@@ -13,7 +13,8 @@ from scipy.optimize import brentq
 GUESS_ERROR_MS = 10.0
 """`zero_bracket` begins its search at its guess plus and minus this much."""
 LARGEST_RATE_PER_S = 1.0
-"""Rates are clipped to this size, because they can be infinite. The zero crossing does not depend on their size."""
+"""Growth rates of oscillations are clipped to this size, because they can be infinite. The zero crossing does not depend
+on their size."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,16 +54,18 @@ def first_bracket(criterion: Callable[[float], bool], grid_ms: Sequence[float], 
     return Bracket(low_ms, high_ms, monotone)
 
 
-def zero_bracket(rate: Callable[[float], float], guess_ms: float, longest_ms: float, within_ms: float) -> Bracket:
-    """Find the delay between 0 and `longest_ms` at which `rate` rises through 0; the bracket has the width `within_ms`.
+def zero_bracket(
+    growth_rate: Callable[[float], float], guess_ms: float, longest_ms: float, within_ms: float
+) -> Bracket:
+    """Find the delay between 0 and `longest_ms` at which `growth_rate` rises through 0, to a width of `within_ms`.
 
     The search begins at the guess plus and minus `GUESS_ERROR_MS`, and moves outwards until the sign changes. Brent's
-    method (`scipy.optimize.brentq`) then evaluates a smooth rate at few delays only. The returned bracket is the root
-    plus and minus half of `within_ms`, cut at 0 and `longest_ms`; `rate` was not evaluated at its ends.
+    method (`scipy.optimize.brentq`) then evaluates a smooth function at few delays only. The returned bracket is the
+    root plus and minus half of `within_ms`, cut at 0 and `longest_ms`; `growth_rate` was not evaluated at its ends.
     """
 
     def clipped_rate(delay_ms: float) -> float:
-        return min(max(rate(delay_ms), -LARGEST_RATE_PER_S), LARGEST_RATE_PER_S)
+        return min(max(growth_rate(delay_ms), -LARGEST_RATE_PER_S), LARGEST_RATE_PER_S)
 
     low_ms = min(max(guess_ms - GUESS_ERROR_MS, 0.0), longest_ms)
     high_ms = min(max(guess_ms + GUESS_ERROR_MS, 0.0), longest_ms)

@@ -60,9 +60,9 @@ class BoundarySearch:
 def plan_boundary(config: BoundaryConfig) -> list[BoundarySearch]:
     """Plan the searches of every route with every preset, once for each repetition.
 
-    The first repetition of every search comes before the second repetition of any search. Raises `UserError` for a run
-    that `plan_run` rejects, for a run in real time or without the simulator, for a config with a video delay, and for
-    missing or duplicate routes or presets.
+    The result begins with the first repetitions of all searches; then come all second repetitions, and so on. Raises
+    `UserError` for a run that `plan_run` rejects, for a run in real time or without the simulator, for a config with a
+    video delay, and for missing or duplicate routes or presets.
     """
     if config.time != "virtual" or config.vehicle.kind != "simulator":
         raise UserError(
@@ -275,18 +275,18 @@ def search_boundary(
     Returns the content of `boundary.json`, and whether all searches were run.
     """
     found, failed, is_complete = run_searches(searches, jobs=jobs, on_progress=on_progress)
-    entry = {
+    content = {
         "schema": 1,
         "config": config.model_dump(mode="json"),
         "runs": found,
         "groups": summarize_groups(found),
         "failed": failed,
     }
-    write_json(out / BOUNDARY, entry)
+    write_json(out / BOUNDARY, content)
     with (out / "boundary.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, CSV_COLUMNS, extrasaction="ignore")
         writer.writeheader()
         writer.writerows(found)
     if found:
-        save_figure(out, "boundary", boundary_figure(entry), "boundaries", "")
-    return entry, is_complete
+        save_figure(out, "boundary", boundary_figure(content), "boundaries", "")
+    return content, is_complete

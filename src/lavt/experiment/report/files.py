@@ -44,7 +44,7 @@ def save_table(report_dir: Path, name: str, table: TableData) -> Markup:
 
 def link_table(report_dir: Path, name: str, table: TableData) -> Markup:
     """Write a table that is too long for the page, and return only links to its files as HTML."""
-    return _save_table(report_dir, name, table, Markup(), is_short=True)
+    return _save_table(report_dir, name, table, Markup(), is_short=True)  # on the page: the links only
 
 
 def _save_table(report_dir: Path, name: str, table: TableData, html: Markup, *, is_short: bool) -> Markup:

@@ -19,8 +19,8 @@ VIDEO_LATENCY_STAGES = (
     ("driver", "decode"),
     ("driver", "read_stamp"),
 )
-"""The stages that are part of tau_v. A profile gives the complete tau_v, so the delay of its network is tau_v minus the
-times of these stages."""
+"""The stages that are part of tau_v. A network profile gives the complete tau_v (the inherent latency), so the delay of
+its network is tau_v minus the times of these stages."""
 CONTROL_LATENCY_STAGES = (("driver", "command"),)
 """The stages that are part of tau_c."""
 
@@ -45,7 +45,7 @@ INHERENT = {
 
 @dataclass(frozen=True, slots=True)
 class NetworkDelays:
-    """The delays of video, state (server to client), control (client to server), and traffic that is never delayed.
+    """The delays of video, state (server to client), control (client to server), and traffic without injected delay.
 
     `state` includes the delay injected into the state. If only a constant delay is injected into the video, `video`
     includes it; any other injection into the video, with its constant part, is in `video_injected` instead. The same
@@ -55,7 +55,7 @@ class NetworkDelays:
     video: DelayModel
     control: DelayModel
     state: DelayModel
-    never_delayed: DelayModel
+    without_injection: DelayModel
     video_injected: LinkInjection | None = None
     control_injected: LinkInjection | None = None
 
@@ -83,7 +83,7 @@ def injected_network(profile: str, condition: Condition, costs: Costs, seed: int
         video=DelayModel(constant_video_ms, jitter, seed, name="video inherent"),
         control=DelayModel(constant_control_ms),
         state=DelayModel(max(0.0, control_ms) + state_ms),
-        never_delayed=DelayModel(0.0),
+        without_injection=DelayModel(0.0),
         video_injected=video_injected,
         control_injected=control_injected,
     )
@@ -96,7 +96,7 @@ def virtual_network(requested: NetworkDelays, costs: Costs) -> NetworkDelays:
         video=_add_delay(requested.video, costs.links_us["video"]),
         control=_add_delay(requested.control, costs.links_us["control"]),
         state=_add_delay(requested.state, costs.links_us["state"]),
-        never_delayed=_add_delay(requested.never_delayed, costs.links_us["state"]),
+        without_injection=_add_delay(requested.without_injection, costs.links_us["state"]),
     )
 
 

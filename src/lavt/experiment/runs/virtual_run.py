@@ -190,11 +190,11 @@ def virtual_links(network: NetworkDelays) -> dict[str, VirtualLink]:
         "rtp": link(network.video, network.video_injected, lambda payload, _number: video_delay_index(payload)),
         "control": link(network.control, network.control_injected),
         "state": link(network.state),
-        "feedback": link(network.never_delayed),
+        "feedback": link(network.without_injection),
         "session": link(network.control, session),
         "session_reply": link(network.state),
-        "probe_request": link(network.never_delayed),
-        "probe_reply": link(network.never_delayed),
+        "probe_request": link(network.without_injection),
+        "probe_reply": link(network.without_injection),
     }
 
 

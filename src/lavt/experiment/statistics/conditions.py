@@ -108,7 +108,7 @@ def road_rates(runs: Sequence[Run]) -> list[float]:
 
 
 def group_by(runs: Iterable[Run], key: str) -> dict[str, list[Run]]:
-    """Return the runs by the text of their value of `key`."""
+    """Group the runs by their value of `key`, converted to text."""
     runs_of: dict[str, list[Run]] = {}
     for run in runs:
         runs_of.setdefault(str(run[key]), []).append(run)
@@ -118,7 +118,7 @@ def group_by(runs: Iterable[Run], key: str) -> dict[str, list[Run]]:
 def common_distances(runs: Sequence[Run]) -> CommonDistances:
     """Return for each route, repetition and seed the distance, in units of 10 m, that all its valid runs reached."""
     distances: dict[tuple[Any, ...], int] = {}
-    for run in runs:  # `p95_by_10m` has an entry for each 10 m of the run
+    for run in runs:  # `p95_by_10m` has an entry for each 10 m that the run reached
         if run["valid"] and run.get("p95_by_10m") is not None:
             key, distance = _start_key(run), len(run["p95_by_10m"])
             distances[key] = min(distances.get(key, distance), distance)
@@ -134,9 +134,9 @@ def common_p95_m(runs: Sequence[Run], distances: CommonDistances) -> list[float]
 def worst_rank_m(runs: Sequence[Run]) -> dict[str, float | None]:
     """Return the quartiles of P95 of all runs, with the worst rank for each run that was not completed.
 
-    Such a run ranks after all completed runs. A quartile is the smallest P95 of any run such that at least 25, 50 or
-    75 % of the runs have no larger P95. It is None if the run with this P95 was not completed. A completed run whose
-    error is unknown is left out.
+    The worst rank is an infinite P95. The quartile of 25, 50 or 75 % is the smallest P95 of any run that at least this
+    share of the runs does not exceed. An infinite quartile is returned as None. A completed run whose error is unknown
+    is left out.
     """
     errors_m = [run["p95_m"] if run["ending"] == "completed" else np.inf for run in runs]
     known = [value for value in errors_m if value is not None]

@@ -11,8 +11,8 @@ from scipy.stats import binomtest, fisher_exact
 from lavt.experiment.statistics.intervals import holm
 
 PLANNED = (("L0", "L1"), ("L1", "L2"), ("L2", "L3"), ("L2", "L4"), ("L3", "L4"), ("L3", "L5"))
-"""The contrasts, chosen before any run was driven: each next larger injected delay, and L3 with L4, whose sums of
-video and control delay are equal."""
+"""The pairs of conditions to compare, chosen before any run was driven. In each pair the second condition has the next
+larger sum of video and control delay, except in L3 with L4, whose sums are equal."""
 
 PAIRED_BY = ("route", "repetition", "seed", "participant", "block")
 """The keys that are equal in the two runs of a pair; only the condition differs. `participant` and `block` are

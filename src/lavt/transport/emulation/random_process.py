@@ -57,12 +57,12 @@ class Draws:
 
 @lru_cache
 def quantiles(distribution: Distribution) -> tuple[float, ...]:
-    """Return one value for each of 4096 equally likely parts of a distribution, in netem's standard deviations.
+    """Return 4096 quantiles of a distribution, in units of the standard deviation that netem is given.
 
-    The value is the middle of the part; for `pareto` it is the lower end. For `uniform` the unit is half of the
-    distribution's width. netem's tables end at 4 standard deviations, which cuts off the tails of `pareto` (shape 3)
-    and `paretonormal`. So the true standard deviations of these two are 0.82 and 0.83 instead of 1, and their means are
-    -0.03 instead of 0.
+    The distribution is divided into 4096 equally likely parts. Each quantile is the middle of its part; for `pareto` it
+    is the lower end. For `uniform` the unit is half of the distribution's width. netem's tables end at 4 standard
+    deviations, which cuts off the tails of `pareto` (shape 3) and `paretonormal`. So the true standard deviations of
+    these two are 0.82 and 0.83 instead of 1, and their means are -0.03 instead of 0.
     """
     if distribution == "uniform":
         return tuple((2 * part + 1) / QUANTILES - 1 for part in range(QUANTILES))

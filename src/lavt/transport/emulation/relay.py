@@ -42,8 +42,8 @@ Address = tuple[str, int]
 NO_DELAY = DelayModel(0.0)
 
 
-def is_delayed_video_datagram(datagram: bytes) -> bool:
-    """Return whether a datagram from the server is RTP or RTCP (version 2), and not part of path validation."""
+def must_delay_video_datagram(datagram: bytes) -> bool:
+    """Return whether to delay a datagram from the server: RTP and RTCP (version 2), but not path validation."""
     return len(datagram) >= 2 and datagram[0] >> 6 == 2
 
 
@@ -66,8 +66,8 @@ class RelayedFlow:
     upstream: DelayModel
     downstream: DelayModel
     downstream_delay_filter: Callable[[bytes], bool] = lambda _datagram: True
-    """Returns whether a datagram from the server is delayed; by default all are."""
-    downstream_index_function: Callable[[bytes], int] | None = None
+    """Returns whether to delay a datagram from the server; by default all are delayed."""
+    downstream_delay_index_function: Callable[[bytes], int] | None = None
     """Maps a datagram from the server to the index of its delay; None: the index is the datagram's number."""
     upstream_injected: LinkInjection | None = None
     downstream_injected: LinkInjection | None = None
@@ -80,7 +80,7 @@ class _DelayedPath:
 
     line: DelayLine
     send: Callable[[bytes], object]
-    index_function: Callable[[bytes], int] | None
+    delay_index_function: Callable[[bytes], int] | None
     """Maps a datagram to the index of its delay; None: the index is `count`."""
     delay_filter: Callable[[bytes], bool]
     count: int = 0
@@ -129,7 +129,7 @@ class Relay:
         """Return the port that was opened for each flow."""
         return {active.flow.name: active.port for active in self._flows}
 
-    def held_ms(self) -> dict[str, float | None]:
+    def median_delays_ms(self) -> dict[str, float | None]:
         """Return for each flow and direction the median delay of its datagrams, or None if there were none.
 
         The medians cover the current clients and their last datagrams.
@@ -139,7 +139,7 @@ class Relay:
             for name, paths in self._paths()
         }
 
-    def late_ms(self) -> dict[str, float | None]:
+    def median_lateness_ms(self) -> dict[str, float | None]:
         """Return for each flow and direction how late its datagrams left, as a median, or None if there were none."""
         return {
             name: _median_ms([late_ns for path in paths for late_ns in path.lateness_ns])
@@ -199,7 +199,7 @@ class Relay:
             self._send(path, datagram)
             return
         path.count += 1
-        index = path.count if path.index_function is None else path.index_function(datagram)
+        index = path.count if path.delay_index_function is None else path.delay_index_function(datagram)
         path.line.push((datagram, arrived_ns), arrived_ns, index, len(datagram))
         self._schedule(path)
 
@@ -272,7 +272,7 @@ class _ActiveFlow:
             _DelayedPath(
                 downstream,
                 lambda data: self._socket.sendto(data, address),
-                flow.downstream_index_function,
+                flow.downstream_delay_index_function,
                 flow.downstream_delay_filter,
             ),
             self._relay.now_ns(),

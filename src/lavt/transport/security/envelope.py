@@ -265,7 +265,7 @@ class VerifiedReply(Struct, frozen=True):
     """The result of verifying a reply: its body, or the envelope of the request to send again, or neither."""
 
     body: bytes | None
-    retry: bytes | None
+    repeated_request: bytes | None
 
 
 class VerifiedState(Struct, frozen=True):

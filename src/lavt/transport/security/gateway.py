@@ -21,7 +21,8 @@ Deliver = Callable[[str, Any, Now, Peer], None]
 Carry = Callable[..., None]
 """Takes `Send`s and passes them to the link."""
 
-REQUEST_PERIOD_NS: Final = NS_PER_S
+OWN_REQUEST_PERIOD_NS: Final = NS_PER_S
+"""The least time between two requests that the client's gateway sends by itself, to authenticate the server."""
 MAX_UNANSWERED_REQUESTS: Final = 64
 STATES_PER_S: Final = 500
 """Ten times as many as a vehicle sends; to verify this many signatures takes 7 % of a core."""
@@ -53,8 +54,8 @@ class ServerGateway:
         self._flood_filter = FloodFilter(in_force, authenticator.is_from_active_operator)
         self._request_limiters = {channel: RateLimiter(REQUESTS_PER_S) for channel in REQUESTS}
         self._requests: dict[tuple[str, Peer], VerifiedRequest] = {}
-        self._retry: Send | None = None
-        """A reply that demands the request again, sent as soon as the lock is free."""
+        self._retry_reply: Send | None = None
+        """A reply that tells the client to send its request again; it is sent as soon as the lock is free."""
         self._counts: Counter[str] = Counter()
         self._lock = threading.Lock()
 
@@ -68,9 +69,11 @@ class ServerGateway:
         with self._lock:
             verify = self._verify_command if channel == "control" else self._verify_request
             body = verify(channel, payload, arrived.mono_ns, peer)
-            retry, self._retry = self._retry, None
-        if retry is not None:  # sent outside the lock: the link can block for its router, which must not block `send`
-            self._carry(retry)
+            retry_reply, self._retry_reply = self._retry_reply, None
+        if (
+            retry_reply is not None
+        ):  # sent outside the lock: the link can block for its router, which must not block `send`
+            self._carry(retry_reply)
         if body is not None:
             self._deliver(channel, body, arrived, peer)
 
@@ -94,7 +97,7 @@ class ServerGateway:
         if request is None:
             return None
         if request.must_retry:
-            self._retry = Send(f"{channel}_reply", self._authenticator.sign_reply(request, b""), peer)
+            self._retry_reply = Send(f"{channel}_reply", self._authenticator.sign_reply(request, b""), peer)
             return None
         self._requests[channel, peer] = request
         if len(self._requests) > MAX_UNANSWERED_REQUESTS:
@@ -146,8 +149,9 @@ class ClientGateway:
             self._counts["states_screened_out"] += 1
             return None
         state = self._authenticator.verify_state(payload)
+        # The server's process is not authenticated yet. Its answer to a request authenticates it.
         if state.client_must_request and (
-            self._requested_ns is None or now_ns - self._requested_ns >= REQUEST_PERIOD_NS
+            self._requested_ns is None or now_ns - self._requested_ns >= OWN_REQUEST_PERIOD_NS
         ):
             self._requested_ns = now_ns
             self._send_in_thread(Send("session", self._authenticator.sign_request("session", b"")))
@@ -156,8 +160,8 @@ class ClientGateway:
     def _verify_reply(self, channel: str, payload: bytes, _now_ns: int) -> bytes | None:
         request_channel = channel.removesuffix("_reply")
         reply = self._authenticator.verify_reply(request_channel, payload)
-        if reply.retry is not None:
-            self._send_in_thread(Send(request_channel, reply.retry))
+        if reply.repeated_request is not None:
+            self._send_in_thread(Send(request_channel, reply.repeated_request))
         return reply.body
 
     def _send_in_thread(self, send: Send) -> None:

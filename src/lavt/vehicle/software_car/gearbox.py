@@ -12,7 +12,7 @@ GEARS: Final = {Gear.PARK, Gear.NEUTRAL, Gear.DRIVE}
 
 def shift(state: KitState, order: GearOrder) -> None:
     """Execute a gear order, or record why it is rejected."""
-    if not order.is_valid:
+    if not order.is_valid:  # the frame had a wrong checksum
         return
     if order.is_clearing:
         state.is_gear_overridden = False

@@ -33,7 +33,7 @@ class SoftwareCarRunner:
         self._events: list[KitEvent] = []
         self.counts: Counter[str] = Counter(frames_sent=0, frames_heard=0, frames_lost=0)
         self.max_delay_ns = 0
-        """The largest delay of a step so far."""
+        """The largest lateness of any step so far."""
 
     def step(self, now_ns: int) -> None:
         """Process received frames, advance to `now_ns`, and send the frames due until then."""

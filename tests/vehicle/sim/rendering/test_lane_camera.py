@@ -84,13 +84,13 @@ def test_a_camera_turned_aside_has_less_confidence(yaw_deg: float, y_m: float, c
 def test_there_is_no_picture_without_a_pose() -> None:
     """There is no picture before the first pose."""
     assert camera().capture(0, 0, None) is None
-    assert camera().expose(0, 0, []) is None
+    assert camera().capture_after_exposure(0, 0, []) is None
 
 
 def test_an_exposed_lane_is_that_of_the_middle_of_the_exposure() -> None:
     """With an exposure, the lane and the capture time are those of the middle of the exposure."""
     poses = [pose_at(S_M, at_ns=0), pose_at(S_M, 0.4, at_ns=10_000_000), pose_at(S_M, 9.0, at_ns=20_000_000)]
-    frame = camera(exposure_ns=10_000_000).expose(3, 0, poses)
+    frame = camera(exposure_ns=10_000_000).capture_after_exposure(3, 0, poses)
     expected = camera().capture(3, 5_000_000, pose_at(S_M, 0.2))
     assert frame is not None
     assert expected is not None

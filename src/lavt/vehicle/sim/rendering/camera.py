@@ -53,7 +53,7 @@ class SimCamera:
             return None
         return CapturedFrame(number, at_ns, self._renderer.render(pose, number))
 
-    def expose(self, number: int, begin_ns: int, poses: Sequence[Pose]) -> CapturedFrame | None:
+    def capture_after_exposure(self, number: int, begin_ns: int, poses: Sequence[Pose]) -> CapturedFrame | None:
         """Render frame `number` with motion blur; None if all poses are later than the opening of the shutter."""
         if self.exposure_ns == 0:
             return self.capture(number, begin_ns, newest_pose(poses, begin_ns))

@@ -73,7 +73,7 @@ class LaneCamera:
             return None
         return CapturedFrame(number, at_ns, SeenLane(0, at_ns, self.observe_lane(pose)))
 
-    def expose(self, number: int, begin_ns: int, poses: Sequence[Pose]) -> CapturedFrame | None:
+    def capture_after_exposure(self, number: int, begin_ns: int, poses: Sequence[Pose]) -> CapturedFrame | None:
         """Return the lane visible from the middle between the poses when the shutter opens and when it closes."""
         first, last = newest_pose(poses, begin_ns), newest_pose(poses, begin_ns + self.exposure_ns)
         if first is None or last is None:

@@ -1,6 +1,6 @@
 """Roadside objects: rails and barriers, lamp posts, trees and buildings.
 
-The positions and shapes of the objects are the same in every run and every light.
+The positions and shapes of the objects are the same in every run and with every setting of `vehicle.light`.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class RoadsideObjects:
 
 
 def place_roadside_objects(road: Road, *, full_scenery: bool) -> RoadsideObjects:
-    """Place the objects along a road: rails, barriers and, in full scenery, also trees, lamp posts and buildings."""
+    """Place a road's rails and barriers (two kinds of `Rail`) and, in full scenery, trees, lamp posts and buildings."""
     sampled_rails = [_rail_stations(road, rail) for rail in road.rails]
     placed_trees = _place_trees(road) if full_scenery else np.empty((0, 4))
     return RoadsideObjects(
