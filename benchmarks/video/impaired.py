@@ -61,11 +61,8 @@ def psnr_db(mean_squared_error: float) -> float:
 
 def loss_free_errors(run: Run) -> list[float]:
     """Decode the stream as it was sent; return the mean squared error of each frame's luma to the source picture."""
-    decoder, source, numbers = (
-        open_decoder(),
-        memory_map_pictures(run.pictures_stem),
-        run.map_sent_table()[:, NUMBER_COLUMN],
-    )
+    decoder, source = open_decoder(), memory_map_pictures(run.pictures_stem)
+    numbers = run.map_sent_table()[:, NUMBER_COLUMN]
     errors = []
     for index, unit in enumerate(load_units(run)):
         frames = decoder.decode(av.Packet(unit))

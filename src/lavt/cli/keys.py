@@ -1,4 +1,4 @@
-"""`lavt keys`: create certificates and signing keys with a test authority, and list the files for each machine."""
+"""`lavt keys`: create certificates and signing keys with a test certificate authority, and list each machine's files."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def keys(
     ] = None,
     days: Annotated[int, typer.Option(help="Validity of the certificates and signing keys in days.")] = DEFAULT_DAYS,
 ) -> None:
-    """Create certificates and signing keys with a test authority.
+    """Create certificates and signing keys with a test certificate authority.
 
     Run the command again to add names. The authority is for tests only: its private key has no password. The command
     overwrites nothing.

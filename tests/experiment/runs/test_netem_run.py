@@ -55,8 +55,8 @@ class FakeNetemInterface(NetemInterface):
 
     def _probe_result(self, count: int, delay_ms: float) -> ProbeResult:
         percentiles = {"p5_ms": delay_ms, "median_ms": delay_ms, "p95_ms": delay_ms}
-        no_reordering = {"reordered": 0, "early": 0}  # `early`: packets that netem sent at once, to reorder them
-        return ProbeResult(sent=count, lost=0, **no_reordering, **percentiles)
+        # `early` counts packets that netem sent at once, to reorder them.
+        return ProbeResult(sent=count, lost=0, reordered=0, early=0, **percentiles)
 
     def problems(self) -> list[str]:
         """Return the messages about correlated jitter that has stopped."""

@@ -13,8 +13,8 @@ from scipy.optimize import brentq
 GUESS_ERROR_MS = 10.0
 """`zero_bracket` begins its search at its guess plus and minus this much."""
 LARGEST_RATE_PER_S = 1.0
-"""Growth rates of oscillations are clipped to this size, because they can be infinite. The zero crossing does not depend
-on their size."""
+"""Growth rates of oscillations are clipped to this size, because they can be infinite. The zero crossing does not
+depend on their size."""
 
 
 @dataclass(frozen=True, slots=True)

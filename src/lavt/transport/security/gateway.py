@@ -70,9 +70,8 @@ class ServerGateway:
             verify = self._verify_command if channel == "control" else self._verify_request
             body = verify(channel, payload, arrived.mono_ns, peer)
             retry_reply, self._retry_reply = self._retry_reply, None
-        if (
-            retry_reply is not None
-        ):  # sent outside the lock: the link can block for its router, which must not block `send`
+        # Sent outside the lock: the link can block for its router, which must not block `send`.
+        if retry_reply is not None:
             self._carry(retry_reply)
         if body is not None:
             self._deliver(channel, body, arrived, peer)
