@@ -1,4 +1,4 @@
-"""`lavt keys`: create certificates and signing keys with a test certificate authority, and list each machine's files."""
+"""`lavt keys`: create certificates and signing keys with a test certificate authority, and list the files."""
 
 from __future__ import annotations
 
