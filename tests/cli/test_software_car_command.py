@@ -179,7 +179,6 @@ def test_a_fault_changes_the_reports(profile: str, identifier: int, start: Start
 
 @pytest.mark.realtime
 @pytest.mark.judges_times
-@pytest.mark.timeout(60)
 @pytest.mark.parametrize("generation", [1, 2])
 def test_driven_by_another_process(generation: int, start: Start) -> None:
     """The car executes commands of another process, reports its events, and brakes when the commands stop."""

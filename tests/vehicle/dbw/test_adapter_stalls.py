@@ -15,7 +15,6 @@ from lavt.vehicle.software_car.authority import WATCHDOG_BRAKE
 
 
 @both_generations
-@pytest.mark.timeout(30)
 def test_a_stall_while_parking_ends(generation: int) -> None:
     """If the kit disengages in a stall while parking, at whatever moment, parking ends, and the watchdog brakes."""
     parking_rig = driving_rig(generation)
