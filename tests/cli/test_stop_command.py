@@ -92,6 +92,14 @@ def test_without_a_router_the_stop_is_reported_as_not_sent(run: Run) -> None:
     assert endpoint in sentence
 
 
+def test_with_an_invalid_key_the_stop_is_reported_as_not_sent(run: Run) -> None:
+    """With a key that cannot be read, the command says that the stop was not sent."""
+    failed = run("stop", CONFIG, "--set", "security.key=none", "--set", "security.vehicle=none")
+    assert failed.code == 2
+    assert "NOT sent" in failed.err
+    assert failed.err.count("\n") == 1
+
+
 def test_without_a_vehicle_the_exit_code_is_1(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """With a router but no vehicle, the command fails with exit code 1 and says that the stop was not confirmed."""
     monkeypatch.setattr(stop, "RETRY_PERIOD_S", 0.1)

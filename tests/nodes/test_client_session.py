@@ -5,6 +5,8 @@ from msgspec.structs import replace
 
 from lavt.domain import NS_PER_S, Now, SafetyState, SessionReply, State
 from lavt.nodes.client_session import ClientSession
+from lavt.safety.session import RELEASED_BEFORE
+from lavt.safety.state_machine import TRIGGER_MESSAGES
 
 GRANTED = SessionReply(
     granted=True, reason="", epoch=5, token=bytes(16), video_port=5600, host="kernel", emergency_stop=0
@@ -86,7 +88,8 @@ def test_a_stopped_vehicle_stays_stopped(safety: SafetyState) -> None:
     session.handle_state(state("degraded"), 400)
     assert session.phase == "driving"
     session.handle_state(state(safety), 500)
-    assert (session.phase, session.may_command, session.reason) == ("stopped", False, "reason")
+    hint = "" if safety == "safe_stop" else "; restart this client to drive"
+    assert (session.phase, session.may_command, session.reason) == ("stopped", False, f"reason{hint}")
     session.handle_state(state(safety), 600)
     assert session.take_request(10 * NS_PER_S) is None
 
@@ -152,7 +155,7 @@ def test_an_emergency_stop_is_repeated_until_answered(released: bool) -> None:
     assert session.next_wake_ns() == 400 + NS_PER_S
     assert session.take_request(400 + NS_PER_S) == first
     assert session.take_request(400 + 2 * NS_PER_S) == first
-    session.handle_reply(replace(REJECTED, emergency_stop=60), 400 + 2 * NS_PER_S)
+    session.handle_reply(replace(NOTED, emergency_stop=60), 400 + 2 * NS_PER_S)
     assert "emergency_stop" not in {take_operation(session, number * NS_PER_S) for number in range(3, 10)}
 
 
@@ -231,6 +234,95 @@ def test_a_waiting_client_does_not_arm_after_an_emergency_stop(rearm: bool, has_
     session.handle_state(state("emergency_stop"), 300)
     session.handle_state(replace(state("disarmed"), instance=2 if restarted else 0), 400)
     assert (session.phase, session.may_command, session.take_request(10 * NS_PER_S)) == ("stopped", False, None)
+
+
+@pytest.mark.parametrize("rearm", [False, True])
+@pytest.mark.parametrize("before", ["arming", "driving", "safe_stop"])
+@pytest.mark.parametrize("has_control", [False, True])
+def test_a_waiting_client_does_not_arm_after_a_driver_override(
+    rearm: bool, before: SafetyState, has_control: bool
+) -> None:
+    """If the driver in the car takes over, a client that waits or arms does not arm the vehicle any more."""
+    override = replace(state("disarmed"), reason=TRIGGER_MESSAGES["driver override"])
+    session = new_session(rearm=rearm)
+    if has_control:
+        session.handle_reply(GRANTED, 200)
+    session.handle_state(replace(state(before), active_operator="" if has_control else "bob"), 300)
+    session.handle_state(override, 400)
+    session.handle_state(state("disarmed"), 500)
+    assert (session.phase, session.may_command, session.take_request(10 * NS_PER_S)) == ("stopped", False, None)
+
+
+def test_a_new_client_arms_after_an_earlier_driver_override() -> None:
+    """An override before this client started does not keep it from arming: a person has started it."""
+    session = new_session()
+    session.handle_state(replace(state("disarmed"), reason=TRIGGER_MESSAGES["driver override"]), 150)
+    session.handle_reply(GRANTED, 200)
+    session.handle_state(replace(state("disarmed"), reason=TRIGGER_MESSAGES["driver override"]), 300)
+    assert (session.phase, session.may_command) == ("arming", True)
+
+
+def test_a_client_that_is_to_clear_a_stop_does_not_arm_after_a_later_one() -> None:
+    """With `clear_stop`, a stop after the one to be cleared awaits a person, even if the server restarts at once."""
+    for seen_between in ("driving", "disarmed"):
+        session = ClientSession("alice", 7, rearm=False, start_ns=100, clear_stop=True)
+        session.handle_reply(STOPPED, 200)
+        session.handle_state(replace(state(seen_between), active_operator="bob"), 300)
+        session.handle_state(state("emergency_stop"), 400)
+        session.handle_state(replace(state("disarmed"), instance=2), 500)
+        session.handle_reply(GRANTED, 600)
+        assert (session.phase, session.may_command) == ("stopped", False)
+
+
+def test_a_stop_that_a_restarted_server_has_forgotten_is_not_cleared() -> None:
+    """With `clear_stop`, a stop before the first reply awaits a person if the reply of a new server names none."""
+    session = ClientSession("alice", 7, rearm=False, start_ns=100, clear_stop=True)
+    session.handle_state(state("emergency_stop"), 150)
+    session.handle_state(replace(state("disarmed"), instance=2), 200)
+    session.handle_reply(GRANTED, 300)
+    assert (session.phase, session.may_command) == ("stopped", False)
+
+
+def test_a_client_that_is_to_clear_a_stop_acquires_control_again() -> None:
+    """While the stop lasts, requests to clear it and requests for control alternate, because control may be lost."""
+    session = clearing_session()
+    operations = [take_operation(session, second * NS_PER_S) for second in range(1, 5)]
+    assert operations == ["clear_emergency_stop", "acquire", "clear_emergency_stop", "acquire"]
+
+
+@pytest.mark.parametrize("phase", ["stopped", "seeking"])
+def test_rearm_takes_no_control_back(phase: str) -> None:
+    """With `rearm`, a client whose control went to another one while it received no states only watches."""
+    session = driving_session(rearm=True)
+    session.handle_state(state_with_operator("alice", "driving"), 310)
+    session.handle_state(replace(state_with_operator("alice", "safe_stop"), speed_mps=3.0), 400)
+    if phase == "seeking":
+        session.handle_state(state_with_operator("alice", "safe_stop"), 450)
+    assert session.phase == phase
+    session.handle_state(state_with_operator("bob", "safe_stop"), 500)
+    assert (session.phase, session.take_request(10 * NS_PER_S)) == ("watching", None)
+
+
+def test_an_own_emergency_stop_that_was_cleared_before_its_reply_is_repeated() -> None:
+    """If the reply to a stop was lost and somebody has cleared the stop, another stop follows."""
+    session = driving_session()
+    stop = session.raise_emergency_stop(Now(400, 60))
+    session.handle_state(state("emergency_stop"), 500)
+    session.handle_state(state("disarmed"), 600)
+    session.handle_reply(replace(REJECTED, emergency_stop=stop.number), 700)
+    repeated = session.take_request(400 + NS_PER_S)
+    assert repeated is not None
+    assert (repeated.operation, repeated.number) == ("emergency_stop", stop.number + 1)
+
+
+def test_another_rejection_confirms_no_release() -> None:
+    """After a release, a rejection of an earlier request does not confirm it; that of a repeated release does."""
+    session = driving_session()
+    session.release(1000)
+    session.handle_reply(replace(REJECTED, reason="the vehicle is not stationary yet"), 1100)
+    assert not session.released
+    session.handle_reply(replace(REJECTED, reason=RELEASED_BEFORE), 1200)
+    assert session.released
 
 
 def test_an_emergency_stop_that_no_state_reported_is_noticed() -> None:

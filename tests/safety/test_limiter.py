@@ -113,12 +113,6 @@ def test_a_speed_that_is_not_finite_lifts_no_limit(speed_mps: float) -> None:
     assert limit_request(Actuation(0.0, 1.0, 0.0), speed_mps)[0].throttle == 0.0
 
 
-def test_the_highest_speed_leaves_no_steering() -> None:
-    """The highest finite speed, whose square is not finite, limits the wheel to the middle and removes the throttle."""
-    actuation, _ = limit_request(Actuation(0.5, 1.0, 0.0), sys.float_info.max)
-    assert actuation == Actuation(0.0, 0.0, 0.0)
-
-
 @pytest.mark.parametrize("steering_rad", [math.nan, math.inf, -math.inf])
 def test_a_wheel_angle_that_is_not_finite_changes_no_target(steering_rad: float) -> None:
     """A reported wheel angle that is not finite neither becomes a target nor lifts the limit of the steering rate."""
@@ -272,10 +266,13 @@ def test_a_request_that_is_not_finite_brakes() -> None:
     assert applied_limits == ("not finite",)
 
 
-@pytest.mark.parametrize("speed_mps", [1e155, -1e300])
-def test_a_huge_speed_does_not_overflow(speed_mps: float) -> None:
-    """A finite speed whose square is not finite limits the wheel to 0."""
-    assert limit_request(Actuation(0.5, 0.0, 0.0), speed_mps)[0].steering_rad == 0.0
+@pytest.mark.parametrize("speed_mps", [101.0, 1e155, -1e300, sys.float_info.max, math.nan])
+def test_an_impossible_speed_limits_the_wheel_as_at_the_speed_limit(speed_mps: float) -> None:
+    """A speed above any vehicle's is unknown: it neither straightens the wheel in a curve nor lifts the limit."""
+    at_speed_limit_rad = math.atan(WHEELBASE_M * LIMITS.lateral_acceleration_mps2 / LIMITS.speed_limit_mps**2)
+    limited = limit_request(Actuation(0.5, 1.0, 0.0), speed_mps)[0]
+    assert limited.steering_rad == pytest.approx(at_speed_limit_rad)
+    assert limited.throttle == 0.0
 
 
 def test_an_implausible_speed_gives_no_throttle_and_the_least_steering() -> None:

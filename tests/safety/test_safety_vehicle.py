@@ -30,6 +30,15 @@ def test_an_inhibited_vehicle_is_not_armed() -> None:
     assert rig.state == "arming"
 
 
+def test_a_vehicle_with_an_impossible_angle_is_not_armed() -> None:
+    """While the vehicle reports an angle that no wheel has, arming is rejected."""
+    rig = Rig().acquire()
+    rig.vehicle = replace(vehicle_at(), steering_rad=2.0)
+    rig.take_picture()
+    assert rig.send().reason is RejectionReason.INHIBITED
+    assert rig.state == "disarmed"
+
+
 def test_arming_waits_until_the_vehicle_is_engaged() -> None:
     """Arming completes when the vehicle is engaged, if that takes longer than 1 s."""
     rig = Rig().acquire()

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import queue
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -52,7 +53,8 @@ def stop(
     """
     console.reserve_stdout()
     settings = load_config(ClientConfig, config, changes or [])
-    authenticator = build_authenticator(settings)  # the vehicle also accepts a stop that an expired key has signed
+    with _not_sent():
+        authenticator = build_authenticator(settings)  # the vehicle also accepts a stop that an expired key has signed
     quiet_logs()
     clock, replies = MachineClock(), queue.Queue[bytes]()
 
@@ -60,7 +62,7 @@ def stop(
         if channel == "session_reply":
             replies.put(payload)
 
-    try:
+    with _not_sent():
         link = ZenohLink(
             clock,
             side="client",
@@ -69,8 +71,6 @@ def stop(
             vehicle=settings.vehicle_id,
             who=settings.who,
         )
-    except UserError as error:
-        raise UserError(f"the emergency stop was NOT sent, so stop the vehicle by other means: {error}") from error
     gateway = build_gateway(authenticator, deliver, link.send, lambda: (0, -1))
     link.start(gateway.receive, queries_only=True)
     try:
@@ -80,6 +80,15 @@ def stop(
         console.print_result(f"{settings.vehicle_id} accepted the emergency stop")
     finally:
         link.close()
+
+
+@contextmanager
+def _not_sent() -> Iterator[None]:
+    """Say in a `UserError` that the stop was not sent."""
+    try:
+        yield
+    except UserError as error:
+        raise UserError(f"the emergency stop was NOT sent, so stop the vehicle by other means: {error}") from error
 
 
 def _repeat_until_confirmed(

@@ -6,6 +6,8 @@ from typing import Literal
 
 from lavt.domain import NS_PER_S, Now, Operation, SessionReply, SessionRequest, State
 from lavt.safety.limits import LIMITS
+from lavt.safety.session import RELEASED_BEFORE
+from lavt.safety.state_machine import TRIGGER_MESSAGES
 
 Phase = Literal["seeking", "arming", "driving", "stopped", "watching"]
 """seeking: no control yet. arming: commands request arming. driving: the vehicle executes drive commands. stopped:
@@ -13,17 +15,17 @@ the vehicle has stopped, and drives again only if a person or `rearm` requests i
 lost for good."""
 
 REQUEST_PERIOD_NS = NS_PER_S
+RESTART_HINT = "; restart this client to drive"
 
 
 class ClientSession:
     """A client session that requests control until it is granted and the vehicle armed; repeated requests are harmless.
 
-    With `rearm`, it requests control again after a safe stop and from a restarted server, but not after a driver
-    override, which disarms the vehicle. With `clear_stop`, it clears the emergency stop that the first reply reports,
-    and no other one. After any other emergency stop it never arms the vehicle again, not even if it has not driven yet,
-    if somebody clears the stop, or if the server restarts and has forgotten the stop. With `waits_for_condition`, it
-    arms the vehicle only when the network condition is in force. With `take_over`, it requests a handover from the
-    active operator.
+    With `rearm`, it requests control again after a safe stop and from a restarted server. With `clear_stop`, it clears
+    the emergency stop that the first reply reports, and no other one. After any other emergency stop, and after a
+    driver override, it never arms the vehicle again: not if it has not driven yet, if somebody clears the stop, or if
+    the server restarts and has forgotten the stop. With `waits_for_condition`, it arms the vehicle only when the
+    network condition is in force. With `take_over`, it requests a handover from the active operator.
     """
 
     def __init__(
@@ -51,6 +53,8 @@ class ClientSession:
         self._rearm = rearm
         self._looks_for_stop = clear_stop
         """The first reply reports the emergency stop that is to be cleared."""
+        self._saw_stop_before_reply = False
+        """A state reported the emergency stop that the first reply is expected to name."""
         self._stop_to_clear: int | None = None
         """Number of the emergency stop that this client clears; None: none."""
         self._last_stop: int | None = None
@@ -68,7 +72,8 @@ class ClientSession:
         self._server = 0
         """Instance of the server process that sent the last state."""
         self._awaits_person = False
-        """There was an emergency stop, or the same server process has disarmed the vehicle since this client drove."""
+        """There was an emergency stop or a driver override, or the same server process has disarmed the vehicle since
+        this client drove."""
         self._request_ns = start_ns
         self._stop_ns: int | None = None
         """When the request of the emergency stop is repeated; None: there is no stop, or the vehicle has answered."""
@@ -100,7 +105,9 @@ class ClientSession:
         self._request_ns = now_ns + REQUEST_PERIOD_NS
         if self.phase == "watching":
             return SessionRequest("release", self._who, self._instance, 0)
-        if self._stop_to_clear is not None and self.phase == "arming" and self.safety == "emergency_stop":
+        is_stopped = self.phase == "arming" and self.safety == "emergency_stop"
+        if self._stop_to_clear is not None and is_stopped and self._last_operation != "clear_emergency_stop":
+            self._last_operation = "clear_emergency_stop"  # alternates with "acquire": control may have been lost
             return SessionRequest("clear_emergency_stop", self._who, self._instance, self._stop_to_clear)
         self._last_operation, self._next_operation = self._next_operation, "acquire"
         return SessionRequest(self._last_operation, self._who, self._instance, 0)
@@ -123,12 +130,16 @@ class ClientSession:
             self._last_stop = reply.emergency_stop
         if self._looks_for_stop:
             self._looks_for_stop, self._stop_to_clear = False, reply.emergency_stop or None
+            is_new_stop = self._saw_stop_before_reply and self._stop_to_clear is None  # the server has restarted
         elif reply.emergency_stop != self._stop_to_clear:  # there was another stop since: a person must decide again
             self._stop_to_clear = None
         if is_new_stop:  # the states that reported this stop may have been lost
             self._await_person("there was an emergency stop")
-        if reply.emergency_stop == self.emergency_stop:
-            self._stop_ns = None
+        if self._stop_ns is not None and reply.emergency_stop == self.emergency_stop:
+            if reply.granted or self.safety == "emergency_stop":
+                self._stop_ns = None
+            else:  # the vehicle has executed this stop, but somebody has cleared it since
+                self.emergency_stop += 1
         if reply.granted and reply.token:
             self.host = reply.host
             self.epoch = reply.epoch
@@ -139,7 +150,8 @@ class ClientSession:
 
     def _update_reason(self, reply: SessionReply) -> None:
         if self.phase == "watching":
-            self.released = self.released or not reply.token  # a reply with a token belongs to an earlier request
+            # A reply with a token, or with another rejection, belongs to an earlier request.
+            self.released |= not reply.token and (reply.granted or reply.reason == RELEASED_BEFORE)
             return
         if reply.token:
             self._rejections.clear()
@@ -150,18 +162,18 @@ class ClientSession:
 
     def handle_state(self, state: State, now_ns: int) -> None:
         """Process a state of the vehicle."""
-        if self.phase in ("driving", "stopped"):
-            is_same_server = state.instance == self._server
-            self._awaits_person |= is_same_server and self.safety != "disarmed" and state.safety == "disarmed"
-        if state.safety == "emergency_stop" and not self._looks_for_stop and self._stop_to_clear is None:
-            self._await_person(state.reason)
+        self._notice_stop(state)
         self.safety, self._server = state.safety, state.instance
         names_this_client = (state.active_operator, state.active_operator_instance) == (self._who, self._instance)
         names_other_client = state.active_operator != "" and not names_this_client
-        if self.phase == "arming" and state.safety == "driving" and not names_other_client:
+        if names_other_client and self._was_active_operator and self.phase != "watching":
+            # A takeover at standstill needs no consent: two clients that took control back would alternate for ever.
+            self.phase, self.released = "watching", True
+            self.reason = f"{state.active_operator} has taken control"
+        elif self.phase == "arming" and state.safety == "driving" and not names_other_client:
             self.phase, self._stop_to_clear = "driving", None
         elif self.phase == "driving" and state.safety in ("disarmed", "safe_stop", "emergency_stop"):
-            self.phase, self.reason = "stopped", state.reason
+            self.phase, self.reason = "stopped", state.reason + RESTART_HINT * self._awaits_person
         elif (
             self.phase == "stopped"
             and self._rearm
@@ -169,17 +181,26 @@ class ClientSession:
             and not self._awaits_person
         ):
             self.phase, self._request_ns = "seeking", now_ns
-        if names_other_client and self._was_active_operator and self.phase not in ("seeking", "watching"):
-            # A takeover at standstill needs no consent: two clients that took control back would alternate for ever.
-            self.phase, self.released = "watching", True
-            self.reason = f"{state.active_operator} has taken control"
         self._was_active_operator |= names_this_client
 
+    def _notice_stop(self, state: State) -> None:
+        """Notice an emergency stop that this client does not clear, and the end of a drive by disarming."""
+        if self._looks_for_stop:
+            self._saw_stop_before_reply |= state.safety == "emergency_stop"
+        elif state.safety != "emergency_stop":
+            self._stop_to_clear = None  # it has been cleared: another stop is a person's decision
+        elif self._stop_to_clear is None:
+            self._await_person(state.reason)
+        if state.instance == self._server and state.safety == "disarmed" and self.safety not in ("", "disarmed"):
+            is_override = state.reason == TRIGGER_MESSAGES["driver override"]
+            if is_override or self.phase in ("driving", "stopped"):
+                self._await_person(state.reason)
+
     def _await_person(self, reason: str) -> None:
-        """Do not arm the vehicle from now on: only a person decides what follows an emergency stop."""
+        """Do not arm the vehicle from now on: a person must decide what follows, and restart this client."""
         self._awaits_person = True
-        if self.phase in ("seeking", "arming"):
-            self.phase, self.reason = "stopped", f"{reason}; restart this client to drive"
+        if self.phase in ("seeking", "arming", "stopped"):
+            self.phase, self.reason = "stopped", reason + RESTART_HINT
 
     def raise_emergency_stop(self, now: Now) -> SessionRequest:
         """Raise an emergency stop and return its request; every later command carries its number.

@@ -154,7 +154,7 @@ class SafetyGate:
             return RejectionReason.EMERGENCY_STOP_LATCHED
         if command.mode == "arm" and not self._limits.is_stationary(vehicle):
             return RejectionReason.NOT_STATIONARY
-        if command.mode == "arm" and vehicle.inhibit_reason:
+        if command.mode == "arm" and (vehicle.inhibit_reason or not self._limits.is_possible(vehicle)):
             return RejectionReason.INHIBITED
         return None
 

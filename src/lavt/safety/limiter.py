@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from lavt.control.client_limits import CLIENT_LIMITS
-from lavt.domain import NS_PER_S, Actuation, VehicleState
+from lavt.domain import MAX_REPORTED_MPS, NS_PER_S, Actuation, VehicleState
 from lavt.errors import UserError
 from lavt.safety.limits import Limits
 
@@ -73,7 +73,7 @@ class Limiter:
         if not -bound_rad <= steering_rad <= bound_rad:
             changed.append("steering angle")
             steering_rad = min(max(steering_rad, -bound_rad), bound_rad)
-        is_speed_known = vehicle.is_speed_plausible and math.isfinite(vehicle.speed_mps)
+        is_speed_known = vehicle.is_speed_plausible and abs(vehicle.speed_mps) <= MAX_REPORTED_MPS
         bound_rad = self._lateral_limit_rad(vehicle.speed_mps, is_speed_known)
         if not -bound_rad <= steering_rad <= bound_rad:
             changed.append("lateral acceleration")
@@ -110,10 +110,10 @@ class Limiter:
     def _lateral_limit_rad(self, speed_mps: float, is_known: bool) -> float:
         """Return the road wheel angle at which the lateral acceleration v^2 tan(angle) / wheelbase is at its limit.
 
-        An unknown speed is assumed to be the speed limit, or the reported speed if this is higher.
+        An unknown speed is assumed to be the speed limit, or the reported speed if this is higher and possible.
         """
         if not is_known:
-            reported_mps = abs(speed_mps) if math.isfinite(speed_mps) else 0.0
+            reported_mps = abs(speed_mps) if abs(speed_mps) <= MAX_REPORTED_MPS else 0.0
             speed_mps = max(reported_mps, self.limits.speed_limit_mps)
         if abs(speed_mps) < 0.1:  # so slow that no angle reaches the limit
             return math.pi / 2

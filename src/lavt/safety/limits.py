@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from lavt.domain import NS_PER_MS, NS_PER_S, PATH_POINTS, PATH_STEP_M, VehicleState
+from lavt.domain import (
+    MAX_REPORTED_MPS,
+    MAX_ROAD_WHEEL_RAD,
+    NS_PER_MS,
+    NS_PER_S,
+    PATH_POINTS,
+    PATH_STEP_M,
+    VehicleState,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +69,11 @@ class Limits:
     """The vehicle is stationary if it is slower than this."""
     frozen_frames: int = 5
     """This many equal pictures in a row are a camera fault."""
+
+    @staticmethod
+    def is_possible(vehicle: VehicleState) -> bool:
+        """Return whether the reported speed and steering angle are finite and not larger than any vehicle's."""
+        return abs(vehicle.speed_mps) <= MAX_REPORTED_MPS and abs(vehicle.steering_rad) <= MAX_ROAD_WHEEL_RAD
 
     def is_stationary(self, vehicle: VehicleState) -> bool:
         """Return whether the vehicle is at standstill; False if its speed is implausible."""

@@ -11,6 +11,8 @@ from lavt.safety.limits import Limits
 from lavt.safety.state_machine import SafetyStateMachine
 from lavt.safety.takeover_requests import TakeoverRequests
 
+RELEASED_BEFORE = "only the client that has control can release it"
+"""The rejection of a release that is repeated, because the reply to the first one was lost."""
 REMEMBERED_STOPS: Final = 1000
 """How many emergency stops are remembered by their numbers, so that none of them is executed a second time."""
 
@@ -134,7 +136,7 @@ class VehicleSession:
 
     def _release(self, request: SessionRequest, _vehicle: VehicleState, now_ns: int) -> str:
         if not self._has_control(request):
-            return "only the client that has control can release it"
+            return RELEASED_BEFORE
         self._machine.trigger("control released")
         self.takeover_requests.reserve(now_ns)
         self._end_control()

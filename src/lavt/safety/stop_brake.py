@@ -5,9 +5,7 @@ The deceleration of a brake is neither proportional to its pedal nor always the 
 
 from __future__ import annotations
 
-import math
-
-from lavt.domain import NS_PER_S, VehicleState
+from lavt.domain import MAX_REPORTED_MPS, NS_PER_S, VehicleState
 from lavt.safety.limits import Limits
 
 
@@ -39,7 +37,7 @@ class StopBrake:
         braked_ns = now_ns - began_ns - limits.stop_settling_ns
         planned_mps = max(0.0, began_mps - limits.stop_deceleration_mps2 * braked_ns / NS_PER_S)
         excess_mps = abs(vehicle.speed_mps) - planned_mps
-        if not (vehicle.is_speed_plausible and math.isfinite(excess_mps)):
+        if not (vehicle.is_speed_plausible and abs(vehicle.speed_mps) <= MAX_REPORTED_MPS):
             self._pedal = 1.0
         elif braked_ns > 0 and excess_mps > 0:
             excess_share = min(1.0, excess_mps / limits.stop_excess_mps)

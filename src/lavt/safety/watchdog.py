@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lavt.domain import MAX_REPORTED_MPS, MAX_ROAD_WHEEL_RAD, Actuation, Command, VehicleState
+from lavt.domain import Actuation, Command, VehicleState
 from lavt.safety.issued_stamps import IssuedStamps
 from lavt.safety.limiter import Limiter
 from lavt.safety.limits import Limits
@@ -72,7 +72,7 @@ class Watchdog:
             self._machine.trigger("driver override")
         elif vehicle.inhibit_reason:
             self._machine.trigger("vehicle fault", vehicle.inhibit_reason)
-        elif not (abs(vehicle.speed_mps) <= MAX_REPORTED_MPS and abs(vehicle.steering_rad) <= MAX_ROAD_WHEEL_RAD):
+        elif not self._limits.is_possible(vehicle):
             self._machine.trigger("vehicle fault", "its speed or steering angle is not a possible number")
         elif not vehicle.is_speed_plausible:
             self._machine.trigger("vehicle fault", "its speed is not plausible")

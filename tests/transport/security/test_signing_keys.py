@@ -98,6 +98,25 @@ def test_an_unreadable_expiry_is_rejected(tmp_path: Path, damage: tuple[bytes, b
         load_public(path, NOW_NS)
 
 
+def test_an_expiry_behind_the_end_of_the_key_is_found(tmp_path: Path) -> None:
+    """An expiry on the line that ends the key is not overlooked."""
+    path = tmp_path / "key"
+    expiry, _, key = new_signing_pair(NOW_NS, 30).public.partition(b"\n")
+    assert key.startswith(b"-----BEGIN")
+    path.write_bytes(key.rstrip() + b" " + expiry + b"\n")
+    with pytest.raises(UserError):
+        load_public(path, NOW_NS + 31 * 86_400 * NS_PER_S)
+
+
+def test_without_a_time_the_text_outside_of_the_key_is_not_read(tmp_path: Path) -> None:
+    """`lavt stop` needs no valid expiry: a comment in the file of a key must not prevent an emergency stop."""
+    path = tmp_path / "key"
+    path.write_bytes(b"a comment\n" + new_signing_pair(NOW_NS, 30).public)
+    load_public(path)
+    with pytest.raises(UserError, match="expiry"):
+        load_public(path, NOW_NS)
+
+
 def test_a_key_of_another_kind_is_rejected(tmp_path: Path) -> None:
     """A valid key that cannot sign, such as an X25519 key, is rejected, private or public."""
     private, public = write_pair(tmp_path, X25519PrivateKey.generate())

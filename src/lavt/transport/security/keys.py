@@ -27,7 +27,7 @@ NS_PER_DAY: Final = 86_400 * NS_PER_S
 _EXPIRY: Final = b"LAVT signing key 1, expires "
 """The beginning of the line before a PEM key, where a PEM file may have any text (RFC 7468); 1 is the version."""
 _EXPIRY_LINE: Final = re.compile(rb"%s(\d{1,11}) " % _EXPIRY)
-_PEM_BLOCK: Final = re.compile(rb"-----BEGIN .*?-----END [^\n]*", re.DOTALL)
+_PEM_BLOCK: Final = re.compile(rb"-----BEGIN .*?-----END [^-\n]*-----", re.DOTALL)
 _INSTALL: Final = "signing needs the package cryptography: pip install 'lavt[secure]'"
 
 
@@ -89,9 +89,11 @@ def key_expiry_ns(data: bytes, path: Path) -> int | None:
 
 
 def _check_expiry(data: bytes, path: Path, now_wall_ns: int | None) -> None:
-    """Raise `UserError` for a key that has expired by `now_wall_ns`; None: any time is accepted."""
+    """Raise `UserError` for a key that has expired by `now_wall_ns`; None: the expiry is not read."""
+    if now_wall_ns is None:
+        return
     expires_ns = key_expiry_ns(data, path)
-    if expires_ns is not None and now_wall_ns is not None and now_wall_ns >= expires_ns:
+    if expires_ns is not None and now_wall_ns >= expires_ns:
         day = calendar_time(expires_ns).strftime("%Y-%m-%d")
         raise UserError(f"the key {path} expired on {day}: make new keys with `lavt keys DIR`")
 
