@@ -5,7 +5,7 @@ from msgspec.structs import replace
 
 from lavt.domain import NS_PER_S, Now, SafetyState, SessionReply, State
 from lavt.nodes.client_session import ClientSession
-from lavt.safety.session import RELEASED_BEFORE
+from lavt.safety.session import CLEARED_BEFORE, RELEASED_BEFORE
 from lavt.safety.state_machine import TRIGGER_MESSAGES
 
 GRANTED = SessionReply(
@@ -253,6 +253,35 @@ def test_a_waiting_client_does_not_arm_after_a_driver_override(
     assert (session.phase, session.may_command, session.take_request(10 * NS_PER_S)) == ("stopped", False, None)
 
 
+@pytest.mark.parametrize("instance", [0, 2])
+@pytest.mark.parametrize("rearm", [False, True])
+def test_a_driver_override_between_lost_states_is_noticed(instance: int, rearm: bool) -> None:
+    """An override is noticed if no state since arming began arrived, or none of a restarted server before it."""
+    session = new_session(rearm=rearm)
+    session.handle_state(state("disarmed"), 150)
+    session.handle_reply(GRANTED, 200)
+    override = replace(state("disarmed"), reason=TRIGGER_MESSAGES["driver override"], instance=instance)
+    session.handle_state(override, 300)
+    session.handle_state(override, 320)
+    assert (session.phase, session.may_command, session.take_request(10 * NS_PER_S)) == ("stopped", False, None)
+
+
+def test_the_reason_of_a_stop_remains() -> None:
+    """A reply to an earlier request does not replace the reason why a client stopped."""
+    session = driving_session()
+    session.handle_state(state("emergency_stop"), 400)
+    session.handle_reply(GRANTED, 500)
+    assert session.reason == "reason; restart this client to drive"
+
+
+def test_a_restart_during_a_second_stop_awaits_a_person() -> None:
+    """With `clear_stop`, a restart of the server in an emergency stop awaits a person: it can be another stop."""
+    session = clearing_session()
+    session.handle_state(replace(state("disarmed"), instance=2), 400)
+    session.handle_reply(GRANTED, 500)
+    assert (session.phase, session.may_command) == ("stopped", False)
+
+
 def test_a_new_client_arms_after_an_earlier_driver_override() -> None:
     """An override before this client started does not keep it from arming: a person has started it."""
     session = new_session()
@@ -309,7 +338,7 @@ def test_an_own_emergency_stop_that_was_cleared_before_its_reply_is_repeated() -
     stop = session.raise_emergency_stop(Now(400, 60))
     session.handle_state(state("emergency_stop"), 500)
     session.handle_state(state("disarmed"), 600)
-    session.handle_reply(replace(REJECTED, emergency_stop=stop.number), 700)
+    session.handle_reply(replace(REJECTED, reason=CLEARED_BEFORE, emergency_stop=stop.number), 700)
     repeated = session.take_request(400 + NS_PER_S)
     assert repeated is not None
     assert (repeated.operation, repeated.number) == ("emergency_stop", stop.number + 1)

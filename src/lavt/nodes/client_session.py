@@ -6,7 +6,7 @@ from typing import Literal
 
 from lavt.domain import NS_PER_S, Now, Operation, SessionReply, SessionRequest, State
 from lavt.safety.limits import LIMITS
-from lavt.safety.session import RELEASED_BEFORE
+from lavt.safety.session import CLEARED_BEFORE, RELEASED_BEFORE
 from lavt.safety.state_machine import TRIGGER_MESSAGES
 
 Phase = Literal["seeking", "arming", "driving", "stopped", "watching"]
@@ -71,6 +71,8 @@ class ClientSession:
         """A state has named this client as the active operator."""
         self._server = 0
         """Instance of the server process that sent the last state."""
+        self._state_reason = ""
+        """Reason in the last state."""
         self._awaits_person = False
         """There was an emergency stop or a driver override, or the same server process has disarmed the vehicle since
         this client drove."""
@@ -136,10 +138,10 @@ class ClientSession:
         if is_new_stop:  # the states that reported this stop may have been lost
             self._await_person("there was an emergency stop")
         if self._stop_ns is not None and reply.emergency_stop == self.emergency_stop:
-            if reply.granted or self.safety == "emergency_stop":
-                self._stop_ns = None
-            else:  # the vehicle has executed this stop, but somebody has cleared it since
+            if reply.reason == CLEARED_BEFORE:
                 self.emergency_stop += 1
+            else:
+                self._stop_ns = None
         if reply.granted and reply.token:
             self.host = reply.host
             self.epoch = reply.epoch
@@ -153,6 +155,8 @@ class ClientSession:
             # A reply with a token, or with another rejection, belongs to an earlier request.
             self.released |= not reply.token and (reply.granted or reply.reason == RELEASED_BEFORE)
             return
+        if self.phase == "stopped":
+            return
         if reply.token:
             self._rejections.clear()
         else:
@@ -163,7 +167,7 @@ class ClientSession:
     def handle_state(self, state: State, now_ns: int) -> None:
         """Process a state of the vehicle."""
         self._notice_stop(state)
-        self.safety, self._server = state.safety, state.instance
+        self.safety, self._server, self._state_reason = state.safety, state.instance, state.reason
         names_this_client = (state.active_operator, state.active_operator_instance) == (self._who, self._instance)
         names_other_client = state.active_operator != "" and not names_this_client
         if names_other_client and self._was_active_operator and self.phase != "watching":
@@ -191,9 +195,16 @@ class ClientSession:
             self._stop_to_clear = None  # it has been cleared: another stop is a person's decision
         elif self._stop_to_clear is None:
             self._await_person(state.reason)
-        if state.instance == self._server and state.safety == "disarmed" and self.safety not in ("", "disarmed"):
-            is_override = state.reason == TRIGGER_MESSAGES["driver override"]
-            if is_override or self.phase in ("driving", "stopped"):
+        if self.safety == "":  # the first state can tell of what happened before this client started
+            return
+        is_restarted = state.instance != self._server
+        if is_restarted and self.safety == "emergency_stop" and not self._looks_for_stop:
+            self._await_person("the server has restarted in an emergency stop")
+        if state.safety == "disarmed":
+            is_new = is_restarted or (self.safety, self._state_reason) != ("disarmed", state.reason)
+            is_override = is_new and state.reason == TRIGGER_MESSAGES["driver override"]
+            ends_drive = not is_restarted and self.safety != "disarmed" and self.phase in ("driving", "stopped")
+            if is_override or ends_drive:
                 self._await_person(state.reason)
 
     def _await_person(self, reason: str) -> None:

@@ -11,6 +11,7 @@ from lavt.safety.limits import Limits
 from lavt.safety.state_machine import SafetyStateMachine
 from lavt.safety.takeover_requests import TakeoverRequests
 
+CLEARED_BEFORE = "this emergency stop was executed before, and has been cleared since"
 RELEASED_BEFORE = "only the client that has control can release it"
 """The rejection of a release that is repeated, because the reply to the first one was lost."""
 REMEMBERED_STOPS: Final = 1000
@@ -151,7 +152,7 @@ class VehicleSession:
         if self.raise_emergency_stop(request.number):
             self._machine.reason = f"emergency stop by {request.who}"
         elif self._machine.state != "emergency_stop":
-            return "this emergency stop was executed before, and has been cleared since"
+            return CLEARED_BEFORE
         return ""  # also for a stop that was executed already: its client repeats the request until it is granted
 
     def _clear_emergency_stop(self, request: SessionRequest, vehicle: VehicleState, _now_ns: int) -> str:
