@@ -62,8 +62,8 @@ STEP_NS = NS_PER_MS
 """Time between two inputs."""
 INPUTS_PER_FRAME = FRAME_NS // STEP_NS
 """After this number of inputs a true frame arrives."""
-INPUTS_PER_RESTART = 2000
-"""After this number of inputs the client is restarted, so that a client that lost control is replaced."""
+INPUTS_PER_RESTART = 50
+"""After this number of inputs a new client takes the place of one that lost control or noticed an emergency stop."""
 FEWEST_INPUTS = 1000
 """After fewer inputs than this, a target need not have sent a command or shown a picture."""
 WIDTH_PX, HEIGHT_PX = 128, 96
@@ -95,8 +95,9 @@ def new_driver() -> DriverNode:
 def driver(seed: int, *, stops_after: int | None = None) -> Target:  # noqa: ARG001 (it uses no random numbers)
     """Make a target for states and replies.
 
-    Invariant: the vehicle can decode every command and request that the driver node sends. With `stops_after` a person
-    stops the vehicle after that many inputs. Without `stops_after` the client is restarted repeatedly.
+    Invariant: the vehicle can decode every command and request that the driver node sends. The client is restarted
+    repeatedly, because after an emergency stop it arms no more. With `stops_after` a person stops the vehicle after
+    that many inputs, and the client is not restarted from then on.
     """
     commands = drive_commands = rejected_before_restarts = 0
 
@@ -129,7 +130,7 @@ def driver(seed: int, *, stops_after: int | None = None) -> Target:  # noqa: ARG
     def feed(channel: str, data: bytes, _chance: Chance) -> None:
         nonlocal inputs, rejected_before_restarts
         inputs += 1
-        if stops_after is None and inputs % INPUTS_PER_RESTART == 0:
+        if inputs % INPUTS_PER_RESTART == 0 and (stops_after is None or inputs < stops_after):
             rejected_before_restarts = rejected_count()
             bench.node = new_driver()
         bench.deliver(channel, data)
