@@ -298,6 +298,7 @@ def test_a_client_that_is_to_clear_a_stop_does_not_arm_after_a_later_one() -> No
         session.handle_reply(STOPPED, 200)
         session.handle_state(replace(state(seen_between), active_operator="bob"), 300)
         session.handle_state(state("emergency_stop"), 400)
+        assert session.phase == "stopped"
         session.handle_state(replace(state("disarmed"), instance=2), 500)
         session.handle_reply(GRANTED, 600)
         assert (session.phase, session.may_command) == ("stopped", False)

@@ -266,6 +266,15 @@ def test_a_request_that_is_not_finite_brakes() -> None:
     assert applied_limits == ("not finite",)
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_car_that_is_too_fast_for_its_path_brakes(sign: int) -> None:
+    """Above the speed from which it can stop on its path, a car brakes without throttle, forward or backward."""
+    vehicle = vehicle_at(sign * LIMITS.speed_limit_mps)
+    actuation = new_limiter().limit(Actuation(0.0, 1.0, 0.0), vehicle, LONG_NS, NS_PER_S)
+    assert actuation.throttle == 0.0
+    assert actuation.brake > 0.0
+
+
 @pytest.mark.parametrize("speed_mps", [101.0, 1e155, -1e300, sys.float_info.max, math.nan])
 def test_an_impossible_speed_limits_the_wheel_as_at_the_speed_limit(speed_mps: float) -> None:
     """A speed above any vehicle's is unknown: it neither straightens the wheel in a curve nor lifts the limit."""

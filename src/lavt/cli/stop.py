@@ -84,7 +84,7 @@ def stop(
 
 @contextmanager
 def _not_sent() -> Iterator[None]:
-    """Say in a `UserError` that the stop was not sent."""
+    """Add to each `UserError` that the emergency stop was not sent."""
     try:
         yield
     except UserError as error:
