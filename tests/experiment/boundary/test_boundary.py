@@ -416,12 +416,12 @@ def kill_process_in_repetitions_1_and_2(search: boundary_module.BoundarySearch) 
 
 @pytest.mark.full
 def test_searches_of_a_dead_process_are_repeated(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Searches of a dead process are repeated, each alone; only a search that kills its process again has failed."""
+    """The search of a process that dies is repeated; only a search whose processes always die has failed."""
     monkeypatch.setattr(boundary_module, "run_search", kill_process_in_repetitions_1_and_2)
     searches = plan_boundary(small_search("repetitions=5", f"study.participant={tmp_path}"))
     results, failed, completed = run_searches(searches, jobs=2, on_progress=lambda _: None)
     assert [run["repetition"] for run in results] == [0, 2, 3, 4]
-    assert failed == [{"name": "a_key paper_calibrated 01", "why": "the process that searched it died"}]
+    assert failed == [{"name": "a_key paper_calibrated 01", "why": "each of the processes that searched it died"}]
     assert completed
 
 

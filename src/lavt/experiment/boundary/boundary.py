@@ -239,19 +239,13 @@ class _SearchProgress:
 
 
 def _search_in_processes(progress: _SearchProgress, todo: Sequence[BoundarySearch], jobs: int) -> None:
-    """Run the searches in a pool of processes.
-
-    A process that dies breaks the pool. The searches that were possibly in progress are then repeated, each in a pool
-    of its own.
-    """
-    while todo:
-        with process_workers(jobs) as workers:
-            broken = progress.search(workers, todo)
-        for search in broken[:jobs]:  # searches start in order, so only the first `jobs` of them can have started
-            with process_workers(1) as single:
-                if progress.search(single, [search]):
-                    progress.fail(search, "the process that searched it died")
-        todo = broken[jobs:]
+    """Run the searches in processes. A search whose processes died is repeated once more, alone."""
+    with process_workers(jobs) as workers:
+        broken = progress.search(workers, todo)
+    for search in broken:
+        with process_workers(1) as single:
+            if progress.search(single, [search]):
+                progress.fail(search, "each of the processes that searched it died")
 
 
 def _format_boundaries(found: Mapping[str, Any]) -> str:

@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Iterator
+from concurrent.futures import BrokenExecutor
+from pathlib import Path
+
+import pytest
+
+from lavt.clock import pause
+from lavt.domain import NS_PER_MS
+from lavt.errors import UserError, WorkError
+from lavt.experiment.sweep.worker_processes import WorkerProcesses
+
+
+@pytest.fixture
+def workers() -> Iterator[WorkerProcesses]:
+    with WorkerProcesses(2) as executor:
+        yield executor
+
+
+def kill(process_id: int) -> None:
+    os.kill(process_id, signal.SIGKILL)
+
+
+def die(folder: Path, times: int) -> int:
+    """Kill the own process, unless `times` processes have already done so; a file in `folder` marks each of them."""
+    deaths = len(list(folder.iterdir()))
+    if deaths < times:
+        (folder / str(deaths)).touch()
+        kill(os.getpid())
+    return deaths
+
+
+def wait_for(file: Path) -> int:
+    """Wait until `file` exists; return the number of the process."""
+    while not file.exists():
+        pause(5 * NS_PER_MS)
+    return os.getpid()
+
+
+class UnpicklableError(Exception):
+    """An error that cannot be sent to the parent process."""
+
+    def __reduce__(self) -> str:
+        raise TypeError("this error has no bytes")
+
+
+def fail(error: type[Exception]) -> None:
+    """Raise the error."""
+    raise error("the input is wrong")
+
+
+@pytest.mark.parametrize("moment", ["importing", "idle"])
+def test_a_process_that_dies_before_a_call_is_replaced(workers: WorkerProcesses, moment: str) -> None:
+    """If processes are killed while they import or wait for work, new processes do the work."""
+    if moment == "idle":
+        assert workers.submit(os.getppid).result(60) == os.getpid()
+    killed = [int(process.pid or 0) for process in multiprocessing.active_children()]
+    for process_id in killed:
+        kill(process_id)
+    numbers = [workers.submit(os.getpid).result(60) for _ in range(4)]
+    assert not {*numbers} & {*killed}
+
+
+def test_a_process_that_dies_costs_only_its_own_call(workers: WorkerProcesses, tmp_path: Path) -> None:
+    """The call of a process that dies is repeated, and the other process goes on with its call."""
+    deaths, go_on = tmp_path / "deaths", tmp_path / "go on"
+    deaths.mkdir()
+    at_start = {process.pid for process in multiprocessing.active_children()}
+    undisturbed = workers.submit(wait_for, go_on)
+    assert workers.submit(die, deaths, 1).result(60) == 1
+    go_on.touch()
+    assert undisturbed.result(60) in at_start
+
+
+def test_a_call_that_always_dies_is_broken(workers: WorkerProcesses, tmp_path: Path) -> None:
+    """A call whose processes die is tried in two of them; later calls succeed."""
+    call = workers.submit(die, tmp_path, 100)
+    with pytest.raises(BrokenExecutor):
+        call.result(60)
+    assert len(list(tmp_path.iterdir())) == 2
+    assert {workers.submit(os.getppid).result(60) for _ in range(3)} == {os.getpid()}
+
+
+def test_errors_of_a_call_are_raised(workers: WorkerProcesses) -> None:
+    """An error of a call is raised as it is, or as a `WorkError` with its text if it cannot be sent."""
+    with pytest.raises(UserError, match="the input is wrong"):
+        workers.submit(fail, UserError).result(60)
+    with pytest.raises(WorkError, match="UnpicklableError: the input is wrong"):
+        workers.submit(fail, UnpicklableError).result(60)
