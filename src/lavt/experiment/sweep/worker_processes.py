@@ -141,15 +141,17 @@ def _execute_calls(connection: Connection) -> None:
             function, arguments, keywords = connection.recv()
         except EOFError:
             return
+        result: Any = None
+        failure: Exception | None = None
         try:
-            outcome = (function(*arguments, **keywords), None)
+            result = function(*arguments, **keywords)
         except Exception as error:  # an error of one call does not end the process
-            outcome = (None, error)
+            failure = error
         try:
-            connection.send(outcome)
+            connection.send((result, failure))
         except (AttributeError, TypeError, PicklingError) as error:  # the result or the error cannot be pickled
-            connection.send((None, WorkError(describe_error(outcome[1] or error))))
-        del outcome  # it may be large, and the next call needs memory
+            connection.send((None, WorkError(describe_error(failure or error))))
+        del result, failure  # they may be large, and the next call needs memory
 
 
 def _end_with_parent() -> None:
