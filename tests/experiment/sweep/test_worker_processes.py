@@ -5,6 +5,7 @@ import os
 import signal
 from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -83,6 +84,15 @@ def test_a_call_that_always_dies_is_broken(workers: WorkerProcesses, tmp_path: P
         call.result(60)
     assert len(list(tmp_path.iterdir())) == 2
     assert {workers.submit(os.getppid).result(60) for _ in range(3)} == {os.getpid()}
+
+
+def test_after_ctrl_c_no_further_call_begins(tmp_path: Path) -> None:
+    """If Ctrl-C interrupts the `with` block anywhere, calls that have not begun are cancelled."""
+    (tmp_path / "go on").touch()
+    with suppress(KeyboardInterrupt), WorkerProcesses(1) as executor:
+        calls = [executor.submit(wait_for, tmp_path / "go on") for _ in range(20)]
+        raise KeyboardInterrupt
+    assert calls[-1].cancelled()
 
 
 def test_errors_of_a_call_are_raised(workers: WorkerProcesses) -> None:

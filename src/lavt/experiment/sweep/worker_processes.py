@@ -132,6 +132,10 @@ class WorkerProcesses(Executor):
             self._idle.get().close()
             self._jobs -= 1
 
+    def __exit__(self, error_type: type[BaseException] | None, *_: object) -> None:
+        """Wait for all calls; after an error or Ctrl-C in the `with` block, only for those in progress."""
+        self.shutdown(cancel_futures=error_type is not None)
+
 
 def _execute_calls(connection: Connection) -> None:
     ignore_terminal_signals()
