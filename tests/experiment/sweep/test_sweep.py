@@ -407,20 +407,19 @@ class DeadProcesses(Executor):
 
 
 def test_a_run_whose_processes_always_die_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A run whose processes die is tried again alone, and then listed as failed."""
+    """A run whose processes die is driven three times, at last in a single process, and then listed as failed."""
     pools: list[int] = []
 
     def dead_workers(jobs: int) -> nullcontext[Workers]:
         pools.append(jobs)
         return nullcontext(Workers(DeadProcesses(), jobs, remote=False))
 
-    monkeypatch.setattr(lavt.experiment.sweep.sweep, "process_workers", dead_workers)
+    monkeypatch.setattr("lavt.experiment.sweep.workers.process_workers", dead_workers)
     driven, _ = run_all(two_runs(), tmp_path, jobs=2, on_progress=lambda _: None)
     assert sorted(driven.failed) == [
-        (run.name, "each of the processes that drove the run died")
-        for run in sorted(two_runs(), key=lambda run: run.name)
+        (name, "each of the processes that drove it died") for name in sorted(run.name for run in two_runs())
     ]
-    assert pools == [2, 1, 1]
+    assert pools == [2, 2, 1]
 
 
 @pytest.mark.full

@@ -3,6 +3,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor
 from contextlib import suppress
@@ -26,13 +27,9 @@ def kill(process_id: int) -> None:
     os.kill(process_id, signal.SIGKILL)
 
 
-def die(folder: Path, times: int) -> int:
-    """Kill the own process, unless `times` processes have already done so; a file in `folder` marks each of them."""
-    deaths = len(list(folder.iterdir()))
-    if deaths < times:
-        (folder / str(deaths)).touch()
-        kill(os.getpid())
-    return deaths
+def die() -> None:
+    """Kill the own process."""
+    kill(os.getpid())
 
 
 def wait_for(file: Path) -> int:
@@ -46,7 +43,7 @@ class UnpicklableError(Exception):
     """An error that cannot be sent to the parent process."""
 
     def __reduce__(self) -> str:
-        raise TypeError("this error has no bytes")
+        raise ValueError("this error has no bytes")
 
 
 def fail(error: type[Exception]) -> None:
@@ -55,35 +52,29 @@ def fail(error: type[Exception]) -> None:
 
 
 @pytest.mark.parametrize("moment", ["importing", "idle"])
-def test_a_process_that_dies_before_a_call_is_replaced(workers: WorkerProcesses, moment: str) -> None:
-    """If processes are killed while they import or wait for work, new processes do the work."""
+def test_a_process_that_died_gets_no_call(workers: WorkerProcesses, moment: str) -> None:
+    """If processes died while they imported or waited for work, new processes execute the next calls."""
     if moment == "idle":
         assert workers.submit(os.getppid).result(60) == os.getpid()
-    killed = [int(process.pid or 0) for process in multiprocessing.active_children()]
-    for process_id in killed:
-        kill(process_id)
-    numbers = [workers.submit(os.getpid).result(60) for _ in range(4)]
-    assert not {*numbers} & {*killed}
+    dead = multiprocessing.active_children()
+    for process in dead:
+        kill(int(process.pid or 0))
+        process.join()
+    numbers = {workers.submit(os.getpid).result(60) for _ in range(4)}
+    assert len(numbers) == 2
+    assert not numbers & {process.pid for process in dead}
 
 
 def test_a_process_that_dies_costs_only_its_own_call(workers: WorkerProcesses, tmp_path: Path) -> None:
-    """The call of a process that dies is repeated, and the other process goes on with its call."""
-    deaths, go_on = tmp_path / "deaths", tmp_path / "go on"
-    deaths.mkdir()
+    """The call of a process that dies has an error, a new process replaces it, and the other process continues."""
     at_start = {process.pid for process in multiprocessing.active_children()}
-    undisturbed = workers.submit(wait_for, go_on)
-    assert workers.submit(die, deaths, 1).result(60) == 1
-    go_on.touch()
+    undisturbed = workers.submit(wait_for, tmp_path / "go on")
+    for _ in range(3):
+        with pytest.raises(BrokenExecutor):
+            workers.submit(die).result(60)
+    assert workers.submit(os.getpid).result(60) not in at_start
+    (tmp_path / "go on").touch()
     assert undisturbed.result(60) in at_start
-
-
-def test_a_call_that_always_dies_is_broken(workers: WorkerProcesses, tmp_path: Path) -> None:
-    """A call whose processes die is tried in two of them; later calls succeed."""
-    call = workers.submit(die, tmp_path, 100)
-    with pytest.raises(BrokenExecutor):
-        call.result(60)
-    assert len(list(tmp_path.iterdir())) == 2
-    assert {workers.submit(os.getppid).result(60) for _ in range(3)} == {os.getpid()}
 
 
 def test_after_ctrl_c_no_further_call_begins(tmp_path: Path) -> None:
@@ -96,8 +87,10 @@ def test_after_ctrl_c_no_further_call_begins(tmp_path: Path) -> None:
 
 
 def test_errors_of_a_call_are_raised(workers: WorkerProcesses) -> None:
-    """An error of a call is raised as it is, or as a `WorkError` with its text if it cannot be sent."""
+    """An error of a call is raised as it is, or as a `WorkError` with its text if it or the result cannot be sent."""
     with pytest.raises(UserError, match="the input is wrong"):
         workers.submit(fail, UserError).result(60)
     with pytest.raises(WorkError, match="UnpicklableError: the input is wrong"):
         workers.submit(fail, UnpicklableError).result(60)
+    with pytest.raises(WorkError, match="cannot pickle"):
+        workers.submit(threading.Lock).result(60)

@@ -25,7 +25,7 @@ from lavt.experiment.analysis.results import FAILED, read_json, write_json
 from lavt.experiment.runs.plan import PlannedRun, plan_sweep
 from lavt.experiment.runs.run import CONFIG, RESULT, config_text
 from lavt.experiment.sweep.cluster import cluster_workers
-from lavt.experiment.sweep.workers import Workers, is_finished, process_workers, remove_unfinished
+from lavt.experiment.sweep.workers import Workers, attempt_in_processes, is_finished, remove_unfinished
 from lavt.recording.output_directory import prepare_directory
 
 SWEEP = "sweep.yaml"
@@ -69,7 +69,8 @@ def run_all(
     progress = _SweepProgress(runs_dir, on_progress)
     if cluster_address is None:
         jobs = 1 if any(run.config.time == "real" for run in todo) else jobs or os.cpu_count() or 1
-        _drive_in_processes(progress, todo, jobs)
+        for run in attempt_in_processes(progress.drive, todo, jobs):
+            progress.fail(run, "each of the processes that drove it died")
     elif todo:
         with cluster_workers(cluster_address, jobs) as workers:
             jobs = workers.jobs
@@ -130,18 +131,6 @@ class _SweepProgress:
         """Add a failed run."""
         self.failed.append((planned.name, reason))
         self._on_progress(f"{planned.name} failed: {reason}")
-
-
-def _drive_in_processes(progress: _SweepProgress, todo: Sequence[PlannedRun], jobs: int) -> None:
-    """Drive the runs in processes. A run whose processes died is driven once more, while no other run is driven."""
-    if not todo:
-        return
-    with process_workers(jobs) as workers:
-        broken = progress.drive(workers, todo)
-    for run in broken:
-        with process_workers(1) as single:
-            if progress.drive(single, [run]):
-                progress.fail(run, "each of the processes that drove the run died")
 
 
 def open_sweep(out: Path, *, resume: bool) -> None:

@@ -8,13 +8,13 @@ directory and send the files back.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, TypeVar
 
 from lavt.experiment.analysis.drive_data import DriveData, read_drive
 from lavt.experiment.analysis.results import read_json
@@ -22,6 +22,8 @@ from lavt.experiment.runs.plan import PlannedRun
 from lavt.experiment.runs.run import RESULT, drive_once
 from lavt.experiment.sweep.worker_processes import WorkerProcesses
 from lavt.recording.output_directory import prepare_directory
+
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +61,21 @@ def process_workers(jobs: int) -> Iterator[Workers]:
     """Yield worker processes on this machine, which end when this process ends or is killed."""
     with WorkerProcesses(jobs) as executor:
         yield Workers(executor, jobs, remote=False)
+
+
+def attempt_in_processes(
+    attempt: Callable[[Workers, Sequence[Item]], Sequence[Item]], todo: Sequence[Item], jobs: int
+) -> Sequence[Item]:
+    """Attempt all of `todo` in worker processes, at most three times; return the items without a result.
+
+    `attempt` returns the items whose process died. Two processes that die for lack of memory may need
+    too much only together. Therefore the third attempt has a single process.
+    """
+    for processes in (jobs, jobs, 1):
+        if todo:
+            with process_workers(processes) as workers:
+                todo = attempt(workers, todo)
+    return todo
 
 
 def is_finished(directory: Path) -> bool:
