@@ -373,6 +373,7 @@ def kill_worker_when(moment: str, runs_dir: Path) -> None:
         pause(5 * NS_PER_MS)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("moment", ["importing", "server.mcap", "config.yaml"])
 def test_a_worker_killed_before_the_first_result_costs_nothing(moment: str, sweep_folder: Path, tmp_path: Path) -> None:
     """If a worker is killed before any run has a result, all runs have the results of an undisturbed sweep."""
