@@ -1,7 +1,7 @@
 """`lavt`: the table of commands.
 
-Only the module of the requested command is imported, because the modules of all commands take twice the time and memory
-of `lavt stop`.
+Only the module of the requested command is imported. `lavt stop --help` takes 0.6 s of CPU time and 55 MB of memory.
+With the modules of all commands, it took 1.2 s and 103 MB.
 """
 
 from __future__ import annotations

@@ -68,8 +68,8 @@ def attempt_in_processes(
 ) -> Sequence[Item]:
     """Attempt all of `todo` in worker processes, at most three times; return the items without a result.
 
-    `attempt` returns the items whose process died. Two processes that die for lack of memory may need
-    too much only together. Therefore the third attempt has a single process.
+    `attempt` returns the items whose process died. The third attempt has a single process, for which the memory may
+    suffice even if it does not suffice for several.
     """
     for processes in (jobs, jobs, 1):
         if todo:
