@@ -3,12 +3,19 @@
 LAVT's two processes of `video_vs_gstreamer.py` send and receive. Memory is the resident set of each process, sampled
 twice a second. The growth of memory is the slope of a straight line through the samples after the first quarter.
 
+With `--road-km`, drive a long road instead, in virtual time at 11 m/s with full scenery but without a codec, in one
+process that has the nodes of both sides. It is sampled every second of virtual time.
+
     python benchmarks/endurance.py [--minutes 2]
+    python benchmarks/endurance.py --road-km 5
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import math
+import os
 import sys
 import tempfile
 import threading
@@ -26,12 +33,21 @@ from benchmarks.video.pictures import render_pictures
 from benchmarks.video.processes import BenchmarkProcess, measure
 from benchmarks.video.run import RATE_HZ
 
+from lavt.config import RunConfig
+from lavt.config_file import load_config, shipped
+from lavt.domain import NS_PER_S
+from lavt.errors import WorkError
+from lavt.experiment.runs.plan import plan_run
+from lavt.experiment.runs.virtual_run import build_loop, drive
 from lavt.runtime import process_priority
 
 SAMPLE_PERIOD_S = 0.5
+ROAD_SPEED_MPS = 11.0
 MEDIAN_INTERVAL_S = 10
 MAX_GROWTH_KB_PER_MINUTE = 100.0
 """Growth up to this limit is the normal variation of an allocator."""
+MAX_ROAD_GROWTH_KB_PER_MINUTE = 1000.0
+"""The limit on a long road. If no ground were removed from the cache, memory would grow by more than 50 000 kB/min."""
 MAX_GROWTH_MS = 0.5
 """Latency has grown if it has increased by more than this limit and by more than a quarter."""
 
@@ -112,11 +128,62 @@ def describe_growth(samples: Mapping[str, Sequence[ResourceSample]], latency_ms:
     return clauses
 
 
+def long_road(length_km: float) -> str:
+    """Return a road file of at least this length: straights, and curves of 200 m radius to either side."""
+    segments = [
+        segment
+        for kilometre in range(math.ceil(length_km))
+        for segment in (
+            {"length_m": 500.0},
+            {"length_m": 100.0, "end_curvature_per_m": 0.005 * (-1) ** kilometre},
+            {"length_m": 300.0, "curvature_per_m": 0.005 * (-1) ** kilometre},
+            {"length_m": 100.0, "curvature_per_m": 0.005 * (-1) ** kilometre, "end_curvature_per_m": 0.0},
+        )
+    ]
+    rails = [{"offset_m": -3.5}, {"offset_m": 7.0}]
+    return json.dumps(
+        {"title": "long", "segments": segments, "lanes": {"widths_m": [3.5, 3.5], "driven": 1}, "rails": rails}
+    )
+
+
+def drive_long_road(length_km: float, folder: Path) -> list[ResourceSample]:
+    """Drive in virtual time; return this process's resources at each second. Raise `WorkError` if the car departs."""
+    road = folder / "long.yaml"
+    road.write_text(long_road(length_km))
+    changes = [f"vehicle.route={road}", "fidelity=pixels", f"controller.speed_mps={ROAD_SPEED_MPS}"]
+    loop = build_loop(plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), changes)), folder / "run")
+    samples: list[ResourceSample] = []
+    drive(loop, progress=lambda at_ns: samples.append(sample_process(os.getpid(), at_ns / NS_PER_S)))
+    if loop.observer.ending != "completed":
+        raise WorkError(f"the drive ended with {loop.observer.ending}")
+    return samples
+
+
+def check_long_road(length_km: float) -> int:
+    """Drive a long road and print its memory of each minute; return 1 if it grew."""
+    with tempfile.TemporaryDirectory() as folder:
+        samples = drive_long_road(length_km, Path(folder))
+    print("| minute | memory MB |")
+    print("|---|---|")
+    for sample in samples[::60]:
+        print(f"| {sample.at_s / 60:.0f} | {sample.memory_kb / 1000:.1f} |")
+    slope = growth_kb_per_minute(samples[len(samples) // 2 :])
+    grew = slope > MAX_ROAD_GROWTH_KB_PER_MINUTE
+    print(f"\nMemory grew by {slope:.0f} kB/min, at the end to {samples[-1].memory_kb / 1000:.1f} MB.")
+    print("Memory grew too much." if grew else "Nothing grew.")
+    return 1 if grew else 0
+
+
 def main() -> int:
     """Measure and print a table; return 1 if anything grew."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--minutes", type=float, default=2.0, help="length of the run, after a warm-up of 3 s")
+    parser.add_argument("--road-km", type=float, help="drive a road of this length in virtual time instead")
     options = parser.parse_args()
+    if options.road_km is not None:
+        if not 0 < options.road_km <= 100:
+            parser.error("--road-km must be above zero and at most 100")
+        return check_long_road(options.road_km)
     if not 0 < options.minutes <= 60:
         parser.error("--minutes must be above zero and at most 60")
     process_priority.raise_priority()  # as the server and the client do

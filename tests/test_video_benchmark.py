@@ -16,6 +16,7 @@ from tests.interop.tools import missing_tools
 from tests.require import need
 
 from lavt.runtime import process_priority
+from lavt.vehicle.sim.road.road import parse_road
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
@@ -160,6 +161,35 @@ def test_the_video_benchmark_runs() -> None:
     assert 0 < result["loss1"]["undamaged"] <= 1
     assert "| LAVT 1 | " in completed.stdout
     assert "| GStreamer, usual settings | " in completed.stdout
+
+
+@pytest.mark.parametrize(("kb_per_s", "status"), [(10, 0), (50, 1)])
+def test_growth_on_a_long_road_is_an_error(
+    kb_per_s: int, status: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The benchmark fails if memory grows along a long road by more than 1000 kB/min."""
+    samples = [endurance.ResourceSample(at_s, memory_kb=400_000 + kb_per_s * at_s, threads=5) for at_s in range(240)]
+    monkeypatch.setattr(endurance, "drive_long_road", lambda _length_km, _folder: samples)
+    assert endurance.check_long_road(5.0) == status
+    assert f"grew by {60 * kb_per_s} kB/min" in capsys.readouterr().out
+
+
+def test_the_long_road_has_the_requested_length() -> None:
+    """The road of the benchmark is at least as long as requested."""
+    assert parse_road(endurance.long_road(4.5), "long.yaml").route_length_m == pytest.approx(5000.0)
+
+
+@pytest.mark.full
+def test_a_long_road_is_driven() -> None:
+    """`benchmarks/endurance.py --road-km` drives the whole road, and prints the memory and, last, its verdict."""
+    completed = subprocess.run(
+        [sys.executable, BENCHMARKS / "endurance.py", "--road-km", "0.1"],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
+    assert completed.stdout.splitlines()[-1] in {"Nothing grew.", "Memory grew too much."}, completed.stderr
 
 
 @pytest.mark.full

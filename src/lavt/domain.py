@@ -6,7 +6,7 @@ origin on the ground under the middle of the rear axle. `mono_ns` is a host's mo
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from msgspec import Struct
@@ -131,6 +131,20 @@ class CameraModel(Struct, frozen=True):
     def focal_px(self) -> float:
         """Return the focal length in pixels."""
         return self.width_px / 2 / float(np.tan(self.field_of_view_rad / 2))
+
+
+class ReceivedPicture(Protocol):
+    """A picture decoded from an access unit."""
+
+    @property
+    def picture(self) -> FramePayload:
+        """The picture for a detector, or the lane that replaces it. Reading this property can convert the picture."""
+        ...
+
+    @property
+    def corrupt(self) -> bool:
+        """True if the decoder had to conceal parts of the picture."""
+        ...
 
 
 class Lane(Struct, frozen=True):

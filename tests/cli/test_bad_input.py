@@ -15,7 +15,7 @@ import pytest
 from tests.support.command_line import CommandResult, Run
 
 import lavt
-from lavt.cli.main import app
+from lavt.cli.main import build_app
 from lavt.config_file import shipped
 from lavt.experiment.analysis.results import IDENTITY_KEYS
 from lavt.transport.zenoh_link import Router, quiet_logs
@@ -395,7 +395,7 @@ def test_list_of_commands(run: Run) -> None:
     """The help of `lavt` lists all commands."""
     result = run("--help")
     assert result.code == 0
-    assert sorted(command.name or "" for command in app.registered_commands) == sorted(COMMANDS)
+    assert sorted(command.name or "" for command in build_app().registered_commands) == sorted(COMMANDS)
     assert all(command in result.out for command in COMMANDS)
 
 

@@ -11,7 +11,7 @@ from tests.kernel.lane.chrony import SERVE_OWN_CLOCK, follow_server
 from tests.require import need
 from typer.testing import CliRunner
 
-from lavt.cli.main import app
+from lavt.cli.main import build_app
 from lavt.runtime import process_priority
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
@@ -41,7 +41,7 @@ def test_units_start_existing_commands(path: Path) -> None:
     """Each unit starts an existing command of lavt with existing options and a file in /etc/lavt."""
     program, command, *arguments = read_unit(path)["Service"]["ExecStart"].split()
     assert program == PROGRAM
-    help_result = CliRunner().invoke(app, [command, "--help"])
+    help_result = CliRunner().invoke(build_app(), [command, "--help"])
     assert help_result.exit_code == 0
     options = [word for word in arguments if word.startswith("-")]
     assert all(option in help_result.output for option in options)
@@ -110,7 +110,7 @@ def test_the_documentation_names_existing_commands_and_files() -> None:
     text = (DEPLOY.parent / "docs/deployment.md").read_text()
     commands = set(re.findall(r"(?:^ {4}|`|/|&& )lavt ([a-z]+)\b", text, re.MULTILINE))
     assert commands >= {"doctor", "keys", "router", "server", "client", "stop", "clock", "join", "report"}
-    assert commands <= {command.name for command in app.registered_commands}
+    assert commands <= {command.name for command in build_app().registered_commands}
     files = set(re.findall(r"(?<![\w/])(?:configs|zenoh-configs|deploy)/[\w./-]*\w", text))
     assert len(files) > 12
     assert {file for file in files if not (DEPLOY.parent / file).exists()} == set()

@@ -10,7 +10,7 @@ import pytest
 from lavt.assembly.cameras import camera_of_file
 from lavt.assembly.entropy import MachineEntropy
 from lavt.assembly.nodes import build_client
-from lavt.cli.main import app
+from lavt.cli.main import build_app
 from lavt.cli.pictures import write_video
 from lavt.clock import MachineClock
 from lavt.config import ClientConfig
@@ -46,7 +46,7 @@ def show(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Show:
     cv2.imwrite("road.png", ROAD)
 
     def show_here(source: str, *options: str, camera: str = "camera.yaml") -> None:
-        app(["perception", "show", source, "--camera", camera, *options], standalone_mode=False)
+        build_app()(["perception", "show", source, "--camera", camera, *options], standalone_mode=False)
 
     return show_here
 

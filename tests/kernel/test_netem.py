@@ -32,7 +32,7 @@ from tests.support.stalls import Stalls
 
 from lavt.assembly.injection import Role, netem_flows
 from lavt.cli import console
-from lavt.cli.main import app
+from lavt.cli.main import build_app
 from lavt.clock import MachineClock, pause
 from lavt.config import RunConfig
 from lavt.config_file import condition, load_config, shipped
@@ -377,7 +377,7 @@ def lavt(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) ->
 
     def run(*arguments: str) -> CommandResult:
         with pytest.raises(SystemExit) as completed:
-            console.run_command(lambda: app(list(arguments)))
+            console.run_command(lambda: build_app()(list(arguments)))
         output = capsys.readouterr()
         code = completed.value.code
         return CommandResult(code if isinstance(code, int) else 0, output.out, output.err)

@@ -40,7 +40,8 @@ def sweep(
     Example: lavt sweep configs/sweep.yaml --set 'conditions=[L0, L3]' --out out/sweep
     """
     from lavt.experiment.sweep.cluster import check_cluster  # noqa: PLC0415 (slow: scipy)
-    from lavt.experiment.sweep.sweep import drive_sweep, is_finished, open_sweep  # noqa: PLC0415 (slow: scipy)
+    from lavt.experiment.sweep.sweep import drive_sweep, open_sweep  # noqa: PLC0415 (slow: scipy)
+    from lavt.experiment.sweep.workers import is_finished  # noqa: PLC0415
 
     settings = load_config(SweepConfig, config, changes or [])
     planned_runs = plan_sweep(settings)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from msgspec import Struct
 
-from lavt.domain import Lane
-from lavt.transport.video.frame_codec import ReceivedPicture
+from lavt.domain import Lane, ReceivedPicture
 
 
 class FrameWritten(Struct, frozen=True):

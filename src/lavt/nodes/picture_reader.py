@@ -7,11 +7,11 @@ from collections.abc import Callable, Sequence
 
 from msgspec import Struct
 
-from lavt.domain import Now
+from lavt.domain import Now, ReceivedPicture
 from lavt.errors import BadPacket
 from lavt.node import Message, Send, Stage
 from lavt.nodes.payloads import DecodedFrame, PictureRead, ReceivedUnit, VideoUnit
-from lavt.transport.video.frame_codec import PictureReceiver, ReceivedPicture
+from lavt.transport.video.frame_codec import PictureReceiver
 from lavt.transport.video.stamp import stamp_agrees
 
 

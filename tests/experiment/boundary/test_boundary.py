@@ -391,7 +391,7 @@ def test_a_failed_search_does_not_stop_the_others(monkeypatch: pytest.MonkeyPatc
         return run_entry("a_key", 0)
 
     monkeypatch.setattr(boundary_module, "run_search", fake)
-    monkeypatch.setattr(boundary_module, "process_workers", in_this_process)
+    monkeypatch.setattr("lavt.experiment.sweep.workers.process_workers", in_this_process)
     lines: list[str] = []
     results, failed, completed = run_searches(
         plan_boundary(small_search("repetitions=3")), jobs=1, on_progress=lines.append
@@ -401,34 +401,36 @@ def test_a_failed_search_does_not_stop_the_others(monkeypatch: pytest.MonkeyPatc
     assert "a_key paper_calibrated 01: failed: the vehicle was never armed" in lines
 
 
-def kill_process_in_repetitions_1_and_2(search: boundary_module.BoundarySearch) -> dict[str, Any]:
-    """Kill the process always in repetition 1 and once in repetition 2; in all other cases return an entry.
+DEATHS = {0: 0, 1: 3, 2: 2, 3: 1, 4: 0}
+"""The number of processes that die in the search of each repetition."""
 
-    A file in the directory `study.participant` marks each repetition that was killed.
-    """
+
+def die_or_return_entry(search: boundary_module.BoundarySearch) -> dict[str, Any]:
+    """Kill the process as often as `DEATHS` says, which files in `study.participant` mark; then return an entry."""
     repetition = int(search.name[-2:])
-    marker_file = Path(search.planned.config.study.participant or "") / str(repetition)
-    if repetition == 1 or (repetition == 2 and not marker_file.exists()):
-        marker_file.touch()
+    folder = Path(search.planned.config.study.participant or "")
+    deaths = len(list(folder.glob(f"{repetition} *")))
+    if deaths < DEATHS[repetition]:
+        (folder / f"{repetition} {deaths}").touch()
         os.kill(os.getpid(), signal.SIGKILL)
     return run_entry("a_key", repetition)
 
 
 @pytest.mark.full
 def test_searches_of_a_dead_process_are_repeated(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Searches of a dead process are repeated, each alone; only a search that kills its process again has failed."""
-    monkeypatch.setattr(boundary_module, "run_search", kill_process_in_repetitions_1_and_2)
+    """A search whose process dies is repeated twice; only a search whose processes died three times has failed."""
+    monkeypatch.setattr(boundary_module, "run_search", die_or_return_entry)
     searches = plan_boundary(small_search("repetitions=5", f"study.participant={tmp_path}"))
     results, failed, completed = run_searches(searches, jobs=2, on_progress=lambda _: None)
     assert [run["repetition"] for run in results] == [0, 2, 3, 4]
-    assert failed == [{"name": "a_key paper_calibrated 01", "why": "the process that searched it died"}]
+    assert failed == [{"name": "a_key paper_calibrated 01", "why": "each of the processes that searched it died"}]
     assert completed
 
 
 def test_ctrl_c_keeps_the_found_boundaries(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """After Ctrl-C, started searches are finished, no search is started, and the files have all results."""
     monkeypatch.setattr(boundary_module, "run_search", lambda search: run_entry("a_key", int(search.name[-2:])))
-    monkeypatch.setattr(boundary_module, "process_workers", in_this_process)
+    monkeypatch.setattr("lavt.experiment.sweep.workers.process_workers", in_this_process)
     monkeypatch.setattr(_InThisProcess, "max_calls", 3)
     lines: list[str] = []
 

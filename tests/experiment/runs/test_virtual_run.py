@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import subprocess
 import sys
@@ -19,14 +20,17 @@ from lavt.config_file import condition, load_config, shipped
 from lavt.domain import NS_PER_S, Picture, Pose
 from lavt.experiment.analysis.metrics import driving_interval, measure
 from lavt.experiment.analysis.results import run_result
+from lavt.experiment.runs.monitored_run import drive_monitored
 from lavt.experiment.runs.network import VIDEO_LATENCY_STAGES, injected_network, virtual_network
 from lavt.experiment.runs.plan import PlannedRun, plan_run
+from lavt.experiment.runs.run import run_once
 from lavt.experiment.runs.virtual_run import VirtualLoop, build_loop, drive, host_clocks, read_costs
 from lavt.recording.record import Record, read_record
 from lavt.runtime.virtual import modelled_clock_source
 from lavt.streams import stream
 from lavt.transport.clock_sync.clock_report import ClockReport
 from lavt.vehicle.camera import CapturedFrame
+from lavt.vehicle.sim.rendering.renderer import Renderer
 
 NO_SCENERY = "vehicle.scenery=none"
 GREY_FROM_FRAME = 240  # 8 s: the car drives at 30 km/h and is about to enter the curve
@@ -83,6 +87,25 @@ def test_the_car_keeps_its_lane_without_delay(l0: Path) -> None:
     assert result["p95_m"] < 0.3
     assert result["lane_invasions"] == 0
     assert result["valid"], result["invalid_reasons"]
+
+
+def count_renderers() -> int:
+    return sum(type(thing) is Renderer for thing in gc.get_objects())
+
+
+def test_a_finished_run_leaves_no_painted_world(tmp_path: Path) -> None:
+    """After a run with pictures, its renderer with the painted ground is freed without waiting for Python's search."""
+    short = planned("fidelity=pixels", "vehicle.scenery=none", "vehicle.time_limit_s=1")
+    gc.collect()
+    gc.disable()
+    try:
+        before = count_renderers()
+        run_once(short, tmp_path / "run")
+        assert count_renderers() == before
+        drive_monitored(short)
+        assert count_renderers() == before
+    finally:
+        gc.enable()
 
 
 def true_latencies_ms(run: PlannedRun) -> tuple[float, float]:

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import weakref
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
@@ -27,7 +28,7 @@ from lavt.experiment.analysis.results import read_json
 from lavt.experiment.runs.plan import PlannedRun, plan_run, plan_sweep
 from lavt.experiment.runs.run import RESULT, run_once
 from lavt.experiment.sweep.sweep import base_of, drive_sweep, open_sweep, recorded_base, run_all
-from lavt.experiment.sweep.workers import Workers, process_workers
+from lavt.experiment.sweep.workers import Workers, drive_or_read, process_workers
 
 CHANGES = ("fidelity=geometry", "conditions=[L0, L3]", "repetitions=1", "network.inherent=loopback")
 
@@ -362,28 +363,64 @@ def test_runs_of_a_killed_process_are_repeated(tmp_path: Path) -> None:
     assert sorted(result["run"] for result in driven.results) == sorted(run.name for run in planned)
 
 
-class BrokenAfterRunExecutor(Executor):
-    """An executor that drives inline and then fails as if its process had died after the run."""
+def kill_worker_when(moment: str, runs_dir: Path) -> None:
+    """Kill a worker while it imports, or when the runs have the file that is named `moment`."""
+    for _ in range(6000):
+        children = multiprocessing.active_children()
+        if len(children) == 2 and (moment == "importing" or list(runs_dir.glob(f"*/{moment}"))):
+            os.kill(int(children[0].pid or 0), signal.SIGKILL)
+            return
+        pause(5 * NS_PER_MS)
 
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Drive, and return a future with `BrokenExecutor`."""
-        fn(*args, **kwargs)
+
+@pytest.mark.full
+@pytest.mark.parametrize("moment", ["importing", "server.mcap", "config.yaml"])
+def test_a_worker_killed_before_the_first_result_costs_nothing(moment: str, sweep_folder: Path, tmp_path: Path) -> None:
+    """If a worker is killed before any run has a result, all runs have the results of an undisturbed sweep."""
+    killer = threading.Thread(target=kill_worker_when, args=(moment, tmp_path))
+    killer.start()
+    driven, _ = run_all(two_runs(), tmp_path, jobs=2, on_progress=lambda _: None)
+    killer.join()
+    assert driven.failed == []
+    undisturbed = {run.name: read_json(sweep_folder / "runs" / run.name / RESULT) for run in two_runs()}
+    assert {result["run"]: result for result in driven.results} == undisturbed
+
+
+def test_a_run_whose_process_dies_after_it_is_kept(tmp_path: Path) -> None:
+    """A run that had a result when its process died is read and not driven again."""
+    run = two_runs()[0]
+    driven = drive_or_read(run, tmp_path / run.name)
+    written_ns = (tmp_path / run.name / RESULT).stat().st_mtime_ns
+    read = drive_or_read(run, tmp_path / run.name)
+    assert read.result == driven.result == read_json(tmp_path / run.name / RESULT)
+    assert len(read.truth) == len(driven.truth) > 0
+    assert (tmp_path / run.name / RESULT).stat().st_mtime_ns == written_ns
+
+
+class DeadProcesses(Executor):
+    """An executor whose processes die at once."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:  # noqa: ARG002 (protocol)
+        """Return a future with `BrokenExecutor`."""
         future: Future[Any] = Future()
         future.set_exception(BrokenExecutor())
         return future
 
 
-def test_a_run_whose_process_dies_after_it_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A run that had a result when its process died is kept and not driven again."""
-    workers = Workers(BrokenAfterRunExecutor(), 1, remote=False)
-    monkeypatch.setattr(lavt.experiment.sweep.sweep, "process_workers", lambda _jobs: nullcontext(workers))
-    _, planned = geometry_sweep()
-    driven, _ = run_all(planned[:1], tmp_path, jobs=1, on_progress=lambda _: None)
-    assert driven.failed == []
-    assert (
-        [drive.result for drive in driven.drives] == driven.results == [read_json(tmp_path / planned[0].name / RESULT)]
-    )
-    assert len(driven.drives[0].truth) > 0
+def test_a_run_whose_processes_always_die_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run whose processes die is driven three times, at last in a single process, and then listed as failed."""
+    pools: list[int] = []
+
+    def dead_workers(jobs: int) -> nullcontext[Workers]:
+        pools.append(jobs)
+        return nullcontext(Workers(DeadProcesses(), jobs, remote=False))
+
+    monkeypatch.setattr("lavt.experiment.sweep.workers.process_workers", dead_workers)
+    driven, _ = run_all(two_runs(), tmp_path, jobs=2, on_progress=lambda _: None)
+    assert sorted(driven.failed) == [
+        (name, "each of the processes that drove it died") for name in sorted(run.name for run in two_runs())
+    ]
+    assert pools == [2, 2, 1]
 
 
 @pytest.mark.full

@@ -28,7 +28,7 @@ from lavt.experiment.report.files import save_figure
 from lavt.experiment.runs.monitored_run import MonitoredRun, drive_monitored
 from lavt.experiment.runs.plan import PlannedRun, plan_run
 from lavt.experiment.statistics.boundary_summary import CRITERIA, summarize_groups
-from lavt.experiment.sweep.workers import Workers, process_workers
+from lavt.experiment.sweep.workers import Workers, attempt_in_processes
 
 BOUNDARY = "boundary.json"
 CSV_COLUMNS = ("route", "preset", "seed", "repetition", *(f"{name}_ms" for name in CRITERIA), "theory_ms")
@@ -191,7 +191,8 @@ def run_searches(
     """
     progress, is_complete = _SearchProgress(on_progress), True
     try:
-        _search_in_processes(progress, searches, jobs or os.cpu_count() or 1)
+        for search in attempt_in_processes(progress.search, searches, jobs or os.cpu_count() or 1):
+            progress.fail(search, "each of the processes that searched it died")
     except KeyboardInterrupt:
         is_complete = False
     found = [progress.found[search.name] for search in searches if search.name in progress.found]
@@ -236,22 +237,6 @@ class _SearchProgress:
         """Add a failed search."""
         self.failed.append({"name": search.name, "why": reason})
         self._on_progress(f"{search.name}: failed: {reason}")
-
-
-def _search_in_processes(progress: _SearchProgress, todo: Sequence[BoundarySearch], jobs: int) -> None:
-    """Run the searches in a pool of processes.
-
-    A process that dies breaks the pool. The searches that were possibly in progress are then repeated, each in a pool
-    of its own.
-    """
-    while todo:
-        with process_workers(jobs) as workers:
-            broken = progress.search(workers, todo)
-        for search in broken[:jobs]:  # searches start in order, so only the first `jobs` of them can have started
-            with process_workers(1) as single:
-                if progress.search(single, [search]):
-                    progress.fail(search, "the process that searched it died")
-        todo = broken[jobs:]
 
 
 def _format_boundaries(found: Mapping[str, Any]) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 
 from lavt.domain import NS_PER_MS, NS_PER_S, FloatArray, Now
 from lavt.experiment.runs.plan import PlannedRun
-from lavt.experiment.runs.virtual_run import build_loop, drive
+from lavt.experiment.runs.virtual_run import build_loop, drive, free_finished_loops
 from lavt.nodes.payloads import Admission, FrameWritten
 from lavt.runtime.recorder import Recorders
 
@@ -67,6 +67,8 @@ def drive_monitored(planned: PlannedRun, *, limit_s: float = 3600.0) -> Monitore
         loop.runtime.hosts["server"].recorder = Recorders(loop.observer, recorder)
         loop.runtime.hosts["client"].recorder = InMemoryRecorder()
         drive(loop, limit_ns=round(limit_s * NS_PER_S))
+    del loop
+    free_finished_loops(planned.config)
     return summarize_drive(recorder.payloads)
 
 

@@ -17,7 +17,7 @@ from lavt.experiment.analysis.results import read_json, run_result, write_json
 from lavt.experiment.runs.netem_run import NETEM, netem_invalid_reasons
 from lavt.experiment.runs.plan import PlannedRun
 from lavt.experiment.runs.real_run import RELAY, Progress, drive_real, relay_invalid_reasons
-from lavt.experiment.runs.virtual_run import build_loop, drive
+from lavt.experiment.runs.virtual_run import build_loop, drive, free_finished_loops
 from lavt.recording.output_directory import check_directory, prepare_directory
 from lavt.recording.record import evaluating, read_record
 
@@ -44,6 +44,8 @@ def drive_once(planned: PlannedRun, out: Path, *, progress: Progress | None = No
         digest = loop.digest.hexdigest()
         if not loop.observer.began:
             raise WorkError(f"{planned.name}: the vehicle was never armed: {loop.client.driver.session.reason}")
+        del loop
+        free_finished_loops(planned.config)
     else:
         prepare_directory(out)
         _write_config(planned, out)

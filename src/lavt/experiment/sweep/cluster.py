@@ -10,7 +10,8 @@ from importlib import import_module
 from typing import Any
 
 from lavt.errors import UserError
-from lavt.experiment.sweep.workers import Workers, ignore_terminal_signals, terminal_signals_blocked
+from lavt.experiment.sweep.worker_processes import ignore_terminal_signals, terminal_signals_blocked
+from lavt.experiment.sweep.workers import Workers
 from lavt.recording.provenance import provenance
 
 LOCAL = "local"

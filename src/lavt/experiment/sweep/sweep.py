@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import itertools
 import os
-import shutil
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, as_completed
@@ -21,12 +20,12 @@ from lavt.config import RunConfig, SweepConfig
 from lavt.config_file import load_config
 from lavt.domain import NS_PER_S
 from lavt.errors import UserError, WorkError, describe_error
-from lavt.experiment.analysis.drive_data import DriveData, read_drive
+from lavt.experiment.analysis.drive_data import DriveData
 from lavt.experiment.analysis.results import FAILED, read_json, write_json
 from lavt.experiment.runs.plan import PlannedRun, plan_sweep
 from lavt.experiment.runs.run import CONFIG, RESULT, config_text
 from lavt.experiment.sweep.cluster import cluster_workers
-from lavt.experiment.sweep.workers import Workers, process_workers
+from lavt.experiment.sweep.workers import Workers, attempt_in_processes, is_finished, remove_unfinished
 from lavt.recording.output_directory import prepare_directory
 
 SWEEP = "sweep.yaml"
@@ -70,7 +69,8 @@ def run_all(
     progress = _SweepProgress(runs_dir, on_progress)
     if cluster_address is None:
         jobs = 1 if any(run.config.time == "real" for run in todo) else jobs or os.cpu_count() or 1
-        _drive_in_processes(progress, todo, jobs)
+        for run in attempt_in_processes(progress.drive, todo, jobs):
+            progress.fail(run, "each of the processes that drove it died")
     elif todo:
         with cluster_workers(cluster_address, jobs) as workers:
             jobs = workers.jobs
@@ -86,11 +86,6 @@ def run_all(
         "jobs": jobs,
     }
     return sweep_result, speed
-
-
-def is_finished(directory: Path) -> bool:
-    """Return whether the run in `directory` has a result, with any ending."""
-    return (directory / RESULT).is_file()
 
 
 class _SweepProgress:
@@ -136,32 +131,6 @@ class _SweepProgress:
         """Add a failed run."""
         self.failed.append((planned.name, reason))
         self._on_progress(f"{planned.name} failed: {reason}")
-
-
-def _drive_in_processes(progress: _SweepProgress, todo: Sequence[PlannedRun], jobs: int) -> None:
-    """Drive the runs in a pool of processes.
-
-    A process that dies breaks the pool. The runs that were in progress are then driven again, each in a pool of its
-    own.
-    """
-    while todo:
-        with process_workers(jobs) as workers:
-            broken = progress.drive(workers, todo)
-        begun = [run for run in broken if (progress.runs_dir / run.name).exists()]
-        _remove_unfinished(broken, progress.runs_dir)
-        for run in begun:
-            directory = progress.runs_dir / run.name
-            if is_finished(directory):  # the process died after the run
-                progress.take(run, read_drive(directory, read_json(directory / RESULT)))
-                continue
-            with process_workers(1) as single:
-                if progress.drive(single, [run]):
-                    progress.fail(run, "the process that drove the run died, twice")
-        todo = [run for run in broken if run not in begun]
-        if todo and not begun:
-            for run in todo:
-                progress.fail(run, "its process died before the run began")
-            return
 
 
 def open_sweep(out: Path, *, resume: bool) -> None:
@@ -258,6 +227,4 @@ def _check_config(planned: PlannedRun, directory: Path) -> None:
 def _remove_unfinished(planned: Sequence[PlannedRun], runs_dir: Path) -> None:
     """Remove the directories of runs without a result, so that these runs are driven again."""
     for run in planned:
-        directory = runs_dir / run.name
-        if directory.is_dir() and not is_finished(directory):
-            shutil.rmtree(directory)
+        remove_unfinished(runs_dir / run.name)

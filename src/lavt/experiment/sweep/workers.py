@@ -7,25 +7,23 @@ directory and send the files back.
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import signal
-import threading
-from collections.abc import Iterator, Mapping
-from concurrent.futures import Executor, Future, ProcessPoolExecutor
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, Future
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, TypeVar
 
-from lavt.experiment.analysis.drive_data import DriveData
+from lavt.experiment.analysis.drive_data import DriveData, read_drive
+from lavt.experiment.analysis.results import read_json
 from lavt.experiment.runs.plan import PlannedRun
 from lavt.experiment.runs.run import RESULT, drive_once
+from lavt.experiment.sweep.worker_processes import WorkerProcesses
 from lavt.recording.output_directory import prepare_directory
 
-TERMINAL_SIGNALS = (signal.SIGINT, signal.SIGHUP)
-"""The signals that Ctrl-C and the closing of a terminal send."""
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +38,7 @@ class Workers:
         """Start a run, and return a future whose result is an argument of `collect`."""
         if self.remote:
             return self.executor.submit(drive_remotely, planned)
-        return self.executor.submit(drive_once, planned, directory)
+        return self.executor.submit(drive_or_read, planned, directory)
 
     def collect(self, result: Any, directory: Path) -> DriveData:
         """Return the data of a finished run; if the run was remote, first write its files into `directory`."""
@@ -61,49 +59,42 @@ class Workers:
 @contextmanager
 def process_workers(jobs: int) -> Iterator[Workers]:
     """Yield worker processes on this machine, which end when this process ends or is killed."""
-    context = multiprocessing.get_context("spawn")  # a fork would copy locks that are never released
-    with terminal_signals_blocked():
-        executor = ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin_process)
-    with terminal_signals_blocked():  # again: the start of Python's resource tracker unblocked SIGINT
-        for _ in range(jobs):
-            executor.submit(os.getpid)  # starts a process
-    with executor:
+    with WorkerProcesses(jobs) as executor:
         yield Workers(executor, jobs, remote=False)
 
 
-@contextmanager
-def terminal_signals_blocked() -> Iterator[None]:
-    """Block the terminal's signals inside the `with` block.
+def attempt_in_processes(
+    attempt: Callable[[Workers, Sequence[Item]], Sequence[Item]], todo: Sequence[Item], jobs: int
+) -> Sequence[Item]:
+    """Attempt all of `todo` in worker processes, at most three times; return the items without a result.
 
-    In processes that are started in the block, these signals are blocked until they call `ignore_terminal_signals`.
+    `attempt` returns the items whose process died. The third attempt has a single process, for which the memory may
+    suffice even if it does not suffice for several.
     """
-    previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, TERMINAL_SIGNALS)
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, previous_mask)
+    for processes in (jobs, jobs, 1):
+        if todo:
+            with process_workers(processes) as workers:
+                todo = attempt(workers, todo)
+    return todo
 
 
-def ignore_terminal_signals() -> None:
-    """Ignore the terminal's signals: all processes of the terminal receive them, but only the parent handles them."""
-    for number in TERMINAL_SIGNALS:
-        signal.signal(number, signal.SIG_IGN)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, TERMINAL_SIGNALS)
+def is_finished(directory: Path) -> bool:
+    """Return whether the run in `directory` has a result, with any ending."""
+    return (directory / RESULT).is_file()
 
 
-def _begin_process() -> None:
-    ignore_terminal_signals()
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+def remove_unfinished(directory: Path) -> None:
+    """Remove the directory of a run that has no result, so that the run can be driven again."""
+    if directory.is_dir() and not is_finished(directory):
+        shutil.rmtree(directory)
 
 
-def _end_with_parent() -> None:
-    """Exit when the parent process has ended, so that no process of an old sweep writes into a resumed sweep."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        try:
-            parent.join()
-        finally:
-            os._exit(1)
+def drive_or_read(planned: PlannedRun, directory: Path) -> DriveData:
+    """Drive a run, unless it was finished by a process that died afterwards; return its data."""
+    if is_finished(directory):
+        return read_drive(directory, read_json(directory / RESULT))
+    remove_unfinished(directory)
+    return drive_once(planned, directory)
 
 
 def drive_remotely(planned: PlannedRun) -> tuple[DriveData, dict[str, bytes]]:

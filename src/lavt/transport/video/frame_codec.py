@@ -16,7 +16,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from lavt.domain import FramePayload, Lane, Picture, SeenLane
+from lavt.domain import FramePayload, Lane, Picture, ReceivedPicture, SeenLane
 from lavt.errors import BadPacket
 from lavt.transport.video.h264 import DecodedPicture, Decoder, Encoder
 from lavt.transport.video.stamp import STAMP_PX, read_stamp, write_stamp, write_stamp_i420
@@ -34,20 +34,6 @@ CHECKSUM_ROW_STEP: Final = 16
 """The checksum of a picture covers every sixteenth row."""
 MAX_STORED_PICTURES: Final = 300
 """Largest number of pictures in transit: 10 s at 30 Hz, and 280 MB."""
-
-
-class ReceivedPicture(Protocol):
-    """A picture decoded from an access unit."""
-
-    @property
-    def picture(self) -> FramePayload:
-        """The picture for a detector, or the lane that replaces it. Reading this property can convert the picture."""
-        ...
-
-    @property
-    def corrupt(self) -> bool:
-        """True if the decoder had to conceal parts of the picture."""
-        ...
 
 
 class PictureSender(Protocol):
