@@ -14,21 +14,21 @@ import argparse
 import json
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # for the package `benchmarks`
 
-from benchmarks.video.clean import SIZES, run_clean_part
+from benchmarks.video.clean import SIZES, Size, run_clean_part
 from benchmarks.video.gstreamer import load_gstreamer
-from benchmarks.video.impaired import CASES, run_impaired_part
+from benchmarks.video.impaired import CASES, IMPAIRED_SIZE, run_impaired_part
 from benchmarks.video.pictures import render_pictures
 
 from lavt.errors import LavtError, UserError
 from lavt.runtime import process_priority
 
-QUICK = {"pairs": 1, "seconds": 4.0, "frames": 120}
+QUICK = {"pairs": 1, "seconds": 1.0, "frames": 30}
 
 
 def parts(requested: argparse.Namespace, folder: Path) -> dict[str, Callable[[], dict[str, float]]]:
@@ -38,6 +38,12 @@ def parts(requested: argparse.Namespace, folder: Path) -> dict[str, Callable[[],
         for size in SIZES
     }
     return clean | {case.name: partial(run_impaired_part, folder, case, frames=requested.frames) for case in CASES}
+
+
+def needed_sizes(requested_parts: Sequence[str]) -> list[Size]:
+    """Return the picture sizes that the parts use; parts on an impaired link use `IMPAIRED_SIZE`."""
+    names = {IMPAIRED_SIZE.name if part in {case.name for case in CASES} else part for part in requested_parts}
+    return [size for size in SIZES if size.name in names]
 
 
 def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
@@ -68,10 +74,11 @@ def main() -> int:
             unknown = set(requested.only or ()) - all_parts.keys()
             if unknown:
                 raise UserError(f"unknown part {', '.join(sorted(unknown))}: choose from {', '.join(all_parts)}")
-            for size in SIZES:
+            requested_parts = requested.only or list(all_parts)
+            for size in needed_sizes(requested_parts):
                 print(f"rendering the pictures of {size.name}", file=sys.stderr)
                 render_pictures(Path(folder) / f"{size.width_px}x{size.height_px}", size.width_px, size.height_px)
-            results = {part: measure() for part, measure in all_parts.items() if part in (requested.only or all_parts)}
+            results = {part: measure() for part, measure in all_parts.items() if part in requested_parts}
     except LavtError as error:
         print(error, file=sys.stderr)
         return 2 if isinstance(error, UserError) else 1

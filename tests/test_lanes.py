@@ -164,6 +164,16 @@ def test_runner_adds_up_the_results_of_the_lanes() -> None:
     assert output.splitlines()[-1].startswith("6 passed, 0 failed, 1 skipped, 1 rerun in ")
 
 
+def test_a_lane_at_the_same_time_starts_with_the_last_command(tmp_path: Path) -> None:
+    """A lane that runs at the same time as another does not run during the other's first command, even if it fails."""
+    began, ended = tmp_path / "began", tmp_path / "ended"
+    other = LaneSpec("full", (shell(f"touch {began}; test -e {ended}"),), 1)
+    first = shell(f"sleep 0.3; test ! -e {began} && touch {ended}; exit 4")
+    code, output = run(LaneSpec("kernel", (first, shell(f"until test -e {began}; do sleep 0.1; done")), 1, other))
+    assert code == 1
+    assert output.count("ended with") == output.count("ended with 4") == 1
+
+
 @pytest.mark.parametrize("meanwhile", [False, True])
 def test_failing_lane_fails_the_run(meanwhile: bool) -> None:
     """A lane with an exit code other than 0 fails the run; all other lanes still run, and the output has the code."""

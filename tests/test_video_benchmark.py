@@ -30,6 +30,12 @@ def test_defaults_measure_every_part() -> None:
     assert set(video_vs_gstreamer.parts(requested, Path())) >= {"480p", "720p", "reorder", "loss1", "loss5"}
 
 
+def test_only_the_pictures_of_the_requested_parts_are_rendered() -> None:
+    """Pictures are rendered in the sizes of the requested parts."""
+    for requested_parts, names in ((["720p"], ["720p"]), (["loss1"], ["480p"]), (["loss1", "720p"], ["480p", "720p"])):
+        assert [size.name for size in video_vs_gstreamer.needed_sizes(requested_parts)] == names
+
+
 @pytest.mark.parametrize("arguments", [["--pairs", "0"], ["--seconds", "0"], ["--frames", "0"]])
 def test_empty_measurements_are_rejected(arguments: list[str]) -> None:
     """A benchmark without pairs, time or frames is rejected with exit status 2."""

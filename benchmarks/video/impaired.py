@@ -26,6 +26,7 @@ CASES = (
     LinkCase("burst1", loss=0.01, burst_packets=3),
     LinkCase("burst5", loss=0.05, burst_packets=3),
 )
+IMPAIRED_SIZE = SIZES[0]
 GSTREAMER_JITTER_BUFFERS_MS = {"reorder": (30,), "loss1": (0, 30), "loss5": (0, 30), "burst1": (30,), "burst5": (30,)}
 """The lengths of GStreamer's jitter buffer with which each case is measured. The line of JSON has the best result."""
 DAMAGED_DB = 2.0
@@ -90,7 +91,7 @@ def undamaged_share(received: dict[int, float], loss_free: Sequence[float]) -> f
 
 def run_impaired_part(folder: Path, case: LinkCase, *, frames: int) -> dict[str, float]:
     """Measure a case, print its table, and return its values for the line of JSON (none for bursts)."""
-    size = SIZES[0]
+    size = IMPAIRED_SIZE
     run = Run(
         str(folder),
         size.width_px,

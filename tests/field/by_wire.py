@@ -104,12 +104,15 @@ def ms_since(at_ns: int, since_ns: int) -> float:
 class SoftwareCarProcess:
     """`lavt software-car` as a process, with the events that it printed.
 
-    If `stalls` is given, a stall of the host at the time of a late reaction excuses the reaction.
+    If `stalls` is given, a stall of the host at the time of a late reaction excuses the reaction. `explain` gets the
+    exception for a kit that disengaged although the test had caused no fault, and the time, and returns the exception
+    to raise.
     """
 
     process: subprocess.Popen[str]
     stalls: Stalls | None = None
     stall_ms: float = STALL_MS
+    explain: Callable[[Exception, int], Exception] = lambda failure, _at_ns: failure
     events: list[dict[str, Any]] = field(default_factory=list)
     _lines: queue.SimpleQueue[dict[str, Any] | None] = field(default_factory=queue.SimpleQueue)
     _reader: threading.Thread = field(default_factory=threading.Thread)
@@ -169,9 +172,10 @@ class SoftwareCarProcess:
     def unexpected_release(self, braked_ns: int, message: str) -> Exception:
         """Return the exception for a kit that got no command in time although the test had caused no fault."""
         failure = self.verdict(message, braked_ns - KIT_LOOKBACK_MS * NS_PER_MS, braked_ns)
-        if self.stalls is None:
-            return failure
-        return excuse_slow_machine(failure, self.stalls, braked_ns - SLOW_MACHINE_LOOKBACK_MS * NS_PER_MS, braked_ns)
+        if self.stalls is not None:
+            since_ns = braked_ns - SLOW_MACHINE_LOOKBACK_MS * NS_PER_MS
+            failure = excuse_slow_machine(failure, self.stalls, since_ns, braked_ns)
+        return self.explain(failure, braked_ns)
 
     def verdict(self, message: str, since_ns: int, until_ns: int) -> Exception:
         """Return the exception for a late reaction: `HostStalled` if the host stalled between the times."""
@@ -208,10 +212,8 @@ class SoftwareCarProcess:
 
 
 @contextmanager
-def software_car(
-    config: str | Path, *changes: str, stalls: Stalls | None = None, stall_ms: float = STALL_MS
-) -> Iterator[SoftwareCarProcess]:
-    """Run `lavt software-car` with a server's config; end it afterwards."""
+def software_car(config: str | Path, *changes: str, **settings: Any) -> Iterator[SoftwareCarProcess]:
+    """Run `lavt software-car` with a server's config; end it afterwards. `settings` are for `SoftwareCarProcess`."""
     process = subprocess.Popen(
         [sys.executable, "-m", "lavt", "software-car", str(config), *changes, "--json"],
         stdin=subprocess.PIPE,
@@ -219,7 +221,7 @@ def software_car(
         text=True,
         start_new_session=True,
     )
-    car = SoftwareCarProcess(process, stalls, stall_ms)
+    car = SoftwareCarProcess(process, **settings)
     try:
         yield car
     finally:

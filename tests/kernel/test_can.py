@@ -34,9 +34,9 @@ from tests.kernel.lane.machine import Machine, MachineError, wait_until
 from tests.kernel.lane.processor_use import ProcessorUse, measured_processor
 from tests.kernel.lane.verdicts import (
     KIT_STALL_MS,
+    entered_ns,
     explain_state,
     require_valid,
-    safe_stop_ns,
     safety_changes,
     shortest_stall_ms,
 )
@@ -52,12 +52,12 @@ pytestmark = [
     pytest.mark.usefixtures("vcan"),
     pytest.mark.flaky(reruns=UNEXPLAINED_RERUNS, rerun_except="^(?!HostStalled:|UnexplainedStop:)"),
 ]
-"""A drive that stops early is repeated: on some hosts a program of the first machine waits up to 0.15 s for its
-processor, more often than the probes explain. A fault that stops every drive, or most of them, fails the tests."""
+"""A drive that stops early, or is degraded and leaves the middle of its lane, is repeated: the first machine's only
+processor is barely fast enough for three programs. A fault that stops every drive, or most of them, fails the tests."""
 
 ReportMeasurement = Callable[[str], None]
 
-SMALL_PICTURES = ("camera.width_px=320", "camera.height_px=240", "camera.rate_hz=15")
+SMALL_PICTURES = ("camera.width_px=320", "camera.height_px=240", "camera.rate_hz=10")
 """Pictures that a user-mode kernel, with one processor and slow system calls, can process in time."""
 MAX_P95_M = 0.22
 COMMAND_IDENTIFIERS = {0x200, 0x201, 0x202}
@@ -125,9 +125,9 @@ class UnexplainedStop(Exception):
     """A drive stopped early for a time-out that no recorded stall explains."""
 
 
-def excuse(failure: Exception, stalls: Stalls, processor: ProcessorUse, since_ns: int, stopped_ns: int) -> Exception:
+def explain(failure: Exception, processor: ProcessorUse, stopped_ns: int) -> Exception:
     """Return the exception for a drive that stopped early: `HostStalled` if a record explains the stop."""
-    failure = processor.verdict(excuse_slow_machine(failure, stalls, since_ns, stopped_ns), stopped_ns)
+    failure = processor.verdict(failure, stopped_ns)
     return failure if isinstance(failure, HostStalled) else UnexplainedStop(str(failure))
 
 
@@ -160,11 +160,10 @@ class ActiveDrive:
         since_ns = self.car.event_ns("enabled", "enabled: ") or now_ns
         message = f"stopped before it drove: {status}, {self.car.events}"
         if braked_ns is not None:
-            failure = self.car.unexpected_release(braked_ns, message)
-        else:
-            stall_ms = shortest_stall_ms(str(status["reason"]))
-            failure = self.stalls.verdict(message, since_ns, now_ns, stall_ms=stall_ms)
-        return excuse(failure, self.stalls, self.processor, since_ns, now_ns if braked_ns is None else braked_ns)
+            return self.car.unexpected_release(braked_ns, message)
+        stall_ms = shortest_stall_ms(str(status["reason"]))
+        failure = self.stalls.verdict(message, since_ns, now_ns, stall_ms=stall_ms)
+        return explain(excuse_slow_machine(failure, self.stalls, since_ns, now_ns), self.processor, now_ns)
 
     def reason(self) -> str:
         """Return the server's reason for the stop."""
@@ -196,10 +195,15 @@ class CanLab:
         if not (self.proof_folder / f"{profile}.json").exists():
             run_watchdog_test(self.server, changes, self.stalls)
         out = self.work / "drive"
-        car_settings = set_arguments(changes)
         with (
             measured_processor() as processor,
-            software_car(BY_WIRE, *car_settings, stalls=self.stalls, stall_ms=KIT_STALL_MS) as car,
+            software_car(
+                BY_WIRE,
+                *set_arguments(changes),
+                stalls=self.stalls,
+                stall_ms=KIT_STALL_MS,
+                explain=lambda failure, stopped_ns: explain(failure, processor, stopped_ns),
+            ) as car,
         ):
             client = ("clock.source=probe", *SMALL_PICTURES)
             loop = start_by_wire(self.server, self.client, out, server_changes=changes, client_changes=client)
@@ -248,12 +252,15 @@ def test_drive_over_can_completes(profile: str, lab: CanLab, report_measurement:
         braked_ns = active_drive.car.watchdog_braked_ns()
     measurements = f"{profile}: {describe_result(drive.result)}; {'; '.join(safety_changes(drive))}"
     report_measurement(measurements)
-    if drive.result["ending"] != "completed":
-        stopped_ns = safe_stop_ns(drive) if braked_ns is None else braked_ns
-        failure = explain_state(drive, lab.stalls, "safe_stop", measurements)
-        if braked_ns is not None:
-            failure = active_drive.car.unexpected_release(braked_ns, measurements)
-        raise excuse(failure, lab.stalls, active_drive.processor, since_ns, stopped_ns)
+    if braked_ns is not None:
+        raise active_drive.car.unexpected_release(braked_ns, measurements)
+    is_completed = drive.result["ending"] == "completed"
+    late_ns = entered_ns(drive, state := "degraded" if is_completed else "safe_stop")
+    if late_ns is not None and not (is_completed and drive.result["p95_m"] <= MAX_P95_M):
+        failure = explain_state(drive, lab.stalls, state, measurements)
+        failure = excuse_slow_machine(failure, lab.stalls, since_ns, late_ns)
+        raise explain(failure, active_drive.processor, late_ns)
+    assert is_completed, measurements
     require_valid(drive, lab.stalls)
     assert drive.result["p95_m"] <= MAX_P95_M
     wheel = command_to_wheel_stage(drive.result)

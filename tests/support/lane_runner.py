@@ -64,15 +64,23 @@ class RunningLane:
         self._progress.parent.mkdir()
         self._output.touch()
         self._returned_bytes = 0
-        self._began_ns = self._ended_ns = MachineClock().now().mono_ns
+        self._began_ns: int | None = None
+        self._ended_ns = 0
         self.failures: list[str] = []
         self.running = True
+
+    @property
+    def is_at_last_command(self) -> bool:
+        """Whether the last command was started."""
+        return not self._waiting_commands
 
     def poll(self) -> None:
         """Check the running command, start the next one, and end a lane that exceeds its time limit."""
         if not self.running:
             return
         now_ns = self._ended_ns = MachineClock().now().mono_ns
+        if self._began_ns is None:
+            self._began_ns = now_ns
         if self._process is not None and self._process.poll() is not None:
             if code := self._process.returncode:
                 self.failures.append(f"`{self._command}` ended with {code}")
@@ -129,13 +137,15 @@ class RunningLane:
     def outcome(self) -> LaneOutcome:
         """Return the result."""
         counts = parse_counts(self._output.read_text(errors="replace"))
-        return LaneOutcome(self.lane.name, (self._ended_ns - self._began_ns) / NS_PER_S, counts, self.failures)
+        took_s = 0.0 if self._began_ns is None else (self._ended_ns - self._began_ns) / NS_PER_S
+        return LaneOutcome(self.lane.name, took_s, counts, self.failures)
 
 
 def run_lanes(lanes: Sequence[LaneSpec], *, write: Write) -> int:
     """Run lanes in their order; return 0 if all passed, else 1.
 
-    A lane that runs at the same time as another (`meanwhile`) has its output written after the other's output.
+    A lane that runs at the same time as another (`meanwhile`) starts with the other's last command. Its output is
+    written after the other's output.
     """
     outcomes: list[LaneOutcome] = []
     began_ns = MachineClock().now().mono_ns
@@ -157,8 +167,10 @@ def run_lanes(lanes: Sequence[LaneSpec], *, write: Write) -> int:
 
 def _run_together(running: Sequence[RunningLane], write: Write) -> None:
     while any(lane.running for lane in running):
-        for lane in running:
-            lane.poll()
+        running[0].poll()
+        if running[0].is_at_last_command:
+            for lane in running[1:]:
+                lane.poll()
         unfinished = next((lane for lane in running if lane.running), None)
         for lane in running:  # the lanes before `unfinished` have ended, so their output is complete
             write(lane.new_output())

@@ -1,12 +1,6 @@
 """Verdicts on failed drives: which stalls of the host explain a failure.
 
 A failed drive is a fault, unless a long enough stall was recorded at the relevant time.
-
-If a machine uses its processor fully, ordinary programs of the host still get 50 to 60 ms of each second (the fair
-server of the host's kernel). This time is recorded as a stall of the machine, too. Such stalls make the kit of a busy
-machine disengage, because commands are 20 ms apart and programs wait for each other. So a fault of LAVT that occupies
-the processor all the time also causes stalls. They would excuse this fault only if all three attempts failed within
-200 ms of a stall. A busy machine by itself causes no longer stalls, and no stalled share above 6 %.
 """
 
 from __future__ import annotations
@@ -37,8 +31,7 @@ sources and the sum of the loop's parts are judged by the shortest round trips o
 does not change.
 """
 MEDIAN_SHARE = 0.07
-"""Share of a drive that must be stalled to explain medians that are too large. It is more than a machine loses when it
-uses its processor fully."""
+"""Share of a drive that must be stalled to explain medians that are too large."""
 REPORT_TIMEOUT = re.compile(r"Report\w* for (\d+) ms")
 
 
@@ -77,17 +70,16 @@ def explain_state(drive: DriveResult, stalls: Stalls, state: str, message: str) 
 def shortest_stall_ms(reason: str) -> float:
     """Return the length of the shortest stall that explains a safety state, by the server's reason.
 
-    Without commands the state is degraded after 300 ms, and a safe stop follows after 500 ms; frames come every 67 ms.
-    The kit's reports may be missing for as long as the reason says.
+    Without commands the state is degraded after 300 ms, and a safe stop follows after 500 ms; frames come every 67 to
+    100 ms. The kit's reports may be missing for as long as the reason says.
     """
     limits_ms = [int(limit_ms) for limit_ms in REPORT_TIMEOUT.findall(reason)]
     return min(limits_ms) - MARGIN_MS if limits_ms else STOP_STALL_MS
 
 
-def safe_stop_ns(drive: DriveResult) -> int:
-    """Return when the first safe stop began, or the end of the record if there was none."""
-    at_ns = next((at_ns for at_ns, detail in _safety(drive) if "-> safe_stop" in detail), None)
-    return max(driving_interval(drive.server)[:2]) if at_ns is None else at_ns
+def entered_ns(drive: DriveResult, state: str) -> int | None:
+    """Return when a safety state was entered first, or None if it never was."""
+    return next((at_ns for at_ns, detail in _safety(drive) if f"-> {state}" in detail), None)
 
 
 def safety_changes(drive: DriveResult) -> list[str]:
