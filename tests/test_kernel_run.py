@@ -36,6 +36,7 @@ def run_rejected(*arguments: str, **environment: str) -> str:
         (["test_lane.py"], ["tests/kernel/test_lane.py"]),
         (["tests/kernel/test_lane.py", "-q"], ["tests/kernel/test_lane.py", "-q"]),
         (["test_lane.py::test_a[b.py]"], ["tests/kernel/test_lane.py::test_a[b.py]"]),
+        (["--ignore=tests/kernel/test_can.py"], ["--ignore=tests/kernel/test_can.py", "tests/kernel"]),
         (["tests/assembly/test_assembly.py"], ["tests/assembly/test_assembly.py", "tests/kernel"]),
     ],
 )

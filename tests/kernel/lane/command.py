@@ -66,7 +66,7 @@ def pytest_arguments(extra: Sequence[str]) -> list[str]:
 def _complete_path(argument: str) -> str:
     file, separator, test = argument.partition("::")
     path = Path(file)
-    if path.suffix != ".py" or not (HERE / path.name).is_file():
+    if argument.startswith("-") or path.suffix != ".py" or not (HERE / path.name).is_file():
         return argument
     return f"tests/kernel/{path.name}{separator}{test}"
 
