@@ -48,8 +48,8 @@ def program(name: str, *arguments: str) -> tuple[str, ...]:
 
 
 CAN_DRIVES = "tests/kernel/test_can.py"
-"""These tests run alone: one machine's only processor is just fast enough for their drives. Work on the other processor
-slows it down if the two processors share a core."""
+"""These tests run alone, because other work slows the machines, and one machine's only processor is just fast enough
+for the drives of these tests."""
 KERNEL = (sys.executable, "tests/kernel/run", *SHOW_SLOWEST)
 FULL = LaneSpec("full", (pytest("-m", "full"),), 40)
 LINTERS = (program("ruff", "check"), program("ruff", "format", "--check"), program("mypy"), program("lint-imports"))

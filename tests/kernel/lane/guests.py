@@ -210,4 +210,4 @@ def _configure_process(processor: int) -> None:
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
     with suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
-        Path("/proc/self/autogroup").write_text(str(NICENESS))  # the niceness of the machine's session
+        Path("/proc/self/autogroup").write_text(str(NICENESS))  # of the session

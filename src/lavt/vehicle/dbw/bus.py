@@ -234,16 +234,18 @@ class CanPort:
         """
         began = self._clock.now()
         messages: list[Message] = []
+        is_empty = False
         for _ in range(MAX_READS):
             with suppress(_MalformedMessage):
                 message = self._read_message(bus, 0)
                 if message is None:
+                    is_empty = True
                     break
                 messages.append(message)
         now = self._clock.now() if messages else began
         for message in messages:
             self._receive(message, now, bus)
-        if len(messages) < MAX_READS:
+        if is_empty:
             bus.arrivals.note_empty(began)
 
     def _declare_unreadable(self, bus: OpenBus, error: Exception) -> None:
