@@ -54,16 +54,6 @@ def test_impossible_timestamps() -> None:
     assert arrivals.arrived_ns(at(105.9).wall_ns, at(105)) == 105 * NS_PER_MS
 
 
-def test_a_queue_found_empty_after_frames_were_read() -> None:
-    """A frame is not earlier than the frames before it, even if the queue counts as empty from an earlier time on."""
-    arrivals = ArrivalTimes(at(90))
-    assert arrivals.arrived_ns(at(100).wall_ns, at(110)) == 100 * NS_PER_MS
-    arrivals.note_empty(at(95))
-    assert arrivals.arrived_ns(0, at(120)) == 100 * NS_PER_MS
-    arrivals.note_empty(at(115))
-    assert arrivals.arrived_ns(0, at(120)) == 115 * NS_PER_MS
-
-
 STEPS_MS = (-200, -60, -50, -40, -30, -1, 1, 30, 40, 50, 60, 200)
 
 

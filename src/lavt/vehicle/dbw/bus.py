@@ -10,6 +10,7 @@ from __future__ import annotations
 import errno
 import logging
 import secrets
+import select
 import socket
 import threading
 from collections import Counter, deque
@@ -74,10 +75,6 @@ class OpenBus(NamedTuple):
             self.datagram_check.close()
         with suppress(Exception):
             self.driver.shutdown()
-
-
-class _MalformedMessage(Exception):
-    """A datagram is not a valid message."""
 
 
 class CanPort:
@@ -212,9 +209,7 @@ class CanPort:
         try:
             while self._bus is bus and not self._closing.is_set():
                 if self._interface not in STAMPED_BY_KERNEL:
-                    message = self._read_message(bus, POLL_S)
-                    if message is not None:
-                        self._receive(message, self._clock.now(), bus)
+                    self._read_frame(bus, POLL_S)
                     continue
                 with bus.read_lock:
                     self._read_waiting(bus)
@@ -227,49 +222,40 @@ class CanPort:
             bus.shut_down()
 
     def _read_waiting(self, bus: OpenBus) -> None:
-        """Read the messages that wait; the caller holds `bus.read_lock`.
+        """Read the frames that wait; the caller holds `bus.read_lock`.
 
-        The clocks are read once before the messages and once after them, because a reading can take as long as a
-        message.
+        Only `select` tells whether the queue is empty: python-can also returns None for a message that it filters out,
+        and on an empty queue it can wait longer than the timeout if the wall clock is set back.
         """
-        began = self._clock.now()
-        messages: list[Message] = []
-        is_empty = False
         for _ in range(MAX_READS):
-            with suppress(_MalformedMessage):
-                message = self._read_message(bus, 0)
-                if message is None:
-                    is_empty = True
-                    break
-                messages.append(message)
-        now = self._clock.now() if messages else began
-        for message in messages:
-            self._receive(message, now, bus)
-        if is_empty:
-            bus.arrivals.note_empty(began)
+            now = self._clock.now()
+            if not select.select([bus.driver.fileno()], [], [], 0)[0]:
+                bus.arrivals.note_empty(now)
+                return
+            self._read_frame(bus, 0)
 
     def _declare_unreadable(self, bus: OpenBus, error: Exception) -> None:
         """Declare a bus lost whose driver raised `error`, unless it is lost already."""
         if self._bus is bus:
             self._declare_lost(f"{self._interface} {self._channel} cannot be read ({_error_text(error)})")
 
-    def _read_message(self, bus: OpenBus, timeout_s: float) -> Message | None:
-        """Wait for a message for at most `timeout_s`, and return it; None: there is none.
-
-        A datagram that is malformed, or whose values contradict each other, is counted and raises `_MalformedMessage`.
-        """
-        check = bus.datagram_check
+    def _read_frame(self, bus: OpenBus, timeout_s: float) -> None:
+        """Wait for a frame for at most `timeout_s`, and read it."""
         try:
-            if check is None or not check.drop_malformed():
-                return bus.driver.recv(timeout_s)
-        except BlockingIOError:  # also if a datagram was reported, but the kernel then dropped it for a wrong checksum
-            return None
+            if bus.datagram_check is not None and bus.datagram_check.drop_malformed():
+                self.counts["unreadable"] += 1
+                return
+            message = bus.driver.recv(timeout_s)
+        except BlockingIOError:  # `select` reported a datagram, but the kernel then dropped it for a wrong checksum
+            return
         except Exception as error:
             is_unpacking_error = error.__cause__ is not None and not isinstance(error.__cause__, OSError)
-            if check is None or not is_unpacking_error:
+            if bus.datagram_check is None or not is_unpacking_error:
                 raise
-        self.counts["unreadable"] += 1
-        raise _MalformedMessage
+            self.counts["unreadable"] += 1  # the values of the datagram contradict each other
+            return
+        if message is not None:
+            self._receive(message, self._clock.now(), bus)
 
     def _receive(self, message: Message, now: Now, bus: OpenBus) -> None:
         if self._own_mark is not None and message.channel == self._own_mark:

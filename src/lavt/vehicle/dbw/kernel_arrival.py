@@ -22,15 +22,14 @@ class ArrivalTimes:
     """
 
     def __init__(self, now: Now) -> None:
-        self._earliest_ns = now.mono_ns
         self.note_empty(now)
 
     def note_empty(self, now: Now) -> None:
-        """Note that the queue was found empty after `now`; frames that arrived since `now` may have been read."""
-        self._earliest_ns, self._wall_ahead_ns = max(now.mono_ns, self._earliest_ns), now.wall_ns - now.mono_ns
+        """Note that the queue was found empty after `now`."""
+        self._earliest_ns, self._wall_ahead_ns = now.mono_ns, now.wall_ns - now.mono_ns
 
     def arrived_ns(self, timestamp_ns: int, now: Now) -> int:
-        """Return when a frame arrived that has the wall-clock time `timestamp_ns` and was read before `now`."""
+        """Return when a frame arrived that has the wall-clock time `timestamp_ns` and was read just before `now`."""
         earliest_ns, latest_ns = self._earliest_ns, now.mono_ns
         candidates_ns = (timestamp_ns - self._wall_ahead_ns, timestamp_ns - (now.wall_ns - now.mono_ns))
         outside_ns, at_ns = min((max(earliest_ns - at_ns, at_ns - latest_ns, 0), at_ns) for at_ns in candidates_ns)
