@@ -13,10 +13,11 @@ from msgspec.structs import replace
 
 from lavt.assembly.entropy import MachineEntropy
 from lavt.assembly.security import build_authenticator, build_gateway
+from lavt.assembly.zenoh import program_session
 from lavt.cli import console
 from lavt.clock import Clock, MachineClock
 from lavt.config import ClientConfig
-from lavt.config_file import find_file, load_config
+from lavt.config_file import load_config
 from lavt.domain import NS_PER_S, Now, SessionReply, SessionRequest
 from lavt.errors import BadMessage, UserError, WorkError
 from lavt.node import Send
@@ -66,8 +67,7 @@ def stop(
         link = ZenohLink(
             clock,
             side="client",
-            path=find_file(Path(settings.zenoh.session)),
-            router=settings.zenoh.router,
+            settings=program_session(settings),
             vehicle=settings.vehicle_id,
             who=settings.who,
         )

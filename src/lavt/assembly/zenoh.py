@@ -1,0 +1,76 @@
+"""The settings of the Zenoh sessions of a side and of other programs on its machine, from the side's config."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from lavt.config import ClientConfig, ServerConfig
+from lavt.config_file import find_file
+from lavt.errors import UserError
+from lavt.transport.zenoh_config import flatten, with_host
+from lavt.transport.zenoh_link import SessionSettings, configured_endpoints
+
+SESSION_FILE = "zenoh-configs/session.json5"
+LOCAL_ENDPOINTS = ("unixsock-stream/", "tcp/127.", "tcp/localhost:", "tcp/[::1]:")
+"""Beginnings of endpoints at which a router listens for programs on its own machine."""
+AS_A_SESSION = {"mode": "client", "listen/endpoints": [], "connect/timeout_ms": 0, "connect/exit_on_failure": True}
+"""Changes of a router's config for a session that makes one attempt to reach the router that this router dials."""
+
+Config = ServerConfig | ClientConfig
+
+
+def side_session(config: Config) -> SessionSettings:
+    """Return the settings of the side's own session: a router, or a session with a separate one."""
+    if not config.zenoh.is_embedded:
+        return _separate(config)
+    return SessionSettings(_router_file(config), _router_changes(config), is_router=True)
+
+
+def program_session(config: Config) -> SessionSettings:
+    """Return the settings for another program on the side's machine, such as `lavt stop`; it never listens.
+
+    The router of such a program is the separate router, the server's embedded router, or the router that the client's
+    embedded router dials.
+    """
+    if not config.zenoh.is_embedded:
+        return _separate(config)
+    path, changes = _router_file(config), _router_changes(config)
+    if isinstance(config, ClientConfig):
+        advice = "is `lavt server` running there, and is video.server the vehicle's address?"
+        return SessionSettings(path, changes | AS_A_SESSION, advice=advice)
+    endpoints = configured_endpoints(path, "listen/endpoints", changes)
+    local = next((endpoint for endpoint in endpoints if endpoint.startswith(LOCAL_ENDPOINTS)), None)
+    if local is None:
+        raise UserError(
+            f"the server's router has no endpoint for programs on its machine: add one to listen.endpoints, in {path} "
+            "or in zenoh.router_settings, such as tcp/127.0.0.1:7447"
+        )
+    return SessionSettings(find_file(Path(SESSION_FILE)), {"connect/endpoints": [local]}, advice="start `lavt server`")
+
+
+def _separate(config: Config) -> SessionSettings:
+    zenoh = config.zenoh
+    changes = {"connect/endpoints": [zenoh.router]} if zenoh.router else {}
+    return SessionSettings(find_file(Path(zenoh.session or SESSION_FILE)), changes)
+
+
+def _router_file(config: Config) -> Path:
+    """Return the config of the embedded router: the file in the config, or the shipped one of this kind of side."""
+    side = "server" if isinstance(config, ServerConfig) else "client"
+    shipped_file = f"zenoh-configs/router-{side}{'-tls' if config.security.key else ''}.json5"
+    return find_file(Path(config.zenoh.router_file or shipped_file))
+
+
+def _router_changes(config: Config) -> dict[str, Any]:
+    """Return the changes of the embedded router's config.
+
+    A client's router listens nowhere. With a shipped file, it dials the address of the vehicle.
+    """
+    changes = flatten(config.zenoh.router_settings)
+    if isinstance(config, ClientConfig):
+        changes.setdefault("listen/endpoints", [])
+        if not config.zenoh.router_file and "connect/endpoints" not in changes:
+            dialled = configured_endpoints(_router_file(config), "connect/endpoints", {})
+            changes["connect/endpoints"] = [with_host(endpoint, config.video.server) for endpoint in dialled]
+    return changes
