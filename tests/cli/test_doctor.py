@@ -135,6 +135,8 @@ VERDICTS: list[tuple[Callable[[], Check], str, str]] = [
     (lambda: check_port("Address already in use", False), "problem", "Address already in use"),
     (lambda: checks.check_router("tcp/127.0.0.1:7447", ""), "ok", "tcp/127.0.0.1:7447"),
     (lambda: checks.check_router("tcp/127.0.0.1:7447", "no router answers"), "problem", "no router answers"),
+    (lambda: checks.check_embedded_router(["tcp/127.0.0.1:7447"], ""), "ok", "can listen at tcp/127.0.0.1:7447"),
+    (lambda: checks.check_embedded_router([], "in use"), "problem", "in use"),
     (lambda: checks.check_link(Routers(1, ("v1", "v1")), has_vehicle=False), "ok", "1 other router"),
     (lambda: checks.check_link(Routers(0, ("v1",)), has_vehicle=True), "ok", "linked to 0 other routers"),
     (lambda: checks.check_link(Routers(0, ("v1",)), has_vehicle=False), "warning", "no link to another one"),
