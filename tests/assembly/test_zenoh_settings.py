@@ -30,6 +30,14 @@ def endpoints(session: SessionSettings, key: str) -> list[str]:
     return configured_endpoints(session.path, f"{key}/endpoints", session.changes)
 
 
+def test_the_default_is_an_embedded_router() -> None:
+    """Without a section `zenoh`, a server or client contains its router; a session file alone is rejected."""
+    assert ServerConfig().zenoh.is_embedded
+    assert ClientConfig().zenoh.is_embedded
+    with pytest.raises(UserError, match=r"set zenoh\.router to the endpoint"):
+        server({"session": "zenoh-configs/session-unix.json5"})
+
+
 @pytest.mark.parametrize(("security", "protocol"), [({}, "udp"), (SERVER_KEYS, "quic")])
 def test_a_servers_router_listens_as_its_file_says(security: dict[str, Any], protocol: str) -> None:
     """A server's embedded router has the unchanged shipped config, the encrypted one if the server has a key."""
@@ -73,7 +81,7 @@ def test_a_separate_router_is_reached_by_the_session_file() -> None:
         session = side_session(config)
         assert session == program_session(config) == SessionSettings(session.path, {"connect/endpoints": ["tcp/h:1"]})
         assert session.path.name == "session.json5"
-    unix = side_session(server({"session": "zenoh-configs/session-unix.json5"}))
+    unix = side_session(server({"router": "", "session": "zenoh-configs/session-unix.json5"}))
     assert endpoints(unix, "connect") == ["unixsock-stream//run/lavt/zenoh.sock"]
 
 
@@ -108,7 +116,7 @@ def test_a_servers_router_without_a_local_endpoint() -> None:
     [
         (EMBEDDED | {"session": "zenoh-configs/session.json5"}, "zenoh.session"),
         ({"router": "tcp/h:1", "router_file": "router.json5"}, "zenoh.router_file"),
-        ({"router_settings": {"mode": "router"}}, "zenoh.router_settings"),
+        ({"router": "", "router_settings": {"mode": "router"}}, "zenoh.router_settings"),
     ],
 )
 def test_keys_of_the_other_kind_of_router(zenoh: dict[str, Any], key: str) -> None:

@@ -54,6 +54,11 @@ class Pair:
         self.port, self.probe_port = free_port(), free_port()
         self._keys = keys
 
+    @property
+    def is_plain(self) -> bool:
+        """Whether both sides are without keys."""
+        return self._keys is None
+
     def server(self) -> list[str]:
         """Return the server's arguments."""
         listen = {"endpoints": [(PLAIN if self._keys is None else ENCRYPTED).format(self.port)]}
@@ -123,7 +128,8 @@ def listening_tcp_ports(pid: int) -> list[int]:
 def test_two_commands_are_enough(pair: Pair, tmp_path: Path) -> None:
     """Two processes are enough for a client to get control of a server and to stop it, plain and secure.
 
-    Here the client starts first. Its machine accepts no connections, and `lavt stop` reaches the vehicle directly.
+    Here the client starts first. Its machine accepts no connections, and `lavt stop` reaches the vehicle directly. A
+    plain side says once that it is plain.
     """
     with Processes(tmp_path) as processes:
         client = processes.start("client", *pair.client())
@@ -139,6 +145,8 @@ def test_two_commands_are_enough(pair: Pair, tmp_path: Path) -> None:
         assert (stopped.returncode, stopped.stdout) == (0, "vehicle-1 accepted the emergency stop\n"), stopped.stderr
         wait_until("the server reports the stop", lambda: "emergency_stop" in str(server.latest))
     assert (client.popen.returncode, server.popen.returncode) == (0, 0)
+    for side in ("client", "server"):
+        assert (tmp_path / f"{side}.log").read_text().count("this side is plain") == pair.is_plain
 
 
 def test_standard_output_has_lines_of_json_only() -> None:

@@ -15,7 +15,7 @@ EMBEDDED = "embedded"
 class ZenohConfig(Section):
     """The router of this side: in the side's process, or a separate program to which the side has a session."""
 
-    router: str = ""
+    router: str = EMBEDDED
     """`embedded`, or the endpoint of a separate router; empty: a separate router, at the endpoint in `session`."""
     session: str = ""
     """For a separate router, the config of the session, in JSON5: a path, or the name of a shipped file; empty:
@@ -36,8 +36,7 @@ class ZenohConfig(Section):
     def _check_kind(self) -> ZenohConfig:
         if self.is_embedded and self.session:
             raise ValueError(
-                f"zenoh.session is for a separate router: leave it out, or replace zenoh.router: {EMBEDDED} by the "
-                "endpoint of a router"
+                "zenoh.session is for a separate router: leave it out, or set zenoh.router to the endpoint of a router"
             )
         if not self.is_embedded and (self.router_file or self.router_settings):
             raise ValueError(

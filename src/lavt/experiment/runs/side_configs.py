@@ -16,7 +16,6 @@ from lavt.config import (
     ServerVideoConfig,
     ZenohConfig,
 )
-from lavt.config.zenoh import EMBEDDED
 from lavt.transport.clock_sync import probe
 
 LOCAL_TCP = "tcp/127.0.0.1:0"
@@ -26,7 +25,7 @@ SERVER_LISTENS = (LOCAL_TCP, "udp/127.0.0.1:0?rel=1;mixed_rel=1")
 def embedded_router(*, listen: Sequence[str] = (), dialled: Sequence[str] = ()) -> ZenohConfig:
     """Return the config of an embedded router with these endpoints."""
     settings = {key: {"endpoints": list(endpoints)} for key, endpoints in (("listen", listen), ("connect", dialled))}
-    return ZenohConfig(router=EMBEDDED, router_settings=settings)
+    return ZenohConfig(router_settings=settings)
 
 
 def server_config(run: RunConfig, seed: int, *, zenoh: ZenohConfig | None = None) -> ServerConfig:
