@@ -149,6 +149,29 @@ def test_two_commands_are_enough(pair: Pair, tmp_path: Path) -> None:
         assert (tmp_path / f"{side}.log").read_text().count("this side is plain") == pair.is_plain
 
 
+def messages(process: Process) -> str:
+    """Return the session's log that a process has printed."""
+    lines = list(process._first.queue)
+    return "\n".join(message for line in lines if line for message in line.get("said", []))
+
+
+def test_a_client_outlives_a_killed_server(pair: Pair, tmp_path: Path) -> None:
+    """If a server is killed with its router, the client continues without states, and gets control of the next one."""
+    with Processes(tmp_path) as processes:
+        server = processes.start("server", *pair.server())
+        server.wait_ready()
+        client = processes.start("client", *pair.client(), *options("controller.rearm=true"))
+        wait_until("the client has control", lambda: has_control(client))
+        server.popen.kill()
+        wait_until("the client misses the states", lambda: "no state from the vehicle for" in messages(client))
+        assert client.running
+        next_server = processes.start("next-server", *pair.server())
+        next_server.wait_ready()
+        wait_until("the client receives states again", lambda: "state received again" in messages(client))
+        wait_until("the client has control of the next server", lambda: "operator-1" in str(next_server.latest))
+    assert (client.popen.returncode, next_server.popen.returncode) == (0, 0)
+
+
 def test_standard_output_has_lines_of_json_only() -> None:
     """With RUST_LOG set, Zenoh's log goes to standard error, and standard output has lines of JSON only."""
     process = subprocess.Popen(
