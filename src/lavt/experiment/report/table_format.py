@@ -6,7 +6,7 @@ import csv
 import io
 import re
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -68,6 +68,22 @@ class TableData:
         ]
         columns = [self.columns[index] for index in known]
         return TableData(columns, [[row[index] for index in known] for row in self.rows])
+
+
+def table_of_entries(entries: Iterable[Mapping[str, Any]], columns: Sequence[tuple[Column, str]]) -> TableData:
+    """Return the table with a row for each entry, without empty columns.
+
+    `columns` has each column with the key of its values in an entry; "a.b" is the key `b` of the nested entry `a`.
+    """
+    rows = [[_nested_value(entry, key) for _, key in columns] for entry in entries]
+    return TableData([column for column, _ in columns], rows).without_empty_columns()
+
+
+def _nested_value(entry: Mapping[str, Any], key: str) -> Any:
+    value: Any = entry
+    for name in key.split("."):
+        value = (value or {}).get(name)
+    return value
 
 
 def text_column(title: str, *, is_long: bool = False) -> Column:

@@ -45,10 +45,11 @@ def summarize_condition(all_runs: Sequence[Run], distances: CommonDistances) -> 
     """Summarize the valid runs of one condition."""
     runs = [run for run in all_runs if run["valid"]]
     routes = group_by(runs, "route")
-    p95_m, p95_common_m = _completed_p95_m(runs), common_p95_m(runs, distances)
+    p95_m, p95_common_m = _completed_values(runs, "p95_m"), common_p95_m(runs, distances)
     curves = {name: survival(routes[name]) for name in sorted(routes)}
     return {
         **completion(runs),
+        **own_lane_completion(runs),
         "completion_interval_over_roads": bootstrap_interval(road_rates(runs)),
         "endings": dict(sorted(Counter(str(run["ending"]) for run in runs).items())),
         "routes": {name: _summarize_route(routes[name], distances) for name in sorted(routes)},
@@ -58,10 +59,13 @@ def summarize_condition(all_runs: Sequence[Run], distances: CommonDistances) -> 
         "lane_invasions_per_km": _per_km(runs, "lane_invasions"),
         "p95_m": _mean(p95_m),
         "p95_interval": bootstrap_interval(p95_m),
+        "followed_p95_m": _mean(_completed_values(runs, "followed_p95_m")),
         "p95_common_m": _mean(p95_common_m),
         "p95_common_interval": bootstrap_interval(p95_common_m),
         "p95_worst_rank_m": worst_rank_m(runs),
         **{name: _mean([run[name] for run in runs if run.get(name) is not None]) for name in MEANS},
+        **{f"{name}_per_run": _lane_kept_mean(runs, name) for name in ("followed_changes", "occupied_changes")},
+        "own_lane_share": _lane_kept_mean(runs, "own_lane_share"),
         "injected_ms": _injected_ms(all_runs),
         "tau_v_ms": _latency([run["tau_v_ms"] for run in runs], bounded=True),
         "tau_c_ms": _latency([run["tau_c_ms"] for run in runs], bounded=True),
@@ -81,6 +85,19 @@ def completion(runs: Sequence[Run]) -> dict[str, Any]:
         "completed": completed,
         "completion_rate": completed / len(runs) if runs else None,
         "completion_interval": exact_interval(completed, len(runs)),
+    }
+
+
+def own_lane_completion(runs: Sequence[Run]) -> dict[str, Any]:
+    """Return how many of these valid runs were completed in their own lane, the rate, and its exact interval.
+
+    Runs of which this is unknown are left out of the rate.
+    """
+    known = [run["completed_in_own_lane"] for run in runs if run.get("completed_in_own_lane") is not None]
+    return {
+        "completed_in_own_lane": sum(known) if known else None,
+        "own_lane_completion_rate": sum(known) / len(known) if known else None,
+        "own_lane_completion_interval": exact_interval(sum(known), len(known)),
     }
 
 
@@ -155,13 +172,19 @@ def _start_key(run: Run) -> tuple[Any, ...]:
 def _summarize_route(runs: Sequence[Run], distances: CommonDistances) -> dict[str, Any]:
     return {
         **completion(runs),
-        "p95_m": _mean(_completed_p95_m(runs)),
+        "completed_in_own_lane": own_lane_completion(runs)["completed_in_own_lane"],
+        "p95_m": _mean(_completed_values(runs, "p95_m")),
+        "followed_p95_m": _mean(_completed_values(runs, "followed_p95_m")),
         "p95_common_m": _mean(common_p95_m(runs, distances)),
     }
 
 
-def _completed_p95_m(runs: Sequence[Run]) -> list[float]:
-    return [run["p95_m"] for run in runs if run["ending"] == "completed" and run["p95_m"] is not None]
+def _completed_values(runs: Sequence[Run], name: str) -> list[float]:
+    return [run[name] for run in runs if run["ending"] == "completed" and run.get(name) is not None]
+
+
+def _lane_kept_mean(runs: Sequence[Run], name: str) -> float | None:
+    return _mean([run["lane_kept"][name] for run in runs if run.get("lane_kept")])
 
 
 def _mean(values: Sequence[float]) -> float | None:
