@@ -48,6 +48,10 @@ NEW_CONDITION_KEYS = (
     "own_lane_completion_rate",
     "own_lane_completion_interval",
     "followed_p95_m",
+    "followed_p95_route_balanced_m",
+    "p95_route_balanced_m",
+    "p95_routes",
+    "by_road",
     "own_lane_share",
     "followed_changes_per_run",
     "occupied_changes_per_run",
@@ -168,7 +172,8 @@ def test_results_are_compared_with_the_paper(tmp_path: Path) -> None:
     row = re.search(r"<tr><td class=\"text\">L3 – L4</td>(.*?)</tr>", parts["contrasts"])
     assert row is not None
     pairs, completed_under_one_only, p_values, paper_p_values = ["6"], ["0", "0"], ["1", "1"], ["0.78", "1"]
-    assert text_of(row[1]).split() == [*pairs, *completed_under_one_only, *p_values, *paper_p_values]
+    by_road = ["2", "0", "0", "1", "1"]
+    assert text_of(row[1]).split() == [*pairs, *completed_under_one_only, *p_values, *by_road, *paper_p_values]
 
 
 def test_survival_curves_have_data_files(tmp_path: Path) -> None:
@@ -260,6 +265,18 @@ def test_a_summary_of_an_older_version_is_reported(tmp_path: Path) -> None:
     assert {cells[1] for cells in shown.values()} == {"0", "100"}
 
 
+def test_few_roads_allow_no_statement_about_roads(tmp_path: Path) -> None:
+    """With three roads the report says that no statement by road is possible; with six it says to quote it."""
+    for count, expected in ((3, "No statement about other roads"), (6, "Quote the columns “by road”")):
+        runs = [run_of(name, route=f"road{number}") for name in ("L2", "L3") for number in range(count)]
+        parts = parts_of(report_of(summarize(runs, None), tmp_path), "conditions", "contrasts")
+        conditions, contrasts = (text_of(html).replace("\N{NO-BREAK SPACE}", " ") for html in parts.values())
+        assert expected in conditions
+        assert ("no interval, 3 roads" in conditions) == (count == 3)
+        assert ("With 3 roads it cannot be below 0.25" in contrasts) == (count == 3)
+        assert "Quote “p by road”" in contrasts
+
+
 def csv_rows(path: Path) -> list[dict[str, str]]:
     return list(csv.DictReader(path.read_text().splitlines()))
 
@@ -290,7 +307,10 @@ def test_the_headline_has_completion_in_the_own_lane(tmp_path: Path) -> None:
         "0.5",
         "0.0",
     ]
-    assert [float(row[name]) for name in row if name.startswith("p95 m")] == pytest.approx([2.0, 0.3])
+    errors = ("p95 m, completed runs, mean of routes", "p95 m against the lane followed, mean of routes")
+    assert [float(row[name]) for name in errors] == pytest.approx([2.0, 0.3])
+    assert (row["completed, by road mean (share)"], row["completed, by road low (share)"]) == ("1.0", "")
+    assert row["completed, by road roads (share)"] == "2"
     (change,) = csv_rows(tmp_path / "tables" / "lane_changes.csv")
     assert change == {
         "run": "b_L0_0",

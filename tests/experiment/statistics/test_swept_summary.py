@@ -54,6 +54,10 @@ CONDITION_KEYS = {
     "lane_invasions_per_km",
     "p95_m",
     "p95_interval",
+    "p95_route_balanced_m",
+    "p95_routes",
+    "followed_p95_route_balanced_m",
+    "by_road",
     "followed_p95_m",
     "own_lane_share",
     "followed_changes_per_run",
@@ -108,7 +112,10 @@ def test_every_key_is_present(summary: Any) -> None:
             assert list(condition["routes"]) == list(condition["survival"]) == ["a_key", "b_key"]
             assert all(route.keys() == ROUTE_KEYS for route in condition["routes"].values())
     assert [contrast.keys() for contrast in summary["contrasts"]] == [
-        {"a", "b", "pairs", "only_a", "only_b", "p", "p_holm"}
+        {
+            *("a", "b", "pairs", "only_a", "only_b", "p", "p_holm"),
+            *("roads", "roads_for_a", "roads_for_b", "p_by_road", "p_by_road_holm"),
+        }
     ]
     assert summary["contrasts"][0]["pairs"] == 2
     assert summary["paper"]["conditions"]["L1"]["completed"] == 28

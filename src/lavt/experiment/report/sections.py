@@ -146,7 +146,7 @@ def degradation_parts(report: ReportContext) -> Parts:
     caption = (
         "Completion and error over the median loop latency (from a frame's stamp to the application of its command), "
         "and over the mean frame age (the age of the frame from which the command in force was made). Bars are 95 % "
-        "intervals. Names above each other are in the vertical order of their points."
+        "intervals for these routes. Names above each other are in the vertical order of their points."
         + (PAPER_POINTS if paper else "")
         + _base_note(report)
     )
