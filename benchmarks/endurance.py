@@ -130,16 +130,17 @@ def describe_growth(samples: Mapping[str, Sequence[ResourceSample]], latency_ms:
 
 def long_road(length_km: float) -> str:
     """Return a road file of at least this length: straights, and curves of 200 m radius to either side."""
-    segments = [
-        segment
-        for kilometre in range(math.ceil(length_km))
-        for segment in (
+    segments: list[dict[str, float]] = []
+    for kilometre in range(math.ceil(length_km)):
+        bend_per_m = 0.005 * (-1) ** kilometre
+        segments += (
             {"length_m": 500.0},
-            {"length_m": 100.0, "end_curvature_per_m": 0.005 * (-1) ** kilometre},
-            {"length_m": 300.0, "curvature_per_m": 0.005 * (-1) ** kilometre},
-            {"length_m": 100.0, "curvature_per_m": 0.005 * (-1) ** kilometre, "end_curvature_per_m": 0.0},
+            {"length_m": 100.0, "end_curvature_per_m": bend_per_m},
+            {"length_m": 300.0, "curvature_per_m": bend_per_m},
+            {"length_m": 100.0, "curvature_per_m": bend_per_m, "end_curvature_per_m": 0.0},
         )
-    ]
+    while sum(segment["length_m"] for segment in segments[:-1]) >= length_km * 1000:
+        segments.pop()
     rails = [{"offset_m": -3.5}, {"offset_m": 7.0}]
     return json.dumps(
         {"title": "long", "segments": segments, "lanes": {"widths_m": [3.5, 3.5], "driven": 1}, "rails": rails}

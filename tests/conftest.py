@@ -26,9 +26,12 @@ hypothesis.settings.load_profile("lavt")
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """Return the number of processors for tests that can run in parallel, or 0: the tests run in this process."""
+    """Return the number of workers: 0 if the tests run in this process, otherwise one more than there are processors.
+
+    Some tests only wait for other processes. Meanwhile the additional worker uses the processor.
+    """
     directories = [Path(argument.partition("::")[0]).resolve() for argument in config.args]
     if not runs_in_parallel(config.option.markexpr, directories):
         return 0
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
-    return len(os.sched_getaffinity(0))
+    return len(os.sched_getaffinity(0)) + 1

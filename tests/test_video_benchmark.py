@@ -180,9 +180,11 @@ def test_growth_on_a_long_road_is_an_error(
     assert f"grew by {60 * kb_per_s} kB/min" in capsys.readouterr().out
 
 
-def test_the_long_road_has_the_requested_length() -> None:
-    """The road of the benchmark is at least as long as requested."""
-    assert parse_road(endurance.long_road(4.5), "long.yaml").route_length_m == pytest.approx(5000.0)
+@pytest.mark.parametrize(("requested_km", "length_m"), [(0.1, 500.0), (1.0, 1000.0), (4.55, 4600.0)])
+def test_the_long_road_has_the_requested_length(requested_km: float, length_m: float) -> None:
+    """The road of the benchmark ends with the first segment that makes it as long as requested."""
+    road = parse_road(endurance.long_road(requested_km), "long.yaml")
+    assert road.route_length_m == pytest.approx(length_m)
 
 
 @pytest.mark.full

@@ -401,7 +401,7 @@ def test_a_failed_search_does_not_stop_the_others(monkeypatch: pytest.MonkeyPatc
     assert "a_key paper_calibrated 01: failed: the vehicle was never armed" in lines
 
 
-DEATHS = {0: 0, 1: 3, 2: 2, 3: 1, 4: 0}
+DEATHS = {0: 0, 1: 3, 2: 2}
 """The number of processes that die in the search of each repetition."""
 
 
@@ -420,9 +420,9 @@ def die_or_return_entry(search: boundary_module.BoundarySearch) -> dict[str, Any
 def test_searches_of_a_dead_process_are_repeated(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A search whose process dies is repeated twice; only a search whose processes died three times has failed."""
     monkeypatch.setattr(boundary_module, "run_search", die_or_return_entry)
-    searches = plan_boundary(small_search("repetitions=5", f"study.participant={tmp_path}"))
+    searches = plan_boundary(small_search("repetitions=3", f"study.participant={tmp_path}"))
     results, failed, completed = run_searches(searches, jobs=2, on_progress=lambda _: None)
-    assert [run["repetition"] for run in results] == [0, 2, 3, 4]
+    assert [run["repetition"] for run in results] == [0, 2]
     assert failed == [{"name": "a_key paper_calibrated 01", "why": "each of the processes that searched it died"}]
     assert completed
 

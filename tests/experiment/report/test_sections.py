@@ -14,6 +14,7 @@ import pytest
 
 from lavt.experiment.analysis.results import run_result, write_json
 from lavt.experiment.report import boundary_section
+from lavt.experiment.report.condition_sections import conditions_parts, contrast_parts
 from lavt.experiment.report.figure_style import condition_colours
 from lavt.experiment.report.groups import axes_of, differing_settings, is_in_group, sort_groups, title_of
 from lavt.experiment.report.report import write_report
@@ -21,8 +22,6 @@ from lavt.experiment.report.run_figures import drawn_indexes
 from lavt.experiment.report.sections import (
     ReportContext,
     axis_parts,
-    conditions_parts,
-    contrast_parts,
     degradation_parts,
     group_parts,
     injected_parts,
@@ -45,6 +44,17 @@ NEW_CONDITION_KEYS = (
     "completion_interval_over_roads",
     "endings",
     "routes",
+    "completed_in_own_lane",
+    "own_lane_completion_rate",
+    "own_lane_completion_interval",
+    "followed_p95_m",
+    "followed_p95_route_balanced_m",
+    "p95_route_balanced_m",
+    "p95_routes",
+    "by_road",
+    "own_lane_share",
+    "followed_changes_per_run",
+    "occupied_changes_per_run",
     "p95_common_m",
     "p95_common_interval",
     "p95_worst_rank_m",
@@ -162,7 +172,8 @@ def test_results_are_compared_with_the_paper(tmp_path: Path) -> None:
     row = re.search(r"<tr><td class=\"text\">L3 – L4</td>(.*?)</tr>", parts["contrasts"])
     assert row is not None
     pairs, completed_under_one_only, p_values, paper_p_values = ["6"], ["0", "0"], ["1", "1"], ["0.78", "1"]
-    assert text_of(row[1]).split() == [*pairs, *completed_under_one_only, *p_values, *paper_p_values]
+    by_road = ["2", "0", "0", "1", "1"]
+    assert text_of(row[1]).split() == [*pairs, *completed_under_one_only, *p_values, *by_road, *paper_p_values]
 
 
 def test_survival_curves_have_data_files(tmp_path: Path) -> None:
@@ -247,11 +258,68 @@ def test_a_summary_of_an_older_version_is_reported(tmp_path: Path) -> None:
         "routes",
     ]
     rows = re.findall(r'<tr><td class="text">(L\d)</td>(.*?)</tr>', parts["conditions"])
-    assert [name for name, _ in rows] == [*INJECTED] * 3
+    assert [name for name, _ in rows] == [*INJECTED] * 4
     shown = {name: text_of(cells).split() for name, cells in rows[: len(INJECTED)]}
     for name, condition in summary["conditions"].items():
         assert shown[name][:2] == [f"{condition['runs']}", f"{100 * condition['completion_rate']:.0f}"]
     assert {cells[1] for cells in shown.values()} == {"0", "100"}
+
+
+def test_few_roads_allow_no_statement_about_roads(tmp_path: Path) -> None:
+    """With three roads the report says that no statement by road is possible; with six it says to quote it."""
+    for count, expected in ((3, "No statement about other roads"), (6, "Quote the columns “by road”")):
+        runs = [run_of(name, route=f"road{number}") for name in ("L2", "L3") for number in range(count)]
+        parts = parts_of(report_of(summarize(runs, None), tmp_path), "conditions", "contrasts")
+        conditions, contrasts = (text_of(html).replace("\N{NO-BREAK SPACE}", " ") for html in parts.values())
+        assert expected in conditions
+        assert ("no interval, 3 roads" in conditions) == (count == 3)
+        assert ("With 3 roads it cannot be below 0.25" in contrasts) == (count == 3)
+        assert "Quote “p by road”" in contrasts
+
+
+def csv_rows(path: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader(path.read_text().splitlines()))
+
+
+KEPT = {"own_lane_share": 1.0, "followed_changes": 0, "occupied_changes": 0, "changes": []}
+CHANGE = {"lane": "followed", "mono_ns": 5, "progress_m": 40.0, "from": 0, "to": -1}
+
+
+def test_the_headline_has_completion_in_the_own_lane(tmp_path: Path) -> None:
+    """The headline has completion, completion in the own lane, collisions, and P95 against both lanes."""
+    runs = [
+        run_of("L0", followed_p95_m=0.1, completed_in_own_lane=True, lane_kept=KEPT),
+        run_of(
+            "L0",
+            "b",
+            p95_m=3.9,
+            followed_p95_m=0.5,
+            completed_in_own_lane=False,
+            lane_kept={**KEPT, "changes": [CHANGE]},
+        ),
+    ]
+    report = report_of(summarize(runs, None), tmp_path)
+    conditions_parts(report)
+    run_parts(report)
+    (row,) = csv_rows(tmp_path / "tables" / "conditions_virtual_headline.csv")
+    assert [row[name] for name in ("completed (share)", "completed in own lane (share)", "collisions / run")] == [
+        "1.0",
+        "0.5",
+        "0.0",
+    ]
+    errors = ("p95 m, completed runs, mean of routes", "p95 m against the lane followed, mean of routes")
+    assert [float(row[name]) for name in errors] == pytest.approx([2.0, 0.3])
+    assert (row["completed, by road mean (share)"], row["completed, by road low (share)"]) == ("1.0", "")
+    assert row["completed, by road roads (share)"] == "2"
+    (change,) = csv_rows(tmp_path / "tables" / "lane_changes.csv")
+    assert change == {
+        "run": "b_L0_0",
+        "lane": "followed",
+        "server's monotonic clock ns": "5",
+        "distance m": "40.0",
+        "from lane": "0",
+        "to lane": "-1",
+    }
 
 
 def test_two_presets_are_separate_groups(tmp_path: Path) -> None:

@@ -2,7 +2,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from lavt.experiment.statistics.conditions import common_distances, common_p95_m, worst_rank_m
+import pytest
+
+from lavt.experiment.statistics.conditions import common_distances, common_p95_m, own_lane_completion, worst_rank_m
 
 
 def run(by_10m: list[float] | None = None, **changes: Any) -> dict[str, Any]:
@@ -32,6 +34,15 @@ def test_repetitions_with_under_ten_metres_are_left_out() -> None:
     runs = [run([0.1]), run([]), run([0.4], repetition=1), run(None, repetition=1)]
     assert common_p95_m(runs, common_distances(runs)) == [0.4]
     assert common_p95_m([], common_distances([])) == []
+
+
+def test_completion_in_the_own_lane() -> None:
+    """One of two known runs kept its lane: the rate is a half; a run of an older version is left out."""
+    runs = [run(completed_in_own_lane=True), run(completed_in_own_lane=False), run(completed_in_own_lane=None), run()]
+    completion = own_lane_completion(runs)
+    assert (completion["completed_in_own_lane"], completion["own_lane_completion_rate"]) == (1, 0.5)
+    assert completion["own_lane_completion_interval"] == pytest.approx([0.0126, 0.9874], abs=1e-4)
+    assert set(own_lane_completion([run()]).values()) == {None}
 
 
 def test_runs_not_completed_rank_last() -> None:

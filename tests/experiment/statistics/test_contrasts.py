@@ -50,8 +50,33 @@ def test_a_contrast_pairs_runs_of_one_route_repetition_and_seed() -> None:
             "only_b": 1,
             "p": pytest.approx(p_of_5_against_1),
             "p_holm": p_of_5_against_1,
+            "roads": 1,
+            "roads_for_a": 1,
+            "roads_for_b": 0,
+            "p_by_road": 1.0,
+            "p_by_road_holm": 1.0,
         }
     ]
+
+
+def test_the_sign_test_counts_each_road_once() -> None:
+    """A route and its key part are one road; six roads for one condition give p = 2 / 2^6, three give 0.25."""
+    roads = [*"abcdef"]
+    good = [run for road in roads for route in (road, f"{road}_key") for run in runs("L0", "ccc", route=route)]
+    bad = [run for road in roads for route in (road, f"{road}_key") for run in runs("L1", "xxc", route=route)]
+    (contrast,) = paired_contrasts([*good, *bad])
+    assert (contrast["pairs"], contrast["roads"], contrast["roads_for_a"], contrast["roads_for_b"]) == (36, 6, 6, 0)
+    assert contrast["p"] == pytest.approx(2 / 2**24)
+    assert contrast["p_by_road"] == pytest.approx(2 / 2**6)
+    (few,) = paired_contrasts([run for run in (*good, *bad) if run["route"][0] in "abc"])
+    assert few["p_by_road"] == pytest.approx(0.25)
+
+
+def test_roads_without_a_difference_do_not_count() -> None:
+    """A road with one pair for each condition is a tie; Holm's correction covers the tests by road."""
+    tie = [*runs("L0", "cx", route="a"), *runs("L1", "xc", route="a")]
+    contrasts = paired_contrasts([*tie, *runs("L0", "cc", route="b"), *runs("L1", "xc", route="b")])
+    assert [contrasts[0][key] for key in ("roads", "roads_for_a", "roads_for_b", "p_by_road")] == [2, 1, 0, 1.0]
 
 
 def test_holms_correction_is_over_all_contrasts() -> None:

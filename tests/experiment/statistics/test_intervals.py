@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from lavt.experiment.statistics.intervals import bootstrap_interval, exact_interval, holm
+from lavt.experiment.statistics.intervals import (
+    bootstrap_interval,
+    cluster_interval,
+    exact_interval,
+    holm,
+    stratified_interval,
+)
 
 
 @pytest.mark.parametrize(
@@ -93,6 +99,44 @@ def test_the_bootstrap_of_three_is_their_range() -> None:
     """
     assert bootstrap_interval([0.2, 1.0, 0.6]) == pytest.approx([0.2, 1.0])
     assert bootstrap_interval([1.0, 1.0, 1.0]) == [1.0, 1.0]
+
+
+def test_differences_between_strata_do_not_widen_the_interval() -> None:
+    """Three strata of equal spread and different means have the interval of one stratum with all their deviations."""
+    deviations = [-0.02, -0.01, 0.0, 0.01, 0.02]
+    apart = stratified_interval([[centre + deviation for deviation in deviations] for centre in (0.0, 1.0, 5.0)])
+    together = bootstrap_interval([2.0 + deviation for deviation in deviations * 3])
+    assert apart is not None
+    assert together is not None
+    assert apart == pytest.approx(together, abs=0.0006)
+    pooled = bootstrap_interval([centre + deviation for centre in (0.0, 1.0, 5.0) for deviation in deviations])
+    assert pooled is not None
+    assert pooled[1] - pooled[0] > 50 * (apart[1] - apart[0])
+
+
+def test_strata_weigh_as_many_runs_as_they_have() -> None:
+    """The interval is that of the mean of all values; a stratum with one value has a weight, but no spread."""
+    assert stratified_interval([[1.0, 1.0, 1.0], [5.0]]) == [2.0, 2.0]
+    assert stratified_interval([[1.0], [5.0], []]) is None
+    assert stratified_interval([]) is None
+
+
+def test_fewer_than_six_clusters_have_no_interval() -> None:
+    """Five values have no interval, six have one, and six equal values have none."""
+    assert cluster_interval([0.1, 0.5, 0.2, 0.9, 0.4]) is None
+    assert cluster_interval([0.1, 0.5, 0.2, 0.9, 0.4, 0.3]) is not None
+    assert cluster_interval([0.5] * 6) is None
+
+
+@pytest.mark.parametrize("clusters", [6, 10, 30])
+def test_the_interval_of_clusters_covers_the_population(clusters: int) -> None:
+    """For normally distributed clusters, the interval covers the true mean in about 95 % of 300 experiments."""
+    generator = np.random.default_rng(1)
+    covered = 0
+    for _ in range(300):
+        low, high = cluster_interval(generator.normal(0.0, 1.0, clusters).tolist()) or [1.0, 0.0]
+        covered += low <= 0.0 <= high
+    assert covered >= 0.92 * 300
 
 
 def test_holms_correction() -> None:

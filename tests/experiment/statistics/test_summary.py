@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from lavt.experiment.statistics.conditions import road_rates
+from lavt.experiment.statistics.by_road import road_rates
 from lavt.experiment.statistics.intervals import exact_interval
 from lavt.experiment.statistics.summary import summarize
 
@@ -109,6 +109,37 @@ def test_completion_by_route_and_by_road() -> None:
     assert condition["routes"]["b"]["completion_interval"] == pytest.approx([0.0, 1 - 0.025**0.2])
     assert condition["routes"]["b"]["p95_m"] is None
     assert condition["survival"]["b"]["surviving"][-1] == 0.0
+
+
+def test_p95_of_the_routes_has_equal_weights() -> None:
+    """A route with three completed runs and one with a single one count equally; one without any is left out."""
+    runs = [run(p95_m=1.0)] * 3 + [run(route="B", p95_m=5.0), run(route="C", ending="collision", p95_m=9.0)]
+    condition = summarize(runs, SPEED)["conditions"]["L0"]
+    assert (condition["p95_m"], condition["p95_route_balanced_m"], condition["p95_routes"]) == (2.0, 3.0, 2)
+
+
+def test_results_by_road() -> None:
+    """Each road counts once; with six roads there is an interval, with five none."""
+    roads = [run(route=f"road{number}", p95_m=float(number)) for number in range(6)]
+    runs = [*roads, *(run(route="road0", ending="collision", collisions=1) for _ in range(3))]
+    by_road = summarize(runs, SPEED)["conditions"]["L0"]["by_road"]
+    assert by_road["completion_rate"]["mean"] == pytest.approx((0.25 + 5) / 6)
+    assert by_road["collisions_per_run"]["mean"] == pytest.approx(0.75 / 6)
+    assert (by_road["p95_m"]["mean"], by_road["p95_m"]["roads"]) == (2.5, 6)
+    assert 0.0 <= by_road["p95_m"]["low"] < 1.0
+    assert 4.0 < by_road["p95_m"]["high"] <= 5.0
+    assert by_road["own_lane_completion_rate"] == {"roads": 0, "mean": None, "low": None, "high": None}
+    few = summarize(runs[1:6], SPEED)["conditions"]["L0"]["by_road"]
+    assert few["p95_m"] == {"roads": 5, "mean": 3.0, "low": None, "high": None}
+
+
+def test_a_rate_that_is_equal_on_all_roads_has_an_exact_interval() -> None:
+    """Six roads that are all completed give 54 to 100 %, as six of six; three such roads give no interval."""
+    runs = [run(route=f"road{number}") for number in range(6)]
+    by_road = summarize(runs, SPEED)["conditions"]["L0"]["by_road"]
+    assert [by_road["completion_rate"][key] for key in ("low", "high")] == exact_interval(6, 6)
+    assert by_road["collisions_per_run"]["low"] is None
+    assert summarize(runs[:3], SPEED)["conditions"]["L0"]["by_road"]["completion_rate"]["low"] is None
 
 
 @pytest.mark.parametrize("suffix", ["", ".yaml", ".yml"])

@@ -28,6 +28,12 @@ RUN_KEYS = {
     "collisions_per_km",
     "lane_invasions_per_km",
     "p95_by_10m",
+    "completed_in_own_lane",
+    "lane_kept",
+    "followed_mae_m",
+    "followed_rms_m",
+    "followed_p95_m",
+    "followed_max_m",
     "age_at_actuation_ms",
     "stages_ms",
 }
@@ -36,6 +42,9 @@ CONDITION_KEYS = {
     "completed",
     "completion_rate",
     "completion_interval",
+    "completed_in_own_lane",
+    "own_lane_completion_rate",
+    "own_lane_completion_interval",
     "completion_interval_over_roads",
     "endings",
     "routes",
@@ -45,6 +54,14 @@ CONDITION_KEYS = {
     "lane_invasions_per_km",
     "p95_m",
     "p95_interval",
+    "p95_route_balanced_m",
+    "p95_routes",
+    "followed_p95_route_balanced_m",
+    "by_road",
+    "followed_p95_m",
+    "own_lane_share",
+    "followed_changes_per_run",
+    "occupied_changes_per_run",
     "p95_common_m",
     "p95_common_interval",
     "p95_worst_rank_m",
@@ -63,7 +80,16 @@ CONDITION_KEYS = {
     "stages_ms",
     "survival",
 }
-ROUTE_KEYS = {"runs", "completed", "completion_rate", "completion_interval", "p95_m", "p95_common_m"}
+ROUTE_KEYS = {
+    "runs",
+    "completed",
+    "completion_rate",
+    "completion_interval",
+    "completed_in_own_lane",
+    "p95_m",
+    "followed_p95_m",
+    "p95_common_m",
+}
 
 
 @pytest.fixture(scope="module")
@@ -86,10 +112,23 @@ def test_every_key_is_present(summary: Any) -> None:
             assert list(condition["routes"]) == list(condition["survival"]) == ["a_key", "b_key"]
             assert all(route.keys() == ROUTE_KEYS for route in condition["routes"].values())
     assert [contrast.keys() for contrast in summary["contrasts"]] == [
-        {"a", "b", "pairs", "only_a", "only_b", "p", "p_holm"}
+        {
+            *("a", "b", "pairs", "only_a", "only_b", "p", "p_holm"),
+            *("roads", "roads_for_a", "roads_for_b", "p_by_road", "p_by_road_holm"),
+        }
     ]
     assert summary["contrasts"][0]["pairs"] == 2
     assert summary["paper"]["conditions"]["L1"]["completed"] == 28
+
+
+def test_without_delay_the_own_lane_is_kept(summary: Any) -> None:
+    """At L0 and L1, the runs are completed in their own lane, with equal errors against both lanes."""
+    for run in summary["runs"]:
+        assert run["completed_in_own_lane"]
+        assert run["lane_kept"]["own_lane_share"] == 1.0
+        assert run["lane_kept"]["lane_width_m"] == pytest.approx(3.5)
+        assert run["followed_p95_m"] == pytest.approx(run["p95_m"])
+    assert summary["conditions"]["L1"]["own_lane_completion_rate"] == 1.0
 
 
 def test_stage_latencies_add_up_to_the_loop_latency(summary: Any) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.experiment.analysis.clocks import RunClocks, run_clocks
+from lavt.experiment.analysis.lane_kept import completed_in_own_lane, lane_kept
 from lavt.experiment.analysis.latency import (
     ages_at_actuation_ns,
     control_latency_ns,
@@ -77,10 +78,14 @@ def measure(server: Record, client: Record) -> RunMeasurement:
     began_ns, ended_ns, ending = driving_interval(server)
     has_begun = began_ns <= ended_ns
     clocks = run_clocks(server, client, began_ns, ended_ns)
+    truth, route, frames = (server.table(name) for name in ("truth", "route", "frame"))
+    kept = lane_kept(truth, route, frames, client.table("lane"), (began_ns, ended_ns))
     latencies, closure_p95_ms = _latencies(server, client, began_ns, ended_ns, clocks)
     entry = {
         "ending": ending,
         **_tracking(server, began_ns, ended_ns),
+        "completed_in_own_lane": completed_in_own_lane(ending, kept["lane_kept"]),
+        **kept,
         "duration_s": (ended_ns - began_ns) / NS_PER_S if has_begun else None,
         **latencies,
         "delta": clocks.entry,

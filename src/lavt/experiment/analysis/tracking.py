@@ -39,7 +39,11 @@ def sampled_by_distance(truth: Table, name: str) -> FloatArray:
 
 def cross_track_metrics(truth: Table) -> dict[str, float | None]:
     """Return mean, RMS, 95th percentile and maximum of the distance from the lane's centre, in metres."""
-    error_m = np.abs(sampled_by_distance(truth, "cross_track_m"))
+    return absolute_error_metrics(np.abs(sampled_by_distance(truth, "cross_track_m")))
+
+
+def absolute_error_metrics(error_m: FloatArray) -> dict[str, float | None]:
+    """Return mean, RMS, 95th percentile and maximum of absolute errors in metres; None without errors."""
     if len(error_m) == 0:
         return {"mae_m": None, "rms_m": None, "p95_m": None, "max_m": None}
     return {

@@ -13,6 +13,7 @@ from lavt.experiment.analysis.drive_data import DriveData
 from lavt.experiment.analysis.results import FAILED, read_json, write_json
 from lavt.experiment.report import html_page
 from lavt.experiment.report.boundary_section import boundary_parts
+from lavt.experiment.report.condition_sections import conditions_parts, contrast_parts
 from lavt.experiment.report.figure_style import condition_colours
 from lavt.experiment.report.run_sections import (
     DriveSets,
@@ -27,8 +28,6 @@ from lavt.experiment.report.sections import (
     ReportContext,
     axis_parts,
     clock_parts,
-    conditions_parts,
-    contrast_parts,
     degradation_parts,
     group_parts,
     injected_parts,

@@ -14,7 +14,7 @@ from lavt.experiment.report.run_figures import cross_track_figure, frames_figure
 from lavt.experiment.report.sections import Parts, ReportContext
 from lavt.experiment.report.table_format import html_of
 from lavt.experiment.report.tables import machine_table
-from lavt.experiment.statistics.conditions import is_key_part
+from lavt.experiment.statistics.by_road import is_key_part
 from lavt.recording.record import read_record
 
 SHOWN_FRAMES = 4

@@ -12,6 +12,7 @@ from markupsafe import Markup
 from lavt.experiment.analysis.clocks import PROBE, SAME_KERNEL
 from lavt.experiment.analysis.stage_latency import AFTER_LOOP
 from lavt.experiment.report import html_page
+from lavt.experiment.report.condition_tables import matching_paper
 from lavt.experiment.report.figure_style import Colours, Conditions
 from lavt.experiment.report.files import link_table, save_figure, save_table
 from lavt.experiment.report.groups import Group, axes_of, differing_settings, short_name, sort_groups, title_of
@@ -20,12 +21,8 @@ from lavt.experiment.report.sentences import results_sentences, runs_overview
 from lavt.experiment.report.sweep_figures import axis_figure, incidence_figure, routes_with_survival, survival_figure
 from lavt.experiment.report.tables import (
     clock_table,
-    contrast_table,
-    driving_table,
-    error_table,
     group_table,
-    latency_table,
-    matching_paper,
+    lane_change_table,
     route_overview,
     route_table,
     run_setup,
@@ -39,26 +36,9 @@ Parts = list[Markup]
 SOURCES_WITHOUT_OFFSET = (None, SAME_KERNEL)
 """The sources of a clock offset that the report does not show. None: the offset is unknown. `SAME_KERNEL`: it is 0."""
 
-LATENCIES_NOTE = (
-    "Each latency is given in ms as median ± bound of the clock error (p5 to p95). The loop latency, from a frame's "
-    "stamp to the application of its command, is measured on the server's clock alone, so it has no such bound."
-)
-PAPER_NOTE = " The paper did not measure the loop latency; the table shows the sum of its median τ video and τ control."
 PAPER_POINTS = (
     " The paper's points are drawn at the sum of its two median one-way latencies. The intervals of its completion "
     "are computed from its counts. The paper gives no interval of the error."
-)
-ROUTES_NOTE = " “95 %, these routes” is the exact confidence interval of completion for repeated runs of these routes."
-ROADS_NOTE = (
-    " “Range over roads” shows how much completion differs between roads; a route and its key part count as one road. "
-    "It is not a 95 % interval."
-)
-ERRORS_NOTE = (
-    " Each error is computed for each run and then averaged over the runs. P95 of the cross-track error is given in "
-    "three ways. The first is the mean over the completed runs only, to be read together with the completion. The "
-    "second is the mean over all runs, each up to the common distance, which all runs of its route and repetition "
-    "reached. The third is the median (quartiles) of all runs, where a run that ended early ranks last. "
-    "docs/metrics.md defines each number."
 )
 STAGES_NOTE = (
     "The first row, from capture to stamp, is from one run of each condition. The other rows are from all runs of "
@@ -136,61 +116,6 @@ def summary_parts(report: ReportContext) -> Parts:
     return parts
 
 
-def conditions_parts(report: ReportContext) -> Parts:
-    """Return the tables of the conditions for each kind of time, with the paper's values of the same conditions."""
-    if not report.kinds:
-        return [
-            html_page.paragraph("No run has the settings of the base config. See the table of groups.", is_note=True)
-        ]
-    parts = []
-    for kind, conditions in report.kinds.items():
-        paper = report.paper(conditions)
-        parts.append(html_page.heading(report.setup(kind)))
-        for name, make in (("driving", driving_table), ("latency", latency_table), ("error", error_table)):
-            parts.append(save_table(report.directory, f"conditions_{kind}_{name}", make(conditions, paper)))
-    has_roads = any(
-        entry.get("completion_interval_over_roads")
-        for conditions in report.kinds.values()
-        for entry in conditions.values()
-    )
-    has_paper = any(report.paper(conditions) for conditions in report.kinds.values())
-    return [
-        *parts,
-        html_page.paragraph(
-            "".join((LATENCIES_NOTE, PAPER_NOTE * has_paper, ROUTES_NOTE, ROADS_NOTE * has_roads, ERRORS_NOTE)),
-            is_note=True,
-        ),
-    ]
-
-
-def contrast_parts(report: ReportContext) -> Parts:
-    """Return the planned contrasts of completion between conditions."""
-    summary, paper = report.summary, (report.summary.get("paper") or {}).get("contrasts") or []
-    contrasts = summary.get("contrasts") or []
-    if not contrasts:
-        return []
-    paper_contrasts = paper if report.paper(summary["conditions"]) else []
-    names = differing_settings(report.groups)
-    base = title_of(report.base[0], names) if report.groups[1:] and report.base else ""
-    shows_all_groups = report.groups[1:] and len(report.groups) <= MAX_COMPARED_GROUPS
-    parts = [html_page.heading(base)] if base else []
-    parts += [save_table(report.directory, "contrasts", contrast_table(contrasts, paper_contrasts))]
-    for group in report.groups if shows_all_groups else []:
-        if group not in report.base[:1] and group.get("contrasts"):
-            title = title_of(group, names)
-            parts.append(html_page.heading(title))
-            name = f"contrasts_{html_page.slug(title)}"
-            parts.append(save_table(report.directory, name, contrast_table(group["contrasts"], paper_contrasts)))
-    fisher = " The paper's p values are from Fisher's exact test on its counts." if paper_contrasts else ""
-    note = (
-        "Each contrast compares completion under two conditions by McNemar's exact test on pairs of runs with the "
-        "same route, repetition and seed. All contrasts were planned before the first run, and Holm's correction "
-        f"covers all of them.{fisher}"
-    )
-    parts.append(html_page.paragraph(note, is_note=True))
-    return parts
-
-
 def _base_note(report: ReportContext) -> str:
     """Return a sentence for a caption on the group of the virtual runs; "" if there is only one group."""
     if len(report.groups) < 2 or not report.base:
@@ -221,7 +146,7 @@ def degradation_parts(report: ReportContext) -> Parts:
     caption = (
         "Completion and error over the median loop latency (from a frame's stamp to the application of its command), "
         "and over the mean frame age (the age of the frame from which the command in force was made). Bars are 95 % "
-        "intervals. Names above each other are in the vertical order of their points."
+        "intervals for these routes. Names above each other are in the vertical order of their points."
         + (PAPER_POINTS if paper else "")
         + _base_note(report)
     )
@@ -360,8 +285,12 @@ def route_parts(report: ReportContext) -> Parts:
 
 
 def run_parts(report: ReportContext) -> Parts:
-    """Return the table of all runs with their validity."""
-    return [save_table(report.directory, "runs", run_table(report.summary["runs"]))]
+    """Return the table of all runs with their validity, and a link to the table of their lane changes."""
+    runs = report.summary["runs"]
+    return [
+        save_table(report.directory, "runs", run_table(runs)),
+        link_table(report.directory, "lane_changes", lane_change_table(runs)),
+    ]
 
 
 def clock_parts(report: ReportContext) -> Parts:

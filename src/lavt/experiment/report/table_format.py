@@ -6,7 +6,7 @@ import csv
 import io
 import re
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +22,7 @@ SHARE = "share"
 """The unit of a share in CSV, where 1 is the whole. The page shows per cent instead."""
 
 LOW_HIGH = ("low", "high")
+BY_ROAD = ("mean", "low", "high", "roads")
 PERCENTILES = ("p50", "p5", "p95")
 
 TITLE_CHARACTERS = 14
@@ -70,6 +71,22 @@ class TableData:
         return TableData(columns, [[row[index] for index in known] for row in self.rows])
 
 
+def table_of_entries(entries: Iterable[Mapping[str, Any]], columns: Sequence[tuple[Column, str]]) -> TableData:
+    """Return the table with a row for each entry, without empty columns.
+
+    `columns` has each column with the key of its values in an entry; "a.b" is the key `b` of the nested entry `a`.
+    """
+    rows = [[_nested_value(entry, key) for _, key in columns] for entry in entries]
+    return TableData([column for column, _ in columns], rows).without_empty_columns()
+
+
+def _nested_value(entry: Mapping[str, Any], key: str) -> Any:
+    value: Any = entry
+    for name in key.split("."):
+        value = (value or {}).get(name)
+    return value
+
+
 def text_column(title: str, *, is_long: bool = False) -> Column:
     """Return a column of texts."""
     return Column(title, lambda cell: NOTHING if cell is None else str(cell), is_text=True, is_long=is_long)
@@ -98,6 +115,29 @@ def share_interval_column(title: str) -> Column:
 def interval_column(title: str) -> Column:
     """Return a column of intervals, each with a low and a high bound."""
     return Column(title, lambda cell: format_interval(cell, digits=2), LOW_HIGH)
+
+
+def by_road_column(title: str, *, digits: int = 2, is_share: bool = False) -> Column:
+    """Return a column of values by road: the mean over roads with its interval, or with the number of too few roads."""
+    return Column(
+        title,
+        lambda cell: format_by_road(cell, digits=digits, is_share=is_share),
+        BY_ROAD,
+        csv_unit=SHARE if is_share else "",
+    )
+
+
+def format_by_road(cell: Mapping[str, Any] | None, *, digits: int = 2, is_share: bool = False) -> str:
+    """Return the mean over roads, and its interval or, if there is none, the number of roads."""
+    if cell is None or cell["mean"] is None:
+        return NOTHING
+    scale, unit = (100.0, f"{UNBROKEN}%") if is_share else (1.0, "")
+    shown = f"{cell['mean'] * scale:.{0 if is_share else digits}f}{unit}"
+    if cell["low"] is None:
+        roads = "1 road" if cell["roads"] == 1 else f"{cell['roads']} roads"
+        return f"{shown} (no interval, {roads})".replace(" ", UNBROKEN)
+    interval = format_interval((cell["low"], cell["high"]), scale=scale, digits=0 if is_share else digits)
+    return f"{shown}{UNBROKEN}({interval}{unit})"
 
 
 def probability_column(title: str) -> Column:

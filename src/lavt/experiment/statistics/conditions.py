@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from lavt.experiment.statistics.intervals import bootstrap_interval, exact_interval
+from lavt.experiment.statistics.by_road import by_road, completed_values, road_rates
+from lavt.experiment.statistics.intervals import bootstrap_interval, exact_interval, stratified_interval
 from lavt.experiment.statistics.survival import survival
 
 Run = Mapping[str, Any]
@@ -17,9 +18,6 @@ keys."""
 
 CommonDistances = Mapping[tuple[Any, ...], int]
 """The common distance up to which runs are compared, in units of 10 m, by route, repetition and seed."""
-
-KEY_PART = "_key"
-"""The suffix of a route that is the key part of another route. Both routes are on the same road."""
 
 MEANS = (
     "mae_m",
@@ -45,10 +43,11 @@ def summarize_condition(all_runs: Sequence[Run], distances: CommonDistances) -> 
     """Summarize the valid runs of one condition."""
     runs = [run for run in all_runs if run["valid"]]
     routes = group_by(runs, "route")
-    p95_m, p95_common_m = _completed_p95_m(runs), common_p95_m(runs, distances)
+    by_route = [routes[name] for name in sorted(routes)]
     curves = {name: survival(routes[name]) for name in sorted(routes)}
     return {
         **completion(runs),
+        **own_lane_completion(runs),
         "completion_interval_over_roads": bootstrap_interval(road_rates(runs)),
         "endings": dict(sorted(Counter(str(run["ending"]) for run in runs).items())),
         "routes": {name: _summarize_route(routes[name], distances) for name in sorted(routes)},
@@ -56,12 +55,19 @@ def summarize_condition(all_runs: Sequence[Run], distances: CommonDistances) -> 
         "lane_invasions_per_run": _mean([run["lane_invasions"] for run in runs]),
         "collisions_per_km": _per_km(runs, "collisions"),
         "lane_invasions_per_km": _per_km(runs, "lane_invasions"),
-        "p95_m": _mean(p95_m),
-        "p95_interval": bootstrap_interval(p95_m),
-        "p95_common_m": _mean(p95_common_m),
-        "p95_common_interval": bootstrap_interval(p95_common_m),
+        "by_road": by_road(runs, lambda runs_on_road: common_p95_m(runs_on_road, distances)),
+        "p95_m": _mean(completed_values(runs, "p95_m")),
+        "p95_interval": stratified_interval([completed_values(runs_on, "p95_m") for runs_on in by_route]),
+        "p95_route_balanced_m": _route_balanced(by_route, "p95_m"),
+        "p95_routes": sum(bool(completed_values(runs_on, "p95_m")) for runs_on in by_route),
+        "followed_p95_m": _mean(completed_values(runs, "followed_p95_m")),
+        "followed_p95_route_balanced_m": _route_balanced(by_route, "followed_p95_m"),
+        "p95_common_m": _mean(common_p95_m(runs, distances)),
+        "p95_common_interval": stratified_interval([common_p95_m(runs_on, distances) for runs_on in by_route]),
         "p95_worst_rank_m": worst_rank_m(runs),
         **{name: _mean([run[name] for run in runs if run.get(name) is not None]) for name in MEANS},
+        **{f"{name}_per_run": _lane_kept_mean(runs, name) for name in ("followed_changes", "occupied_changes")},
+        "own_lane_share": _lane_kept_mean(runs, "own_lane_share"),
         "injected_ms": _injected_ms(all_runs),
         "tau_v_ms": _latency([run["tau_v_ms"] for run in runs], bounded=True),
         "tau_c_ms": _latency([run["tau_c_ms"] for run in runs], bounded=True),
@@ -84,27 +90,17 @@ def completion(runs: Sequence[Run]) -> dict[str, Any]:
     }
 
 
-def is_key_part(route: str) -> bool:
-    """Return whether a route is the key part of another route."""
-    return _route_name(route).endswith(KEY_PART)
+def own_lane_completion(runs: Sequence[Run]) -> dict[str, Any]:
+    """Return how many of these valid runs were completed in their own lane, the rate, and its exact interval.
 
-
-def road_of(route: str) -> str:
-    """Return the name of the road of a route; a route and its key part have the same road."""
-    return _route_name(route).removesuffix(KEY_PART)
-
-
-def _route_name(route: str) -> str:
-    """Return a route's name, or the path of its file without ".yaml"."""
-    return route.removesuffix(".yaml").removesuffix(".yml")
-
-
-def road_rates(runs: Sequence[Run]) -> list[float]:
-    """Return the completion rate of each road, sorted by road. A route and its key part have the same road."""
-    completions: dict[str, list[bool]] = {}  # by road
-    for run in runs:
-        completions.setdefault(road_of(str(run["route"])), []).append(run["ending"] == "completed")
-    return [sum(completions[road]) / len(completions[road]) for road in sorted(completions)]
+    Runs of which this is unknown are left out of the rate.
+    """
+    known = [run["completed_in_own_lane"] for run in runs if run.get("completed_in_own_lane") is not None]
+    return {
+        "completed_in_own_lane": sum(known) if known else None,
+        "own_lane_completion_rate": sum(known) / len(known) if known else None,
+        "own_lane_completion_interval": exact_interval(sum(known), len(known)),
+    }
 
 
 def group_by(runs: Iterable[Run], key: str) -> dict[str, list[Run]]:
@@ -155,13 +151,21 @@ def _start_key(run: Run) -> tuple[Any, ...]:
 def _summarize_route(runs: Sequence[Run], distances: CommonDistances) -> dict[str, Any]:
     return {
         **completion(runs),
-        "p95_m": _mean(_completed_p95_m(runs)),
+        "completed_in_own_lane": own_lane_completion(runs)["completed_in_own_lane"],
+        "p95_m": _mean(completed_values(runs, "p95_m")),
+        "followed_p95_m": _mean(completed_values(runs, "followed_p95_m")),
         "p95_common_m": _mean(common_p95_m(runs, distances)),
     }
 
 
-def _completed_p95_m(runs: Sequence[Run]) -> list[float]:
-    return [run["p95_m"] for run in runs if run["ending"] == "completed" and run["p95_m"] is not None]
+def _route_balanced(runs_by_route: Sequence[Sequence[Run]], name: str) -> float | None:
+    """Return the mean over routes of the mean over their completed runs; routes without such a run are left out."""
+    values = [completed_values(runs, name) for runs in runs_by_route]
+    return _mean([float(np.mean(on_route)) for on_route in values if on_route])
+
+
+def _lane_kept_mean(runs: Sequence[Run], name: str) -> float | None:
+    return _mean([run["lane_kept"][name] for run in runs if run.get("lane_kept")])
 
 
 def _mean(values: Sequence[float]) -> float | None:

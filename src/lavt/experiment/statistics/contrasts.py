@@ -1,4 +1,4 @@
-"""Planned contrasts between conditions: McNemar's exact test for paired runs, Fisher's exact test for counts."""
+"""Planned contrasts between conditions: exact tests of paired runs and of roads, Fisher's exact test of counts."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 
 from scipy.stats import binomtest, fisher_exact
 
+from lavt.experiment.statistics.by_road import road_of
 from lavt.experiment.statistics.intervals import holm
 
 PLANNED = (("L0", "L1"), ("L1", "L2"), ("L2", "L3"), ("L2", "L4"), ("L3", "L4"), ("L3", "L5"))
@@ -19,12 +20,16 @@ PAIRED_BY = ("route", "repetition", "seed", "participant", "block")
 keys of the config's section `study`."""
 
 
+Completions = Mapping[tuple[Any, ...], bool]
+"""Whether each run was completed, by its `PAIRED_BY` keys."""
+
+
 def paired_contrasts(runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Compare completion between conditions by pairs of runs, with Holm's correction for all returned contrasts.
 
     A contrast is returned if both its conditions were driven. Invalid runs are not paired. If several runs of one
     condition have equal `PAIRED_BY` keys, they are not paired either, because their partner would be ambiguous. `p` is
-    None without pairs.
+    None without pairs. Each contrast also has the sign test by road, which is the one to quote.
     """
     driven = {str(run["condition"]) for run in runs}
     completed = {name: _completed(runs, name) for name in driven}
@@ -34,8 +39,30 @@ def paired_contrasts(runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
             pairs = [(completed[a][key], completed[b][key]) for key in completed[a] if key in completed[b]]
             only_a, only_b = pairs.count((True, False)), pairs.count((False, True))
             p = mcnemar(only_a, only_b) if pairs else None
-            contrasts.append({"a": a, "b": b, "pairs": len(pairs), "only_a": only_a, "only_b": only_b, "p": p})
-    return with_holm(contrasts)
+            contrast = {"a": a, "b": b, "pairs": len(pairs), "only_a": only_a, "only_b": only_b, "p": p}
+            contrasts.append({**contrast, **_by_road(completed[a], completed[b])})
+    by_road = holm([contrast["p_by_road"] for contrast in contrasts])
+    return [{**contrast, "p_by_road_holm": p} for contrast, p in zip(with_holm(contrasts), by_road, strict=True)]
+
+
+def _by_road(a: Completions, b: Completions) -> dict[str, Any]:
+    """Return the exact sign test with the road as the unit.
+
+    A road counts for the condition under which more of its paired runs were completed. `p_by_road` is None without
+    pairs.
+    """
+    differences: dict[str, int] = {}
+    for key in a:
+        if key in b:
+            road = road_of(str(key[PAIRED_BY.index("route")]))
+            differences[road] = differences.get(road, 0) + a[key] - b[key]
+    for_a, for_b = (sum(sign * difference > 0 for difference in differences.values()) for sign in (1, -1))
+    return {
+        "roads": len(differences),
+        "roads_for_a": for_a,
+        "roads_for_b": for_b,
+        "p_by_road": mcnemar(for_a, for_b) if differences else None,
+    }
 
 
 def with_holm(contrasts: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -60,7 +87,7 @@ def fisher(a_completed: int, a_runs: int, b_completed: int, b_runs: int) -> floa
     return float(fisher_exact(table)[1])
 
 
-def _completed(runs: Sequence[Mapping[str, Any]], condition: str) -> dict[tuple[Any, ...], bool]:
+def _completed(runs: Sequence[Mapping[str, Any]], condition: str) -> Completions:
     """Return for each valid run of a condition, by its `PAIRED_BY` keys, whether it was completed."""
     valid = [run for run in runs if run["valid"] and run["condition"] == condition]
     keys = [tuple(run.get(name) for name in PAIRED_BY) for run in valid]

@@ -6,12 +6,17 @@ from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
-from scipy.stats import binomtest, bootstrap
+from scipy.stats import binomtest, bootstrap, norm, t
 
+from lavt.domain import FloatArray
 from lavt.streams import stream
 
 RESAMPLES = 10_000
 """The number of bootstrap samples for an interval."""
+
+FEWEST_CLUSTERS = 6
+"""With fewer values, even their whole range contains the median of the population with a probability of less than 95 %:
+1 - 2 / 2^n. And no two-sided sign test of n pairs can have a p value of less than 2 / 2^n."""
 
 
 def exact_interval(successes: int, trials: int) -> list[float] | None:
@@ -38,15 +43,65 @@ def bootstrap_interval(values: Sequence[float]) -> list[float] | None:
     """
     if len(values) < 2:
         return None
+    return list(_bootstrap(tuple(values), 0.95))
+
+
+def stratified_interval(strata: Sequence[Sequence[float]]) -> list[float] | None:
+    """Return the 95 % percentile bootstrap interval of the mean of all values, resampled within each stratum.
+
+    So differences between the strata do not widen the interval. A stratum with one value has no spread. The result is
+    None if no stratum has two values. The resampling has a fixed seed.
+    """
+    samples = [np.asarray(values, np.float64) for values in strata if len(values) > 1]
+    if not samples:
+        return None
+    constant = sum(values[0] for values in strata if len(values) == 1)
+    count = sum(map(len, strata))
+
+    def pooled_mean(*resampled: FloatArray, axis: int) -> FloatArray:
+        return np.asarray((sum(values.sum(axis=axis) for values in resampled) + constant) / count)
+
     interval = bootstrap(
-        (np.asarray(values, np.float64),),
-        np.mean,
+        samples,
+        pooled_mean,
         n_resamples=RESAMPLES,
         confidence_level=0.95,
         method="percentile",
         random_state=stream(0, "bootstrap interval"),
     ).confidence_interval
     return [float(interval.low), float(interval.high)]
+
+
+def has_enough_clusters(count: int) -> bool:
+    """Return whether so many clusters can support a 95 % statement about the population of clusters."""
+    return count >= FEWEST_CLUSTERS
+
+
+def cluster_interval(means: Sequence[float]) -> list[float] | None:
+    """Return the 95 % interval of the mean over a population of clusters, from the means of sampled clusters.
+
+    It is the expanded percentile bootstrap interval (T. C. Hesterberg, What Teachers Should Know About the Bootstrap,
+    The American Statistician 69, 2015, section 5.3), which is as wide as Student's t for these few values. The result
+    is None for fewer than `FEWEST_CLUSTERS` means, and if all are equal.
+    """
+    count = len(means)
+    if not has_enough_clusters(count) or len(set(means)) == 1:
+        return None
+    level = 1 - 2 * float(norm.cdf(-np.sqrt(count / (count - 1)) * t.ppf(0.975, count - 1)))
+    return list(_bootstrap(tuple(means), level))
+
+
+@cache  # the runs of the base config are summarized twice
+def _bootstrap(values: tuple[float, ...], level: float) -> tuple[float, float]:
+    interval = bootstrap(
+        (np.asarray(values, np.float64),),
+        np.mean,
+        n_resamples=RESAMPLES,
+        confidence_level=level,
+        method="percentile",
+        random_state=stream(0, "bootstrap interval"),
+    ).confidence_interval
+    return float(interval.low), float(interval.high)
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:

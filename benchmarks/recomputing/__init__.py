@@ -1,0 +1,1 @@
+"""Recomputation of results from records, without LAVT."""
