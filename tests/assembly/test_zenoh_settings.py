@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from lavt.assembly.zenoh import program_session, side_session
+from lavt.assembly.zenoh import program_sessions, side_session
 from lavt.config import ClientConfig, ServerConfig
 from lavt.config_file import parse_config, shipped
 from lavt.errors import UserError
@@ -49,16 +49,19 @@ def test_a_servers_router_listens_as_its_file_says(security: dict[str, Any], pro
 
 
 @pytest.mark.parametrize(
-    ("security", "dialled"),
-    [({}, "udp/192.0.2.7:7448?mixed_rel=1;rel=1"), (CLIENT_KEYS, "quic/192.0.2.7:7448?mixed_rel=1")],
+    ("security", "dialled", "local"),
+    [
+        ({}, "udp/192.0.2.7:7448?mixed_rel=1;rel=1", "tcp/127.0.0.1:7457"),
+        (CLIENT_KEYS, "quic/192.0.2.7:7448?mixed_rel=1", "unixsock-stream//run/lavt/zenoh.sock"),
+    ],
 )
-def test_a_clients_router_dials_the_vehicle_and_listens_nowhere(security: dict[str, Any], dialled: str) -> None:
-    """A client's embedded router dials `video.server`, encrypted if the client has a key, and has no endpoint."""
+def test_a_clients_router_dials_the_vehicle(security: dict[str, Any], dialled: str, local: str) -> None:
+    """A client's embedded router dials `video.server`, encrypted if the client has a key, and listens locally."""
     session = side_session(client(EMBEDDED, security=security))
     assert session.is_router
     assert session.path.name == ("router-client-tls.json5" if security else "router-client.json5")
     assert endpoints(session, "connect") == [dialled]
-    assert endpoints(session, "listen") == []
+    assert endpoints(session, "listen") == [local]
 
 
 def test_settings_replace_values_of_the_file() -> None:
@@ -79,19 +82,30 @@ def test_a_separate_router_is_reached_by_the_session_file() -> None:
     """Without an embedded router, a side and other programs have the same session, at the configured endpoint."""
     for config in (server({"router": "tcp/h:1"}), client({"router": "tcp/h:1"})):
         session = side_session(config)
-        assert session == program_session(config) == SessionSettings(session.path, {"connect/endpoints": ["tcp/h:1"]})
+        assert session == SessionSettings(session.path, {"connect/endpoints": ["tcp/h:1"]})
+        assert program_sessions(config) == [session]
         assert session.path.name == "session.json5"
     unix = side_session(server({"router": "", "session": "zenoh-configs/session-unix.json5"}))
     assert endpoints(unix, "connect") == ["unixsock-stream//run/lavt/zenoh.sock"]
 
 
-def test_a_program_on_the_clients_machine_reaches_the_vehicle() -> None:
-    """Another program dials what the client's embedded router dials, once, and routes nothing."""
-    session = program_session(client(EMBEDDED))
-    assert not session.is_router
-    assert session.changes["mode"] == "client"
+def test_a_program_on_the_clients_machine_has_two_ways_to_the_vehicle() -> None:
+    """Another program connects to the client's router, or dials the vehicle itself, once and under an id of its own."""
+    config = client(EMBEDDED | {"router_settings": {"id": "abc"}})
+    by_client, direct = program_sessions(config)
+    assert not by_client.is_router
+    assert endpoints(by_client, "connect") == ["tcp/127.0.0.1:7457"]
+    assert not direct.is_router
+    assert direct.changes["mode"] == "client"
+    assert direct.changes["id"] != "abc"
+    assert endpoints(direct, "connect") == ["udp/192.0.2.7:7448?mixed_rel=1;rel=1"]
+    assert endpoints(direct, "listen") == []
+
+
+def test_a_program_dials_the_vehicle_if_the_clients_router_has_no_local_endpoint() -> None:
+    """If the client's router listens nowhere, another program has only the way to the vehicle itself."""
+    (session,) = program_sessions(client(EMBEDDED | {"router_settings": {"listen": {"endpoints": []}}}))
     assert endpoints(session, "connect") == ["udp/192.0.2.7:7448?mixed_rel=1;rel=1"]
-    assert endpoints(session, "listen") == []
 
 
 @pytest.mark.parametrize(
@@ -99,7 +113,7 @@ def test_a_program_on_the_clients_machine_reaches_the_vehicle() -> None:
 )
 def test_a_program_on_the_servers_machine_uses_the_servers_router(security: dict[str, Any], local: str) -> None:
     """Another program connects to the local endpoint of the server's embedded router."""
-    session = program_session(server(EMBEDDED, security=security))
+    (session,) = program_sessions(server(EMBEDDED, security=security))
     assert not session.is_router
     assert endpoints(session, "connect") == [local]
 
@@ -108,7 +122,7 @@ def test_a_servers_router_without_a_local_endpoint() -> None:
     """If the server's embedded router has no endpoint for local programs, the error says which key lacks one."""
     config = server(EMBEDDED | {"router_settings": {"listen": {"endpoints": ["udp/0.0.0.0:7448?rel=1;mixed_rel=1"]}}})
     with pytest.raises(UserError, match=r"listen\.endpoints"):
-        program_session(config)
+        program_sessions(config)
 
 
 @pytest.mark.parametrize(

@@ -515,7 +515,9 @@ def test_client_with_an_unknown_protocol(run: Run, tmp_path: Path) -> None:
 
 def test_stop_without_a_router(run: Run) -> None:
     """Without a router, `lavt stop` fails with one sentence that names the command that starts a router."""
-    assert "`lavt router" in run("stop", CLIENT, "--set", "zenoh.router=tcp/127.0.0.1:1").rejection()
+    assert (
+        "`lavt router" in run("stop", CLIENT, "--timeout", "0.1", "--set", "zenoh.router=tcp/127.0.0.1:1").rejection()
+    )
 
 
 def test_bad_input_of_a_process(used_port: int) -> None:

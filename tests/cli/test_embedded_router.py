@@ -52,6 +52,8 @@ class Pair:
 
     def __init__(self, keys: Path | None = None) -> None:
         self.port, self.probe_port = free_port(), free_port()
+        self.local_port = 0
+        """The TCP port of the client's router for programs on its machine; 0: none."""
         self._keys = keys
 
     @property
@@ -75,8 +77,9 @@ class Pair:
     def client(self, command: str = "client") -> list[str]:
         """Return the arguments of a command with the client's config."""
         connect = {"endpoints": [(PLAIN if self._keys is None else ENCRYPTED).format(self.port)]}
+        listen = {"endpoints": [f"tcp/{LOOPBACK}:{self.local_port}"] if self.local_port else []}
         changes = [
-            embedded(connect=connect, **self._tls("operator-1", "connect")),
+            embedded(connect=connect, listen=listen, **self._tls("operator-1", "connect")),
             *(f"video.server={LOOPBACK}", f"clock.probe_port={self.probe_port}"),
         ]
         if self._keys is None:
@@ -225,40 +228,79 @@ def test_a_wrong_setting(change: str, reason: str, run: Run, tmp_path: Path) -> 
 
 
 def test_a_stop_without_a_vehicle_says_what_to_check(run: Run) -> None:
-    """If nothing answers at the vehicle's address, `lavt stop` fails at once and says that the stop was not sent."""
+    """If nothing answers at the vehicle's address until the timeout, `lavt stop` says that the stop was not sent."""
     endpoint = f"tcp/{LOOPBACK}:{free_port(socket.SOCK_STREAM)}"
-    sentence = run("stop", CLIENT, *options(embedded(connect={"endpoints": [endpoint]}))).rejection()
+    router = embedded(connect={"endpoints": [endpoint]}, listen={"endpoints": []})
+    sentence = run("stop", CLIENT, "--timeout", "0.2", *options(router)).rejection()
     assert "NOT sent" in sentence
     assert endpoint in sentence
     assert "`lavt server`" in sentence
 
 
-@pytest.mark.parametrize("command", ["server", "router"])
-def test_a_panic_of_zenoh_ends_the_process(command: str, tmp_path: Path) -> None:
-    """If a thread of Zenoh panics while it accepts a connection, the process ends with one sentence and exit code 1.
-
-    The panic is a real one: Zenoh is told to start no thread that receives.
-    """
+def test_a_stop_uses_the_link_of_the_running_client(tmp_path: Path) -> None:
+    """`lavt stop` needs no link of its own to the vehicle if the client's router has one."""
     pair = Pair()
-    endpoint = PLAIN.format(pair.port)
-    arguments = pair.server()
-    if command == "router":
-        file = str(shipped("zenoh-configs/router-server.json5"))
-        arguments = ["router", file, *options(f"listen.endpoints={json.dumps([endpoint])}")]
-    with (tmp_path / "err").open("w") as err:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "lavt", *arguments, "--json"],
-            stdout=subprocess.PIPE,
-            stderr=err,
-            text=True,
-            env={**os.environ, "ZENOH_RUNTIME": "(rx: (worker_threads: 0))", "RUST_BACKTRACE": "0"},
+    pair.local_port = free_port(socket.SOCK_STREAM)
+    with Processes(tmp_path) as processes:
+        processes.start("server", *pair.server()).wait_ready()
+        client = processes.start("client", *pair.client())
+        wait_until("the client has control", lambda: has_control(client))
+        pair.port = free_port()  # nothing answers there
+        stopped = subprocess.run(
+            [sys.executable, "-m", "lavt", *pair.client("stop")], capture_output=True, text=True, check=False
         )
-        assert process.stdout is not None
-        process.stdout.readline()
-        with Processes(tmp_path) as processes:
-            processes.start("client", *pair.client()).wait_ready()
-            assert process.wait(LIMIT_S) == 1
-        process.stdout.close()
-    last_line = (tmp_path / "err").read_text().splitlines()[-1]
-    assert last_line.startswith("lavt: ")
-    assert "Zenoh panicked at" in last_line
+    assert (stopped.returncode, stopped.stdout) == (0, "vehicle-1 accepted the emergency stop\n"), stopped.stderr
+
+
+HARMFUL_PEER = """
+import sys, zenoh
+config = zenoh.Config()
+for key, value in (("mode", '"client"'), ("connect/endpoints", f'["{sys.argv[1]}"]'), ("connect/timeout_ms", "2000"),
+                   ("scouting/multicast/enabled", "false"), ("transport/link/tx/batch_size", "0")):
+    config.insert_json5(key, value)
+zenoh.open(config)
+"""
+"""A program whose handshake makes a task of the other router panic."""
+
+
+def test_a_peer_that_makes_zenoh_panic_harms_only_its_own_connection(tmp_path: Path) -> None:
+    """A panic in the handshake with a peer ends neither the drive nor the server, and new connections are accepted."""
+    pair = Pair()
+    with Processes(tmp_path) as processes:
+        server = processes.start("server", *pair.server())
+        server.wait_ready()
+        client = processes.start("client", *pair.client())
+        wait_until("the client has control", lambda: has_control(client))
+        for _ in range(2):
+            attack = [sys.executable, "-c", HARMFUL_PEER, PLAIN.format(pair.port)]
+            subprocess.run(attack, capture_output=True, timeout=60, check=False)
+        assert "panicked at" in (tmp_path / "server.log").read_text()
+        stopped = subprocess.run(
+            [sys.executable, "-m", "lavt", *pair.client("stop")], capture_output=True, text=True, check=False
+        )
+        assert (stopped.returncode, stopped.stdout) == (0, "vehicle-1 accepted the emergency stop\n"), stopped.stderr
+    assert (client.popen.returncode, server.popen.returncode) == (0, 0)
+
+
+CLOSED_SESSION = """
+import lavt.assembly.side
+from lavt.cli.main import main
+from lavt.transport import zenoh_link
+
+class ClosedLater(zenoh_link.ZenohLink):
+    def start(self, *arguments, **options):
+        super().start(*arguments, **options)
+        self._session.close()
+
+lavt.assembly.side.ZenohLink = ClosedLater
+main()
+"""
+"""A program that runs `lavt` and closes the session of its embedded router without the link's knowledge."""
+
+
+def test_a_side_whose_router_has_failed_ends() -> None:
+    """If the embedded router no longer works, the side ends with one sentence and exit code 1."""
+    command = [sys.executable, "-c", CLOSED_SESSION, *Pair().server()]
+    process = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=False)
+    assert process.returncode == 1
+    assert process.stderr.splitlines()[-1].startswith("lavt: ")

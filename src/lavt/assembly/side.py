@@ -51,11 +51,6 @@ from lavt.transport.video.path_validation import PathServer
 from lavt.transport.zenoh_link import ZenohLink, quiet_logs
 
 PrintMessage = Callable[[str], None]
-PLAIN = (
-    "lavt: this side is plain: nothing is encrypted or signed, and anyone who can reach the vehicle's router can drive "
-    "(docs/security.md)"
-)
-"""The message of a side without keys."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +94,8 @@ class Side:
         path: PathServer | None = None,
     ) -> None:
         self.clock = clock
+        self.is_plain = not config.security.key
+        """Whether messages are neither encrypted nor signed."""
         self.session = session
         """The client's session; None on a server."""
         self.actuator = actuator
@@ -215,8 +212,6 @@ def open_server(
         )
         opened.pop_all()  # from now on, `side.close` closes these parts
     with closing(side):
-        if not config.security.key:
-            print_message(PLAIN)
         yield side, ready
 
 
@@ -247,8 +242,6 @@ def open_client(config: ClientConfig, out: Path | None, clock: Clock, print_mess
         )
         opened.pop_all()
     with closing(side):
-        if not config.security.key:
-            print_message(PLAIN)
         yield side
 
 

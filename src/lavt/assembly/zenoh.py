@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from lavt.assembly.entropy import MachineEntropy
 from lavt.config import ClientConfig, ServerConfig
 from lavt.config_file import find_file
 from lavt.errors import UserError
@@ -27,26 +28,32 @@ def side_session(config: Config) -> SessionSettings:
     return SessionSettings(_router_file(config), _router_changes(config), is_router=True)
 
 
-def program_session(config: Config) -> SessionSettings:
-    """Return the settings for another program on the side's machine, such as `lavt stop`; it never listens.
+def program_sessions(config: Config) -> list[SessionSettings]:
+    """Return the settings with which another program on the side's machine, such as `lavt stop`, can open its session.
 
-    The router of such a program is the separate router, the server's embedded router, or the router that the client's
-    embedded router dials.
+    The first one is for the router on this machine: the separate one, or the embedded one of the running side. A client
+    also has one for the vehicle's router, which is independent of the running client.
     """
     if not config.zenoh.is_embedded:
-        return _separate(config)
+        return [_separate(config)]
     path, changes = _router_file(config), _router_changes(config)
+    endpoints = configured_endpoints(path, "listen/endpoints", changes)
+    advice = f"start `lavt {'server' if isinstance(config, ServerConfig) else 'client'}`"
+    sessions = [
+        SessionSettings(find_file(Path(SESSION_FILE)), {"connect/endpoints": [endpoint]}, advice=advice)
+        for endpoint in endpoints
+        if endpoint.startswith(LOCAL_ENDPOINTS)
+    ][:1]
     if isinstance(config, ClientConfig):
         advice = "is `lavt server` running there, and is video.server the vehicle's address?"
-        return SessionSettings(path, changes | AS_A_SESSION, advice=advice)
-    endpoints = configured_endpoints(path, "listen/endpoints", changes)
-    local = next((endpoint for endpoint in endpoints if endpoint.startswith(LOCAL_ENDPOINTS)), None)
-    if local is None:
+        own_id = {"id": f"{MachineEntropy().number(64):x}"}  # the router of a running client has the id of the file
+        sessions.append(SessionSettings(path, changes | AS_A_SESSION | own_id, advice=advice))
+    if not sessions:
         raise UserError(
             f"the server's router has no endpoint for programs on its machine: add one to listen.endpoints, in {path} "
             "or in zenoh.router_settings, such as tcp/127.0.0.1:7447"
         )
-    return SessionSettings(find_file(Path(SESSION_FILE)), {"connect/endpoints": [local]}, advice="start `lavt server`")
+    return sessions
 
 
 def _separate(config: Config) -> SessionSettings:
@@ -63,14 +70,9 @@ def _router_file(config: Config) -> Path:
 
 
 def _router_changes(config: Config) -> dict[str, Any]:
-    """Return the changes of the embedded router's config.
-
-    A client's router listens nowhere. With a shipped file, it dials the address of the vehicle.
-    """
+    """Return the changes of the embedded router's config; with a shipped file, a client dials the vehicle's address."""
     changes = flatten(config.zenoh.router_settings)
-    if isinstance(config, ClientConfig):
-        changes.setdefault("listen/endpoints", [])
-        if not config.zenoh.router_file and "connect/endpoints" not in changes:
-            dialled = configured_endpoints(_router_file(config), "connect/endpoints", {})
-            changes["connect/endpoints"] = [with_host(endpoint, config.video.server) for endpoint in dialled]
+    if isinstance(config, ClientConfig) and not config.zenoh.router_file and "connect/endpoints" not in changes:
+        dialled = configured_endpoints(_router_file(config), "connect/endpoints", {})
+        changes["connect/endpoints"] = [with_host(endpoint, config.video.server) for endpoint in dialled]
     return changes

@@ -10,7 +10,6 @@ import typer
 from lavt.cli import console
 from lavt.config_file import find_file, split_change
 from lavt.runtime import process_priority
-from lavt.runtime.native_panics import end_in_any_case, fail_on_panics
 
 POLL_PERIOD_S = 0.5
 """How often the main thread wakes to run signal handlers: a signal that a Zenoh thread receives does not wake it."""
@@ -36,19 +35,15 @@ def router(
 
     quiet_logs()
     zenoh_router = Router(find_file(file), parse_overrides(changes or []))
-    panics: list[BaseException] = []
     try:
-        with console.stop_on_signals() as stop, fail_on_panics(panics.append):
+        with console.stop_on_signals() as stop:
             locators = zenoh_router.locators()
             if as_json:
                 console.print_json({"locators": locators})
             else:
                 console.print_result(f"routing at {', '.join(locators)}; Ctrl-C ends it")
-            while not stop.wait(POLL_PERIOD_S) and not panics:
-                pass
-            if panics:
-                end_in_any_case(exit_code=1)
-                raise panics[0]
+            while not stop.wait(POLL_PERIOD_S):
+                zenoh_router.check()
     finally:
         zenoh_router.close()  # an open router would keep the process alive
 

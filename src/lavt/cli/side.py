@@ -11,11 +11,14 @@ from lavt.cli.session_log import SessionLog, client_end_line, server_end_line
 from lavt.domain import NS_PER_S, State
 from lavt.errors import WorkError, describe_error
 from lavt.nodes.client_session import ClientSession
-from lavt.runtime.native_panics import end_in_any_case, fail_on_panics
 from lavt.runtime.thread_failures import fail_on_thread_errors
 from lavt.safety.limits import LIMITS
 from lavt.safety.state_machine import ACTIVE
 
+PLAIN = (
+    "lavt: this side is plain: nothing is encrypted or signed, and anyone who can reach the vehicle's router can drive "
+    "(docs/security.md)"
+)
 STATUS_PERIOD_S = 0.2
 POLL_PERIOD_S = 0.02
 """How often a side checks, before it ends, whether the vehicle is stationary (server) or released (client)."""
@@ -34,7 +37,9 @@ def run_side(side: Side, client_name: str, *, once: bool, as_json: bool, ready: 
     client releases the vehicle, and a server stops the vehicle. A second Ctrl-C ends the process immediately.
     """
     log, session, runtime = SessionLog(client_name), side.session, side.runtime
-    with console.stop_on_signals() as stop, fail_on_thread_errors(runtime.fail), fail_on_panics(_end_after_panic(side)):
+    with console.stop_on_signals() as stop, fail_on_thread_errors(runtime.fail):
+        if side.is_plain:
+            console.print_message(PLAIN)
         side.start()
         if as_json:
             console.print_json({"ready": dict(ready)})
@@ -48,16 +53,6 @@ def run_side(side: Side, client_name: str, *, once: bool, as_json: bool, ready: 
             _print_status(side, log, as_json=as_json, last_line=last_line)
     if runtime.failed is not None:
         raise WorkError(f"stopped because a part failed: {describe_error(runtime.failed)}")
-
-
-def _end_after_panic(side: Side) -> Callable[[BaseException], None]:
-    """Return a function that makes the side fail and ensures that its process ends."""
-
-    def fail(error: BaseException) -> None:
-        side.runtime.fail(error)
-        end_in_any_case(exit_code=1)
-
-    return fail
 
 
 def _print_status(side: Side, log: SessionLog, *, as_json: bool, last_line: str = "") -> None:

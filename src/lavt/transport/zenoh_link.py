@@ -21,16 +21,16 @@ import zenoh
 
 from lavt.clock import Clock
 from lavt.domain import Now
-from lavt.errors import UserError, WorkError
+from lavt.errors import UserError
 from lavt.node import Send
 from lavt.transport.messages import NAME
+from lavt.transport.router_check import RouterCheck, end_process_later, router_locators
 from lavt.transport.zenoh_config import check_endpoints, check_private_keys, error_text
 
 Deliver = Callable[[str, Any, Now, Any], None]
 """Takes (channel, payload, arrived, peer) of each received message."""
 
 REPLY_TIMEOUT_S = 2.0
-ROUTER_READY_S = 5.0
 RETRY_S = 1.0
 REPLY_CHANNELS = {"session": "session_reply", "netem": "netem_reply"}
 """The channel of the replies for each channel of queries. The channel of a query is the last part of its key."""
@@ -96,7 +96,7 @@ def _check_listen_endpoints(config: zenoh.Config, path: Path, *, may_be_empty: b
 
 
 def _open(config: zenoh.Config) -> zenoh.Session:
-    """Open a session; raise `zenoh.ZError` if it cannot be opened, and `WorkError` if Zenoh panics."""
+    """Open a session; raise `zenoh.ZError` if it cannot be opened, and `UserError` if Zenoh panics at this config."""
     try:
         return zenoh.open(config)
     except Exception:
@@ -104,7 +104,7 @@ def _open(config: zenoh.Config) -> zenoh.Session:
     except BaseException as error:
         if type(error).__name__ != "PanicException":  # its class cannot be imported, and is not an `Exception`
             raise
-        raise WorkError(f"Zenoh failed while it opened a session: {error_text(error)}") from error
+        raise UserError(f"Zenoh failed to open a session, so check its config: {error_text(error)}") from error
 
 
 def _open_router(path: Path, changes: Mapping[str, Any], *, must_listen: bool) -> zenoh.Session:
@@ -123,15 +123,6 @@ def _open_router(path: Path, changes: Mapping[str, Any], *, must_listen: bool) -
         raise UserError(f"the router of {path} does not start: {error_text(error)}; use other endpoints") from error
 
 
-def _locators(session: zenoh.Session) -> list[str]:
-    """Return the endpoints at which a router listens, with the actual port where the config has 0."""
-    for reply in session.get(f"@/{session.info.zid()}/router", timeout=ROUTER_READY_S):
-        if reply.ok is not None:
-            locators: list[str] = json.loads(reply.ok.payload.to_string())["locators"]
-            return locators
-    raise WorkError(f"the router does not report within {ROUTER_READY_S:.0f} s where it listens")
-
-
 def configured_endpoints(path: Path, key: str, changes: Mapping[str, Any]) -> list[str]:
     """Return the endpoints at `key`, `listen/endpoints` or `connect/endpoints`, of a config file with `changes`."""
     endpoints = json.loads(_load(path, changes).get_json(key))
@@ -145,13 +136,20 @@ class Router:
 
     def __init__(self, path: Path, overrides: Mapping[str, Any]) -> None:
         self._session = _open_router(path, overrides, must_listen=True)
+        self._check = RouterCheck(self._session)
+
+    def check(self) -> None:
+        """Raise `WorkError` if the router no longer answers."""
+        self._check.run()
 
     def locators(self) -> list[str]:
         """Return the endpoints at which the router listens, with the actual port where the config has 0."""
-        return _locators(self._session)
+        return router_locators(self._session)
 
     def close(self) -> None:
         """Stop routing."""
+        if self._check.has_failed:
+            end_process_later()
         self._session.close()
 
 
@@ -231,8 +229,10 @@ class ZenohLink:
         self._listener: threading.Thread | None = None
         self._waiting = waiting
         self._waiting_reason = ""
+        self._check: RouterCheck | None = None
         if settings.is_router:
             self._session = _open_router(settings.path, settings.changes, must_listen=False)
+            self._check = RouterCheck(self._session)
         else:
             self._open_session(settings)
 
@@ -249,7 +249,7 @@ class ZenohLink:
 
     def locators(self) -> list[str]:
         """Return the endpoints at which a session that is a router listens."""
-        return _locators(self._session)
+        return router_locators(self._session)
 
     def start(self, deliver: Deliver, *, queries_only: bool = False) -> None:
         """Start to send and to receive; threads of the link call `deliver`.
@@ -259,6 +259,8 @@ class ZenohLink:
         self._deliver = deliver
         if queries_only:
             return
+        if self._check is not None:
+            threading.Thread(target=self._check.repeat, args=(self._closing,), name="zenoh check", daemon=True).start()
         if self._session is not None:
             self._declare(self._session)
         elif self._waiting is not None:
@@ -334,6 +336,9 @@ class ZenohLink:
     def close(self) -> None:
         """Close the session; a process with an open session would not end."""
         self._closing.set()
+        if self._check is not None and self._check.has_failed:
+            end_process_later()
+            return
         if self._opener is not None:
             self._opener.join()
         if self._session is not None:
