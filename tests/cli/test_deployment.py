@@ -78,10 +78,10 @@ def test_only_the_server_may_lock_its_memory() -> None:
 
 
 def test_the_directory_of_the_socket() -> None:
-    """The units of server and router create /run/lavt, which outlives them; their socket is for one user."""
+    """The units of server, client and router create /run/lavt, which outlives them; their socket is for one user."""
     services = {path.name: read_unit(path)["Service"] for path in UNITS}
     creators = {name for name, service in services.items() if "RuntimeDirectory" in service}
-    assert creators == {"lavt-router.service", "lavt-server.service"}
+    assert creators == {"lavt-client.service", "lavt-router.service", "lavt-server.service"}
     for service in (services[name] for name in creators):
         assert (service["RuntimeDirectory"], service["RuntimeDirectoryMode"]) == ("lavt", "0750")
         assert service["RuntimeDirectoryPreserve"] == "yes"

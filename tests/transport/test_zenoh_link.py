@@ -371,7 +371,7 @@ def test_a_router_without_listen_endpoints_in_its_file(tmp_path: Path) -> None:
 
 
 def test_a_panic_while_a_session_opens(monkeypatch: pytest.MonkeyPatch) -> None:
-    """If Zenoh panics while it opens a session, a WorkError with the panic's text is raised."""
+    """If Zenoh panics while it opens a session, a `UserError` with the panic's text is raised."""
 
     class PanicException(BaseException):
         """A stand-in for pyo3's exception, which is no `Exception` either."""
@@ -380,9 +380,9 @@ def test_a_panic_while_a_session_opens(monkeypatch: pytest.MonkeyPatch) -> None:
         raise PanicException("called `Option::unwrap()` on a `None` value")
 
     monkeypatch.setattr(zenoh, "open", panic)
-    with pytest.raises(WorkError, match="Option::unwrap"):
+    with pytest.raises(UserError, match="Option::unwrap"):
         open_embedded("client", dialling(1), vehicle="panic")
-    with pytest.raises(WorkError, match="Option::unwrap"):
+    with pytest.raises(UserError, match="Option::unwrap"):
         open_link("client", "tcp/127.0.0.1:1")
 
 
