@@ -17,7 +17,7 @@ from tests.support.ports import free_port
 from lavt.clock import MachineClock, pause
 from lavt.config_file import shipped
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
-from lavt.errors import UserError, WorkError
+from lavt.errors import UserError
 from lavt.node import Send
 from lavt.runtime.thread_failures import fail_on_thread_errors
 from lavt.transport.messages import MAX_MESSAGE_BYTES
