@@ -3,7 +3,8 @@
     python benchmarks/sensitivity.py [--routes a_key,b_key,c_key] [--repetitions 3] [--jobs N]
 
 The drives use geometry fidelity: the lane's true centre replaces the detector, and all else is as in the whole loop.
-The inherent latency is `paper_wifi5`, and the seeds are the same in every column. `docs/controllers.md` has the output.
+The inherent latency is `paper_wifi5`, the stopping-distance limit is 200 m, and the seeds are the same in every column.
+`docs/controllers.md` has the output.
 """
 
 from __future__ import annotations
@@ -62,6 +63,7 @@ def run_drives(preset: str, key: str, values: SettingValues, options: argparse.N
     base["controller"]["preset"] = preset
     config = {
         **base,
+        "safety": {**base["safety"], "stopping_distance_limit_m": 200.0},  # the speed must not depend on the delay
         "fidelity": "geometry",
         "routes": options.routes.split(","),
         "conditions": list(CONDITIONS),

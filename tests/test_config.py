@@ -40,6 +40,7 @@ SCHEMAS: dict[str, type[Section]] = {
     "costs.yaml": Costs,
     "demo.yaml": RunConfig,
     "loss_and_jitter.yaml": SweepConfig,
+    "roads.yaml": SweepConfig,
     "paper.yaml": SweepConfig,
     "paper_designed.yaml": SweepConfig,
     "relay.yaml": RelayConfig,
@@ -90,7 +91,7 @@ def test_the_paper_config() -> None:
     assert len(plan_sweep(paper)) == 180
 
 
-@pytest.mark.parametrize(("name", "count"), [("loss_and_jitter.yaml", 36), ("speed.yaml", 54)])
+@pytest.mark.parametrize(("name", "count"), [("loss_and_jitter.yaml", 36), ("roads.yaml", 180), ("speed.yaml", 54)])
 def test_sweeps_over_further_axes(name: str, count: int) -> None:
     """The sweeps over loss and jitter, and over speed, can be planned; each axis contains the base config's value."""
     sweep = load_config(SweepConfig, shipped("configs") / name)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from operator import itemgetter
@@ -86,11 +87,13 @@ def over_roads(runs: Sequence[Row], values: Values, *, is_rate: bool) -> Row:
     of_roads = [values(of_road) for of_road in groups(runs, road).values()]
     means = [float(np.mean(found)) for found in of_roads if found]
     n, interval = len(means), None
-    if n >= 6 and len(set(means)) > 1:
+    if n >= 6 and is_rate:
+        total = round(sum(means), 9)
+        lows, highs = exact(math.floor(total), n), exact(math.ceil(total), n)
+        interval = [lows[0], highs[1]] if lows and highs else None
+    elif n >= 6 and len(set(means)) > 1:
         student = stats.t.ppf(0.975, n - 1)
         interval = bootstrap([means], np.mean, 1 - 2 * stats.norm.cdf(-np.sqrt(n / (n - 1)) * student))
-    elif n >= 6 and is_rate and means[0] in (0, 1):
-        interval = exact(n if means[0] else 0, n)
     low, high = interval or (None, None)
     return {"roads": n, "mean": mean(means), "low": low, "high": high}
 

@@ -10,6 +10,7 @@ from scipy.stats import binom
 from lavt.experiment.statistics.intervals import (
     bootstrap_interval,
     cluster_interval,
+    cluster_rate_interval,
     exact_interval,
     holm,
     stratified_interval,
@@ -126,6 +127,34 @@ def test_fewer_than_six_clusters_have_no_interval() -> None:
     assert cluster_interval([0.1, 0.5, 0.2, 0.9, 0.4]) is None
     assert cluster_interval([0.1, 0.5, 0.2, 0.9, 0.4, 0.3]) is not None
     assert cluster_interval([0.5] * 6) is None
+
+
+def test_the_interval_of_rates_counts_clusters() -> None:
+    """Rates of 0 and 1 have the exact interval of their number; a sum between whole numbers is rounded outwards."""
+    assert cluster_rate_interval([1.0] + [0.0] * 29) == exact_interval(1, 30)
+    assert cluster_rate_interval([0.1] * 10) == exact_interval(1, 10)  # despite the rounding of ten times 0.1
+    low, high = cluster_rate_interval([0.5] + [0.0] * 9) or [1.0, 0.0]
+    assert [low, high] == [0.0, (exact_interval(1, 10) or [])[1]]
+    assert cluster_rate_interval([1.0] * 5) is None
+
+
+@pytest.mark.parametrize("clusters", [6, 12])
+def test_the_interval_of_rates_covers_any_population(clusters: int) -> None:
+    """For any distribution over clusters with the rates 0, 1/2 and 1, the coverage is at least 95 %."""
+    for none, half in itertools.product(np.linspace(0, 1, 11), repeat=2):
+        if none + half > 1 + 1e-9:
+            continue
+        one_cluster = np.array([none, half, max(1 - none - half, 0.0)])  # of twice the rate
+        distribution = np.ones(1)
+        for _ in range(clusters):
+            distribution = np.convolve(distribution, one_cluster)
+        mean = float(one_cluster @ [0.0, 0.5, 1.0])
+        covered = 0.0
+        for doubled, chance in enumerate(distribution):
+            rates = [1.0] * (doubled // 2) + [0.5] * (doubled % 2)
+            low, high = cluster_rate_interval([*rates, *[0.0] * (clusters - len(rates))]) or [1.0, 0.0]
+            covered += chance * (low - 1e-12 <= mean <= high + 1e-12)
+        assert covered >= 0.95, (none, half)
 
 
 @pytest.mark.parametrize("clusters", [6, 10, 30])

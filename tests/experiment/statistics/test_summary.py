@@ -133,7 +133,7 @@ def test_results_by_road() -> None:
     assert few["p95_m"] == {"roads": 5, "mean": 3.0, "low": None, "high": None}
 
 
-def test_a_rate_that_is_equal_on_all_roads_has_an_exact_interval() -> None:
+def test_rates_by_road_have_an_exact_interval() -> None:
     """Six roads that are all completed give 54 to 100 %, as six of six; three such roads give no interval."""
     runs = [run(route=f"road{number}") for number in range(6)]
     by_road = summarize(runs, SPEED)["conditions"]["L0"]["by_road"]

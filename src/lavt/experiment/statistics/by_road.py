@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lavt.experiment.statistics.intervals import cluster_interval, exact_interval, has_enough_clusters
+from lavt.experiment.statistics.intervals import cluster_interval, cluster_rate_interval
 
 Run = Mapping[str, Any]
 """An entry of `runs` in `summary.json`."""
@@ -75,8 +75,6 @@ def by_road(valid_runs: Sequence[Run], common_p95_m: Callable[[Sequence[Run]], S
 def _over_roads(name: str, values_by_road: Sequence[Sequence[float]]) -> dict[str, Any]:
     """Return the number of roads that have a value, the mean over these roads, and its interval."""
     means = [float(np.mean(values)) for values in values_by_road if values]
-    interval = cluster_interval(means)
-    if interval is None and name.endswith("_rate") and set(means) in ({0.0}, {1.0}):
-        interval = exact_interval(round(sum(means)), len(means)) if has_enough_clusters(len(means)) else None
+    interval = cluster_rate_interval(means) if name.endswith("_rate") else cluster_interval(means)
     low, high = interval or (None, None)
     return {"roads": len(means), "mean": float(np.mean(means)) if means else None, "low": low, "high": high}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import cache
 
@@ -89,6 +90,18 @@ def cluster_interval(means: Sequence[float]) -> list[float] | None:
         return None
     level = 1 - 2 * float(norm.cdf(-np.sqrt(count / (count - 1)) * t.ppf(0.975, count - 1)))
     return list(_bootstrap(tuple(means), level))
+
+
+def cluster_rate_interval(rates: Sequence[float]) -> list[float] | None:
+    """Return the 95 % interval of the mean rate over a population of clusters; None for fewer than `FEWEST_CLUSTERS`.
+
+    It is Clopper and Pearson's interval, as if each cluster had the rate 0 or 1: of all rates with the same mean, these
+    are spread most. A sum of rates that is not whole is rounded down for the lower and up for the upper limit.
+    """
+    count, total = len(rates), round(math.fsum(rates), 9)
+    if not has_enough_clusters(count):
+        return None
+    return [_clopper_pearson(math.floor(total), count)[0], _clopper_pearson(math.ceil(total), count)[1]]
 
 
 @cache  # the runs of the base config are summarized twice

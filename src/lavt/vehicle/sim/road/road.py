@@ -19,6 +19,7 @@ from lavt.domain import FloatArray
 from lavt.errors import UserError
 from lavt.vehicle.sim.road.centreline import Centreline, CentrelinePoints, Segment
 from lavt.vehicle.sim.road.cross_section import Lanes, PavedArea, Rail, RoadMark, shift_stations
+from lavt.vehicle.sim.road.random_road import random_road_number, random_road_text
 from lavt.vehicle.sim.road.road_file import RoadFile, read_road_file
 
 PROJECTION_WINDOW_M = 15.0
@@ -102,7 +103,7 @@ def road_names() -> list[str]:
 
 
 def load_road(name: str) -> Road:
-    """Load the road that comes with LAVT under `name`, or the road file at that path.
+    """Load the road that comes with LAVT under `name`, a random road (`random_1`), or the road file at that path.
 
     Raises `UserError` if there is no such road, or if its file is invalid.
     """
@@ -159,9 +160,13 @@ def _read_text(name: str) -> tuple[str, str]:
     if name in road_names():
         file = resources.files("lavt") / "data" / "roads" / f"{name}.yaml"
         return file.read_text(encoding="utf-8"), f"{name}.yaml"
+    number = random_road_number(name)
+    if number is not None:
+        return random_road_text(number), name
     if not name.endswith((".yaml", ".yml")):
         raise UserError(
-            f"there is no road {name!r}: name one that comes with LAVT ({', '.join(road_names())}) or a .yaml file"
+            f"there is no road {name!r}: name one that comes with LAVT ({', '.join(road_names())}), a random one "
+            "(random_1, random_2, ..) or a .yaml file"
         )
     try:
         return Path(name).read_text(encoding="utf-8"), name
@@ -172,4 +177,8 @@ def _read_text(name: str) -> tuple[str, str]:
 
 
 def _resolve_part_of(source: str, part_of: str) -> str:
-    return part_of if part_of in road_names() else str(Path(source).parent / part_of)
+    return (
+        part_of
+        if part_of in road_names() or random_road_number(part_of) is not None
+        else str(Path(source).parent / part_of)
+    )
