@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import queue
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
@@ -24,7 +23,7 @@ from lavt.errors import BadMessage, UserError, WorkError
 from lavt.node import Send
 from lavt.transport.messages import decode, encode
 from lavt.transport.security.gateway import Carry
-from lavt.transport.zenoh_link import ZenohLink, quiet_logs
+from lavt.transport.zenoh_link import RouterUnreachable, ZenohLink, quiet_logs
 
 RETRY_PERIOD_S = 0.1
 """How long to wait for a confirmation before the stop is sent again. A flood of queries makes repetition necessary.
@@ -32,6 +31,8 @@ Measured with 1000 queries a second, of which the vehicle accepts 100: five of f
 none of six stops that were sent only once."""
 LINK_S = 3.0
 """How long to repeat the stop over one link, if there is another way to the vehicle."""
+LEAST_S = 0.5
+"""How long to repeat the stop over a link at least, even if the time is over."""
 TIMEOUT_S = 10.0
 
 
@@ -69,29 +70,34 @@ def stop(
 
     request = SessionRequest("emergency_stop", settings.who, MachineEntropy().number(64), clock.now().wall_ns)
     until_ns, was_sent = clock.now().mono_ns + round(timeout * NS_PER_S), False
-    for session in itertools.cycle(sessions):
-        left_s = (until_ns - clock.now().mono_ns) / NS_PER_S
-        if was_sent and left_s <= 0:
-            raise WorkError(
-                f"the emergency stop was NOT confirmed within {timeout:g} s, and the vehicle may still be moving: stop "
-                "it by other means and repeat this command. Is its server running, is vehicle_id correct, and do the "
-                "keys match? Run `lavt doctor CONFIG` to find out"
-            )
-        try:
-            link = ZenohLink(clock, side="client", settings=session, vehicle=settings.vehicle_id, who=settings.who)
-        except UserError:
-            if not was_sent and left_s <= 0:
-                with _not_sent():
-                    raise
-            pause(round(RETRY_PERIOD_S * NS_PER_S))
-            continue
-        was_sent = True
-        with closing(link):
-            gateway = build_gateway(authenticator, deliver, link.send, lambda: (0, -1))
-            link.start(gateway.receive, queries_only=True)
-            if _is_confirmed(gateway.send, replies, request, clock, min(left_s, LINK_S)):
-                console.print_result(f"{settings.vehicle_id} accepted the emergency stop")
-                return
+    errors: dict[int, UserError] = {}
+    while clock.now().mono_ns < until_ns:
+        for number, session in enumerate(sessions):
+            try:
+                link = ZenohLink(clock, side="client", settings=session, vehicle=settings.vehicle_id, who=settings.who)
+            except UserError as error:
+                errors[number] = error
+                continue
+            was_sent = True
+            with closing(link):
+                gateway = build_gateway(authenticator, deliver, link.send, lambda: (0, -1))
+                link.start(gateway.receive, queries_only=True)
+                left_s = (until_ns - clock.now().mono_ns) / NS_PER_S
+                if _is_confirmed(gateway.send, replies, request, clock, max(LEAST_S, min(left_s, LINK_S))):
+                    console.print_result(f"{settings.vehicle_id} accepted the emergency stop")
+                    return
+        if len(errors) == len(sessions) and not any(isinstance(error, RouterUnreachable) for error in errors.values()):
+            break  # wrong settings, which another attempt would not change
+        pause(round(RETRY_PERIOD_S * NS_PER_S))
+    if not was_sent:
+        direct = len(sessions) - 1 if settings.security.key else 0
+        with _not_sent():
+            raise errors[direct]
+    raise WorkError(
+        f"the emergency stop was NOT confirmed within {timeout:g} s, and the vehicle may still be moving: stop it by "
+        "other means and repeat this command. Is its server running, is vehicle_id correct, and do the keys match? "
+        "Run `lavt doctor CONFIG` to find out"
+    )
 
 
 @contextmanager

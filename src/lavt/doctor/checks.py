@@ -11,8 +11,8 @@ from typing import Any, Final, Literal
 from lavt.doctor.clock_checks import HINTS, ClockComparison, check_host
 from lavt.domain import NS_PER_MS, NS_PER_S, NS_PER_US, State
 from lavt.transport.clock_sync.clock_report import ClockReport
+from lavt.transport.router_check import Routers
 from lavt.transport.udp_link import RECEIVE_BUFFER_BYTES
-from lavt.transport.zenoh_link import Routers
 
 Verdict = Literal["ok", "warning", "problem", "not checked"]
 

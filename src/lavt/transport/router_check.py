@@ -1,4 +1,7 @@
-"""Whether a Zenoh router in this process still answers; a session is an object of type `zenoh.Session`."""
+"""What Zenoh routers report, and whether the router in this process still answers.
+
+A peer can answer a query for a router's report, too, and with anything.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +9,11 @@ import faulthandler
 import json
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Sequence, Set
 from contextlib import suppress
+from operator import itemgetter
 from pathlib import Path
-from typing import Any, Final
+from typing import Final, NamedTuple
 
 from lavt.errors import WorkError
 from lavt.transport.zenoh_config import error_text
@@ -22,22 +26,31 @@ FAILED_END_S: Final = 5.0
 """How long a process may take to end after its links are closed, if its router has failed."""
 
 
+class Routers(NamedTuple):
+    """The links and versions that a session's router and the routers linked to it report."""
+
+    linked: int
+    """The number of other routers to which the session's router is linked."""
+    versions: tuple[str, ...]
+    """Zenoh's version in every router that reports it, the session's router first."""
+
+
 class RouterCheck:
-    """A check of the router of a session, to be repeated.
+    """A check of the router in this process, to be repeated; `query` returns the answers to a query for its report.
 
     A panic in Zenoh ends only one of its tasks, for example the handshake with one peer. But if this task changes the
     routing tables, they become unusable, and the router no longer delivers any message.
     """
 
-    def __init__(self, session: Any) -> None:
+    def __init__(self, query: Callable[[], Sequence[bytes]]) -> None:
         self.has_failed = False
-        self._session = session
+        self._query = query
         self._unanswered = 0
 
     def run(self) -> None:
         """Query the router; raise `WorkError` if Zenoh fails, or after `MAX_UNANSWERED` queries without an answer."""
         try:
-            self._unanswered = 0 if any(True for _ in _reports(self._session)) else self._unanswered + 1
+            self._unanswered = 0 if self._query() else self._unanswered + 1
         except BaseException as error:  # a panic is not an `Exception`
             self._fail(error_text(error))
         if self._unanswered >= MAX_UNANSWERED:
@@ -57,11 +70,11 @@ class RouterCheck:
         raise WorkError(f"the Zenoh router in this process has failed: {reason}")
 
 
-def router_locators(session: Any) -> list[str]:
-    """Return the endpoints at which the router of a session listens, with the actual port where the config has 0."""
-    for report in _reports(session):
-        with suppress(ValueError, TypeError, KeyError):  # a peer can answer, too
-            locators: list[str] = json.loads(report)["locators"]
+def parse_locators(answers: Iterable[bytes]) -> list[str]:
+    """Return the endpoints at which a router listens, with the actual port where the config has 0."""
+    for answer in answers:
+        with suppress(ValueError, TypeError, KeyError):
+            locators: list[str] = json.loads(answer)["locators"]
             return locators
     raise WorkError(f"the router does not report within {REPORT_TIMEOUT_S:.0f} s where it listens")
 
@@ -71,8 +84,15 @@ def end_process_later() -> None:
     faulthandler.dump_traceback_later(FAILED_END_S, exit=True, file=Path(os.devnull).open("w"))  # noqa: SIM115
 
 
-def _reports(session: Any) -> Iterator[str]:
-    """Query the router of a session for its report, and yield each answer."""
-    for reply in session.get(f"@/{session.info.zid()}/router", timeout=REPORT_TIMEOUT_S):
-        if reply.ok is not None:
-            yield reply.ok.payload.to_string()
+def parse_routers(answers: Iterable[bytes], own: Set[str]) -> Routers | None:
+    """Return the links and versions that routers report; None if no router whose id is in `own` has answered."""
+    reports: list[tuple[bool, int, str]] = []
+    for answer in answers:
+        with suppress(ValueError, TypeError, KeyError, AttributeError):
+            report = json.loads(answer)
+            linked = sum(peer["whatami"] == "router" for peer in report["sessions"])
+            reports.append((report["zid"] not in own, linked, report["version"].partition("-")[0]))
+    reports.sort(key=itemgetter(0))
+    if not reports or reports[0][0]:
+        return None
+    return Routers(reports[0][1], tuple(version for _, _, version in reports))

@@ -14,8 +14,9 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import zenoh
 
@@ -24,7 +25,14 @@ from lavt.domain import Now
 from lavt.errors import UserError
 from lavt.node import Send
 from lavt.transport.messages import NAME
-from lavt.transport.router_check import RouterCheck, end_process_later, router_locators
+from lavt.transport.router_check import (
+    REPORT_TIMEOUT_S,
+    RouterCheck,
+    Routers,
+    end_process_later,
+    parse_locators,
+    parse_routers,
+)
 from lavt.transport.zenoh_config import check_endpoints, check_private_keys, error_text
 
 Deliver = Callable[[str, Any, Now, Any], None]
@@ -123,6 +131,13 @@ def _open_router(path: Path, changes: Mapping[str, Any], *, must_listen: bool) -
         raise UserError(f"the router of {path} does not start: {error_text(error)}; use other endpoints") from error
 
 
+def _router_reports(session: zenoh.Session, selector: str = "") -> list[bytes]:
+    """Query the reports of routers, by default that of the router in this process, and return all answers."""
+    selector = selector or f"@/{session.info.zid()}/router"
+    replies: Any = session.get(selector, timeout=REPORT_TIMEOUT_S, consolidation=zenoh.ConsolidationMode.NONE)
+    return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
+
+
 def configured_endpoints(path: Path, key: str, changes: Mapping[str, Any]) -> list[str]:
     """Return the endpoints at `key`, `listen/endpoints` or `connect/endpoints`, of a config file with `changes`."""
     endpoints = json.loads(_load(path, changes).get_json(key))
@@ -136,7 +151,7 @@ class Router:
 
     def __init__(self, path: Path, overrides: Mapping[str, Any]) -> None:
         self._session = _open_router(path, overrides, must_listen=True)
-        self._check = RouterCheck(self._session)
+        self._check = RouterCheck(partial(_router_reports, self._session))
 
     def check(self) -> None:
         """Raise `WorkError` if the router no longer answers."""
@@ -144,13 +159,17 @@ class Router:
 
     def locators(self) -> list[str]:
         """Return the endpoints at which the router listens, with the actual port where the config has 0."""
-        return router_locators(self._session)
+        return parse_locators(_router_reports(self._session))
 
     def close(self) -> None:
         """Stop routing."""
         if self._check.has_failed:
             end_process_later()
         self._session.close()
+
+
+class RouterUnreachable(UserError):
+    """No router answers, or it rejects the session."""
 
 
 @dataclass(frozen=True)
@@ -165,15 +184,6 @@ class SessionSettings:
     """Whether the session is a router itself. Otherwise it is a session with a router."""
     advice: str = "start one with `lavt router FILE.json5`, or use another endpoint"
     """What to do if no router answers."""
-
-
-class Routers(NamedTuple):
-    """The links and versions that a session's router and the routers linked to it report."""
-
-    linked: int
-    """The number of other routers to which the session's router is linked."""
-    versions: tuple[str, ...]
-    """Zenoh's version in every router that reports it, the session's router first."""
 
 
 def _zenoh_callback(handle: Callable[[str, Any], None], channel: str) -> Callable[[Any], None]:
@@ -232,7 +242,7 @@ class ZenohLink:
         self._check: RouterCheck | None = None
         if settings.is_router:
             self._session = _open_router(settings.path, settings.changes, must_listen=False)
-            self._check = RouterCheck(self._session)
+            self._check = RouterCheck(partial(_router_reports, self._session))
         else:
             self._open_session(settings)
 
@@ -245,11 +255,11 @@ class ZenohLink:
         except zenoh.ZError as error:
             self._waiting_reason = f"no router answers at {endpoints}: {settings.advice} ({error_text(error)})"
             if self._waiting is None:
-                raise UserError(self._waiting_reason) from error
+                raise RouterUnreachable(self._waiting_reason) from error
 
     def locators(self) -> list[str]:
         """Return the endpoints at which a session that is a router listens."""
-        return router_locators(self._session)
+        return parse_locators(_router_reports(self._session))
 
     def start(self, deliver: Deliver, *, queries_only: bool = False) -> None:
         """Start to send and to receive; threads of the link call `deliver`.
@@ -320,25 +330,14 @@ class ZenohLink:
 
     def routers(self) -> Routers | None:
         """Query the routers for their links and versions; return None if this session's router does not answer."""
-        own_routers = {str(zid) for zid in self._session.info.routers_zid()}
-        reports = [
-            json.loads(reply.ok.payload.to_string())
-            for reply in self._session.get("@/*/router", timeout=REPLY_TIMEOUT_S)
-            if reply.ok is not None
-        ]
-        reports.sort(key=lambda report: report["zid"] not in own_routers)
-        own_report = reports[0] if reports else None
-        if own_report is None or own_report["zid"] not in own_routers:
-            return None
-        linked = sum(session["whatami"] == "router" for session in own_report["sessions"])
-        return Routers(linked, tuple(report["version"].partition("-")[0] for report in reports))
+        own = {str(zid) for zid in self._session.info.routers_zid()}
+        return parse_routers(_router_reports(self._session, "@/*/router"), own)
 
     def close(self) -> None:
         """Close the session; a process with an open session would not end."""
         self._closing.set()
         if self._check is not None and self._check.has_failed:
             end_process_later()
-            return
         if self._opener is not None:
             self._opener.join()
         if self._session is not None:
