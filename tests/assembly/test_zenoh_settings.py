@@ -92,7 +92,7 @@ def test_a_separate_router_is_reached_by_the_session_file() -> None:
 def test_a_program_on_the_clients_machine_has_two_ways_to_the_vehicle() -> None:
     """Another program connects to the client's router, or dials the vehicle itself, once and under an id of its own."""
     config = client(EMBEDDED | {"router_settings": {"id": "abc"}})
-    direct, by_client = program_sessions(config)
+    by_client, direct = program_sessions(config)
     assert not by_client.is_router
     assert endpoints(by_client, "connect") == ["tcp/127.0.0.1:7457"]
     assert not direct.is_router
@@ -100,13 +100,6 @@ def test_a_program_on_the_clients_machine_has_two_ways_to_the_vehicle() -> None:
     assert direct.changes["id"] != "abc"
     assert endpoints(direct, "connect") == ["udp/192.0.2.7:7448?mixed_rel=1;rel=1"]
     assert endpoints(direct, "listen") == []
-
-
-def test_with_keys_the_running_clients_router_is_preferred() -> None:
-    """With keys, another program first uses the link of the running client: a stop is signed for one vehicle only."""
-    by_client, direct = program_sessions(client(EMBEDDED, security=CLIENT_KEYS))
-    assert endpoints(by_client, "connect") == ["unixsock-stream//run/lavt/zenoh.sock"]
-    assert endpoints(direct, "connect") == ["quic/192.0.2.7:7448?mixed_rel=1"]
 
 
 def test_a_program_dials_the_vehicle_if_the_clients_router_has_no_local_endpoint() -> None:

@@ -31,9 +31,8 @@ def side_session(config: Config) -> SessionSettings:
 def program_sessions(config: Config) -> list[SessionSettings]:
     """Return the settings with which another program on the side's machine, such as `lavt stop`, can open its session.
 
-    They are in the order of preference. One is for the router on this machine: the separate one, or the embedded one of
-    the running side. A client also has one for the vehicle's router. Without keys it is the first one, because then
-    nothing shows whether the running client dials the same vehicle.
+    The first one is for the router on this machine: the separate one, or the embedded one of the running side. A client
+    also has a last one for the vehicle's router, which is independent of the running client.
     """
     if not config.zenoh.is_embedded:
         return [_separate(config)]
@@ -48,8 +47,7 @@ def program_sessions(config: Config) -> list[SessionSettings]:
     if isinstance(config, ClientConfig):
         advice = "is `lavt server` running there, and is video.server the vehicle's address?"
         own_id = {"id": f"{MachineEntropy().number(64):x}"}  # the router of a running client has the id of the file
-        direct = SessionSettings(path, changes | AS_A_SESSION | own_id, advice=advice)
-        sessions.insert(len(sessions) if config.security.key else 0, direct)
+        sessions.append(SessionSettings(path, changes | AS_A_SESSION | own_id, advice=advice))
     if not sessions:
         raise UserError(
             f"the server's router has no endpoint for programs on its machine: add one to listen.endpoints, in {path} "

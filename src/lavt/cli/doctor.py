@@ -206,7 +206,9 @@ def _zenoh_checks(settings: Settings, clock: MachineClock) -> Iterator[Check]:
         return
     listener, endpoint = measurements.StateListener(settings), settings.zenoh.router
     try:
-        link, endpoint = _open_link(settings, clock)
+        session = program_sessions(settings)[-1]
+        endpoint = ", ".join(configured_endpoints(session.path, "connect/endpoints", session.changes))
+        link = ZenohLink(clock, side="client", settings=session, vehicle=settings.vehicle_id, who=CLIENT_NAME)
     except UserError as error:
         if settings.zenoh.is_embedded and isinstance(settings, ServerConfig):
             yield _embedded_router_check(settings, clock)
@@ -221,21 +223,6 @@ def _zenoh_checks(settings: Settings, clock: MachineClock) -> Iterator[Check]:
         sample = listener.listen(link, clock)
         yield checks.check_vehicle(sample, settings.vehicle_id, lavt.__version__)
         yield checks.check_link(link.routers(), has_vehicle=bool(sample.states or sample.unreadable))
-
-
-def _open_link(settings: Settings, clock: MachineClock) -> tuple[ZenohLink, str]:
-    """Open a link to the first router that answers; return it and its endpoints. Raise `UserError` if none answers."""
-    *preferred, last = program_sessions(settings)
-    for session in (*preferred, last):
-        endpoint = ", ".join(configured_endpoints(session.path, "connect/endpoints", session.changes))
-        try:
-            link = ZenohLink(clock, side="client", settings=session, vehicle=settings.vehicle_id, who=CLIENT_NAME)
-        except UserError:
-            if session is last:
-                raise
-        else:
-            return link, endpoint
-    raise AssertionError  # the last session is opened, or raises
 
 
 def _embedded_router_check(settings: ServerConfig, clock: MachineClock) -> Check:

@@ -61,6 +61,8 @@ def stop(
     with _not_sent():
         authenticator = build_authenticator(settings)  # the vehicle also accepts a stop that an expired key has signed
         sessions = program_sessions(settings)
+        if not settings.security.key:  # then nothing shows whether the running client dials the same vehicle
+            sessions.reverse()
     quiet_logs()
     replies = queue.Queue[bytes]()
 
