@@ -12,7 +12,7 @@ from tests.support.clocks import ManualClock
 from lavt.assembly import by_wire
 from lavt.assembly.by_wire import inhibit_reason_of
 from lavt.assembly.dbw import load_profile
-from lavt.assembly.software_car import build_software_car
+from lavt.assembly.simulators import build_software_car
 from lavt.config import DbwConfig, ServerConfig, ServerSecurityConfig, VehicleConfig
 from lavt.domain import NS_PER_MS, NS_PER_S, State
 from lavt.safety.gate import RejectionReason

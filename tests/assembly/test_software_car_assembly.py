@@ -6,8 +6,7 @@ import pytest
 from tests.vehicle.software_car.rig import START_NS, CommandValues, Sender1, Sender2
 
 from lavt.assembly.dbw import load_profile
-from lavt.assembly.simulators import simulator_of
-from lavt.assembly.software_car import build_software_car
+from lavt.assembly.simulators import build_software_car, simulator_of
 from lavt.config import DbwConfig, ServerConfig, VehicleConfig
 from lavt.vehicle.sim.road.road import load_road
 from lavt.vehicle.software_car.car import SoftwareCar

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import cv2  # noqa: F401 (its first import changes the environment, which no test may do)
 import pytest
 from tests.support.command_line import CommandResult, Run
 

@@ -78,12 +78,14 @@ def test_only_the_server_may_lock_its_memory() -> None:
 
 
 def test_the_directory_of_the_socket() -> None:
-    """Only the router's unit creates /run/lavt; its socket is for one user, and the directory outlives the unit."""
-    assert [path.name for path in UNITS if "RuntimeDirectory" in read_unit(path)["Service"]] == ["lavt-router.service"]
-    service = read_unit(DEPLOY / "systemd/lavt-router.service")["Service"]
-    assert (service["RuntimeDirectory"], service["RuntimeDirectoryMode"]) == ("lavt", "0750")
-    assert service["RuntimeDirectoryPreserve"] == "yes"
-    assert service["UMask"] == "0077"
+    """The units of server, client and router create /run/lavt, which outlives them; their socket is for one user."""
+    services = {path.name: read_unit(path)["Service"] for path in UNITS}
+    creators = {name for name, service in services.items() if "RuntimeDirectory" in service}
+    assert creators == {"lavt-client.service", "lavt-router.service", "lavt-server.service"}
+    for service in (services[name] for name in creators):
+        assert (service["RuntimeDirectory"], service["RuntimeDirectoryMode"]) == ("lavt", "0750")
+        assert service["RuntimeDirectoryPreserve"] == "yes"
+        assert int(service["UMask"], 8) & 0o022 == 0o022  # who may not write to the socket cannot connect
 
 
 def test_the_client_is_started_by_a_person() -> None:

@@ -6,20 +6,13 @@ have failed, so that only the signatures protect the drive.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tests.field.secured_routers import (
-    BASE,
-    QUIC,
-    direct_handler,
-    open_session,
-    quic_endpoint,
-    start_router,
-    tls_changes,
-)
+from tests.field.secured_routers import BASE, QUIC, direct_handler, open_session
 
 from lavt.clock import MachineClock, pause
 from lavt.config_file import shipped
@@ -162,24 +155,12 @@ def run_attack(clock: MachineClock, attack: Callable[[], None], period_ns: int) 
 
 
 def start_secure_loop(processes: Processes, work: Path, keys: Path) -> tuple[Insider, Process, Process]:
-    """Start both routers, the insider, and then `lavt server` and `lavt client` with the secure configs."""
-    sockets = {name: f"unixsock-stream/{work}/{name}.sock" for name in ("vehicle", "operator")}
-    vehicle = start_router(
-        processes,
-        "vehicle",
-        "router-server-tls.json5",
-        f'listen.endpoints=["{sockets["vehicle"]}", "{QUIC}"]',
-        *tls_changes(keys, "vehicle-1", "listen"),
-    )
-    start_router(
-        processes,
-        "operator",
-        "router-client-tls.json5",
-        f'listen.endpoints=["{sockets["operator"]}"]',
-        f'connect.endpoints=["{quic_endpoint(vehicle)}"]',
-        *tls_changes(keys, "operator-1", "connect"),
-    ).wait_ready()
-    insider = Insider(sockets["operator"])
+    """Start `lavt server` and `lavt client` with the secure configs and embedded routers, and then the insider.
+
+    The client's router listens at a socket, as if other programs needed it; there the insider gets in.
+    """
+    socket = f"unixsock-stream/{work}/operator.sock"
+    listen = {"listen": {"endpoints": [QUIC]}, **tls_settings(keys, "vehicle-1", "listen")}
     server = processes.start(
         "server",
         "server",
@@ -187,7 +168,7 @@ def start_secure_loop(processes: Processes, work: Path, keys: Path) -> tuple[Ins
         "--out",
         str(work / "server"),
         *set_arguments(
-            f"zenoh.router={sockets['vehicle']}",
+            f"zenoh.router_settings={json.dumps(listen)}",
             f"security.key={keys}/vehicle-1.sign.key",
             f"security.operators={{operator-1: {keys}/operator-1.sign.pub}}",
             "video.bind=127.0.0.1",
@@ -198,7 +179,9 @@ def start_secure_loop(processes: Processes, work: Path, keys: Path) -> tuple[Ins
             "vehicle.route=a",
         ),
     )
-    ports = server.wait_ready()["ready"]
+    ready = server.wait_ready()["ready"]
+    endpoints = {"listen": {"endpoints": [socket]}, "connect": {"endpoints": ready["locators"]}}
+    dial = {**endpoints, **tls_settings(keys, "operator-1", "connect")}
     client = processes.start(
         "client",
         "client",
@@ -206,18 +189,25 @@ def start_secure_loop(processes: Processes, work: Path, keys: Path) -> tuple[Ins
         "--out",
         str(work / "client"),
         *set_arguments(
-            f"zenoh.router={sockets['operator']}",
+            f"zenoh.router_settings={json.dumps(dial)}",
             f"security.key={keys}/operator-1.sign.key",
             f"security.vehicle={keys}/vehicle-1.sign.pub",
             "video.server=127.0.0.1",
-            f"video.port={ports['video_port']}",
-            f"clock.probe_port={ports['probe_port']}",
+            f"video.port={ready['video_port']}",
+            f"clock.probe_port={ready['probe_port']}",
             "clock.source=probe",
             "controller.rearm=true",
         ),
     )
     client.wait_ready()
-    return insider, server, client
+    return Insider(socket), server, client
+
+
+def tls_settings(keys: Path, name: str, action: str) -> dict[str, Any]:
+    """Return the settings of an embedded router for the keys of `name`; `action` is "listen" or "connect"."""
+    files = {"root_ca_certificate": "authority.pem", f"{action}_certificate": f"{name}.pem"}
+    files[f"{action}_private_key"] = f"{name}.key"
+    return {"transport": {"link": {"tls": {key: str(keys / file) for key, file in files.items()}}}}
 
 
 def set_arguments(*changes: str) -> list[str]:

@@ -23,7 +23,7 @@ CHANGES_OF_BOTH_SIDES = ("record.video=false",)
 OBSERVER = Path(__file__).with_name("command_observer.py")
 POLL_NS = 20 * NS_PER_MS
 DRIVING_WITHIN_S = 90.0
-"""In this time routers find each other, and the client gets control, arms and speeds up; usual are 8 s."""
+"""In this time the sides find each other, and the client gets control, arms and speeds up; usual are 8 s."""
 
 
 def wait_until(expectation: str, condition: Callable[[], bool], limit_s: float = DRIVING_WITHIN_S) -> None:
@@ -38,58 +38,78 @@ def _udp_endpoint(host: str) -> str:
     return f"udp/{host}:7448?rel=1;mixed_rel=1"
 
 
+def _embedded(file: str = "", **settings: Any) -> str:
+    """Return the change of a side's config for an embedded router with a shipped file and changes of it."""
+    router_file = f"zenoh-configs/{file}" if file else ""
+    return "zenoh=" + json.dumps({"router_file": router_file, "router_settings": settings})
+
+
 @dataclass(frozen=True)
 class Links:
-    """For each router and the rendezvous: its config, then changes of it. For server and client: changes only."""
+    """The changes of the configs of server and client; for separate routers and the rendezvous, also their configs."""
 
-    vehicle_router: tuple[str, ...] = ("router-server.json5",)
-    operator_router: tuple[str, ...] = ("router-client.json5", f'connect.endpoints=["{_udp_endpoint(VEHICLE)}"]')
-    cloud_router: tuple[str, ...] = ()
-    """Empty without a router in the cloud: the operator's router then dials the vehicle's."""
-    rendezvous: tuple[str, ...] = ()
-    """Empty without a rendezvous: the client then reaches the vehicle directly."""
     server_changes: tuple[str, ...] = ()
     client_changes: tuple[str, ...] = ()
+    vehicle_router: tuple[str, ...] = ()
+    """Empty if the server contains its router, as by default. Otherwise the file, and changes of it."""
+    operator_router: tuple[str, ...] = ()
+    cloud_router: tuple[str, ...] = ()
+    """Empty without a router in the cloud: the client's router then dials the vehicle's."""
+    rendezvous: tuple[str, ...] = ()
+    """Empty without a rendezvous: the client then reaches the vehicle directly."""
 
 
 MIXED = Links()
 """The shipped configs: a reliable stream and best-effort datagrams over UDP, and a lease of 2 s."""
+SEPARATE = Links(
+    ("zenoh.router=tcp/127.0.0.1:7447",),
+    ("zenoh.router=tcp/127.0.0.1:7457",),
+    ("router-server.json5",),
+    ("router-client.json5", f'connect.endpoints=["{_udp_endpoint(VEHICLE)}"]'),
+)
+"""The same with routers in processes of their own."""
+LONG_LEASE = {"link": {"tx": {"lease": 10000}}}
 TCP = Links(
-    (
-        "router-server.json5",
-        'listen.endpoints=["tcp/127.0.0.1:7447", "tcp/0.0.0.0:7448"]',
-        "transport.link.tx.lease=10000",
-    ),
-    ("router-client.json5", f'connect.endpoints=["tcp/{VEHICLE}:7448"]', "transport.link.tx.lease=10000"),
+    (_embedded(listen={"endpoints": ["tcp/127.0.0.1:7447", "tcp/0.0.0.0:7448"]}, transport=LONG_LEASE),),
+    (_embedded(connect={"endpoints": [f"tcp/{VEHICLE}:7448"]}, transport=LONG_LEASE),),
 )
 """Zenoh's defaults: TCP and a lease of 10 s. The kernel buffers messages during an outage and delivers them later."""
+TO_CLOUD = {"endpoints": [_udp_endpoint(INTERNET)]}
 CLOUD = Links(
-    (
-        "router-client.json5",
-        'listen.endpoints=["tcp/127.0.0.1:7447"]',
-        f'connect.endpoints=["{_udp_endpoint(INTERNET)}"]',
-    ),
-    ("router-client.json5", f'connect.endpoints=["{_udp_endpoint(INTERNET)}"]'),
-    ("router-server.json5", f'listen.endpoints=["{_udp_endpoint("0.0.0.0")}"]'),
+    (_embedded("router-server-to-cloud.json5", connect=TO_CLOUD),),
+    (_embedded("router-client.json5", connect=TO_CLOUD),),
+    cloud_router=("router-server.json5", f'listen.endpoints=["{_udp_endpoint("0.0.0.0")}"]'),
 )
-"""The routers of vehicle and operator dial a router in the cloud, so both use the config of a router that dials."""
+"""The routers of vehicle and operator dial a router in the cloud."""
+
+
+def signed(links: Links, keys: Path) -> Links:
+    """Return links on which messages are signed and the video is encrypted with keys of `lavt keys`."""
+    server = (
+        f"security.key={keys}/vehicle-1.sign.key",
+        f"security.operators={{operator-1: {keys}/operator-1.sign.pub}}",
+    )
+    client = (f"security.key={keys}/operator-1.sign.key", f"security.vehicle={keys}/vehicle-1.sign.pub")
+    return replace(
+        links, server_changes=(*links.server_changes, *server), client_changes=(*links.client_changes, *client)
+    )
+
+
+SIGNED_ONLY = Links(
+    (_embedded("router-server.json5"),),
+    (_embedded("router-client.json5", connect={"endpoints": [_udp_endpoint(VEHICLE)]}),),
+)
+"""Routers without certificates although the sides have keys."""
 
 
 def through_rendezvous(keys: Path) -> Links:
     """Return links on which everything goes through the cloud, signed and encrypted with keys of `lavt keys`."""
+    links = signed(CLOUD, keys)
     return replace(
-        CLOUD,
+        links,
         rendezvous=("rendezvous.yaml", f"bind={INTERNET}", f"vehicle_key={keys}/vehicle-1.sign.pub"),
-        server_changes=(
-            f"rendezvous.host={INTERNET}",
-            f"security.key={keys}/vehicle-1.sign.key",
-            f"security.operators={{operator-1: {keys}/operator-1.sign.pub}}",
-        ),
-        client_changes=(
-            f"video.server={INTERNET}",
-            f"security.key={keys}/operator-1.sign.key",
-            f"security.vehicle={keys}/vehicle-1.sign.pub",
-        ),
+        server_changes=(*links.server_changes, f"rendezvous.host={INTERNET}"),
+        client_changes=(*links.client_changes, f"video.server={INTERNET}"),
     )
 
 
@@ -122,10 +142,12 @@ class Drive:
             self.start_process("cloud-router")
         if self.links.rendezvous:
             self.start_process("rendezvous")
-        self.start_process("vehicle-router")
-        self.start_process("observer")
+        if self.links.vehicle_router:
+            self.start_process("vehicle-router")
         self.start_process("server")
-        self.start_process("operator-router")
+        self.start_process("observer")
+        if self.links.operator_router:
+            self.start_process("operator-router")
         self.start_process("client")
 
     def start_process(self, role: str) -> Process:

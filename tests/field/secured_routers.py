@@ -1,11 +1,12 @@
 """The shipped encrypted routers on the loopback, with a vehicle, an operator and attackers.
 
 Vehicle, operator and attackers are plain Zenoh sessions without LAVT's gateway, so that only the routers protect
-against the attackers.
+against the attackers. The sessions of vehicle and operator contain their routers, or have separate ones.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from typing import Any
 
 import zenoh
 
+from lavt.cli.router import parse_overrides
 from lavt.clock import MachineClock, pause
 from lavt.config_file import shipped
 from lavt.domain import NS_PER_MS, NS_PER_S
@@ -30,6 +32,7 @@ ROUNDS = 25
 LIMIT_S = 15.0
 """Time limit of an attack."""
 LONG_COMMAND_BYTES = 5000
+_INTRUDER_NUMBERS = itertools.count()
 
 
 def make_keys(directory: Path, *arguments: str) -> None:
@@ -51,6 +54,14 @@ def start_router(processes: Processes, name: str, file: str, *changes: str) -> P
     """Start `lavt router` with a shipped config and `--set` for each change."""
     set_options = [word for change in changes for word in ("--set", change)]
     return processes.start(name, "router", str(shipped(f"zenoh-configs/{file}")), *set_options)
+
+
+def open_embedded_router(file: str, *changes: str) -> Any:
+    """Open a session that is a router, with a shipped config and changes as for `lavt router`."""
+    config = zenoh.Config.from_file(str(shipped(f"zenoh-configs/{file}")))
+    for key, value in parse_overrides(list(changes)).items():
+        config.insert_json5(key, json.dumps(value))
+    return zenoh.open(config)
 
 
 def quic_endpoint(router: Process) -> str:
@@ -94,11 +105,11 @@ def direct_handler(callback: Callable[[Any], None]) -> Any:
 class VehicleStandIn:
     """A stand-in for `lavt server` that receives commands, answers queries and publishes states."""
 
-    def __init__(self, endpoint: str) -> None:
+    def __init__(self, session: Any) -> None:
         self.commands: list[bytes] = []
         self.deleted = 0
         self.queries: list[bytes] = []
-        self.session = open_session(endpoint)
+        self.session = session
         self._state = self.session.declare_publisher(f"{BASE}/state", **STATE)
         self.session.declare_subscriber(f"{BASE}/control", direct_handler(self._on_command))
         for key in (f"{BASE}/session", f"{BASE}/netem"):
@@ -154,12 +165,13 @@ class ClientStandIn:
 
 @dataclass
 class Site:
-    """A vehicle and its operator, each at its own router; the routers are linked."""
+    """A vehicle and its operator, each with its own router, embedded or separate; the routers are linked."""
 
     keys: Path
     endpoint: str
     """The endpoint of the router that accepts links from outside: the vehicle's or the cloud's."""
     operator_socket: Path
+    """The socket at which the operator's router listens."""
     vehicle: VehicleStandIn
     operator: ClientStandIn
     processes: Processes
@@ -214,7 +226,7 @@ class Intruder(ClientStandIn):
     """An attacker with a session: `attempt` sends all kinds of messages, `achieved` returns their effects."""
 
     def __init__(self, session: Any) -> None:
-        super().__init__(session, b"intruder")
+        super().__init__(session, b"intruder %d" % next(_INTRUDER_NUMBERS))  # the last intruder's messages may be late
         for key in ("**", "lavt/**", "lavt/*/*", f"{BASE}/control"):
             self.subscribe(key)
         self.alive: list[str] = []
@@ -242,11 +254,11 @@ class Intruder(ClientStandIn):
         ]
         replies = set(self.replies) - {b"forged"}
         effects = {
-            "commands": b"intruder" in site.vehicle.commands,
+            "commands": self.name in site.vehicle.commands,
             "wildcard commands": b"wildcard" in site.vehicle.commands,
             "deletes": site.vehicle.deleted > 0,
             "long commands": any(len(command) >= LONG_COMMAND_BYTES for command in site.vehicle.commands),
-            "queries": b"intruder" in site.vehicle.queries,
+            "queries": self.name in site.vehicle.queries,
             "session": b"reply to session" in replies,
             "netem": b"reply to netem" in replies,
             "the routers' own state": bool(replies - {b"reply to session", b"reply to netem"}),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import socket
 import stat
@@ -24,6 +25,7 @@ from tests.field.secured_routers import (
     Site,
     VehicleStandIn,
     make_keys,
+    open_embedded_router,
     open_session,
     quic_endpoint,
     start_router,
@@ -31,6 +33,7 @@ from tests.field.secured_routers import (
     udp_port,
 )
 from tests.require import need
+from tests.support.ports import free_port
 from tests.support.stalls import BUSY_SHARE, LONG_STALL_MS, SharedResult, Stalls
 
 from lavt.control.client_limits import CLIENT_LIMITS
@@ -82,7 +85,7 @@ def others_keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
-def start_site(stack: ExitStack, keys: Path, *changes: str, cloud: bool) -> Site:
+def start_site(stack: ExitStack, keys: Path, *changes: str, cloud: bool, embedded: bool = True) -> Site:
     """Start the routers, the vehicle and the operator, and wait until they exchange messages.
 
     `changes` apply to the router that others dial.
@@ -93,47 +96,40 @@ def start_site(stack: ExitStack, keys: Path, *changes: str, cloud: bool) -> Site
     processes = stack.enter_context(Processes(work))
     sockets = {name: work / f"{name}.sock" for name in ("vehicle", "operator")}
     local = {name: f"unixsock-stream/{path}" for name, path in sockets.items()}
+    endpoint = f"quic/127.0.0.1:{free_port()}?mixed_rel=1"
+    listens = [local["vehicle"]] if cloud else [local["vehicle"], endpoint]
+    vehicle_changes = [f"listen.endpoints={json.dumps(listens)}"]
     if cloud:
-        cloud_router = start_router(
+        start_router(
             processes,
             "cloud",
             "router-cloud-tls.json5",
-            f'listen.endpoints=["{QUIC}"]',
+            f'listen.endpoints=["{endpoint}"]',
             *tls_changes(keys, "cloud-1", "listen"),
             *changes,
-        )
-        endpoint = quic_endpoint(cloud_router)
-        vehicle = start_router(
-            processes,
-            "vehicle",
-            "router-server-to-cloud-tls.json5",
-            f'listen.endpoints=["{local["vehicle"]}"]',
-            f'connect.endpoints=["{endpoint}"]',
-            *tls_changes(keys, "vehicle-1", "connect"),
-        )
-        vehicle.wait_ready()
+        ).wait_ready()
+        vehicle_file = "router-server-to-cloud-tls.json5"
+        vehicle_changes += [f'connect.endpoints=["{endpoint}"]', *tls_changes(keys, "vehicle-1", "connect")]
     else:
-        vehicle = start_router(
-            processes,
-            "vehicle",
-            "router-server-tls.json5",
-            f'listen.endpoints=["{local["vehicle"]}", "{QUIC}"]',
-            *tls_changes(keys, "vehicle-1", "listen"),
-            *changes,
-        )
-        endpoint = quic_endpoint(vehicle)
-    start_router(
-        processes,
-        "operator",
-        "router-client-tls.json5",
+        vehicle_file = "router-server-tls.json5"
+        vehicle_changes += [*tls_changes(keys, "vehicle-1", "listen"), *changes]
+    operator_changes = (
         f'listen.endpoints=["{local["operator"]}"]',
         f'connect.endpoints=["{endpoint}"]',
         *tls_changes(keys, "operator-1", "connect"),
-    ).wait_ready()
-    car = VehicleStandIn(local["vehicle"])
-    stack.callback(car.session.close)
-    operator = ClientStandIn(open_session(local["operator"]), b"operator")
-    stack.callback(operator.session.close)
+    )
+
+    def open_own_session(name: str, file: str, *own_changes: str) -> Any:
+        if embedded:
+            session = open_embedded_router(file, *own_changes)
+        else:
+            start_router(processes, name, file, *own_changes).wait_ready()
+            session = open_session(local[name])
+        stack.callback(session.close)
+        return session
+
+    car = VehicleStandIn(open_own_session("vehicle", vehicle_file, *vehicle_changes))
+    operator = ClientStandIn(open_own_session("operator", "router-client-tls.json5", *operator_changes), b"operator")
     site = Site(keys, endpoint, sockets["operator"], car, operator, processes)
     site.exchange_messages()
     return site
@@ -153,10 +149,15 @@ def cloud_site(keys: Path) -> Iterator[Site]:
         yield start_site(stack, keys, cloud=True)
 
 
-@pytest.fixture(params=["direct_site", "cloud_site"])
-def site(request: pytest.FixtureRequest) -> Site:
-    """Return each kind of site in turn; the messages of earlier tests are forgotten."""
-    site: Site = request.getfixturevalue(request.param)
+@pytest.fixture(scope="module")
+def separate_site(keys: Path) -> Iterator[Site]:
+    """Start a site like the first, with routers in processes of their own."""
+    with ExitStack() as stack:
+        yield start_site(stack, keys, cloud=False, embedded=False)
+
+
+def forget_messages(site: Site) -> Site:
+    """Return a site that has forgotten the messages of earlier tests."""
     for messages in (
         site.vehicle.commands,
         site.vehicle.queries,
@@ -168,16 +169,28 @@ def site(request: pytest.FixtureRequest) -> Site:
     return site
 
 
+@pytest.fixture(params=["direct_site", "cloud_site"])
+def site(request: pytest.FixtureRequest) -> Site:
+    """Return each kind of site with embedded routers in turn."""
+    return forget_messages(request.getfixturevalue(request.param))
+
+
+@pytest.fixture(params=["direct_site", "cloud_site", "separate_site"])
+def any_site(request: pytest.FixtureRequest) -> Site:
+    """Return each kind of site in turn, also the one with separate routers."""
+    return forget_messages(request.getfixturevalue(request.param))
+
+
 @pytest.mark.parametrize("mode", ["client", "router"])
 @pytest.mark.parametrize(("name", "effects"), EFFECTS_BY_NAME)
-def test_access_depends_on_the_certificates_name(site: Site, name: str, effects: set[str], mode: str) -> None:
+def test_access_depends_on_the_certificates_name(any_site: Site, name: str, effects: set[str], mode: str) -> None:
     """The listed operator may send commands and queries, a monitor may only see the state, an unlisted name nothing.
 
     None of them succeeds with wildcards, deletes, long messages, forged states or forged replies.
     """
-    with closing(site.intruder(name, mode)) as intruder:
-        site.exchange_messages(intruder.attempt)
-        assert intruder.achieved(site) == effects
+    with closing(any_site.intruder(name, mode)) as intruder:
+        any_site.exchange_messages(intruder.attempt)
+        assert intruder.achieved(any_site) == effects
 
 
 def test_without_access_lists_every_attack_succeeds(keys: Path) -> None:
@@ -197,11 +210,11 @@ def test_without_access_lists_every_attack_succeeds(keys: Path) -> None:
     assert achieved == ALL_EFFECTS
 
 
-def test_messages_pass_the_operators_own_router(site: Site) -> None:
+def test_messages_pass_the_operators_own_router(any_site: Site) -> None:
     """Commands, queries, replies and states pass through the operator's own router."""
-    site.exchange_messages()
-    assert set(site.vehicle.commands) == {b"operator"}
-    assert set(site.vehicle.queries) == {b"operator"}
+    any_site.exchange_messages()
+    assert set(any_site.vehicle.commands) == {b"operator"}
+    assert set(any_site.vehicle.queries) == {b"operator"}
 
 
 def test_certificate_of_another_authority_gets_no_link(site: Site, keys: Path, others_keys: Path) -> None:

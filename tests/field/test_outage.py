@@ -14,7 +14,7 @@ from statistics import median
 
 import numpy as np
 import pytest
-from tests.field.driving import TCP, Drive, running_loop
+from tests.field.driving import SEPARATE, TCP, Drive, running_loop
 from tests.field.namespaces import Direction, FieldNetworks, plain_field
 from tests.field.outage_effects import OutageEffects, effects_table, measure
 from tests.support.stalls import BUSY_SHARE, LONG_STALL_MS, Stalls
@@ -60,9 +60,13 @@ MEDIAN_RECOVERY_S = 3.0
 SHORT_OUTAGES = tuple(f"{name} {SHORT_S:g} s{again}" for again in ("", ", again") for name in DIRECTIONS)
 LONG_OUTAGES = (*(f"{name} 1 s" for name in DIRECTIONS), "both ways 3 s")
 """Shorter and longer than the routers' lease of 2 s."""
-PROCESS_KILLED = ("vehicle's router killed", "operator's router killed", "client killed")
+CLIENT_KILLED = "client killed"
 CLIENT_FROZEN = "client frozen"
-STOPPING_OUTAGES = (*LONG_OUTAGES, *PROCESS_KILLED, CLIENT_FROZEN)
+ROUTERS_KILLED = ("vehicle's router killed", "operator's router killed")
+SEPARATE_NETWORK_OUTAGE = "both ways 3 s, separate routers"
+SEPARATE_OUTAGES = (SEPARATE_NETWORK_OUTAGE, *ROUTERS_KILLED)
+"""The outages of the drive whose routers are processes of their own."""
+STOPPING_OUTAGES = (*LONG_OUTAGES, CLIENT_KILLED, CLIENT_FROZEN)
 SERVER_KILLED = "server killed"
 ALL_OUTAGES = (*SHORT_OUTAGES, *STOPPING_OUTAGES, SERVER_KILLED)
 
@@ -115,15 +119,39 @@ def all_outages(
     work = tmp_path_factory.mktemp("outages")
     with running_loop(field, work) as drive:
         cause_network_outages(drive, (*SHORT_OUTAGES, *LONG_OUTAGES))
-        for name, role in zip(PROCESS_KILLED, ("vehicle-router", "operator-router", "client"), strict=True):
-            drive.reach_speed(SPEED_MPS)
-            drive.kill_and_restart(name, role, RESTART_AFTER_S)
+        drive.reach_speed(SPEED_MPS)
+        drive.kill_and_restart(CLIENT_KILLED, "client", RESTART_AFTER_S)
         drive.reach_speed(SPEED_MPS)
         drive.freeze_process(CLIENT_FROZEN, "client", RESTART_AFTER_S)
         drive.reach_speed(SPEED_MPS)
         drive.kill_and_restart(SERVER_KILLED, "server", RESTART_AFTER_S)
         drive.reach_speed(SPEED_MPS)
-    return measure_and_print(drive, work, print_report, "routers as shipped")
+    return measure_and_print(drive, work, print_report, "as shipped")
+
+
+@pytest.fixture(scope="module")
+def separate_routers(
+    field: FieldNetworks, tmp_path_factory: pytest.TempPathFactory, print_report: PrintReport
+) -> OutageDriveResult:
+    """Drive with routers in processes of their own, through an outage of the network, and kill each router."""
+    work = tmp_path_factory.mktemp("separate")
+    with running_loop(field, work, SEPARATE) as drive:
+        drive.reach_speed(SPEED_MPS)
+        drive.block_network(SEPARATE_NETWORK_OUTAGE, DIRECTIONS["both ways"], 3.0)
+        pause(NS_PER_S)
+        for name, role in zip(ROUTERS_KILLED, ("vehicle-router", "operator-router"), strict=True):
+            drive.reach_speed(SPEED_MPS)
+            drive.kill_and_restart(name, role, RESTART_AFTER_S)
+        drive.reach_speed(SPEED_MPS)
+    return measure_and_print(drive, work, print_report, "separate routers")
+
+
+@pytest.fixture
+def effect(request: pytest.FixtureRequest, outage: str) -> OutageEffects:
+    """Return the effects of an outage, from the drive in which it is."""
+    drive = request.getfixturevalue("separate_routers" if outage in SEPARATE_OUTAGES else "all_outages")
+    effects: dict[str, OutageEffects] = drive.effects
+    return effects[outage]
 
 
 def drive_with_buffering_link(
@@ -152,12 +180,9 @@ def buffered_unguarded(
     return drive_with_buffering_link(field, work, print_report, "TCP, lease 10 s, no checks", (ACCEPTS_EVERYTHING,))
 
 
-@pytest.mark.parametrize("outage", STOPPING_OUTAGES)
-def test_a_command_timeout_degrades_and_stops_in_time(
-    all_outages: OutageDriveResult, stalls: Stalls, outage: str
-) -> None:
+@pytest.mark.parametrize("outage", [*STOPPING_OUTAGES, *SEPARATE_OUTAGES])
+def test_a_command_timeout_degrades_and_stops_in_time(effect: OutageEffects, stalls: Stalls) -> None:
     """300 ms after the last command from a newer picture the vehicle is degraded; 200 ms later the safe stop begins."""
-    effect = all_outages.effects[outage]
     degraded_s, stop_s = effect.command_gap_at_degraded_s, effect.command_gap_at_safe_stop_s
 
     assert stop_s is not None
@@ -179,11 +204,9 @@ def test_the_median_stop_begins_half_a_second_after_an_outage(all_outages: Outag
         assert median(effect.command_gap_at_safe_stop_s or 0.0 for effect in effects) <= STOP_AFTER_S + MEDIAN_MARGIN_S
 
 
-@pytest.mark.parametrize("outage", STOPPING_OUTAGES)
-def test_the_vehicle_is_stationary_in_time(all_outages: OutageDriveResult, outage: str) -> None:
+@pytest.mark.parametrize("outage", [*STOPPING_OUTAGES, *SEPARATE_OUTAGES])
+def test_the_vehicle_is_stationary_in_time(effect: OutageEffects) -> None:
     """In a safe stop the vehicle decelerates with 4 m/s2 until it is stationary."""
-    effect = all_outages.effects[outage]
-
     assert effect.stopping_s is not None
     assert effect.stopped_from_mps is not None
     assert effect.stopping_s <= effect.stopped_from_mps / STOP_MPS2 + BRAKE_DELAY_S
@@ -203,11 +226,12 @@ def test_most_outages_of_300_ms_cause_no_stop(all_outages: OutageDriveResult, st
         assert all((effect.to_driving_s or 0.0) < CONTINUES_WITHIN_S for effect in without_stop)
 
 
-@pytest.mark.parametrize("outage", [*STOPPING_OUTAGES, SERVER_KILLED])
-def test_the_drive_recovers_by_itself(all_outages: OutageDriveResult, stalls: Stalls, outage: str) -> None:
-    """After an outage a client with the permission to arm again drives the vehicle again within 10 s."""
-    effect = all_outages.effects[outage]
+@pytest.mark.parametrize("outage", [*STOPPING_OUTAGES, SERVER_KILLED, *SEPARATE_OUTAGES])
+def test_the_drive_recovers_by_itself(effect: OutageEffects, stalls: Stalls) -> None:
+    """After an outage a client with the permission to arm again drives the vehicle again within 10 s.
 
+    When the server is killed, its router ends with it; the client gets control of the next server and drives again.
+    """
     assert effect.to_driving_s is not None
     with stalls.excusing_failures(
         effect.outage.end.mono_ns, effect.outage.end.later(RECOVERY_NS).mono_ns, stall_ms=LONG_STALL_MS
@@ -223,11 +247,9 @@ def test_the_median_recovery_is_short(all_outages: OutageDriveResult, stalls: St
         assert median(effect.to_driving_s or 0.0 for effect in effects) <= MEDIAN_RECOVERY_S
 
 
-@pytest.mark.parametrize("outage", ALL_OUTAGES)
-def test_nothing_stale_is_accepted(all_outages: OutageDriveResult, stalls: Stalls, outage: str) -> None:
+@pytest.mark.parametrize("outage", [*ALL_OUTAGES, *SEPARATE_OUTAGES])
+def test_nothing_stale_is_accepted(effect: OutageEffects, stalls: Stalls) -> None:
     """No stale command is accepted, and the observer recorded at least 95 % of the accepted commands."""
-    effect = all_outages.effects[outage]
-
     assert effect.stale_accepted == 0
     assert effect.accepted > 20
     with stalls.excusing_failures(begin_ns(effect), effect.outage.end.later(RECOVERY_NS).mono_ns):

@@ -5,12 +5,11 @@ from __future__ import annotations
 import socket
 import struct
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.field.driving import MIXED, running_loop, wait_until
+from tests.field.driving import SIGNED_ONLY, running_loop, signed, wait_until
 from tests.field.namespaces import OPERATOR, VEHICLE, VEHICLE_UPLINK_ROUTER, plain_field
 from tests.field.secured_routers import make_keys
 
@@ -62,14 +61,7 @@ def test_a_replayed_hello_leaves_encrypted_video_readable(tmp_path: Path, print_
     """
     keys = tmp_path / "keys"
     make_keys(keys, "--vehicle", "vehicle-1", "--operator", "operator-1", "--host", VEHICLE)
-    links = replace(
-        MIXED,
-        server_changes=(
-            f"security.key={keys}/vehicle-1.sign.key",
-            f"security.operators={{operator-1: {keys}/operator-1.sign.pub}}",
-        ),
-        client_changes=(f"security.key={keys}/operator-1.sign.key", f"security.vehicle={keys}/vehicle-1.sign.pub"),
-    )
+    links = signed(SIGNED_ONLY, keys)
     clock = MachineClock()
     with plain_field() as field:
         listener = field.inside(

@@ -18,10 +18,10 @@ from tests.support.ports import free_port
 from tests.support.stalls import LONG_STALL_MS, SharedResult, Stalls
 
 from lavt.clock import MachineClock
+from lavt.config import ZenohConfig
 from lavt.domain import NS_PER_S
 from lavt.experiment.runs.plan import PlannedRun
 from lavt.experiment.runs.processes import Process, Processes
-from lavt.experiment.runs.real_run import start_client_router
 from lavt.experiment.runs.side_configs import client_config, server_config
 from lavt.recording.record import Record, read_record
 
@@ -47,7 +47,7 @@ def has_printed(process: Process, *words: str) -> bool:
 class Session:
     """A server and clients, with their reports, exit codes and times.
 
-    The processes start in the worst order: a client, the server, and only then the routers.
+    The routers are separate. The processes start in the worst order: a client, the server, and only then the routers.
     """
 
     processes: Processes
@@ -69,14 +69,14 @@ class Session:
 
     def start_client(self, name: str, operator: str, *options: str) -> Process:
         run = self.planned.config
-        config = client_config(run, router=self.client_endpoint, probe_port=self.probe_port)
+        config = client_config(run, zenoh=ZenohConfig(router=self.client_endpoint), probe_port=self.probe_port)
         path = self.write(name, config.model_copy(update={"who": operator}))
         process = self.processes.start(name, "client", path, "--out", str(self.work / name), *options)
         process.wait_ready()
         return process
 
     def start_server(self) -> Process:
-        config = server_config(self.planned.config, self.planned.seed, router=self.server_endpoint)
+        config = server_config(self.planned.config, self.planned.seed, zenoh=ZenohConfig(router=self.server_endpoint))
         clock = config.clock.model_copy(update={"probe_port": self.probe_port})
         path = self.write("server", config.model_copy(update={"clock": clock}))
         process = self.processes.start("server", "server", path, "--out", str(self.work / "server"))
@@ -84,11 +84,14 @@ class Session:
         return process
 
     def start_routers(self) -> None:
-        listen = f"listen.endpoints={json.dumps([self.server_endpoint, self.link_of_routers])}"
-        self.processes.start(
-            "server-router", "router", "zenoh-configs/router-server.json5", "--set", listen
-        ).wait_ready()
-        start_client_router(self.processes, self.link_of_routers, self.client_endpoint)
+        link, local = [self.link_of_routers], [self.client_endpoint]
+        self.start_router("server", listen=[self.server_endpoint, *link], connect=[])
+        self.start_router("client", listen=local, connect=link)
+
+    def start_router(self, side: str, **endpoints: list[str]) -> None:
+        changes = [word for key, ends in endpoints.items() for word in ("--set", f"{key}.endpoints={json.dumps(ends)}")]
+        file = f"zenoh-configs/router-{side}.json5"
+        self.processes.start(f"{side}-router", "router", file, *changes).wait_ready()
 
     def write(self, name: str, config: BaseModel) -> str:
         path = self.work / f"{name}.yaml"

@@ -17,8 +17,7 @@ from pydantic import BaseModel
 from lavt.clock import pause
 from lavt.domain import NS_PER_S
 from lavt.experiment.runs.plan import PlannedRun
-from lavt.experiment.runs.processes import Processes
-from lavt.experiment.runs.side_configs import client_config, server_config
+from lavt.experiment.runs.side_configs import client_config, embedded_router, server_config
 from lavt.recording.record import read_record
 
 DRIVING_WITHIN_S = 150.0
@@ -67,17 +66,12 @@ def test_signals_end_a_client_and_a_server_whose_output_is_not_read(
 ) -> None:
     """SIGTERM ends a client and a server whose output pipes are full; the client releases the vehicle first."""
     run = planned("vehicle.scenery=none")
-    with Processes(tmp_path) as processes, ExitStack() as stack:
-        router = processes.start(
-            "router", "router", "zenoh-configs/router-server.json5", "--set", 'listen.endpoints=["tcp/127.0.0.1:0"]'
-        )
-        (local,) = router.wait_ready()["locators"]
-        server = stack.enter_context(
-            start_unread("server", server_config(run.config, run.seed, router=local), tmp_path)
-        )
+    with ExitStack() as stack:
+        server = stack.enter_context(start_unread("server", server_config(run.config, run.seed), tmp_path))
         ready = first_line(server.stdout)["ready"]
         ports = {key: ready[key] for key in ("video_port", "probe_port")}
-        client = stack.enter_context(start_unread("client", client_config(run.config, router=local, **ports), tmp_path))
+        zenoh = embedded_router(dialled=[next(locator for locator in ready["locators"] if locator.startswith("udp/"))])
+        client = stack.enter_context(start_unread("client", client_config(run.config, zenoh=zenoh, **ports), tmp_path))
         wait_until("the car drives", lambda: is_driving(tmp_path / "server" / "server.mcap"), DRIVING_WITHIN_S)
         pause(UNREAD_S * NS_PER_S)
         client.send_signal(signal.SIGTERM)

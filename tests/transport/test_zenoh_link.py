@@ -21,7 +21,7 @@ from lavt.errors import UserError
 from lavt.node import Send
 from lavt.runtime.thread_failures import fail_on_thread_errors
 from lavt.transport.messages import MAX_MESSAGE_BYTES
-from lavt.transport.zenoh_link import RECEIVE_RING_LENGTH, Router, ZenohLink, quiet_logs
+from lavt.transport.zenoh_link import RECEIVE_RING_LENGTH, Router, SessionSettings, ZenohLink, quiet_logs
 
 ARRIVAL_TIMEOUT_S = 10.0
 CONFIGS = shipped("zenoh-configs")
@@ -81,6 +81,11 @@ def routers() -> Iterator[tuple[str, str]]:
         yield loopback_endpoint(server), loopback_endpoint(client)
 
 
+def session_at(endpoint: str, path: Path = SESSION) -> SessionSettings:
+    """Return the settings of a session at a router's endpoint."""
+    return SessionSettings(path, {"connect/endpoints": [endpoint]})
+
+
 def open_link(
     side: Literal["server", "client"],
     router: str,
@@ -92,8 +97,7 @@ def open_link(
     return ZenohLink(
         MachineClock(),
         side=side,
-        path=path,
-        router=router,
+        settings=session_at(router, path),
         vehicle=vehicle,
         who=f"{side}-1" if who is None else who,
     )
@@ -292,11 +296,94 @@ def test_names(name: str) -> None:
             ZenohLink(
                 MachineClock(),
                 side="client",
-                path=SESSION,
-                router="tcp/127.0.0.1:1",
+                settings=session_at("tcp/127.0.0.1:1"),
                 vehicle=vehicle,
                 who=who,
             )
+
+
+def open_embedded(side: Literal["server", "client"], changes: dict[str, Any], *, vehicle: str) -> ZenohLink:
+    """Open a link whose session is a router with the shipped config of this side."""
+    settings = SessionSettings(CONFIGS / f"router-{side}.json5", changes, is_router=True)
+    return ZenohLink(MachineClock(), side=side, settings=settings, vehicle=vehicle, who=f"{side}-1")
+
+
+def dialling(port: int) -> dict[str, Any]:
+    """Return the changes of a router that dials a port of this machine and listens nowhere."""
+    return {"listen/endpoints": [], "connect/endpoints": [f"udp/127.0.0.1:{port}?rel=1;mixed_rel=1"]}
+
+
+def listening(port: int) -> dict[str, Any]:
+    """Return the changes of a router that listens at a port of this machine."""
+    return {"listen/endpoints": [f"udp/127.0.0.1:{port}?rel=1;mixed_rel=1"]}
+
+
+def open_server_again(port: int, vehicle: str) -> ZenohLink:
+    """Open a server's link that is a router, as soon as the port of the link before it is free."""
+    for _ in range(100):
+        with suppress(UserError):
+            return open_embedded("server", listening(port), vehicle=vehicle)
+        pause(round(ARRIVAL_TIMEOUT_S * NS_PER_S) // 100)
+    raise AssertionError(f"port {port} stays in use")
+
+
+def exchange_all_kinds(server: ZenohLink, server_received: Received, client: ZenohLink, received: Received) -> None:
+    """Exchange a command, a state, and a query with its reply."""
+    server_received.next(("control", b"command"), lambda: client.send(Send("control", b"command")))
+    received.next(("state", b"state"), lambda: server.send(Send("state", b"state")))
+    _, peer = server_received.next(("session", b"request"), lambda: client.send(Send("session", b"request")))
+    server.send(Send("session_reply", b"reply", peer))
+    received.next(("session_reply", b"reply"))
+
+
+def test_sides_that_are_routers_themselves() -> None:
+    """Two links that are routers exchange all kinds of messages, whichever side starts first, also after a restart."""
+    port, received = free_port(), Received()
+    with closing(open_embedded("client", dialling(port), vehicle="embedded")) as client:
+        assert client.locators() == []
+        client.start(received)
+        client.send(Send("control", b"into the void"))
+        for _ in range(2):
+            server_received = Received()
+            with closing(open_server_again(port, "embedded")) as server:
+                assert [str(port) in locator for locator in server.locators()] == [True]
+                server.start(server_received)
+                exchange_all_kinds(server, server_received, client, received)
+
+
+def test_an_embedded_router_whose_port_is_in_use() -> None:
+    """A link that is a router raises a UserError that names the endpoint if its port is in use."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as occupant:
+        occupant.bind(("127.0.0.1", 0))
+        port = occupant.getsockname()[1]
+        with pytest.raises(UserError, match=rf"127\.0\.0\.1:{port}.*use other endpoints") as error:
+            open_embedded("server", listening(port), vehicle="occupied")
+    assert is_one_plain_line(error)
+
+
+def test_a_router_without_listen_endpoints_in_its_file(tmp_path: Path) -> None:
+    """Without listen endpoints in the file a link is not opened, because Zenoh would listen on all interfaces."""
+    path = tmp_path / "router.json5"
+    path.write_text(f'{{ mode: "router", {REQUIRED_KEYS} }}')
+    settings = SessionSettings(path, is_router=True)
+    with pytest.raises(UserError, match="no listen endpoints"):
+        ZenohLink(MachineClock(), side="server", settings=settings, vehicle="anywhere", who="server")
+
+
+def test_a_panic_while_a_session_opens(monkeypatch: pytest.MonkeyPatch) -> None:
+    """If Zenoh panics while it opens a session, a `UserError` with the panic's text is raised."""
+
+    class PanicException(BaseException):
+        """A stand-in for pyo3's exception, which is no `Exception` either."""
+
+    def panic(_: zenoh.Config) -> zenoh.Session:
+        raise PanicException("called `Option::unwrap()` on a `None` value")
+
+    monkeypatch.setattr(zenoh, "open", panic)
+    with pytest.raises(UserError, match="Option::unwrap"):
+        open_embedded("client", dialling(1), vehicle="panic")
+    with pytest.raises(UserError, match="Option::unwrap"):
+        open_link("client", "tcp/127.0.0.1:1")
 
 
 def is_one_plain_line(error: pytest.ExceptionInfo[UserError]) -> bool:
@@ -324,8 +411,7 @@ def test_waiting_for_a_router() -> None:
         waiting = ZenohLink(
             MachineClock(),
             side="client",
-            path=SESSION,
-            router=endpoint,
+            settings=session_at(endpoint),
             vehicle="late",
             who="client-1",
             waiting=reasons.append,
@@ -377,8 +463,7 @@ def test_a_failed_declaration_in_the_background_is_not_silent(
     waiting = ZenohLink(
         MachineClock(),
         side="server",
-        path=SESSION,
-        router=routers[0],
+        settings=session_at(routers[0]),
         vehicle="refused",
         who="server-1",
         waiting=lambda _: None,
@@ -398,8 +483,7 @@ def test_closing_while_waiting_for_a_router() -> None:
         ZenohLink(
             MachineClock(),
             side="server",
-            path=SESSION,
-            router=unanswered_endpoint(),
+            settings=session_at(unanswered_endpoint()),
             vehicle="late",
             who="server",
             waiting=lambda _: None,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from lavt.assembly.addresses import resolved_address
 from lavt.assembly.dbw import load_profile
-from lavt.assembly.software_car import build_software_car
+from lavt.assembly.simulators import build_software_car
 from lavt.assembly.watchdog_proof import proof_rejection
 from lavt.clock import Clock, pause
 from lavt.config import ServerConfig, VehicleConfig

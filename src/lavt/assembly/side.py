@@ -27,9 +27,9 @@ from lavt.assembly.entropy import MachineEntropy
 from lavt.assembly.nodes import build_client, build_server
 from lavt.assembly.rendezvous import open_flow
 from lavt.assembly.security import Authenticator, build_authenticator, build_gateway
+from lavt.assembly.zenoh import side_session
 from lavt.clock import Clock
 from lavt.config import ClientConfig, ServerConfig
-from lavt.config_file import find_file
 from lavt.domain import Now
 from lavt.node import Node, Peer
 from lavt.nodes.client_session import ClientSession
@@ -94,6 +94,8 @@ class Side:
         path: PathServer | None = None,
     ) -> None:
         self.clock = clock
+        self.is_plain = not config.security.key
+        """Whether messages are neither encrypted nor signed."""
         self.session = session
         """The client's session; None on a server."""
         self.actuator = actuator
@@ -170,8 +172,10 @@ class Side:
 @contextmanager
 def open_server(
     config: ServerConfig, out: Path | None, clock: Clock, print_message: PrintMessage
-) -> Iterator[tuple[Side, dict[str, int]]]:
-    """Build a server, yield it with its ports and the process id of its actuator, and close it afterwards.
+) -> Iterator[tuple[Side, dict[str, Any]]]:
+    """Build a server, yield it with its ports, the endpoints of its embedded router and the process id of its actuator.
+
+    The server is closed afterwards.
 
     Raises `UserError` for a wrong config, before the output directory is created.
     """
@@ -185,7 +189,9 @@ def open_server(
         links = Links(video, probe, opened.enter_context(closing(_open_zenoh(config, clock, print_message))))
         host = kernel_identity()
         nodes = build_server(config, clock.now, MachineEntropy(), host=host, video_port=video.port)
-        ready = {"video_port": video.port, "probe_port": probe.port}
+        ready: dict[str, Any] = {"video_port": video.port, "probe_port": probe.port}
+        if config.zenoh.is_embedded:
+            ready["locators"] = links.zenoh.locators()
         if nodes.actuator is not None:
             actuator, in_force = None, nodes.actuator.gate.in_force
         else:
@@ -260,8 +266,7 @@ def _open_zenoh(config: ServerConfig | ClientConfig, clock: Clock, print_message
     return ZenohLink(
         clock,
         side="server" if isinstance(config, ServerConfig) else "client",
-        path=find_file(Path(config.zenoh.session)),
-        router=config.zenoh.router,
+        settings=side_session(config),
         vehicle=config.vehicle_id,
         who="server" if isinstance(config, ServerConfig) else config.who,
         waiting=lambda reason: print_message(f"lavt: {reason}; waiting for one"),

@@ -1,13 +1,21 @@
-"""The construction of the built-in simulator."""
+"""The construction of the built-in simulator, and of software cars: a by-wire kit and this simulator."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Final, Literal
 
 from lavt.config import ServerConfig, VehicleConfig
+from lavt.vehicle.dbw.profile import Profile
 from lavt.vehicle.sim.dynamics import CarParameters, named_car
 from lavt.vehicle.sim.road.road import Road
 from lavt.vehicle.sim.simulator import Simulator
+from lavt.vehicle.software_car.car import SoftwareCar
+from lavt.vehicle.software_car.kit import Kit
+from lavt.vehicle.software_car.mechanics import Mechanics
+
+GENERATIONS: Final[dict[str, Literal[1, 2]]] = {"dataspeed_1": 1, "dataspeed_2": 2}
+"""The kit's generation for each value of a profile's `kit`."""
 
 
 def car_of(config: VehicleConfig) -> CarParameters:
@@ -33,3 +41,18 @@ def simulator_of(config: ServerConfig, road: Road, start_ns: int) -> Simulator:
         continue_after_collision=config.vehicle.after_collision == "continue",
         limit_s=config.vehicle.time_limit_s,
     )
+
+
+def build_software_car(config: ServerConfig, profile: Profile, road: Road, start_ns: int) -> SoftwareCar:
+    """Build a car with the kind of kit and the command set of a profile; the car uses nothing else of the profile.
+
+    The kit interprets commands as documented. If the profile has an error, the car therefore does not respond.
+    """
+    simulator = simulator_of(config, road, start_ns)
+    kit = Kit(
+        GENERATIONS[profile.kit],
+        start_ns=start_ns,
+        commands=profile.commands or "remote",
+        mechanics=Mechanics(max_braking_mps2=simulator.capabilities.max_braking_mps2),
+    )
+    return SoftwareCar(kit, simulator)

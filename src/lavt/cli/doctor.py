@@ -18,11 +18,12 @@ import typer
 import lavt
 from lavt.assembly.by_wire import listen
 from lavt.assembly.cameras import client_camera
+from lavt.assembly.zenoh import program_sessions, side_session
 from lavt.cli import console
 from lavt.cli.clock import probe
 from lavt.clock import MachineClock
 from lavt.config import ClientConfig, ServerCameraConfig, ServerConfig
-from lavt.config_file import find_file, load_config, read_yaml, split_change
+from lavt.config_file import load_config, read_yaml, split_change
 from lavt.doctor import checks, key_checks, measurements
 from lavt.doctor.checks import Check
 from lavt.doctor.clock_checks import compare_with_server
@@ -32,7 +33,7 @@ from lavt.runtime import process_priority
 from lavt.runtime.resident_memory import lift_lock_limit
 from lavt.transport.clock_sync.clock_report import ClockReport
 from lavt.transport.udp_link import resolve_host
-from lavt.transport.zenoh_link import ZenohLink, quiet_logs
+from lavt.transport.zenoh_link import ZenohLink, configured_endpoints, quiet_logs
 
 PROBE_DURATION_NS = NS_PER_S
 LISTEN_NS = NS_PER_S
@@ -200,22 +201,19 @@ def _port_checks(settings: ServerConfig, clock: MachineClock) -> Iterator[Check]
 
 
 def _zenoh_checks(settings: Settings, clock: MachineClock) -> Iterator[Check]:
-    endpoint = settings.zenoh.router or f"the endpoint of {settings.zenoh.session}"
     if measurements.keys_rejection(settings):
         yield Check("router", "not checked", "fix the keys first")
         return
-    listener = measurements.StateListener(settings)
+    listener, endpoint = measurements.StateListener(settings), settings.zenoh.router
     try:
-        link = ZenohLink(
-            clock,
-            side="client",
-            path=find_file(Path(settings.zenoh.session)),
-            router=settings.zenoh.router,
-            vehicle=settings.vehicle_id,
-            who=CLIENT_NAME,
-        )
+        session = program_sessions(settings)[-1]
+        endpoint = ", ".join(configured_endpoints(session.path, "connect/endpoints", session.changes))
+        link = ZenohLink(clock, side="client", settings=session, vehicle=settings.vehicle_id, who=CLIENT_NAME)
     except UserError as error:
-        yield checks.check_router(endpoint, str(error))
+        if settings.zenoh.is_embedded and isinstance(settings, ServerConfig):
+            yield _embedded_router_check(settings, clock)
+        else:
+            yield checks.check_router(endpoint, str(error), is_embedded=settings.zenoh.is_embedded)
         return
     with closing(link):
         yield checks.check_router(endpoint, "")
@@ -225,6 +223,18 @@ def _zenoh_checks(settings: Settings, clock: MachineClock) -> Iterator[Check]:
         sample = listener.listen(link, clock)
         yield checks.check_vehicle(sample, settings.vehicle_id, lavt.__version__)
         yield checks.check_link(link.routers(), has_vehicle=bool(sample.states or sample.unreadable))
+
+
+def _embedded_router_check(settings: ServerConfig, clock: MachineClock) -> Check:
+    """Check that the server, which is not running, can start its embedded router."""
+    session = side_session(settings)
+    try:
+        with closing(
+            ZenohLink(clock, side="server", settings=session, vehicle=settings.vehicle_id, who=CLIENT_NAME)
+        ) as link:
+            return checks.check_embedded_router(link.locators(), "")
+    except UserError as error:
+        return checks.check_embedded_router([], str(error))
 
 
 def _probe_check(settings: ClientConfig, report_before: ClockReport | None, clock: MachineClock) -> Check:

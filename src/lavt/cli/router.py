@@ -43,7 +43,7 @@ def router(
             else:
                 console.print_result(f"routing at {', '.join(locators)}; Ctrl-C ends it")
             while not stop.wait(POLL_PERIOD_S):
-                pass
+                zenoh_router.check()
     finally:
         zenoh_router.close()  # an open router would keep the process alive
 

@@ -15,6 +15,10 @@ from lavt.runtime.thread_failures import fail_on_thread_errors
 from lavt.safety.limits import LIMITS
 from lavt.safety.state_machine import ACTIVE
 
+PLAIN = (
+    "lavt: this side is plain: nothing is encrypted or signed, and anyone who can reach the vehicle's router can drive "
+    "(docs/security.md)"
+)
 STATUS_PERIOD_S = 0.2
 POLL_PERIOD_S = 0.02
 """How often a side checks, before it ends, whether the vehicle is stationary (server) or released (client)."""
@@ -34,6 +38,8 @@ def run_side(side: Side, client_name: str, *, once: bool, as_json: bool, ready: 
     """
     log, session, runtime = SessionLog(client_name), side.session, side.runtime
     with console.stop_on_signals() as stop, fail_on_thread_errors(runtime.fail):
+        if side.is_plain:
+            console.print_message(PLAIN)
         side.start()
         if as_json:
             console.print_json({"ready": dict(ready)})

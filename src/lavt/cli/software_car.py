@@ -16,7 +16,7 @@ import typer
 
 from lavt.assembly.addresses import resolved_address
 from lavt.assembly.dbw import load_profile
-from lavt.assembly.software_car import GENERATIONS, build_software_car
+from lavt.assembly.simulators import GENERATIONS, build_software_car
 from lavt.cli import console
 from lavt.clock import MachineClock
 from lavt.config import ServerConfig

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import queue
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,21 +13,26 @@ from msgspec.structs import replace
 
 from lavt.assembly.entropy import MachineEntropy
 from lavt.assembly.security import build_authenticator, build_gateway
+from lavt.assembly.zenoh import program_sessions
 from lavt.cli import console
-from lavt.clock import Clock, MachineClock
+from lavt.clock import Clock, MachineClock, pause
 from lavt.config import ClientConfig
-from lavt.config_file import find_file, load_config
+from lavt.config_file import load_config
 from lavt.domain import NS_PER_S, Now, SessionReply, SessionRequest
 from lavt.errors import BadMessage, UserError, WorkError
 from lavt.node import Send
 from lavt.transport.messages import decode, encode
 from lavt.transport.security.gateway import Carry
-from lavt.transport.zenoh_link import ZenohLink, quiet_logs
+from lavt.transport.zenoh_link import RouterUnreachable, ZenohLink, quiet_logs
 
 RETRY_PERIOD_S = 0.1
 """How long to wait for a confirmation before the stop is sent again. A flood of queries makes repetition necessary.
 Measured with 1000 queries a second, of which the vehicle accepts 100: five of five stops succeeded within 30 tries, but
 none of six stops that were sent only once."""
+LINK_S = 3.0
+"""How long to repeat the stop over one link, if there is another way to the vehicle."""
+LEAST_S = 0.5
+"""How long to repeat the stop over a link at least, even if the time is over."""
 TIMEOUT_S = 10.0
 
 
@@ -52,34 +57,49 @@ def stop(
     Example: lavt stop configs/client.yaml
     """
     console.reserve_stdout()
-    settings = load_config(ClientConfig, config, changes or [])
+    settings, clock = load_config(ClientConfig, config, changes or []), MachineClock()
     with _not_sent():
         authenticator = build_authenticator(settings)  # the vehicle also accepts a stop that an expired key has signed
+        sessions = program_sessions(settings)
+        if not settings.security.key:  # then nothing shows whether the running client dials the same vehicle
+            sessions.reverse()
     quiet_logs()
-    clock, replies = MachineClock(), queue.Queue[bytes]()
+    replies = queue.Queue[bytes]()
 
     def deliver(channel: str, payload: Any, _arrived: Now, _peer: Any) -> None:
         if channel == "session_reply":
             replies.put(payload)
 
-    with _not_sent():
-        link = ZenohLink(
-            clock,
-            side="client",
-            path=find_file(Path(settings.zenoh.session)),
-            router=settings.zenoh.router,
-            vehicle=settings.vehicle_id,
-            who=settings.who,
-        )
-    gateway = build_gateway(authenticator, deliver, link.send, lambda: (0, -1))
-    link.start(gateway.receive, queries_only=True)
-    try:
-        instance = MachineEntropy().number(64)
-        request = SessionRequest("emergency_stop", settings.who, instance, clock.now().wall_ns)
-        _repeat_until_confirmed(gateway.send, replies, request, clock, timeout)
-        console.print_result(f"{settings.vehicle_id} accepted the emergency stop")
-    finally:
-        link.close()
+    request = SessionRequest("emergency_stop", settings.who, MachineEntropy().number(64), clock.now().wall_ns)
+    until_ns, was_sent = clock.now().mono_ns + round(timeout * NS_PER_S), False
+    errors: dict[int, UserError] = {}
+    while clock.now().mono_ns < until_ns:
+        for number, session in enumerate(sessions):
+            try:
+                link = ZenohLink(clock, side="client", settings=session, vehicle=settings.vehicle_id, who=settings.who)
+            except UserError as error:
+                errors[number] = error
+                continue
+            was_sent = True
+            with closing(link):
+                gateway = build_gateway(authenticator, deliver, link.send, lambda: (0, -1))
+                link.start(gateway.receive, queries_only=True)
+                left_s = (until_ns - clock.now().mono_ns) / NS_PER_S
+                if _is_confirmed(gateway.send, replies, request, clock, max(LEAST_S, min(left_s, LINK_S))):
+                    console.print_result(f"{settings.vehicle_id} accepted the emergency stop")
+                    return
+        if len(errors) == len(sessions) and not any(isinstance(error, RouterUnreachable) for error in errors.values()):
+            break  # wrong settings, which another attempt would not change
+        pause(round(RETRY_PERIOD_S * NS_PER_S))
+    if not was_sent:
+        direct = len(sessions) - 1 if settings.security.key else 0
+        with _not_sent():
+            raise errors[direct]
+    raise WorkError(
+        f"the emergency stop was NOT confirmed within {timeout:g} s, and the vehicle may still be moving: stop it by "
+        "other means and repeat this command. Is its server running, is vehicle_id correct, and do the keys match? "
+        "Run `lavt doctor CONFIG` to find out"
+    )
 
 
 @contextmanager
@@ -91,10 +111,10 @@ def _not_sent() -> Iterator[None]:
         raise UserError(f"the emergency stop was NOT sent, so stop the vehicle by other means: {error}") from error
 
 
-def _repeat_until_confirmed(
+def _is_confirmed(
     send: Carry, replies: queue.Queue[bytes], request: SessionRequest, clock: Clock, timeout_s: float
-) -> None:
-    """Send the request until the vehicle confirms the stop; raise `WorkError` after `timeout_s`.
+) -> bool:
+    """Send the request until the vehicle confirms the stop or the time is over; return whether it was confirmed.
 
     A single query can be lost or exceed the vehicle's rate limit. Repeated queries with the same number are one stop.
     If somebody has cleared this stop before its confirmation arrived, it gets a new number.
@@ -104,14 +124,10 @@ def _repeat_until_confirmed(
         send(Send("session", encode(request)))
         reply = _reply_to(request, replies, clock)
         if reply is not None and reply.granted:
-            return
+            return True
         if reply is not None:
             request = replace(request, number=request.number + 1)
-    raise WorkError(
-        f"the emergency stop was NOT confirmed within {timeout_s:g} s, and the vehicle may still be moving: stop it by "
-        "other means and repeat this command. Is its server running, is vehicle_id correct, and do the keys match? "
-        "Run `lavt doctor CONFIG` to find out"
-    )
+    return False
 
 
 def _reply_to(request: SessionRequest, replies: queue.Queue[bytes], clock: Clock) -> SessionReply | None:

@@ -23,6 +23,7 @@ from lavt.config.rendezvous import ServerRendezvousConfig as ServerRendezvousCon
 from lavt.config.section import Section as Section
 from lavt.config.security import ClientSecurityConfig as ClientSecurityConfig
 from lavt.config.security import ServerSecurityConfig as ServerSecurityConfig
+from lavt.config.zenoh import ZenohConfig as ZenohConfig
 from lavt.transport.clock_sync import probe
 
 
@@ -243,15 +244,6 @@ class BoundaryConfig(RunConfig):
     """The search first tries delays that are this far apart."""
     within_ms: float = Field(2.0, ge=0.1, le=100)
     """The accuracy to which the search then determines each boundary, between two neighbouring delays of the grid."""
-
-
-class ZenohConfig(Section):
-    """The session to the router on this machine."""
-
-    session: str = "zenoh-configs/session.json5"
-    """A JSON5 file: a path, or the name of a shipped file."""
-    router: str = ""
-    """The endpoint of the router; empty: the endpoint in the file `session`."""
 
 
 class ClockConfig(Section):

@@ -11,8 +11,8 @@ from typing import Any, Final, Literal
 from lavt.doctor.clock_checks import HINTS, ClockComparison, check_host
 from lavt.domain import NS_PER_MS, NS_PER_S, NS_PER_US, State
 from lavt.transport.clock_sync.clock_report import ClockReport
+from lavt.transport.router_check import Routers
 from lavt.transport.udp_link import RECEIVE_BUFFER_BYTES
-from lavt.transport.zenoh_link import Routers
 
 Verdict = Literal["ok", "warning", "problem", "not checked"]
 
@@ -280,12 +280,23 @@ def check_port(name: str, key: str, host: str, port: int, *, rejection: str, is_
     return Check(name, "problem", f"{address} cannot be opened: {rejection}", do, measured)
 
 
-def check_router(endpoint: str, rejection: str) -> Check:
-    """Check that a router answers on this machine."""
+def check_router(endpoint: str, rejection: str, *, is_embedded: bool = False) -> Check:
+    """Check that a router answers: of this machine or, if a client's router is embedded, the router that it dials."""
     measured = {"endpoint": endpoint}
     if not rejection:
         return Check("router", "ok", f"a router answers at {endpoint}", measured=measured)
-    return Check("router", "problem", rejection, "start `lavt router FILE.json5` here, or fix zenoh.router", measured)
+    do = "start `lavt router FILE.json5` here, or fix zenoh.router"
+    if is_embedded:
+        do = "start `lavt server` on the vehicle's machine, and open UDP port 7448 there"
+    return Check("router", "problem", rejection, do, measured)
+
+
+def check_embedded_router(locators: Sequence[str], rejection: str) -> Check:
+    """Check that the embedded router of a server that is not running can listen."""
+    measured = {"locators": list(locators)}
+    if not rejection:
+        return Check("router", "ok", f"the server's router can listen at {', '.join(locators)}", measured=measured)
+    return Check("router", "problem", rejection, "fix zenoh.router_file or zenoh.router_settings", measured)
 
 
 def check_link(routers: Routers | None, *, has_vehicle: bool) -> Check:

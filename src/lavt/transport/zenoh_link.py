@@ -1,42 +1,45 @@
 """Commands, states and session requests over Zenoh. Only this module imports `zenoh`.
 
-Each side has a Zenoh session with a router on its own machine, and the routers are linked to each other. Safety does
-not depend on Zenoh: after an outage Zenoh can deliver commands that are seconds old, and it reports a lost session only
-when the lease has expired.
+Each side has a router, and the routers are linked to each other. The session of a side is this router itself, or a
+session with a separate router. Safety does not depend on Zenoh: after an outage Zenoh can deliver commands that are
+seconds old, and it reports a lost session only when the lease has expired.
 """
 
 from __future__ import annotations
 
 import itertools
 import json
-import re
 import threading
 from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import zenoh
 
 from lavt.clock import Clock
 from lavt.domain import Now
-from lavt.errors import UserError, WorkError
+from lavt.errors import UserError
 from lavt.node import Send
 from lavt.transport.messages import NAME
+from lavt.transport.router_check import (
+    REPORT_TIMEOUT_S,
+    RouterCheck,
+    Routers,
+    end_process_later,
+    parse_locators,
+    parse_routers,
+)
+from lavt.transport.zenoh_config import check_endpoints, check_private_keys, error_text
 
 Deliver = Callable[[str, Any, Now, Any], None]
 """Takes (channel, payload, arrived, peer) of each received message."""
 
 REPLY_TIMEOUT_S = 2.0
-PRIVATE_KEYS = ("transport/link/tls/listen_private_key", "transport/link/tls/connect_private_key")
-"""Config keys of private key files; Zenoh does not check their permissions."""
-ROUTER_READY_S = 5.0
 RETRY_S = 1.0
-PROTOCOLS = ("tcp", "tls", "quic", "udp", "ws")
-"""Protocols of endpoints with a host and a port. They are checked here, because Zenoh reports an unknown protocol as
-unreachable."""
-PATH_PROTOCOLS = ("unixsock-stream", "unixpipe", "vsock", "serial")
 REPLY_CHANNELS = {"session": "session_reply", "netem": "netem_reply"}
 """The channel of the replies for each channel of queries. The channel of a query is the last part of its key."""
 QUERY_CHANNELS = {reply: query for query, reply in REPLY_CHANNELS.items()}
@@ -79,101 +82,108 @@ def _load(path: Path, overrides: Mapping[str, Any]) -> zenoh.Config:
     try:
         config = zenoh.Config.from_file(str(path))
     except zenoh.ZError as error:
-        raise UserError(f"{path} is not a Zenoh config: {_error_text(error)}") from error
+        raise UserError(f"{path} is not a Zenoh config: {error_text(error)}") from error
     for key, value in overrides.items():
         try:
             config.insert_json5(key, json.dumps(value))
         except (zenoh.ZError, TypeError, ValueError) as error:
             raise UserError(
-                f"{key.replace('/', '.')} cannot be {value!r} in a Zenoh config: {_error_text(error)}"
+                f"{key.replace('/', '.')} cannot be {value!r} in a Zenoh config: {error_text(error)}"
             ) from error
     return config
 
 
-def _check_private_keys(config: zenoh.Config) -> None:
-    """Raise `UserError` if other users have any permission on a private key of a config."""
-    for key in PRIVATE_KEYS:
-        file = json.loads(config.get_json(key))
-        if file is not None and Path(file).is_file() and Path(file).stat().st_mode & 0o077:
-            raise UserError(
-                f"other users may read the private key {file}: chmod 600 it, and make new keys if somebody has read it"
-            )
-
-
-def _error_text(error: Exception) -> str:
-    """Return an error text of Zenoh in one line, without Zenoh's source locations and type names."""
-    text = " ".join(re.sub(r" at /\S+\.rs:\d+\.?", "", str(error)).split())
-    text = re.sub(
-        r"(?:Json5Err\()?Message \{ msg: \"(.*)\", location: .*? line: (\d+), column: (\d+) .*", r"\1 (line \2)", text
-    )
-    return re.sub(r"^Str\(\"(.*)\"\)$", r"\1", text)
-
-
-def _has_listen_endpoints(config: zenoh.Config) -> bool:
-    """Return whether a router's config has listen endpoints; without them Zenoh listens on all interfaces."""
+def _check_listen_endpoints(config: zenoh.Config, path: Path, *, may_be_empty: bool) -> None:
+    """Raise `UserError` if a router's config has no listen endpoints, or an empty list where that is not useful."""
     endpoints = config.get_json("listen/endpoints")
-    if endpoints == zenoh.Config().get_json("listen/endpoints"):
-        return False
+    is_default = endpoints == zenoh.Config().get_json("listen/endpoints")
     configured = json.loads(endpoints)
-    return bool(configured.get("router") if isinstance(configured, dict) else configured)
+    configured = configured.get("router") if isinstance(configured, dict) else configured
+    if is_default or configured is None or not (configured or may_be_empty):
+        raise UserError(f"{path} has no listen endpoints; without them Zenoh would listen on all interfaces")
 
 
-def _check_endpoints(config: zenoh.Config) -> Any:
-    """Return the endpoints that a session connects to; raise `UserError` for an invalid one."""
-    endpoints = json.loads(config.get_json("connect/endpoints"))
-    for endpoint in endpoints if isinstance(endpoints, list) else []:
-        protocol, _, address = endpoint.partition("/")
-        port = re.split(r"[?#]", address)[0].rpartition(":")[2]
-        if protocol in PATH_PROTOCOLS or (protocol in PROTOCOLS and port.isdecimal() and 0 < int(port) < 65_536):
-            continue
-        raise UserError(
-            f"zenoh.router cannot be {endpoint!r}: write PROTOCOL/HOST:PORT with one of {', '.join(PROTOCOLS)}"
-        )
-    return endpoints
+def _open(config: zenoh.Config) -> zenoh.Session:
+    """Open a session; raise `zenoh.ZError` if it cannot be opened, and `UserError` if Zenoh panics at this config."""
+    try:
+        return zenoh.open(config)
+    except Exception:
+        raise
+    except BaseException as error:
+        if type(error).__name__ != "PanicException":  # its class cannot be imported, and is not an `Exception`
+            raise
+        raise UserError(f"Zenoh failed to open a session, so check its config: {error_text(error)}") from error
+
+
+def _open_router(path: Path, changes: Mapping[str, Any], *, must_listen: bool) -> zenoh.Session:
+    """Open a session that is a router; raise `UserError` if the config is wrong or an endpoint cannot be used."""
+    config = _load(path, changes)
+    if json.loads(config.get_json("mode")) != "router":
+        raise UserError(f'{path} is not the config of a router: set mode: "router"')
+    _check_listen_endpoints(config, path, may_be_empty=not must_listen)
+    if not json.loads(config.get_json("adminspace/enabled")):
+        raise UserError(f"set adminspace: {{ enabled: true }} in {path}, or the router cannot report where it listens")
+    check_endpoints(config, "connect.endpoints")
+    check_private_keys(config)
+    try:
+        return _open(config)
+    except zenoh.ZError as error:
+        raise UserError(f"the router of {path} does not start: {error_text(error)}; use other endpoints") from error
+
+
+def _router_reports(session: zenoh.Session, selector: str = "") -> list[bytes]:
+    """Query the reports of routers, by default that of the router in this process, and return all answers."""
+    selector = selector or f"@/{session.info.zid()}/router"
+    replies: Any = session.get(selector, timeout=REPORT_TIMEOUT_S, consolidation=zenoh.ConsolidationMode.NONE)
+    return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
+
+
+def configured_endpoints(path: Path, key: str, changes: Mapping[str, Any]) -> list[str]:
+    """Return the endpoints at `key`, `listen/endpoints` or `connect/endpoints`, of a config file with `changes`."""
+    endpoints = json.loads(_load(path, changes).get_json(key))
+    if isinstance(endpoints, dict):
+        endpoints = endpoints.get("router")
+    return endpoints if isinstance(endpoints, list) else []
 
 
 class Router:
     """A Zenoh router in this process, from a config file with `mode: "router"`."""
 
     def __init__(self, path: Path, overrides: Mapping[str, Any]) -> None:
-        config = _load(path, overrides)
-        if json.loads(config.get_json("mode")) != "router":
-            raise UserError(f'{path} is not the config of a router: set mode: "router"')
-        if not _has_listen_endpoints(config):
-            raise UserError(f"{path} has no listen endpoints; without them Zenoh would listen on all interfaces")
-        if not json.loads(config.get_json("adminspace/enabled")):
-            raise UserError(
-                f"set adminspace: {{ enabled: true }} in {path}, or the router cannot report where it listens"
-            )
-        _check_private_keys(config)
-        try:
-            self._session = zenoh.open(config)
-        except zenoh.ZError as error:
-            raise UserError(
-                f"the router of {path} does not start: {_error_text(error)}; use other endpoints"
-            ) from error
+        self._session = _open_router(path, overrides, must_listen=True)
+        self._check = RouterCheck(partial(_router_reports, self._session))
+
+    def check(self) -> None:
+        """Raise `WorkError` if the router no longer answers."""
+        self._check.run()
 
     def locators(self) -> list[str]:
         """Return the endpoints at which the router listens, with the actual port where the config has 0."""
-        selector = f"@/{self._session.info.zid()}/router"
-        for reply in self._session.get(selector, timeout=ROUTER_READY_S):
-            if reply.ok is not None:
-                locators: list[str] = json.loads(reply.ok.payload.to_string())["locators"]
-                return locators
-        raise WorkError(f"the router does not report within {ROUTER_READY_S:.0f} s where it listens")
+        return parse_locators(_router_reports(self._session))
 
     def close(self) -> None:
         """Stop routing."""
+        if self._check.has_failed:
+            end_process_later()
         self._session.close()
 
 
-class Routers(NamedTuple):
-    """The links and versions that a session's router and the routers linked to it report."""
+class RouterUnreachable(UserError):
+    """No router answers, or it rejects the session."""
 
-    linked: int
-    """The number of other routers to which the session's router is linked."""
-    versions: tuple[str, ...]
-    """Zenoh's version in every router that reports it, the session's router first."""
+
+@dataclass(frozen=True)
+class SessionSettings:
+    """What a link needs to open its session."""
+
+    path: Path
+    """The config file."""
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    """Values that replace those of the file, by keys with slashes."""
+    is_router: bool = False
+    """Whether the session is a router itself. Otherwise it is a session with a router."""
+    advice: str = "start one with `lavt router FILE.json5`, or use another endpoint"
+    """What to do if no router answers."""
 
 
 def _zenoh_callback(handle: Callable[[str, Any], None], channel: str) -> Callable[[Any], None]:
@@ -196,9 +206,10 @@ def _discard(_channel: str, _payload: bytes, _arrived: Now, _peer: object) -> No
 class ZenohLink:
     """A Zenoh session of one side, which publishes, subscribes, and sends or answers queries.
 
-    `who` names this session in its liveliness token. Raises `UserError` for an invalid config, and if no router
-    answers. With `waiting`, a missing router is not an error: `start` calls `waiting` with the reason and opens the
-    session in the background as soon as a router answers. Messages that are sent before then are counted as not sent.
+    `who` names this session in its liveliness token. Raises `UserError` for an invalid config, if a session that is a
+    router cannot listen, and if no router answers. With `waiting`, a missing router is not an error: `start` calls
+    `waiting` with the reason and opens the session in the background as soon as a router answers. Messages that are
+    sent before then are counted as not sent. A session that is a router dials other routers in the background.
     """
 
     def __init__(
@@ -206,8 +217,7 @@ class ZenohLink:
         clock: Clock,
         *,
         side: Literal["server", "client"],
-        path: Path,
-        router: str,
+        settings: SessionSettings,
         vehicle: str,
         who: str,
         waiting: Callable[[str], None] | None = None,
@@ -221,8 +231,6 @@ class ZenohLink:
         self._queries: dict[str, dict[int, zenoh.Query]] = {channel: {} for channel in REPLY_CHANNELS}
         self._queries_lock = threading.Lock()
         self._query_numbers = itertools.count()
-        self._config = _load(path, {"connect/endpoints": [router]} if router else {})
-        endpoints = _check_endpoints(self._config)
         self._session: Any = None
         self._publisher: Any = None
         self._declared: list[Any] = []
@@ -231,15 +239,27 @@ class ZenohLink:
         self._listener: threading.Thread | None = None
         self._waiting = waiting
         self._waiting_reason = ""
+        self._check: RouterCheck | None = None
+        if settings.is_router:
+            self._session = _open_router(settings.path, settings.changes, must_listen=False)
+            self._check = RouterCheck(partial(_router_reports, self._session))
+        else:
+            self._open_session(settings)
+
+    def _open_session(self, settings: SessionSettings) -> None:
+        self._config = _load(settings.path, settings.changes)
+        endpoints = check_endpoints(self._config, "zenoh.router")
+        check_private_keys(self._config)
         try:
-            self._session = zenoh.open(self._config)
+            self._session = _open(self._config)
         except zenoh.ZError as error:
-            self._waiting_reason = (
-                f"no router answers at {endpoints}: start one with `lavt router FILE.json5`, or use another endpoint "
-                f"({_error_text(error)})"
-            )
-            if waiting is None:
-                raise UserError(self._waiting_reason) from error
+            self._waiting_reason = f"no router answers at {endpoints}: {settings.advice} ({error_text(error)})"
+            if self._waiting is None:
+                raise RouterUnreachable(self._waiting_reason) from error
+
+    def locators(self) -> list[str]:
+        """Return the endpoints at which a session that is a router listens."""
+        return parse_locators(_router_reports(self._session))
 
     def start(self, deliver: Deliver, *, queries_only: bool = False) -> None:
         """Start to send and to receive; threads of the link call `deliver`.
@@ -249,6 +269,8 @@ class ZenohLink:
         self._deliver = deliver
         if queries_only:
             return
+        if self._check is not None:
+            threading.Thread(target=self._check.repeat, args=(self._closing,), name="zenoh check", daemon=True).start()
         if self._session is not None:
             self._declare(self._session)
         elif self._waiting is not None:
@@ -260,7 +282,7 @@ class ZenohLink:
         """Try to open the session until it succeeds; each attempt takes at most the config's open_timeout."""
         while not self._closing.wait(RETRY_S):
             try:
-                session = zenoh.open(self._config)
+                session = _open(self._config)
             except zenoh.ZError:
                 self.counts["router_unreachable"] += 1
                 continue
@@ -308,22 +330,14 @@ class ZenohLink:
 
     def routers(self) -> Routers | None:
         """Query the routers for their links and versions; return None if this session's router does not answer."""
-        own_routers = {str(zid) for zid in self._session.info.routers_zid()}
-        reports = [
-            json.loads(reply.ok.payload.to_string())
-            for reply in self._session.get("@/*/router", timeout=REPLY_TIMEOUT_S)
-            if reply.ok is not None
-        ]
-        reports.sort(key=lambda report: report["zid"] not in own_routers)
-        own_report = reports[0] if reports else None
-        if own_report is None or own_report["zid"] not in own_routers:
-            return None
-        linked = sum(session["whatami"] == "router" for session in own_report["sessions"])
-        return Routers(linked, tuple(report["version"].partition("-")[0] for report in reports))
+        own = {str(zid) for zid in self._session.info.routers_zid()}
+        return parse_routers(_router_reports(self._session, "@/*/router"), own)
 
     def close(self) -> None:
         """Close the session; a process with an open session would not end."""
         self._closing.set()
+        if self._check is not None and self._check.has_failed:
+            end_process_later()
         if self._opener is not None:
             self._opener.join()
         if self._session is not None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.support.summary_keys import CONDITION_KEYS, RUN_KEYS
 
 from lavt.config import SweepConfig
 from lavt.config_file import load_config, shipped
@@ -15,71 +16,6 @@ from lavt.experiment.sweep.sweep import drive_sweep, open_sweep
 
 CHANGES = ("fidelity=geometry", "conditions=[L0, L1]", "routes=[a_key, b_key]", "repetitions=1")
 
-RUN_KEYS = {
-    "route_length_m",
-    "heading_mae_rad",
-    "heading_rms_rad",
-    "heading_p95_rad",
-    "steering_rms_rad",
-    "steering_rate_rms_radps",
-    "steering_reversals_per_s",
-    "steering_reversals_per_km",
-    "oscillation_hz",
-    "collisions_per_km",
-    "lane_invasions_per_km",
-    "p95_by_10m",
-    "completed_in_own_lane",
-    "lane_kept",
-    "followed_mae_m",
-    "followed_rms_m",
-    "followed_p95_m",
-    "followed_max_m",
-    "age_at_actuation_ms",
-    "stages_ms",
-}
-CONDITION_KEYS = {
-    "runs",
-    "completed",
-    "completion_rate",
-    "completion_interval",
-    "completed_in_own_lane",
-    "own_lane_completion_rate",
-    "own_lane_completion_interval",
-    "completion_interval_over_roads",
-    "endings",
-    "routes",
-    "collisions_per_run",
-    "lane_invasions_per_run",
-    "collisions_per_km",
-    "lane_invasions_per_km",
-    "p95_m",
-    "p95_interval",
-    "p95_route_balanced_m",
-    "p95_routes",
-    "followed_p95_route_balanced_m",
-    "by_road",
-    "followed_p95_m",
-    "own_lane_share",
-    "followed_changes_per_run",
-    "occupied_changes_per_run",
-    "p95_common_m",
-    "p95_common_interval",
-    "p95_worst_rank_m",
-    "mae_m",
-    "rms_m",
-    "max_m",
-    "heading_rms_rad",
-    "steering_reversals_per_s",
-    "oscillation_hz",
-    "injected_ms",
-    "tau_v_ms",
-    "tau_c_ms",
-    "loop_ms",
-    "picture_age_ms",
-    "age_at_actuation_ms",
-    "stages_ms",
-    "survival",
-}
 ROUTE_KEYS = {
     "runs",
     "completed",

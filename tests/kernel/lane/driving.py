@@ -1,4 +1,4 @@
-"""A drive with the two machines: start routers, server and client on their machines, and collect the result."""
+"""A drive with the two machines: start server and client on their machines, and collect the result."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ SHORT_ROAD = REPOSITORY / "tests/kernel/roads/short.yaml"
 NO_SCENERY = ("vehicle.scenery=none",)
 """Without scenery, a user-mode kernel with one processor and slow system calls can render in time."""
 BY_WIRE = "configs/server-by-wire.yaml"
-ROUTER_TO_ROUTER_PORT = 7448
 PROGRAM_TO_ROUTER_PORT = 7447
 DRIVE_TIMEOUT_S = 240
 
@@ -31,6 +30,7 @@ class LoopPrograms:
     """The programs of a control loop, which make a drive."""
 
     routers: tuple[StartedProgram, ...]
+    """Separate routers; none if server and client contain their routers."""
     server: StartedProgram
     client: StartedProgram
 
@@ -58,16 +58,10 @@ def start_loop(
     server_changes: Sequence[str] = (),
     client_changes: Sequence[str] = (),
 ) -> LoopPrograms:
-    """Start two routers, server and client; `out` is a new directory on both machines."""
-    endpoints = json.dumps([f"udp/{server.address}:{ROUTER_TO_ROUTER_PORT}?rel=1;mixed_rel=1"])
-    routers = (
-        _start(server, "router", "zenoh-configs/router-server.json5"),
-        _start(client, "router", "zenoh-configs/router-client.json5", changes=[f"connect.endpoints={endpoints}"]),
-    )
-    _wait_ready(*routers)
+    """Start server and client, which contain their routers; `out` is a new directory on both machines."""
     changes = [f"vehicle.route={SHORT_ROAD}", *NO_SCENERY, *server_changes]
     loop = LoopPrograms(
-        routers,
+        (),
         _start_server(server, "configs/server.yaml", out, changes),
         _start_client(client, server, out, client_changes),
     )
@@ -83,7 +77,7 @@ def start_by_wire(
     server_changes: Sequence[str] = (),
     client_changes: Sequence[str] = (),
 ) -> LoopPrograms:
-    """Start a by-wire drive. It has one router, on the client's machine, to relieve the server's machine."""
+    """Start a by-wire drive. It has one separate router, on the client's machine, to relieve the server's machine."""
     endpoints = json.dumps([f"tcp/0.0.0.0:{PROGRAM_TO_ROUTER_PORT}"])
     router = _start(client, "router", "zenoh-configs/router-server.json5", changes=[f"listen.endpoints={endpoints}"])
     _wait_ready(router)

@@ -1,11 +1,10 @@
-"""One run in real time on this machine: two routers, a server, a client and a relay, each a process of its own.
+"""One run in real time on this machine: a server, a client and a relay, each a process of its own.
 
-With netem on the loopback there is no relay.
+Server and client contain their Zenoh routers. With netem on the loopback there is no relay.
 """
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
@@ -29,7 +28,7 @@ from lavt.experiment.runs.netem_run import NETEM, NetemRun, uses_netem
 from lavt.experiment.runs.network import NetworkDelays, injected_network
 from lavt.experiment.runs.plan import PlannedRun
 from lavt.experiment.runs.processes import LAVT, Process, Processes
-from lavt.experiment.runs.side_configs import client_config, server_config
+from lavt.experiment.runs.side_configs import client_config, embedded_router, server_config
 from lavt.experiment.runs.virtual_run import read_costs
 from lavt.transport.emulation.delay_line import DelayModel
 
@@ -37,8 +36,6 @@ RELAY = "relay.json"
 """The file in a run directory with the delays that the relay was asked to inject, and the delays that it measured."""
 DELAYED_DIRECTIONS = {"video": "video downstream", "control": "control upstream"}
 """The delayed direction of each relayed flow, as `relay.json` names it."""
-LOCAL_TCP = "tcp/127.0.0.1:0"
-SERVER_LISTENS = (LOCAL_TCP, "udp/127.0.0.1:0?rel=1;mixed_rel=1")
 BEGIN_LIMIT_S = 40
 """The time limit for the start of the drive; the time begins when all processes have started."""
 RUN_LIMIT_S = 900
@@ -54,15 +51,11 @@ Progress = Callable[[dict[str, Any], dict[str, Any]], None]
 class LoopProcesses:
     """The processes of a run. With a relay, all video and control between server and client passes through it."""
 
-    server_router: Process
     server: Process
     relay: Process | None
-    client_router: Process
     client: Process
     router: str
-    """The endpoint of the client's router, for other programs on the client's machine."""
-    dialled: str
-    """The endpoint to which the client's router connects: the server's router, or the relay in front of it."""
+    """The endpoint of the server's router for other programs on this machine."""
     server_ready: Mapping[str, Any]
     """The server's `ready` message, with its ports."""
 
@@ -84,14 +77,12 @@ def start_loop(
     server keeps running after the first drive. `netem` is applied before the client starts.
     """
     run = planned.config
-    server_router, local, remote = _start_router(processes, "server-router", "router-server.json5", SERVER_LISTENS)
-    server_yaml = _write(work, "server", server_config(run, planned.seed, router=local))
+    server_yaml = _write(work, "server", server_config(run, planned.seed))
     arguments = ("server", server_yaml, *(["--once"] if once else []), "--out", str(out / "server"))
     server = processes.start("server", *arguments, program=server_program)
     ready = server.wait_ready()["ready"]
-    video_port, probe_port = ready["video_port"], ready["probe_port"]
+    video_port, control_port = ready["video_port"], _port(ready["locators"], "udp/")
     relay = None
-    control_port = int(remote.partition("?")[0].rpartition(":")[2])
     if run.network.injection == "relay":
         relay = processes.start(
             "relay", "relay", _write(work, "relay", _relay_config(planned, video_port, control_port))
@@ -101,21 +92,13 @@ def start_loop(
     elif netem is not None:
         netem.apply(video_port=video_port, control_port=control_port)
     dialled = f"udp/127.0.0.1:{control_port}?rel=1;mixed_rel=1"
-    client_router, local = start_client_router(processes, dialled)
-    config = client_config(run, router=local, video_port=video_port, probe_port=probe_port)
+    zenoh = embedded_router(dialled=[dialled])
+    config = client_config(run, zenoh=zenoh, video_port=video_port, probe_port=ready["probe_port"])
     config = config.model_copy(update={"controller": config.controller.model_copy(update={"rearm": rearm})})
     client = processes.start("client", "client", _write(work, "client", config), "--out", str(out / "client"))
     client.wait_ready()
-    return LoopProcesses(server_router, server, relay, client_router, client, local, dialled, ready)
-
-
-def start_client_router(processes: Processes, dialled: str, listen: str = LOCAL_TCP) -> tuple[Process, str]:
-    """Start the client's router, and return it with its endpoint.
-
-    To replace a router that has ended, pass its endpoint as `listen`.
-    """
-    router, local, _ = _start_router(processes, "client-router", "router-client.json5", [listen], [dialled])
-    return router, local
+    router = next(locator for locator in ready["locators"] if locator.startswith("tcp/"))
+    return LoopProcesses(server, relay, client, router, ready)
 
 
 def drive_real(planned: PlannedRun, out: Path, *, progress: Progress | None = None) -> None:
@@ -201,16 +184,10 @@ def _injected_delays(planned: PlannedRun) -> NetworkDelays:
     )
 
 
-def _start_router(
-    processes: Processes, name: str, file: str, listen: Sequence[str], dialled: Sequence[str] = ()
-) -> tuple[Process, str, str]:
-    """Start a router, and return it with its TCP endpoint and its UDP endpoint, which is "" for the client's router."""
-    endpoints = {"listen": listen, "connect": dialled}
-    changes = [part for key, value in endpoints.items() for part in ("--set", f"{key}.endpoints={json.dumps(value)}")]
-    router = processes.start(name, "router", f"zenoh-configs/{file}", *changes)
-    locators = router.wait_ready()["locators"]
-    local = next(locator for locator in locators if locator.startswith("tcp/"))
-    return router, local, next((locator for locator in locators if locator.startswith("udp/")), "")
+def _port(locators: Sequence[str], protocol: str) -> int:
+    """Return the port of the locator with a protocol."""
+    locator = next(locator for locator in locators if locator.startswith(protocol))
+    return int(locator.partition("?")[0].rpartition(":")[2])
 
 
 def _relay_config(planned: PlannedRun, video_port: int, control_port: int) -> RelayConfig:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from lavt.config import (
     ClientCameraConfig,
     ClientClockConfig,
@@ -16,14 +18,26 @@ from lavt.config import (
 )
 from lavt.transport.clock_sync import probe
 
+LOCAL_TCP = "tcp/127.0.0.1:0"
+SERVER_LISTENS = (LOCAL_TCP, "udp/127.0.0.1:0?rel=1;mixed_rel=1")
 
-def server_config(run: RunConfig, seed: int, *, router: str = "") -> ServerConfig:
-    """Return the server's config of a run; its ports are free ports on the loopback interface."""
+
+def embedded_router(*, listen: Sequence[str] = (), dialled: Sequence[str] = ()) -> ZenohConfig:
+    """Return the config of an embedded router with these endpoints."""
+    settings = {key: {"endpoints": list(endpoints)} for key, endpoints in (("listen", listen), ("connect", dialled))}
+    return ZenohConfig(router_settings=settings)
+
+
+def server_config(run: RunConfig, seed: int, *, zenoh: ZenohConfig | None = None) -> ServerConfig:
+    """Return the server's config of a run; its ports are free ports on the loopback interface.
+
+    Without `zenoh`, the server has an embedded router.
+    """
     return ServerConfig(
         vehicle=run.vehicle,
         camera=ServerCameraConfig(**run.camera.model_dump()),
         video=ServerVideoConfig(bind="127.0.0.1", port=0, **run.video.model_dump()),
-        zenoh=ZenohConfig(router=router),
+        zenoh=zenoh or embedded_router(listen=SERVER_LISTENS),
         clock=ClockConfig(probe_port=0),
         safety=run.safety,
         record=run.record,
@@ -32,14 +46,18 @@ def server_config(run: RunConfig, seed: int, *, router: str = "") -> ServerConfi
 
 
 def client_config(
-    run: RunConfig, *, router: str = "", video_port: int = 0, probe_port: int = probe.DEFAULT_PORT
+    run: RunConfig,
+    *,
+    zenoh: ZenohConfig | None = None,
+    video_port: int = 0,
+    probe_port: int = probe.DEFAULT_PORT,
 ) -> ClientConfig:
-    """Return the client's config of a run."""
+    """Return the client's config of a run; without `zenoh`, the default router."""
     return ClientConfig(
         controller=run.controller,
         camera=ClientCameraConfig(**run.camera.model_dump()),
         video=ClientVideoConfig(port=video_port, reorder_hold_ms=run.video.reorder_hold_ms),
-        zenoh=ZenohConfig(router=router),
+        zenoh=zenoh or ZenohConfig(),
         clock=ClientClockConfig(probe_port=probe_port),
         record=run.record,
     )

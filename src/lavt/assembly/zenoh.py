@@ -1,0 +1,78 @@
+"""The settings of the Zenoh sessions of a side and of other programs on its machine, from the side's config."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from lavt.assembly.entropy import MachineEntropy
+from lavt.config import ClientConfig, ServerConfig
+from lavt.config_file import find_file
+from lavt.errors import UserError
+from lavt.transport.zenoh_config import flatten, with_host
+from lavt.transport.zenoh_link import SessionSettings, configured_endpoints
+
+SESSION_FILE = "zenoh-configs/session.json5"
+LOCAL_ENDPOINTS = ("unixsock-stream/", "tcp/127.", "tcp/localhost:", "tcp/[::1]:")
+"""Beginnings of endpoints at which a router listens for programs on its own machine."""
+AS_A_SESSION = {"mode": "client", "listen/endpoints": [], "connect/timeout_ms": 0, "connect/exit_on_failure": True}
+"""Changes of a router's config for a session that makes one attempt to reach the router that this router dials."""
+
+Config = ServerConfig | ClientConfig
+
+
+def side_session(config: Config) -> SessionSettings:
+    """Return the settings of the side's own session: a router, or a session with a separate one."""
+    if not config.zenoh.is_embedded:
+        return _separate(config)
+    return SessionSettings(_router_file(config), _router_changes(config), is_router=True)
+
+
+def program_sessions(config: Config) -> list[SessionSettings]:
+    """Return the settings with which another program on the side's machine, such as `lavt stop`, can open its session.
+
+    The first one is for the router on this machine: the separate one, or the embedded one of the running side. A client
+    also has a last one for the vehicle's router, which is independent of the running client.
+    """
+    if not config.zenoh.is_embedded:
+        return [_separate(config)]
+    path, changes = _router_file(config), _router_changes(config)
+    endpoints = configured_endpoints(path, "listen/endpoints", changes)
+    advice = f"start `lavt {'server' if isinstance(config, ServerConfig) else 'client'}`"
+    sessions = [
+        SessionSettings(find_file(Path(SESSION_FILE)), {"connect/endpoints": [endpoint]}, advice=advice)
+        for endpoint in endpoints
+        if endpoint.startswith(LOCAL_ENDPOINTS)
+    ][:1]
+    if isinstance(config, ClientConfig):
+        advice = "is `lavt server` running there, and is video.server the vehicle's address?"
+        own_id = {"id": f"{MachineEntropy().number(64):x}"}  # the router of a running client has the id of the file
+        sessions.append(SessionSettings(path, changes | AS_A_SESSION | own_id, advice=advice))
+    if not sessions:
+        raise UserError(
+            f"the server's router has no endpoint for programs on its machine: add one to listen.endpoints, in {path} "
+            "or in zenoh.router_settings, such as tcp/127.0.0.1:7447"
+        )
+    return sessions
+
+
+def _separate(config: Config) -> SessionSettings:
+    zenoh = config.zenoh
+    changes = {"connect/endpoints": [zenoh.router]} if zenoh.router else {}
+    return SessionSettings(find_file(Path(zenoh.session or SESSION_FILE)), changes)
+
+
+def _router_file(config: Config) -> Path:
+    """Return the config of the embedded router: the file in the config, or the shipped one of this kind of side."""
+    side = "server" if isinstance(config, ServerConfig) else "client"
+    shipped_file = f"zenoh-configs/router-{side}{'-tls' if config.security.key else ''}.json5"
+    return find_file(Path(config.zenoh.router_file or shipped_file))
+
+
+def _router_changes(config: Config) -> dict[str, Any]:
+    """Return the changes of the embedded router's config; with a shipped file, a client dials the vehicle's address."""
+    changes = flatten(config.zenoh.router_settings)
+    if isinstance(config, ClientConfig) and not config.zenoh.router_file and "connect/endpoints" not in changes:
+        dialled = configured_endpoints(_router_file(config), "connect/endpoints", {})
+        changes["connect/endpoints"] = [with_host(endpoint, config.video.server) for endpoint in dialled]
+    return changes

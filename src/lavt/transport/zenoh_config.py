@@ -1,0 +1,70 @@
+"""Checks of a Zenoh config, and texts of Zenoh's errors; a config is an object of type `zenoh.Config`."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from lavt.errors import UserError
+
+PRIVATE_KEYS = ("transport/link/tls/listen_private_key", "transport/link/tls/connect_private_key")
+"""Config keys of private key files; Zenoh does not check their permissions."""
+PROTOCOLS = ("tcp", "tls", "quic", "udp", "ws")
+"""Protocols of endpoints with a host and a port. They are checked here, because Zenoh reports an unknown protocol as
+unreachable."""
+PATH_PROTOCOLS = ("unixsock-stream", "unixpipe", "vsock", "serial")
+
+
+def check_private_keys(config: Any) -> None:
+    """Raise `UserError` if other users have any permission on a private key of a config."""
+    for key in PRIVATE_KEYS:
+        file = json.loads(config.get_json(key))
+        if file is not None and Path(file).is_file() and Path(file).stat().st_mode & 0o077:
+            raise UserError(
+                f"other users may read the private key {file}: chmod 600 it, and make new keys if somebody has read it"
+            )
+
+
+def error_text(error: BaseException) -> str:
+    """Return an error text of Zenoh in one line, without Zenoh's source locations and type names."""
+    text = " ".join(re.sub(r" at /\S+\.rs:\d+\.?", "", str(error)).split())
+    text = re.sub(
+        r"(?:Json5Err\()?Message \{ msg: \"(.*)\", location: .*? line: (\d+), column: (\d+) .*", r"\1 (line \2)", text
+    )
+    return re.sub(r"^Str\(\"(.*)\"\)$", r"\1", text)
+
+
+def check_endpoints(config: Any, key: str) -> Any:
+    """Return the endpoints that a session connects to; raise `UserError` that names `key` for an invalid one."""
+    endpoints = json.loads(config.get_json("connect/endpoints"))
+    for endpoint in endpoints if isinstance(endpoints, list) else []:
+        protocol, _, address = endpoint.partition("/")
+        port = re.split(r"[?#]", address)[0].rpartition(":")[2]
+        if protocol in PATH_PROTOCOLS or (protocol in PROTOCOLS and port.isdecimal() and 0 < int(port) < 65_536):
+            continue
+        raise UserError(f"{key} cannot be {endpoint!r}: write PROTOCOL/HOST:PORT with one of {', '.join(PROTOCOLS)}")
+    return endpoints
+
+
+def with_host(endpoint: str, host: str) -> str:
+    """Return an endpoint PROTOCOL/HOST:PORT with another host; an endpoint that is a path stays as it is."""
+    protocol, _, address = endpoint.partition("/")
+    if protocol in PATH_PROTOCOLS:
+        return endpoint
+    parameters = address[len(re.split(r"[?#]", address)[0]) :]
+    port = address.removesuffix(parameters).rpartition(":")[2]
+    return f"{protocol}/{f'[{host}]' if ':' in host else host}:{port}{parameters}"
+
+
+def flatten(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return nested settings by Zenoh's keys, such as `connect/endpoints`."""
+    flat: dict[str, Any] = {}
+    for key, value in settings.items():
+        if isinstance(value, Mapping) and value:
+            flat |= {f"{key}/{inner_key}": inner for inner_key, inner in flatten(value).items()}
+        else:
+            flat[key] = value
+    return flat
