@@ -74,3 +74,16 @@ def test_killed_shell_is_replaced(shell: Shell) -> None:
     os.kill(int(completed.output), signal.SIGKILL)
     assert shell.run(["echo", "lost"], 10) is None
     assert shell.run(["echo", "next"], 10) == Completed(0, "next\n")
+
+
+def test_a_program_that_cannot_be_executed_is_not_found(tmp_path: Path) -> None:
+    """A persistent program that the user may not execute counts as missing, as if no such file existed."""
+
+    class Forbidden(Shell):
+        """A shell from a file without the permission to execute it."""
+
+        program = (str(tmp_path / "sh"),)
+
+    (tmp_path / "sh").touch(mode=0o600)
+    with closing(Forbidden()) as forbidden:
+        assert forbidden.run(["true"], 10) == Completed(NOT_FOUND, "")

@@ -63,7 +63,7 @@ class PersistentProcess(ABC):
                 return None
             try:
                 return self._query(self.encode(command), timeout_s)
-            except FileNotFoundError:
+            except (FileNotFoundError, PermissionError):  # the latter also if a directory of PATH cannot be searched
                 return Completed(NOT_FOUND, "")
             except OSError:  # the process was killed: the next query starts another one
                 self._kill()
