@@ -13,7 +13,7 @@ import zenoh
 from tests.support.ports import free_port
 
 from lavt.errors import WorkError
-from lavt.transport.router_check import MAX_UNANSWERED, RouterCheck, parse_locators, parse_routers
+from lavt.transport.router_check import MAX_REPORTS, MAX_UNANSWERED, RouterCheck, parse_locators, parse_routers
 from lavt.transport.zenoh_link import _router_reports, quiet_logs
 
 ANSWERS = (b"\xff", b"[not json", b"[1]", b"7", b"null", b"{}", b'{"zid": 1, "version": 2, "sessions": [3]}', b"")
@@ -59,6 +59,18 @@ def test_answers_of_strangers_do_no_harm(session: zenoh.Session) -> None:
     routers = parse_routers(_router_reports(session, "@/*/router"), {str(session.info.zid())})
     assert routers is not None
     assert (routers.linked, len(routers.versions)) == (0, 1)
+
+
+def test_answers_without_end_are_not_all_read(session: zenoh.Session) -> None:
+    """Of the answers of a peer that answers very often, only `MAX_REPORTS` are read."""
+
+    def answer(query: zenoh.Query) -> None:
+        for _ in range(4 * MAX_REPORTS):
+            query.reply(query.key_expr, b"x")
+
+    queryable: Any = session.declare_queryable("@/strange/router", answer)
+    assert len(_router_reports(session, "@/strange/router")) == MAX_REPORTS
+    queryable.undeclare()
 
 
 def test_a_router_that_does_not_answer_for_several_times_has_failed() -> None:

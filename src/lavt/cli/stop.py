@@ -73,7 +73,7 @@ def stop(
     request = SessionRequest("emergency_stop", settings.who, MachineEntropy().number(64), clock.now().wall_ns)
     until_ns, was_sent = clock.now().mono_ns + round(timeout * NS_PER_S), False
     errors: dict[int, UserError] = {}
-    while clock.now().mono_ns < until_ns:
+    while clock.now().mono_ns < until_ns or not (errors or was_sent):
         for number, session in enumerate(sessions):
             try:
                 link = ZenohLink(clock, side="client", settings=session, vehicle=settings.vehicle_id, who=settings.who)

@@ -20,6 +20,8 @@ from lavt.transport.zenoh_config import error_text
 
 CHECK_PERIOD_S: Final = 1.0
 REPORT_TIMEOUT_S: Final = 5.0
+MAX_REPORTS: Final = 64
+"""The number of answers that are read: a peer can answer without end."""
 MAX_UNANSWERED: Final = 3
 """A query can remain unanswered because the process was suspended meanwhile."""
 FAILED_END_S: Final = 5.0

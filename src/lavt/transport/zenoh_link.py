@@ -26,6 +26,7 @@ from lavt.errors import UserError
 from lavt.node import Send
 from lavt.transport.messages import NAME
 from lavt.transport.router_check import (
+    MAX_REPORTS,
     REPORT_TIMEOUT_S,
     RouterCheck,
     Routers,
@@ -132,10 +133,10 @@ def _open_router(path: Path, changes: Mapping[str, Any], *, must_listen: bool) -
 
 
 def _router_reports(session: zenoh.Session, selector: str = "") -> list[bytes]:
-    """Query the reports of routers, by default that of the router in this process, and return all answers."""
+    """Query the reports of routers, by default that of the router in this process, and return the first answers."""
     selector = selector or f"@/{session.info.zid()}/router"
     replies: Any = session.get(selector, timeout=REPORT_TIMEOUT_S, consolidation=zenoh.ConsolidationMode.NONE)
-    return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
+    return [reply.ok.payload.to_bytes() for reply in itertools.islice(replies, MAX_REPORTS) if reply.ok is not None]
 
 
 def configured_endpoints(path: Path, key: str, changes: Mapping[str, Any]) -> list[str]:
