@@ -186,6 +186,7 @@ MISSING_FILES = {
     "rendezvous": ["rendezvous", "nothing.yaml"],
     "router": ["router", "nothing.json5"],
     "report": ["report", "nothing"],
+    "replay": ["replay", "nothing"],
 }
 
 
@@ -316,6 +317,9 @@ BAD_COMMANDS = {
         ["rendezvous", RENDEZVOUS, "--set", "vehicle_key=no.sign.pub"],
         "no.sign.pub",
     ),
+    "replay of five runs": (["replay", *"abcde"], "at most 4"),
+    "replay in an unknown format": (["replay", "a", "--out", "a.avi"], "a.avi"),
+    "replay in a missing directory": (["replay", "a", "--out", "no/a.mp4"], "no is not a directory"),
     "no address": (["relay", RELAY, "--set", "video_listen=here"], "video_listen"),
     "router's unknown key": (["router", ROUTER, "--set", "lisen.endpoints=[]"], "lisen.endpoints"),
     "router without endpoints": (["router", ROUTER, "--set", "listen.endpoints=[]"], ROUTER),
@@ -366,6 +370,7 @@ COMMANDS = [
     "sweep",
     "boundary",
     "report",
+    "replay",
     "server",
     "client",
     "software-car",

@@ -22,6 +22,7 @@ COMMANDS = (
     "sweep",
     "boundary",
     "report",
+    "replay",
     "join",
     "road",
     "perception",
