@@ -415,3 +415,38 @@ def test_every_impairment_can_be_changed_by_a_run() -> None:
     for name, schema in ImpairmentConfig.model_json_schema()["properties"].items():
         bounds = {key: value for key, value in schema.items() if key not in ("title", "default", "description")}
         assert bounds in changes[name]["anyOf"], name
+
+
+COSTS = {"measured_on": "here", "stages_us": {"camera": {"encode": 2000.0}}, "links_us": {"video": 1200.0}}
+QUANTILES = {"levels": [0.0, 0.5, 1.0], "link_quantiles_us": {"video": [900.0, 1200.0, 4000.0]}}
+
+
+def test_costs_with_quantiles() -> None:
+    """Costs can have quantiles of some stages and links; their constant version has only the medians."""
+    costs = parse_config(
+        Costs, {**COSTS, **QUANTILES, "stage_quantiles_us": {"camera": {"encode": [1.0, 2.0, 3.0]}}}, ""
+    )
+    assert costs.constant == parse_config(Costs, COSTS, "")
+    assert costs.constant != costs
+
+
+@pytest.mark.parametrize(
+    ("change", "fact"),
+    [
+        ({"levels": [0.0, 0.5]}, "levels"),
+        ({"levels": [0.0, 1.0, 1.0]}, "levels"),
+        ({"levels": []}, "levels"),
+        ({"link_quantiles_us": {"state": [1.0, 2.0, 3.0]}}, "state has quantiles but no median"),
+        (
+            {"stage_quantiles_us": {"camera": {"decode": [1.0, 2.0, 3.0]}}},
+            r"camera\.decode has quantiles but no median",
+        ),
+        ({"link_quantiles_us": {"video": [1.0, 2.0]}}, "video"),
+        ({"link_quantiles_us": {"video": [1.0, 3.0, 2.0]}}, "video"),
+        ({"link_quantiles_us": {"video": [-1.0, 2.0, 3.0]}}, "video"),
+    ],
+)
+def test_invalid_quantiles_of_costs(change: dict[str, Any], fact: str) -> None:
+    """Quantiles that do not belong to a median, do not match the levels or decrease are rejected in one sentence."""
+    with pytest.raises(UserError, match=fact):
+        parse_config(Costs, {**COSTS, **QUANTILES, **change}, "costs.yaml")

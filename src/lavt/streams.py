@@ -8,6 +8,7 @@ in pairs.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -43,3 +44,30 @@ class IndexedStream:
         self._counter[:] = (0, 0, index & (2**64 - 1), 0)
         self._bits.state = self._initial_state
         return self._generator
+
+
+BLOCK_ENTRIES = 128
+"""`QuantileStream` draws this many entries together, because a single draw takes almost as long as a block."""
+
+
+class QuantileStream:
+    """The stream `name` of `seed` with entries from a distribution that is given by its quantiles.
+
+    `values[i]` is the quantile at `levels[i]`; the levels grow from 0 to 1, and the quantile function is linear between
+    them. Entries are independent of each other.
+    """
+
+    def __init__(self, seed: int, name: str, levels: Sequence[float], values: Sequence[float]) -> None:
+        self._stream = IndexedStream(seed, name)
+        self._levels, self._values = np.array(levels), np.array(values)
+        self._block = -1
+        self._entries: list[int] = []
+
+    def at(self, index: int) -> int:
+        """Return entry `index`, rounded to an integer; it does not depend on the entries that were read before."""
+        block, position = divmod(index, BLOCK_ENTRIES)
+        if block != self._block:
+            levels = self._stream.at(block).random(BLOCK_ENTRIES)
+            self._entries = np.rint(np.interp(levels, self._levels, self._values)).astype(np.int64).tolist()
+            self._block = block
+        return self._entries[position]

@@ -10,6 +10,7 @@ from lavt.config.camera import CalibrationConfig as CalibrationConfig
 from lavt.config.camera import CameraConfig as CameraConfig
 from lavt.config.camera import ClientCameraConfig as ClientCameraConfig
 from lavt.config.camera import ServerCameraConfig as ServerCameraConfig
+from lavt.config.costs import Costs as Costs
 from lavt.config.dbw import DbwConfig as DbwConfig
 from lavt.config.injection import ClientInjectionConfig as ClientInjectionConfig
 from lavt.config.injection import Condition as Condition
@@ -201,6 +202,9 @@ class RunConfig(Section):
     fidelity: Literal["video", "pixels", "geometry"] = "video"
     """For virtual time. video: H.264-coded pictures. pixels: rendered pictures. geometry: no pictures, only the lane
     that they would show."""
+    costs: Literal["measured", "constant"] = "measured"
+    """For virtual time: the times of stages and links. measured: drawn from the distributions in `configs/costs.yaml`.
+    constant: always the medians in that file."""
     seed: int = Field(1, ge=0, lt=2**63)
     repetition: int = Field(0, ge=0)
     """The number of this run among the runs with the same seed. Each repetition has its own start and noise, which are
@@ -364,13 +368,3 @@ class RelayConfig(Section):
     control: DelayConfig = DelayConfig()
     state: DelayConfig = DelayConfig()
     seed: int = Field(1, ge=0, lt=2**63)
-
-
-class Costs(Section):
-    """The processing times that the virtual runtime models: see `configs/costs.yaml`."""
-
-    measured_on: str
-    stages_us: dict[str, dict[str, float]]
-    """The time of each stage, by node and stage."""
-    links_us: dict[str, float]
-    """The time that each link needs for a message."""
