@@ -24,6 +24,7 @@ import argparse
 import json
 import os
 import platform
+import signal
 import subprocess
 import sys
 import tempfile
@@ -192,6 +193,7 @@ def main() -> int:
         return 2
     run_s = options.seconds + options.messages * 0.0005 + OVERHEAD_S
     print(f"{len(carriers)} carriers, about {options.rounds * len(carriers) * run_s / 60:.0f} min", flush=True)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that the separate routers are ended, too
     quiet = Quiet()
     try:
         medians = measure(carriers, options.rounds, options.seconds, options.messages)
