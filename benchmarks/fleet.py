@@ -38,7 +38,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # for the package `benchmarks`
 
-from benchmarks.fleet_parts.costs import costs_per_vehicle, table_row
+from benchmarks.fleet_parts.costs import costs_per_vehicle, is_complete, table_row
 from benchmarks.fleet_parts.rendezvous import measure_rendezvous
 from benchmarks.fleet_parts.sessions import SAMPLED
 from benchmarks.fleet_parts.usage import usage
@@ -285,6 +285,8 @@ def measure_topology(
                     print(f"{name}: not measured, like all larger steps: {error}", flush=True)
                     return results
                 print(f"{name}: {json.dumps(result)}", flush=True)
+                if not is_complete(result):
+                    print(f"{name}: states were lost, so this step does not count for the costs", flush=True)
                 if result["sent_per_s"] >= MIN_RATE_SHARE * rate_hz * light:
                     results.append(result)
                     if light >= BOTH_RATES_FROM and count == min(driven):

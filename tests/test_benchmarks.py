@@ -115,10 +115,12 @@ def test_the_costs_of_a_vehicle_are_found_from_steps() -> None:
             "processor_share": 0.01 + 2e-5 * (light * rate_hz + 100 * driven) + 3e-4 * (light + 2 * driven),
             "resident_mb": 70 + 0.5 * (light + 2 * driven),
             "descriptors": 20,
+            "states_received_share": 1.0,
         }
         for light, driven, rate_hz in ((1, 1, 50), (10, 1, 50), (10, 10, 50), (100, 1, 50), (100, 10, 5))
     ]
-    costs = costs_per_vehicle(steps, "clients")
+    with_losses = [*steps, {**steps[0], "processor_share": 9.0, "states_received_share": 0.5}]
+    costs = costs_per_vehicle(with_losses, "clients")
     assert costs["processor_s_per_state"] == pytest.approx(2e-5, rel=0.01)
     assert costs["processor_s_per_session_s"] == pytest.approx(3e-4, rel=0.01)
     assert costs["resident_mb_per_session"] == pytest.approx(0.5, rel=0.01)

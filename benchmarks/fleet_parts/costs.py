@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 MIN_STEPS = 2
+MIN_RECEIVED_SHARE = 0.95
+"""A step in which more states are lost shows a limit, not the cost of a state."""
 
 
 def costs_per_vehicle(steps: Sequence[Mapping[str, Any]], topology: str) -> dict[str, float]:
@@ -15,9 +17,9 @@ def costs_per_vehicle(steps: Sequence[Mapping[str, Any]], topology: str) -> dict
 
     `processor_s_per_state` is the time for one state that comes in and goes out to one subscriber,
     `processor_s_per_session_s` that for one connected vehicle in one second without states. Driven vehicles count as
-    100 messages a second and two sessions each. Empty if too few steps were measured.
+    100 messages a second and two sessions each. Steps with lost states are left out. Empty if too few steps remain.
     """
-    chosen = [step for step in steps if step["topology"] == topology]
+    chosen = [step for step in steps if step["topology"] == topology and is_complete(step)]
     sessions = np.array([step["light"] + 2 * step["driven"] for step in chosen], dtype=float)
     if len(set(sessions)) < MIN_STEPS:
         return {}
@@ -35,6 +37,11 @@ def costs_per_vehicle(steps: Sequence[Mapping[str, Any]], topology: str) -> dict
         values = np.array([step[name] for step in chosen], dtype=float)
         costs[f"{name}_per_session"] = float(np.polyfit(sessions, values, 1)[0])
     return {name: float(f"{value:.3g}") for name, value in costs.items()}
+
+
+def is_complete(step: Mapping[str, Any]) -> bool:
+    """Return whether nearly all states of the sampled vehicles arrived."""
+    return bool(step["states_received_share"] >= MIN_RECEIVED_SHARE)
 
 
 def table_row(step: Mapping[str, Any]) -> list[str]:
