@@ -181,9 +181,12 @@ def summarize(runs: Sequence[Row], common_p95: Values) -> Row:
         "p95_common_interval": stratified(runs, common_p95),
         "p95_worst_rank_m": worst_rank(runs),
         **{name: mean([run[name] for run in runs if run[name] is not None]) for name in MEANS},
-        "own_lane_share": mean([run["lane_kept"]["own_lane_share"] for run in runs]),
         **{
-            f"{name}_per_run": mean([run["lane_kept"][name] for run in runs])
+            name: mean([run["lane_kept"][name] for run in runs if run["lane_kept"]])
+            for name in ("own_lane_share", "followed_unknown_share")
+        },
+        **{
+            f"{name}_per_run": mean([run["lane_kept"][name] for run in runs if run["lane_kept"]])
             for name in ("followed_changes", "occupied_changes")
         },
         **{name: medians([run[name] for run in runs]) for name in LATENCIES},

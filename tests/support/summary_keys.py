@@ -80,6 +80,7 @@ CONDITION_KEYS = {
     "by_road",
     "followed_p95_m",
     "own_lane_share",
+    "followed_unknown_share",
     "followed_changes_per_run",
     "occupied_changes_per_run",
     "p95_common_m",

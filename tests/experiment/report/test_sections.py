@@ -53,6 +53,7 @@ NEW_CONDITION_KEYS = (
     "p95_routes",
     "by_road",
     "own_lane_share",
+    "followed_unknown_share",
     "followed_changes_per_run",
     "occupied_changes_per_run",
     "p95_common_m",
@@ -281,7 +282,13 @@ def csv_rows(path: Path) -> list[dict[str, str]]:
     return list(csv.DictReader(path.read_text().splitlines()))
 
 
-KEPT = {"own_lane_share": 1.0, "followed_changes": 0, "occupied_changes": 0, "changes": []}
+KEPT = {
+    "own_lane_share": 1.0,
+    "followed_unknown_share": 0.0,
+    "followed_changes": 0,
+    "occupied_changes": 0,
+    "changes": [],
+}
 CHANGE = {"lane": "followed", "mono_ns": 5, "progress_m": 40.0, "from": 0, "to": -1}
 
 

@@ -24,9 +24,10 @@ LATENCIES_NOTE = (
 )
 PAPER_NOTE = " The paper did not measure the loop latency; the table shows the sum of its median τ video and τ control."
 OWN_LANE_NOTE = (
-    " A run is completed in its own lane if the driver followed the lane of the route, and the middle of the rear axle "
-    "was in it, all the time. P95 of the cross-track error is against the lane of the route and, in a column of its "
-    "own, against the lane that the driver followed."
+    " A run is completed in its own lane if the middle of the rear axle was in the lane of the route all the time, and "
+    "the driver followed no other lane. After three pictures without a lane, the lane followed is unknown. P95 of the "
+    "cross-track error is against the lane of the route and, in a column of its own, against the lane that the driver "
+    "followed, where this lane is known."
 )
 ROUTES_NOTE = (
     " The intervals “these routes” show only how repeated runs of these routes vary: that of completion is exact, that "

@@ -108,6 +108,7 @@ def driving_table(conditions: Conditions, paper: Conditions) -> TableData:
             (share_column("completed in own lane"), "own_lane_completion_rate"),
             (share_interval_column("95 %, these routes, own lane"), "own_lane_completion_interval"),
             (share_column("time in own lane"), "own_lane_share"),
+            (share_column("time with lane followed unknown"), "followed_unknown_share"),
             (number_column("changes of the lane followed / run", 2), "followed_changes_per_run"),
             (number_column("changes of the lane occupied / run", 2), "occupied_changes_per_run"),
             (number_column("collisions / run", 2), "collisions_per_run"),

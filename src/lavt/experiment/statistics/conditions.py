@@ -67,7 +67,7 @@ def summarize_condition(all_runs: Sequence[Run], distances: CommonDistances) -> 
         "p95_worst_rank_m": worst_rank_m(runs),
         **{name: _mean([run[name] for run in runs if run.get(name) is not None]) for name in MEANS},
         **{f"{name}_per_run": _lane_kept_mean(runs, name) for name in ("followed_changes", "occupied_changes")},
-        "own_lane_share": _lane_kept_mean(runs, "own_lane_share"),
+        **{name: _lane_kept_mean(runs, name) for name in ("own_lane_share", "followed_unknown_share")},
         "injected_ms": _injected_ms(all_runs),
         "tau_v_ms": _latency([run["tau_v_ms"] for run in runs], bounded=True),
         "tau_c_ms": _latency([run["tau_c_ms"] for run in runs], bounded=True),
@@ -165,7 +165,7 @@ def _route_balanced(runs_by_route: Sequence[Sequence[Run]], name: str) -> float 
 
 
 def _lane_kept_mean(runs: Sequence[Run], name: str) -> float | None:
-    return _mean([run["lane_kept"][name] for run in runs if run.get("lane_kept")])
+    return _mean([run["lane_kept"][name] for run in runs if name in (run.get("lane_kept") or {})])
 
 
 def _mean(values: Sequence[float]) -> float | None:
