@@ -155,7 +155,6 @@ def summarize(runs: Sequence[Row], common_p95: Values) -> Row:
         "followed_p95_m": followed,
         "p95_common_m": common_p95,
     }
-    rates = [float(np.mean(completed(of_road))) for of_road in groups(runs, road).values()]
     return {
         "runs": n,
         "completed": int(sum(ended)),
@@ -164,7 +163,6 @@ def summarize(runs: Sequence[Row], common_p95: Values) -> Row:
         "completed_in_own_lane": int(sum(kept)),
         "own_lane_completion_rate": mean(kept),
         "own_lane_completion_interval": exact(int(sum(kept)), len(kept)),
-        "completion_interval_over_roads": bootstrap([rates], np.mean) if len(rates) > 1 else None,
         "endings": dict(Counter(run["ending"] for run in runs)),
         **{f"{name}_per_run": mean([run[name] for run in runs]) for name in COUNTS},
         **{f"{name}_per_km": sum(run[name] for run in runs) / kilometres for name in COUNTS},

@@ -65,7 +65,6 @@ CONDITION_KEYS = {
     "completed_in_own_lane",
     "own_lane_completion_rate",
     "own_lane_completion_interval",
-    "completion_interval_over_roads",
     "endings",
     "routes",
     "collisions_per_run",

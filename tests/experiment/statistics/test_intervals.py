@@ -8,7 +8,6 @@ import pytest
 from scipy.stats import binom
 
 from lavt.experiment.statistics.intervals import (
-    bootstrap_interval,
     cluster_interval,
     cluster_rate_interval,
     exact_interval,
@@ -75,17 +74,17 @@ def test_the_pooled_interval_covers_any_three_routes() -> None:
 
 
 def test_intervals_of_too_few_values_are_null() -> None:
-    """Without runs there is no exact interval, and with fewer than two values no bootstrap interval."""
+    """Without runs there is no exact interval, and with fewer than two values no interval of their mean."""
     assert exact_interval(0, 0) is None
-    assert bootstrap_interval([]) is None
-    assert bootstrap_interval([1.0]) is None
+    assert stratified_interval([[]]) is None
+    assert stratified_interval([[1.0]]) is None
 
 
 def test_the_bootstrap_is_reproducible_and_accurate() -> None:
     """The interval is reproducible; for 100 evenly spaced values it is about the mean +- 1.96 standard errors."""
     values = [index / 99 for index in range(100)]
-    interval = bootstrap_interval(values)
-    assert interval == bootstrap_interval(values)
+    interval = stratified_interval([values])
+    assert interval == stratified_interval([values])
     assert interval is not None
     low, high = interval
     mean, standard_error = 0.5, 0.0291
@@ -93,24 +92,15 @@ def test_the_bootstrap_is_reproducible_and_accurate() -> None:
     assert high == pytest.approx(mean + 1.96 * standard_error, abs=0.006)
 
 
-def test_the_bootstrap_of_three_is_their_range() -> None:
-    """The 95 % interval of three values is their range.
-
-    Of 27 resamples, one has only the smallest value and one only the largest, and 1/27 is more than 2.5 %.
-    """
-    assert bootstrap_interval([0.2, 1.0, 0.6]) == pytest.approx([0.2, 1.0])
-    assert bootstrap_interval([1.0, 1.0, 1.0]) == [1.0, 1.0]
-
-
 def test_differences_between_strata_do_not_widen_the_interval() -> None:
     """Three strata of equal spread and different means have the interval of one stratum with all their deviations."""
     deviations = [-0.02, -0.01, 0.0, 0.01, 0.02]
     apart = stratified_interval([[centre + deviation for deviation in deviations] for centre in (0.0, 1.0, 5.0)])
-    together = bootstrap_interval([2.0 + deviation for deviation in deviations * 3])
+    together = stratified_interval([[2.0 + deviation for deviation in deviations * 3]])
     assert apart is not None
     assert together is not None
     assert apart == pytest.approx(together, abs=0.0006)
-    pooled = bootstrap_interval([centre + deviation for centre in (0.0, 1.0, 5.0) for deviation in deviations])
+    pooled = stratified_interval([[centre + deviation for centre in (0.0, 1.0, 5.0) for deviation in deviations]])
     assert pooled is not None
     assert pooled[1] - pooled[0] > 50 * (apart[1] - apart[0])
 

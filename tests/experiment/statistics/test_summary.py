@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from lavt.experiment.statistics.by_road import road_rates
+from lavt.experiment.statistics.by_road import group_by_road
 from lavt.experiment.statistics.intervals import exact_interval
 from lavt.experiment.statistics.summary import summarize
 
@@ -92,12 +92,11 @@ def campaign(*, condition: str = "L0", bad_route: str | None = None, **changes: 
     ]
 
 
-def test_completion_by_route_and_by_road() -> None:
-    """If one of six routes is never completed, its interval is 0 to 52 %, and the range over roads is 50 to 100 %."""
+def test_completion_by_route() -> None:
+    """If one of six routes is never completed, its interval is 0 to 52 %; the pooled interval is that of 25 of 30."""
     condition = summarize(campaign(bad_route="b"), SPEED)["conditions"]["L0"]
     assert condition["endings"] == {"completed": 25, "safe_stop": 5}
     assert condition["completion_interval"] == exact_interval(25, 30)
-    assert condition["completion_interval_over_roads"] == [0.5, 1.0]
     assert {name: route["completed"] for name, route in condition["routes"].items()} == {
         "a": 5,
         "a_key": 5,
@@ -146,13 +145,7 @@ def test_rates_by_road_have_an_exact_interval() -> None:
 def test_a_route_and_its_key_route_are_one_road(suffix: str) -> None:
     """Two routes whose names or paths differ only by `_key` are one road."""
     runs = [run(route=f"roads/my{suffix}"), run(route=f"roads/my_key{suffix}", ending="collision"), run(route="b")]
-    assert road_rates(runs) == [1.0, 0.5]
-
-
-def test_one_road_has_no_range_over_roads() -> None:
-    """Runs on a single road (a route and its key part) have no range over roads."""
-    runs = [entry for entry in campaign() if entry["route"] in {"a", "a_key"}]
-    assert summarize(runs, SPEED)["conditions"]["L0"]["completion_interval_over_roads"] is None
+    assert [len(on_road) for on_road in group_by_road(runs).values()] == [1, 2]
 
 
 def test_rates_by_distance_are_of_all_kilometres() -> None:

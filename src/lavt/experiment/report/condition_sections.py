@@ -33,10 +33,6 @@ ROUTES_NOTE = (
     " The intervals “these routes” show only how repeated runs of these routes vary: that of completion is exact, that "
     "of P95 is bootstrapped within each route."
 )
-ROADS_NOTE = (
-    " “Range over roads” shows how much completion differs between roads; a route and its key part count as one road. "
-    "It is not a 95 % interval."
-)
 BY_ROAD_NOTE = (
     " Quote the columns “by road”: they have the mean over roads and its 95 % interval for other roads of this kind. "
     "Repeated runs on one road are no evidence on other roads, so the other columns look more certain than they are."
@@ -74,11 +70,6 @@ def conditions_parts(report: ReportContext) -> Parts:
         }
         for name, make in tables.items():
             parts.append(save_table(report.directory, f"conditions_{kind}_{name}", make(conditions, paper)))
-    has_roads = any(
-        entry.get("completion_interval_over_roads")
-        for conditions in report.kinds.values()
-        for entry in conditions.values()
-    )
     roads = max(_roads(entry) for conditions in report.kinds.values() for entry in conditions.values())
     has_paper = any(report.paper(conditions) for conditions in report.kinds.values())
     return [
@@ -90,7 +81,6 @@ def conditions_parts(report: ReportContext) -> Parts:
                     PAPER_NOTE * has_paper,
                     OWN_LANE_NOTE,
                     ROUTES_NOTE,
-                    ROADS_NOTE * has_roads,
                     _by_road_note(roads) if roads else "",
                     ERRORS_NOTE,
                 )

@@ -102,7 +102,6 @@ def driving_table(conditions: Conditions, paper: Conditions) -> TableData:
             (number_column("runs", 0), "runs"),
             (share_column("completed"), "completion_rate"),
             (share_interval_column("95 %, these routes"), "completion_interval"),
-            (share_interval_column("range over roads"), "completion_interval_over_roads"),
             (share_column("the paper's completed"), "paper.completion_rate"),
             (share_interval_column("the paper's 95 %"), "paper.completion_interval"),
             (share_column("completed in own lane"), "own_lane_completion_rate"),

@@ -31,14 +31,6 @@ def _route_name(route: str) -> str:
     return route.removesuffix(".yaml").removesuffix(".yml")
 
 
-def road_rates(runs: Sequence[Run]) -> list[float]:
-    """Return the completion rate of each road, sorted by road."""
-    return [
-        sum(run["ending"] == "completed" for run in runs_on_road) / len(runs_on_road)
-        for runs_on_road in group_by_road(runs).values()
-    ]
-
-
 def group_by_road(runs: Sequence[Run]) -> dict[str, list[Run]]:
     """Group the runs by road, sorted by road."""
     runs_on: dict[str, list[Run]] = {}

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from lavt.experiment.statistics.by_road import by_road, completed_values, road_rates
-from lavt.experiment.statistics.intervals import bootstrap_interval, exact_interval, stratified_interval
+from lavt.experiment.statistics.by_road import by_road, completed_values
+from lavt.experiment.statistics.intervals import exact_interval, stratified_interval
 from lavt.experiment.statistics.survival import survival
 
 Run = Mapping[str, Any]
@@ -48,7 +48,6 @@ def summarize_condition(all_runs: Sequence[Run], distances: CommonDistances) -> 
     return {
         **completion(runs),
         **own_lane_completion(runs),
-        "completion_interval_over_roads": bootstrap_interval(road_rates(runs)),
         "endings": dict(sorted(Counter(str(run["ending"]) for run in runs).items())),
         "routes": {name: _summarize_route(routes[name], distances) for name in sorted(routes)},
         "collisions_per_run": _mean([run["collisions"] for run in runs]),

@@ -37,16 +37,6 @@ def _clopper_pearson(successes: int, trials: int) -> tuple[float, float]:
     return float(interval.low), float(interval.high)
 
 
-def bootstrap_interval(values: Sequence[float]) -> list[float] | None:
-    """Return the 95 % percentile bootstrap interval of the mean; None for fewer than two values.
-
-    The resampling has a fixed seed, so the interval is reproducible.
-    """
-    if len(values) < 2:
-        return None
-    return list(_bootstrap(tuple(values), 0.95))
-
-
 def stratified_interval(strata: Sequence[Sequence[float]]) -> list[float] | None:
     """Return the 95 % percentile bootstrap interval of the mean of all values, resampled within each stratum.
 
