@@ -55,6 +55,12 @@ def exact(successes: int, trials: int) -> list[float] | None:
     return [interval.low, interval.high]
 
 
+def exact_mean_count(count: int, trials: int) -> list[float]:
+    """Return Garwood's interval of the mean of `trials` Poisson numbers whose sum is `count`."""
+    low = stats.gamma.ppf(0.025, count) if count else 0.0
+    return [low / trials, stats.gamma.ppf(0.975, count + 1) / trials]
+
+
 def bootstrap(samples: Sequence[Sequence[float]], statistic: Callable[..., Any], level: float = 0.95) -> list[float]:
     """Return the percentile bootstrap interval with the documented resamples."""
     key = int.from_bytes(hashlib.sha256(b"0/bootstrap interval").digest()[:16], "little")
@@ -165,6 +171,7 @@ def summarize(runs: Sequence[Row], common_p95: Values) -> Row:
         "own_lane_completion_interval": exact(int(sum(kept)), len(kept)),
         "endings": dict(Counter(run["ending"] for run in runs)),
         **{f"{name}_per_run": mean([run[name] for run in runs]) for name in COUNTS},
+        "collisions_per_run_interval": exact_mean_count(sum(run["collisions"] for run in runs), n),
         **{f"{name}_per_km": sum(run[name] for run in runs) / kilometres for name in COUNTS},
         "by_road": {
             name: over_roads(runs, values, is_rate=name.endswith("_rate")) for name, values in measures.items()

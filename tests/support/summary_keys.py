@@ -68,6 +68,7 @@ CONDITION_KEYS = {
     "endings",
     "routes",
     "collisions_per_run",
+    "collisions_per_run_interval",
     "lane_invasions_per_run",
     "collisions_per_km",
     "lane_invasions_per_km",

@@ -58,6 +58,7 @@ NEW_CONDITION_KEYS = (
     "p95_common_m",
     "p95_common_interval",
     "p95_worst_rank_m",
+    "collisions_per_run_interval",
     "collisions_per_km",
     "lane_invasions_per_km",
     "heading_rms_rad",

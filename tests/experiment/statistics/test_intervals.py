@@ -5,12 +5,13 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from scipy.stats import binom
+from scipy.stats import binom, poisson
 
 from lavt.experiment.statistics.intervals import (
     cluster_interval,
     cluster_rate_interval,
     exact_interval,
+    exact_rate_interval,
     holm,
     stratified_interval,
 )
@@ -71,6 +72,24 @@ def test_the_pooled_interval_covers_any_three_routes() -> None:
             if low - 1e-12 <= mean <= high + 1e-12
         )
         assert covered >= 0.95, probabilities
+
+
+def test_the_interval_of_a_count_is_exact() -> None:
+    """No event in 30 runs gives 0 to ln 40 / 30, five give the published limits 1.62 and 11.67; no run gives none."""
+    assert exact_rate_interval(0, 30) == pytest.approx([0.0, np.log(40) / 30])
+    assert exact_rate_interval(5, 1) == pytest.approx([1.62, 11.67], abs=0.005)
+    assert exact_rate_interval(0, 0) is None
+
+
+@pytest.mark.parametrize("mean", [0.02, 0.1, 0.5, 0.9, 2.0])
+def test_the_interval_of_a_count_covers_the_mean(mean: float) -> None:
+    """The coverage is at least 95 % if the events of 30 runs are Poisson distributed, or at most one in a run."""
+    counts = range(150)
+    intervals = [exact_rate_interval(count, 30) or [1.0, 0.0] for count in counts]
+    covers = [low <= mean <= high for low, high in intervals]
+    assert float(np.dot(poisson.pmf(counts, 30 * mean), covers)) >= 0.95
+    if mean <= 1:
+        assert float(np.dot(binom.pmf(counts, 30, mean), covers)) >= 0.95
 
 
 def test_intervals_of_too_few_values_are_null() -> None:

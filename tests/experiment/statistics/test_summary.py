@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from lavt.experiment.statistics.by_road import group_by_road
-from lavt.experiment.statistics.intervals import exact_interval
+from lavt.experiment.statistics.intervals import exact_interval, exact_rate_interval
 from lavt.experiment.statistics.summary import summarize
 
 SPEED = {"simulated_s": 100.0, "wall_s": 10.0, "jobs": 2}
@@ -44,6 +44,7 @@ def test_summary_of_a_condition() -> None:
     assert (condition["runs"], condition["completed"]) == (3, 2)
     assert condition["completion_rate"] == pytest.approx(2 / 3)
     assert condition["collisions_per_run"] == pytest.approx(1 / 3)
+    assert condition["collisions_per_run_interval"] == exact_rate_interval(1, 3)
     assert condition["p95_m"] == 2.0
     assert condition["injected_ms"] == {"video": 75.0, "control": 0.0}
     assert condition["tau_v_ms"] == {"p5": 60.0, "p50": 62.0, "p95": 86.0, "bound": 0.4, "n": 300}

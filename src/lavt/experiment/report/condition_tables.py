@@ -111,6 +111,7 @@ def driving_table(conditions: Conditions, paper: Conditions) -> TableData:
             (number_column("changes of the lane followed / run", 2), "followed_changes_per_run"),
             (number_column("changes of the lane occupied / run", 2), "occupied_changes_per_run"),
             (number_column("collisions / run", 2), "collisions_per_run"),
+            (interval_column("95 %, these routes, collisions / run"), "collisions_per_run_interval"),
             (number_column("the paper's collisions / run", 2), "paper.collisions_per_run"),
             (number_column("collisions / km", 2), "collisions_per_km"),
             (number_column("lane invasions / run", 2), "lane_invasions_per_run"),

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lavt.experiment.statistics.by_road import by_road, completed_values
-from lavt.experiment.statistics.intervals import exact_interval, stratified_interval
+from lavt.experiment.statistics.intervals import exact_interval, exact_rate_interval, stratified_interval
 from lavt.experiment.statistics.survival import survival
 
 Run = Mapping[str, Any]
@@ -51,6 +51,7 @@ def summarize_condition(all_runs: Sequence[Run], distances: CommonDistances) -> 
         "endings": dict(sorted(Counter(str(run["ending"]) for run in runs).items())),
         "routes": {name: _summarize_route(routes[name], distances) for name in sorted(routes)},
         "collisions_per_run": _mean([run["collisions"] for run in runs]),
+        "collisions_per_run_interval": exact_rate_interval(sum(run["collisions"] for run in runs), len(runs)),
         "lane_invasions_per_run": _mean([run["lane_invasions"] for run in runs]),
         "collisions_per_km": _per_km(runs, "collisions"),
         "lane_invasions_per_km": _per_km(runs, "lane_invasions"),

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
-from scipy.stats import binomtest, bootstrap, norm, t
+from scipy.stats import binomtest, bootstrap, chi2, norm, t
 
 from lavt.domain import FloatArray
 from lavt.streams import stream
@@ -35,6 +35,18 @@ def exact_interval(successes: int, trials: int) -> list[float] | None:
 def _clopper_pearson(successes: int, trials: int) -> tuple[float, float]:
     interval = binomtest(successes, trials).proportion_ci(confidence_level=0.95, method="exact")
     return float(interval.low), float(interval.high)
+
+
+def exact_rate_interval(count: int, runs: int) -> list[float] | None:
+    """Return the 95 % interval of the mean number of events per run, from the number of all events; None without runs.
+
+    It is exact for Poisson distributed numbers, also if the runs have different rates (F. Garwood, Fiducial Limits for
+    the Poisson Distribution, Biometrika 28, 1936), and too wide if a run has at most one event.
+    """
+    if runs == 0:
+        return None
+    low = float(chi2.ppf(0.025, 2 * count)) / 2 if count else 0.0
+    return [low / runs, float(chi2.ppf(0.975, 2 * count + 2)) / 2 / runs]
 
 
 def stratified_interval(strata: Sequence[Sequence[float]]) -> list[float] | None:
