@@ -34,6 +34,11 @@ def groups(runs: Iterable[Row], key: Callable[[Row], Any]) -> dict[Any, list[Row
     return {value: found[value] for value in sorted(found)}
 
 
+def by_route(runs: Iterable[Row]) -> Iterable[list[Row]]:
+    """Return the runs of each route."""
+    return groups(runs, lambda run: run["route"]).values()
+
+
 def road(run: Row) -> str:
     """Return the name of the road of a run."""
     return str(run["route"]).removesuffix(".yaml").removesuffix(".yml").removesuffix("_key")
@@ -76,16 +81,22 @@ def bootstrap(samples: Sequence[Sequence[float]], statistic: Callable[..., Any],
 
 
 def stratified(runs: Sequence[Row], values: Values) -> list[float] | None:
-    """Return the interval of the mean of all values, resampled within each route."""
-    strata = [values(of_route) for of_route in groups(runs, lambda run: run["route"]).values()]
-    resampled = [sample for sample in strata if len(sample) >= 2]
-    unchanged = sum(sample[0] for sample in strata if len(sample) == 1)
-    total = sum(len(sample) for sample in strata)
-
-    def mean_of_all(*samples: Any, axis: int) -> Any:
-        return (sum(sample.sum(axis=axis) for sample in samples) + unchanged) / total
-
-    return bootstrap(resampled, mean_of_all) if resampled else None
+    """Return Student's interval of the mean of all values, from their spread within each route."""
+    strata = [found for found in (values(of_route) for of_route in by_route(runs)) if found]
+    total = sum(len(found) for found in strata)
+    squares = freedom = 0.0
+    for found in strata:
+        if len(found) >= 2:
+            error = len(found) / total * stats.sem(found)
+            squares += error**2
+            freedom += error**4 / (len(found) - 1)
+    centre = mean([value for found in strata for value in found])
+    if centre is None or max(len(found) for found in strata) < 2:
+        return None
+    if squares == 0:
+        return [centre, centre]
+    low, high = stats.t.interval(0.95, squares**2 / freedom, centre, math.sqrt(squares))
+    return [low, high]
 
 
 def over_roads(runs: Sequence[Row], values: Values, *, is_rate: bool) -> Row:
@@ -124,7 +135,7 @@ def of_completed(name: str) -> Values:
 
 def route_balanced(runs: Sequence[Row], name: str) -> list[float]:
     """Return the mean of each route that has a completed run."""
-    of_routes = [of_completed(name)(of_route) for of_route in groups(runs, lambda run: run["route"]).values()]
+    of_routes = [of_completed(name)(of_route) for of_route in by_route(runs)]
     return [float(np.mean(values)) for values in of_routes if values]
 
 

@@ -31,7 +31,7 @@ OWN_LANE_NOTE = (
 )
 ROUTES_NOTE = (
     " The intervals “these routes” show only how repeated runs of these routes vary: those of completion and of "
-    "collisions are exact, that of P95 is bootstrapped within each route."
+    "collisions are exact, that of P95 is Student's t, from the spread within each route."
 )
 BY_ROAD_NOTE = (
     " Quote the columns “by road”: they have the mean over roads and its 95 % interval for other roads of this kind. "
