@@ -169,6 +169,7 @@ def summarize(runs: Sequence[Row], common_p95: Values) -> Row:
         "own_lane_completion_rate": in_own_lane,
         "collisions_per_run": lambda found: [run["collisions"] for run in found],
         "p95_m": p95,
+        "p95_all_runs_m": lambda found: [run["p95_m"] for run in found],
         "followed_p95_m": followed,
         "p95_common_m": common_p95,
     }

@@ -15,6 +15,7 @@ import pytest
 from lavt.experiment.analysis.results import run_result, write_json
 from lavt.experiment.report import boundary_section
 from lavt.experiment.report.condition_sections import conditions_parts, contrast_parts
+from lavt.experiment.report.condition_tables import COMPLETED_P95, FOLLOWED_P95
 from lavt.experiment.report.figure_style import condition_colours
 from lavt.experiment.report.groups import axes_of, differing_settings, is_in_group, sort_groups, title_of
 from lavt.experiment.report.report import write_report
@@ -311,7 +312,7 @@ def test_the_headline_has_completion_in_the_own_lane(tmp_path: Path) -> None:
         "0.5",
         "0.0",
     ]
-    errors = ("p95 m, completed runs, mean of routes", "p95 m against the lane followed, mean of routes")
+    errors = (f"{COMPLETED_P95}, mean of routes", f"{FOLLOWED_P95}, mean of routes")
     assert [float(row[name]) for name in errors] == pytest.approx([2.0, 0.3])
     assert (row["completed, by road mean (share)"], row["completed, by road low (share)"]) == ("1.0", "")
     assert row["completed, by road roads (share)"] == "2"

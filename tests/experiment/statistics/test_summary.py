@@ -121,13 +121,14 @@ def test_p95_of_the_routes_has_equal_weights() -> None:
 def test_results_by_road() -> None:
     """Each road counts once; with six roads there is an interval, with five none."""
     roads = [run(route=f"road{number}", p95_m=float(number)) for number in range(6)]
-    runs = [*roads, *(run(route="road0", ending="collision", collisions=1) for _ in range(3))]
+    runs = [*roads, *(run(route="road0", ending="collision", collisions=1, p95_m=9.0) for _ in range(3))]
     by_road = summarize(runs, SPEED)["conditions"]["L0"]["by_road"]
     assert by_road["completion_rate"]["mean"] == pytest.approx((0.25 + 5) / 6)
     assert by_road["collisions_per_run"]["mean"] == pytest.approx(0.75 / 6)
     assert (by_road["p95_m"]["mean"], by_road["p95_m"]["roads"]) == (2.5, 6)
     assert 0.0 <= by_road["p95_m"]["low"] < 1.0
     assert 4.0 < by_road["p95_m"]["high"] <= 5.0
+    assert by_road["p95_all_runs_m"]["mean"] == pytest.approx((3 * 9 / 4 + 1 + 2 + 3 + 4 + 5) / 6)
     assert by_road["own_lane_completion_rate"] == {"roads": 0, "mean": None, "low": None, "high": None}
     few = summarize(runs[1:6], SPEED)["conditions"]["L0"]["by_road"]
     assert few["p95_m"] == {"roads": 5, "mean": 3.0, "low": None, "high": None}

@@ -44,10 +44,11 @@ FEW_ROADS_NOTE = (
 )
 ERRORS_NOTE = (
     " Each error is computed for each run and then averaged over the runs. P95 of the cross-track error is given in "
-    "three ways. The first is the mean over the completed runs only, to be read together with the completion: of all "
-    "these runs, and of the means of the routes. The second is the mean over all runs, each up to the "
-    "common distance, which all runs of its route and repetition reached. The third is the median (quartiles) of all "
-    "runs, where a run that ended early ranks last. "
+    "three ways. The first is the mean over the runs that completed, to be read together with the completion: of all "
+    "these runs, and of the means of the routes and of the roads. The mean over roads is also shown for all runs, each "
+    "up to its own end. The second is the mean over all runs, each up to the common distance, which all runs of its "
+    "route and repetition reached. The third is the median (quartiles) of all runs, where a run that ended early ranks "
+    "last. "
     "docs/metrics.md defines each number."
 )
 

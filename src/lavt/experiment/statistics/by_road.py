@@ -57,6 +57,7 @@ def by_road(valid_runs: Sequence[Run], common_p95_m: Callable[[Sequence[Run]], S
         ],
         "collisions_per_run": lambda runs: [float(run["collisions"]) for run in runs],
         "p95_m": lambda runs: completed_values(runs, "p95_m"),
+        "p95_all_runs_m": lambda runs: [run["p95_m"] for run in runs if run.get("p95_m") is not None],
         "followed_p95_m": lambda runs: completed_values(runs, "followed_p95_m"),
         "p95_common_m": common_p95_m,
     }
