@@ -5,9 +5,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from benchmarks.fleet_parts.costs import costs_per_vehicle
 from benchmarks.growth_onset import table_row
+from benchmarks.interval_coverage import percentile_bootstrap, studentised_bootstrap
 from benchmarks.virtual_loop import with_rest
 
 from lavt.errors import WorkError
@@ -148,3 +150,15 @@ def test_fleet_benchmark_runs() -> None:
         assert step["resident_mb"] > 0
     assert result["rendezvous"]["processor_us_per_packet"] >= 0
     assert completed.stdout.count("\n| routers | 2 | 1 |") == 1
+
+
+def test_the_bootstraps_of_the_coverage_study() -> None:
+    """Both bootstraps of equal values have no width; otherwise both include the mean, and the studentised is wider."""
+    generator = np.random.default_rng(1)
+    values = np.array([[1.0, 2.0, 4.0, 5.0], [0.0, 1.0, 1.0, 2.0]])
+    for method in (percentile_bootstrap, studentised_bootstrap):
+        assert list(method(np.ones((2, 4)), generator)) == [1.0, 1.0]
+        low, high = method(values, generator)
+        assert low < 2.0 < high
+    narrow, wide = percentile_bootstrap(values, generator), studentised_bootstrap(values, generator)
+    assert wide[1] - wide[0] > narrow[1] - narrow[0]

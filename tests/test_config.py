@@ -91,7 +91,7 @@ def test_the_paper_config() -> None:
     assert len(plan_sweep(paper)) == 180
 
 
-@pytest.mark.parametrize(("name", "count"), [("loss_and_jitter.yaml", 36), ("roads.yaml", 180), ("speed.yaml", 54)])
+@pytest.mark.parametrize(("name", "count"), [("loss_and_jitter.yaml", 36), ("roads.yaml", 180), ("speed.yaml", 72)])
 def test_sweeps_over_further_axes(name: str, count: int) -> None:
     """The sweeps over loss and jitter, and over speed, can be planned; each axis contains the base config's value."""
     sweep = load_config(SweepConfig, shipped("configs") / name)
@@ -375,6 +375,7 @@ def test_configs_are_immutable() -> None:
         SafetyConfig(lateral_acceleration_mps2=3.1),
         SafetyConfig(picture_age_limit_ms=501.0),
         SafetyConfig(stopping_distance_limit_m=21.0),
+        SafetyConfig(speed_limit_mps=80 / 3.6),
     ],
 )
 def test_wide_limits_are_for_simulators(safety: SafetyConfig) -> None:
@@ -386,6 +387,7 @@ def test_wide_limits_are_for_simulators(safety: SafetyConfig) -> None:
     assert wide.lateral_acceleration_mps2 == safety.lateral_acceleration_mps2
     assert wide.picture_age_limit_ns == safety.picture_age_limit_ms * 1e6
     assert wide.stopping_distance_limit_m == safety.stopping_distance_limit_m
+    assert wide.speed_limit_mps == safety.speed_limit_mps
 
 
 @pytest.mark.parametrize("simulated", [True, False])

@@ -104,6 +104,10 @@ class NetworkConfig(Section):
         return ", ".join(changes) or None
 
 
+MAX_SIMULATED_MPS = 22.3
+"""The largest speed that can be configured, a little above 80 km/h."""
+
+
 class SafetyConfig(Section):
     """The safety limits that a study may widen, for a simulated vehicle only."""
 
@@ -111,6 +115,8 @@ class SafetyConfig(Section):
     picture_age_limit_ms: float = Field(500.0, gt=0, le=2000)
     stopping_distance_limit_m: float = Field(20.0, gt=0, le=200)
     """The distance in which the car must be able to stop; above 20 m, the car can drive faster than it was tested."""
+    speed_limit_mps: float = Field(40 / 3.6, gt=0, le=MAX_SIMULATED_MPS)
+    """Above this speed the vehicle allows no throttle."""
 
 
 class RecordConfig(Section):
@@ -135,8 +141,9 @@ class ControllerConfig(Section):
     steering_limit_rad: float | None = Field(None, gt=0, le=0.5)
     """The limit of the angle of the road wheels."""
     lateral_limit_mps2: float | None = Field(None, gt=0, le=20)
-    speed_mps: float | None = Field(None, ge=1, le=11)
-    """The target speed; the vehicle allows no throttle above 40 km/h in any case."""
+    speed_mps: float | None = Field(None, ge=1, le=MAX_SIMULATED_MPS)
+    """The target speed. The vehicle allows no throttle above `safety.speed_limit_mps`, which is at most 40 km/h for a
+    vehicle that is not simulated."""
     wheelbase_m: float = Field(2.8448, gt=0.5, lt=10)
     """The wheelbase of the driven vehicle; by default the built-in car's."""
     rearm: bool = False
