@@ -278,6 +278,22 @@ class NetemReply(Struct, frozen=True):
     reason: str
 
 
+class VehicleInfo(Struct, frozen=True):
+    """The server's answer to a query of anybody who may receive the state: the vehicle for a list of vehicles."""
+
+    lavt_version: str
+    safety: SafetyState
+    reason: str
+    """The reason for the safety state, as a message."""
+    active_operator: str
+    """Name of the client that has control; empty: no client has control."""
+    speed_mps: float
+    state_age_ns: int
+    """Age of the vehicle's state when the query arrived."""
+    instance: int
+    """Random number of the server process."""
+
+
 class SessionReply(Struct, frozen=True):
     """The server's answer to a `SessionRequest`."""
 
