@@ -361,6 +361,7 @@ def test_bad_commands(case: str, run: Run, tmp_path: Path) -> None:
 
 
 COMMANDS = [
+    "vehicles",
     "demo",
     "run",
     "sweep",

@@ -12,6 +12,7 @@ ALLOWED_PACKAGES: dict[str, set[str]] = {
     **{command: set() for command in SMALL_COMMANDS},
     "clock": {"mcap"},
     "stop": {"zenoh"},
+    "vehicles": {"zenoh"},
     "run": {"av", "cv2", "mcap"},
     "server": {"av", "cv2", "mcap", "zenoh"},
     "client": {"av", "cv2", "mcap", "zenoh"},

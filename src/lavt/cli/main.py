@@ -28,6 +28,7 @@ COMMANDS = (
     "server",
     "software-car",
     "client",
+    "vehicles",
     "sdp",
     "watch",
     "stop",
