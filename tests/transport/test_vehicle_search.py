@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import itertools
+from typing import NamedTuple
+
 import msgpack
 import pytest
+import zenoh
 from msgspec.structs import replace
+from tests.support.clocks import ManualClock
 
-from lavt.domain import VehicleInfo
+from lavt.domain import NS_PER_S, VehicleInfo
 from lavt.streams import stream
+from lavt.transport import vehicle_search
 from lavt.transport.messages import VERSION, encode
 from lavt.transport.security.keys import SIGNATURE_BYTES
 from lavt.transport.vehicle_search import (
     MAX_LOCATORS,
+    MAX_ROUTERS,
     MAX_VEHICLES,
     Answer,
     FoundVehicles,
+    scout,
     usable_locators,
 )
 
@@ -161,3 +169,50 @@ def test_a_router_with_many_addresses() -> None:
     """Only the first addresses of a router are dialled."""
     locators = [f"tcp/192.0.2.{number}:7447" for number in range(1, 100)]
     assert usable_locators(locators) == locators[:MAX_LOCATORS]
+
+
+class Hello(NamedTuple):
+    """An answer to scouting."""
+
+    zid: str
+    locators: list[str]
+
+
+class ManyHellos:
+    """Stands for Zenoh's scouting: each of ever more routers answers twice."""
+
+    def __init__(self) -> None:
+        self.numbers = itertools.count()
+        self.is_stopped = False
+
+    def try_recv(self) -> Hello | None:
+        """Return the next answer; every third time there is none."""
+        number = next(self.numbers)
+        if number % 3 == 2:
+            return None
+        router = number // 3
+        return Hello(f"{router:x}", ["tcp/127.0.0.1:7447", f"udp/192.0.2.{router + 1}:7448"])
+
+    def stop(self) -> None:
+        """End scouting."""
+        self.is_stopped = True
+
+
+def test_scouting_returns_the_first_routers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scouting returns the usable addresses of the first routers, each once, and then stops."""
+    hellos = ManyHellos()
+    monkeypatch.setattr(zenoh, "scout", lambda **_: hellos)
+    monkeypatch.setattr(vehicle_search, "pause", lambda _: None)
+    routers = scout(ManualClock(step_ns=1), 1.0)
+    assert routers == [[f"udp/192.0.2.{number}:7448"] for number in range(1, MAX_ROUTERS + 1)]
+    assert hellos.is_stopped
+
+
+def test_scouting_ends_after_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scouting ends after its time if fewer routers answer."""
+    hellos = ManyHellos()
+    monkeypatch.setattr(zenoh, "scout", lambda **_: hellos)
+    monkeypatch.setattr(vehicle_search, "pause", lambda _: None)
+    routers = scout(ManualClock(step_ns=NS_PER_S // 5), 1.0)
+    assert 0 < len(routers) < 6
+    assert hellos.is_stopped
