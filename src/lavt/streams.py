@@ -8,9 +8,10 @@ in pairs.
 from __future__ import annotations
 
 import hashlib
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
+if TYPE_CHECKING:
+    import numpy as np
 
 
 def stream_key(seed: int, name: str) -> int:
@@ -23,6 +24,8 @@ def stream(seed: int, name: str, index: int = 0) -> np.random.Generator:
 
     Philox is counter-based: the index is the upper half of its counter, so that entries never overlap.
     """
+    import numpy as np  # noqa: PLC0415 (large, and commands without random streams need none)
+
     return np.random.Generator(np.random.Philox(key=stream_key(seed, name), counter=(index & (2**64 - 1)) << 128))
 
 
@@ -33,6 +36,8 @@ class IndexedStream:
     """
 
     def __init__(self, seed: int, name: str) -> None:
+        import numpy as np  # noqa: PLC0415 (as above)
+
         self._bits = np.random.Philox(key=stream_key(seed, name))
         self._initial_state: Any = self._bits.state
         self._counter = self._initial_state["state"]["counter"]
