@@ -222,7 +222,7 @@ def test_a_server_without_a_config_says_how_to_drive_it(run: Run) -> None:
     changes = ("zenoh={router_settings: {connect: {endpoints: [foo/h:1]}}}", "video.port=0", "clock.probe_port=0")
     result = run("server", *(word for change in changes for word in ("--set", change)))
     first, last = result.err.splitlines()
-    assert first.startswith("lavt: the vehicle is the simulator")
+    assert first.startswith("lavt: default settings, vehicle: simulator; ")
     assert "`lavt client HOST`" in first
     assert (result.code, result.out) == (2, "")
     assert "foo/h:1" in last

@@ -43,7 +43,10 @@ def server(
     process_priority.raise_priority()
     if config is None:
         settings = build_config(ServerConfig, {}, changes or [], "the default config")
-        console.print_message("lavt: the vehicle is the simulator; drive it with `lavt client HOST` (this machine's)")
+        console.print_message(
+            f"lavt: default settings, vehicle: {settings.vehicle.kind}; drive it with `lavt client HOST`; HOST is "
+            "the address of this machine"
+        )
     else:
         settings = load_config(ServerConfig, config, changes or [])
     with open_server(settings, out, MachineClock(), console.print_message) as (side, ready):
