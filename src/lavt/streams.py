@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
+if TYPE_CHECKING:
+    import numpy as np
 
 
 def stream_key(seed: int, name: str) -> int:
@@ -24,6 +25,8 @@ def stream(seed: int, name: str, index: int = 0) -> np.random.Generator:
 
     Philox is counter-based: the index is the upper half of its counter, so that entries never overlap.
     """
+    import numpy as np  # noqa: PLC0415 (large, and commands without random streams need none)
+
     return np.random.Generator(np.random.Philox(key=stream_key(seed, name), counter=(index & (2**64 - 1)) << 128))
 
 
@@ -34,6 +37,8 @@ class IndexedStream:
     """
 
     def __init__(self, seed: int, name: str) -> None:
+        import numpy as np  # noqa: PLC0415 (as above)
+
         self._bits = np.random.Philox(key=stream_key(seed, name))
         self._initial_state: Any = self._bits.state
         self._counter = self._initial_state["state"]["counter"]
@@ -58,6 +63,8 @@ class QuantileStream:
     """
 
     def __init__(self, seed: int, name: str, levels: Sequence[float], values: Sequence[float]) -> None:
+        import numpy as np  # noqa: PLC0415 (as above)
+
         self._stream = IndexedStream(seed, name)
         self._levels, self._values = np.array(levels), np.array(values)
         self._block = -1
@@ -67,6 +74,8 @@ class QuantileStream:
         """Return entry `index`, rounded to an integer; it does not depend on the entries that were read before."""
         block, position = divmod(index, BLOCK_ENTRIES)
         if block != self._block:
+            import numpy as np  # noqa: PLC0415 (as above)
+
             levels = self._stream.at(block).random(BLOCK_ENTRIES)
             self._entries = np.rint(np.interp(levels, self._levels, self._values)).astype(np.int64).tolist()
             self._block = block

@@ -9,7 +9,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from lavt.domain import PATH_POINTS, Command, NetemReply, NetemRequest, SessionReply, SessionRequest, State
+from lavt.domain import (
+    PATH_POINTS,
+    Command,
+    NetemReply,
+    NetemRequest,
+    SessionReply,
+    SessionRequest,
+    State,
+    VehicleInfo,
+)
 from lavt.errors import BadMessage
 from lavt.streams import stream
 from lavt.transport.messages import (
@@ -20,10 +29,11 @@ from lavt.transport.messages import (
     TYPES,
     VERSION,
     decode,
+    decode_versions,
     encode,
 )
 
-AnyMessage = Command | State | SessionRequest | SessionReply | NetemRequest | NetemReply
+AnyMessage = Command | State | SessionRequest | SessionReply | NetemRequest | NetemReply | VehicleInfo
 
 COMMAND = Command(
     epoch=7,
@@ -67,8 +77,17 @@ NETEM = NetemRequest(
     state_delay_ms=150.0,
 )
 NETEM_REPLY = NetemReply(granted=False, reason="no")
+INFO = VehicleInfo(
+    lavt_version="0.1.0",
+    safety="driving",
+    reason="armed by alice",
+    active_operator="alice",
+    speed_mps=3.5,
+    state_age_ns=2_000_000,
+    instance=9,
+)
 MESSAGES: dict[type, AnyMessage] = {
-    type(message): message for message in (COMMAND, STATE, REQUEST, REPLY, NETEM, NETEM_REPLY)
+    type(message): message for message in (COMMAND, STATE, REQUEST, REPLY, NETEM, NETEM_REPLY, INFO)
 }
 
 U64 = st.integers(0, 2**64 - 1)
@@ -164,6 +183,7 @@ def test_longest_texts_fit(letter: str) -> None:
 ANY_TEXT = st.one_of(st.text(st.characters(categories=["L", "Cs", "So"]), max_size=2000), st.text())
 TEXTS: list[tuple[type[Any], str]] = [(State, "reason"), (State, "rejected"), (State, "limited")]
 TEXTS += [(SessionReply, "reason"), (SessionReply, "host"), (NetemRequest, "condition"), (NetemReply, "reason")]
+TEXTS += [(VehicleInfo, "lavt_version"), (VehicleInfo, "reason")]
 
 
 @given(st.sampled_from(TEXTS), ANY_TEXT)
@@ -293,6 +313,15 @@ OUT_OF_RANGE: dict[type, dict[str, list[Any]]] = {
         "state_delay_ms": [*NOT_A_NUMBER, -0.1, 10_000.1],
     },
     NetemReply: {"granted": [0, 1, 1.0, "true", None, []], "reason": [*NOT_A_TEXT, "x" * 401]},
+    VehicleInfo: {
+        "lavt_version": [*NOT_A_TEXT, "x" * 33],
+        "safety": [*NOT_A_TEXT, "", "safe"],
+        "reason": [*NOT_A_TEXT, "x" * 301],
+        "active_operator": NOT_A_NAME_OR_EMPTY,
+        "speed_mps": [*NOT_A_NUMBER, 100.1, -100.1],
+        "state_age_ns": NOT_A_U63,
+        "instance": [*NOT_AN_INTEGER, -1],
+    },
 }
 
 
@@ -363,3 +392,39 @@ def test_bombs(bomb: str) -> None:
     finally:
         tracemalloc.stop()
     assert peak_bytes < 1_000_000
+
+
+def test_versions_of_information_from_another_version() -> None:
+    """The versions in the information about a vehicle can be read, whatever the version of the rest."""
+    assert decode_versions(encode(INFO)) == (VERSION, "0.1.0")
+    assert decode_versions(msgpack.packb([9, "2.0", {"new": [1.5, None]}, b"x"])) == (9, "2.0")
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"\xc1", msgpack.packb(5), msgpack.packb([]), msgpack.packb([9]), msgpack.packb({9: "2.0"})]
+)
+def test_no_versions(data: bytes) -> None:
+    """Data without versions raises BadMessage."""
+    with pytest.raises(BadMessage):
+        decode_versions(data)
+
+
+@pytest.mark.parametrize("values", [["9", "2.0"], [-1, "2.0"], [True, "2.0"], [9, 2], [9, "x" * 33], [2**63, "2.0"]])
+def test_wrong_versions(values: list[Any]) -> None:
+    """Versions of a wrong type or out of range raise BadMessage."""
+    with pytest.raises(BadMessage):
+        decode_versions(msgpack.packb(values))
+
+
+def test_versions_in_random_bytes() -> None:
+    """Random bytes, a nested array and too many bytes raise BadMessage and nothing else, or contain versions."""
+    generator = stream(1, "random bytes with versions")
+    for data in (b"\x91" * 1000, msgpack.packb([9, "2.0", bytes(MAX_MESSAGE_BYTES)])):
+        with pytest.raises(BadMessage):
+            decode_versions(data)
+    for _ in range(10_000):
+        try:
+            version, _ = decode_versions(generator.bytes(int(generator.integers(0, 200))))
+        except BadMessage:
+            continue
+        assert version >= 0

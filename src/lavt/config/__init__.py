@@ -353,6 +353,12 @@ class ClientConfig(Section):
     clock: ClientClockConfig = ClientClockConfig()
     record: RecordConfig = RecordConfig()
 
+    @model_validator(mode="after")
+    def _check_scouting(self) -> ClientConfig:
+        if self.zenoh.scouting:
+            raise ValueError("zenoh.scouting is for a server, because only servers are searched: leave it out")
+        return self
+
 
 class DelayConfig(Section):
     """One direction of a relayed flow: a constant delay, a lognormal jitter, and the impairments of a condition."""
