@@ -24,7 +24,7 @@ COMMANDS = {
     "sweep": "Drive routes under network conditions and report.",
     "boundary": "Find the maximum tolerable latency.",
     "report": "Write a report of finished runs.",
-    "replay": "Make a video of one or several runs: what the driver saw, the lane it detected, and where the car was.",
+    "replay": "Make a video of runs side by side.",
     "join": "Join the records of two machines into one run.",
     "road": "Draw roads: shipped ones and your own.",
     "perception": "Inspect lane detection.",

@@ -30,10 +30,11 @@ def replay(
     ] = None,
     width: Annotated[int | None, typer.Option(min=200, max=4096, help="Width of the video in pixels.")] = None,
 ) -> None:
-    """Make a video of one or several runs: what the driver saw, the lane it detected, and where the car was.
+    """Make a video of runs side by side.
 
-    The picture at each moment is the one from which the command in force was made. A run without recorded video shows
-    only the car's position.
+    The video shows what the driver saw, the lane that it detected, and where the car was. The picture at
+    each moment is the one from which the command in force was made. A run without recorded video shows only the car's
+    position.
 
     Example: lavt replay out/demo/runs/real_a_key_L0_00 out/demo/runs/real_a_key_L5_00 --out replay.mp4
     """

@@ -54,7 +54,7 @@ class Seen(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class ReplayLayout:
     """The panels and scales that all drives of a replay share."""
 
     has_pictures: bool
@@ -79,7 +79,7 @@ def draw_columns(columns: Sequence[Picture], width_px: int | None = None) -> Pic
     return np.asarray(cv2.resize(drawn, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def draw_scene(drive: ReplayDrive, scene: Scene, layout: Layout, seen: Seen) -> Picture:
+def draw_scene(drive: ReplayDrive, scene: Scene, layout: ReplayLayout, seen: Seen) -> Picture:
     """Return the column of one drive at one moment."""
     canvas = _blank(layout.height_px, WIDTH_PX, BACKGROUND)
     _write_header(canvas, drive, scene)
@@ -205,7 +205,7 @@ def _draw_map(drive: ReplayDrive, scene: Scene) -> Picture:
     return _smooth(tile)
 
 
-def _draw_error(drive: ReplayDrive, scene: Scene, layout: Layout) -> Picture:
+def _draw_error(drive: ReplayDrive, scene: Scene, layout: ReplayLayout) -> Picture:
     """Return the plot of the cross-track error over the time of the drive, up to now; left is up."""
     width, height = (WIDTH_PX - MAP_PX - GAP_PX) * FINER, LOWER_PX * FINER
     tile = _blank(height, width, TILE)

@@ -9,7 +9,7 @@ import numpy as np
 
 from lavt.domain import Picture
 from lavt.errors import UserError
-from lavt.experiment.replay.drawing import Layout, Seen, draw_columns, draw_scene
+from lavt.experiment.replay.drawing import ReplayLayout, Seen, draw_columns, draw_scene
 from lavt.experiment.replay.drive import DriverView, ReplayDrive, read_driver_view, read_replay_drive
 
 RATE_HZ = 20.0
@@ -38,7 +38,7 @@ def replay_pictures(
         if drive.duration_s <= 0:
             raise UserError(f"{drive.directory} has no drive to replay: its vehicle never drove")
     errors_m = np.concatenate([drive.truth.floats("cross_track_m") for drive in drives])
-    layout = Layout(
+    layout = ReplayLayout(
         any(view.units for view in views),
         len(errors_m) > 0,
         longest_s=max(drive.duration_s for drive in drives),
@@ -54,7 +54,7 @@ def replay_pictures(
         yield draw_columns(parts, width_px)
 
 
-def _column(drive: ReplayDrive, view: DriverView, layout: Layout, times_s: Sequence[float]) -> Iterator[Picture]:
+def _column(drive: ReplayDrive, view: DriverView, layout: ReplayLayout, times_s: Sequence[float]) -> Iterator[Picture]:
     """Yield the drawing of a drive at each time."""
     scenes = [drive.scene(time_s) for time_s in times_s]
     pictures = view.pictures(scene.stamp_ns for scene in scenes)
