@@ -112,7 +112,7 @@ def _import_pylibsrtp() -> Any:
 
 def _new_session(library: Any, key_and_salt: bytes, direction: int) -> Any:
     if len(key_and_salt) != KEY_BYTES:
-        raise UserError(f"an SRTP key with its salt has {KEY_BYTES} bytes, not {len(key_and_salt)}")
+        raise UserError(f"an SRTP key with its salt has {KEY_BYTES} bytes, not {len(key_and_salt)}: give all of them")
     profile = library.Policy.SRTP_PROFILE_AEAD_AES_128_GCM
     policy = library.Policy(key=key_and_salt, ssrc_type=direction, srtp_profile=profile)
     policy.window_size = WINDOW_PACKETS
