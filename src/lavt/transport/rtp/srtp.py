@@ -107,7 +107,7 @@ def _import_pylibsrtp() -> Any:
     try:
         return import_module("pylibsrtp")  # an extra
     except ImportError as error:
-        raise UserError(f"encrypted video needs pylibsrtp ({error}): pip install 'lavt[secure]'") from error
+        raise UserError(f"encryption needs pylibsrtp ({error}): pip install -e '.[secure]' in the clone") from error
 
 
 def _new_session(library: Any, key_and_salt: bytes, direction: int) -> Any:
