@@ -22,10 +22,13 @@ from lavt.config import Section
 ROOT = Path(__file__).parents[1]
 DOCS = [path for path in ROOT.glob("*.md") if path.name != "CHANGELOG.md"] + sorted((ROOT / "docs").rglob("*.md"))
 each_page = pytest.mark.parametrize("page", DOCS, ids=lambda path: path.relative_to(ROOT).as_posix())
+importing = pytest.mark.usefixtures("restored_environment")
+"""For tests that import the modules of all commands: OpenCV sets an environment variable."""
 LAVT = re.compile(r"(?:^ {4}|`|&& |^)(?:sudo )?(?:\S*/bin/)?lavt ((?!\.\.\.)[a-z][^`\n]*)", re.MULTILINE)
 """A command of `lavt`: in an indented line or between backticks."""
 
 
+@importing
 @pytest.mark.parametrize("name", PAGES)
 def test_generated_pages(name: str) -> None:
     """A generated page is what `python docs/draw_reference.py` writes."""
@@ -77,6 +80,7 @@ def named_commands(text: str) -> Iterator[list[str]]:
             yield command.split()
 
 
+@importing
 @each_page
 def test_commands(page: Path) -> None:
     """Each command of `lavt` on a page exists, with the named options and the named keys of its config."""
