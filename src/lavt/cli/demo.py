@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 from rich import box
@@ -20,6 +20,9 @@ from lavt.experiment.analysis.results import read_json
 from lavt.experiment.runs.plan import plan_run, plan_sweep
 from lavt.experiment.runs.run import run_once
 from lavt.recording.output_directory import prepare_directory
+
+if TYPE_CHECKING:
+    from lavt.experiment.sweep.sweep import SweepResult
 
 REAL_CONDITIONS = ("L0", "L5")
 VIRTUAL_CONDITIONS = ("L0", "L1", "L2", "L3", "L4", "L5")
@@ -52,11 +55,13 @@ def demo(out: console.OutOption = None, as_json: console.JsonOption = False) -> 
     prepare_directory(out)
     with console.interruptible():
         _drive_real(config, out)
-        failed, speed = _drive_virtual(config, out)
+        sweep_result, speed = _drive_virtual(config, out)
     from lavt.experiment.report.report import write_report  # noqa: PLC0415 (slow: scipy, matplotlib)
 
     console.print_message("writing the report")
-    page = write_report(out, speed=speed)
+    drives = {drive.directory: drive for drive in sweep_result.drives}
+    failed = [{"run": name, "reason": reason} for name, reason in sweep_result.failed]
+    page = write_report(out, speed=speed, drives=drives, failed=failed)
     summary = read_json(out / "summary.json")
     if as_json:
         console.print_json(summary)
@@ -78,8 +83,8 @@ def _drive_real(config: Path, out: Path) -> None:
         console.print_message(f"real time, {name}: {describe_ending(result)}")
 
 
-def _drive_virtual(config: Path, out: Path) -> tuple[bool, dict[str, Any] | None]:
-    """Drive the roads under all conditions; return whether any run failed, and the summary's entry `speed`."""
+def _drive_virtual(config: Path, out: Path) -> tuple[SweepResult, dict[str, Any] | None]:
+    """Drive the roads under all conditions; return the runs and the summary's entry `speed`."""
     base = load_config(RunConfig, config, ["time=virtual", "fidelity=geometry"])
     axes = {"routes": list(ROADS), "conditions": list(VIRTUAL_CONDITIONS)}
     planned_runs = plan_sweep(parse_config(SweepConfig, {**base.model_dump(mode="json"), **axes}, str(config)))
@@ -87,8 +92,7 @@ def _drive_virtual(config: Path, out: Path) -> tuple[bool, dict[str, Any] | None
 
     console.print_message(WHY_THESE_ROADS)
     with progress(f"virtual time, L0 to L5 on {len(ROADS)} roads", len(planned_runs)) as report_done:
-        sweep_result, speed = run_all(planned_runs, out / "runs", jobs=None, on_progress=report_done)
-    return bool(sweep_result.failed), speed
+        return run_all(planned_runs, out / "runs", jobs=None, on_progress=report_done)
 
 
 def describe_ending(run: Mapping[str, Any]) -> str:
