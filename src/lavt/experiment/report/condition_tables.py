@@ -56,11 +56,11 @@ def headline_table(conditions: Conditions, paper: Conditions) -> TableData:
         [
             (text_column("condition"), "condition"),
             (number_column("runs", 0), "runs"),
+            (share_column("completed in own lane"), "own_lane_completion_rate"),
+            (by_road_column("completed in own lane, by road", is_share=True), "by_road.own_lane_completion_rate"),
             (share_column("completed"), "completion_rate"),
             (extra(by_road_column("completed, by road", is_share=True)), "by_road.completion_rate"),
             (share_column("the paper's completed"), "paper.completion_rate"),
-            (share_column("completed in own lane"), "own_lane_completion_rate"),
-            (by_road_column("completed in own lane, by road", is_share=True), "by_road.own_lane_completion_rate"),
             (extra(number_column("collisions / run", 2)), "collisions_per_run"),
             (extra(by_road_column("collisions / run, by road")), "by_road.collisions_per_run"),
             (extra(number_column("the paper's collisions / run", 2)), "paper.collisions_per_run"),
