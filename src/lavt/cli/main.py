@@ -21,7 +21,7 @@ from lavt.errors import WorkError
 
 GROUPS = {
     "Try LAVT on this machine": {
-        "demo": "Run the demo: drive by video under L0 to L5 and report.",
+        "demo": "Run the demo: show what delay does to driving by video.",
         "run": "Drive one route under one network condition.",
         "replay": "Make a video of runs side by side.",
         "doctor": "Check whether this machine is ready to drive.",
