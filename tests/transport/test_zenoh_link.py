@@ -21,7 +21,8 @@ from lavt.errors import UserError
 from lavt.node import Send
 from lavt.runtime.thread_failures import fail_on_thread_errors
 from lavt.transport.messages import MAX_MESSAGE_BYTES
-from lavt.transport.zenoh_link import RECEIVE_RING_LENGTH, Router, SessionSettings, ZenohLink, quiet_logs
+from lavt.transport.zenoh_config import SessionSettings
+from lavt.transport.zenoh_link import RECEIVE_RING_LENGTH, Router, ZenohLink, quiet_logs
 
 ARRIVAL_TIMEOUT_S = 10.0
 CONFIGS = shipped("zenoh-configs")

@@ -27,6 +27,11 @@ from lavt.domain import (
     NetemReply,
     NetemRequest,
     Operation,
+    RunOperation,
+    RunPhase,
+    RunRefusal,
+    RunReply,
+    RunRequest,
     SafetyState,
     SessionReply,
     SessionRequest,
@@ -36,6 +41,9 @@ from lavt.errors import BadMessage
 
 VERSION = 4
 MAX_MESSAGE_BYTES = 1024
+RECORD_PART_BYTES = 32_768
+"""The longest part of a record in a `RunReply`."""
+MAX_RUN_REPLY_BYTES = RECORD_PART_BYTES + MAX_MESSAGE_BYTES
 NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_-]{0,31}\Z")
 """A valid name of a vehicle or client: it contains nothing that has a meaning in a Zenoh key."""
 ELLIPSIS = "\N{HORIZONTAL ELLIPSIS}"
@@ -53,6 +61,7 @@ RoadWheel = Annotated[float, Meta(ge=-MAX_ROAD_WHEEL_RAD, le=MAX_ROAD_WHEEL_RAD)
 Curvature = Annotated[float, Meta(ge=-CURVATURE_BOUND_PER_M, le=CURVATURE_BOUND_PER_M)]
 ZeroToOne = Annotated[float, Meta(ge=0.0, le=1.0)]
 Delay = Annotated[float, Meta(ge=0.0, le=MAX_DELAY_MS)]
+Port = Annotated[int, Meta(ge=0, le=65535)]
 Name = Annotated[str, Meta(pattern=NAME.pattern)]
 NameOrEmpty = Annotated[str, Meta(pattern=rf"^\Z|{NAME.pattern}")]
 
@@ -65,6 +74,8 @@ TEXT_BYTES: dict[type, dict[str, int]] = {
     SessionReply: {"reason": REASON_BYTES, "host": 64},
     NetemRequest: {"condition": 32},
     NetemReply: {"reason": 400},
+    RunRequest: {"settings": 800},
+    RunReply: {"reason": 400, "ending": 32},
 }
 """The maximum length of each text: in bytes for the sender, in characters for the receiver."""
 
@@ -112,7 +123,7 @@ TYPES: dict[type, dict[str, Any]] = {
         "reason": _text(SessionReply, "reason"),
         "epoch": U64,
         "token": bytes,
-        "video_port": Annotated[int, Meta(ge=0, le=65535)],
+        "video_port": Port,
         "host": _text(SessionReply, "host"),
         "emergency_stop": U63,
     },
@@ -132,11 +143,33 @@ TYPES: dict[type, dict[str, Any]] = {
         "state_delay_ms": Delay,
     },
     NetemReply: {"granted": bool, "reason": _text(NetemReply, "reason")},
+    RunRequest: {
+        "operation": RunOperation,
+        "who": Name,
+        "instance": U64,
+        "number": U63,
+        "run": U63,
+        "settings": _text(RunRequest, "settings"),
+        "offset": U63,
+    },
+    RunReply: {
+        "number": U63,
+        "refusal": RunRefusal,
+        "reason": _text(RunReply, "reason"),
+        "phase": RunPhase,
+        "ending": _text(RunReply, "ending"),
+        "video_port": Port,
+        "probe_port": Port,
+        "size": U63,
+        "digest": bytes,
+        "data": Annotated[bytes, Meta(max_length=RECORD_PART_BYTES)],
+    },
 }
 """The fields of each message in the order on the wire, with types and ranges. NaN is in no range."""
 
 CHECKS: dict[type, dict[str, Callable[[Any], bool]]] = {
     SessionReply: {"token": lambda token: len(token) in {0, 16}},
+    RunReply: {"digest": lambda digest: len(digest) in {0, 32}},
     NetemRequest: {"rate_bps": lambda rate_bps: rate_bps == 0 or rate_bps >= 10_000},
 }
 """Checks of fields that a range cannot express."""
@@ -149,10 +182,11 @@ _FIELD_VALUES: dict[type, Callable[[Any], tuple[Any, ...]]] = {
     kind: attrgetter(*fields) for kind, fields in TYPES.items()
 }
 
-Kind = TypeVar("Kind", Command, State, SessionRequest, SessionReply, NetemRequest, NetemReply)
+Message = Command | State | SessionRequest | SessionReply | NetemRequest | NetemReply | RunRequest | RunReply
+Kind = TypeVar("Kind", Command, State, SessionRequest, SessionReply, NetemRequest, NetemReply, RunRequest, RunReply)
 
 
-def encode(message: Command | State | SessionRequest | SessionReply | NetemRequest | NetemReply) -> bytes:
+def encode(message: Message) -> bytes:
     """Return the bytes of `message` on the wire, with texts and reported numbers within their limits."""
     kind = type(message)
     limited: dict[str, str | float] = {
@@ -180,14 +214,18 @@ def _bounded(number: float, bound: float) -> float:
 def decode(kind: type[Kind], data: bytes) -> Kind:
     """Return the message of class `kind` in `data`; raise `BadMessage` for invalid data, and nothing else."""
     untyped: Any = kind
-    message: Kind = _decode(untyped, bytes(data))
+    if kind is RunReply:  # too large for the cache
+        message: Kind = _decode.__wrapped__(untyped, bytes(data))
+    else:
+        message = _decode(untyped, bytes(data))
     return message
 
 
 @lru_cache(maxsize=512)  # in virtual time both records and the receiver decode the same bytes
 def _decode(kind: type[Any], data: bytes) -> Any:
-    if len(data) > MAX_MESSAGE_BYTES:
-        raise BadMessage(f"{len(data)} bytes exceed the maximum of a message ({MAX_MESSAGE_BYTES})")
+    longest = MAX_RUN_REPLY_BYTES if kind is RunReply else MAX_MESSAGE_BYTES
+    if len(data) > longest:
+        raise BadMessage(f"{len(data)} bytes exceed the maximum of a message ({longest})")
     try:
         _, *values = _DECODERS[kind].decode(data)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:

@@ -37,6 +37,8 @@ class Process:
         self.name = name
         self.latest: dict[str, Any] = {}
         """The newest line of the process."""
+        self.first: dict[str, Any] = {}
+        """The first line of the process, which says that it is ready."""
         self._log = log_dir / f"{name}.log"
         self._first: queue.Queue[dict[str, Any] | None] = queue.Queue()
         with self._log.open("wb") as log:
@@ -103,6 +105,7 @@ class Process:
             for text in self.popen.stdout:
                 with suppress(ValueError):
                     self.latest = json.loads(text)
+                    self.first = self.first or self.latest
                     self._first.put(self.latest)
         except BaseException:
             self.popen.kill()
