@@ -43,6 +43,8 @@ VERSION = 4
 MAX_MESSAGE_BYTES = 1024
 RECORD_PART_BYTES = 32_768
 """The longest part of a record in a `RunReply`."""
+DIGEST_BYTES = 32
+"""The length of the SHA-256 of a record."""
 MAX_RUN_REPLY_BYTES = RECORD_PART_BYTES + MAX_MESSAGE_BYTES
 NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_-]{0,31}\Z")
 """A valid name of a vehicle or client: it contains nothing that has a meaning in a Zenoh key."""
@@ -161,7 +163,7 @@ TYPES: dict[type, dict[str, Any]] = {
         "video_port": Port,
         "probe_port": Port,
         "size": U63,
-        "digest": bytes,
+        "digest": Annotated[bytes, Meta(max_length=DIGEST_BYTES)],
         "data": Annotated[bytes, Meta(max_length=RECORD_PART_BYTES)],
     },
 }
@@ -169,7 +171,7 @@ TYPES: dict[type, dict[str, Any]] = {
 
 CHECKS: dict[type, dict[str, Callable[[Any], bool]]] = {
     SessionReply: {"token": lambda token: len(token) in {0, 16}},
-    RunReply: {"digest": lambda digest: len(digest) in {0, 32}},
+    RunReply: {"digest": lambda digest: len(digest) in {0, DIGEST_BYTES}},
     NetemRequest: {"rate_bps": lambda rate_bps: rate_bps == 0 or rate_bps >= 10_000},
 }
 """Checks of fields that a range cannot express."""

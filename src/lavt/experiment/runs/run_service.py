@@ -186,7 +186,7 @@ class RunService:
                 raise _Refused("busy", f"{run.owner.who} has a run on this server")
         settings = _parse_settings(request.settings)
         self._check_space()
-        config = self._run_config(settings)
+        config = self._run_config(settings, owner.who)
         directory = self._new_directory()
         now_ns = self._clock.now().mono_ns
         process = self._start_process(config, directory)
@@ -205,8 +205,8 @@ class RunService:
         directory.mkdir()
         return directory
 
-    def _run_config(self, settings: RemoteRunConfig) -> ServerConfig:
-        """Return the config of the run's server: this server's, with the requested sections."""
+    def _run_config(self, settings: RemoteRunConfig, operator: str) -> ServerConfig:
+        """Return the config of the run's server: this server's, with the requested sections, for one operator."""
         own = self._config
         video = {**own.video.model_dump(), **settings.video.model_dump()}
         return own.model_copy(
@@ -218,7 +218,7 @@ class RunService:
                 "record": settings.record,
                 "seed": settings.seed,
                 "zenoh": self._zenoh,
-                "experiment": ExperimentConfig(),
+                "experiment": ExperimentConfig(operator=operator),
             }
         )
 
