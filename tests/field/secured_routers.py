@@ -25,6 +25,7 @@ from lavt.experiment.runs.processes import Process, Processes
 from lavt.transport.zenoh_link import CONTROL, STATE
 
 BASE = "lavt/vehicle-1"
+QUERY_KEYS = (f"{BASE}/session", f"{BASE}/netem", f"{BASE}/run")
 QUIC = "quic/127.0.0.1:0?mixed_rel=1"
 ROUND_NS = 20 * NS_PER_MS
 ROUNDS = 25
@@ -112,7 +113,7 @@ class VehicleStandIn:
         self.session = session
         self._state = self.session.declare_publisher(f"{BASE}/state", **STATE)
         self.session.declare_subscriber(f"{BASE}/control", direct_handler(self._on_command))
-        for key in (f"{BASE}/session", f"{BASE}/netem"):
+        for key in QUERY_KEYS:
             self.session.declare_queryable(key, direct_handler(self._on_query))
         self._alive = self.session.liveliness().declare_token(f"{BASE}/alive/server-1")
 
@@ -128,7 +129,7 @@ class VehicleStandIn:
     def _on_query(self, query: Any) -> None:
         with query:
             self.queries.append(b"" if query.payload is None else query.payload.to_bytes())
-            for key in (f"{BASE}/session", f"{BASE}/netem"):
+            for key in QUERY_KEYS:
                 if query.key_expr.intersects(zenoh.KeyExpr(key)):
                     query.reply(key, b"reply to " + key.rpartition("/")[2].encode())
 
@@ -233,7 +234,7 @@ class Intruder(ClientStandIn):
         session.liveliness().declare_subscriber(
             f"{BASE}/alive/*", direct_handler(lambda sample: self.alive.append(str(sample.key_expr))), history=True
         )
-        for key in (f"{BASE}/session", f"{BASE}/netem", "lavt/**"):
+        for key in (*QUERY_KEYS, "lavt/**"):
             session.declare_queryable(key, direct_handler(self._forge), complete=True)
 
     def attempt(self) -> None:
@@ -244,7 +245,7 @@ class Intruder(ClientStandIn):
         self.session.delete(f"{BASE}/control")
         self.session.put(f"{BASE}/control", b"long" * (LONG_COMMAND_BYTES // 4))
         self.session.put(f"{BASE}/state", b"forged")
-        for key in (f"{BASE}/session", f"{BASE}/netem", "lavt/**", "@/**"):
+        for key in (*QUERY_KEYS, "lavt/**", "@/**"):
             self.send_query(key)
 
     def achieved(self, site: Site) -> set[str]:
@@ -261,7 +262,8 @@ class Intruder(ClientStandIn):
             "queries": self.name in site.vehicle.queries,
             "session": b"reply to session" in replies,
             "netem": b"reply to netem" in replies,
-            "the routers' own state": bool(replies - {b"reply to session", b"reply to netem"}),
+            "run": b"reply to run" in replies,
+            "the routers' own state": bool(replies - {b"reply to session", b"reply to netem", b"reply to run"}),
             "forged state": any(state != b"state" for state in site.operator.received[f"{BASE}/state"]),
             "forged replies": b"forged" in site.operator.replies,
             "state": b"state" in self.received[f"{BASE}/state"],

@@ -9,7 +9,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from lavt.domain import PATH_POINTS, Command, NetemReply, NetemRequest, RunReply, RunRequest, SessionReply, SessionRequest, State
+from lavt.domain import (
+    PATH_POINTS,
+    Command,
+    NetemReply,
+    NetemRequest,
+    RunReply,
+    RunRequest,
+    SessionReply,
+    SessionRequest,
+    State,
+)
 from lavt.errors import BadMessage
 from lavt.streams import stream
 from lavt.transport.messages import (

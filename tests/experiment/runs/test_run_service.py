@@ -194,7 +194,7 @@ def test_a_run_belongs_to_its_client(rig: Rig, other: dict[str, Any]) -> None:
     rig.ask(replace(END, **other))
     assert rig.ask(STATUS).phase == "finished"
     rig.ask(END)
-    assert rig.ask(replace(BEGIN, **other)).refusal == ""
+    assert rig.ask(replace(BEGIN, run=8, **other)).refusal == ""
 
 
 def test_a_client_has_one_run_at_a_time(rig: Rig) -> None:
@@ -204,6 +204,15 @@ def test_a_client_has_one_run_at_a_time(rig: Rig) -> None:
     assert rig.ask(replace(STATUS, run=8)).refusal == "unknown_run"
     rig.finish(b"record")
     assert rig.ask(replace(BEGIN, run=8)).phase == "starting"
+
+
+def test_a_run_that_is_over_does_not_begin_again(rig: Rig) -> None:
+    """A late copy of the request that began a run starts nothing when the run is over."""
+    rig.ask(BEGIN)
+    rig.finish(b"record")
+    rig.ask(END)
+    assert rig.ask(BEGIN).refusal == "unknown_run"
+    assert len(rig.processes) == 1
 
 
 def test_a_run_that_is_not_finished_has_no_record(rig: Rig) -> None:
@@ -224,7 +233,7 @@ def test_a_silent_client_loses_its_run(rig: Rig) -> None:
     rig.clock.advance(LEASE_MS + 1)
     rig.settle()
     assert not rig.processes[0].running
-    assert rig.ask(replace(BEGIN, who="operator-2")).phase == "starting"
+    assert rig.ask(replace(BEGIN, who="operator-2", run=8)).phase == "starting"
 
 
 def test_a_finished_run_is_forgotten_after_the_lease(rig: Rig) -> None:
@@ -234,7 +243,7 @@ def test_a_finished_run_is_forgotten_after_the_lease(rig: Rig) -> None:
     rig.clock.advance(LEASE_MS + 1)
     rig.service.step()
     assert rig.ask(STATUS).refusal == "unknown_run"
-    assert rig.ask(replace(BEGIN, who="operator-2")).refusal == ""
+    assert rig.ask(replace(BEGIN, who="operator-2", run=8)).refusal == ""
 
 
 def test_a_run_that_is_ended_early_is_forgotten(rig: Rig) -> None:

@@ -65,6 +65,9 @@ class RunRequests:
     def request(self, operation: RunOperation, run: int, *, settings: str = "", offset: int = 0) -> RunReply:
         """Send a request until a reply arrives; raise `RunRefused` or `ConnectionLost`."""
         self._number += 1
+        with suppress(queue.Empty):  # what waits is not the reply to this request
+            while True:
+                self._replies.get_nowait()
         request = RunRequest(operation, self._who, self._instance, self._number, run, settings, offset)
         until_ns = self._clock.now().mono_ns + round(ANSWER_LIMIT_S * NS_PER_S)
         while (now_ns := self._clock.now().mono_ns) < until_ns:

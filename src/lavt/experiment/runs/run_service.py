@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import threading
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,6 +30,7 @@ LEASE_S = 20.0
 """A client sends two requests a second; without a request for this long, its run is ended and forgotten."""
 START_LIMIT_S = 60.0
 """A process of a run that is not ready in this time is ended; on a quiet machine it takes 1 to 5 s."""
+REMEMBERED_RUNS = 1000
 RECORD = Path("server") / "server.mcap"
 """The record of a run, in the directory of the run."""
 BYTES_PER_MB = 1_000_000
@@ -113,6 +114,8 @@ class RunService:
         self._zenoh = zenoh
         """How the process of a run reaches the router."""
         self._run: _ActiveRun | None = None
+        self._begun: deque[int] = deque(maxlen=REMEMBERED_RUNS)
+        """Numbers of the runs that were begun: a late request must not begin one of them again."""
         self._is_closed = False
 
     def answer(self, data: bytes) -> RunReply:
@@ -184,12 +187,15 @@ class RunService:
                 return run  # the request is repeated, because its reply was lost
             if run.has_process or run.owner != owner:
                 raise _Refused("busy", f"{run.owner.who} has a run on this server")
+        if request.run in self._begun:
+            raise _Refused("unknown_run", "this run is over")
         settings = _parse_settings(request.settings)
         self._check_space()
         config = self._run_config(settings, owner.who)
         directory = self._new_directory()
         now_ns = self._clock.now().mono_ns
         process = self._start_process(config, directory)
+        self._begun.append(request.run)
         self._run = _ActiveRun(owner, request.run, directory, process, now_ns, now_ns)
         return self._run
 
