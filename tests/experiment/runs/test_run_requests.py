@@ -87,10 +87,11 @@ def test_a_server_that_does_not_answer_is_lost() -> None:
 
 def test_a_refusal_has_its_code() -> None:
     """A refused request raises an error with the server's code."""
-    network = Network(lambda request: [reply_to(request, refusal="busy", reason="operator-2 has a run")])
+    network = Network(lambda request: [reply_to(request, refusal="busy", reason="operator-2\x1b[2J has a run")])
     with pytest.raises(RunRefused) as refused:
         network.requests.request("begin", 7)
     assert refused.value.refusal == "busy"
+    assert str(refused.value).isprintable()
 
 
 def test_waiting_replies_are_bounded() -> None:

@@ -10,6 +10,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from msgspec.structs import replace
+
 from lavt.assembly.entropy import MachineEntropy
 from lavt.assembly.security import build_authenticator, build_gateway
 from lavt.assembly.zenoh import program_sessions
@@ -93,7 +95,7 @@ class RunRequests:
                     self.ignored += 1
                     continue
                 if reply.number == self._number:
-                    return reply
+                    return replace(reply, reason=_printable(reply.reason), ending=_printable(reply.ending))
                 self.ignored += 1
         return None
 
@@ -119,6 +121,11 @@ class RunConnection(RunRequests):
         self, _kind: type[BaseException] | None, _error: BaseException | None, _trace: TracebackType | None
     ) -> None:
         self._link.close()
+
+
+def _printable(text: str) -> str:
+    """Return a text of the server without control characters, which a terminal would execute."""
+    return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
 def fetch_record(requests: RunRequests, run: int, finished: RunReply, path: Path) -> None:
