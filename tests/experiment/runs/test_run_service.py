@@ -36,6 +36,7 @@ class RunProcessStandIn:
     first: dict[str, Any] = field(default_factory=dict)
     latest: dict[str, Any] = field(default_factory=dict)
     running: bool = True
+    exit_code: int | None = None
 
     def drive(self) -> None:
         """Become ready and begin to drive."""
@@ -47,7 +48,7 @@ class RunProcessStandIn:
         self.latest = {"ending": "completed"}
         (self.directory / RECORD).parent.mkdir()
         (self.directory / RECORD).write_bytes(record)
-        self.running = False
+        self.running, self.exit_code = False, 0
 
     def last_message(self) -> str:
         """Return a message."""
@@ -278,10 +279,12 @@ def test_a_run_has_time_limits(rig: Rig, latest: dict[str, Any], after_ms: int) 
     assert not rig.processes[0].running
 
 
-def test_a_failed_process_fails_the_run(rig: Rig) -> None:
-    """If the process ends before its drive, the run has failed, and the reply has its last message."""
+@pytest.mark.parametrize(("ending", "exit_code"), [(None, 0), (None, 2), ("completed", 1), ("completed", -9)])
+def test_a_failed_process_fails_the_run(rig: Rig, ending: str | None, exit_code: int) -> None:
+    """If the process ends before its drive or with an error, the run has failed, and the reply has its last message."""
     rig.ask(BEGIN)
-    rig.processes[0].running = False
+    rig.processes[0].complete(b"record")
+    rig.processes[0].latest, rig.processes[0].exit_code = {"ending": ending}, exit_code
     rig.service.step()
     failed = rig.ask(STATUS)
     assert (failed.phase, failed.size) == ("failed", 0)

@@ -74,6 +74,11 @@ class Process:
         """Whether the process has not ended yet."""
         return self.popen.poll() is None
 
+    @property
+    def exit_code(self) -> int | None:
+        """The exit code of the process, None while it runs; negative: the number of the signal that ended it."""
+        return self.popen.poll()
+
     def last_message(self) -> str:
         """Return the last line on standard error."""
         lines = self._log.read_text(errors="replace").strip().splitlines()

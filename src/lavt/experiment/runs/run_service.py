@@ -47,6 +47,11 @@ class RunProcess(Protocol):
         """Whether the process has not ended yet."""
         ...
 
+    @property
+    def exit_code(self) -> int | None:
+        """The exit code of the process, None while it runs."""
+        ...
+
     def last_message(self) -> str:
         """Return the last line on standard error."""
         ...
@@ -251,7 +256,8 @@ class RunService:
     def _finish(self, run: _ActiveRun) -> None:
         """Note the record of a run whose process has ended, or why there is none."""
         record = run.directory / RECORD
-        if not run.failure and (run.process.latest.get("ending") is None or not record.is_file()):
+        run.process.end()  # wait until its last line has been read
+        if not run.failure and (run.process.exit_code != 0 or run.process.latest.get("ending") is None):
             run.failure = f"the server of the run failed: {run.process.last_message()}"
         if run.failure:
             run.phase = "failed"
