@@ -26,6 +26,7 @@ from lavt.domain import NS_PER_MS, NS_PER_S, RunReply, RunRequest
 from lavt.errors import LavtError, UserError, WorkError
 from lavt.experiment.analysis.drive_data import DriveData, extract_drive
 from lavt.experiment.analysis.results import write_json
+from lavt.experiment.runs.join import check_same_drive
 from lavt.experiment.runs.plan import PlannedRun
 from lavt.experiment.runs.processes import Process, Processes
 from lavt.experiment.runs.real_run import RELAY, relay_config, requested_ms, write_config
@@ -121,6 +122,10 @@ def _drive(config: ClientConfig, planned: PlannedRun, work: Path) -> None:
         finally:
             with suppress(LavtError):
                 requests.request("end", run)
+    try:
+        check_same_drive(work / "server.mcap", work / "client" / "client.mcap")
+    except UserError as error:
+        raise WorkError(f"the run was driven by another client, or its record is damaged: {error}") from error
 
 
 def _begin(requests: RunRequests, run: int, settings: str) -> None:
