@@ -20,9 +20,9 @@ from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.errors import UserError
 from lavt.node import Send
 from lavt.runtime.thread_failures import fail_on_thread_errors
-from lavt.transport.messages import MAX_MESSAGE_BYTES
+from lavt.transport.security.envelope import MAX_ENVELOPE_BYTES, MAX_RUN_REPLY_ENVELOPE_BYTES
 from lavt.transport.zenoh_config import SessionSettings
-from lavt.transport.zenoh_link import RECEIVE_RING_LENGTH, Router, ZenohLink, quiet_logs
+from lavt.transport.zenoh_link import RECEIVE_RING_LENGTH, REPLY_CHANNELS, Router, ZenohLink, quiet_logs
 
 ARRIVAL_TIMEOUT_S = 10.0
 CONFIGS = shipped("zenoh-configs")
@@ -189,6 +189,20 @@ def test_queries(pair: Pair, channel: str, reply: str) -> None:
     _, peer = pair.server_received.next((channel, b"query"), lambda: pair.client.send(query))
     pair.server.send(Send(reply, b"reply", peer))
     pair.client_received.next((reply, b"reply"))
+
+
+def test_only_a_server_of_runs_answers_requests_for_runs(pair: Pair, routers: tuple[str, str]) -> None:
+    """A link that answers runs gets no other query; an ordinary server's link gets no request for a run."""
+    received = Received()
+    with closing(open_link("server", routers[0])) as runs:
+        runs.start(received, answers_runs_only=True)
+        send = pair.client.send
+        _, peer = received.next(("run", b"begin"), lambda: send(Send("session", b"ask"), Send("run", b"begin")))
+        part = bytes(32_768)
+        pair.client_received.next(("run_reply", part), lambda: runs.send(Send("run_reply", part, peer)))
+        pair.server_received.next(("session", b"ask"), lambda: send(Send("session", b"ask"), Send("run", b"begin")))
+    assert set(received.payloads) == {b"begin"}
+    assert b"begin" not in pair.server_received.payloads
 
 
 def test_reply_without_a_query(pair: Pair) -> None:
@@ -668,8 +682,11 @@ def test_encrypted_configs_restrict_access(name: str) -> None:
     assert all("mixed_rel=1" in endpoint for endpoint in endpoints if endpoint.startswith("quic"))
     tls = json.loads(config.get_json("transport/link/tls"))
     assert (tls["enable_mtls"], tls["verify_name_on_connect"], tls["close_link_on_expiration"]) == (True, True, True)
-    (limit,) = json.loads(config.get_json("low_pass_filter"))
-    assert limit["size_limit"] > MAX_MESSAGE_BYTES
+    limits = {limit["id"]: limit for limit in json.loads(config.get_json("low_pass_filter"))}
+    sizes = {name: limit["size_limit"] for name, limit in limits.items()}
+    assert sizes == {"short": MAX_ENVELOPE_BYTES, "replies": MAX_ENVELOPE_BYTES, "parts": MAX_RUN_REPLY_ENVELOPE_BYTES}
+    limited_keys = {*limits["replies"]["key_exprs"], *limits["parts"]["key_exprs"]}
+    assert limited_keys == {f"lavt/*/{channel}" for channel in REPLY_CHANNELS}
     access = json.loads(config.get_json("access_control"))
     assert access["enabled"] is (name != "router-client-tls.json5")
     assert access["default_permission"] == "deny"

@@ -51,6 +51,8 @@ def sweep(
     from lavt.experiment.sweep.sweep import drive_sweep, open_sweep  # noqa: PLC0415 (slow: scipy)
     from lavt.experiment.sweep.workers import is_finished  # noqa: PLC0415
 
+    if cluster and server:
+        raise UserError("--cluster and --server exclude each other: a server drives one run at a time")
     settings = load_config(SweepConfig, config, [*(["time=real"] if server else []), *(changes or [])])
     planned_runs = plan_sweep(settings)
     remote = None
@@ -59,15 +61,15 @@ def sweep(
         remote_client = load_config(ClientConfig, find_file(client), [f"video.server={server}"])
         remote = RemoteServer(remote_client, console.print_message)
         remote.check(planned_runs)
-        if cluster:
-            raise UserError("--cluster and --server exclude each other: a server drives one run at a time")
     if cluster and any(run.config.time == "real" for run in planned_runs):
         raise UserError("--cluster needs virtual time: set time: virtual, or run without --cluster")
     out = out or Path("out") / "sweep"
     if cluster:
         check_cluster(cluster, jobs)
-    open_sweep(out, resume=resume)
     remaining = sum(not is_finished(out / "runs" / run.name) for run in planned_runs)
+    if remote and remaining:
+        remote.check_connection()
+    open_sweep(out, resume=resume)
     with console.interruptible(), progress(f"sweep, results in {out}", remaining) as report_done:
         page, result = drive_sweep(
             settings, planned_runs, out, jobs=jobs, on_progress=report_done, cluster_address=cluster, server=remote

@@ -74,6 +74,11 @@ class RemoteServer:
                 raise UserError(f"{run.name}: too many values differ from the defaults to request this run")
             parse_config(RemoteRunConfig, run.config.model_dump(include=set(RemoteRunConfig.model_fields)), run.name)
 
+    def check_connection(self) -> None:
+        """Raise `ConnectionLost` if the server does not answer, and `UserError` if its router does not."""
+        with RunConnection(self.client, MachineClock()) as requests, suppress(RunRefused):
+            requests.request("status", 0)
+
     def drive(self, planned: PlannedRun, out: Path) -> DriveData:
         """Drive a run, at most `ATTEMPTS` times; write everything into `out`, and return the result with its data."""
         for attempt in range(1, ATTEMPTS + 1):
