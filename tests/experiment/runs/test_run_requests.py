@@ -73,6 +73,7 @@ def test_a_request_is_repeated_until_it_is_answered() -> None:
     network = Network(answer)
     assert network.requests.request("status", 7).phase == "finished"
     assert [request.number for request in network.sent] == [1, 1, 1]
+    assert 2 <= network.requests.longest_wait_s < 5
     network.requests.request("status", 7)
     assert network.sent[-1].number == 2
 

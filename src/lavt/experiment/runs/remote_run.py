@@ -46,6 +46,8 @@ POLL_NS = 500 * NS_PER_MS
 RETRY_NS = 2 * NS_PER_S
 BUSY_LIMIT_S = LEASE_S + 15.0
 """How long to wait for the end of another run: so long that a run whose client has died is over."""
+OUTAGE_S = 2.0
+"""If the server has not answered for this time, a safe stop counts as an effect of the lost connection."""
 UDP_PROTOCOLS = ("udp/", "quic/")
 FINAL_REFUSALS = ("malformed", "invalid", "storage_full")
 """Refusals that another attempt would not change."""
@@ -117,7 +119,12 @@ def _drive(config: ClientConfig, planned: PlannedRun, work: Path) -> None:
             ready = _wait(requests, run, lambda reply: reply.phase != "starting")
             keep_alive = partial(_status, requests, run)
             relay, client = _start_client(processes, config, planned, work, ready, keep_alive=keep_alive)
+            requests.longest_wait_s = 0.0
             finished = _wait(requests, run, lambda reply: reply.phase == "finished", relay, client)
+            if finished.ending == "safe_stop" and requests.longest_wait_s > OUTAGE_S:
+                raise WorkError(
+                    f"the server did not answer for {requests.longest_wait_s:.1f} s, and the vehicle made a safe stop"
+                )
             for process in reversed(processes.started):
                 process.end()
             if relay is not None:

@@ -52,6 +52,8 @@ class RunRequests:
         self.send: Callable[..., None] = lambda *_: None
         self.ignored = 0
         """Number of replies that were unreadable or to another request."""
+        self.longest_wait_s = 0.0
+        """The longest time that a request has waited for its reply."""
         self._who = who
         self._clock = clock
         self._instance = instance
@@ -71,10 +73,14 @@ class RunRequests:
             while True:
                 self._replies.get_nowait()
         request = RunRequest(operation, self._who, self._instance, self._number, run, settings, offset)
-        until_ns = self._clock.now().mono_ns + round(ANSWER_LIMIT_S * NS_PER_S)
+        sent_ns = self._clock.now().mono_ns
+        until_ns = sent_ns + round(ANSWER_LIMIT_S * NS_PER_S)
         while (now_ns := self._clock.now().mono_ns) < until_ns:
             self.send(Send("run", encode(request)))
             reply = self._reply(min(until_ns, now_ns + round(REPEAT_S * NS_PER_S)))
+            if reply is not None:
+                waited_s = (self._clock.now().mono_ns - sent_ns) / NS_PER_S
+                self.longest_wait_s = max(self.longest_wait_s, waited_s)
             if reply is not None and reply.refusal:
                 raise RunRefused(reply.refusal, reply.reason)
             if reply is not None:
