@@ -1,18 +1,21 @@
-"""Measure the round trip of a command through two Zenoh routers, compared with raw UDP, pyzmq and CycloneDDS.
+"""Measure the round trip of a command: embedded and separate Zenoh routers, raw UDP, pyzmq and CycloneDDS.
 
 The message is an encoded command. One process sends it, a second process echoes it, and the first process measures the
-time until the echo arrives. A carrier is what carries the message: Zenoh, or one of the three compared with it. Zenoh
-is set up as in LAVT: with a router for each side (`lavt router` with the files of `zenoh-configs/`, linked by
-`udp?rel=1;mixed_rel=1`), with the quality of service of commands, and with a listening thread that passes messages to
-the node's thread. The other carriers connect the two processes directly. All processes run on one machine and use its
-loopback, so the benchmark compares processing, not networks. In each round every carrier is measured once.
+time until the echo arrives. A carrier is what carries the message. All carriers have the same structure: in each
+process a listening thread receives, and passes the message to the main thread, as in LAVT. Zenoh is used with LAVT's
+link and gateway, with embedded routers (the default of LAVT) and with a separate router for each side, plain and secure
+(QUIC with certificates, and signatures). The other carriers connect the two processes directly. All processes run on
+one machine and use its loopback, so the benchmark compares processing, not networks. In each round every carrier is
+measured once; every second round is in reverse order.
+
+Further variants of the embedded routers leave one part out or add one, and stamps in both processes divide the
+round trip into stages. `--only` selects carriers; `--no-variants` leaves out the variants.
 
 pyzmq and CycloneDDS are measured if they are installed: pip install pyzmq cyclonedds. LAVT does not need them.
 
-    python benchmarks/control_round_trip.py [--rounds 5] [--seconds 10] [--messages 2000] [--only udp --only zenoh]
+    python benchmarks/control_round_trip.py [--rounds 7] [--seconds 10] [--messages 2000] [--only udp --only embedded]
 
-Prints each run, a table of medians over the rounds, and finally a line of JSON with the medians and their ratios to raw
-UDP.
+Prints each run, tables (medians and ranges over the rounds, ratios to raw UDP), the goals, and finally a line of JSON.
 """
 
 from __future__ import annotations
@@ -21,18 +24,33 @@ import argparse
 import json
 import os
 import platform
+import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import msgspec
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # for the package `benchmarks`
 
+from benchmarks.quiet import Quiet
 from benchmarks.round_trip.carriers import CARRIERS
+from benchmarks.round_trip.results import (
+    PACE_LABELS,
+    PaceResults,
+    carriers_table,
+    cell,
+    goals,
+    run_results,
+    stages_table,
+    summary,
+    variants_table,
+)
+from benchmarks.round_trip.surroundings import make_keys, start_routers
+from benchmarks.round_trip.zenoh_end import Places
 
 import lavt
 from lavt.errors import LavtError, UserError, WorkError
@@ -40,36 +58,13 @@ from lavt.experiment.runs.processes import Processes
 from lavt.runtime import process_priority
 
 REPOSITORY = Path(__file__).parents[1]
-PACE_LABELS = {"at_50_hz": "50 Hz", "back_to_back": "back to back"}
-PERCENTILES = (50, 95, 99)
-SESSION_ENDPOINT = "tcp/127.0.0.1:0"
-ROUTER_LINK = "udp/127.0.0.1:{port}?rel=1;mixed_rel=1"
-MAX_OVERHEAD_S = 30.0
+MAX_OVERHEAD_S = 60.0
 """The time limit for start, discovery and end, in addition to the time of the measurement."""
 MAX_MEAN_ROUND_TRIP_S = 0.01
 """The time limit for each message that is sent back to back, on average."""
-
-PaceResults = dict[str, dict[str, float]]
-"""For each pace, the percentiles of the round trip in microseconds, and the number of lost echoes."""
-
-
-def start_routers(processes: Processes) -> tuple[str, str]:
-    """Start the vehicle's router, then the operator's, which connects to the vehicle's.
-
-    Returns the endpoints for sessions, the vehicle's first.
-    """
-    endpoints = []
-    remote_endpoint = ""
-    for side, listen in (("server", [SESSION_ENDPOINT, ROUTER_LINK.format(port=0)]), ("client", [SESSION_ENDPOINT])):
-        connect = [remote_endpoint] if remote_endpoint else []
-        changes = [f"listen.endpoints={json.dumps(listen)}", f"connect.endpoints={json.dumps(connect)}"]
-        words = [word for change in changes for word in ("--set", change)]
-        router = processes.start(f"{side}-router", "router", f"zenoh-configs/router-{side}.json5", *words)
-        locators = router.wait_ready()["locators"]
-        endpoints.append(next(locator for locator in locators if locator.startswith("tcp/")))
-        remote = next((locator for locator in locators if locator.startswith("udp/")), "")
-        remote_endpoint = ROUTER_LINK.format(port=remote.partition("?")[0].rpartition(":")[2])
-    return endpoints[0], endpoints[1]
+OVERHEAD_S = 4.0
+"""The time of a run in addition to that of its messages, for the estimate."""
+SHORT = {"rounds": 1, "seconds": 1.0, "messages": 50}
 
 
 def start_process(*words: str) -> subprocess.Popen[str]:
@@ -77,6 +72,7 @@ def start_process(*words: str) -> subprocess.Popen[str]:
     paths = os.pathsep.join([str(REPOSITORY), str(Path(lavt.__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
     return subprocess.Popen(
         [sys.executable, "-m", "benchmarks.round_trip.process", *words],
+        stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
         cwd=REPOSITORY,
@@ -84,125 +80,132 @@ def start_process(*words: str) -> subprocess.Popen[str]:
     )
 
 
-def run(carrier: str, routers: tuple[str, str], seconds: float, messages: int) -> PaceResults:
+def run(carrier: str, places: Places, seconds: float, messages: int) -> PaceResults:
     """Measure one carrier once; raise `WorkError` if a process fails."""
-    endpoints = json.dumps(routers)
-    echo = start_process("echo", carrier, endpoints)
+    where = msgspec.json.encode(places).decode()
+    echo = start_process("echo", carrier, where)
     try:
         assert echo.stdout is not None
         line = echo.stdout.readline()
         if not line:
             raise WorkError(f"the echo process of {carrier} ended too early; see above")
-        sender = start_process("ask", carrier, endpoints, json.loads(line)["address"], str(seconds), str(messages))
+        asked = _ask(carrier, where, json.loads(line)["address"], seconds, messages)
         try:
-            output, _ = sender.communicate(timeout=MAX_OVERHEAD_S + 2 * seconds + MAX_MEAN_ROUND_TRIP_S * messages)
+            echoed, _ = echo.communicate(timeout=MAX_OVERHEAD_S)  # closes its standard input, which ends it
         except subprocess.TimeoutExpired:
-            sender.kill()
-            raise WorkError(f"the round trips of {carrier} did not end") from None
-        if sender.returncode:
-            raise WorkError(f"the round trips of {carrier} could not be measured; see above")
-        echo.wait(MAX_OVERHEAD_S)
+            raise WorkError(f"the echo process of {carrier} did not end") from None
+        if echo.returncode:
+            raise WorkError(f"the echo process of {carrier} failed; see above")
     finally:
         echo.kill()
         echo.communicate()
-    return {pace: percentiles(carrier, times_ns) for pace, times_ns in json.loads(output).items()}
+    return run_results(carrier, asked, json.loads(echoed))
 
 
-def percentiles(carrier: str, times_ns: Sequence[int | None]) -> dict[str, float]:
-    """Return percentiles of the round trip in microseconds and the number of lost echoes, which are None in `times_ns`.
-
-    Raise `WorkError` if all echoes were lost.
-    """
-    received_ns = [time_ns for time_ns in times_ns if time_ns is not None]
-    if not received_ns:
-        raise WorkError(f"{carrier} lost every echo")
-    values = np.percentile(received_ns, PERCENTILES) / 1000
-    named = {f"p{rank}_us": round(float(value), 1) for rank, value in zip(PERCENTILES, values, strict=True)}
-    return {**named, "lost": len(times_ns) - len(received_ns)}
-
-
-def summary(rounds: Mapping[str, Sequence[PaceResults]]) -> dict[str, Any]:
-    """Return medians over the rounds by carrier and pace, with ratios to raw UDP if raw UDP was measured."""
-    medians: dict[str, Any] = {}
-    for carrier, carrier_rounds in rounds.items():
-        medians[carrier] = {}
-        for pace in PACE_LABELS:
-            values = {
-                name: float(np.median([results[pace][name] for results in carrier_rounds]))
-                for name in carrier_rounds[0][pace]
-            }
-            udp_values = values if carrier == "udp" else medians.get("udp", {}).get(pace)
-            names = [f"p{rank}" for rank in PERCENTILES] if udp_values else []
-            ratios = {f"{name}_ratio": round(values[f"{name}_us"] / udp_values[f"{name}_us"], 2) for name in names}
-            medians[carrier][pace] = {**values, **ratios}
-    return medians
+def _ask(carrier: str, where: str, address: str, seconds: float, messages: int) -> dict[str, Any]:
+    sender = start_process("ask", carrier, where, address, str(seconds), str(messages))
+    try:
+        output, _ = sender.communicate(timeout=MAX_OVERHEAD_S + 2 * seconds + MAX_MEAN_ROUND_TRIP_S * messages)
+    except subprocess.TimeoutExpired:
+        raise WorkError(f"the round trips of {carrier} did not end") from None
+    finally:
+        sender.kill()
+        sender.communicate()
+    if sender.returncode:
+        raise WorkError(f"the round trips of {carrier} could not be measured; see above")
+    asked: dict[str, Any] = json.loads(output)
+    return asked
 
 
-def table(medians: Mapping[str, Any]) -> str:
-    """Return the medians as a Markdown table."""
-    ranks = " / ".join(f"p{rank}" for rank in PERCENTILES)
-    heads = ["carrier", *(f"{label}: {ranks}" for label in PACE_LABELS.values())]
-    rows = [
-        [CARRIERS[carrier].label, *(_cell(by_pace[pace]) for pace in PACE_LABELS)]
-        for carrier, by_pace in medians.items()
-    ]
-    return "\n".join(f"| {' | '.join(row)} |" for row in (heads, ["---"] * len(heads), *rows))
-
-
-def _cell(values: Mapping[str, float]) -> str:
-    times = " / ".join(f"{values[f'p{rank}_us']:.0f}" for rank in PERCENTILES)
-    ratio = values.get("p50_ratio")
-    lost = f", {values['lost']:.0f} lost" if values["lost"] else ""
-    return f"{times} us{lost}" + ("" if ratio is None else f" ({ratio:.1f} x)")
+def prepare(carriers: Sequence[str], processes: Processes, folder: Path) -> dict[str, Places]:
+    """Make keys and start the separate routers that the carriers need; return the places for each carrier."""
+    keys = make_keys(folder / "keys") if any(CARRIERS[name].needs_keys for name in carriers) else ""
+    places = {}
+    for name in carriers:
+        variant = CARRIERS[name].zenoh
+        if variant is None or variant.is_embedded:
+            places[name] = Places(keys=keys)
+        else:
+            places[name] = start_routers(processes, folder, keys if variant.is_tls else "")
+    return places
 
 
 def measure(carriers: Sequence[str], rounds: int, seconds: float, messages: int) -> dict[str, Any]:
-    """Measure every carrier once in each round, and return the summary; every second round is in reverse order."""
+    """Measure every carrier once in each round, and return the summary; a carrier that fails is left out."""
     rounds_by_carrier: dict[str, list[PaceResults]] = {carrier: [] for carrier in carriers}
     with tempfile.TemporaryDirectory() as folder, Processes(Path(folder)) as processes:
-        routers = start_routers(processes)
+        places = prepare(carriers, processes, Path(folder))
         for number in range(rounds):
-            for carrier in carriers if number % 2 == 0 else reversed(carriers):
-                results = run(carrier, routers, seconds, messages)
+            names = list(rounds_by_carrier)
+            for carrier in names if number % 2 == 0 else reversed(names):
+                try:
+                    results = run(carrier, places[carrier], seconds, messages)
+                except WorkError as error:
+                    print(f"{carrier} is left out from now on: {error}", file=sys.stderr)
+                    del rounds_by_carrier[carrier]
+                    continue
                 rounds_by_carrier[carrier].append(results)
-                cells = "; ".join(f"{label} {_cell(results[pace])}" for pace, label in PACE_LABELS.items())
-                print(f"{number + 1} {carrier}: {cells}", flush=True)
+                cells = (
+                    f"{label} {cell(results[pace], 50)} / {cell(results[pace], 99)} us"
+                    + (f", {results[pace]['lost']:.0f} lost" if results[pace]["lost"] else "")
+                    for pace, label in PACE_LABELS.items()
+                )
+                print(f"{number + 1} {carrier}: {'; '.join(cells)}", flush=True)
     return summary(rounds_by_carrier)
 
 
 def arguments(words: list[str] | None = None) -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--seconds", type=float, default=10.0, help="duration of the part at 50 Hz of each run")
     parser.add_argument("--messages", type=int, default=2000, help="number of messages back to back in each run")
     parser.add_argument("--only", action="append", choices=CARRIERS, help="a carrier; repeatable")
+    parser.add_argument("--no-variants", action="store_true", help="leave out the variants of the embedded routers")
+    parser.add_argument("--short", action="store_true", help="one round of a second each, to try the benchmark")
     options = parser.parse_args(words)
+    if options.short:
+        vars(options).update(SHORT)
     if options.rounds < 1 or options.seconds <= 0 or options.messages < 1:
         parser.error("--rounds, --seconds and --messages must be above zero")
     return options
 
 
-def main() -> int:
-    """Measure the selected carriers that are installed, and return the exit code: 2 if none is installed."""
-    options = arguments()
-    process_priority.raise_priority()  # as the server and the client do; routers and measuring processes inherit it
-    missing = [name for name, carrier in CARRIERS.items() if carrier.missing and name in (options.only or CARRIERS)]
+def select(options: argparse.Namespace) -> list[str]:
+    """Return the carriers to measure, and say which are not installed."""
+    requested = [
+        name
+        for name, carrier in CARRIERS.items()
+        if name in (options.only or CARRIERS) and not (options.no_variants and carrier.is_variant)
+    ]
+    missing = [name for name in requested if CARRIERS[name].is_missing]
     for name in missing:
         print(f"{name} is not measured: it is not installed (pip install {CARRIERS[name].package})", file=sys.stderr)
-    carriers = [name for name in CARRIERS if name in (options.only or CARRIERS) and name not in missing]
+    return [name for name in requested if name not in missing]
+
+
+def main() -> int:
+    """Measure the selected carriers, and return the exit code: 2 if none is installed, 1 if one failed."""
+    options = arguments()
+    process_priority.raise_priority()  # as the server and the client do; routers and measuring processes inherit it
+    carriers = select(options)
     if not carriers:
         return 2
+    run_s = options.seconds + options.messages * 0.0005 + OVERHEAD_S
+    print(f"{len(carriers)} carriers, about {options.rounds * len(carriers) * run_s / 60:.0f} min", flush=True)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that the separate routers are ended, too
+    quiet = Quiet()
     try:
         medians = measure(carriers, options.rounds, options.seconds, options.messages)
     except LavtError as error:
         print(error, file=sys.stderr)
         return 2 if isinstance(error, UserError) else 1
-    load = os.getloadavg()[0]
-    print(f"\n{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}, load {load:.1f}\n")
-    print(table(medians))
+    print(f"\n{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}, {quiet.sentence()}\n")
+    measured = {name: values for name, values in medians.items() if not CARRIERS[name].is_variant}
+    for text in (carriers_table(measured), stages_table(medians), variants_table(medians), "\n".join(goals(medians))):
+        print(f"{text}\n")
     print(json.dumps(medians))
-    return 0
+    return 0 if len(medians) == len(carriers) else 1
 
 
 if __name__ == "__main__":

@@ -33,6 +33,7 @@ def case(lookahead_s: float, rate_hz: float, speed_mps: float, seed: int) -> Run
         f"controller.speed_mps={speed_mps}",
         f"camera.rate_hz={rate_hz}",
         "safety.stopping_distance_limit_m=200",  # the speed must not depend on the delay
+        "safety.speed_limit_mps=22.3",
     ]
     return load_config(RunConfig, shipped("configs/demo.yaml"), changes)
 

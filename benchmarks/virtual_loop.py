@@ -110,10 +110,8 @@ def stages_ms(changes: Iterable[str], limit_s: float) -> dict[str, float]:
     def instrument_stages(loop: VirtualLoop) -> None:
         for host in loop.runtime.hosts.values():
             for runner in host.runners.values():  # the runtime has looked up the pipelines already
-                runner.pipelines = {
-                    channel: (tuple(timed(runner.node, name, function) for name, function in stages), ends_ns)
-                    for channel, (stages, ends_ns) in runner.pipelines.items()
-                }
+                for pipeline in runner.pipelines.values():
+                    pipeline.stages = [timed(runner.node, name, function) for name, function in pipeline.stages]
 
     drive_cost = drive_once(changes, limit_s, instrument_stages)
     parts_ms = {

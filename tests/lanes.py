@@ -51,7 +51,8 @@ CAN_DRIVES = "tests/kernel/test_can.py"
 """These tests run alone, because other work slows the machines, and one machine's only processor is just fast enough
 for the drives of these tests."""
 KERNEL = (sys.executable, "tests/kernel/run", *SHOW_SLOWEST)
-FULL = LaneSpec("full", (pytest("-m", "full"),), 40)
+FULL = LaneSpec("full", (pytest("-m", "full", "--timeout=1800"),), 40)
+"""A test has more time here, because the lane runs at the lowest priority beside another one."""
 LINTERS = (program("ruff", "check"), program("ruff", "format", "--check"), program("mypy"), program("lint-imports"))
 LANES = (
     LaneSpec("linters", LINTERS, 10),

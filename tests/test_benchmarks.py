@@ -5,8 +5,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from benchmarks.fleet_parts.costs import costs_per_vehicle
 from benchmarks.growth_onset import table_row
+from benchmarks.interval_coverage import percentile_bootstrap, studentised_bootstrap
 from benchmarks.virtual_loop import with_rest
 
 from lavt.errors import WorkError
@@ -101,3 +104,61 @@ def test_rendezvous_benchmark_runs() -> None:
     delays_us = json.loads(completed.stdout.splitlines()[-1])["us"]
     assert delays_us["straight"]["p50"] > 0
     assert delays_us["through"]["p50"] > 0
+
+
+def test_the_costs_of_a_vehicle_are_found_from_steps() -> None:
+    """From steps whose costs are straight lines, the costs per state and per session are found again."""
+    steps = [
+        {
+            "topology": "clients",
+            "light": light,
+            "driven": driven,
+            "sent_per_s": light * rate_hz,
+            "processor_share": 0.01 + 2e-5 * (light * rate_hz + 100 * driven) + 3e-4 * (light + 2 * driven),
+            "resident_mb": 70 + 0.5 * (light + 2 * driven),
+            "descriptors": 20,
+            "states_received_share": 1.0,
+        }
+        for light, driven, rate_hz in ((1, 1, 50), (10, 1, 50), (10, 10, 50), (100, 1, 50), (100, 10, 5))
+    ]
+    with_losses = [*steps, {**steps[0], "processor_share": 9.0, "states_received_share": 0.5}]
+    costs = costs_per_vehicle(with_losses, "clients")
+    assert costs["processor_s_per_state"] == pytest.approx(2e-5, rel=0.01)
+    assert costs["processor_s_per_session_s"] == pytest.approx(3e-4, rel=0.01)
+    assert costs["resident_mb_per_session"] == pytest.approx(0.5, rel=0.01)
+    assert costs["descriptors_per_session"] == pytest.approx(0, abs=1e-6)
+    assert costs_per_vehicle(steps, "routers") == {}
+
+
+@pytest.mark.full
+@pytest.mark.timeout(600)
+def test_fleet_benchmark_runs() -> None:
+    """`benchmarks/fleet.py` drives a vehicle among light ones, and prints a row for each step and, last, JSON."""
+    completed = subprocess.run(
+        [sys.executable, BENCHMARKS / "fleet.py", "--short", "--vehicles", "2"],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=550,
+    )
+    assert completed.returncode == 0, completed.stderr
+    result = json.loads(completed.stdout.splitlines()[-1])
+    assert [step["topology"] for step in result["steps"]] == ["routers", "clients"]
+    for step in result["steps"]:
+        assert step["state_ms"][0] > 0
+        assert step["round_trip_ms"][0] > 0
+        assert step["resident_mb"] > 0
+    assert result["rendezvous"]["processor_us_per_packet"] >= 0
+    assert completed.stdout.count("\n| routers | 2 | 1 |") == 1
+
+
+def test_the_bootstraps_of_the_coverage_study() -> None:
+    """Both bootstraps of equal values have no width; otherwise both include the mean, and the studentised is wider."""
+    generator = np.random.default_rng(1)
+    values = np.array([[1.0, 2.0, 4.0, 5.0], [0.0, 1.0, 1.0, 2.0]])
+    for method in (percentile_bootstrap, studentised_bootstrap):
+        assert list(method(np.ones((2, 4)), generator)) == [1.0, 1.0]
+        low, high = method(values, generator)
+        assert low < 2.0 < high
+    narrow, wide = percentile_bootstrap(values, generator), studentised_bootstrap(values, generator)
+    assert wide[1] - wide[0] > narrow[1] - narrow[0]

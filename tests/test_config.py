@@ -91,7 +91,7 @@ def test_the_paper_config() -> None:
     assert len(plan_sweep(paper)) == 180
 
 
-@pytest.mark.parametrize(("name", "count"), [("loss_and_jitter.yaml", 36), ("roads.yaml", 180), ("speed.yaml", 54)])
+@pytest.mark.parametrize(("name", "count"), [("loss_and_jitter.yaml", 36), ("roads.yaml", 180), ("speed.yaml", 72)])
 def test_sweeps_over_further_axes(name: str, count: int) -> None:
     """The sweeps over loss and jitter, and over speed, can be planned; each axis contains the base config's value."""
     sweep = load_config(SweepConfig, shipped("configs") / name)
@@ -375,6 +375,7 @@ def test_configs_are_immutable() -> None:
         SafetyConfig(lateral_acceleration_mps2=3.1),
         SafetyConfig(picture_age_limit_ms=501.0),
         SafetyConfig(stopping_distance_limit_m=21.0),
+        SafetyConfig(speed_limit_mps=80 / 3.6),
     ],
 )
 def test_wide_limits_are_for_simulators(safety: SafetyConfig) -> None:
@@ -386,6 +387,7 @@ def test_wide_limits_are_for_simulators(safety: SafetyConfig) -> None:
     assert wide.lateral_acceleration_mps2 == safety.lateral_acceleration_mps2
     assert wide.picture_age_limit_ns == safety.picture_age_limit_ms * 1e6
     assert wide.stopping_distance_limit_m == safety.stopping_distance_limit_m
+    assert wide.speed_limit_mps == safety.speed_limit_mps
 
 
 @pytest.mark.parametrize("simulated", [True, False])
@@ -415,3 +417,38 @@ def test_every_impairment_can_be_changed_by_a_run() -> None:
     for name, schema in ImpairmentConfig.model_json_schema()["properties"].items():
         bounds = {key: value for key, value in schema.items() if key not in ("title", "default", "description")}
         assert bounds in changes[name]["anyOf"], name
+
+
+COSTS = {"measured_on": "here", "stages_us": {"camera": {"encode": 2000.0}}, "links_us": {"video": 1200.0}}
+QUANTILES = {"levels": [0.0, 0.5, 1.0], "link_quantiles_us": {"video": [900.0, 1200.0, 4000.0]}}
+
+
+def test_costs_with_quantiles() -> None:
+    """Costs can have quantiles of some stages and links; their constant version has only the medians."""
+    costs = parse_config(
+        Costs, {**COSTS, **QUANTILES, "stage_quantiles_us": {"camera": {"encode": [1.0, 2.0, 3.0]}}}, ""
+    )
+    assert costs.constant == parse_config(Costs, COSTS, "")
+    assert costs.constant != costs
+
+
+@pytest.mark.parametrize(
+    ("change", "fact"),
+    [
+        ({"levels": [0.0, 0.5]}, "levels"),
+        ({"levels": [0.0, 1.0, 1.0]}, "levels"),
+        ({"levels": []}, "levels"),
+        ({"link_quantiles_us": {"state": [1.0, 2.0, 3.0]}}, "state has quantiles but no median"),
+        (
+            {"stage_quantiles_us": {"camera": {"decode": [1.0, 2.0, 3.0]}}},
+            r"camera\.decode has quantiles but no median",
+        ),
+        ({"link_quantiles_us": {"video": [1.0, 2.0]}}, "video"),
+        ({"link_quantiles_us": {"video": [1.0, 3.0, 2.0]}}, "video"),
+        ({"link_quantiles_us": {"video": [-1.0, 2.0, 3.0]}}, "video"),
+    ],
+)
+def test_invalid_quantiles_of_costs(change: dict[str, Any], fact: str) -> None:
+    """Quantiles that do not belong to a median, do not match the levels or decrease are rejected in one sentence."""
+    with pytest.raises(UserError, match=fact):
+        parse_config(Costs, {**COSTS, **QUANTILES, **change}, "costs.yaml")

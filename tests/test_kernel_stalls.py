@@ -8,16 +8,18 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from tests.field.by_wire import STOP_STALL_MS
-from tests.kernel.lane import clocks, host_stalls
+from tests.kernel.lane import clocks, host_stalls, verdicts
 from tests.kernel.lane.host_stalls import STALLS_PER_ANSWER, HostProbe
 from tests.kernel.lane.verdicts import MEDIAN_SHARE, shortest_stall_ms
 from tests.support.stalls import HostStalled, ProbeEnded, Stall, Stalls, excuse_slow_machine, stalled_share
 from tests.test_stalls import QUIET, FakeLatenessProbe, stalls_of
 
 from lavt.domain import NS_PER_MS, NS_PER_S
+from lavt.experiment.analysis.invalid_reason import InvalidCode, InvalidReason
 
 COUNTER_HZ = 2e9
 READING = 9_000_000_000, 50 * NS_PER_S
@@ -126,6 +128,27 @@ def test_answers_have_a_limited_length() -> None:
 def test_least_stall_for_each_safe_stop(reason: str, least_ms: float) -> None:
     """A stall of 100 ms explains a stop without commands; for missing reports, their timeout minus 60 ms is enough."""
     assert shortest_stall_ms(reason) == least_ms
+
+
+@pytest.mark.parametrize(
+    ("codes", "stalled_ms", "is_excused"),
+    [
+        ([InvalidCode.INJECTION_NOT_IN_FORCE], 80, True),
+        ([InvalidCode.INJECTION_DIFFERS], 60, False),
+        ([InvalidCode.CLOCK_NOT_SAMPLED], 80, False),
+        ([InvalidCode.CLOCK_NOT_SAMPLED, InvalidCode.INJECTION_DIFFERS], 1600, True),
+        ([InvalidCode.INJECTION_DIFFERS, InvalidCode.CLOCK_STEP], 1600, False),
+    ],
+)
+def test_reasons_that_a_stall_explains(
+    codes: list[InvalidCode], stalled_ms: int, is_excused: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A stalled share explains a wrong delay, and a long stall a missing sample; nothing explains a clock's step."""
+    monkeypatch.setattr(verdicts, "invalid_reasons", lambda _: [InvalidReason(code, code.value) for code in codes])
+    monkeypatch.setattr(verdicts, "driving_interval", lambda _: (0, NS_PER_S, "completed"))
+    stalls = stalls_of(Stall(0, 0, stalled_ms * NS_PER_MS))
+    with pytest.raises(HostStalled if is_excused else AssertionError):
+        verdicts.require_valid(Mock(), stalls)
 
 
 def test_full_processor_use_excuses_nothing() -> None:

@@ -34,6 +34,11 @@ def groups(runs: Iterable[Row], key: Callable[[Row], Any]) -> dict[Any, list[Row
     return {value: found[value] for value in sorted(found)}
 
 
+def by_route(runs: Iterable[Row]) -> Iterable[list[Row]]:
+    """Return the runs of each route."""
+    return groups(runs, lambda run: run["route"]).values()
+
+
 def road(run: Row) -> str:
     """Return the name of the road of a run."""
     return str(run["route"]).removesuffix(".yaml").removesuffix(".yml").removesuffix("_key")
@@ -55,6 +60,12 @@ def exact(successes: int, trials: int) -> list[float] | None:
     return [interval.low, interval.high]
 
 
+def exact_mean_count(count: int, trials: int) -> list[float]:
+    """Return Garwood's interval of the mean of `trials` Poisson numbers whose sum is `count`."""
+    low = stats.gamma.ppf(0.025, count) if count else 0.0
+    return [low / trials, stats.gamma.ppf(0.975, count + 1) / trials]
+
+
 def bootstrap(samples: Sequence[Sequence[float]], statistic: Callable[..., Any], level: float = 0.95) -> list[float]:
     """Return the percentile bootstrap interval with the documented resamples."""
     key = int.from_bytes(hashlib.sha256(b"0/bootstrap interval").digest()[:16], "little")
@@ -70,16 +81,22 @@ def bootstrap(samples: Sequence[Sequence[float]], statistic: Callable[..., Any],
 
 
 def stratified(runs: Sequence[Row], values: Values) -> list[float] | None:
-    """Return the interval of the mean of all values, resampled within each route."""
-    strata = [values(of_route) for of_route in groups(runs, lambda run: run["route"]).values()]
-    resampled = [sample for sample in strata if len(sample) >= 2]
-    unchanged = sum(sample[0] for sample in strata if len(sample) == 1)
-    total = sum(len(sample) for sample in strata)
-
-    def mean_of_all(*samples: Any, axis: int) -> Any:
-        return (sum(sample.sum(axis=axis) for sample in samples) + unchanged) / total
-
-    return bootstrap(resampled, mean_of_all) if resampled else None
+    """Return Student's interval of the mean of all values, from their spread within each route."""
+    strata = [found for found in (values(of_route) for of_route in by_route(runs)) if found]
+    total = sum(len(found) for found in strata)
+    squares = freedom = 0.0
+    for found in strata:
+        if len(found) >= 2:
+            error = len(found) / total * stats.sem(found)
+            squares += error**2
+            freedom += error**4 / (len(found) - 1)
+    centre = mean([value for found in strata for value in found])
+    if centre is None or max(len(found) for found in strata) < 2:
+        return None
+    if squares == 0:
+        return [centre, centre]
+    low, high = stats.t.interval(0.95, squares**2 / freedom, centre, math.sqrt(squares))
+    return [low, high]
 
 
 def over_roads(runs: Sequence[Row], values: Values, *, is_rate: bool) -> Row:
@@ -118,7 +135,7 @@ def of_completed(name: str) -> Values:
 
 def route_balanced(runs: Sequence[Row], name: str) -> list[float]:
     """Return the mean of each route that has a completed run."""
-    of_routes = [of_completed(name)(of_route) for of_route in groups(runs, lambda run: run["route"]).values()]
+    of_routes = [of_completed(name)(of_route) for of_route in by_route(runs)]
     return [float(np.mean(values)) for values in of_routes if values]
 
 
@@ -152,10 +169,10 @@ def summarize(runs: Sequence[Row], common_p95: Values) -> Row:
         "own_lane_completion_rate": in_own_lane,
         "collisions_per_run": lambda found: [run["collisions"] for run in found],
         "p95_m": p95,
+        "p95_all_runs_m": lambda found: [run["p95_m"] for run in found],
         "followed_p95_m": followed,
         "p95_common_m": common_p95,
     }
-    rates = [float(np.mean(completed(of_road))) for of_road in groups(runs, road).values()]
     return {
         "runs": n,
         "completed": int(sum(ended)),
@@ -164,9 +181,9 @@ def summarize(runs: Sequence[Row], common_p95: Values) -> Row:
         "completed_in_own_lane": int(sum(kept)),
         "own_lane_completion_rate": mean(kept),
         "own_lane_completion_interval": exact(int(sum(kept)), len(kept)),
-        "completion_interval_over_roads": bootstrap([rates], np.mean) if len(rates) > 1 else None,
         "endings": dict(Counter(run["ending"] for run in runs)),
         **{f"{name}_per_run": mean([run[name] for run in runs]) for name in COUNTS},
+        "collisions_per_run_interval": exact_mean_count(sum(run["collisions"] for run in runs), n),
         **{f"{name}_per_km": sum(run[name] for run in runs) / kilometres for name in COUNTS},
         "by_road": {
             name: over_roads(runs, values, is_rate=name.endswith("_rate")) for name, values in measures.items()
@@ -181,9 +198,12 @@ def summarize(runs: Sequence[Row], common_p95: Values) -> Row:
         "p95_common_interval": stratified(runs, common_p95),
         "p95_worst_rank_m": worst_rank(runs),
         **{name: mean([run[name] for run in runs if run[name] is not None]) for name in MEANS},
-        "own_lane_share": mean([run["lane_kept"]["own_lane_share"] for run in runs]),
         **{
-            f"{name}_per_run": mean([run["lane_kept"][name] for run in runs])
+            name: mean([run["lane_kept"][name] for run in runs if run["lane_kept"]])
+            for name in ("own_lane_share", "followed_unknown_share")
+        },
+        **{
+            f"{name}_per_run": mean([run["lane_kept"][name] for run in runs if run["lane_kept"]])
             for name in ("followed_changes", "occupied_changes")
         },
         **{name: medians([run[name] for run in runs]) for name in LATENCIES},

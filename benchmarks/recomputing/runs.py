@@ -180,59 +180,111 @@ def numbered(offsets_m: Iterable[float], width_m: float) -> list[int]:
     return numbers
 
 
-def own_lane(server: Record, client: Record, truth: list[Row], interval: tuple[int, int], ending: str) -> Row:
-    """Return the values of the section "Own lane"."""
-    all_truth, points = server["truth"], np.array(server["route"][0]["points"])
-    frames, start = first_by(server["frame"], "stamp_ns"), all_truth[0]["mono_ns"]
-    truth_s = np.array([row["mono_ns"] - start for row in all_truth], np.float64)
-    poses = {name: column(all_truth, name) for name in ("x_m", "y_m", "heading_rad", "progress_m")}
-    seen = []  # capture time, offset
+def followed_in(offsets_m: Sequence[float | None], width_m: float) -> list[int | None]:
+    """Return the number of the lane followed in each picture; None if it is unknown."""
+    followed: list[int | None] = []
+    lane: int | None = None  # the lane followed
+    streak: list[tuple[int, int]] = []  # index and number of the last pictures with the same number
+    missing = 0  # successive pictures without a lane
+    for index, offset in enumerate(offsets_m):
+        followed.append(lane)
+        missing = missing + 1 if offset is None else 0
+        if missing >= 3:
+            lane, streak = None, []
+            followed[-3:] = [None] * 3
+        if offset is None:
+            continue
+        stays = lane is not None and abs(offset - lane * width_m) <= width_m / 2 + 0.25
+        number = lane if lane is not None and stays else round(offset / width_m)
+        streak = [*(entry for entry in streak if entry[1] == number), (index, number)]
+        if len(streak) >= 3 and lane != number:
+            lane = number
+            followed[streak[0][0] :] = [lane] * (index + 1 - streak[0][0])
+    return followed
+
+
+def errors_against_followed(truth: list[Row], at_rows: Sequence[int | None], width_m: float) -> Floats:
+    """Return the samples of the error against the lane followed, without those next to a row where it is unknown."""
+    progress_m = column(truth, "progress_m")
+    known = np.array([number is not None for number in at_rows])
+    numbers = np.array([number or 0 for number in at_rows])
+    errors_m = samples(progress_m, column(truth, "cross_track_m") - numbers * width_m)
+    return np.asarray(errors_m[samples(progress_m, known.astype(float)) == 1], np.float64)
+
+
+def placed_lanes(
+    server: Record, client: Record, interval: tuple[int, int]
+) -> tuple[list[int], list[float | None], list[float]]:
+    """Return capture times and offsets (None without a lane) of the pictures, and the widths of the seen lanes."""
+    points, frames = np.array(server["route"][0]["points"]), first_by(server["frame"], "stamp_ns")
+    start = server["truth"][0]["mono_ns"]
+    truth_s = [row["mono_ns"] - start for row in server["truth"]]
+    poses = [column(server["truth"], name) for name in ("x_m", "y_m", "heading_rad", "progress_m")]
+    times: list[int] = []
+    offsets: list[float | None] = []
     widths_m = []
     for stamp, message in first_by(client["lane"], "stamp_ns").items():
         frame, lane = frames.get(stamp), message["lane"]
-        if frame is None or not interval[0] <= frame["stamped_mono_ns"] <= interval[1] or lane["confidence"] < 0.2:
+        if frame is None or not interval[0] <= frame["stamped_mono_ns"] <= interval[1]:
             continue
-        captured = frame["stamped_mono_ns"] if frame["capture_ns"] is None else frame["capture_ns"]
-        x, y, heading, progress = (np.interp(captured - start, truth_s, values) for values in poses.values())
+        times.append(frame["stamped_mono_ns"] if frame["capture_ns"] is None else frame["capture_ns"])
+        if lane["confidence"] < 0.2:
+            offsets.append(None)
+            continue
+        x, y, heading, progress = (np.interp(times[-1] - start, truth_s, values) for values in poses)
         ahead, (c0, c1, c2) = lane["near_m"], lane["centre"]
         left = c0 + c1 * ahead + c2 * ahead**2
         world_x = x + ahead * math.cos(heading) - left * math.sin(heading)
         world_y = y + ahead * math.sin(heading) + left * math.cos(heading)
-        seen.append((captured, offset_from(points, world_x, world_y, progress + ahead)))
+        offsets.append(offset_from(points, world_x, world_y, progress + ahead))
         widths_m.append(lane["width_m"])
-    width_m = float(np.median(widths_m))
-    followed = numbered((offset for _, offset in seen), width_m)
+    return times, offsets, widths_m
+
+
+def own_lane(server: Record, client: Record, truth: list[Row], interval: tuple[int, int], ending: str) -> Row:
+    """Return the values of the section "Own lane"."""
+    times, offsets, widths_m = placed_lanes(server, client, interval)
+    width_m = float(np.median(widths_m)) if widths_m else math.nan
+    followed = followed_in(offsets, width_m)
+    if all(number is None for number in followed):
+        unknown = dict.fromkeys(f"followed_{name}_m" for name in ("mae", "rms", "p95", "max"))
+        return {"lane_kept": None, "completed_in_own_lane": None if ending == "completed" else False, **unknown}
     occupied = numbered((row["cross_track_m"] for row in truth), width_m)
-    at_rows = [followed[max(sum(captured <= row["mono_ns"] for captured, _ in seen) - 1, 0)] for row in truth]
-    errors_m = column(truth, "cross_track_m") - np.array(at_rows) * width_m
+    at_rows = [followed[max(sum(captured <= row["mono_ns"] for captured in times) - 1, 0)] for row in truth]
     steps = np.diff([row["mono_ns"] for row in truth])
 
     def share(is_true: Sequence[bool]) -> float:
         return float(steps[np.array(is_true[:-1])].sum() / steps.sum())
 
-    changes = [
-        {"lane": name, "mono_ns": int(at), "progress_m": np.interp(at - start, truth_s, poses["progress_m"])}
-        | {"from": before, "to": after}
-        for name, times, numbers in (
-            ("followed", [captured for captured, _ in seen], followed),
-            ("occupied", [row["mono_ns"] for row in truth], occupied),
-        )
-        for at, before, after in zip(times[1:], numbers, numbers[1:], strict=False)
-        if before != after
-    ]
+    start, progress_m = truth[0]["mono_ns"], column(server["truth"], "progress_m")
+    truth_s = [row["mono_ns"] - start for row in server["truth"]]
+    changes = []
+    for name, at_times, numbers in (
+        ("followed", times, followed),
+        ("occupied", [row["mono_ns"] for row in truth], occupied),
+    ):
+        known = [(at, number) for at, number in zip(at_times, numbers, strict=True) if number is not None]
+        changes += [
+            {"lane": name, "mono_ns": at, "progress_m": np.interp(at - start, truth_s, progress_m)}
+            | {"from": before, "to": after}
+            for (_, before), (at, after) in itertools.pairwise(known)
+            if before != after
+        ]
     kept = {
         "lane_width_m": width_m,
         "followed_share": share([number == 0 for number in at_rows]),
+        "followed_unknown_share": share([number is None for number in at_rows]),
         "occupied_share": share([number == 0 for number in occupied]),
         "own_lane_share": share([f == 0 == o for f, o in zip(at_rows, occupied, strict=True)]),
         "followed_changes": sum(change["lane"] == "followed" for change in changes),
         "occupied_changes": sum(change["lane"] == "occupied" for change in changes),
         "changes": sorted(changes, key=lambda change: change["mono_ns"]),
     }
+    own = kept["occupied_share"] == 1 and kept["followed_share"] > 0 and not changes
     return {
         "lane_kept": kept,
-        "completed_in_own_lane": ending == "completed" and kept["own_lane_share"] == 1 and not changes,
-        **error_metrics("followed_", samples(column(truth, "progress_m"), errors_m)),
+        "completed_in_own_lane": ending == "completed" and own,
+        **error_metrics("followed_", errors_against_followed(truth, at_rows, width_m)),
     }
 
 

@@ -37,10 +37,14 @@ def load_config(kind: type[Config], path: Path, changes: Iterable[str] = ()) -> 
 
     Raises `UserError` for values that are missing, unknown, of the wrong type or out of range.
     """
-    data = read_yaml(path)
+    return build_config(kind, read_yaml(path), changes, str(path))
+
+
+def build_config(kind: type[Config], data: dict[str, Any], changes: Iterable[str], source: str) -> Config:
+    """Return the config of class `kind` with the values in `data` and `--set` changes; otherwise like `load_config`."""
     for change in changes:
         _apply_change(data, change)
-    return parse_config(kind, data, str(path))
+    return parse_config(kind, data, source)
 
 
 def read_yaml(path: Path) -> dict[str, Any]:

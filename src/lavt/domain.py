@@ -6,20 +6,24 @@ origin on the ground under the middle of the rear axle. `mono_ns` is a host's mo
 
 from __future__ import annotations
 
-from typing import Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
-import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 
-Picture = NDArray[np.uint8]
-"""An image: (height, width, 3), blue green red, 0 to 255."""
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    Picture = NDArray[np.uint8]
+    """An image: (height, width, 3), blue green red, 0 to 255."""
+
+    FloatArray = NDArray[np.float64]
+else:  # commands without pictures need no numpy, which is large
+    Picture = FloatArray = Any
 
 FramePayload = Any
 """The content of a frame on its way from camera to detector: a `Picture` or, if nothing is rendered, a `SeenLane`. Only
 camera, frame codec and detector use this content."""
-
-FloatArray = NDArray[np.float64]
 
 NS_PER_S = 1_000_000_000
 NS_PER_MS = 1_000_000
@@ -130,6 +134,8 @@ class CameraModel(Struct, frozen=True):
     @property
     def focal_px(self) -> float:
         """Return the focal length in pixels."""
+        import numpy as np  # noqa: PLC0415 (large, and only cameras need it)
+
         return self.width_px / 2 / float(np.tan(self.field_of_view_rad / 2))
 
 
@@ -276,6 +282,22 @@ class NetemReply(Struct, frozen=True):
 
     granted: bool
     reason: str
+
+
+class VehicleInfo(Struct, frozen=True):
+    """The server's answer to a query of anybody who may receive the state: the vehicle for a list of vehicles."""
+
+    lavt_version: str
+    safety: SafetyState
+    reason: str
+    """The reason for the safety state, as a message."""
+    active_operator: str
+    """Name of the client that has control; empty: no client has control."""
+    speed_mps: float
+    state_age_ns: int
+    """Age of the vehicle's state when the query arrived."""
+    instance: int
+    """Random number of the server process."""
 
 
 RunOperation = Literal["begin", "status", "read", "end"]

@@ -8,9 +8,11 @@ in pairs.
 from __future__ import annotations
 
 import hashlib
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
+if TYPE_CHECKING:
+    import numpy as np
 
 
 def stream_key(seed: int, name: str) -> int:
@@ -23,6 +25,8 @@ def stream(seed: int, name: str, index: int = 0) -> np.random.Generator:
 
     Philox is counter-based: the index is the upper half of its counter, so that entries never overlap.
     """
+    import numpy as np  # noqa: PLC0415 (large, and commands without random streams need none)
+
     return np.random.Generator(np.random.Philox(key=stream_key(seed, name), counter=(index & (2**64 - 1)) << 128))
 
 
@@ -33,6 +37,8 @@ class IndexedStream:
     """
 
     def __init__(self, seed: int, name: str) -> None:
+        import numpy as np  # noqa: PLC0415 (as above)
+
         self._bits = np.random.Philox(key=stream_key(seed, name))
         self._initial_state: Any = self._bits.state
         self._counter = self._initial_state["state"]["counter"]
@@ -43,3 +49,34 @@ class IndexedStream:
         self._counter[:] = (0, 0, index & (2**64 - 1), 0)
         self._bits.state = self._initial_state
         return self._generator
+
+
+BLOCK_ENTRIES = 128
+"""`QuantileStream` draws this many entries together, because a single draw takes almost as long as a block."""
+
+
+class QuantileStream:
+    """The stream `name` of `seed` with entries from a distribution that is given by its quantiles.
+
+    `values[i]` is the quantile at `levels[i]`; the levels grow from 0 to 1, and the quantile function is linear between
+    them. Entries are independent of each other.
+    """
+
+    def __init__(self, seed: int, name: str, levels: Sequence[float], values: Sequence[float]) -> None:
+        import numpy as np  # noqa: PLC0415 (as above)
+
+        self._stream = IndexedStream(seed, name)
+        self._levels, self._values = np.array(levels), np.array(values)
+        self._block = -1
+        self._entries: list[int] = []
+
+    def at(self, index: int) -> int:
+        """Return entry `index`, rounded to an integer; it does not depend on the entries that were read before."""
+        block, position = divmod(index, BLOCK_ENTRIES)
+        if block != self._block:
+            import numpy as np  # noqa: PLC0415 (as above)
+
+            levels = self._stream.at(block).random(BLOCK_ENTRIES)
+            self._entries = np.rint(np.interp(levels, self._levels, self._values)).astype(np.int64).tolist()
+            self._block = block
+        return self._entries[position]

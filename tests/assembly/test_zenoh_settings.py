@@ -8,7 +8,7 @@ import pytest
 
 from lavt.assembly.zenoh import program_sessions, side_session
 from lavt.config import ClientConfig, ServerConfig
-from lavt.config_file import parse_config, shipped
+from lavt.config_file import load_config, parse_config, shipped
 from lavt.errors import UserError
 from lavt.transport.zenoh_config import SessionSettings
 from lavt.transport.zenoh_link import configured_endpoints
@@ -140,3 +140,20 @@ def test_keys_of_the_other_kind_of_router(zenoh: dict[str, Any], key: str) -> No
         with pytest.raises(UserError, match=key) as error:
             parse(zenoh)
         assert "\n" not in str(error.value)
+
+
+def test_a_server_answers_scouting_only_if_its_config_says_so() -> None:
+    """Multicast is off in every shipped router config; `zenoh.scouting` switches on the answers, and nothing else."""
+    for path in shipped("zenoh-configs").glob("*.json5"):
+        assert "multicast: { enabled: false }" in path.read_text(), path
+    session = side_session(server({"scouting": True}))
+    assert session.changes == {"scouting/multicast/enabled": True, "scouting/multicast/autoconnect": []}
+    assert side_session(server({})).changes == {}
+    with pytest.raises(UserError, match="for a server"):
+        client({"scouting": True})
+
+
+def test_the_plain_configs_are_the_defaults() -> None:
+    """`lavt server` and `lavt client` without a config have the settings of the shipped plain configs."""
+    assert load_config(ServerConfig, shipped("configs/server.yaml")) == ServerConfig()
+    assert load_config(ClientConfig, shipped("configs/client.yaml")) == ClientConfig()

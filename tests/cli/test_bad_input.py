@@ -10,11 +10,15 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import pytest
 from tests.support.command_line import CommandResult, Run
+from typer.main import get_command
+from typer.testing import CliRunner
 
 import lavt
+from lavt.cli import main
 from lavt.cli.main import build_app
 from lavt.config_file import shipped
 from lavt.experiment.analysis.results import IDENTITY_KEYS
@@ -186,6 +190,7 @@ MISSING_FILES = {
     "rendezvous": ["rendezvous", "nothing.yaml"],
     "router": ["router", "nothing.json5"],
     "report": ["report", "nothing"],
+    "replay": ["replay", "nothing"],
 }
 
 
@@ -316,6 +321,9 @@ BAD_COMMANDS = {
         ["rendezvous", RENDEZVOUS, "--set", "vehicle_key=no.sign.pub"],
         "no.sign.pub",
     ),
+    "replay of five runs": (["replay", *"abcde"], "at most 4"),
+    "replay in an unknown format": (["replay", "a", "--out", "a.avi"], "a.avi"),
+    "replay in a missing directory": (["replay", "a", "--out", "no/a.mp4"], "no is not a directory"),
     "no address": (["relay", RELAY, "--set", "video_listen=here"], "video_listen"),
     "router's unknown key": (["router", ROUTER, "--set", "lisen.endpoints=[]"], "lisen.endpoints"),
     "router without endpoints": (["router", ROUTER, "--set", "listen.endpoints=[]"], ROUTER),
@@ -361,11 +369,13 @@ def test_bad_commands(case: str, run: Run, tmp_path: Path) -> None:
 
 
 COMMANDS = [
+    "vehicles",
     "demo",
     "run",
     "sweep",
     "boundary",
     "report",
+    "replay",
     "server",
     "client",
     "software-car",
@@ -392,11 +402,37 @@ def test_help(command: str, run: Run) -> None:
 
 
 def test_list_of_commands(run: Run) -> None:
-    """The help of `lavt` lists all commands."""
+    """The help of `lavt` lists all commands in the order of the table, as with the modules of all commands."""
     result = run("--help")
     assert result.code == 0
     assert sorted(command.name or "" for command in build_app().registered_commands) == sorted(COMMANDS)
     assert all(command in result.out for command in COMMANDS)
+    lines, complete_lines = (
+        CliRunner().invoke(app, ["--help"]).output.splitlines() for app in (build_app([]), build_app())
+    )
+    assert sorted(lines) == sorted(complete_lines), "the complete help has groups of commands last"
+    assert [line.split()[0] for line in lines[-len(main.COMMANDS) :]] == list(main.COMMANDS)
+
+
+def test_the_sentences_in_the_list_of_commands() -> None:
+    """The sentence of each command in the list is the first one of its own help."""
+    group: Any = get_command(build_app())
+    sentences = {name: command.get_short_help_str(1000) for name, command in group.commands.items()}
+    assert sentences == main.COMMANDS
+
+
+@pytest.mark.parametrize("arguments", [["--version"], ["--help", "run"]])
+def test_options_before_a_command(arguments: list[str], run: Run) -> None:
+    """The options of `lavt` itself take precedence over a command that follows them."""
+    result = run(*arguments)
+    assert (result.code, result.err) == (0, "")
+    assert result.out == f"lavt {lavt.__version__}\n" if "--version" in arguments else "netem" in result.out
+
+
+def test_a_command_after_two_hyphens(run: Run, tmp_path: Path) -> None:
+    """A command that follows `--` is executed."""
+    assert "missing.yaml" in run("--", "run", "missing.yaml").rejection()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_join_of_nothing(run: Run, tmp_path: Path) -> None:

@@ -129,10 +129,10 @@ def listening_tcp_ports(pid: int) -> list[int]:
 
 
 def test_two_commands_are_enough(pair: Pair, tmp_path: Path) -> None:
-    """Two processes are enough for a client to get control of a server and to stop it, plain and secure.
+    """Two processes are enough for a client to get control of a server, to list and to stop it, plain and secure.
 
-    Here the client starts first. Its machine accepts no connections, and `lavt stop` reaches the vehicle directly. A
-    plain side says once that it is plain.
+    Here the client starts first. Its machine accepts no connections, and `lavt vehicles` and `lavt stop` reach the
+    vehicle directly. A plain side says once that it is plain.
     """
     with Processes(tmp_path) as processes:
         client = processes.start("client", *pair.client())
@@ -142,6 +142,15 @@ def test_two_commands_are_enough(pair: Pair, tmp_path: Path) -> None:
         assert f":{pair.port}" in locator
         wait_until("the client has control", lambda: has_control(client))
         assert listening_tcp_ports(client.popen.pid) == []
+        listed = subprocess.run(
+            [sys.executable, "-m", "lavt", *pair.client("vehicles"), "--json"],
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        (vehicle,) = json.loads(listed.stdout)["vehicles"]
+        assert (vehicle["vehicle"], vehicle["active_operator"]) == ("vehicle-1", "operator-1")
+        assert vehicle["is_authentic"] != pair.is_plain
         stopped = subprocess.run(
             [sys.executable, "-m", "lavt", *pair.client("stop")], capture_output=True, text=True, check=False
         )

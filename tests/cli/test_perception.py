@@ -11,7 +11,6 @@ from lavt.assembly.cameras import camera_of_file
 from lavt.assembly.entropy import MachineEntropy
 from lavt.assembly.nodes import build_client
 from lavt.cli.main import build_app
-from lavt.cli.pictures import write_video
 from lavt.clock import MachineClock
 from lavt.config import ClientConfig
 from lavt.config_file import parse_config, shipped
@@ -19,6 +18,7 @@ from lavt.domain import CameraModel
 from lavt.errors import UserError
 from lavt.perception.calibration import calibrated_pinhole_camera
 from lavt.perception.lane_detector import LaneDetector
+from lavt.transport.video.video_file import write_video
 
 CALIBRATION = """
 width_px: 640

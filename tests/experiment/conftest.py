@@ -29,6 +29,8 @@ class SyntheticDrive:
     tau_v_ms: float = 62.0
     spread_ms: float = 2.0
     client_ms: float = 3.0
+    slow_frame_ms: float = 0.0
+    """How much longer the client takes for every tenth frame."""
     tau_c_ms: float = 9.0
     actuator_ms: float = 2.0
     offset_s: float = 0.25
@@ -175,7 +177,8 @@ def write_frame(writer: RecordWriter, drive: SyntheticDrive, number: int) -> Non
 
 def write_admission(writer: RecordWriter, drive: SyntheticDrive, sequence: int, number: int, delay_ns: int) -> None:
     read_ns = number * FRAME_NS + drive.tau_v_of_frame_ns(number)
-    sent_ns = read_ns + round(drive.client_ms * NS_PER_MS) + delay_ns
+    client_ms = drive.client_ms + (drive.slow_frame_ms if number % 10 == 0 else 0.0)
+    sent_ns = read_ns + round(client_ms * NS_PER_MS) + delay_ns
     received_ns = sent_ns + round(drive.tau_c_ms * NS_PER_MS)
     applied_ns = received_ns + round(drive.actuator_ms * NS_PER_MS)
     rejected = sequence % 100 == 98  # an even number: a repeated command, so its rejection changes no loop latency

@@ -25,7 +25,9 @@ from lavt.experiment.runs.processes import Process, Processes
 from lavt.transport.zenoh_link import CONTROL, STATE
 
 BASE = "lavt/vehicle-1"
-QUERY_KEYS = (f"{BASE}/session", f"{BASE}/netem", f"{BASE}/run")
+OPERATOR_KEYS = (f"{BASE}/session", f"{BASE}/netem", f"{BASE}/run")
+"""The keys that only operators may query."""
+QUERY_KEYS = (*OPERATOR_KEYS, f"{BASE}/info")
 QUIC = "quic/127.0.0.1:0?mixed_rel=1"
 ROUND_NS = 20 * NS_PER_MS
 ROUNDS = 25
@@ -128,7 +130,8 @@ class VehicleStandIn:
 
     def _on_query(self, query: Any) -> None:
         with query:
-            self.queries.append(b"" if query.payload is None else query.payload.to_bytes())
+            if any(query.key_expr.intersects(zenoh.KeyExpr(key)) for key in OPERATOR_KEYS):
+                self.queries.append(b"" if query.payload is None else query.payload.to_bytes())
             for key in QUERY_KEYS:
                 if query.key_expr.intersects(zenoh.KeyExpr(key)):
                     query.reply(key, b"reply to " + key.rpartition("/")[2].encode())
@@ -190,7 +193,7 @@ class Site:
         while True:
             self._round(action)
             now_commands, now_states, now_replies = (len(messages) for messages in self._arrived())
-            rounds = min(now_commands - commands, now_states - states, (now_replies - replies) // 2)
+            rounds = min(now_commands - commands, now_states - states, (now_replies - replies) // len(QUERY_KEYS))
             if rounds >= ROUNDS:
                 return
             assert self.clock.now().mono_ns < limit_ns, f"only {rounds} rounds arrived in {LIMIT_S:g} s"
@@ -211,8 +214,8 @@ class Site:
         action()
         self.operator.send_command()
         self.vehicle.publish_state()
-        for channel in ("session", "netem"):
-            self.operator.send_query(f"{BASE}/{channel}")
+        for key in QUERY_KEYS:
+            self.operator.send_query(key)
         pause(ROUND_NS)
 
     def _arrived(self) -> tuple[list[bytes], list[bytes], list[bytes]]:
@@ -245,7 +248,7 @@ class Intruder(ClientStandIn):
         self.session.delete(f"{BASE}/control")
         self.session.put(f"{BASE}/control", b"long" * (LONG_COMMAND_BYTES // 4))
         self.session.put(f"{BASE}/state", b"forged")
-        for key in (*QUERY_KEYS, "lavt/**", "@/**"):
+        for key in (*OPERATOR_KEYS, "lavt/*/info", "lavt/**", "@/**"):
             self.send_query(key)
 
     def achieved(self, site: Site) -> set[str]:
@@ -263,7 +266,10 @@ class Intruder(ClientStandIn):
             "session": b"reply to session" in replies,
             "netem": b"reply to netem" in replies,
             "run": b"reply to run" in replies,
-            "the routers' own state": bool(replies - {b"reply to session", b"reply to netem", b"reply to run"}),
+            "info": b"reply to info" in replies,
+            "the routers' own state": bool(
+                replies - {b"reply to session", b"reply to netem", b"reply to info", b"reply to run"}
+            ),
             "forged state": any(state != b"state" for state in site.operator.received[f"{BASE}/state"]),
             "forged replies": b"forged" in site.operator.replies,
             "state": b"state" in self.received[f"{BASE}/state"],

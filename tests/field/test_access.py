@@ -46,7 +46,7 @@ from lavt.transport.zenoh_link import quiet_logs
 
 pytest.importorskip("cryptography")
 
-OPERATOR_EFFECTS = {"commands", "queries", "session", "netem", "run", "state", "alive"}
+OPERATOR_EFFECTS = {"commands", "queries", "session", "netem", "info", "run", "state", "alive"}
 ALL_EFFECTS = OPERATOR_EFFECTS | {
     "wildcard commands",
     "deletes",
@@ -56,7 +56,7 @@ ALL_EFFECTS = OPERATOR_EFFECTS | {
     "forged replies",
     "others' commands",
 }
-MONITOR_EFFECTS = {"state", "alive"}
+MONITOR_EFFECTS = {"info", "state", "alive"}
 EFFECTS_BY_NAME = [("operator-1", OPERATOR_EFFECTS), ("operator-2", set()), ("monitor-1", MONITOR_EFFECTS)]
 """The effects that a session can achieve, by the name in its certificate. operator-2 has a certificate, but is in no
 access list."""
@@ -184,9 +184,10 @@ def any_site(request: pytest.FixtureRequest) -> Site:
 @pytest.mark.parametrize("mode", ["client", "router"])
 @pytest.mark.parametrize(("name", "effects"), EFFECTS_BY_NAME)
 def test_access_depends_on_the_certificates_name(any_site: Site, name: str, effects: set[str], mode: str) -> None:
-    """The listed operator may send commands and queries, a monitor may only see the state, an unlisted name nothing.
+    """The listed operator may send commands and queries, a monitor may only see the state and query the vehicle's info.
 
-    None of them succeeds with wildcards, deletes, long messages, forged states or forged replies.
+    An unlisted name may nothing. None of them succeeds with wildcards, deletes, long messages, forged states or forged
+    replies.
     """
     with closing(any_site.intruder(name, mode)) as intruder:
         any_site.exchange_messages(intruder.attempt)

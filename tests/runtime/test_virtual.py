@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.node import WAKE, Message, Send, Stage
-from lavt.runtime.virtual import HostClock, VirtualHost, VirtualLink, VirtualRuntime, modelled_clock_source
+from lavt.runtime.virtual import Cost, HostClock, VirtualHost, VirtualLink, VirtualRuntime, modelled_clock_source
+from lavt.streams import QuantileStream
 from lavt.transport.emulation.delay_line import DelayLine, DelayModel, Lognormal
 
 MS = NS_PER_MS
@@ -53,7 +54,7 @@ class NullRecorder:
 
 
 def new_runtime(
-    delay: DelayModel, *, costs_ns: Mapping[tuple[str, str], int] | None = None, period_ns: int = 20 * MS
+    delay: DelayModel, *, costs_ns: Mapping[tuple[str, str], Cost] | None = None, period_ns: int = 20 * MS
 ) -> tuple[VirtualRuntime, PeriodicSender]:
     """Return a runtime in which a driver sends `control` to an actuator."""
     clock = HostClock(0, 0)
@@ -107,6 +108,39 @@ def test_a_busy_node_queues_messages() -> None:
     runtime.run(200 * MS, lambda: False)
     assert [arrived // MS for _, arrived, _ in actuator.received[:4]] == [3, 23, 43, 63]
     assert [started // MS for _, _, started in actuator.received[:4]] == [3, 33, 63, 93]
+
+
+def drawn(name: str, longest_ms: int) -> QuantileStream:
+    return QuantileStream(1, name, [0.0, 0.9, 1.0], [0.0, 2.0 * MS, float(longest_ms * MS)])
+
+
+def test_drawn_costs_keep_the_order() -> None:
+    """If stages and links take random times, messages differ in their times but never overtake each other."""
+    costs_ns = {("driver", "send"): drawn("send", 15), ("actuator", "wait_control"): drawn("wait", 60)}
+    runtime, actuator = new_runtime(DelayModel(5.0, measured_ns=drawn("link", 90)), costs_ns=costs_ns)
+    runtime.run(4 * NS_PER_S, lambda: False)
+    numbers = [int.from_bytes(payload, "big") for payload, _, _ in actuator.received]
+    assert numbers == list(range(1, len(numbers) + 1))
+    for times in zip(*((arrived, began) for _, arrived, began in actuator.received), strict=True):
+        assert list(times) == sorted(times)
+    waits_ms = [(began - arrived) / MS for _, arrived, began in actuator.received]
+    assert len(set(waits_ms)) > 100
+    assert max(waits_ms) > 10
+
+
+def test_drawn_costs_do_not_depend_on_the_network() -> None:
+    """A message has the same drawn costs whatever the delay of the link."""
+
+    def waits_ns(delay_ms: float) -> list[int]:
+        runtime, actuator = new_runtime(
+            DelayModel(delay_ms), costs_ns={("actuator", "wait_control"): drawn("wait", 15)}
+        )
+        runtime.run(2 * NS_PER_S, lambda: False)
+        return [began - arrived for _, arrived, began in actuator.received]
+
+    near, far = waits_ns(0.0), waits_ns(700.0)
+    assert len(set(far)) > 50
+    assert near[: len(far)] == far
 
 
 def test_a_closed_link_loses_messages() -> None:

@@ -19,6 +19,7 @@ from lavt.domain import (
     SessionReply,
     SessionRequest,
     State,
+    VehicleInfo,
 )
 from lavt.errors import BadMessage
 from lavt.streams import stream
@@ -30,10 +31,13 @@ from lavt.transport.messages import (
     TYPES,
     VERSION,
     decode,
+    decode_versions,
     encode,
 )
 
-AnyMessage = Command | State | SessionRequest | SessionReply | NetemRequest | NetemReply | RunRequest | RunReply
+AnyMessage = (
+    Command | State | SessionRequest | SessionReply | NetemRequest | NetemReply | VehicleInfo | RunRequest | RunReply
+)
 
 COMMAND = Command(
     epoch=7,
@@ -79,8 +83,17 @@ NETEM = NetemRequest(
 NETEM_REPLY = NetemReply(granted=False, reason="no")
 RUN = RunRequest("begin", "operator-1", instance=5, number=1, run=2**63 - 1, settings="{}", offset=0)
 RUN_REPLY = RunReply(1, "", "", "finished", "completed", 5600, 5602, size=3, digest=bytes(32), data=b"abc")
+INFO = VehicleInfo(
+    lavt_version="0.1.0",
+    safety="driving",
+    reason="armed by alice",
+    active_operator="alice",
+    speed_mps=3.5,
+    state_age_ns=2_000_000,
+    instance=9,
+)
 MESSAGES: dict[type, AnyMessage] = {
-    type(message): message for message in (COMMAND, STATE, REQUEST, REPLY, NETEM, NETEM_REPLY, RUN, RUN_REPLY)
+    type(message): message for message in (COMMAND, STATE, REQUEST, REPLY, NETEM, NETEM_REPLY, INFO, RUN, RUN_REPLY)
 }
 
 U64 = st.integers(0, 2**64 - 1)
@@ -177,6 +190,7 @@ ANY_TEXT = st.one_of(st.text(st.characters(categories=["L", "Cs", "So"]), max_si
 TEXTS: list[tuple[type[Any], str]] = [(State, "reason"), (State, "rejected"), (State, "limited")]
 TEXTS += [(SessionReply, "reason"), (SessionReply, "host"), (NetemRequest, "condition"), (NetemReply, "reason")]
 TEXTS += [(RunReply, "reason"), (RunReply, "ending")]
+TEXTS += [(VehicleInfo, "lavt_version"), (VehicleInfo, "reason")]
 
 
 @given(st.sampled_from(TEXTS), ANY_TEXT)
@@ -306,6 +320,15 @@ OUT_OF_RANGE: dict[type, dict[str, list[Any]]] = {
         "state_delay_ms": [*NOT_A_NUMBER, -0.1, 10_000.1],
     },
     NetemReply: {"granted": [0, 1, 1.0, "true", None, []], "reason": [*NOT_A_TEXT, "x" * 401]},
+    VehicleInfo: {
+        "lavt_version": [*NOT_A_TEXT, "x" * 33],
+        "safety": [*NOT_A_TEXT, "", "safe"],
+        "reason": [*NOT_A_TEXT, "x" * 301],
+        "active_operator": NOT_A_NAME_OR_EMPTY,
+        "speed_mps": [*NOT_A_NUMBER, 100.1, -100.1],
+        "state_age_ns": NOT_A_U63,
+        "instance": [*NOT_AN_INTEGER, -1],
+    },
     RunRequest: {
         "operation": [*NOT_A_TEXT, "", "delete"],
         "who": NOT_A_NAME,
@@ -397,3 +420,39 @@ def test_bombs(bomb: str) -> None:
     finally:
         tracemalloc.stop()
     assert peak_bytes < 1_000_000
+
+
+def test_versions_of_information_from_another_version() -> None:
+    """The versions in the information about a vehicle can be read, whatever the version of the rest."""
+    assert decode_versions(encode(INFO)) == (VERSION, "0.1.0")
+    assert decode_versions(msgpack.packb([9, "2.0", {"new": [1.5, None]}, b"x"])) == (9, "2.0")
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"\xc1", msgpack.packb(5), msgpack.packb([]), msgpack.packb([9]), msgpack.packb({9: "2.0"})]
+)
+def test_no_versions(data: bytes) -> None:
+    """Data without versions raises BadMessage."""
+    with pytest.raises(BadMessage):
+        decode_versions(data)
+
+
+@pytest.mark.parametrize("values", [["9", "2.0"], [-1, "2.0"], [True, "2.0"], [9, 2], [9, "x" * 33], [2**63, "2.0"]])
+def test_wrong_versions(values: list[Any]) -> None:
+    """Versions of a wrong type or out of range raise BadMessage."""
+    with pytest.raises(BadMessage):
+        decode_versions(msgpack.packb(values))
+
+
+def test_versions_in_random_bytes() -> None:
+    """Random bytes, a nested array and too many bytes raise BadMessage and nothing else, or contain versions."""
+    generator = stream(1, "random bytes with versions")
+    for data in (b"\x91" * 1000, msgpack.packb([9, "2.0", bytes(MAX_MESSAGE_BYTES)])):
+        with pytest.raises(BadMessage):
+            decode_versions(data)
+    for _ in range(10_000):
+        try:
+            version, _ = decode_versions(generator.bytes(int(generator.integers(0, 200))))
+        except BadMessage:
+            continue
+        assert version >= 0

@@ -9,8 +9,7 @@ from lavt.config_file import condition
 from lavt.domain import NetemRequest
 from lavt.errors import BadMessage, UserError
 from lavt.nodes.injection import InjectionClient, InjectionNode
-from lavt.transport.emulation.impairment import ImpairedFlow, Impairment
-from lavt.transport.emulation.link import QUEUE_PACKETS
+from lavt.transport.emulation.impairment import QUEUE_PACKETS, ImpairedFlow, Impairment
 from lavt.transport.messages import decode
 
 NO_CONDITION: Final = Condition(video_ms=0, control_ms=0)

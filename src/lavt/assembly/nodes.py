@@ -89,18 +89,20 @@ def limits_of(config: SafetyConfig, *, simulated: bool) -> Limits:
         lateral_acceleration_mps2=config.lateral_acceleration_mps2,
         picture_age_limit_ns=round(config.picture_age_limit_ms * NS_PER_MS),
         stopping_distance_limit_m=config.stopping_distance_limit_m,
+        speed_limit_mps=config.speed_limit_mps,
     )
     exceeds_defaults = (
         limits.lateral_acceleration_mps2 > LIMITS.lateral_acceleration_mps2
         or limits.picture_age_limit_ns > LIMITS.picture_age_limit_ns
         or limits.stopping_distance_limit_m > LIMITS.stopping_distance_limit_m
+        or limits.speed_limit_mps > LIMITS.speed_limit_mps
     )
     if exceeds_defaults and not simulated:
         raise UserError(
             f"only a simulated vehicle can have safety limits beyond {LIMITS.lateral_acceleration_mps2} m/s2, "
-            f"{LIMITS.picture_age_limit_ns // NS_PER_MS} ms and {LIMITS.stopping_distance_limit_m:.0f} m: lower "
-            "safety.lateral_acceleration_mps2, safety.picture_age_limit_ms and "
-            "safety.stopping_distance_limit_m"
+            f"{LIMITS.picture_age_limit_ns // NS_PER_MS} ms, {LIMITS.stopping_distance_limit_m:.0f} m and "
+            f"{LIMITS.speed_limit_mps * 3.6:.0f} km/h: lower safety.lateral_acceleration_mps2, "
+            "safety.picture_age_limit_ms, safety.stopping_distance_limit_m and safety.speed_limit_mps"
         )
     return limits
 

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import signal
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from lavt.assembly.side import open_client
+from lavt.assembly.zenoh import load_client_config
 from lavt.cli import console
 from lavt.cli.side import run_side
+from lavt.cli.vehicles import TIMEOUT_S, ScoutOption, list_vehicles
 from lavt.clock import MachineClock
-from lavt.config import ClientConfig
-from lavt.config_file import load_config
+from lavt.errors import UserError
 from lavt.runtime import process_priority
 
 
@@ -23,12 +23,20 @@ def register(app: typer.Typer) -> None:
 
 
 def client(
-    config: Annotated[Path, typer.Argument(help="A client config in YAML, such as configs/client.yaml.")],
+    target: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[HOST|CONFIG]",
+            help="The vehicle's machine, or a client config such as configs/client.yaml; default: list the vehicles.",
+            show_default=False,
+        ),
+    ] = None,
     out: console.OutOption = None,
     changes: console.SetOption = None,
     take_over: Annotated[
         bool, typer.Option("--take-over", help="Ask the client in control to hand over the vehicle.")
     ] = False,
+    use_scouting: ScoutOption = False,
     as_json: console.JsonOption = False,
 ) -> None:
     """Run the operator's side: acquire control, arm and drive.
@@ -36,11 +44,24 @@ def client(
     The controller drives the vehicle by the received video. SIGUSR1 triggers an emergency stop. SIGUSR2 releases
     control: to the client that requests a handover, if there is one. Ctrl-C releases control and exits.
 
-    Example: lavt client configs/client.yaml --set video.server=192.0.2.7
+    With a host, the settings are the defaults, without encryption. Without an argument, the command only lists the
+    vehicles that answer, like `lavt vehicles`.
+
+    Example: lavt client 192.0.2.7
     """
+    if target is None and (out is not None or changes or take_over):
+        raise UserError("--out, --set and --take-over are for driving: name the vehicle's host or a config")
+    if target is not None and use_scouting:
+        raise UserError("--scout is for a list of vehicles: leave it out, or name no host and no config")
     console.reserve_stdout()
+    if target is None:
+        if list_vehicles(None, None, use_scouting=use_scouting, timeout_s=TIMEOUT_S, as_json=as_json):
+            console.print_message("lavt: drive a vehicle with `lavt client HOST`, the address of its machine")
+        return
     process_priority.raise_priority()
-    settings = load_config(ClientConfig, config, [*(changes or []), *(["take_over=true"] if take_over else [])])
+    settings = load_client_config(target, [*(changes or []), *(["take_over=true"] if take_over else [])])
+    if ":" in settings.video.server:
+        raise UserError("video.server needs an IPv4 address or a name that has one, because video goes over IPv4")
     with open_client(settings, out, MachineClock(), console.print_message) as side:
         signal.signal(signal.SIGUSR1, lambda *_: side.send("operator", "emergency_stop"))
         signal.signal(signal.SIGUSR2, lambda *_: side.send("operator", "release"))

@@ -11,13 +11,14 @@ import typer
 
 from lavt.assembly.cameras import camera_of_file
 from lavt.cli import console
-from lavt.cli.pictures import check_output, read_pictures, write_picture, write_video
+from lavt.cli.pictures import check_output, read_pictures, write_picture
 from lavt.domain import Picture
 from lavt.errors import UserError
 from lavt.perception.calibration import CalibratedCamera
 from lavt.perception.lane_detector import GRID, LANE_WIDTH_M, LaneDetector
 from lavt.perception.panel import draw_panel
 from lavt.transport.video.stamp import has_stamp
+from lavt.transport.video.video_file import write_video
 
 
 def register(app: typer.Typer) -> None:
@@ -37,7 +38,9 @@ def show(
     camera: Annotated[Path, typer.Option(help="A calibration in YAML, or a config with a camera section.")],
     out: Annotated[
         Path | None,
-        typer.Option(help="Output file: .png or .jpg for a picture, .mp4 or .mkv for a video; default: NAME-steps."),
+        typer.Option(
+            help="Output file: .png or .jpg for a picture, .mp4, .mkv or .webp for a video; default: NAME-steps."
+        ),
     ] = None,
     lane_width_m: Annotated[
         float, typer.Option(min=2.0, max=5.0, help="The assumed lane width if only one marking is visible.")

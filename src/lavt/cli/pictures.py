@@ -1,9 +1,9 @@
-"""Reading and writing of picture and video files."""
+"""Reading of picture and video files, and writing of pictures."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,9 +14,9 @@ from lavt.domain import Picture
 from lavt.errors import UserError, WorkError
 from lavt.recording.record import read_record
 from lavt.transport.video.h264 import Decoder
+from lavt.transport.video.video_file import VIDEO_CODECS
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg")
-VIDEO_SUFFIXES = (".mp4", ".mkv")
 DEFAULT_RATE_HZ = 30.0
 """The picture rate of a video whose file states no plausible rate."""
 
@@ -81,7 +81,7 @@ def _read_record(path: Path) -> Iterator[Picture]:
 
 def check_output(out: Path, *, source: Path, is_video: bool) -> None:
     """Raise `UserError` if `out` has an unknown suffix, is in a missing directory, or is the source."""
-    suffixes = VIDEO_SUFFIXES if is_video else PICTURE_SUFFIXES
+    suffixes = tuple(VIDEO_CODECS) if is_video else PICTURE_SUFFIXES
     if out.suffix.lower() not in suffixes:
         kind = "video" if is_video else "picture"
         raise UserError(f"{out} cannot be written: the name of a {kind} ends with {' or '.join(suffixes)}")
@@ -95,22 +95,3 @@ def write_picture(out: Path, picture: Picture) -> None:
     """Write one picture."""
     if not cv2.imwrite(str(out), picture):
         raise WorkError(f"{out} could not be written")
-
-
-def write_video(out: Path, pictures: Iterable[Picture], rate_hz: float) -> int:
-    """Write a video and return its number of pictures."""
-    writer: cv2.VideoWriter | None = None
-    count = 0
-    try:
-        for picture in pictures:
-            if writer is None:
-                size = (picture.shape[1], picture.shape[0])
-                writer = cv2.VideoWriter(str(out), cv2.VideoWriter.fourcc(*"mp4v"), rate_hz, size)
-                if not writer.isOpened():
-                    raise WorkError(f"{out} could not be written as MPEG-4 video")
-            writer.write(picture)
-            count += 1
-    finally:
-        if writer is not None:
-            writer.release()
-    return count

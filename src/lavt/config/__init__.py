@@ -10,6 +10,7 @@ from lavt.config.camera import CalibrationConfig as CalibrationConfig
 from lavt.config.camera import CameraConfig as CameraConfig
 from lavt.config.camera import ClientCameraConfig as ClientCameraConfig
 from lavt.config.camera import ServerCameraConfig as ServerCameraConfig
+from lavt.config.costs import Costs as Costs
 from lavt.config.dbw import DbwConfig as DbwConfig
 from lavt.config.experiment import ExperimentConfig as ExperimentConfig
 from lavt.config.injection import ClientInjectionConfig as ClientInjectionConfig
@@ -104,6 +105,10 @@ class NetworkConfig(Section):
         return ", ".join(changes) or None
 
 
+MAX_SIMULATED_MPS = 22.3
+"""The largest speed that can be configured, a little above 80 km/h."""
+
+
 class SafetyConfig(Section):
     """The safety limits that a study may widen, for a simulated vehicle only."""
 
@@ -111,6 +116,8 @@ class SafetyConfig(Section):
     picture_age_limit_ms: float = Field(500.0, gt=0, le=2000)
     stopping_distance_limit_m: float = Field(20.0, gt=0, le=200)
     """The distance in which the car must be able to stop; above 20 m, the car can drive faster than it was tested."""
+    speed_limit_mps: float = Field(40 / 3.6, gt=0, le=MAX_SIMULATED_MPS)
+    """Above this speed the vehicle allows no throttle."""
 
 
 class RecordConfig(Section):
@@ -135,8 +142,9 @@ class ControllerConfig(Section):
     steering_limit_rad: float | None = Field(None, gt=0, le=0.5)
     """The limit of the angle of the road wheels."""
     lateral_limit_mps2: float | None = Field(None, gt=0, le=20)
-    speed_mps: float | None = Field(None, ge=1, le=11)
-    """The target speed; the vehicle allows no throttle above 40 km/h in any case."""
+    speed_mps: float | None = Field(None, ge=1, le=MAX_SIMULATED_MPS)
+    """The target speed. The vehicle allows no throttle above `safety.speed_limit_mps`, which is at most 40 km/h for a
+    vehicle that is not simulated."""
     wheelbase_m: float = Field(2.8448, gt=0.5, lt=10)
     """The wheelbase of the driven vehicle; by default the built-in car's."""
     rearm: bool = False
@@ -202,6 +210,9 @@ class RunConfig(Section):
     fidelity: Literal["video", "pixels", "geometry"] = "video"
     """For virtual time. video: H.264-coded pictures. pixels: rendered pictures. geometry: no pictures, only the lane
     that they would show."""
+    costs: Literal["measured", "constant"] = "measured"
+    """For virtual time: the times of stages and links. measured: drawn from the distributions in `configs/costs.yaml`.
+    constant: always the medians in that file."""
     seed: int = Field(1, ge=0, lt=2**63)
     repetition: int = Field(0, ge=0)
     """The number of this run among the runs with the same seed. Each repetition has its own start and noise, which are
@@ -352,6 +363,12 @@ class ClientConfig(Section):
     clock: ClientClockConfig = ClientClockConfig()
     record: RecordConfig = RecordConfig()
 
+    @model_validator(mode="after")
+    def _check_scouting(self) -> ClientConfig:
+        if self.zenoh.scouting:
+            raise ValueError("zenoh.scouting is for a server, because only servers are searched: leave it out")
+        return self
+
 
 class DelayConfig(Section):
     """One direction of a relayed flow: a constant delay, a lognormal jitter, and the impairments of a condition."""
@@ -374,13 +391,3 @@ class RelayConfig(Section):
     control: DelayConfig = DelayConfig()
     state: DelayConfig = DelayConfig()
     seed: int = Field(1, ge=0, lt=2**63)
-
-
-class Costs(Section):
-    """The processing times that the virtual runtime models: see `configs/costs.yaml`."""
-
-    measured_on: str
-    stages_us: dict[str, dict[str, float]]
-    """The time of each stage, by node and stage."""
-    links_us: dict[str, float]
-    """The time that each link needs for a message."""

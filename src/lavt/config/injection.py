@@ -7,7 +7,7 @@ from typing import Any, Final, Literal
 from pydantic import Field
 
 from lavt.config.section import Section
-from lavt.transport.emulation.link import QUEUE_PACKETS
+from lavt.transport.emulation.impairment import QUEUE_PACKETS
 
 MAX_UNDELAYED_SHARE: Final = {"video": 0.0, "control": 0.5}
 """For each flow, the largest share of undelayed packets with which at least half of the flow is still delayed. For

@@ -26,6 +26,9 @@ class ZenohConfig(Section):
     router_settings: dict[str, Any] = Field(default_factory=dict)
     """For the embedded router, values that replace those of its config, with the same nested keys, such as
     `listen: {endpoints: [...]}`."""
+    scouting: bool = False
+    """For the embedded router of a server, whether it answers the multicast of `lavt vehicles --scout`. Then everybody
+    on the local network learns its address, and Zenoh programs with default settings connect to it by themselves."""
 
     @property
     def is_embedded(self) -> bool:
@@ -38,9 +41,9 @@ class ZenohConfig(Section):
             raise ValueError(
                 "zenoh.session is for a separate router: leave it out, or set zenoh.router to the endpoint of a router"
             )
-        if not self.is_embedded and (self.router_file or self.router_settings):
+        if not self.is_embedded and (self.router_file or self.router_settings or self.scouting):
             raise ValueError(
-                f"zenoh.router_file and zenoh.router_settings are for an embedded router: leave them out, or set "
-                f"zenoh.router: {EMBEDDED}"
+                f"zenoh.router_file, zenoh.router_settings and zenoh.scouting are for an embedded router: leave them "
+                f"out, or set zenoh.router: {EMBEDDED}"
             )
         return self

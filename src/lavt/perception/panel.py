@@ -45,7 +45,7 @@ def draw_panel(camera: CalibratedCamera, detector: LaneDetector, picture: Pictur
         "8 marks in the bird's-eye view": _grey_to_colour(trace.mask),
         "9 points: left, right, other": _draw_points(trace, bird_eye.grid),
         "10 fitted lane": _draw_fit(trace, lane, bird_eye),
-        "11 lane in the picture": _draw_lane(camera, picture, lane),
+        "11 lane in the picture": draw_lane(camera, picture, lane),
     }
     drawn = [_make_tile(label, tile) for label, tile in tiles.items()]
     drawn.append(_make_tile("12 confidence", _confidence_text(trace, lane)))
@@ -156,7 +156,7 @@ def _draw_fit(trace: DetectionTrace, lane: Lane, bird_eye: BirdEye) -> Picture:
     return drawn
 
 
-def _draw_lane(camera: CalibratedCamera, picture: Picture, lane: Lane) -> Picture:
+def draw_lane(camera: CalibratedCamera, picture: Picture, lane: Lane) -> Picture:
     """Return the picture with the lane drawn through the lens, unless its confidence is too low."""
     drawn = picture.copy()
     if lane.confidence < TRACK_CONFIDENCE:

@@ -1,7 +1,7 @@
 """The virtual-time runtime: one event heap, simulated links, and hosts with their own clocks.
 
-Pixels, codec and packets are as in real time; only waiting is skipped. The same seed and configuration give a
-byte-for-byte reproducible result.
+Pixels, codec and packets are as in real time; only waiting is skipped. A stage takes a constant time, or a time that is
+drawn from a measured distribution. The same seed and configuration give a byte-for-byte reproducible result.
 """
 
 from __future__ import annotations
@@ -14,14 +14,23 @@ from typing import Any
 
 from lavt.channels import CHANNELS
 from lavt.domain import NS_PER_S, Now
-from lavt.node import WAKE, Message, Node, Peer, Send
+from lavt.node import WAKE, Message, Node, Peer, Send, Stage
 from lavt.runtime.inbox import Inbox
 from lavt.runtime.pipeline import run_stages
 from lavt.runtime.recorder import UNRECORDED, WIRE_DECODERS, Recorder, record
+from lavt.streams import QuantileStream
 from lavt.transport.clock_sync.clock_report import ClockReport
 from lavt.transport.emulation.delay_line import DelayLine
 
 ONE_IN_PPB = 1_000_000_000
+
+FRAMES_PER_S = 120
+"""Draws for frames are numbered by time in steps of 1/120 s: frames at up to this rate have different draws."""
+RTP_TICKS_PER_DRAW = 90_000 // FRAMES_PER_S
+"""The same step in the units of RTP timestamps."""
+
+Cost = int | QuantileStream
+"""The processing time of a stage in ns: constant, or drawn from a distribution."""
 
 
 @dataclass
@@ -79,7 +88,7 @@ class VirtualHost:
     clock: HostClock
     nodes: Sequence[Node]
     recorder: Recorder
-    costs_ns: Mapping[tuple[str, str], int]
+    costs_ns: Mapping[tuple[str, str], Cost]
     """Processing time by (node, stage). The time from a message on CHANNEL to the first stage has the key
     (node, "wait_CHANNEL"). Times that are not listed are 0."""
     clock_source: Callable[[int], ClockReport]
@@ -116,14 +125,15 @@ class _NodeRunner:
         self.node = node
         self.inbox = Inbox()
         self.pipelines = {
-            channel: (
+            channel: _Pipeline(
                 stages,
-                _end_times_ns(host.costs_ns, node.name, (f"wait_{channel}", *(name for name, _ in stages))),
+                [
+                    host.costs_ns.get((node.name, name), 0)
+                    for name in (f"wait_{channel}", *(name for name, _ in stages))
+                ],
             )
             for channel, stages in node.pipelines.items()
         }
-        """By channel: the stages of the pipeline; and when the first stage begins and each stage ends, counted from the
-        beginning of the pipeline run."""
         self.free_ns = 0
         """When the last pipeline run ends."""
         self.next_step_ns: int | None = None
@@ -141,9 +151,42 @@ class _NodeRunner:
         self.wake_ns = None if wake_mono_ns is None else self.host.clock.true_ns(wake_mono_ns)
 
 
-def _end_times_ns(costs_ns: Mapping[tuple[str, str], int], node: str, names: Sequence[str]) -> tuple[int, ...]:
-    """Return the end times of a pipeline's wait and stages, in order of `names`, relative to the start of the wait."""
-    return tuple(accumulate(costs_ns.get((node, name), 0) for name in names))
+class _Pipeline:
+    """The stages of a pipeline, and the costs of its wait and of each stage."""
+
+    def __init__(self, stages: Sequence[Stage], costs_ns: Sequence[Cost]) -> None:
+        self.stages = stages
+        self.runs = 0
+        self._costs_ns = costs_ns
+        constant_ns = [cost for cost in costs_ns if isinstance(cost, int)]
+        self._ends_ns = tuple(accumulate(constant_ns)) if len(constant_ns) == len(costs_ns) else None
+
+    def end_times_ns(self, message: Message, wake_ns: int | None) -> tuple[int, ...]:
+        """Return when the first stage begins and each stage ends, counted from the beginning of the pipeline run.
+
+        `wake_ns` is when the node asked to be woken, on its host's monotonic clock.
+        """
+        self.runs += 1
+        if self._ends_ns is not None:
+            return self._ends_ns
+        number = _draw_number(message, wake_ns, self.runs)
+        return tuple(accumulate(cost if isinstance(cost, int) else cost.at(number) for cost in self._costs_ns))
+
+
+def _draw_number(message: Message, wake_ns: int | None, run_number: int) -> int:
+    """Return the number of the draws for a pipeline run: the same for the same frame under every network condition.
+
+    The number comes from the frame's stamp or RTP timestamp, or from the time for which a wake was requested. A message
+    without either, such as a command, has the number of the pipeline run.
+    """
+    payload = message.payload
+    if message.channel == WAKE and wake_ns is not None:
+        return wake_ns * FRAMES_PER_S // NS_PER_S
+    if isinstance(stamp_ns := getattr(payload, "stamp_ns", None), int):
+        return stamp_ns * FRAMES_PER_S // NS_PER_S
+    if isinstance(timestamp := getattr(payload, "rtp_timestamp", None), int):
+        return timestamp // RTP_TICKS_PER_DRAW
+    return run_number
 
 
 class VirtualRuntime:
@@ -229,12 +272,13 @@ class VirtualRuntime:
 
     def _run_pipeline(self, runner: _NodeRunner, message: Message, now: Now) -> None:
         host, true_ns = runner.host, self.true_ns
-        stages, ends_ns = runner.pipelines[message.channel]
+        pipeline = runner.pipelines[message.channel]
+        ends_ns = pipeline.end_times_ns(message, runner.wake_mono_ns)
         # `times` yields the start of the first stage, then the end of each stage.
         times: Iterator[Now] = repeat(now)  # if no stage takes time, they are all the same
         if ends_ns[-1]:
             times = map(host.clock.now_at, [true_ns + end_ns for end_ns in ends_ns])
-        outcome = run_stages(runner.node.name, stages, message, next(times), times)
+        outcome = run_stages(runner.node.name, pipeline.stages, message, next(times), times)
         duration_ns = ends_ns[outcome.stages_run]
         runner.free_ns = free_ns = true_ns + duration_ns
         if outcome.timeline is not None:

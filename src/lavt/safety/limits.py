@@ -53,7 +53,8 @@ class Limits:
     steering_rate_radps: float = 0.8
     """Rate of the road wheels' angle. The cars we know reach 0.53 rad/s, so only faulty commands exceed this limit."""
     speed_limit_mps: float = 40 / 3.6
-    """Above this speed there is no throttle. The controllers drive 30 km/h."""
+    """Above this speed there is no throttle. The controllers drive 30 km/h. For a simulated vehicle the config can set
+    up to 80 km/h."""
     arming_hold_ns: int = NS_PER_S
     """All arming conditions must be met for this long."""
     handover_request_timeout_ns: int = 3 * NS_PER_S

@@ -36,6 +36,7 @@ from lavt.domain import (
     SessionReply,
     SessionRequest,
     State,
+    VehicleInfo,
 )
 from lavt.errors import BadMessage
 
@@ -59,6 +60,7 @@ U64 = Annotated[int, Meta(ge=0)]
 """An epoch, or the instance of a process. The type has no upper bound, because msgpack has no larger integers."""
 U63 = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 """Times, and numbers that grow, such as that of an emergency stop: the non-negative signed 64-bit integers."""
+Speed = Annotated[float, Meta(ge=-MAX_REPORTED_MPS, le=MAX_REPORTED_MPS)]
 RoadWheel = Annotated[float, Meta(ge=-MAX_ROAD_WHEEL_RAD, le=MAX_ROAD_WHEEL_RAD)]
 Curvature = Annotated[float, Meta(ge=-CURVATURE_BOUND_PER_M, le=CURVATURE_BOUND_PER_M)]
 ZeroToOne = Annotated[float, Meta(ge=0.0, le=1.0)]
@@ -76,6 +78,7 @@ TEXT_BYTES: dict[type, dict[str, int]] = {
     SessionReply: {"reason": REASON_BYTES, "host": 64},
     NetemRequest: {"condition": 32},
     NetemReply: {"reason": 400},
+    VehicleInfo: {"lavt_version": 32, "reason": REASON_BYTES},
     RunRequest: {"settings": 800},
     RunReply: {"reason": 400, "ending": 32},
 }
@@ -106,7 +109,7 @@ TYPES: dict[type, dict[str, Any]] = {
     State: {
         "sent_wall_ns": U63,
         "state_mono_ns": U63,
-        "speed_mps": Annotated[float, Meta(ge=-MAX_REPORTED_MPS, le=MAX_REPORTED_MPS)],
+        "speed_mps": Speed,
         "steering_rad": RoadWheel,
         "gear": Literal["park", "reverse", "neutral", "drive"],
         "safety": SafetyState,
@@ -145,6 +148,15 @@ TYPES: dict[type, dict[str, Any]] = {
         "state_delay_ms": Delay,
     },
     NetemReply: {"granted": bool, "reason": _text(NetemReply, "reason")},
+    VehicleInfo: {
+        "lavt_version": _text(VehicleInfo, "lavt_version"),
+        "safety": SafetyState,
+        "reason": _text(VehicleInfo, "reason"),
+        "active_operator": NameOrEmpty,
+        "speed_mps": Speed,
+        "state_age_ns": U63,
+        "instance": U64,
+    },
     RunRequest: {
         "operation": RunOperation,
         "who": Name,
@@ -177,6 +189,8 @@ CHECKS: dict[type, dict[str, Callable[[Any], bool]]] = {
 """Checks of fields that a range cannot express."""
 
 _ENCODER = msgspec.msgpack.Encoder()
+_VERSIONS = GenericAlias(tuple, (U63, TYPES[VehicleInfo]["lavt_version"]))
+_ANY_DECODER = msgspec.msgpack.Decoder(list[Any])
 _DECODERS: dict[type, msgspec.msgpack.Decoder[tuple[Any, ...]]] = {
     kind: msgspec.msgpack.Decoder(GenericAlias(tuple, (Version, *fields.values()))) for kind, fields in TYPES.items()
 }
@@ -184,8 +198,21 @@ _FIELD_VALUES: dict[type, Callable[[Any], tuple[Any, ...]]] = {
     kind: attrgetter(*fields) for kind, fields in TYPES.items()
 }
 
-Message = Command | State | SessionRequest | SessionReply | NetemRequest | NetemReply | RunRequest | RunReply
-Kind = TypeVar("Kind", Command, State, SessionRequest, SessionReply, NetemRequest, NetemReply, RunRequest, RunReply)
+Message = (
+    Command | State | SessionRequest | SessionReply | NetemRequest | NetemReply | VehicleInfo | RunRequest | RunReply
+)
+Kind = TypeVar(
+    "Kind",
+    Command,
+    State,
+    SessionRequest,
+    SessionReply,
+    NetemRequest,
+    NetemReply,
+    VehicleInfo,
+    RunRequest,
+    RunReply,
+)
 
 
 def encode(message: Message) -> bytes:
@@ -221,6 +248,18 @@ def decode(kind: type[Kind], data: bytes) -> Kind:
     else:
         message = _decode(untyped, bytes(data))
     return message
+
+
+def decode_versions(data: bytes) -> tuple[int, str]:
+    """Return the version of the messages and that of LAVT in a `VehicleInfo` of any version; raise `BadMessage`."""
+    if len(data) > MAX_MESSAGE_BYTES:
+        raise BadMessage(f"{len(data)} bytes exceed the maximum of a message ({MAX_MESSAGE_BYTES})")
+    try:
+        version, lavt_version, *_ = _ANY_DECODER.decode(data)
+        versions: tuple[int, str] = msgspec.convert((version, lavt_version), _VERSIONS)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, ValueError) as error:
+        raise BadMessage(f"VehicleInfo: {error}") from error
+    return versions
 
 
 @lru_cache(maxsize=512)  # in virtual time both records and the receiver decode the same bytes

@@ -64,14 +64,14 @@ def check_endpoints(config: Any, key: str) -> Any:
     return endpoints
 
 
-def with_host(endpoint: str, host: str) -> str:
-    """Return an endpoint PROTOCOL/HOST:PORT with another host; an endpoint that is a path stays as it is."""
+def with_host(endpoint: str, host: str, port: int | None = None) -> str:
+    """Return an endpoint PROTOCOL/HOST:PORT with another host (and port); an endpoint that is a path is unchanged."""
     protocol, _, address = endpoint.partition("/")
     if protocol in PATH_PROTOCOLS:
         return endpoint
     parameters = address[len(re.split(r"[?#]", address)[0]) :]
-    port = address.removesuffix(parameters).rpartition(":")[2]
-    return f"{protocol}/{f'[{host}]' if ':' in host else host}:{port}{parameters}"
+    own_port = address.removesuffix(parameters).rpartition(":")[2]
+    return f"{protocol}/{f'[{host}]' if ':' in host else host}:{port or own_port}{parameters}"
 
 
 def with_address(endpoint: str, address: str) -> str:

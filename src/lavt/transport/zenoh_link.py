@@ -40,9 +40,9 @@ Deliver = Callable[[str, Any, Now, Any], None]
 
 REPLY_TIMEOUT_S = 2.0
 RETRY_S = 1.0
-REPLY_CHANNELS = {"session": "session_reply", "netem": "netem_reply", "run": "run_reply"}
+REPLY_CHANNELS = {"session": "session_reply", "netem": "netem_reply", "info": "info_reply", "run": "run_reply"}
 """The channel of the replies for each channel of queries. The channel of a query is the last part of its key."""
-DRIVE_QUERIES = ("session", "netem")
+DRIVE_QUERIES = ("session", "netem", "info")
 """The queries that every server answers. Only a server that allows remote runs also answers `run`."""
 QUERY_CHANNELS = {reply: query for query, reply in REPLY_CHANNELS.items()}
 RECEIVE_RING_LENGTH = 256
@@ -77,7 +77,7 @@ def check_name(subject: str, name: str) -> str:
     return name
 
 
-def _load(path: Path, overrides: Mapping[str, Any]) -> zenoh.Config:
+def load_zenoh_config(path: Path, overrides: Mapping[str, Any]) -> zenoh.Config:
     """Read a config file and set `overrides` (keys with slashes) in it."""
     if not path.is_file():
         raise UserError(f"there is no Zenoh config {path}: the shipped ones are in zenoh-configs/")
@@ -105,7 +105,7 @@ def _check_listen_endpoints(config: zenoh.Config, path: Path, *, may_be_empty: b
         raise UserError(f"{path} has no listen endpoints; without them Zenoh would listen on all interfaces")
 
 
-def _open(config: zenoh.Config) -> zenoh.Session:
+def open_zenoh(config: zenoh.Config) -> zenoh.Session:
     """Open a session; raise `zenoh.ZError` if it cannot be opened, and `UserError` if Zenoh panics at this config."""
     try:
         return zenoh.open(config)
@@ -119,7 +119,7 @@ def _open(config: zenoh.Config) -> zenoh.Session:
 
 def _open_router(path: Path, changes: Mapping[str, Any], *, must_listen: bool) -> zenoh.Session:
     """Open a session that is a router; raise `UserError` if the config is wrong or an endpoint cannot be used."""
-    config = _load(path, changes)
+    config = load_zenoh_config(path, changes)
     if json.loads(config.get_json("mode")) != "router":
         raise UserError(f'{path} is not the config of a router: set mode: "router"')
     _check_listen_endpoints(config, path, may_be_empty=not must_listen)
@@ -128,7 +128,7 @@ def _open_router(path: Path, changes: Mapping[str, Any], *, must_listen: bool) -
     check_endpoints(config, "connect.endpoints")
     check_private_keys(config)
     try:
-        return _open(config)
+        return open_zenoh(config)
     except zenoh.ZError as error:
         raise UserError(f"the router of {path} does not start: {error_text(error)}; use other endpoints") from error
 
@@ -142,7 +142,7 @@ def _router_reports(session: zenoh.Session, selector: str = "") -> list[bytes]:
 
 def configured_endpoints(path: Path, key: str, changes: Mapping[str, Any]) -> list[str]:
     """Return the endpoints at `key`, `listen/endpoints` or `connect/endpoints`, of a config file with `changes`."""
-    endpoints = json.loads(_load(path, changes).get_json(key))
+    endpoints = json.loads(load_zenoh_config(path, changes).get_json(key))
     if isinstance(endpoints, dict):
         endpoints = endpoints.get("router")
     return endpoints if isinstance(endpoints, list) else []
@@ -236,11 +236,11 @@ class ZenohLink:
             self._open_session(settings)
 
     def _open_session(self, settings: SessionSettings) -> None:
-        self._config = _load(settings.path, settings.changes)
+        self._config = load_zenoh_config(settings.path, settings.changes)
         endpoints = check_endpoints(self._config, "zenoh.router")
         check_private_keys(self._config)
         try:
-            self._session = _open(self._config)
+            self._session = open_zenoh(self._config)
         except zenoh.ZError as error:
             self._waiting_reason = f"no router answers at {endpoints}: {settings.advice} ({error_text(error)})"
             if self._waiting is None:
@@ -273,7 +273,7 @@ class ZenohLink:
         """Try to open the session until it succeeds; each attempt takes at most the config's open_timeout."""
         while not self._closing.wait(RETRY_S):
             try:
-                session = _open(self._config)
+                session = open_zenoh(self._config)
             except zenoh.ZError:
                 self.counts["router_unreachable"] += 1
                 continue

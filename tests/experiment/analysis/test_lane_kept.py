@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lavt.experiment.analysis.lane_kept import completed_in_own_lane, lane_kept, lane_numbers
+from lavt.experiment.analysis.lane_kept import completed_in_own_lane, followed_numbers, lane_kept, lane_numbers
 from lavt.recording.table import Table, table_of
 
 WIDTH_M = 3.5
@@ -107,6 +107,7 @@ def test_a_car_in_its_lane() -> None:
     assert result["lane_kept"] == {
         "lane_width_m": WIDTH_M,
         "followed_share": 1.0,
+        "followed_unknown_share": 0.0,
         "occupied_share": 1.0,
         "own_lane_share": 1.0,
         "followed_changes": 0,
@@ -165,6 +166,64 @@ def test_a_lane_without_confidence_is_not_followed() -> None:
             partial(confidence_between, confidence),
         )
         assert result["lane_kept"]["followed_changes"] == changes
+
+
+UNSEEN = math.nan
+UNKNOWN = None
+
+
+@pytest.mark.parametrize(
+    ("offsets_m", "expected"),
+    [
+        ([0, 0, 0, 3.5, 0], [0, 0, 0, 0, 0]),
+        ([0, 0, 0, 3.5, 3.5, 0], [0, 0, 0, 0, 0, 0]),
+        ([0, 0, 0, 3.5, 3.5, 3.5], [0, 0, 0, 1, 1, 1]),
+        ([0, 0, 0, 3.5, -3.5, 3.5, 3.5], [0] * 7),
+        ([0, 0, 0, 3.5, 1.8, 1.8, 1.8, 1.8], [0] * 8),  # within the margin of lane 0, which was not left
+        ([0, 0, 0, UNSEEN, UNSEEN, 0], [0] * 6),
+        ([0, 0, 0, 3.5, UNSEEN, 3.5, UNSEEN, 3.5], [0, 0, 0, 1, 1, 1, 1, 1]),
+        ([0, 0, 0, *[UNSEEN] * 3, 0, 0, 0], [0, 0, 0, *[UNKNOWN] * 3, 0, 0, 0]),
+        ([0, 0, 0, 3.5, 3.5, *[UNSEEN] * 4, 3.5], [0, 0, 0, 0, 0, *[UNKNOWN] * 5]),
+        ([0, 0, *[UNSEEN] * 3, 0, 0], [UNKNOWN] * 7),
+        ([0, 3.5, 0, 3.5], [UNKNOWN] * 4),
+        ([UNSEEN, 0, 0, 0], [UNKNOWN, 0, 0, 0]),
+        ([], []),
+    ],
+)
+def test_the_lane_followed_needs_three_pictures(offsets_m: list[float], expected: list[float | None]) -> None:
+    """Three pictures decide which lane is followed, and three without a lane make it unknown; fewer change nothing."""
+    numbers = followed_numbers(np.array(offsets_m, np.float64), WIDTH_M)
+    assert [None if math.isnan(number) else number for number in numbers.tolist()] == expected
+
+
+def test_a_wrong_picture_before_a_gap_changes_nothing() -> None:
+    """Two wrong pictures before a second without a lane are no lane change; the time without a lane is unknown.
+
+    The errors against the lane followed leave this time out.
+    """
+
+    def lane_at(at_s: float) -> float:
+        return WIDTH_M if 4.75 < at_s < 4.95 else 0.0
+
+    def confidence_at(at_s: float) -> float:
+        return 0.0 if 4.95 < at_s < 5.95 else 0.9
+
+    result = evaluate(lambda at_s: 3.0 if 5.1 <= at_s <= 5.8 else 0.5, lane_at, confidence_at)
+    kept = result["lane_kept"]
+    assert [event["lane"] for event in kept["changes"]] == ["occupied", "occupied"]
+    assert kept["followed_unknown_share"] == pytest.approx(0.1)
+    assert kept["followed_share"] == kept["own_lane_share"] == pytest.approx(0.9)
+    assert result["followed_max_m"] == pytest.approx(0.5)
+
+
+def test_a_lane_change_while_the_lane_is_unknown() -> None:
+    """A driver that finds another lane after a gap changed lanes; one that finds the same lane did not."""
+    for found_m, changes in ((0.0, []), (-WIDTH_M, [(0, -1, ns(6.0))])):
+        result = evaluate(stationary(0.0), after(6.0, found_m), lambda at_s: 0.0 if 4.95 < at_s < 5.95 else 0.9)
+        kept = result["lane_kept"]
+        assert [(event["from"], event["to"], event["mono_ns"]) for event in kept["changes"]] == changes
+        assert kept["followed_changes"] == len(changes)
+        assert completed_in_own_lane("completed", kept) is (not changes)
 
 
 def test_only_pictures_of_the_drive_count() -> None:
@@ -240,15 +299,17 @@ def test_without_data_the_lane_kept_is_unknown(missing: str) -> None:
 @pytest.mark.parametrize(
     ("ending", "kept", "expected"),
     [
-        ("completed", {"own_lane_share": 1.0, "changes": []}, True),
-        ("completed", {"own_lane_share": 0.999, "changes": []}, False),
-        ("completed", {"own_lane_share": 1.0, "changes": [{"lane": "followed"}]}, False),
+        ("completed", {"followed_share": 1.0, "occupied_share": 1.0, "changes": []}, True),
+        ("completed", {"followed_share": 0.6, "occupied_share": 1.0, "changes": []}, True),  # unknown for the rest
+        ("completed", {"followed_share": 1.0, "occupied_share": 0.0, "changes": []}, False),
+        ("completed", {"followed_share": 0.0, "occupied_share": 1.0, "changes": []}, False),
+        ("completed", {"followed_share": 0.9, "occupied_share": 1.0, "changes": [{"lane": "followed"}]}, False),
         ("completed", None, None),
-        ("collision", {"own_lane_share": 1.0, "changes": []}, False),
+        ("collision", {"followed_share": 1.0, "occupied_share": 1.0, "changes": []}, False),
         ("safe_stop", None, False),
         (None, None, False),
     ],
 )
 def test_completed_in_own_lane(ending: str | None, kept: Mapping[str, Any] | None, expected: bool | None) -> None:
-    """A run is completed in its own lane only if it was completed without any time in, or after, another lane."""
+    """A completed run is in its own lane if the car was in no other lane and the driver followed no other lane."""
     assert completed_in_own_lane(ending, kept) is expected

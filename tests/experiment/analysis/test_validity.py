@@ -50,6 +50,7 @@ def test_a_run_without_faults_is_valid(make_run: MakeRun, tmp_path: Path) -> Non
         ({"late": 3}, InvalidCode.PHYSICS_LATE, "180 ms"),
         ({"skipped": 10}, InvalidCode.FRAMES_MISSED, "10 of 361"),
         ({"ending": None}, InvalidCode.NO_ENDING, ""),
+        ({"slow_frame_ms": 11.0}, InvalidCode.LOOP_JITTER, "11.0 ms"),
         ({"server_unsampled_s": (4, 6)}, InvalidCode.CLOCK_NOT_SAMPLED, "3.0 s"),
         ({"server_unsampled_s": (-1, 3)}, InvalidCode.CLOCK_NOT_SAMPLED, "3.0 s"),
         ({"server_unsampled_s": (10, 15)}, InvalidCode.CLOCK_NOT_SAMPLED, "3.0 s"),
@@ -73,13 +74,15 @@ def test_each_infrastructure_fault_makes_the_run_invalid(
         {"late": 1},
         {"skipped": 3, "server_counts": (("record_overflow", 0),)},
         {"step_s": 0.0005},
+        {"slow_frame_ms": 9.0},
+        {"spread_ms": 60.0},  # of tau_v: jitter of the network
         {"server_unsampled_s": (4, 5), "client_unsampled_s": (7, 8)},
         {"server_unsampled_s": (-1, 2)},
         {"server_unsampled_s": (11, 15)},
     ],
 )
 def test_small_faults_are_tolerated(make_run: MakeRun, tmp_path: Path, settings: dict[str, Any]) -> None:
-    """A run is valid with one late event, under 1 % missed frames, a small clock step or one missing clock sample."""
+    """A run is valid with small faults: late physics, missed frames, clock steps, unsampled clocks, loop jitter."""
     assert reasons(make_run, tmp_path, **settings) == []
 
 

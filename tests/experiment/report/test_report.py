@@ -4,20 +4,23 @@ import csv
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from markupsafe import escape
 
 from lavt.domain import NS_PER_S, Now
 from lavt.errors import WorkError
-from lavt.experiment.analysis.drive_data import capture_to_stamp_ms, read_drive
+from lavt.experiment.analysis.drive_data import DriveData, capture_to_stamp_ms, read_drive
 from lavt.experiment.analysis.results import read_json, run_result, write_json
 from lavt.experiment.report import table_format
 from lavt.experiment.report.figure_style import condition_colours
+from lavt.experiment.report.replay_section import least_and_most_delayed
 from lavt.experiment.report.report import write_report
 from lavt.experiment.report.run_sections import received_pictures
 from lavt.experiment.report.tables import stage_table
@@ -78,7 +81,7 @@ def page_of(sweep: Path) -> str:
 def test_the_report_is_complete(sweep: Path) -> None:
     """The report has the page, all files it links to, and the summary; the page loads nothing from a network."""
     html = page_of(sweep)
-    figures = {name.rpartition(".")[0] for name in re.findall(r'src="([^"]+)"', html)}
+    figures = {name.rpartition(".")[0] for name in re.findall(r'<img src="([^"]+)"', html)}
     assert figures == {
         "degradation",
         "injected",
@@ -116,6 +119,7 @@ def test_the_page_links_to_its_sections_in_order(sweep: Path) -> None:
     names = re.findall(r'<h2 id="([^"]+)"', html)
     assert re.findall(r'<a href="#([^"]+)"', html) == names
     assert names == [
+        "replay",
         "conditions",
         "planned_contrasts",
         "trajectories",
@@ -129,6 +133,31 @@ def test_the_page_links_to_its_sections_in_order(sweep: Path) -> None:
         "clock_offset_between_two_machines",
         "versions_and_machines",
     ]
+
+
+def test_the_replay_is_a_video(sweep: Path) -> None:
+    """The page plays the replay of the runs with the least and the most delay, and names them."""
+    html = page_of(sweep)
+    assert re.findall(r'<video src="([^"]+)"', html) == ["replay.mp4"]
+    assert "The runs 0 and 1" in html
+    video = cv2.VideoCapture(str(sweep / "report" / "replay.mp4"))
+    assert int(video.get(cv2.CAP_PROP_FRAME_COUNT)) > 20
+
+
+def test_the_runs_with_the_least_and_most_delay_are_shown(sweep: Path, tmp_path: Path) -> None:
+    """Runs of different routes or repetitions are not compared, and runs without delay give no replay."""
+    drive = read_drive(sweep / "runs" / "0", read_json(sweep / "runs" / "0" / "result.json"))
+
+    def change(directory: Path = drive.directory, video_ms: float = 0.0, **keys: Any) -> DriveData:
+        return replace(drive, directory=directory, result={**drive.result, "injected_ms": {"video": video_ms}, **keys})
+
+    none, little, most = change(), change(video_ms=75.0), change(video_ms=225.0)
+    assert least_and_most_delayed([little, most, none]) == [none, most]
+    assert least_and_most_delayed([none, change(video_ms=75.0, repetition=1)]) == []
+    assert least_and_most_delayed([none, change(video_ms=75.0, route="b")]) == []
+    assert least_and_most_delayed([none, change(video_ms=75.0, fidelity="geometry")]) == []
+    assert least_and_most_delayed([none, change(tmp_path, 75.0)]) == []
+    assert least_and_most_delayed([none, none]) == []
 
 
 def test_a_report_is_byte_for_byte_reproducible(sweep: Path) -> None:

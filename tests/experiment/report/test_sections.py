@@ -15,6 +15,7 @@ import pytest
 from lavt.experiment.analysis.results import run_result, write_json
 from lavt.experiment.report import boundary_section
 from lavt.experiment.report.condition_sections import conditions_parts, contrast_parts
+from lavt.experiment.report.condition_tables import COMPLETED_P95, FOLLOWED_P95
 from lavt.experiment.report.figure_style import condition_colours
 from lavt.experiment.report.groups import axes_of, differing_settings, is_in_group, sort_groups, title_of
 from lavt.experiment.report.report import write_report
@@ -41,7 +42,6 @@ MakeRun = Callable[..., Path]
 INJECTED = {"L0": (0, 0), "L1": (75, 0), "L2": (150, 0), "L3": (225, 0), "L4": (150, 75), "L5": (225, 100)}
 
 NEW_CONDITION_KEYS = (
-    "completion_interval_over_roads",
     "endings",
     "routes",
     "completed_in_own_lane",
@@ -53,11 +53,13 @@ NEW_CONDITION_KEYS = (
     "p95_routes",
     "by_road",
     "own_lane_share",
+    "followed_unknown_share",
     "followed_changes_per_run",
     "occupied_changes_per_run",
     "p95_common_m",
     "p95_common_interval",
     "p95_worst_rank_m",
+    "collisions_per_run_interval",
     "collisions_per_km",
     "lane_invasions_per_km",
     "heading_rms_rad",
@@ -165,10 +167,7 @@ def test_results_are_compared_with_the_paper(tmp_path: Path) -> None:
     parts = parts_of(report_of(summarize(campaign(), None), tmp_path), "conditions", "contrasts")
     assert "13.15" in parts["conditions"]
     titles = re.findall("<th[^>]*>(.*?)</th>", unescape(parts["conditions"]))
-    assert {"the paper's completed", "the paper's τ video ms", "the paper's τ control ms", "range over roads"} < set(
-        titles
-    )
-    assert "not a 95 % interval" in text_of(parts["conditions"])
+    assert {"the paper's completed", "the paper's τ video ms", "the paper's τ control ms"} < set(titles)
     row = re.search(r"<tr><td class=\"text\">L3 – L4</td>(.*?)</tr>", parts["contrasts"])
     assert row is not None
     pairs, completed_under_one_only, p_values, paper_p_values = ["6"], ["0", "0"], ["1", "1"], ["0.78", "1"]
@@ -281,7 +280,13 @@ def csv_rows(path: Path) -> list[dict[str, str]]:
     return list(csv.DictReader(path.read_text().splitlines()))
 
 
-KEPT = {"own_lane_share": 1.0, "followed_changes": 0, "occupied_changes": 0, "changes": []}
+KEPT = {
+    "own_lane_share": 1.0,
+    "followed_unknown_share": 0.0,
+    "followed_changes": 0,
+    "occupied_changes": 0,
+    "changes": [],
+}
 CHANGE = {"lane": "followed", "mono_ns": 5, "progress_m": 40.0, "from": 0, "to": -1}
 
 
@@ -307,7 +312,7 @@ def test_the_headline_has_completion_in_the_own_lane(tmp_path: Path) -> None:
         "0.5",
         "0.0",
     ]
-    errors = ("p95 m, completed runs, mean of routes", "p95 m against the lane followed, mean of routes")
+    errors = (f"{COMPLETED_P95}, mean of routes", f"{FOLLOWED_P95}, mean of routes")
     assert [float(row[name]) for name in errors] == pytest.approx([2.0, 0.3])
     assert (row["completed, by road mean (share)"], row["completed, by road low (share)"]) == ("1.0", "")
     assert row["completed, by road roads (share)"] == "2"
@@ -444,4 +449,4 @@ def test_the_report_has_the_maximum_tolerable_latency(make_run: MakeRun, tmp_pat
     assert "designed, route a: theory predicts growing oscillation from a total delay of 204 ms" in html
     assert "210" in (tmp_path / "report" / "tables" / "boundary.csv").read_text()
     assert boundary_section.DASHES in html
-    assert json.loads((tmp_path / "summary.json").read_text())["schema"] == 1
+    assert json.loads((tmp_path / "summary.json").read_text())["schema"] == 2

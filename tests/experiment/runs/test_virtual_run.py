@@ -21,7 +21,7 @@ from lavt.domain import NS_PER_S, Picture, Pose
 from lavt.experiment.analysis.metrics import driving_interval, measure
 from lavt.experiment.analysis.results import run_result
 from lavt.experiment.runs.monitored_run import drive_monitored
-from lavt.experiment.runs.network import VIDEO_LATENCY_STAGES, injected_network, virtual_network
+from lavt.experiment.runs.network import VIDEO_LATENCY_STAGES, injected_network
 from lavt.experiment.runs.plan import PlannedRun, plan_run
 from lavt.experiment.runs.run import run_once
 from lavt.experiment.runs.virtual_run import VirtualLoop, build_loop, drive, host_clocks, read_costs
@@ -39,7 +39,8 @@ Change = Callable[[VirtualLoop], None]
 
 
 def planned(*changes: str) -> PlannedRun:
-    return plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), changes))
+    """Plan a run of the demo with constant costs, so that its latencies are known exactly."""
+    return plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), ("costs=constant", *changes)))
 
 
 def run(
@@ -109,15 +110,15 @@ def test_a_finished_run_leaves_no_painted_world(tmp_path: Path) -> None:
 
 
 def true_latencies_ms(run: PlannedRun) -> tuple[float, float]:
-    """Return the modelled latencies of video and control: the costs of the stages plus the link delays."""
+    """Return the modelled latencies of video and control with constant costs: stages plus link delays."""
     costs = read_costs()
     requested = injected_network(
         run.config.network.inherent, condition(run.config.network.condition), costs, run.seed, state_delay="none"
     )
-    network = virtual_network(requested, costs)
     stages_us = sum(costs.stages_us.get(node, {}).get(stage, 0.0) for node, stage in VIDEO_LATENCY_STAGES)
-    sending_us = costs.stages_us["driver"]["command"]
-    return network.video.constant_ms + stages_us / 1000, network.control.constant_ms + sending_us / 1000
+    video_us = stages_us + costs.links_us["video"]
+    control_us = costs.links_us["control"] + costs.stages_us["driver"]["command"]
+    return requested.video.constant_ms + video_us / 1000, requested.control.constant_ms + control_us / 1000
 
 
 def test_latencies_are_correct_within_their_bound(l0: Path) -> None:

@@ -5,13 +5,13 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from scipy.stats import binom
+from scipy.stats import binom, poisson
 
 from lavt.experiment.statistics.intervals import (
-    bootstrap_interval,
     cluster_interval,
     cluster_rate_interval,
     exact_interval,
+    exact_rate_interval,
     holm,
     stratified_interval,
 )
@@ -74,43 +74,44 @@ def test_the_pooled_interval_covers_any_three_routes() -> None:
         assert covered >= 0.95, probabilities
 
 
+def test_the_interval_of_a_count_is_exact() -> None:
+    """No event in 30 runs gives 0 to ln 40 / 30, five give the published limits 1.62 and 11.67; no run gives none."""
+    assert exact_rate_interval(0, 30) == pytest.approx([0.0, np.log(40) / 30])
+    assert exact_rate_interval(5, 1) == pytest.approx([1.62, 11.67], abs=0.005)
+    assert exact_rate_interval(0, 0) is None
+
+
+@pytest.mark.parametrize("mean", [0.02, 0.1, 0.5, 0.9, 2.0])
+def test_the_interval_of_a_count_covers_the_mean(mean: float) -> None:
+    """The coverage is at least 95 % if the events of 30 runs are Poisson distributed, or at most one in a run."""
+    counts = range(150)
+    intervals = [exact_rate_interval(count, 30) or [1.0, 0.0] for count in counts]
+    covers = [low <= mean <= high for low, high in intervals]
+    assert float(np.dot(poisson.pmf(counts, 30 * mean), covers)) >= 0.95
+    if mean <= 1:
+        assert float(np.dot(binom.pmf(counts, 30, mean), covers)) >= 0.95
+
+
 def test_intervals_of_too_few_values_are_null() -> None:
-    """Without runs there is no exact interval, and with fewer than two values no bootstrap interval."""
+    """Without runs there is no exact interval, and with fewer than two values no interval of their mean."""
     assert exact_interval(0, 0) is None
-    assert bootstrap_interval([]) is None
-    assert bootstrap_interval([1.0]) is None
+    assert stratified_interval([[]]) is None
+    assert stratified_interval([[1.0]]) is None
 
 
-def test_the_bootstrap_is_reproducible_and_accurate() -> None:
-    """The interval is reproducible; for 100 evenly spaced values it is about the mean +- 1.96 standard errors."""
-    values = [index / 99 for index in range(100)]
-    interval = bootstrap_interval(values)
-    assert interval == bootstrap_interval(values)
-    assert interval is not None
-    low, high = interval
-    mean, standard_error = 0.5, 0.0291
-    assert low == pytest.approx(mean - 1.96 * standard_error, abs=0.006)
-    assert high == pytest.approx(mean + 1.96 * standard_error, abs=0.006)
-
-
-def test_the_bootstrap_of_three_is_their_range() -> None:
-    """The 95 % interval of three values is their range.
-
-    Of 27 resamples, one has only the smallest value and one only the largest, and 1/27 is more than 2.5 %.
-    """
-    assert bootstrap_interval([0.2, 1.0, 0.6]) == pytest.approx([0.2, 1.0])
-    assert bootstrap_interval([1.0, 1.0, 1.0]) == [1.0, 1.0]
+def test_the_interval_of_one_stratum_is_students() -> None:
+    """The interval of the values 1, 2 and 3 is 2 +- 4.303 / sqrt(3)."""
+    assert stratified_interval([[1.0, 2.0, 3.0]]) == pytest.approx([2 - 4.303 / 3**0.5, 2 + 4.303 / 3**0.5], abs=0.001)
 
 
 def test_differences_between_strata_do_not_widen_the_interval() -> None:
-    """Three strata of equal spread and different means have the interval of one stratum with all their deviations."""
+    """Three strata of equal spread and different means have 12 degrees of freedom, and the spread within a stratum."""
     deviations = [-0.02, -0.01, 0.0, 0.01, 0.02]
     apart = stratified_interval([[centre + deviation for deviation in deviations] for centre in (0.0, 1.0, 5.0)])
-    together = bootstrap_interval([2.0 + deviation for deviation in deviations * 3])
+    half_width = 2.179 * float(np.std(deviations, ddof=1)) / 15**0.5
+    assert apart == pytest.approx([2 - half_width, 2 + half_width], abs=1e-5)
     assert apart is not None
-    assert together is not None
-    assert apart == pytest.approx(together, abs=0.0006)
-    pooled = bootstrap_interval([centre + deviation for centre in (0.0, 1.0, 5.0) for deviation in deviations])
+    pooled = stratified_interval([[centre + deviation for centre in (0.0, 1.0, 5.0) for deviation in deviations]])
     assert pooled is not None
     assert pooled[1] - pooled[0] > 50 * (apart[1] - apart[0])
 
@@ -120,6 +121,21 @@ def test_strata_weigh_as_many_runs_as_they_have() -> None:
     assert stratified_interval([[1.0, 1.0, 1.0], [5.0]]) == [2.0, 2.0]
     assert stratified_interval([[1.0], [5.0], []]) is None
     assert stratified_interval([]) is None
+
+
+def test_a_stratum_that_spreads_more_has_the_degrees_of_freedom() -> None:
+    """Beside a stratum without spread, the interval is that of the other one, for its share of all values."""
+    low, high = stratified_interval([[1.0, 2.0, 3.0], [5.0, 5.0, 5.0]]) or [0.0, 0.0]
+    assert (low + high) / 2 == pytest.approx(3.5)
+    assert (high - low) / 2 == pytest.approx(4.303 / 3**0.5 / 2, abs=0.001)
+
+
+@pytest.mark.parametrize("runs", [2, 3, 5])
+def test_the_interval_of_strata_covers_the_mean(runs: int) -> None:
+    """With six strata of normal values, two of which spread more, it covers the mean in about 95 % of experiments."""
+    values = np.random.default_rng(1).normal(0.0, 1.0, (1000, 6, runs)) * np.array([[5], [2], [1], [1], [1], [1]])
+    intervals = [stratified_interval(strata) or [1.0, 0.0] for strata in values.tolist()]
+    assert sum(low <= 0.0 <= high for low, high in intervals) >= 0.93 * 1000
 
 
 def test_fewer_than_six_clusters_have_no_interval() -> None:

@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
-from lavt.experiment.statistics.by_road import road_rates
-from lavt.experiment.statistics.intervals import exact_interval
+from lavt.experiment.statistics.by_road import group_by_road
+from lavt.experiment.statistics.intervals import exact_interval, exact_rate_interval
 from lavt.experiment.statistics.summary import summarize
 
 SPEED = {"simulated_s": 100.0, "wall_s": 10.0, "jobs": 2}
@@ -44,6 +44,7 @@ def test_summary_of_a_condition() -> None:
     assert (condition["runs"], condition["completed"]) == (3, 2)
     assert condition["completion_rate"] == pytest.approx(2 / 3)
     assert condition["collisions_per_run"] == pytest.approx(1 / 3)
+    assert condition["collisions_per_run_interval"] == exact_rate_interval(1, 3)
     assert condition["p95_m"] == 2.0
     assert condition["injected_ms"] == {"video": 75.0, "control": 0.0}
     assert condition["tau_v_ms"] == {"p5": 60.0, "p50": 62.0, "p95": 86.0, "bound": 0.4, "n": 300}
@@ -92,12 +93,11 @@ def campaign(*, condition: str = "L0", bad_route: str | None = None, **changes: 
     ]
 
 
-def test_completion_by_route_and_by_road() -> None:
-    """If one of six routes is never completed, its interval is 0 to 52 %, and the range over roads is 50 to 100 %."""
+def test_completion_by_route() -> None:
+    """If one of six routes is never completed, its interval is 0 to 52 %; the pooled interval is that of 25 of 30."""
     condition = summarize(campaign(bad_route="b"), SPEED)["conditions"]["L0"]
     assert condition["endings"] == {"completed": 25, "safe_stop": 5}
     assert condition["completion_interval"] == exact_interval(25, 30)
-    assert condition["completion_interval_over_roads"] == [0.5, 1.0]
     assert {name: route["completed"] for name, route in condition["routes"].items()} == {
         "a": 5,
         "a_key": 5,
@@ -121,13 +121,14 @@ def test_p95_of_the_routes_has_equal_weights() -> None:
 def test_results_by_road() -> None:
     """Each road counts once; with six roads there is an interval, with five none."""
     roads = [run(route=f"road{number}", p95_m=float(number)) for number in range(6)]
-    runs = [*roads, *(run(route="road0", ending="collision", collisions=1) for _ in range(3))]
+    runs = [*roads, *(run(route="road0", ending="collision", collisions=1, p95_m=9.0) for _ in range(3))]
     by_road = summarize(runs, SPEED)["conditions"]["L0"]["by_road"]
     assert by_road["completion_rate"]["mean"] == pytest.approx((0.25 + 5) / 6)
     assert by_road["collisions_per_run"]["mean"] == pytest.approx(0.75 / 6)
     assert (by_road["p95_m"]["mean"], by_road["p95_m"]["roads"]) == (2.5, 6)
     assert 0.0 <= by_road["p95_m"]["low"] < 1.0
     assert 4.0 < by_road["p95_m"]["high"] <= 5.0
+    assert by_road["p95_all_runs_m"]["mean"] == pytest.approx((3 * 9 / 4 + 1 + 2 + 3 + 4 + 5) / 6)
     assert by_road["own_lane_completion_rate"] == {"roads": 0, "mean": None, "low": None, "high": None}
     few = summarize(runs[1:6], SPEED)["conditions"]["L0"]["by_road"]
     assert few["p95_m"] == {"roads": 5, "mean": 3.0, "low": None, "high": None}
@@ -146,13 +147,7 @@ def test_rates_by_road_have_an_exact_interval() -> None:
 def test_a_route_and_its_key_route_are_one_road(suffix: str) -> None:
     """Two routes whose names or paths differ only by `_key` are one road."""
     runs = [run(route=f"roads/my{suffix}"), run(route=f"roads/my_key{suffix}", ending="collision"), run(route="b")]
-    assert road_rates(runs) == [1.0, 0.5]
-
-
-def test_one_road_has_no_range_over_roads() -> None:
-    """Runs on a single road (a route and its key part) have no range over roads."""
-    runs = [entry for entry in campaign() if entry["route"] in {"a", "a_key"}]
-    assert summarize(runs, SPEED)["conditions"]["L0"]["completion_interval_over_roads"] is None
+    assert [len(on_road) for on_road in group_by_road(runs).values()] == [1, 2]
 
 
 def test_rates_by_distance_are_of_all_kilometres() -> None:

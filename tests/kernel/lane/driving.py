@@ -135,7 +135,7 @@ def collect(loop: LoopPrograms, client: Machine, out: Path) -> DriveResult:
     return DriveResult(run, server_record, client_record, measure(server_record, client_record), result)
 
 
-SLOW_MACHINE_CODES = (InvalidCode.PHYSICS_LATE, InvalidCode.FRAMES_MISSED)
+SLOW_MACHINE_CODES = (InvalidCode.PHYSICS_LATE, InvalidCode.FRAMES_MISSED, InvalidCode.LOOP_JITTER)
 
 
 def invalid_reasons(finished_drive: DriveResult) -> list[InvalidReason]:

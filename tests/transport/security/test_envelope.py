@@ -29,10 +29,9 @@ from lavt.transport.security.envelope import (
     NullVehicleAuthenticator,
     OperatorAuthenticator,
     VehicleAuthenticator,
-    VerifiedReply,
-    VerifiedState,
 )
 from lavt.transport.security.keys import PrivateKey
+from lavt.transport.security.verified import VerifiedReply, VerifiedState
 
 MAX_ENTRIES, MAX_ENVELOPE_BYTES = 8, 1280
 """The design's limits on pending requests, on key agreements and on the size of an envelope, repeated here: a change of

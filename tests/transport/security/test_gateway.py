@@ -6,11 +6,29 @@ from typing import Any
 
 import pytest
 
-from lavt.domain import NS_PER_S, PATH_POINTS, Command, Now, RunReply, RunRequest, SessionReply, SessionRequest
+import lavt
+from lavt.domain import (
+    NS_PER_MS,
+    NS_PER_S,
+    PATH_POINTS,
+    Command,
+    Now,
+    RunReply,
+    RunRequest,
+    SessionReply,
+    SessionRequest,
+    State,
+    VehicleInfo,
+)
 from lavt.node import Send
 from lavt.transport import zenoh_link
-from lavt.transport.messages import encode
-from lavt.transport.security.envelope import NullVehicleAuthenticator, OperatorAuthenticator, VehicleAuthenticator
+from lavt.transport.messages import decode, encode
+from lavt.transport.security.envelope import (
+    NullVehicleAuthenticator,
+    OperatorAuthenticator,
+    VehicleAuthenticator,
+    verify_info,
+)
 from lavt.transport.security.gateway import ClientGateway, OpenClientGateway, ServerGateway
 
 pytest.importorskip("cryptography", reason="an extra: pip install 'lavt[secure]'")
@@ -22,6 +40,7 @@ from lavt.transport.security.keys import PrivateKey
 # The expected values of the code's limits. They are not imported, so that a changed limit makes a test fail.
 UNACCEPTABLE_COMMANDS_PER_S = 200
 REQUESTS_PER_S = 100
+INFO_QUERIES_PER_S = 50
 STATES_PER_S = 500
 MAX_UNANSWERED_REQUESTS = 64
 EPOCH, LAST_ACCEPTED_SEQUENCE = 7, 2
@@ -66,6 +85,7 @@ class GatewayPair:
 
     def __init__(self) -> None:
         vehicle, alice, bob = (PrivateKey(Ed25519PrivateKey.generate()) for _ in range(3))
+        self.vehicle_key = vehicle.public
         self.bob = OperatorAuthenticator("car", "bob", bob, vehicle.public)
         self.in_flight: list[Send] = []
         self.server_received: list[tuple[str, bytes, Any]] = []
@@ -353,3 +373,81 @@ def test_an_open_gateway_changes_nothing() -> None:
     gateway.send(Send("control", b"command"))
     assert delivered == [("state", b"state", Now(1, 2), None)]
     assert sent == [Send("control", b"command")]
+
+
+STATE = State(
+    sent_wall_ns=1,
+    state_mono_ns=5 * NS_PER_S,
+    speed_mps=3.5,
+    steering_rad=0.1,
+    gear="drive",
+    safety="driving",
+    reason="armed by alice",
+    applied_sequence=1,
+    rejected="",
+    active_operator="alice",
+    instance=9,
+)
+NONCE = bytes(range(16))
+
+
+def query_info(gateway: ServerGateway, nonce: bytes, mono_ns: int, in_flight: list[Send]) -> list[Send]:
+    """Deliver a query for the vehicle's information; return the replies."""
+    in_flight.clear()
+    gateway.receive("info", nonce, Now(mono_ns, 0), "query")
+    return list(in_flight)
+
+
+@pytest.mark.parametrize("signed", [True, False])
+def test_the_vehicle_describes_itself_to_whoever_asks(pair: GatewayPair, signed: bool) -> None:
+    """A query for information is answered from the newest state, with its age, and is not delivered to the nodes."""
+    gateway = pair.server
+    if not signed:
+        sent = pair.in_flight
+        gateway = ServerGateway(
+            lambda *_: None, lambda *sends: sent.extend(sends), lambda: (0, -1), NullVehicleAuthenticator()
+        )
+    gateway.send(Send("state", b"unreadable"), Send("state", encode(STATE)))
+    received = list(pair.server_received)
+    (reply,) = query_info(gateway, NONCE, STATE.state_mono_ns + 20 * NS_PER_MS, pair.in_flight)
+    assert (reply.channel, reply.peer) == ("info_reply", "query")
+    body = verify_info("car", pair.vehicle_key, NONCE, reply.payload) if signed else reply.payload
+    assert body is not None
+    assert decode(VehicleInfo, body) == VehicleInfo(
+        lavt.__version__, "driving", "armed by alice", "alice", 3.5, 20 * NS_PER_MS, 9
+    )
+    assert pair.server_received == received
+
+
+def test_information_is_signed_for_one_query_of_one_vehicle(pair: GatewayPair) -> None:
+    """Information that is replayed, changed, too long, or of another vehicle or key is not verified."""
+    pair.server.send(Send("state", encode(STATE)))
+    (reply,) = query_info(pair.server, NONCE, STATE.state_mono_ns, pair.in_flight)
+    data, key = reply.payload, pair.vehicle_key
+    assert verify_info("car", key, NONCE, data) is not None
+    assert verify_info("car", key, bytes(16), data) is None
+    assert verify_info("bus", key, NONCE, data) is None
+    assert verify_info("car", PrivateKey(Ed25519PrivateKey.generate()).public, NONCE, data) is None
+    for bad in (b"", data[:10], data[:-1], b"x" + data, data[:-1] + bytes([data[-1] ^ 1]), bytes(2000)):
+        assert verify_info("car", key, NONCE, bad) is None
+
+
+@pytest.mark.parametrize("nonce", [b"", bytes(15), bytes(17), bytes(2000)])
+def test_a_query_for_information_needs_a_nonce(pair: GatewayPair, nonce: bytes) -> None:
+    """A query for information with another number of bytes than 16 is counted and not answered."""
+    pair.server.send(Send("state", encode(STATE)))
+    assert query_info(pair.server, nonce, STATE.state_mono_ns, pair.in_flight) == []
+    assert pair.server.counts["info_queries_unreadable"] == 1
+
+
+def test_without_a_state_there_is_no_information(pair: GatewayPair) -> None:
+    """A server that has not sent a state yet does not answer a query for information."""
+    assert query_info(pair.server, NONCE, 0, pair.in_flight) == []
+
+
+def test_queries_for_information_are_rate_limited(pair: GatewayPair) -> None:
+    """Of 1000 queries for information in a second, 50 are answered and the others are counted."""
+    pair.server.send(Send("state", encode(STATE)))
+    replies = [reply for _ in range(1000) for reply in query_info(pair.server, NONCE, 6 * NS_PER_S, pair.in_flight)]
+    assert len(replies) == INFO_QUERIES_PER_S
+    assert pair.server.counts["info_queries_screened_out"] == 1000 - INFO_QUERIES_PER_S

@@ -61,7 +61,7 @@ def test_a_frame_is_available_after_exposure_and_delay(road: Road, exposure_ns: 
 
 def capture_to_stamp_us(out: Path, *changes: str) -> list[int]:
     """Drive two virtual seconds and return the time from capture to stamp of every frame, in microseconds."""
-    changes = ("vehicle.scenery=none", "record.video=false", *changes)
+    changes = ("vehicle.scenery=none", "record.video=false", "costs=constant", *changes)
     loop = build_loop(plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), changes)), out)
     drive(loop, limit_ns=2 * NS_PER_S)
     frames = read_record(out / "server.mcap").table("frame")

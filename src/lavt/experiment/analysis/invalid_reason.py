@@ -25,6 +25,7 @@ class InvalidCode(StrEnum):
     CLOSURE = "closure"
     PHYSICS_LATE = "physics_late"
     FRAMES_MISSED = "frames_missed"
+    LOOP_JITTER = "loop_jitter"
     INJECTION_DIFFERS = "injection_differs"
     INJECTION_NOT_MEASURED = "injection_not_measured"
     INJECTION_NOT_IN_FORCE = "injection_not_in_force"

@@ -23,7 +23,7 @@ from lavt.experiment.analysis.latency import (
     received_frames_of,
     video_latency_ns,
 )
-from lavt.experiment.analysis.stage_latency import stage_percentiles
+from lavt.experiment.analysis.stage_latency import processing_ns, stage_percentiles
 from lavt.experiment.analysis.steering import steering_metrics
 from lavt.experiment.analysis.tracking import (
     cross_track_metrics,
@@ -34,7 +34,7 @@ from lavt.experiment.analysis.tracking import (
     route_length_m,
 )
 from lavt.recording.record import Record
-from lavt.recording.table import MISSING, Table
+from lavt.recording.table import MISSING, IntArray, Table
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +132,7 @@ def _latencies(
     entry = {
         "loop_ms": percentiles_ms(paired.loop_ns),
         "picture_age_ms": {"mean": age.mean_ms, "p95": age.p95_ms},
+        "loop_jitter_ms": _spread_ms(processing_ns(server.table("timeline"), decoded, paired)),
         "age_at_actuation_ms": percentiles_ms(ages_at_actuation_ns(all_frames, command_verdicts, began_ns, ended_ns)),
         "tau_v_ms": _with_bound(percentiles_ms(tau_v_ns), bound_ms),
         "tau_c_ms": _with_bound(percentiles_ms(tau_c_ns), bound_ms),
@@ -141,6 +142,12 @@ def _latencies(
         "frames_unreadable": int(np.sum(~decoded.flags("readable"))),
     }
     return entry, closure_p95_ms
+
+
+def _spread_ms(durations_ns: IntArray) -> float | None:
+    """Return the 95th percentile minus the median in ms; None without durations."""
+    percentiles = percentiles_ms(durations_ns)
+    return percentiles["p95"] - percentiles["p50"] if percentiles["n"] else None
 
 
 def _with_bound(summary: dict[str, Any], bound_ms: float | None) -> dict[str, Any]:

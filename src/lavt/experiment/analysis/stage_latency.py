@@ -9,7 +9,7 @@ import numpy as np
 
 from lavt.domain import NS_PER_MS
 from lavt.experiment.analysis.clock_offset import ClockOffset
-from lavt.experiment.analysis.latency import look_up, received_frames_of, video_latency_ns
+from lavt.experiment.analysis.latency import FramesWithCommands, look_up, received_frames_of, video_latency_ns
 from lavt.recording.record import Record
 from lavt.recording.table import MISSING, IntArray, Table
 
@@ -87,11 +87,8 @@ def video_link_ns(timelines: Table, received_frames: Table, frames: Table, offse
     frame. It is computed as tau_v, minus the camera's time after the stamp, minus the client's time from that packet to
     the reading of the stamp. `timelines` are the server's.
     """
-    camera = timelines.where(np.array([node == "camera" for node in timelines.texts("node")], np.bool_))
-    last_stages = [stages[-1] if stages else ("", MISSING) for stages in camera.objects("stages")]
-    last_ends_ns = np.array([end_ns for _, end_ns in last_stages], np.int64)
     stamps = received_frames.ints("stamp_ns")
-    sent_ns = look_up(camera.ints("stamp_ns"), last_ends_ns, stamps)
+    sent_ns = _sent_by_camera_ns(timelines, stamps)
     stamped_ns = look_up(frames.ints("stamp_ns"), frames.ints("stamped_mono_ns"), stamps)
     client_times = (received_frames.ints(name) for name in ("read_wall_ns", "read_mono_ns", "packet_mono_ns"))
     has_times = np.all([times != MISSING for times in (sent_ns, stamped_ns, *client_times)], axis=0)
@@ -100,6 +97,32 @@ def video_link_ns(timelines: Table, received_frames: Table, frames: Table, offse
     on_camera_ns = (sent_ns - stamped_ns)[is_known]
     on_client_ns = readable.ints("read_mono_ns") - readable.ints("packet_mono_ns")
     return np.asarray(video_latency_ns(readable, offset) - on_camera_ns - on_client_ns, np.int64)
+
+
+def _sent_by_camera_ns(timelines: Table, stamps: IntArray) -> IntArray:
+    """Return when the camera had sent each frame, on the server's monotonic clock; `MISSING` if it is unknown."""
+    camera = timelines.where(np.array([node == "camera" for node in timelines.texts("node")], np.bool_))
+    last_stages = [stages[-1] if stages else ("", MISSING) for stages in camera.objects("stages")]
+    return look_up(camera.ints("stamp_ns"), np.array([end_ns for _, end_ns in last_stages], np.int64), stamps)
+
+
+def processing_ns(timelines: Table, received_frames: Table, paired: FramesWithCommands) -> IntArray:
+    """Return the part of each frame's loop latency that is not on the network, in ns.
+
+    It is the camera's time after the stamp, the client's time from the packet that completes the frame to the sending
+    of the command, and the actuator's time. Each is measured on one clock. `timelines` are the server's.
+    """
+    readable = received_frames.where(received_frames.flags("readable"))
+    packet_ns, read_ns = (
+        look_up(readable.ints("stamp_ns"), readable.ints(name), paired.stamp_ns)
+        for name in ("packet_mono_ns", "read_mono_ns")
+    )
+    sent_ns = _sent_by_camera_ns(timelines, paired.stamp_ns)
+    commands = paired.commands
+    command_times = (commands.ints(name) for name in ("sent_wall_ns", "stamp_received_wall_ns", "received_mono_ns"))
+    is_known = np.all([times != MISSING for times in (packet_ns, read_ns, sent_ns, *command_times)], axis=0)
+    processing = sent_ns - paired.stamped_mono_ns + read_ns - packet_ns + paired.client_ns + paired.actuator_ns
+    return np.asarray(processing[is_known], np.int64)
 
 
 def _receiver_ns(timelines: Table, received_frames: Table, frames: Table) -> IntArray:

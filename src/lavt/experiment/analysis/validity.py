@@ -20,6 +20,10 @@ LATE_LIMIT = 0.01
 """The largest allowed share of the drive by which the physics is late in total; delays up to 50 ms are ignored."""
 MISSED_FRAMES_LIMIT = 0.01
 """The largest allowed share of frames that the camera misses."""
+LOOP_JITTER_LIMIT_MS = 10.0
+"""The largest allowed loop jitter. On an idle machine with two cores, the 95th percentile of the whole loop latency,
+network included, was 3.4 ms above its median (docs/measuring_latency.md). The limit is three times that value: a run
+beyond it measured the load of the machine rather than the injected delay."""
 INJECTION_LIMIT_MS = 1.0
 """The largest allowed difference between the injected and the requested delay."""
 
@@ -31,6 +35,7 @@ def invalid_reasons(server: Record, client: Record, measured: RunMeasurement) ->
         *_record_reasons("client", client),
         *_clock_reasons(server, client, measured),
         *_simulator_reasons(server),
+        *_jitter_reasons(measured),
     ]
 
 
@@ -97,6 +102,18 @@ def _simulator_reasons(server: Record) -> list[InvalidReason]:
         text = f"the camera missed {missed_count} of {due_count} frames (limit {MISSED_FRAMES_LIMIT:.0%})"
         reasons.append(InvalidReason(InvalidCode.FRAMES_MISSED, text))
     return reasons
+
+
+def _jitter_reasons(measured: RunMeasurement) -> list[InvalidReason]:
+    """Return the reason if the time that frames need outside the network varies too much: the machine was busy."""
+    jitter_ms = measured.entry["loop_jitter_ms"]
+    if jitter_ms is None or jitter_ms <= LOOP_JITTER_LIMIT_MS:
+        return []
+    text = (
+        f"the processing time of frames varied: its 95th percentile was {jitter_ms:.1f} ms above its median (limit "
+        f"{LOOP_JITTER_LIMIT_MS:g} ms)"
+    )
+    return [InvalidReason(InvalidCode.LOOP_JITTER, text)]
 
 
 def lateness_reasons(late_ms: Mapping[str, float | None]) -> list[InvalidReason]:

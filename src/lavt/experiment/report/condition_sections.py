@@ -24,17 +24,14 @@ LATENCIES_NOTE = (
 )
 PAPER_NOTE = " The paper did not measure the loop latency; the table shows the sum of its median τ video and τ control."
 OWN_LANE_NOTE = (
-    " A run is completed in its own lane if the driver followed the lane of the route, and the middle of the rear axle "
-    "was in it, all the time. P95 of the cross-track error is against the lane of the route and, in a column of its "
-    "own, against the lane that the driver followed."
+    " A run is completed in its own lane if the middle of the rear axle was in the lane of the route all the time, and "
+    "the driver followed no other lane. After three pictures without a lane, the lane followed is unknown. P95 of the "
+    "cross-track error is against the lane of the route and, in a column of its own, against the lane that the driver "
+    "followed, where this lane is known."
 )
 ROUTES_NOTE = (
-    " The intervals “these routes” show only how repeated runs of these routes vary: that of completion is exact, that "
-    "of P95 is bootstrapped within each route."
-)
-ROADS_NOTE = (
-    " “Range over roads” shows how much completion differs between roads; a route and its key part count as one road. "
-    "It is not a 95 % interval."
+    " The intervals “these routes” show only how repeated runs of these routes vary: those of completion and of "
+    "collisions are exact, that of P95 is Student's t, from the spread within each route."
 )
 BY_ROAD_NOTE = (
     " Quote the columns “by road”: they have the mean over roads and its 95 % interval for other roads of this kind. "
@@ -47,10 +44,11 @@ FEW_ROADS_NOTE = (
 )
 ERRORS_NOTE = (
     " Each error is computed for each run and then averaged over the runs. P95 of the cross-track error is given in "
-    "three ways. The first is the mean over the completed runs only, to be read together with the completion: of all "
-    "these runs, and of the means of the routes. The second is the mean over all runs, each up to the "
-    "common distance, which all runs of its route and repetition reached. The third is the median (quartiles) of all "
-    "runs, where a run that ended early ranks last. "
+    "three ways. The first is the mean over the runs that completed, to be read together with the completion: of all "
+    "these runs, and of the means of the routes and of the roads. The mean over roads is also shown for all runs, each "
+    "up to its own end. The second is the mean over all runs, each up to the common distance, which all runs of its "
+    "route and repetition reached. The third is the median (quartiles) of all runs, where a run that ended early ranks "
+    "last. "
     "docs/metrics.md defines each number."
 )
 
@@ -73,11 +71,6 @@ def conditions_parts(report: ReportContext) -> Parts:
         }
         for name, make in tables.items():
             parts.append(save_table(report.directory, f"conditions_{kind}_{name}", make(conditions, paper)))
-    has_roads = any(
-        entry.get("completion_interval_over_roads")
-        for conditions in report.kinds.values()
-        for entry in conditions.values()
-    )
     roads = max(_roads(entry) for conditions in report.kinds.values() for entry in conditions.values())
     has_paper = any(report.paper(conditions) for conditions in report.kinds.values())
     return [
@@ -89,7 +82,6 @@ def conditions_parts(report: ReportContext) -> Parts:
                     PAPER_NOTE * has_paper,
                     OWN_LANE_NOTE,
                     ROUTES_NOTE,
-                    ROADS_NOTE * has_roads,
                     _by_road_note(roads) if roads else "",
                     ERRORS_NOTE,
                 )

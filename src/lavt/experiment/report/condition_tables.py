@@ -25,7 +25,9 @@ from lavt.experiment.report.table_format import (
 
 FLOWS = ("video", "control")
 
-COMPLETED_P95 = "p95 m, completed runs"
+COMPLETED_P95 = "p95 m of the runs that completed"
+ALL_RUNS_P95 = "p95 m of all runs up to their end"
+FOLLOWED_P95 = "p95 m against the lane followed, of the runs that completed"
 COMMON_P95 = "p95 m, up to common distance"
 
 ENDED_EARLY = "ended early"
@@ -64,9 +66,16 @@ def headline_table(conditions: Conditions, paper: Conditions) -> TableData:
             (number_column(f"{COMPLETED_P95}, mean of routes", 2), "p95_route_balanced_m"),
             (number_column("routes with completed runs", 0), "p95_routes"),
             (by_road_column(f"{COMPLETED_P95}, by road"), "by_road.p95_m"),
+            (by_road_column(f"{ALL_RUNS_P95}, by road"), "by_road.p95_all_runs_m"),
             (number_column("the paper's p95 m", 2), "paper.p95_m"),
-            (number_column("p95 m against the lane followed, mean of routes", 2), "followed_p95_route_balanced_m"),
-            (by_road_column("p95 m against the lane followed, by road"), "by_road.followed_p95_m"),
+            (
+                number_column("p95 m against the lane followed, of the runs that completed, mean of routes", 2),
+                "followed_p95_route_balanced_m",
+            ),
+            (
+                by_road_column(f"{FOLLOWED_P95}, by road"),
+                "by_road.followed_p95_m",
+            ),
         ],
     )
 
@@ -102,15 +111,16 @@ def driving_table(conditions: Conditions, paper: Conditions) -> TableData:
             (number_column("runs", 0), "runs"),
             (share_column("completed"), "completion_rate"),
             (share_interval_column("95 %, these routes"), "completion_interval"),
-            (share_interval_column("range over roads"), "completion_interval_over_roads"),
             (share_column("the paper's completed"), "paper.completion_rate"),
             (share_interval_column("the paper's 95 %"), "paper.completion_interval"),
             (share_column("completed in own lane"), "own_lane_completion_rate"),
             (share_interval_column("95 %, these routes, own lane"), "own_lane_completion_interval"),
             (share_column("time in own lane"), "own_lane_share"),
+            (share_column("time with lane followed unknown"), "followed_unknown_share"),
             (number_column("changes of the lane followed / run", 2), "followed_changes_per_run"),
             (number_column("changes of the lane occupied / run", 2), "occupied_changes_per_run"),
             (number_column("collisions / run", 2), "collisions_per_run"),
+            (interval_column("95 %, these routes, collisions / run"), "collisions_per_run_interval"),
             (number_column("the paper's collisions / run", 2), "paper.collisions_per_run"),
             (number_column("collisions / km", 2), "collisions_per_km"),
             (number_column("lane invasions / run", 2), "lane_invasions_per_run"),
@@ -132,7 +142,7 @@ def error_table(conditions: Conditions, paper: Conditions) -> TableData:
         [
             (text_column("condition"), "condition"),
             (number_column(f"{COMPLETED_P95}, mean of runs", 2), "p95_m"),
-            (interval_column("95 %, these routes, completed runs m"), "p95_interval"),
+            (interval_column("95 %, these routes, of the runs that completed m"), "p95_interval"),
             (number_column(f"{COMPLETED_P95}, mean of routes", 2), "p95_route_balanced_m"),
             (number_column("routes with completed runs", 0), "p95_routes"),
             (number_column("the paper's p95 m", 2), "paper.p95_m"),

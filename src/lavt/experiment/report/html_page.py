@@ -71,6 +71,11 @@ def figure(shown: str, files: Sequence[str], alternative: str, caption: str) -> 
     return _part("figure", shown, files, alternative, caption)
 
 
+def video(shown: str, alternative: str, caption: str) -> Markup:
+    """Return a video that plays again and again without sound, with its caption and a link to its file."""
+    return _part("video", shown, alternative, caption)
+
+
 def table(columns: Sequence[Any], rows: Sequence[Sequence[str]]) -> Markup:
     """Return a table that scrolls sideways on a narrow screen; each column has `title`, `is_text` and `is_long`."""
     return _part("table", columns, rows)

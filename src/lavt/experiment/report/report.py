@@ -15,6 +15,7 @@ from lavt.experiment.report import html_page
 from lavt.experiment.report.boundary_section import boundary_parts
 from lavt.experiment.report.condition_sections import conditions_parts, contrast_parts
 from lavt.experiment.report.figure_style import condition_colours
+from lavt.experiment.report.replay_section import replay_parts
 from lavt.experiment.report.run_sections import (
     DriveSets,
     capture_to_stamp_medians,
@@ -91,6 +92,7 @@ def _sections(
     """Return the page's sections in their order."""
     return [
         ("Summary", summary_parts(report)),
+        ("Replay", replay_parts(report, sets)),
         ("Conditions", conditions_parts(report)),
         ("Planned contrasts", contrast_parts(report)),
         ("Trajectories", trajectory_parts(report, sets)),

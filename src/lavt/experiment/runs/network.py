@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from lavt.assembly.links import link_injection
 from lavt.config import Condition, Costs
+from lavt.domain import NS_PER_US
+from lavt.runtime.virtual import RTP_TICKS_PER_DRAW
+from lavt.streams import QuantileStream
 from lavt.transport.emulation.delay_line import DelayModel, Lognormal
 from lavt.transport.emulation.link import LinkInjection
 
@@ -89,19 +93,25 @@ def injected_network(profile: str, condition: Condition, costs: Costs, seed: int
     )
 
 
-def virtual_network(requested: NetworkDelays, costs: Costs) -> NetworkDelays:
-    """Return the requested delays plus the measured latency of a real loopback interface."""
+def virtual_delay(requested: DelayModel, costs: Costs, link: str, seed: int, channel: str) -> DelayModel:
+    """Return the requested delay plus the measured latency of `link`, a key of the costs, on a real loopback interface.
+
+    If the costs have quantiles, the latency is drawn, and each channel has a random-number stream of its own. The
+    packets of a video frame share one draw.
+    """
+    quantiles_us = costs.link_quantiles_us.get(link)
+    if quantiles_us is None:
+        return replace(requested, constant_ms=requested.constant_ms + costs.links_us[link] / US_PER_MS)
     return replace(
         requested,
-        video=_add_delay(requested.video, costs.links_us["video"]),
-        control=_add_delay(requested.control, costs.links_us["control"]),
-        state=_add_delay(requested.state, costs.links_us["state"]),
-        without_injection=_add_delay(requested.without_injection, costs.links_us["state"]),
+        measured_ns=QuantileStream(seed, f"cost of link {channel}", costs.levels, in_ns(quantiles_us)),
+        indices_per_draw=RTP_TICKS_PER_DRAW if channel == "rtp" else 1,
     )
 
 
-def _add_delay(delay: DelayModel, delay_us: float) -> DelayModel:
-    return DelayModel(delay.constant_ms + delay_us / US_PER_MS, delay.jitter, delay.seed, delay.name)
+def in_ns(values_us: Sequence[float]) -> list[float]:
+    """Convert microseconds to nanoseconds."""
+    return [value_us * NS_PER_US for value_us in values_us]
 
 
 def _stages_ms(costs: Costs, stages: tuple[tuple[str, str], ...]) -> float:

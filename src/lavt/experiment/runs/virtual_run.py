@@ -18,14 +18,15 @@ from lavt.assembly.nodes import ClientNodes, ServerNodes, build_client, build_se
 from lavt.config import Costs, RunConfig
 from lavt.config_file import load_config, shipped
 from lavt.domain import NS_PER_S, NS_PER_US, GroundTruth, Now
-from lavt.experiment.runs.network import NetworkDelays, injected_network, virtual_network
+from lavt.experiment.runs.network import NetworkDelays, in_ns, injected_network, virtual_delay
 from lavt.experiment.runs.plan import PlannedRun
 from lavt.experiment.runs.side_configs import client_config, server_config
 from lavt.recording.output_directory import make_directory
 from lavt.recording.provenance import provenance
 from lavt.recording.record import RecordWriter
 from lavt.runtime.recorder import Recorders
-from lavt.runtime.virtual import HostClock, VirtualHost, VirtualLink, VirtualRuntime, modelled_clock_source
+from lavt.runtime.virtual import Cost, HostClock, VirtualHost, VirtualLink, VirtualRuntime, modelled_clock_source
+from lavt.streams import QuantileStream
 from lavt.transport.emulation.delay_line import DelayLine, DelayModel
 from lavt.transport.emulation.link import EmulatedLink, LinkInjection
 from lavt.transport.emulation.relay import video_delay_index
@@ -98,7 +99,8 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
 
     Raises `UserError` for an invalid config, before the directory is created.
     """
-    config, seed, costs = planned.config, planned.seed, read_costs()
+    config, seed = planned.config, planned.seed
+    costs = read_costs() if config.costs == "measured" else read_costs().constant
     requested = planned.requested
     server_clock, client_clock = clocks or host_clocks(config)
     fidelity = FIDELITIES[config.fidelity]()
@@ -131,11 +133,7 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
             },
         )
     observer = DriveObserver()
-    costs_ns = {
-        (node, stage): round(cost_us * NS_PER_US)
-        for node, stages in costs.stages_us.items()
-        for stage, cost_us in stages.items()
-    }
+    costs_ns = stage_costs_ns(costs, seed)
     error_s, bound_s = config.clocks.error_us / 1e6, config.clocks.bound_us / 1e6
     hosts = [
         VirtualHost(
@@ -165,11 +163,25 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
         seed,
         state_delay=config.network.state_delay,
     )
-    runtime = VirtualRuntime(hosts, virtual_links(virtual_network(injected, costs)))
+    runtime = VirtualRuntime(hosts, virtual_links(injected, costs, seed))
     return VirtualLoop(runtime, server, client, observer, (server_writer, client_writer), digest)
 
 
-def virtual_links(network: NetworkDelays) -> dict[str, VirtualLink]:
+def stage_costs_ns(costs: Costs, seed: int) -> dict[tuple[str, str], Cost]:
+    """Return the time of each stage in ns, by node and stage; it is drawn if the costs have quantiles of the stage."""
+    costs_ns: dict[tuple[str, str], Cost] = {
+        (node, stage): round(cost_us * NS_PER_US)
+        for node, stages in costs.stages_us.items()
+        for stage, cost_us in stages.items()
+    }
+    for node, stages_us in costs.stage_quantiles_us.items():
+        for stage, quantiles_us in stages_us.items():
+            name = f"cost of stage {node} {stage}"
+            costs_ns[node, stage] = QuantileStream(seed, name, costs.levels, in_ns(quantiles_us))
+    return costs_ns
+
+
+def virtual_links(network: NetworkDelays, costs: Costs, seed: int) -> dict[str, VirtualLink]:
     """Return the links of all channels that cross the network.
 
     In reality, commands and session requests share a network path. Here each of the two channels has a delay line and
@@ -180,21 +192,30 @@ def virtual_links(network: NetworkDelays) -> dict[str, VirtualLink]:
     def packet_number(_payload: bytes, number: int) -> int:
         return number
 
-    def link(
-        delay: DelayModel, injected: LinkInjection | None = None, index: Callable[[bytes, int], int] = packet_number
-    ) -> VirtualLink:
-        return VirtualLink(DelayLine(delay, None if injected is None else EmulatedLink(injected)), index)
+    def video_frame(payload: bytes, _number: int) -> int:
+        return video_delay_index(payload)
 
     session = None if network.control_injected is None else replace(network.control_injected, name="session")
+    links: dict[str, tuple[DelayModel, str, LinkInjection | None]] = {
+        "rtp": (network.video, "video", network.video_injected),
+        "control": (network.control, "control", network.control_injected),
+        "state": (network.state, "state", None),
+        "feedback": (network.without_injection, "state", None),
+        "session": (network.control, "control", session),
+        "session_reply": (network.state, "state", None),
+        "probe_request": (network.without_injection, "state", None),
+        "probe_reply": (network.without_injection, "state", None),
+    }
+    """By channel: the requested delay, the key of the link's own latency in the costs, and what else is injected."""
     return {
-        "rtp": link(network.video, network.video_injected, lambda payload, _number: video_delay_index(payload)),
-        "control": link(network.control, network.control_injected),
-        "state": link(network.state),
-        "feedback": link(network.without_injection),
-        "session": link(network.control, session),
-        "session_reply": link(network.state),
-        "probe_request": link(network.without_injection),
-        "probe_reply": link(network.without_injection),
+        channel: VirtualLink(
+            DelayLine(
+                virtual_delay(requested, costs, cost_key, seed, channel),
+                None if injected is None else EmulatedLink(injected),
+            ),
+            video_frame if channel == "rtp" else packet_number,
+        )
+        for channel, (requested, cost_key, injected) in links.items()
     }
 
 

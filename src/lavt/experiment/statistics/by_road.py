@@ -31,14 +31,6 @@ def _route_name(route: str) -> str:
     return route.removesuffix(".yaml").removesuffix(".yml")
 
 
-def road_rates(runs: Sequence[Run]) -> list[float]:
-    """Return the completion rate of each road, sorted by road."""
-    return [
-        sum(run["ending"] == "completed" for run in runs_on_road) / len(runs_on_road)
-        for runs_on_road in group_by_road(runs).values()
-    ]
-
-
 def group_by_road(runs: Sequence[Run]) -> dict[str, list[Run]]:
     """Group the runs by road, sorted by road."""
     runs_on: dict[str, list[Run]] = {}
@@ -65,6 +57,7 @@ def by_road(valid_runs: Sequence[Run], common_p95_m: Callable[[Sequence[Run]], S
         ],
         "collisions_per_run": lambda runs: [float(run["collisions"]) for run in runs],
         "p95_m": lambda runs: completed_values(runs, "p95_m"),
+        "p95_all_runs_m": lambda runs: [run["p95_m"] for run in runs if run.get("p95_m") is not None],
         "followed_p95_m": lambda runs: completed_values(runs, "followed_p95_m"),
         "p95_common_m": common_p95_m,
     }

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from lavt.experiment.statistics.by_road import by_road, completed_values, road_rates
-from lavt.experiment.statistics.intervals import bootstrap_interval, exact_interval, stratified_interval
+from lavt.experiment.statistics.by_road import by_road, completed_values
+from lavt.experiment.statistics.intervals import exact_interval, exact_rate_interval, stratified_interval
 from lavt.experiment.statistics.survival import survival
 
 Run = Mapping[str, Any]
@@ -48,10 +48,10 @@ def summarize_condition(all_runs: Sequence[Run], distances: CommonDistances) -> 
     return {
         **completion(runs),
         **own_lane_completion(runs),
-        "completion_interval_over_roads": bootstrap_interval(road_rates(runs)),
         "endings": dict(sorted(Counter(str(run["ending"]) for run in runs).items())),
         "routes": {name: _summarize_route(routes[name], distances) for name in sorted(routes)},
         "collisions_per_run": _mean([run["collisions"] for run in runs]),
+        "collisions_per_run_interval": exact_rate_interval(sum(run["collisions"] for run in runs), len(runs)),
         "lane_invasions_per_run": _mean([run["lane_invasions"] for run in runs]),
         "collisions_per_km": _per_km(runs, "collisions"),
         "lane_invasions_per_km": _per_km(runs, "lane_invasions"),
@@ -67,7 +67,7 @@ def summarize_condition(all_runs: Sequence[Run], distances: CommonDistances) -> 
         "p95_worst_rank_m": worst_rank_m(runs),
         **{name: _mean([run[name] for run in runs if run.get(name) is not None]) for name in MEANS},
         **{f"{name}_per_run": _lane_kept_mean(runs, name) for name in ("followed_changes", "occupied_changes")},
-        "own_lane_share": _lane_kept_mean(runs, "own_lane_share"),
+        **{name: _lane_kept_mean(runs, name) for name in ("own_lane_share", "followed_unknown_share")},
         "injected_ms": _injected_ms(all_runs),
         "tau_v_ms": _latency([run["tau_v_ms"] for run in runs], bounded=True),
         "tau_c_ms": _latency([run["tau_c_ms"] for run in runs], bounded=True),
@@ -165,7 +165,7 @@ def _route_balanced(runs_by_route: Sequence[Sequence[Run]], name: str) -> float 
 
 
 def _lane_kept_mean(runs: Sequence[Run], name: str) -> float | None:
-    return _mean([run["lane_kept"][name] for run in runs if run.get("lane_kept")])
+    return _mean([run["lane_kept"][name] for run in runs if name in (run.get("lane_kept") or {})])
 
 
 def _mean(values: Sequence[float]) -> float | None:

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
-from scipy.stats import binomtest, bootstrap, norm, t
+from scipy.stats import binomtest, bootstrap, chi2, norm, t
 
-from lavt.domain import FloatArray
 from lavt.streams import stream
 
 RESAMPLES = 10_000
@@ -37,40 +36,39 @@ def _clopper_pearson(successes: int, trials: int) -> tuple[float, float]:
     return float(interval.low), float(interval.high)
 
 
-def bootstrap_interval(values: Sequence[float]) -> list[float] | None:
-    """Return the 95 % percentile bootstrap interval of the mean; None for fewer than two values.
+def exact_rate_interval(count: int, runs: int) -> list[float] | None:
+    """Return the 95 % interval of the mean number of events per run, from the number of all events; None without runs.
 
-    The resampling has a fixed seed, so the interval is reproducible.
+    It is exact for Poisson distributed numbers, also if the runs have different rates (F. Garwood, Fiducial Limits for
+    the Poisson Distribution, Biometrika 28, 1936), and too wide if a run has at most one event.
     """
-    if len(values) < 2:
+    if runs == 0:
         return None
-    return list(_bootstrap(tuple(values), 0.95))
+    low = float(chi2.ppf(0.025, 2 * count)) / 2 if count else 0.0
+    return [low / runs, float(chi2.ppf(0.975, 2 * count + 2)) / 2 / runs]
 
 
 def stratified_interval(strata: Sequence[Sequence[float]]) -> list[float] | None:
-    """Return the 95 % percentile bootstrap interval of the mean of all values, resampled within each stratum.
+    """Return the 95 % interval of the mean of all values, from the spread within each stratum.
 
-    So differences between the strata do not widen the interval. A stratum with one value has no spread. The result is
-    None if no stratum has two values. The resampling has a fixed seed.
+    So differences between the strata do not widen the interval. It is Student's t, with the degrees of freedom of
+    F. E. Satterthwaite (An Approximate Distribution of Estimates of Variance Components, Biometrics Bulletin 2, 1946),
+    because the strata may spread differently. A stratum with one value has no spread. The result is None if no stratum
+    has two values.
     """
-    samples = [np.asarray(values, np.float64) for values in strata if len(values) > 1]
-    if not samples:
+    samples = [np.asarray(values, np.float64) for values in strata if values]
+    spread = [values for values in samples if len(values) > 1]
+    if not spread:
         return None
-    constant = sum(values[0] for values in strata if len(values) == 1)
-    count = sum(map(len, strata))
-
-    def pooled_mean(*resampled: FloatArray, axis: int) -> FloatArray:
-        return np.asarray((sum(values.sum(axis=axis) for values in resampled) + constant) / count)
-
-    interval = bootstrap(
-        samples,
-        pooled_mean,
-        n_resamples=RESAMPLES,
-        confidence_level=0.95,
-        method="percentile",
-        random_state=stream(0, "bootstrap interval"),
-    ).confidence_interval
-    return [float(interval.low), float(interval.high)]
+    count = sum(map(len, samples))
+    mean = float(sum(values.sum() for values in samples)) / count
+    variances = np.array([len(values) * values.var(ddof=1) for values in spread]) / count**2
+    variance = float(variances.sum())
+    if variance == 0:
+        return [mean, mean]
+    freedom = variance**2 / np.sum(variances**2 / [len(values) - 1 for values in spread])
+    half_width = float(t.ppf(0.975, freedom)) * math.sqrt(variance)
+    return [mean - half_width, mean + half_width]
 
 
 def has_enough_clusters(count: int) -> bool:

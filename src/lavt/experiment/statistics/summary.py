@@ -10,7 +10,7 @@ from lavt.experiment.statistics.conditions import Run, summarize_conditions
 from lavt.experiment.statistics.contrasts import paired_contrasts
 from lavt.experiment.statistics.paper_results import paper
 
-SCHEMA = 1
+SCHEMA = 2
 
 GROUP_KEYS = ("fidelity", "inherent", "changes", "controller", "preset", "driver")
 """The keys whose values are equal for all runs of a group, besides the axes of the sweep.

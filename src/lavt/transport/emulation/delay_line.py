@@ -13,7 +13,7 @@ from functools import lru_cache
 from typing import Any
 
 from lavt.domain import NS_PER_MS
-from lavt.streams import IndexedStream
+from lavt.streams import IndexedStream, QuantileStream
 from lavt.transport.emulation.link import EmulatedLink
 
 
@@ -27,21 +27,28 @@ class Lognormal:
 
 @dataclass(frozen=True, slots=True)
 class DelayModel:
-    """A constant delay plus optional jitter, drawn for each index from the random-number stream `name` of `seed`."""
+    """A constant delay plus optional jitter, drawn for each index from the random-number stream `name` of `seed`.
+
+    `measured_ns` is a further random delay in nanoseconds, with the distribution of a measurement. An item draws it by
+    its index divided by `indices_per_draw`.
+    """
 
     constant_ms: float
     jitter: Lognormal | None = None
     seed: int = 0
     name: str = ""
+    measured_ns: QuantileStream | None = None
+    indices_per_draw: int = 1
 
     def median_ms(self) -> float:
-        """Return the median delay."""
+        """Return the median delay without the measured part."""
         return max(0.0, self.constant_ms + (0.0 if self.jitter is None else self.jitter.median_ms))
 
     def delay_ns(self, index: int) -> int:
         """Return the delay of the item with this index in nanoseconds; it is never negative."""
         jitter_ms = 0.0 if self.jitter is None else _lognormal_ms(self.seed, self.name, index, self.jitter)
-        return max(0, round((self.constant_ms + jitter_ms) * NS_PER_MS))
+        delay_ns = max(0, round((self.constant_ms + jitter_ms) * NS_PER_MS))
+        return delay_ns if self.measured_ns is None else delay_ns + self.measured_ns.at(index // self.indices_per_draw)
 
 
 @lru_cache(maxsize=256)

@@ -13,6 +13,8 @@ from lavt.errors import UserError
 ORDER_RATE_BPS: Final = 10_000_000_000
 """The rate that netem gets for a flow without a rate limit, because netem keeps packets in order only if it has a rate.
 This rate adds 1 us to the delay of each packet."""
+QUEUE_PACKETS: Final = 10_000
+"""The queue limit that LAVT gives to netem."""
 
 Distribution = Literal["normal", "uniform", "pareto", "paretonormal"]
 DISTRIBUTIONS: Final[tuple[Distribution, ...]] = ("normal", "uniform", "pareto", "paretonormal")

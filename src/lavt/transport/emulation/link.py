@@ -16,14 +16,18 @@ from typing import Final
 
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
-from lavt.transport.emulation.impairment import Impairment, burst_probabilities, check_impairment, has_loss_bursts
+from lavt.transport.emulation.impairment import (
+    QUEUE_PACKETS,
+    Impairment,
+    burst_probabilities,
+    check_impairment,
+    has_loss_bursts,
+)
 from lavt.transport.emulation.random_process import QUANTILES, CorrelatedProcess, Draws, LossProcess, quantiles
 from lavt.transport.emulation.trace import OPPORTUNITY_BYTES, CapacityTrace, DelayTrace, Trace
 
 HEADER_BYTES: Final = 42
 """Ethernet, IPv4 and UDP headers, which netem counts in addition to the payload."""
-QUEUE_PACKETS: Final = 10_000
-"""The queue limit that LAVT gives to netem."""
 SLOT_NS: Final = 20 * NS_PER_MS
 """Correlated jitter changes once per slot."""
 

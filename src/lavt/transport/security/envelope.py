@@ -16,8 +16,6 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Any, Final
 
-from msgspec import Struct
-
 from lavt.domain import Command, NetemRequest, RunRequest, SessionReply, SessionRequest
 from lavt.errors import BadMessage
 from lavt.transport.messages import MAX_MESSAGE_BYTES, MAX_RUN_REPLY_BYTES, decode
@@ -30,6 +28,7 @@ from lavt.transport.security.keys import (
     decrypt,
     encrypt,
 )
+from lavt.transport.security.verified import VerifiedReply, VerifiedRequest, VerifiedState
 
 MAC_BYTES: Final = 16
 """Size of a MAC, which costs a fiftieth of a signature: it separates the active operator's messages from a flood."""
@@ -80,24 +79,6 @@ def _signed_part(data: bytes) -> bytes:
     return data[:-TRAILER_BYTES] if len(data) <= MAX_ENVELOPE_BYTES else b""
 
 
-class VerifiedRequest(Struct, frozen=True):
-    """A request with a valid signature, and the data that its reply needs."""
-
-    channel: str
-    operator: str
-    body: bytes
-    """The request itself; empty: it requests only the next replay counter."""
-    digest: bytes
-    """Digest of the request's envelope, which the reply repeats."""
-    secret: bytes
-    """The secret shared with the client, with which the reply is encrypted."""
-    public: bytes
-    """The server's public key of the agreement on the secret."""
-    must_retry: bool
-    """The body is ignored, and the reply demands the request again, with the replay counter in that reply. The request
-    had a wrong counter, so it could be a replay, or it was empty."""
-
-
 class NullVehicleAuthenticator:
     """The vehicle's authenticator if nothing is signed: it accepts every message and signs none."""
 
@@ -129,6 +110,10 @@ class NullVehicleAuthenticator:
 
     def sign_reply(self, _request: VerifiedRequest, body: bytes) -> bytes:
         """Return the reply unchanged."""
+        return body
+
+    def sign_info(self, _nonce: bytes, body: bytes) -> bytes:
+        """Return the information unchanged."""
         return body
 
 
@@ -250,6 +235,10 @@ class VehicleAuthenticator(NullVehicleAuthenticator):
         signed = request.digest + (_RETRY if request.must_retry else _ANSWER) + counter + request.public + encrypted
         return signed + self._key.sign(_signing_context(f"{request.channel} reply", self._vehicle) + signed)
 
+    def sign_info(self, nonce: bytes, body: bytes) -> bytes:
+        """Sign the information about the vehicle for the query with this nonce, so that it cannot be replayed."""
+        return body + self._key.sign(_signing_context("info", self._vehicle) + nonce + body)
+
     def _update_session(self, request: VerifiedRequest, body: bytes) -> None:
         """Update the active operator and the session's MACs from a reply that is about to be sent."""
         if request.channel != "session":
@@ -259,22 +248,6 @@ class VehicleAuthenticator(NullVehicleAuthenticator):
             self._active_operator, self._macs = "", _SessionMacs()
         elif reply.granted and reply.token:
             self._active_operator, self._macs = request.operator, _SessionMacs(reply.token)
-
-
-class VerifiedReply(Struct, frozen=True):
-    """The result of verifying a reply: its body, or the envelope of the request to send again, or neither."""
-
-    body: bytes | None
-    repeated_request: bytes | None
-
-
-class VerifiedState(Struct, frozen=True):
-    """The result of verifying a state; `body` is None if the state must be dropped."""
-
-    body: bytes | None
-    client_must_request: bool
-    """Whether the client must send a request: the server's process that signed the state has not answered a request of
-    this client yet, so the state could be a replay."""
 
 
 class OperatorAuthenticator:
@@ -389,6 +362,13 @@ class OperatorAuthenticator:
             return VerifiedState(None, client_must_request=True)
         self._newest_state_number = number
         return VerifiedState(signed[REPLAY_COUNTER_BYTES:], client_must_request=False)
+
+
+def verify_info(vehicle: str, key: PublicKey, nonce: bytes, data: bytes) -> bytes | None:
+    """Return the information that a vehicle has signed for the query with this nonce, otherwise None."""
+    body, signature = data[:-SIGNATURE_BYTES], data[-SIGNATURE_BYTES:]
+    is_signed = key.verify(signature, _signing_context("info", vehicle) + nonce + body)
+    return body if len(data) <= MAX_ENVELOPE_BYTES and is_signed else None
 
 
 def _digest(data: bytes) -> bytes:

@@ -11,10 +11,14 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
-from lavt.domain import NS_PER_S, Now
+import lavt
+from lavt.domain import NS_PER_S, Now, State, VehicleInfo
+from lavt.errors import BadMessage
 from lavt.node import Peer, Send
-from lavt.transport.security.envelope import REQUESTS, NullVehicleAuthenticator, OperatorAuthenticator, VerifiedRequest
+from lavt.transport.messages import decode, encode
+from lavt.transport.security.envelope import REQUESTS, NullVehicleAuthenticator, OperatorAuthenticator
 from lavt.transport.security.flood_filter import REQUESTS_PER_S, FloodFilter, RateLimiter
+from lavt.transport.security.verified import VerifiedRequest
 
 Deliver = Callable[[str, Any, Now, Peer], None]
 """Takes (channel, payload, arrived, peer) of each authentic message."""
@@ -24,6 +28,10 @@ Carry = Callable[..., None]
 OWN_REQUEST_PERIOD_NS: Final = NS_PER_S
 """The least time between two requests that the client's gateway sends by itself, to authenticate the server."""
 MAX_UNANSWERED_REQUESTS: Final = 64
+INFO_QUERIES_PER_S: Final = 50
+"""The limit for all who ask; the answer to a query takes one signature."""
+INFO_NONCE_BYTES: Final = 16
+"""Size of the random number in a query, which the signature of the answer covers."""
 STATES_PER_S: Final = 500
 """Ten times as many as a vehicle sends; to verify this many signatures takes 7 % of a core."""
 
@@ -54,8 +62,11 @@ class ServerGateway:
         self._flood_filter = FloodFilter(in_force, authenticator.is_from_active_operator)
         self._request_limiters = {channel: RateLimiter(REQUESTS_PER_S) for channel in REQUESTS}
         self._requests: dict[tuple[str, Peer], VerifiedRequest] = {}
-        self._retry_reply: Send | None = None
-        """A reply that tells the client to send its request again; it is sent as soon as the lock is free."""
+        self._info_limiter = RateLimiter(INFO_QUERIES_PER_S)
+        self._newest_state = b""
+        self._own_reply: Send | None = None
+        """A reply of the gateway itself, such as the demand to send a request again; it is sent as soon as the lock is
+        free."""
         self._counts: Counter[str] = Counter()
         self._lock = threading.Lock()
 
@@ -67,12 +78,12 @@ class ServerGateway:
     def receive(self, channel: str, payload: bytes, arrived: Now, peer: Peer) -> None:
         """Filter and verify a message from the link, and deliver it to the runtime if it is authentic."""
         with self._lock:
-            verify = self._verify_command if channel == "control" else self._verify_request
+            verify = {"control": self._verify_command, "info": self._answer_info}.get(channel, self._verify_request)
             body = verify(channel, payload, arrived.mono_ns, peer)
-            retry_reply, self._retry_reply = self._retry_reply, None
+            own_reply, self._own_reply = self._own_reply, None
         # Sent outside the lock: the link can block for its router, which must not block `send`.
-        if retry_reply is not None:
-            self._carry(retry_reply)
+        if own_reply is not None:
+            self._carry(own_reply)
         if body is not None:
             self._deliver(channel, body, arrived, peer)
 
@@ -96,12 +107,35 @@ class ServerGateway:
         if request is None:
             return None
         if request.must_retry:
-            self._retry_reply = Send(f"{channel}_reply", self._authenticator.sign_reply(request, b""), peer)
+            self._own_reply = Send(f"{channel}_reply", self._authenticator.sign_reply(request, b""), peer)
             return None
         self._requests[channel, peer] = request
         if len(self._requests) > MAX_UNANSWERED_REQUESTS:
             self._requests.pop(next(iter(self._requests)))
         return request.body
+
+    def _answer_info(self, _channel: str, nonce: bytes, now_ns: int, peer: Peer) -> None:
+        """Answer a query for information about the vehicle, from the newest state; the nodes do not receive it."""
+        if not self._info_limiter.take(now_ns):
+            self._counts["info_queries_screened_out"] += 1
+            return
+        if len(nonce) != INFO_NONCE_BYTES:
+            self._counts["info_queries_unreadable"] += 1
+            return
+        try:
+            state = decode(State, self._newest_state)
+        except BadMessage:  # there is no state yet
+            return
+        info = VehicleInfo(
+            lavt.__version__,
+            state.safety,
+            state.reason,
+            state.active_operator,
+            state.speed_mps,
+            max(0, now_ns - state.state_mono_ns),
+            state.instance,
+        )
+        self._own_reply = Send("info_reply", self._authenticator.sign_info(nonce, encode(info)), peer)
 
     def send(self, *sends: Send) -> None:
         """Sign messages from the runtime and pass them to the link; a reply without a pending request is dropped."""
@@ -111,6 +145,7 @@ class ServerGateway:
 
     def _sign(self, send: Send) -> Send | None:
         if send.channel == "state":
+            self._newest_state = send.payload
             return Send("state", self._authenticator.sign_state(send.payload))
         request = self._requests.pop((send.channel.removesuffix("_reply"), send.peer), None)
         if request is None:

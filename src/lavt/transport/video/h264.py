@@ -1,8 +1,8 @@
 """H.264 encoder and decoder: one access unit for each picture, without a frame of delay on either side.
 
-This is the only module that imports PyAV (libx264 and FFmpeg's decoder). The encoder uses constrained baseline, no
-look-ahead and a constant bit rate with a small decoder buffer (VBV), so that no frame is much larger than its share.
-The decoder uses one thread, since each of FFmpeg's frame threads adds one frame of delay.
+This module uses PyAV (libx264 and FFmpeg's decoder). The encoder uses constrained baseline, no look-ahead
+and a constant bit rate with a small decoder buffer (VBV), so that no frame is much larger than its share. The decoder
+uses one thread, since each of FFmpeg's frame threads adds one frame of delay.
 """
 
 from __future__ import annotations

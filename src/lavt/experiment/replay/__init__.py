@@ -1,0 +1,1 @@
+"""Replays of finished runs: videos made from their records."""

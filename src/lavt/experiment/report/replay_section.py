@@ -1,0 +1,59 @@
+"""The replay in a report: the runs with the least and with the most injected delay, side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from lavt.experiment.analysis.drive_data import DriveData
+from lavt.experiment.report import html_page
+from lavt.experiment.report.run_sections import DriveSets
+from lavt.experiment.report.sections import Parts, ReportContext
+
+FILE = "replay.mp4"
+WIDTH_PX, RATE_HZ, SPEED, UNTIL_S = 960, 10.0, 2.0, 40.0
+
+
+def replay_parts(report: ReportContext, sets: DriveSets) -> Parts:
+    """Return the replay of two runs that differ in delay; nothing if no two runs with video do."""
+    pairs = (least_and_most_delayed(drives) for drives in sets.values())
+    pair = next((pair for pair in pairs if pair), None)
+    if pair is None:
+        return []
+    # Slow to import, and not needed without video.
+    from lavt.experiment.replay.replay import replay_pictures  # noqa: PLC0415
+    from lavt.transport.video.video_file import write_video  # noqa: PLC0415
+
+    pictures = replay_pictures(
+        [drive.directory for drive in pair], rate_hz=RATE_HZ, speed=SPEED, until_s=UNTIL_S, width_px=WIDTH_PX
+    )
+    write_video(report.directory / FILE, pictures, RATE_HZ)
+    names = " and ".join(str(drive.result["run"]) for drive in pair)
+    caption = (
+        f"The runs {names}, those with the least and the most injected delay on the first route and in the first "
+        f"repetition, at {SPEED:g} times the speed: the frame from which the command in force was made, with the lane "
+        "that the driver detected in it; the road from above; and the distance from the lane centre."
+    )
+    return [html_page.video(FILE, f"replay of the runs {names}", caption)]
+
+
+def least_and_most_delayed(drives: Sequence[DriveData]) -> list[DriveData]:
+    """Return the runs with the least and the most injected delay of the first route and repetition that has both.
+
+    Runs without video or without a drive do not count. The result is empty if there are no such runs.
+    """
+    groups: dict[tuple[str, int], list[DriveData]] = {}
+    for drive in drives:
+        has_video = drive.result.get("fidelity") in {None, "video"} and (drive.directory / "client.mcap").is_file()
+        if has_video and len(drive.truth):
+            key = str(drive.result["route"]), int(drive.result.get("repetition") or 0)
+            groups.setdefault(key, []).append(drive)
+    for _, members in sorted(groups.items()):
+        least, most = (choose(members, key=_injected_ms) for choose in (min, max))
+        if _injected_ms(least) < _injected_ms(most):
+            return [least, most]
+    return []
+
+
+def _injected_ms(drive: DriveData) -> float:
+    injected_ms = drive.result.get("injected_ms") or {}
+    return sum(value or 0.0 for value in injected_ms.values())

@@ -1,0 +1,204 @@
+"""The search for vehicles: queries to all vehicles behind a router, and scouting for routers on the local network.
+
+Anybody on the network can answer, and with anything. So the number and the size of answers are limited, an invalid
+answer is counted, and addresses of strangers are dialled only if they are numeric.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import itertools
+import json
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Final, NamedTuple
+
+import zenoh
+from msgspec import Struct, field
+
+from lavt.clock import Clock, pause
+from lavt.domain import NS_PER_MS, NS_PER_S, VehicleInfo
+from lavt.errors import BadMessage
+from lavt.transport.messages import NAME, VERSION, decode, decode_versions
+from lavt.transport.security.keys import SIGNATURE_BYTES
+from lavt.transport.zenoh_config import SessionSettings, check_endpoints, check_private_keys, error_text
+from lavt.transport.zenoh_link import RouterUnreachable, load_zenoh_config, open_zenoh
+
+SELECTOR: Final = "lavt/*/info"
+KEY: Final = re.compile(rf"lavt/({NAME.pattern.removeprefix('^').removesuffix(chr(92) + 'Z')})/info\Z")
+MAX_ANSWERS: Final = 64
+"""The number of answers to one query that are read."""
+MAX_VEHICLES: Final = 256
+MAX_MESSAGE_BYTES: Final = 65_536
+"""The longest message that the session of a search receives; Zenoh's own limit is 1 GB."""
+MAX_ROUTERS: Final = 16
+"""The number of routers that scouting returns."""
+MAX_LOCATORS: Final = 4
+"""The number of addresses of one router that are dialled."""
+LOCATOR: Final = re.compile(
+    r"(?:udp|quic|tcp|tls)/(?:(?P<v4>[0-9.]{7,15})|\[(?P<v6>[0-9a-fA-F:.]{2,45})\]):[0-9]{1,5}(?:\?[a-z0-9_=;]{1,64})?\Z"
+)
+SCOUT_STEP_NS: Final = 20 * NS_PER_MS
+
+Verify = Callable[[str, bytes, bytes], bytes | None]
+"""Takes a vehicle's name, the nonce of the query and the answer; returns the answer without its signature, or None if
+the vehicle has not signed it."""
+
+
+class Answer(NamedTuple):
+    """An answer to a query, by anybody."""
+
+    key: str
+    payload: bytes
+    nonce: bytes
+    """The random bytes in the query."""
+    round_trip_ns: int
+
+
+class FoundVehicle(Struct):
+    """A vehicle that has answered."""
+
+    name: str
+    router: str
+    """The endpoints of the router over which it answered first."""
+    message_version: int
+    lavt_version: str
+    info: VehicleInfo | None
+    """Its newest information; None if the version of its messages is another."""
+    is_authentic: bool
+    """Whether the key of this vehicle is known, and has signed the information."""
+    round_trips_ns: list[int] = field(default_factory=list)
+
+
+class FoundVehicles:
+    """The vehicles that have answered, collected over several queries and routers.
+
+    `verify` has the functions that verify the answers of the vehicles whose keys are known, by the vehicle's name.
+    """
+
+    def __init__(self, verify: Mapping[str, Verify]) -> None:
+        self.counts: Counter[str] = Counter()
+        self._verify = verify
+        self._vehicles: dict[tuple[str, int | None], FoundVehicle] = {}
+
+    def vehicles(self) -> list[FoundVehicle]:
+        """Return the vehicles by name; there are several of one name if they have several servers."""
+        return sorted(self._vehicles.values(), key=lambda vehicle: vehicle.name)
+
+    def add(self, answer: Answer, router: str) -> None:
+        """Add an answer, or count it if it is invalid, not authentic, or one too many."""
+        match = KEY.match(answer.key)
+        if match is None:
+            self.counts["answers_unreadable"] += 1
+            return
+        name = match[1]
+        verify = self._verify.get(name)
+        payload = answer.payload if verify is None else verify(name, answer.nonce, answer.payload)
+        if payload is None:
+            self.counts["answers_forged"] += 1
+            return
+        try:
+            versions, info = _parse(payload)
+        except BadMessage:
+            self.counts["answers_unreadable"] += 1
+            return
+        key = (name, None if info is None else info.instance)
+        vehicle = self._vehicles.get(key)
+        if vehicle is None:
+            if len(self._vehicles) >= MAX_VEHICLES:
+                self.counts["answers_beyond_limit"] += 1
+                return
+            vehicle = self._vehicles[key] = FoundVehicle(name, router, *versions, info, verify is not None)
+        vehicle.info = info
+        if vehicle.router == router:
+            vehicle.round_trips_ns.append(answer.round_trip_ns)
+
+
+def _parse(payload: bytes) -> tuple[tuple[int, str], VehicleInfo | None]:
+    """Return the versions in an answer and, if they are known, its information; raise `BadMessage` for anything else.
+
+    The signature of a vehicle whose key is unknown is ignored.
+    """
+    for body in (payload, payload[:-SIGNATURE_BYTES]):
+        try:
+            versions = decode_versions(body)
+        except BadMessage:
+            continue
+        return versions, decode(VehicleInfo, body) if versions[0] == VERSION else None
+    raise BadMessage("the answer has no versions")
+
+
+class SearchSession:
+    """A session with a router, to query all vehicles behind it. Raises `RouterUnreachable` if no router answers."""
+
+    def __init__(self, clock: Clock, settings: SessionSettings) -> None:
+        self._clock = clock
+        config = load_zenoh_config(
+            settings.path, {**settings.changes, "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES}
+        )
+        endpoints = check_endpoints(config, "the router")
+        check_private_keys(config)
+        self.router: str = ", ".join(endpoints)
+        try:
+            self._session: Any = open_zenoh(config)
+        except zenoh.ZError as error:
+            raise RouterUnreachable(
+                f"no router answers at {endpoints}: {settings.advice} ({error_text(error)})"
+            ) from error
+
+    def query(self, nonce: bytes, timeout_s: float) -> list[Answer]:
+        """Query all vehicles, and return the first answers within `timeout_s`."""
+        sent_ns = self._clock.now().mono_ns
+        answers = []
+        replies = self._session.get(
+            SELECTOR,
+            payload=nonce,
+            timeout=timeout_s,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            target=zenoh.QueryTarget.ALL,
+        )
+        for reply in itertools.islice(replies, MAX_ANSWERS):
+            round_trip_ns = self._clock.now().mono_ns - sent_ns
+            if reply.ok is not None:
+                answers.append(Answer(str(reply.ok.key_expr), reply.ok.payload.to_bytes(), nonce, round_trip_ns))
+        return answers
+
+    def close(self) -> None:
+        """Close the session."""
+        self._session.close()
+
+
+def scout(clock: Clock, duration_s: float) -> list[list[str]]:
+    """Ask by multicast which routers are on the local network; return the usable endpoints of each."""
+    config = zenoh.Config()
+    config.insert_json5("scouting/multicast/enabled", json.dumps(True))
+    hellos: dict[str, list[str]] = {}
+    scouting: Any = zenoh.scout(what="router", config=config)
+    try:
+        end_ns = clock.now().mono_ns + round(duration_s * NS_PER_S)
+        while clock.now().mono_ns < end_ns and len(hellos) < MAX_ROUTERS:
+            hello = scouting.try_recv()
+            if hello is None:
+                pause(SCOUT_STEP_NS)
+            else:
+                hellos.setdefault(str(hello.zid), usable_locators(hello.locators))
+    finally:
+        scouting.stop()
+    return [locators for locators in hellos.values() if locators]
+
+
+def usable_locators(locators: Iterable[Any]) -> list[str]:
+    """Return the endpoints that another machine can dial: numeric, and neither on its own machine nor link-local."""
+    usable = []
+    for locator in locators:
+        match = LOCATOR.match(str(locator))
+        if match is None:
+            continue
+        try:
+            address = ipaddress.ip_address(match["v4"] or match["v6"])
+        except ValueError:
+            continue
+        if not (address.is_loopback or address.is_link_local or address.is_multicast or address.is_unspecified):
+            usable.append(str(locator))
+    return usable[:MAX_LOCATORS]
