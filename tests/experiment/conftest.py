@@ -175,9 +175,13 @@ def write_frame(writer: RecordWriter, drive: SyntheticDrive, number: int) -> Non
     writer.write("timeline", {**timeline, "stages": stages}, now)
 
 
+def slowness_ms(drive: SyntheticDrive, number: int) -> float:
+    return drive.slow_frame_ms if number % 10 == 0 else 0.0
+
+
 def write_admission(writer: RecordWriter, drive: SyntheticDrive, sequence: int, number: int, delay_ns: int) -> None:
     read_ns = number * FRAME_NS + drive.tau_v_of_frame_ns(number)
-    client_ms = drive.client_ms + (drive.slow_frame_ms if number % 10 == 0 else 0.0)
+    client_ms = drive.client_ms + slowness_ms(drive, number)
     sent_ns = read_ns + round(client_ms * NS_PER_MS) + delay_ns
     received_ns = sent_ns + round(drive.tau_c_ms * NS_PER_MS)
     applied_ns = received_ns + round(drive.actuator_ms * NS_PER_MS)
@@ -234,8 +238,14 @@ def write_client(drive: SyntheticDrive, path: Path) -> None:
         }
         writer.write("picture", picture, read_at)
         arrived_ns = read_at.mono_ns - 4 * NS_PER_MS
-        stage_ends_ms = (("reorder", 1), ("decode", 3), ("read_stamp", 4), ("lane", 6), ("control", 7))
-        stages = [[name, arrived_ns + end_ms * NS_PER_MS] for name, end_ms in stage_ends_ms]
+        stage_ends_ms = (
+            ("reorder", 1),
+            ("decode", 3),
+            ("read_stamp", 4),
+            ("lane", 6),
+            ("control", 7 + slowness_ms(drive, number)),
+        )
+        stages = [[name, arrived_ns + round(end_ms * NS_PER_MS)] for name, end_ms in stage_ends_ms]
         timeline = {"node": "driver", "stamp_ns": stamp_ns, "channel": "access_unit", "arrived_mono_ns": arrived_ns}
         writer.write("timeline", {**timeline, "stages": stages}, read_at)
     writer.close()

@@ -132,7 +132,7 @@ def _latencies(
     entry = {
         "loop_ms": percentiles_ms(paired.loop_ns),
         "picture_age_ms": {"mean": age.mean_ms, "p95": age.p95_ms},
-        "loop_jitter_ms": _spread_ms(processing_ns(server.table("timeline"), decoded, paired)),
+        "loop_jitter_ms": _spread_ms(processing_ns(server, client, decoded, paired)),
         "age_at_actuation_ms": percentiles_ms(ages_at_actuation_ns(all_frames, command_verdicts, began_ns, ended_ns)),
         "tau_v_ms": _with_bound(percentiles_ms(tau_v_ns), bound_ms),
         "tau_c_ms": _with_bound(percentiles_ms(tau_c_ns), bound_ms),

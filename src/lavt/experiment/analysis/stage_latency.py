@@ -88,7 +88,7 @@ def video_link_ns(timelines: Table, received_frames: Table, frames: Table, offse
     the reading of the stamp. `timelines` are the server's.
     """
     stamps = received_frames.ints("stamp_ns")
-    sent_ns = _sent_by_camera_ns(timelines, stamps)
+    sent_ns = _last_end_ns(timelines, "camera", stamps)
     stamped_ns = look_up(frames.ints("stamp_ns"), frames.ints("stamped_mono_ns"), stamps)
     client_times = (received_frames.ints(name) for name in ("read_wall_ns", "read_mono_ns", "packet_mono_ns"))
     has_times = np.all([times != MISSING for times in (sent_ns, stamped_ns, *client_times)], axis=0)
@@ -99,29 +99,28 @@ def video_link_ns(timelines: Table, received_frames: Table, frames: Table, offse
     return np.asarray(video_latency_ns(readable, offset) - on_camera_ns - on_client_ns, np.int64)
 
 
-def _sent_by_camera_ns(timelines: Table, stamps: IntArray) -> IntArray:
-    """Return when the camera had sent each frame, on the server's monotonic clock; `MISSING` if it is unknown."""
-    camera = timelines.where(np.array([node == "camera" for node in timelines.texts("node")], np.bool_))
-    last_stages = [stages[-1] if stages else ("", MISSING) for stages in camera.objects("stages")]
-    return look_up(camera.ints("stamp_ns"), np.array([end_ns for _, end_ns in last_stages], np.int64), stamps)
+def _last_end_ns(timelines: Table, node: str, stamps: IntArray) -> IntArray:
+    """Return when a node had finished with each frame, on its host's monotonic clock; `MISSING` if it is unknown."""
+    of_node = timelines.where(np.array([name == node for name in timelines.texts("node")], np.bool_))
+    ends_ns = np.array([stages[-1][1] if stages else MISSING for stages in of_node.objects("stages")], np.int64)
+    latest_first = np.argsort(-ends_ns, kind="stable")
+    return look_up(of_node.ints("stamp_ns")[latest_first], ends_ns[latest_first], stamps)
 
 
-def processing_ns(timelines: Table, received_frames: Table, paired: FramesWithCommands) -> IntArray:
+def processing_ns(server: Record, client: Record, received_frames: Table, paired: FramesWithCommands) -> IntArray:
     """Return the part of each frame's loop latency that is not on the network, in ns.
 
-    It is the camera's time after the stamp, the client's time from the packet that completes the frame to the sending
-    of the command, and the actuator's time. Each is measured on one clock. `timelines` are the server's.
+    It is the camera's time after the stamp, the client's time from the packet that completes the frame to the frame's
+    first command, and the actuator's time. Each is measured on one clock. A command that was lost and repeated does not
+    count.
     """
     readable = received_frames.where(received_frames.flags("readable"))
-    packet_ns, read_ns = (
-        look_up(readable.ints("stamp_ns"), readable.ints(name), paired.stamp_ns)
-        for name in ("packet_mono_ns", "read_mono_ns")
-    )
-    sent_ns = _sent_by_camera_ns(timelines, paired.stamp_ns)
-    commands = paired.commands
-    command_times = (commands.ints(name) for name in ("sent_wall_ns", "stamp_received_wall_ns", "received_mono_ns"))
-    is_known = np.all([times != MISSING for times in (packet_ns, read_ns, sent_ns, *command_times)], axis=0)
-    processing = sent_ns - paired.stamped_mono_ns + read_ns - packet_ns + paired.client_ns + paired.actuator_ns
+    packet_ns = look_up(readable.ints("stamp_ns"), readable.ints("packet_mono_ns"), paired.stamp_ns)
+    sent_ns = _last_end_ns(server.table("timeline"), "camera", paired.stamp_ns)
+    decided_ns = _last_end_ns(client.table("timeline"), "driver", paired.stamp_ns)
+    received_ns = paired.commands.ints("received_mono_ns")
+    is_known = np.all([times != MISSING for times in (packet_ns, sent_ns, decided_ns, received_ns)], axis=0)
+    processing = sent_ns - paired.stamped_mono_ns + decided_ns - packet_ns + paired.actuator_ns
     return np.asarray(processing[is_known], np.int64)
 
 
