@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import functools
 import itertools
 import json
 import queue
@@ -685,13 +686,49 @@ def test_encrypted_configs_restrict_access(name: str) -> None:
     limits = {limit["id"]: limit for limit in json.loads(config.get_json("low_pass_filter"))}
     sizes = {name: limit["size_limit"] for name, limit in limits.items()}
     assert sizes == {"short": MAX_ENVELOPE_BYTES, "replies": MAX_ENVELOPE_BYTES, "parts": MAX_RUN_REPLY_ENVELOPE_BYTES}
-    limited_keys = {*limits["replies"]["key_exprs"], *limits["parts"]["key_exprs"]}
-    assert limited_keys == {f"lavt/*/{channel}" for channel in REPLY_CHANNELS}
+    assert limits["parts"]["key_exprs"] == ["**"]
+    short = [zenoh.KeyExpr(key) for key in limits["replies"]["key_exprs"]]
+    for key in (
+        *(f"lavt/v/{name}" for name in REPLY_CHANNELS),
+        "lavt/v/state",
+        "lavt/v/alive/x",
+        "x",
+        "x/y",
+        "a/b/c/d/e",
+    ):
+        assert any(limited.intersects(key) for limited in short) is (key != "lavt/v/run"), key
     access = json.loads(config.get_json("access_control"))
     assert access["enabled"] is (name != "router-client-tls.json5")
     assert access["default_permission"] == "deny"
     defined_rules = {rule["id"] for rule in access["rules"] or ()}
     assert defined_rules == {rule for policy in access["policies"] or () for rule in policy["rules"]}
+
+
+def test_only_replies_about_runs_can_be_long() -> None:
+    """With the filter of an encrypted router, a part of a record passes on the key `run`, and on no other one."""
+    limits = zenoh.Config.from_file(str(CONFIGS / "router-server-tls.json5")).get_json("low_pass_filter")
+    filtering = {"listen/endpoints": [LOCAL], "low_pass_filter": json.loads(limits)}
+    config = zenoh.Config.from_file(str(SESSION))
+    with closing(Router(CONFIGS / "router-server.json5", filtering)) as router:
+        config.insert_json5("connect/endpoints", json.dumps([loopback_endpoint(router)]))
+        with zenoh.open(config) as server, zenoh.open(config) as client:
+            longest = {}
+            for key in ("lavt/v/run", "lavt/v/session", "lavt/v/info", "lavt/v/alive/x", "x/y"):
+                queryable = server.declare_queryable(
+                    key, lambda query, key=key: query.reply(key, bytes(int(query.parameters["bytes"])))
+                )
+                ask = functools.partial(_longest_reply, client, key)
+                assert any(ask(1) for _ in range(100)), "the router knows the key after a moment"
+                longest[key] = max(ask(size) for size in (1280, 1281, 34_048, 34_049))
+                queryable.undeclare()
+    assert longest.pop("lavt/v/run") == 34_048
+    assert set(longest.values()) == {1280}
+
+
+def _longest_reply(session: zenoh.Session, key: str, size: int) -> int:
+    """Query a key for a reply of this size; return the size of the longest reply, 0 without any."""
+    replies = session.get(f"{key}?bytes={size}", timeout=ARRIVAL_TIMEOUT_S)
+    return max((len(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None), default=0)
 
 
 @pytest.mark.parametrize("name", sorted(path.name for path in CONFIGS.glob("router-*.json5") if "tls" not in path.name))
