@@ -16,7 +16,7 @@ from lavt.config import ClientConfig, RunConfig, SweepConfig
 from lavt.config_file import parse_config
 from lavt.domain import NS_PER_MS, Now, RunReply, RunRequest
 from lavt.errors import UserError, WorkError
-from lavt.experiment.runs import run_requests
+from lavt.experiment.runs import remote_run, run_requests
 from lavt.experiment.runs.plan import plan_run, plan_sweep
 from lavt.experiment.runs.remote_run import RemoteServer
 from lavt.experiment.runs.run_requests import ConnectionLost, RunRefused, RunRequests, fetch_record
@@ -58,8 +58,9 @@ def reply_to(request: RunRequest, **changed: Any) -> bytes:
 
 @pytest.fixture(autouse=True)
 def _no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fetch records without pauses."""
+    """Fetch records and ask for the phase without pauses."""
     monkeypatch.setattr(run_requests, "PART_PERIOD_NS", 0)
+    monkeypatch.setattr(remote_run, "POLL_NS", 0)
 
 
 def test_a_request_is_repeated_until_it_is_answered() -> None:
@@ -138,6 +139,26 @@ def test_a_wrong_record_is_rejected(tmp_path: Path, answer: Answer, announcement
     """A record with another digest, parts of a wrong length and impossible sizes are errors; no transfer is endless."""
     with pytest.raises(WorkError):
         fetch_record(Network(answer).requests, 7, announcement, tmp_path / "server.mcap")
+
+
+def test_the_transfer_of_a_record_has_a_deadline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """If the parts of a record arrive too slowly, the transfer ends with a sentence."""
+    monkeypatch.setattr(run_requests, "FETCH_LIMIT_S", 0.5)
+    endless = replace(DONE, size=4_000_000_000)
+    network = Network(lambda request: [reply_to(request, data=bytes(32_768))])
+    with pytest.raises(WorkError, match="arrived within"):
+        fetch_record(network.requests, 7, endless, tmp_path / "server.mcap")
+    assert len(network.sent) < 20
+
+
+def test_each_phase_of_a_run_has_a_deadline() -> None:
+    """A server that is always busy, or whose run never goes on, holds up a sweep for a limited time only."""
+    busy = Network(lambda request: [reply_to(request, refusal="busy", reason="operator-2 has a run")])
+    with pytest.raises(RunRefused, match="operator-2 has a run"):
+        remote_run._begin(busy.requests, 7, "{}")
+    stuck = Network(lambda request: [reply_to(request, phase="starting")])
+    with pytest.raises(WorkError, match="still starting after 90 s"):
+        remote_run._wait(stuck.requests, 7, lambda reply: reply.phase == "running", 90.0)
 
 
 def test_runs_that_cannot_be_requested_are_rejected_at_once() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,8 +18,9 @@ from lavt.config.remote_run import remote_part
 from lavt.config_file import parse_config
 from lavt.domain import RunReply, RunRequest
 from lavt.errors import UserError
+from lavt.experiment.runs import run_service
 from lavt.experiment.runs.run_service import RECORD, RunService
-from lavt.transport.messages import encode
+from lavt.transport.messages import VERSION, decode, encode
 
 # The expected values of the code's limits. They are not imported, so that a changed limit makes a test fail.
 LEASE_MS = 20_000
@@ -63,6 +65,7 @@ class Rig:
     """A service and the processes that it has started."""
 
     def __init__(self, out: Path, changes: dict[str, Any] | None = None) -> None:
+        self.out = out
         self.clock = ManualClock()
         self.processes: list[RunProcessStandIn] = []
         data = {"experiment": {"remote_runs": True}, "video": {"port": 7777}, **(changes or {})}
@@ -151,6 +154,16 @@ def test_a_record_is_read_in_parts(rig: Rig) -> None:
         ('"text"', "malformed"),
         ('{"unknown":1}', "invalid"),
         ('{"seed":NaN}', "invalid"),
+        ('{"vehicle":{"time_limit_s":Infinity}}', "invalid"),
+        ('{"vehicle":{"time_limit_s":1e9}}', "invalid"),
+        ('{"camera":{"rate_hz":NaN}}', "invalid"),
+        ('{"video":{"reorder_hold_ms":-Infinity}}', "invalid"),
+        (f'{{"seed":{"9" * 700}}}', "invalid"),
+        ('{"\\ud800":1}', "invalid"),
+        ('{"vehicle":{"route":"\\ud800"}}', "invalid"),
+        ('{"vehicle":{"car":"\\ud800"}}', "invalid"),
+        ('{"vehicle":{"scenery":"\\ud800"}}', "invalid"),
+        ('{"experiment":{"operator":"operator-2"}}', "invalid"),
         ('{"seed":-1}', "invalid"),
         ('{"camera":{"width_px":100000}}', "invalid"),
         ('{"camera":{"source":"device","device":"/etc/passwd"}}', "invalid"),
@@ -168,17 +181,32 @@ def test_a_record_is_read_in_parts(rig: Rig) -> None:
 )
 def test_invalid_settings_are_refused(rig: Rig, settings: str, refusal: str) -> None:
     """Settings that are not JSON, or that a file could not have either, start nothing; nor do paths of files."""
-    reply = rig.ask(replace(BEGIN, settings=settings))
+    reply = decode(RunReply, encode(rig.ask(replace(BEGIN, settings=settings))))
     assert (reply.refusal, reply.number) == (refusal, BEGIN.number)
     assert reply.reason
     assert not rig.processes
+    assert not list(rig.out.iterdir())
     assert rig.ask(BEGIN).refusal == ""
 
 
-@pytest.mark.parametrize("data", [b"", b"\xff", bytes(1025), encode(BEGIN)[:-1], encode(BEGIN) + b"\0"])
+OTHER_VERSION = encode(BEGIN).replace(bytes([VERSION]), bytes([VERSION + 1]), 1)
+HUGE = encode(replace(BEGIN, settings="x" * 800)) + bytes(10_000_000)
+NAMES = ("../operator", "a/b", "n" * 10_000, "", "operator\n")
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        *(b"", b"\xff", bytes(1025), encode(BEGIN)[:-1], encode(BEGIN) + b"\0", HUGE, OTHER_VERSION),
+        *(encode(replace(BEGIN, who=name)) for name in NAMES),
+        *(encode(replace(BEGIN, run=run)) for run in (-1, 2**63)),
+        encode(BEGIN).replace(b"seed", b"\xed\xa0\x80x"),
+    ],
+)
 def test_unreadable_requests_are_refused(rig: Rig, data: bytes) -> None:
-    """A request that cannot be decoded, or is longer than a message may be, is counted."""
-    assert rig.service.answer(data).refusal == "malformed"
+    """A request that cannot be decoded, or is longer than a message may be, is counted and starts nothing."""
+    assert decode(RunReply, encode(rig.service.answer(data))).refusal == "malformed"
+    assert not rig.processes
     assert rig.service.counts == {"malformed": 1}
 
 
@@ -318,6 +346,47 @@ def test_errors_of_the_servers_files_are_refusals(tmp_path: Path) -> None:
     rig.finish(b"record")
     (tmp_path / "0001" / RECORD).unlink()
     assert rig.ask(READ).refusal == "server_error"
+
+
+def test_a_run_whose_directory_is_deleted_fails(rig: Rig) -> None:
+    """If the files of a run vanish during the drive, the run has failed, and the server continues."""
+    rig.ask(BEGIN)
+    rig.processes[0].drive()
+    rig.service.step()
+    rig.processes[0].complete(b"record")
+    shutil.rmtree(rig.processes[0].directory)
+    rig.service.step()
+    assert rig.ask(STATUS).phase == "failed"
+    assert rig.ask(replace(BEGIN, run=8)).phase == "starting"
+
+
+def test_a_failed_start_leaves_no_files(tmp_path: Path) -> None:
+    """Neither a process that cannot be started nor one that ends before it is ready leaves a directory."""
+
+    def fail(_config: ServerConfig, _directory: Path) -> RunProcessStandIn:
+        raise OSError(28, "No space left on device")
+
+    rig = Rig(tmp_path)
+    rig.service._start_process = fail
+    assert rig.ask(BEGIN).refusal == "server_error"
+    assert not list(tmp_path.iterdir())
+    rig.service._start_process = rig.start
+    assert rig.ask(BEGIN).phase == "starting"
+    rig.processes[0].running = False
+    rig.service.step()
+    failed = rig.ask(STATUS)
+    assert (failed.phase, "the last message" in failed.reason) == ("failed", True)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_number_of_stored_runs_is_limited(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs that are begun and ended again and again do not fill the output directory with directories."""
+    monkeypatch.setattr(run_service, "MAX_STORED_RUNS", 2)
+    for run in range(3):
+        reply = rig.ask(replace(BEGIN, run=run))
+        if not reply.refusal:
+            rig.finish(b"record")
+    assert (reply.refusal, len(rig.processes)) == ("storage_full", 2)
 
 
 def test_a_closed_service_begins_no_run(rig: Rig) -> None:

@@ -28,11 +28,11 @@ from lavt.experiment.analysis.drive_data import DriveData, extract_drive
 from lavt.experiment.analysis.results import write_json
 from lavt.experiment.runs.join import check_same_drive
 from lavt.experiment.runs.plan import PlannedRun
-from lavt.experiment.runs.processes import Process, Processes
-from lavt.experiment.runs.real_run import RELAY, relay_config, requested_ms, write_config
+from lavt.experiment.runs.processes import READY_LIMIT_S, Process, Processes
+from lavt.experiment.runs.real_run import RELAY, RUN_LIMIT_S, relay_config, requested_ms, write_config
 from lavt.experiment.runs.run import CONFIG, NETWORK, compute_result, config_text
 from lavt.experiment.runs.run_requests import RunConnection, RunRefused, RunRequests, fetch_record
-from lavt.experiment.runs.run_service import LEASE_S
+from lavt.experiment.runs.run_service import LEASE_S, START_LIMIT_S
 from lavt.experiment.runs.side_configs import client_config
 from lavt.recording.output_directory import prepare_directory
 from lavt.recording.record import read_record
@@ -46,6 +46,10 @@ POLL_NS = 500 * NS_PER_MS
 RETRY_NS = 2 * NS_PER_S
 BUSY_LIMIT_S = LEASE_S + 15.0
 """How long to wait for the end of another run: so long that a run whose client has died is over."""
+SERVER_START_LIMIT_S = START_LIMIT_S + 30.0
+DRIVE_LIMIT_S = START_LIMIT_S + RUN_LIMIT_S + 60.0
+"""Time limits for the server to be ready and for the record to be finished. The server has limits of its own, which are
+shorter and say more; these are for a server that does not keep them."""
 OUTAGE_S = 2.0
 """If the server has not answered for this time, a safe stop counts as an effect of the lost connection."""
 UDP_PROTOCOLS = ("udp/", "quic/")
@@ -116,11 +120,13 @@ def _drive(config: ClientConfig, planned: PlannedRun, work: Path) -> None:
     with RunConnection(config, MachineClock()) as requests, Processes(work) as processes:
         _begin(requests, run, remote_part(planned.config, planned.seed))
         try:
-            ready = _wait(requests, run, lambda reply: reply.phase != "starting")
+            ready = _wait(requests, run, lambda reply: reply.phase != "starting", SERVER_START_LIMIT_S)
+            if not ready.video_port or not ready.probe_port:
+                raise WorkError(f"the server names no ports of the run, which is {ready.phase}")
             keep_alive = partial(_status, requests, run)
             relay, client = _start_client(processes, config, planned, work, ready, keep_alive=keep_alive)
             requests.longest_wait_s = 0.0
-            finished = _wait(requests, run, lambda reply: reply.phase == "finished", relay, client)
+            finished = _wait(requests, run, lambda reply: reply.phase == "finished", DRIVE_LIMIT_S, relay, client)
             if finished.ending == "safe_stop" and requests.longest_wait_s > OUTAGE_S:
                 raise WorkError(
                     f"the server did not answer for {requests.longest_wait_s:.1f} s, and the vehicle made a safe stop"
@@ -142,13 +148,12 @@ def _drive(config: ClientConfig, planned: PlannedRun, work: Path) -> None:
 
 def _begin(requests: RunRequests, run: int, settings: str) -> None:
     """Request the run; wait while the server has another one."""
-    clock = MachineClock()
-    until_ns = clock.now().mono_ns + round(BUSY_LIMIT_S * NS_PER_S)
+    until_ns = requests.clock.now().mono_ns + round(BUSY_LIMIT_S * NS_PER_S)
     while True:
         try:
             requests.request("begin", run, settings=settings)
         except RunRefused as refused:
-            if refused.refusal != "busy" or clock.now().mono_ns > until_ns:
+            if refused.refusal != "busy" or requests.clock.now().mono_ns > until_ns:
                 raise
         else:
             return
@@ -163,14 +168,20 @@ def _status(requests: RunRequests, run: int) -> RunReply:
 
 
 def _wait(
-    requests: RunRequests, run: int, is_reached: Callable[[RunReply], bool], *processes: Process | None
+    requests: RunRequests, run: int, is_reached: Callable[[RunReply], bool], limit_s: float, *processes: Process | None
 ) -> RunReply:
-    """Wait until the server's run has reached a phase; raise `WorkError` if the run fails or a process ends before."""
+    """Wait until the server's run has reached a phase.
+
+    Raises `WorkError` if this takes longer than `limit_s`, or if the run fails or a process ends before.
+    """
+    until_ns = requests.clock.now().mono_ns + round(limit_s * NS_PER_S)
     while not is_reached(reply := _status(requests, run)):
         for process in processes:
             if process is not None and not process.running:
                 code = process.popen.returncode
                 raise WorkError(f"{process.name} ended during the run with exit code {code}: {process.last_message()}")
+        if requests.clock.now().mono_ns > until_ns:
+            raise WorkError(f"the run on the server is still {reply.phase} after {limit_s:.0f} s")
         pause(POLL_NS)
     return reply
 
@@ -212,7 +223,11 @@ def _start_client(
 
 
 def _wait_ready(process: Process, keep_alive: Callable[[], Any]) -> dict[str, Any]:
+    clock = MachineClock()
+    until_ns = clock.now().mono_ns + round(READY_LIMIT_S * NS_PER_S)
     while process.running and not process.first:
+        if clock.now().mono_ns > until_ns:
+            raise WorkError(f"{process.name} did not get ready within {READY_LIMIT_S:.0f} s")
         keep_alive()
         pause(POLL_NS)
     return process.wait_ready()

@@ -30,6 +30,8 @@ ANSWER_LIMIT_S = 15.0
 PART_PERIOD_NS = 12 * NS_PER_MS
 """The least time between two requests, because the server answers 100 a second."""
 MAX_RECORD_BYTES = 4_000_000_000
+FETCH_LIMIT_S = 3600.0
+"""The time limit for the transfer of a record."""
 MAX_WAITING = 64
 
 
@@ -55,7 +57,7 @@ class RunRequests:
         self.longest_wait_s = 0.0
         """The longest time that a request has waited for its reply."""
         self._who = who
-        self._clock = clock
+        self.clock = clock
         self._instance = instance
         self._number = 0
         self._replies: queue.Queue[bytes] = queue.Queue(MAX_WAITING)
@@ -73,13 +75,13 @@ class RunRequests:
             while True:
                 self._replies.get_nowait()
         request = RunRequest(operation, self._who, self._instance, self._number, run, settings, offset)
-        sent_ns = self._clock.now().mono_ns
+        sent_ns = self.clock.now().mono_ns
         until_ns = sent_ns + round(ANSWER_LIMIT_S * NS_PER_S)
-        while (now_ns := self._clock.now().mono_ns) < until_ns:
+        while (now_ns := self.clock.now().mono_ns) < until_ns:
             self.send(Send("run", encode(request)))
             reply = self._reply(min(until_ns, now_ns + round(REPEAT_S * NS_PER_S)))
             if reply is not None:
-                waited_s = (self._clock.now().mono_ns - sent_ns) / NS_PER_S
+                waited_s = (self.clock.now().mono_ns - sent_ns) / NS_PER_S
                 self.longest_wait_s = max(self.longest_wait_s, waited_s)
             if reply is not None and reply.refusal:
                 raise RunRefused(reply.refusal, reply.reason)
@@ -92,7 +94,7 @@ class RunRequests:
 
     def _reply(self, until_ns: int) -> RunReply | None:
         """Return the reply to the last request, None if there is none in time."""
-        while (wait_ns := until_ns - self._clock.now().mono_ns) > 0:
+        while (wait_ns := until_ns - self.clock.now().mono_ns) > 0:
             with suppress(queue.Empty):
                 payload = self._replies.get(timeout=wait_ns / NS_PER_S)
                 try:
@@ -142,8 +144,14 @@ def fetch_record(requests: RunRequests, run: int, finished: RunReply, path: Path
     if not 0 < finished.size <= MAX_RECORD_BYTES:
         raise WorkError(f"the server announces a record of {finished.size} bytes, which cannot be right")
     digest, size = hashlib.sha256(), 0
+    until_ns = requests.clock.now().mono_ns + round(FETCH_LIMIT_S * NS_PER_S)
     with path.open("wb") as file:
         while size < finished.size:
+            if requests.clock.now().mono_ns > until_ns:
+                raise WorkError(
+                    f"only {size} of the record's {finished.size} bytes arrived within {FETCH_LIMIT_S:.0f} s: set "
+                    "record.video: false, or use a faster network"
+                )
             part = requests.request("read", run, offset=size).data
             if len(part) != min(RECORD_PART_BYTES, finished.size - size):
                 raise WorkError("the server sent a part of the record with a wrong length")

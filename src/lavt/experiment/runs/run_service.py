@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 import threading
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
@@ -18,7 +19,7 @@ from typing import Any, NamedTuple, Protocol
 
 from lavt.assembly.vehicles import check_vehicle
 from lavt.clock import Clock
-from lavt.config import ExperimentConfig, ServerCameraConfig, ServerConfig, ServerVideoConfig, ZenohConfig
+from lavt.config import ExperimentConfig, ServerConfig, ZenohConfig
 from lavt.config.remote_run import RemoteRunConfig
 from lavt.config_file import parse_config
 from lavt.domain import NS_PER_S, RunPhase, RunRefusal, RunReply, RunRequest
@@ -31,6 +32,8 @@ LEASE_S = 20.0
 START_LIMIT_S = 60.0
 """A process of a run that is not ready in this time is ended; on a quiet machine it takes 1 to 5 s."""
 REMEMBERED_RUNS = 1000
+MAX_STORED_RUNS = 10_000
+"""The most directories of runs in the output directory; then no further run begins."""
 RECORD = Path("server") / "server.mcap"
 """The record of a run, in the directory of the run."""
 BYTES_PER_MB = 1_000_000
@@ -195,16 +198,22 @@ class RunService:
         if request.run in self._begun:
             raise _Refused("unknown_run", "this run is over")
         settings = _parse_settings(request.settings)
-        self._check_space()
         config = self._run_config(settings, owner.who)
+        self._check_space()
         directory = self._new_directory()
         now_ns = self._clock.now().mono_ns
-        process = self._start_process(config, directory)
+        try:
+            process = self._start_process(config, directory)
+        except OSError:
+            shutil.rmtree(directory, ignore_errors=True)
+            raise
         self._begun.append(request.run)
         self._run = _ActiveRun(owner, request.run, directory, process, now_ns, now_ns)
         return self._run
 
     def _check_space(self) -> None:
+        if sum(1 for _ in self._out.iterdir()) >= MAX_STORED_RUNS:
+            raise _Refused("storage_full", f"the server keeps the files of {MAX_STORED_RUNS} runs: delete old ones")
         limit_mb = self._config.experiment.max_stored_mb
         used = sum(path.stat().st_size for path in self._out.rglob("*") if path.is_file())
         if used >= limit_mb * BYTES_PER_MB:
@@ -218,20 +227,18 @@ class RunService:
 
     def _run_config(self, settings: RemoteRunConfig, operator: str) -> ServerConfig:
         """Return the config of the run's server: this server's, with the requested sections, for one operator."""
-        own = self._config
-        video = {**own.video.model_dump(), **settings.video.model_dump()}
-        return own.model_copy(
-            update={
-                "vehicle": settings.vehicle,
-                "camera": ServerCameraConfig(**settings.camera.model_dump()),
-                "video": ServerVideoConfig(**video),
-                "safety": settings.safety,
-                "record": settings.record,
-                "seed": settings.seed,
-                "zenoh": self._zenoh,
-                "experiment": ExperimentConfig(operator=operator),
-            }
-        )
+        own, requested = self._config.model_dump(mode="json"), settings.model_dump(mode="json")
+        merged = {
+            **own,
+            **requested,
+            "video": own["video"] | requested["video"],
+            "zenoh": self._zenoh.model_dump(mode="json"),
+            "experiment": ExperimentConfig(operator=operator).model_dump(mode="json"),
+        }
+        try:
+            return parse_config(ServerConfig, merged, "the requested run, with this server's config")
+        except UserError as error:
+            raise _Refused("invalid", str(error)) from None
 
     def _watch(self, run: _ActiveRun, now_ns: int) -> None:
         run.ready = run.ready or run.process.first.get("ready", {})
@@ -254,13 +261,15 @@ class RunService:
             self._fail(run, f"the drive did not end within {age_s:.0f} s")
 
     def _finish(self, run: _ActiveRun) -> None:
-        """Note the record of a run whose process has ended, or why there is none."""
+        """Note the record of a run whose process has ended, or why there is none; a failed start leaves no files."""
         record = run.directory / RECORD
         run.process.end()  # wait until its last line has been read
         if not run.failure and (run.process.exit_code != 0 or run.process.latest.get("ending") is None):
             run.failure = f"the server of the run failed: {run.process.last_message()}"
         if run.failure:
             run.phase = "failed"
+            if not run.ready:
+                shutil.rmtree(run.directory, ignore_errors=True)
             return
         try:
             with record.open("rb") as file:
