@@ -35,7 +35,7 @@ def test_virtual_loop_benchmark_runs() -> None:
         capture_output=True,
         text=True,
         check=True,
-        timeout=120,
+        timeout=900,
     )
     result = json.loads(completed.stdout.splitlines()[-1])
     assert list(result) == ["full_speedup", "bare_speedup", "geometry_speedup", "perception_ms", "render_ms"]
@@ -59,7 +59,7 @@ def test_growth_onset_benchmark_runs() -> None:
         capture_output=True,
         text=True,
         check=True,
-        timeout=300,
+        timeout=900,
     )
     header, _, row = completed.stdout.splitlines()
     assert header.count("|") == row.count("|")
@@ -79,7 +79,7 @@ def test_stamp_reading_study_runs() -> None:
         capture_output=True,
         text=True,
         check=True,
-        timeout=120,
+        timeout=900,
     )
     lines = completed.stdout.splitlines()
     assert lines[4].startswith("| 460 | ")
@@ -99,7 +99,7 @@ def test_rendezvous_benchmark_runs() -> None:
         capture_output=True,
         text=True,
         check=True,
-        timeout=120,
+        timeout=900,
     )
     delays_us = json.loads(completed.stdout.splitlines()[-1])["us"]
     assert delays_us["straight"]["p50"] > 0
@@ -131,7 +131,7 @@ def test_the_costs_of_a_vehicle_are_found_from_steps() -> None:
 
 
 @pytest.mark.full
-@pytest.mark.timeout(600)
+@pytest.mark.timeout(1800)
 def test_fleet_benchmark_runs() -> None:
     """`benchmarks/fleet.py` drives a vehicle among light ones, and prints a row for each step and, last, JSON."""
     completed = subprocess.run(
@@ -139,7 +139,7 @@ def test_fleet_benchmark_runs() -> None:
         capture_output=True,
         text=True,
         check=False,
-        timeout=550,
+        timeout=900,
     )
     assert completed.returncode == 0, completed.stderr
     result = json.loads(completed.stdout.splitlines()[-1])

@@ -152,7 +152,7 @@ def test_the_video_benchmark_runs() -> None:
         capture_output=True,
         text=True,
         check=False,
-        timeout=300,
+        timeout=900,
     )
     if completed.returncode == 2 and not missing_tools():
         pytest.skip(f"Debian's GStreamer modules do not support this Python: {completed.stderr}")
@@ -195,7 +195,7 @@ def test_a_long_road_is_driven() -> None:
         capture_output=True,
         text=True,
         check=False,
-        timeout=300,
+        timeout=900,
     )
     assert completed.stdout.splitlines()[-1] in {"Nothing grew.", "Memory grew too much."}, completed.stderr
 
@@ -208,7 +208,7 @@ def test_the_endurance_benchmark_runs() -> None:
         capture_output=True,
         text=True,
         check=False,
-        timeout=120,
+        timeout=900,
     )
     assert "| our_sender | " in completed.stdout
     assert "| our_receiver | " in completed.stdout

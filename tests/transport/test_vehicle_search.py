@@ -17,6 +17,7 @@ from lavt.transport import vehicle_search
 from lavt.transport.messages import VERSION, encode
 from lavt.transport.security.keys import SIGNATURE_BYTES
 from lavt.transport.vehicle_search import (
+    MAX_ANSWERS,
     MAX_LOCATORS,
     MAX_ROUTERS,
     MAX_VEHICLES,
@@ -158,11 +159,23 @@ def test_usable_locators(locator: str) -> None:
         *("", "tcp/127.0.0.1:7447", "tcp/[::1]:7447", "udp/[fe80::1]:7448", "udp/0.0.0.0:7448", "udp/224.0.0.224:7446"),
         *("tcp/host.example:7447", "unixsock-stream//run/lavt/zenoh.sock", "tcp/999.0.2.7:7447", "tcp/192.0.2.7"),
         *("tcp/192.0.2.7:7447#iface=eth0", "tcp/192.0.2.7:7447\n", "tcp/192.0.2.7:7447?x=\x1b[2J", 5, None),
+        *("tcp/192.0.2.7:0", "tcp/192.0.2.7:65536", "tcp/192.0.2.7:7447?so_sndbuf=1", "udp/192.0.2.7:7448?rel=7"),
+        *("tcp/[::ffff:127.0.0.1]:7447", "tcp/[::ffff:169.254.169.254]:80", "tcp/[::127.0.0.1]:7447"),
+        *("tcp/[64:ff9b::7f00:1]:7447", "tcp/0.1.2.3:7447", "tcp/255.255.255.255:7447", "tcp/240.0.0.1:7447"),
     ],
 )
 def test_locators_that_are_not_dialled(locator: object) -> None:
     """A name, a path, parameters of a socket, and an address on this machine or link are not dialled."""
     assert usable_locators([locator]) == []
+
+
+def test_many_answers_are_reported() -> None:
+    """If a query has as many answers as are read, there may have been more, and the vehicle's may be among them."""
+    found = FoundVehicles({})
+    found.add_all([answer()] * (MAX_ANSWERS - 1), ROUTER)
+    assert not found.counts
+    found.add_all([answer()] * MAX_ANSWERS, ROUTER)
+    assert found.counts == {"answers_cut_off": 1}
 
 
 def test_a_router_with_many_addresses() -> None:
@@ -201,7 +214,7 @@ class ManyHellos:
 def test_scouting_returns_the_first_routers(monkeypatch: pytest.MonkeyPatch) -> None:
     """Scouting returns the usable addresses of the first routers, each once, and then stops."""
     hellos = ManyHellos()
-    monkeypatch.setattr(zenoh, "scout", lambda **_: hellos)
+    monkeypatch.setattr(zenoh, "scout", lambda *_, **__: hellos)
     monkeypatch.setattr(vehicle_search, "pause", lambda _: None)
     routers = scout(ManualClock(step_ns=1), 1.0)
     assert routers == [[f"udp/192.0.2.{number}:7448"] for number in range(1, MAX_ROUTERS + 1)]
@@ -211,7 +224,7 @@ def test_scouting_returns_the_first_routers(monkeypatch: pytest.MonkeyPatch) -> 
 def test_scouting_ends_after_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """Scouting ends after its time if fewer routers answer."""
     hellos = ManyHellos()
-    monkeypatch.setattr(zenoh, "scout", lambda **_: hellos)
+    monkeypatch.setattr(zenoh, "scout", lambda *_, **__: hellos)
     monkeypatch.setattr(vehicle_search, "pause", lambda _: None)
     routers = scout(ManualClock(step_ns=NS_PER_S // 5), 1.0)
     assert 0 < len(routers) < 6

@@ -11,7 +11,7 @@ import typer
 
 from lavt.cli import console
 from lavt.errors import UserError, WorkError
-from lavt.experiment.analysis.results import IDENTITY_KEYS, read_json
+from lavt.experiment.analysis.results import read_json, read_result
 from lavt.experiment.runs.run import RESULT, compute_result
 from lavt.recording.output_directory import make_directory
 
@@ -43,7 +43,7 @@ def report(
     if not found_runs:
         raise UserError(f"{directories[0]} has a boundary but no runs: name the directory of a sweep, too")
     runs = [run for runs_in_directory in found_runs.values() for run in runs_in_directory]
-    results = [_read_result(run / RESULT) for run in runs]  # all are read before any is written
+    results = [read_result(run / RESULT) for run in runs]  # all are read before any is written
     for run, result in zip(runs, results, strict=True):
         compute_result(run, result, result.get("digest"))
     names = _sweep_names(list(found_runs))
@@ -100,17 +100,3 @@ def _find_runs(directory: Path) -> list[Path]:
     if not runs:
         raise UserError(f"{directory} has no finished run: name the directory of a run or a sweep")
     return runs
-
-
-def _read_result(path: Path) -> dict[str, Any]:
-    """Read the result of a run; raise `WorkError` if the file is not a result."""
-    result = read_json(path)
-    if not isinstance(result, dict):
-        raise WorkError(f"{path} is not the result of a run: it is not a JSON object")
-    missing = [key for key in IDENTITY_KEYS if key not in result]
-    if missing:
-        raise WorkError(f"{path} is not the result of a run: it lacks {', '.join(missing)}")
-    for key in ("axes", "injected_ms", "injected_least_ms"):
-        if not isinstance(result.get(key, {}), dict):
-            raise WorkError(f"{path} is not the result of a run: {key!r} is not a JSON object")
-    return result

@@ -25,7 +25,7 @@ from lavt.transport.security.gateway import INFO_NONCE_BYTES
 from lavt.transport.security.keys import load_public
 from lavt.transport.vehicle_search import FoundVehicle, FoundVehicles, SearchSession, scout
 from lavt.transport.zenoh_config import SessionSettings
-from lavt.transport.zenoh_link import RouterUnreachable, quiet_logs
+from lavt.transport.zenoh_link import quiet_logs
 
 QUERIES = 5
 """The number of queries to each router; the latency is the median of their round trips."""
@@ -61,7 +61,9 @@ def vehicles(
         str | None, typer.Option(help="The endpoint of another router to ask, such as tcp/192.0.2.7:7447.")
     ] = None,
     use_scouting: ScoutOption = False,
-    timeout: Annotated[float, typer.Option(min=0.1, help="How long to search, in s.")] = TIMEOUT_S,
+    timeout: Annotated[
+        float, typer.Option(min=0.1, help="How long to search, in s; an address that does not answer can take longer.")
+    ] = TIMEOUT_S,
     changes: console.SetOption = None,
     as_json: console.JsonOption = False,
 ) -> None:
@@ -121,26 +123,27 @@ def _verify_functions(config: ClientConfig | None) -> dict[str, Any]:
     return {config.vehicle_id: verify}
 
 
-def _query_all(
-    clock: Clock, sessions: Sequence[SessionSettings], found: FoundVehicles, end_ns: int
-) -> list[RouterUnreachable]:
-    """Query the vehicles behind each router until `end_ns`; return the errors of the routers that do not answer."""
-    errors = []
+def _query_all(clock: Clock, sessions: Sequence[SessionSettings], found: FoundVehicles, end_ns: int) -> list[UserError]:
+    """Query the vehicles behind each router until `end_ns`; return the errors of the routers that do not answer.
+
+    Vehicles whose keys are known are also queried by name, so that the answers of others cannot hide them.
+    """
+    errors: list[UserError] = []
     for settings in sessions:
         if clock.now().mono_ns >= end_ns:
             break
         try:
             session = SearchSession(clock, settings)
-        except RouterUnreachable as error:
+        except UserError as error:  # scouting can also return an endpoint that Zenoh rejects
             errors.append(error)
             continue
         with closing(session):
-            for _ in range(QUERIES):
+            for name in (*found.known_names, "*") * QUERIES:
                 left_s = (end_ns - clock.now().mono_ns) / NS_PER_S
                 if left_s <= 0:
                     break
-                for answer in session.query(secrets.token_bytes(INFO_NONCE_BYTES), min(left_s, QUERY_TIMEOUT_S)):
-                    found.add(answer, session.router)
+                answers = session.query(secrets.token_bytes(INFO_NONCE_BYTES), min(left_s, QUERY_TIMEOUT_S), name)
+                found.add_all(answers, session.router)
                 pause(round(QUERY_PERIOD_S * NS_PER_S))
     return errors
 
@@ -155,6 +158,12 @@ def _messages(listed: Sequence[FoundVehicle], found: FoundVehicles, *, use_scout
     ]
     if found.counts["answers_forged"]:
         messages.append("answers that the vehicle's key has not signed were ignored: do the keys match?")
+    ignored = found.counts["answers_unreadable"] + found.counts["answers_beyond_limit"]
+    if ignored or found.counts["answers_cut_off"]:
+        messages.append(
+            f"{ignored} answers were ignored, and {found.counts['answers_cut_off']} queries had more answers than are "
+            "read: another program answers in the name of vehicles, and may hide them"
+        )
     if not listed:
         advice = "" if use_scouting else ", or search the local network with --scout"
         messages.append(

@@ -11,7 +11,7 @@ import itertools
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 import zenoh
@@ -25,7 +25,6 @@ from lavt.transport.security.keys import SIGNATURE_BYTES
 from lavt.transport.zenoh_config import SessionSettings, check_endpoints, check_private_keys, error_text
 from lavt.transport.zenoh_link import RouterUnreachable, load_zenoh_config, open_zenoh
 
-SELECTOR: Final = "lavt/*/info"
 KEY: Final = re.compile(rf"lavt/({NAME.pattern.removeprefix('^').removesuffix(chr(92) + 'Z')})/info\Z")
 MAX_ANSWERS: Final = 64
 """The number of answers to one query that are read."""
@@ -37,7 +36,8 @@ MAX_ROUTERS: Final = 16
 MAX_LOCATORS: Final = 4
 """The number of addresses of one router that are dialled."""
 LOCATOR: Final = re.compile(
-    r"(?:udp|quic|tcp|tls)/(?:(?P<v4>[0-9.]{7,15})|\[(?P<v6>[0-9a-fA-F:.]{2,45})\]):[0-9]{1,5}(?:\?[a-z0-9_=;]{1,64})?\Z"
+    r"(?:udp|quic|tcp|tls)/(?:(?P<v4>[0-9.]{7,15})|\[(?P<v6>[0-9a-fA-F:.]{2,45})\]):(?P<port>[0-9]{1,5})"
+    r"(?:\?(?:(?:mixed_)?rel=[01];?){1,2})?\Z"
 )
 SCOUT_STEP_NS: Final = 20 * NS_PER_MS
 
@@ -85,6 +85,18 @@ class FoundVehicles:
     def vehicles(self) -> list[FoundVehicle]:
         """Return the vehicles by name; there are several of one name if they have several servers."""
         return sorted(self._vehicles.values(), key=lambda vehicle: vehicle.name)
+
+    @property
+    def known_names(self) -> list[str]:
+        """The names of the vehicles whose keys are known."""
+        return list(self._verify)
+
+    def add_all(self, answers: Sequence[Answer], router: str) -> None:
+        """Add the answers to one query, and count whether there may have been more than were read."""
+        if len(answers) >= MAX_ANSWERS:
+            self.counts["answers_cut_off"] += 1
+        for answer in answers:
+            self.add(answer, router)
 
     def add(self, answer: Answer, router: str) -> None:
         """Add an answer, or count it if it is invalid, not authentic, or one too many."""
@@ -134,12 +146,13 @@ class SearchSession:
 
     def __init__(self, clock: Clock, settings: SessionSettings) -> None:
         self._clock = clock
-        config = load_zenoh_config(
-            settings.path, {**settings.changes, "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES}
-        )
+        limits = {"transport/link/rx/max_message_size": MAX_MESSAGE_BYTES, "adminspace/enabled": False}
+        config = load_zenoh_config(settings.path, {**settings.changes, **limits})
         endpoints = check_endpoints(config, "the router")
         check_private_keys(config)
         self.router: str = ", ".join(endpoints)
+        self._read: list[Any] = []
+        """Handlers of earlier queries: Zenoh prints an error for each answer whose handler is gone."""
         try:
             self._session: Any = open_zenoh(config)
         except zenoh.ZError as error:
@@ -147,17 +160,19 @@ class SearchSession:
                 f"no router answers at {endpoints}: {settings.advice} ({error_text(error)})"
             ) from error
 
-    def query(self, nonce: bytes, timeout_s: float) -> list[Answer]:
-        """Query all vehicles, and return the first answers within `timeout_s`."""
+    def query(self, nonce: bytes, timeout_s: float, vehicle: str = "*") -> list[Answer]:
+        """Query all vehicles or one, and return at most `MAX_ANSWERS` answers within `timeout_s`."""
         sent_ns = self._clock.now().mono_ns
         answers = []
-        replies = self._session.get(
-            SELECTOR,
+        replies: Any = self._session.get(
+            f"lavt/{vehicle}/info",
+            zenoh.handlers.RingChannel(MAX_ANSWERS),
             payload=nonce,
             timeout=timeout_s,
             consolidation=zenoh.ConsolidationMode.NONE,
             target=zenoh.QueryTarget.ALL,
         )
+        self._read.append(replies)
         for reply in itertools.islice(replies, MAX_ANSWERS):
             round_trip_ns = self._clock.now().mono_ns - sent_ns
             if reply.ok is not None:
@@ -174,7 +189,7 @@ def scout(clock: Clock, duration_s: float) -> list[list[str]]:
     config = zenoh.Config()
     config.insert_json5("scouting/multicast/enabled", json.dumps(True))
     hellos: dict[str, list[str]] = {}
-    scouting: Any = zenoh.scout(what="router", config=config)
+    scouting: Any = zenoh.scout(zenoh.handlers.RingChannel(MAX_ROUTERS), what="router", config=config)
     try:
         end_ns = clock.now().mono_ns + round(duration_s * NS_PER_S)
         while clock.now().mono_ns < end_ns and len(hellos) < MAX_ROUTERS:
@@ -182,23 +197,28 @@ def scout(clock: Clock, duration_s: float) -> list[list[str]]:
             if hello is None:
                 pause(SCOUT_STEP_NS)
             else:
-                hellos.setdefault(str(hello.zid), usable_locators(hello.locators))
+                known = hellos.setdefault(str(hello.zid), [])
+                known += [locator for locator in usable_locators(hello.locators) if locator not in known]
     finally:
         scouting.stop()
-    return [locators for locators in hellos.values() if locators]
+    return [locators[:MAX_LOCATORS] for locators in hellos.values() if locators]
 
 
 def usable_locators(locators: Iterable[Any]) -> list[str]:
-    """Return the endpoints that another machine can dial: numeric, and neither on its own machine nor link-local."""
+    """Return the endpoints that another machine can dial: numeric, and neither on its own machine nor link-local.
+
+    Reserved addresses, which include every IPv6 address that contains an IPv4 address, cannot be dialled, either.
+    """
     usable = []
     for locator in locators:
         match = LOCATOR.match(str(locator))
-        if match is None:
+        if match is None or not 0 < int(match["port"]) < 65_536:
             continue
         try:
             address = ipaddress.ip_address(match["v4"] or match["v6"])
         except ValueError:
             continue
-        if not (address.is_loopback or address.is_link_local or address.is_multicast or address.is_unspecified):
+        kinds = (address.is_loopback, address.is_link_local, address.is_multicast, address.is_reserved)
+        if not any(kinds) and address.packed[0] != 0:
             usable.append(str(locator))
     return usable[:MAX_LOCATORS]

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import json
 from itertools import islice, pairwise
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import pytest
 from lavt.cli.main import build_app
 from lavt.config import RunConfig
 from lavt.config_file import load_config, shipped
-from lavt.errors import UserError
+from lavt.errors import UserError, WorkError
 from lavt.experiment.replay.drawing import GAP_PX, WIDTH_PX
 from lavt.experiment.replay.drive import read_driver_view, read_replay_drive
 from lavt.experiment.replay.replay import replay_pictures
@@ -123,11 +122,13 @@ def test_a_run_that_never_drove_is_rejected(longer: Path, tmp_path: Path) -> Non
         next(replay_pictures([run]))
 
 
-def test_the_result_may_be_of_another_version(longer: Path, tmp_path: Path) -> None:
-    """A result that lacks keys, as after a crash, is replayed from the records."""
+@pytest.mark.parametrize("result", ["[]", "1", "{}", '{"condition": "L0"}', "not JSON"])
+def test_a_file_that_is_no_result_is_rejected(result: str, longer: Path, tmp_path: Path) -> None:
+    """A `result.json` that is not the result of a run is rejected in a sentence that names it."""
     run = tmp_path / "run"
     run.mkdir()
     for name in ("client.mcap", "server.mcap"):
         (run / name).write_bytes((longer / name).read_bytes())
-    (run / "result.json").write_text(json.dumps({"condition": "L0", "ending": None}))
-    assert next(replay_pictures([run])).shape[1] == WIDTH_PX
+    (run / "result.json").write_text(result)
+    with pytest.raises(WorkError, match=r"result\.json"):
+        next(replay_pictures([run]))

@@ -87,3 +87,17 @@ def read_json(path: Path) -> Any:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise WorkError(f"cannot read {path}: {error}") from error
+
+
+def read_result(path: Path) -> dict[str, Any]:
+    """Read the result of a run; raise `WorkError` if the file is not a result."""
+    result = read_json(path)
+    if not isinstance(result, dict):
+        raise WorkError(f"{path} is not the result of a run: it is not a JSON object")
+    missing = [key for key in IDENTITY_KEYS if key not in result]
+    if missing:
+        raise WorkError(f"{path} is not the result of a run: it lacks {', '.join(missing)}")
+    for key in ("axes", "injected_ms", "injected_least_ms"):
+        if not isinstance(result.get(key, {}), dict):
+            raise WorkError(f"{path} is not the result of a run: {key!r} is not a JSON object")
+    return result

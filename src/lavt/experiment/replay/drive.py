@@ -19,7 +19,7 @@ from lavt.domain import NS_PER_MS, NS_PER_S, FloatArray, Lane, Picture
 from lavt.errors import UserError
 from lavt.experiment.analysis.latency import accepted_commands, look_up
 from lavt.experiment.analysis.metrics import driving_interval
-from lavt.experiment.analysis.results import read_json
+from lavt.experiment.analysis.results import read_result
 from lavt.perception.calibration import CalibratedCamera
 from lavt.recording.record import evaluating, read_record
 from lavt.recording.table import MISSING, IntArray, Table
@@ -38,8 +38,6 @@ class Scene:
     stamp_ns: int | None
     """The stamp of the frame from which the command in force was made; None before the first command."""
     frame_age_ms: float | None
-    loop_latency_ms: float | None
-    """Time from the stamp of that frame to the application of its command."""
     truth_index: int | None
     """The index of the newest ground truth."""
     state: str
@@ -80,7 +78,6 @@ class ReplayDrive:
             (now_ns - self.began_ns) / NS_PER_S,
             None if command is None else int(self.stamps_ns[command]),
             None if command is None else float(now_ns - self.stamped_ns[command]) / NS_PER_MS,
-            None if command is None else float(self.applied_ns[command] - self.stamped_ns[command]) / NS_PER_MS,
             _newest(self.truth.ints("mono_ns"), now_ns),
             _ending(self.result) if is_over else self._state(now_ns),
         )
@@ -92,7 +89,7 @@ class ReplayDrive:
 
 
 def _ending(result: Mapping[str, Any]) -> str:
-    ending = str(result["ending"] or "record ends").replace("_", " ")
+    ending = str(result.get("ending") or "record ends").replace("_", " ")
     if ending == "completed" and result.get("completed_in_own_lane") is False:
         return "completed, not in its own lane"
     return ending
@@ -106,7 +103,7 @@ def _newest(times_ns: IntArray, now_ns: int) -> int | None:
 
 def read_replay_drive(directory: Path) -> ReplayDrive:
     """Read the drive of the run in `directory`; raise `UserError` or `WorkError` if its records cannot be used."""
-    result = read_json(directory / "result.json")
+    result = read_result(directory / "result.json")
     record = read_record(directory / "server.mcap", channels=SERVER_CHANNELS)
     with evaluating(record.path):
         began_ns, ended_ns, _ = driving_interval(record)
