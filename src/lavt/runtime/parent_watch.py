@@ -13,13 +13,16 @@ ENDS_WITH_STDIN: Final = "LAVT_ENDS_WITH_STDIN"
 
 
 def end_with_parent() -> None:
-    """Interrupt this process, as Ctrl-C does, as soon as its parent is gone, if the parent has asked for it."""
+    """Stop this process by SIGTERM as soon as its parent is gone, if the parent has asked for it.
+
+    Not by SIGINT, because the processes that a sweep's worker starts ignore it until they are ready.
+    """
     if os.environ.pop(ENDS_WITH_STDIN, ""):
-        threading.Thread(target=_interrupt_at_end_of_input, name="parent watch", daemon=True).start()
+        threading.Thread(target=_stop_at_end_of_input, name="parent watch", daemon=True).start()
 
 
-def _interrupt_at_end_of_input() -> None:
+def _stop_at_end_of_input() -> None:
     with suppress(OSError):
         while os.read(0, 4096):
             pass
-    os.kill(os.getpid(), signal.SIGINT)
+    os.kill(os.getpid(), signal.SIGTERM)
