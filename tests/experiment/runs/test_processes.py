@@ -28,7 +28,7 @@ print(json.dumps({"child": child.pid}), flush=True)
 
 
 def test_a_process_ends_with_its_parent(tmp_path: Path) -> None:
-    """When the parent's end of the pipe closes, as it does when the parent is killed, the child is stopped, even if it ignores Ctrl-C."""
+    """When the parent's end of the pipe closes, as after SIGKILL, the child is stopped, even if it ignores Ctrl-C."""
     process = Process("child", (), tmp_path, ("-c", WATCHING))
     process.wait_ready()
     assert process.running
