@@ -102,7 +102,7 @@ def _check_listen_endpoints(config: zenoh.Config, path: Path, *, may_be_empty: b
     configured = json.loads(endpoints)
     configured = configured.get("router") if isinstance(configured, dict) else configured
     if is_default or configured is None or not (configured or may_be_empty):
-        raise UserError(f"{path} has no listen endpoints; without them Zenoh would listen on all interfaces")
+        raise UserError(f"{path} has no listen endpoints, so Zenoh would listen on all interfaces: add one")
 
 
 def open_zenoh(config: zenoh.Config) -> zenoh.Session:

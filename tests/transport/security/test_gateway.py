@@ -31,7 +31,7 @@ from lavt.transport.security.envelope import (
 )
 from lavt.transport.security.gateway import ClientGateway, OpenClientGateway, ServerGateway
 
-pytest.importorskip("cryptography", reason="an extra: pip install 'lavt[secure]'")
+pytest.importorskip("cryptography", reason="an extra: pip install -e '.[secure]'")
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 

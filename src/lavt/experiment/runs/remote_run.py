@@ -74,7 +74,7 @@ class RemoteServer:
             if network.injection == "netem":
                 raise UserError("--server injects with the relay on this machine: choose network.injection relay")
             if network.injection == "relay" and not endpoint.startswith(UDP_PROTOCOLS):
-                raise UserError(f"the relay forwards UDP only, so the router cannot be dialled at {endpoint}")
+                raise UserError(f"the relay forwards UDP only: dial an endpoint udp/ or quic/, not {endpoint}")
             part = remote_part(run.config, run.seed)
             if len(part) > TEXT_BYTES[RunRequest]["settings"]:
                 raise UserError(f"{run.name}: too many values differ from the defaults to request this run")
