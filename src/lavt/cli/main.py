@@ -18,6 +18,7 @@ from typer.core import TyperGroup
 import lavt
 from lavt.cli import console
 from lavt.errors import WorkError
+from lavt.runtime.parent_watch import end_with_parent
 
 GROUPS = {
     "Try LAVT on this machine": {
@@ -113,6 +114,7 @@ def global_options(
 
 def main() -> None:
     """Run the command line and exit with the command's exit code."""
+    end_with_parent()
     words = sys.argv[1:]
     is_plain = bool(words) and words[0] in COMMANDS
     console.run_command(build_app(words[:1] if is_plain else words, has_all=not is_plain))

@@ -13,6 +13,7 @@ from lavt.config.camera import ServerCameraConfig as ServerCameraConfig
 from lavt.config.controller import ControllerConfig as ControllerConfig
 from lavt.config.costs import Costs as Costs
 from lavt.config.dbw import DbwConfig as DbwConfig
+from lavt.config.experiment import ExperimentConfig as ExperimentConfig
 from lavt.config.injection import ClientInjectionConfig as ClientInjectionConfig
 from lavt.config.injection import Condition as Condition
 from lavt.config.injection import FlowChanges as FlowChanges
@@ -234,6 +235,8 @@ class ClientClockConfig(ClockConfig):
     """The clock of the client. Its probe port cannot be 0, because the client must know the server's port."""
 
     probe_port: int = Field(probe.DEFAULT_PORT, ge=1, le=65535)
+    probe_server: str = ""
+    """The server's address for the clock probe; empty: `video.server`. It differs if a relay forwards the video."""
 
 
 class ServerVideoConfig(VideoConfig):
@@ -262,8 +265,15 @@ class ServerConfig(Section):
     clock: ClockConfig = ClockConfig()
     safety: SafetyConfig = SafetyConfig()
     record: RecordConfig = RecordConfig()
+    experiment: ExperimentConfig = ExperimentConfig()
     seed: int = Field(1, ge=0, lt=2**63)
     """The seed of everything random."""
+
+    @model_validator(mode="after")
+    def _check_remote_runs(self) -> ServerConfig:
+        if self.experiment.remote_runs and (self.vehicle.kind, self.camera.source) != ("simulator", "simulated"):
+            raise ValueError("experiment.remote_runs is for the simulator and its camera only: leave it out")
+        return self
 
     @model_validator(mode="after")
     def _check_encryption(self) -> ServerConfig:
