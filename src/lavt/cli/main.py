@@ -20,6 +20,7 @@ from lavt.errors import WorkError
 
 COMMANDS = {
     "demo": "Run the demo: drive by video under L0 to L5 and report.",
+    "drive": "Drive yourself: the simulator's car, from a web page on this machine.",
     "run": "Drive one route under one network condition.",
     "sweep": "Drive routes under network conditions and report.",
     "boundary": "Find the maximum tolerable latency.",

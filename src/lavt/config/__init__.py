@@ -131,10 +131,15 @@ class RecordConfig(Section):
         return frozenset() if self.video else frozenset({"video"})
 
 
+HUMAN = "human"
+"""The kind of controller with which a person drives."""
+
+
 class ControllerConfig(Section):
     """The controller that drives."""
 
     kind: str = "lane_keeper"
+    """A controller's name; human: a person drives from a web page (`docs/drive.md`)."""
     preset: str = "designed"
     lookahead_s: float | None = Field(None, ge=0.2, le=5)
     """How far ahead the car aims, in seconds of driving. This key and the three below replace the preset's values."""
@@ -336,6 +341,13 @@ class ClientVideoConfig(Section):
     reorder_hold_ms: ReorderHold = "auto"
 
 
+class ConsoleConfig(Section):
+    """The web page from which a person drives, if `controller.kind` is human."""
+
+    port: int = Field(0, ge=0, le=65535)
+    """The TCP port of the page on this machine's loopback addresses; 0: any free port."""
+
+
 class ClientConfig(Section):
     """The operator's machine."""
 
@@ -345,6 +357,7 @@ class ClientConfig(Section):
     take_over: bool = False
     """Whether to request a handover from the client in control, see `docs/session.md`."""
     controller: ControllerConfig = ControllerConfig()
+    console: ConsoleConfig = ConsoleConfig()
     camera: ClientCameraConfig = ClientCameraConfig()
     video: ClientVideoConfig = ClientVideoConfig()
     zenoh: ZenohConfig = ZenohConfig()
