@@ -1,15 +1,17 @@
 // What the page shows besides the picture.
 
+import { QUESTIONS, devices } from "./gamepad.js";
+
 const byId = (id) => document.getElementById(id);
 const SAFETY = {
   disarmed: "disarmed", arming: "arming", driving: "driving", degraded: "degraded",
   safe_stop: "safe stop", emergency_stop: "emergency stop",
 };
 const HANDS = {
-  not_seen: "let go of the space bar, then hold it",
-  not_live: "click the page, then hold the space bar",
-  old_input: "this page was stopped for a moment: let go of the space bar, then hold it",
-  no_input: "this page sent no input for a moment: let go of the space bar, then hold it",
+  not_seen: "let go of the dead-man control (the space bar), then hold it",
+  not_live: "click the page, then let go of the dead-man control (the space bar) and hold it",
+  old_input: "this page was stopped for a moment: let go of the dead-man control, then hold it",
+  no_input: "this page sent no input for a moment: let go of the dead-man control, then hold it",
 };
 
 export function showClosed(text) {
@@ -52,14 +54,21 @@ function hint(status, input) {
   if (status.hand in HANDS) return HANDS[status.hand];
   if (status.phase === "arming") {
     if (status.session_reason) return status.session_reason;
-    if (status.hand === "open") return "hold the space bar for a second to arm";
-    return input.throttle > 0.05 ? "release the throttle to arm" : "arming: keep holding the space bar";
+    if (status.hand === "open") return "hold the dead-man control (the space bar) for a second to arm";
+    return input.throttle > 0.05 ? "release the throttle to arm" : "arming: keep holding";
   }
-  return status.hand === "held" ? "" : "the space bar was released: the vehicle stops";
+  return status.hand === "held" ? "" : "the dead-man control was released: the vehicle stops";
 }
 
 function ms(value) {
   return value === null ? "–" : `${value.toFixed(value < 10 ? 1 : 0)} ms`;
+}
+
+// Show the question of a calibration; without one, whether there is a device to calibrate.
+export function showCalibration(calibration) {
+  byId("calibrate").hidden = calibration === null && devices().length === 0;
+  byId("calibrate").textContent = calibration === null ? "Calibrate a wheel or gamepad" : "Cancel";
+  if (calibration !== null) byId("hint").textContent = QUESTIONS[calibration.next];
 }
 
 let shownConditions = "";

@@ -1,8 +1,10 @@
 // The console's page: connects to the client, sends the person's input, and shows video and state.
 
 import { Offset, pageTime_us } from "./clock.js";
+import { Calibration, Gamepads } from "./gamepad.js";
 import { Keyboard } from "./hand.js";
-import { showClosed, showStatus } from "./hud.js";
+import { showCalibration, showClosed, showStatus } from "./hud.js";
+import { Touch } from "./touch.js";
 import { Video } from "./video.js";
 
 const VERSION = 1; // of the messages
@@ -13,6 +15,10 @@ const UNIT_HEAD_BYTES = 16;
 
 const byId = (id) => document.getElementById(id);
 const keyboard = new Keyboard();
+const gamepads = new Gamepads(() => send({ type: "stop" }));
+const touch = new Touch(byId("touch_steering"), byId("touch_pedals"));
+let source = keyboard; // of the newest input
+let calibration = null; // while the person calibrates a device
 let socket = null;
 let seen_us = 0; // `sent_us` of the newest message
 let status = null;
@@ -60,7 +66,8 @@ function takeStatus(message) {
   if (message.version !== VERSION) return socket.close(4000, "reload this page: it is of another version of lavt");
   seen_us = message.sent_us;
   status = message;
-  showStatus(status, keyboard, video);
+  showStatus(status, source, video);
+  showCalibration(calibration);
 }
 
 function takeUnit(buffer) {
@@ -82,9 +89,14 @@ function sendInput() {
   const now_ms = performance.now();
   keyboard.advance(Math.min((now_ms - advanced_ms) / 1000, 0.1));
   advanced_ms = now_ms;
+  if (calibration === null) gamepads.poll();
+  else calibration.poll();
+  if (calibration?.next === null) calibration = null;
   if (status?.role !== "drives") return;
-  const { holds, steering, throttle, brake } = keyboard;
-  const live = document.visibilityState === "visible" && document.hasFocus();
+  source = [keyboard, touch, gamepads].find(({ holds }) => holds) ?? (gamepads.id === "" ? keyboard : gamepads);
+  const { holds, steering, throttle, brake } = source;
+  const isSeen = document.visibilityState === "visible" && document.hasFocus();
+  const live = isSeen && calibration === null && !gamepads.lost;
   send({ type: "input", seen_us, held: holds, live, steering, throttle, brake });
 }
 
@@ -100,6 +112,10 @@ addEventListener("keydown", (event) => {
 byId("stop").onclick = (event) => {
   send({ type: "stop" });
   event.currentTarget.blur(); // the space bar must not press the button
+};
+byId("calibrate").onclick = (event) => {
+  calibration = calibration === null ? new Calibration() : null;
+  event.currentTarget.blur();
 };
 byId("take").onclick = (event) => {
   send({ type: "drive" });
