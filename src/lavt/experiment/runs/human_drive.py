@@ -33,6 +33,7 @@ DEFAULTS: Final[Mapping[str, Any]] = {
     "time": "real",
     "controller": {"kind": HUMAN},
     "vehicle": {"after_collision": "continue"},
+    "safety": {"picture_age_limit_ms": MAX_DELAY_MS},  # so that a person can feel long delays, too
 }
 
 
