@@ -120,7 +120,7 @@ class Browser:
             return connection.getresponse().read()
 
     def renderers(self) -> list[int]:
-        """Return the process ids of the browser's renderers, the newest one last."""
+        """Return the process ids of the browser's renderers."""
         found = []
         for entry in Path("/proc").iterdir():
             if entry.name.isdigit():
@@ -130,7 +130,7 @@ class Browser:
                     continue
                 if b"--type=renderer" in command and str(self._profile).encode() in command:
                     found.append(int(entry.name))
-        return sorted(found)
+        return found
 
     def close(self) -> None:
         """Close the connections to all tabs."""
@@ -143,7 +143,6 @@ def running_browser(profile: Path) -> Iterator[Browser]:
     """Run Chromium with an empty profile in this directory, and end all its processes."""
     arguments = ["--headless=new", "--disable-gpu", "--no-first-run", "--window-size=1280,800"]
     arguments += ["--remote-debugging-port=0", "--remote-allow-origins=*", f"--user-data-dir={profile}"]
-    arguments += ["--disable-features=SpareRendererForSitePerProcess"]  # so that a tab's renderer is the newest one
     arguments += ["--disable-background-networking", "--disable-component-update", "--disable-sync"]
     arguments += ["--no-sandbox"] * (os.geteuid() == 0)
     profile.mkdir(parents=True, exist_ok=True)

@@ -6,7 +6,7 @@ import json
 from typing import Any
 
 from tests.browser.chromium import Tab, wait_until
-from tests.browser.conftest import PersonDrive, field
+from tests.browser.conftest import PersonDrive, drive_until, field
 
 GAMEPAD = {"id": "pad", "mapping": "standard", "axes": [0, 0, 0, 0], "buttons": [0] * 17}
 WHEEL = {"id": "wheel", "mapping": "", "axes": [0, 0, 0], "buttons": [0] * 4}
@@ -33,6 +33,11 @@ def moved(device: dict[str, Any], *, axes: dict[int, float] | None = None, butto
     }
 
 
+def let_time_pass(tab: Tab, duration_ms: int) -> None:
+    """Let the page's own timer of 20 ms read the devices, however busy the machine is."""
+    tab.evaluate(f"new Promise((resolve) => setTimeout(resolve, {duration_ms}))")
+
+
 def hint(tab: Tab) -> str:
     """Return what the page asks the person to do."""
     return str(tab.evaluate("document.querySelector('#hint').textContent"))
@@ -40,9 +45,7 @@ def hint(tab: Tab) -> str:
 
 def arm(tab: Tab, held: dict[str, Any]) -> None:
     """Hold the dead-man control of a device until the vehicle is driving."""
-    wait_until("the vehicle can be armed", lambda: field(tab, "hand") == "open" and field(tab, "phase") == "arming")
-    plug(tab, held)
-    wait_until("the vehicle is armed", lambda: field(tab, "safety") == "driving")
+    drive_until(tab, lambda: plug(tab, held), lambda: plug(tab, GAMEPAD), lambda: field(tab, "safety") == "driving")
 
 
 def test_a_gamepad_drives_until_it_is_unplugged(person_drive: PersonDrive) -> None:
@@ -51,13 +54,16 @@ def test_a_gamepad_drives_until_it_is_unplugged(person_drive: PersonDrive) -> No
     plug(tab, GAMEPAD)
     arm(tab, moved(GAMEPAD, buttons=(RB,)))
     plug(tab, moved(GAMEPAD, axes={0: -1.0}, buttons=(RB, RT)))
-    wait_until("the car drives", lambda: (field(tab, "speed_mps") or 0) > 1)
-    wait_until("it turns to the left", lambda: (field(tab, "command") or [0])[0] > 0.1)
+    wait_until("it accelerates to the left", lambda: tuple(field(tab, "command") or (0, 0))[:2] > (0.1, 0.9))
     plug(tab, None)
     wait_until("the car stops", lambda: field(tab, "safety") == "safe_stop")
-    plug(tab, moved(GAMEPAD, buttons=(RB, RT)))
+    plug(tab, moved(GAMEPAD, buttons=(RB,)))
     wait_until("the car is stationary", lambda: field(tab, "phase") == "arming")
-    assert field(tab, "safety") == "safe_stop"
+    let_time_pass(tab, 300)
+    assert (field(tab, "hand"), field(tab, "safety")) == ("open", "safe_stop")
+    plug(tab, GAMEPAD)
+    let_time_pass(tab, 100)
+    arm(tab, moved(GAMEPAD, buttons=(RB,)))
 
 
 def test_the_button_of_a_gamepad_stops(person_drive: PersonDrive) -> None:
@@ -85,7 +91,7 @@ def test_a_wheel_drives_after_its_calibration(person_drive: PersonDrive) -> None
         plug(tab, moved(rest, **answer))  # type: ignore[arg-type]
         wait_until("the next question", lambda asked=question: hint(tab) != asked)  # type: ignore[misc]
         plug(tab, rest)
-        tab.evaluate("new Promise((resolve) => setTimeout(resolve, 100))")  # the page's own timer is shorter
+        let_time_pass(tab, 100)
     wait_until("the calibration is saved", lambda: tab.evaluate("localStorage.length") == 1)
     plug(tab, moved(rest, axes={0: -1.0, 1: 0.0}, buttons=(0,)))
     wait_until("it steers to the left", lambda: tab.evaluate("document.querySelector('#steering').value") == -1)
@@ -105,11 +111,17 @@ def test_touch_holds_and_steers(person_drive: PersonDrive) -> None:
         "(({x, y, width, height}) => [x + width / 2, y + height / 2])"
         "(document.querySelector('#touch_steering').getBoundingClientRect())"
     )
-    wait_until("the vehicle can be armed", lambda: field(tab, "hand") == "open" and field(tab, "phase") == "arming")
-    tab.call("Input.dispatchTouchEvent", type="touchStart", touchPoints=[{"x": x, "y": y}])
-    wait_until("the vehicle is armed", lambda: field(tab, "safety") == "driving")
-    tab.call("Input.dispatchTouchEvent", type="touchMove", touchPoints=[{"x": x - 100, "y": y}])
+
+    def touch(kind: str, *points: dict[str, float]) -> None:
+        tab.call("Input.dispatchTouchEvent", type=kind, touchPoints=list(points))
+
+    drive_until(
+        tab,
+        lambda: touch("touchStart", {"x": x, "y": y}),
+        lambda: touch("touchEnd"),
+        lambda: field(tab, "safety") == "driving",
+    )
+    touch("touchMove", {"x": x - 100, "y": y})
     wait_until("it steers to the left", lambda: (field(tab, "command") or [0])[0] > 0.1)
-    tab.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+    touch("touchEnd")
     wait_until("the car stops", lambda: field(tab, "safety") == "safe_stop")
-    assert "requested a stop" in field(tab, "reason")

@@ -30,7 +30,7 @@ export const QUESTIONS = {
 };
 
 export class Gamepads {
-  #rested = new Set(); // pedals that have been at rest since the device was connected
+  #rested = new Set(); // pedals and dead-man control, once they have been at rest since the device was connected
   #wasStopped = false;
   #stop;
 
@@ -58,7 +58,9 @@ export class Gamepads {
     this.steering = beyondDeadZone(deflection(device, calibration.left) - deflection(device, calibration.right));
     this.throttle = this.#pedal(device, calibration, "throttle");
     this.brake = this.#pedal(device, calibration, "brake");
-    this.holds = deflection(device, calibration.hold) > PRESSED;
+    const holds = deflection(device, calibration.hold) > PRESSED;
+    if (!holds) this.#rested.add("hold");
+    this.holds = holds && this.#rested.has("hold"); // a button that was held when the device came is no decision
     const stops = deflection(device, calibration.stop) > PRESSED;
     if (stops && !this.#wasStopped) this.#stop();
     this.#wasStopped = stops;
