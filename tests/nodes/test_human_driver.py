@@ -264,6 +264,17 @@ def test_any_page_makes_an_emergency_stop(page: int) -> None:
     assert bench.status()["emergency_stop"] == "confirmed"
 
 
+def test_the_driving_page_hands_over() -> None:
+    """The driving page releases control, as SIGUSR2 does, and another page cannot."""
+    bench = HumanBench().drive()
+    bench.deliver("page_opened", None, peer=2)
+    assert bench.page(2, type="release") == []
+    (request,) = [decode(SessionRequest, payload) for payload in payloads(bench.page(type="release"), "session")]
+    assert request.operation == "release"
+    assert bench.input(throttle=1.0) is None
+    assert (bench.status()["phase"], bench.status()["session_reason"]) == ("watching", "released")
+
+
 def test_after_a_safe_stop_a_fresh_press_arms_again() -> None:
     """After a safe stop, at standstill, the vehicle is armed again only by a hand that opens and holds."""
     bench = HumanBench().drive()

@@ -20,6 +20,7 @@ from lavt.errors import WorkError
 from lavt.experiment.runs.human_drive import HumanDrive, drive_config, start_human_drive
 from lavt.recording.output_directory import check_directory
 from lavt.runtime import process_priority
+from lavt.transport.console.console_link import check_installed
 
 
 def register(app: typer.Typer) -> None:
@@ -44,6 +45,7 @@ def drive(
     """
     console.reserve_stdout()
     process_priority.raise_priority()
+    check_installed()
     config, clock = drive_config(changes or []), MachineClock()
     if out is not None:
         check_directory(out)

@@ -35,6 +35,7 @@ from lavt.transport.console.page_messages import (
     PageInput,
     PageLost,
     PageProbe,
+    PageRelease,
     PageShown,
     PageStatus,
     PageStop,
@@ -236,6 +237,10 @@ class HumanDriverNode(Commander):
             return []
         return self._raise_emergency_stop(now)
 
+    def _release_from(self, page: Peer, _request: PageRelease, now: Now) -> list[Send]:
+        """Release control, for the driving page only; the vehicle stops."""
+        return self._release(now) if page == self._driving_page else []
+
     def _change_delay(self, page: Peer, delay: PageDelay, _now: Now) -> list[Send]:
         if self._delay is None or page != self._driving_page:
             self._counts["delays_rejected"] += 1
@@ -250,6 +255,7 @@ class HumanDriverNode(Commander):
         PageLost: _lose_video,
         PageStop: _stop,
         PageDrive: _drive_from,
+        PageRelease: _release_from,
         PageDelay: _change_delay,
     }
 

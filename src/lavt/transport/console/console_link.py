@@ -208,6 +208,11 @@ class ConsoleLink:
             self._end(error)
 
 
+def check_installed() -> None:
+    """Raise `UserError` if `websockets` is not installed."""
+    _import_websockets()
+
+
 def _import_websockets() -> Any:
     try:
         import websockets.asyncio.server  # noqa: PLC0415 (an optional package)

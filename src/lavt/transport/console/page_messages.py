@@ -90,6 +90,10 @@ class PageDrive(Struct, frozen=True, tag="drive", forbid_unknown_fields=True):
     """The person wants to drive from this page, which only watches so far."""
 
 
+class PageRelease(Struct, frozen=True, tag="release", forbid_unknown_fields=True):
+    """The person hands the vehicle over to the client that requests it, or only releases it."""
+
+
 class PageDelay(Struct, frozen=True, tag="delay", forbid_unknown_fields=True):
     """The person chooses the injected delay of each direction."""
 
@@ -97,7 +101,7 @@ class PageDelay(Struct, frozen=True, tag="delay", forbid_unknown_fields=True):
     control_ms: _Delay
 
 
-PageMessage = PageInput | PageAck | PageShown | PageProbe | PageLost | PageStop | PageDrive | PageDelay
+PageMessage = PageInput | PageAck | PageShown | PageProbe | PageLost | PageStop | PageDrive | PageRelease | PageDelay
 
 _messages = msgspec.json.Decoder(PageMessage)
 _hellos = msgspec.json.Decoder(PageHello)

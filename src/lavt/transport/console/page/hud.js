@@ -17,7 +17,7 @@ const HANDS = {
 export function showClosed(text) {
   byId("connection").textContent = "not connected";
   byId("hint").textContent = text;
-  byId("take").hidden = true;
+  byId("take").hidden = byId("release").hidden = true;
 }
 
 export function showStatus(status, input, video) {
@@ -27,8 +27,11 @@ export function showStatus(status, input, video) {
   safety.className = `badge ${status.safety in SAFETY ? status.safety : ""}`;
   const rejected = status.rejected && `command rejected: ${status.rejected}`;
   const limited = status.limited && `limited: ${status.limited}`;
-  byId("reason").textContent = [status.reason, rejected, limited].filter(Boolean).join(" · ");
+  const requested = status.requested_by && `${status.requested_by} requests control`;
+  byId("reason").textContent = [status.reason, requested, rejected, limited].filter(Boolean).join(" · ");
   byId("hint").textContent = hint(status, input);
+  byId("release").hidden = !(status.role === "drives" && status.has_control && status.requested_by !== "");
+  byId("release").textContent = `Hand over to ${status.requested_by}`;
   byId("take").hidden = !(status.role === "watches" && status.can_drive);
   const [speed, target] = [byId("speed").querySelector("b"), byId("speed").querySelector("i")];
   speed.textContent = status.speed_mps === null ? "–" : (status.speed_mps * 3.6).toFixed(0);

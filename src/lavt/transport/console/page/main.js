@@ -117,6 +117,10 @@ byId("calibrate").onclick = (event) => {
   calibration = calibration === null ? new Calibration() : null;
   event.currentTarget.blur();
 };
+byId("release").onclick = (event) => {
+  send({ type: "release" });
+  event.currentTarget.blur();
+};
 byId("take").onclick = (event) => {
   send({ type: "drive" });
   event.currentTarget.blur();
@@ -131,6 +135,9 @@ for (const slider of [byId("video_delay"), byId("control_delay")]) {
   slider.onchange = () => slider.blur();
 }
 setInterval(sendInput, INPUT_PERIOD_MS);
-setInterval(() => send({ type: "probe", sent_us: pageTime_us() }), PROBE_PERIOD_MS);
+setInterval(() => {
+  send({ type: "probe", sent_us: pageTime_us() });
+  video.check();
+}, PROBE_PERIOD_MS);
 addEventListener("hashchange", () => location.reload());
 connect();

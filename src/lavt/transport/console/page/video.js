@@ -4,6 +4,7 @@ import { pageTime_us } from "./clock.js";
 import { readStamp } from "./stamp.js";
 
 const MAX_DECODING = 3; // access units in the decoder
+const DECODING_LIMIT_US = 1_000_000;
 
 export class Video {
   #canvas;
@@ -42,6 +43,12 @@ export class Video {
     } catch {
       this.#fail();
     }
+  }
+
+  // Give up an access unit from which the decoder makes neither a picture nor an error.
+  check() {
+    const [oldest] = this.#pending.values();
+    if (oldest !== undefined && pageTime_us() - oldest[1] > DECODING_LIMIT_US) this.#fail();
   }
 
   close() {
