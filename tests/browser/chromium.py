@@ -26,6 +26,8 @@ from lavt.domain import NS_PER_MS, NS_PER_S
 PACKAGES: Final = ("chromium",)
 """Debian packages; .ci/run installs them."""
 PROGRAM: Final = "chromium"
+FOREIGN_NAME: Final = "attacker.example"
+"""A name of another site that leads to this machine, as after DNS rebinding."""
 START_LIMIT_S: Final = 60.0
 POLL_NS: Final = 50 * NS_PER_MS
 KEY_CODES: Final = {"Space": 32, "ArrowLeft": 37, "ArrowUp": 38, "ArrowRight": 39, "ArrowDown": 40, "Escape": 27}
@@ -144,6 +146,7 @@ def running_browser(profile: Path) -> Iterator[Browser]:
     arguments = ["--headless=new", "--disable-gpu", "--no-first-run", "--window-size=1280,800"]
     arguments += ["--remote-debugging-port=0", "--remote-allow-origins=*", f"--user-data-dir={profile}"]
     arguments += ["--disable-background-networking", "--disable-component-update", "--disable-sync"]
+    arguments += [f"--host-resolver-rules=MAP {FOREIGN_NAME} 127.0.0.1"]
     arguments += ["--no-sandbox"] * (os.geteuid() == 0)
     profile.mkdir(parents=True, exist_ok=True)
     with (profile / "browser.log").open("wb") as log:
