@@ -301,6 +301,8 @@ def test_the_status_has_state_delays_and_round_trip() -> None:
     assert (status["safety"], status["reason"], status["speed_mps"]) == ("driving", "why", 4.0)
     assert (status["hand"], status["phase"], status["command"][1]) == ("held", "driving", 0.5)
     assert status["round_trip_ms"] == 7.0
+    bench.deliver("access_unit", ReceivedUnit(bytes(1000), 1, True, False, MONO_NS))
+    assert (bench.status()["bit_rate_bps"], bench.wake(NS_PER_S) and bench.status()["bit_rate_bps"]) == (8000, 0)
     assert status["conditions"] == [list(condition) for condition in DELAYS.conditions]
     assert status["delay"] == [0.0, 0.0]
 

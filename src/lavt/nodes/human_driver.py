@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Final
 
 from lavt.control.client_limits import ClientLimits
 from lavt.control.human_controls import LOST, HumanControls, HumanInput
-from lavt.domain import NS_PER_MS, NS_PER_US, Decision, Mode, Now
+from lavt.domain import NS_PER_MS, NS_PER_S, NS_PER_US, Decision, Mode, Now
 from lavt.errors import BadMessage
 from lavt.node import WAKE, Message, Peer, Send, Stage
 from lavt.nodes.client_session import ClientSession
@@ -48,7 +48,7 @@ from lavt.transport.video.stamp import rtp_timestamp
 
 STATUS_PERIOD_NS: Final = 50 * NS_PER_MS
 MAX_FRAMES: Final = 300
-"""How many decoded frames are remembered until the page has shown them: ten seconds."""
+"""How many frames are remembered, until the page has shown them or for the bit rate: ten seconds at 30 Hz."""
 MAX_COMMANDS: Final = 512
 """How many commands are remembered until the vehicle has applied them: five seconds."""
 IDLE_COMMAND_NS: Final = 100 * NS_PER_MS
@@ -83,6 +83,8 @@ class HumanDriverNode(Commander):
         """The state of the hand in the last record entry."""
         self._frames: dict[int, FrameStamp] = {}
         """Decoded frames by RTP timestamp."""
+        self._arrived: deque[tuple[int, int]] = deque(maxlen=MAX_FRAMES)
+        """Times and sizes (bytes) of the access units that arrived in the last second."""
         self._shown_unit: int | None = None
         """The newest access unit that the driving page has shown, if it has not been decoded here yet."""
         self._sent: deque[tuple[int, int]] = deque(maxlen=MAX_COMMANDS)
@@ -126,6 +128,7 @@ class HumanDriverNode(Commander):
     def _forward(self, message: Message, now: Now) -> list[Send]:
         """Send an access unit to the pages, and then decode it."""
         unit: ReceivedUnit = message.payload
+        self._arrived.append((now.mono_ns, len(unit.data)))
         pages = [peer for peer, video in self._pages.items() if video.offer(unit)]
         sends = []
         if pages:
@@ -299,6 +302,11 @@ class HumanDriverNode(Commander):
 
     # Status.
 
+    def _bit_rate_bps(self, now: Now) -> int:
+        while self._arrived and self._arrived[0][0] < now.mono_ns - NS_PER_S:
+            self._arrived.popleft()
+        return 8 * sum(size for _, size in self._arrived)
+
     def _statuses(self, now: Now) -> list[Send]:
         return [Send("page_status", pack_text(self._status(page, now)), page) for page in self._pages]
 
@@ -327,6 +335,7 @@ class HumanDriverNode(Commander):
             command=(last[1].steering_rad, last[1].throttle, last[1].brake) if last and is_current else None,
             video_ms=None if view is None else (view.read_wall_ns - view.stamp_ns) / NS_PER_MS,
             round_trip_ms=None if self._round_trip_ns is None else self._round_trip_ns / NS_PER_MS,
+            bit_rate_bps=self._bit_rate_bps(now),
             delay=None if self._delay is None else (self._delay.video_ms, self._delay.control_ms),
             conditions=self._conditions,
             **vehicle,

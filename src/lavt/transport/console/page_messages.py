@@ -173,6 +173,8 @@ class PageStatus(Struct, frozen=True, kw_only=True):
     their offset."""
     round_trip_ms: float | None
     """From a command to the first state in which the vehicle reports it as applied."""
+    bit_rate_bps: int
+    """Bit rate of the access units that arrived in the last second."""
     delay: tuple[float, float] | None
     """The injected delays of video and control in ms; None: this client cannot inject any."""
     conditions: tuple[tuple[str, float, float], ...] = ()

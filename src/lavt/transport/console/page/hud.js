@@ -1,12 +1,14 @@
 // What the page shows besides the picture.
 
 import { QUESTIONS, devices } from "./gamepad.js";
+import { History } from "./history.js";
 
 const byId = (id) => document.getElementById(id);
 const SAFETY = {
   disarmed: "disarmed", arming: "arming", driving: "driving", degraded: "degraded",
   safe_stop: "safe stop", emergency_stop: "emergency stop",
 };
+const history = new History(byId("history"));
 const HANDS = {
   not_seen: "let go of the dead-man control (the space bar), then hold it",
   not_live: "click the page, then let go of the dead-man control (the space bar) and hold it",
@@ -20,7 +22,8 @@ export function showClosed(text) {
   byId("take").hidden = byId("release").hidden = true;
 }
 
-export function showStatus(status, input, video) {
+// `age_ms` is the age of the picture on the screen, from its stamp; null: unknown.
+export function showStatus(status, input, video, age_ms) {
   byId("connection").textContent = status.role === "drives" ? "drives" : "watches";
   const safety = byId("safety");
   safety.textContent = SAFETY[status.safety] ?? "no state";
@@ -42,7 +45,10 @@ export function showStatus(status, input, video) {
   byId("video_ms").textContent = ms(status.video_ms);
   byId("round_trip_ms").textContent = ms(status.round_trip_ms);
   byId("shown_ms").textContent = ms(video.shown_ms);
+  byId("age_ms").textContent = ms(age_ms);
+  byId("bit_rate").textContent = `${(status.bit_rate_bps / 1e6).toFixed(1)} Mb/s`;
   byId("errors").textContent = video.errors;
+  history.add(age_ms);
   byId("stop").className = status.emergency_stop;
   showNetwork(status);
 }

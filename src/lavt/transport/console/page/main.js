@@ -66,7 +66,7 @@ function takeStatus(message) {
   if (message.version !== VERSION) return socket.close(4000, "reload this page: it is of another version of lavt");
   seen_us = message.sent_us;
   status = message;
-  showStatus(status, source, video);
+  showStatus(status, source, video, frameAge_ms());
   showCalibration(calibration);
 }
 
@@ -81,8 +81,14 @@ function takeUnit(buffer) {
 function reportShown(times) {
   const best = offset.best;
   if (best === null) return;
-  video.shown_ms = (times.shown_us + best.offset_us) / 1000 - Number(BigInt(times.stamp) / 1000n) / 1000;
+  video.stamp_us = Number(BigInt(times.stamp) / 1000n);
+  video.shown_ms = (times.shown_us + best.offset_us - video.stamp_us) / 1000;
   send({ type: "shown", ...times, ...best });
+}
+
+function frameAge_ms() {
+  const best = offset.best;
+  return best === null || video.stamp_us === null ? null : (pageTime_us() + best.offset_us - video.stamp_us) / 1000;
 }
 
 function sendInput() {

@@ -25,6 +25,7 @@ export class Video {
     this.#acknowledge = acknowledge;
     this.#lose = lose;
     this.shown = 0;
+    this.stamp_us = null; // of the newest picture that was shown
     this.shown_ms = null; // from the stamp until the newest picture was shown
     this.errors = 0;
   }
