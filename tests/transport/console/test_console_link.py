@@ -1,0 +1,255 @@
+"""The web server of the console, with real sockets and the client of the package `websockets`."""
+
+# ruff: noqa: D102 (a test bench with short methods)
+
+from __future__ import annotations
+
+import http.client
+import json
+import queue
+import socket
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+
+from lavt.clock import MachineClock
+from lavt.domain import Now
+from lavt.errors import UserError
+from lavt.node import Send
+from lavt.runtime.thread_failures import fail_on_thread_errors
+from lavt.transport.console import console_link
+from lavt.transport.console.console_link import MAX_PAGES, ConsoleLink
+from lavt.transport.console.page_messages import MAX_PAGE_MESSAGE_BYTES, PAGE_VERSION
+from lavt.transport.console.site import HEADERS, NOT_A_HELLO, TOO_MANY_PAGES, WRONG_TOKEN, WRONG_VERSION
+
+TOKEN = "0123456789abcdef"
+HELLO = json.dumps({"type": "hello", "version": PAGE_VERSION, "token": TOKEN})
+Delivered = tuple[str, Any, int]
+
+
+class Console:
+    """A running link, and what it has delivered."""
+
+    def __init__(self) -> None:
+        self.link = ConsoleLink(MachineClock(), TOKEN)
+        self.delivered: queue.Queue[Delivered] = queue.Queue()
+
+        self._connections = ExitStack()
+
+    def deliver(self, channel: str, payload: Any, _arrived: Now, peer: Any) -> None:
+        self.delivered.put((channel, payload, peer))
+
+    def take(self) -> Delivered:
+        return self.delivered.get(timeout=10)
+
+    def connect(self, *, origin: str | None = None, host: str = "127.0.0.1") -> ClientConnection:
+        own: Any = f"http://127.0.0.1:{self.link.port}" if origin is None else origin or None
+        uri = f"ws://{host}:{self.link.port}/socket"
+        connection = connect(uri, origin=own, compression=None, proxy=None, close_timeout=1)
+        opened: ClientConnection = self._connections.enter_context(connection)
+        return opened
+
+    def close(self) -> None:
+        self.link.close()
+        self._connections.close()
+
+    def open(self) -> tuple[ClientConnection, int]:
+        """Open a page with the right token, and return its connection and its number."""
+        page = self.connect()
+        page.send(HELLO)
+        channel, _, number = self.take()
+        assert channel == "page_opened"
+        return page, number
+
+    def closing_code(self, hello: str | bytes) -> int:
+        """Return the code with which the socket is closed after this first message."""
+        page = self.connect()
+        page.send(hello)
+        with pytest.raises(ConnectionClosed) as raised:
+            page.recv(timeout=10)
+        assert raised.value.rcvd is not None
+        return raised.value.rcvd.code
+
+
+@pytest.fixture
+def console() -> Iterator[Console]:
+    console = Console()
+    failures: list[BaseException] = []
+    with fail_on_thread_errors(failures.append):
+        console.link.start(console.deliver)
+        yield console
+        console.close()
+    assert failures == []
+
+
+def get(port: int, path: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    connection.request("GET", path, headers=headers)
+    response = connection.getresponse()
+    result = response.status, dict(response.getheaders()), response.read()
+    connection.close()
+    return result
+
+
+def test_the_page_is_served_with_security_headers(console: Console) -> None:
+    """The page and its files are served with the headers that bind it to this site; foreign requests are rejected."""
+    status, headers, body = get(console.link.port, "/")
+    assert (status, headers["Content-Type"]) == (200, "text/html; charset=utf-8")
+    assert b"<canvas" in body
+    assert headers.items() >= HEADERS.items()
+    assert not [name for name in headers if name.lower().startswith("access-control")]
+    assert get(console.link.port, "/main.js")[1]["Content-Type"].startswith("text/javascript")
+    assert get(console.link.port, "/", Host="attacker.example")[0] == 421
+    assert get(console.link.port, "/", Origin="http://attacker.example")[0] == 403
+    assert get(console.link.port, "/../site.py")[0] == 404
+    assert console.link.counts == {"requests_answered": 2, "requests_rejected": 3}
+
+
+@pytest.mark.parametrize("origin", ["http://attacker.example", "null", ""])
+def test_a_foreign_page_cannot_open_the_socket(console: Console, origin: str) -> None:
+    """A WebSocket with a foreign, null or missing Origin is rejected with 403, whatever token it knows."""
+    with pytest.raises(InvalidStatus) as raised:
+        console.connect(origin=origin)
+    assert raised.value.response.status_code == 403
+
+
+def test_a_foreign_name_cannot_open_the_socket(console: Console) -> None:
+    """A WebSocket to a foreign host name that leads to this machine is rejected with 421."""
+    uri = f"ws://attacker.example:{console.link.port}/socket"
+    with socket.create_connection(("127.0.0.1", console.link.port)) as sock, pytest.raises(InvalidStatus) as raised:
+        connect(uri, sock=sock, compression=None, proxy=None)
+    assert raised.value.response.status_code == 421
+
+
+def test_the_server_listens_on_loopback_addresses_only(console: Console) -> None:
+    """The server answers at 127.0.0.1 and, if this machine has it, at ::1, and listens at no other address."""
+    addresses = {listener.getsockname()[0] for listener in console.link._sockets}
+    assert addresses <= {"127.0.0.1", "::1"}
+    assert ("::1" in addresses) == console_link._has_ipv6()
+    if "::1" in addresses:
+        page = console.connect(host="[::1]", origin=f"http://[::1]:{console.link.port}")
+        page.send(HELLO)
+        assert console.take()[0] == "page_opened"
+
+
+@pytest.mark.parametrize(
+    ("hello", "code"),
+    [
+        (json.dumps({"type": "hello", "version": PAGE_VERSION, "token": "wrong"}), WRONG_TOKEN.code),
+        (json.dumps({"type": "hello", "version": 0, "token": TOKEN}), WRONG_VERSION.code),
+        ('{"type": "stop"}', NOT_A_HELLO.code),
+        (b"\xff\xfe\x00", NOT_A_HELLO.code),
+        ("x" * (MAX_PAGE_MESSAGE_BYTES + 1), 1009),
+    ],
+)
+def test_without_the_token_nothing_is_delivered(console: Console, hello: str | bytes, code: int) -> None:
+    """A page whose first message is not a hello with the token is closed, and nothing of it is delivered."""
+    assert console.closing_code(hello) == code
+    assert console.delivered.empty()
+
+
+def test_messages_of_a_page_are_delivered(console: Console) -> None:
+    """After the hello, messages are delivered as they are, and the end of the connection is."""
+    page, number = console.open()
+    page.send("any text")
+    page.send(b"\xff\x00")
+    assert [console.take(), console.take()] == [
+        ("page_message", "any text", number),
+        ("page_message", b"\xff\x00", number),
+    ]
+    page.close()
+    assert console.take() == ("page_closed", None, number)
+
+
+def test_a_huge_message_closes_the_page(console: Console) -> None:
+    """A message that is too long closes its page, and the link goes on."""
+    page, number = console.open()
+    page.send("x" * 100_000)
+    assert console.take() == ("page_closed", None, number)
+    console.open()[0].close()
+
+
+def test_messages_reach_their_page(console: Console) -> None:
+    """Statuses arrive as text and access units as bytes, each at its page; those for closed pages are dropped."""
+    (first, one), (second, two) = console.open(), console.open()
+    console.link.send(Send("page_unit", b"unit", one), Send("page_status", b"{}", two), Send("page_unit", b"", 99))
+    assert first.recv(timeout=10) == b"unit"
+    assert second.recv(timeout=10) == "{}"
+    first.close()
+    second.close()
+
+
+def test_a_page_that_does_not_read_loses_statuses(console: Console) -> None:
+    """A page that reads nothing delays nobody: statuses for it are dropped and counted."""
+    page, number = console.open()
+    for _ in range(3000):
+        console.link.send(Send("page_status", b" " * 4096, number))
+    other, other_number = console.open()
+    console.link.send(Send("page_status", b"{}", other_number))
+    assert other.recv(timeout=10) == "{}"
+    assert console.link.counts["page_status_dropped"] > 0
+    other.close()
+    page.close()
+
+
+def test_the_number_of_pages_is_limited(console: Console) -> None:
+    """One page more than `MAX_PAGES` is closed with a code that says so."""
+    pages = [console.open()[0] for _ in range(MAX_PAGES)]
+    assert console.closing_code(HELLO) == TOO_MANY_PAGES.code
+    for page in pages:
+        page.close()
+
+
+def test_garbage_on_the_port_changes_nothing(console: Console) -> None:
+    """Bytes that are not HTTP end only their own connection."""
+    for garbage in (b"\x00" * 5000, b"GET / HTTP/1.1\r\n" + b"a: b\r\n" * 2000, b"POST / HTTP/1.1\r\n\r\n", b"\r\n"):
+        with socket.create_connection(("127.0.0.1", console.link.port), timeout=10) as sock:
+            sock.sendall(garbage)
+            sock.shutdown(socket.SHUT_WR)
+            while sock.recv(4096):
+                pass
+    assert get(console.link.port, "/")[0] == 200
+
+
+def test_a_used_port_is_an_error_of_the_user(console: Console) -> None:
+    """A port that another program uses gives one sentence."""
+    with pytest.raises(UserError, match=f"port {console.link.port} cannot be opened"):
+        ConsoleLink(MachineClock(), TOKEN, console.link.port)
+
+
+def test_a_link_that_was_not_started_can_be_closed() -> None:
+    """A link is closed without having been started, and its port is free again."""
+    link = ConsoleLink(MachineClock(), TOKEN)
+    link.close()
+    ConsoleLink(MachineClock(), TOKEN, link.port).close()
+
+
+def test_an_error_in_the_thread_fails_the_process() -> None:
+    """If the delivery of a message raises, the link's thread ends with that error."""
+
+    def fail(*_: Any) -> None:
+        raise RuntimeError("delivery is broken")
+
+    failures: list[BaseException] = []
+    link = ConsoleLink(MachineClock(), TOKEN)
+    with fail_on_thread_errors(failures.append):
+        link.start(fail)
+        own: Any = f"http://127.0.0.1:{link.port}"
+        with connect(f"ws://127.0.0.1:{link.port}/socket", origin=own, proxy=None) as page:
+            page.send(HELLO)
+            assert link._thread is not None
+            link._thread.join(10)
+        link.close()
+    assert [str(failure) for failure in failures] == ["delivery is broken"]
+
+
+def test_without_the_package_the_user_gets_advice(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the package `websockets`, the error names the extra that installs it."""
+    monkeypatch.setitem(sys.modules, "websockets.asyncio.server", None)
+    with pytest.raises(UserError, match=r"lavt\[console\]"):
+        ConsoleLink(MachineClock(), TOKEN)
