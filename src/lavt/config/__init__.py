@@ -37,6 +37,8 @@ class VehicleConfig(Section):
     scenery: Literal["full", "light", "none"] = "full"
     light: Literal["noon", "low_sun", "overcast"] = "noon"
     """The position of the sun and the state of the sky, see `docs/camera.md`."""
+    weather: Literal["clear", "wet", "rain", "fog", "night", "worn"] = "clear"
+    """The weather and the state of the road, see `docs/camera.md`. It changes pictures only."""
     car: str = "lincoln_mkz"
     steering_dead_time_ms: float | None = Field(None, ge=0, le=2000)
     """The time from a command until the wheels begin to follow. Null, here and for the four keys below: the value of
