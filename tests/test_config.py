@@ -49,6 +49,7 @@ SCHEMAS: dict[str, type[Section]] = {
     "server-by-wire.yaml": ServerConfig,
     "server-secure.yaml": ServerConfig,
     "speed.yaml": SweepConfig,
+    "weather.yaml": SweepConfig,
     "sweep.yaml": SweepConfig,
 }
 """The schema of each file in configs/."""
@@ -91,9 +92,11 @@ def test_the_paper_config() -> None:
     assert len(plan_sweep(paper)) == 180
 
 
-@pytest.mark.parametrize(("name", "count"), [("loss_and_jitter.yaml", 36), ("roads.yaml", 180), ("speed.yaml", 72)])
+@pytest.mark.parametrize(
+    ("name", "count"), [("loss_and_jitter.yaml", 36), ("roads.yaml", 180), ("speed.yaml", 72), ("weather.yaml", 18)]
+)
 def test_sweeps_over_further_axes(name: str, count: int) -> None:
-    """The sweeps over loss and jitter, and over speed, can be planned; each axis contains the base config's value."""
+    """The sweeps over loss and jitter, speed and weather can be planned; each axis contains the base config's value."""
     sweep = load_config(SweepConfig, shipped("configs") / name)
     runs = plan_sweep(sweep)
     assert len(runs) == count

@@ -24,6 +24,8 @@ class VehicleConfig(Section):
     """light: without trees, lamp posts, buildings and clouds; none: also without rails and shadows."""
     light: Literal["noon", "low_sun", "overcast"] = "noon"
     """The position of the sun and the state of the sky, see `docs/camera.md`."""
+    weather: Literal["clear", "wet", "rain", "fog", "night", "worn"] = "clear"
+    """The weather and the state of the road, see `docs/camera.md`. It changes pictures only."""
     car: str = "lincoln_mkz"
     """The name of a car of the simulator (`docs/roads.md`)."""
     steering_dead_time_ms: float | None = Field(None, ge=0, le=2000)

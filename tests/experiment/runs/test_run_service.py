@@ -307,7 +307,7 @@ def test_a_run_has_time_limits(rig: Rig, latest: dict[str, Any], after_ms: int) 
     assert not rig.processes[0].running
 
 
-@pytest.mark.parametrize(("ending", "exit_code"), [(None, 0), (None, 2), ("completed", 1), ("completed", -9)])
+@pytest.mark.parametrize(("ending", "exit_code"), [(None, 0), (None, 2), ("completed", 1)])
 def test_a_failed_process_fails_the_run(rig: Rig, ending: str | None, exit_code: int) -> None:
     """If the process ends before its drive or with an error, the run has failed, and the reply has its last message."""
     rig.ask(BEGIN)
@@ -317,6 +317,25 @@ def test_a_failed_process_fails_the_run(rig: Rig, ending: str | None, exit_code:
     failed = rig.ask(STATUS)
     assert (failed.phase, failed.size) == ("failed", 0)
     assert "the last message" in failed.reason
+
+
+def test_the_reason_of_a_killed_process_is_the_signal(rig: Rig) -> None:
+    """If the process is killed, which it could not report, the reply names the signal."""
+    rig.ask(BEGIN)
+    rig.processes[0].complete(b"record")
+    rig.processes[0].exit_code = -9
+    rig.service.step()
+    failed = rig.ask(STATUS)
+    assert failed.phase == "failed"
+    assert "signal 9" in failed.reason
+    assert "the last message" not in failed.reason
+
+
+def test_a_deleted_output_directory_is_made_again(rig: Rig) -> None:
+    """A run begins even if somebody has deleted the directory of all runs."""
+    shutil.rmtree(rig.out)
+    assert rig.ask(BEGIN).phase == "starting"
+    assert [path.name for path in rig.out.iterdir()] == ["0001"]
 
 
 def test_directories_are_numbered_by_the_server(tmp_path: Path) -> None:
@@ -339,12 +358,13 @@ def test_a_full_store_begins_no_run(tmp_path: Path) -> None:
 
 def test_errors_of_the_servers_files_are_refusals(tmp_path: Path) -> None:
     """If a directory or record cannot be used, the request is refused, and the server continues."""
-    rig = Rig(tmp_path / "missing")
+    (tmp_path / "file").touch()
+    rig = Rig(tmp_path / "file")
     assert rig.ask(BEGIN).refusal == "server_error"
-    rig = Rig(tmp_path)
+    rig = Rig(tmp_path / "runs")
     rig.ask(BEGIN)
     rig.finish(b"record")
-    (tmp_path / "0001" / RECORD).unlink()
+    (tmp_path / "runs" / "0001" / RECORD).unlink()
     assert rig.ask(READ).refusal == "server_error"
 
 

@@ -140,10 +140,21 @@ def _drive(config: ClientConfig, planned: PlannedRun, work: Path) -> None:
         finally:
             with suppress(LavtError):
                 requests.request("end", run)
+    check_record(work / "server.mcap", work / "client" / "client.mcap")
+
+
+def check_record(server: Path, client: Path) -> None:
+    """Raise `WorkError` if the server's record is incomplete, unreadable, or of another drive than the client's."""
     try:
-        check_same_drive(work / "server.mcap", work / "client" / "client.mcap")
+        is_complete = read_record(server, channels=("event",)).complete
+        check_same_drive(server, client)
     except UserError as error:
-        raise WorkError(f"the run was driven by another client, or its record is damaged: {error}") from error
+        raise WorkError(
+            "the server sent a damaged record, or another client has driven: see whether another program uses the name "
+            "of this operator"
+        ) from error
+    if not is_complete:
+        raise WorkError("the server could not write the whole record: free space on its disk")
 
 
 def _begin(requests: RunRequests, run: int, settings: str) -> None:

@@ -199,6 +199,7 @@ class RunService:
             raise _Refused("unknown_run", "this run is over")
         settings = _parse_settings(request.settings)
         config = self._run_config(settings, owner.who)
+        self._out.mkdir(parents=True, exist_ok=True)  # it can have been deleted
         self._check_space()
         directory = self._new_directory()
         now_ns = self._clock.now().mono_ns
@@ -265,7 +266,7 @@ class RunService:
         record = run.directory / RECORD
         run.process.end()  # wait until its last line has been read
         if not run.failure and (run.process.exit_code != 0 or run.process.latest.get("ending") is None):
-            run.failure = f"the server of the run failed: {run.process.last_message()}"
+            run.failure = _failure(run.process)
         if run.failure:
             run.phase = "failed"
             if not run.ready:
@@ -294,6 +295,13 @@ class RunService:
             self._fail(run, reason)
         else:
             self._run = None
+
+
+def _failure(process: RunProcess) -> str:
+    code = process.exit_code
+    if code is not None and code < 0:
+        return f"the server of the run was killed by signal {-code}"
+    return f"the server of the run failed with exit code {code}: {process.last_message()}"
 
 
 def _parse_settings(text: str) -> RemoteRunConfig:
