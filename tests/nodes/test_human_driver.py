@@ -291,6 +291,20 @@ def test_after_a_safe_stop_a_fresh_press_arms_again() -> None:
     assert bench.input().mode == "arm"
 
 
+def test_a_hold_that_lasts_through_a_stop_does_not_arm() -> None:
+    """A hand that has held since before the vehicle stopped by itself arms nothing; a fresh press does."""
+    bench = HumanBench().drive()
+    for speed_mps in (3.0, 0.0, 0.0):
+        bench.mono_ns += NS_PER_MS
+        bench.state("safe_stop", speed_mps)
+    assert bench.session.phase == "seeking"
+    bench.grant()
+    assert [bench.input() for _ in range(5)] == [None] * 5
+    assert bench.status()["hand"] == "not_seen"
+    assert bench.input(held=False) is None
+    assert bench.input().mode == "arm"
+
+
 def test_the_status_has_state_delays_and_round_trip() -> None:
     """The status reports the vehicle's state, the hand, the last command and the round trip of a command."""
     bench = HumanBench(DELAYS).drive()

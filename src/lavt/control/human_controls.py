@@ -86,6 +86,11 @@ class HumanControls:
         """Take no more input: no page drives."""
         self._lock("no_page")
 
+    def lock(self) -> None:
+        """Lock the latch after a drive: a hold that lasts since then is no decision to drive again."""
+        if self._hand != "no_page":
+            self._lock("not_seen")
+
     def hand(self, now_ns: int) -> HandState:
         """Return the state of the hand; without an input for too long, the latch locks."""
         if self._hand == "no_page":

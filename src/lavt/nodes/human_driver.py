@@ -78,6 +78,8 @@ class HumanDriverNode(Commander):
         self._page_counts: Counter[str] = Counter()
         """Counts of closed pages."""
         self._driving_page: Peer = None
+        self._was_driving = False
+        """The session was driving when it was last examined."""
         self._status_ns = 0
         self._hand: str = "no_page"
         """The state of the hand in the last record entry."""
@@ -225,6 +227,7 @@ class HumanDriverNode(Commander):
         if page != self._driving_page:
             self._counts["inputs_without_control"] += 1
             return []
+        self._lock_after_drive()
         self._controls.handle(
             HumanInput(new.seen_us * NS_PER_US, new.held, new.live, new.steering, new.throttle, new.brake), now.mono_ns
         )
@@ -290,6 +293,17 @@ class HumanDriverNode(Commander):
     def _note_command(self, decision: Decision, now: Now) -> None:
         self._sent.append((self._sequence, now.mono_ns))
         self._last = now.mono_ns, decision
+
+    def _note_state(self, message: Message, now: Now) -> None:
+        super()._note_state(message, now)
+        self._lock_after_drive()
+
+    def _lock_after_drive(self) -> None:
+        """Lock the latch when a drive has ended, for whatever reason, so that only a fresh press arms again."""
+        is_driving = self.session.phase == "driving"
+        if self._was_driving and not is_driving:
+            self._controls.lock()
+        self._was_driving = is_driving
 
     def _handle_newer_state(self, now: Now) -> None:
         state = self._newest_state
