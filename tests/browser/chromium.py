@@ -1,4 +1,4 @@
-"""A real Chromium without a window, controlled over the Chrome DevTools Protocol.
+"""A real Chromium, by default without a window, controlled over the Chrome DevTools Protocol.
 
 Libraries such as Playwright tell a page that it is visible and has the focus even if it is not, which makes tests of a
 dead-man control worthless. The protocol itself does not.
@@ -23,9 +23,10 @@ from websockets.sync.client import connect
 from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S
 
-PACKAGES: Final = ("chromium",)
+PACKAGES: Final = ("chromium", "xvfb", "xdotool", "openbox")
 """Debian packages; .ci/run installs them."""
 PROGRAM: Final = "chromium"
+PROGRAMS: Final = (PROGRAM, "Xvfb", "xdotool", "openbox")
 FOREIGN_NAME: Final = "attacker.example"
 """A name of another site that leads to this machine, as after DNS rebinding."""
 START_LIMIT_S: Final = 60.0
@@ -34,8 +35,8 @@ KEY_CODES: Final = {"Space": 32, "ArrowLeft": 37, "ArrowUp": 38, "ArrowRight": 3
 
 
 def is_missing() -> bool:
-    """Return whether Chromium is not installed."""
-    return shutil.which(PROGRAM) is None
+    """Return whether Chromium, or a program with which a test uses its window, is not installed."""
+    return any(shutil.which(program) is None for program in PROGRAMS)
 
 
 def wait_until(expectation: str, condition: Callable[[], bool], limit_s: float = 30.0) -> None:
@@ -83,6 +84,10 @@ class Tab:
         """Press or release a key."""
         event = {"code": code, "windowsVirtualKeyCode": KEY_CODES.get(code, ord(code[-1]))}
         self.call("Input.dispatchKeyEvent", type="rawKeyDown" if down else "keyUp", key=code, **event)
+
+    def point(self, x: float = 300, y: float = 200) -> None:
+        """Move the pointer to a place over the page."""
+        self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
 
     def to_front(self) -> None:
         """Show this tab, which hides the others."""
@@ -141,9 +146,16 @@ class Browser:
 
 
 @contextmanager
-def running_browser(profile: Path) -> Iterator[Browser]:
-    """Run Chromium with an empty profile in this directory, and end all its processes."""
-    arguments = ["--headless=new", "--disable-gpu", "--no-first-run", "--window-size=1280,800"]
+def running_browser(profile: Path, display: str | None = None) -> Iterator[Browser]:
+    """Run Chromium with an empty profile in this directory, and end all its processes.
+
+    With `display`, it has a window there, at (50, 30).
+    """
+    arguments = ["--disable-gpu", "--no-first-run"]
+    if display is None:
+        arguments += ["--headless=new", "--window-size=1280,800"]
+    else:
+        arguments += ["--window-size=1000,800", "--window-position=50,30"]
     arguments += ["--remote-debugging-port=0", "--remote-allow-origins=*", f"--user-data-dir={profile}"]
     arguments += ["--disable-background-networking", "--disable-component-update", "--disable-sync"]
     arguments += [f"--host-resolver-rules=MAP {FOREIGN_NAME} 127.0.0.1"]
@@ -155,6 +167,7 @@ def running_browser(profile: Path) -> Iterator[Browser]:
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,
+            env=os.environ | ({} if display is None else {"DISPLAY": display}),
             start_new_session=True,
         )
     browser = None

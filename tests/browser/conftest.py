@@ -102,7 +102,8 @@ def drive_until(tab: Tab, hold: Callable[[], None], let_go: Callable[[], None], 
 
 
 def press(tab: Tab, *codes: str) -> None:
-    """Press keys."""
+    """Press keys, with the pointer over the page."""
+    tab.point()
     for code in codes:
         tab.key(code, down=True)
 

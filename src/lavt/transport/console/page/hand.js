@@ -7,11 +7,14 @@ const KEYS = {
   ArrowUp: "throttle", KeyW: "throttle",
   ArrowDown: "brake", KeyS: "brake",
 };
+const OTHER_KEYS = /^(Digit[0-9]|Escape)$/; // which the page uses, too; any other key may open a menu
 const STEERING_PER_S = 1.6; // of full deflection
 const RETURN_PER_S = 3.0;
 const THROTTLE_PER_S = 2.0;
 const BRAKE_PER_S = 4.0;
 
+// While a menu is open or a window is dragged, the browser delivers no release of a key, and the page keeps the focus.
+// So a key counts only while nothing can have opened one: the pointer is over the page, and no other key is pressed.
 export class Keyboard {
   #held = new Set(); // codes of the keys that are down
 
@@ -19,13 +22,19 @@ export class Keyboard {
     this.steering = 0; // -1 to 1, left positive
     this.throttle = 0;
     this.brake = 0;
-    addEventListener("keydown", (event) => this.#keyDown(event));
-    addEventListener("keyup", (event) => this.#held.delete(event.code));
+    this.isPointed = false; // the pointer is over the page
+    addEventListener("keydown", (event) => this.#keyDown(event), true);
+    addEventListener("keyup", (event) => this.#held.delete(event.code), true);
     addEventListener("blur", () => this.release());
-    document.addEventListener("visibilitychange", () => this.release());
+    document.addEventListener("visibilitychange", () => this.#leave());
+    document.addEventListener("mousemove", () => { this.isPointed = true; });
+    document.addEventListener("mouseleave", () => this.#leave());
+    addEventListener("mousedown", ({ button }) => button !== 0 && this.release(), true);
+    addEventListener("contextmenu", (event) => this.#prevent(event), true);
+    addEventListener("dragstart", (event) => this.#prevent(event), true);
   }
 
-  // Forget all keys: a key that is released while the page has no focus sends no event.
+  // Forget all keys: the release of a key may send no event.
   release() {
     this.#held.clear();
     this.steering = this.throttle = this.brake = 0;
@@ -54,10 +63,24 @@ export class Keyboard {
     return [...this.#held].some((code) => KEYS[code] === action);
   }
 
-  #keyDown(event) {
-    if (!(event.code in KEYS) || event.ctrlKey || event.altKey || event.metaKey) return;
+  #leave() {
+    this.isPointed = false;
+    this.release();
+  }
+
+  #prevent(event) {
     event.preventDefault();
-    if (!event.repeat) this.#held.add(event.code); // a repeated event is no new press
+    this.release();
+  }
+
+  #keyDown(event) {
+    const hasModifier = event.ctrlKey || event.altKey || event.metaKey;
+    if (hasModifier || !(event.code in KEYS)) {
+      if (hasModifier || !OTHER_KEYS.test(event.code)) this.release();
+      return;
+    }
+    event.preventDefault();
+    if (!event.repeat && this.isPointed) this.#held.add(event.code); // a repeated event is no new press
   }
 }
 

@@ -22,8 +22,8 @@ export function showClosed(text) {
   byId("take").hidden = byId("release").hidden = true;
 }
 
-// `age_ms` is the age of the picture on the screen, from its stamp; null: unknown.
-export function showStatus(status, input, video, age_ms) {
+// `age_ms` is the age of the picture on the screen, from its stamp; null: unknown. Without `canHold`, keys do not count.
+export function showStatus(status, input, video, age_ms, canHold) {
   byId("connection").textContent = status.role === "drives" ? "drives" : "watches";
   const safety = byId("safety");
   safety.textContent = SAFETY[status.safety] ?? "no state";
@@ -32,7 +32,7 @@ export function showStatus(status, input, video, age_ms) {
   const limited = status.limited && `limited: ${status.limited}`;
   const requested = status.requested_by && `${status.requested_by} requests control`;
   byId("reason").textContent = [status.reason, requested, rejected, limited].filter(Boolean).join(" · ");
-  byId("hint").textContent = hint(status, input);
+  byId("hint").textContent = hint(status, input, canHold);
   byId("release").hidden = !(status.role === "drives" && status.has_control && status.requested_by !== "");
   byId("release").textContent = `Hand over to ${status.requested_by}`;
   byId("take").hidden = !(status.role === "watches" && status.can_drive);
@@ -53,7 +53,7 @@ export function showStatus(status, input, video, age_ms) {
   showNetwork(status);
 }
 
-function hint(status, input) {
+function hint(status, input, canHold) {
   if (status.emergency_stop === "sent") return "emergency stop sent, not confirmed yet";
   if (status.emergency_stop === "confirmed") return "emergency stop: the vehicle has confirmed it; restart this client to drive";
   if (status.role === "watches") return status.can_drive ? "no page drives" : "another page drives";
@@ -61,6 +61,7 @@ function hint(status, input) {
     return status.session_reason || "waiting for the vehicle";
   }
   if (status.hand in HANDS) return HANDS[status.hand];
+  if (!canHold) return "move the pointer over this page and leave it there: keys count only then";
   if (status.phase === "arming") {
     if (status.session_reason) return status.session_reason;
     if (status.hand === "open") return "hold the dead-man control (the space bar) for a second to arm";

@@ -32,7 +32,7 @@ const video = new Video(
   () => send({ type: "lost" }),
   reportShown,
 );
-globalThis.lavtConsole = { get status() { return status; }, video }; // for tests and the curious
+globalThis.lavtConsole = { get status() { return status; }, keyboard, video }; // for tests and the curious
 
 function send(message) {
   if (socket !== null && socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message));
@@ -66,7 +66,7 @@ function takeStatus(message) {
   if (message.version !== VERSION) return socket.close(4000, "reload this page: it is of another version of lavt");
   seen_us = message.sent_us;
   status = message;
-  showStatus(status, source, video, frameAge_ms());
+  showStatus(status, source, video, frameAge_ms(), source !== keyboard || keyboard.isPointed);
   showCalibration(calibration);
 }
 
