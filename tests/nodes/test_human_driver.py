@@ -264,6 +264,20 @@ def test_any_page_makes_an_emergency_stop(page: int) -> None:
     assert bench.status()["emergency_stop"] == "confirmed"
 
 
+def test_a_stop_is_not_swallowed_by_an_old_state() -> None:
+    """A stop that the vehicle has confirmed is not made twice, but made again once the vehicle's state is old."""
+    bench = HumanBench().drive()
+    (request,) = [decode(SessionRequest, each) for each in payloads(bench.page(type="stop"), "session")]
+    bench.deliver("session_reply", encode(SessionReply(True, "", 0, b"", 5600, "kernel", request.number)))
+    bench.mono_ns += NS_PER_MS
+    bench.state("emergency_stop")
+    assert payloads(bench.page(type="stop"), "session") == []
+    bench.mono_ns += NS_PER_S
+    (again,) = [decode(SessionRequest, each) for each in payloads(bench.page(type="stop"), "session")]
+    assert again.operation == "emergency_stop"
+    assert again.number != request.number
+
+
 def test_the_driving_page_hands_over() -> None:
     """The driving page releases control, as SIGUSR2 does, and another page cannot."""
     bench = HumanBench().drive()

@@ -51,6 +51,8 @@ MAX_FRAMES: Final = 300
 """How many frames are remembered, until the page has shown them or for the bit rate: ten seconds at 30 Hz."""
 MAX_COMMANDS: Final = 512
 """How many commands are remembered until the vehicle has applied them: five seconds."""
+STATE_AGE_NS: Final = 300 * NS_PER_MS
+"""An older state does not tell what the vehicle does now."""
 IDLE_COMMAND_NS: Final = 100 * NS_PER_MS
 """A command that is older is no longer shown as the last one."""
 
@@ -236,9 +238,13 @@ class HumanDriverNode(Commander):
         return [*self._command(now), Send("human_input", sample)]
 
     def _stop(self, _page: Peer, _stop: PageStop, now: Now) -> list[Send]:
-        """Make an emergency stop, also for a page that watches; a repeated request is the same stop."""
-        session = self.session
-        is_stopped = self._newest_state is not None and self._newest_state.safety == "emergency_stop"
+        """Make an emergency stop, also for a page that watches.
+
+        A repeated request is the same stop, unless this client does not know whether the vehicle is still stopped.
+        """
+        session, state = self.session, self._newest_state
+        is_known = now.mono_ns - self._state_ns < STATE_AGE_NS
+        is_stopped = state is not None and state.safety == "emergency_stop" and is_known
         if session.emergency_stop and (is_stopped or not session.is_stop_confirmed):
             return []
         return self._raise_emergency_stop(now)
