@@ -115,3 +115,20 @@ def test_keys_count_only_under_the_pointer(window: Window) -> None:
     window.act("keydown", "space")
     window.wait_for_hold(is_held=True)
     window.act("keyup", "space")
+
+
+def test_a_finger_counts_only_once_it_is_put_down_again(window: Window) -> None:
+    """After the page has lost the focus, a finger that stays on the field and moves does not hold."""
+
+    def finger(kind: str, x: int) -> bool:
+        event = f"new PointerEvent('{kind}', {{pointerId: 1, clientX: {x}, clientY: 10, cancelable: true}})"
+        window.tab.evaluate(f"document.querySelector('#touch_steering').dispatchEvent({event}); 0")
+        return bool(window.tab.evaluate("lavtConsole.touch.holds"))
+
+    window.tab.evaluate("Element.prototype.setPointerCapture = () => {}; 0")
+    assert finger("pointerdown", 100)
+    window.tab.evaluate("dispatchEvent(new Event('blur')); 0")
+    assert not finger("pointermove", 101)
+    assert not finger("pointerup", 101)
+    assert finger("pointerdown", 100)
+    assert not finger("pointerup", 100)

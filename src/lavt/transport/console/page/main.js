@@ -32,7 +32,7 @@ const video = new Video(
   () => send({ type: "lost" }),
   reportShown,
 );
-globalThis.lavtConsole = { get status() { return status; }, keyboard, video }; // for tests and the curious
+globalThis.lavtConsole = { get status() { return status; }, keyboard, touch, video }; // for tests and the curious
 
 function send(message) {
   if (socket !== null && socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message));
@@ -52,6 +52,7 @@ function connect() {
     offset = new Offset();
     video.close();
     keyboard.release();
+    touch.release();
     showClosed(reason || "the connection to lavt has ended");
     if (code < 4000) setTimeout(connect, RETRY_MS); // a code above tells that another attempt is pointless
   };

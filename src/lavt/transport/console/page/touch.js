@@ -7,6 +7,7 @@ const SHARE = 0.4; // of a field's size for full deflection
 export class Touch {
   #steers = null; // the pointer on the left field, and where it began
   #pedals = null;
+  #begins = new Map(); // by field: the event with which the finger on it began
 
   constructor(left, right) {
     this.release();
@@ -16,7 +17,9 @@ export class Touch {
     document.addEventListener("visibilitychange", () => this.release());
   }
 
+  // Forget all fingers: only one that is put down again counts.
   release() {
+    this.#begins.clear();
     this.#steers = this.#pedals = null;
   }
 
@@ -38,15 +41,15 @@ export class Touch {
 
   // Call `set` with the deflection of a finger on a field, or null when it is lifted.
   #listen(field, set) {
-    let begin = null;
     field.addEventListener("pointerdown", (event) => {
       event.preventDefault();
-      if (begin !== null) return;
-      begin = event;
+      if (this.#begins.has(field)) return;
+      this.#begins.set(field, event);
       field.setPointerCapture(event.pointerId);
       set({ x: 0, y: 0 });
     });
     field.addEventListener("pointermove", (event) => {
+      const begin = this.#begins.get(field);
       if (begin?.pointerId !== event.pointerId) return;
       const { width, height } = field.getBoundingClientRect();
       set({
@@ -56,8 +59,8 @@ export class Touch {
     });
     for (const name of ["pointerup", "pointercancel", "lostpointercapture"]) {
       field.addEventListener(name, (event) => {
-        if (begin?.pointerId !== event.pointerId) return;
-        begin = null;
+        if (this.#begins.get(field)?.pointerId !== event.pointerId) return;
+        this.#begins.delete(field);
         set(null);
       });
     }
