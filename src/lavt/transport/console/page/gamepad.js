@@ -33,6 +33,8 @@ export class Gamepads {
   #rested = new Set(); // pedals and dead-man control, once they have been at rest since the device was connected
   #wasStopped = false;
   #stop;
+  #index = null; // of the device in use; two devices may have the same id
+  #isGone = false; // it was disconnected since the last `poll`
 
   // `stop()` is called when the button for the emergency stop is pressed.
   constructor(stop) {
@@ -43,14 +45,20 @@ export class Gamepads {
     this.steering = 0; // -1 to 1, left positive
     this.throttle = 0;
     this.brake = 0;
+    addEventListener("gamepaddisconnected", ({ gamepad }) => {
+      if (gamepad.index === this.#index) this.#isGone = true;
+    });
   }
 
   // Read the first device that needs no calibration, or has one.
   poll() {
     const device = devices().find((candidate) => calibrationOf(candidate) !== null) ?? null;
-    this.lost = this.id !== "" && device?.id !== this.id;
-    if (device?.id !== this.id) this.#rested.clear();
+    const isOther = this.#isGone || device?.id !== this.id || device?.index !== this.#index;
+    this.lost = this.id !== "" && isOther;
+    if (isOther) this.#rested.clear();
     this.id = device?.id ?? "";
+    this.#index = device?.index ?? null;
+    this.#isGone = false;
     this.holds = false;
     this.steering = this.throttle = this.brake = 0;
     if (device === null) return;
