@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 from collections.abc import Iterator
@@ -31,9 +32,14 @@ GRABS = {
 class Window:
     """A browser's window on a display of its own, with the console's page, and a person's mouse and keys."""
 
-    def __init__(self, display: str, tab: Tab) -> None:
+    def __init__(self, display: str, tab: Tab, link: ConsoleLink) -> None:
         self._display = display
         self.tab = tab
+        self.close_link = link.close
+
+    def text(self, name: str) -> str:
+        """Return the text of an element."""
+        return str(self.tab.evaluate(f"document.querySelector('#{name}').textContent"))
 
     def act(self, *action: str) -> None:
         """Let xdotool make an input."""
@@ -82,7 +88,7 @@ def window(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Window]:
         browser = stack.enter_context(running_browser(out / "profile", display))
         tab = browser.open(link.url)
         wait_until("the page is loaded", lambda: is_loaded(tab))
-        window = Window(display, tab)
+        window = Window(display, tab, link)
         wait_until("the window takes clicks and keys", window.has_focus)
         yield window
 
@@ -132,3 +138,40 @@ def test_a_finger_counts_only_once_it_is_put_down_again(window: Window) -> None:
     assert not finger("pointerup", 101)
     assert finger("pointerdown", 100)
     assert not finger("pointerup", 100)
+
+
+def test_another_gamepad_of_the_same_kind_is_another_device(window: Window) -> None:
+    """If one of two equal gamepads is unplugged, or unplugged and plugged in again, its hold does not continue."""
+
+    def plug(index: int, *, is_held: bool) -> None:
+        values = json.dumps([float(is_held and button == 5) for button in range(17)])
+        window.tab.evaluate(
+            f"globalThis.pad = {{id: 'pad', mapping: 'standard', axes: [0, 0, 0, 0], connected: true, index: {index},"
+            f" buttons: {values}.map((value) => ({{value}}))}}; navigator.getGamepads = () => [pad];"
+            "new Promise((resolve) => setTimeout(resolve, 200))"
+        )
+
+    def holds() -> bool:
+        return bool(window.tab.evaluate("lavtConsole.gamepads.holds"))
+
+    for is_replugged in (False, True):
+        plug(0, is_held=False)
+        plug(0, is_held=True)
+        assert holds()
+        if is_replugged:
+            event = "Object.assign(new Event('gamepaddisconnected'), {gamepad: pad})"
+            window.tab.evaluate(f"dispatchEvent({event}); new Promise((resolve) => setTimeout(resolve, 200))")
+        else:
+            plug(1, is_held=True)
+        assert not holds()
+
+
+def test_a_stop_without_a_connection_says_so(window: Window) -> None:
+    """When the connection has ended, no state is shown any more, and an emergency stop is shown as not sent."""
+    window.close_link()
+    wait_until("the page is not connected", lambda: window.text("connection") == "not connected")
+    assert window.text("safety") == "no state"
+    window.tab.evaluate("document.querySelector('#stop').click()")
+    assert "NOT sent" in window.text("hint")
+    window.tab.evaluate("new Promise((resolve) => setTimeout(resolve, 1500))")
+    assert "NOT sent" in window.text("hint")

@@ -278,6 +278,15 @@ def test_a_stop_is_not_swallowed_by_an_old_state() -> None:
     assert again.number != request.number
 
 
+def test_after_the_page_is_closed_commands_still_carry_the_stop() -> None:
+    """When the page is closed after an emergency stop, each later command still has the stop's number."""
+    bench = HumanBench().drive()
+    (request,) = [decode(SessionRequest, each) for each in payloads(bench.page(type="stop"), "session")]
+    bench.deliver("page_closed", None, peer=1)
+    later = [command(bench.wake(CLIENT_LIMITS.command_period_ns)) for _ in range(5)]
+    assert [new and (new.mode, new.emergency_stop) for new in later] == [("stop", request.number)] * 5
+
+
 def test_the_driving_page_hands_over() -> None:
     """The driving page releases control, as SIGUSR2 does, and another page cannot."""
     bench = HumanBench().drive()

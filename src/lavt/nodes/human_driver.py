@@ -200,7 +200,8 @@ class HumanDriverNode(Commander):
         if video is not None:
             self._page_counts += video.counts
         if message.peer == self._driving_page:
-            self._driving_page, self._view, self._shown_unit = None, None, None
+            self._driving_page = None
+            self._forget_view()
             self._controls.detach()
         return self._record_hand(now)
 
@@ -208,9 +209,16 @@ class HumanDriverNode(Commander):
         """Let a page drive if no other page does."""
         if self._driving_page is not None:
             return []
-        self._driving_page, self._view, self._shown_unit = page, None, None
+        self._driving_page = page
+        self._forget_view()
         self._controls.attach(now.mono_ns)
         return [*self._record_hand(now), *self._request_keyframe(page)]
+
+    def _forget_view(self) -> None:
+        """Make no command from a picture of another page; after an emergency stop, commands still carry it."""
+        self._shown_unit = None
+        if not self.session.emergency_stop:
+            self._view = None
 
     def _handle_page_message(self, message: Message, now: Now) -> list[Send]:
         if message.peer not in self._pages:  # it was closed in the meantime

@@ -8,6 +8,7 @@ const SAFETY = {
   disarmed: "disarmed", arming: "arming", driving: "driving", degraded: "degraded",
   safe_stop: "safe stop", emergency_stop: "emergency stop",
 };
+const STOP_NOT_SENT = "emergency stop NOT sent: no connection to lavt. Use another emergency stop";
 const history = new History(byId("history"));
 const HANDS = {
   not_seen: "let go of the dead-man control (the space bar), then hold it",
@@ -16,18 +17,32 @@ const HANDS = {
   no_input: "this page sent no input for a moment: let go of the dead-man control, then hold it",
 };
 
+let isStopLost = false; // a stop was made without a connection
+
 export function showClosed(text) {
   byId("connection").textContent = "not connected";
-  byId("hint").textContent = text;
+  showSafety("");
+  byId("reason").textContent = "";
+  byId("stop").className = "";
+  byId("hint").textContent = isStopLost ? STOP_NOT_SENT : text;
   byId("take").hidden = byId("release").hidden = true;
+}
+
+export function showStopNotSent() {
+  isStopLost = true;
+  byId("hint").textContent = STOP_NOT_SENT;
+}
+
+function showSafety(name) {
+  byId("safety").textContent = SAFETY[name] ?? "no state";
+  byId("safety").className = `badge ${name in SAFETY ? name : ""}`;
 }
 
 // `age_ms` is the age of the picture on the screen, from its stamp; null: unknown. Without `canHold`, keys do not count.
 export function showStatus(status, input, video, age_ms, canHold) {
   byId("connection").textContent = status.role === "drives" ? "drives" : "watches";
-  const safety = byId("safety");
-  safety.textContent = SAFETY[status.safety] ?? "no state";
-  safety.className = `badge ${status.safety in SAFETY ? status.safety : ""}`;
+  showSafety(status.safety);
+  isStopLost = false;
   const rejected = status.rejected && `command rejected: ${status.rejected}`;
   const limited = status.limited && `limited: ${status.limited}`;
   const requested = status.requested_by && `${status.requested_by} requests control`;
@@ -49,11 +64,19 @@ export function showStatus(status, input, video, age_ms, canHold) {
   byId("bit_rate").textContent = `${(status.bit_rate_bps / 1e6).toFixed(1)} Mb/s`;
   byId("errors").textContent = video.errors;
   history.add(age_ms);
-  byId("stop").className = status.emergency_stop;
+  byId("stop").className = isPast(status) ? "" : status.emergency_stop;
   showNetwork(status);
 }
 
+// The vehicle has executed an emergency stop of this client, but is in another state now.
+function isPast({ emergency_stop, safety }) {
+  return emergency_stop === "confirmed" && safety !== "emergency_stop";
+}
+
 function hint(status, input, canHold) {
+  if (isPast(status)) {
+    return "an earlier emergency stop was confirmed, but the vehicle is in another state now; restart this client to drive";
+  }
   if (status.emergency_stop === "sent") return "emergency stop sent, not confirmed yet";
   if (status.emergency_stop === "confirmed") return "emergency stop: the vehicle has confirmed it; restart this client to drive";
   if (status.role === "watches") return status.can_drive ? "no page drives" : "another page drives";
@@ -78,7 +101,7 @@ function ms(value) {
 export function showCalibration(calibration) {
   byId("calibrate").hidden = calibration === null && devices().length === 0;
   byId("calibrate").textContent = calibration === null ? "Calibrate a wheel or gamepad" : "Cancel";
-  if (calibration !== null) byId("hint").textContent = QUESTIONS[calibration.next];
+  if (calibration !== null) byId("hint").textContent = `${QUESTIONS[calibration.next]} (meanwhile, only Esc and the page's button stop)`;
 }
 
 let shownConditions = "";

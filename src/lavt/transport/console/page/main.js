@@ -3,7 +3,7 @@
 import { Offset, pageTime_us } from "./clock.js";
 import { Calibration, Gamepads } from "./gamepad.js";
 import { Keyboard } from "./hand.js";
-import { showCalibration, showClosed, showStatus } from "./hud.js";
+import { showCalibration, showClosed, showStatus, showStopNotSent } from "./hud.js";
 import { Touch } from "./touch.js";
 import { Video } from "./video.js";
 
@@ -15,7 +15,7 @@ const UNIT_HEAD_BYTES = 16;
 
 const byId = (id) => document.getElementById(id);
 const keyboard = new Keyboard();
-const gamepads = new Gamepads(() => send({ type: "stop" }));
+const gamepads = new Gamepads(stop);
 const touch = new Touch(byId("touch_steering"), byId("touch_pedals"));
 let source = keyboard; // of the newest input
 let calibration = null; // while the person calibrates a device
@@ -32,10 +32,18 @@ const video = new Video(
   () => send({ type: "lost" }),
   reportShown,
 );
-globalThis.lavtConsole = { get status() { return status; }, keyboard, touch, video }; // for tests and the curious
+globalThis.lavtConsole = { get status() { return status; }, keyboard, touch, gamepads, video }; // for tests and the curious
 
+// Send a message, and return whether there was a connection to lavt.
 function send(message) {
-  if (socket !== null && socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message));
+  if (socket === null || socket.readyState !== WebSocket.OPEN) return false;
+  socket.send(JSON.stringify(message));
+  return true;
+}
+
+function stop() {
+  const isSent = send({ type: "stop" });
+  if (!isSent) showStopNotSent();
 }
 
 function connect() {
@@ -112,12 +120,12 @@ function chooseDelay(video_ms, control_ms) {
 }
 
 addEventListener("keydown", (event) => {
-  if (event.code === "Escape") send({ type: "stop" });
+  if (event.code === "Escape") stop();
   const condition = /^Digit[0-9]$/.test(event.code) && status?.conditions?.[Number(event.code.slice(5))];
   if (condition && !event.repeat && !event.ctrlKey && !event.altKey) chooseDelay(condition[1], condition[2]);
 });
 byId("stop").onclick = (event) => {
-  send({ type: "stop" });
+  stop();
   event.currentTarget.blur(); // the space bar must not press the button
 };
 byId("calibrate").onclick = (event) => {
