@@ -251,5 +251,5 @@ def test_an_error_in_the_thread_fails_the_process() -> None:
 def test_without_the_package_the_user_gets_advice(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without the package `websockets`, the error names the extra that installs it."""
     monkeypatch.setitem(sys.modules, "websockets.asyncio.server", None)
-    with pytest.raises(UserError, match=r"lavt\[console\]"):
+    with pytest.raises(UserError, match=r"\.\[console\]"):
         ConsoleLink(MachineClock(), TOKEN)
