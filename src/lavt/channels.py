@@ -18,8 +18,8 @@ QUEUE_LENGTH = 4096
 """More than a second of packets."""
 COMMAND_QUEUE_LENGTH = 64
 """More than the commands of a second; older commands would be rejected anyway."""
-PAGE_QUEUE_LENGTH = 256
-"""More than the messages of a page in two seconds."""
+PAGE_QUEUE_LENGTH = 4096
+"""More than the messages of all pages in a second: the link closes a page that sends more, so that none is dropped."""
 PROBE_QUEUE_LENGTH = 64
 """A probe that waits behind many other probes measures mainly its wait in this queue."""
 

@@ -10,20 +10,21 @@ import queue
 import socket
 import sys
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from typing import Any
 
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
+from lavt.channels import CHANNELS
 from lavt.clock import MachineClock
 from lavt.domain import Now
 from lavt.errors import UserError
 from lavt.node import Send
 from lavt.runtime.thread_failures import fail_on_thread_errors
 from lavt.transport.console import console_link
-from lavt.transport.console.console_link import MAX_PAGES, ConsoleLink
+from lavt.transport.console.console_link import MAX_MESSAGES_PER_S, MAX_PAGES, ConsoleLink
 from lavt.transport.console.page_messages import MAX_PAGE_MESSAGE_BYTES, PAGE_VERSION
 from lavt.transport.console.site import HEADERS, NOT_A_HELLO, TOO_MANY_PAGES, WRONG_TOKEN, WRONG_VERSION
 
@@ -172,6 +173,21 @@ def test_a_huge_message_closes_the_page(console: Console) -> None:
     page.send("x" * 100_000)
     assert console.take() == ("page_closed", None, number)
     console.open()[0].close()
+
+
+def test_a_page_that_floods_is_closed(console: Console) -> None:
+    """A page that sends too much is closed before its messages fill the queue; another page's stop is delivered."""
+    (page, number), (other, other_number) = console.open(), console.open()
+    with suppress(ConnectionClosed):
+        for _ in range(MAX_MESSAGES_PER_S * 20):
+            page.send("flood")
+    other.send("stop")
+    delivered = []
+    while {("page_closed", None, number), ("page_message", "stop", other_number)} - set(delivered):
+        delivered.append(console.take())
+    assert len(delivered) < CHANNELS["page_message"].length
+    assert console.link.counts["pages_too_busy"] == 1
+    other.close()
 
 
 def test_messages_reach_their_page(console: Console) -> None:

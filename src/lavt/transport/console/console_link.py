@@ -17,11 +17,11 @@ from http import HTTPStatus
 from typing import TYPE_CHECKING, Any, Final
 
 from lavt.clock import Clock
-from lavt.domain import Now
+from lavt.domain import NS_PER_S, Now
 from lavt.errors import UserError, WorkError
 from lavt.node import Send
 from lavt.transport.console.page_messages import MAX_PAGE_MESSAGE_BYTES
-from lavt.transport.console.site import TOO_MANY_PAGES, ConsoleSite, page_headers
+from lavt.transport.console.site import TOO_MANY_MESSAGES, TOO_MANY_PAGES, ConsoleSite, page_headers
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import Server, ServerConnection
@@ -31,6 +31,9 @@ Deliver = Callable[[str, Any, Now, Any], None]
 """Takes (channel, payload, arrived, peer) of each message; the peer is the number of the page."""
 
 MAX_PAGES: Final = 8
+MAX_MESSAGES_PER_S: Final = 400
+"""A page that sends more is closed: its messages would drop those of other pages from the queue, such as a stop. A page
+sends 50 inputs and two messages for each picture in a second, and what it could not send before."""
 MAX_QUEUED: Final = 16
 """Messages to a page that does not read them: all access units that may be on the way fit, and further statuses are
 dropped."""
@@ -46,6 +49,16 @@ class _Page:
     def __init__(self, connection: ServerConnection) -> None:
         self.connection = connection
         self.waiting: asyncio.Queue[str | bytes] = asyncio.Queue(MAX_QUEUED)
+        self._second = 0
+        self._received = 0
+        """How many messages have arrived in this second."""
+
+    def may_send(self, now: Now) -> bool:
+        """Count a message of the page, and return whether it is one of the first of this second."""
+        second = now.mono_ns // NS_PER_S
+        self._received = self._received + 1 if second == self._second else 1
+        self._second = second
+        return self._received <= MAX_MESSAGES_PER_S
 
 
 class ConsoleLink:
@@ -180,7 +193,12 @@ class ConsoleLink:
         try:
             deliver("page_opened", None, self._clock.now(), number)
             async for message in connection:
-                deliver("page_message", message, self._clock.now(), number)
+                now = self._clock.now()
+                if not page.may_send(now):
+                    self.counts["pages_too_busy"] += 1
+                    await connection.close(*TOO_MANY_MESSAGES)
+                    return
+                deliver("page_message", message, now, number)
         finally:
             del self._pages[number]
             writer.cancel()

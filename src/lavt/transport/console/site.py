@@ -59,6 +59,8 @@ WRONG_VERSION: Final = Closing(4426, "this page is of another version of lavt: r
 NOT_A_HELLO: Final = Closing(4400, "not a page of lavt")
 TOO_MANY_PAGES: Final = Closing(4429, "too many pages are open: close one")
 
+TOO_MANY_MESSAGES: Final = Closing(4408, "this page has sent too many messages: reload it")
+
 
 class ConsoleSite:
     """The files of the page, and the rules for requests to `port` of this machine."""
