@@ -16,7 +16,7 @@ from lavt.control.human_controls import HUMAN_LIMITS, HumanControls
 from lavt.domain import NS_PER_MS, NS_PER_S, NS_PER_US, Command, SessionReply, SessionRequest, State
 from lavt.node import WAKE, Message, Send
 from lavt.nodes.client_session import ClientSession
-from lavt.nodes.human_driver import HumanDriverNode
+from lavt.nodes.human_driver import COMMAND_GAP_NS, SEAT_NS, HumanDriverNode
 from lavt.nodes.payloads import DecodedFrame, DelayChoice, ReceivedUnit, RelayDelay
 from lavt.nodes.picture_reader import PictureReader
 from lavt.runtime.pipeline import run_stages
@@ -245,6 +245,35 @@ def test_a_second_page_watches_only() -> None:
     bench.show(2)
     assert bench.input(page=2) is None
     assert bench.input(page=2, held=False).mode == "stop"
+
+
+def test_a_frozen_page_does_not_keep_the_seat() -> None:
+    """A page that has sent nothing for seconds stays connected, but another page can drive, after an open hand."""
+    bench = HumanBench().drive()
+    bench.deliver("page_opened", None, peer=2)
+    bench.wake(SEAT_NS - NS_PER_S)
+    assert not bench.status(2)["can_drive"]
+    bench.wake(NS_PER_S)
+    assert bench.status(2)["can_drive"]
+    bench.page(2, type="drive")
+    assert (bench.status(1)["role"], bench.status(2)["role"]) == ("watches", "drives")
+    bench.show(2)
+    assert bench.input(throttle=1.0) is None
+    assert bench.input(page=2) is None
+    assert bench.input(page=2, held=False).mode == "stop"
+
+
+def test_a_burst_of_inputs_is_no_burst_of_commands() -> None:
+    """Inputs that arrive at once cause one command, and then one with the newest input."""
+    bench = HumanBench().drive()
+    bench.input()
+    seen_us = at(bench.mono_ns).mono_ns // NS_PER_US
+    values: dict[str, Any] = {"held": True, "live": True, "steering": 0.0, "brake": 0.0}
+    burst = [bench.page(type="input", seen_us=seen_us, throttle=each / 10, **values) for each in range(10)]
+    assert [command(sends) for sends in burst] == [None] * 10
+    newest = command(bench.wake(COMMAND_GAP_NS))
+    assert newest is not None
+    assert newest.throttle == 0.9
 
 
 @pytest.mark.parametrize("page", [1, 2])

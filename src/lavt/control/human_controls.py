@@ -91,6 +91,10 @@ class HumanControls:
         if self._hand != "no_page":
             self._lock("not_seen")
 
+    def silent_ns(self, now_ns: int) -> int:
+        """Return for how long no valid input has arrived from the page that drives."""
+        return now_ns - self._input_ns
+
     def hand(self, now_ns: int) -> HandState:
         """Return the state of the hand; without an input for too long, the latch locks."""
         if self._hand == "no_page":

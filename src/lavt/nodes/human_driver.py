@@ -53,6 +53,10 @@ MAX_COMMANDS: Final = 512
 """How many commands are remembered until the vehicle has applied them: five seconds."""
 STATE_AGE_NS: Final = 300 * NS_PER_MS
 """An older state does not tell what the vehicle does now."""
+SEAT_NS: Final = 5 * NS_PER_S
+"""After this long without an input from the driving page, another page can drive."""
+COMMAND_GAP_NS: Final = 5 * NS_PER_MS
+"""Between commands that inputs cause; a page sends an input every 20 ms, but can send bursts."""
 IDLE_COMMAND_NS: Final = 100 * NS_PER_MS
 """A command that is older is no longer shown as the last one."""
 
@@ -205,9 +209,13 @@ class HumanDriverNode(Commander):
             self._controls.detach()
         return self._record_hand(now)
 
+    def _is_seat_free(self, now: Now) -> bool:
+        """Return whether no page drives: none has begun to, or the one that has is silent, as if frozen."""
+        return self._driving_page is None or self._controls.silent_ns(now.mono_ns) >= SEAT_NS
+
     def _drive_from(self, page: Peer, _request: PageDrive | None, now: Now) -> list[Send]:
         """Let a page drive if no other page does."""
-        if self._driving_page is not None:
+        if not self._is_seat_free(now) or page == self._driving_page:
             return []
         self._driving_page = page
         self._forget_view()
@@ -243,7 +251,15 @@ class HumanDriverNode(Commander):
         )
         self._hand = self._controls.hand(now.mono_ns)
         sample = HumanSample(now.mono_ns, self._hand, new.steering, new.throttle, new.brake)
-        return [*self._command(now), Send("human_input", sample)]
+        return [*self._command_after_input(now), Send("human_input", sample)]
+
+    def _command_after_input(self, now: Now) -> list[Send]:
+        """Return a command at once, or let it be due later if the last one has just been sent."""
+        due_ns = 0 if self._last is None else self._last[0] + COMMAND_GAP_NS
+        if now.mono_ns >= due_ns:
+            return self._command(now)
+        self._command_ns = due_ns
+        return []
 
     def _stop(self, _page: Peer, _stop: PageStop, now: Now) -> list[Send]:
         """Make an emergency stop, also for a page that watches.
@@ -350,7 +366,7 @@ class HumanDriverNode(Commander):
         return PageStatus(
             sent_us=now.mono_ns // NS_PER_US,
             role="drives" if page == self._driving_page else "watches",
-            can_drive=self._driving_page is None,
+            can_drive=self._is_seat_free(now),
             hand=self._hand,
             phase=session.phase,
             session_reason=session.reason,
