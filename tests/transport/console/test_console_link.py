@@ -24,7 +24,7 @@ from lavt.errors import UserError
 from lavt.node import Send
 from lavt.runtime.thread_failures import fail_on_thread_errors
 from lavt.transport.console import console_link
-from lavt.transport.console.console_link import MAX_MESSAGES_PER_S, MAX_PAGES, ConsoleLink
+from lavt.transport.console.console_link import MAX_MESSAGES_PER_S, MAX_PAGES, MAX_STRANGERS, ConsoleLink
 from lavt.transport.console.page_messages import MAX_PAGE_MESSAGE_BYTES, PAGE_VERSION
 from lavt.transport.console.site import HEADERS, NOT_A_HELLO, TOO_MANY_PAGES, WRONG_TOKEN, WRONG_VERSION
 
@@ -182,7 +182,7 @@ def test_a_page_that_floods_is_closed(console: Console) -> None:
         for _ in range(MAX_MESSAGES_PER_S * 20):
             page.send("flood")
     other.send("stop")
-    delivered = []
+    delivered: list[Delivered] = []
     while {("page_closed", None, number), ("page_message", "stop", other_number)} - set(delivered):
         delivered.append(console.take())
     assert len(delivered) < CHANNELS["page_message"].length
@@ -219,6 +219,44 @@ def test_the_number_of_pages_is_limited(console: Console) -> None:
     assert console.closing_code(HELLO) == TOO_MANY_PAGES.code
     for page in pages:
         page.close()
+
+
+def test_the_number_of_strangers_is_limited(console: Console) -> None:
+    """Connections without the token are limited, do not count after it, and make room when they end."""
+    page, _ = console.open()
+    strangers = [socket.create_connection(("127.0.0.1", console.link.port), timeout=10) for _ in range(MAX_STRANGERS)]
+    with socket.create_connection(("127.0.0.1", console.link.port), timeout=10) as late, suppress(ConnectionError):
+        assert late.recv(1) == b""
+    assert console.link.counts["connections_too_many"] == 1
+    page.send("a message")
+    assert console.take()[1] == "a message"
+    for stranger in strangers:
+        stranger.close()
+    page.close()
+    while get_or_nothing(console.link.port) != 200:
+        pass
+
+
+def get_or_nothing(port: int) -> int | None:
+    try:
+        return get(port, "/")[0]
+    except (OSError, http.client.HTTPException):
+        return None
+
+
+def test_a_flood_of_pings_ends_its_connection(console: Console, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A connection that sends pings and reads no answers is closed before its answers fill the memory."""
+    monkeypatch.setattr(console_link, "MAX_UNSENT_BYTES", 2**16)
+    site = f"127.0.0.1:{console.link.port}"
+    upgrade = "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13"
+    request = f"GET /socket HTTP/1.1\r\nHost: {site}\r\nOrigin: http://{site}\r\n{upgrade}\r\n"
+    ping = bytes([0x89, 0x80 | 125, 0, 0, 0, 0]) + bytes(125)
+    with socket.create_connection(("127.0.0.1", console.link.port), timeout=10) as sock:
+        sock.sendall(f"{request}Sec-WebSocket-Key: {'A' * 22}==\r\n\r\n".encode())
+        assert b"101" in sock.recv(16)
+        with pytest.raises(OSError, match=r"reset|[Bb]roken"):
+            sock.sendall(ping * 500_000)
+    assert console.link.counts["connections_not_reading"] == 1
 
 
 def test_garbage_on_the_port_changes_nothing(console: Console) -> None:

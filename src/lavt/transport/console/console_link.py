@@ -37,6 +37,11 @@ sends 50 inputs and two messages for each picture in a second, and what it could
 MAX_QUEUED: Final = 16
 """Messages to a page that does not read them: all access units that may be on the way fit, and further statuses are
 dropped."""
+MAX_STRANGERS: Final = 32
+"""Connections that have not shown the token yet, and requests for files; a further one is closed at once."""
+MAX_UNSENT_BYTES: Final = 8 * 2**20
+"""A connection that reads nothing is closed when this much waits for it, such as answers to its pings. All access units
+of a page that may be on the way are smaller."""
 HELLO_TIMEOUT_S: Final = 5.0
 CLOSE_TIMEOUT_S: Final = 1.0
 PORT_ATTEMPTS: Final = 10
@@ -81,6 +86,8 @@ class ConsoleLink:
         self._ends: asyncio.Future[None] = self._loop.create_future()
         """Done when the link is closed, or has failed."""
         self._pages: dict[int, _Page] = {}
+        self._strangers: set[object] = set()
+        """Connections that have not shown the token."""
         self._numbers = itertools.count(1)
         self._closing = False
         self._thread: threading.Thread | None = None
@@ -140,6 +147,7 @@ class ConsoleLink:
         server: Server = await self._websockets.asyncio.server.serve(
             lambda connection: self._guard(connection, deliver),
             sock=listener,
+            create_connection=_limited_connection(self._strangers, self.counts),
             process_request=self._process_request,
             compression=None,
             max_size=MAX_PAGE_MESSAGE_BYTES,
@@ -187,6 +195,7 @@ class ConsoleLink:
             self.counts["pages_rejected"] += 1
             await connection.close(*closing)
             return
+        self._strangers.discard(connection)
         number, page = next(self._numbers), _Page(connection)
         self._pages[number] = page
         writer = asyncio.create_task(self._write(page))
@@ -224,6 +233,33 @@ class ConsoleLink:
             return
         except Exception as error:
             self._end(error)
+
+
+def _limited_connection(strangers: set[object], counts: Counter[str]) -> type[ServerConnection]:
+    """Return the class of connections that are limited in number before the token, and in what waits to be sent."""
+    from websockets.asyncio.server import ServerConnection  # noqa: PLC0415 (an optional package)
+
+    class LimitedConnection(ServerConnection):
+        def connection_made(self, transport: asyncio.BaseTransport) -> None:
+            super().connection_made(transport)
+            strangers.add(self)
+            if len(strangers) > MAX_STRANGERS:
+                self._abort("connections_too_many")
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            strangers.discard(self)
+            super().connection_lost(exc)
+
+        def data_received(self, data: bytes) -> None:
+            super().data_received(data)
+            if self.transport.get_write_buffer_size() > MAX_UNSENT_BYTES:
+                self._abort("connections_not_reading")
+
+        def _abort(self, why: str) -> None:
+            counts[why] += 1
+            self.transport.abort()
+
+    return LimitedConnection
 
 
 def check_installed() -> None:
