@@ -166,6 +166,30 @@ def test_another_gamepad_of_the_same_kind_is_another_device(window: Window) -> N
         assert not holds()
 
 
+VIDEO = """(async () => {
+  const {Video} = await import("/video.js");
+  const real = globalThis.VideoDecoder;
+  globalThis.VideoDecoder = class {
+    constructor({output}) { this.output = output; }
+    configure() {}
+    close() {}
+    decode({timestamp}) { this.output({timestamp, displayWidth: 1, displayHeight: 1, close() {}}); }
+  };
+  const calls = [];
+  const canvas = {getContext: () => ({drawImage() { throw new Error("no picture"); }})};
+  const video = new Video(canvas, () => calls.push("acknowledged"), () => calls.push("lost"), () => {});
+  video.push({data: new Uint8Array(%s), unit: 1, isKeyframe: true});
+  globalThis.VideoDecoder = real;
+  return [calls.join(), video.errors];
+})()"""
+
+
+@pytest.mark.parametrize("data", ["[0, 0, 1, 0x67, 66, 192, 30, 0]", "[0, 0, 1, 0x65, 0, 0, 0, 0]"])
+def test_a_picture_that_cannot_be_drawn_is_lost(window: Window, data: str) -> None:
+    """A keyframe whose picture cannot be drawn, or that has no parameters for a decoder, is reported as lost."""
+    assert window.tab.evaluate(VIDEO % data) == ["lost", 1]
+
+
 def test_a_stop_without_a_connection_says_so(window: Window) -> None:
     """When the connection has ended, no state is shown any more, and an emergency stop is shown as not sent."""
     window.close_link()

@@ -34,7 +34,7 @@ export class Video {
   push({ data, unit, isKeyframe }) {
     if (this.#decoder === null) {
       if (!isKeyframe) return this.#lose();
-      if (!this.#open(data)) return;
+      if (!this.#open(data)) return this.#fail();
     }
     if (this.#pending.size >= MAX_DECODING) return this.#fail();
     const timestamp = ++this.#number;
@@ -58,6 +58,7 @@ export class Video {
     this.#pending.clear();
   }
 
+  // Return whether there is a decoder for the keyframe.
   #open(data) {
     const codec = codecOf(data);
     if (codec === null) return false;
@@ -65,12 +66,17 @@ export class Video {
       output: (frame) => this.#show(frame, decoder),
       error: () => decoder === this.#decoder && this.#fail(),
     });
-    decoder.configure({ codec, optimizeForLatency: true, hardwareAcceleration: "no-preference" });
+    try {
+      decoder.configure({ codec, optimizeForLatency: true, hardwareAcceleration: "no-preference" });
+    } catch {
+      return false;
+    }
     this.#decoder = decoder;
     return true;
   }
 
   async #show(frame, decoder) {
+    let isDrawn = false;
     try {
       const decoded_us = pageTime_us();
       const [unit, arrived_us] = this.#pending.get(frame.timestamp) ?? [];
@@ -81,6 +87,7 @@ export class Video {
         this.#canvas.height = frame.displayHeight;
       }
       this.#context.drawImage(frame, 0, 0);
+      isDrawn = true;
       this.shown += 1;
       this.#acknowledge(unit);
       const times = { unit, arrived_us, decoded_us, drawn_us: pageTime_us() };
@@ -91,7 +98,8 @@ export class Video {
         this.#report({ ...times, stamp, shown_us: await shown });
       }
     } catch {
-      this.errors += 1;
+      if (isDrawn) this.errors += 1;
+      else this.#fail(); // it was not acknowledged
     } finally {
       frame.close();
     }
