@@ -111,6 +111,26 @@ def test_the_page_is_served_with_security_headers(console: Console) -> None:
     assert console.link.counts == {"requests_answered": 2, "requests_rejected": 3}
 
 
+@pytest.mark.parametrize("request_line", ["GET /socket HTTP/1.1", f"GET /{'x' * 10000} HTTP/1.1"], ids=["426", "414"])
+def test_every_error_has_the_security_headers(console: Console, request_line: str) -> None:
+    """Also an answer to a request that is no valid one, or should have opened the socket, binds a page to this site."""
+    site = f"127.0.0.1:{console.link.port}"
+    with socket.create_connection(("127.0.0.1", console.link.port), timeout=10) as sock:
+        sock.sendall(f"{request_line}\r\nHost: {site}\r\nOrigin: http://{site}\r\n\r\n".encode())
+        head = sock.recv(65536).partition(b"\r\n\r\n")[0].decode()
+    assert head.startswith("HTTP/1.1 4")
+    assert f"Content-Security-Policy: {HEADERS['Content-Security-Policy']}" in head
+
+
+def test_the_answer_to_head_has_no_body(console: Console) -> None:
+    """A HEAD request gets the headers only, and no further bytes."""
+    with socket.create_connection(("127.0.0.1", console.link.port), timeout=10) as sock:
+        sock.sendall(f"HEAD / HTTP/1.1\r\nHost: 127.0.0.1:{console.link.port}\r\n\r\n".encode())
+        answer = b"".join(iter(lambda: sock.recv(65536), b""))
+    assert b"Content-Security-Policy" in answer
+    assert b"<canvas" not in answer
+
+
 @pytest.mark.parametrize("origin", ["http://attacker.example", "null", ""])
 def test_a_foreign_page_cannot_open_the_socket(console: Console, origin: str) -> None:
     """A WebSocket with a foreign, null or missing Origin is rejected with 403, whatever token it knows."""

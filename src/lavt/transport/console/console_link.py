@@ -21,7 +21,7 @@ from lavt.domain import NS_PER_S, Now
 from lavt.errors import UserError, WorkError
 from lavt.node import Send
 from lavt.transport.console.page_messages import MAX_PAGE_MESSAGE_BYTES
-from lavt.transport.console.site import TOO_MANY_MESSAGES, TOO_MANY_PAGES, ConsoleSite, page_headers
+from lavt.transport.console.site import HEADERS, TOO_MANY_MESSAGES, TOO_MANY_PAGES, ConsoleSite, page_headers
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import Server, ServerConnection
@@ -171,7 +171,7 @@ class ConsoleLink:
                 del response.headers[name]
         for name, value in page_headers(answer).items():
             response.headers[name] = value
-        response.body = answer.body
+        response.body = b"" if getattr(request, "method", "GET") == "HEAD" else answer.body
         return response
 
     async def _guard(self, connection: ServerConnection, deliver: Deliver) -> None:
@@ -236,12 +236,23 @@ class ConsoleLink:
 
 
 def _limited_connection(strangers: set[object], counts: Counter[str]) -> type[ServerConnection]:
-    """Return the class of connections that are limited in number before the token, and in what waits to be sent."""
+    """Return the class of connections that are limited in number before the token, and in what waits to be sent.
+
+    Their own errors, as for a request that is no valid HTTP, have the headers of the site.
+    """
     from websockets.asyncio.server import ServerConnection  # noqa: PLC0415 (an optional package)
 
     class LimitedConnection(ServerConnection):
         def connection_made(self, transport: asyncio.BaseTransport) -> None:
             super().connection_made(transport)
+            reject = self.protocol.reject
+
+            def reject_with_headers(status: HTTPStatus | int, text: str) -> Response:
+                response = reject(status, text)
+                response.headers.update(HEADERS)
+                return response
+
+            self.protocol.reject = reject_with_headers  # type: ignore[method-assign]
             strangers.add(self)
             if len(strangers) > MAX_STRANGERS:
                 self._abort("connections_too_many")
