@@ -75,7 +75,8 @@ function takeStatus(message) {
   if (message.version !== VERSION) return socket.close(4000, "reload this page: it is of another version of lavt");
   seen_us = message.sent_us;
   status = message;
-  showStatus(status, source, video, frameAge_ms(), source !== keyboard || keyboard.isPointed);
+  const canHold = source !== keyboard || keyboard.isPointed || !matchMedia("(any-hover: hover)").matches;
+  showStatus(status, source, video, frameAge_ms(), canHold);
   showCalibration(calibration);
 }
 
