@@ -19,7 +19,14 @@ from lavt.vehicle.sim.rendering.weather import (
     rain_extinction_per_m,
     worn_paint,
 )
-from lavt.vehicle.sim.rendering.weather_optics import Headlights, Windscreen, fresnel, lamp_lux, slant_distance_m
+from lavt.vehicle.sim.rendering.weather_optics import (
+    WIPE_NS,
+    Headlights,
+    Windscreen,
+    fresnel,
+    lamp_lux,
+    slant_distance_m,
+)
 from lavt.vehicle.sim.road.road import Road, load_road
 
 WEATHER_NAMES: tuple[WeatherName, ...] = ("clear", "wet", "rain", "fog", "night", "worn")
@@ -109,6 +116,15 @@ def test_the_wiper_removes_drops() -> None:
     assert just_wiped < 0.1 < half < full
     other = Windscreen(MODEL, RAIN_MMPH, seed=2)
     assert (other.cover(AT_NS) != screen.cover(AT_NS)).any()
+
+
+def test_a_picture_in_rain_shows_the_drops(road: Road) -> None:
+    """Two pictures from one place with the same noise differ where drops have arrived in the meantime."""
+    camera = camera_on(road, light="overcast", scenery="none", weather="rain")
+    wiped, later = (
+        picture_of(camera, pose_at(road, 0.0, mono_ns=at_ns), 5).astype(int) for at_ns in (WIPE_NS, 2 * WIPE_NS - 1)
+    )
+    assert (wiped != later).any()
 
 
 def test_headlights_fade_with_the_distance_and_to_the_sides() -> None:
