@@ -1,4 +1,4 @@
-"""`lavt demo`: show in about a minute what delay does to driving by video, and report it."""
+"""`lavt demo`: show what delay does to driving by video, and report it."""
 
 from __future__ import annotations
 
