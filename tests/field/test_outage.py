@@ -252,7 +252,13 @@ def test_nothing_stale_is_accepted(effect: OutageEffects, stalls: Stalls) -> Non
     """No stale command is accepted, and the observer recorded at least 95 % of the accepted commands."""
     assert effect.stale_accepted == 0
     assert effect.accepted > 20
-    with stalls.excusing_failures(begin_ns(effect), effect.outage.end.later(RECOVERY_NS).mono_ns):
+    assert_observed(effect, stalls)
+
+
+def assert_observed(effect: OutageEffects, stalls: Stalls) -> None:
+    """Assert that the observer missed few of the accepted commands; a router without processor time can drop more."""
+    period_ns = begin_ns(effect), effect.outage.end.later(RECOVERY_NS).mono_ns
+    with stalls.excusing_failures(*period_ns), stalls.excusing_failures(*period_ns, share=BUSY_SHARE):
         assert effect.accepted_unobserved <= effect.accepted * MAX_UNOBSERVED
 
 
@@ -262,8 +268,7 @@ def test_buffered_stale_commands_are_rejected(buffered: OutageDriveResult, stall
 
     assert effect.stale_observed > 0
     assert effect.stale_accepted == 0
-    with stalls.excusing_failures(begin_ns(effect), effect.outage.end.later(RECOVERY_NS).mono_ns):
-        assert effect.accepted_unobserved <= effect.accepted * MAX_UNOBSERVED
+    assert_observed(effect, stalls)
 
 
 def test_a_server_without_checks_accepts_stale_commands(buffered_unguarded: OutageDriveResult) -> None:
