@@ -14,7 +14,7 @@ from statistics import median
 
 from lavt.config import RunConfig
 from lavt.config_file import load_config, shipped
-from lavt.experiment.boundary.bisection import zero_bracket
+from lavt.experiment.boundary.bisection import Bracket, zero_bracket
 from lavt.experiment.boundary.boundary import theoretical_ms, with_video_delay
 from lavt.experiment.boundary.oscillation_growth import straight_growth
 from lavt.experiment.report.table_format import NOTHING
@@ -38,8 +38,8 @@ def case(lookahead_s: float, rate_hz: float, speed_mps: float, seed: int) -> Run
     return load_config(RunConfig, shipped("configs/demo.yaml"), changes)
 
 
-def onset_ms(config: RunConfig, theory_ms: float | None) -> float | None:
-    """Return the total delay at which the oscillation neither grows nor decays; None if no such delay was found."""
+def onset_bracket(config: RunConfig, theory_ms: float | None) -> Bracket:
+    """Return the total delays between which the oscillation begins to grow; an end is None if it was not found."""
     other_delays_ms = []  # of each drive: the total delay minus the added delay of the video
 
     def growth(added_ms: float) -> float:
@@ -48,9 +48,16 @@ def onset_ms(config: RunConfig, theory_ms: float | None) -> float | None:
         return growth_per_s
 
     bracket = zero_bracket(growth, theory_ms or 0.0, MAX_DELAY_MS, PRECISION_MS)
+    other_ms = median(other_delays_ms)
+    low_ms, high_ms = (None if end_ms is None else end_ms + other_ms for end_ms in (bracket.low_ms, bracket.high_ms))
+    return Bracket(low_ms, high_ms)
+
+
+def onset_ms(bracket: Bracket) -> float | None:
+    """Return the middle of a bracket; None if the onset is outside the searched delays."""
     if bracket.low_ms is None or bracket.high_ms is None:
         return None
-    return (bracket.low_ms + bracket.high_ms) / 2 + median(other_delays_ms)
+    return (bracket.low_ms + bracket.high_ms) / 2
 
 
 def table_row(
@@ -83,7 +90,8 @@ def main() -> None:
     ):
         config = case(lookahead_s, rate_hz, speed_mps, seed)
         theory_ms = theoretical_ms(config)
-        rows.append(table_row(lookahead_s, rate_hz, speed_mps, theory_ms, onset_ms(config, theory_ms)))
+        measured_ms = onset_ms(onset_bracket(config, theory_ms))
+        rows.append(table_row(lookahead_s, rate_hz, speed_mps, theory_ms, measured_ms))
         print(rows[-1], flush=True)
     if any(NOTHING in row for row in rows):
         print(f"\n{NOTHING}: no growing oscillation by theory, or none measured with 0 to {MAX_DELAY_MS:g} ms added")

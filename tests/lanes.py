@@ -53,7 +53,13 @@ for the drives of these tests."""
 KERNEL = (sys.executable, "tests/kernel/run", *SHOW_SLOWEST)
 FULL = LaneSpec("full", (pytest("-m", "full", "--timeout=1800"),), 40)
 """A test has more time here, because the lane runs at the lowest priority beside another one."""
-LINTERS = (program("ruff", "check"), program("ruff", "format", "--check"), program("mypy"), program("lint-imports"))
+LINTERS = (
+    program("ruff", "check"),
+    program("ruff", "format", "--check"),
+    program("mypy"),
+    program("lint-imports"),
+    ("env", "NO_MKDOCS_2_WARNING=1", *program("mkdocs", "build", "--strict", "--quiet")),
+)
 LANES = (
     LaneSpec("linters", LINTERS, 10),
     LaneSpec("quick", (pytest(),), 15),

@@ -49,6 +49,7 @@ SCHEMAS: dict[str, type[Section]] = {
     "server-by-wire.yaml": ServerConfig,
     "server-secure.yaml": ServerConfig,
     "speed.yaml": SweepConfig,
+    "weather.yaml": SweepConfig,
     "sweep.yaml": SweepConfig,
 }
 """The schema of each file in configs/."""
@@ -91,9 +92,11 @@ def test_the_paper_config() -> None:
     assert len(plan_sweep(paper)) == 180
 
 
-@pytest.mark.parametrize(("name", "count"), [("loss_and_jitter.yaml", 36), ("roads.yaml", 180), ("speed.yaml", 72)])
+@pytest.mark.parametrize(
+    ("name", "count"), [("loss_and_jitter.yaml", 36), ("roads.yaml", 180), ("speed.yaml", 72), ("weather.yaml", 18)]
+)
 def test_sweeps_over_further_axes(name: str, count: int) -> None:
-    """The sweeps over loss and jitter, and over speed, can be planned; each axis contains the base config's value."""
+    """The sweeps over loss and jitter, speed and weather can be planned; each axis contains the base config's value."""
     sweep = load_config(SweepConfig, shipped("configs") / name)
     runs = plan_sweep(sweep)
     assert len(runs) == count
@@ -258,7 +261,7 @@ BAD_VALUES: list[tuple[type[Section], str, str]] = [
     (RunConfig, "safety: {picture_age_limit_ms: -1}", "'safety.picture_age_limit_ms'"),
     (RunConfig, "clocks: {error_us: 200, bound_us: 100}", "'clocks.bound_us'"),
     (RunConfig, "1: 2", "'1'"),
-    (SweepConfig, "conditions: L0", "'conditions'"),
+    (SweepConfig, "conditions: L0", "'conditions': write a list, such as [a, b], not 'L0'"),
     (SweepConfig, "conditions: [L0, 3]", "'conditions.1'"),
     (SweepConfig, "repetitions: 0", "'repetitions'"),
     (SweepConfig, "axes: [1]", "'axes'"),
@@ -321,6 +324,21 @@ def test_bad_files_are_rejected(text: str, reason: str, tmp_path: Path) -> None:
     sentence = rejection(text, tmp_path)
     assert reason in sentence
     assert "my.yaml" in sentence
+
+
+def test_config_of_another_command(tmp_path: Path) -> None:
+    """An error of a config whose keys are those of another command's config names that command."""
+    assert rejection("routes: [a]\nconditions: [L0]", tmp_path).endswith("a config for `lavt sweep`)")
+    assert "config for" not in rejection("sed: 1", tmp_path)
+    assert "config for" not in rejection("seed: -1", tmp_path)
+
+
+def test_many_errors_are_counted(tmp_path: Path) -> None:
+    """Of many errors the first five are described, and the others counted."""
+    sentence = rejection("\n".join(f"key_{number}: 1" for number in range(9)), tmp_path)
+    assert "'key_4'" in sentence
+    assert "'key_5'" not in sentence
+    assert "and 4 more errors" in sentence
 
 
 def test_binary_file(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 EXPECTED_OUTPUT = {
     "compare_delays.py": ("L0: completed", "L3: "),
     "my_controller.py": ("lane_keeper under L1: completed", "stanley under L1: completed"),
+    "my_vehicle.py": ("simulator: completed", "pulling_car: completed"),
 }
 """Text that each example must print."""
 

@@ -28,7 +28,7 @@ def fuzz_with(name: str, feed: object, monkeypatch: pytest.MonkeyPatch) -> fuzz.
 def test_damaged_inputs_cause_no_error_and_no_memory_growth(inputs: int) -> None:
     """Many damaged inputs cause no error in any parser and no growth of memory."""
     for module in ("cryptography", "pylibsrtp"):
-        pytest.importorskip(module, reason="an extra: pip install 'lavt[secure]'")
+        pytest.importorskip(module, reason="an extra: pip install -e '.[secure]'")
     completed = subprocess.run(
         [sys.executable, Path(fuzz.__file__), "--inputs", str(inputs)],
         capture_output=True,

@@ -34,8 +34,8 @@ from lavt.vehicle.sim.rendering.camera import SimCamera
 from lavt.vehicle.sim.road.road import load_road
 from lavt.vehicle.sim.simulator import Simulator
 
-pytest.importorskip("cryptography", reason="an extra: pip install 'lavt[secure]'")
-pytest.importorskip("pylibsrtp", reason="an extra: pip install 'lavt[secure]'")
+pytest.importorskip("cryptography", reason="an extra: pip install -e '.[secure]'")
+pytest.importorskip("pylibsrtp", reason="an extra: pip install -e '.[secure]'")
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 

@@ -46,6 +46,7 @@ def recompute(directory: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, SCRIPT, directory], capture_output=True, text=True, timeout=250, check=False)
 
 
+@pytest.mark.full
 def test_every_value_is_recomputed_without_lavt(sweep: Path) -> None:
     """All values of a small sweep are recomputed from its records, with no difference beyond rounding."""
     completed = recompute(sweep)
@@ -62,6 +63,7 @@ def test_every_value_is_recomputed_without_lavt(sweep: Path) -> None:
     assert 0.0 < l3["completion_rate"] < 1.0
 
 
+@pytest.mark.full
 def test_a_wrong_value_is_found(sweep: Path) -> None:
     """Each published value of a run that is not the recomputed one, or is missing, is named."""
     directory = sweep / "runs" / "b_key_L2_00"

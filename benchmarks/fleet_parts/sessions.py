@@ -12,7 +12,8 @@ import zenoh
 from lavt.config_file import shipped
 from lavt.domain import State
 from lavt.transport.messages import encode
-from lavt.transport.zenoh_link import RECEIVE_RING_LENGTH, REPLY_CHANNELS, STATE, SessionSettings
+from lavt.transport.zenoh_config import SessionSettings
+from lavt.transport.zenoh_link import RECEIVE_RING_LENGTH, REPLY_CHANNELS, STATE
 
 Topology = Literal["routers", "clients"]
 """routers: each vehicle and each client has an embedded router, as is LAVT's default, which dials the cloud's router.

@@ -24,7 +24,8 @@ from lavt.transport.messages import decode, encode
 from lavt.transport.security.envelope import NullVehicleAuthenticator, OperatorAuthenticator, VehicleAuthenticator
 from lavt.transport.security.gateway import ClientGateway, OpenClientGateway, ServerGateway
 from lavt.transport.security.keys import load_private, load_public
-from lavt.transport.zenoh_link import SessionSettings, ZenohLink
+from lavt.transport.zenoh_config import SessionSettings
+from lavt.transport.zenoh_link import ZenohLink
 
 VEHICLE: Final = "vehicle-1"
 OPERATOR: Final = "operator-1"

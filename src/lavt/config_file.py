@@ -14,8 +14,31 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from lavt.config import Condition, Section
+from lavt.config import (
+    BoundaryConfig,
+    ClientConfig,
+    Condition,
+    RelayConfig,
+    RendezvousConfig,
+    RunConfig,
+    Section,
+    ServerConfig,
+    SweepConfig,
+)
 from lavt.errors import UserError
+
+USES: dict[str, type[Section]] = {
+    "run": RunConfig,
+    "sweep": SweepConfig,
+    "boundary": BoundaryConfig,
+    "server": ServerConfig,
+    "client": ClientConfig,
+    "relay": RelayConfig,
+    "rendezvous": RendezvousConfig,
+}
+"""The schema of the config of each command."""
+MAX_PROBLEMS = 5
+"""A message describes at most so many errors of a config."""
 
 
 def shipped(name: str) -> Path:
@@ -54,12 +77,13 @@ def read_yaml(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise UserError(f"{path} cannot be read ({error.strerror}): name an existing file") from error
     except UnicodeDecodeError as error:
-        raise UserError(f"{path} is not YAML: {error}") from error
+        raise UserError(f"{path} is not YAML, because it is not text ({error}): name a YAML file") from error
     data = parse_yaml(text, str(path))
     if data is None:
         return {}
     if not isinstance(data, dict):
-        raise UserError(f"{path} must contain keys and values, not a {type(data).__name__}")
+        kind = type(data).__name__
+        raise UserError(f"{path} must have keys and values, not a {kind}: write, for example, `seed: 7`")
     return data
 
 
@@ -69,7 +93,8 @@ def parse_yaml(text: str, source: str) -> Any:
         return yaml.safe_load(text)
     except (yaml.YAMLError, ValueError, AttributeError, RecursionError) as error:
         # besides its own error, the library raises others for impossible dates, bad numbers and deep nesting
-        raise UserError(f"{source} is not YAML: {' '.join(str(error).split())}") from error
+        reason = " ".join(str(error).replace('in "<unicode string>", ', "in ").split())
+        raise UserError(f"{source} is not YAML: {reason}: correct it there") from error
 
 
 def split_change(change: str) -> tuple[list[str], Any]:
@@ -77,7 +102,7 @@ def split_change(change: str) -> tuple[list[str], Any]:
     key, equals, text = change.partition("=")
     parts = key.split(".")
     if not equals or not all(parts):
-        raise UserError(f"--set {change!r} is not of the form a.b=value")
+        raise UserError(f"--set {change!r} is not of the form a.b=value: write, for example, --set seed=7")
     return parts, parse_yaml(text, f"--set {change!r}: the value")
 
 
@@ -86,7 +111,10 @@ def parse_config(kind: type[Config], data: Mapping[str, Any], source: str) -> Co
     try:
         return kind.model_validate(_with_tuples(kind, data))
     except ValidationError as error:
-        raise UserError(f"{source}: " + "; ".join(_describe(kind, problem) for problem in error.errors())) from error
+        problems = [_describe(kind, problem) for problem in error.errors()]
+        if len(problems) > MAX_PROBLEMS:
+            problems[MAX_PROBLEMS:] = [f"and {len(problems) - MAX_PROBLEMS} more errors"]
+        raise UserError(f"{source}: {'; '.join(problems)}{_other_use(kind, data)}") from error
 
 
 @functools.cache
@@ -109,7 +137,7 @@ def _apply_change(data: dict[str, Any], change: str) -> None:
     for section in sections:
         data = data.setdefault(section, {})
         if not isinstance(data, dict):
-            raise UserError(f"--set {change!r}: {section} is not a section")
+            raise UserError(f"--set {change!r}: {section} is not a section: write --set {section}=value")
     data[last] = value
 
 
@@ -126,6 +154,14 @@ def _with_tuples(kind: type[BaseModel], data: Mapping[str, Any]) -> dict[str, An
     return converted
 
 
+def _other_use(kind: type[BaseModel], data: Mapping[str, Any]) -> str:
+    """Return a hint if the keys of `data` are those of another command's config; otherwise an empty text."""
+    if kind not in USES.values() or data.keys() <= kind.model_fields.keys():
+        return ""
+    other = next((name for name, schema in USES.items() if data.keys() <= schema.model_fields.keys()), None)
+    return "" if other is None else f" (these are the keys of a config for `lavt {other}`)"
+
+
 def _describe(kind: type[BaseModel], problem: Any) -> str:
     """Describe one validation error, and suggest a fix."""
     location = [str(part) for part in problem["loc"]]
@@ -137,7 +173,9 @@ def _describe(kind: type[BaseModel], problem: Any) -> str:
         hint = f"did you mean {similar[0]!r}?" if similar else f"known keys are {', '.join(sorted(known))}"
         return f"unknown key {key!r}: {hint}"
     if problem["type"] == "missing":
-        return f"{key!r} is missing"
+        return f"{key!r} is missing: add it"
+    if problem["type"] == "tuple_type":
+        return f"{key!r}: write a list, such as [a, b], not {problem['input']!r}"
     if problem["type"] == "float_type" and (number := _parse_float(problem["input"])) is not None:
         return f"{key!r}: YAML reads {problem['input']} as text: write {_yaml_float(number)}"
     # Pydantic puts "Value error, " before the messages of LAVT's validators.

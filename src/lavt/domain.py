@@ -300,6 +300,53 @@ class VehicleInfo(Struct, frozen=True):
     """Random number of the server process."""
 
 
+RunOperation = Literal["begin", "status", "read", "end"]
+RunPhase = Literal["idle", "starting", "running", "ending", "finished", "failed"]
+RunRefusal = Literal[
+    "", "malformed", "invalid", "busy", "storage_full", "unknown_run", "not_finished", "shutting_down", "server_error"
+]
+"""Why the server does not do what a `RunRequest` asks for; empty: it does."""
+
+
+class RunRequest(Struct, frozen=True):
+    """A sweeping machine's request to the server about one run of an experiment."""
+
+    operation: RunOperation
+    """begin: drive this run. status: report its phase. read: send a part of its record. end: end it, and forget it."""
+    who: str
+    instance: int
+    """As in a `SessionRequest`."""
+    number: int
+    """Repeated in the reply."""
+    run: int
+    """Random number of the run."""
+    settings: str
+    """For `begin`: the server's part of the run's config, in JSON. Empty for other operations."""
+    offset: int
+    """For `read`: where in the record the part begins, in bytes."""
+
+
+class RunReply(Struct, frozen=True):
+    """The server's answer to a `RunRequest`."""
+
+    number: int
+    refusal: RunRefusal
+    reason: str
+    """Why the request was refused, or why the run failed."""
+    phase: RunPhase
+    """The phase of the sender's run; idle if the sender has no run."""
+    ending: str
+    """How the drive ended; empty before its end."""
+    video_port: int
+    probe_port: int
+    size: int
+    """Size of the record of a finished run, in bytes."""
+    digest: bytes
+    """SHA-256 of that record; empty before the run is finished."""
+    data: bytes
+    """The part of the record that was asked for."""
+
+
 class SessionReply(Struct, frozen=True):
     """The server's answer to a `SessionRequest`."""
 

@@ -11,7 +11,8 @@ from lavt.assembly.zenoh import load_client_config, program_sessions, search_ses
 from lavt.config import ClientConfig
 from lavt.config_file import shipped
 from lavt.errors import UserError
-from lavt.transport.zenoh_link import SessionSettings, configured_endpoints
+from lavt.transport.zenoh_config import SessionSettings
+from lavt.transport.zenoh_link import configured_endpoints
 
 
 def dialled(session: SessionSettings) -> list[str]:

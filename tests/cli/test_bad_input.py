@@ -402,7 +402,7 @@ def test_help(command: str, run: Run) -> None:
 
 
 def test_list_of_commands(run: Run) -> None:
-    """The help of `lavt` lists all commands in the order of the table, as with the modules of all commands."""
+    """The help of `lavt` lists all commands by group in the order of the table, as with the modules of all commands."""
     result = run("--help")
     assert result.code == 0
     assert sorted(command.name or "" for command in build_app().registered_commands) == sorted(COMMANDS)
@@ -411,7 +411,8 @@ def test_list_of_commands(run: Run) -> None:
         CliRunner().invoke(app, ["--help"]).output.splitlines() for app in (build_app([]), build_app())
     )
     assert sorted(lines) == sorted(complete_lines), "the complete help has groups of commands last"
-    assert [line.split()[0] for line in lines[-len(main.COMMANDS) :]] == list(main.COMMANDS)
+    assert re.findall(r"^  ([a-z][a-z-]*)", result.out, re.MULTILINE) == list(main.COMMANDS)
+    assert re.findall(r"^([A-Z].*):$", result.out, re.MULTILINE)[1:] == list(main.GROUPS)
 
 
 def test_the_sentences_in_the_list_of_commands() -> None:

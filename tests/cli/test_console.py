@@ -1,11 +1,16 @@
 from __future__ import annotations
 
+import ast
+import errno
+import re
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
+import lavt
 from lavt.cli import console
 from lavt.errors import WorkError
 
@@ -69,3 +74,37 @@ def test_an_ignored_hangup_stays_ignored() -> None:
             assert not stop.is_set()
     finally:
         signal.signal(signal.SIGHUP, former_handler)
+
+
+def test_an_error_of_the_system_comes_with_advice(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    """An error of the operating system ends a command with exit code 1, the path and advice."""
+
+    def fill_the_disk() -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", str(tmp_path))
+
+    with pytest.raises(SystemExit) as exit_error:
+        console.run_command(fill_the_disk)
+    message = capsys.readouterr().err
+    assert exit_error.value.code == 1
+    assert str(tmp_path) in message
+    assert "free space" in message
+
+
+def messages(call: ast.Call) -> str:
+    """Return the constant texts of the message of an exception."""
+    constants = [part.value for part in ast.walk(call) if isinstance(part, ast.Constant)]
+    return "".join(text for text in constants if isinstance(text, str))
+
+
+def test_every_rejection_says_what_to_do() -> None:
+    """The message of each `UserError` has two parts: the error, and after a colon or semicolon the remedy."""
+    without_remedy = []
+    for path in Path(lavt.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not (isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call)):
+                continue
+            if isinstance(node.exc.func, ast.Name) and node.exc.func.id == "UserError":
+                text = messages(node.exc)
+                if text and not re.search(r"[:;] ", text):
+                    without_remedy.append(f"{path.name}:{node.lineno}: {text}")
+    assert without_remedy == []

@@ -211,4 +211,4 @@ def test_without_the_library(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     import lavt.transport.security
 
     monkeypatch.delattr(lavt.transport.security, "certificates", raising=False)
-    assert "pip install 'lavt[secure]'" in run("keys", "--vehicle", "one").rejection()
+    assert "pip install -e '.[secure]'" in run("keys", "--vehicle", "one").rejection()

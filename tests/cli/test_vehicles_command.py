@@ -16,16 +16,17 @@ from tests.support.ports import free_port
 from lavt.assembly.zenoh import search_sessions
 from lavt.cli import vehicles
 from lavt.cli.vehicles import printable, table_lines
-from lavt.clock import MachineClock
+from lavt.clock import MachineClock, pause
 from lavt.config_file import shipped
 from lavt.domain import NS_PER_MS, State, VehicleInfo
 from lavt.node import Send
 from lavt.transport import vehicle_search
 from lavt.transport.messages import VERSION, encode
 from lavt.transport.security.envelope import NullVehicleAuthenticator
-from lavt.transport.security.gateway import ServerGateway
+from lavt.transport.security.gateway import INFO_NONCE_BYTES, ServerGateway
 from lavt.transport.vehicle_search import FoundVehicle
-from lavt.transport.zenoh_link import SessionSettings, ZenohLink, quiet_logs
+from lavt.transport.zenoh_config import SessionSettings
+from lavt.transport.zenoh_link import ZenohLink, quiet_logs
 
 ROUTER = shipped("zenoh-configs/router-server.json5")
 ESCAPE = "\x1b[2J"
@@ -81,7 +82,18 @@ def router() -> Iterator[str]:
 
         handler: Any = zenoh.handlers.Callback(answer, indirect=False)
         stranger.declare_queryable("lavt/stranger/info", handler)
+        wait_until_known(stranger, {"lavt/car-1/info", "lavt/car-2/info"})
         yield endpoint
+
+
+def wait_until_known(session: Any, keys: set[str]) -> None:
+    """Wait until the keys answer to a session, because a router learns of them one after the other."""
+    for _ in range(600):
+        replies = session.get("lavt/*/info", payload=bytes(INFO_NONCE_BYTES), timeout=1.0)
+        if keys <= {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}:
+            return
+        pause(50 * NS_PER_MS)
+    raise AssertionError(f"not all of {keys} have answered")
 
 
 def test_the_table_of_vehicles(router: str, run: Run) -> None:

@@ -25,7 +25,7 @@ from lavt.experiment.runs.processes import Process, Processes
 from lavt.transport.zenoh_link import CONTROL, STATE
 
 BASE = "lavt/vehicle-1"
-OPERATOR_KEYS = (f"{BASE}/session", f"{BASE}/netem")
+OPERATOR_KEYS = (f"{BASE}/session", f"{BASE}/netem", f"{BASE}/run")
 """The keys that only operators may query."""
 QUERY_KEYS = (*OPERATOR_KEYS, f"{BASE}/info")
 QUIC = "quic/127.0.0.1:0?mixed_rel=1"
@@ -265,8 +265,11 @@ class Intruder(ClientStandIn):
             "queries": self.name in site.vehicle.queries,
             "session": b"reply to session" in replies,
             "netem": b"reply to netem" in replies,
+            "run": b"reply to run" in replies,
             "info": b"reply to info" in replies,
-            "the routers' own state": bool(replies - {b"reply to session", b"reply to netem", b"reply to info"}),
+            "the routers' own state": bool(
+                replies - {b"reply to session", b"reply to netem", b"reply to info", b"reply to run"}
+            ),
             "forged state": any(state != b"state" for state in site.operator.received[f"{BASE}/state"]),
             "forged replies": b"forged" in site.operator.replies,
             "state": b"state" in self.received[f"{BASE}/state"],

@@ -46,7 +46,7 @@ from lavt.transport.zenoh_link import quiet_logs
 
 pytest.importorskip("cryptography")
 
-OPERATOR_EFFECTS = {"commands", "queries", "session", "netem", "info", "state", "alive"}
+OPERATOR_EFFECTS = {"commands", "queries", "session", "netem", "info", "run", "state", "alive"}
 ALL_EFFECTS = OPERATOR_EFFECTS | {
     "wildcard commands",
     "deletes",

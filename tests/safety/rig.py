@@ -42,7 +42,7 @@ def vehicle_at(speed_mps: float = 0.0, steering_rad: float = 0.0) -> VehicleStat
 class Rig:
     """A safety gate with its surroundings; `now_ns` is the server's monotonic clock, which `pass_time` advances."""
 
-    def __init__(self, limits: Limits = LIMITS) -> None:
+    def __init__(self, limits: Limits = LIMITS, *, only_operator: str = "") -> None:
         epochs, tokens = count(1000), count(1)
         self.gate = SafetyGate(
             limits,
@@ -51,6 +51,7 @@ class Rig:
             new_token=lambda: next(tokens).to_bytes(16, "big"),
             host="bench",
             video_port=5600,
+            only_operator=only_operator,
         )
         self.now_ns = START_NS
         self.vehicle = vehicle_at()

@@ -45,6 +45,18 @@ def test_the_active_operator_gets_an_epoch_and_a_token() -> None:
     assert (reply.video_port, reply.host, reply.emergency_stop) == (5600, "bench", 0)
 
 
+def test_a_run_is_reserved_for_one_operator() -> None:
+    """With an only operator, no other one gets control, not even by a handover, but every one can stop the vehicle."""
+    rig = Rig(only_operator="alice")
+    assert not rig.request("acquire", "bob").granted
+    rig.acquire()
+    rig.request("request_handover", "bob")
+    rig.request("release")
+    assert not rig.request("acquire", "bob").granted
+    assert rig.request("emergency_stop", "bob", number=5).granted
+    assert rig.state == "emergency_stop"
+
+
 def test_acquiring_control_again_changes_nothing() -> None:
     """An instance that acquires control again, also while driving, gets the same epoch and token."""
     rig = Rig()

@@ -14,6 +14,8 @@ from lavt.domain import (
     Command,
     NetemReply,
     NetemRequest,
+    RunReply,
+    RunRequest,
     SessionReply,
     SessionRequest,
     State,
@@ -33,7 +35,9 @@ from lavt.transport.messages import (
     encode,
 )
 
-AnyMessage = Command | State | SessionRequest | SessionReply | NetemRequest | NetemReply | VehicleInfo
+AnyMessage = (
+    Command | State | SessionRequest | SessionReply | NetemRequest | NetemReply | VehicleInfo | RunRequest | RunReply
+)
 
 COMMAND = Command(
     epoch=7,
@@ -77,6 +81,8 @@ NETEM = NetemRequest(
     state_delay_ms=150.0,
 )
 NETEM_REPLY = NetemReply(granted=False, reason="no")
+RUN = RunRequest("begin", "operator-1", instance=5, number=1, run=2**63 - 1, settings="{}", offset=0)
+RUN_REPLY = RunReply(1, "", "", "finished", "completed", 5600, 5602, size=3, digest=bytes(32), data=b"abc")
 INFO = VehicleInfo(
     lavt_version="0.1.0",
     safety="driving",
@@ -87,7 +93,7 @@ INFO = VehicleInfo(
     instance=9,
 )
 MESSAGES: dict[type, AnyMessage] = {
-    type(message): message for message in (COMMAND, STATE, REQUEST, REPLY, NETEM, NETEM_REPLY, INFO)
+    type(message): message for message in (COMMAND, STATE, REQUEST, REPLY, NETEM, NETEM_REPLY, INFO, RUN, RUN_REPLY)
 }
 
 U64 = st.integers(0, 2**64 - 1)
@@ -183,6 +189,7 @@ def test_longest_texts_fit(letter: str) -> None:
 ANY_TEXT = st.one_of(st.text(st.characters(categories=["L", "Cs", "So"]), max_size=2000), st.text())
 TEXTS: list[tuple[type[Any], str]] = [(State, "reason"), (State, "rejected"), (State, "limited")]
 TEXTS += [(SessionReply, "reason"), (SessionReply, "host"), (NetemRequest, "condition"), (NetemReply, "reason")]
+TEXTS += [(RunReply, "reason"), (RunReply, "ending")]
 TEXTS += [(VehicleInfo, "lavt_version"), (VehicleInfo, "reason")]
 
 
@@ -321,6 +328,27 @@ OUT_OF_RANGE: dict[type, dict[str, list[Any]]] = {
         "speed_mps": [*NOT_A_NUMBER, 100.1, -100.1],
         "state_age_ns": NOT_A_U63,
         "instance": [*NOT_AN_INTEGER, -1],
+    },
+    RunRequest: {
+        "operation": [*NOT_A_TEXT, "", "delete"],
+        "who": NOT_A_NAME,
+        "instance": [*NOT_AN_INTEGER, -1],
+        "number": NOT_A_U63,
+        "run": NOT_A_U63,
+        "settings": [*NOT_A_TEXT, "x" * 801],
+        "offset": NOT_A_U63,
+    },
+    RunReply: {
+        "number": NOT_A_U63,
+        "refusal": [*NOT_A_TEXT, "no"],
+        "reason": [*NOT_A_TEXT, "x" * 401],
+        "phase": [*NOT_A_TEXT, "", "begun"],
+        "ending": [*NOT_A_TEXT, "x" * 33],
+        "video_port": [*NOT_AN_INTEGER, -1, 65536],
+        "probe_port": [*NOT_AN_INTEGER, -1, 65536],
+        "size": NOT_A_U63,
+        "digest": ["", "x" * 32, None, 0, bytes(31), bytes(33), [0] * 32],
+        "data": ["", None, 0, bytes(32_769), [0]],
     },
 }
 

@@ -37,6 +37,8 @@ def type_text(annotation: Any) -> str:
     assert get_origin(annotation) is Annotated
     kind, meta = get_args(annotation)
     assert isinstance(meta, Meta)
+    if kind is bytes:
+        return f"binary, at most {number_text(meta.max_length or 0)} bytes"
     if kind is str:
         return f"text, at most {meta.max_length} characters"
     if get_origin(kind) is tuple:

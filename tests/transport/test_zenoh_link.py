@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import functools
 import itertools
 import json
 import queue
@@ -20,8 +21,9 @@ from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.errors import UserError
 from lavt.node import Send
 from lavt.runtime.thread_failures import fail_on_thread_errors
-from lavt.transport.messages import MAX_MESSAGE_BYTES
-from lavt.transport.zenoh_link import RECEIVE_RING_LENGTH, Router, SessionSettings, ZenohLink, quiet_logs
+from lavt.transport.security.envelope import MAX_ENVELOPE_BYTES, MAX_RUN_REPLY_ENVELOPE_BYTES
+from lavt.transport.zenoh_config import SessionSettings
+from lavt.transport.zenoh_link import RECEIVE_RING_LENGTH, REPLY_CHANNELS, Router, ZenohLink, quiet_logs
 
 ARRIVAL_TIMEOUT_S = 10.0
 CONFIGS = shipped("zenoh-configs")
@@ -188,6 +190,20 @@ def test_queries(pair: Pair, channel: str, reply: str) -> None:
     _, peer = pair.server_received.next((channel, b"query"), lambda: pair.client.send(query))
     pair.server.send(Send(reply, b"reply", peer))
     pair.client_received.next((reply, b"reply"))
+
+
+def test_only_a_server_of_runs_answers_requests_for_runs(pair: Pair, routers: tuple[str, str]) -> None:
+    """A link that answers runs gets no other query; an ordinary server's link gets no request for a run."""
+    received = Received()
+    with closing(open_link("server", routers[0])) as runs:
+        runs.start(received, answers_runs_only=True)
+        send = pair.client.send
+        _, peer = received.next(("run", b"begin"), lambda: send(Send("session", b"ask"), Send("run", b"begin")))
+        part = bytes(32_768)
+        pair.client_received.next(("run_reply", part), lambda: runs.send(Send("run_reply", part, peer)))
+        pair.server_received.next(("session", b"ask"), lambda: send(Send("session", b"ask"), Send("run", b"begin")))
+    assert set(received.payloads) == {b"begin"}
+    assert b"begin" not in pair.server_received.payloads
 
 
 def test_reply_without_a_query(pair: Pair) -> None:
@@ -667,13 +683,52 @@ def test_encrypted_configs_restrict_access(name: str) -> None:
     assert all("mixed_rel=1" in endpoint for endpoint in endpoints if endpoint.startswith("quic"))
     tls = json.loads(config.get_json("transport/link/tls"))
     assert (tls["enable_mtls"], tls["verify_name_on_connect"], tls["close_link_on_expiration"]) == (True, True, True)
-    (limit,) = json.loads(config.get_json("low_pass_filter"))
-    assert limit["size_limit"] > MAX_MESSAGE_BYTES
+    limits = {limit["id"]: limit for limit in json.loads(config.get_json("low_pass_filter"))}
+    sizes = {name: limit["size_limit"] for name, limit in limits.items()}
+    assert sizes == {"short": MAX_ENVELOPE_BYTES, "replies": MAX_ENVELOPE_BYTES, "parts": MAX_RUN_REPLY_ENVELOPE_BYTES}
+    assert limits["parts"]["key_exprs"] == ["**"]
+    short = [zenoh.KeyExpr(key) for key in limits["replies"]["key_exprs"]]
+    for key in (
+        *(f"lavt/v/{name}" for name in REPLY_CHANNELS),
+        "lavt/v/state",
+        "lavt/v/alive/x",
+        "x",
+        "x/y",
+        "a/b/c/d/e",
+    ):
+        assert any(limited.intersects(key) for limited in short) is (key != "lavt/v/run"), key
     access = json.loads(config.get_json("access_control"))
     assert access["enabled"] is (name != "router-client-tls.json5")
     assert access["default_permission"] == "deny"
     defined_rules = {rule["id"] for rule in access["rules"] or ()}
     assert defined_rules == {rule for policy in access["policies"] or () for rule in policy["rules"]}
+
+
+def test_only_replies_about_runs_can_be_long() -> None:
+    """With the filter of an encrypted router, a part of a record passes on the key `run`, and on no other one."""
+    limits = zenoh.Config.from_file(str(CONFIGS / "router-server-tls.json5")).get_json("low_pass_filter")
+    filtering = {"listen/endpoints": [LOCAL], "low_pass_filter": json.loads(limits)}
+    config = zenoh.Config.from_file(str(SESSION))
+    with closing(Router(CONFIGS / "router-server.json5", filtering)) as router:
+        config.insert_json5("connect/endpoints", json.dumps([loopback_endpoint(router)]))
+        with zenoh.open(config) as server, zenoh.open(config) as client:
+            longest = {}
+            for key in ("lavt/v/run", "lavt/v/session", "lavt/v/info", "lavt/v/alive/x", "x/y"):
+                queryable = server.declare_queryable(
+                    key, lambda query, key=key: query.reply(key, bytes(int(query.parameters["bytes"])))
+                )
+                ask = functools.partial(_longest_reply, client, key)
+                assert any(ask(1) for _ in range(100)), "the router knows the key after a moment"
+                longest[key] = max(ask(size) for size in (1280, 1281, 34_048, 34_049))
+                queryable.undeclare()
+    assert longest.pop("lavt/v/run") == 34_048
+    assert set(longest.values()) == {1280}
+
+
+def _longest_reply(session: zenoh.Session, key: str, size: int) -> int:
+    """Query a key for a reply of this size; return the size of the longest reply, 0 without any."""
+    replies = session.get(f"{key}?bytes={size}", timeout=ARRIVAL_TIMEOUT_S)
+    return max((len(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None), default=0)
 
 
 @pytest.mark.parametrize("name", sorted(path.name for path in CONFIGS.glob("router-*.json5") if "tls" not in path.name))

@@ -186,6 +186,7 @@ def build_actuator(
         host=host,
         video_port=video_port,
         instance=entropy.number(64),
+        only_operator=config.experiment.operator,
     )
     return ActuatorNode(
         vehicle,

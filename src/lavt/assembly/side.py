@@ -226,7 +226,8 @@ def open_client(config: ClientConfig, out: Path | None, clock: Clock, print_mess
         server = config.video.server
         video = open_flow(config, clock, "video", "rtp", bind=("", 0), remote=(server, config.video.port))
         opened.callback(video.close)
-        probe = open_flow(config, clock, "probe", "probe_reply", bind=("", 0), remote=(server, config.clock.probe_port))
+        probe_address = (config.clock.probe_server or server, config.clock.probe_port)
+        probe = open_flow(config, clock, "probe", "probe_reply", bind=("", 0), remote=probe_address)
         opened.callback(probe.close)
         links = Links(video, probe, opened.enter_context(closing(_open_zenoh(config, clock, print_message))))
         nodes = build_client(config, clock.now, MachineEntropy())

@@ -80,6 +80,7 @@ def _build_sim_camera(config: ServerConfig, road: Road) -> SimCamera:
         seed=config.seed,
         scenery=config.vehicle.scenery,
         light=config.vehicle.light,
+        weather=config.vehicle.weather,
         exposure_ns=round(config.camera.exposure_ms * NS_PER_MS),
         sensor_delay_ns=round(config.camera.sensor_delay_ms * NS_PER_MS),
     )

@@ -96,7 +96,7 @@ def _read_json_object(path: str) -> dict[str, object]:
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
-        raise UserError(f"{path} is not JSON") from error
+        raise UserError(f"{path} is not a watchdog proof: it is not JSON") from error
     if not isinstance(data, dict):
         raise UserError(f"{path} is not a watchdog proof: it contains no JSON object")
     return data

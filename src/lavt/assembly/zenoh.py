@@ -10,16 +10,20 @@ from typing import Any, Final
 
 from lavt.assembly.addresses import parse_host
 from lavt.assembly.entropy import MachineEntropy
-from lavt.config import ClientConfig, ServerConfig
+from lavt.config import ClientConfig, ServerConfig, ZenohConfig
 from lavt.config_file import build_config, find_file, load_config
 from lavt.errors import UserError
-from lavt.transport.zenoh_config import flatten, with_host
-from lavt.transport.zenoh_link import SessionSettings, configured_endpoints
+from lavt.transport.zenoh_config import SessionSettings, flatten, with_host
+from lavt.transport.zenoh_link import configured_endpoints
 
 CONFIG_SUFFIXES: Final = (".yaml", ".yml")
 SESSION_FILE = "zenoh-configs/session.json5"
 LOCAL_ENDPOINTS = ("unixsock-stream/", "tcp/127.", "tcp/localhost:", "tcp/[::1]:")
 """Beginnings of endpoints at which a router listens for programs on its own machine."""
+NO_LOCAL_ENDPOINT = (
+    "the server's router has no endpoint for programs on its machine: add one to listen.endpoints, in {} or in "
+    "zenoh.router_settings, such as tcp/127.0.0.1:7447"
+)
 AS_A_SESSION = {"mode": "client", "listen/endpoints": [], "connect/timeout_ms": 0, "connect/exit_on_failure": True}
 """Changes of a router's config for a session that makes one attempt to reach the router that this router dials."""
 SCOUTED = {"scouting/multicast/enabled": True, "scouting/multicast/autoconnect": []}
@@ -77,10 +81,7 @@ def program_sessions(config: Config) -> list[SessionSettings]:
         own_id = {"id": f"{MachineEntropy().number(64):x}"}  # the router of a running client has the id of the file
         sessions.append(SessionSettings(path, changes | AS_A_SESSION | own_id, advice=advice))
     if not sessions:
-        raise UserError(
-            f"the server's router has no endpoint for programs on its machine: add one to listen.endpoints, in {path} "
-            "or in zenoh.router_settings, such as tcp/127.0.0.1:7447"
-        )
+        raise UserError(NO_LOCAL_ENDPOINT.format(path))
     return sessions
 
 
@@ -105,6 +106,37 @@ def _local_endpoints(config: Config) -> list[str]:
     """Return the first endpoint of the embedded router for programs on its machine, in a list; empty if none."""
     endpoints = configured_endpoints(_router_file(config), "listen/endpoints", _router_changes(config))
     return [endpoint for endpoint in endpoints if endpoint.startswith(LOCAL_ENDPOINTS)][:1]
+
+
+def local_session(config: ServerConfig, locators: Sequence[str]) -> ZenohConfig:
+    """Return the config of another process that uses the router of this server, which listens at `locators`."""
+    if not config.zenoh.is_embedded:
+        return config.zenoh
+    local = [locator for locator in locators if locator.startswith(LOCAL_ENDPOINTS)]
+    if not local:
+        raise UserError(NO_LOCAL_ENDPOINT.format(_router_file(config)))
+    return ZenohConfig(router=local[0])
+
+
+def vehicle_endpoint(config: ClientConfig) -> str:
+    """Return the endpoint of the vehicle's router, which the client's embedded router dials."""
+    endpoints = configured_endpoints(_router_file(config), "connect/endpoints", _router_changes(config))
+    if not config.zenoh.is_embedded or not endpoints:
+        raise UserError("zenoh.router must be embedded, with one connect.endpoints: the vehicle's router")
+    return endpoints[0]
+
+
+def dialling(config: ClientConfig, endpoint: str) -> ZenohConfig:
+    """Return the config of the client's embedded router that dials another endpoint, and does not listen."""
+    settings = flatten(config.zenoh.router_settings) | {"connect/endpoints": [endpoint], "listen/endpoints": []}
+    nested: dict[str, Any] = {}
+    for key, value in settings.items():
+        *sections, name = key.split("/")
+        section = nested
+        for part in sections:
+            section = section.setdefault(part, {})
+        section[name] = value
+    return config.zenoh.model_copy(update={"router_settings": nested})
 
 
 def _separate(config: Config) -> SessionSettings:

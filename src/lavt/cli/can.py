@@ -93,7 +93,9 @@ def monitor(
         write_frame = stack.enter_context(_log_writer(write, config.channel, wall_offset_ns))
         if not _show_batches(batches, (codec, expected), drop_counts, write_frame, as_json):
             raise WorkError(
-                f"no frame arrived on {config.interface} {config.channel}" if log is None else f"{log} is empty"
+                f"no frame arrived on {config.interface} {config.channel}: is it up, and does anything send?"
+                if log is None
+                else f"{log} is empty: name another log"
             )
 
 
@@ -229,7 +231,7 @@ def _with_bus(config: DbwConfig, interface: str | None, channel: str | None, opt
     for text in option or ():
         name, equals, value = text.partition("=")
         if not (name and equals):
-            raise UserError(f"--option {text!r} is not of the form name=value")
+            raise UserError(f"--option {text!r} is not of the form name=value: write it as bitrate=500000")
         options[name] = parse_yaml(value, f"--option {name}")
     return config.model_copy(
         update={

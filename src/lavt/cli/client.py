@@ -61,7 +61,7 @@ def client(
     process_priority.raise_priority()
     settings = load_client_config(target, [*(changes or []), *(["take_over=true"] if take_over else [])])
     if ":" in settings.video.server:
-        raise UserError("video.server needs an IPv4 address or a name that has one, because video goes over IPv4")
+        raise UserError("video goes over IPv4: set video.server to an IPv4 address, or to a name that has one")
     with open_client(settings, out, MachineClock(), console.print_message) as side:
         signal.signal(signal.SIGUSR1, lambda *_: side.send("operator", "emergency_stop"))
         signal.signal(signal.SIGUSR2, lambda *_: side.send("operator", "release"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import signal
@@ -22,6 +23,19 @@ SetOption = Annotated[
     list[str] | None, typer.Option("--set", help="Override a config value, as a.b=value; repeatable.")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
+
+OS_REMEDIES = {
+    errno.ENOSPC: "free space on the disk, or name another one with --out",
+    errno.EDQUOT: "free space in your quota, or name another disk with --out",
+    errno.EACCES: "get the permission, or name another place",
+    errno.EPERM: "get the permission, or name another place",
+    errno.EROFS: "name a place that can be written",
+    errno.EADDRINUSE: "end the program that uses the port, or choose another port",
+    errno.ENETUNREACH: "check the address and this machine's network",
+    errno.EHOSTUNREACH: "check the address and the network",
+    errno.EMFILE: "raise the limit of open files (`ulimit -n`)",
+}
+"""What to do about an error of the operating system."""
 
 
 def print_message(text: str) -> None:
@@ -68,7 +82,8 @@ def run_command(command: Callable[[], None]) -> None:
         print_message(f"lavt: {error}")
         raise SystemExit(1) from None
     except OSError as error:  # such as a full disk or a missing permission that no check anticipated
-        print_message(f"lavt: {error}")
+        remedy = OS_REMEDIES.get(error.errno or 0)
+        print_message(f"lavt: {error}" + (f": {remedy}" if remedy else ""))
         raise SystemExit(1) from None
 
 

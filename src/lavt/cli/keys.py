@@ -87,7 +87,7 @@ def _certificates() -> ModuleType:
     try:
         from lavt.transport.security import certificates  # noqa: PLC0415 (an optional dependency)
     except ImportError as error:
-        raise UserError(f"lavt keys needs cryptography ({error}): pip install 'lavt[secure]'") from error
+        raise UserError(f"lavt keys needs cryptography ({error}): pip install -e '.[secure]' in the clone") from error
     return certificates
 
 

@@ -63,4 +63,11 @@ def _status_line(server: dict[str, Any], client: dict[str, Any]) -> str:
         for name, value, number_format, unit in values
         if value is not None
     )
-    return f"{server.get('safety', ''):<10} " + "  ".join(shown)
+    return f"{server.get('safety', ''):<10} " + "  ".join((*shown, *_lane(client.get("lane_confidence"))))
+
+
+def _lane(confidence: float | None) -> list[str]:
+    """Return what the driver detects in the newest picture."""
+    if confidence is None:
+        return []
+    return [f"lane seen {confidence * 100:3.0f} %" if confidence > 0 else "no lane seen"]

@@ -10,48 +10,74 @@ from __future__ import annotations
 import sys
 from collections.abc import Container
 from importlib import import_module
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 import lavt
 from lavt.cli import console
 from lavt.errors import WorkError
+from lavt.runtime.parent_watch import end_with_parent
 
-COMMANDS = {
-    "demo": "Run the demo: drive by video under L0 to L5 and report.",
-    "run": "Drive one route under one network condition.",
-    "sweep": "Drive routes under network conditions and report.",
-    "boundary": "Find the maximum tolerable latency.",
-    "report": "Write a report of finished runs.",
-    "replay": "Make a video of runs side by side.",
-    "join": "Join the records of two machines into one run.",
-    "road": "Draw roads: shipped ones and your own.",
-    "perception": "Inspect lane detection.",
-    "server": "Run the vehicle's side: stream video and execute commands.",
-    "software-car": "Simulate a car with a by-wire kit on a CAN bus.",
-    "client": "Run the operator's side: acquire control, arm and drive.",
-    "vehicles": "List the vehicles that answer: state, who has control, and latency.",
-    "sdp": "Print the SDP file for watching the video in a player.",
-    "watch": "Receive an RTP/H.264 stream and measure its latency.",
-    "stop": "Trigger an emergency stop, whoever has control, and wait until the vehicle confirms it.",
-    "router": "Run a Zenoh router until Ctrl-C.",
-    "keys": "Create certificates and signing keys with a test certificate authority.",
-    "relay": "Forward video and control with injected latency.",
-    "rendezvous": "Forward the video of a vehicle behind NAT to its clients.",
-    "netem": "Inject latency with tc netem (docs/netem.md).",
-    "can": "Inspect drive-by-wire CAN buses (docs/can.md).",
-    "clock": "Report the error of this machine's clock.",
-    "doctor": "Check whether this machine is ready to drive.",
+GROUPS = {
+    "Try LAVT on this machine": {
+        "demo": "Run the demo: show what delay does to driving by video.",
+        "run": "Drive one route under one network condition.",
+        "replay": "Make a video of runs side by side.",
+        "doctor": "Check whether this machine is ready to drive.",
+    },
+    "Drive a vehicle on another machine": {
+        "server": "Run the vehicle's side: stream video and execute commands.",
+        "client": "Run the operator's side: acquire control, arm and drive.",
+        "vehicles": "List the vehicles that answer: state, who has control, and latency.",
+        "stop": "Trigger an emergency stop, whoever has control, and wait until the vehicle confirms it.",
+        "sdp": "Print the SDP file for watching the video in a player.",
+        "watch": "Receive an RTP/H.264 stream and measure its latency.",
+    },
+    "Experiment": {
+        "sweep": "Drive routes under network conditions and report.",
+        "boundary": "Find the maximum tolerable latency.",
+        "report": "Write a report of finished runs.",
+        "join": "Join the records of two machines into one run.",
+    },
+    "Network and clocks": {
+        "relay": "Forward video and control with injected latency.",
+        "netem": "Inject latency with tc netem (docs/netem.md).",
+        "clock": "Report the error of this machine's clock.",
+        "keys": "Create certificates and signing keys with a test certificate authority.",
+        "router": "Run a Zenoh router until Ctrl-C.",
+        "rendezvous": "Forward the video of a vehicle behind NAT to its clients.",
+    },
+    "Vehicle, camera and road": {
+        "road": "Draw roads: shipped ones and your own.",
+        "perception": "Inspect lane detection.",
+        "software-car": "Simulate a car with a by-wire kit on a CAN bus.",
+        "can": "Inspect drive-by-wire CAN buses (docs/can.md).",
+    },
 }
-"""All commands, in the order of the help, with the first sentence of their own help. The module of a command has its
-name, with `_` for `-`."""
+"""All commands by what one does with them, in the order of the help, with the first sentence of their own help. The
+module of a command has its name, with `_` for `-`."""
+
+COMMANDS = {command: summary for group in GROUPS.values() for command, summary in group.items()}
+"""All commands."""
+
+
+class GroupedHelp(TyperGroup):
+    """The help of `lavt`, with the commands in groups."""
+
+    def format_commands(self, _ctx: Any, formatter: Any) -> None:
+        """Write the commands of each group."""
+        for title, commands in GROUPS.items():
+            with formatter.section(title):
+                formatter.write_dl([(command, COMMANDS[command]) for command in commands])
 
 
 def build_app(commands: Container[str] = COMMANDS, *, has_all: bool = True) -> typer.Typer:
     """Return the command line with these commands; with `has_all`, the help also lists the others, not imported."""
     app = typer.Typer(
         name="lavt",
+        cls=GroupedHelp,
         help="Measure how network latency affects vision-based teleoperation.",
         no_args_is_help=True,
         add_completion=False,
@@ -88,6 +114,7 @@ def global_options(
 
 def main() -> None:
     """Run the command line and exit with the command's exit code."""
+    end_with_parent()
     words = sys.argv[1:]
     is_plain = bool(words) and words[0] in COMMANDS
     console.run_command(build_app(words[:1] if is_plain else words, has_all=not is_plain))

@@ -94,4 +94,4 @@ def check_output(out: Path, *, source: Path, is_video: bool) -> None:
 def write_picture(out: Path, picture: Picture) -> None:
     """Write one picture."""
     if not cv2.imwrite(str(out), picture):
-        raise WorkError(f"{out} could not be written")
+        raise WorkError(f"{out} could not be written: is there space on the disk?")

@@ -88,7 +88,7 @@ def _read_boundary(directory: Path) -> dict[str, Any]:
     boundary: Any = read_json(directory / BOUNDARY)
     lists = [boundary.get(key) for key in ("runs", "groups")] if isinstance(boundary, dict) else []
     if not lists or not all(isinstance(entries, list) and entries for entries in lists):
-        raise WorkError(f"{directory / BOUNDARY} is not the result of a boundary search: it lacks runs or groups")
+        raise WorkError(f"{directory / BOUNDARY} has no runs or groups: search again with `lavt boundary`")
     return dict(boundary)
 
 

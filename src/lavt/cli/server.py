@@ -34,6 +34,7 @@ def server(
     """Run the vehicle's side: stream video and execute commands.
 
     The server executes the commands of the client that has control. If no valid command arrives, it stops the vehicle.
+    With experiment.remote_runs it drives the runs that `lavt sweep --server` requests.
 
     Without a config, the vehicle is the built-in simulator, and nothing is encrypted or signed.
 
@@ -49,5 +50,10 @@ def server(
         )
     else:
         settings = load_config(ServerConfig, config, changes or [])
+    if settings.experiment.remote_runs:
+        from lavt.cli.serve_runs import serve_runs  # noqa: PLC0415 (a server of a vehicle needs none of it)
+
+        serve_runs(settings, out or Path("out") / "runs", as_json=as_json)
+        return
     with open_server(settings, out, MachineClock(), console.print_message) as (side, ready):
         run_side(side, "", once=once, as_json=as_json, ready=ready)

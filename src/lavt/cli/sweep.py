@@ -9,8 +9,8 @@ import typer
 
 from lavt.cli import console
 from lavt.cli.progress import progress
-from lavt.config import SweepConfig
-from lavt.config_file import load_config
+from lavt.config import ClientConfig, SweepConfig
+from lavt.config_file import find_file, load_config
 from lavt.errors import UserError
 from lavt.experiment.analysis.results import read_json
 from lavt.experiment.runs.plan import plan_sweep
@@ -31,30 +31,48 @@ def sweep(
         str | None,
         typer.Option(metavar="ADDRESS|local", help="Run on the Dask workers of a scheduler, or on local workers."),
     ] = None,
+    server: Annotated[
+        str | None, typer.Option(metavar="HOST", help="Drive in real time on the server at this address.")
+    ] = None,
+    client: Annotated[Path, typer.Option(help="With --server: the config of this machine's client.")] = Path(
+        "configs/client.yaml"
+    ),
     as_json: console.JsonOption = False,
 ) -> None:
     """Drive routes under network conditions and report.
 
-    Each combination is repeated as the config says. Finished runs of a stopped sweep are kept; see --resume.
+    Each combination is repeated as the config says. Finished runs of a stopped sweep are kept; see --resume. With
+    --server, the vehicle's side of each run is on that machine, whose server allows it (experiment.remote_runs).
 
     Example: lavt sweep configs/sweep.yaml --set 'conditions=[L0, L3]' --out out/sweep
     """
+    from lavt.experiment.runs.remote_run import RemoteServer  # noqa: PLC0415
     from lavt.experiment.sweep.cluster import check_cluster  # noqa: PLC0415 (slow: scipy)
     from lavt.experiment.sweep.sweep import drive_sweep, open_sweep  # noqa: PLC0415 (slow: scipy)
     from lavt.experiment.sweep.workers import is_finished  # noqa: PLC0415
 
-    settings = load_config(SweepConfig, config, changes or [])
+    if cluster and server:
+        raise UserError("--cluster and --server exclude each other: a server drives one run at a time")
+    settings = load_config(SweepConfig, config, [*(["time=real"] if server else []), *(changes or [])])
     planned_runs = plan_sweep(settings)
+    remote = None
+    if server:
+        console.reserve_stdout()
+        remote_client = load_config(ClientConfig, find_file(client), [f"video.server={server}"])
+        remote = RemoteServer(remote_client, console.print_message)
+        remote.check(planned_runs)
     if cluster and any(run.config.time == "real" for run in planned_runs):
         raise UserError("--cluster needs virtual time: set time: virtual, or run without --cluster")
     out = out or Path("out") / "sweep"
     if cluster:
         check_cluster(cluster, jobs)
-    open_sweep(out, resume=resume)
     remaining = sum(not is_finished(out / "runs" / run.name) for run in planned_runs)
+    if remote and remaining:
+        remote.check_connection()
+    open_sweep(out, resume=resume)
     with console.interruptible(), progress(f"sweep, results in {out}", remaining) as report_done:
         page, result = drive_sweep(
-            settings, planned_runs, out, jobs=jobs, on_progress=report_done, cluster_address=cluster
+            settings, planned_runs, out, jobs=jobs, on_progress=report_done, cluster_address=cluster, server=remote
         )
     for name, reason in result.failed:
         console.print_message(f"failed: {name}: {reason}")

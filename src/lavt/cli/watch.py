@@ -89,7 +89,7 @@ def watch(
     values = {**summary, "datagrams_from_strangers": from_strangers, "check": CHECKS[sender]}
     _print_statistics("summary", values, as_json)
     if not summary["pictures"]:
-        raise WorkError("no picture arrived")
+        raise WorkError(f"no picture arrived: does a sender send to UDP port {link.port} of this machine?")
     if not summary["stamps_accepted"]:
         console.print_message("no stamp was accepted: do the pictures have stamps, and is --sender correct?")
 

@@ -10,8 +10,10 @@ from lavt.config.camera import CalibrationConfig as CalibrationConfig
 from lavt.config.camera import CameraConfig as CameraConfig
 from lavt.config.camera import ClientCameraConfig as ClientCameraConfig
 from lavt.config.camera import ServerCameraConfig as ServerCameraConfig
+from lavt.config.controller import ControllerConfig as ControllerConfig
 from lavt.config.costs import Costs as Costs
 from lavt.config.dbw import DbwConfig as DbwConfig
+from lavt.config.experiment import ExperimentConfig as ExperimentConfig
 from lavt.config.injection import ClientInjectionConfig as ClientInjectionConfig
 from lavt.config.injection import Condition as Condition
 from lavt.config.injection import FlowChanges as FlowChanges
@@ -19,39 +21,18 @@ from lavt.config.injection import ImpairmentConfig as ImpairmentConfig
 from lavt.config.injection import InjectionConfig as InjectionConfig
 from lavt.config.injection import LinkConfig as LinkConfig
 from lavt.config.injection import ServerInjectionConfig as ServerInjectionConfig
+from lavt.config.relay import DelayConfig as DelayConfig
+from lavt.config.relay import RelayConfig as RelayConfig
 from lavt.config.rendezvous import RendezvousConfig as RendezvousConfig
 from lavt.config.rendezvous import ServerRendezvousConfig as ServerRendezvousConfig
 from lavt.config.section import Section as Section
 from lavt.config.security import ClientSecurityConfig as ClientSecurityConfig
 from lavt.config.security import ServerSecurityConfig as ServerSecurityConfig
+from lavt.config.vehicle import MAX_SIMULATED_MPS as MAX_SIMULATED_MPS
+from lavt.config.vehicle import SafetyConfig as SafetyConfig
+from lavt.config.vehicle import VehicleConfig as VehicleConfig
 from lavt.config.zenoh import ZenohConfig as ZenohConfig
 from lavt.transport.clock_sync import probe
-
-
-class VehicleConfig(Section):
-    """The vehicle and its route; all keys except `kind` and `dbw` are for the built-in simulator or a software car."""
-
-    kind: str = "simulator"
-    route: str = "a_key"
-    """The name of a shipped road, or the path of a road's YAML file (`docs/roads.md`)."""
-    scenery: Literal["full", "light", "none"] = "full"
-    light: Literal["noon", "low_sun", "overcast"] = "noon"
-    """The position of the sun and the state of the sky, see `docs/camera.md`."""
-    car: str = "lincoln_mkz"
-    steering_dead_time_ms: float | None = Field(None, ge=0, le=2000)
-    """The time from a command until the wheels begin to follow. Null, here and for the four keys below: the value of
-    `car`."""
-    steering_lag_ms: float | None = Field(None, ge=0, le=2000)
-    pedal_dead_time_ms: float | None = Field(None, ge=0, le=2000)
-    throttle_lag_ms: float | None = Field(None, ge=0, le=5000)
-    brake_lag_ms: float | None = Field(None, ge=0, le=5000)
-    after_collision: Literal["end", "continue"] = "end"
-    """Whether a collision ends the drive, or the car slides along the obstacle and continues."""
-    time_limit_s: float | None = Field(None, gt=0, le=86_400)
-    """The maximum duration of a drive from the first movement; null: the route's time at 10 km/h plus 30 s."""
-    dbw: DbwConfig = DbwConfig()
-    """The by-wire kit of a vehicle of kind `dbw`. The other keys then apply to the software car, if there is one."""
-
 
 ReorderHold = Literal["auto"] | Annotated[float, Field(ge=0, le=500)]
 """How many ms a packet waits for missing earlier packets; auto: 1.25 times the largest recent reordering, at least
@@ -77,15 +58,20 @@ class VideoConfig(Section):
     repair_packets: Literal["auto", 0, 1, 2] = "auto"
     """Repair packets per frame, or per 16 packets of a larger frame; auto: the number follows the reported loss."""
     reorder_hold_ms: ReorderHold = "auto"
+    """How long a packet waits for missing earlier ones; auto: 1.25 times the largest recent reordering, at least 10."""
 
 
 class NetworkConfig(Section):
     """The network of a run on one machine."""
 
     condition: str = "L0"
+    """The name of a network condition (`netem/conditions.yaml`)."""
     inherent: Literal["loopback", "paper_wifi5"] = "loopback"
+    """The latency that the network has without injection: that of one machine, or a model of the paper's WiFi."""
     injection: Literal["relay", "netem", "none"] = "relay"
+    """In real time, what injects the delay: the relay, the kernel (`docs/netem.md`), or nothing."""
     state_delay: Literal["none", "with_video"] = "none"
+    """with_video: the vehicle's state is delayed by the video's constant delay, too."""
     video: FlowChanges = FlowChanges()
     """Values that replace those of the condition, so that a sweep can vary a single value."""
     control: FlowChanges = FlowChanges()
@@ -104,21 +90,6 @@ class NetworkConfig(Section):
         return ", ".join(changes) or None
 
 
-MAX_SIMULATED_MPS = 22.3
-"""The largest speed that can be configured, a little above 80 km/h."""
-
-
-class SafetyConfig(Section):
-    """The safety limits that a study may widen, for a simulated vehicle only."""
-
-    lateral_acceleration_mps2: float = Field(3.0, gt=0, le=6.0)
-    picture_age_limit_ms: float = Field(500.0, gt=0, le=2000)
-    stopping_distance_limit_m: float = Field(20.0, gt=0, le=200)
-    """The distance in which the car must be able to stop; above 20 m, the car can drive faster than it was tested."""
-    speed_limit_mps: float = Field(40 / 3.6, gt=0, le=MAX_SIMULATED_MPS)
-    """Above this speed the vehicle allows no throttle."""
-
-
 class RecordConfig(Section):
     """The contents of the record."""
 
@@ -131,40 +102,6 @@ class RecordConfig(Section):
         return frozenset() if self.video else frozenset({"video"})
 
 
-class ControllerConfig(Section):
-    """The controller that drives."""
-
-    kind: str = "lane_keeper"
-    preset: str = "designed"
-    lookahead_s: float | None = Field(None, ge=0.2, le=5)
-    """How far ahead the car aims, in seconds of driving. This key and the three below replace the preset's values."""
-    steering_limit_rad: float | None = Field(None, gt=0, le=0.5)
-    """The limit of the angle of the road wheels."""
-    lateral_limit_mps2: float | None = Field(None, gt=0, le=20)
-    speed_mps: float | None = Field(None, ge=1, le=MAX_SIMULATED_MPS)
-    """The target speed. The vehicle allows no throttle above `safety.speed_limit_mps`, which is at most 40 km/h for a
-    vehicle that is not simulated."""
-    wheelbase_m: float = Field(2.8448, gt=0.5, lt=10)
-    """The wheelbase of the driven vehicle; by default the built-in car's."""
-    rearm: bool = False
-    """Arm automatically after a safe stop, and after a restart of the server, but not after an emergency stop
-    (docs/session.md)."""
-    clear_emergency_stop: bool = False
-    """Clear the emergency stop that exists when the client starts, and no later one; set this only after its cause has
-    been removed."""
-
-    @property
-    def changes(self) -> dict[str, Any]:
-        """Settings that replace the preset's values."""
-        settings = ("lookahead_s", "steering_limit_rad", "lateral_limit_mps2", "speed_mps")
-        return {name: value for name in settings if (value := getattr(self, name)) is not None}
-
-    @property
-    def settings(self) -> str:
-        """The preset's name and the changed settings, as results show them."""
-        return ", ".join([self.preset, *(f"{name} {value:g}" for name, value in self.changes.items())])
-
-
 class ClocksConfig(Section):
     """The clocks of the virtual hosts.
 
@@ -173,9 +110,13 @@ class ClocksConfig(Section):
     """
 
     offset_ms: float = Field(250.0, ge=-60_000, le=60_000)
+    """The server's clock minus the true time, at the beginning."""
     drift_ppm: float = Field(20.0, ge=-500, le=500)
+    """How fast this offset grows."""
     error_us: float = Field(20.0, ge=0)
+    """The error of the correction that the modelled chrony reports."""
     bound_us: float = Field(100.0, ge=0)
+    """The bound of that error, which the modelled chrony reports."""
 
     @field_validator("bound_us")
     @classmethod
@@ -189,8 +130,11 @@ class StudyConfig(Section):
     """The place of a run in a study with human operators; without values if a controller drives."""
 
     participant: str | None = None
+    """The participant of the study."""
     block: int | None = None
+    """The block of the study to which this run belongs."""
     order: int | None = None
+    """The position of this run in the order in which the participant drove."""
 
 
 class RunConfig(Section):
@@ -206,6 +150,7 @@ class RunConfig(Section):
     clocks: ClocksConfig = ClocksConfig()
     study: StudyConfig = StudyConfig()
     time: Literal["real", "virtual"] = "virtual"
+    """virtual: computed, waiting is skipped; real: with processes, sockets and the machine's clocks."""
     fidelity: Literal["video", "pixels", "geometry"] = "video"
     """For virtual time. video: H.264-coded pictures. pixels: rendered pictures. geometry: no pictures, only the lane
     that they would show."""
@@ -213,6 +158,7 @@ class RunConfig(Section):
     """For virtual time: the times of stages and links. measured: drawn from the distributions in `configs/costs.yaml`.
     constant: always the medians in that file."""
     seed: int = Field(1, ge=0, lt=2**63)
+    """The seed of everything random."""
     repetition: int = Field(0, ge=0)
     """The number of this run among the runs with the same seed. Each repetition has its own start and noise, which are
     equal under all conditions."""
@@ -237,8 +183,11 @@ class SweepConfig(RunConfig):
     """Many runs: every route under every condition, repeated, for every combination of further axes."""
 
     routes: tuple[str, ...] = ("a_key",)
+    """The routes that are driven; they replace `vehicle.route`."""
     conditions: tuple[str, ...] = ("L0", "L1", "L2", "L3", "L4", "L5")
+    """The network conditions that are driven."""
     repetitions: int = Field(1, ge=1, le=10_000)
+    """How often each combination is driven, each time with another seed."""
     axes: dict[str, list[Any]] = Field(default_factory=dict)
     """The values of each further axis, by config key, such as `controller.preset`."""
 
@@ -247,8 +196,11 @@ class BoundaryConfig(RunConfig):
     """Many searches for the maximum tolerable latency: every route with every preset, repeated with other seeds."""
 
     routes: tuple[str, ...] = ("a_key",)
+    """The routes that are driven; they replace `vehicle.route`."""
     presets: tuple[str, ...] = ("designed", "paper_calibrated")
+    """The presets of the controller that are searched."""
     repetitions: int = Field(10, ge=1, le=10_000)
+    """How many seeds each combination has."""
     longest_delay_ms: float = Field(700.0, gt=0, le=5000)
     """The longest delay of the video that the search tries; the total delay also includes the loop's own latency."""
     grid_ms: float = Field(100.0, gt=0, le=1000)
@@ -283,13 +235,17 @@ class ClientClockConfig(ClockConfig):
     """The clock of the client. Its probe port cannot be 0, because the client must know the server's port."""
 
     probe_port: int = Field(probe.DEFAULT_PORT, ge=1, le=65535)
+    probe_server: str = ""
+    """The server's address for the clock probe; empty: `video.server`. It differs if a relay forwards the video."""
 
 
 class ServerVideoConfig(VideoConfig):
     """The video as the server sends it."""
 
     bind: str = "0.0.0.0"  # noqa: S104 (the video's path is validated before anything is sent)
+    """The local address from which video is sent."""
     port: int = Field(5600, ge=0, le=65535)
+    """The UDP port for video; 0: any free port, which the server names in the session."""
     send_to: tuple[str, ...] = ()
     """Plain receivers, as host:port, to which the video is sent without path validation."""
 
@@ -298,6 +254,7 @@ class ServerConfig(Section):
     """The vehicle's machine."""
 
     vehicle_id: str = "vehicle-1"
+    """The vehicle's name, which is part of every Zenoh key; equal on server and client."""
     vehicle: VehicleConfig = VehicleConfig()
     camera: ServerCameraConfig = ServerCameraConfig()
     video: ServerVideoConfig = ServerVideoConfig()
@@ -308,7 +265,15 @@ class ServerConfig(Section):
     clock: ClockConfig = ClockConfig()
     safety: SafetyConfig = SafetyConfig()
     record: RecordConfig = RecordConfig()
+    experiment: ExperimentConfig = ExperimentConfig()
     seed: int = Field(1, ge=0, lt=2**63)
+    """The seed of everything random."""
+
+    @model_validator(mode="after")
+    def _check_remote_runs(self) -> ServerConfig:
+        if self.experiment.remote_runs and (self.vehicle.kind, self.camera.source) != ("simulator", "simulated"):
+            raise ValueError("experiment.remote_runs is for the simulator and its camera only: leave it out")
+        return self
 
     @model_validator(mode="after")
     def _check_encryption(self) -> ServerConfig:
@@ -329,17 +294,20 @@ class ClientVideoConfig(Section):
     """The video as the client receives it."""
 
     server: str = "127.0.0.1"
+    """The address or name of the vehicle's machine."""
     port: int = Field(0, ge=0, le=65535)
     """0: the port that the server names in the session."""
     max_bit_rate_bps: int | None = Field(None, ge=50_000, le=50_000_000)
     """The bit rate that the client requests if the server's bit rate is higher."""
     reorder_hold_ms: ReorderHold = "auto"
+    """How long a packet waits for missing earlier ones; auto: 1.25 times the largest recent reordering, at least 10."""
 
 
 class ClientConfig(Section):
     """The operator's machine."""
 
     vehicle_id: str = "vehicle-1"
+    """The vehicle's name, which is part of every Zenoh key; equal on server and client."""
     who: str = "operator-1"
     """The operator's name."""
     take_over: bool = False
@@ -358,26 +326,3 @@ class ClientConfig(Section):
         if self.zenoh.scouting:
             raise ValueError("zenoh.scouting is for a server, because only servers are searched: leave it out")
         return self
-
-
-class DelayConfig(Section):
-    """One direction of a relayed flow: a constant delay, a lognormal jitter, and the impairments of a condition."""
-
-    constant_ms: float = Field(0.0, ge=0, le=70_000)
-    """The sum of the constant delays of the inherent latency and of the condition."""
-    jitter_median_ms: float = Field(0.0, ge=0, le=60_000)
-    jitter_sigma: float = Field(0.0, ge=0, le=3)
-    link: LinkConfig = LinkConfig()
-
-
-class RelayConfig(Section):
-    """The relay: its own addresses, the server's addresses, and the delays."""
-
-    video_listen: str = "127.0.0.1:0"
-    video_server: str
-    control_listen: str = "127.0.0.1:0"
-    control_server: str
-    video: DelayConfig = DelayConfig()
-    control: DelayConfig = DelayConfig()
-    state: DelayConfig = DelayConfig()
-    seed: int = Field(1, ge=0, lt=2**63)

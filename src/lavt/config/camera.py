@@ -13,12 +13,19 @@ class CameraConfig(Section):
     """The camera: its picture size and rate, and its pose in the vehicle's frame."""
 
     width_px: int = Field(640, ge=128, le=3840, multiple_of=2)
+    """The width of a picture."""
     height_px: int = Field(480, ge=128, le=2160, multiple_of=2)
+    """The height of a picture."""
     rate_hz: float = Field(30.0, ge=1, le=120)
+    """The number of pictures per second."""
     field_of_view_deg: float = Field(90.0, gt=10, lt=150)
+    """The horizontal field of view."""
     x_m: float = Field(1.6, ge=-10, le=10)
+    """The camera's distance in front of the rear axle."""
     y_m: float = Field(0.0, ge=-5, le=5)
+    """The camera's distance to the left of the middle of the car."""
     z_m: float = Field(1.4, gt=0, le=10)
+    """The camera's height above the ground."""
     yaw_deg: float = Field(0.0, ge=-180, le=180)
     """Positive to the left."""
     pitch_deg: float = Field(0.0, ge=-20, le=45)
@@ -61,23 +68,36 @@ class CalibrationConfig(Section):
     """A calibrated camera: picture size, lens parameters as in OpenCV, and pose in the vehicle's frame."""
 
     width_px: int = Field(ge=64, le=8192)
+    """The width of a picture."""
     height_px: int = Field(ge=64, le=8192)
+    """The height of a picture."""
     field_of_view_deg: float | None = Field(None, gt=10, lt=150)
     """The horizontal field of view of a camera with square pixels and a centred optical axis; it replaces the four keys
     below."""
     fx_px: float | None = Field(None, gt=0)
+    """The horizontal focal length."""
     fy_px: float | None = Field(None, gt=0)
+    """The vertical focal length."""
     cx_px: float | None = None
+    """The horizontal position of the optical axis."""
     cy_px: float | None = None
+    """The vertical position of the optical axis."""
     lens: Literal["pinhole", "fisheye"] = "pinhole"
+    """The model of the lens."""
     distortion: tuple[float, ...] = ()
     """k1, k2, p1, p2 (and k3, or k3 to k6) of a pinhole lens, k1 to k4 of a fisheye lens; empty: no distortion."""
     x_m: float
+    """The camera's distance in front of the rear axle."""
     y_m: float = 0.0
+    """The camera's distance to the left of the middle of the car."""
     z_m: float = Field(gt=0)
+    """The camera's height above the ground."""
     yaw_deg: float = Field(0.0, ge=-90, le=90)
+    """Positive to the left."""
     pitch_deg: float = Field(0.0, ge=-60, le=80)
+    """Positive downwards."""
     roll_deg: float = Field(0.0, ge=-60, le=60)
+    """Positive when the camera leans to the right."""
 
     @field_validator("distortion")
     @classmethod

@@ -19,6 +19,7 @@ class Costs(Section):
     """
 
     measured_on: str
+    """The machine and the load under which the times were measured."""
     stages_us: dict[str, dict[str, float]]
     """The median time of each stage, by node and stage."""
     links_us: dict[str, float]
@@ -26,7 +27,9 @@ class Costs(Section):
     levels: list[float] = Field(default_factory=list)
     """The levels of all quantiles below, from 0 (the smallest value) to 1 (the largest)."""
     stage_quantiles_us: dict[str, dict[str, list[float]]] = Field(default_factory=dict)
+    """The quantiles of the time of each stage, by node and stage."""
     link_quantiles_us: dict[str, list[float]] = Field(default_factory=dict)
+    """The quantiles of the time that each link needs."""
 
     @model_validator(mode="after")
     def _check_quantiles(self) -> Costs:

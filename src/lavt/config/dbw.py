@@ -23,6 +23,7 @@ class CommandConfig(Section):
     value: str = ""
     """The commanded value, in the DBC's unit. If the signal is multiplexed, its multiplexer is set accordingly."""
     enable: str = ""
+    """The signal that enables the axis."""
     clear: str = ""
     """The signal that resets the conditions that the kit has latched, such as an override."""
     rate: str = ""
@@ -39,11 +40,17 @@ class SystemCommandConfig(Section):
     """The command that enables and disables the kit as a whole; an empty message: the kit needs none."""
 
     message: str = ""
+    """The message's name; empty: none."""
     value: str = ""
+    """The signal of the value."""
     enable: int = 1
+    """The value that enables the kit."""
     disable: int = 2
+    """The value that disables the kit."""
     count: str = ""
+    """The frame counter, which wraps around."""
     checksum: str = ""
+    """The checksum's signal."""
 
 
 class SentConfig(Section):
@@ -68,6 +75,7 @@ class ReportConfig(Section):
     """
 
     message: str = ""
+    """The message's name; empty: none."""
     timeout_ms: int = Field(200, ge=10, le=5000)
     """Driving is inhibited if the report is missing for longer than this."""
     values: dict[ReportedValue, str] = Field(default_factory=dict)
@@ -108,6 +116,7 @@ class OwnBrakeConfig(Section):
     """How the brake's report shows that the kit brakes by itself; an empty signal: the report does not show it."""
 
     signal: str = ""
+    """The signal that shows it."""
     above: float = Field(0.0, ge=0)
     """The kit brakes by itself if the signal is above this value while the brake is reported as not enabled."""
 
@@ -116,6 +125,7 @@ class ByWireCarConfig(Section):
     """The car with the kit."""
 
     wheelbase_m: float = Field(gt=0.5, lt=10)
+    """The car's wheelbase."""
     steering_ratio: float = Field(gt=1, lt=50)
     """The angle of the steering wheel divided by the angle of the road wheels."""
     steering_sign: Literal[1, -1] | None = None
@@ -123,18 +133,26 @@ class ByWireCarConfig(Section):
     wheel_radius_m: float = Field(0.33, gt=0.1, lt=1)
     """The radius with which reported wheel speeds are converted to the speed of the car."""
     max_acceleration_mps2: float = Field(gt=0, le=20)
+    """The acceleration at full throttle."""
     max_braking_mps2: float = Field(gt=0, le=20)
+    """The deceleration at full brake."""
 
 
 class ByWireLimitsConfig(Section):
     """The limits of all commands on the bus. The rates of pedals limit only how fast a pedal is pressed."""
 
     steering_wheel_deg: float = Field(gt=0, le=3000)
+    """The largest angle of the steering wheel."""
     steering_wheel_rate_degps: float = Field(gt=0, le=3000)
+    """The largest rate of the steering wheel."""
     throttle: float = Field(1.0, ge=0, le=1)
+    """The largest throttle."""
     brake: float = Field(1.0, gt=0, le=1)
+    """The largest brake."""
     throttle_rate_per_s: float = Field(gt=0, le=1000)
+    """How fast the throttle may be pressed."""
     brake_rate_per_s: float = Field(gt=0, le=1000)
+    """How fast the brake may be pressed."""
     holding_brake: float = Field(0.3, gt=0, le=1)
     """The minimum brake while the kit is being enabled and while the car is being parked."""
 
@@ -169,6 +187,7 @@ class DbwConfig(Section):
     interface: str = "socketcan"
     """The name of an interface of python-can, or `inside`: a software car in the server's process."""
     channel: str = "can0"
+    """The name of the bus, such as can0."""
     options: dict[str, Any] = Field(default_factory=dict)
     """Further arguments of python-can's `Bus`."""
     truth: str = ""

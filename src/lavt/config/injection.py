@@ -39,6 +39,7 @@ class ClientInjectionConfig(InjectionConfig):
     condition: str = ""
     """A condition of `netem/conditions.yaml`; empty: no injection."""
     state_delay: Literal["none", "with_video"] = "none"
+    """with_video: the vehicle's state is delayed by the video's constant delay, too."""
 
 
 class ImpairmentConfig(Section):
@@ -49,7 +50,9 @@ class ImpairmentConfig(Section):
     jitter_correlation: float = Field(0.0, ge=0, lt=1)
     """The correlation of the delay with the delay 20 ms earlier."""
     jitter_distribution: Literal["normal", "uniform", "pareto", "paretonormal"] = "normal"
+    """The distribution of the delay: normal, pareto and paretonormal by the tables of tc, or uniform."""
     loss: float = Field(0.0, ge=0, lt=1)
+    """The share of packets that are lost."""
     loss_burst_packets: float = Field(0.0, ge=0, le=10_000)
     """The mean length of a burst of lost packets; 0 or 1: independent losses."""
     rate_bps: int = Field(0, ge=0, le=10_000_000_000)
@@ -72,21 +75,32 @@ class LinkConfig(ImpairmentConfig):
     """The delay and the impairments of one direction of a relayed flow."""
 
     delay_ms: float = Field(0.0, ge=0, le=60_000)
+    """The constant delay."""
 
 
 class FlowChanges(Section):
     """The values with which a run replaces those of its condition in one direction; null: the condition's value."""
 
     delay_ms: float | None = Field(None, ge=0, le=60_000)
+    """The constant delay."""
     jitter_ms: float | None = Field(None, ge=0, le=10_000)
+    """The standard deviation of the delay."""
     jitter_correlation: float | None = Field(None, ge=0, lt=1)
+    """The correlation of the delay with the delay 20 ms earlier."""
     jitter_distribution: Literal["normal", "uniform", "pareto", "paretonormal"] | None = None
+    """The distribution of the delay: normal, pareto and paretonormal by the tables of tc, or uniform."""
     loss: float | None = Field(None, ge=0, lt=1)
+    """The share of packets that are lost."""
     loss_burst_packets: float | None = Field(None, ge=0, le=10_000)
+    """The mean length of a burst of lost packets."""
     rate_bps: int | None = Field(None, ge=0, le=10_000_000_000)
+    """The rate limit; 0: none."""
     reorder: float | None = Field(None, ge=0, lt=1)
+    """The share of packets that are not delayed."""
     trace: str | None = None
+    """A trace of the delay or of the capacity."""
     queue_packets: int | None = Field(None, ge=1, le=1_000_000)
+    """The length of the queue before a rate limit."""
 
     @property
     def replacements(self) -> dict[str, Any]:
@@ -104,7 +118,9 @@ class Condition(Section):
     """A network condition: the delay and impairments of both flows."""
 
     video_ms: float = Field(ge=0, le=60_000)
+    """The constant delay of the video."""
     control_ms: float = Field(ge=0, le=60_000)
+    """The constant delay of the commands."""
     video: ImpairmentConfig = ImpairmentConfig()
     control: ImpairmentConfig = ImpairmentConfig()
 

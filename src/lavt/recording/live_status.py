@@ -34,6 +34,7 @@ class LiveStatus:
             "truth": self._update_truth,
             "admission": self._update_admission,
             "event": self._update_ending,
+            "lane": self._update_lane,
             "picture": self._update_picture,
             "state": self._update_state,
         }
@@ -92,6 +93,9 @@ class LiveStatus:
     def _update_picture(self, picture: Any, _now: Now) -> None:
         if picture.readable:
             self._status["raw_tau_v_ms"] = (picture.read_wall_ns - picture.stamp_ns) / NS_PER_MS
+
+    def _update_lane(self, seen: Any, _now: Now) -> None:
+        self._status["lane_confidence"] = seen.lane.confidence
 
     def _update_ending(self, event: Any, _now: Now) -> None:
         if event.kind == "ending":

@@ -229,7 +229,7 @@ def read_record(path: Path, channels: Container[str] | None = None) -> Record:
     file, and `UserError` for a record in another format version.
     """
     if not path.is_file():
-        raise WorkError(f"there is no record at {path}")
+        raise WorkError(f"there is no record at {path}: name the directory of a run")
 
     def is_wanted(topic: str) -> bool:
         channel = topic.removeprefix("/")

@@ -77,6 +77,7 @@ class SafetyGate:
         host: str = "",
         video_port: int = 0,
         instance: int = 0,
+        only_operator: str = "",
     ) -> None:
         self.limiter = limiter
         self.instance = instance
@@ -87,7 +88,14 @@ class SafetyGate:
         self.epoch = CommandEpoch(new_epoch)
         self.machine = SafetyStateMachine(limits, self.epoch.renew)
         self.session = VehicleSession(
-            limits, self.machine, self.epoch, self.counts, new_token=new_token, host=host, video_port=video_port
+            limits,
+            self.machine,
+            self.epoch,
+            self.counts,
+            new_token=new_token,
+            host=host,
+            video_port=video_port,
+            only_operator=only_operator,
         )
         self.watchdog = Watchdog(limits, limiter, self.machine, self.epoch, self.issued_stamps)
         self._limits = limits

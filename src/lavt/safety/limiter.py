@@ -31,7 +31,10 @@ class Limiter:
     ) -> None:
         properties = (wheelbase_m, max_steering_rad, max_acceleration_mps2, max_braking_mps2)
         if not all(0 < number < math.inf for number in properties):
-            raise UserError("wheelbase, largest steering angle and accelerations of a vehicle must be positive numbers")
+            raise UserError(
+                "wheelbase, largest steering angle and accelerations of a vehicle must be positive numbers: correct "
+                "them in the vehicle's capabilities"
+            )
         self.limits = limits
         self.max_braking_mps2 = max_braking_mps2
         self.applied_limits: tuple[str, ...] = ()

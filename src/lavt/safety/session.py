@@ -49,6 +49,7 @@ class VehicleSession:
         new_token: Callable[[], bytes],
         host: str,
         video_port: int,
+        only_operator: str = "",
     ) -> None:
         self.active_operator: tuple[str, int] | None = None
         """Name and instance of the client that has control."""
@@ -63,6 +64,8 @@ class VehicleSession:
         self._new_token = new_token
         self._host = host
         self._video_port = video_port
+        self._only_operator = only_operator
+        """The only operator who can acquire control; empty: any."""
         self._executed_stops: dict[int, None] = {}
         """Numbers of the emergency stops, in the order of their execution."""
         self._is_closed = False
@@ -117,6 +120,8 @@ class VehicleSession:
             return "the server is shutting down"
         if self._has_control(request):
             return ""
+        if self._only_operator and request.who != self._only_operator:
+            return f"the vehicle is in a run of {self._only_operator}"
         if self.active_operator is not None and not self._machine.is_at_rest(vehicle):
             return f"{self.active_operator[0]} has control, and the vehicle is not disarmed and stationary"
         reserved_for = self.takeover_requests.reserved_for(request, now_ns)

@@ -27,6 +27,11 @@ from lavt.domain import (
     NetemReply,
     NetemRequest,
     Operation,
+    RunOperation,
+    RunPhase,
+    RunRefusal,
+    RunReply,
+    RunRequest,
     SafetyState,
     SessionReply,
     SessionRequest,
@@ -37,6 +42,11 @@ from lavt.errors import BadMessage
 
 VERSION = 4
 MAX_MESSAGE_BYTES = 1024
+RECORD_PART_BYTES = 32_768
+"""The longest part of a record in a `RunReply`."""
+DIGEST_BYTES = 32
+"""The length of the SHA-256 of a record."""
+MAX_RUN_REPLY_BYTES = RECORD_PART_BYTES + MAX_MESSAGE_BYTES
 NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_-]{0,31}\Z")
 """A valid name of a vehicle or client: it contains nothing that has a meaning in a Zenoh key."""
 ELLIPSIS = "\N{HORIZONTAL ELLIPSIS}"
@@ -55,6 +65,7 @@ RoadWheel = Annotated[float, Meta(ge=-MAX_ROAD_WHEEL_RAD, le=MAX_ROAD_WHEEL_RAD)
 Curvature = Annotated[float, Meta(ge=-CURVATURE_BOUND_PER_M, le=CURVATURE_BOUND_PER_M)]
 ZeroToOne = Annotated[float, Meta(ge=0.0, le=1.0)]
 Delay = Annotated[float, Meta(ge=0.0, le=MAX_DELAY_MS)]
+Port = Annotated[int, Meta(ge=0, le=65535)]
 Name = Annotated[str, Meta(pattern=NAME.pattern)]
 NameOrEmpty = Annotated[str, Meta(pattern=rf"^\Z|{NAME.pattern}")]
 
@@ -68,6 +79,8 @@ TEXT_BYTES: dict[type, dict[str, int]] = {
     NetemRequest: {"condition": 32},
     NetemReply: {"reason": 400},
     VehicleInfo: {"lavt_version": 32, "reason": REASON_BYTES},
+    RunRequest: {"settings": 800},
+    RunReply: {"reason": 400, "ending": 32},
 }
 """The maximum length of each text: in bytes for the sender, in characters for the receiver."""
 
@@ -115,7 +128,7 @@ TYPES: dict[type, dict[str, Any]] = {
         "reason": _text(SessionReply, "reason"),
         "epoch": U64,
         "token": bytes,
-        "video_port": Annotated[int, Meta(ge=0, le=65535)],
+        "video_port": Port,
         "host": _text(SessionReply, "host"),
         "emergency_stop": U63,
     },
@@ -144,11 +157,33 @@ TYPES: dict[type, dict[str, Any]] = {
         "state_age_ns": U63,
         "instance": U64,
     },
+    RunRequest: {
+        "operation": RunOperation,
+        "who": Name,
+        "instance": U64,
+        "number": U63,
+        "run": U63,
+        "settings": _text(RunRequest, "settings"),
+        "offset": U63,
+    },
+    RunReply: {
+        "number": U63,
+        "refusal": RunRefusal,
+        "reason": _text(RunReply, "reason"),
+        "phase": RunPhase,
+        "ending": _text(RunReply, "ending"),
+        "video_port": Port,
+        "probe_port": Port,
+        "size": U63,
+        "digest": Annotated[bytes, Meta(max_length=DIGEST_BYTES)],
+        "data": Annotated[bytes, Meta(max_length=RECORD_PART_BYTES)],
+    },
 }
 """The fields of each message in the order on the wire, with types and ranges. NaN is in no range."""
 
 CHECKS: dict[type, dict[str, Callable[[Any], bool]]] = {
     SessionReply: {"token": lambda token: len(token) in {0, 16}},
+    RunReply: {"digest": lambda digest: len(digest) in {0, DIGEST_BYTES}},
     NetemRequest: {"rate_bps": lambda rate_bps: rate_bps == 0 or rate_bps >= 10_000},
 }
 """Checks of fields that a range cannot express."""
@@ -163,12 +198,24 @@ _FIELD_VALUES: dict[type, Callable[[Any], tuple[Any, ...]]] = {
     kind: attrgetter(*fields) for kind, fields in TYPES.items()
 }
 
-Kind = TypeVar("Kind", Command, State, SessionRequest, SessionReply, NetemRequest, NetemReply, VehicleInfo)
+Message = (
+    Command | State | SessionRequest | SessionReply | NetemRequest | NetemReply | VehicleInfo | RunRequest | RunReply
+)
+Kind = TypeVar(
+    "Kind",
+    Command,
+    State,
+    SessionRequest,
+    SessionReply,
+    NetemRequest,
+    NetemReply,
+    VehicleInfo,
+    RunRequest,
+    RunReply,
+)
 
 
-def encode(
-    message: Command | State | SessionRequest | SessionReply | NetemRequest | NetemReply | VehicleInfo,
-) -> bytes:
+def encode(message: Message) -> bytes:
     """Return the bytes of `message` on the wire, with texts and reported numbers within their limits."""
     kind = type(message)
     limited: dict[str, str | float] = {
@@ -196,7 +243,10 @@ def _bounded(number: float, bound: float) -> float:
 def decode(kind: type[Kind], data: bytes) -> Kind:
     """Return the message of class `kind` in `data`; raise `BadMessage` for invalid data, and nothing else."""
     untyped: Any = kind
-    message: Kind = _decode(untyped, bytes(data))
+    if kind is RunReply:  # too large for the cache
+        message: Kind = _decode.__wrapped__(untyped, bytes(data))
+    else:
+        message = _decode(untyped, bytes(data))
     return message
 
 
@@ -214,8 +264,9 @@ def decode_versions(data: bytes) -> tuple[int, str]:
 
 @lru_cache(maxsize=512)  # in virtual time both records and the receiver decode the same bytes
 def _decode(kind: type[Any], data: bytes) -> Any:
-    if len(data) > MAX_MESSAGE_BYTES:
-        raise BadMessage(f"{len(data)} bytes exceed the maximum of a message ({MAX_MESSAGE_BYTES})")
+    longest = MAX_RUN_REPLY_BYTES if kind is RunReply else MAX_MESSAGE_BYTES
+    if len(data) > longest:
+        raise BadMessage(f"{len(data)} bytes exceed the maximum of a message ({longest})")
     try:
         _, *values = _DECODERS[kind].decode(data)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,20 @@ PROTOCOLS = ("tcp", "tls", "quic", "udp", "ws")
 """Protocols of endpoints with a host and a port. They are checked here, because Zenoh reports an unknown protocol as
 unreachable."""
 PATH_PROTOCOLS = ("unixsock-stream", "unixpipe", "vsock", "serial")
+
+
+@dataclass(frozen=True)
+class SessionSettings:
+    """What a link needs to open its session."""
+
+    path: Path
+    """The config file."""
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    """Values that replace those of the file, by keys with slashes."""
+    is_router: bool = False
+    """Whether the session is a router itself. Otherwise it is a session with a router."""
+    advice: str = "start one with `lavt router FILE.json5`, or use another endpoint"
+    """What to do if no router answers."""
 
 
 def check_private_keys(config: Any) -> None:
@@ -57,6 +72,12 @@ def with_host(endpoint: str, host: str, port: int | None = None) -> str:
     parameters = address[len(re.split(r"[?#]", address)[0]) :]
     own_port = address.removesuffix(parameters).rpartition(":")[2]
     return f"{protocol}/{f'[{host}]' if ':' in host else host}:{port or own_port}{parameters}"
+
+
+def with_address(endpoint: str, address: str) -> str:
+    """Return an endpoint PROTOCOL/HOST:PORT with another HOST:PORT."""
+    protocol, _, former = endpoint.partition("/")
+    return f"{protocol}/{address}{former[len(re.split(r'[?#]', former)[0]) :]}"
 
 
 def flatten(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -13,7 +13,6 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -34,15 +33,17 @@ from lavt.transport.router_check import (
     parse_locators,
     parse_routers,
 )
-from lavt.transport.zenoh_config import check_endpoints, check_private_keys, error_text
+from lavt.transport.zenoh_config import SessionSettings, check_endpoints, check_private_keys, error_text
 
 Deliver = Callable[[str, Any, Now, Any], None]
 """Takes (channel, payload, arrived, peer) of each received message."""
 
 REPLY_TIMEOUT_S = 2.0
 RETRY_S = 1.0
-REPLY_CHANNELS = {"session": "session_reply", "netem": "netem_reply", "info": "info_reply"}
+REPLY_CHANNELS = {"session": "session_reply", "netem": "netem_reply", "info": "info_reply", "run": "run_reply"}
 """The channel of the replies for each channel of queries. The channel of a query is the last part of its key."""
+DRIVE_QUERIES = ("session", "netem", "info")
+"""The queries that every server answers. Only a server that allows remote runs also answers `run`."""
 QUERY_CHANNELS = {reply: query for query, reply in REPLY_CHANNELS.items()}
 RECEIVE_RING_LENGTH = 256
 """The number of received messages that can wait; if there are more, the oldest is dropped. Zenoh's threads write to
@@ -101,7 +102,7 @@ def _check_listen_endpoints(config: zenoh.Config, path: Path, *, may_be_empty: b
     configured = json.loads(endpoints)
     configured = configured.get("router") if isinstance(configured, dict) else configured
     if is_default or configured is None or not (configured or may_be_empty):
-        raise UserError(f"{path} has no listen endpoints; without them Zenoh would listen on all interfaces")
+        raise UserError(f"{path} has no listen endpoints, so Zenoh would listen on all interfaces: add one")
 
 
 def open_zenoh(config: zenoh.Config) -> zenoh.Session:
@@ -173,20 +174,6 @@ class RouterUnreachable(UserError):
     """No router answers, or it rejects the session."""
 
 
-@dataclass(frozen=True)
-class SessionSettings:
-    """What a link needs to open its session."""
-
-    path: Path
-    """The config file."""
-    changes: Mapping[str, Any] = field(default_factory=dict)
-    """Values that replace those of the file, by keys with slashes."""
-    is_router: bool = False
-    """Whether the session is a router itself. Otherwise it is a session with a router."""
-    advice: str = "start one with `lavt router FILE.json5`, or use another endpoint"
-    """What to do if no router answers."""
-
-
 def _zenoh_callback(handle: Callable[[str, Any], None], channel: str) -> Callable[[Any], None]:
     """Return a callback for Zenoh's threads that treats an error in `handle` like the error of a Python thread."""
 
@@ -226,6 +213,7 @@ class ZenohLink:
         self.counts: Counter[str] = Counter()
         self._clock = clock
         self._deliver: Deliver = _discard
+        self._answers_runs_only = False
         self._side = side
         self._base = f"lavt/{check_name('the vehicle', vehicle)}"
         self._who = check_name("the client", who)
@@ -262,12 +250,14 @@ class ZenohLink:
         """Return the endpoints at which a session that is a router listens."""
         return parse_locators(_router_reports(self._session))
 
-    def start(self, deliver: Deliver, *, queries_only: bool = False) -> None:
+    def start(self, deliver: Deliver, *, queries_only: bool = False, answers_runs_only: bool = False) -> None:
         """Start to send and to receive; threads of the link call `deliver`.
 
-        With `queries_only` the link sends queries and receives replies, but does not publish, subscribe or answer.
+        With `queries_only` the link sends queries and receives replies, but does not publish, subscribe or answer. With
+        `answers_runs_only` it answers the queries `run`, and nothing else.
         """
         self._deliver = deliver
+        self._answers_runs_only = answers_runs_only
         if queries_only:
             return
         if self._check is not None:
@@ -297,6 +287,9 @@ class ZenohLink:
             return
 
     def _declare(self, session: zenoh.Session) -> None:
+        if self._answers_runs_only:
+            self._answer(session, "run")
+            return
         received, sent, qos = ("control", "state", STATE) if self._side == "server" else ("state", "control", CONTROL)
         self._publisher = session.declare_publisher(f"{self._base}/{sent}", **qos)
         ring: Any = zenoh.handlers.RingChannel(RECEIVE_RING_LENGTH)
@@ -306,10 +299,13 @@ class ZenohLink:
             target=self._listen, args=(received, subscriber.handler), name=f"zenoh {received}", daemon=True
         )
         self._listener.start()
-        for channel in REPLY_CHANNELS if self._side == "server" else ():
+        self._answer(session, *(DRIVE_QUERIES if self._side == "server" else ()))
+        self._declared.append(session.liveliness().declare_token(f"{self._base}/alive/{self._who}"))
+
+    def _answer(self, session: zenoh.Session, *channels: str) -> None:
+        for channel in channels:
             on_query: Any = zenoh.handlers.Callback(_zenoh_callback(self._on_query, channel), indirect=False)
             self._declared.append(session.declare_queryable(f"{self._base}/{channel}", on_query))
-        self._declared.append(session.liveliness().declare_token(f"{self._base}/alive/{self._who}"))
 
     def send(self, *sends: Send) -> None:
         """Send messages of this side. A message that cannot be sent now is counted and dropped: a newer one follows."""

@@ -12,7 +12,7 @@ from lavt.config import Condition, ImpairmentConfig, RunConfig
 from lavt.config_file import conditions, parse_config
 from lavt.experiment.analysis.invalid_reason import InvalidCode, InvalidReason, not_measured
 from lavt.experiment.runs.plan import PlannedRun, injected_entry, plan_run
-from lavt.experiment.runs.real_run import _relay_config, _requested_ms, relay_invalid_reasons
+from lavt.experiment.runs.real_run import relay_config, relay_invalid_reasons, requested_ms
 
 
 def planned(condition: str, **network: Any) -> PlannedRun:
@@ -23,7 +23,7 @@ def planned(condition: str, **network: Any) -> PlannedRun:
 def test_the_relay_receives_the_whole_condition(name: str) -> None:
     """The relay's flows have the delay, impairment, trace and seed of the run's condition."""
     run = planned(name, inherent="paper_wifi5")
-    video, control = flows(_relay_config(run, 5600, 7448))
+    video, control = flows(relay_config(run, "127.0.0.1:5600", "127.0.0.1:7448"))
     requested = run.requested
     assert video.downstream_injected == link_injection("video", requested.video_ms, requested.video, run.seed)
     assert control.upstream_injected == link_injection("control", requested.control_ms, requested.control, run.seed)
@@ -33,7 +33,7 @@ def test_the_relay_receives_the_whole_condition(name: str) -> None:
 
 
 def _inherent_ms() -> float:
-    video, _ = flows(_relay_config(planned("L0", inherent="paper_wifi5"), 5600, 7448))
+    video, _ = flows(relay_config(planned("L0", inherent="paper_wifi5"), "127.0.0.1:5600", "127.0.0.1:7448"))
     return video.downstream.constant_ms
 
 
@@ -79,8 +79,8 @@ def test_a_relay_without_measurements_makes_the_run_invalid() -> None:
 
 def test_only_a_constant_delay_has_a_requested_median() -> None:
     """Only a flow with a constant delay has a requested median."""
-    assert _requested_ms(planned("L4")) == {"video": 150, "control": 75}
-    assert _requested_ms(planned("jitter")) == {"video": None, "control": 0}
+    assert requested_ms(planned("L4")) == {"video": 150, "control": 75}
+    assert requested_ms(planned("jitter")) == {"video": None, "control": 0}
 
 
 def test_least_expected_delay() -> None:

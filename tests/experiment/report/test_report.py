@@ -36,6 +36,9 @@ FAILED_RUNS = [{"run": "<b>5</b>", "reason": '<img src=x onerror="alert(1)"> & m
 """A failed run whose name and reason have special characters of HTML."""
 
 
+CHAPTERS = ("results", "trajectories", "latency", "statistics", "validity", "every_run")
+
+
 def add_run(make_run: MakeRun, sweep: Path, name: str, *, time: str = "virtual", **settings: Any) -> None:
     condition, video_ms = settings.pop("condition", "L0"), settings.pop("video_ms", 0.0)
     directory = make_run(sweep / "runs" / name, tau_v_ms=62.0 + video_ms, **settings)
@@ -81,8 +84,9 @@ def page_of(sweep: Path) -> str:
 def test_the_report_is_complete(sweep: Path) -> None:
     """The report has the page, all files it links to, and the summary; the page loads nothing from a network."""
     html = page_of(sweep)
-    figures = {name.rpartition(".")[0] for name in re.findall(r'<img src="([^"]+)"', html)}
+    figures = set(re.findall(r'<img data-name="([^"]+)" src="data:image/', html))
     assert figures == {
+        "headline",
         "degradation",
         "injected",
         "stages_virtual",
@@ -105,7 +109,8 @@ def test_the_report_is_complete(sweep: Path) -> None:
     assert {f"{figure}.{ending}" for figure in figures for ending in ("svg", "png")} < linked
     assert {"tables/runs.csv", "tables/runs.tex", "tables/conditions_real_driving.csv"} < linked
     assert all((sweep / "report" / name).is_file() for name in linked)
-    assert "http" not in html
+    assert not re.search(r'(?:src|srcset)="(?!data:)', html)
+    assert "http" not in re.sub('base64,[^"]+', "", html)
     assert "3.0 times as fast" in html
     summary = json.loads((sweep / "summary.json").read_text())
     assert summary["conditions"]["L1"]["completion_rate"] == 0.5
@@ -113,32 +118,62 @@ def test_the_report_is_complete(sweep: Path) -> None:
     assert summary["speed"]["jobs"] == 2
 
 
-def test_the_page_links_to_its_sections_in_order(sweep: Path) -> None:
-    """The page links to each of its sections, in their order."""
+def test_the_page_links_to_its_chapters_in_order(sweep: Path) -> None:
+    """The page links to each of its chapters, which fold; those of results and trajectories are open."""
     html = page_of(sweep)
-    names = re.findall(r'<h2 id="([^"]+)"', html)
-    assert re.findall(r'<a href="#([^"]+)"', html) == names
-    assert names == [
-        "replay",
+    names = re.findall(r'<div class="inside" id="([^"]+)"', html)
+    links = re.findall(r'<a href="#([^"]+)"', html.partition("<nav>")[2])
+    assert links == names == [f"chapter_{name}" for name in CHAPTERS]
+    assert re.findall(r"<details( open)?><summary>", html) == [" open", " open", "", "", "", ""]
+    assert re.findall(r'<h3 id="([^"]+)"', html) == [
         "conditions",
-        "planned_contrasts",
-        "trajectories",
-        "injected_and_measured_latency",
         "driving_performance_over_latency",
         "distance_driven_and_endings",
-        "latency_of_each_stage",
         "results_by_route",
+        "trajectories",
         "single_runs",
-        "all_runs",
+        "latencies_of_the_conditions",
+        "injected_and_measured_latency",
+        "latency_of_each_stage",
+        "planned_contrasts",
+        "errors_of_lane_keeping",
+        "valid_and_invalid_runs",
         "clock_offset_between_two_machines",
         "versions_and_machines",
+        "all_runs",
     ]
+
+
+def test_the_first_screen_says_what_was_run(sweep: Path) -> None:
+    """Before the chapters come what was run, the headline figure, the replay and the legend, with a link to why."""
+    first = page_of(sweep).partition("<nav>")[0]
+    places = [first.index(part) for part in ("runs in virtual time", 'data-name="headline"', "<video", "<dl")]
+    assert places == sorted(places)
+    assert '<a href="#chapter_validity">See why.</a>' in first
+    assert '<source media="(max-width: 40rem)" srcset="data:image/svg' in first
+    assert "Loop latency" in first
+
+
+def test_a_table_hides_columns_behind_a_switch(sweep: Path) -> None:
+    """The page shows the main columns of a table; a switch shows the rest, which the CSV always has."""
+    html = page_of(sweep)
+    driving = html.partition("lane invasions / run</th>")[0].rpartition("<table>")[2]
+    assert '<th class="extra">completed</th>' in driving
+    assert "<th>runs</th>" in driving
+    assert 'type="checkbox"> all ' in html
+
+
+def test_figures_follow_the_scheme_of_the_page(sweep: Path) -> None:
+    """Each SVG exchanges its background and its ink if the page is dark."""
+    svg = (sweep / "report" / "headline.svg").read_text()
+    assert svg.count("prefers-color-scheme:dark") == 1
 
 
 def test_the_replay_is_a_video(sweep: Path) -> None:
     """The page plays the replay of the runs with the least and the most delay, and names them."""
     html = page_of(sweep)
-    assert re.findall(r'<video src="([^"]+)"', html) == ["replay.mp4"]
+    assert len(re.findall(r'<video src="data:video/mp4;base64,', html)) == 1
+    assert '<a href="replay.mp4">MP4</a>' in html
     assert "The runs 0 and 1" in html
     video = cv2.VideoCapture(str(sweep / "report" / "replay.mp4"))
     assert int(video.get(cv2.CAP_PROP_FRAME_COUNT)) > 20

@@ -14,9 +14,15 @@ import pytest
 
 from lavt.experiment.analysis.results import run_result, write_json
 from lavt.experiment.report import boundary_section
-from lavt.experiment.report.condition_sections import conditions_parts, contrast_parts
+from lavt.experiment.report.condition_sections import (
+    conditions_parts,
+    contrast_parts,
+    error_table_parts,
+    latency_table_parts,
+)
 from lavt.experiment.report.condition_tables import COMPLETED_P95, FOLLOWED_P95
 from lavt.experiment.report.figure_style import condition_colours
+from lavt.experiment.report.first_screen import first_parts
 from lavt.experiment.report.groups import axes_of, differing_settings, is_in_group, sort_groups, title_of
 from lavt.experiment.report.report import write_report
 from lavt.experiment.report.run_figures import drawn_indexes
@@ -29,8 +35,8 @@ from lavt.experiment.report.sections import (
     route_parts,
     run_parts,
     stage_parts,
-    summary_parts,
     survival_parts,
+    validity_parts,
 )
 from lavt.experiment.report.sweep_figures import axis_figure
 from lavt.experiment.report.table_format import NOTHING
@@ -139,8 +145,11 @@ def report_of(summary: dict[str, Any], directory: Path) -> ReportContext:
 
 
 SECTIONS: dict[str, Callable[[ReportContext], Sequence[str]]] = {
-    "summary": summary_parts,
+    "first": lambda report: first_parts(report, []),
+    "validity": validity_parts,
     "conditions": conditions_parts,
+    "latencies": latency_table_parts,
+    "errors": error_table_parts,
     "contrasts": contrast_parts,
     "injected": injected_parts,
     "degradation": degradation_parts,
@@ -164,9 +173,9 @@ def text_of(html: str) -> str:
 
 def test_results_are_compared_with_the_paper(tmp_path: Path) -> None:
     """The tables have the paper's completion, latency and error, and the p values of its contrasts by Fisher's test."""
-    parts = parts_of(report_of(summarize(campaign(), None), tmp_path), "conditions", "contrasts")
+    parts = parts_of(report_of(summarize(campaign(), None), tmp_path), "conditions", "latencies", "contrasts")
     assert "13.15" in parts["conditions"]
-    titles = re.findall("<th[^>]*>(.*?)</th>", unescape(parts["conditions"]))
+    titles = re.findall("<th[^>]*>(.*?)</th>", unescape(parts["conditions"] + parts["latencies"]))
     assert {"the paper's completed", "the paper's τ video ms", "the paper's τ control ms"} < set(titles)
     row = re.search(r"<tr><td class=\"text\">L3 – L4</td>(.*?)</tr>", parts["contrasts"])
     assert row is not None
@@ -192,11 +201,11 @@ def test_figures_and_tables_name_their_group(tmp_path: Path) -> None:
     parts = parts_of(
         report_of(summarize(runs, None, base={"sweep": "x"}), tmp_path), "contrasts", "survival", "degradation"
     )
-    assert re.findall("<h3>(.*?)</h3>", parts["contrasts"]) == ["preset paper_calibrated", "preset designed"]
+    assert re.findall("<h4>(.*?)</h4>", parts["contrasts"]) == ["preset paper_calibrated", "preset designed"]
     assert parts["survival"].count("Virtual time (preset paper_calibrated).") == 2
     assert "Runs in virtual time are from one group (preset paper_calibrated)." in text_of(parts["degradation"])
     single_group = parts_of(report_of(summarize(campaign(), None), tmp_path), "contrasts")
-    assert "<h3>" not in single_group["contrasts"]
+    assert "<h4>" not in single_group["contrasts"]
 
 
 def test_the_bar_of_stages_is_the_loop(tmp_path: Path) -> None:
@@ -224,9 +233,9 @@ def test_the_bar_of_stages_is_the_loop(tmp_path: Path) -> None:
 def test_failed_runs_are_in_the_summary(tmp_path: Path) -> None:
     """The summary section has the number of failed runs, their names and the reasons."""
     failed = [{"run": "a_L0_00", "reason": "the disk is full"}]
-    text = text_of("".join(summary_parts(report_of(summarize(campaign(), None, failed=failed), tmp_path))))
+    text = text_of("".join(validity_parts(report_of(summarize(campaign(), None, failed=failed), tmp_path))))
     assert "1 run failed and is left out: a_L0_00: the disk is full" in text
-    assert "failed" not in text_of("".join(summary_parts(report_of(summarize(campaign(), None), tmp_path))))
+    assert "failed" not in text_of("".join(validity_parts(report_of(summarize(campaign(), None), tmp_path))))
 
 
 def test_other_conditions_are_not_compared_with_the_paper(tmp_path: Path) -> None:
@@ -256,7 +265,8 @@ def test_a_summary_of_an_older_version_is_reported(tmp_path: Path) -> None:
         "axes",
         "routes",
     ]
-    rows = re.findall(r'<tr><td class="text">(L\d)</td>(.*?)</tr>', parts["conditions"])
+    tables = parts["conditions"] + parts["latencies"] + parts["errors"]
+    rows = re.findall(r'<tr><td class="text">(L\d)</td>(.*?)</tr>', tables)
     assert [name for name, _ in rows] == [*INJECTED] * 4
     shown = {name: text_of(cells).split() for name, cells in rows[: len(INJECTED)]}
     for name, condition in summary["conditions"].items():
@@ -336,18 +346,18 @@ def test_two_presets_are_separate_groups(tmp_path: Path) -> None:
     summary = summarize(runs, None, base={"sweep": "calibrated"})
     assert summary["conditions"]["L5"]["completed"] == 0
     report = report_of(summary, tmp_path)
-    parts = parts_of(report, "summary", "conditions", "contrasts", "runs", "groups")
+    parts = parts_of(report, "first", "conditions", "contrasts", "runs", "groups")
     assert [title_of(group, differing_settings(report.groups)) for group in report.groups] == [
         "preset paper_calibrated",
         "preset designed",
     ]
-    assert "Virtual time, preset designed. Completed" in parts["summary"]
+    assert "Virtual time, preset designed. Runs completed" in parts["first"]
     assert "(preset paper_calibrated)" in parts["conditions"]
     assert {path.name for path in (tmp_path / "tables").glob("contrasts*.csv")} == {
         "contrasts.csv",
         "contrasts_preset_designed.csv",
     }
-    assert parts["runs"].count('<td class="text">other</td>') == 36
+    assert parts["runs"].count('<td class="text extra">other</td>') == 36
     assert "designed" in parts["groups"]
 
 
@@ -444,7 +454,7 @@ def test_the_report_has_the_maximum_tolerable_latency(make_run: MakeRun, tmp_pat
     run = {"route": "a", "preset": "designed", "completion_ms": None, **searched}
     boundary = {"schema": 1, "config": {}, "runs": [run], "groups": [group]}
     html = write_report(tmp_path, boundaries=[boundary]).read_text()
-    assert '<h2 id="maximum_tolerable_latency">' in html
+    assert '<h3 id="maximum_tolerable_latency">' in html
     assert 'href="boundary.svg"' in html
     assert "designed, route a: theory predicts growing oscillation from a total delay of 204 ms" in html
     assert "210" in (tmp_path / "report" / "tables" / "boundary.csv").read_text()

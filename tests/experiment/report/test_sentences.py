@@ -74,3 +74,25 @@ def test_a_fall_is_between_two_latencies() -> None:
         for name, (loop_ms, rate) in rates.items()
     }
     assert "fall" not in results_sentences("Virtual time", conditions)
+
+
+def test_single_runs_are_an_example() -> None:
+    """Conditions with one run each have no percentage and no fall."""
+    single = {
+        name: {**entry(name, rate, loop_ms), "runs": 1}
+        for name, rate, loop_ms in (("L0", 1.0, 11.0), ("L5", 0.0, 341.0))
+    }
+    text = results_sentences("Real time", single)
+    assert (
+        text == "Real time, one run for each condition, as an example: L0 completed (11 ms), L5 not completed (341 ms)."
+    )
+
+
+def test_completion_is_judged_in_the_own_lane() -> None:
+    """If it is known, the completion in the own lane counts, not that in any lane."""
+    known = {name: {**value, "own_lane_completion_rate": 0.0} for name, value in conditions(1.0, 1.0).items()}
+    assert "in their own lane by condition, with the median loop latency: L0 0 % (72 ms)" in results_sentences(
+        "It", known
+    )
+    known["L0"]["own_lane_completion_rate"] = None
+    assert "Runs completed by condition" in results_sentences("It", known)

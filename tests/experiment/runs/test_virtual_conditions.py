@@ -126,6 +126,7 @@ AXES: list[tuple[str, list[Any], str]] = [
     ("controller.preset", ["designed", "paper_calibrated"], "geometry"),
     ("video.bit_rate_bps", [1_000_000, 4_000_000], "video"),
     ("vehicle.light", ["noon", "low_sun"], "pixels"),
+    ("vehicle.weather", ["clear", "fog"], "pixels"),
 ]
 
 

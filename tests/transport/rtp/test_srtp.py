@@ -213,5 +213,5 @@ def test_invalid_keys_and_packets() -> None:
 def test_without_the_library(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without pylibsrtp the error names the extra to install."""
     monkeypatch.setitem(sys.modules, "pylibsrtp", None)
-    with pytest.raises(UserError, match=r"pip install 'lavt\[secure\]'"):
+    with pytest.raises(UserError, match=r"pip install -e '\.\[secure\]'"):
         Protector(KEY)

@@ -20,7 +20,7 @@ from lavt.domain import (
 )
 from lavt.transport.messages import decode, encode
 
-pytest.importorskip("cryptography", reason="an extra: pip install 'lavt[secure]'")
+pytest.importorskip("cryptography", reason="an extra: pip install -e '.[secure]'")
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 

@@ -12,7 +12,7 @@ from lavt.domain import SessionReply, SessionRequest
 from lavt.transport.messages import MAX_MESSAGE_BYTES, encode
 from lavt.transport.security.envelope import MAX_ENVELOPE_BYTES, OperatorAuthenticator, VehicleAuthenticator
 
-pytest.importorskip("cryptography", reason="an extra: pip install 'lavt[secure]'")
+pytest.importorskip("cryptography", reason="an extra: pip install -e '.[secure]'")
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PublicKey

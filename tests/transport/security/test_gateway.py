@@ -13,6 +13,8 @@ from lavt.domain import (
     PATH_POINTS,
     Command,
     Now,
+    RunReply,
+    RunRequest,
     SessionReply,
     SessionRequest,
     State,
@@ -29,7 +31,7 @@ from lavt.transport.security.envelope import (
 )
 from lavt.transport.security.gateway import ClientGateway, OpenClientGateway, ServerGateway
 
-pytest.importorskip("cryptography", reason="an extra: pip install 'lavt[secure]'")
+pytest.importorskip("cryptography", reason="an extra: pip install -e '.[secure]'")
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
@@ -105,7 +107,8 @@ class GatewayPair:
         """Deliver all messages in flight, and those sent in response."""
         while self.in_flight:
             send = self.in_flight.pop(0)
-            gateway = self.client if send.channel in ("state", "session_reply", "netem_reply") else self.server
+            is_for_client = send.channel == "state" or send.channel.endswith("_reply")
+            gateway = self.client if is_for_client else self.server
             gateway.receive(send.channel, send.payload, Now(mono_ns, 0), send.peer or "query")
 
     def acquire_control(self) -> None:
@@ -153,6 +156,32 @@ def test_replayed_requests_replies_and_states_are_rejected(pair: GatewayPair) ->
     # Two requests had a wrong counter: the replayed one, and the client's first one, which it then sent again.
     assert pair.server.counts["session_requests_with_wrong_counter"] == 2
     assert pair.client.counts["states_replayed"] == 1
+
+
+def test_requests_for_runs_are_signed_and_not_replayed(pair: GatewayPair) -> None:
+    """A request for a run arrives once, in the name of its signer only; a part of a record arrives as the reply."""
+    begin = RunRequest("begin", "alice", instance=5, number=1, run=7, settings="{}", offset=0)
+    pair.server_received.clear()
+    pair.client_received.clear()
+    pair.client.send(Send("run", encode(begin)))
+    pair.deliver_all()
+    assert pair.server_received == [("run", encode(begin), "query")]
+    part = encode(RunReply(1, "", "", "finished", "", 1, 2, size=32_768, digest=bytes(32), data=bytes(32_768)))
+    pair.server.send(Send("run_reply", part, "query"))
+    reply = pair.in_flight[0]
+    pair.deliver_all()
+    pair.in_flight = [reply]
+    pair.deliver_all()
+    assert pair.client_received == [("run_reply", part)], "the replayed reply is dropped"
+    pair.client.send(Send("run", encode(begin)))
+    recorded = list(pair.in_flight)
+    pair.deliver_all()
+    pair.server.send(Send("run_reply", part, "query"))
+    pair.deliver_all()
+    pair.server_received.clear()
+    pair.in_flight = [*recorded, Send("run", pair.bob.sign_request("run", encode(begin))), Send("run", encode(begin))]
+    pair.deliver_all()
+    assert not pair.server_received, "a replay, a request in another's name, and an unsigned one"
 
 
 def test_replays_of_a_rejected_command_are_rate_limited(pair: GatewayPair) -> None:

@@ -35,7 +35,7 @@ pytestmark = pytest.mark.usefixtures("srtp")
 
 @pytest.fixture
 def srtp() -> None:
-    pytest.importorskip("pylibsrtp", reason="an extra: pip install 'lavt[secure]'")
+    pytest.importorskip("pylibsrtp", reason="an extra: pip install -e '.[secure]'")
 
 
 class Path:

@@ -286,7 +286,7 @@ def test_an_open_path_keeps_its_cipher() -> None:
 
 
 def encrypted_pair() -> tuple[PathServer, PathClient]:
-    pytest.importorskip("pylibsrtp", reason="an extra: pip install 'lavt[secure]'")
+    pytest.importorskip("pylibsrtp", reason="an extra: pip install -e '.[secure]'")
     server = PathServer(new_secrets(), partial(SrtpCipher, "server"))
     server.set_token(TOKEN)
     return server, PathClient(TOKEN, partial(SrtpCipher, "client"))

@@ -791,7 +791,7 @@ def test_without_python_can(monkeypatch: pytest.MonkeyPatch) -> None:
         raise ImportError(f"No module named {name!r}")
 
     monkeypatch.setattr(bus_module, "import_module", missing)
-    with pytest.raises(UserError, match=r"pip install 'lavt\[can\]'"):
+    with pytest.raises(UserError, match=r"pip install -e '\.\[can\]'"):
         CanPort("virtual", "x", {}, clock=MachineClock())
 
 

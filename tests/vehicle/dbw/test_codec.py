@@ -226,5 +226,5 @@ def test_without_cantools(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> No
         raise ImportError(f"No module named {name!r}")
 
     monkeypatch.setattr(codec_module, "import_module", missing)
-    with pytest.raises(UserError, match=r"pip install 'lavt\[can\]'"):
+    with pytest.raises(UserError, match=r"pip install -e '\.\[can\]'"):
         Codec(tmp_path / "any.dbc")

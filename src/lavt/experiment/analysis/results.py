@@ -93,11 +93,11 @@ def read_result(path: Path) -> dict[str, Any]:
     """Read the result of a run; raise `WorkError` if the file is not a result."""
     result = read_json(path)
     if not isinstance(result, dict):
-        raise WorkError(f"{path} is not the result of a run: it is not a JSON object")
+        raise WorkError(f"{path} is not the result of a run: it is not a JSON object: drive it again")
     missing = [key for key in IDENTITY_KEYS if key not in result]
     if missing:
-        raise WorkError(f"{path} is not the result of a run: it lacks {', '.join(missing)}")
+        raise WorkError(f"{path} is not the result of a run: it lacks {', '.join(missing)}: drive it again")
     for key in ("axes", "injected_ms", "injected_least_ms"):
         if not isinstance(result.get(key, {}), dict):
-            raise WorkError(f"{path} is not the result of a run: {key!r} is not a JSON object")
+            raise WorkError(f"{path} is not the result of a run: {key!r} is not a JSON object: drive it again")
     return result

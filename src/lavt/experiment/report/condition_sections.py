@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
+
+from markupsafe import Markup
 
 from lavt.experiment.report import html_page
 from lavt.experiment.report.condition_tables import (
@@ -13,9 +15,11 @@ from lavt.experiment.report.condition_tables import (
     headline_table,
     latency_table,
 )
+from lavt.experiment.report.figure_style import Conditions
 from lavt.experiment.report.files import save_table
 from lavt.experiment.report.groups import differing_settings, title_of
 from lavt.experiment.report.sections import MAX_COMPARED_GROUPS, Parts, ReportContext
+from lavt.experiment.report.table_format import TableData
 from lavt.experiment.statistics.intervals import FEWEST_CLUSTERS, has_enough_clusters
 
 LATENCIES_NOTE = (
@@ -54,41 +58,42 @@ ERRORS_NOTE = (
 
 
 def conditions_parts(report: ReportContext) -> Parts:
-    """Return the tables of the conditions for each kind of time, with the paper's values of the same conditions."""
+    """Return the main tables of the conditions for each kind of time, with the paper's values."""
     if not report.kinds:
         return [
             html_page.paragraph("No run has the settings of the base config. See the table of groups.", is_note=True)
         ]
+    roads = max(_roads(entry) for conditions in report.kinds.values() for entry in conditions.values())
+    note = "".join((OWN_LANE_NOTE, ROUTES_NOTE, _by_road_note(roads) if roads else ""))
+    return [*_tables(report, {"headline": headline_table, "driving": driving_table}), _note(note)]
+
+
+def latency_table_parts(report: ReportContext) -> Parts:
+    """Return the tables of injected and measured latency for each kind of time."""
+    if not report.kinds:
+        return []
+    has_paper = any(report.paper(conditions) for conditions in report.kinds.values())
+    return [*_tables(report, {"latency": latency_table}), _note(LATENCIES_NOTE + PAPER_NOTE * has_paper)]
+
+
+def error_table_parts(report: ReportContext) -> Parts:
+    """Return the tables of lane-keeping errors for each kind of time."""
+    return [*_tables(report, {"error": error_table}), _note(ERRORS_NOTE)] if report.kinds else []
+
+
+def _tables(report: ReportContext, tables: Mapping[str, Callable[[Conditions, Conditions], TableData]]) -> Parts:
+    """Return these tables for each kind of time, below a heading that says how its runs were made."""
     parts = []
     for kind, conditions in report.kinds.items():
-        paper = report.paper(conditions)
         parts.append(html_page.heading(report.setup(kind)))
-        tables = {
-            "headline": headline_table,
-            "driving": driving_table,
-            "latency": latency_table,
-            "error": error_table,
-        }
         for name, make in tables.items():
-            parts.append(save_table(report.directory, f"conditions_{kind}_{name}", make(conditions, paper)))
-    roads = max(_roads(entry) for conditions in report.kinds.values() for entry in conditions.values())
-    has_paper = any(report.paper(conditions) for conditions in report.kinds.values())
-    return [
-        *parts,
-        html_page.paragraph(
-            "".join(
-                (
-                    LATENCIES_NOTE,
-                    PAPER_NOTE * has_paper,
-                    OWN_LANE_NOTE,
-                    ROUTES_NOTE,
-                    _by_road_note(roads) if roads else "",
-                    ERRORS_NOTE,
-                )
-            ),
-            is_note=True,
-        ),
-    ]
+            table = make(conditions, report.paper(conditions))
+            parts.append(save_table(report.directory, f"conditions_{kind}_{name}", table))
+    return parts
+
+
+def _note(text: str) -> Markup:
+    return html_page.paragraph(text.strip(), is_note=True)
 
 
 def _roads(entry: Mapping[str, Any]) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,16 @@ from lavt.experiment.report.table_format import TableData, csv_of, html_of, tex_
 
 RESOLUTION_DPI = 120
 
-LARGEST_SHOWN_BYTES = 400_000
+LARGEST_SHOWN_BYTES = 300_000
 """If the SVG of a figure is larger than this, the page shows the PNG, because a phone renders a large SVG slowly."""
+
+_DARK = "".join(
+    f'[style*="{name}: {light}"]{{{name}:{dark}!important}}'
+    for light, dark in {"#ffffff": "#14171a", "#000000": "#e4e7ea", "#b0b0b0": "#59626b", "#4d4d4d": "#b5bcc4"}.items()
+    for name in ("fill", "stroke")
+)
+DARK_STYLE = f"<style>@media (prefers-color-scheme:dark){{text{{fill:#e4e7ea}}{_DARK}}}</style>"
+"""Exchanges background and ink of a figure on a dark page. The colours of conditions remain."""
 
 SHORT_ROWS = 30
 """A table with more rows can be split between printed pages; its head is then repeated on each page."""
@@ -26,15 +35,29 @@ _SVG_SETTINGS: Any = {"svg.hashsalt": "lavt", "svg.fonttype": "none", "path.simp
 _NO_METADATA = {"Date": None, "Creator": None, "Format": None, "Type": None}
 
 
-def save_figure(report_dir: Path, name: str, figure: Figure, alternative: str, caption: str) -> Markup:
-    """Write `name`.png and `name`.svg, and return the figure as HTML; the text `alternative` describes the figure."""
+def save_figure(
+    report_dir: Path, name: str, figure: Figure, alternative: str, caption: str, *, narrow: Figure | None = None
+) -> Markup:
+    """Write `name`.png and `name`.svg, and return the figure as HTML; the text `alternative` describes the figure.
+
+    `narrow` is the same figure for narrow screens; its files are `name`_narrow.
+    """
+    shown, files = _write_figure(report_dir, name, figure)
+    narrow_shown = _write_figure(report_dir, f"{name}_narrow", narrow)[0] if narrow else None
+    return html_page.figure(shown, narrow_shown, files, alternative, caption)
+
+
+def _write_figure(report_dir: Path, name: str, figure: Figure) -> tuple[Path, list[str]]:
+    """Write a figure, and return the file that the page shows and the names of all its files."""
     png, svg = report_dir / f"{name}.png", report_dir / f"{name}.svg"
     with mpl.rc_context(_SVG_SETTINGS):
         figure.savefig(png, dpi=RESOLUTION_DPI, metadata={"Software": None})
         figure.set_layout_engine("none")  # keep the layout: to compute it again takes as long as drawing the figure
-        figure.savefig(svg, metadata=_NO_METADATA)
+        text = io.StringIO()
+        figure.savefig(text, format="svg", metadata=_NO_METADATA)
+    svg.write_text(text.getvalue().replace("</style>", f"</style>{DARK_STYLE}", 1), encoding="utf-8")
     shown = svg if svg.stat().st_size <= LARGEST_SHOWN_BYTES else png
-    return html_page.figure(shown.name, [svg.name, png.name], alternative, caption)
+    return shown, [svg.name, png.name]
 
 
 def save_table(report_dir: Path, name: str, table: TableData) -> Markup:

@@ -1,13 +1,16 @@
 """The HTML of the report's page and of its parts, rendered from `templates/`.
 
-The page loads nothing from a network. The templates escape every text argument of these functions.
+The page is one file: figures and video are inside it, and it loads nothing. Only links lead to other files of
+the report. The templates escape every text argument of these functions.
 """
 
 from __future__ import annotations
 
 import re
+from base64 import b64encode
 from collections.abc import Iterable, Sequence
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
@@ -26,16 +29,45 @@ _TEMPLATES = Environment(
 _PARTS: Any = _TEMPLATES.get_template("parts.html.j2").module
 
 
-def page(title: str, sections: Iterable[Section]) -> str:
-    """Return the page, without the sections that have no parts.
+class Chapter(NamedTuple):
+    """A part of the page that folds, with its sections."""
 
-    The first section has no heading, because the page's title is directly above it.
-    """
-    shown = [
-        {"heading": heading, "anchor": slug(heading).lower(), "parts": parts} for heading, parts in sections if parts
-    ]
-    first = shown[0]["parts"] if shown else []
-    return _TEMPLATES.get_template("page.html.j2").render(title=title, first=first, others=shown[1:])
+    heading: str
+    sections: Sequence[Section]
+    is_open: bool = False
+
+
+_MEDIA_TYPES = {".svg": "image/svg+xml", ".png": "image/png", ".mp4": "video/mp4"}
+
+
+def page(title: str, first: Sequence[Markup], chapters: Iterable[Chapter]) -> str:
+    """Return the page: the parts of the first screen, then the chapters, without sections that have no parts."""
+    shown = []
+    for chapter in chapters:
+        sections = [
+            {"heading": name, "anchor": anchor(name), "parts": shown_parts}
+            for name, parts in chapter.sections
+            if (shown_parts := [part for part in parts if part])
+        ]
+        if sections:
+            about = {"heading": chapter.heading, "anchor": chapter_anchor(chapter.heading)}
+            shown.append({**about, "is_open": chapter.is_open, "sections": sections})
+    return _TEMPLATES.get_template("page.html.j2").render(title=title, first=first, chapters=shown)
+
+
+def anchor(section: str) -> str:
+    """Return the anchor of the section with this heading."""
+    return slug(section).lower()
+
+
+def chapter_anchor(chapter: str) -> str:
+    """Return the anchor of the chapter with this heading, which may be that of a section, too."""
+    return f"chapter_{anchor(chapter)}"
+
+
+def embedded(path: Path) -> str:
+    """Return a file as an address that contains it."""
+    return f"data:{_MEDIA_TYPES[path.suffix]};base64,{b64encode(path.read_bytes()).decode()}"
 
 
 def _part(macro: str, *values: object) -> Markup:
@@ -53,9 +85,9 @@ def heading(text: str) -> Markup:
     return _part("heading", text)
 
 
-def paragraph(text: str, *, is_note: bool = False) -> Markup:
-    """Return a paragraph; a note is printed smaller."""
-    return _part("paragraph", text, is_note)
+def paragraph(text: str, *, is_note: bool = False, link: tuple[str, str] | None = None) -> Markup:
+    """Return a paragraph; a note is printed smaller. `link` has the text and the anchor of a link after the text."""
+    return _part("paragraph", text, is_note, link)
 
 
 def bullets(texts: Sequence[str]) -> Markup:
@@ -63,21 +95,35 @@ def bullets(texts: Sequence[str]) -> Markup:
     return _part("bullets", texts)
 
 
-def figure(shown: str, files: Sequence[str], alternative: str, caption: str) -> Markup:
+def terms(pairs: Sequence[tuple[str, str]]) -> Markup:
+    """Return a legend: terms with their meanings."""
+    return _part("terms", pairs)
+
+
+def columns(parts: Sequence[Markup]) -> Markup:
+    """Return one or two parts next to each other; on a narrow screen they are below each other."""
+    return _part("columns", parts)
+
+
+def figure(shown: Path, narrow: Path | None, files: Sequence[str], alternative: str, caption: str) -> Markup:
     """Return a figure with its caption and links to its files.
 
-    `shown` is the file that the page shows, `files` are all formats of the figure.
+    The page contains the file `shown` and, for narrow screens, the file `narrow`. `files` are all formats.
     """
-    return _part("figure", shown, files, alternative, caption)
+    narrow_address = embedded(narrow) if narrow else None
+    return _part("figure", shown.stem, embedded(shown), narrow_address, files, alternative, caption)
 
 
-def video(shown: str, alternative: str, caption: str) -> Markup:
+def video(shown: Path, alternative: str, caption: str) -> Markup:
     """Return a video that plays again and again without sound, with its caption and a link to its file."""
-    return _part("video", shown, alternative, caption)
+    return _part("video", shown.name, embedded(shown), alternative, caption)
 
 
 def table(columns: Sequence[Any], rows: Sequence[Sequence[str]]) -> Markup:
-    """Return a table that scrolls sideways on a narrow screen; each column has `title`, `is_text` and `is_long`."""
+    """Return a table that scrolls sideways on a narrow screen.
+
+    Each column has `title`, `is_text`, `is_long` and `is_extra`. A switch above the table shows the extra columns.
+    """
     return _part("table", columns, rows)
 
 

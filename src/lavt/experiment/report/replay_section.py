@@ -33,7 +33,10 @@ def replay_parts(report: ReportContext, sets: DriveSets) -> Parts:
         f"repetition, at {SPEED:g} times the speed: the frame from which the command in force was made, with the lane "
         "that the driver detected in it; the road from above; and the distance from the lane centre."
     )
-    return [html_page.video(FILE, f"replay of the runs {names}", caption)]
+    invalid = [str(drive.result["run"]) for drive in pair if not drive.result.get("valid", True)]
+    if invalid:
+        caption += f" Not valid, so an example only: {' and '.join(invalid)}."
+    return [html_page.video(report.directory / FILE, f"replay of the runs {names}", caption)]
 
 
 def least_and_most_delayed(drives: Sequence[DriveData]) -> list[DriveData]:

@@ -13,8 +13,14 @@ from lavt.experiment.analysis.drive_data import DriveData
 from lavt.experiment.analysis.results import FAILED, read_json, write_json
 from lavt.experiment.report import html_page
 from lavt.experiment.report.boundary_section import boundary_parts
-from lavt.experiment.report.condition_sections import conditions_parts, contrast_parts
+from lavt.experiment.report.condition_sections import (
+    conditions_parts,
+    contrast_parts,
+    error_table_parts,
+    latency_table_parts,
+)
 from lavt.experiment.report.figure_style import condition_colours
+from lavt.experiment.report.first_screen import VALIDITY, first_parts
 from lavt.experiment.report.replay_section import replay_parts
 from lavt.experiment.report.run_sections import (
     DriveSets,
@@ -35,8 +41,8 @@ from lavt.experiment.report.sections import (
     route_parts,
     run_parts,
     stage_parts,
-    summary_parts,
     survival_parts,
+    validity_parts,
 )
 from lavt.experiment.statistics.summary import summarize
 
@@ -80,34 +86,51 @@ def write_report(
     report = ReportContext(summary, report_dir, condition_colours(str(run["condition"]) for run in summary["runs"]))
     sets = read_drives(drawn_runs(report, results), drives or {})
     with mpl.rc_context({"text.parse_math": False}):  # a dollar sign in a name does not begin a formula
-        sections = _sections(report, sets, boundaries)
+        first = first_parts(report, replay_parts(report, sets))
+        chapters = _chapters(report, sets, boundaries)
     index = report_dir / "index.html"
-    index.write_text(html_page.page(TITLE, sections), encoding="utf-8")
+    index.write_text(html_page.page(TITLE, first, chapters), encoding="utf-8")
     return index
 
 
-def _sections(
+def _chapters(
     report: ReportContext, sets: DriveSets, boundaries: Sequence[Mapping[str, Any]]
-) -> list[html_page.Section]:
-    """Return the page's sections in their order."""
-    return [
-        ("Summary", summary_parts(report)),
-        ("Replay", replay_parts(report, sets)),
+) -> list[html_page.Chapter]:
+    """Return the page's chapters in their order; those of results and trajectories are open."""
+    results = [
         ("Conditions", conditions_parts(report)),
-        ("Planned contrasts", contrast_parts(report)),
-        ("Trajectories", trajectory_parts(report, sets)),
-        ("Injected and measured latency", injected_parts(report)),
         ("Driving performance over latency", degradation_parts(report)),
         ("Distance driven and endings", survival_parts(report)),
         ("Maximum tolerable latency", boundary_parts(boundaries, report.directory)),
-        ("Latency of each stage", stage_parts(report, capture_to_stamp_medians(sets))),
         ("Comparison of presets and settings", group_parts(report)),
         ("Axes of the sweep", axis_parts(report)),
         ("Results by route", route_parts(report)),
+    ]
+    trajectories = [
+        ("Trajectories", trajectory_parts(report, sets)),
         ("Single runs", single_run_parts(report, sets)),
-        ("All runs", run_parts(report)),
+    ]
+    latency = [
+        ("Latencies of the conditions", latency_table_parts(report)),
+        ("Injected and measured latency", injected_parts(report)),
+        ("Latency of each stage", stage_parts(report, capture_to_stamp_medians(sets))),
+    ]
+    statistics = [
+        ("Planned contrasts", contrast_parts(report)),
+        ("Errors of lane keeping", error_table_parts(report)),
+    ]
+    validity = [
+        ("Valid and invalid runs", validity_parts(report)),
         ("Clock offset between two machines", clock_parts(report)),
         ("Versions and machines", machine_parts(report, sets)),
+    ]
+    return [
+        html_page.Chapter("Results", results, is_open=True),
+        html_page.Chapter("Trajectories", trajectories, is_open=True),
+        html_page.Chapter("Latency", latency),
+        html_page.Chapter("Statistics", statistics),
+        html_page.Chapter(VALIDITY, validity),
+        html_page.Chapter("Every run", [("All runs", run_parts(report))]),
     ]
 
 

@@ -17,7 +17,6 @@ from lavt.experiment.report.figure_style import Colours, Conditions
 from lavt.experiment.report.files import link_table, save_figure, save_table
 from lavt.experiment.report.groups import Group, axes_of, differing_settings, short_name, sort_groups, title_of
 from lavt.experiment.report.latency_figures import degradation_figure, injected_figure, presets_figure, stages_figure
-from lavt.experiment.report.sentences import results_sentences, runs_overview
 from lavt.experiment.report.sweep_figures import axis_figure, incidence_figure, routes_with_survival, survival_figure
 from lavt.experiment.report.tables import (
     clock_table,
@@ -47,6 +46,11 @@ STAGES_NOTE = (
 
 SMALLEST_REST_MS = 0.5
 """The part of the loop latency that belongs to no stage is shown as a stage if it is larger than this."""
+
+BUSY_CODES = {"physics_late", "frames_missed", "loop_jitter", "injection_differs"}
+"""The reasons of invalid runs that a busy machine explains (docs/metrics.md)."""
+
+MAX_LISTED_INVALID = 20
 
 MAX_COMPARED_GROUPS = 6
 """If there are more groups, only their table and the figures of their axes show them."""
@@ -91,29 +95,43 @@ class ReportContext:
         return f" ({title_of(self.base[0], names)})" if kind == "virtual" and self.base else ""
 
 
-def summary_parts(report: ReportContext) -> Parts:
-    """Return the summary: the runs, their results, the speed of the simulation, and the failed runs."""
+def validity_parts(report: ReportContext) -> Parts:
+    """Return the reasons of invalid and failed runs, and the speed of the simulation."""
     runs, speed, failed = report.summary["runs"], report.summary["speed"], report.summary.get("failed")
-    parts = [html_page.paragraph(runs_overview(runs))]
-    names = differing_settings(report.groups)
-    compared = report.groups if 1 < len(report.groups) <= MAX_COMPARED_GROUPS else []
-    conditions_by_name = {f"Virtual time, {title_of(group, names)}": group["conditions"] for group in compared}
-    if "virtual" in report.kinds and not conditions_by_name:
-        conditions_by_name = {f"Virtual time{report.base_title()}": report.kinds["virtual"]}
-    if "real" in report.kinds:
-        conditions_by_name["Real time"] = report.kinds["real"]
-    sentences = [results_sentences(name, conditions) for name, conditions in conditions_by_name.items()]
-    parts.append(html_page.bullets([sentence for sentence in sentences if sentence]))
+    invalid = [run for run in runs if not run["valid"]]
+    parts = (
+        []
+        if invalid
+        else [html_page.paragraph(f"All {len(runs)} runs are valid." if runs[1:] else "The run is valid.")]
+    )
+    if invalid:
+        parts.append(
+            html_page.paragraph(f"{len(invalid)} of {len(runs)} runs are invalid and in no statistic.{_busy(invalid)}")
+        )
+        texts = [
+            f"{run['run']} ({run['time']} time): " + "; ".join(str(reason["text"]) for reason in run["invalid_reasons"])
+            for run in invalid[:MAX_LISTED_INVALID]
+        ]
+        more = len(invalid) - len(texts)
+        parts.append(html_page.bullets([*texts, *([f"{more} more: see the table of every run."] if more else [])]))
+    if failed:
+        runs_failed = "1 run" if len(failed) == 1 else f"{len(failed)} runs"
+        parts.append(html_page.paragraph(f"{runs_failed} failed and {'is' if len(failed) == 1 else 'are'} left out:"))
+        parts.append(html_page.bullets([f"{run['run']}: {run['reason']}" for run in failed]))
     if speed["wall_s"]:
         factor = speed["simulated_s"] / speed["wall_s"]
         jobs = f"{speed['jobs']} parallel job{'s' if speed['jobs'] != 1 else ''}"
         text = f"{speed['simulated_s']:.0f} s of driving were simulated in {speed['wall_s']:.0f} s with {jobs}. "
         parts.append(html_page.paragraph(f"{text}This is {factor:.1f} times as fast as real time.", is_note=True))
-    if failed:
-        runs_failed = "1 run" if len(failed) == 1 else f"{len(failed)} runs"
-        parts.append(html_page.paragraph(f"{runs_failed} failed and {'is' if len(failed) == 1 else 'are'} left out:"))
-        parts.append(html_page.bullets([f"{run['run']}: {run['reason']}" for run in failed]))
     return parts
+
+
+def _busy(invalid: Sequence[Mapping[str, Any]]) -> str:
+    """Return a sentence on busy machines if they can be the reason of every one of these invalid runs."""
+    codes = {str(reason["code"]) for run in invalid for reason in run["invalid_reasons"]}
+    if not codes or not codes <= BUSY_CODES:
+        return ""
+    return " The machine was too busy to drive in real time; the same run on an idle machine can be valid."
 
 
 def _base_note(report: ReportContext) -> str:
@@ -154,11 +172,16 @@ def degradation_parts(report: ReportContext) -> Parts:
     return [save_figure(report.directory, "degradation", figure, "completion and error over latency", caption)]
 
 
+def _is_repeated(conditions: Conditions) -> bool:
+    """Return whether any route was driven more than once under a condition: only then is there a share of its runs."""
+    return any(route["runs"] > 1 for entry in conditions.values() for route in (entry.get("routes") or {}).values())
+
+
 def survival_parts(report: ReportContext) -> Parts:
-    """Return the figures of distance driven and of endings for each kind of time."""
+    """Return the figures of distance driven and of endings for each kind of time with repeated runs."""
     parts = []
     for kind, conditions in report.kinds.items():
-        if not routes_with_survival(conditions):
+        if not (routes_with_survival(conditions) and _is_repeated(conditions)):
             continue
         figures = {
             "survival": (
@@ -280,7 +303,8 @@ def route_parts(report: ReportContext) -> Parts:
         if any(entry.get("routes") for entry in conditions.values()):
             parts.append(html_page.heading(f"{kind.capitalize()} time{report.base_title(kind)}"))
             parts.append(save_table(report.directory, f"routes_{kind}_overview", route_overview(conditions)))
-            parts.append(save_table(report.directory, f"routes_{kind}", route_table(conditions)))
+            if _is_repeated(conditions):
+                parts.append(save_table(report.directory, f"routes_{kind}", route_table(conditions)))
     return parts
 
 

@@ -16,19 +16,27 @@ EQUAL_LOOP_LATENCY_MS = 3.0
 
 
 class ConditionPoint(NamedTuple):
-    """A condition with its median loop latency and its completion."""
+    """A condition with its median loop latency and its completion, in the own lane if that is known."""
 
     name: str
     loop_ms: float
     completion_rate: float
 
 
+def _rate_key(conditions: Conditions) -> str:
+    """Return the key of completion in the own lane if it is known for all conditions with runs, else of completion."""
+    known = [entry for entry in conditions.values() if entry["completion_rate"] is not None]
+    own_lane = "own_lane_completion_rate"
+    return own_lane if known and all(entry.get(own_lane) is not None for entry in known) else "completion_rate"
+
+
 def _latency_levels(conditions: Conditions) -> list[list[ConditionPoint]]:
     """Return the conditions with known loop latency and completion, in levels of equal latency, the lowest first."""
+    rate_key = _rate_key(conditions)
     known = [
-        ConditionPoint(name, float(entry["loop_ms"]["p50"]), float(entry["completion_rate"]))
+        ConditionPoint(name, float(entry["loop_ms"]["p50"]), float(entry[rate_key]))
         for name, entry in conditions.items()
-        if entry["loop_ms"]["p50"] is not None and entry["completion_rate"] is not None
+        if entry["loop_ms"]["p50"] is not None and entry.get(rate_key) is not None
     ]
     level_starts_ms: list[float] = []
     for loop_ms in sorted(point.loop_ms for point in known):
@@ -53,7 +61,7 @@ def runs_overview(runs: Sequence[Mapping[str, Any]]) -> str:
     validity = "All runs are valid."
     if invalid:
         subject = "1 run is" if invalid == 1 else f"{invalid} runs are"
-        validity = f"{subject} invalid and excluded from all statistics; the table of all runs gives the reasons."
+        validity = f"{subject} invalid and excluded from all statistics."
     where = f"{_listed('route', routes)} under {_listed('condition', names)}"
     return f"{by_time} on {where}. {validity}"
 
@@ -73,10 +81,13 @@ def results_sentences(name: str, conditions: Conditions) -> str:
     known = [point for level in levels for point in level]
     if not known:
         return ""
+    if all(conditions[point.name].get("runs") == 1 for point in known):
+        return _example_sentence(name, conditions, known)
     parts = []
     if len(known) <= MAX_LISTED_NAMES:
         rates = ", ".join(f"{condition} {rate * 100:.0f} % ({loop_ms:.0f} ms)" for condition, loop_ms, rate in known)
-        parts.append(f"Completed runs by condition, with the median loop latency: {rates}.")
+        lane = " in their own lane" if _rate_key(conditions) != "completion_rate" else ""
+        parts.append(f"Runs completed{lane} by condition, with the median loop latency: {rates}.")
     parts += _fall_sentences(levels)
     errors = [(condition, conditions[condition]["p95_m"]) for condition, _, _ in known]
     known_errors = [(condition, error_m) for condition, error_m in errors if error_m is not None]
@@ -87,6 +98,16 @@ def results_sentences(name: str, conditions: Conditions) -> str:
             f"{last_m:.2f} m at {last}."
         )
     return f"{name}. {' '.join(parts)}"
+
+
+def _example_sentence(name: str, conditions: Conditions, known: Sequence[ConditionPoint]) -> str:
+    """Return a sentence on conditions with one run each, which show no share of runs."""
+    lane = " in its own lane" if _rate_key(conditions) != "completion_rate" else ""
+    endings = ", ".join(
+        f"{condition} {'completed' if rate else 'not completed'}{lane} ({loop_ms:.0f} ms)"
+        for condition, loop_ms, rate in known
+    )
+    return f"{name}, one run for each condition, as an example: {endings}."
 
 
 def _fall_sentences(levels: Sequence[Sequence[ConditionPoint]]) -> list[str]:

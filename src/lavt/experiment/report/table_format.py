@@ -7,7 +7,7 @@ import io
 import re
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from markupsafe import Markup
@@ -42,7 +42,8 @@ class Column:
 
     If a cell has several values (a sequence, or a mapping), `parts` has their names or keys, and CSV has a column for
     each of them. `csv_unit` is the unit of the values in CSV if it differs from the unit on the page. `is_text` marks a
-    column of words, which is aligned left, and `is_long` a column of sentences.
+    column of words, which is aligned left, and `is_long` a column of sentences. The page shows an `is_extra` column
+    only on demand.
     """
 
     title: str
@@ -51,6 +52,7 @@ class Column:
     is_text: bool = False
     is_long: bool = False
     csv_unit: str = ""
+    is_extra: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +87,11 @@ def _nested_value(entry: Mapping[str, Any], key: str) -> Any:
     for name in key.split("."):
         value = (value or {}).get(name)
     return value
+
+
+def extra(column: Column) -> Column:
+    """Return the column as one that the page shows only on demand."""
+    return replace(column, is_extra=True)
 
 
 def text_column(title: str, *, is_long: bool = False) -> Column:

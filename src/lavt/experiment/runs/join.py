@@ -35,7 +35,7 @@ def join_sides(server_dir: Path, client_dir: Path, out: Path) -> dict[str, Any]:
             if not (directory / name).is_file():
                 raise UserError(f"{directory} has no {name}: name the --out of `lavt {side}`")
     server, client = load_config(ServerConfig, server_dir / CONFIG), load_config(ClientConfig, client_dir / CONFIG)
-    _check_same_drive(server_dir / "server.mcap", client_dir / "client.mcap")
+    check_same_drive(server_dir / "server.mcap", client_dir / "client.mcap")
     run = run_config(server, client)
     make_directory(out)
     (out / CONFIG).write_text(yaml.safe_dump(run.model_dump(mode="json"), sort_keys=False))
@@ -87,7 +87,7 @@ def _identity(name: str, run: RunConfig, client: ClientConfig) -> dict[str, Any]
     }
 
 
-def _check_same_drive(server: Path, client: Path) -> None:
+def check_same_drive(server: Path, client: Path) -> None:
     """Raise `UserError` if the client read none of the stamps that the server wrote during the drive."""
     server_record = read_record(server, channels=("event", "frame"))
     with evaluating(server):

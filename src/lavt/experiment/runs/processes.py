@@ -1,6 +1,6 @@
 """Child processes that run LAVT: each prints JSON lines, and is ended with SIGINT when the run ends.
 
-Child processes survive only if the parent process is killed with SIGKILL.
+They also end if the parent process dies, even by SIGKILL (`runtime/parent_watch.py`).
 """
 
 from __future__ import annotations
@@ -19,11 +19,14 @@ from types import TracebackType
 from typing import Any
 
 from lavt.errors import UserError, WorkError
+from lavt.runtime.parent_watch import ENDS_WITH_STDIN
 
 READY_LIMIT_S = 60.0
 """The time limit for the first line of a process. On a quiet machine, imports and preparations take 1 to 5 s."""
 END_LIMIT_S = 15.0
 """A process that has not ended this long after SIGINT is killed."""
+OUTPUT_LIMIT_S = 5.0
+"""How long to wait for the last lines of a process that has ended: another process may hold its output open."""
 USER_ERROR_CODE = 2
 """The exit code of a program whose input was wrong."""
 LAVT = ("-m", "lavt")
@@ -37,6 +40,8 @@ class Process:
         self.name = name
         self.latest: dict[str, Any] = {}
         """The newest line of the process."""
+        self.first: dict[str, Any] = {}
+        """The first line of the process, which says that it is ready."""
         self._log = log_dir / f"{name}.log"
         self._first: queue.Queue[dict[str, Any] | None] = queue.Queue()
         with self._log.open("wb") as log:
@@ -44,9 +49,9 @@ class Process:
                 [sys.executable, *program, *arguments, "--json"],
                 stdout=subprocess.PIPE,
                 stderr=log,
-                stdin=subprocess.DEVNULL,
+                stdin=subprocess.PIPE,  # nothing is written: it closes when this process dies
                 start_new_session=True,  # the parent alone receives Ctrl-C, and ends its processes in order
-                env={**os.environ, "OPENCV_FOR_THREADS_NUM": "1"},
+                env={**os.environ, "OPENCV_FOR_THREADS_NUM": "1", ENDS_WITH_STDIN: "1"},
             )
         self._reader = threading.Thread(target=self._read, name=f"{name} lines", daemon=True)
         self._reader.start()
@@ -72,10 +77,17 @@ class Process:
         """Whether the process has not ended yet."""
         return self.popen.poll() is None
 
+    @property
+    def exit_code(self) -> int | None:
+        """The exit code of the process, None while it runs; negative: the number of the signal that ended it."""
+        return self.popen.poll()
+
     def last_message(self) -> str:
         """Return the last line on standard error."""
-        lines = self._log.read_text(errors="replace").strip().splitlines()
-        return lines[-1] if lines else "no message"
+        with suppress(OSError):  # the file has been deleted
+            if lines := self._log.read_text(errors="replace").strip().splitlines():
+                return lines[-1]
+        return "no message"
 
     def end(self) -> None:
         """End the process with SIGINT, and kill it if it does not end in time."""
@@ -87,23 +99,25 @@ class Process:
             except subprocess.TimeoutExpired:
                 self.popen.kill()
         self.popen.wait()
-        self._reader.join()
-        if self.popen.stdout is not None:
-            self.popen.stdout.close()
+        self._reader.join(OUTPUT_LIMIT_S)
+        if self.popen.stdin is not None:
+            self.popen.stdin.close()
 
     def last_line(self) -> dict[str, Any]:
-        """Wait for the end of the process's output, and return its last line."""
-        self._reader.join()
+        """Wait for the end of the output of a process that has ended, and return its last line."""
+        self._reader.join(OUTPUT_LIMIT_S)
         return self.latest
 
     def _read(self) -> None:
         """Read lines until the process ends; kill it if reading fails, so that the run does not wait for its lines."""
         assert self.popen.stdout is not None  # noqa: S101 (it is a pipe)
         try:
-            for text in self.popen.stdout:
-                with suppress(ValueError):
-                    self.latest = json.loads(text)
-                    self._first.put(self.latest)
+            with self.popen.stdout as lines:
+                for text in lines:
+                    with suppress(ValueError):
+                        self.latest = json.loads(text)
+                        self.first = self.first or self.latest
+                        self._first.put(self.latest)
         except BaseException:
             self.popen.kill()
             raise

@@ -77,16 +77,15 @@ def start_loop(
     server keeps running after the first drive. `netem` is applied before the client starts.
     """
     run = planned.config
-    server_yaml = _write(work, "server", server_config(run, planned.seed))
+    server_yaml = write_config(work, "server", server_config(run, planned.seed))
     arguments = ("server", server_yaml, *(["--once"] if once else []), "--out", str(out / "server"))
     server = processes.start("server", *arguments, program=server_program)
     ready = server.wait_ready()["ready"]
     video_port, control_port = ready["video_port"], _port(ready["locators"], "udp/")
     relay = None
     if run.network.injection == "relay":
-        relay = processes.start(
-            "relay", "relay", _write(work, "relay", _relay_config(planned, video_port, control_port))
-        )
+        addresses = f"127.0.0.1:{video_port}", f"127.0.0.1:{control_port}"
+        relay = processes.start("relay", "relay", write_config(work, "relay", relay_config(planned, *addresses)))
         ports = relay.wait_ready()["ports"]
         video_port, control_port = ports["video"], ports["control"]
     elif netem is not None:
@@ -95,7 +94,7 @@ def start_loop(
     zenoh = embedded_router(dialled=[dialled])
     config = client_config(run, zenoh=zenoh, video_port=video_port, probe_port=ready["probe_port"])
     config = config.model_copy(update={"controller": config.controller.model_copy(update={"rearm": rearm})})
-    client = processes.start("client", "client", _write(work, "client", config), "--out", str(out / "client"))
+    client = processes.start("client", "client", write_config(work, "client", config), "--out", str(out / "client"))
     client.wait_ready()
     router = next(locator for locator in ready["locators"] if locator.startswith("tcp/"))
     return LoopProcesses(server, relay, client, router, ready)
@@ -117,7 +116,7 @@ def drive_real(planned: PlannedRun, out: Path, *, progress: Progress | None = No
                 for process in reversed(processes.started):
                     process.end()
                 if loop.relay is not None:
-                    requested = {"requested_ms": _requested_ms(planned), "traces": trace_digests(planned.requested)}
+                    requested = {"requested_ms": requested_ms(planned), "traces": trace_digests(planned.requested)}
                     write_json(out / RELAY, {**requested, **loop.relay.last_line()})
                 if netem is not None:
                     write_json(out / NETEM, netem.report())
@@ -147,7 +146,7 @@ def _wait_for_ending(processes: Processes, loop: LoopProcesses, progress: Progre
         raise WorkError(f"the server failed: {loop.server.last_message()}")
 
 
-def _requested_ms(planned: PlannedRun) -> dict[str, float | None]:
+def requested_ms(planned: PlannedRun) -> dict[str, float | None]:
     """Return the median delay that the relay is asked to inject into each flow, including the inherent latency.
 
     The value is None for a flow with an impairment other than a constant delay, because its median depends on the
@@ -190,11 +189,12 @@ def _port(locators: Sequence[str], protocol: str) -> int:
     return int(locator.partition("?")[0].rpartition(":")[2])
 
 
-def _relay_config(planned: PlannedRun, video_port: int, control_port: int) -> RelayConfig:
+def relay_config(planned: PlannedRun, video_server: str, control_server: str) -> RelayConfig:
+    """Return the config of the relay of a run, which forwards to these addresses of the server."""
     injected, requested = _injected_delays(planned), planned.requested
     return RelayConfig(
-        video_server=f"127.0.0.1:{video_port}",
-        control_server=f"127.0.0.1:{control_port}",
+        video_server=video_server,
+        control_server=control_server,
         video=_delay_config(injected.video, requested.video_ms, requested.video),
         control=_delay_config(injected.control, requested.control_ms, requested.control),
         state=_delay_config(injected.state),
@@ -218,7 +218,8 @@ def _delay_config(delay: DelayModel, delay_ms: float = 0.0, impairment: Impairme
     )
 
 
-def _write(work: Path, name: str, config: BaseModel) -> str:
+def write_config(work: Path, name: str, config: BaseModel) -> str:
+    """Write the config of a process, and return the file's path."""
     path = work / f"{name}.yaml"
     path.write_text(yaml.safe_dump(config.model_dump(mode="json")))
     return str(path)

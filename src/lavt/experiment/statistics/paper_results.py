@@ -12,6 +12,10 @@ from typing import Any
 from lavt.experiment.statistics.contrasts import PLANNED, fisher, with_holm
 from lavt.experiment.statistics.intervals import exact_interval
 
+REFERENCE = (
+    "A. Khalil, J. Kwon, “Nonlinear Performance Degradation of Vision-Based Teleoperation under Network Latency”, 2026."
+)
+
 RUNS = 30
 
 COLUMNS = (

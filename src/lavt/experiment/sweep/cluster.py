@@ -66,7 +66,7 @@ def _import_dask() -> Any:
     try:
         return import_module("distributed")  # an optional dependency
     except ImportError as error:
-        raise UserError(f"--cluster needs Dask ({error}): pip install 'lavt[cluster]'") from error
+        raise UserError(f"--cluster needs Dask ({error}): pip install -e '.[cluster]' in the clone") from error
 
 
 def _checked_workers(client: Any, address: str) -> Workers:

@@ -23,9 +23,10 @@ from lavt.errors import UserError, WorkError, describe_error
 from lavt.experiment.analysis.drive_data import DriveData
 from lavt.experiment.analysis.results import FAILED, read_json, write_json
 from lavt.experiment.runs.plan import PlannedRun, plan_sweep
-from lavt.experiment.runs.run import CONFIG, RESULT, config_text
+from lavt.experiment.runs.remote_run import RemoteServer
+from lavt.experiment.runs.run import CONFIG, RESULT, config_text, drive_once
 from lavt.experiment.sweep.cluster import cluster_workers
-from lavt.experiment.sweep.workers import Workers, attempt_in_processes, is_finished, remove_unfinished
+from lavt.experiment.sweep.workers import DriveRun, Workers, attempt_in_processes, is_finished, remove_unfinished
 from lavt.recording.output_directory import prepare_directory
 
 SWEEP = "sweep.yaml"
@@ -55,10 +56,12 @@ def run_all(
     jobs: int | None,
     on_progress: ProgressCallback,
     cluster_address: str | None = None,
+    server: RemoteServer | None = None,
 ) -> tuple[SweepResult, dict[str, Any] | None]:
     """Drive the runs that have no result yet, `jobs` at a time (None: one per core), or one by one in real time.
 
-    With `cluster_address`, the Dask workers of that scheduler drive the runs. Returns all results, including those of
+    With `cluster_address`, the Dask workers of that scheduler drive the runs. With `server`, that server drives the
+    vehicle. Returns all results, including those of
     earlier calls, and the entry `speed` of the summary. This entry is about the runs in virtual time of this call; it
     is None without such runs.
     """
@@ -66,7 +69,7 @@ def run_all(
     start_ns = clock.now().mono_ns
     earlier = [read_json(runs_dir / run.name / RESULT) for run in planned if is_finished(runs_dir / run.name)]
     todo = [run for run in planned if not is_finished(runs_dir / run.name)]
-    progress = _SweepProgress(runs_dir, on_progress)
+    progress = _SweepProgress(runs_dir, on_progress, drive_once if server is None else server.drive)
     if cluster_address is None:
         jobs = 1 if any(run.config.time == "real" for run in todo) else jobs or os.cpu_count() or 1
         for run in attempt_in_processes(progress.drive, todo, jobs):
@@ -91,15 +94,16 @@ def run_all(
 class _SweepProgress:
     """The finished and the failed runs of a sweep so far."""
 
-    def __init__(self, runs_dir: Path, on_progress: ProgressCallback) -> None:
+    def __init__(self, runs_dir: Path, on_progress: ProgressCallback, drive_run: DriveRun) -> None:
         self.drives: list[DriveData] = []
         self.failed: list[tuple[str, str]] = []
         self.runs_dir = runs_dir
         self._on_progress = on_progress
+        self._drive_run = drive_run
 
     def drive(self, workers: Workers, todo: Sequence[PlannedRun]) -> list[PlannedRun]:
         """Drive the runs `todo`; return the ones that have no result because a worker's process died."""
-        futures = {workers.submit(run, self.runs_dir / run.name): run for run in todo}
+        futures = {workers.submit(run, self.runs_dir / run.name, self._drive_run): run for run in todo}
         broken = []
         # The import of matplotlib and SciPy takes long, so it is done during the drives. It is not done in the main
         # thread, because it executes strings (of dataclasses): if Ctrl-C interrupts such an execution, `python -m` dies
@@ -152,11 +156,12 @@ def drive_sweep(
     jobs: int | None,
     on_progress: ProgressCallback,
     cluster_address: str | None = None,
+    server: RemoteServer | None = None,
 ) -> tuple[Path, SweepResult]:
     """Drive the missing runs of a sweep into `out`, and write its config, summary and report.
 
-    `planned` are the runs of `config`; `cluster_address` is passed to `run_all`. Returns the path of the report's page,
-    and the results. Failed runs are listed in `out`/failed.json, in the summary and in the report.
+    `planned` are the runs of `config`; `cluster_address` and `server` are passed to `run_all`. Returns the path of the
+    report's page, and the results. Failed runs are listed in `out`/failed.json, in the summary and in the report.
     """
     _check_sweep(config, out)
     runs_dir = out / "runs"
@@ -167,7 +172,7 @@ def drive_sweep(
     (out / SWEEP).write_text(yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
     _remove_unfinished(planned, runs_dir)
     sweep_result, speed = run_all(
-        planned, runs_dir, jobs=jobs, on_progress=on_progress, cluster_address=cluster_address
+        planned, runs_dir, jobs=jobs, on_progress=on_progress, cluster_address=cluster_address, server=server
     )
     failed = [{"run": name, "reason": reason} for name, reason in sweep_result.failed]
     write_json(out / FAILED, failed)

@@ -24,6 +24,8 @@ from lavt.experiment.sweep.worker_processes import WorkerProcesses
 from lavt.recording.output_directory import prepare_directory
 
 Item = TypeVar("Item")
+DriveRun = Callable[[PlannedRun, Path], DriveData]
+"""Drives a run, and writes its files into a directory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,11 +36,11 @@ class Workers:
     jobs: int
     remote: bool
 
-    def submit(self, planned: PlannedRun, directory: Path) -> Future[Any]:
-        """Start a run, and return a future whose result is an argument of `collect`."""
+    def submit(self, planned: PlannedRun, directory: Path, drive: DriveRun) -> Future[Any]:
+        """Start a run, and return a future whose result is an argument of `collect`; remote workers ignore `drive`."""
         if self.remote:
             return self.executor.submit(drive_remotely, planned)
-        return self.executor.submit(drive_or_read, planned, directory)
+        return self.executor.submit(drive_or_read, planned, directory, drive)
 
     def collect(self, result: Any, directory: Path) -> DriveData:
         """Return the data of a finished run; if the run was remote, first write its files into `directory`."""
@@ -89,12 +91,12 @@ def remove_unfinished(directory: Path) -> None:
         shutil.rmtree(directory)
 
 
-def drive_or_read(planned: PlannedRun, directory: Path) -> DriveData:
+def drive_or_read(planned: PlannedRun, directory: Path, drive: DriveRun = drive_once) -> DriveData:
     """Drive a run, unless it was finished by a process that died afterwards; return its data."""
     if is_finished(directory):
         return read_drive(directory, read_json(directory / RESULT))
     remove_unfinished(directory)
-    return drive_once(planned, directory)
+    return drive(planned, directory)
 
 
 def drive_remotely(planned: PlannedRun) -> tuple[DriveData, dict[str, bytes]]:

@@ -83,7 +83,7 @@ def check_impairment(name: str, impairment: Impairment) -> None:
     if max(impairment.loss, impairment.reorder, impairment.jitter_correlation) >= 1:
         raise UserError(f"{name}: loss, reorder and jitter_correlation must be below 1, unlike in {impairment}")
     if impairment.jitter_distribution not in DISTRIBUTIONS:
-        raise UserError(f"{name}: jitter_distribution is one of {', '.join(DISTRIBUTIONS)}")
+        raise UserError(f"{name}: unknown jitter_distribution: choose one of {', '.join(DISTRIBUTIONS)}")
     if impairment.jitter_correlation and impairment.jitter_distribution != "normal":
         raise UserError(f"{name}: jitter with a correlation must have the jitter_distribution normal")
     if impairment.loss_burst_packets > 1 and burst_probabilities(impairment).begin > 1:

@@ -107,12 +107,12 @@ def _import_pylibsrtp() -> Any:
     try:
         return import_module("pylibsrtp")  # an extra
     except ImportError as error:
-        raise UserError(f"encrypted video needs pylibsrtp ({error}): pip install 'lavt[secure]'") from error
+        raise UserError(f"encryption needs pylibsrtp ({error}): pip install -e '.[secure]' in the clone") from error
 
 
 def _new_session(library: Any, key_and_salt: bytes, direction: int) -> Any:
     if len(key_and_salt) != KEY_BYTES:
-        raise UserError(f"an SRTP key with its salt has {KEY_BYTES} bytes, not {len(key_and_salt)}")
+        raise UserError(f"an SRTP key with its salt has {KEY_BYTES} bytes, not {len(key_and_salt)}: give all of them")
     profile = library.Policy.SRTP_PROFILE_AEAD_AES_128_GCM
     policy = library.Policy(key=key_and_salt, ssrc_type=direction, srtp_profile=profile)
     policy.window_size = WINDOW_PACKETS

@@ -196,9 +196,9 @@ def _load_authority(authority: KeyPair) -> tuple[x509.Certificate, EllipticCurve
     try:
         key = serialization.load_pem_private_key(authority.private, password=None)
     except (ValueError, TypeError, UnsupportedAlgorithm) as error:
-        raise UserError("the authority's key is not a PEM private key without a password") from error
+        raise UserError("the authority's key is not a PEM private key without a password: copy it back") from error
     if not isinstance(key, EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
-        raise UserError("the authority's key does not match its certificate")
+        raise UserError("the authority's key does not match its certificate: copy both back")
     return certificate, key
 
 

@@ -16,9 +16,9 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Any, Final
 
-from lavt.domain import Command, NetemRequest, SessionReply, SessionRequest
+from lavt.domain import Command, NetemRequest, RunRequest, SessionReply, SessionRequest
 from lavt.errors import BadMessage
-from lavt.transport.messages import MAX_MESSAGE_BYTES, decode
+from lavt.transport.messages import MAX_MESSAGE_BYTES, MAX_RUN_REPLY_BYTES, decode
 from lavt.transport.security.keys import (
     PUBLIC_KEY_BYTES,
     SIGNATURE_BYTES,
@@ -38,10 +38,11 @@ REPLAY_COUNTER_BYTES: Final = 16
 """A random number of the server's process and a counter within that process, 8 bytes each."""
 DIGEST_BYTES: Final = 16
 MAX_ENVELOPE_BYTES: Final = MAX_MESSAGE_BYTES + 256
+MAX_RUN_REPLY_ENVELOPE_BYTES: Final = MAX_RUN_REPLY_BYTES + 256
 MAX_PENDING_REQUESTS: Final = 8
 MAX_AGREEMENTS: Final = 8
 
-REQUESTS: Final[dict[str, type[SessionRequest | NetemRequest]]] = {"session": SessionRequest, "netem": NetemRequest}
+REQUESTS: Final[dict[str, Any]] = {"session": SessionRequest, "netem": NetemRequest, "run": RunRequest}
 """Request classes by channel."""
 
 _NO_MAC: Final = bytes(MAC_BYTES)
@@ -194,9 +195,8 @@ class VehicleAuthenticator(NullVehicleAuthenticator):
 
     def _is_in_own_name(self, channel: str, operator: str, body: bytes) -> bool:
         """Return whether a request names the operator that signed it; an empty request passes."""
-        kind: Any = REQUESTS[channel]
         try:
-            return body == b"" or bool(decode(kind, body).who == operator)
+            return body == b"" or bool(decode(REQUESTS[channel], body).who == operator)
         except BadMessage:
             return False
 
@@ -297,7 +297,7 @@ class OperatorAuthenticator:
         pending_channel, pending_body = self._pending.get(digest, ("", b""))
         if (
             pending_channel != channel
-            or len(data) > MAX_ENVELOPE_BYTES
+            or len(data) > (MAX_RUN_REPLY_ENVELOPE_BYTES if channel == "run" else MAX_ENVELOPE_BYTES)
             or not self._vehicle_key.verify(signature, _signing_context(f"{channel} reply", self._vehicle) + signed)
         ):
             return self._reject_forged_reply(channel)

@@ -28,7 +28,7 @@ _EXPIRY: Final = b"LAVT signing key 1, expires "
 """The beginning of the line before a PEM key, where a PEM file may have any text (RFC 7468); 1 is the version."""
 _EXPIRY_LINE: Final = re.compile(rb"%s(\d{1,11}) " % _EXPIRY)
 _PEM_BLOCK: Final = re.compile(rb"-----BEGIN .*?-----END [^-\n]*-----", re.DOTALL)
-_INSTALL: Final = "signing needs the package cryptography: pip install 'lavt[secure]'"
+_INSTALL: Final = "signing needs the package cryptography: pip install -e '.[secure]' in the clone"
 
 
 class PrivateKey:

@@ -90,7 +90,7 @@ class Encoder:
         Raises `UserError` for a picture of another size.
         """
         if picture_bgr.shape != self._shape:
-            raise UserError(f"the encoder takes pictures of shape {self._shape}, not {picture_bgr.shape}")
+            raise UserError(f"the encoder takes pictures of one shape: {self._shape}, not {picture_bgr.shape}")
         return cast("NDArray[np.uint8]", cv2.cvtColor(picture_bgr, cv2.COLOR_BGR2YUV_I420, dst=self._planes))
 
     def encode(self, picture_bgr: Picture, keyframe: bool = False) -> bytes:
@@ -106,7 +106,7 @@ class Encoder:
         Raises `UserError` for a picture of another size.
         """
         if planes.shape != self._planes.shape:
-            raise UserError(f"the encoder takes I420 of shape {self._planes.shape}, not {planes.shape}")
+            raise UserError(f"the encoder takes I420 of one shape: {self._planes.shape}, not {planes.shape}")
         frame = VideoFrame.from_numpy_buffer(planes, format="yuv420p")
         frame.pts = self._next_pts
         self._next_pts += 1

@@ -314,7 +314,7 @@ def _library() -> Any:
     try:
         return import_module("can")  # an extra
     except ImportError as error:
-        raise UserError(f"a CAN bus needs python-can ({error}): pip install 'lavt[can]'") from error
+        raise UserError(f"a CAN bus needs python-can ({error}): pip install -e '.[can]' in the clone") from error
 
 
 def _open_bus(interface: str, channel: str, options: Mapping[str, Any]) -> BusABC:

@@ -180,7 +180,7 @@ def _load(dbc: Path) -> Database:
     try:
         cantools = import_module("cantools")  # an extra
     except ImportError as error:
-        raise UserError(f"drive-by-wire needs cantools ({error}): pip install 'lavt[can]'") from error
+        raise UserError(f"drive-by-wire needs cantools ({error}): pip install -e '.[can]' in the clone") from error
     try:
         _check_lengths(dbc.read_bytes())
         loaded: Database = cantools.database.load_file(dbc, database_format="dbc")

@@ -38,7 +38,7 @@ def parse_number(text: str) -> float:
     except ValueError:
         number = math.nan
     if not math.isfinite(number):
-        raise UserError(f"{text[:MAX_QUOTED]!r} is not a number")
+        raise UserError(f"{text[:MAX_QUOTED]!r} is not a number: write one, such as 0.5")
     return number
 
 

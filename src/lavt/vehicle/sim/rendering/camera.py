@@ -9,6 +9,7 @@ from lavt.domain import NS_PER_MS, CameraModel, Pose
 from lavt.vehicle.camera import CapturedFrame, newest_pose
 from lavt.vehicle.sim.rendering.light import LightName
 from lavt.vehicle.sim.rendering.renderer import Renderer, SceneryKind
+from lavt.vehicle.sim.rendering.weather import WeatherName
 from lavt.vehicle.sim.road.road import Road
 
 MAX_EXTRAPOLATION_NS = 20 * NS_PER_MS
@@ -33,6 +34,7 @@ class SimCamera:
         seed: int,
         scenery: SceneryKind = "full",
         light: LightName = "noon",
+        weather: WeatherName = "clear",
         exposure_ns: int = 0,
         sensor_delay_ns: int = 0,
     ) -> None:
@@ -41,7 +43,7 @@ class SimCamera:
         self.phase_ns = phase_ns
         self.exposure_ns = exposure_ns
         self.sensor_delay_ns = sensor_delay_ns
-        self._renderer = Renderer(road, model, seed=seed, scenery=scenery, light=light)
+        self._renderer = Renderer(road, model, seed=seed, scenery=scenery, light=light, weather=weather)
 
     def prepare(self) -> None:
         """Fill the caches whose first use would delay a frame in real time."""

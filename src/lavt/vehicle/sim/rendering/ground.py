@@ -19,6 +19,7 @@ from lavt.vehicle.sim.rendering.light import Light
 from lavt.vehicle.sim.rendering.shadows import Shadows
 from lavt.vehicle.sim.rendering.surface_wear import surface_wear
 from lavt.vehicle.sim.rendering.textures import SCALES_M, all_textures
+from lavt.vehicle.sim.rendering.weather import WEATHERS, Weather, worn_paint
 from lavt.vehicle.sim.road.road import Road
 from lavt.vehicle.sim.road.strips import (
     MAX_PIECE_M,
@@ -47,9 +48,10 @@ _OIL = (0.7, 6)
 
 
 class Ground:
-    """The tiles of one road in one light, painted on first use."""
+    """The tiles of one road in one light and weather, painted on first use."""
 
-    def __init__(self, road: Road, light: Light, shadows: Shadows | None) -> None:
+    def __init__(self, road: Road, light: Light, shadows: Shadows | None, weather: Weather = WEATHERS["clear"]) -> None:
+        self._weather = weather
         self._tiles: tuple[OrderedDict[tuple[int, int], Picture], ...] = tuple(OrderedDict() for _ in SCALES_M)
         # Both in 255ths: the light on a surface in the sun, and the share of this light that is missing in full shadow.
         self._sunlight = _bytes(np.array(light.lit))
@@ -73,7 +75,7 @@ class Ground:
 
         Row 0 has the lowest y and column 0 the lowest x. The middle of texel i is at (i + 0.5) * scale from the corner.
         The picture has an unused fourth channel, because OpenCV warps texels of four bytes in less than half the time
-        that texels of three bytes take.
+        that texels of three bytes take. On a wet road it has the share of asphalt.
         """
         pixels = round(TILE_M[level] / SCALES_M[level])
         assembled = np.empty((count * pixels, count * pixels, 4), dtype=np.uint8)
@@ -82,6 +84,10 @@ class Ground:
                 tile = self.tile(level, first_tile[0] + column, first_tile[1] + row)
                 part = np.s_[row * pixels : (row + 1) * pixels, column * pixels : (column + 1) * pixels]
                 cv2.cvtColor(tile, cv2.COLOR_BGR2BGRA, assembled[part])
+                if self._weather.film:
+                    corner = (first_tile[0] + column, first_tile[1] + row)
+                    asphalt = self._asphalt.mask(_square(level, *corner))
+                    assembled[part][..., 3] = 0 if asphalt is None else asphalt
         return assembled
 
     def has_room(self, level: int) -> bool:
@@ -93,8 +99,7 @@ class Ground:
         tiles = self._tiles[level]
         tile = tiles.get((column, row))
         if tile is None:
-            edge_m = TILE_M[level]
-            tile = self._paint(level, Square(column * edge_m, row * edge_m, edge_m, SCALES_M[level]))
+            tile = self._paint(level, _square(level, column, row))
             tiles[(column, row)] = tile
             if len(tiles) > _MAX_TILES[level]:
                 tiles.popitem(last=False)
@@ -134,6 +139,8 @@ class Ground:
             if grey_levels:
                 wear.strips.fill(darkening, square, grey_levels)
         worn = np.asarray(cv2.subtract(_crop_texture(textures.asphalt, square), darkening), dtype=np.uint8)
+        if self._weather.asphalt != 1.0:
+            worn = np.asarray(cv2.convertScaleAbs(worn, alpha=self._weather.asphalt), dtype=np.uint8)
         picture = np.asarray(cv2.merge((worn, worn, worn - 2)), dtype=np.uint8)
         for colour, width_m, strips in self._marks:
             paint = strips.mask(square)
@@ -142,10 +149,19 @@ class Ground:
                 alpha = np.asarray(
                     cv2.multiply(paint, _crop_texture(textures.wear, square), scale=thinness / 255), np.uint8
                 )
+                if self._weather.paint_left < 1.0:
+                    left = _crop_texture(worn_paint(self._weather.paint_left)[level], square)
+                    alpha = np.asarray(cv2.multiply(alpha, left, scale=1 / 255), np.uint8)
                 cover = cv2.merge((alpha, alpha, alpha))
                 kept = cv2.multiply(picture, cv2.bitwise_not(cover), scale=1 / 255)
                 picture = np.asarray(cv2.add(kept, _multiply_colour(cover, _PAINT[colour])), dtype=np.uint8)
         return picture
+
+
+def _square(level: int, column: int, row: int) -> Square:
+    """Return the square of ground that a tile shows."""
+    edge_m = TILE_M[level]
+    return Square(column * edge_m, row * edge_m, edge_m, SCALES_M[level])
 
 
 def _bytes(factors: FloatArray) -> tuple[int, ...]:

@@ -15,11 +15,12 @@ from typing import Literal
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from lavt.domain import CameraModel, FloatArray, Picture, Pose
 from lavt.streams import stream
 from lavt.vehicle.sim.rendering.ground import TILE_M, Ground
-from lavt.vehicle.sim.rendering.light import LIGHTS, LightName
+from lavt.vehicle.sim.rendering.light import Colour, LightName
 from lavt.vehicle.sim.rendering.panorama import Panorama
 from lavt.vehicle.sim.rendering.pinhole import (
     CameraPlacement,
@@ -30,9 +31,11 @@ from lavt.vehicle.sim.rendering.pinhole import (
     row_of_depth,
 )
 from lavt.vehicle.sim.rendering.roadside_objects import place_roadside_objects
-from lavt.vehicle.sim.rendering.scenery import HAZE_M, Scenery
+from lavt.vehicle.sim.rendering.scenery import Scenery
 from lavt.vehicle.sim.rendering.shadows import Shadows
 from lavt.vehicle.sim.rendering.textures import SCALES_M
+from lavt.vehicle.sim.rendering.weather import HAZE_BEGIN_M, HAZE_M, WEATHERS, Weather, WeatherName
+from lavt.vehicle.sim.rendering.weather_optics import Headlights, WaterFilm, Windscreen, slant_distance_m
 from lavt.vehicle.sim.road.road import Road
 
 SceneryKind = Literal["full", "light", "none"]
@@ -57,7 +60,6 @@ _NEAR_BANDS = 2
 
 _NOISE_DEVIATION = 2.2
 _NOISE_MARGIN_PX = 64
-_HAZE_BEGIN_M = 11.0
 _FINEST_PREPARED_LEVEL = 2
 """`prepare` paints this scale and the coarser scales; the finer scales are painted during the drive."""
 
@@ -119,21 +121,36 @@ class Band:
 
 
 class Renderer:
-    """A renderer of one road in one light for one camera model."""
+    """A renderer of one road in one light and one weather for one camera model."""
 
     def __init__(
-        self, road: Road, model: CameraModel, *, seed: int, scenery: SceneryKind, light: LightName = "noon"
+        self,
+        road: Road,
+        model: CameraModel,
+        *,
+        seed: int,
+        scenery: SceneryKind,
+        light: LightName = "noon",
+        weather: WeatherName = "clear",
     ) -> None:
         cv2.setNumThreads(1)  # with more threads the division of work, and so the last bit, could vary
         self._road, self._model, self._seed = road, model, seed
         self._level_model = level_model(model)
-        self._ground, self._scenery = world(road, scenery, light)
+        self._ground, self._scenery = world(road, scenery, light, weather)
         self._bands = tuple(Band(self._level_model, level) for level in range(len(SCALES_M)))
-        self._panorama = Panorama(self._level_model, self._bands[-1].first_row, LIGHTS[light], plain=scenery != "full")
+        air = WEATHERS[weather]
+        sky = air.light(light)
+        self._panorama = Panorama(self._level_model, self._bands[-1].first_row, sky, plain=scenery != "full")
         self._last_squares: list[tuple[tuple[int, int], Picture] | None] = [None] * len(self._bands)
         """The square of tiles that each band used last: the index of the square's first tile, and its texels."""
         self._canvas = np.empty((self._level_model.height_px, self._level_model.width_px, 4), dtype=np.uint8)
-        self._haze_factor, self._haze = _haze(self._level_model, self._bands, LIGHTS[light].haze)
+        self._haze_factor, self._haze = _haze(self._level_model, self._bands, sky.haze, air)
+        self._haze_colour = np.array([*sky.haze, 0.0])
+        self._far_clearness = math.exp(-air.extinction_per_m * BAND_FAR_M[-1])
+        """How much of the panorama, which is farther than the ground that is drawn, rain or fog leave."""
+        self._film = WaterFilm(self._level_model, air.film) if air.film else None
+        self._headlights = Headlights(self._level_model) if air.headlights else None
+        self._windscreen = Windscreen(model, air.rain_mmph, seed) if air.rain_mmph else None
         self._positive_noise, self._negative_noise = _noise(model)
 
     def prepare(self) -> None:
@@ -150,9 +167,7 @@ class Renderer:
 
     def render(self, pose: Pose, number: int) -> Picture:
         """Return frame `number` for a vehicle at `pose`, without motion blur, in a new array."""
-        picture = self._draw_world(pose)
-        self._add_noise(picture, number)
-        return picture
+        return self._finish(self._draw_world(pose), pose, number)
 
     def render_exposed(self, begin: Pose, end: Pose, number: int) -> Picture:
         """Return frame `number` for a vehicle that moves from `begin` to `end` during the exposure.
@@ -167,7 +182,12 @@ class Renderer:
             shares = (part + (np.arange(instants) + 0.5) / instants) / parts
             near_poses = [_interpolate_pose(begin, end, share) for share in shares.tolist()]
             total += self._draw_world(_interpolate_pose(begin, end, (part + 0.5) / parts), near_poses)
-        picture = ((total + parts // 2) // parts).astype(np.uint8)
+        return self._finish(((total + parts // 2) // parts).astype(np.uint8), end, number)
+
+    def _finish(self, picture: Picture, pose: Pose, number: int) -> Picture:
+        """Return frame `number` with the drops on the windscreen at the pose's time, and with the sensor's noise."""
+        if self._windscreen is not None:
+            picture = self._windscreen.add_drops(picture, pose.mono_ns)
         self._add_noise(picture, number)
         return picture
 
@@ -177,17 +197,25 @@ class Renderer:
         With several `near_poses` the near ground is the mean of the views from them.
         """
         placement = place_camera(self._level_model, pose)
-        self._panorama.crop(placement.heading_rad, self._canvas[: self._bands[-1].first_row])
+        background = self._canvas[: self._bands[-1].first_row]
+        self._panorama.crop(placement.heading_rad, background)
+        if self._far_clearness < 1:
+            air = (1 - self._far_clearness) * self._haze_colour
+            background[:] = np.rint(self._far_clearness * background + air)
         blurred = len(near_poses) > 1
         homography = placement.ground_from_picture()
         for band in self._bands[_NEAR_BANDS if blurred else 0 :]:
             self._warp(band, placement, homography)
         if blurred:
             self._blur_near([place_camera(self._level_model, near_pose) for near_pose in near_poses])
+        if self._film is not None:
+            self._film.reflect(self._canvas, self._bands[-1].first_row)
         self._add_haze()
         picture = np.asarray(cv2.cvtColor(self._canvas, cv2.COLOR_BGRA2BGR), dtype=np.uint8)
         if self._scenery is not None:
             self._scenery.draw(placement, picture)
+        if self._headlights is not None:
+            picture = self._headlights.illuminate(picture)
         return picture if self._level_model is self._model else self._apply_roll(picture)
 
     def _warp(self, band: Band, placement: CameraPlacement, homography: FloatArray) -> None:
@@ -265,19 +293,27 @@ class Renderer:
     def _add_noise(self, picture: Picture, number: int) -> None:
         down, right = stream(self._seed, "sensor noise", number).integers(0, _NOISE_MARGIN_PX, 2).tolist()
         part = np.s_[down : down + self._model.height_px, right : right + self._model.width_px]
+        if self._headlights is not None:
+            deviation = self._headlights.noise_deviation(_NOISE_DEVIATION)[picture]
+            noise = _unit_noise(self._model)[part] * deviation
+            picture[:] = np.clip(np.rint(picture + noise), 0, 255)
+            return
         cv2.add(picture, self._positive_noise[part], picture)
         cv2.subtract(picture, self._negative_noise[part], picture)
 
 
 @lru_cache(maxsize=1)  # the tiles of one road take up to 221 MB
-def world(road: Road, scenery: SceneryKind, light_name: LightName) -> tuple[Ground, Scenery | None]:
+def world(
+    road: Road, scenery: SceneryKind, light_name: LightName, weather_name: WeatherName
+) -> tuple[Ground, Scenery | None]:
     """Return a road's ground and scenery, cached for consecutive runs of a sweep."""
-    light = LIGHTS[light_name]
+    weather = WEATHERS[weather_name]
+    light = weather.light(light_name)
     if scenery == "none":
-        return Ground(road, light, None), None
+        return Ground(road, light, None, weather), None
     objects = place_roadside_objects(road, full_scenery=scenery == "full")
     shadows = Shadows(objects, light, clouds=scenery == "full" and light.clouds_shade) if light.shadows else None
-    return Ground(road, light, shadows), Scenery(objects, light)
+    return Ground(road, light, shadows, weather), Scenery(objects, light, weather.haze_m)
 
 
 def _part_count(moved_px: float, limit: int) -> int:
@@ -294,21 +330,40 @@ def _interpolate_pose(begin: Pose, end: Pose, share: float) -> Pose:
     )
 
 
-def _haze(model: CameraModel, bands: tuple[Band, ...], colour: tuple[float, ...]) -> tuple[Picture, Picture]:
-    """Return the haze of the far rows: factor of colours (255ths) and added colour, (rows, columns, 4) each."""
+def _haze(model: CameraModel, bands: tuple[Band, ...], colour: Colour, weather: Weather) -> tuple[Picture, Picture]:
+    """Return the haze of the ground's first rows: factor of colours (255ths) and added colour, (rows, columns, 4) each.
+
+    In rain and fog these are all rows of the ground.
+    """
+    if weather.extinction_per_m:
+        distance_m = slant_distance_m(model)[bands[-1].first_row :]
+        return _haze_of_shares(1.0 - np.exp(-distance_m / weather.haze_m), colour)
     rows = np.arange(bands[-1].first_row, bands[1].first_row)
     angle_rad = np.arctan((rows - (model.height_px - 1) / 2) / model.focal_px) + model.pitch_rad
     depth_m = model.z_m / np.maximum(np.tan(angle_rad), 1e-6)
-    share = np.broadcast_to(
-        (1.0 - np.exp(-np.maximum(depth_m - _HAZE_BEGIN_M, 0.0) / HAZE_M))[:, None, None],
-        (len(rows), model.width_px, 4),
-    )
+    shares = 1.0 - np.exp(-np.maximum(depth_m - HAZE_BEGIN_M, 0.0) / HAZE_M)
+    return _haze_of_shares(np.broadcast_to(shares[:, None], (len(rows), model.width_px)), colour)
+
+
+def _haze_of_shares(shares: FloatArray, colour: Colour) -> tuple[Picture, Picture]:
+    """Return the factor of colours (255ths) and the added colour, (rows, columns, 4) each, of shares of haze."""
+    share = np.repeat(shares[..., None], 4, axis=2)
     added = share * np.array([*colour, 0.0])
     return np.rint(255.0 * (1 - share)).astype(np.uint8), np.rint(added).astype(np.uint8)
 
 
 def _noise(model: CameraModel) -> tuple[Picture, Picture]:
     """Return positive and negative sensor noise, both larger than a picture. Each frame uses a random part of them."""
-    size = (model.height_px + _NOISE_MARGIN_PX, model.width_px + _NOISE_MARGIN_PX, 3)
-    noise = np.rint(stream(0, "sensor noise bank").standard_normal(size) * _NOISE_DEVIATION)
+    noise = np.rint(_standard_normal(model) * _NOISE_DEVIATION)
     return np.clip(noise, 0, 255).astype(np.uint8), np.clip(-noise, 0, 255).astype(np.uint8)
+
+
+@lru_cache(maxsize=1)
+def _unit_noise(model: CameraModel) -> NDArray[np.float32]:
+    """Return noise of deviation 1, larger than a picture, for noise that depends on the brightness."""
+    return _standard_normal(model).astype(np.float32)
+
+
+def _standard_normal(model: CameraModel) -> FloatArray:
+    size = (model.height_px + _NOISE_MARGIN_PX, model.width_px + _NOISE_MARGIN_PX, 3)
+    return stream(0, "sensor noise bank").standard_normal(size)

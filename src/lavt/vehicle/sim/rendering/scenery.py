@@ -17,9 +17,7 @@ from lavt.vehicle.sim.rendering.light import Light
 from lavt.vehicle.sim.rendering.pinhole import CameraPlacement
 from lavt.vehicle.sim.rendering.roadside_objects import FAR_M, RoadsideObjects
 from lavt.vehicle.sim.rendering.sprites import TREE_WIDTH, Trees
-
-HAZE_M = 240.0
-"""At this distance 63 % of an object's colour is haze."""
+from lavt.vehicle.sim.rendering.weather import HAZE_M
 
 _NEAR_M = 0.4
 """Parts of faces that are closer to the camera than this distance are not drawn."""
@@ -36,7 +34,7 @@ Drawing = tuple[float, Callable[..., None], Any, Any]
 class Scenery:
     """The roadside objects of one road, in one light."""
 
-    def __init__(self, objects: RoadsideObjects, light: Light) -> None:
+    def __init__(self, objects: RoadsideObjects, light: Light, haze_m: float = HAZE_M) -> None:
         self._objects = objects
         faces, walls = objects.faces, objects.walls
         self._colours = faces.colours * light.upright_factors(faces.normals)
@@ -47,6 +45,7 @@ class Scenery:
         mirrored = np.sin(light.azimuth_rad - objects.tree_road_rad) < 0
         self._trees = np.column_stack([objects.trees, mirrored])
         self._haze = np.array(light.haze)
+        self._haze_m = haze_m
         self._sprites = Trees(light)
 
     def prepare(self) -> None:
@@ -104,7 +103,7 @@ class Scenery:
         inside = (heights_px >= 3) & (u_px > -reach_px) & (u_px < placement.model.width_px + reach_px)
         shapes = np.column_stack([u_px, v_px, heights_px, kinds, mirrored])[inside].tolist()
         depth = all_depths_m[inside]
-        haze = (1.0 - np.exp(-depth / HAZE_M)).tolist()
+        haze = (1.0 - np.exp(-depth / self._haze_m)).tolist()
         return zip(depth.tolist(), repeat(self._sprites.draw), shapes, haze)
 
     def _wall_drawings(self, placement: CameraPlacement) -> Iterable[Drawing]:
@@ -128,7 +127,7 @@ class Scenery:
         return zip(depth.tolist(), repeat(_facade), shapes, zip(*walls_and_glass, strict=True))
 
     def _add_haze(self, colours: FloatArray, depth_m: FloatArray) -> FloatArray:
-        share = (1.0 - np.exp(-depth_m / HAZE_M))[:, None]
+        share = (1.0 - np.exp(-depth_m / self._haze_m))[:, None]
         return np.asarray(np.minimum(np.rint(colours * (1 - share) + self._haze * share), 255.0))
 
 

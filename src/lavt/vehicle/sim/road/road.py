@@ -173,7 +173,7 @@ def _read_text(name: str) -> tuple[str, str]:
     except OSError as error:
         raise UserError(f"the road {name} cannot be read ({error.strerror}): name an existing file") from error
     except ValueError as error:  # bytes that are not text, or a path with a null character
-        raise UserError(f"the road {name} is not a text file: {error}") from error
+        raise UserError(f"the road {name} is not a text file ({error}): name a YAML file") from error
 
 
 def _resolve_part_of(source: str, part_of: str) -> str:

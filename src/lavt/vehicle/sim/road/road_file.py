@@ -184,7 +184,8 @@ def read_road_file(text: str, source: str) -> RoadFile | PartFile:
     except (yaml.YAMLError, ValueError, AttributeError, RecursionError) as error:
         raise UserError(f"{source} is not YAML: {' '.join(str(error).split())}") from error
     if not isinstance(data, dict):
-        raise UserError(f"{source} must contain keys and values, as docs/roads.md shows, not a {type(data).__name__}")
+        kind_name = type(data).__name__
+        raise UserError(f"{source} must have keys and values, not a {kind_name}: write them as in docs/roads.md")
     kind = PartFile if "part_of" in data else RoadFile
     try:
         road_file = kind.model_validate(data)

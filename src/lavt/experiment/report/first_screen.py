@@ -1,0 +1,106 @@
+"""The first screen of a report: what was run, the headline figure next to the replay, the findings, and a legend."""
+
+from __future__ import annotations
+
+from markupsafe import Markup
+
+from lavt.experiment.report import html_page
+from lavt.experiment.report.files import save_figure
+from lavt.experiment.report.groups import differing_settings, title_of
+from lavt.experiment.report.headline_figure import has_own_lane, headline_figure
+from lavt.experiment.report.sections import MAX_COMPARED_GROUPS, Parts, ReportContext
+from lavt.experiment.report.sentences import results_sentences, runs_overview
+from lavt.experiment.statistics.by_road import is_key_part
+from lavt.experiment.statistics.paper_results import REFERENCE
+
+VALIDITY = "Validity"
+"""The chapter with the reasons of invalid runs."""
+
+OWN_LANE = (
+    "the middle of the rear axle was in the lane of the route until its end, and the driver followed no other lane."
+)
+PRESETS = {
+    "paper_calibrated": "gains of the lane keeper, tuned by hand so that completion falls where it does in the "
+    "campaign of Khalil and Kwon (2026): the delay at which it falls is an input, not a finding.",
+    "designed": "gains of the lane keeper, found by theory alone.",
+}
+
+
+def first_parts(report: ReportContext, replay: Parts) -> Parts:
+    """Return the parts of the first screen; `replay` is the replay, if there is one."""
+    runs, failed = report.summary["runs"], report.summary.get("failed")
+    invalid = any(not run["valid"] for run in runs) or failed
+    link = ("See why.", html_page.chapter_anchor(VALIDITY)) if invalid else None
+    parts = [html_page.paragraph(runs_overview(runs), link=link)]
+    heroes = [*headline_parts(report), *replay]
+    if heroes:
+        parts.append(html_page.columns(heroes))
+    sentences = [sentence for sentence in _findings(report) if sentence]
+    if sentences:
+        parts.append(html_page.bullets(sentences))
+    return [*parts, _legend(report)]
+
+
+def _findings(report: ReportContext) -> list[str]:
+    names = differing_settings(report.groups)
+    compared = report.groups if 1 < len(report.groups) <= MAX_COMPARED_GROUPS else []
+    conditions_by_name = {f"Virtual time, {title_of(group, names)}": group["conditions"] for group in compared}
+    if "virtual" in report.kinds and not conditions_by_name:
+        conditions_by_name = {f"Virtual time{report.base_title()}": report.kinds["virtual"]}
+    if "real" in report.kinds:
+        conditions_by_name["Real time"] = report.kinds["real"]
+    return [results_sentences(name, conditions) for name, conditions in conditions_by_name.items()]
+
+
+def headline_parts(report: ReportContext) -> Parts:
+    """Return the headline figure; nothing if no condition has a loop latency and a completion."""
+    kinds = report.kinds
+    if not any(
+        entry["loop_ms"]["p50"] is not None and entry["completion_rate"] is not None
+        for conditions in kinds.values()
+        for entry in conditions.values()
+    ):
+        return []
+    paper = report.paper(report.summary["conditions"])
+    judged = "in their own lane" if has_own_lane(kinds) else "in any lane"
+    sentences = [
+        f"Runs completed {judged}, and P95 of the cross-track error of all runs, each up to its own end (mean over "
+        "roads). Bars are 95 % intervals; a single run has none.",
+        "Triangles are the paper's: its completion, in any lane, and its P95, at the sum of its two latencies."
+        * bool(paper),
+    ]
+    wide, narrow = (headline_figure(kinds, paper, report.colours, is_narrow=is_narrow) for is_narrow in (False, True))
+    alternative = "completion and error over loop latency"
+    caption = " ".join(filter(None, sentences))
+    return [save_figure(report.directory, "headline", wide, alternative, caption, narrow=narrow)]
+
+
+def _legend(report: ReportContext) -> Markup:
+    """Return the meanings of the names that this report uses."""
+    runs = report.summary["runs"]
+    delays = {str(run["condition"]): run.get("injected_ms") or {} for run in runs}
+    listed = ", ".join(
+        f"{name} {injected_ms['video']:g} + {injected_ms['control']:g}"
+        for name, injected_ms in sorted(delays.items())
+        if injected_ms.get("video") is not None and injected_ms.get("control") is not None
+    )
+    pairs = [
+        ("Condition", f"the delay that was injected into video + control, in ms: {listed}." if listed else ""),
+        ("Loop latency", "from a frame's stamp to the application of its command."),
+        ("τ video, τ control", "the one-way latencies of a frame and of a command."),
+        ("Own lane", OWN_LANE if has_own_lane(report.kinds) else ""),
+        *((name, meaning) for name, meaning in PRESETS.items() if any(run.get("preset") == name for run in runs)),
+        *_route_terms(sorted({str(run["route"]) for run in runs})),
+        ("The paper", REFERENCE if report.paper(report.summary["conditions"]) else ""),
+    ]
+    return html_page.terms([(term, meaning) for term, meaning in pairs if meaning])
+
+
+def _route_terms(routes: list[str]) -> list[tuple[str, str]]:
+    terms = []
+    if any(is_key_part(route) for route in routes):
+        name = next(route for route in routes if is_key_part(route))
+        terms.append((name, "the key part, mostly the curve, of the route without “_key”."))
+    if any(route.startswith("random_") for route in routes):
+        terms.append(("random_1, …", "random roads of one kind, by their number."))
+    return terms
