@@ -102,7 +102,7 @@ class Pair:
         return {"transport": {"link": {"tls": tls}}}
 
 
-@pytest.fixture(params=["plain", "secure"])
+@pytest.fixture(params=["plain", pytest.param("secure", marks=pytest.mark.full)])
 def pair(request: pytest.FixtureRequest, tmp_path: Path) -> Pair:
     if request.param == "plain":
         return Pair()
@@ -167,6 +167,7 @@ def messages(process: Process) -> str:
     return "\n".join(message for line in lines if line for message in line.get("said", []))
 
 
+@pytest.mark.full
 def test_a_client_outlives_a_killed_server(pair: Pair, tmp_path: Path) -> None:
     """If a server is killed with its router, the client continues without states, and gets control of the next one."""
     with Processes(tmp_path) as processes:
@@ -272,6 +273,7 @@ zenoh.open(config)
 """A program whose handshake makes a task of the other router panic."""
 
 
+@pytest.mark.full
 def test_a_peer_that_makes_zenoh_panic_harms_only_its_own_connection(tmp_path: Path) -> None:
     """A panic in the handshake with a peer ends neither the drive nor the server, and new connections are accepted."""
     pair = Pair()

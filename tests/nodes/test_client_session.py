@@ -54,7 +54,9 @@ def test_control_is_requested_every_second_until_driving() -> None:
     assert (request.operation, request.who, request.instance) == ("acquire", "alice", 7)
     assert session.take_request(100 + NS_PER_S - 1) is None
     session.handle_reply(REJECTED, 200)
-    assert (session.phase, session.reason, session.may_command) == ("seeking", REJECTED.reason, False)
+    assert (session.phase, session.reason) == ("seeking", REJECTED.reason)
+    assert not session.may_command
+    assert not session.has_control
     assert session.take_request(100 + NS_PER_S) is not None
     session.handle_reply(GRANTED, NS_PER_S)
     assert (session.phase, session.epoch, session.host, session.may_command) == ("arming", 5, "kernel", True)

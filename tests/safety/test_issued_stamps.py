@@ -53,7 +53,7 @@ def test_capture_time() -> None:
     assert [stamps.captured_ns(stamp_ns) for stamp_ns in (1, 2, 3, 4, 5)] == [90, 200, 200, 390, 500]
 
 
-@given(st.lists(st.tuples(st.integers(0, 20), st.integers(0, NS_PER_S)), max_size=60))
+@given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, MEMORY_NS)), max_size=60))
 def test_only_the_last_5_s_are_kept(frames: list[tuple[int, int]]) -> None:
     """For any sequence of stamps, exactly those of the last 5 s are kept and known."""
     stamps = IssuedStamps(MEMORY_NS, 5)

@@ -195,6 +195,7 @@ def test_the_runs_with_the_least_and_most_delay_are_shown(sweep: Path, tmp_path:
     assert least_and_most_delayed([none, none]) == []
 
 
+@pytest.mark.full
 def test_a_report_is_byte_for_byte_reproducible(sweep: Path) -> None:
     """A second report of the same runs, from drives that are already read, has the same bytes in each file.
 

@@ -94,6 +94,7 @@ def count_renderers() -> int:
     return sum(type(thing) is Renderer for thing in gc.get_objects())
 
 
+@pytest.mark.full
 def test_a_finished_run_leaves_no_painted_world(tmp_path: Path) -> None:
     """After a run with pictures, its renderer with the painted ground is freed without waiting for Python's search."""
     short = planned("fidelity=pixels", "vehicle.scenery=none", "vehicle.time_limit_s=1")

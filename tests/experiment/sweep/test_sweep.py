@@ -92,6 +92,7 @@ def test_resuming_drives_only_missing_runs(resumed: ResumedSweep) -> None:
     assert resumed.after["conditions"] == resumed.before["conditions"]
 
 
+@pytest.mark.full
 def test_the_speed_is_that_of_the_last_drives(sweep_folder: Path, resumed: ResumedSweep) -> None:
     """A resumed sweep's speed includes only the runs that it drove; if it drove no run, the speed is kept."""
     speed = resumed.after["speed"]

@@ -435,6 +435,7 @@ def test_bus_gone(generation: int) -> None:
     assert (state.is_engaged, state.inhibit_reason) == (False, "can0 is down")
     assert rig.run_until_released_ms(cut_ns) == 100
     assert last_sent_ns(rig) == cut_ns
+    assert rig.adapter.next_wake_ns() > rig.now_ns + NS_PER_MS, "the adapter spins while nothing can be sent"
     rig.is_cut = False
     rig.run_ms(500, step_ms=COARSE_MS)
     assert rig.state == "lost"

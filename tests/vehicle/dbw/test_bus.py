@@ -178,6 +178,18 @@ def test_take_reads_the_frames_that_wait(open_port: Callable[..., CanPort], monk
     assert [received.frame for received in other.take(0)] == [STEERING, BRAKE]
 
 
+def test_take_does_not_wait_for_the_ports_thread(open_port: Callable[..., CanPort]) -> None:
+    """`take` returns what has been read already while the port's thread reads."""
+    port = open_port("udp_multicast", GROUP, port=free_port())
+    bus = port._bus
+    assert bus is not None
+    with bus.read_lock:
+        taking = threading.Thread(target=port.take, args=(0,), daemon=True)
+        taking.start()
+        taking.join(DEADLINE_S)
+        assert not taking.is_alive()
+
+
 def test_a_frame_behind_a_flood_of_garbage_keeps_its_time(
     open_port: Callable[..., CanPort], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -724,6 +736,8 @@ def test_a_port_closes_whatever_the_wall_clock_does(monkeypatch: pytest.MonkeyPa
     before_ns = now_ns()
     port.close()
     assert now_ns() - before_ns < 5 * NS_PER_S
+    with pytest.raises(BusGone):
+        port.send([STEERING], now_ns())
     assert port._thread.is_alive() == (interface == "virtual")
     if interface == "virtual":  # its thread waits for a frame
         with can.Bus(interface="virtual", channel=GROUP, ignore_config=True) as other:

@@ -198,7 +198,8 @@ INHIBITED: list[tuple[Callable[[Attempt], object], str]] = [
     (lambda attempt: attempt.kit.set_fault("steering.fault", START_NS), "the steering has a fault"),
     (lambda attempt: attempt.kit.inhibit("door", START_NS), "a door is open"),
     (lambda attempt: attempt.kit.switch_remote(1, START_NS), "RemoteReport has STATE pause"),
-    (lambda attempt: attempt.test.receive(CanFrame(0x201, bytes(8)), START_NS), "another sender"),
+    (lambda attempt: attempt.test.receive(CanFrame(0x201, bytes(8)), START_NS), "leave the bus to this program"),
+    (lambda attempt: attempt.test.receive(CanFrame(0x216, bytes(2)), START_NS), "leave the bus to this program"),
     (lambda attempt: attempt.test.on_bus_gone("pulled out"), "pulled out"),
 ]
 
