@@ -58,8 +58,7 @@ def headline_figure(
                 axes.plot([point.x for point in path], [point.y for point in path], **style)
             for point in points:
                 draw_point(axes, point, PAPER_MARKER if kind == "paper" else marker(kind, colours[point.name]))
-            if kind != "paper":
-                _write_names(axes, points, kind)
+            _write_names(axes, points, kind)
     tidy(completion, "", f"completed{' in own lane' if own_lane else ''} (%)")
     tidy(error, "loop latency, median (ms)", "P95 cross-track error (m)")
     completion.set_ylim(-14, 109)
