@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -15,9 +16,16 @@ SCRIPT = Path(__file__).parent / "support" / "other_system.py"
 REPOSITORY = SCRIPT.parents[2]
 
 
-def run_elsewhere(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, str(SCRIPT), *arguments]
-    return subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False, timeout=900)
+def run_elsewhere(*arguments: str, like: str = "windows") -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, str(SCRIPT), *arguments],
+        cwd=REPOSITORY,
+        env={**os.environ, "LAVT_LIKE": like},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=900,
+    )
 
 
 def test_here_nothing_is_missing() -> None:
@@ -25,18 +33,25 @@ def test_here_nothing_is_missing() -> None:
     assert missing_in_real_time() == ""
 
 
-def test_all_modules_can_be_imported() -> None:
+@pytest.mark.parametrize("like", ["windows", "macos"])
+def test_all_modules_can_be_imported(like: str) -> None:
     """No module needs one of the names when it is imported."""
-    completed = run_elsewhere()
+    completed = run_elsewhere(like=like)
     assert completed.returncode == 0, completed.stderr
 
 
 @pytest.mark.parametrize(
-    "arguments", [["server"], ["can", "check"], ["run", "configs/demo.yaml", "--set", "time=real"]], ids=" ".join
+    ("arguments", "like"),
+    [
+        (["server"], "macos"),
+        (["keys"], "windows"),
+        (["run", "configs/demo.yaml", "--set", "time=real"], "windows"),
+    ],
 )
-def test_real_time_is_rejected(arguments: list[str], tmp_path: Path) -> None:
-    """A command that needs real time says so in one sentence, and what to do, with exit code 2."""
-    completed = run_elsewhere(*arguments, *(["--out", str(tmp_path / "out")] if arguments[0] == "run" else []))
+def test_real_time_is_rejected(arguments: list[str], like: str, tmp_path: Path) -> None:
+    """A command that needs Linux says so in one sentence, and what to do, with exit code 2."""
+    out = ["--out", str(tmp_path / "out")] if arguments[0] == "run" else []
+    completed = run_elsewhere(*arguments, *out, like=like)
     assert completed.returncode == 2
     [line] = completed.stderr.splitlines()
     assert "needs Linux (this system has no time.CLOCK_BOOTTIME): use a machine with Linux" in line

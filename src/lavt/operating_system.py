@@ -18,6 +18,8 @@ from lavt.errors import UserError
 HANGUP: Final[tuple[signal.Signals, ...]] = (signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ()
 """The signal of a closed terminal, where there is one."""
 
+CAN_BLOCK_SIGNALS: Final = hasattr(signal, "pthread_sigmask")
+
 NEEDED_IN_REAL_TIME: Final[tuple[tuple[ModuleType, str], ...]] = (
     (time, "CLOCK_BOOTTIME"),
     (signal, "pthread_sigmask"),

@@ -1,7 +1,7 @@
-"""Run `lavt` as on a system that lacks what only Linux has: modules and names of Python's library are taken away.
+"""Run `lavt` as on macOS or Windows, which lack what only Linux has: names of Python's library are taken away.
 
-    python tests/support/other_system.py run configs/demo.yaml ...
-    python tests/support/other_system.py                            # only import all modules
+    LAVT_LIKE=windows python tests/support/other_system.py run configs/demo.yaml ...
+    LAVT_LIKE=macos python tests/support/other_system.py                                # only import all modules
 
 This is no other system: the rest of Python's library still behaves as on Linux.
 """
@@ -24,21 +24,29 @@ import cv2  # noqa: F401 (libraries may use the names that are taken away)
 import numpy as np  # noqa: F401
 import zenoh  # noqa: F401
 
-MODULES = ("fcntl", "resource", "termios", "pwd", "grp", "pty", "tty")
-NAMES = {
-    os: "setpriority getpriority PRIO_PROCESS sched_getaffinity sched_setaffinity killpg setsid getuid geteuid getsid",
-    signal: "SIGHUP SIGUSR1 SIGUSR2 SIGCONT SIGSTOP SIGTTIN SIGALRM pthread_sigmask SIG_BLOCK SIG_UNBLOCK SIG_SETMASK",
-    socket: "MSG_DONTWAIT AF_CAN AF_NETLINK AF_PACKET SO_BINDTODEVICE",
-    time: "CLOCK_BOOTTIME CLOCK_MONOTONIC_RAW clock_gettime_ns",
+NOT_ON_MACOS = {
+    os: "sched_getaffinity sched_setaffinity sched_setscheduler",
+    socket: "AF_CAN AF_NETLINK AF_PACKET SO_BINDTODEVICE",
+    time: "CLOCK_BOOTTIME",
 }
+NOT_ON_WINDOWS = {
+    os: "setpriority getpriority PRIO_PROCESS killpg setsid getuid geteuid getsid",
+    signal: "SIGHUP SIGUSR1 SIGUSR2 SIGCONT SIGSTOP SIGTTIN SIGALRM pthread_sigmask SIG_BLOCK SIG_UNBLOCK SIG_SETMASK",
+    socket: "MSG_DONTWAIT",
+    time: "CLOCK_MONOTONIC_RAW clock_gettime_ns",
+}
+NO_MODULES_ON_WINDOWS = ("fcntl", "resource", "termios", "pwd", "grp", "pty", "tty")
+IS_LIKE_WINDOWS = os.environ["LAVT_LIKE"] == "windows"
 
-for module, names in NAMES.items():
-    for name in names.split():
-        if hasattr(module, name):
-            delattr(module, name)
-for name in MODULES:
-    sys.modules[name] = cast(ModuleType, None)  # then an import of it fails
-multiprocessing.resource_tracker._HAVE_SIGMASK = False  # type: ignore[attr-defined]
+for missing in (NOT_ON_MACOS, NOT_ON_WINDOWS) if IS_LIKE_WINDOWS else (NOT_ON_MACOS,):
+    for module, names in missing.items():
+        for name in names.split():
+            if hasattr(module, name):
+                delattr(module, name)
+if IS_LIKE_WINDOWS:
+    for name in NO_MODULES_ON_WINDOWS:
+        sys.modules[name] = cast(ModuleType, None)  # then an import of it fails
+    multiprocessing.resource_tracker._HAVE_SIGMASK = False  # type: ignore[attr-defined]
 
 if __name__ == "__main__":
     if len(sys.argv) > 1:

@@ -63,7 +63,7 @@ module of a command has its name, with `_` for `-`."""
 COMMANDS = {command: summary for group in GROUPS.values() for command, summary in group.items()}
 """All commands."""
 
-ON_ANY_SYSTEM = {"demo", "run", "replay", "sweep", "boundary", "report", "join", "keys", "road", "perception"}
+ON_ANY_SYSTEM = {"demo", "run", "replay", "sweep", "boundary", "report", "join", "road", "perception"}
 """The commands that do something without real time, and so on other systems than Linux."""
 
 

@@ -19,11 +19,10 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from lavt.errors import WorkError, describe_error
-from lavt.operating_system import HANGUP
+from lavt.operating_system import CAN_BLOCK_SIGNALS, HANGUP
 
 TERMINAL_SIGNALS = (signal.SIGINT, *HANGUP)
 """The signals that Ctrl-C and the closing of a terminal send."""
-CAN_BLOCK_SIGNALS = hasattr(signal, "pthread_sigmask")
 
 
 @contextmanager
