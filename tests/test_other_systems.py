@@ -33,7 +33,7 @@ def test_here_nothing_is_missing() -> None:
     assert missing_in_real_time() == ""
 
 
-@pytest.mark.parametrize("like", ["windows", "macos"])
+@pytest.mark.parametrize("like", ["windows", pytest.param("macos", marks=pytest.mark.full)])
 def test_all_modules_can_be_imported(like: str) -> None:
     """No module needs one of the names when it is imported."""
     completed = run_elsewhere(like=like)
