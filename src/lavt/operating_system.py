@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import signal
 import socket
-import time  # noqa: TID251 (only whether a clock exists)
 from types import ModuleType
 from typing import Final
 
@@ -21,13 +20,11 @@ HANGUP: Final[tuple[signal.Signals, ...]] = (signal.SIGHUP,) if hasattr(signal, 
 CAN_BLOCK_SIGNALS: Final = hasattr(signal, "pthread_sigmask")
 
 NEEDED_IN_REAL_TIME: Final[tuple[tuple[ModuleType, str], ...]] = (
-    (time, "CLOCK_BOOTTIME"),
+    (os, "sched_getaffinity"),
     (signal, "pthread_sigmask"),
     (socket, "MSG_DONTWAIT"),
-    (os, "sched_getaffinity"),
-    (os, "setsid"),
 )
-"""Names of Python's library that exist on Linux, and of which every other system lacks at least one."""
+"""Names of Python's library that exist on Linux. macOS lacks the first, Windows all of them."""
 
 
 def missing_in_real_time() -> str:
