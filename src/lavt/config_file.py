@@ -73,7 +73,7 @@ def build_config(kind: type[Config], data: dict[str, Any], changes: Iterable[str
 def read_yaml(path: Path) -> dict[str, Any]:
     """Read a YAML file that contains a mapping; raise `UserError` for any other file."""
     try:
-        text = path.read_text()
+        text = path.read_text(encoding="utf-8")
     except OSError as error:
         raise UserError(f"{path} cannot be read ({error.strerror}): name an existing file") from error
     except UnicodeDecodeError as error:

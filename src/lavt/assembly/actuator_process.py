@@ -25,6 +25,7 @@ from lavt.config import ServerConfig
 from lavt.domain import NS_PER_S
 from lavt.errors import UserError, WorkError
 from lavt.nodes.payloads import Event
+from lavt.operating_system import HANGUP
 from lavt.runtime import process_priority
 from lavt.runtime.output import queue_output
 from lavt.runtime.realtime import RealRuntime
@@ -41,7 +42,7 @@ brakes for at least 8 s."""
 POLL_PERIOD_S = 0.05
 KILL_AFTER_S = 13
 """This many seconds after the server's end, an alarm kills the actuator's process, even if its node is stuck."""
-IGNORED_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+IGNORED_SIGNALS = (signal.SIGINT, signal.SIGTERM, *HANGUP)
 """Signals that all processes of a terminal or service receive. The server's process handles them; this process detects
 that the server's process ends."""
 THREAD_STACK_BYTES = 2 << 20

@@ -57,7 +57,7 @@ def read_trace(name: str) -> Trace:
     try:
         if path.stat().st_size > MAX_TRACE_BYTES:
             raise UserError(f"the trace {path} is larger than {MAX_TRACE_BYTES} bytes: shorten it")
-        text = path.read_text()
+        text = path.read_text(encoding="utf-8")
     except OSError as error:
         raise UserError(f"the trace {path} cannot be read ({error.strerror}): name another file") from error
     except UnicodeDecodeError as error:

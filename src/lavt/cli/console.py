@@ -16,6 +16,7 @@ from typing import Annotated, Any
 import typer
 
 from lavt.errors import LavtError, UserError, WorkError
+from lavt.operating_system import HANGUP
 from lavt.runtime.output import queue_output
 
 OutOption = Annotated[Path | None, typer.Option(help="Output directory.")]
@@ -157,7 +158,7 @@ def _signal_handlers(handler: Callable[..., None], *signals: signal.Signals) -> 
 
     SIGHUP stays ignored if it was ignored before, as under `nohup`.
     """
-    hangup = [] if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN else [signal.SIGHUP]
+    hangup = [number for number in HANGUP if signal.getsignal(number) != signal.SIG_IGN]
     former_handlers = {number: signal.signal(number, handler) for number in (*signals, *hangup)}
     try:
         yield

@@ -19,6 +19,7 @@ from lavt.config_file import load_config, parse_config, shipped
 from lavt.experiment.analysis.results import read_json
 from lavt.experiment.runs.plan import plan_run, plan_sweep
 from lavt.experiment.runs.run import run_once
+from lavt.operating_system import missing_in_real_time
 from lavt.recording.output_directory import prepare_directory
 
 if TYPE_CHECKING:
@@ -54,7 +55,10 @@ def demo(out: console.OutOption = None, as_json: console.JsonOption = False) -> 
     config = shipped("configs/demo.yaml")
     prepare_directory(out)
     with console.interruptible():
-        _drive_real(config, out)
+        if missing := missing_in_real_time():
+            console.print_message(f"the part in real time needs Linux (this system has no {missing}), and is left out")
+        else:
+            _drive_real(config, out)
         sweep_result, speed = _drive_virtual(config, out)
     from lavt.experiment.report.report import write_report  # noqa: PLC0415 (slow: scipy, matplotlib)
 

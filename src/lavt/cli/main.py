@@ -8,7 +8,7 @@ memory (`benchmarks/start.py`, medians of five rounds).
 from __future__ import annotations
 
 import sys
-from collections.abc import Container
+from collections.abc import Container, Sequence
 from importlib import import_module
 from typing import Annotated, Any
 
@@ -18,6 +18,7 @@ from typer.core import TyperGroup
 import lavt
 from lavt.cli import console
 from lavt.errors import WorkError
+from lavt.operating_system import require_real_time
 from lavt.runtime.parent_watch import end_with_parent
 
 GROUPS = {
@@ -62,6 +63,9 @@ module of a command has its name, with `_` for `-`."""
 
 COMMANDS = {command: summary for group in GROUPS.values() for command, summary in group.items()}
 """All commands."""
+
+ON_ANY_SYSTEM = {"demo", "run", "replay", "sweep", "boundary", "report", "join", "road", "perception"}
+"""The commands that do something without real time, and so on other systems than Linux."""
 
 
 class GroupedHelp(TyperGroup):
@@ -116,6 +120,12 @@ def global_options(
 def main() -> None:
     """Run the command line and exit with the command's exit code."""
     end_with_parent()
-    words = sys.argv[1:]
+    console.run_command(lambda: _run(sys.argv[1:]))
+
+
+def _run(words: Sequence[str]) -> None:
     is_plain = bool(words) and words[0] in COMMANDS
-    console.run_command(build_app(words[:1] if is_plain else words, has_all=not is_plain))
+    app = build_app(words[:1] if is_plain else words, has_all=not is_plain)
+    if is_plain and words[0] not in ON_ANY_SYSTEM and "--help" not in words:
+        require_real_time(f"lavt {words[0]}")
+    app()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import mmap
 import os
-import resource
 from typing import Final
 
 MCL_CURRENT: Final = 1
@@ -39,6 +38,8 @@ def lift_lock_limit() -> str:
 
     Under a limit, memory is better not locked: each allocation beyond it would fail.
     """
+    import resource  # noqa: PLC0415 (not on every system)
+
     limit_bytes, hard_limit_bytes = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     try:
         resource.setrlimit(resource.RLIMIT_MEMLOCK, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))

@@ -68,6 +68,13 @@ def test_the_degradation_figure_has_all_intervals_and_names() -> None:
     assert point_names(error) == ["L3", "L4", "L2", "L4\nL3", "L2"]
 
 
+def test_a_single_run_has_no_interval() -> None:
+    """One run for each condition is an example: its points have no bars."""
+    single = {name: {**condition, "runs": 1} for name, condition in CONDITIONS.items()}
+    completion, _ = degradation_figure({"virtual": single}, {}, COLOURS).axes
+    assert error_bars(completion) == []
+
+
 def test_conditions_with_overlapping_points_are_named() -> None:
     """The comparison of groups names conditions whose markers overlap."""
     completion, error = presets_figure({"one": CONDITIONS, "other": {"L2": CONDITIONS["L2"]}}, COLOURS).axes

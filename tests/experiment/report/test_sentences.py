@@ -29,7 +29,25 @@ def test_the_results_name_the_largest_fall_of_completion() -> None:
     text = results_sentences("Virtual time", conditions(1.0, 1.0, 0.8, 0.3, 0.3, 0.0))
     assert "L2 80 % (222 ms), L3 30 % (297 ms)" in text
     assert "80 % at L2 to 30 % at L3, between 222 and 297 ms" in text
-    assert "At 297 ms and above, fewer than half" in text
+    assert "At 297 ms, and at each longer latency, fewer than half" in text
+
+
+def test_equal_falls_are_all_named() -> None:
+    """If two falls are the largest, both are named."""
+    text = results_sentences("Virtual time", conditions(1.0, 0.5, 0.5, 0.0))
+    assert "from 100 % at L0 to 50 % at L1, between 72 and 147 ms" in text
+    assert ", and from 50 % at L2 to 0 % at L3, between 222 and 297 ms" in text
+
+
+def test_the_error_is_that_of_the_headline_figure() -> None:
+    """If the error of all runs is known, it is named; else that of the completed runs."""
+    known = conditions(1.0, 0.5)
+    assert "of the completed runs (mean) is 0.10 m at L0 and 0.10 m at L1" in results_sentences("It", known)
+    for name, mean_m in (("L0", 0.05), ("L1", 5.5)):
+        known[name]["by_road"] = {"p95_all_runs_m": {"mean": mean_m}}
+    assert "of all runs, each up to its own end (mean over roads) is 0.05 m at L0 and 5.50 m at L1" in (
+        results_sentences("It", known)
+    )
 
 
 def test_no_fall_is_reported_if_there_is_none() -> None:
@@ -51,7 +69,7 @@ def test_many_routes_and_conditions_are_counted() -> None:
 def test_conditions_with_equal_loop_latency_are_sorted_by_name() -> None:
     """Conditions whose loop latencies differ by at most 3 ms are treated as equally slow.
 
-    This rule also applies to the sentence "At ... ms and above, fewer than half".
+    This rule also applies to the sentence "At ... ms, fewer than half".
     """
     rates = {"L2": (222.5, 0.9), "L3": (297.6, 0.53), "L4": (297.4, 0.47), "L5": (397.3, 0.1)}
     conditions = {
@@ -61,9 +79,9 @@ def test_conditions_with_equal_loop_latency_are_sorted_by_name() -> None:
     text = results_sentences("Virtual time", conditions)
     assert "L3 53 % (298 ms), L4 47 % (297 ms), L5 10 % (397 ms)" in text
     assert "90 % at L2 to 47 % at L4, between 222 and 297 ms" in text
-    assert "At 397 ms and above, fewer than half" in text
+    assert "At 397 ms, the longest latency, fewer than half" in text
     conditions["L3"]["completion_rate"] = 0.49
-    assert "At 297 ms and above, fewer than half" in results_sentences("Virtual time", conditions)
+    assert "At 297 ms, and at each longer latency, fewer than half" in results_sentences("Virtual time", conditions)
 
 
 def test_a_fall_is_between_two_latencies() -> None:
@@ -91,8 +109,9 @@ def test_single_runs_are_an_example() -> None:
 def test_completion_is_judged_in_the_own_lane() -> None:
     """If it is known, the completion in the own lane counts, not that in any lane."""
     known = {name: {**value, "own_lane_completion_rate": 0.0} for name, value in conditions(1.0, 1.0).items()}
-    assert "in their own lane by condition, with the median loop latency: L0 0 % (72 ms)" in results_sentences(
-        "It", known
+    assert (
+        "in their own lane by condition (30 runs each), with the median loop latency: L0 0 % (72 ms)"
+        in results_sentences("It", known)
     )
     known["L0"]["own_lane_completion_rate"] = None
     assert "Runs completed by condition" in results_sentences("It", known)

@@ -54,6 +54,22 @@ class FigurePoint(NamedTuple):
     interval: Sequence[float] | None
 
 
+def shown_interval(
+    entry: Mapping[str, Any], interval: Sequence[float] | None, scale: float = 1.0
+) -> list[float] | None:
+    """Return the interval multiplied by `scale`; nothing for a single run, which is an example."""
+    return [bound * scale for bound in interval] if interval and entry.get("runs") != 1 else None
+
+
+def draw_point(axes: Axes, point: FigurePoint, style: Mapping[str, Any]) -> None:
+    """Draw a point, with its interval if it has one."""
+    bars = None
+    if point.interval is not None:
+        low, high = point.interval
+        bars = [[max(point.y - low, 0.0)], [max(high - point.y, 0.0)]]
+    axes.errorbar(point.x, point.y, yerr=bars, capsize=3, linestyle="none", elinewidth=1, **style)
+
+
 def condition_colours(names: Iterable[str]) -> dict[str, Any]:
     """Return a distinct colour for each condition, for use in every figure of a report."""
     ordered = sorted(set(names))

@@ -16,6 +16,11 @@ from lavt.experiment.statistics.paper_results import REFERENCE
 VALIDITY = "Validity"
 """The chapter with the reasons of invalid runs."""
 
+WHAT_IT_IS = (
+    "LAVT (Latency-Aware Vision Teleoperation) drives a car from its video over a network, delays the video and the "
+    "commands, and measures how driving degrades."
+)
+WITHOUT_PICTURES = " Runs without pictures (fidelity geometry) get the lane without an error of detection."
 OWN_LANE = (
     "the middle of the rear axle was in the lane of the route until its end, and the driver followed no other lane."
 )
@@ -31,7 +36,8 @@ def first_parts(report: ReportContext, replay: Parts) -> Parts:
     runs, failed = report.summary["runs"], report.summary.get("failed")
     invalid = any(not run["valid"] for run in runs) or failed
     link = ("See why.", html_page.chapter_anchor(VALIDITY)) if invalid else None
-    parts = [html_page.paragraph(runs_overview(runs), link=link)]
+    overview = runs_overview(runs) + WITHOUT_PICTURES * any(run.get("fidelity") == "geometry" for run in runs)
+    parts = [html_page.paragraph(f"{WHAT_IT_IS} This page: {overview}", link=link)]
     heroes = [*headline_parts(report), *replay]
     if heroes:
         parts.append(html_page.columns(heroes))
@@ -66,7 +72,7 @@ def headline_parts(report: ReportContext) -> Parts:
     sentences = [
         f"Runs completed {judged}, and P95 of the cross-track error of all runs, each up to its own end (mean over "
         "roads). Bars are 95 % intervals; a single run has none.",
-        "Triangles are the paper's: its completion, in any lane, and its P95, at the sum of its two latencies."
+        "Grey triangles are the paper's: its completion, in any lane, and its P95, at the sum of its two latencies."
         * bool(paper),
     ]
     wide, narrow = (headline_figure(kinds, paper, report.colours, is_narrow=is_narrow) for is_narrow in (False, True))
@@ -86,7 +92,9 @@ def _legend(report: ReportContext) -> Markup:
     )
     pairs = [
         ("Condition", f"the delay that was injected into video + control, in ms: {listed}." if listed else ""),
-        ("Loop latency", "from a frame's stamp to the application of its command."),
+        ("Virtual time", "the same programs on a simulated clock." * ("virtual" in report.kinds)),
+        ("Loop latency", "from a frame's stamp (its send time) to the application of its command."),
+        ("P95", "95 % of the time, the rear axle was closer to the centre of the route's lane."),
         ("τ video, τ control", "the one-way latencies of a frame and of a command."),
         ("Own lane", OWN_LANE if has_own_lane(report.kinds) else ""),
         *((name, meaning) for name, meaning in PRESETS.items() if any(run.get("preset") == name for run in runs)),
@@ -100,7 +108,7 @@ def _route_terms(routes: list[str]) -> list[tuple[str, str]]:
     terms = []
     if any(is_key_part(route) for route in routes):
         name = next(route for route in routes if is_key_part(route))
-        terms.append((name, "the key part, mostly the curve, of the route without “_key”."))
+        terms.append((name, f"the key part, mostly the curve, of a longer route “{name.removesuffix('_key')}”."))
     if any(route.startswith("random_") for route in routes):
-        terms.append(("random_1, …", "random roads of one kind, by their number."))
+        terms.append(("random_1, …", "random roads of the same kind and of different lengths, by their number."))
     return terms

@@ -15,11 +15,13 @@ from lavt.experiment.report.figure_style import (
     Conditions,
     FigurePoint,
     clusters_of,
+    draw_point,
     kind_handles,
     legend_below,
     marker,
     name_style,
     new_figure,
+    shown_interval,
     tidy,
 )
 from lavt.experiment.report.latency_figures import PAPER_MARKER
@@ -55,9 +57,8 @@ def headline_figure(
                 style = {"color": "0.7", "linewidth": 1, "zorder": 0, "linestyle": ":" if kind == "paper" else "-"}
                 axes.plot([point.x for point in path], [point.y for point in path], **style)
             for point in points:
-                _draw(axes, point, PAPER_MARKER if kind == "paper" else marker(kind, colours[point.name]))
-            if kind != "paper":
-                _write_names(axes, points, kind)
+                draw_point(axes, point, PAPER_MARKER if kind == "paper" else marker(kind, colours[point.name]))
+            _write_names(axes, points, kind)
     tidy(completion, "", f"completed{' in own lane' if own_lane else ''} (%)")
     tidy(error, "loop latency, median (ms)", "P95 cross-track error (m)")
     completion.set_ylim(-14, 109)
@@ -76,7 +77,7 @@ def _completions(conditions: Conditions, own_lane: bool) -> list[FigurePoint]:
         prefix = "own_lane_" if own_lane and "own_lane_completion_rate" in entry else ""
         rate, interval = entry[f"{prefix}completion_rate"], entry[f"{prefix}completion_interval"]
         if rate is not None and _loop_ms(entry) is not None:
-            points.append(FigurePoint(name, _loop_ms(entry) or 0.0, 100 * rate, _shown(entry, interval, 100.0)))
+            points.append(FigurePoint(name, _loop_ms(entry) or 0.0, 100 * rate, shown_interval(entry, interval, 100.0)))
     return points
 
 
@@ -90,7 +91,7 @@ def _errors(conditions: Conditions) -> list[FigurePoint]:
             value_m = all_runs["mean"]
             interval = None if all_runs["low"] is None else (all_runs["low"], all_runs["high"])
         if value_m is not None and _loop_ms(entry) is not None:
-            points.append(FigurePoint(name, _loop_ms(entry) or 0.0, value_m, _shown(entry, interval, 1.0)))
+            points.append(FigurePoint(name, _loop_ms(entry) or 0.0, value_m, shown_interval(entry, interval, 1.0)))
     return points
 
 
@@ -100,19 +101,6 @@ def _loop_ms(entry: Mapping[str, Any]) -> float | None:
         return float(entry["tau_v_ms"] + entry["tau_c_ms"])
     median_ms: float | None = entry["loop_ms"]["p50"]
     return median_ms
-
-
-def _shown(entry: Mapping[str, Any], interval: Sequence[float] | None, scale: float) -> list[float] | None:
-    """Return the interval multiplied by `scale`; nothing for a single run, which is an example."""
-    return [bound * scale for bound in interval] if interval and entry["runs"] > 1 else None
-
-
-def _draw(axes: Axes, point: FigurePoint, style: Mapping[str, Any]) -> None:
-    bars = None
-    if point.interval is not None:
-        low, high = point.interval
-        bars = [[max(point.y - low, 0.0)], [max(high - point.y, 0.0)]]
-    axes.errorbar(point.x, point.y, yerr=bars, capsize=3, linestyle="none", elinewidth=1, **style)
 
 
 def _write_names(axes: Axes, points: Sequence[FigurePoint], kind: str) -> None:

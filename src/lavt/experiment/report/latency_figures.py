@@ -20,11 +20,13 @@ from lavt.experiment.report.figure_style import (
     Conditions,
     FigurePoint,
     clusters_of,
+    draw_point,
     kind_handles,
     legend_below,
     marker,
     name_style,
     new_figure,
+    shown_interval,
     tidy,
 )
 
@@ -69,10 +71,10 @@ def degradation_figure(kinds: Mapping[str, Conditions], paper: Conditions, colou
             }
             for axes, points in shown.items():
                 for point in points:
-                    _draw(axes, point, PAPER_MARKER if kind == "paper" else marker(kind, colours[point.name]))
+                    draw_point(axes, point, PAPER_MARKER if kind == "paper" else marker(kind, colours[point.name]))
                 named_points.append((axes, kind, points))
             for point in _points(conditions, latency, "p95_common_m", "p95_common_interval"):
-                _draw(error, point, {**DIAMOND, "color": colours[point.name], "zorder": 4})
+                draw_point(error, point, {**DIAMOND, "color": colours[point.name], "zorder": 4})
         completion.margins(x=0.16)
         error.margins(x=0.16)
         tidy(completion, "", "runs completed (%)" if column == 0 else "")
@@ -111,23 +113,13 @@ def _points(
     for name, entry in conditions.items():
         x, y, interval = (entry.get(key) or {}).get(part), entry.get(y_key), entry.get(interval_key)
         if x is not None and y is not None:
-            scaled_interval = [bound * scale for bound in interval] if interval else None
-            points.append(FigurePoint(name, x, y * scale, scaled_interval))
+            points.append(FigurePoint(name, x, y * scale, shown_interval(entry, interval, scale)))
     return points
 
 
 def _with_totals(paper: Conditions) -> Conditions:
     """Return the paper's conditions with the sum of both one-way latencies as loop latency."""
     return {name: {**entry, "loop_ms": {"p50": entry["tau_v_ms"] + entry["tau_c_ms"]}} for name, entry in paper.items()}
-
-
-def _draw(axes: Axes, point: FigurePoint, style: Mapping[str, Any]) -> None:
-    """Draw a point, with its interval if it has one."""
-    bar_lengths = None
-    if point.interval is not None:
-        low, high = point.interval
-        bar_lengths = [[max(point.y - low, 0)], [max(high - point.y, 0)]]
-    axes.errorbar(point.x, point.y, yerr=bar_lengths, capsize=3, linestyle="none", elinewidth=1, **style)
 
 
 def _write_names(axes: Axes, clusters: Sequence[Sequence[FigurePoint]], kind: str) -> None:

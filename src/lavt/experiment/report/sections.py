@@ -164,9 +164,8 @@ def degradation_parts(report: ReportContext) -> Parts:
     caption = (
         "Completion and error over the median loop latency (from a frame's stamp to the application of its command), "
         "and over the mean frame age (the age of the frame from which the command in force was made). Bars are 95 % "
-        "intervals for these routes. Names above each other are in the vertical order of their points."
-        + (PAPER_POINTS if paper else "")
-        + _base_note(report)
+        "intervals for these routes; a single run has none. Names above each other are in the vertical order of their "
+        "points." + (PAPER_POINTS if paper else "") + _base_note(report)
     )
     figure = degradation_figure(report.kinds, paper, report.colours)
     return [save_figure(report.directory, "degradation", figure, "completion and error over latency", caption)]

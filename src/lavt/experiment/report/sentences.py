@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from itertools import groupby, pairwise, product
 from typing import Any, NamedTuple
@@ -87,17 +88,29 @@ def results_sentences(name: str, conditions: Conditions) -> str:
     if len(known) <= MAX_LISTED_NAMES:
         rates = ", ".join(f"{condition} {rate * 100:.0f} % ({loop_ms:.0f} ms)" for condition, loop_ms, rate in known)
         lane = " in their own lane" if _rate_key(conditions) != "completion_rate" else ""
-        parts.append(f"Runs completed{lane} by condition, with the median loop latency: {rates}.")
+        counts = {conditions[point.name].get("runs") for point in known}
+        number = counts.pop() if len(counts) == 1 else None
+        each = f" ({number} runs each)" if number else ""
+        parts.append(f"Runs completed{lane} by condition{each}, with the median loop latency: {rates}.")
     parts += _fall_sentences(levels)
-    errors = [(condition, conditions[condition]["p95_m"]) for condition, _, _ in known]
-    known_errors = [(condition, error_m) for condition, error_m in errors if error_m is not None]
-    if len(known_errors) > 1:
-        (first, first_m), (last, last_m) = known_errors[0], known_errors[-1]
-        parts.append(
-            f"The P95 of the cross-track error, averaged over completed runs, is {first_m:.2f} m at {first} and "
-            f"{last_m:.2f} m at {last}."
-        )
+    parts += _error_sentence({condition: conditions[condition] for condition, _, _ in known})
     return f"{name}. {' '.join(parts)}"
+
+
+def _error_sentence(conditions: Conditions) -> list[str]:
+    """Return a sentence on P95 of all runs, as in the headline figure, or else of the completed runs."""
+    all_runs = {name: ((entry.get("by_road") or {}).get("p95_all_runs_m") or {}) for name, entry in conditions.items()}
+    errors = {name: entry["mean"] for name, entry in all_runs.items() if entry.get("mean") is not None}
+    of = "of all runs, each up to its own end (mean over roads)"
+    if not errors:
+        errors = {name: entry["p95_m"] for name, entry in conditions.items() if entry["p95_m"] is not None}
+        of = "of the completed runs (mean)"
+    if len(errors) < 2:
+        return []
+    first, *_, last = errors
+    return [
+        f"The P95 of the cross-track error {of} is {errors[first]:.2f} m at {first} and {errors[last]:.2f} m at {last}."
+    ]
 
 
 def _example_sentence(name: str, conditions: Conditions, known: Sequence[ConditionPoint]) -> str:
@@ -110,22 +123,30 @@ def _example_sentence(name: str, conditions: Conditions, known: Sequence[Conditi
     return f"{name}, one run for each condition, as an example: {endings}."
 
 
+def _fall(pair: tuple[ConditionPoint, ConditionPoint]) -> float:
+    before, after = pair
+    return before.completion_rate - after.completion_rate
+
+
 def _fall_sentences(levels: Sequence[Sequence[ConditionPoint]]) -> list[str]:
     """Return sentences on the largest fall of completion, and on the latency above which fewer than half complete."""
-    falls = [pair for lower, higher in pairwise(levels) for pair in product(lower, higher)]
+    falls = [max(product(lower, higher), key=_fall) for lower, higher in pairwise(levels)]
     if not falls:
         return []
-    before, after = max(falls, key=lambda fall: fall[0].completion_rate - fall[1].completion_rate)
-    if before.completion_rate <= after.completion_rate:
+    largest = max(map(_fall, falls))
+    if largest <= 0:
         return ["Completion does not fall as latency increases."]
-    parts = [
-        f"The largest fall of completion is from {before.completion_rate * 100:.0f} % at {before.name} to "
-        f"{after.completion_rate * 100:.0f} % at {after.name}, between {before.loop_ms:.0f} and {after.loop_ms:.0f} ms "
-        "of loop latency."
+    described = [
+        f"from {before.completion_rate * 100:.0f} % at {before.name} to {after.completion_rate * 100:.0f} % at "
+        f"{after.name}, between {before.loop_ms:.0f} and {after.loop_ms:.0f} ms of loop latency"
+        for before, after in falls
+        if math.isclose(_fall((before, after)), largest)
     ]
+    parts = [f"The largest fall of completion is {', and '.join(described)}."]
     best_rates = [max(point.completion_rate for point in level) for level in levels]
     last = max((index for index, best_rate in enumerate(best_rates) if best_rate >= 0.5), default=-1)
     if last + 1 < len(levels):
         start_ms = min(point.loop_ms for point in levels[last + 1])
-        parts.append(f"At {start_ms:.0f} ms and above, fewer than half of the runs are completed.")
+        beyond = "the longest latency" if last + 2 == len(levels) else "and at each longer latency"
+        parts.append(f"At {start_ms:.0f} ms, {beyond}, fewer than half of the runs are completed.")
     return parts

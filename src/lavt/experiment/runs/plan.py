@@ -16,6 +16,7 @@ from lavt.assembly.nodes import check_names
 from lavt.config import Condition, RunConfig, SweepConfig
 from lavt.config_file import condition, parse_config
 from lavt.errors import UserError
+from lavt.operating_system import require_real_time
 from lavt.transport.emulation.impairment import check_flows
 
 RESERVED_AXES = {"vehicle.route": "routes", "network.condition": "conditions", "repetition": "repetitions"}
@@ -49,6 +50,8 @@ def plan_run(config: RunConfig, *, name: str = "run", axes: Mapping[str, Any] | 
             "network.injection is none, so nothing can delay this run in real time: choose relay, or condition L0 and "
             "inherent loopback"
         )
+    if config.time == "real":
+        require_real_time("a run in real time")
     if config.time == "real" and config.fidelity != "video":
         raise UserError(
             f"fidelity {config.fidelity} is for virtual time only: choose fidelity video for real time, or time virtual"

@@ -19,17 +19,21 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from lavt.errors import WorkError, describe_error
+from lavt.operating_system import CAN_BLOCK_SIGNALS, HANGUP
 
-TERMINAL_SIGNALS = (signal.SIGINT, signal.SIGHUP)
+TERMINAL_SIGNALS = (signal.SIGINT, *HANGUP)
 """The signals that Ctrl-C and the closing of a terminal send."""
 
 
 @contextmanager
 def terminal_signals_blocked() -> Iterator[None]:
-    """Block the terminal's signals inside the `with` block.
+    """Block the terminal's signals inside the `with` block, if the system can.
 
     In processes that are started in the block, these signals are blocked until they call `ignore_terminal_signals`.
     """
+    if not CAN_BLOCK_SIGNALS:
+        yield
+        return
     previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, TERMINAL_SIGNALS)
     try:
         yield
@@ -41,7 +45,8 @@ def ignore_terminal_signals() -> None:
     """Ignore the terminal's signals: all processes of the terminal receive them, but only the parent handles them."""
     for number in TERMINAL_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, TERMINAL_SIGNALS)
+    if CAN_BLOCK_SIGNALS:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, TERMINAL_SIGNALS)
 
 
 class WorkerProcess:
@@ -49,7 +54,8 @@ class WorkerProcess:
 
     def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")  # a fork would copy locks that are never released
-        resource_tracker.ensure_running()  # before the signals are blocked, because its start unblocks SIGINT
+        if CAN_BLOCK_SIGNALS:
+            resource_tracker.ensure_running()  # before the signals are blocked, because its start unblocks SIGINT
         self._connection, remote_end = context.Pipe()
         self._process = context.Process(target=_execute_calls, args=(remote_end,), daemon=True)
         # Without the parent's copy of the remote end, the pipe ends when the process dies. An `OSError` means that the

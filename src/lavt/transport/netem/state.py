@@ -6,7 +6,6 @@ that clears the interface when it ends. Impairments that `lavt netem apply` leav
 
 from __future__ import annotations
 
-import fcntl
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -97,6 +96,8 @@ class StateFiles:
                 "does not need it"
             ) from error
         try:
+            import fcntl  # noqa: PLC0415 (not on every system, and this module is imported on every system)
+
             fcntl.flock(lock, fcntl.LOCK_EX)
             yield
         finally:
