@@ -15,6 +15,15 @@ from lavt.experiment.runs.processes import Process, Processes
 HERE = Path(__file__).parent
 TIMEOUT_S = 300
 ATTEMPTS = 8
+REPEAT_KEYS = """(() => {
+  let newest = null;
+  addEventListener("keydown", ({isTrusted, code}) => { if (isTrusted) newest = code; }, true);
+  addEventListener("keyup", ({code}) => { if (code === newest) newest = null; }, true);
+  setInterval(() => {
+    if (newest !== null) dispatchEvent(new KeyboardEvent("keydown", {code: newest, repeat: true, cancelable: true}));
+  }, 40);
+})()"""
+"""Repeats the key that was pressed last, as a display server does, and the protocol of Chromium does not."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -51,6 +60,7 @@ class PersonDrive:
         if browser is None:
             self._tabs.append(tab)
         wait_until("the page has a status", lambda: (status(tab) or {}).get("safety") not in (None, ""))
+        repeat_keys(tab)
         return tab
 
     def close(self) -> None:
@@ -69,6 +79,11 @@ def person_drive(browser: Browser, tmp_path: Path) -> Iterator[PersonDrive]:
             yield drive
         finally:
             drive.close()
+
+
+def repeat_keys(tab: Tab) -> None:
+    """Let the page get repeats of the key that was pressed last."""
+    tab.evaluate(REPEAT_KEYS)
 
 
 def status(tab: Tab) -> dict[str, Any] | None:

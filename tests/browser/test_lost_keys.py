@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 from collections.abc import Iterator
 from contextlib import ExitStack
 
 import pytest
-from tests.browser.chromium import ProtocolError, Tab, running_browser, wait_until
-
-from lavt.clock import MachineClock
-from lavt.transport.console.console_link import ConsoleLink
+from tests.browser.chromium import Tab, running_browser, wait_until
+from tests.browser.fake_client import FakeClient, wait_until_loaded
+from tests.browser.x_keyboard import grabbed_keyboard, without_repeats
 
 IN_PAGE = ("mousemove", "500", "450")
 RIGHT, PRESS = ("click", "3"), ("mousedown", "1")
@@ -32,10 +32,11 @@ GRABS = {
 class Window:
     """A browser's window on a display of its own, with the console's page, and a person's mouse and keys."""
 
-    def __init__(self, display: str, tab: Tab, link: ConsoleLink) -> None:
-        self._display = display
+    def __init__(self, display: str, server: subprocess.Popen[bytes], tab: Tab, client: FakeClient) -> None:
+        self.display = display
+        self.server = server
         self.tab = tab
-        self.close_link = link.close
+        self.client = client
 
     def text(self, name: str) -> str:
         """Return the text of an element."""
@@ -43,8 +44,12 @@ class Window:
 
     def act(self, *action: str) -> None:
         """Let xdotool make an input."""
-        subprocess.run(["xdotool", *action], env=os.environ | {"DISPLAY": self._display}, check=True)
+        subprocess.run(["xdotool", *action], env=os.environ | {"DISPLAY": self.display}, check=True)
         self.tab.evaluate("new Promise((resolve) => setTimeout(resolve, 150))")
+
+    def pass_time(self, duration_s: float) -> None:
+        """Let the page go on for a while."""
+        self.tab.evaluate(f"new Promise((resolve) => setTimeout(resolve, {duration_s * 1000}))")
 
     def has_focus(self) -> bool:
         """Click the page, and return whether it has the pointer and the focus."""
@@ -53,24 +58,16 @@ class Window:
 
     def wait_for_hold(self, *, is_held: bool) -> None:
         """Wait until the page takes the dead-man control for held, or not."""
-        wait_until(f"held: {is_held}", lambda: bool(self.tab.evaluate("lavtConsole.keyboard.holds")) == is_held, 5)
-
-
-def is_loaded(tab: Tab) -> bool:
-    """Return whether the page's modules have been executed."""
-    try:
-        return bool(tab.evaluate("'lavtConsole' in globalThis"))
-    except ProtocolError:
-        return False
+        self.client.wait_for_input(f"held: {is_held}", held=is_held)
 
 
 @pytest.fixture(scope="module")
 def window(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Window]:
     out = tmp_path_factory.mktemp("window")
-    link = ConsoleLink(MachineClock(), "0123456789abcdef")
     with ExitStack() as stack:
-        link.start(lambda *_: None)
-        stack.callback(link.close)
+        client = FakeClient()
+        client.confirms_stops = True
+        stack.callback(client.close)
         number = out / "display"
         with number.open("w") as file:
             server = subprocess.Popen(
@@ -86,9 +83,9 @@ def window(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Window]:
         stack.callback(manager.wait)
         stack.callback(manager.kill)
         browser = stack.enter_context(running_browser(out / "profile", display))
-        tab = browser.open(link.url)
-        wait_until("the page is loaded", lambda: is_loaded(tab))
-        window = Window(display, tab, link)
+        tab = browser.open(client.url)
+        wait_until_loaded(tab, client)
+        window = Window(display, server, tab, client)
         wait_until("the window takes clicks and keys", window.has_focus)
         yield window
 
@@ -123,11 +120,79 @@ def test_keys_count_only_under_the_pointer(window: Window) -> None:
     window.act("keyup", "space")
 
 
+@pytest.mark.parametrize("grab_s", [0.2, 3.0])
+def test_a_key_released_during_a_grab_is_not_held(window: Window, grab_s: float) -> None:
+    """If another client takes the keyboard without any event, the page sees the end of the repeats."""
+    wait_until("the page has the focus", window.has_focus)
+    window.act("keydown", "space", "keydown", "Up")
+    window.wait_for_hold(is_held=True)
+    with grabbed_keyboard(window.display):
+        window.act("keyup", "Up", "keyup", "space")
+        window.pass_time(grab_s)
+    window.wait_for_hold(is_held=False)
+
+
+def test_a_held_key_holds_as_long_as_it_repeats(window: Window) -> None:
+    """A space bar that is held, and a later key that is, hold without end; other keys may be tapped in between."""
+    wait_until("the page has the focus", window.has_focus)
+    window.act("keydown", "space")
+    window.wait_for_hold(is_held=True)
+    begin = len(window.client.inputs)
+    window.pass_time(3)
+    for key in ("Left", "3", "Right"):
+        window.act("keydown", key)
+        window.pass_time(2)
+        window.act("keyup", key)
+        window.pass_time(0.5)
+    window.act("keydown", "Up")
+    window.pass_time(3)
+    assert all(each.held for each in window.client.inputs[begin:])
+    window.act("keyup", "Up", "keyup", "space")
+    window.wait_for_hold(is_held=False)
+
+
+def test_when_no_key_repeats_one_must_be_pressed(window: Window) -> None:
+    """After the key that repeats is let go, the space bar repeats no more: the page asks for a key, then lets go."""
+    wait_until("the page has the focus", window.has_focus)
+    window.act("keydown", "space")
+    window.wait_for_hold(is_held=True)
+    window.act("key", "Left")
+    wait_until("the page asks for a key", lambda: "press an arrow key again" in window.text("hint"), 1)
+    window.wait_for_hold(is_held=False)
+    wait_until("the page says why", lambda: "no key events" in window.text("hint"), 1)
+    window.act("keyup", "space")
+
+
+def test_a_keyboard_without_repeats_does_not_hold(window: Window) -> None:
+    """If the system repeats no key, a lost release would not be noticed: the page does not hold, and says so."""
+    with without_repeats(window.display):
+        window.tab.evaluate("location.reload(); 0")
+        window.client.inputs.clear()
+        wait_until_loaded(window.tab, window.client)
+        wait_until("the page has the focus", window.has_focus)
+        window.act("keydown", "space")
+        wait_until("the page says why", lambda: "repeats no key" in window.text("hint"), 5)
+        assert not any(each.held for each in window.client.inputs)
+        window.act("keyup", "space")
+
+
+def test_a_page_whose_screen_stands_still_is_not_live(window: Window) -> None:
+    """If the display server hangs, the page is no longer live, although it has the focus and holds."""
+    wait_until("the page has the focus", window.has_focus)
+    window.client.wait_for_input("the page is live", live=True)
+    window.server.send_signal(signal.SIGSTOP)
+    try:
+        window.client.wait_for_input("the page is not live", live=False, limit_s=2)
+    finally:
+        window.server.send_signal(signal.SIGCONT)
+    window.client.wait_for_input("the page is live again", live=True)
+
+
 def test_a_finger_counts_only_once_it_is_put_down_again(window: Window) -> None:
     """After the page has lost the focus, a finger that stays on the field and moves does not hold."""
 
     def finger(kind: str, x: int) -> bool:
-        event = f"new PointerEvent('{kind}', {{pointerId: 1, clientX: {x}, clientY: 10, cancelable: true}})"
+        event = f"new PointerEvent('{kind}', {{pointerId: 1, buttons: 1, clientX: {x}, clientY: 10, cancelable: true}})"
         window.tab.evaluate(f"document.querySelector('#touch_steering').dispatchEvent({event}); 0")
         return bool(window.tab.evaluate("lavtConsole.touch.holds"))
 
@@ -188,14 +253,3 @@ VIDEO = """(async () => {
 def test_a_picture_that_cannot_be_drawn_is_lost(window: Window, data: str) -> None:
     """A keyframe whose picture cannot be drawn, or that has no parameters for a decoder, is reported as lost."""
     assert window.tab.evaluate(VIDEO % data) == ["lost", 1]
-
-
-def test_a_stop_without_a_connection_says_so(window: Window) -> None:
-    """When the connection has ended, no state is shown any more, and an emergency stop is shown as not sent."""
-    window.close_link()
-    wait_until("the page is not connected", lambda: window.text("connection") == "not connected")
-    assert window.text("safety") == "no state"
-    window.tab.evaluate("document.querySelector('#stop').click()")
-    assert "NOT sent" in window.text("hint")
-    window.tab.evaluate("new Promise((resolve) => setTimeout(resolve, 1500))")
-    assert "NOT sent" in window.text("hint")

@@ -16,6 +16,7 @@ from lavt.assembly.side import Side, open_client
 from lavt.cli import console
 from lavt.cli.side import run_side
 from lavt.clock import MachineClock
+from lavt.config import ConsoleConfig
 from lavt.errors import WorkError
 from lavt.experiment.runs.human_drive import HumanDrive, drive_config, start_human_drive
 from lavt.recording.output_directory import check_directory
@@ -34,6 +35,10 @@ def drive(
     opens_page: Annotated[
         bool, typer.Option("--browser/--no-browser", help="Open the page, if this machine has a display.")
     ] = True,
+    port: Annotated[
+        int,
+        typer.Option(min=0, max=65535, help="TCP port of the page, which has its calibrations; 0: any."),
+    ] = 0,
     as_json: console.JsonOption = False,
 ) -> None:
     """Drive yourself: the simulator's car, from a web page on this machine.
@@ -50,7 +55,8 @@ def drive(
     if out is not None:
         check_directory(out)
     with start_human_drive(config, out, clock) as human_drive:
-        client, own_out = human_drive.client, None if out is None else out / "client"
+        client = human_drive.client.model_copy(update={"console": ConsoleConfig(port=port)})
+        own_out = None if out is None else out / "client"
         with open_client(
             client, own_out, clock, console.print_message, relay=human_drive.relay, delays=human_drive.delays
         ) as side:

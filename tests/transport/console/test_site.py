@@ -130,4 +130,4 @@ def test_the_page_fetches_nothing_from_elsewhere() -> None:
         assert not re.search(r"<script(?![^>]*\bsrc=)|<style|\bstyle=|\bon\w+=\"", text), path
         for imported in re.findall(r'from "\./([^"]+)"', text):
             assert (PAGE_FILES / imported).is_file()
-    assert f"const VERSION = {PAGE_VERSION};" in (PAGE_FILES / "main.js").read_text()
+    assert f"const VERSION = {PAGE_VERSION};" in (PAGE_FILES / "connection.js").read_text()

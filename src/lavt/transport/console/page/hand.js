@@ -12,11 +12,24 @@ const STEERING_PER_S = 1.6; // of full deflection
 const RETURN_PER_S = 3.0;
 const THROTTLE_PER_S = 2.0;
 const BRAKE_PER_S = 4.0;
+const NEXT_REPEAT_MS = 700; // the slowest repeat that systems offer is 500 ms
+const FIRST_REPEAT_MS = 1500; // the longest delay that most systems offer is 1 s
+const NO_REPEATS = "this system repeats no key that is held, so a lost release would not be noticed: turn the repeat on, or use another device";
+const SILENT = "no key events arrived any more, so all keys count as released: let go of them, then hold them again";
+const PRESS_AGAIN = "press an arrow key again: no key repeats any more, and soon all will count as released";
 
 // While a menu is open or a window is dragged, the browser delivers no release of a key, and the page keeps the focus.
 // So a key counts only while nothing can have opened one: the pointer is over the page, and no other key is pressed.
+//
+// The keyboard may also be taken without any event. But the key that was pressed last repeats while it is held, and its
+// repeats end when another client gets the keys. So keys count only while events of keys arrive. When the key that
+// repeats is let go, no other key repeats, and one must be pressed again. A keyboard that does not repeat never holds.
 export class Keyboard {
   #held = new Set(); // codes of the keys that are down
+  #heard_ms = 0; // when the newest event of a key arrived
+  #newest = ""; // what it was: "press", "repeat" or "release"
+  #repeats = false; // this keyboard has repeated a key
+  #isSilent = false; // the events ended although keys were down, and no key has been pressed since
 
   constructor() {
     this.steering = 0; // -1 to 1, left positive
@@ -24,7 +37,7 @@ export class Keyboard {
     this.brake = 0;
     this.isPointed = false; // the pointer is over the page
     addEventListener("keydown", (event) => this.#keyDown(event), true);
-    addEventListener("keyup", (event) => this.#held.delete(event.code), true);
+    addEventListener("keyup", (event) => this.#keyUp(event), true);
     addEventListener("blur", () => this.release());
     document.addEventListener("visibilitychange", () => this.#leave());
     document.addEventListener("mousemove", () => { this.isPointed = true; });
@@ -41,11 +54,18 @@ export class Keyboard {
   }
 
   get holds() {
-    return this.#is("hold");
+    return this.#repeats && this.#is("hold");
+  }
+
+  // What the person must know; empty: nothing.
+  get notice() {
+    if (this.#isSilent) return this.#repeats ? SILENT : NO_REPEATS;
+    return this.#held.size > 0 && this.#newest === "release" ? PRESS_AGAIN : "";
   }
 
   // Advance steering and pedals by `step_s`.
   advance(step_s) {
+    this.#checkEvents();
     const turn = this.#is("left") - this.#is("right");
     if (turn !== 0) {
       // Turning back through the middle is as fast as the return.
@@ -63,6 +83,19 @@ export class Keyboard {
     return [...this.#held].some((code) => KEYS[code] === action);
   }
 
+  #note(event) {
+    this.#heard_ms = performance.now();
+    this.#newest = event;
+    this.#repeats ||= event === "repeat";
+  }
+
+  #checkEvents() {
+    const limit_ms = this.#newest === "repeat" ? NEXT_REPEAT_MS : FIRST_REPEAT_MS;
+    if (this.#held.size === 0 || performance.now() - this.#heard_ms < limit_ms) return;
+    this.release();
+    this.#isSilent = true;
+  }
+
   #leave() {
     this.isPointed = false;
     this.release();
@@ -73,14 +106,22 @@ export class Keyboard {
     this.release();
   }
 
+  #keyUp(event) {
+    this.#note("release");
+    this.#held.delete(event.code);
+  }
+
   #keyDown(event) {
+    this.#note(event.repeat ? "repeat" : "press");
     const hasModifier = event.ctrlKey || event.altKey || event.metaKey;
     if (hasModifier || !(event.code in KEYS)) {
       if (hasModifier || !OTHER_KEYS.test(event.code)) this.release();
       return;
     }
     event.preventDefault();
-    if (!event.repeat && this.isPointed) this.#held.add(event.code); // a repeated event is no new press
+    if (event.repeat || !this.isPointed) return; // a repeated event is no new press
+    this.#held.add(event.code);
+    this.#isSilent = false;
   }
 }
 

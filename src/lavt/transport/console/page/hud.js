@@ -8,7 +8,10 @@ const SAFETY = {
   disarmed: "disarmed", arming: "arming", driving: "driving", degraded: "degraded",
   safe_stop: "safe stop", emergency_stop: "emergency stop",
 };
-const STOP_NOT_SENT = "emergency stop NOT sent: no connection to lavt. Use another emergency stop";
+const STOP_NOT_SENT =
+  "emergency stop NOT sent: no connection to lavt. Use another emergency stop. It is sent if the connection returns";
+const STOP_NOT_CONFIRMED = "emergency stop sent, not confirmed yet";
+const STALE_MS = 1000; // lavt sends a status every 50 ms
 const history = new History(byId("history"));
 const HANDS = {
   not_seen: "let go of the dead-man control (the space bar), then hold it",
@@ -17,20 +20,25 @@ const HANDS = {
   no_input: "this page sent no input for a moment: let go of the dead-man control, then hold it",
 };
 
-let isStopLost = false; // a stop was made without a connection
-
-export function showClosed(text) {
+export function showClosed(text, isStopPending = false) {
   byId("connection").textContent = "not connected";
   showSafety("");
   byId("reason").textContent = "";
   byId("stop").className = "";
-  byId("hint").textContent = isStopLost ? STOP_NOT_SENT : text;
+  byId("hint").textContent = isStopPending ? STOP_NOT_SENT : text;
   byId("take").hidden = byId("release").hidden = true;
 }
 
-export function showStopNotSent() {
-  isStopLost = true;
-  byId("hint").textContent = STOP_NOT_SENT;
+// Show nothing old as the present state if lavt has sent nothing for a while.
+export function showSilence(silence_ms, isStopPending) {
+  if (silence_ms < STALE_MS) return;
+  const silence = `no status from lavt for ${Math.floor(silence_ms / 1000)} s`;
+  byId("connection").textContent = silence;
+  showSafety("");
+  byId("reason").textContent = "";
+  byId("hint").textContent = isStopPending
+    ? `${STOP_NOT_CONFIRMED}, and ${silence}: use another emergency stop`
+    : `${silence}: the page does not know what the vehicle does`;
 }
 
 function showSafety(name) {
@@ -38,16 +46,15 @@ function showSafety(name) {
   byId("safety").className = `badge ${name in SAFETY ? name : ""}`;
 }
 
-// `age_ms` is the age of the picture on the screen, from its stamp; null: unknown. Without `canHold`, keys do not count.
-export function showStatus(status, input, video, age_ms, canHold) {
+// `age_ms` is the age of the picture on the screen, from its stamp; null: unknown. `notice` is about the keys.
+export function showStatus(status, input, video, age_ms, isStopPending, notice) {
   byId("connection").textContent = status.role === "drives" ? "drives" : "watches";
   showSafety(status.safety);
-  isStopLost = false;
   const rejected = status.rejected && `command rejected: ${status.rejected}`;
   const limited = status.limited && `limited: ${status.limited}`;
   const requested = status.requested_by && `${status.requested_by} requests control`;
   byId("reason").textContent = [status.reason, requested, rejected, limited].filter(Boolean).join(" · ");
-  byId("hint").textContent = hint(status, input, canHold);
+  byId("hint").textContent = hint(status, input, isStopPending, notice);
   byId("release").hidden = !(status.role === "drives" && status.has_control && status.requested_by !== "");
   byId("release").textContent = `Hand over to ${status.requested_by}`;
   byId("take").hidden = !(status.role === "watches" && status.can_drive);
@@ -73,18 +80,18 @@ function isPast({ emergency_stop, safety }) {
   return emergency_stop === "confirmed" && safety !== "emergency_stop";
 }
 
-function hint(status, input, canHold) {
+function hint(status, input, isStopPending, notice) {
+  if (isStopPending || status.emergency_stop === "sent") return STOP_NOT_CONFIRMED;
   if (isPast(status)) {
     return "an earlier emergency stop was confirmed, but the vehicle is in another state now; restart this client to drive";
   }
-  if (status.emergency_stop === "sent") return "emergency stop sent, not confirmed yet";
   if (status.emergency_stop === "confirmed") return "emergency stop: the vehicle has confirmed it; restart this client to drive";
   if (status.role === "watches") return status.can_drive ? "no page drives" : "another page drives";
   if (status.phase === "seeking" || status.phase === "stopped" || status.phase === "watching") {
     return status.session_reason || "waiting for the vehicle";
   }
   if (status.hand in HANDS) return HANDS[status.hand];
-  if (!canHold) return "move the pointer over this page and leave it there: keys count only then";
+  if (notice !== "") return notice;
   if (status.phase === "arming") {
     if (status.session_reason) return status.session_reason;
     if (status.hand === "open") return "hold the dead-man control (the space bar) for a second to arm";

@@ -1,26 +1,27 @@
 // The console's page: connects to the client, sends the person's input, and shows video and state.
 
 import { Offset, pageTime_us } from "./clock.js";
+import { Connection } from "./connection.js";
 import { Calibration, Gamepads } from "./gamepad.js";
 import { Keyboard } from "./hand.js";
-import { showCalibration, showClosed, showStatus, showStopNotSent } from "./hud.js";
+import { showCalibration, showClosed, showSilence, showStatus } from "./hud.js";
+import { Screen } from "./screen.js";
+import { Sources } from "./source.js";
 import { Touch } from "./touch.js";
 import { Video } from "./video.js";
 
-const VERSION = 1; // of the messages
 const INPUT_PERIOD_MS = 20;
 const PROBE_PERIOD_MS = 500;
-const RETRY_MS = 1000;
 const UNIT_HEAD_BYTES = 16;
 
 const byId = (id) => document.getElementById(id);
 const keyboard = new Keyboard();
 const gamepads = new Gamepads(stop);
 const touch = new Touch(byId("touch_steering"), byId("touch_pedals"));
-let source = keyboard; // of the newest input
+const sources = new Sources([keyboard, touch, gamepads], () => (gamepads.id === "" ? keyboard : gamepads));
+const screen = new Screen();
 let calibration = null; // while the person calibrates a device
-let socket = null;
-let seen_us = 0; // `sent_us` of the newest message
+let connection = null;
 let status = null;
 let advanced_ms = performance.now();
 
@@ -34,55 +35,48 @@ const video = new Video(
 );
 globalThis.lavtConsole = { get status() { return status; }, keyboard, touch, gamepads, video }; // for tests and the curious
 
-// Send a message, and return whether there was a connection to lavt.
 function send(message) {
-  if (socket === null || socket.readyState !== WebSocket.OPEN) return false;
-  socket.send(JSON.stringify(message));
-  return true;
+  connection?.send(message);
 }
 
 function stop() {
-  const isSent = send({ type: "stop" });
-  if (!isSent) showStopNotSent();
+  connection?.stop();
+  if (connection?.isOpen !== true) showClosed("", true);
 }
 
 function connect() {
   const token = location.hash.slice(1);
   if (token === "") return showClosed("open the address that lavt has printed, with all that follows the #");
   if (!("VideoDecoder" in globalThis)) return showClosed("this browser cannot decode video (WebCodecs): use another");
-  socket = new WebSocket(`ws://${location.host}/socket`);
-  socket.binaryType = "arraybuffer";
-  socket.onopen = () => send({ type: "hello", version: VERSION, token });
-  socket.onmessage = ({ data }) => (typeof data === "string" ? takeText(JSON.parse(data)) : takeUnit(data));
-  socket.onclose = ({ code, reason }) => {
-    socket = null;
-    status = null;
-    offset = new Offset();
-    video.close();
-    keyboard.release();
-    touch.release();
-    showClosed(reason || "the connection to lavt has ended");
-    if (code < 4000) setTimeout(connect, RETRY_MS); // a code above tells that another attempt is pointless
-  };
+  connection = new Connection(token, { takeStatus, takeUnit, takeProbe: (answer) => offset.note(answer), close });
 }
 
-function takeText(message) {
-  if (message.type === "probe") offset.note(message);
-  else takeStatus(message);
+function close(text) {
+  status = null;
+  offset = new Offset();
+  video.close();
+  keyboard.release();
+  touch.release();
+  showClosed(text, connection.isStopPending);
 }
 
 function takeStatus(message) {
-  if (message.version !== VERSION) return socket.close(4000, "reload this page: it is of another version of lavt");
-  seen_us = message.sent_us;
   status = message;
-  const canHold = source !== keyboard || keyboard.isPointed || !matchMedia("(any-hover: hover)").matches;
-  showStatus(status, source, video, frameAge_ms(), canHold);
+  showStatus(status, sources.current, video, frameAge_ms(), connection.isStopPending, keyboardNotice());
   showCalibration(calibration);
+}
+
+// What the person must know about the keys; empty while another device drives.
+function keyboardNotice() {
+  if (sources.current !== keyboard) return "";
+  if (!keyboard.isPointed && matchMedia("(any-hover: hover)").matches) {
+    return "move the pointer over this page and leave it there: keys count only then";
+  }
+  return keyboard.notice;
 }
 
 function takeUnit(buffer) {
   const head = new DataView(buffer, 0, UNIT_HEAD_BYTES);
-  seen_us = Number(head.getBigUint64(8));
   const isKeyframe = (head.getUint8(1) & 1) === 1;
   video.push({ data: new Uint8Array(buffer, UNIT_HEAD_BYTES), unit: head.getUint32(4), isKeyframe });
 }
@@ -108,12 +102,11 @@ function sendInput() {
   if (calibration === null) gamepads.poll();
   else calibration.poll();
   if (calibration?.next === null) calibration = null;
+  sources.poll();
   if (status?.role !== "drives") return;
-  source = [keyboard, touch, gamepads].find(({ holds }) => holds) ?? (gamepads.id === "" ? keyboard : gamepads);
-  const { holds, steering, throttle, brake } = source;
-  const isSeen = document.visibilityState === "visible" && document.hasFocus();
-  const live = isSeen && calibration === null && !gamepads.lost;
-  send({ type: "input", seen_us, held: holds, live, steering, throttle, brake });
+  const { steering, throttle, brake } = sources.current;
+  const live = screen.isShown && document.hasFocus() && calibration === null && !gamepads.lost;
+  connection.sendInput({ held: sources.holds, live, steering, throttle, brake });
 }
 
 function chooseDelay(video_ms, control_ms) {
@@ -154,6 +147,7 @@ setInterval(sendInput, INPUT_PERIOD_MS);
 setInterval(() => {
   send({ type: "probe", sent_us: pageTime_us() });
   video.check();
+  if (status !== null) showSilence(connection.silence_ms, connection.isStopPending);
 }, PROBE_PERIOD_MS);
 addEventListener("hashchange", () => location.reload());
 connect();

@@ -3,6 +3,7 @@
 import { limit } from "./hand.js";
 
 const SHARE = 0.4; // of a field's size for full deflection
+const LEFT = 1; // in `buttons`: only the left button of a mouse, or a finger
 
 export class Touch {
   #steers = null; // the pointer on the left field, and where it began
@@ -41,9 +42,13 @@ export class Touch {
 
   // Call `set` with the deflection of a finger on a field, or null when it is lifted.
   #listen(field, set) {
+    const end = () => {
+      this.#begins.delete(field);
+      set(null);
+    };
     field.addEventListener("pointerdown", (event) => {
       event.preventDefault();
-      if (this.#begins.has(field)) return;
+      if (event.button !== 0 || this.#begins.has(field)) return;
       this.#begins.set(field, event);
       field.setPointerCapture(event.pointerId);
       set({ x: 0, y: 0 });
@@ -51,6 +56,7 @@ export class Touch {
     field.addEventListener("pointermove", (event) => {
       const begin = this.#begins.get(field);
       if (begin?.pointerId !== event.pointerId) return;
+      if (event.buttons !== LEFT) return end(); // while another button is down, the release of this one is no event
       const { width, height } = field.getBoundingClientRect();
       set({
         x: (event.clientX - begin.clientX) / (width * SHARE),
@@ -59,9 +65,7 @@ export class Touch {
     });
     for (const name of ["pointerup", "pointercancel", "lostpointercapture"]) {
       field.addEventListener(name, (event) => {
-        if (this.#begins.get(field)?.pointerId !== event.pointerId) return;
-        this.#begins.delete(field);
-        set(null);
+        if (this.#begins.get(field)?.pointerId === event.pointerId) end();
       });
     }
   }
