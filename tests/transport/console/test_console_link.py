@@ -23,13 +23,18 @@ from lavt.domain import Now
 from lavt.errors import UserError
 from lavt.node import Send
 from lavt.runtime.thread_failures import fail_on_thread_errors
-from lavt.transport.console import console_link
-from lavt.transport.console.console_link import MAX_MESSAGES_PER_S, MAX_PAGES, MAX_STRANGERS, ConsoleLink
+from lavt.transport.console import console_link, message_limit
+from lavt.transport.console.console_link import MAX_PAGES, ConsoleLink
+from lavt.transport.console.message_limit import MAX_MESSAGES_PER_S
 from lavt.transport.console.page_messages import MAX_PAGE_MESSAGE_BYTES, PAGE_VERSION
 from lavt.transport.console.site import HEADERS, NOT_A_HELLO, TOO_MANY_PAGES, WRONG_TOKEN, WRONG_VERSION
+from lavt.transport.console.strangers import MAX_STRANGER_BYTES, MAX_STRANGERS
 
 TOKEN = "0123456789abcdef"
 HELLO = json.dumps({"type": "hello", "version": PAGE_VERSION, "token": TOKEN})
+KEY = f"Sec-WebSocket-Key: {'A' * 22}=="
+STOP = json.dumps({"type": "stop"})
+PING = bytes([0x89, 0x80 | 125, 0, 0, 0, 0]) + bytes(125)
 Delivered = tuple[str, Any, int]
 
 
@@ -123,12 +128,12 @@ def test_every_error_has_the_security_headers(console: Console, request_line: st
 
 
 def test_the_answer_to_head_has_no_body(console: Console) -> None:
-    """A HEAD request gets the headers only, and no further bytes."""
+    """A HEAD request is not allowed, and its answer has headers only."""
     with socket.create_connection(("127.0.0.1", console.link.port), timeout=10) as sock:
         sock.sendall(f"HEAD / HTTP/1.1\r\nHost: 127.0.0.1:{console.link.port}\r\n\r\n".encode())
         answer = b"".join(iter(lambda: sock.recv(65536), b""))
-    assert b"Content-Security-Policy" in answer
-    assert b"<canvas" not in answer
+    assert answer.startswith(b"HTTP/1.1 405 ")
+    assert answer.endswith(b"\r\n\r\n")
 
 
 @pytest.mark.parametrize("origin", ["http://attacker.example", "null", ""])
@@ -195,8 +200,9 @@ def test_a_huge_message_closes_the_page(console: Console) -> None:
     console.open()[0].close()
 
 
-def test_a_page_that_floods_is_closed(console: Console) -> None:
+def test_a_page_that_floods_is_closed(console: Console, monkeypatch: pytest.MonkeyPatch) -> None:
     """A page that sends too much is closed before its messages fill the queue; another page's stop is delivered."""
+    monkeypatch.setattr(message_limit, "MAX_DROPPED_PER_S", 100)
     (page, number), (other, other_number) = console.open(), console.open()
     with suppress(ConnectionClosed):
         for _ in range(MAX_MESSAGES_PER_S * 20):
@@ -208,6 +214,20 @@ def test_a_page_that_floods_is_closed(console: Console) -> None:
     assert len(delivered) < CHANNELS["page_message"].length
     assert console.link.counts["pages_too_busy"] == 1
     other.close()
+
+
+def test_a_stop_behind_too_many_messages_is_delivered(console: Console, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Above the limit, inputs are dropped and counted, and the emergency stop that follows them is delivered."""
+    monkeypatch.setattr(message_limit, "MAX_MESSAGES_PER_S", 5)
+    page, number = console.open()
+    for _ in range(100):
+        page.send("input")
+    page.send(STOP)
+    delivered = [console.take()]
+    while delivered[-1] != ("page_message", STOP, number):
+        delivered.append(console.take())
+    assert console.link.counts["page_messages_too_many"] == 101 - len(delivered) > 0
+    page.close()
 
 
 def test_messages_reach_their_page(console: Console) -> None:
@@ -242,40 +262,52 @@ def test_the_number_of_pages_is_limited(console: Console) -> None:
 
 
 def test_the_number_of_strangers_is_limited(console: Console) -> None:
-    """Connections without the token are limited, do not count after it, and make room when they end."""
+    """A connection too many without the token closes the oldest one, so that a new page gets in; pages do not count."""
     page, _ = console.open()
     strangers = [socket.create_connection(("127.0.0.1", console.link.port), timeout=10) for _ in range(MAX_STRANGERS)]
-    with socket.create_connection(("127.0.0.1", console.link.port), timeout=10) as late, suppress(ConnectionError):
-        assert late.recv(1) == b""
+    late, _ = console.open()
+    with suppress(ConnectionError):
+        assert strangers[0].recv(1) == b""
     assert console.link.counts["connections_too_many"] == 1
     page.send("a message")
     assert console.take()[1] == "a message"
     for stranger in strangers:
         stranger.close()
     page.close()
-    while get_or_nothing(console.link.port) != 200:
-        pass
+    late.close()
 
 
-def get_or_nothing(port: int) -> int | None:
-    try:
-        return get(port, "/")[0]
-    except (OSError, http.client.HTTPException):
-        return None
-
-
-def test_a_flood_of_pings_ends_its_connection(console: Console, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A connection that sends pings and reads no answers is closed before its answers fill the memory."""
-    monkeypatch.setattr(console_link, "MAX_UNSENT_BYTES", 2**16)
-    site = f"127.0.0.1:{console.link.port}"
+def open_socket(port: int) -> socket.socket:
+    """Return a connection that has opened the WebSocket, and has sent nothing yet."""
+    site = f"127.0.0.1:{port}"
     upgrade = "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13"
-    request = f"GET /socket HTTP/1.1\r\nHost: {site}\r\nOrigin: http://{site}\r\n{upgrade}\r\n"
-    ping = bytes([0x89, 0x80 | 125, 0, 0, 0, 0]) + bytes(125)
-    with socket.create_connection(("127.0.0.1", console.link.port), timeout=10) as sock:
-        sock.sendall(f"{request}Sec-WebSocket-Key: {'A' * 22}==\r\n\r\n".encode())
-        assert b"101" in sock.recv(16)
+    connection = socket.create_connection(("127.0.0.1", port), timeout=10)
+    connection.sendall(
+        f"GET /socket HTTP/1.1\r\nHost: {site}\r\nOrigin: http://{site}\r\n{upgrade}\r\n{KEY}\r\n\r\n".encode()
+    )
+    assert b"101" in connection.recv(16)
+    return connection
+
+
+def test_a_flood_without_the_token_is_not_read(console: Console) -> None:
+    """A connection that sends pings, and no token, is closed after a few KiB."""
+    with open_socket(console.link.port) as sock:
+        sock.sendall(PING * (MAX_STRANGER_BYTES // len(PING) + 1))
+        with suppress(ConnectionError):
+            while sock.recv(4096):
+                pass
+    assert console.link.counts["connections_too_long"] == 1
+
+
+def test_a_page_that_reads_no_answers_is_closed(console: Console, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A page that sends pings and reads no answers is closed before its answers fill the memory."""
+    monkeypatch.setattr(console_link, "MAX_UNSENT_BYTES", 2**16)
+    with open_socket(console.link.port) as sock:
+        hello = HELLO.encode()
+        sock.sendall(bytes([0x81, 0x80 | len(hello), 0, 0, 0, 0]) + hello)
+        assert console.take()[0] == "page_opened"
         with pytest.raises(OSError, match=r"reset|[Bb]roken"):
-            sock.sendall(ping * 500_000)
+            sock.sendall(PING * 500_000)
     assert console.link.counts["connections_not_reading"] == 1
 
 

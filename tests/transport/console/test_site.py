@@ -24,7 +24,7 @@ ORIGIN = ["http://127.0.0.1:8000"]
 
 
 def status(path: str, hosts: list[str], origins: list[str]) -> int | None:
-    answer = SITE.answer(path, hosts, origins)
+    answer = SITE.answer("GET", path, hosts, origins)
     return None if answer is None else answer.status
 
 
@@ -74,6 +74,16 @@ def test_the_socket_needs_the_sites_origin(origins: list[str]) -> None:
     assert status("/socket", HOST, ORIGIN) is None
 
 
+@pytest.mark.parametrize("method", ["HEAD", "POST", "PUT", "OPTIONS", "DELETE", "CONNECT", "get"])
+def test_only_get_is_allowed(method: str) -> None:
+    """A request with another method gets 405 with the allowed one, for files and for the socket."""
+    for path in ("/", "/socket"):
+        answer = SITE.answer(method, path, HOST, ORIGIN)
+        assert answer is not None
+        assert (answer.status, page_headers(answer)["Allow"]) == (405, "GET")
+    assert "Allow" not in page_headers(SITE._files["/"])
+
+
 def test_foreign_pages_get_no_files() -> None:
     """A request for a file with a foreign Origin is rejected."""
     assert status("/main.js", HOST, ["http://attacker.example"]) == 403
@@ -111,7 +121,7 @@ def test_no_other_first_message_is_accepted(data: str | bytes) -> None:
 def test_every_answer_has_the_security_headers() -> None:
     """Files and errors have the policy on contents, and no header allows other sites anything."""
     for path in ("/", "/no"):
-        answer = SITE.answer(path, HOST, [])
+        answer = SITE.answer("GET", path, HOST, [])
         assert answer is not None
         headers = page_headers(answer)
         assert headers.items() >= HEADERS.items()

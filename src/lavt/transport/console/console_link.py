@@ -17,11 +17,13 @@ from http import HTTPStatus
 from typing import TYPE_CHECKING, Any, Final
 
 from lavt.clock import Clock
-from lavt.domain import NS_PER_S, Now
+from lavt.domain import Now
 from lavt.errors import UserError, WorkError
 from lavt.node import Send
+from lavt.transport.console.message_limit import MessageLimit, Verdict
 from lavt.transport.console.page_messages import MAX_PAGE_MESSAGE_BYTES
 from lavt.transport.console.site import HEADERS, TOO_MANY_MESSAGES, TOO_MANY_PAGES, ConsoleSite, page_headers
+from lavt.transport.console.strangers import Strangers
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import Server, ServerConnection
@@ -31,14 +33,9 @@ Deliver = Callable[[str, Any, Now, Any], None]
 """Takes (channel, payload, arrived, peer) of each message; the peer is the number of the page."""
 
 MAX_PAGES: Final = 8
-MAX_MESSAGES_PER_S: Final = 400
-"""A page that sends more is closed: its messages would drop those of other pages from the queue, such as a stop. A page
-sends 50 inputs and two messages for each picture in a second, and what it could not send before."""
 MAX_QUEUED: Final = 16
 """Messages to a page that does not read them: all access units that may be on the way fit, and further statuses are
 dropped."""
-MAX_STRANGERS: Final = 32
-"""Connections that have not shown the token yet, and requests for files; a further one is closed at once."""
 MAX_UNSENT_BYTES: Final = 8 * 2**20
 """A connection that reads nothing is closed when this much waits for it, such as answers to its pings. All access units
 of a page that may be on the way are smaller."""
@@ -54,16 +51,7 @@ class _Page:
     def __init__(self, connection: ServerConnection) -> None:
         self.connection = connection
         self.waiting: asyncio.Queue[str | bytes] = asyncio.Queue(MAX_QUEUED)
-        self._second = 0
-        self._received = 0
-        """How many messages have arrived in this second."""
-
-    def may_send(self, now: Now) -> bool:
-        """Count a message of the page, and return whether it is one of the first of this second."""
-        second = now.mono_ns // NS_PER_S
-        self._received = self._received + 1 if second == self._second else 1
-        self._second = second
-        return self._received <= MAX_MESSAGES_PER_S
+        self.limit = MessageLimit()
 
 
 class ConsoleLink:
@@ -86,8 +74,7 @@ class ConsoleLink:
         self._ends: asyncio.Future[None] = self._loop.create_future()
         """Done when the link is closed, or has failed."""
         self._pages: dict[int, _Page] = {}
-        self._strangers: set[object] = set()
-        """Connections that have not shown the token."""
+        self._strangers = Strangers(self.counts)
         self._numbers = itertools.count(1)
         self._closing = False
         self._thread: threading.Thread | None = None
@@ -161,7 +148,8 @@ class ConsoleLink:
     def _process_request(self, connection: ServerConnection, request: Request) -> Response | None:
         """Answer a request for a file, or return None for a request that opens the socket."""
         headers = request.headers
-        answer = self._site.answer(request.path, headers.get_all("Host"), headers.get_all("Origin"))
+        method = getattr(request, "method", "GET")  # older versions of `websockets` reject other methods
+        answer = self._site.answer(method, request.path, headers.get_all("Host"), headers.get_all("Origin"))
         if answer is None:
             return None
         self.counts["requests_answered" if answer.status == HTTPStatus.OK else "requests_rejected"] += 1
@@ -171,7 +159,7 @@ class ConsoleLink:
                 del response.headers[name]
         for name, value in page_headers(answer).items():
             response.headers[name] = value
-        response.body = b"" if getattr(request, "method", "GET") == "HEAD" else answer.body
+        response.body = b"" if method == "HEAD" else answer.body
         return response
 
     async def _guard(self, connection: ServerConnection, deliver: Deliver) -> None:
@@ -195,7 +183,7 @@ class ConsoleLink:
             self.counts["pages_rejected"] += 1
             await connection.close(*closing)
             return
-        self._strangers.discard(connection)
+        self._strangers.remove(connection)
         number, page = next(self._numbers), _Page(connection)
         self._pages[number] = page
         writer = asyncio.create_task(self._write(page))
@@ -203,11 +191,15 @@ class ConsoleLink:
             deliver("page_opened", None, self._clock.now(), number)
             async for message in connection:
                 now = self._clock.now()
-                if not page.may_send(now):
+                verdict = page.limit.judge(message, now.mono_ns)
+                if verdict is Verdict.CLOSE:
                     self.counts["pages_too_busy"] += 1
                     await connection.close(*TOO_MANY_MESSAGES)
                     return
-                deliver("page_message", message, now, number)
+                if verdict is Verdict.DROP:
+                    self.counts["page_messages_too_many"] += 1
+                else:
+                    deliver("page_message", message, now, number)
         finally:
             del self._pages[number]
             writer.cancel()
@@ -235,7 +227,7 @@ class ConsoleLink:
             self._end(error)
 
 
-def _limited_connection(strangers: set[object], counts: Counter[str]) -> type[ServerConnection]:
+def _limited_connection(strangers: Strangers, counts: Counter[str]) -> type[ServerConnection]:
     """Return the class of connections that are limited in number before the token, and in what waits to be sent.
 
     Their own errors, as for a request that is no valid HTTP, have the headers of the site.
@@ -253,22 +245,19 @@ def _limited_connection(strangers: set[object], counts: Counter[str]) -> type[Se
                 return response
 
             self.protocol.reject = reject_with_headers  # type: ignore[method-assign]
-            strangers.add(self)
-            if len(strangers) > MAX_STRANGERS:
-                self._abort("connections_too_many")
+            strangers.add(self, self.transport.abort)
 
         def connection_lost(self, exc: Exception | None) -> None:
-            strangers.discard(self)
+            strangers.remove(self)
             super().connection_lost(exc)
 
         def data_received(self, data: bytes) -> None:
+            if not strangers.may_read(self, len(data)):
+                return
             super().data_received(data)
             if self.transport.get_write_buffer_size() > MAX_UNSENT_BYTES:
-                self._abort("connections_not_reading")
-
-        def _abort(self, why: str) -> None:
-            counts[why] += 1
-            self.transport.abort()
+                counts["connections_not_reading"] += 1
+                self.transport.abort()
 
     return LimitedConnection
 

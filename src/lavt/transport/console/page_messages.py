@@ -113,6 +113,14 @@ def parse_page_message(data: str | bytes) -> PageMessage:
     return parsed
 
 
+def is_stop(data: str | bytes) -> bool:
+    """Return whether a message of a page is an emergency stop."""
+    try:
+        return isinstance(parse_page_message(data), PageStop)
+    except BadMessage:
+        return False
+
+
 def parse_hello(data: str | bytes) -> PageHello:
     """Parse the first message of a page; raise `BadMessage` for anything else."""
     parsed: PageHello = _parse(_hellos, data)

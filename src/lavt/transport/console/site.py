@@ -58,7 +58,6 @@ WRONG_TOKEN: Final = Closing(4401, "wrong token: open the address that lavt has 
 WRONG_VERSION: Final = Closing(4426, "this page is of another version of lavt: reload it")
 NOT_A_HELLO: Final = Closing(4400, "not a page of lavt")
 TOO_MANY_PAGES: Final = Closing(4429, "too many pages are open: close one")
-
 TOO_MANY_MESSAGES: Final = Closing(4408, "this page has sent too many messages: reload it")
 
 
@@ -76,10 +75,12 @@ class ConsoleSite:
         }
         self._files["/"] = self._files["/index.html"]
 
-    def answer(self, path: str, hosts: Sequence[str], origins: Sequence[str]) -> SiteAnswer | None:
+    def answer(self, method: str, path: str, hosts: Sequence[str], origins: Sequence[str]) -> SiteAnswer | None:
         """Return the answer to a request with these `Host` and `Origin` headers; None: the socket may be opened."""
         if len(hosts) != 1 or hosts[0].lower() not in self._hosts:
             return _error(421, "this host is not served here")
+        if method != "GET":
+            return _error(405, "only GET is allowed here")
         if path == SOCKET_PATH:
             is_own = len(origins) == 1 and origins[0] in self._origins
             return None if is_own else _error(403, "only the page of this site may open the socket")
@@ -104,4 +105,5 @@ def _error(status: int, text: str) -> SiteAnswer:
 
 def page_headers(answer: SiteAnswer) -> Mapping[str, str]:
     """Return all headers of an answer."""
-    return {**HEADERS, "Content-Type": answer.content_type, "Content-Length": str(len(answer.body))}
+    allowed = {"Allow": "GET"} if answer.status == 405 else {}
+    return {**HEADERS, **allowed, "Content-Type": answer.content_type, "Content-Length": str(len(answer.body))}
