@@ -86,6 +86,21 @@ def repeat_keys(tab: Tab) -> None:
     tab.evaluate(REPEAT_KEYS)
 
 
+def plug_gamepad(tab: Tab, *, is_held: bool, index: int = 0) -> None:
+    """Connect a fake gamepad that the browser knows, and let the page read it; its dead-man button is held or not."""
+    values = [float(is_held and button == 5) for button in range(17)]
+    tab.evaluate(
+        f"globalThis.pad = {{id: 'pad', mapping: 'standard', axes: [0, 0, 0, 0], connected: true, index: {index},"
+        f" buttons: {values}.map((value) => ({{value}}))}}; navigator.getGamepads = () => [pad];"
+        "new Promise((resolve) => setTimeout(resolve, 200))"
+    )
+
+
+def unplug_gamepads(tab: Tab) -> None:
+    """Disconnect all gamepads, and let the page see it."""
+    tab.evaluate("navigator.getGamepads = () => []; new Promise((resolve) => setTimeout(resolve, 200))")
+
+
 def status(tab: Tab) -> dict[str, Any] | None:
     """Return the newest status that the page has received; None while it is not loaded or not connected."""
     try:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 
 import pytest
 from tests.browser.chromium import Browser, Tab, wait_until
-from tests.browser.conftest import press, release, repeat_keys
+from tests.browser.conftest import plug_gamepad, press, release, repeat_keys
 from tests.browser.fake_client import CONFIRMED, FakeClient, wait_until_loaded
 
 SILENCE_S = 3.0
@@ -101,25 +100,16 @@ def test_a_stop_without_a_connection_is_sent_later(page: ConnectedPage) -> None:
 
 def test_a_hold_of_another_device_is_no_fresh_press(page: ConnectedPage) -> None:
     """When the space bar is let go while a gamepad is held, nothing is held until the gamepad is pressed again."""
-
-    def plug(*, is_held: bool) -> None:
-        values = json.dumps([float(is_held and button == 5) for button in range(17)])
-        page.tab.evaluate(
-            "globalThis.pad = {id: 'pad', mapping: 'standard', axes: [0, 0, 0, 0], connected: true, index: 0,"
-            f" buttons: {values}.map((value) => ({{value}}))}}; navigator.getGamepads = () => [pad]; 0"
-        )
-        page.pass_time(0.1)
-
-    plug(is_held=False)
+    plug_gamepad(page.tab, is_held=False)
     press(page.tab, "Space")
     page.client.wait_for_input("the space bar holds", held=True)
-    plug(is_held=True)
+    plug_gamepad(page.tab, is_held=True)
     release(page.tab, "Space")
     page.client.wait_for_input("nothing holds", held=False)
     page.pass_time(0.3)
     assert not page.client.inputs[-1].held
-    plug(is_held=False)
-    plug(is_held=True)
+    plug_gamepad(page.tab, is_held=False)
+    plug_gamepad(page.tab, is_held=True)
     page.client.wait_for_input("the gamepad holds", held=True)
 
 

@@ -105,7 +105,8 @@ function sendInput() {
   sources.poll();
   if (status?.role !== "drives") return;
   const { steering, throttle, brake } = sources.current;
-  const live = screen.isShown && document.hasFocus() && calibration === null && !gamepads.lost;
+  if (screen.isStalled && sources.holds) return; // as if the page were stopped; a short stall is bridged
+  const live = document.visibilityState === "visible" && document.hasFocus() && calibration === null && !gamepads.lost;
   connection.sendInput({ held: sources.holds, live, steering, throttle, brake });
 }
 

@@ -14,7 +14,8 @@ export class Screen {
     requestAnimationFrame(note);
   }
 
-  get isShown() {
-    return document.visibilityState === "visible" && performance.now() - this.#frame_ms < LIMIT_MS;
+  // The page is visible, but its screen stands still.
+  get isStalled() {
+    return document.visibilityState === "visible" && performance.now() - this.#frame_ms >= LIMIT_MS;
   }
 }
