@@ -8,9 +8,17 @@ from itertools import groupby, pairwise, product
 from typing import Any, NamedTuple
 
 from lavt.experiment.report.figure_style import Conditions
+from lavt.experiment.statistics.by_road import road_of
 
 MAX_LISTED_NAMES = 8
 """If there are more names, a sentence gives only their number; the tables list them."""
+
+MAX_LISTED_ROUTES = 3
+"""The same for the names of routes in the sentence on what was run."""
+
+SIGNIFICANT_P = 0.05
+LARGEST_CHANCE = 0.1
+"""An order of roads by length is named if, by chance alone, it is less probable than this."""
 
 EQUAL_LOOP_LATENCY_MS = 3.0
 """Median loop latencies that differ by no more than this are treated as equal."""
@@ -63,12 +71,12 @@ def runs_overview(runs: Sequence[Mapping[str, Any]]) -> str:
     if invalid:
         subject = "1 run is" if invalid == 1 else f"{invalid} runs are"
         validity = f"{subject} invalid and excluded from all statistics."
-    where = f"{_listed('route', routes)} under {_listed('condition', names)}"
+    where = f"{_listed('route', routes, MAX_LISTED_ROUTES)} under {_listed('condition', names, MAX_LISTED_NAMES)}"
     return f"{by_time} on {where}. {validity}"
 
 
-def _listed(word: str, names: Sequence[str]) -> str:
-    if len(names) > MAX_LISTED_NAMES:
+def _listed(word: str, names: Sequence[str], most: int) -> str:
+    if len(names) > most:
         return f"{len(names)} {word}s"
     return f"the {word}{'s' if len(names) > 1 else ''} {', '.join(names)}"
 
@@ -95,6 +103,82 @@ def results_sentences(name: str, conditions: Conditions) -> str:
     parts += _fall_sentences(levels)
     parts += _error_sentence({condition: conditions[condition] for condition, _, _ in known})
     return f"{name}. {' '.join(parts)}"
+
+
+def contrast_sentence(contrasts: Sequence[Mapping[str, Any]]) -> str:
+    """Return a sentence on what the planned contrasts, tested by road, show or cannot show; "" without contrasts."""
+    tested = [contrast for contrast in contrasts if contrast.get("p_by_road_holm") is not None]
+    if not tested:
+        return ""
+    shown = [contrast for contrast in tested if contrast["p_by_road_holm"] < SIGNIFICANT_P]
+    if shown:
+        differences = ", ".join(
+            f"{better} than at {worse} (p = {contrast['p_by_road_holm']:.2g})"
+            for contrast in shown
+            for better, worse in [_by_completion(contrast)]
+        )
+        others = len(tested) - len(shown)
+        rest = f"; the other {_counted(others, 'contrast')} {'is' if others == 1 else 'are'} not significant" * (
+            others > 0
+        )
+        return f"Tested by road (planned contrasts, Holm's correction), more runs are completed at {differences}{rest}."
+    roads = max(contrast["roads"] for contrast in tested)
+    least_p = min(1.0, len(tested) * 2 * 0.5**roads)
+    start = "Tested by road, no planned contrast of completion in any lane is significant"
+    if least_p >= SIGNIFICANT_P:
+        return (
+            f"{start}, and none could be: with {_counted(roads, 'road')} and {_counted(len(tested), 'contrast')}, p "
+            f"after Holm's correction is at least {least_p:.2g}, so this test cannot show whether neighbouring "
+            "conditions differ on other roads."
+        )
+    return f"{start} ({_counted(roads, 'road')}), which does not show that the conditions are equal."
+
+
+def _counted(count: int, word: str) -> str:
+    return f"{count} {word}{'s' * (count != 1)}"
+
+
+def _by_completion(contrast: Mapping[str, Any]) -> tuple[str, str]:
+    """Return both conditions of a contrast, the one with more completed runs on more roads first."""
+    a, b = str(contrast["a"]), str(contrast["b"])
+    return (a, b) if contrast["roads_for_a"] > contrast["roads_for_b"] else (b, a)
+
+
+def length_sentences(conditions: Conditions, lengths_m: Mapping[str, float]) -> str:
+    """Return sentences on the conditions under which only the shorter routes are completed; "" if there are none.
+
+    `lengths_m` are the lengths of routes by name. A route counts as completed if all its runs are, in their own lane
+    if that is known. A condition is named if each completed route is shorter than each other route, and if that is
+    improbable by chance alone. If several routes are on one road, they are not independent, and no condition is named.
+    """
+    own_lane = _rate_key(conditions) != "completion_rate"
+    conditions_by_split: dict[tuple[tuple[float, ...], tuple[float, ...]], list[str]] = {}
+    for name, entry in conditions.items():
+        routes = {route: runs for route, runs in (entry.get("routes") or {}).items() if route in lengths_m}
+        completed: list[float] = []
+        other: list[float] = []
+        for route, runs in routes.items():
+            count = runs.get("completed_in_own_lane") if own_lane else runs["completed"]
+            (completed if count == runs["runs"] else other).append(lengths_m[route])
+        is_split = completed and other and max(completed) < min(other)
+        if is_split and len({road_of(route) for route in routes}) == len(routes):
+            conditions_by_split.setdefault((tuple(sorted(completed)), tuple(sorted(other))), []).append(name)
+    sentences = []
+    for (shorter_m, longer_m), names in conditions_by_split.items():
+        orders = math.comb(len(shorter_m) + len(longer_m), len(shorter_m))
+        if 1 / orders <= LARGEST_CHANCE:
+            sentences.append(
+                f"Longer roads fail first: at {' and '.join(names)}, every run is completed"
+                f"{' in its own lane' * own_lane} on the {_counted(len(shorter_m), 'shorter route')} "
+                f"({_range_m(shorter_m)}), and not on the {_counted(len(longer_m), 'longer one')} "
+                f"({_range_m(longer_m)}); if length did not matter, the chance of this order would be 1 in {orders}."
+            )
+    return " ".join(sentences)
+
+
+def _range_m(lengths_m: Sequence[float]) -> str:
+    first, last = f"{lengths_m[0]:.0f}", f"{lengths_m[-1]:.0f}"
+    return f"{first} m" if first == last else f"{first} to {last} m"
 
 
 def _error_sentence(conditions: Conditions) -> list[str]:
