@@ -23,7 +23,7 @@ from lavt.experiment.report.figure_style import condition_colours
 from lavt.experiment.report.replay_section import largest_error_s, least_and_most_delayed
 from lavt.experiment.report.report import write_report
 from lavt.experiment.report.run_sections import received_pictures
-from lavt.experiment.report.tables import stage_table
+from lavt.experiment.report.tables import machine_table, stage_table
 from lavt.nodes.payloads import VideoUnit
 from lavt.recording.record import RecordWriter, read_record
 
@@ -279,6 +279,12 @@ def test_real_and_virtual_runs_have_separate_tables(sweep: Path) -> None:
     assert "Virtual time, fidelity video: modelled network and clocks" in html
     assert "Real time, injected by relay" in html
     assert "invalid: the offset between the clocks is only known to 6.00 ms" in html
+
+
+def test_the_table_of_machines_says_where_the_costs_were_measured() -> None:
+    """Of the costs the table has only where they were measured, and it has no empty entries."""
+    model = {"costs": '{"measured_on": "2 cores", "stages_us": {}}', "traces": "{}", "condition": "{}"}
+    assert machine_table({"model": model}).rows == [["model", "costs measured on", "2 cores"]]
 
 
 def test_the_page_has_the_clock_offset_of_two_machines(sweep: Path) -> None:

@@ -28,10 +28,11 @@ WHAT_IT_IS = (
 VIRTUAL = "the same programs on a simulated clock."
 WITHOUT_PICTURES = " Runs without pictures (fidelity geometry) get the lane without an error of detection."
 OWN_LANE = (
-    "the middle of the rear axle was in the lane of the route until its end, and the driver followed no other lane."
+    "the middle of the rear axle was in the lane of the route until its end, and the driver followed no other lane. "
+    "The car may have touched a line."
 )
 PRESETS = {
-    "paper_calibrated": "gains of the lane keeper, tuned by hand so that completion falls where it does in the "
+    "paper_calibrated": "gains of the lane keeper, tuned by hand so that completion falls about where it does in the "
     "campaign of Khalil and Kwon (2026): the delay at which it falls is an input, not a finding.",
     "designed": "gains of the lane keeper, found by theory alone.",
 }
@@ -107,7 +108,7 @@ def _legend(report: ReportContext) -> Markup:
         ("Condition", f"the delay that was injected into video + control, in ms: {listed}." if listed else ""),
         ("Virtual time", (VIRTUAL + without_pictures) * ("virtual" in report.kinds)),
         ("Loop latency", "from a frame's stamp (its send time) to the application of its command."),
-        ("P95", "95 % of the time, the rear axle was closer to the centre of the route's lane."),
+        ("P95", "on 95 % of the distance, the rear axle was closer to the centre of the route's lane."),
         ("τ video, τ control", "the one-way latencies of a frame and of a command."),
         ("Own lane", OWN_LANE if has_own_lane(report.kinds) else ""),
         *((name, meaning) for name, meaning in PRESETS.items() if any(run.get("preset") == name for run in runs)),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -250,12 +251,13 @@ def stage_table(
 
 
 def machine_table(annotations: Mapping[str, Mapping[str, str]]) -> TableData:
-    """Return the table of versions and machines from a run's records."""
+    """Return the table of versions and machines from a run's records; of the costs, only where they were measured."""
     columns = [text_column("category"), text_column("property", is_long=True), text_column("value", is_long=True)]
     rows = [
-        [name, key, value]
+        [name, "costs measured on", json.loads(value).get("measured_on")] if key == "costs" else [name, key, value]
         for name in sorted(annotations)
         for key, value in annotations[name].items()
-        if key != "condition"  # not a property of the machine; other tables show it
+        # The condition is not a property of the machine; other tables show it. Most runs have no traces.
+        if key != "condition" and value != "{}"
     ]
     return TableData(columns, rows or [["not recorded", None, None]])
