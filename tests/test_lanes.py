@@ -63,6 +63,7 @@ def collect_tests(root: Path, arguments: tuple[str, ...]) -> list[str]:
     return subprocess.run(command, cwd=root, capture_output=True, text=True, check=False).stdout.splitlines()
 
 
+@pytest.mark.full
 def test_every_test_belongs_to_one_lane(collected: dict[str, set[str]]) -> None:
     """The pytest lanes together run every test exactly once, except the kernel tests, which the kernel lane runs."""
     tests = [f"tests/{folder}/test_{folder}.py::test_plain" for folder in ("cli", *SEQUENTIAL_FOLDERS)]
@@ -72,6 +73,7 @@ def test_every_test_belongs_to_one_lane(collected: dict[str, set[str]]) -> None:
     assert Counter(test for lane in collected.values() for test in lane) == Counter(tests)
 
 
+@pytest.mark.full
 def test_folder_and_marker_select_the_lane(collected: dict[str, set[str]]) -> None:
     """A test is in the lane of its folder, else in the lane of its marker, else in quick."""
     assert collected["quick"] == {"tests/test_root.py::test_plain", "tests/cli/test_cli.py::test_plain"}
