@@ -83,7 +83,7 @@ def test_folder_and_marker_select_the_lane(collected: dict[str, set[str]]) -> No
         "tests/test_root.py::test_realtime",
         "tests/cli/test_cli.py::test_realtime",
     }
-    for folder in ("field", "interop"):
+    for folder in ("browser", "field", "interop"):
         assert collected[folder] == {f"tests/{folder}/test_{folder}.py::test_plain"}
 
 
@@ -117,6 +117,7 @@ def test_every_lane_is_documented() -> None:
         "pytest -m realtime",
         "pytest tests/field",
         "pytest tests/interop",
+        "pytest tests/browser",
         "tests/kernel/run",
     ]
     assert [command for command in [*commands, "tests.lanes", ".ci/run"] if command not in text] == []
@@ -251,7 +252,7 @@ def test_table_lists_lanes_and_failures() -> None:
 def test_the_programs_in_the_ci_script_run() -> None:
     """The Python programs in `.ci/run` can import all names that they use; no linter checks these programs."""
     programs = re.findall(r"python -c '([^']*)'", (REPOSITORY / ".ci" / "run").read_text())
-    assert len(programs) == 3
+    assert len(programs) == 4
     for program in programs:
         completed = subprocess.run(
             [sys.executable, "-c", program], cwd=REPOSITORY, capture_output=True, text=True, check=False, timeout=60
