@@ -199,6 +199,7 @@ def test_the_replay_is_a_video(sweep: Path) -> None:
     for colour, meaning in (("#50c850", "the lane that the driver detected"), ("#ffc850", "where the rear axle was")):
         assert f'<i style="background: {colour}"></i> {meaning}' in html
     assert "The runs 0 and 1" in html
+    assert re.search(r"a still picture shows the moment [0-9.]+ s after the start, when L1 is farthest", html)
     video = cv2.VideoCapture(str(sweep / "report" / "replay.mp4"))
     assert int(video.get(cv2.CAP_PROP_FRAME_COUNT)) > 20
 

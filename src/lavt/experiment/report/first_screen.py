@@ -28,6 +28,10 @@ WHAT_IT_IS = (
 LANE_KEEPER = " The driver is a program that keeps the lane."
 VIRTUAL = "the same programs on a simulated clock."
 WITHOUT_PICTURES = " Runs without pictures (fidelity geometry) get the lane without an error of detection."
+FRAME_AGE = (
+    "at a moment, the time since the stamp of the frame from which the command in force was made. It grows while a "
+    "command stays in force; its mean is over time."
+)
 OWN_LANE = (
     "the middle of the rear axle was in the lane of the route until its end, and the driver followed no other lane. "
     "The car may have touched a line."
@@ -110,6 +114,7 @@ def _legend(report: ReportContext) -> Markup:
         ("Condition", f"the delay that was injected into video + control, in ms: {listed}." if listed else ""),
         ("Virtual time", (VIRTUAL + without_pictures) * ("virtual" in report.kinds)),
         ("Loop latency", "from a frame's stamp, set just before encoding, to the application of its command."),
+        ("Frame age", FRAME_AGE if any(run.get("picture_age_ms") for run in runs) else ""),
         ("P95", "on 95 % of the distance, the rear axle was closer to the centre of the route's lane."),
         ("τ video, τ control", "the one-way latencies of a frame and of a command."),
         ("Own lane", OWN_LANE if has_own_lane(report.kinds) else ""),

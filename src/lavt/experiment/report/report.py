@@ -38,6 +38,7 @@ from lavt.experiment.report.sections import (
     degradation_parts,
     group_parts,
     injected_parts,
+    lane_change_parts,
     route_parts,
     run_parts,
     stage_parts,
@@ -130,7 +131,7 @@ def _chapters(
         html_page.Chapter("Latency", latency),
         html_page.Chapter("Statistics", statistics),
         html_page.Chapter(VALIDITY, validity),
-        html_page.Chapter("Every run", [("All runs", run_parts(report))]),
+        html_page.Chapter("Every run", [("All runs", run_parts(report)), ("Lane changes", lane_change_parts(report))]),
     ]
 
 

@@ -326,12 +326,17 @@ def route_parts(report: ReportContext) -> Parts:
 
 
 def run_parts(report: ReportContext) -> Parts:
-    """Return the table of all runs with their validity, and a link to the table of their lane changes."""
-    runs = report.summary["runs"]
-    return [
-        save_table(report.directory, "runs", run_table(runs)),
-        link_table(report.directory, "lane_changes", lane_change_table(runs)),
-    ]
+    """Return the table of all runs with their validity."""
+    return [save_table(report.directory, "runs", run_table(report.summary["runs"]))]
+
+
+def lane_change_parts(report: ReportContext) -> Parts:
+    """Return links to the table of all lane changes, which is too long for the page, with a sentence on it."""
+    table = lane_change_table(report.summary["runs"])
+    if not table.rows:
+        return []
+    text = "Every change of the lane that the driver followed, or of the lane that the car was in, is in these files:"
+    return [html_page.paragraph(text), link_table(report.directory, "lane_changes", table)]
 
 
 def clock_parts(report: ReportContext) -> Parts:
