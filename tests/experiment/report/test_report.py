@@ -282,6 +282,19 @@ def test_real_and_virtual_runs_have_separate_tables(sweep: Path) -> None:
     assert "invalid: the offset between the clocks is only known to 6.00 ms" in html
 
 
+def test_the_worst_value_of_each_check_is_shown(sweep: Path) -> None:
+    """Beside the limit of each check is the worst value of all runs, with its run, for each kind of time."""
+    with (sweep / "report" / "tables" / "checks.csv").open(newline="") as file:
+        rows = {row["check"]: row for row in csv.DictReader(file)}
+    bound = rows["error bound of the clock offset, ms"]
+    assert bound["run in real time"] == "3"
+    assert float(bound["worst in real time (limit) value"]) == pytest.approx(6.0)
+    assert float(bound["worst in real time (limit) limit"]) == 2.0
+    assert float(bound["worst in virtual time (limit) value"]) == pytest.approx(0.4, abs=0.05)
+    validity = page_of(sweep).partition('id="valid_and_invalid_runs"')[2].partition("<h3")[0]
+    assert "6.00\N{NO-BREAK SPACE}(2.00)" in validity
+
+
 def test_the_table_of_machines_says_where_the_costs_were_measured() -> None:
     """Of the costs the table has only where they were measured, and it has no empty entries."""
     model = {"costs": '{"measured_on": "2 cores", "stages_us": {}}', "traces": "{}", "condition": "{}"}

@@ -26,6 +26,7 @@ from lavt.experiment.report.latency_figures import (
 )
 from lavt.experiment.report.sweep_figures import axis_figure, incidence_figure, routes_with_survival, survival_figure
 from lavt.experiment.report.tables import (
+    check_table,
     clock_table,
     group_table,
     lane_change_table,
@@ -50,6 +51,10 @@ AGE_NOTE = " The paper does not give it."
 STAGES_NOTE = (
     "The first row, from capture to stamp, is from one run of each condition. The other rows are from all runs of "
     "the condition. The bars contain neither the first row, which is before the loop, nor the stages after the loop."
+)
+CHECKS_NOTE = (
+    "The table has the worst value of each check over all runs, valid or not. A value over its limit makes its run "
+    "invalid. Other checks have no number, for example whether the records are complete. docs/metrics.md explains all."
 )
 
 SMALLEST_REST_MS = 0.5
@@ -126,6 +131,9 @@ def validity_parts(report: ReportContext) -> Parts:
         runs_failed = "1 run" if len(failed) == 1 else f"{len(failed)} runs"
         parts.append(html_page.paragraph(f"{runs_failed} failed and {'is' if len(failed) == 1 else 'are'} left out:"))
         parts.append(html_page.bullets([f"{run['run']}: {run['reason']}" for run in failed]))
+    table = check_table(runs)
+    if table.rows:
+        parts += [save_table(report.directory, "checks", table), html_page.paragraph(CHECKS_NOTE, is_note=True)]
     if speed["wall_s"]:
         factor = speed["simulated_s"] / speed["wall_s"]
         jobs = f"{speed['jobs']} parallel job{'s' if speed['jobs'] != 1 else ''}"
