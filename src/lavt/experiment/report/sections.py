@@ -179,8 +179,7 @@ def degradation_parts(report: ReportContext) -> Parts:
     paper = report.paper(report.summary["conditions"])
     caption = (
         "Completion in any lane, and error of the completed runs, over the median loop latency. Bars are 95 % "
-        "intervals for these routes; a single run has none. Names above each other are in the vertical order of their "
-        "points." + (PAPER_POINTS if paper else "") + _base_note(report)
+        "intervals for these routes; a single run has none." + (PAPER_POINTS if paper else "") + _base_note(report)
     )
     return [
         save_figure(
@@ -278,8 +277,8 @@ def group_parts(report: ReportContext) -> Parts:
     if len(groups) <= MAX_COMPARED_GROUPS:
         figure = presets_figure({title_of(group, names): group["conditions"] for group in groups}, report.colours)
         caption = (
-            "Comparison of the groups in virtual time. The legend names the settings that differ. Where the points "
-            "of several conditions overlap, their names are in the vertical order of the points."
+            "Comparison of the groups in virtual time. The legend names the settings that differ. Names are written "
+            "where the points of several conditions are at the same place."
         )
         parts.append(save_figure(report.directory, "groups", figure, "comparison of the groups", caption))
     return [*parts, save_table(report.directory, "groups", group_table(groups, names))]
