@@ -48,9 +48,12 @@ def save_figure(report_dir: Path, name: str, figure: Figure, alternative: str, c
     return html_page.figure(shown, [svg.name, png.name], alternative, caption)
 
 
-def save_table(report_dir: Path, name: str, table: TableData) -> Markup:
-    """Write tables/`name`.csv and .tex, and return the table as HTML; if it has no rows, write and return nothing."""
-    return _save_table(report_dir, name, table, html_of(table), is_short=len(table.rows) <= SHORT_ROWS)
+def save_table(report_dir: Path, name: str, table: TableData, extra_note: str = "") -> Markup:
+    """Write tables/`name`.csv and .tex, and return the table as HTML; if it has no rows, write and return nothing.
+
+    `extra_note` explains the extra columns; the page shows it only together with them.
+    """
+    return _save_table(report_dir, name, table, html_of(table, extra_note), is_short=len(table.rows) <= SHORT_ROWS)
 
 
 def link_table(report_dir: Path, name: str, table: TableData) -> Markup:
