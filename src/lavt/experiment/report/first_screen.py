@@ -12,6 +12,7 @@ from lavt.experiment.report.sections import MAX_COMPARED_GROUPS, Parts, ReportCo
 from lavt.experiment.report.sentences import (
     contrast_sentence,
     length_sentences,
+    limits_sentence,
     results_sentences,
     runs_overview,
 )
@@ -43,8 +44,8 @@ PRESETS = {
 }
 
 
-def first_parts(report: ReportContext, replay: Parts) -> Parts:
-    """Return the parts of the first screen; `replay` is the replay, if there is one.
+def first_parts(report: ReportContext, replay: Parts, setting: str = "") -> Parts:
+    """Return the parts of the first screen; `replay` is the replay, if there is one, and `setting` follows the runs.
 
     A narrow screen shows them in this order: what was run, the figure, its findings in words, and then the replay,
     which is an example. A wide screen has the replay next to the figure.
@@ -53,7 +54,7 @@ def first_parts(report: ReportContext, replay: Parts) -> Parts:
     invalid = any(not run["valid"] for run in runs) or failed
     link = ("See why.", html_page.chapter_anchor(VALIDITY)) if invalid else None
     driver = LANE_KEEPER if all(run.get("driver") == "lane_keeper" for run in runs) else ""
-    about = html_page.paragraph(f"{WHAT_IT_IS}{driver} This page: {runs_overview(runs)}", link=link)
+    about = html_page.paragraph(f"{WHAT_IT_IS}{driver} This page: {runs_overview(runs, setting)}", link=link)
     sentences = [sentence for sentence in _findings(report) if sentence]
     findings = [html_page.bullets(sentences)] if sentences else []
     shown = [*headline_parts(report), *findings, *replay]
@@ -75,7 +76,8 @@ def _findings(report: ReportContext) -> list[str]:
         sentences += [results_sentences(name, conditions), lengths and f"{name}. {lengths}" if compared else lengths]
     sentences.append(contrast_sentence(report.summary.get("contrasts") or []))
     real = report.kinds.get("real")
-    return [*sentences, *([results_sentences("Real time", real)] if real else [])]
+    examples = [results_sentences("Real time", real)] if real else []
+    return [*sentences, *examples, limits_sentence(report.summary["runs"])]
 
 
 def headline_parts(report: ReportContext) -> Parts:

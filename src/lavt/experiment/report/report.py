@@ -28,6 +28,7 @@ from lavt.experiment.report.run_sections import (
     drawn_runs,
     machine_parts,
     read_drives,
+    setting_text,
     single_run_parts,
     trajectory_parts,
 )
@@ -87,7 +88,7 @@ def write_report(
     report = ReportContext(summary, report_dir, condition_colours(str(run["condition"]) for run in summary["runs"]))
     sets = read_drives(drawn_runs(report, results), drives or {})
     with mpl.rc_context(SETTINGS):
-        first = first_parts(report, replay_parts(report, sets))
+        first = first_parts(report, replay_parts(report, sets), setting_text(report, sets))
         chapters = _chapters(report, sets, boundaries)
     index = report_dir / "index.html"
     index.write_text(html_page.page(TITLE, first, chapters), encoding="utf-8")

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+
+from lavt.clock import calendar_time
 from lavt.domain import NS_PER_S, Picture
 from lavt.experiment.analysis.drive_data import DriveData, capture_to_stamp_ms, one_of_each_condition, read_drive
 from lavt.experiment.report import html_page
@@ -57,6 +60,38 @@ def read_drives(
         key: [already_read.get(directory) or read_drive(directory, run) for directory, run in members]
         for key, members in sets.items()
     }
+
+
+def setting_text(report: ReportContext, sets: DriveSets) -> str:
+    """Return sentences on the speed, the lane width and the date of the runs, as far as the records have them.
+
+    The clock of runs in virtual time is simulated, so they have no date. If not all runs are drawn, the speed is left
+    out, because the record of a run that is not drawn is not read.
+    """
+    runs, drives = report.summary["runs"], [drive for members in sets.values() for drive in members]
+    speeds_mps = [float(np.median(drive.truth.floats("speed_mps"))) for drive in drives if len(drive.truth)]
+    speeds = [round(speed_mps * 3.6) for speed_mps in speeds_mps if np.isfinite(speed_mps)]
+    widths_m = [(run.get("lane_kept") or {}).get("lane_width_m") for run in runs]
+    widths = [round(width_m, 1) for width_m in widths_m if width_m is not None]
+    dates = [
+        calendar_time(drive.began_wall_ns).date().isoformat()
+        for drive in drives
+        if drive.result["time"] == "real" and drive.began_wall_ns is not None
+    ]
+    sentences = []
+    if len(speeds) == len(runs):
+        sentences.append(f"The median speed of a run is {_range(speeds)} km/h.")
+    if widths:
+        sentences.append(f"The lanes are {_range(widths)} m wide.")
+    if dates:
+        sentences.append(f"The runs in real time were driven on {_range(dates)} (UTC).")
+    return " ".join(sentences)
+
+
+def _range(values: Sequence[float] | Sequence[str]) -> str:
+    """Return the lowest and the highest of values, or the only one."""
+    in_order = sorted(values)
+    return f"{in_order[0]}" if in_order[0] == in_order[-1] else f"{in_order[0]} to {in_order[-1]}"
 
 
 def trajectory_parts(report: ReportContext, sets: DriveSets) -> Parts:
