@@ -177,9 +177,9 @@ def _picture_tile(seen: Seen, height: int) -> Picture:
 
 
 def _write_sign(tile: Picture, text: str) -> None:
-    """Write a large text on a dark ground in the middle of a tile."""
+    """Write a large text on a dark ground near the lower edge of a tile."""
     (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, SIGN_SIZE, 2)
-    x, y = (tile.shape[1] - width) // 2, (tile.shape[0] + height) // 2
+    x, y = (tile.shape[1] - width) // 2, tile.shape[0] - 40
     cv2.rectangle(tile, (x - 14, y - height - 14), (x + width + 14, y + 16), BACKGROUND, -1)
     _text(tile, text, (x, y), SIGN_SIZE, RED)
 

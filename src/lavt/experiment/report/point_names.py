@@ -17,7 +17,7 @@ from lavt.experiment.report.figure_style import SMALL_TEXT_POINTS, FigurePoint
 COLOURS = {"paper": "0.45"}
 """The colour of the names of a kind of points; other names are black."""
 
-CHARACTER_POINTS = 0.65 * SMALL_TEXT_POINTS
+CHARACTER_POINTS = 0.6 * SMALL_TEXT_POINTS
 LINE_POINTS = 1.25 * SMALL_TEXT_POINTS
 """Width of a character and height of a line, in typographic points, with a margin for other fonts."""
 MARKER_POINTS = 4.0
