@@ -130,7 +130,7 @@ def test_conditions_with_overlapping_points_are_named() -> None:
 
 def test_the_lowest_panel_has_an_x_label() -> None:
     """The routes are below each other, and only the last has an x label."""
-    panels = cross_track_figure({"a": [], "b": [], "c": []}, COLOURS).axes[:3]
+    panels = cross_track_figure({"a": [], "b": [], "c": []}, COLOURS, []).axes[:3]
     assert [axes.get_xlabel() for axes in panels] == ["", "", "distance along the route (m)"]
     assert len({axes.get_position().x0 for axes in panels}) == 1
 

@@ -110,6 +110,11 @@ def columns(parts: Sequence[Markup]) -> Markup:
     return _part("columns", parts)
 
 
+def figures(parts: Sequence[Markup]) -> Markup:
+    """Return figures next to each other, two or three in a row, so that rows are full where the number allows it."""
+    return _part("figures", parts)
+
+
 def figure(shown: Path, files: Sequence[str], alternative: str, caption: str) -> Markup:
     """Return a figure with its caption and links to its files.
 

@@ -181,7 +181,7 @@ def degradation_parts(report: ReportContext) -> Parts:
         "Completion in any lane, and error of the completed runs, over the median loop latency. Bars are 95 % "
         "intervals for these routes; a single run has none." + (PAPER_POINTS if paper else "") + _base_note(report)
     )
-    return [
+    figures = [
         save_figure(
             report.directory,
             "degradation" if label == LOOP_LABEL else "degradation_age",
@@ -191,6 +191,7 @@ def degradation_parts(report: ReportContext) -> Parts:
         )
         for label in known_latencies(report.kinds)
     ]
+    return [html_page.figures(figures)]
 
 
 def _is_repeated(conditions: Conditions) -> bool:
@@ -215,18 +216,17 @@ def survival_parts(report: ReportContext) -> Parts:
                 "Cumulative incidence: the share of runs that ended in each way up to each distance.",
             ),
         }
-        for name, (make, caption) in figures.items():
-            figure = make(conditions, report.colours)
-            alternative = f"{name} by distance, {kind} time"
-            parts.append(
-                save_figure(
-                    report.directory,
-                    f"{name}_{kind}",
-                    figure,
-                    alternative,
-                    f"{caption} {kind.capitalize()} time{report.base_title(kind)}.",
-                )
+        saved = [
+            save_figure(
+                report.directory,
+                f"{name}_{kind}",
+                make(conditions, report.colours),
+                f"{name} by distance, {kind} time",
+                f"{caption} {kind.capitalize()} time{report.base_title(kind)}.",
             )
+            for name, (make, caption) in figures.items()
+        ]
+        parts.append(html_page.figures(saved))
         parts.append(link_table(report.directory, f"survival_{kind}", survival_table(conditions)))
     return parts
 
@@ -311,7 +311,7 @@ def axis_parts(report: ReportContext) -> Parts:
         name = "_".join(["axes", *(html_page.slug(title),)]) if title else "axes"
         alternative = f"driving results by {short_name(x_axis)}"
         parts.append(save_figure(report.directory, name, figure, alternative, caption))
-    return parts
+    return [html_page.figures(parts)]
 
 
 def _numeric_values(groups: Sequence[Group], axis: str) -> int:
@@ -342,7 +342,10 @@ def lane_change_parts(report: ReportContext) -> Parts:
     table = lane_change_table(report.summary["runs"])
     if not table.rows:
         return []
-    text = "Every change of the lane that the driver followed, or of the lane that the car was in, is in these files:"
+    text = (
+        "Every change of the lane that the driver followed, or of the lane that the car was in, is in the file "
+        "tables/lane_changes.csv."
+    )
     return [html_page.paragraph(text), link_table(report.directory, "lane_changes", table)]
 
 
