@@ -20,7 +20,13 @@ LARGEST_SHOWN_BYTES = 300_000
 
 _DARK = "".join(
     f'[style*="{name}: {light}"]{{{name}:{dark}!important}}'
-    for light, dark in {"#ffffff": "#14171a", "#000000": "#e4e7ea", "#b0b0b0": "#59626b", "#4d4d4d": "#b5bcc4"}.items()
+    for light, dark in {
+        "#ffffff": "#14171a",
+        "#000000": "#e4e7ea",
+        "#b0b0b0": "#59626b",
+        "#4d4d4d": "#b5bcc4",
+        "#737373": "#a2abb4",
+    }.items()
     for name in ("fill", "stroke")
 )
 DARK_STYLE = f"<style>@media (prefers-color-scheme:dark){{text{{fill:#e4e7ea}}{_DARK}}}</style>"
