@@ -12,7 +12,7 @@ from lavt.config import Condition, ImpairmentConfig, RunConfig
 from lavt.config_file import conditions, parse_config
 from lavt.experiment.analysis.invalid_reason import InvalidCode, InvalidReason, not_measured
 from lavt.experiment.runs.plan import PlannedRun, injected_entry, plan_run
-from lavt.experiment.runs.real_run import relay_config, relay_invalid_reasons, requested_ms
+from lavt.experiment.runs.real_run import relay_checks, relay_config, relay_invalid_reasons, requested_ms
 
 
 def planned(condition: str, **network: Any) -> PlannedRun:
@@ -49,6 +49,15 @@ def reasons(
             "late_ms": dict(zip(directions, lateness_ms, strict=True)),
         }
     )
+
+
+def test_the_check_has_the_largest_difference() -> None:
+    """The check has the larger difference of both flows: from the request, or of a varying delay from the plan."""
+    report = {"held_ms": {"video downstream": 75.4, "control upstream": 9.0}, "late_ms": {"control upstream": -0.7}}
+    (check,) = relay_checks({"requested_ms": {"video": 75.0, "control": None}, **report})
+    assert (check.code, check.limit) == (InvalidCode.INJECTION_DIFFERS, 1.0)
+    assert check.value == pytest.approx(0.7)
+    assert relay_checks({}) == []
 
 
 def test_a_constant_delay_is_judged_by_its_median() -> None:

@@ -12,7 +12,7 @@ from lavt.experiment.analysis.clock_validity import step_reasons
 from lavt.experiment.analysis.invalid_reason import InvalidCode, InvalidReason, not_measured
 from lavt.experiment.analysis.metrics import measure
 from lavt.experiment.analysis.results import IDENTITY_KEYS, OPTIONAL_IDENTITY_KEYS, run_result, write_json
-from lavt.experiment.analysis.validity import injection_reasons, invalid_reasons
+from lavt.experiment.analysis.validity import injection_reasons, invalid_reasons, measured_checks
 from lavt.recording.record import read_record
 
 MakeRun = Callable[..., Path]
@@ -84,6 +84,33 @@ def test_each_infrastructure_fault_makes_the_run_invalid(
 def test_small_faults_are_tolerated(make_run: MakeRun, tmp_path: Path, settings: dict[str, Any]) -> None:
     """A run is valid with small faults: late physics, missed frames, clock steps, unsampled clocks, loop jitter."""
     assert reasons(make_run, tmp_path, **settings) == []
+
+
+@pytest.mark.parametrize(
+    ("settings", "code", "expected"),
+    [
+        ({"step_s": 0.002}, InvalidCode.CLOCK_STEP, (2.0, 5.0)),
+        ({"server_unsampled_s": (4, 5)}, InvalidCode.CLOCK_NOT_SAMPLED, (2.0, 2.5)),
+        ({"client_unsampled_s": (10, 15)}, InvalidCode.CLOCK_NOT_SAMPLED, (3.0, 2.5)),
+        ({"bound_s": 0.0011}, InvalidCode.CLOCK_BOUND, (2.2, 2.0)),
+        ({"late": 1}, InvalidCode.PHYSICS_LATE, (0.005, 0.01)),
+        ({"skipped": 3}, InvalidCode.FRAMES_MISSED, (3 / 361, 0.01)),
+        ({"slow_frame_ms": 9.0}, InvalidCode.LOOP_JITTER, (9.0, 10.0)),
+        ({}, InvalidCode.CLOSURE, (0.0, 1.0)),
+    ],
+)
+def test_each_check_has_its_value_and_limit(
+    make_run: MakeRun, tmp_path: Path, settings: dict[str, Any], code: InvalidCode, expected: tuple[float, float]
+) -> None:
+    """A check has its measured value and its limit in each run, and exceeds the limit only in an invalid run."""
+    make_run(tmp_path, **settings)
+    server, client = read_record(tmp_path / "server.mcap"), read_record(tmp_path / "client.mcap")
+    measured = measure(server, client)
+    checks = measured_checks(server, client, measured)
+    (check,) = [check for check in checks if check.code is code]
+    assert (check.value, check.limit) == pytest.approx(expected, rel=0.05, abs=1e-3)
+    exceeded = {check.code for check in checks if check.value > check.limit}
+    assert exceeded == {reason.code for reason in invalid_reasons(server, client, measured)}
 
 
 # The clocks.
@@ -338,7 +365,7 @@ def test_a_result_has_every_key(make_run: MakeRun, tmp_path: Path) -> None:
     read = json.loads((tmp_path / "result.json").read_text())
     metrics = measure(server, client).entry
     assert list(read)[: len(IDENTITY_KEYS)] == list(IDENTITY_KEYS)
-    assert read.keys() == {*IDENTITY_KEYS, "digest", "valid", "invalid_reasons", *metrics}
+    assert read.keys() == {*IDENTITY_KEYS, "digest", "valid", "invalid_reasons", "checks", *metrics}
     assert read["participant"] is None
     assert read["mae_m"] is None
     assert (read["valid"], read["invalid_reasons"]) == (

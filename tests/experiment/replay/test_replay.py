@@ -10,12 +10,14 @@ import pytest
 from lavt.cli.main import build_app
 from lavt.config import RunConfig
 from lavt.config_file import load_config, shipped
+from lavt.domain import Lane, Picture
 from lavt.errors import UserError, WorkError
-from lavt.experiment.replay.drawing import GAP_PX, WIDTH_PX
+from lavt.experiment.replay.drawing import GAP_PX, WIDTH_PX, ReplayLayout, Seen, draw_scene
 from lavt.experiment.replay.drive import read_driver_view, read_replay_drive
 from lavt.experiment.replay.replay import replay_pictures
 from lavt.experiment.runs.plan import plan_run
 from lavt.experiment.runs.run import run_once
+from lavt.perception.lane_detector import TRACK_CONFIDENCE
 from lavt.transport.video.stamp import read_stamp
 
 
@@ -80,6 +82,21 @@ def test_drives_are_side_by_side(delayed: Path, longer: Path) -> None:
     alone = next(replay_pictures([longer]))
     assert picture.shape[1] == 2 * WIDTH_PX + GAP_PX
     assert alone.shape[0] < picture.shape[0] / 2 + 20, "a drive without video has no panel for it"
+
+
+def test_a_picture_without_a_lane_says_so(delayed: Path) -> None:
+    """The picture says that no lane was detected if the confidence is too low for a lane, and only then."""
+    drive = read_replay_drive(delayed)
+    layout = ReplayLayout(has_pictures=True, has_truth=False, longest_s=1.0, largest_error_m=1.0)
+    picture = np.zeros((480, 640, 3), np.uint8)
+
+    def drawn(confidence: float | None) -> Picture:
+        lane = None if confidence is None else Lane((0.0, 0.0, 0.0), 3.5, 4.0, 20.0, confidence)
+        return draw_scene(drive, drive.scene(1.0), layout, Seen(picture, lane, None))
+
+    unknown = drawn(None)
+    assert np.array_equal(drawn(TRACK_CONFIDENCE), unknown)
+    assert not np.array_equal(drawn(TRACK_CONFIDENCE - 0.01), unknown)
 
 
 def test_the_duration_follows_speed_and_rate(longer: Path) -> None:

@@ -1,16 +1,25 @@
 from __future__ import annotations
 
+from itertools import combinations
 from typing import Any
 
+import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.container import ErrorbarContainer
-from matplotlib.figure import Figure
 from matplotlib.text import Annotation
 
-from lavt.experiment.report.figure_style import SETTINGS, FigurePoint, clusters_of, condition_colours
+from lavt.experiment.report.figure_style import (
+    SETTINGS,
+    FigurePoint,
+    condition_colours,
+    condition_handles,
+    legend_below,
+    new_figure,
+)
 from lavt.experiment.report.headline_figure import headline_figure
 from lavt.experiment.report.latency_figures import degradation_figure, presets_figure
+from lavt.experiment.report.point_names import name_points
 from lavt.experiment.report.run_figures import cross_track_figure
 from lavt.experiment.statistics.paper_results import paper
 
@@ -46,15 +55,50 @@ def error_bars(axes: Axes) -> list[list[float]]:
     return [[round(float(y), 9) for _, y in bar.get_segments()[0]] for bar in bars]
 
 
-def test_points_with_overlapping_names_form_a_cluster() -> None:
-    """Points whose names would overlap form a cluster, with the upper point first; other points are alone."""
-    axes = Figure().subplots()
-    axes.set(xlim=(0, 420), ylim=(0, 112))
-    points = [("a", 100.0, 50.0), ("b", 104.1, 53.4), ("c", 100.0, 90.0), ("d", 350.0, 50.0)]
-    for shift in range(12):
-        moved = [FigurePoint(name, x + shift, y + shift / 4, None) for name, x, y in points]
-        assert [[point.name for point in cluster] for cluster in clusters_of(moved, axes)] == [["c"], ["b", "a"], ["d"]]
-    assert clusters_of([], axes) == []
+def test_names_never_overlap() -> None:
+    """However the points lie, no two names overlap or leave the panel, and each point has its name."""
+    generator = np.random.default_rng(5)
+    for _ in range(5):
+        figure = new_figure(3.5)
+        axes = figure.subplots()
+        axes.set(xlim=(0, 400), ylim=(-14, 109))
+        points = {
+            kind: [
+                FigurePoint(f"L{number}", 150 + 50 * x, 50 + 20 * y, None)
+                for number, (x, y) in enumerate(generator.normal(size=(6, 2)))
+            ]
+            for kind in ("virtual", "paper")
+        }
+        name_points(figure, [(axes, kind, members) for kind, members in points.items()])
+        boxes = [text.get_window_extent() for text in axes.texts]
+        assert not [pair for pair in combinations(boxes, 2) if pair[0].overlaps(pair[1])]
+        assert all(axes.get_window_extent().contains(*corner) for box in boxes for corner in box.corners())
+        names = ", ".join(point_names(axes)).split(", ")
+        assert sorted(names) == sorted(point.name for members in points.values() for point in members)
+
+
+def test_points_at_the_same_place_share_a_name() -> None:
+    """Points of one kind at the same place share a name; the paper's point there has its own name."""
+    figure = new_figure(3.5)
+    axes = figure.subplots()
+    axes.set(xlim=(0, 400), ylim=(0, 100))
+    points = [FigurePoint(name, 200.0, 50.0, None) for name in ("L4", "L3")]
+    name_points(figure, [(axes, "virtual", points), (axes, "paper", points[:1])])
+    assert point_names(axes) == ["L3, L4", "L4"]
+
+
+def test_a_legend_is_not_cut_off() -> None:
+    """A legend of six short names is inside its figure."""
+    figure = new_figure(2.0)
+    figure.subplots()
+    names = [f"L{number}" for number in range(6)]
+    with rc_context(SETTINGS):
+        legend_below(figure, list(condition_handles(names, condition_colours(names))))
+        figure.draw_without_rendering()
+    (legend,) = figure.legends
+    box = legend.get_window_extent()
+    assert figure.bbox.x0 <= box.x0
+    assert box.x1 <= figure.bbox.x1
 
 
 def test_the_degradation_figure_has_all_intervals_and_names() -> None:
@@ -66,8 +110,8 @@ def test_the_degradation_figure_has_all_intervals_and_names() -> None:
     ]
     assert error_bars(completion) == [*paper_intervals, [80.0, 100.0], [36.7, 56.7], [43.3, 63.3]]
     assert error_bars(error) == [[2.0, 3.0], [5.5, 6.5], [5.8, 6.8], *[[0.75, 1.5]] * 3]
-    assert point_names(completion) == ["L2", "L3\nL4", "L2", "L4\nL3"]
-    assert point_names(error) == ["L3", "L4", "L2", "L4\nL3", "L2"]
+    assert point_names(completion) == ["L2", "L3", "L4", "L2", "L3", "L4"]
+    assert point_names(error) == ["L2", "L3, L4", "L2", "L3", "L4"]
 
 
 def test_a_single_run_has_no_interval() -> None:
@@ -78,14 +122,15 @@ def test_a_single_run_has_no_interval() -> None:
 
 
 def test_conditions_with_overlapping_points_are_named() -> None:
-    """The comparison of groups names conditions whose markers overlap."""
-    completion, error = presets_figure({"one": CONDITIONS, "other": {"L2": CONDITIONS["L2"]}}, COLOURS).axes
-    assert point_names(completion) == point_names(error) == ["L4\nL3"]
+    """The comparison of groups names conditions whose points are at the same place, and no others."""
+    conditions = {**CONDITIONS, "L4": CONDITIONS["L3"]}
+    completion, error = presets_figure({"one": conditions, "other": {"L2": CONDITIONS["L2"]}}, COLOURS).axes
+    assert point_names(completion) == point_names(error) == ["L3, L4"]
 
 
 def test_the_lowest_panel_has_an_x_label() -> None:
     """The routes are below each other, and only the last has an x label."""
-    panels = cross_track_figure({"a": [], "b": [], "c": []}, COLOURS).axes[:3]
+    panels = cross_track_figure({"a": [], "b": [], "c": []}, COLOURS, []).axes[:3]
     assert [axes.get_xlabel() for axes in panels] == ["", "", "distance along the route (m)"]
     assert len({axes.get_position().x0 for axes in panels}) == 1
 
@@ -116,5 +161,5 @@ def test_a_name_is_written_once() -> None:
     """A point in real time next to the point of its condition in virtual time is not named again."""
     near, far = entry(224.0, 0.91, 2.6), entry(300.0, 0.1, 9.0)
     completion, error = headline_figure({"virtual": CONDITIONS, "real": {"L2": near, "L3": far}}, {}, COLOURS).axes
-    assert sorted(point_names(completion)) == ["L2", "L3", "L4\nL3"]
+    assert sorted(point_names(completion)) == ["L2", "L3", "L3, L4"]
     assert point_names(error).count("L2") == 1

@@ -12,17 +12,18 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from markupsafe import escape
+from markupsafe import Markup, escape
 
 from lavt.domain import NS_PER_S, Now
 from lavt.errors import WorkError
 from lavt.experiment.analysis.drive_data import DriveData, capture_to_stamp_ms, read_drive
 from lavt.experiment.analysis.results import read_json, run_result, write_json
-from lavt.experiment.report import table_format
+from lavt.experiment.report import html_page, table_format
 from lavt.experiment.report.figure_style import condition_colours
 from lavt.experiment.report.replay_section import largest_error_s, least_and_most_delayed
 from lavt.experiment.report.report import write_report
-from lavt.experiment.report.run_sections import received_pictures
+from lavt.experiment.report.run_sections import received_pictures, setting_text
+from lavt.experiment.report.sections import ReportContext
 from lavt.experiment.report.tables import machine_table, stage_table
 from lavt.nodes.payloads import VideoUnit
 from lavt.recording.record import RecordWriter, read_record
@@ -100,8 +101,8 @@ def test_the_report_is_complete(sweep: Path) -> None:
         "incidence_real",
         "trajectories_whole_virtual",
         "trajectories_whole_real",
-        "cross_track_virtual",
-        "cross_track_real",
+        "cross_track_whole_virtual",
+        "cross_track_whole_real",
     }
     for figure in figures:
         assert (sweep / "report" / f"{figure}.png").read_bytes().startswith(b"\x89PNG")
@@ -154,6 +155,22 @@ def test_the_first_screen_says_what_was_run(sweep: Path) -> None:
     assert "Loop latency" in first
 
 
+def test_the_first_screen_has_speed_lane_width_and_date(sweep: Path) -> None:
+    """Speed, lane width and date are from the records; the speed is left out if not all runs are drawn."""
+    first = page_of(sweep).partition("<nav>")[0]
+    assert "The median speed of a run is 29 km/h. The runs in real time were driven on 2023-11-14 (UTC)." in first
+    drives = [read_drive(sweep / "runs" / name, read_json(sweep / "runs" / name / "result.json")) for name in "03"]
+    faster = replace(
+        drives[1].truth, columns={**drives[1].truth.columns, "speed_mps": np.full(len(drives[1].truth), 10)}
+    )
+    sets = {("virtual", ""): drives[:1], ("real", ""): [replace(drives[1], truth=faster)]}
+    runs = [{**drive.result, "lane_kept": {"lane_width_m": 3.494}} for drive in drives]
+    report = ReportContext({"runs": runs}, sweep, {})
+    text = "The median speed of a run is 29 to 36 km/h. The lanes are 3.5 m wide. The runs in real time"
+    assert setting_text(report, sets).startswith(text)
+    assert setting_text(report, {("virtual", ""): drives[:1]}) == "The lanes are 3.5 m wide."
+
+
 def test_texts_of_figures_are_legible_on_a_phone(sweep: Path) -> None:
     """On a screen of 390 px, where a figure is 368 px wide, each text of a figure has at least 11 px."""
     for path in (sweep / "report").glob("*.svg"):
@@ -185,6 +202,31 @@ def test_a_table_hides_columns_behind_a_switch(sweep: Path) -> None:
     assert 'type="checkbox"> all ' in html
 
 
+def test_a_note_on_hidden_columns_is_behind_their_switch(sweep: Path) -> None:
+    """A note that explains only hidden columns is inside the table's switch, once for each table, and nowhere else."""
+    html = page_of(sweep)
+    section = html.partition('id="conditions"')[2].partition("<h3")[0]
+    notes = re.findall(r'<p class="note extra">([^<]*)</p></div>', section)
+    assert len(notes) == section.count("The intervals “these routes”") == section.count("<table") == 2
+    assert ".table:has(> .switch > input:checked) p.extra { display: block; }" in html
+
+
+def test_the_figures_of_a_route_are_side_by_side(sweep: Path) -> None:
+    """The trajectories of up to three routes and their errors are a row; the figures of a section leave no gap."""
+    section = page_of(sweep).partition('id="trajectories"')[2].partition("<h3")[0]
+    rows = [re.findall('data-name="([^"]+)"', row) for row in section.split('<div class="figures two">')[1:]]
+    assert rows == [
+        [f"{name}_whole_{kind}" for name in ("trajectories", "cross_track")] for kind in ("virtual", "real")
+    ]
+    assert [str(html_page.figures([Markup()] * count)).split('"')[1] for count in (1, 2, 3, 4, 6)] == [
+        "figures",
+        "figures two",
+        "figures three",
+        "figures two",
+        "figures three",
+    ]
+
+
 def test_figures_follow_the_scheme_of_the_page(sweep: Path) -> None:
     """Each SVG exchanges its background and its ink if the page is dark."""
     svg = (sweep / "report" / "headline.svg").read_text()
@@ -199,6 +241,7 @@ def test_the_replay_is_a_video(sweep: Path) -> None:
     for colour, meaning in (("#50c850", "the lane that the driver detected"), ("#ffc850", "where the rear axle was")):
         assert f'<i style="background: {colour}"></i> {meaning}' in html
     assert "The runs 0 and 1" in html
+    assert re.search(r"a still picture shows the moment [0-9.]+ s after the start, when L1 is farthest", html)
     video = cv2.VideoCapture(str(sweep / "report" / "replay.mp4"))
     assert int(video.get(cv2.CAP_PROP_FRAME_COUNT)) > 20
 
@@ -279,6 +322,19 @@ def test_real_and_virtual_runs_have_separate_tables(sweep: Path) -> None:
     assert "Virtual time, fidelity video: modelled network and clocks" in html
     assert "Real time, injected by relay" in html
     assert "invalid: the offset between the clocks is only known to 6.00 ms" in html
+
+
+def test_the_worst_value_of_each_check_is_shown(sweep: Path) -> None:
+    """Beside the limit of each check is the worst value of all runs, with its run, for each kind of time."""
+    with (sweep / "report" / "tables" / "checks.csv").open(newline="") as file:
+        rows = {row["check"]: row for row in csv.DictReader(file)}
+    bound = rows["error bound of the clock offset, ms"]
+    assert bound["run in real time"] == "3"
+    assert float(bound["worst in real time (limit) value"]) == pytest.approx(6.0)
+    assert float(bound["worst in real time (limit) limit"]) == 2.0
+    assert float(bound["worst in virtual time (limit) value"]) == pytest.approx(0.4, abs=0.05)
+    validity = page_of(sweep).partition('id="valid_and_invalid_runs"')[2].partition("<h3")[0]
+    assert "6.00\N{NO-BREAK SPACE}(2.00)" in validity
 
 
 def test_the_table_of_machines_says_where_the_costs_were_measured() -> None:

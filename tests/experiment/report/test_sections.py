@@ -32,6 +32,7 @@ from lavt.experiment.report.sections import (
     degradation_parts,
     group_parts,
     injected_parts,
+    lane_change_parts,
     route_parts,
     run_parts,
     stage_parts,
@@ -160,6 +161,7 @@ SECTIONS: dict[str, Callable[[ReportContext], Sequence[str]]] = {
     "axes": axis_parts,
     "routes": route_parts,
     "runs": run_parts,
+    "lane_changes": lane_change_parts,
 }
 
 
@@ -239,6 +241,24 @@ def test_failed_runs_are_in_the_summary(tmp_path: Path) -> None:
     assert "failed" not in text_of("".join(validity_parts(report_of(summarize(campaign(), None), tmp_path))))
 
 
+def test_endings_are_counted_in_words(tmp_path: Path) -> None:
+    """The table of conditions has the number of each ending in words, with a plural where there is one."""
+    runs = [
+        run_of("L0", repetition=number, ending=ending)
+        for number, ending in enumerate(("collision", "collision", "off_road", "off_road", "safe_stop"))
+    ]
+    text = text_of(parts_of(report_of(summarize(runs, None), tmp_path), "conditions")["conditions"])
+    assert "2 collisions, 2 off road, 1 safe stop" in text
+
+
+def test_the_legend_explains_the_frame_age(tmp_path: Path) -> None:
+    """A report with the frame age has its meaning in the legend; other reports do not."""
+    for age in ({"mean": 90.0, "p95": 120.0}, None):
+        summary = summarize([run_of("L0", picture_age_ms=age)], None)
+        text = text_of("".join(first_parts(report_of(summary, tmp_path), [])))
+        assert ("since the stamp of the frame from which the command in force was made" in text) == (age is not None)
+
+
 def test_other_conditions_are_not_compared_with_the_paper(tmp_path: Path) -> None:
     """Conditions whose name or injected delay is not the paper's are not compared with the paper."""
     runs = [{**run_of("L0"), "condition": "mine"}, {**run_of("L1"), "condition": "L0"}]
@@ -265,6 +285,7 @@ def test_a_summary_of_an_older_version_is_reported(tmp_path: Path) -> None:
         "groups",
         "axes",
         "routes",
+        "lane_changes",
     ]
     tables = parts["conditions"] + parts["latencies"] + parts["errors"]
     rows = re.findall(r'<tr><td class="text"[^>]*>(L\d)</td>(.*?)</tr>', tables)
@@ -318,7 +339,9 @@ def test_the_tables_have_completion_in_the_own_lane(tmp_path: Path) -> None:
     html = "".join([*conditions_parts(report), *error_table_parts(report)])
     titles = re.findall("<th(?: [^>]*)?>(.*?)</th>", html)
     assert [title for title in titles if titles.count(title) > 1] == ["condition"] * 2
-    run_parts(report)
+    (text, links) = lane_change_parts(report)
+    assert "Every change of the lane" in text
+    assert 'href="tables/lane_changes.csv"' in links
     (row,) = csv_rows(tmp_path / "tables" / "conditions_virtual_driving.csv")
     assert [row[name] for name in ("completed (share)", "completed in own lane (share)", "collisions / run")] == [
         "1.0",

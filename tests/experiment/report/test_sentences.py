@@ -5,6 +5,7 @@ from typing import Any
 from lavt.experiment.report.sentences import (
     contrast_sentence,
     length_sentences,
+    limits_sentence,
     results_sentences,
     runs_overview,
 )
@@ -173,3 +174,16 @@ def test_an_order_by_length_is_not_assumed() -> None:
     shared["routes"]["r2_key"] = shared["routes"].pop("r5")
     lengths_m = {**LENGTHS_M, "r2_key": 140.0}
     assert length_sentences({"L3": shared}, lengths_m) == ""
+
+
+def test_what_was_not_shown_follows_from_the_runs() -> None:
+    """The limits of fitted gains, missing pictures and a loopback are named only where they apply to the runs."""
+    demo = {"preset": "paper_calibrated", "fidelity": "geometry", "inherent": "loopback"}
+    text = limits_sentence([demo, {**demo, "fidelity": "video"}])
+    assert text.startswith("Not shown: where driving fails for another controller or car")
+    assert "in the runs without pictures, errors of lane detection" in text
+    assert "the latency of a real network" in text
+    by_video = limits_sentence([{**demo, "preset": "designed", "fidelity": "video"}])
+    assert "controller" not in by_video
+    assert "pictures" not in by_video
+    assert limits_sentence([{"preset": "designed", "fidelity": "video", "inherent": "network"}]) == ""

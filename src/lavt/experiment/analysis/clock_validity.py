@@ -38,29 +38,31 @@ def step_reasons(
     server: Record, client: Record, clocks: RunClocks, began_ns: int, ended_ns: int
 ) -> list[InvalidReason]:
     """Return a reason for each wall clock that was set near the drive; two sides on one kernel share one clock."""
-    steps_ms = {
-        "server": _step_ms(server.table("clock"), (began_ns, ended_ns)),
-        "client": _step_ms(client.table("clock"), drive_on_client(server, client, began_ns, ended_ns)),
-    }
     reasons = [
         InvalidReason(InvalidCode.CLOCK_STEP, f"the wall clock of the {side} stepped by {ms:+.1f} ms")
-        for side, ms in steps_ms.items()
-        if ms is not None
+        for side, ms in steps_ms(server, client, began_ns, ended_ns).items()
+        if abs(ms) > STEP_LIMIT_MS
     ]
     return reasons[:1] if clocks.source == SAME_KERNEL else reasons
 
 
-def _step_ms(samples: Table, drive_ns: tuple[int, int]) -> float | None:
-    """Return the largest step of a side's wall clock near the drive; None if it is at most `STEP_LIMIT_MS`."""
+def steps_ms(server: Record, client: Record, began_ns: int, ended_ns: int) -> dict[str, float]:
+    """Return the largest change of each side's wall clock, relative to its monotonic clock, between two samples."""
+    return {
+        "server": _step_ms(server.table("clock"), (began_ns, ended_ns)),
+        "client": _step_ms(client.table("clock"), drive_on_client(server, client, began_ns, ended_ns)),
+    }
+
+
+def _step_ms(samples: Table, drive_ns: tuple[int, int]) -> float:
+    """Return the largest step of a side's wall clock near the drive; 0 without samples."""
     began_ns, ended_ns = drive_ns
     mono_ns, wall_ns = samples.ints("mono_ns"), samples.ints("wall_ns")
     known = (mono_ns != MISSING) & (wall_ns != MISSING)
     mono_ns, wall_ns = mono_ns[known], wall_ns[known]
     near_drive = (mono_ns[1:] > began_ns - MARGIN_NS) & (mono_ns[:-1] < ended_ns + MARGIN_NS)
     jumps_ms = np.diff(wall_ns - mono_ns)[near_drive] / NS_PER_MS
-    if len(jumps_ms) == 0 or np.max(np.abs(jumps_ms)) <= STEP_LIMIT_MS:
-        return None
-    return float(jumps_ms[np.argmax(np.abs(jumps_ms))])
+    return float(jumps_ms[np.argmax(np.abs(jumps_ms))]) if len(jumps_ms) else 0.0
 
 
 def sampling_reasons(server: Record, client: Record, began_ns: int, ended_ns: int) -> list[InvalidReason]:
@@ -70,33 +72,54 @@ def sampling_reasons(server: Record, client: Record, began_ns: int, ended_ns: in
     """
     if began_ns > ended_ns:
         return []
-    server_ns, client_ns = _sampled_ns(server), _sampled_ns(client)
+    client_ns = _sampled_ns(client)
     client_began_ns, client_ended_ns = drive_on_client(server, client, began_ns, ended_ns)
-    longest_gaps_ns = {
-        "server": max(
-            _nearest_sample_ns(server_ns, began_ns, if_none=ended_ns - began_ns),
-            _nearest_sample_ns(server_ns, ended_ns, if_none=ended_ns - began_ns),
-            _longest_gap_ns(server_ns, began_ns, ended_ns),
-        ),
-        "client": _longest_gap_ns(client_ns, client_began_ns, client_ended_ns),
-    }
     limit_ns = SAMPLE_GAP_LIMIT_S * NS_PER_S
     reasons = [
         InvalidReason(
             InvalidCode.CLOCK_NOT_SAMPLED,
             f"the clock of the {side} was not sampled for {gap_ns / NS_PER_S:.1f} s (limit {SAMPLE_GAP_LIMIT_S} s)",
         )
-        for side, gap_ns in longest_gaps_ns.items()
+        for side, gap_ns in _longest_gaps_ns(server, client, began_ns, ended_ns).items()
         if gap_ns > limit_ns
     ]
     near_drive_ns = client_ns[(client_ns > client_began_ns - limit_ns) & (client_ns < client_ended_ns + limit_ns)]
-    is_covered = len(client_ns) and max(client_ns[0] - client_began_ns, client_ended_ns - client_ns[-1]) <= limit_ns
-    if not is_covered:
+    if len(client_ns) == 0 or _uncovered_ns(server, client, began_ns, ended_ns) > limit_ns:
         covered_s = (int(np.ptp(near_drive_ns)) if len(near_drive_ns) else 0) / NS_PER_S
         drive_s = (ended_ns - began_ns) / NS_PER_S
         text = f"the clock samples of the client cover {covered_s:.1f} s of a drive of {drive_s:.1f} s"
         reasons.append(InvalidReason(InvalidCode.CLOCK_NOT_SAMPLED, text))
     return reasons
+
+
+def longest_unsampled_s(server: Record, client: Record, began_ns: int, ended_ns: int) -> float:
+    """Return the longest time of the drive without a sample of a clock; 0 without a drive."""
+    if began_ns > ended_ns:
+        return 0.0
+    gaps_ns = _longest_gaps_ns(server, client, began_ns, ended_ns)
+    return max(*gaps_ns.values(), _uncovered_ns(server, client, began_ns, ended_ns)) / NS_PER_S
+
+
+def _longest_gaps_ns(server: Record, client: Record, began_ns: int, ended_ns: int) -> dict[str, int]:
+    """Return the longest time between two samples of each side; the server also has samples near both ends."""
+    server_ns = _sampled_ns(server)
+    return {
+        "server": max(
+            _nearest_sample_ns(server_ns, began_ns, if_none=ended_ns - began_ns),
+            _nearest_sample_ns(server_ns, ended_ns, if_none=ended_ns - began_ns),
+            _longest_gap_ns(server_ns, began_ns, ended_ns),
+        ),
+        "client": _longest_gap_ns(_sampled_ns(client), *drive_on_client(server, client, began_ns, ended_ns)),
+    }
+
+
+def _uncovered_ns(server: Record, client: Record, began_ns: int, ended_ns: int) -> int:
+    """Return the longer of the times before the client's first sample and after its last one, within the drive."""
+    client_ns = _sampled_ns(client)
+    client_began_ns, client_ended_ns = drive_on_client(server, client, began_ns, ended_ns)
+    if len(client_ns) == 0:
+        return ended_ns - began_ns
+    return max(int(client_ns[0]) - client_began_ns, client_ended_ns - int(client_ns[-1]), 0)
 
 
 def _nearest_sample_ns(sampled_ns: IntArray, at_ns: int, *, if_none: int) -> int:
@@ -248,6 +271,8 @@ def _agreement_reasons(clocks: RunClocks) -> list[InvalidReason]:
     if disagreement_ms is None:
         return []
     source_ms, probe_ms, allowed_ms = disagreement_ms
+    if abs(source_ms - probe_ms) <= allowed_ms:
+        return []
     text = (
         f"{clocks.source} and the probe disagree about the offset between the clocks: {source_ms:.2f} and "
         f"{probe_ms:.2f} ms, although the sum of their error bounds is {allowed_ms:.2f} ms"

@@ -63,10 +63,10 @@ class RunClocks:
         }
 
     def disagreement_ms(self) -> tuple[float, float, float] | None:
-        """Return Delta, the probe's Delta and the sum of both bounds, in ms; None if the two estimates agree.
+        """Return Delta, the probe's Delta and the sum of both bounds, in ms; None if they cannot be compared.
 
-        The check compares every exchange of the drive with Delta at the time of the exchange. The returned values
-        belong to the exchange whose difference exceeds the bounds most.
+        Every exchange of the drive is compared with Delta at the time of the exchange. The returned values belong to
+        the exchange whose difference exceeds the bounds most or, if none does, comes nearest to them.
         """
         exchanges = self.drive_exchanges
         if self.offset is None or self.source == PROBE or len(exchanges) == 0:
@@ -75,7 +75,7 @@ class RunClocks:
         bound_ns = self.offset.bound_at(exchanges.client_wall_ns) + exchanges.round_trip_ns / 2
         excess_ns = np.abs(delta_ns - exchanges.delta_ns) - bound_ns
         worst = int(np.argmax(np.nan_to_num(excess_ns, nan=-np.inf)))
-        if not excess_ns[worst] > 0:
+        if not np.isfinite(excess_ns[worst]):
             return None
         delta_ms, probe_ms, bound_ms = (
             float(values_ns[worst]) / NS_PER_MS for values_ns in (delta_ns, exchanges.delta_ns, bound_ns)

@@ -15,8 +15,8 @@ from lavt.experiment.analysis.metrics import driving_interval
 from lavt.recording.record import Record, evaluating, read_record
 from lavt.recording.table import MISSING, Table
 
-DRAWN_COLUMNS = ("mono_ns", "x_m", "y_m", "progress_m", "cross_track_m", "steering_rad")
-"""The columns of the ground truth that figures show."""
+DRAWN_COLUMNS = ("mono_ns", "x_m", "y_m", "progress_m", "cross_track_m", "steering_rad", "speed_mps")
+"""The columns of the ground truth that the report shows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +34,8 @@ class DriveData:
     began_ns: int
     annotations: Mapping[str, Mapping[str, str]]
     """Versions and machine, as recorded."""
+    began_wall_ns: int | None
+    """The server's wall clock at the first event of its record, which in virtual time is simulated."""
 
     @property
     def condition(self) -> str:
@@ -58,7 +60,9 @@ def extract_drive(record: Record, directory: Path, result: Mapping[str, Any]) ->
     drive_truth = truth.where((truth_ns >= began_ns) & (truth_ns <= ended_ns))
     columns = {name: drive_truth.columns[name] for name in DRAWN_COLUMNS if name in drive_truth.columns}
     drawn_truth = Table(drive_truth.mono_ns, drive_truth.wall_ns, columns)
-    return DriveData(directory, result, drawn_truth, reference_m, began_ns, record.annotations)
+    event_wall_ns = record.table("event").wall_ns
+    began_wall_ns = int(event_wall_ns[0]) if len(event_wall_ns) else None
+    return DriveData(directory, result, drawn_truth, reference_m, began_ns, record.annotations, began_wall_ns)
 
 
 def one_of_each_condition(drives: Sequence[DriveData]) -> list[DriveData]:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from lavt.domain import NS_PER_S
-from lavt.experiment.analysis.invalid_reason import InvalidCode, InvalidReason, not_measured
+from lavt.experiment.analysis.invalid_reason import InvalidCode, InvalidReason, MeasuredCheck, not_measured
 from lavt.experiment.analysis.metrics import driving_interval
 from lavt.recording.record import Record
 from lavt.recording.table import Table
@@ -106,6 +106,17 @@ def missing_delay_reasons(entry: Mapping[str, Any], requested_ms: Mapping[str, f
             )
             reasons.append(InvalidReason(InvalidCode.INJECTION_NOT_ON_PATH, text))
     return reasons
+
+
+def path_checks(entry: Mapping[str, Any], requested_ms: Mapping[str, float]) -> list[MeasuredCheck]:
+    """Return the check of `missing_delay_reasons`: the largest share of a flow's delay that its latency lacks."""
+    missing = [
+        1 - (entry[key]["p50"] + (entry[key]["bound"] or 0.0)) / requested_ms[flow]
+        for flow, key in (("video", "tau_v_ms"), ("control", "tau_c_ms"))
+        if requested_ms.get(flow) and entry[key]["p50"] is not None
+    ]
+    limit = round(1 - SMALLEST_LATENCY_SHARE, 9)
+    return [MeasuredCheck(InvalidCode.INJECTION_NOT_ON_PATH, max(*missing, 0.0), limit)] if missing else []
 
 
 def _is_measured(table: Table, flow: str) -> bool:

@@ -41,6 +41,15 @@ class InvalidReason(Struct, frozen=True):
     """A sentence with the measured value and its limit."""
 
 
+class MeasuredCheck(Struct, frozen=True):
+    """A check of a run's validity with a number: a value over its limit makes the run invalid."""
+
+    code: InvalidCode
+    value: float
+    limit: float
+    """Both in ms; in s for clock samples; a share for physics, frames and the path of the injected delay."""
+
+
 def not_measured(flow: str) -> InvalidReason:
     """Return the reason for a flow whose injected delay was not measured."""
     return InvalidReason(InvalidCode.INJECTION_NOT_MEASURED, f"the injected delay of {flow} was not measured")

@@ -10,10 +10,10 @@ from typing import Any
 import msgspec
 
 from lavt.errors import WorkError
-from lavt.experiment.analysis.injection_validity import missing_delay_reasons
-from lavt.experiment.analysis.invalid_reason import InvalidReason
+from lavt.experiment.analysis.injection_validity import missing_delay_reasons, path_checks
+from lavt.experiment.analysis.invalid_reason import InvalidReason, MeasuredCheck
 from lavt.experiment.analysis.metrics import measure
-from lavt.experiment.analysis.validity import invalid_reasons
+from lavt.experiment.analysis.validity import invalid_reasons, measured_checks
 from lavt.recording.json_payload import to_json
 from lavt.recording.record import Record
 
@@ -50,18 +50,22 @@ def run_result(
     *,
     digest: str | None = None,
     reasons: Sequence[InvalidReason] = (),
+    checks: Sequence[MeasuredCheck] = (),
 ) -> dict[str, Any]:
     """Compute the run's `result.json`, which is also its entry in `summary.json`, from its records.
 
     `identity` has the keys `IDENTITY_KEYS`. It can also have `axes` (the values of a sweep's further axes), `changes`
     (of the condition), `injected_ms` (the requested delay) and `injected_least_ms` (the smallest expected delay, if it
-    is smaller than `injected_ms`); all of them are copied. `reasons` are further reasons why the run is invalid, which
-    its records do not show.
+    is smaller than `injected_ms`); all of them are copied. `reasons` are further reasons why the run is invalid, and
+    `checks` further measured checks, which its records do not show.
     """
     measured = measure(server, client)
     all_reasons = [*invalid_reasons(server, client, measured), *reasons]
+    all_checks = [*measured_checks(server, client, measured), *checks]
     if not all_reasons and "injected_ms" in identity:  # with another reason, the latencies themselves can be wrong
-        all_reasons = missing_delay_reasons(measured.entry, identity.get("injected_least_ms", identity["injected_ms"]))
+        least_ms = identity.get("injected_least_ms", identity["injected_ms"])
+        all_reasons = missing_delay_reasons(measured.entry, least_ms)
+        all_checks += path_checks(measured.entry, least_ms)
     return {
         **{key: identity.get(key) for key in IDENTITY_KEYS},
         **{key: identity[key] for key in OPTIONAL_IDENTITY_KEYS if key in identity},
@@ -69,6 +73,7 @@ def run_result(
         "ending": measured.entry["ending"],
         "valid": not all_reasons,
         "invalid_reasons": msgspec.to_builtins(all_reasons),
+        "checks": msgspec.to_builtins(all_checks),
         **measured.entry,
     }
 

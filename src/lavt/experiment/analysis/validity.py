@@ -8,8 +8,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from lavt.domain import NS_PER_MS
-from lavt.experiment.analysis.clock_validity import offset_reasons, sampling_reasons, step_reasons
-from lavt.experiment.analysis.invalid_reason import InvalidCode, InvalidReason, not_measured
+from lavt.experiment.analysis.clock_validity import (
+    CLOCK_BOUND_LIMIT_MS,
+    SAMPLE_GAP_LIMIT_S,
+    STEP_LIMIT_MS,
+    longest_unsampled_s,
+    offset_reasons,
+    sampling_reasons,
+    step_reasons,
+    steps_ms,
+)
+from lavt.experiment.analysis.clocks import SAME_KERNEL
+from lavt.experiment.analysis.invalid_reason import InvalidCode, InvalidReason, MeasuredCheck, not_measured
 from lavt.experiment.analysis.latency import frames_within
 from lavt.experiment.analysis.metrics import RunMeasurement, driving_interval, last_count
 from lavt.recording.record import Record
@@ -85,23 +95,68 @@ def _simulator_reasons(server: Record) -> list[InvalidReason]:
     """Return the reasons from the server's physics and camera during the drive."""
     began_ns, ended_ns, ending = driving_interval(server)
     reasons = [] if ending is not None else [InvalidReason(InvalidCode.NO_ENDING, "the record has no ending")]
-    events = server.table("event")
-    events = events.where((events.ints("mono_ns") >= began_ns) & (events.ints("mono_ns") <= ended_ns))
-    late_ms = [
-        int(detail.removesuffix(" ms"))
-        for kind, detail in zip(events.texts("kind"), events.texts("detail"), strict=True)
-        if kind == "late"
-    ]
-    if sum(late_ms) * NS_PER_MS > LATE_LIMIT * (ended_ns - began_ns):
-        text = f"the physics was {sum(late_ms)} ms late in total (limit {LATE_LIMIT:.0%} of the drive)"
+    late_ms = _late_ms(server, began_ns, ended_ns)
+    if late_ms * NS_PER_MS > LATE_LIMIT * (ended_ns - began_ns):
+        text = f"the physics was {late_ms} ms late in total (limit {LATE_LIMIT:.0%} of the drive)"
         reasons.append(InvalidReason(InvalidCode.PHYSICS_LATE, text))
-    frame_numbers = frames_within(server.table("frame"), began_ns, ended_ns).ints("number")
-    due_count = int(frame_numbers[-1] - frame_numbers[0]) + 1 if len(frame_numbers) else 0
-    missed_count = due_count - len(frame_numbers)
+    missed_count, due_count = _missed_frames(server, began_ns, ended_ns)
     if missed_count > MISSED_FRAMES_LIMIT * due_count:
         text = f"the camera missed {missed_count} of {due_count} frames (limit {MISSED_FRAMES_LIMIT:.0%})"
         reasons.append(InvalidReason(InvalidCode.FRAMES_MISSED, text))
     return reasons
+
+
+def _late_ms(server: Record, began_ns: int, ended_ns: int) -> int:
+    """Return by how much the physics was late during the drive, in total."""
+    events = server.table("event")
+    events = events.where((events.ints("mono_ns") >= began_ns) & (events.ints("mono_ns") <= ended_ns))
+    return sum(
+        int(detail.removesuffix(" ms"))
+        for kind, detail in zip(events.texts("kind"), events.texts("detail"), strict=True)
+        if kind == "late"
+    )
+
+
+def _missed_frames(server: Record, began_ns: int, ended_ns: int) -> tuple[int, int]:
+    """Return how many frames the camera missed during the drive, and how many were due."""
+    frame_numbers = frames_within(server.table("frame"), began_ns, ended_ns).ints("number")
+    due_count = int(frame_numbers[-1] - frame_numbers[0]) + 1 if len(frame_numbers) else 0
+    return due_count - len(frame_numbers), due_count
+
+
+def measured_checks(server: Record, client: Record, measured: RunMeasurement) -> list[MeasuredCheck]:
+    """Return the values of the checks that have a number, with their limits; none without a drive.
+
+    As in `invalid_reasons`, offset and closure are not checked if a clock was set, and hosts with one kernel have no
+    offset to check.
+    """
+    began_ns, ended_ns, _ = driving_interval(server)
+    if began_ns >= ended_ns:
+        return []
+    clocks, jitter_ms = measured.clocks, measured.entry["loop_jitter_ms"]
+    step_ms = max(map(abs, steps_ms(server, client, began_ns, ended_ns).values()))
+    missed_count, due_count = _missed_frames(server, began_ns, ended_ns)
+    late_share = _late_ms(server, began_ns, ended_ns) * NS_PER_MS / (ended_ns - began_ns)
+    unsampled_s = longest_unsampled_s(server, client, began_ns, ended_ns)
+    checks = [
+        MeasuredCheck(InvalidCode.CLOCK_STEP, step_ms, STEP_LIMIT_MS),
+        MeasuredCheck(InvalidCode.CLOCK_NOT_SAMPLED, unsampled_s, SAMPLE_GAP_LIMIT_S),
+        MeasuredCheck(InvalidCode.PHYSICS_LATE, late_share, LATE_LIMIT),
+        MeasuredCheck(InvalidCode.FRAMES_MISSED, missed_count / max(due_count, 1), MISSED_FRAMES_LIMIT),
+    ]
+    if jitter_ms is not None:
+        checks.append(MeasuredCheck(InvalidCode.LOOP_JITTER, jitter_ms, LOOP_JITTER_LIMIT_MS))
+    if step_ms > STEP_LIMIT_MS:
+        return checks
+    if measured.closure_p95_ms is not None:
+        checks.append(MeasuredCheck(InvalidCode.CLOSURE, measured.closure_p95_ms, CLOSURE_LIMIT_MS))
+    disagreement_ms = clocks.disagreement_ms()
+    if clocks.source != SAME_KERNEL and clocks.bound_ms is not None:
+        checks.append(MeasuredCheck(InvalidCode.CLOCK_BOUND, clocks.bound_ms, CLOCK_BOUND_LIMIT_MS))
+    if clocks.source != SAME_KERNEL and disagreement_ms is not None:
+        source_ms, probe_ms, allowed_ms = disagreement_ms
+        checks.append(MeasuredCheck(InvalidCode.CLOCK_DISAGREEMENT, abs(source_ms - probe_ms), allowed_ms))
+    return checks
 
 
 def _jitter_reasons(measured: RunMeasurement) -> list[InvalidReason]:

@@ -13,6 +13,7 @@ import numpy as np
 from lavt.domain import NS_PER_S, FloatArray, Lane, Picture
 from lavt.experiment.replay.drive import ReplayDrive, Scene
 from lavt.perception.calibration import CalibratedCamera
+from lavt.perception.lane_detector import TRACK_CONFIDENCE
 from lavt.perception.panel import CENTRE, LEFT, draw_lane
 
 Colour = tuple[int, int, int]
@@ -50,6 +51,7 @@ LANE_WIDTH_M = 3.5
 """Drawn if the run does not show the width of its lanes."""
 CAR_M = (3.6, 0.9, 0.9)
 """Distance from the rear axle to the front and to the rear of the drawn car, and half its width."""
+NO_LANE, SIGN_SIZE = "no lane detected", 1.5
 EASY_STATES = {"driving", "completed"}
 
 
@@ -169,7 +171,17 @@ def _picture_tile(seen: Seen, height: int) -> Picture:
     scaled = picture if factor == 1 else cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
     left, top = (WIDTH_PX - size[0]) // 2, (height - size[1]) // 2
     tile[top : top + size[1], left : left + size[0]] = scaled
+    if lane is not None and lane.confidence < TRACK_CONFIDENCE:
+        _write_sign(tile, NO_LANE)
     return tile
+
+
+def _write_sign(tile: Picture, text: str) -> None:
+    """Write a large text on a dark ground near the lower edge of a tile."""
+    (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, SIGN_SIZE, 2)
+    x, y = (tile.shape[1] - width) // 2, tile.shape[0] - 40
+    cv2.rectangle(tile, (x - 14, y - height - 14), (x + width + 14, y + 16), BACKGROUND, -1)
+    _text(tile, text, (x, y), SIGN_SIZE, RED)
 
 
 def lane_width_m(drive: ReplayDrive) -> float:

@@ -25,15 +25,15 @@ LATENCIES_NOTE = (
     "Each latency is given in ms as median ± bound of the clock error (p5 to p95). The loop latency, from a frame's "
     "stamp to the application of its command, is measured on the server's clock alone, so it has no such bound."
 )
-PAPER_NOTE = " The paper did not measure the loop latency; the table shows the sum of its median τ video and τ control."
+PAPER_NOTE = "The paper did not measure the loop latency; the table shows the sum of its median τ video and τ control."
 OWN_LANE_NOTE = (
     " A run is completed in its own lane if the middle of the rear axle was in the lane of the route all the time, and "
-    "the driver followed no other lane. After three pictures without a lane, the lane followed is unknown. P95 of the "
-    "cross-track error is against the lane of the route."
+    "the driver followed no other lane. P95 of the cross-track error is against the lane of the route."
 )
 ROUTES_NOTE = (
-    " The intervals “these routes” show only how repeated runs of these routes vary: those of completion and of "
-    "collisions are exact, that of P95 is Student's t, from the spread within each route."
+    "After three pictures without a lane, the lane followed is unknown. The intervals “these routes” show only how "
+    "repeated runs of these routes vary: those of completion and of collisions are exact, that of P95 is Student's t, "
+    "from the spread within each route."
 )
 BY_ROAD_NOTE = (
     " Quote the columns “by road”: they have the mean over roads and its 95 % interval for other roads of this kind. "
@@ -46,12 +46,18 @@ FEW_ROADS_NOTE = (
 )
 ERRORS_NOTE = (
     " Each error is computed for each run and then averaged over the runs. P95 of the cross-track error is given in "
-    "three ways. The first is the mean over the runs that completed, to be read together with the completion: of all "
-    "these runs, and of the means of the routes and of the roads. The mean over roads is also shown for all runs, each "
-    "up to its own end. The second is the mean over all runs, each up to the common distance, which all runs of its "
-    "route and repetition reached. The third is the median (quartiles) of all runs, where a run that ended early ranks "
-    "last. An error against the lane followed is against the lane that the driver followed, where it is known. "
+    "three ways. The first is the mean over the runs that completed, to be read together with the completion. The "
+    "second is the mean over all runs, each up to the common distance, which all runs of its route and repetition "
+    "reached. The third is the median (quartiles) of all runs, where a run that ended early ranks last. "
     "docs/metrics.md defines each number."
+)
+ERROR_INTERVAL_NOTE = (
+    " The intervals “these routes” show only how repeated runs of these routes vary: they are Student's t, from the "
+    "spread within each route."
+)
+MORE_ERRORS_NOTE = (
+    "The mean over routes, or over roads, is that of the means of each route or road. An error against the lane "
+    "followed is against the lane that the driver followed, where it is known."
 )
 
 
@@ -62,8 +68,8 @@ def conditions_parts(report: ReportContext) -> Parts:
             html_page.paragraph("No run has the settings of the base config. See the table of groups.", is_note=True)
         ]
     roads = max(_roads(entry) for conditions in report.kinds.values() for entry in conditions.values())
-    note = "".join((OWN_LANE_NOTE, ROUTES_NOTE, _by_road_note(roads) if roads else ""))
-    return [*_tables(report, "driving", driving_table), _note(note)]
+    note = OWN_LANE_NOTE + (_by_road_note(roads) if roads else "")
+    return [*_tables(report, "driving", driving_table, ROUTES_NOTE), _note(note)]
 
 
 def latency_table_parts(report: ReportContext) -> Parts:
@@ -71,21 +77,30 @@ def latency_table_parts(report: ReportContext) -> Parts:
     if not report.kinds:
         return []
     has_paper = any(report.paper(conditions) for conditions in report.kinds.values())
-    return [*_tables(report, "latency", latency_table), _note(LATENCIES_NOTE + PAPER_NOTE * has_paper)]
+    return [*_tables(report, "latency", latency_table, PAPER_NOTE * has_paper), _note(LATENCIES_NOTE)]
 
 
 def error_table_parts(report: ReportContext) -> Parts:
     """Return the tables of lane-keeping errors for each kind of time."""
-    return [*_tables(report, "error", error_table), _note(ERRORS_NOTE)] if report.kinds else []
+    if not report.kinds:
+        return []
+    entries = [entry for conditions in report.kinds.values() for entry in conditions.values()]
+    intervals = ERROR_INTERVAL_NOTE * any(entry.get("p95_interval") for entry in entries)
+    return [*_tables(report, "error", error_table, MORE_ERRORS_NOTE), _note(ERRORS_NOTE + intervals)]
 
 
-def _tables(report: ReportContext, name: str, make: Callable[[Conditions, Conditions], TableData]) -> Parts:
-    """Return a table for each kind of time, below a heading that says how its runs were made."""
+def _tables(
+    report: ReportContext, name: str, make: Callable[[Conditions, Conditions], TableData], extra_note: str
+) -> Parts:
+    """Return a table for each kind of time, below a heading that says how its runs were made.
+
+    `extra_note` explains the columns that are hidden at first.
+    """
     parts = []
     for kind, conditions in report.kinds.items():
         table = make(conditions, report.paper(conditions))
         parts.append(html_page.heading(report.setup(kind)))
-        parts.append(save_table(report.directory, f"conditions_{kind}_{name}", table))
+        parts.append(save_table(report.directory, f"conditions_{kind}_{name}", table, extra_note))
     return parts
 
 

@@ -34,6 +34,9 @@ COMMON_P95 = "p95 m, up to common distance"
 ENDED_EARLY = "ended early"
 """The text of a quantile over all runs if the run with this rank was not completed."""
 
+ENDINGS_WITH_PLURAL = {"collision", "safe_stop", "timeout"}
+"""The endings that are nouns, so that a number of them has a plural."""
+
 
 def matching_paper(conditions: Conditions, paper: Conditions) -> Conditions:
     """Return the paper's conditions with the same name and the same injected delay as one of `conditions`."""
@@ -107,7 +110,13 @@ def driving_table(conditions: Conditions, paper: Conditions) -> TableData:
 
 
 def _endings(entry: Mapping[str, Any]) -> str | None:
-    return ", ".join(f"{count} {ending}" for ending, count in (entry.get("endings") or {}).items()) or None
+    return ", ".join(_counted(count, ending) for ending, count in (entry.get("endings") or {}).items()) or None
+
+
+def _counted(count: int, ending: str) -> str:
+    """Return a number of runs with their ending in words; an ending that is a noun has a plural."""
+    plural = "s" * (count != 1 and ending in ENDINGS_WITH_PLURAL)
+    return f"{count} {ending.replace('_', ' ')}{plural}"
 
 
 def error_table(conditions: Conditions, paper: Conditions) -> TableData:

@@ -42,22 +42,6 @@ SETTINGS: Any = {
 }
 """The settings of Matplotlib under which the report makes its figures."""
 
-NAME_STYLES = {
-    "virtual": ((7, -2), "left", "top", "black"),
-    "real": ((-7, 2), "right", "bottom", "black"),
-    "paper": ((-7, 2), "right", "bottom", "0.45"),
-    "group": ((7, 2), "left", "bottom", "black"),
-}
-"""The style of the names next to each kind of point: offset (x, y) in typographic points, horizontal and vertical
-alignment, colour."""
-
-NAMES_PER_PANEL = 14
-"""The number of names that fit into the height of a panel, and also into its width."""
-PANEL_SHARE = 0.75
-"""The width of a panel in a figure with one column of panels, as a share of the figure's."""
-CHARACTER_POINTS = 0.65 * SMALL_TEXT_POINTS
-"""Width of a small character, in typographic points."""
-
 
 class FigurePoint(NamedTuple):
     """The point of a condition in a figure, with the interval of y."""
@@ -114,75 +98,13 @@ def marker(kind: str, colour: Any) -> dict[str, Any]:
     return {"marker": symbol, "markerfacecolor": face, "markeredgecolor": colour, "color": colour, "label": label}
 
 
-def name_points(named_points: Iterable[tuple[Axes, str, Sequence[FigurePoint]]]) -> None:
-    """Write the names of the points of each kind in each panel, whose limits must be set.
-
-    A point of LAVT is not named if a point of LAVT with its name is so near that both names would overlap.
-    """
-    named: list[tuple[Axes, FigurePoint]] = []
-    for axes, kind, points in named_points:
-        others = [other for panel, other in named if panel is axes]
-        new = [point for point in points if not any(_is_named_by(point, other, axes) for other in others)]
-        named += [(axes, point) for point in new if kind != "paper"]
-        write_names(axes, clusters_of(new, axes), kind)
-
-
-def _is_named_by(point: FigurePoint, other: FigurePoint, axes: Axes) -> bool:
-    return point.name == other.name and len(clusters_of([point, other], axes)) == 1
-
-
-def write_names(axes: Axes, clusters: Iterable[Sequence[FigurePoint]], kind: str) -> None:
-    """Write the names of each cluster of points, in the vertical order of the points; the limits of x must be set."""
-    for cluster in clusters:
-        middle = (sum(point.x for point in cluster) / len(cluster), sum(point.y for point in cluster) / len(cluster))
-        names = [point.name for point in cluster]
-        axes.annotate("\n".join(names), middle, **name_style(axes, kind, middle[0], max(map(len, names))))
-
-
-def name_style(axes: Axes, kind: str, x: float, characters: int) -> dict[str, Any]:
-    """Return position and colour of a name next to a point of one kind at `x`.
-
-    The positions of the kinds differ, so that the names of two points of different kinds at the same place do not
-    overlap. If a name would cross the left or the right edge of the panel, it is on the other side of its point.
-    """
-    (offset, rise), horizontal, vertical, colour = NAME_STYLES[kind]
-    low, high = axes.get_xlim()
-    room = (high - x if offset > 0 else x - low) / (high - low) * PANEL_SHARE * WIDTH_IN * 72
-    if room < abs(offset) + characters * CHARACTER_POINTS:
-        offset, horizontal = -offset, {"left": "right", "right": "left"}[horizontal]
-    return {
-        "xytext": (offset, rise),
-        "ha": horizontal,
-        "va": vertical,
-        "color": colour,
-        "textcoords": "offset points",
-        "fontsize": SMALL_TEXT_POINTS,
-    }
-
-
-def clusters_of(points: Sequence[FigurePoint], axes: Axes) -> list[list[FigurePoint]]:
-    """Return clusters of points whose names would overlap in `axes`, the upper points first."""
-    reach_x, reach_y = ((high - low) / NAMES_PER_PANEL for low, high in (axes.get_xlim(), axes.get_ylim()))
-    clusters: list[list[FigurePoint]] = []
-    for point in sorted(points, key=lambda point: (-point.y, point.name)):
-        near_clusters = (
-            cluster
-            for cluster in clusters
-            if abs(cluster[-1].x - point.x) <= reach_x and abs(cluster[-1].y - point.y) <= reach_y
-        )
-        near_cluster = next(near_clusters, None)
-        if near_cluster is None:
-            clusters.append([point])
-        else:
-            near_cluster.append(point)
-    return clusters
-
-
 def legend_below(figure: Figure, handles: list[Any]) -> None:
     """Add a legend below all panels."""
     lengths = [len(str(handle.get_label())) + HANDLE_CHARACTERS for handle in handles]
     columns = len(handles) if sum(lengths) <= LINE_CHARACTERS else max(1, LINE_CHARACTERS // max(lengths))
-    figure.legend(handles=handles, fontsize=SMALL_TEXT_POINTS, ncols=columns, loc="outside lower center", frameon=False)
+    spacing = {"handlelength": 1.6, "columnspacing": 1.0}  # so that a handle takes `HANDLE_CHARACTERS`
+    style: dict[str, Any] = {"fontsize": SMALL_TEXT_POINTS, "frameon": False, **spacing}
+    figure.legend(handles=handles, ncols=columns, loc="outside lower center", **style)
 
 
 def kind_handles(kinds: Iterable[str]) -> list[Line2D]:

@@ -20,7 +20,13 @@ LARGEST_SHOWN_BYTES = 300_000
 
 _DARK = "".join(
     f'[style*="{name}: {light}"]{{{name}:{dark}!important}}'
-    for light, dark in {"#ffffff": "#14171a", "#000000": "#e4e7ea", "#b0b0b0": "#59626b", "#4d4d4d": "#b5bcc4"}.items()
+    for light, dark in {
+        "#ffffff": "#14171a",
+        "#000000": "#e4e7ea",
+        "#b0b0b0": "#59626b",
+        "#4d4d4d": "#b5bcc4",
+        "#737373": "#a2abb4",
+    }.items()
     for name in ("fill", "stroke")
 )
 DARK_STYLE = f"<style>@media (prefers-color-scheme:dark){{text{{fill:#e4e7ea}}{_DARK}}}</style>"
@@ -48,9 +54,12 @@ def save_figure(report_dir: Path, name: str, figure: Figure, alternative: str, c
     return html_page.figure(shown, [svg.name, png.name], alternative, caption)
 
 
-def save_table(report_dir: Path, name: str, table: TableData) -> Markup:
-    """Write tables/`name`.csv and .tex, and return the table as HTML; if it has no rows, write and return nothing."""
-    return _save_table(report_dir, name, table, html_of(table), is_short=len(table.rows) <= SHORT_ROWS)
+def save_table(report_dir: Path, name: str, table: TableData, extra_note: str = "") -> Markup:
+    """Write tables/`name`.csv and .tex, and return the table as HTML; if it has no rows, write and return nothing.
+
+    `extra_note` explains the extra columns; the page shows it only together with them.
+    """
+    return _save_table(report_dir, name, table, html_of(table, extra_note), is_short=len(table.rows) <= SHORT_ROWS)
 
 
 def link_table(report_dir: Path, name: str, table: TableData) -> Markup:

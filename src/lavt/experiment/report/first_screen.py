@@ -12,6 +12,7 @@ from lavt.experiment.report.sections import MAX_COMPARED_GROUPS, Parts, ReportCo
 from lavt.experiment.report.sentences import (
     contrast_sentence,
     length_sentences,
+    limits_sentence,
     results_sentences,
     runs_overview,
 )
@@ -28,6 +29,10 @@ WHAT_IT_IS = (
 LANE_KEEPER = " The driver is a program that keeps the lane."
 VIRTUAL = "the same programs on a simulated clock."
 WITHOUT_PICTURES = " Runs without pictures (fidelity geometry) get the lane without an error of detection."
+FRAME_AGE = (
+    "at a moment, the time since the stamp of the frame from which the command in force was made. It grows while a "
+    "command stays in force; its mean is over time."
+)
 OWN_LANE = (
     "the middle of the rear axle was in the lane of the route until its end, and the driver followed no other lane. "
     "The car may have touched a line."
@@ -39,8 +44,8 @@ PRESETS = {
 }
 
 
-def first_parts(report: ReportContext, replay: Parts) -> Parts:
-    """Return the parts of the first screen; `replay` is the replay, if there is one.
+def first_parts(report: ReportContext, replay: Parts, setting: str = "") -> Parts:
+    """Return the parts of the first screen; `replay` is the replay, if there is one, and `setting` follows the runs.
 
     A narrow screen shows them in this order: what was run, the figure, its findings in words, and then the replay,
     which is an example. A wide screen has the replay next to the figure.
@@ -49,7 +54,7 @@ def first_parts(report: ReportContext, replay: Parts) -> Parts:
     invalid = any(not run["valid"] for run in runs) or failed
     link = ("See why.", html_page.chapter_anchor(VALIDITY)) if invalid else None
     driver = LANE_KEEPER if all(run.get("driver") == "lane_keeper" for run in runs) else ""
-    about = html_page.paragraph(f"{WHAT_IT_IS}{driver} This page: {runs_overview(runs)}", link=link)
+    about = html_page.paragraph(f"{WHAT_IT_IS}{driver} This page: {runs_overview(runs, setting)}", link=link)
     sentences = [sentence for sentence in _findings(report) if sentence]
     findings = [html_page.bullets(sentences)] if sentences else []
     shown = [*headline_parts(report), *findings, *replay]
@@ -71,7 +76,8 @@ def _findings(report: ReportContext) -> list[str]:
         sentences += [results_sentences(name, conditions), lengths and f"{name}. {lengths}" if compared else lengths]
     sentences.append(contrast_sentence(report.summary.get("contrasts") or []))
     real = report.kinds.get("real")
-    return [*sentences, *([results_sentences("Real time", real)] if real else [])]
+    examples = [results_sentences("Real time", real)] if real else []
+    return [*sentences, *examples, limits_sentence(report.summary["runs"])]
 
 
 def headline_parts(report: ReportContext) -> Parts:
@@ -110,6 +116,7 @@ def _legend(report: ReportContext) -> Markup:
         ("Condition", f"the delay that was injected into video + control, in ms: {listed}." if listed else ""),
         ("Virtual time", (VIRTUAL + without_pictures) * ("virtual" in report.kinds)),
         ("Loop latency", "from a frame's stamp, set just before encoding, to the application of its command."),
+        ("Frame age", FRAME_AGE if any(run.get("picture_age_ms") for run in runs) else ""),
         ("P95", "on 95 % of the distance, the rear axle was closer to the centre of the route's lane."),
         ("τ video, τ control", "the one-way latencies of a frame and of a command."),
         ("Own lane", OWN_LANE if has_own_lane(report.kinds) else ""),

@@ -17,12 +17,12 @@ from lavt.experiment.report.figure_style import (
     kind_handles,
     legend_below,
     marker,
-    name_points,
     new_figure,
     shown_interval,
     tidy,
 )
 from lavt.experiment.report.latency_figures import PAPER_MARKER
+from lavt.experiment.report.point_names import name_points
 
 
 def has_own_lane(kinds: Mapping[str, Conditions]) -> bool:
@@ -57,11 +57,11 @@ def headline_figure(kinds: Mapping[str, Conditions], paper: Conditions, colours:
     completion.set_ylim(-14, 109)
     completion.margins(x=0.1)
     error.set_ylim(bottom=-0.14 * error.get_ylim()[1])
-    name_points(named_points)
     handles: list[Any] = kind_handles(kinds)
     if paper:
         handles.append(Line2D([], [], linestyle="none", **PAPER_MARKER))
     legend_below(figure, handles)
+    name_points(figure, named_points)
     return figure
 
 

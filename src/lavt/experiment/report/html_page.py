@@ -110,6 +110,11 @@ def columns(parts: Sequence[Markup]) -> Markup:
     return _part("columns", parts)
 
 
+def figures(parts: Sequence[Markup]) -> Markup:
+    """Return figures next to each other, two or three in a row, so that rows are full where the number allows it."""
+    return _part("figures", parts)
+
+
 def figure(shown: Path, files: Sequence[str], alternative: str, caption: str) -> Markup:
     """Return a figure with its caption and links to its files.
 
@@ -126,12 +131,13 @@ def video(shown: Path, poster: Path, alternative: str, caption: str, key: Sequen
     return _part("video", shown.name, embedded(shown), embedded(poster), alternative, caption, key)
 
 
-def table(columns: Sequence[Any], rows: Sequence[Sequence[str]]) -> Markup:
+def table(columns: Sequence[Any], rows: Sequence[Sequence[str]], extra_note: str = "") -> Markup:
     """Return a table; if it is wider than a phone, a narrow screen shows each row as a list of titles and cells.
 
-    Each column has `title`, `is_text`, `is_long` and `is_extra`. A switch above the table shows the extra columns.
+    Each column has `title`, `is_text`, `is_long` and `is_extra`. A switch above the table shows the extra columns
+    and, below the table, the text `extra_note`, which explains them.
     """
-    return _part("table", columns, rows, _characters(columns, rows) > PHONE_CHARACTERS)
+    return _part("table", columns, rows, _characters(columns, rows) > PHONE_CHARACTERS, extra_note)
 
 
 def _characters(columns: Sequence[Any], rows: Sequence[Sequence[str]]) -> int:

@@ -19,18 +19,15 @@ from lavt.experiment.report.figure_style import (
     Colours,
     Conditions,
     FigurePoint,
-    clusters_of,
     draw_point,
     kind_handles,
     legend_below,
     marker,
-    name_points,
-    name_style,
     new_figure,
     shown_interval,
     tidy,
-    write_names,
 )
+from lavt.experiment.report.point_names import PointName, name_points, name_shared_places, place_names
 
 NODE_COLOURS = {"camera": "Blues", "network": "Greys", "receiver": "Purples", "driver": "Greens", "actuator": "Oranges"}
 OTHER_COLOURS = "Reds"
@@ -85,14 +82,14 @@ def degradation_figure(
     tidy(error, label, ERROR_LABEL)
     completion.set_ylim(-9, 112)  # leaves room for the names below and above the points
     error.set_ylim(bottom=-0.09 * error.get_ylim()[1])
-    name_points(named_points)
     handles: list[Any] = kind_handles(kinds)
     if any("p95_common_m" in entry for conditions in kinds.values() for entry in conditions.values()):
         label = "error up to the common distance"
         handles.append(Line2D([], [], label=label, color="0.4", linestyle="none", **DIAMOND))
-    if paper:
+    if any(kind == "paper" and points for _, kind, points in named_points):
         handles.append(Line2D([], [], linestyle="none", **PAPER_MARKER))
     legend_below(figure, handles)
+    name_points(figure, named_points)
     return figure
 
 
@@ -128,7 +125,7 @@ def _with_totals(paper: Conditions) -> Conditions:
 def presets_figure(groups: Mapping[str, Conditions], colours: Colours) -> Figure:
     """Return the figure of completion and error over loop latency: a line for each group, a colour for each condition.
 
-    The names of conditions are written only next to points that are close to each other.
+    The names of conditions are written only where points of a group are at the same place.
     """
     figure = new_figure(4.6)
     completion, error = figure.subplots(2, 1)
@@ -146,13 +143,12 @@ def presets_figure(groups: Mapping[str, Conditions], colours: Colours) -> Figure
     completion.set_ylim(-5, 112)
     tidy(error, LOOP_LABEL, ERROR_LABEL, "Error of completed runs")
     error.set_ylim(0, 1.1 * error.get_ylim()[1])
-    for axes, points in lines:
-        write_names(axes, [cluster for cluster in clusters_of(points, axes) if len(cluster) > 1], "group")
     group_handles = [
         Line2D([], [], color="0.4", marker=symbols[title], label=title, linestyle="none") for title in groups
     ]
     names = dict.fromkeys(name for conditions in groups.values() for name in conditions)
     legend_below(figure, [*group_handles, *(Patch(color=colours[name], label=name) for name in names)])
+    name_shared_places(figure, lines)
     return figure
 
 
@@ -165,12 +161,15 @@ def injected_figure(kinds: Mapping[str, Conditions], colours: Colours) -> Figure
     """
     figure = new_figure(3.9)
     panels = figure.subplots(2, 2, sharex="col", height_ratios=[3, 2])
+    names: list[tuple[Axes, list[PointName]]] = []
     for column, (direction, key) in enumerate((("video", "tau_v_ms"), ("control", "tau_c_ms"))):
         latency_axes, deviation_axes = panels[:, column]
-        named_ms: set[float] = set()
+        names_by_delay: dict[float, PointName] = {}
         for kind, conditions in kinds.items():
             points = _injected_points(conditions, direction, key)
-            _draw_injected(panels[:, column], points, kind, colours, named_ms)
+            _draw_injected(panels[:, column], points, kind, colours)
+            names_by_delay = {**_injected_names(points), **names_by_delay}
+        names.append((latency_axes, list(names_by_delay.values())))
         tidy(latency_axes, "", "measured (ms)" if column == 0 else "", f"τ {direction}")
         latency_axes.set_ylim(bottom=-0.12 * latency_axes.get_ylim()[1])  # leaves room for the names below the points
         tidy(deviation_axes, "injected (ms)", "deviation (ms)" if column == 0 else "")
@@ -178,6 +177,9 @@ def injected_figure(kinds: Mapping[str, Conditions], colours: Colours) -> Figure
         deviation_axes.set_ylim(min(low, -1.2), max(high, 1.2))
         deviation_axes.axhline(0, color="0.6", linewidth=0.8, zorder=0)
     legend_below(figure, list(kind_handles(kinds)))
+    figure.draw_without_rendering()
+    for axes, panel_names in names:
+        place_names(axes, panel_names)
     return figure
 
 
@@ -196,9 +198,8 @@ def _draw_injected(
     points: Sequence[tuple[str, float, Mapping[str, Any]]],
     kind: str,
     colours: Colours,
-    named_ms: set[float],
 ) -> None:
-    """Draw the points of one kind, and name those whose delay is not in `named_ms`, which then contains it."""
+    """Draw the points of one kind."""
     if not points:
         return
     latency_axes, deviation_axes = panels
@@ -206,23 +207,22 @@ def _draw_injected(
     _, largest_ms, _ = points[-1]
     base_ms = smallest_latency["p50"] - smallest_ms
     latency_axes.plot([0, largest_ms], [base_ms, base_ms + largest_ms], color="0.6", linewidth=0.8, zorder=0)
-    names_by_delay: dict[float, list[str]] = {}
     for name, injected_ms, latency in points:
-        names_by_delay.setdefault(injected_ms, []).append(name)
         bar_lengths = [[latency["p50"] - latency["p5"]], [latency["p95"] - latency["p50"]]]
         style = {"capsize": 3, "linestyle": "none", **marker(kind, colours[name])}
         latency_axes.errorbar(injected_ms, latency["p50"], yerr=bar_lengths, **style)
         deviation_ms = latency["p50"] - injected_ms - base_ms
         deviation_axes.errorbar(injected_ms, deviation_ms, yerr=latency["bound"] or 0.0, **style)
-    medians_ms = {injected_ms: latency["p50"] for _, injected_ms, latency in points}
     latency_axes.margins(x=0.25)
-    for injected_ms, names in names_by_delay.items():
-        if injected_ms in named_ms:
-            continue
-        named_ms.add(injected_ms)
-        text = ", ".join(names)
-        style = name_style(latency_axes, kind, injected_ms, 2 * len(text))  # the panel has half the figure's width
-        latency_axes.annotate(text, (injected_ms, medians_ms[injected_ms]), **style)
+
+
+def _injected_names(points: Sequence[tuple[str, float, Mapping[str, Any]]]) -> dict[float, PointName]:
+    """Return one name for all conditions with the same injected delay, by this delay, at the last of their medians."""
+    names: dict[float, list[str]] = {}
+    for name, injected_ms, _ in points:
+        names.setdefault(injected_ms, []).append(name)
+    medians_ms = {injected_ms: float(latency["p50"]) for _, injected_ms, latency in points}
+    return {ms: PointName(", ".join(group), ms, medians_ms[ms]) for ms, group in names.items()}
 
 
 def stages_figure(stages: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:

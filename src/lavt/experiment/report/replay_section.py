@@ -39,8 +39,8 @@ def replay_parts(report: ReportContext, sets: DriveSets) -> Parts:
     caption = (
         f"The runs {names}, those with the least and the most injected delay on the first route and in the first "
         f"repetition, at {SPEED:g} times the speed: the frame from which the command in force was made; the road from "
-        f"above; and the distance from the lane centre. Printed: {poster_s:.1f} s, when {pair[-1].condition} is "
-        "farthest from the lane centre."
+        f"above; and the distance from the lane centre. On paper, a still picture shows the moment {poster_s:.1f} s "
+        f"after the start, when {pair[-1].condition} is farthest from the lane centre."
     )
     invalid = [str(drive.result["run"]) for drive in pair if not drive.result.get("valid", True)]
     if invalid:

@@ -28,6 +28,7 @@ from lavt.experiment.report.run_sections import (
     drawn_runs,
     machine_parts,
     read_drives,
+    setting_text,
     single_run_parts,
     trajectory_parts,
 )
@@ -38,6 +39,7 @@ from lavt.experiment.report.sections import (
     degradation_parts,
     group_parts,
     injected_parts,
+    lane_change_parts,
     route_parts,
     run_parts,
     stage_parts,
@@ -86,7 +88,7 @@ def write_report(
     report = ReportContext(summary, report_dir, condition_colours(str(run["condition"]) for run in summary["runs"]))
     sets = read_drives(drawn_runs(report, results), drives or {})
     with mpl.rc_context(SETTINGS):
-        first = first_parts(report, replay_parts(report, sets))
+        first = first_parts(report, replay_parts(report, sets), setting_text(report, sets))
         chapters = _chapters(report, sets, boundaries)
     index = report_dir / "index.html"
     index.write_text(html_page.page(TITLE, first, chapters), encoding="utf-8")
@@ -130,7 +132,7 @@ def _chapters(
         html_page.Chapter("Latency", latency),
         html_page.Chapter("Statistics", statistics),
         html_page.Chapter(VALIDITY, validity),
-        html_page.Chapter("Every run", [("All runs", run_parts(report))]),
+        html_page.Chapter("Every run", [("All runs", run_parts(report)), ("Lane changes", lane_change_parts(report))]),
     ]
 
 

@@ -86,8 +86,13 @@ def _extent(points_m: FloatArray) -> tuple[float, float]:
     return float(width_m), float(height_m)
 
 
-def cross_track_figure(routes: Mapping[str, Sequence[DriveData]], colours: Colours) -> Figure:
-    """Return the figure of cross-track error over distance along the route, one panel for each route."""
+def cross_track_figure(
+    routes: Mapping[str, Sequence[DriveData]], colours: Colours, compared: Sequence[DriveData]
+) -> Figure:
+    """Return the figure of cross-track error over distance along the route, one panel for each route.
+
+    The scale of the error includes the drives in `compared`, so that several figures have the same scale.
+    """
     figure = new_figure(1.15 * len(routes) + 0.7)
     panels = figure.subplots(len(routes), 1, squeeze=False, sharey=True)[:, 0]
     for axes, (route, drives) in zip(panels, routes.items(), strict=True):
@@ -102,6 +107,7 @@ def cross_track_figure(routes: Mapping[str, Sequence[DriveData]], colours: Colou
         if early_ends:
             axes.plot(*np.transpose(early_ends), **EARLY_END_MARKER)
         tidy(axes, "", "", f"Route {route}")
+    panels[0].set_ylim(*_scale([drive.truth.floats("cross_track_m") for drive in compared]))  # of all panels
     panels[-1].set_xlabel("distance along the route (m)")
     figure.supylabel("left of lane centre (m)")
     _legend(figure, routes, colours)
@@ -116,20 +122,38 @@ def _legend(figure: Figure, routes: Mapping[str, Sequence[DriveData]], colours: 
     )
 
 
-def time_figure(drives: Sequence[DriveData], colours: Colours) -> Figure:
-    """Return the figure of steering and cross-track error over time, one row for each drive."""
+def time_figure(drives: Sequence[DriveData], colours: Colours, compared: Sequence[DriveData]) -> Figure:
+    """Return the figure of steering and cross-track error over time, one row for each drive.
+
+    The scales include the drives in `compared`, so that several figures have the same scales.
+    """
     figure = new_figure(1.1 * len(drives) + 0.4)
     panels = figure.subplots(len(drives), 2, sharex=True, sharey="col", squeeze=False)
     for (steering_axes, error_axes), drive in zip(panels, drives, strict=True):
-        time_s = (drive.truth.ints("mono_ns") - drive.began_ns) / NS_PER_S
+        time_s = _time_s(drive)
         colour = colours[drive.condition]
         steering_axes.plot(time_s, np.degrees(drive.truth.floats("steering_rad")), color=colour, linewidth=1)
         error_axes.plot(time_s, drive.truth.floats("cross_track_m"), color=colour, linewidth=1)
-        tidy(steering_axes, "", "steering (°)", f"{drive.condition}, {drive.result['ending']}")
+        tidy(steering_axes, "", "steering (°)", f"{drive.condition}, {str(drive.result['ending']).replace('_', ' ')}")
         tidy(error_axes, "", "left (m)")
     for axes in panels[-1]:
         axes.set_xlabel("time (s)")
+    panels[0, 0].set_xlim(*_scale([_time_s(drive) for drive in compared]))
+    panels[0, 0].set_ylim(*_scale([np.degrees(drive.truth.floats("steering_rad")) for drive in compared]))
+    panels[0, 1].set_ylim(*_scale([drive.truth.floats("cross_track_m") for drive in compared]))
     return figure
+
+
+def _time_s(drive: DriveData) -> FloatArray:
+    return (drive.truth.ints("mono_ns") - drive.began_ns) / NS_PER_S
+
+
+def _scale(values: Sequence[FloatArray]) -> tuple[float, float]:
+    """Return the ends of an axis that shows all finite values with a margin."""
+    known = np.concatenate([np.zeros(1), *values])
+    low, high = np.nanmin(known), np.nanmax(known)
+    margin = 0.06 * float(high - low) or 1.0
+    return float(low) - margin, float(high) + margin
 
 
 def frames_figure(pictures: Sequence[tuple[str, Picture]]) -> Figure:

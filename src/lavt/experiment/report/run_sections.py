@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+
+from lavt.clock import calendar_time
 from lavt.domain import NS_PER_S, Picture
 from lavt.experiment.analysis.drive_data import DriveData, capture_to_stamp_ms, one_of_each_condition, read_drive
 from lavt.experiment.report import html_page
@@ -24,7 +27,7 @@ DRAWN_GROUPS = 4
 such group, the first group."""
 
 MAX_PANELS = 3
-"""The maximum number of routes in one figure of trajectories: the paper has three key parts and three whole routes."""
+"""The maximum number of routes, or of runs, in one figure: the paper has three key parts and three whole routes."""
 
 DriveSets = Mapping[tuple[str, str], Sequence[DriveData]]
 """Drives by kind of time (`virtual` or `real`) and by title of their group (see `groups.py`; "" in real time). Each set
@@ -59,6 +62,38 @@ def read_drives(
     }
 
 
+def setting_text(report: ReportContext, sets: DriveSets) -> str:
+    """Return sentences on the speed, the lane width and the date of the runs, as far as the records have them.
+
+    The clock of runs in virtual time is simulated, so they have no date. If not all runs are drawn, the speed is left
+    out, because the record of a run that is not drawn is not read.
+    """
+    runs, drives = report.summary["runs"], [drive for members in sets.values() for drive in members]
+    speeds_mps = [float(np.median(drive.truth.floats("speed_mps"))) for drive in drives if len(drive.truth)]
+    speeds = [round(speed_mps * 3.6) for speed_mps in speeds_mps if np.isfinite(speed_mps)]
+    widths_m = [(run.get("lane_kept") or {}).get("lane_width_m") for run in runs]
+    widths = [round(width_m, 1) for width_m in widths_m if width_m is not None]
+    dates = [
+        calendar_time(drive.began_wall_ns).date().isoformat()
+        for drive in drives
+        if drive.result["time"] == "real" and drive.began_wall_ns is not None
+    ]
+    sentences = []
+    if len(speeds) == len(runs):
+        sentences.append(f"The median speed of a run is {_range(speeds)} km/h.")
+    if widths:
+        sentences.append(f"The lanes are {_range(widths)} m wide.")
+    if dates:
+        sentences.append(f"The runs in real time were driven on {_range(dates)} (UTC).")
+    return " ".join(sentences)
+
+
+def _range(values: Sequence[float] | Sequence[str]) -> str:
+    """Return the lowest and the highest of values, or the only one."""
+    in_order = sorted(values)
+    return f"{in_order[0]}" if in_order[0] == in_order[-1] else f"{in_order[0]} to {in_order[-1]}"
+
+
 def trajectory_parts(report: ReportContext, sets: DriveSets) -> Parts:
     """Return the figures of all trajectories and of their cross-track error.
 
@@ -72,18 +107,21 @@ def trajectory_parts(report: ReportContext, sets: DriveSets) -> Parts:
                 routes.setdefault(str(drive.result["route"]), []).append(drive)
         origin = f"{kind} time{f', {title}' if title else ''}"
         suffix = "_".join(word for word in (kind, html_page.slug(title)) if word)
+        all_drives = [drive for members in routes.values() for drive in members]
         for name, shown in _figures_of(list(routes)):
-            figure = trajectories_figure({route: routes[route] for route in shown}, report.colours)
+            shown_routes = {route: routes[route] for route in shown}
+            figure = trajectories_figure(shown_routes, report.colours)
             caption = (
                 f"All trajectories, {origin}. Each route is rotated to fit. A red cross marks the end of a run that "
                 "ended early."
             )
             alternative = f"trajectories on routes {', '.join(shown)}"
-            parts.append(save_figure(report.directory, f"trajectories_{name}_{suffix}", figure, alternative, caption))
-        if routes:
-            caption = f"Distance from the lane centre along the route, {origin}."
-            figure = cross_track_figure(routes, report.colours)
-            parts.append(save_figure(report.directory, f"cross_track_{suffix}", figure, "cross-track error", caption))
+            trajectories = save_figure(report.directory, f"trajectories_{name}_{suffix}", figure, alternative, caption)
+            caption = f"Distance from the lane centre along the same routes, {origin}."
+            figure = cross_track_figure(shown_routes, report.colours, all_drives)
+            alternative = f"cross-track error on routes {', '.join(shown)}"
+            errors = save_figure(report.directory, f"cross_track_{name}_{suffix}", figure, alternative, caption)
+            parts.append(html_page.figures([trajectories, errors]))
     return parts
 
 
@@ -106,14 +144,16 @@ def single_run_parts(report: ReportContext, sets: DriveSets) -> Parts:
     for kind, drives in _first_sets(sets).items():
         chosen = one_of_each_condition(drives)
         driven = [drive for drive in chosen if len(drive.truth)]
-        if driven:
-            names = ", ".join(str(drive.result["run"]) for drive in driven)
+        for begin in range(0, len(driven), MAX_PANELS):
+            shown = driven[begin : begin + MAX_PANELS]
+            names = ", ".join(str(drive.result["run"]) for drive in shown)
             caption = (
-                "Angle of the road wheels and distance from the lane centre over time; left is positive. The figure "
-                f"shows one run of each condition in {kind} time: {names}."
+                "Angle of the road wheels and distance from the lane centre over time; left is positive. One run of "
+                f"each condition, {kind} time: {names}."
             )
-            figure = time_figure(driven, report.colours)
-            parts.append(save_figure(report.directory, f"time_{kind}", figure, "steering over time", caption))
+            figure = time_figure(shown, report.colours, driven)
+            name = f"time_{kind}{begin // MAX_PANELS + 1 if begin else ''}"
+            parts.append(save_figure(report.directory, name, figure, "steering over time", caption))
         pictures = received_pictures(chosen[0].directory / "client.mcap")
         if pictures:
             caption = (
@@ -122,7 +162,7 @@ def single_run_parts(report: ReportContext, sets: DriveSets) -> Parts:
             )
             figure = frames_figure(pictures)
             parts.append(save_figure(report.directory, f"frames_{kind}", figure, "received frames", caption))
-    return parts
+    return [html_page.figures(parts)] if parts else []
 
 
 def _first_sets(sets: DriveSets) -> dict[str, Sequence[DriveData]]:

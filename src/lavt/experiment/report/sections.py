@@ -26,6 +26,7 @@ from lavt.experiment.report.latency_figures import (
 )
 from lavt.experiment.report.sweep_figures import axis_figure, incidence_figure, routes_with_survival, survival_figure
 from lavt.experiment.report.tables import (
+    check_table,
     clock_table,
     group_table,
     lane_change_table,
@@ -50,6 +51,10 @@ AGE_NOTE = " The paper does not give it."
 STAGES_NOTE = (
     "The first row, from capture to stamp, is from one run of each condition. The other rows are from all runs of "
     "the condition. The bars contain neither the first row, which is before the loop, nor the stages after the loop."
+)
+CHECKS_NOTE = (
+    "The table has the worst value of each check over all runs, valid or not. A value over its limit makes its run "
+    "invalid. Other checks have no number, for example whether the records are complete. docs/metrics.md explains all."
 )
 
 SMALLEST_REST_MS = 0.5
@@ -126,6 +131,9 @@ def validity_parts(report: ReportContext) -> Parts:
         runs_failed = "1 run" if len(failed) == 1 else f"{len(failed)} runs"
         parts.append(html_page.paragraph(f"{runs_failed} failed and {'is' if len(failed) == 1 else 'are'} left out:"))
         parts.append(html_page.bullets([f"{run['run']}: {run['reason']}" for run in failed]))
+    table = check_table(runs)
+    if table.rows:
+        parts += [save_table(report.directory, "checks", table), html_page.paragraph(CHECKS_NOTE, is_note=True)]
     if speed["wall_s"]:
         factor = speed["simulated_s"] / speed["wall_s"]
         jobs = f"{speed['jobs']} parallel job{'s' if speed['jobs'] != 1 else ''}"
@@ -171,10 +179,9 @@ def degradation_parts(report: ReportContext) -> Parts:
     paper = report.paper(report.summary["conditions"])
     caption = (
         "Completion in any lane, and error of the completed runs, over the median loop latency. Bars are 95 % "
-        "intervals for these routes; a single run has none. Names above each other are in the vertical order of their "
-        "points." + (PAPER_POINTS if paper else "") + _base_note(report)
+        "intervals for these routes; a single run has none." + (PAPER_POINTS if paper else "") + _base_note(report)
     )
-    return [
+    figures = [
         save_figure(
             report.directory,
             "degradation" if label == LOOP_LABEL else "degradation_age",
@@ -184,6 +191,7 @@ def degradation_parts(report: ReportContext) -> Parts:
         )
         for label in known_latencies(report.kinds)
     ]
+    return [html_page.figures(figures)]
 
 
 def _is_repeated(conditions: Conditions) -> bool:
@@ -208,18 +216,17 @@ def survival_parts(report: ReportContext) -> Parts:
                 "Cumulative incidence: the share of runs that ended in each way up to each distance.",
             ),
         }
-        for name, (make, caption) in figures.items():
-            figure = make(conditions, report.colours)
-            alternative = f"{name} by distance, {kind} time"
-            parts.append(
-                save_figure(
-                    report.directory,
-                    f"{name}_{kind}",
-                    figure,
-                    alternative,
-                    f"{caption} {kind.capitalize()} time{report.base_title(kind)}.",
-                )
+        saved = [
+            save_figure(
+                report.directory,
+                f"{name}_{kind}",
+                make(conditions, report.colours),
+                f"{name} by distance, {kind} time",
+                f"{caption} {kind.capitalize()} time{report.base_title(kind)}.",
             )
+            for name, (make, caption) in figures.items()
+        ]
+        parts.append(html_page.figures(saved))
         parts.append(link_table(report.directory, f"survival_{kind}", survival_table(conditions)))
     return parts
 
@@ -270,8 +277,8 @@ def group_parts(report: ReportContext) -> Parts:
     if len(groups) <= MAX_COMPARED_GROUPS:
         figure = presets_figure({title_of(group, names): group["conditions"] for group in groups}, report.colours)
         caption = (
-            "Comparison of the groups in virtual time. The legend names the settings that differ. Where the points "
-            "of several conditions overlap, their names are in the vertical order of the points."
+            "Comparison of the groups in virtual time. The legend names the settings that differ. Names are written "
+            "where the points of several conditions are at the same place."
         )
         parts.append(save_figure(report.directory, "groups", figure, "comparison of the groups", caption))
     return [*parts, save_table(report.directory, "groups", group_table(groups, names))]
@@ -304,7 +311,7 @@ def axis_parts(report: ReportContext) -> Parts:
         name = "_".join(["axes", *(html_page.slug(title),)]) if title else "axes"
         alternative = f"driving results by {short_name(x_axis)}"
         parts.append(save_figure(report.directory, name, figure, alternative, caption))
-    return parts
+    return [html_page.figures(parts)]
 
 
 def _numeric_values(groups: Sequence[Group], axis: str) -> int:
@@ -326,12 +333,20 @@ def route_parts(report: ReportContext) -> Parts:
 
 
 def run_parts(report: ReportContext) -> Parts:
-    """Return the table of all runs with their validity, and a link to the table of their lane changes."""
-    runs = report.summary["runs"]
-    return [
-        save_table(report.directory, "runs", run_table(runs)),
-        link_table(report.directory, "lane_changes", lane_change_table(runs)),
-    ]
+    """Return the table of all runs with their validity."""
+    return [save_table(report.directory, "runs", run_table(report.summary["runs"]))]
+
+
+def lane_change_parts(report: ReportContext) -> Parts:
+    """Return links to the table of all lane changes, which is too long for the page, with a sentence on it."""
+    table = lane_change_table(report.summary["runs"])
+    if not table.rows:
+        return []
+    text = (
+        "Every change of the lane that the driver followed, or of the lane that the car was in, is in the file "
+        "tables/lane_changes.csv."
+    )
+    return [html_page.paragraph(text), link_table(report.directory, "lane_changes", table)]
 
 
 def clock_parts(report: ReportContext) -> Parts:

@@ -66,8 +66,11 @@ def _latency_levels(conditions: Conditions) -> list[list[ConditionPoint]]:
     return [list(members) for _, members in groupby(sorted(known, key=lambda point: (level(point), point.name)), level)]
 
 
-def runs_overview(runs: Sequence[Mapping[str, Any]]) -> str:
-    """Return a sentence with the number of runs, their routes and conditions, and the number of invalid runs."""
+def runs_overview(runs: Sequence[Mapping[str, Any]], setting: str = "") -> str:
+    """Return sentences with the number of runs, their routes and conditions, and the number of invalid runs.
+
+    `setting` has further sentences on the runs, which follow the conditions.
+    """
     kinds = Counter((str(run["time"]), run.get("fidelity") or "video") for run in runs)
     by_time = " and ".join(
         f"{_counted(count, 'run')} in {time} time {PICTURES[fidelity]}"
@@ -81,7 +84,25 @@ def runs_overview(runs: Sequence[Mapping[str, Any]]) -> str:
         subject = "1 run is" if invalid == 1 else f"{invalid} runs are"
         validity = f"{subject} invalid and excluded from all statistics."
     where = f"{_listed('route', routes, MAX_LISTED_ROUTES)} under {_listed('condition', names, MAX_LISTED_NAMES)}"
-    return f"{by_time} on {where}. {validity}"
+    return " ".join(filter(None, (f"{by_time} on {where}.", setting, validity)))
+
+
+def limits_sentence(runs: Sequence[Mapping[str, Any]]) -> str:
+    """Return a sentence on what these runs cannot show; "" if nothing of it is known."""
+    limits = []
+    if {run.get("preset") for run in runs} == {"paper_calibrated"}:
+        limits.append(
+            "where driving fails for another controller or car, because the delay at which completion falls was an "
+            "input to the gains (paper_calibrated)"
+        )
+    if any(run.get("fidelity") == "geometry" for run in runs):
+        limits.append(
+            "in the runs without pictures, errors of lane detection or a driver who follows another lane, because "
+            "these runs always follow the lane of the route"
+        )
+    if all(run.get("inherent") == "loopback" for run in runs):
+        limits.append("the latency of a real network: without injected delay, it is that of one machine's loopback")
+    return f"Not shown: {'; '.join(limits)}." if limits else ""
 
 
 def _listed(word: str, names: Sequence[str], most: int) -> str:

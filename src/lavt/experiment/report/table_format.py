@@ -206,9 +206,9 @@ def format_with_bound(value: float | None, bound: float | None, *, digits: int =
     return f"{value:.{digits}f} ± {error}".replace(" ", UNBROKEN)
 
 
-def html_of(table: TableData) -> Markup:
-    """Return a table as HTML."""
-    return html_page.table(table.columns, _shown_texts(table))
+def html_of(table: TableData, extra_note: str = "") -> Markup:
+    """Return a table as HTML; the page shows `extra_note` only together with the extra columns."""
+    return html_page.table(table.columns, _shown_texts(table), extra_note)
 
 
 def csv_of(table: TableData) -> str:

@@ -12,6 +12,7 @@ from lavt.experiment.report.figure_style import Conditions
 from lavt.experiment.report.groups import Group, short_name
 from lavt.experiment.report.table_format import (
     NOTHING,
+    UNBROKEN,
     Column,
     TableData,
     extra,
@@ -32,6 +33,20 @@ FIDELITY_DESCRIPTIONS = {
     "pixels": "modelled network, clocks and codec, real images",
     "geometry": "modelled network, clocks, codec, camera and perception, lane detection without errors",
 }
+
+CHECKS: Mapping[str, tuple[str, float]] = {
+    "loop_jitter": ("loop jitter, ms", 1.0),
+    "physics_late": ("physics late, % of the drive", 100.0),
+    "frames_missed": ("frames that the camera missed, %", 100.0),
+    "injection_differs": ("delay in the relay against the request, ms", 1.0),
+    "injection_not_on_path": ("injected delay that the latency lacks, %", 100.0),
+    "closure": ("sum of the loop's parts against the loop latency, p95, ms", 1.0),
+    "clock_step": ("step of a clock, ms", 1.0),
+    "clock_not_sampled": ("time without a sample of a clock, s", 1.0),
+    "clock_bound": ("error bound of the clock offset, ms", 1.0),
+    "clock_disagreement": ("clock offset against the probe's, ms", 1.0),
+}
+"""The label of each check with a number, by its code, and the factor by which its value is multiplied."""
 
 
 def run_setup(runs: Sequence[Mapping[str, Any]]) -> str:
@@ -203,6 +218,47 @@ def lane_change_table(runs: Sequence[Mapping[str, Any]]) -> TableData:
             (number_column("to lane", 0), "to"),
         ],
     )
+
+
+def check_table(runs: Sequence[Mapping[str, Any]]) -> TableData:
+    """Return the table of validity checks with a number: the limit, and the worst value in each kind of time."""
+    worst: dict[str, dict[str, tuple[Mapping[str, Any], Mapping[str, Any]]]] = {}
+    for run in runs:
+        for check in run.get("checks") or []:
+            by_time = worst.setdefault(str(check["code"]), {})
+            if run["time"] not in by_time or _severity(check) > _severity(by_time[run["time"]][0]):
+                by_time[run["time"]] = check, run
+    rows = []
+    for code, (label, scale) in CHECKS.items():
+        row: list[Any] = [label]
+        for time in ("real", "virtual"):
+            check, run = worst.get(code, {}).get(time, (None, {}))
+            row += [(check["value"] * scale, check["limit"] * scale), run["run"]] if check else [None, None]
+        if code in worst:
+            rows.append(row)
+    columns = [
+        text_column("check"),
+        *(
+            column
+            for time in ("real", "virtual")
+            for column in (
+                Column(f"worst in {time} time (limit)", _format_check, ("value", "limit")),
+                text_column(f"run in {time} time"),
+            )
+        ),
+    ]
+    return TableData(columns, rows).without_empty_columns()
+
+
+def _format_check(value_and_limit: tuple[float, float] | None) -> str:
+    if value_and_limit is None:
+        return NOTHING
+    value, limit = value_and_limit
+    return f"{value:.2f} ({limit:.2f})".replace(" ", UNBROKEN)
+
+
+def _severity(check: Mapping[str, Any]) -> float:
+    return float(check["value"]) / float(check["limit"]) if check["limit"] else 0.0
 
 
 def clock_table(runs: Sequence[Mapping[str, Any]]) -> TableData:

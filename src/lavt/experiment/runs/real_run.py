@@ -21,9 +21,9 @@ from lavt.clock import MachineClock, pause
 from lavt.config import DelayConfig, ImpairmentConfig, LinkConfig, RelayConfig
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import WorkError
-from lavt.experiment.analysis.invalid_reason import InvalidReason
+from lavt.experiment.analysis.invalid_reason import InvalidCode, InvalidReason, MeasuredCheck
 from lavt.experiment.analysis.results import write_json
-from lavt.experiment.analysis.validity import injection_reasons, lateness_reasons
+from lavt.experiment.analysis.validity import INJECTION_LIMIT_MS, injection_reasons, lateness_reasons
 from lavt.experiment.runs.netem_run import NETEM, NetemRun, uses_netem
 from lavt.experiment.runs.network import NetworkDelays, injected_network
 from lavt.experiment.runs.plan import PlannedRun
@@ -174,6 +174,18 @@ def relay_invalid_reasons(relay: Mapping[str, Any]) -> list[InvalidReason]:
             {flow: lateness_ms.get(DELAYED_DIRECTIONS[flow]) for flow in requested_ms if flow not in constant_ms}
         ),
     ]
+
+
+def relay_checks(relay: Mapping[str, Any]) -> list[MeasuredCheck]:
+    """Return the check of `relay_invalid_reasons`: the largest difference of a flow's delay from the request."""
+    differences_ms = []
+    for flow, delay_ms in relay.get("requested_ms", {}).items():
+        measured_ms = relay.get("late_ms" if delay_ms is None else "held_ms", {}).get(DELAYED_DIRECTIONS[flow])
+        if measured_ms is not None:
+            differences_ms.append(abs(measured_ms - (delay_ms or 0.0)))
+    if not differences_ms:
+        return []
+    return [MeasuredCheck(InvalidCode.INJECTION_DIFFERS, max(differences_ms), INJECTION_LIMIT_MS)]
 
 
 def _injected_delays(planned: PlannedRun) -> NetworkDelays:

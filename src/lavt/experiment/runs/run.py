@@ -12,11 +12,11 @@ import yaml
 from lavt.errors import WorkError
 from lavt.experiment.analysis.drive_data import DriveData, extract_drive
 from lavt.experiment.analysis.injection_validity import recorded_reasons
-from lavt.experiment.analysis.invalid_reason import InvalidReason
+from lavt.experiment.analysis.invalid_reason import InvalidReason, MeasuredCheck
 from lavt.experiment.analysis.results import read_json, run_result, write_json
 from lavt.experiment.runs.netem_run import NETEM, netem_invalid_reasons
 from lavt.experiment.runs.plan import PlannedRun
-from lavt.experiment.runs.real_run import RELAY, Progress, drive_real, relay_invalid_reasons
+from lavt.experiment.runs.real_run import RELAY, Progress, drive_real, relay_checks, relay_invalid_reasons
 from lavt.experiment.runs.virtual_run import build_loop, drive, free_finished_loops
 from lavt.recording.output_directory import check_directory, prepare_directory
 from lavt.recording.record import evaluating, read_record
@@ -75,14 +75,15 @@ def compute_result(out: Path, identity: Mapping[str, Any], digest: str | None) -
 def _compute(out: Path, identity: Mapping[str, Any], digest: str | None) -> DriveData:
     server, client = read_record(out / "server.mcap"), read_record(out / "client.mcap")
     reasons: list[InvalidReason] = []
+    checks: list[MeasuredCheck] = []
     if identity["injection"] == "relay":
         relay = read_json(out / RELAY) if (out / RELAY).is_file() else {}
-        reasons = relay_invalid_reasons(relay)
+        reasons, checks = relay_invalid_reasons(relay), relay_checks(relay)
     elif identity["inherent"] == NETWORK:
         requested = identity["condition"] if identity["injection"] == "netem" else ""
         reasons = recorded_reasons(server, client, requested, identity["injected_ms"])
     elif identity["injection"] == "netem":
         reasons = netem_invalid_reasons(read_json(out / NETEM) if (out / NETEM).is_file() else {})
-    result = run_result(identity, server, client, digest=digest, reasons=reasons)
+    result = run_result(identity, server, client, digest=digest, reasons=reasons, checks=checks)
     write_json(out / RESULT, result)
     return extract_drive(server, out, result)
