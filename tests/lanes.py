@@ -1,8 +1,8 @@
 """The lanes of tests: which tests each lane has, and the command that runs it.
 
-A test belongs to the lane of its folder (`tests/field`, `tests/interop`, `tests/kernel`, `tests/realtime`); elsewhere
-to `full` or `realtime` if it has that marker, and to `quick` otherwise. `python -m pytest` runs `quick`;
-`python -m tests.lanes` runs all lanes, `python -m tests.lanes NAME...` the named ones.
+A test belongs to the lane of its folder (`tests/browser`, `tests/field`, `tests/interop`, `tests/kernel`,
+`tests/realtime`); elsewhere to `full` or `realtime` if it has that marker, and to `quick` otherwise. `python -m pytest`
+runs `quick`; `python -m tests.lanes` runs all lanes, `python -m tests.lanes NAME...` the named ones.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pathlib import Path
 TESTS = Path(__file__).resolve().parent
 REPOSITORY = TESTS.parent
 
-SEQUENTIAL_FOLDERS = ("field", "interop", "kernel", "realtime")
+SEQUENTIAL_FOLDERS = ("browser", "field", "interop", "kernel", "realtime")
 """Tests in these folders run sequentially and alone, because they judge times or need a separate network."""
 QUICK = "not full and not realtime"
 """The marker expression of `python -m pytest`."""
@@ -34,7 +34,7 @@ class LaneSpec:
     limit_min: float
     """A lane that takes longer is killed and has failed."""
     meanwhile: LaneSpec | None = None
-    """Another lane that runs at the same time as the last command, at the lowest priority."""
+    """Another lane that starts with the last command, at the lowest priority, and goes on beside the lanes after it."""
 
 
 def pytest(*arguments: str) -> tuple[str, ...]:
@@ -52,7 +52,7 @@ CAN_DRIVES = "tests/kernel/test_can.py"
 for the drives of these tests."""
 KERNEL = (sys.executable, "tests/kernel/run", *SHOW_SLOWEST)
 FULL = LaneSpec("full", (pytest("-m", "full", "--timeout=1800"),), 40)
-"""A test has more time here, because the lane runs at the lowest priority beside another one."""
+"""A test has more time here, because the lane runs at the lowest priority beside others."""
 LINTERS = (
     program("ruff", "check"),
     program("ruff", "format", "--check"),
@@ -63,10 +63,11 @@ LINTERS = (
 LANES = (
     LaneSpec("linters", LINTERS, 10),
     LaneSpec("quick", (pytest(),), 15),
-    LaneSpec("interop", (pytest("tests/interop"),), 5),
     LaneSpec("realtime", (pytest("-m", "realtime"),), 35),
     LaneSpec("field", (pytest("tests/field"),), 35),
     LaneSpec("kernel", ((*KERNEL, CAN_DRIVES), (*KERNEL, f"--ignore={CAN_DRIVES}")), 30, meanwhile=FULL),
+    LaneSpec("interop", (pytest("tests/interop"),), 5),
+    LaneSpec("browser", (pytest("tests/browser"),), 10),
 )
 
 

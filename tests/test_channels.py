@@ -13,17 +13,25 @@ import lavt.nodes
 from lavt.assembly.entropy import SeededEntropy
 from lavt.assembly.nodes import build_client, build_server
 from lavt.channels import CHANNELS, QUEUE_LENGTH
-from lavt.config import ClientCameraConfig, ClientConfig, ServerCameraConfig, ServerConfig, VehicleConfig
+from lavt.config import (
+    HUMAN,
+    ClientCameraConfig,
+    ClientConfig,
+    ControllerConfig,
+    ServerCameraConfig,
+    ServerConfig,
+    VehicleConfig,
+)
 from lavt.domain import Now
 from lavt.node import WAKE, Node
 
-EXTERNAL_SENDERS = {"clock_source", "injector", "operator", "runtime"}
+EXTERNAL_SENDERS = {"clock_source", "console", "injector", "operator", "runtime"}
 """The senders in the table that are no nodes."""
 
 
 @pytest.fixture(scope="module")
 def nodes() -> Sequence[Node]:
-    """Return all nodes of both sides, built as for a run."""
+    """Return all nodes of both sides, built as for a run, and those of a client with which a person drives."""
     camera = ServerCameraConfig(width_px=640, height_px=480)
     server = build_server(
         ServerConfig(vehicle=VehicleConfig(scenery="none"), camera=camera),
@@ -32,15 +40,20 @@ def nodes() -> Sequence[Node]:
         host="",
         video_port=1,
     )
-    client = build_client(
-        ClientConfig(camera=ClientCameraConfig(width_px=640, height_px=480)),
-        lambda: Now(0, 10**18),
-        SeededEntropy(1, "client"),
-    )
-    return [*server.all, *client.all]
+    clients = [
+        build_client(
+            ClientConfig(
+                camera=ClientCameraConfig(width_px=640, height_px=480), controller=ControllerConfig(kind=controller)
+            ),
+            lambda: Now(0, 10**18),
+            SeededEntropy(1, "client"),
+        )
+        for controller in ("lane_keeper", HUMAN)
+    ]
+    return [*server.all, *(node for client in clients for node in client.all)]
 
 
-NODE_OF_MODULE = {"picture_reader": "driver"}
+NODE_OF_MODULE = {"picture_reader": "driver", "commander": "driver", "human_driver": "driver"}
 """The nodes of the modules that are not named after their node."""
 
 
@@ -92,11 +105,14 @@ def test_senders_and_receivers_exist(nodes: Sequence[Node]) -> None:
 
 
 def test_channels_without_receivers() -> None:
-    """Every channel has a receiver, except for those that are only recorded, `clock_query` and `inject`."""
+    """Every channel has a receiver, except for those that are only recorded, and those to parts that are no nodes."""
     without_receivers = {name for name, row in CHANNELS.items() if not row.receivers}
     assert without_receivers == {name for name, row in CHANNELS.items() if row.carrier == "record"} | {
         "clock_query",
         "inject",
+        "page_status",
+        "page_unit",
+        "relay_delay",
     }
 
 

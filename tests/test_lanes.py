@@ -83,7 +83,7 @@ def test_folder_and_marker_select_the_lane(collected: dict[str, set[str]]) -> No
         "tests/test_root.py::test_realtime",
         "tests/cli/test_cli.py::test_realtime",
     }
-    for folder in ("field", "interop"):
+    for folder in ("browser", "field", "interop"):
         assert collected[folder] == {f"tests/{folder}/test_{folder}.py::test_plain"}
 
 
@@ -117,15 +117,17 @@ def test_every_lane_is_documented() -> None:
         "pytest -m realtime",
         "pytest tests/field",
         "pytest tests/interop",
+        "pytest tests/browser",
         "tests/kernel/run",
     ]
     assert [command for command in [*commands, "tests.lanes", ".ci/run"] if command not in text] == []
 
 
 def test_lanes_can_be_selected_by_name() -> None:
-    """Without names all lanes run, `full` at the same time as `kernel`; named lanes run in the given order."""
+    """Without names all lanes run, `full` only beside `kernel` and the lanes after it; or else the named lanes."""
     assert select_lanes([]) == list(LANES)
     assert [lane.name for lane in LANES if lane.meanwhile is FULL] == ["kernel"]
+    assert [lane.name for lane in LANES][-3:] == ["kernel", "interop", "browser"]
     assert [(lane.name, lane.meanwhile) for lane in select_lanes(["full", "kernel"])] == [
         ("full", None),
         ("kernel", None),
@@ -174,6 +176,16 @@ def test_a_lane_at_the_same_time_starts_with_the_last_command(tmp_path: Path) ->
     code, output = run(LaneSpec("kernel", (first, shell(f"until test -e {began}; do sleep 0.1; done")), 1, other))
     assert code == 1
     assert output.count("ended with") == output.count("ended with 4") == 1
+
+
+def test_a_lane_at_the_same_time_goes_on_beside_the_next_lanes(tmp_path: Path) -> None:
+    """A lane that runs at the same time as another still runs during the next lane; its output follows at the end."""
+    began = tmp_path / "began"
+    other = LaneSpec("full", (shell(f"until test -e {began}; do sleep 0.1; done; echo other"),), 1)
+    kernel = LaneSpec("kernel", (shell("true"),), 1, meanwhile=other)
+    code, output = run(kernel, LaneSpec("browser", (shell(f"touch {began}; sleep 0.5; echo browser"),), 1))
+    assert code == 0
+    assert output.index("---- browser\nbrowser") < output.index("---- full\nother")
 
 
 @pytest.mark.parametrize("meanwhile", [False, True])
@@ -251,7 +263,7 @@ def test_table_lists_lanes_and_failures() -> None:
 def test_the_programs_in_the_ci_script_run() -> None:
     """The Python programs in `.ci/run` can import all names that they use; no linter checks these programs."""
     programs = re.findall(r"python -c '([^']*)'", (REPOSITORY / ".ci" / "run").read_text())
-    assert len(programs) == 3
+    assert len(programs) == 4
     for program in programs:
         completed = subprocess.run(
             [sys.executable, "-c", program], cwd=REPOSITORY, capture_output=True, text=True, check=False, timeout=60

@@ -183,6 +183,9 @@ def summarize(runs: Sequence[Row], common_p95: Values) -> Row:
         "completed_in_own_lane": int(sum(kept)),
         "own_lane_completion_rate": mean(kept),
         "own_lane_completion_interval": exact(int(sum(kept)), len(kept)),
+        "invasion_free_completion_rate": mean(
+            [done * (run["lane_invasions"] == 0) for done, run in zip(ended, runs, strict=True)]
+        ),
         "endings": dict(Counter(run["ending"] for run in runs)),
         **{f"{name}_per_run": mean([run[name] for run in runs]) for name in COUNTS},
         "collisions_per_run_interval": (exact if hit_once else exact_mean_count)(hits, n),

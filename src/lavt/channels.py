@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-Carrier = Literal["local", "video", "zenoh", "probe", "clock", "netem", "record"]
+Carrier = Literal["local", "video", "zenoh", "probe", "clock", "netem", "console", "relay", "record"]
 """local: between nodes of one side. video: the UDP flow of the video. zenoh: a Zenoh key or query. probe: the UDP flow
-of the clock probes. clock: the host's time source. netem: the host's network queues. record: the record only, no
-receiver."""
+of the clock probes. clock: the host's time source. netem: the host's network queues. console: the web pages from which
+a person drives. relay: a relay in the client's process. record: the record only, no receiver."""
 
 Waiting = Literal["queue", "newest"]
 """queue: messages are received in order; a full queue drops its oldest message. newest: a new message replaces the
@@ -18,6 +18,8 @@ QUEUE_LENGTH = 4096
 """More than a second of packets."""
 COMMAND_QUEUE_LENGTH = 64
 """More than the commands of a second; older commands would be rejected anyway."""
+PAGE_QUEUE_LENGTH = 4096
+"""More than the messages of all pages in a second: the link closes a page that sends more, so that none is dropped."""
 PROBE_QUEUE_LENGTH = 64
 """A probe that waits behind many other probes measures mainly its wait in this queue."""
 
@@ -53,6 +55,14 @@ CHANNELS: dict[str, Channel] = {
     "operator": Channel("local", "operator", ("driver",)),  # a person requests a stop or a release
     "path_token": Channel("local", "driver", ("receiver",)),
     "condition_in_force": Channel("local", "injection", ("driver",), "newest"),
+    # client, if a person drives: between the driver node and the pages, and to a relay of its own
+    "unit_to_decode": Channel("local", "driver", ("driver",)),
+    "page_opened": Channel("local", "console", ("driver",)),
+    "page_closed": Channel("local", "console", ("driver",)),
+    "page_message": Channel("local", "console", ("driver",), length=PAGE_QUEUE_LENGTH),
+    "page_unit": Channel("console", "driver"),
+    "page_status": Channel("console", "driver"),
+    "relay_delay": Channel("relay", "driver"),
     # across the network
     # server to client: RTP, sender reports, and challenges, to which the client must answer to prove its address
     "rtp": Channel("video", "camera", ("receiver",), inline=True),
@@ -81,6 +91,8 @@ CHANNELS: dict[str, Channel] = {
     "reception": Channel("record", "receiver"),
     "picture": Channel("record", "driver"),
     "lane": Channel("record", "driver"),
+    "human_input": Channel("record", "driver"),
+    "page_picture": Channel("record", "driver"),
     "clock": Channel("record", "clock_sync"),
     "injection": Channel("record", "injection"),
     "clock_probe": Channel("record", "clock_sync"),

@@ -164,7 +164,7 @@ def _other_use(kind: type[BaseModel], data: Mapping[str, Any]) -> str:
     if this is None or other is None or not foreign:
         return ""
     keys = "is a key" if len(foreign) == 1 else "are keys"
-    return f"{', '.join(foreign)} {keys} of `lavt {other}`, not of `lavt {this}`: use that command, or another config"
+    return f"{', '.join(foreign)} {keys} of a config for `lavt {other}`, not for `lavt {this}`: use another config"
 
 
 def _describe(kind: type[BaseModel], problem: Any) -> str:

@@ -224,6 +224,7 @@ COMMANDS_WITH_OUT = {
     "demo": ["demo", "--out"],
     "server": ["server", SERVER, "--out"],
     "client": ["client", CLIENT, "--out"],
+    "drive": ["drive", "--no-browser", "--out"],
 }
 
 
@@ -324,6 +325,12 @@ BAD_COMMANDS = {
     "replay of five runs": (["replay", *"abcde"], "at most 4"),
     "replay in an unknown format": (["replay", "a", "--out", "a.avi"], "a.avi"),
     "replay in a missing directory": (["replay", "a", "--out", "no/a.mp4"], "no is not a directory"),
+    "a person's drive with a controller": (["drive", "--set", "controller.kind=lane_keeper"], "controller.kind"),
+    "a person's drive in virtual time": (["drive", "--set", "time=virtual"], "in real time"),
+    "a person's drive with netem": (["drive", "--set", "network.injection=netem"], "condition, video and control"),
+    "a person's drive with jitter": (["drive", "--set", "network.video.jitter_ms=5"], "constant delays"),
+    "a person's drive with a long delay": (["drive", "--set", "network.control.delay_ms=2001"], "at most 2000 ms"),
+    "a run of a person": (["run", DEMO, "--set", "controller.kind=human"], "lavt drive"),
     "no address": (["relay", RELAY, "--set", "video_listen=here"], "video_listen"),
     "router's unknown key": (["router", ROUTER, "--set", "lisen.endpoints=[]"], "lisen.endpoints"),
     "router without endpoints": (["router", ROUTER, "--set", "listen.endpoints=[]"], ROUTER),
@@ -371,6 +378,7 @@ def test_bad_commands(case: str, run: Run, tmp_path: Path) -> None:
 COMMANDS = [
     "vehicles",
     "demo",
+    "drive",
     "run",
     "sweep",
     "boundary",

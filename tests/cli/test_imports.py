@@ -16,6 +16,7 @@ ALLOWED_PACKAGES: dict[str, set[str]] = {
     "vehicles": {"zenoh"},
     "run": {"av", "cv2", "mcap", "numpy"},
     "server": {"av", "cv2", "mcap", "numpy", "zenoh"},
+    "drive": {"av", "cv2", "mcap", "numpy", "zenoh"},
     "client": {"av", "cv2", "mcap", "numpy", "zenoh"},
 }
 """The large packages that a command may import before it begins its work."""

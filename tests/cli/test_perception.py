@@ -16,6 +16,7 @@ from lavt.config import ClientConfig
 from lavt.config_file import parse_config, shipped
 from lavt.domain import CameraModel
 from lavt.errors import UserError
+from lavt.nodes.driver import DriverNode
 from lavt.perception.calibration import calibrated_pinhole_camera
 from lavt.perception.lane_detector import LaneDetector
 from lavt.transport.video.video_file import write_video
@@ -123,6 +124,7 @@ def test_a_client_uses_a_calibrated_camera(show: Show) -> None:  # noqa: ARG001 
     """The client uses the calibration file that `camera.calibration` names."""
     config = parse_config(ClientConfig, {"camera": {"calibration": "camera.yaml"}}, "test")
     nodes = build_client(config, MachineClock().now, MachineEntropy())
+    assert isinstance(nodes.driver, DriverNode)
     detector = nodes.driver._detector
     assert isinstance(detector, LaneDetector)
     assert isinstance(detector.bird_eye.region_from_grid, tuple)

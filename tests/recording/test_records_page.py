@@ -30,7 +30,19 @@ from lavt.domain import (
 )
 from lavt.experiment.runs.plan import plan_run
 from lavt.experiment.runs.virtual_run import build_loop, drive
-from lavt.nodes.payloads import Admission, AtWheel, Event, FrameWritten, InjectionSample, LaneSeen, PictureRead, Route
+from lavt.nodes.payloads import (
+    Admission,
+    AtWheel,
+    Event,
+    FrameWritten,
+    HumanSample,
+    InjectionSample,
+    LaneSeen,
+    PagePicture,
+    PictureRead,
+    RelayDelay,
+    Route,
+)
 from lavt.runtime.pipeline import Timeline
 from lavt.runtime.recorder import UNRECORDED, Packet
 from lavt.transport.clock_sync.clock_report import ClockReport
@@ -56,6 +68,9 @@ PAYLOADS: dict[str, type[Struct]] = {
     "route": Route,
     "event": Event,
     "lane": LaneSeen,
+    "human_input": HumanSample,
+    "page_picture": PagePicture,
+    "relay_delay": RelayDelay,
     "clock": ClockReport,
     "clock_probe": ClockProbe,
     "timeline": Timeline,

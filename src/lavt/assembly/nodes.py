@@ -12,9 +12,10 @@ from lavt.assembly.fidelity import VIDEO, FidelityModel
 from lavt.assembly.injection import injection_client, injection_node
 from lavt.assembly.security import build_cipher
 from lavt.assembly.vehicles import check_vehicle, physics_sample_times
-from lavt.config import ClientConfig, ControllerConfig, SafetyConfig, ServerConfig, VehicleConfig
+from lavt.config import HUMAN, ClientConfig, ControllerConfig, SafetyConfig, ServerConfig, VehicleConfig
 from lavt.control.client_limits import CLIENT_LIMITS
-from lavt.control.drive_controller import DriveController, find_preset, make_controller
+from lavt.control.drive_controller import DriveController, Preset, find_preset, make_controller
+from lavt.control.human_controls import HUMAN_LIMITS, HumanControls
 from lavt.domain import NS_PER_MS, Now
 from lavt.errors import UserError
 from lavt.node import Node
@@ -23,8 +24,9 @@ from lavt.nodes.camera import CameraNode
 from lavt.nodes.client_session import ClientSession
 from lavt.nodes.clock_sync import ClockSyncNode, ProbingClockSyncNode
 from lavt.nodes.driver import DriverNode
+from lavt.nodes.human_driver import HumanDriverNode
 from lavt.nodes.injection import InjectionClient, InjectionNode
-from lavt.nodes.payloads import Route
+from lavt.nodes.payloads import DelayChoice, Route
 from lavt.nodes.picture_reader import PictureReader
 from lavt.nodes.receiver import ReceiverNode
 from lavt.safety.gate import SafetyGate
@@ -60,7 +62,7 @@ class ClientNodes:
     """The client's nodes."""
 
     receiver: ReceiverNode
-    driver: DriverNode
+    driver: DriverNode | HumanDriverNode
     clock_sync: ClockSyncNode
     injection: InjectionClient
 
@@ -79,7 +81,26 @@ def check_names(vehicle: VehicleConfig, controller: ControllerConfig) -> None:
 
 def build_controller(config: ControllerConfig) -> DriveController:
     """Build the configured controller; raise `UserError` with the known names for an unknown controller or preset."""
-    return make_controller(config.kind, replace(find_preset(config.preset), **config.changes), config.wheelbase_m)
+    if config.kind == HUMAN:
+        raise UserError("a person drives by `lavt drive` or `lavt client CONFIG --human` only: name another controller")
+    return make_controller(config.kind, _settings(config), config.wheelbase_m)
+
+
+def _settings(config: ControllerConfig) -> Preset:
+    """Return the preset with the changes of the config; raise `UserError` for an unknown preset."""
+    return replace(find_preset(config.preset), **config.changes)
+
+
+def build_controls(config: ControllerConfig) -> HumanControls:
+    """Build the controls of a person; of the preset, they use the limits and the speed."""
+    settings = _settings(config)
+    limits = replace(
+        HUMAN_LIMITS,
+        steering_limit_rad=min(settings.steering_limit_rad, HUMAN_LIMITS.steering_limit_rad),
+        lateral_limit_mps2=settings.lateral_limit_mps2,
+        speed_mps=settings.speed_mps,
+    )
+    return HumanControls(limits, wheelbase_m=config.wheelbase_m)
 
 
 def limits_of(config: SafetyConfig, *, simulated: bool) -> Limits:
@@ -199,19 +220,23 @@ def build_actuator(
 
 
 def build_client(
-    config: ClientConfig, now: Callable[[], Now], entropy: Entropy, *, fidelity: FidelityModel = VIDEO
+    config: ClientConfig,
+    now: Callable[[], Now],
+    entropy: Entropy,
+    *,
+    fidelity: FidelityModel = VIDEO,
+    delays: DelayChoice | None = None,
 ) -> ClientNodes:
-    """Build the client's nodes."""
+    """Build the client's nodes. `delays` are those that a person who drives can choose, if any."""
     controller = config.controller
-    picture_receiver, detector = fidelity.receiver(config), fidelity.detector(config)
+    build_driver = _human_driver(config, fidelity, delays) if controller.kind == HUMAN else _driver(config, fidelity)
     hold_ms = config.video.reorder_hold_ms
-    drive_controller = build_controller(controller)
     start = now()
     instance = entropy.number(64)
     session = ClientSession(
         config.who,
         instance,
-        rearm=controller.rearm,
+        rearm=controller.rearm or controller.kind == HUMAN,  # a person decides by a fresh press to arm again
         start_ns=start.mono_ns,
         clear_stop=controller.clear_emergency_stop,
         waits_for_condition=config.injection.condition != "",
@@ -224,13 +249,22 @@ def build_client(
             config.video.max_bit_rate_bps,
             build_cipher(config),
         ),
-        DriverNode(
-            PictureReader(picture_receiver),
-            detector,
-            drive_controller,
-            session,
-            CLIENT_LIMITS,
-        ),
+        build_driver(session),
         ProbingClockSyncNode(start.mono_ns),
         injection_client(config.injection, config.who, instance, start.mono_ns),
     )
+
+
+def _driver(config: ClientConfig, fidelity: FidelityModel) -> Callable[[ClientSession], DriverNode]:
+    """Prepare a driver node with the configured controller; return a function that builds it for a session."""
+    reader, detector = PictureReader(fidelity.receiver(config)), fidelity.detector(config)
+    controller = build_controller(config.controller)
+    return lambda session: DriverNode(reader, detector, controller, session, CLIENT_LIMITS)
+
+
+def _human_driver(
+    config: ClientConfig, fidelity: FidelityModel, delays: DelayChoice | None
+) -> Callable[[ClientSession], HumanDriverNode]:
+    """Prepare the driver node of a person; return a function that builds it for a session."""
+    reader, controls = PictureReader(fidelity.receiver(config)), build_controls(config.controller)
+    return lambda session: HumanDriverNode(reader, controls, session, CLIENT_LIMITS, delays)

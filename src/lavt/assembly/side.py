@@ -29,18 +29,20 @@ from lavt.assembly.rendezvous import open_flow
 from lavt.assembly.security import Authenticator, build_authenticator, build_gateway
 from lavt.assembly.zenoh import side_session
 from lavt.clock import Clock
-from lavt.config import ClientConfig, ServerConfig
+from lavt.config import HUMAN, ClientConfig, ServerConfig
 from lavt.domain import Now
 from lavt.node import Node, Peer
 from lavt.nodes.client_session import ClientSession
+from lavt.nodes.payloads import DelayChoice
 from lavt.recording.live_status import LiveStatus
 from lavt.recording.output_directory import check_directory, prepare_directory
 from lavt.recording.provenance import provenance
 from lavt.recording.record import RecordWriter
-from lavt.runtime.realtime import RealRuntime
+from lavt.runtime.realtime import MessageLink, RealRuntime
 from lavt.runtime.recorder import QueuedRecorder, Recorders
 from lavt.transport.clock_sync.clock_report import kernel_identity
 from lavt.transport.clock_sync.persistent_process import PersistentProcess
+from lavt.transport.console.console_link import ConsoleLink
 from lavt.transport.datagram_filter import ProbePortFilter, VideoPortFilter, filtered
 from lavt.transport.emulation.impairment import ExemptPort
 from lavt.transport.netem.injector import Injector
@@ -51,6 +53,9 @@ from lavt.transport.video.path_validation import PathServer
 from lavt.transport.zenoh_link import ZenohLink, quiet_logs
 
 PrintMessage = Callable[[str], None]
+
+CONSOLE_TOKEN_BYTES = 16
+"""Length of the random token in the address of the console's page."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +76,10 @@ class Links:
     video: UdpLink | RendezvousLink
     probe: UdpLink | RendezvousLink
     zenoh: ZenohLink
+    console: ConsoleLink | None = None
+    """The pages from which a person drives; None if no person drives."""
+    relay: MessageLink | None = None
+    """A relay in this process whose delays the person chooses; None: there is none."""
 
 
 class Side:
@@ -121,7 +130,17 @@ class Side:
         """Start the runtime, then deliver received messages to it."""
         links, gateway = self._links, self._gateway
         links.zenoh.start(gateway.receive)
-        self.runtime.start({"video": links.video, "probe": links.probe, "zenoh": gateway, "netem": self._injector})
+        carriers: dict[str, MessageLink | None] = {
+            "video": links.video,
+            "probe": links.probe,
+            "zenoh": gateway,
+            "netem": self._injector,
+            "console": links.console,
+            "relay": links.relay,
+        }
+        self.runtime.start({carrier: link for carrier, link in carriers.items() if link is not None})
+        if links.console is not None:
+            links.console.start(self._deliver)
         if self.actuator is not None:
             self.actuator.start(self.runtime)
         if self._path is None:
@@ -130,6 +149,11 @@ class Side:
         else:
             links.video.start(filtered(self._deliver, VideoPortFilter(self._path), links.video.counts))
             links.probe.start(filtered(self._deliver, ProbePortFilter(self._path), links.probe.counts))
+
+    @property
+    def console_url(self) -> str | None:
+        """The address of the page from which a person drives; None if no person drives."""
+        return None if self._links.console is None else self._links.console.url
 
     def send(self, channel: str, payload: Any) -> None:
         """Send a message of this program to the nodes of its own side that receive `channel`."""
@@ -140,8 +164,9 @@ class Side:
         links = self._links
         with ExitStack() as parts:  # calls the last callback first
             parts.callback(self._close_record)
-            for link in (links.zenoh, links.probe, links.video):
-                parts.callback(link.close)
+            for link in (links.zenoh, links.probe, links.video, links.console):
+                if link is not None:
+                    parts.callback(link.close)
             parts.callback(self._time_source.close)
             parts.callback(self._injector.close)
             parts.callback(self.runtime.stop)
@@ -161,6 +186,7 @@ class Side:
             "video": links.video.counts,
             "probe": links.probe.counts,
             "zenoh": {**links.zenoh.counts, **self._gateway.counts},
+            **({} if links.console is None else {"console": links.console.counts}),
         }
 
     def _deliver(self, channel: str, payload: Any, arrived: Now, peer: Peer) -> None:
@@ -216,8 +242,18 @@ def open_server(
 
 
 @contextmanager
-def open_client(config: ClientConfig, out: Path | None, clock: Clock, print_message: PrintMessage) -> Iterator[Side]:
+def open_client(
+    config: ClientConfig,
+    out: Path | None,
+    clock: Clock,
+    print_message: PrintMessage,
+    *,
+    relay: MessageLink | None = None,
+    delays: DelayChoice | None = None,
+) -> Iterator[Side]:
     """Build a client, yield it, and close it afterwards.
+
+    If a person drives, they can choose from `delays` for `relay`, a relay in this process.
 
     Raises `UserError` for a wrong config, before the output directory is created.
     """
@@ -229,8 +265,13 @@ def open_client(config: ClientConfig, out: Path | None, clock: Clock, print_mess
         probe_address = (config.clock.probe_server or server, config.clock.probe_port)
         probe = open_flow(config, clock, "probe", "probe_reply", bind=("", 0), remote=probe_address)
         opened.callback(probe.close)
-        links = Links(video, probe, opened.enter_context(closing(_open_zenoh(config, clock, print_message))))
-        nodes = build_client(config, clock.now, MachineEntropy())
+        console = None
+        if config.controller.kind == HUMAN:
+            console = ConsoleLink(clock, MachineEntropy().token(CONSOLE_TOKEN_BYTES).hex(), config.console.port)
+            opened.callback(console.close)
+        zenoh = opened.enter_context(closing(_open_zenoh(config, clock, print_message)))
+        links = Links(video, probe, zenoh, console, relay)
+        nodes = build_client(config, clock.now, MachineEntropy(), delays=delays)
         side = Side(
             config,
             clock,

@@ -13,6 +13,7 @@ from lavt.cli import console
 from lavt.cli.side import run_side
 from lavt.cli.vehicles import TIMEOUT_S, ScoutOption, list_vehicles
 from lavt.clock import MachineClock
+from lavt.config import HUMAN
 from lavt.errors import UserError
 from lavt.runtime import process_priority
 
@@ -36,6 +37,9 @@ def client(
     take_over: Annotated[
         bool, typer.Option("--take-over", help="Ask the client in control to hand over the vehicle.")
     ] = False,
+    human: Annotated[
+        bool, typer.Option("--human", help="Drive yourself, from a web page on this machine (docs/drive.md).")
+    ] = False,
     use_scouting: ScoutOption = False,
     as_json: console.JsonOption = False,
 ) -> None:
@@ -49,8 +53,8 @@ def client(
 
     Example: lavt client 192.0.2.7
     """
-    if target is None and (out is not None or changes or take_over):
-        raise UserError("--out, --set and --take-over are for driving: name the vehicle's host or a config")
+    if target is None and (out is not None or changes or take_over or human):
+        raise UserError("--out, --set, --take-over and --human are for driving: name the vehicle's host or a config")
     if target is not None and use_scouting:
         raise UserError("--scout is for a list of vehicles: leave it out, or name no host and no config")
     console.reserve_stdout()
@@ -59,10 +63,16 @@ def client(
             console.print_message("lavt: drive a vehicle with `lavt client HOST`, the address of its machine")
         return
     process_priority.raise_priority()
-    settings = load_client_config(target, [*(changes or []), *(["take_over=true"] if take_over else [])])
+    options = {"take_over=true": take_over, f"controller.kind={HUMAN}": human}
+    chosen = [change for change, is_chosen in options.items() if is_chosen]
+    settings = load_client_config(target, [*(changes or []), *chosen])
     if ":" in settings.video.server:
         raise UserError("video goes over IPv4: set video.server to an IPv4 address, or to a name that has one")
     with open_client(settings, out, MachineClock(), console.print_message) as side:
         signal.signal(signal.SIGUSR1, lambda *_: side.send("operator", "emergency_stop"))
         signal.signal(signal.SIGUSR2, lambda *_: side.send("operator", "release"))
-        run_side(side, settings.who, once=False, as_json=as_json, ready={})
+        ready = {}
+        if side.console_url is not None:
+            ready["console"] = side.console_url
+            console.print_message(f"lavt: drive from {side.console_url}")
+        run_side(side, settings.who, once=False, as_json=as_json, ready=ready)

@@ -24,6 +24,7 @@ from lavt.runtime.parent_watch import end_with_parent
 GROUPS = {
     "Try LAVT on this machine": {
         "demo": "Run the demo: show what delay does to driving by video.",
+        "drive": "Drive yourself: the simulator's car, from a web page on this machine.",
         "run": "Drive one route under one network condition.",
         "replay": "Make a video of runs side by side.",
         "doctor": "Check whether this machine is ready to drive.",

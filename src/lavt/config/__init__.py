@@ -10,6 +10,7 @@ from lavt.config.camera import CalibrationConfig as CalibrationConfig
 from lavt.config.camera import CameraConfig as CameraConfig
 from lavt.config.camera import ClientCameraConfig as ClientCameraConfig
 from lavt.config.camera import ServerCameraConfig as ServerCameraConfig
+from lavt.config.controller import HUMAN as HUMAN
 from lavt.config.controller import ControllerConfig as ControllerConfig
 from lavt.config.costs import Costs as Costs
 from lavt.config.dbw import DbwConfig as DbwConfig
@@ -303,6 +304,13 @@ class ClientVideoConfig(Section):
     """How long a packet waits for missing earlier ones; auto: 1.25 times the largest recent reordering, at least 10."""
 
 
+class ConsoleConfig(Section):
+    """The web page from which a person drives, if `controller.kind` is human."""
+
+    port: int = Field(0, ge=0, le=65535)
+    """The TCP port of the page on this machine's loopback addresses; 0: any free port."""
+
+
 class ClientConfig(Section):
     """The operator's machine."""
 
@@ -313,6 +321,7 @@ class ClientConfig(Section):
     take_over: bool = False
     """Whether to request a handover from the client in control, see `docs/session.md`."""
     controller: ControllerConfig = ControllerConfig()
+    console: ConsoleConfig = ConsoleConfig()
     camera: ClientCameraConfig = ClientCameraConfig()
     video: ClientVideoConfig = ClientVideoConfig()
     zenoh: ZenohConfig = ZenohConfig()

@@ -9,12 +9,16 @@ from pydantic import Field
 from lavt.config.section import Section
 from lavt.config.vehicle import MAX_SIMULATED_MPS
 
+HUMAN = "human"
+"""The kind of controller with which a person drives."""
+
 
 class ControllerConfig(Section):
     """The controller that drives."""
 
     kind: str = "lane_keeper"
-    """lane_keeper: the built-in controller; or the name of your own (`docs/controllers.md`)."""
+    """lane_keeper: the built-in controller; human: a person drives from a web page (`docs/drive.md`); or the name of
+    your own (`docs/controllers.md`)."""
     preset: str = "designed"
     """The set of gains: designed (found by theory) or paper_calibrated (fitted to the paper, `docs/controllers.md`)."""
     lookahead_s: float | None = Field(None, ge=0.2, le=5)

@@ -90,6 +90,11 @@ class ClientSession:
         """Return whether this client has control of the vehicle."""
         return self.epoch != 0 and self.phase != "watching"
 
+    @property
+    def is_stop_confirmed(self) -> bool:
+        """Return whether the vehicle has answered the emergency stop of this client."""
+        return self.emergency_stop != 0 and self._stop_ns is None
+
     def next_wake_ns(self) -> int | None:
         """Return when the next request is due."""
         releasing = self.phase == "watching" and not self.released

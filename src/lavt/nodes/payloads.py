@@ -45,6 +45,13 @@ class DecodedFrame(Struct, frozen=True):
     received: ReceivedPicture
 
 
+class FrameStamp(Struct, frozen=True):
+    """A decoded frame's stamp and when it was read, without the picture."""
+
+    stamp_ns: int
+    read_wall_ns: int
+
+
 class PictureRead(Struct, frozen=True):
     """The outcome of decoding an access unit and reading its stamp."""
 
@@ -146,3 +153,44 @@ class InjectionSample(Struct, frozen=True):
     measured_ms: float | None
     reason: str
     """Why the condition is not in force, or which measurement deviates from the request; empty: neither."""
+
+
+class HumanSample(Struct, frozen=True):
+    """An input of the person who drives, or a change of the state of the hand without an input."""
+
+    mono_ns: int
+    hand: str
+    """The state of the hand after this input (`control/human_controls.py`)."""
+    steering: float
+    """-1 to 1, left positive."""
+    throttle: float
+    brake: float
+
+
+class PagePicture(Struct, frozen=True):
+    """The times at which the page had a picture, on the client's wall clock, from the page's clock and its offset."""
+
+    stamp_ns: int
+    arrived_wall_ns: int
+    """The page's script got the access unit."""
+    decoded_wall_ns: int
+    drawn_wall_ns: int
+    shown_wall_ns: int
+    """The browser began to make the next picture of the screen, which shows the frame."""
+    bound_ns: int
+    """The largest error of these times: half of the round trip of the probe between page and client."""
+
+
+class RelayDelay(Struct, frozen=True):
+    """The delays that the person has chosen for a relay in the client's process."""
+
+    video_ms: float
+    control_ms: float
+
+
+class DelayChoice(Struct, frozen=True):
+    """The delays that a person can choose: named conditions, or any others; and those at the start."""
+
+    conditions: tuple[tuple[str, float, float], ...]
+    """Name, delay of the video and delay of the control, in ms."""
+    initial: RelayDelay

@@ -105,6 +105,12 @@ UNRECORDED = frozenset(
         "video_token",
         "path_token",
         "access_unit",
+        "unit_to_decode",
+        "page_opened",
+        "page_closed",
+        "page_message",
+        "page_unit",
+        "page_status",
         "picture_lost",
         "rest",
         "condition_in_force",
@@ -117,8 +123,8 @@ UNRECORDED = frozenset(
         "injected",
     }
 )
-"""Channels that are not recorded: their content is secret, or recorded in another form (truth, access units, samples of
-clocks and network queues)."""
+"""Channels that are not recorded: their content is secret, or recorded in another form (truth, access units, inputs of
+a person, samples of clocks and network queues)."""
 
 
 def record(recorder: Recorder, channel: str, payload: Any, now: Now) -> None:

@@ -285,6 +285,8 @@ def test_the_table_of_machines_says_where_the_costs_were_measured() -> None:
     """Of the costs the table has only where they were measured, and it has no empty entries."""
     model = {"costs": '{"measured_on": "2 cores", "stages_us": {}}', "traces": "{}", "condition": "{}"}
     assert machine_table({"model": model}).rows == [["model", "costs measured on", "2 cores"]]
+    for damaged in ("", "[]", "{}x", '{"stages_us": {}}'):
+        assert machine_table({"model": {"costs": damaged}}).rows == [["model", "costs measured on", "unknown"]]
 
 
 def test_the_page_has_the_clock_offset_of_two_machines(sweep: Path) -> None:

@@ -53,6 +53,7 @@ NEW_CONDITION_KEYS = (
     "completed_in_own_lane",
     "own_lane_completion_rate",
     "own_lane_completion_interval",
+    "invasion_free_completion_rate",
     "followed_p95_m",
     "followed_p95_route_balanced_m",
     "p95_route_balanced_m",

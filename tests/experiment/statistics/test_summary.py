@@ -45,6 +45,7 @@ def test_summary_of_a_condition() -> None:
     assert condition["completion_rate"] == pytest.approx(2 / 3)
     assert condition["collisions_per_run"] == pytest.approx(1 / 3)
     assert condition["collisions_per_run_interval"] == exact_interval(1, 3)
+    assert condition["invasion_free_completion_rate"] == 0.0
     assert condition["p95_m"] == 2.0
     assert condition["injected_ms"] == {"video": 75.0, "control": 0.0}
     assert condition["tau_v_ms"] == {"p5": 60.0, "p50": 62.0, "p95": 86.0, "bound": 0.4, "n": 300}

@@ -15,8 +15,9 @@ from lavt.config import DelayConfig, ImpairmentConfig, LinkConfig, RelayConfig
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
 from lavt.streams import stream
+from lavt.transport.emulation.delay_line import DelayModel
 from lavt.transport.emulation.link import EmulatedLink
-from lavt.transport.emulation.relay import Relay
+from lavt.transport.emulation.relay import NO_DELAY, Relay
 
 TIMEOUT_S = 5.0
 """How long a test waits for a datagram that must arrive."""
@@ -181,6 +182,27 @@ def test_state_with_a_delay_of_its_own_is_delayed() -> None:
         assert client.receives_nothing()
         net.advance(0.001)
         assert client.receive()[0] == b"state"
+
+
+def test_delays_change_while_a_client_is_connected(net: RelayNetwork) -> None:
+    """After a change, new datagrams of old and new clients have the new delay, and none overtakes an older one."""
+    client, address_at_server = net.connect("video")
+    net.server["video"].send(rtp(9000), address_at_server)
+    net.step()
+    net.relay.change_delays("video", upstream=NO_DELAY, downstream=DelayModel(10.0))
+    net.server["video"].send(rtp(12000), address_at_server)
+    net.step()
+    net.advance(10.0)
+    assert client.receives_nothing()
+    net.advance(VIDEO_MS - 10.0)
+    assert [client.receive()[0], client.receive()[0]] == [rtp(9000), rtp(12000)]
+    other, other_at_server = net.connect("video")
+    for end, address in ((client, address_at_server), (other, other_at_server)):
+        net.server["video"].send(rtp(15000), address)
+        net.step()
+        assert end.receives_nothing()
+        net.advance(10.0)
+        assert end.receive()[0] == rtp(15000)
 
 
 def test_each_client_has_its_own_address(net: RelayNetwork) -> None:

@@ -81,6 +81,7 @@ def driving_table(conditions: Conditions, paper: Conditions) -> TableData:
             (extra(share_column("completed in own lane")), "own_lane_completion_rate"),
             (extra(share_interval_column("95 %, these routes, own lane")), "own_lane_completion_interval"),
             (by_road_column("completed in own lane, by road", is_share=True), "by_road.own_lane_completion_rate"),
+            (share_column("completed without touching a line"), "invasion_free_completion_rate"),
             (share_column("completed"), "completion_rate"),
             (extra(share_interval_column("95 %, these routes")), "completion_interval"),
             (extra(by_road_column("completed, by road", is_share=True)), "by_road.completion_rate"),

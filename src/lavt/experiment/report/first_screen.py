@@ -22,9 +22,10 @@ VALIDITY = "Validity"
 """The chapter with the reasons of invalid runs."""
 
 WHAT_IT_IS = (
-    "LAVT (Latency-Aware Vision Teleoperation) drives a car from its video over a network, delays the video and the "
-    "commands, and measures how driving degrades."
+    "LAVT (Latency-Aware Vision Teleoperation) delays what the driver of a remote car sees, and the commands that come "
+    "back, and measures how driving degrades."
 )
+LANE_KEEPER = " The driver is a program that keeps the lane."
 VIRTUAL = "the same programs on a simulated clock."
 WITHOUT_PICTURES = " Runs without pictures (fidelity geometry) get the lane without an error of detection."
 OWN_LANE = (
@@ -47,7 +48,8 @@ def first_parts(report: ReportContext, replay: Parts) -> Parts:
     runs, failed = report.summary["runs"], report.summary.get("failed")
     invalid = any(not run["valid"] for run in runs) or failed
     link = ("See why.", html_page.chapter_anchor(VALIDITY)) if invalid else None
-    about = html_page.paragraph(f"{WHAT_IT_IS} This page: {runs_overview(runs)}", link=link)
+    driver = LANE_KEEPER if all(run.get("driver") == "lane_keeper" for run in runs) else ""
+    about = html_page.paragraph(f"{WHAT_IT_IS}{driver} This page: {runs_overview(runs)}", link=link)
     sentences = [sentence for sentence in _findings(report) if sentence]
     findings = [html_page.bullets(sentences)] if sentences else []
     shown = [*headline_parts(report), *findings, *replay]
@@ -107,7 +109,7 @@ def _legend(report: ReportContext) -> Markup:
     pairs = [
         ("Condition", f"the delay that was injected into video + control, in ms: {listed}." if listed else ""),
         ("Virtual time", (VIRTUAL + without_pictures) * ("virtual" in report.kinds)),
-        ("Loop latency", "from a frame's stamp (its send time) to the application of its command."),
+        ("Loop latency", "from a frame's stamp, set just before encoding, to the application of its command."),
         ("P95", "on 95 % of the distance, the rear axle was closer to the centre of the route's lane."),
         ("τ video, τ control", "the one-way latencies of a frame and of a command."),
         ("Own lane", OWN_LANE if has_own_lane(report.kinds) else ""),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import groupby, pairwise, product
 from typing import Any, NamedTuple
@@ -15,6 +16,13 @@ MAX_LISTED_NAMES = 8
 
 MAX_LISTED_ROUTES = 3
 """The same for the names of routes in the sentence on what was run."""
+
+PICTURES = {
+    "video": "by video",
+    "pixels": "from pictures",
+    "geometry": "without pictures (the lane is known, not detected)",
+}
+"""What the driver of a run got, by the run's fidelity."""
 
 SIGNIFICANT_P = 0.05
 LARGEST_CHANCE = 0.1
@@ -60,9 +68,10 @@ def _latency_levels(conditions: Conditions) -> list[list[ConditionPoint]]:
 
 def runs_overview(runs: Sequence[Mapping[str, Any]]) -> str:
     """Return a sentence with the number of runs, their routes and conditions, and the number of invalid runs."""
-    counts = {kind: sum(run["time"] == kind for run in runs) for kind in ("virtual", "real")}
+    kinds = Counter((str(run["time"]), run.get("fidelity") or "video") for run in runs)
     by_time = " and ".join(
-        f"{count} run{'s' if count > 1 else ''} in {kind} time" for kind, count in counts.items() if count
+        f"{_counted(count, 'run')} in {time} time {PICTURES[fidelity]}"
+        for (time, fidelity), count in sorted(kinds.items(), reverse=True)
     )
     routes = sorted({str(run["route"]) for run in runs})
     names = sorted({str(run["condition"]) for run in runs})
@@ -93,14 +102,14 @@ def results_sentences(name: str, conditions: Conditions) -> str:
     if all(conditions[point.name].get("runs") == 1 for point in known):
         return _example_sentence(name, conditions, known)
     parts = []
+    lane = " in their own lane" if _rate_key(conditions) != "completion_rate" else ""
     if len(known) <= MAX_LISTED_NAMES:
         rates = ", ".join(f"{condition} {rate * 100:.0f} % ({loop_ms:.0f} ms)" for condition, loop_ms, rate in known)
-        lane = " in their own lane" if _rate_key(conditions) != "completion_rate" else ""
         counts = {conditions[point.name].get("runs") for point in known}
         number = counts.pop() if len(counts) == 1 else None
         each = f" ({number} runs each)" if number else ""
         parts.append(f"Runs completed{lane} by condition{each}, with the median loop latency: {rates}.")
-    parts += _fall_sentences(levels)
+    parts += _fall_sentences(levels, lane)
     parts += _error_sentence({condition: conditions[condition] for condition, _, _ in known})
     return f"{name}. {' '.join(parts)}"
 
@@ -127,9 +136,8 @@ def contrast_sentence(contrasts: Sequence[Mapping[str, Any]]) -> str:
     start = "Tested by road, no planned contrast of completion in any lane is significant"
     if least_p >= SIGNIFICANT_P:
         return (
-            f"{start}, and none could be: with {_counted(roads, 'road')} and {_counted(len(tested), 'contrast')}, p "
-            f"after Holm's correction is at least {least_p:.2g}, so this test cannot show whether neighbouring "
-            "conditions differ on other roads."
+            f"{start}, and none could be: {_counted(roads, 'road')} are too few, because even if all agreed, p would "
+            f"be {least_p:.2g} (Holm's correction for {_counted(len(tested), 'contrast')})."
         )
     return f"{start} ({_counted(roads, 'road')}), which does not show that the conditions are equal."
 
@@ -168,7 +176,8 @@ def length_sentences(conditions: Conditions, lengths_m: Mapping[str, float]) -> 
         orders = math.comb(len(shorter_m) + len(longer_m), len(shorter_m))
         if 1 / orders <= LARGEST_CHANCE:
             sentences.append(
-                f"Longer roads fail first: at {' and '.join(names)}, every run is completed"
+                "Longer roads fail first (seen in the results, not planned): "
+                f"at {' and '.join(names)}, every run is completed"
                 f"{' in its own lane' * own_lane} on the {_counted(len(shorter_m), 'shorter route')} "
                 f"({_range_m(shorter_m)}), and not on the {_counted(len(longer_m), 'longer one')} "
                 f"({_range_m(longer_m)}); if length did not matter, the chance of this order would be 1 in {orders}."
@@ -192,9 +201,7 @@ def _error_sentence(conditions: Conditions) -> list[str]:
     if len(errors) < 2:
         return []
     first, *_, last = errors
-    return [
-        f"The P95 of the cross-track error {of} is {errors[first]:.2f} m at {first} and {errors[last]:.2f} m at {last}."
-    ]
+    return [f"P95 of the cross-track error: {errors[first]:.2f} m at {first}, {errors[last]:.2f} m at {last}, {of}."]
 
 
 def _example_sentence(name: str, conditions: Conditions, known: Sequence[ConditionPoint]) -> str:
@@ -212,25 +219,28 @@ def _fall(pair: tuple[ConditionPoint, ConditionPoint]) -> float:
     return before.completion_rate - after.completion_rate
 
 
-def _fall_sentences(levels: Sequence[Sequence[ConditionPoint]]) -> list[str]:
-    """Return sentences on the largest fall of completion, and on the latency above which fewer than half complete."""
+def _fall_sentences(levels: Sequence[Sequence[ConditionPoint]], lane: str) -> list[str]:
+    """Return sentences on the largest fall of completion, and on the latency above which fewer than half complete.
+
+    `lane` follows "completed" where the own lane is judged.
+    """
     falls = [max(product(lower, higher), key=_fall) for lower, higher in pairwise(levels)]
     if not falls:
         return []
     largest = max(map(_fall, falls))
     if largest <= 0:
-        return ["Completion does not fall as latency increases."]
+        return [f"The share of runs completed{lane} does not fall as latency increases."]
     described = [
         f"from {before.completion_rate * 100:.0f} % at {before.name} to {after.completion_rate * 100:.0f} % at "
         f"{after.name}, between {before.loop_ms:.0f} and {after.loop_ms:.0f} ms of loop latency"
         for before, after in falls
         if math.isclose(_fall((before, after)), largest)
     ]
-    parts = [f"The largest fall of completion is {', and '.join(described)}."]
+    parts = [f"The largest fall is {', and '.join(described)}."]
     best_rates = [max(point.completion_rate for point in level) for level in levels]
     last = max((index for index, best_rate in enumerate(best_rates) if best_rate >= 0.5), default=-1)
     if last + 1 < len(levels):
         start_ms = min(point.loop_ms for point in levels[last + 1])
         beyond = "the longest latency" if last + 2 == len(levels) else "and at each longer latency"
-        parts.append(f"At {start_ms:.0f} ms, {beyond}, fewer than half of the runs are completed.")
+        parts.append(f"At {start_ms:.0f} ms, {beyond}, fewer than half of the runs are completed{lane}.")
     return parts

@@ -250,11 +250,19 @@ def stage_table(
     return TableData(columns, [["camera: capture to stamp, before the loop", *before_loop], *rows])
 
 
+def _measured_on(costs: str) -> str:
+    """Return where recorded costs were measured; "unknown" if a record of another version does not say it."""
+    try:
+        return str(json.loads(costs)["measured_on"])
+    except (ValueError, KeyError, TypeError):
+        return "unknown"
+
+
 def machine_table(annotations: Mapping[str, Mapping[str, str]]) -> TableData:
     """Return the table of versions and machines from a run's records; of the costs, only where they were measured."""
     columns = [text_column("category"), text_column("property", is_long=True), text_column("value", is_long=True)]
     rows = [
-        [name, "costs measured on", json.loads(value).get("measured_on")] if key == "costs" else [name, key, value]
+        [name, "costs measured on", _measured_on(value)] if key == "costs" else [name, key, value]
         for name in sorted(annotations)
         for key, value in annotations[name].items()
         # The condition is not a property of the machine; other tables show it. Most runs have no traces.

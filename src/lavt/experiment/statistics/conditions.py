@@ -52,6 +52,9 @@ def summarize_condition(all_runs: Sequence[Run], distances: CommonDistances) -> 
         "routes": {name: _summarize_route(routes[name], distances) for name in sorted(routes)},
         "collisions_per_run": _mean([run["collisions"] for run in runs]),
         "collisions_per_run_interval": _collisions_interval(runs),
+        "invasion_free_completion_rate": _mean(
+            [run["ending"] == "completed" and run["lane_invasions"] == 0 for run in runs]
+        ),
         "lane_invasions_per_run": _mean([run["lane_invasions"] for run in runs]),
         "collisions_per_km": _per_km(runs, "collisions"),
         "lane_invasions_per_km": _per_km(runs, "lane_invasions"),

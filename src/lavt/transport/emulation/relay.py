@@ -13,7 +13,7 @@ import socket
 import struct
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from statistics import median
 
 from lavt.clock import Clock
@@ -154,6 +154,14 @@ class Relay:
                 counts[f"{active.flow.name} {direction}"].update(past_counts)
         return {name: dict(counter) for name, counter in counts.items() if counter}
 
+    def change_delays(self, name: str, *, upstream: DelayModel, downstream: DelayModel) -> None:
+        """Change the delays of a flow for datagrams that arrive from now on; a flow keeps the order of its datagrams.
+
+        Call this between two steps.
+        """
+        active = next(active for active in self._flows if active.flow.name == name)
+        active.change_delays(upstream, downstream)
+
     def _paths(self) -> Iterator[tuple[str, list[_DelayedPath]]]:
         for active in self._flows:
             for direction, paths in active.paths().items():
@@ -248,6 +256,11 @@ class _ActiveFlow:
     def paths(self) -> dict[str, list[_DelayedPath]]:
         clients = self._clients.values()
         return {"upstream": [client.up for client in clients], "downstream": [client.down for client in clients]}
+
+    def change_delays(self, upstream: DelayModel, downstream: DelayModel) -> None:
+        self.flow = replace(self.flow, upstream=upstream, downstream=downstream)
+        for client in self._clients.values():
+            client.up.line.delay, client.down.line.delay = upstream, downstream
 
     def close(self) -> None:
         for client in self._clients.values():

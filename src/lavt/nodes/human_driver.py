@@ -1,0 +1,386 @@
+"""The driver node of a person, who sees the video and drives in a web page (docs/drive.md).
+
+Access units go to the page undecoded. The client decodes them, too, for their stamps: a command has the stamp of the
+newest picture that the page has shown. So if the page stops, the vehicle gets no command from a newer picture.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar, Final
+
+from lavt.control.client_limits import ClientLimits
+from lavt.control.human_controls import LOST, HumanControls, HumanInput
+from lavt.domain import NS_PER_MS, NS_PER_S, NS_PER_US, Decision, Mode, Now
+from lavt.errors import BadMessage
+from lavt.node import WAKE, Message, Peer, Send, Stage
+from lavt.nodes.client_session import ClientSession
+from lavt.nodes.commander import Commander, stopping
+from lavt.nodes.page_video import PageVideo
+from lavt.nodes.payloads import (
+    DecodedFrame,
+    DelayChoice,
+    FrameStamp,
+    HumanSample,
+    PagePicture,
+    ReceivedUnit,
+    RelayDelay,
+)
+from lavt.nodes.picture_reader import PictureReader
+from lavt.transport.console.page_messages import (
+    PageAck,
+    PageDelay,
+    PageDrive,
+    PageInput,
+    PageLost,
+    PageProbe,
+    PageRelease,
+    PageShown,
+    PageStatus,
+    PageStop,
+    ProbeAnswer,
+    pack_text,
+    pack_unit,
+    parse_page_message,
+)
+from lavt.transport.video.stamp import rtp_timestamp
+
+STATUS_PERIOD_NS: Final = 50 * NS_PER_MS
+MAX_FRAMES: Final = 300
+"""How many frames are remembered, until the page has shown them or for the bit rate: ten seconds at 30 Hz."""
+MAX_COMMANDS: Final = 512
+"""How many commands are remembered until the vehicle has applied them: five seconds."""
+STATE_AGE_NS: Final = 300 * NS_PER_MS
+"""An older state does not tell what the vehicle does now."""
+SEAT_NS: Final = 5 * NS_PER_S
+"""After this long without an input from the driving page, another page can drive."""
+COMMAND_GAP_NS: Final = 5 * NS_PER_MS
+"""Between commands that inputs cause; a page sends an input every 20 ms, but can send bursts."""
+IDLE_COMMAND_NS: Final = 100 * NS_PER_MS
+"""A command that is older is no longer shown as the last one."""
+
+
+class HumanDriverNode(Commander):
+    """The node that drives by the inputs of a person, from one page at a time; other pages watch.
+
+    `delays` are those that the person can choose; None: this client cannot change the delays.
+    """
+
+    def __init__(
+        self,
+        reader: PictureReader,
+        controls: HumanControls,
+        session: ClientSession,
+        limits: ClientLimits,
+        delays: DelayChoice | None = None,
+    ) -> None:
+        super().__init__(session, limits)
+        self._reader = reader
+        self._controls = controls
+        self._conditions = () if delays is None else delays.conditions
+        self._delay = None if delays is None else delays.initial
+        self._pages: dict[Peer, PageVideo] = {}
+        self._page_counts: Counter[str] = Counter()
+        """Counts of closed pages."""
+        self._driving_page: Peer = None
+        self._was_driving = False
+        """The session was driving when it was last examined."""
+        self._status_ns = 0
+        self._hand: str = "no_page"
+        """The state of the hand in the last record entry."""
+        self._frames: dict[int, FrameStamp] = {}
+        """Decoded frames by RTP timestamp."""
+        self._arrived: deque[tuple[int, int]] = deque(maxlen=MAX_FRAMES)
+        """Times and sizes (bytes) of the access units that arrived in the last second."""
+        self._shown_unit: int | None = None
+        """The newest access unit that the driving page has shown, if it has not been decoded here yet."""
+        self._sent: deque[tuple[int, int]] = deque(maxlen=MAX_COMMANDS)
+        """Sequence numbers and send times of commands that the vehicle has not applied yet."""
+        self._round_trip_ns: int | None = None
+        self._last: tuple[int, Decision] | None = None
+        """Time and content of the last command."""
+        self.pipelines: Mapping[str, Sequence[Stage]] = {
+            **self._session_pipelines,
+            "access_unit": (("forward", self._forward),),
+            "unit_to_decode": reader.stages,
+            "view": (("note", self._note_view),),
+            "page_opened": (("note", self._open_page),),
+            "page_closed": (("note", self._close_page),),
+            "page_message": (("handle", self._handle_page_message),),
+            WAKE: (("wake", self._wake_all),),
+        }
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """Return the counts of the node, its picture reader, the controls and the pages."""
+        pages = sum((page.counts for page in self._pages.values()), self._page_counts)
+        return {**self._reader.counts, **self._controls.counts, **pages, **self._counts}
+
+    def next_wake_ns(self) -> int | None:
+        """Return when a command, a session request or a status is due."""
+        wake_ns = super().next_wake_ns()
+        if not self._pages:
+            return wake_ns
+        return self._status_ns if wake_ns is None else min(wake_ns, self._status_ns)
+
+    def _wake_all(self, message: Message, now: Now) -> list[Send]:
+        sends = self._wake(message, now)
+        if self._pages and now.mono_ns >= self._status_ns:
+            self._status_ns = now.mono_ns + STATUS_PERIOD_NS
+            sends += [*self._record_hand(now), *self._statuses(now)]
+        return sends
+
+    # Video.
+
+    def _forward(self, message: Message, now: Now) -> list[Send]:
+        """Send an access unit to the pages, and then decode it."""
+        unit: ReceivedUnit = message.payload
+        self._arrived.append((now.mono_ns, len(unit.data)))
+        pages = [peer for peer, video in self._pages.items() if video.offer(unit)]
+        sends = []
+        if pages:
+            sent_us = now.mono_ns // NS_PER_US
+            packed = pack_unit(unit.data, unit.rtp_timestamp, is_keyframe=unit.keyframe, sent_us=sent_us)
+            sends = [Send("page_unit", packed, peer) for peer in pages]
+        return [*sends, Send("unit_to_decode", unit)]
+
+    def _note_view(self, message: Message, now: Now) -> None:
+        frame: DecodedFrame = message.payload
+        unit = rtp_timestamp(frame.stamp_ns)  # `PictureReader` has checked that they agree
+        if len(self._frames) >= MAX_FRAMES:
+            self._frames.pop(next(iter(self._frames)))
+        self._frames[unit] = FrameStamp(frame.stamp_ns, frame.read_wall_ns)
+        if unit == self._shown_unit:
+            self._show(unit, now)
+
+    def _acknowledge(self, page: Peer, ack: PageAck, now: Now) -> list[Send]:
+        is_known = self._pages[page].acknowledge(ack.unit)
+        if is_known and page == self._driving_page:
+            self._show(ack.unit, now)
+        return self._request_keyframe(page)
+
+    def _show(self, unit: int, now: Now) -> None:
+        """Decide from a frame that the page has shown, or as soon as this client has decoded it, too."""
+        frame = self._frames.get(unit)
+        self._shown_unit = unit if frame is None else None
+        if frame is not None:
+            self._view, self._view_ns = frame, now.mono_ns
+
+    def _record_shown(self, page: Peer, shown: PageShown, _now: Now) -> list[Send]:
+        """Record when the driving page had a picture, unless the page has read another stamp than this client."""
+        frame = self._frames.get(shown.unit)
+        if page != self._driving_page or frame is None:
+            return []
+        is_true = int(shown.stamp) == frame.stamp_ns
+        self._counts["page_stamps_true" if is_true else "page_stamps_false"] += 1
+        if not is_true:
+            return []
+        page_times_us = (shown.arrived_us, shown.decoded_us, shown.drawn_us, shown.shown_us)
+        offset_ns = round(shown.offset_us * NS_PER_US)
+        arrived_ns, decoded_ns, drawn_ns, shown_ns = (time_us * NS_PER_US + offset_ns for time_us in page_times_us)
+        bound_ns = round(shown.bound_us * NS_PER_US)
+        return [Send("page_picture", PagePicture(frame.stamp_ns, arrived_ns, decoded_ns, drawn_ns, shown_ns, bound_ns))]
+
+    def _lose_video(self, page: Peer, _lost: PageLost, _now: Now) -> list[Send]:
+        self._pages[page].lose()
+        return self._request_keyframe(page)
+
+    def _request_keyframe(self, page: Peer) -> list[Send]:
+        """Return a request for a keyframe if the driving page waits for one; a page that watches gets the next one."""
+        is_needed = page == self._driving_page and self._pages[page].needs_keyframe
+        return [Send("picture_lost", None)] if is_needed else []
+
+    # Pages.
+
+    def _open_page(self, message: Message, now: Now) -> list[Send]:
+        self._pages[message.peer] = PageVideo()
+        self._status_ns = now.mono_ns
+        self._counts["pages_opened"] += 1
+        return self._drive_from(message.peer, None, now)
+
+    def _close_page(self, message: Message, now: Now) -> list[Send]:
+        video = self._pages.pop(message.peer, None)
+        if video is not None:
+            self._page_counts += video.counts
+        if message.peer == self._driving_page:
+            self._driving_page = None
+            self._forget_view()
+            self._controls.detach()
+        return self._record_hand(now)
+
+    def _is_seat_free(self, now: Now) -> bool:
+        """Return whether no page drives: none has begun to, or the one that has is silent, as if frozen."""
+        return self._driving_page is None or self._controls.silent_ns(now.mono_ns) >= SEAT_NS
+
+    def _drive_from(self, page: Peer, _request: PageDrive | None, now: Now) -> list[Send]:
+        """Let a page drive if no other page does."""
+        if not self._is_seat_free(now) or page == self._driving_page:
+            return []
+        self._driving_page = page
+        self._forget_view()
+        self._controls.attach(now.mono_ns)
+        return [*self._record_hand(now), *self._request_keyframe(page)]
+
+    def _forget_view(self) -> None:
+        """Make no command from a picture of another page; after an emergency stop, commands still carry it."""
+        self._shown_unit = None
+        if not self.session.emergency_stop:
+            self._view = None
+
+    def _handle_page_message(self, message: Message, now: Now) -> list[Send]:
+        if message.peer not in self._pages:  # it was closed in the meantime
+            return []
+        try:
+            parsed = parse_page_message(message.payload)
+        except BadMessage:
+            self._counts["page_messages_unreadable"] += 1
+            return []
+        if isinstance(parsed, PageProbe):
+            arrived_us, now_us = message.arrived.wall_ns // NS_PER_US, now.wall_ns // NS_PER_US
+            return [Send("page_status", pack_text(ProbeAnswer(parsed.sent_us, arrived_us, now_us)), message.peer)]
+        return self._PAGE_MESSAGES[type(parsed)](self, message.peer, parsed, now)
+
+    def _handle_input(self, page: Peer, new: PageInput, now: Now) -> list[Send]:
+        if page != self._driving_page:
+            self._counts["inputs_without_control"] += 1
+            return []
+        self._lock_after_drive()
+        self._controls.handle(
+            HumanInput(new.seen_us * NS_PER_US, new.held, new.live, new.steering, new.throttle, new.brake), now.mono_ns
+        )
+        self._hand = self._controls.hand(now.mono_ns)
+        sample = HumanSample(now.mono_ns, self._hand, new.steering, new.throttle, new.brake)
+        return [*self._command_after_input(now), Send("human_input", sample)]
+
+    def _command_after_input(self, now: Now) -> list[Send]:
+        """Return a command at once, or let it be due later if the last one has just been sent."""
+        due_ns = 0 if self._last is None else self._last[0] + COMMAND_GAP_NS
+        if now.mono_ns >= due_ns:
+            return self._command(now)
+        self._command_ns = due_ns
+        return []
+
+    def _stop(self, _page: Peer, _stop: PageStop, now: Now) -> list[Send]:
+        """Make an emergency stop, also for a page that watches.
+
+        A repeated request is the same stop, unless this client does not know whether the vehicle is still stopped.
+        """
+        session, state = self.session, self._newest_state
+        is_known = now.mono_ns - self._state_ns < STATE_AGE_NS
+        is_stopped = state is not None and state.safety == "emergency_stop" and is_known
+        if session.emergency_stop and (is_stopped or not session.is_stop_confirmed):
+            return []
+        return self._raise_emergency_stop(now)
+
+    def _release_from(self, page: Peer, _request: PageRelease, now: Now) -> list[Send]:
+        """Release control, for the driving page only; the vehicle stops."""
+        return self._release(now) if page == self._driving_page else []
+
+    def _change_delay(self, page: Peer, delay: PageDelay, _now: Now) -> list[Send]:
+        if self._delay is None or page != self._driving_page:
+            self._counts["delays_rejected"] += 1
+            return []
+        self._delay = RelayDelay(delay.video_ms, delay.control_ms)
+        return [Send("relay_delay", self._delay)]
+
+    _PAGE_MESSAGES: ClassVar[dict[type, Callable[..., list[Send]]]] = {
+        PageInput: _handle_input,
+        PageAck: _acknowledge,
+        PageShown: _record_shown,
+        PageLost: _lose_video,
+        PageStop: _stop,
+        PageDrive: _drive_from,
+        PageRelease: _release_from,
+        PageDelay: _change_delay,
+    }
+
+    def _record_hand(self, now: Now) -> list[Send]:
+        """Return a record entry if the state of the hand has changed without an input."""
+        hand = self._controls.hand(now.mono_ns)
+        if hand == self._hand:
+            return []
+        self._hand = hand
+        return [Send("human_input", HumanSample(now.mono_ns, hand, 0.0, 0.0, 0.0))]
+
+    # Commands.
+
+    def _choose(self, now_ns: int) -> tuple[Mode, Decision] | None:
+        """Return what the person commands; None if the page or the hand is lost: the vehicle then stops by itself."""
+        hand = self._controls.hand(now_ns)
+        decision = self._controls.decide(self._speed_mps)
+        if self.session.emergency_stop:
+            return "stop", stopping(decision)
+        if hand in LOST:
+            return None
+        if self.session.phase != "driving":
+            is_ready = hand == "held" and self._controls.is_neutral
+            return ("arm", Decision(0.0, 0.0, 1.0, decision.path_curvature_per_m)) if is_ready else None
+        if hand != "held":
+            return "stop", stopping(decision)
+        return self._limited_by_age(decision, now_ns)
+
+    def _note_command(self, decision: Decision, now: Now) -> None:
+        self._sent.append((self._sequence, now.mono_ns))
+        self._last = now.mono_ns, decision
+
+    def _note_state(self, message: Message, now: Now) -> None:
+        super()._note_state(message, now)
+        self._lock_after_drive()
+
+    def _lock_after_drive(self) -> None:
+        """Lock the latch when a drive has ended, for whatever reason, so that only a fresh press arms again."""
+        is_driving = self.session.phase == "driving"
+        if self._was_driving and not is_driving:
+            self._controls.lock()
+        self._was_driving = is_driving
+
+    def _handle_newer_state(self, now: Now) -> None:
+        state = self._newest_state
+        if state is None or not self.session.has_control:
+            return
+        while self._sent and self._sent[0][0] <= state.applied_sequence:
+            sequence, sent_ns = self._sent.popleft()
+            if sequence == state.applied_sequence:
+                self._round_trip_ns = now.mono_ns - sent_ns
+
+    # Status.
+
+    def _bit_rate_bps(self, now: Now) -> int:
+        while self._arrived and self._arrived[0][0] < now.mono_ns - NS_PER_S:
+            self._arrived.popleft()
+        return 8 * sum(size for _, size in self._arrived)
+
+    def _statuses(self, now: Now) -> list[Send]:
+        return [Send("page_status", pack_text(self._status(page, now)), page) for page in self._pages]
+
+    def _status(self, page: Peer, now: Now) -> PageStatus:
+        state, session, view = self._newest_state, self.session, self._view
+        last = self._last
+        is_current = last is not None and now.mono_ns - last[0] < IDLE_COMMAND_NS
+        vehicle: dict[str, Any] = {
+            name: getattr(state, name, "")
+            for name in ("safety", "reason", "active_operator", "requested_by", "rejected", "limited")
+        }
+        stop = "none" if not session.emergency_stop else "confirmed" if session.is_stop_confirmed else "sent"
+        return PageStatus(
+            sent_us=now.mono_ns // NS_PER_US,
+            role="drives" if page == self._driving_page else "watches",
+            can_drive=self._is_seat_free(now),
+            hand=self._hand,
+            phase=session.phase,
+            session_reason=session.reason,
+            has_control=session.has_control,
+            speed_mps=None if state is None else state.speed_mps,
+            target_mps=self._controls.speed_mps,
+            steering_rad=None if state is None else state.steering_rad,
+            state_age_ms=None if state is None else (now.mono_ns - self._state_ns) / NS_PER_MS,
+            emergency_stop=stop,  # type: ignore[arg-type]
+            command=(last[1].steering_rad, last[1].throttle, last[1].brake) if last and is_current else None,
+            video_ms=None if view is None else (view.read_wall_ns - view.stamp_ns) / NS_PER_MS,
+            round_trip_ms=None if self._round_trip_ns is None else self._round_trip_ns / NS_PER_MS,
+            bit_rate_bps=self._bit_rate_bps(now),
+            delay=None if self._delay is None else (self._delay.video_ms, self._delay.control_ms),
+            conditions=self._conditions,
+            **vehicle,
+        )

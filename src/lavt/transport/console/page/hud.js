@@ -1,0 +1,140 @@
+// What the page shows besides the picture.
+
+import { QUESTIONS, devices } from "./gamepad.js";
+import { History } from "./history.js";
+
+const byId = (id) => document.getElementById(id);
+const SAFETY = {
+  disarmed: "disarmed", arming: "arming", driving: "driving", degraded: "degraded",
+  safe_stop: "safe stop", emergency_stop: "emergency stop",
+};
+const STOP_NOT_SENT = "emergency stop NOT sent: no connection to lavt. Use another emergency stop.";
+const STOP_SENT_LATER = "It is sent if the connection returns";
+const STOP_NOT_CONFIRMED = "emergency stop sent, not confirmed yet";
+const STALE_MS = 1000; // lavt sends a status every 50 ms
+const history = new History(byId("history"));
+const HANDS = {
+  not_seen: "let go of the dead-man control (the space bar), then hold it",
+  not_live: "click the page, then let go of the dead-man control (the space bar) and hold it",
+  old_input: "this page was stopped for a moment: let go of the dead-man control, then hold it",
+  no_input: "this page sent no input for a moment: let go of the dead-man control, then hold it",
+};
+
+// `stop` is "pending" if an emergency stop waits for a connection, "lost" if there will be none, and else empty.
+export function showClosed(text, stop = "") {
+  byId("connection").textContent = "not connected";
+  showSafety("");
+  byId("reason").textContent = "";
+  byId("stop").className = "";
+  const warnings = { "": text, pending: `${STOP_NOT_SENT} ${STOP_SENT_LATER}`, lost: `${STOP_NOT_SENT} ${text}` };
+  byId("hint").textContent = warnings[stop];
+  byId("take").hidden = byId("release").hidden = true;
+}
+
+// Show nothing old as the present state if lavt has sent nothing for a while.
+export function showSilence(silence_ms, isStopPending) {
+  if (silence_ms < STALE_MS) return;
+  const silence = `no status from lavt for ${Math.floor(silence_ms / 1000)} s`;
+  byId("connection").textContent = silence;
+  showSafety("");
+  byId("reason").textContent = "";
+  byId("hint").textContent = isStopPending
+    ? `${STOP_NOT_CONFIRMED}, and ${silence}: use another emergency stop`
+    : `${silence}: the page does not know what the vehicle does`;
+}
+
+function showSafety(name) {
+  byId("safety").textContent = SAFETY[name] ?? "no state";
+  byId("safety").className = `badge ${name in SAFETY ? name : ""}`;
+}
+
+// `age_ms` is the age of the picture on the screen, from its stamp; null: unknown. `notice` is about the keys.
+export function showStatus(status, input, video, age_ms, isStopPending, notice) {
+  byId("connection").textContent = status.role === "drives" ? "drives" : "watches";
+  showSafety(status.safety);
+  const rejected = status.rejected && `command rejected: ${status.rejected}`;
+  const limited = status.limited && `limited: ${status.limited}`;
+  const requested = status.requested_by && `${status.requested_by} requests control`;
+  byId("reason").textContent = [status.reason, requested, rejected, limited].filter(Boolean).join(" · ");
+  byId("hint").textContent = hint(status, input, isStopPending, notice);
+  byId("release").hidden = !(status.role === "drives" && status.has_control && status.requested_by !== "");
+  byId("release").textContent = `Hand over to ${status.requested_by}`;
+  byId("take").hidden = !(status.role === "watches" && status.can_drive);
+  const [speed, target] = [byId("speed").querySelector("b"), byId("speed").querySelector("i")];
+  speed.textContent = status.speed_mps === null ? "–" : (status.speed_mps * 3.6).toFixed(0);
+  target.textContent = (status.target_mps * 3.6).toFixed(0);
+  byId("steering").value = -input.steering; // to the right on the screen is to the right
+  byId("throttle").value = input.throttle;
+  byId("brake").value = input.brake;
+  byId("video_ms").textContent = ms(status.video_ms);
+  byId("round_trip_ms").textContent = ms(status.round_trip_ms);
+  byId("shown_ms").textContent = ms(video.shown_ms);
+  byId("age_ms").textContent = ms(age_ms);
+  byId("bit_rate").textContent = `${(status.bit_rate_bps / 1e6).toFixed(1)} Mb/s`;
+  byId("errors").textContent = video.errors;
+  history.add(age_ms);
+  byId("stop").className = isPast(status) ? "" : status.emergency_stop;
+  showNetwork(status);
+}
+
+// The vehicle has executed an emergency stop of this client, but is in another state now.
+function isPast({ emergency_stop, safety }) {
+  return emergency_stop === "confirmed" && safety !== "emergency_stop";
+}
+
+function hint(status, input, isStopPending, notice) {
+  if (isStopPending || status.emergency_stop === "sent") return STOP_NOT_CONFIRMED;
+  if (isPast(status)) {
+    return "an earlier emergency stop was confirmed, but the vehicle is in another state now; restart this client to drive";
+  }
+  if (status.emergency_stop === "confirmed") return "emergency stop: the vehicle has confirmed it; restart this client to drive";
+  if (status.role === "watches") return status.can_drive ? "no page drives" : "another page drives";
+  if (status.phase === "seeking" || status.phase === "stopped" || status.phase === "watching") {
+    return status.session_reason || "waiting for the vehicle";
+  }
+  if (status.hand in HANDS) return HANDS[status.hand];
+  if (notice !== "") return notice;
+  if (status.phase === "arming") {
+    if (status.session_reason) return status.session_reason;
+    if (status.hand === "open") return "hold the dead-man control (the space bar) for a second to arm";
+    return input.throttle > 0.05 ? "release the throttle to arm" : "arming: keep holding";
+  }
+  return status.hand === "held" ? "" : "the dead-man control was released: the vehicle stops";
+}
+
+function ms(value) {
+  return value === null ? "–" : `${value.toFixed(value < 10 ? 1 : 0)} ms`;
+}
+
+// Show the question of a calibration; without one, whether there is a device to calibrate.
+export function showCalibration(calibration) {
+  byId("calibrate").hidden = calibration === null && devices().length === 0;
+  byId("calibrate").textContent = calibration === null ? "Calibrate a wheel or gamepad" : "Cancel";
+  if (calibration !== null) byId("hint").textContent = `${QUESTIONS[calibration.next]} (meanwhile, only Esc and the page's button stop)`;
+}
+
+let shownConditions = "";
+
+function showNetwork(status) {
+  byId("network").hidden = status.delay === null;
+  if (status.delay === null) return;
+  const names = status.conditions.map(([name]) => name).join();
+  if (names !== shownConditions) {
+    shownConditions = names;
+    byId("conditions").replaceChildren(...status.conditions.map(([name, video, control]) => {
+      const button = document.createElement("button");
+      Object.assign(button, { type: "button", textContent: name, title: `video ${video} ms, control ${control} ms` });
+      Object.assign(button.dataset, { video, control });
+      return button;
+    }));
+  }
+  for (const button of byId("conditions").children) {
+    const isChosen = Number(button.dataset.video) === status.delay[0] && Number(button.dataset.control) === status.delay[1];
+    button.setAttribute("aria-pressed", isChosen);
+  }
+  ["video", "control"].forEach((flow, index) => {
+    const slider = byId(`${flow}_delay`);
+    if (document.activeElement !== slider) slider.value = status.delay[index];
+    byId(`${flow}_delay_ms`).textContent = `${status.delay[index].toFixed(0)} ms`;
+  });
+}

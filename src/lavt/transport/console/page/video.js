@@ -1,0 +1,124 @@
+// The video: access units are decoded by WebCodecs, drawn at once, and acknowledged. Then the stamp is read.
+
+import { pageTime_us } from "./clock.js";
+import { readStamp } from "./stamp.js";
+
+const MAX_DECODING = 3; // access units in the decoder
+const DECODING_LIMIT_US = 1_000_000;
+
+export class Video {
+  #canvas;
+  #context;
+  #decoder = null;
+  #pending = new Map(); // by timestamp in the decoder: [RTP timestamp, time of arrival in us]
+  #number = 0;
+  #acknowledge;
+  #lose;
+  #report;
+
+  // `acknowledge(unit)` is called when a picture has been drawn, `lose()` when only a keyframe can be decoded, and
+  // `report(times)` when a picture with a readable stamp is about to appear.
+  constructor(canvas, acknowledge, lose, report) {
+    this.#report = report;
+    this.#canvas = canvas;
+    this.#context = canvas.getContext("2d", { desynchronized: true, alpha: false });
+    this.#acknowledge = acknowledge;
+    this.#lose = lose;
+    this.shown = 0;
+    this.stamp_us = null; // of the newest picture that was shown
+    this.shown_ms = null; // from the stamp until the newest picture was shown
+    this.errors = 0;
+  }
+
+  // Decode a unit: `{data, unit, isKeyframe}`.
+  push({ data, unit, isKeyframe }) {
+    if (this.#decoder === null) {
+      if (!isKeyframe) return this.#lose();
+      if (!this.#open(data)) return this.#fail();
+    }
+    if (this.#pending.size >= MAX_DECODING) return this.#fail();
+    const timestamp = ++this.#number;
+    this.#pending.set(timestamp, [unit, pageTime_us()]);
+    try {
+      this.#decoder.decode(new EncodedVideoChunk({ type: isKeyframe ? "key" : "delta", timestamp, data }));
+    } catch {
+      this.#fail();
+    }
+  }
+
+  // Give up an access unit from which the decoder makes neither a picture nor an error.
+  check() {
+    const [oldest] = this.#pending.values();
+    if (oldest !== undefined && pageTime_us() - oldest[1] > DECODING_LIMIT_US) this.#fail();
+  }
+
+  close() {
+    if (this.#decoder !== null && this.#decoder.state !== "closed") this.#decoder.close();
+    this.#decoder = null;
+    this.#pending.clear();
+  }
+
+  // Return whether there is a decoder for the keyframe.
+  #open(data) {
+    const codec = codecOf(data);
+    if (codec === null) return false;
+    const decoder = new VideoDecoder({
+      output: (frame) => this.#show(frame, decoder),
+      error: () => decoder === this.#decoder && this.#fail(),
+    });
+    try {
+      decoder.configure({ codec, optimizeForLatency: true, hardwareAcceleration: "no-preference" });
+    } catch {
+      return false;
+    }
+    this.#decoder = decoder;
+    return true;
+  }
+
+  async #show(frame, decoder) {
+    let isDrawn = false;
+    try {
+      const decoded_us = pageTime_us();
+      const [unit, arrived_us] = this.#pending.get(frame.timestamp) ?? [];
+      if (decoder !== this.#decoder || unit === undefined) return;
+      this.#pending.delete(frame.timestamp);
+      if (this.#canvas.width !== frame.displayWidth || this.#canvas.height !== frame.displayHeight) {
+        this.#canvas.width = frame.displayWidth;
+        this.#canvas.height = frame.displayHeight;
+      }
+      this.#context.drawImage(frame, 0, 0);
+      if (this.#context.isContextLost?.()) return this.#fail(); // then nothing has been drawn
+      isDrawn = true;
+      this.shown += 1;
+      this.#acknowledge(unit);
+      const times = { unit, arrived_us, decoded_us, drawn_us: pageTime_us() };
+      const shown = new Promise((resolve) => requestAnimationFrame(() => resolve(pageTime_us())));
+      const stamp = await readStamp(frame);
+      frame.close(); // a page that is hidden shows nothing, and must not keep the decoder's pictures
+      if (stamp !== null && document.visibilityState === "visible") {
+        this.#report({ ...times, stamp, shown_us: await shown });
+      }
+    } catch {
+      if (isDrawn) this.errors += 1;
+      else this.#fail(); // it was not acknowledged
+    } finally {
+      frame.close();
+    }
+  }
+
+  #fail() {
+    this.errors += 1;
+    this.close();
+    this.#lose();
+  }
+}
+
+// The codec string of WebCodecs from the SPS in an access unit (Annex B); null: it has none.
+function codecOf(data) {
+  for (let i = 0; i + 6 < data.length; i += 1) {
+    if (data[i] === 0 && data[i + 1] === 0 && data[i + 2] === 1 && (data[i + 3] & 0x1f) === 7) {
+      return "avc1." + [...data.subarray(i + 4, i + 7)].map((byte) => byte.toString(16).padStart(2, "0")).join("");
+    }
+  }
+  return null;
+}

@@ -1,0 +1,162 @@
+"""Tests of the console's page in a real Chromium, with the real programs behind it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tests.browser.chromium import PACKAGES, Browser, ProtocolError, Tab, is_missing, running_browser, wait_until
+from tests.require import need
+
+from lavt.experiment.runs.processes import Process, Processes
+
+HERE = Path(__file__).parent
+TIMEOUT_S = 300
+ATTEMPTS = 8
+REPEAT_KEYS = """(() => {
+  let newest = null;
+  addEventListener("keydown", ({isTrusted, code}) => { if (isTrusted) newest = code; }, true);
+  addEventListener("keyup", ({code}) => { if (code === newest) newest = null; }, true);
+  setInterval(() => {
+    if (newest !== null) dispatchEvent(new KeyboardEvent("keydown", {code: newest, repeat: true, cancelable: true}));
+  }, 40);
+})()"""
+"""Repeats the key that was pressed last, as a display server does, and the protocol of Chromium does not."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if HERE in item.path.parents:
+            item.add_marker(pytest.mark.timeout(TIMEOUT_S))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup() -> None:
+    if is_missing():
+        need("chromium", f"needs Chromium: apt-get install {' '.join(PACKAGES)}")
+
+
+@pytest.fixture(scope="session")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with running_browser(tmp_path_factory.mktemp("chromium")) as browser:
+        yield browser
+
+
+class PersonDrive:
+    """A running `lavt drive`, with the pages that a test opens."""
+
+    def __init__(self, process: Process, url: str, browser: Browser, out: Path) -> None:
+        self.process = process
+        self.url = url
+        self.out = out
+        self._browser = browser
+        self._tabs: list[Tab] = []
+
+    def open(self, browser: Browser | None = None) -> Tab:
+        """Open a page in a new tab, also of another browser, and wait until it shows a state of the vehicle."""
+        tab = (browser or self._browser).open(self.url)
+        if browser is None:
+            self._tabs.append(tab)
+        wait_until("the page has a status", lambda: (status(tab) or {}).get("safety") not in (None, ""))
+        repeat_keys(tab)
+        return tab
+
+    def close(self) -> None:
+        """Close all pages."""
+        for tab in self._tabs:
+            self._browser.close_tab(tab)
+
+
+@pytest.fixture
+def person_drive(browser: Browser, tmp_path: Path) -> Iterator[PersonDrive]:
+    with Processes(tmp_path) as processes:
+        settings = ("--set", "vehicle.scenery=none", "--set", "camera.width_px=320", "--set", "camera.height_px=240")
+        process = processes.start("drive", "drive", "--no-browser", "--out", str(tmp_path / "out"), *settings)
+        drive = PersonDrive(process, process.wait_ready()["ready"]["console"], browser, tmp_path / "out")
+        try:
+            yield drive
+        finally:
+            drive.close()
+
+
+def repeat_keys(tab: Tab) -> None:
+    """Let the page get repeats of the key that was pressed last."""
+    tab.evaluate(REPEAT_KEYS)
+
+
+def plug_gamepad(tab: Tab, *, is_held: bool, index: int = 0) -> None:
+    """Connect a fake gamepad that the browser knows, and let the page read it; its dead-man button is held or not."""
+    values = [float(is_held and button == 5) for button in range(17)]
+    tab.evaluate(
+        f"globalThis.pad = {{id: 'pad', mapping: 'standard', axes: [0, 0, 0, 0], connected: true, index: {index},"
+        f" buttons: {values}.map((value) => ({{value}}))}}; navigator.getGamepads = () => [pad];"
+        "new Promise((resolve) => setTimeout(resolve, 200))"
+    )
+
+
+def unplug_gamepads(tab: Tab) -> None:
+    """Disconnect all gamepads, and let the page see it."""
+    tab.evaluate("navigator.getGamepads = () => []; new Promise((resolve) => setTimeout(resolve, 200))")
+
+
+def status(tab: Tab) -> dict[str, Any] | None:
+    """Return the newest status that the page has received; None while it is not loaded or not connected."""
+    try:
+        result: dict[str, Any] | None = tab.evaluate("globalThis.lavtConsole?.status ?? null")
+    except ProtocolError:
+        return None
+    return result
+
+
+def field(tab: Tab, name: str) -> Any:
+    """Return one value of the page's newest status; None while it is not connected."""
+    return (status(tab) or {}).get(name)
+
+
+def drive_until(tab: Tab, hold: Callable[[], None], let_go: Callable[[], None], condition: Callable[[], bool]) -> None:
+    """Arm by `hold` and wait until `condition()`; if the vehicle stops before, let go and try again.
+
+    On a busy machine the browser pauses for longer than the latch of the dead-man control allows.
+    """
+    for _ in range(ATTEMPTS):
+        wait_until("the vehicle can be armed", lambda: field(tab, "hand") == "open" and field(tab, "phase") == "arming")
+        hold()
+        wait_until("the hand holds, or is lost", lambda: field(tab, "hand") != "open")
+        wait_until("the car drives, or has stopped", lambda: condition() or field(tab, "hand") != "held")
+        if condition():
+            return
+        let_go()
+    pytest.fail(f"the car did not drive in {ATTEMPTS} attempts")
+
+
+def press(tab: Tab, *codes: str) -> None:
+    """Press keys, with the pointer over the page."""
+    tab.point()
+    for code in codes:
+        tab.key(code, down=True)
+
+
+def release(tab: Tab, *codes: str) -> None:
+    """Release keys."""
+    for code in codes:
+        tab.key(code, down=False)
+
+
+def arm(tab: Tab) -> None:
+    """Hold the space bar until the vehicle is driving."""
+    drive_until(
+        tab, lambda: press(tab, "Space"), lambda: release(tab, "Space"), lambda: field(tab, "safety") == "driving"
+    )
+
+
+def drive_off(tab: Tab) -> None:
+    """Arm, and accelerate to 2 m/s."""
+
+    def accelerates() -> bool:
+        if field(tab, "safety") == "driving":
+            press(tab, "ArrowUp")
+        return (field(tab, "speed_mps") or 0) > 2
+
+    drive_until(tab, lambda: press(tab, "Space"), lambda: release(tab, "ArrowUp", "Space"), accelerates)

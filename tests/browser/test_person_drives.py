@@ -1,0 +1,137 @@
+from __future__ import annotations
+
+import os
+import signal
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from tests.browser.chromium import Browser, Tab, running_browser, wait_until
+from tests.browser.conftest import PersonDrive, arm, drive_off, field
+
+from lavt.recording.record import read_record
+
+
+def wait_for_standstill(tab: Tab) -> None:
+    wait_until(
+        "the car is stationary", lambda: field(tab, "safety") == "safe_stop" and abs(field(tab, "speed_mps")) < 0.05
+    )
+
+
+def test_a_person_arms_drives_and_stops(person_drive: PersonDrive) -> None:
+    """Holding the space bar arms, the arrow key accelerates, letting go stops; the video is shown; all is recorded."""
+    tab = person_drive.open()
+    assert field(tab, "role") == "drives"
+    drive_off(tab)
+    shown = tab.evaluate("lavtConsole.video.shown")
+    wait_until("pictures are shown", lambda: tab.evaluate("lavtConsole.video.shown") > shown + 20)
+    assert tab.evaluate("lavtConsole.video.errors") == 0
+    assert tab.evaluate("document.querySelector('#picture').width") == 320
+    tab.key("Space", down=False)
+    wait_for_standstill(tab)
+    person_drive.process.end()
+    assert person_drive.process.popen.returncode == 0
+    record = read_record(person_drive.out / "client" / "client.mcap")
+    hands = set(record.table("human_input").texts("hand"))
+    assert {"open", "held"} <= hands
+
+
+def test_the_page_reads_every_stamp(person_drive: PersonDrive) -> None:
+    """The page reads the stamps that the client reads, and the times at which it had the pictures are in order."""
+    tab = person_drive.open()
+    wait_until("pictures are shown", lambda: tab.evaluate("lavtConsole.video.shown") > 60)
+    person_drive.process.end()
+    record = read_record(person_drive.out / "client" / "client.mcap")
+    counts = record.table("counts")
+    assert max(value or 0 for value in counts.objects("page_stamps_true")) > 30
+    assert not any(counts.objects("page_stamps_false"))
+    pictures = record.table("page_picture")
+    names = ("stamp_ns", "arrived_wall_ns", "decoded_wall_ns", "drawn_wall_ns", "shown_wall_ns")
+    times = [pictures.ints(name) for name in names]
+    bound = pictures.ints("bound_ns")
+    assert (times[1] >= times[0] - bound).all()
+    for before, after in pairwise(times[1:]):
+        assert (after >= before).all()
+
+
+def test_after_a_stop_the_person_drives_again(person_drive: PersonDrive) -> None:
+    """After a safe stop, a fresh press arms the vehicle again; a key that is still held does not."""
+    tab = person_drive.open()
+    drive_off(tab)
+    tab.key("ArrowUp", down=False)
+    tab.key("Space", down=False)
+    wait_for_standstill(tab)
+    arm(tab)
+
+
+def test_the_keys_choose_the_delay(person_drive: PersonDrive) -> None:
+    """The key 3 chooses the delays of L3 while driving, and the page measures them; 0 removes them."""
+    tab = person_drive.open()
+    arm(tab)
+    tab.key("Digit3", down=True)
+    wait_until("the video is delayed", lambda: (field(tab, "video_ms") or 0) > 225)
+    assert field(tab, "delay") == [225, 0]
+    tab.key("Digit0", down=True)
+    wait_until("the video is not delayed", lambda: (field(tab, "video_ms") or 1000) < 200)
+    assert field(tab, "safety") == "driving"
+
+
+def test_a_hidden_page_drives_no_more(person_drive: PersonDrive, browser: Browser) -> None:
+    """When another tab hides the page, the vehicle stops by itself; when it is back, only a fresh press counts."""
+    tab = person_drive.open()
+    drive_off(tab)
+    other = browser.open("about:blank")
+    wait_until("the car stops", lambda: field(tab, "safety") == "safe_stop")
+    assert "newer picture" in field(tab, "reason")
+    browser.close_tab(other)
+    tab.to_front()
+    wait_for_standstill(tab)
+    wait_until("the hand is seen open", lambda: field(tab, "hand") == "open")
+    arm(tab)
+
+
+@pytest.mark.parametrize("number", [signal.SIGSTOP, signal.SIGKILL])
+def test_a_renderer_that_ends_or_stops_drives_no_more(
+    person_drive: PersonDrive, tmp_path: Path, number: signal.Signals
+) -> None:
+    """When the page's process is stopped or killed, the vehicle stops by itself; another page sees it."""
+    with running_browser(tmp_path / "other") as other:
+        tab = person_drive.open(other)
+        watching = person_drive.open()
+        drive_off(tab)
+        for renderer in other.renderers():
+            os.kill(renderer, number)
+        wait_until("the car stops", lambda: field(watching, "safety") == "safe_stop")
+        assert "newer picture" in field(watching, "reason")
+    wait_until("no page drives any more", lambda: bool(field(watching, "can_drive")))
+
+
+def test_a_lost_canvas_drives_no_more(person_drive: PersonDrive) -> None:
+    """If the canvas is lost, as after a crash of the graphics processor's process, the vehicle stops by itself."""
+    tab = person_drive.open()
+    drive_off(tab)
+    tab.evaluate("CanvasRenderingContext2D.prototype.isContextLost = () => true; 0")
+    wait_until("the car stops", lambda: field(tab, "safety") == "safe_stop")
+
+
+def test_a_drive_without_a_vehicle_ends(person_drive: PersonDrive) -> None:
+    """If the process of the vehicle's side is killed, `lavt drive` ends with exit code 1."""
+    tab = person_drive.open()
+    children = Path(f"/proc/{person_drive.process.popen.pid}/task/{person_drive.process.popen.pid}/children")
+    (server,) = [int(pid) for pid in children.read_text().split()]
+    os.kill(server, signal.SIGKILL)
+    assert person_drive.process.popen.wait(30) == 1
+    assert "vehicle's side has ended" in person_drive.process.last_message()
+    wait_until("the page is not connected", lambda: tab.evaluate("lavtConsole.status") is None)
+
+
+def test_a_second_page_watches_and_can_stop(person_drive: PersonDrive) -> None:
+    """A second page shows the video and does not drive; its emergency stop is confirmed."""
+    tab = person_drive.open()
+    arm(tab)
+    second = person_drive.open()
+    assert field(second, "role") == "watches"
+    wait_until("the second page shows the video", lambda: second.evaluate("lavtConsole.video.shown") > 0)
+    second.key("Escape", down=True)
+    wait_until("the stop is confirmed", lambda: field(second, "emergency_stop") == "confirmed")
+    wait_until("the vehicle is in an emergency stop", lambda: field(second, "safety") == "emergency_stop")
