@@ -10,6 +10,7 @@ from lavt.errors import UserError
 from lavt.opendrive.geometry import Clothoid, Cubic, CubicCurve, PlanElement
 from lavt.opendrive.ignored import ignored_content
 from lavt.opendrive.road_map import (
+    STATION_TOLERANCE_M,
     CubicPieces,
     JunctionConnection,
     LaneMark,
@@ -19,10 +20,13 @@ from lavt.opendrive.road_map import (
     OpenDriveMap,
     RoadLink,
 )
-from lavt.opendrive.xml_tree import parse_xml, read_file, read_integer, read_number, read_text
+from lavt.opendrive.xml_tree import parse_xml, read_file, read_id, read_integer, read_number, read_text
 
 MAX_LENGTH_M = 1_000_000.0
-MAX_TURN_RAD = 1000.0
+MAX_LANES = 200
+"""The largest number of lanes of a lane section: more would take too long to compute."""
+
+MAX_TURN_RAD = 100.0
 """The largest angle by which one element of a plan view may turn: more would take too long to compute."""
 
 MIN_CURVE_M = 1e-9
@@ -40,7 +44,7 @@ def parse_map(content: bytes, source: str) -> OpenDriveMap:
     """Parse the content of a map file; `source` is its name in messages."""
     root = parse_xml(content, source)
     if root.tag != "OpenDRIVE":
-        raise UserError(f"{source} is not an OpenDRIVE map (its root is <{root.tag[:40]}>): name a file .xodr")
+        raise UserError(f"{source} is not an OpenDRIVE map (its root is {root.tag[:40]!a}): name a file .xodr")
     roads: dict[str, MapRoad] = {}
     for element in root.iterfind("road"):
         road = _read_road(element, source)
@@ -51,7 +55,7 @@ def parse_map(content: bytes, source: str) -> OpenDriveMap:
         raise UserError(f"{source} has no roads: name a map with roads")
     junctions: dict[str, tuple[JunctionConnection, ...]] = {}
     for element in root.iterfind("junction"):
-        number = read_text(element, "id", source)
+        number = read_id(element, "id", source)
         where = f"{source}: junction {number}"
         connections = [_read_connection(child, where) for child in element.iterfind("connection")]
         junctions[number] = tuple(connection for connection in connections if connection is not None)
@@ -59,7 +63,7 @@ def parse_map(content: bytes, source: str) -> OpenDriveMap:
 
 
 def _read_road(element: Element, source: str) -> MapRoad:
-    number = read_text(element, "id", source)
+    number = read_id(element, "id", source)
     where = f"{source}: road {number}"
     length_m = _read_length(element, where)
     plan = [
@@ -134,7 +138,7 @@ def _read_param_poly3(element: Element, length_m: float, where: str) -> CubicCur
     # Without pRange, the parameter is normalized: it was so in OpenDRIVE 1.4, where the attribute was optional.
     p_range = element.get("pRange", "normalized")
     if p_range not in {"normalized", "arcLength"}:
-        raise UserError(f"{where}: pRange is {p_range[:40]!r}: use normalized or arcLength")
+        raise UserError(f"{where}: pRange is {p_range[:40]!a}: use normalized or arcLength")
     ahead, left = (Cubic(*(read_number(element, f"{letter}{axis}", where) for letter in "abcd")) for axis in ("U", "V"))
     if not any((ahead.b, ahead.c, ahead.d, left.b, left.c, left.d)):
         raise UserError(f"{where}: the paramPoly3 is a single point: give it coefficients")
@@ -168,9 +172,10 @@ def _read_sections(road: Element, length_m: float, where: str) -> tuple[LaneSect
     elements.sort(key=lambda item: item[0])
     sections = []
     for index, (s_m, element) in enumerate(elements):
-        end_m = elements[index + 1][0] if index + 1 < len(elements) else length_m
-        if not 0.0 <= s_m <= length_m:
+        end_m = min(elements[index + 1][0], length_m) if index + 1 < len(elements) else length_m
+        if not -STATION_TOLERANCE_M <= s_m <= length_m + STATION_TOLERANCE_M:
             raise UserError(f"{where}: a lane section begins at s={s_m:g} m: the road has 0 to {length_m:g} m")
+        s_m = min(max(s_m, 0.0), length_m)
         sections.append(LaneSection(s_m, end_m, _read_lanes(element, f"{where}: lane section at s={s_m:g} m")))
     return tuple(sections)
 
@@ -182,6 +187,8 @@ def _read_lanes(section: Element, where: str) -> dict[int, MapLane]:
             number = read_integer(element, "id", where)
             if (number > 0) - (number < 0) != sign or number in lanes:
                 raise UserError(f"{where}: lane {number} is twice there or on the wrong side (<{side}>): renumber it")
+            if len(lanes) == MAX_LANES:
+                raise UserError(f"{where}: there are more than {MAX_LANES} lanes: remove some")
             lanes[number] = _read_lane(element, number, f"{where}: lane {number}")
     for number in lanes:
         inner = number - (number > 0) + (number < 0)
@@ -218,12 +225,14 @@ def _read_lane(element: Element, number: int, where: str) -> MapLane:
 def _read_road_link(element: Element | None, where: str) -> RoadLink | None:
     if element is None:
         return None
-    kind, target = element.get("elementType"), read_text(element, "elementId", where)
+    kind, target = read_text(element, "elementType", where), read_text(element, "elementId", where)
     if kind == "junction":
         return RoadLink("junction", target, None)
     if kind == "road":
+        if "elementS" in element.attrib:
+            return None  # into the middle of a road, at a virtual junction
         return RoadLink("road", target, _read_contact(element, where))
-    raise UserError(f"{where}: a link has elementType={kind!r}: use road or junction")
+    raise UserError(f"{where}: a link has elementType={kind[:40]!a}: use road or junction")
 
 
 def _read_connection(element: Element, where: str) -> JunctionConnection | None:
@@ -239,9 +248,9 @@ def _read_connection(element: Element, where: str) -> JunctionConnection | None:
 
 
 def _read_contact(element: Element, where: str) -> Literal["start", "end"]:
-    contact = element.get("contactPoint", "start")
+    contact = read_text(element, "contactPoint", where)
     if contact == "start":
         return "start"
     if contact == "end":
         return "end"
-    raise UserError(f"{where}: contactPoint is {contact[:40]!r}: use start or end")
+    raise UserError(f"{where}: contactPoint is {contact[:40]!a}: use start or end")

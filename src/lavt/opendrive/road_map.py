@@ -7,7 +7,7 @@ metres. Lane 0 has no width; lanes to its left have positive numbers, lanes to i
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -155,6 +155,18 @@ class OpenDriveMap:
     def road(self, number: str) -> MapRoad:
         """Return a road; raise UserError if the map does not have it."""
         if number not in self.roads:
-            some = ", ".join(list(self.roads)[:10])
-            raise UserError(f"{self.source} has no road {number}: it has {len(self.roads)} roads ({some}, ...)")
+            some = ", ".join([*list(self.roads)[:10], *(["..."] if len(self.roads) > 10 else [])])
+            raise UserError(f"{self.source} has no road {number}: name one of its {len(self.roads)} roads ({some})")
         return self.roads[number]
+
+    def connections(self, junction: str, incoming: str) -> Sequence[JunctionConnection]:
+        """Return the connections of a junction that begin on a road."""
+        return self._connections.get((junction, incoming), ())
+
+    @cached_property
+    def _connections(self) -> Mapping[tuple[str, str], Sequence[JunctionConnection]]:
+        found: dict[tuple[str, str], list[JunctionConnection]] = {}
+        for junction, connections in self.junctions.items():
+            for connection in connections:
+                found.setdefault((junction, connection.incoming), []).append(connection)
+        return found

@@ -63,10 +63,8 @@ def next_steps(road_map: OpenDriveMap, step: LaneStep) -> Iterator[LaneStep]:
             yield from _enter(road_map, link.target, number, link.contact)
         return
     leaving: Literal["start", "end"] = "end" if forward else "start"
-    for connection in road_map.junctions.get(link.target, ()):
-        if connection.incoming == road.number and _joins(
-            road_map, connection.connecting, connection.contact, road, leaving
-        ):
+    for connection in road_map.connections(link.target, road.number):
+        if _joins(road_map, connection.connecting, connection.contact, road, leaving):
             for from_lane, to_lane in connection.lane_links:
                 if from_lane == step.lane:
                     yield from _enter(road_map, connection.connecting, to_lane, connection.contact)

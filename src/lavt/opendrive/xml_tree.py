@@ -13,6 +13,7 @@ from lavt.errors import UserError
 MAX_BYTES = 64 * 1024 * 1024
 MAX_DEPTH = 32
 MAX_ELEMENTS = 2_000_000
+MAX_ID_CHARACTERS = 64
 MAX_NUMBER = 1e9
 """The largest magnitude of a number. Computations with larger ones could overflow."""
 
@@ -67,6 +68,17 @@ def parse_xml(content: bytes, source: str) -> Element:
     return builder.close()
 
 
+def read_id(element: Element, key: str, where: str) -> str:
+    """Return an id, which must exist and be fit for messages: printable and not too long."""
+    value = read_text(element, key, where)
+    if len(value) > MAX_ID_CHARACTERS or not value.isprintable():
+        shown = ascii(value[:20])
+        raise UserError(
+            f"{where}: <{element.tag}> has {key}={shown}...: use at most {MAX_ID_CHARACTERS} printable characters"
+        )
+    return value
+
+
 def read_text(element: Element, key: str, where: str) -> str:
     """Return an attribute that must exist."""
     value = element.get(key)
@@ -82,11 +94,11 @@ def read_number(element: Element, key: str, where: str, default: float | None = 
         return default
     text = read_text(element, key, where)
     try:
-        number = float(text)
+        number = math.nan if "_" in text else float(text)  # Python reads 1_0 as 10, XML does not
     except ValueError:
         number = math.nan
     if not abs(number) <= MAX_NUMBER:
-        raise UserError(f"{where}: <{element.tag}> has {key}={text[:40]!r}: write a number of at most {MAX_NUMBER:.0e}")
+        raise UserError(f"{where}: <{element.tag}> has {key}={text[:40]!a}: write a number of at most {MAX_NUMBER:.0e}")
     return number
 
 
@@ -95,5 +107,5 @@ def read_integer(element: Element, key: str, where: str) -> int:
     text = read_text(element, key, where).strip()
     digits = text.removeprefix("-").removeprefix("+")
     if not (digits.isascii() and digits.isdigit() and len(digits) <= 9):
-        raise UserError(f"{where}: <{element.tag}> has {key}={text[:40]!r}: write a whole number")
+        raise UserError(f"{where}: <{element.tag}> has {key}={text[:40]!a}: write a whole number")
     return int(text)
