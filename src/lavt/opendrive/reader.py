@@ -175,8 +175,8 @@ def _read_sections(road: Element, length_m: float, where: str) -> tuple[LaneSect
         end_m = min(elements[index + 1][0], length_m) if index + 1 < len(elements) else length_m
         if not -STATION_TOLERANCE_M <= s_m <= length_m + STATION_TOLERANCE_M:
             raise UserError(f"{where}: a lane section begins at s={s_m:g} m: the road has 0 to {length_m:g} m")
-        s_m = min(max(s_m, 0.0), length_m)
-        sections.append(LaneSection(s_m, end_m, _read_lanes(element, f"{where}: lane section at s={s_m:g} m")))
+        lanes = _read_lanes(element, f"{where}: lane section at s={s_m:g} m")
+        sections.append(LaneSection(min(max(s_m, 0.0), length_m), end_m, lanes))
     return tuple(sections)
 
 

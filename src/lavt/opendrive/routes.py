@@ -9,6 +9,9 @@ from typing import Literal, NamedTuple
 from lavt.errors import UserError
 from lavt.opendrive.road_map import MapRoad, OpenDriveMap, RoadLink
 
+MAX_STARTS = 20
+"""A route is searched from at most so many sections of the lane where it begins."""
+
 
 class LaneStep(NamedTuple):
     """A lane within one lane section of a road."""
@@ -21,9 +24,23 @@ class LaneStep(NamedTuple):
 def find_route(road_map: OpenDriveMap, start: tuple[str, int], goal: tuple[str, int]) -> list[LaneStep]:
     """Return the shortest sequence of lanes from one (road, lane) to another, without changes of lane.
 
-    It begins where vehicles enter the lane `start`, and ends where they leave the lane `goal`.
+    It begins where vehicles enter the lane `start`, and ends where they leave the lane `goal`. Where a lane's number
+    means another lane in a later section of the road, the first section from which a way leads counts, and the last
+    section to which it leads.
     """
-    first, last = _steps_of_lane(road_map, *start)[0], _steps_of_lane(road_map, *goal)[-1]
+    firsts, lasts = _steps_of_lane(road_map, *start), _steps_of_lane(road_map, *goal)
+    for first in firsts[:MAX_STARTS]:
+        steps = _search(road_map, first, lasts)
+        if steps is not None:
+            return steps
+    raise UserError(
+        f"{road_map.source}: no way leads from road {start[0]} lane {start[1]} to road {goal[0]} lane {goal[1]} "
+        "without a change of lane: name lanes that are joined in the direction of driving"
+    )
+
+
+def _search(road_map: OpenDriveMap, first: LaneStep, lasts: list[LaneStep]) -> list[LaneStep] | None:
+    """Return the shortest sequence of lanes to the last of the goals that can be reached, or None."""
     came_from: dict[LaneStep, LaneStep | None] = {}
     queue: list[tuple[float, LaneStep, LaneStep | None]] = [(0.0, first, None)]
     while queue:
@@ -31,17 +48,15 @@ def find_route(road_map: OpenDriveMap, start: tuple[str, int], goal: tuple[str, 
         if step in came_from:
             continue
         came_from[step] = previous
-        if step == last:
-            return _walk_back(came_from, step)
+        if step == lasts[-1]:
+            break
         section = road_map.roads[step.road].sections[step.section_index]
         length_m += section.end_m - section.s_m
         for following in next_steps(road_map, step):
             if following not in came_from:
                 heapq.heappush(queue, (length_m, following, step))
-    raise UserError(
-        f"{road_map.source}: no way leads from road {start[0]} lane {start[1]} to road {goal[0]} lane {goal[1]} "
-        "without a change of lane: name lanes that are joined in the direction of driving"
-    )
+    reached = [last for last in lasts if last in came_from]
+    return _walk_back(came_from, reached[-1]) if reached else None
 
 
 def next_steps(road_map: OpenDriveMap, step: LaneStep) -> Iterator[LaneStep]:

@@ -31,7 +31,10 @@ MIN_DASH_M = 0.1
 MIN_INNER_SHARE = 0.1
 """In a curve, the length of the road's inner edge must be at least this share of the length of the lane's centre."""
 
-Coordinate = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-100_000, le=100_000)]
+MAX_COORDINATE_M = 100_000.0
+MAX_LENGTH_M = 20_000.0
+
+Coordinate = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MAX_COORDINATE_M, le=MAX_COORDINATE_M)]
 Offset = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-200, le=200)]
 Station = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-20_000, le=20_000)]
 Length = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=20_000)]
@@ -218,7 +221,7 @@ def _find_problems(road: RoadFile) -> Iterable[str]:
     for strip in road.all_paved:
         if strip.left_m <= strip.right_m:
             yield f"a strip of paved has left_m {strip.left_m} and right_m {strip.right_m}: left is the greater offset"
-    if road.segments_length_m > 20_000:
+    if road.segments_length_m > MAX_LENGTH_M:
         yield f"the segments are {road.segments_length_m:.0f} m long: 20 km are enough"
     elif road.route_length_m < MIN_ROUTE_M:
         yield f"the segments are only {road.segments_length_m:g} m long: a route has at least {MIN_ROUTE_M:g} m"
