@@ -21,7 +21,7 @@ def test_the_documented_example_is_a_valid_road() -> None:
     assert len(text[1].splitlines()) <= 10
     road = parse_road(text[1], source="my_bend.yaml")
     assert (road.route_length_m, road.first_m, road.last_m) == (250.0, -20.0, 350.0)
-    assert road.lanes.edges_m == (-1.75, 1.75, 5.25)
+    assert road.lanes.edges_at(0.0) == (-1.75, 1.75, 5.25)
     assert [(mark.offset_m, mark.kind) for mark in road.marks] == [(-1.75, "solid"), (1.75, "broken"), (5.25, "solid")]
     assert [(strip.left_m, strip.right_m) for strip in road.paved] == [(5.75, -2.25)]
     assert float(np.abs(road.centre_at(np.arange(0.0, 250.0)).curvature_per_m).max()) == pytest.approx(0.02)
@@ -42,7 +42,7 @@ def test_a_title_and_a_segment_make_a_road() -> None:
     road = parse_road(SHORT, source="x.yaml")
     assert road.start == (0.0, 0.0, 0.0)
     assert road.route_length_m == 100.0
-    assert road.lanes.edges_m == (-1.75, 1.75)
+    assert road.lanes.edges_at(0.0) == (-1.75, 1.75)
     assert road.rails == ()
 
 

@@ -15,7 +15,7 @@ from lavt.opendrive.lane_path import LanePath
 from lavt.opendrive.road_map import OpenDriveMap
 from lavt.opendrive.routes import find_route
 from lavt.vehicle.sim.road.road import Road, parse_road
-from lavt.vehicle.sim.road.road_file import MAX_COORDINATE_M, MAX_CURVATURE_PER_M, MAX_LENGTH_M, MIN_ROUTE_M
+from lavt.vehicle.sim.road.road_keys import MAX_COORDINATE_M, MAX_CURVATURE_PER_M, MAX_LENGTH_M, MIN_ROUTE_M
 
 STEP_M = 0.5
 MAX_WIDTH_CHANGE_M = 0.3
