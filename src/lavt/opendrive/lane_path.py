@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
-from lavt.opendrive.lanes import lane_edges, lane_point
+from lavt.opendrive.lanes import all_edges_m, lane_point
 from lavt.opendrive.road_map import CubicPieces, LaneSection, MapRoad, OpenDriveMap
 from lavt.opendrive.routes import LaneStep
 
@@ -52,7 +52,8 @@ class PathStep:
     def station_m(self, path_m: float) -> float:
         """Return the station of the road at a distance along the path."""
         along_m = min(max(path_m - self.begin_m, 0.0), self.end_m - self.begin_m)
-        return self.section.s_m + along_m if self.forward else self.section.end_m - along_m
+        station_m = self.section.s_m + along_m if self.forward else self.section.end_m - along_m
+        return min(max(station_m, self.section.s_m), self.section.end_m)
 
     def path_m(self, station_m: float) -> float:
         """Return the distance along the path at a station of the road."""
@@ -69,15 +70,13 @@ class PathStep:
         """Return the lane's width."""
         return lane_point(self.road, self.lane, self.station_m(path_m), self.section_index).width_m
 
-    def edge_offsets_m(self, path_m: float, lane: int) -> tuple[float, float]:
-        """Return the edges of any lane of the section as offsets from the path, left positive: inner, then outer."""
-        station_m = self.station_m(path_m)
-        where = f"road {self.road.number}"
-        own_inner, own_outer = lane_edges(self.section, self.lane, station_m, where)
-        centre_m = (own_inner[0] + own_outer[0]) / 2
-        inner, outer = lane_edges(self.section, lane, station_m, where)
+    def edge_offsets_m(self, path_m: float) -> dict[int, float]:
+        """Return the outer edge of every lane of the section, and lane 0, as offsets from the path, left positive."""
+        edges_m = all_edges_m(self.section, self.station_m(path_m))
+        inner_lane = self.lane - 1 if self.lane > 0 else self.lane + 1
+        centre_m = (edges_m[inner_lane] + edges_m[self.lane]) / 2
         sign = 1.0 if self.forward else -1.0
-        return sign * (inner[0] - centre_m), sign * (outer[0] - centre_m)
+        return {lane: sign * (edge_m - centre_m) for lane, edge_m in edges_m.items()}
 
     def breaks_m(self) -> Iterator[float]:
         """Yield the distances along the path at which the shape of the centre line may change."""

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from lavt.errors import UserError
 from lavt.opendrive.geometry import ReferencePoint, element_point
-from lavt.opendrive.road_map import LaneSection, MapRoad
+from lavt.opendrive.road_map import LaneSection, MapLane, MapRoad
 
 
 class LanePoint(NamedTuple):
@@ -64,13 +64,27 @@ def lane_edges(
     along_m = s_m - section.s_m
     inner = outer = (0.0, 0.0)
     for number in range(side, lane + side, side) if lane else ():
-        inner = outer
-        item = section.lanes[number]
-        if item.borders.cubics:
-            border_m, border_slope = item.borders.value_and_slope(along_m)
-            width_m, slope = side * (border_m - inner[0]), side * (border_slope - inner[1])
-        else:
-            width_m, slope = item.widths.value_and_slope(along_m)
-        if width_m > 0.0:
-            outer = inner[0] + side * width_m, inner[1] + side * slope
+        inner, outer = outer, _outer_edge(section.lanes[number], outer, side, along_m)
     return inner, outer
+
+
+def all_edges_m(section: LaneSection, s_m: float) -> dict[int, float]:
+    """Return the outer edges of all lanes of a section as distances to the left of lane 0, which is among them."""
+    edges_m = {0: 0.0}
+    for side in (1, -1):
+        edge, number = (0.0, 0.0), side
+        while number in section.lanes:
+            edge = _outer_edge(section.lanes[number], edge, side, s_m - section.s_m)
+            edges_m[number] = edge[0]
+            number += side
+    return edges_m
+
+
+def _outer_edge(lane: MapLane, inner: tuple[float, float], side: int, along_m: float) -> tuple[float, float]:
+    """Return the outer edge of a lane and its slope, from the inner edge and its slope."""
+    if lane.borders.cubics:
+        border_m, border_slope = lane.borders.value_and_slope(along_m)
+        width_m, slope = side * (border_m - inner[0]), side * (border_slope - inner[1])
+    else:
+        width_m, slope = lane.widths.value_and_slope(along_m)
+    return (inner[0] + side * width_m, inner[1] + side * slope) if width_m > 0.0 else inner

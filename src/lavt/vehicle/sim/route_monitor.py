@@ -261,7 +261,9 @@ class _EventMargin:
     def _changing_distance_m(self, position: RoadPosition) -> float:
         """Return the distance of a point from the nearest boundary whose offset changes along the road."""
         s_m, lateral_m, _ = position
-        offsets_m = [float(edge_m) for strip in self._tapered for edge_m in (strip.left_at(s_m), strip.right_at(s_m))]
+        # The body does not reach an end of a strip between two checks, so only the strips that it is beside count.
+        strips = [strip for strip in self._tapered if strip.from_m <= s_m <= strip.to_m]
+        offsets_m = [float(edge_m) for strip in strips for edge_m in (strip.left_at(s_m), strip.right_at(s_m))]
         if self._changing_lanes is not None:
             offsets_m += self._changing_lanes.edges_at(s_m)
         return min([abs(lateral_m - offset_m) for offset_m in offsets_m], default=math.inf)

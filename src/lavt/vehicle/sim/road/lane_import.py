@@ -8,18 +8,18 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
+from lavt.domain import FloatArray
 from lavt.errors import UserError
 from lavt.opendrive.clothoid_fit import fit_clothoids
 from lavt.opendrive.geometry import Clothoid
 from lavt.opendrive.lane_path import LanePath
 from lavt.opendrive.road_map import OpenDriveMap
 from lavt.opendrive.routes import find_route
+from lavt.vehicle.sim.road.lane_surroundings import Surroundings
 from lavt.vehicle.sim.road.road import Road, parse_road
 from lavt.vehicle.sim.road.road_keys import MAX_COORDINATE_M, MAX_CURVATURE_PER_M, MAX_LENGTH_M, MIN_ROUTE_M
 
 STEP_M = 0.5
-MAX_WIDTH_CHANGE_M = 0.3
-"""The largest difference of widths along the driven lane: a road has one width for each lane."""
 
 
 class ImportedRoad(NamedTuple):
@@ -44,28 +44,29 @@ def import_lanes(road_map: OpenDriveMap, start: tuple[str, int], goal: tuple[str
     path = LanePath(road_map, find_route(road_map, start, goal))
     _check_length(path)
     notes = list(road_map.ignored)
-    clothoids = fit_clothoids(path, MAX_CURVATURE_PER_M)
     first = path.mean_pose(0.0)
     shift_m = (0.0, 0.0)
     if max(abs(first.x_m), abs(first.y_m)) > MAX_COORDINATE_M:
         shift_m = (first.x_m, first.y_m)
         notes.append(f"the map's coordinates are too large: {first.x_m:.4f}, {first.y_m:.4f} m was subtracted")
-    width_m, width_note = _find_width(path)
-    notes += width_note
     name = PurePath(road_map.source).stem[:40]
-    keys = {
+    keys: dict[str, Any] = {
         "title": f"{name}: {start[0]},{start[1]} to {goal[0]},{goal[1]}"[:100],
         "origin": {
             "x_m": round(first.x_m - shift_m[0], 6),
             "y_m": round(first.y_m - shift_m[1], 6),
             "heading_rad": round(first.heading_rad, 10),
         },
-        "segments": [_segment_keys(clothoid) for clothoid in clothoids],
-        "lanes": {"widths_m": [width_m], "driven": 0},
+        "segments": [_segment_keys(clothoid) for clothoid in fit_clothoids(path, MAX_CURVATURE_PER_M)],
     }
+    source = f"the road of these lanes of {road_map.source}"
+    centre = parse_road(_to_yaml({**keys, "lanes": {"widths_m": [0.5]}}, "", []), source)
+    path_m = np.array(sample_path(path))
+    stations_m, deviation_m = _follow(path, path_m, centre, shift_m)
+    surroundings = Surroundings(path, centre, path_m, stations_m)
+    keys |= {"lanes": surroundings.lanes(), "paved": surroundings.paved(), "marks": surroundings.marks()}
     text = _to_yaml(keys, f"Imported from {PurePath(road_map.source).name!a}", notes)
-    road = parse_road(text, f"the road of these lanes of {road_map.source}")
-    return ImportedRoad(text, road, path, shift_m, _largest_deviation_m(path, road, shift_m), tuple(notes))
+    return ImportedRoad(text, parse_road(text, source), path, shift_m, deviation_m, tuple(notes))
 
 
 def _check_length(path: LanePath) -> None:
@@ -77,34 +78,22 @@ def _check_length(path: LanePath) -> None:
         raise UserError(f"the lanes are {path.length_m:.0f} m long: {MAX_LENGTH_M:.0f} m are enough, name fewer lanes")
 
 
-def _find_width(path: LanePath) -> tuple[float, list[str]]:
-    """Return the width of the driven lane, and a sentence if it varies."""
-    widths_m = [path.step(at_m).width_m(at_m) for at_m in sample_path(path)]
-    narrowest_m, widest_m = min(widths_m), max(widths_m)
-    if widest_m - narrowest_m > MAX_WIDTH_CHANGE_M:
-        raise UserError(
-            f"the lanes are {narrowest_m:.2f} to {widest_m:.2f} m wide, but a road of LAVT has one width: "
-            f"choose lanes whose width varies by at most {MAX_WIDTH_CHANGE_M} m"
-        )
-    width_m = round((narrowest_m + widest_m) / 2, 4)
-    if widest_m - narrowest_m < 0.001:
-        return width_m, []
-    return width_m, [f"the lanes are {narrowest_m:.2f} to {widest_m:.2f} m wide: the road is {width_m:.2f} m wide"]
-
-
 def sample_path(path: LanePath) -> list[float]:
     """Return distances along a path at steps of at most 0.5 m."""
     distances: list[float] = np.linspace(0.0, path.length_m, int(path.length_m / STEP_M) + 2).tolist()
     return distances
 
 
-def _largest_deviation_m(path: LanePath, road: Road, shift_m: tuple[float, float]) -> float:
+def _follow(path: LanePath, path_m: FloatArray, road: Road, shift_m: tuple[float, float]) -> tuple[FloatArray, float]:
+    """Return the stations of the road at distances along the path, and its largest distance from the path."""
     near_m = deviation_m = 0.0
-    for at_m in sample_path(path):
+    stations_m = []
+    for at_m in path_m.tolist():
         pose = path.pose(at_m)
         near_m, offset_m, _ = road.project(pose.x_m - shift_m[0], pose.y_m - shift_m[1], near_m)
         deviation_m = max(deviation_m, abs(offset_m))
-    return deviation_m
+        stations_m.append(near_m)
+    return np.maximum.accumulate(np.array(stations_m)), deviation_m
 
 
 def _segment_keys(clothoid: Clothoid) -> dict[str, float]:

@@ -23,6 +23,8 @@ MIN_ROUTE_M = 10.0
 MIN_DASH_M = 0.1
 """The shortest dash and gap. Shorter dashes would be invisible, and drawing hundreds of thousands takes minutes."""
 
+MAX_LANES, MAX_CHANGES, MAX_STRIPS, MAX_MARKS = 12, 300, 300, 1000
+
 MAX_COORDINATE_M = 100_000.0
 MAX_LENGTH_M = 20_000.0
 
@@ -72,15 +74,15 @@ class ChangeKeys(RoadFileKeys):
 
     from_m: Station
     to_m: Station
-    widths_m: Annotated[list[LaneWidth], Field(min_length=1, max_length=12)]
+    widths_m: Annotated[list[LaneWidth], Field(min_length=1, max_length=MAX_LANES)]
 
 
 class LaneKeys(RoadFileKeys):
     """The lanes of the driven direction."""
 
-    widths_m: Annotated[list[LaneWidth], Field(min_length=1, max_length=12)] = [3.5]
+    widths_m: Annotated[list[LaneWidth], Field(min_length=1, max_length=MAX_LANES)] = [3.5]
     driven: Index = 0
-    changes: Annotated[list[ChangeKeys], Field(max_length=200)] = []
+    changes: Annotated[list[ChangeKeys], Field(max_length=MAX_CHANGES)] = []
 
 
 class ShoulderKeys(RoadFileKeys):
@@ -146,8 +148,8 @@ class RoadFile(RoadFileKeys):
     run_out_m: RunLength = 100.0
     lane_keys: LaneKeys = Field(LaneKeys(), alias="lanes")
     shoulders: ShoulderKeys | None = None
-    paved: Annotated[list[PavedKeys], Field(max_length=100)] | None = None
-    marks: Annotated[list[MarkKeys], Field(max_length=200)] | None = None
+    paved: Annotated[list[PavedKeys], Field(max_length=MAX_STRIPS)] | None = None
+    marks: Annotated[list[MarkKeys], Field(max_length=MAX_MARKS)] | None = None
     rail_keys: Annotated[list[RailKeys], Field(max_length=100)] = Field([], alias="rails")
 
     @property
