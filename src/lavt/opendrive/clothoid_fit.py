@@ -24,6 +24,9 @@ MAX_DEVIATION_M = 0.04
 """The largest distance from the centre line, which is needed only where the map has a gap or a kink."""
 
 MIN_PIECE_M = 0.5
+SMOOTH_M = 8.0
+"""A gap or a kink is smoothed over at most this length."""
+
 MAX_PIECE_TURN_RAD = 1.5
 MAX_PIECES = 1000
 
@@ -35,10 +38,10 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(20)
 _SHARES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
 
 
-class _Piece(NamedTuple):
-    """A clothoid with its largest distance from the centre line; infinite if it is too tight."""
+class _Fit(NamedTuple):
+    """Clothoids with their largest distance from the centre line; infinite if one is too tight."""
 
-    clothoid: Clothoid
+    clothoids: list[Clothoid]
     deviation_m: float
 
 
@@ -54,25 +57,34 @@ class _Fitter:
         self.failed_at_m = 0.0
         """The middle of the last short interval without a clothoid."""
 
-    def fit(self, begin_m: float, end_m: float) -> list[Clothoid] | None:
-        """Return clothoids from one distance along the path to another, or None if there are none."""
+    def fit(self, begin_m: float, end_m: float) -> _Fit | None:
+        """Return clothoids from one distance along the path to another, or None if there are none.
+
+        Where the map has a gap, short clothoids would be nearer to it, but would swerve.
+        """
         self._made += 1
         if self._made > 4 * MAX_PIECES:
             raise UserError(f"the lanes need more than {MAX_PIECES} lines, arcs and clothoids: import fewer lanes")
-        piece = self._single(begin_m, end_m)
-        if piece.deviation_m <= TOLERANCE_M:
-            return [piece.clothoid]
+        whole = self._single(begin_m, end_m)
+        if whole.deviation_m <= TOLERANCE_M:
+            return whole
+        halves = None
         if end_m - begin_m >= 2 * MIN_PIECE_M:
             middle_m = (begin_m + end_m) / 2
             first = self.fit(begin_m, middle_m)
             second = None if first is None else self.fit(middle_m, end_m)
             if first is not None and second is not None:
-                return first + second
-        elif piece.deviation_m > MAX_DEVIATION_M:
+                deviation_m = max(first.deviation_m, second.deviation_m)
+                halves = _Fit(first.clothoids + second.clothoids, deviation_m)
+                if deviation_m <= TOLERANCE_M or end_m - begin_m > SMOOTH_M:
+                    return halves
+        if whole.deviation_m <= MAX_DEVIATION_M:
+            return whole
+        if halves is None and end_m - begin_m < 2 * MIN_PIECE_M:
             self.failed_at_m = (begin_m + end_m) / 2
-        return [piece.clothoid] if piece.deviation_m <= MAX_DEVIATION_M else None
+        return halves
 
-    def _single(self, begin_m: float, end_m: float) -> _Piece:
+    def _single(self, begin_m: float, end_m: float) -> _Fit:
         path = self._path
         begin, end = path.mean_pose(begin_m), path.mean_pose(end_m)
         clothoid = clothoid_between(begin, end)
@@ -81,13 +93,13 @@ class _Fitter:
         headings = [begin.heading_rad, *(pose.heading_rad for pose in samples), end.heading_rad]
         turned_rad = sum(abs(math.remainder(b - a, 2 * math.pi)) for a, b in itertools.pairwise(headings))
         if turned_rad > MAX_PIECE_TURN_RAD or not clothoid.length_m > 0.0:
-            return _Piece(clothoid, math.inf)
+            return _Fit([clothoid], math.inf)
         deviation_m = max(_distance_m(clothoid, begin, pose) for pose in samples)
         if tightest_per_m > self._max_curvature_per_m:
             if deviation_m <= TOLERANCE_M:
                 self.tightest_per_m = max(self.tightest_per_m, tightest_per_m)
-            return _Piece(clothoid, math.inf)
-        return _Piece(clothoid, deviation_m)
+            return _Fit([clothoid], math.inf)
+        return _Fit([clothoid], deviation_m)
 
 
 def fit_clothoids(path: LanePath, max_curvature_per_m: float) -> list[Clothoid]:
@@ -106,7 +118,7 @@ def fit_clothoids(path: LanePath, max_curvature_per_m: float) -> list[Clothoid]:
         fitted = fitter.fit(begin_m, end_m)
         if fitted is None:
             raise UserError(_why_not(path, fitter.failed_at_m, fitter.tightest_per_m, max_curvature_per_m))
-        clothoids += fitted
+        clothoids += fitted.clothoids
     clothoids = _join_equal(clothoids)
     if len(clothoids) > MAX_PIECES:
         raise UserError(f"the lanes need more than {MAX_PIECES} lines, arcs and clothoids: import fewer lanes")

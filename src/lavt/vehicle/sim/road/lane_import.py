@@ -20,6 +20,8 @@ from lavt.vehicle.sim.road.road import Road, parse_road
 from lavt.vehicle.sim.road.road_keys import MAX_COORDINATE_M, MAX_CURVATURE_PER_M, MAX_LENGTH_M, MIN_ROUTE_M
 
 STEP_M = 0.5
+MIN_WIDTH_M, MAX_WIDTH_M = 0.5, 20.0
+"""The narrowest and the widest driven lane."""
 
 
 class ImportedRoad(NamedTuple):
@@ -43,6 +45,7 @@ def import_lanes(road_map: OpenDriveMap, start: tuple[str, int], goal: tuple[str
     """
     path = LanePath(road_map, find_route(road_map, start, goal))
     _check_length(path)
+    _check_width(path)
     notes = list(road_map.ignored)
     first = path.mean_pose(0.0)
     shift_m = (0.0, 0.0)
@@ -76,6 +79,17 @@ def _check_length(path: LanePath) -> None:
         )
     if path.length_m > MAX_LENGTH_M:
         raise UserError(f"the lanes are {path.length_m:.0f} m long: {MAX_LENGTH_M:.0f} m are enough, name fewer lanes")
+
+
+def _check_width(path: LanePath) -> None:
+    for at_m in sample_path(path):
+        step = path.step(at_m)
+        width_m = step.width_m(at_m)
+        if not MIN_WIDTH_M <= width_m <= MAX_WIDTH_M:
+            raise UserError(
+                f"road {step.road.number} lane {step.lane} is {width_m:.2f} m wide at s={step.station_m(at_m):.1f} m: "
+                f"choose lanes of {MIN_WIDTH_M:g} to {MAX_WIDTH_M:g} m"
+            )
 
 
 def sample_path(path: LanePath) -> list[float]:
