@@ -1,4 +1,4 @@
-"""`lavt road`: draw roads, and import them from maps."""
+"""`lavt road`: draw roads, import them from maps, and export them as maps."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ def register(app: typer.Typer) -> None:
     road = typer.Typer(no_args_is_help=True, help="Draw roads; import and export OpenDRIVE maps.")
     road.command("draw")(draw)
     road.command("import")(import_road)
+    road.command("export")(export)
     app.add_typer(road, name="road")
 
 
@@ -81,3 +82,29 @@ def _parse_lane(option: str, text: str) -> tuple[str, int]:
     if not (comma and road and digits.isascii() and digits.isdigit() and len(digits) <= 9):
         raise UserError(f"{option} {text}: write the id of a road, a comma and the number of a lane, such as 37,-3")
     return road.strip(), int(lane)
+
+
+def export(
+    name: Annotated[
+        str, typer.Argument(metavar="FILE_OR_NAME", help="A road's YAML file, or the name of a shipped road.")
+    ],
+    out: Annotated[Path | None, typer.Option(help="Output file, an OpenDRIVE map; default: out/NAME.xodr.")] = None,
+) -> None:
+    """Write a road as an OpenDRIVE map (docs/opendrive.md).
+
+    Example: lavt road export a --out a.xodr
+    """
+    road = load_road(name)
+    out = out or Path("out") / f"{Path(name).stem}.xodr"
+    if out.suffix != ".xodr":
+        raise UserError(f"--out {out}: the name of an OpenDRIVE map must end with .xodr")
+    from lavt.vehicle.sim.road.opendrive_export import export_road  # noqa: PLC0415 (only this command needs it)
+
+    exported = export_road(road)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_text(exported.text, encoding="utf-8")
+    for note in exported.notes:
+        console.print_message(note)
+    console.print_result(
+        f"the map is {out}: the route is on road 1, lane {exported.lane}, from s={exported.start_m:g} m"
+    )
