@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 from lavt.opendrive.lanes import lane_point
 from lavt.opendrive.reader import read_map
 from lavt.opendrive.road_map import MapRoad, OpenDriveMap
+from lavt.vehicle.sim.road.lane_import import import_lanes, sample_path
 
 STEP_M = 0.5
 LARGE = 0.05
@@ -42,6 +43,32 @@ def compare(path: str, kinds: tuple[str, ...] = ("driving",)) -> Iterator[Differ
     for road in ours.roads.values():
         for lane, s_m in _places(road, kinds):
             yield _difference(ours, theirs, road, lane, s_m)
+
+
+def compare_import(path: str, start: tuple[str, int], goal: tuple[str, int]) -> Iterator[Difference]:
+    """Yield the differences of an imported road's centre and width, at steps of 0.5 m along the lanes."""
+    carla: Any = importlib.import_module("carla")
+    theirs = carla.Map("map", Path(path).read_text(encoding="utf-8"))
+    imported = import_lanes(read_map(path), start, goal)
+    road, near_m = imported.road, 0.0
+    for at_m in sample_path(imported.path):
+        step = imported.path.step(at_m)
+        s_m = step.station_m(at_m)
+        if min(s_m - step.section.s_m, step.section.end_m - s_m) < END_M:
+            continue
+        waypoint = theirs.get_waypoint_xodr(int(step.road.number), step.lane, s_m)
+        location = waypoint.transform.location
+        shift_x_m, shift_y_m = imported.shift_m
+        near_m, offset_m, heading_rad = road.project(location.x - shift_x_m, -location.y - shift_y_m, near_m)
+        yaw_rad = -math.radians(waypoint.transform.rotation.yaw)
+        yield Difference(
+            abs(offset_m),
+            abs(waypoint.lane_width - road.lanes.driven_width_at(near_m)),
+            abs(math.remainder(yaw_rad - heading_rad, 2 * math.pi)),
+            step.road.number,
+            step.lane,
+            s_m,
+        )
 
 
 def _places(road: MapRoad, kinds: tuple[str, ...]) -> Iterator[tuple[int, float]]:

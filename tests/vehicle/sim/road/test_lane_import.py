@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from lavt.errors import UserError
+from lavt.opendrive.lanes import lane_point
 from lavt.opendrive.reader import parse_map, read_map
 from lavt.opendrive.road_map import OpenDriveMap
 from lavt.vehicle.sim.road.lane_import import ImportedRoad, import_lanes, sample_path
@@ -87,3 +88,60 @@ def test_lanes_that_cannot_be_a_road_are_rejected(
     """Lanes that are too short or long, have gaps or kinks, or curve too tightly raise UserError with the place."""
     with pytest.raises(UserError, match=message):
         import_only_road(make_map(*geometries))
+
+
+def test_the_lanes_beside_the_driven_lane_are_imported() -> None:
+    """A turn lane that opens to the right is a lane that widens from 0 m, within 2 cm of the map."""
+    imported = import_lanes(HAMLET, ("1", -1), ("2", -1))
+    road = imported.road
+    assert road.lanes.driven == 0
+    map_road = HAMLET.road("1")
+    for s_m in (45.0, 50.0, 55.0, 60.0, 68.0):
+        near_m, offset_m, _ = road.project(*lane_point(map_road, -2, s_m)[:2], s_m)
+        right_m, line_m, left_m = road.lanes.edges_at(near_m)
+        assert (right_m + line_m) / 2 == pytest.approx(offset_m, abs=0.02)
+        assert line_m - right_m == pytest.approx(lane_point(map_road, -2, s_m).width_m, abs=0.02)
+        assert left_m - line_m == pytest.approx(3.5, abs=0.02)
+    assert road.lanes.edges_at(20.0)[:2] == pytest.approx((-1.75, -1.75), abs=0.01)
+
+
+def test_marks_and_asphalt_are_imported() -> None:
+    """Marks keep kind, colour and place; there is none where the map has none; asphalt lies under all lanes."""
+    road = import_lanes(HAMLET, ("1", -1), ("2", -1)).road
+
+    def marks_at(s_m: float) -> list[tuple[float, str, str]]:
+        there = [mark for mark in road.marks if mark.from_m <= s_m <= mark.to_m]
+        return sorted((round(float(mark.offset_at(s_m)), 1), mark.kind, mark.colour) for mark in there)
+
+    # The offsets are those of the marks, 1.75 m from the centre, and of the next lanes' edges at 5.25 m.
+    yellow = (1.8, "broken", "yellow")
+    assert marks_at(20.0) == [(-1.8, "solid", "white"), yellow, (5.2, "solid", "white")]
+    assert marks_at(66.0) == [(-5.2, "solid", "white"), (-1.8, "broken", "white"), yellow, (5.2, "solid", "white")]
+    assert marks_at(80.0) == [yellow], "within the junction, only the middle is marked"
+    for s_m, right_m in ((20.0, -1.8), (66.0, -5.2), (120.0, -5.2)):
+        for offset_m, is_asphalt in ((5.2, True), (5.4, False), (right_m, True), (right_m - 0.3, False)):
+            assert any(strip.contains(s_m, offset_m) for strip in road.paved) == is_asphalt, (s_m, offset_m)
+
+
+def test_a_driven_lane_of_changing_width_is_imported() -> None:
+    """A driven lane that narrows has the map's width, and its centre is the middle of the lane."""
+    lanes = LANES.replace('a="3.5" b="0"', 'a="3.5" b="-0.025"')
+    road = import_only_road(make_map(("<line/>", 40.0, 0.0, 0.0, 0.0), lanes=lanes)).road
+    assert [road.lanes.driven_width_at(s_m) for s_m in (0.0, 20.0, 40.0)] == pytest.approx([3.5, 3.0, 2.5], abs=0.01)
+    assert road.centre_at(40.0).y_m == pytest.approx(-1.25, abs=0.001)
+
+
+def test_lanes_on_the_inside_of_a_tight_turn_are_limited() -> None:
+    """Lanes beyond the middle of a turn's circle are cut off, so that the road is valid."""
+    lanes = "".join(LANES.replace("-1", str(-lane))[7:-8] for lane in (1, 2, 3, 4))
+    road_map = make_map(('<arc curvature="-0.08"/>', 15.0, 0.0, 0.0, 0.0), lanes=f"<right>{lanes}</right>")
+    road = import_only_road(road_map).road
+    radius_m = 12.5 - 1.75
+    assert -road.lanes.edges_at(5.0)[0] == pytest.approx(0.85 * radius_m, abs=0.05)
+
+
+def test_a_driven_lane_without_width_is_rejected() -> None:
+    """A driven lane that begins at a point raises UserError with the place."""
+    lanes = LANES.replace('a="3.5" b="0"', 'a="0" b="0.1"')
+    with pytest.raises(UserError, match=r"road 1 lane -1 is 0\.00 m wide at s=0\.0 m"):
+        import_only_road(make_map(("<line/>", 40.0, 0.0, 0.0, 0.0), lanes=lanes))

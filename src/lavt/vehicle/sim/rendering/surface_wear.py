@@ -61,9 +61,8 @@ def _patches(road: Road) -> tuple[dict[int, list[Strips]], Strips]:
         strip, first_m, last_m = strips[int(random.integers(len(strips)))]
         begin_m = random.uniform(first_m, last_m)
         end_m = min(begin_m + random.uniform(2.0, 16.0), last_m)
-        strip_left_m, strip_right_m = min(strip.lefts_m), max(strip.rights_m)
-        right_m = random.uniform(strip_right_m, max(strip_left_m - 2.0, strip_right_m))
-        left_m = min(right_m + random.uniform(1.0, 3.4), strip_left_m)
+        right_m = random.uniform(strip.right_m, max(strip.left_m - 2.0, strip.right_m))
+        left_m = min(right_m + random.uniform(1.0, 3.4), strip.left_m)
         darkening = sorted(by_darkening)[int(random.integers(len(by_darkening)))]
         by_darkening[darkening].append(strip_along(road, left_m, right_m, begin_m, end_m))
         seams += [
@@ -88,19 +87,19 @@ def _cracks(road: Road, name: str, width_m: float) -> Strips:
         else:
             ahead, left = random.normal(0.0, 0.10, steps), random.uniform(0.15, 0.40, steps)
         station = random.uniform(first_m, last_m) + np.cumsum(ahead)
-        offset = random.uniform(max(strip.rights_m), min(strip.lefts_m)) + np.cumsum(left)
-        inside = (offset < min(strip.lefts_m)) & (station > first_m) & (station < last_m)
+        offset = random.uniform(strip.right_m, strip.left_m) + np.cumsum(left)
+        inside = (offset < strip.left_m) & (station > first_m) & (station < last_m)
         if inside.sum() > 2:
             cracks.append(_line(road.point_at(station[inside], offset[inside]), width_m))
     return join_strips(cracks)
 
 
 def _wearing_strips(road: Road) -> list[tuple[PavedArea, float, float]]:
-    """Return the strips of asphalt that have a part of constant width, each with its ends on the road."""
+    """Return the strips of asphalt of constant width, each with its ends on the road."""
     return [
         (strip, max(strip.from_m, road.first_m), min(strip.to_m, road.last_m))
         for strip in road.paved
-        if max(strip.rights_m) < min(strip.lefts_m)
+        if not strip.is_tapered
     ]
 
 
