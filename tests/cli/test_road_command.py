@@ -109,6 +109,7 @@ def test_ignored_content_of_a_map_is_named(run: Run, tmp_path: Path) -> None:
         (["import", "HAMLET", "--from", "1,-1", "--to", "2,-1", "--out", "x.txt"], "must end with .yaml"),
         (["export", "nowhere"], "'nowhere'"),
         (["export", "a", "--out", "a.xml"], "must end with .xodr"),
+        (["export", "a", "--out", "/dev/null/a.xodr"], "cannot be written"),
     ],
 )
 def test_bad_input_of_import_and_export(run: Run, arguments: list[str], reason: str) -> None:

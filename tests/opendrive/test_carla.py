@@ -29,7 +29,7 @@ def test_driving_lanes_agree_with_carla(path: Path) -> None:
 
 
 def test_an_imported_road_agrees_with_carla() -> None:
-    """At steps of 0.5 m, the centre and the width of an imported road are within 5 cm of CARLA's, in both directions."""
+    """At steps of 0.5 m, the centre and the width of an imported road are within 5 cm of CARLA's, both ways."""
     need_carla()
     for start, goal in ((("1", -1), ("3", 1)), (("2", 1), ("1", 1))):
         check_differences(list(compare_import(str(HAMLET), start, goal)))

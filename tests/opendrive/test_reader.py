@@ -67,7 +67,7 @@ def test_ignored_content_is_named() -> None:
         ('id="1"', f'id="{"1" * 65}"', "at most 64"),
         ('a="3"', 'a="1_0"', "write a number"),
         ('id="-1"', 'id="-1.5"', "write a whole number"),
-        ("</lane></right>", "</lane>" + "".join(f'<lane id="-{n}"/>' for n in range(2, 300)) + "</right>", "200 lanes"),
+        ("</lane></right>", "</lane>" + "".join(f'<lane id="-{n}"/>' for n in range(2, 300)) + "</right>", "64 lanes"),
         ('id="-1"', 'id="-2"', "no lane -1"),
         ('id="-1"', 'id="1"', "wrong side"),
         ("<planView>", "<link><successor elementType='river' elementId='2'/></link><planView>", "elementType='river'"),

@@ -65,8 +65,7 @@ def import_road(
     from lavt.vehicle.sim.road.lane_import import import_lanes  # noqa: PLC0415 (the same)
 
     imported = import_lanes(read_map(file), start_lane, goal_lane)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(imported.text, encoding="utf-8")
+    _write(out, imported.text)
     for note in imported.notes:
         console.print_message(note)
     console.print_result(
@@ -101,10 +100,17 @@ def export(
     from lavt.vehicle.sim.road.opendrive_export import export_road  # noqa: PLC0415 (only this command needs it)
 
     exported = export_road(road)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(exported.text, encoding="utf-8")
+    _write(out, exported.text)
     for note in exported.notes:
         console.print_message(note)
     console.print_result(
         f"the map is {out}: the route is on road 1, lane {exported.lane}, from s={exported.start_m:g} m"
     )
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise UserError(f"{path} cannot be written ({error.strerror}): name another file with --out") from error

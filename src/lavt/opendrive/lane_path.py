@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
-from lavt.opendrive.lanes import all_edges_m, lane_point
+from lavt.opendrive.lanes import all_edges_m, lane_edges, lane_point
 from lavt.opendrive.road_map import CubicPieces, LaneSection, MapRoad, OpenDriveMap
 from lavt.opendrive.routes import LaneStep
 
@@ -68,7 +68,8 @@ class PathStep:
 
     def width_m(self, path_m: float) -> float:
         """Return the lane's width."""
-        return lane_point(self.road, self.lane, self.station_m(path_m), self.section_index).width_m
+        inner, outer = lane_edges(self.section, self.lane, self.station_m(path_m), f"road {self.road.number}")
+        return abs(outer[0] - inner[0])
 
     def edge_offsets_m(self, path_m: float) -> dict[int, float]:
         """Return the outer edge of every lane of the section, and lane 0, as offsets from the path, left positive."""

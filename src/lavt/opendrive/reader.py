@@ -23,7 +23,7 @@ from lavt.opendrive.road_map import (
 from lavt.opendrive.xml_tree import parse_xml, read_file, read_id, read_integer, read_number, read_text
 
 MAX_LENGTH_M = 1_000_000.0
-MAX_LANES = 200
+MAX_LANES = 64
 """The largest number of lanes of a lane section: more would take too long to compute."""
 
 MAX_TURN_RAD = 100.0

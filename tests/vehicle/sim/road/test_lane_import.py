@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+import re
 from pathlib import Path
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from lavt.errors import UserError
 from lavt.opendrive.lanes import lane_point
@@ -13,7 +17,8 @@ from lavt.opendrive.reader import parse_map, read_map
 from lavt.opendrive.road_map import OpenDriveMap
 from lavt.vehicle.sim.road.lane_import import ImportedRoad, import_lanes, sample_path
 
-HAMLET = read_map(str(Path(__file__).parents[3] / "opendrive" / "data" / "hamlet.xodr"))
+HAMLET_FILE = Path(__file__).parents[3] / "opendrive" / "data" / "hamlet.xodr"
+HAMLET = read_map(str(HAMLET_FILE))
 LANES = '<right><lane id="-1" type="driving"><width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane></right>'
 
 
@@ -145,3 +150,23 @@ def test_a_driven_lane_without_width_is_rejected() -> None:
     lanes = LANES.replace('a="3.5" b="0"', 'a="0" b="0.1"')
     with pytest.raises(UserError, match=r"road 1 lane -1 is 0\.00 m wide at s=0\.0 m"):
         import_only_road(make_map(("<line/>", 40.0, 0.0, 0.0, 0.0), lanes=lanes))
+
+
+NUMBERS = re.findall(rb'="(-?[0-9][0-9.e-]*)"', HAMLET_FILE.read_bytes())
+
+
+@given(
+    index=st.integers(0, len(NUMBERS) - 1),
+    value=st.sampled_from([b"0", b"-1", b"1e9", b"-1e9", b"1e-9", b"nan", b"3", b"1000", b"0.3"]),
+    goal=st.sampled_from([("3", 1), ("2", -1)]),
+)
+@settings(max_examples=25)
+def test_maps_with_a_wrong_number_raise_nothing_but_user_errors(
+    index: int, value: bytes, goal: tuple[str, int]
+) -> None:
+    """A map in which one number is replaced is imported as a valid road, or raises UserError."""
+    matches = list(re.finditer(rb'="(-?[0-9][0-9.e-]*)"', HAMLET_FILE.read_bytes()))
+    begin, end = matches[index].span(1)
+    content = HAMLET_FILE.read_bytes()
+    with contextlib.suppress(UserError):
+        import_lanes(parse_map(content[:begin] + value + content[end:], "m.xodr"), ("1", -1), goal)

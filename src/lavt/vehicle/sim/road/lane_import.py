@@ -17,7 +17,14 @@ from lavt.opendrive.road_map import OpenDriveMap
 from lavt.opendrive.routes import find_route
 from lavt.vehicle.sim.road.lane_surroundings import Surroundings
 from lavt.vehicle.sim.road.road import Road, parse_road
-from lavt.vehicle.sim.road.road_keys import MAX_COORDINATE_M, MAX_CURVATURE_PER_M, MAX_LENGTH_M, MIN_ROUTE_M
+from lavt.vehicle.sim.road.road_keys import (
+    MAX_COORDINATE_M,
+    MAX_CURVATURE_PER_M,
+    MAX_LENGTH_M,
+    MAX_MARKS,
+    MAX_STRIPS,
+    MIN_ROUTE_M,
+)
 
 STEP_M = 0.5
 MIN_WIDTH_M, MAX_WIDTH_M = 0.5, 20.0
@@ -68,6 +75,8 @@ def import_lanes(road_map: OpenDriveMap, start: tuple[str, int], goal: tuple[str
     stations_m, deviation_m = _follow(path, path_m, centre, shift_m)
     surroundings = Surroundings(path, centre, path_m, stations_m)
     keys |= {"lanes": surroundings.lanes(), "paved": surroundings.paved(), "marks": surroundings.marks()}
+    if len(keys["marks"]) > MAX_MARKS or max(len(keys["paved"]), len(keys["lanes"].get("changes", ()))) > MAX_STRIPS:
+        raise UserError("the lanes have more marks or changes of widths than a road file can hold: name fewer lanes")
     text = _to_yaml(keys, f"Imported from {PurePath(road_map.source).name!a}", notes)
     return ImportedRoad(text, parse_road(text, source), path, shift_m, deviation_m, tuple(notes))
 
