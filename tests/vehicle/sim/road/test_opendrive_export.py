@@ -16,7 +16,7 @@ from lavt.vehicle.sim.road.opendrive_export import ExportedRoad, export_road
 from lavt.vehicle.sim.road.road import Road, load_road, parse_road
 
 WIDENING = """
-title: '"widening" & <bending>'
+title: "\\"widening\\" & <bending>\\a"
 segments:
   - {length_m: 15, end_curvature_per_m: 0.05}
   - {length_m: 20, curvature_per_m: 0.05}

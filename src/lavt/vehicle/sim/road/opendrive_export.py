@@ -49,10 +49,11 @@ def export_road(road: Road) -> ExportedRoad:
         right += _lane(-1 - len(widths), "shoulder", shoulders[1], "")
     offsets = _entries(road, knots_m, [road.lanes.edges_at(s_m)[-1] for s_m in knots_m])
     offset_elements = "".join(f"<laneOffset s={_number(s_m)} {_cubic(a, b)}/>\n" for s_m, a, b in offsets)
+    name = quoteattr("".join(filter(str.isprintable, road.title)))  # XML cannot hold control characters
     text = f"""<?xml version="1.0" encoding="UTF-8"?>
 <OpenDRIVE>
-<header revMajor="1" revMinor="4" name={quoteattr(road.title)} version="1.00"/>
-<road name={quoteattr(road.title)} length={_number(length_m)} id="1" junction="-1">
+<header revMajor="1" revMinor="4" name={name} version="1.00"/>
+<road name={name} length={_number(length_m)} id="1" junction="-1">
 <link/>
 <type s="0" type="town"/>
 <planView>
