@@ -51,6 +51,7 @@ class _Samples:
     """The outer edge of each lane, and lane 0."""
 
     def is_paved(self, lane: int) -> bool:
+        """Return whether a lane is asphalt; the driven one always is."""
         return lane == self.step.lane or self.step.section.lanes[lane].kind in _PAVED_KINDS
 
     def between(self, first_m: float, last_m: float, values: FloatArray) -> tuple[FloatArray, FloatArray]:
