@@ -68,3 +68,50 @@ def test_a_run_accepts_the_path_of_a_road(bend: Path) -> None:
     bend.write_text("title: x")
     with pytest.raises(UserError, match="'segments'"):
         plan_run(RunConfig(vehicle=VehicleConfig(route=str(bend), scenery="none")))
+
+
+HAMLET = Path(__file__).parents[1] / "opendrive" / "data" / "hamlet.xodr"
+
+
+def test_a_road_is_imported_and_exported(run: Run, tmp_path: Path) -> None:
+    """`lavt road import` writes a road file that can be loaded, and `lavt road export` writes it as a map again."""
+    road, map_file = tmp_path / "new" / "hamlet.yaml", tmp_path / "hamlet.xodr"
+    code, printed, notes = run("road", "import", str(HAMLET), "--from", "1,-1", "--to", "3,1", "--out", str(road))
+    assert (code, notes) == (0, "")
+    assert f"the road is {road}: 149.9 m" in printed
+    assert load_road(str(road)).route_length_m == pytest.approx(149.9, abs=0.1)
+    code, printed, _ = run("road", "export", str(road), "--out", str(map_file))
+    assert (code, "road 1, lane -1, from s=20 m" in printed) == (0, True)
+    assert run("road", "import", str(map_file), "--from", "1,-1", "--to", "1,-1", "--out", str(road)).code == 0
+
+
+def test_ignored_content_of_a_map_is_named(run: Run, tmp_path: Path) -> None:
+    """What an import ignores is said on standard error and in the road file."""
+    path = tmp_path / "hills.xodr"
+    hill = '<elevationProfile><elevation s="0" a="1" b="0" c="0" d="0"/></elevationProfile><lanes>'
+    path.write_text(HAMLET.read_text().replace("<lanes>", hill, 1))
+    out = tmp_path / "road.yaml"
+    result = run("road", "import", str(path), "--from", "1,-1", "--to", "1,-1", "--out", str(out))
+    assert (result.code, result.err) == (0, "elevation is ignored (1 of 5 roads have it): all roads are read as flat\n")
+    assert "# elevation is ignored" in out.read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["import", "none.xodr", "--from", "1,-1", "--to", "2,-1"], "cannot be read"),
+        (["import", "HAMLET", "--from", "1", "--to", "2,-1"], "--from 1: write the id of a road, a comma"),
+        (["import", "HAMLET", "--from", "1,-1", "--to", "2,x"], "--to 2,x: write"),
+        (["import", "HAMLET", "--from", "1,-1", "--to", "9,-1"], "no road 9"),
+        (["import", "HAMLET", "--from", "1,-9", "--to", "2,-1"], "no lane -9"),
+        (["import", "HAMLET", "--from", "2,-1", "--to", "1,-1"], "no way leads"),
+        (["import", "HAMLET", "--from", "1,-2", "--to", "2,-2"], "is 0.00 m wide"),
+        (["import", "HAMLET", "--from", "1,-1", "--to", "2,-1", "--out", "x.txt"], "must end with .yaml"),
+        (["export", "nowhere"], "'nowhere'"),
+        (["export", "a", "--out", "a.xml"], "must end with .xodr"),
+        (["export", "a", "--out", "/dev/null/a.xodr"], "cannot be written"),
+    ],
+)
+def test_bad_input_of_import_and_export(run: Run, arguments: list[str], reason: str) -> None:
+    """A bad file, lane or output name gives one sentence and exit code 2."""
+    assert reason in run("road", *(str(HAMLET) if word == "HAMLET" else word for word in arguments)).rejection()

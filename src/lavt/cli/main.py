@@ -52,7 +52,7 @@ GROUPS = {
         "rendezvous": "Forward the video of a vehicle behind NAT to its clients.",
     },
     "Vehicle, camera and road": {
-        "road": "Draw roads: shipped ones and your own.",
+        "road": "Draw roads; import and export OpenDRIVE maps.",
         "perception": "Inspect lane detection.",
         "software-car": "Simulate a car with a by-wire kit on a CAN bus.",
         "can": "Inspect drive-by-wire CAN buses (docs/can.md).",

@@ -190,6 +190,30 @@ rails: [{offset_m: -6, from_m: 40}]
 """
 
 
+NARROWING = """
+title: narrowing
+segments: [{length_m: 100}]
+lanes: {widths_m: [3.5], changes: [{from_m: 20, to_m: 60, widths_m: [2.5]}]}
+shoulders: {left_m: 0, right_m: 0}
+"""
+
+
+def test_a_car_leaves_a_lane_that_narrows() -> None:
+    """A car beside the centre of a narrowing lane invades the next one where the lane's edge reaches its body, and is
+    off the road where the asphalt's edge reaches its middle.
+    """
+    road = parse_road(NARROWING, source="x")
+    events = events_along(road, [(10.0 + step / 10, -0.5) for step in range(400)])
+    assert kinds(events) == ["lane_invasion"]
+    corner_m = 0.5 + CAR.body_width_m / 2
+    front_m = 20.0 + 40.0 * (1.75 - corner_m) / 0.5  # half the width falls by 0.5 m over 40 m
+    assert 10.0 + events[0].mono_ns / 1e4 == pytest.approx(front_m - CAR.rear_axle_to_front_m, abs=0.11)
+    off_road = events_along(road, [(10.0 + step / 10, -1.5) for step in range(400)])
+    middle_m = 20.0 + 40.0 * (1.75 - 1.5) / 0.5 - (CAR.rear_axle_to_front_m - CAR.rear_axle_to_rear_m) / 2
+    (left,) = [event for event in off_road if event.kind == "off_road"]
+    assert 10.0 + left.mono_ns / 1e4 == pytest.approx(middle_m, abs=0.11)
+
+
 def test_grass_before_a_rail_is_off_road() -> None:
     """Grass between the asphalt and a rail is off the road."""
     road = parse_road(OPEN_RAIL, source="x")
@@ -259,7 +283,16 @@ segments:
   - {length_m: 20, curvature_per_m: -0.05}
 rails: [{offset_m: -5, to_m: 50}, {offset_m: 6, kind: barrier, from_m: 20}]
 """
-ROADS = [load_road("a_key"), *(parse_road(text, source="x") for text in (OPEN_RAIL, WINDING))]
+TAPERING = f"""
+{WINDING}
+lanes:
+  widths_m: [3.5, 3.2, 0]
+  driven: 1
+  changes:
+    - {{from_m: 10, to_m: 25, widths_m: [3.5, 2.6, 0]}}
+    - {{from_m: 25, to_m: 32, widths_m: [2, 4, 3]}}
+"""
+ROADS = [load_road("a_key"), *(parse_road(text, source="x") for text in (OPEN_RAIL, WINDING, TAPERING))]
 STEPS = st.tuples(st.floats(-0.3, 0.6), st.floats(-0.3, 0.3), st.floats(-0.1, 0.1))
 
 

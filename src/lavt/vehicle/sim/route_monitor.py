@@ -98,8 +98,7 @@ class RouteMonitor:
         progress_m, lateral_m, heading_rad = self._road.project(motion.x_m, motion.y_m, self._near_station_m)
         self._near_station_m = progress_m
         *corners, middle = self._project_points(motion, (*self._corners, self._middle))
-        offsets_m = [corner_lateral_m for _, corner_lateral_m, _ in corners]
-        events = self._lane_events(max(offsets_m), min(offsets_m), at_ns)
+        events = self._lane_events(corners, at_ns)
         self.contacts, touched_rail = self._find_contacts(corners)
         if touched_rail is not None:
             if self._last_contact_ns is None or at_ns - self._last_contact_ns > CONTACT_GAP_NS:
@@ -129,13 +128,16 @@ class RouteMonitor:
             for ahead, left in points
         ]
 
-    def _lane_events(self, left_m: float, right_m: float, at_ns: int) -> list[VehicleEvent]:
+    def _lane_events(self, corners: Sequence[RoadPosition], at_ns: int) -> list[VehicleEvent]:
         """Return an event for each edge of the body that has changed lanes; the rightmost lane has number 1.
 
         An edge that is exactly on a line has not crossed the line.
         """
-        edges_m = self._road.lanes.edges_m
-        lanes = (bisect_left(edges_m, left_m), bisect_right(edges_m, right_m))
+        edges_at = self._road.lanes.edges_at
+        lanes = (
+            max([bisect_left(edges_at(s_m), offset_m) for s_m, offset_m, _ in corners]),
+            min([bisect_right(edges_at(s_m), offset_m) for s_m, offset_m, _ in corners]),
+        )
         previous_lanes, self._lanes = self._lanes, lanes
         if previous_lanes is None:
             return []
@@ -170,10 +172,7 @@ class RouteMonitor:
 
     def _on_asphalt(self, position: RoadPosition) -> bool:
         s_m, lateral_m, _ = position
-        return any(
-            strip.right_m <= lateral_m <= strip.left_m and strip.from_m <= s_m <= strip.to_m
-            for strip in self._road.paved
-        )
+        return any(strip.contains(s_m, lateral_m) for strip in self._road.paved)
 
 
 class _EventMargin:
@@ -185,13 +184,20 @@ class _EventMargin:
     When a point of the body moves by d, its station changes by at most d / `_station_scale`, because on the inside of a
     curve a metre covers more than a metre of stations. The point's lateral offset changes by at most the sum of two
     distances: the point's movement across the direction that the road had at the last check, and the distance by which
-    the road bends away from that direction along the movement.
+    the road bends away from that direction along the movement. If a boundary's offset changes along the road, the
+    distance to it changes, in addition, by at most its largest slope times the change of the station.
     """
 
     def __init__(self, road: Road, body_reach_m: float) -> None:
         self._body_reach_m = body_reach_m
-        edges_m = [*road.lanes.edges_m, *itertools.chain(*((strip.left_m, strip.right_m) for strip in road.paved))]
-        self._offsets_m = sorted({*edges_m, *(rail.offset_m for rail in road.rails)})
+        lanes, tapered = road.lanes, tuple(strip for strip in road.paved if strip.is_tapered)
+        self._changing_lanes = lanes if lanes.changes else None
+        self._tapered = tapered
+        offsets_m = {edge_m for strip in road.paved if not strip.is_tapered for edge_m in (strip.left_m, strip.right_m)}
+        if self._changing_lanes is None:
+            offsets_m.update(lanes.edges_at(0.0))
+        self._offsets_m = sorted({*offsets_m, *(rail.offset_m for rail in road.rails)})
+        """The boundaries whose offset does not change."""
         asphalt_ends_m = [end_m for strip in road.paved for end_m in (strip.from_m, strip.to_m)]
         rail_ends_m = [end_m for rail in road.rails for end_m in (rail.from_m, rail.to_m)]
         self._stations_m = sorted({road.route_length_m, *filter(math.isfinite, asphalt_ends_m)})
@@ -200,12 +206,18 @@ class _EventMargin:
             max((rail.offset_m for rail in road.rails if rail.offset_m < 0.0), default=-math.inf),
             min((rail.offset_m for rail in road.rails if rail.offset_m >= 0.0), default=math.inf),
         )
-        max_offset_m = max(abs(self._offsets_m[0]), abs(self._offsets_m[-1])) + body_reach_m
+        tapered_ends_m = [offset_m for strip in tapered for offset_m in (*strip.lefts_m, *strip.rights_m)]
+        lane_ends_m = [edge_m for s_m in lanes.knots_m for edge_m in lanes.edges_at(s_m)]
+        reached_m = [*self._offsets_m, *tapered_ends_m, *lane_ends_m]
+        max_offset_m = max(map(abs, reached_m)) + body_reach_m
         max_curvature_per_m = max(
             max(abs(segment.curvature_per_m), abs(segment.end_curvature_per_m)) for segment in road.segments
         )
         self._station_scale = 1.0 - max_curvature_per_m * max_offset_m
         self._bend_per_m = max_curvature_per_m / self._station_scale if self._station_scale > 0.0 else math.inf
+        slope = max([lanes.max_slope, *(strip.max_slope for strip in tapered)])
+        self._shift_per_m = slope / self._station_scale if self._station_scale > 0.0 else math.inf
+        """By how much the offset of a boundary changes at most while the body moves by a metre."""
         self._reference_pose = (math.inf, math.inf, 0.0)
         self._across_direction = (0.0, 1.0)
         self._heading_spread_rad = 0.0
@@ -221,6 +233,8 @@ class _EventMargin:
         self._heading_spread_rad = max([abs(heading_rad - road_rad) for _, _, heading_rad in positions])
         offsets_m = self._offsets_m
         self._across_margin_m = min([_distance_m(offsets_m, lateral_m) for _, lateral_m, _ in positions])
+        if self._shift_per_m:
+            self._across_margin_m = min([self._across_margin_m, *map(self._changing_distance_m, positions)])
         right_m, left_m = self._between_rails_m
         is_between_rails = all(right_m < lateral_m < left_m for _, lateral_m, _ in positions)
         stations_m = self._stations_m if is_between_rails else self._stations_and_rail_ends_m
@@ -241,7 +255,18 @@ class _EventMargin:
             + moved_m * self._heading_spread_rad
             + turned_m
         )
+        across_m += self._shift_per_m * max_moved_m
         return across_m + self._bend_per_m * max_moved_m * max_moved_m / 2 < self._across_margin_m
+
+    def _changing_distance_m(self, position: RoadPosition) -> float:
+        """Return the distance of a point from the nearest boundary whose offset changes along the road."""
+        s_m, lateral_m, _ = position
+        # The body does not reach an end of a strip between two checks, so only the strips that it is beside count.
+        strips = [strip for strip in self._tapered if strip.from_m <= s_m <= strip.to_m]
+        offsets_m = [float(edge_m) for strip in strips for edge_m in (strip.left_at(s_m), strip.right_at(s_m))]
+        if self._changing_lanes is not None:
+            offsets_m += self._changing_lanes.edges_at(s_m)
+        return min([abs(lateral_m - offset_m) for offset_m in offsets_m], default=math.inf)
 
 
 def _distance_m(boundaries_m: Sequence[float], at_m: float) -> float:

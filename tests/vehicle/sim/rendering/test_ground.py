@@ -46,3 +46,18 @@ def test_a_distant_mark_fades_with_its_width(width_m: float, share: float) -> No
         np.median(brightness(road, s_m, 2.0, level)) - np.median(brightness(road, s_m, 0.0, level)) for level in (0, 4)
     )
     assert far / near == pytest.approx(share, abs=0.15)
+
+
+def test_a_mark_follows_its_changing_offset() -> None:
+    """A mark whose offset changes from 2 to 0 m is painted half-way at 1 m, and asphalt ends where it narrows."""
+    text = """
+title: taper
+segments: [{length_m: 60}]
+paved: [{left_m: 6, right_m: -2, from_m: -20, to_m: 60, to_left_m: 2}, {left_m: 2, right_m: -2, from_m: 60}]
+marks: [{offset_m: 2, from_m: 10, to_m: 50, to_offset_m: 0, width_m: 0.3}]
+"""
+    road = parse_road(text, source="x")
+    there, before, after = (brightness(road, np.array([s_m]), 1.0, 1)[0] for s_m in (30.0, 20.0, 40.0))
+    assert there > max(before, after) + 40
+    strip = road.paved[0]
+    assert [strip.contains(20.0, offset_m) for offset_m in (3.9, 4.1)] == [True, False]

@@ -7,15 +7,15 @@ import pytest
 
 from lavt.domain import CameraModel, Lane, Pose
 from lavt.vehicle.sim.rendering.lane_camera import LaneCamera
-from lavt.vehicle.sim.road.road import Road, load_road
+from lavt.vehicle.sim.road.road import Road, load_road, parse_road
 
 ROAD = load_road("a_key")
 S_M = 5.0
 
 
-def camera(*, model: CameraModel = CameraModel(), **keys: int) -> LaneCamera:  # noqa: B008 (frozen)
+def camera(*, model: CameraModel = CameraModel(), road: Road = ROAD, **keys: int) -> LaneCamera:  # noqa: B008 (frozen)
     return LaneCamera(
-        model=model, rate_hz=30.0, phase_ns=0, road=ROAD, near_m=3.6, far_m=20.0, half_width_m=7.0, **keys
+        model=model, rate_hz=30.0, phase_ns=0, road=road, near_m=3.6, far_m=20.0, half_width_m=7.0, **keys
     )
 
 
@@ -96,3 +96,12 @@ def test_an_exposed_lane_is_that_of_the_middle_of_the_exposure() -> None:
     assert expected is not None
     assert (frame.number, frame.capture_ns) == (3, 5_000_000)
     assert frame.picture.lane.centre == pytest.approx(expected.picture.lane.centre)
+
+
+def test_the_width_of_the_lane_is_that_at_the_car() -> None:
+    """On a lane that narrows, the camera reports the width at the car's station."""
+    text = "title: x\nsegments: [{length_m: 100}]\nlanes: {changes: [{from_m: 20, to_m: 60, widths_m: [2.5]}]}"
+    road = parse_road(text, source="x")
+    lane_camera = camera(road=road)
+    widths_m = [lane_camera.observe_lane(pose_at(s_m, road=road)).width_m for s_m in range(10, 71, 10)]
+    assert widths_m == pytest.approx([3.5, 3.5, 3.25, 3.0, 2.75, 2.5, 2.5])

@@ -46,7 +46,7 @@ def test_a_route_has_the_shape_of_the_map(name: str) -> None:
 def test_a_route_has_the_lanes_of_the_map(name: str) -> None:
     """A route has the four lanes, shoulders, barrier and rails of the map, and the third lane is driven."""
     road = load_road(name)
-    assert (road.lanes.edges_m, road.lanes.driven) == ((-5.25, -1.75, 1.75, 5.25, 8.75), 2)
+    assert (road.lanes.edges_at(0.0), road.lanes.driven) == ((-5.25, -1.75, 1.75, 5.25, 8.75), 2)
     assert [(strip.left_m, strip.right_m) for strip in road.paved] == [(12.25, -8.75), (33.25, 12.25)]
     assert {mark.offset_m for mark in road.marks if mark.colour == "yellow"} == {8.75, 15.75}
     assert {mark.offset_m for mark in road.marks if mark.kind == "broken"} >= {5.25, 1.75, -1.75}

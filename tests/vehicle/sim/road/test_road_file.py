@@ -21,7 +21,7 @@ def test_the_documented_example_is_a_valid_road() -> None:
     assert len(text[1].splitlines()) <= 10
     road = parse_road(text[1], source="my_bend.yaml")
     assert (road.route_length_m, road.first_m, road.last_m) == (250.0, -20.0, 350.0)
-    assert road.lanes.edges_m == (-1.75, 1.75, 5.25)
+    assert road.lanes.edges_at(0.0) == (-1.75, 1.75, 5.25)
     assert [(mark.offset_m, mark.kind) for mark in road.marks] == [(-1.75, "solid"), (1.75, "broken"), (5.25, "solid")]
     assert [(strip.left_m, strip.right_m) for strip in road.paved] == [(5.75, -2.25)]
     assert float(np.abs(road.centre_at(np.arange(0.0, 250.0)).curvature_per_m).max()) == pytest.approx(0.02)
@@ -42,8 +42,28 @@ def test_a_title_and_a_segment_make_a_road() -> None:
     road = parse_road(SHORT, source="x.yaml")
     assert road.start == (0.0, 0.0, 0.0)
     assert road.route_length_m == 100.0
-    assert road.lanes.edges_m == (-1.75, 1.75)
+    assert road.lanes.edges_at(0.0) == (-1.75, 1.75)
     assert road.rails == ()
+
+
+def test_asphalt_and_marks_follow_lanes_that_change() -> None:
+    """By default, asphalt and marks follow the lanes' edges; a lane without width has no mark."""
+    road = parse_road(SHORT + CHANGE, source="x.yaml")
+    assert road.lanes.edges_at(35.0) == pytest.approx((-2.125, -1.625, 1.625))
+    assert [(mark.kind, *mark.offsets_m) for mark in road.marks if mark.from_m == 20.0] == [
+        ("solid", -1.75, -2.5),
+        ("broken", -1.75, -1.5),
+        ("solid", 1.75, 1.5),
+    ]
+    assert [mark.kind for mark in road.marks if mark.to_m == 20.0] == ["solid", "solid"]
+    assert [(strip.lefts_m, strip.rights_m) for strip in road.paved] == [
+        ((2.25, 2.25), (-2.25, -2.25)),
+        ((2.25, 2.0), (-2.25, -3.0)),
+        ((2.0, 2.0), (-3.0, -3.0)),
+    ]
+    part = road.sub_route("x", 30.0, 20.0)
+    assert part.lanes.edges_at(5.0) == pytest.approx(road.lanes.edges_at(35.0))
+    np.testing.assert_allclose(part.lanes.edges_along(np.array([5.0]))[:, 0], part.lanes.edges_at(5.0))
 
 
 def test_a_road_is_loaded_from_its_path(tmp_path: Path) -> None:
@@ -53,6 +73,8 @@ def test_a_road_is_loaded_from_its_path(tmp_path: Path) -> None:
     part = load_road(str(tmp_path / "part.yaml"))
     assert (part.title, part.start, part.first_m) == ("y", (40.0, 0.0, 0.0), -60.0)
 
+
+CHANGE = "lanes: {widths_m: [3.5, 0], changes: [{from_m: 20, to_m: 50, widths_m: [3, 1]}]}"
 
 BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"{new}: &{new} [{', '.join([f'*{old}'] * 9)}]\n" for old, new in itertools.pairwise("abcdefghij")
@@ -116,6 +138,30 @@ REJECTED = {
     "part too long": ("title: x\npart_of: a\nfrom_m: 400\nlength_m: 30", r"a has only 5\.\d m from 400\.0 m on"),
     "part beyond its road": ("title: x\npart_of: a\nfrom_m: 1000\nlength_m: 30", r"a ends at 405\.\d m: from_m must"),
     "dashes too short": ("title: x\nsegments: [{length_m: 9}]\nmarks: [{offset_m: 1, dash_m: 0.01}]", r"dash_m.*0\.1"),
+    "widths for other lanes": (
+        SHORT + CHANGE.replace("[3, 1]", "[3]"),
+        r"lanes\.changes\.0 has 1 widths_m for 2 lanes",
+    ),
+    "a driven lane without width": (SHORT + CHANGE.replace("[3, 1]", "[0, 1]"), r"width of 0 for the driven lane"),
+    "a change backwards": (SHORT + CHANGE.replace("50", "10"), r"from_m must be less than to_m"),
+    "changes out of order": (
+        SHORT + CHANGE.replace("]}]", "]}, {from_m: 40, to_m: 60, widths_m: [3, 1]}]"),
+        r"sort them",
+    ),
+    "unknown key of a change": (SHORT + CHANGE.replace("to_m", "to"), r"changes\.0\.to': did you mean 'to_m'"),
+    "a taper without ends": (SHORT + "marks: [{offset_m: 1, to_offset_m: 2, to_m: 9}]", r"marks\.0 .* give it from_m"),
+    "asphalt that closes wrongly": (
+        SHORT + "paved: [{left_m: 2, right_m: -2}, {left_m: 5, right_m: 2, from_m: 1, to_m: 9, to_left_m: 1}]",
+        r"to_left_m 1\.0 and to_right_m 2\.0",
+    ),
+    "asphalt narrower than the lane": (
+        SHORT + "paved: [{left_m: 2, right_m: -2, from_m: -20, to_m: 100, to_left_m: 1}]",
+        r"no asphalt from 0\.0 m",
+    ),
+    "a rail in a lane that widens": (
+        SHORT + "lanes: {changes: [{from_m: 1, to_m: 9, widths_m: [5]}]}\nrails: [{offset_m: 2.4}]",
+        r"rails\.0 is in the driven lane",
+    ),
     "part with segments": ("title: x\npart_of: a\nfrom_m: 0\nlength_m: 30\nsegments: []", r"unknown key 'segments'"),
 }
 

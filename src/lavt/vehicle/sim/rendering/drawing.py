@@ -58,14 +58,14 @@ def _draw_plan(axes: Axes, road: Road) -> None:
     first_m, last_m = max(road.first_m, -60.0), min(road.last_m, road.route_length_m + 120.0)
     _draw_ground(axes, road, first_m, last_m)
     spacings_m = (spacing_m for spacing_m in _LABEL_SPACINGS_M if road.route_length_m / spacing_m <= _MAX_LABELS)
-    right_edge_m = min(strip.right_m for strip in road.paved)
+    right_edge_m = min(min(strip.rights_m) for strip in road.paved)
     for s_m in np.arange(0.0, road.route_length_m, next(spacings_m, _LABEL_SPACINGS_M[-1])).tolist():
         edge, beyond = road.point_at(s_m, [right_edge_m, right_edge_m - 1.0])
         label: dict[str, Any] = {"textcoords": "offset points", "fontsize": 8, "ha": "center", "va": "center"}
         line = {"arrowstyle": "-", "linewidth": 0.8, "shrinkB": 0.0}
         axes.annotate(f"{s_m:.0f} m", edge, xytext=(beyond - edge) * _LABEL_DISTANCE_PT, arrowprops=line, **label)
-    edges_m = road.lanes.edges_m
     for s_m, colour, name in ((0.0, "#1a7f37", "start"), (road.route_length_m, "#c1121f", "end")):
+        edges_m = road.lanes.edges_at(s_m)
         axes.plot(*road.point_at(s_m, [edges_m[0], edges_m[-1]]).T, color=colour, linewidth=2.5, label=name)
     axes.legend(fontsize=8, loc="best")
     axes.set_aspect("equal", adjustable="datalim")
@@ -78,15 +78,16 @@ def _draw_detail(axes: Axes, road: Road) -> None:
     """Draw the first metres of the road as if it were straight; stations increase upwards, and offsets to the left."""
     last_m = min(DETAIL_M, road.route_length_m)
     for strip in _overlapping(road.paved, 0.0, last_m):
-        axes.fill_between(
-            [strip.right_m, strip.left_m], _first_station(strip, 0.0), _last_station(strip, last_m), color=_ASPHALT
-        )
-    half_width_m = road.lanes.widths_m[road.lanes.driven] / 2
-    axes.fill_between([-half_width_m, half_width_m], 0.0, last_m, color=_LANE, alpha=0.5)
+        stations_m = _sample_stations(_first_station(strip, 0.0), _last_station(strip, last_m))
+        axes.fill_betweenx(stations_m, strip.right_at(stations_m), strip.left_at(stations_m), color=_ASPHALT)
+    stations_m = _sample_stations(0.0, last_m)
+    half_m = _half_widths_m(road, stations_m)
+    axes.fill_betweenx(stations_m, -half_m, half_m, color=_LANE, alpha=0.5)
     for mark in _overlapping(road.marks, 0.0, last_m):
         for begin_m, end_m in _painted_pieces(mark, 0.0, last_m):
-            right_m = mark.offset_m - mark.width_m / 2
-            axes.fill_between([right_m, right_m + mark.width_m], begin_m, end_m, color=_PAINT[mark.colour])
+            stations_m = np.array([begin_m, end_m])
+            right_m = mark.offset_at(stations_m) - mark.width_m / 2
+            axes.fill_betweenx(stations_m, right_m, right_m + mark.width_m, color=_PAINT[mark.colour])
     for rail in _overlapping(road.rails, 0.0, last_m):
         axes.vlines(
             rail.offset_m,
@@ -114,15 +115,17 @@ def _draw_curvature(axes: Axes, road: Road) -> None:
 
 def _draw_ground(axes: Axes, road: Road, first_m: float, last_m: float) -> None:
     axes.set_facecolor(_GRASS)
-    half_width_m = road.lanes.widths_m[road.lanes.driven] / 2
     for strip in _overlapping(road.paved, first_m, last_m):
-        _fill(axes, road, strip, (_first_station(strip, first_m), _last_station(strip, last_m)), _ASPHALT)
-    _fill(axes, road, PavedArea(half_width_m, -half_width_m), (0.0, road.route_length_m), _LANE)
+        stations_m = _sample_stations(_first_station(strip, first_m), _last_station(strip, last_m))
+        _fill(axes, road, stations_m, (strip.left_at(stations_m), strip.right_at(stations_m)), _ASPHALT)
+    stations_m = _sample_stations(0.0, road.route_length_m)
+    half_m = _half_widths_m(road, stations_m)
+    _fill(axes, road, stations_m, (half_m, -half_m), _LANE)
     # A line of fixed width, which stays visible at any scale.
     axes.plot(*road.point_at(_sample_stations(0.0, road.route_length_m), 0.0).T, color=_LANE, linewidth=1.0)
     for colour, paint in _PAINT.items():
         lines = [
-            road.point_at(_sample_stations(*piece), mark.offset_m)
+            road.point_at(_sample_stations(*piece), mark.offset_at(_sample_stations(*piece)))
             for mark in _overlapping(road.marks, first_m, last_m)
             if mark.colour == colour
             for piece in _painted_pieces(mark, first_m, last_m)
@@ -135,10 +138,14 @@ def _draw_ground(axes: Axes, road: Road, first_m: float, last_m: float) -> None:
     axes.autoscale_view()
 
 
-def _fill(axes: Axes, road: Road, strip: PavedArea, ends_m: tuple[float, float], colour: str) -> None:
-    stations_m = _sample_stations(*ends_m)
-    outline = np.concatenate([road.point_at(stations_m, strip.left_m), road.point_at(stations_m[::-1], strip.right_m)])
-    axes.add_collection(PolyCollection([outline], facecolors=colour, edgecolors="none"))
+def _fill(axes: Axes, road: Road, stations_m: FloatArray, edges_m: tuple[FloatArray, FloatArray], colour: str) -> None:
+    left, right = (road.point_at(stations_m, edge_m) for edge_m in edges_m)
+    axes.add_collection(PolyCollection([np.concatenate([left, right[::-1]])], facecolors=colour, edgecolors="none"))
+
+
+def _half_widths_m(road: Road, stations_m: FloatArray) -> FloatArray:
+    """Return half the width of the driven lane at stations (n,)."""
+    return np.array([road.lanes.driven_width_at(s_m) for s_m in stations_m.tolist()]) / 2
 
 
 def _overlapping(elements: tuple[RoadElement, ...], first_m: float, last_m: float) -> list[RoadElement]:

@@ -27,9 +27,12 @@ from lavt.vehicle.sim.road.strips import (
     Grey,
     Square,
     Strips,
+    across_mark,
+    beside_lane,
     join_strips,
     strip_along,
     strip_pieces,
+    widen,
 )
 
 TILE_M = (8.0, 16.0, 32.0, 32.0, 64.0)
@@ -58,12 +61,7 @@ class Ground:
         self._missing_in_shadow = _bytes(1.0 - np.array(light.shade) / np.array(light.lit))
         self._shadows = shadows
         self._gravel, self._asphalt = (
-            join_strips(
-                [
-                    strip_along(road, strip.left_m + margin_m, strip.right_m - margin_m, strip.from_m, strip.to_m)
-                    for strip in road.paved
-                ]
-            )
+            join_strips([strip_along(road, *widen(strip, margin_m), strip.from_m, strip.to_m) for strip in road.paved])
             for margin_m in (_GRAVEL_WIDTH_M, 0.0)
         )
         self._tracks = _tracks(road)
@@ -197,16 +195,20 @@ def _crop_texture(texture: NDArray[np.uint8], square: Square) -> NDArray[np.uint
 
 def _tracks(road: Road) -> list[tuple[Strips, int]]:
     """Return the strips of wheel tracks and oil in every lane of the driven direction, with their darkening."""
-    edges = np.array(road.lanes.edges_m)
-    centres = (edges[1:] + edges[:-1]) / 2
-    wheels = [centre + from_centre_m for centre in centres for from_centre_m in (-0.85, 0.85)]
-    tracks = [(centres, *_OIL)] + [(wheels, width_m, darkening) for width_m, darkening in _TRACK_PROFILE]
+    lanes = range(len(road.lanes.widths_m))
+    tracks = [(_OIL[0], (0.0,), _OIL[1])] + [(width_m, (-0.85, 0.85), dark) for width_m, dark in _TRACK_PROFILE]
     return [
         (
-            join_strips([strip_along(road, offset_m + width_m / 2, offset_m - width_m / 2) for offset_m in offsets_m]),
+            join_strips(
+                [
+                    strip_along(road, *beside_lane(road.lanes, lane, from_centre_m, width_m))
+                    for lane in lanes
+                    for from_centre_m in from_centres_m
+                ]
+            ),
             darkening,
         )
-        for offsets_m, width_m, darkening in tracks
+        for width_m, from_centres_m, darkening in tracks
     ]
 
 
@@ -225,7 +227,7 @@ def _marks(road: Road, colour: str, width_m: float) -> Strips:
     for mark in road.marks:
         if (mark.colour, mark.width_m) != (colour, width_m):
             continue
-        left_m, right_m = mark.offset_m + mark.width_m / 2, mark.offset_m - mark.width_m / 2
+        left_m, right_m = across_mark(mark)
         if mark.kind == "solid":
             parts.append(strip_along(road, left_m, right_m, mark.from_m, mark.to_m))
             continue

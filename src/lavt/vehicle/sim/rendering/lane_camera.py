@@ -58,10 +58,11 @@ class LaneCamera:
         self._left_slope, self._right_slope = (
             math.tan(min(max(model.yaw_rad + edge_rad, -_ABEAM_RAD), _ABEAM_RAD)) for edge_rad in (half_rad, -half_rad)
         )
-        self._width_m = road.lanes.widths_m[road.lanes.driven]
+        self._lanes = road.lanes
         self._count_ahead = math.ceil(math.hypot(far_m, half_width_m) / STATION_SPACING_M) + 1
         stations_m = np.arange(road.route_length_m / STATION_SPACING_M + 2 * self._count_ahead) * STATION_SPACING_M
-        lines = [road.point_at(stations_m, offset_m) for offset_m in (0.0, self._width_m / 2, -self._width_m / 2)]
+        half_m = np.array([self._lanes.driven_width_at(s_m) for s_m in stations_m.tolist()]) / 2
+        lines = [road.point_at(stations_m, offset_m) for offset_m in (0.0, half_m, -half_m)]
         self._line_points: list[list[float]] = np.concatenate(lines, axis=1).tolist()
         """For each station, world x and y of the lane's centre, of its left line, and of its right line."""
         self._near_station_m = 0.0
@@ -116,13 +117,12 @@ class LaneCamera:
                 visible_line_points += visible_lines
                 dx, dy = centre_x - x_m, centre_y - y_m
                 centre.append((dx * cosine + dy * sine, dy * cosine - dx * sine))
+        width_m = self._lanes.driven_width_at(self._near_station_m)
         if len(centre) < MIN_POINTS:
-            return Lane((0.0, 0.0, 0.0), self._width_m, near_m, far_m, 0.0)
+            return Lane((0.0, 0.0, 0.0), width_m, near_m, far_m, 0.0)
         share = visible_line_points * STATION_SPACING_M / (2 * (far_m - near_m))
         near_m, far_m = min(centre)[0], max(centre)[0]
-        return Lane(
-            _fit_centre(centre, far_m - near_m >= LINEAR_BELOW_M), self._width_m, near_m, far_m, min(share, 1.0)
-        )
+        return Lane(_fit_centre(centre, far_m - near_m >= LINEAR_BELOW_M), width_m, near_m, far_m, min(share, 1.0))
 
 
 def _fit_centre(points: list[tuple[float, float]], curved: bool) -> tuple[float, float, float]:

@@ -182,8 +182,8 @@ def _place_poles(road: Road, sampled_rails: Sequence[tuple[Rail, FloatArray]], *
 
 def _road_middle(road: Road) -> tuple[FloatArray, FloatArray, float]:
     """Return points (n, 2) along the asphalt's middle, the road's heading there (n,), and half the asphalt's width."""
-    left_m = max(strip.left_m for strip in road.paved)
-    right_m = min(strip.right_m for strip in road.paved)
+    left_m = max(max(strip.lefts_m) for strip in road.paved)
+    right_m = min(min(strip.rights_m) for strip in road.paved)
     stations = np.arange(road.first_m - 40.0, road.last_m + 40.0, 4.0)
     return road.point_at(stations, (left_m + right_m) / 2), road.centre_at(stations).heading_rad, (left_m - right_m) / 2
 

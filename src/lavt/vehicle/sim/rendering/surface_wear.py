@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from lavt.domain import FloatArray
 from lavt.streams import stream
+from lavt.vehicle.sim.road.cross_section import PavedArea
 from lavt.vehicle.sim.road.road import Road
 from lavt.vehicle.sim.road.strips import Strips, join_strips, make_strips, strip_along, strip_pieces
 
@@ -37,7 +39,7 @@ def surface_wear(road: Road) -> list[SurfaceWear]:
     seams = [
         strip_along(road, offset_m + _SEAM_WIDTH_M / 2, offset_m - _SEAM_WIDTH_M / 2, strip.from_m, strip.to_m)
         for strip in road.paved
-        for offset_m in np.arange(strip.right_m + _PAVER_WIDTH_M, strip.left_m - 1.0, _PAVER_WIDTH_M)
+        for offset_m in np.arange(max(strip.rights_m) + _PAVER_WIDTH_M, min(strip.lefts_m) - 1.0, _PAVER_WIDTH_M)
     ]
     return [
         *(SurfaceWear(join_strips(strips), 2.0, darkening) for darkening, strips in patches.items()),
@@ -54,10 +56,9 @@ def _patches(road: Road) -> tuple[dict[int, list[Strips]], Strips]:
     by_darkening: dict[int, list[Strips]] = {7: [], 12: [], 17: []}
     half_seam_m = _PATCH_SEAM_WIDTH_M / 2
     seams = []
-    count = int((road.last_m - road.first_m) / _PATCH_SPACING_M * len(road.paved))
-    for _ in range(count):
-        strip = road.paved[int(random.integers(len(road.paved)))]
-        first_m, last_m = max(strip.from_m, road.first_m), min(strip.to_m, road.last_m)
+    strips = _wearing_strips(road)
+    for _ in range(int(_paved_length_m(strips) / _PATCH_SPACING_M)):
+        strip, first_m, last_m = strips[int(random.integers(len(strips)))]
         begin_m = random.uniform(first_m, last_m)
         end_m = min(begin_m + random.uniform(2.0, 16.0), last_m)
         right_m = random.uniform(strip.right_m, max(strip.left_m - 2.0, strip.right_m))
@@ -77,20 +78,34 @@ def _cracks(road: Road, name: str, width_m: float) -> Strips:
     """Return cracks: random polylines along or across the road, with steps of about a third of a metre."""
     random = stream(_WORLD_SEED, name)
     cracks = []
-    for _ in range(int((road.last_m - road.first_m) / _CRACK_SPACING_M * len(road.paved))):
-        strip = road.paved[int(random.integers(len(road.paved)))]
+    strips = _wearing_strips(road)
+    for _ in range(int(_paved_length_m(strips) / _CRACK_SPACING_M)):
+        strip, first_m, last_m = strips[int(random.integers(len(strips)))]
         steps = int(random.integers(8, 30))
         if random.uniform() < 0.5:
             ahead, left = random.uniform(0.15, 0.45, steps), random.normal(0.0, 0.10, steps)
         else:
             ahead, left = random.normal(0.0, 0.10, steps), random.uniform(0.15, 0.40, steps)
-        first_m, last_m = max(strip.from_m, road.first_m), min(strip.to_m, road.last_m)
         station = random.uniform(first_m, last_m) + np.cumsum(ahead)
         offset = random.uniform(strip.right_m, strip.left_m) + np.cumsum(left)
         inside = (offset < strip.left_m) & (station > first_m) & (station < last_m)
         if inside.sum() > 2:
             cracks.append(_line(road.point_at(station[inside], offset[inside]), width_m))
     return join_strips(cracks)
+
+
+def _wearing_strips(road: Road) -> list[tuple[PavedArea, float, float]]:
+    """Return the strips of asphalt of constant width, each with its ends on the road."""
+    return [
+        (strip, max(strip.from_m, road.first_m), min(strip.to_m, road.last_m))
+        for strip in road.paved
+        if not strip.is_tapered
+    ]
+
+
+def _paved_length_m(strips: Sequence[tuple[PavedArea, float, float]]) -> float:
+    """Return the sum of the lengths of strips; pieces that follow each other count like one strip."""
+    return sum(last_m - first_m for _, first_m, last_m in strips)
 
 
 def _line(points_m: FloatArray, width_m: float) -> Strips:

@@ -20,7 +20,8 @@ from lavt.errors import UserError
 from lavt.vehicle.sim.road.centreline import Centreline, CentrelinePoints, Segment
 from lavt.vehicle.sim.road.cross_section import Lanes, PavedArea, Rail, RoadMark, shift_stations
 from lavt.vehicle.sim.road.random_road import random_road_number, random_road_text
-from lavt.vehicle.sim.road.road_file import RoadFile, read_road_file
+from lavt.vehicle.sim.road.road_file import read_road_file
+from lavt.vehicle.sim.road.road_keys import RoadFile
 
 PROJECTION_WINDOW_M = 15.0
 """A projection searches this far before and behind the last known station. A search of the whole road could find
@@ -84,6 +85,7 @@ class Road:
             title=title,
             first_m=self.first_m - from_m,
             route_length_m=route_length_m,
+            lanes=self.lanes.shifted(from_m),
             paved=tuple(shift_stations(strip, from_m) for strip in self.paved),
             marks=tuple(
                 replace(shift_stations(mark, from_m), dash_at_m=mark.dash_at_m - from_m) for mark in self.marks
