@@ -14,8 +14,10 @@ from lavt.assembly.security import build_cipher
 from lavt.assembly.vehicles import check_vehicle, physics_sample_times
 from lavt.config import HUMAN, ClientConfig, ControllerConfig, SafetyConfig, ServerConfig, VehicleConfig
 from lavt.control.client_limits import CLIENT_LIMITS
-from lavt.control.drive_controller import DriveController, Preset, find_preset, make_controller
+from lavt.control.drive_controller import DriveController, make_controller
 from lavt.control.human_controls import HUMAN_LIMITS, HumanControls
+from lavt.control.preset import Preset, find_preset
+from lavt.control.two_point import TWO_POINT, TwoPointDriver, TwoPointSettings
 from lavt.domain import NS_PER_MS, Now
 from lavt.errors import UserError
 from lavt.node import Node
@@ -83,6 +85,9 @@ def build_controller(config: ControllerConfig) -> DriveController:
     """Build the configured controller; raise `UserError` with the known names for an unknown controller or preset."""
     if config.kind == HUMAN:
         raise UserError("a person drives by `lavt drive` or `lavt client CONFIG --human` only: name another controller")
+    if config.kind == TWO_POINT:
+        model = TwoPointSettings(**config.two_point.model_dump())
+        return TwoPointDriver(_settings(config), wheelbase_m=config.wheelbase_m, settings=model)
     return make_controller(config.kind, _settings(config), config.wheelbase_m)
 
 

@@ -79,6 +79,18 @@ def test_the_digest_is_reproducible_without_video(fidelity: str, tmp_path: Path)
     assert digests[0] == digests[1] != digests[2]
 
 
+def test_a_run_of_the_human_model_is_reproducible(tmp_path: Path) -> None:
+    """Equal runs of the human model with noise have equal digests, and another noise changes the digest."""
+    model = ("fidelity=geometry", "controller.kind=two_point", "controller.two_point.noise_rad=0.002")
+    digests = []
+    for number, noise_seed in enumerate((1, 1, 2)):
+        changes = (*model, f"controller.two_point.noise_seed={noise_seed}")
+        loop = build_loop(planned(*changes), tmp_path / str(number))
+        drive(loop, limit_ns=6 * NS_PER_S)
+        digests.append(loop.digest.hexdigest())
+    assert digests[0] == digests[1] != digests[2]
+
+
 @pytest.mark.parametrize("fidelity", ["pixels", "geometry"])
 def test_records_without_video(fidelity: str, tmp_path: Path) -> None:
     """Access units are recorded only at fidelity video; at geometry no channel repeats the data of another."""
