@@ -34,7 +34,7 @@ class LaneSpec:
     limit_min: float
     """A lane that takes longer is killed and has failed."""
     meanwhile: LaneSpec | None = None
-    """Another lane that runs at the same time as the last command, at the lowest priority."""
+    """Another lane that starts with the last command, at the lowest priority, and goes on beside the lanes after it."""
 
 
 def pytest(*arguments: str) -> tuple[str, ...]:
@@ -52,7 +52,7 @@ CAN_DRIVES = "tests/kernel/test_can.py"
 for the drives of these tests."""
 KERNEL = (sys.executable, "tests/kernel/run", *SHOW_SLOWEST)
 FULL = LaneSpec("full", (pytest("-m", "full", "--timeout=1800"),), 40)
-"""A test has more time here, because the lane runs at the lowest priority beside another one."""
+"""A test has more time here, because the lane runs at the lowest priority beside others."""
 LINTERS = (
     program("ruff", "check"),
     program("ruff", "format", "--check"),
@@ -63,11 +63,11 @@ LINTERS = (
 LANES = (
     LaneSpec("linters", LINTERS, 10),
     LaneSpec("quick", (pytest(),), 15),
-    LaneSpec("interop", (pytest("tests/interop"),), 5),
-    LaneSpec("browser", (pytest("tests/browser"),), 10),
     LaneSpec("realtime", (pytest("-m", "realtime"),), 35),
     LaneSpec("field", (pytest("tests/field"),), 35),
     LaneSpec("kernel", ((*KERNEL, CAN_DRIVES), (*KERNEL, f"--ignore={CAN_DRIVES}")), 30, meanwhile=FULL),
+    LaneSpec("interop", (pytest("tests/interop"),), 5),
+    LaneSpec("browser", (pytest("tests/browser"),), 10),
 )
 
 

@@ -272,7 +272,11 @@ BAD_VALUES: list[tuple[type[Section], str, str]] = [
     (ServerConfig, "rendezvous: {probe: 5602}", "did you mean 'probe_port'"),
     (ServerConfig, "{rendezvous: {host: a}, injection: {interface: eth0}}", "rendezvous.host"),
     (RendezvousConfig, "video_port: 65536", "'video_port'"),
-    (RendezvousConfig, "security: {key: a}", "unknown key 'security'"),
+    (
+        RendezvousConfig,
+        "security: {key: a}",
+        "'security' is a key of a config for `lavt server`, not for `lavt rendezvous`",
+    ),
     (RelayConfig, "video_server: 127.0.0.1:1", "'control_server' is missing"),
     (RelayConfig, "{video_server: a:1, control_server: a:1, video: {constant_ms: -1}}", "'video.constant_ms'"),
     (RelayConfig, "{video_server: a:1, control_server: a:1, video: {jitter_median_ms: .inf}}", "jitter_median_ms"),
@@ -328,9 +332,11 @@ def test_bad_files_are_rejected(text: str, reason: str, tmp_path: Path) -> None:
 
 def test_config_of_another_command(tmp_path: Path) -> None:
     """An error of a config whose keys are those of another command's config names that command."""
-    assert rejection("routes: [a]\nconditions: [L0]", tmp_path).endswith("a config for `lavt sweep`)")
-    assert "config for" not in rejection("sed: 1", tmp_path)
-    assert "config for" not in rejection("seed: -1", tmp_path)
+    assert "are keys of a config for `lavt sweep`, not for `lavt run`" in rejection(
+        "routes: [a]\nconditions: [L0]", tmp_path
+    )
+    assert "`lavt" not in rejection("sed: 1", tmp_path)
+    assert "`lavt" not in rejection("seed: -1", tmp_path)
 
 
 def test_many_errors_are_counted(tmp_path: Path) -> None:

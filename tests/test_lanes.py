@@ -63,6 +63,7 @@ def collect_tests(root: Path, arguments: tuple[str, ...]) -> list[str]:
     return subprocess.run(command, cwd=root, capture_output=True, text=True, check=False).stdout.splitlines()
 
 
+@pytest.mark.full
 def test_every_test_belongs_to_one_lane(collected: dict[str, set[str]]) -> None:
     """The pytest lanes together run every test exactly once, except the kernel tests, which the kernel lane runs."""
     tests = [f"tests/{folder}/test_{folder}.py::test_plain" for folder in ("cli", *SEQUENTIAL_FOLDERS)]
@@ -72,6 +73,7 @@ def test_every_test_belongs_to_one_lane(collected: dict[str, set[str]]) -> None:
     assert Counter(test for lane in collected.values() for test in lane) == Counter(tests)
 
 
+@pytest.mark.full
 def test_folder_and_marker_select_the_lane(collected: dict[str, set[str]]) -> None:
     """A test is in the lane of its folder, else in the lane of its marker, else in quick."""
     assert collected["quick"] == {"tests/test_root.py::test_plain", "tests/cli/test_cli.py::test_plain"}
@@ -122,9 +124,10 @@ def test_every_lane_is_documented() -> None:
 
 
 def test_lanes_can_be_selected_by_name() -> None:
-    """Without names all lanes run, `full` at the same time as `kernel`; named lanes run in the given order."""
+    """Without names all lanes run, `full` only beside `kernel` and the lanes after it; or else the named lanes."""
     assert select_lanes([]) == list(LANES)
     assert [lane.name for lane in LANES if lane.meanwhile is FULL] == ["kernel"]
+    assert [lane.name for lane in LANES][-3:] == ["kernel", "interop", "browser"]
     assert [(lane.name, lane.meanwhile) for lane in select_lanes(["full", "kernel"])] == [
         ("full", None),
         ("kernel", None),
@@ -173,6 +176,16 @@ def test_a_lane_at_the_same_time_starts_with_the_last_command(tmp_path: Path) ->
     code, output = run(LaneSpec("kernel", (first, shell(f"until test -e {began}; do sleep 0.1; done")), 1, other))
     assert code == 1
     assert output.count("ended with") == output.count("ended with 4") == 1
+
+
+def test_a_lane_at_the_same_time_goes_on_beside_the_next_lanes(tmp_path: Path) -> None:
+    """A lane that runs at the same time as another still runs during the next lane; its output follows at the end."""
+    began = tmp_path / "began"
+    other = LaneSpec("full", (shell(f"until test -e {began}; do sleep 0.1; done; echo other"),), 1)
+    kernel = LaneSpec("kernel", (shell("true"),), 1, meanwhile=other)
+    code, output = run(kernel, LaneSpec("browser", (shell(f"touch {began}; sleep 0.5; echo browser"),), 1))
+    assert code == 0
+    assert output.index("---- browser\nbrowser") < output.index("---- full\nother")
 
 
 @pytest.mark.parametrize("meanwhile", [False, True])

@@ -44,7 +44,7 @@ def test_all_modules_can_be_imported(like: str) -> None:
     ("arguments", "like"),
     [
         (["server"], "macos"),
-        (["keys"], "windows"),
+        pytest.param(["keys"], "windows", marks=pytest.mark.full),
         (["run", "configs/demo.yaml", "--set", "time=real"], "windows"),
     ],
 )

@@ -37,7 +37,7 @@ def run_tests(folder: Path, required: str | None, tests: str, **variables: str) 
     ("required", "code", "expected"),
     [
         (None, 0, "1 skipped"),
-        ("", 0, "1 skipped"),
+        pytest.param("", 0, "1 skipped", marks=pytest.mark.full),
         ("kernel", 0, "1 skipped"),
         ("unicorn", 1, "LAVT_REQUIRE names unicorn: no unicorn here"),
         ("kernel, unicorn", 1, "1 failed"),
@@ -54,6 +54,7 @@ def test_missing_requirement_fails(tmp_path: Path, required: str | None, code: i
     assert expected in output
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("required", "code", "expected"), [(None, 0, "tests/kernel/run"), ("kernel", 1, "LAVT_REQUIRE names kernel")]
 )
@@ -67,6 +68,7 @@ def test_kernel_lane_skips_on_an_ordinary_machine(
     assert expected in output
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("required", "code", "expected"),
     [(None, 0, "apt-get install gstreamer1.0-tools"), ("gstreamer", 1, "LAVT_REQUIRE names gstreamer: needs gst")],

@@ -107,6 +107,18 @@ def test_only_an_overlapping_stall_excuses_a_failure(stall: Stall | None, raised
     assert STALL_MS == 30
 
 
+@pytest.mark.parametrize(
+    ("stall_ms", "until_ms", "raised"),
+    [(20, 1000, HostStalled), (20, 999, AssertionError), (14, 1000, AssertionError)],
+)
+def test_many_short_stalls_excuse_a_failure(stall_ms: int, until_ms: int, raised: type[Exception]) -> None:
+    """Stalls that are too short excuse a failure if they take 15 % of an interval of at least a second."""
+    stalls = stalls_of(*(Stall(0, at * 100 * MS, (at * 100 + stall_ms) * MS) for at in range(10)))
+    with pytest.raises(raised, match="slow") as caught, stalls.excusing_failures(0, until_ms * MS):
+        raise AssertionError("slow")
+    assert caught.type is raised
+
+
 @pytest.mark.parametrize(("share", "raised"), [(0.05, HostStalled), (0.2, AssertionError)])
 def test_stalled_share_excuses_a_failure(share: float, raised: type[Exception]) -> None:
     """A failed assertion is excused if a processor was stalled for at least the given share of the interval."""

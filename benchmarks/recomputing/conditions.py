@@ -162,6 +162,8 @@ def worst_rank(runs: Sequence[Row]) -> Row:
 def summarize(runs: Sequence[Row], common_p95: Values) -> Row:
     """Return the entry of a condition from its valid runs."""
     n, ended, kept = len(runs), completed(runs), in_own_lane(runs)
+    hits = sum(run["collisions"] for run in runs)
+    hit_once = all((run["ending"] == "collision") == run["collisions"] for run in runs)
     kilometres = sum(run["distance_m"] for run in runs) / 1000
     p95, followed = of_completed("p95_m"), of_completed("followed_p95_m")
     measures: dict[str, Values] = {
@@ -181,12 +183,18 @@ def summarize(runs: Sequence[Row], common_p95: Values) -> Row:
         "completed_in_own_lane": int(sum(kept)),
         "own_lane_completion_rate": mean(kept),
         "own_lane_completion_interval": exact(int(sum(kept)), len(kept)),
+        "invasion_free_completion_rate": mean(
+            [done * (run["lane_invasions"] == 0) for done, run in zip(ended, runs, strict=True)]
+        ),
         "endings": dict(Counter(run["ending"] for run in runs)),
         **{f"{name}_per_run": mean([run[name] for run in runs]) for name in COUNTS},
-        "collisions_per_run_interval": exact_mean_count(sum(run["collisions"] for run in runs), n),
+        "collisions_per_run_interval": (exact if hit_once else exact_mean_count)(hits, n),
         **{f"{name}_per_km": sum(run[name] for run in runs) / kilometres for name in COUNTS},
         "by_road": {
-            name: over_roads(runs, values, is_rate=name.endswith("_rate")) for name, values in measures.items()
+            name: over_roads(
+                runs, values, is_rate=name.endswith("_rate") or (name == "collisions_per_run" and hit_once)
+            )
+            for name, values in measures.items()
         },
         "p95_m": mean(p95(runs)),
         "p95_interval": stratified(runs, p95),

@@ -111,10 +111,12 @@ def parse_config(kind: type[Config], data: Mapping[str, Any], source: str) -> Co
     try:
         return kind.model_validate(_with_tuples(kind, data))
     except ValidationError as error:
+        if other := _other_use(kind, data):
+            raise UserError(f"{source}: {other}") from error
         problems = [_describe(kind, problem) for problem in error.errors()]
         if len(problems) > MAX_PROBLEMS:
             problems[MAX_PROBLEMS:] = [f"and {len(problems) - MAX_PROBLEMS} more errors"]
-        raise UserError(f"{source}: {'; '.join(problems)}{_other_use(kind, data)}") from error
+        raise UserError(f"{source}: {'; '.join(problems)}") from error
 
 
 @functools.cache
@@ -155,11 +157,14 @@ def _with_tuples(kind: type[BaseModel], data: Mapping[str, Any]) -> dict[str, An
 
 
 def _other_use(kind: type[BaseModel], data: Mapping[str, Any]) -> str:
-    """Return a hint if the keys of `data` are those of another command's config; otherwise an empty text."""
-    if kind not in USES.values() or data.keys() <= kind.model_fields.keys():
-        return ""
+    """Return what is wrong if the keys of `data` are those of another command's config; otherwise an empty text."""
+    this = next((name for name, schema in USES.items() if schema is kind), None)
+    foreign = [repr(key) for key in data if key not in kind.model_fields]
     other = next((name for name, schema in USES.items() if data.keys() <= schema.model_fields.keys()), None)
-    return "" if other is None else f" (these are the keys of a config for `lavt {other}`)"
+    if this is None or other is None or not foreign:
+        return ""
+    keys = "is a key" if len(foreign) == 1 else "are keys"
+    return f"{', '.join(foreign)} {keys} of a config for `lavt {other}`, not for `lavt {this}`: use another config"
 
 
 def _describe(kind: type[BaseModel], problem: Any) -> str:

@@ -43,9 +43,9 @@ CONFIRMED: Final = {"emergency_stop": "confirmed", "safety": "emergency_stop"}
 class FakeClient:
     """A link that answers each message of its page, which sends one at least every 500 ms, with a status."""
 
-    def __init__(self, port: int = 0) -> None:
+    def __init__(self, port: int = 0, token: str = TOKEN) -> None:
         self._clock = MachineClock()
-        self._link = ConsoleLink(self._clock, TOKEN, port)
+        self._link = ConsoleLink(self._clock, token, port)
         self.port, self.url = self._link.port, self._link.url
         self.is_silent = False
         self.confirms_stops = False

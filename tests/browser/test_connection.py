@@ -9,6 +9,8 @@ from tests.browser.chromium import Browser, Tab, wait_until
 from tests.browser.conftest import plug_gamepad, press, release, repeat_keys
 from tests.browser.fake_client import CONFIRMED, FakeClient, wait_until_loaded
 
+from lavt.transport.console import console_link
+
 SILENCE_S = 3.0
 
 
@@ -96,6 +98,35 @@ def test_a_stop_without_a_connection_is_sent_later(page: ConnectedPage) -> None:
     wait_until("the stop is sent", lambda: page.client.stops > 0)
     page.pass_time(1.5)
     assert "not confirmed" in page.text("hint")
+
+
+def test_a_page_without_a_place_tries_again(page: ConnectedPage, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A page that finds too many pages open is let in as soon as there is a place, and sends its stop."""
+    page.client.close()
+    monkeypatch.setattr(console_link, "MAX_PAGES", 0)
+    page.client = FakeClient(page.client.port)
+    wait_until("the page is refused", lambda: "too many pages" in page.text("hint"))
+    page.stop()
+    assert "It is sent if" in page.text("hint")
+    monkeypatch.undo()
+    wait_until("the stop is sent", lambda: page.client.stops > 0)
+
+
+def test_a_stop_that_will_never_be_sent_is_said(page: ConnectedPage) -> None:
+    """A page whose token is no longer valid says that the stop was not sent, and promises nothing."""
+    page.client.close()
+    page.client = FakeClient(page.client.port, "fedcba9876543210")
+    wait_until("the page is refused", lambda: "wrong token" in page.text("hint"))
+    page.stop()
+    assert "NOT sent" in page.text("hint")
+    assert "It is sent if" not in page.text("hint")
+
+
+def test_any_key_that_means_escape_stops(page: ConnectedPage) -> None:
+    """A key that the person's keyboard layout has made Escape is an emergency stop, too."""
+    event = "new KeyboardEvent('keydown', {code: 'CapsLock', key: 'Escape', bubbles: true})"
+    page.tab.evaluate(f"document.body.dispatchEvent({event}); 0")
+    wait_until("the stop is sent", lambda: page.client.stops > 0)
 
 
 def test_a_hold_of_another_device_is_no_fresh_press(page: ConnectedPage) -> None:

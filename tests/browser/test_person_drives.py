@@ -106,6 +106,14 @@ def test_a_renderer_that_ends_or_stops_drives_no_more(
     wait_until("no page drives any more", lambda: bool(field(watching, "can_drive")))
 
 
+def test_a_lost_canvas_drives_no_more(person_drive: PersonDrive) -> None:
+    """If the canvas is lost, as after a crash of the graphics processor's process, the vehicle stops by itself."""
+    tab = person_drive.open()
+    drive_off(tab)
+    tab.evaluate("CanvasRenderingContext2D.prototype.isContextLost = () => true; 0")
+    wait_until("the car stops", lambda: field(tab, "safety") == "safe_stop")
+
+
 def test_a_drive_without_a_vehicle_ends(person_drive: PersonDrive) -> None:
     """If the process of the vehicle's side is killed, `lavt drive` ends with exit code 1."""
     tab = person_drive.open()

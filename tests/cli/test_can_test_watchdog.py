@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from tests.support.command_line import Run
 from tests.support.ports import free_port
-from tests.support.stalls import SLOW_SHARE, Stalls
+from tests.support.stalls import Stalls
 
 from lavt.assembly.dbw import load_profile, shipped_profiles
 from lavt.assembly.watchdog_proof import new_proof, proof_rejection
@@ -108,7 +108,7 @@ def test_a_car_that_does_not_brake_fails(run: Run, tmp_path: Path, port: int, pr
     assert (code, out) == (1, "")
     assert not (tmp_path / "proof.json").exists()
     # Late reports or commands end the test with another message.
-    with stalls.excusing_failures(since_ns), stalls.excusing_failures(since_ns, share=SLOW_SHARE):
+    with stalls.excusing_failures(since_ns):
         assert err.startswith("lavt: ")
         assert "500 ms" in err
 

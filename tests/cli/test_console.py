@@ -52,7 +52,7 @@ with console.stop_on_signals() as stop:
 
 def test_nested_signals_do_not_deadlock() -> None:
     """Signals that interrupt any line of the stop event's methods do not block the program, and set the event."""
-    subprocess.run([sys.executable, "-c", SIGNAL_AT_EVERY_LINE], check=True, timeout=60)
+    subprocess.run([sys.executable, "-c", SIGNAL_AT_EVERY_LINE], check=True, timeout=280)
 
 
 @pytest.mark.usefixtures("default_sighup_action")

@@ -246,7 +246,7 @@ def test_output_as_text(run: Run, monkeypatch: pytest.MonkeyPatch, verdict: Verd
         (("--set", "seed=1"), "--set"),
         ((str(shipped("configs/client.yaml")), "--set", "whom=me"), "'whom'"),
         ((str(shipped("configs/server.yaml")), "--set", "nothing"), "a.b=value"),
-        ((str(shipped("configs/demo.yaml")),), "unknown key"),
+        ((str(shipped("configs/demo.yaml")),), "keys of a config for `lavt run`"),
     ],
 )
 def test_bad_input(run: Run, arguments: tuple[str, ...], reason: str) -> None:

@@ -375,8 +375,9 @@ def test_only_the_vehicles_states_are_accepted(attacked_drive: attacks.AttackedD
 
     assert set(received_states) <= set(sent_states)
     assert len(set(received_states)) == len(received_states)
-    with stalls.excusing_failures(*attack_interval_ns(attacked_drive), stall_ms=LONG_STALL_MS):
+    with stalls.excusing_failures(*attack_interval_ns(attacked_drive), share=BUSY_SHARE):
         assert len(received_states) > 0.9 * len(sent_states) - 100
+    with stalls.excusing_failures(*attack_interval_ns(attacked_drive), stall_ms=LONG_STALL_MS):
         assert total_count(attacked_drive.client, "states_replayed") > 100
         assert total_count(attacked_drive.client, "states_forged") > 100
 

@@ -36,7 +36,7 @@ print(before_kib, locked_kib() - before_kib)
 def lock(*arguments: str) -> tuple[str, int, int]:
     """Lock a process's memory; return why not, and the KiB locked of its first memory and of 10 MiB mapped later."""
     command = [sys.executable, "-c", LOCKS, *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=280)
     if "namespaces are not permitted" in done.stderr:
         pytest.skip(done.stderr.strip())
     reason, sizes = done.stdout.splitlines()

@@ -52,15 +52,17 @@ class LaneOutcome:
 class RunningLane:
     """The commands of a lane, run sequentially, with their output in a file."""
 
-    def __init__(self, lane: LaneSpec, folder: Path, *, niceness: int = 0) -> None:
-        self.lane = lane
+    def __init__(self, spec: LaneSpec, folder: Path, *, niceness: int = 0, beside: RunningLane | None = None) -> None:
+        self.spec = spec
+        self._beside = beside
+        """This lane starts with the last command of that one."""
         self._niceness = niceness
-        self._waiting_commands = list(lane.commands)
+        self._waiting_commands = list(spec.commands)
         self._command = ""
         self._process: subprocess.Popen[bytes] | None = None
-        self._output = folder / f"{lane.name}.output"
+        self._output = folder / f"{spec.name}.output"
         # The kernel lane's machines can write to the folder of the progress file, so this folder has no other files.
-        self._progress = folder / lane.name / "progress"
+        self._progress = folder / spec.name / "progress"
         self._progress.parent.mkdir()
         self._output.touch()
         self._returned_bytes = 0
@@ -76,7 +78,7 @@ class RunningLane:
 
     def poll(self) -> None:
         """Check the running command, start the next one, and end a lane that exceeds its time limit."""
-        if not self.running:
+        if not self.running or (self._beside is not None and not self._beside.is_at_last_command):
             return
         now_ns = self._ended_ns = MachineClock().now().mono_ns
         if self._began_ns is None:
@@ -85,10 +87,10 @@ class RunningLane:
             if code := self._process.returncode:
                 self.failures.append(f"`{self._command}` ended with {code}")
             self._process = None
-        if now_ns - self._began_ns > self.lane.limit_min * 60 * NS_PER_S:
+        if now_ns - self._began_ns > self.spec.limit_min * 60 * NS_PER_S:
             running_test = self._progress.read_text() if self._progress.exists() else ""
             self.failures.append(
-                f"took longer than {self.lane.limit_min:g} min, and was at: {running_test or 'no test'}"
+                f"took longer than {self.spec.limit_min:g} min, and was at: {running_test or 'no test'}"
             )
             self.end()
         elif self._process is None and self._waiting_commands:
@@ -138,47 +140,45 @@ class RunningLane:
         """Return the result."""
         counts = parse_counts(self._output.read_text(errors="replace"))
         took_s = 0.0 if self._began_ns is None else (self._ended_ns - self._began_ns) / NS_PER_S
-        return LaneOutcome(self.lane.name, took_s, counts, self.failures)
+        return LaneOutcome(self.spec.name, took_s, counts, self.failures)
 
 
 def run_lanes(lanes: Sequence[LaneSpec], *, write: Write) -> int:
     """Run lanes in their order; return 0 if all passed, else 1.
 
-    A lane that runs at the same time as another (`meanwhile`) starts with the other's last command. Its output is
-    written after the other's output.
+    A lane that runs at the same time as others (`meanwhile`) starts with the last command of its lane, and goes on
+    beside the lanes that follow. Its output is written at the end.
     """
-    outcomes: list[LaneOutcome] = []
+    in_turn: list[RunningLane] = []
+    background: list[RunningLane] = []
     began_ns = MachineClock().now().mono_ns
     with TemporaryDirectory(prefix="lavt-lanes-") as folder:
-        for lane in lanes:
-            running = [RunningLane(lane, Path(folder))]
-            if lane.meanwhile is not None:
-                running.append(RunningLane(lane.meanwhile, Path(folder), niceness=LOW_PRIORITY))
-            write(f"\n---- {' and '.join(running_lane.lane.name for running_lane in running)}\n")
-            try:
-                _run_together(running, write)
-            finally:
-                for running_lane in running:
-                    running_lane.end()
-            outcomes += [running_lane.outcome() for running_lane in running]
+        try:
+            for spec in lanes:
+                lane = RunningLane(spec, Path(folder))
+                in_turn.append(lane)
+                if spec.meanwhile is not None:
+                    background.append(RunningLane(spec.meanwhile, Path(folder), niceness=LOW_PRIORITY, beside=lane))
+                _run_lane(lane, background, write)
+            for lane in background:
+                _run_lane(lane, background, write)
+        finally:
+            for lane in (*in_turn, *background):
+                lane.end()
+        outcomes = [lane.outcome() for lane in (*in_turn, *background)]
     write(f"\n{table(outcomes)}\n{closing_line(outcomes, (MachineClock().now().mono_ns - began_ns) / NS_PER_S)}\n")
     return int(any(outcome.failures for outcome in outcomes))
 
 
-def _run_together(running: Sequence[RunningLane], write: Write) -> None:
-    while any(lane.running for lane in running):
-        running[0].poll()
-        if running[0].is_at_last_command:
-            for lane in running[1:]:
-                lane.poll()
-        unfinished = next((lane for lane in running if lane.running), None)
-        for lane in running:  # the lanes before `unfinished` have ended, so their output is complete
-            write(lane.new_output())
-            if lane is unfinished:
-                break
-        pause(POLL_NS)
-    for lane in running:
+def _run_lane(lane: RunningLane, background: Sequence[RunningLane], write: Write) -> None:
+    """Run a lane to its end, with the others in the background, and write its output."""
+    write(f"\n---- {lane.spec.name}\n")
+    while lane.running:
+        for each in {lane, *background}:
+            each.poll()
         write(lane.new_output())
+        pause(POLL_NS)
+    write(lane.new_output())
 
 
 def table(outcomes: Sequence[LaneOutcome]) -> str:

@@ -15,6 +15,7 @@ so.
 from __future__ import annotations
 
 import json
+import math
 import os
 import subprocess
 import sys
@@ -35,8 +36,10 @@ LONG_STALL_MS = 100.0
 BUSY_SHARE = 0.05
 """If this share of a drive or more is stalled, the medians of the drive's latencies change."""
 SLOW_SHARE = 0.15
-"""The share of a by-wire drive that must be stalled before many short stalls explain a failure. A drive that lacks
-15 ms of each 100 ms still works as usual (`docs/by_wire.md`)."""
+"""The share of an interval that must be stalled before many short stalls explain a failure. A drive that lacks 15 ms of
+each 100 ms still works as usual (`docs/by_wire.md`)."""
+SLOW_INTERVAL_NS = NS_PER_S
+"""In shorter intervals the share explains nothing, because one short stall can be a large share of them."""
 COUNTED_MS = 10.0
 """The summary at the end counts only stalls of this length or more."""
 MAX_DESCRIBED = 4
@@ -265,15 +268,19 @@ class Stalls:
     ) -> Iterator[None]:
         """Excuse a failed assertion about times in this context, by one stall or, with `share`, by a stalled share.
 
-        Without `until_ns` the interval ends when the assertion fails. Assertions on safety must be outside.
+        In an interval of `SLOW_INTERVAL_NS` or more, many stalls shorter than `stall_ms` excuse it, too, if they take
+        `SLOW_SHARE` of it. Without `until_ns` the interval ends when the assertion fails. Assertions on safety must be
+        outside.
         """
         try:
             yield
         except AssertionError as failure:
             end_ns = self.clock.now().mono_ns if until_ns is None else until_ns
+            verdict: Exception = failure
             if share is None:
                 verdict = self.verdict(str(failure), since_ns, end_ns, stall_ms=stall_ms)
-            else:
+                share = SLOW_SHARE if end_ns - since_ns >= SLOW_INTERVAL_NS else math.inf
+            if not isinstance(verdict, HostStalled):
                 verdict = self.share_verdict(str(failure), since_ns, end_ns, share=share)
             if isinstance(verdict, AssertionError):
                 raise

@@ -64,6 +64,7 @@ CONDITION_KEYS = {
     "completion_interval",
     "completed_in_own_lane",
     "own_lane_completion_rate",
+    "invasion_free_completion_rate",
     "own_lane_completion_interval",
     "endings",
     "routes",

@@ -2,12 +2,14 @@ from __future__ import annotations
 
 from typing import Any
 
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
 from matplotlib.text import Annotation
 
-from lavt.experiment.report.figure_style import FigurePoint, clusters_of, condition_colours
+from lavt.experiment.report.figure_style import SETTINGS, FigurePoint, clusters_of, condition_colours
+from lavt.experiment.report.headline_figure import headline_figure
 from lavt.experiment.report.latency_figures import degradation_figure, presets_figure
 from lavt.experiment.report.run_figures import cross_track_figure
 from lavt.experiment.statistics.paper_results import paper
@@ -81,8 +83,38 @@ def test_conditions_with_overlapping_points_are_named() -> None:
     assert point_names(completion) == point_names(error) == ["L4\nL3"]
 
 
-def test_the_lowest_panel_of_each_column_has_an_x_label() -> None:
-    """With three routes in two columns, the lower left and the right panel have an x label, the upper left has none."""
+def test_the_lowest_panel_has_an_x_label() -> None:
+    """The routes are below each other, and only the last has an x label."""
     panels = cross_track_figure({"a": [], "b": [], "c": []}, COLOURS).axes[:3]
-    label = "distance along the route (m)"
-    assert [axes.get_xlabel() for axes in panels] == ["", label, label]
+    assert [axes.get_xlabel() for axes in panels] == ["", "", "distance along the route (m)"]
+    assert len({axes.get_position().x0 for axes in panels}) == 1
+
+
+def test_names_are_inside_their_panel() -> None:
+    """The name of a point next to an edge of its panel is on the other side of the point; no label is cut off."""
+    own_lane = {"own_lane_completion_rate": 0.5, "own_lane_completion_interval": [0.4, 0.6]}
+    conditions = {
+        name: {**entry(loop_ms, 0.5, 3.0), **own_lane} for name, loop_ms in (("L2", 9.0), ("L3", 200.0), ("L4", 390.0))
+    }
+    for kind in ("virtual", "real"):
+        with rc_context(SETTINGS):
+            figure = headline_figure({kind: conditions}, {}, COLOURS)
+            figure.draw_without_rendering()
+        for axes in figure.axes:
+            label = axes.yaxis.label.get_window_extent()
+            assert figure.bbox.y0 <= label.y0
+            assert label.y1 <= figure.bbox.y1
+            names = [text for text in axes.texts if isinstance(text, Annotation)]
+            assert len(names) == 3
+            for text in names:
+                box, panel = text.get_window_extent(), axes.get_window_extent()
+                assert panel.x0 <= box.x0
+                assert box.x1 <= panel.x1
+
+
+def test_a_name_is_written_once() -> None:
+    """A point in real time next to the point of its condition in virtual time is not named again."""
+    near, far = entry(224.0, 0.91, 2.6), entry(300.0, 0.1, 9.0)
+    completion, error = headline_figure({"virtual": CONDITIONS, "real": {"L2": near, "L3": far}}, {}, COLOURS).axes
+    assert sorted(point_names(completion)) == ["L2", "L3", "L4\nL3"]
+    assert point_names(error).count("L2") == 1

@@ -20,10 +20,10 @@ from lavt.experiment.analysis.drive_data import DriveData, capture_to_stamp_ms, 
 from lavt.experiment.analysis.results import read_json, run_result, write_json
 from lavt.experiment.report import table_format
 from lavt.experiment.report.figure_style import condition_colours
-from lavt.experiment.report.replay_section import least_and_most_delayed
+from lavt.experiment.report.replay_section import largest_error_s, least_and_most_delayed
 from lavt.experiment.report.report import write_report
 from lavt.experiment.report.run_sections import received_pictures
-from lavt.experiment.report.tables import stage_table
+from lavt.experiment.report.tables import machine_table, stage_table
 from lavt.nodes.payloads import VideoUnit
 from lavt.recording.record import RecordWriter, read_record
 
@@ -88,6 +88,7 @@ def test_the_report_is_complete(sweep: Path) -> None:
     assert figures == {
         "headline",
         "degradation",
+        "degradation_age",
         "injected",
         "stages_virtual",
         "stages_real",
@@ -145,20 +146,41 @@ def test_the_page_links_to_its_chapters_in_order(sweep: Path) -> None:
 
 
 def test_the_first_screen_says_what_was_run(sweep: Path) -> None:
-    """Before the chapters come what was run, the headline figure, the replay and the legend, with a link to why."""
+    """Before the chapters come what was run, the headline figure, the findings, the replay and the legend."""
     first = page_of(sweep).partition("<nav>")[0]
-    places = [first.index(part) for part in ("runs in virtual time", 'data-name="headline"', "<video", "<dl")]
+    places = [first.index(part) for part in ("runs in virtual time", 'data-name="headline"', "<ul", "<video", "<dl")]
     assert places == sorted(places)
     assert '<a href="#chapter_validity">See why.</a>' in first
-    assert '<source media="(max-width: 40rem)" srcset="data:image/svg' in first
     assert "Loop latency" in first
+
+
+def test_texts_of_figures_are_legible_on_a_phone(sweep: Path) -> None:
+    """On a screen of 390 px, where a figure is 368 px wide, each text of a figure has at least 11 px."""
+    for path in (sweep / "report").glob("*.svg"):
+        svg = path.read_text()
+        width = re.search(r'viewBox="0 0 ([0-9.]+) ', svg)
+        sizes = [float(size) for size in re.findall(r"font-size: ([0-9.]+)px", svg)]
+        assert width is not None
+        assert sizes, path
+        assert min(sizes) * 368 / float(width[1]) >= 11, path
+
+
+def test_a_wide_table_has_its_titles_in_each_row(sweep: Path) -> None:
+    """On a narrow screen each row of a wide table is a list of titles and cells; a small table remains a table."""
+    html = page_of(sweep)
+    wide, *_ = re.findall(r'<table class="wide">.*?</table>', html, re.DOTALL)
+    row = wide.partition("<tbody>")[2].partition("</tr>")[0]
+    assert row.count("<td") == row.count("data-title=") == wide.count("<th") - 1  # without <thead>
+    assert '<td class="text" data-title="condition">L0</td>' in row
+    routes = html.partition('id="results_by_route"')[2].partition("</table>")[0]
+    assert "data-title" not in routes
 
 
 def test_a_table_hides_columns_behind_a_switch(sweep: Path) -> None:
     """The page shows the main columns of a table; a switch shows the rest, which the CSV always has."""
     html = page_of(sweep)
-    driving = html.partition("lane invasions / run</th>")[0].rpartition("<table>")[2]
-    assert '<th class="extra">completed</th>' in driving
+    driving = html.partition("lane invasions / run</th>")[0].rpartition("<table")[2]
+    assert '<th class="extra">95 %, these routes</th>' in driving
     assert "<th>runs</th>" in driving
     assert 'type="checkbox"> all ' in html
 
@@ -174,9 +196,28 @@ def test_the_replay_is_a_video(sweep: Path) -> None:
     html = page_of(sweep)
     assert len(re.findall(r'<video src="data:video/mp4;base64,', html)) == 1
     assert '<a href="replay.mp4">MP4</a>' in html
+    for colour, meaning in (("#50c850", "the lane that the driver detected"), ("#ffc850", "where the rear axle was")):
+        assert f'<i style="background: {colour}"></i> {meaning}' in html
     assert "The runs 0 and 1" in html
     video = cv2.VideoCapture(str(sweep / "report" / "replay.mp4"))
     assert int(video.get(cv2.CAP_PROP_FRAME_COUNT)) > 20
+
+
+def test_the_poster_shows_the_largest_error(sweep: Path) -> None:
+    """Before it plays and on paper, the replay shows the moment of the largest error of the run with the most delay."""
+    directory = sweep / "runs" / "2"
+    drive = read_drive(directory, read_json(directory / "result.json"))
+    time_s = largest_error_s(drive)
+    index = int(np.searchsorted(drive.truth.ints("mono_ns"), drive.began_ns + round(time_s * NS_PER_S)))
+    error_m = np.abs(drive.truth.floats("cross_track_m"))
+    assert error_m[index] == error_m.max() > 1.5
+    html = page_of(sweep)
+    poster = re.search(r' poster="(data:image/jpeg;base64,[^"]+)"', html)
+    assert poster is not None
+    assert f'<img class="printed" src="{poster[1]}"' in html
+    picture = cv2.imread(str(sweep / "report" / "replay.jpg"))
+    assert picture is not None
+    assert picture.shape[1] == 960
 
 
 def test_the_runs_with_the_least_and_most_delay_are_shown(sweep: Path, tmp_path: Path) -> None:
@@ -238,6 +279,14 @@ def test_real_and_virtual_runs_have_separate_tables(sweep: Path) -> None:
     assert "Virtual time, fidelity video: modelled network and clocks" in html
     assert "Real time, injected by relay" in html
     assert "invalid: the offset between the clocks is only known to 6.00 ms" in html
+
+
+def test_the_table_of_machines_says_where_the_costs_were_measured() -> None:
+    """Of the costs the table has only where they were measured, and it has no empty entries."""
+    model = {"costs": '{"measured_on": "2 cores", "stages_us": {}}', "traces": "{}", "condition": "{}"}
+    assert machine_table({"model": model}).rows == [["model", "costs measured on", "2 cores"]]
+    for damaged in ("", "[]", "{}x", '{"stages_us": {}}'):
+        assert machine_table({"model": {"costs": damaged}}).rows == [["model", "costs measured on", "unknown"]]
 
 
 def test_the_page_has_the_clock_offset_of_two_machines(sweep: Path) -> None:
@@ -319,7 +368,7 @@ def test_received_pictures_are_decoded(tmp_path: Path) -> None:
         writer.write("video", VideoUnit(index * NS_PER_S, unit), Now(index, index))
     writer.close()
     pictures = received_pictures(tmp_path / "client.mcap")
-    assert [text for text, _ in pictures] == ["1.0 s", "3.0 s", "5.0 s", "7.0 s"]
+    assert [text for text, _ in pictures] == ["0.0 s", "2.0 s", "4.0 s", "6.0 s"]
     indexes = [round((float(picture.mean()) - 40) / 20) for _, picture in pictures]
     assert indexes == [1, 3, 5, 7]
 

@@ -23,7 +23,7 @@ from lavt.experiment.report.condition_sections import (
 from lavt.experiment.report.condition_tables import COMPLETED_P95, FOLLOWED_P95
 from lavt.experiment.report.figure_style import condition_colours
 from lavt.experiment.report.first_screen import first_parts
-from lavt.experiment.report.groups import axes_of, differing_settings, is_in_group, sort_groups, title_of
+from lavt.experiment.report.groups import differing_settings, is_in_group, sort_groups, title_of
 from lavt.experiment.report.report import write_report
 from lavt.experiment.report.run_figures import drawn_indexes
 from lavt.experiment.report.sections import (
@@ -53,6 +53,7 @@ NEW_CONDITION_KEYS = (
     "completed_in_own_lane",
     "own_lane_completion_rate",
     "own_lane_completion_interval",
+    "invasion_free_completion_rate",
     "followed_p95_m",
     "followed_p95_route_balanced_m",
     "p95_route_balanced_m",
@@ -177,7 +178,7 @@ def test_results_are_compared_with_the_paper(tmp_path: Path) -> None:
     assert "13.15" in parts["conditions"]
     titles = re.findall("<th[^>]*>(.*?)</th>", unescape(parts["conditions"] + parts["latencies"]))
     assert {"the paper's completed", "the paper's τ video ms", "the paper's τ control ms"} < set(titles)
-    row = re.search(r"<tr><td class=\"text\">L3 – L4</td>(.*?)</tr>", parts["contrasts"])
+    row = re.search(r"<tr><td class=\"text\"[^>]*>L3 – L4</td>(.*?)</tr>", parts["contrasts"])
     assert row is not None
     pairs, completed_under_one_only, p_values, paper_p_values = ["6"], ["0", "0"], ["1", "1"], ["0.78", "1"]
     by_road = ["2", "0", "0", "1", "1"]
@@ -266,8 +267,8 @@ def test_a_summary_of_an_older_version_is_reported(tmp_path: Path) -> None:
         "routes",
     ]
     tables = parts["conditions"] + parts["latencies"] + parts["errors"]
-    rows = re.findall(r'<tr><td class="text">(L\d)</td>(.*?)</tr>', tables)
-    assert [name for name, _ in rows] == [*INJECTED] * 4
+    rows = re.findall(r'<tr><td class="text"[^>]*>(L\d)</td>(.*?)</tr>', tables)
+    assert [name for name, _ in rows] == [*INJECTED] * 3
     shown = {name: text_of(cells).split() for name, cells in rows[: len(INJECTED)]}
     for name, condition in summary["conditions"].items():
         assert shown[name][:2] == [f"{condition['runs']}", f"{100 * condition['completion_rate']:.0f}"]
@@ -300,8 +301,8 @@ KEPT = {
 CHANGE = {"lane": "followed", "mono_ns": 5, "progress_m": 40.0, "from": 0, "to": -1}
 
 
-def test_the_headline_has_completion_in_the_own_lane(tmp_path: Path) -> None:
-    """The headline has completion, completion in the own lane, collisions, and P95 against both lanes."""
+def test_the_tables_have_completion_in_the_own_lane(tmp_path: Path) -> None:
+    """The tables have completion, completion in the own lane, collisions, and P95 against both lanes, each once."""
     runs = [
         run_of("L0", followed_p95_m=0.1, completed_in_own_lane=True, lane_kept=KEPT),
         run_of(
@@ -314,16 +315,19 @@ def test_the_headline_has_completion_in_the_own_lane(tmp_path: Path) -> None:
         ),
     ]
     report = report_of(summarize(runs, None), tmp_path)
-    conditions_parts(report)
+    html = "".join([*conditions_parts(report), *error_table_parts(report)])
+    titles = re.findall("<th(?: [^>]*)?>(.*?)</th>", html)
+    assert [title for title in titles if titles.count(title) > 1] == ["condition"] * 2
     run_parts(report)
-    (row,) = csv_rows(tmp_path / "tables" / "conditions_virtual_headline.csv")
+    (row,) = csv_rows(tmp_path / "tables" / "conditions_virtual_driving.csv")
     assert [row[name] for name in ("completed (share)", "completed in own lane (share)", "collisions / run")] == [
         "1.0",
         "0.5",
         "0.0",
     ]
     errors = (f"{COMPLETED_P95}, mean of routes", f"{FOLLOWED_P95}, mean of routes")
-    assert [float(row[name]) for name in errors] == pytest.approx([2.0, 0.3])
+    (error_row,) = csv_rows(tmp_path / "tables" / "conditions_virtual_error.csv")
+    assert [float(error_row[name]) for name in errors] == pytest.approx([2.0, 0.3])
     assert (row["completed, by road mean (share)"], row["completed, by road low (share)"]) == ("1.0", "")
     assert row["completed, by road roads (share)"] == "2"
     (change,) = csv_rows(tmp_path / "tables" / "lane_changes.csv")
@@ -357,7 +361,7 @@ def test_two_presets_are_separate_groups(tmp_path: Path) -> None:
         "contrasts.csv",
         "contrasts_preset_designed.csv",
     }
-    assert parts["runs"].count('<td class="text extra">other</td>') == 36
+    assert parts["runs"].count('data-title="sweep">other</td>') == 36
     assert "designed" in parts["groups"]
 
 
@@ -370,17 +374,19 @@ def test_sweeps_with_equal_settings_are_separate_groups() -> None:
 
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_axes_of_a_sweep_are_drawn(count: int, tmp_path: Path) -> None:
-    """One axis gives one column of panels, two axes a column for each value of the second; three give no figure."""
+    """One axis gives one figure, two axes a figure for each value of the second; three give no figure."""
     axes = {"controller.speed_mps": (10.0, 6.0, 8.0), "network.video.loss": (0.0, 0.1), "camera.rate_hz": (30.0, 15.0)}
     runs = campaign()
     for name in list(axes)[:count]:
         runs = [{**run, "axes": {**run.get("axes", {}), name: value}} for value in axes[name] for run in runs]
     report = report_of(summarize(runs, None), tmp_path)
     html = "\n".join(axis_parts(report))
-    assert ("axes.png" in html) == (count < 3)
+    second = ["axes_video_loss_0_0.png", "axes_video_loss_0_1.png"]
+    assert re.findall(r'href="(axes[^"]*\.png)"', html) == {1: ["axes.png"], 2: second, 3: []}[count]
     if count < 3:
-        figure = axis_figure(report.groups, axes_of(report.groups)[:count], report.colours)
-        assert len(figure.axes) == 3 * (1 if count == 1 else 2)
+        same_second = [group for group in report.groups if group.get("network.video.loss") in {None, 0.1}]
+        figure = axis_figure(same_second, "controller.speed_mps", report.colours, report.groups)
+        assert len(figure.axes) == 3
         line = figure.axes[0].get_lines()[0]
         assert list(np.asarray(line.get_xdata())) == [6.0, 8.0, 10.0]
         assert len(figure.axes[0].get_lines()) == 6

@@ -2,7 +2,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from lavt.experiment.report.sentences import results_sentences, runs_overview
+from lavt.experiment.report.sentences import (
+    contrast_sentence,
+    length_sentences,
+    results_sentences,
+    runs_overview,
+)
 
 INJECTED = {"L0": (0, 0), "L1": (75, 0), "L2": (150, 0), "L3": (225, 0), "L4": (150, 75), "L5": (225, 100)}
 
@@ -42,17 +47,17 @@ def test_equal_falls_are_all_named() -> None:
 def test_the_error_is_that_of_the_headline_figure() -> None:
     """If the error of all runs is known, it is named; else that of the completed runs."""
     known = conditions(1.0, 0.5)
-    assert "of the completed runs (mean) is 0.10 m at L0 and 0.10 m at L1" in results_sentences("It", known)
+    assert "0.10 m at L0, 0.10 m at L1, of the completed runs (mean)" in results_sentences("It", known)
     for name, mean_m in (("L0", 0.05), ("L1", 5.5)):
         known[name]["by_road"] = {"p95_all_runs_m": {"mean": mean_m}}
-    assert "of all runs, each up to its own end (mean over roads) is 0.05 m at L0 and 5.50 m at L1" in (
+    assert "0.05 m at L0, 5.50 m at L1, of all runs, each up to its own end (mean over roads)" in (
         results_sentences("It", known)
     )
 
 
 def test_no_fall_is_reported_if_there_is_none() -> None:
     """Constant completion has a sentence; with one condition no fall is named; without conditions there is no text."""
-    assert "Completion does not fall" in results_sentences("It", conditions(1.0, 1.0, 1.0))
+    assert "does not fall" in results_sentences("It", conditions(1.0, 1.0, 1.0))
     assert "fall" not in results_sentences("It", conditions(1.0))
     assert results_sentences("It", {}) == ""
     assert results_sentences("It", {"L0": entry("L0", 1.0, None)}) == ""
@@ -115,3 +120,56 @@ def test_completion_is_judged_in_the_own_lane() -> None:
     )
     known["L0"]["own_lane_completion_rate"] = None
     assert "Runs completed by condition" in results_sentences("It", known)
+
+
+def contrast(a: str, b: str, p: float | None, *, for_a: int = 0, for_b: int = 0, roads: int = 6) -> dict[str, Any]:
+    return {"a": a, "b": b, "roads": roads, "roads_for_a": for_a, "roads_for_b": for_b, "p_by_road_holm": p}
+
+
+def test_a_test_by_road_that_cannot_be_significant_says_so() -> None:
+    """With six contrasts on six roads, the smallest p after Holm's correction is 6 times 2 times 0.5 to the 6th."""
+    text = contrast_sentence([contrast("L0", f"L{index}", 1.0) for index in range(6)])
+    assert "none could be: 6 roads are too few, because even if all agreed, p would be 0.19" in text
+    text = contrast_sentence([contrast("L0", "L1", 1.0, roads=10)])
+    assert "no planned contrast of completion in any lane is significant (10 roads), which does not show" in text
+    assert contrast_sentence([contrast("L0", "L1", None)]) == contrast_sentence([]) == ""
+
+
+def test_significant_contrasts_are_named_with_their_direction() -> None:
+    """A significant contrast names the condition with more completed runs first; the others are counted."""
+    text = contrast_sentence(
+        [contrast("L2", "L3", 0.002, for_a=9), contrast("L3", "L5", 0.01, for_b=8), contrast("L0", "L1", 1.0)]
+    )
+    assert "more runs are completed at L2 than at L3 (p = 0.002), L5 than at L3 (p = 0.01)" in text
+    assert "the other 1 contrast is not significant" in text
+
+
+LENGTHS_M = {"r1": 582.0, "r2": 187.0, "r3": 328.0, "r4": 677.0, "r5": 140.0, "r6": 229.0}
+
+
+def completed_on(*routes: str) -> dict[str, Any]:
+    counts = {name: int(name in routes) for name in LENGTHS_M}
+    rows = {name: {"runs": 1, "completed": 1, "completed_in_own_lane": count} for name, count in counts.items()}
+    return {"completion_rate": 1.0, "own_lane_completion_rate": len(routes) / 6, "routes": rows}
+
+
+def test_longer_roads_that_fail_first_are_named() -> None:
+    """If only the shorter routes are completed in the own lane, the lengths and the chance of this order are given."""
+    split = {"L0": completed_on(*LENGTHS_M), "L3": completed_on("r2", "r5"), "L4": completed_on("r2", "r5")}
+    text = length_sentences(split, LENGTHS_M)
+    assert text.count("Longer roads fail first") == 1
+    assert "at L3 and L4, every run is completed in its own lane on the 2 shorter routes (140 to 187 m)" in text
+    assert "not on the 4 longer ones (229 to 677 m)" in text
+    assert "1 in 15." in text
+
+
+def test_an_order_by_length_is_not_assumed() -> None:
+    """Nothing is said if a longer route is completed, if chance explains the order, or if routes share a road."""
+    assert length_sentences({"L3": completed_on("r2", "r3")}, LENGTHS_M) == ""
+    assert length_sentences({"L3": completed_on("r1", "r3", "r4", "r6")}, LENGTHS_M) == ""
+    assert length_sentences({"L3": completed_on("r2", "r3", "r5", "r6", "r1")}, LENGTHS_M) == ""
+    assert length_sentences({"L0": completed_on(*LENGTHS_M), "L5": completed_on()}, LENGTHS_M) == ""
+    shared = completed_on("r2", "r5")
+    shared["routes"]["r2_key"] = shared["routes"].pop("r5")
+    lengths_m = {**LENGTHS_M, "r2_key": 140.0}
+    assert length_sentences({"L3": shared}, lengths_m) == ""

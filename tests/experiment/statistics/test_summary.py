@@ -44,7 +44,8 @@ def test_summary_of_a_condition() -> None:
     assert (condition["runs"], condition["completed"]) == (3, 2)
     assert condition["completion_rate"] == pytest.approx(2 / 3)
     assert condition["collisions_per_run"] == pytest.approx(1 / 3)
-    assert condition["collisions_per_run_interval"] == exact_rate_interval(1, 3)
+    assert condition["collisions_per_run_interval"] == exact_interval(1, 3)
+    assert condition["invasion_free_completion_rate"] == 0.0
     assert condition["p95_m"] == 2.0
     assert condition["injected_ms"] == {"video": 75.0, "control": 0.0}
     assert condition["tau_v_ms"] == {"p5": 60.0, "p50": 62.0, "p95": 86.0, "bound": 0.4, "n": 300}
@@ -139,8 +140,16 @@ def test_rates_by_road_have_an_exact_interval() -> None:
     runs = [run(route=f"road{number}") for number in range(6)]
     by_road = summarize(runs, SPEED)["conditions"]["L0"]["by_road"]
     assert [by_road["completion_rate"][key] for key in ("low", "high")] == exact_interval(6, 6)
-    assert by_road["collisions_per_run"]["low"] is None
+    assert [by_road["collisions_per_run"][key] for key in ("low", "high")] == exact_interval(0, 6)
     assert summarize(runs[:3], SPEED)["conditions"]["L0"]["by_road"]["completion_rate"]["low"] is None
+
+
+def test_collisions_that_do_not_end_a_run_are_counts() -> None:
+    """If a run goes on after a collision, the intervals are those of a count, and of the roads' means."""
+    runs = [run(route=f"road{number}", collisions=number) for number in range(6)]
+    condition = summarize(runs, SPEED)["conditions"]["L0"]
+    assert condition["collisions_per_run_interval"] == exact_rate_interval(15, 6)
+    assert condition["by_road"]["collisions_per_run"]["high"] > 1.0
 
 
 @pytest.mark.parametrize("suffix", ["", ".yaml", ".yml"])

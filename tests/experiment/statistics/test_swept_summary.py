@@ -65,6 +65,7 @@ def test_without_delay_the_own_lane_is_kept(summary: Any) -> None:
         assert run["lane_kept"]["lane_width_m"] == pytest.approx(3.5)
         assert run["followed_p95_m"] == pytest.approx(run["p95_m"])
     assert summary["conditions"]["L1"]["own_lane_completion_rate"] == 1.0
+    assert summary["conditions"]["L1"]["invasion_free_completion_rate"] == 1.0
 
 
 def test_stage_latencies_add_up_to_the_loop_latency(summary: Any) -> None:

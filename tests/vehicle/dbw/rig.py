@@ -199,3 +199,5 @@ def with_one_speed(generation: int) -> Profile:
 
 
 both_generations = pytest.mark.parametrize("generation", [1, 2])
+mostly_generation_2 = pytest.mark.parametrize("generation", [pytest.param(1, marks=pytest.mark.full), 2])
+"""Both generations; generation 1 in the full lane only, for long tests of what both have in common."""

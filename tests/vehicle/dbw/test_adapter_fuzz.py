@@ -12,7 +12,7 @@ from tests.vehicle.dbw.fuzzer import run_ticks
 from lavt.vehicle.dbw import speed_monitor
 from lavt.vehicle.dbw.states import State
 
-QUICK_SEEDS, FULL_SEEDS = 4, 15
+QUICK_SEEDS, FULL_SEEDS = 2, 15
 """The number of runs of each generation in the quick lane and in the full lane."""
 TICKS = 1500
 """The number of ticks of a run. A thousand ticks take about half a second."""

@@ -9,8 +9,8 @@ from tests.vehicle.dbw.rig import (
     COARSE_MS,
     SPEED_SOURCES,
     AdapterRig,
-    both_generations,
     driving_rig,
+    mostly_generation_2,
     stationary_rig,
     with_one_speed,
 )
@@ -54,7 +54,7 @@ def requests_a_gear(rig: AdapterRig) -> bool:
     return GEAR_COMMAND[rig.generation] in {frame.identifier for _, frame in newest}
 
 
-@both_generations
+@mostly_generation_2
 @pytest.mark.parametrize("stuck_mps", [0.0, 3.0])
 def test_a_stuck_speed_stops_the_car(generation: int, stuck_mps: float) -> None:
     """A speed stuck at 0 or at 3 m/s while the car drives at 8.3 m/s is a fault: full brake, and no PARK before
@@ -81,7 +81,7 @@ def test_a_stuck_speed_stops_the_car(generation: int, stuck_mps: float) -> None:
         assert rig.kit.state.gear == Gear.PARK
 
 
-@both_generations
+@mostly_generation_2
 def test_all_speeds_stuck_at_zero(generation: int) -> None:
     """Even if all speeds drop to 0, the car brakes fully for long enough to stop before it is parked."""
     rig, gate = fast_rig(generation)
@@ -106,7 +106,7 @@ def with_speeds_stuck_at_zero(generation: int) -> tuple[AdapterRig, SafetyGate]:
     return rig, gate
 
 
-@both_generations
+@mostly_generation_2
 @pytest.mark.parametrize(
     "throttle", [*(pytest.param(throttle, marks=pytest.mark.full) for throttle in (0.1, 0.2)), 0.45, 1.0]
 )
@@ -123,7 +123,7 @@ def test_all_speeds_stuck_at_zero_since_standstill(generation: int, throttle: fl
     assert (rig.speed_mps, rig.kit.state.gear) == (0.0, Gear.PARK)
 
 
-@both_generations
+@mostly_generation_2
 @pytest.mark.parametrize(("brake_share", "coasting_ms"), [(1.0, 0), (1.0, 2000), (0.5, 0), (0.5, 2000), (0.3, 0)])
 def test_a_stop_before_stuck_speeds_are_found(generation: int, brake_share: float, coasting_ms: int) -> None:
     """If all speeds stay 0 and the drive ends before this is found, the car is not parked before it is stationary, not
@@ -142,7 +142,7 @@ def test_a_stop_before_stuck_speeds_are_found(generation: int, brake_share: floa
     assert not any(name.startswith("speed_") for name in rig.adapter.counts)
 
 
-@both_generations
+@mostly_generation_2
 @pytest.mark.parametrize(("brake_share", "speed_mps"), [(0.5, 2.5), (0.25, 2.2)])
 def test_a_parked_car_with_weak_brakes_and_stuck_speeds(generation: int, brake_share: float, speed_mps: float) -> None:
     """If all speeds stay 0 and driving is no longer wanted, even a car that the holding brake slows by a quarter of
@@ -159,7 +159,7 @@ def test_a_parked_car_with_weak_brakes_and_stuck_speeds(generation: int, brake_s
     assert rig.speed_mps == 0.0
 
 
-@both_generations
+@mostly_generation_2
 def test_wheels_that_lock_on_ice(generation: int) -> None:
     """A car that slides on ice with locked wheels is not parked before it is stationary."""
     rig, gate = stationary_rig(generation).copy(), new_gate()
@@ -178,7 +178,7 @@ def test_wheels_that_lock_on_ice(generation: int) -> None:
     assert not any(name.startswith("speed_") for name in rig.adapter.counts)
 
 
-@both_generations
+@mostly_generation_2
 @pytest.mark.parametrize("speed_mps", [0.0, 3.0])
 def test_a_stuck_speed_under_throttle(generation: int, speed_mps: float) -> None:
     """A speed that is stuck at the start, or at 3 m/s, ends the drive before the car is much faster."""
@@ -192,7 +192,7 @@ def test_a_stuck_speed_under_throttle(generation: int, speed_mps: float) -> None
     assert not rig.adapter.state().is_speed_plausible
 
 
-@both_generations
+@mostly_generation_2
 def test_a_stuck_speed_of_a_kit_with_one_speed(generation: int) -> None:
     """If the kit reports only one speed, this speed, stuck at 3 m/s under throttle, still ends the drive."""
     rig = AdapterRig(generation, profile=with_one_speed(generation))
@@ -205,7 +205,7 @@ def test_a_stuck_speed_of_a_kit_with_one_speed(generation: int) -> None:
     assert not rig.adapter.state().is_speed_plausible
 
 
-@both_generations
+@mostly_generation_2
 def test_a_scaled_speed_stops_the_car(generation: int) -> None:
     """A reported speed that becomes half the real speed is a fault."""
     rig, gate = fast_rig(generation)
@@ -214,7 +214,7 @@ def test_a_scaled_speed_stops_the_car(generation: int) -> None:
     assert (gate.state, rig.adapter.state().is_speed_plausible) == ("safe_stop", False)
 
 
-@both_generations
+@mostly_generation_2
 @pytest.mark.parametrize("source", ["speed", "wheel_speed"])
 def test_a_missing_speed_stops_the_car(generation: int, source: str) -> None:
     """A speed or wheel speeds that are no longer reported stop the car."""
@@ -227,7 +227,7 @@ def test_a_missing_speed_stops_the_car(generation: int, source: str) -> None:
     assert not rig.adapter.state().is_engaged
 
 
-@both_generations
+@mostly_generation_2
 def test_unknown_wheel_speeds_stop_the_car(generation: int) -> None:
     """Wheel speeds that are reported as unknown stop the car, like missing wheel speeds."""
     rig, gate = fast_rig(generation)
@@ -236,7 +236,7 @@ def test_unknown_wheel_speeds_stop_the_car(generation: int) -> None:
     assert (gate.state, rig.speed_mps) == ("safe_stop", 0.0)
 
 
-@both_generations
+@mostly_generation_2
 def test_a_safe_stop_with_weak_brakes_brakes_fully(generation: int) -> None:
     """If the brake has half its force, a safe stop presses it fully, and the speed is no fault."""
     rig, gate = fast_rig(generation)
@@ -249,7 +249,7 @@ def test_a_safe_stop_with_weak_brakes_brakes_fully(generation: int) -> None:
     assert not any(name.startswith("speed_") for name in rig.adapter.counts)
 
 
-@both_generations
+@mostly_generation_2
 def test_a_safe_stop_with_good_brakes_leaves_grip_for_steering(generation: int) -> None:
     """A safe stop that decelerates as wanted does not press the brake further, and raises no fault."""
     rig, gate = fast_rig(generation)

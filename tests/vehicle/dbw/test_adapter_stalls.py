@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 
 import pytest
-from tests.vehicle.dbw.rig import COARSE_MS, AdapterRig, both_generations, driving_rig
+from tests.vehicle.dbw.rig import COARSE_MS, AdapterRig, driving_rig, mostly_generation_2
 
 from lavt.domain import NS_PER_MS, Actuation
 from lavt.vehicle.can_frame import CanFrame
@@ -14,7 +14,7 @@ from lavt.vehicle.dbw.profile import AXES, Axis
 from lavt.vehicle.software_car.authority import WATCHDOG_BRAKE
 
 
-@both_generations
+@mostly_generation_2
 def test_a_stall_while_parking_ends(generation: int) -> None:
     """If the kit disengages in a stall while parking, at whatever moment, parking ends, and the watchdog brakes."""
     parking_rig = driving_rig(generation)
@@ -56,7 +56,7 @@ def forge_enabled(rig: AdapterRig, axis: Axis, *, is_enabled: bool) -> None:
     rig.lose_report = forge
 
 
-@both_generations
+@mostly_generation_2
 @pytest.mark.parametrize("is_wanted", [False, True])
 def test_axes_released_while_parking_are_a_reason(generation: int, is_wanted: bool) -> None:
     """If the kit releases all axes before PARK, there is an event with the reason. The state is then `lost` while
@@ -77,7 +77,7 @@ def test_axes_released_while_parking_are_a_reason(generation: int, is_wanted: bo
     assert rig.adapter.state().inhibit_reason
 
 
-@both_generations
+@mostly_generation_2
 @pytest.mark.parametrize("axis", AXES)
 @pytest.mark.parametrize("is_wanted", [True, False])
 def test_the_car_brakes_without_an_axis(generation: int, axis: Axis, is_wanted: bool) -> None:
@@ -112,7 +112,7 @@ def test_a_released_axis_is_not_enabled_again() -> None:
     assert round(rig.kit.state.brake, 2) == 0.4
 
 
-@both_generations
+@mostly_generation_2
 @pytest.mark.parametrize("dropped", [1, 2, 3, 4])
 def test_dropped_frames_leave_no_gap_in_the_counters(generation: int, dropped: int) -> None:
     """If the last frames of a set are not written, the next frames get their counters, and driving continues."""
@@ -138,7 +138,7 @@ def test_dropped_frames_leave_no_gap_in_the_counters(generation: int, dropped: i
         assert {(after - before) % modulus for before, after in pairwise(found)} == {1}
 
 
-@both_generations
+@mostly_generation_2
 def test_sets_that_are_never_written_are_no_commands(generation: int) -> None:
     """If no frame is written for 100 ms, driving ends as if no frame had been due."""
     rig = driving_rig(generation)
@@ -151,7 +151,7 @@ def test_sets_that_are_never_written_are_no_commands(generation: int) -> None:
     assert any("no command was sent" in event.detail for event in rig.events)
 
 
-@both_generations
+@mostly_generation_2
 @pytest.mark.parametrize("dropped", [1, 2, 9])
 def test_frames_that_were_not_written_are_due_at_the_next_tick(generation: int, dropped: int) -> None:
     """A set that was not written completely is due again at the next call, and not earlier."""
@@ -166,7 +166,7 @@ def test_frames_that_were_not_written_are_due_at_the_next_tick(generation: int, 
     assert len(rig.sent) - written >= 3
 
 
-@both_generations
+@mostly_generation_2
 def test_a_buffer_with_room_for_one_frame_at_a_time_ends_driving(generation: int) -> None:
     """If only the first frame of each set is written, the kit releases the other axes, which ends driving."""
     rig = driving_rig(generation)

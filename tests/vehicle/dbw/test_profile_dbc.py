@@ -29,7 +29,9 @@ def load_database(profile: str) -> Database:
 
 
 def load_vectors(profile: str) -> dict[str, Any]:
-    found: dict[str, Any] = yaml.safe_load((Path(__file__).parent / "vectors" / f"{profile}.yaml").read_text())
+    found: dict[str, Any] = yaml.load(
+        (Path(__file__).parent / "vectors" / f"{profile}.yaml").read_text(), Loader=yaml.CSafeLoader
+    )
     return found
 
 

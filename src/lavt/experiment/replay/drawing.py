@@ -13,7 +13,7 @@ import numpy as np
 from lavt.domain import NS_PER_S, FloatArray, Lane, Picture
 from lavt.experiment.replay.drive import ReplayDrive, Scene
 from lavt.perception.calibration import CalibratedCamera
-from lavt.perception.panel import draw_lane
+from lavt.perception.panel import CENTRE, LEFT, draw_lane
 
 Colour = tuple[int, int, int]
 """Blue, green, red."""
@@ -35,6 +35,14 @@ ROAD, LINE, TRAIL, CAR, RED, GREEN = (
     (90, 90, 255),
     (120, 210, 120),
 )
+KEY = (
+    (LEFT, "the lane that the driver detected"),
+    (CENTRE, "its centre, which the driver steers to"),
+    (ROAD, "the lane of the route"),
+    (TRAIL, "where the rear axle was"),
+    (CAR, "the car now"),
+)
+"""The colours of a replay with their meanings."""
 SHOWN_M = 55.0
 """Length of the road that the map shows."""
 BEHIND_SHARE = 0.3

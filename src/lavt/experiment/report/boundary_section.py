@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from lavt.experiment.report import html_page
+from lavt.experiment.report.figure_style import legend_below, new_figure
 from lavt.experiment.report.files import save_figure, save_table
 from lavt.experiment.report.sections import Parts
 from lavt.experiment.report.table_format import (
@@ -105,21 +106,20 @@ def boundary_figure(boundary: Boundary) -> Figure:
     """
     presets = list(dict.fromkeys(group["preset"] for group in boundary["groups"]))
     groups_of = {preset: [group for group in boundary["groups"] if group["preset"] == preset] for preset in presets}
-    height_in = 1.0 + sum(0.75 + 0.5 * len(groups) for groups in groups_of.values())
-    figure = Figure(figsize=(8, height_in), dpi=130, layout="constrained")
+    figure = new_figure(0.9 + sum(0.5 + 0.5 * len(groups) for groups in groups_of.values()))
     panels = figure.subplots(
         len(presets), 1, sharex=True, squeeze=False, height_ratios=[len(groups) for groups in groups_of.values()]
     )
     for axes, preset in zip(panels[:, 0], presets, strict=True):
         _draw_panel(axes, boundary["runs"], groups_of[preset])
-        axes.set_title(preset, loc="left", fontsize=10)
-    panels[-1, 0].set_xlabel("total delay, from the middle of the exposure to the command in force (ms)")
+        axes.set_title(preset, loc="left")
+    panels[-1, 0].set_xlabel("total delay (ms)")
     handles = [
         Line2D([], [], linestyle="none", marker=marker, color=colour, label=LABELS[name])
         for name, (colour, marker) in STYLES.items()
     ]
     handles.append(Line2D([], [], linestyle="--", color="black", label="onset by theory"))
-    figure.legend(handles=handles, fontsize=8, ncols=4, loc="outside lower center", frameon=False)
+    legend_below(figure, handles)
     return figure
 
 

@@ -12,7 +12,6 @@ from lavt.experiment.report.condition_tables import (
     contrast_table,
     driving_table,
     error_table,
-    headline_table,
     latency_table,
 )
 from lavt.experiment.report.figure_style import Conditions
@@ -30,8 +29,7 @@ PAPER_NOTE = " The paper did not measure the loop latency; the table shows the s
 OWN_LANE_NOTE = (
     " A run is completed in its own lane if the middle of the rear axle was in the lane of the route all the time, and "
     "the driver followed no other lane. After three pictures without a lane, the lane followed is unknown. P95 of the "
-    "cross-track error is against the lane of the route and, in a column of its own, against the lane that the driver "
-    "followed, where this lane is known."
+    "cross-track error is against the lane of the route."
 )
 ROUTES_NOTE = (
     " The intervals “these routes” show only how repeated runs of these routes vary: those of completion and of "
@@ -52,20 +50,20 @@ ERRORS_NOTE = (
     "these runs, and of the means of the routes and of the roads. The mean over roads is also shown for all runs, each "
     "up to its own end. The second is the mean over all runs, each up to the common distance, which all runs of its "
     "route and repetition reached. The third is the median (quartiles) of all runs, where a run that ended early ranks "
-    "last. "
+    "last. An error against the lane followed is against the lane that the driver followed, where it is known. "
     "docs/metrics.md defines each number."
 )
 
 
 def conditions_parts(report: ReportContext) -> Parts:
-    """Return the main tables of the conditions for each kind of time, with the paper's values."""
+    """Return the main table of the conditions for each kind of time, with the paper's values."""
     if not report.kinds:
         return [
             html_page.paragraph("No run has the settings of the base config. See the table of groups.", is_note=True)
         ]
     roads = max(_roads(entry) for conditions in report.kinds.values() for entry in conditions.values())
     note = "".join((OWN_LANE_NOTE, ROUTES_NOTE, _by_road_note(roads) if roads else ""))
-    return [*_tables(report, {"headline": headline_table, "driving": driving_table}), _note(note)]
+    return [*_tables(report, "driving", driving_table), _note(note)]
 
 
 def latency_table_parts(report: ReportContext) -> Parts:
@@ -73,22 +71,21 @@ def latency_table_parts(report: ReportContext) -> Parts:
     if not report.kinds:
         return []
     has_paper = any(report.paper(conditions) for conditions in report.kinds.values())
-    return [*_tables(report, {"latency": latency_table}), _note(LATENCIES_NOTE + PAPER_NOTE * has_paper)]
+    return [*_tables(report, "latency", latency_table), _note(LATENCIES_NOTE + PAPER_NOTE * has_paper)]
 
 
 def error_table_parts(report: ReportContext) -> Parts:
     """Return the tables of lane-keeping errors for each kind of time."""
-    return [*_tables(report, {"error": error_table}), _note(ERRORS_NOTE)] if report.kinds else []
+    return [*_tables(report, "error", error_table), _note(ERRORS_NOTE)] if report.kinds else []
 
 
-def _tables(report: ReportContext, tables: Mapping[str, Callable[[Conditions, Conditions], TableData]]) -> Parts:
-    """Return these tables for each kind of time, below a heading that says how its runs were made."""
+def _tables(report: ReportContext, name: str, make: Callable[[Conditions, Conditions], TableData]) -> Parts:
+    """Return a table for each kind of time, below a heading that says how its runs were made."""
     parts = []
     for kind, conditions in report.kinds.items():
+        table = make(conditions, report.paper(conditions))
         parts.append(html_page.heading(report.setup(kind)))
-        for name, make in tables.items():
-            table = make(conditions, report.paper(conditions))
-            parts.append(save_table(report.directory, f"conditions_{kind}_{name}", table))
+        parts.append(save_table(report.directory, f"conditions_{kind}_{name}", table))
     return parts
 
 

@@ -49,38 +49,6 @@ def _with_paper(conditions: Conditions, paper: Conditions) -> list[Mapping[str, 
     return [{**entry, "condition": name, "paper": paper.get(name, {})} for name, entry in conditions.items()]
 
 
-def headline_table(conditions: Conditions, paper: Conditions) -> TableData:
-    """Return the table of the main results with the paper's values: one row for each condition."""
-    return table_of_entries(
-        _with_paper(conditions, paper),
-        [
-            (text_column("condition"), "condition"),
-            (number_column("runs", 0), "runs"),
-            (share_column("completed in own lane"), "own_lane_completion_rate"),
-            (by_road_column("completed in own lane, by road", is_share=True), "by_road.own_lane_completion_rate"),
-            (share_column("completed"), "completion_rate"),
-            (extra(by_road_column("completed, by road", is_share=True)), "by_road.completion_rate"),
-            (share_column("the paper's completed"), "paper.completion_rate"),
-            (number_column("collisions / run", 2), "collisions_per_run"),
-            (extra(by_road_column("collisions / run, by road")), "by_road.collisions_per_run"),
-            (number_column("the paper's collisions / run", 2), "paper.collisions_per_run"),
-            (extra(number_column(f"{COMPLETED_P95}, mean of routes", 2)), "p95_route_balanced_m"),
-            (extra(number_column("routes with completed runs", 0)), "p95_routes"),
-            (extra(by_road_column(f"{COMPLETED_P95}, by road")), "by_road.p95_m"),
-            (by_road_column(f"{ALL_RUNS_P95}, by road"), "by_road.p95_all_runs_m"),
-            (number_column("the paper's p95 m", 2), "paper.p95_m"),
-            (
-                extra(number_column("p95 m against the lane followed, of the runs that completed, mean of routes", 2)),
-                "followed_p95_route_balanced_m",
-            ),
-            (
-                extra(by_road_column(f"{FOLLOWED_P95}, by road")),
-                "by_road.followed_p95_m",
-            ),
-        ],
-    )
-
-
 def latency_table(conditions: Conditions, paper: Conditions) -> TableData:
     """Return the table of injected and measured latency with the paper's values: one row for each condition."""
     totals = {name: {**entry, "total_ms": entry["tau_v_ms"] + entry["tau_c_ms"]} for name, entry in paper.items()}
@@ -104,29 +72,35 @@ def latency_table(conditions: Conditions, paper: Conditions) -> TableData:
 
 
 def driving_table(conditions: Conditions, paper: Conditions) -> TableData:
-    """Return the table of completion and endings with the paper's values: one row for each condition."""
+    """Return the table of the main results with the paper's values: one row for each condition."""
     return table_of_entries(
         [{**entry, "endings": _endings(entry)} for entry in _with_paper(conditions, paper)],
         [
             (text_column("condition"), "condition"),
             (number_column("runs", 0), "runs"),
-            (extra(share_column("completed")), "completion_rate"),
+            (extra(share_column("completed in own lane")), "own_lane_completion_rate"),
+            (extra(share_interval_column("95 %, these routes, own lane")), "own_lane_completion_interval"),
+            (by_road_column("completed in own lane, by road", is_share=True), "by_road.own_lane_completion_rate"),
+            (share_column("completed without touching a line"), "invasion_free_completion_rate"),
+            (share_column("completed"), "completion_rate"),
             (extra(share_interval_column("95 %, these routes")), "completion_interval"),
-            (extra(share_column("the paper's completed")), "paper.completion_rate"),
+            (extra(by_road_column("completed, by road", is_share=True)), "by_road.completion_rate"),
+            (share_column("the paper's completed"), "paper.completion_rate"),
             (extra(share_interval_column("the paper's 95 %")), "paper.completion_interval"),
-            (share_column("completed in own lane"), "own_lane_completion_rate"),
-            (share_interval_column("95 %, these routes, own lane"), "own_lane_completion_interval"),
-            (share_column("time in own lane"), "own_lane_share"),
+            (extra(share_column("time in own lane")), "own_lane_share"),
             (extra(share_column("time with lane followed unknown")), "followed_unknown_share"),
             (extra(number_column("changes of the lane followed / run", 2)), "followed_changes_per_run"),
             (extra(number_column("changes of the lane occupied / run", 2)), "occupied_changes_per_run"),
             (number_column("collisions / run", 2), "collisions_per_run"),
             (extra(interval_column("95 %, these routes, collisions / run")), "collisions_per_run_interval"),
+            (extra(by_road_column("collisions / run, by road")), "by_road.collisions_per_run"),
             (extra(number_column("the paper's collisions / run", 2)), "paper.collisions_per_run"),
             (extra(number_column("collisions / km", 2)), "collisions_per_km"),
-            (number_column("lane invasions / run", 2), "lane_invasions_per_run"),
+            (extra(number_column("lane invasions / run", 2)), "lane_invasions_per_run"),
             (extra(number_column("the paper's lane invasions / run", 2)), "paper.lane_invasions_per_run"),
             (extra(number_column("lane invasions / km", 1)), "lane_invasions_per_km"),
+            (by_road_column(f"{ALL_RUNS_P95}, by road"), "by_road.p95_all_runs_m"),
+            (number_column("the paper's p95 m", 2), "paper.p95_m"),
             (text_column("endings"), "endings"),
         ],
     )
@@ -146,7 +120,9 @@ def error_table(conditions: Conditions, paper: Conditions) -> TableData:
             (interval_column("95 %, these routes, of the runs that completed m"), "p95_interval"),
             (extra(number_column(f"{COMPLETED_P95}, mean of routes", 2)), "p95_route_balanced_m"),
             (extra(number_column("routes with completed runs", 0)), "p95_routes"),
-            (number_column("the paper's p95 m", 2), "paper.p95_m"),
+            (extra(by_road_column(f"{COMPLETED_P95}, by road")), "by_road.p95_m"),
+            (extra(number_column(f"{FOLLOWED_P95}, mean of routes", 2)), "followed_p95_route_balanced_m"),
+            (extra(by_road_column(f"{FOLLOWED_P95}, by road")), "by_road.followed_p95_m"),
             (number_column(f"{COMMON_P95}, mean of runs", 2), "p95_common_m"),
             (extra(interval_column("95 %, these routes, up to common distance m")), "p95_common_interval"),
             (extra(by_road_column(f"{COMMON_P95}, by road")), "by_road.p95_common_m"),

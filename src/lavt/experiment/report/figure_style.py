@@ -23,14 +23,24 @@ KINDS = {"virtual": ("o", "virtual time"), "real": ("s", "real time")}
 COLOURS = ("#0072b2", "#56b4e9", "#009e73", "#e69f00", "#d55e00", "#cc79a7")
 """Colours that people with any colour vision can distinguish (Okabe and Ito, "Color universal design")."""
 
-WIDTH_IN = 8.0
-LINE_CHARACTERS = 115
+WIDTH_IN = 3.5
+"""Width of each figure: that of a phone, which then shows small text as 11 CSS pixels, and of a column of a paper.
+Wider screens show several figures next to each other."""
+LINE_CHARACTERS = 48
 """The number of small characters that fit in a line below a figure."""
 HANDLE_CHARACTERS = 5
 """The width of a legend handle, in small characters."""
 
 SMALL_TEXT_POINTS = 8
-"""Size of small text."""
+"""Size of the smallest text, and of all text under `SETTINGS`."""
+
+SETTINGS: Any = {
+    "font.size": SMALL_TEXT_POINTS,
+    "axes.titlesize": "medium",
+    "figure.labelsize": "medium",
+    "text.parse_math": False,  # a dollar sign in a name does not begin a formula
+}
+"""The settings of Matplotlib under which the report makes its figures."""
 
 NAME_STYLES = {
     "virtual": ((7, -2), "left", "top", "black"),
@@ -43,6 +53,10 @@ alignment, colour."""
 
 NAMES_PER_PANEL = 14
 """The number of names that fit into the height of a panel, and also into its width."""
+PANEL_SHARE = 0.75
+"""The width of a panel in a figure with one column of panels, as a share of the figure's."""
+CHARACTER_POINTS = 0.65 * SMALL_TEXT_POINTS
+"""Width of a small character, in typographic points."""
 
 
 class FigurePoint(NamedTuple):
@@ -79,16 +93,16 @@ def condition_colours(names: Iterable[str]) -> dict[str, Any]:
     return {name: colormaps["turbo"](shade) for name, shade in zip(ordered, shades, strict=True)}
 
 
-def new_figure(height_in: float, width_in: float = WIDTH_IN) -> Figure:
+def new_figure(height_in: float) -> Figure:
     """Return a new figure whose layout is computed when it is drawn."""
-    return Figure(figsize=(width_in, height_in), layout="constrained")
+    return Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
 
 
 def tidy(axes: Axes, x_label: str, y_label: str, title: str = "") -> None:
     """Label the axes, add a light grid, and remove the upper and right border."""
     axes.set_xlabel(x_label)
     axes.set_ylabel(y_label)
-    axes.set_title(title, loc="left", fontsize=10)
+    axes.set_title(title, loc="left")
     axes.grid(visible=True, alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
 
@@ -100,14 +114,44 @@ def marker(kind: str, colour: Any) -> dict[str, Any]:
     return {"marker": symbol, "markerfacecolor": face, "markeredgecolor": colour, "color": colour, "label": label}
 
 
-def name_style(kind: str) -> dict[str, Any]:
-    """Return position and colour of the names of one kind of point.
+def name_points(named_points: Iterable[tuple[Axes, str, Sequence[FigurePoint]]]) -> None:
+    """Write the names of the points of each kind in each panel, whose limits must be set.
 
-    The positions differ, so that the names of two points of different kinds at the same place do not overlap.
+    A point of LAVT is not named if a point of LAVT with its name is so near that both names would overlap.
     """
-    offset, horizontal, vertical, colour = NAME_STYLES[kind]
+    named: list[tuple[Axes, FigurePoint]] = []
+    for axes, kind, points in named_points:
+        others = [other for panel, other in named if panel is axes]
+        new = [point for point in points if not any(_is_named_by(point, other, axes) for other in others)]
+        named += [(axes, point) for point in new if kind != "paper"]
+        write_names(axes, clusters_of(new, axes), kind)
+
+
+def _is_named_by(point: FigurePoint, other: FigurePoint, axes: Axes) -> bool:
+    return point.name == other.name and len(clusters_of([point, other], axes)) == 1
+
+
+def write_names(axes: Axes, clusters: Iterable[Sequence[FigurePoint]], kind: str) -> None:
+    """Write the names of each cluster of points, in the vertical order of the points; the limits of x must be set."""
+    for cluster in clusters:
+        middle = (sum(point.x for point in cluster) / len(cluster), sum(point.y for point in cluster) / len(cluster))
+        names = [point.name for point in cluster]
+        axes.annotate("\n".join(names), middle, **name_style(axes, kind, middle[0], max(map(len, names))))
+
+
+def name_style(axes: Axes, kind: str, x: float, characters: int) -> dict[str, Any]:
+    """Return position and colour of a name next to a point of one kind at `x`.
+
+    The positions of the kinds differ, so that the names of two points of different kinds at the same place do not
+    overlap. If a name would cross the left or the right edge of the panel, it is on the other side of its point.
+    """
+    (offset, rise), horizontal, vertical, colour = NAME_STYLES[kind]
+    low, high = axes.get_xlim()
+    room = (high - x if offset > 0 else x - low) / (high - low) * PANEL_SHARE * WIDTH_IN * 72
+    if room < abs(offset) + characters * CHARACTER_POINTS:
+        offset, horizontal = -offset, {"left": "right", "right": "left"}[horizontal]
     return {
-        "xytext": offset,
+        "xytext": (offset, rise),
         "ha": horizontal,
         "va": vertical,
         "color": colour,

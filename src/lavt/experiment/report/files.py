@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from lavt.experiment.report import html_page
 from lavt.experiment.report.table_format import TableData, csv_of, html_of, tex_of
 
-RESOLUTION_DPI = 120
+RESOLUTION_DPI = 250
 
 LARGEST_SHOWN_BYTES = 300_000
 """If the SVG of a figure is larger than this, the page shows the PNG, because a phone renders a large SVG slowly."""
@@ -35,20 +35,8 @@ _SVG_SETTINGS: Any = {"svg.hashsalt": "lavt", "svg.fonttype": "none", "path.simp
 _NO_METADATA = {"Date": None, "Creator": None, "Format": None, "Type": None}
 
 
-def save_figure(
-    report_dir: Path, name: str, figure: Figure, alternative: str, caption: str, *, narrow: Figure | None = None
-) -> Markup:
-    """Write `name`.png and `name`.svg, and return the figure as HTML; the text `alternative` describes the figure.
-
-    `narrow` is the same figure for narrow screens; its files are `name`_narrow.
-    """
-    shown, files = _write_figure(report_dir, name, figure)
-    narrow_shown = _write_figure(report_dir, f"{name}_narrow", narrow)[0] if narrow else None
-    return html_page.figure(shown, narrow_shown, files, alternative, caption)
-
-
-def _write_figure(report_dir: Path, name: str, figure: Figure) -> tuple[Path, list[str]]:
-    """Write a figure, and return the file that the page shows and the names of all its files."""
+def save_figure(report_dir: Path, name: str, figure: Figure, alternative: str, caption: str) -> Markup:
+    """Write `name`.png and `name`.svg, and return the figure as HTML; the text `alternative` describes the figure."""
     png, svg = report_dir / f"{name}.png", report_dir / f"{name}.svg"
     with mpl.rc_context(_SVG_SETTINGS):
         figure.savefig(png, dpi=RESOLUTION_DPI, metadata={"Software": None})
@@ -57,7 +45,7 @@ def _write_figure(report_dir: Path, name: str, figure: Figure) -> tuple[Path, li
         figure.savefig(text, format="svg", metadata=_NO_METADATA)
     svg.write_text(text.getvalue().replace("</style>", f"</style>{DARK_STYLE}", 1), encoding="utf-8")
     shown = svg if svg.stat().st_size <= LARGEST_SHOWN_BYTES else png
-    return shown, [svg.name, png.name]
+    return html_page.figure(shown, [svg.name, png.name], alternative, caption)
 
 
 def save_table(report_dir: Path, name: str, table: TableData) -> Markup:

@@ -9,7 +9,12 @@ from lavt.experiment.report.files import save_figure
 from lavt.experiment.report.groups import differing_settings, title_of
 from lavt.experiment.report.headline_figure import has_own_lane, headline_figure
 from lavt.experiment.report.sections import MAX_COMPARED_GROUPS, Parts, ReportContext
-from lavt.experiment.report.sentences import results_sentences, runs_overview
+from lavt.experiment.report.sentences import (
+    contrast_sentence,
+    length_sentences,
+    results_sentences,
+    runs_overview,
+)
 from lavt.experiment.statistics.by_road import is_key_part
 from lavt.experiment.statistics.paper_results import REFERENCE
 
@@ -17,34 +22,38 @@ VALIDITY = "Validity"
 """The chapter with the reasons of invalid runs."""
 
 WHAT_IT_IS = (
-    "LAVT (Latency-Aware Vision Teleoperation) drives a car from its video over a network, delays the video and the "
-    "commands, and measures how driving degrades."
+    "LAVT (Latency-Aware Vision Teleoperation) delays what the driver of a remote car sees, and the commands that come "
+    "back, and measures how driving degrades."
 )
+LANE_KEEPER = " The driver is a program that keeps the lane."
+VIRTUAL = "the same programs on a simulated clock."
 WITHOUT_PICTURES = " Runs without pictures (fidelity geometry) get the lane without an error of detection."
 OWN_LANE = (
-    "the middle of the rear axle was in the lane of the route until its end, and the driver followed no other lane."
+    "the middle of the rear axle was in the lane of the route until its end, and the driver followed no other lane. "
+    "The car may have touched a line."
 )
 PRESETS = {
-    "paper_calibrated": "gains of the lane keeper, tuned by hand so that completion falls where it does in the "
+    "paper_calibrated": "gains of the lane keeper, tuned by hand so that completion falls about where it does in the "
     "campaign of Khalil and Kwon (2026): the delay at which it falls is an input, not a finding.",
     "designed": "gains of the lane keeper, found by theory alone.",
 }
 
 
 def first_parts(report: ReportContext, replay: Parts) -> Parts:
-    """Return the parts of the first screen; `replay` is the replay, if there is one."""
+    """Return the parts of the first screen; `replay` is the replay, if there is one.
+
+    A narrow screen shows them in this order: what was run, the figure, its findings in words, and then the replay,
+    which is an example. A wide screen has the replay next to the figure.
+    """
     runs, failed = report.summary["runs"], report.summary.get("failed")
     invalid = any(not run["valid"] for run in runs) or failed
     link = ("See why.", html_page.chapter_anchor(VALIDITY)) if invalid else None
-    overview = runs_overview(runs) + WITHOUT_PICTURES * any(run.get("fidelity") == "geometry" for run in runs)
-    parts = [html_page.paragraph(f"{WHAT_IT_IS} This page: {overview}", link=link)]
-    heroes = [*headline_parts(report), *replay]
-    if heroes:
-        parts.append(html_page.columns(heroes))
+    driver = LANE_KEEPER if all(run.get("driver") == "lane_keeper" for run in runs) else ""
+    about = html_page.paragraph(f"{WHAT_IT_IS}{driver} This page: {runs_overview(runs)}", link=link)
     sentences = [sentence for sentence in _findings(report) if sentence]
-    if sentences:
-        parts.append(html_page.bullets(sentences))
-    return [*parts, _legend(report)]
+    findings = [html_page.bullets(sentences)] if sentences else []
+    shown = [*headline_parts(report), *findings, *replay]
+    return [about, *([html_page.columns(shown)] if shown else []), _legend(report)]
 
 
 def _findings(report: ReportContext) -> list[str]:
@@ -53,9 +62,16 @@ def _findings(report: ReportContext) -> list[str]:
     conditions_by_name = {f"Virtual time, {title_of(group, names)}": group["conditions"] for group in compared}
     if "virtual" in report.kinds and not conditions_by_name:
         conditions_by_name = {f"Virtual time{report.base_title()}": report.kinds["virtual"]}
-    if "real" in report.kinds:
-        conditions_by_name["Real time"] = report.kinds["real"]
-    return [results_sentences(name, conditions) for name, conditions in conditions_by_name.items()]
+    lengths_m = {
+        str(run["route"]): float(run["route_length_m"]) for run in report.summary["runs"] if run.get("route_length_m")
+    }
+    sentences = []
+    for name, conditions in conditions_by_name.items():
+        lengths = length_sentences(conditions, lengths_m)
+        sentences += [results_sentences(name, conditions), lengths and f"{name}. {lengths}" if compared else lengths]
+    sentences.append(contrast_sentence(report.summary.get("contrasts") or []))
+    real = report.kinds.get("real")
+    return [*sentences, *([results_sentences("Real time", real)] if real else [])]
 
 
 def headline_parts(report: ReportContext) -> Parts:
@@ -75,15 +91,15 @@ def headline_parts(report: ReportContext) -> Parts:
         "Grey triangles are the paper's: its completion, in any lane, and its P95, at the sum of its two latencies."
         * bool(paper),
     ]
-    wide, narrow = (headline_figure(kinds, paper, report.colours, is_narrow=is_narrow) for is_narrow in (False, True))
+    figure = headline_figure(kinds, paper, report.colours)
     alternative = "completion and error over loop latency"
-    caption = " ".join(filter(None, sentences))
-    return [save_figure(report.directory, "headline", wide, alternative, caption, narrow=narrow)]
+    return [save_figure(report.directory, "headline", figure, alternative, " ".join(filter(None, sentences)))]
 
 
 def _legend(report: ReportContext) -> Markup:
     """Return the meanings of the names that this report uses."""
     runs = report.summary["runs"]
+    without_pictures = WITHOUT_PICTURES * any(run.get("fidelity") == "geometry" for run in runs)
     delays = {str(run["condition"]): run.get("injected_ms") or {} for run in runs}
     listed = ", ".join(
         f"{name} {injected_ms['video']:g} + {injected_ms['control']:g}"
@@ -92,9 +108,9 @@ def _legend(report: ReportContext) -> Markup:
     )
     pairs = [
         ("Condition", f"the delay that was injected into video + control, in ms: {listed}." if listed else ""),
-        ("Virtual time", "the same programs on a simulated clock." * ("virtual" in report.kinds)),
-        ("Loop latency", "from a frame's stamp (its send time) to the application of its command."),
-        ("P95", "95 % of the time, the rear axle was closer to the centre of the route's lane."),
+        ("Virtual time", (VIRTUAL + without_pictures) * ("virtual" in report.kinds)),
+        ("Loop latency", "from a frame's stamp, set just before encoding, to the application of its command."),
+        ("P95", "on 95 % of the distance, the rear axle was closer to the centre of the route's lane."),
         ("τ video, τ control", "the one-way latencies of a frame and of a command."),
         ("Own lane", OWN_LANE if has_own_lane(report.kinds) else ""),
         *((name, meaning) for name, meaning in PRESETS.items() if any(run.get("preset") == name for run in runs)),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from matplotlib.axes import Axes
@@ -10,24 +10,19 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from lavt.experiment.report.figure_style import (
-    SMALL_TEXT_POINTS,
     Colours,
     Conditions,
     FigurePoint,
-    clusters_of,
     draw_point,
     kind_handles,
     legend_below,
     marker,
-    name_style,
+    name_points,
     new_figure,
     shown_interval,
     tidy,
 )
 from lavt.experiment.report.latency_figures import PAPER_MARKER
-
-WIDE_IN, NARROW_IN = (6.6, 4.6), (4.0, 5.0)
-"""Width and height of the figure for wide and for narrow screens."""
 
 
 def has_own_lane(kinds: Mapping[str, Conditions]) -> bool:
@@ -39,17 +34,15 @@ def has_own_lane(kinds: Mapping[str, Conditions]) -> bool:
     )
 
 
-def headline_figure(
-    kinds: Mapping[str, Conditions], paper: Conditions, colours: Colours, *, is_narrow: bool = False
-) -> Figure:
+def headline_figure(kinds: Mapping[str, Conditions], paper: Conditions, colours: Colours) -> Figure:
     """Return the figure: one panel for completion, one for P95 of the cross-track error, each condition is a point.
 
     If no run says whether it was in its own lane, the figure shows all completed runs.
     """
-    width_in, height_in = NARROW_IN if is_narrow else WIDE_IN
-    figure = new_figure(height_in, width_in)
+    figure = new_figure(3.5)
     completion, error = figure.subplots(2, 1, sharex=True)
     own_lane = has_own_lane(kinds)
+    named_points: list[tuple[Axes, str, list[FigurePoint]]] = []
     for kind, conditions in {"paper": paper, **kinds}.items():
         for axes, points in ((completion, _completions(conditions, own_lane)), (error, _errors(conditions))):
             if kind != "real":
@@ -58,12 +51,13 @@ def headline_figure(
                 axes.plot([point.x for point in path], [point.y for point in path], **style)
             for point in points:
                 draw_point(axes, point, PAPER_MARKER if kind == "paper" else marker(kind, colours[point.name]))
-            _write_names(axes, points, kind)
-    tidy(completion, "", f"completed{' in own lane' if own_lane else ''} (%)")
-    tidy(error, "loop latency, median (ms)", "P95 cross-track error (m)")
+            named_points.append((axes, kind, points))
+    tidy(completion, "", "completed\nin own lane (%)" if own_lane else "completed (%)")
+    tidy(error, "loop latency, median (ms)", "P95 of cross-track\nerror (m)")
     completion.set_ylim(-14, 109)
     completion.margins(x=0.1)
     error.set_ylim(bottom=-0.14 * error.get_ylim()[1])
+    name_points(named_points)
     handles: list[Any] = kind_handles(kinds)
     if paper:
         handles.append(Line2D([], [], linestyle="none", **PAPER_MARKER))
@@ -101,10 +95,3 @@ def _loop_ms(entry: Mapping[str, Any]) -> float | None:
         return float(entry["tau_v_ms"] + entry["tau_c_ms"])
     median_ms: float | None = entry["loop_ms"]["p50"]
     return median_ms
-
-
-def _write_names(axes: Axes, points: Sequence[FigurePoint], kind: str) -> None:
-    for cluster in clusters_of(points, axes):
-        middle = (sum(point.x for point in cluster) / len(cluster), sum(point.y for point in cluster) / len(cluster))
-        style = {**name_style(kind), "fontsize": SMALL_TEXT_POINTS}
-        axes.annotate("\n".join(point.name for point in cluster), middle, **style)

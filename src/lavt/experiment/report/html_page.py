@@ -18,6 +18,11 @@ from markupsafe import Markup
 Section = tuple[str, Sequence[Markup]]
 """The heading of a section, and its parts."""
 
+PHONE_CHARACTERS = 54
+"""The characters that fit into a row of a table on a screen of 390 px, with one for the space between two columns."""
+MAX_TEXT_CHARACTERS = 11
+"""On a narrow screen, longer texts in a table are broken into lines."""
+
 _TEMPLATES = Environment(
     loader=PackageLoader("lavt.experiment.report"),
     autoescape=True,
@@ -37,7 +42,7 @@ class Chapter(NamedTuple):
     is_open: bool = False
 
 
-_MEDIA_TYPES = {".svg": "image/svg+xml", ".png": "image/png", ".mp4": "video/mp4"}
+_MEDIA_TYPES = {".svg": "image/svg+xml", ".png": "image/png", ".jpg": "image/jpeg", ".mp4": "video/mp4"}
 
 
 def page(title: str, first: Sequence[Markup], chapters: Iterable[Chapter]) -> str:
@@ -101,30 +106,46 @@ def terms(pairs: Sequence[tuple[str, str]]) -> Markup:
 
 
 def columns(parts: Sequence[Markup]) -> Markup:
-    """Return one or two parts next to each other; on a narrow screen they are below each other."""
+    """Return figures next to each other, and a list below them; on a narrow screen all parts are below each other."""
     return _part("columns", parts)
 
 
-def figure(shown: Path, narrow: Path | None, files: Sequence[str], alternative: str, caption: str) -> Markup:
+def figure(shown: Path, files: Sequence[str], alternative: str, caption: str) -> Markup:
     """Return a figure with its caption and links to its files.
 
-    The page contains the file `shown` and, for narrow screens, the file `narrow`. `files` are all formats.
+    The page contains the file `shown`. `files` are all formats.
     """
-    narrow_address = embedded(narrow) if narrow else None
-    return _part("figure", shown.stem, embedded(shown), narrow_address, files, alternative, caption)
+    return _part("figure", shown.stem, embedded(shown), files, alternative, caption)
 
 
-def video(shown: Path, alternative: str, caption: str) -> Markup:
-    """Return a video that plays again and again without sound, with its caption and a link to its file."""
-    return _part("video", shown.name, embedded(shown), alternative, caption)
+def video(shown: Path, poster: Path, alternative: str, caption: str, key: Sequence[tuple[str, str]]) -> Markup:
+    """Return a video that plays again and again without sound, with its caption and a link to its file.
+
+    `poster` is the picture before the video plays and on paper. `key` has the colours with their meanings.
+    """
+    return _part("video", shown.name, embedded(shown), embedded(poster), alternative, caption, key)
 
 
 def table(columns: Sequence[Any], rows: Sequence[Sequence[str]]) -> Markup:
-    """Return a table that scrolls sideways on a narrow screen.
+    """Return a table; if it is wider than a phone, a narrow screen shows each row as a list of titles and cells.
 
     Each column has `title`, `is_text`, `is_long` and `is_extra`. A switch above the table shows the extra columns.
     """
-    return _part("table", columns, rows)
+    return _part("table", columns, rows, _characters(columns, rows) > PHONE_CHARACTERS)
+
+
+def _characters(columns: Sequence[Any], rows: Sequence[Sequence[str]]) -> int:
+    """Return the width in characters of the columns that are not extra, if titles and texts are broken into lines.
+
+    A title has at most about four lines.
+    """
+    shown = [
+        (column, max(map(len, cells)), max(len(column.title) // 3, *map(len, column.title.split())))
+        for column, cells in zip(columns, zip(*rows, strict=True), strict=True)
+        if not column.is_extra
+    ]
+    widths = [max(min(cell, MAX_TEXT_CHARACTERS) if column.is_text else cell, title) for column, cell, title in shown]
+    return sum(widths) + len(widths)
 
 
 def linked_table(html: Markup, files: Sequence[str], *, is_short: bool) -> Markup:

@@ -24,10 +24,12 @@ from lavt.experiment.report.figure_style import (
     kind_handles,
     legend_below,
     marker,
+    name_points,
     name_style,
     new_figure,
     shown_interval,
     tidy,
+    write_names,
 )
 
 NODE_COLOURS = {"camera": "Blues", "network": "Greys", "receiver": "Purples", "driver": "Greens", "actuator": "Oranges"}
@@ -45,44 +47,45 @@ LatencyKey = tuple[str, str]
 
 LOOP: LatencyKey = ("loop_ms", "p50")
 
-X_LATENCIES: Mapping[str, LatencyKey] = {
-    "loop latency, median (ms)": LOOP,
-    "frame age, mean (ms)": ("picture_age_ms", "mean"),
-}
-"""The latencies on the x axes of the degradation figure, by label."""
+LOOP_LABEL = "loop latency, median (ms)"
+X_LATENCIES: Mapping[str, LatencyKey] = {LOOP_LABEL: LOOP, "frame age, mean (ms)": ("picture_age_ms", "mean")}
+"""The latencies on the x axes of the degradation figures, by label."""
 
 
-def degradation_figure(kinds: Mapping[str, Conditions], paper: Conditions, colours: Colours) -> Figure:
-    """Return the figure of completion and cross-track error over loop latency and, if known, over frame age.
+def known_latencies(kinds: Mapping[str, Conditions]) -> list[str]:
+    """Return the labels of the latencies that any condition has."""
+    return [label for label, latency in X_LATENCIES.items() if _is_known(kinds, latency)]
+
+
+def degradation_figure(
+    kinds: Mapping[str, Conditions], paper: Conditions, colours: Colours, label: str = LOOP_LABEL
+) -> Figure:
+    """Return the figure of completion and cross-track error over the latency with this label.
 
     Each condition is a point. The loop latency of the conditions in `paper` is the paper's tau_v + tau_c. Diamonds show
     the error of all runs up to the common distance.
     """
-    x_latencies = {label: latency for label, latency in X_LATENCIES.items() if _is_known(kinds, latency)}
+    latency = X_LATENCIES[label]
     named_points: list[tuple[Axes, str, list[FigurePoint]]] = []
-    figure = new_figure(5.6)
-    panels = figure.subplots(2, len(x_latencies), sharex="col", sharey="row", squeeze=False)
-    for column, (label, latency) in enumerate(x_latencies.items()):
-        completion, error = panels[:, column]
-        for kind, conditions in {"paper": _with_totals(paper), **kinds}.items():
-            shown = {
-                completion: _points(conditions, latency, "completion_rate", "completion_interval", 100.0),
-                error: _points(conditions, latency, "p95_m", "p95_interval"),
-            }
-            for axes, points in shown.items():
-                for point in points:
-                    draw_point(axes, point, PAPER_MARKER if kind == "paper" else marker(kind, colours[point.name]))
-                named_points.append((axes, kind, points))
-            for point in _points(conditions, latency, "p95_common_m", "p95_common_interval"):
-                draw_point(error, point, {**DIAMOND, "color": colours[point.name], "zorder": 4})
-        completion.margins(x=0.16)
-        error.margins(x=0.16)
-        tidy(completion, "", "runs completed (%)" if column == 0 else "")
-        tidy(error, label, ERROR_LABEL if column == 0 else "")
-    panels[0, 0].set_ylim(-9, 112)  # leaves room for the names below and above the points
-    panels[1, 0].set_ylim(bottom=-0.09 * panels[1, 0].get_ylim()[1])
-    for axes, kind, points in named_points:
-        _write_names(axes, clusters_of(points, axes), kind)
+    figure = new_figure(4.2)
+    completion, error = figure.subplots(2, 1, sharex=True)
+    for kind, conditions in {"paper": _with_totals(paper), **kinds}.items():
+        shown = {
+            completion: _points(conditions, latency, "completion_rate", "completion_interval", 100.0),
+            error: _points(conditions, latency, "p95_m", "p95_interval"),
+        }
+        for axes, points in shown.items():
+            for point in points:
+                draw_point(axes, point, PAPER_MARKER if kind == "paper" else marker(kind, colours[point.name]))
+            named_points.append((axes, kind, points))
+        for point in _points(conditions, latency, "p95_common_m", "p95_common_interval"):
+            draw_point(error, point, {**DIAMOND, "color": colours[point.name], "zorder": 4})
+    completion.margins(x=0.1)
+    tidy(completion, "", "runs completed (%)")
+    tidy(error, label, ERROR_LABEL)
+    completion.set_ylim(-9, 112)  # leaves room for the names below and above the points
+    error.set_ylim(bottom=-0.09 * error.get_ylim()[1])
+    name_points(named_points)
     handles: list[Any] = kind_handles(kinds)
     if any("p95_common_m" in entry for conditions in kinds.values() for entry in conditions.values()):
         label = "error up to the common distance"
@@ -122,20 +125,13 @@ def _with_totals(paper: Conditions) -> Conditions:
     return {name: {**entry, "loop_ms": {"p50": entry["tau_v_ms"] + entry["tau_c_ms"]}} for name, entry in paper.items()}
 
 
-def _write_names(axes: Axes, clusters: Sequence[Sequence[FigurePoint]], kind: str) -> None:
-    """Write the names of each cluster of points in the vertical order of the points."""
-    for cluster in clusters:
-        middle = (sum(point.x for point in cluster) / len(cluster), sum(point.y for point in cluster) / len(cluster))
-        axes.annotate("\n".join(point.name for point in cluster), middle, **name_style(kind))
-
-
 def presets_figure(groups: Mapping[str, Conditions], colours: Colours) -> Figure:
     """Return the figure of completion and error over loop latency: a line for each group, a colour for each condition.
 
     The names of conditions are written only next to points that are close to each other.
     """
-    figure = new_figure(3.8)
-    completion, error = figure.subplots(1, 2)
+    figure = new_figure(4.6)
+    completion, error = figure.subplots(2, 1)
     lines: list[tuple[Axes, list[FigurePoint]]] = []
     symbols = dict(zip(groups, "osD^vP", strict=False))
     for number, (title, conditions) in enumerate(groups.items()):
@@ -146,12 +142,12 @@ def presets_figure(groups: Mapping[str, Conditions], colours: Colours) -> Figure
             axes.plot([point.x for point in points], [point.y for point in points], color="0.6", linestyle=dashes)
             for point in points:
                 axes.plot(point.x, point.y, marker=symbols[title], color=colours[point.name], linestyle="none")
-    tidy(completion, "loop latency, median (ms)", "runs completed (%)", "Completion")
+    tidy(completion, "", "runs completed (%)", "Completion")
     completion.set_ylim(-5, 112)
-    tidy(error, "loop latency, median (ms)", ERROR_LABEL, "Error of completed runs")
+    tidy(error, LOOP_LABEL, ERROR_LABEL, "Error of completed runs")
     error.set_ylim(0, 1.1 * error.get_ylim()[1])
     for axes, points in lines:
-        _write_names(axes, [cluster for cluster in clusters_of(points, axes) if len(cluster) > 1], "group")
+        write_names(axes, [cluster for cluster in clusters_of(points, axes) if len(cluster) > 1], "group")
     group_handles = [
         Line2D([], [], color="0.4", marker=symbols[title], label=title, linestyle="none") for title in groups
     ]
@@ -167,17 +163,17 @@ def injected_figure(kinds: Mapping[str, Conditions], colours: Colours) -> Figure
     median of the condition with the smallest injected delay, and rises with the injected delay. The lower panels show
     the deviations of the medians from the line; the bars are the bound of the clock error.
     """
-    figure = new_figure(5.2)
+    figure = new_figure(3.9)
     panels = figure.subplots(2, 2, sharex="col", height_ratios=[3, 2])
     for column, (direction, key) in enumerate((("video", "tau_v_ms"), ("control", "tau_c_ms"))):
         latency_axes, deviation_axes = panels[:, column]
+        named_ms: set[float] = set()
         for kind, conditions in kinds.items():
             points = _injected_points(conditions, direction, key)
-            _draw_injected(latency_axes, deviation_axes, points, kind, colours)
-        symbol = "τ video" if direction == "video" else "τ control"
-        tidy(latency_axes, "", f"{symbol}, measured (ms)", direction.capitalize())
-        latency_axes.set_ylim(bottom=min(0.0, latency_axes.get_ylim()[0]))
-        tidy(deviation_axes, f"injected {direction} delay (ms)", "deviation (ms)")
+            _draw_injected(panels[:, column], points, kind, colours, named_ms)
+        tidy(latency_axes, "", "measured (ms)" if column == 0 else "", f"τ {direction}")
+        latency_axes.set_ylim(bottom=-0.12 * latency_axes.get_ylim()[1])  # leaves room for the names below the points
+        tidy(deviation_axes, "injected (ms)", "deviation (ms)" if column == 0 else "")
         low, high = deviation_axes.get_ylim()
         deviation_axes.set_ylim(min(low, -1.2), max(high, 1.2))
         deviation_axes.axhline(0, color="0.6", linewidth=0.8, zorder=0)
@@ -196,14 +192,16 @@ def _injected_points(conditions: Conditions, direction: str, key: str) -> list[t
 
 
 def _draw_injected(
-    latency_axes: Axes,
-    deviation_axes: Axes,
+    panels: Sequence[Axes],
     points: Sequence[tuple[str, float, Mapping[str, Any]]],
     kind: str,
     colours: Colours,
+    named_ms: set[float],
 ) -> None:
+    """Draw the points of one kind, and name those whose delay is not in `named_ms`, which then contains it."""
     if not points:
         return
+    latency_axes, deviation_axes = panels
     _, smallest_ms, smallest_latency = points[0]
     _, largest_ms, _ = points[-1]
     base_ms = smallest_latency["p50"] - smallest_ms
@@ -217,14 +215,19 @@ def _draw_injected(
         deviation_ms = latency["p50"] - injected_ms - base_ms
         deviation_axes.errorbar(injected_ms, deviation_ms, yerr=latency["bound"] or 0.0, **style)
     medians_ms = {injected_ms: latency["p50"] for _, injected_ms, latency in points}
+    latency_axes.margins(x=0.25)
     for injected_ms, names in names_by_delay.items():
-        latency_axes.annotate(", ".join(names), (injected_ms, medians_ms[injected_ms]), **name_style(kind))
-    latency_axes.margins(x=0.15)
+        if injected_ms in named_ms:
+            continue
+        named_ms.add(injected_ms)
+        text = ", ".join(names)
+        style = name_style(latency_axes, kind, injected_ms, 2 * len(text))  # the panel has half the figure's width
+        latency_axes.annotate(text, (injected_ms, medians_ms[injected_ms]), **style)
 
 
 def stages_figure(stages: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
     """Return the figure of stage latencies: a bar for each condition, with a shade for each stage."""
-    figure = new_figure(0.42 * len(stages) + 1.6)
+    figure = new_figure(0.3 * len(stages) + 1.5)
     axes = figure.subplots()
     colours = _stage_colours(stages)
     for row, entries in enumerate(stages.values()):
@@ -242,7 +245,7 @@ def stages_figure(stages: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
         axes.annotate(f"{left_ms:.0f} ms", (left_ms, row), **text)
     axes.set_yticks(range(len(stages)), list(stages))
     axes.invert_yaxis()
-    axes.margins(x=0.1)
+    axes.margins(x=0.2)
     tidy(axes, "median latency of the stages, in order (ms)", "")
     axes.grid(visible=False, axis="y")
     legend = {stage if node == "network" else node: colour for (node, stage), colour in colours.items()}

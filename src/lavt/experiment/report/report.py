@@ -19,7 +19,7 @@ from lavt.experiment.report.condition_sections import (
     error_table_parts,
     latency_table_parts,
 )
-from lavt.experiment.report.figure_style import condition_colours
+from lavt.experiment.report.figure_style import SETTINGS, condition_colours
 from lavt.experiment.report.first_screen import VALIDITY, first_parts
 from lavt.experiment.report.replay_section import replay_parts
 from lavt.experiment.report.run_sections import (
@@ -85,7 +85,7 @@ def write_report(
     report_dir.mkdir(parents=True, exist_ok=True)
     report = ReportContext(summary, report_dir, condition_colours(str(run["condition"]) for run in summary["runs"]))
     sets = read_drives(drawn_runs(report, results), drives or {})
-    with mpl.rc_context({"text.parse_math": False}):  # a dollar sign in a name does not begin a formula
+    with mpl.rc_context(SETTINGS):
         first = first_parts(report, replay_parts(report, sets))
         chapters = _chapters(report, sets, boundaries)
     index = report_dir / "index.html"

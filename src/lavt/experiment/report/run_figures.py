@@ -45,11 +45,11 @@ def trajectories_figure(routes: Mapping[str, Sequence[DriveData]], colours: Colo
     rotations = {route: _rotation_to_x(reference_m) for route, reference_m in references.items()}
     extents_m = {route: _extent(rotations[route](reference_m)) for route, reference_m in references.items()}
     heights = [min(max(height_m / width_m, 0.12), 0.7) for width_m, height_m in extents_m.values()]
-    figure = new_figure(7.2 * sum(heights) + 0.75 * len(heights) + 0.4)
+    figure = new_figure(3.1 * sum(heights) + 0.55 * len(heights) + 0.7)
     panels = figure.subplots(len(routes), 1, squeeze=False, height_ratios=heights)[:, 0]
     for axes, (route, drives) in zip(panels, routes.items(), strict=True):
         rotate, reference_m = rotations[route], rotations[route](references[route])
-        axes.plot(reference_m[:, 0], reference_m[:, 1], color="black", linewidth=3.5, solid_capstyle="butt")
+        axes.plot(reference_m[:, 0], reference_m[:, 1], color="black", linewidth=2.5, solid_capstyle="butt")
         early_ends = []
         for drive in drives:
             shown = drawn_indexes(drive.truth.floats("progress_m"))
@@ -88,13 +88,9 @@ def _extent(points_m: FloatArray) -> tuple[float, float]:
 
 def cross_track_figure(routes: Mapping[str, Sequence[DriveData]], colours: Colours) -> Figure:
     """Return the figure of cross-track error over distance along the route, one panel for each route."""
-    columns = min(2, len(routes))
-    rows = -(-len(routes) // columns)
-    figure = new_figure(1.9 * rows + 0.6)
-    panels = figure.subplots(rows, columns, squeeze=False, sharey=True)
-    for axes in panels.flat[len(routes) :]:
-        axes.axis("off")
-    for axes, (route, drives) in zip(panels.flat, routes.items(), strict=False):
+    figure = new_figure(1.15 * len(routes) + 0.7)
+    panels = figure.subplots(len(routes), 1, squeeze=False, sharey=True)[:, 0]
+    for axes, (route, drives) in zip(panels, routes.items(), strict=True):
         axes.axhline(0, color="black", linewidth=2)
         early_ends = []
         for drive in drives:
@@ -106,16 +102,15 @@ def cross_track_figure(routes: Mapping[str, Sequence[DriveData]], colours: Colou
         if early_ends:
             axes.plot(*np.transpose(early_ends), **EARLY_END_MARKER)
         tidy(axes, "", "", f"Route {route}")
-    for axes in panels.flat[max(len(routes) - columns, 0) : len(routes)]:
-        axes.set_xlabel("distance along the route (m)")
-    figure.supylabel("left of lane centre (m)", fontsize=10)
+    panels[-1].set_xlabel("distance along the route (m)")
+    figure.supylabel("left of lane centre (m)")
     _legend(figure, routes, colours)
     return figure
 
 
 def _legend(figure: Figure, routes: Mapping[str, Sequence[DriveData]], colours: Colours) -> None:
     names = sorted({drive.condition for drives in routes.values() for drive in drives})
-    reference = Line2D([], [], color="black", linewidth=3.5, label="lane centre")
+    reference = Line2D([], [], color="black", linewidth=2.5, label="lane centre")
     legend_below(
         figure, [*condition_handles(names, colours), reference, Line2D([], [], label="ended early", **EARLY_END_MARKER)]
     )
@@ -123,7 +118,7 @@ def _legend(figure: Figure, routes: Mapping[str, Sequence[DriveData]], colours: 
 
 def time_figure(drives: Sequence[DriveData], colours: Colours) -> Figure:
     """Return the figure of steering and cross-track error over time, one row for each drive."""
-    figure = new_figure(1.35 * len(drives) + 0.6)
+    figure = new_figure(1.1 * len(drives) + 0.4)
     panels = figure.subplots(len(drives), 2, sharex=True, sharey="col", squeeze=False)
     for (steering_axes, error_axes), drive in zip(panels, drives, strict=True):
         time_s = (drive.truth.ints("mono_ns") - drive.began_ns) / NS_PER_S
@@ -141,10 +136,10 @@ def frames_figure(pictures: Sequence[tuple[str, Picture]]) -> Figure:
     """Return the figure of received pictures, each with a line of text."""
     columns = min(2, len(pictures))
     rows = -(-len(pictures) // columns)
-    figure = new_figure(3.1 * rows)
+    figure = new_figure(1.45 * rows)
     for axes in figure.subplots(rows, columns, squeeze=False).flat:
         axes.axis("off")
     for axes, (text, picture) in zip(figure.axes, pictures, strict=False):
         axes.imshow(picture[:, :, ::-1])
-        axes.set_title(text, fontsize=9, loc="left")
+        axes.set_title(text, loc="left")
     return figure

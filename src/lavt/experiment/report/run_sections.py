@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from lavt.domain import Picture
+from lavt.domain import NS_PER_S, Picture
 from lavt.experiment.analysis.drive_data import DriveData, capture_to_stamp_ms, one_of_each_condition, read_drive
 from lavt.experiment.report import html_page
 from lavt.experiment.report.files import save_figure, save_table
@@ -117,8 +117,8 @@ def single_run_parts(report: ReportContext, sets: DriveSets) -> Parts:
         pictures = received_pictures(chosen[0].directory / "client.mcap")
         if pictures:
             caption = (
-                f"Frames as the client received them in the run {chosen[0].result['run']}. "
-                "The stamp is at the top left."
+                f"Frames as the client received them in the run {chosen[0].result['run']}, with the time since the "
+                "first of them. The stamp is at the top left."
             )
             figure = frames_figure(pictures)
             parts.append(save_figure(report.directory, f"frames_{kind}", figure, "received frames", caption))
@@ -145,7 +145,10 @@ def capture_to_stamp_medians(sets: DriveSets) -> dict[str, dict[str, float | Non
 
 
 def received_pictures(client_record: Path) -> list[tuple[str, Picture]]:
-    """Return `SHOWN_FRAMES` evenly spaced pictures from the received video, each with its time; [] without video."""
+    """Return `SHOWN_FRAMES` evenly spaced pictures from the received video, each with its time since the first of them.
+
+    Without video, the result is empty.
+    """
     units = read_record(client_record, channels=()).video() if client_record.is_file() else []
     if not units:
         return []
@@ -153,12 +156,12 @@ def received_pictures(client_record: Path) -> list[tuple[str, Picture]]:
 
     shown = {len(units) * (2 * index + 1) // (2 * SHOWN_FRAMES) for index in range(SHOWN_FRAMES)}
     decoder = Decoder()
-    pictures: list[tuple[str, Picture]] = []
+    pictures: list[tuple[int, Picture]] = []
     for index, (stamp_ns, unit) in enumerate(units):
         decoded = decoder.decode(unit)
         if index in shown and decoded is not None:
-            pictures.append((f"{(stamp_ns - units[0][0]) / 1e9:.1f} s", decoded.picture))
-    return pictures
+            pictures.append((stamp_ns, decoded.picture))
+    return [(f"{(stamp_ns - pictures[0][0]) / NS_PER_S:.1f} s", picture) for stamp_ns, picture in pictures]
 
 
 def machine_parts(report: ReportContext, sets: DriveSets) -> Parts:

@@ -16,7 +16,14 @@ from lavt.experiment.report.condition_tables import matching_paper
 from lavt.experiment.report.figure_style import Colours, Conditions
 from lavt.experiment.report.files import link_table, save_figure, save_table
 from lavt.experiment.report.groups import Group, axes_of, differing_settings, short_name, sort_groups, title_of
-from lavt.experiment.report.latency_figures import degradation_figure, injected_figure, presets_figure, stages_figure
+from lavt.experiment.report.latency_figures import (
+    LOOP_LABEL,
+    degradation_figure,
+    injected_figure,
+    known_latencies,
+    presets_figure,
+    stages_figure,
+)
 from lavt.experiment.report.sweep_figures import axis_figure, incidence_figure, routes_with_survival, survival_figure
 from lavt.experiment.report.tables import (
     clock_table,
@@ -39,6 +46,7 @@ PAPER_POINTS = (
     " The paper's points are drawn at the sum of its two median one-way latencies. The intervals of its completion "
     "are computed from its counts. The paper gives no interval of the error."
 )
+AGE_NOTE = " The paper does not give it."
 STAGES_NOTE = (
     "The first row, from capture to stamp, is from one run of each condition. The other rows are from all runs of "
     "the condition. The bars contain neither the first row, which is before the loop, nor the stages after the loop."
@@ -162,13 +170,20 @@ def degradation_parts(report: ReportContext) -> Parts:
         return []
     paper = report.paper(report.summary["conditions"])
     caption = (
-        "Completion and error over the median loop latency (from a frame's stamp to the application of its command), "
-        "and over the mean frame age (the age of the frame from which the command in force was made). Bars are 95 % "
+        "Completion in any lane, and error of the completed runs, over the median loop latency. Bars are 95 % "
         "intervals for these routes; a single run has none. Names above each other are in the vertical order of their "
         "points." + (PAPER_POINTS if paper else "") + _base_note(report)
     )
-    figure = degradation_figure(report.kinds, paper, report.colours)
-    return [save_figure(report.directory, "degradation", figure, "completion and error over latency", caption)]
+    return [
+        save_figure(
+            report.directory,
+            "degradation" if label == LOOP_LABEL else "degradation_age",
+            degradation_figure(report.kinds, paper, report.colours, label),
+            f"completion and error over {label}",
+            caption if label == LOOP_LABEL else f"The same, over the mean frame age.{AGE_NOTE * bool(paper)}",
+        )
+        for label in known_latencies(report.kinds)
+    ]
 
 
 def _is_repeated(conditions: Conditions) -> bool:
@@ -263,28 +278,31 @@ def group_parts(report: ReportContext) -> Parts:
 
 
 def axis_parts(report: ReportContext) -> Parts:
-    """Return a figure of the sweep's further axes for each set of groups that differ in these axes only."""
+    """Return a figure of the sweep's further axis for each set of groups that differ in this axis only.
+
+    Of two axes, the one with more numbers is on x, and each value of the other has a figure with the same scales.
+    """
     axes = axes_of(report.groups)
     if not axes:
         return []
     if len(axes) > 2:
         return [
             html_page.paragraph(
-                f"A figure can show two axes, but this sweep has {len(axes)}. See the table of groups.", is_note=True
+                f"The figures show at most two axes, but this sweep has {len(axes)}. See the table of groups.",
+                is_note=True,
             )
         ]
-    most_numeric_first = sorted(axes, key=lambda axis: -_numeric_values(report.groups, axis))
-    other_settings = [name for name in differing_settings(report.groups) if name not in axes]
+    x_axis = max(axes, key=lambda axis: _numeric_values(report.groups, axis))
+    other_settings = [name for name in differing_settings(report.groups) if name != x_axis]
     groups_by_title: dict[str, list[Group]] = {}
     for group in report.groups:
         groups_by_title.setdefault(title_of(group, other_settings), []).append(group)
     parts = []
     for title, groups in groups_by_title.items():
-        figure = axis_figure(groups, most_numeric_first, report.colours)
-        names = " and ".join(short_name(axis) for axis in most_numeric_first)
-        caption = f"Driving results by {names}, virtual time{f', {title}' if title else ''}."
+        figure = axis_figure(groups, x_axis, report.colours, report.groups)
+        caption = f"Driving results by {short_name(x_axis)}, virtual time{f', {title}' if title else ''}."
         name = "_".join(["axes", *(html_page.slug(title),)]) if title else "axes"
-        alternative = f"driving results by {short_name(most_numeric_first[0])}"
+        alternative = f"driving results by {short_name(x_axis)}"
         parts.append(save_figure(report.directory, name, figure, alternative, caption))
     return parts
 

@@ -20,7 +20,7 @@ ENDING_DASHES: Mapping[str, Any] = {
     "timeout": (0, (6, 1.5, 1, 1.5)),
 }
 
-PANELS_PER_ROW = 3
+PANELS_PER_ROW = 2
 """The number of panels in a row of a figure."""
 MAX_BANDS = 2
 """The intervals of survival are drawn for at most this many conditions, because more would overlap."""
@@ -60,7 +60,7 @@ def survival_figure(conditions: Conditions, colours: Colours) -> Figure:
         tidy(axes, "", "", f"Route {route}")
         axes.set_ylim(-4, 104)
     _label_distance(panels)
-    figure.supylabel("runs still driving (%)", fontsize=10)
+    figure.supylabel("runs still driving (%)")
     legend_below(figure, list(condition_handles(conditions, colours)))
     return figure
 
@@ -84,7 +84,7 @@ def incidence_figure(conditions: Conditions, colours: Colours) -> Figure:
         tidy(axes, "", "", f"Route {route}")
         axes.set_ylim(-4, 104)
     _label_distance(panels)
-    figure.supylabel("runs ended in this way (%)", fontsize=10)
+    figure.supylabel("runs ended in this way (%)")
     endings = [Line2D([], [], color="0.3", linestyle=dash, label=ending) for ending, dash in dashes.items()]
     legend_below(figure, [*condition_handles(conditions, colours), *endings])
     return figure
@@ -104,50 +104,42 @@ def _new_panels(count: int) -> tuple[Figure, list[Axes]]:
     """Return a new figure with `count` small panels that share the scale of y, `PANELS_PER_ROW` in a row."""
     column_count = min(PANELS_PER_ROW, count)
     row_count = -(-count // column_count)
-    figure = new_figure(2.0 * row_count + 0.7)
+    figure = new_figure(1.6 * row_count + 0.7)
     panels = list(figure.subplots(row_count, column_count, squeeze=False, sharey=True).flat)
     for axes in panels[count:]:
         axes.axis("off")
     return figure, panels[:count]
 
 
-def axis_figure(groups: Sequence[Group], axis_names: Sequence[str], colours: Colours) -> Figure:
-    """Return the figure of results over one or two axes of a sweep.
+def axis_figure(groups: Sequence[Group], x_axis: str, colours: Colours, compared: Sequence[Group]) -> Figure:
+    """Return the figure of results over one axis of a sweep.
 
-    The first axis is on x, and each value of the second axis has a column of panels. Each line is a condition. The rows
-    are completion, error and frame age, if they are known.
+    Each line is a condition. The panels are completion, error and frame age, if they are known. Their scales include
+    the groups in `compared`, so that the figures of several values of a second axis have the same scales.
     """
-    x_axis = axis_names[0]
-    column_axis = axis_names[1] if len(axis_names) > 1 else None
     positions, labels = _positions([group.get(x_axis) for group in groups])
-    columns = list(dict.fromkeys(str(group.get(column_axis)) for group in groups)) if column_axis else [""]
     names = sorted({name for group in groups for name in group["conditions"]})
-    entries = [entry for group in groups for entry in group["conditions"].values()]
+    entries = [entry for group in compared for entry in group["conditions"].values()]
     rows = [(label, key, scale) for label, key, scale in AXIS_ROWS if any(_has_value(entry, key) for entry in entries)]
-    figure = new_figure(1.9 * len(rows) + 0.8, width_in=max(5.5, min(2.6 * len(columns) + 0.6, 13)))
-    panels = figure.subplots(len(rows), len(columns), squeeze=False, sharex=True, sharey="row")
-    for column, value in enumerate(columns):
-        members = [group for group in groups if not column_axis or str(group.get(column_axis)) == value]
-        title = f"{short_name(column_axis)} {value}" if column_axis else ""
-        for row, (label, key, scale) in enumerate(rows):
-            axes = panels[row, column]
-            for name, width in zip(names, _line_widths(len(names)), strict=True):
-                points = sorted(
-                    (positions[str(group.get(x_axis))], _value(group["conditions"][name], key) * scale)
-                    for group in members
-                    if name in group["conditions"] and _has_value(group["conditions"][name], key)
-                )
-                if points:
-                    x, y = zip(*points, strict=True)
-                    axes.plot(x, y, marker="o", markersize=width + 2.5, linewidth=width, color=colours[name])
-            tidy(axes, "", label if column == 0 else "", title if row == 0 else "")
-            if labels or len(positions) <= MAX_TICKS:
-                axes.set_xticks(list(positions.values()), labels or list(positions))
-    for axes in panels[:, 0]:
-        axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
-    panels[0, 0].set_ylim(-5, 105)
-    for axes in panels[-1]:
-        axes.set_xlabel(short_name(x_axis))
+    figure = new_figure(1.5 * len(rows) + 0.7)
+    panels = figure.subplots(len(rows), 1, squeeze=False, sharex=True)[:, 0]
+    for axes, (label, key, scale) in zip(panels, rows, strict=True):
+        for name, width in zip(names, _line_widths(len(names)), strict=True):
+            points = sorted(
+                (positions[str(group.get(x_axis))], _value(group["conditions"][name], key) * scale)
+                for group in groups
+                if name in group["conditions"] and _has_value(group["conditions"][name], key)
+            )
+            if points:
+                x, y = zip(*points, strict=True)
+                axes.plot(x, y, marker="o", markersize=width + 2.5, linewidth=width, color=colours[name])
+        tidy(axes, "", label)
+        if labels or len(positions) <= MAX_TICKS:
+            axes.set_xticks(list(positions.values()), labels or list(positions))
+        most = max(_value(entry, key) * scale for entry in entries if _has_value(entry, key))
+        axes.set_ylim(0, 1.05 * most or 1.0)
+    panels[0].set_ylim(-5, 105)
+    panels[-1].set_xlabel(short_name(x_axis))
     legend_below(figure, list(condition_handles(names, colours)))
     return figure
 

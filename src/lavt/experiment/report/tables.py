@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -249,13 +250,22 @@ def stage_table(
     return TableData(columns, [["camera: capture to stamp, before the loop", *before_loop], *rows])
 
 
+def _measured_on(costs: str) -> str:
+    """Return where recorded costs were measured; "unknown" if a record of another version does not say it."""
+    try:
+        return str(json.loads(costs)["measured_on"])
+    except (ValueError, KeyError, TypeError):
+        return "unknown"
+
+
 def machine_table(annotations: Mapping[str, Mapping[str, str]]) -> TableData:
-    """Return the table of versions and machines from a run's records."""
+    """Return the table of versions and machines from a run's records; of the costs, only where they were measured."""
     columns = [text_column("category"), text_column("property", is_long=True), text_column("value", is_long=True)]
     rows = [
-        [name, key, value]
+        [name, "costs measured on", _measured_on(value)] if key == "costs" else [name, key, value]
         for name in sorted(annotations)
         for key, value in annotations[name].items()
-        if key != "condition"  # not a property of the machine; other tables show it
+        # The condition is not a property of the machine; other tables show it. Most runs have no traces.
+        if key != "condition" and value != "{}"
     ]
     return TableData(columns, rows or [["not recorded", None, None]])

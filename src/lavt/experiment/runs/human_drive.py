@@ -116,7 +116,7 @@ def drive_config(changes: Iterable[str]) -> RunConfig:
     if any(flow != ImpairmentConfig() for _, flow in requested.flows.values()):
         raise UserError(f"lavt drive injects constant delays only: choose one of {', '.join(CONDITIONS)}")
     if max(requested.video_ms, requested.control_ms) > MAX_DELAY_MS:
-        raise UserError(f"lavt drive injects at most {MAX_DELAY_MS:g} ms into each direction")
+        raise UserError(f"lavt drive injects at most {MAX_DELAY_MS:g} ms into each direction: choose shorter delays")
     return config
 
 

@@ -43,7 +43,8 @@ def drive_once(planned: PlannedRun, out: Path, *, progress: Progress | None = No
         drive(loop, progress=None if progress is None else lambda _: progress(loop.observer.status(), {}))
         digest = loop.digest.hexdigest()
         if not loop.observer.began:
-            raise WorkError(f"{planned.name}: the vehicle was never armed: {loop.client.driver.session.reason}")
+            reason = loop.client.driver.session.reason or "see its records"
+            raise WorkError(f"{planned.name}: the vehicle was never armed: {reason}")
         del loop
         free_finished_loops(planned.config)
     else:

@@ -44,6 +44,11 @@ def completed_values(runs: Sequence[Run], name: str) -> list[float]:
     return [run[name] for run in runs if run["ending"] == "completed" and run.get(name) is not None]
 
 
+def collisions_end_runs(runs: Sequence[Run]) -> bool:
+    """Return whether each collision ended its run, so that collisions per run are a share of the runs."""
+    return all(run["collisions"] == (run["ending"] == "collision") for run in runs)
+
+
 def by_road(valid_runs: Sequence[Run], common_p95_m: Callable[[Sequence[Run]], Sequence[float]]) -> dict[str, Any]:
     """Return for each main result its mean over roads, with the interval for other roads of this kind.
 
@@ -61,13 +66,19 @@ def by_road(valid_runs: Sequence[Run], common_p95_m: Callable[[Sequence[Run]], S
         "followed_p95_m": lambda runs: completed_values(runs, "followed_p95_m"),
         "p95_common_m": common_p95_m,
     }
+    rates = {"completion_rate", "own_lane_completion_rate"}
+    if collisions_end_runs(valid_runs):
+        rates.add("collisions_per_run")
     roads = list(group_by_road(valid_runs).values())
-    return {name: _over_roads(name, [values_of(runs) for runs in roads]) for name, values_of in measures.items()}
+    return {
+        name: _over_roads([values_of(runs) for runs in roads], is_rate=name in rates)
+        for name, values_of in measures.items()
+    }
 
 
-def _over_roads(name: str, values_by_road: Sequence[Sequence[float]]) -> dict[str, Any]:
+def _over_roads(values_by_road: Sequence[Sequence[float]], *, is_rate: bool) -> dict[str, Any]:
     """Return the number of roads that have a value, the mean over these roads, and its interval."""
     means = [float(np.mean(values)) for values in values_by_road if values]
-    interval = cluster_rate_interval(means) if name.endswith("_rate") else cluster_interval(means)
+    interval = cluster_rate_interval(means) if is_rate else cluster_interval(means)
     low, high = interval or (None, None)
     return {"roads": len(means), "mean": float(np.mean(means)) if means else None, "low": low, "high": high}

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lavt.experiment.statistics.by_road import by_road, completed_values
+from lavt.experiment.statistics.by_road import by_road, collisions_end_runs, completed_values
 from lavt.experiment.statistics.intervals import exact_interval, exact_rate_interval, stratified_interval
 from lavt.experiment.statistics.survival import survival
 
@@ -51,7 +51,10 @@ def summarize_condition(all_runs: Sequence[Run], distances: CommonDistances) -> 
         "endings": dict(sorted(Counter(str(run["ending"]) for run in runs).items())),
         "routes": {name: _summarize_route(routes[name], distances) for name in sorted(routes)},
         "collisions_per_run": _mean([run["collisions"] for run in runs]),
-        "collisions_per_run_interval": exact_rate_interval(sum(run["collisions"] for run in runs), len(runs)),
+        "collisions_per_run_interval": _collisions_interval(runs),
+        "invasion_free_completion_rate": _mean(
+            [run["ending"] == "completed" and run["lane_invasions"] == 0 for run in runs]
+        ),
         "lane_invasions_per_run": _mean([run["lane_invasions"] for run in runs]),
         "collisions_per_km": _per_km(runs, "collisions"),
         "lane_invasions_per_km": _per_km(runs, "lane_invasions"),
@@ -101,6 +104,12 @@ def own_lane_completion(runs: Sequence[Run]) -> dict[str, Any]:
         "own_lane_completion_rate": sum(known) / len(known) if known else None,
         "own_lane_completion_interval": exact_interval(sum(known), len(known)),
     }
+
+
+def _collisions_interval(runs: Sequence[Run]) -> list[float] | None:
+    """Return the exact interval of the number of collisions per run, a share of the runs if a collision ends a run."""
+    interval = exact_interval if collisions_end_runs(runs) else exact_rate_interval
+    return interval(sum(run["collisions"] for run in runs), len(runs))
 
 
 def group_by(runs: Iterable[Run], key: str) -> dict[str, list[Run]]:

@@ -40,7 +40,7 @@ def exact_rate_interval(count: int, runs: int) -> list[float] | None:
     """Return the 95 % interval of the mean number of events per run, from the number of all events; None without runs.
 
     It is exact for Poisson distributed numbers, also if the runs have different rates (F. Garwood, Fiducial Limits for
-    the Poisson Distribution, Biometrika 28, 1936), and too wide if a run has at most one event.
+    the Poisson Distribution, Biometrika 28, 1936).
     """
     if runs == 0:
         return None

@@ -6,7 +6,8 @@ const RETRY_MS = 1000;
 const STOP_PERIOD_MS = 500; // between the messages of a stop that is not confirmed
 const SILENT_MS = 400; // lavt sends a message at least every 50 ms
 const MAX_UNSENT_BYTES = 1024; // some messages of the last milliseconds: the browser counts what it has just taken, too
-const TOO_MANY_MESSAGES = 4408;
+const ANOTHER_VERSION = 4000; // closed by this page
+const FINAL = [ANOTHER_VERSION, 4401, 4426]; // wrong token or version: the same page is never let in
 
 export class Connection {
   #token;
@@ -14,6 +15,7 @@ export class Connection {
   #socket = null;
   #heard_ms = 0; // when the newest message arrived, or the connection was opened
   #stop_ms = null; // when the stop that is not confirmed was last sent; null: there is none
+  #isFinal = false; // there will be no other connection
 
   // `listener` has `takeStatus(status)`, `takeProbe(answer)`, `takeUnit(buffer)` and `close(text)`.
   constructor(token, listener) {
@@ -31,6 +33,11 @@ export class Connection {
   // How long lavt has sent nothing.
   get silence_ms() {
     return performance.now() - this.#heard_ms;
+  }
+
+  // There is no connection, and there will be none.
+  get isFinal() {
+    return this.#isFinal;
   }
 
   // An emergency stop was made that the vehicle has not confirmed.
@@ -75,8 +82,8 @@ export class Connection {
     socket.onmessage = ({ data }) => this.#take(data);
     socket.onclose = ({ code, reason }) => {
       this.#socket = null;
-      // Another code above 4000 tells that another attempt is pointless.
-      if (code < 4000 || code === TOO_MANY_MESSAGES) setTimeout(() => this.#open(), RETRY_MS);
+      this.#isFinal = FINAL.includes(code);
+      if (!this.#isFinal) setTimeout(() => this.#open(), RETRY_MS);
       this.#listener.close(reason || "the connection to lavt has ended");
     };
   }
@@ -89,7 +96,7 @@ export class Connection {
     }
     const message = JSON.parse(data);
     if (message.type === "probe") return this.#listener.takeProbe(message);
-    if (message.version !== VERSION) return this.#socket.close(4000, "reload this page: it is of another version of lavt");
+    if (message.version !== VERSION) return this.#socket.close(ANOTHER_VERSION, "reload this page: it is of another version of lavt");
     this.seen_us = message.sent_us;
     if (message.emergency_stop === "confirmed" && message.safety === "emergency_stop") this.#stop_ms = null;
     this.#listener.takeStatus(message);

@@ -92,6 +92,7 @@ export class Keyboard {
   #checkEvents() {
     const limit_ms = this.#newest === "repeat" ? NEXT_REPEAT_MS : FIRST_REPEAT_MS;
     if (this.#held.size === 0 || performance.now() - this.#heard_ms < limit_ms) return;
+    if (this.#newest === "press") this.#repeats = false; // the repeat was turned off
     this.release();
     this.#isSilent = true;
   }
@@ -115,7 +116,7 @@ export class Keyboard {
     this.#note(event.repeat ? "repeat" : "press");
     const hasModifier = event.ctrlKey || event.altKey || event.metaKey;
     if (hasModifier || !(event.code in KEYS)) {
-      if (hasModifier || !OTHER_KEYS.test(event.code)) this.release();
+      if (hasModifier || !(OTHER_KEYS.test(event.code) || event.key === "Escape")) this.release();
       return;
     }
     event.preventDefault();

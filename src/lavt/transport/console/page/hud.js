@@ -8,8 +8,8 @@ const SAFETY = {
   disarmed: "disarmed", arming: "arming", driving: "driving", degraded: "degraded",
   safe_stop: "safe stop", emergency_stop: "emergency stop",
 };
-const STOP_NOT_SENT =
-  "emergency stop NOT sent: no connection to lavt. Use another emergency stop. It is sent if the connection returns";
+const STOP_NOT_SENT = "emergency stop NOT sent: no connection to lavt. Use another emergency stop.";
+const STOP_SENT_LATER = "It is sent if the connection returns";
 const STOP_NOT_CONFIRMED = "emergency stop sent, not confirmed yet";
 const STALE_MS = 1000; // lavt sends a status every 50 ms
 const history = new History(byId("history"));
@@ -20,12 +20,14 @@ const HANDS = {
   no_input: "this page sent no input for a moment: let go of the dead-man control, then hold it",
 };
 
-export function showClosed(text, isStopPending = false) {
+// `stop` is "pending" if an emergency stop waits for a connection, "lost" if there will be none, and else empty.
+export function showClosed(text, stop = "") {
   byId("connection").textContent = "not connected";
   showSafety("");
   byId("reason").textContent = "";
   byId("stop").className = "";
-  byId("hint").textContent = isStopPending ? STOP_NOT_SENT : text;
+  const warnings = { "": text, pending: `${STOP_NOT_SENT} ${STOP_SENT_LATER}`, lost: `${STOP_NOT_SENT} ${text}` };
+  byId("hint").textContent = warnings[stop];
   byId("take").hidden = byId("release").hidden = true;
 }
 

@@ -23,6 +23,7 @@ const screen = new Screen();
 let calibration = null; // while the person calibrates a device
 let connection = null;
 let status = null;
+let closedText = ""; // why there is no connection
 let advanced_ms = performance.now();
 
 let offset = new Offset();
@@ -41,7 +42,7 @@ function send(message) {
 
 function stop() {
   connection?.stop();
-  if (connection?.isOpen !== true) showClosed("", true);
+  if (connection?.isOpen !== true) showClosed(closedText, connection === null || connection.isFinal ? "lost" : "pending");
 }
 
 function connect() {
@@ -57,7 +58,9 @@ function close(text) {
   video.close();
   keyboard.release();
   touch.release();
-  showClosed(text, connection.isStopPending);
+  closedText = text;
+  if (connection.isStopPending) showClosed(text, connection.isFinal ? "lost" : "pending");
+  else showClosed(text);
 }
 
 function takeStatus(message) {
@@ -115,7 +118,7 @@ function chooseDelay(video_ms, control_ms) {
 }
 
 addEventListener("keydown", (event) => {
-  if (event.code === "Escape") stop();
+  if (event.code === "Escape" || event.key === "Escape") stop();
   const condition = /^Digit[0-9]$/.test(event.code) && status?.conditions?.[Number(event.code.slice(5))];
   if (condition && !event.repeat && !event.ctrlKey && !event.altKey) chooseDelay(condition[1], condition[2]);
 });

@@ -87,6 +87,7 @@ export class Video {
         this.#canvas.height = frame.displayHeight;
       }
       this.#context.drawImage(frame, 0, 0);
+      if (this.#context.isContextLost?.()) return this.#fail(); // then nothing has been drawn
       isDrawn = true;
       this.shown += 1;
       this.#acknowledge(unit);
