@@ -163,7 +163,7 @@ def test_configured_settings_replace_those_of_the_preset() -> None:
 
 def test_the_configured_human_model_drives() -> None:
     """The section `two_point` sets the model, and results list its changed settings, for this controller only."""
-    model = TwoPointConfig(far_gain=3.5, reaction_delay_s=0.0, neuromuscular_lag_s=0.0, noise_seed=12345678)
+    model = TwoPointConfig(far_gain=3.5, reaction_delay_s=0.0, neuromuscular_lag_s=0.0, noise_rad=0.0025)
     changed = ControllerConfig(kind="two_point", two_point=model)
     undelayed = TwoPointConfig(reaction_delay_s=0.0, neuromuscular_lag_s=0.0)
     default = ControllerConfig(kind="two_point", two_point=undelayed)
@@ -173,7 +173,7 @@ def test_the_configured_human_model_drives() -> None:
     assert 0 < by_changed.steering_rad < by_default.steering_rad
     assert changed.settings == (
         "designed, two_point.far_gain 3.5, two_point.reaction_delay_s 0, two_point.neuromuscular_lag_s 0, "
-        "two_point.noise_seed 12345678"
+        "two_point.noise_rad 0.0025"
     )
     assert ControllerConfig(two_point=model).settings == "designed"
 

@@ -81,13 +81,16 @@ def check_names(vehicle: VehicleConfig, controller: ControllerConfig) -> None:
     build_controller(controller)
 
 
-def build_controller(config: ControllerConfig) -> DriveController:
-    """Build the configured controller; raise `UserError` with the known names for an unknown controller or preset."""
+def build_controller(config: ControllerConfig, seed: int = 1) -> DriveController:
+    """Build the configured controller; the noise of the human model depends on `seed`.
+
+    Raises `UserError` with the known names for an unknown controller or preset.
+    """
     if config.kind == HUMAN:
         raise UserError("a person drives by `lavt drive` or `lavt client CONFIG --human` only: name another controller")
     if config.kind == TWO_POINT:
         model = TwoPointSettings(**config.two_point.model_dump())
-        return TwoPointDriver(_settings(config), wheelbase_m=config.wheelbase_m, settings=model)
+        return TwoPointDriver(_settings(config), wheelbase_m=config.wheelbase_m, settings=model, seed=seed)
     return make_controller(config.kind, _settings(config), config.wheelbase_m)
 
 
@@ -263,7 +266,7 @@ def build_client(
 def _driver(config: ClientConfig, fidelity: FidelityModel) -> Callable[[ClientSession], DriverNode]:
     """Prepare a driver node with the configured controller; return a function that builds it for a session."""
     reader, detector = PictureReader(fidelity.receiver(config)), fidelity.detector(config)
-    controller = build_controller(config.controller)
+    controller = build_controller(config.controller, config.seed)
     return lambda session: DriverNode(reader, detector, controller, session, CLIENT_LIMITS)
 
 

@@ -330,6 +330,8 @@ class ClientConfig(Section):
     injection: ClientInjectionConfig = ClientInjectionConfig()
     clock: ClientClockConfig = ClientClockConfig()
     record: RecordConfig = RecordConfig()
+    seed: int = Field(1, ge=0, lt=2**63)
+    """The seed of the noise of `controller.kind` two_point."""
 
     @model_validator(mode="after")
     def _check_scouting(self) -> ClientConfig:

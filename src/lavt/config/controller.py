@@ -43,16 +43,12 @@ class TwoPointConfig(Section):
     neuromuscular_lag_s: float = Field(_MODEL.neuromuscular_lag_s, ge=0, le=2)
     """Time constant with which the arms follow."""
     noise_rad: float = Field(_MODEL.noise_rad, ge=0, le=0.1)
-    """Standard deviation of the noise of both visual angles; above 0 it needs `noise_seed`."""
-    noise_seed: int | None = Field(_MODEL.noise_seed, ge=0, lt=2**63)
-    """The seed of the noise. Runs with the same seed have the same noise."""
+    """Standard deviation of the noise of both visual angles. The noise depends on the seed of the run."""
 
     @model_validator(mode="after")
-    def _check_points_and_noise(self) -> TwoPointConfig:
+    def _check_points(self) -> TwoPointConfig:
         if self.far_point_min_m < self.near_point_m:
             raise ValueError("far_point_min_m must be at least near_point_m: the far point is not before the near one")
-        if self.noise_rad > 0 and self.noise_seed is None:
-            raise ValueError("noise_rad needs noise_seed, so that a run can be repeated: set both or none")
         return self
 
     @property

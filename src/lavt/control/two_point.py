@@ -51,7 +51,7 @@ class TwoPointSettings:
     """Rate of the steering wheel for each angle of the near point: 3 x 0.40."""
     near_angle_limit_rad: float = 0.07
     """Largest near angle that is integrated."""
-    near_point_m: float = 10.0
+    near_point_m: float = 8.0
     """Distance of the near point, ahead of the rear axle as all distances of a lane."""
     far_point_s: float = 4.0
     """Distance of the far point, in seconds of driving, if the lane is seen as far as this."""
@@ -67,8 +67,6 @@ class TwoPointSettings:
     """Time constant of the arms."""
     noise_rad: float = 0.0
     """Standard deviation of the noise of each seen angle, independent between pictures."""
-    noise_seed: int | None = None
-    """Seed of the noise; without a seed there is no noise."""
 
 
 class TwoPointDriver:
@@ -76,16 +74,19 @@ class TwoPointDriver:
 
     Without a lane it keeps the wheel where it last wanted it, and uses no pedal; the driver node then brakes and stops.
     The path for a vehicle without commands is the lane keeper's. Angles of the wheel are held as angles of the road
-    wheels. Without `note_stamp`, the times between pictures are those between the calls of `decide`.
+    wheels. Without `note_stamp`, the times between pictures are those between the calls of `decide`. The noise of the
+    seen angles depends on `seed` only.
     """
 
-    def __init__(self, preset: Preset, *, wheelbase_m: float, settings: TwoPointSettings | None = None) -> None:
+    def __init__(
+        self, preset: Preset, *, wheelbase_m: float, settings: TwoPointSettings | None = None, seed: int = 1
+    ) -> None:
         self._preset = preset
         self._wheelbase_m = wheelbase_m
         self._settings = settings or TwoPointSettings()
         self._speed_keeper = SpeedKeeper(preset.speed_mps)
         self._remembered = RememberedLane()
-        self._steering = SteeringLaw(self._settings)
+        self._steering = SteeringLaw(self._settings, IndexedStream(seed, "two-point noise"))
         self._arms = Arms(self._settings)
         self._stamp_ns: int | None = None
         self._decided_ns: int | None = None
@@ -117,11 +118,9 @@ class TwoPointDriver:
 class SteeringLaw:
     """The steering law: the wheel angle that the driver wants, from the lanes of successive pictures."""
 
-    def __init__(self, settings: TwoPointSettings, noise: IndexedStream | None = None, pictures: int = 0) -> None:
+    def __init__(self, settings: TwoPointSettings, noise: IndexedStream, pictures: int = 0) -> None:
         self._settings = settings
         self._noise = noise
-        if settings.noise_seed is not None and settings.noise_rad > 0 and noise is None:
-            self._noise = IndexedStream(settings.noise_seed, "two-point noise")
         self._pictures = pictures
         self._wheel_rad = 0.0
         self._near_rad = self._far_rad = 0.0
@@ -155,7 +154,7 @@ class SteeringLaw:
         near_m = min(settings.near_point_m, lane.far_m)
         far_m = min(max(settings.far_point_s * speed_mps, settings.far_point_min_m), lane.far_m)
         near_rad, far_rad = self._angle_rad(lane, near_m), self._angle_rad(lane, far_m)
-        if self._noise is not None:
+        if settings.noise_rad > 0:
             near_noise, far_noise = self._noise.at(self._pictures).normal(0.0, settings.noise_rad, 2)
             near_rad, far_rad = near_rad + float(near_noise), far_rad + float(far_noise)
         self._pictures += 1

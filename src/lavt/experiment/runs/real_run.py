@@ -92,7 +92,7 @@ def start_loop(
         netem.apply(video_port=video_port, control_port=control_port)
     dialled = f"udp/127.0.0.1:{control_port}?rel=1;mixed_rel=1"
     zenoh = embedded_router(dialled=[dialled])
-    config = client_config(run, zenoh=zenoh, video_port=video_port, probe_port=ready["probe_port"])
+    config = client_config(run, planned.seed, zenoh=zenoh, video_port=video_port, probe_port=ready["probe_port"])
     config = config.model_copy(update={"controller": config.controller.model_copy(update={"rearm": rearm})})
     client = processes.start("client", "client", write_config(work, "client", config), "--out", str(out / "client"))
     client.wait_ready()

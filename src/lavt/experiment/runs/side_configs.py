@@ -47,6 +47,7 @@ def server_config(run: RunConfig, seed: int, *, zenoh: ZenohConfig | None = None
 
 def client_config(
     run: RunConfig,
+    seed: int,
     *,
     zenoh: ZenohConfig | None = None,
     video_port: int = 0,
@@ -60,4 +61,5 @@ def client_config(
         zenoh=zenoh or ZenohConfig(),
         clock=ClientClockConfig(probe_port=probe_port),
         record=run.record,
+        seed=seed,
     )
