@@ -78,7 +78,10 @@ class ClientNodes:
 def check_names(vehicle: VehicleConfig, controller: ControllerConfig) -> None:
     """Raise `UserError` for an unknown vehicle, route, controller or preset, before any work starts."""
     check_vehicle(vehicle)
-    build_controller(controller)
+    if controller.kind == HUMAN:
+        build_controls(controller)
+    else:
+        build_controller(controller)
 
 
 def build_controller(config: ControllerConfig, seed: int = 1) -> DriveController:
@@ -275,4 +278,7 @@ def _human_driver(
 ) -> Callable[[ClientSession], HumanDriverNode]:
     """Prepare the driver node of a person; return a function that builds it for a session."""
     reader, controls = PictureReader(fidelity.receiver(config)), build_controls(config.controller)
-    return lambda session: HumanDriverNode(reader, controls, session, CLIENT_LIMITS, delays)
+    shows_latency = config.console.shows_latency
+    return lambda session: HumanDriverNode(
+        reader, controls, session, CLIENT_LIMITS, delays, shows_latency=shows_latency
+    )

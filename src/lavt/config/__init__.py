@@ -222,6 +222,8 @@ class StudyConfig(RunConfig):
     """The routes that are driven in each block, in this order; they replace `vehicle.route`."""
     repetitions: int = Field(1, ge=1, le=100)
     """How often the routes are driven in each block, each time with another start and noise."""
+    instructions: str = ""
+    """The text that a person reads in the terminal before each block."""
 
     @model_validator(mode="after")
     def _check_study(self) -> StudyConfig:
@@ -233,11 +235,8 @@ class StudyConfig(RunConfig):
             raise ValueError("conditions needs at least two conditions, because a study compares them: add one")
         if self.study != StudyPlaceConfig():
             raise ValueError("study.* is set for each run by the study itself: leave out the section study")
-        if self.controller.kind == HUMAN:
-            raise ValueError(
-                "controller.kind human: drives by a person are not built yet for studies: choose two_point, a model of "
-                "a human driver"
-            )
+        if self.controller.kind == HUMAN and self.time != "real":
+            raise ValueError("controller.kind human needs time real, because a person drives in real time: set it")
         return self
 
 
@@ -340,6 +339,8 @@ class ConsoleConfig(Section):
 
     port: int = Field(0, ge=0, le=65535)
     """The TCP port of the page on this machine's loopback addresses; 0: any free port."""
+    shows_latency: bool = True
+    """Whether the page shows the measured latencies; `lavt study` hides them from a participant."""
 
 
 class ClientConfig(Section):

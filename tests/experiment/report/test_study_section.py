@@ -20,6 +20,7 @@ def runs(participants: int, driver: str = "two_point") -> list[dict[str, Any]]:
             "route": "a_key",
             "repetition": 0,
             "valid": True,
+            "ending": "completed",
             "driver": driver,
         }
         for number in range(1, participants + 1)

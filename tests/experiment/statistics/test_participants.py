@@ -14,6 +14,7 @@ def run(participant: str | None, condition: str, p95_m: float | None, **changes:
         "repetition": 0,
         "valid": True,
         "driver": "two_point",
+        "ending": "completed",
         **changes,
     }
 
@@ -70,7 +71,7 @@ def test_runs_outside_a_study_are_not_compared() -> None:
 def test_the_workload_is_compared_if_somebody_was_asked() -> None:
     """The raw TLX is a measure if there are answers; without answers, as of a model, it is none."""
     asked = [
-        {"participant": "1", "condition": name, "driver": "two_point", "raw_tlx": load}
+        {"participant": "1", "condition": name, "driver": "two_point", "ending": "completed", "raw_tlx": load}
         for name, load in (("L0", 20.0), ("L5", 60.0))
     ]
     (comparison,) = compare_studies(COMPLETE, asked)

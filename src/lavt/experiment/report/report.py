@@ -88,7 +88,7 @@ def write_report(
     summary = summarize([result for _, result in results], speed, base=base, failed=left_out)
     write_json(summary_path, summary)
     studies = compare_studies(summary["runs"], answers)
-    if studies:
+    if any(run.get("participant") is not None for run in summary["runs"]):
         write_json(sweep_dir / STUDY, {"schema": SCHEMA, "studies": studies})
     report_dir = sweep_dir / "report"
     report_dir.mkdir(parents=True, exist_ok=True)

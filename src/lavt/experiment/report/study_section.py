@@ -20,16 +20,16 @@ from lavt.experiment.report.table_format import (
     probability_column,
     text_column,
 )
-from lavt.experiment.statistics.participants import MEASURES, WORKLOAD
+from lavt.experiment.statistics.participants import PRIMARY, WORKLOAD
 
 TITLES = {
     "p95_m": "P95 of the cross-track error (m)",
+    "completed": "share of the drives completed",
     "completed_in_own_lane": "share of the drives completed in the own lane",
     "lane_invasions_per_km": "lane invasions per km",
     "steering_reversals_per_km": "steering reversals per km",
     WORKLOAD: "workload (raw NASA-TLX, 0 to 100)",
 }
-PRIMARY = next(iter(MEASURES))
 WHY = (
     "The unit is the participant: the value of a participant under a condition is the mean over the same drives under "
     "every condition, because the drives of one person are no independent evidence. Everybody drove under all "

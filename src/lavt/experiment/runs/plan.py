@@ -13,7 +13,7 @@ from lavt.assembly.entropy import run_seed
 from lavt.assembly.injection import NO_CONDITION, netem_flows
 from lavt.assembly.links import link_injection
 from lavt.assembly.nodes import check_names
-from lavt.config import Condition, RunConfig, SweepConfig
+from lavt.config import HUMAN, Condition, RunConfig, SweepConfig
 from lavt.config_file import condition, parse_config
 from lavt.errors import UserError
 from lavt.operating_system import require_real_time
@@ -39,8 +39,18 @@ class PlannedRun:
     """The requested network condition."""
 
 
-def plan_run(config: RunConfig, *, name: str = "run", axes: Mapping[str, Any] | None = None) -> PlannedRun:
-    """Plan one run; raise `UserError` for a condition, route, vehicle, controller or preset that does not exist."""
+def plan_run(
+    config: RunConfig, *, name: str = "run", axes: Mapping[str, Any] | None = None, is_study: bool = False
+) -> PlannedRun:
+    """Plan one run; only in a study (`is_study`) can a person drive it.
+
+    Raises `UserError` for a condition, route, vehicle, controller or preset that does not exist.
+    """
+    if config.controller.kind == HUMAN and not is_study:
+        raise UserError(
+            "a person drives by `lavt drive`, `lavt client CONFIG --human` or `lavt study` only: name another "
+            "controller"
+        )
     requested = config.network.requested(condition(config.network.condition))
     check_names(config.vehicle, config.controller)
     _check_injection(config, requested)

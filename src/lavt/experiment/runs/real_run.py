@@ -38,11 +38,16 @@ DELAYED_DIRECTIONS = {"video": "video downstream", "control": "control upstream"
 """The delayed direction of each relayed flow, as `relay.json` names it."""
 BEGIN_LIMIT_S = 40
 """The time limit for the start of the drive; the time begins when all processes have started."""
+PERSON_BEGIN_LIMIT_S = 1800
+"""The time limit for the start of a drive by a person, who opens the page first."""
 RUN_LIMIT_S = 900
-"""The time limit for the ending of the drive; the time begins when all processes have started."""
+"""The time limit for the ending of the drive, except that of a person; the time begins when all processes have
+started."""
 UNIMPAIRED = ImpairmentConfig()
 STATUS_PERIOD_NS = 200 * NS_PER_MS
 
+OnPage = Callable[[str], None]
+"""A callback with the address of the page from which a person drives."""
 Progress = Callable[[dict[str, Any], dict[str, Any]], None]
 """A callback with the status of the server and of the client, called several times a second."""
 
@@ -100,8 +105,12 @@ def start_loop(
     return LoopProcesses(server, relay, client, router, ready)
 
 
-def drive_real(planned: PlannedRun, out: Path, *, progress: Progress | None = None) -> None:
+def drive_real(
+    planned: PlannedRun, out: Path, *, progress: Progress | None = None, on_page: OnPage | None = None
+) -> None:
     """Drive once, and write the two records into `out`, with the requests and measurements of the relay or netem.
+
+    If a person drives, `on_page` shows them the page.
 
     Raises `WorkError` if a process ends early or the drive does not begin; the records up to then stay in `out`.
     """
@@ -112,7 +121,12 @@ def drive_real(planned: PlannedRun, out: Path, *, progress: Progress | None = No
                 netem = stack.enter_context(NetemRun(planned)) if uses_netem(planned) else None
                 processes = stack.enter_context(Processes(work))
                 loop = start_loop(processes, planned, work, work, netem=netem)
-                _wait_for_ending(processes, loop, progress)
+                page = loop.client.first["ready"].get("console")
+                if page is not None and on_page is not None:
+                    on_page(page)
+                _wait_for_ending(
+                    processes, loop, progress, begin_limit_s=BEGIN_LIMIT_S if page is None else PERSON_BEGIN_LIMIT_S
+                )
                 for process in reversed(processes.started):
                     process.end()
                 if loop.relay is not None:
@@ -125,7 +139,10 @@ def drive_real(planned: PlannedRun, out: Path, *, progress: Progress | None = No
                 shutil.move(record, out / record.name)
 
 
-def _wait_for_ending(processes: Processes, loop: LoopProcesses, progress: Progress | None) -> None:
+def _wait_for_ending(
+    processes: Processes, loop: LoopProcesses, progress: Progress | None, *, begin_limit_s: float
+) -> None:
+    run_limit_s = RUN_LIMIT_S + begin_limit_s - BEGIN_LIMIT_S
     clock = MachineClock()
     start_ns = clock.now().mono_ns
     while loop.server.running and loop.server.latest.get("ending") is None:
@@ -137,7 +154,7 @@ def _wait_for_ending(processes: Processes, loop: LoopProcesses, progress: Progre
             code = ended.popen.returncode  # a negative code is the number of the signal that ended the process
             raise WorkError(f"{ended.name} ended during the run with exit code {code}: {ended.last_message()}")
         not_begun = status.get("safety") in (None, "disarmed", "arming")
-        if elapsed_s > RUN_LIMIT_S or (elapsed_s > BEGIN_LIMIT_S and not_begun):
+        if elapsed_s > run_limit_s or (elapsed_s > begin_limit_s and not_begun):
             raise WorkError(f"the drive did not begin or end within {elapsed_s:.0f} s: {loop.client.latest} {status}")
         if progress is not None:
             progress(status, loop.client.latest.get("status", {}))

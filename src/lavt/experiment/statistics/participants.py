@@ -22,11 +22,14 @@ def _known(key: str) -> Callable[[Run], float | None]:
 
 MEASURES: Mapping[str, Callable[[Run], float | None]] = {
     "p95_m": _known("p95_m"),
+    "completed": lambda run: float(run["ending"] == "completed"),
     "completed_in_own_lane": _known("completed_in_own_lane"),
     "lane_invasions_per_km": _known("lane_invasions_per_km"),
     "steering_reversals_per_km": _known("steering_reversals_per_km"),
 }
-"""The measures of a run that are compared. The first is the primary one, chosen before any study was driven."""
+"""The measures of a run that are compared. The first is the primary one, chosen before any study was driven. Others are
+left out if nobody has a value, such as that of the own lane, which needs a driver that reports the lane it follows."""
+PRIMARY = next(iter(MEASURES))
 
 
 def compare_studies(runs: Sequence[Run], answers: Sequence[Answers] = ()) -> list[dict[str, Any]]:
@@ -53,8 +56,8 @@ def _compare(runs: Sequence[Run], conditions: Sequence[str], answers: Sequence[A
         name: {person: _run_values(runs, person, conditions, measure) for person in participants}
         for name, measure in MEASURES.items()
     }
-    if any(entry["raw_tlx"] is not None for entry in answers):
-        by_measure[WORKLOAD] = {person: _workload(answers, person, conditions) for person in participants}
+    by_measure[WORKLOAD] = {person: _workload(answers, person, conditions) for person in participants}
+    by_measure = {name: rows for name, rows in by_measure.items() if name == PRIMARY or any(rows.values())}
     return {
         "conditions": list(conditions),
         "measures": {name: _compare_measure(conditions, values) for name, values in by_measure.items()},

@@ -35,9 +35,14 @@ def raw_tlx(scales: Mapping[str, int]) -> float:
     if scales.keys() != SCALES.keys():
         raise UserError(f"NASA-TLX has the scales {', '.join(SCALES)}: give each of them a number")
     for name, value in scales.items():
-        if type(value) is not int or value not in range(0, 101, STEP):
-            raise UserError(f"{name} is {value!r}: write a number from 0 to 100 in steps of {STEP}")
+        check_scale(name, value)
     return sum(scales.values()) / len(scales)
+
+
+def check_scale(name: str, value: object) -> None:
+    """Raise `UserError` unless `value` is a number from 0 to 100 in steps of 5."""
+    if type(value) is not int or value not in range(0, 101, STEP):
+        raise UserError(f"{name} is {value!r}: write a number from 0 to 100 in steps of {STEP}")
 
 
 def has_answers(out: Path, block: Block) -> bool:

@@ -1,4 +1,4 @@
-"""Drive the runs of participants by a model of a driver, and write the report of a study. A study resumes by itself."""
+"""The directory of a study: check it, drive the runs by a model of a driver, and write the report."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import yaml
 
 from lavt.config import StudyConfig
 from lavt.errors import WorkError
+from lavt.experiment.analysis.drive_data import DriveData
 from lavt.experiment.analysis.results import FAILED, write_json
 from lavt.experiment.study.answers import has_answers, read_answers, write_answers
 from lavt.experiment.study.study_plan import Block, check_order
@@ -43,30 +44,35 @@ def open_study(config: StudyConfig, blocks: Sequence[Block], out: Path) -> int:
     return sum(not is_finished(out / "runs" / run.name) for run in runs)
 
 
-def drive_study(
-    config: StudyConfig, blocks: Sequence[Block], out: Path, *, jobs: int | None, on_progress: ProgressCallback
-) -> tuple[Path, SweepResult]:
-    """Drive the runs of `blocks` that are not finished, and write the report of all runs in `out`.
+def begin_study(config: StudyConfig, out: Path) -> None:
+    """Write the config of a study into its directory; call `open_study` first."""
+    (out / "runs").mkdir(exist_ok=True)
+    (out / STUDY).write_text(yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
 
-    Call `open_study` first. The runs have no effect on each other, because a model learns nothing, so `jobs` of them
-    are driven at the same time. Returns the path of the report's page, and the results of `blocks`. Failed runs are
-    listed in `out`/failed.json and in the report.
+
+def drive_study(blocks: Sequence[Block], out: Path, *, jobs: int | None, on_progress: ProgressCallback) -> SweepResult:
+    """Drive the runs of `blocks` that are not finished by the configured controller, and return all their results.
+
+    The runs have no effect on each other, because a model learns nothing, so `jobs` of them are driven at the same
+    time. Failed runs are listed in `out`/failed.json.
     """
     runs_dir = out / "runs"
-    runs_dir.mkdir(exist_ok=True)
-    (out / STUDY).write_text(yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
     planned = [run for block in blocks for run in block.runs]
     remove_all_unfinished(planned, runs_dir)
-    result, speed = run_all(planned, runs_dir, jobs=jobs, on_progress=on_progress)
-    failed = [{"run": name, "reason": reason} for name, reason in result.failed]
-    write_json(out / FAILED, failed)
+    result, _ = run_all(planned, runs_dir, jobs=jobs, on_progress=on_progress)
+    write_json(out / FAILED, [{"run": name, "reason": reason} for name, reason in result.failed])
     if not result.results:
         raise WorkError("no run was finished: " + "; ".join(f"{name}: {reason}" for name, reason in result.failed))
     for block in blocks:
         is_over = all(is_finished(runs_dir / run.name) for run in block.runs)
         if is_over and not has_answers(out, block):
             write_answers(out, block, None, NOT_ASKED.format(driver=block.runs[0].identity["driver"]))
-    from lavt.experiment.report.report import write_report  # noqa: PLC0415 (slow, and imported during the drives)
+    return result
 
-    drives = {drive.directory: drive for drive in result.drives}
-    return write_report(out, speed=speed, drives=drives, failed=failed, answers=read_answers(out)), result
+
+def report_study(out: Path, drives: Sequence[DriveData] = ()) -> Path:
+    """Write the report of all finished runs in `out`, and return its page; `drives` has data that need not be read."""
+    from lavt.experiment.report.report import read_failed, write_report  # noqa: PLC0415 (slow: matplotlib)
+
+    by_directory = {drive.directory: drive for drive in drives}
+    return write_report(out, drives=by_directory, failed=read_failed(out), answers=read_answers(out))

@@ -56,7 +56,7 @@ def plan_participant(study: StudyConfig, participant: int) -> list[Block]:
             }
             config = parse_config(RunConfig, with_changes(base, changes), "the study")
             name = f"{_prefix(participant)}{order:03d}_{run_name(route, condition, repetition, {})}"
-            runs.append(plan_run(config, name=name))
+            runs.append(plan_run(config, name=name, is_study=True))
         blocks.append(Block(participant, number, condition, runs))
     return blocks
 
