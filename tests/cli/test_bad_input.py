@@ -63,6 +63,7 @@ BAD_RUNS = {
     "unknown route in real time": (["--set", "vehicle.route=nowhere", "--set", "time=real"], "a_key"),
     "unknown preset": (["--set", "controller.preset=magic"], "designed, paper_calibrated"),
     "unknown preset in real time": (["--set", "controller.preset=magic", "--set", "time=real"], "designed"),
+    "a person": (["--set", "controller.kind=human"], "`lavt drive`, `lavt client CONFIG --human` or `lavt study`"),
     "unknown controller": (["--set", "controller.kind=wizard"], "lane_keeper"),
     "a far point before the near one": (["--set", "controller.two_point.far_point_min_m=7"], "far_point_min_m must be"),
     "a negative reaction delay": (["--set", "controller.two_point.reaction_delay_s=-0.1"], "reaction_delay_s"),
@@ -147,6 +148,15 @@ BAD_STUDIES = {
     "no route": (["--set", "routes=[]"], "routes must be"),
     "unknown condition": (["--set", "conditions=[L0, L9]"], "'L9'"),
     "unknown road": (["--set", "routes=[nowhere]"], "'nowhere'"),
+    "a person in virtual time": (["--set", "controller.kind=human"], "time real"),
+    "a person without a number": (
+        ["--set", "controller.kind=human", "--set", "time=real", "--set", "fidelity=video"],
+        "--participant",
+    ),
+    "a person without video": (
+        ["--set", "controller.kind=human", "--set", "time=real", "--participant", "1"],
+        "fidelity geometry",
+    ),
     "a place in the study": (["--set", "study.block=2"], "leave out the section study"),
     "a sweep's key": (["--set", "axes={seed: [1]}"], "'axes'"),
 }

@@ -68,6 +68,19 @@ def test_runs_outside_a_study_are_not_compared() -> None:
     assert compare_studies([run(None, "L0", 0.5), run(None, "L5", 0.5), run("1", "L0", 0.5)]) == []
 
 
+def test_events_are_counted_per_drive() -> None:
+    """Equal numbers of events are ties, although the drives differ by some cm, so that their rates per km differ."""
+    runs = [
+        run(str(number), condition, 0.5, distance_m=distance_m, steering_reversals_per_km=3000 / distance_m)
+        for number in range(1, 8)
+        for condition, distance_m in (("L0", 120.0), ("L5", 119.9))
+    ]
+    (comparison,) = compare_studies(runs)
+    measure = comparison["measures"]["steering_reversals"]
+    assert measure["values"]["7"] == [3.0, 3.0]
+    assert (measure["friedman"]["p"], measure["pairs"][0]["p"], measure["pairs"][0]["differing"]) == (1.0, 1.0, 0)
+
+
 def test_the_workload_is_compared_if_somebody_was_asked() -> None:
     """The raw TLX is a measure if there are answers; without answers, as of a model, it is none."""
     asked = [

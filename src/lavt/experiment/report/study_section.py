@@ -26,8 +26,8 @@ TITLES = {
     "p95_m": "P95 of the cross-track error (m)",
     "completed": "share of the drives completed",
     "completed_in_own_lane": "share of the drives completed in the own lane",
-    "lane_invasions_per_km": "lane invasions per km",
-    "steering_reversals_per_km": "steering reversals per km",
+    "lane_invasions": "lane invasions per drive",
+    "steering_reversals": "steering reversals per drive",
     WORKLOAD: "workload (raw NASA-TLX, 0 to 100)",
 }
 WHY = (

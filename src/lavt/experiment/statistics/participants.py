@@ -20,15 +20,22 @@ def _known(key: str) -> Callable[[Run], float | None]:
     return lambda run: None if run.get(key) is None else float(run[key])
 
 
+def _steering_reversals(run: Run) -> float | None:
+    per_km = run.get("steering_reversals_per_km")
+    return None if per_km is None else float(round(per_km * run["distance_m"] / 1000))
+
+
 MEASURES: Mapping[str, Callable[[Run], float | None]] = {
     "p95_m": _known("p95_m"),
     "completed": lambda run: float(run["ending"] == "completed"),
     "completed_in_own_lane": _known("completed_in_own_lane"),
-    "lane_invasions_per_km": _known("lane_invasions_per_km"),
-    "steering_reversals_per_km": _known("steering_reversals_per_km"),
+    "lane_invasions": _known("lane_invasions"),
+    "steering_reversals": _steering_reversals,
 }
 """The measures of a run that are compared. The first is the primary one, chosen before any study was driven. Others are
-left out if nobody has a value, such as that of the own lane, which needs a driver that reports the lane it follows."""
+left out if nobody has a value, such as that of the own lane, which needs a driver that reports the lane it follows.
+Events are counted per drive: with rates per km, drives with equal counts would differ by a few cm of distance, and
+a test by ranks would find a difference."""
 PRIMARY = next(iter(MEASURES))
 
 
