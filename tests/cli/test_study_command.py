@@ -29,6 +29,7 @@ def test_the_whole_chain_with_a_model(run: Run, tmp_path: Path) -> None:
     before = {path: path.stat().st_mtime_ns for path in results}
     code, printed, messages = run("study", STUDY, *OPTIONS, "--out", "out", "--jobs", "1", "--json")
     assert code == 0, messages
+    assert "not balanced" not in messages
     assert {path: path.stat().st_mtime_ns for path in results} == before
 
     plan = json.loads(run("study", STUDY, *OPTIONS, "--plan", "--json").out)
@@ -60,3 +61,9 @@ def test_the_plan_is_printed(participant: str | None, run: Run, tmp_path: Path) 
     assert len(lines) == (12 if participant is None else 1)
     assert lines[0].startswith("participant 1: L")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_order_that_is_not_balanced_is_mentioned(run: Run) -> None:
+    """If the participants are no multiple of the orders, a message says so."""
+    messages = run("study", STUDY, "--plan", "--set", "participants=10").err
+    assert "10 participants are no multiple of the 4 orders" in messages

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -39,6 +39,10 @@ def study(
     opens_page: Annotated[
         bool, typer.Option("--browser/--no-browser", help="Open a person's page, if this machine has a display.")
     ] = True,
+    port: Annotated[
+        int,
+        typer.Option(min=0, max=65535, help="TCP port of a person's page, which has its calibrations; 0: any."),
+    ] = 0,
     as_json: console.JsonOption = False,
 ) -> None:
     """Drive a study: participants, balanced conditions, tests.
@@ -48,12 +52,18 @@ def study(
 
     Example: lavt study configs/study.yaml --participant 1 --out out/study
     """
+    from lavt.experiment.study.balanced_order import orders_in_set  # noqa: PLC0415 (slow: scipy)
     from lavt.experiment.study.study import begin_study, drive_study, open_study, report_study  # noqa: PLC0415 (slow)
     from lavt.experiment.study.study_plan import plan_participant  # noqa: PLC0415 (slow: scipy)
 
     settings = load_config(StudyConfig, config, changes or [])
     participants = range(1, settings.participants + 1) if participant is None else [participant]
     blocks = [block for number in participants for block in plan_participant(settings, number)]
+    if settings.participants % (orders := orders_in_set(len(settings.conditions))):
+        console.print_message(
+            f"lavt: {settings.participants} participants are no multiple of the {orders} orders of "
+            f"{len(settings.conditions)} conditions, so the order is not balanced"
+        )
     if shows_plan:
         _print_plan(blocks, as_json=as_json)
         return
@@ -64,7 +74,7 @@ def study(
     remaining = open_study(settings, blocks, out)
     begin_study(settings, out)
     if is_person:
-        _hold_session(blocks, settings.instructions, out, opens_page=opens_page)
+        _hold_session(blocks, settings.instructions, out, opens_page=opens_page, port=port)
         page, failed = report_study(out), []
     else:
         with console.interruptible(), progress(f"study, results in {out}", remaining) as report_done:
@@ -91,20 +101,21 @@ def _print_plan(blocks: Sequence[Block], *, as_json: bool) -> None:
         console.print_result(f"participant {number}: {', '.join(order)}")
 
 
-def _hold_session(blocks: Sequence[Block], instructions: str, out: Path, *, opens_page: bool) -> None:
+def _hold_session(blocks: Sequence[Block], instructions: str, out: Path, *, opens_page: bool, port: int) -> None:
     """Let a person drive, with texts and questions in the terminal."""
     from lavt.cli.drive import show_page  # noqa: PLC0415 (only if a person drives)
     from lavt.experiment.runs.plan import PlannedRun  # noqa: PLC0415 (slow: scipy)
+    from lavt.experiment.runs.real_run import PersonPage  # noqa: PLC0415 (slow: scipy)
     from lavt.experiment.runs.run import drive_once  # noqa: PLC0415 (slow: scipy)
     from lavt.experiment.study.session import Experimenter, hold_session  # noqa: PLC0415 (slow: scipy)
     from lavt.transport.console.console_link import check_installed  # noqa: PLC0415 (only if a person drives)
 
     check_installed()
     with TemporaryDirectory(prefix="lavt-") as work, console.interruptible():
+        page = PersonPage(port, lambda url: show_page(url, Path(work), opens_page=opens_page))
 
-        def drive(run: PlannedRun, directory: Path) -> str:
-            data = drive_once(run, directory, on_page=lambda url: show_page(url, Path(work), opens_page=opens_page))
-            return str(data.result["ending"])
+        def drive(run: PlannedRun, directory: Path) -> Mapping[str, Any]:
+            return drive_once(run, directory, page=page).result
 
         hold_session(blocks, instructions, out, Experimenter(console.print_message, _ask, drive))
 

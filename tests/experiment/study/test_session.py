@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -25,8 +26,8 @@ class Session:
         self.out = out
         self.texts: list[str] = []
         self.driven: list[str] = []
-        self.endings: list[str] = []
-        """How the next drives end; then all are completed."""
+        self.results: list[dict[str, Any]] = []
+        """The results of the next drives; then all are completed and valid."""
         self._answers: Iterator[str] = iter(answers)
 
     def hold(self) -> None:
@@ -40,11 +41,11 @@ class Session:
         except StopIteration:
             raise KeyboardInterrupt from None
 
-    def _drive(self, run: PlannedRun, directory: Path) -> str:
+    def _drive(self, run: PlannedRun, directory: Path) -> dict[str, Any]:
         directory.mkdir(parents=True)
         (directory / RESULT).write_text("{}")
         self.driven.append(run.name)
-        return self.endings.pop(0) if self.endings else "completed"
+        return self.results.pop(0) if self.results else {"ending": "completed", "valid": True}
 
 
 BLOCK = (ENTER, ENTER, "5", "10", "15", "20", "25", "30", " It was late. ")
@@ -87,10 +88,11 @@ def test_an_interrupted_session_continues(answered: int, driven: int, tmp_path: 
     assert len(read_answers(tmp_path)) == 2
 
 
-def test_a_stopped_drive_can_be_repeated(tmp_path: Path) -> None:
-    """A drive that a stop ended is repeated as often as requested, and each time the earlier drive is set aside."""
+@pytest.mark.parametrize(("ending", "valid"), [("safe_stop", True), ("completed", False)])
+def test_a_flawed_drive_can_be_repeated(ending: str, tmp_path: Path, *, valid: bool) -> None:
+    """A stopped or invalid drive is repeated as often as requested, and each time the earlier drive is set aside."""
     session = Session(tmp_path, ENTER, "r", ENTER, "r", ENTER, ENTER, ENTER, *BLOCK[2:], *BLOCK)
-    session.endings = ["safe_stop", "safe_stop", "safe_stop"]
+    session.results = [{"ending": ending, "valid": valid}] * 3
     session.hold()
     names = [run.name for block in session.blocks for run in block.runs]
     assert session.driven == [names[0], names[0], *names]

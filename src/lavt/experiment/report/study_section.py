@@ -39,7 +39,7 @@ WHY = (
     "model would assume normally distributed effects of persons, which so few participants cannot confirm. The tests "
     "do not model practice or fatigue; the balanced order spreads these over the conditions. “Smallest p” is what this "
     "number of participants can reach if all of them differ in the same direction, without ties. If it is above 0.05, "
-    "the test cannot show a difference."
+    "the test cannot show a difference. No correction covers several measures, so the secondary ones are exploratory."
 )
 EFFECTS = (
     "Effect sizes: Kendall's W is 0 without agreement between the participants, and 1 if all rank the conditions "

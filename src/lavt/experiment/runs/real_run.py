@@ -46,10 +46,16 @@ started."""
 UNIMPAIRED = ImpairmentConfig()
 STATUS_PERIOD_NS = 200 * NS_PER_MS
 
-OnPage = Callable[[str], None]
-"""A callback with the address of the page from which a person drives."""
 Progress = Callable[[dict[str, Any], dict[str, Any]], None]
 """A callback with the status of the server and of the client, called several times a second."""
+
+
+@dataclass(frozen=True, slots=True)
+class PersonPage:
+    """The page from which a person drives: its TCP port (0: any), and a function that shows the page at an address."""
+
+    port: int
+    show: Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,11 +81,13 @@ def start_loop(
     once: bool = True,
     server_program: Sequence[str] = LAVT,
     netem: NetemRun | None = None,
+    console_port: int = 0,
 ) -> LoopProcesses:
     """Start all processes in order; each gets the ports of the processes before it.
 
     The sides write their records into `out`. The configs of the processes are written into `work`. Without `once`, the
-    server keeps running after the first drive. `netem` is applied before the client starts.
+    server keeps running after the first drive. `netem` is applied before the client starts. `console_port` is the port
+    of the page if a person drives.
     """
     run = planned.config
     server_yaml = write_config(work, "server", server_config(run, planned.seed))
@@ -98,7 +106,9 @@ def start_loop(
     dialled = f"udp/127.0.0.1:{control_port}?rel=1;mixed_rel=1"
     zenoh = embedded_router(dialled=[dialled])
     config = client_config(run, planned.seed, zenoh=zenoh, video_port=video_port, probe_port=ready["probe_port"])
-    config = config.model_copy(update={"controller": config.controller.model_copy(update={"rearm": rearm})})
+    controller = config.controller.model_copy(update={"rearm": rearm})
+    console = config.console.model_copy(update={"port": console_port})
+    config = config.model_copy(update={"controller": controller, "console": console})
     client = processes.start("client", "client", write_config(work, "client", config), "--out", str(out / "client"))
     client.wait_ready()
     router = next(locator for locator in ready["locators"] if locator.startswith("tcp/"))
@@ -106,11 +116,11 @@ def start_loop(
 
 
 def drive_real(
-    planned: PlannedRun, out: Path, *, progress: Progress | None = None, on_page: OnPage | None = None
+    planned: PlannedRun, out: Path, *, progress: Progress | None = None, page: PersonPage | None = None
 ) -> None:
     """Drive once, and write the two records into `out`, with the requests and measurements of the relay or netem.
 
-    If a person drives, `on_page` shows them the page.
+    A drive by a person needs `page`.
 
     Raises `WorkError` if a process ends early or the drive does not begin; the records up to then stay in `out`.
     """
@@ -120,13 +130,12 @@ def drive_real(
             with ExitStack() as stack:
                 netem = stack.enter_context(NetemRun(planned)) if uses_netem(planned) else None
                 processes = stack.enter_context(Processes(work))
-                loop = start_loop(processes, planned, work, work, netem=netem)
-                page = loop.client.first["ready"].get("console")
-                if page is not None and on_page is not None:
-                    on_page(page)
-                _wait_for_ending(
-                    processes, loop, progress, begin_limit_s=BEGIN_LIMIT_S if page is None else PERSON_BEGIN_LIMIT_S
-                )
+                port = 0 if page is None else page.port
+                loop = start_loop(processes, planned, work, work, netem=netem, console_port=port)
+                if page is not None:
+                    page.show(loop.client.first["ready"]["console"])
+                begin_limit_s = BEGIN_LIMIT_S if page is None else PERSON_BEGIN_LIMIT_S
+                _wait_for_ending(processes, loop, progress, begin_limit_s=begin_limit_s)
                 for process in reversed(processes.started):
                     process.end()
                 if loop.relay is not None:

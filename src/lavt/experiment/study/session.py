@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from lavt.errors import UserError
 from lavt.experiment.runs.plan import PlannedRun
@@ -25,8 +26,8 @@ class Experimenter:
 
     say: Callable[[str], None]
     ask: Callable[[str], str]
-    drive: Callable[[PlannedRun, Path], str]
-    """Drives a run into its directory, and returns how it ended."""
+    drive: Callable[[PlannedRun, Path], Mapping[str, Any]]
+    """Drives a run into its directory, and returns its result."""
 
 
 def hold_session(blocks: Sequence[Block], instructions: str, out: Path, experimenter: Experimenter) -> None:
@@ -55,18 +56,23 @@ def hold_session(blocks: Sequence[Block], instructions: str, out: Path, experime
 
 
 def _drive(run: PlannedRun, directory: Path, title: str, experimenter: Experimenter) -> None:
-    """Drive a run; repeat it as often as the answers request, if a stop ended it."""
+    """Drive a run; if it was stopped or is not valid, repeat it as often as the answers request.
+
+    The reasons for an invalid run are not shown, because they can have the injected delays.
+    """
     question = f"{title}: press Enter to begin."
     while True:
         experimenter.ask(question)
-        ending = experimenter.drive(run, directory)
+        result = experimenter.drive(run, directory)
         experimenter.say(f"{title} has ended.")
-        if ending != STOPPED:
+        flaws = []
+        if result["ending"] == STOPPED:
+            flaws.append("It was stopped before the end of the route")
+        if not result["valid"]:
+            flaws.append("It is not valid, because this machine was too busy or a part failed")
+        if not flaws:
             return
-        answer = experimenter.ask(
-            "It was stopped before the end of the route: press Enter to keep it, or type r to repeat it."
-        )
-        if answer.strip() != "r":
+        if experimenter.ask(f"{'. '.join(flaws)}: press Enter to keep it, or type r to repeat it.").strip() != "r":
             return
         _set_aside(directory)
 
