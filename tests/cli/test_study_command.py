@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 from tests.support.command_line import Run
@@ -20,35 +21,49 @@ SMALL = ("participants=2", "conditions=[L0, L5]", "routes=[road.yaml]", "costs=c
 OPTIONS = [part for change in SMALL for part in ("--set", change)]
 
 
-def test_the_whole_chain_with_a_model(run: Run, tmp_path: Path) -> None:
-    """A participant drives all runs in order, the next call adds the others, and the report compares them."""
+def results(out: Path) -> list[dict[str, Any]]:
+    """Return the results of the finished runs in the order of their names."""
+    return [json.loads(path.read_text()) for path in sorted((out / "runs").glob("*/result.json"))]
+
+
+def test_a_participant_drives_the_planned_blocks(run: Run, tmp_path: Path) -> None:
+    """A model drives a participant's runs in the planned order; records, answers and report have their place."""
     (tmp_path / "road.yaml").write_text(ROAD)
-    code, _, messages = run("study", STUDY, *OPTIONS, "--participant", "1", "--out", "out", "--jobs", "1")
-    assert code == 0, messages
-    results = sorted((tmp_path / "out" / "runs").glob("p001_*/result.json"))
-    before = {path: path.stat().st_mtime_ns for path in results}
-    code, printed, messages = run("study", STUDY, *OPTIONS, "--out", "out", "--jobs", "1", "--json")
+    code, printed, messages = run(
+        "study", STUDY, *OPTIONS, "--participant", "1", "--out", "out", "--jobs", "1", "--json"
+    )
     assert code == 0, messages
     assert "not balanced" not in messages
-    assert {path: path.stat().st_mtime_ns for path in results} == before
-
     plan = json.loads(run("study", STUDY, *OPTIONS, "--plan", "--json").out)
-    driven = [json.loads(path.read_text()) for path in sorted((tmp_path / "out" / "runs").glob("*/result.json"))]
-    places = [(entry["participant"], entry["block"], entry["order"], entry["condition"]) for entry in driven]
-    assert places == [
-        (person, number, number, condition) for person in "12" for number, condition in enumerate(plan[person], start=1)
-    ]
-    assert {entry["driver"] for entry in driven} == {"two_point"}
+    places = [(run["participant"], run["block"], run["order"], run["condition"]) for run in results(tmp_path / "out")]
+    assert places == [("1", number, number, condition) for number, condition in enumerate(plan["1"], start=1)]
     (study,) = json.loads(printed)["studies"]
-    assert json.loads((tmp_path / "out" / "study.json").read_text()) == json.loads(printed)
-    assert study["measures"]["p95_m"]["participants"] == 2
-    assert len(list((tmp_path / "out" / "answers").iterdir())) == 4
+    assert (study["driver"], study["measures"]["p95_m"]["participants"]) == ("two_point", 1)
+    answers = [json.loads(path.read_text()) for path in sorted((tmp_path / "out" / "answers").iterdir())]
+    assert [(entry["condition"], entry["raw_tlx"]) for entry in answers] == [(name, None) for name in plan["1"]]
     page = (tmp_path / "out" / "report" / "index.html").read_text()
     assert "Comparison over the participants" in page
-    assert "they say nothing about persons" in page.lower()
+    assert "They say nothing about persons" in page
 
+
+@pytest.mark.full
+def test_a_study_adds_participants(run: Run, tmp_path: Path) -> None:
+    """The next call keeps the finished runs and adds participants, and `lavt report` writes the same comparison."""
+    (tmp_path / "road.yaml").write_text(ROAD)
+    out = tmp_path / "out"
+    assert run("study", STUDY, *OPTIONS, "--participant", "2", "--out", "out").code == 0
+    before = {path: path.stat().st_mtime_ns for path in (out / "runs").glob("p002_*/result.json")}
+    code, printed, messages = run("study", STUDY, *OPTIONS, "--out", "out", "--json")
+    assert code == 0, messages
+    assert len(before) == 2
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+    assert len(results(out)) == len(list((out / "answers").iterdir())) == 4
+    (study,) = json.loads(printed)["studies"]
+    assert study["measures"]["p95_m"]["participants"] == 2
+
+    (out / "study.json").unlink()
     assert run("report", "out").code == 0
-    assert json.loads((tmp_path / "out" / "study.json").read_text()) == json.loads(printed)
+    assert json.loads((out / "study.json").read_text()) == json.loads(printed)
     changed = [*OPTIONS, "--set", "seed=2", "--out", "out"]
     assert "another config (seed)" in run("study", STUDY, *changed).rejection()
 
