@@ -34,7 +34,7 @@ def test_the_sentence_has_n_p_its_smallest_value_and_the_effect() -> None:
     (study,) = compare_studies(runs(3))
     assert sentence("p95_m", study["measures"]["p95_m"]) == (
         "P95 of the cross-track error (m) (primary measure, 3 participants): Friedman's chi-squared 3.00, p = 0.25 "
-        "(exact; smallest p 0.25), Kendall's W = 1.00."
+        "(exact; smallest p = 0.25), Kendall's W = 1.00."
     )
 
 

@@ -79,11 +79,17 @@ def sentence(key: str, measure: Mapping[str, Any]) -> str:
     test = measure["friedman"]
     if test is None:
         return f"{begin}: no test, because nobody has a value under every condition.{end}"
-    how = "exact" if test["permutations"] is None else f"{test['permutations']} random permutations"
+    how = "exact" if test["permutations"] is None else f"from {test['permutations']:,} random permutations"
     return (
-        f"{begin}: Friedman's chi-squared {test['statistic']:.2f}, p = {format_probability(test['p'])} ({how}; "
-        f"smallest p {format_probability(test['smallest_p'])}), Kendall's W = {test['kendall_w']:.2f}.{end}"
+        f"{begin}: Friedman's chi-squared {test['statistic']:.2f}, p {_relation(test['p'])} ({how}; "
+        f"smallest p {_relation(test['smallest_p'])}), Kendall's W = {test['kendall_w']:.2f}.{end}"
     )
+
+
+def _relation(p: float) -> str:
+    """Return a p value with its relation, such as "= 0.02" or "< 0.0001"."""
+    text = format_probability(p)
+    return text if text.startswith("<") else f"= {text}"
 
 
 def condition_table(study: Mapping[str, Any]) -> TableData:
