@@ -6,10 +6,11 @@ from typing import Any
 import pytest
 import yaml
 
-from lavt.config import StudyConfig
+from lavt.config import RunConfig, StudyConfig
 from lavt.config_file import load_config, shipped
 from lavt.errors import UserError
 from lavt.experiment.runs.run import CONFIG, RESULT, config_text
+from lavt.experiment.runs.side_configs import client_config
 from lavt.experiment.study.balanced_order import order_of
 from lavt.experiment.study.study import STUDY, open_study
 from lavt.experiment.study.study_plan import Block, check_order, plan_participant
@@ -58,6 +59,13 @@ def test_unknown_participants_are_rejected(participant: int) -> None:
     """A participant whom the study does not have is rejected with the range of numbers."""
     with pytest.raises(UserError, match="from 1 to 12"):
         plan(participant)
+
+
+def test_the_page_of_a_participant_shows_no_latency() -> None:
+    """The client's config of a run in a study hides the latencies from the page; that of another run shows them."""
+    run = plan()[0].runs[0]
+    assert not client_config(run.config, run.seed).console.shows_latency
+    assert client_config(RunConfig(), 1).console.shows_latency
 
 
 def finish_first(blocks: list[Block], out: Path, config: StudyConfig) -> Path:
