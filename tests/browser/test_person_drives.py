@@ -6,9 +6,15 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
+import yaml
+from pydantic import BaseModel
 from tests.browser.chromium import Browser, Tab, running_browser, wait_until
 from tests.browser.conftest import PersonDrive, arm, drive_off, field
 
+from lavt.config import RunConfig
+from lavt.config_file import build_config
+from lavt.experiment.runs.processes import Process, Processes
+from lavt.experiment.runs.side_configs import client_config, embedded_router, server_config
 from lavt.recording.record import read_record
 
 
@@ -135,3 +141,29 @@ def test_a_second_page_watches_and_can_stop(person_drive: PersonDrive) -> None:
     second.key("Escape", down=True)
     wait_until("the stop is confirmed", lambda: field(second, "emergency_stop") == "confirmed")
     wait_until("the vehicle is in an emergency stop", lambda: field(second, "safety") == "emergency_stop")
+
+
+def test_a_person_drives_the_vehicle_of_a_server(browser: Browser, tmp_path: Path) -> None:
+    """`lavt client --human` drives a vehicle of a separate `lavt server`, which stops if the client is killed."""
+
+    def start(name: str, config: BaseModel, *options: str) -> Process:
+        path = tmp_path / f"{name}.yaml"
+        path.write_text(yaml.safe_dump(config.model_dump(mode="json")))
+        return processes.start(name, name, str(path), "--out", str(tmp_path / name), *options)
+
+    run = build_config(RunConfig, {}, ["vehicle.scenery=none", "camera.width_px=320", "camera.height_px=240"], "test")
+    with Processes(tmp_path) as processes:
+        server = start("server", server_config(run, 0))
+        ready = server.wait_ready()["ready"]
+        ports = {key: ready[key] for key in ("video_port", "probe_port")}
+        router = embedded_router(dialled=[next(each for each in ready["locators"] if each.startswith("udp/"))])
+        client = start("client", client_config(run, zenoh=router, **ports), "--human")
+        drive = PersonDrive(client, client.wait_ready()["ready"]["console"], browser, tmp_path)
+        try:
+            tab = drive.open()
+            assert field(tab, "delay") is None
+            drive_off(tab)
+            client.popen.kill()
+            wait_until("the car stops", lambda: server.latest["status"]["safety"] == "safe_stop")
+        finally:
+            drive.close()

@@ -1,10 +1,10 @@
 from __future__ import annotations
 
+import importlib
 from typing import Any
 
 import numpy as np
 import pytest
-from scipy.signal import periodogram
 
 from lavt.domain import NS_PER_MS, FloatArray
 from lavt.experiment.analysis.steering import oscillation_hz, power_spectrum, steering_metrics, steering_rate_rms_radps
@@ -50,6 +50,7 @@ def test_the_spectrum_equals_scipys() -> None:
     """The spectrum equals SciPy's periodogram with the same window, except at 0 Hz and the highest frequency."""
     angles_rad = np.random.default_rng(1).normal(size=311).cumsum()
     hertz, power = power_spectrum(angles_rad)
+    periodogram = importlib.import_module("scipy.signal").periodogram  # the import takes a second of each worker
     expected_hertz, expected_power = periodogram(
         angles_rad, 20.0, "hann", nfft=4096, detrend="linear", scaling="spectrum"
     )

@@ -63,7 +63,7 @@ def test_every_condition_is_driven_reproducibly(name: str, tmp_path: Path) -> No
 
 def test_lost_packets_are_counted_and_missing(tmp_path: Path) -> None:
     """The sender's record has the number of lost packets, and so many packets are missing in the receiver's record."""
-    drive_run(tmp_path / "run", "fidelity=pixels", "vehicle.time_limit_s=10", "network.condition=loss")
+    drive_run(tmp_path / "run", "fidelity=pixels", "vehicle.time_limit_s=5", "network.condition=loss")
     server, client = (read_record(tmp_path / f"run/{side}.mcap") for side in ("server", "client"))
     video = link_counts(tmp_path / "run/server.mcap")["link rtp"]
     control = link_counts(tmp_path / "run/client.mcap")["link control"]

@@ -191,7 +191,7 @@ print(loop.digest.hexdigest())
 
 
 def digest(out: Path, *changes: str, change: Change = lambda _: None) -> str:
-    hexadecimal: str = run(out, planned(NO_SCENERY, *changes), change=change, seconds=3).digest.hexdigest()
+    hexadecimal: str = run(out, planned(NO_SCENERY, *changes), change=change, seconds=2.2).digest.hexdigest()
     return hexadecimal
 
 
@@ -298,7 +298,7 @@ def test_a_lost_vehicle_state_stops_the_car(tmp_path: Path) -> None:
         loop.runtime.call_at(8 * NS_PER_S, lambda: setattr(loop.runtime.links["state"], "open", False))
 
     out = tmp_path / "run"
-    run(out, planned(NO_SCENERY), change=lose_the_state, seconds=60)
+    run(out, planned("fidelity=geometry"), change=lose_the_state, seconds=60)
     entry = measure(*records(out)).entry
     assert entry["ending"] == "safe_stop"
     assert entry["duration_s"] < 11

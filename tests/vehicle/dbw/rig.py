@@ -6,9 +6,11 @@ from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from lavt.assembly.dbw import load_profile
 from lavt.domain import NS_PER_MS, Actuation, VehicleEvent
@@ -30,6 +32,14 @@ COARSE_MS = 5
 @cache
 def profile(name: str) -> Profile:
     return load_profile(name, steering_sign=1)
+
+
+@cache
+def vector_file(name: str) -> dict[str, Any]:
+    """Return the frames and limits of a profile that were worked out by hand."""
+    text = (Path(__file__).parent / "vectors" / f"{name}.yaml").read_text()
+    loaded: dict[str, Any] = yaml.load(text, Loader=yaml.CSafeLoader)
+    return loaded
 
 
 @cache

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
-from tests.vehicle.dbw.rig import START_NS, profile
+from tests.vehicle.dbw.rig import START_NS, profile, vector_file
 
 from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.dbw.profile import AXES, Axis, Profile
@@ -19,9 +17,8 @@ NO_AXES: frozenset[Axis] = frozenset()
 
 
 def vectors(name: str) -> list[dict[str, Any]]:
-    text = (Path(__file__).parent / "vectors" / f"{name.partition(':')[0]}.yaml").read_text()
-    loaded: list[dict[str, Any]] = yaml.safe_load(text)["vectors"]
-    return loaded
+    found: list[dict[str, Any]] = vector_file(name.partition(":")[0])["vectors"]
+    return found
 
 
 def adapter_frame(name: str, vector: dict[str, Any]) -> CanFrame | None:

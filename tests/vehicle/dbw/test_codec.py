@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.vehicle.dbw.rig import vector_file
 
 from lavt.errors import UserError
 from lavt.vehicle.can_frame import CanFrame
@@ -31,7 +31,7 @@ GENERATION_1, GENERATION_2 = CODECS.values()
 VECTORS = [
     pytest.param(CODECS[profile], vector, id=f"{profile}: {vector['name']}")
     for profile in PROFILES
-    for vector in yaml.safe_load((Path(__file__).parent / "vectors" / f"{profile}.yaml").read_text())["vectors"]
+    for vector in vector_file(profile)["vectors"]
 ]
 
 AWKWARD = """VERSION ""

@@ -5,16 +5,15 @@ from __future__ import annotations
 import math
 from functools import partial
 from importlib.resources import files
-from pathlib import Path
 from typing import Any
 
 import cantools
 import pytest
-import yaml
 from cantools.database import EncodeError
 from cantools.database.can import Database, Message, Signal
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.vehicle.dbw.rig import vector_file
 
 from lavt.vehicle.dbw.crc8 import frame_crc8
 
@@ -28,15 +27,8 @@ def load_database(profile: str) -> Database:
     return database
 
 
-def load_vectors(profile: str) -> dict[str, Any]:
-    found: dict[str, Any] = yaml.load(
-        (Path(__file__).parent / "vectors" / f"{profile}.yaml").read_text(), Loader=yaml.CSafeLoader
-    )
-    return found
-
-
 DATABASES = {profile: load_database(profile) for profile in PROFILES}
-VECTOR_FILES = {profile: load_vectors(profile) for profile in PROFILES}
+VECTOR_FILES = {profile: vector_file(profile) for profile in PROFILES}
 
 CASES = [
     pytest.param(DATABASES[profile].get_message_by_name(vector["message"]), vector, id=f"{profile}: {vector['name']}")
