@@ -19,7 +19,7 @@ from typing import Any
 
 from lavt.config import SweepConfig
 from lavt.config_file import load_config, parse_config, shipped
-from lavt.control.drive_controller import Preset, find_preset
+from lavt.control.preset import Preset, find_preset
 from lavt.experiment.boundary.delay_margin import LateralLoop, critical_delay_s, phase_margin_rad
 from lavt.experiment.runs.plan import plan_sweep
 from lavt.experiment.sweep.sweep import run_all

@@ -31,6 +31,7 @@ from lavt.config import (
     RunConfig,
     Section,
     ServerConfig,
+    StudyConfig,
     SweepConfig,
 )
 from lavt.config.dbw import ProfileConfig
@@ -83,6 +84,7 @@ TOPS: dict[str, tuple[type[Section], str]] = {
     "a run": (RunConfig, "for `lavt run`, such as `configs/demo.yaml`"),
     "a sweep": (SweepConfig, "for `lavt sweep`, such as `configs/sweep.yaml` ([sweeps.md](sweeps.md))"),
     "a boundary search": (BoundaryConfig, "for `lavt boundary`: `configs/boundary.yaml` ([boundary.md](boundary.md))"),
+    "a study": (StudyConfig, "for `lavt study`: `configs/study.yaml` ([studies.md](studies.md))"),
     "a server": (ServerConfig, "for `lavt server`, such as `configs/server.yaml`"),
     "a client": (ClientConfig, "for `lavt client`, such as `configs/client.yaml`"),
     "a relay": (RelayConfig, "for `lavt relay`: `configs/relay.yaml`"),

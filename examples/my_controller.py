@@ -18,7 +18,8 @@ from tempfile import mkdtemp
 
 from lavt.config import RunConfig
 from lavt.config_file import load_config, shipped
-from lavt.control.drive_controller import CONTROLLERS, Preset
+from lavt.control.drive_controller import CONTROLLERS
+from lavt.control.preset import Preset
 from lavt.domain import PATH_POINTS, Decision, Lane
 from lavt.experiment.runs.plan import plan_run
 from lavt.experiment.runs.run import run_once

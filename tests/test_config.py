@@ -26,6 +26,7 @@ from lavt.config import (
     SafetyConfig,
     Section,
     ServerConfig,
+    StudyConfig,
     SweepConfig,
 )
 from lavt.config_file import condition, conditions, load_config, parse_config, parse_yaml, shipped
@@ -35,6 +36,7 @@ from lavt.safety.limits import LIMITS
 
 SCHEMAS: dict[str, type[Section]] = {
     "boundary.yaml": BoundaryConfig,
+    "study.yaml": StudyConfig,
     "client.yaml": ClientConfig,
     "client-secure.yaml": ClientConfig,
     "costs.yaml": Costs,

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from lavt.control.drive_controller import PRESETS, make_controller
+from lavt.control.drive_controller import make_controller
+from lavt.control.preset import PRESETS
 from lavt.domain import NS_PER_MS, NS_PER_S, CameraModel, Command, Now, SessionReply, SessionRequest
 from lavt.experiment.analysis.latency import frames_with_commands
 from lavt.node import Send

@@ -11,7 +11,8 @@ from benchmarks.fuzzing.target import START, NodeBench, Target, expect, payloads
 from msgspec.structs import replace
 
 from lavt.control.client_limits import CLIENT_LIMITS
-from lavt.control.drive_controller import PRESETS, make_controller
+from lavt.control.drive_controller import make_controller
+from lavt.control.preset import PRESETS
 from lavt.domain import (
     NS_PER_MS,
     NS_PER_S,

@@ -23,6 +23,7 @@ from lavt.config import (
     RunConfig,
     Section,
     ServerConfig,
+    StudyConfig,
     SweepConfig,
 )
 from lavt.errors import UserError
@@ -31,6 +32,7 @@ USES: dict[str, type[Section]] = {
     "run": RunConfig,
     "sweep": SweepConfig,
     "boundary": BoundaryConfig,
+    "study": StudyConfig,
     "server": ServerConfig,
     "client": ClientConfig,
     "relay": RelayConfig,

@@ -34,6 +34,7 @@ from lavt.config import (
     ControllerConfig,
     ServerCameraConfig,
     ServerConfig,
+    TwoPointConfig,
     VehicleConfig,
 )
 from lavt.domain import Lane, Now
@@ -158,6 +159,23 @@ def test_configured_settings_replace_those_of_the_preset() -> None:
     assert by_changed.brake > 0
     assert changed.settings == "designed, lookahead_s 2, speed_mps 5"
     assert ControllerConfig().settings == "designed"
+
+
+def test_the_configured_human_model_drives() -> None:
+    """The section `two_point` sets the model, and results list its changed settings, for this controller only."""
+    model = TwoPointConfig(far_gain=3.5, reaction_delay_s=0.0, neuromuscular_lag_s=0.0, noise_rad=0.0025)
+    changed = ControllerConfig(kind="two_point", two_point=model)
+    undelayed = TwoPointConfig(reaction_delay_s=0.0, neuromuscular_lag_s=0.0)
+    default = ControllerConfig(kind="two_point", two_point=undelayed)
+    lane = Lane(centre=(0.0, 0.0, 0.005), width_m=3.5, near_m=3.6, far_m=20.0, confidence=1.0)
+    by_changed, by_default = (build_controller(config).decide(lane, 8.0, 0) for config in (changed, default))
+
+    assert 0 < by_changed.steering_rad < by_default.steering_rad
+    assert changed.settings == (
+        "designed, two_point.far_gain 3.5, two_point.reaction_delay_s 0, two_point.neuromuscular_lag_s 0, "
+        "two_point.noise_rad 0.0025"
+    )
+    assert ControllerConfig(two_point=model).settings == "designed"
 
 
 def test_lazy_physics_advances_for_frames_and_states_only() -> None:

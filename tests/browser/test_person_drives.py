@@ -157,7 +157,7 @@ def test_a_person_drives_the_vehicle_of_a_server(browser: Browser, tmp_path: Pat
         ready = server.wait_ready()["ready"]
         ports = {key: ready[key] for key in ("video_port", "probe_port")}
         router = embedded_router(dialled=[next(each for each in ready["locators"] if each.startswith("udp/"))])
-        client = start("client", client_config(run, zenoh=router, **ports), "--human")
+        client = start("client", client_config(run, run.seed, zenoh=router, **ports), "--human")
         drive = PersonDrive(client, client.wait_ready()["ready"]["console"], browser, tmp_path)
         try:
             tab = drive.open()

@@ -27,6 +27,7 @@ from lavt.transport.zenoh_link import Router, quiet_logs
 DEMO = str(shipped("configs/demo.yaml"))
 BOUNDARY = str(shipped("configs/boundary.yaml"))
 SWEEP = str(shipped("configs/sweep.yaml"))
+STUDY = str(shipped("configs/study.yaml"))
 SERVER = str(shipped("configs/server.yaml"))
 CLIENT = str(shipped("configs/client.yaml"))
 RELAY = str(shipped("configs/relay.yaml"))
@@ -62,7 +63,10 @@ BAD_RUNS = {
     "unknown route in real time": (["--set", "vehicle.route=nowhere", "--set", "time=real"], "a_key"),
     "unknown preset": (["--set", "controller.preset=magic"], "designed, paper_calibrated"),
     "unknown preset in real time": (["--set", "controller.preset=magic", "--set", "time=real"], "designed"),
+    "a person": (["--set", "controller.kind=human"], "`lavt drive`, `lavt client CONFIG --human` or `lavt study`"),
     "unknown controller": (["--set", "controller.kind=wizard"], "lane_keeper"),
+    "a far point before the near one": (["--set", "controller.two_point.far_point_min_m=7"], "far_point_min_m must be"),
+    "a negative reaction delay": (["--set", "controller.two_point.reaction_delay_s=-0.1"], "reaction_delay_s"),
     "no pictures in real time": (["--set", "fidelity=geometry", "--set", "time=real"], "fidelity geometry"),
     "unknown fidelity": (["--set", "fidelity=sketch"], "'geometry'"),
     "unknown vehicle": (["--set", "vehicle.kind=boat"], "simulator"),
@@ -136,6 +140,36 @@ def test_bad_boundaries(case: str, run: Run, tmp_path: Path) -> None:
     assert files(tmp_path) == {}
 
 
+BAD_STUDIES = {
+    "a participant whom the study does not have": (["--participant", "13"], "from 1 to 12"),
+    "participant 0": (["--participant", "0"], "from 1 to 12"),
+    "one condition": (["--set", "conditions=[L0]"], "two conditions"),
+    "a condition twice": (["--set", "conditions=[L0, L2, L0]"], "conditions must be a list without duplicates"),
+    "no route": (["--set", "routes=[]"], "routes must be"),
+    "unknown condition": (["--set", "conditions=[L0, L9]"], "'L9'"),
+    "unknown road": (["--set", "routes=[nowhere]"], "'nowhere'"),
+    "a person in virtual time": (["--set", "controller.kind=human"], "time real"),
+    "a person without a number": (
+        ["--set", "controller.kind=human", "--set", "time=real", "--set", "fidelity=video"],
+        "--participant",
+    ),
+    "a person without video": (
+        ["--set", "controller.kind=human", "--set", "time=real", "--participant", "1"],
+        "fidelity geometry",
+    ),
+    "a place in the study": (["--set", "study.block=2"], "leave out the section study"),
+    "a sweep's key": (["--set", "axes={seed: [1]}"], "'axes'"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_STUDIES)
+def test_bad_studies(case: str, run: Run, tmp_path: Path) -> None:
+    """An invalid study is rejected in one sentence, and no directory is created."""
+    options, reason = BAD_STUDIES[case]
+    assert reason in run("study", STUDY, *options, "--out", "mine").rejection()
+    assert files(tmp_path) == {}
+
+
 def test_settings_that_the_encoder_rejects(run: Run, tmp_path: Path) -> None:
     """Settings that only the encoder can reject are rejected in one sentence, and no directory is created."""
     result = run("run", DEMO, "--set", "video.buffer_ms=0.5", "--set", "vehicle.scenery=none", "--out", "mine")
@@ -183,6 +217,7 @@ def test_netem_dry_run(run: Run) -> None:
 MISSING_FILES = {
     "run": ["run", "nothing.yaml"],
     "sweep": ["sweep", "nothing.yaml"],
+    "study": ["study", "nothing.yaml"],
     "server": ["server", "nothing.yaml"],
     "client": ["client", "nothing.yaml"],
     "software-car": ["software-car", "nothing.yaml"],
@@ -221,6 +256,7 @@ def test_config_of_another_command(command: str, run: Run) -> None:
 COMMANDS_WITH_OUT = {
     "run": ["run", DEMO, "--out"],
     "sweep": ["sweep", SWEEP, "--out"],
+    "study": ["study", STUDY, "--out"],
     "demo": ["demo", "--out"],
     "server": ["server", SERVER, "--out"],
     "client": ["client", CLIENT, "--out"],

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lavt.control.drive_controller import CONTROLLERS, PRESETS, DriveController, make_controller
+from lavt.control.drive_controller import CONTROLLERS, DriveController, make_controller
+from lavt.control.preset import PRESETS
 from lavt.domain import NS_PER_S, PATH_POINTS, Decision, Lane
 
 FRAME_NS = NS_PER_S // 30

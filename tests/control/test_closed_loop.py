@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from lavt.control.client_limits import CLIENT_LIMITS
-from lavt.control.drive_controller import PRESETS, make_controller
+from lavt.control.drive_controller import make_controller
 from lavt.control.lane_watch import LaneState, LaneWatch
+from lavt.control.preset import PRESETS
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation, CameraModel, Picture
 from lavt.perception.lane_detector import LaneDetector
 from lavt.vehicle.sim.rendering.renderer import Renderer

@@ -4,19 +4,15 @@ from importlib.metadata import EntryPoint
 import pytest
 
 from lavt.control import drive_controller
-from lavt.control.drive_controller import (
-    DESIGNED,
+from lavt.control.drive_controller import LaneKeeper, make_controller
+from lavt.control.preset import DESIGNED, PRESETS, Preset, find_preset
+from lavt.control.pure_pursuit import curvature_per_m
+from lavt.control.speed_control import (
     GENTLE_BRAKING_MPS2,
-    PRESETS,
-    LaneKeeper,
-    Preset,
     SpeedPiController,
-    find_preset,
-    make_controller,
     pedals,
     speed_for_confidence_mps,
 )
-from lavt.control.pure_pursuit import curvature_per_m
 from lavt.domain import NS_PER_S, PATH_POINTS, Decision, Lane
 from lavt.errors import UserError
 

@@ -13,6 +13,8 @@ from tests.nodes.stand_ins import MONO_NS, SMALL_CAMERA, WALL_NS, at, deliver, n
 
 from lavt.channels import CHANNELS
 from lavt.control.client_limits import CLIENT_LIMITS
+from lavt.control.drive_controller import DriveController, make_controller
+from lavt.control.preset import DESIGNED
 from lavt.domain import (
     NS_PER_MS,
     NS_PER_S,
@@ -67,16 +69,28 @@ class FakeController:
         return Decision(0.125, 0.5, 0.0, (0.0,) * 10)
 
 
+@dataclass
+class StampedController(FakeController):
+    """A fake controller that also reads stamps; it stores the stamps that it got."""
+
+    stamps_ns: list[int] = field(default_factory=list)
+
+    def note_stamp(self, stamp_ns: int) -> None:
+        """Store the stamp."""
+        self.stamps_ns.append(stamp_ns)
+
+
 class Bench:
     """A driver node, with methods that deliver the messages of the vehicle's side."""
 
-    def __init__(self, detector: LaneDetector | None = None) -> None:
+    def __init__(self, detector: LaneDetector | None = None, controller: DriveController | None = None) -> None:
+        self.controller = controller or FakeController()
         self.detector = FakeLaneDetector()
         self.session = ClientSession("alice", 1, rearm=False, start_ns=MONO_NS)
         self.node = DriverNode(
             PictureReader(VideoReceiver(Decoder(), (SMALL_CAMERA.height_px, SMALL_CAMERA.width_px))),
             detector or self.detector,
-            FakeController(),
+            self.controller,
             self.session,
             CLIENT_LIMITS,
         )
@@ -287,12 +301,14 @@ def test_the_time_of_a_restarted_server_begins_anew() -> None:
     assert command.brake < CLIENT_LIMITS.brake
 
 
+@pytest.mark.parametrize("kind", ["any", "lane_keeper", "two_point"])
 @pytest.mark.parametrize(
     ("lost_ms", "mode", "brakes"), [(480, "drive", False), (520, "drive", True), (2520, "stop", True)]
 )
-def test_without_a_lane_the_driver_brakes_and_stops(lost_ms: int, mode: str, *, brakes: bool) -> None:
-    """Without a lane the driver brakes after 0.5 s and requests a stop after 2.5 s."""
-    bench = Bench().start_driving()
+def test_without_a_lane_the_driver_brakes_and_stops(lost_ms: int, mode: str, kind: str, *, brakes: bool) -> None:
+    """Without a lane the driver brakes after 0.5 s and requests a stop after 2.5 s, with every controller."""
+    controller = None if kind == "any" else make_controller(kind, DESIGNED, 2.8448)
+    bench = Bench(controller=controller).start_driving()
     bench.detector.confidence = 0.0
     for _ in range(lost_ms // 20):
         bench.mono_ns += 20 * NS_PER_MS
@@ -300,6 +316,18 @@ def test_without_a_lane_the_driver_brakes_and_stops(lost_ms: int, mode: str, *, 
         (command,) = bench.deliver_picture()
     assert command.mode == mode
     assert (command.brake >= CLIENT_LIMITS.brake) == brakes
+
+
+def test_a_controller_that_reads_stamps_gets_the_stamp_of_each_picture() -> None:
+    """A controller with `note_stamp` gets the picture's stamp before its lane."""
+    bench = Bench(controller=StampedController()).start_driving()
+    stamps_ns = [WALL_NS + bench.mono_ns]
+    for _ in range(2):
+        bench.mono_ns += FRAME_NS
+        bench.deliver_picture()
+        stamps_ns.append(WALL_NS + bench.mono_ns)
+    assert isinstance(bench.controller, StampedController)
+    assert bench.controller.stamps_ns == stamps_ns
 
 
 def test_grey_pictures_lead_to_a_stop() -> None:

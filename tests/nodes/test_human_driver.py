@@ -33,7 +33,7 @@ DELAYS = DelayChoice((("L0", 0.0, 0.0), ("L3", 225.0, 0.0)), RelayDelay(0.0, 0.0
 class HumanBench:
     """A person's driver node with page 1, and methods that deliver what the page and the vehicle send."""
 
-    def __init__(self, delays: DelayChoice | None = None) -> None:
+    def __init__(self, delays: DelayChoice | None = None, *, shows_latency: bool = True) -> None:
         self.session = ClientSession("alice", 1, rearm=True, start_ns=MONO_NS)
         self.controls = HumanControls(wheelbase_m=2.8)
         self.node = HumanDriverNode(
@@ -42,6 +42,7 @@ class HumanBench:
             self.session,
             CLIENT_LIMITS,
             delays,
+            shows_latency=shows_latency,
         )
         self.mono_ns = 0
         self.opened = self.deliver("page_opened", None, peer=1)
@@ -371,6 +372,17 @@ def test_the_status_has_state_delays_and_round_trip() -> None:
     assert (bench.status()["bit_rate_bps"], bench.wake(NS_PER_S) and bench.status()["bit_rate_bps"]) == (8000, 0)
     assert status["conditions"] == [list(condition) for condition in DELAYS.conditions]
     assert status["delay"] == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("shows_latency", [True, False])
+def test_a_page_that_shows_no_latency_gets_none(*, shows_latency: bool) -> None:
+    """Without `shows_latency` the status has no latency, although they are known, and says so."""
+    bench = HumanBench(shows_latency=shows_latency).drive()
+    bench.mono_ns += 7 * NS_PER_MS
+    bench.state("driving", applied=1)
+    status = bench.status()
+    known = [status[name] is not None for name in ("video_ms", "round_trip_ms")]
+    assert (status["shows_latency"], known) == (shows_latency, [shows_latency] * 2)
 
 
 def test_only_the_driving_page_of_a_client_with_a_relay_changes_delays() -> None:

@@ -43,7 +43,7 @@ class Fleet:
     def start_client(self, name: str, operator: str, vehicle: str) -> Process:
         """Start a client of this vehicle."""
         router = embedded_router(dialled=[self._link])
-        config = client_config(self._run.config, zenoh=router, probe_port=self._probe_ports[vehicle])
+        config = client_config(self._run.config, self._run.seed, zenoh=router, probe_port=self._probe_ports[vehicle])
         return self._start("client", name, config.model_copy(update={"vehicle_id": vehicle, "who": operator}))
 
     def _start(self, command: str, name: str, config: BaseModel) -> Process:

@@ -69,7 +69,9 @@ class Session:
 
     def start_client(self, name: str, operator: str, *options: str) -> Process:
         run = self.planned.config
-        config = client_config(run, zenoh=ZenohConfig(router=self.client_endpoint), probe_port=self.probe_port)
+        config = client_config(
+            run, run.seed, zenoh=ZenohConfig(router=self.client_endpoint), probe_port=self.probe_port
+        )
         path = self.write(name, config.model_copy(update={"who": operator}))
         process = self.processes.start(name, "client", path, "--out", str(self.work / name), *options)
         process.wait_ready()

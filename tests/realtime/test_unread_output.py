@@ -71,7 +71,8 @@ def test_signals_end_a_client_and_a_server_whose_output_is_not_read(
         ready = first_line(server.stdout)["ready"]
         ports = {key: ready[key] for key in ("video_port", "probe_port")}
         zenoh = embedded_router(dialled=[next(locator for locator in ready["locators"] if locator.startswith("udp/"))])
-        client = stack.enter_context(start_unread("client", client_config(run.config, zenoh=zenoh, **ports), tmp_path))
+        config = client_config(run.config, run.seed, zenoh=zenoh, **ports)
+        client = stack.enter_context(start_unread("client", config, tmp_path))
         wait_until("the car drives", lambda: is_driving(tmp_path / "server" / "server.mcap"), DRIVING_WITHIN_S)
         pause(UNREAD_S * NS_PER_S)
         client.send_signal(signal.SIGTERM)

@@ -23,7 +23,7 @@ import numpy as np
 
 from lavt.config import RunConfig
 from lavt.config_file import parse_config
-from lavt.control import drive_controller
+from lavt.control import speed_control
 from lavt.domain import NS_PER_S, Now
 from lavt.experiment.runs.plan import plan_run
 from lavt.experiment.runs.virtual_run import VirtualLoop, build_loop
@@ -157,7 +157,7 @@ def full_throttle_stops(delay_ms: float, start_mps: float, duration_s: float = 5
         "safety": {"picture_age_limit_ms": 2000.0},
         "fidelity": "geometry",
     }
-    with TemporaryDirectory() as directory, patch.object(drive_controller, "pedals", lambda *_: (1.0, 0.0)):
+    with TemporaryDirectory() as directory, patch.object(speed_control, "pedals", lambda *_: (1.0, 0.0)):
         loop = build_loop(plan_run(parse_config(RunConfig, config, "the stops")), Path(directory) / "run")
         node, car = actuator_of(loop), actuator_of(loop).vehicle
         gate, watchdog = node.gate, node.gate.watchdog

@@ -47,6 +47,11 @@ class SeededEntropy:
         return self._generator.bytes(length)
 
 
+def participant_seed(seed: int, participant: int) -> int:
+    """Return the seed of all runs of one participant of a study; it has 53 bits, as `run_seed` has."""
+    return stream_key(seed, f"participant {participant}") & (2**53 - 1)
+
+
 def run_seed(seed: int, route: str, repetition: int) -> int:
     """Return the seed of one repetition on a route.
 

@@ -14,8 +14,10 @@ from lavt.assembly.security import build_cipher
 from lavt.assembly.vehicles import check_vehicle, physics_sample_times
 from lavt.config import HUMAN, ClientConfig, ControllerConfig, SafetyConfig, ServerConfig, VehicleConfig
 from lavt.control.client_limits import CLIENT_LIMITS
-from lavt.control.drive_controller import DriveController, Preset, find_preset, make_controller
+from lavt.control.drive_controller import DriveController, make_controller
 from lavt.control.human_controls import HUMAN_LIMITS, HumanControls
+from lavt.control.preset import Preset, find_preset
+from lavt.control.two_point import TWO_POINT, TwoPointDriver, TwoPointSettings
 from lavt.domain import NS_PER_MS, Now
 from lavt.errors import UserError
 from lavt.node import Node
@@ -76,13 +78,22 @@ class ClientNodes:
 def check_names(vehicle: VehicleConfig, controller: ControllerConfig) -> None:
     """Raise `UserError` for an unknown vehicle, route, controller or preset, before any work starts."""
     check_vehicle(vehicle)
-    build_controller(controller)
+    if controller.kind == HUMAN:
+        build_controls(controller)
+    else:
+        build_controller(controller)
 
 
-def build_controller(config: ControllerConfig) -> DriveController:
-    """Build the configured controller; raise `UserError` with the known names for an unknown controller or preset."""
+def build_controller(config: ControllerConfig, seed: int = 1) -> DriveController:
+    """Build the configured controller; the noise of the human model depends on `seed`.
+
+    Raises `UserError` with the known names for an unknown controller or preset.
+    """
     if config.kind == HUMAN:
         raise UserError("a person drives by `lavt drive` or `lavt client CONFIG --human` only: name another controller")
+    if config.kind == TWO_POINT:
+        model = TwoPointSettings(**config.two_point.model_dump())
+        return TwoPointDriver(_settings(config), wheelbase_m=config.wheelbase_m, settings=model, seed=seed)
     return make_controller(config.kind, _settings(config), config.wheelbase_m)
 
 
@@ -258,7 +269,7 @@ def build_client(
 def _driver(config: ClientConfig, fidelity: FidelityModel) -> Callable[[ClientSession], DriverNode]:
     """Prepare a driver node with the configured controller; return a function that builds it for a session."""
     reader, detector = PictureReader(fidelity.receiver(config)), fidelity.detector(config)
-    controller = build_controller(config.controller)
+    controller = build_controller(config.controller, config.seed)
     return lambda session: DriverNode(reader, detector, controller, session, CLIENT_LIMITS)
 
 
@@ -267,4 +278,7 @@ def _human_driver(
 ) -> Callable[[ClientSession], HumanDriverNode]:
     """Prepare the driver node of a person; return a function that builds it for a session."""
     reader, controls = PictureReader(fidelity.receiver(config)), build_controls(config.controller)
-    return lambda session: HumanDriverNode(reader, controls, session, CLIENT_LIMITS, delays)
+    shows_latency = config.console.shows_latency
+    return lambda session: HumanDriverNode(
+        reader, controls, session, CLIENT_LIMITS, delays, shows_latency=shows_latency
+    )

@@ -61,13 +61,13 @@ def drive(
             client, own_out, clock, console.print_message, relay=human_drive.relay, delays=human_drive.delays
         ) as side:
             assert side.console_url is not None  # noqa: S101 (a person drives)
-            _show_page(side.console_url, human_drive.work, opens_page=opens_page)
+            show_page(side.console_url, human_drive.work, opens_page=opens_page)
             human_drive.relay.start()
             with _fail_with_server(human_drive, side):
                 run_side(side, client.who, once=False, as_json=as_json, ready={"console": side.console_url})
 
 
-def _show_page(url: str, work: Path, *, opens_page: bool) -> None:
+def show_page(url: str, work: Path, *, opens_page: bool) -> None:
     """Print the page's address, and open the page if this machine has a display."""
     console.print_message(f"lavt: drive from {url}")
     if opens_page and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):

@@ -40,6 +40,7 @@ GROUPS = {
     "Experiment": {
         "sweep": "Drive routes under network conditions and report.",
         "boundary": "Find the maximum tolerable latency.",
+        "study": "Drive a study: participants, balanced conditions, tests.",
         "report": "Write a report of finished runs.",
         "join": "Join the records of two machines into one run.",
     },
@@ -64,7 +65,7 @@ module of a command has its name, with `_` for `-`."""
 COMMANDS = {command: summary for group in GROUPS.values() for command, summary in group.items()}
 """All commands."""
 
-ON_ANY_SYSTEM = {"demo", "run", "replay", "sweep", "boundary", "report", "join", "road", "perception"}
+ON_ANY_SYSTEM = {"demo", "run", "replay", "sweep", "boundary", "study", "report", "join", "road", "perception"}
 """The commands that do something without real time, and so on other systems than Linux."""
 
 

@@ -51,7 +51,10 @@ def report(
     make_directory(out)
     failed = [run for directory in found_runs for run in read_failed(directory)]
     base = _base_config(list(found_runs), names)
-    page = write_report(out, run_dirs=runs, base=base, sweeps=sweeps, boundaries=boundaries, failed=failed)
+    answers = _read_answers(list(found_runs), names)
+    page = write_report(
+        out, run_dirs=runs, base=base, sweeps=sweeps, boundaries=boundaries, failed=failed, answers=answers
+    )
     console.print_result(f"the report is {page}")
 
 
@@ -67,6 +70,17 @@ def _base_config(directories: Sequence[Path], names: dict[Path, str]) -> dict[st
         return None
     base = recorded_base(first)
     return {**(base or {}), "sweep": names[first]} if first in names else base
+
+
+def _read_answers(directories: Sequence[Path], names: dict[Path, str]) -> list[dict[str, Any]]:
+    """Return the answers of the participants of all studies; of several sweeps, each has the name of its sweep."""
+    from lavt.experiment.study.answers import read_answers  # noqa: PLC0415 (slow: scipy, matplotlib)
+
+    return [
+        {**entry, **({"sweep": names[directory]} if directory in names else {})}
+        for directory in directories
+        for entry in read_answers(directory)
+    ]
 
 
 def _sweep_names(directories: Sequence[Path]) -> dict[Path, str]:

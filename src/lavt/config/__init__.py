@@ -12,6 +12,7 @@ from lavt.config.camera import ClientCameraConfig as ClientCameraConfig
 from lavt.config.camera import ServerCameraConfig as ServerCameraConfig
 from lavt.config.controller import HUMAN as HUMAN
 from lavt.config.controller import ControllerConfig as ControllerConfig
+from lavt.config.controller import TwoPointConfig as TwoPointConfig
 from lavt.config.costs import Costs as Costs
 from lavt.config.dbw import DbwConfig as DbwConfig
 from lavt.config.experiment import ExperimentConfig as ExperimentConfig
@@ -127,15 +128,15 @@ class ClocksConfig(Section):
         return bound_us
 
 
-class StudyConfig(Section):
-    """The place of a run in a study with human operators; without values if a controller drives."""
+class StudyPlaceConfig(Section):
+    """The place of a run in a study; `lavt study` sets it, and other runs have no values."""
 
     participant: str | None = None
     """The participant of the study."""
     block: int | None = None
-    """The block of the study to which this run belongs."""
+    """The number of the block to which this run belongs, counted from 1; a block has one condition."""
     order: int | None = None
-    """The position of this run in the order in which the participant drove."""
+    """The position of this run in the order in which the participant drove, counted from 1."""
 
 
 class RunConfig(Section):
@@ -149,7 +150,7 @@ class RunConfig(Section):
     safety: SafetyConfig = SafetyConfig()
     record: RecordConfig = RecordConfig()
     clocks: ClocksConfig = ClocksConfig()
-    study: StudyConfig = StudyConfig()
+    study: StudyPlaceConfig = StudyPlaceConfig()
     time: Literal["real", "virtual"] = "virtual"
     """virtual: computed, waiting is skipped; real: with processes, sockets and the machine's clocks."""
     fidelity: Literal["video", "pixels", "geometry"] = "video"
@@ -208,6 +209,35 @@ class BoundaryConfig(RunConfig):
     """The search first tries delays that are this far apart."""
     within_ms: float = Field(2.0, ge=0.1, le=100)
     """The accuracy to which the search then determines each boundary, between two neighbouring delays of the grid."""
+
+
+class StudyConfig(RunConfig):
+    """A study: every participant drives all routes under all conditions, a block for each condition."""
+
+    participants: int = Field(12, ge=1, le=999)
+    """The planned number of participants. Their numbers begin with 1."""
+    conditions: tuple[str, ...] = ("L0", "L2", "L3", "L5")
+    """The network conditions; each participant drives them in an order that is balanced over the participants."""
+    routes: tuple[str, ...] = ("a_key",)
+    """The routes that are driven in each block, in this order; they replace `vehicle.route`."""
+    repetitions: int = Field(1, ge=1, le=100)
+    """How often the routes are driven in each block, each time with another start and noise."""
+    instructions: str = ""
+    """The text that a person reads in the terminal before each block."""
+
+    @model_validator(mode="after")
+    def _check_study(self) -> StudyConfig:
+        for name in ("conditions", "routes"):
+            values = getattr(self, name)
+            if len(set(values)) < len(values) or not values:
+                raise ValueError(f"{name} must be a list without duplicates: name each entry once, and at least one")
+        if len(self.conditions) < 2:
+            raise ValueError("conditions needs at least two conditions, because a study compares them: add one")
+        if self.study != StudyPlaceConfig():
+            raise ValueError("study.* is set for each run by the study itself: leave out the section study")
+        if self.controller.kind == HUMAN and self.time != "real":
+            raise ValueError("controller.kind human needs time real, because a person drives in real time: set it")
+        return self
 
 
 class ClockConfig(Section):
@@ -309,6 +339,8 @@ class ConsoleConfig(Section):
 
     port: int = Field(0, ge=0, le=65535)
     """The TCP port of the page on this machine's loopback addresses; 0: any free port."""
+    shows_latency: bool = True
+    """Whether the page shows the measured latencies; `lavt study` hides them from a participant."""
 
 
 class ClientConfig(Section):
@@ -329,6 +361,8 @@ class ClientConfig(Section):
     injection: ClientInjectionConfig = ClientInjectionConfig()
     clock: ClientClockConfig = ClientClockConfig()
     record: RecordConfig = RecordConfig()
+    seed: int = Field(1, ge=0, lt=2**63)
+    """The seed of the noise of `controller.kind` two_point."""
 
     @model_validator(mode="after")
     def _check_scouting(self) -> ClientConfig:

@@ -4,21 +4,65 @@ from __future__ import annotations
 
 from typing import Any
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from lavt.config.section import Section
 from lavt.config.vehicle import MAX_SIMULATED_MPS
+from lavt.control.two_point import TWO_POINT, TwoPointSettings
 
 HUMAN = "human"
 """The kind of controller with which a person drives."""
+
+
+_MODEL = TwoPointSettings()
+
+
+class TwoPointConfig(Section):
+    """The model of a human driver, for `controller.kind` two_point. Gains are for the angle of the steering wheel."""
+
+    far_gain: float = Field(_MODEL.far_gain, ge=0, le=100)
+    """Change of the steering wheel's angle for each change of the far point's visual angle."""
+    near_gain: float = Field(_MODEL.near_gain, ge=0, le=100)
+    """The same for the near point."""
+    near_integral_gain_per_s: float = Field(_MODEL.near_integral_gain_per_s, ge=0, le=100)
+    """Rate of the steering wheel's angle for each angle of the near point."""
+    near_angle_limit_rad: float = Field(_MODEL.near_angle_limit_rad, gt=0, le=1.5)
+    """The largest near angle for which this rate grows."""
+    near_point_m: float = Field(_MODEL.near_point_m, gt=4, le=20)
+    """Distance of the near point from the rear axle."""
+    far_point_s: float = Field(_MODEL.far_point_s, gt=0, le=10)
+    """Distance of the far point in seconds of driving. It is never beyond the lane that is seen."""
+    far_point_min_m: float = Field(_MODEL.far_point_min_m, gt=4, le=100)
+    """The smallest distance of the far point, if the lane is seen as far as this."""
+    eye_ahead_m: float = Field(_MODEL.eye_ahead_m, ge=0, le=3.5)
+    """Position of the driver's eye ahead of the rear axle; by default that of the built-in camera."""
+    steering_ratio: float = Field(_MODEL.steering_ratio, ge=1, le=40)
+    """Angle of the steering wheel for each angle of the road wheels; by default the built-in car's."""
+    reaction_delay_s: float = Field(_MODEL.reaction_delay_s, ge=0, le=2)
+    """Time from seeing a picture to the beginning of the movement that it causes."""
+    neuromuscular_lag_s: float = Field(_MODEL.neuromuscular_lag_s, ge=0, le=2)
+    """Time constant with which the arms follow."""
+    noise_rad: float = Field(_MODEL.noise_rad, ge=0, le=0.1)
+    """Standard deviation of the noise of both visual angles. The noise depends on the seed of the run."""
+
+    @model_validator(mode="after")
+    def _check_points(self) -> TwoPointConfig:
+        if self.far_point_min_m < self.near_point_m:
+            raise ValueError("far_point_min_m must be at least near_point_m: the far point is not before the near one")
+        return self
+
+    @property
+    def changes(self) -> dict[str, Any]:
+        """Settings that differ from the defaults."""
+        return {name: value for name, value in self.model_dump().items() if value != getattr(_MODEL, name)}
 
 
 class ControllerConfig(Section):
     """The controller that drives."""
 
     kind: str = "lane_keeper"
-    """lane_keeper: the built-in controller; human: a person drives from a web page (`docs/drive.md`); or the name of
-    your own (`docs/controllers.md`)."""
+    """lane_keeper: the built-in controller; two_point: a model of a human driver; human: a person drives from a web
+    page (`docs/drive.md`); or the name of your own (`docs/controllers.md`)."""
     preset: str = "designed"
     """The set of gains: designed (found by theory) or paper_calibrated (fitted to the paper, `docs/controllers.md`)."""
     lookahead_s: float | None = Field(None, ge=0.2, le=5)
@@ -30,6 +74,7 @@ class ControllerConfig(Section):
     speed_mps: float | None = Field(None, ge=1, le=MAX_SIMULATED_MPS)
     """The target speed. The vehicle allows no throttle above `safety.speed_limit_mps`, which is at most 40 km/h for a
     vehicle that is not simulated."""
+    two_point: TwoPointConfig = TwoPointConfig()
     wheelbase_m: float = Field(2.8448, gt=0.5, lt=10)
     """The wheelbase of the driven vehicle; by default the built-in car's."""
     rearm: bool = False
@@ -48,4 +93,11 @@ class ControllerConfig(Section):
     @property
     def settings(self) -> str:
         """The preset's name and the changed settings, as results show them."""
-        return ", ".join([self.preset, *(f"{name} {value:g}" for name, value in self.changes.items())])
+        changes = dict(self.changes)
+        if self.kind == TWO_POINT:
+            changes |= {f"two_point.{name}": value for name, value in self.two_point.changes.items()}
+        return ", ".join([self.preset, *(f"{name} {_format(value)}" for name, value in changes.items())])
+
+
+def _format(value: float) -> str:
+    return str(value) if isinstance(value, int) else f"{value:g}"

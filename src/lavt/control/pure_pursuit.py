@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 
+from lavt.control.lane_watch import LANE_CONFIDENCE
 from lavt.domain import PATH_POINTS, PATH_STEP_M, Lane
 
 LOOKAHEAD_RANGE_M = (4.0, 20.0)
@@ -97,6 +98,26 @@ def pursuit_path_per_m(
             next_per_m = clamp(next_per_m, limit_per_m)
         curvatures.append(next_per_m)
     return tuple(curvatures)
+
+
+class RememberedLane:
+    """The last lane detected with confidence, and the car's pose in the frame of this lane."""
+
+    def __init__(self) -> None:
+        self.lane = Lane((0.0, 0.0, 0.0), 0.0, 0.0, 0.0, 0.0)
+        self.pose = ORIGIN
+
+    def update(self, lane: Lane, driven_m: float, curvature_per_m: float) -> bool:
+        """Return whether `lane` is confident, and remember it if so.
+
+        Otherwise move the pose by dead reckoning: the car has driven `driven_m` with the commanded curvature.
+        """
+        is_confident = lane.confidence >= LANE_CONFIDENCE
+        if is_confident:
+            self.lane, self.pose = lane, ORIGIN
+        else:
+            self.pose = move_along_arc(self.pose, driven_m, curvature_per_m)
+        return is_confident
 
 
 def clamp(value: float, limit: float) -> float:

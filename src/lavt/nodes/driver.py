@@ -11,7 +11,7 @@ from typing import Protocol
 from msgspec import Struct
 
 from lavt.control.client_limits import ClientLimits
-from lavt.control.drive_controller import DriveController
+from lavt.control.drive_controller import DriveController, StampReader
 from lavt.control.lane_watch import LaneState, LaneWatch
 from lavt.domain import Decision, FramePayload, Lane, Mode, Now
 from lavt.node import Message, Send, Stage
@@ -61,6 +61,7 @@ class DriverNode(Commander):
         self._reader = reader
         self._detector = detector
         self._controller = controller
+        self._stamp_reader = controller if isinstance(controller, StampReader) else None
         self._lane_watch = LaneWatch()
         self._detected_stamp_ns = 0
         self._decision: Decision | None = None
@@ -90,6 +91,8 @@ class DriverNode(Commander):
 
     def _decide(self, perceived: PerceivedFrame, now: Now) -> PerceivedFrame:
         self._lane_state = self._lane_watch.check(perceived.lane.confidence, now.mono_ns)
+        if self._stamp_reader is not None:
+            self._stamp_reader.note_stamp(perceived.stamp_ns)
         self._decision = self._controller.decide(perceived.lane, self._speed_mps, now.mono_ns)
         self._view, self._view_ns = perceived.view, now.mono_ns
         return perceived

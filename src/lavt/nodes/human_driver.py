@@ -64,7 +64,8 @@ IDLE_COMMAND_NS: Final = 100 * NS_PER_MS
 class HumanDriverNode(Commander):
     """The node that drives by the inputs of a person, from one page at a time; other pages watch.
 
-    `delays` are those that the person can choose; None: this client cannot change the delays.
+    `delays` are those that the person can choose; None: this client cannot change the delays. Without `shows_latency`,
+    the pages show no latencies.
     """
 
     def __init__(
@@ -74,10 +75,13 @@ class HumanDriverNode(Commander):
         session: ClientSession,
         limits: ClientLimits,
         delays: DelayChoice | None = None,
+        *,
+        shows_latency: bool = True,
     ) -> None:
         super().__init__(session, limits)
         self._reader = reader
         self._controls = controls
+        self._shows_latency = shows_latency
         self._conditions = () if delays is None else delays.conditions
         self._delay = None if delays is None else delays.initial
         self._pages: dict[Peer, PageVideo] = {}
@@ -356,7 +360,7 @@ class HumanDriverNode(Commander):
 
     def _status(self, page: Peer, now: Now) -> PageStatus:
         state, session, view = self._newest_state, self.session, self._view
-        last = self._last
+        last, shows = self._last, self._shows_latency
         is_current = last is not None and now.mono_ns - last[0] < IDLE_COMMAND_NS
         vehicle: dict[str, Any] = {
             name: getattr(state, name, "")
@@ -377,8 +381,9 @@ class HumanDriverNode(Commander):
             state_age_ms=None if state is None else (now.mono_ns - self._state_ns) / NS_PER_MS,
             emergency_stop=stop,  # type: ignore[arg-type]
             command=(last[1].steering_rad, last[1].throttle, last[1].brake) if last and is_current else None,
-            video_ms=None if view is None else (view.read_wall_ns - view.stamp_ns) / NS_PER_MS,
-            round_trip_ms=None if self._round_trip_ns is None else self._round_trip_ns / NS_PER_MS,
+            shows_latency=shows,
+            video_ms=None if view is None or not shows else (view.read_wall_ns - view.stamp_ns) / NS_PER_MS,
+            round_trip_ms=None if self._round_trip_ns is None or not shows else self._round_trip_ns / NS_PER_MS,
             bit_rate_bps=self._bit_rate_bps(now),
             delay=None if self._delay is None else (self._delay.video_ms, self._delay.control_ms),
             conditions=self._conditions,

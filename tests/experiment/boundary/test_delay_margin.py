@@ -6,7 +6,7 @@ import pytest
 
 from lavt.config import RunConfig
 from lavt.config_file import load_config, shipped
-from lavt.control.drive_controller import PRESETS
+from lavt.control.preset import PRESETS
 from lavt.experiment.boundary.delay_margin import (
     DELAY_PER_LOOKAHEAD,
     LateralLoop,

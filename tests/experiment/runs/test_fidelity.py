@@ -6,12 +6,15 @@ from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 
+from lavt.assembly import nodes
 from lavt.assembly.fidelity import FIDELITIES
 from lavt.config import RunConfig
 from lavt.config_file import load_config, shipped
+from lavt.control.two_point import TwoPointDriver
 from lavt.domain import NS_PER_S
 from lavt.errors import UserError
 from lavt.experiment.report.tables import FIDELITY_DESCRIPTIONS
@@ -77,6 +80,27 @@ def test_the_digest_is_reproducible_without_video(fidelity: str, tmp_path: Path)
         drive(loop, limit_ns=3 * NS_PER_S)
         digests.append(loop.digest.hexdigest())
     assert digests[0] == digests[1] != digests[2]
+
+
+def test_a_run_of_the_human_model_is_reproducible(tmp_path: Path) -> None:
+    """Equal runs of the human model with noise have equal digests, and the noise changes the digest."""
+    digests = []
+    for number, noise_rad in enumerate((0.002, 0.002, 0.0)):
+        changes = ("controller.kind=two_point", f"controller.two_point.noise_rad={noise_rad}")
+        loop = build_loop(planned("fidelity=geometry", *changes), tmp_path / str(number))
+        drive(loop, limit_ns=6 * NS_PER_S)
+        digests.append(loop.digest.hexdigest())
+    assert digests[0] == digests[1] != digests[2]
+
+
+def test_each_repetition_has_its_own_noise(tmp_path: Path) -> None:
+    """The noise of the human model has the seed of the run, which differs between repetitions."""
+    runs = [planned("controller.kind=two_point", "fidelity=geometry", f"repetition={number}") for number in (0, 1)]
+    with patch.object(nodes, "TwoPointDriver", wraps=TwoPointDriver) as make:
+        for run in runs:
+            drive(build_loop(run, tmp_path / str(run.config.repetition)), limit_ns=NS_PER_S)
+    assert [call.kwargs["seed"] for call in make.call_args_list] == [run.seed for run in runs]
+    assert runs[0].seed != runs[1].seed
 
 
 @pytest.mark.parametrize("fidelity", ["pixels", "geometry"])

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from lavt.config import RunConfig, StudyConfig, SweepConfig
+from lavt.config import RunConfig, StudyPlaceConfig, SweepConfig
 from lavt.config_file import parse_config
 from lavt.errors import UserError
 from lavt.experiment.analysis.results import IDENTITY_KEYS
@@ -169,5 +169,5 @@ def test_identity_has_every_key(time: str) -> None:
 
 def test_identity_without_a_study() -> None:
     """Without a study, the keys of the study are null."""
-    identity = plan_run(RunConfig(study=StudyConfig())).identity
+    identity = plan_run(RunConfig(study=StudyPlaceConfig())).identity
     assert (identity["participant"], identity["block"], identity["order"]) == (None, None, None)

@@ -29,7 +29,7 @@ from scipy.linalg import expm
 
 from lavt.assembly.simulators import car_of
 from lavt.config import RunConfig
-from lavt.control.drive_controller import find_preset
+from lavt.control.preset import find_preset
 from lavt.control.pure_pursuit import lookahead_m
 from lavt.domain import FloatArray
 from lavt.perception.lane_detector import SMOOTHING
@@ -120,7 +120,7 @@ def _advance(a: FloatArray, b: FloatArray, duration_s: float) -> tuple[FloatArra
 
 
 @dataclass(frozen=True, slots=True)
-class _SampledPlant:
+class SampledPlant:
     """The plant, sampled once per frame; x is its state, u a command.
 
     x[k + 1] = transition x[k] + previous_input u[k - delay_frames - 1] + new_input u[k - delay_frames]
@@ -133,7 +133,8 @@ class _SampledPlant:
     """The whole frame periods in the total delay."""
 
 
-def _sampled(loop: LateralLoop, total_delay_s: float) -> _SampledPlant:
+def sampled_plant(loop: LateralLoop, total_delay_s: float) -> SampledPlant:
+    """Return the plant, sampled once per frame, with a total delay between exposure and wheel command."""
     a, b = plant(loop)
     period_s = 1 / loop.frame_rate_hz
     total_delay_s += loop.car.steering_dead_time_s
@@ -143,7 +144,7 @@ def _sampled(loop: LateralLoop, total_delay_s: float) -> _SampledPlant:
     _, input_until_change = _advance(a, b, fraction_s)
     transition_after_change, new_input = _advance(a, b, period_s - fraction_s)
     previous_input = transition_after_change @ input_until_change
-    return _SampledPlant(transition, previous_input, new_input, delay_frames)
+    return SampledPlant(transition, previous_input, new_input, delay_frames)
 
 
 def closed_loop(loop: LateralLoop, total_delay_s: float) -> FloatArray:
@@ -153,7 +154,7 @@ def closed_loop(loop: LateralLoop, total_delay_s: float) -> FloatArray:
     newest of these commands is also the state of the moving average: because the command is a linear function of the
     lane, the average of the commands is the command for the average of the lanes.
     """
-    sampled = _sampled(loop, total_delay_s)
+    sampled = sampled_plant(loop, total_delay_s)
     size, past = 5, sampled.delay_frames + 1
     command = np.zeros(size + past)  # u[k] is this row times the column (x[k], u[k - 1], ..)
     command[2:4] = loop.smoothing * loop.gain
@@ -177,19 +178,24 @@ def spectral_radius(loop: LateralLoop, total_delay_s: float) -> float:
 
 def critical_delay_s(loop: LateralLoop) -> float:
     """Return the delay margin: the smallest total delay in seconds at which `loop` is unstable; over 3 s, infinity."""
+    return smallest_unstable_s(lambda delay_s: spectral_radius(loop, delay_s))
+
+
+def smallest_unstable_s(radius: Callable[[float], float]) -> float:
+    """Return the smallest delay in seconds at which the spectral radius is 1 or more; over 3 s, infinity."""
     for number in range(int(_LONGEST_DELAY_S / _SEARCH_STEP_S)):
-        if spectral_radius(loop, number * _SEARCH_STEP_S) >= 1:
+        if radius(number * _SEARCH_STEP_S) >= 1:
             if number == 0:
                 return 0.0
             return _crossing(
-                lambda delay_s: spectral_radius(loop, delay_s) - 1,
+                lambda delay_s: radius(delay_s) - 1,
                 low=(number - 1) * _SEARCH_STEP_S,
                 high=number * _SEARCH_STEP_S,
             )
     return math.inf
 
 
-def _response(loop: LateralLoop, sampled: _SampledPlant, frequencies_radps: FloatArray) -> ComplexArray:
+def _response(loop: LateralLoop, sampled: SampledPlant, frequencies_radps: FloatArray) -> ComplexArray:
     """Return the response of the loop, opened at the controller's output, at each frequency."""
     z = np.exp(1j * frequencies_radps / loop.frame_rate_hz)[:, np.newaxis]
     delay = sampled.delay_frames
@@ -205,7 +211,7 @@ def phase_margin_rad(loop: LateralLoop, total_delay_s: float) -> float:
 
     The margin is negative if the loop is unstable, and infinite if the gain never reaches 1.
     """
-    sampled = _sampled(loop, total_delay_s)
+    sampled = sampled_plant(loop, total_delay_s)
     frequencies = np.geomspace(0.05, math.pi * loop.frame_rate_hz * 0.999, 200)
     responses = _response(loop, sampled, frequencies)
     large = np.flatnonzero(np.abs(responses) > 1)

@@ -46,8 +46,12 @@ from lavt.experiment.report.sections import (
     survival_parts,
     validity_parts,
 )
+from lavt.experiment.report.study_section import study_parts
+from lavt.experiment.statistics.participants import SCHEMA, compare_studies
 from lavt.experiment.statistics.summary import summarize
 
+STUDY = "study.json"
+"""The file with the comparisons over the participants of studies."""
 TITLE = "LAVT: driving performance over network latency"
 
 
@@ -61,6 +65,7 @@ def write_report(
     sweeps: Mapping[Path, str] | None = None,
     boundaries: Sequence[Mapping[str, Any]] = (),
     failed: Sequence[Mapping[str, str]] = (),
+    answers: Sequence[Mapping[str, Any]] = (),
 ) -> Path:
     """Write `summary.json` and `report/` into `sweep_dir`, and return the page's path.
 
@@ -68,6 +73,7 @@ def write_report(
     `summary.summarize`. `speed` defaults to the value in the existing summary. `drives` has the data of drives that
     were already read, by run directory. If the runs are from several sweeps, `sweeps` has the name of the sweep of each
     run directory. `boundaries` are the contents of `boundary.json` files. `failed` are the failed runs, as in `FAILED`.
+    `answers` are those of the participants of a study. If the runs have participants, `study.json` is written, too.
     The page lists as left out: the failed runs, and the runs without a readable result. Raises `WorkError` if no run
     has a result.
     """
@@ -83,23 +89,30 @@ def write_report(
         speed = read_json(summary_path).get("speed")
     summary = summarize([result for _, result in results], speed, base=base, failed=left_out)
     write_json(summary_path, summary)
+    studies = compare_studies(summary["runs"], answers)
+    if any(run.get("participant") is not None for run in summary["runs"]):
+        write_json(sweep_dir / STUDY, {"schema": SCHEMA, "studies": studies})
     report_dir = sweep_dir / "report"
     report_dir.mkdir(parents=True, exist_ok=True)
     report = ReportContext(summary, report_dir, condition_colours(str(run["condition"]) for run in summary["runs"]))
     sets = read_drives(drawn_runs(report, results), drives or {})
     with mpl.rc_context(SETTINGS):
         first = first_parts(report, replay_parts(report, sets), setting_text(report, sets))
-        chapters = _chapters(report, sets, boundaries)
+        chapters = _chapters(report, sets, boundaries, studies)
     index = report_dir / "index.html"
     index.write_text(html_page.page(TITLE, first, chapters), encoding="utf-8")
     return index
 
 
 def _chapters(
-    report: ReportContext, sets: DriveSets, boundaries: Sequence[Mapping[str, Any]]
+    report: ReportContext,
+    sets: DriveSets,
+    boundaries: Sequence[Mapping[str, Any]],
+    studies: Sequence[Mapping[str, Any]],
 ) -> list[html_page.Chapter]:
     """Return the page's chapters in their order; those of results and trajectories are open."""
     results = [
+        ("Comparison over the participants", study_parts(studies, report.directory)),
         ("Conditions", conditions_parts(report)),
         ("Driving performance over latency", degradation_parts(report)),
         ("Distance driven and endings", survival_parts(report)),

@@ -140,6 +140,7 @@ def start_human_drive(config: RunConfig, out: Path | None, clock: Clock) -> Iter
             dialled = f"udp/{LOOPBACK}:{relay.ports['control']}?rel=1;mixed_rel=1"
             client = client_config(
                 config,
+                config.seed,
                 zenoh=embedded_router(listen=[f"tcp/{LOOPBACK}:0"], dialled=[dialled]),
                 video_port=relay.ports["video"],
                 probe_port=ready["probe_port"],

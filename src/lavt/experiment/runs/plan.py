@@ -13,7 +13,7 @@ from lavt.assembly.entropy import run_seed
 from lavt.assembly.injection import NO_CONDITION, netem_flows
 from lavt.assembly.links import link_injection
 from lavt.assembly.nodes import check_names
-from lavt.config import Condition, RunConfig, SweepConfig
+from lavt.config import HUMAN, Condition, RunConfig, SweepConfig
 from lavt.config_file import condition, parse_config
 from lavt.errors import UserError
 from lavt.operating_system import require_real_time
@@ -39,8 +39,18 @@ class PlannedRun:
     """The requested network condition."""
 
 
-def plan_run(config: RunConfig, *, name: str = "run", axes: Mapping[str, Any] | None = None) -> PlannedRun:
-    """Plan one run; raise `UserError` for a condition, route, vehicle, controller or preset that does not exist."""
+def plan_run(
+    config: RunConfig, *, name: str = "run", axes: Mapping[str, Any] | None = None, is_study: bool = False
+) -> PlannedRun:
+    """Plan one run; only in a study (`is_study`) can a person drive it.
+
+    Raises `UserError` for a condition, route, vehicle, controller or preset that does not exist.
+    """
+    if config.controller.kind == HUMAN and not is_study:
+        raise UserError(
+            "a person drives by `lavt drive`, `lavt client CONFIG --human` or `lavt study` only: name another "
+            "controller"
+        )
     requested = config.network.requested(condition(config.network.condition))
     check_names(config.vehicle, config.controller)
     _check_injection(config, requested)
@@ -125,8 +135,8 @@ def plan_sweep(sweep: SweepConfig) -> list[PlannedRun]:
         keys = itertools.product(sweep.routes, sweep.conditions, range(sweep.repetitions))
         for route, condition_name, repetition in keys:
             changes = {"vehicle.route": route, "network.condition": condition_name, "repetition": repetition, **axes}
-            config = parse_config(RunConfig, _with_changes(base, changes), "the sweep")
-            runs.append(plan_run(config, name=_run_name(route, condition_name, repetition, axes), axes=axes))
+            config = parse_config(RunConfig, with_changes(base, changes), "the sweep")
+            runs.append(plan_run(config, name=run_name(route, condition_name, repetition, axes), axes=axes))
     if not runs:
         raise UserError("the sweep has no run: give routes, conditions and axes at least one value each")
     duplicates = [name for name, count in Counter(run.name for run in runs).items() if count > 1]
@@ -135,12 +145,13 @@ def plan_sweep(sweep: SweepConfig) -> list[PlannedRun]:
     return runs
 
 
-def _run_name(route: str, condition_name: str, repetition: int, axes: Mapping[str, Any]) -> str:
+def run_name(route: str, condition_name: str, repetition: int, axes: Mapping[str, Any]) -> str:
+    """Return the name of a run, which is also the name of its directory."""
     parts = [route, condition_name, f"{repetition:02d}", *(f"{key}={value}" for key, value in axes.items())]
     return "_".join(re.sub("[^A-Za-z0-9=._-]", "-", part) for part in parts)
 
 
-def _with_changes(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+def with_changes(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """Return a copy of `base` with `changes`, by dotted keys; raise `UserError` for a missing section."""
     result = dict(base)
     for key, value in changes.items():

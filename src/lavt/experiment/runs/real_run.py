@@ -38,13 +38,24 @@ DELAYED_DIRECTIONS = {"video": "video downstream", "control": "control upstream"
 """The delayed direction of each relayed flow, as `relay.json` names it."""
 BEGIN_LIMIT_S = 40
 """The time limit for the start of the drive; the time begins when all processes have started."""
+PERSON_BEGIN_LIMIT_S = 1800
+"""The time limit for the start of a drive by a person, who opens the page first."""
 RUN_LIMIT_S = 900
-"""The time limit for the ending of the drive; the time begins when all processes have started."""
+"""The time limit for the ending of the drive, except that of a person; the time begins when all processes have
+started."""
 UNIMPAIRED = ImpairmentConfig()
 STATUS_PERIOD_NS = 200 * NS_PER_MS
 
 Progress = Callable[[dict[str, Any], dict[str, Any]], None]
 """A callback with the status of the server and of the client, called several times a second."""
+
+
+@dataclass(frozen=True, slots=True)
+class PersonPage:
+    """The page from which a person drives: its TCP port (0: any), and a function that shows the page at an address."""
+
+    port: int
+    show: Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,11 +81,13 @@ def start_loop(
     once: bool = True,
     server_program: Sequence[str] = LAVT,
     netem: NetemRun | None = None,
+    console_port: int = 0,
 ) -> LoopProcesses:
     """Start all processes in order; each gets the ports of the processes before it.
 
     The sides write their records into `out`. The configs of the processes are written into `work`. Without `once`, the
-    server keeps running after the first drive. `netem` is applied before the client starts.
+    server keeps running after the first drive. `netem` is applied before the client starts. `console_port` is the port
+    of the page if a person drives.
     """
     run = planned.config
     server_yaml = write_config(work, "server", server_config(run, planned.seed))
@@ -92,16 +105,22 @@ def start_loop(
         netem.apply(video_port=video_port, control_port=control_port)
     dialled = f"udp/127.0.0.1:{control_port}?rel=1;mixed_rel=1"
     zenoh = embedded_router(dialled=[dialled])
-    config = client_config(run, zenoh=zenoh, video_port=video_port, probe_port=ready["probe_port"])
-    config = config.model_copy(update={"controller": config.controller.model_copy(update={"rearm": rearm})})
+    config = client_config(run, planned.seed, zenoh=zenoh, video_port=video_port, probe_port=ready["probe_port"])
+    controller = config.controller.model_copy(update={"rearm": rearm})
+    console = config.console.model_copy(update={"port": console_port})
+    config = config.model_copy(update={"controller": controller, "console": console})
     client = processes.start("client", "client", write_config(work, "client", config), "--out", str(out / "client"))
     client.wait_ready()
     router = next(locator for locator in ready["locators"] if locator.startswith("tcp/"))
     return LoopProcesses(server, relay, client, router, ready)
 
 
-def drive_real(planned: PlannedRun, out: Path, *, progress: Progress | None = None) -> None:
+def drive_real(
+    planned: PlannedRun, out: Path, *, progress: Progress | None = None, page: PersonPage | None = None
+) -> None:
     """Drive once, and write the two records into `out`, with the requests and measurements of the relay or netem.
+
+    A drive by a person needs `page`.
 
     Raises `WorkError` if a process ends early or the drive does not begin; the records up to then stay in `out`.
     """
@@ -111,8 +130,12 @@ def drive_real(planned: PlannedRun, out: Path, *, progress: Progress | None = No
             with ExitStack() as stack:
                 netem = stack.enter_context(NetemRun(planned)) if uses_netem(planned) else None
                 processes = stack.enter_context(Processes(work))
-                loop = start_loop(processes, planned, work, work, netem=netem)
-                _wait_for_ending(processes, loop, progress)
+                port = 0 if page is None else page.port
+                loop = start_loop(processes, planned, work, work, netem=netem, console_port=port)
+                if page is not None:
+                    page.show(loop.client.first["ready"]["console"])
+                begin_limit_s = BEGIN_LIMIT_S if page is None else PERSON_BEGIN_LIMIT_S
+                _wait_for_ending(processes, loop, progress, begin_limit_s=begin_limit_s)
                 for process in reversed(processes.started):
                     process.end()
                 if loop.relay is not None:
@@ -125,7 +148,10 @@ def drive_real(planned: PlannedRun, out: Path, *, progress: Progress | None = No
                 shutil.move(record, out / record.name)
 
 
-def _wait_for_ending(processes: Processes, loop: LoopProcesses, progress: Progress | None) -> None:
+def _wait_for_ending(
+    processes: Processes, loop: LoopProcesses, progress: Progress | None, *, begin_limit_s: float
+) -> None:
+    run_limit_s = RUN_LIMIT_S + begin_limit_s - BEGIN_LIMIT_S
     clock = MachineClock()
     start_ns = clock.now().mono_ns
     while loop.server.running and loop.server.latest.get("ending") is None:
@@ -137,7 +163,7 @@ def _wait_for_ending(processes: Processes, loop: LoopProcesses, progress: Progre
             code = ended.popen.returncode  # a negative code is the number of the signal that ended the process
             raise WorkError(f"{ended.name} ended during the run with exit code {code}: {ended.last_message()}")
         not_begun = status.get("safety") in (None, "disarmed", "arming")
-        if elapsed_s > RUN_LIMIT_S or (elapsed_s > BEGIN_LIMIT_S and not_begun):
+        if elapsed_s > run_limit_s or (elapsed_s > begin_limit_s and not_begun):
             raise WorkError(f"the drive did not begin or end within {elapsed_s:.0f} s: {loop.client.latest} {status}")
         if progress is not None:
             progress(status, loop.client.latest.get("status", {}))

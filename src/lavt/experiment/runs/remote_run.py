@@ -216,7 +216,7 @@ def _start_client(
         ports = _wait_ready(relay, keep_alive)["ports"]
         host, endpoint = "127.0.0.1", with_address(endpoint, f"127.0.0.1:{ports['control']}")
         video_port = ports["video"]
-    local = client_config(planned.config, zenoh=dialling(config, endpoint), video_port=video_port)
+    local = client_config(planned.config, planned.seed, zenoh=dialling(config, endpoint), video_port=video_port)
     local = local.model_copy(
         update={
             "vehicle_id": config.vehicle_id,

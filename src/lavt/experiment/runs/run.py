@@ -16,7 +16,14 @@ from lavt.experiment.analysis.invalid_reason import InvalidReason, MeasuredCheck
 from lavt.experiment.analysis.results import read_json, run_result, write_json
 from lavt.experiment.runs.netem_run import NETEM, netem_invalid_reasons
 from lavt.experiment.runs.plan import PlannedRun
-from lavt.experiment.runs.real_run import RELAY, Progress, drive_real, relay_checks, relay_invalid_reasons
+from lavt.experiment.runs.real_run import (
+    RELAY,
+    PersonPage,
+    Progress,
+    drive_real,
+    relay_checks,
+    relay_invalid_reasons,
+)
 from lavt.experiment.runs.virtual_run import build_loop, drive, free_finished_loops
 from lavt.recording.output_directory import check_directory, prepare_directory
 from lavt.recording.record import evaluating, read_record
@@ -32,8 +39,13 @@ def run_once(planned: PlannedRun, out: Path, *, progress: Progress | None = None
     return dict(drive_once(planned, out, progress=progress).result)
 
 
-def drive_once(planned: PlannedRun, out: Path, *, progress: Progress | None = None) -> DriveData:
-    """Drive as `run_once` does, and return the result with the data that figures need."""
+def drive_once(
+    planned: PlannedRun, out: Path, *, progress: Progress | None = None, page: PersonPage | None = None
+) -> DriveData:
+    """Drive as `run_once` does, and return the result with the data that figures need.
+
+    A drive by a person needs `page`.
+    """
     cv2.setNumThreads(1)  # more threads would change the order of summation, and runs would not be reproducible
     check_directory(out)
     digest = None
@@ -50,7 +62,7 @@ def drive_once(planned: PlannedRun, out: Path, *, progress: Progress | None = No
     else:
         prepare_directory(out)
         _write_config(planned, out)
-        drive_real(planned, out, progress=progress)
+        drive_real(planned, out, progress=progress, page=page)
     return _compute(out, planned.identity, digest)
 
 

@@ -10,6 +10,7 @@ from lavt.config import (
     ClientConfig,
     ClientVideoConfig,
     ClockConfig,
+    ConsoleConfig,
     RunConfig,
     ServerCameraConfig,
     ServerConfig,
@@ -47,17 +48,23 @@ def server_config(run: RunConfig, seed: int, *, zenoh: ZenohConfig | None = None
 
 def client_config(
     run: RunConfig,
+    seed: int,
     *,
     zenoh: ZenohConfig | None = None,
     video_port: int = 0,
     probe_port: int = probe.DEFAULT_PORT,
 ) -> ClientConfig:
-    """Return the client's config of a run; without `zenoh`, the default router."""
+    """Return the client's config of a run; without `zenoh`, the default router.
+
+    In a study, the page of a person shows no latencies, because the participant must not know the condition.
+    """
     return ClientConfig(
         controller=run.controller,
+        console=ConsoleConfig(shows_latency=run.study.participant is None),
         camera=ClientCameraConfig(**run.camera.model_dump()),
         video=ClientVideoConfig(port=video_port, reorder_hold_ms=run.video.reorder_hold_ms),
         zenoh=zenoh or ZenohConfig(),
         clock=ClientClockConfig(probe_port=probe_port),
         record=run.record,
+        seed=seed,
     )

@@ -114,7 +114,7 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
         lazy_physics=True,
     )
     client = build_client(
-        client_config(config), lambda: client_clock.now_at(0), SeededEntropy(seed, "client"), fidelity=fidelity
+        client_config(config, seed), lambda: client_clock.now_at(0), SeededEntropy(seed, "client"), fidelity=fidelity
     )
     make_directory(out)
     digest = hashlib.sha256()

@@ -122,7 +122,7 @@ class _SweepProgress:
                     self.take(planned, drive)
         except KeyboardInterrupt:
             workers.stop()
-            _remove_unfinished(todo, self.runs_dir)  # the files of remote runs can be incomplete
+            remove_all_unfinished(todo, self.runs_dir)  # the files of remote runs can be incomplete
             raise
         return broken
 
@@ -163,14 +163,13 @@ def drive_sweep(
     `planned` are the runs of `config`; `cluster_address` and `server` are passed to `run_all`. Returns the path of the
     report's page, and the results. Failed runs are listed in `out`/failed.json, in the summary and in the report.
     """
-    _check_sweep(config, out)
+    check_recorded_config(config, out / SWEEP)
     runs_dir = out / "runs"
     runs_dir.mkdir(exist_ok=True)
     for run in planned:
-        if is_finished(runs_dir / run.name):
-            _check_config(run, runs_dir / run.name)
+        check_run_config(run, runs_dir / run.name)
     (out / SWEEP).write_text(yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
-    _remove_unfinished(planned, runs_dir)
+    remove_all_unfinished(planned, runs_dir)
     sweep_result, speed = run_all(
         planned, runs_dir, jobs=jobs, on_progress=on_progress, cluster_address=cluster_address, server=server
     )
@@ -211,25 +210,26 @@ def _value_at(config: RunConfig, key: str) -> Any:
     return functools.reduce(lambda section, name: section[name], key.split("."), config.model_dump(mode="json"))
 
 
-def _check_sweep(config: SweepConfig, out: Path) -> None:
-    """Raise `UserError` if another sweep was begun in `out`, because a report would mix the runs of both sweeps."""
-    if not (out / SWEEP).is_file():
+def check_recorded_config(config: RunConfig, path: Path) -> None:
+    """Raise `UserError` if `path` has another config, because a report would mix the runs of both configs."""
+    if not path.is_file():
         return
-    recorded, requested = (sweep.model_dump(mode="json") for sweep in (load_config(SweepConfig, out / SWEEP), config))
+    recorded, requested = (loaded.model_dump(mode="json") for loaded in (load_config(type(config), path), config))
     different = [key for key in requested if requested[key] != recorded[key]]
     if different:
         raise UserError(
-            f"{out} was begun with another config ({', '.join(different)}): use that config, or name another --out"
+            f"{path.parent} was begun with another config ({', '.join(different)}): use that config, or name another "
+            "--out"
         )
 
 
-def _check_config(planned: PlannedRun, directory: Path) -> None:
-    """Raise `UserError` if a finished run was driven with a config that is not the sweep's."""
-    if (directory / CONFIG).read_text() != config_text(planned):
+def check_run_config(planned: PlannedRun, directory: Path) -> None:
+    """Raise `UserError` if the run in `directory` is finished, but was driven with another config than the planned."""
+    if is_finished(directory) and (directory / CONFIG).read_text() != config_text(planned):
         raise UserError(f"{directory} was driven with another config: use that config, or name another --out")
 
 
-def _remove_unfinished(planned: Sequence[PlannedRun], runs_dir: Path) -> None:
+def remove_all_unfinished(planned: Sequence[PlannedRun], runs_dir: Path) -> None:
     """Remove the directories of runs without a result, so that these runs are driven again."""
     for run in planned:
         remove_unfinished(runs_dir / run.name)

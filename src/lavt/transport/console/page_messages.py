@@ -176,6 +176,8 @@ class PageStatus(Struct, frozen=True, kw_only=True):
     emergency_stop: Literal["none", "sent", "confirmed"]
     command: tuple[float, float, float] | None
     """Steering (rad), throttle and brake of the last command; None: no command is sent."""
+    shows_latency: bool = True
+    """Whether the page shows latencies."""
     video_ms: float | None
     """From the stamp until the client had decoded the frame, by the wall clocks of both machines, not corrected for
     their offset."""

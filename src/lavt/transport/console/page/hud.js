@@ -66,6 +66,7 @@ export function showStatus(status, input, video, age_ms, isStopPending, notice) 
   byId("steering").value = -input.steering; // to the right on the screen is to the right
   byId("throttle").value = input.throttle;
   byId("brake").value = input.brake;
+  for (const element of document.querySelectorAll("[data-latency]")) element.hidden = !status.shows_latency;
   byId("video_ms").textContent = ms(status.video_ms);
   byId("round_trip_ms").textContent = ms(status.round_trip_ms);
   byId("shown_ms").textContent = ms(video.shown_ms);

@@ -1,0 +1,128 @@
+"""`lavt study`: drive a study with participants, in a balanced order of the conditions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from lavt.cli import console
+from lavt.cli.progress import progress
+from lavt.config import HUMAN, StudyConfig
+from lavt.config_file import load_config
+from lavt.errors import UserError
+from lavt.experiment.analysis.results import read_json
+
+if TYPE_CHECKING:
+    from lavt.experiment.study.study_plan import Block
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("study")(study)
+
+
+def study(
+    config: Annotated[Path, typer.Argument(help="A study config in YAML, such as configs/study.yaml.")],
+    participant: Annotated[
+        int | None, typer.Option(metavar="NUMBER", help="The participant who drives; default: all, for a model only.")
+    ] = None,
+    changes: console.SetOption = None,
+    out: console.OutOption = None,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Number of parallel runs; default: one per core.")] = None,
+    shows_plan: Annotated[bool, typer.Option("--plan", help="Print the order of the conditions and drive nothing.")] = (
+        False
+    ),
+    opens_page: Annotated[
+        bool, typer.Option("--browser/--no-browser", help="Open a person's page, if this machine has a display.")
+    ] = True,
+    port: Annotated[
+        int,
+        typer.Option(min=0, max=65535, help="TCP port of a person's page, which has its calibrations; 0: any."),
+    ] = 0,
+    as_json: console.JsonOption = False,
+) -> None:
+    """Drive a study: participants, balanced conditions, tests.
+
+    Every participant drives all routes under all conditions: a person from a web page (controller.kind human), or a
+    model of a driver. The same command continues a stopped study, and adds participants to it.
+
+    Example: lavt study configs/study.yaml --participant 1 --out out/study
+    """
+    from lavt.experiment.study.balanced_order import orders_in_set  # noqa: PLC0415 (slow: scipy)
+    from lavt.experiment.study.study import begin_study, drive_study, open_study, report_study  # noqa: PLC0415 (slow)
+    from lavt.experiment.study.study_plan import plan_participant  # noqa: PLC0415 (slow: scipy)
+
+    settings = load_config(StudyConfig, config, changes or [])
+    participants = range(1, settings.participants + 1) if participant is None else [participant]
+    blocks = [block for number in participants for block in plan_participant(settings, number)]
+    if settings.participants % (orders := orders_in_set(len(settings.conditions))):
+        console.print_message(
+            f"lavt: {settings.participants} participants are no multiple of the {orders} orders of "
+            f"{len(settings.conditions)} conditions, so the order is not balanced"
+        )
+    if shows_plan:
+        _print_plan(blocks, as_json=as_json)
+        return
+    is_person = settings.controller.kind == HUMAN
+    if is_person and participant is None:
+        raise UserError("one person drives at a time: name the participant with --participant")
+    out = out or Path("out") / "study"
+    remaining = open_study(settings, blocks, out)
+    begin_study(settings, out)
+    if is_person:
+        _hold_session(blocks, settings.instructions, out, opens_page=opens_page, port=port)
+        page, failed = report_study(out), []
+    else:
+        with console.interruptible(), progress(f"study, results in {out}", remaining) as report_done:
+            result = drive_study(blocks, out, jobs=jobs, on_progress=report_done)
+            page, failed = report_study(out, result.drives), list(result.failed)
+    for name, reason in failed:
+        console.print_message(f"failed: {name}: {reason}")
+    if as_json:
+        console.print_json(read_json(out / "study.json"))
+    else:
+        console.print_result(f"the report is {page}")
+    if failed:
+        raise typer.Exit(1)
+
+
+def _print_plan(blocks: Sequence[Block], *, as_json: bool) -> None:
+    orders: dict[int, list[str]] = {}
+    for block in blocks:
+        orders.setdefault(block.participant, []).append(block.condition)
+    if as_json:
+        console.print_json(orders)
+        return
+    for number, order in orders.items():
+        console.print_result(f"participant {number}: {', '.join(order)}")
+
+
+def _hold_session(blocks: Sequence[Block], instructions: str, out: Path, *, opens_page: bool, port: int) -> None:
+    """Let a person drive, with texts and questions in the terminal."""
+    from lavt.cli.drive import show_page  # noqa: PLC0415 (only if a person drives)
+    from lavt.experiment.runs.plan import PlannedRun  # noqa: PLC0415 (slow: scipy)
+    from lavt.experiment.runs.real_run import PersonPage  # noqa: PLC0415 (slow: scipy)
+    from lavt.experiment.runs.run import drive_once  # noqa: PLC0415 (slow: scipy)
+    from lavt.experiment.study.session import Experimenter, hold_session  # noqa: PLC0415 (slow: scipy)
+    from lavt.transport.console.console_link import check_installed  # noqa: PLC0415 (only if a person drives)
+
+    check_installed()
+    with TemporaryDirectory(prefix="lavt-") as work, console.interruptible():
+        page = PersonPage(port, lambda url: show_page(url, Path(work), opens_page=opens_page))
+
+        def drive(run: PlannedRun, directory: Path) -> Mapping[str, Any]:
+            return drive_once(run, directory, page=page).result
+
+        hold_session(blocks, instructions, out, Experimenter(console.print_message, _ask, drive))
+
+
+def _ask(question: str) -> str:
+    console.print_message(question)
+    try:
+        return input()
+    except EOFError:
+        raise UserError("lavt study asks questions when a person drives: start it in a terminal") from None
