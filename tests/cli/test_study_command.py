@@ -44,6 +44,12 @@ def test_a_participant_drives_the_planned_blocks(run: Run, tmp_path: Path) -> No
     page = (tmp_path / "out" / "report" / "index.html").read_text()
     assert "Comparison over the participants" in page
     assert "They say nothing about persons" in page
+    first, second = sorted((tmp_path / "out" / "runs").iterdir())
+    (first / "result.json").write_text((second / "result.json").read_text())
+    command = ("study", STUDY, *OPTIONS, "--participant", "1", "--out", "out")
+    assert "the result of another run" in run(*command).rejection()
+    (first / "config.yaml").unlink()
+    assert "cannot be read" in run(*command).rejection()
 
 
 @pytest.mark.full

@@ -15,6 +15,7 @@ from lavt.config import HUMAN, StudyConfig
 from lavt.config_file import load_config
 from lavt.errors import UserError
 from lavt.experiment.analysis.results import read_json
+from lavt.recording.output_directory import reserve_directory
 
 if TYPE_CHECKING:
     from lavt.experiment.study.study_plan import Block
@@ -48,7 +49,7 @@ def study(
     """Drive a study: participants, balanced conditions, tests.
 
     Every participant drives all routes under all conditions: a person from a web page (controller.kind human), or a
-    model of a driver. The same command continues a stopped study, and adds participants to it.
+    model of a driver. The same command continues a stopped study.
 
     Example: lavt study configs/study.yaml --participant 1 --out out/study
     """
@@ -72,14 +73,15 @@ def study(
         raise UserError("one person drives at a time: name the participant with --participant")
     out = out or Path("out") / "study"
     remaining = open_study(settings, blocks, out)
-    begin_study(settings, out)
-    if is_person:
-        _hold_session(blocks, settings.instructions, out, opens_page=opens_page, port=port)
-        page, failed = report_study(out), []
-    else:
-        with console.interruptible(), progress(f"study, results in {out}", remaining) as report_done:
-            result = drive_study(blocks, out, jobs=jobs, on_progress=report_done)
-            page, failed = report_study(out, result.drives), list(result.failed)
+    with reserve_directory(out):
+        begin_study(settings, out)
+        if is_person:
+            _hold_session(blocks, settings.instructions, out, opens_page=opens_page, port=port)
+            page, failed = report_study(out), []
+        else:
+            with console.interruptible(), progress(f"study, results in {out}", remaining) as report_done:
+                result = drive_study(blocks, out, jobs=jobs, on_progress=report_done)
+                page, failed = report_study(out, result.drives), list(result.failed)
     for name, reason in failed:
         console.print_message(f"failed: {name}: {reason}")
     if as_json:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from lavt.errors import UserError
@@ -25,3 +28,25 @@ def make_directory(out: Path) -> None:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"{out} cannot be created ({error.strerror}): name another directory with --out") from error
+
+
+@contextmanager
+def reserve_directory(out: Path) -> Iterator[None]:
+    """Keep other processes that call this out of an existing directory; raise `UserError` if one is in it.
+
+    The operating system ends the reservation with the process. Where it has no `flock`, nothing is reserved.
+    """
+    try:
+        import fcntl  # noqa: PLC0415 (not on every system)
+    except ImportError:
+        yield
+        return
+    descriptor = os.open(out, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise UserError(f"another command writes into {out}: wait for its end, or name another --out") from None
+        yield
+    finally:
+        os.close(descriptor)

@@ -46,6 +46,13 @@ def test_left_out_participants_are_named() -> None:
     assert "(primary measure, 0 participants): no test" in sentence("p95_m", study["measures"]["p95_m"])
 
 
+def test_without_any_complete_participant_there_are_sentences_only(tmp_path: Path) -> None:
+    """If nobody has a value under every condition, the section has no table."""
+    parts = study_parts(compare_studies([runs(1)[0], runs(2)[-1]]), tmp_path)
+    assert any("no test" in part for part in parts)
+    assert not (tmp_path / "tables").exists()
+
+
 def test_the_table_of_pairs_has_all_numbers() -> None:
     """Each pair has the participants, those with a difference, the effect, and all p values."""
     (study,) = compare_studies(runs(6))

@@ -54,6 +54,14 @@ def test_random_permutations_replace_too_many(monkeypatch: pytest.MonkeyPatch) -
     assert friedman(table) == sampled
 
 
+def test_rounding_does_not_break_ties() -> None:
+    """Differences of means of thirds that are equal but for rounding have equal ranks, as have equal means."""
+    means = np.array([[1 / 3, 2 / 3], [2 / 3, 1.0], [1.0, 2 / 3], [0.0, 2 / 3], [1 / 3, 1.0], [0.3, 0.1 + 0.2]])
+    whole = np.array([[1.0, 2.0], [2.0, 3.0], [3.0, 2.0], [0.0, 2.0], [1.0, 3.0], [1.0, 1.0]])
+    assert signed_rank(means[:, 1] - means[:, 0])["p"] == signed_rank(whole[:, 1] - whole[:, 0])["p"]
+    assert friedman(means) == friedman(whole)
+
+
 def test_the_signed_rank_test_is_exact() -> None:
     """Without ties the p value is that of SciPy's exact test, and the effect size that of its rank sums."""
     differences = RANDOM.normal(size=9) + 0.5

@@ -56,6 +56,8 @@ def test_a_missing_scale_is_rejected() -> None:
         ({"raw_tlx": 12.0}, "not consistent"),
         ({"tlx": {"effort": 5}}, "scales"),
         ({"tlx": 5}, "restore"),
+        ({"participant": "3"}, "another block"),
+        ({"block": None}, "another block"),
     ],
 )
 def test_a_changed_file_is_rejected(changes: dict[str, object], reason: str, tmp_path: Path) -> None:
@@ -65,3 +67,14 @@ def test_a_changed_file_is_rejected(changes: dict[str, object], reason: str, tmp
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
     with pytest.raises(UserError, match=reason):
         read_answers(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["[]", '{"version"', ""])
+def test_a_damaged_file_is_rejected(text: str, tmp_path: Path) -> None:
+    """A file that has no answers is rejected in one sentence, and stays."""
+    write_answers(tmp_path, BLOCKS[0], GIVEN, "")
+    (path,) = (tmp_path / "answers").iterdir()
+    path.write_text(text)
+    with pytest.raises(UserError, match="restore the file"):
+        read_answers(tmp_path)
+    assert path.read_text() == text

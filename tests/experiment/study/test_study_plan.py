@@ -9,6 +9,7 @@ import yaml
 from lavt.config import RunConfig, StudyConfig
 from lavt.config_file import load_config, shipped
 from lavt.errors import UserError
+from lavt.experiment.analysis.results import IDENTITY_KEYS, write_json
 from lavt.experiment.runs.run import CONFIG, RESULT, config_text
 from lavt.experiment.runs.side_configs import client_config
 from lavt.experiment.study.balanced_order import order_of
@@ -74,7 +75,7 @@ def finish_first(blocks: list[Block], out: Path, config: StudyConfig) -> Path:
     directory = out / "runs" / run.name
     directory.mkdir(parents=True)
     (directory / CONFIG).write_text(config_text(run))
-    (directory / RESULT).write_text("{}")
+    write_json(directory / RESULT, dict.fromkeys(IDENTITY_KEYS) | dict(run.identity))
     (out / STUDY).write_text(yaml.safe_dump(config.model_dump(mode="json")))
     return directory
 

@@ -63,8 +63,8 @@ def study_parts(studies: Sequence[Mapping[str, Any]], report_dir: Path) -> Parts
         if study["driver"] != HUMAN:
             parts.append(html_page.paragraph(MODEL.format(driver=study["driver"])))
         parts.append(html_page.bullets([sentence(key, entry) for key, entry in study["measures"].items()]))
-        parts.append(save_table(report_dir, f"{name}_conditions", condition_table(study)))
-        parts.append(save_table(report_dir, f"{name}_pairs", pair_table(study)))
+        tables = {"conditions": condition_table(study), "pairs": pair_table(study)}
+        parts += [save_table(report_dir, f"{name}_{key}", table) for key, table in tables.items() if table.rows]
     return [*parts, html_page.paragraph(f"{WHY} {EFFECTS}", is_note=True)] if parts else []
 
 

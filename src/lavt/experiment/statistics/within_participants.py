@@ -23,12 +23,15 @@ from scipy.stats import rankdata
 
 from lavt.domain import FloatArray
 from lavt.experiment.statistics.intervals import holm
+from lavt.recording.table import IntArray
 from lavt.streams import stream
 
 PERMUTATIONS = 100_000
 """The number of random permutations if there are too many for all of them."""
 MOST_STEPS = 100_000
 """The exact distribution is computed if one participant needs no more steps than this."""
+TIE_DECIMALS = 9
+"""Values are ranked after rounding to so many decimals: means such as 1 - 2/3 and 2/3 - 1/3 differ by rounding only."""
 
 Values = Mapping[str, Sequence[float]]
 """For each participant a value for each condition, in the order of the conditions."""
@@ -77,7 +80,7 @@ def friedman(table: FloatArray) -> dict[str, Any]:
     participants rank the conditions alike, without ties.
     """
     participants, conditions = table.shape
-    ranks = np.round(2 * rankdata(table, axis=1)).astype(np.int64)  # doubled, so that ranks of ties are whole
+    ranks = _doubled_ranks(table)
     spread = float(np.sum((ranks - (conditions + 1)) ** 2))
     observed = _sum_of_squares(ranks.sum(axis=0), participants * (conditions + 1))
     statistic = (conditions - 1) * observed / spread if spread else 0.0
@@ -95,6 +98,12 @@ def friedman(table: FloatArray) -> dict[str, Any]:
         "smallest_p": smallest_p,
         "permutations": permutations,
     }
+
+
+def _doubled_ranks(values: FloatArray) -> IntArray:
+    """Return twice the ranks along the last axis, so that those of ties are whole numbers."""
+    ranks: FloatArray = rankdata(np.round(values, TIE_DECIMALS), axis=-1)
+    return np.round(2 * ranks).astype(np.int64)
 
 
 def _sum_of_squares(rank_sums: Any, mean: int) -> int:
@@ -141,8 +150,9 @@ def signed_rank(differences: FloatArray) -> dict[str, Any]:
     `differing` is the number of differences that are not 0. `effect` is the rank-biserial correlation, from -1 (all
     differences are negative) to 1. `smallest_p` is the p value if all participants differ in the same direction.
     """
-    differing = differences[differences != 0]
-    ranks = np.round(2 * rankdata(np.abs(differing))).astype(np.int64)  # doubled, so that ranks of ties are whole
+    rounded = np.round(differences, TIE_DECIMALS)
+    differing = rounded[rounded != 0]
+    ranks = _doubled_ranks(np.abs(differing))
     total, positive = int(ranks.sum()), int(ranks[differing > 0].sum())
     ways = [1]  # ways[s]: in how many of all choices of signs the positive ranks have the sum s
     for rank in ranks.tolist():

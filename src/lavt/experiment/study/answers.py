@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from lavt.errors import UserError
+from lavt.errors import UserError, WorkError
 from lavt.experiment.analysis.results import read_json, write_json
 from lavt.experiment.study.study_plan import Block
 
@@ -76,18 +76,33 @@ def read_answers(out: Path) -> list[dict[str, Any]]:
 
 
 def _path(out: Path, block: Block) -> Path:
-    return out / ANSWERS / f"p{block.participant:03d}_b{block.number:02d}.json"
+    return out / ANSWERS / _file_name(block.participant, block.number)
+
+
+def _file_name(participant: int, block: int) -> str:
+    return f"p{participant:03d}_b{block:02d}.json"
 
 
 def _read(path: Path) -> dict[str, Any]:
-    answers = read_json(path)
-    if not isinstance(answers, dict) or answers.get("version") != VERSION:
+    try:
+        answers = read_json(path)
+    except WorkError as error:
+        raise UserError(f"{error}: restore the file, or remove it") from error
+    if not isinstance(answers, dict):
+        raise UserError(f"{path} has no answers: restore the file, or remove it")
+    if answers.get("version") != VERSION:
         raise UserError(f"{path} has no answers of version {VERSION}: read it with the version of LAVT that wrote it")
     try:
         expected = None if answers["tlx"] is None else raw_tlx(answers["tlx"])
-        is_valid = answers["raw_tlx"] == expected and {"participant", "block", "condition"} <= answers.keys()
+        is_valid = (
+            answers["raw_tlx"] == expected
+            and {"condition", "driver"} <= answers.keys()
+            and path.name == _file_name(int(answers["participant"]), int(answers["block"]))
+        )
     except (KeyError, AttributeError) as error:
         raise UserError(f"{path} lacks {error}: restore the file, or remove it") from error
+    except (TypeError, ValueError):
+        is_valid = False
     if not is_valid:
-        raise UserError(f"{path} is not consistent: restore the file, or remove it")
+        raise UserError(f"{path} is not consistent, or has the answers of another block: restore it, or remove it")
     return answers

@@ -8,9 +8,11 @@ from pathlib import Path
 import yaml
 
 from lavt.config import StudyConfig
-from lavt.errors import WorkError
+from lavt.errors import UserError, WorkError
 from lavt.experiment.analysis.drive_data import DriveData
-from lavt.experiment.analysis.results import FAILED, write_json
+from lavt.experiment.analysis.results import FAILED, read_result, write_json
+from lavt.experiment.runs.plan import PlannedRun
+from lavt.experiment.runs.run import RESULT
 from lavt.experiment.study.answers import has_answers, read_answers, write_answers
 from lavt.experiment.study.study_plan import Block, check_order
 from lavt.experiment.sweep.sweep import (
@@ -32,7 +34,7 @@ NOT_ASKED = "not asked: {driver} drove, not a person"
 def open_study(config: StudyConfig, blocks: Sequence[Block], out: Path) -> int:
     """Create the directory of a study, or check that its files agree with `config`; return the number of runs to drive.
 
-    Raises `UserError` if `out` has another study, runs that are not in the plan, or anything else.
+    Raises `UserError` if `out` has another study, runs that are not in the plan, damaged files, or anything else.
     """
     if not (out / STUDY).is_file():
         prepare_directory(out)
@@ -40,8 +42,23 @@ def open_study(config: StudyConfig, blocks: Sequence[Block], out: Path) -> int:
     check_order(blocks, out / "runs")
     runs = [run for block in blocks for run in block.runs]
     for run in runs:
-        check_run_config(run, out / "runs" / run.name)
+        _check_run(run, out / "runs" / run.name)
+    read_answers(out)
     return sum(not is_finished(out / "runs" / run.name) for run in runs)
+
+
+def _check_run(run: PlannedRun, directory: Path) -> None:
+    """Raise `UserError` if the planned run is finished, but its files are damaged or those of another run."""
+    remedy = "restore its files, or remove it, to drive it again"
+    if not is_finished(directory):
+        return
+    try:
+        check_run_config(run, directory)
+        result = read_result(directory / RESULT)
+    except (OSError, ValueError, WorkError) as error:
+        raise UserError(f"{directory} cannot be read ({error}): {remedy}") from error
+    if any(result[key] != run.identity.get(key) for key in ("run", "condition", "participant")):
+        raise UserError(f"{directory} has the result of another run: {remedy}")
 
 
 def begin_study(config: StudyConfig, out: Path) -> None:
