@@ -15,7 +15,7 @@ from operator import attrgetter
 from matplotlib.figure import Figure
 from tests.safety.stops import ALLOWED_BEYOND_M, ROUTES, Curve, Stop, StopPair, stops
 
-from lavt.experiment.report.figure_style import COLOURS, new_figure
+from lavt.experiment.report.figures.figure_style import COLOURS, new_figure
 
 FOLLOWED, HELD = "along the path", "wheel held"
 """Labels of the two kinds of stops: the vehicle follows the last command's path, or keeps the steering angle."""

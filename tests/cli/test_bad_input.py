@@ -417,6 +417,7 @@ COMMANDS = [
     "drive",
     "run",
     "sweep",
+    "study",
     "boundary",
     "report",
     "replay",

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.container import ErrorbarContainer
 from matplotlib.text import Annotation
 
-from lavt.experiment.report.figure_style import (
+from lavt.experiment.report.figures.figure_style import (
     SETTINGS,
     FigurePoint,
     condition_colours,
@@ -17,10 +17,10 @@ from lavt.experiment.report.figure_style import (
     legend_below,
     new_figure,
 )
-from lavt.experiment.report.headline_figure import headline_figure
-from lavt.experiment.report.latency_figures import degradation_figure, presets_figure
-from lavt.experiment.report.point_names import name_points
-from lavt.experiment.report.run_figures import cross_track_figure
+from lavt.experiment.report.figures.headline_figure import headline_figure
+from lavt.experiment.report.figures.latency_figures import degradation_figure, presets_figure
+from lavt.experiment.report.figures.point_names import name_points
+from lavt.experiment.report.figures.run_figures import cross_track_figure
 from lavt.experiment.statistics.paper_results import paper
 
 COLOURS = condition_colours(["L2", "L3", "L4"])

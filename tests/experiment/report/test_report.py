@@ -19,7 +19,7 @@ from lavt.errors import WorkError
 from lavt.experiment.analysis.drive_data import DriveData, capture_to_stamp_ms, read_drive
 from lavt.experiment.analysis.results import read_json, run_result, write_json
 from lavt.experiment.report import html_page, table_format
-from lavt.experiment.report.figure_style import condition_colours
+from lavt.experiment.report.figures.figure_style import condition_colours
 from lavt.experiment.report.replay_section import largest_error_s, least_and_most_delayed
 from lavt.experiment.report.report import write_report
 from lavt.experiment.report.run_sections import received_pictures, setting_text

@@ -21,11 +21,12 @@ from lavt.experiment.report.condition_sections import (
     latency_table_parts,
 )
 from lavt.experiment.report.condition_tables import COMPLETED_P95, FOLLOWED_P95
-from lavt.experiment.report.figure_style import condition_colours
+from lavt.experiment.report.figures.figure_style import condition_colours
+from lavt.experiment.report.figures.run_figures import drawn_indexes
+from lavt.experiment.report.figures.sweep_figures import axis_figure
 from lavt.experiment.report.first_screen import first_parts
 from lavt.experiment.report.groups import differing_settings, is_in_group, sort_groups, title_of
 from lavt.experiment.report.report import write_report
-from lavt.experiment.report.run_figures import drawn_indexes
 from lavt.experiment.report.sections import (
     ReportContext,
     axis_parts,
@@ -39,7 +40,6 @@ from lavt.experiment.report.sections import (
     survival_parts,
     validity_parts,
 )
-from lavt.experiment.report.sweep_figures import axis_figure
 from lavt.experiment.report.table_format import NOTHING
 from lavt.experiment.statistics.summary import summarize
 from lavt.recording.record import read_record

@@ -749,10 +749,12 @@ def test_a_port_closes_whatever_the_wall_clock_does(monkeypatch: pytest.MonkeyPa
 def test_bus_off(open_port: Callable[..., CanPort], device: Device) -> None:
     """An error frame with bus-off means that the bus is lost."""
     port = open_port("breakable", "stick", clock=ManualClock(0))
+    device.may_open.clear()
     device.incoming.append(can.Message(is_error_frame=True, arbitration_id=0x40, is_extended_id=False))
     until(lambda: device.shut_down == 1)
     with pytest.raises(BusGone, match="bus-off"):
         port.take(0)
+    device.may_open.set()
 
 
 def test_closed(device: Device) -> None:

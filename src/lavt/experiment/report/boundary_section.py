@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from lavt.experiment.report import html_page
-from lavt.experiment.report.figure_style import legend_below, new_figure
+from lavt.experiment.report.figures.figure_style import legend_below, new_figure
 from lavt.experiment.report.files import save_figure, save_table
 from lavt.experiment.report.sections import Parts
 from lavt.experiment.report.table_format import (

@@ -14,7 +14,7 @@ from lavt.experiment.report.condition_tables import (
     error_table,
     latency_table,
 )
-from lavt.experiment.report.figure_style import Conditions
+from lavt.experiment.report.figures.figure_style import Conditions
 from lavt.experiment.report.files import save_table
 from lavt.experiment.report.groups import differing_settings, title_of
 from lavt.experiment.report.sections import MAX_COMPARED_GROUPS, Parts, ReportContext

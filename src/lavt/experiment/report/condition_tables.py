@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from lavt.experiment.report.figure_style import Conditions
+from lavt.experiment.report.figures.figure_style import Conditions
 from lavt.experiment.report.table_format import (
     NOTHING,
     UNBROKEN,

@@ -5,9 +5,9 @@ from __future__ import annotations
 from markupsafe import Markup
 
 from lavt.experiment.report import html_page
+from lavt.experiment.report.figures.headline_figure import has_own_lane, headline_figure
 from lavt.experiment.report.files import save_figure
 from lavt.experiment.report.groups import differing_settings, title_of
-from lavt.experiment.report.headline_figure import has_own_lane, headline_figure
 from lavt.experiment.report.sections import MAX_COMPARED_GROUPS, Parts, ReportContext
 from lavt.experiment.report.sentences import (
     contrast_sentence,

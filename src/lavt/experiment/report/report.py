@@ -19,7 +19,7 @@ from lavt.experiment.report.condition_sections import (
     error_table_parts,
     latency_table_parts,
 )
-from lavt.experiment.report.figure_style import SETTINGS, condition_colours
+from lavt.experiment.report.figures.figure_style import SETTINGS, condition_colours
 from lavt.experiment.report.first_screen import VALIDITY, first_parts
 from lavt.experiment.report.replay_section import replay_parts
 from lavt.experiment.report.run_sections import (

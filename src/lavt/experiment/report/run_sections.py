@@ -11,9 +11,14 @@ from lavt.clock import calendar_time
 from lavt.domain import NS_PER_S, Picture
 from lavt.experiment.analysis.drive_data import DriveData, capture_to_stamp_ms, one_of_each_condition, read_drive
 from lavt.experiment.report import html_page
+from lavt.experiment.report.figures.run_figures import (
+    cross_track_figure,
+    frames_figure,
+    time_figure,
+    trajectories_figure,
+)
 from lavt.experiment.report.files import save_figure, save_table
 from lavt.experiment.report.groups import differing_settings, is_in_group, title_of
-from lavt.experiment.report.run_figures import cross_track_figure, frames_figure, time_figure, trajectories_figure
 from lavt.experiment.report.sections import Parts, ReportContext
 from lavt.experiment.report.table_format import html_of
 from lavt.experiment.report.tables import machine_table

@@ -13,10 +13,8 @@ from lavt.experiment.analysis.clocks import PROBE, SAME_KERNEL
 from lavt.experiment.analysis.stage_latency import AFTER_LOOP
 from lavt.experiment.report import html_page
 from lavt.experiment.report.condition_tables import matching_paper
-from lavt.experiment.report.figure_style import Colours, Conditions
-from lavt.experiment.report.files import link_table, save_figure, save_table
-from lavt.experiment.report.groups import Group, axes_of, differing_settings, short_name, sort_groups, title_of
-from lavt.experiment.report.latency_figures import (
+from lavt.experiment.report.figures.figure_style import Colours, Conditions
+from lavt.experiment.report.figures.latency_figures import (
     LOOP_LABEL,
     degradation_figure,
     injected_figure,
@@ -24,7 +22,14 @@ from lavt.experiment.report.latency_figures import (
     presets_figure,
     stages_figure,
 )
-from lavt.experiment.report.sweep_figures import axis_figure, incidence_figure, routes_with_survival, survival_figure
+from lavt.experiment.report.figures.sweep_figures import (
+    axis_figure,
+    incidence_figure,
+    routes_with_survival,
+    survival_figure,
+)
+from lavt.experiment.report.files import link_table, save_figure, save_table
+from lavt.experiment.report.groups import Group, axes_of, differing_settings, short_name, sort_groups, title_of
 from lavt.experiment.report.tables import (
     check_table,
     clock_table,

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from itertools import groupby, pairwise, product
 from typing import Any, NamedTuple
 
-from lavt.experiment.report.figure_style import Conditions
+from lavt.experiment.report.figures.figure_style import Conditions
 from lavt.experiment.statistics.by_road import road_of
 
 MAX_LISTED_NAMES = 8

@@ -8,7 +8,7 @@ from typing import Any
 
 from lavt.experiment.analysis.stage_latency import AFTER_LOOP
 from lavt.experiment.report.condition_tables import COMMON_P95, COMPLETED_P95
-from lavt.experiment.report.figure_style import Conditions
+from lavt.experiment.report.figures.figure_style import Conditions
 from lavt.experiment.report.groups import Group, short_name
 from lavt.experiment.report.table_format import (
     NOTHING,

@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 
 from lavt.domain import NS_PER_S, FloatArray, Picture
 from lavt.experiment.analysis.drive_data import DriveData
-from lavt.experiment.report.figure_style import Colours, condition_handles, legend_below, new_figure, tidy
+from lavt.experiment.report.figures.figure_style import Colours, condition_handles, legend_below, new_figure, tidy
 
 DRAWN_EVERY_M = 0.5
 """Distance between drawn points. Denser points cannot be distinguished and make the file of 90 drives too large."""

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from lavt.experiment.report.figure_style import (
+from lavt.experiment.report.figures.figure_style import (
     SMALL_TEXT_POINTS,
     Colours,
     Conditions,
@@ -27,7 +27,7 @@ from lavt.experiment.report.figure_style import (
     shown_interval,
     tidy,
 )
-from lavt.experiment.report.point_names import PointName, name_points, name_shared_places, place_names
+from lavt.experiment.report.figures.point_names import PointName, name_points, name_shared_places, place_names
 
 NODE_COLOURS = {"camera": "Blues", "network": "Greys", "receiver": "Purples", "driver": "Greens", "actuator": "Oranges"}
 OTHER_COLOURS = "Reds"

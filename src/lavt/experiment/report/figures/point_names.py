@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from lavt.experiment.report.figure_style import SMALL_TEXT_POINTS, FigurePoint
+from lavt.experiment.report.figures.figure_style import SMALL_TEXT_POINTS, FigurePoint
 
 COLOURS = {"paper": "0.45"}
 """The colour of the names of a kind of points; other names are black."""

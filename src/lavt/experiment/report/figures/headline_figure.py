@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from lavt.experiment.report.figure_style import (
+from lavt.experiment.report.figures.figure_style import (
     Colours,
     Conditions,
     FigurePoint,
@@ -21,8 +21,8 @@ from lavt.experiment.report.figure_style import (
     shown_interval,
     tidy,
 )
-from lavt.experiment.report.latency_figures import PAPER_MARKER
-from lavt.experiment.report.point_names import name_points
+from lavt.experiment.report.figures.latency_figures import PAPER_MARKER
+from lavt.experiment.report.figures.point_names import name_points
 
 
 def has_own_lane(kinds: Mapping[str, Conditions]) -> bool:

@@ -10,7 +10,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from lavt.experiment.report.figure_style import Colours, Conditions, condition_handles, legend_below, new_figure, tidy
+from lavt.experiment.report.figures.figure_style import (
+    Colours,
+    Conditions,
+    condition_handles,
+    legend_below,
+    new_figure,
+    tidy,
+)
 from lavt.experiment.report.groups import Group, short_name
 
 ENDING_DASHES: Mapping[str, Any] = {
