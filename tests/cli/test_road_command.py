@@ -102,6 +102,7 @@ def test_ignored_content_of_a_map_is_named(run: Run, tmp_path: Path) -> None:
         (["import", "none.xodr", "--from", "1,-1", "--to", "2,-1"], "cannot be read"),
         (["import", "HAMLET", "--from", "1", "--to", "2,-1"], "--from 1: write the id of a road, a comma"),
         (["import", "HAMLET", "--from", "1,-1", "--to", "2,x"], "--to 2,x: write"),
+        (["import", "HAMLET", "--from", "1,-+1", "--to", "2,-1"], "--from 1,-+1: write"),
         (["import", "HAMLET", "--from", "1,-1", "--to", "9,-1"], "no road 9"),
         (["import", "HAMLET", "--from", "1,-9", "--to", "2,-1"], "no lane -9"),
         (["import", "HAMLET", "--from", "2,-1", "--to", "1,-1"], "no way leads"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from pathlib import Path
 
 import pytest
@@ -59,14 +60,15 @@ def test_ignored_content_is_named() -> None:
         ("<line/>", "", "one shape"),
         ("<line/>", '<spiral curvStart="0" curvEnd="1e9"/>', "turns by more than"),
         ("<line/>", '<paramPoly3 aU="0" bU="0" cU="0" dU="0" aV="0" bV="0" cV="0" dV="0"/>', "single point"),
-        ('hdg="0"', 'hdg="nan"', "write a number"),
+        ('hdg="0"', 'hdg="nan"', "write a finite number"),
         ('hdg="0"', "", "no attribute hdg"),
         ('length="20" junction', 'length="-5" junction', "length -5"),
-        ('a="3"', 'a="1e300"', "write a number"),
+        ('a="3"', 'a="1e300"', "write a finite number"),
         ('id="1"', 'id="1&#10;2"', "printable characters"),
         ('id="1"', f'id="{"1" * 65}"', "at most 64"),
-        ('a="3"', 'a="1_0"', "write a number"),
+        ('a="3"', 'a="1_0"', "write a finite number"),
         ('id="-1"', 'id="-1.5"', "write a whole number"),
+        ('id="-1"', 'id="-+1"', "write a whole number"),
         ("</lane></right>", "</lane>" + "".join(f'<lane id="-{n}"/>' for n in range(2, 300)) + "</right>", "64 lanes"),
         ('id="-1"', 'id="-2"', "no lane -1"),
         ('id="-1"', 'id="1"', "wrong side"),
@@ -124,6 +126,13 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path: Path, name: str, message:
     """A missing file, an impossible path or a directory raises UserError."""
     with pytest.raises(UserError, match=message):
         read_map(str(tmp_path / name))
+
+
+def test_a_pipe_is_rejected(tmp_path: Path) -> None:
+    """A pipe is rejected without waiting for its writer."""
+    os.mkfifo(tmp_path / "pipe.xodr")
+    with pytest.raises(UserError, match="is a pipe"):
+        read_map(str(tmp_path / "pipe.xodr"))
 
 
 def test_large_files_are_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

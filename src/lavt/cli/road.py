@@ -10,6 +10,8 @@ import typer
 from lavt.cli import console
 from lavt.domain import CameraModel
 from lavt.errors import UserError
+from lavt.opendrive.xml_tree import INTEGER
+from lavt.recording.output_directory import replace_text
 from lavt.vehicle.sim.road.road import load_road
 
 
@@ -77,8 +79,7 @@ def import_road(
 def _parse_lane(option: str, text: str) -> tuple[str, int]:
     """Return a road's id and a lane's number; an id may itself contain commas."""
     road, comma, lane = text.rpartition(",")
-    digits = lane.strip().removeprefix("-").removeprefix("+")
-    if not (comma and road and digits.isascii() and digits.isdigit() and len(digits) <= 9):
+    if not (comma and road and INTEGER.fullmatch(lane.strip())):
         raise UserError(f"{option} {text}: write the id of a road, a comma and the number of a lane, such as 37,-3")
     return road.strip(), int(lane)
 
@@ -109,8 +110,9 @@ def export(
 
 
 def _write(path: Path, text: str) -> None:
+    """Write a file, or replace it; it stays as it was if this fails."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
+        replace_text(path, text)
     except OSError as error:
         raise UserError(f"{path} cannot be written ({error.strerror}): name another file with --out") from error

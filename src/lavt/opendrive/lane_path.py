@@ -86,8 +86,7 @@ class PathStep:
         inner_lanes = range(self.lane, 0, -1 if self.lane > 0 else 1)
         entries: list[CubicPieces] = [pieces for n in inner_lanes for pieces in _pieces(section, n)]
         stations_m = itertools.chain(
-            (element.s_m for element in road.plan),
-            road.lane_offsets.begins_m,
+            road.shape_breaks_m(section.s_m, section.end_m),
             (section.s_m + begin_m for pieces in entries for begin_m in pieces.begins_m),
         )
         yield from (self.path_m(s_m) for s_m in stations_m if section.s_m < s_m < section.end_m)

@@ -6,7 +6,7 @@ metres. Lane 0 has no width; lanes to its left have positive numbers, lanes to i
 
 from __future__ import annotations
 
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -109,6 +109,14 @@ class MapRoad:
     @cached_property
     def _section_begins_m(self) -> list[float]:
         return [section.s_m for section in self.sections]
+
+    def shape_breaks_m(self, begin_m: float, end_m: float) -> list[float]:
+        """Return the stations between two others at which an element of the plan view or a lane offset begins."""
+        return [
+            s_m
+            for begins_m in (self._plan_begins_m, self.lane_offsets.begins_m)
+            for s_m in begins_m[bisect_right(begins_m, begin_m) : bisect_left(begins_m, end_m)]
+        ]
 
     def plan_element(self, s_m: float) -> PlanElement:
         """Return the element of the plan view at a station."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 from typing import NoReturn
 from xml.etree.ElementTree import Element, TreeBuilder
@@ -14,6 +15,7 @@ MAX_BYTES = 64 * 1024 * 1024
 MAX_DEPTH = 32
 MAX_ELEMENTS = 2_000_000
 MAX_ID_CHARACTERS = 64
+INTEGER = re.compile(r"[+-]?[0-9]{1,9}")
 MAX_NUMBER = 1e9
 """The largest magnitude of a number. Computations with larger ones could overflow."""
 
@@ -21,6 +23,8 @@ MAX_NUMBER = 1e9
 def read_file(path: str) -> bytes:
     """Return the content of a map file; raise UserError if it cannot be read or is too large."""
     try:
+        if Path(path).is_fifo():
+            raise UserError(f"the map {path} is a pipe: name a file")
         with Path(path).open("rb") as file:
             content = file.read(MAX_BYTES + 1)
     except OSError as error:
@@ -64,7 +68,7 @@ def parse_xml(content: bytes, source: str) -> Element:
     except expat.ExpatError as error:
         raise UserError(f"{source} is not well-formed XML ({error}): name an OpenDRIVE file (.xodr)") from error
     except (LookupError, ValueError) as error:  # an encoding that Python does not know, or cannot use here
-        raise UserError(f"{source} has an unknown encoding ({error}): save it as UTF-8") from error
+        raise UserError(f"{source} has an unknown encoding ({str(error)[:80]}): save it as UTF-8") from error
     return builder.close()
 
 
@@ -98,14 +102,15 @@ def read_number(element: Element, key: str, where: str, default: float | None = 
     except ValueError:
         number = math.nan
     if not abs(number) <= MAX_NUMBER:
-        raise UserError(f"{where}: <{element.tag}> has {key}={text[:40]!a}: write a number of at most {MAX_NUMBER:.0e}")
+        raise UserError(
+            f"{where}: <{element.tag}> has {key}={text[:40]!a}: write a finite number, at most {MAX_NUMBER:.0e}"
+        )
     return number
 
 
 def read_integer(element: Element, key: str, where: str) -> int:
     """Return an attribute that must be a whole number of at most nine digits."""
     text = read_text(element, key, where).strip()
-    digits = text.removeprefix("-").removeprefix("+")
-    if not (digits.isascii() and digits.isdigit() and len(digits) <= 9):
+    if not INTEGER.fullmatch(text):
         raise UserError(f"{where}: <{element.tag}> has {key}={text[:40]!a}: write a whole number")
     return int(text)

@@ -50,3 +50,14 @@ def reserve_directory(out: Path) -> Iterator[None]:
         yield
     finally:
         os.close(descriptor)
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Write a text file atomically: a reader never sees an incomplete file, and an old one stays if writing fails."""
+    unfinished = path.with_name(path.name + ".part")
+    try:
+        unfinished.write_text(text, encoding="utf-8")
+        unfinished.replace(path)
+    except (OSError, UnicodeEncodeError):
+        unfinished.unlink(missing_ok=True)
+        raise

@@ -15,6 +15,7 @@ from lavt.experiment.analysis.invalid_reason import InvalidReason, MeasuredCheck
 from lavt.experiment.analysis.metrics import measure
 from lavt.experiment.analysis.validity import invalid_reasons, measured_checks
 from lavt.recording.json_payload import to_json
+from lavt.recording.output_directory import replace_text
 from lavt.recording.record import Record
 
 FAILED = "failed.json"
@@ -80,10 +81,7 @@ def run_result(
 
 def write_json(path: Path, value: Any) -> None:
     """Write `value` as indented JSON, atomically: a reader never sees an incomplete file. NaN becomes null."""
-    text = msgspec.json.format(to_json(value), indent=2).decode() + "\n"
-    unfinished = path.with_name(path.name + ".part")
-    unfinished.write_text(text, encoding="utf-8")
-    unfinished.replace(path)
+    replace_text(path, msgspec.json.format(to_json(value), indent=2).decode() + "\n")
 
 
 def read_json(path: Path) -> Any:
