@@ -62,6 +62,7 @@ def test_the_default_gains_are_stable_at_l0() -> None:
     assert two_point_critical_delay_s(LOOP, twice) < 0.081
 
 
+@pytest.mark.full
 def test_the_driver_s_own_delay_counts_like_delay_of_the_network() -> None:
     """A frame more of reaction delay reduces the critical delay by a frame."""
     by_delay_s = [

@@ -44,6 +44,7 @@ def sweeps(make_run: MakeRun, tmp_path: Path) -> tuple[Path, Path]:
     return first, second
 
 
+@pytest.mark.full
 def test_two_sweeps_in_one_report_are_separate_groups(sweeps: tuple[Path, Path], tmp_path: Path) -> None:
     """Each run names its sweep, each sweep is a group, and `conditions` has only the runs of the first sweep."""
     report(list(sweeps), tmp_path / "both")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,8 +9,10 @@ from tests.support.summary_keys import CONDITION_KEYS, RUN_KEYS
 
 from lavt.config import SweepConfig
 from lavt.config_file import load_config, shipped
+from lavt.experiment.analysis.results import read_json, write_json
 from lavt.experiment.runs.plan import plan_sweep
-from lavt.experiment.sweep.sweep import drive_sweep, open_sweep
+from lavt.experiment.statistics.summary import summarize
+from lavt.experiment.sweep.sweep import run_all
 
 CHANGES = ("fidelity=geometry", "conditions=[L0, L1]", "routes=[a_key, b_key]", "repetitions=1")
 
@@ -31,11 +31,11 @@ ROUTE_KEYS = {
 @pytest.fixture(scope="module")
 def summary(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Return the summary of four driven runs without pixels."""
-    config = load_config(SweepConfig, shipped("configs/paper.yaml"), CHANGES)
-    out: Path = tmp_path_factory.mktemp("sweep") / "out"
-    open_sweep(out, resume=False)
-    drive_sweep(config, plan_sweep(config), out, jobs=2, on_progress=lambda _: None)
-    return json.loads((out / "summary.json").read_text())
+    planned = plan_sweep(load_config(SweepConfig, shipped("configs/paper.yaml"), CHANGES))
+    driven, speed = run_all(planned, tmp_path_factory.mktemp("sweep"), jobs=1, on_progress=lambda _: None)
+    path = tmp_path_factory.mktemp("summary") / "summary.json"
+    write_json(path, summarize(list(driven.results), speed))
+    return read_json(path)
 
 
 def test_every_key_is_present(summary: Any) -> None:
