@@ -115,8 +115,10 @@ def field(tab: Tab, name: str) -> Any:
     return (status(tab) or {}).get(name)
 
 
-def drive_until(tab: Tab, hold: Callable[[], None], let_go: Callable[[], None], condition: Callable[[], bool]) -> None:
-    """Arm by `hold` and wait until `condition()`; if the vehicle stops before, let go and try again.
+def drive_until(
+    tab: Tab, hold: Callable[[], None], release_all: Callable[[], None], condition: Callable[[], bool]
+) -> None:
+    """Arm by `hold` and wait until `condition()`; if the vehicle stops before, release and try again.
 
     On a busy machine the browser pauses for longer than the latch of the dead-man control allows.
     """
@@ -127,7 +129,7 @@ def drive_until(tab: Tab, hold: Callable[[], None], let_go: Callable[[], None], 
         wait_until("the car drives, or has stopped", lambda: condition() or field(tab, "hand") != "held")
         if condition():
             return
-        let_go()
+        release_all()
     pytest.fail(f"the car did not drive in {ATTEMPTS} attempts")
 
 

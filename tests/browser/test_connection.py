@@ -130,7 +130,7 @@ def test_any_key_that_means_escape_stops(page: ConnectedPage) -> None:
 
 
 def test_a_hold_of_another_device_is_no_fresh_press(page: ConnectedPage) -> None:
-    """When the space bar is let go while a gamepad is held, nothing is held until the gamepad is pressed again."""
+    """When the space bar is released while a gamepad is held, nothing is held until the gamepad is pressed again."""
     plug_gamepad(page.tab, is_held=False)
     press(page.tab, "Space")
     page.client.wait_for_input("the space bar holds", held=True)

@@ -170,7 +170,7 @@ def test_a_held_key_holds_as_long_as_it_repeats(window: Window) -> None:
 
 
 def test_when_no_key_repeats_one_must_be_pressed(window: Window) -> None:
-    """After the key that repeats is let go, the space bar repeats no more: the page asks for a key, then lets go."""
+    """After the release of the key that repeats, nothing repeats: the page asks for a key, then releases all."""
     wait_until("the page has the focus", window.has_focus)
     window.act("keydown", "space")
     window.wait_for_hold(is_held=True)

@@ -25,7 +25,7 @@ def wait_for_standstill(tab: Tab) -> None:
 
 
 def test_a_person_arms_drives_and_stops(person_drive: PersonDrive) -> None:
-    """Holding the space bar arms, the arrow key accelerates, letting go stops; the video is shown; all is recorded."""
+    """Holding the space bar arms, the arrow key accelerates, its release stops; the video is shown; all is recorded."""
     tab = person_drive.open()
     assert field(tab, "role") == "drives"
     drive_off(tab)

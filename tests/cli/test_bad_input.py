@@ -22,6 +22,7 @@ from lavt.cli import main
 from lavt.cli.main import build_app
 from lavt.config_file import shipped
 from lavt.experiment.analysis.results import IDENTITY_KEYS
+from lavt.recording.output_directory import reserve_directory
 from lavt.transport.zenoh_link import Router, quiet_logs
 
 DEMO = str(shipped("configs/demo.yaml"))
@@ -340,6 +341,13 @@ def test_report_of_a_boundary_without_a_sweep(run: Run, tmp_path: Path) -> None:
 def test_nothing_to_resume(run: Run, tmp_path: Path) -> None:
     """A sweep that was never started cannot be resumed."""
     assert "never" in run("sweep", SWEEP, "--resume", "--out", "never").rejection()
+    assert files(tmp_path) == {}
+
+
+def test_a_sweep_is_not_resumed_twice_at_once(run: Run, tmp_path: Path) -> None:
+    """While a command drives a sweep, another one for the same directory is rejected."""
+    with reserve_directory(tmp_path):
+        assert "another command" in run("sweep", SWEEP, "--resume", "--out", str(tmp_path)).rejection()
     assert files(tmp_path) == {}
 
 

@@ -8,6 +8,7 @@ import pytest
 from tests.support.command_line import Run
 
 from lavt.config_file import shipped
+from lavt.recording.output_directory import reserve_directory
 
 ROAD = """\
 title: A few metres
@@ -45,8 +46,10 @@ def test_a_participant_drives_the_planned_blocks(run: Run, tmp_path: Path) -> No
     assert "Comparison over the participants" in page
     assert "They say nothing about persons" in page
     first, second = sorted((tmp_path / "out" / "runs").iterdir())
-    (first / "result.json").write_text((second / "result.json").read_text())
     command = ("study", STUDY, *OPTIONS, "--participant", "1", "--out", "out")
+    with reserve_directory(tmp_path / "out"):
+        assert "another command writes into out" in run(*command).rejection()
+    (first / "result.json").write_text((second / "result.json").read_text())
     assert "the result of another run" in run(*command).rejection()
     (first / "config.yaml").unlink()
     assert "cannot be read" in run(*command).rejection()

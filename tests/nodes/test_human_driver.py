@@ -295,7 +295,7 @@ def test_any_page_makes_an_emergency_stop(page: int) -> None:
 
 
 def test_a_stop_is_not_swallowed_by_an_old_state() -> None:
-    """A stop that the vehicle has confirmed is not made twice, but made again once the vehicle's state is old."""
+    """A stop that the vehicle has confirmed is not requested twice, except after the vehicle's state is old."""
     bench = HumanBench().drive()
     (request,) = [decode(SessionRequest, each) for each in payloads(bench.page(type="stop"), "session")]
     bench.deliver("session_reply", encode(SessionReply(True, "", 0, b"", 5600, "kernel", request.number)))

@@ -128,6 +128,16 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path: Path, name: str, message:
         read_map(str(tmp_path / name))
 
 
+def test_breaks_of_a_road_are_where_its_shape_changes() -> None:
+    """Between two stations, every beginning of an element of the plan view or of a lane offset is a break."""
+    plan = '<geometry s="8" x="8" y="0" hdg="0" length="12"><line/></geometry></planView>'
+    offsets = "".join(f'<laneOffset s="{s_m}" a="0" b="0" c="0" d="0"/>' for s_m in (0, 5, 10))
+    text = SMALL.replace('hdg="0" length="20"', 'hdg="0" length="8"').replace("</planView>", plan)
+    road = parse_map(text.replace("<lanes>", f"<lanes>{offsets}").encode(), "m.xodr").road("1")
+    assert sorted(road.shape_breaks_m(0.0, 20.0)) == [5.0, 8.0, 10.0]
+    assert road.shape_breaks_m(5.0, 10.0) == [8.0]
+
+
 def test_a_pipe_is_rejected(tmp_path: Path) -> None:
     """A pipe is rejected without waiting for its writer."""
     os.mkfifo(tmp_path / "pipe.xodr")

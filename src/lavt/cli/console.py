@@ -8,7 +8,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,6 +19,12 @@ from lavt.errors import LavtError, UserError, WorkError
 from lavt.operating_system import HANGUP
 from lavt.runtime.output import queue_output
 
+BrowserOption = Annotated[
+    bool, typer.Option("--browser/--no-browser", help="Open the page of a person, if this machine has a display.")
+]
+PagePortOption = Annotated[
+    int, typer.Option("--port", min=0, max=65535, help="TCP port of this page, which has its calibrations; 0: any.")
+]
 OutOption = Annotated[Path | None, typer.Option(help="Output directory.")]
 SetOption = Annotated[
     list[str] | None, typer.Option("--set", help="Override a config value, as a.b=value; repeatable.")
@@ -47,6 +53,21 @@ def print_message(text: str) -> None:
 def print_result(text: str) -> None:
     """Print a result to standard output."""
     print(f"{text}\n", end="", flush=True)
+
+
+def print_report(page: Path, content: Path, failed: Sequence[tuple[str, str]], *, as_json: bool) -> None:
+    """Print the failed runs with their reasons, and the path of a report's page or, as JSON, its content.
+
+    Raises `typer.Exit` with code 1 if a run has failed.
+    """
+    for name, reason in failed:
+        print_message(f"failed: {name}: {reason}")
+    if as_json:
+        print_json(json.loads(content.read_text(encoding="utf-8")))
+    else:
+        print_result(f"the report is {page}")
+    if failed:
+        raise typer.Exit(1)
 
 
 def print_json(value: Any) -> None:

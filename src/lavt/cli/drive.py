@@ -8,7 +8,6 @@ import webbrowser
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
@@ -32,13 +31,8 @@ def register(app: typer.Typer) -> None:
 def drive(
     out: console.OutOption = None,
     changes: console.SetOption = None,
-    opens_page: Annotated[
-        bool, typer.Option("--browser/--no-browser", help="Open the page, if this machine has a display.")
-    ] = True,
-    port: Annotated[
-        int,
-        typer.Option(min=0, max=65535, help="TCP port of the page, which has its calibrations; 0: any."),
-    ] = 0,
+    opens_page: console.BrowserOption = True,
+    port: console.PagePortOption = 0,
     as_json: console.JsonOption = False,
 ) -> None:
     """Drive yourself: the simulator's car, from a web page on this machine.

@@ -14,10 +14,10 @@ from lavt.cli.progress import progress
 from lavt.config import HUMAN, StudyConfig
 from lavt.config_file import load_config
 from lavt.errors import UserError
-from lavt.experiment.analysis.results import read_json
 from lavt.recording.output_directory import reserve_directory
 
 if TYPE_CHECKING:
+    from lavt.experiment.analysis.drive_data import DriveData
     from lavt.experiment.study.study_plan import Block
 
 
@@ -34,16 +34,9 @@ def study(
     changes: console.SetOption = None,
     out: console.OutOption = None,
     jobs: Annotated[int | None, typer.Option(min=1, help="Number of parallel runs; default: one per core.")] = None,
-    shows_plan: Annotated[bool, typer.Option("--plan", help="Print the order of the conditions and drive nothing.")] = (
-        False
-    ),
-    opens_page: Annotated[
-        bool, typer.Option("--browser/--no-browser", help="Open a person's page, if this machine has a display.")
-    ] = True,
-    port: Annotated[
-        int,
-        typer.Option(min=0, max=65535, help="TCP port of a person's page, which has its calibrations; 0: any."),
-    ] = 0,
+    shows_plan: Annotated[bool, typer.Option("--plan", help="Print the orders of the conditions only.")] = False,
+    opens_page: console.BrowserOption = True,
+    port: console.PagePortOption = 0,
     as_json: console.JsonOption = False,
 ) -> None:
     """Drive a study: participants, balanced conditions, tests.
@@ -73,23 +66,18 @@ def study(
         raise UserError("one person drives at a time: name the participant with --participant")
     out = out or Path("out") / "study"
     remaining = open_study(settings, blocks, out)
+    failed: Sequence[tuple[str, str]] = ()
+    drives: Sequence[DriveData] = ()
     with reserve_directory(out):
         begin_study(settings, out)
         if is_person:
             _hold_session(blocks, settings.instructions, out, opens_page=opens_page, port=port)
-            page, failed = report_study(out), []
         else:
             with console.interruptible(), progress(f"study, results in {out}", remaining) as report_done:
                 result = drive_study(blocks, out, jobs=jobs, on_progress=report_done)
-                page, failed = report_study(out, result.drives), list(result.failed)
-    for name, reason in failed:
-        console.print_message(f"failed: {name}: {reason}")
-    if as_json:
-        console.print_json(read_json(out / "study.json"))
-    else:
-        console.print_result(f"the report is {page}")
-    if failed:
-        raise typer.Exit(1)
+                failed, drives = result.failed, result.drives
+        page = report_study(out, drives)
+    console.print_report(page, out / "study.json", failed, as_json=as_json)
 
 
 def _print_plan(blocks: Sequence[Block], *, as_json: bool) -> None:

@@ -12,8 +12,8 @@ from lavt.cli.progress import progress
 from lavt.config import ClientConfig, SweepConfig
 from lavt.config_file import find_file, load_config
 from lavt.errors import UserError
-from lavt.experiment.analysis.results import read_json
 from lavt.experiment.runs.plan import plan_sweep
+from lavt.recording.output_directory import reserve_directory
 
 
 def register(app: typer.Typer) -> None:
@@ -70,15 +70,12 @@ def sweep(
     if remote and remaining:
         remote.check_connection()
     open_sweep(out, resume=resume)
-    with console.interruptible(), progress(f"sweep, results in {out}", remaining) as report_done:
+    with (
+        reserve_directory(out),
+        console.interruptible(),
+        progress(f"sweep, results in {out}", remaining) as report_done,
+    ):
         page, result = drive_sweep(
             settings, planned_runs, out, jobs=jobs, on_progress=report_done, cluster_address=cluster, server=remote
         )
-    for name, reason in result.failed:
-        console.print_message(f"failed: {name}: {reason}")
-    if as_json:
-        console.print_json(read_json(out / "summary.json"))
-    else:
-        console.print_result(f"the report is {page}")
-    if result.failed:
-        raise typer.Exit(1)
+    console.print_report(page, out / "summary.json", result.failed, as_json=as_json)

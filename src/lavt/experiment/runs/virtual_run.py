@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import gc
 import hashlib
+import itertools
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -119,19 +120,15 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
     make_directory(out)
     digest = hashlib.sha256()
     left_out = config.left_out
-    server_writer = RecordWriter(out / "server.mcap", "server", digest, left_out=left_out)
-    client_writer = RecordWriter(out / "client.mcap", "client", digest, left_out=left_out)
-    for writer in (server_writer, client_writer):
-        for name, entries in provenance().items():
-            writer.annotate(name, entries)
-        writer.annotate(
-            "model",
-            {
-                "costs": costs.model_dump_json(),
-                "condition": requested.model_dump_json(),
-                "traces": json.dumps(trace_digests(requested)),
-            },
-        )
+    model = {
+        "costs": costs.model_dump_json(),
+        "condition": requested.model_dump_json(),
+        "traces": json.dumps(trace_digests(requested)),
+    }
+    writers = [RecordWriter(out / f"{side}.mcap", side, digest, left_out=left_out) for side in ("server", "client")]
+    for writer, (name, entries) in itertools.product(writers, {**provenance(), "model": model}.items()):
+        writer.annotate(name, entries)
+    server_writer, client_writer = writers
     observer = DriveObserver()
     costs_ns = stage_costs_ns(costs, seed)
     error_s, bound_s = config.clocks.error_us / 1e6, config.clocks.bound_us / 1e6

@@ -15,7 +15,7 @@ from lavt.experiment.sweep.sweep import remove_all_unfinished
 from lavt.experiment.sweep.workers import is_finished
 
 STOPPED = "safe_stop"
-"""The ending of a drive that a person has stopped, perhaps by letting go of the dead-man control."""
+"""The ending of a drive that a person has stopped, perhaps by releasing the dead-man control."""
 REPEATED = "repeated"
 """The directory of the drives that were repeated, in the directory of a study."""
 

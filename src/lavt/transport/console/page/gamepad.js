@@ -21,10 +21,10 @@ const STANDARD = {
 const BUTTONS_ONLY = ["hold", "stop"];
 
 export const QUESTIONS = {
-  left: "turn fully to the left, then let go",
-  right: "turn fully to the right, then let go",
-  throttle: "press the throttle fully, then let go",
-  brake: "press the brake fully, then let go",
+  left: "turn fully to the left, then release it",
+  right: "turn fully to the right, then release it",
+  throttle: "press the throttle fully, then release it",
+  brake: "press the brake fully, then release it",
   hold: "press and release the button that you will hold to drive",
   stop: "press and release the button for the emergency stop",
 };

@@ -15,7 +15,7 @@ const BRAKE_PER_S = 4.0;
 const NEXT_REPEAT_MS = 700; // the slowest repeat that systems offer is 500 ms
 const FIRST_REPEAT_MS = 1500; // the longest delay that most systems offer is 1 s
 const NO_REPEATS = "this system repeats no key that is held, so a lost release would not be noticed: turn the repeat on, or use another device";
-const SILENT = "no key events arrived any more, so all keys count as released: let go of them, then hold them again";
+const SILENT = "no key events arrived any more, so all keys count as released: release them, then hold them again";
 const PRESS_AGAIN = "press an arrow key again: no key repeats any more, and soon all will count as released";
 
 // While a menu is open or a window is dragged, the browser delivers no release of a key, and the page keeps the focus.
@@ -23,7 +23,7 @@ const PRESS_AGAIN = "press an arrow key again: no key repeats any more, and soon
 //
 // The keyboard may also be taken without any event. But the key that was pressed last repeats while it is held, and its
 // repeats end when another client gets the keys. So keys count only while events of keys arrive. When the key that
-// repeats is let go, no other key repeats, and one must be pressed again. A keyboard that does not repeat never holds.
+// repeats is released, no other key repeats, and one must be pressed again. A keyboard that does not repeat never holds.
 export class Keyboard {
   #held = new Set(); // codes of the keys that are down
   #heard_ms = 0; // when the newest event of a key arrived

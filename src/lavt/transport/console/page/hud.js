@@ -14,10 +14,10 @@ const STOP_NOT_CONFIRMED = "emergency stop sent, not confirmed yet";
 const STALE_MS = 1000; // lavt sends a status every 50 ms
 const history = new History(byId("history"));
 const HANDS = {
-  not_seen: "let go of the dead-man control (the space bar), then hold it",
-  not_live: "click the page, then let go of the dead-man control (the space bar) and hold it",
-  old_input: "this page was stopped for a moment: let go of the dead-man control, then hold it",
-  no_input: "this page sent no input for a moment: let go of the dead-man control, then hold it",
+  not_seen: "release the dead-man control (the space bar), then hold it",
+  not_live: "click the page, then release the dead-man control (the space bar) and hold it",
+  old_input: "this page was stopped for a moment: release the dead-man control, then hold it",
+  no_input: "this page sent no input for a moment: release the dead-man control, then hold it",
 };
 
 // `stop` is "pending" if an emergency stop waits for a connection, "lost" if there will be none, and else empty.

@@ -4,7 +4,7 @@ export class Sources {
   #all;
   #resting;
   #used = null; // the device whose hold counts
-  #spent = new Set(); // devices that were held while another one counted, and have not been let go since
+  #spent = new Set(); // devices that were held while another one counted, and have not been released since
 
   // `resting()` returns the device whose values are shown and sent while no hold counts.
   constructor(all, resting) {
