@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import itertools
-from typing import NamedTuple
+import json
+import socket
+from collections.abc import Iterator
+from contextlib import closing
+from typing import Any, NamedTuple
 
 import msgpack
 import pytest
 import zenoh
 from msgspec.structs import replace
 from tests.support.clocks import ManualClock
+from tests.support.ports import free_port
 
+from lavt.assembly.zenoh import search_sessions
+from lavt.clock import MachineClock
+from lavt.config_file import shipped
 from lavt.domain import NS_PER_S, VehicleInfo
 from lavt.streams import stream
 from lavt.transport import vehicle_search
@@ -23,6 +31,7 @@ from lavt.transport.vehicle_search import (
     MAX_VEHICLES,
     Answer,
     FoundVehicles,
+    SearchSession,
     scout,
     usable_locators,
 )
@@ -229,3 +238,38 @@ def test_scouting_ends_after_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
     routers = scout(ManualClock(step_ns=NS_PER_S // 5), 1.0)
     assert 0 < len(routers) < 6
     assert hellos.is_stopped
+
+
+@pytest.fixture(scope="module")
+def search_session() -> Iterator[SearchSession]:
+    """Yield a session with a router that answers each query with the number of answers that its nonce asks for."""
+    endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    config = zenoh.Config.from_file(str(shipped("zenoh-configs/router-server.json5")))
+    config.insert_json5("listen/endpoints", json.dumps([endpoint]))
+
+    def reply_often(query: Any) -> None:
+        with query:
+            for number in range(query.payload.to_bytes()[0]):
+                query.reply("lavt/vehicle-1/info", bytes([number]))
+
+    handler: Any = zenoh.handlers.Callback(reply_often, indirect=False)
+    with zenoh.open(config) as router:
+        router.declare_queryable("lavt/vehicle-1/info", handler)
+        (settings,) = search_sessions(None, [endpoint])
+        with closing(SearchSession(MachineClock(), settings)) as session:
+            yield session
+
+
+def test_every_answer_to_a_query_is_read(search_session: SearchSession) -> None:
+    """Answers that arrive at once with the last one are read, too."""
+    for count in (1, 2, MAX_ANSWERS):
+        for _ in range(20):
+            answers = search_session.query(bytes([count]), 30.0)
+            assert [answer.payload[0] for answer in answers] == list(range(count))
+
+
+def test_a_flood_of_answers_ends_the_query(search_session: SearchSession) -> None:
+    """Only the first answers of a flood are read, and the next query has none of it."""
+    answers = search_session.query(bytes([255]), 30.0)
+    assert [answer.payload[0] for answer in answers] == list(range(MAX_ANSWERS))
+    assert len(search_session.query(bytes([1]), 30.0)) == 1

@@ -7,9 +7,9 @@ answer is counted, and addresses of strangers are dialled only if they are numer
 from __future__ import annotations
 
 import ipaddress
-import itertools
 import json
 import re
+import threading
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
@@ -151,8 +151,6 @@ class SearchSession:
         endpoints = check_endpoints(config, "the router")
         check_private_keys(config)
         self.router: str = ", ".join(endpoints)
-        self._read: list[Any] = []
-        """Handlers of earlier queries: Zenoh prints an error for each answer whose handler is gone."""
         try:
             self._session: Any = open_zenoh(config)
         except zenoh.ZError as error:
@@ -162,22 +160,29 @@ class SearchSession:
 
     def query(self, nonce: bytes, timeout_s: float, vehicle: str = "*") -> list[Answer]:
         """Query all vehicles or one, and return at most `MAX_ANSWERS` answers within `timeout_s`."""
+        answers: list[Answer] = []
+        is_finished = threading.Event()
         sent_ns = self._clock.now().mono_ns
-        answers = []
-        replies: Any = self._session.get(
+
+        def receive(reply: zenoh.Reply) -> None:
+            round_trip_ns = self._clock.now().mono_ns - sent_ns
+            if reply.ok is not None and len(answers) < MAX_ANSWERS:
+                answers.append(Answer(str(reply.ok.key_expr), reply.ok.payload.to_bytes(), nonce, round_trip_ns))
+            if len(answers) == MAX_ANSWERS:
+                is_finished.set()
+
+        # A channel would lose the answers that are still unread when the last one arrives.
+        on_reply: Any = zenoh.handlers.Callback(receive, is_finished.set, indirect=False)
+        self._session.get(
             f"lavt/{vehicle}/info",
-            zenoh.handlers.RingChannel(MAX_ANSWERS),
+            on_reply,
             payload=nonce,
             timeout=timeout_s,
             consolidation=zenoh.ConsolidationMode.NONE,
             target=zenoh.QueryTarget.ALL,
         )
-        self._read.append(replies)
-        for reply in itertools.islice(replies, MAX_ANSWERS):
-            round_trip_ns = self._clock.now().mono_ns - sent_ns
-            if reply.ok is not None:
-                answers.append(Answer(str(reply.ok.key_expr), reply.ok.payload.to_bytes(), nonce, round_trip_ns))
-        return answers
+        is_finished.wait(timeout_s)
+        return list(answers)
 
     def close(self) -> None:
         """Close the session."""
