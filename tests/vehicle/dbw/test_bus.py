@@ -372,6 +372,8 @@ class Device:
     """Opening waits for it."""
     on_receive: Callable[[], None] = lambda: None
     """Called in each read, before it returns a frame."""
+    polls: int = 0
+    """How often its descriptor was asked for, to see whether frames wait."""
     ends: tuple[socket.socket, socket.socket] = field(
         default_factory=lambda: socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
     )
@@ -398,6 +400,7 @@ class BreakableBus(can.BusABC):
         super().__init__(channel)
 
     def fileno(self) -> int:  # noqa: D102 (python-can's)
+        self.device.polls += 1
         return self.device.ends[0].fileno()
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:  # noqa: ARG002 (python-can's)
@@ -685,6 +688,8 @@ class TimestampedFrames:
 
         Return the error of its arrival time in ms, or None if the frame was dropped.
         """
+        polls = self.device.polls
+        until(lambda: self.device.polls >= polls + 2)  # the port has found the queue empty since the last step
         self.clock.advance(20)
         arrived, clock = self.clock.now(), self.clock
 
