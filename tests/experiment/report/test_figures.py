@@ -1,9 +1,11 @@
 from __future__ import annotations
 
 from itertools import combinations
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.container import ErrorbarContainer
@@ -133,6 +135,18 @@ def test_the_lowest_panel_has_an_x_label() -> None:
     panels = cross_track_figure({"a": [], "b": [], "c": []}, COLOURS, []).axes[:3]
     assert [axes.get_xlabel() for axes in panels] == ["", "", "distance along the route (m)"]
     assert len({axes.get_position().x0 for axes in panels}) == 1
+
+
+@pytest.mark.parametrize(("kept", "drawn_m"), [({"lane_width_m": 3.5}, [-2.0, 2.0]), (None, [])])
+def test_the_limits_of_the_own_lane_are_drawn(kept: dict[str, float] | None, drawn_m: list[float]) -> None:
+    """Dashed lines are half a lane and the margin of 0.25 m from the centre, if the lane is known."""
+    truth = SimpleNamespace(floats=lambda _: np.array([0.0, 0.1]))
+    drive: Any = SimpleNamespace(truth=truth, condition="L2", result={"ending": "completed", "lane_kept": kept})
+    (axes,) = cross_track_figure({"a": [drive]}, COLOURS, [drive]).axes
+    dashed = [line for line in axes.get_lines() if line.get_linestyle() == "--"]
+    assert [np.asarray(line.get_ydata()).max() for line in dashed] == drawn_m
+    low, high = axes.get_ylim()
+    assert all(low < limit_m < high for limit_m in drawn_m)
 
 
 def test_names_are_inside_their_panel() -> None:

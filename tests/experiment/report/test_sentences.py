@@ -5,7 +5,7 @@ from typing import Any
 from lavt.experiment.report.sentences import (
     contrast_sentence,
     length_sentences,
-    limits_sentence,
+    limits_sentences,
     results_sentences,
     runs_overview,
 )
@@ -68,8 +68,17 @@ def test_many_routes_and_conditions_are_counted() -> None:
     """A few names are listed, many names are only counted, and the number of invalid runs is given."""
     runs = [{"time": "virtual", "route": f"r{index}", "condition": "L0", "valid": index > 0} for index in range(20)]
     text = runs_overview(runs)
-    assert all(part in text for part in ("20 runs in virtual time", "20 routes", "L0", "1 run is invalid"))
+    assert all(part in text for part in ("20 runs in virtual time", "on 20 routes", "L0", "1 run is invalid"))
     assert "All runs are valid" in runs_overview(runs[1:])
+
+
+def test_each_kind_of_run_has_its_own_routes() -> None:
+    """The overview gives the number of runs and the routes of each kind of time."""
+    runs = [{"time": "virtual", "route": f"r{index}", "condition": "L0", "valid": True} for index in range(4)]
+    text = runs_overview([*runs, {"time": "real", "route": "a", "condition": "L5", "valid": True}])
+    assert text.startswith(
+        "4 runs in virtual time by video on 4 routes and 1 run in real time by video on the route a,"
+    )
 
 
 def test_conditions_with_equal_loop_latency_are_sorted_by_name() -> None:
@@ -158,7 +167,7 @@ def test_longer_roads_that_fail_first_are_named() -> None:
     """If only the shorter routes are completed in the own lane, the lengths and the chance of this order are given."""
     split = {"L0": completed_on(*LENGTHS_M), "L3": completed_on("r2", "r5"), "L4": completed_on("r2", "r5")}
     text = length_sentences(split, LENGTHS_M)
-    assert text.count("Longer roads fail first") == 1
+    assert text.count("Only shorter roads are completed") == 1
     assert "at L3 and L4, every run is completed in its own lane on the 2 shorter routes (140 to 187 m)" in text
     assert "not on the 4 longer ones (229 to 677 m)" in text
     assert "1 in 15." in text
@@ -179,11 +188,11 @@ def test_an_order_by_length_is_not_assumed() -> None:
 def test_what_was_not_shown_follows_from_the_runs() -> None:
     """The limits of fitted gains, missing pictures and a loopback are named only where they apply to the runs."""
     demo = {"preset": "paper_calibrated", "fidelity": "geometry", "inherent": "loopback"}
-    text = limits_sentence([demo, {**demo, "fidelity": "video"}])
+    text = limits_sentences([demo, {**demo, "fidelity": "video"}])
     assert text.startswith("Not shown: where driving fails for another controller or car")
-    assert "in the runs without pictures, errors of lane detection" in text
+    assert "what errors of lane detection do, in the runs without pictures" in text
     assert "the latency of a real network" in text
-    by_video = limits_sentence([{**demo, "preset": "designed", "fidelity": "video"}])
+    by_video = limits_sentences([{**demo, "preset": "designed", "fidelity": "video"}])
     assert "controller" not in by_video
     assert "pictures" not in by_video
-    assert limits_sentence([{"preset": "designed", "fidelity": "video", "inherent": "network"}]) == ""
+    assert limits_sentences([{"preset": "designed", "fidelity": "video", "inherent": "network"}]) == ""

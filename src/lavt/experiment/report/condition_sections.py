@@ -7,6 +7,7 @@ from typing import Any
 
 from markupsafe import Markup
 
+from lavt.experiment.analysis.lane_kept import LINE_MARGIN_M
 from lavt.experiment.report import html_page
 from lavt.experiment.report.condition_tables import (
     contrast_table,
@@ -27,8 +28,9 @@ LATENCIES_NOTE = (
 )
 PAPER_NOTE = "The paper did not measure the loop latency; the table shows the sum of its median τ video and τ control."
 OWN_LANE_NOTE = (
-    " A run is completed in its own lane if the middle of the rear axle was in the lane of the route all the time, and "
-    "the driver followed no other lane. P95 of the cross-track error is against the lane of the route."
+    " A run is completed in its own lane if the middle of the rear axle was in the lane of the route all the time, or "
+    f"at most {LINE_MARGIN_M:g} m beyond its line, and the driver followed no other lane. P95 of the cross-track error "
+    "is against the lane of the route."
 )
 ROUTES_NOTE = (
     "After three pictures without a lane, the lane followed is unknown. The intervals “these routes” show only how "
@@ -47,9 +49,9 @@ FEW_ROADS_NOTE = (
 ERRORS_NOTE = (
     " Each error is computed for each run and then averaged over the runs. P95 of the cross-track error is given in "
     "three ways. The first is the mean over the runs that completed, to be read together with the completion. The "
-    "second is the mean over all runs, each up to the common distance, which all runs of its route and repetition "
-    "reached. The third is the median (quartiles) of all runs, where a run that ended early ranks last. "
-    "docs/metrics.md defines each number."
+    "second is the mean over all runs, each up to the common distance: the largest multiple of 10 m that all runs of "
+    "its route and repetition reached. The third is the median (quartiles) of all runs, where a run that ended early "
+    "ranks last. docs/metrics.md defines each number."
 )
 ERROR_INTERVAL_NOTE = (
     " The intervals “these routes” show only how repeated runs of these routes vary: they are Student's t, from the "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from markupsafe import Markup
 
+from lavt.experiment.analysis.lane_kept import LINE_MARGIN_M
 from lavt.experiment.report import html_page
 from lavt.experiment.report.figures.headline_figure import has_own_lane, headline_figure
 from lavt.experiment.report.files import save_figure
@@ -12,7 +13,7 @@ from lavt.experiment.report.sections import MAX_COMPARED_GROUPS, Parts, ReportCo
 from lavt.experiment.report.sentences import (
     contrast_sentence,
     length_sentences,
-    limits_sentence,
+    limits_sentences,
     results_sentences,
     runs_overview,
 )
@@ -34,8 +35,8 @@ FRAME_AGE = (
     "command stays in force; its mean is over time."
 )
 OWN_LANE = (
-    "the middle of the rear axle was in the lane of the route until its end, and the driver followed no other lane. "
-    "The car may have touched a line."
+    "until the end of the route, the middle of the rear axle was in the route's lane, or at most "
+    f"{LINE_MARGIN_M:g} m beyond its line, and the driver followed no other lane. A wheel may have crossed the line."
 )
 PRESETS = {
     "paper_calibrated": "gains of the lane keeper, tuned by hand so that completion falls about where it does in the "
@@ -77,7 +78,7 @@ def _findings(report: ReportContext) -> list[str]:
     sentences.append(contrast_sentence(report.summary.get("contrasts") or []))
     real = report.kinds.get("real")
     examples = [results_sentences("Real time", real)] if real else []
-    return [*sentences, *examples, limits_sentence(report.summary["runs"])]
+    return [*sentences, *examples, limits_sentences(report.summary["runs"])]
 
 
 def headline_parts(report: ReportContext) -> Parts:

@@ -142,7 +142,7 @@ def validity_parts(report: ReportContext) -> Parts:
     if speed["wall_s"]:
         factor = speed["simulated_s"] / speed["wall_s"]
         jobs = f"{speed['jobs']} parallel job{'s' if speed['jobs'] != 1 else ''}"
-        text = f"{speed['simulated_s']:.0f} s of driving were simulated in {speed['wall_s']:.0f} s with {jobs}. "
+        text = f"{speed['simulated_s']:.0f} s of driving were simulated in {speed['wall_s']:.1f} s with {jobs}. "
         parts.append(html_page.paragraph(f"{text}This is {factor:.1f} times as fast as real time.", is_note=True))
     return parts
 

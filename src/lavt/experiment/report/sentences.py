@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import groupby, pairwise, product
 from typing import Any, NamedTuple
@@ -71,38 +70,41 @@ def runs_overview(runs: Sequence[Mapping[str, Any]], setting: str = "") -> str:
 
     `setting` has further sentences on the runs, which follow the conditions.
     """
-    kinds = Counter((str(run["time"]), run.get("fidelity") or "video") for run in runs)
-    by_time = " and ".join(
-        f"{_counted(count, 'run')} in {time} time {PICTURES[fidelity]}"
-        for (time, fidelity), count in sorted(kinds.items(), reverse=True)
+    routes_by_kind: dict[tuple[str, str], list[str]] = {}
+    for run in runs:
+        kind = str(run["time"]), run.get("fidelity") or "video"
+        routes_by_kind.setdefault(kind, []).append(str(run["route"]))
+    by_kind = " and ".join(
+        f"{_counted(len(routes), 'run')} in {time} time {PICTURES[fidelity]} on "
+        f"{_listed('route', sorted(set(routes)), MAX_LISTED_ROUTES)}"
+        for (time, fidelity), routes in sorted(routes_by_kind.items(), reverse=True)
     )
-    routes = sorted({str(run["route"]) for run in runs})
     names = sorted({str(run["condition"]) for run in runs})
     invalid = sum(not run["valid"] for run in runs)
     validity = "All runs are valid."
     if invalid:
         subject = "1 run is" if invalid == 1 else f"{invalid} runs are"
         validity = f"{subject} invalid and excluded from all statistics."
-    where = f"{_listed('route', routes, MAX_LISTED_ROUTES)} under {_listed('condition', names, MAX_LISTED_NAMES)}"
-    return " ".join(filter(None, (f"{by_time} on {where}.", setting, validity)))
+    conditions = _listed("condition", names, MAX_LISTED_NAMES)
+    return " ".join(filter(None, (f"{by_kind}, under {conditions}.", setting, validity)))
 
 
-def limits_sentence(runs: Sequence[Mapping[str, Any]]) -> str:
-    """Return a sentence on what these runs cannot show; "" if nothing of it is known."""
+def limits_sentences(runs: Sequence[Mapping[str, Any]]) -> str:
+    """Return sentences on what these runs cannot show; "" if nothing of it is known."""
     limits = []
     if {run.get("preset") for run in runs} == {"paper_calibrated"}:
         limits.append(
-            "where driving fails for another controller or car, because the delay at which completion falls was an "
-            "input to the gains (paper_calibrated)"
+            "where driving fails for another controller or car: the delay at which completion falls was an input to "
+            "the gains (paper_calibrated)"
         )
     if any(run.get("fidelity") == "geometry" for run in runs):
         limits.append(
-            "in the runs without pictures, errors of lane detection or a driver who follows another lane, because "
-            "these runs always follow the lane of the route"
+            "what errors of lane detection do, in the runs without pictures: their driver always follows the lane of "
+            "the route"
         )
     if all(run.get("inherent") == "loopback" for run in runs):
         limits.append("the latency of a real network: without injected delay, it is that of one machine's loopback")
-    return f"Not shown: {'; '.join(limits)}." if limits else ""
+    return " ".join(f"Not shown: {limit}." for limit in limits)
 
 
 def _listed(word: str, names: Sequence[str], most: int) -> str:
@@ -197,7 +199,7 @@ def length_sentences(conditions: Conditions, lengths_m: Mapping[str, float]) -> 
         orders = math.comb(len(shorter_m) + len(longer_m), len(shorter_m))
         if 1 / orders <= LARGEST_CHANCE:
             sentences.append(
-                "Longer roads fail first (seen in the results, not planned): "
+                "Only shorter roads are completed (seen in the results, not planned): "
                 f"at {' and '.join(names)}, every run is completed"
                 f"{' in its own lane' * own_lane} on the {_counted(len(shorter_m), 'shorter route')} "
                 f"({_range_m(shorter_m)}), and not on the {_counted(len(longer_m), 'longer one')} "

@@ -11,6 +11,7 @@ from matplotlib.lines import Line2D
 
 from lavt.domain import NS_PER_S, FloatArray, Picture
 from lavt.experiment.analysis.drive_data import DriveData
+from lavt.experiment.analysis.lane_kept import LINE_MARGIN_M
 from lavt.experiment.report.figures.figure_style import Colours, condition_handles, legend_below, new_figure, tidy
 
 DRAWN_EVERY_M = 0.5
@@ -23,6 +24,14 @@ EARLY_END_MARKER: dict[str, Any] = {
     "markeredgewidth": 1.5,
     "linestyle": "none",
     "zorder": 5,
+}
+
+OWN_LANE_LIMIT: dict[str, Any] = {
+    "color": "0.5",
+    "linewidth": 0.8,
+    "linestyle": "--",
+    "zorder": 1,
+    "label": "own lane",
 }
 
 
@@ -91,12 +100,15 @@ def cross_track_figure(
 ) -> Figure:
     """Return the figure of cross-track error over distance along the route, one panel for each route.
 
-    The scale of the error includes the drives in `compared`, so that several figures have the same scale.
+    The scale of the error includes the drives in `compared`, so that several figures have the same scale. Dashed lines
+    show how far from the centre a car still counts as in its own lane.
     """
     figure = new_figure(1.15 * len(routes) + 0.7)
     panels = figure.subplots(len(routes), 1, squeeze=False, sharey=True)[:, 0]
     for axes, (route, drives) in zip(panels, routes.items(), strict=True):
         axes.axhline(0, color="black", linewidth=2)
+        for limit_m in _own_lane_limits_m(drives):
+            axes.axhline(limit_m, **OWN_LANE_LIMIT)
         early_ends = []
         for drive in drives:
             progress_m, error_m = drive.truth.floats("progress_m"), drive.truth.floats("cross_track_m")
@@ -107,19 +119,31 @@ def cross_track_figure(
         if early_ends:
             axes.plot(*np.transpose(early_ends), **EARLY_END_MARKER)
         tidy(axes, "", "", f"Route {route}")
-    panels[0].set_ylim(*_scale([drive.truth.floats("cross_track_m") for drive in compared]))  # of all panels
+    limits_m = _own_lane_limits_m(compared)
+    errors_m = [drive.truth.floats("cross_track_m") for drive in compared]
+    panels[0].set_ylim(*_scale([*errors_m, np.array(limits_m)]))  # of all panels
     panels[-1].set_xlabel("distance along the route (m)")
     figure.supylabel("left of lane centre (m)")
-    _legend(figure, routes, colours)
+    _legend(figure, routes, colours, [Line2D([], [], **OWN_LANE_LIMIT)] * bool(limits_m))
     return figure
 
 
-def _legend(figure: Figure, routes: Mapping[str, Sequence[DriveData]], colours: Colours) -> None:
+def _own_lane_limits_m(drives: Sequence[DriveData]) -> list[float]:
+    """Return the smallest and the largest distance to the left of the lane centre that is in the own lane, if known."""
+    widths_m = [kept["lane_width_m"] for drive in drives if (kept := drive.result.get("lane_kept"))]
+    if not widths_m:
+        return []
+    limit_m = float(np.median(widths_m)) / 2 + LINE_MARGIN_M
+    return [-limit_m, limit_m]
+
+
+def _legend(
+    figure: Figure, routes: Mapping[str, Sequence[DriveData]], colours: Colours, limits: Sequence[Line2D] = ()
+) -> None:
     names = sorted({drive.condition for drives in routes.values() for drive in drives})
     reference = Line2D([], [], color="black", linewidth=2.5, label="lane centre")
-    legend_below(
-        figure, [*condition_handles(names, colours), reference, Line2D([], [], label="ended early", **EARLY_END_MARKER)]
-    )
+    early_end = Line2D([], [], label="ended early", **EARLY_END_MARKER)
+    legend_below(figure, [*condition_handles(names, colours), reference, *limits, early_end])
 
 
 def time_figure(drives: Sequence[DriveData], colours: Colours, compared: Sequence[DriveData]) -> Figure:
