@@ -73,7 +73,10 @@ def test_a_run_is_driven(tmp_path: Path) -> None:
 
 @pytest.mark.full
 def test_the_demo_leaves_out_real_time(tmp_path: Path) -> None:
-    """The demo leaves out the part in real time and says so, drives the rest in processes, and writes its report."""
+    """The demo leaves out the part in real time and says so, drives the rest in processes, and writes its report.
+
+    Here it drives on one of its roads.
+    """
     completed = run_elsewhere("demo", "--out", str(tmp_path / "demo"))
     assert completed.returncode == 0, completed.stderr
     assert "the part in real time needs Linux" in completed.stderr
