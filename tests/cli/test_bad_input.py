@@ -146,7 +146,7 @@ BAD_STUDIES = {
     "participant 0": (["--participant", "0"], "from 1 to 12"),
     "one condition": (["--set", "conditions=[L0]"], "two conditions"),
     "a condition twice": (["--set", "conditions=[L0, L2, L0]"], "conditions must be a list without duplicates"),
-    "no route": (["--set", "routes=[]"], "routes must be"),
+    "no route": (["--set", "routes=[]"], "routes is empty: name at least one"),
     "unknown condition": (["--set", "conditions=[L0, L9]"], "'L9'"),
     "unknown road": (["--set", "routes=[nowhere]"], "'nowhere'"),
     "a person in virtual time": (["--set", "controller.kind=human"], "time real"),

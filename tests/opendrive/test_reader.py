@@ -82,6 +82,7 @@ def test_ignored_content_is_named() -> None:
         ("<lanes>", "<lanes><laneOffset s='0' a='1' b='0' c='0' d='0'/>", None),
         ("</road>", "</road>" + "<a>" * 40, "nested deeper"),
         ("</road>", "</road><road id='1' length='1'/>", "no geometry"),
+        ("</road>", "</road><junction id='5'/><junction id='5'/>", "two junctions have the id 5"),
         ('laneSection s="0"', 'laneSection s="21"', "begins at s=21"),
         ("road", "rood", "no roads"),
     ],

@@ -229,8 +229,10 @@ class StudyConfig(RunConfig):
     def _check_study(self) -> StudyConfig:
         for name in ("conditions", "routes"):
             values = getattr(self, name)
-            if len(set(values)) < len(values) or not values:
-                raise ValueError(f"{name} must be a list without duplicates: name each entry once, and at least one")
+            if not values:
+                raise ValueError(f"{name} is empty: name at least one entry")
+            if len(set(values)) < len(values):
+                raise ValueError(f"{name} must be a list without duplicates: name each entry once")
         if len(self.conditions) < 2:
             raise ValueError("conditions needs at least two conditions, because a study compares them: add one")
         if self.study != StudyPlaceConfig():

@@ -57,6 +57,8 @@ def parse_map(content: bytes, source: str) -> OpenDriveMap:
     for element in root.iterfind("junction"):
         number = read_id(element, "id", source)
         where = f"{source}: junction {number}"
+        if number in junctions:
+            raise UserError(f"{source}: two junctions have the id {number}: rename one of them")
         connections = [_read_connection(child, where) for child in element.iterfind("connection")]
         junctions[number] = tuple(connection for connection in connections if connection is not None)
     return OpenDriveMap(source, roads, junctions, ignored_content(root))

@@ -95,7 +95,7 @@ REJECTED = {
     "an integer beyond floats": (f"title: x\nsegments: [{{length_m: 1{'0' * 400}}}]", r"'segments\.0\.length_m'"),
     "too long in total": (
         "title: x\nsegments: [{length_m: 15000}, {length_m: 15000}]",
-        r"30000 m long: 20 km are enough",
+        r"30000 m long: a road has at most 20 km",
     ),
     "driven lane": (SHORT + "lanes: {widths_m: [3, 3], driven: 2}", r"lanes\.driven is 2, but lanes count from 0 to 1"),
     "negative lane": (SHORT + "lanes: {driven: -1}", r"'lanes\.driven'"),

@@ -87,7 +87,9 @@ def _check_length(path: LanePath) -> None:
             f"the lanes are only {path.length_m:.1f} m long: a route needs {MIN_ROUTE_M:g} m, name more lanes"
         )
     if path.length_m > MAX_LENGTH_M:
-        raise UserError(f"the lanes are {path.length_m:.0f} m long: {MAX_LENGTH_M:.0f} m are enough, name fewer lanes")
+        raise UserError(
+            f"the lanes are {path.length_m:.0f} m long, and a road has at most {MAX_LENGTH_M:.0f} m: name fewer lanes"
+        )
 
 
 def _check_width(path: LanePath) -> None:

@@ -34,7 +34,7 @@ def find_problems(road: RoadFile) -> Iterable[str]:
             return
     yield from _find_misplaced(road)
     if road.segments_length_m > MAX_LENGTH_M:
-        yield f"the segments are {road.segments_length_m:.0f} m long: 20 km are enough"
+        yield f"the segments are {road.segments_length_m:.0f} m long: a road has at most {MAX_LENGTH_M / 1000:g} km"
     elif road.route_length_m < MIN_ROUTE_M:
         yield f"the segments are only {road.segments_length_m:g} m long: a route has at least {MIN_ROUTE_M:g} m"
     elif road.route_length_m > road.segments_length_m:
