@@ -33,6 +33,7 @@ def test_a_person_arms_drives_and_stops(person_drive: PersonDrive) -> None:
     shown = tab.evaluate("lavtConsole.video.shown")
     wait_until("pictures are shown", lambda: tab.evaluate("lavtConsole.video.shown") > shown + 20)
     assert tab.evaluate("lavtConsole.video.errors") == 0
+    wait_until("losses are measured", lambda: field(tab, "lost_share") is not None)
     assert tab.evaluate("document.querySelector('#picture').width") == 320
     tab.key("Space", down=False)
     wait_for_standstill(tab)
