@@ -57,6 +57,7 @@ CHANNELS: dict[str, Channel] = {
     "condition_in_force": Channel("local", "injection", ("driver",), "newest"),
     # client, if a person drives: between the driver node and the pages, and to a relay of its own
     "unit_to_decode": Channel("local", "driver", ("driver",)),
+    "video_reception": Channel("local", "receiver", ("driver",), "newest"),
     "page_opened": Channel("local", "console", ("driver",)),
     "page_closed": Channel("local", "console", ("driver",)),
     "page_message": Channel("local", "console", ("driver",), length=PAGE_QUEUE_LENGTH),

@@ -35,6 +35,7 @@ STATUS: Final[dict[str, Any]] = {
     "video_ms": None,
     "round_trip_ms": None,
     "bit_rate_bps": 0,
+    "lost_share": None,
     "delay": None,
 }
 CONFIRMED: Final = {"emergency_stop": "confirmed", "safety": "emergency_stop"}

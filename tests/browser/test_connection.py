@@ -49,6 +49,15 @@ def page(browser: Browser) -> Iterator[ConnectedPage]:
         page.client.close()
 
 
+def test_the_page_shows_bit_rate_and_lost_packets(page: ConnectedPage) -> None:
+    """The page shows the client's bit rate and share of lost packets, and a dash if the share is unknown."""
+    page.client.changes = {"bit_rate_bps": 2_540_000, "lost_share": 0.025}
+    wait_until("the losses are shown", lambda: page.text("lost_share") == "2.5 %")
+    assert page.text("bit_rate") == "2.5 Mb/s"
+    page.client.changes = {}
+    wait_until("a dash is shown", lambda: page.text("lost_share") == "–")
+
+
 def test_no_input_waits_behind_others(page: ConnectedPage) -> None:
     """While the client sends nothing, the page sends no inputs and shows no old state; a stop is sent."""
     page.client.is_silent = True

@@ -13,6 +13,7 @@ from tests.browser.conftest import PersonDrive, arm, drive_off, field
 
 from lavt.config import RunConfig
 from lavt.config_file import build_config
+from lavt.experiment.analysis.metrics import measure
 from lavt.experiment.runs.processes import Process, Processes
 from lavt.experiment.runs.side_configs import client_config, embedded_router, server_config
 from lavt.recording.record import read_record
@@ -25,13 +26,14 @@ def wait_for_standstill(tab: Tab) -> None:
 
 
 def test_a_person_arms_drives_and_stops(person_drive: PersonDrive) -> None:
-    """Holding the space bar arms, the arrow key accelerates, its release stops; the video is shown; all is recorded."""
+    """Holding the space bar arms, the arrow key accelerates, its release stops; the video is shown; all is timed."""
     tab = person_drive.open()
     assert field(tab, "role") == "drives"
     drive_off(tab)
     shown = tab.evaluate("lavtConsole.video.shown")
     wait_until("pictures are shown", lambda: tab.evaluate("lavtConsole.video.shown") > shown + 20)
     assert tab.evaluate("lavtConsole.video.errors") == 0
+    wait_until("losses are measured", lambda: field(tab, "lost_share") is not None)
     assert tab.evaluate("document.querySelector('#picture').width") == 320
     tab.key("Space", down=False)
     wait_for_standstill(tab)
@@ -40,6 +42,11 @@ def test_a_person_arms_drives_and_stops(person_drive: PersonDrive) -> None:
     record = read_record(person_drive.out / "client" / "client.mcap")
     hands = set(record.table("human_input").texts("hand"))
     assert {"open", "held"} <= hands
+    entry = measure(read_record(person_drive.out / "server" / "server.mcap"), record).entry
+    decoded, shown = entry["page_decoded_ms"], entry["page_shown_ms"]
+    assert 20 < decoded["n"] == shown["n"] <= entry["frames_sent"]
+    assert decoded["p50"] + decoded["bound"] > 0
+    assert decoded["p50"] <= shown["p50"] <= shown["max"]
 
 
 def test_the_page_reads_every_stamp(person_drive: PersonDrive) -> None:

@@ -12,6 +12,7 @@ from tests.browser.chromium import Browser, Tab, wait_until
 from tests.browser.conftest import ATTEMPTS, field, press, release, repeat_keys, status
 
 from lavt.config_file import shipped
+from lavt.experiment.study.answers import read_answers
 
 SETTINGS = (
     "controller.kind=human",
@@ -33,7 +34,7 @@ def running_study(out: Path) -> Iterator[subprocess.Popen[str]]:
     changes = [part for change in SETTINGS for part in ("--set", change)]
     arguments = ["study", str(shipped("configs/study.yaml")), *changes, "--participant", "1", "--no-browser"]
     with subprocess.Popen(
-        [sys.executable, "-m", "lavt", *arguments, "--out", str(out), "--json"],
+        [sys.executable, "-m", "lavt", *arguments, "--questions-in-page", "--out", str(out), "--json"],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -90,8 +91,22 @@ def drive_blind(browser: Browser, url: str) -> None:
     browser.close_tab(tab)
 
 
+def answer_in_page(browser: Browser, url: str) -> None:
+    """Choose a point on each scale, write a comment, and send the answers."""
+    tab = browser.open(url)
+    wait_until("the questions are asked", lambda: tab.evaluate("document.querySelectorAll('fieldset').length") == 6)
+    tab.evaluate("document.querySelector('button').click()")
+    assert tab.evaluate("document.querySelector('#form').checkValidity()") is False
+    assert tab.evaluate("document.querySelector('#form').checkVisibility()")
+    choose = "[...document.querySelectorAll('fieldset')].forEach((scale, number) => scale.elements[number].click())"
+    tab.evaluate(f"{choose}; document.querySelector('#comment').value = 'fine'")
+    tab.evaluate("document.querySelector('button').click()")
+    wait_until("the page says thanks", lambda: "Thank you" in tab.evaluate("document.body.innerText"))
+    browser.close_tab(tab)
+
+
 def test_a_person_drives_a_study_blind(browser: Browser, tmp_path: Path) -> None:
-    """A person drives each block from a page without latencies and conditions, and answers in the terminal."""
+    """A person drives each block from a page without latencies and conditions, and answers in another page."""
     with running_study(tmp_path / "out") as process:
         for _ in range(2):
             read_until(process, "Keep your lane.")
@@ -100,9 +115,7 @@ def test_a_person_drives_a_study_blind(browser: Browser, tmp_path: Path) -> None
             drive_blind(browser, read_until(process, "drive from").split()[-1])
             read_until(process, "press Enter to keep it")
             answer(process, "")
-            for number in range(6):
-                answer(process, str(5 * number))
-            answer(process, "fine")
+            answer_in_page(browser, read_until(process, "answer the questions at").split()[-1])
         read_until(process, "driven all blocks")
         assert process.stdout is not None
         printed = json.loads(process.stdout.read())
@@ -114,3 +127,4 @@ def test_a_person_drives_a_study_blind(browser: Browser, tmp_path: Path) -> None
     ]
     (study,) = printed["studies"]
     assert study["measures"]["raw_tlx"]["values"] == {"1": [12.5, 12.5]}
+    assert [entry["comment"] for entry in read_answers(tmp_path / "out")] == ["fine", "fine"]

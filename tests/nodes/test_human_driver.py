@@ -21,6 +21,7 @@ from lavt.nodes.payloads import DecodedFrame, DelayChoice, ReceivedUnit, RelayDe
 from lavt.nodes.picture_reader import PictureReader
 from lavt.runtime.pipeline import run_stages
 from lavt.transport.messages import decode, encode
+from lavt.transport.rtp.reception_stats import ReceptionSample
 from lavt.transport.video.frame_codec import RenderedPicture, VideoReceiver
 from lavt.transport.video.h264 import Decoder
 from lavt.transport.video.stamp import rtp_timestamp
@@ -106,6 +107,11 @@ class HumanBench:
         (text,) = [send.payload for send in sends if (send.channel, send.peer) == ("page_status", page)]
         status: dict[str, Any] = json.loads(text)
         return status
+
+
+def reception(packets: int, recovered: int, lost: int) -> ReceptionSample:
+    """Return a sample of a second in which packets arrived, and others were recovered or lost."""
+    return ReceptionSample(NS_PER_S, packets, recovered + lost, recovered, lost, 0, 0, 0, 0, None)
 
 
 def command(sends: list[Send]) -> Command | None:
@@ -374,15 +380,25 @@ def test_the_status_has_state_delays_and_round_trip() -> None:
     assert status["delay"] == [0.0, 0.0]
 
 
+def test_the_status_has_the_share_of_lost_packets() -> None:
+    """The share is of the packets that were due in the newest sample; it is null at first, and if none was due."""
+    bench = HumanBench()
+    assert bench.status()["lost_share"] is None
+    for packets, recovered, lost, share in ((94, 4, 2, 0.02), (50, 0, 0, 0.0), (0, 0, 0, None)):
+        bench.deliver("video_reception", reception(packets, recovered, lost))
+        assert bench.status()["lost_share"] == share
+
+
 @pytest.mark.parametrize("shows_latency", [True, False])
 def test_a_page_that_shows_no_latency_gets_none(*, shows_latency: bool) -> None:
-    """Without `shows_latency` the status has no latency, although they are known, and says so."""
+    """Without `shows_latency` the status has no latency and no losses, although they are known, and says so."""
     bench = HumanBench(shows_latency=shows_latency).drive()
     bench.mono_ns += 7 * NS_PER_MS
     bench.state("driving", applied=1)
+    bench.deliver("video_reception", reception(90, 0, 10))
     status = bench.status()
-    known = [status[name] is not None for name in ("video_ms", "round_trip_ms")]
-    assert (status["shows_latency"], known) == (shows_latency, [shows_latency] * 2)
+    known = [status[name] is not None for name in ("video_ms", "round_trip_ms", "lost_share")]
+    assert (status["shows_latency"], known) == (shows_latency, [shows_latency] * 3)
 
 
 def test_only_the_driving_page_of_a_client_with_a_relay_changes_delays() -> None:

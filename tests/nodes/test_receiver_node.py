@@ -201,6 +201,17 @@ def test_reception_is_recorded_every_second() -> None:
     assert [sample.lost_after_repair for sample in samples] == [0, 1, 0, 0]
 
 
+def test_the_driver_gets_the_samples_if_a_person_drives() -> None:
+    """With `informs_driver` the driver gets each sample that is recorded; without, it gets none."""
+    for informs_driver in (True, False):
+        node = ReceiverNode(JitterBuffer(), Depacketizer(), informs_driver=informs_driver)
+        (packet, *_), *_ = packets_of_frames()
+        deliver(node, "rtp", packet, at(0))
+        sends = deliver(node, WAKE, None, at(NS_PER_S))
+        assert len(payloads(sends, "reception")) == 1
+        assert payloads(sends, "video_reception") == payloads(sends, "reception") * informs_driver
+
+
 def test_the_bit_rate_is_requested_with_each_report() -> None:
     """The configured maximum bit rate is sent with every report."""
     node = ReceiverNode(JitterBuffer(), Depacketizer(), 700_000)

@@ -259,6 +259,7 @@ def build_client(
             Depacketizer(),
             config.video.max_bit_rate_bps,
             build_cipher(config),
+            informs_driver=controller.kind == HUMAN,
         ),
         build_driver(session),
         ProbingClockSyncNode(start.mono_ns),

@@ -61,9 +61,9 @@ def drive(
                 run_side(side, client.who, once=False, as_json=as_json, ready={"console": side.console_url})
 
 
-def show_page(url: str, work: Path, *, opens_page: bool) -> None:
-    """Print the page's address, and open the page if this machine has a display."""
-    console.print_message(f"lavt: drive from {url}")
+def show_page(url: str, work: Path, *, opens_page: bool, purpose: str = "drive from") -> None:
+    """Print the page's address with its purpose, and open the page if this machine has a display."""
+    console.print_message(f"lavt: {purpose} {url}")
     if opens_page and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         # The address has the token. As an argument of the browser, other users could read it in the list of processes.
         redirection = work / "console.html"

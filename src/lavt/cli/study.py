@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -37,6 +37,9 @@ def study(
     shows_plan: Annotated[bool, typer.Option("--plan", help="Print the orders of the conditions only.")] = False,
     opens_page: console.BrowserOption = True,
     port: console.PagePortOption = 0,
+    asks_in_page: Annotated[
+        bool, typer.Option("--questions-in-page", help="Ask a person the questions in a page, not in the terminal.")
+    ] = False,
     as_json: console.JsonOption = False,
 ) -> None:
     """Drive a study: participants, balanced conditions, tests.
@@ -71,7 +74,8 @@ def study(
     with reserve_directory(out):
         begin_study(settings, out)
         if is_person:
-            _hold_session(blocks, settings.instructions, out, opens_page=opens_page, port=port)
+            page_settings = PageSettings(port, opens_page, asks_in_page)
+            _hold_session(blocks, settings.instructions, out, page_settings)
         else:
             with console.interruptible(), progress(f"study, results in {out}", remaining) as report_done:
                 result = drive_study(blocks, out, jobs=jobs, on_progress=report_done)
@@ -91,23 +95,40 @@ def _print_plan(blocks: Sequence[Block], *, as_json: bool) -> None:
         console.print_result(f"participant {number}: {', '.join(order)}")
 
 
-def _hold_session(blocks: Sequence[Block], instructions: str, out: Path, *, opens_page: bool, port: int) -> None:
-    """Let a person drive, with texts and questions in the terminal."""
+class PageSettings(NamedTuple):
+    """The port of the pages of a person (0: any), whether to open them, and whether they ask the questions."""
+
+    port: int
+    opens_page: bool
+    asks_questions: bool
+
+
+def _hold_session(blocks: Sequence[Block], instructions: str, out: Path, settings: PageSettings) -> None:
+    """Let a person drive, with texts in the terminal, and with questions there or in a page."""
     from lavt.cli.drive import show_page  # noqa: PLC0415 (only if a person drives)
     from lavt.experiment.runs.plan import PlannedRun  # noqa: PLC0415 (slow: scipy)
     from lavt.experiment.runs.real_run import PersonPage  # noqa: PLC0415 (slow: scipy)
     from lavt.experiment.runs.run import drive_once  # noqa: PLC0415 (slow: scipy)
+    from lavt.experiment.study.questions_page import ask_in_page  # noqa: PLC0415 (only if a person drives)
     from lavt.experiment.study.session import Experimenter, hold_session  # noqa: PLC0415 (slow: scipy)
     from lavt.transport.console.console_link import check_installed  # noqa: PLC0415 (only if a person drives)
 
     check_installed()
     with TemporaryDirectory(prefix="lavt-") as work, console.interruptible():
-        page = PersonPage(port, lambda url: show_page(url, Path(work), opens_page=opens_page))
+
+        def show(url: str, purpose: str = "drive from") -> None:
+            show_page(url, Path(work), opens_page=settings.opens_page, purpose=purpose)
+
+        page = PersonPage(settings.port, show)
 
         def drive(run: PlannedRun, directory: Path) -> Mapping[str, Any]:
             return drive_once(run, directory, page=page).result
 
-        hold_session(blocks, instructions, out, Experimenter(console.print_message, _ask, drive))
+        def ask(title: str) -> tuple[Mapping[str, int], str]:
+            return ask_in_page(title, settings.port, lambda url: show(url, "answer the questions at"))
+
+        experimenter = Experimenter(console.print_message, _ask, drive, ask if settings.asks_questions else None)
+        hold_session(blocks, instructions, out, experimenter)
 
 
 def _ask(question: str) -> str:

@@ -342,7 +342,7 @@ class ConsoleConfig(Section):
     port: int = Field(0, ge=0, le=65535)
     """The TCP port of the page on this machine's loopback addresses; 0: any free port."""
     shows_latency: bool = True
-    """Whether the page shows the measured latencies; `lavt study` hides them from a participant."""
+    """Whether the page shows the measured latencies and lost packets; `lavt study` hides them from a participant."""
 
 
 class ClientConfig(Section):

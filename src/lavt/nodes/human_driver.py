@@ -44,6 +44,7 @@ from lavt.transport.console.page_messages import (
     pack_unit,
     parse_page_message,
 )
+from lavt.transport.rtp.reception_stats import ReceptionSample
 from lavt.transport.video.stamp import rtp_timestamp
 
 STATUS_PERIOD_NS: Final = 50 * NS_PER_MS
@@ -65,7 +66,7 @@ class HumanDriverNode(Commander):
     """The node that drives by the inputs of a person, from one page at a time; other pages watch.
 
     `delays` are those that the person can choose; None: this client cannot change the delays. Without `shows_latency`,
-    the pages show no latencies.
+    the pages show no latencies and no lost packets.
     """
 
     def __init__(
@@ -97,6 +98,7 @@ class HumanDriverNode(Commander):
         """Decoded frames by RTP timestamp."""
         self._arrived: deque[tuple[int, int]] = deque(maxlen=MAX_FRAMES)
         """Times and sizes (bytes) of the access units that arrived in the last second."""
+        self._reception: ReceptionSample | None = None
         self._shown_unit: int | None = None
         """The newest access unit that the driving page has shown, if it has not been decoded here yet."""
         self._sent: deque[tuple[int, int]] = deque(maxlen=MAX_COMMANDS)
@@ -108,6 +110,7 @@ class HumanDriverNode(Commander):
             **self._session_pipelines,
             "access_unit": (("forward", self._forward),),
             "unit_to_decode": reader.stages,
+            "video_reception": (("note", self._note_reception),),
             "view": (("note", self._note_view),),
             "page_opened": (("note", self._open_page),),
             "page_closed": (("note", self._close_page),),
@@ -157,6 +160,9 @@ class HumanDriverNode(Commander):
         self._frames[unit] = FrameStamp(frame.stamp_ns, frame.read_wall_ns)
         if unit == self._shown_unit:
             self._show(unit, now)
+
+    def _note_reception(self, message: Message, _now: Now) -> None:
+        self._reception = message.payload
 
     def _acknowledge(self, page: Peer, ack: PageAck, now: Now) -> list[Send]:
         is_known = self._pages[page].acknowledge(ack.unit)
@@ -385,6 +391,7 @@ class HumanDriverNode(Commander):
             video_ms=None if view is None or not shows else (view.read_wall_ns - view.stamp_ns) / NS_PER_MS,
             round_trip_ms=None if self._round_trip_ns is None or not shows else self._round_trip_ns / NS_PER_MS,
             bit_rate_bps=self._bit_rate_bps(now),
+            lost_share=None if self._reception is None or not shows else self._reception.lost_share,
             delay=None if self._delay is None else (self._delay.video_ms, self._delay.control_ms),
             conditions=self._conditions,
             **vehicle,

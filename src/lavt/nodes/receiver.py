@@ -45,7 +45,8 @@ class ReceiverNode:
 
     Lost packets are recovered from repair packets, if enough of those arrive. Otherwise pictures are in doubt until the
     next complete keyframe. A keyframe is requested at once, and again after each round trip in which none arrives. With
-    each report, the receiver requests a bit rate of at most `max_bit_rate_bps` from the sender.
+    each report, the receiver requests a bit rate of at most `max_bit_rate_bps` from the sender. With `informs_driver`,
+    the driver node gets each sample of the reception, too.
     """
 
     name = "receiver"
@@ -56,6 +57,8 @@ class ReceiverNode:
         depacketizer: Depacketizer,
         max_bit_rate_bps: int | None = None,
         new_cipher: NewCipher = plain_cipher,
+        *,
+        informs_driver: bool = False,
     ) -> None:
         self._counts: Counter[str] = Counter()
         self._jitter_buffer = jitter_buffer
@@ -64,6 +67,7 @@ class ReceiverNode:
         self._reception = Reception(jitter_buffer)
         self._max_bit_rate_bps = max_bit_rate_bps
         self._new_cipher = new_cipher
+        self._informs_driver = informs_driver
         self._path: PathClient | None = None
         self._token = b""
         self._port = 0
@@ -163,7 +167,10 @@ class ReceiverNode:
                 sends += self._report(self._media_ssrc, now_ns)
             if now_ns >= self._sample_ns:
                 self._sample_ns = now_ns + SAMPLE_PERIOD_NS
-                sends.append(Send("reception", self._reception.sample(now_ns)))
+                sample = self._reception.sample(now_ns)
+                sends.append(Send("reception", sample))
+                if self._informs_driver:
+                    sends.append(Send("video_reception", sample))
             if self._repeats_requests():
                 sends += self._request_keyframe(now_ns)
         return OrderedPackets(self._jitter_buffer.expire(now_ns), message.arrived, sends)

@@ -106,6 +106,7 @@ UNRECORDED = frozenset(
         "path_token",
         "access_unit",
         "unit_to_decode",
+        "video_reception",
         "page_opened",
         "page_closed",
         "page_message",
@@ -124,7 +125,7 @@ UNRECORDED = frozenset(
     }
 )
 """Channels that are not recorded: their content is secret, or recorded in another form (truth, access units, inputs of
-a person, samples of clocks and network queues)."""
+a person, samples of clocks, network queues and reception)."""
 
 
 def record(recorder: Recorder, channel: str, payload: Any, now: Now) -> None:

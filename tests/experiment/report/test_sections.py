@@ -81,6 +81,8 @@ NEW_CONDITION_KEYS = (
     "max_m",
     "picture_age_ms",
     "age_at_actuation_ms",
+    "page_decoded_ms",
+    "page_shown_ms",
     "stages_ms",
     "survival",
 )
@@ -270,6 +272,19 @@ def test_the_legend_explains_the_frame_age(tmp_path: Path) -> None:
         summary = summarize([run_of("L0", picture_age_ms=age)], None)
         text = text_of("".join(first_parts(report_of(summary, tmp_path), [])))
         assert ("since the stamp of the frame from which the command in force was made" in text) == (age is not None)
+
+
+def test_the_latencies_of_the_page_are_those_of_a_person(tmp_path: Path) -> None:
+    """If a person drove, the table of latencies has those of the page with their bounds; other reports do not."""
+    page = {"p5": 20.0, "p50": 30.0, "p95": 40.0, "bound": 0.31, "n": 10, "max": 90.0}
+    for name, run in (("nobody", run_of("L0")), ("person", run_of("L0", page_decoded_ms=page, page_shown_ms=page))):
+        (tmp_path / name).mkdir()
+        text = text_of("".join(latency_table_parts(report_of(summarize([run], None), tmp_path / name))))
+        assert ("stamp to shown in the page" in text) == (name == "person")
+        assert ("from which a person drives" in text) == (name == "person")
+    (row,) = csv_rows(tmp_path / "person" / "tables" / "conditions_virtual_latency.csv")
+    for title in ("stamp to decoded in the page ms", "stamp to shown in the page ms"):
+        assert [row[f"{title}{part}"] for part in (" p50", " bound", ", maximum")] == ["30.0", "0.31", "90.0"]
 
 
 def test_other_conditions_are_not_compared_with_the_paper(tmp_path: Path) -> None:

@@ -247,6 +247,17 @@ def test_the_bound_of_a_condition_is_the_largest() -> None:
     assert (condition["tau_v_ms"]["bound"], condition["tau_c_ms"]["bound"]) == (0.8, None)
 
 
+def test_the_latencies_of_the_page_are_summarized() -> None:
+    """Runs without a person do not count; the others give medians of percentiles, the largest maximum and bound."""
+    page = {"p5": 20.0, "p50": 30.0, "p95": 40.0, "bound": 0.3, "n": 10, "max": 90.0}
+    nobody = {"p5": None, "p50": None, "p95": None, "bound": None, "n": 0, "max": None}
+    other = {**page, "p50": 50.0, "bound": 0.5, "max": 60.0}
+    runs = [run(page_shown_ms=page), run(page_shown_ms=nobody), run(page_shown_ms=other), run()]
+    condition = summarize(runs, SPEED)["conditions"]["L0"]
+    assert condition["page_shown_ms"] == {**page, "p50": 40.0, "bound": 0.5, "n": 20}
+    assert condition["page_decoded_ms"] == nobody
+
+
 def test_every_value_is_defined_in_the_documentation() -> None:
     """`docs/metrics.md` has each key of the summary, of a condition and of a contrast."""
     page = (Path(__file__).parents[3] / "docs" / "metrics.md").read_text()

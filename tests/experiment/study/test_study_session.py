@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ from lavt.config import StudyConfig
 from lavt.config_file import load_config, shipped
 from lavt.experiment.runs.plan import PlannedRun
 from lavt.experiment.runs.run import RESULT
-from lavt.experiment.study.answers import read_answers
+from lavt.experiment.study.answers import SCALES, read_answers
 from lavt.experiment.study.session import Experimenter, hold_session
 from lavt.experiment.study.study_plan import Block, plan_participant
 
@@ -30,9 +30,10 @@ class Session:
         """The results of the next drives; then all are completed and valid."""
         self._answers: Iterator[str] = iter(answers)
 
-    def hold(self) -> None:
+    def hold(self, ask_in_page: Callable[[str], tuple[dict[str, int], str]] | None = None) -> None:
         """Hold the session until the prepared answers are used up."""
-        hold_session(self.blocks, "Keep your lane.", self.out, Experimenter(self.texts.append, self._ask, self._drive))
+        experimenter = Experimenter(self.texts.append, self._ask, self._drive, ask_in_page)
+        hold_session(self.blocks, "Keep your lane.", self.out, experimenter)
 
     def _ask(self, question: str) -> str:
         self.texts.append(question)
@@ -63,6 +64,20 @@ def test_a_session_drives_all_blocks_and_keeps_the_answers(tmp_path: Path) -> No
     ]
     assert answers[0]["driver"] == "human"
     assert session.texts.count("Keep your lane.") == 2
+
+
+def test_the_questions_can_be_asked_in_a_page(tmp_path: Path) -> None:
+    """With a page, the terminal asks for the drives only, and the answers of each block are those of the page."""
+    session, titles = Session(tmp_path, *[ENTER] * 4), []
+
+    def ask_in_page(title: str) -> tuple[dict[str, int], str]:
+        titles.append(title)
+        return dict.fromkeys(SCALES, 10 * len(titles)), "late"
+
+    session.hold(ask_in_page)
+    assert titles == ["Questions about block 1 of 2", "Questions about block 2 of 2"]
+    answers = read_answers(tmp_path)
+    assert [(entry["raw_tlx"], entry["comment"]) for entry in answers] == [(10.0, "late"), (20.0, "late")]
 
 
 def test_the_participant_does_not_learn_the_condition(tmp_path: Path) -> None:

@@ -134,6 +134,20 @@ def test_reordered_late_and_duplicate() -> None:
     assert losses(stream, 52 * NS_PER_MS) == (5, 0.0, -1)
 
 
+def test_the_share_of_lost_packets() -> None:
+    """Of five expected packets, one is recovered and one is lost, a fifth; its late arrival is no expected packet."""
+    stream = ReceivedStream()
+    stream.start(0, 2)
+    stream.arrive(4, 20 * NS_PER_MS)
+    stream.recover(3, 21 * NS_PER_MS)
+    stream.jitter_buffer.expire(30 * NS_PER_MS)
+    assert stream.reception.sample(30 * NS_PER_MS).lost_share == 1 / 5
+    stream.arrive(2, 31 * NS_PER_MS)
+    assert stream.reception.sample(32 * NS_PER_MS).lost_share is None
+    stream.arrive(5, 40 * NS_PER_MS)
+    assert stream.reception.sample(41 * NS_PER_MS).lost_share == 0.0
+
+
 PACKET_FATES = {
     "arrives": [("arrive", 0)],
     "twice": [("arrive", 0), ("arrive", 2)],

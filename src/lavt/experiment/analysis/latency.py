@@ -5,7 +5,8 @@ clock.
 
 `frames` are rows of the server's channel `frame`, one for each stamped frame. `received_frames` are rows of the
 client's channel `picture`, one for each frame that the client received and tried to decode. `command_verdicts` are rows
-of the server's channel `admission`, one for each command that reached the gate.
+of the server's channel `admission`, one for each command that reached the gate. `page_pictures` are rows of the
+client's channel `page_picture`, one for each frame that the page of the person who drives has drawn.
 """
 
 from __future__ import annotations
@@ -76,6 +77,26 @@ def video_latency_ns(received_frames: Table, offset: ClockOffset) -> IntArray:
     is_known = received_frames.flags("readable") & (received_frames.ints("read_wall_ns") != MISSING)
     readable = received_frames.where(is_known)
     return offset.to_server_ns(readable.ints("read_wall_ns")) - readable.ints("stamp_ns")
+
+
+def page_pictures_of(page_pictures: Table, frames: Table) -> Table:
+    """Return the first row of each of `frames` that the page of the person who drives has drawn.
+
+    Rows without all of their times are left out.
+    """
+    names = ("stamp_ns", "decoded_wall_ns", "shown_wall_ns", "bound_ns")
+    is_known = np.all([page_pictures.ints(name) != MISSING for name in names], axis=0)
+    known = page_pictures.where(is_known & np.isin(page_pictures.ints("stamp_ns"), frames.ints("stamp_ns")))
+    _, first = np.unique(known.ints("stamp_ns"), return_index=True)
+    return known.where(np.sort(first))
+
+
+def page_latency_ns(page_pictures: Table, time: str, offset: ClockOffset) -> IntArray:
+    """Return the times between writing the stamp of each picture and its `time` in the page.
+
+    `time` is a field of the channel `page_picture` on the client's wall clock. Both times are on the server's.
+    """
+    return offset.to_server_ns(page_pictures.ints(time)) - page_pictures.ints("stamp_ns")
 
 
 def control_latency_ns(command_verdicts: Table, offset: ClockOffset, began_ns: int, ended_ns: int) -> IntArray:

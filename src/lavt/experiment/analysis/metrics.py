@@ -19,6 +19,8 @@ from lavt.experiment.analysis.latency import (
     frames_with_commands,
     frames_within,
     latency_sum_error_ns,
+    page_latency_ns,
+    page_pictures_of,
     percentiles_ms,
     received_frames_of,
     video_latency_ns,
@@ -136,12 +138,29 @@ def _latencies(
         "age_at_actuation_ms": percentiles_ms(ages_at_actuation_ns(all_frames, command_verdicts, began_ns, ended_ns)),
         "tau_v_ms": _with_bound(percentiles_ms(tau_v_ns), bound_ms),
         "tau_c_ms": _with_bound(percentiles_ms(tau_c_ns), bound_ms),
+        **_page_latencies(client, frames, clocks),
         "stages_ms": stage_percentiles(server, client, frames, tau_c_ns, clocks.offset),
         "frames_sent": len(frames),
         "frames_decoded": len(decoded),
         "frames_unreadable": int(np.sum(~decoded.flags("readable"))),
     }
     return entry, closure_p95_ms
+
+
+def _page_latencies(client: Record, frames: Table, clocks: RunClocks) -> dict[str, Any]:
+    """Return the latencies from a frame's stamp to the page of the person who drives; `n` is 0 if no person drives."""
+    pictures = page_pictures_of(client.table("page_picture"), frames)
+    bound_ms = clocks.bound_ms
+    if bound_ms is not None and len(pictures):
+        bound_ms += float(pictures.ints("bound_ns").max()) / NS_PER_MS
+    entry = {}
+    for name in ("decoded", "shown"):
+        times_ns = np.zeros(0, np.int64)
+        if clocks.offset is not None:
+            times_ns = page_latency_ns(pictures, f"{name}_wall_ns", clocks.offset)
+        max_ms = float(times_ns.max()) / NS_PER_MS if len(times_ns) else None
+        entry[f"page_{name}_ms"] = {**_with_bound(percentiles_ms(times_ns), bound_ms), "max": max_ms}
+    return entry
 
 
 def _spread_ms(durations_ns: IntArray) -> float | None:

@@ -26,6 +26,10 @@ LATENCIES_NOTE = (
     "Each latency is given in ms as median ± bound of the clock error (p5 to p95). The loop latency, from a frame's "
     "stamp to the application of its command, is measured on the server's clock alone, so it has no such bound."
 )
+PAGE_NOTE = (
+    " The page is the one from which a person drives. A picture is shown when the browser begins to make the picture "
+    "of the screen with it; the screen itself comes later. The bound includes that of the page's clock."
+)
 PAPER_NOTE = "The paper did not measure the loop latency; the table shows the sum of its median τ video and τ control."
 OWN_LANE_NOTE = (
     " A run is completed in its own lane if the middle of the rear axle was in the lane of the route all the time, or "
@@ -79,7 +83,9 @@ def latency_table_parts(report: ReportContext) -> Parts:
     if not report.kinds:
         return []
     has_paper = any(report.paper(conditions) for conditions in report.kinds.values())
-    return [*_tables(report, "latency", latency_table, PAPER_NOTE * has_paper), _note(LATENCIES_NOTE)]
+    entries = [entry for conditions in report.kinds.values() for entry in conditions.values()]
+    page = PAGE_NOTE * any((entry.get("page_shown_ms") or {}).get("n") for entry in entries)
+    return [*_tables(report, "latency", latency_table, PAPER_NOTE * has_paper), _note(LATENCIES_NOTE + page)]
 
 
 def error_table_parts(report: ReportContext) -> Parts:

@@ -74,6 +74,8 @@ def summarize_condition(all_runs: Sequence[Run], distances: CommonDistances) -> 
         "injected_ms": _injected_ms(all_runs),
         "tau_v_ms": _latency([run["tau_v_ms"] for run in runs], bounded=True),
         "tau_c_ms": _latency([run["tau_c_ms"] for run in runs], bounded=True),
+        "page_decoded_ms": _page_latency(runs, "page_decoded_ms"),
+        "page_shown_ms": _page_latency(runs, "page_shown_ms"),
         "loop_ms": _latency([run["loop_ms"] for run in runs]),
         "picture_age_ms": _picture_age_ms(runs),
         "age_at_actuation_ms": _latency([run.get("age_at_actuation_ms") or {"n": 0} for run in runs]),
@@ -210,6 +212,12 @@ def _latency(entries: Sequence[Mapping[str, Any]], *, bounded: bool = False) -> 
         summary["bound"] = max(bounds) if bounds and None not in bounds else None
     summary["n"] = sum(entry["n"] for entry in known)
     return summary
+
+
+def _page_latency(runs: Sequence[Run], name: str) -> dict[str, Any]:
+    """Return the summary of a latency with a bound and a maximum; the maximum is the largest of all runs."""
+    known = [run[name] for run in runs if (run.get(name) or {}).get("n")]
+    return {**_latency(known, bounded=True), "max": max((entry["max"] for entry in known), default=None)}
 
 
 def _picture_age_ms(runs: Sequence[Run]) -> dict[str, float | None]:

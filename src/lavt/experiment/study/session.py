@@ -28,6 +28,8 @@ class Experimenter:
     ask: Callable[[str], str]
     drive: Callable[[PlannedRun, Path], Mapping[str, Any]]
     """Drives a run into its directory, and returns its result."""
+    ask_in_page: Callable[[str], tuple[Mapping[str, int], str]] | None = None
+    """Asks the questions about a block in a page with this title, and returns scales and comment; None: `ask` does."""
 
 
 def hold_session(blocks: Sequence[Block], instructions: str, out: Path, experimenter: Experimenter) -> None:
@@ -47,8 +49,7 @@ def hold_session(blocks: Sequence[Block], instructions: str, out: Path, experime
             if is_finished(directory):
                 continue
             _drive(run, directory, f"Drive {number} of {len(block.runs)}", experimenter)
-        scales = _ask_scales(experimenter)
-        comment = experimenter.ask("Comment on this block (one line, or only Enter):").strip()
+        scales, comment = _ask_about(f"Questions about block {block.number} of {len(blocks)}", experimenter)
         write_answers(out, block, scales, comment)
         if block is not blocks[-1]:
             experimenter.say("Take a break if you like. Ctrl-C ends the session, and the same command continues it.")
@@ -83,6 +84,14 @@ def _set_aside(directory: Path) -> None:
     aside.mkdir(exist_ok=True)
     number = len(list(aside.glob(f"{directory.name}.*"))) + 1
     directory.rename(aside / f"{directory.name}.{number}")
+
+
+def _ask_about(title: str, experimenter: Experimenter) -> tuple[Mapping[str, int], str]:
+    """Ask the questions about a block; return the scales and the comment."""
+    if experimenter.ask_in_page is not None:
+        return experimenter.ask_in_page(title)
+    scales = _ask_scales(experimenter)
+    return scales, experimenter.ask("Comment on this block (one line, or only Enter):").strip()
 
 
 def _ask_scales(experimenter: Experimenter) -> dict[str, int]:

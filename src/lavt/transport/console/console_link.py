@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from http import HTTPStatus
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from lavt.clock import Clock
@@ -22,7 +23,14 @@ from lavt.errors import UserError, WorkError
 from lavt.node import Send
 from lavt.transport.console.message_limit import MessageLimit, Verdict
 from lavt.transport.console.page_messages import MAX_PAGE_MESSAGE_BYTES
-from lavt.transport.console.site import HEADERS, TOO_MANY_MESSAGES, TOO_MANY_PAGES, ConsoleSite, page_headers
+from lavt.transport.console.site import (
+    HEADERS,
+    PAGE_FILES,
+    TOO_MANY_MESSAGES,
+    TOO_MANY_PAGES,
+    ConsoleSite,
+    page_headers,
+)
 from lavt.transport.console.strangers import Strangers
 
 if TYPE_CHECKING:
@@ -58,18 +66,27 @@ class ConsoleLink:
     """A web server for the page from which a person drives, at 127.0.0.1 and, if this machine has it, ::1.
 
     `port` 0 is any free port. Messages of pages are delivered on the channels `page_opened`, `page_message` and
-    `page_closed`, after the page has shown the token. Raises `UserError` if the port cannot be opened or `websockets`
-    is missing.
+    `page_closed`, after the page has shown the token. The page has the files in `folder`; a longer message than
+    `max_message_bytes` closes it. Raises `UserError` if the port cannot be opened or `websockets` is missing.
     """
 
-    def __init__(self, clock: Clock, token: str, port: int = 0) -> None:
+    def __init__(
+        self,
+        clock: Clock,
+        token: str,
+        port: int = 0,
+        *,
+        folder: Path = PAGE_FILES,
+        max_message_bytes: int = MAX_PAGE_MESSAGE_BYTES,
+    ) -> None:
         self.counts: Counter[str] = Counter()
         self._websockets = _import_websockets()
         self._clock = clock
         self._sockets = _open_sockets(port)
         self.port: int = self._sockets[0].getsockname()[1]
         self.url = f"http://127.0.0.1:{self.port}/#{token}"
-        self._site = ConsoleSite(self.port, token)
+        self._site = ConsoleSite(self.port, token, folder)
+        self._max_message_bytes = max_message_bytes
         self._loop = asyncio.new_event_loop()
         self._ends: asyncio.Future[None] = self._loop.create_future()
         """Done when the link is closed, or has failed."""
@@ -137,7 +154,7 @@ class ConsoleLink:
             create_connection=_limited_connection(self._strangers, self.counts),
             process_request=self._process_request,
             compression=None,
-            max_size=MAX_PAGE_MESSAGE_BYTES,
+            max_size=self._max_message_bytes,
             open_timeout=HELLO_TIMEOUT_S,
             close_timeout=CLOSE_TIMEOUT_S,
             server_header=None,

@@ -177,7 +177,7 @@ class PageStatus(Struct, frozen=True, kw_only=True):
     command: tuple[float, float, float] | None
     """Steering (rad), throttle and brake of the last command; None: no command is sent."""
     shows_latency: bool = True
-    """Whether the page shows latencies."""
+    """Whether the page shows latencies and lost packets, which would tell the condition."""
     video_ms: float | None
     """From the stamp until the client had decoded the frame, by the wall clocks of both machines, not corrected for
     their offset."""
@@ -185,6 +185,8 @@ class PageStatus(Struct, frozen=True, kw_only=True):
     """From a command to the first state in which the vehicle reports it as applied."""
     bit_rate_bps: int
     """Bit rate of the access units that arrived in the last second."""
+    lost_share: float | None
+    """Share of the video's packets that were lost after repair in the last second; None: unknown, or none was due."""
     delay: tuple[float, float] | None
     """The injected delays of video and control in ms; None: this client cannot inject any."""
     conditions: tuple[tuple[str, float, float], ...] = ()

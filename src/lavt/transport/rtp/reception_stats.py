@@ -41,6 +41,12 @@ class ReceptionSample(Struct, frozen=True):
     round_trip_us: int | None
     """Last known round-trip time, from a report to the sender and the sender's answer to this report."""
 
+    @property
+    def lost_share(self) -> float | None:
+        """The share of the expected packets that were given up (after repair); None if no packet was expected."""
+        expected = self.packets + self.lost_before_repair
+        return self.lost_after_repair / expected if expected > 0 else None
+
 
 class Reception:
     """Reception statistics of a stream; the losses come from the counters of its `jitter_buffer`.

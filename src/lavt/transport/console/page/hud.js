@@ -72,6 +72,7 @@ export function showStatus(status, input, video, age_ms, isStopPending, notice) 
   byId("shown_ms").textContent = ms(video.shown_ms);
   byId("age_ms").textContent = ms(age_ms);
   byId("bit_rate").textContent = `${(status.bit_rate_bps / 1e6).toFixed(1)} Mb/s`;
+  byId("lost_share").textContent = status.lost_share === null ? "–" : `${(status.lost_share * 100).toFixed(1)} %`;
   byId("errors").textContent = video.errors;
   history.add(age_ms);
   byId("stop").className = isPast(status) ? "" : status.emergency_stop;
