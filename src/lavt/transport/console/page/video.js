@@ -92,18 +92,25 @@ export class Video {
       this.shown += 1;
       this.#acknowledge(unit);
       const times = { unit, arrived_us, decoded_us, drawn_us: pageTime_us() };
-      const shown = new Promise((resolve) => requestAnimationFrame(() => resolve(pageTime_us())));
+      const shown = this.#untilShown(this.shown);
       const stamp = await readStamp(frame);
       frame.close(); // a page that is hidden shows nothing, and must not keep the decoder's pictures
-      if (stamp !== null && document.visibilityState === "visible") {
-        this.#report({ ...times, stamp, shown_us: await shown });
-      }
+      const shown_us = await shown;
+      if (stamp !== null && shown_us !== null) this.#report({ ...times, stamp, shown_us });
     } catch {
       if (isDrawn) this.errors += 1;
       else this.#fail(); // it was not acknowledged
     } finally {
       frame.close();
     }
+  }
+
+  // Return when the picture with this number appears; null if the page is hidden, or a newer one is drawn over it first.
+  #untilShown(number) {
+    if (document.visibilityState !== "visible") return null;
+    return new Promise((resolve) =>
+      requestAnimationFrame(() => resolve(number === this.shown ? pageTime_us() : null)),
+    );
   }
 
   #fail() {
