@@ -18,6 +18,7 @@ from lavt.recording.output_directory import reserve_directory
 
 if TYPE_CHECKING:
     from lavt.experiment.analysis.drive_data import DriveData
+    from lavt.experiment.study.answers import Store
     from lavt.experiment.study.study_plan import Block
 
 
@@ -124,8 +125,8 @@ def _hold_session(blocks: Sequence[Block], instructions: str, out: Path, setting
         def drive(run: PlannedRun, directory: Path) -> Mapping[str, Any]:
             return drive_once(run, directory, page=page).result
 
-        def ask(title: str) -> tuple[Mapping[str, int], str]:
-            return ask_in_page(title, settings.port, lambda url: show(url, "answer the questions at"))
+        def ask(title: str, store: Store) -> None:
+            ask_in_page(title, settings.port, lambda url: show(url, "answer the questions at"), store)
 
         experimenter = Experimenter(console.print_message, _ask, drive, ask if settings.asks_questions else None)
         hold_session(blocks, instructions, out, experimenter)

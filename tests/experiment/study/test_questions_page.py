@@ -5,14 +5,19 @@ from __future__ import annotations
 import json
 import queue
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
+from lavt.clock import pause
+from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.errors import BadMessage, UserError
+from lavt.experiment.study import questions_page
 from lavt.experiment.study.answers import SCALES
 from lavt.experiment.study.questions_page import MAX_COMMENT_CHARACTERS, PAGE_FILES, ask_in_page, parse_answers
 from lavt.transport.console.page_messages import PAGE_VERSION
@@ -25,13 +30,26 @@ class Participant:
 
     def __init__(self) -> None:
         self.answers: list[Any] = []
+        """The stored answers: scales and comment."""
+        self.error: BaseException | None = None
+        self.store_error: Exception | None = None
+        """Raised when answers are to be stored."""
         urls: queue.Queue[str] = queue.Queue()
         self._pages = ExitStack()
-        self._thread = threading.Thread(
-            target=lambda: self.answers.append(ask_in_page("Block 1", 0, urls.put)), daemon=True
-        )
+        self._thread = threading.Thread(target=self._ask, args=(urls.put,), daemon=True)
         self._thread.start()
         self._site, _, self._token = urls.get(timeout=10).partition("/#")
+
+    def _ask(self, show: Callable[[str], None]) -> None:
+        try:
+            ask_in_page("Block 1", 0, show, self._store)
+        except OSError as error:
+            self.error = error
+
+    def _store(self, scales: Mapping[str, int], comment: str) -> None:
+        if self.store_error is not None:
+            raise self.store_error
+        self.answers.append((scales, comment))
 
     def open(self) -> tuple[ClientConnection, dict[str, Any]]:
         """Open a page; return its connection and the questions."""
@@ -54,6 +72,13 @@ def receive(page: ClientConnection) -> dict[str, Any]:
     return message
 
 
+def send_often(page: ClientConnection) -> None:
+    """Send a message every 10 ms for 4 s."""
+    for _ in range(400):
+        page.send("x")
+        pause(10 * NS_PER_MS)
+
+
 def answers(**changes: Any) -> str:
     return json.dumps({"type": "answers", "scales": SCALES_OF_ANSWER, "comment": "", **changes})
 
@@ -62,7 +87,7 @@ def answers(**changes: Any) -> str:
 def participant() -> Iterator[Participant]:
     participant = Participant()
     yield participant
-    if not participant.answers:
+    if not participant.answers and participant.error is None:
         page, _ = participant.open()
         page.send(answers())
         page.close()
@@ -80,9 +105,38 @@ def test_the_page_asks_and_returns_the_answers(participant: Participant) -> None
     assert (rejected["type"], "effort" in rejected["notice"]) == ("rejected", True)
     page.send(answers(comment=" It was\nlate. "))
     assert receive(page)["type"] == "thanks"
+    assert participant.answers == [(SCALES_OF_ANSWER, "It was late.")], "the answers were stored before"
     page.close()
     participant.wait()
-    assert participant.answers == [(SCALES_OF_ANSWER, "It was late.")]
+    assert len(participant.answers) == 1
+
+
+def test_answers_that_cannot_be_stored_get_no_thanks(participant: Participant) -> None:
+    """If the answers cannot be stored, the page is closed without thanks, and the error is raised."""
+    participant.store_error = OSError("the disk is full")
+    page, _ = participant.open()
+    page.send(answers())
+    with pytest.raises(ConnectionClosed):
+        page.recv(timeout=10)
+    participant.wait()
+    assert participant.error is participant.store_error
+
+
+def test_a_page_that_stays_open_does_not_delay_the_end(
+    participant: Participant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After the thanks, neither the page nor messages of other pages make the wait longer."""
+    now_ns = [0]
+    clock = SimpleNamespace(now=lambda: Now(now_ns[0], 0))
+    monkeypatch.setattr(questions_page, "MachineClock", lambda: clock)
+    other, _ = participant.open()
+    page, _ = participant.open()
+    page.send(answers())
+    assert receive(page)["type"] == "thanks"
+    now_ns[0] = round(questions_page.THANKS_S * NS_PER_S)
+    with pytest.raises(ConnectionClosed):
+        send_often(other)
+    participant.wait()
 
 
 def test_the_longest_comment_is_accepted(participant: Participant) -> None:

@@ -10,7 +10,7 @@ from lavt.config import StudyConfig
 from lavt.config_file import load_config, shipped
 from lavt.experiment.runs.plan import PlannedRun
 from lavt.experiment.runs.run import RESULT
-from lavt.experiment.study.answers import SCALES, read_answers
+from lavt.experiment.study.answers import SCALES, Store, read_answers
 from lavt.experiment.study.session import Experimenter, hold_session
 from lavt.experiment.study.study_plan import Block, plan_participant
 
@@ -30,7 +30,7 @@ class Session:
         """The results of the next drives; then all are completed and valid."""
         self._answers: Iterator[str] = iter(answers)
 
-    def hold(self, ask_in_page: Callable[[str], tuple[dict[str, int], str]] | None = None) -> None:
+    def hold(self, ask_in_page: Callable[[str, Store], None] | None = None) -> None:
         """Hold the session until the prepared answers are used up."""
         experimenter = Experimenter(self.texts.append, self._ask, self._drive, ask_in_page)
         hold_session(self.blocks, "Keep your lane.", self.out, experimenter)
@@ -70,9 +70,9 @@ def test_the_questions_can_be_asked_in_a_page(tmp_path: Path) -> None:
     """With a page, the terminal asks for the drives only, and the answers of each block are those of the page."""
     session, titles = Session(tmp_path, *[ENTER] * 4), []
 
-    def ask_in_page(title: str) -> tuple[dict[str, int], str]:
+    def ask_in_page(title: str, store: Store) -> None:
         titles.append(title)
-        return dict.fromkeys(SCALES, 10 * len(titles)), "late"
+        store(dict.fromkeys(SCALES, 10 * len(titles)), "late")
 
     session.hold(ask_in_page)
     assert titles == ["Questions about block 1 of 2", "Questions about block 2 of 2"]

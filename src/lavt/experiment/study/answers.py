@@ -7,7 +7,7 @@ Index, 20 Years Later, Proceedings of the Human Factors and Ergonomics Society 5
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,9 @@ SCALES = {
 }
 """The scales with their questions. In all of them 0 is the least load, so 0 of `performance` is a perfect one."""
 STEP = 5
+
+Store = Callable[[Mapping[str, int], str], None]
+"""Stores the scales and the comment of a block."""
 
 
 def raw_tlx(scales: Mapping[str, int]) -> float:

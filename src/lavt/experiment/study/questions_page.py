@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Annotated, Any, Final, Literal, NamedTuple
@@ -12,8 +13,9 @@ from msgspec import Meta, Struct
 
 from lavt.assembly.entropy import MachineEntropy
 from lavt.clock import MachineClock
+from lavt.domain import NS_PER_S
 from lavt.errors import BadMessage, UserError
-from lavt.experiment.study.answers import SCALES, STEP, raw_tlx
+from lavt.experiment.study.answers import SCALES, STEP, Store, raw_tlx
 from lavt.node import Send
 from lavt.runtime.thread_failures import fail_on_thread_errors
 from lavt.transport.console.console_link import ConsoleLink
@@ -22,9 +24,9 @@ PAGE_FILES: Final = Path(__file__).parent / "page"
 TOKEN_BYTES: Final = 16
 MAX_COMMENT_CHARACTERS: Final = 1000
 MAX_MESSAGE_BYTES: Final = 8192
-"""The answers are smaller, also if JSON escapes each character of the comment."""
+"""The answers are smaller: the page counts UTF-16 units, each of which takes at most 6 bytes."""
 THANKS_S: Final = 2.0
-"""How long the page may take to show that its answers have arrived."""
+"""How long the page may take to show that its answers are stored."""
 
 
 class PageAnswers(Struct, frozen=True, tag="answers", forbid_unknown_fields=True):
@@ -52,13 +54,14 @@ class _FromLink(NamedTuple):
     page: Any
 
 
-THANKS: Final = _ToPage("thanks", "Thank you, your answers have arrived. Close this page.")
+THANKS: Final = _ToPage("thanks", "Thank you, your answers are stored. Close this page.")
 
 
-def ask_in_page(title: str, port: int, show: Callable[[str], None]) -> tuple[Mapping[str, int], str]:
-    """Serve the page of the questions at `port` (0: any), `show` its address, and return the answers: scales, comment.
+def ask_in_page(title: str, port: int, show: Callable[[str], None], store: Store) -> None:
+    """Serve the page of the questions at `port` (0: any), `show` its address, and `store` the answers.
 
-    The first valid answers count, from whichever page. Raises `UserError` if the port cannot be opened.
+    The first valid answers count, from whichever page; the page learns of it when they are stored. Raises `UserError`
+    if the port cannot be opened.
     """
     arrived: SimpleQueue[_FromLink | BaseException] = SimpleQueue()
     token = MachineEntropy().token(TOKEN_BYTES).hex()
@@ -67,14 +70,18 @@ def ask_in_page(title: str, port: int, show: Callable[[str], None]) -> tuple[Map
         link.start(lambda channel, payload, _now, page: arrived.put(_FromLink(channel, payload, page)))
         try:
             show(link.url)
-            return _answers(title, link, arrived)
+            page, answers = _first_answers(title, link, arrived)
+            store(answers.scales, " ".join(answers.comment.split()))
+            _send(link, page, THANKS)
+            _wait_until_closed(page, arrived)
         finally:
             link.close()
 
 
-def _answers(
+def _first_answers(
     title: str, link: ConsoleLink, arrived: SimpleQueue[_FromLink | BaseException]
-) -> tuple[Mapping[str, int], str]:
+) -> tuple[Any, PageAnswers]:
+    """Send the questions to each page; return the first valid answers, and the page that has sent them."""
     while True:
         message = arrived.get()
         if isinstance(message, BaseException):
@@ -83,13 +90,9 @@ def _answers(
             _send(link, message.page, _ToPage("questions", title=title, questions=tuple(SCALES.items())))
         elif message.channel == "page_message":
             try:
-                answers = parse_answers(message.payload)
+                return message.page, parse_answers(message.payload)
             except (BadMessage, UserError) as error:
                 _send(link, message.page, _ToPage("rejected", f"The answers were not accepted: {error}."))
-                continue
-            _send(link, message.page, THANKS)
-            _wait_until_closed(message.page, arrived)
-            return answers.scales, " ".join(answers.comment.split())
 
 
 def parse_answers(data: str | bytes) -> PageAnswers:
@@ -107,11 +110,11 @@ def _send(link: ConsoleLink, page: Any, message: _ToPage) -> None:
 
 
 def _wait_until_closed(page: Any, arrived: SimpleQueue[_FromLink | BaseException]) -> None:
-    """Wait until the page has closed its connection, but no longer than `THANKS_S` for any message."""
-    try:
-        while True:
-            message = arrived.get(timeout=THANKS_S)
+    """Wait until the page has closed its connection, but no longer than `THANKS_S`."""
+    clock = MachineClock()
+    end_ns = clock.now().mono_ns + round(THANKS_S * NS_PER_S)
+    with suppress(Empty):
+        while (left_ns := end_ns - clock.now().mono_ns) > 0:
+            message = arrived.get(timeout=left_ns / NS_PER_S)
             if isinstance(message, BaseException) or (message.channel, message.page) == ("page_closed", page):
                 return
-    except Empty:
-        return

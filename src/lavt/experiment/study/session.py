@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from lavt.errors import UserError
 from lavt.experiment.runs.plan import PlannedRun
-from lavt.experiment.study.answers import SCALES, STEP, check_scale, has_answers, write_answers
+from lavt.experiment.study.answers import SCALES, STEP, Store, check_scale, has_answers, write_answers
 from lavt.experiment.study.study_plan import Block
 from lavt.experiment.sweep.sweep import remove_all_unfinished
 from lavt.experiment.sweep.workers import is_finished
@@ -28,8 +29,8 @@ class Experimenter:
     ask: Callable[[str], str]
     drive: Callable[[PlannedRun, Path], Mapping[str, Any]]
     """Drives a run into its directory, and returns its result."""
-    ask_in_page: Callable[[str], tuple[Mapping[str, int], str]] | None = None
-    """Asks the questions about a block in a page with this title, and returns scales and comment; None: `ask` does."""
+    ask_in_page: Callable[[str, Store], None] | None = None
+    """Asks the questions about a block in a page with this title, and stores the answers; None: `ask` does."""
 
 
 def hold_session(blocks: Sequence[Block], instructions: str, out: Path, experimenter: Experimenter) -> None:
@@ -49,8 +50,8 @@ def hold_session(blocks: Sequence[Block], instructions: str, out: Path, experime
             if is_finished(directory):
                 continue
             _drive(run, directory, f"Drive {number} of {len(block.runs)}", experimenter)
-        scales, comment = _ask_about(f"Questions about block {block.number} of {len(blocks)}", experimenter)
-        write_answers(out, block, scales, comment)
+        title = f"Questions about block {block.number} of {len(blocks)}"
+        _ask_about(title, experimenter, partial(write_answers, out, block))
         if block is not blocks[-1]:
             experimenter.say("Take a break if you like. Ctrl-C ends the session, and the same command continues it.")
     experimenter.say("The participant has driven all blocks.")
@@ -86,12 +87,13 @@ def _set_aside(directory: Path) -> None:
     directory.rename(aside / f"{directory.name}.{number}")
 
 
-def _ask_about(title: str, experimenter: Experimenter) -> tuple[Mapping[str, int], str]:
-    """Ask the questions about a block; return the scales and the comment."""
+def _ask_about(title: str, experimenter: Experimenter, store: Store) -> None:
+    """Ask the questions about a block, and store the answers."""
     if experimenter.ask_in_page is not None:
-        return experimenter.ask_in_page(title)
+        experimenter.ask_in_page(title, store)
+        return
     scales = _ask_scales(experimenter)
-    return scales, experimenter.ask("Comment on this block (one line, or only Enter):").strip()
+    store(scales, experimenter.ask("Comment on this block (one line, or only Enter):").strip())
 
 
 def _ask_scales(experimenter: Experimenter) -> dict[str, int]:
