@@ -171,8 +171,12 @@ class SoftwareCarProcess:
 
     def unexpected_release(self, braked_ns: int, message: str) -> Exception:
         """Return the exception for a kit that got no command in time although the test had caused no fault."""
-        failure = self.verdict(message, braked_ns - KIT_LOOKBACK_MS * NS_PER_MS, braked_ns)
+        since_ns = braked_ns - KIT_LOOKBACK_MS * NS_PER_MS
+        failure = self.verdict(message, since_ns, braked_ns)
         if self.stalls is not None:
+            # Several stalls before the release excuse it like one that is as long as all of them.
+            share = self.stall_ms / KIT_LOOKBACK_MS
+            failure = excuse_slow_machine(failure, self.stalls, since_ns, braked_ns, share=share)
             since_ns = braked_ns - SLOW_MACHINE_LOOKBACK_MS * NS_PER_MS
             failure = excuse_slow_machine(failure, self.stalls, since_ns, braked_ns)
         return self.explain(failure, braked_ns)

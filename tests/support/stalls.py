@@ -348,11 +348,13 @@ class SharedResult(Generic[Result]):
         return self._results[0]
 
 
-def excuse_slow_machine(failure: Exception, stalls: Stalls, since_ns: int, until_ns: int) -> Exception:
-    """Return `HostStalled` if many short stalls made the machine too slow, and the failure otherwise."""
+def excuse_slow_machine(
+    failure: Exception, stalls: Stalls, since_ns: int, until_ns: int, *, share: float = SLOW_SHARE
+) -> Exception:
+    """Return `HostStalled` if many short stalls took `share` of the interval, and the failure otherwise."""
     if isinstance(failure, HostStalled):
         return failure
     recorded = stalls.during(since_ns, until_ns)
-    share = stalled_share(recorded, since_ns, until_ns)
-    message = f"stalled for {share:.1%} of the time, {describe(recorded, since_ns)}; {failure}"
-    return AssertionError(message) if share < SLOW_SHARE else HostStalled(message)
+    stalled = stalled_share(recorded, since_ns, until_ns)
+    message = f"stalled for {stalled:.1%} of the time, {describe(recorded, since_ns)}; {failure}"
+    return AssertionError(message) if stalled < share else HostStalled(message)
