@@ -10,7 +10,9 @@ import yaml
 from pydantic import BaseModel
 from tests.browser.chromium import Browser, Tab, running_browser, wait_until
 from tests.browser.conftest import PersonDrive, arm, drive_off, field
+from tests.support.stalls import Stalls
 
+from lavt.clock import MachineClock
 from lavt.config import RunConfig
 from lavt.config_file import build_config
 from lavt.experiment.analysis.metrics import measure
@@ -77,16 +79,18 @@ def test_after_a_stop_the_person_drives_again(person_drive: PersonDrive) -> None
     arm(tab)
 
 
-def test_the_keys_choose_the_delay(person_drive: PersonDrive) -> None:
+def test_the_keys_choose_the_delay(person_drive: PersonDrive, stalls: Stalls) -> None:
     """The key 3 chooses the delays of L3 while driving, and the page measures them; 0 removes them."""
     tab = person_drive.open()
     arm(tab)
+    since_ns = MachineClock().now().mono_ns
     tab.key("Digit3", down=True)
     wait_until("the video is delayed", lambda: (field(tab, "video_ms") or 0) > 225)
     assert field(tab, "delay") == [225, 0]
     tab.key("Digit0", down=True)
     wait_until("the video is not delayed", lambda: (field(tab, "video_ms") or 1000) < 200)
-    assert field(tab, "safety") == "driving"
+    with stalls.excusing_failures(since_ns):  # the vehicle stops if the host stops the client
+        assert field(tab, "safety") == "driving"
 
 
 def test_a_hidden_page_drives_no_more(person_drive: PersonDrive, browser: Browser) -> None:
