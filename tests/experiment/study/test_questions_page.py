@@ -7,15 +7,15 @@ import queue
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from tests.support.clocks import ManualClock
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
 from lavt.clock import pause
-from lavt.domain import NS_PER_MS, NS_PER_S, Now
+from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import BadMessage, UserError
 from lavt.experiment.study import questions_page
 from lavt.experiment.study.answers import SCALES
@@ -126,14 +126,11 @@ def test_a_page_that_stays_open_does_not_delay_the_end(
     participant: Participant, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """After the thanks, neither the page nor messages of other pages make the wait longer."""
-    now_ns = [0]
-    clock = SimpleNamespace(now=lambda: Now(now_ns[0], 0))
-    monkeypatch.setattr(questions_page, "MachineClock", lambda: clock)
+    monkeypatch.setattr(questions_page, "MachineClock", lambda: ManualClock(step_ns=NS_PER_S // 2))
     other, _ = participant.open()
     page, _ = participant.open()
     page.send(answers())
     assert receive(page)["type"] == "thanks"
-    now_ns[0] = round(questions_page.THANKS_S * NS_PER_S)
     with pytest.raises(ConnectionClosed):
         send_often(other)
     participant.wait()
