@@ -15,6 +15,7 @@ from tests.support.stalls import Stalls
 from lavt.clock import MachineClock
 from lavt.config import RunConfig
 from lavt.config_file import build_config
+from lavt.domain import NS_PER_MS
 from lavt.experiment.analysis.metrics import measure
 from lavt.experiment.runs.processes import Process, Processes
 from lavt.experiment.runs.side_configs import client_config, embedded_router, server_config
@@ -67,6 +68,22 @@ def test_the_page_reads_every_stamp(person_drive: PersonDrive) -> None:
     assert (times[1] >= times[0] - bound).all()
     for before, after in pairwise(times[1:]):
         assert (after >= before).all()
+
+
+def test_a_picture_that_never_appeared_has_no_times(person_drive: PersonDrive, stalls: Stalls) -> None:
+    """A picture over which a newer one is drawn before the browser's next picture of the screen is not recorded."""
+    tab = person_drive.open()
+    tab.evaluate(
+        "const next = requestAnimationFrame;"
+        "window.requestAnimationFrame = (show) => setTimeout(() => next(show), 500); undefined"
+    )
+    since_ns = MachineClock().now().mono_ns
+    shown = tab.evaluate("lavtConsole.video.shown")
+    wait_until("pictures are drawn", lambda: tab.evaluate("lavtConsole.video.shown") > shown + 40)
+    person_drive.process.end()
+    pictures = read_record(person_drive.out / "client" / "client.mcap").table("page_picture")
+    with stalls.excusing_failures(since_ns):  # the newest picture appears if no other follows for 500 ms
+        assert (pictures.ints("shown_wall_ns") - pictures.ints("drawn_wall_ns") < 400 * NS_PER_MS).all()
 
 
 def test_after_a_stop_the_person_drives_again(person_drive: PersonDrive) -> None:

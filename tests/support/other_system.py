@@ -51,8 +51,9 @@ if IS_LIKE_WINDOWS:
 if __name__ == "__main__":
     if len(sys.argv) > 1:
         sys.argv[0] = "lavt"
-        demo = importlib.import_module("lavt.cli.demo")
-        demo.ROADS = demo.ROADS[:1]  # type: ignore[attr-defined]  # six times as fast
+        if sys.argv[1] == "demo":
+            demo = importlib.import_module("lavt.cli.demo")
+            demo.ROADS = demo.ROADS[:1]  # type: ignore[attr-defined]  # six times as fast
         importlib.import_module("lavt.cli.main").main()
     else:
         lavt = importlib.import_module("lavt")

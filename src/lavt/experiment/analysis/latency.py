@@ -6,7 +6,7 @@ clock.
 `frames` are rows of the server's channel `frame`, one for each stamped frame. `received_frames` are rows of the
 client's channel `picture`, one for each frame that the client received and tried to decode. `command_verdicts` are rows
 of the server's channel `admission`, one for each command that reached the gate. `page_pictures` are rows of the
-client's channel `page_picture`, one for each frame that the page of the person who drives has drawn.
+client's channel `page_picture`, one for each frame that the page of the person who drives has shown.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def video_latency_ns(received_frames: Table, offset: ClockOffset) -> IntArray:
 
 
 def page_pictures_of(page_pictures: Table, frames: Table) -> Table:
-    """Return the first row of each of `frames` that the page of the person who drives has drawn.
+    """Return the first row of each of `frames` that the page of the person who drives has shown.
 
     Rows without all of their times are left out.
     """

@@ -122,10 +122,9 @@ def trajectory_parts(report: ReportContext, sets: DriveSets) -> Parts:
             )
             alternative = f"trajectories on routes {', '.join(shown)}"
             trajectories = save_figure(report.directory, f"trajectories_{name}_{suffix}", figure, alternative, caption)
-            caption = (
-                f"Distance from the lane centre along the same routes, {origin}. Between the dashed lines, the car "
-                "counts as in its own lane."
-            )
+            caption = f"Distance from the lane centre along the same routes, {origin}."
+            if any(drive.result.get("lane_kept") for drive in all_drives):
+                caption += " Between the dashed lines, the car counts as in its own lane."
             figure = cross_track_figure(shown_routes, report.colours, all_drives)
             alternative = f"cross-track error on routes {', '.join(shown)}"
             errors = save_figure(report.directory, f"cross_track_{name}_{suffix}", figure, alternative, caption)

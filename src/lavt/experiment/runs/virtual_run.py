@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import gc
 import hashlib
-import itertools
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -16,7 +15,7 @@ from lavt.assembly.entropy import SeededEntropy
 from lavt.assembly.fidelity import FIDELITIES
 from lavt.assembly.links import trace_digests
 from lavt.assembly.nodes import ClientNodes, ServerNodes, build_client, build_server
-from lavt.config import Costs, RunConfig
+from lavt.config import Condition, Costs, RunConfig
 from lavt.config_file import load_config, shipped
 from lavt.domain import NS_PER_S, NS_PER_US, GroundTruth, Now
 from lavt.experiment.runs.network import NetworkDelays, in_ns, injected_network, virtual_delay
@@ -120,15 +119,10 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
     make_directory(out)
     digest = hashlib.sha256()
     left_out = config.left_out
-    model = {
-        "costs": costs.model_dump_json(),
-        "condition": requested.model_dump_json(),
-        "traces": json.dumps(trace_digests(requested)),
-    }
-    writers = [RecordWriter(out / f"{side}.mcap", side, digest, left_out=left_out) for side in ("server", "client")]
-    for writer, (name, entries) in itertools.product(writers, {**provenance(), "model": model}.items()):
-        writer.annotate(name, entries)
-    server_writer, client_writer = writers
+    server_writer = RecordWriter(out / "server.mcap", "server", digest, left_out=left_out)
+    client_writer = RecordWriter(out / "client.mcap", "client", digest, left_out=left_out)
+    for writer in (server_writer, client_writer):
+        _annotate(writer, costs, requested)
     observer = DriveObserver()
     costs_ns = stage_costs_ns(costs, seed)
     error_s, bound_s = config.clocks.error_us / 1e6, config.clocks.bound_us / 1e6
@@ -153,15 +147,24 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
             left_out=left_out,
         ),
     ]
-    injected = injected_network(
-        config.network.inherent,
-        requested,
-        costs,
-        seed,
-        state_delay=config.network.state_delay,
-    )
+    network = config.network
+    injected = injected_network(network.inherent, requested, costs, seed, state_delay=network.state_delay)
     runtime = VirtualRuntime(hosts, virtual_links(injected, costs, seed))
     return VirtualLoop(runtime, server, client, observer, (server_writer, client_writer), digest)
+
+
+def _annotate(writer: RecordWriter, costs: Costs, requested: Condition) -> None:
+    """Store in a record what its values were computed from."""
+    for name, entries in provenance().items():
+        writer.annotate(name, entries)
+    writer.annotate(
+        "model",
+        {
+            "costs": costs.model_dump_json(),
+            "condition": requested.model_dump_json(),
+            "traces": json.dumps(trace_digests(requested)),
+        },
+    )
 
 
 def stage_costs_ns(costs: Costs, seed: int) -> dict[tuple[str, str], Cost]:
