@@ -231,7 +231,7 @@ def test_changes_reach_nested_keys(tmp_path: Path) -> None:
 def test_changes_can_be_lists_and_mappings(tmp_path: Path) -> None:
     """The value of a change can be a list or a mapping in YAML, and can contain an equals sign."""
     path = tmp_path / "my.yaml"
-    path.write_text("")
+    path.write_text("{}")
     changes = ["conditions=[L0, L3]", "axes={video.bit_rate_bps: [1000000, 2000000]}", "study.participant=a=b"]
     config = load_config(SweepConfig, path, changes)
     assert config.conditions == ("L0", "L3")
@@ -364,10 +364,12 @@ def test_missing_file(name: str, tmp_path: Path) -> None:
         load_config(RunConfig, tmp_path / name)
 
 
-def test_empty_file(tmp_path: Path) -> None:
-    """An empty file gives the default config."""
-    (tmp_path / "my.yaml").write_text("# nothing\n")
-    assert load_config(RunConfig, tmp_path / "my.yaml") == RunConfig()
+@pytest.mark.parametrize("text", ["", "# nothing\n"])
+def test_a_file_without_keys_is_rejected(text: str, tmp_path: Path) -> None:
+    """A file without keys, perhaps one that was cut off, does not give the default config."""
+    (tmp_path / "my.yaml").write_text(text)
+    with pytest.raises(UserError, match=r"my\.yaml has no keys"):
+        load_config(RunConfig, tmp_path / "my.yaml")
 
 
 @given(st.text(max_size=60))

@@ -82,7 +82,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
         raise UserError(f"{path} is not YAML, because it is not text ({error}): name a YAML file") from error
     data = parse_yaml(text, str(path))
     if data is None:
-        return {}
+        raise UserError(f"{path} has no keys: write at least one, for example `seed: 7`")
     if not isinstance(data, dict):
         kind = type(data).__name__
         raise UserError(f"{path} must have keys and values, not a {kind}: write, for example, `seed: 7`")

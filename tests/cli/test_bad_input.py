@@ -44,6 +44,13 @@ def files(directory: Path) -> Mapping[str, bytes | None]:
     }
 
 
+@pytest.mark.parametrize("command", ["run demo", "sweep sweep", "boundary boundary", "study study"])
+def test_a_shipped_config_is_found_from_any_directory(command: str, run: Run) -> None:
+    """The shipped config that the help names is read if the present directory has no file of that name."""
+    name, config = command.split()
+    assert "unknown key 'sede'" in run(name, f"configs/{config}.yaml", "--set", "sede=7").rejection()
+
+
 NETEM_OPTIONS = [
     part
     for change in ("time=real", "network.injection=netem", "network.inherent=loopback")

@@ -515,11 +515,11 @@ def test_an_unknown_host(router: str) -> None:
 
 def test_side_of_a_config(tmp_path: Path) -> None:
     """A config, with its --set changes, is a client's if it has a key that only a client has, otherwise a server's."""
-    empty = tmp_path / "empty.yaml"
-    empty.write_text("")
-    assert isinstance(doctor._load(empty, []), ServerConfig)
-    assert not isinstance(doctor._load(empty, ["video.server=192.0.2.7"]), ServerConfig)
-    assert not isinstance(doctor._load(empty, ["who=operator-2"]), ServerConfig)
+    neither = tmp_path / "neither.yaml"
+    neither.write_text("{}")
+    assert isinstance(doctor._load(neither, []), ServerConfig)
+    assert not isinstance(doctor._load(neither, ["video.server=192.0.2.7"]), ServerConfig)
+    assert not isinstance(doctor._load(neither, ["who=operator-2"]), ServerConfig)
 
 
 class Security(Section):

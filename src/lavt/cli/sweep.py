@@ -53,7 +53,7 @@ def sweep(
 
     if cluster and server:
         raise UserError("--cluster and --server exclude each other: a server drives one run at a time")
-    settings = load_config(SweepConfig, config, [*(["time=real"] if server else []), *(changes or [])])
+    settings = load_config(SweepConfig, find_file(config), [*(["time=real"] if server else []), *(changes or [])])
     planned_runs = plan_sweep(settings)
     remote = None
     if server:
