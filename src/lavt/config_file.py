@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import functools
 import math
+import os
 import typing
 from collections.abc import Iterable, Mapping
 from importlib import resources
@@ -53,15 +54,20 @@ Config = TypeVar("Config", bound=Section)
 
 
 def find_file(file: Path) -> Path:
-    """Return `file` if it exists, otherwise the shipped file of that name."""
-    return file if file.exists() else shipped(str(file))
+    """Return `file` if it exists or no file of that name is shipped, otherwise the shipped file."""
+    candidates = file, shipped(str(file))
+    # `Path.exists` raises for a name that is too long or may not be looked up.
+    return next((path for path in candidates if os.path.exists(path)), file)  # noqa: PTH110
 
 
 def load_config(kind: type[Config], path: Path, changes: Iterable[str] = ()) -> Config:
     """Read a YAML file and `--set` changes (`a.b=value`, the value in YAML) into a config of class `kind`.
 
+    Without such a file, read the shipped file of that name.
+
     Raises `UserError` for values that are missing, unknown, of the wrong type or out of range.
     """
+    path = find_file(path)
     return build_config(kind, read_yaml(path), changes, str(path))
 
 

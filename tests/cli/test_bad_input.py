@@ -44,7 +44,10 @@ def files(directory: Path) -> Mapping[str, bytes | None]:
     }
 
 
-@pytest.mark.parametrize("command", ["run demo", "sweep sweep", "boundary boundary", "study study"])
+@pytest.mark.parametrize(
+    "command",
+    ["run demo", "sweep sweep", "boundary boundary", "study study", "server server", "client client", "doctor server"],
+)
 def test_a_shipped_config_is_found_from_any_directory(command: str, run: Run) -> None:
     """The shipped config that the help names is read if the present directory has no file of that name."""
     name, config = command.split()
@@ -293,6 +296,13 @@ def test_out_in_a_file(run: Run, tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
     for arguments in (["demo"], ["sweep", SWEEP]):
         assert "file/inside" in run(*arguments, "--out", "file/inside").rejection()
+
+
+def test_a_file_that_the_system_cannot_look_up(run: Run) -> None:
+    """A config or an output directory that the system refuses to look up is rejected in one sentence."""
+    too_long = "a" * 300
+    assert too_long in run("run", DEMO, "--out", too_long).rejection()
+    assert too_long in run("run", f"{too_long}.yaml").rejection()
 
 
 def test_report_of_nothing(run: Run, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import typer
 from lavt.cli import console
 from lavt.cli.progress import progress
 from lavt.config import BoundaryConfig
-from lavt.config_file import find_file, load_config
+from lavt.config_file import load_config
 from lavt.errors import WorkError
 from lavt.recording.output_directory import prepare_directory
 
@@ -36,7 +36,7 @@ def boundary(
     """
     from lavt.experiment.boundary.boundary import plan_boundary, search_boundary  # noqa: PLC0415 (slow: scipy)
 
-    settings = load_config(BoundaryConfig, find_file(config), changes or [])
+    settings = load_config(BoundaryConfig, config, changes or [])
     searches = plan_boundary(settings)
     out = out or Path("out") / "boundary"
     prepare_directory(out)

@@ -23,7 +23,7 @@ from lavt.cli import console
 from lavt.cli.clock import probe
 from lavt.clock import MachineClock
 from lavt.config import ClientConfig, ServerCameraConfig, ServerConfig
-from lavt.config_file import load_config, read_yaml, split_change
+from lavt.config_file import find_file, load_config, read_yaml, split_change
 from lavt.doctor import checks, key_checks, measurements
 from lavt.doctor.checks import Check
 from lavt.doctor.clock_checks import compare_with_server
@@ -83,7 +83,7 @@ def doctor(
 
 def _load(path: Path, changes: list[str]) -> Settings:
     """Read a client's config if the file or a change has a key of clients only, otherwise a server's config."""
-    data = read_yaml(path)
+    data = read_yaml(find_file(path))
     video = data.get("video")
     keys = {*data, *(f"video.{key}" for key in (video if isinstance(video, dict) else {}))}
     for parts, _ in map(split_change, changes):

@@ -10,7 +10,7 @@ import typer
 from lavt.cli import console
 from lavt.cli.live_view import LiveView
 from lavt.config import RunConfig
-from lavt.config_file import find_file, load_config
+from lavt.config_file import load_config
 from lavt.experiment.runs.netem_run import check_netem
 from lavt.experiment.runs.plan import plan_run
 from lavt.experiment.runs.run import run_once
@@ -34,7 +34,7 @@ def run(
 
     Example: lavt run configs/demo.yaml --set network.condition=L2 --out out/l2
     """
-    planned_run = plan_run(load_config(RunConfig, find_file(config), changes or []))
+    planned_run = plan_run(load_config(RunConfig, config, changes or []))
     out = out or Path("out") / "run"
     check_directory(out)
     with console.interruptible():

@@ -12,7 +12,7 @@ import typer
 from lavt.cli import console
 from lavt.cli.progress import progress
 from lavt.config import HUMAN, StudyConfig
-from lavt.config_file import find_file, load_config
+from lavt.config_file import load_config
 from lavt.errors import UserError
 from lavt.recording.output_directory import reserve_directory
 
@@ -54,7 +54,7 @@ def study(
     from lavt.experiment.study.study import begin_study, drive_study, open_study, report_study  # noqa: PLC0415 (slow)
     from lavt.experiment.study.study_plan import plan_participant  # noqa: PLC0415 (slow: scipy)
 
-    settings = load_config(StudyConfig, find_file(config), changes or [])
+    settings = load_config(StudyConfig, config, changes or [])
     participants = range(1, settings.participants + 1) if participant is None else [participant]
     blocks = [block for number in participants for block in plan_participant(settings, number)]
     if settings.participants % (orders := orders_in_set(len(settings.conditions))):

@@ -10,7 +10,7 @@ import typer
 from lavt.cli import console
 from lavt.cli.progress import progress
 from lavt.config import ClientConfig, SweepConfig
-from lavt.config_file import find_file, load_config
+from lavt.config_file import load_config
 from lavt.errors import UserError
 from lavt.experiment.runs.plan import plan_sweep
 from lavt.recording.output_directory import reserve_directory
@@ -53,12 +53,12 @@ def sweep(
 
     if cluster and server:
         raise UserError("--cluster and --server exclude each other: a server drives one run at a time")
-    settings = load_config(SweepConfig, find_file(config), [*(["time=real"] if server else []), *(changes or [])])
+    settings = load_config(SweepConfig, config, [*(["time=real"] if server else []), *(changes or [])])
     planned_runs = plan_sweep(settings)
     remote = None
     if server:
         console.reserve_stdout()
-        remote_client = load_config(ClientConfig, find_file(client), [f"video.server={server}"])
+        remote_client = load_config(ClientConfig, client, [f"video.server={server}"])
         remote = RemoteServer(remote_client, console.print_message)
         remote.check(planned_runs)
     if cluster and any(run.config.time == "real" for run in planned_runs):

@@ -12,7 +12,11 @@ from lavt.errors import UserError
 
 def check_directory(out: Path) -> None:
     """Raise `UserError` unless `out` is absent or an empty directory; create nothing."""
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+    try:
+        is_usable = not out.exists() or (out.is_dir() and not any(out.iterdir()))
+    except OSError as error:
+        raise UserError(f"{out} cannot be read ({error.strerror}): name another directory with --out") from error
+    if not is_usable:
         raise UserError(f"{out} is not an empty directory: name another with --out, or remove it")
 
 
