@@ -65,6 +65,20 @@ def test_a_signal_interrupts_long_work(signal_number: signal.Signals) -> None:
     assert signal.getsignal(signal_number) == former_handler
 
 
+def test_the_first_interrupt_says_what_is_finished(capsys: pytest.CaptureFixture[str]) -> None:
+    """The first Ctrl-C during long work says what is finished before the end; the second adds nothing."""
+
+    def work() -> None:
+        try:
+            signal.raise_signal(signal.SIGINT)
+        finally:
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(WorkError, match="stopped"), console.interruptible("runs"):
+        work()
+    assert capsys.readouterr().err.count("finishing the runs in progress; Ctrl-C again ends at once") == 1
+
+
 def test_an_ignored_hangup_stays_ignored() -> None:
     """Under nohup, a closed terminal ends neither long work nor a program that runs until it is stopped."""
     former_handler = signal.signal(signal.SIGHUP, signal.SIG_IGN)

@@ -48,6 +48,23 @@ for command in sys.argv[1:]:
 """
 """A program that prints the packages that each command imports; a fork of the program runs each command."""
 
+INTERRUPTED_IMPORT = """
+import runpy, signal, sys
+
+interrupted = sys.argv[1]
+
+class Finder:
+    def find_spec(self, name, path=None, target=None):
+        if name == interrupted:
+            signal.raise_signal(signal.SIGINT)
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # even if the tests ignore it
+sys.meta_path.insert(0, Finder())
+sys.argv = ["lavt", "run", "absent.yaml"]
+runpy.run_module("lavt", run_name="__main__")
+"""
+"""A program that sends itself SIGINT when `lavt run` imports the module that the first argument names."""
+
 
 @pytest.fixture(scope="module")
 def imported() -> dict[str, list[str]]:
@@ -73,3 +90,12 @@ def test_the_help_of_lavt_imports_no_command() -> None:
     modules = set(json.loads(completed.stdout))
     assert {name for name in modules if name.startswith("lavt.cli.")} == {"lavt.cli.console", "lavt.cli.main"}
     assert not modules & (LARGE_PACKAGES | {"msgspec", "pydantic", "yaml"})
+
+
+@pytest.mark.parametrize("module", ["lavt.cli.main", "typer", "pydantic", "lavt.cli.run", "lavt.config_file"])
+def test_ctrl_c_during_the_start_of_a_command(module: str) -> None:
+    """Ctrl-C while a command imports its modules ends it with exit code 130 and no traceback."""
+    completed = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED_IMPORT, module], capture_output=True, text=True, timeout=300, check=False
+    )
+    assert (completed.returncode, completed.stdout, completed.stderr) == (130, "", "")

@@ -40,7 +40,10 @@ def boundary(
     searches = plan_boundary(settings)
     out = out or Path("out") / "boundary"
     prepare_directory(out)
-    with console.interruptible(), progress(f"boundary search, results in {out}", len(searches)) as report_done:
+    with (
+        console.interruptible("searches"),
+        progress(f"boundary search, results in {out}", len(searches)) as report_done,
+    ):
         result, is_complete = search_boundary(settings, searches, out, jobs=jobs, on_progress=report_done)
     for failure in result["failed"]:
         console.print_message(f"failed: {failure['name']}: {failure['why']}")

@@ -110,18 +110,22 @@ def run_command(command: Callable[[], None]) -> None:
 
 
 @contextmanager
-def interruptible() -> Iterator[None]:
+def interruptible(in_progress: str = "") -> Iterator[None]:
     """Raise `WorkError` when Ctrl-C, SIGTERM or a closed terminal interrupts long work.
 
+    If the work finishes what is in progress first, `in_progress` names it ("runs"), and the first interrupt says so.
     From the beginning of the block on, no message to standard error blocks the program.
     """
+    notices = [f"lavt: finishing the {in_progress} in progress; Ctrl-C again ends at once"] if in_progress else []
 
     def interrupt(*_: object) -> None:
+        if notices:
+            print_message(notices.pop())
         raise KeyboardInterrupt
 
     queue_output("stderr")
     try:
-        with _signal_handlers(interrupt, signal.SIGTERM):
+        with _signal_handlers(interrupt, signal.SIGINT, signal.SIGTERM):
             yield
     except KeyboardInterrupt:
         raise WorkError("stopped; the finished results are kept") from None

@@ -27,6 +27,6 @@ def join(
 
     The command also computes the result of the run.
 
-    Example: lavt join out/server out/client --out out/run; lavt report out/run
+    Example: lavt join out/server out/client --out out/joined; lavt report out/joined
     """
     print_run(join_sides(server, client, out), out, as_json=as_json)

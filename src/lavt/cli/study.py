@@ -78,7 +78,7 @@ def study(
             page_settings = PageSettings(port, opens_page, asks_in_page)
             _hold_session(blocks, settings.instructions, out, page_settings)
         else:
-            with console.interruptible(), progress(f"study, results in {out}", remaining) as report_done:
+            with console.interruptible("runs"), progress(f"study, results in {out}", remaining) as report_done:
                 result = drive_study(blocks, out, jobs=jobs, on_progress=report_done)
                 failed, drives = result.failed, result.drives
         page = report_study(out, drives)

@@ -72,7 +72,7 @@ def sweep(
     open_sweep(out, resume=resume)
     with (
         reserve_directory(out),
-        console.interruptible(),
+        console.interruptible("runs"),
         progress(f"sweep, results in {out}", remaining) as report_done,
     ):
         page, result = drive_sweep(

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 import json
 import multiprocessing
 import os
@@ -201,6 +202,45 @@ def test_a_stopped_sweep_keeps_what_is_finished(signal_number: int, options: tup
     assert "Traceback" not in stderr
     planned_runs = 6 * 10  # conditions x repetitions
     assert 0 < len(list(out.glob("runs/*/result.json"))) == len(list(out.glob("runs/*"))) < planned_runs
+
+
+@pytest.mark.full
+def test_a_second_ctrl_c_ends_a_sweep_at_once(tmp_path: Path) -> None:
+    """The first Ctrl-C announces that the runs in progress are finished; the second breaks them off."""
+    out = tmp_path / "out"
+    process = subprocess.Popen(
+        [
+            *(
+                sys.executable,
+                "-m",
+                "lavt",
+                "sweep",
+                str(shipped("configs/sweep.yaml")),
+                "--jobs",
+                "2",
+                "--out",
+                str(out),
+            )
+        ],
+        stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        text=True,
+        start_new_session=True,
+    )
+    for _ in range(3000):
+        if len(list(out.glob("runs/*/*"))) > 1:
+            break
+        pause(20 * NS_PER_MS)
+    assert process.stderr is not None
+    os.killpg(process.pid, signal.SIGINT)
+    printed = list(itertools.takewhile(lambda line: "Ctrl-C again" not in line, process.stderr))
+    os.killpg(process.pid, signal.SIGINT)
+    _, rest = process.communicate(timeout=END_LIMIT_S)
+    assert process.returncode == 1
+    assert "results are kept" in rest
+    assert "Traceback" not in "".join(printed) + rest
+    assert list(out.glob("runs/*"))
+    assert not list(out.glob("runs/*/result.json"))
 
 
 def test_ctrl_c_leaves_no_partial_remote_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,6 +15,7 @@ from lavt.clock import pause
 from lavt.domain import NS_PER_MS
 from lavt.errors import UserError, WorkError
 from lavt.experiment.sweep.worker_processes import WorkerProcesses
+from lavt.operating_system import CAN_BLOCK_SIGNALS
 
 
 @pytest.fixture
@@ -37,6 +38,12 @@ def wait_for(file: Path) -> int:
     while not file.exists():
         pause(5 * NS_PER_MS)
     return os.getpid()
+
+
+def begin_and_wait(directory: Path) -> int:
+    """Write the file `begun`, and wait for the file `never`."""
+    (directory / "begun").touch()
+    return wait_for(directory / "never")
 
 
 class UnpicklableError(Exception):
@@ -84,6 +91,27 @@ def test_after_ctrl_c_no_further_call_begins(tmp_path: Path) -> None:
         calls = [executor.submit(wait_for, tmp_path / "go on") for _ in range(20)]
         raise KeyboardInterrupt
     assert calls[-1].cancelled()
+
+
+@pytest.mark.skipif(not CAN_BLOCK_SIGNALS, reason="no thread can be sent a signal")
+def test_a_second_ctrl_c_breaks_off_the_call(tmp_path: Path) -> None:
+    """Ctrl-C while the executor waits for a call in progress kills the call's process; no other call begins."""
+
+    def interrupt_the_wait(main_thread: int) -> None:
+        for file in ("begun", "waiting"):
+            wait_for(tmp_path / file)
+        signal.pthread_kill(main_thread, signal.SIGINT)
+
+    interrupter = threading.Thread(target=interrupt_the_wait, args=(threading.get_ident(),))
+    interrupter.start()
+    with suppress(KeyboardInterrupt), WorkerProcesses(1) as executor:
+        calls = [executor.submit(begin_and_wait, tmp_path) for _ in range(2)]
+        wait_for(tmp_path / "begun")
+        (tmp_path / "waiting").touch()
+        executor.shutdown(cancel_futures=True)
+    interrupter.join()
+    assert isinstance(calls[0].exception(60), BrokenExecutor)
+    assert calls[1].cancelled()
 
 
 def test_errors_of_a_call_are_raised(workers: WorkerProcesses) -> None:

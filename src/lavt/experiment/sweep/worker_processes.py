@@ -84,6 +84,11 @@ class WorkerProcess:
         """Close the pipe, whereupon a process without a call ends."""
         self._connection.close()
 
+    def kill(self) -> None:
+        """Kill the process, and so break off its call."""
+        if self._process.pid is not None:  # it was started
+            self._process.kill()
+
     def join(self) -> None:
         """Wait for the end of the process."""
         if self.is_alive():
@@ -95,6 +100,8 @@ class WorkerProcesses(Executor):
 
     def __init__(self, jobs: int) -> None:
         self._idle = deque(WorkerProcess() for _ in range(jobs))
+        self._busy: set[WorkerProcess] = set()
+        self._is_broken_off = False
         self._threads = ThreadPoolExecutor(jobs)  # one thread for each process
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -106,18 +113,35 @@ class WorkerProcesses(Executor):
         try:
             if not worker.is_alive():
                 worker = WorkerProcess()
+            self._busy.add(worker)
+            if self._is_broken_off:
+                raise BrokenExecutor
             return worker.call(function, arguments, keywords)
         finally:
+            self._busy.discard(worker)
             self._idle.append(worker)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Wait for the calls that were submitted, or with `cancel_futures` for those in progress, and end."""
-        self._threads.shutdown(wait=wait, cancel_futures=cancel_futures)
+        """Wait for the calls that were submitted, or with `cancel_futures` for those in progress, and end.
+
+        Ctrl-C during the wait breaks off the calls in progress.
+        """
+        try:
+            self._threads.shutdown(wait=wait, cancel_futures=cancel_futures)
+        except KeyboardInterrupt:
+            self._break_off()
+            raise
         if wait:
             for worker in self._idle:
                 worker.close()
             for worker in self._idle:
                 worker.join()
+
+    def _break_off(self) -> None:
+        self._is_broken_off = True
+        self._threads.shutdown(wait=False, cancel_futures=True)
+        for worker in tuple(self._busy):
+            worker.kill()
 
     def __exit__(self, error_type: type[BaseException] | None, *_: object) -> None:
         """Wait for all calls; after an error or Ctrl-C in the `with` block, only for those in progress."""
