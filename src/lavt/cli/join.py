@@ -29,4 +29,5 @@ def join(
 
     Example: lavt join out/server out/client --out out/joined; lavt report out/joined
     """
-    print_run(join_sides(server, client, out), out, as_json=as_json)
+    result = join_sides(server, client, out)
+    print_run(result, out, result["seed"], as_json=as_json)

@@ -43,23 +43,23 @@ def run(
     title = f"driving {planned_run.config.vehicle.route} under {planned_run.config.network.condition}"
     with console.interruptible(), LiveView(title) as view:
         result = run_once(planned_run, out, progress=view.update)
-    print_run(result, out, as_json=as_json)
+    print_run(result, out, planned_run.config.seed, as_json=as_json)
 
 
-def print_run(result: dict[str, Any], out: Path, *, as_json: bool) -> None:
-    """Print the result of a run, as JSON or as text with its directory."""
+def print_run(result: dict[str, Any], out: Path, seed: int, *, as_json: bool) -> None:
+    """Print the result of a run with the config's seed, as JSON or as text with the run's directory."""
     if as_json:
         console.print_json(result)
     else:
-        console.print_result(_summarize(result))
+        console.print_result(_summarize(result, seed))
         console.print_result(f"records and result.json are in {out}")
 
 
-def _summarize(result: dict[str, Any]) -> str:
+def _summarize(result: dict[str, Any], seed: int) -> str:
     """Return a summary of a run in a few lines."""
     loop_ms, frame_age_ms = result["loop_ms"], result["picture_age_ms"]
     lines = [
-        f"{result['route']} under {result['condition']}, seed {result['seed']}: {result['ending']} after "
+        f"{result['route']} under {result['condition']}, seed {seed}: {result['ending']} after "
         f"{_format_number(result['distance_m'], 'm')}, cross-track P95 {_format_number(result['p95_m'], 'm', 2)}",
         f"loop latency {_format_number(loop_ms['p50'], 'ms')} (p95 {_format_number(loop_ms['p95'], 'ms')}), "
         f"mean frame age {_format_number(frame_age_ms['mean'], 'ms')}",
