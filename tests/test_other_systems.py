@@ -9,7 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from lavt import operating_system
 from lavt.cli.main import COMMANDS, ON_ANY_SYSTEM
+from lavt.errors import UserError
 from lavt.operating_system import missing_in_real_time
 
 SCRIPT = Path(__file__).parent / "support" / "other_system.py"
@@ -81,3 +83,11 @@ def test_the_demo_leaves_out_real_time(tmp_path: Path) -> None:
     assert completed.returncode == 0, completed.stderr
     assert "the part in real time needs Linux" in completed.stderr
     assert (tmp_path / "demo" / "report" / "index.html").exists()
+
+
+def test_without_loopback_a_run_in_real_time_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
+    """If the address of the machine itself cannot be reached, the sentence names the interface to enable."""
+    operating_system.require_loopback()
+    monkeypatch.setattr(operating_system, "LOOPBACK", "255.255.255.255")  # a socket may not send to all by default
+    with pytest.raises(UserError, match="ip link set lo up"):
+        operating_system.require_loopback()

@@ -47,7 +47,7 @@ MAX_PROBLEMS = 5
 def shipped(name: str) -> Path:
     """Return the path of a shipped file, such as `configs/costs.yaml`, in the package or in the source tree."""
     packaged = Path(str(resources.files("lavt"))) / "data" / name
-    return packaged if packaged.exists() else Path(__file__).parents[2] / name
+    return packaged if _exists(packaged) else Path(__file__).parents[2] / name
 
 
 Config = TypeVar("Config", bound=Section)
@@ -55,9 +55,11 @@ Config = TypeVar("Config", bound=Section)
 
 def find_file(file: Path) -> Path:
     """Return `file` if it exists or no file of that name is shipped, otherwise the shipped file."""
-    candidates = file, shipped(str(file))
-    # `Path.exists` raises for a name that is too long or may not be looked up.
-    return next((path for path in candidates if os.path.exists(path)), file)  # noqa: PTH110
+    return next((path for path in (file, shipped(str(file))) if _exists(path)), file)
+
+
+def _exists(path: Path) -> bool:
+    return os.path.exists(path)  # noqa: PTH110 (`Path.exists` raises for a name that is too long)
 
 
 def load_config(kind: type[Config], path: Path, changes: Iterable[str] = ()) -> Config:

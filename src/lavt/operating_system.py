@@ -17,6 +17,8 @@ from lavt.errors import UserError
 HANGUP: Final[tuple[signal.Signals, ...]] = (signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ()
 """The signal of a closed terminal, where there is one."""
 
+LOOPBACK: Final = "127.0.0.1"
+
 CAN_BLOCK_SIGNALS: Final = hasattr(signal, "pthread_sigmask")
 
 NEEDED_IN_REAL_TIME: Final[tuple[tuple[ModuleType, str], ...]] = (
@@ -30,6 +32,18 @@ NEEDED_IN_REAL_TIME: Final[tuple[tuple[ModuleType, str], ...]] = (
 def missing_in_real_time() -> str:
     """Return the first name that real time needs and this system lacks; empty: it lacks none."""
     return next((f"{module.__name__}.{name}" for module, name in NEEDED_IN_REAL_TIME if not hasattr(module, name)), "")
+
+
+def require_loopback() -> None:
+    """Raise `UserError` if processes of this machine cannot reach each other over 127.0.0.1."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect((LOOPBACK, 9))  # sends nothing
+        except OSError as error:
+            raise UserError(
+                f"a run in real time needs the address {LOOPBACK} ({error.strerror}): enable the interface with "
+                "`ip link set lo up`"
+            ) from error
 
 
 def require_real_time(what: str) -> None:

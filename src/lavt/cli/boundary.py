@@ -12,7 +12,7 @@ from lavt.cli.progress import progress
 from lavt.config import BoundaryConfig
 from lavt.config_file import load_config
 from lavt.errors import WorkError
-from lavt.recording.output_directory import prepare_directory
+from lavt.recording.output_directory import disk_errors_named, prepare_directory
 
 
 def register(app: typer.Typer) -> None:
@@ -42,6 +42,7 @@ def boundary(
     prepare_directory(out)
     with (
         console.interruptible("searches"),
+        disk_errors_named(out),
         progress(f"boundary search, results in {out}", len(searches)) as report_done,
     ):
         result, is_complete = search_boundary(settings, searches, out, jobs=jobs, on_progress=report_done)

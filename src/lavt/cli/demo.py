@@ -20,7 +20,7 @@ from lavt.experiment.analysis.results import read_json
 from lavt.experiment.runs.plan import plan_run, plan_sweep
 from lavt.experiment.runs.run import run_once
 from lavt.operating_system import missing_in_real_time
-from lavt.recording.output_directory import prepare_directory
+from lavt.recording.output_directory import disk_errors_named, prepare_directory
 
 if TYPE_CHECKING:
     from lavt.experiment.sweep.sweep import SweepResult
@@ -54,7 +54,7 @@ def demo(out: console.OutOption = None, as_json: console.JsonOption = False) -> 
     out = out or Path("out") / "demo"
     config = shipped("configs/demo.yaml")
     prepare_directory(out)
-    with console.interruptible():
+    with console.interruptible(), disk_errors_named(out):
         if missing := missing_in_real_time():
             console.print_message(f"the part in real time needs Linux (this system has no {missing}), and is left out")
         else:
@@ -65,7 +65,8 @@ def demo(out: console.OutOption = None, as_json: console.JsonOption = False) -> 
     console.print_message("writing the report")
     drives = {drive.directory: drive for drive in sweep_result.drives}
     failed = [{"run": name, "reason": reason} for name, reason in sweep_result.failed]
-    page = write_report(out, speed=speed, drives=drives, failed=failed)
+    with disk_errors_named(out):
+        page = write_report(out, speed=speed, drives=drives, failed=failed)
     summary = read_json(out / "summary.json")
     if as_json:
         console.print_json(summary)

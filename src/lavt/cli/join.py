@@ -10,6 +10,7 @@ import typer
 from lavt.cli import console
 from lavt.cli.run import print_run
 from lavt.experiment.runs.join import join_sides
+from lavt.recording.output_directory import disk_errors_named
 
 
 def register(app: typer.Typer) -> None:
@@ -29,5 +30,6 @@ def join(
 
     Example: lavt join out/server out/client --out out/joined; lavt report out/joined
     """
-    result = join_sides(server, client, out)
+    with disk_errors_named(out):
+        result = join_sides(server, client, out)
     print_run(result, out, result["seed"], as_json=as_json)

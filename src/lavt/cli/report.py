@@ -13,7 +13,7 @@ from lavt.cli import console
 from lavt.errors import UserError, WorkError
 from lavt.experiment.analysis.results import read_json, read_result
 from lavt.experiment.runs.run import RESULT, compute_result
-from lavt.recording.output_directory import make_directory
+from lavt.recording.output_directory import disk_errors_named, make_directory
 
 BOUNDARY = "boundary.json"
 
@@ -52,9 +52,10 @@ def report(
     failed = [run for directory in found_runs for run in read_failed(directory)]
     base = _base_config(list(found_runs), names)
     answers = _read_answers(list(found_runs), names)
-    page = write_report(
-        out, run_dirs=runs, base=base, sweeps=sweeps, boundaries=boundaries, failed=failed, answers=answers
-    )
+    with disk_errors_named(out):
+        page = write_report(
+            out, run_dirs=runs, base=base, sweeps=sweeps, boundaries=boundaries, failed=failed, answers=answers
+        )
     console.print_result(f"the report is {page}")
 
 

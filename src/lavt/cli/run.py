@@ -14,7 +14,7 @@ from lavt.config_file import load_config
 from lavt.experiment.runs.netem_run import check_netem
 from lavt.experiment.runs.plan import plan_run
 from lavt.experiment.runs.run import run_once
-from lavt.recording.output_directory import check_directory
+from lavt.recording.output_directory import check_directory, disk_errors_named
 
 
 def register(app: typer.Typer) -> None:
@@ -41,7 +41,7 @@ def run(
         for message in check_netem(planned_run):
             console.print_message(f"lavt: {message}")
     title = f"driving {planned_run.config.vehicle.route} under {planned_run.config.network.condition}"
-    with console.interruptible(), LiveView(title) as view:
+    with console.interruptible(), LiveView(title) as view, disk_errors_named(out):
         result = run_once(planned_run, out, progress=view.update)
     print_run(result, out, planned_run.config.seed, as_json=as_json)
 

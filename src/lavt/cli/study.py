@@ -14,7 +14,7 @@ from lavt.cli.progress import progress
 from lavt.config import HUMAN, StudyConfig
 from lavt.config_file import load_config
 from lavt.errors import UserError
-from lavt.recording.output_directory import reserve_directory
+from lavt.recording.output_directory import disk_errors_named, reserve_directory
 
 if TYPE_CHECKING:
     from lavt.experiment.analysis.drive_data import DriveData
@@ -72,7 +72,7 @@ def study(
     remaining = open_study(settings, blocks, out)
     failed: Sequence[tuple[str, str]] = ()
     drives: Sequence[DriveData] = ()
-    with reserve_directory(out):
+    with reserve_directory(out), disk_errors_named(out):
         begin_study(settings, out)
         if is_person:
             page_settings = PageSettings(port, opens_page, asks_in_page)

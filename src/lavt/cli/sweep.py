@@ -13,7 +13,7 @@ from lavt.config import ClientConfig, SweepConfig
 from lavt.config_file import load_config
 from lavt.errors import UserError
 from lavt.experiment.runs.plan import plan_sweep
-from lavt.recording.output_directory import reserve_directory
+from lavt.recording.output_directory import disk_errors_named, reserve_directory
 
 
 def register(app: typer.Typer) -> None:
@@ -72,6 +72,7 @@ def sweep(
     open_sweep(out, resume=resume)
     with (
         reserve_directory(out),
+        disk_errors_named(out),
         console.interruptible("runs"),
         progress(f"sweep, results in {out}", remaining) as report_done,
     ):

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from lavt.errors import UserError
+
+DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG}
+"""The errors of a disk that a write can have."""
 
 
 def check_directory(out: Path) -> None:
@@ -32,6 +36,17 @@ def make_directory(out: Path) -> None:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"{out} cannot be created ({error.strerror}): name another directory with --out") from error
+
+
+@contextmanager
+def disk_errors_named(directory: Path) -> Iterator[None]:
+    """Add the directory to an error of its disk inside the `with` block; an error of writing itself names no file."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None and error.errno in DISK_ERRORS:
+            raise OSError(error.errno, error.strerror, str(directory)) from error
+        raise
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from lavt.assembly.nodes import check_names
 from lavt.config import HUMAN, Condition, RunConfig, SweepConfig
 from lavt.config_file import condition, parse_config
 from lavt.errors import UserError
-from lavt.operating_system import require_real_time
+from lavt.operating_system import require_loopback, require_real_time
 from lavt.transport.emulation.impairment import check_flows
 
 RESERVED_AXES = {"vehicle.route": "routes", "network.condition": "conditions", "repetition": "repetitions"}
@@ -62,6 +62,7 @@ def plan_run(
         )
     if config.time == "real":
         require_real_time("a run in real time")
+        require_loopback()
     if config.time == "real" and config.fidelity != "video":
         raise UserError(
             f"fidelity {config.fidelity} is for virtual time only: choose fidelity video for real time, or time virtual"

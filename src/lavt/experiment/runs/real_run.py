@@ -164,12 +164,21 @@ def _wait_for_ending(
             raise WorkError(f"{ended.name} ended during the run with exit code {code}: {ended.last_message()}")
         not_begun = status.get("safety") in (None, "disarmed", "arming")
         if elapsed_s > run_limit_s or (elapsed_s > begin_limit_s and not_begun):
-            raise WorkError(f"the drive did not begin or end within {elapsed_s:.0f} s: {loop.client.latest} {status}")
+            client = loop.client.latest.get("status", {})
+            raise WorkError(
+                f"the drive did not begin or end within {elapsed_s:.0f} s; vehicle: {_describe(status, 'safety')}; "
+                f"client: {_describe(client, 'phase')}"
+            )
         if progress is not None:
             progress(status, loop.client.latest.get("status", {}))
         pause(STATUS_PERIOD_NS)
     if loop.server.popen.poll() not in (None, 0):
         raise WorkError(f"the server failed: {loop.server.last_message()}")
+
+
+def _describe(status: Mapping[str, Any], state: str) -> str:
+    """Return the state of a side with its reason, as far as its status has them."""
+    return ", ".join(str(status[key]) for key in (state, "reason") if status.get(key)) or "no status"
 
 
 def requested_ms(planned: PlannedRun) -> dict[str, float | None]:

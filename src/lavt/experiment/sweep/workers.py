@@ -21,7 +21,7 @@ from lavt.experiment.analysis.results import read_json
 from lavt.experiment.runs.plan import PlannedRun
 from lavt.experiment.runs.run import RESULT, drive_once
 from lavt.experiment.sweep.worker_processes import WorkerProcesses
-from lavt.recording.output_directory import prepare_directory
+from lavt.recording.output_directory import disk_errors_named, prepare_directory
 
 Item = TypeVar("Item")
 DriveRun = Callable[[PlannedRun, Path], DriveData]
@@ -96,7 +96,8 @@ def drive_or_read(planned: PlannedRun, directory: Path, drive: DriveRun = drive_
     if is_finished(directory):
         return read_drive(directory, read_json(directory / RESULT))
     remove_unfinished(directory)
-    return drive(planned, directory)
+    with disk_errors_named(directory):
+        return drive(planned, directory)
 
 
 def drive_remotely(planned: PlannedRun) -> tuple[DriveData, dict[str, bytes]]:
