@@ -182,7 +182,7 @@ class ClientSession:
         elif self.phase == "arming" and state.safety == "driving" and not names_other_client:
             self.phase, self._stop_to_clear = "driving", None
         elif self.phase == "driving" and state.safety in ("disarmed", "safe_stop", "emergency_stop"):
-            self.phase, self.reason = "stopped", state.reason + RESTART_HINT * self._awaits_person
+            self.phase, self.reason = "stopped", state.reason + RESTART_HINT * (self._awaits_person or not self._rearm)
         elif (
             self.phase == "stopped"
             and self._rearm
