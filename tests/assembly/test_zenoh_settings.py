@@ -53,7 +53,7 @@ def test_a_servers_router_listens_as_its_file_says(security: dict[str, Any], pro
     ("security", "dialled", "local"),
     [
         ({}, "udp/192.0.2.7:7448?mixed_rel=1;rel=1", "tcp/127.0.0.1:7457"),
-        (CLIENT_KEYS, "quic/192.0.2.7:7448?mixed_rel=1", "unixsock-stream//run/lavt/zenoh.sock"),
+        (CLIENT_KEYS, "quic/192.0.2.7:7448?mixed_rel=1", "unixsock-stream//run/lavt/zenoh-client.sock"),
     ],
 )
 def test_a_clients_router_dials_the_vehicle(security: dict[str, Any], dialled: str, local: str) -> None:

@@ -642,6 +642,18 @@ def test_shipped_configs(
         assert len(router.locators()) >= len(endpoints)
 
 
+@pytest.mark.parametrize("security", ["", "-tls"])
+def test_both_routers_can_run_on_one_machine(security: str) -> None:
+    """The routers of a server and of a client listen on different ports and sockets."""
+    server, client = (
+        json.loads(zenoh.Config.from_file(str(CONFIGS / f"router-{side}{security}.json5")).get_json("listen/endpoints"))
+        for side in ("server", "client")
+    )
+    assert server
+    assert client
+    assert not {*server} & {*client}
+
+
 @pytest.mark.parametrize("name", sorted(path.name for path in CONFIGS.iterdir()))
 def test_shipped_configs_use_no_scouting(name: str) -> None:
     """Every shipped config disables scouting by multicast and gossip, and Zenoh's timestamps."""
