@@ -90,7 +90,11 @@ def test_a_stopped_vehicle_stays_stopped(safety: SafetyState) -> None:
     session.handle_state(state("degraded"), 400)
     assert session.phase == "driving"
     session.handle_state(state(safety), 500)
-    assert (session.phase, session.may_command, session.reason) == ("stopped", False, "reason; restart this client to drive")
+    assert (session.phase, session.may_command, session.reason) == (
+        "stopped",
+        False,
+        "reason; restart this client to drive",
+    )
     session.handle_state(state(safety), 600)
     assert session.take_request(10 * NS_PER_S) is None
 
