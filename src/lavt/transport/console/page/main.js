@@ -9,7 +9,7 @@ import { Lanes } from "./lane.js";
 import { Screen } from "./screen.js";
 import { Sources } from "./source.js";
 import { Touch } from "./touch.js";
-import { Video } from "./video.js";
+import { Video, canDecode } from "./video.js";
 
 const INPUT_PERIOD_MS = 20;
 const PROBE_PERIOD_MS = 500;
@@ -53,10 +53,11 @@ function isWatching() {
   return Boolean(status?.controller);
 }
 
-function connect() {
+async function connect() {
   const token = location.hash.slice(1);
   if (token === "") return showClosed("open the address that lavt has printed, with all that follows the #");
   if (!("VideoDecoder" in globalThis)) return showClosed("this browser cannot decode video (WebCodecs): use another");
+  if (!(await canDecode())) return showClosed("this browser cannot decode H.264, the format of the video: install its codecs, or use another browser");
   const takeProbe = (answer) => offset.note(answer);
   const takeLane = (lane) => video.lanes?.take(lane);
   connection = new Connection(token, { takeStatus, takeLane, takeUnit, takeProbe, close });

@@ -8,6 +8,15 @@ const MAX_DECODING = 3; // access units in the decoder
 const MAX_DECODING_WITH_LANES = 8; // as many as lavt sends to a page that watches
 const DECODING_LIMIT_US = 1_000_000;
 
+// Return whether this browser decodes the video's format; some have WebCodecs, but no decoder for it.
+export async function canDecode() {
+  try {
+    return (await VideoDecoder.isConfigSupported({ codec: "avc1.42C01E" })).supported === true;
+  } catch {
+    return false;
+  }
+}
+
 export class Video {
   #canvas;
   #context;
