@@ -30,7 +30,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # for the package `benchmarks`
 
-from benchmarks.fuzzing import camera, operator_side, rendezvous, secured, vehicle
+from benchmarks.fuzzing import camera, operator_side, pages, rendezvous, secured, vehicle
 from benchmarks.fuzzing.mutation import Chance, next_input
 from benchmarks.fuzzing.target import Target
 
@@ -54,6 +54,9 @@ TARGETS: dict[str, tuple[Callable[[int], Target], float]] = {
     "encrypted_video": (secured.encrypted_video, 0.03),
     "encrypted_feedback": (secured.encrypted_feedback, 0.02),
     "rendezvous": (rendezvous.rendezvous, 0.03),
+    "driving_page": (pages.driving_page, 0.03),
+    "watching_page": (pages.watching_page, 0.02),
+    "console_site": (pages.console_site, 0.02),
 }
 """The function that makes each target, and the target's share of the inputs."""
 

@@ -1,4 +1,4 @@
-"""Recompute the results of a sweep from its records alone, and compare them with LAVT's.
+"""Recompute the results of a sweep or a run from its records alone, and compare them with LAVT's.
 
     python benchmarks/recompute.py out/paper
 
@@ -6,8 +6,8 @@ This program and its modules in `recomputing` import nothing of LAVT: they were 
 `docs/records.md`, with `mcap`, `numpy` and `scipy`. From `result.json` they take only what the records do not have: the
 identity of the run and its validity. The program prints the headline table, and each value of `result.json` and
 `summary.json` that differs by more than rounding. The exit code is 1 if there is any. It covers sweeps in virtual time
-without further axes. It does not recompute the stages, the bound and drift of the clock offset, the validity, survival,
-and the groups.
+without further axes, and single runs, also of a person, whose clocks are those of one kernel or have time sources. It
+does not recompute the stages, the bound and drift of the clock offset, the validity, survival, and the groups.
 """
 
 from __future__ import annotations
@@ -86,6 +86,13 @@ def recompute_sweep(directory: Path) -> tuple[dict[str, Row], list[str], int]:
     return conditions, found, compared + count_values(recomputed)
 
 
+def recompute_one(directory: Path) -> tuple[dict[str, Row], list[str], int]:
+    """Return no conditions, a text for each difference, and the number of compared values of a single run."""
+    values = recompute_run(directory)
+    found = differences("run", values, json.loads((directory / "result.json").read_text()))
+    return {}, list(found), count_values(values)
+
+
 def print_table(conditions: dict[str, Row]) -> None:
     """Print the headline as a Markdown table."""
     print("| | " + " | ".join(HEADLINE) + " |")
@@ -96,11 +103,14 @@ def print_table(conditions: dict[str, Row]) -> None:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Recompute the sweep in the named directory; return 1 if a value differs."""
+    """Recompute the sweep or the run in the named directory; return 1 if a value differs."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("directory", type=Path, help="directory of a sweep")
-    conditions, found, compared = recompute_sweep(parser.parse_args(arguments).directory)
-    print_table(conditions)
+    parser.add_argument("directory", type=Path, help="directory of a sweep, or of a run")
+    directory = parser.parse_args(arguments).directory
+    recompute = recompute_one if (directory / "result.json").is_file() else recompute_sweep
+    conditions, found, compared = recompute(directory)
+    if conditions:
+        print_table(conditions)
     print(f"{compared} values were recomputed; {len(found)} differ by more than rounding")
     print("\n".join(found))
     return 1 if found else 0

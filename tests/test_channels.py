@@ -31,7 +31,7 @@ EXTERNAL_SENDERS = {"clock_source", "console", "injector", "operator", "runtime"
 
 @pytest.fixture(scope="module")
 def nodes() -> Sequence[Node]:
-    """Return all nodes of both sides, built as for a run, and those of a client with which a person drives."""
+    """Return all nodes of both sides, built as for a run, and those of clients that a person drives or watches."""
     camera = ServerCameraConfig(width_px=640, height_px=480)
     server = build_server(
         ServerConfig(vehicle=VehicleConfig(scenery="none"), camera=camera),
@@ -47,6 +47,7 @@ def nodes() -> Sequence[Node]:
             ),
             lambda: Now(0, 10**18),
             SeededEntropy(1, "client"),
+            is_watched=controller != HUMAN,
         )
         for controller in ("lane_keeper", HUMAN)
     ]
@@ -72,9 +73,11 @@ def sent_channels() -> set[tuple[str, str]]:
 
 
 def test_nodes_receive_the_channels_of_the_table(nodes: Sequence[Node]) -> None:
-    """Nodes receive exactly the channels that list them as receivers."""
+    """Nodes receive exactly the channels that list them as receivers or observers."""
     received = {(channel, node.name) for node in nodes for channel in node.pipelines if channel != WAKE}
-    assert received == {(channel, name) for channel, row in CHANNELS.items() for name in row.receivers}
+    assert received == {
+        (channel, name) for channel, row in CHANNELS.items() for name in (*row.receivers, *row.observers)
+    }
 
 
 def test_stages_have_different_names(nodes: Sequence[Node]) -> None:
@@ -113,13 +116,24 @@ def test_channels_without_receivers() -> None:
         "page_status",
         "page_unit",
         "relay_delay",
+        "watch_status",
+        "watch_unit",
     }
+
+
+def test_a_watching_page_reaches_no_other_node() -> None:
+    """The node of pages that watch sends to pages only, and observes no channel whose messages run inline."""
+    sent = {name: row for name, row in CHANNELS.items() if row.sender == "page_watch"}
+    assert {(row.carrier, row.receivers, row.observers) for row in sent.values()} == {("console", (), ())}
+    from_pages = {"watch_opened", "watch_closed", "watch_message"}
+    assert {CHANNELS[name].receivers for name in from_pages} == {("page_watch",)}
+    assert not any(row.inline for row in CHANNELS.values() if row.observers)
 
 
 def test_ground_truth_stays_on_the_server() -> None:
     """Ground truth is recorded only; it crosses no network and reaches no node."""
     assert CHANNELS["truth"].carrier == "record"
-    assert CHANNELS["truth"].receivers == ()
+    assert CHANNELS["truth"].receivers == CHANNELS["truth"].observers == ()
 
 
 def test_commands_wait_in_a_bounded_queue() -> None:

@@ -79,6 +79,17 @@ def test_a_wrong_value_is_found(sweep: Path) -> None:
     assert names == {f"run.{name}" for name in changed}
 
 
+def test_a_single_run_is_recomputed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A directory with a result is one of a run; its values are compared without a table of conditions."""
+    (tmp_path / "result.json").write_text('{"p95_m": 1.0}')
+    for p95_m, code in ((1.0, 0), (2.0, 1)):
+        monkeypatch.setattr("benchmarks.recompute.recompute_run", lambda _directory, p95_m=p95_m: {"p95_m": p95_m})
+        assert main([str(tmp_path)]) == code
+        assert capsys.readouterr().out.startswith(f"1 values were recomputed; {code} differ")
+
+
 def test_the_exit_code_tells_of_differences(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

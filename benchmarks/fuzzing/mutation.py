@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -88,6 +89,9 @@ BOMBS: Final = (
 )
 """Prefixes of msgpack that are invalid, announce more data than follows, or nest deeper than any message."""
 
+JSON_BOMBS: Final = (b"[" * 5000, b'{"a":' * 5000, b"9" * 5000, b'"', b"\\ud800", b"\x00", b"\xef\xbb\xbf")
+"""Prefixes of JSON that are invalid, nest deeper than any message, or are longer than any."""
+
 Item = TypeVar("Item")
 
 
@@ -129,6 +133,8 @@ class Corpus:
     """Offset and length (bytes) of each field, if the inputs have a binary layout."""
     packed: bool = False
     """Whether the inputs are msgpack arrays, in which single values are replaced."""
+    is_json: bool = False
+    """Whether the inputs are JSON objects, in which single values are replaced."""
     replays: deque[bytes] = field(default_factory=lambda: deque(maxlen=64))
     """Earlier true inputs, which are repeated without changes."""
 
@@ -144,11 +150,18 @@ def next_input(corpus: Corpus, chance: Chance) -> bytes:
     if kind <= 2 and corpus.replays:
         return chance.choice(corpus.replays)
     data = chance.choice(corpus.entries)
-    structured = PACKED_MUTATIONS if corpus.packed else BINARY_MUTATIONS
-    mutations = structured if corpus.packed or corpus.fields else UNSTRUCTURED_MUTATIONS
+    mutations = _mutations_of(corpus)
     for _ in range(chance.below(MAX_MUTATIONS_PER_INPUT + 1)):
         data = chance.choice(mutations)(data, corpus, chance)
     return data
+
+
+def _mutations_of(corpus: Corpus) -> tuple[Mutation, ...]:
+    if corpus.packed:
+        return PACKED_MUTATIONS
+    if corpus.is_json:
+        return JSON_MUTATIONS
+    return BINARY_MUTATIONS if corpus.fields else UNSTRUCTURED_MUTATIONS
 
 
 def _flip(data: bytes, _corpus: Corpus, chance: Chance) -> bytes:
@@ -225,6 +238,24 @@ def _change_shape(data: bytes, _corpus: Corpus, chance: Chance) -> bytes:
     return packed
 
 
+def _change_json(data: bytes, _corpus: Corpus, chance: Chance) -> bytes:
+    """Replace, remove or add a value of a JSON object; numbers that JSON does not have are written as Python does."""
+    try:
+        values = json.loads(data)
+        name = chance.choice((*values, "x"))
+        if chance.below(4):
+            values[name] = chance.choice(VALUES)
+        else:
+            values.pop(name, None)
+        return json.dumps(values, default=repr).encode(errors="surrogatepass")
+    except Exception:  # an earlier mutation broke the message
+        return data
+
+
+def _prepend_json_bomb(data: bytes, _corpus: Corpus, chance: Chance) -> bytes:
+    return chance.choice(JSON_BOMBS) + data
+
+
 def _prepend_bomb(data: bytes, _corpus: Corpus, chance: Chance) -> bytes:
     return chance.choice(BOMBS) + data
 
@@ -233,6 +264,11 @@ UNSTRUCTURED_MUTATIONS: Final[tuple[Mutation, ...]] = (_flip, _truncate, _length
 BINARY_MUTATIONS: Final[tuple[Mutation, ...]] = (
     *UNSTRUCTURED_MUTATIONS,
     *(_change_field,) * len(UNSTRUCTURED_MUTATIONS),
+)
+JSON_MUTATIONS: Final[tuple[Mutation, ...]] = (
+    *UNSTRUCTURED_MUTATIONS,
+    *(_change_json,) * 2 * len(UNSTRUCTURED_MUTATIONS),
+    _prepend_json_bomb,
 )
 PACKED_MUTATIONS: Final[tuple[Mutation, ...]] = (
     *UNSTRUCTURED_MUTATIONS,

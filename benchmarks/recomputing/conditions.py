@@ -24,6 +24,7 @@ PLANNED = (("L0", "L1"), ("L1", "L2"), ("L2", "L3"), ("L2", "L4"), ("L3", "L4"),
 MEANS = ("mae_m", "rms_m", "max_m", "heading_rms_rad", "steering_reversals_per_s", "oscillation_hz")
 COUNTS = ("collisions", "lane_invasions")
 LATENCIES = ("tau_v_ms", "tau_c_ms", "loop_ms", "age_at_actuation_ms")
+PAGE_LATENCIES = ("page_decoded_ms", "page_shown_ms")
 
 
 def groups(runs: Iterable[Row], key: Callable[[Row], Any]) -> dict[Any, list[Row]]:
@@ -215,6 +216,7 @@ def summarize(runs: Sequence[Row], common_p95: Values) -> Row:
             for name in ("followed_changes", "occupied_changes")
         },
         **{name: medians([run[name] for run in runs]) for name in LATENCIES},
+        **{name: page_latency([run[name] for run in runs]) for name in PAGE_LATENCIES},
         "picture_age_ms": {
             key: float(np.median([run["picture_age_ms"][key] for run in runs])) for key in ("mean", "p95")
         },
@@ -224,8 +226,15 @@ def summarize(runs: Sequence[Row], common_p95: Values) -> Row:
 def medians(entries: Sequence[Row]) -> Row:
     """Return the medians of the runs' percentiles and the sum of their numbers."""
     known = [entry for entry in entries if entry["n"]]
-    summary: Row = {key: float(np.median([entry[key] for entry in known])) for key in ("p5", "p50", "p95")}
+    summary: Row = {
+        key: float(np.median([entry[key] for entry in known])) if known else None for key in ("p5", "p50", "p95")
+    }
     return {**summary, "n": sum(entry["n"] for entry in known)}
+
+
+def page_latency(entries: Sequence[Row]) -> Row:
+    """Return the medians as for other latencies, and the largest maximum."""
+    return {**medians(entries), "max": max((entry["max"] for entry in entries if entry["n"]), default=None)}
 
 
 # Contrasts.

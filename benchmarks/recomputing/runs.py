@@ -22,7 +22,7 @@ Record = dict[str, list[Row]]
 
 SIDES = {
     "server": ("frame", "admission", "truth", "route", "event", "clock"),
-    "client": ("picture", "lane", "clock"),
+    "client": ("picture", "lane", "clock", "page_picture"),
 }
 """The channels that are read."""
 
@@ -93,7 +93,8 @@ def lane_keeping(truth: list[Row], events: Counter[str]) -> Row:
     steering_rad = column(truth, "steering_rad")
     times_s = np.array([row["mono_ns"] - truth[0]["mono_ns"] for row in truth]) / 1e9
     driven_m = progress_m.max() - progress_m[0]
-    steps_s = np.diff(times_s)
+    steps_s, changes_rad = np.diff(times_s), np.diff(steering_rad)
+    steps_s, changes_rad = steps_s[steps_s > 0], changes_rad[steps_s > 0]
     reversals = count_reversals(steering_rad.tolist())
     return {
         **error_metrics("", cross_track_m),
@@ -104,7 +105,7 @@ def lane_keeping(truth: list[Row], events: Counter[str]) -> Row:
         "heading_rms_rad": np.sqrt(np.mean(heading_rad**2)),
         "heading_p95_rad": np.percentile(heading_rad, 95),
         "steering_rms_rad": np.sqrt(np.mean(samples(progress_m, steering_rad) ** 2)),
-        "steering_rate_rms_radps": np.sqrt(np.sum(np.diff(steering_rad) ** 2 / steps_s) / np.sum(steps_s)),
+        "steering_rate_rms_radps": np.sqrt(np.sum(changes_rad**2 / steps_s) / np.sum(steps_s)),
         "steering_reversals_per_s": reversals / times_s[-1],
         "steering_reversals_per_km": reversals / (driven_m / 1000),
         "oscillation_hz": oscillation_hz(times_s, steering_rad),
@@ -298,7 +299,10 @@ def percentiles(values_ns: Sequence[float]) -> Row:
 
 
 def clock_offset(server: Record, client: Record, interval: tuple[int, int], shift_ns: int) -> Callable[[int], int]:
-    """Return Delta as a function of the client's wall clock, by the clock sources of both sides."""
+    """Return Delta as a function of the client's wall clock: 0 on one kernel, else by both sides' clock sources."""
+    hosts = {row.get("host") for record in (server, client) for row in record["clock"]}
+    if len(hosts) == 1 and hosts != {""}:
+        return lambda _wall_ns: 0
     sides = []
     for record, shift in ((server, 0), (client, shift_ns)):
         low, high = interval[0] + shift - 5 * 10**9, interval[1] + shift + 5 * 10**9
@@ -348,6 +352,7 @@ def latencies(server: Record, client: Record, interval: tuple[int, int]) -> Row:
             [row["read_wall_ns"] + delta(row["read_wall_ns"]) - row["stamp_ns"] for row in readable]
         ),
         "tau_c_ms": percentiles(tau_c),
+        **page_latencies(client, in_drive, delta),
         "loop_ms": percentiles(loop),
         "age_at_actuation_ms": percentiles(at_actuation),
         "picture_age_ms": frame_age(accepted, frames, interval),
@@ -355,6 +360,24 @@ def latencies(server: Record, client: Record, interval: tuple[int, int]) -> Row:
         "frames_decoded": len(pictures),
         "frames_unreadable": len(pictures) - len(readable),
     }
+
+
+def page_latencies(client: Record, in_drive: dict[Any, Row], delta: Callable[[int], int]) -> Row:
+    """Return the latencies from the stamp to the page of a person; without a row of these frames, all but `n` is None.
+
+    A row counts if it has all of its times and the bound, and only the first one with its stamp.
+    """
+    needed = ("decoded_wall_ns", "shown_wall_ns", "bound_ns")
+    complete = [row for row in client["page_picture"] if all(row.get(name) is not None for name in needed)]
+    rows = [row for stamp, row in first_by(complete, "stamp_ns").items() if stamp in in_drive]
+    found: Row = {}
+    for name in ("decoded", "shown"):
+        times = [(row[f"{name}_wall_ns"], row["stamp_ns"]) for row in rows]
+        latencies_ns = [wall + delta(wall) - stamp for wall, stamp in times]
+        none = {"p5": None, "p50": None, "p95": None, "n": 0, "max": None}
+        measured = {**percentiles(latencies_ns), "max": max(latencies_ns) / 1e6} if latencies_ns else none
+        found[f"page_{name}_ms"] = measured
+    return found
 
 
 def frame_age(accepted: list[Row], frames: dict[Any, Row], interval: tuple[int, int]) -> Row:

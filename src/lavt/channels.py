@@ -8,7 +8,7 @@ from typing import Literal
 Carrier = Literal["local", "video", "zenoh", "probe", "clock", "netem", "console", "relay", "record"]
 """local: between nodes of one side. video: the UDP flow of the video. zenoh: a Zenoh key or query. probe: the UDP flow
 of the clock probes. clock: the host's time source. netem: the host's network queues. console: the web pages from which
-a person drives. relay: a relay in the client's process. record: the record only, no receiver."""
+a person drives or watches. relay: a relay in the client's process. record: the record only, no receiver."""
 
 Waiting = Literal["queue", "newest"]
 """queue: messages are received in order; a full queue drops its oldest message. newest: a new message replaces the
@@ -22,6 +22,9 @@ PAGE_QUEUE_LENGTH = 4096
 """More than the messages of all pages in a second: the link closes a page that sends more, so that none is dropped."""
 PROBE_QUEUE_LENGTH = 64
 """A probe that waits behind many other probes measures mainly its wait in this queue."""
+
+WATCHED = ("page_watch",)
+"""The observer of what the pages show that watch a client."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +40,9 @@ class Channel:
     inline: bool = False
     """Whether the thread that delivers a message in real time also runs the receiver's pipeline; for pipelines that are
     short and run often."""
+    observers: tuple[str, ...] = ()
+    """Nodes of the side that sends or receives the messages. If it has them, they get each message, too, in real
+    time."""
 
 
 CHANNELS: dict[str, Channel] = {
@@ -49,7 +55,7 @@ CHANNELS: dict[str, Channel] = {
     "rest": Channel("local", "actuator", ("injection",)),
     "server_ends": Channel("local", "operator", ("actuator",)),  # stops the vehicle before a server shutdown
     # client, between its nodes
-    "access_unit": Channel("local", "receiver", ("driver",)),
+    "access_unit": Channel("local", "receiver", ("driver",), observers=WATCHED),
     "view": Channel("local", "driver", ("driver",), "newest"),
     "picture_lost": Channel("local", "driver", ("receiver",)),
     "operator": Channel("local", "operator", ("driver",)),  # a person requests a stop or a release
@@ -64,12 +70,18 @@ CHANNELS: dict[str, Channel] = {
     "page_unit": Channel("console", "driver"),
     "page_status": Channel("console", "driver"),
     "relay_delay": Channel("relay", "driver"),
+    # client, if pages only watch: between them and the node that serves them, which sends to no other node
+    "watch_opened": Channel("local", "console", ("page_watch",)),
+    "watch_closed": Channel("local", "console", ("page_watch",)),
+    "watch_message": Channel("local", "console", ("page_watch",), length=PAGE_QUEUE_LENGTH),
+    "watch_unit": Channel("console", "page_watch"),
+    "watch_status": Channel("console", "page_watch"),
     # across the network
     # server to client: RTP, sender reports, and challenges, to which the client must answer to prove its address
     "rtp": Channel("video", "camera", ("receiver",), inline=True),
     "feedback": Channel("video", "receiver", ("camera",)),  # client to server: RTCP, hellos, answers to challenges
-    "control": Channel("zenoh", "driver", ("actuator",), length=COMMAND_QUEUE_LENGTH),
-    "state": Channel("zenoh", "actuator", ("driver",), "newest"),
+    "control": Channel("zenoh", "driver", ("actuator",), length=COMMAND_QUEUE_LENGTH, observers=WATCHED),
+    "state": Channel("zenoh", "actuator", ("driver",), "newest", observers=WATCHED),
     "session": Channel("zenoh", "driver", ("actuator",), length=COMMAND_QUEUE_LENGTH),
     "session_reply": Channel("zenoh", "actuator", ("driver",)),
     "netem": Channel("zenoh", "injection", ("injection",), length=COMMAND_QUEUE_LENGTH),
@@ -89,9 +101,9 @@ CHANNELS: dict[str, Channel] = {
     "truth": Channel("record", "actuator"),
     "route": Channel("record", "actuator"),
     "event": Channel("record", "actuator"),
-    "reception": Channel("record", "receiver"),
-    "picture": Channel("record", "driver"),
-    "lane": Channel("record", "driver"),
+    "reception": Channel("record", "receiver", observers=WATCHED),
+    "picture": Channel("record", "driver", observers=WATCHED),
+    "lane": Channel("record", "driver", observers=WATCHED),
     "human_input": Channel("record", "driver"),
     "page_picture": Channel("record", "driver"),
     "clock": Channel("record", "clock_sync"),

@@ -11,10 +11,11 @@ import json
 import os
 import shutil
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
 from http.client import HTTPConnection
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final
 from urllib.parse import quote
 
@@ -146,10 +147,12 @@ class Browser:
 
 
 @contextmanager
-def running_browser(profile: Path, display: str | None = None) -> Iterator[Browser]:
+def running_browser(
+    profile: Path, display: str | None = None, *, environment: Mapping[str, str] = MappingProxyType({})
+) -> Iterator[Browser]:
     """Run Chromium with an empty profile in this directory, and end all its processes.
 
-    With `display`, it has a window there, at (50, 30).
+    With `display`, it has a window there, at (50, 30). `environment` has further variables of its environment.
     """
     arguments = ["--disable-gpu", "--no-first-run"]
     if display is None:
@@ -167,7 +170,7 @@ def running_browser(profile: Path, display: str | None = None) -> Iterator[Brows
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,
-            env=os.environ | ({} if display is None else {"DISPLAY": display}),
+            env=os.environ | dict(environment) | ({} if display is None else {"DISPLAY": display}),
             start_new_session=True,
         )
     browser = None

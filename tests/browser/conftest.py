@@ -8,10 +8,12 @@ from typing import Any
 
 import pytest
 from tests.browser.chromium import PACKAGES, Browser, ProtocolError, Tab, is_missing, running_browser, wait_until
+from tests.browser.firefox import FirefoxTab
 from tests.require import need
 
 from lavt.experiment.runs.processes import Process, Processes
 
+AnyTab = Tab | FirefoxTab
 HERE = Path(__file__).parent
 TIMEOUT_S = 300
 ATTEMPTS = 8
@@ -81,7 +83,7 @@ def person_drive(browser: Browser, tmp_path: Path) -> Iterator[PersonDrive]:
             drive.close()
 
 
-def repeat_keys(tab: Tab) -> None:
+def repeat_keys(tab: AnyTab) -> None:
     """Let the page get repeats of the key that was pressed last."""
     tab.evaluate(REPEAT_KEYS)
 
@@ -101,7 +103,7 @@ def unplug_gamepads(tab: Tab) -> None:
     tab.evaluate("navigator.getGamepads = () => []; new Promise((resolve) => setTimeout(resolve, 200))")
 
 
-def status(tab: Tab) -> dict[str, Any] | None:
+def status(tab: AnyTab) -> dict[str, Any] | None:
     """Return the newest status that the page has received; None while it is not loaded or not connected."""
     try:
         result: dict[str, Any] | None = tab.evaluate("globalThis.lavtConsole?.status ?? null")
@@ -110,13 +112,13 @@ def status(tab: Tab) -> dict[str, Any] | None:
     return result
 
 
-def field(tab: Tab, name: str) -> Any:
+def field(tab: AnyTab, name: str) -> Any:
     """Return one value of the page's newest status; None while it is not connected."""
     return (status(tab) or {}).get(name)
 
 
 def drive_until(
-    tab: Tab, hold: Callable[[], None], release_all: Callable[[], None], condition: Callable[[], bool]
+    tab: AnyTab, hold: Callable[[], None], release_all: Callable[[], None], condition: Callable[[], bool]
 ) -> None:
     """Arm by `hold` and wait until `condition()`; if the vehicle stops before, release and try again.
 
@@ -133,27 +135,27 @@ def drive_until(
     pytest.fail(f"the car did not drive in {ATTEMPTS} attempts")
 
 
-def press(tab: Tab, *codes: str) -> None:
+def press(tab: AnyTab, *codes: str) -> None:
     """Press keys, with the pointer over the page."""
     tab.point()
     for code in codes:
         tab.key(code, down=True)
 
 
-def release(tab: Tab, *codes: str) -> None:
+def release(tab: AnyTab, *codes: str) -> None:
     """Release keys."""
     for code in codes:
         tab.key(code, down=False)
 
 
-def arm(tab: Tab) -> None:
+def arm(tab: AnyTab) -> None:
     """Hold the space bar until the vehicle is driving."""
     drive_until(
         tab, lambda: press(tab, "Space"), lambda: release(tab, "Space"), lambda: field(tab, "safety") == "driving"
     )
 
 
-def drive_off(tab: Tab) -> None:
+def drive_off(tab: AnyTab) -> None:
     """Arm, and accelerate to 2 m/s."""
 
     def accelerates() -> bool:

@@ -10,7 +10,7 @@ import pytest
 
 from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
-from lavt.node import WAKE, Message, Send, Stage
+from lavt.node import WAKE, Message, Node, Send, Stage
 from lavt.runtime.realtime import RealRuntime
 from lavt.transport.clock_sync.clock_report import ClockReport
 
@@ -88,6 +88,55 @@ def test_nodes_are_woken_in_time_and_messages_delivered() -> None:
     assert node.threads == {"driver"}
     assert "driver" not in {thread.name for thread in threading.enumerate()}
     assert ("counts", {"node": "driver", "received": 1}) in recorded.entries
+
+
+class ObservingNode:
+    """A node that observes what the node "driver" receives, sends and records, and stores it."""
+
+    name = "page_watch"
+
+    def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
+        self.seen: list[tuple[str, Any]] = []
+        self.pipelines: Mapping[str, Sequence[Stage]] = dict.fromkeys(
+            ("state", "control", "lane"), (("note", self._note),)
+        )
+
+    def next_wake_ns(self) -> None:
+        """Return None: only messages wake the node."""
+
+    def _note(self, message: Message, _now: Now) -> None:
+        self.seen.append((message.channel, message.payload))
+
+
+class RecordingNode(PeriodicNode):
+    """A node that answers each message with a command and an entry of the record."""
+
+    def __init__(self) -> None:
+        super().__init__(0)
+        self.pipelines = {"state": (("answer", lambda _message, _now: [Send("control", b"go"), Send("lane", "seen")]),)}
+
+    def next_wake_ns(self) -> None:  # type: ignore[override]
+        """Return None: only messages wake the node."""
+
+
+@pytest.mark.parametrize("is_observed", [True, False])
+def test_an_observer_gets_what_others_receive_send_and_record(is_observed: bool) -> None:
+    """An observer gets what a node receives, sends to the network and records, each once; the node is not affected."""
+    clock, recorded, observer = MachineClock(), ListRecorder(), ObservingNode()
+    nodes: list[Node] = [RecordingNode(), observer] if is_observed else [RecordingNode()]
+    runtime = RealRuntime(clock, nodes, recorded, lambda: None)
+    runtime.start({"zenoh": recorded})
+    for number in range(3):
+        runtime.deliver("state", number, runtime.now())
+        pause(NS_PER_S // 20)
+    runtime.stop()
+    assert runtime.failed is None
+    seen = sorted(map(str, observer.seen))
+    expected = [("control", b"go"), ("lane", "seen")] * 3 + [("state", number) for number in range(3)]
+    assert seen == (sorted(map(str, expected)) if is_observed else [])
+    assert recorded.sent == [Send("control", b"go")] * 3
+    assert [entry for entry in recorded.entries if entry[0] == "lane"] == [("lane", "seen")] * 3
 
 
 def test_a_failing_node_ends_the_run() -> None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 from lavt.assembly.addresses import resolved_address
+from lavt.assembly.cameras import client_camera
 from lavt.assembly.entropy import Entropy
 from lavt.assembly.fidelity import VIDEO, FidelityModel
 from lavt.assembly.injection import injection_client, injection_node
@@ -28,6 +29,7 @@ from lavt.nodes.clock_sync import ClockSyncNode, ProbingClockSyncNode
 from lavt.nodes.driver import DriverNode
 from lavt.nodes.human_driver import HumanDriverNode
 from lavt.nodes.injection import InjectionClient, InjectionNode
+from lavt.nodes.page_watch import PageWatchNode
 from lavt.nodes.payloads import DelayChoice, Route
 from lavt.nodes.picture_reader import PictureReader
 from lavt.nodes.receiver import ReceiverNode
@@ -67,11 +69,14 @@ class ClientNodes:
     driver: DriverNode | HumanDriverNode
     clock_sync: ClockSyncNode
     injection: InjectionClient
+    page_watch: PageWatchNode | None = None
+    """None: no page watches."""
 
     @property
     def all(self) -> Sequence[Node]:
         """All nodes, for a runtime."""
-        return (self.receiver, self.driver, self.clock_sync, self.injection)
+        watch = () if self.page_watch is None else (self.page_watch,)
+        return (self.receiver, self.driver, self.clock_sync, self.injection, *watch)
 
 
 @lru_cache(maxsize=64)  # a sweep checks each of its runs
@@ -237,8 +242,12 @@ def build_client(
     *,
     fidelity: FidelityModel = VIDEO,
     delays: DelayChoice | None = None,
+    is_watched: bool = False,
 ) -> ClientNodes:
-    """Build the client's nodes. `delays` are those that a person who drives can choose, if any."""
+    """Build the client's nodes, with `is_watched` also that of pages that watch the controller.
+
+    `delays` are those that a person who drives can choose, if any.
+    """
     controller = config.controller
     build_driver = _human_driver(config, fidelity, delays) if controller.kind == HUMAN else _driver(config, fidelity)
     hold_ms = config.video.reorder_hold_ms
@@ -264,7 +273,13 @@ def build_client(
         build_driver(session),
         ProbingClockSyncNode(start.mono_ns),
         injection_client(config.injection, config.who, instance, start.mono_ns),
+        _page_watch(config, instance) if is_watched else None,
     )
+
+
+def _page_watch(config: ClientConfig, instance: int) -> PageWatchNode:
+    controller, camera = config.controller, client_camera(config.camera)
+    return PageWatchNode(controller.kind, _settings(controller).speed_mps, camera, (config.who, instance))
 
 
 def _driver(config: ClientConfig, fidelity: FidelityModel) -> Callable[[ClientSession], DriverNode]:

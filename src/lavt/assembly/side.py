@@ -31,6 +31,7 @@ from lavt.assembly.zenoh import side_session
 from lavt.clock import Clock
 from lavt.config import HUMAN, ClientConfig, ServerConfig
 from lavt.domain import Now
+from lavt.errors import UserError
 from lavt.node import Node, Peer
 from lavt.nodes.client_session import ClientSession
 from lavt.nodes.payloads import DelayChoice
@@ -56,6 +57,7 @@ PrintMessage = Callable[[str], None]
 
 CONSOLE_TOKEN_BYTES = 16
 """Length of the random token in the address of the console's page."""
+WATCHED_PERSON = "--watch is for a controller, but a person drives: leave it out, and open the person's page once more"
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,7 @@ class Links:
     probe: UdpLink | RendezvousLink
     zenoh: ZenohLink
     console: ConsoleLink | None = None
-    """The pages from which a person drives; None if no person drives."""
+    """The pages from which a person drives or watches; None: there are none."""
     relay: MessageLink | None = None
     """A relay in this process whose delays the person chooses; None: there is none."""
 
@@ -152,7 +154,7 @@ class Side:
 
     @property
     def console_url(self) -> str | None:
-        """The address of the page from which a person drives; None if no person drives."""
+        """The address of the page from which a person drives or watches; None: there is none."""
         return None if self._links.console is None else self._links.console.url
 
     def send(self, channel: str, payload: Any) -> None:
@@ -250,13 +252,18 @@ def open_client(
     *,
     relay: MessageLink | None = None,
     delays: DelayChoice | None = None,
+    is_watched: bool = False,
 ) -> Iterator[Side]:
     """Build a client, yield it, and close it afterwards.
 
-    If a person drives, they can choose from `delays` for `relay`, a relay in this process.
+    If a person drives, they can choose from `delays` for `relay`, a relay in this process. With `is_watched`, there is
+    a page that shows how the controller drives.
 
     Raises `UserError` for a wrong config, before the output directory is created.
     """
+    is_human = config.controller.kind == HUMAN
+    if is_human and is_watched:
+        raise UserError(WATCHED_PERSON)
     with ExitStack() as opened:
         prepared = _prepare(config, out, clock, opened, print_message)
         server = config.video.server
@@ -266,12 +273,13 @@ def open_client(
         probe = open_flow(config, clock, "probe", "probe_reply", bind=("", 0), remote=probe_address)
         opened.callback(probe.close)
         console = None
-        if config.controller.kind == HUMAN:
-            console = ConsoleLink(clock, MachineEntropy().token(CONSOLE_TOKEN_BYTES).hex(), config.console.port)
+        if is_human or is_watched:
+            token = MachineEntropy().token(CONSOLE_TOKEN_BYTES).hex()
+            console = ConsoleLink(clock, token, config.console.port, prefix="page" if is_human else "watch")
             opened.callback(console.close)
         zenoh = opened.enter_context(closing(_open_zenoh(config, clock, print_message)))
         links = Links(video, probe, zenoh, console, relay)
-        nodes = build_client(config, clock.now, MachineEntropy(), delays=delays)
+        nodes = build_client(config, clock.now, MachineEntropy(), delays=delays, is_watched=is_watched)
         side = Side(
             config,
             clock,

@@ -40,6 +40,7 @@ def client(
     human: Annotated[
         bool, typer.Option("--human", help="Drive yourself, from a web page on this machine (docs/drive.md).")
     ] = False,
+    watches: console.WatchOption = False,
     use_scouting: ScoutOption = False,
     as_json: console.JsonOption = False,
 ) -> None:
@@ -53,8 +54,10 @@ def client(
 
     Example: lavt client 192.0.2.7
     """
-    if target is None and (out is not None or changes or take_over or human):
-        raise UserError("--out, --set, --take-over and --human are for driving: name the vehicle's host or a config")
+    if target is None and (out is not None or changes or take_over or human or watches):
+        raise UserError(
+            "--out, --set, --take-over, --human and --watch are for driving: name the vehicle's host or a config"
+        )
     if target is not None and use_scouting:
         raise UserError("--scout is for a list of vehicles: leave it out, or name no host and no config")
     console.reserve_stdout()
@@ -68,11 +71,11 @@ def client(
     settings = load_client_config(target, [*(changes or []), *chosen])
     if ":" in settings.video.server:
         raise UserError("video goes over IPv4: set video.server to an IPv4 address, or to a name that has one")
-    with open_client(settings, out, MachineClock(), console.print_message) as side:
+    with open_client(settings, out, MachineClock(), console.print_message, is_watched=watches) as side:
         signal.signal(signal.SIGUSR1, lambda *_: side.send("operator", "emergency_stop"))
         signal.signal(signal.SIGUSR2, lambda *_: side.send("operator", "release"))
         ready = {}
         if side.console_url is not None:
             ready["console"] = side.console_url
-            console.print_message(f"lavt: drive from {side.console_url}")
+            console.print_message(f"lavt: {'watch at' if watches else 'drive from'} {side.console_url}")
         run_side(side, settings.who, once=False, as_json=as_json, ready=ready)

@@ -22,6 +22,9 @@ from lavt.runtime.output import queue_output
 BrowserOption = Annotated[
     bool, typer.Option("--browser/--no-browser", help="Open the page of a person, if this machine has a display.")
 ]
+WatchOption = Annotated[
+    bool, typer.Option("--watch", help="Serve a page that shows the video with the detected lane (docs/drive.md).")
+]
 PagePortOption = Annotated[
     int, typer.Option("--port", min=0, max=65535, help="TCP port of this page, which has its calibrations; 0: any.")
 ]

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import os
 import threading
-import webbrowser
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import typer
 
 from lavt.assembly.side import Side, open_client
 from lavt.cli import console
+from lavt.cli.page import show_page
 from lavt.cli.side import run_side
 from lavt.clock import MachineClock
 from lavt.config import ConsoleConfig
@@ -59,16 +57,6 @@ def drive(
             human_drive.relay.start()
             with _fail_with_server(human_drive, side):
                 run_side(side, client.who, once=False, as_json=as_json, ready={"console": side.console_url})
-
-
-def show_page(url: str, work: Path, *, opens_page: bool, purpose: str = "drive from") -> None:
-    """Print the page's address with its purpose, and open the page if this machine has a display."""
-    console.print_message(f"lavt: {purpose} {url}")
-    if opens_page and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        # The address has the token. As an argument of the browser, other users could read it in the list of processes.
-        redirection = work / "console.html"
-        redirection.write_text(f'<!doctype html><meta http-equiv="refresh" content="0; url={url}">\n')
-        webbrowser.open(redirection.as_uri())
 
 
 @contextmanager

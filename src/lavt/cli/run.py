@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 import typer
 
 from lavt.cli import console
 from lavt.cli.live_view import LiveView
+from lavt.cli.page import show_page
 from lavt.config import RunConfig
 from lavt.config_file import load_config
+from lavt.errors import UserError
 from lavt.experiment.runs.netem_run import check_netem
-from lavt.experiment.runs.plan import plan_run
+from lavt.experiment.runs.plan import PlannedRun, plan_run
 from lavt.experiment.runs.run import run_once
 from lavt.recording.output_directory import check_directory, disk_errors_named
+from lavt.transport.console.console_link import check_installed
 
 
 def register(app: typer.Typer) -> None:
@@ -26,24 +30,44 @@ def run(
     config: Annotated[Path, typer.Argument(help="A run config in YAML, such as configs/demo.yaml.")],
     changes: console.SetOption = None,
     out: console.OutOption = None,
+    watches: console.WatchOption = False,
+    opens_page: console.BrowserOption = True,
     as_json: console.JsonOption = False,
 ) -> None:
     """Drive one route under one network condition.
 
-    The run is in virtual or real time, as the config says.
+    The run is in virtual or real time, as the config says. With `--watch`, in real time only, a page in the browser
+    shows the video and the lane that the controller detects.
 
     Example: lavt run configs/demo.yaml --set network.condition=L2 --out out/l2
     """
     planned_run = plan_run(load_config(RunConfig, config, changes or []))
+    if watches:
+        _check_watch(planned_run)
     out = out or Path("out") / "run"
     check_directory(out)
     with console.interruptible():
         for message in check_netem(planned_run):
             console.print_message(f"lavt: {message}")
     title = f"driving {planned_run.config.vehicle.route} under {planned_run.config.network.condition}"
-    with console.interruptible(), LiveView(title) as view, disk_errors_named(out):
-        result = run_once(planned_run, out, progress=view.update)
+    with (
+        console.interruptible(),
+        TemporaryDirectory(prefix="lavt-") as work,
+        LiveView(title) as view,
+        disk_errors_named(out),
+    ):
+
+        def show(url: str) -> None:
+            show_page(url, Path(work), opens_page=opens_page, purpose="watch at")
+
+        result = run_once(planned_run, out, progress=view.update, watch=show if watches else None)
     print_run(result, out, planned_run.config.seed, as_json=as_json)
+
+
+def _check_watch(planned_run: PlannedRun) -> None:
+    if planned_run.config.time != "real":
+        raise UserError("a run in virtual time cannot be watched: add --set time=real, or leave out --watch")
+    check_installed()
 
 
 def print_run(result: dict[str, Any], out: Path, seed: int, *, as_json: bool) -> None:

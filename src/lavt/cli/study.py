@@ -106,7 +106,7 @@ class PageSettings(NamedTuple):
 
 def _hold_session(blocks: Sequence[Block], instructions: str, out: Path, settings: PageSettings) -> None:
     """Let a person drive, with texts in the terminal, and with questions there or in a page."""
-    from lavt.cli.drive import show_page  # noqa: PLC0415 (only if a person drives)
+    from lavt.cli.page import show_page  # noqa: PLC0415 (only if a person drives)
     from lavt.experiment.runs.plan import PlannedRun  # noqa: PLC0415 (slow: scipy)
     from lavt.experiment.runs.real_run import PersonPage  # noqa: PLC0415 (slow: scipy)
     from lavt.experiment.runs.run import drive_once  # noqa: PLC0415 (slow: scipy)

@@ -6,7 +6,7 @@ newest picture that the page has shown. So if the page stops, the vehicle gets n
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, Final
 
@@ -17,6 +17,7 @@ from lavt.errors import BadMessage
 from lavt.node import WAKE, Message, Peer, Send, Stage
 from lavt.nodes.client_session import ClientSession
 from lavt.nodes.commander import Commander, stopping
+from lavt.nodes.page_figures import BitRate, RoundTrip
 from lavt.nodes.page_video import PageVideo
 from lavt.nodes.payloads import (
     DecodedFrame,
@@ -49,9 +50,7 @@ from lavt.transport.video.stamp import rtp_timestamp
 
 STATUS_PERIOD_NS: Final = 50 * NS_PER_MS
 MAX_FRAMES: Final = 300
-"""How many frames are remembered, until the page has shown them or for the bit rate: ten seconds at 30 Hz."""
-MAX_COMMANDS: Final = 512
-"""How many commands are remembered until the vehicle has applied them: five seconds."""
+"""How many frames are remembered until the page has shown them: ten seconds at 30 Hz."""
 STATE_AGE_NS: Final = 300 * NS_PER_MS
 """An older state does not tell what the vehicle does now."""
 SEAT_NS: Final = 5 * NS_PER_S
@@ -96,14 +95,10 @@ class HumanDriverNode(Commander):
         """The state of the hand in the last record entry."""
         self._frames: dict[int, FrameStamp] = {}
         """Decoded frames by RTP timestamp."""
-        self._arrived: deque[tuple[int, int]] = deque(maxlen=MAX_FRAMES)
-        """Times and sizes (bytes) of the access units that arrived in the last second."""
+        self._bit_rate, self._round_trip = BitRate(), RoundTrip()
         self._reception: ReceptionSample | None = None
         self._shown_unit: int | None = None
         """The newest access unit that the driving page has shown, if it has not been decoded here yet."""
-        self._sent: deque[tuple[int, int]] = deque(maxlen=MAX_COMMANDS)
-        """Sequence numbers and send times of commands that the vehicle has not applied yet."""
-        self._round_trip_ns: int | None = None
         self._last: tuple[int, Decision] | None = None
         """Time and content of the last command."""
         self.pipelines: Mapping[str, Sequence[Stage]] = {
@@ -143,7 +138,7 @@ class HumanDriverNode(Commander):
     def _forward(self, message: Message, now: Now) -> list[Send]:
         """Send an access unit to the pages, and then decode it."""
         unit: ReceivedUnit = message.payload
-        self._arrived.append((now.mono_ns, len(unit.data)))
+        self._bit_rate.note(len(unit.data), now.mono_ns)
         pages = [peer for peer, video in self._pages.items() if video.offer(unit)]
         sends = []
         if pages:
@@ -331,7 +326,7 @@ class HumanDriverNode(Commander):
         return self._limited_by_age(decision, now_ns)
 
     def _note_command(self, decision: Decision, now: Now) -> None:
-        self._sent.append((self._sequence, now.mono_ns))
+        self._round_trip.note_command(self._sequence, now.mono_ns)
         self._last = now.mono_ns, decision
 
     def _note_state(self, message: Message, now: Now) -> None:
@@ -347,26 +342,17 @@ class HumanDriverNode(Commander):
 
     def _handle_newer_state(self, now: Now) -> None:
         state = self._newest_state
-        if state is None or not self.session.has_control:
-            return
-        while self._sent and self._sent[0][0] <= state.applied_sequence:
-            sequence, sent_ns = self._sent.popleft()
-            if sequence == state.applied_sequence:
-                self._round_trip_ns = now.mono_ns - sent_ns
+        if state is not None and self.session.has_control:
+            self._round_trip.note_applied(state.applied_sequence, now.mono_ns)
 
     # Status.
-
-    def _bit_rate_bps(self, now: Now) -> int:
-        while self._arrived and self._arrived[0][0] < now.mono_ns - NS_PER_S:
-            self._arrived.popleft()
-        return 8 * sum(size for _, size in self._arrived)
 
     def _statuses(self, now: Now) -> list[Send]:
         return [Send("page_status", pack_text(self._status(page, now)), page) for page in self._pages]
 
     def _status(self, page: Peer, now: Now) -> PageStatus:
         state, session, view = self._newest_state, self.session, self._view
-        last, shows = self._last, self._shows_latency
+        last, shows, round_trip_ns = self._last, self._shows_latency, self._round_trip.newest_ns
         is_current = last is not None and now.mono_ns - last[0] < IDLE_COMMAND_NS
         vehicle: dict[str, Any] = {
             name: getattr(state, name, "")
@@ -389,8 +375,8 @@ class HumanDriverNode(Commander):
             command=(last[1].steering_rad, last[1].throttle, last[1].brake) if last and is_current else None,
             shows_latency=shows,
             video_ms=None if view is None or not shows else (view.read_wall_ns - view.stamp_ns) / NS_PER_MS,
-            round_trip_ms=None if self._round_trip_ns is None or not shows else self._round_trip_ns / NS_PER_MS,
-            bit_rate_bps=self._bit_rate_bps(now),
+            round_trip_ms=None if round_trip_ns is None or not shows else round_trip_ns / NS_PER_MS,
+            bit_rate_bps=self._bit_rate.at_bps(now.mono_ns),
             lost_share=None if self._reception is None or not shows else self._reception.lost_share,
             delay=None if self._delay is None else (self._delay.video_ms, self._delay.control_ms),
             conditions=self._conditions,

@@ -13,10 +13,11 @@ kernel's buffers hide that a page has stalled, and it shows the old pictures aft
 
 
 class PageVideo:
-    """The access units that a page was sent and has not acknowledged. A page begins with a keyframe."""
+    """The access units that a page was sent and has not acknowledged: at most `limit`. It begins with a keyframe."""
 
-    def __init__(self) -> None:
+    def __init__(self, limit: int = MAX_UNACKNOWLEDGED) -> None:
         self.counts: Counter[str] = Counter()
+        self._limit = limit
         self._waits_for_keyframe = True
         self._unacknowledged: deque[int] = deque()
         """RTP timestamps, oldest first."""
@@ -24,11 +25,11 @@ class PageVideo:
     @property
     def needs_keyframe(self) -> bool:
         """Return whether a keyframe would be sent, and nothing else."""
-        return self._waits_for_keyframe and len(self._unacknowledged) < MAX_UNACKNOWLEDGED
+        return self._waits_for_keyframe and len(self._unacknowledged) < self._limit
 
     def offer(self, unit: ReceivedUnit) -> bool:
         """Return whether to send this access unit now; after one that is not sent, only a keyframe is."""
-        is_room = len(self._unacknowledged) < MAX_UNACKNOWLEDGED
+        is_room = len(self._unacknowledged) < self._limit
         is_decodable = unit.complete and (unit.keyframe or not self._waits_for_keyframe)
         if not (is_room and is_decodable):
             self._waits_for_keyframe = True

@@ -67,6 +67,10 @@ class RealRuntime:
         self._clock_source = clock_source
         self._workers = {node.name: _Worker(self, node) for node in nodes}
         self._receivers: dict[str, Receiver] = {**remote_receivers, **self._workers}
+        self._observers: dict[str, list[Receiver]] = {
+            name: [self._workers[observer] for observer in channel.observers if observer in self._workers]
+            for name, channel in CHANNELS.items()
+        }
 
     def start(self, links: Mapping[str, MessageLink]) -> None:
         """Start to wake nodes and to deliver messages."""
@@ -97,9 +101,10 @@ class RealRuntime:
         self.put(Message(channel, payload, arrived, peer))
 
     def put(self, message: Message) -> None:
-        """Deliver a message to its receivers without recording it."""
+        """Deliver a message to its receivers and observers without recording it."""
         for receiver in CHANNELS[message.channel].receivers:
             self._receivers[receiver].put(message)
+        self._show_observers(message)
 
     def record(self, topic: str, payload: Any, now: Now) -> None:
         """Record an entry that another process reports."""
@@ -140,6 +145,12 @@ class RealRuntime:
             self.links[carrier].send(*sends)
         for send in sends:
             self._recorder.write(send.channel, send.payload, now)
+            if carrier != "local":
+                self._show_observers(Message(send.channel, send.payload, now))
+
+    def _show_observers(self, message: Message) -> None:
+        for observer in self._observers[message.channel]:
+            observer.put(message)
 
     def _report_clock(self) -> None:
         """Query the clock source; this has its own thread, because a query of chrony takes some milliseconds."""

@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from benchmarks.recompute import differences
+from benchmarks.recomputing.runs import driving_interval, latencies, read
 from tests.experiment.conftest import FRAME_NS, SyntheticDrive
 
 from lavt.domain import NS_PER_MS
@@ -76,3 +78,20 @@ def test_without_a_person_the_latencies_of_the_page_are_null(records: tuple[Reco
     without_offset = with_pictures(replace(client, tables=unsampled), picture(1, 60.0, 70.0))
     entry = measure(server, without_offset).entry
     assert (entry["delta"]["ms"], entry["page_decoded_ms"]) == (None, NO_LATENCY)
+
+
+def test_the_latencies_of_a_page_are_recomputed(make_run: MakeRun, tmp_path: Path) -> None:
+    """`benchmarks/recompute.py` computes the same: of each frame of the drive, the first row with all times counts."""
+    directory = make_run(tmp_path / "run")
+    server, client = read_record(directory / "server.mcap"), read_record(directory / "client.mcap")
+    rows = [picture(number, 70.0 + number**2 / 10, 90.0 + number) for number in range(30)]
+    rows += [picture(3, 500.0, 500.0), {**picture(31, 1.0, 1.0), "shown_wall_ns": None}, picture(-50, 300.0, 400.0)]
+    published = measure(server, with_pictures(client, *rows)).entry
+    server_rows, client_rows = read(directory, "server"), read(directory, "client")
+    client_rows["page_picture"] = rows
+    recomputed = latencies(server_rows, client_rows, driving_interval(server_rows)[:2])
+    names = ("page_decoded_ms", "page_shown_ms")
+    assert [recomputed[name]["n"] for name in names] == [30, 30]
+    for name in names:
+        assert list(differences(name, recomputed[name], published[name])) == []
+    assert list(differences("max", recomputed["page_shown_ms"]["max"], published["page_shown_ms"]["max"] + 1e-6))

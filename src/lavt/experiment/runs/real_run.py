@@ -50,12 +50,16 @@ Progress = Callable[[dict[str, Any], dict[str, Any]], None]
 """A callback with the status of the server and of the client, called several times a second."""
 
 
+Show = Callable[[str], None]
+"""A function that shows a person the page at an address."""
+
+
 @dataclass(frozen=True, slots=True)
 class PersonPage:
-    """The page from which a person drives: its TCP port (0: any), and a function that shows the page at an address."""
+    """The page from which a person drives: its TCP port (0: any), and a function that shows it."""
 
     port: int
-    show: Callable[[str], None]
+    show: Show
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,12 +86,13 @@ def start_loop(
     server_program: Sequence[str] = LAVT,
     netem: NetemRun | None = None,
     console_port: int = 0,
+    is_watched: bool = False,
 ) -> LoopProcesses:
     """Start all processes in order; each gets the ports of the processes before it.
 
     The sides write their records into `out`. The configs of the processes are written into `work`. Without `once`, the
     server keeps running after the first drive. `netem` is applied before the client starts. `console_port` is the port
-    of the page if a person drives.
+    of the page if a person drives, or watches the controller (`is_watched`).
     """
     run = planned.config
     server_yaml = write_config(work, "server", server_config(run, planned.seed))
@@ -109,18 +114,24 @@ def start_loop(
     controller = config.controller.model_copy(update={"rearm": rearm})
     console = config.console.model_copy(update={"port": console_port})
     config = config.model_copy(update={"controller": controller, "console": console})
-    client = processes.start("client", "client", write_config(work, "client", config), "--out", str(out / "client"))
+    client_arguments = (write_config(work, "client", config), "--out", str(out / "client"))
+    client = processes.start("client", "client", *client_arguments, *(["--watch"] if is_watched else []))
     client.wait_ready()
     router = next(locator for locator in ready["locators"] if locator.startswith("tcp/"))
     return LoopProcesses(server, relay, client, router, ready)
 
 
 def drive_real(
-    planned: PlannedRun, out: Path, *, progress: Progress | None = None, page: PersonPage | None = None
+    planned: PlannedRun,
+    out: Path,
+    *,
+    progress: Progress | None = None,
+    page: PersonPage | None = None,
+    watch: Show | None = None,
 ) -> None:
     """Drive once, and write the two records into `out`, with the requests and measurements of the relay or netem.
 
-    A drive by a person needs `page`.
+    A drive by a person needs `page`. `watch` shows a page that shows how the controller drives.
 
     Raises `WorkError` if a process ends early or the drive does not begin; the records up to then stay in `out`.
     """
@@ -131,9 +142,11 @@ def drive_real(
                 netem = stack.enter_context(NetemRun(planned)) if uses_netem(planned) else None
                 processes = stack.enter_context(Processes(work))
                 port = 0 if page is None else page.port
-                loop = start_loop(processes, planned, work, work, netem=netem, console_port=port)
-                if page is not None:
-                    page.show(loop.client.first["ready"]["console"])
+                is_watched = watch is not None
+                loop = start_loop(processes, planned, work, work, netem=netem, console_port=port, is_watched=is_watched)
+                show = watch if page is None else page.show
+                if show is not None:
+                    show(loop.client.first["ready"]["console"])
                 begin_limit_s = BEGIN_LIMIT_S if page is None else PERSON_BEGIN_LIMIT_S
                 _wait_for_ending(processes, loop, progress, begin_limit_s=begin_limit_s)
                 for process in reversed(processes.started):

@@ -20,6 +20,7 @@ from lavt.experiment.runs.real_run import (
     RELAY,
     PersonPage,
     Progress,
+    Show,
     drive_real,
     relay_checks,
     relay_invalid_reasons,
@@ -34,13 +35,23 @@ NETWORK = "network"
 """The value of `inherent` for a run on two machines: the inherent latency is that of the network between them."""
 
 
-def run_once(planned: PlannedRun, out: Path, *, progress: Progress | None = None) -> dict[str, Any]:
-    """Drive, write everything into `out`, and return the result; raise `WorkError` if the drive did not begin."""
-    return dict(drive_once(planned, out, progress=progress).result)
+def run_once(
+    planned: PlannedRun, out: Path, *, progress: Progress | None = None, watch: Show | None = None
+) -> dict[str, Any]:
+    """Drive, write everything into `out`, and return the result; raise `WorkError` if the drive did not begin.
+
+    In real time, `watch` shows a page that shows how the controller drives.
+    """
+    return dict(drive_once(planned, out, progress=progress, watch=watch).result)
 
 
 def drive_once(
-    planned: PlannedRun, out: Path, *, progress: Progress | None = None, page: PersonPage | None = None
+    planned: PlannedRun,
+    out: Path,
+    *,
+    progress: Progress | None = None,
+    page: PersonPage | None = None,
+    watch: Show | None = None,
 ) -> DriveData:
     """Drive as `run_once` does, and return the result with the data that figures need.
 
@@ -62,7 +73,7 @@ def drive_once(
     else:
         prepare_directory(out)
         _write_config(planned, out)
-        drive_real(planned, out, progress=progress, page=page)
+        drive_real(planned, out, progress=progress, page=page, watch=watch)
     return _compute(out, planned.identity, digest)
 
 

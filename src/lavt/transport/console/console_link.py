@@ -15,7 +15,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from http import HTTPStatus
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from lavt.clock import Clock
 from lavt.domain import Now
@@ -50,7 +50,7 @@ of a page that may be on the way are smaller."""
 HELLO_TIMEOUT_S: Final = 5.0
 CLOSE_TIMEOUT_S: Final = 1.0
 PORT_ATTEMPTS: Final = 10
-MISSING: Final = "a person drives in a web page, which needs the package websockets: pip install -e '.[console]'"
+MISSING: Final = "the console is a web page, which needs the package websockets: pip install -e '.[console]'"
 
 
 class _Page:
@@ -63,11 +63,12 @@ class _Page:
 
 
 class ConsoleLink:
-    """A web server for the page from which a person drives, at 127.0.0.1 and, if this machine has it, ::1.
+    """A web server for the page from which a person drives or watches, at 127.0.0.1 and, if this machine has it, ::1.
 
     `port` 0 is any free port. Messages of pages are delivered on the channels `page_opened`, `page_message` and
-    `page_closed`, after the page has shown the token. The page has the files in `folder`; a longer message than
-    `max_message_bytes` closes it. Raises `UserError` if the port cannot be opened or `websockets` is missing.
+    `page_closed`, after the page has shown the token; their names begin with `prefix` instead of "page". The page has
+    the files in `folder`; a longer message than `max_message_bytes` closes it. Raises `UserError` if the port cannot be
+    opened or `websockets` is missing.
     """
 
     def __init__(
@@ -78,6 +79,7 @@ class ConsoleLink:
         *,
         folder: Path = PAGE_FILES,
         max_message_bytes: int = MAX_PAGE_MESSAGE_BYTES,
+        prefix: Literal["page", "watch"] = "page",
     ) -> None:
         self.counts: Counter[str] = Counter()
         self._websockets = _import_websockets()
@@ -87,6 +89,7 @@ class ConsoleLink:
         self.url = f"http://127.0.0.1:{self.port}/#{token}"
         self._site = ConsoleSite(self.port, token, folder)
         self._max_message_bytes = max_message_bytes
+        self._prefix = prefix
         self._loop = asyncio.new_event_loop()
         self._ends: asyncio.Future[None] = self._loop.create_future()
         """Done when the link is closed, or has failed."""
@@ -205,7 +208,7 @@ class ConsoleLink:
         self._pages[number] = page
         writer = asyncio.create_task(self._write(page))
         try:
-            deliver("page_opened", None, self._clock.now(), number)
+            deliver(f"{self._prefix}_opened", None, self._clock.now(), number)
             async for message in connection:
                 now = self._clock.now()
                 verdict = page.limit.judge(message, now.mono_ns)
@@ -216,18 +219,18 @@ class ConsoleLink:
                 if verdict is Verdict.DROP:
                     self.counts["page_messages_too_many"] += 1
                 else:
-                    deliver("page_message", message, now, number)
+                    deliver(f"{self._prefix}_message", message, now, number)
         finally:
             del self._pages[number]
             writer.cancel()
-            deliver("page_closed", None, self._clock.now(), number)
+            deliver(f"{self._prefix}_closed", None, self._clock.now(), number)
 
     def _enqueue(self, sends: tuple[Send, ...]) -> None:
         for send in sends:
             page = self._pages.get(send.peer)
             if page is None:
                 continue
-            is_status = send.channel == "page_status"
+            is_status = send.channel.endswith("_status")
             if page.waiting.qsize() >= (MAX_QUEUED // 2 if is_status else MAX_QUEUED):
                 self.counts[f"{send.channel}_dropped"] += 1
             else:

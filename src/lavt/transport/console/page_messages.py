@@ -1,6 +1,7 @@
 """The messages between the client and the page of the console.
 
-The page sends JSON texts, each with a `type`. The client sends statuses (JSON texts) and access units (binary).
+The page sends JSON texts, each with a `type`. The client sends statuses and lanes (JSON texts) and access units
+(binary).
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from msgspec import Meta, Struct
 
 from lavt.errors import BadMessage
 
-PAGE_VERSION: Final = 1
+PAGE_VERSION: Final = 2
 """The version of these messages. A page of another version is told to reload."""
 MAX_PAGE_MESSAGE_BYTES: Final = 1024
 MAX_DELAY_MS: Final = 2000.0
@@ -191,6 +192,22 @@ class PageStatus(Struct, frozen=True, kw_only=True):
     """The injected delays of video and control in ms; None: this client cannot inject any."""
     conditions: tuple[tuple[str, float, float], ...] = ()
     """Name and delays of the conditions to choose from."""
+    controller: str = ""
+    """The controller that drives; then the pages can command nothing. Empty: a person drives."""
+
+
+class PageLane(Struct, frozen=True, kw_only=True):
+    """The lane that a controller has detected in a picture; points are (column, row) in pixels, the nearest first."""
+
+    type: Literal["lane"] = "lane"
+    unit: int
+    """RTP timestamp of the picture's access unit."""
+    stamp: str
+    """The picture's stamp in ns; as text, because JavaScript's numbers have 53 bits."""
+    confidence: float
+    """0 to 1."""
+    left: tuple[tuple[float, float], ...]
+    right: tuple[tuple[float, float], ...]
 
 
 class ProbeAnswer(Struct, frozen=True):
@@ -205,6 +222,6 @@ class ProbeAnswer(Struct, frozen=True):
 _encoder = msgspec.json.Encoder()
 
 
-def pack_text(message: PageStatus | ProbeAnswer) -> bytes:
+def pack_text(message: PageStatus | PageLane | ProbeAnswer) -> bytes:
     """Return the JSON of a message to the page."""
     return _encoder.encode(message)

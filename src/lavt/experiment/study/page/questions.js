@@ -1,6 +1,6 @@
 // The page of the questions at the end of a block: shows them, and sends the answers.
 
-const VERSION = 1; // of the messages
+const VERSION = 2; // of the messages
 const RETRY_MS = 1000;
 const FIRST_FINAL = 4400; // the codes from here on: the same page is never let in
 

@@ -1,7 +1,7 @@
 // The connection to lavt: it is opened again after its end, sends no input that would arrive late, and keeps an
 // emergency stop until the vehicle has confirmed it.
 
-const VERSION = 1; // of the messages
+const VERSION = 2; // of the messages
 const RETRY_MS = 1000;
 const STOP_PERIOD_MS = 500; // between the messages of a stop that is not confirmed
 const SILENT_MS = 400; // lavt sends a message at least every 50 ms
@@ -17,7 +17,7 @@ export class Connection {
   #stop_ms = null; // when the stop that is not confirmed was last sent; null: there is none
   #isFinal = false; // there will be no other connection
 
-  // `listener` has `takeStatus(status)`, `takeProbe(answer)`, `takeUnit(buffer)` and `close(text)`.
+  // `listener` has `takeStatus(status)`, `takeLane(lane)`, `takeProbe(answer)`, `takeUnit(buffer)` and `close(text)`.
   constructor(token, listener) {
     this.#token = token;
     this.#listener = listener;
@@ -96,9 +96,11 @@ export class Connection {
     }
     const message = JSON.parse(data);
     if (message.type === "probe") return this.#listener.takeProbe(message);
+    if (message.type === "lane") return this.#listener.takeLane(message);
     if (message.version !== VERSION) return this.#socket.close(ANOTHER_VERSION, "reload this page: it is of another version of lavt");
     this.seen_us = message.sent_us;
     if (message.emergency_stop === "confirmed" && message.safety === "emergency_stop") this.#stop_ms = null;
+    if (message.controller !== "") this.#stop_ms = null; // this page cannot stop the vehicle
     this.#listener.takeStatus(message);
   }
 }

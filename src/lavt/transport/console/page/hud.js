@@ -50,7 +50,9 @@ function showSafety(name) {
 
 // `age_ms` is the age of the picture on the screen, from its stamp; null: unknown. `notice` is about the keys.
 export function showStatus(status, input, video, age_ms, isStopPending, notice) {
-  byId("connection").textContent = status.role === "drives" ? "drives" : "watches";
+  const isWatching = status.controller !== "";
+  document.body.classList.toggle("watching", isWatching);
+  byId("connection").textContent = status.role === "drives" ? "drives" : isWatching ? `watches ${status.controller}` : "watches";
   showSafety(status.safety);
   const rejected = status.rejected && `command rejected: ${status.rejected}`;
   const limited = status.limited && `limited: ${status.limited}`;
@@ -84,7 +86,14 @@ function isPast({ emergency_stop, safety }) {
   return emergency_stop === "confirmed" && safety !== "emergency_stop";
 }
 
+// The page of a controller's drive has no other hint than about the state.
+function watchHint({ safety, state_age_ms }) {
+  if (safety === "") return "waiting for the vehicle";
+  return state_age_ms > STALE_MS ? `no state of the vehicle for ${Math.floor(state_age_ms / 1000)} s` : "";
+}
+
 function hint(status, input, isStopPending, notice) {
+  if (status.controller !== "") return watchHint(status);
   if (isStopPending || status.emergency_stop === "sent") return STOP_NOT_CONFIRMED;
   if (isPast(status)) {
     return "an earlier emergency stop was confirmed, but the vehicle is in another state now; restart this client to drive";

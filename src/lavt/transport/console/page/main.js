@@ -5,14 +5,16 @@ import { Connection } from "./connection.js";
 import { Calibration, Gamepads } from "./gamepad.js";
 import { Keyboard } from "./hand.js";
 import { showCalibration, showClosed, showSilence, showStatus } from "./hud.js";
+import { Lanes } from "./lane.js";
 import { Screen } from "./screen.js";
 import { Sources } from "./source.js";
 import { Touch } from "./touch.js";
-import { Video } from "./video.js";
+import { Video, canDecode } from "./video.js";
 
 const INPUT_PERIOD_MS = 20;
 const PROBE_PERIOD_MS = 500;
 const UNIT_HEAD_BYTES = 16;
+const FULL_STEERING_RAD = 0.5; // at the end of the meter, if a controller drives
 
 const byId = (id) => document.getElementById(id);
 const keyboard = new Keyboard();
@@ -34,22 +36,31 @@ const video = new Video(
   () => send({ type: "lost" }),
   reportShown,
 );
-globalThis.lavtConsole = { get status() { return status; }, keyboard, touch, gamepads, video }; // for tests and the curious
+globalThis.lavtConsole = { get status() { return status; }, keyboard, touch, gamepads, video, send }; // for tests and the curious
 
 function send(message) {
   connection?.send(message);
 }
 
 function stop() {
+  if (isWatching()) return;
   connection?.stop();
   if (connection?.isOpen !== true) showClosed(closedText, connection === null || connection.isFinal ? "lost" : "pending");
 }
 
-function connect() {
+// A controller drives, and this page can command nothing.
+function isWatching() {
+  return Boolean(status?.controller);
+}
+
+async function connect() {
   const token = location.hash.slice(1);
   if (token === "") return showClosed("open the address that lavt has printed, with all that follows the #");
   if (!("VideoDecoder" in globalThis)) return showClosed("this browser cannot decode video (WebCodecs): use another");
-  connection = new Connection(token, { takeStatus, takeUnit, takeProbe: (answer) => offset.note(answer), close });
+  if (!(await canDecode())) return showClosed("this browser cannot decode H.264, the format of the video: install its codecs, or use another browser");
+  const takeProbe = (answer) => offset.note(answer);
+  const takeLane = (lane) => video.lanes?.take(lane);
+  connection = new Connection(token, { takeStatus, takeLane, takeUnit, takeProbe, close });
 }
 
 function close(text) {
@@ -65,8 +76,15 @@ function close(text) {
 
 function takeStatus(message) {
   status = message;
-  showStatus(status, sources.current, video, frameAge_ms(), connection.isStopPending, keyboardNotice());
+  if (isWatching()) video.lanes ??= new Lanes();
+  showStatus(status, isWatching() ? commanded(status) : sources.current, video, frameAge_ms(), connection.isStopPending, keyboardNotice());
   showCalibration(calibration);
+}
+
+// The controller's last command, as the input of a person.
+function commanded({ command }) {
+  const [steering_rad, throttle, brake] = command ?? [0, 0, 0];
+  return { steering: Math.max(-1, Math.min(1, steering_rad / FULL_STEERING_RAD)), throttle, brake };
 }
 
 // What the person must know about the keys; empty while another device drives.

@@ -1,10 +1,21 @@
 // The video: access units are decoded by WebCodecs, drawn at once, and acknowledged. Then the stamp is read.
 
 import { pageTime_us } from "./clock.js";
+import { drawLane } from "./lane.js";
 import { readStamp } from "./stamp.js";
 
 const MAX_DECODING = 3; // access units in the decoder
+const MAX_DECODING_WITH_LANES = 8; // as many as lavt sends to a page that watches
 const DECODING_LIMIT_US = 1_000_000;
+
+// Return whether this browser decodes the video's format; some have WebCodecs, but no decoder for it.
+export async function canDecode() {
+  try {
+    return (await VideoDecoder.isConfigSupported({ codec: "avc1.42C01E" })).supported === true;
+  } catch {
+    return false;
+  }
+}
 
 export class Video {
   #canvas;
@@ -24,6 +35,8 @@ export class Video {
     this.#context = canvas.getContext("2d", { desynchronized: true, alpha: false });
     this.#acknowledge = acknowledge;
     this.#lose = lose;
+    this.lanes = null; // the lanes to draw; null: none are detected
+    this.lanesDrawn = 0;
     this.shown = 0;
     this.stamp_us = null; // of the newest picture that was shown
     this.shown_ms = null; // from the stamp until the newest picture was shown
@@ -36,7 +49,7 @@ export class Video {
       if (!isKeyframe) return this.#lose();
       if (!this.#open(data)) return this.#fail();
     }
-    if (this.#pending.size >= MAX_DECODING) return this.#fail();
+    if (this.#pending.size >= (this.lanes === null ? MAX_DECODING : MAX_DECODING_WITH_LANES)) return this.#fail();
     const timestamp = ++this.#number;
     this.#pending.set(timestamp, [unit, pageTime_us()]);
     try {
@@ -82,18 +95,22 @@ export class Video {
       const [unit, arrived_us] = this.#pending.get(frame.timestamp) ?? [];
       if (decoder !== this.#decoder || unit === undefined) return;
       this.#pending.delete(frame.timestamp);
+      const lane = this.lanes === null ? null : await this.lanes.of(unit);
+      if (decoder !== this.#decoder) return; // it was closed while the picture waited
       if (this.#canvas.width !== frame.displayWidth || this.#canvas.height !== frame.displayHeight) {
         this.#canvas.width = frame.displayWidth;
         this.#canvas.height = frame.displayHeight;
       }
       this.#context.drawImage(frame, 0, 0);
       if (this.#context.isContextLost?.()) return this.#fail(); // then nothing has been drawn
+      if (lane !== null) drawLane(this.#context, lane);
       isDrawn = true;
       this.shown += 1;
       this.#acknowledge(unit);
       const times = { unit, arrived_us, decoded_us, drawn_us: pageTime_us() };
       const shown = this.#untilShown(this.shown);
       const stamp = await readStamp(frame);
+      if (lane !== null && stamp !== null) this.#countLane(lane.stamp === stamp);
       frame.close(); // a page that is hidden shows nothing, and must not keep the decoder's pictures
       const shown_us = await shown;
       if (stamp !== null && shown_us !== null) this.#report({ ...times, stamp, shown_us });
@@ -103,6 +120,11 @@ export class Video {
     } finally {
       frame.close();
     }
+  }
+
+  #countLane(isOfPicture) {
+    if (isOfPicture) this.lanesDrawn += 1;
+    else this.errors += 1; // the lane of another picture was drawn
   }
 
   // Return when the picture with this number appears; null if the page is hidden, or a newer one is drawn over it first.
