@@ -12,6 +12,7 @@ from msgspec.structs import replace
 from lavt.assembly.by_wire import build_inside, check_by_wire, is_simulated
 from lavt.assembly.cameras import build_camera, camera_model, check_simulated_camera
 from lavt.assembly.simulators import car_of, simulator_of
+from lavt.clock import Clock
 from lavt.config import ServerConfig, VehicleConfig
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.errors import UserError
@@ -43,6 +44,10 @@ class VehicleSetup:
     simulated: bool = False
     catches_up: bool = False
     """Whether a late call of the vehicle's `advance` loses no accuracy."""
+    run: Callable[[Clock], None] | None = None
+    """Starts the vehicle's own thread in real time; None: it has none."""
+    close: Callable[[], None] | None = None
+    """Ends the vehicle's connections; None: it has none."""
 
 
 def build_simulator(config: ServerConfig) -> VehicleSetup:
@@ -69,6 +74,22 @@ def build_dbw(config: ServerConfig) -> VehicleSetup:
             "`lavt software-car`"
         )
     return VehicleSetup(device, start=None, route=None)
+
+
+def build_carla(config: ServerConfig) -> VehicleSetup:
+    """Connect to the configured CARLA server, and build its car and its camera."""
+    from lavt.assembly.carla import open_carla  # noqa: PLC0415 (only a CARLA vehicle needs it)
+
+    road = load_road(config.vehicle.route)
+    parts = open_carla(config, road, camera_phase_ns(config))
+    return VehicleSetup(
+        parts.camera,
+        parts.start,
+        route_of(config.vehicle.route, road),
+        simulated=True,
+        run=parts.run,
+        close=parts.close,
+    )
 
 
 def _build_sim_camera(config: ServerConfig, road: Road) -> SimCamera:
@@ -140,7 +161,11 @@ def _build_simulated(config: ServerConfig, road: Road, camera: Camera) -> Vehicl
     )
 
 
-VEHICLES: dict[str, Callable[[ServerConfig], VehicleSetup]] = {"simulator": build_simulator, "dbw": build_dbw}
+VEHICLES: dict[str, Callable[[ServerConfig], VehicleSetup]] = {
+    "simulator": build_simulator,
+    "dbw": build_dbw,
+    "carla": build_carla,
+}
 
 
 def build_vehicle_setup(config: ServerConfig) -> VehicleSetup:
@@ -163,7 +188,7 @@ def check_vehicle(config: VehicleConfig) -> None:
     _find_builder(config.kind)
     if config.kind == "dbw":
         check_by_wire(config)
-    if config.kind == "simulator" or config.dbw.is_inside or config.dbw.truth:
+    if config.kind in {"simulator", "carla"} or config.dbw.is_inside or config.dbw.truth:
         load_road(config.route)
         car_of(config)
 
