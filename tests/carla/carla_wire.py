@@ -36,6 +36,7 @@ class WirePose:
     rotation: Vector = (0.0, 0.0, 0.0)
 
     def packed(self) -> list[list[float]]:
+        """Return the value in the protocol."""
         return [list(self.location), list(self.rotation)]
 
 
@@ -60,6 +61,7 @@ class WireActor:
     control: list[Any] = field(default_factory=lambda: [0.0, 0.0, 0.0, False, False, False, 0])
 
     def packed(self, port: int) -> list[Any]:
+        """Return the actor in the protocol."""
         attributes = [[name, kind, value] for name, (kind, value) in self.attributes.items()]
         tags = b"\x0e" if self.kind == VEHICLE else b""
         return [

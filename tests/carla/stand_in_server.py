@@ -13,7 +13,7 @@ import socket
 import struct
 import sys
 import threading
-import time  # noqa: TID251 (a program of its own, as a CARLA server is)
+import time
 from collections.abc import Callable
 from typing import Any
 

@@ -34,7 +34,7 @@ Publish = Callable[[int, bytes], None]
 """Sends the data of a stream to its subscribers."""
 
 
-class Refused(Exception):  # noqa: N818 (the protocol's answer, not an error of the stand-in)
+class Refused(Exception):
     """A request that the server answers with an error."""
 
 
@@ -85,6 +85,7 @@ class DrivenCar:
         return -math.degrees(self._simulator._car.motion.steering_rad)
 
     def rear_axle_pose(self) -> Pose:
+        """Return the rear axle's pose in LAVT's frame."""
         return self._simulator.pose()
 
 
@@ -109,6 +110,7 @@ class StandInWorld:
 
     @property
     def is_synchronous(self) -> bool:
+        """Whether a client ticks the world."""
         return bool(self.settings[0])
 
     @property
@@ -167,9 +169,11 @@ class StandInWorld:
         return self.episode
 
     def packed_actors(self, numbers: list[int]) -> list[Any]:
+        """Return the actors that exist in the protocol."""
         return [self.actors[number].packed(self._stream_port) for number in numbers if number in self.actors]
 
     def control(self, number: int, fields: list[Any]) -> None:
+        """Apply a control to a car, if it exists."""
         if number in self._cars:
             self._cars[number].control(fields, self.elapsed_ns)
 
@@ -181,6 +185,7 @@ class StandInWorld:
             self._cars[number] = DrivenCar(self.road, actor, self.elapsed_ns)
 
     def physics_control(self, number: int) -> list[Any]:
+        """Return the physics control of a car."""
         actor = self.actors[number]
         yaw_rad = math.radians(actor.pose.rotation[1])
 
@@ -196,9 +201,11 @@ class StandInWorld:
         return wire.physics_control(wheels, place, LINCOLN_MKZ.mass_kg, [(0.0, 1.0), (120.0, 1.0)])
 
     def wheel_deg(self, number: int) -> float:
+        """Return the angle of a car's front wheels."""
         return self._cars[number].wheel_deg if number in self._cars else 0.0
 
     def sensor_token(self, stream: int) -> bytes:
+        """Return the token of a stream."""
         return wire.token(stream, self._stream_port)
 
     def _header(self, kind: int, pose: WirePose) -> bytes:

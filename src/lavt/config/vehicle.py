@@ -15,8 +15,7 @@ MAX_SIMULATED_MPS: Final = 22.3
 
 
 class VehicleConfig(Section):
-    """The vehicle and its route; all keys except `kind`, `dbw` and `carla` are for the built-in simulator or a software
-    car."""
+    """The vehicle and its route; most keys are for the built-in simulator or a software car only."""
 
     kind: str = "simulator"
     """simulator: the built-in car; dbw: a by-wire kit; carla: a car in a CARLA server (`docs/carla.md`); or the name of

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 from lavt.domain import CameraModel
@@ -45,9 +46,7 @@ class Axles(NamedTuple):
     wheelbase_m: float
 
 
-def rear_axle_pose(
-    actor: CarlaPose, rear_axle_m: float, map_shift_m: tuple[float, float] = (0.0, 0.0)
-) -> FlatPose:
+def rear_axle_pose(actor: CarlaPose, rear_axle_m: float, map_shift_m: tuple[float, float] = (0.0, 0.0)) -> FlatPose:
     """Return the rear axle's pose in LAVT's world frame, for an actor in CARLA's.
 
     `map_shift_m` is the position of LAVT's origin in the map, in the map's right-handed coordinates.
@@ -103,7 +102,7 @@ def curve_at(curve: Sequence[tuple[float, float]], at: float) -> float:
     """Return the value of a piecewise linear curve of (x, y) points, sorted by x; 1 for a curve without points."""
     if not curve:
         return 1.0
-    for (first_x, first_y), (second_x, second_y) in zip(curve, curve[1:], strict=False):
+    for (first_x, first_y), (second_x, second_y) in pairwise(curve):
         if at < second_x:
             share = max(0.0, (at - first_x) / (second_x - first_x)) if second_x > first_x else 1.0
             return first_y + share * (second_y - first_y)

@@ -22,7 +22,8 @@ def load_library() -> Any:
         ) from None
     if installed != SUPPORTED:
         raise UserError(
-            f"the package carla is {installed}, but LAVT supports {SUPPORTED} only: run `pip install carla=={SUPPORTED}`"
+            f"the package carla is {installed}, but LAVT supports {SUPPORTED} only: run "
+            f"`pip install carla=={SUPPORTED}`"
         )
     import carla  # noqa: PLC0415 (an extra, and large)
 
