@@ -2,12 +2,14 @@
 
     python -m tests.carla.stand_in_server --port 2000 --road a_key
 
-prints a line with its port when it accepts connections. Only the genuine wheel `carla` 0.9.16 is used to talk to it.
+prints a line with its port when it accepts connections, and then answers commands on standard input, at whose end it
+ends. Only the genuine wheel `carla` 0.9.16 is used to talk to it.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import socket
 import struct
@@ -116,6 +118,22 @@ class StandInServer:
                     self._world.tick(now_s, now_s - last_s)
             last_s = now_s
 
+    def report(self, command: list[str]) -> str:
+        """Return the answer to a test's command on standard input."""
+        world = self._world
+        with self._lock:
+            match command:
+                case ["actors"]:
+                    return " ".join(actor.kind for actor in world.actors.values())
+                case ["settings"]:
+                    return f"{world.settings[0]} {world.settings[2]}"
+                case ["frame"]:
+                    return str(world.frame)
+                case ["speed"]:
+                    return " ".join(f"{math.hypot(*actor.velocity):.3f}" for actor in world.actors.values())
+                case _:
+                    return "unknown"
+
     def _answer(self, method: str, arguments: list[Any]) -> Any:
         if method not in self._methods:
             print(f"stand-in: no method {method} {arguments!r}", file=sys.stderr, flush=True)
@@ -181,7 +199,8 @@ def main() -> None:
         threading.Thread(target=_accept, args=(listener, serve), daemon=True).start()
     threading.Thread(target=server.run_asynchronously, daemon=True).start()
     print(f"ready {given.port}", flush=True)
-    sys.stdin.read()
+    for line in sys.stdin:
+        print(server.report(line.split()), flush=True)
     os._exit(0)
 
 

@@ -22,6 +22,13 @@ OTHER_CLIENT_WAIT_S: Final = 1.0
 NO_OVERRIDE: Final = "vehicle.carla.host and vehicle.carla.port"
 
 
+_all_clients: list[Any] = []
+"""All clients of this process, which are never freed: if one of the wheel's own threads happens to free the client, the
+process is aborted."""
+_usable_clients: dict[tuple[str, int], Any] = {}
+"""The newest client of each address, which the sessions of a sweep share."""
+
+
 class OpenedWorld(NamedTuple):
     """A world that this client ticks, with what it restores in the end."""
 
@@ -42,6 +49,7 @@ def sentences(settings: CarlaSettings, work: str) -> Iterator[None]:
     try:
         yield
     except RuntimeError as error:
+        forget_client(settings)
         reason = " ".join(str(error).split())
         raise VehicleError(
             f"the CARLA server at {settings.address} did not {work} ({reason}): check that it runs, or restart it"
@@ -50,11 +58,11 @@ def sentences(settings: CarlaSettings, work: str) -> Iterator[None]:
 
 def connect(carla: Any, settings: CarlaSettings) -> Any:
     """Return a client; raise `UserError` if no server answers, or one of another version."""
-    client = carla.Client(settings.host, settings.port)
-    client.set_timeout(settings.timeout_s)
+    client = _find_client(carla, settings)
     try:
         found = client.get_server_version()
     except RuntimeError:
+        forget_client(settings)
         raise UserError(
             f"no CARLA server answers at {settings.address} within {settings.timeout_s:g} s: start CARLA {SUPPORTED} "
             f"there, or set {NO_OVERRIDE}"
@@ -65,6 +73,21 @@ def connect(carla: Any, settings: CarlaSettings) -> Any:
             f"CARLA {SUPPORTED}, or set {NO_OVERRIDE}"
         )
     return client
+
+
+def forget_client(settings: CarlaSettings) -> None:
+    """Make the next session connect anew, because the server failed."""
+    _usable_clients.pop((settings.host, settings.port), None)
+
+
+def _find_client(carla: Any, settings: CarlaSettings) -> Any:
+    """Return the client of an address, with the timeout of these settings."""
+    address = (settings.host, settings.port)
+    if address not in _usable_clients:
+        _usable_clients[address] = carla.Client(*address)
+        _all_clients.append(_usable_clients[address])
+    _usable_clients[address].set_timeout(settings.timeout_s)
+    return _usable_clients[address]
 
 
 def open_world(carla: Any, client: Any, settings: CarlaSettings) -> OpenedWorld:
