@@ -127,6 +127,10 @@ class StandInServer:
                     return " ".join(actor.kind for actor in world.actors.values())
                 case ["settings"]:
                     return f"{world.settings[0]} {world.settings[2]}"
+                case ["park", x_m, y_m]:
+                    pose = wire.WirePose((float(x_m), -float(y_m), 0.0))
+                    world.spawn([0, wire.VEHICLE, [["role_name", wire.STRING, "parked"]]], pose)
+                    return "parked"
                 case ["frame"]:
                     return str(world.frame)
                 case ["speed"]:
@@ -183,7 +187,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--scenery", default="full")
     parser.add_argument("--version", default=wire.VERSION)
-    parser.add_argument("--camera", action="store_true", help="prepare the default camera before the first client")
+    parser.add_argument("--camera", type=int, nargs=2, help="prepare the default camera in this size")
     parser.add_argument("--late-pictures", type=int, default=0)
     given = parser.parse_args()
     streams = Streams()
@@ -191,7 +195,7 @@ def main() -> None:
         load_road(given.road), given.town, given.port, streams.publish, seed=given.seed, scenery=given.scenery
     )
     if given.camera:
-        world.prepare_camera(CameraModel())
+        world.prepare_camera(CameraModel(*given.camera))
     world.late_pictures = given.late_pictures
     server = StandInServer(world, given.version)
     for port, serve in ((given.port, server.serve), (given.port + 1, streams.subscribe)):

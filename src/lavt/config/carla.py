@@ -33,5 +33,5 @@ class CarlaConfig(Section):
     """The road wheel angle at full steer; null: the one that the server announces."""
     timeout_s: float = Field(10.0, gt=0, le=600)
     """The longest wait for an answer of the server while a session begins."""
-    tick_timeout_s: float = Field(2.0, gt=0, le=60)
+    tick_timeout_s: float = Field(5.0, gt=0, le=60)
     """The longest wait for a tick; then the run ends."""

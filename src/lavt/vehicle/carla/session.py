@@ -78,6 +78,7 @@ class CarlaSession:
             self._measure_car()
             self._place_car()
             self._add_sensors()
+            self._client.set_timeout(settings.tick_timeout_s)
         except BaseException:
             self.close()
             raise
