@@ -97,7 +97,7 @@ def test_an_absent_server_is_named() -> None:
     """Without a server, a sentence names the address."""
     need_carla()
     port = free_tcp_pair()
-    with pytest.raises(UserError, match=f"no CARLA server answers at 127.0.0.1:{port} within 1 s"):
+    with pytest.raises(UserError, match=rf"no CARLA server answers at 127\.0\.0\.1:{port} within 1 s"):
         CarlaSession(blind_settings(port, timeout_s=TIMEOUT_S)[0])
 
 
@@ -191,7 +191,7 @@ def test_a_frozen_server_ends_the_run_and_its_car_stands_still() -> None:
         opened.close()
         server.resume()
         assert int(server.ask("frame")) <= frame + 1
-        assert server.ask("settings").startswith("True") or server.ask("actors") == ""
+        assert server.ask("settings").startswith("True")
         with closing(CarlaSession(blind_settings(server.port)[0])):
             assert server.ask("actors") == CAR_AND_SENSORS
 

@@ -25,10 +25,12 @@ class RecordedWorld:
         self.events: list[CarlaEvent] = []
 
     def tick(self, actuation: Actuation, *, hand_brake: bool = False) -> Snapshot:
+        """Record the tick."""
         self.actuations.append((actuation, hand_brake))
         return Snapshot(len(self.actuations), FlatPose(0.0, 0.0, 0.0), 0.0, 0.0, 1)
 
     def take_events(self) -> list[CarlaEvent]:
+        """Return the events since the last call."""
         events, self.events = self.events, []
         return events
 

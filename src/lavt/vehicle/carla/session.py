@@ -116,9 +116,10 @@ class CarlaSession:
         return [self._events.popleft() for _ in range(len(self._events))]
 
     def close(self) -> None:
-        """Destroy the actors in reverse order and restore the world's settings; a dead server is ignored.
+        """Destroy the actors in reverse order and restore the world's settings.
 
-        The settings come last: with them, the world may run by itself again.
+        The settings come last, because with them the world may run by itself again. If the server does not answer, the
+        world stays frozen, with the rest of the actors, until the next session removes them.
         """
         if self._is_closed:
             return
@@ -129,10 +130,10 @@ class CarlaSession:
             for actor in reversed(self._actors):
                 if actor.type_id.startswith("sensor."):
                     actor.stop()
-                actor.destroy()
+                if not actor.destroy():
+                    return
             if self._opened is not None:
                 self._opened.restore(has_own_weather=bool(self.settings.weather))
-        self._actors.clear()
 
     # The car.
 
