@@ -14,6 +14,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+import cv2  # noqa: F401 (its first import changes the environment, which no test may do)
 from tests.require import need
 
 from lavt.vehicle.carla.library import SUPPORTED

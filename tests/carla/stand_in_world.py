@@ -114,6 +114,12 @@ class StandInWorld:
         return bool(self.settings[0])
 
     @property
+    def start(self) -> WirePose:
+        """The place at the start of the route, which the town recommends."""
+        x_m, y_m, heading_rad = self.road.start
+        return WirePose((x_m, -y_m, 0.0), (0.0, -math.degrees(heading_rad), 0.0))
+
+    @property
     def dt_s(self) -> float:
         """The length of a tick: the setting, or that of the asynchronous world."""
         return float(self.settings[2][1]) if self.settings[2][0] else ASYNCHRONOUS_DT_S

@@ -107,7 +107,7 @@ def test_a_camera_of_another_source_is_refused() -> None:
     from lavt.config import ServerCameraConfig
 
     config = server_config(2000).model_copy(update={"camera": ServerCameraConfig()})
-    with pytest.raises(UserError, match="set camera.source carla"):
+    with pytest.raises(UserError, match=r"set camera\.source carla"):
         build_carla(config)
 
 

@@ -19,6 +19,7 @@ from lavt.vehicle.carla.connection import OpenedWorld, connect, open_world, sent
 from lavt.vehicle.carla.frames import (
     Axles,
     CarlaPose,
+    FlatPose,
     actor_pose,
     camera_mount,
     curve_at,
@@ -68,6 +69,7 @@ class CarlaSession:
         self._max_steering_rad = 1.0
         self._steering_curve: tuple[tuple[float, float], ...] = ()
         self._frame = 0
+        self._start = FlatPose(0.0, 0.0, 0.0)
         self._client = connect(self._carla, settings)
         atexit.register(self.close)
         try:
@@ -76,7 +78,7 @@ class CarlaSession:
             self._car = self._spawn_car()
             self._settle()
             self._measure_car()
-            self._place_car()
+            self.reset()
             self._add_sensors()
             self._client.set_timeout(settings.tick_timeout_s)
         except BaseException:
@@ -115,6 +117,15 @@ class CarlaSession:
         """Return the collisions and lane invasions that arrived since the last call."""
         return [self._events.popleft() for _ in range(len(self._events))]
 
+    def reset(self) -> None:
+        """Put the car, stationary, with its rear axle exactly at the start."""
+        with sentences(self.settings, "place the car"):
+            now = _pose(self._car.get_transform())
+            pose = actor_pose(self._start, self._axles.rear_axle_m, self.settings.map_shift_m, now.z_m)
+            self._car.set_target_velocity(self._carla.Vector3D())
+            self._car.set_transform(_transform(self._carla, pose._replace(pitch_deg=now.pitch_deg)))
+        self._settle()
+
     def close(self) -> None:
         """Destroy the actors in reverse order and restore the world's settings.
 
@@ -140,9 +151,14 @@ class CarlaSession:
     def _spawn_car(self) -> Any:
         settings = self.settings
         with sentences(settings, "spawn the car"):
-            pose = actor_pose(settings.start, GUESSED_REAR_AXLE_M, settings.map_shift_m)
-            location = self._carla.Location(pose.x_m, pose.y_m, 0.0)
-            lane = self._world.get_map().get_waypoint(location, project_to_road=False)
+            town = self._world.get_map()
+            if settings.start is None:
+                pose = _pose(next(iter(town.get_spawn_points()), self._carla.Transform()))
+                self._start = rear_axle_pose(pose, GUESSED_REAR_AXLE_M, settings.map_shift_m)
+            else:
+                self._start = settings.start
+            pose = actor_pose(self._start, GUESSED_REAR_AXLE_M, settings.map_shift_m)
+            lane = town.get_waypoint(self._carla.Location(pose.x_m, pose.y_m, 0.0), project_to_road=False)
             if lane is None:
                 raise UserError(
                     f"the start, x {pose.x_m:.1f} m and y {pose.y_m:.1f} m in CARLA, is on no lane of "
@@ -188,14 +204,6 @@ class CarlaSession:
                 "set vehicle.carla.max_steering_deg"
             )
         self._steering_curve = tuple((point.x, point.y) for point in physics.steering_curve)
-
-    def _place_car(self) -> None:
-        """Put the rear axle, whose place in the car is known now, exactly at the start."""
-        with sentences(self.settings, "place the car"):
-            now = _pose(self._car.get_transform())
-            pose = actor_pose(self.settings.start, self._axles.rear_axle_m, self.settings.map_shift_m, now.z_m)
-            self._car.set_transform(_transform(self._carla, pose._replace(pitch_deg=now.pitch_deg)))
-        self._settle()
 
     # Sensors.
 

@@ -18,8 +18,8 @@ class CarlaSettings:
     port: int
     tick_s: float
     """The time by which a tick advances the world."""
-    start: FlatPose
-    """The start of the rear axle, in LAVT's world frame."""
+    start: FlatPose | None
+    """The start of the rear axle, in LAVT's world frame; None: the first place that the town recommends."""
     map_shift_m: tuple[float, float] = (0.0, 0.0)
     town: str = ""
     weather: str = ""

@@ -19,10 +19,11 @@ from typing import Final, Protocol
 from msgspec import Struct
 
 from lavt.clock import Clock
-from lavt.domain import NS_PER_S, Actuation
+from lavt.domain import NS_PER_MS, NS_PER_S, Actuation
 from lavt.vehicle.carla.settings import CarlaEvent, Snapshot
 
 REMEMBERED_TICKS: Final = 64
+LATE_NS: Final = 2 * NS_PER_MS
 
 
 class World(Protocol):
@@ -88,7 +89,7 @@ class Ticker:
         self._hand_brake = True
         self._ticked: deque[Ticked] = deque(maxlen=REMEMBERED_TICKS)
         self._events: list[tuple[int, CarlaEvent]] = []
-        self._counts = Counter({"ticks": 0, "late_ticks": 0})
+        self._counts = Counter({"ticks": 0, "ticks_begun_late": 0, "ticks_skipped": 0})
         self._is_threaded = False
         self._stopped = threading.Event()
         self._failed: BaseException | None = None
@@ -97,7 +98,7 @@ class Ticker:
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """The number of ticks, and of those that were late by more than half a period."""
+        """The number of ticks, of those that began more than `LATE_NS` late, and of those that were skipped."""
         return dict(self._counts)
 
     @property
@@ -171,12 +172,22 @@ class Ticker:
                     self._stopped.wait(-late_ns / NS_PER_S)
                     continue
                 if late_ns > self._period_ns // 2:
-                    # A late tick cannot be made up for: the grid begins anew.
-                    self._counts["late_ticks"] += 1
-                    self._anchor_ns, self._count = self.next_due_ns + late_ns, 0
+                    self._skip(late_ns)
+                    continue
+                self._counts["ticks_begun_late"] += late_ns > LATE_NS
                 self._tick(self.next_due_ns)
         except BaseException as error:  # the actuator node raises it and so ends the run
             self._failed = error
+
+    def _skip(self, late_ns: int) -> None:
+        """Move the grid by whole periods, so that the next tick is due in the future and still at a frame's time.
+
+        The world stood still meanwhile: it lost this time.
+        """
+        periods = 1 + late_ns // self._period_ns
+        with self._lock:
+            self._anchor_ns += periods * self._period_ns
+            self._counts["ticks_skipped"] += periods
 
     def _tick(self, due_ns: int) -> None:
         with self._lock:
