@@ -32,7 +32,7 @@ def test_the_check_writes_a_log(
 ) -> None:
     """The check drives, steers, brakes and takes pictures, passes with LAVT's own car, and removes everything."""
     monkeypatch.chdir(tmp_path)
-    code = run(monkeypatch, "check", "127.0.0.1", "--port", str(server.port), "--set", "timeout_s=30.0")
+    code = run(monkeypatch, "check", "127.0.0.1", "--port", str(server.port), "--set", "vehicle.carla.timeout_s=30.0")
     output = capsys.readouterr()
     assert code == 0, output
     log = json.loads((tmp_path / "carla-check.json").read_text())
@@ -53,7 +53,14 @@ def test_calibration_finds_the_steering_ratio(
     server: StandIn, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """With a largest angle that is twice the true one, the calibration prints about the true one, 29.4 degrees."""
-    options = ("--port", str(server.port), "--set", "max_steering_deg=58.8", "--set", "timeout_s=30.0")
+    options = (
+        "--port",
+        str(server.port),
+        "--set",
+        "vehicle.carla.max_steering_deg=58.8",
+        "--set",
+        "vehicle.carla.timeout_s=30.0",
+    )
     assert run(monkeypatch, "calibrate", "127.0.0.1", *options) == 0
     last = capsys.readouterr().out.splitlines()[-1]
     name, value = last.split(": ")

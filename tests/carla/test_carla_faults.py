@@ -15,7 +15,7 @@ import pytest
 from tests.carla.contract_vehicle import blind_settings, server_config
 from tests.carla.stand_in import REPOSITORY, StandIn, free_tcp_pair, need_carla, stand_in
 
-from lavt.assembly.carla import carla_settings
+from lavt.assembly.simulators import carla_settings
 from lavt.domain import Actuation
 from lavt.errors import UserError, VehicleError
 from lavt.vehicle.carla import library, session

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from lavt.assembly.by_wire import build_inside, check_by_wire, is_simulated
 from lavt.assembly.cameras import build_camera, camera_model, check_simulated_camera
-from lavt.assembly.simulators import car_of, simulator_of
+from lavt.assembly.simulators import car_of, open_carla, simulator_of
 from lavt.clock import Clock
 from lavt.config import ServerConfig, VehicleConfig
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
@@ -78,8 +78,6 @@ def build_dbw(config: ServerConfig) -> VehicleSetup:
 
 def build_carla(config: ServerConfig) -> VehicleSetup:
     """Connect to the configured CARLA server, and build its car and its camera."""
-    from lavt.assembly.carla import open_carla  # noqa: PLC0415 (only a CARLA vehicle needs it)
-
     road = load_road(config.vehicle.route)
     parts = open_carla(config, road, camera_phase_ns(config))
     return VehicleSetup(

@@ -5,16 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
 import typer
 
-from lavt.assembly.cameras import camera_model
+from lavt.assembly.simulators import carla_settings
 from lavt.cli import console
 from lavt.clock import MachineClock
-from lavt.config import CameraConfig, CarlaConfig
+from lavt.config import ServerConfig
 from lavt.config_file import build_config
 from lavt.errors import WorkError
 from lavt.recording.provenance import provenance
@@ -27,16 +28,9 @@ from lavt.vehicle.carla.check import (
     time_ticks,
 )
 from lavt.vehicle.carla.session import CarlaSession
-from lavt.vehicle.carla.settings import CarlaSettings
-
-TICK_S = 1 / 30
 
 Host = Annotated[str, typer.Argument(help="The machine of the CARLA server.")]
 Port = Annotated[int, typer.Option(min=1, max=65_534, help="The server's RPC port.")]
-Changes = Annotated[
-    list[str] | None,
-    typer.Option("--set", help="Override a value of the config section vehicle.carla, as town=Town04; repeatable."),
-]
 
 
 def register(app: typer.Typer) -> None:
@@ -50,7 +44,7 @@ def register(app: typer.Typer) -> None:
 def check(
     host: Host = "127.0.0.1",
     port: Port = 2000,
-    changes: Changes = None,
+    changes: console.SetOption = None,
     out: Annotated[Path, typer.Option(help="The log to write, in JSON.")] = Path("carla-check.json"),
 ) -> None:
     """Check whether a CARLA server does what LAVT assumes, and write a log.
@@ -58,7 +52,7 @@ def check(
     The command spawns a car at a place that the town recommends, drives it, steers it, and measures how long ticks and
     pictures take. LAVT was never tried with a real server: please send the log in. Exits with 1 if a check failed.
 
-    Example: lavt carla check 192.0.2.7 --set town=Town04
+    Example: lavt carla check 192.0.2.7 --set vehicle.carla.town=Town04
     """
     with _session(host, port, changes, with_camera=True) as session:
         checks = check_driving(session)
@@ -90,7 +84,7 @@ def check(
         raise WorkError("the server does not do what LAVT assumes: see the failed checks")
 
 
-def calibrate(host: Host = "127.0.0.1", port: Port = 2000, changes: Changes = None) -> None:
+def calibrate(host: Host = "127.0.0.1", port: Port = 2000, changes: console.SetOption = None) -> None:
     """Measure the steering angle that the car drives for a commanded one, and print the config key that corrects it.
 
     Example: lavt carla calibrate 192.0.2.7
@@ -110,20 +104,10 @@ def calibrate(host: Host = "127.0.0.1", port: Port = 2000, changes: Changes = No
 
 @contextmanager
 def _session(host: str, port: int, changes: list[str] | None, *, with_camera: bool) -> Iterator[CarlaSession]:
-    config = build_config(CarlaConfig, {"host": host, "port": port}, changes or [], "the options")
-    settings = CarlaSettings(
-        host=config.host,
-        port=config.port,
-        tick_s=TICK_S,
-        start=None,
-        town=config.town,
-        weather=config.weather,
-        blueprint=config.blueprint,
-        role_name=config.role_name,
-        camera=camera_model(CameraConfig()) if with_camera else None,
-        timeout_s=config.timeout_s,
-        tick_timeout_s=config.tick_timeout_s,
-        max_steering_rad=None if config.max_steering_deg is None else math.radians(config.max_steering_deg),
+    config = build_config(
+        ServerConfig, {"vehicle": {"kind": "carla"}, "camera": {"source": "carla"}}, changes or [], ""
     )
-    with closing(CarlaSession(settings)) as session:
+    settings = carla_settings(config, None)
+    camera = settings.camera if with_camera else None
+    with closing(CarlaSession(replace(settings, host=host, port=port, camera=camera))) as session:
         yield session
