@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from tests.carla.stand_in import StandIn, need_carla, stand_in
 
-from lavt.assembly.simulators import carla_settings
+from lavt.assembly.vehicles import carla_settings
 from lavt.config import CarlaConfig, ServerCameraConfig, ServerConfig, VehicleConfig
 from lavt.vehicle.carla.session import BRAKED, CarlaSession
 from lavt.vehicle.carla.settings import CarlaSettings

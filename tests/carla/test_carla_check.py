@@ -53,14 +53,8 @@ def test_calibration_finds_the_steering_ratio(
     server: StandIn, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """With a largest angle that is twice the true one, the calibration prints about the true one, 29.4 degrees."""
-    options = (
-        "--port",
-        str(server.port),
-        "--set",
-        "vehicle.carla.max_steering_deg=58.8",
-        "--set",
-        "vehicle.carla.timeout_s=30.0",
-    )
+    changes = ("--set", "vehicle.carla.max_steering_deg=58.8", "--set", "vehicle.carla.timeout_s=30.0")
+    options = ("--port", str(server.port), *changes)
     assert run(monkeypatch, "calibrate", "127.0.0.1", *options) == 0
     last = capsys.readouterr().out.splitlines()[-1]
     name, value = last.split(": ")

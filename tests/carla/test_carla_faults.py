@@ -15,7 +15,7 @@ import pytest
 from tests.carla.contract_vehicle import blind_settings, server_config
 from tests.carla.stand_in import REPOSITORY, StandIn, free_tcp_pair, need_carla, stand_in
 
-from lavt.assembly.simulators import carla_settings
+from lavt.assembly.vehicles import carla_settings
 from lavt.domain import Actuation
 from lavt.errors import UserError, VehicleError
 from lavt.vehicle.carla import library, session
@@ -133,6 +133,7 @@ def test_an_occupied_start_is_named() -> None:
     """A car that is parked at the start is not removed; the run is refused and leaves the server as it was."""
     with stand_in() as server:
         settings, _ = blind_settings(server.port)
+        assert settings.start is not None
         assert server.ask("park", settings.start.x_m, settings.start.y_m) == "parked"
         with pytest.raises(UserError, match="the start is occupied"):
             CarlaSession(settings)

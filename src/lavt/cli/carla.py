@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
-from lavt.assembly.simulators import carla_settings
+from lavt.assembly.vehicles import carla_settings
 from lavt.cli import console
 from lavt.clock import MachineClock
 from lavt.config import ServerConfig
@@ -104,9 +104,8 @@ def calibrate(host: Host = "127.0.0.1", port: Port = 2000, changes: console.SetO
 
 @contextmanager
 def _session(host: str, port: int, changes: list[str] | None, *, with_camera: bool) -> Iterator[CarlaSession]:
-    config = build_config(
-        ServerConfig, {"vehicle": {"kind": "carla"}, "camera": {"source": "carla"}}, changes or [], ""
-    )
+    data = {"vehicle": {"kind": "carla"}, "camera": {"source": "carla"}}
+    config = build_config(ServerConfig, data, changes or [], "the options")
     settings = carla_settings(config, None)
     camera = settings.camera if with_camera else None
     with closing(CarlaSession(replace(settings, host=host, port=port, camera=camera))) as session:
