@@ -61,7 +61,8 @@ class StandInServer:
     def __init__(self, world: StandInWorld, version: str) -> None:
         self._world, self._version = world, version
         self._lock = threading.Lock()
-        self.ticked = threading.Event()
+        self._tick_times_ns: list[int] = []
+        """When each tick of a client began."""
         self._methods: dict[str, Callable[..., Any]] = {
             "version": lambda: wire.value(self._version),
             "get_episode_info": lambda: wire.value([world.episode, [world.sensor_token(wire.WORLD_STREAM)]]),
@@ -132,6 +133,8 @@ class StandInServer:
                     pose = wire.WirePose((float(x_m), -float(y_m), 0.0))
                     world.spawn([0, wire.VEHICLE, [["role_name", wire.STRING, "parked"]]], pose)
                     return "parked"
+                case ["tick_times"]:
+                    return " ".join(map(str, self._tick_times_ns))
                 case ["frame"]:
                     return str(world.frame)
                 case ["speed"]:
@@ -162,6 +165,7 @@ class StandInServer:
         return wire.done()
 
     def _tick_cue(self) -> Any:
+        self._tick_times_ns.append(time.monotonic_ns())
         return wire.value(self._world.tick(time.monotonic()))
 
 
