@@ -64,10 +64,11 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> TimedDrive:
     return TimedDrive(read_record(out / "server.mcap"), tick_times_ns, began_ns, ended_ns)
 
 
-def test_the_car_drives_and_is_removed(drive: TimedDrive) -> None:
+def test_the_car_drives_and_is_removed(drive: TimedDrive, stalls: Stalls) -> None:
     """The drive begins and the car moves; afterwards no actor of it is left in the world."""
     assert "drive_began" in drive.record.table("event").texts("kind")
-    assert max(drive.record.table("truth").floats("progress_m")) > 5.0
+    with stalls.excusing_failures(drive.began_ns, drive.ended_ns):  # a stall can stop the car
+        assert max(drive.record.table("truth").floats("progress_m")) > 5.0
 
 
 def test_capture_times_are_those_of_the_ticks(drive: TimedDrive, stalls: Stalls) -> None:
