@@ -152,8 +152,8 @@ def _load_town(client: Any, world: Any, settings: CarlaSettings) -> Any:
 
 def _own_settings(carla: Any, before: Any, settings: CarlaSettings) -> Any:
     own = _copied(carla, before)
-    own.synchronous_mode = settings.synchronous
-    own.fixed_delta_seconds = settings.tick_s if settings.synchronous else None
+    own.synchronous_mode = True
+    own.fixed_delta_seconds = settings.tick_s
     own.substepping = True
     own.max_substep_delta_time = SUBSTEP_S
     own.max_substeps = min(MAX_SUBSTEPS, max(MIN_SUBSTEPS, math.ceil(settings.tick_s / SUBSTEP_S)))

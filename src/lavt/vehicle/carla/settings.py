@@ -27,7 +27,6 @@ class CarlaSettings:
     role_name: str = "lavt"
     camera: CameraModel | None = None
     """None: no camera."""
-    synchronous: bool = True
     timeout_s: float = 10.0
     tick_timeout_s: float = 2.0
     load_timeout_s: float = 120.0
