@@ -44,6 +44,7 @@ SCHEMAS: dict[str, type[Section]] = {
     "loss_and_jitter.yaml": SweepConfig,
     "roads.yaml": SweepConfig,
     "paper.yaml": SweepConfig,
+    "paper_carla.yaml": SweepConfig,
     "paper_designed.yaml": SweepConfig,
     "relay.yaml": RelayConfig,
     "rendezvous.yaml": RendezvousConfig,

@@ -6,7 +6,19 @@ import sys
 
 import pytest
 
-LARGE_PACKAGES = {"av", "can", "cantools", "cryptography", "cv2", "matplotlib", "mcap", "numpy", "scipy", "zenoh"}
+LARGE_PACKAGES = {
+    "av",
+    "can",
+    "cantools",
+    "carla",
+    "cryptography",
+    "cv2",
+    "matplotlib",
+    "mcap",
+    "numpy",
+    "scipy",
+    "zenoh",
+}
 SMALL_COMMANDS = ["boundary", "can", "keys", "netem", "rendezvous", "router"]
 ALLOWED_PACKAGES: dict[str, set[str]] = {
     **{command: set() for command in SMALL_COMMANDS},

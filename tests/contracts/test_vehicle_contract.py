@@ -8,6 +8,7 @@ from collections.abc import Callable
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.carla.contract_vehicle import contract_vehicle
 from tests.nodes.stand_ins import MONO_NS, FakeVehicle
 
 from lavt.assembly.by_wire import build_inside
@@ -29,6 +30,7 @@ def by_wire(profile: str) -> Vehicle:
 
 DRIVABLE: dict[str, Callable[[], Vehicle]] = {
     "simulator": lambda: Simulator(road=ROAD, seed=1, start_mono_ns=MONO_NS),
+    "carla, in a stand-in server": lambda: contract_vehicle(MONO_NS),
     "dataspeed_gen1": lambda: by_wire("dataspeed_gen1"),
     "dataspeed_gen2": lambda: by_wire("dataspeed_gen2"),
 }

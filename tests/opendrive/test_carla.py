@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 from pathlib import Path
 
 import pytest
+from tests.carla.stand_in import need_carla
 from tests.opendrive.carla_comparison import Difference, compare, compare_import
-from tests.require import need
 
 from lavt.vehicle.sim.road.opendrive_export import export_road
 from lavt.vehicle.sim.road.road import load_road
@@ -41,11 +40,6 @@ def test_carla_reads_an_exported_road(tmp_path: Path) -> None:
     path = tmp_path / "b.xodr"
     path.write_text(export_road(load_road("b")).text)
     check_differences(list(compare(str(path))))
-
-
-def need_carla() -> None:
-    if importlib.util.find_spec("carla") is None:
-        need("carla", "needs the wheel carla: pip install carla==0.9.16 (Python 3.11 or 3.12)")
 
 
 def check_differences(differences: list[Difference]) -> None:

@@ -27,6 +27,8 @@ from lavt.vehicle.video_device import VideoDevice
 CUSTOM_CAMERAS = "lavt.cameras"
 """The group of entry points with which users add cameras: functions like `build_device`."""
 SIMULATED = "simulated"
+CARLA = "carla"
+"""The source of pictures of a vehicle in a CARLA server, which builds its camera itself."""
 
 
 def build_device(config: ServerConfig) -> VideoDevice:

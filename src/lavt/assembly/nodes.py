@@ -12,7 +12,7 @@ from lavt.assembly.entropy import Entropy
 from lavt.assembly.fidelity import VIDEO, FidelityModel
 from lavt.assembly.injection import injection_client, injection_node
 from lavt.assembly.security import build_cipher
-from lavt.assembly.vehicles import check_vehicle, physics_sample_times
+from lavt.assembly.vehicles import VehicleSetup, check_vehicle, physics_sample_times
 from lavt.config import HUMAN, ClientConfig, ControllerConfig, SafetyConfig, ServerConfig, VehicleConfig
 from lavt.control.client_limits import CLIENT_LIMITS
 from lavt.control.drive_controller import DriveController, make_controller
@@ -53,6 +53,8 @@ class ServerNodes:
     actuator: ActuatorNode | None
     clock_sync: ClockSyncNode
     injection: InjectionNode
+    setup: VehicleSetup
+    """The vehicle and its camera."""
 
     @property
     def all(self) -> Sequence[Node]:
@@ -191,6 +193,7 @@ def build_server(
         actuator,
         ClockSyncNode(start.mono_ns),
         injection_node(config.injection, simulated=setup.simulated, video_port=video_port),
+        setup,
     )
 
 

@@ -27,6 +27,7 @@ from lavt.assembly.entropy import MachineEntropy
 from lavt.assembly.nodes import build_client, build_server
 from lavt.assembly.rendezvous import open_flow
 from lavt.assembly.security import Authenticator, build_authenticator, build_gateway
+from lavt.assembly.vehicles import VehicleSetup
 from lavt.assembly.zenoh import side_session
 from lavt.clock import Clock
 from lavt.config import HUMAN, ClientConfig, ServerConfig
@@ -103,6 +104,7 @@ class Side:
         actuator: ActuatorProcess | None = None,
         session: ClientSession | None = None,
         path: PathServer | None = None,
+        setup: VehicleSetup | None = None,
     ) -> None:
         self.clock = clock
         self.is_plain = not config.security.key
@@ -112,6 +114,8 @@ class Side:
         self.actuator = actuator
         """The server's actuator if it runs in a process of its own, otherwise None."""
         self._links = links
+        self._setup = setup
+        """The server's vehicle; None on a client."""
         self._path = path
         """The server's end of the video path, which decides whose datagrams are dropped; None on a client."""
         self._time_source = prepared.time_source
@@ -140,6 +144,8 @@ class Side:
             "console": links.console,
             "relay": links.relay,
         }
+        if self._setup is not None and self._setup.run is not None:
+            self._setup.run(self.clock)
         self.runtime.start({carrier: link for carrier, link in carriers.items() if link is not None})
         if links.console is not None:
             links.console.start(self._deliver)
@@ -171,6 +177,8 @@ class Side:
                     parts.callback(link.close)
             parts.callback(self._time_source.close)
             parts.callback(self._injector.close)
+            if self._setup is not None and self._setup.close is not None:
+                parts.callback(self._setup.close)
             parts.callback(self.runtime.stop)
             if self.actuator is not None:
                 parts.callback(self.actuator.end)
@@ -217,6 +225,8 @@ def open_server(
         links = Links(video, probe, opened.enter_context(closing(_open_zenoh(config, clock, print_message))))
         host = kernel_identity()
         nodes = build_server(config, clock.now, MachineEntropy(), host=host, video_port=video.port)
+        if nodes.setup.close is not None:
+            opened.callback(nodes.setup.close)
         ready: dict[str, Any] = {"video_port": video.port, "probe_port": probe.port}
         if config.zenoh.is_embedded:
             ready["locators"] = links.zenoh.locators()
@@ -237,6 +247,7 @@ def open_server(
             in_force=in_force,
             actuator=actuator,
             path=nodes.camera.path,
+            setup=nodes.setup,
         )
         opened.pop_all()  # from now on, `side.close` closes these parts
     with closing(side):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import entry_points
@@ -10,8 +11,9 @@ import numpy as np
 from msgspec.structs import replace
 
 from lavt.assembly.by_wire import build_inside, check_by_wire, is_simulated
-from lavt.assembly.cameras import build_camera, camera_model, check_simulated_camera
+from lavt.assembly.cameras import CARLA, build_camera, camera_model, check_simulated_camera
 from lavt.assembly.simulators import car_of, simulator_of
+from lavt.clock import Clock
 from lavt.config import ServerConfig, VehicleConfig
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.errors import UserError
@@ -19,9 +21,16 @@ from lavt.nodes.payloads import Route
 from lavt.perception.lane_detector import GRID
 from lavt.streams import stream
 from lavt.vehicle.camera import Camera, FrameTimes, TimedCamera
+from lavt.vehicle.carla.camera import CarlaCamera
+from lavt.vehicle.carla.frames import FlatPose
+from lavt.vehicle.carla.session import BRAKED, CarlaSession
+from lavt.vehicle.carla.settings import CarlaSettings
+from lavt.vehicle.carla.ticker import Ticker
+from lavt.vehicle.carla.vehicle import CarlaVehicle
 from lavt.vehicle.sim.rendering.camera import SimCamera
 from lavt.vehicle.sim.rendering.lane_camera import LaneCamera
 from lavt.vehicle.sim.road.road import Road, load_road
+from lavt.vehicle.sim.simulator import start_offset
 from lavt.vehicle.vehicle import Vehicle
 
 CUSTOM_VEHICLES = "lavt.vehicles"
@@ -29,6 +38,10 @@ CUSTOM_VEHICLES = "lavt.vehicles"
 
 ROUTE_STEP_M = 1.0
 """The distance between the recorded points of a route."""
+
+
+LONGEST_TICK_S = 0.1
+"""CARLA's physics is not valid for longer ticks."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +56,10 @@ class VehicleSetup:
     simulated: bool = False
     catches_up: bool = False
     """Whether a late call of the vehicle's `advance` loses no accuracy."""
+    run: Callable[[Clock], None] | None = None
+    """Starts the vehicle's own thread in real time; None: it has none."""
+    close: Callable[[], None] | None = None
+    """Ends the vehicle's connections; None: it has none."""
 
 
 def build_simulator(config: ServerConfig) -> VehicleSetup:
@@ -69,6 +86,86 @@ def build_dbw(config: ServerConfig) -> VehicleSetup:
             "`lavt software-car`"
         )
     return VehicleSetup(device, start=None, route=None)
+
+
+def build_carla(config: ServerConfig) -> VehicleSetup:
+    """Connect to the configured CARLA server, and build its car and its camera; raise `UserError` if that fails."""
+    if config.camera.source != CARLA:
+        raise UserError("a vehicle of kind 'carla' has CARLA's camera: set camera.source carla")
+    road, phase_ns = load_road(config.vehicle.route), camera_phase_ns(config)
+    settings = carla_settings(config, road)
+    session = CarlaSession(settings)
+    camera = CarlaCamera(
+        session,
+        camera_model(config.camera),
+        rate_hz=config.camera.rate_hz,
+        phase_ns=phase_ns,
+        sensor_delay_ns=round(config.camera.sensor_delay_ms * NS_PER_MS),
+    )
+    tickers: list[Ticker] = []
+
+    def start(now: Now) -> Vehicle:
+        period_ns = round(settings.tick_s * NS_PER_S)
+        # The ticks include the times of all frames; the first is the first one after the start.
+        first_ns = now.mono_ns + phase_ns - phase_ns // period_ns * period_ns
+        ticker = Ticker(session, first_due_ns=first_ns, period_s=settings.tick_s, actuation=BRAKED)
+        camera.ticker = ticker
+        tickers.append(ticker)
+        limit_s = config.vehicle.time_limit_s
+        return CarlaVehicle(session, ticker, road, car_of(config.vehicle), start_ns=now.mono_ns, limit_s=limit_s)
+
+    def run(clock: Clock) -> None:
+        for ticker in tickers:
+            ticker.start(clock)
+
+    def close() -> None:
+        for ticker in tickers:
+            ticker.stop()
+        session.close()
+
+    route = route_of(config.vehicle.route, road)
+    return VehicleSetup(camera, start, route, simulated=True, run=run, close=close)
+
+
+def carla_settings(config: ServerConfig, road: Road | None) -> CarlaSettings:
+    """Return the settings of a session for a config; without a road, the car starts at a place of the town.
+
+    Raises `UserError` for values that do not fit together.
+    """
+    carla, camera = config.vehicle.carla, config.camera
+    tick_s = 1.0 / (camera.rate_hz * carla.ticks_per_frame)
+    if tick_s > LONGEST_TICK_S:
+        raise UserError(
+            f"a tick of CARLA would be {tick_s:.3g} s long, but at most {LONGEST_TICK_S} s are valid: raise "
+            "vehicle.carla.ticks_per_frame or camera.rate_hz"
+        )
+    if camera.exposure_ms:
+        raise UserError("CARLA's camera takes instantaneous pictures: leave out camera.exposure_ms")
+    return CarlaSettings(
+        host=carla.host,
+        port=carla.port,
+        tick_s=tick_s,
+        start=None if road is None else start_pose(config, road),
+        map_shift_m=carla.map_shift_m,
+        town=carla.town,
+        weather=carla.weather,
+        blueprint=carla.blueprint,
+        role_name=carla.role_name,
+        camera=camera_model(camera),
+        timeout_s=carla.timeout_s,
+        tick_timeout_s=carla.tick_timeout_s,
+        max_steering_rad=None if carla.max_steering_deg is None else math.radians(carla.max_steering_deg),
+    )
+
+
+def start_pose(config: ServerConfig, road: Road) -> FlatPose:
+    """Return the rear axle's start in the road's frame: the configured one, or near the route's start by the seed."""
+    if config.vehicle.carla.start is not None:
+        x_m, y_m, heading_deg = config.vehicle.carla.start
+        return FlatPose(x_m, y_m, math.radians(heading_deg))
+    ahead_m, lateral_m, turned_rad = start_offset(config.seed)
+    x_m, y_m = road.point_at(ahead_m, lateral_m).tolist()
+    return FlatPose(x_m, y_m, float(road.centre_at(ahead_m).heading_rad) + turned_rad)
 
 
 def _build_sim_camera(config: ServerConfig, road: Road) -> SimCamera:
@@ -140,7 +237,11 @@ def _build_simulated(config: ServerConfig, road: Road, camera: Camera) -> Vehicl
     )
 
 
-VEHICLES: dict[str, Callable[[ServerConfig], VehicleSetup]] = {"simulator": build_simulator, "dbw": build_dbw}
+VEHICLES: dict[str, Callable[[ServerConfig], VehicleSetup]] = {
+    "simulator": build_simulator,
+    "dbw": build_dbw,
+    "carla": build_carla,
+}
 
 
 def build_vehicle_setup(config: ServerConfig) -> VehicleSetup:
@@ -163,7 +264,7 @@ def check_vehicle(config: VehicleConfig) -> None:
     _find_builder(config.kind)
     if config.kind == "dbw":
         check_by_wire(config)
-    if config.kind == "simulator" or config.dbw.is_inside or config.dbw.truth:
+    if config.kind in {"simulator", "carla"} or config.dbw.is_inside or config.dbw.truth:
         load_road(config.route)
         car_of(config)
 

@@ -57,6 +57,7 @@ GROUPS = {
         "perception": "Inspect lane detection.",
         "software-car": "Simulate a car with a by-wire kit on a CAN bus.",
         "can": "Inspect drive-by-wire CAN buses (docs/can.md).",
+        "carla": "Check a CARLA server (docs/carla.md).",
     },
 }
 """All commands by what one does with them, in the order of the help, with the first sentence of their own help. The

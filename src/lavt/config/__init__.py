@@ -10,6 +10,7 @@ from lavt.config.camera import CalibrationConfig as CalibrationConfig
 from lavt.config.camera import CameraConfig as CameraConfig
 from lavt.config.camera import ClientCameraConfig as ClientCameraConfig
 from lavt.config.camera import ServerCameraConfig as ServerCameraConfig
+from lavt.config.carla import CarlaConfig as CarlaConfig
 from lavt.config.controller import HUMAN as HUMAN
 from lavt.config.controller import ControllerConfig as ControllerConfig
 from lavt.config.controller import TwoPointConfig as TwoPointConfig

@@ -50,7 +50,8 @@ class ServerCameraConfig(CameraConfig):
     """The camera in the config of the vehicle's machine."""
 
     source: str = "simulated"
-    """simulated: the simulator's camera; device: a real camera (`docs/camera.md`)."""
+    """simulated: the simulator's camera; device: a real camera (`docs/camera.md`); carla: the camera of a vehicle of
+    kind `carla`."""
     device: str | int = "/dev/video0"
     """For source `device`: a V4L2 device or its number, or the file or address of a video."""
     format: str = Field("", pattern="^([!-~]{4})?$")

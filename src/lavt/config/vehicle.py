@@ -6,6 +6,7 @@ from typing import Final, Literal
 
 from pydantic import Field
 
+from lavt.config.carla import CarlaConfig
 from lavt.config.dbw import DbwConfig
 from lavt.config.section import Section
 
@@ -14,10 +15,11 @@ MAX_SIMULATED_MPS: Final = 22.3
 
 
 class VehicleConfig(Section):
-    """The vehicle and its route; all keys except `kind` and `dbw` are for the built-in simulator or a software car."""
+    """The vehicle and its route; most keys are for the built-in simulator or a software car only."""
 
     kind: str = "simulator"
-    """simulator: the built-in car; dbw: a by-wire kit; or the name of your own vehicle (`docs/vehicles.md`)."""
+    """simulator: the built-in car; dbw: a by-wire kit; carla: a car in a CARLA server (`docs/carla.md`); or the name of
+    your own vehicle (`docs/vehicles.md`)."""
     route: str = "a_key"
     """The name of a shipped road, or the path of a road's YAML file (`docs/roads.md`)."""
     scenery: Literal["full", "light", "none"] = "full"
@@ -45,6 +47,9 @@ class VehicleConfig(Section):
     """The maximum duration of a drive from the first movement; null: the route's time at 10 km/h plus 30 s."""
     dbw: DbwConfig = DbwConfig()
     """The by-wire kit of a vehicle of kind `dbw`. The other keys then apply to the software car, if there is one."""
+    carla: CarlaConfig = CarlaConfig()
+    """The server of a vehicle of kind `carla`. Of the other keys, `route`, `car`, `after_collision` and `time_limit_s`
+    then apply."""
 
 
 class SafetyConfig(Section):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from lavt.assembly.cameras import CARLA, SIMULATED
 from lavt.config import (
     ClientCameraConfig,
     ClientClockConfig,
@@ -18,6 +19,9 @@ from lavt.config import (
     ZenohConfig,
 )
 from lavt.transport.clock_sync import probe
+
+CAMERA_SOURCES = {"carla": CARLA}
+"""The source of the pictures of a run by the kind of its vehicle, if it is not the simulator's camera."""
 
 LOCAL_TCP = "tcp/127.0.0.1:0"
 SERVER_LISTENS = (LOCAL_TCP, "udp/127.0.0.1:0?rel=1;mixed_rel=1")
@@ -36,7 +40,7 @@ def server_config(run: RunConfig, seed: int, *, zenoh: ZenohConfig | None = None
     """
     return ServerConfig(
         vehicle=run.vehicle,
-        camera=ServerCameraConfig(**run.camera.model_dump()),
+        camera=ServerCameraConfig(source=CAMERA_SOURCES.get(run.vehicle.kind, SIMULATED), **run.camera.model_dump()),
         video=ServerVideoConfig(bind="127.0.0.1", port=0, **run.video.model_dump()),
         zenoh=zenoh or embedded_router(listen=SERVER_LISTENS),
         clock=ClockConfig(probe_port=0),

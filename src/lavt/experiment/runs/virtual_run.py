@@ -237,6 +237,8 @@ def drive(loop: VirtualLoop, *, limit_ns: int = RUN_LIMIT_NS, progress: Callable
         runtime.close()
     finally:
         gc.unfreeze()
+        if loop.server.setup.close is not None:
+            loop.server.setup.close()
         for writer in loop.writers:
             writer.close()
 

@@ -1,0 +1,30 @@
+"""The only module that imports the wheel `carla`, and only when a CARLA vehicle is built."""
+
+from __future__ import annotations
+
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+from lavt.errors import UserError
+
+SUPPORTED = "0.9.16"
+"""The version of client and server; another server's version aborts the client's process."""
+
+
+def load_library() -> Any:
+    """Return the module `carla`; raise `UserError` if it is not installed or has another version."""
+    try:
+        installed = version("carla")
+    except PackageNotFoundError:
+        raise UserError(
+            f"vehicle.kind carla needs the package carla {SUPPORTED}: run `pip install 'lavt[carla]'` with Python 3.11 "
+            "or 3.12"
+        ) from None
+    if installed != SUPPORTED:
+        raise UserError(
+            f"the package carla is {installed}, but LAVT supports {SUPPORTED} only: run "
+            f"`pip install carla=={SUPPORTED}`"
+        )
+    import carla  # noqa: PLC0415 (an extra, and large)
+
+    return carla

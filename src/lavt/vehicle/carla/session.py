@@ -1,0 +1,299 @@
+"""A car with its sensors in a CARLA server: spawn them, tick, and leave the server as it was.
+
+The world is synchronous: it stands still unless this client ticks it. So a dead client leaves a frozen world and no
+driving car. The next session removes the actors of a killed one, which it finds by their role name.
+"""
+
+from __future__ import annotations
+
+import atexit
+import math
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any, Final
+
+from lavt.domain import Actuation, CameraModel
+from lavt.errors import UserError, VehicleError
+from lavt.vehicle.carla.connection import OpenedWorld, connect, open_world, sentences, town_of
+from lavt.vehicle.carla.frames import (
+    Axles,
+    CarlaPose,
+    FlatPose,
+    actor_pose,
+    camera_mount,
+    curve_at,
+    find_axles,
+    forward_speed_mps,
+    rear_axle_pose,
+    road_wheel_rad,
+    steer_for,
+)
+from lavt.vehicle.carla.library import load_library
+from lavt.vehicle.carla.pictures import PictureBox
+from lavt.vehicle.carla.settings import CarlaEvent, CarlaSettings, Snapshot
+
+SPAWN_HEIGHT_M: Final = 0.3
+"""The car is spawned at this height above the lane, and drops."""
+SETTLING_S: Final = 3.0
+"""The longest time that the car may take to come to rest after it was spawned."""
+AT_REST_MPS: Final = 0.05
+GUESSED_REAR_AXLE_M: Final = -1.4
+"""Where the rear axle is assumed until the wheels have been seen."""
+MAX_TICKS_TO_PICTURE: Final = 60
+PICTURE_WAIT_S: Final = 0.25
+"""A picture that has not come this long after a tick was not taken: a camera starts some ticks after it was spawned."""
+CLOSE_TIMEOUT_S: Final = 2.0
+BRAKED: Final = Actuation(0.0, 0.0, 1.0)
+MPS_TO_KMH: Final = 3.6
+COLLISION, LANE_INVASION, CAMERA = "sensor.other.collision", "sensor.other.lane_invasion", "sensor.camera.rgb"
+
+
+class CarlaSession:
+    """A car with its sensors, ticked by this client only.
+
+    Raises `UserError` if the server is absent, of another version, ticked by another client, or has no such town, car
+    or free start; raises `VehicleError` if it stops answering.
+    """
+
+    def __init__(self, settings: CarlaSettings) -> None:
+        self.settings = settings
+        self.pictures = PictureBox()
+        self._carla = load_library()
+        self._events: deque[CarlaEvent] = deque()
+        self._actors: list[Any] = []
+        """The spawned actors, in order."""
+        self._opened: OpenedWorld | None = None
+        self._is_closed = False
+        self._axles = Axles(GUESSED_REAR_AXLE_M, 1.0)
+        self._max_steering_rad = 1.0
+        self._steering_curve: tuple[tuple[float, float], ...] = ()
+        self._frame = 0
+        self._start = FlatPose(0.0, 0.0, 0.0)
+        self._client = connect(self._carla, settings)
+        atexit.register(self.close)
+        try:
+            self._opened = open_world(self._carla, self._client, settings)
+            self._world = self._opened.world
+            self._car = self._spawn_car()
+            self._settle()
+            self._measure_car()
+            self.reset()
+            self._add_sensors()
+            self._client.set_timeout(settings.tick_timeout_s)
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def wheelbase_m(self) -> float:
+        """The distance of the axles, from the wheels' positions."""
+        return self._axles.wheelbase_m
+
+    @property
+    def max_steering_rad(self) -> float:
+        """The road wheel angle at full steer: the configured one, or the one that the server announces."""
+        return self._max_steering_rad
+
+    @property
+    def snapshot(self) -> Snapshot:
+        """The car after the newest tick."""
+        return self._snapshot
+
+    def tick(self, actuation: Actuation, *, hand_brake: bool = False) -> Snapshot:
+        """Advance the world by one tick under an actuation and return the car after it."""
+        with sentences(self.settings, "complete a tick"):
+            self._apply(actuation, hand_brake=hand_brake)
+            before, self._frame = self._frame, self._world.tick(self.settings.tick_timeout_s)
+            self._snapshot = self._read()
+        if before and self._frame != before + 1:
+            raise VehicleError(
+                f"the CARLA server at {self.settings.address} went from frame {before} to {self._frame} in one tick: "
+                "end the other client that ticks it"
+            )
+        return self._snapshot
+
+    def take_events(self) -> list[CarlaEvent]:
+        """Return the collisions and lane invasions that arrived since the last call."""
+        return [self._events.popleft() for _ in range(len(self._events))]
+
+    def reset(self) -> None:
+        """Put the car, stationary, with its rear axle exactly at the start."""
+        with sentences(self.settings, "place the car"):
+            now = _pose(self._car.get_transform())
+            pose = actor_pose(self._start, self._axles.rear_axle_m, self.settings.map_shift_m, now.z_m)
+            self._car.set_target_velocity(self._carla.Vector3D())
+            self._car.set_transform(_transform(self._carla, pose._replace(pitch_deg=now.pitch_deg)))
+        self._settle()
+
+    def close(self) -> None:
+        """Destroy the actors in reverse order and restore the world's settings.
+
+        The settings come last, because with them the world may run by itself again. If the server does not answer, the
+        world stays frozen, with the rest of the actors, until the next session removes them.
+        """
+        if self._is_closed:
+            return
+        self._is_closed = True
+        atexit.unregister(self.close)
+        with suppress(RuntimeError):
+            self._client.set_timeout(CLOSE_TIMEOUT_S)
+            for actor in reversed(self._actors):
+                if actor.type_id.startswith("sensor."):
+                    actor.stop()
+                if not actor.destroy():
+                    return
+            if self._opened is not None:
+                self._opened.restore(has_own_weather=bool(self.settings.weather))
+
+    # The car.
+
+    def _spawn_car(self) -> Any:
+        settings = self.settings
+        with sentences(settings, "spawn the car"):
+            town = self._world.get_map()
+            if settings.start is None:
+                pose = _pose(next(iter(town.get_spawn_points()), self._carla.Transform()))
+                self._start = rear_axle_pose(pose, GUESSED_REAR_AXLE_M, settings.map_shift_m)
+            else:
+                self._start = settings.start
+            pose = actor_pose(self._start, GUESSED_REAR_AXLE_M, settings.map_shift_m)
+            lane = town.get_waypoint(self._carla.Location(pose.x_m, pose.y_m, 0.0), project_to_road=False)
+            if lane is None:
+                raise UserError(
+                    f"the start, x {pose.x_m:.1f} m and y {pose.y_m:.1f} m in CARLA, is on no lane of "
+                    f"{town_of(self._world)}: set vehicle.carla.town and vehicle.carla.map_shift_m, or another route"
+                )
+            pose = pose._replace(z_m=lane.transform.location.z + SPAWN_HEIGHT_M)
+            car = self._world.try_spawn_actor(self._blueprint(settings.blueprint), _transform(self._carla, pose))
+        if car is None:
+            raise UserError(
+                f"the start is occupied in the CARLA server at {settings.address}: remove the other actor, or set "
+                "vehicle.carla.start or another route"
+            )
+        self._actors.append(car)
+        return car
+
+    def _settle(self) -> None:
+        """Tick, braked, until the car has a pose and rests on the road."""
+        for count in range(math.ceil(SETTLING_S / self.settings.tick_s)):
+            self.tick(BRAKED, hand_brake=True)
+            velocity = self._car.get_velocity()
+            if count >= 2 and math.hypot(velocity.x, velocity.y, velocity.z) < AT_REST_MPS:
+                return
+
+    def _measure_car(self) -> None:
+        """Read where the axles are, and how far the wheels turn."""
+        blueprint = self.settings.blueprint
+        with sentences(self.settings, "describe the car"):
+            physics, pose = self._car.get_physics_control(), _pose(self._car.get_transform())
+        wheels = [(wheel.position.x, wheel.position.y) for wheel in physics.wheels]
+        if len(wheels) != 4:
+            raise UserError(f"{blueprint} has {len(wheels)} wheels: set vehicle.carla.blueprint to a car with four")
+        self._axles = find_axles(pose, wheels)
+        if not 1.0 < self._axles.wheelbase_m < 10.0:
+            raise VehicleError(
+                f"CARLA reports a wheelbase of {self._axles.wheelbase_m:.3g} m for {blueprint}: set another "
+                "vehicle.carla.blueprint"
+            )
+        announced_rad = math.radians(max(wheel.max_steer_angle for wheel in physics.wheels))
+        self._max_steering_rad = self.settings.max_steering_rad or announced_rad
+        if not 0.0 < self._max_steering_rad < math.pi / 2:
+            raise VehicleError(
+                f"CARLA reports a largest steering angle of {math.degrees(announced_rad):.3g} degrees for {blueprint}: "
+                "set vehicle.carla.max_steering_deg"
+            )
+        self._steering_curve = tuple((point.x, point.y) for point in physics.steering_curve)
+
+    # Sensors.
+
+    def _add_sensors(self) -> None:
+        with sentences(self.settings, "spawn the sensors"):
+            origin = CarlaPose(0.0, 0.0, 0.0)
+            self._attach(self._blueprint(COLLISION), origin, self._note_collision)
+            self._attach(self._blueprint(LANE_INVASION), origin, self._note_lane_invasion)
+            if self.settings.camera is not None:
+                blueprint = self._camera_blueprint(self.settings.camera)
+                self._attach(blueprint, camera_mount(self.settings.camera, self._axles.rear_axle_m), self.pictures.put)
+        if self.settings.camera is not None:
+            self._await_picture()
+
+    def _camera_blueprint(self, model: CameraModel) -> Any:
+        blueprint = self._blueprint(CAMERA)
+        attributes = {
+            "image_size_x": model.width_px,
+            "image_size_y": model.height_px,
+            "fov": math.degrees(model.field_of_view_rad),
+            "sensor_tick": 0.0,  # a picture in each tick; other values do not divide exactly
+            "motion_blur_intensity": 0.0,
+        }
+        for name, value in attributes.items():
+            if blueprint.has_attribute(name):
+                blueprint.set_attribute(name, str(value))
+        return blueprint
+
+    def _await_picture(self) -> None:
+        for _ in range(MAX_TICKS_TO_PICTURE):
+            self.tick(BRAKED, hand_brake=True)
+            if self.pictures.wait_for_any(PICTURE_WAIT_S):
+                return
+        raise VehicleError(
+            f"the CARLA server at {self.settings.address} sent no picture in {MAX_TICKS_TO_PICTURE} ticks: start it "
+            "with rendering (-RenderOffScreen, not -nullrhi)"
+        )
+
+    def _attach(self, blueprint: Any, pose: CarlaPose, listener: Callable[[Any], None]) -> None:
+        sensor = self._world.spawn_actor(blueprint, _transform(self._carla, pose), attach_to=self._car)
+        self._actors.append(sensor)
+        sensor.listen(listener)
+
+    def _blueprint(self, name: str) -> Any:
+        try:
+            blueprint = self._world.get_blueprint_library().find(name)
+        except IndexError:
+            raise UserError(f"the CARLA server has no {name!r}: set vehicle.carla.blueprint to another car") from None
+        if blueprint.has_attribute("role_name"):
+            blueprint.set_attribute("role_name", self.settings.role_name)
+        return blueprint
+
+    # Driving.
+
+    def _apply(self, actuation: Actuation, *, hand_brake: bool) -> None:
+        factor = curve_at(self._steering_curve, self._car.get_velocity().length() * MPS_TO_KMH)
+        control = self._carla.VehicleControl(
+            throttle=actuation.throttle,
+            steer=steer_for(actuation.steering_rad, self._max_steering_rad, factor),
+            brake=actuation.brake,
+            hand_brake=hand_brake,
+        )
+        self._car.apply_control(control)
+
+    def _read(self) -> Snapshot:
+        wheel = self._carla.VehicleWheelLocation
+        left_deg, right_deg = (self._car.get_wheel_steer_angle(place) for place in (wheel.FL_Wheel, wheel.FR_Wheel))
+        pose, velocity = _pose(self._car.get_transform()), self._car.get_velocity()
+        return Snapshot(
+            self._frame,
+            rear_axle_pose(pose, self._axles.rear_axle_m, self.settings.map_shift_m),
+            forward_speed_mps((velocity.x, velocity.y), pose.yaw_deg),
+            road_wheel_rad(left_deg, right_deg),
+            self._car.get_control().gear,
+        )
+
+    def _note_collision(self, event: Any) -> None:
+        self._events.append(CarlaEvent(event.frame, "collision", f"with {event.other_actor.type_id}"))
+
+    def _note_lane_invasion(self, event: Any) -> None:
+        marks = ", ".join(str(mark.type) for mark in event.crossed_lane_markings)
+        self._events.append(CarlaEvent(event.frame, "lane_invasion", f"over {marks}"))
+
+
+def _transform(carla: Any, pose: CarlaPose) -> Any:
+    return carla.Transform(
+        carla.Location(pose.x_m, pose.y_m, pose.z_m), carla.Rotation(pose.pitch_deg, pose.yaw_deg, pose.roll_deg)
+    )
+
+
+def _pose(transform: Any) -> CarlaPose:
+    location, rotation = transform.location, transform.rotation
+    return CarlaPose(location.x, location.y, location.z, rotation.pitch, rotation.yaw, rotation.roll)

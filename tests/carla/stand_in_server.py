@@ -1,0 +1,217 @@
+"""A stand-in for a CARLA server, for tests: msgpack-rpc on a TCP port, sensor data on the next one.
+
+    python -m tests.carla.stand_in_server --port 2000 --road a_key
+
+prints a line with its port when it accepts connections, and then answers commands on standard input, at whose end it
+ends. Only the genuine wheel `carla` 0.9.16 is used to talk to it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import socket
+import struct
+import sys
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import msgpack
+from tests.carla import carla_wire as wire
+from tests.carla.stand_in_world import ASYNCHRONOUS_DT_S, Refused, StandInWorld
+
+from lavt.domain import CameraModel
+from lavt.vehicle.sim.road.road import load_road
+
+MAP_FILE = "OpenDrive"
+
+
+class Streams:
+    """The subscribers of each stream."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._subscribers: dict[int, list[socket.socket]] = {}
+
+    def subscribe(self, connection: socket.socket) -> None:
+        """Read the number of the stream that a client wants, and add the client."""
+        number = connection.recv(4, socket.MSG_WAITALL)
+        if len(number) == 4:
+            with self._lock:
+                self._subscribers.setdefault(struct.unpack("<I", number)[0], []).append(connection)
+
+    def publish(self, stream: int, data: bytes) -> None:
+        """Send data to all subscribers; forget those that are gone."""
+        with self._lock:
+            subscribers = list(self._subscribers.get(stream, []))
+        for subscriber in subscribers:
+            try:
+                subscriber.sendall(struct.pack("<I", len(data)) + data)
+            except OSError:
+                with self._lock:
+                    self._subscribers[stream].remove(subscriber)
+
+
+class StandInServer:
+    """The methods of the protocol by name, on a world."""
+
+    def __init__(self, world: StandInWorld, version: str) -> None:
+        self._world, self._version = world, version
+        self._lock = threading.Lock()
+        self._tick_times_ns: list[int] = []
+        """When each tick of a client began."""
+        self._methods: dict[str, Callable[..., Any]] = {
+            "version": lambda: wire.value(self._version),
+            "get_episode_info": lambda: wire.value([world.episode, [world.sensor_token(wire.WORLD_STREAM)]]),
+            "get_sensor_token": lambda stream: wire.value([world.sensor_token(stream)]),
+            "get_episode_settings": lambda: wire.value(world.settings),
+            "set_episode_settings": self._set_settings,
+            "get_required_files": lambda *_: wire.value([]),
+            "query_lights_state": lambda *_: wire.value([]),
+            "get_available_maps": lambda: wire.value([f"/Game/Carla/Maps/{world.town}"]),
+            "get_map_info": lambda: wire.value([f"Carla/Maps/{world.town}", [world.start.packed()]]),
+            "get_map_data": lambda: wire.value(world.map_text),
+            "request_file": lambda *_: wire.value(world.map_text.encode()),
+            "get_actor_definitions": lambda: wire.value(wire.DEFINITIONS),
+            "spawn_actor": lambda description, pose: wire.value(world.spawn(description, wire.pose_of(pose))),
+            "spawn_actor_with_parent": lambda description, pose, parent, *_: wire.value(
+                world.spawn(description, wire.pose_of(pose), parent)
+            ),
+            "get_actors_by_id": lambda numbers: wire.value(world.packed_actors(numbers)),
+            "get_actor_bounding_box": lambda _: wire.value(wire.BOX),
+            "destroy_actor": lambda number: wire.value(world.destroy(number)),
+            "get_physics_control": lambda number: wire.value(world.physics_control(number)),
+            "get_wheel_steer_angle": lambda number, _: wire.value(world.wheel_deg(number)),
+            "apply_control_to_vehicle": self._control,
+            "set_actor_target_velocity": lambda *_: wire.done(),
+            "set_actor_transform": self._place,
+            "get_weather_parameters": lambda: wire.value(wire.WEATHER),
+            "tick_cue": self._tick_cue,
+            "load_new_episode": lambda *_: wire.value(world.reload()),
+            "set_weather_parameters": lambda *_: wire.done(),
+            "enable_sensor_for_ros": lambda *_: wire.done(),
+            "disable_sensor_for_ros": lambda *_: wire.done(),
+            "is_sensor_enabled_for_ros": lambda *_: wire.value(False),
+        }
+
+    def serve(self, connection: socket.socket) -> None:
+        """Answer the requests of a client until it goes."""
+        unpacker = msgpack.Unpacker(raw=False, strict_map_key=False)
+        while data := _received(connection):
+            unpacker.feed(data)
+            for _, number, method, arguments in unpacker:
+                answer = msgpack.packb([1, number, None, self._answer(method, arguments[1:])])
+                try:
+                    connection.sendall(answer)
+                except OSError:
+                    return
+
+    def run_asynchronously(self) -> None:
+        """Tick in real time as long as the world is not synchronous."""
+        last_s = time.monotonic()
+        while True:
+            time.sleep(ASYNCHRONOUS_DT_S)
+            now_s = time.monotonic()
+            with self._lock:
+                if not self._world.is_synchronous:
+                    self._world.tick(now_s, now_s - last_s)
+            last_s = now_s
+
+    def report(self, command: list[str]) -> str:
+        """Return the answer to a test's command on standard input."""
+        world = self._world
+        with self._lock:
+            match command:
+                case ["actors"]:
+                    return " ".join(actor.kind for actor in world.actors.values())
+                case ["settings"]:
+                    return f"{world.settings[0]} {world.settings[2]}"
+                case ["park", x_m, y_m]:
+                    pose = wire.WirePose((float(x_m), -float(y_m), 0.0))
+                    world.spawn([0, wire.VEHICLE, [["role_name", wire.STRING, "parked"]]], pose)
+                    return "parked"
+                case ["tick_times"]:
+                    return " ".join(map(str, self._tick_times_ns))
+                case ["frame"]:
+                    return str(world.frame)
+                case ["speed"]:
+                    return " ".join(f"{math.hypot(*actor.velocity):.3f}" for actor in world.actors.values())
+                case _:
+                    return "unknown"
+
+    def _answer(self, method: str, arguments: list[Any]) -> Any:
+        if method not in self._methods:
+            print(f"stand-in: no method {method} {arguments!r}", file=sys.stderr, flush=True)
+            return wire.failure(f"the stand-in has no method {method}")
+        with self._lock:
+            try:
+                return self._methods[method](*arguments)
+            except Refused as refusal:
+                return wire.failure(str(refusal))
+
+    def _set_settings(self, settings: list[Any]) -> Any:
+        self._world.settings = settings
+        return wire.value(self._world.frame)
+
+    def _control(self, number: int, fields: list[Any]) -> Any:
+        self._world.control(number, fields)
+        return wire.done()
+
+    def _place(self, number: int, pose: Any) -> Any:
+        self._world.place(number, wire.pose_of(pose))
+        return wire.done()
+
+    def _tick_cue(self) -> Any:
+        self._tick_times_ns.append(time.monotonic_ns())
+        return wire.value(self._world.tick(time.monotonic()))
+
+
+def _received(connection: socket.socket) -> bytes:
+    try:
+        return connection.recv(1 << 16)
+    except OSError:
+        return b""
+
+
+def _accept(listener: socket.socket, serve: Callable[[socket.socket], None]) -> None:
+    while True:
+        connection, _ = listener.accept()
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        threading.Thread(target=serve, args=(connection,), daemon=True).start()
+
+
+def main() -> None:
+    """Serve until standard input ends."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--port", type=int, required=True)
+    parser.add_argument("--road", default="a_key")
+    parser.add_argument("--town", default="StandIn")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--scenery", default="full")
+    parser.add_argument("--version", default=wire.VERSION)
+    parser.add_argument("--camera", type=int, nargs=2, help="prepare the default camera in this size")
+    parser.add_argument("--late-pictures", type=int, default=0)
+    given = parser.parse_args()
+    streams = Streams()
+    world = StandInWorld(
+        load_road(given.road), given.town, given.port, streams.publish, seed=given.seed, scenery=given.scenery
+    )
+    if given.camera:
+        world.prepare_camera(CameraModel(*given.camera))
+    world.late_pictures = given.late_pictures
+    server = StandInServer(world, given.version)
+    for port, serve in ((given.port, server.serve), (given.port + 1, streams.subscribe)):
+        listener = socket.create_server(("127.0.0.1", port))
+        threading.Thread(target=_accept, args=(listener, serve), daemon=True).start()
+    threading.Thread(target=server.run_asynchronously, daemon=True).start()
+    print(f"ready {given.port}", flush=True)
+    for line in sys.stdin:
+        print(server.report(line.split()), flush=True)
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main()

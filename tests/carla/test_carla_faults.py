@@ -1,0 +1,223 @@
+"""Faults of a CARLA server: each gives a sentence, and no car drives on."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from importlib.metadata import PackageNotFoundError
+from pathlib import Path
+
+import pytest
+from tests.carla.contract_vehicle import blind_settings, server_config
+from tests.carla.stand_in import REPOSITORY, StandIn, free_tcp_pair, need_carla, stand_in
+
+from lavt.assembly.vehicles import carla_settings
+from lavt.domain import Actuation
+from lavt.errors import UserError, VehicleError
+from lavt.vehicle.carla import library, session
+from lavt.vehicle.carla.session import BRAKED, CarlaSession
+from lavt.vehicle.sim.road.road import load_road
+
+FULL_THROTTLE = Actuation(0.0, 1.0, 0.0)
+CAR_AND_SENSORS = "vehicle.lincoln.mkz_2020 sensor.other.collision sensor.other.lane_invasion"
+TIMEOUT_S = 1.0
+KILLED_CLIENT = """
+import os, sys
+from tests.carla.contract_vehicle import blind_settings
+from lavt.domain import Actuation
+from lavt.vehicle.carla.session import CarlaSession
+session = CarlaSession(blind_settings(int(sys.argv[1]))[0])
+for _ in range(30):
+    session.tick(Actuation(0.0, 1.0, 0.0))
+os.kill(os.getpid(), 9)
+"""
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[StandIn]:
+    """Start a stand-in server that the faults of clients share."""
+    with stand_in() as started:
+        yield started
+
+
+@contextmanager
+def driving(port: int) -> Iterator[CarlaSession]:
+    """Open a session, and drive for a second."""
+    with closing(CarlaSession(blind_settings(port, tick_timeout_s=TIMEOUT_S, timeout_s=20.0)[0])) as opened:
+        for _ in range(30):
+            opened.tick(FULL_THROTTLE)
+        yield opened
+
+
+def run_lavt(port: int, tmp_path: Path, *changes: str) -> tuple[int, str]:
+    """Run a drive in a process of its own, and return its exit code and its messages."""
+    settings = ["vehicle.kind=carla", f"vehicle.carla.port={port}", f"vehicle.carla.timeout_s={TIMEOUT_S}", *changes]
+    command = [sys.executable, "-m", "lavt", "run", str(REPOSITORY / "configs" / "demo.yaml"), "--out", "out"]
+    done = subprocess.run(
+        [*command, *(word for setting in settings for word in ("--set", setting))],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": str(REPOSITORY / "src")},
+    )
+    return done.returncode, done.stderr
+
+
+def test_without_the_wheel_one_sentence_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the wheel, or with another version of it, the vehicle is refused before anything is imported."""
+
+    def no_version(name: str) -> str:
+        raise PackageNotFoundError(name)
+
+    monkeypatch.setattr(library, "version", no_version)
+    with pytest.raises(UserError, match=r"pip install 'lavt\[carla\]'"):
+        library.load_library()
+    monkeypatch.setattr(library, "version", lambda _: "0.9.15")
+    with pytest.raises(UserError, match=r"is 0\.9\.15"):
+        library.load_library()
+
+
+def test_a_server_of_another_version_is_refused(tmp_path: Path) -> None:
+    """A server of another version, which would abort the process, ends it with exit code 2 and one sentence."""
+    with stand_in("--version", "0.9.15") as other:
+        code, message = run_lavt(other.port, tmp_path, f"vehicle.carla.timeout_s={20 * TIMEOUT_S}")
+    assert code == 2, message
+    sentence = message.splitlines()[-1]
+    assert sentence.startswith(f"lavt: the CARLA server at 127.0.0.1:{other.port} ")
+    assert "Traceback" not in message
+    assert "has version '0.9.15', but LAVT supports 0.9.16 only" in message
+
+
+def test_an_absent_server_is_named() -> None:
+    """Without a server, a sentence names the address."""
+    need_carla()
+    port = free_tcp_pair()
+    with pytest.raises(UserError, match=rf"no CARLA server answers at 127\.0\.0\.1:{port} within 1 s"):
+        CarlaSession(blind_settings(port, timeout_s=TIMEOUT_S)[0])
+
+
+def test_a_camera_of_another_source_is_refused() -> None:
+    """A car in CARLA has CARLA's camera only."""
+    from lavt.assembly.vehicles import build_carla
+    from lavt.config import ServerCameraConfig
+
+    config = server_config(2000).model_copy(update={"camera": ServerCameraConfig()})
+    with pytest.raises(UserError, match=r"set camera\.source carla"):
+        build_carla(config)
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"town": "Town99"}, "has no town 'Town99'"),
+        ({"weather": "Hail"}, "CARLA has no weather 'Hail'"),
+        ({"blueprint": "vehicle.flying.saucer"}, "has no 'vehicle.flying.saucer'"),
+        ({"start": (1e5, 0.0, 0.0)}, "is on no lane of StandIn"),
+    ],
+)
+def test_wrong_settings_are_named(changes: dict[str, object], reason: str, server: StandIn) -> None:
+    """An unknown town, weather or car, or a start beside the road, is refused, and the server is left as it was."""
+    settings, _ = blind_settings(server.port, **changes)
+    with pytest.raises(UserError, match=reason):
+        CarlaSession(settings)
+    assert server.ask("actors") == ""
+    assert server.ask("settings") == "False [False]"
+
+
+def test_an_occupied_start_is_named() -> None:
+    """A car that is parked at the start is not removed; the run is refused and leaves the server as it was."""
+    with stand_in() as server:
+        settings, _ = blind_settings(server.port)
+        assert settings.start is not None
+        assert server.ask("park", settings.start.x_m, settings.start.y_m) == "parked"
+        with pytest.raises(UserError, match="the start is occupied"):
+            CarlaSession(settings)
+        assert server.ask("actors") == "vehicle.lincoln.mkz_2020"
+        assert server.ask("settings") == "False [False]"
+
+
+def test_the_leftovers_of_a_killed_run_are_removed(server: StandIn) -> None:
+    """A killed run leaves a frozen world; the next run removes its actors, and in the end the world runs again."""
+    killed = subprocess.run(
+        [sys.executable, "-c", KILLED_CLIENT, str(server.port)],
+        cwd=REPOSITORY,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(REPOSITORY / "src"), str(REPOSITORY)])},
+        check=False,
+        stdout=subprocess.DEVNULL,
+    )
+    assert killed.returncode == -9
+    assert server.ask("actors") == CAR_AND_SENSORS
+    assert server.ask("settings").startswith("True")
+    frame = server.ask("frame")
+    with closing(CarlaSession(blind_settings(server.port)[0])) as opened:
+        assert int(frame) < opened.snapshot.frame
+        assert server.ask("actors") == CAR_AND_SENSORS
+        assert server.ask("speed").split()[0] == "0.000"
+    assert server.ask("actors") == ""
+    assert server.ask("settings") == "False [False]"
+
+
+def test_a_second_ticking_client_is_refused(server: StandIn) -> None:
+    """While one run ticks the world, another one is refused, and the first one goes on."""
+    with driving(server.port) as first:
+        ended = threading.Event()
+
+        def tick() -> None:
+            while not ended.wait(0.02):
+                first.tick(BRAKED)
+
+        ticking = threading.Thread(target=tick)
+        ticking.start()
+        try:
+            with pytest.raises(UserError, match="another client ticks"):
+                CarlaSession(blind_settings(server.port)[0])
+        finally:
+            ended.set()
+            ticking.join()
+        assert server.ask("actors") == CAR_AND_SENSORS
+
+
+def test_a_frozen_server_ends_the_run_and_its_car_stands_still() -> None:
+    """A frozen server gives a sentence after the tick's time-out; when it goes on, its world moves by one tick only."""
+    with stand_in() as server, driving(server.port) as opened:
+        frame = int(server.ask("frame"))
+        server.freeze()
+        with pytest.raises(VehicleError, match="did not complete a tick"):
+            opened.tick(FULL_THROTTLE)
+        opened.close()
+        server.resume()
+        assert int(server.ask("frame")) <= frame + 1
+        assert server.ask("settings").startswith("True")
+        with closing(CarlaSession(blind_settings(server.port)[0])):
+            assert server.ask("actors") == CAR_AND_SENSORS
+
+
+def test_a_killed_server_ends_the_run() -> None:
+    """A killed server gives a sentence, closing the session does not wait for it, and it is absent for the next run."""
+    with stand_in() as server, driving(server.port) as opened:
+        server.kill()
+        with pytest.raises(VehicleError, match="did not complete a tick"):
+            opened.tick(FULL_THROTTLE)
+        opened.close()
+        with pytest.raises(UserError, match="no CARLA server answers"):
+            CarlaSession(blind_settings(server.port, timeout_s=TIMEOUT_S)[0])
+
+
+def test_a_late_first_picture_is_awaited(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A camera whose first pictures fail is ticked until one comes; without any, a sentence says what to check."""
+    monkeypatch.setattr(session, "MAX_TICKS_TO_PICTURE", 6)
+    for late, is_enough in ((3, True), (100, False)):
+        with stand_in("--scenery", "none", "--camera", "640", "480", "--late-pictures", str(late)) as server:
+            settings = carla_settings(server_config(server.port), load_road("a_key"))
+            if is_enough:
+                with closing(CarlaSession(settings)) as opened:
+                    assert opened.pictures.counts["pictures_read"] >= 1
+                continue
+            with pytest.raises(VehicleError, match="sent no picture in 6 ticks"):
+                CarlaSession(settings)
+            assert server.ask("actors") == ""
