@@ -12,6 +12,8 @@ from tests.carla.stand_in import StandIn, stand_in
 
 from lavt.cli.main import main
 
+pytestmark = pytest.mark.full
+
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[StandIn]:

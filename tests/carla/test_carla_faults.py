@@ -30,6 +30,8 @@ import os, sys
 from tests.carla.contract_vehicle import blind_settings
 from lavt.domain import Actuation
 from lavt.vehicle.carla.session import CarlaSession
+
+pytestmark = pytest.mark.full
 session = CarlaSession(blind_settings(int(sys.argv[1]))[0])
 for _ in range(30):
     session.tick(Actuation(0.0, 1.0, 0.0))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import pytest
 from hypothesis import given, settings
@@ -28,15 +28,25 @@ def by_wire(profile: str) -> Vehicle:
     return build_inside(ServerConfig(vehicle=VehicleConfig(kind="dbw", dbw=dbw)), ROAD, Now(MONO_NS, 0))
 
 
+CARLA = "carla, in a stand-in server"
 DRIVABLE: dict[str, Callable[[], Vehicle]] = {
     "simulator": lambda: Simulator(road=ROAD, seed=1, start_mono_ns=MONO_NS),
-    "carla, in a stand-in server": lambda: contract_vehicle(MONO_NS),
+    CARLA: lambda: contract_vehicle(MONO_NS),
     "dataspeed_gen1": lambda: by_wire("dataspeed_gen1"),
     "dataspeed_gen2": lambda: by_wire("dataspeed_gen2"),
 }
 VEHICLES: dict[str, Callable[[], Vehicle]] = {**DRIVABLE, "fake of the node tests": FakeVehicle}
-each_vehicle = pytest.mark.parametrize("name", sorted(VEHICLES))
-each_drivable = pytest.mark.parametrize("name", sorted(DRIVABLE))
+SLOW = {CARLA}
+"""Vehicles whose tests start a server."""
+
+
+def each_of(vehicles: Iterable[str]) -> pytest.MarkDecorator:
+    """Parametrize a test by vehicles; the tests of slow ones are in the full lane."""
+    marks = {name: [pytest.mark.full] if name in SLOW else [] for name in sorted(vehicles)}
+    return pytest.mark.parametrize("name", [pytest.param(name, marks=of_name) for name, of_name in marks.items()])
+
+
+each_vehicle, each_drivable = each_of(VEHICLES), each_of(DRIVABLE)
 
 
 def run(vehicle: Vehicle, start_ns: int, actuation: Actuation, *, should_engage: bool, seconds: float) -> int:
