@@ -22,6 +22,8 @@ from lavt.vehicle.carla import library, session
 from lavt.vehicle.carla.session import BRAKED, CarlaSession
 from lavt.vehicle.sim.road.road import load_road
 
+pytestmark = pytest.mark.full
+
 FULL_THROTTLE = Actuation(0.0, 1.0, 0.0)
 CAR_AND_SENSORS = "vehicle.lincoln.mkz_2020 sensor.other.collision sensor.other.lane_invasion"
 TIMEOUT_S = 1.0
@@ -30,8 +32,6 @@ import os, sys
 from tests.carla.contract_vehicle import blind_settings
 from lavt.domain import Actuation
 from lavt.vehicle.carla.session import CarlaSession
-
-pytestmark = pytest.mark.full
 session = CarlaSession(blind_settings(int(sys.argv[1]))[0])
 for _ in range(30):
     session.tick(Actuation(0.0, 1.0, 0.0))

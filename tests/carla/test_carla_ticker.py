@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from lavt.domain import NS_PER_MS, Actuation
 from lavt.vehicle.carla.frames import FlatPose
 from lavt.vehicle.carla.settings import CarlaEvent, Snapshot
-from lavt.vehicle.carla.ticker import CommandHistory, Ticker
+from lavt.vehicle.carla.ticker import FULL_BRAKE, CommandHistory, Ticker
 
 START_NS = 1_000 * NS_PER_MS
 PERIOD_S = 0.1
@@ -62,6 +62,24 @@ def test_a_command_is_in_force_for_its_part_of_a_tick() -> None:
     assert (second.steering_rad, second.throttle, second.brake) == pytest.approx((0.3, 0.75, 0.25))
     assert third == Actuation(0.4, 1.0, 0.0)
     assert [hand_brake for _, hand_brake in world.actuations] == [True, False, False]
+
+
+def test_the_thread_brakes_when_the_actuator_is_silent(monkeypatch: pytest.MonkeyPatch) -> None:
+    """If the actuator has not looked for ticks for more than 200 ms, the car brakes until the next command."""
+    world = RecordedWorld()
+    ticker = build(world)
+    monkeypatch.setattr(ticker, "_is_threaded", True)
+    ticker.tick_until(START_NS)
+    ticker.command(Actuation(0.4, 1.0, 0.0), START_NS, hand_brake=False)
+    for after_ms, silences in ((0, 0), (200, 0), (201, 1), (900, 1)):
+        ticker.brake_if_silent(START_NS + after_ms * NS_PER_MS)
+        assert ticker.counts["silences"] == silences
+    monkeypatch.setattr(ticker, "_is_threaded", False)
+    ticker.tick_until(START_NS + 400 * NS_PER_MS)
+    assert world.actuations[-1] == (FULL_BRAKE, False)
+    ticker.command(Actuation(0.1, 0.5, 0.0), START_NS + 400 * NS_PER_MS, hand_brake=False)
+    ticker.tick_until(START_NS + 500 * NS_PER_MS)
+    assert world.actuations[-1] == (Actuation(0.1, 0.5, 0.0), False)
 
 
 @given(COMMANDS)

@@ -6,7 +6,8 @@ actuations in force during that time, each weighted by how long it was in force:
 nor late by a part of a tick.
 
 In virtual time, ticks are made inside `Ticker.tick_until`. In real time, a thread makes them, because a tick of a real
-server takes tens of milliseconds while the actuator must go on admitting commands.
+server takes tens of milliseconds while the actuator must go on admitting commands. If the actuator hangs, this thread
+brakes the car.
 """
 
 from __future__ import annotations
@@ -24,6 +25,9 @@ from lavt.vehicle.carla.settings import CarlaEvent, Snapshot
 
 REMEMBERED_TICKS: Final = 64
 LATE_NS: Final = 2 * NS_PER_MS
+SILENCE_NS: Final = 200 * NS_PER_MS
+"""If the actuator has not looked for ticks for this long, the thread brakes the car; it looks every 5 ms."""
+FULL_BRAKE: Final = Actuation(0.0, 0.0, 1.0)
 
 
 class World(Protocol):
@@ -89,8 +93,10 @@ class Ticker:
         self._hand_brake = True
         self._ticked: deque[Ticked] = deque(maxlen=REMEMBERED_TICKS)
         self._events: list[tuple[int, CarlaEvent]] = []
-        self._counts = Counter({"ticks": 0, "ticks_begun_late": 0, "ticks_skipped": 0})
+        self._counts = Counter({"ticks": 0, "ticks_begun_late": 0, "ticks_skipped": 0, "silences": 0})
         self._is_threaded = False
+        self._heard_ns: int | None = None
+        """When the actuator last looked for ticks of the thread; None: it has not yet."""
         self._stopped = threading.Event()
         self._failed: BaseException | None = None
         self._thread: threading.Thread | None = None
@@ -98,7 +104,10 @@ class Ticker:
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """The number of ticks, of those that began more than `LATE_NS` late, and of those that were skipped."""
+        """Return the numbers of ticks, of late and skipped ones, and of silences of the actuator that made it brake.
+
+        A tick is late if it began more than `LATE_NS` after its due time.
+        """
         return dict(self._counts)
 
     @property
@@ -124,11 +133,20 @@ class Ticker:
     def tick_until(self, to_ns: int) -> None:
         """Make all ticks that are due by `to_ns`; do nothing if a thread makes them. Raises `VehicleError`."""
         if self._is_threaded:
+            self._heard_ns = to_ns
             if self._failed is not None:
                 raise self._failed
             return
         while self.next_due_ns <= to_ns:
             self._tick(self.next_due_ns)
+
+    def brake_if_silent(self, now_ns: int) -> None:
+        """Brake fully if the actuator has not looked for ticks for `SILENCE_NS`, until its next command."""
+        heard_ns = self._heard_ns
+        if heard_ns is not None and now_ns - heard_ns > SILENCE_NS:
+            self._heard_ns = None  # until the actuator is heard again
+            self._counts["silences"] += 1
+            self.command(FULL_BRAKE, now_ns, hand_brake=False)
 
     def ticked_at(self, at_ns: int) -> Ticked | None:
         """Return the newest tick that was due by `at_ns`; None if it is forgotten or there was none."""
@@ -175,6 +193,7 @@ class Ticker:
                     self._skip(late_ns)
                     continue
                 self._counts["ticks_begun_late"] += late_ns > LATE_NS
+                self.brake_if_silent(clock.now().mono_ns)
                 self._tick(self.next_due_ns)
         except BaseException as error:  # the actuator node raises it and so ends the run
             self._failed = error
