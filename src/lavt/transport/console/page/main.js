@@ -59,7 +59,8 @@ function connect() {
   if (!("VideoDecoder" in globalThis)) return showClosed("this browser cannot decode video (WebCodecs): use another");
   const takeProbe = (answer) => offset.note(answer);
   const takeLane = (lane) => video.lanes?.take(lane);
-  connection = new Connection(token, { takeStatus, takeLane, takeUnit, takeProbe, close });
+  const takePrediction = (prediction) => video.predictions.take(prediction);
+  connection = new Connection(token, { takeStatus, takeLane, takePrediction, takeUnit, takeProbe, close });
 }
 
 function close(text) {
