@@ -51,9 +51,10 @@ def drawn(tab: Tab) -> int:
     return int(tab.evaluate("lavtConsole.video.predictionsDrawn"))
 
 
-def are_large(shapes: dict[str, list[int]]) -> bool:
-    """Return whether both shapes are on the canvas."""
-    return all(pixels > 30 for pixels, _ in shapes.values())
+def are_on_the_road(shapes: dict[str, list[int]]) -> bool:
+    """Return whether both shapes are on the canvas, below the horizon, and the stopping line is beyond the path."""
+    (path, path_row), (stop, stop_row) = shapes["path"], shapes["stop"]
+    return path > 30 and stop > 30 and 120 < stop_row < path_row
 
 
 def test_the_prediction_is_drawn_while_the_car_drives(start: Callable[..., PersonDrive]) -> None:
@@ -65,9 +66,7 @@ def test_the_prediction_is_drawn_while_the_car_drives(start: Callable[..., Perso
     before = drawn(tab)
     wait_until("predictions are drawn", lambda: drawn(tab) > before + 30)
     assert tab.evaluate("lavtConsole.video.errors") == 0  # also counts predictions over other pictures
-    found = []
-    wait_until("the shapes are on the canvas", lambda: found.append(tab.evaluate(SHAPES)) or are_large(found[-1]))
-    assert 120 < found[-1]["stop"][1] < found[-1]["path"][1]  # below the horizon; the line is beyond the path
+    wait_until("both shapes are on the road", lambda: are_on_the_road(tab.evaluate(SHAPES)))
     tab.key("Space", down=False)
     wait_until("the car stops", lambda: field(tab, "safety") == "safe_stop")
     wait_until("the shapes are gone", lambda: tab.evaluate(SHAPES)["stop"][0] == 0)

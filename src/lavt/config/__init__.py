@@ -12,6 +12,7 @@ from lavt.config.camera import ClientCameraConfig as ClientCameraConfig
 from lavt.config.camera import ServerCameraConfig as ServerCameraConfig
 from lavt.config.controller import HUMAN as HUMAN
 from lavt.config.controller import ControllerConfig as ControllerConfig
+from lavt.config.controller import PredictionConfig as PredictionConfig
 from lavt.config.controller import TwoPointConfig as TwoPointConfig
 from lavt.config.costs import Costs as Costs
 from lavt.config.dbw import DbwConfig as DbwConfig
