@@ -334,3 +334,4 @@ def test_the_predictive_display_is_a_setting_of_a_person_s_drive() -> None:
         LINCOLN_MKZ.rear_axle_to_rear_m,
         LINCOLN_MKZ.body_width_m,
     )
+    assert shown.steering_lag_s == LINCOLN_MKZ.steering_lag_s

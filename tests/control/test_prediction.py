@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -20,7 +21,7 @@ from lavt.control.prediction import (
 )
 from lavt.domain import MAX_REPORTED_MPS, NS_PER_MS, NS_PER_S
 
-CAR = CarModel(wheelbase_m=2.8, steering_rate_radps=0.8, stop_deceleration_mps2=4.0)
+CAR = CarModel(wheelbase_m=2.8, steering_rate_radps=0.8, steering_lag_s=0.0, stop_deceleration_mps2=4.0)
 PICTURE_NS = 1_790_000_000 * NS_PER_S
 SPEEDS = st.floats(0.0, 20.0)
 ANGLES = st.floats(-0.5, 0.5)
@@ -120,6 +121,15 @@ def test_the_wheels_follow_the_commands_at_a_limited_rate() -> None:
     assert late is not None
     assert late.ghost.heading_rad == 0.0
     assert late.standstill.heading_rad > 0.1  # a command that is on its way counts for the stop
+
+
+def test_the_wheels_follow_with_their_lag() -> None:
+    """A small step is followed exponentially, so that after many time constants the turn is later by the lag."""
+    commands = [SteeringCommand(PICTURE_NS, 0.02)]
+    lagging = replace(CAR, steering_lag_s=0.1)
+    prediction = predict(lagging, motions(8.0, 0.0, 0), commands, PICTURE_NS, PICTURE_NS + NS_PER_S)
+    assert prediction is not None
+    assert prediction.ghost.heading_rad == pytest.approx(8.0 / CAR.wheelbase_m * 0.02 * (1.0 - 0.1), rel=1e-3)
 
 
 def test_reports_are_believed_before_commands() -> None:

@@ -21,7 +21,7 @@ from lavt.perception.calibration import CalibratedCamera, calibrated_pinhole_cam
 from lavt.transport.messages import encode
 from lavt.transport.video.stamp import rtp_timestamp
 
-MODEL = CarModel(wheelbase_m=2.8, steering_rate_radps=0.8, stop_deceleration_mps2=4.0)
+MODEL = CarModel(wheelbase_m=2.8, steering_rate_radps=0.8, steering_lag_s=0.12, stop_deceleration_mps2=4.0)
 OUTLINE = Outline(front_m=4.0, rear_m=1.0, width_m=2.0)
 CAMERA = calibrated_pinhole_camera(CameraModel(width_px=640, height_px=480))
 VIDEO_NS, CONTROL_NS = 200 * NS_PER_MS, 50 * NS_PER_MS
@@ -115,6 +115,27 @@ def test_commands_on_their_way_count() -> None:
     assert straight is not None
     assert turned is not None
     assert turned["stop"][0][0] < straight["stop"][0][0] - 5
+
+
+def turned_after(acting_ns: int) -> float:
+    """Return the heading after a step of 0.05 rad at 8 m/s has acted for this time, with the lag of the wheels."""
+    lag_s, acting_s = MODEL.steering_lag_s, acting_ns / NS_PER_S
+    return 8.0 / MODEL.wheelbase_m * 0.05 * (acting_s - lag_s * (1 - math.exp(-acting_s / lag_s)))
+
+
+@pytest.mark.parametrize("acting_ns", [0, 40 * NS_PER_MS, 100 * NS_PER_MS, 200 * NS_PER_MS])
+def test_a_command_turns_the_ghost_as_long_as_it_acts(acting_ns: int) -> None:
+    """A command that is sent now does not turn the ghost; later, it has acted since then, to half a states' period."""
+    predictor, control_ns, now_ns = PagePredictor(MODEL, OUTLINE, CAMERA), 250 * NS_PER_MS, 100 * STEP_NS
+    sent = [(number, number * STEP_NS) for number in range(101)]
+    for number, at_ns in sent:
+        predictor.note_command(number, 0.05 if at_ns >= now_ns - acting_ns else 0.0, at_ns)
+        applied = max((n for n, t in sent[: number + 1] if t + control_ns <= at_ns), default=-1)
+        predictor.note_state(state(at_ns, applied), at_ns)
+    prediction = predictor.predict_since(WALL_NS + now_ns - VIDEO_NS, now_ns)
+    assert prediction is not None
+    least, most = (turned_after(max(0, acting_ns + error_ns)) for error_ns in (-STEP_NS // 2, STEP_NS // 2))
+    assert 0.99 * least <= prediction.ghost.heading_rad <= 1.01 * most
 
 
 @pytest.mark.parametrize(

@@ -307,6 +307,11 @@ def build_predictor(config: ClientConfig) -> PagePredictor | None:
     settings = config.controller.prediction
     if not settings.shown:
         return None
-    model = CarModel(config.controller.wheelbase_m, LIMITS.steering_rate_radps, LIMITS.stop_deceleration_mps2)
+    model = CarModel(
+        wheelbase_m=config.controller.wheelbase_m,
+        steering_rate_radps=LIMITS.steering_rate_radps,
+        steering_lag_s=settings.steering_lag_s,
+        stop_deceleration_mps2=LIMITS.stop_deceleration_mps2,
+    )
     outline = Outline(settings.front_m, settings.rear_m, settings.width_m)
     return PagePredictor(model, outline, client_camera(config.camera))

@@ -58,7 +58,7 @@ class TwoPointConfig(Section):
 
 
 class PredictionConfig(Section):
-    """The predictive display, for `controller.kind` human (`docs/drive.md`), and the outline of the driven vehicle."""
+    """The predictive display, for `controller.kind` human (`docs/drive.md`), and what it knows of the vehicle."""
 
     shown: bool = False
     """Whether the page draws the predicted path, the car at its end, and the stopping line."""
@@ -68,6 +68,8 @@ class PredictionConfig(Section):
     """Distance from the rear axle to the rear of the vehicle; by default the built-in car's."""
     width_m: float = Field(1.86, gt=0, lt=5)
     """Width of the vehicle; by default the built-in car's."""
+    steering_lag_s: float = Field(0.12, ge=0, le=2)
+    """Time constant with which the wheels follow a command; by default the built-in car's."""
 
 
 class ControllerConfig(Section):

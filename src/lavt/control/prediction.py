@@ -2,7 +2,8 @@
 
 The model is the kinematic single-track model at the rear axle, without slip (R. Rajamani, *Vehicle Dynamics and
 Control*, 2nd ed., 2012, section 2.2): curvature tan(steering) / wheelbase. The speed stays as last reported, because a
-client does not know how strongly the vehicle's pedals act. The wheels turn to the commanded angle at a limited rate.
+client does not know how strongly the vehicle's pedals act. The wheels follow the commanded angle with a first-order lag
+and at a limited rate.
 
 All times are on the vehicle's clock. Nothing here reads a clock, and nothing here changes a command.
 """
@@ -31,6 +32,8 @@ class CarModel:
     wheelbase_m: float
     steering_rate_radps: float
     """The largest rate of the road wheels' angle."""
+    steering_lag_s: float
+    """The time constant with which the wheels follow; 0: at the largest rate."""
     stop_deceleration_mps2: float
     """The deceleration with which the car stops at the stopping line."""
 
@@ -109,7 +112,7 @@ def predict(
             target_rad, following = commands[following].steering_rad, following + 1
         until_ns = min(at_ns + STEP_NS, effect_ns, picture_ns if at_ns < picture_ns else effect_ns)
         duration_s = (until_ns - at_ns) / NS_PER_S
-        next_rad = _turn_wheels(steering_rad, target_rad, model.steering_rate_radps * duration_s)
+        next_rad = _turn_wheels(model, steering_rad, target_rad, duration_s)
         if at_ns >= picture_ns:
             mean_rad = (steering_rad + next_rad) / 2
             path.append(_move(path[-1], newest.speed_mps * duration_s, mean_rad, model.wheelbase_m))
@@ -151,8 +154,10 @@ def _motion_at(motions: Sequence[Motion], at_ns: int) -> Motion:
     )
 
 
-def _turn_wheels(steering_rad: float, target_rad: float, most_rad: float) -> float:
-    return steering_rad + min(max(target_rad - steering_rad, -most_rad), most_rad)
+def _turn_wheels(model: CarModel, steering_rad: float, target_rad: float, duration_s: float) -> float:
+    share = 1.0 - math.exp(-duration_s / model.steering_lag_s) if model.steering_lag_s > 0 else 1.0
+    most_rad = model.steering_rate_radps * duration_s
+    return steering_rad + min(max(share * (target_rad - steering_rad), -most_rad), most_rad)
 
 
 def _stop(
@@ -164,7 +169,7 @@ def _stop(
     while speed_mps > 0:
         duration_s = min(STOP_STEP_S, speed_mps / deceleration_mps2)
         next_mps = speed_mps - deceleration_mps2 * duration_s if duration_s == STOP_STEP_S else 0.0
-        next_rad = _turn_wheels(steering_rad, target_rad, model.steering_rate_radps * duration_s)
+        next_rad = _turn_wheels(model, steering_rad, target_rad, duration_s)
         distance_m = (speed_mps + next_mps) / 2 * duration_s
         poses.append(_move(poses[-1], distance_m, (steering_rad + next_rad) / 2, model.wheelbase_m))
         speed_mps, steering_rad = next_mps, next_rad

@@ -62,13 +62,13 @@ def error_bounds(
     """Return the bounds at these largest values of speed, steering, its change, and acceleration in the loop delay.
 
     `unknown_s` is by how much the display can be wrong about the length of the loop delay. The car turns later than
-    the model by the lag of its wheels, their smaller rate, and the time constant of its tyres.
+    the model by the smaller rate of its wheels and the time constant of its tyres.
     """
     distance_m, unknown_m = speed_mps * loop_s, speed_mps * unknown_s
     curvature = math.tan(steering_rad) / CAR.wheelbase_m
     slower_s = change_rad / 2 * (1 / CAR.max_steering_rate_radps - 1 / LIMITS.steering_rate_radps)
     tyres_s = CAR.mass_kg * speed_mps / (CAR.front_stiffness_nprad + CAR.rear_stiffness_nprad)
-    lagging_rad = speed_mps / CAR.wheelbase_m * (CAR.steering_lag_s + slower_s + tyres_s) * change_rad
+    lagging_rad = speed_mps / CAR.wheelbase_m * (slower_s + tyres_s) * change_rad
     turn_rad = lagging_rad + curvature * unknown_m
     return Bounds(
         unknown_m + acceleration_mps2 * loop_s**2 / 2, (REAR_SLIP_RAD + turn_rad) * distance_m, turn_rad + 0.005
@@ -147,7 +147,7 @@ def test_the_ghost_is_where_the_car_was(state_delay: str, tmp_path: Path) -> Non
         )
     }
     assert len(found) > 0.9 * len(applications) > 900
-    errors, actual = [], []
+    errors, actual, late_m = [], [], []
     for sequence in sorted(found.keys() & applications.keys()):
         (captured_ns, stamped_ns), applied_ns = captures[found[sequence].stamp_ns], applications[sequence]
         if applied_ns is None:
@@ -165,11 +165,13 @@ def test_the_ghost_is_where_the_car_was(state_delay: str, tmp_path: Path) -> Non
         )
         actual.append(np.array(moved(at(captured_ns), at(applied_ns))))
         errors.append(np.array(found[sequence].prediction.ghost) - actual[-1])
+        late_m.append(errors[-1][0] + at(captured_ns)[3] * (stamped_ns - captured_ns) / NS_PER_S)
         assert (np.abs(errors[-1]) <= bounds).all(), (sequence, errors[-1], bounds)
     report(f"L3, state delay {state_delay}", errors, actual)
     assert (
         np.median(np.abs(errors), axis=0)[0] < 0.1 * np.median(np.abs(actual), axis=0)[0]
     )  # a picture without a ghost
+    assert abs(np.median(late_m)) < EFFECT_ERROR_S * 8.0  # without the time from capture to stamp
     turning = np.abs(np.array(actual)[:, 2]) > 0.03
     assert turning.sum() > 30
     assert np.abs(errors)[turning, 2].mean() < 0.25 * np.abs(actual)[turning, 2].mean()  # a straight prediction
@@ -183,7 +185,12 @@ def test_a_person_s_steps_of_steering_and_brake(known_ns: int) -> None:
     """
     loop_ns, step_ns, each = 240 * NS_PER_MS, 20 * NS_PER_MS, 5
     car = CarDynamics(CAR, CarMotion(0.0, 0.0, 0.0, speed_mps=8.0), step_ns / each / NS_PER_S)
-    model = CarModel(CAR.wheelbase_m, LIMITS.steering_rate_radps, LIMITS.stop_deceleration_mps2)
+    model = CarModel(
+        wheelbase_m=CAR.wheelbase_m,
+        steering_rate_radps=LIMITS.steering_rate_radps,
+        steering_lag_s=CAR.steering_lag_s,
+        stop_deceleration_mps2=LIMITS.stop_deceleration_mps2,
+    )
     steps = [(0.0, 0.0, 0.0), (1, 0.0, 0.0), (0.0, 1.0, 0.0), (-1, 0.0, 0.0), (1, 0.0, 0.0), (0.0, 0.0, 1.0)]
     requested = [Actuation(left * STEP_RAD, *pedals) for left, *pedals in steps for _ in range(40)]
     motions: list[FloatArray] = []
