@@ -23,15 +23,18 @@ from lavt.assembly.clock_source import clock_source
 from lavt.assembly.entropy import MachineEntropy, SeededEntropy, run_seed
 from lavt.assembly.fidelity import FIDELITIES
 from lavt.assembly.injection import injection_client
-from lavt.assembly.nodes import build_controller, build_server, check_names
+from lavt.assembly.nodes import build_controller, build_predictor, build_server, check_names
 from lavt.assembly.simulators import car_of
 from lavt.assembly.vehicles import build_geometry_setup, build_vehicle_setup
 from lavt.clock import MachineClock
 from lavt.config import (
     CameraConfig,
+    ClientConfig,
     ClientInjectionConfig,
     ClockConfig,
     ControllerConfig,
+    PredictionConfig,
+    RunConfig,
     ServerCameraConfig,
     ServerConfig,
     TwoPointConfig,
@@ -39,6 +42,8 @@ from lavt.config import (
 )
 from lavt.domain import Lane, Now
 from lavt.errors import UserError
+from lavt.experiment.runs.plan import plan_run
+from lavt.experiment.runs.side_configs import client_config
 from lavt.node import WAKE, Message
 from lavt.runtime.pipeline import run_stages
 from lavt.transport.clock_sync.persistent_process import Shell
@@ -311,3 +316,22 @@ def test_a_pixel_format_has_four_characters(pixel_format: str) -> None:
     """A V4L2 pixel format has four printable characters; anything else is rejected."""
     with pytest.raises(ValidationError):
         ServerCameraConfig(format=pixel_format)
+
+
+def test_the_predictive_display_is_a_setting_of_a_person_s_drive() -> None:
+    """It is off by default; results name it for a person's drive only; the outline is the built-in car's."""
+    shown = PredictionConfig(shown=True)
+    person = ControllerConfig(kind="human", prediction=shown)
+    assert build_predictor(ClientConfig()) is None
+    assert build_predictor(ClientConfig(controller=person)) is not None
+    assert ControllerConfig(kind="human").settings == ControllerConfig(prediction=shown).settings == "designed"
+    assert person.settings == "designed, prediction.shown"
+    run = RunConfig(controller=person, time="real")
+    assert plan_run(run, is_study=True).identity["preset"] == "designed, prediction.shown"
+    assert client_config(run, 1).controller.prediction.shown
+    assert (shown.front_m, shown.rear_m, shown.width_m) == (
+        LINCOLN_MKZ.rear_axle_to_front_m,
+        LINCOLN_MKZ.rear_axle_to_rear_m,
+        LINCOLN_MKZ.body_width_m,
+    )
+    assert shown.steering_lag_s == LINCOLN_MKZ.steering_lag_s

@@ -17,6 +17,7 @@ from lavt.domain import NS_PER_MS, NS_PER_S, NS_PER_US, Command, SessionReply, S
 from lavt.node import WAKE, Message, Send
 from lavt.nodes.client_session import ClientSession
 from lavt.nodes.human_driver import COMMAND_GAP_NS, SEAT_NS, HumanDriverNode
+from lavt.nodes.page_prediction import PagePredictor
 from lavt.nodes.payloads import DecodedFrame, DelayChoice, ReceivedUnit, RelayDelay
 from lavt.nodes.picture_reader import PictureReader
 from lavt.runtime.pipeline import run_stages
@@ -34,7 +35,13 @@ DELAYS = DelayChoice((("L0", 0.0, 0.0), ("L3", 225.0, 0.0)), RelayDelay(0.0, 0.0
 class HumanBench:
     """A person's driver node with page 1, and methods that deliver what the page and the vehicle send."""
 
-    def __init__(self, delays: DelayChoice | None = None, *, shows_latency: bool = True) -> None:
+    def __init__(
+        self,
+        delays: DelayChoice | None = None,
+        *,
+        shows_latency: bool = True,
+        predictor: PagePredictor | None = None,
+    ) -> None:
         self.session = ClientSession("alice", 1, rearm=True, start_ns=MONO_NS)
         self.controls = HumanControls(wheelbase_m=2.8)
         self.node = HumanDriverNode(
@@ -44,6 +51,7 @@ class HumanBench:
             CLIENT_LIMITS,
             delays,
             shows_latency=shows_latency,
+            predictor=predictor,
         )
         self.mono_ns = 0
         self.opened = self.deliver("page_opened", None, peer=1)

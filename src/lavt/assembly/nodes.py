@@ -17,6 +17,7 @@ from lavt.config import HUMAN, ClientConfig, ControllerConfig, SafetyConfig, Ser
 from lavt.control.client_limits import CLIENT_LIMITS
 from lavt.control.drive_controller import DriveController, make_controller
 from lavt.control.human_controls import HUMAN_LIMITS, HumanControls
+from lavt.control.prediction import CarModel
 from lavt.control.preset import Preset, find_preset
 from lavt.control.two_point import TWO_POINT, TwoPointDriver, TwoPointSettings
 from lavt.domain import NS_PER_MS, Now
@@ -29,6 +30,7 @@ from lavt.nodes.clock_sync import ClockSyncNode, ProbingClockSyncNode
 from lavt.nodes.driver import DriverNode
 from lavt.nodes.human_driver import HumanDriverNode
 from lavt.nodes.injection import InjectionClient, InjectionNode
+from lavt.nodes.page_prediction import Outline, PagePredictor
 from lavt.nodes.page_watch import PageWatchNode
 from lavt.nodes.payloads import DelayChoice, Route
 from lavt.nodes.picture_reader import PictureReader
@@ -297,7 +299,22 @@ def _human_driver(
 ) -> Callable[[ClientSession], HumanDriverNode]:
     """Prepare the driver node of a person; return a function that builds it for a session."""
     reader, controls = PictureReader(fidelity.receiver(config)), build_controls(config.controller)
-    shows_latency = config.console.shows_latency
+    shows_latency, predictor = config.console.shows_latency, build_predictor(config)
     return lambda session: HumanDriverNode(
-        reader, controls, session, CLIENT_LIMITS, delays, shows_latency=shows_latency
+        reader, controls, session, CLIENT_LIMITS, delays, shows_latency=shows_latency, predictor=predictor
     )
+
+
+def build_predictor(config: ClientConfig) -> PagePredictor | None:
+    """Build the predictive display of a person's page; None: the config does not show it."""
+    settings = config.controller.prediction
+    if not settings.shown:
+        return None
+    model = CarModel(
+        wheelbase_m=config.controller.wheelbase_m,
+        steering_rate_radps=LIMITS.steering_rate_radps,
+        steering_lag_s=settings.steering_lag_s,
+        stop_deceleration_mps2=LIMITS.stop_deceleration_mps2,
+    )
+    outline = Outline(settings.front_m, settings.rear_m, settings.width_m)
+    return PagePredictor(model, outline, client_camera(config.camera))

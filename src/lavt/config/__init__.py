@@ -13,6 +13,7 @@ from lavt.config.camera import ServerCameraConfig as ServerCameraConfig
 from lavt.config.carla import CarlaConfig as CarlaConfig
 from lavt.config.controller import HUMAN as HUMAN
 from lavt.config.controller import ControllerConfig as ControllerConfig
+from lavt.config.controller import PredictionConfig as PredictionConfig
 from lavt.config.controller import TwoPointConfig as TwoPointConfig
 from lavt.config.costs import Costs as Costs
 from lavt.config.dbw import DbwConfig as DbwConfig

@@ -57,6 +57,21 @@ class TwoPointConfig(Section):
         return {name: value for name, value in self.model_dump().items() if value != getattr(_MODEL, name)}
 
 
+class PredictionConfig(Section):
+    """The predictive display, for `controller.kind` human (`docs/drive.md`), and what it knows of the vehicle."""
+
+    shown: bool = False
+    """Whether the page draws the predicted path, the car at its end, and the stopping line."""
+    front_m: float = Field(3.89, gt=0, lt=20)
+    """Distance from the rear axle to the front of the vehicle; by default the built-in car's."""
+    rear_m: float = Field(1.043, ge=0, lt=20)
+    """Distance from the rear axle to the rear of the vehicle; by default the built-in car's."""
+    width_m: float = Field(1.86, gt=0, lt=5)
+    """Width of the vehicle; by default the built-in car's."""
+    steering_lag_s: float = Field(0.12, ge=0, le=2)
+    """Time constant with which the wheels follow a command; by default the built-in car's."""
+
+
 class ControllerConfig(Section):
     """The controller that drives."""
 
@@ -75,6 +90,7 @@ class ControllerConfig(Section):
     """The target speed. The vehicle allows no throttle above `safety.speed_limit_mps`, which is at most 40 km/h for a
     vehicle that is not simulated."""
     two_point: TwoPointConfig = TwoPointConfig()
+    prediction: PredictionConfig = PredictionConfig()
     wheelbase_m: float = Field(2.8448, gt=0.5, lt=10)
     """The wheelbase of the driven vehicle; by default the built-in car's."""
     rearm: bool = False
@@ -96,7 +112,8 @@ class ControllerConfig(Section):
         changes = dict(self.changes)
         if self.kind == TWO_POINT:
             changes |= {f"two_point.{name}": value for name, value in self.two_point.changes.items()}
-        return ", ".join([self.preset, *(f"{name} {_format(value)}" for name, value in changes.items())])
+        shown = ["prediction.shown"] if self.kind == HUMAN and self.prediction.shown else []
+        return ", ".join([self.preset, *shown, *(f"{name} {_format(value)}" for name, value in changes.items())])
 
 
 def _format(value: float) -> str:

@@ -18,6 +18,7 @@ from lavt.node import WAKE, Message, Peer, Send, Stage
 from lavt.nodes.client_session import ClientSession
 from lavt.nodes.commander import Commander, stopping
 from lavt.nodes.page_figures import BitRate, RoundTrip
+from lavt.nodes.page_prediction import PagePredictor
 from lavt.nodes.page_video import PageVideo
 from lavt.nodes.payloads import (
     DecodedFrame,
@@ -65,7 +66,7 @@ class HumanDriverNode(Commander):
     """The node that drives by the inputs of a person, from one page at a time; other pages watch.
 
     `delays` are those that the person can choose; None: this client cannot change the delays. Without `shows_latency`,
-    the pages show no latencies and no lost packets.
+    the pages show no latencies and no lost packets. With a `predictor`, they show its predictions.
     """
 
     def __init__(
@@ -77,11 +78,12 @@ class HumanDriverNode(Commander):
         delays: DelayChoice | None = None,
         *,
         shows_latency: bool = True,
+        predictor: PagePredictor | None = None,
     ) -> None:
         super().__init__(session, limits)
         self._reader = reader
         self._controls = controls
-        self._shows_latency = shows_latency
+        self._shows_latency, self._predictor = shows_latency, predictor
         self._conditions = () if delays is None else delays.conditions
         self._delay = None if delays is None else delays.initial
         self._pages: dict[Peer, PageVideo] = {}
@@ -144,8 +146,13 @@ class HumanDriverNode(Commander):
         if pages:
             sent_us = now.mono_ns // NS_PER_US
             packed = pack_unit(unit.data, unit.rtp_timestamp, is_keyframe=unit.keyframe, sent_us=sent_us)
-            sends = [Send("page_unit", packed, peer) for peer in pages]
+            sends = [*self._predict(unit, pages, now), *(Send("page_unit", packed, peer) for peer in pages)]
         return [*sends, Send("unit_to_decode", unit)]
+
+    def _predict(self, unit: ReceivedUnit, pages: Sequence[Peer], now: Now) -> list[Send]:
+        """Return what is predicted for the picture of a unit; the page has it before the picture."""
+        prediction = None if self._predictor is None else self._predictor.message(unit.rtp_timestamp, now)
+        return [] if prediction is None else [Send("page_status", pack_text(prediction), peer) for peer in pages]
 
     def _note_view(self, message: Message, now: Now) -> None:
         frame: DecodedFrame = message.payload
@@ -153,6 +160,8 @@ class HumanDriverNode(Commander):
         if len(self._frames) >= MAX_FRAMES:
             self._frames.pop(next(iter(self._frames)))
         self._frames[unit] = FrameStamp(frame.stamp_ns, frame.read_wall_ns)
+        if self._predictor is not None:
+            self._predictor.note_picture(frame.stamp_ns)
         if unit == self._shown_unit:
             self._show(unit, now)
 
@@ -328,6 +337,8 @@ class HumanDriverNode(Commander):
     def _note_command(self, decision: Decision, now: Now) -> None:
         self._round_trip.note_command(self._sequence, now.mono_ns)
         self._last = now.mono_ns, decision
+        if self._predictor is not None:
+            self._predictor.note_command(self._sequence, decision.steering_rad, now.mono_ns)
 
     def _note_state(self, message: Message, now: Now) -> None:
         super()._note_state(message, now)
@@ -344,6 +355,10 @@ class HumanDriverNode(Commander):
         state = self._newest_state
         if state is not None and self.session.has_control:
             self._round_trip.note_applied(state.applied_sequence, now.mono_ns)
+            if self._predictor is not None:
+                self._predictor.note_state(state, now.mono_ns)
+        elif self._predictor is not None:
+            self._predictor.forget()
 
     # Status.
 

@@ -15,6 +15,7 @@ from lavt.transport.video.stamp import (
     read_stamp,
     rtp_timestamp,
     stamp_agrees,
+    stamp_near,
     write_stamp,
     write_stamp_i420,
     write_stamp_luma,
@@ -152,6 +153,14 @@ def test_clear_stamp() -> None:
         luma[:8, :8] = grey
         with pytest.raises(BadPacket, match="neither"):
             read_clear_stamp(luma)
+
+
+@given(st.integers(2**60, 2**61), st.integers(-(10**13), 10**13))
+def test_a_stamp_follows_from_the_rtp_timestamp(stamp_ns: int, since_ns: int) -> None:
+    """With a time within some hours of it, the RTP timestamp tells the stamp, at most 12 us too early."""
+    found_ns = stamp_near(rtp_timestamp(stamp_ns), stamp_ns + since_ns)
+    assert 0 <= stamp_ns - found_ns < 12_000
+    assert stamp_agrees(found_ns, rtp_timestamp(stamp_ns))
 
 
 def test_rtp_timestamp() -> None:

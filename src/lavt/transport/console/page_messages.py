@@ -1,7 +1,7 @@
 """The messages between the client and the page of the console.
 
-The page sends JSON texts, each with a `type`. The client sends statuses and lanes (JSON texts) and access units
-(binary).
+The page sends JSON texts, each with a `type`. The client sends statuses, lanes and predictions (JSON texts) and access
+units (binary).
 """
 
 from __future__ import annotations
@@ -210,6 +210,28 @@ class PageLane(Struct, frozen=True, kw_only=True):
     right: tuple[tuple[float, float], ...]
 
 
+class PagePrediction(Struct, frozen=True, kw_only=True):
+    """Where the car of a picture is predicted to be; points are (column, row) in pixels of this picture.
+
+    It is sent before the picture's access unit.
+    """
+
+    type: Literal["prediction"] = "prediction"
+    unit: int
+    """RTP timestamp of the picture's access unit."""
+    stamp: str
+    """The picture's stamp in ns, computed from the RTP timestamp, so at most 12 us too early; as text, because
+    JavaScript's numbers have 53 bits."""
+    left: tuple[tuple[float, float], ...]
+    right: tuple[tuple[float, float], ...]
+    """The paths of the car's front corners since the picture, the oldest point first."""
+    ghost: tuple[tuple[float, float], ...]
+    """The outline of the car where a command that is sent now takes effect, without the parts that the camera cannot
+    see."""
+    stop: tuple[tuple[float, float], ...]
+    """The stopping line: where the car's front is at standstill, if this command brakes."""
+
+
 class ProbeAnswer(Struct, frozen=True):
     """The answer to a `PageProbe`; times are on the client's wall clock."""
 
@@ -222,6 +244,6 @@ class ProbeAnswer(Struct, frozen=True):
 _encoder = msgspec.json.Encoder()
 
 
-def pack_text(message: PageStatus | PageLane | ProbeAnswer) -> bytes:
+def pack_text(message: PageStatus | PageLane | PagePrediction | ProbeAnswer) -> bytes:
     """Return the JSON of a message to the page."""
     return _encoder.encode(message)

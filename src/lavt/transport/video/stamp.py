@@ -149,6 +149,13 @@ def rtp_timestamp(stamp_ns: int) -> int:
     return stamp_ns * _RTP_TICKS_PER_100_US // _NS_PER_100_US % 2**32
 
 
+def stamp_near(rtp_timestamp_of_frame: int, near_ns: int) -> int:
+    """Return the stamp of a frame from its RTP timestamp, at most 12 us too early; `near_ns` is within 6 h of it."""
+    ticks = (rtp_timestamp_of_frame - rtp_timestamp(near_ns) + 2**31) % 2**32 - 2**31
+    near_ticks = near_ns * _RTP_TICKS_PER_100_US // _NS_PER_100_US
+    return -((near_ticks + ticks) * -_NS_PER_100_US // _RTP_TICKS_PER_100_US)
+
+
 def stamp_agrees(stamp_ns: int, rtp_timestamp_of_frame: int) -> bool:
     """Return whether a stamp read from a picture is the same time as the RTP timestamp of the picture's packets.
 

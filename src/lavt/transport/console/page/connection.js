@@ -17,7 +17,8 @@ export class Connection {
   #stop_ms = null; // when the stop that is not confirmed was last sent; null: there is none
   #isFinal = false; // there will be no other connection
 
-  // `listener` has `takeStatus(status)`, `takeLane(lane)`, `takeProbe(answer)`, `takeUnit(buffer)` and `close(text)`.
+  // `listener` has `takeStatus(status)`, `takeLane(lane)`, `takePrediction(prediction)`, `takeProbe(answer)`,
+  // `takeUnit(buffer)` and `close(text)`.
   constructor(token, listener) {
     this.#token = token;
     this.#listener = listener;
@@ -97,6 +98,7 @@ export class Connection {
     const message = JSON.parse(data);
     if (message.type === "probe") return this.#listener.takeProbe(message);
     if (message.type === "lane") return this.#listener.takeLane(message);
+    if (message.type === "prediction") return this.#listener.takePrediction(message);
     if (message.version !== VERSION) return this.#socket.close(ANOTHER_VERSION, "reload this page: it is of another version of lavt");
     this.seen_us = message.sent_us;
     if (message.emergency_stop === "confirmed" && message.safety === "emergency_stop") this.#stop_ms = null;

@@ -60,7 +60,8 @@ async function connect() {
   if (!(await canDecode())) return showClosed("this browser cannot decode H.264, the format of the video: install its codecs, or use another browser");
   const takeProbe = (answer) => offset.note(answer);
   const takeLane = (lane) => video.lanes?.take(lane);
-  connection = new Connection(token, { takeStatus, takeLane, takeUnit, takeProbe, close });
+  const takePrediction = (prediction) => video.predictions.take(prediction);
+  connection = new Connection(token, { takeStatus, takeLane, takePrediction, takeUnit, takeProbe, close });
 }
 
 function close(text) {

@@ -2,6 +2,7 @@
 
 import { pageTime_us } from "./clock.js";
 import { drawLane } from "./lane.js";
+import { Predictions, drawPrediction, isOfStamp } from "./prediction.js";
 import { readStamp } from "./stamp.js";
 
 const MAX_DECODING = 3; // access units in the decoder
@@ -37,6 +38,8 @@ export class Video {
     this.#lose = lose;
     this.lanes = null; // the lanes to draw; null: none are detected
     this.lanesDrawn = 0;
+    this.predictions = new Predictions();
+    this.predictionsDrawn = 0;
     this.shown = 0;
     this.stamp_us = null; // of the newest picture that was shown
     this.shown_ms = null; // from the stamp until the newest picture was shown
@@ -104,6 +107,8 @@ export class Video {
       this.#context.drawImage(frame, 0, 0);
       if (this.#context.isContextLost?.()) return this.#fail(); // then nothing has been drawn
       if (lane !== null) drawLane(this.#context, lane);
+      const prediction = this.predictions.of(unit);
+      if (prediction !== null) drawPrediction(this.#context, prediction);
       isDrawn = true;
       this.shown += 1;
       this.#acknowledge(unit);
@@ -111,6 +116,7 @@ export class Video {
       const shown = this.#untilShown(this.shown);
       const stamp = await readStamp(frame);
       if (lane !== null && stamp !== null) this.#countLane(lane.stamp === stamp);
+      if (prediction !== null && stamp !== null) this.#countPrediction(isOfStamp(prediction, stamp));
       frame.close(); // a page that is hidden shows nothing, and must not keep the decoder's pictures
       const shown_us = await shown;
       if (stamp !== null && shown_us !== null) this.#report({ ...times, stamp, shown_us });
@@ -125,6 +131,11 @@ export class Video {
   #countLane(isOfPicture) {
     if (isOfPicture) this.lanesDrawn += 1;
     else this.errors += 1; // the lane of another picture was drawn
+  }
+
+  #countPrediction(isOfPicture) {
+    if (isOfPicture) this.predictionsDrawn += 1;
+    else this.errors += 1; // the prediction for another picture was drawn
   }
 
   // Return when the picture with this number appears; null if the page is hidden, or a newer one is drawn over it first.
