@@ -48,6 +48,12 @@ def test_a_real_joystick_drives_until_it_is_unplugged(pad: Joystick, person_driv
         pad.axis(THROTTLE, -FULL)
         pad.button(DEAD_MAN, down=False)
 
+    def is_read_when_pressed() -> bool:
+        for down in (False, True):  # the browser hides a press that it finds when it opens the device
+            pad.button(DEAD_MAN, down=down)
+            let_time_pass(tab)
+        return gamepads(tab) == [["standard", 0, 1]]
+
     def accelerates_to_the_left() -> bool:
         if field(tab, "safety") == "driving":
             pad.axis(STEERING, -FULL)
@@ -58,9 +64,9 @@ def test_a_real_joystick_drives_until_it_is_unplugged(pad: Joystick, person_driv
         tab = person_drive.open(browser)
         assert gamepads(tab) == []
         pad.plug()
-        pad.button(DEAD_MAN, down=True)  # a browser shows no gamepad before its first event
-        wait_until("the browser reads the button", lambda: gamepads(tab) == [["standard", 0, 1]])
+        wait_until("the browser reads the button", is_read_when_pressed)  # it shows no gamepad before its first event
         pad.button(DEAD_MAN, down=False)
+        let_time_pass(tab)
         drive_until(tab, hold, let_go, accelerates_to_the_left)
         assert gamepads(tab) == [["standard", -1, 1]]
         pad.unplug()
