@@ -204,6 +204,21 @@ def test_a_stopped_sweep_keeps_what_is_finished(signal_number: int, options: tup
     assert 0 < len(list(out.glob("runs/*/result.json"))) == len(list(out.glob("runs/*"))) < planned_runs
 
 
+def test_runs_in_a_carla_server_are_driven_one_by_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A sweep with a CARLA server has one worker, whatever was asked, because only one client can tick a server."""
+    used: list[int] = []
+
+    def note_jobs(_attempt: object, _todo: object, jobs: int) -> list[object]:
+        used.append(jobs)
+        return []
+
+    monkeypatch.setattr("lavt.experiment.sweep.sweep.attempt_in_processes", note_jobs)
+    for kind in ("simulator", "carla"):
+        planned = plan_sweep(sweep_config("fidelity=pixels", f"vehicle.kind={kind}"))
+        run_all(planned, tmp_path, jobs=4, on_progress=lambda _: None)
+    assert used == [4, 1]
+
+
 @pytest.mark.full
 def test_a_second_ctrl_c_ends_a_sweep_at_once(tmp_path: Path) -> None:
     """The first Ctrl-C announces that the runs in progress are finished; the second breaks them off."""

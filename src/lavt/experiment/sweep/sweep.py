@@ -71,7 +71,7 @@ def run_all(
     todo = [run for run in planned if not is_finished(runs_dir / run.name)]
     progress = _SweepProgress(runs_dir, on_progress, drive_once if server is None else server.drive)
     if cluster_address is None:
-        jobs = 1 if any(run.config.time == "real" for run in todo) else jobs or os.cpu_count() or 1
+        jobs = 1 if any(_drives_alone(run.config) for run in todo) else jobs or os.cpu_count() or 1
         for run in attempt_in_processes(progress.drive, todo, jobs):
             progress.fail(run, "each of the processes that drove it died")
     elif todo:
@@ -89,6 +89,11 @@ def run_all(
         "jobs": jobs,
     }
     return sweep_result, speed
+
+
+def _drives_alone(config: RunConfig) -> bool:
+    """Return whether a run must be the only one: it is in real time, or its client must be the only one of a server."""
+    return config.time == "real" or config.vehicle.kind == "carla"
 
 
 class _SweepProgress:
