@@ -117,6 +117,7 @@ def test_the_watchdog_can_be_disabled(lines: list[str], brake: float) -> None:
         ("inhibit me", ["'me'", "acceleration, door, reverse, seat belt, speed"]),
         ("switch_remote 2", ["'2'", "control_allowed, emergency_stop, pause, remote"]),
         ("bus_off now", ["bus_off", "'now'"]),
+        ("scale_speed 0\n0", ["'0\\n0'", "SOURCE=0.5"]),
     ],
 )
 def test_an_invalid_command_changes_nothing(line: str, key_words: list[str]) -> None:

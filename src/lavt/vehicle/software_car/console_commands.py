@@ -62,7 +62,7 @@ def scale_speed(kit: Kit, text: str, _: int) -> None:
     """Scale the speed of a source, for the text `SOURCE=FACTOR`. Raises `UserError`."""
     source, factor = parse_source(text)
     if factor is None:
-        raise UserError(f"scale_speed needs a factor: write {source[:MAX_QUOTED]}=0.5")
+        raise UserError(f"scale_speed {source[:MAX_QUOTED]!r} needs a factor: write SOURCE=0.5")
     kit.scale_speed(source, factor)
 
 
